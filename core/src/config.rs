@@ -1,0 +1,98 @@
+//! Every limit of CARA in one place: what can be set while running ([`Constraints`]) and what is fixed when compiling.
+
+use crate::time::Duration;
+
+/// Protocol version, one byte in every datagram and hello. Units of different versions refuse each other by name.
+pub const VERSION: u8 = 1;
+/// First four bytes of every datagram and hello in plain mode. Secured mode has its own, so the two never meet.
+pub const PLAIN_MAGIC: [u8; 4] = *b"CARp";
+/// UDP port on which units of plain mode listen for broadcasts. Secured mode uses the next one.
+pub const PLAIN_PORT: u16 = 21_970;
+
+/// Longest name of a node, in bytes of UTF-8. Costs this much per known node.
+pub const NODE_NAME_BYTES: usize = 32;
+/// Longest name of a function or variable, in bytes of UTF-8. Stored as long as it is.
+pub const NAME_BYTES: usize = 32;
+/// Most variables in one `Parameters`, and in the arguments or results of one function. Costs 16 bytes each per `Parameters`.
+pub const VARIABLES: usize = 16;
+/// Longest encoded signature (name, arguments and results of one function), in bytes. Stored as long as it is.
+pub const SIGNATURE_BYTES: usize = 384;
+/// Bytes of the values and names in a `Parameters` whose size is not given.
+pub const PARAMETERS_BYTES: usize = 512;
+
+/// Longest frame body that the protocol allows, in bytes; a peer may tell less. Bounds how long an emergency waits
+/// behind another message: 4 KiB take 33 ms on a 1 Mbit/s link.
+pub const CHUNK_BYTES: usize = 4096;
+/// Shortest chunk that a unit may tell as its limit: an emergency must fit into one.
+pub const MINIMUM_CHUNK_BYTES: usize = 320;
+/// Longest emergency message, in bytes: fits one chunk and one datagram. Each link reserves room for one.
+pub const EMERGENCY_BYTES: usize = 256;
+/// Longest message of best-effort delivery, in bytes: one UDP datagram that is not fragmented on Ethernet.
+pub const DATAGRAM_BYTES: usize = 1400;
+/// The buffer that each link owns: partial frames and handshakes up to this length need none from the pool.
+pub const LINK_BUFFER_BYTES: usize = 512;
+
+/// Ids behind the newest one that the at-most-once window of a priority remembers.
+pub const WINDOW: u32 = 64;
+/// How long a unit waits for the peer's hello on a new link before it closes it.
+pub const HELLO_TIMEOUT: Duration = Duration::from_secs(2);
+/// How long an old link may take to answer the challenge that tells a restarted peer from a duplicate one.
+pub const CHALLENGE_TIMEOUT: Duration = Duration::from_millis(300);
+/// Keep-alives that may be missed in a row.
+pub const MISSED_KEEP_ALIVES: u8 = 3;
+/// Loss is declared this late where only TCP passes, since one retransmission alone can take seconds.
+pub const TCP_ONLY_LOSS: Duration = Duration::from_secs(8);
+/// One-way messages written this soon after the last write are gathered.
+pub const GATHER: Duration = Duration::from_micros(50);
+/// First pause between two searches; doubles up to [`LONGEST_SEARCH`], each with full jitter on top.
+pub const FIRST_SEARCH: Duration = Duration::from_millis(250);
+/// Longest pause between two searches.
+pub const LONGEST_SEARCH: Duration = Duration::from_secs(8);
+/// Who-has datagrams per [`SEARCH_WINDOW`] on a network, own and heard, above which a unit defers its own.
+pub const SEARCH_BUDGET: u8 = 4;
+/// The window of [`SEARCH_BUDGET`].
+pub const SEARCH_WINDOW: Duration = Duration::from_secs(1);
+/// An answer to a broadcast is delayed at random by up to this much per node that is expected to answer as well.
+pub const ANSWER_SPREAD: Duration = Duration::from_millis(1);
+
+/// What can be set by hand (paper, section 2), before the start and while running. Peers are told what concerns them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Constraints {
+    /// Time-out of a blocking request that names none; also the life of an asynchronous one.
+    pub request_timeout: Duration,
+    /// Least time between two requests to one node; zero switches the limit off. The callee enforces its own as well.
+    pub minimum_interval: Duration,
+    /// Most nodes connected at a time; the next one is refused with `Full`.
+    pub maximum_nodes: u16,
+    /// Longest message received, in bytes of its block of parameters; told to peers, which refuse to send a longer one.
+    pub message_size: u32,
+    /// Longest chunk received, in bytes; told to peers.
+    pub chunk_size: u16,
+    /// Pause between two keep-alives.
+    pub keep_alive: Duration,
+    /// Calls that one peer may have waiting or running here; the next one is answered with `Busy`.
+    pub calls_per_peer: u16,
+}
+
+impl Constraints {
+    /// Defaults of an m_unit.
+    pub const M_UNIT: Self = Self {
+        request_timeout: Duration::from_secs(2),
+        minimum_interval: Duration::ZERO,
+        maximum_nodes: 64,
+        message_size: 32 * 1024,
+        chunk_size: CHUNK_BYTES as u16,
+        keep_alive: Duration::from_secs(1),
+        calls_per_peer: 64,
+    };
+    /// Defaults of an s_unit, sized for a microcontroller.
+    pub const S_UNIT: Self = Self {
+        request_timeout: Duration::from_secs(2),
+        minimum_interval: Duration::ZERO,
+        maximum_nodes: 1,
+        message_size: 1024,
+        chunk_size: 1024,
+        keep_alive: Duration::from_secs(1),
+        calls_per_peer: 8,
+    };
+}

@@ -1,0 +1,95 @@
+//! Who a node is: name, id, role, fleet (paper, Fig. 2) and the boot epoch that tells two lives of it apart.
+
+use core::fmt;
+
+use serde::{Deserialize, Serialize};
+
+use crate::config::NODE_NAME_BYTES;
+use crate::error::Error;
+
+/// m_unit or s_unit.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub enum Role {
+    /// `CommunicationSystem`: connects to many nodes.
+    MUnit,
+    /// `Unit`: connects to exactly one m_unit.
+    SUnit,
+}
+
+/// Units of different fleets on one network do not meet.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub struct Fleet(pub u32);
+
+/// One life of a node: differs from boot to boot.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub struct Epoch(pub u64);
+
+/// Name, ID number and role of a node.
+///
+/// Ordered by (id, name): of two m_units the smaller one dials.
+#[derive(Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub struct Identity {
+    id: u32,
+    name: heapless::String<NODE_NAME_BYTES>,
+    role: Role,
+}
+
+impl Identity {
+    /// An m_unit's identity.
+    pub fn m_unit(name: &str, id: u32) -> Result<Self, Error> {
+        Self::new(name, id, Role::MUnit)
+    }
+
+    /// An s_unit's identity.
+    pub fn s_unit(name: &str, id: u32) -> Result<Self, Error> {
+        Self::new(name, id, Role::SUnit)
+    }
+
+    /// An identity; [`Error::BadName`] for a name that is empty or longer than [`NODE_NAME_BYTES`].
+    pub fn new(name: &str, id: u32, role: Role) -> Result<Self, Error> {
+        if name.is_empty() {
+            return Err(Error::BadName);
+        }
+        let name = heapless::String::try_from(name).map_err(|_| Error::BadName)?;
+        Ok(Self { id, name, role })
+    }
+
+    /// The name.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// The ID number.
+    pub const fn id(&self) -> u32 {
+        self.id
+    }
+
+    /// The role.
+    pub const fn role(&self) -> Role {
+        self.role
+    }
+}
+
+impl Ord for Identity {
+    fn cmp(&self, other: &Self) -> core::cmp::Ordering {
+        (self.id, self.name(), self.role).cmp(&(other.id, other.name(), other.role))
+    }
+}
+
+impl PartialOrd for Identity {
+    fn partial_cmp(&self, other: &Self) -> Option<core::cmp::Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+impl fmt::Display for Identity {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}/{}", self.name(), self.id)
+    }
+}
+
+impl fmt::Debug for Identity {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::Display::fmt(self, f)
+    }
+}

@@ -1,0 +1,299 @@
+//! Everything that can go wrong, sorted by who must act. Small, `Copy`, and each text says what to do.
+
+use crate::time::Duration;
+
+/// Who must act on an [`Error`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Cause {
+    /// The program or its configuration must change; trying again does not help.
+    Configuration,
+    /// The other unit refused, failed or went away.
+    Peer,
+    /// A limit was reached; it passes, or the limit can be raised.
+    Resource,
+    /// The network below failed.
+    Transport,
+}
+
+/// A limit of [`crate::config`] or of the storage that the port lent.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[repr(u8)]
+pub enum Limit {
+    /// `Constraints::maximum_nodes`, or the table of nodes.
+    Nodes = 0,
+    /// The table of links.
+    Links = 1,
+    /// Calls in flight to one peer.
+    Calls = 2,
+    /// `Constraints::calls_per_peer`: calls of one peer that wait or run.
+    IncomingCalls = 3,
+    /// The pool of message buffers.
+    Buffers = 4,
+    /// Messages that wait to be written to one peer.
+    SendQueue = 5,
+    /// The table of functions.
+    Functions = 6,
+    /// Bytes for signatures.
+    SignatureBytes = 7,
+    /// Variables in one `Parameters`.
+    Variables = 8,
+    /// Bytes in one `Parameters`.
+    ParametersBytes = 9,
+    /// Bytes in a name.
+    NameBytes = 10,
+    /// Leases held by one peer.
+    Leases = 11,
+    /// Handlers running at the same time.
+    Handlers = 12,
+}
+
+/// What a unit tells the other end when it does not take a link.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, thiserror::Error)]
+#[repr(u8)]
+pub enum Refusal {
+    /// The two speak different versions of the protocol.
+    #[error("the peer speaks another version of the protocol: update one of the two")]
+    Version = 1,
+    /// The two belong to different fleets.
+    #[error("the peer belongs to another fleet: set the same fleet on both")]
+    Fleet = 2,
+    /// An s_unit of another manager.
+    #[error("the s_unit belongs to another manager: check the manager's name and id set in it")]
+    WrongManager = 3,
+    /// `Constraints::maximum_nodes` is reached.
+    #[error("the peer has as many nodes as it may: raise its maximum_nodes")]
+    Full = 4,
+    /// Another live node has the same name, id and role.
+    #[error("another live node has the same name and id: give each node its own")]
+    DuplicateIdentity = 5,
+    /// Both ends have the same role or identity where that cannot be.
+    #[error("the two roles cannot be joined: an s_unit joins an m_unit")]
+    Role = 6,
+    /// The peers are connected already.
+    #[error("the two nodes are connected already")]
+    AlreadyConnected = 7,
+    /// The hello could not be read.
+    #[error("the peer's hello could not be read: is it a CARA unit?")]
+    Malformed = 8,
+}
+
+/// Why a link ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, thiserror::Error)]
+#[repr(u8)]
+pub enum CloseReason {
+    /// The other unit was stopped in an orderly way.
+    #[error("the peer was stopped")]
+    Stopped = 1,
+    /// The connection was reset or closed below.
+    #[error("the connection was closed by the network")]
+    Reset = 2,
+    /// Nothing was heard for the time of three keep-alives (8 s where only TCP passes).
+    #[error("nothing was heard from the peer: check power, cable and manager")]
+    Silent = 3,
+    /// The same identity came back with a new boot epoch.
+    #[error("the peer restarted")]
+    PeerRestarted = 4,
+    /// The other end broke the protocol.
+    #[error("the peer broke the protocol: check its version")]
+    Protocol = 5,
+    /// A frame or message above the told limit.
+    #[error("the peer sent more than the limit that it was told")]
+    Oversize = 6,
+    /// No hello came in time.
+    #[error("no hello came in time")]
+    HelloTimeout = 7,
+    /// The unit refused the link.
+    #[error("{0}")]
+    Refused(Refusal) = 8,
+    /// The connection could not be opened.
+    #[error("the connection could not be opened: is the peer's port reachable?")]
+    DialFailed = 9,
+    /// Request ids ran out; the pair connects again.
+    #[error("request ids ran out; the link is opened anew")]
+    Exhausted = 10,
+}
+
+/// What a handler answers instead of results.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, thiserror::Error)]
+pub enum ServiceError {
+    /// The service failed with a code of its own.
+    #[error("the service failed with code {0}")]
+    Failed(u16),
+    /// The handler panicked; the unit runs on.
+    #[error("the service's handler panicked: see the peer's log")]
+    Panicked,
+    /// The service refuses now.
+    #[error("the service is not ready: try again later")]
+    NotReady,
+    /// The handler set results that the signature does not hold.
+    #[error("the service's results do not match its published signature")]
+    BadResults,
+}
+
+/// An error of any operation.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, thiserror::Error)]
+pub enum Error {
+    // --- configuration
+    /// The peer has published no function of this name to this unit.
+    #[error("the peer has not published this function: see its function list")]
+    UnknownFunction,
+    /// The function was removed or changed since its list was read; the news follows.
+    #[error("the function was removed or changed: look at the new list and call again")]
+    StaleFunction,
+    /// Argument number `index` of the signature is not among the parameters.
+    #[error("argument {index} of the signature is missing: add it by its name")]
+    MissingArgument {
+        /// Position in the signature, from 0.
+        index: u8,
+    },
+    /// A variable has another type than asked for.
+    #[error("variable {index} has another type than the signature says")]
+    WrongType {
+        /// Position in the signature (or table), from 0.
+        index: u8,
+    },
+    /// A variable has another size than asked for.
+    #[error("variable {index} has size {found}, and {expected} is needed")]
+    WrongSize {
+        /// Position in the signature (or table), from 0.
+        index: u8,
+        /// The size that the signature or variable declares.
+        expected: u32,
+        /// The size that was found.
+        found: u32,
+    },
+    /// No variable of this name.
+    #[error("there is no variable of this name")]
+    UnknownVariable,
+    /// A variable, function or node of this name exists already.
+    #[error("the name is taken already")]
+    NameTaken,
+    /// A name is empty or holds other characters than letters, digits, `_`, `-`, `.`, `/`.
+    #[error("a name has letters, digits, '_', '-', '.' or '/', and at least one of them")]
+    BadName,
+    /// A number does not fit the Rust type that it was asked as, or the variable that it is put into.
+    #[error("the number does not fit the type it was asked as")]
+    OutOfRange,
+    /// The caller's parameters cannot hold the result.
+    #[error("the result needs {need} bytes, and the parameters have room for {have}")]
+    ResultWouldNotFit {
+        /// Bytes that the result needs.
+        need: u32,
+        /// Bytes that are free.
+        have: u32,
+    },
+    /// The message is longer than the receiver allows.
+    #[error("the message is longer than the receiver's limit of {limit} bytes: raise message_size there")]
+    TooLarge {
+        /// The receiver's limit in bytes.
+        limit: u32,
+    },
+    /// A blocking request that would wait for itself.
+    #[error("the request would wait for itself: answer first, or request without blocking")]
+    WouldDeadlock,
+    /// A constraint outside what its type or the lent storage allows.
+    #[error("the constraint's value is outside what this unit can hold")]
+    BadConstraint,
+
+    // --- peer
+    /// No node of this name, id or index is connected.
+    #[error("the node is not connected")]
+    NotConnected,
+    /// No answer within the deadline; the service may have run.
+    #[error("no answer came in time: the service may have run")]
+    TimedOut,
+    /// The link ended while the call was in flight; the service may have run.
+    #[error("the link ended during the call: the service may have run")]
+    Interrupted,
+    /// The callee found the request older than its remaining time and did not run it.
+    #[error("the request arrived too late and was not run")]
+    Expired,
+    /// The callee saw this id, or a much newer one, before and did not run it again.
+    #[error("the request was seen before and was not run again")]
+    Stale,
+    /// The callee holds as many calls of this unit as it may; it did not run it.
+    #[error("the peer is busy and did not run the request: try again later")]
+    Busy,
+    /// The callee could not read the message; it did not run it.
+    #[error("the peer could not read the request: check its version")]
+    Malformed,
+    /// The callee's rules do not let this unit call the function.
+    #[error("the peer does not allow this call")]
+    NotAllowed,
+    /// The service answered with an error.
+    #[error("{0}")]
+    Service(ServiceError),
+    /// The peer refused the link.
+    #[error("{0}")]
+    Refused(Refusal),
+
+    // --- resource
+    /// A table or queue of this unit is full.
+    #[error("full: {0:?}")]
+    Full(Limit),
+    /// The minimum interval between requests to this node has not passed.
+    #[error("too soon after the last request: wait {} us", wait.as_micros())]
+    TooSoon {
+        /// How long to wait.
+        wait: Duration,
+    },
+
+    // --- transport
+    /// The link ended.
+    #[error("{0}")]
+    Closed(CloseReason),
+    /// The network refused a datagram or a connection.
+    #[error("the network refused: is the interface up?")]
+    Network,
+    /// Another process owns the port.
+    #[error("the port is in use by a program that does not share it")]
+    PortInUse,
+    /// The unit has been stopped.
+    #[error("the unit has been stopped")]
+    NotRunning,
+}
+
+impl Error {
+    /// Who must act.
+    pub const fn cause(&self) -> Cause {
+        match self {
+            Self::UnknownFunction
+            | Self::StaleFunction
+            | Self::MissingArgument { .. }
+            | Self::WrongType { .. }
+            | Self::WrongSize { .. }
+            | Self::UnknownVariable
+            | Self::NameTaken
+            | Self::BadName
+            | Self::OutOfRange
+            | Self::ResultWouldNotFit { .. }
+            | Self::TooLarge { .. }
+            | Self::WouldDeadlock
+            | Self::BadConstraint => Cause::Configuration,
+            Self::NotConnected
+            | Self::TimedOut
+            | Self::Interrupted
+            | Self::Expired
+            | Self::Stale
+            | Self::Busy
+            | Self::Malformed
+            | Self::NotAllowed
+            | Self::Service(_)
+            | Self::Refused(_) => Cause::Peer,
+            Self::Full(_) | Self::TooSoon { .. } => Cause::Resource,
+            Self::Closed(_) | Self::Network | Self::PortInUse | Self::NotRunning => Cause::Transport,
+        }
+    }
+}
+
+impl From<ServiceError> for Error {
+    fn from(error: ServiceError) -> Self {
+        Self::Service(error)
+    }
+}
+
+impl From<Refusal> for Error {
+    fn from(refusal: Refusal) -> Self {
+        Self::Refused(refusal)
+    }
+}

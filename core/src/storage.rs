@@ -1,0 +1,65 @@
+//! Where tables and buffers live: lent by the port, sized at run time, never a type parameter of the machines.
+//!
+//! A state machine names the *kind* of storage (`S: Storage`); how long each slice is, its provider decides: statics on
+//! a board ([`Lent`]), boxed slices on Linux and in the simulator (a type of the port).
+
+use core::ops::DerefMut;
+
+/// A kind of owned slice. Two exist: [`Lent`] here and boxed slices in ports that have an allocator.
+pub trait Storage: 'static {
+    /// A slice of `T` that its holder owns for good.
+    type Slice<T: 'static>: DerefMut<Target = [T]>;
+}
+
+/// Slices lent for ever, as from a `static` on a board.
+#[derive(Debug, Clone, Copy)]
+pub enum Lent {}
+
+impl Storage for Lent {
+    type Slice<T: 'static> = &'static mut [T];
+}
+
+/// A buffer for one whole message, taken from a [`Buffers`] pool and given back to it.
+pub type Buffer<S> = <S as Storage>::Slice<u8>;
+
+/// The bounded pool of full message buffers that all links of a unit share.
+///
+/// A port that lends one pool to several threads locks inside.
+pub trait Buffers<S: Storage> {
+    /// Takes a buffer out of the pool; `None` when all are in use, which the caller counts and reports.
+    fn take(&mut self) -> Option<Buffer<S>>;
+    /// Gives a buffer back.
+    fn give(&mut self, buffer: Buffer<S>);
+}
+
+/// A pool over lent slots, for one-cell ports.
+pub struct Pool<S: Storage> {
+    slots: S::Slice<Option<Buffer<S>>>,
+}
+
+impl<S: Storage> Pool<S>
+where
+    Buffer<S>: 'static,
+{
+    /// A pool of the buffers in `slots`; an empty slot is room for nothing.
+    pub fn new(slots: S::Slice<Option<Buffer<S>>>) -> Self {
+        Self { slots }
+    }
+
+    /// How many buffers are free now.
+    pub fn free(&self) -> usize {
+        self.slots.iter().filter(|slot| slot.is_some()).count()
+    }
+}
+
+impl<S: Storage> Buffers<S> for Pool<S> {
+    fn take(&mut self) -> Option<Buffer<S>> {
+        self.slots.iter_mut().find_map(Option::take)
+    }
+
+    fn give(&mut self, buffer: Buffer<S>) {
+        if let Some(slot) = self.slots.iter_mut().find(|slot| slot.is_none()) {
+            *slot = Some(buffer);
+        }
+    }
+}
