@@ -23,4 +23,3 @@ macro_rules! warning {
         { let _ = ::core::format_args!($($arg)*); }
     }};
 }
-
