@@ -96,3 +96,40 @@ impl Constraints {
         calls_per_peer: 8,
     };
 }
+
+/// Class of a request. An emergency goes between the chunks of other messages, ignores the minimum interval and has
+/// reserved room everywhere; the other classes take turns between messages, highest first.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[repr(u8)]
+pub enum Priority {
+    /// "Stop now": at most [`EMERGENCY_BYTES`], also sent as a datagram.
+    Emergency = 0,
+    /// Before normal messages.
+    High = 1,
+    /// The default.
+    #[default]
+    Normal = 2,
+    /// After all others.
+    Low = 3,
+}
+
+impl Priority {
+    /// All classes, highest first.
+    pub const ALL: [Self; 4] = [Self::Emergency, Self::High, Self::Normal, Self::Low];
+
+    /// The byte on the wire.
+    pub const fn to_wire(self) -> u8 {
+        self as u8
+    }
+
+    /// The class of a byte on the wire.
+    pub const fn from_wire(byte: u8) -> Option<Self> {
+        match byte {
+            0 => Some(Self::Emergency),
+            1 => Some(Self::High),
+            2 => Some(Self::Normal),
+            3 => Some(Self::Low),
+            _ => None,
+        }
+    }
+}

@@ -5,6 +5,7 @@
 extern crate std;
 
 pub mod config;
+pub mod counters;
 pub mod error;
 #[macro_use]
 mod fmt;

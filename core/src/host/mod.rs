@@ -2,3 +2,5 @@
 
 pub mod mailman;
 pub mod secure;
+pub mod connections;
+pub mod frame;

@@ -1,0 +1,90 @@
+//! Counters: one for every reason to drop, refuse or defer, so that nothing is lost in silence.
+
+use core::fmt;
+use core::marker::PhantomData;
+
+/// An enum whose variants each name a counter; made by the `counters!` macro.
+pub trait Counter: Copy + 'static {
+    /// All of them, in order.
+    const ALL: &'static [Self];
+    /// Position in [`ALL`](Self::ALL).
+    fn index(self) -> usize;
+    /// The name, in words joined by `_`, as the command line and metrics show it.
+    fn name(self) -> &'static str;
+}
+
+/// A set of counters, all zero at first. `N` is the enum's `COUNT`.
+#[derive(Clone)]
+pub struct Counters<C, const N: usize> {
+    values: [u64; N],
+    kind: PhantomData<C>,
+}
+
+impl<C: Counter, const N: usize> Counters<C, N> {
+    /// All zero.
+    pub const fn new() -> Self {
+        Self { values: [0; N], kind: PhantomData }
+    }
+
+    /// Adds `count`; saturates.
+    pub fn add(&mut self, counter: C, count: u64) {
+        if let Some(value) = self.values.get_mut(counter.index()) {
+            *value = value.saturating_add(count);
+        }
+    }
+
+    /// The value of one counter.
+    pub fn value(&self, counter: C) -> u64 {
+        self.values.get(counter.index()).copied().unwrap_or(0)
+    }
+
+    /// All names and values, zeros included.
+    pub fn iter(&self) -> impl Iterator<Item = (&'static str, u64)> + '_ {
+        C::ALL.iter().map(|&counter| (counter.name(), self.value(counter)))
+    }
+
+    /// Adds the values of `other`, as when links are summed up.
+    pub fn merge(&mut self, other: &Self) {
+        for (value, more) in self.values.iter_mut().zip(&other.values) {
+            *value = value.saturating_add(*more);
+        }
+    }
+}
+
+impl<C: Counter, const N: usize> Default for Counters<C, N> {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl<C: Counter, const N: usize> fmt::Debug for Counters<C, N> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_map().entries(self.iter().filter(|(_, value)| *value > 0)).finish()
+    }
+}
+
+/// Declares an enum of counters: `counters! { /// doc  pub enum Name { /// doc  Variant, … } }`.
+macro_rules! counters {
+    ($(#[$meta:meta])* pub enum $name:ident { $($(#[$doc:meta])* $variant:ident,)+ }) => {
+        $(#[$meta])*
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+        pub enum $name { $($(#[$doc])* $variant,)+ }
+
+        impl $name {
+            /// How many counters there are.
+            pub const COUNT: usize = <Self as $crate::counters::Counter>::ALL.len();
+        }
+
+        impl $crate::counters::Counter for $name {
+            const ALL: &'static [Self] = &[$(Self::$variant,)+];
+            fn index(self) -> usize {
+                self as usize
+            }
+            fn name(self) -> &'static str {
+                match self { $(Self::$variant => stringify!($variant),)+ }
+            }
+        }
+    };
+}
+
+pub(crate) use counters;

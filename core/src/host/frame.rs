@@ -1,0 +1,297 @@
+//! Frames of a stream and the chunks in which messages travel.
+//!
+//! A frame is a `u16` length (little-endian, of what follows) and a body whose first byte is its kind. A message of any
+//! length travels as chunk frames of one priority; only an emergency, which always fits one chunk, may stand between
+//! two chunks of another message. The first chunk tells the message's length.
+
+use crate::config::{MINIMUM_CHUNK_BYTES, Priority};
+use crate::error::CloseReason;
+
+/// Bytes before a frame's body.
+pub const HEADER_BYTES: usize = 2;
+/// Kind and priority at the start of each chunk's body.
+const CHUNK_BYTES: usize = 2;
+/// Kind, priority and the message's length at the start of a first chunk's body.
+const FIRST_CHUNK_BYTES: usize = 6;
+
+const HELLO: u8 = 1;
+const REFUSE: u8 = 2;
+const CLOSE: u8 = 3;
+const PING: u8 = 4;
+const PONG: u8 = 5;
+const SESSION: u8 = 6;
+const CHUNK: u8 = 0x10;
+const FIRST: u8 = 0x01;
+const LAST: u8 = 0x02;
+
+/// What a frame's body holds.
+#[derive(Debug, PartialEq, Eq)]
+pub enum Frame<'b> {
+    /// The sender's hello, encoded.
+    Hello(&'b [u8]),
+    /// The link is refused, with a code of [`crate::error::Refusal`].
+    Refuse(u8),
+    /// The link ends, with a code of [`CloseReason`].
+    Close(u8),
+    /// To be answered with a pong at once.
+    Ping,
+    /// The answer to a ping.
+    Pong,
+    /// A session body (keep-alive, renewal), as it otherwise travels in a datagram.
+    Session(&'b [u8]),
+    /// A piece of a message.
+    Chunk(Chunk<'b>),
+}
+
+/// A piece of a message.
+#[derive(Debug, PartialEq, Eq)]
+pub struct Chunk<'b> {
+    /// The message's priority.
+    pub priority: Priority,
+    /// In a first chunk, the length of the whole message.
+    pub total: Option<u32>,
+    /// No chunk of this message follows.
+    pub last: bool,
+    /// The piece.
+    pub bytes: &'b [u8],
+}
+
+impl<'b> Frame<'b> {
+    /// Reads a frame's body. Any deviation from the format is a protocol error.
+    pub fn parse(body: &'b [u8]) -> Result<Self, CloseReason> {
+        let (&kind, rest) = body.split_first().ok_or(CloseReason::Protocol)?;
+        match kind {
+            HELLO => Ok(Self::Hello(rest)),
+            REFUSE => Ok(Self::Refuse(only_byte(rest)?)),
+            CLOSE => Ok(Self::Close(only_byte(rest)?)),
+            PING if rest.is_empty() => Ok(Self::Ping),
+            PONG if rest.is_empty() => Ok(Self::Pong),
+            SESSION => Ok(Self::Session(rest)),
+            kind if kind & !(FIRST | LAST) == CHUNK => Chunk::parse(kind, body.len(), rest).map(Self::Chunk),
+            _ => Err(CloseReason::Protocol),
+        }
+    }
+}
+
+fn only_byte(rest: &[u8]) -> Result<u8, CloseReason> {
+    match rest {
+        [byte] => Ok(*byte),
+        _ => Err(CloseReason::Protocol),
+    }
+}
+
+impl<'b> Chunk<'b> {
+    fn parse(kind: u8, body_length: usize, rest: &'b [u8]) -> Result<Self, CloseReason> {
+        let (&priority, rest) = rest.split_first().ok_or(CloseReason::Protocol)?;
+        let priority = Priority::from_wire(priority).ok_or(CloseReason::Protocol)?;
+        let (total, bytes) = if kind & FIRST == 0 {
+            (None, rest)
+        } else {
+            let (total, bytes) = rest.split_first_chunk().ok_or(CloseReason::Protocol)?;
+            (Some(u32::from_le_bytes(*total)), bytes)
+        };
+        let last = kind & LAST != 0;
+        if priority == Priority::Emergency && !(last && total.is_some()) {
+            return Err(CloseReason::Protocol);
+        }
+        // A unit that is out of buffers must know from a frame's length alone whether it may need one.
+        if !last && body_length < MINIMUM_CHUNK_BYTES {
+            return Err(CloseReason::Protocol);
+        }
+        Ok(Self { priority, total, last, bytes })
+    }
+}
+
+/// The frames that are not chunks, encoded into `out`; returns how many bytes were written, 0 where they do not fit.
+pub fn encode(frame: &Frame<'_>, overhead: usize, out: &mut [u8]) -> usize {
+    let (kind, payload): (u8, &[u8]) = match frame {
+        Frame::Hello(bytes) => (HELLO, bytes),
+        Frame::Refuse(code) => (REFUSE, core::slice::from_ref(code)),
+        Frame::Close(code) => (CLOSE, core::slice::from_ref(code)),
+        Frame::Ping => (PING, &[]),
+        Frame::Pong => (PONG, &[]),
+        Frame::Session(bytes) => (SESSION, bytes),
+        Frame::Chunk(_) => return 0,
+    };
+    let body_length = payload.len().saturating_add(1).saturating_add(overhead);
+    let Some(frame_length) = frame_length(body_length) else { return 0 };
+    let Some(out) = out.get_mut(..frame_length) else { return 0 };
+    let mut writer = Writer { out, position: 0 };
+    writer.put(&length_bytes(body_length));
+    writer.put(&[kind]);
+    writer.put(payload);
+    frame_length
+}
+
+fn frame_length(body_length: usize) -> Option<usize> {
+    u16::try_from(body_length).ok()?;
+    body_length.checked_add(HEADER_BYTES)
+}
+
+fn length_bytes(body_length: usize) -> [u8; 2] {
+    (body_length as u16).to_le_bytes()
+}
+
+/// How a sender cuts messages: the peer's chunk limit (of a frame's body) and what sealing adds.
+#[derive(Clone, Copy, Debug)]
+pub struct Cut {
+    /// Longest body of a frame.
+    pub chunk: usize,
+    /// Bytes that sealing adds to a body.
+    pub overhead: usize,
+}
+
+impl Cut {
+    fn first_payload(self) -> usize {
+        self.chunk.saturating_sub(FIRST_CHUNK_BYTES).saturating_sub(self.overhead)
+    }
+
+    fn next_payload(self) -> usize {
+        self.chunk.saturating_sub(CHUNK_BYTES).saturating_sub(self.overhead).max(1)
+    }
+
+    /// Bytes on the wire of a message of `total` bytes.
+    pub fn framed_length(self, total: usize) -> usize {
+        let first = HEADER_BYTES.saturating_add(FIRST_CHUNK_BYTES).saturating_add(self.overhead);
+        let next = HEADER_BYTES.saturating_add(CHUNK_BYTES).saturating_add(self.overhead);
+        let more = total.saturating_sub(self.first_payload()).div_ceil(self.next_payload());
+        total.saturating_add(first).saturating_add(more.saturating_mul(next))
+    }
+}
+
+/// Writes one message of known length as chunk frames, copying each byte once.
+pub struct ChunkWriter<'b> {
+    writer: Writer<'b>,
+    cut: Cut,
+    priority: Priority,
+    /// Bytes of the message that no frame header covers yet.
+    uncovered: usize,
+    /// Bytes that the frame being written still takes.
+    room: usize,
+}
+
+impl<'b> ChunkWriter<'b> {
+    /// A writer of a message of `total` bytes into `out`, which must hold [`Cut::framed_length`] of them.
+    pub fn new(out: &'b mut [u8], cut: Cut, priority: Priority, total: usize) -> Option<Self> {
+        let out = out.get_mut(..cut.framed_length(total))?;
+        let mut writer = Self { writer: Writer { out, position: 0 }, cut, priority, uncovered: total, room: 0 };
+        let payload = total.min(cut.first_payload());
+        writer.open_frame(FIRST, FIRST_CHUNK_BYTES, payload);
+        writer.writer.put(&(total as u32).to_le_bytes());
+        Some(writer)
+    }
+
+    /// Appends bytes of the message. What goes beyond the announced length is ignored.
+    pub fn put(&mut self, mut bytes: &[u8]) {
+        while !bytes.is_empty() {
+            if self.room == 0 {
+                if self.uncovered == 0 {
+                    return;
+                }
+                self.writer.skip(self.cut.overhead);
+                self.open_frame(0, CHUNK_BYTES, self.uncovered.min(self.cut.next_payload()));
+            }
+            let (now, later) = bytes.split_at_checked(self.room).unwrap_or((bytes, &[]));
+            self.writer.put(now);
+            self.room = self.room.saturating_sub(now.len());
+            bytes = later;
+        }
+    }
+
+    fn open_frame(&mut self, first: u8, head: usize, payload: usize) {
+        self.uncovered = self.uncovered.saturating_sub(payload);
+        self.room = payload;
+        let last = if self.uncovered == 0 { LAST } else { 0 };
+        let body = head.saturating_add(payload).saturating_add(self.cut.overhead);
+        self.writer.put(&length_bytes(body));
+        self.writer.put(&[CHUNK | first | last, self.priority.to_wire()]);
+    }
+}
+
+struct Writer<'b> {
+    out: &'b mut [u8],
+    position: usize,
+}
+
+impl Writer<'_> {
+    fn put(&mut self, bytes: &[u8]) {
+        let end = self.position.saturating_add(bytes.len());
+        if let Some(place) = self.out.get_mut(self.position..end) {
+            place.copy_from_slice(bytes);
+            self.position = end;
+        }
+    }
+
+    fn skip(&mut self, count: usize) {
+        self.position = self.position.saturating_add(count);
+    }
+}
+
+/// The first frame in `bytes`: its whole length, header included. `None` while the header is incomplete.
+pub fn first_frame_length(bytes: &[u8]) -> Option<usize> {
+    let header = bytes.first_chunk::<HEADER_BYTES>()?;
+    Some(usize::from(u16::from_le_bytes(*header)).saturating_add(HEADER_BYTES))
+}
+
+/// Whether the frame at the start of `bytes` (not sealed yet) ends a message, or is no chunk at all.
+pub fn ends_message(bytes: &[u8]) -> bool {
+    match bytes.get(HEADER_BYTES) {
+        Some(kind) if kind & CHUNK != 0 => kind & LAST != 0,
+        _ => true,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, clippy::indexing_slicing, clippy::arithmetic_side_effects)]
+    use super::*;
+    use proptest::prelude::*;
+    use std::vec;
+    use std::vec::Vec;
+
+    fn reassemble(mut framed: &[u8], overhead: usize) -> Vec<u8> {
+        let mut message = Vec::new();
+        let mut total = None;
+        while !framed.is_empty() {
+            let length = first_frame_length(framed).unwrap();
+            let body = &framed[HEADER_BYTES..length - overhead];
+            let Frame::Chunk(chunk) = Frame::parse(body).unwrap() else { unreachable!() };
+            total = total.or(chunk.total);
+            message.extend_from_slice(chunk.bytes);
+            framed = &framed[length..];
+            assert_eq!(chunk.last, framed.is_empty());
+        }
+        assert_eq!(total.unwrap() as usize, message.len());
+        message
+    }
+
+    proptest! {
+        #[test]
+        fn a_message_survives_any_cut(
+            message in prop::collection::vec(any::<u8>(), 0..10_000),
+            chunk in MINIMUM_CHUNK_BYTES + 16..4096usize,
+            overhead in prop::sample::select(vec![0usize, 16]),
+            piece in 1..3000usize,
+        ) {
+            let cut = Cut { chunk, overhead };
+            let mut out = vec![0; cut.framed_length(message.len())];
+            let mut writer = ChunkWriter::new(&mut out, cut, Priority::Normal, message.len()).unwrap();
+            for piece in message.chunks(piece) {
+                writer.put(piece);
+            }
+            prop_assert_eq!(reassemble(&out, overhead), message);
+        }
+
+        #[test]
+        fn parsing_never_panics(body in prop::collection::vec(any::<u8>(), 0..64)) {
+            let _ = Frame::parse(&body);
+        }
+    }
+
+    #[test]
+    fn a_writer_refuses_a_buffer_that_is_too_short() {
+        let cut = Cut { chunk: 1024, overhead: 0 };
+        let mut out = [0; 100];
+        assert!(ChunkWriter::new(&mut out, cut, Priority::Normal, 100).is_none());
+    }
+}
