@@ -1,0 +1,76 @@
+//! Child processes: started in the project's root, output streamed through or captured as text.
+
+use std::ffi::OsStr;
+use std::io::ErrorKind;
+use std::process::{Command, Stdio};
+
+use anyhow::{Context, Result, bail};
+
+use crate::workspace;
+
+/// A command about to be run in the project's root, without standard input.
+pub(crate) struct Run {
+    command: Command,
+}
+
+impl Run {
+    pub(crate) fn new(program: &str) -> Self {
+        let mut command = Command::new(program);
+        command.current_dir(workspace::root()).stdin(Stdio::null());
+        Self { command }
+    }
+
+    /// The cargo that runs this program.
+    pub(crate) fn cargo() -> Self {
+        Self::new(&std::env::var("CARGO").unwrap_or_else(|_| "cargo".into()))
+    }
+
+    pub(crate) fn args<A: AsRef<OsStr>>(mut self, arguments: impl IntoIterator<Item = A>) -> Self {
+        self.command.args(arguments);
+        self
+    }
+
+    pub(crate) fn env(mut self, name: &str, value: &str) -> Self {
+        self.command.env(name, value);
+        self
+    }
+
+    /// Streams the output through; an error unless the command succeeds.
+    pub(crate) fn stream(mut self) -> Result<()> {
+        let shown = self.shown();
+        println!("$ {shown}");
+        let status = self.command.status().with_context(|| format!("cannot start `{shown}`"))?;
+        if !status.success() {
+            bail!("`{shown}` failed: {status}");
+        }
+        Ok(())
+    }
+
+    /// Standard output as text; an error, with the standard error in it, unless the command succeeds.
+    pub(crate) fn text(self) -> Result<String> {
+        let shown = self.shown();
+        let (success, output, errors) = self.captured()?;
+        if !success {
+            bail!("`{shown}` failed: {}", errors.trim());
+        }
+        Ok(output)
+    }
+
+    /// Whether it succeeded, its standard output and its standard error.
+    pub(crate) fn captured(mut self) -> Result<(bool, String, String)> {
+        let output = self.command.output().with_context(|| format!("cannot start `{}`", self.shown()))?;
+        let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+        Ok((output.status.success(), text(&output.stdout), text(&output.stderr)))
+    }
+
+    fn shown(&self) -> String {
+        let words = std::iter::once(self.command.get_program()).chain(self.command.get_args());
+        words.map(|word| word.to_string_lossy()).collect::<Vec<_>>().join(" ")
+    }
+}
+
+/// Whether `program` can be started at all.
+pub(crate) fn exists(program: &str) -> bool {
+    let started = Command::new(program).arg("--version").stdout(Stdio::null()).stderr(Stdio::null()).status();
+    !matches!(started, Err(error) if error.kind() == ErrorKind::NotFound)
+}

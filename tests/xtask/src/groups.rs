@@ -1,0 +1,232 @@
+//! The table of the groups of checks: the one place that says what is checked, at what cost, and how.
+
+use std::path::Path;
+
+use anyhow::{Result, bail};
+
+use crate::command::Run;
+use crate::{dependencies, hygiene, install, layers, licences, links, manifests, names, panic_free, paper, workspace};
+
+/// A group of checks that is run and reported as one.
+pub(crate) struct Group {
+    pub(crate) name: &'static str,
+    pub(crate) what: &'static str,
+    /// Seconds that the group may take on a machine of two cores, with dependencies built.
+    pub(crate) budget: u64,
+    /// The same for `--quick`, or `None` where the quick run leaves the group out.
+    pub(crate) quick: Option<u64>,
+    /// Whether it runs when no group is named. A group that does not is not part of what `.ci/run` promises.
+    pub(crate) by_default: bool,
+    pub(crate) run: fn(Extent) -> Outcome,
+}
+
+/// How much of a group is run.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Extent {
+    Full,
+    Quick,
+}
+
+/// How a group ended. A skipped group has shown nothing.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) enum Outcome {
+    Passed,
+    Failed(String),
+    Skipped(String),
+}
+
+/// All groups, in the order in which they run: cheap ones first.
+pub(crate) const GROUPS: [Group; 13] = [
+    Group {
+        name: "format",
+        what: "every crate is formatted",
+        budget: 10,
+        quick: Some(10),
+        by_default: true,
+        run: |_| needing(install::rust_component("rustfmt", "rustfmt"), format),
+    },
+    Group {
+        name: "layers",
+        what: "arrows between layers and crates; file sizes; no unsafe, no machine paths",
+        budget: 5,
+        quick: Some(5),
+        by_default: true,
+        run: |_| all(&[layers::check, manifests::check, hygiene::check]),
+    },
+    Group {
+        name: "dependencies",
+        what: "each dependency has its reason; licences and sources are allowed",
+        budget: 5,
+        quick: Some(5),
+        by_default: true,
+        run: |_| all(&[dependencies::check, licences::check]),
+    },
+    Group {
+        name: "links",
+        what: "every relative link of the documents leads somewhere",
+        budget: 2,
+        quick: Some(2),
+        by_default: true,
+        run: |_| links::check().into(),
+    },
+    Group {
+        name: "paper",
+        what: "every promise of the paper has its test, and the test exists",
+        budget: 2,
+        quick: Some(2),
+        by_default: false,
+        run: |_| paper::check().into(),
+    },
+    Group {
+        name: "names",
+        what: "every name of the paper leads to its Rust name in the documentation's search",
+        budget: 2,
+        quick: Some(2),
+        by_default: false,
+        run: |_| names::check().into(),
+    },
+    Group {
+        name: "clippy",
+        what: "clippy on all crates and targets, warnings are errors",
+        budget: 120,
+        quick: Some(120),
+        by_default: true,
+        run: |_| needing(install::rust_component("clippy", "cargo-clippy"), clippy),
+    },
+    Group {
+        name: "doc",
+        what: "the documentation of all crates, warnings are errors",
+        budget: 60,
+        quick: None,
+        by_default: true,
+        run: |_| doc().into(),
+    },
+    Group {
+        name: "unit",
+        what: "cargo test of the whole workspace",
+        budget: 300,
+        quick: Some(300),
+        by_default: true,
+        run: |_| Run::cargo().args(["test", "--workspace"]).stream().into(),
+    },
+    Group {
+        name: "thumb",
+        what: "the core builds for a Cortex-M3; in full also: no panic is reachable from its entry points",
+        budget: 60,
+        quick: Some(20),
+        by_default: true,
+        run: |extent| needing(install::rust_target(panic_free::TARGET), || thumb(extent)),
+    },
+    Group {
+        name: "vectors",
+        what: "a decoder in a second language reads the golden vectors",
+        budget: 5,
+        quick: Some(5),
+        by_default: true,
+        run: |_| needing(install::program("python3", "python3"), vectors),
+    },
+    Group {
+        name: "scenarios",
+        what: "every scenario on the simulator, with faults, for 1,000 seeds (quick: 50)",
+        budget: 600,
+        quick: Some(90),
+        by_default: true,
+        run: |extent| scenarios(extent).into(),
+    },
+    Group {
+        name: "demo",
+        what: "cargo xtask demo: the listing between real processes",
+        budget: 90,
+        quick: None,
+        by_default: true,
+        run: |_| Run::cargo().args(["xtask", "demo"]).stream().into(),
+    },
+];
+
+impl From<Result<()>> for Outcome {
+    fn from(result: Result<()>) -> Self {
+        match result {
+            Ok(()) => Self::Passed,
+            Err(error) => Self::Failed(format!("{error:#}")),
+        }
+    }
+}
+
+/// Runs a check once what it needs is there; what cannot be had is a reason to skip it.
+fn needing(installed: Result<(), String>, check: impl FnOnce() -> Result<()>) -> Outcome {
+    match installed {
+        Ok(()) => check().into(),
+        Err(reason) => Outcome::Skipped(reason),
+    }
+}
+
+/// Runs every check, also behind one that fails.
+fn all(checks: &[fn() -> Result<()>]) -> Outcome {
+    let failures: Vec<String> =
+        checks.iter().filter_map(|check| check().err()).map(|error| format!("{error:#}")).collect();
+    if failures.is_empty() { Outcome::Passed } else { Outcome::Failed(failures.join("; ")) }
+}
+
+fn format() -> Result<()> {
+    Run::cargo().args(["fmt", "--all", "--check"]).stream()?;
+    for manifest in manifests::all()?.iter().filter(|manifest| manifest.is_workspace()) {
+        let file = manifest.file.to_string_lossy();
+        Run::cargo().args(["fmt", "--check", "--manifest-path", &file]).stream()?;
+    }
+    Ok(())
+}
+
+fn clippy() -> Result<()> {
+    Run::cargo().args(["clippy", "--workspace", "--all-targets", "--", "-D", "warnings"]).stream()
+}
+
+fn doc() -> Result<()> {
+    Run::cargo().args(["doc", "--workspace", "--no-deps"]).env("RUSTDOCFLAGS", "-D warnings").stream()
+}
+
+fn thumb(extent: Extent) -> Result<()> {
+    Run::cargo().args(["build", "--package", "cara-core", "--target", panic_free::TARGET]).stream()?;
+    if extent == Extent::Full { panic_free::check() } else { Ok(()) }
+}
+
+fn vectors() -> Result<()> {
+    present("tests/vectors/decode.py")?;
+    Run::new("python3").args(["tests/vectors/decode.py"]).stream()
+}
+
+fn scenarios(extent: Extent) -> Result<()> {
+    present("tests/scenarios/Cargo.toml")?;
+    let seeds = if extent == Extent::Full { "1000" } else { "50" };
+    let run = ["run", "--release", "--package", "cara-scenarios", "--bin", "seeds", "--", "--seeds", seeds];
+    Run::cargo().args(run).stream()
+}
+
+fn present(file: &str) -> Result<()> {
+    if !workspace::root().join(Path::new(file)).is_file() {
+        bail!("{file} is absent");
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{GROUPS, Outcome, all, needing};
+    use std::collections::HashSet;
+
+    #[test]
+    fn names_are_unique() {
+        let names: HashSet<&str> = GROUPS.iter().map(|group| group.name).collect();
+        assert_eq!(names.len(), GROUPS.len());
+    }
+
+    #[test]
+    fn what_cannot_be_had_is_skipped_not_passed() {
+        assert_eq!(needing(Err("no rustup".into()), || Ok(())), Outcome::Skipped("no rustup".into()));
+    }
+
+    #[test]
+    fn one_failure_of_several_fails() {
+        let outcome = all(&[|| Ok(()), || anyhow::bail!("broken"), || Ok(())]);
+        assert_eq!(outcome, Outcome::Failed("broken".into()));
+    }
+}

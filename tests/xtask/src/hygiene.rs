@@ -1,0 +1,95 @@
+//! What holds for every file: no source file too long to read, no path of one machine, no unsafe in the Linux port.
+
+use std::path::Path;
+
+use anyhow::{Result, bail};
+
+use crate::{source, workspace};
+
+/// Lines that a source file may have, its tests included.
+const LONGEST: usize = 800;
+
+/// Folders of one machine; put together here so that this file does not name them.
+const MACHINE_PATHS: [&str; 2] = [concat!("/", "work/"), concat!("/", "tmp/")];
+
+/// Reads all files of the project and fails with every offence.
+pub(crate) fn check() -> Result<()> {
+    let mut wrong = Vec::new();
+    let files = workspace::files()?;
+    for file in &files {
+        // Golden vectors and the like need not be text.
+        if let Ok(text) = workspace::read(file) {
+            wrong.extend(offences(file, &text));
+        }
+    }
+    if wrong.is_empty() {
+        println!("{} files, none too long, none with a path of one machine", files.len());
+        return Ok(());
+    }
+    wrong.iter().for_each(|line| eprintln!("{line}"));
+    bail!("{} offences", wrong.len())
+}
+
+fn offences(file: &Path, text: &str) -> Vec<String> {
+    let name = file.display();
+    let mut found = Vec::new();
+    for (number, line) in text.lines().enumerate() {
+        if let Some(path) = machine_path(line) {
+            found.push(format!("{name}:{}: names {path}, a folder of one machine", number + 1));
+        }
+    }
+    if file.extension().is_none_or(|extension| extension != "rs") {
+        return found;
+    }
+    let lines = text.lines().count();
+    if lines > LONGEST {
+        found.push(format!("{name}: {lines} lines, {LONGEST} are allowed: it answers more than one question"));
+    }
+    if file.starts_with("std-port") {
+        let tokens = source::tokens(text);
+        found.extend(
+            tokens.iter().filter(|token| token.text == "unsafe").map(|token| format!("{name}:{}: unsafe", token.line)),
+        );
+    }
+    found
+}
+
+/// A machine's folder at the start of a path, not in the middle of one.
+fn machine_path(line: &str) -> Option<&'static str> {
+    let at_start = |path: &str| {
+        line.match_indices(path).any(|(at, _)| {
+            let before = line[..at].chars().next_back();
+            before.is_none_or(|c| !c.is_alphanumeric() && !"._-/}*".contains(c))
+        })
+    };
+    MACHINE_PATHS.into_iter().find(|path| at_start(path))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{LONGEST, MACHINE_PATHS, offences};
+    use std::path::Path;
+
+    #[test]
+    fn a_long_file_is_told() {
+        let file = Path::new("core/src/time.rs");
+        assert!(offences(file, &"\n".repeat(LONGEST)).is_empty());
+        assert_eq!(offences(file, &"\n".repeat(LONGEST + 1)).len(), 1);
+        assert!(offences(Path::new("Cargo.lock"), &"\n".repeat(LONGEST + 1)).is_empty());
+    }
+
+    #[test]
+    fn a_path_of_a_machine_is_told() {
+        let [work, temporary] = MACHINE_PATHS;
+        let told = |text: String| offences(Path::new("README.md"), &text).len();
+        assert_eq!(told(format!("see `{work}main`")), 1);
+        assert_eq!(told(format!("(\"{temporary}x\")\n")), 1);
+        assert_eq!(told(format!("target{temporary}x and https://example.org{work}")), 0);
+    }
+
+    #[test]
+    fn unsafe_in_the_linux_port_is_told() {
+        assert_eq!(offences(Path::new("std-port/src/lib.rs"), "// unsafe\nunsafe {}").len(), 1);
+        assert!(offences(Path::new("embassy-port/src/lib.rs"), "unsafe {}").is_empty());
+    }
+}

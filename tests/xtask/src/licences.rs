@@ -1,0 +1,105 @@
+//! Licences and sources of everything in the lock file: what may be linked, and from the registry only.
+
+use anyhow::{Result, bail};
+use serde_json::Value;
+
+use crate::command::Run;
+
+/// Licences that MIT OR Apache-2.0 software may be linked with.
+const ALLOWED: [&str; 11] = [
+    "0BSD",
+    "Apache-2.0",
+    "Apache-2.0 WITH LLVM-exception",
+    "BSD-2-Clause",
+    "BSD-3-Clause",
+    "BSL-1.0",
+    "CC0-1.0",
+    "ISC",
+    "MIT",
+    "Unicode-3.0",
+    "Zlib",
+];
+
+const REGISTRY: &str = "registry+https://github.com/rust-lang/crates.io-index";
+
+/// Asks cargo for all packages and fails with those that may not be used.
+pub(crate) fn check() -> Result<()> {
+    let text = Run::cargo().args(["metadata", "--format-version", "1", "--locked"]).text()?;
+    let metadata: Value = serde_json::from_str(&text)?;
+    let packages = metadata.get("packages").and_then(Value::as_array).map_or(&[][..], Vec::as_slice);
+    let wrong: Vec<String> = packages.iter().filter_map(objection).collect();
+    if packages.is_empty() {
+        bail!("cargo metadata names no packages");
+    }
+    if wrong.is_empty() {
+        println!("{} packages, all licences and sources allowed", packages.len());
+        return Ok(());
+    }
+    wrong.iter().for_each(|line| eprintln!("{line}"));
+    bail!("{} packages may not be used", wrong.len())
+}
+
+fn objection(package: &Value) -> Option<String> {
+    let text = |key: &str| package.get(key).and_then(Value::as_str);
+    let name = format!("{} {}", text("name").unwrap_or("?"), text("version").unwrap_or("?"));
+    if let Some(source) = text("source").filter(|source| *source != REGISTRY) {
+        return Some(format!("{name}: comes from {source}, not from the registry"));
+    }
+    match text("license") {
+        None => Some(format!("{name}: names no licence")),
+        Some(licence) if !is_allowed(licence) => Some(format!("{name}: licence {licence}")),
+        Some(_) => None,
+    }
+}
+
+/// Reads an SPDX expression as alternatives of conjunctions, brackets included.
+fn is_allowed(expression: &str) -> bool {
+    let expression = expression.replace('/', " OR ");
+    split(&expression, " OR ").iter().any(|alternative| {
+        split(alternative, " AND ").iter().all(|part| {
+            let part = part.trim();
+            match part.strip_prefix('(').and_then(|part| part.strip_suffix(')')) {
+                Some(inner) => is_allowed(inner),
+                None => ALLOWED.contains(&part),
+            }
+        })
+    })
+}
+
+/// Splits at `separator` where no bracket is open.
+fn split<'t>(text: &'t str, separator: &str) -> Vec<&'t str> {
+    let (mut parts, mut depth, mut start) = (Vec::new(), 0_i32, 0);
+    for (at, c) in text.char_indices() {
+        depth += i32::from(c == '(') - i32::from(c == ')');
+        if depth == 0 && at >= start && text[at..].starts_with(separator) {
+            parts.push(&text[start..at]);
+            start = at + separator.len();
+        }
+    }
+    parts.push(&text[start..]);
+    parts
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{is_allowed, objection};
+    use serde_json::json;
+
+    #[test]
+    fn expressions_are_read() {
+        assert!(is_allowed("MIT OR Apache-2.0"));
+        assert!(is_allowed("MIT/Apache-2.0"));
+        assert!(is_allowed("(MIT OR GPL-3.0) AND Unicode-3.0"));
+        assert!(is_allowed("GPL-3.0 OR MIT"));
+        assert!(!is_allowed("MIT AND GPL-3.0"));
+        assert!(!is_allowed("(MIT AND GPL-3.0)"));
+        assert!(!is_allowed(""));
+    }
+
+    #[test]
+    fn git_sources_are_refused() {
+        assert!(objection(&json!({"name": "a", "license": "MIT", "source": "git+https://example.org/a"})).is_some());
+        assert!(objection(&json!({"name": "a", "license": "MIT", "source": null})).is_none());
+        assert!(objection(&json!({"name": "a", "source": null})).is_some());
+    }
+}

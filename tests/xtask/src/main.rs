@@ -1,0 +1,88 @@
+//! `cargo xtask`: the project's own commands. Checks and demonstrations live here; nothing that ships does.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+mod command;
+mod demo;
+mod dependencies;
+mod groups;
+mod hygiene;
+mod install;
+mod later;
+mod layers;
+mod licences;
+mod links;
+mod manifests;
+mod names;
+mod panic_free;
+mod paper;
+mod runner;
+mod source;
+mod workspace;
+
+#[derive(Parser)]
+#[command(name = "cargo xtask", about = "Demonstrates, checks and measures CARA", max_term_width = 120)]
+struct Arguments {
+    #[command(subcommand)]
+    task: Task,
+}
+
+#[derive(Subcommand)]
+enum Task {
+    /// Runs a manager and three AGVs as processes, shows the paper's listing line by line, then breaks things.
+    Demo,
+    /// Runs the groups of checks; without names, those of the default run.
+    Test {
+        /// Groups to run; `--list` shows them.
+        #[arg(value_name = "GROUP")]
+        groups: Vec<String>,
+        /// Leaves out the slow groups and shortens the others.
+        #[arg(long)]
+        quick: bool,
+        /// Shows the groups, what each checks and its budget, and runs none.
+        #[arg(long)]
+        list: bool,
+    },
+    /// Prints the sizes of the firmware images and the memory that each capacity costs.
+    Sizes {
+        /// Also writes the figures here.
+        #[arg(long, value_name = "FILE")]
+        json: Option<PathBuf>,
+    },
+    /// Runs the paper's experiments and the round trip against a raw socket.
+    Bench {
+        /// Fewer requests per configuration.
+        #[arg(long)]
+        quick: bool,
+        /// Also writes the figures here.
+        #[arg(long, value_name = "FILE")]
+        json: Option<PathBuf>,
+    },
+    /// Builds the firmware of a board, or of all boards.
+    Firmware {
+        /// Which board.
+        #[arg(value_name = "BOARD")]
+        board: Option<String>,
+        /// Also runs the image in QEMU.
+        #[arg(long)]
+        run: bool,
+    },
+}
+
+fn main() -> ExitCode {
+    let finished = match Arguments::parse().task {
+        Task::Demo => demo::run(),
+        Task::Test { list: true, .. } => runner::list(),
+        Task::Test { groups, quick, list: false } => runner::run(&groups, quick),
+        Task::Sizes { .. } => Ok(later::SIZES.refuse()),
+        Task::Bench { .. } => Ok(later::BENCH.refuse()),
+        Task::Firmware { .. } => Ok(later::FIRMWARE.refuse()),
+    };
+    finished.unwrap_or_else(|error| {
+        eprintln!("xtask: {error:#}");
+        ExitCode::FAILURE
+    })
+}
