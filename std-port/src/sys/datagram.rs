@@ -1,0 +1,186 @@
+//! UDP: the discovery socket that all units of a host share, the unit's own socket, and broadcasts on every interface.
+//!
+//! Everything is sent from the own socket and answered to it. The shared socket only hears broadcasts; of unicast
+//! datagrams to its port the kernel gives each to one unit alone.
+
+use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use cara_core::error::Error;
+use rustix::io::Errno;
+use rustix::net::{
+    AddressFamily, RecvFlags, SendFlags, SocketFlags, SocketType, bind, recvfrom, sendto, socket_with, sockopt,
+};
+
+use super::interfaces::{Interface, Interfaces, interfaces};
+use super::stream::local_port;
+
+/// How long a list of interfaces is used before the system is asked again: a cable that is plugged in is found by the
+/// next search after that.
+const REFRESH: Duration = Duration::from_secs(3);
+
+/// Bytes of datagrams that may wait to be read, where the system allows it: a thousand nodes that answer at once.
+const RECEIVE_BUFFER: usize = 1024 * 1024;
+
+/// A unit's two sockets for datagrams.
+#[derive(Debug)]
+pub struct Datagrams {
+    shared: OwnedFd,
+    own: OwnedFd,
+    own_port: u16,
+    discovery_port: u16,
+    interfaces: Interfaces,
+    targets: Mutex<Targets>,
+}
+
+/// The interfaces as they were a short while ago.
+#[derive(Debug)]
+struct Targets {
+    list: Arc<[Interface]>,
+    asked: Instant,
+}
+
+/// Which of the two sockets.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Socket {
+    /// The one that hears broadcasts to the discovery port.
+    Shared,
+    /// The one that sends, and hears what is sent to this unit alone.
+    Own,
+}
+
+impl Datagrams {
+    /// Opens both sockets on `interfaces`; other units of the host may share `discovery_port`.
+    ///
+    /// [`Error::PortInUse`] when a program that does not share it has that port, [`Error::Network`] otherwise.
+    pub fn open(interfaces: Interfaces, discovery_port: u16) -> Result<Self, Error> {
+        // Bound to all addresses even for loopback alone, where `receive` drops what comes from elsewhere: a socket
+        // bound to one address hears no broadcasts.
+        let shared = open_socket(Ipv4Addr::UNSPECIFIED, discovery_port, true).map_err(|errno| match errno {
+            Errno::ADDRINUSE => Error::PortInUse,
+            errno => network(errno),
+        })?;
+        let own = open_socket(interfaces.bind_address(), 0, false).map_err(network)?;
+        sockopt::set_socket_broadcast(&own, true).map_err(network)?;
+        let own_port = local_port(&own).map_err(|_| Error::Network)?;
+        let discovery_port = local_port(&shared).map_err(|_| Error::Network)?;
+        let targets = Targets { list: look(interfaces).into(), asked: Instant::now() };
+        Ok(Self { shared, own, own_port, discovery_port, interfaces, targets: Mutex::new(targets) })
+    }
+
+    /// The port of the own socket, from which everything is sent.
+    pub const fn own_port(&self) -> u16 {
+        self.own_port
+    }
+
+    /// The port that broadcasts go to.
+    pub const fn discovery_port(&self) -> u16 {
+        self.discovery_port
+    }
+
+    /// The descriptor to watch for one of the sockets.
+    pub fn fd(&self, socket: Socket) -> BorrowedFd<'_> {
+        match socket {
+            Socket::Shared => self.shared.as_fd(),
+            Socket::Own => self.own.as_fd(),
+        }
+    }
+
+    /// The next datagram of `socket` and its source, without waiting; `None` when there is none.
+    ///
+    /// A datagram longer than `buffer` is cut to its length: lend one byte more than the longest that counts. Own
+    /// broadcasts, and what comes from an interface that is not used, are dropped here.
+    pub fn receive(&self, socket: Socket, buffer: &mut [u8]) -> Option<(usize, SocketAddr)> {
+        loop {
+            let (count, source) = match recvfrom(self.fd(socket), &mut *buffer, RecvFlags::DONTWAIT) {
+                Ok((count, _, source)) => (count, source),
+                Err(Errno::AGAIN) => return None,
+                // An earlier datagram found no reader at its target, or a signal came; the next one is unharmed.
+                Err(Errno::INTR | Errno::CONNREFUSED | Errno::HOSTUNREACH | Errno::NETUNREACH) => continue,
+                Err(errno) => {
+                    tracing::debug!(%errno, "a datagram could not be read");
+                    return None;
+                }
+            };
+            let Some(Ok(SocketAddr::V4(source))) = source.map(SocketAddr::try_from) else { continue };
+            if self.interfaces.accept(*source.ip()) && !self.is_own(source) {
+                return Some((count, source.into()));
+            }
+        }
+    }
+
+    /// Sends one datagram to one address. `false` when the network refused it or has no room.
+    pub fn send_to(&self, to: SocketAddr, datagram: &[u8]) -> bool {
+        match send_datagram(&self.own, to, datagram) {
+            Ok(()) => true,
+            Err(errno) => {
+                tracing::debug!(%errno, %to, "a datagram could not be sent");
+                false
+            }
+        }
+    }
+
+    /// Sends one datagram to the discovery port of all nodes on each interface. `false` when no interface took it.
+    pub fn broadcast(&self, datagram: &[u8]) -> bool {
+        let mut sent = false;
+        for target in self.targets().iter().filter(|interface| interface.up).filter_map(|interface| interface.broadcast)
+        {
+            sent |= self.send_to(SocketAddrV4::new(target, self.discovery_port).into(), datagram);
+        }
+        sent
+    }
+
+    /// The interfaces that are used, with those that are down.
+    pub fn targets(&self) -> Arc<[Interface]> {
+        let mut targets = self.targets.lock().unwrap_or_else(PoisonError::into_inner);
+        if targets.asked.elapsed() >= REFRESH {
+            *targets = Targets { list: look(self.interfaces).into(), asked: Instant::now() };
+        }
+        targets.list.clone()
+    }
+
+    fn is_own(&self, source: SocketAddrV4) -> bool {
+        if source.port() != self.own_port {
+            return false;
+        }
+        source.ip().is_loopback() || self.targets().iter().any(|interface| interface.address == *source.ip())
+    }
+}
+
+fn look(wanted: Interfaces) -> Vec<Interface> {
+    match interfaces() {
+        Ok(all) => all.into_iter().filter(|interface| wanted.accept(interface.address)).collect(),
+        Err(error) => {
+            tracing::warn!(%error, "the interfaces could not be listed");
+            Vec::new()
+        }
+    }
+}
+
+fn open_socket(address: Ipv4Addr, port: u16, shared: bool) -> rustix::io::Result<OwnedFd> {
+    let socket = socket_with(AddressFamily::INET, SocketType::DGRAM, SocketFlags::CLOEXEC, None)?;
+    sockopt::set_socket_reuseaddr(&socket, shared)?;
+    sockopt::set_socket_recv_buffer_size(&socket, RECEIVE_BUFFER)?;
+    bind(&socket, &SocketAddrV4::new(address, port))?;
+    Ok(socket)
+}
+
+fn send_datagram(socket: &OwnedFd, to: SocketAddr, datagram: &[u8]) -> rustix::io::Result<()> {
+    let flags = SendFlags::DONTWAIT | SendFlags::NOSIGNAL;
+    // A refusal that an earlier datagram met is reported by the next send, which itself was not tried.
+    for _ in 0..3 {
+        match sendto(socket, datagram, flags, &to) {
+            Ok(_) => return Ok(()),
+            Err(Errno::INTR | Errno::CONNREFUSED) => {}
+            Err(errno) => return Err(errno),
+        }
+    }
+    Err(Errno::CONNREFUSED)
+}
+
+fn network(errno: Errno) -> Error {
+    tracing::warn!(%errno, "a socket for datagrams could not be opened");
+    Error::Network
+}

@@ -1,0 +1,20 @@
+//! The few system calls of the port, each behind a safe type: readiness, TCP streams, UDP datagrams, interfaces.
+//!
+//! Nothing here knows the protocol, starts a thread or holds a lock across a call that may block.
+
+pub mod datagram;
+pub mod epoll;
+pub mod interfaces;
+pub mod stream;
+
+use cara_core::time::Duration;
+use rustix::time::Timespec;
+
+/// A span as the kernel takes it; [`Duration::MAX`] and the like become the longest span that it can hold.
+fn timespec(span: Duration) -> Timespec {
+    let micros = span.as_micros();
+    Timespec {
+        tv_sec: i64::try_from(micros / 1_000_000).unwrap_or(i64::MAX),
+        tv_nsec: i64::try_from((micros % 1_000_000).saturating_mul(1_000)).unwrap_or(0),
+    }
+}

@@ -1,0 +1,270 @@
+//! TCP links: dial, accept, send without blocking, receive with or without.
+//!
+//! A connected socket is in blocking mode with a receive time-out of [`SLICE`], so that a caller who leads its link
+//! waits for the reply with one system call. Everything else asks not to wait, per call.
+
+use std::io::{self, IoSlice};
+use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+
+use cara_core::error::CloseReason;
+use cara_core::time::Duration;
+use rustix::io::{Errno, ioctl_fionbio};
+use rustix::net::{
+    AddressFamily, RecvFlags, SendAncillaryBuffer, SendFlags, Shutdown, SocketFlags, SocketType, accept_with, bind,
+    connect, getpeername, getsockname, listen, recv, send, sendmsg, shutdown, socket_with, sockopt,
+};
+
+use super::epoll::wait_readable;
+
+/// The longest that one blocking receive lasts; a waiting caller looks at its deadline and timers this often.
+pub const SLICE: Duration = Duration::from_millis(50);
+
+/// Bytes that may wait unsent in the kernel before it calls the socket full: an emergency has no more in front of it
+/// than this and one message.
+pub const UNSENT_BYTES: u32 = 16 * 1024;
+
+/// Connections that the kernel completes ahead of `accept`: a fleet that dials a restarted manager at once.
+const BACKLOG: i32 = 1024;
+
+/// Slices that one send passes on; more are sent by the next call.
+const SLICES: usize = 8;
+
+/// How long [`Stream::receive`] may wait.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Wait {
+    /// Not at all.
+    Not,
+    /// Up to [`SLICE`], in one system call.
+    Slice,
+    /// Up to [`SLICE`] or this span, whichever is shorter, to some 50 µs; a span below [`SLICE`] costs a second
+    /// system call.
+    AtMost(Duration),
+}
+
+/// What [`Stream::receive`] brought.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Received {
+    /// This many bytes, at least one, at the front of the buffer.
+    Bytes(usize),
+    /// Nothing came in the time given, or a signal ended the wait.
+    WouldBlock,
+    /// The peer closed the stream, or the network reset it. Nothing will come any more.
+    Closed,
+}
+
+/// A TCP connection, or one that is being dialled. Any thread may use it at any time.
+#[derive(Debug)]
+pub struct Stream {
+    socket: OwnedFd,
+}
+
+impl Stream {
+    /// Starts to connect to `to` and returns at once; the stream is writable when the attempt has ended, and
+    /// [`finish_connect`](Self::finish_connect) tells how. Sending or receiving before that finds it closed or blocked.
+    pub fn connect(to: SocketAddr) -> Result<Self, CloseReason> {
+        let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
+        let socket = socket_with(AddressFamily::of(to), SocketType::STREAM, flags, None).map_err(dial_failed)?;
+        set_options(&socket).map_err(dial_failed)?;
+        match connect(&socket, &to) {
+            Ok(()) | Err(Errno::INPROGRESS | Errno::INTR) => Ok(Self { socket }),
+            Err(errno) => Err(dial_failed(errno)),
+        }
+    }
+
+    /// How the attempt to connect has ended: `Ok(true)` connected and ready to use, `Ok(false)` not ended yet.
+    pub fn finish_connect(&self) -> Result<bool, CloseReason> {
+        sockopt::socket_error(&self.socket).and_then(|outcome| outcome).map_err(dial_failed)?;
+        let peer = match getpeername(&self.socket) {
+            Ok(peer) => peer,
+            Err(Errno::NOTCONN) => return Ok(false),
+            Err(errno) => return Err(dial_failed(errno)),
+        };
+        // Dialling an unused port of one's own range can connect a socket to itself.
+        if peer == getsockname(&self.socket).ok() {
+            return Err(CloseReason::DialFailed);
+        }
+        ioctl_fionbio(&self.socket, false).map_err(dial_failed)?;
+        Ok(true)
+    }
+
+    /// The peer's address; `None` when the stream is not connected.
+    pub fn peer_address(&self) -> Option<SocketAddr> {
+        getpeername(&self.socket).ok().flatten()?.try_into().ok()
+    }
+
+    /// The address of this end; `None` when the stream is not connected.
+    pub fn local_address(&self) -> Option<SocketAddr> {
+        getsockname(&self.socket).ok()?.try_into().ok()
+    }
+
+    /// Sends what the kernel takes of `slices`, in order, without waiting; 0 when it has no room.
+    ///
+    /// One system call; from the ninth slice on, the next call sends the rest. No bytes to send are 0 as well.
+    pub fn send(&self, slices: &[&[u8]]) -> Result<usize, CloseReason> {
+        let flags = SendFlags::DONTWAIT | SendFlags::NOSIGNAL;
+        loop {
+            let sent = match slices {
+                [] => return Ok(0),
+                [only] => send(&self.socket, only, flags),
+                _ => self.send_several(slices, flags),
+            };
+            return match sent {
+                Ok(sent) => Ok(sent),
+                Err(Errno::INTR) => continue,
+                // Lack of memory passes, too; the link's timers end one on which it does not.
+                Err(Errno::AGAIN | Errno::NOBUFS | Errno::NOMEM) => Ok(0),
+                Err(_) => Err(CloseReason::Reset),
+            };
+        }
+    }
+
+    fn send_several(&self, slices: &[&[u8]], flags: SendFlags) -> rustix::io::Result<usize> {
+        let mut vectors = [IoSlice::new(&[]); SLICES];
+        let mut used = 0;
+        for (vector, slice) in vectors.iter_mut().zip(slices) {
+            *vector = IoSlice::new(slice);
+            used += 1;
+        }
+        let vectors = vectors.get(..used).unwrap_or_default();
+        sendmsg(&self.socket, vectors, &mut SendAncillaryBuffer::default(), flags)
+    }
+
+    /// Receives into `buffer`, which must not be empty.
+    pub fn receive(&self, buffer: &mut [u8], wait: Wait) -> Received {
+        let flags = match wait {
+            Wait::Not => RecvFlags::DONTWAIT,
+            Wait::Slice => RecvFlags::empty(),
+            Wait::AtMost(span) if span >= SLICE => RecvFlags::empty(),
+            // A failed wait is told by the receive that follows.
+            Wait::AtMost(span) => match wait_readable(self.socket.as_fd(), span) {
+                Ok(false) => return Received::WouldBlock,
+                Ok(true) | Err(_) => RecvFlags::DONTWAIT,
+            },
+        };
+        match recv(&self.socket, buffer, flags) {
+            Ok((0, _)) => Received::Closed,
+            Ok((count, _)) => Received::Bytes(count),
+            Err(Errno::AGAIN | Errno::INTR | Errno::NOBUFS | Errno::NOMEM) => Received::WouldBlock,
+            Err(_) => Received::Closed,
+        }
+    }
+
+    /// Ends both directions: what was sent still goes out, a thread that waits in a receive returns, and both ends
+    /// find the stream closed.
+    pub fn shutdown(&self) {
+        // A stream that is not connected (any more) is closed already.
+        let _ = shutdown(&self.socket, Shutdown::Both);
+    }
+
+    /// A connected socket with the port's options, in blocking mode.
+    fn accepted(socket: OwnedFd) -> rustix::io::Result<Self> {
+        set_options(&socket)?;
+        Ok(Self { socket })
+    }
+}
+
+impl AsFd for Stream {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.socket.as_fd()
+    }
+}
+
+fn set_options(socket: &OwnedFd) -> rustix::io::Result<()> {
+    sockopt::set_tcp_nodelay(socket, true)?;
+    sockopt::set_socket_timeout(socket, sockopt::Timeout::Recv, Some(SLICE.into()))?;
+    let unsent = socket2::SockRef::from(socket).set_tcp_notsent_lowat(UNSENT_BYTES);
+    unsent.map_err(|error| Errno::from_io_error(&error).unwrap_or(Errno::INVAL))
+}
+
+fn dial_failed(errno: Errno) -> CloseReason {
+    tracing::debug!(%errno, "a connection could not be opened");
+    CloseReason::DialFailed
+}
+
+/// What [`Listener::accept`] brought.
+#[derive(Debug)]
+pub enum Accepted {
+    /// A new connection and the address of its other end.
+    Stream(Stream, SocketAddr),
+    /// Nobody is waiting.
+    WouldBlock,
+    /// The process or the system is out of descriptors or memory. The connection still waits: watch the listener
+    /// again after a pause, since it stays readable.
+    Exhausted,
+}
+
+/// Takes connections from other units.
+#[derive(Debug)]
+pub struct Listener {
+    socket: OwnedFd,
+    port: u16,
+}
+
+impl Listener {
+    /// Listens on `port` of `address`; port 0 lets the kernel choose.
+    pub fn open(address: Ipv4Addr, port: u16) -> io::Result<Self> {
+        let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
+        let socket = socket_with(AddressFamily::INET, SocketType::STREAM, flags, None)?;
+        // Connections of an earlier process that linger must not keep a restarted one from its port.
+        sockopt::set_socket_reuseaddr(&socket, true)?;
+        bind(&socket, &SocketAddrV4::new(address, port))?;
+        listen(&socket, BACKLOG)?;
+        let port = local_port(&socket)?;
+        Ok(Self { socket, port })
+    }
+
+    /// The port that it listens on.
+    pub const fn port(&self) -> u16 {
+        self.port
+    }
+
+    /// Takes the next waiting connection, never waits for one.
+    pub fn accept(&self) -> Accepted {
+        loop {
+            match accept_with(&self.socket, SocketFlags::CLOEXEC) {
+                Ok(socket) => {
+                    // One that is gone by now is nobody's.
+                    let Ok(stream) = Stream::accepted(socket) else { continue };
+                    let Some(peer) = stream.peer_address() else { continue };
+                    return Accepted::Stream(stream, peer);
+                }
+                Err(Errno::AGAIN) => return Accepted::WouldBlock,
+                Err(errno @ (Errno::MFILE | Errno::NFILE | Errno::NOBUFS | Errno::NOMEM)) => {
+                    tracing::warn!(%errno, "a connection cannot be taken: raise the limit of open files");
+                    return Accepted::Exhausted;
+                }
+                // The socket itself is of no use any more; nothing will come from it.
+                Err(Errno::BADF | Errno::INVAL | Errno::NOTSOCK | Errno::OPNOTSUPP) => return Accepted::WouldBlock,
+                // The rest are errors of the connection that was being taken.
+                Err(_) => {}
+            }
+        }
+    }
+}
+
+impl AsFd for Listener {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.socket.as_fd()
+    }
+}
+
+/// The port that a bound socket has.
+pub(super) fn local_port(socket: &OwnedFd) -> io::Result<u16> {
+    let address = SocketAddr::try_from(getsockname(socket)?)?;
+    Ok(address.port())
+}
+
+/// The address family of a socket address.
+trait Of {
+    fn of(address: SocketAddr) -> Self;
+}
+
+impl Of for AddressFamily {
+    fn of(address: SocketAddr) -> Self {
+        match address {
+            SocketAddr::V4(_) => Self::INET,
+            SocketAddr::V6(_) => Self::INET6,
+        }
+    }
+}
