@@ -19,6 +19,16 @@ impl Storage for Lent {
     type Slice<T: 'static> = &'static mut [T];
 }
 
+/// Boxed slices, for the core's own tests.
+#[cfg(test)]
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum Boxed {}
+
+#[cfg(test)]
+impl Storage for Boxed {
+    type Slice<T: 'static> = std::boxed::Box<[T]>;
+}
+
 /// A buffer for one whole message, taken from a [`Buffers`] pool and given back to it.
 pub type Buffer<S> = <S as Storage>::Slice<u8>;
 

@@ -1,0 +1,301 @@
+//! The encoding of a block of parameters: the values in the signature's order, without names, read in place.
+//!
+//! Every value starts at a multiple of 8 bytes from the block's start. Integers are 8 bytes each, little-endian;
+//! floats the same with their bits; truth values one byte each, 0 or 1, padded with zeros to 8; strings and bytes have
+//! their length as u32, four bytes of zero, then the bytes, padded with zeros to 8. There is one encoding of each
+//! list of values; anything else is malformed.
+
+use super::function::VariableSpec;
+use super::parameters::{ParametersView, Type, Value, bytes_of_variable};
+use super::value::{copy, saturate};
+use crate::config::VARIABLES;
+use crate::error::{Error, Limit};
+
+/// Where a block is written to. It has room: the length is checked before.
+pub trait Put {
+    /// Appends `bytes`.
+    fn put(&mut self, bytes: &[u8]);
+}
+
+/// Writes to a slice; drops what does not fit.
+pub struct SliceWriter<'a> {
+    slice: &'a mut [u8],
+    written: usize,
+}
+
+impl<'a> SliceWriter<'a> {
+    /// Writes from the start of `slice`.
+    pub const fn new(slice: &'a mut [u8]) -> Self {
+        Self { slice, written: 0 }
+    }
+
+    /// Bytes written so far.
+    pub const fn written(&self) -> usize {
+        self.written
+    }
+}
+
+impl Put for SliceWriter<'_> {
+    fn put(&mut self, bytes: &[u8]) {
+        let end = self.written.saturating_add(bytes.len());
+        if let Some(place) = self.slice.get_mut(self.written..end) {
+            copy(bytes, place);
+            self.written = end;
+        }
+    }
+}
+
+const ZEROS: [u8; 8] = [0; 8];
+
+/// Checks `parameters` against `specs` and returns the length of their block in bytes.
+///
+/// More variables than needed are allowed, and a string or bytes shorter than declared. The errors are
+/// [`Error::MissingArgument`], [`Error::WrongType`] and [`Error::WrongSize`], with the position among the specs.
+///
+/// ```
+/// use cara_core::distribution::{block, function::Definition, parameters::Parameters};
+///
+/// let go_to = Definition::parse("go_to(position: int[2])").unwrap();
+/// let mut pos = Parameters::new();
+/// pos.add_int("position", 2)?;
+/// let arguments = go_to.signature().arguments();
+/// assert_eq!(block::measure(arguments, &pos), Ok(16));
+///
+/// let mut bytes = [0; 16];
+/// block::write(arguments, &pos, &mut block::SliceWriter::new(&mut bytes));
+/// assert_eq!(block::check(arguments, &bytes), Ok(()));
+/// # Ok::<(), cara_core::error::Error>(())
+/// ```
+pub fn measure<'s>(specs: impl Iterator<Item = VariableSpec<'s>>, parameters: &ParametersView) -> Result<usize, Error> {
+    let mut length = 0_usize;
+    for (position, spec) in specs.enumerate() {
+        let index = position as u8;
+        let value = parameters.value(spec.name).map_err(|_| Error::MissingArgument { index })?;
+        if value.kind() != spec.kind {
+            return Err(Error::WrongType { index });
+        }
+        let found = if spec.kind.is_fixed() { value.size() } else { saturate(value.raw().len()) };
+        if found > spec.size || (spec.kind.is_fixed() && found != spec.size) {
+            return Err(Error::WrongSize { index, expected: spec.size, found });
+        }
+        length = length.saturating_add(encoded_length(value));
+    }
+    Ok(length)
+}
+
+/// Writes the block of `parameters`, which [`measure`] accepted.
+pub fn write<'s>(specs: impl Iterator<Item = VariableSpec<'s>>, parameters: &ParametersView, to: &mut impl Put) {
+    for spec in specs {
+        let Ok(value) = parameters.value(spec.name) else { continue };
+        let bytes = value.raw();
+        if !spec.kind.is_fixed() {
+            to.put(&u64::from(saturate(bytes.len())).to_le_bytes());
+        }
+        to.put(bytes);
+        to.put(ZEROS.get(..padding_after(bytes.len())).unwrap_or_default());
+    }
+}
+
+/// The longest block that `specs` allow, in bytes; `None` where that exceeds the address space.
+pub fn longest<'s>(mut specs: impl Iterator<Item = VariableSpec<'s>>) -> Option<usize> {
+    specs.try_fold(0_usize, |sum, spec| {
+        let head = if spec.kind.is_fixed() { 0 } else { 8 };
+        sum.checked_add(head)?.checked_add(spec.kind.bytes_of(spec.size)?.checked_next_multiple_of(8)?)
+    })
+}
+
+/// Validates all of a block, UTF-8 included; [`Error::Malformed`] for any block that [`write`] can't have made.
+pub fn check<'s>(specs: impl Iterator<Item = VariableSpec<'s>>, block: &[u8]) -> Result<(), Error> {
+    each(specs, block, |_, _, _| Ok(()))
+}
+
+/// Updates `parameters` with a block of results (paper, section 2: "the request will update the `pos` object").
+///
+/// Variables of the same name take the new value; missing ones are added with their declared size. Everything is
+/// validated first, UTF-8 once: [`Error::Malformed`], or [`Error::ResultWouldNotFit`], [`Error::WrongType`],
+/// [`Error::WrongSize`] and [`Error::Full`] if the parameters can't hold the results. On any error they are unchanged.
+pub fn read<'s>(
+    specs: impl Iterator<Item = VariableSpec<'s>> + Clone,
+    block: &[u8],
+    parameters: &mut ParametersView,
+) -> Result<(), Error> {
+    let mut room = Room::of(parameters);
+    each(specs.clone(), block, |index, spec, value| {
+        let needed = if spec.kind.is_fixed() { spec.size } else { saturate(value.len()) };
+        room.take(parameters, index, spec, needed)
+    })?;
+    room.check()?;
+    commit(specs, block, parameters)
+}
+
+/// Whether `parameters` can hold every result that `specs` allow, before the call is sent; the errors of [`read`].
+pub fn check_results_fit<'s>(
+    specs: impl Iterator<Item = VariableSpec<'s>>,
+    parameters: &ParametersView,
+) -> Result<(), Error> {
+    let mut room = Room::of(parameters);
+    for (position, spec) in specs.enumerate() {
+        room.take(parameters, position as u8, spec, spec.size)?;
+    }
+    room.check()
+}
+
+/// Replaces the variables of `parameters` by the arguments in a block, each with its declared size: what a service
+/// gets to see.
+///
+/// [`Error::Malformed`], or [`Error::Full`] if the parameters are too small; they may be empty after an error.
+pub fn read_arguments<'s>(
+    specs: impl Iterator<Item = VariableSpec<'s>> + Clone,
+    block: &[u8],
+    parameters: &mut ParametersView,
+) -> Result<(), Error> {
+    check(specs.clone(), block)?;
+    parameters.clear();
+    let read = commit(specs, block, parameters);
+    if read.is_err() {
+        parameters.clear();
+    }
+    read
+}
+
+/// Adds the results that are not among `parameters` yet, so that a service only sets them.
+///
+/// [`Error::Full`] if the parameters are too small, [`Error::WrongType`] and [`Error::WrongSize`] for a variable that is
+/// another one than the result of its name.
+pub fn prepare_results<'s>(
+    specs: impl Iterator<Item = VariableSpec<'s>>,
+    parameters: &mut ParametersView,
+) -> Result<(), Error> {
+    for (position, spec) in specs.enumerate() {
+        let index = position as u8;
+        let Ok(value) = parameters.value(spec.name) else {
+            parameters.add(spec.name, spec.kind, spec.size)?;
+            continue;
+        };
+        if value.kind() != spec.kind {
+            return Err(Error::WrongType { index });
+        }
+        if value.size() != spec.size {
+            return Err(Error::WrongSize { index, expected: spec.size, found: value.size() });
+        }
+    }
+    Ok(())
+}
+
+/// What is left of some parameters while results are fitted in.
+struct Room {
+    variables: usize,
+    bytes: usize,
+    needed: usize,
+}
+
+impl Room {
+    fn of(parameters: &ParametersView) -> Self {
+        Self { variables: VARIABLES.saturating_sub(parameters.len()), bytes: parameters.remaining(), needed: 0 }
+    }
+
+    /// Takes the room for one result of `size` elements; a variable of its name must be able to hold it.
+    fn take(&mut self, parameters: &ParametersView, index: u8, spec: VariableSpec<'_>, size: u32) -> Result<(), Error> {
+        let Ok(value) = parameters.value(spec.name) else {
+            self.variables = self.variables.checked_sub(1).ok_or(Error::Full(Limit::Variables))?;
+            let bytes = bytes_of_variable(spec.name, spec.kind, spec.size).unwrap_or(usize::MAX);
+            self.needed = self.needed.saturating_add(bytes);
+            return Ok(());
+        };
+        if value.kind() != spec.kind {
+            return Err(Error::WrongType { index });
+        }
+        if size > value.size() {
+            let [need, have] = [size, value.size()].map(|size| size.saturating_mul(spec.kind.width() as u32));
+            return Err(Error::ResultWouldNotFit { need, have });
+        }
+        if spec.kind.is_fixed() && size != value.size() {
+            return Err(Error::WrongSize { index, expected: value.size(), found: size });
+        }
+        Ok(())
+    }
+
+    /// Whether everything new fits together.
+    fn check(&self) -> Result<(), Error> {
+        if self.needed > self.bytes {
+            return Err(Error::ResultWouldNotFit { need: saturate(self.needed), have: saturate(self.bytes) });
+        }
+        Ok(())
+    }
+}
+
+/// Validates a block and shows each value, its UTF-8 included, to `visit`.
+fn each<'s>(
+    specs: impl Iterator<Item = VariableSpec<'s>>,
+    block: &[u8],
+    mut visit: impl FnMut(u8, VariableSpec<'s>, &[u8]) -> Result<(), Error>,
+) -> Result<(), Error> {
+    let mut rest = block;
+    let mut refusal = Ok(());
+    for (index, spec) in specs.enumerate() {
+        let value;
+        (value, rest) = split(spec, rest).ok_or(Error::Malformed)?;
+        if !is_canonical(spec.kind, value) {
+            return Err(Error::Malformed);
+        }
+        refusal = refusal.and_then(|()| visit(index as u8, spec, value));
+    }
+    // A malformed block is the peer's fault, whatever else would be wrong with its values.
+    if rest.is_empty() { refusal } else { Err(Error::Malformed) }
+}
+
+/// Stores the values of a validated block.
+fn commit<'s>(
+    specs: impl Iterator<Item = VariableSpec<'s>>,
+    block: &[u8],
+    parameters: &mut ParametersView,
+) -> Result<(), Error> {
+    let mut rest = block;
+    for spec in specs {
+        let value;
+        (value, rest) = split(spec, rest).ok_or(Error::Malformed)?;
+        let index = match parameters.find(spec.name) {
+            Some(index) => index,
+            None => {
+                parameters.add(spec.name, spec.kind, spec.size)?;
+                parameters.len().saturating_sub(1)
+            }
+        };
+        parameters.set_checked(index, value);
+    }
+    Ok(())
+}
+
+/// The value at the start of `block`, and what follows it; `None` if it is cut off, too long or not padded with zeros.
+fn split<'b>(spec: VariableSpec<'_>, block: &'b [u8]) -> Option<(&'b [u8], &'b [u8])> {
+    let (length, rest) = if spec.kind.is_fixed() {
+        (spec.kind.bytes_of(spec.size)?, block)
+    } else {
+        let (&head, rest) = block.split_first_chunk::<8>()?;
+        // The upper half is the four bytes of zero, so that a longer value fails here.
+        let length = u32::try_from(u64::from_le_bytes(head)).ok().filter(|&length| length <= spec.size)?;
+        (length as usize, rest)
+    };
+    let (value, rest) = rest.split_at_checked(length)?;
+    let (padding, rest) = rest.split_at_checked(padding_after(length))?;
+    padding.iter().all(|&byte| byte == 0).then_some((value, rest))
+}
+
+fn is_canonical(kind: Type, value: &[u8]) -> bool {
+    match kind {
+        Type::String => core::str::from_utf8(value).is_ok(),
+        Type::Bool => value.iter().all(|&byte| byte <= 1),
+        Type::Int | Type::Float | Type::Bytes => true,
+    }
+}
+
+fn encoded_length(value: Value<'_>) -> usize {
+    let head = if value.kind().is_fixed() { 0 } else { 8 };
+    let bytes = value.raw().len();
+    bytes.saturating_add(head).saturating_add(padding_after(bytes))
+}
+
+/// Bytes of zero after `length` bytes, so that the next value starts at a multiple of 8.
+const fn padding_after(length: usize) -> usize {
+    length.wrapping_neg() & 7
+}

@@ -1,0 +1,413 @@
+//! The paper's `Function`: a name with the arguments that it needs and the results that it gives.
+//!
+//! A signature exists in one encoding, which is stored and travels as it is: name length u8, name, number of
+//! arguments u8, arguments, number of results u8, results; each variable: type u8, name length u8, size u32
+//! little-endian, name. [`Definition`] owns one, [`Signature`] borrows one.
+
+use core::fmt;
+
+use crate::config::{Priority, SIGNATURE_BYTES, VARIABLES};
+use crate::error::{Error, Limit};
+use crate::time::Duration;
+
+use super::parameters::{ParametersView, Type, bytes_of_variable, check_name};
+use super::text::{self, ParseError};
+use super::value::saturate;
+
+/// An own function's signature.
+///
+/// ```
+/// use cara_core::distribution::function::Definition;
+/// use cara_core::distribution::parameters::Parameters;
+///
+/// let mut pos = Parameters::new();
+/// pos.add_int("position", 2)?;
+/// let pos_info = Definition::new("pos_info")?.results(&pos)?;
+/// assert_eq!(pos_info, Definition::parse("pos_info() -> (position: int[2])").unwrap());
+/// # Ok::<(), cara_core::error::Error>(())
+/// ```
+#[derive(Clone, PartialEq, Eq)]
+pub struct Definition {
+    bytes: heapless::Vec<u8, SIGNATURE_BYTES>,
+}
+
+/// A signature in somebody else's bytes; `Display` is its text form.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub struct Signature<'a> {
+    bytes: &'a [u8],
+    name: &'a str,
+    arguments: VariableSpecs<'a>,
+    results: VariableSpecs<'a>,
+}
+
+/// Name, type and size of one argument or result.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct VariableSpec<'a> {
+    /// Its name.
+    pub name: &'a str,
+    /// Its type.
+    pub kind: Type,
+    /// Its size: exactly this many elements, or at most this many bytes of a string or bytes.
+    pub size: u32,
+}
+
+/// The arguments or the results of a [`Signature`], in its order.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct VariableSpecs<'a> {
+    left: u8,
+    rest: &'a [u8],
+}
+
+/// How a function wants to be called.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Attributes {
+    /// Priority of calls that name none.
+    pub priority: Priority,
+    /// What the function starts goes on for this long after the last call; whole milliseconds travel.
+    pub lease: Option<Duration>,
+    /// Running it twice is as good as running it once.
+    pub idempotent: bool,
+}
+
+impl Definition {
+    /// A function without arguments and results.
+    pub fn new(name: &str) -> Result<Self, Error> {
+        Builder::new(name).map(Builder::finish)
+    }
+
+    /// A function from its text form, as in `go_to(position: int[2]) -> (done: bool)`.
+    pub fn parse(text: &str) -> Result<Self, ParseError> {
+        text::parse(text)
+    }
+
+    /// The same function with the variables of `parameters` as its arguments; their values don't matter.
+    pub fn arguments(self, parameters: &ParametersView) -> Result<Self, Error> {
+        let signature = self.signature();
+        Self::build(signature.name(), specs_of(parameters), signature.results())
+    }
+
+    /// The same function with the variables of `parameters` as its results; their values don't matter.
+    ///
+    /// A result with the name of an argument is the same variable, so it has the same type and size.
+    pub fn results(self, parameters: &ParametersView) -> Result<Self, Error> {
+        let signature = self.signature();
+        Self::build(signature.name(), signature.arguments(), specs_of(parameters))
+    }
+
+    /// The function's name.
+    pub fn name(&self) -> &str {
+        self.signature().name
+    }
+
+    /// The signature.
+    pub fn signature(&self) -> Signature<'_> {
+        Signature::of_checked(&self.bytes)
+    }
+
+    /// The encoded signature.
+    pub fn as_bytes(&self) -> &[u8] {
+        &self.bytes
+    }
+
+    fn build<'a>(
+        name: &str,
+        arguments: impl Iterator<Item = VariableSpec<'a>>,
+        results: impl Iterator<Item = VariableSpec<'a>>,
+    ) -> Result<Self, Error> {
+        let mut builder = Builder::new(name)?;
+        for argument in arguments {
+            builder.argument(argument)?;
+        }
+        for result in results {
+            builder.result(result)?;
+        }
+        Ok(builder.finish())
+    }
+}
+
+/// The variables of `parameters` as a signature names them.
+fn specs_of(parameters: &ParametersView) -> impl Iterator<Item = VariableSpec<'_>> {
+    parameters.iter().map(|variable| VariableSpec { name: variable.name, kind: variable.kind, size: variable.size })
+}
+
+impl<'a> Signature<'a> {
+    /// Checks an encoded signature; [`Error::Malformed`] for anything that [`Definition`] could not have made.
+    pub fn decode(bytes: &'a [u8]) -> Result<Self, Error> {
+        let signature = Self::split(bytes).ok_or(Error::Malformed)?;
+        match Definition::build(signature.name, signature.arguments(), signature.results()) {
+            Ok(definition) if definition.as_bytes() == bytes => Ok(signature),
+            _ => Err(Error::Malformed),
+        }
+    }
+
+    /// The function's name.
+    pub const fn name(&self) -> &'a str {
+        self.name
+    }
+
+    /// What a caller must pass.
+    pub const fn arguments(&self) -> VariableSpecs<'a> {
+        self.arguments
+    }
+
+    /// What a caller gets back.
+    pub const fn results(&self) -> VariableSpecs<'a> {
+        self.results
+    }
+
+    /// The encoded signature.
+    pub const fn as_bytes(&self) -> &'a [u8] {
+        self.bytes
+    }
+
+    /// Bytes of a `Parameters` that holds all arguments and results, as the callee's does.
+    pub fn parameters_bytes(&self) -> u32 {
+        let only_results = self.results().filter(|result| self.arguments.named(result.name).is_none());
+        let bytes = self
+            .arguments()
+            .chain(only_results)
+            .try_fold(0_usize, |sum, spec| sum.checked_add(bytes_of_variable(spec.name, spec.kind, spec.size)?));
+        bytes.map_or(u32::MAX, saturate)
+    }
+
+    /// The signature in bytes that were checked when they were stored.
+    pub(crate) fn of_checked(bytes: &'a [u8]) -> Self {
+        let none = VariableSpecs { left: 0, rest: &[] };
+        Self::split(bytes).unwrap_or(Self { bytes: &[], name: "", arguments: none, results: none })
+    }
+
+    fn split(bytes: &'a [u8]) -> Option<Self> {
+        let (&length, rest) = bytes.split_first()?;
+        let (name, rest) = rest.split_at_checked(usize::from(length))?;
+        let name = core::str::from_utf8(name).ok()?;
+        let (arguments, rest) = VariableSpecs::split(rest)?;
+        let (results, rest) = VariableSpecs::split(rest)?;
+        rest.is_empty().then_some(Self { bytes, name, arguments, results })
+    }
+}
+
+impl<'a> VariableSpecs<'a> {
+    /// The variable of this name.
+    pub fn named(mut self, name: &str) -> Option<VariableSpec<'a>> {
+        self.find(|spec| spec.name == name)
+    }
+
+    fn split(bytes: &'a [u8]) -> Option<(Self, &'a [u8])> {
+        let (&count, start) = bytes.split_first()?;
+        let mut rest = start;
+        for _ in 0..count {
+            rest = VariableSpec::split(rest)?.1;
+        }
+        Some((Self { left: count, rest: start }, rest))
+    }
+}
+
+impl<'a> Iterator for VariableSpecs<'a> {
+    type Item = VariableSpec<'a>;
+
+    fn next(&mut self) -> Option<VariableSpec<'a>> {
+        self.left = self.left.checked_sub(1)?;
+        let (spec, rest) = VariableSpec::split(self.rest)?;
+        self.rest = rest;
+        Some(spec)
+    }
+
+    fn size_hint(&self) -> (usize, Option<usize>) {
+        (0, Some(usize::from(self.left)))
+    }
+}
+
+impl<'a> VariableSpec<'a> {
+    fn split(bytes: &'a [u8]) -> Option<(Self, &'a [u8])> {
+        let (&[kind, length], rest) = bytes.split_first_chunk::<2>()?;
+        let (&size, rest) = rest.split_first_chunk::<4>()?;
+        let (name, rest) = rest.split_at_checked(usize::from(length))?;
+        let name = core::str::from_utf8(name).ok()?;
+        Some((Self { name, kind: Type::from_wire(kind)?, size: u32::from_le_bytes(size) }, rest))
+    }
+}
+
+impl Attributes {
+    /// Bytes of the encoded form.
+    pub const WIRE_BYTES: usize = 8;
+    const IDEMPOTENT: u8 = 1 << 2;
+
+    /// Bits 0 and 1: priority; bit 2: idempotent; three bytes of zero; the lease in milliseconds, u32 little-endian, 0
+    /// for none. A lease is rounded down, but never to none.
+    pub fn encode(&self) -> [u8; Self::WIRE_BYTES] {
+        let flags = self.priority as u8 | if self.idempotent { Self::IDEMPOTENT } else { 0 };
+        let lease = self.lease.map_or(0, |lease| u32::try_from(lease.as_millis()).unwrap_or(u32::MAX).max(1));
+        let [a, b, c, d] = lease.to_le_bytes();
+        [flags, 0, 0, 0, a, b, c, d]
+    }
+
+    /// The inverse of [`encode`](Self::encode); [`Error::Malformed`] for any other bytes.
+    pub fn decode(bytes: &[u8]) -> Result<Self, Error> {
+        let &[flags, 0, 0, 0, a, b, c, d] = bytes else { return Err(Error::Malformed) };
+        if flags >= Self::IDEMPOTENT << 1 {
+            return Err(Error::Malformed);
+        }
+        let lease = u32::from_le_bytes([a, b, c, d]);
+        Ok(Self {
+            priority: Priority::from_wire(flags & 3).ok_or(Error::Malformed)?,
+            lease: (lease != 0).then(|| Duration::from_millis(u64::from(lease))),
+            idempotent: flags & Self::IDEMPOTENT != 0,
+        })
+    }
+}
+
+/// Writes a signature variable by variable, and knows every rule about signatures.
+pub(super) struct Builder {
+    bytes: heapless::Vec<u8, SIGNATURE_BYTES>,
+    arguments_at: usize,
+    results_at: Option<usize>,
+}
+
+impl Builder {
+    pub(super) fn new(name: &str) -> Result<Self, Error> {
+        check_name(name)?;
+        let mut builder = Self { bytes: heapless::Vec::new(), arguments_at: 0, results_at: None };
+        builder.push(&[name.len() as u8])?;
+        builder.push(name.as_bytes())?;
+        builder.arguments_at = builder.bytes.len();
+        // Room for the number of results as well, so that `finish` can't fail.
+        builder.push(&[0])?;
+        Ok(builder)
+    }
+
+    /// Adds an argument; the arguments come before the results.
+    pub(super) fn argument(&mut self, spec: VariableSpec<'_>) -> Result<(), Error> {
+        self.check_free(self.arguments_at, spec.name)?;
+        if self.list(self.arguments_at).count() >= VARIABLES {
+            return Err(Error::Full(Limit::Variables));
+        }
+        self.variable(self.arguments_at, spec)
+    }
+
+    /// Adds a result. Results that are arguments as well are the same variables; all others count anew, since a
+    /// `Parameters` must hold both.
+    pub(super) fn result(&mut self, spec: VariableSpec<'_>) -> Result<(), Error> {
+        let results_at = self.begin_results()?;
+        self.check_free(results_at, spec.name)?;
+        let arguments = self.list(self.arguments_at);
+        let results = self.list(results_at);
+        match arguments.named(spec.name) {
+            Some(argument) => check_same(argument, spec, results.count())?,
+            None => {
+                let others = results.filter(|result| arguments.named(result.name).is_none()).count();
+                if arguments.count().saturating_add(others) >= VARIABLES {
+                    return Err(Error::Full(Limit::Variables));
+                }
+            }
+        }
+        self.variable(results_at, spec)
+    }
+
+    pub(super) fn finish(mut self) -> Definition {
+        // `variable` keeps a byte free for this one.
+        let _ = self.begin_results();
+        Definition { bytes: self.bytes }
+    }
+
+    fn begin_results(&mut self) -> Result<usize, Error> {
+        if let Some(results_at) = self.results_at {
+            return Ok(results_at);
+        }
+        let results_at = self.bytes.len();
+        self.push(&[0])?;
+        self.results_at = Some(results_at);
+        Ok(results_at)
+    }
+
+    fn variable(&mut self, list_at: usize, spec: VariableSpec<'_>) -> Result<(), Error> {
+        check_name(spec.name)?;
+        let end = self.bytes.len().saturating_add(spec.name.len()).saturating_add(6);
+        let count_of_results = usize::from(self.results_at.is_none());
+        if end.saturating_add(count_of_results) > SIGNATURE_BYTES {
+            return Err(Error::Full(Limit::SignatureBytes));
+        }
+        self.push(&[spec.kind as u8, spec.name.len() as u8])?;
+        self.push(&spec.size.to_le_bytes())?;
+        self.push(spec.name.as_bytes())?;
+        if let Some(count) = self.bytes.get_mut(list_at) {
+            *count = count.saturating_add(1);
+        }
+        Ok(())
+    }
+
+    fn check_free(&self, list_at: usize, name: &str) -> Result<(), Error> {
+        if self.list(list_at).named(name).is_some() { Err(Error::NameTaken) } else { Ok(()) }
+    }
+
+    fn list(&self, at: usize) -> VariableSpecs<'_> {
+        let bytes = self.bytes.get(at..).unwrap_or_default();
+        VariableSpecs::split(bytes).map_or(VariableSpecs { left: 0, rest: &[] }, |(list, _)| list)
+    }
+
+    fn push(&mut self, bytes: &[u8]) -> Result<(), Error> {
+        self.bytes.extend_from_slice(bytes).map_err(|_| Error::Full(Limit::SignatureBytes))
+    }
+}
+
+fn check_same(argument: VariableSpec<'_>, result: VariableSpec<'_>, position: usize) -> Result<(), Error> {
+    let index = position as u8;
+    if argument.kind != result.kind {
+        return Err(Error::WrongType { index });
+    }
+    if argument.size != result.size {
+        return Err(Error::WrongSize { index, expected: argument.size, found: result.size });
+    }
+    Ok(())
+}
+
+impl core::str::FromStr for Definition {
+    type Err = ParseError;
+    fn from_str(text: &str) -> Result<Self, ParseError> {
+        Self::parse(text)
+    }
+}
+
+impl fmt::Display for VariableSpec<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}: {}", self.name, self.kind)?;
+        if self.kind.is_fixed() && self.size == 1 { Ok(()) } else { write!(f, "[{}]", self.size) }
+    }
+}
+
+impl fmt::Display for VariableSpecs<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("(")?;
+        for (index, spec) in self.enumerate() {
+            if index > 0 {
+                f.write_str(", ")?;
+            }
+            fmt::Display::fmt(&spec, f)?;
+        }
+        f.write_str(")")
+    }
+}
+
+impl fmt::Display for Signature<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}{}", self.name, self.arguments)?;
+        if self.results.left == 0 { Ok(()) } else { write!(f, " -> {}", self.results) }
+    }
+}
+
+impl fmt::Debug for Signature<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::Display::fmt(self, f)
+    }
+}
+
+impl fmt::Display for Definition {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::Display::fmt(&self.signature(), f)
+    }
+}
+
+impl fmt::Debug for Definition {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::Display::fmt(self, f)
+    }
+}

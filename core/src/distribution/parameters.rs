@@ -1,0 +1,362 @@
+//! The paper's `Parameters`: named variables with a type and a size, passed to a service and updated by its results.
+//!
+//! [`Parameters`] owns its bytes and has no heap; functions take a [`ParametersView`], to which a `Parameters` of any
+//! size coerces. Names and values lie in one arena; each value reserves its declared size, so that setting one
+//! never moves another.
+
+use core::fmt;
+use core::ops::{Deref, DerefMut};
+
+use crate::config::{NAME_BYTES, PARAMETERS_BYTES, VARIABLES};
+use crate::error::{Error, Limit};
+
+pub use super::value::{Element, FromValue, IntoValue, Target, Type, Value};
+use super::value::{copy, read_elements, saturate};
+
+/// Variables in `BYTES` bytes of names and values (paper, listing line 11).
+///
+/// ```
+/// use cara_core::distribution::parameters::Parameters;
+///
+/// let mut pos = Parameters::new();
+/// pos.add_int("position", 2)?;
+/// pos.set_value("position", [1, 2])?;
+/// let coordinates: [i64; 2] = pos.variable("position")?;
+/// assert_eq!(coordinates, [1, 2]);
+/// # Ok::<(), cara_core::error::Error>(())
+/// ```
+pub type Parameters<const BYTES: usize = PARAMETERS_BYTES> = ParametersInner<[u8; BYTES]>;
+
+/// [`Parameters`] of any size, behind a reference or a box.
+///
+/// ```
+/// use cara_core::distribution::parameters::{Parameters, ParametersView};
+///
+/// fn stop(parameters: &mut ParametersView) -> Result<(), cara_core::error::Error> {
+///     parameters.add_bool("stopped", 1)?;
+///     parameters.set_value("stopped", true)
+/// }
+/// stop(&mut Parameters::<64>::sized())?;
+/// # Ok::<(), cara_core::error::Error>(())
+/// ```
+pub type ParametersView = ParametersInner<[u8]>;
+
+/// Both [`Parameters`] and [`ParametersView`]; not named directly.
+#[derive(Clone)]
+pub struct ParametersInner<B: ?Sized> {
+    table: [Entry; VARIABLES],
+    count: u8,
+    used: u32,
+    bytes: B,
+}
+
+/// One variable. Its name lies right before its value in the arena.
+#[derive(Clone, Copy)]
+struct Entry {
+    value_at: u32,
+    size: u32,
+    /// Bytes of the value now.
+    length: u32,
+    name_length: u8,
+    kind: Type,
+}
+
+impl Entry {
+    const EMPTY: Self = Self { value_at: 0, size: 0, length: 0, name_length: 0, kind: Type::Int };
+}
+
+/// One variable of a [`ParametersView`], borrowed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Variable<'a> {
+    /// Its name.
+    pub name: &'a str,
+    /// Its type.
+    pub kind: Type,
+    /// Its declared size.
+    pub size: u32,
+    /// Its value.
+    pub value: Value<'a>,
+}
+
+impl Parameters {
+    /// Empty parameters of the usual size.
+    pub const fn new() -> Self {
+        Self::sized()
+    }
+}
+
+impl<const BYTES: usize> ParametersInner<[u8; BYTES]> {
+    /// Empty parameters of any size: `Parameters::<2048>::sized()`.
+    pub const fn sized() -> Self {
+        Self { table: [Entry::EMPTY; VARIABLES], count: 0, used: 0, bytes: [0; BYTES] }
+    }
+}
+
+impl ParametersView {
+    /// Adds `size` integers, all 0.
+    ///
+    /// [`Error::NameTaken`], [`Error::BadName`] or [`Error::Full`] leave the parameters unchanged; so for all types.
+    pub fn add_int(&mut self, name: &str, size: u32) -> Result<(), Error> {
+        self.add(name, Type::Int, size)
+    }
+
+    /// Adds `size` floating-point numbers, all 0.
+    pub fn add_float(&mut self, name: &str, size: u32) -> Result<(), Error> {
+        self.add(name, Type::Float, size)
+    }
+
+    /// Adds `size` truth values, all `false`.
+    pub fn add_bool(&mut self, name: &str, size: u32) -> Result<(), Error> {
+        self.add(name, Type::Bool, size)
+    }
+
+    /// Adds an empty text of at most `maximum` bytes.
+    ///
+    /// ```
+    /// use cara_core::distribution::parameters::Parameters;
+    ///
+    /// let mut message = Parameters::new();
+    /// message.add_string("text", 200)?;
+    /// message.set_value("text", "battery low")?;
+    /// assert_eq!(message.variable::<&str>("text")?, "battery low");
+    /// # Ok::<(), cara_core::error::Error>(())
+    /// ```
+    pub fn add_string(&mut self, name: &str, maximum: u32) -> Result<(), Error> {
+        self.add(name, Type::String, maximum)
+    }
+
+    /// Adds an empty array of at most `maximum` bytes.
+    pub fn add_bytes(&mut self, name: &str, maximum: u32) -> Result<(), Error> {
+        self.add(name, Type::Bytes, maximum)
+    }
+
+    /// Adds a variable of any type, with the value 0, `false` or empty.
+    pub fn add(&mut self, name: &str, kind: Type, size: u32) -> Result<(), Error> {
+        check_name(name)?;
+        if self.find(name).is_some() {
+            return Err(Error::NameTaken);
+        }
+        let place = self.table.get_mut(usize::from(self.count)).ok_or(Error::Full(Limit::Variables))?;
+        let full = Error::Full(Limit::ParametersBytes);
+        let length = kind.bytes_of(size).ok_or(full)?;
+        let (_, free) = self.bytes.split_at_mut_checked(self.used as usize).ok_or(full)?;
+        let (name_place, free) = free.split_at_mut_checked(name.len()).ok_or(full)?;
+        let value = free.get_mut(..length).ok_or(full)?;
+        copy(name.as_bytes(), name_place);
+        if kind.is_fixed() {
+            value.fill(0);
+        }
+        let value_at = self.used.saturating_add(saturate(name.len()));
+        *place = Entry {
+            value_at,
+            size,
+            length: if kind.is_fixed() { saturate(length) } else { 0 },
+            name_length: name.len() as u8,
+            kind,
+        };
+        self.used = value_at.saturating_add(saturate(length));
+        self.count = self.count.saturating_add(1);
+        Ok(())
+    }
+
+    /// Sets a variable from a number, a truth value, an array or slice of them, a `&str` or a `&[u8]`.
+    ///
+    /// Fixed sizes must be exact; text and bytes at most as long as declared. On an error the old value stays.
+    ///
+    /// ```
+    /// use cara_core::distribution::parameters::Parameters;
+    /// use cara_core::error::Error;
+    ///
+    /// let mut pos = Parameters::new();
+    /// pos.add_int("position", 2)?;
+    /// pos.set_value("position", [1, 2])?;
+    /// let wrong = pos.set_value("position", [1, 2, 3]);
+    /// assert_eq!(wrong, Err(Error::WrongSize { index: 0, expected: 2, found: 3 }));
+    /// # Ok::<(), Error>(())
+    /// ```
+    pub fn set_value(&mut self, name: &str, value: impl IntoValue) -> Result<(), Error> {
+        let index = self.find(name).ok_or(Error::UnknownVariable)?;
+        value.into_value(self.target(index).ok_or(Error::UnknownVariable)?)
+    }
+
+    /// Reads a variable as `T`: a number, a truth value, an array of them, a `&str` or a `&[u8]`.
+    ///
+    /// The type must match and the size must be exact; a number that a narrower `T` can't hold is
+    /// [`Error::OutOfRange`].
+    ///
+    /// ```
+    /// use cara_core::distribution::parameters::Parameters;
+    /// use cara_core::error::Error;
+    ///
+    /// let mut speed = Parameters::new();
+    /// speed.add_int("limit", 1)?;
+    /// speed.set_value("limit", 300)?;
+    /// assert_eq!(speed.variable::<u16>("limit"), Ok(300));
+    /// assert_eq!(speed.variable::<u8>("limit"), Err(Error::OutOfRange));
+    /// # Ok::<(), Error>(())
+    /// ```
+    #[doc(alias = "get_variable")]
+    pub fn variable<'a, T: FromValue<'a>>(&'a self, name: &str) -> Result<T, Error> {
+        T::from_value(self.value(name)?)
+    }
+
+    /// Reads all elements of a variable into `elements`, which must be as many. On an error they are unchanged.
+    ///
+    /// ```
+    /// use cara_core::distribution::parameters::Parameters;
+    ///
+    /// let mut pos = Parameters::new();
+    /// pos.add_int("position", 2)?;
+    /// let mut coordinates = [9; 2];
+    /// pos.variable_into("position", &mut coordinates)?;
+    /// assert_eq!(coordinates, [0, 0]);
+    /// # Ok::<(), cara_core::error::Error>(())
+    /// ```
+    #[doc(alias = "get_variable")]
+    pub fn variable_into<T: Element>(&self, name: &str, elements: &mut [T]) -> Result<(), Error> {
+        read_elements(self.value(name)?, elements)
+    }
+
+    /// Removes all variables.
+    pub fn clear(&mut self) {
+        self.count = 0;
+        self.used = 0;
+    }
+
+    /// Replaces all variables by those of `other`; [`Error::Full`] leaves the parameters unchanged.
+    pub fn copy_from(&mut self, other: &Self) -> Result<(), Error> {
+        let full = Error::Full(Limit::ParametersBytes);
+        let used = other.used as usize;
+        let from = other.bytes.get(..used).ok_or(full)?;
+        copy(from, self.bytes.get_mut(..used).ok_or(full)?);
+        self.table = other.table;
+        self.count = other.count;
+        self.used = other.used;
+        Ok(())
+    }
+
+    /// Bytes that are free for further names and values.
+    pub fn remaining(&self) -> usize {
+        self.bytes.len().saturating_sub(self.used as usize)
+    }
+
+    /// Number of variables.
+    pub const fn len(&self) -> usize {
+        self.count as usize
+    }
+
+    /// Whether there is no variable.
+    pub const fn is_empty(&self) -> bool {
+        self.count == 0
+    }
+
+    /// The variables in the order in which they were added.
+    pub fn iter(&self) -> impl Iterator<Item = Variable<'_>> + Clone {
+        (0..self.len()).filter_map(|index| {
+            let entry = self.table.get(index)?;
+            let name = core::str::from_utf8(self.name_of(entry)).ok()?;
+            Some(Variable { name, kind: entry.kind, size: entry.size, value: self.value_at(index)? })
+        })
+    }
+
+    /// The value of a variable of any type.
+    pub fn value(&self, name: &str) -> Result<Value<'_>, Error> {
+        self.find(name).and_then(|index| self.value_at(index)).ok_or(Error::UnknownVariable)
+    }
+
+    pub(crate) fn find(&self, name: &str) -> Option<usize> {
+        self.table.iter().take(self.len()).position(|entry| self.name_of(entry) == name.as_bytes())
+    }
+
+    pub(crate) fn value_at(&self, index: usize) -> Option<Value<'_>> {
+        let entry = self.table.get(index)?;
+        let start = entry.value_at as usize;
+        let bytes = self.bytes.get(start..start.saturating_add(entry.length as usize))?;
+        Some(Value { index: index as u8, kind: entry.kind, size: entry.size, bytes })
+    }
+
+    /// Sets the value of the variable at `index` from bytes that were checked against its type and size.
+    pub(crate) fn set_checked(&mut self, index: usize, bytes: &[u8]) {
+        let Some(target) = self.target(index) else { return };
+        if let Some(place) = target.bytes.get_mut(..bytes.len()) {
+            copy(bytes, place);
+            *target.length = saturate(bytes.len());
+        }
+    }
+
+    fn target(&mut self, index: usize) -> Option<Target<'_>> {
+        let entry = self.table.get_mut(index)?;
+        let start = entry.value_at as usize;
+        let end = start.saturating_add(entry.kind.bytes_of(entry.size)?);
+        let bytes = self.bytes.get_mut(start..end)?;
+        Some(Target { index: index as u8, kind: entry.kind, size: entry.size, length: &mut entry.length, bytes })
+    }
+
+    fn name_of(&self, entry: &Entry) -> &[u8] {
+        let end = entry.value_at as usize;
+        self.bytes.get(end.saturating_sub(usize::from(entry.name_length))..end).unwrap_or_default()
+    }
+}
+
+/// Bytes of a [`Parameters`] that one variable takes; `None` where that exceeds the address space.
+pub(crate) fn bytes_of_variable(name: &str, kind: Type, size: u32) -> Option<usize> {
+    kind.bytes_of(size)?.checked_add(name.len())
+}
+
+/// Names of functions and variables: letters, digits, `_`, `-`, `.`, `/` of ASCII, 1 to [`NAME_BYTES`] of them.
+pub(crate) fn check_name(name: &str) -> Result<(), Error> {
+    if name.is_empty() || !name.bytes().all(is_name_byte) {
+        return Err(Error::BadName);
+    }
+    if name.len() > NAME_BYTES {
+        return Err(Error::Full(Limit::NameBytes));
+    }
+    Ok(())
+}
+
+pub(crate) const fn is_name_byte(byte: u8) -> bool {
+    byte.is_ascii_alphanumeric() || matches!(byte, b'_' | b'-' | b'.' | b'/')
+}
+
+impl<const BYTES: usize> Deref for ParametersInner<[u8; BYTES]> {
+    type Target = ParametersView;
+    fn deref(&self) -> &ParametersView {
+        self
+    }
+}
+
+impl<const BYTES: usize> DerefMut for ParametersInner<[u8; BYTES]> {
+    fn deref_mut(&mut self) -> &mut ParametersView {
+        self
+    }
+}
+
+impl<const BYTES: usize> Default for ParametersInner<[u8; BYTES]> {
+    fn default() -> Self {
+        Self::sized()
+    }
+}
+
+impl PartialEq for ParametersView {
+    fn eq(&self, other: &Self) -> bool {
+        self.len() == other.len() && self.iter().eq(other.iter())
+    }
+}
+
+impl<const A: usize, const B: usize> PartialEq<ParametersInner<[u8; B]>> for ParametersInner<[u8; A]> {
+    fn eq(&self, other: &ParametersInner<[u8; B]>) -> bool {
+        **self == **other
+    }
+}
+
+impl fmt::Debug for ParametersView {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_map().entries(self.iter().map(|variable| (variable.name, variable.value))).finish()
+    }
+}
+
+impl<const BYTES: usize> fmt::Debug for ParametersInner<[u8; BYTES]> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::Debug::fmt(&**self, f)
+    }
+}

@@ -1,0 +1,195 @@
+//! The text form of a signature, used by `show_functions`, the command line and the documentation, and its parser.
+//!
+//! `pos_info(position: int[2]) -> (position: int[2])`; `int`, `float` and `bool` alone have the size 1; a function
+//! without results has no arrow. Spaces are free between words.
+
+use core::fmt;
+
+use crate::error::{Error, Limit};
+
+use super::function::{Builder, Definition, VariableSpec};
+use super::parameters::{Type, is_name_byte};
+
+/// Where a text stops being a signature, and what should stand there.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("expected {expected} at byte {position}")]
+pub struct ParseError {
+    /// Bytes before the error.
+    pub position: usize,
+    /// What should stand there.
+    pub expected: Expected,
+}
+
+/// What should stand where a [`ParseError`] points.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Expected {
+    /// A name.
+    Name,
+    /// A name that is not too long.
+    ShorterName,
+    /// A name that the list doesn't have yet.
+    NewName,
+    /// The type and size of the argument of the same name.
+    SameAsArgument,
+    /// One of the five types.
+    Type,
+    /// A size in 32 bits.
+    Size,
+    /// Fewer variables.
+    FewerVariables,
+    /// A signature that takes fewer bytes.
+    ShorterSignature,
+    /// This character.
+    Character(char),
+    /// A further variable or the end of the list.
+    CommaOrParenthesis,
+    /// The results or the end of the text.
+    ArrowOrEnd,
+    /// The end of the text.
+    End,
+}
+
+impl fmt::Display for Expected {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Name => "a name",
+            Self::ShorterName => "a shorter name",
+            Self::NewName => "a name that is not in the list yet",
+            Self::SameAsArgument => "the type and size of the argument of this name",
+            Self::Type => "a type: int, float, string, bool or bytes",
+            Self::Size => "a size: a number of 32 bits",
+            Self::FewerVariables => "fewer variables",
+            Self::ShorterSignature => "a shorter signature",
+            Self::Character(character) => return write!(f, "'{character}'"),
+            Self::CommaOrParenthesis => "',' or ')'",
+            Self::ArrowOrEnd => "'->' or the end",
+            Self::End => "the end",
+        })
+    }
+}
+
+/// Reads a signature; see [`Definition::parse`].
+pub(super) fn parse(text: &str) -> Result<Definition, ParseError> {
+    let mut parser = Parser { text: text.as_bytes(), position: 0 };
+    let (at, name) = parser.name()?;
+    let mut builder = Builder::new(name).map_err(|error| explain(at, error))?;
+    parser.list(|spec| builder.argument(spec))?;
+    parser.skip_spaces();
+    if parser.rest().is_empty() {
+        return Ok(builder.finish());
+    }
+    if !parser.take(b"->") {
+        return Err(parser.error(Expected::ArrowOrEnd));
+    }
+    parser.list(|spec| builder.result(spec))?;
+    parser.skip_spaces();
+    if parser.rest().is_empty() { Ok(builder.finish()) } else { Err(parser.error(Expected::End)) }
+}
+
+struct Parser<'a> {
+    text: &'a [u8],
+    position: usize,
+}
+
+impl<'a> Parser<'a> {
+    fn list(&mut self, mut add: impl FnMut(VariableSpec<'_>) -> Result<(), Error>) -> Result<(), ParseError> {
+        self.character('(')?;
+        self.skip_spaces();
+        if self.take(b")") {
+            return Ok(());
+        }
+        loop {
+            let (at, name) = self.name()?;
+            self.character(':')?;
+            let (kind, size) = self.type_and_size()?;
+            add(VariableSpec { name, kind, size }).map_err(|error| explain(at, error))?;
+            self.skip_spaces();
+            if self.take(b")") {
+                return Ok(());
+            }
+            if !self.take(b",") {
+                return Err(self.error(Expected::CommaOrParenthesis));
+            }
+        }
+    }
+
+    fn type_and_size(&mut self) -> Result<(Type, u32), ParseError> {
+        self.skip_spaces();
+        let at = self.position;
+        let word = self.word();
+        let kind = Type::ALL.into_iter().find(|kind| kind.word() == word);
+        let kind = kind.ok_or(ParseError { position: at, expected: Expected::Type })?;
+        self.skip_spaces();
+        if kind.is_fixed() && self.rest().first() != Some(&b'[') {
+            return Ok((kind, 1));
+        }
+        self.character('[')?;
+        self.skip_spaces();
+        let at = self.position;
+        let size = self.take_while(|byte| byte.is_ascii_digit()).parse();
+        let size = size.map_err(|_| ParseError { position: at, expected: Expected::Size })?;
+        self.character(']')?;
+        Ok((kind, size))
+    }
+
+    fn name(&mut self) -> Result<(usize, &'a str), ParseError> {
+        self.skip_spaces();
+        let at = self.position;
+        let name = self.word();
+        if name.is_empty() { Err(self.error(Expected::Name)) } else { Ok((at, name)) }
+    }
+
+    fn word(&mut self) -> &'a str {
+        self.take_while(is_name_byte)
+    }
+
+    fn character(&mut self, character: char) -> Result<(), ParseError> {
+        self.skip_spaces();
+        if self.take(character.encode_utf8(&mut [0; 4]).as_bytes()) {
+            return Ok(());
+        }
+        Err(self.error(Expected::Character(character)))
+    }
+
+    fn skip_spaces(&mut self) {
+        self.take_while(|byte| byte.is_ascii_whitespace());
+    }
+
+    /// The longest run of bytes of ASCII that `belongs` accepts.
+    fn take_while(&mut self, belongs: impl Fn(u8) -> bool) -> &'a str {
+        let rest = self.rest();
+        let length = rest.iter().position(|&byte| !belongs(byte)).unwrap_or(rest.len());
+        self.position = self.position.saturating_add(length);
+        rest.get(..length).and_then(|run| core::str::from_utf8(run).ok()).unwrap_or_default()
+    }
+
+    fn take(&mut self, token: &[u8]) -> bool {
+        let found = self.rest().starts_with(token);
+        if found {
+            self.position = self.position.saturating_add(token.len());
+        }
+        found
+    }
+
+    fn rest(&self) -> &'a [u8] {
+        self.text.get(self.position..).unwrap_or_default()
+    }
+
+    const fn error(&self, expected: Expected) -> ParseError {
+        ParseError { position: self.position, expected }
+    }
+}
+
+/// What a rule about signatures asks for at a variable that breaks it.
+const fn explain(position: usize, error: Error) -> ParseError {
+    let expected = match error {
+        Error::NameTaken => Expected::NewName,
+        Error::WrongType { .. } | Error::WrongSize { .. } => Expected::SameAsArgument,
+        Error::Full(Limit::NameBytes) => Expected::ShorterName,
+        Error::Full(Limit::Variables) => Expected::FewerVariables,
+        Error::Full(_) => Expected::ShorterSignature,
+        _ => Expected::Name,
+    };
+    ParseError { position, expected }
+}

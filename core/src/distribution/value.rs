@@ -1,0 +1,422 @@
+//! The types of the IDL (paper, section 2), their values, and the Rust types that convert to and from them.
+//!
+//! Integers travel as `i64` and floats as `f64` bits; narrower Rust types convert with a check. Floats are never
+//! formatted here, so that no float formatting enters a firmware image.
+
+use core::fmt;
+
+use crate::error::Error;
+
+/// A type of the IDL. One byte on the wire.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[repr(u8)]
+pub enum Type {
+    /// 64-bit signed integers, exactly `size` of them.
+    Int = 0,
+    /// 64-bit floating-point numbers, exactly `size` of them.
+    Float = 1,
+    /// UTF-8 text of at most `size` bytes.
+    String = 2,
+    /// Truth values, exactly `size` of them.
+    Bool = 3,
+    /// At most `size` bytes.
+    Bytes = 4,
+}
+
+impl Type {
+    /// Every type.
+    pub const ALL: [Self; 5] = [Self::Int, Self::Float, Self::String, Self::Bool, Self::Bytes];
+
+    /// The type that travels as `byte`.
+    pub const fn from_wire(byte: u8) -> Option<Self> {
+        match byte {
+            0 => Some(Self::Int),
+            1 => Some(Self::Float),
+            2 => Some(Self::String),
+            3 => Some(Self::Bool),
+            4 => Some(Self::Bytes),
+            _ => None,
+        }
+    }
+
+    /// The word of the text form.
+    pub const fn word(self) -> &'static str {
+        match self {
+            Self::Int => "int",
+            Self::Float => "float",
+            Self::String => "string",
+            Self::Bool => "bool",
+            Self::Bytes => "bytes",
+        }
+    }
+
+    /// Whether a size n means exactly n elements; of the others it means at most n bytes.
+    pub const fn is_fixed(self) -> bool {
+        matches!(self, Self::Int | Self::Float | Self::Bool)
+    }
+
+    /// Bytes of one element.
+    pub const fn width(self) -> usize {
+        match self {
+            Self::Int | Self::Float => 8,
+            Self::String | Self::Bool | Self::Bytes => 1,
+        }
+    }
+
+    /// Bytes that `size` elements take; `None` where that exceeds the address space.
+    pub const fn bytes_of(self, size: u32) -> Option<usize> {
+        (size as usize).checked_mul(self.width())
+    }
+}
+
+impl fmt::Display for Type {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.word())
+    }
+}
+
+/// The value of one variable, borrowed.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub struct Value<'a> {
+    pub(crate) index: u8,
+    pub(crate) kind: Type,
+    pub(crate) size: u32,
+    pub(crate) bytes: &'a [u8],
+}
+
+impl<'a> Value<'a> {
+    /// The variable's type.
+    pub const fn kind(&self) -> Type {
+        self.kind
+    }
+
+    /// The variable's declared size.
+    pub const fn size(&self) -> u32 {
+        self.size
+    }
+
+    /// The value as it lies in memory: little-endian words, one byte per truth value, or the bytes of text.
+    pub const fn raw(&self) -> &'a [u8] {
+        self.bytes
+    }
+
+    /// The integers; none for another type.
+    pub fn ints(&self) -> impl Iterator<Item = i64> + Clone + use<'a> {
+        self.words(Type::Int).map(i64::from_le_bytes)
+    }
+
+    /// The floating-point numbers; none for another type.
+    pub fn floats(&self) -> impl Iterator<Item = f64> + Clone + use<'a> {
+        self.words(Type::Float).map(f64::from_le_bytes)
+    }
+
+    /// The truth values; none for another type.
+    pub fn bools(&self) -> impl Iterator<Item = bool> + Clone + use<'a> {
+        let bytes = if self.kind == Type::Bool { self.bytes } else { &[] };
+        bytes.iter().map(|&byte| byte != 0)
+    }
+
+    /// The text; `None` for another type.
+    pub fn text(&self) -> Option<&'a str> {
+        if self.kind != Type::String {
+            return None;
+        }
+        core::str::from_utf8(self.bytes).ok()
+    }
+
+    fn words(&self, kind: Type) -> impl Iterator<Item = [u8; 8]> + Clone + use<'a> {
+        let bytes = if self.kind == kind { self.bytes } else { &[] };
+        bytes.as_chunks::<8>().0.iter().copied()
+    }
+
+    const fn wrong_type(&self) -> Error {
+        Error::WrongType { index: self.index }
+    }
+
+    fn wrong_size(&self, found: usize) -> Error {
+        let count = if self.kind.is_fixed() { self.size } else { saturate(self.bytes.len()) };
+        Error::WrongSize { index: self.index, expected: count, found: saturate(found) }
+    }
+}
+
+impl fmt::Debug for Value<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}[{}]", self.kind, self.size)
+    }
+}
+
+/// The place of one variable's value, borrowed for setting it.
+pub struct Target<'a> {
+    pub(crate) index: u8,
+    pub(crate) kind: Type,
+    pub(crate) size: u32,
+    pub(crate) length: &'a mut u32,
+    pub(crate) bytes: &'a mut [u8],
+}
+
+impl Target<'_> {
+    /// The variable's type.
+    pub const fn kind(&self) -> Type {
+        self.kind
+    }
+
+    /// The variable's declared size.
+    pub const fn size(&self) -> u32 {
+        self.size
+    }
+
+    fn set_raw(self, bytes: &[u8]) -> Result<(), Error> {
+        let index = self.index;
+        let wrong = Error::WrongSize { index, expected: self.size, found: saturate(bytes.len()) };
+        copy(bytes, self.bytes.get_mut(..bytes.len()).ok_or(wrong)?);
+        *self.length = saturate(bytes.len());
+        Ok(())
+    }
+
+    fn set_elements<T: Element>(self, elements: &[T]) -> Result<(), Error> {
+        if self.kind == Type::Bytes
+            && let Some(bytes) = T::as_bytes(elements)
+        {
+            return self.set_raw(bytes);
+        }
+        if self.kind != T::KIND {
+            return Err(Error::WrongType { index: self.index });
+        }
+        if elements.len() != self.size as usize {
+            let found = saturate(elements.len());
+            return Err(Error::WrongSize { index: self.index, expected: self.size, found });
+        }
+        if !elements.iter().all(|element| element.fits()) {
+            return Err(Error::OutOfRange);
+        }
+        for (place, element) in self.bytes.chunks_exact_mut(T::KIND.width()).zip(elements) {
+            element.store(place);
+        }
+        Ok(())
+    }
+}
+
+/// A Rust type that a variable can be read as.
+///
+/// Implemented for integers, floats and `bool`, arrays of them, `&str` and `&[u8]`. The size must be exact.
+pub trait FromValue<'a>: Sized {
+    /// Reads the value; [`Error::WrongType`], [`Error::WrongSize`] or [`Error::OutOfRange`].
+    fn from_value(value: Value<'a>) -> Result<Self, Error>;
+}
+
+/// A Rust type that a variable can be set from.
+///
+/// Implemented for integers, floats and `bool`, arrays and slices of them, `&str` and `&[u8]`. Setting is
+/// all-or-nothing.
+pub trait IntoValue {
+    /// Sets the value; [`Error::WrongType`], [`Error::WrongSize`] or [`Error::OutOfRange`], and then it is unchanged.
+    fn into_value(self, target: Target<'_>) -> Result<(), Error>;
+}
+
+impl<T: Element> FromValue<'_> for T {
+    fn from_value(value: Value<'_>) -> Result<Self, Error> {
+        let mut element = [T::default()];
+        read_elements(value, &mut element)?;
+        let [element] = element;
+        Ok(element)
+    }
+}
+
+impl<T: Element, const N: usize> FromValue<'_> for [T; N] {
+    fn from_value(value: Value<'_>) -> Result<Self, Error> {
+        let mut elements = [T::default(); N];
+        read_elements(value, &mut elements)?;
+        Ok(elements)
+    }
+}
+
+impl<'a> FromValue<'a> for &'a str {
+    fn from_value(value: Value<'a>) -> Result<Self, Error> {
+        value.text().ok_or_else(|| value.wrong_type())
+    }
+}
+
+impl<'a> FromValue<'a> for &'a [u8] {
+    fn from_value(value: Value<'a>) -> Result<Self, Error> {
+        if value.kind == Type::Bytes { Ok(value.bytes) } else { Err(value.wrong_type()) }
+    }
+}
+
+impl<T: Element> IntoValue for T {
+    fn into_value(self, target: Target<'_>) -> Result<(), Error> {
+        target.set_elements(&[self])
+    }
+}
+
+impl<T: Element, const N: usize> IntoValue for [T; N] {
+    fn into_value(self, target: Target<'_>) -> Result<(), Error> {
+        target.set_elements(&self)
+    }
+}
+
+impl<T: Element, const N: usize> IntoValue for &[T; N] {
+    fn into_value(self, target: Target<'_>) -> Result<(), Error> {
+        target.set_elements(self)
+    }
+}
+
+impl<T: Element> IntoValue for &[T] {
+    fn into_value(self, target: Target<'_>) -> Result<(), Error> {
+        target.set_elements(self)
+    }
+}
+
+impl IntoValue for &str {
+    fn into_value(self, target: Target<'_>) -> Result<(), Error> {
+        if target.kind != Type::String {
+            return Err(Error::WrongType { index: target.index });
+        }
+        target.set_raw(self.as_bytes())
+    }
+}
+
+/// Reads a whole value into `elements`, or leaves them as they are.
+pub(crate) fn read_elements<T: Element>(value: Value<'_>, elements: &mut [T]) -> Result<(), Error> {
+    let found = elements.len();
+    if value.kind == Type::Bytes
+        && let Some(bytes) = T::as_bytes_mut(elements)
+    {
+        if bytes.len() != value.bytes.len() {
+            return Err(value.wrong_size(found));
+        }
+        copy(value.bytes, bytes);
+        return Ok(());
+    }
+    if value.kind != T::KIND {
+        return Err(value.wrong_type());
+    }
+    if found != value.size as usize {
+        return Err(value.wrong_size(found));
+    }
+    let places = value.bytes.chunks_exact(T::KIND.width());
+    if places.clone().any(|place| T::load(place).is_none()) {
+        return Err(Error::OutOfRange);
+    }
+    for (element, place) in elements.iter_mut().zip(places) {
+        *element = T::load(place).unwrap_or_default();
+    }
+    Ok(())
+}
+
+/// Copies slices of equal length; does nothing for others, so that no path panics.
+pub(crate) fn copy(from: &[u8], to: &mut [u8]) {
+    if from.len() == to.len() {
+        to.copy_from_slice(from);
+    }
+}
+
+/// `length` as 32 bits.
+pub(crate) fn saturate(length: usize) -> u32 {
+    u32::try_from(length).unwrap_or(u32::MAX)
+}
+
+mod sealed {
+    pub trait Sealed {}
+}
+
+/// A Rust type for one element of a variable: the integers, `f32`, `f64` and `bool`.
+pub trait Element: Copy + Default + sealed::Sealed {
+    /// The type of the IDL that holds it.
+    const KIND: Type;
+    /// Reads an element; `None` if it is out of this type's range.
+    #[doc(hidden)]
+    fn load(place: &[u8]) -> Option<Self>;
+    /// Writes an element that fits.
+    #[doc(hidden)]
+    fn store(&self, place: &mut [u8]);
+    /// Whether the element can be stored.
+    #[doc(hidden)]
+    fn fits(&self) -> bool {
+        true
+    }
+    /// The elements as bytes, if that is what they are.
+    #[doc(hidden)]
+    fn as_bytes(_: &[Self]) -> Option<&[u8]> {
+        None
+    }
+    /// The elements as bytes, if that is what they are.
+    #[doc(hidden)]
+    fn as_bytes_mut(_: &mut [Self]) -> Option<&mut [u8]> {
+        None
+    }
+}
+
+macro_rules! integer {
+    ($($integer:ty { $($more:item)* })*) => {$(
+        impl sealed::Sealed for $integer {}
+        impl Element for $integer {
+            const KIND: Type = Type::Int;
+            fn load(place: &[u8]) -> Option<Self> {
+                place.try_into().ok().and_then(|word| Self::try_from(i64::from_le_bytes(word)).ok())
+            }
+            fn store(&self, place: &mut [u8]) {
+                copy(&i64::try_from(*self).unwrap_or_default().to_le_bytes(), place);
+            }
+            fn fits(&self) -> bool {
+                i64::try_from(*self).is_ok()
+            }
+            $($more)*
+        }
+    )*};
+}
+
+integer! {
+    i8 {}
+    i16 {}
+    i32 {}
+    i64 {}
+    isize {}
+    u16 {}
+    u32 {}
+    u64 {}
+    usize {}
+    u8 {
+        fn as_bytes(elements: &[Self]) -> Option<&[u8]> {
+            Some(elements)
+        }
+        fn as_bytes_mut(elements: &mut [Self]) -> Option<&mut [u8]> {
+            Some(elements)
+        }
+    }
+}
+
+impl sealed::Sealed for f64 {}
+impl Element for f64 {
+    const KIND: Type = Type::Float;
+    fn load(place: &[u8]) -> Option<Self> {
+        place.try_into().ok().map(Self::from_le_bytes)
+    }
+    fn store(&self, place: &mut [u8]) {
+        copy(&self.to_le_bytes(), place);
+    }
+}
+
+impl sealed::Sealed for f32 {}
+impl Element for f32 {
+    const KIND: Type = Type::Float;
+    /// Rounds to the nearest; a finite number that would become infinite is out of range.
+    fn load(place: &[u8]) -> Option<Self> {
+        let wide = f64::load(place)?;
+        let narrow = wide as f32;
+        (narrow.is_finite() || !wide.is_finite()).then_some(narrow)
+    }
+    fn store(&self, place: &mut [u8]) {
+        f64::from(*self).store(place);
+    }
+}
+
+impl sealed::Sealed for bool {}
+impl Element for bool {
+    const KIND: Type = Type::Bool;
+    fn load(place: &[u8]) -> Option<Self> {
+        place.first().map(|&byte| byte != 0)
+    }
+    fn store(&self, place: &mut [u8]) {
+        copy(&[u8::from(*self)], place);
+    }
+}
