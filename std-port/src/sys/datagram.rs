@@ -184,3 +184,105 @@ fn network(errno: Errno) -> Error {
     tracing::warn!(%errno, "a socket for datagrams could not be opened");
     Error::Network
 }
+
+#[cfg(test)]
+mod tests {
+    use std::net::UdpSocket;
+
+    use super::super::epoll::wait_readable;
+    use super::*;
+
+    /// Waits for one datagram that is `expected`; other units of the host may broadcast to the same port.
+    fn receive(unit: &Datagrams, socket: Socket, expected: &[u8]) -> SocketAddr {
+        let start = Instant::now();
+        let mut buffer = [0; 64];
+        while start.elapsed() < Duration::from_secs(5) {
+            match unit.receive(socket, &mut buffer) {
+                Some((count, source)) if &buffer[..count] == expected => return source,
+                Some(_) => {}
+                None => drop(wait_readable(unit.fd(socket), Duration::from_millis(20).into())),
+            }
+        }
+        panic!("{expected:?} did not arrive in time")
+    }
+
+    fn units<const N: usize>() -> [Datagrams; N] {
+        let mut port = 0;
+        std::array::from_fn(|_| {
+            let unit = Datagrams::open(Interfaces::Loopback, port).unwrap();
+            port = unit.discovery_port();
+            unit
+        })
+    }
+
+    #[test]
+    fn a_broadcast_reaches_every_other_unit_that_shares_the_port() {
+        let [sender, first, second] = units();
+        assert!(sender.broadcast(b"who has?"));
+        let from = SocketAddr::from((Ipv4Addr::LOCALHOST, sender.own_port()));
+        assert_eq!(receive(&first, Socket::Shared, b"who has?"), from);
+        assert_eq!(receive(&second, Socket::Shared, b"who has?"), from);
+    }
+
+    #[test]
+    fn own_broadcasts_are_not_heard() {
+        let [sender, other] = units();
+        sender.broadcast(b"mine");
+        other.broadcast(b"theirs");
+        // Whatever precedes the other's datagram would be the own one.
+        let start = Instant::now();
+        let mut buffer = [0; 64];
+        let count = loop {
+            match sender.receive(Socket::Shared, &mut buffer) {
+                Some((count, _)) if matches!(&buffer[..count], b"mine" | b"theirs") => break count,
+                _ => assert!(start.elapsed() < Duration::from_secs(5)),
+            }
+        };
+        assert_eq!(&buffer[..count], b"theirs");
+    }
+
+    #[test]
+    fn an_answer_goes_to_the_own_socket_of_one_unit_alone() {
+        let [asker, answerer, third] = units();
+        asker.broadcast(b"who has?");
+        let from = receive(&answerer, Socket::Shared, b"who has?");
+        assert!(answerer.send_to(from, b"here"));
+        assert_eq!(receive(&asker, Socket::Own, b"here").port(), answerer.own_port());
+        assert_eq!(third.receive(Socket::Own, &mut [0; 64]), None);
+    }
+
+    #[test]
+    fn a_port_that_a_foreign_program_has_is_an_error_of_its_own() {
+        let foreign = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).unwrap();
+        let port = foreign.local_addr().unwrap().port();
+        assert_eq!(Datagrams::open(Interfaces::Loopback, port).unwrap_err(), Error::PortInUse);
+    }
+
+    #[test]
+    fn a_datagram_that_nobody_reads_harms_no_other() {
+        let [unit, other] = units();
+        let gone = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap().local_addr().unwrap();
+        for _ in 0..10 {
+            assert!(unit.send_to(gone, b"lost"));
+        }
+        let to = SocketAddr::from((Ipv4Addr::LOCALHOST, other.own_port()));
+        assert!(unit.send_to(to, b"kept"));
+        receive(&other, Socket::Own, b"kept");
+    }
+
+    #[test]
+    fn a_long_datagram_is_cut_to_the_buffer_and_an_oversize_one_refused() {
+        let [unit, other] = units();
+        let to = SocketAddr::from((Ipv4Addr::LOCALHOST, other.own_port()));
+        assert!(unit.send_to(to, &[1; 100]));
+        assert!(!unit.send_to(to, &[1; 70_000]));
+        assert_eq!(receive(&other, Socket::Own, &[1; 64]).port(), unit.own_port());
+    }
+
+    #[test]
+    fn loopback_alone_has_no_other_target() {
+        let [unit] = units();
+        let targets = unit.targets();
+        assert!(!targets.is_empty() && targets.iter().all(|interface| interface.address.is_loopback()), "{targets:?}");
+    }
+}

@@ -268,3 +268,165 @@ impl Of for AddressFamily {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::time::Instant;
+
+    use super::super::epoll::{Epoll, Events, Interest};
+    use super::*;
+
+    const LIMIT: Duration = Duration::from_secs(5);
+
+    /// Waits until `fd` is ready for `interest`; fails after [`LIMIT`].
+    fn await_ready(fd: impl AsFd, interest: Interest) {
+        let set = Epoll::new().unwrap();
+        set.add(fd, 0, interest).unwrap();
+        let mut events = Events::new(1);
+        set.wait(&mut events, Some(LIMIT)).unwrap();
+        assert!(!events.is_empty(), "nothing became ready in time");
+    }
+
+    fn pair() -> (Stream, Stream) {
+        let listener = Listener::open(Ipv4Addr::LOCALHOST, 0).unwrap();
+        let near = Stream::connect(SocketAddrV4::new(Ipv4Addr::LOCALHOST, listener.port()).into()).unwrap();
+        await_ready(&near, Interest::WRITE_ONCE);
+        assert_eq!(near.finish_connect(), Ok(true));
+        await_ready(&listener, Interest::READ_LEVEL);
+        let Accepted::Stream(far, address) = listener.accept() else { panic!("nobody was accepted") };
+        assert_eq!(Some(address), near.local_address());
+        assert!(matches!(listener.accept(), Accepted::WouldBlock));
+        (near, far)
+    }
+
+    /// Receives exactly `count` bytes.
+    fn receive_all(stream: &Stream, count: usize) -> Vec<u8> {
+        let start = Instant::now();
+        let (mut all, mut buffer) = (Vec::new(), [0; 4096]);
+        while all.len() < count && start.elapsed() < LIMIT.into() {
+            match stream.receive(&mut buffer, Wait::Slice) {
+                Received::Bytes(count) => all.extend_from_slice(&buffer[..count]),
+                Received::WouldBlock => {}
+                Received::Closed => break,
+            }
+        }
+        all
+    }
+
+    #[test]
+    fn slices_arrive_in_order_in_both_directions() {
+        let (near, far) = pair();
+        assert_eq!(near.send(&[]), Ok(0));
+        assert_eq!(near.send(&[b"one "]), Ok(4));
+        assert_eq!(near.send(&[b"two ", b"", b"three "]), Ok(10));
+        assert_eq!(receive_all(&far, 14), b"one two three ");
+        let many = [b"x".as_slice(); SLICES + 3];
+        assert_eq!(far.send(&many), Ok(SLICES), "the rest is left to the next call");
+        assert_eq!(receive_all(&near, SLICES), [b'x'; SLICES]);
+    }
+
+    #[test]
+    fn a_receive_waits_as_long_as_it_is_told() {
+        let (near, _far) = pair();
+        let mut buffer = [0; 8];
+        let mut waited = |wait| {
+            let start = Instant::now();
+            assert_eq!(near.receive(&mut buffer, wait), Received::WouldBlock);
+            Duration::from(start.elapsed())
+        };
+        let short = Duration::from_millis(3);
+        assert!(waited(Wait::AtMost(short)) >= short);
+        assert!(waited(Wait::Slice) >= SLICE);
+        assert!(waited(Wait::AtMost(LIMIT)) >= SLICE);
+        let fastest = (0..10).map(|_| waited(Wait::Not)).min();
+        assert!(fastest < Some(Duration::from_millis(1)), "{fastest:?}");
+        let fastest = (0..10).map(|_| waited(Wait::AtMost(short))).min();
+        assert!(fastest < Some(SLICE), "{fastest:?}");
+    }
+
+    #[test]
+    fn a_full_socket_takes_a_part_then_nothing_and_has_room_after_a_read() {
+        let (near, far) = pair();
+        let bytes = vec![7u8; 1 << 20];
+        let mut sent = 0;
+        loop {
+            match near.send(&[&bytes]).unwrap() {
+                0 => break,
+                count => sent += count,
+            }
+            assert!(sent < 1 << 28, "the kernel bounds nothing");
+        }
+        assert!(sent > 0);
+        assert_eq!(receive_all(&far, sent).len(), sent);
+        await_ready(&near, Interest::WRITE_ONCE);
+        assert!(near.send(&[&bytes]).unwrap() > 0);
+    }
+
+    #[test]
+    fn the_end_of_a_stream_is_told_to_reader_and_sender() {
+        let (near, far) = pair();
+        far.send(&[b"bye"]).unwrap();
+        drop(far);
+        assert_eq!(receive_all(&near, 4), b"bye");
+        assert_eq!(near.receive(&mut [0; 8], Wait::Not), Received::Closed);
+        let start = Instant::now();
+        let ended = loop {
+            if let Err(reason) = near.send(&[b"x"]) {
+                break reason;
+            }
+            assert!(start.elapsed() < LIMIT.into());
+        };
+        assert_eq!(ended, CloseReason::Reset);
+    }
+
+    #[test]
+    fn shutdown_ends_a_receive_of_another_thread() {
+        let (near, far) = pair();
+        std::thread::scope(|scope| {
+            let waiting = scope.spawn(|| {
+                let start = Instant::now();
+                loop {
+                    match near.receive(&mut [0; 8], Wait::Slice) {
+                        Received::WouldBlock if start.elapsed() < LIMIT.into() => {}
+                        other => break other,
+                    }
+                }
+            });
+            near.shutdown();
+            assert_eq!(waiting.join().unwrap(), Received::Closed);
+        });
+        await_ready(&far, Interest::READ_LEVEL);
+        assert_eq!(far.receive(&mut [0; 8], Wait::Not), Received::Closed);
+    }
+
+    #[test]
+    fn a_port_where_nobody_listens_is_a_failed_dial() {
+        let unused = Listener::open(Ipv4Addr::LOCALHOST, 0).unwrap().port();
+        let failed = Stream::connect(SocketAddrV4::new(Ipv4Addr::LOCALHOST, unused).into()).and_then(|stream| {
+            await_ready(&stream, Interest::WRITE_ONCE);
+            stream.finish_connect()
+        });
+        assert_eq!(failed, Err(CloseReason::DialFailed));
+    }
+
+    #[test]
+    fn a_connect_that_goes_on_is_neither_done_nor_failed() {
+        // A full backlog keeps the next connection waiting.
+        let flags = SocketFlags::CLOEXEC;
+        let full = socket_with(AddressFamily::INET, SocketType::STREAM, flags, None).unwrap();
+        bind(&full, &SocketAddrV4::new(Ipv4Addr::LOCALHOST, 0)).unwrap();
+        listen(&full, 0).unwrap();
+        let to = SocketAddrV4::new(Ipv4Addr::LOCALHOST, local_port(&full).unwrap()).into();
+        let dials: Vec<_> = (0..4).map(|_| Stream::connect(to).unwrap()).collect();
+        assert_eq!(dials.last().unwrap().finish_connect(), Ok(false));
+    }
+
+    #[test]
+    fn links_do_not_gather_small_writes_and_bound_what_is_unsent() {
+        for stream in <[Stream; 2]>::from(pair()) {
+            assert_eq!(sockopt::tcp_nodelay(&stream.socket), Ok(true));
+            assert_eq!(socket2::SockRef::from(&stream.socket).tcp_notsent_lowat().unwrap(), UNSENT_BYTES);
+            assert!(!socket2::SockRef::from(&stream.socket).nonblocking().unwrap());
+        }
+    }
+}
