@@ -1,0 +1,123 @@
+//! One block: a number of callers that start together and make their calls, each call timed.
+
+use std::sync::Barrier;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, ensure};
+use serde::{Deserialize, Serialize};
+
+use crate::peers::{Caller, Peer};
+
+/// Calls of each caller before those that count.
+const WARM_UP: u32 = 3;
+
+/// What a client process is told to do.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub(crate) struct Order {
+    pub(crate) chars: u32,
+    pub(crate) callers: u32,
+    pub(crate) calls_per_caller: u32,
+    pub(crate) pause_ms: u64,
+}
+
+/// What came of it.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub(crate) struct Outcome {
+    /// Of each call, in nanoseconds.
+    pub(crate) round_trips: Vec<u64>,
+    /// From the common start to the last answer, in nanoseconds.
+    pub(crate) elapsed: u64,
+    /// Time of all CPUs that this process used, in nanoseconds, for this many calls: those before the start count, too.
+    pub(crate) cpu: u64,
+    pub(crate) cpu_calls: u64,
+}
+
+/// The callers of a client process; those once connected stay so from block to block.
+pub(crate) struct Callers<'a> {
+    peer: &'a dyn Peer,
+    run: u32,
+    address: &'a str,
+    connected: Vec<Box<dyn Caller>>,
+}
+
+impl<'a> Callers<'a> {
+    pub(crate) fn new(peer: &'a dyn Peer, run: u32, address: &'a str) -> Self {
+        Self { peer, run, address, connected: Vec::new() }
+    }
+
+    /// Makes the calls of one block.
+    pub(crate) fn run(&mut self, order: &Order) -> Result<Outcome> {
+        let wanted = order.callers as usize;
+        while self.connected.len() < wanted {
+            let caller = self.peer.connect(self.run, self.address).context("connecting")?;
+            self.connected.push(caller);
+        }
+        let text: String = ('a'..='z').cycle().take(order.chars as usize).collect();
+        let barrier = Barrier::new(wanted);
+        let used = cpu_time();
+        let (barrier, text) = (&barrier, text.as_str());
+        let timed: Vec<Result<Timed>> = thread::scope(|scope| {
+            let callers = self.connected.iter_mut().take(wanted);
+            let threads: Vec<_> =
+                callers.map(|caller| scope.spawn(move || make_calls(&mut **caller, order, text, barrier))).collect();
+            threads.into_iter().map(|thread| thread.join().expect("a caller does not panic")).collect()
+        });
+        let cpu = cpu_time().saturating_sub(used);
+        let timed = timed.into_iter().collect::<Result<Vec<_>>>()?;
+        let start = timed.iter().map(|timed| timed.start).min().context("no callers")?;
+        let end = timed.iter().map(|timed| timed.end).max().context("no callers")?;
+        let round_trips = timed.into_iter().flat_map(|timed| timed.round_trips).collect();
+        let cpu_calls = u64::from(order.callers) * u64::from(WARM_UP + order.calls_per_caller);
+        Ok(Outcome { round_trips, elapsed: nanoseconds(end - start), cpu, cpu_calls })
+    }
+}
+
+struct Timed {
+    start: Instant,
+    end: Instant,
+    round_trips: Vec<u64>,
+}
+
+fn make_calls(caller: &mut dyn Caller, order: &Order, text: &str, barrier: &Barrier) -> Result<Timed> {
+    let pause = Duration::from_millis(order.pause_ms);
+    let mut failed = None;
+    for _ in 0..WARM_UP {
+        failed = failed.or(call(caller, text).err());
+    }
+    let mut round_trips = Vec::with_capacity(order.calls_per_caller as usize);
+    // Everyone passes the barrier, even after a failure: the others wait there.
+    barrier.wait();
+    if let Some(error) = failed {
+        return Err(error);
+    }
+    let start = Instant::now();
+    let mut end = start;
+    for _ in 0..order.calls_per_caller {
+        if !pause.is_zero() {
+            thread::sleep(pause);
+            end = Instant::now();
+        }
+        let before = end;
+        call(caller, text)?;
+        end = Instant::now();
+        round_trips.push(nanoseconds(end - before));
+    }
+    Ok(Timed { start, end, round_trips })
+}
+
+fn call(caller: &mut dyn Caller, text: &str) -> Result<()> {
+    let length = caller.echo(text)?;
+    ensure!(length == text.len(), "{length} bytes came back of {}", text.len());
+    Ok(())
+}
+
+/// Nanoseconds of all CPUs that this process has used so far.
+pub(crate) fn cpu_time() -> u64 {
+    let used = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
+    u64::try_from(used.tv_sec * 1_000_000_000 + used.tv_nsec).unwrap_or(0)
+}
+
+fn nanoseconds(span: Duration) -> u64 {
+    u64::try_from(span.as_nanos()).unwrap_or(u64::MAX)
+}

@@ -1,0 +1,52 @@
+//! Where the two ends of a measurement run. It matters more than most of what is measured.
+
+use std::fmt;
+
+use anyhow::{Result, ensure};
+use clap::ValueEnum;
+use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
+
+/// Which CPUs client and server stay on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Pin {
+    /// Both on one CPU: the time is the total work of both.
+    Same,
+    /// One CPU each: the time includes waking the other CPU.
+    Split,
+    /// Where the scheduler puts them; jumps between the other two.
+    None,
+}
+
+impl fmt::Display for Pin {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(match self {
+            Self::Same => "same",
+            Self::Split => "split",
+            Self::None => "none",
+        })
+    }
+}
+
+/// The CPUs of client and server; an error where the machine has too few.
+pub(crate) fn cpus(pin: Pin) -> Result<[Option<usize>; 2]> {
+    let allowed = sched_getaffinity(None)?;
+    let mut allowed = (0..CpuSet::MAX_CPU).filter(|cpu| allowed.is_set(*cpu));
+    let (first, second) = (allowed.next(), allowed.next());
+    match pin {
+        Pin::Same => Ok([first, first]),
+        Pin::None => Ok([None, None]),
+        Pin::Split => {
+            ensure!(second.is_some(), "pin split needs two CPUs");
+            Ok([first, second])
+        }
+    }
+}
+
+/// Keeps this thread, and those that it starts from now on, on `cpu`.
+pub(crate) fn stay_on(cpu: Option<usize>) -> Result<()> {
+    let Some(cpu) = cpu else { return Ok(()) };
+    ensure!(cpu < CpuSet::MAX_CPU, "there is no CPU {cpu}");
+    let mut set = CpuSet::new();
+    set.set(cpu);
+    Ok(sched_setaffinity(None, &set)?)
+}
