@@ -104,7 +104,7 @@ pub fn longest<'s>(mut specs: impl Iterator<Item = VariableSpec<'s>>) -> Option<
     })
 }
 
-/// Validates all of a block, UTF-8 included; [`Error::Malformed`] for any block that [`write`] can't have made.
+/// Validates all of a block, UTF-8 included; [`Error::Malformed`] for any block that [`write()`] can't have made.
 pub fn check<'s>(specs: impl Iterator<Item = VariableSpec<'s>>, block: &[u8]) -> Result<(), Error> {
     each(specs, block, |_, _, _| Ok(()))
 }
@@ -299,3 +299,6 @@ fn encoded_length(value: Value<'_>) -> usize {
 const fn padding_after(length: usize) -> usize {
     length.wrapping_neg() & 7
 }
+
+#[cfg(test)]
+mod tests;

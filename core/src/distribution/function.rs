@@ -6,11 +6,12 @@
 
 use core::fmt;
 
-use crate::config::{Priority, SIGNATURE_BYTES, VARIABLES};
+use crate::config::{SIGNATURE_BYTES, VARIABLES};
 use crate::error::{Error, Limit};
-use crate::time::Duration;
 
-use super::parameters::{ParametersView, Type, bytes_of_variable, check_name};
+pub use super::attributes::Attributes;
+use super::name::check_name;
+use super::parameters::{ParametersView, Type, bytes_of_variable};
 use super::text::{self, ParseError};
 use super::value::saturate;
 
@@ -56,17 +57,6 @@ pub struct VariableSpec<'a> {
 pub struct VariableSpecs<'a> {
     left: u8,
     rest: &'a [u8],
-}
-
-/// How a function wants to be called.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Attributes {
-    /// Priority of calls that name none.
-    pub priority: Priority,
-    /// What the function starts goes on for this long after the last call; whole milliseconds travel.
-    pub lease: Option<Duration>,
-    /// Running it twice is as good as running it once.
-    pub idempotent: bool,
 }
 
 impl Definition {
@@ -227,35 +217,6 @@ impl<'a> VariableSpec<'a> {
     }
 }
 
-impl Attributes {
-    /// Bytes of the encoded form.
-    pub const WIRE_BYTES: usize = 8;
-    const IDEMPOTENT: u8 = 1 << 2;
-
-    /// Bits 0 and 1: priority; bit 2: idempotent; three bytes of zero; the lease in milliseconds, u32 little-endian, 0
-    /// for none. A lease is rounded down, but never to none.
-    pub fn encode(&self) -> [u8; Self::WIRE_BYTES] {
-        let flags = self.priority as u8 | if self.idempotent { Self::IDEMPOTENT } else { 0 };
-        let lease = self.lease.map_or(0, |lease| u32::try_from(lease.as_millis()).unwrap_or(u32::MAX).max(1));
-        let [a, b, c, d] = lease.to_le_bytes();
-        [flags, 0, 0, 0, a, b, c, d]
-    }
-
-    /// The inverse of [`encode`](Self::encode); [`Error::Malformed`] for any other bytes.
-    pub fn decode(bytes: &[u8]) -> Result<Self, Error> {
-        let &[flags, 0, 0, 0, a, b, c, d] = bytes else { return Err(Error::Malformed) };
-        if flags >= Self::IDEMPOTENT << 1 {
-            return Err(Error::Malformed);
-        }
-        let lease = u32::from_le_bytes([a, b, c, d]);
-        Ok(Self {
-            priority: Priority::from_wire(flags & 3).ok_or(Error::Malformed)?,
-            lease: (lease != 0).then(|| Duration::from_millis(u64::from(lease))),
-            idempotent: flags & Self::IDEMPOTENT != 0,
-        })
-    }
-}
-
 /// Writes a signature variable by variable, and knows every rule about signatures.
 pub(super) struct Builder {
     bytes: heapless::Vec<u8, SIGNATURE_BYTES>,
@@ -411,3 +372,6 @@ impl fmt::Debug for Definition {
         fmt::Display::fmt(self, f)
     }
 }
+
+#[cfg(test)]
+pub(super) mod tests;

@@ -5,82 +5,13 @@
 
 use core::fmt;
 
-use serde::{Deserialize, Serialize};
-
-use super::function::{Attributes, Definition, Signature};
-use super::value::{copy, saturate};
+use super::function::{Definition, Signature};
+use super::table::Table;
+pub use super::table::{Entry, Function, Generation, Slot};
 use crate::error::{Error, Limit};
 use crate::storage::Storage;
 
-/// A function's place in its owner's list.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-pub struct Slot(pub u16);
-
-/// Tells apart the functions that have been in one slot.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-pub struct Generation(pub u16);
-
-/// A function in a list. `H` is its handler; `()` in a peer's list.
-pub struct Function<'a, H = ()> {
-    /// Its place.
-    pub slot: Slot,
-    /// The generation of its place.
-    pub generation: Generation,
-    /// Its name, arguments and results.
-    pub signature: Signature<'a>,
-    /// How it wants to be called.
-    pub attributes: Attributes,
-    /// What runs it.
-    pub handler: &'a H,
-}
-
-impl<'a, H> Function<'a, H> {
-    /// Its name.
-    pub const fn name(&self) -> &'a str {
-        self.signature.name()
-    }
-}
-
-impl<H> Clone for Function<'_, H> {
-    fn clone(&self) -> Self {
-        *self
-    }
-}
-
-impl<H> Copy for Function<'_, H> {}
-
-impl<H> fmt::Debug for Function<'_, H> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}.{}: {}", self.slot.0, self.generation.0, self.signature)
-    }
-}
-
-/// Room for one function; ports allocate a slice of empty ones.
-pub struct Entry<H = ()> {
-    generation: Generation,
-    function: Option<Stored<H>>,
-}
-
-struct Stored<H> {
-    slot: Slot,
-    at: u32,
-    length: u16,
-    attributes: Attributes,
-    handler: H,
-}
-
-impl<H> Entry<H> {
-    /// Room without a function.
-    pub const fn empty() -> Self {
-        Self { generation: Generation(0), function: None }
-    }
-}
-
-impl<H> Default for Entry<H> {
-    fn default() -> Self {
-        Self::empty()
-    }
-}
+use super::attributes::Attributes;
 
 /// One's own functions (paper: `my_function_list`).
 ///
@@ -92,8 +23,8 @@ impl<H> Default for Entry<H> {
 /// use cara_core::storage::Lent;
 ///
 /// // A port lends room for 4 functions in 256 bytes of signatures.
-/// let entries = Box::leak(Box::new([const { Entry::<fn()>::empty() }; 4]));
-/// let bytes = Box::leak(Box::new([0; 256]));
+/// let entries: &'static mut [_] = Box::leak(Box::new([const { Entry::<fn()>::empty() }; 4]));
+/// let bytes: &'static mut [u8] = Box::leak(Box::new([0; 256]));
 /// let mut list: FunctionList<Lent, fn()> = FunctionList::new(entries, bytes);
 ///
 /// let call_mechanic = Definition::parse("call_mechanic(code: int) -> (minutes: int)").unwrap();
@@ -248,10 +179,7 @@ impl<S: Storage> TheirFunctionList<S> {
 
     /// Removes everything and forgets what was skipped.
     pub fn clear(&mut self) {
-        for entry in self.table.entries.iter_mut() {
-            entry.function = None;
-        }
-        self.table.used = 0;
+        self.table.clear();
         self.skipped = 0;
     }
 
@@ -324,101 +252,6 @@ impl<S: Storage> TheirFunctionList<S> {
     }
 }
 
-/// Entries, and one arena for all their signatures without gaps.
-struct Table<S: Storage, H: 'static> {
-    entries: S::Slice<Entry<H>>,
-    bytes: S::Slice<u8>,
-    used: usize,
-}
-
-impl<S: Storage, H: 'static> Table<S, H> {
-    fn new(entries: S::Slice<Entry<H>>, bytes: S::Slice<u8>) -> Self {
-        Self { entries, bytes, used: 0 }
-    }
-
-    fn free_index(&self) -> Option<usize> {
-        self.entries.iter().position(|entry| entry.function.is_none())
-    }
-
-    fn free_bytes(&self) -> usize {
-        self.bytes.len().saturating_sub(self.used)
-    }
-
-    /// Stores a checked signature in a free entry.
-    fn put(
-        &mut self,
-        index: usize,
-        slot: Slot,
-        attributes: Attributes,
-        signature: &[u8],
-        handler: H,
-    ) -> Result<(), Error> {
-        let entry = self.entries.get_mut(index).ok_or(Error::Full(Limit::Functions))?;
-        let end = self.used.saturating_add(signature.len());
-        let place = self.bytes.get_mut(self.used..end).ok_or(Error::Full(Limit::SignatureBytes))?;
-        copy(signature, place);
-        let length = signature.len() as u16;
-        entry.function = Some(Stored { slot, at: saturate(self.used), length, attributes, handler });
-        self.used = end;
-        Ok(())
-    }
-
-    /// Empties an entry and closes the gap in the arena.
-    fn take(&mut self, index: usize) -> Option<Stored<H>> {
-        let removed = self.entries.get_mut(index)?.function.take()?;
-        let length = usize::from(removed.length);
-        if let Some(tail) = self.bytes.get_mut(removed.at as usize..self.used)
-            && length <= tail.len()
-        {
-            tail.copy_within(length.., 0);
-        }
-        self.used = self.used.saturating_sub(length);
-        for stored in self.entries.iter_mut().filter_map(|entry| entry.function.as_mut()) {
-            if stored.at > removed.at {
-                stored.at = stored.at.saturating_sub(u32::from(removed.length));
-            }
-        }
-        Some(removed)
-    }
-
-    fn bump(&mut self, index: usize) {
-        if let Some(entry) = self.entries.get_mut(index) {
-            entry.generation.0 = entry.generation.0.wrapping_add(1);
-        }
-    }
-
-    fn find(&self, name: &str) -> Option<usize> {
-        self.entries.iter().position(|entry| {
-            entry.function.as_ref().is_some_and(|stored| {
-                let bytes = self.signature(stored);
-                bytes.get(1..name.len().saturating_add(1)) == Some(name.as_bytes())
-                    && bytes.first().map(|&length| usize::from(length)) == Some(name.len())
-            })
-        })
-    }
-
-    fn function(&self, index: usize) -> Option<Function<'_, H>> {
-        let entry = self.entries.get(index)?;
-        let stored = entry.function.as_ref()?;
-        Some(Function {
-            slot: stored.slot,
-            generation: entry.generation,
-            signature: Signature::of_checked(self.signature(stored)),
-            attributes: stored.attributes,
-            handler: &stored.handler,
-        })
-    }
-
-    fn iter(&self) -> impl Iterator<Item = Function<'_, H>> + Clone {
-        (0..self.entries.len()).filter_map(|index| self.function(index))
-    }
-
-    fn signature(&self, stored: &Stored<H>) -> &[u8] {
-        let start = stored.at as usize;
-        self.bytes.get(start..start.saturating_add(usize::from(stored.length))).unwrap_or_default()
-    }
-}
-
 struct Lines<I>(I);
 
 impl<'a, H: 'a, I: Iterator<Item = Function<'a, H>> + Clone> fmt::Display for Lines<I> {
@@ -426,3 +259,6 @@ impl<'a, H: 'a, I: Iterator<Item = Function<'a, H>> + Clone> fmt::Display for Li
         self.0.clone().try_for_each(|function| writeln!(f, "{}", function.signature))
     }
 }
+
+#[cfg(test)]
+mod tests;

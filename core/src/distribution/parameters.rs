@@ -7,9 +7,10 @@
 use core::fmt;
 use core::ops::{Deref, DerefMut};
 
-use crate::config::{NAME_BYTES, PARAMETERS_BYTES, VARIABLES};
+use crate::config::{PARAMETERS_BYTES, VARIABLES};
 use crate::error::{Error, Limit};
 
+use super::name::check_name;
 pub use super::value::{Element, FromValue, IntoValue, Target, Type, Value};
 use super::value::{copy, read_elements, saturate};
 
@@ -92,7 +93,7 @@ impl<const BYTES: usize> ParametersInner<[u8; BYTES]> {
     }
 }
 
-impl ParametersView {
+impl<B: Arena + ?Sized> ParametersInner<B> {
     /// Adds `size` integers, all 0.
     ///
     /// [`Error::NameTaken`], [`Error::BadName`] or [`Error::Full`] leave the parameters unchanged; so for all types.
@@ -132,31 +133,7 @@ impl ParametersView {
 
     /// Adds a variable of any type, with the value 0, `false` or empty.
     pub fn add(&mut self, name: &str, kind: Type, size: u32) -> Result<(), Error> {
-        check_name(name)?;
-        if self.find(name).is_some() {
-            return Err(Error::NameTaken);
-        }
-        let place = self.table.get_mut(usize::from(self.count)).ok_or(Error::Full(Limit::Variables))?;
-        let full = Error::Full(Limit::ParametersBytes);
-        let length = kind.bytes_of(size).ok_or(full)?;
-        let (_, free) = self.bytes.split_at_mut_checked(self.used as usize).ok_or(full)?;
-        let (name_place, free) = free.split_at_mut_checked(name.len()).ok_or(full)?;
-        let value = free.get_mut(..length).ok_or(full)?;
-        copy(name.as_bytes(), name_place);
-        if kind.is_fixed() {
-            value.fill(0);
-        }
-        let value_at = self.used.saturating_add(saturate(name.len()));
-        *place = Entry {
-            value_at,
-            size,
-            length: if kind.is_fixed() { saturate(length) } else { 0 },
-            name_length: name.len() as u8,
-            kind,
-        };
-        self.used = value_at.saturating_add(saturate(length));
-        self.count = self.count.saturating_add(1);
-        Ok(())
+        self.as_mut_view().add_variable(name, kind, size)
     }
 
     /// Sets a variable from a number, a truth value, an array or slice of them, a `&str` or a `&[u8]`.
@@ -175,8 +152,9 @@ impl ParametersView {
     /// # Ok::<(), Error>(())
     /// ```
     pub fn set_value(&mut self, name: &str, value: impl IntoValue) -> Result<(), Error> {
-        let index = self.find(name).ok_or(Error::UnknownVariable)?;
-        value.into_value(self.target(index).ok_or(Error::UnknownVariable)?)
+        let view = self.as_mut_view();
+        let index = view.find(name).ok_or(Error::UnknownVariable)?;
+        value.into_value(view.target(index).ok_or(Error::UnknownVariable)?)
     }
 
     /// Reads a variable as `T`: a number, a truth value, an array of them, a `&str` or a `&[u8]`.
@@ -224,20 +202,13 @@ impl ParametersView {
     }
 
     /// Replaces all variables by those of `other`; [`Error::Full`] leaves the parameters unchanged.
-    pub fn copy_from(&mut self, other: &Self) -> Result<(), Error> {
-        let full = Error::Full(Limit::ParametersBytes);
-        let used = other.used as usize;
-        let from = other.bytes.get(..used).ok_or(full)?;
-        copy(from, self.bytes.get_mut(..used).ok_or(full)?);
-        self.table = other.table;
-        self.count = other.count;
-        self.used = other.used;
-        Ok(())
+    pub fn copy_from(&mut self, other: &ParametersView) -> Result<(), Error> {
+        self.as_mut_view().replace_by(other)
     }
 
     /// Bytes that are free for further names and values.
     pub fn remaining(&self) -> usize {
-        self.bytes.len().saturating_sub(self.used as usize)
+        self.as_view().bytes.len().saturating_sub(self.used as usize)
     }
 
     /// Number of variables.
@@ -252,16 +223,69 @@ impl ParametersView {
 
     /// The variables in the order in which they were added.
     pub fn iter(&self) -> impl Iterator<Item = Variable<'_>> + Clone {
-        (0..self.len()).filter_map(|index| {
-            let entry = self.table.get(index)?;
-            let name = core::str::from_utf8(self.name_of(entry)).ok()?;
-            Some(Variable { name, kind: entry.kind, size: entry.size, value: self.value_at(index)? })
+        let view = self.as_view();
+        (0..self.len()).filter_map(move |index| {
+            let entry = view.table.get(index)?;
+            let name = core::str::from_utf8(view.name_of(entry)).ok()?;
+            Some(Variable { name, kind: entry.kind, size: entry.size, value: view.value_at(index)? })
         })
     }
 
     /// The value of a variable of any type.
     pub fn value(&self, name: &str) -> Result<Value<'_>, Error> {
-        self.find(name).and_then(|index| self.value_at(index)).ok_or(Error::UnknownVariable)
+        let view = self.as_view();
+        view.find(name).and_then(|index| view.value_at(index)).ok_or(Error::UnknownVariable)
+    }
+
+    /// The parameters without their size as a type.
+    pub fn as_view(&self) -> &ParametersView {
+        B::view(self)
+    }
+
+    /// The parameters without their size as a type.
+    pub fn as_mut_view(&mut self) -> &mut ParametersView {
+        B::view_mut(self)
+    }
+}
+
+impl ParametersView {
+    fn add_variable(&mut self, name: &str, kind: Type, size: u32) -> Result<(), Error> {
+        check_name(name)?;
+        if self.find(name).is_some() {
+            return Err(Error::NameTaken);
+        }
+        let place = self.table.get_mut(usize::from(self.count)).ok_or(Error::Full(Limit::Variables))?;
+        let full = Error::Full(Limit::ParametersBytes);
+        let length = kind.bytes_of(size).ok_or(full)?;
+        let (_, free) = self.bytes.split_at_mut_checked(self.used as usize).ok_or(full)?;
+        let (name_place, free) = free.split_at_mut_checked(name.len()).ok_or(full)?;
+        let value = free.get_mut(..length).ok_or(full)?;
+        copy(name.as_bytes(), name_place);
+        if kind.is_fixed() {
+            value.fill(0);
+        }
+        let value_at = self.used.saturating_add(saturate(name.len()));
+        *place = Entry {
+            value_at,
+            size,
+            length: if kind.is_fixed() { saturate(length) } else { 0 },
+            name_length: name.len() as u8,
+            kind,
+        };
+        self.used = value_at.saturating_add(saturate(length));
+        self.count = self.count.saturating_add(1);
+        Ok(())
+    }
+
+    fn replace_by(&mut self, other: &Self) -> Result<(), Error> {
+        let full = Error::Full(Limit::ParametersBytes);
+        let used = other.used as usize;
+        let from = other.bytes.get(..used).ok_or(full)?;
+        copy(from, self.bytes.get_mut(..used).ok_or(full)?);
+        self.table = other.table;
+        self.count = other.count;
+        self.used = other.used;
+        Ok(())
     }
 
     pub(crate) fn find(&self, name: &str) -> Option<usize> {
@@ -298,24 +322,44 @@ impl ParametersView {
     }
 }
 
+/// The bytes of a `Parameters`: an array or a slice.
+///
+/// The methods are those of the generic type rather than of the view alone, so that
+/// `pos.set_value("x", pos.variable::<i64>("x")? + 1)` compiles.
+pub trait Arena: sealed::Sealed {
+    #[doc(hidden)]
+    fn view(parameters: &ParametersInner<Self>) -> &ParametersView;
+    #[doc(hidden)]
+    fn view_mut(parameters: &mut ParametersInner<Self>) -> &mut ParametersView;
+}
+
+mod sealed {
+    pub trait Sealed {}
+    impl<const BYTES: usize> Sealed for [u8; BYTES] {}
+    impl Sealed for [u8] {}
+}
+
+impl<const BYTES: usize> Arena for [u8; BYTES] {
+    fn view(parameters: &ParametersInner<Self>) -> &ParametersView {
+        parameters
+    }
+    fn view_mut(parameters: &mut ParametersInner<Self>) -> &mut ParametersView {
+        parameters
+    }
+}
+
+impl Arena for [u8] {
+    fn view(parameters: &ParametersView) -> &ParametersView {
+        parameters
+    }
+    fn view_mut(parameters: &mut ParametersView) -> &mut ParametersView {
+        parameters
+    }
+}
+
 /// Bytes of a [`Parameters`] that one variable takes; `None` where that exceeds the address space.
 pub(crate) fn bytes_of_variable(name: &str, kind: Type, size: u32) -> Option<usize> {
     kind.bytes_of(size)?.checked_add(name.len())
-}
-
-/// Names of functions and variables: letters, digits, `_`, `-`, `.`, `/` of ASCII, 1 to [`NAME_BYTES`] of them.
-pub(crate) fn check_name(name: &str) -> Result<(), Error> {
-    if name.is_empty() || !name.bytes().all(is_name_byte) {
-        return Err(Error::BadName);
-    }
-    if name.len() > NAME_BYTES {
-        return Err(Error::Full(Limit::NameBytes));
-    }
-    Ok(())
-}
-
-pub(crate) const fn is_name_byte(byte: u8) -> bool {
-    byte.is_ascii_alphanumeric() || matches!(byte, b'_' | b'-' | b'.' | b'/')
 }
 
 impl<const BYTES: usize> Deref for ParametersInner<[u8; BYTES]> {
@@ -360,3 +404,6 @@ impl<const BYTES: usize> fmt::Debug for ParametersInner<[u8; BYTES]> {
         fmt::Debug::fmt(&**self, f)
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -8,7 +8,8 @@ use core::fmt;
 use crate::error::{Error, Limit};
 
 use super::function::{Builder, Definition, VariableSpec};
-use super::parameters::{Type, is_name_byte};
+use super::name::is_name_byte;
+use super::parameters::Type;
 
 /// Where a text stops being a signature, and what should stand there.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
@@ -193,3 +194,6 @@ const fn explain(position: usize, error: Error) -> ParseError {
     };
     ParseError { position, expected }
 }
+
+#[cfg(test)]
+mod tests;

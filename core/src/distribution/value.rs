@@ -7,6 +7,8 @@ use core::fmt;
 
 use crate::error::Error;
 
+pub use super::element::Element;
+
 /// A type of the IDL. One byte on the wire.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 #[repr(u8)]
@@ -313,110 +315,4 @@ pub(crate) fn copy(from: &[u8], to: &mut [u8]) {
 /// `length` as 32 bits.
 pub(crate) fn saturate(length: usize) -> u32 {
     u32::try_from(length).unwrap_or(u32::MAX)
-}
-
-mod sealed {
-    pub trait Sealed {}
-}
-
-/// A Rust type for one element of a variable: the integers, `f32`, `f64` and `bool`.
-pub trait Element: Copy + Default + sealed::Sealed {
-    /// The type of the IDL that holds it.
-    const KIND: Type;
-    /// Reads an element; `None` if it is out of this type's range.
-    #[doc(hidden)]
-    fn load(place: &[u8]) -> Option<Self>;
-    /// Writes an element that fits.
-    #[doc(hidden)]
-    fn store(&self, place: &mut [u8]);
-    /// Whether the element can be stored.
-    #[doc(hidden)]
-    fn fits(&self) -> bool {
-        true
-    }
-    /// The elements as bytes, if that is what they are.
-    #[doc(hidden)]
-    fn as_bytes(_: &[Self]) -> Option<&[u8]> {
-        None
-    }
-    /// The elements as bytes, if that is what they are.
-    #[doc(hidden)]
-    fn as_bytes_mut(_: &mut [Self]) -> Option<&mut [u8]> {
-        None
-    }
-}
-
-macro_rules! integer {
-    ($($integer:ty { $($more:item)* })*) => {$(
-        impl sealed::Sealed for $integer {}
-        impl Element for $integer {
-            const KIND: Type = Type::Int;
-            fn load(place: &[u8]) -> Option<Self> {
-                place.try_into().ok().and_then(|word| Self::try_from(i64::from_le_bytes(word)).ok())
-            }
-            fn store(&self, place: &mut [u8]) {
-                copy(&i64::try_from(*self).unwrap_or_default().to_le_bytes(), place);
-            }
-            fn fits(&self) -> bool {
-                i64::try_from(*self).is_ok()
-            }
-            $($more)*
-        }
-    )*};
-}
-
-integer! {
-    i8 {}
-    i16 {}
-    i32 {}
-    i64 {}
-    isize {}
-    u16 {}
-    u32 {}
-    u64 {}
-    usize {}
-    u8 {
-        fn as_bytes(elements: &[Self]) -> Option<&[u8]> {
-            Some(elements)
-        }
-        fn as_bytes_mut(elements: &mut [Self]) -> Option<&mut [u8]> {
-            Some(elements)
-        }
-    }
-}
-
-impl sealed::Sealed for f64 {}
-impl Element for f64 {
-    const KIND: Type = Type::Float;
-    fn load(place: &[u8]) -> Option<Self> {
-        place.try_into().ok().map(Self::from_le_bytes)
-    }
-    fn store(&self, place: &mut [u8]) {
-        copy(&self.to_le_bytes(), place);
-    }
-}
-
-impl sealed::Sealed for f32 {}
-impl Element for f32 {
-    const KIND: Type = Type::Float;
-    /// Rounds to the nearest; a finite number that would become infinite is out of range.
-    fn load(place: &[u8]) -> Option<Self> {
-        let wide = f64::load(place)?;
-        let narrow = wide as f32;
-        (narrow.is_finite() || !wide.is_finite()).then_some(narrow)
-    }
-    fn store(&self, place: &mut [u8]) {
-        f64::from(*self).store(place);
-    }
-}
-
-impl sealed::Sealed for bool {}
-impl Element for bool {
-    const KIND: Type = Type::Bool;
-    fn load(place: &[u8]) -> Option<Self> {
-        place.first().map(|&byte| byte != 0)
-    }
-    fn store(&self, place: &mut [u8]) {
-        copy(&[u8::from(*self)], place);
-    }
 }

@@ -1,0 +1,84 @@
+//! How a function wants to be called: priority, lease, idempotence, and their form on the wire.
+
+use crate::config::Priority;
+use crate::error::Error;
+use crate::time::Duration;
+
+/// How a function wants to be called.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Attributes {
+    /// Priority of calls that name none.
+    pub priority: Priority,
+    /// What the function starts goes on for this long after the last call; whole milliseconds travel.
+    pub lease: Option<Duration>,
+    /// Running it twice is as good as running it once.
+    pub idempotent: bool,
+}
+
+impl Attributes {
+    /// Bytes of the encoded form.
+    pub const WIRE_BYTES: usize = 8;
+    const IDEMPOTENT: u8 = 1 << 2;
+
+    /// Bits 0 and 1: priority; bit 2: idempotent; three bytes of zero; the lease in milliseconds, u32 little-endian, 0
+    /// for none. A lease is rounded down, but never to none.
+    pub fn encode(&self) -> [u8; Self::WIRE_BYTES] {
+        let flags = self.priority as u8 | if self.idempotent { Self::IDEMPOTENT } else { 0 };
+        let lease = self.lease.map_or(0, |lease| u32::try_from(lease.as_millis()).unwrap_or(u32::MAX).max(1));
+        let [a, b, c, d] = lease.to_le_bytes();
+        [flags, 0, 0, 0, a, b, c, d]
+    }
+
+    /// The inverse of [`encode`](Self::encode); [`Error::Malformed`] for any other bytes.
+    pub fn decode(bytes: &[u8]) -> Result<Self, Error> {
+        let &[flags, 0, 0, 0, a, b, c, d] = bytes else { return Err(Error::Malformed) };
+        if flags >= Self::IDEMPOTENT << 1 {
+            return Err(Error::Malformed);
+        }
+        let lease = u32::from_le_bytes([a, b, c, d]);
+        Ok(Self {
+            priority: Priority::from_wire(flags & 3).ok_or(Error::Malformed)?,
+            lease: (lease != 0).then(|| Duration::from_millis(u64::from(lease))),
+            idempotent: flags & Self::IDEMPOTENT != 0,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(
+        clippy::indexing_slicing,
+        clippy::unwrap_used,
+        clippy::expect_used,
+        clippy::panic,
+        clippy::arithmetic_side_effects
+    )]
+
+    use proptest::prelude::*;
+
+    use super::*;
+
+    #[test]
+    fn attributes_travel() {
+        let usual = Attributes::default();
+        assert_eq!(usual.encode(), [2, 0, 0, 0, 0, 0, 0, 0]);
+        let all =
+            Attributes { priority: Priority::Emergency, lease: Some(Duration::from_millis(0x1234)), idempotent: true };
+        assert_eq!(all.encode(), [4, 0, 0, 0, 0x34, 0x12, 0, 0]);
+        assert_eq!(Attributes::decode(&all.encode()), Ok(all));
+        let short = Attributes { lease: Some(Duration::from_micros(1)), ..usual };
+        assert_eq!(Attributes::decode(&short.encode()).unwrap().lease, Some(Duration::from_millis(1)));
+        for wrong in [&[0; 7][..], &[8, 0, 0, 0, 0, 0, 0, 0], &[0, 1, 0, 0, 0, 0, 0, 0], &[0, 0, 0, 1, 0, 0, 0, 0]] {
+            assert_eq!(Attributes::decode(wrong), Err(Error::Malformed), "{wrong:?}");
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn attributes_have_one_encoding(bytes in prop::collection::vec(0..16_u8, 8)) {
+            if let Ok(attributes) = Attributes::decode(&bytes) {
+                prop_assert_eq!(&attributes.encode()[..], &bytes[..]);
+            }
+        }
+    }
+}

@@ -1,0 +1,164 @@
+#![allow(
+    clippy::indexing_slicing,
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::arithmetic_side_effects
+)]
+
+use std::string::String;
+use std::vec::Vec;
+use std::{format, vec};
+
+use proptest::prelude::*;
+
+use super::*;
+use crate::distribution::parameters::Parameters;
+
+/// Any valid definition of a few variables, some of them both argument and result.
+pub(crate) fn definition() -> impl Strategy<Value = Definition> {
+    let size = prop_oneof![0..4_u32, any::<u32>()];
+    let variable = ("[a-z0-9_./-]{1,8}", prop::sample::select(&Type::ALL[..]), size, 0..3_u8);
+    ("[A-Za-z0-9_./-]{1,32}", prop::collection::vec(variable, 0..8)).prop_map(|(name, variables)| {
+        let mut builder = Builder::new(&name).unwrap();
+        let spec = |at: usize| {
+            let (name, kind, size, _) = &variables[at];
+            VariableSpec { name, kind: *kind, size: *size }
+        };
+        for at in (0..variables.len()).filter(|&at| variables[at].3 != 1) {
+            let _ = builder.argument(spec(at));
+        }
+        for at in (0..variables.len()).filter(|&at| variables[at].3 != 0) {
+            let _ = builder.result(spec(at));
+        }
+        builder.finish()
+    })
+}
+
+fn definition_of(
+    name: &str,
+    arguments: &[(&str, Type, u32)],
+    results: &[(&str, Type, u32)],
+) -> Result<Definition, Error> {
+    let specs = |list: &'_ [_]| -> Vec<_> {
+        list.iter().map(|&(name, kind, size)| VariableSpec { name, kind, size }).collect()
+    };
+    Definition::build(name, specs(arguments).into_iter(), specs(results).into_iter())
+}
+
+#[test]
+fn the_encoding_is_as_documented() {
+    let definition = definition_of("go", &[("x", Type::Float, 2)], &[("ok", Type::Bool, 0x0102)]).unwrap();
+    let bytes = [2, b'g', b'o', 1, 1, 1, 2, 0, 0, 0, b'x', 1, 3, 2, 2, 1, 0, 0, b'o', b'k'];
+    assert_eq!(definition.as_bytes(), bytes);
+    let signature = Signature::decode(&bytes).unwrap();
+    assert_eq!(signature.name(), "go");
+    assert_eq!(signature.arguments().collect::<Vec<_>>(), [VariableSpec { name: "x", kind: Type::Float, size: 2 }]);
+    assert_eq!(format!("{signature}"), "go(x: float[2]) -> (ok: bool[258])");
+}
+
+#[test]
+fn arguments_and_results_come_in_any_order() {
+    let mut arguments = Parameters::new();
+    arguments.add_int("a", 1).unwrap();
+    let mut results = Parameters::new();
+    results.add_string("b", 9).unwrap();
+    let forth = Definition::new("f").unwrap().arguments(&arguments).unwrap().results(&results).unwrap();
+    let back = Definition::new("f").unwrap().results(&results).unwrap().arguments(&arguments).unwrap();
+    assert_eq!(forth, back);
+    assert_eq!(format!("{forth}"), "f(a: int) -> (b: string[9])");
+    assert_eq!(format!("{}", Definition::new("f").unwrap()), "f()");
+}
+
+#[test]
+fn a_name_stands_for_one_variable() {
+    let same = definition_of("f", &[("a", Type::Int, 1)], &[("a", Type::Int, 1)]);
+    assert_eq!(same.unwrap().signature().parameters_bytes(), 9);
+    let twice = definition_of("f", &[("a", Type::Int, 1), ("a", Type::Int, 1)], &[]);
+    assert_eq!(twice, Err(Error::NameTaken));
+    let other_type = definition_of("f", &[("a", Type::Int, 1)], &[("a", Type::Float, 1)]);
+    assert_eq!(other_type, Err(Error::WrongType { index: 0 }));
+    let other_size = definition_of("f", &[("a", Type::Int, 1)], &[("b", Type::Int, 2), ("a", Type::Int, 2)]);
+    assert_eq!(other_size, Err(Error::WrongSize { index: 1, expected: 1, found: 2 }));
+}
+
+#[test]
+fn arguments_and_results_fit_one_parameters() {
+    let names: Vec<String> = (0..=VARIABLES).map(|index| format!("v{index}")).collect();
+    let variables: Vec<_> = names.iter().map(|name| (name.as_str(), Type::Bool, 1)).collect();
+    assert!(definition_of("f", &variables[..VARIABLES], &variables[..VARIABLES]).is_ok());
+    let full = Err(Error::Full(Limit::Variables));
+    assert_eq!(definition_of("f", &variables, &[]), full);
+    assert_eq!(definition_of("f", &[], &variables), full);
+    assert_eq!(definition_of("f", &variables[..VARIABLES], &variables[VARIABLES..]), full);
+}
+
+#[test]
+fn a_signature_is_bounded() {
+    let names: Vec<String> = (0..11).map(|index| format!("{index:0>32}")).collect();
+    let variables: Vec<_> = names.iter().map(|name| (name.as_str(), Type::Bool, 1)).collect();
+    assert_eq!(definition_of("f", &variables, &[]), Err(Error::Full(Limit::SignatureBytes)));
+    // 1 + name + 1 + 9 * 38 + 1 bytes: the longest name that fits, with the number of results at the very end.
+    let name = |length| format!("{:0>1$}", 1, length);
+    assert_eq!(definition_of(&name(32), &variables[..9], &[]).unwrap().as_bytes().len(), 377);
+    let last = [("1", Type::Bool, 1)];
+    let mut all = variables[..9].to_vec();
+    all.extend(last);
+    assert_eq!(definition_of(&name(32), &all, &[]).unwrap().as_bytes().len(), SIGNATURE_BYTES);
+    assert_eq!(definition_of(&name(32), &variables[..9], &last).unwrap().as_bytes().len(), SIGNATURE_BYTES);
+    let longer = [("12", Type::Bool, 1)];
+    assert_eq!(definition_of(&name(32), &variables[..9], &longer), Err(Error::Full(Limit::SignatureBytes)));
+}
+
+#[test]
+fn what_no_definition_holds_is_malformed() {
+    let malformed: &[&[u8]] = &[
+        &[],
+        &[0, 0, 0],
+        &[1, b'f', 0],
+        &[1, b'f', 0, 0, 0],
+        &[1, b' ', 0, 0],
+        &[1, 0xFF, 0, 0],
+        &[1, b'f', 1, 5, 1, 0, 0, 0, 0, b'a', 0],
+        &[1, b'f', 1, 0, 0, 0, 0, 0, 0, 0],
+        &[1, b'f', 2, 0, 1, 0, 0, 0, 0, b'a', 0, 1, 0, 0, 0, 0, b'a', 0],
+        &[1, b'f', 1, 0, 1, 0, 0, 0, 0, b'a', 1, 1, 1, 0, 0, 0, 0, b'a'],
+    ];
+    for bytes in malformed {
+        assert_eq!(Signature::decode(bytes), Err(Error::Malformed), "{bytes:?}");
+    }
+}
+
+proptest! {
+    #[test]
+    fn decode_is_total(bytes in prop::collection::vec(any::<u8>(), 0..40)) {
+        if let Ok(signature) = Signature::decode(&bytes) {
+            prop_assert_eq!(signature.as_bytes(), &bytes[..]);
+        }
+    }
+
+    #[test]
+    fn decode_takes_what_definition_makes_and_nothing_shorter(definition in definition(), more in any::<u8>()) {
+        let bytes = definition.as_bytes();
+        prop_assert_eq!(Signature::decode(bytes), Ok(definition.signature()));
+        for length in 0..bytes.len() {
+            prop_assert_eq!(Signature::decode(&bytes[..length]), Err(Error::Malformed));
+        }
+        let mut longer = vec![];
+        longer.extend_from_slice(bytes);
+        longer.push(more);
+        prop_assert_eq!(Signature::decode(&longer), Err(Error::Malformed));
+    }
+
+    #[test]
+    fn a_changed_byte_never_panics(definition in definition(), at in any::<prop::sample::Index>(), change in 1..=255_u8) {
+        let mut bytes = definition.as_bytes().to_vec();
+        let at = at.index(bytes.len());
+        bytes[at] ^= change;
+        if let Ok(signature) = Signature::decode(&bytes) {
+            let text = format!("{signature}");
+            let parsed = Definition::parse(&text).unwrap();
+            prop_assert_eq!(parsed.as_bytes(), &bytes[..]);
+        }
+    }
+}

@@ -1,0 +1,183 @@
+//! What both function lists are made of: entries by index, and one arena for all their signatures without gaps.
+
+use core::fmt;
+
+use serde::{Deserialize, Serialize};
+
+use super::attributes::Attributes;
+use super::function::Signature;
+use super::value::{copy, saturate};
+use crate::error::{Error, Limit};
+use crate::storage::Storage;
+
+/// A function's place in its owner's list.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub struct Slot(pub u16);
+
+/// Tells apart the functions that have been in one slot.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub struct Generation(pub u16);
+
+/// A function in a list. `H` is its handler; `()` in a peer's list.
+pub struct Function<'a, H = ()> {
+    /// Its place.
+    pub slot: Slot,
+    /// The generation of its place.
+    pub generation: Generation,
+    /// Its name, arguments and results.
+    pub signature: Signature<'a>,
+    /// How it wants to be called.
+    pub attributes: Attributes,
+    /// What runs it.
+    pub handler: &'a H,
+}
+
+impl<'a, H> Function<'a, H> {
+    /// Its name.
+    pub const fn name(&self) -> &'a str {
+        self.signature.name()
+    }
+}
+
+impl<H> Clone for Function<'_, H> {
+    fn clone(&self) -> Self {
+        *self
+    }
+}
+
+impl<H> Copy for Function<'_, H> {}
+
+impl<H> fmt::Debug for Function<'_, H> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}.{}: {}", self.slot.0, self.generation.0, self.signature)
+    }
+}
+
+/// Room for one function; ports allocate a slice of empty ones.
+pub struct Entry<H = ()> {
+    pub(super) generation: Generation,
+    pub(super) function: Option<Stored<H>>,
+}
+
+pub(super) struct Stored<H> {
+    pub(super) slot: Slot,
+    at: u32,
+    length: u16,
+    attributes: Attributes,
+    pub(super) handler: H,
+}
+
+impl<H> Entry<H> {
+    /// Room without a function.
+    pub const fn empty() -> Self {
+        Self { generation: Generation(0), function: None }
+    }
+}
+
+impl<H> Default for Entry<H> {
+    fn default() -> Self {
+        Self::empty()
+    }
+}
+
+/// Entries, and one arena for all their signatures without gaps.
+pub(super) struct Table<S: Storage, H: 'static> {
+    pub(super) entries: S::Slice<Entry<H>>,
+    bytes: S::Slice<u8>,
+    used: usize,
+}
+
+impl<S: Storage, H: 'static> Table<S, H> {
+    pub(super) fn new(entries: S::Slice<Entry<H>>, bytes: S::Slice<u8>) -> Self {
+        Self { entries, bytes, used: 0 }
+    }
+
+    pub(super) fn free_index(&self) -> Option<usize> {
+        self.entries.iter().position(|entry| entry.function.is_none())
+    }
+
+    pub(super) fn free_bytes(&self) -> usize {
+        self.bytes.len().saturating_sub(self.used)
+    }
+
+    /// Stores a checked signature in a free entry.
+    pub(super) fn put(
+        &mut self,
+        index: usize,
+        slot: Slot,
+        attributes: Attributes,
+        signature: &[u8],
+        handler: H,
+    ) -> Result<(), Error> {
+        let entry = self.entries.get_mut(index).ok_or(Error::Full(Limit::Functions))?;
+        let end = self.used.saturating_add(signature.len());
+        let place = self.bytes.get_mut(self.used..end).ok_or(Error::Full(Limit::SignatureBytes))?;
+        copy(signature, place);
+        let length = signature.len() as u16;
+        entry.function = Some(Stored { slot, at: saturate(self.used), length, attributes, handler });
+        self.used = end;
+        Ok(())
+    }
+
+    /// Empties an entry and closes the gap in the arena.
+    pub(super) fn take(&mut self, index: usize) -> Option<Stored<H>> {
+        let removed = self.entries.get_mut(index)?.function.take()?;
+        let length = usize::from(removed.length);
+        if let Some(tail) = self.bytes.get_mut(removed.at as usize..self.used)
+            && length <= tail.len()
+        {
+            tail.copy_within(length.., 0);
+        }
+        self.used = self.used.saturating_sub(length);
+        for stored in self.entries.iter_mut().filter_map(|entry| entry.function.as_mut()) {
+            if stored.at > removed.at {
+                stored.at = stored.at.saturating_sub(u32::from(removed.length));
+            }
+        }
+        Some(removed)
+    }
+
+    pub(super) fn clear(&mut self) {
+        for entry in self.entries.iter_mut() {
+            entry.function = None;
+        }
+        self.used = 0;
+    }
+
+    pub(super) fn bump(&mut self, index: usize) {
+        if let Some(entry) = self.entries.get_mut(index) {
+            entry.generation.0 = entry.generation.0.wrapping_add(1);
+        }
+    }
+
+    pub(super) fn find(&self, name: &str) -> Option<usize> {
+        self.entries.iter().position(|entry| {
+            entry.function.as_ref().is_some_and(|stored| {
+                let bytes = self.signature(stored);
+                bytes.get(1..name.len().saturating_add(1)) == Some(name.as_bytes())
+                    && bytes.first().map(|&length| usize::from(length)) == Some(name.len())
+            })
+        })
+    }
+
+    pub(super) fn function(&self, index: usize) -> Option<Function<'_, H>> {
+        let entry = self.entries.get(index)?;
+        let stored = entry.function.as_ref()?;
+        Some(Function {
+            slot: stored.slot,
+            generation: entry.generation,
+            signature: Signature::of_checked(self.signature(stored)),
+            attributes: stored.attributes,
+            handler: &stored.handler,
+        })
+    }
+
+    pub(super) fn iter(&self) -> impl Iterator<Item = Function<'_, H>> + Clone {
+        (0..self.entries.len()).filter_map(|index| self.function(index))
+    }
+
+    fn signature(&self, stored: &Stored<H>) -> &[u8] {
+        let start = stored.at as usize;
+        self.bytes.get(start..start.saturating_add(usize::from(stored.length))).unwrap_or_default()
+    }
+}
