@@ -124,10 +124,8 @@ impl<'a> Signature<'a> {
     /// Checks an encoded signature; [`Error::Malformed`] for anything that [`Definition`] could not have made.
     pub fn decode(bytes: &'a [u8]) -> Result<Self, Error> {
         let signature = Self::split(bytes).ok_or(Error::Malformed)?;
-        match Definition::build(signature.name, signature.arguments(), signature.results()) {
-            Ok(definition) if definition.as_bytes() == bytes => Ok(signature),
-            _ => Err(Error::Malformed),
-        }
+        let rebuilt = Definition::build(signature.name, signature.arguments(), signature.results());
+        rebuilt.map(|_| signature).map_err(|_| Error::Malformed)
     }
 
     /// The function's name.

@@ -108,6 +108,8 @@ fn a_signature_is_bounded() {
     assert_eq!(definition_of(&name(32), &variables[..9], &last).unwrap().as_bytes().len(), SIGNATURE_BYTES);
     let longer = [("12", Type::Bool, 1)];
     assert_eq!(definition_of(&name(32), &variables[..9], &longer), Err(Error::Full(Limit::SignatureBytes)));
+    all[9] = longer[0];
+    assert_eq!(definition_of(&name(32), &all, &[]), Err(Error::Full(Limit::SignatureBytes)));
 }
 
 #[test]
