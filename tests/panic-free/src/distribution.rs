@@ -1,0 +1,126 @@
+//! Distribution: parameters, functions, lists, who a node is.
+
+use cara_core::distribution::function::{Attributes, Definition, Signature};
+use cara_core::distribution::function_list::{Entry, FunctionList, TheirFunctionList};
+use cara_core::distribution::identity::Identity;
+use cara_core::distribution::parameters::{Parameters, ParametersView, Value};
+use cara_core::distribution::value::{Target, Type};
+use cara_core::storage::Lent;
+
+use crate::linkage::{drain, keep, unknown, unknown_slice, unknown_text};
+
+type Small = Parameters<64>;
+
+fn parameters() -> &'static mut ParametersView {
+    unknown::<Small>()
+}
+
+entry!(parameters_made, {
+    keep((Parameters::new(), Small::sized()));
+});
+
+entry!(parameters_added, {
+    let parameters = parameters();
+    keep(parameters.add(unknown_text(), *unknown(), *unknown()));
+    keep(parameters.add_int(unknown_text(), *unknown()));
+    keep(parameters.add_float(unknown_text(), *unknown()));
+    keep(parameters.add_bool(unknown_text(), *unknown()));
+    keep(parameters.add_string(unknown_text(), *unknown()));
+    keep(parameters.add_bytes(unknown_text(), *unknown()));
+});
+
+entry!(parameters_set, {
+    let parameters = parameters();
+    keep(parameters.set_value(unknown_text(), *unknown::<[i64; 2]>()));
+    keep(parameters.set_value(unknown_text(), unknown_slice::<f64>() as &[f64]));
+    keep(parameters.set_value(unknown_text(), *unknown::<u16>()));
+    keep(parameters.set_value(unknown_text(), *unknown::<bool>()));
+    keep(parameters.set_value(unknown_text(), *unknown::<f32>()));
+    keep(parameters.set_value(unknown_text(), unknown_text()));
+    keep(parameters.set_value(unknown_text(), unknown_slice::<u8>() as &[u8]));
+    keep(parameters.copy_from(unknown::<Small>()));
+});
+
+entry!(parameters_read, {
+    let parameters = parameters();
+    keep(parameters.variable::<[i64; 2]>(unknown_text()));
+    keep(parameters.variable::<i8>(unknown_text()));
+    keep(parameters.variable::<f32>(unknown_text()));
+    keep(parameters.variable::<[bool; 3]>(unknown_text()));
+    keep(parameters.variable::<&str>(unknown_text()));
+    keep(parameters.variable::<&[u8]>(unknown_text()));
+    keep(parameters.variable_into(unknown_text(), unknown_slice::<u32>()));
+    keep(parameters.value(unknown_text()));
+    drain(parameters.iter());
+    keep((parameters.remaining(), parameters.len(), parameters.is_empty()));
+    parameters.clear();
+});
+
+entry!(values, {
+    let value: &Value<'static> = unknown();
+    drain(value.ints());
+    drain(value.floats());
+    drain(value.bools());
+    keep((value.text(), value.raw(), value.kind(), value.size()));
+    let target: &Target<'static> = unknown();
+    keep((target.kind(), target.size()));
+});
+
+entry!(types, {
+    let kind: &Type = unknown();
+    keep((Type::from_wire(*unknown()), kind.word(), kind.is_fixed(), kind.width(), kind.bytes_of(*unknown())));
+});
+
+entry!(definitions, {
+    keep(Definition::new(unknown_text()));
+    keep(Definition::parse(unknown_text()));
+    let definition = unknown::<Definition>();
+    keep(definition.clone().arguments(parameters()));
+    keep(definition.clone().results(parameters()));
+    keep((definition.name(), definition.as_bytes(), definition.signature()));
+});
+
+entry!(signatures, {
+    if let Ok(signature) = Signature::decode(unknown_slice()) {
+        drain(signature.arguments());
+        drain(signature.results());
+        keep(signature.arguments().named(unknown_text()));
+        keep((signature.name(), signature.as_bytes(), signature.parameters_bytes()));
+    }
+});
+
+entry!(attributes, {
+    keep((Attributes::decode(unknown_slice()), unknown::<Attributes>().encode()));
+});
+
+entry!(own_list, {
+    keep(Entry::<u32>::empty());
+    keep(FunctionList::<Lent, u32>::new(unknown_slice(), unknown_slice()));
+    let list: &mut FunctionList<Lent, u32> = unknown();
+    keep(list.add_function(unknown(), *unknown(), *unknown()));
+    keep(list.replace(unknown(), *unknown(), *unknown()));
+    keep(list.remove(unknown_text()));
+    keep((list.find(unknown_text()), list.function(*unknown()), list.lookup(*unknown(), *unknown())));
+    keep(list.handler_mut(*unknown()));
+    keep((list.generation(*unknown()), list.len(), list.is_empty()));
+    drain(list.iter());
+});
+
+entry!(their_list, {
+    keep(TheirFunctionList::<Lent>::new(unknown_slice(), unknown_slice()));
+    let list: &mut TheirFunctionList<Lent> = unknown();
+    list.keep_only(*unknown());
+    keep(list.insert(*unknown(), *unknown(), *unknown(), unknown_slice()));
+    keep(list.remove(*unknown()));
+    keep((list.find(unknown_text()), list.named(unknown_text()), list.function(*unknown())));
+    keep((list.len(), list.is_empty(), list.skipped()));
+    drain(list.iter());
+    list.clear();
+});
+
+entry!(identities, {
+    keep(Identity::m_unit(unknown_text(), *unknown()));
+    keep(Identity::s_unit(unknown_text(), *unknown()));
+    let (one, other): (&Identity, &Identity) = (unknown(), unknown());
+    keep((one.name(), one.id(), one.role(), one.cmp(other), one == other));
+});

@@ -1,0 +1,98 @@
+//! Host infrastructure: frames, links, liveness.
+
+use core::net::SocketAddr;
+
+use cara_core::error::CloseReason;
+use cara_core::host::connections::{Incoming, Link, Liveness, Place};
+use cara_core::host::frame::{self, ChunkWriter, Cut, Frame};
+use cara_core::host::mailman::{LinkId, Mailman};
+use cara_core::host::secure::{Plain, Secure};
+use cara_core::storage::{Lent, Pool};
+
+use crate::linkage::{drain, keep, unknown, unknown_slice};
+
+/// A network that does anything.
+pub struct AnyMailman;
+
+impl Mailman for AnyMailman {
+    fn write(&mut self, link: LinkId, slices: &[&[u8]]) -> Result<usize, CloseReason> {
+        keep((link, slices));
+        *unknown()
+    }
+
+    fn send_to(&mut self, to: SocketAddr, datagram: &[u8]) -> bool {
+        keep((to, datagram));
+        *unknown()
+    }
+
+    fn broadcast(&mut self, datagram: &[u8]) -> bool {
+        keep(datagram);
+        *unknown()
+    }
+}
+
+type AnyLink = Link<Lent, Plain>;
+
+entry!(frames, {
+    keep(Frame::parse(unknown_slice()));
+    keep(frame::encode(unknown(), *unknown(), unknown_slice()));
+    keep((frame::first_frame_length(unknown_slice()), frame::ends_message(unknown_slice())));
+});
+
+entry!(chunks, {
+    let cut: &Cut = unknown();
+    keep(cut.framed_length(*unknown()));
+    if let Some(mut writer) = ChunkWriter::new(unknown_slice(), *cut, *unknown(), *unknown()) {
+        writer.put(unknown_slice());
+        keep(writer);
+    }
+});
+
+entry!(plain, {
+    keep((Plain.seal(unknown_slice()), Plain.open(unknown_slice())));
+});
+
+entry!(link_made, {
+    keep(AnyLink::new(*unknown(), Plain, unknown_slice(), *unknown(), *unknown()));
+});
+
+entry!(link_receives, {
+    let link: &mut AnyLink = unknown();
+    keep(link.receive(unknown::<Pool<Lent>>(), unknown_slice()));
+    if let Incoming::Message(_, place) = unknown() {
+        keep(link.view(place.after(*unknown()), unknown_slice()));
+    }
+    keep(link.view(*unknown::<Place>(), unknown_slice()));
+});
+
+entry!(link_sends, {
+    let link: &mut AnyLink = unknown();
+    let pool: &mut Pool<Lent> = unknown();
+    let write = |writer: &mut ChunkWriter<'_>| writer.put(unknown_slice());
+    keep(link.send_message(&mut AnyMailman, pool, *unknown(), *unknown(), *unknown(), write));
+    keep(link.send_frame(unknown()));
+    keep(link.flush(&mut AnyMailman, pool));
+    keep((link.wants_to_write(), link.has_room(*unknown(), *unknown()), link.id()));
+});
+
+entry!(link_set, {
+    let link: &mut AnyLink = unknown();
+    link.set_peer_limits(*unknown());
+    link.set_message_limit(*unknown());
+    link.release(unknown::<Pool<Lent>>());
+});
+
+entry!(link_counters, {
+    let link: &mut AnyLink = unknown();
+    link.counters.add(*unknown(), *unknown());
+    link.counters.merge(unknown());
+    keep(link.counters.value(*unknown()));
+    drain(link.counters.iter());
+});
+
+entry!(liveness, {
+    let mut liveness = Liveness::new(*unknown(), *unknown());
+    liveness.heard(*unknown());
+    liveness.heard_datagram(*unknown());
+    keep((liveness.datagrams_pass(), liveness.deadline(), liveness.poll(*unknown())));
+});
