@@ -32,6 +32,9 @@ pub const DATAGRAM_BYTES: usize = 1400;
 /// The buffer that each link owns: partial frames and handshakes up to this length need none from the pool.
 pub const LINK_BUFFER_BYTES: usize = 512;
 
+/// Leases that one peer may hold here, and this unit at one peer. Costs 32 bytes each per link.
+pub const LEASES: usize = 4;
+
 /// Ids behind the newest one that the at-most-once window of a priority remembers.
 pub const WINDOW: u32 = 64;
 /// How long a unit waits for the peer's hello on a new link before it closes it.

@@ -1,14 +1,16 @@
 //! DISTRIBUTION (paper, section 2): the IDL, the encoding of messages, discovery and the table of nodes.
 
+mod attributes;
 pub mod block;
+pub mod datagram;
+mod element;
 pub mod function;
 pub mod function_list;
+pub mod hello;
 pub mod identity;
 pub mod message;
+mod name;
 pub mod parameters;
+mod table;
 pub mod text;
 pub mod value;
-mod attributes;
-mod element;
-mod name;
-mod table;

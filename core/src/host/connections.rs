@@ -76,11 +76,11 @@ crate::counters::counters! {
     }
 }
 
-/// A whole frame or message that arrived.
-#[derive(Debug)]
-pub enum Incoming<'b> {
+/// A whole frame or message that arrived; [`Link::view`] shows the bytes.
+#[derive(Clone, Copy, Debug)]
+pub enum Incoming {
     /// The peer's hello.
-    Hello(&'b [u8]),
+    Hello(Place),
     /// The peer refuses, with a code.
     Refuse(u8),
     /// The peer closes, with a code.
@@ -90,18 +90,45 @@ pub enum Incoming<'b> {
     /// An answer to a ping.
     Pong,
     /// A session body that came in the stream.
-    Session(&'b [u8]),
+    Session(Place),
     /// A whole message.
-    Message(Priority, &'b [u8]),
+    Message(Priority, Place),
+}
+
+/// Where bytes that arrived lie, until the next call of [`Link::receive`].
+#[derive(Clone, Copy, Debug)]
+pub struct Place {
+    store: Store,
+    start: usize,
+    end: usize,
+}
+
+impl Place {
+    /// All of a lent slice of `length` bytes.
+    pub const fn lent(length: usize) -> Self {
+        Self { store: Store::Lent, start: 0, end: length }
+    }
+
+    /// The same without its first `count` bytes.
+    pub fn after(self, count: usize) -> Self {
+        Self { start: self.start.saturating_add(count).min(self.end), ..self }
+    }
+}
+
+#[derive(Clone, Copy, Debug)]
+enum Store {
+    Lent,
+    Partial,
+    Assembly,
 }
 
 /// Result of [`Link::receive`].
-#[derive(Debug)]
-pub struct Received<'b> {
+#[derive(Clone, Copy, Debug)]
+pub struct Received {
     /// How many of the lent bytes are used up.
     pub consumed: usize,
     /// What they completed.
-    pub incoming: Option<Incoming<'b>>,
+    pub incoming: Option<Incoming>,
     /// No message buffer is free: stop reading, and offer the rest again later.
     pub paused: bool,
 }
@@ -145,26 +172,30 @@ impl<S: Storage, C: Secure> Link<S, C> {
 
     /// Takes what the port has read. Call it again with the rest, and once with nothing, until it completes nothing:
     /// that call gives the buffer of the last message back.
-    pub fn receive<'b>(
-        &'b mut self,
-        buffers: &mut impl Buffers<S>,
-        bytes: &'b mut [u8],
-    ) -> Result<Received<'b>, CloseReason> {
+    pub fn receive(&mut self, buffers: &mut impl Buffers<S>, bytes: &mut [u8]) -> Result<Received, CloseReason> {
         let available = bytes.len();
         let received = self.receiver.receive(&mut self.cipher, buffers, bytes)?;
         self.counters.add(LinkCounter::BytesReceived, received.consumed as u64);
         if received.paused && available > 0 {
             self.counters.add(LinkCounter::ReadPaused, 1);
         }
-        match received.incoming {
-            None => {}
-            Some(Incoming::Message(..)) => {
-                self.counters.add(LinkCounter::FramesReceived, 1);
-                self.counters.add(LinkCounter::MessagesReceived, 1);
-            }
-            Some(_) => self.counters.add(LinkCounter::FramesReceived, 1),
+        if received.incoming.is_some() {
+            self.counters.add(LinkCounter::FramesReceived, 1);
+        }
+        if let Some(Incoming::Message(..)) = received.incoming {
+            self.counters.add(LinkCounter::MessagesReceived, 1);
         }
         Ok(received)
+    }
+
+    /// The bytes at `place`; `lent` is the slice that was lent to [`receive`](Self::receive).
+    pub fn view<'b>(&'b self, place: Place, lent: &'b [u8]) -> &'b [u8] {
+        let store = match place.store {
+            Store::Lent => lent,
+            Store::Partial => self.receiver.partial_store(),
+            Store::Assembly => self.receiver.assembly.as_ref().map_or(&[][..], |assembly| &assembly.buffer),
+        };
+        store.get(place.start..place.end).unwrap_or(&[])
     }
 
     /// Accepts one message of `total` bytes, which `write` puts into the send buffer, and writes what the network takes.
@@ -204,9 +235,10 @@ impl<S: Storage, C: Secure> Link<S, C> {
         !self.sender.is_empty()
     }
 
-    /// Room for a message of `total` bytes of `priority` without another buffer, or a lane that has none yet.
-    pub fn has_room(&self, priority: Priority, total: usize) -> bool {
-        self.sender.has_room(priority, total)
+    /// Bytes that wait to be written.
+    pub fn queued(&self) -> usize {
+        let lanes = self.sender.lanes.iter().flatten().map(|lane| lane.end.saturating_sub(lane.start));
+        lanes.fold(self.sender.urgent.len(), usize::saturating_add)
     }
 
     /// Gives every borrowed buffer back. The link is of no use afterwards.
@@ -242,12 +274,12 @@ impl<S: Storage> Receiver<S> {
         Self { small, large: None, partial: 0, partial_done: false, assembly: None, chunk_limit, message_limit }
     }
 
-    fn receive<'b, C: Secure>(
-        &'b mut self,
+    fn receive<C: Secure>(
+        &mut self,
         cipher: &mut C,
         buffers: &mut impl Buffers<S>,
-        bytes: &'b mut [u8],
-    ) -> Result<Received<'b>, CloseReason> {
+        bytes: &mut [u8],
+    ) -> Result<Received, CloseReason> {
         self.clear_finished(buffers);
         if self.partial == 0 {
             match frame::first_frame_length(bytes) {
@@ -259,36 +291,36 @@ impl<S: Storage> Receiver<S> {
     }
 
     /// The frame lies whole in the lent bytes: it is opened there.
-    fn take_whole<'b, C: Secure>(
-        &'b mut self,
+    fn take_whole<C: Secure>(
+        &mut self,
         cipher: &mut C,
         buffers: &mut impl Buffers<S>,
-        bytes: &'b mut [u8],
+        bytes: &mut [u8],
         length: usize,
-    ) -> Result<Received<'b>, CloseReason> {
+    ) -> Result<Received, CloseReason> {
         self.check_length(length)?;
         let Some(spare) = self.reserve(buffers, length) else {
             return Ok(Received { consumed: 0, incoming: None, paused: true });
         };
         let sealed = bytes.get_mut(frame::HEADER_BYTES..length).ok_or(CloseReason::Protocol)?;
         let body = cipher.open(sealed)?;
-        let limit = self.message_limit;
-        let incoming = deliver::<S>(&mut self.assembly, buffers, spare, limit, body)?;
+        let incoming = deliver::<S>(&mut self.assembly, buffers, spare, self.message_limit, Store::Lent, body)?;
         Ok(Received { consumed: length, incoming, paused: false })
     }
 
     /// The frame came in pieces: it is collected in the link's own buffer, or in a borrowed one when it is longer.
-    fn take_partial<'b, C: Secure>(
-        &'b mut self,
+    fn take_partial<C: Secure>(
+        &mut self,
         cipher: &mut C,
         buffers: &mut impl Buffers<S>,
-        bytes: &'b mut [u8],
-    ) -> Result<Received<'b>, CloseReason> {
+        bytes: &[u8],
+    ) -> Result<Received, CloseReason> {
         let mut consumed = 0;
         if self.partial < frame::HEADER_BYTES {
             consumed = self.collect(bytes, frame::HEADER_BYTES);
         }
-        let Some(length) = frame::first_frame_length(self.collected()) else {
+        let collected = self.partial_store().get(..self.partial).unwrap_or(&[]);
+        let Some(length) = frame::first_frame_length(collected) else {
             return Ok(Received { consumed, incoming: None, paused: false });
         };
         self.check_length(length)?;
@@ -304,14 +336,13 @@ impl<S: Storage> Receiver<S> {
             return Ok(Received { consumed, incoming: None, paused: true });
         };
         self.partial_done = true;
-        let limit = self.message_limit;
         let store = match &mut self.large {
             Some(large) => large,
             None => &mut self.small,
         };
         let sealed = store.get_mut(frame::HEADER_BYTES..length).ok_or(CloseReason::Protocol)?;
         let body = cipher.open(sealed)?;
-        let incoming = deliver::<S>(&mut self.assembly, buffers, spare, limit, body)?;
+        let incoming = deliver::<S>(&mut self.assembly, buffers, spare, self.message_limit, Store::Partial, body)?;
         Ok(Received { consumed, incoming, paused: false })
     }
 
@@ -328,9 +359,8 @@ impl<S: Storage> Receiver<S> {
         buffers.take().map(Some)
     }
 
-    fn collected(&self) -> &[u8] {
-        let store = self.large.as_ref().unwrap_or(&self.small);
-        store.get(..self.partial).unwrap_or(&[])
+    fn partial_store(&self) -> &[u8] {
+        self.large.as_ref().unwrap_or(&self.small)
     }
 
     /// Copies from `bytes` until the partial frame has `length` bytes; returns how many were copied.
@@ -383,13 +413,14 @@ impl<S: Storage> Receiver<S> {
 }
 
 /// Turns an opened frame into what it completes. `spare` is the buffer reserved for a chunked message.
-fn deliver<'b, S: Storage>(
-    assembly: &'b mut Option<Assembly<S>>,
+fn deliver<S: Storage>(
+    assembly: &mut Option<Assembly<S>>,
     buffers: &mut impl Buffers<S>,
     spare: Option<Buffer<S>>,
     message_limit: usize,
-    body: &'b [u8],
-) -> Result<Option<Incoming<'b>>, CloseReason> {
+    store: Store,
+    body: &[u8],
+) -> Result<Option<Incoming>, CloseReason> {
     let frame = Frame::parse(body);
     let begins = matches!(&frame, Ok(Frame::Chunk(Chunk { total: Some(_), last: false, .. })));
     let spare = match spare {
@@ -399,42 +430,47 @@ fn deliver<'b, S: Storage>(
         }
         spare => spare,
     };
+    // What a frame carries is the tail of its body, and the body starts behind the header.
+    let end = body.len().saturating_add(frame::HEADER_BYTES);
+    let tail = |bytes: &[u8]| Place { store, start: end.saturating_sub(bytes.len()), end };
     Ok(Some(match frame? {
-        Frame::Hello(bytes) => Incoming::Hello(bytes),
+        Frame::Hello(bytes) => Incoming::Hello(tail(bytes)),
         Frame::Refuse(code) => Incoming::Refuse(code),
         Frame::Close(code) => Incoming::Close(code),
         Frame::Ping => Incoming::Ping,
         Frame::Pong => Incoming::Pong,
-        Frame::Session(bytes) => Incoming::Session(bytes),
-        Frame::Chunk(chunk) => {
-            return match (chunk.total, chunk.last) {
-                (Some(total), true) => whole_message(chunk, total, message_limit).map(Some),
-                (Some(total), false) => begin_assembly::<S>(assembly, buffers, spare, chunk, total, message_limit),
-                (None, _) => continue_assembly::<S>(assembly, chunk),
-            };
-        }
+        Frame::Session(bytes) => Incoming::Session(tail(bytes)),
+        Frame::Chunk(chunk) => match (chunk.total, chunk.last) {
+            (Some(total), true) => {
+                check_whole(&chunk, total, message_limit)?;
+                Incoming::Message(chunk.priority, tail(chunk.bytes))
+            }
+            (Some(total), false) => {
+                begin_assembly::<S>(assembly, buffers, spare, &chunk, total, message_limit)?;
+                return Ok(None);
+            }
+            (None, _) => return continue_assembly::<S>(assembly, &chunk),
+        },
     }))
 }
 
-fn whole_message(chunk: Chunk<'_>, total: u32, message_limit: usize) -> Result<Incoming<'_>, CloseReason> {
+fn check_whole(chunk: &Chunk<'_>, total: u32, message_limit: usize) -> Result<(), CloseReason> {
     let length = total as usize;
     if length > message_limit {
         return Err(CloseReason::Oversize);
     }
-    if length != chunk.bytes.len() {
-        return Err(CloseReason::Protocol);
-    }
-    Ok(Incoming::Message(chunk.priority, chunk.bytes))
+    if length == chunk.bytes.len() { Ok(()) } else { Err(CloseReason::Protocol) }
 }
 
-fn begin_assembly<'b, S: Storage>(
+fn begin_assembly<S: Storage>(
     assembly: &mut Option<Assembly<S>>,
     buffers: &mut impl Buffers<S>,
     spare: Option<Buffer<S>>,
-    chunk: Chunk<'_>,
+    chunk: &Chunk<'_>,
     total: u32,
     message_limit: usize,
-) -> Result<Option<Incoming<'b>>, CloseReason> {
+) -> Result<(), CloseReason> {
+    // Without a spare buffer, another message is being put together already.
     let Some(mut buffer) = spare else { return Err(CloseReason::Protocol) };
     let total = total as usize;
     let refusal = if total > message_limit || total > buffer.len() {
@@ -444,21 +480,20 @@ fn begin_assembly<'b, S: Storage>(
     } else {
         None
     };
-    let place = buffer.get_mut(..chunk.bytes.len());
-    if let (None, Some(place)) = (refusal, place) {
+    let length = chunk.bytes.len();
+    if let (None, Some(place)) = (refusal, buffer.get_mut(..length)) {
         place.copy_from_slice(chunk.bytes);
-        let length = chunk.bytes.len();
         *assembly = Some(Assembly { buffer, length, total, priority: chunk.priority, done: false });
-        return Ok(None);
+        return Ok(());
     }
     buffers.give(buffer);
     Err(refusal.unwrap_or(CloseReason::Protocol))
 }
 
-fn continue_assembly<'b, S: Storage>(
-    assembly: &'b mut Option<Assembly<S>>,
-    chunk: Chunk<'_>,
-) -> Result<Option<Incoming<'b>>, CloseReason> {
+fn continue_assembly<S: Storage>(
+    assembly: &mut Option<Assembly<S>>,
+    chunk: &Chunk<'_>,
+) -> Result<Option<Incoming>, CloseReason> {
     let assembly = assembly.as_mut().ok_or(CloseReason::Protocol)?;
     let end = assembly.length.saturating_add(chunk.bytes.len());
     if chunk.priority != assembly.priority || end > assembly.total || chunk.last != (end == assembly.total) {
@@ -471,8 +506,7 @@ fn continue_assembly<'b, S: Storage>(
         return Ok(None);
     }
     assembly.done = true;
-    let message = assembly.buffer.get(..end).ok_or(CloseReason::Protocol)?;
-    Ok(Some(Incoming::Message(assembly.priority, message)))
+    Ok(Some(Incoming::Message(assembly.priority, Place { store: Store::Assembly, start: 0, end })))
 }
 
 /// What waits to be written: one lane per class and the urgent frames that go between chunks.
@@ -519,17 +553,6 @@ impl<S: Storage> Sender<S> {
 
     fn is_empty(&self) -> bool {
         self.urgent.is_empty() && self.lanes.iter().all(Option::is_none)
-    }
-
-    fn has_room(&self, priority: Priority, total: usize) -> bool {
-        let needed = self.cut.framed_length(total);
-        let Some(index) = lane_index(priority) else {
-            return self.urgent.len().saturating_add(needed) <= URGENT_BYTES;
-        };
-        match self.lanes.get(index) {
-            Some(Some(lane)) => needed <= lane.room(),
-            _ => true,
-        }
     }
 
     fn accept(

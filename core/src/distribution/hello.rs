@@ -1,0 +1,101 @@
+//! The hello: the first frame on each link, in both directions.
+//!
+//! Magic and version stand in fixed places, so that units of different versions can tell each other so; the rest is
+//! postcard.
+
+use serde::{Deserialize, Serialize};
+
+use super::identity::{Epoch, Fleet, Identity};
+use crate::config::{MINIMUM_CHUNK_BYTES, NODE_NAME_BYTES, PLAIN_MAGIC, VERSION};
+
+/// Bytes of magic and version.
+const PREFIX_BYTES: usize = 5;
+
+/// Which manager an s_unit belongs to (paper, section 2: "the manually set properties of the m_unit object").
+#[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub struct Manager {
+    /// The manager's name.
+    pub name: heapless::String<NODE_NAME_BYTES>,
+    /// The manager's ID number.
+    pub id: u32,
+}
+
+/// What a unit takes, told so that nothing longer is sent.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Limits {
+    /// Longest block of parameters, in bytes.
+    pub message_size: u32,
+    /// Longest frame body, in bytes.
+    pub chunk_size: u16,
+    /// Calls of one peer that it holds.
+    pub calls: u16,
+    /// Least time between two requests to it, in microseconds.
+    pub minimum_interval: u32,
+}
+
+/// How a unit introduces itself on a link.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Hello {
+    /// Units of different fleets refuse each other.
+    pub fleet: Fleet,
+    /// Name, id and role.
+    pub identity: Identity,
+    /// The manager that an s_unit belongs to.
+    pub wanted: Option<Manager>,
+    /// This life of the unit.
+    pub epoch: Epoch,
+    /// Fresh for each link; the peer's session datagrams carry it.
+    pub nonce: u64,
+    /// For fail-over between managers, later; 0 now.
+    pub term: u32,
+    /// Abilities beyond this version; 0 now.
+    pub capabilities: u32,
+    /// What the unit takes.
+    pub limits: Limits,
+    /// The index by which the unit wants this link's session datagrams addressed.
+    pub link: u16,
+    /// The UDP port to which session datagrams go; 0 for none.
+    pub udp_port: u16,
+    /// The unit's clock when the hello was made, in microseconds.
+    pub stamp: u64,
+    /// Pause between the unit's keep-alives, in milliseconds.
+    pub keep_alive: u32,
+}
+
+/// Why a hello cannot be used.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum HelloError {
+    /// Not a unit of this mode, or no unit at all.
+    Magic,
+    /// Another version, this one.
+    Version(u8),
+    /// The rest cannot be read.
+    Malformed,
+}
+
+impl Hello {
+    /// Encodes into `out`; the length, or `None` where it does not fit.
+    pub fn encode(&self, out: &mut [u8]) -> Option<usize> {
+        let (prefix, rest) = out.split_first_chunk_mut::<PREFIX_BYTES>()?;
+        let [m0, m1, m2, m3] = PLAIN_MAGIC;
+        *prefix = [m0, m1, m2, m3, VERSION];
+        postcard::to_slice(self, rest).ok()?.len().checked_add(PREFIX_BYTES)
+    }
+
+    /// Reads a hello: all of it, nothing behind it.
+    pub fn decode(bytes: &[u8]) -> Result<Self, HelloError> {
+        let (prefix, rest) = bytes.split_first_chunk::<PREFIX_BYTES>().ok_or(HelloError::Malformed)?;
+        let [m0, m1, m2, m3, version] = *prefix;
+        if [m0, m1, m2, m3] != PLAIN_MAGIC {
+            return Err(HelloError::Magic);
+        }
+        if version != VERSION {
+            return Err(HelloError::Version(version));
+        }
+        let (hello, rest): (Self, _) = postcard::take_from_bytes(rest).map_err(|_| HelloError::Malformed)?;
+        let sound = rest.is_empty()
+            && !hello.identity.name().is_empty()
+            && usize::from(hello.limits.chunk_size) >= MINIMUM_CHUNK_BYTES;
+        if sound { Ok(hello) } else { Err(HelloError::Malformed) }
+    }
+}

@@ -1,0 +1,430 @@
+//! Messages of a session: requests and replies with fixed headers in front of a block of parameters, control messages
+//! in postcard. With [`hello`](super::hello), [`datagram`](super::datagram) and [`block`](super::block) the only code
+//! that knows the encoding; `docs/wire.md` says it in words.
+
+use serde::{Deserialize, Serialize};
+
+use super::block::Put;
+use super::function_list::{Generation, Slot};
+use crate::error::{Error, ServiceError};
+use crate::host::frame::ChunkWriter;
+use crate::time::Duration;
+
+const REQUEST: u8 = 1;
+const REPLY: u8 = 2;
+const CONTROL: u8 = 3;
+const FAILURE: u8 = 4;
+
+const WANTS_REPLY: u8 = 1;
+
+/// Bytes before a request's block.
+pub const REQUEST_BYTES: usize = 32;
+/// Bytes before a reply's block.
+pub const REPLY_BYTES: usize = 16;
+/// Longest control message that is not a `Publish`.
+pub const CONTROL_BYTES: usize = 48;
+/// Bytes that a `Publish` needs beside the signature.
+pub const PUBLISH_BYTES: usize = 24;
+
+/// A message, borrowed from the bytes that it came in.
+#[derive(Debug)]
+pub enum Message<'b> {
+    /// Run a function.
+    Request(RequestHeader, &'b [u8]),
+    /// What a request led to: results, or why there are none.
+    Reply(u32, Result<&'b [u8], Error>),
+    /// An asynchronous request was not run, or its service failed.
+    Failure(u32, Error),
+    /// Lists, limits, leases.
+    Control(Control<'b>),
+}
+
+impl<'b> Message<'b> {
+    /// Reads a message; `None` for anything that the format does not know.
+    pub fn decode(bytes: &'b [u8]) -> Option<Self> {
+        match *bytes.first()? {
+            REQUEST => {
+                let (header, block) = bytes.split_first_chunk()?;
+                Some(Self::Request(RequestHeader::decode(header)?, block))
+            }
+            REPLY => {
+                let (header, block) = bytes.split_first_chunk()?;
+                let (id, status) = decode_reply(header)?;
+                match status {
+                    Ok(()) => Some(Self::Reply(id, Ok(block))),
+                    Err(error) => block.is_empty().then_some(Self::Reply(id, Err(error))),
+                }
+            }
+            FAILURE => {
+                let (id, status) = decode_reply(bytes.try_into().ok()?)?;
+                Some(Self::Failure(id, status.err()?))
+            }
+            CONTROL => {
+                let (control, rest) = postcard::take_from_bytes(bytes.get(1..)?).ok()?;
+                rest.is_empty().then_some(Self::Control(control))
+            }
+            _ => None,
+        }
+    }
+}
+
+impl Put for ChunkWriter<'_> {
+    fn put(&mut self, bytes: &[u8]) {
+        ChunkWriter::put(self, bytes);
+    }
+}
+
+/// What stands in front of a request's arguments.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct RequestHeader {
+    /// Rises within a session; names the request in the reply.
+    pub id: u32,
+    /// The callee's function.
+    pub slot: Slot,
+    /// The life of the slot that the caller knows.
+    pub generation: Generation,
+    /// The caller waits for a reply.
+    pub wants_reply: bool,
+    /// Time until the caller's deadline when the request was made, saturating.
+    pub remaining: Duration,
+    /// The callee's clock as the caller last heard it, in microseconds.
+    pub stamp: u64,
+    /// Time since the caller heard it, saturating.
+    pub since: Duration,
+}
+
+impl RequestHeader {
+    /// The header's bytes.
+    pub fn encode(&self) -> [u8; REQUEST_BYTES] {
+        let mut out = [0; REQUEST_BYTES];
+        let flags = if self.wants_reply { WANTS_REPLY } else { 0 };
+        let fields: [&[u8]; 7] = [
+            &[REQUEST, flags],
+            &self.slot.0.to_le_bytes(),
+            &self.generation.0.to_le_bytes(),
+            &[0, 0],
+            &self.id.to_le_bytes(),
+            &self.remaining.as_wire().to_le_bytes(),
+            &self.stamp.to_le_bytes(),
+        ];
+        let since = self.since.as_wire().to_le_bytes();
+        let bytes = fields.into_iter().flatten().chain(&since);
+        for (place, byte) in out.iter_mut().zip(bytes) {
+            *place = *byte;
+        }
+        out
+    }
+
+    fn decode(bytes: &[u8; REQUEST_BYTES]) -> Option<Self> {
+        let [_, flags, s0, s1, g0, g1, 0, 0, i0, i1, i2, i3, r0, r1, r2, r3, rest @ ..] = bytes else { return None };
+        let [t0, t1, t2, t3, t4, t5, t6, t7, e0, e1, e2, e3, 0, 0, 0, 0] = rest else { return None };
+        if flags & !WANTS_REPLY != 0 {
+            return None;
+        }
+        Some(Self {
+            id: u32::from_le_bytes([*i0, *i1, *i2, *i3]),
+            slot: Slot(u16::from_le_bytes([*s0, *s1])),
+            generation: Generation(u16::from_le_bytes([*g0, *g1])),
+            wants_reply: flags & WANTS_REPLY != 0,
+            remaining: micros([*r0, *r1, *r2, *r3]),
+            stamp: u64::from_le_bytes([*t0, *t1, *t2, *t3, *t4, *t5, *t6, *t7]),
+            since: micros([*e0, *e1, *e2, *e3]),
+        })
+    }
+}
+
+fn micros(bytes: [u8; 4]) -> Duration {
+    Duration::from_micros(u64::from(u32::from_le_bytes(bytes)))
+}
+
+/// The header of a reply to request `id`.
+pub fn encode_reply(id: u32, status: Result<(), Error>) -> [u8; REPLY_BYTES] {
+    answer(REPLY, id, status)
+}
+
+/// The message that tells why asynchronous request `id` failed.
+pub fn encode_failure(id: u32, error: Error) -> [u8; REPLY_BYTES] {
+    answer(FAILURE, id, Err(error))
+}
+
+fn answer(kind: u8, id: u32, status: Result<(), Error>) -> [u8; REPLY_BYTES] {
+    let (code, index, first, second) = match status {
+        Ok(()) => (0, 0, 0, 0),
+        Err(error) => error_code(error),
+    };
+    let [i0, i1, i2, i3] = id.to_le_bytes();
+    let [a0, a1, a2, a3] = first.to_le_bytes();
+    let [b0, b1, b2, b3] = second.to_le_bytes();
+    [kind, code, index, 0, i0, i1, i2, i3, a0, a1, a2, a3, b0, b1, b2, b3]
+}
+
+fn decode_reply(bytes: &[u8; REPLY_BYTES]) -> Option<(u32, Result<(), Error>)> {
+    let &[_, code, index, 0, i0, i1, i2, i3, a0, a1, a2, a3, b0, b1, b2, b3] = bytes else { return None };
+    let id = u32::from_le_bytes([i0, i1, i2, i3]);
+    if code == 0 {
+        return Some((id, Ok(())));
+    }
+    let (first, second) = (u32::from_le_bytes([a0, a1, a2, a3]), u32::from_le_bytes([b0, b1, b2, b3]));
+    Some((id, Err(error_of(code, index, first, second))))
+}
+
+/// (code, index, first number, second number) of an error that a callee answers.
+fn error_code(error: Error) -> (u8, u8, u32, u32) {
+    match error {
+        Error::UnknownFunction => (1, 0, 0, 0),
+        Error::StaleFunction => (2, 0, 0, 0),
+        Error::MissingArgument { index } => (3, index, 0, 0),
+        Error::WrongType { index } => (4, index, 0, 0),
+        Error::WrongSize { index, expected, found } => (5, index, expected, found),
+        Error::Expired => (6, 0, 0, 0),
+        Error::Stale => (7, 0, 0, 0),
+        Error::Busy => (8, 0, 0, 0),
+        Error::NotAllowed => (10, 0, 0, 0),
+        Error::WouldDeadlock => (11, 0, 0, 0),
+        Error::TooLarge { limit } => (12, 0, limit, 0),
+        Error::TooSoon { wait } => (13, 0, wait.as_wire(), 0),
+        Error::ResultWouldNotFit { need, have } => (14, 0, need, have),
+        Error::Service(ServiceError::Failed(code)) => (20, 0, u32::from(code), 0),
+        Error::Service(ServiceError::Panicked) => (21, 0, 0, 0),
+        Error::Service(ServiceError::NotReady) => (22, 0, 0, 0),
+        Error::Service(ServiceError::BadResults) => (23, 0, 0, 0),
+        _ => (9, 0, 0, 0),
+    }
+}
+
+/// The inverse of [`error_code`]; a code of a later version reads as `Malformed`.
+fn error_of(code: u8, index: u8, first: u32, second: u32) -> Error {
+    match code {
+        1 => Error::UnknownFunction,
+        2 => Error::StaleFunction,
+        3 => Error::MissingArgument { index },
+        4 => Error::WrongType { index },
+        5 => Error::WrongSize { index, expected: first, found: second },
+        6 => Error::Expired,
+        7 => Error::Stale,
+        8 => Error::Busy,
+        10 => Error::NotAllowed,
+        11 => Error::WouldDeadlock,
+        12 => Error::TooLarge { limit: first },
+        13 => Error::TooSoon { wait: Duration::from_micros(u64::from(first)) },
+        14 => Error::ResultWouldNotFit { need: first, have: second },
+        20 => Error::Service(ServiceError::Failed(first as u16)),
+        21 => Error::Service(ServiceError::Panicked),
+        22 => Error::Service(ServiceError::NotReady),
+        23 => Error::Service(ServiceError::BadResults),
+        _ => Error::Malformed,
+    }
+}
+
+/// Messages that keep two units' views of each other in step.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Control<'b> {
+    /// A function of the sender may now be called.
+    Publish {
+        /// Its slot.
+        slot: u16,
+        /// Its life.
+        generation: u16,
+        /// [`Attributes`](super::function::Attributes) in their wire form.
+        attributes: [u8; 8],
+        /// The encoded [`Signature`](super::function::Signature).
+        #[serde(borrow)]
+        signature: &'b [u8],
+    },
+    /// A function of the sender may no longer be called.
+    Withdraw {
+        /// Its slot.
+        slot: u16,
+    },
+    /// All publishing and withdrawing up to here is to be acknowledged.
+    ListEnd {
+        /// Rises with each acknowledgement asked for.
+        serial: u32,
+    },
+    /// The list up to `serial` was read.
+    ListAck {
+        /// As in `ListEnd`.
+        serial: u32,
+        /// Functions that the reader keeps no room for.
+        skipped: u16,
+    },
+    /// The sender's limits changed.
+    Limits {
+        /// Longest message that the sender takes.
+        message_size: u32,
+        /// Least time between two requests to the sender, in microseconds.
+        minimum_interval: u32,
+        /// Calls of one peer that the sender holds.
+        calls: u16,
+    },
+    /// The caller no longer wants what the leased function started.
+    Release {
+        /// The function.
+        slot: u16,
+    },
+    /// The callee ended what the leased function started; renewing it is no use.
+    LeaseEnded {
+        /// The function.
+        slot: u16,
+        /// The caller let it expire, as opposed to: it is finished.
+        expired: bool,
+    },
+}
+
+impl Control<'_> {
+    /// Encodes into `out`, whole message; `None` where it does not fit.
+    pub fn encode<'o>(&self, out: &'o mut [u8]) -> Option<&'o [u8]> {
+        let (kind, rest) = out.split_first_mut()?;
+        *kind = CONTROL;
+        let used = postcard::to_slice(self, rest).ok()?.len().checked_add(1)?;
+        out.get(..used)
+    }
+}
+
+/// What travels in a session's datagrams, or in the stream as a session frame.
+#[derive(Debug, PartialEq, Eq)]
+pub enum SessionBody<'b> {
+    /// The sender is alive; its clock in microseconds.
+    KeepAlive {
+        /// The sender's clock.
+        stamp: u64,
+    },
+    /// The caller still wants what a leased function started.
+    Renew(Renewal),
+    /// One whole message: a best-effort request, or an emergency's second copy. The priority's byte, the message.
+    Message(u8, &'b [u8]),
+}
+
+/// The caller still wants what a leased function started; aged like a request.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Renewal {
+    /// The function.
+    pub slot: Slot,
+    /// Its life.
+    pub generation: Generation,
+    /// The callee's clock as the caller last heard it.
+    pub stamp: u64,
+    /// Time since then.
+    pub since: Duration,
+}
+
+/// Longest session body that is not a message.
+pub const SESSION_BODY_BYTES: usize = 20;
+
+const KEEP_ALIVE: u8 = 1;
+const RENEW: u8 = 2;
+const MESSAGE: u8 = 3;
+
+impl<'b> SessionBody<'b> {
+    /// Reads a session body.
+    pub fn decode(bytes: &'b [u8]) -> Option<Self> {
+        let (&kind, rest) = bytes.split_first()?;
+        match kind {
+            KEEP_ALIVE => Some(Self::KeepAlive { stamp: u64::from_le_bytes(rest.try_into().ok()?) }),
+            RENEW => {
+                let (slot, rest) = rest.split_first_chunk()?;
+                let (generation, rest) = rest.split_first_chunk()?;
+                let (stamp, rest) = rest.split_first_chunk()?;
+                Some(Self::Renew(Renewal {
+                    slot: Slot(u16::from_le_bytes(*slot)),
+                    generation: Generation(u16::from_le_bytes(*generation)),
+                    stamp: u64::from_le_bytes(*stamp),
+                    since: micros(rest.try_into().ok()?),
+                }))
+            }
+            MESSAGE => {
+                let (&priority, message) = rest.split_first()?;
+                Some(Self::Message(priority, message))
+            }
+            _ => None,
+        }
+    }
+
+    /// A keep-alive's bytes.
+    pub fn keep_alive(stamp: u64) -> [u8; 9] {
+        let [a, b, c, d, e, f, g, h] = stamp.to_le_bytes();
+        [KEEP_ALIVE, a, b, c, d, e, f, g, h]
+    }
+
+    /// A renewal's bytes.
+    pub fn renewal(renewal: &Renewal) -> [u8; 17] {
+        let [s0, s1] = renewal.slot.0.to_le_bytes();
+        let [g0, g1] = renewal.generation.0.to_le_bytes();
+        let [a, b, c, d, e, f, g, h] = renewal.stamp.to_le_bytes();
+        let [w, x, y, z] = renewal.since.as_wire().to_le_bytes();
+        [RENEW, s0, s1, g0, g1, a, b, c, d, e, f, g, h, w, x, y, z]
+    }
+
+    /// The two bytes before a message.
+    pub const fn message_prefix(priority: u8) -> [u8; 2] {
+        [MESSAGE, priority]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, clippy::indexing_slicing, clippy::panic)]
+    use super::*;
+    use proptest::prelude::*;
+
+    fn headers() -> impl Strategy<Value = RequestHeader> {
+        (any::<u32>(), any::<u16>(), any::<u16>(), any::<bool>(), any::<u32>(), any::<u64>(), any::<u32>()).prop_map(
+            |(id, slot, generation, wants_reply, remaining, stamp, since)| RequestHeader {
+                id,
+                slot: Slot(slot),
+                generation: Generation(generation),
+                wants_reply,
+                remaining: Duration::from_micros(u64::from(remaining)),
+                stamp,
+                since: Duration::from_micros(u64::from(since)),
+            },
+        )
+    }
+
+    proptest! {
+        #[test]
+        fn a_request_header_survives(header in headers()) {
+            let bytes = header.encode();
+            let Some(Message::Request(read, block)) = Message::decode(&bytes) else { panic!() };
+            prop_assert_eq!(read, header);
+            prop_assert!(block.is_empty());
+        }
+
+        #[test]
+        fn decoding_never_panics(bytes in prop::collection::vec(any::<u8>(), 0..80), kind in 0..5u8) {
+            let mut bytes = bytes;
+            bytes.insert(0, kind);
+            let _ = Message::decode(&bytes);
+            let _ = SessionBody::decode(&bytes);
+        }
+
+        #[test]
+        fn error_codes_are_total(code in 1..=255u8, index: u8, first: u32, second: u32) {
+            let error = error_of(code, index, first, second);
+            let bytes = encode_reply(7, Err(error));
+            let Some(Message::Reply(7, Err(read))) = Message::decode(&bytes) else { panic!() };
+            prop_assert_eq!(read, error);
+        }
+    }
+
+    #[test]
+    fn control_messages_fit_their_bound() {
+        let worst = Control::Limits { message_size: u32::MAX, minimum_interval: u32::MAX, calls: u16::MAX };
+        let mut out = [0; CONTROL_BYTES];
+        assert!(worst.encode(&mut out).is_some());
+        let signature = [1; 300];
+        let publish =
+            Control::Publish { slot: u16::MAX, generation: u16::MAX, attributes: [255; 8], signature: &signature };
+        let mut out = [0; PUBLISH_BYTES + 300];
+        let bytes = publish.encode(&mut out).unwrap();
+        let Some(Message::Control(read)) = Message::decode(bytes) else { panic!() };
+        assert_eq!(read, publish);
+    }
+
+    #[test]
+    fn session_bodies_survive() {
+        assert_eq!(SessionBody::decode(&SessionBody::keep_alive(9)), Some(SessionBody::KeepAlive { stamp: 9 }));
+        let renewal = Renewal { slot: Slot(1), generation: Generation(2), stamp: 3, since: Duration::from_micros(4) };
+        assert_eq!(SessionBody::decode(&SessionBody::renewal(&renewal)), Some(SessionBody::Renew(renewal)));
+    }
+}

@@ -1,0 +1,100 @@
+//! Which functions of a unit are visible to whom: to all, also to those that come later, or to one identity, also after
+//! it reconnects (paper, listing lines 23 and 24).
+
+use crate::distribution::function_list::Slot;
+use crate::distribution::identity::Identity;
+use crate::error::{Error, Limit};
+use crate::storage::Storage;
+
+/// A function that one identity may see.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct PublishedToOne {
+    identity: Identity,
+    slot: Slot,
+}
+
+/// The unit's record of what it has published.
+pub struct Publications<S: Storage> {
+    to_all: S::Slice<bool>,
+    to_one: S::Slice<Option<PublishedToOne>>,
+}
+
+impl<S: Storage> Publications<S> {
+    /// A record with one flag per function of the unit's list, and as many functions shown to single nodes as there are
+    /// slots in `to_one`.
+    pub fn new(to_all: S::Slice<bool>, to_one: S::Slice<Option<PublishedToOne>>) -> Self {
+        Self { to_all, to_one }
+    }
+
+    /// Shows a function to every node.
+    pub fn publish_to_all(&mut self, slot: Slot) -> Result<(), Error> {
+        let flag = self.to_all.get_mut(usize::from(slot.0)).ok_or(Error::Full(Limit::Functions))?;
+        *flag = true;
+        Ok(())
+    }
+
+    /// Shows a function to one node.
+    pub fn publish_to(&mut self, identity: &Identity, slot: Slot) -> Result<(), Error> {
+        if self.is_visible(identity, slot) {
+            return Ok(());
+        }
+        let place = self.to_one.iter_mut().find(|place| place.is_none()).ok_or(Error::Full(Limit::Functions))?;
+        *place = Some(PublishedToOne { identity: identity.clone(), slot });
+        Ok(())
+    }
+
+    /// Hides a function from everybody.
+    pub fn withdraw(&mut self, slot: Slot) {
+        if let Some(flag) = self.to_all.get_mut(usize::from(slot.0)) {
+            *flag = false;
+        }
+        for place in self.to_one.iter_mut() {
+            place.take_if(|published| published.slot == slot);
+        }
+    }
+
+    /// Whether a node may see a function.
+    pub fn is_visible(&self, identity: &Identity, slot: Slot) -> bool {
+        let to_all = self.to_all.get(usize::from(slot.0)).copied().unwrap_or(false);
+        to_all || self.to_one.iter().flatten().any(|shown| shown.slot == slot && shown.identity == *identity)
+    }
+
+    /// All functions that a node may see.
+    pub fn visible_to<'p>(&'p self, identity: &'p Identity) -> impl Iterator<Item = Slot> + 'p {
+        (0..self.to_all.len()).map(|index| Slot(index as u16)).filter(|&slot| self.is_visible(identity, slot))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::storage::Boxed;
+    use std::vec;
+    use std::vec::Vec;
+
+    #[test]
+    fn what_is_published_to_one_is_hidden_from_others() {
+        let mut publications: Publications<Boxed> =
+            Publications::new(vec![false; 3].into_boxed_slice(), vec![None; 2].into_boxed_slice());
+        let (one, other) = (Identity::s_unit("one", 1).unwrap(), Identity::s_unit("other", 2).unwrap());
+        publications.publish_to(&one, Slot(1)).unwrap();
+        publications.publish_to_all(Slot(2)).unwrap();
+        assert_eq!(publications.visible_to(&one).collect::<Vec<_>>(), [Slot(1), Slot(2)]);
+        assert_eq!(publications.visible_to(&other).collect::<Vec<_>>(), [Slot(2)]);
+        publications.withdraw(Slot(1));
+        publications.withdraw(Slot(2));
+        assert_eq!(publications.visible_to(&one).count(), 0);
+    }
+
+    #[test]
+    fn a_full_record_says_so() {
+        let mut publications: Publications<Boxed> =
+            Publications::new(vec![false; 1].into_boxed_slice(), vec![None; 1].into_boxed_slice());
+        let (one, other) = (Identity::s_unit("one", 1).unwrap(), Identity::s_unit("other", 2).unwrap());
+        publications.publish_to(&one, Slot(0)).unwrap();
+        publications.publish_to(&one, Slot(0)).unwrap();
+        assert_eq!(publications.publish_to(&other, Slot(0)), Err(Error::Full(Limit::Functions)));
+        assert_eq!(publications.publish_to_all(Slot(1)), Err(Error::Full(Limit::Functions)));
+    }
+}

@@ -1,0 +1,198 @@
+//! Calls of this unit that wait for a reply, and the gate that keeps the minimum interval.
+
+use crate::distribution::function_list::{Generation, Slot};
+use crate::error::{Error, Limit};
+use crate::storage::Storage;
+use crate::time::{Duration, Instant};
+
+/// Names a request within its session; rises with each one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct CallId(pub u32);
+
+/// A call that waits for its reply.
+#[derive(Clone, Copy, Debug)]
+pub struct Pending {
+    pub(crate) id: CallId,
+    pub(crate) slot: Slot,
+    pub(crate) generation: Generation,
+    pub(crate) deadline: Instant,
+}
+
+/// The table of calls in flight to one peer: lent slots, found by id without a search.
+pub struct Requests<S: Storage> {
+    pending: S::Slice<Option<Pending>>,
+    in_flight: usize,
+    next_id: u32,
+    /// No call's deadline is earlier; a call that was closed may leave it too early until the next look.
+    earliest: Instant,
+    last_request: Option<Instant>,
+}
+
+impl<S: Storage> Requests<S> {
+    /// A table with as many slots as were lent.
+    pub fn new(pending: S::Slice<Option<Pending>>) -> Self {
+        Self { pending, in_flight: 0, next_id: 1, earliest: Instant::FAR_FUTURE, last_request: None }
+    }
+
+    /// [`Error::TooSoon`] when `interval` has not passed since the last request.
+    pub(crate) fn gate(&self, now: Instant, interval: Duration) -> Result<(), Error> {
+        let Some(last) = self.last_request else { return Ok(()) };
+        let wait = (last + interval).since(now);
+        if wait == Duration::ZERO { Ok(()) } else { Err(Error::TooSoon { wait }) }
+    }
+
+    /// Notes that a request went out, for the gate.
+    pub(crate) fn sent(&mut self, now: Instant) {
+        self.last_request = Some(now);
+    }
+
+    /// An id for a request that expects no reply. `None` when the ids ran out.
+    pub(crate) fn next_id(&mut self) -> Option<CallId> {
+        let id = self.next_id;
+        self.next_id = id.checked_add(1)?;
+        Some(CallId(id))
+    }
+
+    /// An id and a slot for a call.
+    pub(crate) fn open(
+        &mut self,
+        slot: Slot,
+        generation: Generation,
+        deadline: Instant,
+    ) -> Result<Option<CallId>, Error> {
+        if self.in_flight >= self.pending.len() {
+            return Err(Error::Full(Limit::Calls));
+        }
+        // The slot follows from the id, so an id whose slot is taken is passed over; one is free, so the loop ends.
+        for _ in 0..self.pending.len() {
+            let Some(id) = self.next_id() else { return Ok(None) };
+            let Some(place) = self.place(id) else { continue };
+            if place.is_none() {
+                *place = Some(Pending { id, slot, generation, deadline });
+                self.in_flight = self.in_flight.saturating_add(1);
+                self.earliest = self.earliest.min(deadline);
+                return Ok(Some(id));
+            }
+        }
+        Err(Error::Full(Limit::Calls))
+    }
+
+    /// Ends a call and frees its slot. `None` when it had ended already.
+    pub(crate) fn close(&mut self, id: CallId) -> Option<Pending> {
+        let place = self.place(id)?;
+        let pending = place.take_if(|pending| pending.id == id)?;
+        self.in_flight = self.in_flight.saturating_sub(1);
+        Some(pending)
+    }
+
+    /// Ends one call whose deadline has passed.
+    pub(crate) fn expire(&mut self, now: Instant) -> Option<CallId> {
+        if now < self.earliest {
+            return None;
+        }
+        let due = self.pending.iter().flatten().find(|pending| pending.deadline <= now).map(|pending| pending.id);
+        match due {
+            Some(id) => self.close(id).map(|pending| pending.id),
+            None => {
+                let deadlines = self.pending.iter().flatten().map(|pending| pending.deadline);
+                self.earliest = deadlines.min().unwrap_or(Instant::FAR_FUTURE);
+                None
+            }
+        }
+    }
+
+    /// Ends any one call, as when the link is gone.
+    pub(crate) fn interrupt(&mut self) -> Option<CallId> {
+        let id = self.pending.iter().flatten().map(|pending| pending.id).min()?;
+        self.close(id).map(|pending| pending.id)
+    }
+
+    /// Calls that wait for a reply.
+    pub const fn in_flight(&self) -> usize {
+        self.in_flight
+    }
+
+    pub(crate) const fn deadline(&self) -> Instant {
+        self.earliest
+    }
+
+    fn place(&mut self, id: CallId) -> Option<&mut Option<Pending>> {
+        let index = (id.0 as usize).checked_rem(self.pending.len())?;
+        self.pending.get_mut(index)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, clippy::arithmetic_side_effects)]
+    use super::*;
+    use crate::storage::Boxed;
+    use proptest::prelude::*;
+    use std::collections::BTreeMap;
+    use std::vec;
+
+    fn table(slots: usize) -> Requests<Boxed> {
+        Requests::new(vec![None; slots].into_boxed_slice())
+    }
+
+    fn open(requests: &mut Requests<Boxed>, deadline: u64) -> Result<Option<CallId>, Error> {
+        requests.open(Slot(0), Generation(0), Instant::from_micros(deadline))
+    }
+
+    #[test]
+    fn a_full_table_names_its_limit_and_a_closed_call_frees_its_slot() {
+        let mut requests = table(2);
+        let first = open(&mut requests, 10).unwrap().unwrap();
+        open(&mut requests, 10).unwrap();
+        assert_eq!(open(&mut requests, 10), Err(Error::Full(Limit::Calls)));
+        assert!(requests.close(first).is_some());
+        assert!(requests.close(first).is_none());
+        assert!(open(&mut requests, 10).unwrap().is_some());
+    }
+
+    #[test]
+    fn the_gate_tells_how_long_to_wait() {
+        let mut requests = table(1);
+        let interval = Duration::from_millis(10);
+        assert_eq!(requests.gate(Instant::START, interval), Ok(()));
+        requests.sent(Instant::START);
+        let later = Instant::from_micros(4_000);
+        assert_eq!(requests.gate(later, interval), Err(Error::TooSoon { wait: Duration::from_millis(6) }));
+        assert_eq!(requests.gate(Instant::from_micros(10_000), interval), Ok(()));
+        assert_eq!(requests.gate(later, Duration::ZERO), Ok(()));
+    }
+
+    proptest! {
+        #[test]
+        fn the_table_agrees_with_a_map(steps in prop::collection::vec((0..4u8, 0..40u64), 0..200)) {
+            let mut requests = table(5);
+            let mut model: BTreeMap<CallId, u64> = BTreeMap::new();
+            let mut now = 0;
+            for (step, value) in steps {
+                match step {
+                    0 | 1 => match open(&mut requests, now + value) {
+                        Ok(id) => { model.insert(id.unwrap(), now + value); }
+                        Err(_) => prop_assert_eq!(model.len(), 5),
+                    },
+                    2 => {
+                        let id = model.keys().nth(value as usize % model.len().max(1)).copied();
+                        if let Some(id) = id {
+                            prop_assert!(requests.close(id).is_some());
+                            model.remove(&id);
+                        }
+                    }
+                    _ => {
+                        now += value;
+                        while let Some(id) = requests.expire(Instant::from_micros(now)) {
+                            prop_assert!(model.remove(&id).unwrap() <= now);
+                        }
+                        prop_assert!(model.values().all(|deadline| *deadline > now));
+                        let earliest = model.values().min().map_or(Instant::FAR_FUTURE, |d| Instant::from_micros(*d));
+                        prop_assert!(requests.deadline() <= earliest);
+                    }
+                }
+                prop_assert_eq!(requests.in_flight(), model.len());
+            }
+        }
+    }
+}

@@ -1,0 +1,595 @@
+//! The way up: bytes become frames, frames messages, messages events.
+
+use core::net::SocketAddr;
+
+use super::publishing::Told;
+use super::timing::made_at;
+use super::{Call, Event, Phase, Remote, Session, close_reason};
+use crate::config::Priority;
+use crate::distribution::block;
+use crate::distribution::function::{Attributes, Signature};
+use crate::distribution::function_list::{Generation, Slot};
+use crate::distribution::hello::{Hello, HelloError};
+use crate::distribution::message::{
+    Control, Message, REPLY_BYTES, REQUEST_BYTES, RequestHeader, SessionBody, encode_failure, encode_reply,
+};
+use crate::distribution::parameters::ParametersView;
+use crate::error::{CloseReason, Error, Limit, Refusal, ServiceError};
+use crate::host::connections::{Incoming, LinkCounter, Liveness, Place};
+use crate::host::frame::{ChunkWriter, Frame};
+use crate::host::mailman::Mailman;
+use crate::host::secure::Secure;
+use crate::services::Context;
+use crate::services::calls::{CallHead, Seen, Ticket};
+use crate::services::lease::{Granted, Service};
+use crate::services::requests::CallId;
+use crate::storage::{Buffers, Storage};
+use crate::time::Duration;
+
+/// Result of [`Session::receive`].
+#[derive(Debug)]
+pub struct Receipt<'b> {
+    /// How many of the lent bytes are used up.
+    pub consumed: usize,
+    /// What they led to.
+    pub event: Option<Event<'b>>,
+    /// The rest is to be offered again later: no message buffer is free, or the node has not decided yet.
+    pub paused: bool,
+}
+
+/// The results of a call, still in the buffer that they came in.
+#[derive(Clone, Copy, Debug)]
+pub struct ReplyBlock<'b> {
+    signature: Signature<'b>,
+    bytes: &'b [u8],
+}
+
+impl<'b> ReplyBlock<'b> {
+    /// Updates `parameters` with the results; on an error they are unchanged.
+    pub fn read_into(&self, parameters: &mut ParametersView) -> Result<(), Error> {
+        block::read(self.signature.results(), self.bytes, parameters)
+    }
+
+    /// The function that answered.
+    pub const fn signature(&self) -> Signature<'b> {
+        self.signature
+    }
+
+    /// The encoded block.
+    pub const fn bytes(&self) -> &'b [u8] {
+        self.bytes
+    }
+}
+
+/// What a frame led to, before anything is borrowed for the port.
+enum Outcome {
+    Nothing,
+    Event(Event<'static>),
+    Reply { id: CallId, slot: Slot, generation: Generation, block: Place },
+}
+
+impl From<Event<'static>> for Outcome {
+    fn from(event: Event<'static>) -> Self {
+        Self::Event(event)
+    }
+}
+
+impl<S: Storage, C: Secure> Session<S, C> {
+    /// Takes bytes that the port has read from the stream. Call it again with the rest, and finally with nothing, until
+    /// it consumes nothing and returns no event.
+    ///
+    /// The arguments of a call that may run at once are put into `arguments`; without them, or when more bytes follow
+    /// that must be looked at first, the call waits for [`next_call`](Self::next_call).
+    pub fn receive<'b, M: Mailman, B: Buffers<S>, H: Service>(
+        &'b mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        lent: &'b mut [u8],
+        arguments: Option<&mut ParametersView>,
+    ) -> Receipt<'b> {
+        match self.phase {
+            Phase::Ending(_) | Phase::Ended => return Receipt { consumed: lent.len(), event: None, paused: false },
+            Phase::Deciding => return Receipt { consumed: 0, event: None, paused: true },
+            Phase::AwaitingHello { .. } | Phase::Live => {}
+        }
+        let received = match self.link.receive(cx.buffers, lent) {
+            Ok(received) => received,
+            Err(reason) => {
+                self.close(cx, reason);
+                return Receipt { consumed: lent.len(), event: None, paused: false };
+            }
+        };
+        let Some(incoming) = received.incoming else {
+            return Receipt { consumed: received.consumed, event: None, paused: received.paused };
+        };
+        self.liveness.heard(cx.now);
+        let last = received.consumed == lent.len();
+        let outcome = self.digest(cx, incoming, lent, arguments.filter(|_| last));
+        Receipt { consumed: received.consumed, event: self.event(outcome, lent), paused: received.paused }
+    }
+
+    /// Takes the body of a session datagram, which the node has found to be this link's.
+    pub fn datagram<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        from: SocketAddr,
+        nonce: u64,
+        body: &[u8],
+    ) -> Option<Event<'static>> {
+        if self.phase != Phase::Live || nonce != self.local.nonce || from.ip() != self.peer_address.ip() {
+            self.link.counters.add(LinkCounter::DatagramsDropped, 1);
+            return None;
+        }
+        self.link.counters.add(LinkCounter::DatagramsReceived, 1);
+        self.liveness.heard_datagram(cx.now);
+        match self.session_body(cx, Place::lent(body.len()), body) {
+            Outcome::Event(event) => Some(event),
+            _ => None,
+        }
+    }
+
+    fn event<'b>(&'b self, outcome: Outcome, lent: &'b [u8]) -> Option<Event<'b>> {
+        match outcome {
+            Outcome::Nothing => None,
+            Outcome::Event(event) => Some(event),
+            Outcome::Reply { id, slot, generation, block } => {
+                let function = self.theirs.function(slot).filter(|function| function.generation == generation);
+                let block = function
+                    .map(|function| ReplyBlock { signature: function.signature, bytes: self.link.view(block, lent) });
+                Some(Event::Reply(id, block.ok_or(Error::StaleFunction)))
+            }
+        }
+    }
+
+    fn digest<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        incoming: Incoming,
+        lent: &[u8],
+        arguments: Option<&mut ParametersView>,
+    ) -> Outcome {
+        match (incoming, self.phase) {
+            (Incoming::Refuse(code), _) => {
+                self.end(CloseReason::Refused(refusal(code)));
+                Outcome::Nothing
+            }
+            (Incoming::Close(code), _) => {
+                self.end(close_reason(code));
+                Outcome::Nothing
+            }
+            (Incoming::Hello(place), Phase::AwaitingHello { .. }) => self.hello_arrived(cx, place, lent),
+            (Incoming::Ping, Phase::Live) => {
+                self.link.send_frame(&Frame::Pong);
+                self.flush(cx);
+                Outcome::Nothing
+            }
+            (Incoming::Pong, Phase::Live) => Event::Answered.into(),
+            (Incoming::Session(place), Phase::Live) => self.session_body(cx, place, lent),
+            (Incoming::Message(priority, place), Phase::Live) => {
+                self.message_arrived(cx, priority, place, lent, arguments)
+            }
+            _ => {
+                self.close(cx, CloseReason::Protocol);
+                Outcome::Nothing
+            }
+        }
+    }
+
+    fn hello_arrived<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        place: Place,
+        lent: &[u8],
+    ) -> Outcome {
+        let hello = match Hello::decode(self.link.view(place, lent)) {
+            Ok(hello) => hello,
+            Err(error) => {
+                let version = matches!(error, HelloError::Version(_));
+                self.refuse(cx, if version { Refusal::Version } else { Refusal::Malformed });
+                return Outcome::Nothing;
+            }
+        };
+        self.link.set_peer_limits(usize::from(hello.limits.chunk_size));
+        self.liveness = Liveness::new(cx.now, Duration::from_millis(u64::from(hello.keep_alive)));
+        self.clock.hear(cx.now, hello.stamp);
+        let datagrams = SocketAddr::new(self.peer_address.ip(), hello.udp_port);
+        self.remote = Some(Remote { hello, datagrams });
+        self.phase = Phase::Deciding;
+        Event::Hello.into()
+    }
+
+    fn session_body<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        place: Place,
+        lent: &[u8],
+    ) -> Outcome {
+        match SessionBody::decode(self.link.view(place, lent)) {
+            Some(SessionBody::KeepAlive { stamp }) => {
+                self.clock.hear(cx.now, stamp);
+                Outcome::Nothing
+            }
+            Some(SessionBody::Renew(renewal)) => {
+                self.renewed(cx, &renewal);
+                Outcome::Nothing
+            }
+            Some(SessionBody::Message(priority, message)) => {
+                let prefix = self.link.view(place, lent).len().saturating_sub(message.len());
+                match (Priority::from_wire(priority), Message::decode(message)) {
+                    (Some(priority), Some(Message::Request(header, _))) => {
+                        let block = place.after(prefix).after(REQUEST_BYTES);
+                        self.request_arrived(cx, priority, &header, block, lent, None)
+                    }
+                    _ => self.unreadable_datagram(),
+                }
+            }
+            None => self.unreadable_datagram(),
+        }
+    }
+
+    fn unreadable_datagram(&mut self) -> Outcome {
+        self.link.counters.add(LinkCounter::DatagramsDropped, 1);
+        Outcome::Nothing
+    }
+
+    fn message_arrived<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        priority: Priority,
+        place: Place,
+        lent: &[u8],
+        arguments: Option<&mut ParametersView>,
+    ) -> Outcome {
+        match Message::decode(self.link.view(place, lent)) {
+            Some(Message::Request(header, _)) => {
+                self.request_arrived(cx, priority, &header, place.after(REQUEST_BYTES), lent, arguments)
+            }
+            Some(Message::Reply(id, result)) => {
+                let error = result.err();
+                self.reply_arrived(CallId(id), error, place.after(REPLY_BYTES))
+            }
+            Some(Message::Failure(id, error)) => Event::Failed(CallId(id), error).into(),
+            Some(Message::Control(_)) => self.control_arrived(cx, place, lent),
+            None => {
+                self.close(cx, CloseReason::Protocol);
+                Outcome::Nothing
+            }
+        }
+    }
+
+    fn reply_arrived(&mut self, id: CallId, error: Option<Error>, block: Place) -> Outcome {
+        let Some(pending) = self.requests.close(id) else {
+            self.link.counters.add(LinkCounter::RepliesLate, 1);
+            return Outcome::Nothing;
+        };
+        match error {
+            Some(error) => Event::Reply(id, Err(error)).into(),
+            None => Outcome::Reply { id, slot: pending.slot, generation: pending.generation, block },
+        }
+    }
+
+    fn control_arrived<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        place: Place,
+        lent: &[u8],
+    ) -> Outcome {
+        let Some(Message::Control(control)) = Message::decode(self.link.view(place, lent)) else {
+            return Outcome::Nothing;
+        };
+        match control {
+            Control::Publish { slot, generation, attributes, signature } => {
+                let kept = Attributes::decode(&attributes).and_then(|attributes| {
+                    self.theirs.insert(Slot(slot), Generation(generation), attributes, signature)
+                });
+                match kept {
+                    Ok(()) => {}
+                    Err(Error::Full(_)) => self.link.counters.add(LinkCounter::FunctionsSkipped, 1),
+                    Err(_) => self.close(cx, CloseReason::Protocol),
+                }
+                Outcome::Nothing
+            }
+            Control::Withdraw { slot } => {
+                self.theirs.remove(Slot(slot));
+                Outcome::Nothing
+            }
+            Control::ListEnd { serial } => {
+                self.publishing.acknowledge(serial);
+                self.pump(cx);
+                Event::ListChanged.into()
+            }
+            Control::ListAck { serial, skipped } => Event::Acknowledged { serial, skipped }.into(),
+            Control::Limits { message_size, minimum_interval, calls } => {
+                if let Some(remote) = &mut self.remote {
+                    remote.hello.limits.message_size = message_size;
+                    remote.hello.limits.minimum_interval = minimum_interval;
+                    remote.hello.limits.calls = calls;
+                }
+                Outcome::Nothing
+            }
+            Control::Release { slot } => match self.released(cx, Slot(slot)) {
+                true => Event::LeaseExpired(Slot(slot)).into(),
+                false => Outcome::Nothing,
+            },
+            Control::LeaseEnded { slot, expired } => match self.forget_held(Slot(slot)) {
+                true => Event::LeaseEnded { slot: Slot(slot), expired }.into(),
+                false => Outcome::Nothing,
+            },
+        }
+    }
+
+    fn request_arrived<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        priority: Priority,
+        header: &RequestHeader,
+        block: Place,
+        lent: &[u8],
+        arguments: Option<&mut ParametersView>,
+    ) -> Outcome {
+        self.link.counters.add(LinkCounter::RequestsReceived, 1);
+        let seen = self.calls.note(priority, header.id);
+        if seen == Seen::Before {
+            self.link.counters.add(LinkCounter::RequestsRepeated, 1);
+            return Outcome::Nothing;
+        }
+        let result = self.check_request(cx, priority, header, seen).and_then(|head| {
+            let block = self.link.view(block, lent);
+            match arguments.filter(|_| self.calls.is_idle(priority)) {
+                Some(arguments) => {
+                    read_arguments(cx, &head, block, arguments)?;
+                    self.begin(cx, head).map(Some)
+                }
+                None => self.calls.wait(cx.buffers, head, block).map(|()| None),
+            }
+        });
+        match result {
+            Ok(Some(call)) => Event::Call(call).into(),
+            Ok(None) => Outcome::Nothing,
+            Err(error) => {
+                self.refuse_request(cx, header.id, header.slot, priority, header.wants_reply, error);
+                Outcome::Nothing
+            }
+        }
+    }
+
+    /// Everything that can be said of a request without looking at its arguments.
+    fn check_request<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        priority: Priority,
+        header: &RequestHeader,
+        seen: Seen,
+    ) -> Result<CallHead, Error> {
+        if seen == Seen::TooOld {
+            return Err(Error::Stale);
+        }
+        let made = made_at(cx.now, header.stamp, header.since).ok_or(Error::Malformed)?;
+        let deadline = made + header.remaining;
+        if deadline <= cx.now {
+            return Err(Error::Expired);
+        }
+        match self.publishing.told(header.slot, header.generation) {
+            Told::Never => return Err(Error::UnknownFunction),
+            Told::Earlier => return Err(Error::StaleFunction),
+            Told::Now => cx.functions.lookup(header.slot, header.generation)?,
+        };
+        if priority != Priority::Emergency {
+            self.calls.interval(cx.now, self.constraints.minimum_interval)?;
+        }
+        self.calls.admit(priority, self.constraints.calls_per_peer)?;
+        Ok(CallHead {
+            id: header.id,
+            slot: header.slot,
+            generation: header.generation,
+            priority,
+            wants_reply: header.wants_reply,
+            deadline,
+            made,
+        })
+    }
+
+    /// The next call that waited and may begin now, its arguments in `arguments`. Call it after
+    /// [`receive`](Self::receive) is through and after each [`answer`](Self::answer), until it returns `None`.
+    pub fn next_call<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        arguments: &mut ParametersView,
+    ) -> Option<Call> {
+        while self.phase == Phase::Live {
+            let (functions, now) = (cx.functions, cx.now);
+            let (head, read) = self.calls.take_next(cx.buffers, |head, block| {
+                if head.deadline <= now {
+                    return Err(Error::Expired);
+                }
+                let function = functions.lookup(head.slot, head.generation)?;
+                block::read_arguments(function.signature.arguments(), block, arguments)?;
+                block::prepare_results(function.signature.results(), arguments)
+            })?;
+            match read.and_then(|()| self.begin(cx, head)) {
+                Ok(call) => return Some(call),
+                Err(error) => self.refuse_request(cx, head.id, head.slot, head.priority, head.wants_reply, error),
+            }
+        }
+        None
+    }
+
+    /// Whether [`next_call`](Self::next_call) would look at a call.
+    pub fn has_next_call(&self) -> bool {
+        self.phase == Phase::Live && self.calls.can_begin()
+    }
+
+    fn begin<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        head: CallHead,
+    ) -> Result<Call, Error> {
+        let ticket = self.calls.begin(head)?;
+        let lease = cx.functions.function(head.slot).and_then(|function| function.attributes.lease);
+        if let Some(length) = lease {
+            let end = head.made + length;
+            let granted = Granted { slot: head.slot, generation: head.generation, length, end };
+            let result = if end > cx.now { self.grant(cx, granted) } else { Err(Error::Expired) };
+            if let Err(error) = result {
+                self.calls.end(ticket);
+                return Err(error);
+            }
+        }
+        self.link.counters.add(LinkCounter::RequestsRun, 1);
+        let CallHead { slot, priority, wants_reply, deadline, .. } = head;
+        Ok(Call { ticket, slot, priority, wants_reply, deadline })
+    }
+
+    /// Lets the next call of the class begin while this one goes on, as for a service that takes long.
+    pub fn detach(&mut self, ticket: Ticket) {
+        self.calls.detach(ticket);
+    }
+
+    /// Answers a call. [`Error::Full`] when the answer cannot be kept now: the call stays open, to be answered again
+    /// when the stream has taken bytes. A call that was answered, or whose link has ended, is passed over.
+    pub fn answer<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        ticket: Ticket,
+        result: Result<&ParametersView, Error>,
+    ) -> Result<(), Error> {
+        let Some(head) = self.calls.call(ticket) else { return Ok(()) };
+        if self.phase == Phase::Live {
+            let sent = match result {
+                Ok(results) if head.wants_reply => self.send_results(cx, &head, results),
+                Ok(_) => Ok(()),
+                Err(error) => self.send_error(cx, head.id, head.priority, head.wants_reply, error),
+            };
+            if let Err(error @ Error::Full(_)) = sent {
+                return Err(error);
+            }
+        }
+        if !cfg!(cara_planted = "leaked_slot") {
+            self.calls.end(ticket);
+        }
+        Ok(())
+    }
+
+    /// Gives up on answering a call whose answer could not be kept.
+    pub fn drop_answer(&mut self, ticket: Ticket) {
+        if self.calls.end(ticket).is_some() {
+            self.link.counters.add(LinkCounter::RepliesDropped, 1);
+        }
+    }
+
+    fn send_results<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        head: &CallHead,
+        results: &ParametersView,
+    ) -> Result<(), Error> {
+        let functions = cx.functions;
+        let specs = match functions.lookup(head.slot, head.generation) {
+            Ok(function) => function.signature.results(),
+            Err(error) => return self.send_error(cx, head.id, head.priority, true, error),
+        };
+        let Ok(length) = block::measure(specs, results) else {
+            return self.send_error(cx, head.id, head.priority, true, ServiceError::BadResults.into());
+        };
+        let limit = self.peer_message_size();
+        if length > limit as usize {
+            return self.send_error(cx, head.id, head.priority, true, Error::TooLarge { limit });
+        }
+        let header = encode_reply(head.id, Ok(()));
+        let total = REPLY_BYTES.saturating_add(length);
+        let sent = self.send(cx, head.priority, total, |writer| {
+            writer.put(&header);
+            block::write(specs, results, writer);
+        });
+        match sent {
+            Err(Error::TooLarge { limit }) => {
+                self.send_error(cx, head.id, head.priority, true, Error::TooLarge { limit })
+            }
+            sent => sent,
+        }
+    }
+
+    fn send_error<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        id: u32,
+        priority: Priority,
+        wants_reply: bool,
+        error: Error,
+    ) -> Result<(), Error> {
+        let header = if wants_reply { encode_reply(id, Err(error)) } else { encode_failure(id, error) };
+        self.send(cx, priority, REPLY_BYTES, |writer| writer.put(&header))
+    }
+
+    pub(super) fn send<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        priority: Priority,
+        total: usize,
+        write: impl FnOnce(&mut ChunkWriter<'_>),
+    ) -> Result<(), Error> {
+        self.timers.gathered = crate::time::Instant::FAR_FUTURE;
+        self.timers.last_write = cx.now;
+        let sent = self.link.send_message(cx.mailman, cx.buffers, priority, total, false, write);
+        if let Err(Error::Closed(reason)) = sent {
+            self.end(reason);
+        }
+        sent
+    }
+
+    fn refuse_request<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        id: u32,
+        slot: Slot,
+        priority: Priority,
+        wants_reply: bool,
+        error: Error,
+    ) {
+        let counter = match error {
+            Error::Expired => LinkCounter::RequestsExpired,
+            Error::Stale => LinkCounter::RequestsRepeated,
+            Error::Busy | Error::Full(_) => LinkCounter::RequestsBusy,
+            Error::TooSoon { .. } => LinkCounter::RequestsTooSoon,
+            _ => LinkCounter::RequestsRejected,
+        };
+        self.link.counters.add(counter, 1);
+        let error = match error {
+            Error::Full(Limit::ParametersBytes | Limit::Variables) => {
+                Error::TooLarge { limit: self.constraints.message_size }
+            }
+            Error::Full(_) => Error::Busy,
+            error => error,
+        };
+        if self.send_error(cx, id, priority, wants_reply, error).is_err() {
+            self.link.counters.add(LinkCounter::RepliesDropped, 1);
+        }
+        if error == Error::StaleFunction {
+            self.publishing.tell_again(slot);
+            self.pump(cx);
+        }
+    }
+}
+
+fn read_arguments<S: Storage, M: Mailman, B: Buffers<S>, H: Service>(
+    cx: &Context<'_, S, M, B, H>,
+    head: &CallHead,
+    block: &[u8],
+    arguments: &mut ParametersView,
+) -> Result<(), Error> {
+    let function = cx.functions.lookup(head.slot, head.generation)?;
+    block::read_arguments(function.signature.arguments(), block, arguments)?;
+    block::prepare_results(function.signature.results(), arguments)
+}
+
+fn refusal(code: u8) -> Refusal {
+    match code {
+        1 => Refusal::Version,
+        2 => Refusal::Fleet,
+        3 => Refusal::WrongManager,
+        4 => Refusal::Full,
+        5 => Refusal::DuplicateIdentity,
+        6 => Refusal::Role,
+        7 => Refusal::AlreadyConnected,
+        _ => Refusal::Malformed,
+    }
+}

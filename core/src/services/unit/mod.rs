@@ -1,0 +1,430 @@
+//! One link to one peer: the s_unit's session with its manager, and each peer of an m_unit.
+//!
+//! A [`Session`] turns bytes into [`Event`]s and requests into bytes. It never waits and never calls back: the port
+//! lends it a [`Context`], runs the handler of an [`Event::Call`] outside of any lock, and brings the answer with
+//! [`Session::answer`]. It reaches the unit's [`Node`](crate::distribution::connection_handler::Node) only through
+//! returned events: after [`Event::Hello`] the port asks the node and calls [`Session::accept`] or [`Session::refuse`].
+//!
+//! # What a port does
+//! - bytes arrive: [`Session::receive`] until they are consumed and nothing more comes out, then [`Session::next_call`]
+//!   until it returns `None`, running what it returns;
+//! - the stream is writable: [`Session::writable`];
+//! - a session datagram arrives: [`Session::datagram`];
+//! - [`Session::deadline`] has come, and after every other call that may have ended the link: [`Session::poll`] until
+//!   it returns `None`;
+//! - [`Event::Closed`] is the last event: the port forgets the link and tells the node that it left.
+
+mod inbound;
+mod outbound;
+mod publishing;
+mod timing;
+
+pub use inbound::{Receipt, ReplyBlock};
+pub use outbound::{Delivery, RequestOptions};
+pub use publishing::Publication;
+
+use core::net::SocketAddr;
+
+use crate::config::{Constraints, HELLO_TIMEOUT, LINK_BUFFER_BYTES, Priority};
+use crate::counters::Counters;
+use crate::distribution::function_list::{Entry, Slot, TheirFunctionList};
+use crate::distribution::hello::Hello;
+use crate::distribution::identity::{Epoch, Identity};
+use crate::distribution::message::REQUEST_BYTES;
+use crate::error::{CloseReason, Error, Refusal};
+use crate::host::connections::{Link, LinkCounter, Liveness};
+use crate::host::frame::{self, Frame};
+use crate::host::mailman::{LinkId, Mailman};
+use crate::host::secure::Secure;
+use crate::services::Context;
+use crate::services::calls::{CallHead, Calls, Ticket};
+use crate::services::lease::{GrantedLeases, HeldLeases, Service};
+use crate::services::requests::{CallId, Pending, Requests};
+use crate::storage::{Buffers, Storage};
+use crate::time::{Duration, Instant};
+use timing::{PeerClock, Timers};
+
+/// Longest hello frame.
+const HELLO_BYTES: usize = 320;
+/// Most that a chunk adds to its piece of a message, without sealing.
+const FRAME_BYTES: usize = frame::HEADER_BYTES + 6;
+/// Messages of the protocol itself fit this, however small `message_size` is.
+const LEAST_MESSAGE_BYTES: usize = 512;
+
+/// What a session begins with.
+#[derive(Clone, Debug)]
+pub struct SessionConfig {
+    /// The link's index.
+    pub link: LinkId,
+    /// This unit opens the connection, as opposed to: it accepted one.
+    pub dialed: bool,
+    /// The other end of the stream.
+    pub address: SocketAddr,
+    /// This unit's hello, with a nonce that is fresh.
+    pub local: Hello,
+    /// This unit's constraints.
+    pub constraints: Constraints,
+}
+
+/// The slices that one session lives in.
+pub struct SessionStorage<S: Storage> {
+    /// [`LINK_BUFFER_BYTES`] for partial frames.
+    pub small: S::Slice<u8>,
+    /// One slot per call in flight to the peer.
+    pub pending: S::Slice<Option<Pending>>,
+    /// One slot per call of the peer that runs here, and one more for emergencies.
+    pub running: S::Slice<Option<CallHead>>,
+    /// One slot per function of this unit's own list.
+    pub publications: S::Slice<Publication>,
+    /// One slot per function of the peer's list that is kept.
+    pub their_functions: S::Slice<Entry>,
+    /// Bytes for the signatures of those.
+    pub their_signatures: S::Slice<u8>,
+}
+
+/// What happened on a link.
+#[derive(Debug)]
+pub enum Event<'b> {
+    /// The peer introduced itself: ask the node, then [`Session::accept`] or [`Session::refuse`].
+    Hello,
+    /// A call whose arguments are in the lent parameters: run its handler, then [`Session::answer`].
+    Call(Call),
+    /// The end of a call of this unit.
+    Reply(CallId, Result<ReplyBlock<'b>, Error>),
+    /// An asynchronous request was refused by the peer, or its service failed.
+    Failed(CallId, Error),
+    /// The peer's list of functions changed.
+    ListChanged,
+    /// The peer has read this unit's list up to `serial`, and keeps no room for `skipped` functions of it.
+    Acknowledged {
+        /// As returned by [`Session::publish`].
+        serial: u32,
+        /// Functions that the peer keeps no room for.
+        skipped: u16,
+    },
+    /// A lease on a function of this unit ended without being renewed: run its safe hook before anything else.
+    LeaseExpired(Slot),
+    /// The peer ended the lease that this unit held on its function: finished, or expired there.
+    LeaseEnded {
+        /// The peer's function.
+        slot: Slot,
+        /// It was not renewed in time.
+        expired: bool,
+    },
+    /// The peer answered a [`Session::challenge`].
+    Answered,
+    /// The link has ended; every call in flight and every lease has been reported before.
+    Closed(CloseReason),
+}
+
+/// A call of the peer that is to be run now.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Call {
+    /// Answers it.
+    pub ticket: Ticket,
+    /// The function of this unit's list.
+    pub slot: Slot,
+    /// Its class.
+    pub priority: Priority,
+    /// Whether the caller waits for an answer.
+    pub wants_reply: bool,
+    /// After this nobody waits for the answer.
+    pub deadline: Instant,
+}
+
+/// Where the link stands.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Phase {
+    /// The port is opening the connection, or waits for the peer's hello.
+    AwaitingHello { until: Instant },
+    /// The node decides about the peer.
+    Deciding,
+    /// Both have accepted.
+    Live,
+    /// The link has ended; what was in flight is being reported.
+    Ending(CloseReason),
+    /// Everything has been reported.
+    Ended,
+}
+
+/// What is known of the peer since its hello.
+struct Remote {
+    hello: Hello,
+    /// Where its session datagrams go.
+    datagrams: SocketAddr,
+}
+
+/// One link to one peer.
+pub struct Session<S: Storage, C: Secure> {
+    link: Link<S, C>,
+    phase: Phase,
+    dialed: bool,
+    local: Hello,
+    constraints: Constraints,
+    remote: Option<Remote>,
+    peer_address: SocketAddr,
+    liveness: Liveness,
+    clock: PeerClock,
+    timers: Timers,
+    requests: Requests<S>,
+    calls: Calls<S>,
+    publishing: publishing::Publishing<S>,
+    theirs: TheirFunctionList<S>,
+    granted: GrantedLeases,
+    held: HeldLeases,
+}
+
+impl<S: Storage, C: Secure> Session<S, C> {
+    /// A session on a link that is being opened or was accepted.
+    pub fn new(now: Instant, config: SessionConfig, cipher: C, storage: SessionStorage<S>) -> Self {
+        let SessionConfig { link, dialed, address, local, constraints } = config;
+        let chunk_limit = usize::from(constraints.chunk_size);
+        debug_assert!(storage.small.len() >= LINK_BUFFER_BYTES);
+        Self {
+            link: Link::new(link, cipher, storage.small, chunk_limit, message_limit(&constraints)),
+            phase: Phase::AwaitingHello { until: now + HELLO_TIMEOUT },
+            dialed,
+            local,
+            constraints,
+            remote: None,
+            peer_address: address,
+            liveness: Liveness::new(now, constraints.keep_alive),
+            clock: PeerClock::default(),
+            timers: Timers::new(now),
+            requests: Requests::new(storage.pending),
+            calls: Calls::new(storage.running),
+            publishing: publishing::Publishing::new(storage.publications),
+            theirs: TheirFunctionList::new(storage.their_functions, storage.their_signatures),
+            granted: GrantedLeases::new(),
+            held: HeldLeases::new(),
+        }
+    }
+
+    /// The link's index.
+    pub const fn link(&self) -> LinkId {
+        self.link.id()
+    }
+
+    /// This unit opened the connection.
+    pub const fn dialed(&self) -> bool {
+        self.dialed
+    }
+
+    /// Both ends have accepted each other.
+    pub fn is_live(&self) -> bool {
+        self.phase == Phase::Live
+    }
+
+    /// The link has ended and everything about it has been reported.
+    pub fn is_ended(&self) -> bool {
+        self.phase == Phase::Ended
+    }
+
+    /// The peer's hello, once it has come.
+    pub fn hello(&self) -> Option<&Hello> {
+        self.remote.as_ref().map(|remote| &remote.hello)
+    }
+
+    /// The peer's identity, once it has told it.
+    pub fn identity(&self) -> Option<&Identity> {
+        self.hello().map(|hello| &hello.identity)
+    }
+
+    /// The peer's boot epoch, once it has told it.
+    pub fn epoch(&self) -> Option<Epoch> {
+        self.hello().map(|hello| hello.epoch)
+    }
+
+    /// The other end of the stream.
+    pub const fn address(&self) -> SocketAddr {
+        self.peer_address
+    }
+
+    /// The nonce that the peer's session datagrams carry.
+    pub const fn nonce(&self) -> u64 {
+        self.local.nonce
+    }
+
+    /// What the peer has published to this unit.
+    pub const fn their_function_list(&self) -> &TheirFunctionList<S> {
+        &self.theirs
+    }
+
+    /// What happened on this link.
+    pub const fn counters(&self) -> &Counters<LinkCounter, { LinkCounter::COUNT }> {
+        &self.link.counters
+    }
+
+    /// Calls of this unit that wait for a reply.
+    pub const fn calls_in_flight(&self) -> usize {
+        self.requests.in_flight()
+    }
+
+    /// Calls of the peer that run or wait here.
+    pub const fn calls_held(&self) -> u16 {
+        self.calls.held()
+    }
+
+    /// Bytes wait for the stream to become writable.
+    pub fn wants_to_write(&self) -> bool {
+        self.link.wants_to_write()
+    }
+
+    /// The connection is open: the one who dialed introduces itself first.
+    pub fn connected<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+        self.phase = Phase::AwaitingHello { until: cx.now + HELLO_TIMEOUT };
+        if self.dialed {
+            self.send_hello(cx);
+        }
+    }
+
+    /// The node takes the peer. The link is live from here on.
+    pub fn accept<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+        if self.phase != Phase::Deciding {
+            return;
+        }
+        if !self.dialed {
+            self.send_hello(cx);
+        }
+        if self.phase != Phase::Deciding {
+            return;
+        }
+        self.phase = Phase::Live;
+        self.timers.keep_alive = cx.now;
+        debug!("link {} is live", self.link.id().0);
+    }
+
+    /// The node does not take the peer, which is told why.
+    pub fn refuse<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        refusal: Refusal,
+    ) {
+        self.farewell(cx, &Frame::Refuse(refusal as u8));
+        self.end(CloseReason::Refused(refusal));
+    }
+
+    /// Ends the link in an orderly way; [`poll`](Self::poll) reports what was in flight.
+    pub fn close<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        reason: CloseReason,
+    ) {
+        self.farewell(cx, &Frame::Close(close_code(reason)));
+        self.end(reason);
+    }
+
+    /// The connection below has ended.
+    pub fn disconnected(&mut self, reason: CloseReason) {
+        self.end(reason);
+    }
+
+    /// Asks the peer for a sign of life; it comes as [`Event::Answered`].
+    pub fn challenge<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+        self.link.send_frame(&Frame::Ping);
+        self.flush(cx);
+    }
+
+    /// The stream takes bytes again.
+    pub fn writable<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+        self.flush(cx);
+        self.pump(cx);
+    }
+
+    /// Changes the limits of this unit; the peer is told.
+    pub fn set_constraints<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        constraints: Constraints,
+    ) {
+        self.constraints = constraints;
+        self.link.set_message_limit(message_limit(&constraints));
+        self.publishing.tell_limits();
+        self.pump(cx);
+    }
+
+    fn send_hello<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+        self.local.stamp = cx.now.as_micros();
+        let mut bytes = [0; HELLO_BYTES];
+        let length = self.local.encode(&mut bytes).unwrap_or(0);
+        self.link.send_frame(&Frame::Hello(bytes.get(..length).unwrap_or(&[])));
+        self.flush(cx);
+    }
+
+    /// A last frame, behind what is being written, as far as the network takes it now.
+    fn farewell<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>, frame: &Frame<'_>) {
+        if !matches!(self.phase, Phase::Ending(_) | Phase::Ended) {
+            self.link.send_frame(frame);
+            let _ = self.link.flush(cx.mailman, cx.buffers);
+        }
+    }
+
+    fn flush<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+        self.timers.gathered = Instant::FAR_FUTURE;
+        if let Err(reason) = self.link.flush(cx.mailman, cx.buffers) {
+            self.end(reason);
+        }
+    }
+
+    fn end(&mut self, reason: CloseReason) {
+        if !matches!(self.phase, Phase::Ending(_) | Phase::Ended) {
+            debug!("link {} ends: {}", self.link.id().0, reason);
+            self.phase = Phase::Ending(reason);
+        }
+    }
+
+    /// Longest block that the peer takes.
+    fn peer_message_size(&self) -> u32 {
+        self.hello().map_or(0, |hello| hello.limits.message_size)
+    }
+
+    /// Our own minimum interval or the peer's, whichever is longer.
+    fn interval(&self) -> Duration {
+        let theirs = self.hello().map_or(0, |hello| hello.limits.minimum_interval);
+        self.constraints.minimum_interval.max(Duration::from_micros(u64::from(theirs)))
+    }
+}
+
+fn message_limit(constraints: &Constraints) -> usize {
+    (constraints.message_size as usize).saturating_add(REQUEST_BYTES).max(LEAST_MESSAGE_BYTES)
+}
+
+/// Bytes that a pool buffer needs so that a message of `message_size` fits, framed, in chunks of any allowed size.
+pub const fn buffer_bytes(message_size: u32, overhead: usize) -> usize {
+    let total = (message_size as usize).saturating_add(REQUEST_BYTES);
+    let total = if total < LEAST_MESSAGE_BYTES { LEAST_MESSAGE_BYTES } else { total };
+    let payload = crate::config::MINIMUM_CHUNK_BYTES.saturating_sub(overhead).saturating_sub(FRAME_BYTES);
+    let frames = match total.checked_div(payload) {
+        Some(frames) => frames.saturating_add(2),
+        None => 2,
+    };
+    total.saturating_add(frames.saturating_mul(FRAME_BYTES.saturating_add(overhead)))
+}
+
+const fn close_code(reason: CloseReason) -> u8 {
+    match reason {
+        CloseReason::Stopped => 1,
+        CloseReason::Reset => 2,
+        CloseReason::Silent => 3,
+        CloseReason::PeerRestarted => 4,
+        CloseReason::Protocol => 5,
+        CloseReason::Oversize => 6,
+        CloseReason::HelloTimeout => 7,
+        CloseReason::Refused(_) => 8,
+        CloseReason::DialFailed => 9,
+        CloseReason::Exhausted => 10,
+    }
+}
+
+const fn close_reason(code: u8) -> CloseReason {
+    match code {
+        1 => CloseReason::Stopped,
+        3 => CloseReason::Silent,
+        4 => CloseReason::PeerRestarted,
+        5 => CloseReason::Protocol,
+        6 => CloseReason::Oversize,
+        7 => CloseReason::HelloTimeout,
+        10 => CloseReason::Exhausted,
+        _ => CloseReason::Reset,
+    }
+}

@@ -1,0 +1,294 @@
+//! The way down: a request becomes a message, checked against what the peer published and the limits that it told.
+
+use super::{Phase, Session};
+use crate::config::{DATAGRAM_BYTES, EMERGENCY_BYTES, Priority};
+use crate::distribution::block::{self, Put, SliceWriter};
+use crate::distribution::function::Signature;
+use crate::distribution::function_list::Slot;
+use crate::distribution::message::{REQUEST_BYTES, RequestHeader, SessionBody};
+use crate::distribution::parameters::ParametersView;
+use crate::error::{CloseReason, Error, Limit};
+use crate::host::connections::LinkCounter;
+use crate::host::mailman::Mailman;
+use crate::host::secure::Secure;
+use crate::services::Context;
+use crate::services::lease::{Held, Service};
+use crate::services::requests::CallId;
+use crate::storage::{Buffers, Storage};
+use crate::time::Duration;
+
+/// Gathered one-way messages go out when there are this many bytes of them.
+const GATHERED_BYTES: usize = 8 * 1024;
+/// A held lease is renewed this often within its length, so that lost renewals do not end it.
+const RENEWALS_PER_LEASE: u64 = 4;
+
+/// How a request travels.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Delivery {
+    /// In the stream: it arrives, in order, or the caller learns that it may not have.
+    #[default]
+    Reliable,
+    /// In one datagram, at most [`DATAGRAM_BYTES`]: now or never. Only for requests that want no reply.
+    BestEffort,
+}
+
+/// How a request is made; the default suits most.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct RequestOptions {
+    /// The caller waits no longer, and the callee begins no later, than this; the constraint's value if none.
+    pub timeout: Option<Duration>,
+    /// The class; the function's own if none.
+    pub priority: Option<Priority>,
+    /// Stream or datagram.
+    pub delivery: Delivery,
+    /// Renew the function's lease until it is released. Without it, only further requests renew it.
+    pub renew_lease: bool,
+}
+
+impl Default for RequestOptions {
+    fn default() -> Self {
+        Self { timeout: None, priority: None, delivery: Delivery::Reliable, renew_lease: true }
+    }
+}
+
+/// A request that passed every check.
+struct Checked {
+    header: RequestHeader,
+    priority: Priority,
+    length: usize,
+    lease: Option<Duration>,
+}
+
+impl<S: Storage, C: Secure> Session<S, C> {
+    /// Requests `function` of the peer. With `wants_reply`, its end comes as [`Event::Reply`](super::Event::Reply)
+    /// under the returned id; without, only a failure comes back.
+    ///
+    /// Nothing is sent on an error: [`Error::UnknownFunction`], [`Error::MissingArgument`], [`Error::WrongType`],
+    /// [`Error::WrongSize`], [`Error::ResultWouldNotFit`], [`Error::TooLarge`], [`Error::TooSoon`], [`Error::Full`],
+    /// [`Error::NotConnected`].
+    pub fn request<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        function: &str,
+        parameters: &ParametersView,
+        options: &RequestOptions,
+        wants_reply: bool,
+    ) -> Result<CallId, Error> {
+        let result = self.try_request(cx, function, parameters, options, wants_reply);
+        match result {
+            Ok(_) => self.link.counters.add(LinkCounter::RequestsSent, 1),
+            Err(_) => self.link.counters.add(LinkCounter::RequestsWithheld, 1),
+        }
+        result
+    }
+
+    fn try_request<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        function: &str,
+        parameters: &ParametersView,
+        options: &RequestOptions,
+        wants_reply: bool,
+    ) -> Result<CallId, Error> {
+        let mut checked = self.check(cx, function, parameters, options, wants_reply)?;
+        let slot = checked.header.slot;
+        self.check_held(checked.lease.is_some() && options.renew_lease, slot)?;
+        let id = self.take_id(cx, &checked, wants_reply)?;
+        checked.header.id = id.0;
+        let sent = match options.delivery {
+            Delivery::BestEffort => self.send_best_effort(cx, &checked, parameters),
+            Delivery::Reliable => self.send_reliable(cx, &checked, parameters),
+        };
+        if let Err(error) = sent {
+            self.requests.close(id);
+            return Err(error);
+        }
+        self.requests.sent(cx.now);
+        if let Some(lease) = checked.lease.filter(|_| options.renew_lease) {
+            self.hold_lease(cx, &checked.header, lease);
+        }
+        Ok(id)
+    }
+
+    fn check<M: Mailman, B: Buffers<S>, H: Service>(
+        &self,
+        cx: &Context<'_, S, M, B, H>,
+        function: &str,
+        parameters: &ParametersView,
+        options: &RequestOptions,
+        wants_reply: bool,
+    ) -> Result<Checked, Error> {
+        if self.phase != Phase::Live {
+            return Err(Error::NotConnected);
+        }
+        let function = self.theirs.named(function).ok_or(Error::UnknownFunction)?;
+        let priority = options.priority.unwrap_or(function.attributes.priority);
+        let length = block::measure(function.signature.arguments(), parameters)?;
+        self.check_length(priority, options.delivery, length)?;
+        if wants_reply {
+            block::check_results_fit(function.signature.results(), parameters)?;
+            if options.delivery == Delivery::BestEffort {
+                return Err(Error::BadConstraint);
+            }
+        }
+        if priority != Priority::Emergency {
+            self.requests.gate(cx.now, self.interval())?;
+        }
+        let (stamp, since) = self.clock.tell(cx.now);
+        let remaining = options.timeout.unwrap_or(self.constraints.request_timeout);
+        let header = RequestHeader {
+            id: 0,
+            slot: function.slot,
+            generation: function.generation,
+            wants_reply,
+            remaining,
+            stamp,
+            since,
+        };
+        Ok(Checked { header, priority, length, lease: function.attributes.lease })
+    }
+
+    fn check_length(&self, priority: Priority, delivery: Delivery, length: usize) -> Result<(), Error> {
+        let peer = self.peer_message_size();
+        if length > peer as usize {
+            return Err(Error::TooLarge { limit: peer });
+        }
+        let fixed = match (priority, delivery) {
+            (Priority::Emergency, _) => EMERGENCY_BYTES,
+            (_, Delivery::BestEffort) => DATAGRAM_BYTES,
+            _ => return Ok(()),
+        };
+        let limit = fixed.saturating_sub(REQUEST_BYTES);
+        if length > limit { Err(Error::TooLarge { limit: limit as u32 }) } else { Ok(()) }
+    }
+
+    fn check_held(&self, wanted: bool, slot: Slot) -> Result<(), Error> {
+        let known = self.held.iter().any(|held| held.slot == slot);
+        if wanted && !known && self.held.is_full() { Err(Error::Full(Limit::Leases)) } else { Ok(()) }
+    }
+
+    fn take_id<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        checked: &Checked,
+        wants_reply: bool,
+    ) -> Result<CallId, Error> {
+        let header = &checked.header;
+        let id = if wants_reply {
+            self.requests.open(header.slot, header.generation, cx.now + header.remaining)?
+        } else {
+            self.requests.next_id()
+        };
+        if id.is_none() {
+            self.close(cx, CloseReason::Exhausted);
+        }
+        id.ok_or(Error::Closed(CloseReason::Exhausted))
+    }
+
+    fn send_reliable<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        checked: &Checked,
+        parameters: &ParametersView,
+    ) -> Result<(), Error> {
+        let Checked { header, priority, length, .. } = checked;
+        let total = REQUEST_BYTES.saturating_add(*length);
+        if *priority == Priority::Emergency {
+            self.send_emergency_datagram(cx, header, parameters);
+        }
+        let hold = !header.wants_reply && *priority != Priority::Emergency && self.timers.may_gather(cx.now);
+        let Self { link, theirs, .. } = self;
+        let signature = theirs.function(header.slot).ok_or(Error::StaleFunction)?.signature;
+        let write = |writer: &mut crate::host::frame::ChunkWriter<'_>| {
+            writer.put(&header.encode());
+            block::write(signature.arguments(), parameters, writer);
+        };
+        let sent = link.send_message(cx.mailman, cx.buffers, *priority, total, hold, write);
+        match sent {
+            Ok(()) if hold && self.link.queued() < GATHERED_BYTES => {
+                self.timers.gathered = self.timers.gathered.min(cx.now + crate::config::GATHER);
+                Ok(())
+            }
+            Ok(()) => {
+                self.timers.last_write = cx.now;
+                self.flush(cx);
+                Ok(())
+            }
+            Err(Error::Closed(reason)) => {
+                self.end(reason);
+                Err(Error::Closed(reason))
+            }
+            Err(error) => {
+                // What gathered may be in the way of this one: it goes out, and the caller may try again.
+                self.flush(cx);
+                Err(error)
+            }
+        }
+    }
+
+    /// The second copy of an emergency; at-most-once removes the double.
+    fn send_emergency_datagram<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        header: &RequestHeader,
+        parameters: &ParametersView,
+    ) {
+        let mut message = [0; EMERGENCY_BYTES];
+        let Some(signature) = self.theirs.function(header.slot).map(|function| function.signature) else { return };
+        let length = write_message(&mut message, header, signature, parameters);
+        let prefix = SessionBody::message_prefix(Priority::Emergency.to_wire());
+        self.send_datagram(cx, &prefix, message.get(..length).unwrap_or(&[]));
+    }
+
+    fn send_best_effort<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        checked: &Checked,
+        parameters: &ParametersView,
+    ) -> Result<(), Error> {
+        let mut message = [0; DATAGRAM_BYTES];
+        let signature = self.theirs.function(checked.header.slot).ok_or(Error::StaleFunction)?.signature;
+        let length = write_message(&mut message, &checked.header, signature, parameters);
+        let prefix = SessionBody::message_prefix(checked.priority.to_wire());
+        let sent = self.send_datagram(cx, &prefix, message.get(..length).unwrap_or(&[]));
+        if sent { Ok(()) } else { Err(Error::Network) }
+    }
+
+    fn hold_lease<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        header: &RequestHeader,
+        lease: Duration,
+    ) {
+        let every = lease.divided_by(RENEWALS_PER_LEASE);
+        let held = Held { slot: header.slot, generation: header.generation, every, next: cx.now + every };
+        self.forget_held(header.slot);
+        let _ = self.held.push(held);
+        self.timers.renewal = self.timers.renewal.min(held.next);
+    }
+
+    /// The caller no longer waits for a call. Its reply, should it still come, counts as late.
+    pub fn cancel(&mut self, id: CallId) {
+        if self.requests.close(id).is_some() {
+            self.link.counters.add(LinkCounter::CallsTimedOut, 1);
+        }
+    }
+
+    /// Writes what has gathered now.
+    pub fn flush_gathered<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+        self.flush(cx);
+    }
+}
+
+/// Writes header and block; returns their length.
+fn write_message(
+    out: &mut [u8],
+    header: &RequestHeader,
+    signature: Signature<'_>,
+    parameters: &ParametersView,
+) -> usize {
+    let mut writer = SliceWriter::new(out);
+    writer.put(&header.encode());
+    block::write(signature.arguments(), parameters, &mut writer);
+    writer.written()
+}

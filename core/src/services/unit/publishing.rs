@@ -1,0 +1,188 @@
+//! Which of this unit's functions one peer has been told of, and what it is still to be told.
+
+use super::{Phase, Session};
+use crate::config::{Priority, SIGNATURE_BYTES};
+use crate::distribution::function_list::{Generation, Slot};
+use crate::distribution::message::{CONTROL_BYTES, Control, PUBLISH_BYTES};
+use crate::host::mailman::Mailman;
+use crate::host::secure::Secure;
+use crate::services::Context;
+use crate::services::lease::Service;
+use crate::storage::{Buffers, Storage};
+
+/// One of this unit's functions, as one peer sees it.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Publication {
+    wanted: Option<Generation>,
+    told: Option<Generation>,
+    /// It has been visible at some time, so a call of it is stale rather than unknown.
+    ever: bool,
+}
+
+/// Whether a peer may call a function.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Told {
+    Now,
+    Earlier,
+    Never,
+}
+
+/// What one peer is to be told.
+pub(super) struct Publishing<S: Storage> {
+    table: S::Slice<Publication>,
+    dirty: bool,
+    serial: u32,
+    end_due: bool,
+    acknowledgement_due: Option<u32>,
+    limits_due: bool,
+}
+
+impl<S: Storage> Publishing<S> {
+    pub(super) fn new(table: S::Slice<Publication>) -> Self {
+        Self { table, dirty: false, serial: 0, end_due: false, acknowledgement_due: None, limits_due: false }
+    }
+
+    pub(super) fn told(&self, slot: Slot, generation: Generation) -> Told {
+        match self.table.get(usize::from(slot.0)) {
+            Some(publication) if publication.wanted == Some(generation) => Told::Now,
+            Some(publication) if publication.ever => Told::Earlier,
+            _ => Told::Never,
+        }
+    }
+
+    pub(super) fn acknowledge(&mut self, serial: u32) {
+        self.acknowledgement_due = Some(serial);
+    }
+
+    pub(super) fn tell_limits(&mut self) {
+        self.limits_due = true;
+    }
+
+    /// The peer has old news of a function.
+    pub(super) fn tell_again(&mut self, slot: Slot) {
+        if let Some(publication) = self.table.get_mut(usize::from(slot.0)) {
+            publication.told = None;
+            self.dirty = true;
+            self.end_due = true;
+        }
+    }
+}
+
+impl<S: Storage, C: Secure> Session<S, C> {
+    /// Makes functions of this unit visible to the peer, as they are now. Returns the serial that comes back with
+    /// [`Event::Acknowledged`](super::Event::Acknowledged).
+    pub fn publish<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        slots: impl Iterator<Item = Slot>,
+    ) -> u32 {
+        for slot in slots {
+            let generation = cx.functions.generation(slot);
+            if let Some(publication) = self.publishing.table.get_mut(usize::from(slot.0)) {
+                publication.wanted = generation;
+                publication.ever |= generation.is_some();
+            }
+        }
+        self.end_of_changes(cx)
+    }
+
+    /// Hides a function from the peer.
+    pub fn withdraw<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        slot: Slot,
+    ) -> u32 {
+        if let Some(publication) = self.publishing.table.get_mut(usize::from(slot.0)) {
+            publication.wanted = None;
+        }
+        self.end_of_changes(cx)
+    }
+
+    fn end_of_changes<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) -> u32 {
+        self.publishing.serial = self.publishing.serial.wrapping_add(1);
+        self.publishing.dirty = true;
+        self.publishing.end_due = true;
+        self.pump(cx);
+        self.publishing.serial
+    }
+
+    /// Tells the peer what it is still to be told, as far as there is room.
+    pub(super) fn pump<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+        if self.phase != Phase::Live {
+            return;
+        }
+        if self.publishing.limits_due && self.send_limits(cx) {
+            self.publishing.limits_due = false;
+        }
+        if let Some(serial) = self.publishing.acknowledgement_due {
+            let skipped = u16::try_from(self.theirs.skipped()).unwrap_or(u16::MAX);
+            if self.send_control(cx, &Control::ListAck { serial, skipped }) {
+                self.publishing.acknowledgement_due = None;
+            }
+        }
+        if self.publishing.dirty {
+            self.publishing.dirty = !self.send_news(cx);
+        }
+        if self.publishing.end_due && !self.publishing.dirty {
+            let serial = self.publishing.serial;
+            self.publishing.end_due = !self.send_control(cx, &Control::ListEnd { serial });
+        }
+    }
+
+    /// Whether something waits for room.
+    pub(super) fn has_news(&self) -> bool {
+        let publishing = &self.publishing;
+        publishing.dirty || publishing.end_due || publishing.limits_due || publishing.acknowledgement_due.is_some()
+    }
+
+    fn send_limits<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) -> bool {
+        let control = Control::Limits {
+            message_size: self.constraints.message_size,
+            minimum_interval: self.constraints.minimum_interval.as_wire(),
+            calls: self.constraints.calls_per_peer,
+        };
+        self.send_control(cx, &control)
+    }
+
+    /// Sends each function whose news the peer does not have; `false` when there was no more room.
+    fn send_news<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) -> bool {
+        for index in 0..self.publishing.table.len() {
+            let Some(&publication) = self.publishing.table.get(index) else { break };
+            if publication.wanted == publication.told {
+                continue;
+            }
+            let slot = Slot(index as u16);
+            let function = publication.wanted.and_then(|generation| cx.functions.lookup(slot, generation).ok());
+            let sent = match function {
+                None => self.send_control(cx, &Control::Withdraw { slot: slot.0 }),
+                Some(function) => {
+                    let control = Control::Publish {
+                        slot: slot.0,
+                        generation: function.generation.0,
+                        attributes: function.attributes.encode(),
+                        signature: function.signature.as_bytes(),
+                    };
+                    self.send_control(cx, &control)
+                }
+            };
+            if !sent {
+                return false;
+            }
+            if let Some(publication) = self.publishing.table.get_mut(index) {
+                publication.told = publication.wanted;
+            }
+        }
+        true
+    }
+
+    /// Sends a control message; `false` when there is no room.
+    pub(super) fn send_control<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        control: &Control<'_>,
+    ) -> bool {
+        let mut bytes = [0; CONTROL_BYTES + PUBLISH_BYTES + SIGNATURE_BYTES];
+        let Some(message) = control.encode(&mut bytes) else { return false };
+        self.send(cx, Priority::High, message.len(), |writer| writer.put(message)).is_ok()
+    }
+}

@@ -1,0 +1,325 @@
+//! What a session does because time has passed: keep-alives, deadlines, leases, the end of a silent link.
+
+use core::net::SocketAddr;
+
+use super::{Event, Phase, Session};
+use crate::config::GATHER;
+use crate::distribution::datagram;
+use crate::distribution::function_list::Slot;
+use crate::distribution::message::{Control, Renewal, SESSION_BODY_BYTES, SessionBody};
+use crate::error::{CloseReason, Error};
+use crate::host::connections::LinkCounter;
+use crate::host::frame::Frame;
+use crate::host::mailman::Mailman;
+use crate::host::secure::Secure;
+use crate::services::Context;
+use crate::services::lease::{Granted, Service};
+use crate::storage::{Buffers, Storage};
+use crate::time::{Duration, Instant};
+
+/// A peer's clock as last heard, so that it can bound the age of what we send.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct PeerClock {
+    stamp: u64,
+    heard: Instant,
+}
+
+impl PeerClock {
+    /// Notes the peer's clock; an older stamp than the one known came late and is passed over.
+    pub(super) fn hear(&mut self, now: Instant, stamp: u64) {
+        if stamp >= self.stamp {
+            *self = Self { stamp, heard: now };
+        }
+    }
+
+    /// (the stamp, time since it was heard).
+    pub(super) fn tell(&self, now: Instant) -> (u64, Duration) {
+        (self.stamp, now.since(self.heard))
+    }
+}
+
+/// The earliest time at which the peer can have made what it stamped so; `None` for a stamp from the future.
+pub(super) fn made_at(now: Instant, stamp: u64, since: Duration) -> Option<Instant> {
+    let made = Instant::from_micros(stamp) + since;
+    // The peer's clock runs a little faster or slower than ours; what seems to come from the future is new.
+    if Instant::from_micros(stamp) > now { None } else { Some(made.min(now)) }
+}
+
+/// When each thing is due.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Timers {
+    pub(super) keep_alive: Instant,
+    /// The last write, behind which one-way messages gather.
+    pub(super) last_write: Instant,
+    /// Gathered messages go out.
+    pub(super) gathered: Instant,
+    /// The earliest end of a granted lease.
+    pub(super) lease: Instant,
+    /// The earliest renewal of a held lease.
+    pub(super) renewal: Instant,
+}
+
+impl Timers {
+    pub(super) fn new(now: Instant) -> Self {
+        Self {
+            keep_alive: now,
+            last_write: Instant::START,
+            gathered: Instant::FAR_FUTURE,
+            lease: Instant::FAR_FUTURE,
+            renewal: Instant::FAR_FUTURE,
+        }
+    }
+
+    /// Whether a one-way message made at `now` may wait for company.
+    pub(super) fn may_gather(&self, now: Instant) -> bool {
+        self.last_write != Instant::START && now < self.last_write + GATHER
+    }
+}
+
+impl<S: Storage, C: Secure> Session<S, C> {
+    /// When [`poll`](Self::poll) has something to do next.
+    pub fn deadline(&self) -> Instant {
+        match self.phase {
+            Phase::AwaitingHello { until } => until,
+            Phase::Deciding => Instant::FAR_FUTURE,
+            Phase::Ending(_) => Instant::START,
+            Phase::Ended => Instant::FAR_FUTURE,
+            Phase::Live => {
+                let timers = &self.timers;
+                let own = timers.keep_alive.min(timers.gathered).min(timers.lease).min(timers.renewal);
+                own.min(self.requests.deadline()).min(self.liveness.deadline())
+            }
+        }
+    }
+
+    /// Does what is due. Returns one event at a time; call it until it returns `None`.
+    pub fn poll<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+    ) -> Option<Event<'static>> {
+        match self.phase {
+            Phase::AwaitingHello { until } if cx.now >= until => {
+                self.close(cx, CloseReason::HelloTimeout);
+                self.poll_ending(cx, CloseReason::HelloTimeout)
+            }
+            Phase::AwaitingHello { .. } | Phase::Deciding | Phase::Ended => None,
+            Phase::Ending(reason) => self.poll_ending(cx, reason),
+            Phase::Live => self.poll_live(cx),
+        }
+    }
+
+    fn poll_live<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+    ) -> Option<Event<'static>> {
+        // Leases come first: what moves must stop before anything else is done.
+        if cx.now >= self.timers.lease
+            && let Some(slot) = self.expire_lease(cx)
+        {
+            return Some(Event::LeaseExpired(slot));
+        }
+        if let Some(id) = self.requests.expire(cx.now) {
+            self.link.counters.add(LinkCounter::CallsTimedOut, 1);
+            return Some(Event::Reply(id, Err(Error::TimedOut)));
+        }
+        if self.has_news() {
+            self.pump(cx);
+        }
+        if cx.now >= self.timers.gathered {
+            self.flush(cx);
+        }
+        if cx.now >= self.timers.renewal {
+            self.renew_leases(cx);
+        }
+        if cx.now >= self.timers.keep_alive {
+            self.send_keep_alive(cx);
+        }
+        let (missed, lost) = self.liveness.poll(cx.now);
+        if missed {
+            self.link.counters.add(LinkCounter::KeepAlivesMissed, 1);
+        }
+        if lost {
+            self.close(cx, CloseReason::Silent);
+        }
+        match self.phase {
+            Phase::Ending(reason) => self.poll_ending(cx, reason),
+            _ => None,
+        }
+    }
+
+    /// Reports what ended with the link, one by one: leases first.
+    fn poll_ending<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        reason: CloseReason,
+    ) -> Option<Event<'static>> {
+        if let Some(granted) = self.granted.pop() {
+            end_service_lease(cx, granted.slot);
+            return Some(Event::LeaseExpired(granted.slot));
+        }
+        if let Some(id) = self.requests.interrupt() {
+            return Some(Event::Reply(id, Err(Error::Interrupted)));
+        }
+        self.link.release(cx.buffers);
+        self.calls.release(cx.buffers);
+        self.phase = Phase::Ended;
+        Some(Event::Closed(reason))
+    }
+
+    fn send_keep_alive<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+        self.timers.keep_alive = cx.now + self.constraints.keep_alive.max(Duration::from_millis(1));
+        let body = SessionBody::keep_alive(cx.now.as_micros());
+        self.send_datagram(cx, &body, &[]);
+        if !self.liveness.datagrams_pass() {
+            self.link.send_frame(&Frame::Session(&body));
+            self.flush(cx);
+        }
+    }
+
+    /// Sends a session datagram; `body` and `rest` follow each other in it. `false` when the network refused it.
+    pub(super) fn send_datagram<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        body: &[u8],
+        rest: &[u8],
+    ) -> bool {
+        let Some((to, header)) = self.datagram_header() else { return false };
+        let mut bytes = [0; datagram::SESSION_HEADER_BYTES + SESSION_BODY_BYTES + crate::config::DATAGRAM_BYTES];
+        let length = header.len().saturating_add(body.len()).saturating_add(rest.len());
+        let Some(place) = bytes.get_mut(..length) else { return false };
+        for (place, byte) in place.iter_mut().zip(header.iter().chain(body).chain(rest)) {
+            *place = *byte;
+        }
+        let sent = cx.mailman.send_to(to, place);
+        if sent {
+            self.link.counters.add(LinkCounter::DatagramsSent, 1);
+        }
+        sent
+    }
+
+    fn datagram_header(&self) -> Option<(SocketAddr, [u8; datagram::SESSION_HEADER_BYTES])> {
+        let remote = self.remote.as_ref()?;
+        if remote.datagrams.port() == 0 {
+            return None;
+        }
+        Some((remote.datagrams, datagram::session_header(self.local.fleet, remote.hello.link, remote.hello.nonce)))
+    }
+
+    // --- leases that the peer holds here
+
+    /// The caller's request, made at `made`, starts or renews its lease on a function.
+    pub(super) fn grant<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        granted: Granted,
+    ) -> Result<(), Error> {
+        match self.granted.iter_mut().find(|known| known.slot == granted.slot) {
+            Some(known) => *known = Granted { end: granted.end.max(known.end), ..granted },
+            None => self.granted.push(granted).map_err(|_| Error::Full(crate::error::Limit::Leases))?,
+        }
+        self.timers.lease = self.timers.lease.min(granted.end);
+        renew_service_lease(cx, granted.slot, granted.end);
+        Ok(())
+    }
+
+    pub(super) fn renewed<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        renewal: &Renewal,
+    ) {
+        let known = self.granted.iter().find(|g| g.slot == renewal.slot && g.generation == renewal.generation);
+        let Some(granted) = known.copied() else {
+            self.link.counters.add(LinkCounter::RenewalsIgnored, 1);
+            self.send_control(cx, &Control::LeaseEnded { slot: renewal.slot.0, expired: false });
+            return;
+        };
+        let Some(made) = made_at(cx.now, renewal.stamp, renewal.since) else { return };
+        let end = made + granted.length;
+        if end > cx.now {
+            let _ = self.grant(cx, Granted { end, ..granted });
+        }
+    }
+
+    /// The application has finished what the leased function started: no renewal keeps it alive, no hook runs.
+    pub fn end_lease<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>, slot: Slot) {
+        if let Some(index) = self.granted.iter().position(|granted| granted.slot == slot) {
+            self.granted.swap_remove(index);
+            end_service_lease(cx, slot);
+            self.send_control(cx, &Control::LeaseEnded { slot: slot.0, expired: false });
+        }
+    }
+
+    /// The caller gave up its lease: it ends now, as if it had expired.
+    pub(super) fn released<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        slot: Slot,
+    ) -> bool {
+        let Some(index) = self.granted.iter().position(|granted| granted.slot == slot) else { return false };
+        self.granted.swap_remove(index);
+        end_service_lease(cx, slot);
+        true
+    }
+
+    fn expire_lease<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+    ) -> Option<Slot> {
+        let due = self.granted.iter().position(|granted| granted.end <= cx.now);
+        let Some(index) = due else {
+            self.timers.lease = self.granted.iter().map(|granted| granted.end).min().unwrap_or(Instant::FAR_FUTURE);
+            return None;
+        };
+        let granted = self.granted.swap_remove(index);
+        end_service_lease(cx, granted.slot);
+        self.link.counters.add(LinkCounter::LeasesExpired, 1);
+        self.send_control(cx, &Control::LeaseEnded { slot: granted.slot.0, expired: true });
+        Some(granted.slot)
+    }
+
+    // --- leases that this unit holds at the peer
+
+    fn renew_leases<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+        let (stamp, since) = self.clock.tell(cx.now);
+        let now = cx.now;
+        for index in 0..self.held.len() {
+            let Some(held) = self.held.get_mut(index).filter(|held| held.next <= now) else { continue };
+            held.next = now + held.every;
+            let renewal = Renewal { slot: held.slot, generation: held.generation, stamp, since };
+            let body = SessionBody::renewal(&renewal);
+            // Both ways: one lost datagram must not stop a vehicle, nor must a retransmission in the stream.
+            self.send_datagram(cx, &body, &[]);
+            self.link.send_frame(&Frame::Session(&body));
+        }
+        self.timers.renewal = self.held.iter().map(|held| held.next).min().unwrap_or(Instant::FAR_FUTURE);
+        self.flush(cx);
+    }
+
+    /// Gives up the lease on a function of the peer, which stops what it started.
+    pub fn release<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>, slot: Slot) {
+        self.forget_held(slot);
+        self.send_control(cx, &Control::Release { slot: slot.0 });
+    }
+
+    pub(super) fn forget_held(&mut self, slot: Slot) -> bool {
+        let Some(index) = self.held.iter().position(|held| held.slot == slot) else { return false };
+        self.held.swap_remove(index);
+        true
+    }
+}
+
+fn renew_service_lease<S: Storage, M: Mailman, B: Buffers<S>, H: Service>(
+    cx: &mut Context<'_, S, M, B, H>,
+    slot: Slot,
+    end: Instant,
+) {
+    if let Some(lease) = cx.functions.function(slot).and_then(|function| function.handler.lease()) {
+        lease.renew(end);
+    }
+}
+
+fn end_service_lease<S: Storage, M: Mailman, B: Buffers<S>, H: Service>(cx: &mut Context<'_, S, M, B, H>, slot: Slot) {
+    if let Some(lease) = cx.functions.function(slot).and_then(|function| function.handler.lease()) {
+        lease.end();
+    }
+}
