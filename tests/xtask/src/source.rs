@@ -54,12 +54,12 @@ pub(crate) fn without_tests<'t>(tokens: &[Token<'t>]) -> Vec<Token<'t>> {
 pub(crate) fn test_modules<'t>(tokens: &[Token<'t>]) -> Vec<&'t str> {
     let mut names = Vec::new();
     for at in 0..tokens.len() {
-        let Some(item) = tokens.get(at + CFG_TEST.len()..) else { break };
         if !starts_with(&tokens[at..], &CFG_TEST) {
             continue;
         }
-        if let [first, name, end, ..] = item
-            && first.text == "mod"
+        let item = &tokens[at + CFG_TEST.len()..item_end(tokens, at + CFG_TEST.len())];
+        if let [.., kind, name, end] = item
+            && kind.text == "mod"
             && end.text == ";"
         {
             names.push(name.text);
@@ -269,7 +269,9 @@ mod tests {
 
     #[test]
     fn test_modules_in_other_files_are_named() {
-        assert_eq!(test_modules(&tokens("mod a; #[cfg(test)] mod a_tests; #[cfg(test)] mod inline {}")), ["a_tests"]);
+        let text =
+            "mod a; #[cfg(test)] mod b; #[cfg(test)] mod inline {} #[cfg(test)] #[rustfmt::skip] pub(super) mod c;";
+        assert_eq!(test_modules(&tokens(text)), ["b", "c"]);
     }
 
     #[test]
