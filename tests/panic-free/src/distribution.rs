@@ -53,6 +53,7 @@ entry!(parameters_read, {
     keep(parameters.value(unknown_text()));
     drain(parameters.iter());
     keep((parameters.remaining(), parameters.len(), parameters.is_empty()));
+    keep((unknown::<Small>().as_view(), unknown::<Small>().as_mut_view()));
     parameters.clear();
 });
 

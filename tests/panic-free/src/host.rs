@@ -63,6 +63,7 @@ entry!(link_receives, {
         keep(link.view(place.after(*unknown()), unknown_slice()));
     }
     keep(link.view(*unknown::<Place>(), unknown_slice()));
+    keep(link.view(Place::lent(*unknown()), unknown_slice()));
 });
 
 entry!(link_sends, {
@@ -72,7 +73,7 @@ entry!(link_sends, {
     keep(link.send_message(&mut AnyMailman, pool, *unknown(), *unknown(), *unknown(), write));
     keep(link.send_frame(unknown()));
     keep(link.flush(&mut AnyMailman, pool));
-    keep((link.wants_to_write(), link.has_room(*unknown(), *unknown()), link.id()));
+    keep((link.wants_to_write(), link.queued(), link.id()));
 });
 
 entry!(link_set, {

@@ -12,6 +12,7 @@ mod distribution;
 mod foundation;
 mod host;
 mod messages;
+mod services;
 mod shown;
 
 #[cfg(feature = "planted")]

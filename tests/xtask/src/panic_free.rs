@@ -21,7 +21,10 @@ const NOT_CALLED: [(&str, &str); 0] = [];
 /// Links the binary, then once more with a panic planted in it, which must not link.
 pub(crate) fn check() -> Result<()> {
     if let Err(error) = link("build", &[]).stream() {
-        explain()?;
+        let (_, _, errors) = link("build", &[]).captured()?;
+        if errors.contains(UNDEFINED) {
+            explain()?;
+        }
         return Err(error);
     }
     let (linked, _, errors) = link("build", &["--features", "planted"]).captured()?;

@@ -1,0 +1,153 @@
+//! Common services: a session's whole life, leases, who sees which function.
+
+use core::mem::MaybeUninit;
+
+use cara_core::distribution::datagram;
+use cara_core::distribution::hello::Hello;
+use cara_core::distribution::identity::Identity;
+use cara_core::distribution::parameters::{Parameters, ParametersView};
+use cara_core::host::secure::Plain;
+use cara_core::services::lease::{Lease, Service};
+use cara_core::services::publications::Publications;
+use cara_core::services::requests::Requests;
+use cara_core::services::unit::{self, Event, ReplyBlock, Session, SessionConfig, SessionStorage};
+use cara_core::services::{Context, Ticket};
+use cara_core::storage::{Lent, Pool};
+
+use crate::host::AnyMailman;
+use crate::linkage::{drain, keep, unknown, unknown_slice, unknown_text};
+
+/// A handler that may have a lease.
+struct Handler;
+
+impl Service for Handler {
+    fn lease(&self) -> Option<&Lease> {
+        *unknown()
+    }
+}
+
+type AnySession = Session<Lent, Plain>;
+type AnyContext = Context<'static, Lent, AnyMailman, Pool<Lent>, Handler>;
+
+fn session() -> &'static mut AnySession {
+    unknown()
+}
+
+fn context() -> &'static mut AnyContext {
+    unknown()
+}
+
+fn parameters() -> &'static mut ParametersView {
+    unknown::<Parameters<64>>()
+}
+
+/// A value moved out of nowhere.
+fn taken<T: 'static>() -> Option<T> {
+    unknown::<Option<T>>().take()
+}
+
+entry!(session_made, {
+    if let (Some(config), Some(storage)) = (taken::<SessionConfig>(), taken::<SessionStorage<Lent>>()) {
+        unknown::<MaybeUninit<AnySession>>().write(Session::new(*unknown(), config, Plain, storage));
+    }
+});
+
+entry!(session_asked, {
+    let session = session();
+    keep((session.link(), session.dialed(), session.is_live(), session.is_ended(), session.hello()));
+    keep((session.identity(), session.epoch(), session.address(), session.nonce(), session.deadline()));
+    keep((session.their_function_list(), session.counters(), session.calls_in_flight(), session.calls_held()));
+    keep((session.wants_to_write(), session.has_next_call()));
+});
+
+entry!(session_connected, {
+    session().connected(context());
+    session().accept(context());
+    session().challenge(context());
+    session().writable(context());
+});
+
+entry!(session_ended, {
+    session().refuse(context(), *unknown());
+    session().close(context(), *unknown());
+    session().disconnected(*unknown());
+});
+
+entry!(session_receives, {
+    keep(session().receive(context(), unknown_slice(), Some(parameters())));
+    keep(session().receive(context(), unknown_slice(), None));
+});
+
+entry!(session_datagram, {
+    keep(session().datagram(context(), *unknown(), *unknown(), unknown_slice()));
+});
+
+entry!(session_polled, {
+    keep(session().poll(context()));
+    session().flush_gathered(context());
+});
+
+entry!(session_set, {
+    session().set_constraints(context(), *unknown());
+    keep(unit::buffer_bytes(*unknown(), *unknown()));
+});
+
+entry!(session_requests, {
+    keep(session().request(context(), unknown_text(), parameters(), unknown(), *unknown()));
+    session().cancel(*unknown());
+});
+
+entry!(session_serves, {
+    keep(session().next_call(context(), parameters()));
+    session().detach(*unknown::<Ticket>());
+    keep(session().answer(context(), *unknown(), Ok(parameters())));
+    keep(session().answer(context(), *unknown(), Err(*unknown())));
+    session().drop_answer(*unknown());
+});
+
+entry!(session_publishes, {
+    keep(session().publish(context(), unknown_slice().iter().copied()));
+    keep(session().withdraw(context(), *unknown()));
+});
+
+entry!(session_leases, {
+    session().end_lease(context(), *unknown());
+    session().release(context(), *unknown());
+});
+
+entry!(replies, {
+    if let Event::Reply(_, Ok(block)) = unknown::<Event<'static>>() {
+        keep((block.read_into(parameters()), block.signature(), block.bytes()));
+    }
+    keep(unknown::<ReplyBlock<'static>>().read_into(parameters()));
+});
+
+entry!(leases, {
+    let lease = Lease::new();
+    lease.renew(*unknown());
+    keep(lease.is_live(*unknown()));
+    lease.end();
+    keep(unknown::<Lease>().is_live(*unknown()));
+});
+
+entry!(publications, {
+    keep(Publications::<Lent>::new(unknown_slice(), unknown_slice()));
+    let publications: &mut Publications<Lent> = unknown();
+    let identity: &Identity = unknown();
+    keep(publications.publish_to_all(*unknown()));
+    keep(publications.publish_to(identity, *unknown()));
+    publications.withdraw(*unknown());
+    keep(publications.is_visible(identity, *unknown()));
+    drain(publications.visible_to(identity));
+});
+
+entry!(requests, {
+    let requests: Requests<Lent> = Requests::new(unknown_slice());
+    keep((requests.in_flight(), requests));
+});
+
+entry!(hellos, {
+    keep(Hello::decode(unknown_slice()));
+    keep(unknown::<Hello>().encode(unknown_slice()));
+    keep(datagram::session_header(*unknown(), *unknown(), *unknown()));
+});
