@@ -1,13 +1,247 @@
-//! Header of session datagrams.
-use super::identity::Fleet;
+//! UDP datagrams: a fixed header, then a search, an answer, or the body of a session.
+//!
+//! | bytes | meaning |
+//! |---|---|
+//! | 0–3 | magic of the mode |
+//! | 4 | version |
+//! | 5 | kind: 1 who-has, 2 announce, 3 session |
+//! | 6–7 | zero |
+//! | 8–11 | fleet, little-endian |
+//! | 12– | who-has, announce: postcard; session: link u16, zero u16, nonce u64, body |
+
+use serde::{Deserialize, Serialize};
+
+use super::hello::Manager;
+use super::identity::{Epoch, Fleet, Identity, Role};
 use crate::config::{PLAIN_MAGIC, VERSION};
+
+const WHO_HAS: u8 = 1;
+const ANNOUNCE: u8 = 2;
+const SESSION: u8 = 3;
+
+/// Bytes before the body of a who-has or announce.
+pub const HEADER_BYTES: usize = 12;
 /// Bytes before the body of a session datagram.
 pub const SESSION_HEADER_BYTES: usize = 24;
-/// The header of a session datagram to `link` of the receiver, named by the receiver's `nonce`.
-pub fn session_header(fleet: Fleet, link: u16, nonce: u64) -> [u8; SESSION_HEADER_BYTES] {
+/// Known nodes that one who-has can name.
+pub const KNOWN_NODES: usize = 64;
+/// Longest who-has.
+pub const SEARCH_BYTES: usize = 512;
+
+/// "Who is there?", broadcast (paper: "one node broadcasts a message containing its identifier").
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct WhoHas {
+    /// Who asks.
+    pub identity: Identity,
+    /// This life of who asks.
+    pub epoch: Epoch,
+    /// Rises with each search of this life.
+    pub sequence: u32,
+    /// Comes back in the answer.
+    pub nonce: u64,
+    /// The manager that is looked for; `None` asks other m_units, and the s_units of who asks.
+    pub wanted: Option<Manager>,
+    /// Where who asks can be dialled; 0 for nowhere.
+    pub tcp_port: u16,
+    /// How many nodes who asks expects to answer.
+    pub expected: u16,
+    /// [`short_hash`] of nodes that are connected already and stay silent.
+    pub known: heapless::Vec<u32, KNOWN_NODES>,
+}
+
+/// "Here I am", to who asked, or broadcast when several ask.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Announce {
+    /// Who is here.
+    pub identity: Identity,
+    /// This life of it.
+    pub epoch: Epoch,
+    /// Rises with each announce of this life.
+    pub sequence: u32,
+    /// The nonce of the search that is answered; 0 in a broadcast.
+    pub nonce: u64,
+    /// Where it can be dialled; 0 for nowhere.
+    pub tcp_port: u16,
+    /// How many more nodes it takes.
+    pub room: u16,
+    /// How many nodes it expects to dial because of this announce.
+    pub expected: u16,
+}
+
+/// A datagram, borrowed from the bytes that it came in.
+#[derive(Debug, PartialEq, Eq)]
+pub enum Datagram<'b> {
+    /// A search.
+    WhoHas(WhoHas),
+    /// An answer.
+    Announce(Announce),
+    /// Part of a session.
+    Session {
+        /// The receiver's index of the link.
+        link: u16,
+        /// The receiver's nonce of the session.
+        nonce: u64,
+        /// See [`SessionBody`](super::message::SessionBody).
+        body: &'b [u8],
+    },
+}
+
+/// Why a datagram is not for this unit.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum DatagramError {
+    /// Not of this mode, or of no unit at all.
+    Magic,
+    /// Another version, this one.
+    Version(u8),
+    /// Another fleet, this one.
+    Fleet(Fleet),
+    /// The rest cannot be read.
+    Malformed,
+}
+
+impl<'b> Datagram<'b> {
+    /// Reads a datagram of `fleet`.
+    pub fn decode(bytes: &'b [u8], fleet: Fleet) -> Result<Self, DatagramError> {
+        let (header, body) = bytes.split_first_chunk::<HEADER_BYTES>().ok_or(DatagramError::Malformed)?;
+        let [m0, m1, m2, m3, version, kind, z0, z1, f0, f1, f2, f3] = *header;
+        if [m0, m1, m2, m3] != PLAIN_MAGIC {
+            return Err(DatagramError::Magic);
+        }
+        if version != VERSION {
+            return Err(DatagramError::Version(version));
+        }
+        let theirs = Fleet(u32::from_le_bytes([f0, f1, f2, f3]));
+        if theirs != fleet {
+            return Err(DatagramError::Fleet(theirs));
+        }
+        if [z0, z1] != [0, 0] {
+            return Err(DatagramError::Malformed);
+        }
+        match kind {
+            WHO_HAS => whole(body).map(Self::WhoHas),
+            ANNOUNCE => whole(body).map(Self::Announce),
+            SESSION => session(body).ok_or(DatagramError::Malformed),
+            _ => Err(DatagramError::Malformed),
+        }
+    }
+}
+
+fn whole<'b, T: Deserialize<'b>>(body: &'b [u8]) -> Result<T, DatagramError> {
+    match postcard::take_from_bytes(body) {
+        Ok((value, [])) => Ok(value),
+        _ => Err(DatagramError::Malformed),
+    }
+}
+
+fn session(body: &[u8]) -> Option<Datagram<'_>> {
+    let (head, body) = body.split_first_chunk::<{ SESSION_HEADER_BYTES - HEADER_BYTES }>()?;
+    let [l0, l1, 0, 0, n0, n1, n2, n3, n4, n5, n6, n7] = *head else { return None };
+    let nonce = u64::from_le_bytes([n0, n1, n2, n3, n4, n5, n6, n7]);
+    Some(Datagram::Session { link: u16::from_le_bytes([l0, l1]), nonce, body })
+}
+
+fn header(kind: u8, fleet: Fleet) -> [u8; HEADER_BYTES] {
     let [m0, m1, m2, m3] = PLAIN_MAGIC;
     let [f0, f1, f2, f3] = fleet.0.to_le_bytes();
+    [m0, m1, m2, m3, VERSION, kind, 0, 0, f0, f1, f2, f3]
+}
+
+fn encode<'o>(kind: u8, fleet: Fleet, body: &impl Serialize, out: &'o mut [u8]) -> Option<&'o [u8]> {
+    let (head, rest) = out.split_first_chunk_mut()?;
+    *head = header(kind, fleet);
+    let length = postcard::to_slice(body, rest).ok()?.len().checked_add(HEADER_BYTES)?;
+    out.get(..length)
+}
+
+impl WhoHas {
+    /// The datagram, in `out`; `None` where it does not fit.
+    pub fn encode<'o>(&self, fleet: Fleet, out: &'o mut [u8]) -> Option<&'o [u8]> {
+        encode(WHO_HAS, fleet, self, out)
+    }
+}
+
+impl Announce {
+    /// The datagram, in `out`; `None` where it does not fit.
+    pub fn encode<'o>(&self, fleet: Fleet, out: &'o mut [u8]) -> Option<&'o [u8]> {
+        encode(ANNOUNCE, fleet, self, out)
+    }
+}
+
+/// The header of a session datagram to `link` of the receiver, named by the receiver's `nonce`.
+pub fn session_header(fleet: Fleet, link: u16, nonce: u64) -> [u8; SESSION_HEADER_BYTES] {
+    let [h0, h1, h2, h3, h4, h5, h6, h7, h8, h9, h10, h11] = header(SESSION, fleet);
     let [l0, l1] = link.to_le_bytes();
     let [n0, n1, n2, n3, n4, n5, n6, n7] = nonce.to_le_bytes();
-    [m0, m1, m2, m3, VERSION, 3, 0, 0, f0, f1, f2, f3, l0, l1, 0, 0, n0, n1, n2, n3, n4, n5, n6, n7]
+    [h0, h1, h2, h3, h4, h5, h6, h7, h8, h9, h10, h11, l0, l1, 0, 0, n0, n1, n2, n3, n4, n5, n6, n7]
+}
+
+/// 32 bits that name an identity in a list of known nodes: FNV-1a over role (0 m_unit, 1 s_unit), id (little-endian) and
+/// name. Two nodes with one hash cost a search more, no more.
+pub fn short_hash(identity: &Identity) -> u32 {
+    let role = match identity.role() {
+        Role::MUnit => 0,
+        Role::SUnit => 1,
+    };
+    let bytes = core::iter::once(role).chain(identity.id().to_le_bytes()).chain(identity.name().bytes());
+    bytes.fold(0x811C_9DC5, |hash, byte| (hash ^ u32::from(byte)).wrapping_mul(0x0100_0193))
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, clippy::indexing_slicing, clippy::arithmetic_side_effects)]
+    use super::*;
+    use proptest::prelude::*;
+
+    const FLEET: Fleet = Fleet(7);
+
+    fn who_has(known: usize) -> WhoHas {
+        WhoHas {
+            identity: Identity::m_unit("a-manager-with-a-name-of-32-byte", u32::MAX).unwrap(),
+            epoch: Epoch(u64::MAX),
+            sequence: u32::MAX,
+            nonce: u64::MAX,
+            wanted: Some(Manager { name: "a-manager-with-a-name-of-32-byte".try_into().unwrap(), id: u32::MAX }),
+            tcp_port: u16::MAX,
+            expected: u16::MAX,
+            known: (0..known).map(|_| u32::MAX).collect(),
+        }
+    }
+
+    #[test]
+    fn the_longest_search_fits_and_survives() {
+        let search = who_has(KNOWN_NODES);
+        let mut out = [0; SEARCH_BYTES];
+        let bytes = search.encode(FLEET, &mut out).unwrap();
+        assert_eq!(Datagram::decode(bytes, FLEET), Ok(Datagram::WhoHas(search)));
+    }
+
+    #[test]
+    fn another_fleet_version_or_magic_is_named() {
+        let mut out = [0; SEARCH_BYTES];
+        let length = who_has(0).encode(FLEET, &mut out).unwrap().len();
+        assert_eq!(Datagram::decode(&out[..length], Fleet(8)), Err(DatagramError::Fleet(FLEET)));
+        out[4] = 9;
+        assert_eq!(Datagram::decode(&out[..length], FLEET), Err(DatagramError::Version(9)));
+        out[0] = b'X';
+        assert_eq!(Datagram::decode(&out[..length], FLEET), Err(DatagramError::Magic));
+    }
+
+    #[test]
+    fn a_session_datagram_carries_its_link_and_nonce() {
+        let mut bytes = std::vec::Vec::from(session_header(FLEET, 300, 0x0102_0304_0506_0708));
+        bytes.push(42);
+        let expected = Datagram::Session { link: 300, nonce: 0x0102_0304_0506_0708, body: &[42] };
+        assert_eq!(Datagram::decode(&bytes, FLEET), Ok(expected));
+    }
+
+    proptest! {
+        #[test]
+        fn decoding_mutations_never_panics(place in 0..SEARCH_BYTES, byte: u8, cut in 0..SEARCH_BYTES) {
+            let mut out = [0; SEARCH_BYTES];
+            let length = who_has(3).encode(FLEET, &mut out).unwrap().len();
+            out[place] = byte;
+            let _ = Datagram::decode(&out[..length.min(cut)], FLEET);
+            let _ = Datagram::decode(&out[..length], FLEET);
+        }
+    }
 }
