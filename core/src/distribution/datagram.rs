@@ -69,6 +69,8 @@ pub struct Announce {
 }
 
 /// A datagram, borrowed from the bytes that it came in.
+// Searches are rare and looked at where they are decoded: the size of this enum is never moved about.
+#[allow(clippy::large_enum_variant)]
 #[derive(Debug, PartialEq, Eq)]
 pub enum Datagram<'b> {
     /// A search.

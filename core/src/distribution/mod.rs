@@ -2,6 +2,7 @@
 
 mod attributes;
 pub mod block;
+pub mod connection_handler;
 pub mod datagram;
 mod element;
 pub mod function;

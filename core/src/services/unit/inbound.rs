@@ -297,7 +297,10 @@ impl<S: Storage, C: Secure> Session<S, C> {
                 self.pump(cx);
                 Event::ListChanged.into()
             }
-            Control::ListAck { serial, skipped } => Event::Acknowledged { serial, skipped }.into(),
+            Control::ListAck { serial, skipped } => {
+                self.publishing.was_acknowledged(serial);
+                Event::Acknowledged { serial, skipped }.into()
+            }
             Control::Limits { message_size, minimum_interval, calls } => {
                 if let Some(remote) = &mut self.remote {
                     remote.hello.limits.message_size = message_size;

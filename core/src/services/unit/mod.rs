@@ -240,6 +240,11 @@ impl<S: Storage, C: Secure> Session<S, C> {
         self.peer_address
     }
 
+    /// This unit's constraints, as this link keeps them.
+    pub const fn constraints(&self) -> &Constraints {
+        &self.constraints
+    }
+
     /// The nonce that the peer's session datagrams carry.
     pub const fn nonce(&self) -> u64 {
         self.local.nonce

@@ -33,13 +33,15 @@ pub(super) struct Publishing<S: Storage> {
     dirty: bool,
     serial: u32,
     end_due: bool,
+    /// The newest serial that the peer has read up to.
+    acknowledged: u32,
     acknowledgement_due: Option<u32>,
     limits_due: bool,
 }
 
 impl<S: Storage> Publishing<S> {
     pub(super) fn new(table: S::Slice<Publication>) -> Self {
-        Self { table, dirty: false, serial: 0, end_due: false, acknowledgement_due: None, limits_due: false }
+        Self { table, dirty: false, serial: 0, end_due: false, acknowledged: 0, acknowledgement_due: None, limits_due: false }
     }
 
     pub(super) fn told(&self, slot: Slot, generation: Generation) -> Told {
@@ -52,6 +54,10 @@ impl<S: Storage> Publishing<S> {
 
     pub(super) fn acknowledge(&mut self, serial: u32) {
         self.acknowledgement_due = Some(serial);
+    }
+
+    pub(super) fn was_acknowledged(&mut self, serial: u32) {
+        self.acknowledged = self.acknowledged.max(serial);
     }
 
     pub(super) fn tell_limits(&mut self) {
@@ -84,6 +90,11 @@ impl<S: Storage, C: Secure> Session<S, C> {
             }
         }
         self.end_of_changes(cx)
+    }
+
+    /// Whether the peer has read this unit's list up to `serial`.
+    pub fn is_acknowledged(&self, serial: u32) -> bool {
+        self.publishing.acknowledged >= serial
     }
 
     /// Hides a function from the peer.
