@@ -1,6 +1,58 @@
-//! CARA on Linux: sockets, threads and time for the core's state machines.
+//! CARA on Linux: the paper's `Communication_System` and `Unit` over sockets and threads.
+//!
+//! ```no_run
+//! use cara_std::{CommunicationSystem, Parameters};
+//!
+//! let agv_manager = CommunicationSystem::new("AGV_manager", 1)?;
+//! agv_manager.start()?;
+//! while agv_manager.number_of_s_units() < 1 {
+//!     agv_manager.broadcast();
+//!     std::thread::sleep(std::time::Duration::from_secs(2));
+//! }
+//! print!("{}", agv_manager.s_units()[0].their_function_list().show_functions());
+//! let mut pos = Parameters::new();
+//! pos.add_int("position", 2)?;
+//! agv_manager.s_units()[0].block_request("pos_info", &mut pos)?;
+//! # Ok::<(), cara_std::Error>(())
+//! ```
 
+mod builder;
+mod clock;
+mod communication_system;
+mod config;
+mod engine;
+mod event;
+#[cfg(feature = "async")]
+mod future;
+mod handler;
+mod lease;
+mod my_function_list;
+mod peer;
 pub mod pool;
 pub mod storage;
 pub mod sys;
 pub mod timers;
+mod unit;
+
+pub use builder::Builder;
+pub use cara_core::config::{Constraints, Priority};
+pub use cara_core::distribution::function::{Attributes, Definition, Signature};
+pub use cara_core::distribution::hello::Manager;
+pub use cara_core::distribution::identity::{Fleet, Identity, Role};
+pub use cara_core::distribution::parameters::{Parameters, ParametersView};
+pub use cara_core::error::{Cause, CloseReason, Error, Limit, Refusal, ServiceError};
+pub use cara_core::host::connections::LinkCounter;
+pub use cara_core::services::requests::CallId;
+pub use cara_core::services::unit::{Delivery, RequestOptions};
+pub use cara_core::time::Duration;
+pub use communication_system::CommunicationSystem;
+pub use config::Capacities;
+pub use event::UnitEvent;
+#[cfg(feature = "async")]
+pub use future::PendingReply;
+pub use handler::{Call, IntoHandler, ServiceOptions};
+pub use lease::LeaseWatch;
+pub use my_function_list::MyFunctionList;
+pub use peer::{FunctionNames, Peer};
+pub use sys::interfaces::Interfaces;
+pub use unit::Unit;

@@ -1,0 +1,211 @@
+//! How a unit is made: identity first, then whatever differs from the defaults.
+
+use std::hash::{BuildHasher, Hasher, RandomState};
+use std::sync::Arc;
+
+use cara_core::config::{Constraints, PLAIN_PORT};
+use cara_core::distribution::connection_handler::{Node, NodeConfig, NodeStorage, Target};
+use cara_core::distribution::function_list::{Entry, FunctionList};
+use cara_core::distribution::hello::Manager;
+use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
+use cara_core::error::Error;
+use cara_core::host::secure::{Plain, Secure};
+use cara_core::services::publications::Publications;
+use cara_core::services::unit::buffer_bytes;
+use core::net::SocketAddr;
+
+use crate::clock::Clock;
+use crate::communication_system::CommunicationSystem;
+use crate::config::Capacities;
+use crate::engine::{Engine, EngineParts, NodeCell};
+use crate::pool::MessagePool;
+use crate::storage::{filled, filled_with};
+use crate::sys::datagram::Datagrams;
+use crate::sys::interfaces::Interfaces;
+use crate::sys::stream::Listener;
+use crate::unit::Unit;
+
+/// Message buffers that a unit keeps while it is idle.
+const KEPT_BUFFERS: usize = 8;
+/// Nodes that are remembered beyond the maximum number of connected ones.
+const REMEMBERED_NODES: usize = 16;
+/// Newcomers that may wait for a challenge at the same time.
+const CHALLENGES: usize = 16;
+/// Refusals that are remembered for the operator.
+const FINDINGS: usize = 32;
+
+/// Makes a [`CommunicationSystem`] or a [`Unit`].
+pub struct Builder<T> {
+    pub(crate) identity: Identity,
+    pub(crate) target: Target,
+    fleet: Fleet,
+    constraints: Constraints,
+    capacities: Capacities,
+    interfaces: Interfaces,
+    discovery_port: u16,
+    state: T,
+}
+
+impl Builder<()> {
+    pub(crate) fn new(identity: Identity, target: Target) -> Self {
+        let constraints = match identity.role() {
+            Role::MUnit => Constraints::M_UNIT,
+            Role::SUnit => Constraints {
+                message_size: Constraints::M_UNIT.message_size,
+                chunk_size: Constraints::M_UNIT.chunk_size,
+                ..Constraints::S_UNIT
+            },
+        };
+        Self {
+            identity,
+            target,
+            fleet: Fleet(0),
+            constraints,
+            capacities: Capacities::default(),
+            interfaces: Interfaces::from_environment(),
+            discovery_port: PLAIN_PORT,
+            state: (),
+        }
+    }
+}
+
+impl<T: Send + 'static> Builder<T> {
+    /// Units of different fleets on one network do not meet; 0 unless set.
+    pub fn fleet(mut self, fleet: u32) -> Self {
+        self.fleet = Fleet(fleet);
+        self
+    }
+
+    /// The limits to begin with.
+    pub fn constraints(mut self, constraints: Constraints) -> Self {
+        self.constraints = constraints;
+        self
+    }
+
+    /// The sizes of the unit's tables.
+    pub fn capacities(mut self, capacities: Capacities) -> Self {
+        self.capacities = capacities;
+        self
+    }
+
+    /// All IPv4 interfaces, or loopback alone; the environment's `CARA_INTERFACES=lo` unless set.
+    pub fn interfaces(mut self, interfaces: Interfaces) -> Self {
+        self.interfaces = interfaces;
+        self
+    }
+
+    /// The UDP port of broadcasts, equal for all units that are to meet.
+    pub fn discovery_port(mut self, port: u16) -> Self {
+        self.discovery_port = port;
+        self
+    }
+
+    /// An s_unit's manager is at this address: it is dialled, and nothing is broadcast.
+    pub fn manager_address(mut self, address: SocketAddr) -> Self {
+        if let Target::Manager(manager) = self.target {
+            self.target = Target::Fixed(manager, address);
+        }
+        self
+    }
+
+    /// The application's state, which methods get (paper, section 2: "the object class to be passed as a template
+    /// parameter").
+    pub fn state<U: Send + 'static>(self, state: U) -> Builder<U> {
+        Builder {
+            identity: self.identity,
+            target: self.target,
+            fleet: self.fleet,
+            constraints: self.constraints,
+            capacities: self.capacities,
+            interfaces: self.interfaces,
+            discovery_port: self.discovery_port,
+            state,
+        }
+    }
+
+    /// An m_unit; it does nothing until it is started.
+    pub fn build_system(self) -> Result<CommunicationSystem<T>, Error> {
+        match self.identity.role() {
+            Role::MUnit => Ok(CommunicationSystem::of(self.engine()?)),
+            Role::SUnit => Err(Error::BadConstraint),
+        }
+    }
+
+    /// An s_unit; it does nothing until it is started.
+    pub fn build_unit(self) -> Result<Unit<T>, Error> {
+        match self.identity.role() {
+            Role::SUnit => Ok(Unit::of(self.engine()?)),
+            Role::MUnit => Err(Error::BadConstraint),
+        }
+    }
+
+    fn engine(self) -> Result<Arc<Engine<T>>, Error> {
+        check(&self.constraints)?;
+        let clock = Clock::new();
+        let datagrams = Datagrams::open(self.interfaces, self.discovery_port)?;
+        let listener = match self.identity.role() {
+            Role::MUnit => Some(Listener::open(self.interfaces.bind_address(), 0).map_err(|_| Error::Network)?),
+            Role::SUnit => None,
+        };
+        let capacities = self.capacities;
+        let nodes = usize::from(self.constraints.maximum_nodes);
+        let maximum_links = nodes + capacities.pending_links;
+        let config = NodeConfig {
+            identity: self.identity,
+            fleet: self.fleet,
+            epoch: Epoch(random()),
+            target: self.target,
+            tcp_port: listener.as_ref().map_or(0, Listener::port),
+            udp_port: datagrams.own_port(),
+            constraints: self.constraints,
+            seed: random(),
+        };
+        let storage = NodeStorage {
+            nodes: filled(nodes + REMEMBERED_NODES, None),
+            order: filled(nodes + REMEMBERED_NODES, 0),
+            links: filled(maximum_links, None),
+            challenges: filled(CHALLENGES, None),
+            findings: filled(FINDINGS, None),
+        };
+        let node = Node::new(clock.now(), config, storage);
+        let publications =
+            Publications::new(filled(capacities.functions, false), filled(capacities.published_to_one, None));
+        let functions =
+            FunctionList::new(filled_with(capacities.functions, Entry::empty), filled(capacities.signature_bytes, 0));
+        let size = 2 * buffer_bytes(self.constraints.message_size, Plain::OVERHEAD);
+        let parts = EngineParts {
+            clock,
+            node: NodeCell::new(node, publications, capacities),
+            functions,
+            pool: MessagePool::new(size, capacities.message_buffers, KEPT_BUFFERS),
+            state: self.state,
+            datagrams,
+            listener,
+            maximum_links,
+        };
+        Engine::new(parts).map_err(|_| Error::Network)
+    }
+}
+
+/// The longest message that a Linux unit's parameters can hold.
+pub(crate) const LONGEST_MESSAGE: u32 = 256 * 1024;
+
+/// What this port can hold.
+pub(crate) fn check(constraints: &Constraints) -> Result<(), Error> {
+    let chunk = usize::from(constraints.chunk_size);
+    let sound = constraints.maximum_nodes > 0
+        && constraints.message_size <= LONGEST_MESSAGE
+        && (cara_core::config::MINIMUM_CHUNK_BYTES..=cara_core::config::CHUNK_BYTES).contains(&chunk)
+        && constraints.keep_alive.as_millis() > 0
+        && constraints.calls_per_peer > 0;
+    if sound { Ok(()) } else { Err(Error::BadConstraint) }
+}
+
+/// Bits that differ from process to process and from call to call, without a dependency for them.
+fn random() -> u64 {
+    RandomState::new().build_hasher().finish()
+}
+
+pub(crate) fn manager(name: &str, id: u32) -> Result<Target, Error> {
+    Manager::new(name, id).map(Target::Manager)
+}

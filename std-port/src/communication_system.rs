@@ -1,0 +1,259 @@
+//! The paper's `Communication_System`: an m_unit, which connects to many nodes.
+
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, sync_channel};
+use std::task::{Poll, Wake, Waker};
+
+use cara_core::config::Constraints;
+use cara_core::distribution::connection_handler::{Finding, Target};
+use cara_core::distribution::identity::{Identity, Role};
+use cara_core::distribution::parameters::{Parameters, ParametersView};
+use cara_core::error::Error;
+use cara_core::services::requests::CallId;
+use cara_core::services::unit::RequestOptions;
+use cara_core::time::Duration;
+use core::net::IpAddr;
+
+use crate::builder::{self, Builder};
+use crate::engine::{Engine, lock, read};
+use crate::event::UnitEvent;
+use crate::my_function_list::MyFunctionList;
+use crate::peer::Peer;
+
+/// Events that wait for a subscriber before it loses some.
+const EVENTS: usize = 4096;
+
+/// An m_unit. Clones are handles to the same unit, which stops when the last one is dropped.
+#[doc(alias = "Communication_System")]
+pub struct CommunicationSystem<T: Send + 'static = ()> {
+    pub(crate) owner: Arc<Owner<T>>,
+}
+
+/// Stops the unit's threads when the last handle goes.
+pub(crate) struct Owner<T: Send + 'static> {
+    pub(crate) engine: Arc<Engine<T>>,
+}
+
+impl<T: Send + 'static> Drop for Owner<T> {
+    fn drop(&mut self) {
+        self.engine.stop();
+    }
+}
+
+impl<T: Send + 'static> Clone for CommunicationSystem<T> {
+    fn clone(&self) -> Self {
+        Self { owner: self.owner.clone() }
+    }
+}
+
+impl CommunicationSystem {
+    /// An m_unit with defaults (paper, listing line 1).
+    pub fn new(name: &str, id: u32) -> Result<Self, Error> {
+        Self::builder(name, id)?.build_system()
+    }
+
+    /// An m_unit with other than defaults.
+    pub fn builder(name: &str, id: u32) -> Result<Builder<()>, Error> {
+        Ok(Builder::new(Identity::m_unit(name, id)?, Target::Everybody))
+    }
+}
+
+impl<T: Send + 'static> CommunicationSystem<T> {
+    pub(crate) fn of(engine: Arc<Engine<T>>) -> Self {
+        Self { owner: Arc::new(Owner { engine }) }
+    }
+
+    fn engine(&self) -> &Arc<Engine<T>> {
+        &self.owner.engine
+    }
+
+    /// Searches for nodes and keeps connections, in threads of its own (paper, listing line 2).
+    #[doc(alias = "start_thread")]
+    pub fn start(&self) -> Result<(), Error> {
+        self.engine().start().map_err(|_| Error::Network)
+    }
+
+    /// Ends every link in an orderly way and all threads.
+    pub fn stop(&self) {
+        self.engine().stop();
+    }
+
+    /// This unit's identity.
+    pub fn identity(&self) -> Identity {
+        lock(&self.engine().node).node.identity().clone()
+    }
+
+    /// Searches for nodes now (paper, listing line 6).
+    pub fn broadcast(&self) {
+        self.engine().broadcast();
+    }
+
+    /// How many s_units are connected (paper, listing line 3).
+    #[doc(alias = "get_number_s_units")]
+    pub fn number_of_s_units(&self) -> usize {
+        self.number_of(Role::SUnit)
+    }
+
+    /// How many m_units are connected.
+    pub fn number_of_m_units(&self) -> usize {
+        self.number_of(Role::MUnit)
+    }
+
+    fn number_of(&self, role: Role) -> usize {
+        read(&self.engine().peers).of_role(role).filter(|peer| peer.is_connected()).count()
+    }
+
+    /// The s_units in the order in which they joined. One that has left keeps its place, so an index goes on to mean the
+    /// same node.
+    pub fn s_units(&self) -> Vec<Peer<T>> {
+        self.of_role(Role::SUnit)
+    }
+
+    /// The m_units, likewise.
+    pub fn m_units(&self) -> Vec<Peer<T>> {
+        self.of_role(Role::MUnit)
+    }
+
+    fn of_role(&self, role: Role) -> Vec<Peer<T>> {
+        read(&self.engine().peers).of_role(role).map(|cell| self.peer(cell)).collect()
+    }
+
+    fn peer(&self, cell: &Arc<crate::engine::peers::PeerCell>) -> Peer<T> {
+        Peer { engine: self.engine().clone(), cell: cell.clone() }
+    }
+
+    /// The s_unit of a name.
+    pub fn s_unit(&self, name: &str) -> Option<Peer<T>> {
+        self.find(|identity| identity.role() == Role::SUnit && identity.name() == name)
+    }
+
+    /// The m_unit of a name.
+    pub fn m_unit(&self, name: &str) -> Option<Peer<T>> {
+        self.find(|identity| identity.role() == Role::MUnit && identity.name() == name)
+    }
+
+    /// The node of an ID number.
+    pub fn node_with_id(&self, id: u32) -> Option<Peer<T>> {
+        self.find(|identity| identity.id() == id)
+    }
+
+    /// The connected nodes at an IP address.
+    pub fn nodes_at(&self, address: IpAddr) -> Vec<Peer<T>> {
+        self.connected().filter(|peer| peer.address().is_some_and(|at| at.ip() == address)).collect()
+    }
+
+    /// The connected nodes that offer a function to this unit.
+    pub fn nodes_offering(&self, function: &str) -> Vec<Peer<T>> {
+        self.connected().filter(|peer| peer.their_function_list().contains(function)).collect()
+    }
+
+    fn find(&self, wanted: impl Fn(&Identity) -> bool) -> Option<Peer<T>> {
+        read(&self.engine().peers).find(wanted).map(|cell| self.peer(&cell))
+    }
+
+    fn connected(&self) -> impl Iterator<Item = Peer<T>> {
+        let peers: Vec<_> = read(&self.engine().peers).connected().map(|cell| self.peer(cell)).collect();
+        peers.into_iter()
+    }
+
+    /// The unit's own functions.
+    pub fn my_function_list(&self) -> MyFunctionList<'_, T> {
+        MyFunctionList { engine: self.engine() }
+    }
+
+    /// Makes the unit's functions visible to all nodes, also to those that come later (paper, listing line 24).
+    pub fn publish_my_function_list(&self) -> Result<(), Error> {
+        self.engine().publish(None).map(|_| ())
+    }
+
+    /// As [`publish_my_function_list`](Self::publish_my_function_list), and returns when every connected node has read
+    /// the list, or after `timeout` the nodes that have not.
+    pub fn publish_and_wait(&self, timeout: impl Into<Duration>) -> Result<Vec<Identity>, Error> {
+        let told = self.engine().publish(None)?;
+        let missing = self.engine().await_acknowledgements(&told, timeout.into());
+        Ok(missing.iter().filter_map(|link| link.peer.get()).map(|peer| peer.identity.clone()).collect())
+    }
+
+    /// Requests without waiting from every connected node that offers `function`, with an outcome for each.
+    pub fn request_all(&self, function: &str, parameters: &ParametersView) -> Vec<(Peer<T>, Result<CallId, Error>)> {
+        let peers = self.nodes_offering(function).into_iter();
+        peers.map(|peer| (peer.clone(), peer.request(function, parameters))).collect()
+    }
+
+    /// Calls `function` of every connected node that offers it, all at the same time, and waits for all of them.
+    pub fn block_request_all<const BYTES: usize>(
+        &self,
+        function: &str,
+        parameters: &Parameters<BYTES>,
+        options: &RequestOptions,
+    ) -> Vec<(Peer<T>, Result<Parameters<BYTES>, Error>)> {
+        let peers = self.nodes_offering(function);
+        let calls: Vec<_> = peers
+            .into_iter()
+            .map(|peer| {
+                let call = peer.link().and_then(|link| self.engine().call_future(link, function, parameters, options));
+                (peer, call)
+            })
+            .collect();
+        calls
+            .into_iter()
+            .map(|(peer, call)| {
+                let mut results = parameters.clone();
+                let outcome = call.and_then(|mut call| wait(|cx| call.poll(cx, &mut results)));
+                (peer, outcome.map(|()| results))
+            })
+            .collect()
+    }
+
+    /// The constraints in force.
+    pub fn constraints(&self) -> Constraints {
+        *lock(&self.engine().node).node.constraints()
+    }
+
+    /// Changes the constraints; peers are told. [`Error::BadConstraint`] for values that this unit cannot hold.
+    pub fn set_constraints(&self, constraints: Constraints) -> Result<(), Error> {
+        builder::check(&constraints)?;
+        self.engine().set_constraints(constraints);
+        Ok(())
+    }
+
+    /// What no call returns: joined, left, failed. A subscriber that does not keep up loses events.
+    pub fn events(&self) -> Receiver<UnitEvent> {
+        let (sender, receiver) = sync_channel(EVENTS);
+        self.engine().subscribe(sender);
+        receiver
+    }
+
+    /// Runs `act` with the application's state.
+    pub fn with_state<R>(&self, act: impl FnOnce(&mut T) -> R) -> Result<R, Error> {
+        self.engine().state.enter(None).map(|mut state| act(&mut state))
+    }
+
+    /// What happened in discovery and membership: (name, count), zeros included.
+    pub fn counters(&self) -> Vec<(&'static str, u64)> {
+        lock(&self.engine().node).node.counters.iter().collect()
+    }
+
+    /// The last refusals.
+    pub fn findings(&self) -> Vec<Finding> {
+        lock(&self.engine().node).node.findings().copied().collect()
+    }
+}
+
+/// Blocks this thread until `poll` is ready.
+pub(crate) fn wait<R>(mut poll: impl FnMut(&mut std::task::Context<'_>) -> Poll<R>) -> R {
+    struct Unpark(std::thread::Thread);
+    impl Wake for Unpark {
+        fn wake(self: Arc<Self>) {
+            self.0.unpark();
+        }
+    }
+    let waker = Waker::from(Arc::new(Unpark(std::thread::current())));
+    let mut cx = std::task::Context::from_waker(&waker);
+    loop {
+        if let Poll::Ready(result) = poll(&mut cx) {
+            return result;
+        }
+        std::thread::park();
+    }
+}

@@ -1,0 +1,40 @@
+//! How much a unit on Linux has room for. Memory is taken per link when it opens.
+
+/// Sizes of a unit's tables.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Capacities {
+    /// Functions in the unit's own list.
+    pub functions: usize,
+    /// Bytes for their signatures.
+    pub signature_bytes: usize,
+    /// Functions published to single nodes.
+    pub published_to_one: usize,
+    /// Functions kept of each peer's list.
+    pub their_functions: usize,
+    /// Bytes for their signatures, per peer.
+    pub their_signature_bytes: usize,
+    /// Blocking calls in flight to one peer.
+    pub calls_in_flight: usize,
+    /// Calls of one peer that run here at the same time.
+    pub calls_running: usize,
+    /// Links that are open beyond the maximum number of nodes: those that have not joined yet.
+    pub pending_links: usize,
+    /// Message buffers that all links share.
+    pub message_buffers: usize,
+}
+
+impl Default for Capacities {
+    fn default() -> Self {
+        Self {
+            functions: 64,
+            signature_bytes: 8 * 1024,
+            published_to_one: 1024,
+            their_functions: 48,
+            their_signature_bytes: 2 * 1024,
+            calls_in_flight: 64,
+            calls_running: 8,
+            pending_links: 64,
+            message_buffers: 256,
+        }
+    }
+}

@@ -1,0 +1,173 @@
+//! One link as the threads share it: the session under its lock, who waits for what, and who reads.
+
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::task::Waker;
+use std::thread::Thread;
+
+use cara_core::distribution::function_list::Slot;
+use cara_core::error::{CloseReason, Error};
+use cara_core::host::mailman::{LinkId, Mailman};
+use cara_core::host::secure::Plain;
+use cara_core::services::requests::CallId;
+use cara_core::services::unit::Session;
+use cara_core::time::Instant;
+use core::net::SocketAddr;
+
+use super::Registration;
+use super::peers::PeerCell;
+use super::reader::Reader;
+use crate::storage::Boxed;
+use crate::sys::datagram::Datagrams;
+use crate::sys::stream::Stream;
+
+/// One link of the unit.
+pub(crate) struct LinkCell {
+    pub(crate) id: LinkId,
+    /// Tells this link from an earlier one with the same id.
+    pub(crate) serial: u32,
+    pub(crate) stream: Stream,
+    pub(crate) peer: OnceLock<Arc<PeerCell>>,
+    state: Mutex<LinkState>,
+    /// The stream took bytes, or the link ended.
+    pub(crate) room: Condvar,
+}
+
+/// What the lock of a link protects.
+pub(crate) struct LinkState {
+    pub(crate) session: Session<Boxed, Plain>,
+    pub(crate) waiters: Vec<Waiter>,
+    pub(crate) reader: Reader,
+    /// What the epoll set watches the stream for.
+    pub(crate) registration: Registration,
+    /// The connection is still being opened.
+    pub(crate) connecting: bool,
+    /// Bytes that were read and cannot be looked at yet.
+    pub(crate) leftover: Vec<u8>,
+    /// The timer that is set for the session.
+    pub(crate) timer: Instant,
+    /// What is to be done when the lock is given up.
+    pub(crate) notices: Vec<Notice>,
+}
+
+/// Somebody who waits for a reply.
+pub(crate) struct Waiter {
+    pub(crate) id: CallId,
+    pub(crate) wake: Wake,
+    pub(crate) outcome: Option<Outcome>,
+}
+
+impl Waiter {
+    pub(crate) fn finish(&mut self, outcome: Outcome) {
+        self.outcome = Some(outcome);
+        self.wake.wake();
+    }
+}
+
+/// How to wake somebody.
+pub(crate) enum Wake {
+    Thread(Thread),
+    Task(Option<Waker>),
+}
+
+/// How a call ended: the signature and the block of its results, or why there are none.
+pub(crate) type Outcome = Result<(Box<[u8]>, Box<[u8]>), Error>;
+
+/// What happened under a link's lock and is acted upon without it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) enum Notice {
+    LeaseExpired(Slot),
+    LeaseEnded { slot: Slot, expired: bool },
+    Failed(CallId, Error),
+    ListChanged,
+    Acknowledged { serial: u32, skipped: u16 },
+    Joined,
+    Challenge(LinkId),
+    Answered,
+    Left(CloseReason),
+}
+
+impl LinkCell {
+    pub(crate) fn new(
+        id: LinkId,
+        serial: u32,
+        stream: Stream,
+        session: Session<Boxed, Plain>,
+        connecting: bool,
+    ) -> Self {
+        let state = LinkState {
+            session,
+            waiters: Vec::new(),
+            reader: Reader::new(),
+            registration: Registration { readable: true, writable: connecting },
+            connecting,
+            leftover: Vec::new(),
+            timer: Instant::FAR_FUTURE,
+            notices: Vec::new(),
+        };
+        Self { id, serial, stream, peer: OnceLock::new(), state: Mutex::new(state), room: Condvar::new() }
+    }
+
+    /// The epoll token: id and serial, so that an event of an earlier link with the same id is known.
+    pub(crate) fn token(&self) -> u64 {
+        u64::from(self.serial) << 16 | u64::from(self.id.0)
+    }
+
+    /// Handlers run outside of this lock, and no code under it leaves the state half changed.
+    pub(crate) fn lock(&self) -> MutexGuard<'_, LinkState> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl LinkState {
+    /// Notes how a call ended and wakes who waits for it.
+    pub(crate) fn finish(&mut self, id: CallId, outcome: Outcome) {
+        if let Some(waiter) = self.waiters.iter_mut().find(|waiter| waiter.id == id) {
+            waiter.finish(outcome);
+        }
+    }
+
+    /// Takes out how a call ended, if it has.
+    pub(crate) fn take_outcome(&mut self, id: CallId) -> Option<Outcome> {
+        let index = self.waiters.iter().position(|waiter| waiter.id == id)?;
+        self.waiters.get(index)?.outcome.as_ref()?;
+        self.waiters.swap_remove(index).outcome
+    }
+
+    /// Nobody waits for a call any more.
+    pub(crate) fn forget(&mut self, id: CallId) {
+        self.waiters.retain(|waiter| waiter.id != id);
+    }
+}
+
+impl Wake {
+    pub(crate) fn wake(&mut self) {
+        match self {
+            Self::Thread(thread) => thread.unpark(),
+            Self::Task(waker) => {
+                if let Some(waker) = waker.take() {
+                    waker.wake();
+                }
+            }
+        }
+    }
+}
+
+/// The port's `Mailman`, lent to the core for one call on one link, or for the node without a link.
+pub(crate) struct StdMailman<'a> {
+    pub(crate) stream: Option<&'a Stream>,
+    pub(crate) datagrams: &'a Datagrams,
+}
+
+impl Mailman for StdMailman<'_> {
+    fn write(&mut self, _link: LinkId, slices: &[&[u8]]) -> Result<usize, CloseReason> {
+        self.stream.map_or(Ok(0), |stream| stream.send(slices))
+    }
+
+    fn send_to(&mut self, to: SocketAddr, datagram: &[u8]) -> bool {
+        self.datagrams.send_to(to, datagram)
+    }
+
+    fn broadcast(&mut self, datagram: &[u8]) -> bool {
+        self.datagrams.broadcast(datagram)
+    }
+}

@@ -1,0 +1,348 @@
+//! The node and its links: opening, accepting, admitting, leaving, and what is published to whom.
+
+use std::sync::Arc;
+
+use cara_core::config::Constraints;
+use cara_core::distribution::connection_handler::{Action, Admission, Node};
+use cara_core::distribution::function_list::Slot;
+use cara_core::distribution::identity::Identity;
+use cara_core::error::{CloseReason, Error, Refusal};
+use cara_core::host::mailman::LinkId;
+use cara_core::host::secure::Plain;
+use cara_core::services::publications::Publications;
+use cara_core::services::unit::{Session, SessionConfig, SessionStorage};
+use cara_core::time::{Duration, Instant};
+use core::net::SocketAddr;
+
+use super::link::{LinkCell, LinkState, Notice, StdMailman};
+use super::{Engine, lock, read, write};
+use crate::config::Capacities;
+use crate::event::UnitEvent;
+use crate::storage::{Boxed, filled, filled_with};
+use crate::sys::epoll::Interest;
+use crate::sys::stream::Stream;
+
+/// What the node's lock protects.
+pub(crate) struct NodeCell {
+    pub(crate) node: Node<Boxed>,
+    pub(crate) publications: Publications<Boxed>,
+    pub(crate) capacities: Capacities,
+    serial: u32,
+}
+
+impl NodeCell {
+    pub(crate) fn new(node: Node<Boxed>, publications: Publications<Boxed>, capacities: Capacities) -> Self {
+        Self { node, publications, capacities, serial: 0 }
+    }
+
+    pub(crate) fn set_constraints(&mut self, constraints: Constraints) {
+        self.node.set_constraints(constraints);
+    }
+
+    /// Longest block of parameters that this unit takes.
+    pub(crate) fn longest_message(&self) -> usize {
+        self.node.constraints().message_size as usize
+    }
+}
+
+impl<T: Send + 'static> Engine<T> {
+    /// The slices of one session.
+    fn session_storage(capacities: &Capacities) -> SessionStorage<Boxed> {
+        SessionStorage {
+            small: filled(cara_core::config::LINK_BUFFER_BYTES, 0),
+            pending: filled(capacities.calls_in_flight, None),
+            running: filled(capacities.calls_running + 1, None),
+            publications: filled_with(capacities.functions, Default::default),
+            their_functions: filled_with(
+                capacities.their_functions,
+                cara_core::distribution::function_list::Entry::empty,
+            ),
+            their_signatures: filled(capacities.their_signature_bytes, 0),
+        }
+    }
+
+    /// Puts a stream into the table of links. `None` when the table is full.
+    fn open_link(&self, stream: Stream, address: SocketAddr, dialed: bool) -> Option<Arc<LinkCell>> {
+        let mut links = write(&self.links);
+        let index = links.iter().position(Option::is_none)?;
+        let id = LinkId(u16::try_from(index).ok()?);
+        let now = self.clock.now();
+        let (serial, local, constraints, storage) = {
+            let mut cell = lock(&self.node);
+            cell.serial = cell.serial.wrapping_add(1);
+            let storage = Self::session_storage(&cell.capacities);
+            (cell.serial, cell.node.hello(now, id), *cell.node.constraints(), storage)
+        };
+        let config = SessionConfig { link: id, dialed, address, local, constraints };
+        let session = Session::new(now, config, Plain, storage);
+        let link = Arc::new(LinkCell::new(id, serial, stream, session, dialed));
+        *links.get_mut(index)? = Some(link.clone());
+        drop(links);
+        let interest = if dialed { Interest::READ_EDGE.and_writable() } else { Interest::READ_EDGE };
+        if self.epoll.add(&link.stream, link.token(), interest).is_err() {
+            link.lock().session.disconnected(CloseReason::DialFailed);
+        }
+        self.settle(&link, link.lock());
+        Some(link)
+    }
+
+    pub(super) fn accepted(&self, stream: Stream, address: SocketAddr) {
+        if self.open_link(stream, address, false).is_none() {
+            tracing::warn!(%address, "a connection was dropped: as many links are open as may be");
+        }
+    }
+
+    fn dial(&self, to: SocketAddr, identity: Option<&Identity>) {
+        let link = Stream::connect(to).ok().and_then(|stream| self.open_link(stream, to, true));
+        let mut cell = lock(&self.node);
+        match link {
+            Some(link) => cell.node.dialing(identity, link.id),
+            None => cell.node.dial_failed(self.clock.now(), identity),
+        }
+        drop(cell);
+        self.clock_waker.wake();
+    }
+
+    /// The connection that this unit opened is there, or could not be opened.
+    pub(super) fn connected(&self, link: &Arc<LinkCell>, state: &mut LinkState) {
+        match link.stream.finish_connect() {
+            Ok(false) => {}
+            Ok(true) => {
+                state.connecting = false;
+                self.with(link, state, |session, cx| session.connected(cx));
+            }
+            Err(reason) => {
+                state.connecting = false;
+                state.session.disconnected(reason);
+            }
+        }
+    }
+
+    /// Asks the node about a hello that has come.
+    pub(super) fn admit(&self, link: &Arc<LinkCell>, state: &mut LinkState) {
+        let Some(hello) = state.session.hello().cloned() else { return };
+        let admission = lock(&self.node).node.admit(self.clock.now(), link.id, state.session.address(), &hello);
+        match admission {
+            Admission::Accept => self.join(link, state),
+            Admission::Refuse(refusal) => self.with(link, state, |session, cx| session.refuse(cx, refusal)),
+            Admission::Challenge { old } => state.notices.push(Notice::Challenge(old)),
+        }
+    }
+
+    /// The node has taken the peer: it is told what it may call, and has its place from here on.
+    fn join(&self, link: &Arc<LinkCell>, state: &mut LinkState) {
+        let Some(identity) = state.session.identity().cloned() else { return };
+        self.with(link, state, |session, cx| session.accept(cx));
+        let visible: Vec<Slot> = {
+            let cell = lock(&self.node);
+            cell.publications.visible_to(&identity).collect()
+        };
+        self.with(link, state, |session, cx| session.publish(cx, visible.into_iter()));
+        let limit = usize::from(lock(&self.node).node.constraints().maximum_nodes);
+        let peer = write(&self.peers).of(&identity, limit);
+        peer.join(link.clone());
+        let _ = link.peer.set(peer);
+        state.notices.push(Notice::Joined);
+    }
+
+    /// Acts on what happened under a link's lock: safe hooks first.
+    pub(super) fn act(&self, link: &Arc<LinkCell>, notices: Vec<Notice>) {
+        for notice in &notices {
+            if let Notice::LeaseExpired(slot) = notice {
+                self.make_safe(*slot);
+            }
+        }
+        for notice in notices {
+            self.act_on(link, notice);
+        }
+    }
+
+    fn act_on(&self, link: &Arc<LinkCell>, notice: Notice) {
+        match notice {
+            Notice::Challenge(old) => self.challenge(old),
+            Notice::Answered => {
+                let action = lock(&self.node).node.challenge_answered(self.clock.now(), link.id);
+                self.carry_out(action);
+            }
+            Notice::Left(reason) => self.link_ended(link, reason),
+            notice => {
+                if let Some(event) = link.peer.get().and_then(|peer| self.describe(link, &peer.identity, &notice)) {
+                    self.tell(event);
+                }
+                if let Notice::Acknowledged { .. } = notice {
+                    link.room.notify_all();
+                }
+            }
+        }
+    }
+
+    /// The event that subscribers see.
+    fn describe(&self, link: &LinkCell, peer: &Identity, notice: &Notice) -> Option<UnitEvent> {
+        let peer = peer.clone();
+        let own_name =
+            |slot: Slot| read(&self.functions).function(slot).map(|f| f.name().to_owned()).unwrap_or_default();
+        let their_name = |slot: Slot| {
+            let state = link.lock();
+            state.session.their_function_list().function(slot).map(|f| f.name().to_owned()).unwrap_or_default()
+        };
+        Some(match *notice {
+            Notice::Joined => UnitEvent::Joined { peer },
+            Notice::ListChanged => UnitEvent::ListChanged { peer },
+            Notice::Failed(call, error) => UnitEvent::RequestFailed { peer, call, error },
+            Notice::LeaseExpired(slot) => UnitEvent::LeaseExpired { peer, function: own_name(slot) },
+            Notice::LeaseEnded { slot, expired } => UnitEvent::LeaseEnded { peer, function: their_name(slot), expired },
+            Notice::Acknowledged { skipped, .. } if skipped > 0 => UnitEvent::FunctionsSkipped { peer, skipped },
+            Notice::Acknowledged { .. } | Notice::Challenge(_) | Notice::Answered | Notice::Left(_) => return None,
+        })
+    }
+
+    fn challenge(&self, old: LinkId) {
+        let Some(link) = self.link(old) else {
+            let action = lock(&self.node).node.left(self.clock.now(), old, CloseReason::Reset);
+            self.carry_out(action);
+            return;
+        };
+        let mut state = link.lock();
+        self.with(&link, &mut state, |session, cx| session.challenge(cx));
+        self.settle(&link, state);
+        self.clock_waker.wake();
+    }
+
+    fn link_ended(&self, link: &Arc<LinkCell>, reason: CloseReason) {
+        if let Some(place) = write(&self.links).get_mut(usize::from(link.id.0)) {
+            place.take_if(|current| current.serial == link.serial);
+        }
+        lock(&self.timers).cancel(u32::from(link.id.0));
+        let _ = self.epoll.remove(&link.stream);
+        if let Some(peer) = link.peer.get() {
+            peer.leave(link);
+            self.run_lost_hook();
+            self.tell(UnitEvent::Left { peer: peer.identity.clone(), reason });
+        } else {
+            let peer = link.lock().session.identity().cloned();
+            self.tell(UnitEvent::NotJoined { address: link.lock().session.address(), peer, reason });
+        }
+        let action = lock(&self.node).node.left(self.clock.now(), link.id, reason);
+        self.carry_out(action);
+        // The node may have something to do earlier than before.
+        self.clock_waker.wake();
+    }
+
+    /// Does what the node wants done.
+    pub(super) fn carry_out(&self, action: Option<Action>) {
+        match action {
+            None => {}
+            Some(Action::Dial { to, identity }) => self.dial(to, identity.as_ref()),
+            Some(Action::Supersede { old, new, reason }) => {
+                if let Some(old) = self.link(old) {
+                    let mut state = old.lock();
+                    self.with(&old, &mut state, |session, cx| session.close(cx, reason));
+                    self.settle(&old, state);
+                }
+                self.admit_waiting(new);
+            }
+            Some(Action::Admit { new }) => self.admit_waiting(new),
+            Some(Action::Refuse { new, refusal }) => self.refuse_waiting(new, refusal),
+        }
+    }
+
+    fn admit_waiting(&self, new: LinkId) {
+        let Some(link) = self.link(new) else { return };
+        let mut state = link.lock();
+        self.join(&link, &mut state);
+        self.feed(&link, &mut state, &mut [], None, None);
+        self.settle(&link, state);
+    }
+
+    fn refuse_waiting(&self, new: LinkId, refusal: Refusal) {
+        let Some(link) = self.link(new) else { return };
+        let mut state = link.lock();
+        self.with(&link, &mut state, |session, cx| session.refuse(cx, refusal));
+        self.settle(&link, state);
+    }
+
+    /// Searches for nodes now (paper, listing line 6).
+    pub(crate) fn broadcast(&self) {
+        lock(&self.node).node.broadcast(self.clock.now());
+        self.clock_waker.wake();
+    }
+
+    /// Makes all functions of the unit's list visible: to one node, or to all and those that come later. Returns the
+    /// links that are to acknowledge, each with its serial.
+    pub(crate) fn publish(&self, to: Option<&Identity>) -> Result<Vec<(Arc<LinkCell>, u32)>, Error> {
+        let slots: Vec<Slot> = read(&self.functions).iter().map(|function| function.slot).collect();
+        {
+            let mut cell = lock(&self.node);
+            for &slot in &slots {
+                match to {
+                    None => cell.publications.publish_to_all(slot)?,
+                    Some(identity) => cell.publications.publish_to(identity, slot)?,
+                }
+            }
+        }
+        let peers: Vec<_> = read(&self.peers).connected().cloned().collect();
+        let chosen = peers.into_iter().filter(|peer| to.is_none_or(|identity| peer.identity == *identity));
+        Ok(chosen.filter_map(|peer| self.publish_on(&peer.link()?, &slots)).collect())
+    }
+
+    fn publish_on(&self, link: &Arc<LinkCell>, slots: &[Slot]) -> Option<(Arc<LinkCell>, u32)> {
+        let mut state = link.lock();
+        if !state.session.is_live() {
+            return None;
+        }
+        let serial = self.with(link, &mut state, |session, cx| session.publish(cx, slots.iter().copied()));
+        self.settle(link, state);
+        Some((link.clone(), serial))
+    }
+
+    /// Removes a function: its slot's callers learn that it is gone.
+    pub(crate) fn remove_function(&self, name: &str) -> Result<(), Error> {
+        let (slot, _) = write(&self.functions).remove(name)?;
+        lock(&self.node).publications.withdraw(slot);
+        for link in self.each_link() {
+            let mut state = link.lock();
+            self.with(&link, &mut state, |session, cx| session.withdraw(cx, slot));
+            self.settle(&link, state);
+        }
+        Ok(())
+    }
+
+    /// Waits until each peer has read what it was told, at most until `timeout`; returns those that have not.
+    pub(crate) fn await_acknowledgements(
+        &self,
+        told: &[(Arc<LinkCell>, u32)],
+        timeout: Duration,
+    ) -> Vec<Arc<LinkCell>> {
+        let deadline = self.clock.now() + timeout;
+        let missing = told.iter().filter(|(link, serial)| !self.await_acknowledgement(link, *serial, deadline));
+        missing.map(|(link, _)| link.clone()).collect()
+    }
+
+    fn await_acknowledgement(&self, link: &LinkCell, serial: u32, deadline: Instant) -> bool {
+        let mut state = link.lock();
+        loop {
+            let now = self.clock.now();
+            if state.session.is_acknowledged(serial) || !state.session.is_live() || now >= deadline {
+                return state.session.is_acknowledged(serial);
+            }
+            let waited = link.room.wait_timeout(state, deadline.since(now).into());
+            state = waited.unwrap_or_else(std::sync::PoisonError::into_inner).0;
+        }
+    }
+
+    /// Lends the node the mailman of the unit's datagrams.
+    pub(super) fn poll_node(&self) -> Instant {
+        loop {
+            let (action, next) = {
+                let mut cell = lock(&self.node);
+                let mut mailman = StdMailman { stream: None, datagrams: &self.datagrams };
+                let action = cell.node.poll(self.clock.now(), &mut mailman);
+                (action, cell.node.next_deadline())
+            };
+            if action.is_none() {
+                return next;
+            }
+            self.carry_out(action);
+        }
+    }
+}

@@ -1,0 +1,402 @@
+//! What a unit's threads share, and the few ways in which they touch a link.
+//!
+//! Locks, in the order in which they may be taken: a link, then the node, then anything else; never two links. Handlers,
+//! hooks and subscribers run without any of them. A function that has worked on a link ends with [`Engine::settle`],
+//! which gives the lock up and acts on what happened.
+
+mod calling;
+mod clock_thread;
+pub(crate) mod link;
+mod membership;
+pub(crate) mod peers;
+pub(crate) mod reader;
+mod serving;
+mod state_gate;
+mod workers;
+
+pub(crate) use calling::CallFuture;
+pub(crate) use membership::NodeCell;
+
+use std::collections::VecDeque;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::mpsc::SyncSender;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard, Weak};
+use std::thread::JoinHandle;
+
+use cara_core::config::Constraints;
+use cara_core::distribution::function_list::FunctionList;
+use cara_core::distribution::parameters::ParametersView;
+use cara_core::error::{CloseReason, Error};
+use cara_core::host::mailman::LinkId;
+use cara_core::host::secure::Plain;
+use cara_core::services::unit::{Call, Event, Session};
+use cara_core::services::{Context, requests::CallId};
+use cara_core::time::Instant;
+
+use crate::clock::Clock;
+use crate::event::UnitEvent;
+use crate::handler::Handler;
+use crate::pool::MessagePool;
+use crate::storage::Boxed;
+use crate::sys::datagram::Datagrams;
+use crate::sys::epoll::{Epoll, Interest, Trigger, Waker};
+use crate::sys::stream::Listener;
+use crate::timers::Timers;
+use link::{LinkCell, LinkState, Notice, StdMailman};
+use peers::Peers;
+use state_gate::StateGate;
+
+/// Bytes that one read takes from a stream.
+pub(crate) const READ_BYTES: usize = 64 * 1024;
+/// A link on which reading is paused is looked at again after this.
+const RETRY: cara_core::time::Duration = cara_core::time::Duration::from_millis(1);
+
+/// What a session call is lent on Linux.
+pub(crate) type Lent<'c, T> = Context<'c, Boxed, StdMailman<'c>, &'c MessagePool, Handler<T>>;
+
+/// Everything that a unit's threads and handles share.
+pub(crate) struct Engine<T: 'static> {
+    this: Weak<Self>,
+    pub(crate) clock: Clock,
+    pub(crate) node: Mutex<NodeCell>,
+    pub(crate) functions: RwLock<FunctionList<Boxed, Handler<T>>>,
+    pub(crate) peers: RwLock<Peers>,
+    links: RwLock<Vec<Option<Arc<LinkCell>>>>,
+    pub(crate) pool: MessagePool,
+    pub(crate) state: StateGate<T>,
+    datagrams: Datagrams,
+    listener: Option<Listener>,
+    epoll: Epoll,
+    timers: Mutex<Timers>,
+    clock_waker: Waker,
+    pool_waker: Waker,
+    /// Links on which a call may begin that nobody runs yet.
+    ready: Mutex<VecDeque<LinkId>>,
+    /// Pool threads that wait for something to do.
+    idle: AtomicUsize,
+    workers: AtomicUsize,
+    threads: Mutex<Vec<JoinHandle<()>>>,
+    stopping: AtomicBool,
+    subscribers: Mutex<Vec<SyncSender<UnitEvent>>>,
+    /// Runs when a peer is lost, before its loss is told.
+    pub(crate) lost_hook: Mutex<Option<Arc<crate::handler::Hook<T>>>>,
+}
+
+/// The call of its own that a leader reads for.
+struct OwnCall<'p> {
+    id: CallId,
+    parameters: &'p mut ParametersView,
+    result: Option<Result<(), Error>>,
+}
+
+pub(crate) fn lock<V>(mutex: &Mutex<V>) -> MutexGuard<'_, V> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+pub(crate) fn read<V>(lock: &RwLock<V>) -> RwLockReadGuard<'_, V> {
+    lock.read().unwrap_or_else(PoisonError::into_inner)
+}
+
+pub(crate) fn write<V>(lock: &RwLock<V>) -> RwLockWriteGuard<'_, V> {
+    lock.write().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// The parts that [`Engine::new`] puts together.
+pub(crate) struct EngineParts<T: 'static> {
+    pub(crate) clock: Clock,
+    pub(crate) node: NodeCell,
+    pub(crate) functions: FunctionList<Boxed, Handler<T>>,
+    pub(crate) pool: MessagePool,
+    pub(crate) state: T,
+    pub(crate) datagrams: Datagrams,
+    pub(crate) listener: Option<Listener>,
+    pub(crate) maximum_links: usize,
+}
+
+impl<T: Send + 'static> Engine<T> {
+    pub(crate) fn new(parts: EngineParts<T>) -> std::io::Result<Arc<Self>> {
+        let (epoll, clock_waker, pool_waker) = (Epoll::new()?, Waker::new()?, Waker::new()?);
+        Ok(Arc::new_cyclic(|this| Self {
+            this: this.clone(),
+            clock: parts.clock,
+            node: Mutex::new(parts.node),
+            functions: RwLock::new(parts.functions),
+            peers: RwLock::new(Peers::default()),
+            links: RwLock::new((0..parts.maximum_links).map(|_| None).collect()),
+            pool: parts.pool,
+            state: StateGate::new(parts.state),
+            datagrams: parts.datagrams,
+            listener: parts.listener,
+            epoll,
+            timers: Mutex::new(Timers::new()),
+            clock_waker,
+            pool_waker,
+            ready: Mutex::new(VecDeque::new()),
+            idle: AtomicUsize::new(0),
+            workers: AtomicUsize::new(0),
+            threads: Mutex::new(Vec::new()),
+            stopping: AtomicBool::new(false),
+            subscribers: Mutex::new(Vec::new()),
+            lost_hook: Mutex::new(None),
+        }))
+    }
+
+    pub(crate) fn is_stopping(&self) -> bool {
+        self.stopping.load(Ordering::Acquire)
+    }
+
+    /// Lends the session of a link what it needs.
+    pub(crate) fn with<R>(
+        &self,
+        link: &LinkCell,
+        state: &mut LinkState,
+        act: impl FnOnce(&mut Session<Boxed, Plain>, &mut Lent<'_, T>) -> R,
+    ) -> R {
+        let functions = read(&self.functions);
+        let mut mailman = StdMailman { stream: Some(&link.stream), datagrams: &self.datagrams };
+        let mut buffers = &self.pool;
+        let mut cx =
+            Context { now: self.clock.now(), mailman: &mut mailman, buffers: &mut buffers, functions: &functions };
+        act(&mut state.session, &mut cx)
+    }
+
+    /// Gives the session what was read. Returns the call that is to be run, its arguments in `arguments`.
+    fn feed(
+        &self,
+        link: &Arc<LinkCell>,
+        state: &mut LinkState,
+        bytes: &mut [u8],
+        mut arguments: Option<&mut ParametersView>,
+        mut own: Option<&mut OwnCall<'_>>,
+    ) -> Option<Call> {
+        let mut earlier = std::mem::take(&mut state.leftover);
+        let bytes = if earlier.is_empty() {
+            bytes
+        } else {
+            earlier.extend_from_slice(bytes);
+            &mut earlier[..]
+        };
+        let mut position = 0;
+        let mut call = None;
+        loop {
+            let rest = bytes.get_mut(position..).unwrap_or_default();
+            let step =
+                self.step(link, state, rest, arguments.as_deref_mut().filter(|_| call.is_none()), own.as_deref_mut());
+            position += step.consumed;
+            call = call.or(step.call);
+            if step.hello {
+                self.admit(link, state);
+            }
+            if step.paused {
+                state.leftover = bytes.get(position..).unwrap_or_default().to_vec();
+                return call;
+            }
+            if !step.progress {
+                return call;
+            }
+        }
+    }
+
+    /// One call of `Session::receive`, with its event taken apart.
+    fn step(
+        &self,
+        link: &Arc<LinkCell>,
+        state: &mut LinkState,
+        bytes: &mut [u8],
+        arguments: Option<&mut ParametersView>,
+        own: Option<&mut OwnCall<'_>>,
+    ) -> Step {
+        let functions = read(&self.functions);
+        let mut mailman = StdMailman { stream: Some(&link.stream), datagrams: &self.datagrams };
+        let mut buffers = &self.pool;
+        let mut cx =
+            Context { now: self.clock.now(), mailman: &mut mailman, buffers: &mut buffers, functions: &functions };
+        let LinkState { session, waiters, notices, .. } = state;
+        let receipt = session.receive(&mut cx, bytes, arguments);
+        let mut step = Step {
+            consumed: receipt.consumed,
+            paused: receipt.paused,
+            progress: receipt.consumed > 0 || receipt.event.is_some(),
+            hello: false,
+            call: None,
+        };
+        match receipt.event {
+            None => {}
+            Some(Event::Hello) => step.hello = true,
+            Some(Event::Call(call)) => step.call = Some(call),
+            Some(Event::Reply(id, outcome)) => match own.filter(|own| own.id == id) {
+                Some(own) => own.result = Some(outcome.and_then(|block| block.read_into(own.parameters))),
+                None => {
+                    let outcome =
+                        outcome.map(|block| (block.signature().as_bytes().into(), Box::<[u8]>::from(block.bytes())));
+                    if let Some(waiter) = waiters.iter_mut().find(|waiter| waiter.id == id) {
+                        waiter.finish(outcome);
+                    }
+                }
+            },
+            Some(event) => notices.extend(notice(&event)),
+        }
+        step
+    }
+
+    /// Polls the session as far as something is due, sets its timer and epoll interest, gives the lock up, and acts on
+    /// what happened: safe hooks first.
+    pub(crate) fn settle(&self, link: &Arc<LinkCell>, mut guard: MutexGuard<'_, LinkState>) {
+        let state = &mut *guard;
+        if state.session.deadline() <= self.clock.now() {
+            self.poll_session(link, state);
+        }
+        self.set_timer(link, state);
+        self.set_interest(link, state);
+        if state.notices.is_empty() {
+            return;
+        }
+        let notices = std::mem::take(&mut state.notices);
+        drop(guard);
+        self.act(link, notices);
+    }
+
+    fn poll_session(&self, link: &Arc<LinkCell>, state: &mut LinkState) {
+        loop {
+            let event = self.with(link, state, |session, cx| session.poll(cx));
+            match event {
+                None => return,
+                Some(Event::Reply(id, outcome)) => {
+                    state.finish(id, outcome.map(|_| Default::default()));
+                }
+                Some(event) => {
+                    if let Event::Closed(_) = event {
+                        link.stream.shutdown();
+                        link.room.notify_all();
+                    }
+                    state.notices.extend(notice(&event));
+                }
+            }
+        }
+    }
+
+    fn set_timer(&self, link: &LinkCell, state: &mut LinkState) {
+        let mut deadline = state.session.deadline();
+        if !state.leftover.is_empty() {
+            deadline = deadline.min(self.clock.now() + RETRY);
+        }
+        // A timer that is early does no harm: it is set anew when it comes.
+        if deadline < state.timer {
+            state.timer = deadline;
+            if lock(&self.timers).set(u32::from(link.id.0), deadline) {
+                self.clock_waker.wake();
+            }
+        }
+    }
+
+    /// Keeps the epoll registration in step with who reads and whether bytes wait to be written.
+    fn set_interest(&self, link: &LinkCell, state: &mut LinkState) {
+        let wanted = Registration {
+            readable: state.reader.pool_reads(),
+            writable: state.connecting || state.session.wants_to_write(),
+        };
+        if state.registration == wanted {
+            return;
+        }
+        state.registration = wanted;
+        let interest = Interest { readable: wanted.readable, writable: wanted.writable, trigger: Trigger::Edge };
+        // A descriptor that cannot be watched is one whose link has ended.
+        let _ = self.epoll.modify(&link.stream, link.token(), interest);
+    }
+
+    /// The link of an id.
+    pub(crate) fn link(&self, id: LinkId) -> Option<Arc<LinkCell>> {
+        read(&self.links).get(usize::from(id.0)).cloned().flatten()
+    }
+
+    /// The link that an epoll token means, unless it is gone.
+    fn link_of_token(&self, token: u64) -> Option<Arc<LinkCell>> {
+        let id = LinkId((token & 0xffff) as u16);
+        self.link(id).filter(|link| link.token() == token)
+    }
+
+    pub(crate) fn each_link(&self) -> Vec<Arc<LinkCell>> {
+        read(&self.links).iter().flatten().cloned().collect()
+    }
+
+    /// Tells subscribers; one that does not keep up loses the event, and one that is gone is forgotten.
+    pub(crate) fn tell(&self, event: UnitEvent) {
+        tracing::debug!(?event);
+        lock(&self.subscribers).retain(|subscriber| {
+            !matches!(subscriber.try_send(event.clone()), Err(std::sync::mpsc::TrySendError::Disconnected(_)))
+        });
+    }
+
+    pub(crate) fn subscribe(&self, subscriber: SyncSender<UnitEvent>) {
+        lock(&self.subscribers).push(subscriber);
+    }
+
+    /// Changes the constraints of the unit and tells every peer.
+    pub(crate) fn set_constraints(&self, constraints: Constraints) {
+        lock(&self.node).set_constraints(constraints);
+        for link in self.each_link() {
+            let mut state = link.lock();
+            self.with(&link, &mut state, |session, cx| session.set_constraints(cx, constraints));
+            self.settle(&link, state);
+        }
+    }
+
+    /// Ends every link in an orderly way and all threads.
+    pub(crate) fn stop(&self) {
+        if self.stopping.swap(true, Ordering::AcqRel) {
+            return;
+        }
+        for link in self.each_link() {
+            let mut state = link.lock();
+            self.with(&link, &mut state, |session, cx| session.close(cx, CloseReason::Stopped));
+            self.settle(&link, state);
+        }
+        self.clock_waker.wake();
+        self.pool_waker.wake();
+        let threads = std::mem::take(&mut *lock(&self.threads));
+        let own = std::thread::current().id();
+        for thread in threads.into_iter().filter(|thread| thread.thread().id() != own) {
+            let _ = thread.join();
+        }
+    }
+
+    fn now(&self) -> Instant {
+        self.clock.now()
+    }
+
+    /// The engine as its threads share it.
+    fn this(&self) -> Option<Arc<Self>> {
+        self.this.upgrade()
+    }
+}
+
+/// What one step of feeding led to.
+struct Step {
+    consumed: usize,
+    paused: bool,
+    /// Something was consumed or came out: there may be more.
+    progress: bool,
+    hello: bool,
+    call: Option<Call>,
+}
+
+/// What a link is watched for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Registration {
+    pub(crate) readable: bool,
+    pub(crate) writable: bool,
+}
+
+/// What an event without borrowed bytes means for the port.
+fn notice(event: &Event<'_>) -> Option<Notice> {
+    Some(match *event {
+        Event::LeaseExpired(slot) => Notice::LeaseExpired(slot),
+        Event::LeaseEnded { slot, expired } => Notice::LeaseEnded { slot, expired },
+        Event::Failed(id, error) => Notice::Failed(id, error),
+        Event::ListChanged => Notice::ListChanged,
+        Event::Acknowledged { serial, skipped } => Notice::Acknowledged { serial, skipped },
+        Event::Answered => Notice::Answered,
+        Event::Closed(reason) => Notice::Left(reason),
+        Event::Hello | Event::Call(_) | Event::Reply(..) => return None,
+    })
+}

@@ -1,0 +1,132 @@
+//! Running the peers' calls, on the thread that read them.
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::{Arc, MutexGuard, PoisonError};
+
+use cara_core::distribution::function_list::Slot;
+use cara_core::distribution::parameters::ParametersView;
+use cara_core::error::{Error, ServiceError};
+use cara_core::services::unit::Call;
+
+use super::link::{LinkCell, LinkState};
+use super::{Engine, lock, read};
+use crate::handler::{self, Run};
+use crate::lease::LeaseWatch;
+
+/// How long an answer waits for room at a time.
+const PAUSE: std::time::Duration = std::time::Duration::from_millis(20);
+
+impl<T: Send + 'static> Engine<T> {
+    /// Runs a call and those that waited behind it.
+    pub(super) fn serve(&self, link: &Arc<LinkCell>, call: Call, arguments: &mut ParametersView) {
+        let mut next = Some(call);
+        while let Some(call) = next {
+            let result = self.run(link, &call, arguments);
+            let state = self.answer(link, link.lock(), &call, result, arguments);
+            next = self.next_call(link, state, arguments);
+        }
+    }
+
+    /// Takes the next call that may begin on a link; another thread is told if there is one more.
+    pub(super) fn next_call(
+        &self,
+        link: &Arc<LinkCell>,
+        mut state: MutexGuard<'_, LinkState>,
+        arguments: &mut ParametersView,
+    ) -> Option<Call> {
+        let mut next = None;
+        if state.session.has_next_call() && self.may_run() {
+            next = self.with(link, &mut state, |session, cx| session.next_call(cx, arguments));
+        }
+        if state.session.has_next_call() {
+            self.hand_over(link);
+        }
+        self.settle(link, state);
+        next
+    }
+
+    /// Leaves a link's calls to another thread of the pool.
+    pub(super) fn hand_over(&self, link: &LinkCell) {
+        let mut ready = lock(&self.ready);
+        if !ready.contains(&link.id) {
+            ready.push_back(link.id);
+        }
+        drop(ready);
+        self.pool_waker.wake();
+    }
+
+    fn run(&self, link: &LinkCell, call: &Call, arguments: &mut ParametersView) -> Result<(), Error> {
+        let Some(peer) = link.peer.get() else { return Err(Error::NotConnected) };
+        let (run, lease) = {
+            let functions = read(&self.functions);
+            let function = functions.function(call.slot).ok_or(Error::StaleFunction)?;
+            (function.handler.run.clone(), function.handler.lease.clone())
+        };
+        let told = handler::Call {
+            caller: peer.identity.clone(),
+            priority: call.priority,
+            deadline: call.deadline,
+            wants_reply: call.wants_reply,
+            lease: lease.map(|lease| LeaseWatch::new(lease, self.clock)),
+        };
+        let run = AssertUnwindSafe(|| match run {
+            Run::Free(run) => run(&told, arguments).map_err(Error::Service),
+            Run::Method(run) => {
+                let mut state = self.state.enter(Some(link.id))?;
+                run(&mut state, &told, arguments).map_err(Error::Service)
+            }
+        });
+        catch_unwind(run).unwrap_or_else(|_| {
+            tracing::error!(slot = call.slot.0, caller = %peer.identity, "a handler panicked");
+            Err(Error::Service(ServiceError::Panicked))
+        })
+    }
+
+    /// Answers, waiting for room while somebody waits for the answer.
+    fn answer<'l>(
+        &self,
+        link: &'l Arc<LinkCell>,
+        mut state: MutexGuard<'l, LinkState>,
+        call: &Call,
+        result: Result<(), Error>,
+        results: &ParametersView,
+    ) -> MutexGuard<'l, LinkState> {
+        loop {
+            let answer = match result {
+                Ok(()) => Ok(results),
+                Err(error) => Err(error),
+            };
+            let kept = self.with(link, &mut state, |session, cx| session.answer(cx, call.ticket, answer));
+            if kept.is_ok() {
+                return state;
+            }
+            if self.now() >= call.deadline {
+                state.session.drop_answer(call.ticket);
+                return state;
+            }
+            self.settle(link, state);
+            state = link.lock();
+            state = link.room.wait_timeout(state, PAUSE).unwrap_or_else(PoisonError::into_inner).0;
+        }
+    }
+
+    /// Runs the safe hook of a service whose lease ended.
+    pub(super) fn make_safe(&self, slot: Slot) {
+        let hook = read(&self.functions).function(slot).and_then(|function| function.handler.safe.clone());
+        self.run_hook(hook.as_deref());
+    }
+
+    /// Runs the hook for the loss of a peer.
+    pub(super) fn run_lost_hook(&self) {
+        let hook = lock(&self.lost_hook).clone();
+        self.run_hook(hook.as_deref());
+    }
+
+    fn run_hook(&self, hook: Option<&handler::Hook<T>>) {
+        let Some(hook) = hook else { return };
+        let Ok(mut state) = self.state.enter(None) else { return };
+        if catch_unwind(AssertUnwindSafe(|| hook(&mut state))).is_err() {
+            tracing::error!("a hook panicked");
+        }
+    }
+}

@@ -1,0 +1,166 @@
+//! The pool: a few threads that wait in one epoll set, read what is ready, and run the calls that they read.
+//!
+//! There is always a thread that reads: one that is about to run a handler starts another if none is idle, up to a
+//! limit; beyond it calls wait in their sessions until a handler returns.
+
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+
+use cara_core::distribution::parameters::{Parameters, ParametersView};
+use cara_core::error::CloseReason;
+use cara_core::host::mailman::LinkId;
+use cara_core::services::unit::Call;
+
+use super::link::{LinkCell, LinkState};
+use super::{Engine, READ_BYTES, lock};
+use crate::sys::epoll::{Events, Interest, Ready};
+use crate::sys::stream::{Received, Wait};
+
+/// Threads that a unit starts with.
+const FIRST_WORKERS: usize = 2;
+/// Most threads of a unit's pool.
+const MOST_WORKERS: usize = 14;
+/// The token of the waker.
+pub(super) const WAKER: u64 = u64::MAX;
+/// Reads of one link in a row, so that a busy one does not keep a thread from the others.
+const READS: usize = 8;
+
+struct Worker {
+    events: Events,
+    buffer: Vec<u8>,
+    arguments: Box<ParametersView>,
+}
+
+impl<T: Send + 'static> Engine<T> {
+    pub(super) fn start_workers(self: &Arc<Self>) -> std::io::Result<()> {
+        self.epoll.add(&self.pool_waker, WAKER, Interest::READ_LEVEL)?;
+        for _ in 0..FIRST_WORKERS {
+            self.start_worker();
+        }
+        Ok(())
+    }
+
+    fn start_worker(self: &Arc<Self>) -> bool {
+        let started = self.workers.fetch_add(1, Ordering::AcqRel) < MOST_WORKERS;
+        let engine = self.clone();
+        let thread = std::thread::Builder::new().name("cara-pool".into());
+        match started.then(|| thread.spawn(move || engine.work())) {
+            Some(Ok(thread)) => {
+                lock(&self.threads).push(thread);
+                true
+            }
+            _ => {
+                self.workers.fetch_sub(1, Ordering::AcqRel);
+                false
+            }
+        }
+    }
+
+    /// Whether a call may be run: another thread goes on reading.
+    pub(super) fn may_run(&self) -> bool {
+        self.idle.load(Ordering::Acquire) > 0 || self.this().is_some_and(|engine| engine.start_worker())
+    }
+
+    fn work(self: Arc<Self>) {
+        let message = lock(&self.node).longest_message();
+        let mut worker = Worker { events: Events::new(1), buffer: vec![0; READ_BYTES], arguments: arena(message) };
+        while !self.is_stopping() {
+            self.idle.fetch_add(1, Ordering::AcqRel);
+            let waited = self.epoll.wait(&mut worker.events, None);
+            self.idle.fetch_sub(1, Ordering::AcqRel);
+            if let Err(error) = waited {
+                tracing::error!(%error, "waiting for links failed");
+                return;
+            }
+            let ready = worker.events.iter().next();
+            match ready {
+                // While the unit stops, the waker stays set, so that every thread wakes.
+                Some(ready) if ready.token == WAKER && self.is_stopping() => return,
+                Some(ready) if ready.token == WAKER => {
+                    self.pool_waker.reset();
+                }
+                Some(ready) => self.ready(ready, &mut worker),
+                None => {}
+            }
+            self.serve_waiting(&mut worker);
+        }
+    }
+
+    fn ready(&self, ready: Ready, worker: &mut Worker) {
+        let Some(link) = self.link_of_token(ready.token) else { return };
+        let mut state = link.lock();
+        if state.connecting && ready.writable {
+            self.connected(&link, &mut state);
+        }
+        if ready.writable && !state.connecting {
+            self.with(&link, &mut state, |session, cx| session.writable(cx));
+            link.room.notify_all();
+        }
+        let mut call = None;
+        if ready.readable && !state.connecting && !state.reader.is_led() {
+            call = self.drain(&link, &mut state, ready.hung_up, worker);
+        }
+        match call {
+            None => call = self.next_call(&link, state, &mut worker.arguments),
+            Some(_) => self.settle(&link, state),
+        }
+        if let Some(call) = call {
+            self.serve(&link, call, &mut worker.arguments);
+        }
+    }
+
+    /// Reads until nothing is left or the budget is used up, in which case the epoll set reports the link again.
+    fn drain(&self, link: &Arc<LinkCell>, state: &mut LinkState, hung_up: bool, worker: &mut Worker) -> Option<Call> {
+        let mut call = None;
+        for _ in 0..READS {
+            let count = match link.stream.receive(&mut worker.buffer, Wait::Not) {
+                Received::Bytes(count) => count,
+                Received::WouldBlock => return call,
+                Received::Closed => {
+                    state.session.disconnected(CloseReason::Reset);
+                    return call;
+                }
+            };
+            let arguments = if call.is_none() && self.may_run() { Some(&mut *worker.arguments) } else { None };
+            let bytes = worker.buffer.get_mut(..count).unwrap_or_default();
+            call = call.or(self.feed(link, state, bytes, arguments, None));
+            // A short read has emptied the stream; a hang-up shows in one more.
+            if count < READ_BYTES && !hung_up {
+                return call;
+            }
+        }
+        let interest = Interest { writable: state.registration.writable, ..Interest::READ_EDGE };
+        let _ = self.epoll.modify(&link.stream, link.token(), interest);
+        call
+    }
+
+    /// Runs the calls of links that nobody has run yet.
+    fn serve_waiting(&self, worker: &mut Worker) {
+        while let Some(id) = self.take_ready() {
+            let Some(link) = self.link(id) else { continue };
+            let state = link.lock();
+            if let Some(call) = self.next_call(&link, state, &mut worker.arguments) {
+                self.serve(&link, call, &mut worker.arguments);
+            }
+        }
+    }
+
+    fn take_ready(&self) -> Option<LinkId> {
+        let mut ready = lock(&self.ready);
+        if ready.is_empty() || !self.may_run() {
+            return None;
+        }
+        ready.pop_front()
+    }
+}
+
+/// Parameters that hold a message of up to `bytes`, and as much again for results and names.
+fn arena(bytes: usize) -> Box<ParametersView> {
+    const KIB: usize = 1024;
+    match bytes {
+        0..=2048 => Box::new(Parameters::<{ 8 * KIB }>::sized()),
+        2049..=20_000 => Box::new(Parameters::<{ 48 * KIB }>::sized()),
+        20_001..=40_000 => Box::new(Parameters::<{ 96 * KIB }>::sized()),
+        _ => Box::new(Parameters::<{ 320 * KIB }>::sized()),
+    }
+}

@@ -1,0 +1,69 @@
+//! What a unit tells its subscribers.
+
+use cara_core::distribution::identity::Identity;
+use cara_core::error::{CloseReason, Error};
+use cara_core::services::requests::CallId;
+use core::net::SocketAddr;
+
+/// Something happened that no call returned.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum UnitEvent {
+    /// A node is connected.
+    Joined {
+        /// Which.
+        peer: Identity,
+    },
+    /// A node is no longer connected.
+    Left {
+        /// Which.
+        peer: Identity,
+        /// Why.
+        reason: CloseReason,
+    },
+    /// A link ended before it joined: refused here or there, or silent.
+    NotJoined {
+        /// The other end.
+        address: SocketAddr,
+        /// Who it said it is.
+        peer: Option<Identity>,
+        /// Why.
+        reason: CloseReason,
+    },
+    /// A node published or withdrew functions.
+    ListChanged {
+        /// Which.
+        peer: Identity,
+    },
+    /// A node keeps no room for some of this unit's functions.
+    FunctionsSkipped {
+        /// Which.
+        peer: Identity,
+        /// How many.
+        skipped: u16,
+    },
+    /// An asynchronous request was not run, or its service failed.
+    RequestFailed {
+        /// Asked of this node.
+        peer: Identity,
+        /// As returned by the request.
+        call: CallId,
+        /// Why.
+        error: Error,
+    },
+    /// A service of this unit stopped because its caller no longer wanted it; its safe hook has run.
+    LeaseExpired {
+        /// Whose call it was.
+        peer: Identity,
+        /// The service.
+        function: String,
+    },
+    /// A node ended what this unit's call of a leased service started.
+    LeaseEnded {
+        /// Which.
+        peer: Identity,
+        /// The service.
+        function: String,
+        /// It was not renewed in time, as opposed to: it is finished.
+        expired: bool,
+    },
+}

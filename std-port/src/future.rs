@@ -1,0 +1,32 @@
+//! The asynchronous face, for tokio or any other executor: the unit's own threads read, and wake the task.
+
+use std::future::Future;
+use std::pin::Pin;
+use std::task::{Context, Poll};
+
+use cara_core::distribution::parameters::ParametersView;
+use cara_core::error::Error;
+
+use crate::engine::CallFuture;
+
+/// A call in flight. Dropping it gives up the reply, and frees the call's slot; the service may still run, once.
+#[must_use = "a call is waited for by awaiting it"]
+pub struct PendingReply<'p, T: Send + 'static> {
+    call: CallFuture<T>,
+    parameters: &'p mut ParametersView,
+}
+
+impl<'p, T: Send + 'static> PendingReply<'p, T> {
+    pub(crate) fn new(call: CallFuture<T>, parameters: &'p mut ParametersView) -> Self {
+        Self { call, parameters }
+    }
+}
+
+impl<T: Send + 'static> Future for PendingReply<'_, T> {
+    type Output = Result<(), Error>;
+
+    fn poll(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Self::Output> {
+        let Self { call, parameters } = &mut *self;
+        call.poll(cx, parameters)
+    }
+}

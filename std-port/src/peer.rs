@@ -1,0 +1,209 @@
+//! A node as this unit sees it.
+
+use std::fmt;
+use std::sync::Arc;
+
+use cara_core::distribution::identity::Identity;
+use cara_core::distribution::parameters::ParametersView;
+use cara_core::error::Error;
+use cara_core::services::requests::CallId;
+use cara_core::services::unit::RequestOptions;
+use cara_core::time::Duration;
+use core::net::SocketAddr;
+
+use crate::engine::Engine;
+use crate::engine::link::LinkCell;
+use crate::engine::peers::PeerCell;
+
+/// A node, connected or not. Stays valid when the node leaves, and works again when it comes back.
+pub struct Peer<T: Send + 'static = ()> {
+    pub(crate) engine: Arc<Engine<T>>,
+    pub(crate) cell: Arc<PeerCell>,
+}
+
+impl<T: Send + 'static> Clone for Peer<T> {
+    fn clone(&self) -> Self {
+        Self { engine: self.engine.clone(), cell: self.cell.clone() }
+    }
+}
+
+impl<T: Send + 'static> fmt::Debug for Peer<T> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}", self.cell.identity)
+    }
+}
+
+/// A copy of the functions that a node has published.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct FunctionNames {
+    functions: Vec<(String, String)>,
+}
+
+impl FunctionNames {
+    /// One line per function (paper, listing line 10).
+    pub fn show_functions(&self) -> impl fmt::Display + '_ {
+        self
+    }
+
+    /// The names.
+    pub fn names(&self) -> impl Iterator<Item = &str> {
+        self.functions.iter().map(|(name, _)| name.as_str())
+    }
+
+    /// Whether a function is among them.
+    pub fn contains(&self, name: &str) -> bool {
+        self.names().any(|known| known == name)
+    }
+
+    /// How many there are.
+    pub fn len(&self) -> usize {
+        self.functions.len()
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.functions.is_empty()
+    }
+}
+
+impl fmt::Display for FunctionNames {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.functions.iter().try_for_each(|(_, text)| writeln!(f, "{text}"))
+    }
+}
+
+impl<T: Send + 'static> Peer<T> {
+    /// Its name, id and role.
+    pub fn identity(&self) -> &Identity {
+        &self.cell.identity
+    }
+
+    /// Its name.
+    pub fn name(&self) -> &str {
+        self.cell.identity.name()
+    }
+
+    /// Its ID number.
+    pub fn id(&self) -> u32 {
+        self.cell.identity.id()
+    }
+
+    /// Whether it is connected now.
+    pub fn is_connected(&self) -> bool {
+        self.cell.is_connected()
+    }
+
+    /// The other end of its link, while it is connected.
+    pub fn address(&self) -> Option<SocketAddr> {
+        self.cell.link().map(|link| link.lock().session.address())
+    }
+
+    pub(crate) fn link(&self) -> Result<Arc<LinkCell>, Error> {
+        self.cell.link().ok_or(Error::NotConnected)
+    }
+
+    /// What the node has published to this unit; empty while it is not connected.
+    pub fn their_function_list(&self) -> FunctionNames {
+        let Ok(link) = self.link() else { return FunctionNames::default() };
+        let state = link.lock();
+        let functions = state.session.their_function_list().iter();
+        FunctionNames { functions: functions.map(|f| (f.name().to_owned(), f.signature.to_string())).collect() }
+    }
+
+    /// Waits until the node has published `function`; `false` after `timeout`.
+    pub fn wait_for_function(&self, function: &str, timeout: impl Into<Duration>) -> bool {
+        let deadline = self.engine.clock.now() + timeout.into();
+        while self.engine.clock.now() < deadline {
+            if self.their_function_list().contains(function) {
+                return true;
+            }
+            std::thread::sleep(std::time::Duration::from_millis(2));
+        }
+        false
+    }
+
+    /// Calls a function and waits for its results, which update `parameters` (paper, listing line 13). On an error they
+    /// are unchanged.
+    #[doc(alias = "block_request_their_function")]
+    pub fn block_request(&self, function: &str, parameters: &mut ParametersView) -> Result<(), Error> {
+        self.block_request_with(function, parameters, &RequestOptions::default())
+    }
+
+    /// As [`block_request`](Self::block_request), with a time-out, class or lease of its own.
+    pub fn block_request_with(
+        &self,
+        function: &str,
+        parameters: &mut ParametersView,
+        options: &RequestOptions,
+    ) -> Result<(), Error> {
+        self.engine.block_request(&self.link()?, function, parameters, options)
+    }
+
+    /// Calls a function without waiting (paper, listing line 19): accepted, not sent, not executed. A failure comes as
+    /// [`UnitEvent::RequestFailed`](crate::UnitEvent::RequestFailed) under the returned id.
+    #[doc(alias = "request_their_function")]
+    pub fn request(&self, function: &str, parameters: &ParametersView) -> Result<CallId, Error> {
+        self.request_with(function, parameters, &RequestOptions::default())
+    }
+
+    /// As [`request`](Self::request), with a class, delivery, life or lease of its own.
+    pub fn request_with(
+        &self,
+        function: &str,
+        parameters: &ParametersView,
+        options: &RequestOptions,
+    ) -> Result<CallId, Error> {
+        self.engine.request(&self.link()?, function, parameters, options)
+    }
+
+    /// Calls a function; the future ends with its results, or with why there are none.
+    #[cfg(feature = "async")]
+    pub fn request_async<'p>(
+        &self,
+        function: &str,
+        parameters: &'p mut ParametersView,
+        options: &RequestOptions,
+    ) -> Result<crate::future::PendingReply<'p, T>, Error> {
+        let call = self.engine.call_future(self.link()?, function, parameters, options)?;
+        Ok(crate::future::PendingReply::new(call, parameters))
+    }
+
+    /// Gives up the lease that a call of `function` began: what it started stops.
+    pub fn release(&self, function: &str) -> Result<(), Error> {
+        let link = self.link()?;
+        let mut state = link.lock();
+        let slot = state.session.their_function_list().find(function).ok_or(Error::UnknownFunction)?;
+        self.engine.with(&link, &mut state, |session, cx| session.release(cx, slot));
+        self.engine.settle(&link, state);
+        Ok(())
+    }
+
+    /// Sends one-way messages that gather now.
+    pub fn flush(&self) -> Result<(), Error> {
+        let link = self.link()?;
+        let mut state = link.lock();
+        self.engine.with(&link, &mut state, |session, cx| session.flush_gathered(cx));
+        self.engine.settle(&link, state);
+        Ok(())
+    }
+
+    /// Makes the unit's functions visible to this node only (paper, listing line 23); survives its reconnection.
+    pub fn publish_my_function_list(&self) -> Result<(), Error> {
+        self.engine.publish(Some(&self.cell.identity)).map(|_| ())
+    }
+
+    /// As [`publish_my_function_list`](Self::publish_my_function_list), and returns when the node has read the list;
+    /// [`Error::TimedOut`] otherwise.
+    pub fn publish_and_wait(&self, timeout: impl Into<Duration>) -> Result<(), Error> {
+        let told = self.engine.publish(Some(&self.cell.identity))?;
+        match self.engine.await_acknowledgements(&told, timeout.into()).is_empty() {
+            true => Ok(()),
+            false => Err(Error::TimedOut),
+        }
+    }
+
+    /// What happened on its link: (name, count), zeros included. Empty while it is not connected.
+    pub fn counters(&self) -> Vec<(&'static str, u64)> {
+        self.link().map(|link| link.lock().session.counters().iter().collect()).unwrap_or_default()
+    }
+}

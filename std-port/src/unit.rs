@@ -1,0 +1,142 @@
+//! The paper's `Unit`: an s_unit, which connects to one m_unit, its manager.
+
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, sync_channel};
+
+use cara_core::config::Constraints;
+use cara_core::distribution::identity::{Identity, Role};
+use cara_core::distribution::parameters::ParametersView;
+use cara_core::error::Error;
+use cara_core::services::requests::CallId;
+
+use crate::builder::{self, Builder, manager};
+use crate::communication_system::Owner;
+use crate::engine::{Engine, lock, read};
+use crate::event::UnitEvent;
+use crate::my_function_list::MyFunctionList;
+use crate::peer::Peer;
+
+/// Events that wait for a subscriber before it loses some.
+const EVENTS: usize = 256;
+
+/// An s_unit. Clones are handles to the same unit, which stops when the last one is dropped.
+pub struct Unit<T: Send + 'static = ()> {
+    owner: Arc<Owner<T>>,
+}
+
+impl<T: Send + 'static> Clone for Unit<T> {
+    fn clone(&self) -> Self {
+        Self { owner: self.owner.clone() }
+    }
+}
+
+impl Unit {
+    /// An s_unit with defaults, which joins the manager of the given name and id and no other.
+    pub fn new(name: &str, id: u32, manager_name: &str, manager_id: u32) -> Result<Self, Error> {
+        Self::builder(name, id, manager_name, manager_id)?.build_unit()
+    }
+
+    /// An s_unit with other than defaults.
+    pub fn builder(name: &str, id: u32, manager_name: &str, manager_id: u32) -> Result<Builder<()>, Error> {
+        Ok(Builder::new(Identity::s_unit(name, id)?, manager(manager_name, manager_id)?))
+    }
+}
+
+impl<T: Send + 'static> Unit<T> {
+    pub(crate) fn of(engine: Arc<Engine<T>>) -> Self {
+        Self { owner: Arc::new(Owner { engine }) }
+    }
+
+    fn engine(&self) -> &Arc<Engine<T>> {
+        &self.owner.engine
+    }
+
+    /// Looks for the manager and keeps the connection, in threads of its own.
+    #[doc(alias = "start_thread")]
+    pub fn start(&self) -> Result<(), Error> {
+        self.engine().start().map_err(|_| Error::Network)
+    }
+
+    /// Ends the link in an orderly way and all threads.
+    pub fn stop(&self) {
+        self.engine().stop();
+    }
+
+    /// This unit's identity.
+    pub fn identity(&self) -> Identity {
+        lock(&self.engine().node).node.identity().clone()
+    }
+
+    /// The manager, once it has been met.
+    pub fn manager(&self) -> Option<Peer<T>> {
+        let peers = read(&self.engine().peers);
+        let cell = peers.of_role(Role::MUnit).next().cloned();
+        cell.map(|cell| Peer { engine: self.engine().clone(), cell })
+    }
+
+    /// Whether the manager is connected.
+    pub fn is_connected(&self) -> bool {
+        self.manager().is_some_and(|manager| manager.is_connected())
+    }
+
+    /// Calls a function of the manager and waits for its results.
+    #[doc(alias = "block_request_their_function")]
+    pub fn block_request(&self, function: &str, parameters: &mut ParametersView) -> Result<(), Error> {
+        self.manager().ok_or(Error::NotConnected)?.block_request(function, parameters)
+    }
+
+    /// Calls a function of the manager without waiting.
+    #[doc(alias = "request_their_function")]
+    pub fn request(&self, function: &str, parameters: &ParametersView) -> Result<CallId, Error> {
+        self.manager().ok_or(Error::NotConnected)?.request(function, parameters)
+    }
+
+    /// The unit's own functions.
+    pub fn my_function_list(&self) -> MyFunctionList<'_, T> {
+        MyFunctionList { engine: self.engine() }
+    }
+
+    /// Makes the unit's functions visible to its manager, now or when it comes.
+    pub fn publish_my_function_list(&self) -> Result<(), Error> {
+        self.engine().publish(None).map(|_| ())
+    }
+
+    /// Looks for the manager now.
+    pub fn broadcast(&self) {
+        self.engine().broadcast();
+    }
+
+    /// Runs `hook` each time the manager is lost, once, before anything else is done about it. It must be short.
+    pub fn on_manager_lost(&self, hook: impl Fn(&mut T) + Send + Sync + 'static) {
+        *lock(&self.engine().lost_hook) = Some(Arc::new(hook));
+    }
+
+    /// Runs `act` with the application's state.
+    pub fn with_state<R>(&self, act: impl FnOnce(&mut T) -> R) -> Result<R, Error> {
+        self.engine().state.enter(None).map(|mut state| act(&mut state))
+    }
+
+    /// The constraints in force.
+    pub fn constraints(&self) -> Constraints {
+        *lock(&self.engine().node).node.constraints()
+    }
+
+    /// Changes the constraints; the manager is told.
+    pub fn set_constraints(&self, constraints: Constraints) -> Result<(), Error> {
+        builder::check(&constraints)?;
+        self.engine().set_constraints(constraints);
+        Ok(())
+    }
+
+    /// What no call returns: joined, left, failed. A subscriber that does not keep up loses events.
+    pub fn events(&self) -> Receiver<UnitEvent> {
+        let (sender, receiver) = sync_channel(EVENTS);
+        self.engine().subscribe(sender);
+        receiver
+    }
+
+    /// What happened in discovery: (name, count), zeros included.
+    pub fn counters(&self) -> Vec<(&'static str, u64)> {
+        lock(&self.engine().node).node.counters.iter().collect()
+    }
+}

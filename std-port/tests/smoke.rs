@@ -1,0 +1,69 @@
+//! The shortest way through: two units on loopback, over real sockets.
+
+use std::time::{Duration, Instant};
+
+use cara_std::{Call, CommunicationSystem, Error, Interfaces, Parameters, ParametersView, ServiceError, Unit};
+
+/// A fleet of its own, so that tests on one machine do not meet.
+fn fleet() -> u32 {
+    use std::hash::{BuildHasher, Hasher};
+    std::hash::RandomState::new().build_hasher().finish() as u32
+}
+
+fn until(what: &str, condition: impl Fn() -> bool) {
+    let end = Instant::now() + Duration::from_secs(10);
+    while !condition() {
+        assert!(Instant::now() < end, "not in time: {what}");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+}
+
+fn pair() -> (CommunicationSystem, Unit<[i64; 2]>) {
+    let fleet = fleet();
+    let manager = CommunicationSystem::builder("manager", 1).unwrap().fleet(fleet).interfaces(Interfaces::Loopback);
+    let manager = manager.build_system().unwrap();
+    let agv = Unit::builder("agv", 7, "manager", 1).unwrap().fleet(fleet).interfaces(Interfaces::Loopback);
+    let agv = agv.state([3_i64, 4]).build_unit().unwrap();
+    let mut position = Parameters::new();
+    position.add_int("position", 2).unwrap();
+    let pos_info = |state: &mut [i64; 2], _: &Call, view: &mut ParametersView| -> Result<(), ServiceError> {
+        view.set_value("position", *state).map_err(|_| ServiceError::BadResults)
+    };
+    agv.my_function_list().add_function("pos_info", &position, pos_info).unwrap();
+    let mut text = Parameters::<40_000>::sized();
+    text.add_string("text", 20_000).unwrap();
+    let echo = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+    agv.my_function_list().add_function("echo", &text, echo).unwrap();
+    agv.publish_my_function_list().unwrap();
+    (manager, agv)
+}
+
+#[test]
+fn a_manager_finds_an_agv_and_calls_it() {
+    let (manager, agv) = pair();
+    manager.start().unwrap();
+    assert_eq!(manager.number_of_s_units(), 0);
+    agv.start().unwrap();
+    until("the AGV has joined", || manager.number_of_s_units() == 1);
+    let peer = manager.s_units().remove(0);
+    assert!(peer.wait_for_function("echo", cara_std::Duration::from_secs(5)));
+
+    let mut pos = Parameters::new();
+    pos.add_int("position", 2).unwrap();
+    peer.block_request("pos_info", &mut pos).unwrap();
+    assert_eq!(pos.variable::<[i64; 2]>("position"), Ok([3, 4]));
+
+    let mut text = Parameters::<40_000>::sized();
+    text.add_string("text", 20_000).unwrap();
+    let long = "x".repeat(20_000);
+    text.set_value("text", long.as_str()).unwrap();
+    for _ in 0..100 {
+        peer.block_request("echo", &mut text).unwrap();
+    }
+    assert_eq!(text.variable::<&str>("text"), Ok(long.as_str()));
+    assert_eq!(peer.block_request("no_such_function", &mut pos), Err(Error::UnknownFunction));
+
+    agv.stop();
+    until("the AGV has left", || manager.number_of_s_units() == 0);
+    assert_eq!(peer.block_request("pos_info", &mut pos), Err(Error::NotConnected));
+}
