@@ -4,6 +4,7 @@
 #[cfg(test)]
 extern crate std;
 
+mod bytes;
 pub mod config;
 pub mod counters;
 pub mod error;

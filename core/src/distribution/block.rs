@@ -7,7 +7,8 @@
 
 use super::function::VariableSpec;
 use super::parameters::{ParametersView, Type, Value, bytes_of_variable};
-use super::value::{copy, saturate};
+use super::value::saturate;
+use crate::bytes::copy;
 use crate::config::VARIABLES;
 use crate::error::{Error, Limit};
 

@@ -1,6 +1,7 @@
 //! The Rust types for one element of a variable, and how an element lies in memory: little-endian, fixed width.
 
-use super::value::{Type, copy};
+use super::value::Type;
+use crate::bytes::copy;
 
 mod sealed {
     pub trait Sealed {}

@@ -12,7 +12,8 @@ use crate::error::{Error, Limit};
 
 use super::name::check_name;
 pub use super::value::{Element, FromValue, IntoValue, Target, Type, Value};
-use super::value::{copy, read_elements, saturate};
+use super::value::{read_elements, saturate};
+use crate::bytes::copy;
 
 /// Variables in `BYTES` bytes of names and values (paper, listing line 11).
 ///

@@ -6,7 +6,8 @@ use serde::{Deserialize, Serialize};
 
 use super::attributes::Attributes;
 use super::function::Signature;
-use super::value::{copy, saturate};
+use super::value::saturate;
+use crate::bytes::{copy, move_down};
 use crate::error::{Error, Limit};
 use crate::storage::Storage;
 
@@ -123,10 +124,9 @@ impl<S: Storage, H: 'static> Table<S, H> {
     pub(super) fn take(&mut self, index: usize) -> Option<Stored<H>> {
         let removed = self.entries.get_mut(index)?.function.take()?;
         let length = usize::from(removed.length);
-        if let Some(tail) = self.bytes.get_mut(removed.at as usize..self.used)
-            && length <= tail.len()
-        {
-            tail.copy_within(length.., 0);
+        if let Some(tail) = self.bytes.get_mut(removed.at as usize..self.used) {
+            let end = tail.len();
+            move_down(tail, length..end);
         }
         self.used = self.used.saturating_sub(length);
         for stored in self.entries.iter_mut().filter_map(|entry| entry.function.as_mut()) {

@@ -5,6 +5,7 @@
 
 use core::fmt;
 
+use crate::bytes::copy;
 use crate::error::Error;
 
 pub use super::element::Element;
@@ -303,13 +304,6 @@ pub(crate) fn read_elements<T: Element>(value: Value<'_>, elements: &mut [T]) ->
         *element = T::load(place).unwrap_or_default();
     }
     Ok(())
-}
-
-/// Copies slices of equal length; does nothing for others, so that no path panics.
-pub(crate) fn copy(from: &[u8], to: &mut [u8]) {
-    if from.len() == to.len() {
-        to.copy_from_slice(from);
-    }
 }
 
 /// `length` as 32 bits.

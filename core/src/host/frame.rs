@@ -4,6 +4,7 @@
 //! length travels as chunk frames of one priority; only an emergency, which always fits one chunk, may stand between
 //! two chunks of another message. The first chunk tells the message's length.
 
+use crate::bytes::copy;
 use crate::config::{MINIMUM_CHUNK_BYTES, Priority};
 use crate::error::CloseReason;
 
@@ -217,7 +218,7 @@ impl Writer<'_> {
     fn put(&mut self, bytes: &[u8]) {
         let end = self.position.saturating_add(bytes.len());
         if let Some(place) = self.out.get_mut(self.position..end) {
-            place.copy_from_slice(bytes);
+            copy(bytes, place);
             self.position = end;
         }
     }

@@ -4,7 +4,8 @@ use crate::error::CloseReason;
 
 /// Seals and opens the frames of one link, in place, without IO.
 pub trait Secure {
-    /// Bytes that sealing adds behind a frame's body.
+    /// Bytes that sealing adds behind a frame's body. With 0, sealing changes nothing, and frames may be written in
+    /// another order than they were sealed in.
     const OVERHEAD: usize;
 
     /// Seals `frame`, whose last [`OVERHEAD`](Self::OVERHEAD) bytes are room for the tag.

@@ -3,6 +3,7 @@
 //! A call that may run now becomes a ticket; one whose class is busy waits in the class's queue. An emergency has a
 //! place of its own in both, so that nothing else can keep it out.
 
+use crate::bytes;
 use crate::config::{EMERGENCY_BYTES, Priority, WINDOW};
 use crate::distribution::function_list::{Generation, Slot};
 use crate::error::{Error, Limit};
@@ -275,7 +276,7 @@ impl<S: Storage> Queue<S> {
     fn push(&mut self, head: CallHead, block: &[u8]) -> Result<(), Error> {
         let needed = HEAD_BYTES.saturating_add(block.len());
         if needed > self.buffer.len().saturating_sub(self.end) {
-            self.buffer.copy_within(self.start..self.end, 0);
+            bytes::move_down(&mut self.buffer, self.start..self.end);
             self.end = self.end.saturating_sub(self.start);
             self.start = 0;
         }
@@ -285,7 +286,7 @@ impl<S: Storage> Queue<S> {
         for (place, byte) in head_place.iter_mut().zip(encode_head(&head, block.len())) {
             *place = byte;
         }
-        block_place.copy_from_slice(block);
+        bytes::copy(block, block_place);
         self.end = end;
         Ok(())
     }

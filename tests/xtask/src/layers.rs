@@ -19,7 +19,7 @@ enum Layer {
 }
 
 /// Modules at the root of the core that belong to no layer and that every layer may use.
-const FOUNDATION: [&str; 7] = ["config", "counters", "error", "fmt", "random", "storage", "time"];
+const FOUNDATION: [&str; 8] = ["bytes", "config", "counters", "error", "fmt", "random", "storage", "time"];
 
 /// A layer talks to its neighbour. These modules of the host layer are the exceptions that services use directly: a
 /// session owns one link and lends the port's trait down to it.

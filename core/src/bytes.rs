@@ -1,0 +1,42 @@
+//! Copying bytes without a panic: the slices' own methods panic when lengths differ, and the optimiser does not always
+//! see that they agree.
+
+use core::ops::Range;
+
+/// Copies slices of equal length; does nothing for others.
+pub(crate) fn copy(from: &[u8], to: &mut [u8]) {
+    if from.len() == to.len() {
+        to.copy_from_slice(from);
+    }
+}
+
+/// Moves the bytes of `range` to the front; does nothing for a range that is not inside.
+pub(crate) fn move_down(bytes: &mut [u8], range: Range<usize>) {
+    if range.start <= range.end && range.end <= bytes.len() {
+        bytes.copy_within(range, 0);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn equal_lengths_are_copied_and_others_left_alone() {
+        let mut to = [0; 3];
+        copy(&[1, 2], &mut to);
+        assert_eq!(to, [0; 3]);
+        copy(&[1, 2, 3], &mut to);
+        assert_eq!(to, [1, 2, 3]);
+    }
+
+    #[test]
+    fn a_range_inside_moves_and_others_leave_the_bytes_alone() {
+        let mut bytes = [1, 2, 3, 4, 5];
+        move_down(&mut bytes, 3..6);
+        move_down(&mut bytes, Range { start: 4, end: 3 });
+        assert_eq!(bytes, [1, 2, 3, 4, 5]);
+        move_down(&mut bytes, 1..5);
+        assert_eq!(bytes, [2, 3, 4, 5, 5]);
+    }
+}

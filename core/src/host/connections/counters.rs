@@ -1,0 +1,61 @@
+//! What a link counts: one counter for each reason to drop, refuse or defer.
+
+crate::counters::counters! {
+    /// What a link counts (paper: "message monitoring").
+    pub enum LinkCounter {
+        /// Frames received.
+        FramesReceived,
+        /// Bytes received.
+        BytesReceived,
+        /// Messages received whole.
+        MessagesReceived,
+        /// Messages accepted for sending.
+        MessagesSent,
+        /// Bytes that the network took.
+        BytesSent,
+        /// Frames of the protocol itself (signs of life, renewals, farewells) for which there was no room.
+        FramesWithheld,
+        /// Messages refused because the class's buffer was full or none was free.
+        SendRefused,
+        /// Times that reading paused because no message buffer was free.
+        ReadPaused,
+        /// Session datagrams received.
+        DatagramsReceived,
+        /// Session datagrams sent.
+        DatagramsSent,
+        /// Session datagrams that could not be read, or were not of this session.
+        DatagramsDropped,
+        /// Keep-alives that did not come in time.
+        KeepAlivesMissed,
+        /// Requests sent.
+        RequestsSent,
+        /// Requests received.
+        RequestsReceived,
+        /// Requests given to a handler.
+        RequestsRun,
+        /// Requests refused because their id had been seen.
+        RequestsRepeated,
+        /// Requests refused because they were too old.
+        RequestsExpired,
+        /// Requests refused because as many waited as may.
+        RequestsBusy,
+        /// Requests refused because they came too soon.
+        RequestsTooSoon,
+        /// Requests that did not fit a published function.
+        RequestsRejected,
+        /// Requests of this unit that it did not send itself because of its own limits.
+        RequestsWithheld,
+        /// Calls that ended without an answer in time.
+        CallsTimedOut,
+        /// Answers to calls that had ended already.
+        RepliesLate,
+        /// Answers that could not be sent.
+        RepliesDropped,
+        /// Functions of the peer's list that did not fit here.
+        FunctionsSkipped,
+        /// Leases that ended without being renewed.
+        LeasesExpired,
+        /// Renewals that came for no running lease.
+        RenewalsIgnored,
+    }
+}

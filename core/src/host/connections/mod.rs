@@ -1,0 +1,205 @@
+//! The paper's `Connections`: one link's stream of frames, what waits to be written, and whether the peer is alive.
+//!
+//! A [`Link`] owns little (a small buffer for partial frames, room for one emergency) and borrows full message buffers
+//! from the unit's pool: one for what is being received, one per priority class that cannot be written at once. It
+//! knows nothing of requests; it hands up whole messages and takes whole messages down.
+
+mod counters;
+mod liveness;
+mod receiver;
+mod sender;
+
+pub use counters::LinkCounter;
+pub use liveness::Liveness;
+
+use crate::config::{MINIMUM_CHUNK_BYTES, Priority};
+use crate::counters::Counters;
+use crate::error::{CloseReason, Error};
+use crate::host::frame::{ChunkWriter, Frame};
+use crate::host::mailman::{LinkId, Mailman};
+use crate::host::secure::Secure;
+use crate::storage::{Buffers, Storage};
+use receiver::Receiver;
+use sender::Sender;
+
+/// A whole frame or message that arrived; [`Link::view`] shows the bytes.
+#[derive(Clone, Copy, Debug)]
+pub enum Incoming {
+    /// The peer's hello.
+    Hello(Place),
+    /// The peer refuses, with a code.
+    Refuse(u8),
+    /// The peer closes, with a code.
+    Close(u8),
+    /// To be answered.
+    Ping,
+    /// An answer to a ping.
+    Pong,
+    /// A session body that came in the stream.
+    Session(Place),
+    /// A whole message.
+    Message(Priority, Place),
+}
+
+/// Where bytes that arrived lie, until the next call of [`Link::receive`].
+#[derive(Clone, Copy, Debug)]
+pub struct Place {
+    store: Store,
+    start: usize,
+    end: usize,
+}
+
+impl Place {
+    /// All of a lent slice of `length` bytes.
+    pub const fn lent(length: usize) -> Self {
+        Self { store: Store::Lent, start: 0, end: length }
+    }
+
+    /// The same without its first `count` bytes.
+    pub fn after(self, count: usize) -> Self {
+        Self { start: self.start.saturating_add(count).min(self.end), ..self }
+    }
+
+    fn length(self) -> usize {
+        self.end.saturating_sub(self.start)
+    }
+}
+
+/// Which bytes a [`Place`] is in.
+#[derive(Clone, Copy, Debug)]
+enum Store {
+    /// Those that the port lent.
+    Lent,
+    /// The link's own.
+    Small,
+    /// The buffer that the link borrows for receiving.
+    Buffer,
+}
+
+/// Result of [`Link::receive`].
+#[derive(Clone, Copy, Debug)]
+pub struct Received {
+    /// How many of the lent bytes are used up.
+    pub consumed: usize,
+    /// What they completed.
+    pub incoming: Option<Incoming>,
+    /// No message buffer is free: stop reading, and offer the rest again later.
+    pub paused: bool,
+}
+
+/// One end of a stream.
+pub struct Link<S: Storage, C: Secure> {
+    id: LinkId,
+    cipher: C,
+    receiver: Receiver<S>,
+    sender: Sender<S>,
+    /// What happened on this link.
+    pub counters: Counters<LinkCounter, { LinkCounter::COUNT }>,
+}
+
+impl<S: Storage, C: Secure> Link<S, C> {
+    /// A link; `small` is its own buffer of [`crate::config::LINK_BUFFER_BYTES`], the limits are what this unit told.
+    pub fn new(id: LinkId, cipher: C, small: S::Slice<u8>, chunk_limit: usize, message_limit: usize) -> Self {
+        Self {
+            id,
+            cipher,
+            receiver: Receiver::new(small, chunk_limit.max(MINIMUM_CHUNK_BYTES), message_limit),
+            sender: Sender::new(C::OVERHEAD),
+            counters: Counters::new(),
+        }
+    }
+
+    /// The link's index.
+    pub const fn id(&self) -> LinkId {
+        self.id
+    }
+
+    /// Sets the longest chunk that the peer takes, as its hello told.
+    pub fn set_peer_limits(&mut self, chunk: usize) {
+        self.sender.set_chunk(chunk.max(MINIMUM_CHUNK_BYTES));
+    }
+
+    /// Raises the longest message that this unit takes. A lower limit than one that the peer was told changes nothing
+    /// here, since longer messages may be on their way: whoever reads them refuses them.
+    pub fn set_message_limit(&mut self, limit: usize) {
+        self.receiver.raise_message_limit(limit);
+    }
+
+    /// Takes what the port has read. Call it again with the rest, and once with nothing, until it completes nothing:
+    /// that call gives the buffer of the last message back.
+    pub fn receive(&mut self, buffers: &mut impl Buffers<S>, bytes: &mut [u8]) -> Result<Received, CloseReason> {
+        let available = bytes.len();
+        let received = self.receiver.receive(&mut self.cipher, buffers, bytes)?;
+        self.counters.add(LinkCounter::BytesReceived, received.consumed as u64);
+        if received.paused && available > 0 {
+            self.counters.add(LinkCounter::ReadPaused, 1);
+        }
+        if received.incoming.is_some() {
+            self.counters.add(LinkCounter::FramesReceived, 1);
+        }
+        if let Some(Incoming::Message(..)) = received.incoming {
+            self.counters.add(LinkCounter::MessagesReceived, 1);
+        }
+        Ok(received)
+    }
+
+    /// The bytes at `place`; `lent` is the slice that was lent to [`receive`](Self::receive).
+    pub fn view<'b>(&'b self, place: Place, lent: &'b [u8]) -> &'b [u8] {
+        self.receiver.store(place.store, lent).get(place.start..place.end).unwrap_or(&[])
+    }
+
+    /// Accepts one message of `total` bytes, which `write` puts into the send buffer, and writes what the network takes
+    /// unless it is to `hold`. Refused before the first byte when it cannot be kept: [`Error::Full`] when it can be
+    /// later, [`Error::TooLarge`] when it never can.
+    pub fn send_message(
+        &mut self,
+        mailman: &mut impl Mailman,
+        buffers: &mut impl Buffers<S>,
+        priority: Priority,
+        total: usize,
+        hold: bool,
+        write: impl FnOnce(&mut ChunkWriter<'_>),
+    ) -> Result<(), Error> {
+        if let Err(error) = self.sender.accept(buffers, priority, total, write) {
+            self.counters.add(LinkCounter::SendRefused, 1);
+            return Err(error);
+        }
+        self.counters.add(LinkCounter::MessagesSent, 1);
+        if hold { Ok(()) } else { self.flush(mailman, buffers).map_err(Error::Closed) }
+    }
+
+    /// Accepts a frame that is no chunk. `false` when the room reserved for such frames is full.
+    pub fn send_frame(&mut self, frame: &Frame<'_>) -> bool {
+        let accepted = self.sender.accept_frame(frame);
+        if !accepted {
+            self.counters.add(LinkCounter::FramesWithheld, 1);
+        }
+        accepted
+    }
+
+    /// Writes what the network takes now.
+    pub fn flush(&mut self, mailman: &mut impl Mailman, buffers: &mut impl Buffers<S>) -> Result<(), CloseReason> {
+        let written = self.sender.flush(self.id, &mut self.cipher, mailman, buffers)?;
+        self.counters.add(LinkCounter::BytesSent, written);
+        Ok(())
+    }
+
+    /// Whether bytes wait to be written: the port asks to be told when the stream is writable.
+    pub fn wants_to_write(&self) -> bool {
+        !self.sender.is_empty()
+    }
+
+    /// Bytes that wait to be written.
+    pub fn queued(&self) -> usize {
+        self.sender.queued()
+    }
+
+    /// Gives every borrowed buffer back. The link is of no use afterwards.
+    pub fn release(&mut self, buffers: &mut impl Buffers<S>) {
+        self.receiver.release(buffers);
+        self.sender.release(buffers);
+    }
+}
+
+#[cfg(test)]
+mod harness;

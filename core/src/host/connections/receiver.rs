@@ -1,0 +1,355 @@
+//! Puts frames and messages together from whatever pieces the network delivers.
+//!
+//! A link borrows one buffer at most for all that it receives: for a frame that is longer than the link's own bytes, for
+//! a message in several chunks, or for both, the frame behind what there is of the message. So a link that pauses for
+//! want of a buffer holds none, and links cannot wait for each other.
+
+use super::{Incoming, Place, Received, Store};
+use crate::bytes;
+use crate::config::{MINIMUM_CHUNK_BYTES, Priority};
+use crate::error::CloseReason;
+use crate::host::frame::{self, Chunk, Frame};
+use crate::host::secure::Secure;
+use crate::storage::{Buffer, Buffers, Storage};
+
+pub(super) struct Receiver<S: Storage> {
+    small: S::Slice<u8>,
+    buffer: Option<Buffer<S>>,
+    partial: Partial,
+    assembly: Option<Assembly>,
+    chunk_limit: usize,
+    message_limit: usize,
+}
+
+/// A frame that came in pieces. Its bytes are in `small`, or in the buffer behind the assembly when it is longer.
+#[derive(Default)]
+struct Partial {
+    length: usize,
+    in_buffer: bool,
+    /// It was handed up and is done with.
+    done: bool,
+}
+
+/// A message in several chunks, at the start of the buffer.
+struct Assembly {
+    length: usize,
+    total: usize,
+    priority: Priority,
+    /// It was handed up and is done with.
+    done: bool,
+}
+
+/// A chunk without its bytes.
+struct Piece {
+    priority: Priority,
+    total: Option<u32>,
+    last: bool,
+}
+
+/// A frame without its bytes, which are the tail of its body.
+enum Content {
+    Hello,
+    Refuse(u8),
+    Close(u8),
+    Ping,
+    Pong,
+    Session,
+    Piece(Piece),
+}
+
+impl<S: Storage> Receiver<S> {
+    pub(super) fn new(small: S::Slice<u8>, chunk_limit: usize, message_limit: usize) -> Self {
+        Self { small, buffer: None, partial: Partial::default(), assembly: None, chunk_limit, message_limit }
+    }
+
+    pub(super) fn raise_message_limit(&mut self, limit: usize) {
+        self.message_limit = self.message_limit.max(limit);
+    }
+
+    pub(super) fn store<'b>(&'b self, store: Store, lent: &'b [u8]) -> &'b [u8] {
+        match store {
+            Store::Lent => lent,
+            Store::Small => &self.small,
+            Store::Buffer => self.buffer.as_ref().map_or(&[][..], |buffer| buffer),
+        }
+    }
+
+    pub(super) fn receive<C: Secure>(
+        &mut self,
+        cipher: &mut C,
+        buffers: &mut impl Buffers<S>,
+        lent: &mut [u8],
+    ) -> Result<Received, CloseReason> {
+        let received = self.step(cipher, buffers, lent)?;
+        if self.partial.done && received.consumed == 0 && received.incoming.is_none() {
+            // A chunk that had waited for a buffer: it would look as if nothing were left to do.
+            return self.step(cipher, buffers, lent);
+        }
+        Ok(received)
+    }
+
+    fn step<C: Secure>(
+        &mut self,
+        cipher: &mut C,
+        buffers: &mut impl Buffers<S>,
+        lent: &mut [u8],
+    ) -> Result<Received, CloseReason> {
+        self.clear_finished(buffers);
+        if self.partial.length == 0 {
+            match frame::first_frame_length(lent) {
+                Some(length) if length <= lent.len() => return self.take_whole(cipher, buffers, lent, length),
+                _ => {}
+            }
+        }
+        self.take_partial(cipher, buffers, lent)
+    }
+
+    /// The frame lies whole in the lent bytes: it is opened there.
+    fn take_whole<C: Secure>(
+        &mut self,
+        cipher: &mut C,
+        buffers: &mut impl Buffers<S>,
+        lent: &mut [u8],
+        length: usize,
+    ) -> Result<Received, CloseReason> {
+        self.check_length(length)?;
+        if !self.reserve(buffers, length) {
+            return Ok(Received { consumed: 0, incoming: None, paused: true });
+        }
+        let incoming = self.open(cipher, Store::Lent, lent, 0, length)?;
+        self.give_unused(buffers);
+        Ok(Received { consumed: length, incoming, paused: false })
+    }
+
+    /// The frame came in pieces: it is collected, and opened when it is whole.
+    fn take_partial<C: Secure>(
+        &mut self,
+        cipher: &mut C,
+        buffers: &mut impl Buffers<S>,
+        lent: &mut [u8],
+    ) -> Result<Received, CloseReason> {
+        let mut consumed = self.collect(lent, frame::HEADER_BYTES);
+        let Some(length) = self.partial_frame_length() else {
+            return Ok(Received { consumed, incoming: None, paused: false });
+        };
+        self.check_length(length)?;
+        if length > self.small.len() && !self.partial.in_buffer {
+            if !self.borrow(buffers) {
+                return Ok(Received { consumed, incoming: None, paused: true });
+            }
+            self.move_to_buffer(length)?;
+        }
+        consumed = consumed.saturating_add(self.collect(lent.get(consumed..).unwrap_or(&[]), length));
+        if self.partial.length < length {
+            return Ok(Received { consumed, incoming: None, paused: false });
+        }
+        if !self.partial.in_buffer && !self.reserve(buffers, length) {
+            return Ok(Received { consumed, incoming: None, paused: true });
+        }
+        self.partial.done = true;
+        let (store, start) = self.partial_place();
+        let incoming = self.open(cipher, store, lent, start, length)?;
+        self.give_unused(buffers);
+        Ok(Received { consumed, incoming, paused: false })
+    }
+
+    fn check_length(&self, length: usize) -> Result<(), CloseReason> {
+        if length > self.chunk_limit.saturating_add(frame::HEADER_BYTES) { Err(CloseReason::Oversize) } else { Ok(()) }
+    }
+
+    /// A frame that may begin a chunked message needs a buffer before it is opened, since it cannot be closed again.
+    /// `false` when one is needed and the pool is empty.
+    fn reserve(&mut self, buffers: &mut impl Buffers<S>, length: usize) -> bool {
+        self.assembly.is_some() || length < MINIMUM_CHUNK_BYTES || self.borrow(buffers)
+    }
+
+    fn borrow(&mut self, buffers: &mut impl Buffers<S>) -> bool {
+        if self.buffer.is_none() {
+            self.buffer = buffers.take();
+        }
+        self.buffer.is_some()
+    }
+
+    /// Bytes of the message that is being put together.
+    fn assembled(&self) -> usize {
+        self.assembly.as_ref().map_or(0, |assembly| assembly.length)
+    }
+
+    /// Where the partial frame begins.
+    fn partial_place(&self) -> (Store, usize) {
+        if self.partial.in_buffer { (Store::Buffer, self.assembled()) } else { (Store::Small, 0) }
+    }
+
+    fn partial_frame_length(&self) -> Option<usize> {
+        let (store, start) = self.partial_place();
+        let end = start.saturating_add(self.partial.length);
+        frame::first_frame_length(self.store(store, &[]).get(start..end)?)
+    }
+
+    /// Copies from `bytes` until the partial frame has `length` bytes; returns how many were copied.
+    fn collect(&mut self, bytes: &[u8], length: usize) -> usize {
+        let (_, start) = self.partial_place();
+        let store: &mut [u8] = match &mut self.buffer {
+            Some(buffer) if self.partial.in_buffer => buffer,
+            _ => &mut self.small,
+        };
+        let count = length.saturating_sub(self.partial.length).min(bytes.len());
+        let from = start.saturating_add(self.partial.length);
+        let place = store.get_mut(from..from.saturating_add(count));
+        let (Some(place), Some(piece)) = (place, bytes.get(..count)) else { return 0 };
+        bytes::copy(piece, place);
+        self.partial.length = self.partial.length.saturating_add(count);
+        count
+    }
+
+    /// Moves the partial frame, which has `length` bytes when it is whole, behind the assembly.
+    fn move_to_buffer(&mut self, length: usize) -> Result<(), CloseReason> {
+        let start = self.assembled();
+        let buffer = self.buffer.as_mut().ok_or(CloseReason::Protocol)?;
+        let place = buffer.get_mut(start..start.saturating_add(length)).ok_or(CloseReason::Oversize)?;
+        let collected = self.small.get(..self.partial.length).unwrap_or(&[]);
+        if let Some(place) = place.get_mut(..collected.len()) {
+            bytes::copy(collected, place);
+        }
+        self.partial.in_buffer = true;
+        Ok(())
+    }
+
+    /// Opens the frame of `length` bytes at `start` of `store`.
+    fn open<C: Secure>(
+        &mut self,
+        cipher: &mut C,
+        store: Store,
+        lent: &mut [u8],
+        start: usize,
+        length: usize,
+    ) -> Result<Option<Incoming>, CloseReason> {
+        let bytes: &mut [u8] = match (store, &mut self.buffer) {
+            (Store::Lent, _) => lent,
+            (Store::Buffer, Some(buffer)) => buffer,
+            _ => &mut self.small,
+        };
+        let body_at = start.saturating_add(frame::HEADER_BYTES);
+        let sealed = bytes.get_mut(body_at..start.saturating_add(length)).ok_or(CloseReason::Protocol)?;
+        let body = cipher.open(sealed)?;
+        let end = body_at.saturating_add(body.len());
+        let (content, tail) = Content::of(Frame::parse(body)?);
+        self.deliver(content, Place { store, start: end.saturating_sub(tail), end }, lent)
+    }
+
+    fn deliver(&mut self, content: Content, place: Place, lent: &[u8]) -> Result<Option<Incoming>, CloseReason> {
+        Ok(Some(match content {
+            Content::Hello => Incoming::Hello(place),
+            Content::Refuse(code) => Incoming::Refuse(code),
+            Content::Close(code) => Incoming::Close(code),
+            Content::Ping => Incoming::Ping,
+            Content::Pong => Incoming::Pong,
+            Content::Session => Incoming::Session(place),
+            Content::Piece(Piece { priority, total: Some(total), last: true }) => {
+                self.check_whole(place, total as usize)?;
+                Incoming::Message(priority, place)
+            }
+            Content::Piece(Piece { priority, total: Some(total), last: false }) => {
+                self.begin(priority, total as usize, place, lent)?;
+                return Ok(None);
+            }
+            Content::Piece(piece) => return self.go_on(&piece, place, lent),
+        }))
+    }
+
+    fn check_whole(&self, place: Place, total: usize) -> Result<(), CloseReason> {
+        if total > self.message_limit {
+            return Err(CloseReason::Oversize);
+        }
+        if total == place.length() { Ok(()) } else { Err(CloseReason::Protocol) }
+    }
+
+    /// The first of several chunks.
+    fn begin(&mut self, priority: Priority, total: usize, place: Place, lent: &[u8]) -> Result<(), CloseReason> {
+        let room = self.buffer.as_ref().map_or(0, |buffer| buffer.len());
+        if self.assembly.is_some() || place.length() >= total {
+            return Err(CloseReason::Protocol);
+        }
+        if total > self.message_limit || total > room {
+            return Err(CloseReason::Oversize);
+        }
+        self.keep(place, lent, 0)?;
+        self.assembly = Some(Assembly { length: place.length(), total, priority, done: false });
+        Ok(())
+    }
+
+    /// A chunk behind the first one.
+    fn go_on(&mut self, piece: &Piece, place: Place, lent: &[u8]) -> Result<Option<Incoming>, CloseReason> {
+        let Some(Assembly { length, total, priority, .. }) = self.assembly else { return Err(CloseReason::Protocol) };
+        let end = length.saturating_add(place.length());
+        if piece.priority != priority || end > total || piece.last != (end == total) {
+            return Err(CloseReason::Protocol);
+        }
+        self.keep(place, lent, length)?;
+        self.assembly = Some(Assembly { length: end, total, priority, done: piece.last });
+        let whole = Place { store: Store::Buffer, start: 0, end };
+        Ok(piece.last.then_some(Incoming::Message(priority, whole)))
+    }
+
+    /// Puts the bytes at `place` into the buffer at `at`, which is not behind them where they are in it already.
+    fn keep(&mut self, place: Place, lent: &[u8], at: usize) -> Result<(), CloseReason> {
+        let buffer = self.buffer.as_mut().ok_or(CloseReason::Protocol)?;
+        let from = match place.store {
+            Store::Lent => lent,
+            Store::Small => &self.small,
+            Store::Buffer => {
+                let rest = buffer.get_mut(at..place.end).ok_or(CloseReason::Protocol)?;
+                let end = rest.len();
+                bytes::move_down(rest, place.start.saturating_sub(at)..end);
+                return Ok(());
+            }
+        };
+        let from = from.get(place.start..place.end).ok_or(CloseReason::Protocol)?;
+        let to = buffer.get_mut(at..at.saturating_add(from.len())).ok_or(CloseReason::Oversize)?;
+        bytes::copy(from, to);
+        Ok(())
+    }
+
+    fn clear_finished(&mut self, buffers: &mut impl Buffers<S>) {
+        if self.partial.done {
+            self.partial = Partial::default();
+        }
+        self.assembly.take_if(|assembly| assembly.done);
+        self.give_unused(buffers);
+    }
+
+    fn give_unused(&mut self, buffers: &mut impl Buffers<S>) {
+        if self.assembly.is_none()
+            && !self.partial.in_buffer
+            && let Some(buffer) = self.buffer.take()
+        {
+            buffers.give(buffer);
+        }
+    }
+
+    pub(super) fn release(&mut self, buffers: &mut impl Buffers<S>) {
+        self.assembly = None;
+        self.partial = Partial::default();
+        self.give_unused(buffers);
+    }
+}
+
+impl Content {
+    /// What a frame holds, and how many bytes at the end of its body belong to that.
+    fn of(frame: Frame<'_>) -> (Self, usize) {
+        match frame {
+            Frame::Hello(bytes) => (Self::Hello, bytes.len()),
+            Frame::Refuse(code) => (Self::Refuse(code), 0),
+            Frame::Close(code) => (Self::Close(code), 0),
+            Frame::Ping => (Self::Ping, 0),
+            Frame::Pong => (Self::Pong, 0),
+            Frame::Session(bytes) => (Self::Session, bytes.len()),
+            Frame::Chunk(Chunk { priority, total, last, bytes }) => {
+                (Self::Piece(Piece { priority, total, last }), bytes.len())
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

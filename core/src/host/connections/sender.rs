@@ -1,0 +1,328 @@
+//! What waits to be written: one lane per class and the urgent frames that go between chunks.
+//!
+//! Frames are sealed just before they are written, in the order in which they go out. What is sealed cannot be
+//! overtaken, so no more than a chunk is sealed at a time, and one frame at a time on a link that does not keep up. In
+//! plain mode, where sealing changes nothing, all that waits is written in one go, and whatever frame the network has
+//! not begun to take may still be overtaken. Either way an emergency waits for one chunk at most.
+
+use crate::bytes;
+use crate::config::{EMERGENCY_BYTES, MINIMUM_CHUNK_BYTES, Priority};
+use crate::error::{CloseReason, Error, Limit};
+use crate::host::frame::{self, ChunkWriter, Cut, Frame};
+use crate::host::mailman::{LinkId, Mailman};
+use crate::host::secure::Secure;
+use crate::storage::{Buffer, Buffers, Storage};
+
+/// Room for one emergency and the frames that keep a link going.
+const URGENT_BYTES: usize = 2 * EMERGENCY_RESERVE;
+/// What an emergency may need of it: no other frame may take the last of these bytes.
+const EMERGENCY_RESERVE: usize = EMERGENCY_BYTES + 64;
+
+pub(super) struct Sender<S: Storage> {
+    cut: Cut,
+    urgent: heapless::Vec<u8, URGENT_BYTES>,
+    urgent_sealed: usize,
+    lanes: [Option<Lane<S>>; 3],
+    /// The lane whose frames were sealed last and are not all written, or whose message is not complete.
+    current: Option<usize>,
+    /// The network did not take all that it was offered, and something of it still waits.
+    congested: bool,
+}
+
+/// The framed messages of one class: written up to `start`, sealed up to `sealed`, filled up to `end`.
+struct Lane<S: Storage> {
+    buffer: Buffer<S>,
+    start: usize,
+    sealed: usize,
+    end: usize,
+    /// The last sealed frame ended a message.
+    at_boundary: bool,
+    /// `sealed` and `at_boundary` before the last step of sealing.
+    before: (usize, bool),
+}
+
+/// Whether a step of writing went through, or the network took no more.
+#[derive(PartialEq, Eq)]
+enum Progress {
+    Through,
+    Blocked,
+}
+
+impl<S: Storage> Sender<S> {
+    pub(super) fn new(overhead: usize) -> Self {
+        Self {
+            cut: Cut { chunk: MINIMUM_CHUNK_BYTES, overhead },
+            urgent: heapless::Vec::new(),
+            urgent_sealed: 0,
+            lanes: [const { None }; 3],
+            current: None,
+            congested: false,
+        }
+    }
+
+    pub(super) fn set_chunk(&mut self, chunk: usize) {
+        self.cut.chunk = chunk;
+    }
+
+    pub(super) fn is_empty(&self) -> bool {
+        self.urgent.is_empty() && self.lanes.iter().all(Option::is_none)
+    }
+
+    pub(super) fn queued(&self) -> usize {
+        self.lanes.iter().flatten().map(Lane::waiting).fold(self.urgent.len(), usize::saturating_add)
+    }
+
+    pub(super) fn accept(
+        &mut self,
+        buffers: &mut impl Buffers<S>,
+        priority: Priority,
+        total: usize,
+        write: impl FnOnce(&mut ChunkWriter<'_>),
+    ) -> Result<(), Error> {
+        let Some(index) = lane_index(priority) else { return self.accept_emergency(total, write) };
+        let slot = self.lanes.get_mut(index).ok_or(Error::Full(Limit::SendQueue))?;
+        let lane = match slot {
+            Some(lane) => lane,
+            None => slot.insert(Lane::new(buffers.take().ok_or(Error::Full(Limit::Buffers))?)),
+        };
+        let result = lane.append(self.cut, priority, total, write);
+        if lane.waiting() == 0
+            && let Some(lane) = slot.take()
+        {
+            buffers.give(lane.buffer);
+        }
+        result
+    }
+
+    fn accept_emergency(&mut self, total: usize, write: impl FnOnce(&mut ChunkWriter<'_>)) -> Result<(), Error> {
+        if total > EMERGENCY_BYTES {
+            return Err(Error::TooLarge { limit: EMERGENCY_BYTES as u32 });
+        }
+        let start = self.urgent.len();
+        let end = start.saturating_add(self.cut.framed_length(total));
+        self.urgent.resize(end, 0).map_err(|_| Error::Full(Limit::SendQueue))?;
+        let place = self.urgent.get_mut(start..end).unwrap_or(&mut []);
+        let mut writer =
+            ChunkWriter::new(place, self.cut, Priority::Emergency, total).ok_or(Error::Full(Limit::SendQueue))?;
+        write(&mut writer);
+        Ok(())
+    }
+
+    pub(super) fn accept_frame(&mut self, frame: &Frame<'_>) -> bool {
+        let mut scratch = [0; EMERGENCY_RESERVE];
+        let length = frame::encode(frame, self.cut.overhead, &mut scratch);
+        let end = self.urgent.len().saturating_add(length);
+        if length == 0 || end > URGENT_BYTES.saturating_sub(EMERGENCY_RESERVE) {
+            return false;
+        }
+        self.urgent.extend_from_slice(scratch.get(..length).unwrap_or(&[])).is_ok()
+    }
+
+    /// Writes what the network takes now; returns how many bytes that were.
+    pub(super) fn flush<C: Secure>(
+        &mut self,
+        id: LinkId,
+        cipher: &mut C,
+        mailman: &mut impl Mailman,
+        buffers: &mut impl Buffers<S>,
+    ) -> Result<u64, CloseReason> {
+        let mut written = 0;
+        while self.write_sealed::<C>(id, mailman, &mut written)? == Progress::Through {
+            self.give_drained(buffers);
+            if !self.seal_next(cipher)? {
+                self.congested = false;
+                return Ok(written);
+            }
+        }
+        self.congested = true;
+        Ok(written)
+    }
+
+    /// Writes what is sealed: the rest of the current lane's frames, then sealed urgent ones.
+    fn write_sealed<C: Secure>(
+        &mut self,
+        id: LinkId,
+        mailman: &mut impl Mailman,
+        written: &mut u64,
+    ) -> Result<Progress, CloseReason> {
+        if let Some(Some(lane)) = self.current.and_then(|index| self.lanes.get_mut(index)) {
+            let progress = lane.write(id, mailman, written)?;
+            if progress == Progress::Blocked {
+                if C::OVERHEAD == 0 {
+                    lane.unseal();
+                }
+                return Ok(progress);
+            }
+        }
+        while self.urgent_sealed > 0 {
+            let piece = self.urgent.get(..self.urgent_sealed).unwrap_or(&[]);
+            let count = mailman.write(id, &[piece])?;
+            if count == 0 {
+                return Ok(Progress::Blocked);
+            }
+            self.drop_urgent(count);
+            *written = written.saturating_add(count as u64);
+        }
+        Ok(Progress::Through)
+    }
+
+    fn drop_urgent(&mut self, count: usize) {
+        let end = self.urgent.len();
+        bytes::move_down(&mut self.urgent, count..end);
+        self.urgent.truncate(end.saturating_sub(count));
+        self.urgent_sealed = self.urgent_sealed.saturating_sub(count);
+    }
+
+    /// Seals what is to be written next: urgent frames before all others. `false` when nothing waits.
+    fn seal_next<C: Secure>(&mut self, cipher: &mut C) -> Result<bool, CloseReason> {
+        while self.urgent_sealed < self.urgent.len() {
+            let rest = self.urgent.get_mut(self.urgent_sealed..).unwrap_or(&mut []);
+            let length = seal_first(cipher, rest)?;
+            self.urgent_sealed = self.urgent_sealed.saturating_add(length);
+        }
+        if self.urgent_sealed > 0 {
+            return Ok(true);
+        }
+        self.current = self.next_lane();
+        let Some(Some(lane)) = self.current.and_then(|index| self.lanes.get_mut(index)) else { return Ok(false) };
+        let enough = match C::OVERHEAD {
+            0 => usize::MAX,
+            _ if self.congested => 1,
+            _ => self.cut.chunk,
+        };
+        lane.seal(cipher, enough)?;
+        Ok(true)
+    }
+
+    /// The lane whose message is not complete, or else the highest one.
+    fn next_lane(&self) -> Option<usize> {
+        let unfinished = self.current.filter(|&index| match self.lanes.get(index) {
+            Some(Some(lane)) => !lane.at_boundary,
+            _ => false,
+        });
+        unfinished.or_else(|| self.lanes.iter().position(Option::is_some))
+    }
+
+    fn give_drained(&mut self, buffers: &mut impl Buffers<S>) {
+        for slot in &mut self.lanes {
+            if slot.as_ref().is_some_and(|lane| lane.waiting() == 0)
+                && let Some(lane) = slot.take()
+            {
+                buffers.give(lane.buffer);
+            }
+        }
+    }
+
+    pub(super) fn release(&mut self, buffers: &mut impl Buffers<S>) {
+        for lane in self.lanes.iter_mut().filter_map(Option::take) {
+            buffers.give(lane.buffer);
+        }
+        self.urgent.clear();
+        self.urgent_sealed = 0;
+    }
+}
+
+impl<S: Storage> Lane<S> {
+    fn new(buffer: Buffer<S>) -> Self {
+        Self { buffer, start: 0, sealed: 0, end: 0, at_boundary: true, before: (0, true) }
+    }
+
+    /// Bytes that are not written.
+    fn waiting(&self) -> usize {
+        self.end.saturating_sub(self.start)
+    }
+
+    fn append(
+        &mut self,
+        cut: Cut,
+        priority: Priority,
+        total: usize,
+        write: impl FnOnce(&mut ChunkWriter<'_>),
+    ) -> Result<(), Error> {
+        let framed = cut.framed_length(total);
+        let size = self.buffer.len();
+        if framed > size {
+            let limit = size.saturating_sub(framed.saturating_sub(total));
+            return Err(Error::TooLarge { limit: u32::try_from(limit).unwrap_or(u32::MAX) });
+        }
+        if framed > size.saturating_sub(self.waiting()) {
+            return Err(Error::Full(Limit::SendQueue));
+        }
+        if framed > size.saturating_sub(self.end) {
+            self.close_gap();
+        }
+        let end = self.end.saturating_add(framed);
+        let place = self.buffer.get_mut(self.end..end).unwrap_or(&mut []);
+        let mut writer = ChunkWriter::new(place, cut, priority, total).ok_or(Error::Full(Limit::SendQueue))?;
+        write(&mut writer);
+        self.end = end;
+        Ok(())
+    }
+
+    fn close_gap(&mut self) {
+        bytes::move_down(&mut self.buffer, self.start..self.end);
+        self.end = self.end.saturating_sub(self.start);
+        self.sealed = self.sealed.saturating_sub(self.start);
+        self.before = (self.sealed, self.at_boundary);
+        self.start = 0;
+    }
+
+    /// Seals frames until `enough` bytes of them are ready.
+    fn seal<C: Secure>(&mut self, cipher: &mut C, enough: usize) -> Result<(), CloseReason> {
+        self.before = (self.sealed, self.at_boundary);
+        while self.sealed < self.end && self.sealed.saturating_sub(self.start) < enough {
+            let rest = self.buffer.get_mut(self.sealed..self.end).unwrap_or(&mut []);
+            self.at_boundary = frame::ends_message(rest);
+            let length = seal_first(cipher, rest)?;
+            self.sealed = self.sealed.saturating_add(length);
+        }
+        Ok(())
+    }
+
+    /// Takes back the seal of the frames that the network has not begun to take. For plain mode only.
+    fn unseal(&mut self) {
+        let (mut sealed, mut at_boundary) = self.before;
+        while sealed < self.start {
+            let rest = self.buffer.get(sealed..self.end).unwrap_or(&[]);
+            let Some(length) = frame::first_frame_length(rest) else { return };
+            at_boundary = frame::ends_message(rest);
+            sealed = sealed.saturating_add(length);
+        }
+        self.sealed = sealed;
+        self.at_boundary = at_boundary;
+        self.before = (sealed, at_boundary);
+    }
+
+    fn write(&mut self, id: LinkId, mailman: &mut impl Mailman, written: &mut u64) -> Result<Progress, CloseReason> {
+        while self.start < self.sealed {
+            let piece = self.buffer.get(self.start..self.sealed).unwrap_or(&[]);
+            let count = mailman.write(id, &[piece])?;
+            if count == 0 {
+                return Ok(Progress::Blocked);
+            }
+            self.start = self.start.saturating_add(count);
+            *written = written.saturating_add(count as u64);
+        }
+        Ok(Progress::Through)
+    }
+}
+
+/// Seals the first of `frames`; returns its length.
+fn seal_first<C: Secure>(cipher: &mut C, frames: &mut [u8]) -> Result<usize, CloseReason> {
+    let length = frame::first_frame_length(frames).ok_or(CloseReason::Protocol)?;
+    let body = frames.get_mut(frame::HEADER_BYTES..length).ok_or(CloseReason::Protocol)?;
+    cipher.seal(body)?;
+    Ok(length)
+}
+
+const fn lane_index(priority: Priority) -> Option<usize> {
+    match priority {
+        Priority::Emergency => None,
+        Priority::High => Some(0),
+        Priority::Normal => Some(1),
+        Priority::Low => Some(2),
+    }
+}
+
+#[cfg(test)]
+mod tests;

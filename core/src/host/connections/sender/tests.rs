@@ -1,0 +1,217 @@
+#![allow(clippy::unwrap_used, clippy::indexing_slicing, clippy::arithmetic_side_effects)]
+
+use std::vec;
+use std::vec::Vec;
+
+use proptest::prelude::*;
+
+use super::super::harness::{Item, Numbered, Wire, link, pattern, pool, read};
+use super::super::{Link, LinkCounter};
+use crate::config::{EMERGENCY_BYTES, Priority};
+use crate::error::{Error, Limit};
+use crate::host::frame::Frame;
+use crate::host::secure::{Plain, Secure};
+use crate::storage::{Boxed, Pool};
+
+fn send<C: Secure>(
+    link: &mut Link<Boxed, C>,
+    wire: &mut Wire,
+    pool: &mut Pool<Boxed>,
+    priority: Priority,
+    message: &[u8],
+) -> Result<(), Error> {
+    link.send_message(wire, pool, priority, message.len(), false, |writer| writer.put(message))
+}
+
+fn drain<C: Secure>(link: &mut Link<Boxed, C>, wire: &mut Wire, pool: &mut Pool<Boxed>) {
+    wire.budget = usize::MAX;
+    link.flush(wire, pool).unwrap();
+    assert!(!link.wants_to_write());
+}
+
+fn priorities(items: &[Item]) -> Vec<Priority> {
+    items.iter().filter_map(|item| if let Item::Message(priority, _) = item { Some(*priority) } else { None }).collect()
+}
+
+#[test]
+fn a_link_that_keeps_up_keeps_nothing() {
+    let (mut link, mut wire, mut pool) = (link(Plain), Wire::open(), pool(1, 9000));
+    let bytes = pattern(1, 5000);
+    send(&mut link, &mut wire, &mut pool, Priority::Normal, &bytes).unwrap();
+    assert_eq!((pool.free(), link.queued(), link.wants_to_write()), (1, 0, false));
+    assert_eq!(read(Plain, &wire.bytes), [Item::Message(Priority::Normal, bytes)]);
+}
+
+#[test]
+fn what_waits_goes_out_by_class() {
+    let (mut link, mut wire, mut pool) = (link(Plain), Wire::default(), pool(3, 9000));
+    for priority in [Priority::Low, Priority::Normal, Priority::High, Priority::Normal] {
+        send(&mut link, &mut wire, &mut pool, priority, b"x").unwrap();
+    }
+    assert_eq!(pool.free(), 0);
+    drain(&mut link, &mut wire, &mut pool);
+    let order = [Priority::High, Priority::Normal, Priority::Normal, Priority::Low];
+    assert_eq!(priorities(&read(Plain, &wire.bytes)), order);
+    assert_eq!(pool.free(), 3);
+}
+
+#[test]
+fn a_message_that_was_begun_is_finished_before_a_higher_one() {
+    let (mut link, mut wire, mut pool) = (link(Plain), Wire { budget: 10, ..Wire::default() }, pool(2, 9000));
+    send(&mut link, &mut wire, &mut pool, Priority::Low, &pattern(1, 3000)).unwrap();
+    send(&mut link, &mut wire, &mut pool, Priority::High, b"high").unwrap();
+    drain(&mut link, &mut wire, &mut pool);
+    assert_eq!(priorities(&read(Plain, &wire.bytes)), [Priority::Low, Priority::High]);
+}
+
+#[test]
+fn a_message_that_was_not_begun_is_overtaken() {
+    let (mut link, mut wire, mut pool) = (link(Plain), Wire { budget: 1030, ..Wire::default() }, pool(2, 9000));
+    send(&mut link, &mut wire, &mut pool, Priority::Low, &pattern(1, 1000)).unwrap();
+    send(&mut link, &mut wire, &mut pool, Priority::Low, &pattern(2, 1000)).unwrap();
+    send(&mut link, &mut wire, &mut pool, Priority::Low, &pattern(3, 1000)).unwrap();
+    send(&mut link, &mut wire, &mut pool, Priority::High, b"high").unwrap();
+    drain(&mut link, &mut wire, &mut pool);
+    let order = [Priority::Low, Priority::Low, Priority::High, Priority::Low];
+    assert_eq!(priorities(&read(Plain, &wire.bytes)), order);
+}
+
+/// Bytes between an emergency's acceptance and its last byte on a network that takes `step` bytes at a time.
+fn emergency_behind_a_long_message<C: Secure + Default>(step: usize) -> usize {
+    let (mut link, mut wire, mut pool) = (link(C::default()), Wire { budget: step, ..Wire::default() }, pool(1, 9000));
+    let (long, stop) = (pattern(1, 8000), pattern(2, EMERGENCY_BYTES));
+    send(&mut link, &mut wire, &mut pool, Priority::Normal, &long).unwrap();
+    let before = wire.bytes.len();
+    send(&mut link, &mut wire, &mut pool, Priority::Emergency, &stop).unwrap();
+    while link.wants_to_write() {
+        wire.budget += step;
+        link.flush(&mut wire, &mut pool).unwrap();
+    }
+    let items = read(C::default(), &wire.bytes);
+    assert_eq!(items, [Item::Message(Priority::Emergency, stop), Item::Message(Priority::Normal, long)]);
+    assert_eq!(pool.free(), 1);
+    let ends = (before..=wire.bytes.len()).find(|&end| !read(C::default(), &wire.bytes[..end]).is_empty());
+    ends.unwrap() - before
+}
+
+#[test]
+fn an_emergency_waits_for_one_chunk_at_most() {
+    for step in [1, 7, 100, 1026, 3000] {
+        let bytes = emergency_behind_a_long_message::<Plain>(step);
+        assert!(bytes <= 1026 + EMERGENCY_BYTES + 8, "{bytes} bytes at {step} a step");
+        let bytes = emergency_behind_a_long_message::<Numbered>(step);
+        assert!(bytes <= 1026 + EMERGENCY_BYTES + 8 + 16, "{bytes} sealed bytes at {step} a step");
+    }
+}
+
+#[test]
+fn a_message_is_refused_whole_when_it_does_not_fit_now() {
+    let (mut link, mut wire, mut pool) = (link(Plain), Wire::default(), pool(1, 2000));
+    send(&mut link, &mut wire, &mut pool, Priority::Normal, &pattern(1, 900)).unwrap();
+    let queued = link.queued();
+    let refused = send(&mut link, &mut wire, &mut pool, Priority::Normal, &pattern(2, 1100));
+    assert_eq!(refused, Err(Error::Full(Limit::SendQueue)));
+    assert_eq!(send(&mut link, &mut wire, &mut pool, Priority::High, b"x"), Err(Error::Full(Limit::Buffers)));
+    assert_eq!((link.queued(), link.counters.value(LinkCounter::SendRefused)), (queued, 2));
+    drain(&mut link, &mut wire, &mut pool);
+    assert_eq!(read(Plain, &wire.bytes), [Item::Message(Priority::Normal, pattern(1, 900))]);
+    send(&mut link, &mut wire, &mut pool, Priority::Normal, &pattern(2, 1100)).unwrap();
+}
+
+#[test]
+fn a_message_that_no_buffer_holds_is_too_large() {
+    let (mut link, mut wire, mut pool) = (link(Plain), Wire::open(), pool(1, 2000));
+    let refused = send(&mut link, &mut wire, &mut pool, Priority::Normal, &pattern(1, 2000));
+    assert_eq!(refused, Err(Error::TooLarge { limit: 2000 - 12 }));
+    assert_eq!((pool.free(), wire.bytes.len()), (1, 0));
+}
+
+#[test]
+fn an_emergency_has_room_when_everything_else_is_full() {
+    let (mut link, mut wire, mut pool) = (link(Numbered::default()), Wire::default(), pool(0, 0));
+    while link.send_frame(&Frame::Session(&[7; 20])) {}
+    assert_eq!(link.counters.value(LinkCounter::FramesWithheld), 1);
+    let stop = pattern(2, EMERGENCY_BYTES);
+    send(&mut link, &mut wire, &mut pool, Priority::Emergency, &stop).unwrap();
+    drain(&mut link, &mut wire, &mut pool);
+    assert_eq!(read(Numbered::default(), &wire.bytes).last(), Some(&Item::Message(Priority::Emergency, stop)));
+    let longer = pattern(2, EMERGENCY_BYTES + 1);
+    let refused = send(&mut link, &mut wire, &mut pool, Priority::Emergency, &longer);
+    assert_eq!(refused, Err(Error::TooLarge { limit: EMERGENCY_BYTES as u32 }));
+}
+
+#[test]
+fn a_link_that_ends_gives_every_buffer_back() {
+    let (mut link, mut wire, mut pool) = (link(Plain), Wire { budget: 100, ..Wire::default() }, pool(3, 9000));
+    for priority in [Priority::Low, Priority::Normal, Priority::High] {
+        send(&mut link, &mut wire, &mut pool, priority, &pattern(1, 500)).unwrap();
+    }
+    assert_eq!(pool.free(), 0);
+    link.release(&mut pool);
+    assert_eq!((pool.free(), link.queued()), (3, 0));
+}
+
+/// Sends, flushes and stalls in any order; returns what was accepted.
+fn exercise<C: Secure>(link: &mut Link<Boxed, C>, wire: &mut Wire, steps: &[(u8, usize)]) -> Vec<Item> {
+    let (mut pool, mut accepted) = (pool(2, 4000), Vec::new());
+    for &(kind, amount) in steps {
+        match Priority::from_wire(kind) {
+            Some(priority) => {
+                let limit = if priority == Priority::Emergency { EMERGENCY_BYTES } else { 3000 };
+                let message = pattern(accepted.len() as u8, amount.min(limit));
+                if send(link, wire, &mut pool, priority, &message).is_ok() {
+                    accepted.push(Item::Message(priority, message));
+                }
+            }
+            None => {
+                wire.budget = amount;
+                link.flush(wire, &mut pool).unwrap();
+            }
+        }
+    }
+    drain(link, wire, &mut pool);
+    assert_eq!(pool.free(), 2);
+    accepted
+}
+
+fn of_class(items: &[Item], class: Priority) -> Vec<&Item> {
+    items.iter().filter(|item| matches!(item, Item::Message(priority, _) if *priority == class)).collect()
+}
+
+proptest! {
+    #[test]
+    fn what_is_accepted_arrives_whole_and_in_order_of_its_class(
+        steps in prop::collection::vec((0..7_u8, prop_oneof![0..300_usize, 0..3000_usize]), 1..40),
+    ) {
+        let (mut plain, mut wire) = (link(Plain), Wire::default());
+        let accepted = exercise(&mut plain, &mut wire, &steps);
+        let arrived = read(Plain, &wire.bytes);
+        let (mut sealed, mut wire) = (link(Numbered::default()), Wire::default());
+        let accepted_sealed = exercise(&mut sealed, &mut wire, &steps);
+        let arrived_sealed = read(Numbered::default(), &wire.bytes);
+        for class in Priority::ALL {
+            prop_assert_eq!(of_class(&arrived, class), of_class(&accepted, class));
+            prop_assert_eq!(of_class(&arrived_sealed, class), of_class(&accepted_sealed, class));
+        }
+        prop_assert_eq!(arrived.len(), accepted.len());
+        prop_assert_eq!(arrived_sealed.len(), accepted_sealed.len());
+    }
+}
+
+#[test]
+fn framing_is_the_same_however_little_the_network_takes() {
+    let bytes = pattern(1, 5000);
+    let streams: Vec<Vec<u8>> = [1, 3, 1026, usize::MAX]
+        .into_iter()
+        .map(|step| {
+            let (mut link, mut wire, mut pool) = (link(Plain), Wire { budget: step, bytes: vec![] }, pool(1, 9000));
+            send(&mut link, &mut wire, &mut pool, Priority::Normal, &bytes).unwrap();
+            while link.wants_to_write() {
+                wire.budget = step;
+                link.flush(&mut wire, &mut pool).unwrap();
+            }
+            wire.bytes
+        })
+        .collect();
+    assert!(streams.iter().all(|stream| *stream == streams[0]));
+}
