@@ -41,6 +41,7 @@ mod pipe;
 mod plan;
 mod queue;
 mod storage;
+mod world;
 
 pub use event::{HostId, NetEvent, StreamId};
 pub use faults::{Fault, FaultCounts};
@@ -48,3 +49,6 @@ pub use network::{Broken, Direction, Network};
 pub use path::{Chance, Path};
 pub use plan::{Action, Crash, FaultPlan};
 pub use storage::Boxed;
+pub use world::{
+    BoxedParameters, Call, NewUnit, Outcome, Peer, Service, UnitEvent, UnitHandle, World, boxed_parameters, seeds,
+};

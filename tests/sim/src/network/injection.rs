@@ -202,13 +202,23 @@ impl Network {
     /// Ends the host's process, or cuts its power; [`NetEvent::Crashed`] follows. Until [`Self::restart`] it neither
     /// sends nor hears. Without effect on a host that is down.
     pub fn crash(&mut self, host: HostId, crash: Crash) {
-        if !self.host(host).running {
-            return;
+        if self.host(host).running {
+            self.counts.count(match crash {
+                Crash::PowerCut => Fault::PowerCut,
+                Crash::Process => Fault::ProcessKilled,
+            });
+            self.take_down(host, crash);
         }
-        self.counts.count(match crash {
-            Crash::PowerCut => Fault::PowerCut,
-            Crash::Process => Fault::ProcessKilled,
-        });
+    }
+
+    /// Ends the host's process as if it had wanted that: no fault. [`NetEvent::Crashed`] follows all the same.
+    pub fn stop(&mut self, host: HostId) {
+        if self.host(host).running {
+            self.take_down(host, Crash::Process);
+        }
+    }
+
+    fn take_down(&mut self, host: HostId, crash: Crash) {
         let crashed = self.host_mut(host);
         crashed.life += 1;
         crashed.running = false;

@@ -1,0 +1,324 @@
+//! Whole fleets: units with the real core inside, on the virtual network.
+
+use std::cell::RefCell;
+use std::collections::VecDeque;
+use std::future::Future;
+use std::pin::pin;
+use std::rc::Rc;
+use std::task::{Context, Poll, Waker};
+
+use cara_core::distribution::parameters::ParametersView;
+use cara_core::error::Error;
+use cara_core::time::{Duration, Instant};
+
+use crate::event::HostId;
+use crate::faults::FaultCounts;
+use crate::network::Network;
+use crate::plan::{Crash, FaultPlan};
+use crate::queue::Queue;
+
+mod builder;
+mod events;
+mod handle;
+mod links;
+mod mail;
+mod replies;
+mod service;
+mod state;
+mod tasks;
+
+pub use builder::NewUnit;
+pub use events::UnitEvent;
+pub use handle::{Peer, UnitHandle};
+pub use service::{BoxedParameters, Call, Outcome, Service, boxed_parameters};
+
+use replies::Promise;
+use state::UnitState;
+use tasks::{Job, Owner, Tasks};
+
+/// The environment variable that replays one seed.
+const SEED: &str = "CARA_SIM_SEED";
+/// Longest virtual time that a blocking call of the world may take.
+const PATIENCE: Duration = Duration::from_secs(3_600);
+/// Steps at one instant after which a run counts as stuck.
+const STEPS_AT_ONCE: u32 = 1_000_000;
+
+/// A fleet and its network, on one virtual clock.
+///
+/// Units are added with [`Self::m_unit`] and [`Self::s_unit`] and are used through [`UnitHandle`]s. Nothing moves but
+/// in the methods that say so: [`Self::run_for`], [`Self::run_until`], [`Self::block_on`], [`Self::block_request`].
+///
+/// If a test panics, its seed is printed; with `CARA_SIM_SEED=…` in the environment every world takes that seed.
+pub struct World {
+    shared: Rc<Shared>,
+    seed: u64,
+    stuck: (Instant, u32),
+}
+
+/// What the world, its units' handles and their futures share.
+struct Shared {
+    inner: RefCell<Inner>,
+    tasks: RefCell<Tasks>,
+}
+
+struct Inner {
+    network: Network,
+    /// By host.
+    units: Vec<UnitState>,
+    sleepers: Queue<Promise<()>>,
+    /// Hooks that run before anything else.
+    urgent: VecDeque<Box<dyn FnOnce()>>,
+    spawned: Vec<(Owner, Job)>,
+}
+
+/// The seeds of a run over many: 0 to `count`, or the one in `CARA_SIM_SEED`.
+///
+/// ```
+/// for seed in cara_sim::seeds(3) {
+///     let world = cara_sim::World::new(seed);
+///     assert_eq!(world.seed(), seed);
+/// }
+/// ```
+pub fn seeds(count: u64) -> impl Iterator<Item = u64> {
+    match seed_of_environment() {
+        Some(seed) => seed..seed.saturating_add(1),
+        None => 0..count,
+    }
+}
+
+fn seed_of_environment() -> Option<u64> {
+    std::env::var(SEED).ok()?.parse().ok()
+}
+
+impl World {
+    /// An empty world; `CARA_SIM_SEED` in the environment overrides `seed`.
+    pub fn new(seed: u64) -> Self {
+        let seed = seed_of_environment().unwrap_or(seed);
+        let inner = Inner {
+            network: Network::new(seed),
+            units: Vec::new(),
+            sleepers: Queue::new(),
+            urgent: VecDeque::new(),
+            spawned: Vec::new(),
+        };
+        let shared = Shared { inner: RefCell::new(inner), tasks: RefCell::default() };
+        Self { shared: Rc::new(shared), seed, stuck: (Instant::START, 0) }
+    }
+
+    /// The seed that replays this run.
+    pub fn seed(&self) -> u64 {
+        self.seed
+    }
+
+    /// A manager to be started: connects to many nodes.
+    pub fn m_unit(&self, name: &str, id: u32) -> NewUnit {
+        NewUnit::m_unit(&self.shared, name, id)
+    }
+
+    /// A vehicle to be started: connects to the one manager that it [`NewUnit::joins`].
+    pub fn s_unit(&self, name: &str, id: u32) -> NewUnit {
+        NewUnit::s_unit(&self.shared, name, id)
+    }
+
+    /// The virtual time.
+    pub fn now(&self) -> Instant {
+        self.network(|network| network.now())
+    }
+
+    /// Lends the network, to change paths and to inject faults.
+    pub fn network<R>(&self, act: impl FnOnce(&mut Network) -> R) -> R {
+        act(&mut self.shared.inner.borrow_mut().network)
+    }
+
+    /// What was injected so far.
+    pub fn counts(&self) -> FaultCounts {
+        self.network(|network| *network.counts())
+    }
+
+    /// Equal for equal runs.
+    pub fn trace_hash(&self) -> u64 {
+        self.network(|network| network.trace_hash())
+    }
+
+    // --- running
+
+    /// Runs for a span of virtual time.
+    pub fn run_for(&mut self, span: Duration) {
+        let limit = self.now() + span;
+        while self.step(limit) {}
+    }
+
+    /// Runs until `condition` holds, at most for `limit` of virtual time; whether it held.
+    #[must_use = "false when the limit came first"]
+    pub fn run_until(&mut self, condition: impl Fn(&Self) -> bool, limit: Duration) -> bool {
+        let limit = self.now() + limit;
+        loop {
+            if condition(self) {
+                return true;
+            }
+            if !self.step(limit) {
+                return condition(self);
+            }
+        }
+    }
+
+    /// Runs until a future is over, and returns what it gives.
+    ///
+    /// # Panics
+    /// After an hour of virtual time, which nothing in a fleet may take.
+    pub fn block_on<T>(&mut self, future: impl Future<Output = T>) -> T {
+        let mut future = pin!(future);
+        let mut context = Context::from_waker(Waker::noop());
+        let limit = self.now() + PATIENCE;
+        loop {
+            if let Poll::Ready(value) = future.as_mut().poll(&mut context) {
+                return value;
+            }
+            assert!(self.step(limit), "nothing ends what the world waits for");
+        }
+    }
+
+    /// The paper's synchronous request: runs the world until the reply updates `parameters`, or the call fails.
+    pub fn block_request(
+        &mut self,
+        unit: &UnitHandle,
+        peer: impl Into<Peer>,
+        function: &str,
+        parameters: &mut ParametersView,
+    ) -> Result<(), Error> {
+        self.block_on(unit.block_request(peer, function, parameters))
+    }
+
+    /// One hook, one turn of a future or one event; `false` with the clock at `limit` when nothing is due before.
+    fn step(&mut self, limit: Instant) -> bool {
+        let now = self.now();
+        self.stuck = if self.stuck.0 == now { (now, self.stuck.1 + 1) } else { (now, 0) };
+        assert!(self.stuck.1 < STEPS_AT_ONCE, "the world is stuck at {now:?}");
+        self.shared.step(limit)
+    }
+
+    // --- faults
+
+    /// Schedules a plan's faults for all units.
+    pub fn inject(&self, plan: FaultPlan) {
+        self.network(|network| {
+            let hosts: Vec<HostId> = network.hosts().collect();
+            plan.schedule(network, &hosts);
+        });
+    }
+
+    /// Ends a unit's life now; its state is lost.
+    pub fn crash(&mut self, unit: &UnitHandle, crash: Crash) {
+        self.network(|network| network.crash(unit.host(), crash));
+        self.settle();
+    }
+
+    /// Begins another life of a crashed unit: a new epoch, and its program from the start.
+    pub fn restart(&mut self, unit: &UnitHandle) {
+        self.network(|network| network.restart(unit.host()));
+        self.settle();
+    }
+
+    /// Does what is due at this very instant.
+    fn settle(&mut self) {
+        let now = self.now();
+        while self.step(now) {}
+    }
+}
+
+impl Drop for World {
+    fn drop(&mut self) {
+        if std::thread::panicking() {
+            eprintln!("replay this run with {SEED}={}", self.seed);
+        }
+        // Futures may use the world while they are dropped, so they go first.
+        let jobs = self.shared.tasks.borrow_mut().take_all();
+        drop(jobs);
+        let urgent = std::mem::take(&mut self.shared.inner.borrow_mut().urgent);
+        drop(urgent);
+    }
+}
+
+impl Shared {
+    /// Lends the inner world; what it has spawned is taken over after that.
+    fn with<R>(&self, act: impl FnOnce(&mut Inner) -> R) -> R {
+        let mut inner = self.inner.borrow_mut();
+        let result = act(&mut inner);
+        let mut tasks = self.tasks.borrow_mut();
+        for (owner, job) in inner.spawned.drain(..) {
+            tasks.spawn(Some(owner), job);
+        }
+        result
+    }
+
+    /// Runs programs and hooks that are due.
+    fn run_urgent(&self) {
+        loop {
+            let hook = self.inner.borrow_mut().urgent.pop_front();
+            let Some(hook) = hook else { return };
+            hook();
+        }
+    }
+
+    fn step(self: &Rc<Self>, limit: Instant) -> bool {
+        let hook = self.inner.borrow_mut().urgent.pop_front();
+        if let Some(hook) = hook {
+            hook();
+            return true;
+        }
+        let turn = self.tasks.borrow_mut().next_turn();
+        if let Some(turn) = turn {
+            self.take_turn(turn);
+            return true;
+        }
+        self.advance(limit)
+    }
+
+    fn take_turn(&self, turn: tasks::Turn) {
+        let Some(turn) = turn.poll() else { return };
+        let lives = turn.owner().is_none_or(|owner| self.inner.borrow().is_alive(owner));
+        if lives {
+            self.tasks.borrow_mut().keep(turn);
+        }
+    }
+
+    fn advance(self: &Rc<Self>, limit: Instant) -> bool {
+        let sleeper = self.inner.borrow().sleepers.next_time();
+        let until = sleeper.map_or(limit, |at| at.min(limit));
+        let event = self.inner.borrow_mut().network.next_event_until(until);
+        if let Some(event) = event {
+            let ended = self.with(|inner| inner.dispatch(self, event));
+            if let Some(host) = ended {
+                let jobs = self.tasks.borrow_mut().take_jobs_of(host);
+                drop(jobs);
+            }
+            return true;
+        }
+        self.wake_sleepers()
+    }
+
+    fn wake_sleepers(&self) -> bool {
+        let mut inner = self.inner.borrow_mut();
+        let now = inner.network.now();
+        let mut woken = false;
+        while inner.sleepers.next_time().is_some_and(|at| at <= now) {
+            if let Some((_, promise)) = inner.sleepers.pop() {
+                promise.keep(());
+                woken = true;
+            }
+        }
+        woken
+    }
+}
+
+impl Inner {
+    fn is_alive(&self, owner: Owner) -> bool {
+        self.units.get(owner.host.index()).is_some_and(|unit| unit.life == owner.life && unit.machine.is_some())
+    }
+
+    fn sleep_until(&mut self, at: Instant) -> Promise<()> {
+        let promise = Promise::new();
+        self.sleepers.push(at, promise.clone());
+        promise
+    }
+}

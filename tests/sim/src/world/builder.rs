@@ -1,0 +1,129 @@
+//! How a unit is described before it starts.
+
+use std::net::SocketAddr;
+use std::rc::{Rc, Weak};
+
+use cara_core::config::Constraints;
+use cara_core::distribution::connection_handler::Target;
+use cara_core::distribution::hello::Manager;
+use cara_core::distribution::identity::{Fleet, Identity};
+
+use super::Shared;
+use super::handle::UnitHandle;
+use super::state::{Program, Settings, UnitState};
+
+/// A unit that has not started; made by [`World::m_unit`](super::World::m_unit) and
+/// [`World::s_unit`](super::World::s_unit).
+#[must_use = "it does nothing until it is started"]
+pub struct NewUnit {
+    shared: Weak<Shared>,
+    settings: Settings,
+    segment: u8,
+}
+
+impl NewUnit {
+    pub(super) fn m_unit(shared: &Rc<Shared>, name: &str, id: u32) -> Self {
+        let identity = Identity::m_unit(name, id).expect("a name has 1 to 32 bytes");
+        Self::new(shared, identity, Constraints::M_UNIT)
+    }
+
+    pub(super) fn s_unit(shared: &Rc<Shared>, name: &str, id: u32) -> Self {
+        let identity = Identity::s_unit(name, id).expect("a name has 1 to 32 bytes");
+        Self::new(shared, identity, Constraints::S_UNIT)
+    }
+
+    fn new(shared: &Rc<Shared>, identity: Identity, constraints: Constraints) -> Self {
+        let settings = Settings {
+            identity,
+            fleet: Fleet(0),
+            target: Target::Everybody,
+            constraints,
+            message_buffers: 16,
+            links: usize::from(constraints.maximum_nodes) + 4,
+            functions: 64,
+            boot_seed: None,
+            program: None,
+        };
+        Self { shared: Rc::downgrade(shared), settings, segment: 0 }
+    }
+
+    /// The manager that an s_unit belongs to.
+    pub fn joins(mut self, name: &str, id: u32) -> Self {
+        self.settings.target = Target::Manager(manager(name, id));
+        self
+    }
+
+    /// The manager that an s_unit belongs to, dialled at a fixed address without broadcasts.
+    pub fn joins_at(mut self, name: &str, id: u32, address: SocketAddr) -> Self {
+        self.settings.target = Target::Fixed(manager(name, id), address);
+        self
+    }
+
+    /// Units of different fleets do not meet; 0 if not set.
+    pub fn fleet(mut self, fleet: u32) -> Self {
+        self.settings.fleet = Fleet(fleet);
+        self
+    }
+
+    /// Its limits, instead of the defaults of its role.
+    pub fn constraints(mut self, constraints: Constraints) -> Self {
+        self.settings.constraints = constraints;
+        self.settings.links = usize::from(constraints.maximum_nodes) + 4;
+        self
+    }
+
+    /// How many message buffers its links share (16).
+    pub fn message_buffers(mut self, count: usize) -> Self {
+        self.settings.message_buffers = count;
+        self
+    }
+
+    /// Functions that its own list and its view of each peer's list hold (64).
+    pub fn functions(mut self, count: usize) -> Self {
+        self.settings.functions = count;
+        self
+    }
+
+    /// Every life of it draws the same random numbers, as a board without a source of noise does.
+    pub fn boot_seed(mut self, seed: u64) -> Self {
+        self.settings.boot_seed = Some(seed);
+        self
+    }
+
+    /// The segment of the network that hears its broadcasts.
+    pub fn in_segment(mut self, segment: u8) -> Self {
+        self.segment = segment;
+        self
+    }
+
+    /// What it does when it starts, in this life and after each restart: add services, publish, spawn futures. State
+    /// that is made in here is lost in a crash, as in a real program.
+    pub fn program(mut self, program: impl Fn(&UnitHandle) + 'static) -> Self {
+        let program: Program = Rc::new(program);
+        self.settings.program = Some(program);
+        self
+    }
+
+    /// Starts it.
+    ///
+    /// # Panics
+    /// For an s_unit that joins nobody.
+    pub fn start(self) -> UnitHandle {
+        let shared = self.shared.upgrade().expect("the world outlives its units");
+        let manages = self.settings.identity.role() == cara_core::distribution::identity::Role::MUnit;
+        assert!(manages || self.settings.target != Target::Everybody, "an s_unit joins a manager");
+        let host = shared.with(|inner| {
+            let host = inner.network.add_host_in(self.segment);
+            inner.units.push(UnitState::new(host, self.settings));
+            inner.start(&shared, host);
+            host
+        });
+        let handle = UnitHandle::new(Rc::downgrade(&shared), host);
+        shared.run_urgent();
+        handle
+    }
+}
+
+fn manager(name: &str, id: u32) -> Manager {
+    Manager::new(name, id).expect("a manager's name has 1 to 32 bytes")
+}

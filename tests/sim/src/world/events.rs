@@ -1,0 +1,66 @@
+//! What a unit sees happen, kept with its time in the unit's log.
+
+use cara_core::distribution::identity::Identity;
+use cara_core::error::{CloseReason, Error};
+use cara_core::services::requests::CallId;
+
+/// Something that happened to a unit.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum UnitEvent {
+    /// The unit began a life.
+    Started,
+    /// The life ended, in an orderly way or not.
+    Stopped,
+    /// A peer is connected.
+    Joined {
+        /// The peer.
+        peer: Identity,
+    },
+    /// A connected peer is no longer.
+    Left {
+        /// The peer.
+        peer: Identity,
+        /// Why.
+        reason: CloseReason,
+    },
+    /// A link ended before its peer had joined.
+    LinkEnded {
+        /// Why.
+        reason: CloseReason,
+    },
+    /// A peer's list of functions has been read anew.
+    ListChanged {
+        /// The peer.
+        peer: Identity,
+    },
+    /// A service of the unit was called.
+    Called {
+        /// The function.
+        function: String,
+        /// Who asked.
+        caller: Identity,
+    },
+    /// An asynchronous request failed at the peer.
+    Failed {
+        /// The peer.
+        peer: Identity,
+        /// The request, as returned by it.
+        id: CallId,
+        /// Why.
+        error: Error,
+    },
+    /// A lease on a service of the unit ended without being renewed; its safe hook has run.
+    LeaseExpired {
+        /// The function.
+        function: String,
+    },
+    /// A lease that the unit held on a function of a peer ended there.
+    LeaseEnded {
+        /// The peer.
+        peer: Identity,
+        /// The function; empty where the peer has withdrawn it meanwhile.
+        function: String,
+        /// It was not renewed in time, rather than finished.
+        expired: bool,
+    },
+}

@@ -1,0 +1,382 @@
+//! The links of one unit: sessions over streams, read and written as a port does.
+
+use std::collections::BTreeMap;
+
+use cara_core::distribution::function_list::{FunctionList, Slot};
+use cara_core::distribution::identity::Identity;
+use cara_core::distribution::parameters::ParametersView;
+use cara_core::error::{CloseReason, Error};
+use cara_core::host::secure::Plain;
+use cara_core::services::requests::CallId;
+use cara_core::services::unit::{Event, Session};
+use cara_core::services::{Context, Ticket};
+use cara_core::time::Instant;
+
+use super::mail::{LazyPool, SimMailman};
+use super::replies::{Promise, Waiting};
+use super::service::{BoxedParameters, Handler};
+use crate::event::{HostId, StreamId};
+use crate::network::Network;
+use crate::storage::Boxed;
+
+pub(super) type SimSession = Session<Boxed, Plain>;
+pub(super) type SimContext<'c, 'n> = Context<'c, Boxed, SimMailman<'n>, LazyPool, Handler>;
+
+/// What a link led to that concerns more than the link.
+pub(super) enum Happened {
+    Hello,
+    Call(cara_core::services::unit::Call, BoxedParameters),
+    Failed(CallId, Error),
+    ListChanged,
+    LeaseExpired(Slot),
+    LeaseEnded(Slot, bool),
+    Answered,
+    Closed(CloseReason),
+}
+
+/// One link.
+pub(super) struct Link {
+    pub(super) session: SimSession,
+    pub(super) stream: StreamId,
+    /// Serves only to find what is armed in the network.
+    timer: Instant,
+    /// Read from the stream and not consumed yet.
+    unread: Vec<u8>,
+    waiting: BTreeMap<CallId, Waiting>,
+    acknowledgements: Vec<(u32, Promise<bool>)>,
+    unanswered: Vec<(Ticket, Result<BoxedParameters, Error>)>,
+    /// The session wants no bytes now: the unit is out of buffers or has not decided about the peer.
+    paused: bool,
+    /// The peer, from joining to leaving.
+    pub(super) peer: Option<Identity>,
+}
+
+/// All links of a unit, and what they share.
+pub(super) struct Links {
+    host: HostId,
+    links: Vec<Option<Link>>,
+    streams: Vec<Option<StreamId>>,
+    by_stream: BTreeMap<StreamId, u16>,
+    pub(super) functions: FunctionList<Boxed, Handler>,
+    pub(super) buffers: LazyPool,
+    arguments: BoxedParameters,
+}
+
+/// Bytes read ahead of what the session has consumed; what exceeds it stays in the stream.
+const READ_AHEAD: usize = 16 * 1024;
+
+impl Links {
+    pub(super) fn new(
+        host: HostId,
+        count: usize,
+        functions: FunctionList<Boxed, Handler>,
+        buffers: LazyPool,
+        arguments: BoxedParameters,
+    ) -> Self {
+        let links = (0..count).map(|_| None).collect();
+        Self { host, links, streams: vec![None; count], by_stream: BTreeMap::new(), functions, buffers, arguments }
+    }
+
+    /// An index that no link has.
+    pub(super) fn free_index(&self) -> Option<u16> {
+        self.links.iter().position(Option::is_none).map(|index| index as u16)
+    }
+
+    pub(super) fn insert(&mut self, index: u16, session: SimSession, stream: StreamId) {
+        self.streams[usize::from(index)] = Some(stream);
+        self.by_stream.insert(stream, index);
+        self.links[usize::from(index)] = Some(Link {
+            session,
+            stream,
+            timer: Instant::FAR_FUTURE,
+            unread: Vec::new(),
+            waiting: BTreeMap::new(),
+            acknowledgements: Vec::new(),
+            unanswered: Vec::new(),
+            paused: false,
+            peer: None,
+        });
+    }
+
+    pub(super) fn of_stream(&self, stream: StreamId) -> Option<u16> {
+        self.by_stream.get(&stream).copied()
+    }
+
+    pub(super) fn link(&self, index: u16) -> Option<&Link> {
+        self.links.get(usize::from(index))?.as_ref()
+    }
+
+    pub(super) fn link_mut(&mut self, index: u16) -> Option<&mut Link> {
+        self.links.get_mut(usize::from(index))?.as_mut()
+    }
+
+    /// Links with their indices.
+    pub(super) fn iter(&self) -> impl Iterator<Item = (u16, &Link)> {
+        self.links.iter().enumerate().filter_map(|(index, link)| Some((index as u16, link.as_ref()?)))
+    }
+
+    /// Lends the session of a link with its context.
+    pub(super) fn with<R>(
+        &mut self,
+        network: &mut Network,
+        index: u16,
+        act: impl FnOnce(&mut SimSession, &mut SimContext<'_, '_>) -> R,
+    ) -> Option<R> {
+        let link = self.links.get_mut(usize::from(index))?.as_mut()?;
+        let now = network.now();
+        let mut mailman = SimMailman { network, host: self.host, streams: &self.streams };
+        let mut context =
+            Context { now, mailman: &mut mailman, buffers: &mut self.buffers, functions: &self.functions };
+        Some(act(&mut link.session, &mut context))
+    }
+
+    /// Requests; with `wants_reply` the promise is kept when the call ends.
+    pub(super) fn request(
+        &mut self,
+        network: &mut Network,
+        index: u16,
+        function: &str,
+        parameters: &ParametersView,
+        options: &cara_core::services::unit::RequestOptions,
+        waiting: Option<Waiting>,
+    ) -> Result<CallId, Error> {
+        let wants_reply = waiting.is_some();
+        let requested =
+            self.with(network, index, |session, cx| session.request(cx, function, parameters, options, wants_reply));
+        let id = requested.unwrap_or(Err(Error::NotConnected))?;
+        if let (Some(link), Some(waiting)) = (self.link_mut(index), waiting) {
+            link.waiting.insert(id, waiting);
+        }
+        Ok(id)
+    }
+
+    /// The caller no longer waits.
+    pub(super) fn cancel(&mut self, index: u16, id: CallId) {
+        if let Some(link) = self.link_mut(index)
+            && link.waiting.remove(&id).is_some()
+        {
+            link.session.cancel(id);
+        }
+    }
+
+    /// The promise is kept with `true` when the peer has read the list up to `serial`, with `false` if the link ends.
+    pub(super) fn await_acknowledgement(&mut self, index: u16, serial: u32) -> Promise<bool> {
+        let promise = Promise::new();
+        match self.link_mut(index) {
+            Some(link) => link.acknowledgements.push((serial, promise.clone())),
+            None => promise.keep(false),
+        }
+        promise
+    }
+
+    /// Answers a call, now or when there is room.
+    pub(super) fn answer(
+        &mut self,
+        network: &mut Network,
+        index: u16,
+        ticket: Ticket,
+        outcome: Result<BoxedParameters, Error>,
+    ) {
+        let lent = outcome.as_deref().map_err(|error| *error);
+        let answered = self.with(network, index, |session, cx| session.answer(cx, ticket, lent));
+        if let (Some(Err(_)), Some(link)) = (answered, self.link_mut(index)) {
+            link.unanswered.push((ticket, outcome));
+        }
+    }
+
+    /// Does all that a link can do now: reads, begins calls, polls. Returns what concerns the unit, in order.
+    pub(super) fn work(&mut self, network: &mut Network, index: u16) -> Vec<Happened> {
+        let mut happened = Vec::new();
+        self.answer_again(network, index);
+        self.receive(network, index, &mut happened);
+        self.begin_calls(network, index, &mut happened);
+        self.poll(network, index, &mut happened);
+        self.arm(network, index);
+        happened
+    }
+
+    fn answer_again(&mut self, network: &mut Network, index: u16) {
+        let Some(link) = self.link_mut(index) else { return };
+        for (ticket, outcome) in std::mem::take(&mut link.unanswered) {
+            self.answer(network, index, ticket, outcome);
+        }
+    }
+
+    fn receive(&mut self, network: &mut Network, index: u16, happened: &mut Vec<Happened>) {
+        loop {
+            let Some(link) = self.links.get_mut(usize::from(index)).and_then(Option::as_mut) else { return };
+            let before = link.unread.len();
+            if before < READ_AHEAD {
+                network.read(link.stream, |bytes| {
+                    let taken = bytes.len().min(READ_AHEAD - before);
+                    link.unread.extend_from_slice(&bytes[..taken]);
+                    taken
+                });
+            }
+            let more = link.unread.len() > before;
+            if !self.digest(network, index, happened) && !more {
+                return;
+            }
+        }
+    }
+
+    /// Offers what was read until nothing more comes of it; `false` if nothing came at all.
+    fn digest(&mut self, network: &mut Network, index: u16, happened: &mut Vec<Happened>) -> bool {
+        let Some(link) = self.links.get_mut(usize::from(index)).and_then(Option::as_mut) else { return false };
+        let now = network.now();
+        let mut mailman = SimMailman { network, host: self.host, streams: &self.streams };
+        let mut cx = Context { now, mailman: &mut mailman, buffers: &mut self.buffers, functions: &self.functions };
+        let Link { session, unread, waiting, acknowledgements, paused, .. } = link;
+        let (mut start, mut any) = (0, false);
+        loop {
+            let receipt = session.receive(&mut cx, &mut unread[start..], Some(&mut self.arguments));
+            let quiet = receipt.consumed == 0 && receipt.event.is_none();
+            start += receipt.consumed;
+            *paused = receipt.paused;
+            any |= !quiet;
+            note(receipt.event, waiting, acknowledgements, &self.functions, &self.arguments, happened);
+            if quiet || *paused {
+                break;
+            }
+        }
+        unread.drain(..start);
+        any
+    }
+
+    fn begin_calls(&mut self, network: &mut Network, index: u16, happened: &mut Vec<Happened>) {
+        let mut arguments = std::mem::replace(&mut self.arguments, super::service::boxed_parameters(0));
+        while let Some(Some(call)) = self.with(network, index, |session, cx| session.next_call(cx, &mut arguments)) {
+            happened.push(Happened::Call(call, own(&self.functions, call.slot, &arguments)));
+        }
+        self.arguments = arguments;
+    }
+
+    fn poll(&mut self, network: &mut Network, index: u16, happened: &mut Vec<Happened>) {
+        while let Some(Some(event)) = self.with(network, index, |session, cx| session.poll(cx)) {
+            let Some(link) = self.links.get_mut(usize::from(index)).and_then(Option::as_mut) else { return };
+            let Link { waiting, acknowledgements, .. } = link;
+            note(Some(event), waiting, acknowledgements, &self.functions, &self.arguments, happened);
+        }
+    }
+
+    /// Links that paused for want of buffers and could go on.
+    pub(super) fn resumable(&self) -> Vec<u16> {
+        if self.buffers.free() == 0 {
+            return Vec::new();
+        }
+        self.iter().filter(|(_, link)| link.paused && link.session.is_live()).map(|(index, _)| index).collect()
+    }
+
+    /// Passes a session datagram to its link.
+    pub(super) fn datagram(
+        &mut self,
+        network: &mut Network,
+        index: u16,
+        from: std::net::SocketAddr,
+        nonce: u64,
+        body: &[u8],
+    ) -> Vec<Happened> {
+        let mut happened = Vec::new();
+        if let Some(event) = self.with(network, index, |session, cx| session.datagram(cx, from, nonce, body)) {
+            let Some(link) = self.links.get_mut(usize::from(index)).and_then(Option::as_mut) else { return happened };
+            let Link { waiting, acknowledgements, .. } = link;
+            note(event, waiting, acknowledgements, &self.functions, &self.arguments, &mut happened);
+        }
+        happened.extend(self.work(network, index));
+        happened
+    }
+
+    /// Sets the network's timer for what the session has to do next.
+    pub(super) fn arm(&mut self, network: &mut Network, index: u16) {
+        let host = self.host;
+        let now = network.now();
+        let Some(link) = self.link_mut(index) else { return };
+        let due = link.session.deadline();
+        if due < link.timer || link.timer <= now {
+            link.timer = due;
+            if due != Instant::FAR_FUTURE {
+                network.set_timer(host, due, timer_token(index));
+            }
+        }
+    }
+
+    /// The link has ended: whoever still waits for something of it is told, and the stream is closed.
+    pub(super) fn remove(&mut self, network: &mut Network, index: u16) -> Option<Link> {
+        let link = self.links.get_mut(usize::from(index))?.take()?;
+        self.streams[usize::from(index)] = None;
+        self.by_stream.remove(&link.stream);
+        network.close(link.stream);
+        Some(link)
+    }
+
+    /// The unit is no more: the callers of all links are told.
+    pub(super) fn abandon(&mut self, error: Error) {
+        for link in self.links.iter_mut().filter_map(Option::take) {
+            link.abandon(error);
+        }
+    }
+}
+
+impl Link {
+    /// Tells whoever still waits for something of this link.
+    pub(super) fn abandon(self, error: Error) {
+        for waiting in self.waiting.into_values() {
+            waiting.promise.keep(Err(error));
+        }
+        for (_, promise) in self.acknowledgements {
+            promise.keep(false);
+        }
+    }
+}
+
+/// The timer of a link; 0 is the node's.
+pub(super) fn timer_token(index: u16) -> u64 {
+    u64::from(index) + 1
+}
+
+/// The arguments of a call in parameters of their own.
+fn own(functions: &FunctionList<Boxed, Handler>, slot: Slot, arguments: &ParametersView) -> BoxedParameters {
+    let bytes = functions.function(slot).map_or(0, |function| function.signature.parameters_bytes());
+    let mut parameters = super::service::boxed_parameters(bytes as usize);
+    // Room for the signature is room for its arguments; if not, the service finds them missing and says so.
+    let copied = parameters.copy_from(arguments);
+    debug_assert_eq!(copied, Ok(()));
+    parameters
+}
+
+fn note(
+    event: Option<Event<'_>>,
+    waiting: &mut BTreeMap<CallId, Waiting>,
+    acknowledgements: &mut Vec<(u32, Promise<bool>)>,
+    functions: &FunctionList<Boxed, Handler>,
+    arguments: &ParametersView,
+    happened: &mut Vec<Happened>,
+) {
+    happened.push(match event {
+        None => return,
+        Some(Event::Reply(id, result)) => {
+            if let Some(waiting) = waiting.remove(&id) {
+                waiting.finish(result);
+            }
+            return;
+        }
+        Some(Event::Acknowledged { serial, .. }) => {
+            acknowledgements.retain(|(wanted, promise)| {
+                let reached = wanted.wrapping_sub(serial) as i32 <= 0;
+                if reached {
+                    promise.keep(true);
+                }
+                !reached
+            });
+            return;
+        }
+        Some(Event::Call(call)) => Happened::Call(call, own(functions, call.slot, arguments)),
+        Some(Event::Hello) => Happened::Hello,
+        Some(Event::Failed(id, error)) => Happened::Failed(id, error),
+        Some(Event::ListChanged) => Happened::ListChanged,
+        Some(Event::LeaseExpired(slot)) => Happened::LeaseExpired(slot),
+        Some(Event::LeaseEnded { slot, expired }) => Happened::LeaseEnded(slot, expired),
+        Some(Event::Answered) => Happened::Answered,
+        Some(Event::Closed(reason)) => Happened::Closed(reason),
+    });
+}

@@ -1,0 +1,194 @@
+//! Services of simulated units: a closure that runs at one virtual instant, or a future that lives through many.
+
+use std::cell::RefCell;
+use std::future::Future;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::pin::Pin;
+use std::rc::Rc;
+
+use cara_core::config::Priority;
+use cara_core::distribution::function::Attributes;
+use cara_core::distribution::identity::Identity;
+use cara_core::distribution::parameters::{Parameters, ParametersView};
+use cara_core::error::ServiceError;
+use cara_core::services::lease::Lease;
+use cara_core::time::{Duration, Instant};
+
+use super::UnitHandle;
+
+/// Parameters of any size on the heap.
+pub type BoxedParameters = Box<ParametersView>;
+
+/// How a service's run ends: the parameters with its results, or an error for the caller.
+pub type Outcome = Result<BoxedParameters, ServiceError>;
+
+type Running = Pin<Box<dyn Future<Output = Outcome>>>;
+
+enum Body {
+    AtOnce(Box<RefCell<dyn FnMut(&Call, &mut ParametersView) -> Result<(), ServiceError>>>),
+    Future(Box<dyn Fn(Call, BoxedParameters) -> Running>),
+}
+
+/// What is known of the call that a service answers.
+#[derive(Clone)]
+pub struct Call {
+    /// The unit that serves, which can call any other, the caller among them.
+    pub unit: UnitHandle,
+    /// Who asks.
+    pub caller: Identity,
+    /// The function's name.
+    pub function: Rc<str>,
+    /// Its class.
+    pub priority: Priority,
+    /// Whether the caller waits.
+    pub wants_reply: bool,
+    /// After this nobody waits.
+    pub deadline: Instant,
+    pub(super) service: Rc<Service>,
+}
+
+impl Call {
+    /// Whether the lease of a leased service is live now; true for a service without one.
+    pub fn may_act(&self) -> bool {
+        self.service.lease.as_ref().is_none_or(|lease| lease.is_live(self.unit.now()))
+    }
+}
+
+/// A service with its attributes.
+///
+/// ```
+/// use cara_core::time::Duration;
+/// use cara_sim::Service;
+/// let slow = Service::new(|_, _| Ok(())).takes(Duration::from_millis(300));
+/// let walking = Service::future(|call, parameters| async move {
+///     while call.may_act() {
+///         call.unit.sleep(Duration::from_millis(10)).await;
+///     }
+///     Ok(parameters)
+/// });
+/// # drop((slow, walking));
+/// ```
+pub struct Service {
+    body: Body,
+    takes: Duration,
+    survives_panics: bool,
+    pub(super) attributes: Attributes,
+    pub(super) detached: bool,
+    lease: Option<Lease>,
+    pub(super) safe_hook: Option<Box<dyn Fn(&UnitHandle)>>,
+}
+
+impl Service {
+    /// A service in place: arguments come in the parameters, results go there.
+    pub fn new(body: impl FnMut(&Call, &mut ParametersView) -> Result<(), ServiceError> + 'static) -> Self {
+        Self::with(Body::AtOnce(Box::new(RefCell::new(body))))
+    }
+
+    /// A service in the paper's form: it takes parameters and returns them.
+    pub fn returning<const BYTES: usize>(
+        mut body: impl FnMut(Parameters<BYTES>) -> Parameters<BYTES> + 'static,
+    ) -> Self {
+        Self::new(move |_, parameters| {
+            let mut arguments = Parameters::sized();
+            arguments.copy_from(parameters).map_err(|_| ServiceError::BadResults)?;
+            parameters.copy_from(&body(arguments)).map_err(|_| ServiceError::BadResults)
+        })
+    }
+
+    /// A service that lives through virtual time: it may sleep and call others, while its unit goes on serving.
+    pub fn future<F>(body: impl Fn(Call, BoxedParameters) -> F + 'static) -> Self
+    where
+        F: Future<Output = Outcome> + 'static,
+    {
+        Self::with(Body::Future(Box::new(move |call, parameters| Box::pin(body(call, parameters)))))
+    }
+
+    fn with(body: Body) -> Self {
+        Self {
+            body,
+            takes: Duration::ZERO,
+            survives_panics: false,
+            attributes: Attributes::default(),
+            detached: false,
+            lease: None,
+            safe_hook: None,
+        }
+    }
+
+    /// It answers this much later; the unit goes on with everything else meanwhile.
+    pub fn takes(self, span: Duration) -> Self {
+        Self { takes: span, ..self }
+    }
+
+    /// The class that requests for it have.
+    pub fn priority(self, priority: Priority) -> Self {
+        Self { attributes: Attributes { priority, ..self.attributes }, ..self }
+    }
+
+    /// What it starts may go on only this long after the last renewal.
+    pub fn lease(self, length: Duration) -> Self {
+        let attributes = Attributes { lease: Some(length), ..self.attributes };
+        Self { attributes, lease: Some(Lease::new()), ..self }
+    }
+
+    /// Runs when the lease ends without having been renewed, before anything else the unit does.
+    pub fn on_lease_end(self, hook: impl Fn(&UnitHandle) + 'static) -> Self {
+        Self { safe_hook: Some(Box::new(hook)), ..self }
+    }
+
+    /// It may be called twice without harm.
+    pub fn idempotent(self) -> Self {
+        Self { attributes: Attributes { idempotent: true, ..self.attributes }, ..self }
+    }
+
+    /// The next call of the same peer and class begins while this one still runs.
+    pub fn detached(self) -> Self {
+        Self { detached: true, ..self }
+    }
+
+    /// A panic is answered to the caller as [`ServiceError::Panicked`], as on Linux. Otherwise it ends the test.
+    pub fn survives_panics(self) -> Self {
+        Self { survives_panics: true, ..self }
+    }
+
+    /// Whether its lease is live at `now`; `None` without one.
+    pub(super) fn lease_is_live(&self, now: Instant) -> Option<bool> {
+        self.lease.as_ref().map(|lease| lease.is_live(now))
+    }
+
+    pub(super) async fn run(self: Rc<Self>, call: Call, mut parameters: BoxedParameters) -> Outcome {
+        let unit = call.unit.clone();
+        let outcome = match &self.body {
+            Body::Future(start) => start(call, parameters).await,
+            Body::AtOnce(body) => {
+                let mut run = || (*body.borrow_mut())(&call, &mut parameters);
+                let result = if self.survives_panics { catch_unwind(AssertUnwindSafe(run)) } else { Ok(run()) };
+                result.unwrap_or(Err(ServiceError::Panicked)).map(|()| parameters)
+            }
+        };
+        if self.takes > Duration::ZERO {
+            unit.sleep(self.takes).await;
+        }
+        outcome
+    }
+}
+
+impl cara_core::services::lease::Service for Handler {
+    fn lease(&self) -> Option<&Lease> {
+        self.0.lease.as_ref()
+    }
+}
+
+/// What the core keeps of a service.
+pub(super) struct Handler(pub(super) Rc<Service>);
+
+/// Empty parameters with room for at least `bytes` bytes of names and values.
+pub fn boxed_parameters(bytes: usize) -> BoxedParameters {
+    match bytes {
+        0..=512 => Box::new(Parameters::<512>::sized()),
+        513..=2_048 => Box::new(Parameters::<2_048>::sized()),
+        2_049..=8_192 => Box::new(Parameters::<8_192>::sized()),
+        8_193..=40_960 => Box::new(Parameters::<40_960>::sized()),
+        _ => Box::new(Parameters::<163_840>::sized()),
+    }
+}

@@ -1,0 +1,87 @@
+//! A vehicle moves only while its manager wants it to.
+
+use super::*;
+use cara_core::services::unit::RequestOptions;
+use cara_sim::{Crash, Direction, UnitEvent};
+
+const LEASE: Duration = Duration::from_millis(500);
+
+/// A manager, and a vehicle whose `drive` goes on while its lease is live; with the counts of ticks and safe stops.
+fn driving(seed: u64) -> (World, UnitHandle, UnitHandle, Rc<RefCell<u32>>, Rc<RefCell<u32>>) {
+    let mut world = World::new(seed);
+    let manager = world.m_unit("manager", 1).start();
+    let agv = world.s_unit("agv", 7).joins("manager", 1).start();
+    let ((ticks, driven), (stops, stopped)) = (shared(0), shared(0));
+    let drive = Service::future(move |call, parameters| {
+        let ticks = Rc::clone(&ticks);
+        let moving = call.clone();
+        call.unit.spawn(async move {
+            while moving.may_act() {
+                *ticks.borrow_mut() += 1;
+                moving.unit.sleep(millis(10)).await;
+            }
+        });
+        async move { Ok(parameters) }
+    });
+    agv.add_function("drive()", drive.lease(LEASE).on_lease_end(move |_| *stops.borrow_mut() += 1)).unwrap();
+    agv.publish().unwrap();
+    assert!(world.run_until(|_| manager.knows("agv", "drive"), secs(10)));
+    world.block_request(&manager, "agv", "drive", &mut Parameters::new()).unwrap();
+    (world, manager, agv, driven, stopped)
+}
+
+#[test]
+fn it_drives_while_the_lease_is_renewed_and_stops_when_released() {
+    let (mut world, manager, agv, driven, stopped) = driving(1);
+    world.run_for(secs(5));
+    assert!(agv.lease_is_live("drive"));
+    assert!(*driven.borrow() > 490 && *stopped.borrow() == 0);
+    manager.release("agv", "drive").unwrap();
+    world.run_for(millis(20));
+    assert!(!agv.lease_is_live("drive"));
+    assert_eq!(*stopped.borrow(), 1);
+}
+
+#[test]
+fn it_stops_within_the_lease_when_the_manager_dies_or_the_link_is_cut() {
+    for cut in [false, true] {
+        let (mut world, manager, agv, driven, stopped) = driving(2);
+        world.run_for(secs(1));
+        let before = *driven.borrow();
+        if cut {
+            world.network(|network| network.partition(&[manager.host()], &[agv.host()], Direction::Both));
+        } else {
+            world.crash(&manager, Crash::PowerCut);
+        }
+        world.run_for(LEASE + millis(10));
+        assert_eq!(*stopped.borrow(), 1, "cut: {cut}");
+        assert!(*driven.borrow() - before <= 52, "{} ticks of 10 ms", *driven.borrow() - before);
+        let after = *driven.borrow();
+        world.run_for(secs(20));
+        assert_eq!((*driven.borrow(), *stopped.borrow()), (after, 1));
+        assert_eq!(agv.count(|event| matches!(event, UnitEvent::LeaseExpired { .. })), 1);
+    }
+}
+
+#[test]
+fn without_renewal_the_lease_ends_by_itself() {
+    let (mut world, manager, _agv, _, stopped) = driving(3);
+    manager.release("agv", "drive").unwrap();
+    world.run_for(millis(20));
+    let options = RequestOptions { renew_lease: false, ..RequestOptions::default() };
+    manager.request_with("agv", "drive", &Parameters::new(), options).unwrap();
+    world.run_for(LEASE - millis(50));
+    assert_eq!(*stopped.borrow(), 1, "the release");
+    world.run_for(millis(60));
+    assert_eq!(*stopped.borrow(), 2, "the expiry");
+}
+
+#[test]
+fn what_is_finished_ends_its_lease_without_the_safe_hook() {
+    let (mut world, manager, agv, _, stopped) = driving(4);
+    world.run_for(millis(100));
+    agv.end_lease("drive").unwrap();
+    world.run_for(secs(2));
+    assert_eq!(*stopped.borrow(), 0);
+    assert_eq!(manager.count(|event| matches!(event, UnitEvent::LeaseEnded { expired: false, .. })), 1);
+}
