@@ -1,0 +1,180 @@
+#!/usr/bin/env python3
+"""Reads the golden vectors with a decoder that was written from docs/wire.md, in a language that shares no code with the
+core.
+
+For each vector: its bytes decode to its value, the value encodes to its bytes, and every change of a single byte is
+accepted or refused, and read, exactly as the core does it. The examples in docs/wire.md must be vectors. Exits with 1
+and a line for each difference.
+"""
+
+import json
+import re
+import struct
+import sys
+import time
+import zlib
+from pathlib import Path
+
+import cara_wire as wire
+
+HERE = Path(__file__).resolve().parent
+PAYLOADS = {"hello": "hello", "session": "session_body"}
+DOCUMENT = HERE.parent.parent / "docs" / "wire.md"
+
+
+def decode(kind, context, data):
+    """The value of bytes, None where they are refused. Any other exception is a defect of the decoder."""
+    try:
+        if kind == "stream":
+            return stream(context, data)
+        if kind == "datagram":
+            return wire.decode_datagram(data, context["fleet"])
+        if kind == "block":
+            return wire.decode_block(data, variables(context))
+        return getattr(wire, "decode_" + kind)(data)
+    except wire.Malformed:
+        return None
+
+
+def encode(kind, context, value):
+    if kind == "datagram":
+        return wire.encode_datagram(value, context["fleet"])
+    if kind == "block":
+        return wire.encode_block(value, variables(context))
+    return getattr(wire, "encode_" + kind)(value)
+
+
+def variables(context):
+    if "variables" not in context:
+        context["variables"] = wire.decode_signature(bytes.fromhex(context["signature"]))[context["part"]]
+    return context["variables"]
+
+
+def stream(context, data):
+    link = wire.Link(context["chunk_limit"], context["message_limit"])
+    seen = []
+    try:
+        for incoming in link.receive(data):
+            seen.append(incoming)
+        if link.buffer:
+            seen.append({"incomplete": len(link.buffer)})
+    except wire.Oversize:
+        seen.append({"violation": "oversize"})
+    except wire.Malformed:
+        seen.append({"violation": "protocol"})
+    return seen
+
+
+def frames_of(data):
+    """The frames of a stream, each with its length in front."""
+    frames = []
+    while data:
+        end = 2 + struct.unpack_from("<H", data)[0]
+        frames.append(data[:end])
+        data = data[end:]
+    return frames
+
+
+def frames_again(context, seen):
+    """The frames that carry what was seen; emergencies may have stood between the chunks of others."""
+    frames = []
+    for incoming in seen:
+        if isinstance(incoming, str):
+            frames.append(wire.encode_frame(incoming))
+        elif "message" in incoming:
+            message = wire.encode_message(incoming["message"])
+            frames += wire.encode_chunks(incoming["priority"], message, context["chunk_limit"])
+        else:
+            (name, value), = incoming.items()
+            payload = bytes([value]) if isinstance(value, int) else getattr(wire, "encode_" + PAYLOADS[name])(value)
+            frames.append(wire.encode_frame(name, payload))
+    return frames
+
+
+def canonical(value):
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False).encode()
+
+
+def mutations(kind, context, data, bits_only):
+    """(runs of how many values each byte may take, checksum of the values that all of them lead to)."""
+    runs, checksum, count = [], 0, 0
+    mutated = bytearray(data)
+    for place, original in enumerate(data):
+        accepted = 0
+        values = [original ^ 1 << bit for bit in range(8)] if bits_only else range(256)
+        for byte in values:
+            mutated[place] = byte
+            value = decode(kind, context, bytes(mutated))
+            count += 1
+            if value is not None:
+                accepted += 1
+                checksum = zlib.crc32(canonical(value), checksum)
+        mutated[place] = original
+        if runs and runs[-1][0] == accepted:
+            runs[-1][1] += 1
+        else:
+            runs.append([accepted, 1])
+    return " ".join("%dx%d" % (accepted, length) for accepted, length in runs), checksum, count
+
+
+def differences_again(kind, context, value, data):
+    """What differs when a value is encoded again."""
+    if kind == "stream":
+        same = sorted(frames_again(context, value)) == sorted(frames_of(data))
+        return [] if same else ["is encoded as other frames"]
+    encoded = encode(kind, context, value)
+    return [] if encoded == data else ["is encoded as %s" % encoded.hex()]
+
+
+def check(vector):
+    """The differences of one vector, and how many mutations it had."""
+    kind, context, data = vector["kind"], dict(vector.get("context", {})), bytes.fromhex(vector["hex"])
+    value = decode(kind, context, data)
+    if canonical(value) != canonical(vector["value"]):
+        return ["decodes to %s instead of %s" % (value, vector["value"])], 0
+    wrong = []
+    if value is not None and not vector.get("lossy"):
+        wrong += differences_again(kind, context, value, data)
+    expected = vector["mutations"]
+    accepted, checksum, count = mutations(kind, context, data, expected["bits_only"])
+    if accepted != expected["accepted"]:
+        wrong.append("mutated: accepts %s instead of %s" % (accepted, expected["accepted"]))
+    elif checksum != expected["crc32"]:
+        wrong.append("mutated: some accepted bytes have other values")
+    return wrong, count
+
+
+def check_document(vectors):
+    """Every example of the document is a vector."""
+    wrong = []
+    blocks = re.findall(r"^```hex (\w+)\n(.*?)^```", DOCUMENT.read_text(encoding="utf-8"), re.M | re.S)
+    for name, text in blocks:
+        shown = "".join(text.split())
+        if shown != vectors.get(name, {}).get("hex"):
+            wrong.append("docs/wire.md: the example %s is not the vector" % name)
+    if not blocks:
+        wrong.append("docs/wire.md has no examples")
+    return wrong, len(blocks)
+
+
+def main():
+    begin = time.monotonic()
+    document = json.loads((HERE / "vectors.json").read_text(encoding="utf-8"))
+    wrong = [] if document["version"] == wire.VERSION else ["vectors.json is of version %d" % document["version"]]
+    vectors = {vector["name"]: vector for vector in document["vectors"]}
+    total = 0
+    for name, vector in vectors.items():
+        differences, count = check(vector)
+        wrong += ["%s %s" % (name, difference) for difference in differences]
+        total += count
+    differences, examples = check_document(vectors)
+    wrong += differences
+    for line in wrong:
+        print(line, file=sys.stderr)
+    seconds = time.monotonic() - begin
+    print("%d vectors, %d mutations, %d examples, %d differences, %.1f s" % (len(vectors), total, examples, len(wrong), seconds))
+    return 1 if wrong or not vectors else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,234 @@
+//! What bytes mean, as JSON: the core's decoders, and nothing beside them.
+
+use cara_core::config::Priority;
+use cara_core::distribution::block;
+use cara_core::distribution::datagram::{Announce, Datagram, DatagramError, WhoHas};
+use cara_core::distribution::function::{Attributes, Signature};
+use cara_core::distribution::hello::{Hello, HelloError, Manager};
+use cara_core::distribution::identity::{Fleet, Identity, Role};
+use cara_core::distribution::message::{Control, Message, SessionBody};
+use cara_core::distribution::parameters::{Parameters, Type, Value as Variable};
+use cara_core::error::{Error, ServiceError};
+use serde_json::{Value, json};
+
+use crate::stream;
+use crate::vector::{Context, Kind};
+
+/// The value of `bytes`; `None` where the core refuses them.
+pub(crate) fn decode(kind: Kind, context: &Context, bytes: &[u8]) -> Option<Value> {
+    match kind {
+        Kind::Hello => hello(bytes),
+        Kind::Message => message(bytes),
+        Kind::Signature => Signature::decode(bytes).ok().map(signature),
+        Kind::Attributes => Attributes::decode(bytes).ok().map(|attributes| self::attributes(&attributes)),
+        Kind::Block => block(context, bytes),
+        Kind::SessionBody => session_body(bytes),
+        Kind::Datagram => datagram(context.fleet.unwrap_or_default(), bytes),
+        Kind::Stream => Some(stream::decode(context, bytes)),
+    }
+}
+
+pub(crate) fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+pub(crate) const fn priority(priority: Priority) -> &'static str {
+    match priority {
+        Priority::Emergency => "emergency",
+        Priority::High => "high",
+        Priority::Normal => "normal",
+        Priority::Low => "low",
+    }
+}
+
+pub(crate) fn hello(bytes: &[u8]) -> Option<Value> {
+    match Hello::decode(bytes) {
+        Ok(hello) => Some(json!({
+            "fleet": hello.fleet.0,
+            "identity": identity(&hello.identity),
+            "wanted": manager(hello.wanted.as_ref()),
+            "epoch": hello.epoch.0,
+            "nonce": hello.nonce,
+            "term": hello.term,
+            "capabilities": hello.capabilities,
+            "message_size": hello.limits.message_size,
+            "chunk_size": hello.limits.chunk_size,
+            "calls": hello.limits.calls,
+            "minimum_interval": hello.limits.minimum_interval,
+            "link": hello.link,
+            "udp_port": hello.udp_port,
+            "stamp": hello.stamp,
+            "keep_alive": hello.keep_alive,
+        })),
+        Err(HelloError::Version(version)) => Some(json!({ "other_version": version })),
+        Err(HelloError::Magic | HelloError::Malformed) => None,
+    }
+}
+
+fn identity(identity: &Identity) -> Value {
+    let role = match identity.role() {
+        Role::MUnit => "m_unit",
+        Role::SUnit => "s_unit",
+    };
+    json!({ "id": identity.id(), "name": identity.name(), "role": role })
+}
+
+fn manager(manager: Option<&Manager>) -> Value {
+    manager.map_or(Value::Null, |manager| json!({ "name": manager.name.as_str(), "id": manager.id }))
+}
+
+pub(crate) fn message(bytes: &[u8]) -> Option<Value> {
+    Some(match Message::decode(bytes)? {
+        Message::Request(header, block) => json!({ "request": {
+            "id": header.id,
+            "slot": header.slot.0,
+            "generation": header.generation.0,
+            "wants_reply": header.wants_reply,
+            "remaining": header.remaining.as_micros(),
+            "stamp": header.stamp,
+            "since": header.since.as_micros(),
+            "block": hex(block),
+        }}),
+        Message::Reply(id, Ok(block)) => json!({ "reply": { "id": id, "block": hex(block) } }),
+        Message::Reply(id, Err(error)) => json!({ "reply": { "id": id, "error": self::error(error) } }),
+        Message::Failure(id, error) => json!({ "failure": { "id": id, "error": self::error(error) } }),
+        Message::Control(control) => self::control(&control),
+    })
+}
+
+/// The errors that have a code of their own; all others read as malformed.
+fn error(error: Error) -> Value {
+    match error {
+        Error::UnknownFunction => json!("unknown_function"),
+        Error::StaleFunction => json!("stale_function"),
+        Error::MissingArgument { index } => json!({ "missing_argument": { "index": index } }),
+        Error::WrongType { index } => json!({ "wrong_type": { "index": index } }),
+        Error::WrongSize { index, expected, found } => {
+            json!({ "wrong_size": { "index": index, "expected": expected, "found": found } })
+        }
+        Error::Expired => json!("expired"),
+        Error::Stale => json!("stale"),
+        Error::Busy => json!("busy"),
+        Error::NotAllowed => json!("not_allowed"),
+        Error::WouldDeadlock => json!("would_deadlock"),
+        Error::TooLarge { limit } => json!({ "too_large": { "limit": limit } }),
+        Error::TooSoon { wait } => json!({ "too_soon": { "wait": wait.as_micros() } }),
+        Error::ResultWouldNotFit { need, have } => {
+            json!({ "result_would_not_fit": { "need": need, "have": have } })
+        }
+        Error::Service(ServiceError::Failed(code)) => json!({ "service_failed": { "code": code } }),
+        Error::Service(ServiceError::Panicked) => json!("service_panicked"),
+        Error::Service(ServiceError::NotReady) => json!("service_not_ready"),
+        Error::Service(ServiceError::BadResults) => json!("service_bad_results"),
+        _ => json!("malformed"),
+    }
+}
+
+fn control(control: &Control<'_>) -> Value {
+    match *control {
+        Control::Publish { slot, generation, attributes, signature } => json!({ "publish": {
+            "slot": slot, "generation": generation, "attributes": hex(&attributes), "signature": hex(signature),
+        }}),
+        Control::Withdraw { slot } => json!({ "withdraw": { "slot": slot } }),
+        Control::ListEnd { serial } => json!({ "list_end": { "serial": serial } }),
+        Control::ListAck { serial, skipped } => json!({ "list_ack": { "serial": serial, "skipped": skipped } }),
+        Control::Limits { message_size, minimum_interval, calls } => json!({ "limits": {
+            "message_size": message_size, "minimum_interval": minimum_interval, "calls": calls,
+        }}),
+        Control::Release { slot } => json!({ "release": { "slot": slot } }),
+        Control::LeaseEnded { slot, expired } => json!({ "lease_ended": { "slot": slot, "expired": expired } }),
+    }
+}
+
+fn signature(signature: Signature<'_>) -> Value {
+    let variables = |specs: cara_core::distribution::function::VariableSpecs<'_>| -> Value {
+        specs.map(|spec| json!({ "name": spec.name, "type": spec.kind.word(), "size": spec.size })).collect()
+    };
+    json!({
+        "name": signature.name(),
+        "arguments": variables(signature.arguments()),
+        "results": variables(signature.results()),
+        "text": signature.to_string(),
+    })
+}
+
+fn attributes(attributes: &Attributes) -> Value {
+    json!({
+        "priority": priority(attributes.priority),
+        "idempotent": attributes.idempotent,
+        "lease": attributes.lease.map(|lease| lease.as_millis()),
+    })
+}
+
+fn block(context: &Context, bytes: &[u8]) -> Option<Value> {
+    let encoded = context.signature_bytes();
+    let signature = Signature::decode(&encoded).ok()?;
+    let specs = if context.part == Some("results") { signature.results() } else { signature.arguments() };
+    let mut parameters: Box<Parameters<32_768>> = Box::new(Parameters::sized());
+    block::read_arguments(specs, bytes, &mut *parameters).ok()?;
+    specs.map(|spec| parameters.value(spec.name).ok().map(|value| (spec.name.to_owned(), variable(value)))).collect()
+}
+
+/// Floats as the hexadecimal digits of their bits, highest first, so that nothing depends on how they are printed.
+fn variable(value: Variable<'_>) -> Value {
+    match value.kind() {
+        Type::Int => value.ints().collect(),
+        Type::Float => value.floats().map(|float| format!("{:016x}", float.to_bits())).collect(),
+        Type::String => value.text().into(),
+        Type::Bool => value.bools().collect(),
+        Type::Bytes => hex(value.raw()).into(),
+    }
+}
+
+pub(crate) fn session_body(bytes: &[u8]) -> Option<Value> {
+    Some(match SessionBody::decode(bytes)? {
+        SessionBody::KeepAlive { stamp } => json!({ "keep_alive": { "stamp": stamp } }),
+        SessionBody::Renew(renewal) => json!({ "renew": {
+            "slot": renewal.slot.0,
+            "generation": renewal.generation.0,
+            "stamp": renewal.stamp,
+            "since": renewal.since.as_micros(),
+        }}),
+        SessionBody::Message(byte, message) => json!({ "message": {
+            "priority": priority(Priority::from_wire(byte)?), "message": self::message(message)?,
+        }}),
+    })
+}
+
+pub(crate) fn datagram(fleet: u32, bytes: &[u8]) -> Option<Value> {
+    match Datagram::decode(bytes, Fleet(fleet)) {
+        Ok(Datagram::WhoHas(search)) => Some(json!({ "who_has": who_has(&search) })),
+        Ok(Datagram::Announce(answer)) => Some(json!({ "announce": announce(&answer) })),
+        Ok(Datagram::Session { link, nonce, body }) => {
+            Some(json!({ "session": { "link": link, "nonce": nonce, "body": session_body(body)? } }))
+        }
+        Err(DatagramError::Version(version)) => Some(json!({ "other_version": version })),
+        Err(DatagramError::Fleet(fleet)) => Some(json!({ "other_fleet": fleet.0 })),
+        Err(DatagramError::Magic | DatagramError::Malformed) => None,
+    }
+}
+
+fn who_has(search: &WhoHas) -> Value {
+    json!({
+        "identity": identity(&search.identity),
+        "epoch": search.epoch.0,
+        "sequence": search.sequence,
+        "nonce": search.nonce,
+        "wanted": manager(search.wanted.as_ref()),
+        "tcp_port": search.tcp_port,
+        "expected": search.expected,
+        "known": search.known.as_slice(),
+    })
+}
+
+fn announce(answer: &Announce) -> Value {
+    json!({
+        "identity": identity(&answer.identity),
+        "epoch": answer.epoch.0,
+        "sequence": answer.sequence,
+        "nonce": answer.nonce,
+        "tcp_port": answer.tcp_port,
+        "room": answer.room,
+        "expected": answer.expected,
+    })
+}
