@@ -13,6 +13,7 @@ use cara_core::services::unit::RequestOptions;
 use cara_core::time::{Duration, Instant};
 
 use super::link::{LinkCell, LinkState, Outcome, Waiter, Wake};
+use super::reader::Turn;
 use super::{Engine, OwnCall, READ_BYTES};
 use crate::sys::stream::{Received, Wait};
 
@@ -98,27 +99,27 @@ impl<T: Send + 'static> Engine<T> {
         parameters: &mut ParametersView,
         deadline: Instant,
     ) -> Result<(), Error> {
-        let mut leading = false;
+        let mut turn = None;
         loop {
             // The reply may have come through another thread before this one took the lead.
             if let Some(outcome) = state.take_outcome(id) {
-                self.leave(link, state, leading);
+                self.leave(link, state, turn);
                 return read_outcome(outcome, parameters);
             }
             let now = self.now();
             if now >= deadline {
                 state.session.cancel(id);
                 state.forget(id);
-                self.leave(link, state, leading);
+                self.leave(link, state, turn);
                 return Err(Error::TimedOut);
             }
-            leading = leading || state.reader.take_lead();
-            if leading {
+            turn = turn.or_else(|| state.reader.take_lead());
+            if turn.is_some() {
                 let mut own = OwnCall { id, parameters, result: None };
                 state = self.lead(link, state, &mut own, deadline);
                 if let Some(result) = own.result {
                     state.forget(id);
-                    self.leave(link, state, leading);
+                    self.leave(link, state, turn);
                     return result;
                 }
             } else {
@@ -168,9 +169,9 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     /// A caller is through: it passes the lead on if it has it, or was to have it.
-    fn leave(&self, link: &Arc<LinkCell>, mut guard: MutexGuard<'_, LinkState>, leading: bool) {
+    pub(super) fn leave(&self, link: &Arc<LinkCell>, mut guard: MutexGuard<'_, LinkState>, turn: Option<Turn>) {
         let LinkState { reader, waiters, .. } = &mut *guard;
-        reader.leave(leading, || pass_lead(waiters));
+        reader.leave(turn, || pass_lead(waiters));
         self.settle(link, guard);
     }
 
@@ -193,7 +194,7 @@ impl<T: Send + 'static> Engine<T> {
 }
 
 /// Wakes one thread that waits for a reply, so that it takes the lead. `false` when there is none.
-fn pass_lead(waiters: &mut [Waiter]) -> bool {
+pub(super) fn pass_lead(waiters: &mut [Waiter]) -> bool {
     let next = waiters.iter_mut().find(|w| w.outcome.is_none() && matches!(w.wake, Wake::Thread(_)));
     match next {
         Some(waiter) => {

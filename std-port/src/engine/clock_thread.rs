@@ -41,7 +41,7 @@ impl<T: Send + 'static> Engine<T> {
         let mut events = Events::new(8);
         let mut buffer = vec![0; DATAGRAM];
         while !self.is_stopping() {
-            let next = self.poll_links().min(self.poll_node());
+            let next = self.poll_links().min(self.poll_node()).min(self.relieve_stays());
             let wait = (next != Instant::FAR_FUTURE).then(|| next.since(self.clock.now()));
             if let Err(error) = epoll.wait(&mut events, wait) {
                 tracing::error!(%error, "waiting for time failed");

@@ -37,6 +37,8 @@ pub(crate) struct LinkState {
     pub(crate) session: Session<Boxed, Plain>,
     pub(crate) waiters: Vec<Waiter>,
     pub(crate) reader: Reader,
+    /// The last handler that ran for this link was quick.
+    pub(crate) quick: bool,
     /// What the epoll set watches the stream for.
     pub(crate) registration: Registration,
     /// The connection is still being opened.
@@ -97,7 +99,8 @@ impl LinkCell {
         let state = LinkState {
             session,
             waiters: Vec::new(),
-            reader: Reader::new(),
+            reader: Reader::default(),
+            quick: false,
             registration: Registration { readable: true, writable: connecting },
             connecting,
             leftover: Vec::new(),

@@ -12,8 +12,10 @@ pub(crate) mod peers;
 pub(crate) mod reader;
 mod serving;
 mod state_gate;
+mod staying;
 mod workers;
 
+#[cfg(feature = "async")]
 pub(crate) use calling::CallFuture;
 pub(crate) use membership::NodeCell;
 
@@ -75,6 +77,8 @@ pub(crate) struct Engine<T: 'static> {
     /// Pool threads that wait for something to do.
     idle: AtomicUsize,
     workers: AtomicUsize,
+    /// Links on which a thread of the pool stays.
+    stays: Mutex<Vec<LinkId>>,
     threads: Mutex<Vec<JoinHandle<()>>>,
     stopping: AtomicBool,
     subscribers: Mutex<Vec<SyncSender<UnitEvent>>>,
@@ -134,6 +138,7 @@ impl<T: Send + 'static> Engine<T> {
             ready: Mutex::new(VecDeque::new()),
             idle: AtomicUsize::new(0),
             workers: AtomicUsize::new(0),
+            stays: Mutex::new(Vec::new()),
             threads: Mutex::new(Vec::new()),
             stopping: AtomicBool::new(false),
             subscribers: Mutex::new(Vec::new()),

@@ -7,6 +7,7 @@ use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, ServiceError};
 use cara_core::services::unit::Call;
+use cara_core::time::Duration;
 
 use super::link::{LinkCell, LinkState};
 use super::{Engine, lock, read};
@@ -16,15 +17,32 @@ use crate::lease::LeaseWatch;
 /// How long an answer waits for room at a time.
 const PAUSE: std::time::Duration = std::time::Duration::from_millis(20);
 
+/// A handler that takes less than this is quick: the thread that ran it may stay on the link.
+const QUICK: Duration = Duration::from_micros(50);
+
 impl<T: Send + 'static> Engine<T> {
     /// Runs a call and those that waited behind it.
     pub(super) fn serve(&self, link: &Arc<LinkCell>, call: Call, arguments: &mut ParametersView) {
         let mut next = Some(call);
         while let Some(call) = next {
-            let result = self.run(link, &call, arguments);
-            let state = self.answer(link, link.lock(), &call, result, arguments);
+            let state = self.serve_one(link, &call, arguments);
             next = self.next_call(link, state, arguments);
         }
+    }
+
+    /// Runs one call and answers it.
+    pub(super) fn serve_one<'l>(
+        &self,
+        link: &'l Arc<LinkCell>,
+        call: &Call,
+        arguments: &mut ParametersView,
+    ) -> MutexGuard<'l, LinkState> {
+        let began = self.now();
+        let result = self.run(link, call, arguments);
+        let quick = self.now().since(began) < QUICK;
+        let mut state = link.lock();
+        state.quick = quick;
+        self.answer(link, state, call, result, arguments)
     }
 
     /// Takes the next call that may begin on a link; another thread is told if there is one more.

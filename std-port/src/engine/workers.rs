@@ -25,10 +25,10 @@ pub(super) const WAKER: u64 = u64::MAX;
 /// Reads of one link in a row, so that a busy one does not keep a thread from the others.
 const READS: usize = 8;
 
-struct Worker {
+pub(super) struct Worker {
     events: Events,
-    buffer: Vec<u8>,
-    arguments: Box<ParametersView>,
+    pub(super) buffer: Vec<u8>,
+    pub(super) arguments: Box<ParametersView>,
 }
 
 impl<T: Send + 'static> Engine<T> {
@@ -106,6 +106,7 @@ impl<T: Send + 'static> Engine<T> {
         }
         if let Some(call) = call {
             self.serve(&link, call, &mut worker.arguments);
+            self.stay(&link, worker);
         }
     }
 

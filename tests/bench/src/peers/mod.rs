@@ -1,8 +1,10 @@
 //! What is measured: each peer can echo a string between two processes in its own way.
 
+mod cara;
 mod floor;
 
 use std::any::Any;
+use std::sync::OnceLock;
 
 use anyhow::{Context, Result};
 
@@ -34,7 +36,12 @@ pub(crate) trait Caller: Send {
 type Make = fn() -> Box<dyn Peer>;
 
 /// All peers in the order in which they take turns. The first is the one that the others are compared with.
-const PEERS: [(&str, Make); 2] = [("floor", || Box::new(floor::Floor)), ("floor_again", || Box::new(floor::Floor))];
+const PEERS: [(&str, Make); 4] = [
+    ("floor", || Box::new(floor::Floor)),
+    ("floor_again", || Box::new(floor::Floor)),
+    ("cara", || Box::new(cara::Cara::LinkEach)),
+    ("cara_one_link", || Box::new(cara::Cara::OneLink(OnceLock::new()))),
+];
 
 /// The names of all peers.
 pub(crate) fn names() -> Vec<String> {
