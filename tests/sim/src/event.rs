@@ -160,7 +160,7 @@ impl NetEvent {
     }
 }
 
-/// A running hash (FNV-1a) over everything that happened: equal for equal runs.
+/// A running hash (FNV-1a) over everything that was sent and happened: equal for equal runs.
 #[derive(Clone, Debug)]
 pub(crate) struct Trace(u64);
 

@@ -188,7 +188,7 @@ impl Network {
         &self.counts
     }
 
-    /// A hash over all events so far and all notes: equal for equal runs.
+    /// A hash over all bytes sent, all events so far and all notes: equal for equal runs.
     pub fn trace_hash(&self) -> u64 {
         self.trace.hash()
     }

@@ -3,8 +3,10 @@
 use std::cell::RefCell;
 use std::collections::VecDeque;
 use std::future::Future;
+use std::panic::resume_unwind;
 use std::pin::pin;
 use std::rc::Rc;
+use std::sync::{Mutex, PoisonError};
 use std::task::{Context, Poll, Waker};
 
 use cara_core::distribution::parameters::ParametersView;
@@ -38,6 +40,8 @@ use tasks::{Job, Owner, Tasks};
 
 /// The environment variable that replays one seed.
 const SEED: &str = "CARA_SIM_SEED";
+/// The environment variable that says how many seeds a run takes.
+const SEEDS: &str = "CARA_SIM_SEEDS";
 /// Longest virtual time that a blocking call of the world may take.
 const PATIENCE: Duration = Duration::from_secs(3_600);
 /// Steps at one instant after which a run counts as stuck.
@@ -71,7 +75,8 @@ struct Inner {
     spawned: Vec<(Owner, Job)>,
 }
 
-/// The seeds of a run over many: 0 to `count`, or the one in `CARA_SIM_SEED`.
+/// The seeds of a run over many: 0 to `count`, or the one in `CARA_SIM_SEED`. `CARA_SIM_SEEDS` replaces the count, for
+/// quick and for long runs.
 ///
 /// ```
 /// for seed in cara_sim::seeds(3) {
@@ -80,20 +85,37 @@ struct Inner {
 /// }
 /// ```
 pub fn seeds(count: u64) -> impl Iterator<Item = u64> {
-    match seed_of_environment() {
+    match number_in_environment(SEED) {
         Some(seed) => seed..seed.saturating_add(1),
-        None => 0..count,
+        None => 0..number_in_environment(SEEDS).unwrap_or(count),
     }
 }
 
-fn seed_of_environment() -> Option<u64> {
-    std::env::var(SEED).ok()?.parse().ok()
+/// Runs `run` for each of the [`seeds`], on all processors, and returns the results in the order of the seeds.
+///
+/// # Panics
+/// When one of the runs does; its world has printed its seed.
+pub fn for_each_seed<R: Send>(count: u64, run: impl Fn(u64) -> R + Sync) -> Vec<R> {
+    let queue = Mutex::new(seeds(count));
+    let next = || queue.lock().unwrap_or_else(PoisonError::into_inner).next();
+    let work = || std::iter::from_fn(next).map(|seed| (seed, run(seed))).collect::<Vec<_>>();
+    let threads = std::thread::available_parallelism().map_or(1, usize::from);
+    let mut results: Vec<_> = std::thread::scope(|scope| {
+        let workers: Vec<_> = (0..threads).map(|_| scope.spawn(work)).collect();
+        workers.into_iter().flat_map(|worker| worker.join().unwrap_or_else(|panic| resume_unwind(panic))).collect()
+    });
+    results.sort_by_key(|(seed, _)| *seed);
+    results.into_iter().map(|(_, result)| result).collect()
+}
+
+fn number_in_environment(name: &str) -> Option<u64> {
+    std::env::var(name).ok()?.parse().ok()
 }
 
 impl World {
     /// An empty world; `CARA_SIM_SEED` in the environment overrides `seed`.
     pub fn new(seed: u64) -> Self {
-        let seed = seed_of_environment().unwrap_or(seed);
+        let seed = number_in_environment(SEED).unwrap_or(seed);
         let inner = Inner {
             network: Network::new(seed),
             units: Vec::new(),

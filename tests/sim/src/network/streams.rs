@@ -91,8 +91,18 @@ impl Network {
         }
         let capacity = self.host(host).send_buffer;
         let taken = self.end_mut(stream).outgoing.write(slices, capacity);
+        self.trace_written(stream, slices, taken);
         self.transmit(stream);
         Ok(taken)
+    }
+
+    fn trace_written(&mut self, stream: StreamId, slices: &[&[u8]], mut taken: usize) {
+        self.trace.note(&stream.0.to_le_bytes());
+        for slice in slices {
+            let part = taken.min(slice.len());
+            self.trace.note(&slice[..part]);
+            taken -= part;
+        }
     }
 
     /// Bytes written that have not left yet.

@@ -24,8 +24,11 @@ pub type Outcome = Result<BoxedParameters, ServiceError>;
 
 type Running = Pin<Box<dyn Future<Output = Outcome>>>;
 
+type AtOnce = dyn FnMut(&Call, &mut ParametersView) -> Result<(), ServiceError>;
+type SafeHook = dyn Fn(&UnitHandle);
+
 enum Body {
-    AtOnce(Box<RefCell<dyn FnMut(&Call, &mut ParametersView) -> Result<(), ServiceError>>>),
+    AtOnce(Box<RefCell<AtOnce>>),
     Future(Box<dyn Fn(Call, BoxedParameters) -> Running>),
 }
 
@@ -75,7 +78,7 @@ pub struct Service {
     pub(super) attributes: Attributes,
     pub(super) detached: bool,
     lease: Option<Lease>,
-    pub(super) safe_hook: Option<Box<dyn Fn(&UnitHandle)>>,
+    pub(super) safe_hook: Option<Box<SafeHook>>,
 }
 
 impl Service {
