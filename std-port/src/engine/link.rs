@@ -1,6 +1,6 @@
 //! One link as the threads share it: the session under its lock, who waits for what, and who reads.
 
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError, TryLockError};
 use std::task::Waker;
 use std::thread::Thread;
 
@@ -118,6 +118,15 @@ impl LinkCell {
     /// Handlers run outside of this lock, and no code under it leaves the state half changed.
     pub(crate) fn lock(&self) -> MutexGuard<'_, LinkState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The state, unless somebody has it now.
+    pub(crate) fn try_lock(&self) -> Option<MutexGuard<'_, LinkState>> {
+        match self.state.try_lock() {
+            Ok(state) => Some(state),
+            Err(TryLockError::Poisoned(poisoned)) => Some(poisoned.into_inner()),
+            Err(TryLockError::WouldBlock) => None,
+        }
     }
 }
 
