@@ -39,6 +39,8 @@ pub(crate) struct LinkState {
     pub(crate) reader: Reader,
     /// The last handler that ran for this link was quick.
     pub(crate) quick: bool,
+    /// The pool's count of calls when it last served this link.
+    pub(crate) served: usize,
     /// What the epoll set watches the stream for.
     pub(crate) registration: Registration,
     /// The connection is still being opened.
@@ -101,6 +103,7 @@ impl LinkCell {
             waiters: Vec::new(),
             reader: Reader::default(),
             quick: false,
+            served: 0,
             registration: Registration { readable: true, writable: connecting },
             connecting,
             leftover: Vec::new(),

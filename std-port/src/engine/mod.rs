@@ -79,6 +79,8 @@ pub(crate) struct Engine<T: 'static> {
     workers: AtomicUsize,
     /// Links on which a thread of the pool stays.
     stays: Mutex<Vec<LinkId>>,
+    /// Calls that the pool has read and served, to tell a few busy links from many.
+    served: AtomicUsize,
     threads: Mutex<Vec<JoinHandle<()>>>,
     stopping: AtomicBool,
     subscribers: Mutex<Vec<SyncSender<UnitEvent>>>,
@@ -139,6 +141,7 @@ impl<T: Send + 'static> Engine<T> {
             idle: AtomicUsize::new(0),
             workers: AtomicUsize::new(0),
             stays: Mutex::new(Vec::new()),
+            served: AtomicUsize::new(0),
             threads: Mutex::new(Vec::new()),
             stopping: AtomicBool::new(false),
             subscribers: Mutex::new(Vec::new()),

@@ -22,6 +22,9 @@ use crate::sys::stream::{Received, Wait};
 
 /// Threads of the pool that may stay on links.
 const MOST_STAYS: usize = 4;
+/// A thread stays on a link that is served again after at most this many calls of other links. With more busy links than
+/// that, staying would keep threads from those that have something to read.
+const FEW: usize = 4;
 /// A handler that runs longer than this while its thread has the lead loses it.
 const RELIEF: Duration = Duration::from_millis(1);
 
@@ -45,12 +48,14 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     fn begin_stay(&self, link: &Arc<LinkCell>) -> Option<Turn> {
+        let served = self.served.fetch_add(1, Ordering::Relaxed);
         let mut stays = lock(&self.stays);
         if stays.len() >= MOST_STAYS || self.idle.load(Ordering::Acquire) == 0 {
             return None;
         }
         let mut state = link.lock();
-        if !state.quick || !state.waiters.is_empty() || !state.session.is_live() || !state.reader.pool_reads() {
+        let others = served.wrapping_sub(std::mem::replace(&mut state.served, served));
+        if others > FEW || !state.quick || !state.waiters.is_empty() || !state.session.is_live() || !state.reader.pool_reads() {
             return None;
         }
         let turn = state.reader.take_lead()?;
