@@ -54,6 +54,8 @@ faults! {
     ProcessKilled = "process-killed",
     /// A host or process came back.
     Restart = "restart",
+    /// A host was suspended.
+    Suspend = "suspend",
     /// A host got another address.
     AddressChange = "address-change",
     /// A stream was reset.

@@ -63,6 +63,8 @@ struct Host {
     running: bool,
     /// Counts crashes, so that timers of an earlier life do not go off in a later one.
     life: u32,
+    /// Until then it neither sees nor does anything.
+    suspended: Instant,
     udp_port: u16,
     listeners: Vec<u16>,
     accept_limit: usize,
@@ -145,6 +147,8 @@ enum Happening {
     SegmentHeard {
         segment: u8,
     },
+    /// A suspended host goes on, and sees what it has missed.
+    Missed(NetEvent),
 }
 
 impl Network {
@@ -220,6 +224,7 @@ impl Network {
     pub fn next_event_until(&mut self, limit: Instant) -> Option<NetEvent> {
         loop {
             if let Some(event) = self.ready.pop_front() {
+                let Some(event) = self.hold_if_suspended(event) else { continue };
                 self.trace.note_event(self.now, &event);
                 return Some(event);
             }
@@ -256,6 +261,7 @@ impl Network {
             Happening::Restart { .. } => (),
             Happening::WeatherEnds { number } => self.weather = self.weather.filter(|(current, _)| *current != number),
             Happening::PathRecovers { from, to, number } => self.path_recovers(from, to, number),
+            Happening::Missed(event) => self.see_missed(event),
             Happening::SegmentHeard { segment } => self.quiet_segments.retain(|quiet| *quiet != segment),
         }
     }

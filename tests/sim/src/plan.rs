@@ -82,6 +82,13 @@ pub enum Action {
         /// How long it stays down.
         down: Duration,
     },
+    /// A host sees and does nothing for a while.
+    Suspend {
+        /// The host.
+        host: HostId,
+        /// How long.
+        span: Duration,
+    },
     /// A host gets a free address.
     ChangeAddress {
         /// The host.
@@ -205,7 +212,7 @@ impl FaultPlan {
     fn draw(&mut self, hosts: &[HostId]) -> Option<Action> {
         let span = Duration::from_millis(1) + self.random.jitter(self.longest);
         let (host, other) = self.pair(hosts);
-        let action = match self.random.below(16) {
+        let action = match self.random.below(17) {
             0..4 => Action::Weather { path: self.quality(), span },
             4..6 => Action::Degrade { from: host, to: other, path: self.quality(), span },
             6..8 => self.cut(hosts, span),
@@ -214,6 +221,7 @@ impl FaultPlan {
             11 => Action::DropBroadcasts { segment: 0, span },
             12 if self.addresses => Action::ChangeAddress { host },
             13 => Action::ResetStreams { host },
+            16 => Action::Suspend { host, span },
             14 if self.crashes => Action::Crash { host, crash: Crash::PowerCut, down: span },
             15 if self.crashes => Action::Crash { host, crash: Crash::Process, down: span },
             _ => return None,

@@ -13,18 +13,21 @@ use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 use cara_core::time::{Duration, Instant};
 
-use crate::event::HostId;
+use crate::event::{HostId, NetEvent};
 use crate::faults::FaultCounts;
 use crate::network::Network;
 use crate::plan::{Crash, FaultPlan};
 use crate::queue::Queue;
 
 mod builder;
+mod driving;
 mod events;
 mod handle;
 mod links;
+mod looking;
 mod mail;
 mod replies;
+mod requests;
 mod service;
 mod state;
 mod tasks;
@@ -69,7 +72,7 @@ struct Inner {
     network: Network,
     /// By host.
     units: Vec<UnitState>,
-    sleepers: Queue<Promise<()>>,
+    sleepers: Queue<(HostId, Promise<()>)>,
     /// Hooks that run before anything else.
     urgent: VecDeque<Box<dyn FnOnce()>>,
     spawned: Vec<(Owner, Job)>,
@@ -120,6 +123,8 @@ impl World {
             network: Network::new(seed),
             units: Vec::new(),
             sleepers: Queue::new(),
+            suspended: Vec::new(),
+            held: VecDeque::new(),
             urgent: VecDeque::new(),
             spawned: Vec::new(),
         };
@@ -241,6 +246,14 @@ impl World {
         self.settle();
     }
 
+    /// The unit's machine sleeps for `span`, as a closed laptop does: what arrives and what is due waits, and comes all
+    /// at once when it wakes.
+    pub fn suspend(&mut self, unit: &UnitHandle, span: Duration) {
+        let mut inner = self.shared.inner.borrow_mut();
+        let until = inner.network.now() + span;
+        inner.suspended.push((unit.host(), until));
+    }
+
     /// Does what is due at this very instant.
     fn settle(&mut self) {
         let now = self.now();
@@ -305,9 +318,9 @@ impl Shared {
     }
 
     fn advance(self: &Rc<Self>, limit: Instant) -> bool {
-        let sleeper = self.inner.borrow().sleepers.next_time();
+        let sleeper = self.inner.borrow().next_time();
         let until = sleeper.map_or(limit, |at| at.min(limit));
-        let event = self.inner.borrow_mut().network.next_event_until(until);
+        let event = self.inner.borrow_mut().next_event_until(until);
         if let Some(event) = event {
             let ended = self.with(|inner| inner.dispatch(self, event));
             if let Some(host) = ended {
@@ -324,9 +337,13 @@ impl Shared {
         let now = inner.network.now();
         let mut woken = false;
         while inner.sleepers.next_time().is_some_and(|at| at <= now) {
-            if let Some((_, promise)) = inner.sleepers.pop() {
+            let Some((_, (host, promise))) = inner.sleepers.pop() else { break };
+            woken = true;
+            let suspended = inner.network.suspended_until(host);
+            if suspended > now {
+                inner.sleepers.push(suspended, (host, promise));
+            } else {
                 promise.keep(());
-                woken = true;
             }
         }
         woken
@@ -338,9 +355,9 @@ impl Inner {
         self.units.get(owner.host.index()).is_some_and(|unit| unit.life == owner.life && unit.machine.is_some())
     }
 
-    fn sleep_until(&mut self, at: Instant) -> Promise<()> {
+    fn sleep_until(&mut self, host: HostId, at: Instant) -> Promise<()> {
         let promise = Promise::new();
-        self.sleepers.push(at, promise.clone());
+        self.sleepers.push(at, (host, promise.clone()));
         promise
     }
 }

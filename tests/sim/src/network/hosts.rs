@@ -2,6 +2,8 @@
 
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
 
+use cara_core::time::Instant;
+
 use super::{Host, Network};
 use crate::event::HostId;
 
@@ -37,6 +39,7 @@ impl Network {
             power: true,
             running: true,
             life: 0,
+            suspended: Instant::START,
             udp_port,
             listeners: Vec::new(),
             accept_limit: usize::MAX,

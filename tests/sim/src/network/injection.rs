@@ -221,6 +221,7 @@ impl Network {
     fn take_down(&mut self, host: HostId, crash: Crash) {
         let crashed = self.host_mut(host);
         crashed.life += 1;
+        crashed.suspended = Instant::START;
         crashed.running = false;
         crashed.power = crash == Crash::Process;
         crashed.listeners.clear();
@@ -252,6 +253,47 @@ impl Network {
         self.crash(host, crash);
         let life = self.host(host).life;
         self.push(self.now + down, Happening::Restart { host, life });
+    }
+
+    /// Stops the host for `span`, as a laptop that is closed: its machine goes on to take bytes, its program sees nothing
+    /// until then, and all that it has missed at once after that.
+    pub fn suspend(&mut self, host: HostId, span: Duration) {
+        self.counts.count(Fault::Suspend);
+        let until = self.now + span;
+        let host = self.host_mut(host);
+        host.suspended = host.suspended.max(until);
+    }
+
+    /// When a suspended host goes on; in the past for all others.
+    pub fn suspended_until(&self, host: HostId) -> Instant {
+        self.host(host).suspended
+    }
+
+    /// Gives back what its host may see now.
+    pub(super) fn hold_if_suspended(&mut self, event: NetEvent) -> Option<NetEvent> {
+        let until = self.host(event.host()).suspended;
+        let of_fate =
+            matches!(event, NetEvent::Crashed { .. } | NetEvent::Restarted { .. } | NetEvent::AddressChanged { .. });
+        if of_fate || until <= self.now {
+            return Some(event);
+        }
+        self.push(until, Happening::Missed(event));
+        None
+    }
+
+    /// What was missed and still means something.
+    pub(super) fn see_missed(&mut self, event: NetEvent) {
+        let current = match &event {
+            NetEvent::Connected { stream, .. }
+            | NetEvent::Accepted { stream, .. }
+            | NetEvent::Readable { stream, .. }
+            | NetEvent::Writable { stream, .. }
+            | NetEvent::Closed { stream, .. } => self.is_open(*stream),
+            _ => self.is_running(event.host()),
+        };
+        if current {
+            self.ready.push_back(event);
+        }
     }
 
     /// Gives the host another address; [`NetEvent::AddressChanged`] follows. Its streams lead nowhere from now on,
@@ -292,6 +334,7 @@ impl Network {
             Action::FreezeStreams { from, to, span } => self.freeze_streams(from, to, span),
             Action::DropBroadcasts { segment, span } => self.drop_broadcasts(segment, span),
             Action::Crash { host, crash, down } => self.crash_for(host, crash, down),
+            Action::Suspend { host, span } => self.suspend(host, span),
             Action::ChangeAddress { host } => {
                 let address = self.free_address(host);
                 self.change_address(host, address);

@@ -4,25 +4,19 @@ use std::future::Future;
 use std::net::SocketAddr;
 use std::rc::{Rc, Weak};
 
-use cara_core::config::Constraints;
-use cara_core::distribution::connection_handler::NodeCounter;
 use cara_core::distribution::function::Definition;
 use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::identity::{Identity, Role};
-use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
-use cara_core::host::connections::LinkCounter;
 use cara_core::services::Ticket;
-use cara_core::services::requests::CallId;
-use cara_core::services::unit::{RequestOptions, Session};
 use cara_core::time::{Duration, Instant};
 
-use super::links::{Link, Links};
-use super::replies::{Promise, Waiting};
-use super::service::{BoxedParameters, Handler, Service, boxed_parameters};
-use super::state::{Machine, UnitState};
+use super::links::{Link, Links, SimSession};
+use super::replies::Promise;
+use super::service::{BoxedParameters, Handler, Service};
+use super::state::Machine;
 use super::tasks::Owner;
-use super::{Inner, Shared, UnitEvent};
+use super::{Inner, Shared};
 use crate::event::{HostId, StreamId};
 use crate::network::Network;
 
@@ -76,7 +70,7 @@ impl Peer {
 /// When it is used after its world.
 #[derive(Clone)]
 pub struct UnitHandle {
-    shared: Weak<Shared>,
+    pub(super) shared: Weak<Shared>,
     host: HostId,
 }
 
@@ -209,6 +203,16 @@ impl UnitHandle {
         self.peers().into_iter().filter(|peer| peer.role() == Role::SUnit).collect()
     }
 
+    /// The s_units that this life of the unit has known, in the order in which they became known, and whether each is
+    /// connected. One that has left keeps its place.
+    pub fn s_units_ever(&self) -> Vec<(Identity, bool)> {
+        let known = self.machine(|machine, _| {
+            let s_units = machine.node.nodes().filter(|known| known.identity.role() == Role::SUnit);
+            s_units.map(|known| (known.identity.clone(), known.is_joined())).collect()
+        });
+        known.unwrap_or_default()
+    }
+
     /// The connected m_units.
     pub fn m_units(&self) -> Vec<Identity> {
         self.peers().into_iter().filter(|peer| peer.role() == Role::MUnit).collect()
@@ -238,198 +242,6 @@ impl UnitHandle {
         self.session(peer, |session| session.their_function_list().find(function).is_some()).unwrap_or(false)
     }
 
-    // --- requests
-
-    /// The paper's asynchronous request: returns at once, and leaves the parameters as they are.
-    pub fn request(&self, peer: impl Into<Peer>, function: &str, parameters: &ParametersView) -> Result<CallId, Error> {
-        self.request_with(peer, function, parameters, RequestOptions::default())
-    }
-
-    /// As [`Self::request`], with options.
-    pub fn request_with(
-        &self,
-        peer: impl Into<Peer>,
-        function: &str,
-        parameters: &ParametersView,
-        options: RequestOptions,
-    ) -> Result<CallId, Error> {
-        let index = self.link_to(&peer.into())?;
-        let requested = self
-            .machine(|machine, network| machine.links.request(network, index, function, parameters, &options, None))?;
-        self.work(index);
-        requested
-    }
-
-    /// The asynchronous request to every connected node, with an outcome for each.
-    pub fn request_all(&self, function: &str, parameters: &ParametersView) -> Vec<(Identity, Result<CallId, Error>)> {
-        self.peers().into_iter().map(|peer| (peer.clone(), self.request(&peer, function, parameters))).collect()
-    }
-
-    /// The paper's synchronous request: waits for the reply, which updates the parameters; on an error they are
-    /// unchanged. Waits inside the deadline for the minimum interval to pass.
-    pub async fn block_request(
-        &self,
-        peer: impl Into<Peer>,
-        function: &str,
-        parameters: &mut ParametersView,
-    ) -> Result<(), Error> {
-        self.block_request_with(peer, function, parameters, RequestOptions::default()).await
-    }
-
-    /// As [`Self::block_request`], with options.
-    pub async fn block_request_with(
-        &self,
-        peer: impl Into<Peer>,
-        function: &str,
-        parameters: &mut ParametersView,
-        options: RequestOptions,
-    ) -> Result<(), Error> {
-        let peer = peer.into();
-        let timeout = options.timeout.unwrap_or(self.constraints()?.request_timeout);
-        let deadline = self.now() + timeout;
-        loop {
-            let options = RequestOptions { timeout: Some(deadline.since(self.now())), ..options };
-            match self.call(&peer, function, parameters, &options) {
-                Ok(call) => {
-                    let results = call.promise.clone().await?;
-                    return parameters.copy_from(&results);
-                }
-                Err(Error::TooSoon { wait }) if self.now() + wait < deadline => self.sleep(wait).await,
-                Err(error) => return Err(error),
-            }
-        }
-    }
-
-    /// The synchronous request to every connected node at the same time, with an outcome for each.
-    pub async fn block_request_all(
-        &self,
-        function: &str,
-        parameters: &ParametersView,
-    ) -> Vec<(Identity, Result<BoxedParameters, Error>)> {
-        let options = RequestOptions::default();
-        let calls: Vec<_> = self
-            .peers()
-            .into_iter()
-            .map(|peer| (peer.clone(), self.call(&Peer::Is(peer), function, parameters, &options)))
-            .collect();
-        let mut outcomes = Vec::new();
-        for (peer, call) in calls {
-            outcomes.push((
-                peer,
-                match call {
-                    Ok(call) => call.promise.clone().await,
-                    Err(error) => Err(error),
-                },
-            ));
-        }
-        outcomes
-    }
-
-    /// Gives up the lease that it holds on a function of a peer, which stops what that started.
-    pub fn release(&self, peer: impl Into<Peer>, function: &str) -> Result<(), Error> {
-        let index = self.link_to(&peer.into())?;
-        self.machine(|machine, network| {
-            let released = machine.links.with(network, index, |session, cx| {
-                let slot = session.their_function_list().find(function).ok_or(Error::UnknownFunction)?;
-                session.release(cx, slot);
-                Ok(())
-            });
-            released.unwrap_or(Err(Error::NotConnected))
-        })??;
-        self.work(index);
-        Ok(())
-    }
-
-    /// What a leased service of this unit started is finished: its lease ends, and no safe hook runs.
-    pub fn end_lease(&self, function: &str) -> Result<(), Error> {
-        let slot = self.machine(|machine, _| machine.links.functions.find(function))?.ok_or(Error::UnknownFunction)?;
-        self.each_live_link(|links, network, index| {
-            links.with(network, index, |session, cx| session.end_lease(cx, slot));
-        });
-        Ok(())
-    }
-
-    /// Whether the lease of one of its own services is live now; false for one without a lease.
-    pub fn lease_is_live(&self, function: &str) -> bool {
-        let live = self.machine(|machine, network| {
-            let functions = &machine.links.functions;
-            let function = functions.find(function).and_then(|slot| functions.function(slot))?;
-            function.handler.0.lease_is_live(network.now())
-        });
-        matches!(live, Ok(Some(true)))
-    }
-
-    // --- constraints, counters, log
-
-    /// Its constraints.
-    pub fn constraints(&self) -> Result<Constraints, Error> {
-        self.machine(|machine, _| machine.constraints)
-    }
-
-    /// Changes its constraints while it runs; peers are told.
-    pub fn set_constraints(&self, constraints: Constraints) -> Result<(), Error> {
-        self.with(|inner| {
-            let UnitState { machine, settings, .. } = &mut inner.units[self.host.index()];
-            let machine = machine.as_mut().ok_or(Error::NotRunning)?;
-            let fits = constraints.message_size <= settings.constraints.message_size
-                && usize::from(constraints.maximum_nodes) <= settings.links;
-            if !fits {
-                return Err(Error::BadConstraint);
-            }
-            machine.constraints = constraints;
-            machine.node.set_constraints(constraints);
-            Ok(())
-        })?;
-        self.each_live_link(|links, network, index| {
-            links.with(network, index, |session, cx| session.set_constraints(cx, constraints));
-        });
-        Ok(())
-    }
-
-    /// A counter of all links of all its lives.
-    pub fn link_counter(&self, counter: LinkCounter) -> u64 {
-        self.with(|inner| {
-            let unit = &inner.units[self.host.index()];
-            let live = unit.machine.iter().flat_map(|machine| machine.links.iter());
-            live.map(|(_, link)| link.session.counters().value(counter)).sum::<u64>() + unit.counters.value(counter)
-        })
-    }
-
-    /// A counter of discovery and membership, of this life.
-    pub fn node_counter(&self, counter: NodeCounter) -> u64 {
-        self.machine(|machine, _| machine.node.counters.value(counter)).unwrap_or(0)
-    }
-
-    /// Message buffers that are free now.
-    pub fn free_buffers(&self) -> usize {
-        self.machine(|machine, _| machine.links.buffers.free()).unwrap_or(0)
-    }
-
-    /// Calls of this unit to all peers that wait for a reply.
-    pub fn calls_in_flight(&self) -> usize {
-        self.sum_of_sessions(|session| session.calls_in_flight())
-    }
-
-    /// Calls of all peers that run or wait here.
-    pub fn calls_held(&self) -> usize {
-        self.sum_of_sessions(|session| usize::from(session.calls_held()))
-    }
-
-    /// Everything that happened to it, in all its lives.
-    pub fn log(&self) -> Vec<(Instant, UnitEvent)> {
-        self.with(|inner| inner.units[self.host.index()].log.clone())
-    }
-
-    /// How many events of its log match.
-    pub fn count(&self, matches: impl Fn(&UnitEvent) -> bool) -> usize {
-        self.with(|inner| inner.units[self.host.index()].log.iter().filter(|(_, event)| matches(event)).count())
-    }
-
-    /// Runs at each event from now on, in all its lives.
-    pub fn on_event(&self, hook: impl Fn(&Self, &UnitEvent) + 'static) {
-        self.with(|inner| inner.units[self.host.index()].hooks.push(Rc::new(hook)));
-    }
-
     // --- time
 
     /// Runs a future in this life of the unit, beside everything else.
@@ -444,7 +256,7 @@ impl UnitHandle {
     pub async fn sleep(&self, span: Duration) {
         let promise = self.with(|inner| {
             let at = inner.network.now() + span;
-            inner.sleep_until(at)
+            inner.sleep_until(self.host, at)
         });
         promise.await;
     }
@@ -495,45 +307,12 @@ impl UnitHandle {
         Ok(waiting)
     }
 
-    /// Sends a call whose end the promise tells; giving up the returned value gives up the call.
-    fn call(
-        &self,
-        peer: &Peer,
-        function: &str,
-        parameters: &ParametersView,
-        options: &RequestOptions,
-    ) -> Result<InFlight, Error> {
-        let index = self.link_to(peer)?;
-        let mut copy = boxed_parameters(size_of_val(parameters));
-        copy.copy_from(parameters)?;
-        let promise = Promise::new();
-        let waiting = Waiting { parameters: copy, promise: promise.clone() };
-        let requested = self.machine(|machine, network| {
-            let stream = machine.links.link(index).map(|link| link.stream).ok_or(Error::NotConnected)?;
-            let id = machine.links.request(network, index, function, parameters, options, Some(waiting))?;
-            Ok((stream, id))
-        })?;
-        self.work(index);
-        requested.map(|(stream, id)| InFlight { unit: self.clone(), stream, id, promise })
-    }
-
-    fn session<R>(
-        &self,
-        peer: impl Into<Peer>,
-        look: impl FnOnce(&Session<crate::Boxed, cara_core::host::secure::Plain>) -> R,
-    ) -> Result<R, Error> {
+    pub(super) fn session<R>(&self, peer: impl Into<Peer>, look: impl FnOnce(&SimSession) -> R) -> Result<R, Error> {
         let index = self.link_to(&peer.into())?;
         self.machine(|machine, _| machine.links.link(index).map(|link| look(&link.session)))?.ok_or(Error::NotConnected)
     }
 
-    fn sum_of_sessions(
-        &self,
-        count: impl Fn(&Session<crate::Boxed, cara_core::host::secure::Plain>) -> usize,
-    ) -> usize {
-        self.machine(|machine, _| machine.links.iter().map(|(_, link)| count(&link.session)).sum()).unwrap_or(0)
-    }
-
-    fn link_to(&self, peer: &Peer) -> Result<u16, Error> {
+    pub(super) fn link_to(&self, peer: &Peer) -> Result<u16, Error> {
         self.machine(|machine, _| {
             let is = |link: &Link| link.session.is_live() && link.peer.as_ref().is_some_and(|other| peer.is(other));
             machine.links.iter().find(|(_, link)| is(link)).map(|(index, _)| index)
@@ -541,25 +320,25 @@ impl UnitHandle {
         .ok_or(Error::NotConnected)
     }
 
-    fn live_links(&self) -> Vec<u16> {
+    pub(super) fn live_links(&self) -> Vec<u16> {
         let live = self.machine(|machine, _| {
             machine.links.iter().filter(|(_, link)| link.session.is_live()).map(|(index, _)| index).collect()
         });
         live.unwrap_or_default()
     }
 
-    fn each_live_link(&self, mut act: impl FnMut(&mut Links, &mut Network, u16)) {
+    pub(super) fn each_live_link(&self, mut act: impl FnMut(&mut Links, &mut Network, u16)) {
         for index in self.live_links() {
             let _ = self.machine(|machine, network| act(&mut machine.links, network, index));
             self.work(index);
         }
     }
 
-    fn work(&self, index: u16) {
+    pub(super) fn work(&self, index: u16) {
         self.with_shared(|inner, shared| inner.work(shared, self.host, index));
     }
 
-    fn machine<R>(&self, act: impl FnOnce(&mut Machine, &mut Network) -> R) -> Result<R, Error> {
+    pub(super) fn machine<R>(&self, act: impl FnOnce(&mut Machine, &mut Network) -> R) -> Result<R, Error> {
         self.with(|inner| {
             let Inner { units, network, .. } = inner;
             let machine = units[self.host.index()].machine.as_mut().ok_or(Error::NotRunning)?;
@@ -567,34 +346,13 @@ impl UnitHandle {
         })
     }
 
-    fn with<R>(&self, act: impl FnOnce(&mut Inner) -> R) -> R {
+    pub(super) fn with<R>(&self, act: impl FnOnce(&mut Inner) -> R) -> R {
         self.with_shared(|inner, _| act(inner))
     }
 
-    fn with_shared<R>(&self, act: impl FnOnce(&mut Inner, &Rc<Shared>) -> R) -> R {
+    pub(super) fn with_shared<R>(&self, act: impl FnOnce(&mut Inner, &Rc<Shared>) -> R) -> R {
         let shared = self.shared.upgrade().expect("a unit is not used after its world");
         shared.with(|inner| act(inner, &shared))
-    }
-}
-
-/// A call in flight, which is given up when this is dropped.
-struct InFlight {
-    unit: UnitHandle,
-    stream: StreamId,
-    id: CallId,
-    promise: Promise<Result<BoxedParameters, Error>>,
-}
-
-impl Drop for InFlight {
-    fn drop(&mut self) {
-        if self.unit.shared.strong_count() == 0 {
-            return;
-        }
-        let _ = self.unit.machine(|machine, _| {
-            if let Some(index) = machine.links.of_stream(self.stream) {
-                machine.links.cancel(index, self.id);
-            }
-        });
     }
 }
 

@@ -133,3 +133,19 @@ fn dropped_broadcasts_are_counted_and_unicast_passes() {
     assert_eq!(&bytes[..], b"unicast");
     assert_eq!(pair.network.counts().of(Fault::BroadcastDropped), 1);
 }
+
+#[test]
+fn a_suspended_host_sees_nothing_and_then_everything_in_order() {
+    let mut pair = Pair::open(1);
+    pair.network.suspend(pair.right, millis(500));
+    let to = pair.network.address(pair.right);
+    let start = pair.network.now();
+    for number in 0..3 {
+        pair.network.send_to(pair.left, to, &[number]);
+    }
+    for number in 0..3 {
+        let (at, event) = pair.next_other();
+        assert_eq!(at.since(start), millis(500));
+        assert!(matches!(event, NetEvent::Datagram { bytes, .. } if bytes[..] == [number]));
+    }
+}

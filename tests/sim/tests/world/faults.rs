@@ -2,6 +2,7 @@
 
 use super::*;
 use cara_core::error::{CloseReason, Error, Refusal};
+use cara_core::host::connections::LinkCounter;
 use cara_sim::{Crash, Direction, UnitEvent};
 
 #[test]
@@ -106,4 +107,16 @@ fn a_unit_that_is_stopped_says_so() {
     assert_eq!(manager.count(|event| *event == stopped), 1, "{:?}", manager.log());
     agv.start();
     assert!(world.run_until(|_| manager.knows("agv", "go_to"), secs(10)));
+}
+
+#[test]
+fn a_suspended_manager_counts_one_missed_keep_alive_and_its_vehicles_come_back() {
+    let (mut world, manager, agv) = pair(9);
+    world.run_for(secs(3));
+    world.network(|network| network.suspend(manager.host(), secs(60)));
+    world.run_for(secs(61));
+    let silent = UnitEvent::Left { peer: manager.identity(), reason: CloseReason::Silent };
+    assert_eq!(agv.count(|event| *event == silent), 1, "the vehicle heard nothing for a minute");
+    assert!(manager.link_counter(LinkCounter::KeepAlivesMissed) <= 1, "the vehicle says that it left");
+    assert!(world.run_until(|_| manager.knows("agv", "go_to"), secs(20)));
 }

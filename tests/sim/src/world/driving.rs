@@ -1,0 +1,365 @@
+//! Events go to the machine of their unit, and what comes of them is done, as `docs/notes/driving-the-core.md` says.
+
+use std::net::SocketAddr;
+use std::rc::Rc;
+
+use cara_core::distribution::connection_handler::{Action, Admission, Sorted};
+use cara_core::distribution::function_list::Slot;
+use cara_core::distribution::identity::Identity;
+use cara_core::error::{CloseReason, Error, Refusal};
+use cara_core::host::mailman::LinkId;
+
+use super::handle::UnitHandle;
+use super::links::{Happened, Link, Links};
+use super::service::{BoxedParameters, Call, Handler};
+use super::state::{Machine, NODE_TIMER};
+use super::tasks::Owner;
+use super::{Inner, Shared, UnitEvent};
+use crate::event::{HostId, NetEvent, StreamId};
+use crate::network::Network;
+
+impl Inner {
+    /// Begins a life of a unit; its program runs before anything else happens.
+    pub(super) fn start(&mut self, shared: &Rc<Shared>, host: HostId) {
+        let unit = &mut self.units[host.index()];
+        unit.boot(&mut self.network);
+        let program = unit.settings.program.clone();
+        self.log(shared, host, UnitEvent::Started);
+        if let Some(program) = program {
+            let handle = UnitHandle::new(Rc::downgrade(shared), host);
+            self.urgent.push_back(Box::new(move || program(&handle)));
+        }
+        self.work_node(shared, host);
+    }
+
+    /// Ends a life: what waited for the unit's calls is told.
+    fn end(&mut self, shared: &Rc<Shared>, host: HostId) {
+        let unit = &mut self.units[host.index()];
+        unit.life += 1;
+        if let Some(mut machine) = unit.machine.take() {
+            for (_, link) in machine.links.iter() {
+                unit.counters.merge(link.session.counters());
+            }
+            machine.links.abandon(Error::NotRunning);
+            self.log(shared, host, UnitEvent::Stopped);
+        }
+    }
+
+    /// Passes an event of the network to its unit. Returns the host whose life it ended.
+    pub(super) fn dispatch(&mut self, shared: &Rc<Shared>, event: NetEvent) -> Option<HostId> {
+        let host = event.host();
+        match event {
+            NetEvent::Crashed { .. } => {
+                self.end(shared, host);
+                return Some(host);
+            }
+            NetEvent::Restarted { .. } => self.start(shared, host),
+            NetEvent::AddressChanged { .. } => (),
+            NetEvent::Timer { token: NODE_TIMER, .. } => self.work_node(shared, host),
+            NetEvent::Timer { token, .. } => self.work(shared, host, (token - 1) as u16),
+            NetEvent::Datagram { from, bytes, .. } => self.datagram(shared, host, from, &bytes),
+            NetEvent::Accepted { stream, from, .. } => self.accepted(shared, host, stream, from),
+            NetEvent::Connected { stream, .. } => self.on_stream(shared, host, stream, |links, network, index| {
+                links.with(network, index, |session, cx| session.connected(cx));
+            }),
+            NetEvent::Writable { stream, .. } => self.on_stream(shared, host, stream, |links, network, index| {
+                links.with(network, index, |session, cx| session.writable(cx));
+            }),
+            NetEvent::Readable { stream, .. } => self.on_stream(shared, host, stream, |_, _, _| ()),
+            NetEvent::Refused { stream, .. } => self.broken(shared, host, stream, CloseReason::DialFailed),
+            NetEvent::Closed { stream, .. } | NetEvent::Reset { stream, .. } => {
+                self.broken(shared, host, stream, CloseReason::Reset);
+            }
+        }
+        None
+    }
+
+    fn broken(&mut self, shared: &Rc<Shared>, host: HostId, stream: StreamId, reason: CloseReason) {
+        self.on_stream(shared, host, stream, |links, _, index| {
+            if let Some(link) = links.link_mut(index) {
+                link.session.disconnected(reason);
+            }
+        });
+    }
+
+    fn on_stream(
+        &mut self,
+        shared: &Rc<Shared>,
+        host: HostId,
+        stream: StreamId,
+        act: impl FnOnce(&mut Links, &mut Network, u16),
+    ) {
+        let Some(machine) = &mut self.units[host.index()].machine else { return };
+        let Some(index) = machine.links.of_stream(stream) else { return };
+        act(&mut machine.links, &mut self.network, index);
+        self.work(shared, host, index);
+    }
+
+    fn accepted(&mut self, shared: &Rc<Shared>, host: HostId, stream: StreamId, from: SocketAddr) {
+        let unit = &mut self.units[host.index()];
+        let functions = unit.settings.functions;
+        let Some(machine) = &mut unit.machine else { return };
+        match machine.open(&mut self.network, functions, stream, from, false) {
+            None => self.network.reset(stream),
+            Some(index) => {
+                machine.links.with(&mut self.network, index, |session, cx| session.connected(cx));
+                self.work(shared, host, index);
+            }
+        }
+    }
+
+    fn datagram(&mut self, shared: &Rc<Shared>, host: HostId, from: SocketAddr, bytes: &[u8]) {
+        let Some(machine) = &mut self.units[host.index()].machine else { return };
+        match machine.node.datagram(self.network.now(), from, bytes) {
+            Sorted::Done => self.work_node(shared, host),
+            Sorted::Session { link, nonce, body } => {
+                let happened = machine.links.datagram(&mut self.network, link.0, from, nonce, body);
+                self.happened(shared, host, link.0, happened);
+                self.resume(shared, host);
+            }
+        }
+    }
+
+    /// Lets the node do what is due.
+    pub(super) fn work_node(&mut self, shared: &Rc<Shared>, host: HostId) {
+        loop {
+            let Some(machine) = &mut self.units[host.index()].machine else { return };
+            match machine.poll_node(&mut self.network, host) {
+                Some(action) => self.act(shared, host, action),
+                None => return machine.arm_node(&mut self.network, host),
+            }
+        }
+    }
+
+    /// Lets a link do what it can.
+    pub(super) fn work(&mut self, shared: &Rc<Shared>, host: HostId, index: u16) {
+        let Some(machine) = &mut self.units[host.index()].machine else { return };
+        let happened = machine.links.work(&mut self.network, index);
+        self.happened(shared, host, index, happened);
+        self.resume(shared, host);
+    }
+
+    /// Goes on with links that waited for a buffer.
+    fn resume(&mut self, shared: &Rc<Shared>, host: HostId) {
+        let Some(machine) = &mut self.units[host.index()].machine else { return };
+        for index in machine.links.resumable() {
+            let Some(machine) = &mut self.units[host.index()].machine else { return };
+            let happened = machine.links.work(&mut self.network, index);
+            self.happened(shared, host, index, happened);
+        }
+    }
+
+    fn happened(&mut self, shared: &Rc<Shared>, host: HostId, index: u16, happened: Vec<Happened>) {
+        for happened in happened {
+            self.one_happened(shared, host, index, happened);
+        }
+    }
+
+    fn one_happened(&mut self, shared: &Rc<Shared>, host: HostId, index: u16, happened: Happened) {
+        let unit = &mut self.units[host.index()];
+        let Some(machine) = &mut unit.machine else { return };
+        let peer = machine.links.link(index).and_then(|link| link.peer.clone());
+        match happened {
+            Happened::Hello => self.greet(shared, host, index),
+            Happened::Answered => {
+                let action = machine.node.challenge_answered(self.network.now(), LinkId(index));
+                self.act_all(shared, host, action);
+            }
+            Happened::Closed(reason) => self.closed(shared, host, index, reason),
+            Happened::Call(call, parameters) => self.serve(shared, host, index, &call, parameters),
+            Happened::LeaseExpired(slot) => self.lease_expired(shared, host, slot),
+            Happened::ListChanged => self.log_of(shared, host, peer, |peer| UnitEvent::ListChanged { peer }),
+            Happened::Failed(id, error) => {
+                self.log_of(shared, host, peer, |peer| UnitEvent::Failed { peer, id, error });
+            }
+            Happened::LeaseEnded(slot, expired) => {
+                let theirs = machine.links.link(index).map(|link| link.session.their_function_list());
+                let function = theirs.and_then(|list| list.function(slot));
+                let function = function.map(|function| function.name().to_owned()).unwrap_or_default();
+                self.log_of(shared, host, peer, |peer| UnitEvent::LeaseEnded { peer, function, expired });
+            }
+        }
+    }
+
+    /// The peer of a link has introduced itself.
+    fn greet(&mut self, shared: &Rc<Shared>, host: HostId, index: u16) {
+        let now = self.network.now();
+        let Some(machine) = &mut self.units[host.index()].machine else { return };
+        let Some(link) = machine.links.link(index) else { return };
+        let (Some(hello), address) = (link.session.hello().cloned(), link.session.address()) else { return };
+        match machine.node.admit(now, LinkId(index), address, &hello) {
+            Admission::Accept => self.accept(shared, host, index),
+            Admission::Refuse(refusal) => self.refuse(shared, host, index, refusal),
+            Admission::Challenge { old } => {
+                machine.links.with(&mut self.network, old.0, |session, cx| session.challenge(cx));
+                self.work_node(shared, host);
+            }
+        }
+    }
+
+    fn act_all(&mut self, shared: &Rc<Shared>, host: HostId, action: Option<Action>) {
+        if let Some(action) = action {
+            self.act(shared, host, action);
+        }
+        self.work_node(shared, host);
+    }
+
+    fn act(&mut self, shared: &Rc<Shared>, host: HostId, action: Action) {
+        match action {
+            Action::Dial { to, identity } => self.dial(host, to, identity.as_ref()),
+            Action::Supersede { old, new, reason } => {
+                self.close(shared, host, old.0, reason);
+                self.accept(shared, host, new.0);
+            }
+            Action::Admit { new } => self.accept(shared, host, new.0),
+            Action::Refuse { new, refusal } => self.refuse(shared, host, new.0, refusal),
+        }
+    }
+
+    fn dial(&mut self, host: HostId, to: SocketAddr, identity: Option<&Identity>) {
+        let unit = &mut self.units[host.index()];
+        let functions = unit.settings.functions;
+        let Some(machine) = &mut unit.machine else { return };
+        let now = self.network.now();
+        if machine.links.free_index().is_none() {
+            return machine.node.dial_failed(now, identity);
+        }
+        let stream = self.network.connect(host, to);
+        if let Some(index) = machine.open(&mut self.network, functions, stream, to, true) {
+            machine.node.dialing(identity, LinkId(index));
+            machine.links.arm(&mut self.network, index);
+        }
+    }
+
+    fn close(&mut self, shared: &Rc<Shared>, host: HostId, index: u16, reason: CloseReason) {
+        if let Some(machine) = &mut self.units[host.index()].machine {
+            machine.links.with(&mut self.network, index, |session, cx| session.close(cx, reason));
+            self.work(shared, host, index);
+        }
+    }
+
+    fn refuse(&mut self, shared: &Rc<Shared>, host: HostId, index: u16, refusal: Refusal) {
+        if let Some(machine) = &mut self.units[host.index()].machine {
+            machine.links.with(&mut self.network, index, |session, cx| session.refuse(cx, refusal));
+            self.work(shared, host, index);
+        }
+    }
+
+    /// The link is live: the peer sees what is published to it.
+    fn accept(&mut self, shared: &Rc<Shared>, host: HostId, index: u16) {
+        let Some(machine) = &mut self.units[host.index()].machine else { return };
+        let Machine { links, publications, .. } = machine;
+        let Some(identity) = links.link(index).and_then(|link| link.session.identity().cloned()) else { return };
+        let live = links.with(&mut self.network, index, |session, cx| {
+            session.accept(cx);
+            if session.is_live() {
+                session.publish(cx, publications.visible_to(&identity));
+            }
+            session.is_live()
+        });
+        if live == Some(true)
+            && let Some(link) = links.link_mut(index)
+        {
+            link.peer = Some(identity.clone());
+            self.log(shared, host, UnitEvent::Joined { peer: identity });
+        }
+        self.work(shared, host, index);
+        self.work_node(shared, host);
+    }
+
+    fn closed(&mut self, shared: &Rc<Shared>, host: HostId, index: u16, reason: CloseReason) {
+        let now = self.network.now();
+        let unit = &mut self.units[host.index()];
+        let Some(machine) = &mut unit.machine else { return };
+        let Some(link) = machine.links.remove(&mut self.network, index) else { return };
+        unit.counters.merge(link.session.counters());
+        let peer = link.peer.clone();
+        Link::abandon(link, Error::Interrupted);
+        let action = machine.node.left(now, LinkId(index), reason);
+        self.log(
+            shared,
+            host,
+            match peer {
+                Some(peer) => UnitEvent::Left { peer, reason },
+                None => UnitEvent::LinkEnded { reason },
+            },
+        );
+        self.act_all(shared, host, action);
+    }
+
+    /// Starts the service of a call.
+    fn serve(
+        &mut self,
+        shared: &Rc<Shared>,
+        host: HostId,
+        index: u16,
+        call: &cara_core::services::unit::Call,
+        parameters: BoxedParameters,
+    ) {
+        let unit = &mut self.units[host.index()];
+        let Some(machine) = &mut unit.machine else { return };
+        let Some(function) = machine.links.functions.function(call.slot) else { return };
+        let Handler(service) = function.handler;
+        let (service, function): (_, Rc<str>) = (Rc::clone(service), Rc::from(function.name()));
+        let Some(link) = machine.links.link_mut(index) else { return };
+        let Some(caller) = link.peer.clone() else { return };
+        let (ticket, stream) = (call.ticket, link.stream);
+        if service.detached {
+            link.session.detach(ticket);
+        }
+        let handle = UnitHandle::new(Rc::downgrade(shared), host);
+        let told = Call {
+            unit: handle.clone(),
+            caller: caller.clone(),
+            function: Rc::clone(&function),
+            priority: call.priority,
+            wants_reply: call.wants_reply,
+            deadline: call.deadline,
+            service: Rc::clone(&service),
+        };
+        let owner = Owner { host, life: unit.life };
+        let job = async move {
+            let outcome = service.run(told, parameters).await;
+            handle.answer(stream, ticket, outcome.map_err(Error::Service));
+        };
+        self.spawned.push((owner, Box::pin(job)));
+        self.log(shared, host, UnitEvent::Called { function: function.to_string(), caller });
+    }
+
+    /// The safe hook runs before any other work of any unit.
+    fn lease_expired(&mut self, shared: &Rc<Shared>, host: HostId, slot: Slot) {
+        let Some(machine) = &self.units[host.index()].machine else { return };
+        let Some(function) = machine.links.functions.function(slot) else { return };
+        let Handler(service) = function.handler;
+        let (service, function) = (Rc::clone(service), function.name().to_owned());
+        let handle = UnitHandle::new(Rc::downgrade(shared), host);
+        self.urgent.push_front(Box::new(move || {
+            if let Some(hook) = &service.safe_hook {
+                hook(&handle);
+            }
+        }));
+        self.log(shared, host, UnitEvent::LeaseExpired { function });
+    }
+
+    fn log_of(
+        &mut self,
+        shared: &Rc<Shared>,
+        host: HostId,
+        peer: Option<Identity>,
+        event: impl FnOnce(Identity) -> UnitEvent,
+    ) {
+        if let Some(peer) = peer {
+            self.log(shared, host, event(peer));
+        }
+    }
+
+    fn log(&mut self, shared: &Rc<Shared>, host: HostId, event: UnitEvent) {
+        let now = self.network.now();
+        let unit = &mut self.units[host.index()];
+        for hook in &unit.hooks {
+            let (hook, event, handle) = (Rc::clone(hook), event.clone(), UnitHandle::new(Rc::downgrade(shared), host));
+            self.urgent.push_back(Box::new(move || hook(&handle, &event)));
+        }
+        unit.log.push((now, event));
+    }
+}

@@ -1,0 +1,176 @@
+//! Requests of a unit: the paper's two forms, to one node and to all, and the leases that they hold.
+
+use cara_core::distribution::identity::Identity;
+use cara_core::distribution::parameters::ParametersView;
+use cara_core::error::Error;
+use cara_core::services::requests::CallId;
+use cara_core::services::unit::RequestOptions;
+
+use super::handle::{Peer, UnitHandle};
+use super::replies::{Promise, Waiting};
+use super::service::{BoxedParameters, boxed_parameters};
+use crate::event::StreamId;
+
+impl UnitHandle {
+    /// The paper's asynchronous request: returns at once, and leaves the parameters as they are.
+    pub fn request(&self, peer: impl Into<Peer>, function: &str, parameters: &ParametersView) -> Result<CallId, Error> {
+        self.request_with(peer, function, parameters, RequestOptions::default())
+    }
+
+    /// As [`Self::request`], with options.
+    pub fn request_with(
+        &self,
+        peer: impl Into<Peer>,
+        function: &str,
+        parameters: &ParametersView,
+        options: RequestOptions,
+    ) -> Result<CallId, Error> {
+        let index = self.link_to(&peer.into())?;
+        let requested = self
+            .machine(|machine, network| machine.links.request(network, index, function, parameters, &options, None))?;
+        self.work(index);
+        requested
+    }
+
+    /// The asynchronous request to every connected node, with an outcome for each.
+    pub fn request_all(&self, function: &str, parameters: &ParametersView) -> Vec<(Identity, Result<CallId, Error>)> {
+        self.peers().into_iter().map(|peer| (peer.clone(), self.request(&peer, function, parameters))).collect()
+    }
+
+    /// The paper's synchronous request: waits for the reply, which updates the parameters; on an error they are
+    /// unchanged. Waits inside the deadline for the minimum interval to pass.
+    pub async fn block_request(
+        &self,
+        peer: impl Into<Peer>,
+        function: &str,
+        parameters: &mut ParametersView,
+    ) -> Result<(), Error> {
+        self.block_request_with(peer, function, parameters, RequestOptions::default()).await
+    }
+
+    /// As [`Self::block_request`], with options.
+    pub async fn block_request_with(
+        &self,
+        peer: impl Into<Peer>,
+        function: &str,
+        parameters: &mut ParametersView,
+        options: RequestOptions,
+    ) -> Result<(), Error> {
+        let peer = peer.into();
+        let timeout = options.timeout.unwrap_or(self.constraints()?.request_timeout);
+        let deadline = self.now() + timeout;
+        loop {
+            let options = RequestOptions { timeout: Some(deadline.since(self.now())), ..options };
+            match self.call(&peer, function, parameters, &options) {
+                Ok(call) => {
+                    let results = call.promise.clone().await?;
+                    return parameters.copy_from(&results);
+                }
+                Err(Error::TooSoon { wait }) if self.now() + wait < deadline => self.sleep(wait).await,
+                Err(error) => return Err(error),
+            }
+        }
+    }
+
+    /// The synchronous request to every connected node at the same time, with an outcome for each.
+    pub async fn block_request_all(
+        &self,
+        function: &str,
+        parameters: &ParametersView,
+    ) -> Vec<(Identity, Result<BoxedParameters, Error>)> {
+        let options = RequestOptions::default();
+        let calls: Vec<_> = self
+            .peers()
+            .into_iter()
+            .map(|peer| (peer.clone(), self.call(&Peer::Is(peer), function, parameters, &options)))
+            .collect();
+        let mut outcomes = Vec::new();
+        for (peer, call) in calls {
+            outcomes.push((
+                peer,
+                match call {
+                    Ok(call) => call.promise.clone().await,
+                    Err(error) => Err(error),
+                },
+            ));
+        }
+        outcomes
+    }
+
+    /// Gives up the lease that it holds on a function of a peer, which stops what that started.
+    pub fn release(&self, peer: impl Into<Peer>, function: &str) -> Result<(), Error> {
+        let index = self.link_to(&peer.into())?;
+        self.machine(|machine, network| {
+            let released = machine.links.with(network, index, |session, cx| {
+                let slot = session.their_function_list().find(function).ok_or(Error::UnknownFunction)?;
+                session.release(cx, slot);
+                Ok(())
+            });
+            released.unwrap_or(Err(Error::NotConnected))
+        })??;
+        self.work(index);
+        Ok(())
+    }
+
+    /// What a leased service of this unit started is finished: its lease ends, and no safe hook runs.
+    pub fn end_lease(&self, function: &str) -> Result<(), Error> {
+        let slot = self.machine(|machine, _| machine.links.functions.find(function))?.ok_or(Error::UnknownFunction)?;
+        self.each_live_link(|links, network, index| {
+            links.with(network, index, |session, cx| session.end_lease(cx, slot));
+        });
+        Ok(())
+    }
+
+    /// Whether the lease of one of its own services is live now; false for one without a lease.
+    pub fn lease_is_live(&self, function: &str) -> bool {
+        let live = self.machine(|machine, network| {
+            let functions = &machine.links.functions;
+            let function = functions.find(function).and_then(|slot| functions.function(slot))?;
+            function.handler.0.lease_is_live(network.now())
+        });
+        matches!(live, Ok(Some(true)))
+    }
+
+    /// Sends a call whose end the promise tells; giving up the returned value gives up the call.
+    fn call(
+        &self,
+        peer: &Peer,
+        function: &str,
+        parameters: &ParametersView,
+        options: &RequestOptions,
+    ) -> Result<InFlight, Error> {
+        let index = self.link_to(peer)?;
+        let mut copy = boxed_parameters(size_of_val(parameters));
+        copy.copy_from(parameters)?;
+        let promise = Promise::new();
+        let waiting = Waiting { parameters: copy, promise: promise.clone() };
+        let requested = self.machine(|machine, network| {
+            let stream = machine.links.link(index).map(|link| link.stream).ok_or(Error::NotConnected)?;
+            let id = machine.links.request(network, index, function, parameters, options, Some(waiting))?;
+            Ok((stream, id))
+        })?;
+        self.work(index);
+        requested.map(|(stream, id)| InFlight { unit: self.clone(), stream, id, promise })
+    }
+}
+
+/// A call in flight, which is given up when this is dropped.
+struct InFlight {
+    unit: UnitHandle,
+    stream: StreamId,
+    id: CallId,
+    promise: Promise<Result<BoxedParameters, Error>>,
+}
+
+impl Drop for InFlight {
+    fn drop(&mut self) {
+        if self.unit.shared.strong_count() == 0 {
+            return;
+        }
+        let _ = self.unit.machine(|machine, _| {
+            if let Some(index) = machine.links.of_stream(self.stream) {
+                machine.links.cancel(index, self.id);
+            }
+        });
+    }
+}
