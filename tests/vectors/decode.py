@@ -15,7 +15,9 @@ import time
 import zlib
 from pathlib import Path
 
-import cara_wire as wire
+sys.dont_write_bytecode = True
+
+import cara_wire as wire  # noqa: E402
 
 HERE = Path(__file__).resolve().parent
 PAYLOADS = {"hello": "hello", "session": "session_body"}
@@ -144,6 +146,18 @@ def check(vector):
     return wrong, count
 
 
+def check_answer(answer):
+    """The differences of what a unit answers: it is read, and encoded again, like a stream."""
+    wide = {"chunk_limit": 4096, "message_limit": 32800}
+    data = bytes.fromhex(answer["answer"])
+    value = decode("stream", wide, data)
+    if canonical(value) != canonical(answer["value"]):
+        return ["is answered with %s instead of %s" % (value, answer["value"])]
+    for given in answer["given"]:
+        decode("stream", wide, bytes.fromhex(given))
+    return differences_again("stream", wide, value, data)
+
+
 def check_document(vectors):
     """Every example of the document is a vector."""
     wrong = []
@@ -167,13 +181,16 @@ def main():
         differences, count = check(vector)
         wrong += ["%s %s" % (name, difference) for difference in differences]
         total += count
+    for answer in document["answers"]:
+        wrong += ["%s %s" % (answer["name"], difference) for difference in check_answer(answer)]
     differences, examples = check_document(vectors)
     wrong += differences
     for line in wrong:
         print(line, file=sys.stderr)
     seconds = time.monotonic() - begin
-    print("%d vectors, %d mutations, %d examples, %d differences, %.1f s" % (len(vectors), total, examples, len(wrong), seconds))
-    return 1 if wrong or not vectors else 0
+    counts = (len(vectors), total, len(document["answers"]), examples, len(wrong), seconds)
+    print("%d vectors, %d mutations, %d answers, %d examples, %d differences, %.1f s" % counts)
+    return 1 if wrong or 0 in counts[:4] else 0
 
 
 if __name__ == "__main__":

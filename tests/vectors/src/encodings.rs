@@ -235,7 +235,7 @@ fn manager(name: &str, id: u32) -> Manager {
     Manager { name: name.try_into().unwrap_or_default(), id }
 }
 
-fn encoded_hello(hello: &Hello) -> Vec<u8> {
+pub(crate) fn encoded_hello(hello: &Hello) -> Vec<u8> {
     let mut bytes = vec![0; 320];
     let length = hello.encode(&mut bytes).unwrap_or(0);
     bytes.truncate(length);

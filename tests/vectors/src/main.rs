@@ -4,10 +4,13 @@
 //! test of this crate does; with `-- --write` it writes the file. `tests/vectors/decode.py`, written from
 //! `docs/wire.md`, reads the same file.
 
+mod answers;
 mod decoded;
 mod encodings;
+mod side;
 mod stream;
 mod streams;
+mod talk;
 mod vector;
 
 use std::path::PathBuf;
@@ -16,6 +19,7 @@ use anyhow::{Context as _, Result, bail};
 use serde::Serialize;
 use serde_json::Value;
 
+use crate::answers::Answer;
 use crate::vector::Vector;
 
 fn main() -> Result<()> {
@@ -36,11 +40,13 @@ fn file() -> PathBuf {
 struct Document {
     version: u8,
     vectors: Vec<Vector>,
+    answers: Vec<Answer>,
 }
 
 impl Document {
     fn new() -> Self {
-        Self { version: cara_core::config::VERSION, vectors: [encodings::all(), streams::all()].concat() }
+        let vectors = [encodings::all(), streams::all(), talk::all()].concat();
+        Self { version: cara_core::config::VERSION, vectors, answers: answers::all() }
     }
 }
 

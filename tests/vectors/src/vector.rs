@@ -123,7 +123,9 @@ impl Vector {
 }
 
 /// Longer vectors have single bits mutated only.
-const LONG: usize = 100;
+const LONG: usize = 64;
+/// The same of streams, whose messages are vectors of their own.
+const LONG_STREAM: usize = 24;
 
 /// What becomes of a vector when one byte of it takes every other value.
 #[derive(Clone, Debug, Serialize)]
@@ -138,7 +140,7 @@ pub(crate) struct Mutations {
 
 impl Mutations {
     fn of(kind: Kind, context: &Context, bytes: &[u8]) -> Self {
-        let bits_only = bytes.len() > LONG;
+        let bits_only = bytes.len() > if kind == Kind::Stream { LONG_STREAM } else { LONG };
         let mut bytes = bytes.to_vec();
         let mut crc = Crc::new();
         let mut runs: Vec<(u32, u32)> = Vec::new();

@@ -1,0 +1,298 @@
+//! What a unit answers to bytes that it must not take as they are, and to a few that it must: the rules of
+//! `docs/wire.md`, sections 8 and 12 to 15, as the core's session keeps them.
+
+use cara_core::config::Priority;
+use cara_core::distribution::function_list::{Generation, Slot};
+use cara_core::distribution::hello::Hello;
+use cara_core::distribution::message::{Control, Renewal, RequestHeader, SessionBody, encode_reply};
+use cara_core::error::Error;
+use cara_core::host::frame::Frame;
+use cara_core::time::Duration;
+use serde::Serialize;
+use serde_json::{Value, json};
+
+use crate::decoded::hex;
+use crate::encodings::{agv_hello, encoded_hello, manager_hello};
+use crate::side::{Side, Written};
+use crate::stream;
+use crate::streams::{chunked, frame};
+use crate::talk::live;
+use crate::vector::{Context, canonical};
+
+/// What comes, and what is answered to it in the stream.
+#[derive(Clone, Debug, Serialize)]
+pub(crate) struct Answer {
+    name: &'static str,
+    about: &'static str,
+    /// `live`: the s_unit of the conversation, after `talk_list_ack`. `fresh`: its manager, which has accepted a
+    /// connection. `slow`: as `live`, with a minimum interval of 10 ms.
+    link: &'static str,
+    /// Bytes of the stream that come in; each piece is dealt with before the next one comes.
+    given: Vec<String>,
+    /// Time that passes afterwards, in milliseconds.
+    wait: u64,
+    /// Bytes of the stream that are written then, keep-alives left out.
+    answer: String,
+    value: Value,
+}
+
+/// Every answer.
+pub(crate) fn all() -> Vec<Answer> {
+    [frames(), handshakes(), messages(), requests(), leases(), silence()].concat()
+}
+
+type Case<G> = (&'static str, &'static str, &'static str, G, u64, Value);
+
+/// Bytes that come in, in pieces.
+type Given = Vec<Vec<u8>>;
+
+fn answers<const N: usize>(cases: [Case<Vec<u8>>; N]) -> Vec<Answer> {
+    let in_one = |(name, about, link, given, wait, expected)| answer((name, about, link, vec![given], wait, expected));
+    cases.into_iter().map(in_one).collect()
+}
+
+/// Plays a case, and fails if the answer is another than expected.
+fn answer((name, about, link, given, wait, expected): Case<Given>) -> Answer {
+    let mut side = match link {
+        "fresh" => Side::new(manager_hello(), false, &[]),
+        "slow" => live(slow_hello()).0,
+        _ => live(agv_hello()).0,
+    };
+    let _ = side.written();
+    let mut bytes = Vec::new();
+    for piece in &given {
+        side.hear(&Written::Stream(piece.clone()));
+        bytes.extend(stream_bytes(&mut side));
+    }
+    for _ in 0..wait {
+        side.wait(Duration::from_millis(1));
+        side.poll();
+        bytes.extend(stream_bytes(&mut side));
+    }
+    let value = stream::decode(&Context::limits(4096, 32_800), &bytes);
+    assert_eq!(canonical(&value), canonical(&expected), "{name} is answered otherwise");
+    let given = given.iter().map(|piece| hex(piece)).collect();
+    Answer { name, about, link, given, wait, answer: hex(&bytes), value }
+}
+
+fn stream_bytes(side: &mut Side) -> Vec<u8> {
+    let keep_alive = |bytes: &[u8]| bytes.starts_with(&[10, 0, 6, 1]);
+    let pieces = side.written().into_iter().filter_map(|piece| match piece {
+        Written::Stream(bytes) if !keep_alive(&bytes) => Some(bytes),
+        _ => None,
+    });
+    pieces.flatten().collect()
+}
+
+fn slow_hello() -> Hello {
+    let mut hello = agv_hello();
+    hello.limits.minimum_interval = 10_000;
+    hello
+}
+
+fn normal(message: &[u8]) -> Vec<u8> {
+    chunked(1024, Priority::Normal, message)
+}
+
+fn control(control: &Control<'_>) -> Vec<u8> {
+    let mut bytes = [0; 128];
+    normal(control.encode(&mut bytes).unwrap_or(&[]))
+}
+
+fn close(code: u8) -> Value {
+    json!([{ "close": code }])
+}
+
+fn frames() -> Vec<Answer> {
+    let long = [&[0x00, 0x04, 0x11, 2][..], &1057_u32.to_le_bytes(), &[0; 1018]].concat();
+    answers([
+        ("ping", "answered at once", "live", frame(&Frame::Ping), 0, json!(["pong"])),
+        ("pong_unasked", "no harm", "live", frame(&Frame::Pong), 0, json!([])),
+        ("frame_unknown", "there is no kind 7", "live", vec![1, 0, 7], 0, close(5)),
+        ("frame_oversize", "1,025 bytes, 1,024 are taken", "live", vec![0x01, 0x04], 0, close(6)),
+        ("message_oversize", "1,057 bytes, 1,024 + 32 are taken", "live", long, 0, close(6)),
+        ("chunk_without_first", "nothing was begun", "live", vec![3, 0, 0x12, 2, 9], 0, close(5)),
+        ("second_hello", "one is enough", "live", frame(&Frame::Hello(&encoded_hello(&manager_hello()))), 0, close(5)),
+        ("session_body_unknown", "dropped", "live", frame(&Frame::Session(&[9, 9])), 0, json!([])),
+    ])
+}
+
+fn handshakes() -> Vec<Answer> {
+    let mut version = encoded_hello(&agv_hello());
+    version[4] = 2;
+    let mut magic = version.clone();
+    magic[0] = b'X';
+    let mut small = agv_hello();
+    small.limits.chunk_size = 319;
+    let small = encoded_hello(&small);
+    let refuse = |code: u8| json!([{ "refuse": code }]);
+    answers([
+        ("other_version", "version 2", "fresh", frame(&Frame::Hello(&version)), 0, refuse(1)),
+        ("other_magic", "not of this mode", "fresh", frame(&Frame::Hello(&magic)), 0, refuse(8)),
+        ("small_chunks", "a chunk limit of 319", "fresh", frame(&Frame::Hello(&small)), 0, refuse(8)),
+        ("ping_before_hello", "too early", "fresh", frame(&Frame::Ping), 0, close(5)),
+        ("no_hello", "none within 2 s", "fresh", Vec::new(), 2_000, close(7)),
+    ])
+}
+
+fn messages() -> Vec<Answer> {
+    let publish =
+        Control::Publish { slot: 0, generation: 0, attributes: [2, 0, 0, 0, 0, 0, 0, 0], signature: &[0, 0, 0] };
+    let ack = json!([{ "priority": "high", "message": { "list_ack": { "serial": 9, "skipped": 0 } } }]);
+    answers([
+        ("message_unknown", "there is no kind 5", "live", normal(&[5; 16]), 0, close(5)),
+        (
+            "failure_of_nothing",
+            "a failure needs an error",
+            "live",
+            normal(&[4, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]),
+            0,
+            close(5),
+        ),
+        ("reply_to_nobody", "dropped", "live", normal(&encode_reply(77, Err(Error::Busy))), 0, json!([])),
+        ("publish_malformed", "a function without a name", "live", control(&publish), 0, close(5)),
+        ("withdraw_unknown", "no harm", "live", control(&Control::Withdraw { slot: 77 }), 0, json!([])),
+        ("list_end", "acknowledged", "live", control(&Control::ListEnd { serial: 9 }), 0, ack),
+    ])
+}
+
+/// A request of the s_unit's function in `slot`. The newest keep-alive of it that the manager has heard was made at
+/// 1,001,000 of its clock, which is now.
+fn header(id: u32, slot: u16) -> RequestHeader {
+    RequestHeader {
+        id,
+        slot: Slot(slot),
+        generation: Generation(0),
+        wants_reply: true,
+        remaining: Duration::from_secs(1),
+        stamp: 1_001_000,
+        since: Duration::ZERO,
+    }
+}
+
+fn request(header: RequestHeader, block: &[u8]) -> Vec<u8> {
+    normal(&[&header.encode()[..], block].concat())
+}
+
+fn refused(id: u32, error: Value) -> Value {
+    json!({ "priority": "normal", "message": { "reply": { "id": id, "error": error } } })
+}
+
+fn requests() -> Vec<Answer> {
+    let first = || header(1, 0);
+    let publish = json!({ "priority": "high", "message": { "publish": {
+        "slot": 0, "generation": 0, "attributes": "0200000000000000",
+        "signature": "08706f735f696e666f0001000802000000706f736974696f6e",
+    }}});
+    let news = json!([
+        refused(1, json!("stale_function")), publish,
+        { "priority": "high", "message": { "list_end": { "serial": 1 } } },
+    ]);
+    let one_way = json!([{ "priority": "normal", "message": { "failure": { "id": 1, "error": "unknown_function" } } }]);
+    let twice = [request(first(), &[]), request(first(), &[])].concat();
+    let below = [request(header(100, 0), &[]), request(header(36, 0), &[]), request(header(37, 0), &[])].concat();
+    let many = (1..=9).flat_map(|id| request(header(id, 0), &[])).collect();
+    let three = (1..=3).flat_map(|id| request(header(id, 0), &[])).collect();
+    let future = RequestHeader { stamp: 1_001_001, ..first() };
+    let late = RequestHeader { stamp: 1_000_000, remaining: Duration::from_micros(1_000), ..first() };
+    let just = RequestHeader { stamp: 1_000_000, remaining: Duration::from_micros(1_001), ..first() };
+    let unknown = RequestHeader { wants_reply: false, ..header(1, 7) };
+    answers([
+        ("request_accepted", "it runs, and is answered later", "live", request(first(), &[]), 0, json!([])),
+        (
+            "request_unknown",
+            "slot 7 was never published",
+            "live",
+            request(header(1, 7), &[]),
+            0,
+            json!([refused(1, json!("unknown_function"))]),
+        ),
+        ("request_unknown_one_way", "the same without waiting", "live", request(unknown, &[]), 0, one_way),
+        (
+            "request_stale_function",
+            "another generation: refused, and the news again",
+            "live",
+            request(RequestHeader { generation: Generation(9), ..first() }, &[]),
+            0,
+            news,
+        ),
+        (
+            "request_malformed",
+            "a block of 8 bytes where none belongs",
+            "live",
+            request(first(), &[0; 8]),
+            0,
+            json!([refused(1, json!("malformed"))]),
+        ),
+        (
+            "request_from_the_future",
+            "a stamp of 1 us from now",
+            "live",
+            request(future, &[]),
+            0,
+            json!([refused(1, json!("malformed"))]),
+        ),
+        (
+            "request_expired",
+            "exactly as old as its remaining time",
+            "live",
+            request(late, &[]),
+            0,
+            json!([refused(1, json!("expired"))]),
+        ),
+        ("request_in_time", "1 us younger: it runs", "live", request(just, &[]), 0, json!([])),
+        ("request_twice", "the second copy is dropped without an answer", "live", twice, 0, json!([])),
+        (
+            "request_below_window",
+            "64 below the newest is refused, 63 runs",
+            "live",
+            below,
+            0,
+            json!([refused(36, json!("stale"))]),
+        ),
+        (
+            "request_busy",
+            "eight calls are held, the ninth is refused",
+            "live",
+            many,
+            0,
+            json!([refused(9, json!("busy"))]),
+        ),
+        (
+            "request_too_soon",
+            "one may come early, not two",
+            "slow",
+            three,
+            0,
+            json!([refused(3, json!({ "too_soon": { "wait": 10_000 } }))]),
+        ),
+    ])
+}
+
+fn leases() -> Vec<Answer> {
+    let position = [[3, 0, 0, 0, 0, 0, 0, 0], [4, 0, 0, 0, 0, 0, 0, 0]].concat();
+    let go_to = RequestHeader { wants_reply: false, ..header(1, 1) };
+    let old = RequestHeader { stamp: 501_000, remaining: Duration::from_secs(9), ..go_to };
+    let renewal = Renewal { slot: Slot(1), generation: Generation(0), stamp: 1_001_000, since: Duration::ZERO };
+    let renew = frame(&Frame::Session(&SessionBody::renewal(&renewal)));
+    let started = request(go_to, &position);
+    let released = vec![started.clone(), control(&Control::Release { slot: 1 })];
+    let ended = |expired: bool| json!([{ "priority": "high", "message": { "lease_ended": { "slot": 1, "expired": expired } } }]);
+    let failure = json!([{ "priority": "normal", "message": { "failure": { "id": 1, "error": "expired" } } }]);
+    let lease_released = answer(("lease_released", "it ends without an answer", "live", released, 600, json!([])));
+    let mut leases = answers([
+        ("lease_expires", "500 ms after the request was made", "live", started.clone(), 500, ended(true)),
+        ("lease_lives", "1 ms less", "live", started, 499, json!([])),
+        ("renewal_of_nothing", "no lease runs", "live", renew, 0, ended(false)),
+        ("lease_over", "made 500 ms ago, though its deadline is later", "live", request(old, &position), 0, failure),
+    ]);
+    leases.push(lease_released);
+    leases
+}
+
+fn silence() -> Vec<Answer> {
+    answers([
+        ("silence", "datagrams have come before: 3.5 pauses of 1 s", "live", Vec::new(), 3_500, close(3)),
+        ("not_yet_silence", "1 ms less", "live", Vec::new(), 3_499, json!([])),
+    ])
+}
