@@ -13,7 +13,7 @@ use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 use cara_core::time::{Duration, Instant};
 
-use crate::event::{HostId, NetEvent};
+use crate::event::HostId;
 use crate::faults::FaultCounts;
 use crate::network::Network;
 use crate::plan::{Crash, FaultPlan};
@@ -123,8 +123,6 @@ impl World {
             network: Network::new(seed),
             units: Vec::new(),
             sleepers: Queue::new(),
-            suspended: Vec::new(),
-            held: VecDeque::new(),
             urgent: VecDeque::new(),
             spawned: Vec::new(),
         };
@@ -246,12 +244,10 @@ impl World {
         self.settle();
     }
 
-    /// The unit's machine sleeps for `span`, as a closed laptop does: what arrives and what is due waits, and comes all
-    /// at once when it wakes.
+    /// The unit sees and does nothing for `span`, as on a laptop that is closed; what it has missed comes all at once
+    /// after that.
     pub fn suspend(&mut self, unit: &UnitHandle, span: Duration) {
-        let mut inner = self.shared.inner.borrow_mut();
-        let until = inner.network.now() + span;
-        inner.suspended.push((unit.host(), until));
+        self.network(|network| network.suspend(unit.host(), span));
     }
 
     /// Does what is due at this very instant.
@@ -318,9 +314,9 @@ impl Shared {
     }
 
     fn advance(self: &Rc<Self>, limit: Instant) -> bool {
-        let sleeper = self.inner.borrow().next_time();
+        let sleeper = self.inner.borrow().sleepers.next_time();
         let until = sleeper.map_or(limit, |at| at.min(limit));
-        let event = self.inner.borrow_mut().next_event_until(until);
+        let event = self.inner.borrow_mut().network.next_event_until(until);
         if let Some(event) = event {
             let ended = self.with(|inner| inner.dispatch(self, event));
             if let Some(host) = ended {

@@ -113,7 +113,7 @@ fn a_unit_that_is_stopped_says_so() {
 fn a_suspended_manager_counts_one_missed_keep_alive_and_its_vehicles_come_back() {
     let (mut world, manager, agv) = pair(9);
     world.run_for(secs(3));
-    world.network(|network| network.suspend(manager.host(), secs(60)));
+    world.suspend(&manager, secs(60));
     world.run_for(secs(61));
     let silent = UnitEvent::Left { peer: manager.identity(), reason: CloseReason::Silent };
     assert_eq!(agv.count(|event| *event == silent), 1, "the vehicle heard nothing for a minute");
