@@ -21,20 +21,32 @@ use crate::time::{Duration, Instant};
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct PeerClock {
     stamp: u64,
-    heard: Instant,
+    /// When the stamp came; nothing has come before.
+    heard: Option<Instant>,
 }
 
+/// A sample of the peer's clock counts for this long, however late the newer ones came.
+const SAMPLE_LIFE: Duration = Duration::from_secs(10);
+/// Part of the time since a sample by which the two clocks may have drifted apart.
+const DRIFT: u64 = 1_000;
+
 impl PeerClock {
-    /// Notes the peer's clock; an older stamp than the one known came late and is passed over.
+    /// Notes the peer's clock. A sample that was held up on its way would make everything that is sent look old, so it
+    /// is passed over while a better one is fresh.
     pub(super) fn hear(&mut self, now: Instant, stamp: u64) {
-        if stamp >= self.stamp {
-            *self = Self { stamp, heard: now };
+        let better = self.heard.is_none_or(|heard| {
+            let elapsed = now.since(heard);
+            let expected = Duration::from_micros(self.stamp) + elapsed - elapsed.divided_by(DRIFT);
+            Duration::from_micros(stamp) >= expected || elapsed >= SAMPLE_LIFE
+        });
+        if better {
+            *self = Self { stamp: stamp.max(self.stamp), heard: Some(now) };
         }
     }
 
     /// (the stamp, time since it was heard).
     pub(super) fn tell(&self, now: Instant) -> (u64, Duration) {
-        (self.stamp, now.since(self.heard))
+        (self.stamp, self.heard.map_or(Duration::ZERO, |heard| now.since(heard)))
     }
 }
 
@@ -167,11 +179,15 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     fn send_keep_alive<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
-        self.timers.keep_alive = cx.now + self.constraints.keep_alive.max(Duration::from_millis(1));
+        // The peer counts by what it was told in the hello.
+        let told = Duration::from_millis(u64::from(self.local.keep_alive));
+        self.timers.keep_alive = cx.now + self.constraints.keep_alive.min(told).max(Duration::from_millis(1));
         let body = SessionBody::keep_alive(cx.now.as_micros());
         self.send_datagram(cx, &body, &[]);
         if !self.liveness.datagrams_pass() {
             self.link.send_frame(&Frame::Session(&body));
+            // A peer whose datagrams do not pass may hear ours, and then it sends nothing in the stream unless asked.
+            self.link.send_frame(&Frame::Ping);
             self.flush(cx);
         }
     }
@@ -213,12 +229,16 @@ impl<S: Storage, C: Secure> Session<S, C> {
         cx: &mut Context<'_, S, M, B, H>,
         granted: Granted,
     ) -> Result<(), Error> {
-        match self.granted.iter_mut().find(|known| known.slot == granted.slot) {
-            Some(known) => *known = Granted { end: granted.end.max(known.end), ..granted },
+        let known = self.granted.iter_mut().find(|known| known.slot == granted.slot);
+        // What came late on its way takes nothing away from what came before it.
+        let end = known.as_ref().map_or(granted.end, |known| known.end.max(granted.end));
+        let granted = Granted { end, ..granted };
+        match known {
+            Some(known) => *known = granted,
             None => self.granted.push(granted).map_err(|_| Error::Full(crate::error::Limit::Leases))?,
         }
-        self.timers.lease = self.timers.lease.min(granted.end);
-        renew_service_lease(cx, granted.slot, granted.end);
+        self.timers.lease = self.timers.lease.min(end);
+        renew_service_lease(cx, granted.slot, end);
         Ok(())
     }
 
@@ -227,7 +247,8 @@ impl<S: Storage, C: Secure> Session<S, C> {
         cx: &mut Context<'_, S, M, B, H>,
         renewal: &Renewal,
     ) {
-        let known = self.granted.iter().find(|g| g.slot == renewal.slot && g.generation == renewal.generation);
+        let current = cx.functions.lookup(renewal.slot, renewal.generation).is_ok();
+        let known = self.granted.iter().find(|g| current && (g.slot, g.generation) == (renewal.slot, renewal.generation));
         let Some(granted) = known.copied() else {
             self.link.counters.add(LinkCounter::RenewalsIgnored, 1);
             self.send_control(cx, &Control::LeaseEnded { slot: renewal.slot.0, expired: false });
