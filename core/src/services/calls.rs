@@ -130,15 +130,18 @@ impl<S: Storage> Calls<S> {
         Ok(())
     }
 
-    /// Whether a call of this class may begin at once.
+    /// Whether a call of this class may begin at once: nothing of the class runs or waits, and no other class has a call
+    /// that came before and may begin.
     pub(crate) fn is_idle(&self, priority: Priority) -> bool {
-        let index = usize::from(priority.to_wire());
-        let active = self.active.get(index).is_some_and(Option::is_some);
-        let waiting = match queue_index(priority) {
+        let active = self.active.get(usize::from(priority.to_wire())).is_some_and(Option::is_some);
+        !active && !self.is_waiting(priority) && (priority == Priority::Emergency || !self.can_begin())
+    }
+
+    fn is_waiting(&self, priority: Priority) -> bool {
+        match queue_index(priority) {
             None => self.emergency.is_some(),
             Some(index) => self.queues.get(index).is_some_and(Option::is_some),
-        };
-        !active && !waiting
+        }
     }
 
     /// [`Error::Busy`] when the peer has as many calls here as it may.
@@ -246,10 +249,7 @@ impl<S: Storage> Calls<S> {
     fn next_class(&self) -> Option<Priority> {
         Priority::ALL.into_iter().find(|&class| {
             let idle = self.active.get(usize::from(class.to_wire())).is_some_and(Option::is_none);
-            idle && match queue_index(class) {
-                None => self.emergency.is_some(),
-                Some(index) => self.queues.get(index).is_some_and(Option::is_some),
-            }
+            idle && self.is_waiting(class)
         })
     }
 

@@ -184,9 +184,9 @@ impl<S: Storage, C: Secure> Link<S, C> {
         Ok(())
     }
 
-    /// Whether bytes wait to be written: the port asks to be told when the stream is writable.
+    /// Whether the network did not take all that it was offered: the port asks to be told when the stream is writable.
     pub fn wants_to_write(&self) -> bool {
-        !self.sender.is_empty()
+        self.sender.is_blocked()
     }
 
     /// Bytes that wait to be written.

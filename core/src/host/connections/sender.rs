@@ -26,7 +26,7 @@ pub(super) struct Sender<S: Storage> {
     /// The lane whose frames were sealed last and are not all written, or whose message is not complete.
     current: Option<usize>,
     /// The network did not take all that it was offered, and something of it still waits.
-    congested: bool,
+    blocked: bool,
 }
 
 /// The framed messages of one class: written up to `start`, sealed up to `sealed`, filled up to `end`.
@@ -56,7 +56,7 @@ impl<S: Storage> Sender<S> {
             urgent_sealed: 0,
             lanes: [const { None }; 3],
             current: None,
-            congested: false,
+            blocked: false,
         }
     }
 
@@ -64,8 +64,9 @@ impl<S: Storage> Sender<S> {
         self.cut.chunk = chunk;
     }
 
-    pub(super) fn is_empty(&self) -> bool {
-        self.urgent.is_empty() && self.lanes.iter().all(Option::is_none)
+    /// The network did not take all that it was offered.
+    pub(super) const fn is_blocked(&self) -> bool {
+        self.blocked
     }
 
     pub(super) fn queued(&self) -> usize {
@@ -130,11 +131,11 @@ impl<S: Storage> Sender<S> {
         while self.write_sealed::<C>(id, mailman, &mut written)? == Progress::Through {
             self.give_drained(buffers);
             if !self.seal_next(cipher)? {
-                self.congested = false;
+                self.blocked = false;
                 return Ok(written);
             }
         }
-        self.congested = true;
+        self.blocked = true;
         Ok(written)
     }
 
@@ -187,7 +188,7 @@ impl<S: Storage> Sender<S> {
         let Some(Some(lane)) = self.current.and_then(|index| self.lanes.get_mut(index)) else { return Ok(false) };
         let enough = match C::OVERHEAD {
             0 => usize::MAX,
-            _ if self.congested => 1,
+            _ if self.blocked => 1,
             _ => self.cut.chunk,
         };
         lane.seal(cipher, enough)?;
@@ -219,6 +220,7 @@ impl<S: Storage> Sender<S> {
         }
         self.urgent.clear();
         self.urgent_sealed = 0;
+        self.blocked = false;
     }
 }
 

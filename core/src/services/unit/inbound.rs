@@ -162,7 +162,8 @@ impl<S: Storage, C: Secure> Session<S, C> {
                 self.flush(cx);
                 Outcome::Nothing
             }
-            (Incoming::Pong, Phase::Live) => Event::Answered.into(),
+            (Incoming::Pong, Phase::Live) if core::mem::take(&mut self.challenged) => Event::Answered.into(),
+            (Incoming::Pong, Phase::Live) => Outcome::Nothing,
             (Incoming::Session(place), Phase::Live) => self.session_body(cx, place, lent),
             (Incoming::Message(priority, place), Phase::Live) => {
                 self.message_arrived(cx, priority, place, lent, arguments)
@@ -335,7 +336,8 @@ impl<S: Storage, C: Secure> Session<S, C> {
             self.link.counters.add(LinkCounter::RequestsRepeated, 1);
             return Outcome::Nothing;
         }
-        let result = self.check_request(cx, priority, header, seen).and_then(|head| {
+        let length = self.link.view(block, lent).len();
+        let result = self.check_request(cx, priority, header, seen, length).and_then(|head| {
             let block = self.link.view(block, lent);
             match arguments.filter(|_| self.calls.is_idle(priority)) {
                 Some(arguments) => {
@@ -362,9 +364,15 @@ impl<S: Storage, C: Secure> Session<S, C> {
         priority: Priority,
         header: &RequestHeader,
         seen: Seen,
+        length: usize,
     ) -> Result<CallHead, Error> {
         if seen == Seen::TooOld {
             return Err(Error::Stale);
+        }
+        // The limit may have become lower while the request was on its way.
+        let limit = self.constraints.message_size;
+        if length > limit as usize {
+            return Err(Error::TooLarge { limit });
         }
         let made = made_at(cx.now, header.stamp, header.since).ok_or(Error::Malformed)?;
         let deadline = made + header.remaining;

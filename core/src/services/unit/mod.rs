@@ -164,6 +164,8 @@ pub struct Session<S: Storage, C: Secure> {
     remote: Option<Remote>,
     peer_address: SocketAddr,
     liveness: Liveness,
+    /// The node waits for a sign of life.
+    challenged: bool,
     clock: PeerClock,
     timers: Timers,
     requests: Requests<S>,
@@ -189,6 +191,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
             remote: None,
             peer_address: address,
             liveness: Liveness::new(now, constraints.keep_alive),
+            challenged: false,
             clock: PeerClock::default(),
             timers: Timers::new(now),
             requests: Requests::new(storage.pending),
@@ -270,7 +273,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         self.calls.held()
     }
 
-    /// Bytes wait for the stream to become writable.
+    /// Bytes wait for the stream to become writable. Those that gather do not: they have a deadline.
     pub fn wants_to_write(&self) -> bool {
         self.link.wants_to_write()
     }
@@ -324,10 +327,13 @@ impl<S: Storage, C: Secure> Session<S, C> {
         self.end(reason);
     }
 
-    /// Asks the peer for a sign of life; it comes as [`Event::Answered`].
+    /// Asks the peer of a live link for a sign of life; it comes as [`Event::Answered`].
     pub fn challenge<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
-        self.link.send_frame(&Frame::Ping);
-        self.flush(cx);
+        if self.phase == Phase::Live {
+            self.challenged = true;
+            self.link.send_frame(&Frame::Ping);
+            self.flush(cx);
+        }
     }
 
     /// The stream takes bytes again.
@@ -359,6 +365,8 @@ impl<S: Storage, C: Secure> Session<S, C> {
     /// A last frame, behind what is being written, as far as the network takes it now.
     fn farewell<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>, frame: &Frame<'_>) {
         if !matches!(self.phase, Phase::Ending(_) | Phase::Ended) {
+            // What was accepted goes first: a frame would overtake it.
+            let _ = self.link.flush(cx.mailman, cx.buffers);
             self.link.send_frame(frame);
             let _ = self.link.flush(cx.mailman, cx.buffers);
         }
@@ -433,3 +441,6 @@ const fn close_reason(code: u8) -> CloseReason {
         _ => CloseReason::Reset,
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -41,7 +41,15 @@ pub(super) struct Publishing<S: Storage> {
 
 impl<S: Storage> Publishing<S> {
     pub(super) fn new(table: S::Slice<Publication>) -> Self {
-        Self { table, dirty: false, serial: 0, end_due: false, acknowledged: 0, acknowledgement_due: None, limits_due: false }
+        Self {
+            table,
+            dirty: false,
+            serial: 0,
+            end_due: false,
+            acknowledged: 0,
+            acknowledgement_due: None,
+            limits_due: false,
+        }
     }
 
     pub(super) fn told(&self, slot: Slot, generation: Generation) -> Told {
@@ -186,12 +194,15 @@ impl<S: Storage, C: Secure> Session<S, C> {
         true
     }
 
-    /// Sends a control message; `false` when there is no room.
+    /// Sends a control message; `false` when there is no room, or nobody to send it to.
     pub(super) fn send_control<M: Mailman, B: Buffers<S>, H: Service>(
         &mut self,
         cx: &mut Context<'_, S, M, B, H>,
         control: &Control<'_>,
     ) -> bool {
+        if self.phase != Phase::Live {
+            return false;
+        }
         let mut bytes = [0; CONTROL_BYTES + PUBLISH_BYTES + SIGNATURE_BYTES];
         let Some(message) = control.encode(&mut bytes) else { return false };
         self.send(cx, Priority::High, message.len(), |writer| writer.put(message)).is_ok()

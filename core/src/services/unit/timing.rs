@@ -248,7 +248,8 @@ impl<S: Storage, C: Secure> Session<S, C> {
         renewal: &Renewal,
     ) {
         let current = cx.functions.lookup(renewal.slot, renewal.generation).is_ok();
-        let known = self.granted.iter().find(|g| current && (g.slot, g.generation) == (renewal.slot, renewal.generation));
+        let known =
+            self.granted.iter().find(|g| current && (g.slot, g.generation) == (renewal.slot, renewal.generation));
         let Some(granted) = known.copied() else {
             self.link.counters.add(LinkCounter::RenewalsIgnored, 1);
             self.send_control(cx, &Control::LeaseEnded { slot: renewal.slot.0, expired: false });

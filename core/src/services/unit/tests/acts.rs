@@ -1,0 +1,186 @@
+//! What a test lets one end do, and asks of it.
+
+use std::boxed::Box;
+use std::vec;
+use std::vec::Vec;
+
+use super::super::RequestOptions;
+use super::setup::{self, Handler, Run};
+use super::side::{Arguments, Happened, Side, context};
+use crate::config::{Constraints, Priority};
+use crate::distribution::function::Definition;
+use crate::distribution::function_list::{Generation, Slot};
+use crate::distribution::message::RequestHeader;
+use crate::distribution::parameters::ParametersView;
+use crate::error::{CloseReason, Error};
+use crate::host::connections::LinkCounter;
+use crate::host::frame::{ChunkWriter, Cut};
+use crate::services::Context;
+use crate::services::requests::CallId;
+use crate::storage::Buffers;
+use crate::time::Duration;
+
+impl Side {
+    pub(super) fn counter(&self, counter: LinkCounter) -> u64 {
+        self.session.counters().value(counter)
+    }
+
+    /// Adds a function that is answered at once.
+    pub(super) fn offer(&mut self, definition: &str, run: fn(&mut ParametersView) -> Result<(), Error>) -> Slot {
+        self.add(definition, 0, Run::Now(run))
+    }
+
+    /// Adds a function whose calls wait for the test's answer.
+    pub(super) fn offer_held(&mut self, definition: &str) -> Slot {
+        self.add(definition, 0, Run::Held)
+    }
+
+    /// Adds a function with a lease, answered at once.
+    pub(super) fn offer_leased(&mut self, definition: &str, lease: Duration) -> Slot {
+        self.add(definition, lease.as_millis(), Run::Now(|_| Ok(())))
+    }
+
+    fn add(&mut self, definition: &str, lease: u64, run: Run) -> Slot {
+        let definition = Definition::parse(definition).unwrap();
+        self.functions.add_function(&definition, setup::attributes(lease), Handler::new(run)).unwrap()
+    }
+
+    /// Publishes everything that it offers.
+    pub(super) fn publish(&mut self) -> u32 {
+        let slots: Vec<Slot> = self.functions.iter().map(|function| function.slot).collect();
+        self.session.publish(context!(self), slots.into_iter())
+    }
+
+    pub(super) fn is_live(&self, slot: Slot) -> bool {
+        self.functions.function(slot).unwrap().handler.lease.is_live(self.now)
+    }
+
+    pub(super) fn request_with(
+        &mut self,
+        function: &str,
+        parameters: &ParametersView,
+        options: &RequestOptions,
+        wants_reply: bool,
+    ) -> Result<CallId, Error> {
+        let id = self.session.request(context!(self), function, parameters, options, wants_reply)?;
+        if wants_reply {
+            let mut results: Arguments = Box::default();
+            results.copy_from(parameters).unwrap();
+            self.results.insert(id, results);
+        }
+        Ok(id)
+    }
+
+    /// A request that waits for its reply.
+    pub(super) fn call(&mut self, function: &str, parameters: &ParametersView) -> Result<CallId, Error> {
+        self.request_with(function, parameters, &RequestOptions::default(), true)
+    }
+
+    /// A request that wants no reply.
+    pub(super) fn tell(&mut self, function: &str, parameters: &ParametersView) -> Result<CallId, Error> {
+        self.request_with(function, parameters, &RequestOptions::default(), false)
+    }
+
+    /// Answers the oldest call that waits.
+    pub(super) fn answer_held(&mut self, result: Result<&ParametersView, Error>) {
+        let call = self.held.remove(0);
+        self.session.answer(context!(self), call.ticket, result).unwrap();
+    }
+
+    pub(super) fn close(&mut self, reason: CloseReason) {
+        self.session.close(context!(self), reason);
+    }
+
+    pub(super) fn accept(&mut self) {
+        self.session.accept(context!(self));
+    }
+
+    pub(super) fn challenge(&mut self) {
+        self.session.challenge(context!(self));
+    }
+
+    pub(super) fn release(&mut self, slot: Slot) {
+        self.session.release(context!(self), slot);
+    }
+
+    pub(super) fn end_lease(&mut self, slot: Slot) {
+        self.session.end_lease(context!(self), slot);
+    }
+
+    pub(super) fn withdraw(&mut self, slot: Slot) -> u32 {
+        self.session.withdraw(context!(self), slot)
+    }
+
+    pub(super) fn flush_gathered(&mut self) {
+        self.session.flush_gathered(context!(self));
+    }
+
+    pub(super) fn set_constraints(&mut self, constraints: Constraints) {
+        self.session.set_constraints(context!(self), constraints);
+    }
+
+    /// Puts another function in the place of the one of its name, and publishes nothing.
+    pub(super) fn replace(&mut self, definition: &str) {
+        let definition = Definition::parse(definition).unwrap();
+        let handler = Handler::new(Run::Now(|_| Ok(())));
+        self.functions.replace(&definition, setup::attributes(0), handler).unwrap();
+    }
+
+    /// Bytes arrive in the stream that the other end did not send.
+    pub(super) fn hear(&mut self, bytes: &[u8]) {
+        self.inbox.extend_from_slice(bytes);
+    }
+
+    /// A request arrives that the other end did not send.
+    pub(super) fn hear_request(&mut self, header: &RequestHeader, priority: Priority, block: &[u8]) {
+        let message = [&header.encode()[..], block].concat();
+        let cut = Cut { chunk: 1_024, overhead: 0 };
+        let mut frames = vec![0; cut.framed_length(message.len())];
+        ChunkWriter::new(&mut frames, cut, priority, message.len()).unwrap().put(&message);
+        self.hear(&frames);
+    }
+
+    /// A datagram arrives that the other end did not send.
+    pub(super) fn hear_datagram(&mut self, nonce: u64, body: &[u8]) {
+        self.work(vec![(nonce, body.to_vec())]);
+    }
+
+    /// The other end is believed to have published a function.
+    pub(super) fn hear_of(&mut self, definition: &str, slot: u16, generation: u16) {
+        let definition = Definition::parse(definition).unwrap();
+        let attributes = setup::attributes(0);
+        self.session.theirs.insert(Slot(slot), Generation(generation), attributes, definition.as_bytes()).unwrap();
+    }
+
+    /// Others use up the pool.
+    pub(super) fn take_buffers(&mut self) -> Vec<Box<[u8]>> {
+        core::iter::from_fn(|| self.pool.take()).collect()
+    }
+
+    pub(super) fn give_buffers(&mut self, buffers: Vec<Box<[u8]>>) {
+        buffers.into_iter().for_each(|buffer| self.pool.give(buffer));
+    }
+
+    /// What became of a call, once it has ended.
+    pub(super) fn outcome(&self, id: CallId) -> Option<Result<&ParametersView, Error>> {
+        self.happened.iter().find_map(|happened| match happened {
+            Happened::Reply(known, result) if *known == id => {
+                Some(result.map(|()| self.results.get(&id).unwrap().as_view()))
+            }
+            _ => None,
+        })
+    }
+
+    /// The functions whose handlers were begun, in order.
+    pub(super) fn ran(&self) -> Vec<&str> {
+        self.happened.iter().filter_map(Happened::function).collect()
+    }
+
+    pub(super) fn count(&self, wanted: impl Fn(&Happened) -> bool) -> usize {
+        self.happened.iter().filter(|happened| wanted(happened)).count()
+    }
+
+    pub(super) fn has(&self, wanted: &Happened) -> bool {
+        self.happened.contains(wanted)
+    }
+}

@@ -1,0 +1,222 @@
+//! At most once, in time, in order, the urgent first.
+
+use std::vec;
+use std::vec::Vec;
+
+use super::net::Datagrams;
+use super::pair::{Happened, Pair};
+use super::{none, text, x};
+use crate::config::{EMERGENCY_BYTES, Priority, WINDOW};
+use crate::error::Error;
+use crate::host::connections::LinkCounter;
+use crate::services::unit::{Delivery, RequestOptions};
+use crate::time::Duration;
+
+fn urgent(priority: Priority) -> RequestOptions {
+    RequestOptions { priority: Some(priority), ..RequestOptions::default() }
+}
+
+fn best_effort() -> RequestOptions {
+    RequestOptions { delivery: Delivery::BestEffort, ..RequestOptions::default() }
+}
+
+#[test]
+fn an_emergency_that_arrives_three_times_runs_once() {
+    let mut pair = Pair::live();
+    pair.agv.offer("stop()", |_| Ok(()));
+    pair.publish();
+    pair.manager.net.datagrams = Datagrams::Twice;
+    let id = pair.manager.request_with("stop", &none(), &urgent(Priority::Emergency), true).unwrap();
+    pair.settle();
+    assert_eq!(pair.agv.ran(), ["stop"]);
+    assert_eq!(pair.agv.counter(LinkCounter::RequestsRepeated), 2);
+    assert!(pair.manager.outcome(id).unwrap().is_ok());
+    assert_eq!(pair.manager.counter(LinkCounter::RepliesLate), 0);
+}
+
+#[test]
+fn a_datagram_that_arrives_twice_runs_once() {
+    let mut pair = Pair::live();
+    pair.agv.offer("log(x: int)", |_| Ok(()));
+    pair.publish();
+    pair.manager.net.datagrams = Datagrams::Twice;
+    for at in 0..100 {
+        pair.manager.request_with("log", &x(at), &best_effort(), false).unwrap();
+    }
+    pair.settle();
+    assert_eq!((pair.agv.ran().len(), pair.agv.counter(LinkCounter::RequestsRepeated)), (100, 100));
+}
+
+#[test]
+fn an_emergency_comes_through_a_frozen_stream() {
+    let mut pair = Pair::live();
+    pair.agv.offer("stop()", |_| Ok(()));
+    pair.publish();
+    pair.manager.net.frozen = true;
+    let id = pair.manager.request_with("stop", &none(), &urgent(Priority::Emergency), true).unwrap();
+    pair.settle();
+    assert!(pair.manager.outcome(id).unwrap().is_ok());
+    pair.manager.net.frozen = false;
+    pair.settle();
+    assert_eq!(pair.agv.ran(), ["stop"]);
+}
+
+#[test]
+fn what_a_frozen_link_held_back_is_not_run() {
+    let mut pair = Pair::live();
+    pair.agv.offer("go()", |_| Ok(()));
+    pair.publish();
+    pair.manager.net.frozen = true;
+    let call = pair.manager.call("go", &none()).unwrap();
+    let told = pair.manager.tell("go", &none()).unwrap();
+    pair.run(Duration::from_secs(8));
+    assert!(pair.agv.session.is_live(), "datagrams keep it alive");
+    pair.manager.net.frozen = false;
+    pair.settle();
+    assert!(pair.agv.ran().is_empty());
+    assert_eq!(pair.manager.outcome(call).unwrap().unwrap_err(), Error::TimedOut);
+    assert!(pair.manager.has(&Happened::Failed(told, Error::Expired)));
+    assert_eq!(pair.agv.counter(LinkCounter::RequestsExpired), 2);
+}
+
+#[test]
+fn a_call_is_in_time_until_its_deadline() {
+    for (late, ran) in [(1_999_999, 1), (2_000_000, 0)] {
+        let mut pair = Pair::live();
+        pair.agv.offer("go()", |_| Ok(()));
+        pair.publish();
+        pair.manager.net.frozen = true;
+        pair.manager.tell("go", &none()).unwrap();
+        pair.run(Duration::from_micros(late));
+        pair.manager.net.frozen = false;
+        pair.settle();
+        assert_eq!(pair.agv.ran().len(), ran, "after {late} us");
+    }
+}
+
+#[test]
+fn a_call_that_waited_too_long_for_its_turn_is_not_run() {
+    let mut pair = Pair::live();
+    pair.agv.offer_held("work()");
+    pair.agv.offer("go()", |_| Ok(()));
+    pair.publish();
+    pair.manager.call("work", &none()).unwrap();
+    let told = pair.manager.tell("go", &none()).unwrap();
+    pair.run(Duration::from_secs(3));
+    pair.agv.answer_held(Ok(&*none()));
+    pair.settle();
+    assert_eq!(pair.agv.ran(), ["work"]);
+    assert!(pair.manager.has(&Happened::Failed(told, Error::Expired)));
+}
+
+#[test]
+fn what_falls_behind_the_window_is_stale() {
+    for (overtaking, stale) in [(WINDOW - 1, false), (WINDOW, true)] {
+        let mut pair = Pair::live();
+        pair.agv.offer("go(x: int)", |_| Ok(()));
+        pair.publish();
+        pair.manager.net.frozen = true;
+        let overtaken = pair.manager.tell("go", &x(-1)).unwrap();
+        for at in 0..overtaking {
+            pair.manager.request_with("go", &x(at.into()), &best_effort(), false).unwrap();
+        }
+        pair.run(Duration::from_millis(1));
+        pair.manager.net.frozen = false;
+        pair.settle();
+        assert_eq!(pair.manager.has(&Happened::Failed(overtaken, Error::Stale)), stale);
+        assert_eq!(pair.agv.ran().len() as u32, overtaking + u32::from(!stale));
+    }
+}
+
+#[test]
+fn calls_of_a_class_run_in_their_order_and_higher_classes_go_first() {
+    let mut pair = Pair::live();
+    for function in ["first()", "second()", "third()", "high()", "low()"] {
+        pair.agv.offer_held(function);
+    }
+    pair.publish();
+    for (function, priority) in
+        [("first", Priority::Normal), ("second", Priority::Normal), ("third", Priority::Normal), ("low", Priority::Low)]
+    {
+        pair.manager.request_with(function, &none(), &urgent(priority), false).unwrap();
+    }
+    pair.run(Duration::from_millis(1));
+    assert_eq!(pair.agv.ran(), ["first", "low"], "a class waits for itself only");
+    pair.manager.request_with("high", &none(), &urgent(Priority::High), false).unwrap();
+    pair.settle();
+    while !pair.agv.held.is_empty() {
+        pair.agv.answer_held(Ok(&*none()));
+        pair.settle();
+    }
+    assert_eq!(pair.agv.ran(), ["first", "low", "high", "second", "third"]);
+}
+
+#[test]
+fn of_the_calls_that_arrive_together_the_urgent_run_first() {
+    let mut pair = Pair::live();
+    for function in ["low()", "normal()", "high()", "emergency()"] {
+        pair.agv.offer(function, |_| Ok(()));
+    }
+    pair.publish();
+    pair.manager.net.datagrams = Datagrams::Lost;
+    let classes = [Priority::Low, Priority::Normal, Priority::High, Priority::Emergency];
+    for (function, priority) in ["low", "normal", "high", "emergency"].into_iter().zip(classes) {
+        pair.manager.request_with(function, &none(), &urgent(priority), true).unwrap();
+    }
+    pair.settle();
+    assert_eq!(pair.agv.ran(), ["emergency", "high", "normal", "low"]);
+}
+
+#[test]
+fn a_call_that_is_detached_lets_the_next_one_begin() {
+    let mut pair = Pair::live();
+    pair.agv.offer_held("long()");
+    pair.agv.offer("next()", |_| Ok(()));
+    pair.publish();
+    let long = pair.manager.call("long", &none()).unwrap();
+    pair.manager.tell("next", &none()).unwrap();
+    pair.run(Duration::from_millis(1));
+    assert_eq!(pair.agv.ran(), ["long"]);
+    let ticket = pair.agv.held[0].ticket;
+    pair.agv.session.detach(ticket);
+    pair.settle();
+    assert_eq!(pair.agv.ran(), ["long", "next"]);
+    pair.agv.answer_held(Ok(&*none()));
+    pair.settle();
+    assert!(pair.manager.outcome(long).unwrap().is_ok());
+}
+
+#[test]
+fn an_emergency_overtakes_a_long_message_between_its_chunks() {
+    let mut pair = Pair::live();
+    pair.agv.offer("read(text: string[20000])", |_| Ok(()));
+    pair.agv.offer("stop()", |_| Ok(()));
+    pair.publish();
+    pair.manager.net.datagrams = Datagrams::Lost;
+    pair.manager.net.capacity = 100;
+    pair.manager.tell("read", &text(20_000)).unwrap();
+    while pair.agv.counter(LinkCounter::BytesReceived) < 5_000 {
+        pair.step();
+    }
+    let before = pair.agv.counter(LinkCounter::BytesReceived) as usize;
+    pair.manager.request_with("stop", &none(), &urgent(Priority::Emergency), true).unwrap();
+    pair.settle();
+    let began: Vec<usize> = pair.agv.happened.iter().filter_map(Happened::bytes_at_begin).collect();
+    assert_eq!(pair.agv.ran(), ["stop", "read"]);
+    // The rest of one chunk, the emergency itself, and what the pipe held.
+    assert!(began[0] - before <= 1_024 + EMERGENCY_BYTES + 200, "{} bytes", began[0] - before);
+}
+
+#[test]
+fn a_best_effort_request_goes_in_one_datagram_or_not_at_all() {
+    let mut pair = Pair::live();
+    pair.agv.offer("log(x: int)", |_| Ok(()));
+    pair.publish();
+    let writes = pair.manager.net.writes.len();
+    pair.manager.request_with("log", &x(1), &best_effort(), false).unwrap();
+    pair.settle();
+    pair.manager.net.datagrams = Datagrams::Lost;
+    pair.manager.request_with("log", &x(2), &best_effort(), false).unwrap();
+    pair.settle();
+    assert_eq!((pair.agv.ran(), pair.manager.net.writes.len()), (vec!["log"], writes));
+}

@@ -1,0 +1,90 @@
+//! How a link begins.
+
+use super::pair::{Happened, Pair};
+use super::setup::Setup;
+use crate::config::HELLO_TIMEOUT;
+use crate::error::{CloseReason, Refusal};
+use crate::time::Duration;
+
+#[test]
+fn both_ends_learn_who_the_other_is() {
+    let pair = Pair::live();
+    assert_eq!(pair.manager.session.identity().unwrap().name(), "agv-01");
+    assert_eq!(pair.agv.session.identity().unwrap().name(), "manager");
+    assert_eq!(pair.manager.happened, [Happened::Hello]);
+    assert_eq!(pair.agv.happened, [Happened::Hello]);
+}
+
+#[test]
+fn a_refusal_tells_the_reason_to_both() {
+    for side_refuses in [true, false] {
+        let mut pair = Pair::connected(&Setup::default());
+        let refuses = if side_refuses { &mut pair.manager } else { &mut pair.agv };
+        refuses.decision = Some(Err(Refusal::WrongManager));
+        pair.settle();
+        let closed = Happened::Closed(CloseReason::Refused(Refusal::WrongManager));
+        assert!(pair.manager.has(&closed), "{:?}", pair.manager.happened);
+        assert!(pair.agv.has(&closed), "{:?}", pair.agv.happened);
+    }
+}
+
+#[test]
+fn no_hello_in_time_ends_the_link() {
+    let mut pair = Pair::connected(&Setup::default());
+    pair.agv.net.frozen = true;
+    pair.run(HELLO_TIMEOUT - Duration::from_micros(1));
+    assert!(pair.manager.happened.is_empty());
+    pair.run(Duration::from_micros(1));
+    assert_eq!(pair.manager.happened, [Happened::Closed(CloseReason::HelloTimeout)]);
+}
+
+#[test]
+fn another_version_is_told_to_both() {
+    let mut pair = Pair::connected(&Setup::default());
+    let mut bytes = pair.agv.net.deliver().0;
+    // Behind length, kind and magic.
+    bytes[2 + 1 + 4] += 1;
+    pair.manager.hear(&bytes);
+    pair.settle();
+    let closed = Happened::Closed(CloseReason::Refused(Refusal::Version));
+    for side in [&pair.manager, &pair.agv] {
+        assert_eq!(side.happened, std::slice::from_ref(&closed));
+    }
+}
+
+#[test]
+fn what_is_no_hello_ends_the_link() {
+    for bytes in [&b"GET / HTTP/1.1\r\n\r\n"[..], &[1, 0, 4], &[3, 0, 0x13, 2, 0]] {
+        let mut pair = Pair::connected(&Setup::default());
+        pair.manager.hear(bytes);
+        pair.settle();
+        assert!(pair.manager.session.is_ended(), "{bytes:?}");
+    }
+}
+
+#[test]
+fn what_follows_the_hello_waits_for_the_decision() {
+    let mut pair = Pair::connected(&Setup::default());
+    pair.agv.decision = None;
+    pair.settle();
+    pair.manager.offer("stop()", |_| Ok(()));
+    pair.manager.publish();
+    pair.settle();
+    assert!(pair.agv.session.their_function_list().is_empty());
+    pair.agv.accept();
+    pair.settle();
+    assert_eq!(pair.agv.session.their_function_list().len(), 1);
+}
+
+#[test]
+fn a_challenge_is_answered_once_and_only_on_a_live_link() {
+    let mut pair = Pair::connected(&Setup::default());
+    pair.manager.challenge();
+    pair.settle();
+    assert!(pair.manager.session.is_live(), "{:?}", pair.agv.happened);
+    assert!(!pair.manager.has(&Happened::Answered));
+    pair.manager.challenge();
+    pair.settle();
+    assert_eq!(pair.manager.count(|happened| *happened == Happened::Answered), 1);
+    assert!(!pair.agv.has(&Happened::Answered));
+}

@@ -1,0 +1,187 @@
+//! What moves goes on only while somebody wants it to.
+
+use super::net::Datagrams;
+use super::pair::{Happened, Pair};
+use super::{none, x};
+use crate::distribution::function_list::Slot;
+use crate::error::{Error, Limit};
+use crate::host::connections::LinkCounter;
+use crate::services::unit::RequestOptions;
+use crate::time::Duration;
+
+const LEASE: Duration = Duration::from_millis(500);
+
+/// A pair whose manager has begun `go()`, and its slot. With `renew`, it wants it to go on.
+fn moving(renew: bool) -> (Pair, Slot) {
+    let mut pair = Pair::live();
+    let slot = pair.agv.offer_leased("go()", LEASE);
+    pair.publish();
+    let options = RequestOptions { renew_lease: renew, ..RequestOptions::default() };
+    pair.manager.request_with("go", &none(), &options, true).unwrap();
+    pair.settle();
+    assert!(pair.agv.is_live(slot));
+    (pair, slot)
+}
+
+fn expirations(pair: &Pair) -> usize {
+    pair.agv.count(|happened| matches!(happened, Happened::LeaseExpired(_)))
+}
+
+#[test]
+fn a_lease_that_is_renewed_goes_on() {
+    let (mut pair, slot) = moving(true);
+    for _ in 0..100 {
+        pair.run(Duration::from_millis(99));
+        assert!(pair.agv.is_live(slot));
+    }
+    assert_eq!(expirations(&pair), 0);
+}
+
+#[test]
+fn a_lease_that_is_not_renewed_expires_once_in_time() {
+    let (mut pair, slot) = moving(false);
+    pair.run(LEASE - Duration::from_millis(2));
+    assert!(pair.agv.is_live(slot));
+    pair.run(Duration::from_millis(2));
+    assert!(!pair.agv.is_live(slot));
+    pair.run(Duration::from_secs(2));
+    assert!(pair.agv.has(&Happened::LeaseExpired(slot)));
+    assert_eq!((expirations(&pair), pair.agv.counter(LinkCounter::LeasesExpired)), (1, 1));
+}
+
+#[test]
+fn each_further_request_renews_a_lease() {
+    let (mut pair, slot) = moving(false);
+    let options = RequestOptions { renew_lease: false, ..RequestOptions::default() };
+    for _ in 0..5 {
+        pair.run(LEASE - Duration::from_millis(10));
+        assert!(pair.agv.is_live(slot));
+        pair.manager.request_with("go", &none(), &options, false).unwrap();
+    }
+    pair.run(LEASE);
+    assert_eq!(expirations(&pair), 1);
+}
+
+#[test]
+fn a_lease_ends_in_time_when_nothing_comes_through() {
+    let (mut pair, slot) = moving(true);
+    pair.manager.net.frozen = true;
+    pair.manager.net.datagrams = Datagrams::Lost;
+    pair.run(LEASE);
+    assert!(!pair.agv.is_live(slot));
+    assert_eq!(expirations(&pair), 1);
+    assert!(pair.agv.session.is_live(), "long before the link is given up");
+    pair.manager.net.frozen = false;
+    pair.run(Duration::from_secs(1));
+    assert!(!pair.agv.is_live(slot), "renewals that were held back revive nothing");
+    assert!(pair.manager.has(&Happened::LeaseEnded { slot, expired: true }));
+    assert_eq!(expirations(&pair), 1);
+}
+
+#[test]
+fn either_way_of_a_renewal_is_enough() {
+    let (mut pair, slot) = moving(true);
+    pair.manager.net.datagrams = Datagrams::Lost;
+    pair.run(Duration::from_secs(2));
+    assert!(pair.agv.is_live(slot));
+    pair.manager.net.datagrams = Datagrams::Pass;
+    pair.manager.net.frozen = true;
+    pair.run(Duration::from_secs(2));
+    assert!(pair.agv.is_live(slot));
+}
+
+#[test]
+fn renewals_that_come_late_take_nothing_away() {
+    let (mut pair, slot) = moving(true);
+    // The stream lags behind the datagrams, and room for one renewal is in the pipe.
+    (pair.manager.net.frozen, pair.manager.net.capacity) = (true, 20);
+    pair.run(Duration::from_millis(400));
+    pair.manager.net.datagrams = Datagrams::Lost;
+    pair.manager.net.frozen = false;
+    pair.step();
+    pair.manager.net.frozen = true;
+    assert_eq!(pair.agv.counter(LinkCounter::RenewalsIgnored), 0);
+    // The last renewal was made 25 ms ago.
+    pair.run(LEASE - Duration::from_millis(30));
+    assert!(pair.agv.is_live(slot));
+    assert_eq!(expirations(&pair), 0);
+}
+
+#[test]
+fn a_lease_counts_from_when_the_request_was_made() {
+    let mut pair = Pair::live();
+    let slot = pair.agv.offer_leased("go()", LEASE);
+    pair.publish();
+    pair.manager.net.frozen = true;
+    let options = RequestOptions { renew_lease: false, ..RequestOptions::default() };
+    pair.manager.request_with("go", &none(), &options, false).unwrap();
+    pair.run(Duration::from_millis(400));
+    pair.manager.net.frozen = false;
+    pair.settle();
+    assert!(pair.agv.is_live(slot));
+    pair.run(Duration::from_millis(100));
+    assert!(!pair.agv.is_live(slot));
+}
+
+#[test]
+fn a_request_older_than_its_lease_is_not_run() {
+    let mut pair = Pair::live();
+    let slot = pair.agv.offer_leased("go()", LEASE);
+    pair.publish();
+    pair.manager.net.frozen = true;
+    let options = RequestOptions { renew_lease: false, ..RequestOptions::default() };
+    let id = pair.manager.request_with("go", &none(), &options, false).unwrap();
+    pair.run(LEASE);
+    pair.manager.net.frozen = false;
+    pair.settle();
+    assert!(pair.agv.ran().is_empty() && !pair.agv.is_live(slot));
+    assert!(pair.manager.has(&Happened::Failed(id, Error::Expired)));
+    assert_eq!(pair.agv.session.calls_held(), 0);
+}
+
+#[test]
+fn a_lease_that_is_released_ends_at_once() {
+    let (mut pair, slot) = moving(true);
+    pair.manager.release(slot);
+    pair.settle();
+    assert!(!pair.agv.is_live(slot));
+    pair.run(Duration::from_secs(2));
+    assert_eq!((expirations(&pair), pair.agv.counter(LinkCounter::RenewalsIgnored)), (1, 0));
+}
+
+#[test]
+fn a_motion_that_is_finished_ends_its_lease_without_the_hook() {
+    let (mut pair, slot) = moving(true);
+    pair.agv.end_lease(slot);
+    pair.settle();
+    assert!(!pair.agv.is_live(slot));
+    assert!(pair.manager.has(&Happened::LeaseEnded { slot, expired: false }));
+    pair.run(Duration::from_secs(2));
+    assert_eq!((expirations(&pair), pair.agv.counter(LinkCounter::RenewalsIgnored)), (0, 0));
+}
+
+#[test]
+fn no_more_leases_are_held_than_there_is_room_for() {
+    let mut pair = Pair::live();
+    for at in 0..5 {
+        pair.agv.offer_leased(&std::format!("go_{at}(x: int)"), LEASE);
+    }
+    pair.publish();
+    for at in 0..4 {
+        pair.manager.call(&std::format!("go_{at}"), &x(at)).unwrap();
+    }
+    assert_eq!(pair.manager.call("go_4", &x(4)), Err(Error::Full(Limit::Leases)));
+    pair.settle();
+    assert_eq!(pair.agv.ran().len(), 4);
+    pair.manager.release(Slot(0));
+    pair.settle();
+    assert!(pair.manager.call("go_4", &x(4)).is_ok());
+}
+
+#[test]
+fn a_replaced_function_is_not_kept_alive_by_renewals_of_the_old_one() {
+    let (mut pair, slot) = moving(true);
+    pair.agv.replace("go()");
+    pair.run(Duration::from_secs(2));
+    assert!(!pair.agv.is_live(slot));
+}

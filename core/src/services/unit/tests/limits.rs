@@ -1,0 +1,138 @@
+//! The limits that each end tells the other, and keeps.
+
+use super::pair::Pair;
+use super::setup::Setup;
+use super::{none, text, x};
+use crate::config::{Constraints, Priority};
+use crate::error::Error;
+use crate::host::connections::LinkCounter;
+use crate::services::unit::RequestOptions;
+use crate::time::Duration;
+
+const ECHO: &str = "echo(text: string[20000]) -> (text: string[20000])";
+
+fn emergency() -> RequestOptions {
+    RequestOptions { priority: Some(Priority::Emergency), ..RequestOptions::default() }
+}
+
+#[test]
+fn a_request_above_the_peers_limit_is_not_sent() {
+    let mut pair = Pair::with(&Setup { agv: Constraints::S_UNIT, ..Setup::default() });
+    pair.agv.offer(ECHO, |_| Ok(()));
+    pair.publish();
+    assert_eq!(pair.manager.call("echo", &text(1_100)), Err(Error::TooLarge { limit: 1_024 }));
+    assert!(pair.manager.call("echo", &text(1_000)).is_ok());
+}
+
+#[test]
+fn an_answer_above_the_callers_limit_is_an_error_there() {
+    let manager = Constraints { message_size: 1_024, ..Constraints::M_UNIT };
+    let mut pair = Pair::with(&Setup { manager, ..Setup::default() });
+    pair.agv.offer(ECHO, |_| Ok(()));
+    pair.publish();
+    assert_eq!(pair.block_request("echo", &mut *text(1_100)), Err(Error::TooLarge { limit: 1_024 }));
+    assert_eq!(pair.block_request("echo", &mut *text(1_000)), Ok(()));
+}
+
+#[test]
+fn an_answer_above_the_callees_own_buffers_is_an_error_and_waits_for_nothing() {
+    let mut pair = Pair::with(&Setup { buffer_size: 3_000, ..Setup::default() });
+    pair.agv.offer("read() -> (text: string[20000])", |results| {
+        let long = [b'x'; 5_000];
+        results.set_value("text", core::str::from_utf8(&long).unwrap())
+    });
+    pair.publish();
+    let refused = pair.block_request("read", &mut *text(0));
+    assert!(matches!(refused, Err(Error::TooLarge { limit: 2_900..3_000 })), "{refused:?}");
+    assert_eq!(pair.agv.session.calls_held(), 0);
+}
+
+#[test]
+fn limits_that_change_are_told() {
+    let mut pair = Pair::live();
+    pair.agv.offer(ECHO, |_| Ok(()));
+    pair.publish();
+    pair.agv.set_constraints(Constraints { message_size: 2_000, ..*pair.agv.session.constraints() });
+    pair.settle();
+    assert_eq!(pair.manager.call("echo", &text(3_000)), Err(Error::TooLarge { limit: 2_000 }));
+    pair.agv.set_constraints(Constraints { message_size: 4_000, ..*pair.agv.session.constraints() });
+    pair.settle();
+    assert_eq!(pair.block_request("echo", &mut *text(3_000)), Ok(()));
+}
+
+#[test]
+fn a_message_that_crosses_a_lower_limit_is_refused_and_the_link_lives() {
+    let mut pair = Pair::live();
+    pair.agv.offer(ECHO, |_| Ok(()));
+    pair.publish();
+    let id = pair.manager.call("echo", &text(3_000)).unwrap();
+    pair.agv.set_constraints(Constraints { message_size: 2_000, ..*pair.agv.session.constraints() });
+    pair.settle();
+    assert_eq!(pair.manager.outcome(id).unwrap().unwrap_err(), Error::TooLarge { limit: 2_000 });
+    assert!(pair.agv.session.is_live() && pair.agv.ran().is_empty());
+}
+
+#[test]
+fn the_minimum_interval_is_kept_by_the_caller() {
+    let told = Constraints { minimum_interval: Duration::from_millis(10), ..Constraints::S_UNIT };
+    let mut pair = Pair::with(&Setup { agv: told, ..Setup::default() });
+    pair.agv.offer("go(x: int)", |_| Ok(()));
+    pair.publish();
+    pair.manager.call("go", &x(1)).unwrap();
+    pair.run(Duration::from_millis(4));
+    let wait = Duration::from_millis(6);
+    assert_eq!(pair.manager.call("go", &x(2)), Err(Error::TooSoon { wait }));
+    assert!(pair.manager.request_with("go", &x(0), &emergency(), false).is_ok(), "an emergency ignores it");
+    pair.run(Duration::from_millis(10));
+    assert!(pair.manager.call("go", &x(2)).is_ok());
+    assert!(pair.manager.counter(LinkCounter::RequestsWithheld) == 1);
+}
+
+#[test]
+fn the_minimum_interval_is_kept_by_the_callee() {
+    let mut pair = Pair::live();
+    pair.agv.offer("go(x: int)", |_| Ok(()));
+    pair.publish();
+    let ids: std::vec::Vec<_> = (0..4).map(|at| pair.manager.call("go", &x(at)).unwrap()).collect();
+    // It was told too late to hold these back.
+    let interval = Duration::from_millis(10);
+    pair.agv.set_constraints(Constraints { minimum_interval: interval, ..*pair.agv.session.constraints() });
+    pair.settle();
+    let too_soon = |id| matches!(pair.manager.outcome(id), Some(Err(Error::TooSoon { .. })));
+    assert_eq!(ids.iter().map(|&id| too_soon(id)).collect::<std::vec::Vec<_>>(), [false, false, true, true]);
+    assert_eq!(pair.agv.counter(LinkCounter::RequestsTooSoon), 2);
+    assert_eq!(pair.agv.ran(), ["go", "go"]);
+}
+
+#[test]
+fn a_callee_with_its_hands_full_is_busy_except_for_an_emergency() {
+    let agv = Constraints { calls_per_peer: 3, ..Constraints::S_UNIT };
+    let mut pair = Pair::with(&Setup { agv, ..Setup::default() });
+    pair.agv.offer_held("work()");
+    pair.agv.offer("stop()", |_| Ok(()));
+    pair.publish();
+    let ids: std::vec::Vec<_> = (0..4).map(|_| pair.manager.call("work", &none()).unwrap()).collect();
+    let stop = pair.manager.request_with("stop", &none(), &emergency(), true).unwrap();
+    pair.settle();
+    assert_eq!(pair.manager.outcome(ids[3]).unwrap().unwrap_err(), Error::Busy);
+    assert!(pair.manager.outcome(stop).unwrap().is_ok());
+    assert_eq!((pair.agv.ran(), pair.agv.session.calls_held()), (std::vec!["stop", "work"], 3));
+    assert_eq!(pair.agv.counter(LinkCounter::RequestsBusy), 1);
+}
+
+#[test]
+fn a_call_that_finds_no_buffer_to_wait_in_is_not_run_and_counted() {
+    let mut pair = Pair::live();
+    pair.agv.offer_held("work()");
+    pair.publish();
+    let others = pair.agv.take_buffers();
+    let first = pair.manager.call("work", &none()).unwrap();
+    pair.manager.tell("work", &none()).unwrap();
+    pair.run(Duration::from_millis(1));
+    pair.agv.give_buffers(others);
+    assert_eq!(pair.agv.ran(), ["work"]);
+    assert_eq!(pair.agv.counter(LinkCounter::RequestsBusy), 1);
+    assert_eq!(pair.manager.outcome(first), None);
+    // Nor is there a buffer to say so.
+    assert_eq!(pair.agv.counter(LinkCounter::RepliesDropped), 1);
+}

@@ -1,0 +1,100 @@
+//! What a peer sees of one's functions.
+
+use super::pair::{Happened, Pair};
+use super::setup::Setup;
+use super::{none, x};
+use crate::error::Error;
+use crate::host::connections::LinkCounter;
+
+#[test]
+fn what_is_published_is_visible_and_acknowledged() {
+    let mut pair = Pair::live();
+    pair.agv.offer("pos_info() -> (position: int[2])", |_| Ok(()));
+    pair.agv.offer("go_to(position: int[2])", |_| Ok(()));
+    pair.settle();
+    assert!(pair.manager.session.their_function_list().is_empty(), "adding shows nothing");
+    let serial = pair.agv.publish();
+    pair.settle();
+    assert!(pair.manager.has(&Happened::ListChanged));
+    assert!(pair.agv.has(&Happened::Acknowledged { serial, skipped: 0 }));
+    let shown = pair.manager.session.their_function_list().show_functions();
+    assert_eq!(std::format!("{shown}"), "pos_info() -> (position: int[2])\ngo_to(position: int[2])\n");
+}
+
+#[test]
+fn what_is_not_published_cannot_be_called() {
+    let mut pair = Pair::with_position();
+    pair.agv.offer("secret()", |_| Ok(()));
+    pair.settle();
+    assert_eq!(pair.manager.call("secret", &none()), Err(Error::UnknownFunction));
+    // Nor by somebody who guesses its slot.
+    pair.manager.hear_of("secret()", 1, 0);
+    let id = pair.manager.call("secret", &none()).unwrap();
+    pair.settle();
+    assert_eq!(pair.manager.outcome(id).unwrap().unwrap_err(), Error::UnknownFunction);
+    assert!(pair.agv.ran().is_empty());
+}
+
+#[test]
+fn what_is_withdrawn_is_gone_and_can_come_back() {
+    let mut pair = Pair::with_position();
+    let slot = pair.agv.functions.find("pos_info").unwrap();
+    let serial = pair.agv.withdraw(slot);
+    pair.settle();
+    assert!(pair.agv.has(&Happened::Acknowledged { serial, skipped: 0 }));
+    assert_eq!(pair.manager.call("pos_info", &none()), Err(Error::UnknownFunction));
+    pair.publish();
+    assert!(pair.manager.call("pos_info", &none()).is_ok());
+}
+
+#[test]
+fn a_call_that_crosses_a_withdrawal_is_stale() {
+    let mut pair = Pair::live();
+    let slot = pair.agv.offer("go()", |_| Ok(()));
+    pair.publish();
+    let id = pair.manager.call("go", &none()).unwrap();
+    pair.agv.withdraw(slot);
+    pair.settle();
+    assert_eq!(pair.manager.outcome(id).unwrap().unwrap_err(), Error::StaleFunction);
+    assert!(pair.agv.ran().is_empty());
+}
+
+#[test]
+fn a_function_that_was_replaced_is_stale_and_the_news_follows() {
+    let mut pair = Pair::live();
+    pair.agv.offer("turn(x: int)", |_| Ok(()));
+    pair.publish();
+    pair.agv.replace("turn(angle: float)");
+    let id = pair.manager.call("turn", &x(1)).unwrap();
+    pair.settle();
+    assert_eq!(pair.manager.outcome(id).unwrap().unwrap_err(), Error::StaleFunction);
+    assert!(pair.agv.ran().is_empty());
+    assert_eq!(pair.manager.call("turn", &x(1)), Err(Error::UnknownFunction), "it is not published anew");
+    pair.publish();
+    assert_eq!(pair.manager.call("turn", &x(1)), Err(Error::MissingArgument { index: 0 }));
+}
+
+#[test]
+fn functions_beyond_the_readers_room_are_skipped_and_told() {
+    let mut pair = Pair::with(&Setup { their_functions: 1, ..Setup::default() });
+    pair.agv.offer("one()", |_| Ok(()));
+    pair.agv.offer("two()", |_| Ok(()));
+    pair.agv.offer("three()", |_| Ok(()));
+    let serial = pair.agv.publish();
+    pair.settle();
+    assert!(pair.agv.has(&Happened::Acknowledged { serial, skipped: 2 }));
+    assert_eq!(pair.manager.counter(LinkCounter::FunctionsSkipped), 2);
+}
+
+#[test]
+fn a_list_that_finds_no_room_goes_out_when_there_is_some() {
+    let mut pair = Pair::with(&Setup { buffers: 1, buffer_size: 600, ..Setup::default() });
+    for index in 0..16 {
+        pair.agv.offer(&std::format!("function_with_a_long_name_{index}(position: int[2])"), |_| Ok(()));
+    }
+    pair.agv.net.capacity = 50;
+    let serial = pair.agv.publish();
+    assert!(!pair.agv.session.their_function_list().is_empty() || pair.agv.counter(LinkCounter::SendRefused) > 0);
+    pair.settle();
+    assert!(pair.agv.has(&Happened::Acknowledged { serial, skipped: 8 }));
+}

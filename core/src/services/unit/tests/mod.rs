@@ -1,0 +1,58 @@
+//! What a session promises, one behaviour per test, on two sessions joined in memory.
+#![allow(
+    clippy::indexing_slicing,
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::arithmetic_side_effects
+)]
+
+mod acts;
+mod delivery;
+mod ends;
+mod gathering;
+mod hello;
+mod leases;
+mod limits;
+mod lists;
+mod liveness;
+mod net;
+mod pair;
+mod requests;
+mod setup;
+mod side;
+
+use std::boxed::Box;
+use std::string::String;
+
+use crate::distribution::parameters::ParametersView;
+use side::Arguments;
+
+/// Parameters that `build` has filled.
+fn parameters(build: impl FnOnce(&mut ParametersView)) -> Arguments {
+    let mut parameters: Arguments = Box::default();
+    build(&mut *parameters);
+    parameters
+}
+
+/// No parameters.
+fn none() -> Arguments {
+    parameters(|_| ())
+}
+
+/// One integer called `x`.
+fn x(value: i64) -> Arguments {
+    parameters(|parameters| {
+        parameters.add_int("x", 1).unwrap();
+        parameters.set_value("x", value).unwrap();
+    })
+}
+
+/// One text of `length` characters called `text`, in room for 20,000.
+fn text(length: usize) -> Arguments {
+    let content: String = (0..length).map(|at| char::from(b'a' + (at % 23) as u8)).collect();
+    parameters(|parameters| {
+        parameters.add_string("text", 20_000).unwrap();
+        parameters.set_value("text", content.as_str()).unwrap();
+    })
+}

@@ -1,0 +1,115 @@
+//! What a pair is made of: constraints, storage, hellos, handlers.
+
+use std::vec;
+
+use super::super::{Publication, SessionStorage, buffer_bytes};
+use super::net::DATAGRAM_PORT;
+use crate::config::{Constraints, LINK_BUFFER_BYTES};
+use crate::distribution::function::Attributes;
+use crate::distribution::function_list::{Entry, FunctionList};
+use crate::distribution::hello::{Hello, Limits};
+use crate::distribution::identity::{Epoch, Fleet, Identity};
+use crate::distribution::parameters::ParametersView;
+use crate::error::Error;
+use crate::services::lease::{Lease, Service};
+use crate::storage::{Boxed, Pool};
+use crate::time::Duration;
+
+/// What may differ between pairs.
+pub(super) struct Setup {
+    pub(super) manager: Constraints,
+    pub(super) agv: Constraints,
+    /// The ends tell each other where datagrams go.
+    pub(super) datagrams: bool,
+    /// Buffers of each end's pool, and their size.
+    pub(super) buffers: usize,
+    pub(super) buffer_size: usize,
+    /// Functions of the other end that are kept.
+    pub(super) their_functions: usize,
+}
+
+impl Default for Setup {
+    fn default() -> Self {
+        Self {
+            manager: Constraints::M_UNIT,
+            agv: Constraints { message_size: 32 * 1024, ..Constraints::S_UNIT },
+            datagrams: true,
+            buffers: 6,
+            buffer_size: buffer_bytes(32 * 1024, 0),
+            their_functions: 8,
+        }
+    }
+}
+
+/// A service of a test.
+pub(super) struct Handler {
+    pub(super) run: Run,
+    pub(super) lease: Lease,
+}
+
+/// When a service answers.
+#[derive(Clone, Copy)]
+pub(super) enum Run {
+    /// At once.
+    Now(fn(&mut ParametersView) -> Result<(), Error>),
+    /// When the test says so.
+    Held,
+}
+
+impl Handler {
+    pub(super) fn new(run: Run) -> Self {
+        Self { run, lease: Lease::new() }
+    }
+}
+
+impl Service for Handler {
+    fn lease(&self) -> Option<&Lease> {
+        Some(&self.lease)
+    }
+}
+
+pub(super) fn attributes(lease_millis: u64) -> Attributes {
+    let lease = (lease_millis > 0).then(|| Duration::from_millis(lease_millis));
+    Attributes { lease, ..Attributes::default() }
+}
+
+pub(super) fn hello(constraints: &Constraints, agv: bool, datagrams: bool) -> Hello {
+    Hello {
+        fleet: Fleet(1),
+        identity: if agv { Identity::s_unit("agv-01", 1) } else { Identity::m_unit("manager", 1) }.unwrap(),
+        wanted: None,
+        epoch: Epoch(1),
+        nonce: if agv { 0xA61 } else { 0x3A6A6E2 },
+        term: 0,
+        capabilities: 0,
+        limits: Limits {
+            message_size: constraints.message_size,
+            chunk_size: constraints.chunk_size,
+            calls: constraints.calls_per_peer,
+            minimum_interval: constraints.minimum_interval.as_wire(),
+        },
+        link: u16::from(agv),
+        udp_port: if datagrams { DATAGRAM_PORT } else { 0 },
+        stamp: 0,
+        keep_alive: constraints.keep_alive.as_millis() as u32,
+    }
+}
+
+pub(super) fn storage(constraints: &Constraints, their_functions: usize) -> SessionStorage<Boxed> {
+    SessionStorage {
+        small: vec![0; LINK_BUFFER_BYTES].into_boxed_slice(),
+        pending: vec![None; 128].into_boxed_slice(),
+        running: vec![None; usize::from(constraints.calls_per_peer) + 1].into_boxed_slice(),
+        publications: vec![Publication::default(); 16].into_boxed_slice(),
+        their_functions: (0..their_functions).map(|_| Entry::empty()).collect(),
+        their_signatures: vec![0; 2048].into_boxed_slice(),
+    }
+}
+
+pub(super) fn functions() -> FunctionList<Boxed, Handler> {
+    FunctionList::new((0..16).map(|_| Entry::empty()).collect(), vec![0; 4096].into_boxed_slice())
+}
+
+pub(super) fn pool(count: usize, size: usize) -> Pool<Boxed> {
+    Pool::new((0..count).map(|_| Some(vec![0; size].into_boxed_slice())).collect())
+}

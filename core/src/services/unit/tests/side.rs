@@ -1,0 +1,233 @@
+//! One end of a pair, driven as a port drives a session.
+
+use core::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::boxed::Box;
+use std::collections::BTreeMap;
+use std::string::{String, ToString};
+use std::vec::Vec;
+
+use super::super::{Call, Event, Session, SessionConfig};
+use super::net::{DATAGRAM_PORT, Net};
+use super::setup::{self, Handler, Run, Setup};
+use crate::distribution::function_list::{FunctionList, Slot};
+use crate::distribution::parameters::Parameters;
+use crate::error::{CloseReason, Error, Refusal};
+use crate::host::mailman::LinkId;
+use crate::host::secure::Plain;
+use crate::services::Context;
+use crate::services::requests::CallId;
+use crate::storage::{Boxed, Pool};
+use crate::time::{Duration, Instant};
+
+/// Parameters that hold any message of these tests.
+pub(super) type Arguments = Box<Parameters<24_576>>;
+
+/// An event without what it borrows.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) enum Happened {
+    Hello,
+    Reply(CallId, Result<(), Error>),
+    Failed(CallId, Error),
+    ListChanged,
+    Acknowledged {
+        serial: u32,
+        skipped: u16,
+    },
+    LeaseExpired(Slot),
+    LeaseEnded {
+        slot: Slot,
+        expired: bool,
+    },
+    Answered,
+    Closed(CloseReason),
+    /// A handler was begun: its function, and how many bytes of the stream had arrived by then.
+    Ran(String, usize),
+}
+
+/// One end.
+pub(super) struct Side {
+    pub(super) now: Instant,
+    pub(super) session: Session<Boxed, Plain>,
+    pub(super) functions: FunctionList<Boxed, Handler>,
+    pub(super) pool: Pool<Boxed>,
+    pub(super) net: Net,
+    pub(super) happened: Vec<Happened>,
+    /// Calls that wait for an answer of the test.
+    pub(super) held: Vec<Call>,
+    /// What the node answers a hello; `None` lets it wait.
+    pub(super) decision: Option<Result<(), Refusal>>,
+    pub(super) inbox: Vec<u8>,
+    pub(super) received: usize,
+    /// Where the results of calls go.
+    pub(super) results: BTreeMap<CallId, Arguments>,
+    /// Answers that could not be kept yet.
+    unanswered: Vec<(Call, Result<Arguments, Error>)>,
+    pub(super) buffers: usize,
+    pub(super) base: Duration,
+}
+
+/// The context of a side, whose parts are borrowed one by one.
+macro_rules! context {
+    ($side:expr) => {
+        &mut Context { now: $side.now, mailman: &mut $side.net, buffers: &mut $side.pool, functions: &$side.functions }
+    };
+}
+pub(super) use context;
+
+impl Side {
+    pub(super) fn new(setup: &Setup, agv: bool, address: u8) -> Self {
+        let constraints = if agv { setup.agv } else { setup.manager };
+        // The clocks of the two ends have nothing in common.
+        let base = Duration::from_secs(if agv { 5_000 } else { 10 });
+        let now = Instant::START + base;
+        let config = SessionConfig {
+            link: LinkId(address.into()),
+            dialed: agv,
+            address: SocketAddr::new(IpAddr::V4(Ipv4Addr::new(10, 0, 0, 3_u8.wrapping_sub(address))), DATAGRAM_PORT),
+            local: setup::hello(&constraints, agv, setup.datagrams),
+            constraints,
+        };
+        Self {
+            now,
+            session: Session::new(now, config, Plain, setup::storage(&constraints, setup.their_functions)),
+            functions: setup::functions(),
+            pool: setup::pool(setup.buffers, setup.buffer_size),
+            net: Net::default(),
+            happened: Vec::new(),
+            held: Vec::new(),
+            decision: Some(Ok(())),
+            inbox: Vec::new(),
+            received: 0,
+            results: BTreeMap::new(),
+            unanswered: Vec::new(),
+            buffers: setup.buffers,
+            base,
+        }
+    }
+
+    /// Does what a port does when anything has arrived or is due; whether there was anything.
+    pub(super) fn work(&mut self, datagrams: Vec<(u64, Vec<u8>)>) -> bool {
+        let mut worked = !datagrams.is_empty();
+        let from = SocketAddr::new(self.session.address().ip(), DATAGRAM_PORT);
+        for (nonce, body) in datagrams {
+            let event = self.session.datagram(context!(self), from, nonce, &body).map(own);
+            self.note(event);
+            self.run_calls();
+        }
+        worked |= self.read();
+        worked |= self.run_calls();
+        while let Some(event) = self.session.poll(context!(self)).map(own) {
+            self.note(Some(event));
+            worked = true;
+        }
+        for (call, result) in core::mem::take(&mut self.unanswered) {
+            let unanswered = self.unanswered.len();
+            self.answer(call, result);
+            worked |= self.unanswered.len() == unanswered;
+        }
+        worked
+    }
+
+    fn read(&mut self) -> bool {
+        let mut worked = false;
+        let mut arguments: Arguments = Box::default();
+        loop {
+            let lent = &mut self.inbox;
+            let receipt = self.session.receive(context!(self), lent, Some(&mut *arguments));
+            let (consumed, paused) = (receipt.consumed, receipt.paused);
+            let mut call = None;
+            let event = match receipt.event {
+                Some(Event::Call(begun)) => {
+                    call = Some(begun);
+                    None
+                }
+                Some(Event::Reply(id, Ok(block))) => {
+                    let results = self.results.get_mut(&id).unwrap();
+                    Some(Happened::Reply(id, block.read_into(results)))
+                }
+                event => event.map(own),
+            };
+            self.inbox.drain(..consumed);
+            let more = consumed > 0 || event.is_some() || call.is_some();
+            worked |= more;
+            self.note(event);
+            if let Some(call) = call {
+                self.run(call, &mut arguments);
+            }
+            if paused || !more {
+                return worked;
+            }
+        }
+    }
+
+    fn run_calls(&mut self) -> bool {
+        let mut worked = false;
+        let mut arguments: Arguments = Box::default();
+        while let Some(call) = self.session.next_call(context!(self), &mut *arguments) {
+            self.run(call, &mut arguments);
+            worked = true;
+        }
+        worked
+    }
+
+    fn run(&mut self, call: Call, arguments: &mut Arguments) {
+        let function = self.functions.function(call.slot).unwrap();
+        self.happened.push(Happened::Ran(function.name().to_string(), self.received));
+        match function.handler.run {
+            Run::Held => self.held.push(call),
+            Run::Now(run) => {
+                let result = run(arguments).map(|()| arguments.clone());
+                self.answer(call, result);
+            }
+        }
+    }
+
+    fn answer(&mut self, call: Call, result: Result<Arguments, Error>) {
+        let lent = result.as_ref().map(|results| results.as_view()).map_err(|error| *error);
+        if self.session.answer(context!(self), call.ticket, lent).is_err() {
+            self.unanswered.push((call, result));
+        }
+    }
+
+    fn note(&mut self, event: Option<Happened>) {
+        let Some(event) = event else { return };
+        let decision = self.decision.filter(|_| event == Happened::Hello);
+        self.happened.push(event);
+        match decision {
+            Some(Ok(())) => self.session.accept(context!(self)),
+            Some(Err(refusal)) => self.session.refuse(context!(self), refusal),
+            None => {}
+        }
+    }
+
+    pub(super) fn end(&mut self) {
+        self.session.disconnected(CloseReason::Stopped);
+        while self.session.poll(context!(self)).is_some() {}
+    }
+}
+
+impl Happened {
+    /// How many bytes of the stream had arrived when a handler was begun.
+    pub(super) fn bytes_at_begin(&self) -> Option<usize> {
+        if let Self::Ran(_, bytes) = self { Some(*bytes) } else { None }
+    }
+
+    pub(super) fn function(&self) -> Option<&str> {
+        if let Self::Ran(name, _) = self { Some(name) } else { None }
+    }
+}
+
+fn own(event: Event<'_>) -> Happened {
+    match event {
+        Event::Hello => Happened::Hello,
+        Event::Reply(id, Err(error)) => Happened::Reply(id, Err(error)),
+        Event::Failed(id, error) => Happened::Failed(id, error),
+        Event::ListChanged => Happened::ListChanged,
+        Event::Acknowledged { serial, skipped } => Happened::Acknowledged { serial, skipped },
+        Event::LeaseExpired(slot) => Happened::LeaseExpired(slot),
+        Event::LeaseEnded { slot, expired } => Happened::LeaseEnded { slot, expired },
+        Event::Answered => Happened::Answered,
+        Event::Closed(reason) => Happened::Closed(reason),
+        Event::Call(_) | Event::Reply(_, Ok(_)) => panic!("only `read` gets what borrows"),
+    }
+}
