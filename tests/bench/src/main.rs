@@ -39,6 +39,9 @@ enum Command {
     /// The process that calls; started by the others.
     #[command(hide = true)]
     Call(Child),
+    /// The process that holds idle s_units; started by the others.
+    #[command(hide = true)]
+    Idle(Child),
 }
 
 /// What to measure.
@@ -102,5 +105,6 @@ fn main() -> Result<()> {
         }
         Command::Serve(child) => child::serve(&child),
         Command::Call(child) => child::call(&child),
+        Command::Idle(child) => peers::cara::idle(child.run),
     }
 }

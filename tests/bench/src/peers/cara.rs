@@ -1,12 +1,13 @@
 //! CARA through its public API, discovery on: a passive m_unit that echoes, and main m_units that call it. Both ends
 //! read the string as `&str`.
 
+use std::process::{Child, Command, Stdio};
 use std::sync::OnceLock;
 use std::time::Duration;
 
 use anyhow::{Context, Result, ensure};
 use cara_std::{
-    Call, CommunicationSystem, Constraints, Interfaces, Parameters, ParametersView, Peer as Node, ServiceError,
+    Call, CommunicationSystem, Constraints, Interfaces, Parameters, ParametersView, Peer as Node, ServiceError, Unit,
 };
 
 use super::{Caller, Peer, Server};
@@ -26,10 +27,42 @@ pub(crate) enum Cara {
     LinkEach,
     /// All callers of a process use one link.
     OneLink(OnceLock<CommunicationSystem>),
+    /// As `LinkEach`, and [`IDLE_LINKS`] s_units are connected to the passive m_unit and do nothing.
+    AmongIdle,
+}
+
+/// Links that do nothing but keep alive, for [`Cara::AmongIdle`].
+const IDLE_LINKS: usize = 1_000;
+
+/// The process that holds the idle s_units; ends when its standard input does.
+pub(crate) fn idle(run: u32) -> Result<()> {
+    let mut units = Vec::new();
+    for id in 0..IDLE_LINKS {
+        let builder = Unit::builder(&format!("idle-{id}"), id as u32, "passive", 1)?;
+        let unit = builder.fleet(run).interfaces(Interfaces::Loopback).build_unit()?;
+        unit.start()?;
+        units.push(unit);
+    }
+    let _ = std::io::stdin().lines().next();
+    Ok(())
+}
+
+/// Starts the idle s_units and waits until they have joined.
+fn start_idle(run: u32, passive: &CommunicationSystem) -> Result<Child> {
+    let program = std::env::current_exe()?;
+    let mut command = Command::new(program);
+    command.args(["idle", "--peer", "cara", "--run", &run.to_string()]).stdin(Stdio::piped());
+    let child = command.spawn()?;
+    let end = std::time::Instant::now() + 6 * PATIENCE;
+    while passive.number_of_s_units() < IDLE_LINKS {
+        ensure!(std::time::Instant::now() < end, "only {} idle s_units joined", passive.number_of_s_units());
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    Ok(child)
 }
 
 fn system(run: u32, name: &str, id: u32) -> Result<CommunicationSystem> {
-    let constraints = Constraints { message_size: MESSAGE_BYTES, maximum_nodes: 256, ..Constraints::M_UNIT };
+    let constraints = Constraints { message_size: MESSAGE_BYTES, maximum_nodes: 2_000, ..Constraints::M_UNIT };
     let builder = CommunicationSystem::builder(name, id)?.fleet(run).interfaces(Interfaces::Loopback);
     let system = builder.constraints(constraints).build_system()?;
     system.start()?;
@@ -48,7 +81,11 @@ impl Peer for Cara {
         let text = parameters()?;
         passive.my_function_list().add_function("echo", &*text, echo)?;
         passive.publish_my_function_list()?;
-        Ok(Server { address: String::from("by discovery"), keep: Box::new(passive) })
+        let idle = match self {
+            Self::AmongIdle => Some(start_idle(run, &passive)?),
+            _ => None,
+        };
+        Ok(Server { address: String::from("by discovery"), keep: Box::new((passive, idle)) })
     }
 
     fn connect(&self, run: u32, _address: &str) -> Result<Box<dyn Caller>> {
@@ -58,7 +95,7 @@ impl Peer for Cara {
             system(run, &format!("main-{}-{id}", std::process::id()), id)
         };
         let main = match self {
-            Self::LinkEach => new()?,
+            Self::LinkEach | Self::AmongIdle => new()?,
             Self::OneLink(shared) => match shared.get() {
                 Some(main) => main.clone(),
                 None => {

@@ -1,6 +1,6 @@
 //! What is measured: each peer can echo a string between two processes in its own way.
 
-mod cara;
+pub(crate) mod cara;
 mod floor;
 
 use std::any::Any;
@@ -36,11 +36,12 @@ pub(crate) trait Caller: Send {
 type Make = fn() -> Box<dyn Peer>;
 
 /// All peers in the order in which they take turns. The first is the one that the others are compared with.
-const PEERS: [(&str, Make); 4] = [
+const PEERS: [(&str, Make); 5] = [
     ("floor", || Box::new(floor::Floor)),
     ("floor_again", || Box::new(floor::Floor)),
     ("cara", || Box::new(cara::Cara::LinkEach)),
     ("cara_one_link", || Box::new(cara::Cara::OneLink(OnceLock::new()))),
+    ("cara_among_1000_idle", || Box::new(cara::Cara::AmongIdle)),
 ];
 
 /// The names of all peers.
