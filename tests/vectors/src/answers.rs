@@ -4,6 +4,7 @@
 use cara_core::config::Priority;
 use cara_core::distribution::function_list::{Generation, Slot};
 use cara_core::distribution::hello::Hello;
+use cara_core::distribution::identity::{Fleet, Identity};
 use cara_core::distribution::message::{Control, Renewal, RequestHeader, SessionBody, encode_reply};
 use cara_core::error::Error;
 use cara_core::host::frame::Frame;
@@ -12,7 +13,7 @@ use serde::Serialize;
 use serde_json::{Value, json};
 
 use crate::decoded::hex;
-use crate::encodings::{agv_hello, encoded_hello, manager_hello};
+use crate::introductions::{agv_hello, encoded_hello, manager_hello};
 use crate::side::{Side, Written};
 use crate::stream;
 use crate::streams::{chunked, frame};
@@ -25,7 +26,8 @@ pub(crate) struct Answer {
     name: &'static str,
     about: &'static str,
     /// `live`: the s_unit of the conversation, after `talk_list_ack`. `fresh`: its manager, which has accepted a
-    /// connection. `slow`: as `live`, with a minimum interval of 10 ms.
+    /// connection. `full`: the same, which takes no more nodes. `fresh s_unit`: the s_unit, which has accepted one.
+    /// `slow`: as `live`, with a minimum interval of 10 ms.
     link: &'static str,
     /// Bytes of the stream that come in; each piece is dealt with before the next one comes.
     given: Vec<String>,
@@ -55,6 +57,8 @@ fn answers<const N: usize>(cases: [Case<Vec<u8>>; N]) -> Vec<Answer> {
 fn answer((name, about, link, given, wait, expected): Case<Given>) -> Answer {
     let mut side = match link {
         "fresh" => Side::new(manager_hello(), false, &[]),
+        "full" => Side::with_room(manager_hello(), false, &[], 0),
+        "fresh s_unit" => Side::new(agv_hello(), false, &[]),
         "slow" => live(slow_hello()).0,
         _ => live(agv_hello()).0,
     };
@@ -125,14 +129,32 @@ fn handshakes() -> Vec<Answer> {
     let mut small = agv_hello();
     small.limits.chunk_size = 319;
     let small = encoded_hello(&small);
+    let mut fleet = agv_hello();
+    fleet.fleet = Fleet(8);
+    let mut stray = agv_hello();
+    stray.wanted = None;
+    let hello = |hello: &Hello| frame(&Frame::Hello(&encoded_hello(hello)));
+    let same = hello(&manager_hello());
+    let taken = stream::decode(&Context::limits(4096, 32_800), &same);
     let refuse = |code: u8| json!([{ "refuse": code }]);
     answers([
         ("other_version", "version 2", "fresh", frame(&Frame::Hello(&version)), 0, refuse(1)),
         ("other_magic", "not of this mode", "fresh", frame(&Frame::Hello(&magic)), 0, refuse(8)),
         ("small_chunks", "a chunk limit of 319", "fresh", frame(&Frame::Hello(&small)), 0, refuse(8)),
+        ("hello_taken", "answered with a hello", "fresh", hello(&agv_hello()), 0, taken),
+        ("fleet_refused", "fleet 8 and fleet 7", "fresh", hello(&fleet), 0, refuse(2)),
+        ("manager_refused", "an s_unit of no manager", "fresh", hello(&stray), 0, refuse(3)),
+        ("full_refused", "no more nodes", "full", hello(&agv_hello()), 0, refuse(4)),
+        ("own_identity", "the manager's own name and id", "fresh", same, 0, refuse(5)),
+        ("role_refused", "two s_units", "fresh s_unit", hello(&other_agv()), 0, refuse(6)),
         ("ping_before_hello", "too early", "fresh", frame(&Frame::Ping), 0, close(5)),
         ("no_hello", "none within 2 s", "fresh", Vec::new(), 2_000, close(7)),
     ])
+}
+
+fn other_agv() -> Hello {
+    let identity = Identity::s_unit("agv-08", 8).unwrap_or_else(|error| panic!("{error}"));
+    Hello { identity, ..agv_hello() }
 }
 
 fn messages() -> Vec<Answer> {

@@ -6,11 +6,14 @@
 
 mod answers;
 mod decoded;
-mod encodings;
+mod introductions;
+mod membership;
+mod messages;
 mod side;
 mod stream;
 mod streams;
 mod talk;
+mod values;
 mod vector;
 
 use std::path::PathBuf;
@@ -45,7 +48,7 @@ struct Document {
 
 impl Document {
     fn new() -> Self {
-        let vectors = [encodings::all(), streams::all(), talk::all()].concat();
+        let vectors = [values::all(), introductions::all(), messages::all(), streams::all(), talk::all()].concat();
         Self { version: cara_core::config::VERSION, vectors, answers: answers::all() }
     }
 }

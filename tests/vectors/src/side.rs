@@ -3,6 +3,7 @@
 use core::net::SocketAddr;
 
 use cara_core::config::Constraints;
+use cara_core::distribution::connection_handler::Node;
 use cara_core::distribution::function::Attributes;
 use cara_core::distribution::function_list::{Entry, FunctionList, Slot};
 use cara_core::distribution::hello::Hello;
@@ -15,6 +16,7 @@ use cara_core::services::{Context, Ticket};
 use cara_core::storage::Pool;
 use cara_core::time::{Duration, Instant};
 
+use crate::membership;
 use crate::stream::{Boxed, buffers};
 use crate::vector::definition;
 
@@ -58,6 +60,7 @@ pub(crate) struct Side {
     session: Session<Boxed, Plain>,
     pool: Pool<Boxed>,
     functions: FunctionList<Boxed, ()>,
+    node: Node<Boxed>,
     kept: Kept,
     now: Instant,
     /// Calls that the peer has made and that wait for an answer.
@@ -69,6 +72,11 @@ pub(crate) struct Side {
 impl Side {
     /// An end that has just been connected. Its clock begins at the stamp of its hello.
     pub(crate) fn new(hello: Hello, dialed: bool, functions: &[(&str, Attributes)]) -> Self {
+        Self::with_room(hello, dialed, functions, 1)
+    }
+
+    /// The same of a unit that takes `maximum` peers.
+    pub(crate) fn with_room(hello: Hello, dialed: bool, functions: &[(&str, Attributes)], maximum: u16) -> Self {
         let now = Instant::from_micros(hello.stamp);
         let constraints = Constraints {
             message_size: hello.limits.message_size,
@@ -77,6 +85,7 @@ impl Side {
             minimum_interval: Duration::from_micros(u64::from(hello.limits.minimum_interval)),
             ..Constraints::S_UNIT
         };
+        let node = membership::node(&hello, maximum);
         let config = SessionConfig {
             link: LinkId(hello.link),
             dialed,
@@ -88,6 +97,7 @@ impl Side {
             session: Session::new(now, config, Plain, storage()),
             pool: buffers(8, 40_000),
             functions: FunctionList::new((0..8).map(|_| Entry::empty()).collect(), vec![0; 1024].into()),
+            node,
             kept: Kept::default(),
             now,
             calls: Vec::new(),
@@ -135,13 +145,21 @@ impl Side {
             let hello = noted.as_deref() == Some("Hello");
             self.events.extend(noted.clone());
             if hello {
-                self.with(|session, cx| session.accept(cx));
+                self.decide();
             }
             if consumed == 0 && noted.is_none() {
                 break;
             }
         }
         self.take_calls();
+    }
+
+    fn decide(&mut self) {
+        let Some(peer) = self.session.hello().cloned() else { return };
+        match membership::decide(&mut self.node, self.session.link().0, &peer) {
+            Ok(()) => self.with(|session, cx| session.accept(cx)),
+            Err(refusal) => self.with(|session, cx| session.refuse(cx, refusal)),
+        }
     }
 
     fn receive(&mut self, rest: &mut [u8]) -> (usize, Option<String>, Option<Call>) {

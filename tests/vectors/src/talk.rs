@@ -9,7 +9,7 @@ use cara_core::time::Duration;
 use serde_json::{Value, json};
 
 use crate::decoded::{self, hex};
-use crate::encodings::{agv_hello, manager_hello};
+use crate::introductions::{agv_hello, manager_hello};
 use crate::side::{How, Side, Written};
 use crate::stream;
 use crate::vector::{Context, Kind, Vector};
