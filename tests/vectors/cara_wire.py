@@ -107,7 +107,7 @@ def sized(data):
 def read_identity(reader):
     identity = {"id": reader.varint(32), "name": reader.text(32)}
     role = reader.varint(32)
-    require(role < len(ROLES))
+    require(role < len(ROLES) and identity["name"])
     identity["role"] = ROLES[role]
     return identity
 

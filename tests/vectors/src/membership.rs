@@ -3,7 +3,7 @@
 use core::net::SocketAddr;
 
 use cara_core::config::Constraints;
-use cara_core::distribution::connection_handler::{Admission, Node, NodeConfig, NodeStorage, Target};
+use cara_core::distribution::connection_handler::{Admission, Node, NodeConfig, NodeStorage, Order, Target};
 use cara_core::distribution::hello::Hello;
 use cara_core::error::Refusal;
 use cara_core::host::mailman::LinkId;
@@ -25,9 +25,8 @@ pub(crate) fn node(own: &Hello, maximum: u16) -> Node<Boxed> {
     };
     let storage = NodeStorage {
         nodes: vec![None; 4].into(),
-        order: vec![0; 4].into(),
+        order: vec![Order::default(); 4].into(),
         links: vec![None; 512].into(),
-        challenges: vec![None; 2].into(),
         findings: vec![None; 4].into(),
     };
     Node::new(Instant::START, config, storage)
