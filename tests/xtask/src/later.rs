@@ -14,10 +14,6 @@ pub(crate) const DEMO: Later = Later {
 };
 pub(crate) const SIZES: Later =
     Later { what: "the sizes of firmware images", topic: "s_unit firmware: the embassy port" };
-pub(crate) const BENCH: Later = Later {
-    what: "the paper's experiments as one command",
-    topic: "the paper's experiments, and a round trip at the floor",
-};
 pub(crate) const FIRMWARE: Later =
     Later { what: "firmware images and their run in QEMU", topic: "s_unit firmware: the embassy port" };
 

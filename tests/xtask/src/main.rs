@@ -5,6 +5,7 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
+mod bench;
 mod command;
 mod demo;
 mod dependencies;
@@ -52,7 +53,7 @@ enum Task {
         #[arg(long, value_name = "FILE")]
         json: Option<PathBuf>,
     },
-    /// Runs the paper's experiments and the round trip against a raw socket.
+    /// Measures the round trip against a raw socket, interleaved with its control.
     Bench {
         /// Fewer requests per configuration.
         #[arg(long)]
@@ -78,7 +79,7 @@ fn main() -> ExitCode {
         Task::Test { list: true, .. } => runner::list(),
         Task::Test { groups, quick, list: false } => runner::run(&groups, quick),
         Task::Sizes { .. } => Ok(later::SIZES.refuse()),
-        Task::Bench { .. } => Ok(later::BENCH.refuse()),
+        Task::Bench { quick, json } => bench::run(quick, json.as_deref()),
         Task::Firmware { .. } => Ok(later::FIRMWARE.refuse()),
     };
     finished.unwrap_or_else(|error| {
