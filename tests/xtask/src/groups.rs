@@ -82,7 +82,7 @@ pub(crate) const GROUPS: [Group; 13] = [
         what: "every name of the paper leads to its Rust name in the documentation's search",
         budget: 2,
         quick: Some(2),
-        by_default: false,
+        by_default: true,
         run: |_| names::check().into(),
     },
     Group {
@@ -103,11 +103,11 @@ pub(crate) const GROUPS: [Group; 13] = [
     },
     Group {
         name: "unit",
-        what: "cargo test of the whole workspace",
+        what: "cargo test of the whole workspace, and of the Linux port with its asynchronous face",
         budget: 300,
         quick: Some(300),
         by_default: true,
-        run: |_| Run::cargo().args(["test", "--workspace"]).stream().into(),
+        run: |_| unit().into(),
     },
     Group {
         name: "thumb",
@@ -153,6 +153,11 @@ impl From<Result<()>> for Outcome {
 }
 
 /// Runs a check once what it needs is there; what cannot be had is a reason to skip it.
+fn unit() -> Result<()> {
+    Run::cargo().args(["test", "--workspace"]).stream()?;
+    Run::cargo().args(["test", "--package", "cara-std", "--all-features"]).stream()
+}
+
 fn needing(installed: Result<(), String>, check: impl FnOnce() -> Result<()>) -> Outcome {
     match installed {
         Ok(()) => check().into(),

@@ -88,6 +88,7 @@ pub struct Received {
 }
 
 /// One end of a stream.
+#[doc(alias = "Connections")]
 pub struct Link<S: Storage, C: Secure> {
     id: LinkId,
     cipher: C,
