@@ -131,20 +131,23 @@ impl<T: Send + 'static> Engine<T> {
     /// Runs the safe hook of a service whose lease ended.
     pub(super) fn make_safe(&self, slot: Slot) {
         let hook = read(&self.functions).function(slot).and_then(|function| function.handler.safe.clone());
-        self.run_hook(hook.as_deref());
+        self.run_hook(hook);
     }
 
     /// Runs the hook for the loss of a peer.
     pub(super) fn run_lost_hook(&self) {
         let hook = lock(&self.lost_hook).clone();
-        self.run_hook(hook.as_deref());
+        self.run_hook(hook);
     }
 
-    fn run_hook(&self, hook: Option<&handler::Hook<T>>) {
+    /// While a method holds the state, the hook is left to it: the thread that comes here may be the clock's, or that
+    /// method's own, which reads for its reply.
+    fn run_hook(&self, hook: Option<Arc<handler::Hook<T>>>) {
         let Some(hook) = hook else { return };
-        let Ok(mut state) = self.state.enter(None) else { return };
-        if catch_unwind(AssertUnwindSafe(|| hook(&mut state))).is_err() {
-            tracing::error!("a hook panicked");
-        }
+        self.state.run_or_leave(Box::new(move |state| {
+            if catch_unwind(AssertUnwindSafe(|| hook(state))).is_err() {
+                tracing::error!("a hook panicked");
+            }
+        }));
     }
 }
