@@ -29,8 +29,6 @@ use crate::unit::Unit;
 const KEPT_BUFFERS: usize = 8;
 /// Nodes that are remembered beyond the maximum number of connected ones.
 const REMEMBERED_NODES: usize = 16;
-/// Newcomers that may wait for a challenge at the same time.
-const CHALLENGES: usize = 16;
 /// Refusals that are remembered for the operator.
 const FINDINGS: usize = 32;
 
@@ -162,9 +160,8 @@ impl<T: Send + 'static> Builder<T> {
         };
         let storage = NodeStorage {
             nodes: filled(nodes + REMEMBERED_NODES, None),
-            order: filled(nodes + REMEMBERED_NODES, 0),
+            order: filled_with(nodes + REMEMBERED_NODES, Default::default),
             links: filled(maximum_links, None),
-            challenges: filled(CHALLENGES, None),
             findings: filled(FINDINGS, None),
         };
         let node = Node::new(clock.now(), config, storage);

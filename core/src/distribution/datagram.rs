@@ -120,17 +120,18 @@ impl<'b> Datagram<'b> {
             return Err(DatagramError::Malformed);
         }
         match kind {
-            WHO_HAS => whole(body).map(Self::WhoHas),
-            ANNOUNCE => whole(body).map(Self::Announce),
+            WHO_HAS => whole(body, |who_has: &WhoHas| &who_has.identity).map(Self::WhoHas),
+            ANNOUNCE => whole(body, |announce: &Announce| &announce.identity).map(Self::Announce),
             SESSION => session(body).ok_or(DatagramError::Malformed),
             _ => Err(DatagramError::Malformed),
         }
     }
 }
 
-fn whole<'b, T: Deserialize<'b>>(body: &'b [u8]) -> Result<T, DatagramError> {
+/// The whole body, from a node that has a name.
+fn whole<'b, T: Deserialize<'b>>(body: &'b [u8], who: impl Fn(&T) -> &Identity) -> Result<T, DatagramError> {
     match postcard::take_from_bytes(body) {
-        Ok((value, [])) => Ok(value),
+        Ok((value, [])) if !who(&value).name().is_empty() => Ok(value),
         _ => Err(DatagramError::Malformed),
     }
 }
@@ -236,14 +237,65 @@ mod tests {
         assert_eq!(Datagram::decode(&bytes, FLEET), Ok(expected));
     }
 
+    #[test]
+    fn every_cut_every_tail_and_every_unknown_kind_is_refused() {
+        let mut out = [0; SEARCH_BYTES];
+        let length = who_has(2).encode(FLEET, &mut out).unwrap().len();
+        for cut in 0..length {
+            assert_eq!(Datagram::decode(&out[..cut], FLEET), Err(DatagramError::Malformed));
+        }
+        assert_eq!(Datagram::decode(&out[..length + 1], FLEET), Err(DatagramError::Malformed));
+        for (place, byte) in [(5, 0), (5, 4), (6, 1), (7, 1)] {
+            let mut changed = out;
+            changed[place] = byte;
+            assert_eq!(Datagram::decode(&changed[..length], FLEET), Err(DatagramError::Malformed));
+        }
+        let session = session_header(FLEET, 1, 2);
+        assert_eq!(Datagram::decode(&session[..SESSION_HEADER_BYTES - 1], FLEET), Err(DatagramError::Malformed));
+    }
+
+    #[test]
+    fn a_node_without_a_name_is_refused() {
+        let mut out = [0; SEARCH_BYTES];
+        let length = who_has(0).encode(FLEET, &mut out).unwrap().len();
+        // The identity begins with its id in five bytes; the name's length follows.
+        let at = HEADER_BYTES + 5;
+        assert_eq!(out[at], 32);
+        out[at] = 0;
+        let mut bytes = std::vec::Vec::from(&out[..length]);
+        bytes.drain(at + 1..=at + 32);
+        assert_eq!(Datagram::decode(&bytes, FLEET), Err(DatagramError::Malformed));
+    }
+
+    #[test]
+    fn short_hashes_are_fnv_1a() {
+        // Computed by hand from the definition: role 0, id 1, "a".
+        let mut expected: u32 = 0x811C_9DC5;
+        for byte in [0, 1, 0, 0, 0, b'a'] {
+            expected = (expected ^ u32::from(byte)).wrapping_mul(16_777_619);
+        }
+        assert_eq!(short_hash(&Identity::m_unit("a", 1).unwrap()), expected);
+        assert_ne!(short_hash(&Identity::s_unit("a", 1).unwrap()), expected);
+    }
+
     proptest! {
         #[test]
-        fn decoding_mutations_never_panics(place in 0..SEARCH_BYTES, byte: u8, cut in 0..SEARCH_BYTES) {
+        fn what_is_read_from_changed_bytes_can_be_written_again(
+            changes in prop::collection::vec((0..SEARCH_BYTES, any::<u8>()), 0..6),
+            cut in 0..SEARCH_BYTES,
+            known in 0..KNOWN_NODES,
+        ) {
             let mut out = [0; SEARCH_BYTES];
-            let length = who_has(3).encode(FLEET, &mut out).unwrap().len();
-            out[place] = byte;
+            let length = who_has(known).encode(FLEET, &mut out).unwrap().len();
+            for (place, byte) in changes {
+                out[place] = byte;
+            }
             let _ = Datagram::decode(&out[..length.min(cut)], FLEET);
-            let _ = Datagram::decode(&out[..length], FLEET);
+            if let Ok(Datagram::WhoHas(read)) = Datagram::decode(&out[..length], FLEET) {
+                let mut again = [0; SEARCH_BYTES];
+                let bytes = read.encode(FLEET, &mut again).unwrap();
+                prop_assert_eq!(Datagram::decode(bytes, FLEET), Ok(Datagram::WhoHas(read)));
+            }
         }
     }
 }

@@ -99,3 +99,83 @@ impl Hello {
         if sound { Ok(hello) } else { Err(HelloError::Malformed) }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, clippy::indexing_slicing, clippy::arithmetic_side_effects)]
+    use super::*;
+    use proptest::prelude::*;
+
+    const ROOM: usize = 256;
+
+    fn longest() -> Hello {
+        let name = "a-manager-with-a-name-of-32-byte";
+        Hello {
+            fleet: Fleet(u32::MAX),
+            identity: Identity::s_unit(name, u32::MAX).unwrap(),
+            wanted: Some(Manager { name: name.try_into().unwrap(), id: u32::MAX }),
+            epoch: Epoch(u64::MAX),
+            nonce: u64::MAX,
+            term: u32::MAX,
+            capabilities: u32::MAX,
+            limits: Limits {
+                message_size: u32::MAX,
+                chunk_size: u16::MAX,
+                calls: u16::MAX,
+                minimum_interval: u32::MAX,
+            },
+            link: u16::MAX,
+            udp_port: u16::MAX,
+            stamp: u64::MAX,
+            keep_alive: u32::MAX,
+        }
+    }
+
+    #[test]
+    fn the_longest_hello_fits_256_bytes_and_survives() {
+        let mut out = [0; ROOM];
+        let length = longest().encode(&mut out).unwrap();
+        assert_eq!(Hello::decode(&out[..length]), Ok(longest()));
+        assert_eq!(longest().encode(&mut out[..length - 1]), None);
+        assert_eq!(Hello::decode(&out[..length + 1]), Err(HelloError::Malformed), "nothing may follow");
+    }
+
+    #[test]
+    fn each_fault_of_a_hello_is_named() {
+        let mut out = [0; ROOM];
+        let length = longest().encode(&mut out).unwrap();
+        let with = |place: usize, byte| {
+            let mut bytes = out;
+            bytes[place] = byte;
+            Hello::decode(&bytes[..length])
+        };
+        assert_eq!(with(0, b'X'), Err(HelloError::Magic));
+        assert_eq!(with(4, VERSION + 1), Err(HelloError::Version(VERSION + 1)));
+        for cut in 0..length {
+            assert_eq!(Hello::decode(&out[..cut]), Err(HelloError::Malformed));
+        }
+        let small = Limits { chunk_size: (MINIMUM_CHUNK_BYTES - 1) as u16, ..longest().limits };
+        let length = Hello { limits: small, ..longest() }.encode(&mut out).unwrap();
+        assert_eq!(Hello::decode(&out[..length]), Err(HelloError::Malformed), "an emergency would not fit");
+    }
+
+    proptest! {
+        #[test]
+        fn what_is_read_from_changed_bytes_can_be_written_again(
+            changes in prop::collection::vec((5usize..160, any::<u8>()), 0..6),
+            cut in 0..ROOM,
+        ) {
+            let mut out = [0; ROOM];
+            let length = longest().encode(&mut out).unwrap();
+            for (place, byte) in changes {
+                out[place] = byte;
+            }
+            let _ = Hello::decode(&out[..cut]);
+            if let Ok(hello) = Hello::decode(&out[..length]) {
+                let mut again = [0; ROOM];
+                let length = hello.encode(&mut again).unwrap();
+                prop_assert_eq!(Hello::decode(&again[..length]), Ok(hello));
+            }
+        }
+    }
+}

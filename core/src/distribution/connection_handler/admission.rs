@@ -3,10 +3,12 @@
 
 use core::net::SocketAddr;
 
-use super::{Action, Finding, Node, NodeCounter, NodeState};
+use super::table::{Newcomer, NodeState};
+use super::timetable::Task;
+use super::{Action, Finding, Node, NodeCounter};
 use crate::config::CHALLENGE_TIMEOUT;
 use crate::distribution::hello::Hello;
-use crate::distribution::identity::Role;
+use crate::distribution::identity::{Identity, Role};
 use crate::error::{CloseReason, Refusal};
 use crate::host::mailman::LinkId;
 use crate::storage::Storage;
@@ -26,36 +28,19 @@ pub enum Admission {
     },
 }
 
-/// A newcomer that waits for the link in its way to show whether it lives.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Challenge {
-    old: LinkId,
-    new: LinkId,
-    hello: Hello,
-    address: SocketAddr,
-    pub(super) until: Instant,
-}
-
 impl<S: Storage> Node<S> {
     /// Decides about a link whose hello has come. `from` is the other end of the stream.
     pub fn admit(&mut self, now: Instant, link: LinkId, from: SocketAddr, hello: &Hello) -> Admission {
         if let Err(refusal) = self.check(hello) {
             return self.refuse(now, from, refusal);
         }
-        let known = self.table.find(&hello.identity).and_then(|place| self.table.node(place));
-        let (joined, epoch) = match known {
-            Some(known) => (known.state, Some(known.epoch)),
-            None => (NodeState::Away, None),
-        };
-        match joined {
-            NodeState::Joined(old) if old != link => self.challenge(now, old, link, from, hello),
-            _ if self.is_full() => self.refuse(now, from, Refusal::Full),
-            _ => {
-                if epoch.is_some_and(|epoch| epoch != hello.epoch) {
-                    self.counters.add(NodeCounter::Restarted, 1);
-                }
-                self.join(now, link, from, hello)
-            }
+        let newcomer = Newcomer { link, epoch: hello.epoch, limits: hello.limits, address: from, decided: false };
+        let old = self.table.find(&hello.identity).and_then(|place| Some((place, self.table.node(place)?.link()?)));
+        match old {
+            Some((_, old)) if old == link => Admission::Accept,
+            Some((place, old)) => self.meet(now, place, old, newcomer),
+            None if self.is_full() => self.refuse(now, from, Refusal::Full),
+            None => self.join(now, &hello.identity, newcomer),
         }
     }
 
@@ -68,98 +53,105 @@ impl<S: Storage> Node<S> {
         }
         match (self.config.identity.role(), hello.identity.role()) {
             (Role::SUnit, Role::SUnit) => Err(Refusal::Role),
-            (Role::SUnit, Role::MUnit) => match self.manager() {
-                Some(manager) if manager.is(&hello.identity) => Ok(()),
-                _ => Err(Refusal::WrongManager),
-            },
-            (Role::MUnit, Role::SUnit) => match &hello.wanted {
+            (Role::SUnit, Role::MUnit) if self.is_wanted(&hello.identity) => Ok(()),
+            (Role::SUnit, Role::MUnit) => Err(Refusal::WrongManager),
+            (Role::MUnit, role) => match &hello.wanted {
                 Some(manager) if manager.is(&self.config.identity) => Ok(()),
+                None if role == Role::MUnit => Ok(()),
                 _ => Err(Refusal::WrongManager),
             },
-            (Role::MUnit, Role::MUnit) => Ok(()),
         }
     }
 
-    fn is_full(&self) -> bool {
-        self.table.joined() >= usize::from(self.config.constraints.maximum_nodes)
+    /// As many nodes are connected as may be.
+    pub(super) fn is_full(&self) -> bool {
+        self.table.joined() >= self.config.constraints.maximum_nodes
     }
 
-    fn join(&mut self, now: Instant, link: LinkId, from: SocketAddr, hello: &Hello) -> Admission {
-        let Some((place, forgotten)) = self.table.place_of(&hello.identity, from, hello.epoch) else {
-            return self.refuse(now, from, Refusal::Full);
+    fn join(&mut self, now: Instant, identity: &Identity, newcomer: Newcomer) -> Admission {
+        let Newcomer { link, epoch, limits, address, .. } = newcomer;
+        let Some((place, forgotten)) = self.table.place_of(identity, address, epoch) else {
+            return self.refuse(now, address, Refusal::Full);
         };
-        if forgotten {
-            self.counters.add(NodeCounter::Forgotten, 1);
+        self.count_forgotten(forgotten);
+        let Some(known) = self.table.node_mut(place) else { return Admission::Refuse(Refusal::Full) };
+        let restarted = known.limits.is_some() && known.epoch != epoch;
+        known.dialed = known.dialing.take_if(|dialing| *dialing == link).is_some();
+        if known.dialed {
+            known.listens = Some(address);
         }
-        if let Some(known) = self.table.node_mut(place) {
-            known.epoch = hello.epoch;
-            known.limits = Some(hello.limits);
-            known.address = from;
+        if known.newest.is_none_or(|(newest, _)| newest != epoch) {
+            known.hear(now, epoch, 0);
         }
-        self.table.set_link(place, link, NodeState::Joined(link));
-        self.search.joined(&self.config.target);
+        (known.epoch, known.limits, known.address, known.since) = (epoch, Some(limits), address, now);
+        self.table.cancel(place);
+        self.table.set_state(place, NodeState::Joined(link));
+        self.table.set_link(link, Some(place));
+        self.table.keep_index(place);
+        self.counters.add(NodeCounter::Restarted, u64::from(restarted));
         self.counters.add(NodeCounter::Joined, 1);
         debug!("link {} joins", link.0);
         Admission::Accept
     }
 
-    fn challenge(&mut self, now: Instant, old: LinkId, new: LinkId, address: SocketAddr, hello: &Hello) -> Admission {
-        // A second newcomer for the same place is one too many, whoever it is.
-        let waiting = self.challenges.iter().flatten().any(|challenge| challenge.old == old);
-        let free = self.challenges.iter_mut().find(|place| place.is_none());
-        let (false, Some(place)) = (waiting, free) else {
-            return self.refuse(now, address, Refusal::DuplicateIdentity);
-        };
-        *place = Some(Challenge { old, new, hello: hello.clone(), address, until: now + CHALLENGE_TIMEOUT });
+    /// Another link has the identity of a node that is connected.
+    fn meet(&mut self, now: Instant, place: usize, old: LinkId, mut newcomer: Newcomer) -> Admission {
+        let smaller = self.table.node(place).is_some_and(|known| self.config.identity < known.identity);
+        let Some(known) = self.table.node_mut(place) else { return Admission::Refuse(Refusal::Full) };
+        let same_life = known.epoch == newcomer.epoch;
+        let dialed = known.dialing == Some(newcomer.link);
+        if known.newcomer.is_some() {
+            // One waits already: a second one is one too many, whoever it is.
+            return self.refuse(now, newcomer.address, Refusal::DuplicateIdentity);
+        }
+        // Both ends have dialled each other at once: both keep the link that the smaller one opened.
+        let crossing = same_life && dialed != known.dialed;
+        if crossing && dialed != smaller {
+            return self.refuse(now, newcomer.address, Refusal::AlreadyConnected);
+        }
+        newcomer.decided = crossing;
+        known.newcomer = Some(newcomer);
+        let at = if crossing { now } else { now + CHALLENGE_TIMEOUT };
+        self.table.schedule(place, at, Task::Supersede);
+        self.table.set_link(newcomer.link, Some(place));
+        self.counters.add(NodeCounter::Challenged, 1);
         Admission::Challenge { old }
     }
 
     /// The challenged link has answered: the newcomer is not taken.
     pub fn challenge_answered(&mut self, now: Instant, old: LinkId) -> Option<Action> {
-        let challenge = self.take_challenge(|challenge| challenge.old == old)?;
-        let known_epoch = self.node_of(old).map(|known| known.epoch);
-        let same = known_epoch == Some(challenge.hello.epoch);
-        let refusal = if same { Refusal::AlreadyConnected } else { Refusal::DuplicateIdentity };
-        self.refuse(now, challenge.address, refusal);
-        Some(Action::Refuse { new: challenge.new, refusal })
+        let place = self.table.of_link(old)?;
+        let known = self.table.node_mut(place).filter(|known| known.link() == Some(old))?;
+        let newcomer = known.newcomer.take_if(|newcomer| !newcomer.decided)?;
+        known.dialing.take_if(|dialing| *dialing == newcomer.link);
+        let same_life = known.epoch == newcomer.epoch;
+        let refusal = if same_life { Refusal::AlreadyConnected } else { Refusal::DuplicateIdentity };
+        self.table.cancel(place);
+        self.table.set_link(newcomer.link, None);
+        self.refuse(now, newcomer.address, refusal);
+        Some(Action::Refuse { new: newcomer.link, refusal })
     }
 
-    /// Newcomers whose challenge was not answered take the place.
-    pub(super) fn poll_challenges(&mut self, now: Instant) -> Option<Action> {
-        let challenge = self.take_challenge(|challenge| challenge.until <= now)?;
-        let restarted = self.node_of(challenge.old).is_some_and(|known| known.epoch != challenge.hello.epoch);
-        let reason = if restarted { CloseReason::PeerRestarted } else { CloseReason::Reset };
-        self.take_over(now, &challenge, restarted);
-        Some(Action::Supersede { old: challenge.old, new: challenge.new, reason })
+    /// The challenge has not been answered in time: the newcomer takes the place.
+    pub(super) fn supersede(&mut self, now: Instant, place: usize) -> Option<Action> {
+        let known = self.table.node_mut(place)?;
+        let old = known.link()?;
+        let newcomer = known.newcomer.take()?;
+        let reason = match (known.epoch == newcomer.epoch, newcomer.decided) {
+            (true, true) => CloseReason::Refused(Refusal::AlreadyConnected),
+            (true, false) => CloseReason::Reset,
+            (false, _) => CloseReason::PeerRestarted,
+        };
+        self.table.set_link(old, None);
+        self.take_place(now, place, newcomer);
+        Some(Action::Supersede { old, new: newcomer.link, reason })
     }
 
-    /// The link in a newcomer's way has ended.
-    pub(super) fn freed_by(&mut self, old: LinkId) -> Option<Action> {
-        let challenge = self.take_challenge(|challenge| challenge.old == old)?;
-        let known = self.node(&challenge.hello.identity);
-        let restarted = known.is_some_and(|known| known.epoch != challenge.hello.epoch);
-        self.take_over(Instant::START, &challenge, restarted);
-        Some(Action::Admit { new: challenge.new })
-    }
-
-    fn take_over(&mut self, now: Instant, challenge: &Challenge, restarted: bool) {
-        if restarted {
-            self.counters.add(NodeCounter::Restarted, 1);
+    /// A newcomer joins in the place of a link that is gone.
+    pub(super) fn take_place(&mut self, now: Instant, place: usize, newcomer: Newcomer) {
+        if let Some(identity) = self.table.node(place).map(|known| known.identity.clone()) {
+            self.join(now, &identity, newcomer);
         }
-        if let Some(place) = self.table.of_link(challenge.old) {
-            self.table.leave(place, challenge.old);
-        }
-        self.join(now, challenge.new, challenge.address, &challenge.hello);
-    }
-
-    /// A newcomer that waits has gone itself.
-    pub(super) fn forget_waiting(&mut self, new: LinkId) {
-        let _ = self.take_challenge(|challenge| challenge.new == new);
-    }
-
-    fn take_challenge(&mut self, matches: impl Fn(&Challenge) -> bool) -> Option<Challenge> {
-        let place = self.challenges.iter_mut().find(|place| place.as_ref().is_some_and(&matches))?;
-        place.take()
     }
 
     fn refuse(&mut self, now: Instant, address: SocketAddr, refusal: Refusal) -> Admission {

@@ -12,15 +12,21 @@
 //!   smaller identity dials.
 
 mod admission;
+mod answers;
+mod counter;
+mod links;
 mod search;
 mod table;
+mod timetable;
+mod views;
 
 pub use admission::Admission;
-pub use table::{Known, NodeState};
+pub use counter::NodeCounter;
+pub use table::{Known, NodeState, Order};
 
 use core::net::SocketAddr;
 
-use crate::config::{Constraints, FIRST_SEARCH, LONGEST_SEARCH, NODE_NAME_BYTES};
+use crate::config::{Constraints, NODE_NAME_BYTES};
 use crate::counters::Counters;
 use crate::distribution::datagram::{Datagram, DatagramError};
 use crate::distribution::hello::{Hello, Limits, Manager};
@@ -29,66 +35,11 @@ use crate::error::{CloseReason, Error, Refusal};
 use crate::host::mailman::{LinkId, Mailman};
 use crate::random::Random;
 use crate::storage::Storage;
-use crate::time::{Duration, Instant};
-use admission::Challenge;
-use search::{Answers, Budget, Search};
+use crate::time::Instant;
+use answers::Answers;
+use search::{Budget, Search};
 use table::Table;
-
-crate::counters::counters! {
-    /// What a unit counts about discovery and membership.
-    pub enum NodeCounter {
-        /// Datagrams of another mode, or of no unit at all.
-        DatagramMagic,
-        /// Datagrams of another version.
-        DatagramVersion,
-        /// Datagrams of another fleet.
-        DatagramFleet,
-        /// Datagrams that could not be read.
-        DatagramMalformed,
-        /// Session datagrams for links that this unit does not have.
-        DatagramUnknownLink,
-        /// Searches sent.
-        WhoHasSent,
-        /// Searches of others heard.
-        WhoHasHeard,
-        /// Own searches put off because enough were heard.
-        WhoHasDeferred,
-        /// Answers sent to one node.
-        AnnounceSent,
-        /// Answers sent to all.
-        AnnounceBroadcast,
-        /// Answers heard.
-        AnnounceHeard,
-        /// Answers put off because too many waited already.
-        AnnounceDropped,
-        /// Datagrams older than what is known of their sender.
-        Outdated,
-        /// Searches for, and hellos to, another manager.
-        WrongManager,
-        /// Datagrams of another unit with this unit's own identity.
-        OwnIdentity,
-        /// Links dialled.
-        Dialled,
-        /// Links taken.
-        Joined,
-        /// Links refused because of their version.
-        RefusedVersion,
-        /// Links refused because of their fleet.
-        RefusedFleet,
-        /// Links refused because of their role.
-        RefusedRole,
-        /// Links refused because as many nodes are connected as may be.
-        RefusedFull,
-        /// Links refused because a live node has the same identity.
-        RefusedDuplicate,
-        /// Links refused because the two are connected already.
-        RefusedConnected,
-        /// Nodes that came back with a new epoch.
-        Restarted,
-        /// Nodes forgotten to make room.
-        Forgotten,
-    }
-}
+use timetable::Task;
 
 /// Whom a unit wants to reach.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -108,6 +59,11 @@ impl Manager {
             return Err(Error::BadName);
         }
         Ok(Self { name: heapless::String::try_from(name).map_err(|_| Error::BadName)?, id })
+    }
+
+    /// The manager's identity.
+    fn identity(&self) -> Option<Identity> {
+        Identity::m_unit(&self.name, self.id).ok()
     }
 
     /// Whether an identity is this manager's.
@@ -199,30 +155,31 @@ pub struct Finding {
 
 /// The slices that a node lives in.
 pub struct NodeStorage<S: Storage> {
-    /// One slot per node that is known, connected or not.
+    /// One slot per node that is known, connected or not. More than `maximum_nodes` of them let nodes that left be
+    /// remembered.
     pub nodes: S::Slice<Option<Known>>,
-    /// As many: their order by identity.
-    pub order: S::Slice<u16>,
+    /// As many.
+    pub order: S::Slice<Order>,
     /// One slot per link.
     pub links: S::Slice<Option<u16>>,
-    /// One slot per link that waits for a challenge.
-    pub challenges: S::Slice<Option<Challenge>>,
     /// A few: the last refusals.
     pub findings: S::Slice<Option<Finding>>,
 }
 
-pub use admission::Challenge as PendingChallenge;
-
 /// One unit's view of the network.
+#[doc(alias = "Connection_handler")]
 pub struct Node<S: Storage> {
     config: NodeConfig,
+    /// The manager of an s_unit.
+    target: Option<Identity>,
     table: Table<S>,
-    challenges: S::Slice<Option<Challenge>>,
     findings: S::Slice<Option<Finding>>,
     random: Random,
     search: Search,
     budget: Budget,
     answers: Answers,
+    /// Of the last search or answer.
+    sequence: u32,
     /// What happened.
     pub counters: Counters<NodeCounter, { NodeCounter::COUNT }>,
 }
@@ -231,18 +188,34 @@ impl<S: Storage> Node<S> {
     /// A node that begins to search at once.
     pub fn new(now: Instant, config: NodeConfig, storage: NodeStorage<S>) -> Self {
         let mut random = Random::new(config.seed);
-        let search = Search::new(now, &config.target, &mut random);
-        Self {
+        let target = match &config.target {
+            Target::Everybody => None,
+            Target::Manager(manager) | Target::Fixed(manager, _) => manager.identity(),
+        };
+        let mut node = Self {
+            target,
             table: Table::new(storage.nodes, storage.order, storage.links),
-            challenges: storage.challenges,
             findings: storage.findings,
-            random,
-            search,
-            budget: Budget::new(now),
+            search: Search::new(now, &mut random),
+            budget: Budget::new(),
             answers: Answers::new(),
+            sequence: 0,
             counters: Counters::new(),
             config,
+            random,
+        };
+        node.plan_fixed(now);
+        node
+    }
+
+    fn plan_fixed(&mut self, now: Instant) {
+        let (Target::Fixed(_, address), Some(target)) = (&self.config.target, &self.target) else { return };
+        let (address, at) = (*address, now + self.random.jitter(search::FIRST_DELAY));
+        let Some((place, _)) = self.table.place_of(target, address, Epoch(0)) else { return };
+        if let Some(known) = self.table.node_mut(place) {
+            known.listens = Some(address);
         }
+        self.table.schedule(place, at, Task::Dial);
     }
 
     /// This unit's identity.
@@ -268,6 +241,11 @@ impl<S: Storage> Node<S> {
     /// Changes the constraints. Nodes above a lower maximum stay; the next one is refused.
     pub fn set_constraints(&mut self, constraints: Constraints) {
         self.config.constraints = constraints;
+    }
+
+    /// Changes the most nodes that may be connected at a time.
+    pub fn set_maximum_nodes(&mut self, maximum_nodes: u16) {
+        self.config.constraints.maximum_nodes = maximum_nodes;
     }
 
     /// The hello for a new link, with a fresh nonce.
@@ -301,26 +279,6 @@ impl<S: Storage> Node<S> {
         }
     }
 
-    /// All nodes that are known, in the order in which they became so.
-    pub fn nodes(&self) -> impl Iterator<Item = &Known> {
-        self.table.iter()
-    }
-
-    /// The node of an identity.
-    pub fn node(&self, identity: &Identity) -> Option<&Known> {
-        self.table.find(identity).and_then(|place| self.table.node(place))
-    }
-
-    /// The node at the other end of a link.
-    pub fn node_of(&self, link: LinkId) -> Option<&Known> {
-        self.table.of_link(link).and_then(|place| self.table.node(place))
-    }
-
-    /// How many nodes are connected.
-    pub const fn connected(&self) -> usize {
-        self.table.joined()
-    }
-
     /// The last refusals, in no order.
     pub fn findings(&self) -> impl Iterator<Item = &Finding> {
         self.findings.iter().flatten()
@@ -328,25 +286,27 @@ impl<S: Storage> Node<S> {
 
     /// When [`poll`](Self::poll) has something to do next.
     pub fn next_deadline(&self) -> Instant {
-        let challenge = self.challenges.iter().flatten().map(|challenge| challenge.until).min();
-        let own = self.search.next.min(self.answers.next()).min(self.table.next_dial());
-        own.min(challenge.unwrap_or(Instant::FAR_FUTURE))
+        self.search.next().min(self.answers.next()).min(self.table.next_due())
     }
 
     /// Does what is due. Returns one action at a time; call it until it returns `None`.
     pub fn poll(&mut self, now: Instant, mailman: &mut impl Mailman) -> Option<Action> {
-        if let Some(action) = self.poll_challenges(now) {
-            return Some(action);
+        while let Some((place, task)) = self.table.pop_due(now) {
+            let action = match task {
+                Task::Supersede => self.supersede(now, place),
+                Task::Dial => self.dial(now, place),
+                Task::GiveUp => {
+                    self.dial_ended(now, place);
+                    None
+                }
+            };
+            if action.is_some() {
+                return action;
+            }
         }
         self.poll_answers(now, mailman);
-        if now >= self.search.next
-            && let Some(action) = self.poll_search(now, mailman)
-        {
-            return Some(action);
-        }
-        let (to, identity) = self.table.take_due_dial(now)?;
-        self.counters.add(NodeCounter::Dialled, 1);
-        Some(Action::Dial { to, identity: Some(identity) })
+        self.poll_search(now, mailman);
+        None
     }
 
     /// Takes a datagram that arrived at any of the unit's sockets.
@@ -390,57 +350,14 @@ impl<S: Storage> Node<S> {
         }
     }
 
-    /// The port is opening the link that [`Action::Dial`] asked for.
-    pub fn dialing(&mut self, identity: Option<&Identity>, link: LinkId) {
-        if let Some(place) = identity.and_then(|identity| self.table.find(identity)) {
-            self.table.set_link(place, link, NodeState::Dialing(link));
-        }
-        self.search.dialing = Some(link);
+    fn note_at(&mut self, at: Instant, address: SocketAddr, refusal: Refusal) {
+        self.note(Finding { at, address, refusal });
     }
 
-    /// The link that [`Action::Dial`] asked for could not be opened at all.
-    pub fn dial_failed(&mut self, now: Instant, identity: Option<&Identity>) {
-        if let Some(place) = identity.and_then(|identity| self.table.find(identity)) {
-            self.redial(now, place);
-        }
-        self.search_again(now);
-    }
-
-    /// A link has ended, whatever it was. May free a newcomer that waited for that.
-    pub fn left(&mut self, now: Instant, link: LinkId, reason: CloseReason) -> Option<Action> {
-        self.forget_waiting(link);
-        if self.search.dialing == Some(link) {
-            self.search.dialing = None;
-        }
-        if let Some(place) = self.table.of_link(link) {
-            self.table.leave(place, link);
-            debug!("link {} left: {}", link.0, reason);
-            if self.config.target == Target::Everybody {
-                self.redial(now, place);
-            }
-        }
-        self.search_again(now);
-        self.freed_by(link)
-    }
-
-    /// An m_unit that dials a peer tries again, later and later.
-    fn redial(&mut self, now: Instant, place: usize) {
-        let Some(known) = self.table.node(place) else { return };
-        let dials = self.config.target == Target::Everybody && self.dials(&known.identity);
-        if dials && !known.is_joined() {
-            let pause = FIRST_SEARCH.times(1 << known.attempts().min(5)).min(LONGEST_SEARCH);
-            let at = now + pause + self.random.jitter(pause);
-            self.table.dial_later(place, at);
-        }
-    }
-
-    /// Of two m_units the smaller identity dials; an s_unit always does.
-    fn dials(&self, peer: &Identity) -> bool {
-        peer.role() == Role::MUnit && (self.config.identity.role() == Role::SUnit || self.config.identity < *peer)
-    }
-
-    /// A random span within `spread` for each of `expected` nodes.
-    fn spread(&mut self, expected: u16) -> Duration {
-        self.random.jitter(crate::config::ANSWER_SPREAD.times(u64::from(expected.max(1))))
+    fn count_forgotten(&mut self, forgotten: bool) {
+        self.counters.add(NodeCounter::Forgotten, u64::from(forgotten));
     }
 }
+
+#[cfg(test)]
+mod tests;

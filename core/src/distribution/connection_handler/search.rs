@@ -1,354 +1,297 @@
-//! Searching and answering, within a budget of broadcasts.
+//! Searching, within a budget of broadcasts, and what is heard from others.
 
 use core::net::SocketAddr;
 
-use super::{Action, Node, NodeCounter, NodeState, Target};
+use super::answers::Found;
+use super::table::NodeState;
+use super::timetable::Task;
+use super::{Node, NodeCounter, Target};
 use crate::config::{FIRST_SEARCH, LONGEST_SEARCH, SEARCH_BUDGET, SEARCH_WINDOW};
-use crate::distribution::datagram::{Announce, SEARCH_BYTES, WhoHas, short_hash};
+use crate::distribution::datagram::{Announce, KNOWN_NODES, SEARCH_BYTES, WhoHas, short_hash};
 use crate::distribution::identity::{Epoch, Identity, Role};
-use crate::host::mailman::{LinkId, Mailman};
+use crate::error::Refusal;
+use crate::host::mailman::Mailman;
 use crate::random::Random;
 use crate::storage::Storage;
 use crate::time::{Duration, Instant};
 
 /// First searches wait a random part of this, so that a fleet that is switched on at once does not ask at once.
-const FIRST_DELAY: Duration = Duration::from_millis(50);
-/// A second unit that asks within this is answered, with all others, by one broadcast.
-const SAME_QUESTION: Duration = Duration::from_secs(1);
-/// Two broadcast answers are at least this far apart.
-const ANSWER_PAUSE: Duration = Duration::from_millis(250);
-/// A broadcast answer waits this long for more who ask.
-const ANSWER_GATHER: Duration = Duration::from_millis(20);
-/// Answers to single nodes that may wait for their random delay.
-const WAITING_ANSWERS: usize = 8;
+pub(super) const FIRST_DELAY: Duration = Duration::from_millis(50);
+/// Searches that an m_unit makes after its start, or after it lost its last node, whoever has joined meanwhile: a lost
+/// datagram must not keep two managers apart.
+const M_UNIT_SEARCHES: u8 = 4;
+/// Pauses double until then.
+const LONGEST_PAUSE_AFTER: u8 = 5;
+/// Steps of [`alone`]: among a thousand units about one falls into the earliest that is taken.
+const STEPS: u32 = 12;
 
 /// When this unit asks next.
 #[derive(Clone, Debug)]
 pub(super) struct Search {
     pub(super) next: Instant,
-    pause: Duration,
-    nonce: u64,
-    sequence: u32,
-    /// The unit asked for it: it goes out as soon as the budget allows.
-    explicit: bool,
-    /// A link is being opened: no need to ask.
-    pub(super) dialing: Option<LinkId>,
-    /// A fixed address is dialled instead.
-    dial_at: Option<Instant>,
+    /// The application asked for it: it goes out whatever else is heard until then.
+    explicit: Option<Instant>,
+    /// Searches since the last success, own or of others with the same question.
+    pub(super) attempt: u8,
+    /// When `attempt` was raised last because of others.
+    round: Instant,
+    /// Comes back in answers; the same until one has led to a link.
+    pub(super) nonce: u64,
 }
 
 impl Search {
-    pub(super) fn new(now: Instant, target: &Target, random: &mut Random) -> Self {
-        let next = match target {
-            Target::Fixed(..) => now,
-            _ => now + random.jitter(FIRST_DELAY),
-        };
-        Self { next, pause: FIRST_SEARCH, nonce: 0, sequence: 0, explicit: false, dialing: None, dial_at: None }
-    }
-
-    /// A node has joined: an s_unit has found what it wanted, an m_unit asks no more by itself.
-    pub(super) fn joined(&mut self, target: &Target) {
-        self.pause = FIRST_SEARCH;
-        self.dialing = None;
-        self.dial_at = None;
-        if *target != Target::Everybody || !self.explicit {
-            self.next = Instant::FAR_FUTURE;
-        }
-    }
-}
-
-/// Searches on the network, own and heard.
-#[derive(Clone, Debug)]
-pub(super) struct Budget {
-    window: Instant,
-    used: u8,
-}
-
-impl Budget {
-    pub(super) const fn new(now: Instant) -> Self {
-        Self { window: now, used: 0 }
-    }
-
-    fn roll(&mut self, now: Instant) {
-        if now >= self.window + SEARCH_WINDOW {
-            self.window = now;
-            self.used = 0;
-        }
-    }
-
-    fn note(&mut self, now: Instant) {
-        self.roll(now);
-        self.used = self.used.saturating_add(1);
-    }
-
-    /// When the next search is allowed.
-    fn allowed_at(&mut self, now: Instant) -> Instant {
-        self.roll(now);
-        if self.used < SEARCH_BUDGET { now } else { self.window + SEARCH_WINDOW }
-    }
-}
-
-/// Answers that are due.
-#[derive(Clone, Debug)]
-pub(super) struct Answers {
-    single: heapless::Vec<(Instant, SocketAddr, u64), WAITING_ANSWERS>,
-    broadcast: Option<Instant>,
-    last_broadcast: Option<Instant>,
-    /// Who asked last, and when.
-    asked: Option<(Instant, u32)>,
-    sequence: u32,
-}
-
-impl Answers {
-    pub(super) const fn new() -> Self {
-        Self { single: heapless::Vec::new(), broadcast: None, last_broadcast: None, asked: None, sequence: 0 }
+    pub(super) fn new(now: Instant, random: &mut Random) -> Self {
+        let next = now + alone(random, FIRST_DELAY);
+        Self { next, explicit: None, attempt: 0, round: now, nonce: fresh(random) }
     }
 
     pub(super) fn next(&self) -> Instant {
-        let single = self.single.iter().map(|(at, _, _)| *at).min();
-        single.unwrap_or(Instant::FAR_FUTURE).min(self.broadcast.unwrap_or(Instant::FAR_FUTURE))
+        self.next.min(self.explicit.unwrap_or(Instant::FAR_FUTURE))
+    }
+}
+
+/// Nonces are never 0, which stands for a broadcast.
+fn fresh(random: &mut Random) -> u64 {
+    random.bits() | 1
+}
+
+/// A delay in `[0, limit)` for something that one of many units should do for all, as far as they hear each other: half
+/// of them fall into the last step, a quarter into the one before, and so on, so that few are early, however many there
+/// are.
+pub(super) fn alone(random: &mut Random, limit: Duration) -> Duration {
+    let step = limit.divided_by(u64::from(STEPS));
+    let last = STEPS.saturating_sub(1);
+    let early = random.bits().trailing_ones().min(last);
+    step.times(u64::from(last.saturating_sub(early))) + random.jitter(step)
+}
+
+/// The pause before the next try, without its jitter.
+pub(super) fn pause(attempt: u8) -> Duration {
+    FIRST_SEARCH.times(1 << attempt.min(LONGEST_PAUSE_AFTER)).min(LONGEST_SEARCH)
+}
+
+/// Searches on the network, own and heard: the times of the last few.
+#[derive(Clone, Debug)]
+pub(super) struct Budget {
+    times: heapless::Deque<Instant, { SEARCH_BUDGET as usize }>,
+}
+
+impl Budget {
+    pub(super) const fn new() -> Self {
+        Self { times: heapless::Deque::new() }
+    }
+
+    fn note(&mut self, now: Instant) {
+        if self.times.is_full() {
+            self.times.pop_front();
+        }
+        let _ = self.times.push_back(now);
+    }
+
+    /// When the next search is allowed.
+    fn allowed_at(&self, now: Instant) -> Instant {
+        match self.times.front() {
+            Some(&oldest) if self.times.is_full() => now.max(oldest + SEARCH_WINDOW),
+            _ => now,
+        }
     }
 }
 
 impl<S: Storage> Node<S> {
-    /// Searches now, or as soon as the budget allows (paper, listing line 6).
+    /// Searches now, or as soon as the budget allows (paper, listing line 6). A unit with a fixed address dials instead.
     pub fn broadcast(&mut self, now: Instant) {
-        self.search.explicit = true;
-        self.search.next = self.budget.allowed_at(now);
-    }
-
-    /// Looks for what this unit wants and has not got.
-    pub(super) fn search_again(&mut self, now: Instant) {
-        if self.wants_more() && self.search.dialing.is_none() {
-            let pause = self.search.pause;
-            self.search.pause = pause.times(2).min(LONGEST_SEARCH);
-            let next = now + pause + self.random.jitter(pause);
-            self.search.next = self.search.next.min(next).max(now);
-            if self.search.next == Instant::FAR_FUTURE {
-                self.search.next = next;
+        match (&self.config.target, self.table.joined()) {
+            (Target::Fixed(..), 0) => self.dial_target(now),
+            (Target::Fixed(..), _) => {}
+            _ => {
+                let allowed = self.budget.allowed_at(now);
+                self.search.explicit = Some(self.search.explicit.unwrap_or(allowed));
             }
         }
     }
 
-    fn wants_more(&self) -> bool {
-        self.table.joined() == 0
+    fn dial_target(&mut self, now: Instant) {
+        let place = self.target.as_ref().and_then(|target| self.table.find(target));
+        let away = |place: &usize| self.table.node(*place).is_some_and(|known| known.state == NodeState::Away);
+        if let Some(place) = place.filter(away) {
+            self.table.schedule(place, now, Task::Dial);
+        }
     }
 
-    pub(super) fn poll_search(&mut self, now: Instant, mailman: &mut impl Mailman) -> Option<Action> {
-        if !self.search.explicit && (!self.wants_more() || self.search.dialing.is_some()) {
-            self.search.next = Instant::FAR_FUTURE;
-            return None;
+    /// Whether this unit looks for anything now.
+    fn is_searching(&self) -> bool {
+        match self.config.target {
+            Target::Fixed(..) => false,
+            Target::Everybody => self.search.attempt < M_UNIT_SEARCHES || self.table.joined() == 0,
+            Target::Manager(_) => {
+                let place = self.target.as_ref().and_then(|target| self.table.find(target));
+                let known = place.and_then(|place| self.table.node(place));
+                known.is_none_or(|known| known.state == NodeState::Away && known.task.is_none())
+            }
         }
-        if let Target::Fixed(_, to) = self.config.target {
+    }
+
+    /// Looks again for what has been lost: soon, unless it was lost at once.
+    pub(super) fn search_again(&mut self, now: Instant, settled: bool) {
+        if self.table.joined() > 0 {
+            return;
+        }
+        self.search.nonce = fresh(&mut self.random);
+        if settled {
+            self.search.attempt = 0;
+            self.search.next = now + alone(&mut self.random, FIRST_DELAY);
+        } else {
             self.plan_next(now);
-            self.counters.add(NodeCounter::Dialled, 1);
-            return (self.search.dialing.is_none()).then_some(Action::Dial { to, identity: None });
+        }
+    }
+
+    /// The next search comes after a pause that grows each time.
+    pub(super) fn plan_next(&mut self, now: Instant) {
+        let pause = pause(self.search.attempt);
+        self.search.attempt = self.search.attempt.saturating_add(1);
+        self.search.next = now + pause + alone(&mut self.random, pause);
+    }
+
+    pub(super) fn poll_search(&mut self, now: Instant, mailman: &mut impl Mailman) {
+        if self.search.explicit.take_if(|at| *at <= now).is_some() {
+            self.send_who_has(now, mailman);
+            return;
+        }
+        if now < self.search.next {
+            return;
+        }
+        if !self.is_searching() {
+            self.search.next = Instant::FAR_FUTURE;
+            return;
         }
         let allowed = self.budget.allowed_at(now);
         if allowed > now {
             self.counters.add(NodeCounter::WhoHasDeferred, 1);
-            self.search.next = allowed + self.random.jitter(FIRST_SEARCH);
-            return None;
+            self.search.next = allowed + alone(&mut self.random, FIRST_SEARCH);
+            return;
         }
         self.send_who_has(now, mailman);
-        self.search.explicit = false;
-        self.plan_next(now);
-        None
-    }
-
-    fn plan_next(&mut self, now: Instant) {
-        let pause = self.search.pause;
-        self.search.pause = pause.times(2).min(LONGEST_SEARCH);
-        self.search.next = now + pause + self.random.jitter(pause);
     }
 
     fn send_who_has(&mut self, now: Instant, mailman: &mut impl Mailman) {
-        self.search.sequence = self.search.sequence.saturating_add(1);
-        self.search.nonce = self.random.bits();
+        self.plan_next(now);
+        self.budget.note(now);
         let known = self.table.iter().filter(|known| known.is_joined()).map(|known| short_hash(&known.identity));
         let who_has = WhoHas {
             identity: self.config.identity.clone(),
             epoch: self.config.epoch,
-            sequence: self.search.sequence,
+            sequence: self.sequence.wrapping_add(1),
             nonce: self.search.nonce,
             wanted: self.manager().cloned(),
             tcp_port: self.config.tcp_port,
             expected: self.expected(),
-            known: known.take(crate::distribution::datagram::KNOWN_NODES).collect(),
+            known: known.take(KNOWN_NODES).collect(),
         };
+        self.sequence = who_has.sequence;
         let mut bytes = [0; SEARCH_BYTES];
-        if let Some(datagram) = who_has.encode(self.config.fleet, &mut bytes) {
-            mailman.broadcast(datagram);
-        }
-        self.budget.note(now);
-        self.counters.add(NodeCounter::WhoHasSent, 1);
-    }
-
-    /// How many nodes may answer or dial at once: those that still fit.
-    fn expected(&self) -> u16 {
-        let joined = u16::try_from(self.table.joined()).unwrap_or(u16::MAX);
-        match self.config.identity.role() {
-            Role::MUnit => self.config.constraints.maximum_nodes.saturating_sub(joined),
-            Role::SUnit => 1,
-        }
+        let sent = who_has.encode(self.config.fleet, &mut bytes).is_some_and(|datagram| mailman.broadcast(datagram));
+        self.counters.add(if sent { NodeCounter::WhoHasSent } else { NodeCounter::SendFailed }, 1);
     }
 
     pub(super) fn heard_who_has(&mut self, now: Instant, from: SocketAddr, who_has: &WhoHas) {
-        if self.is_own(&who_has.identity, who_has.epoch) {
+        if self.is_own(now, from, &who_has.identity, who_has.epoch) {
             return;
         }
         self.counters.add(NodeCounter::WhoHasHeard, 1);
         self.budget.note(now);
+        let here = self.config.identity.role() == Role::MUnit;
         match &who_has.wanted {
-            Some(manager) if manager.is(&self.config.identity) => self.answer_soon(now, from, who_has),
-            Some(manager) => {
-                self.counters.add(NodeCounter::WrongManager, 1);
-                if self.manager() == Some(manager) {
-                    self.hold_back(now);
-                }
+            Some(manager) if manager.is(&self.config.identity) => self.answer_seeker(now, from, who_has),
+            Some(manager) if self.manager() == Some(manager) => self.hold_back(now),
+            None if who_has.identity.role() == Role::MUnit => self.heard_m_unit(now, from, who_has),
+            None if here => {
+                let delay = self.spread(who_has.expected);
+                self.answer_later(now + delay, from, who_has.nonce);
             }
-            None => self.heard_m_unit(now, from, who_has),
+            _ => self.counters.add(NodeCounter::WrongManager, 1),
         }
     }
 
     /// Another unit asks this unit's question: the answer will reach both.
     fn hold_back(&mut self, now: Instant) {
-        let waiting = self.wants_more() && self.search.dialing.is_none() && !self.search.explicit;
-        if waiting && matches!(self.config.target, Target::Manager(_)) {
-            self.counters.add(NodeCounter::WhoHasDeferred, 1);
-            let later = now + FIRST_SEARCH + self.random.jitter(FIRST_SEARCH);
-            self.search.next = self.search.next.max(later);
+        if self.search.next == Instant::FAR_FUTURE || !self.is_searching() {
+            return;
         }
-    }
-
-    /// An s_unit looks for this manager: one is answered at once, several with one broadcast.
-    fn answer_soon(&mut self, now: Instant, from: SocketAddr, who_has: &WhoHas) {
-        let who = short_hash(&who_has.identity);
-        let another = self.answers.asked.is_some_and(|(at, asked)| asked != who && now < at + SAME_QUESTION);
-        self.answers.asked = Some((now, who));
-        if !another {
-            self.answer_later(now, from, who_has.nonce);
-        } else if self.answers.broadcast.is_none() {
-            let earliest = self.answers.last_broadcast.map_or(now, |last| last + ANSWER_PAUSE);
-            self.answers.broadcast = Some(earliest.max(now + ANSWER_GATHER));
+        self.counters.add(NodeCounter::WhoHasDeferred, 1);
+        if self.search.attempt == 0 || now >= self.search.round + FIRST_SEARCH {
+            self.search.attempt = self.search.attempt.saturating_add(1);
+            self.search.round = now;
         }
-    }
-
-    fn answer_later(&mut self, at: Instant, to: SocketAddr, nonce: u64) {
-        let waiting = self.answers.single.iter().any(|(_, known, _)| *known == to);
-        if !waiting && self.answers.single.push((at, to, nonce)).is_err() {
-            self.counters.add(NodeCounter::AnnounceDropped, 1);
-        }
+        let pause = pause(self.search.attempt.saturating_sub(1));
+        let later = now + pause + alone(&mut self.random, pause);
+        self.search.next = self.search.next.max(later);
     }
 
     /// An m_unit asks for everybody: its own s_units dial it, and of two m_units the smaller one dials.
     fn heard_m_unit(&mut self, now: Instant, from: SocketAddr, who_has: &WhoHas) {
-        if who_has.known.contains(&short_hash(&self.config.identity)) {
+        if !self.is_wanted(&who_has.identity) {
+            self.counters.add(NodeCounter::WrongManager, 1);
             return;
         }
-        if who_has.identity.role() != Role::MUnit || !self.is_wanted(&who_has.identity) {
-            self.counters.add(NodeCounter::WrongManager, 1);
+        if who_has.known.contains(&short_hash(&self.config.identity)) {
             return;
         }
         let delay = self.spread(who_has.expected);
         if !self.dials(&who_has.identity) {
-            self.answer_later(now + delay, from, who_has.nonce);
+            if !self.is_connected(&who_has.identity, who_has.epoch) {
+                self.answer_later(now + delay, from, who_has.nonce);
+            }
             return;
         }
         let found = Found { epoch: who_has.epoch, sequence: who_has.sequence, tcp_port: who_has.tcp_port };
-        self.found(&who_has.identity, from, found, now + delay);
+        self.found(now, &who_has.identity, from, found, Some(now + delay));
     }
 
     pub(super) fn heard_announce(&mut self, now: Instant, from: SocketAddr, announce: &Announce) {
-        if self.is_own(&announce.identity, announce.epoch) {
+        if self.is_own(now, from, &announce.identity, announce.epoch) {
             return;
         }
         self.counters.add(NodeCounter::AnnounceHeard, 1);
         if announce.identity.role() != Role::MUnit || !self.is_wanted(&announce.identity) {
             self.counters.add(NodeCounter::WrongManager, 1);
+            self.note_at(now, from, Refusal::WrongManager);
             return;
         }
         let broadcast = announce.nonce == 0;
-        if !self.dials(&announce.identity) || !(broadcast || announce.nonce == self.search.nonce) {
+        if !broadcast && announce.nonce != self.search.nonce {
+            self.counters.add(NodeCounter::Unasked, 1);
             return;
+        }
+        if !self.dials(&announce.identity) {
+            return;
+        }
+        // A full manager's broadcast is no invitation; who asked it itself may be the one whose place is being kept.
+        let invited = !broadcast || announce.room > 0;
+        if !invited {
+            self.note_at(now, from, Refusal::Full);
         }
         let delay = if broadcast { self.spread(announce.expected) } else { Duration::ZERO };
         let found = Found { epoch: announce.epoch, sequence: announce.sequence, tcp_port: announce.tcp_port };
-        self.found(&announce.identity, from, found, now + delay);
+        self.found(now, &announce.identity, from, found, invited.then_some(now + delay));
     }
 
-    fn is_wanted(&self, identity: &Identity) -> bool {
+    /// An s_unit wants its manager, an m_unit everybody.
+    pub(super) fn is_wanted(&self, identity: &Identity) -> bool {
         self.manager().is_none_or(|manager| manager.is(identity))
     }
 
-    fn is_own(&mut self, identity: &Identity, epoch: Epoch) -> bool {
+    fn is_connected(&self, identity: &Identity, epoch: Epoch) -> bool {
+        self.node(identity).is_some_and(|known| known.is_joined() && known.epoch == epoch)
+    }
+
+    fn is_own(&mut self, now: Instant, from: SocketAddr, identity: &Identity, epoch: Epoch) -> bool {
         if *identity != self.config.identity {
             return false;
         }
         if epoch != self.config.epoch {
             self.counters.add(NodeCounter::OwnIdentity, 1);
+            self.note_at(now, from, Refusal::DuplicateIdentity);
         }
         true
     }
-
-    /// A node that this unit dials has been found.
-    fn found(&mut self, identity: &Identity, from: SocketAddr, found: Found, dial_at: Instant) {
-        let address = SocketAddr::new(from.ip(), found.tcp_port);
-        if found.tcp_port == 0 {
-            return;
-        }
-        let Some((place, forgotten)) = self.table.place_of(identity, address, found.epoch) else { return };
-        if forgotten {
-            self.counters.add(NodeCounter::Forgotten, 1);
-        }
-        let Some(known) = self.table.node_mut(place) else { return };
-        if (known.epoch, known.sequence) > (found.epoch, found.sequence) && known.epoch == found.epoch {
-            self.counters.add(NodeCounter::Outdated, 1);
-            return;
-        }
-        if known.state == NodeState::Away {
-            known.epoch = found.epoch;
-            known.sequence = found.sequence;
-            known.address = address;
-        }
-        self.table.dial_later(place, dial_at);
-    }
-
-    pub(super) fn poll_answers(&mut self, now: Instant, mailman: &mut impl Mailman) {
-        while let Some(index) = self.answers.single.iter().position(|(at, _, _)| *at <= now) {
-            let (_, to, nonce) = self.answers.single.swap_remove(index);
-            self.counters.add(NodeCounter::AnnounceSent, 1);
-            self.send_announce(nonce, |datagram| mailman.send_to(to, datagram));
-        }
-        if self.answers.broadcast.take_if(|at| *at <= now).is_some() {
-            self.answers.last_broadcast = Some(now);
-            self.counters.add(NodeCounter::AnnounceBroadcast, 1);
-            self.send_announce(0, |datagram| mailman.broadcast(datagram));
-        }
-    }
-
-    fn send_announce(&mut self, nonce: u64, send: impl FnOnce(&[u8]) -> bool) {
-        self.answers.sequence = self.answers.sequence.saturating_add(1);
-        let expected = self.expected();
-        let announce = Announce {
-            identity: self.config.identity.clone(),
-            epoch: self.config.epoch,
-            sequence: self.answers.sequence,
-            nonce,
-            tcp_port: self.config.tcp_port,
-            room: expected,
-            expected,
-        };
-        let mut bytes = [0; SEARCH_BYTES];
-        if let Some(datagram) = announce.encode(self.config.fleet, &mut bytes) {
-            send(datagram);
-        }
-    }
-}
-
-/// What a datagram says of a node that can be dialled.
-struct Found {
-    epoch: Epoch,
-    sequence: u32,
-    tcp_port: u16,
 }

@@ -1,28 +1,68 @@
-//! The table of nodes: lent slots in the order of joining, an index by identity, and one by link.
+//! The table of nodes: lent slots, an index by identity, one entry per link, and places that keep their meaning.
+//!
+//! Each event costs a binary search at most. Only a node that was never seen before costs more: its entry in the sorted
+//! index moves the others by two bytes each.
 
-use core::net::SocketAddr;
+use core::net::{IpAddr, SocketAddr};
 
+use super::timetable::Task;
 use crate::distribution::hello::Limits;
-use crate::distribution::identity::{Epoch, Identity};
+use crate::distribution::identity::{Epoch, Identity, Role};
 use crate::host::mailman::LinkId;
 use crate::storage::Storage;
-use crate::time::Instant;
+use crate::time::{Duration, Instant};
+
+/// No place, position or index.
+pub(super) const NONE: u16 = u16::MAX;
+
+/// Datagrams overtake each other by less than this. Within it the greater (epoch, sequence) is the newer one, whichever
+/// comes first; after it whatever comes is news, since epochs of a board need not rise from boot to boot.
+const REORDERING: Duration = Duration::from_secs(1);
 
 /// What is known of a node.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Known {
     /// Its name, id and role.
     pub identity: Identity,
-    /// Where it was last heard: for a listener the address to dial, otherwise the other end of its link.
+    /// The other end of its link; while it is away, where it was last heard.
     pub address: SocketAddr,
-    /// The newest life of it that was heard.
+    /// The life of it that is connected; while it is away, the newest that was heard.
     pub epoch: Epoch,
     /// What it takes, once it has joined.
     pub limits: Option<Limits>,
-    pub(super) sequence: u32,
+    /// Where it can be dialled, if that is known.
+    pub(super) listens: Option<SocketAddr>,
+    /// The newest datagram of it.
+    pub(super) newest: Option<(Epoch, u32)>,
+    heard: Instant,
     pub(super) state: NodeState,
-    pub(super) dial: Option<Instant>,
+    /// Its link was opened from here.
+    pub(super) dialed: bool,
+    /// The link that is being opened to it.
+    pub(super) dialing: Option<LinkId>,
+    /// A link with its identity that waits for the present one to show whether it lives.
+    pub(super) newcomer: Option<Newcomer>,
+    /// When it joined.
+    pub(super) since: Instant,
+    /// Dials that have failed in a row.
     pub(super) attempts: u8,
+    index: u16,
+    pub(super) task: Option<Task>,
+    pub(super) due: Instant,
+    pub(super) heap: u16,
+    before: u16,
+    after: u16,
+}
+
+/// A link that waits until it is clear whether the older one of the same identity lives.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Newcomer {
+    pub(super) link: LinkId,
+    pub(super) epoch: Epoch,
+    pub(super) limits: Limits,
+    pub(super) address: SocketAddr,
+    /// It takes the place whether the older one answers or not.
+    pub(super) decided: bool,
 }
 
 /// Whether a node is connected.
@@ -31,7 +71,7 @@ pub enum NodeState {
     /// Heard of, or gone.
     Away,
     /// A link to it is being opened.
-    Dialing(LinkId),
+    Dialing,
     /// Connected.
     Joined(LinkId),
 }
@@ -47,25 +87,107 @@ impl Known {
         self.state
     }
 
-    pub(super) const fn attempts(&self) -> u8 {
-        self.attempts
+    /// The node's link, while it is connected.
+    pub const fn link(&self) -> Option<LinkId> {
+        match self.state {
+            NodeState::Joined(link) => Some(link),
+            NodeState::Away | NodeState::Dialing => None,
+        }
+    }
+
+    /// Its place among the nodes of its role, in the order of joining; `None` for a node that has never joined. It keeps
+    /// its meaning while other nodes come and go, and while this one is away.
+    pub const fn index(&self) -> Option<u16> {
+        if self.index == NONE { None } else { Some(self.index) }
+    }
+
+    /// Whether a datagram is newer than what is known.
+    pub(super) fn is_news(&self, now: Instant, epoch: Epoch, sequence: u32) -> bool {
+        self.newest.is_none_or(|newest| (epoch, sequence) > newest) || now >= self.heard + REORDERING
+    }
+
+    /// Notes the newest datagram.
+    pub(super) fn hear(&mut self, now: Instant, epoch: Epoch, sequence: u32) {
+        self.newest = Some((epoch, sequence));
+        self.heard = now;
+    }
+
+    fn new(identity: Identity, address: SocketAddr, epoch: Epoch) -> Self {
+        Self {
+            identity,
+            address,
+            epoch,
+            limits: None,
+            listens: None,
+            newest: None,
+            heard: Instant::START,
+            state: NodeState::Away,
+            dialed: false,
+            dialing: None,
+            newcomer: None,
+            since: Instant::START,
+            attempts: 0,
+            index: NONE,
+            task: None,
+            due: Instant::FAR_FUTURE,
+            heap: NONE,
+            before: NONE,
+            after: NONE,
+        }
+    }
+}
+
+/// One row of the table's orders; ports allocate a slice of default ones. It belongs to no node in particular.
+#[derive(Clone, Copy, Debug)]
+pub struct Order {
+    /// Places, ordered by identity.
+    sorted: u16,
+    /// Places, as a heap by when something is due.
+    pub(super) due: u16,
+    /// Places of the s_units by index.
+    s_unit: u16,
+    /// Places of the m_units by index.
+    m_unit: u16,
+}
+
+impl Default for Order {
+    fn default() -> Self {
+        Self { sorted: NONE, due: NONE, s_unit: NONE, m_unit: NONE }
+    }
+}
+
+impl Order {
+    const fn of(&self, role: Role) -> u16 {
+        match role {
+            Role::SUnit => self.s_unit,
+            Role::MUnit => self.m_unit,
+        }
+    }
+
+    const fn of_mut(&mut self, role: Role) -> &mut u16 {
+        match role {
+            Role::SUnit => &mut self.s_unit,
+            Role::MUnit => &mut self.m_unit,
+        }
     }
 }
 
 pub(super) struct Table<S: Storage> {
     nodes: S::Slice<Option<Known>>,
-    /// Places of the nodes, ordered by identity; the first `len` count.
-    order: S::Slice<u16>,
-    len: usize,
+    pub(super) order: S::Slice<Order>,
     links: S::Slice<Option<u16>>,
-    joined: usize,
-    /// No node is to be dialled earlier.
-    next_dial: Instant,
+    len: usize,
+    pub(super) due_len: usize,
+    s_units: u16,
+    m_units: u16,
+    /// The node that has been away longest, and the one that left last.
+    oldest: u16,
+    youngest: u16,
 }
 
 impl<S: Storage> Table<S> {
-    pub(super) fn new(nodes: S::Slice<Option<Known>>, order: S::Slice<u16>, links: S::Slice<Option<u16>>) -> Self {
-        Self { nodes, order, len: 0, links, joined: 0, next_dial: Instant::FAR_FUTURE }
+    pub(super) fn new(nodes: S::Slice<Option<Known>>, order: S::Slice<Order>, links: S::Slice<Option<u16>>) -> Self {
+        Self { nodes, order, links, len: 0, due_len: 0, s_units: 0, m_units: 0, oldest: NONE, youngest: NONE }
     }
 
     pub(super) fn iter(&self) -> impl Iterator<Item = &Known> {
@@ -80,130 +202,166 @@ impl<S: Storage> Table<S> {
         self.nodes.get_mut(place)?.as_mut()
     }
 
-    pub(super) const fn joined(&self) -> usize {
-        self.joined
+    /// How many are connected.
+    pub(super) const fn joined(&self) -> u16 {
+        self.s_units.saturating_add(self.m_units)
+    }
+
+    /// How many of one role are connected.
+    pub(super) const fn joined_as(&self, role: Role) -> u16 {
+        match role {
+            Role::SUnit => self.s_units,
+            Role::MUnit => self.m_units,
+        }
+    }
+
+    /// The nodes of one role that have joined, by index.
+    pub(super) fn by_index(&self, role: Role) -> impl Iterator<Item = &Known> {
+        self.order.iter().take(self.len).filter_map(move |row| self.node(usize::from(row.of(role))))
+    }
+
+    pub(super) fn at_index(&self, role: Role, index: u16) -> Option<&Known> {
+        self.node(usize::from(self.order.get(usize::from(index))?.of(role)))
+    }
+
+    /// The first node with this id, connected ones before others.
+    pub(super) fn with_id(&self, id: u32) -> Option<&Known> {
+        let sorted = self.order.get(..self.len)?;
+        let place = |row: &Order| self.node(usize::from(row.sorted));
+        let start = sorted.partition_point(|row| place(row).is_some_and(|known| known.identity.id() < id));
+        let mut same = sorted.get(start..)?.iter().filter_map(place).take_while(|known| known.identity.id() == id);
+        let first = same.next()?;
+        if first.is_joined() { Some(first) } else { same.find(|known| known.is_joined()).or(Some(first)) }
+    }
+
+    pub(super) fn with_address(&self, ip: IpAddr) -> impl Iterator<Item = &Known> {
+        self.iter().filter(move |known| known.address.ip() == ip)
     }
 
     pub(super) fn of_link(&self, link: LinkId) -> Option<usize> {
         self.links.get(usize::from(link.0)).copied().flatten().map(usize::from)
     }
 
+    /// Notes whose a link is.
+    pub(super) fn set_link(&mut self, link: LinkId, place: Option<usize>) {
+        if let Some(slot) = self.links.get_mut(usize::from(link.0)) {
+            *slot = place.and_then(|place| u16::try_from(place).ok());
+        }
+    }
+
     pub(super) fn find(&self, identity: &Identity) -> Option<usize> {
         let at = self.search(identity).ok()?;
-        self.order.get(at).copied().map(usize::from)
+        self.order.get(at).map(|row| usize::from(row.sorted))
     }
 
     fn search(&self, identity: &Identity) -> Result<usize, usize> {
-        let order = self.order.get(..self.len).unwrap_or(&[]);
-        order.binary_search_by(|&place| match self.node(usize::from(place)) {
+        let sorted = self.order.get(..self.len).unwrap_or(&[]);
+        sorted.binary_search_by(|row| match self.node(usize::from(row.sorted)) {
             Some(known) => known.identity.cmp(identity),
             None => core::cmp::Ordering::Less,
         })
     }
 
-    /// The place of an identity, new if need be; `true` when another node that was away had to be forgotten for it.
-    /// `None` when every place is taken by a connected node.
+    /// The place of an identity, new if need be; `true` when the node that was away longest had to be forgotten for it.
+    /// `None` when every place is taken by a node that is connected or being dialled.
     pub(super) fn place_of(&mut self, identity: &Identity, address: SocketAddr, epoch: Epoch) -> Option<(usize, bool)> {
         if let Some(place) = self.find(identity) {
             return Some((place, false));
         }
-        let (place, forgotten) = match self.nodes.iter().position(Option::is_none) {
-            Some(place) => (place, false),
-            None => {
-                let place = self.nodes.iter().flatten().position(|known| known.state == NodeState::Away)?;
-                self.remove(place);
-                (place, true)
-            }
+        let capacity = self.nodes.len().min(self.order.len()).min(usize::from(NONE));
+        let (place, forgotten) = if self.len < capacity {
+            (self.len, false)
+        } else {
+            let oldest = usize::from(self.oldest);
+            self.forget(oldest)?;
+            (oldest, true)
         };
         let at = self.search(identity).err()?;
-        let end = self.len.checked_add(1)?;
-        let order = self.order.get_mut(at..end)?;
-        order.rotate_right(1);
-        *order.first_mut()? = u16::try_from(place).ok()?;
-        *self.nodes.get_mut(place)? = Some(Known {
-            identity: identity.clone(),
-            address,
-            epoch,
-            limits: None,
-            sequence: 0,
-            state: NodeState::Away,
-            dial: None,
-            attempts: 0,
-        });
-        self.len = end;
+        let mut carried = u16::try_from(place).ok()?;
+        for row in self.order.get_mut(at..=self.len)? {
+            core::mem::swap(&mut row.sorted, &mut carried);
+        }
+        *self.nodes.get_mut(place)? = Some(Known::new(identity.clone(), address, epoch));
+        self.len = self.len.saturating_add(1);
+        self.begin_rest(place);
         Some((place, forgotten))
     }
 
-    fn remove(&mut self, place: usize) {
-        let Some(identity) = self.node(place).map(|known| known.identity.clone()) else { return };
-        if let Ok(at) = self.search(&identity)
-            && let Some(order) = self.order.get_mut(at..self.len)
-        {
-            order.rotate_left(1);
-            self.len = self.len.saturating_sub(1);
+    /// Empties a place of a node that is away.
+    fn forget(&mut self, place: usize) -> Option<()> {
+        let at = self.search(&self.node(place)?.identity).ok()?;
+        self.cancel(place);
+        self.end_rest(place);
+        let mut carried = NONE;
+        for row in self.order.get_mut(at..self.len)?.iter_mut().rev() {
+            core::mem::swap(&mut row.sorted, &mut carried);
         }
-        if let Some(slot) = self.nodes.get_mut(place) {
-            *slot = None;
+        let known = self.nodes.get_mut(place)?.take()?;
+        if let Some(row) = self.order.get_mut(usize::from(known.index)) {
+            *row.of_mut(known.identity.role()) = NONE;
         }
+        self.len = self.len.saturating_sub(1);
+        Some(())
     }
 
-    /// Notes which link a node has.
-    pub(super) fn set_link(&mut self, place: usize, link: LinkId, state: NodeState) {
-        let Some(known) = self.nodes.get_mut(place).and_then(Option::as_mut) else { return };
-        let was_joined = known.is_joined();
-        known.state = state;
-        known.dial = None;
-        if known.is_joined() {
-            known.attempts = 0;
-        }
-        match (was_joined, known.is_joined()) {
-            (false, true) => self.joined = self.joined.saturating_add(1),
-            (true, false) => self.joined = self.joined.saturating_sub(1),
+    /// Changes a node's state, and with it the counts and whether it may be forgotten.
+    pub(super) fn set_state(&mut self, place: usize, state: NodeState) {
+        let Some(known) = self.node_mut(place) else { return };
+        let role = known.identity.role();
+        let before = core::mem::replace(&mut known.state, state);
+        let count = match role {
+            Role::SUnit => &mut self.s_units,
+            Role::MUnit => &mut self.m_units,
+        };
+        match (matches!(before, NodeState::Joined(_)), matches!(state, NodeState::Joined(_))) {
+            (false, true) => *count = count.saturating_add(1),
+            (true, false) => *count = count.saturating_sub(1),
             _ => {}
         }
-        if let Some(slot) = self.links.get_mut(usize::from(link.0)) {
-            *slot = u16::try_from(place).ok();
+        match (before == NodeState::Away, state == NodeState::Away) {
+            (true, false) => self.end_rest(place),
+            (false, true) => self.begin_rest(place),
+            _ => {}
         }
     }
 
-    /// The link has ended; a node that has a newer one keeps it.
-    pub(super) fn leave(&mut self, place: usize, link: LinkId) {
-        if let Some(slot) = self.links.get_mut(usize::from(link.0)) {
-            *slot = None;
-        }
-        let Some(known) = self.nodes.get_mut(place).and_then(Option::as_mut) else { return };
-        match known.state {
-            NodeState::Joined(current) if current == link => self.joined = self.joined.saturating_sub(1),
-            NodeState::Dialing(current) if current == link => known.attempts = known.attempts.saturating_add(1),
-            _ => return,
-        }
-        known.state = NodeState::Away;
-    }
-
-    pub(super) fn dial_later(&mut self, place: usize, at: Instant) {
-        let Some(known) = self.nodes.get_mut(place).and_then(Option::as_mut) else { return };
-        if known.state == NodeState::Away && known.dial.is_none_or(|earlier| at < earlier) {
-            known.dial = Some(at);
-            self.next_dial = self.next_dial.min(at);
+    /// Gives a node that joins for the first time the lowest index that is free among its role.
+    pub(super) fn keep_index(&mut self, place: usize) {
+        let Some(known) = self.node(place).filter(|known| known.index == NONE) else { return };
+        let role = known.identity.role();
+        let free = self.order.iter().position(|row| row.of(role) == NONE);
+        let Some((index, row)) = free.and_then(|index| Some((index, self.order.get_mut(index)?))) else { return };
+        *row.of_mut(role) = u16::try_from(place).unwrap_or(NONE);
+        if let Some(known) = self.node_mut(place) {
+            known.index = u16::try_from(index).unwrap_or(NONE);
         }
     }
 
-    pub(super) const fn next_dial(&self) -> Instant {
-        self.next_dial
+    /// Puts a node behind all others that are away.
+    fn begin_rest(&mut self, place: usize) {
+        let before = self.youngest;
+        self.youngest = u16::try_from(place).unwrap_or(NONE);
+        if let Some(known) = self.node_mut(place) {
+            (known.before, known.after) = (before, NONE);
+        }
+        match self.nodes.get_mut(usize::from(before)) {
+            Some(Some(known)) => known.after = self.youngest,
+            _ => self.oldest = self.youngest,
+        }
     }
 
-    /// A node whose time to be dialled has come.
-    pub(super) fn take_due_dial(&mut self, now: Instant) -> Option<(SocketAddr, Identity)> {
-        if now < self.next_dial {
-            return None;
+    /// Takes a node out of those that are away.
+    fn end_rest(&mut self, place: usize) {
+        let Some(known) = self.node_mut(place) else { return };
+        let before = core::mem::replace(&mut known.before, NONE);
+        let after = core::mem::replace(&mut known.after, NONE);
+        match self.nodes.get_mut(usize::from(before)) {
+            Some(Some(known)) => known.after = after,
+            _ => self.oldest = after,
         }
-        for known in self.nodes.iter_mut().flatten() {
-            if known.state == NodeState::Away && known.dial.take_if(|at| *at <= now).is_some() {
-                return Some((known.address, known.identity.clone()));
-            }
+        match self.nodes.get_mut(usize::from(after)) {
+            Some(Some(known)) => known.before = before,
+            _ => self.youngest = before,
         }
-        let dials = self.nodes.iter().flatten().filter_map(|known| known.dial);
-        self.next_dial = dials.min().unwrap_or(Instant::FAR_FUTURE);
-        None
     }
 }

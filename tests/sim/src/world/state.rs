@@ -99,7 +99,6 @@ impl UnitState {
             nodes: Boxed::slice(nodes),
             order: Boxed::slice(nodes),
             links: Boxed::slice(settings.links),
-            challenges: Boxed::slice(4),
             findings: Boxed::slice(8),
         };
         let functions =

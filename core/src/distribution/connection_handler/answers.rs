@@ -1,0 +1,218 @@
+//! Answering those who search, and dialling those who were found.
+
+use core::net::SocketAddr;
+
+use super::search::pause;
+use super::table::NodeState;
+use super::timetable::Task;
+use super::{Action, Node, NodeCounter, Target};
+use crate::config::{ANSWER_SPREAD, FIRST_SEARCH, LONGEST_SEARCH};
+use crate::distribution::datagram::{Announce, SEARCH_BYTES, WhoHas, short_hash};
+use crate::distribution::identity::{Epoch, Identity, Role};
+use crate::host::mailman::Mailman;
+use crate::storage::Storage;
+use crate::time::{Duration, Instant};
+
+/// A second unit that asks within this is answered by a broadcast as well: where two ask, more are holding back, and the
+/// longest time for which they do that is this one.
+const SAME_QUESTION: Duration = LONGEST_SEARCH.times(2);
+/// Two broadcast answers are at least this far apart.
+const ANSWER_PAUSE: Duration = FIRST_SEARCH;
+/// An answer waits up to this long, so that one broadcast serves all who ask meanwhile.
+const ANSWER_GATHER: Duration = Duration::from_millis(20);
+/// Answers to single nodes that may wait for their random delay.
+const WAITING_ANSWERS: usize = 8;
+/// Dials are spread over as many nodes at least: those that hold back are more than those that are expected.
+const LEAST_SPREAD: u16 = 50;
+/// A link that is being opened is given up after this, however the network below thinks about it.
+pub(super) const DIAL_TIMEOUT: Duration = Duration::from_secs(6);
+
+/// An answer to a single node.
+#[derive(Clone, Copy, Debug)]
+struct Answer {
+    at: Instant,
+    to: SocketAddr,
+    nonce: u64,
+}
+
+/// Answers that are due.
+#[derive(Clone, Debug)]
+pub(super) struct Answers {
+    single: heapless::Vec<Answer, WAITING_ANSWERS>,
+    broadcast: Option<Instant>,
+    last_broadcast: Option<Instant>,
+    /// Who asked last, and when.
+    asked: Option<(Instant, u32)>,
+}
+
+impl Answers {
+    pub(super) const fn new() -> Self {
+        Self { single: heapless::Vec::new(), broadcast: None, last_broadcast: None, asked: None }
+    }
+
+    pub(super) fn next(&self) -> Instant {
+        let single = self.single.iter().map(|answer| answer.at).min();
+        single.unwrap_or(Instant::FAR_FUTURE).min(self.broadcast.unwrap_or(Instant::FAR_FUTURE))
+    }
+}
+
+/// What a datagram says of a node that can be dialled.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Found {
+    pub(super) epoch: Epoch,
+    pub(super) sequence: u32,
+    pub(super) tcp_port: u16,
+}
+
+impl<S: Storage> Node<S> {
+    /// A unit looks for this manager: the first is answered alone, and with the second all the others as well.
+    pub(super) fn answer_seeker(&mut self, now: Instant, from: SocketAddr, who_has: &WhoHas) {
+        let who = short_hash(&who_has.identity);
+        let another = self.answers.asked.is_some_and(|(at, asked)| asked != who && now < at + SAME_QUESTION);
+        self.answers.asked = Some((now, who));
+        let delay = self.random.jitter(ANSWER_GATHER);
+        self.answer_later(now + delay, from, who_has.nonce);
+        if another && self.answers.broadcast.is_none() {
+            let earliest = self.answers.last_broadcast.map_or(now, |last| last + ANSWER_PAUSE);
+            self.answers.broadcast = Some(earliest.max(now + ANSWER_GATHER));
+        }
+    }
+
+    /// Plans an answer to one node. One that finds no room is left to the broadcast, or to the next question.
+    pub(super) fn answer_later(&mut self, at: Instant, to: SocketAddr, nonce: u64) {
+        let waiting = self.answers.single.iter().any(|answer| answer.to == to && answer.nonce == nonce);
+        if !waiting && self.answers.single.push(Answer { at, to, nonce }).is_err() {
+            self.counters.add(NodeCounter::AnnounceDropped, 1);
+        }
+    }
+
+    pub(super) fn poll_answers(&mut self, now: Instant, mailman: &mut impl Mailman) {
+        while let Some(index) = self.answers.single.iter().position(|answer| answer.at <= now) {
+            let Answer { to, nonce, .. } = self.answers.single.swap_remove(index);
+            self.send_announce(nonce, NodeCounter::AnnounceSent, |datagram| mailman.send_to(to, datagram));
+        }
+        if self.answers.broadcast.take_if(|at| *at <= now).is_some() {
+            self.answers.last_broadcast = Some(now);
+            self.send_announce(0, NodeCounter::AnnounceBroadcast, |datagram| mailman.broadcast(datagram));
+        }
+    }
+
+    fn send_announce(&mut self, nonce: u64, counter: NodeCounter, send: impl FnOnce(&[u8]) -> bool) {
+        let announce = Announce {
+            identity: self.config.identity.clone(),
+            epoch: self.config.epoch,
+            sequence: self.sequence.wrapping_add(1),
+            nonce,
+            tcp_port: self.config.tcp_port,
+            room: self.room(),
+            expected: self.expected(),
+        };
+        self.sequence = announce.sequence;
+        let mut bytes = [0; SEARCH_BYTES];
+        let sent = announce.encode(self.config.fleet, &mut bytes).is_some_and(send);
+        self.counters.add(if sent { counter } else { NodeCounter::SendFailed }, 1);
+    }
+
+    /// How many nodes this unit still takes.
+    fn room(&self) -> u16 {
+        self.config.constraints.maximum_nodes.saturating_sub(self.table.joined())
+    }
+
+    /// How many nodes may answer or dial at once: those that still fit.
+    pub(super) fn expected(&self) -> u16 {
+        match self.config.identity.role() {
+            Role::MUnit => self.room(),
+            Role::SUnit => 1,
+        }
+    }
+
+    /// A random span within the spread for `expected` nodes.
+    pub(super) fn spread(&mut self, expected: u16) -> Duration {
+        self.random.jitter(ANSWER_SPREAD.times(u64::from(expected.max(LEAST_SPREAD))))
+    }
+
+    /// Of two m_units the smaller identity dials; an s_unit always does.
+    pub(super) fn dials(&self, peer: &Identity) -> bool {
+        peer.role() == Role::MUnit && (self.config.identity.role() == Role::SUnit || self.config.identity < *peer)
+    }
+
+    /// A node that this unit dials has been heard; it is dialled at `dial_at`, unless it is connected.
+    pub(super) fn found(
+        &mut self,
+        now: Instant,
+        identity: &Identity,
+        from: SocketAddr,
+        found: Found,
+        dial_at: Option<Instant>,
+    ) {
+        let Found { epoch, sequence, tcp_port } = found;
+        if tcp_port == 0 || matches!(self.config.target, Target::Fixed(..)) {
+            return;
+        }
+        let address = SocketAddr::new(from.ip(), tcp_port);
+        let Some((place, forgotten)) = self.table.place_of(identity, address, epoch) else {
+            self.counters.add(NodeCounter::TableFull, 1);
+            return;
+        };
+        self.count_forgotten(forgotten);
+        let Some(known) = self.table.node_mut(place) else { return };
+        if !known.is_news(now, epoch, sequence) {
+            self.counters.add(NodeCounter::Outdated, 1);
+            return;
+        }
+        known.hear(now, epoch, sequence);
+        known.listens = Some(address);
+        if !known.is_joined() {
+            (known.address, known.epoch) = (address, epoch);
+        }
+        if known.state == NodeState::Away
+            && let Some(dial_at) = dial_at
+        {
+            let planned = if known.task.is_some() { known.due } else { Instant::FAR_FUTURE };
+            self.table.schedule(place, planned.min(dial_at), Task::Dial);
+        }
+    }
+
+    /// The time to dial a node has come.
+    pub(super) fn dial(&mut self, now: Instant, place: usize) -> Option<Action> {
+        if self.is_full() {
+            self.retry(now, place);
+            return None;
+        }
+        let known = self.table.node_mut(place).filter(|known| known.state == NodeState::Away)?;
+        let to = known.listens?;
+        let identity = Some(known.identity.clone());
+        known.dialing = None;
+        self.table.set_state(place, NodeState::Dialing);
+        self.table.schedule(place, now + DIAL_TIMEOUT, Task::GiveUp);
+        self.counters.add(NodeCounter::Dialled, 1);
+        Some(Action::Dial { to, identity })
+    }
+
+    /// A node that was being dialled has not joined.
+    pub(super) fn dial_ended(&mut self, now: Instant, place: usize) {
+        if let Some(known) = self.table.node_mut(place) {
+            known.dialing = None;
+        }
+        self.counters.add(NodeCounter::DialFailed, 1);
+        self.table.set_state(place, NodeState::Away);
+        self.table.cancel(place);
+        self.retry(now, place);
+    }
+
+    /// Tries again later, and later each time: an s_unit asks anew, who has an address dials it.
+    pub(super) fn retry(&mut self, now: Instant, place: usize) {
+        if let Target::Manager(_) = self.config.target {
+            self.plan_next(now);
+            return;
+        }
+        let Some(known) = self.table.node_mut(place) else { return };
+        let pause = pause(known.attempts);
+        known.attempts = known.attempts.saturating_add(1);
+        let identity = known.identity.clone();
+        if known.listens.is_some() && self.dials(&identity) {
+            let at = now + pause + self.random.jitter(pause);
+            self.table.schedule(place, at, Task::Dial);
+        }
+    }
+}

@@ -1,0 +1,67 @@
+//! What a unit counts about discovery and membership.
+
+crate::counters::counters! {
+    /// What a unit counts about discovery and membership.
+    pub enum NodeCounter {
+        /// Datagrams of another mode, or of no unit at all.
+        DatagramMagic,
+        /// Datagrams of another version.
+        DatagramVersion,
+        /// Datagrams of another fleet.
+        DatagramFleet,
+        /// Datagrams that could not be read.
+        DatagramMalformed,
+        /// Session datagrams for links that this unit does not have.
+        DatagramUnknownLink,
+        /// Searches sent.
+        WhoHasSent,
+        /// Searches of others heard.
+        WhoHasHeard,
+        /// Own searches put off because enough were heard.
+        WhoHasDeferred,
+        /// Answers sent to one node.
+        AnnounceSent,
+        /// Answers sent to all.
+        AnnounceBroadcast,
+        /// Answers heard.
+        AnnounceHeard,
+        /// Answers not sent because too many waited already.
+        AnnounceDropped,
+        /// Answers to another question than this unit's last one.
+        Unasked,
+        /// Searches and answers that the network did not take.
+        SendFailed,
+        /// Datagrams older than what is known of their sender.
+        Outdated,
+        /// Searches for, and hellos to, another manager.
+        WrongManager,
+        /// Datagrams of another unit with this unit's own identity.
+        OwnIdentity,
+        /// Links dialled.
+        Dialled,
+        /// Links dialled that have not joined.
+        DialFailed,
+        /// Links taken.
+        Joined,
+        /// Links refused because of their version.
+        RefusedVersion,
+        /// Links refused because of their fleet.
+        RefusedFleet,
+        /// Links refused because of their role.
+        RefusedRole,
+        /// Links refused because as many nodes are connected as may be.
+        RefusedFull,
+        /// Links refused because a live node has the same identity.
+        RefusedDuplicate,
+        /// Links refused because the two are connected already.
+        RefusedConnected,
+        /// Links that had to show whether they live, because another one had the same identity.
+        Challenged,
+        /// Nodes that came back with a new epoch.
+        Restarted,
+        /// Nodes forgotten to make room.
+        Forgotten,
+        /// Nodes heard for which the table has no room.
+        TableFull,
+    }
+}

@@ -1,0 +1,104 @@
+//! Links that are being opened, and links that have ended.
+
+use super::table::NodeState;
+use super::{Action, Node, Target};
+use crate::distribution::identity::Identity;
+use crate::error::{CloseReason, Refusal};
+use crate::host::mailman::LinkId;
+use crate::storage::Storage;
+use crate::time::{Duration, Instant};
+
+/// A link that lasted shorter than this counts as a failed try: what fails at once is not tried again at once.
+const SETTLED: Duration = Duration::from_secs(1);
+/// Failed tries that count as this many when who was dialled has given a reason that only people can remove.
+const HOPELESS: u8 = 5;
+
+impl<S: Storage> Node<S> {
+    /// The port is opening the link that [`Action::Dial`] asked for.
+    pub fn dialing(&mut self, identity: Option<&Identity>, link: LinkId) {
+        let Some(place) = identity.and_then(|identity| self.table.find(identity)) else { return };
+        let Some(known) = self.table.node_mut(place) else { return };
+        match known.state {
+            // The hello was quicker than the port's note.
+            NodeState::Joined(joined) if joined == link => known.dialed = true,
+            NodeState::Joined(_) | NodeState::Dialing => {
+                known.dialing = Some(link);
+                self.table.set_link(link, Some(place));
+            }
+            NodeState::Away => {}
+        }
+    }
+
+    /// The link that [`Action::Dial`] asked for could not be opened at all.
+    pub fn dial_failed(&mut self, now: Instant, identity: Option<&Identity>) {
+        let place = identity.and_then(|identity| self.table.find(identity));
+        let dialing = |place: &usize| self.table.node(*place).is_some_and(|known| known.state == NodeState::Dialing);
+        if let Some(place) = place.filter(dialing) {
+            self.dial_ended(now, place);
+        }
+    }
+
+    /// A link has ended, whatever it was. May free a newcomer that waited for that.
+    pub fn left(&mut self, now: Instant, link: LinkId, reason: CloseReason) -> Option<Action> {
+        let place = self.table.of_link(link)?;
+        self.table.set_link(link, None);
+        let known = self.table.node_mut(place)?;
+        let address = known.address;
+        if known.newcomer.take_if(|newcomer| newcomer.link == link).is_some() {
+            known.dialing.take_if(|dialing| *dialing == link);
+            self.table.cancel(place);
+            return None;
+        }
+        if let CloseReason::Refused(refusal) = reason {
+            self.note_at(now, address, refusal);
+        }
+        let known = self.table.node_mut(place)?;
+        if known.dialing.take_if(|dialing| *dialing == link).is_some() {
+            if known.state == NodeState::Dialing {
+                self.lose_hope(place, reason);
+                self.dial_ended(now, place);
+            }
+            return None;
+        }
+        if known.link() != Some(link) {
+            return None;
+        }
+        debug!("link {} left: {}", link.0, reason);
+        self.part(now, place, reason)
+    }
+
+    /// The link of a node that was connected has ended.
+    fn part(&mut self, now: Instant, place: usize, reason: CloseReason) -> Option<Action> {
+        self.table.set_state(place, NodeState::Away);
+        self.table.cancel(place);
+        let known = self.table.node_mut(place)?;
+        let settled = now.since(known.since) >= SETTLED;
+        if settled {
+            known.attempts = 0;
+        }
+        if let Some(newcomer) = known.newcomer.take() {
+            self.take_place(now, place, newcomer);
+            return Some(Action::Admit { new: newcomer.link });
+        }
+        match self.config.target {
+            // One that was stopped in an orderly way says so itself when it is back.
+            Target::Everybody if reason == CloseReason::Stopped => {}
+            Target::Everybody | Target::Fixed(..) => self.retry(now, place),
+            Target::Manager(_) => {}
+        }
+        self.search_again(now, settled);
+        None
+    }
+
+    /// Who was dialled has refused for a reason that does not pass by itself.
+    fn lose_hope(&mut self, place: usize, reason: CloseReason) {
+        let CloseReason::Refused(refusal) = reason else { return };
+        if matches!(refusal, Refusal::Full | Refusal::AlreadyConnected) {
+            return;
+        }
+        self.search.attempt = self.search.attempt.max(HOPELESS);
+        if let Some(known) = self.table.node_mut(place) {
+            known.attempts = known.attempts.max(HOPELESS);
+        }
+    }
+}

@@ -1,0 +1,329 @@
+//! Searching, answering, dialling, and trying again.
+
+use super::*;
+use crate::config::{FIRST_SEARCH, LONGEST_SEARCH, SEARCH_BUDGET, SEARCH_WINDOW};
+use crate::distribution::datagram::short_hash;
+
+const SOON: u64 = 50;
+
+/// The times at which a node broadcasts up to `end`.
+fn search_times(node: &mut Node<Boxed>, end: Instant) -> Vec<Instant> {
+    let mut times = Vec::new();
+    while node.next_deadline() <= end {
+        let now = node.next_deadline();
+        let mut outbox = Outbox::default();
+        assert_eq!(node.poll(now, &mut outbox), None);
+        times.extend(outbox.broadcasts.iter().map(|_| now));
+    }
+    times
+}
+
+#[test]
+fn an_s_unit_asks_for_its_manager_soon_and_then_more_and_more_seldom() {
+    for seed in 0..50 {
+        let mut node = node(NodeConfig { seed, ..s_unit("agv", 1) });
+        let mut outbox = Outbox::default();
+        run(&mut node, at(SOON), &mut outbox);
+        let who_has = as_who_has(&outbox.broadcasts[0]);
+        assert_eq!((who_has.wanted, who_has.identity.name()), (Some(manager()), "agv"));
+        let mut last = at(SOON);
+        let times = search_times(&mut node, at(120_000));
+        let mut pause = FIRST_SEARCH;
+        for time in times {
+            let waited = time.since(last);
+            let earliest = if last == at(SOON) { pause - Duration::from_millis(SOON) } else { pause };
+            assert!(waited >= earliest && waited <= pause.times(2), "{waited:?} for {pause:?}, seed {seed}");
+            (last, pause) = (time, pause.times(2).min(LONGEST_SEARCH));
+        }
+        assert!(last > at(100_000), "it never gives up");
+    }
+}
+
+#[test]
+fn an_m_unit_asks_a_few_times_and_goes_on_only_while_it_is_alone() {
+    let mut alone = depot();
+    assert!(search_times(&mut alone, at(100_000)).len() > 8);
+    let mut joined = depot();
+    join(&mut joined, at(0), 0, &s_unit("agv", 1));
+    assert_eq!(search_times(&mut joined, at(100_000)).len(), 4);
+    joined.left(at(100_000), LinkId(0), CloseReason::Reset);
+    assert!(search_times(&mut joined, at(101_000)).len() > 1, "it is alone again");
+}
+
+#[test]
+fn a_broadcast_that_is_asked_for_goes_out_at_once_or_when_the_budget_allows() {
+    let mut node = depot();
+    let mut outbox = Outbox::default();
+    for _ in 0..SEARCH_BUDGET {
+        node.broadcast(at(100));
+        node.poll(at(100), &mut outbox);
+    }
+    assert_eq!(outbox.broadcasts.len(), usize::from(SEARCH_BUDGET));
+    node.broadcast(at(101));
+    node.broadcast(at(102));
+    let times = search_times(&mut node, at(100) + SEARCH_WINDOW);
+    assert_eq!(times, [at(100) + SEARCH_WINDOW], "two requests make one search, on time");
+}
+
+#[test]
+fn searches_of_others_count_against_the_budget() {
+    let mut node = depot();
+    for host in 1..=u32::from(SEARCH_BUDGET) {
+        let bytes = who_has_bytes(&search_of(
+            &NodeConfig { target: Target::Manager(Manager::new("yard", 1).unwrap()), ..s_unit("agv", host) },
+            1,
+        ));
+        node.datagram(at(0), address(host, 7_001), &bytes);
+    }
+    let times = search_times(&mut node, at(4_000));
+    assert!(times[0] >= at(0) + SEARCH_WINDOW, "{times:?}");
+    assert_eq!(node.counters.value(NodeCounter::WhoHasDeferred), 1);
+    assert_eq!(node.counters.value(NodeCounter::WrongManager), 4);
+}
+
+#[test]
+fn an_s_unit_holds_back_while_another_asks_the_same() {
+    for seed in 0..50 {
+        let mut node = node(NodeConfig { seed, ..s_unit("agv", 1) });
+        let bytes = who_has_bytes(&search_of(&s_unit("agv", 2), 1));
+        node.datagram(at(0), address(2, 7_001), &bytes);
+        node.datagram(at(2), address(3, 7_001), &who_has_bytes(&search_of(&s_unit("agv", 3), 1)));
+        let first = search_times(&mut node, at(2_000))[0];
+        let earliest = at(0) + FIRST_SEARCH;
+        assert!(first >= earliest && first <= at(2) + FIRST_SEARCH.times(2), "{first:?}");
+    }
+}
+
+#[test]
+fn the_first_seeker_is_answered_alone_and_the_second_with_all_others() {
+    let mut node = depot();
+    let mut outbox = Outbox::default();
+    run(&mut node, at(40_000), &mut Outbox::default());
+    let ask = |node: &mut Node<Boxed>, millis, host| {
+        node.datagram(at(millis), address(host, 7_001), &who_has_bytes(&search_of(&s_unit("agv", host), 1)));
+    };
+    ask(&mut node, 40_001, 1);
+    ask(&mut node, 40_002, 1);
+    let mut before = Outbox::default();
+    while node.next_deadline() <= at(40_030) {
+        node.poll(node.next_deadline(), &mut before);
+    }
+    assert_eq!((before.sent.len(), before.broadcasts.len()), (1, 0));
+    let (to, bytes) = &before.sent[0];
+    let announce = as_announce(bytes);
+    assert_eq!((*to, announce.nonce, announce.tcp_port), (address(1, 7_001), 77, 7_000));
+
+    ask(&mut node, 40_200, 2);
+    ask(&mut node, 40_201, 3);
+    run(&mut node, at(40_300), &mut outbox);
+    let announces: Vec<_> = outbox.broadcasts.iter().map(|bytes| as_announce(bytes)).collect();
+    assert_eq!(announces.iter().map(|announce| announce.nonce).collect::<Vec<_>>(), [0]);
+    assert!(announces[0].sequence > announce.sequence);
+}
+
+#[test]
+fn an_answer_to_this_units_question_is_dialled_at_once_and_to_another_never() {
+    let mut node = node(s_unit("agv", 1));
+    let mut outbox = Outbox::default();
+    run(&mut node, at(SOON), &mut outbox);
+    let nonce = as_who_has(&outbox.broadcasts[0]).nonce;
+    let depot = m_unit(MANAGER, MANAGER_ID);
+    node.datagram(at(60), address(1, 7_001), &announce_bytes(&announce_of(&depot, 1, nonce ^ 2)));
+    assert_eq!(node.counters.value(NodeCounter::Unasked), 1);
+    assert_eq!(node.poll(at(60), &mut outbox), None);
+    node.datagram(at(61), address(1, 7_001), &announce_bytes(&announce_of(&depot, 1, nonce)));
+    let dial = Action::Dial { to: address(1, 7_000), identity: Some(depot.identity) };
+    assert_eq!(node.poll(at(61), &mut outbox), Some(dial));
+}
+
+#[test]
+fn the_wrong_manager_is_ignored() {
+    let mut node = node(s_unit("agv", 1));
+    for wrong in [m_unit(MANAGER, 6), m_unit("yard", MANAGER_ID), s_unit(MANAGER, MANAGER_ID)] {
+        node.datagram(at(1), address(9, 7_001), &announce_bytes(&announce_of(&wrong, 1, 0)));
+        let asks = WhoHas { wanted: None, ..search_of(&wrong, 2) };
+        node.datagram(at(1), address(9, 7_001), &who_has_bytes(&asks));
+    }
+    assert_eq!(run(&mut node, at(500), &mut Outbox::default()), []);
+    assert_eq!(node.counters.value(NodeCounter::WrongManager), 6);
+    assert_eq!(node.nodes().count(), 0);
+}
+
+#[test]
+fn own_s_units_dial_a_manager_that_asks_unless_it_knows_them() {
+    let config = s_unit("agv", 1);
+    let mut ask = search_of(&m_unit(MANAGER, MANAGER_ID), 1);
+    ask.expected = 500;
+    let dials = |known: &[u32]| {
+        let mut node = node(config.clone());
+        let who_has = WhoHas { known: known.iter().copied().collect(), ..ask.clone() };
+        node.datagram(at(0), address(1, 7_001), &who_has_bytes(&who_has));
+        let actions = run(&mut node, at(500), &mut Outbox::default());
+        actions.into_iter().map(|(when, action)| (when, matches!(action, Action::Dial { .. }))).collect::<Vec<_>>()
+    };
+    let dialled = dials(&[]);
+    assert!(matches!(dialled[..], [(_, true)]), "{dialled:?}");
+    assert_eq!(dials(&[1, short_hash(&config.identity)]), []);
+}
+
+#[test]
+fn of_two_m_units_the_smaller_dials_and_the_larger_answers() {
+    let (small, large) = (m_unit("a", 1), m_unit("b", 1));
+    let mut of_small = node(small.clone());
+    of_small.datagram(at(0), address(2, 7_001), &who_has_bytes(&search_of(&large, 1)));
+    let mut outbox = Outbox::default();
+    let actions = run(&mut of_small, at(100), &mut outbox);
+    let dial = Action::Dial { to: address(2, 7_000), identity: Some(large.identity.clone()) };
+    assert_eq!(actions.into_iter().map(|(_, action)| action).collect::<Vec<_>>(), [dial]);
+    assert!(outbox.sent.is_empty());
+
+    let mut of_large = node(large);
+    of_large.datagram(at(0), address(1, 7_001), &who_has_bytes(&search_of(&small, 1)));
+    let mut outbox = Outbox::default();
+    assert_eq!(run(&mut of_large, at(100), &mut outbox), []);
+    assert_eq!(outbox.sent.iter().map(|(to, _)| *to).collect::<Vec<_>>(), [address(1, 7_001)]);
+    assert_eq!(as_announce(&outbox.sent[0].1).nonce, 77);
+}
+
+#[test]
+fn own_datagrams_are_ignored_and_a_double_is_told() {
+    let mut node = depot();
+    let own = m_unit(MANAGER, MANAGER_ID);
+    node.datagram(at(0), address(1, 7_001), &who_has_bytes(&search_of(&own, 1)));
+    assert_eq!((node.counters.value(NodeCounter::OwnIdentity), node.findings().count()), (0, 0));
+    let double = NodeConfig { epoch: Epoch(3), ..own };
+    node.datagram(at(0), address(2, 7_001), &who_has_bytes(&search_of(&double, 1)));
+    assert_eq!(node.counters.value(NodeCounter::OwnIdentity), 1);
+    assert_eq!(node.findings().next().map(|finding| finding.refusal), Some(Refusal::DuplicateIdentity));
+}
+
+#[test]
+fn an_s_unit_that_loses_its_manager_searches_again() {
+    let mut node = node(s_unit("agv", 1));
+    assert_eq!(dial_manager(&mut node, at(1), 1), address(1, 7_000));
+    let depot = m_unit(MANAGER, MANAGER_ID);
+    node.dialing(Some(&depot.identity), LinkId(0));
+    join(&mut node, at(300), 0, &depot);
+    assert_eq!((node.number_of_m_units(), node.next_deadline()), (1, Instant::FAR_FUTURE));
+    node.left(at(10_000), LinkId(0), CloseReason::Silent);
+    let times = search_times(&mut node, at(12_000));
+    assert!(times[0] <= at(10_000 + SOON), "{times:?}");
+    assert_eq!(dial_manager(&mut node, at(12_001), 2), address(1, 7_000));
+}
+
+#[test]
+fn what_fails_at_once_is_not_tried_again_at_once() {
+    let mut node = node(s_unit("agv", 1));
+    let depot = m_unit(MANAGER, MANAGER_ID);
+    let mut now = at(1);
+    let mut pauses = Vec::new();
+    for sequence in 1..=6 {
+        dial_manager(&mut node, now, sequence);
+        now = now + Duration::from_millis(200);
+        node.dialing(Some(&depot.identity), LinkId(0));
+        join(&mut node, now, 0, &depot);
+        now = now + Duration::from_millis(1);
+        node.left(now, LinkId(0), CloseReason::Protocol);
+        pauses.push(node.next_deadline().since(now));
+        now = node.next_deadline();
+    }
+    assert!(pauses[5] >= LONGEST_SEARCH.divided_by(2), "{pauses:?}");
+}
+
+#[test]
+fn a_dial_that_fails_or_is_never_heard_of_again_is_tried_again() {
+    let mut node = node(s_unit("agv", 1));
+    let depot = m_unit(MANAGER, MANAGER_ID);
+    dial_manager(&mut node, at(1), 1);
+    node.dial_failed(at(300), Some(&depot.identity));
+    assert!(!search_times(&mut node, at(2_000)).is_empty());
+    dial_manager(&mut node, at(2_001), 2);
+    node.dialing(Some(&depot.identity), LinkId(3));
+    node.left(at(2_300), LinkId(3), CloseReason::DialFailed);
+    assert!(!search_times(&mut node, at(10_000)).is_empty());
+    // The port forgets to say anything.
+    dial_manager(&mut node, at(10_001), 3);
+    assert!(!search_times(&mut node, at(40_000)).is_empty());
+    assert_eq!(node.counters.value(NodeCounter::DialFailed), 3);
+}
+
+#[test]
+fn a_refusal_that_only_people_can_remove_is_asked_about_seldom() {
+    let wait = |refusal| {
+        let mut node = node(s_unit("agv", 1));
+        dial_manager(&mut node, at(1), 1);
+        node.dialing(Some(&m_unit(MANAGER, MANAGER_ID).identity), LinkId(3));
+        node.left(at(300), LinkId(3), CloseReason::Refused(refusal));
+        assert!(node.findings().any(|finding| finding.refusal == refusal));
+        node.next_deadline().since(at(300))
+    };
+    assert!(wait(Refusal::WrongManager) >= LONGEST_SEARCH);
+    assert!(wait(Refusal::Full) < LONGEST_SEARCH);
+}
+
+#[test]
+fn the_smaller_m_unit_dials_again_and_again() {
+    let mut node = node(m_unit("a", 1));
+    let peer = m_unit("b", 2);
+    node.datagram(at(0), address(2, 7_001), &announce_bytes(&announce_of(&peer, 1, 0)));
+    let mut now = at(100);
+    let mut pauses = Vec::new();
+    run(&mut node, now, &mut Outbox::default());
+    node.dialing(Some(&peer.identity), LinkId(0));
+    assert_eq!(node.admit(now, LinkId(0), address(2, 7_000), &hello_of(&peer)), Admission::Accept);
+    node.left(now + Duration::from_secs(5), LinkId(0), CloseReason::Silent);
+    let mut last = now + Duration::from_secs(5);
+    while pauses.len() < 8 {
+        now = node.next_deadline();
+        if let Some(Action::Dial { to, .. }) = node.poll(now, &mut Outbox::default()) {
+            assert_eq!(to, address(2, 7_000));
+            pauses.push(now.since(last));
+            last = now;
+            node.dial_failed(now, Some(&peer.identity));
+        }
+    }
+    assert!(pauses[0] <= FIRST_SEARCH.times(2) && pauses[7] >= LONGEST_SEARCH, "{pauses:?}");
+}
+
+#[test]
+fn a_fixed_address_is_dialled_without_any_broadcast() {
+    let to = address(8, 7_000);
+    let mut node = node(NodeConfig { target: Target::Fixed(manager(), to), ..s_unit("agv", 1) });
+    let mut outbox = Outbox::default();
+    let mut dials = 0;
+    while dials < 5 {
+        let now = node.next_deadline();
+        if let Some(action) = node.poll(now, &mut outbox) {
+            assert_eq!(action, Action::Dial { to, identity: Some(m_unit(MANAGER, MANAGER_ID).identity) });
+            node.dialing(Some(&m_unit(MANAGER, MANAGER_ID).identity), LinkId(0));
+            node.left(now + Duration::from_secs(1), LinkId(0), CloseReason::DialFailed);
+            dials += 1;
+        }
+    }
+    // What is heard of the manager elsewhere does not change the address.
+    node.datagram(at(100), address(1, 7_001), &announce_bytes(&announce_of(&m_unit(MANAGER, MANAGER_ID), 1, 0)));
+    node.broadcast(at(101));
+    let action = run(&mut node, at(101), &mut outbox).pop().map(|(_, action)| action);
+    assert!(matches!(action, Some(Action::Dial { to: found, .. }) if found == to), "{action:?}");
+    assert!(outbox.broadcasts.is_empty());
+}
+
+#[test]
+fn a_full_managers_broadcast_is_no_invitation() {
+    let mut node = node(s_unit("agv", 1));
+    let full = Announce { room: 0, expected: 0, ..announce_of(&m_unit(MANAGER, MANAGER_ID), 1, 0) };
+    node.datagram(at(0), address(1, 7_001), &announce_bytes(&full));
+    assert_eq!(run(&mut node, at(400), &mut Outbox::default()), []);
+    assert_eq!(node.findings().next().map(|finding| finding.refusal), Some(Refusal::Full));
+}
+
+#[test]
+fn a_hello_that_is_quicker_than_the_ports_note_counts() {
+    let mut node = node(s_unit("agv", 1));
+    let depot = m_unit(MANAGER, MANAGER_ID);
+    dial_manager(&mut node, at(1), 1);
+    join(&mut node, at(300), 0, &depot);
+    node.dialing(Some(&depot.identity), LinkId(0));
+    assert_eq!(run(&mut node, at(60_000), &mut Outbox::default()), []);
+    assert_eq!(node.node(&depot.identity).map(Known::link), Some(Some(LinkId(0))));
+}

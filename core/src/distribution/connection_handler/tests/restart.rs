@@ -1,0 +1,146 @@
+//! Known identities that come back: challenges, and indices that keep their meaning.
+
+use std::string::ToString;
+
+use super::*;
+use crate::config::CHALLENGE_TIMEOUT;
+
+fn reborn(config: &NodeConfig) -> Hello {
+    Hello { epoch: Epoch(999), ..hello_of(config) }
+}
+
+fn challenged() -> Node<Boxed> {
+    let mut node = depot();
+    let agv = s_unit("agv", 1);
+    join(&mut node, at(1), 0, &agv);
+    let admission = node.admit(at(1_000), LinkId(1), address(1, 41_000), &reborn(&agv));
+    assert_eq!(admission, Admission::Challenge { old: LinkId(0) });
+    node
+}
+
+#[test]
+fn an_old_link_that_answers_stays_and_the_newcomer_is_a_duplicate() {
+    let mut node = challenged();
+    let action = node.challenge_answered(at(1_100), LinkId(0));
+    assert_eq!(action, Some(Action::Refuse { new: LinkId(1), refusal: Refusal::DuplicateIdentity }));
+    assert_eq!(node.challenge_answered(at(1_101), LinkId(0)), None);
+    assert_eq!(run(&mut node, at(2_000), &mut Outbox::default()), []);
+    assert_eq!(node.left(at(2_001), LinkId(1), CloseReason::Reset), None);
+    let known = node.node_of(LinkId(0)).unwrap();
+    assert_eq!((known.epoch, node.connected()), (Epoch(1), 1));
+    let finding = node.findings().next().unwrap();
+    assert_eq!((finding.refusal, finding.address), (Refusal::DuplicateIdentity, address(1, 41_000)));
+}
+
+#[test]
+fn an_old_link_that_is_silent_is_superseded_in_time() {
+    let mut node = challenged();
+    let actions = run(&mut node, at(2_000), &mut Outbox::default());
+    let reason = CloseReason::PeerRestarted;
+    assert_eq!(
+        actions,
+        [(at(1_000) + CHALLENGE_TIMEOUT, Action::Supersede { old: LinkId(0), new: LinkId(1), reason })]
+    );
+    assert_eq!(node.left(at(2_001), LinkId(0), reason), None, "the old link's end is no news");
+    assert_eq!(node.node_of(LinkId(1)).map(|known| known.epoch), Some(Epoch(999)));
+    assert_eq!((node.connected(), node.counters.value(NodeCounter::Restarted)), (1, 1));
+    assert_eq!(node.challenge_answered(at(2_002), LinkId(0)), None, "too late");
+}
+
+#[test]
+fn an_old_link_that_breaks_lets_the_newcomer_in_at_once() {
+    let mut node = challenged();
+    assert_eq!(node.left(at(1_001), LinkId(0), CloseReason::Reset), Some(Action::Admit { new: LinkId(1) }));
+    assert_eq!(node.node_of(LinkId(1)).map(Known::link), Some(Some(LinkId(1))));
+    assert_eq!(run(&mut node, at(2_000), &mut Outbox::default()), []);
+    assert_eq!(node.connected(), 1);
+}
+
+#[test]
+fn a_newcomer_that_gives_up_leaves_everything_as_it_was() {
+    let mut node = challenged();
+    assert_eq!(node.left(at(1_001), LinkId(1), CloseReason::Reset), None);
+    assert_eq!(node.challenge_answered(at(1_002), LinkId(0)), None);
+    assert_eq!(run(&mut node, at(2_000), &mut Outbox::default()), []);
+    assert_eq!(node.node_of(LinkId(0)).map(|known| known.epoch), Some(Epoch(1)));
+}
+
+#[test]
+fn a_second_newcomer_is_refused() {
+    let mut node = challenged();
+    let third = node.admit(at(1_001), LinkId(2), address(1, 42_000), &reborn(&s_unit("agv", 1)));
+    assert_eq!(third, Admission::Refuse(Refusal::DuplicateIdentity));
+    node.left(at(1_002), LinkId(2), CloseReason::Reset);
+    assert!(matches!(run(&mut node, at(2_000), &mut Outbox::default())[..], [(_, Action::Supersede { .. })]));
+}
+
+#[test]
+fn a_peer_that_dials_again_in_one_life_waits_for_its_old_link_to_show_itself() {
+    let agv = s_unit("agv", 1);
+    let mut node = depot();
+    join(&mut node, at(1), 0, &agv);
+    let again = |node: &mut Node<Boxed>| node.admit(at(1_000), LinkId(1), address(1, 41_000), &hello_of(&agv));
+    assert_eq!(again(&mut node), Admission::Challenge { old: LinkId(0) });
+    let refusal = Refusal::AlreadyConnected;
+    assert_eq!(node.challenge_answered(at(1_001), LinkId(0)), Some(Action::Refuse { new: LinkId(1), refusal }));
+    assert_eq!(again(&mut node), Admission::Challenge { old: LinkId(0) });
+    let actions = run(&mut node, at(1_500), &mut Outbox::default());
+    let reason = CloseReason::Reset;
+    assert_eq!(actions, [(at(1_300), Action::Supersede { old: LinkId(0), new: LinkId(1), reason })]);
+    assert_eq!(node.counters.value(NodeCounter::Restarted), 0);
+}
+
+#[test]
+fn an_index_keeps_meaning_the_same_node_when_another_leaves() {
+    let mut node = depot();
+    let agvs = [s_unit("agv-1", 31), s_unit("agv-2", 22), s_unit("agv-3", 13)];
+    join(&mut node, at(1), 7, &m_unit("other", 1));
+    for (link, agv) in (0..).zip(&agvs) {
+        join(&mut node, at(2), link, agv);
+    }
+    let name = |node: &Node<Boxed>, index| node.s_unit(index).unwrap().identity.name().to_string();
+    node.left(at(3), LinkId(0), CloseReason::Reset);
+    assert_eq!((name(&node, 1), name(&node, 2)), ("agv-2".into(), "agv-3".into()));
+    assert!(!node.s_unit(0).unwrap().is_joined());
+    join(&mut node, at(4), 4, &s_unit("agv-4", 4));
+    assert_eq!(name(&node, 3), "agv-4");
+    join(&mut node, at(5), 5, &agvs[0]);
+    assert_eq!((name(&node, 0), node.s_unit(0).unwrap().link()), ("agv-1".into(), Some(LinkId(5))));
+    let names: Vec<_> = node.s_units().map(|known| known.identity.name()).collect();
+    assert_eq!(names, ["agv-1", "agv-2", "agv-3", "agv-4"]);
+    assert_eq!(node.m_unit(0).unwrap().identity.name(), "other");
+    assert_eq!((node.s_unit(4).is_none(), node.m_unit(1).is_none()), (true, true));
+    assert_eq!((node.number_of_s_units(), node.number_of_m_units()), (4, 1));
+}
+
+#[test]
+fn nodes_are_found_by_name_id_and_address() {
+    let mut node = depot();
+    join(&mut node, at(1), 0, &s_unit("a", 1));
+    join(&mut node, at(1), 1, &s_unit("b", 1));
+    join(&mut node, at(1), 2, &m_unit("c", 3));
+    assert_eq!(node.find("b").unwrap().link(), Some(LinkId(1)));
+    assert_eq!(node.find_id(3).unwrap().identity.name(), "c");
+    assert_eq!(node.find_id(1).unwrap().identity.name(), "a");
+    node.left(at(2), LinkId(0), CloseReason::Reset);
+    assert_eq!(node.find_id(1).unwrap().identity.name(), "b", "connected ones come first");
+    assert!(node.find("d").is_none() && node.find_id(2).is_none());
+    let names: Vec<_> = node.find_address(address(1, 9).ip()).map(|known| known.identity.name()).collect();
+    assert_eq!(names, ["a", "b"]);
+    let gone = node.find("a").unwrap();
+    assert_eq!((gone.state(), gone.epoch, gone.limits.is_some()), (NodeState::Away, Epoch(1), true));
+}
+
+#[test]
+fn the_node_that_left_first_is_forgotten_first() {
+    let mut node: Node<Boxed> = Node::new(at(0), m_unit(MANAGER, MANAGER_ID), storage(3));
+    for (link, name) in (0..).zip(["a", "b", "c"]) {
+        join(&mut node, at(1), link, &s_unit(name, 10 - u32::from(link)));
+    }
+    node.left(at(2), LinkId(1), CloseReason::Reset);
+    node.left(at(3), LinkId(0), CloseReason::Reset);
+    join(&mut node, at(4), 3, &s_unit("d", 1));
+    assert_eq!((node.find("a").is_some(), node.find("b").is_none()), (true, true));
+    assert_eq!(node.s_unit(1).unwrap().identity.name(), "d", "its index is free as well");
+    assert_eq!(node.counters.value(NodeCounter::Forgotten), 1);
+}

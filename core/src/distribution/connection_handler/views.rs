@@ -1,0 +1,79 @@
+//! The registry: nodes by place, name, id, address and link (paper, section 2).
+
+use core::net::IpAddr;
+
+use super::{Known, Node};
+use crate::distribution::identity::{Identity, Role};
+use crate::host::mailman::LinkId;
+use crate::storage::Storage;
+
+impl<S: Storage> Node<S> {
+    /// All nodes that are known, in the order in which they became so, as long as none had to be forgotten.
+    pub fn nodes(&self) -> impl Iterator<Item = &Known> {
+        self.table.iter()
+    }
+
+    /// The s_units that have joined, those that left included, in the order of joining (paper, listing line 8). The
+    /// index of each is its [`Known::index`].
+    pub fn s_units(&self) -> impl Iterator<Item = &Known> {
+        self.table.by_index(Role::SUnit)
+    }
+
+    /// The m_units that have joined, those that left included, in the order of joining.
+    pub fn m_units(&self) -> impl Iterator<Item = &Known> {
+        self.table.by_index(Role::MUnit)
+    }
+
+    /// The s_unit with this index. It keeps its index while others leave, and while it is away itself.
+    pub fn s_unit(&self, index: u16) -> Option<&Known> {
+        self.table.at_index(Role::SUnit, index)
+    }
+
+    /// The m_unit with this index.
+    pub fn m_unit(&self, index: u16) -> Option<&Known> {
+        self.table.at_index(Role::MUnit, index)
+    }
+
+    /// The node of an identity.
+    pub fn node(&self, identity: &Identity) -> Option<&Known> {
+        self.table.find(identity).and_then(|place| self.table.node(place))
+    }
+
+    /// The first node with this name, connected ones before others. Looks at all nodes.
+    pub fn find(&self, name: &str) -> Option<&Known> {
+        let mut same = self.nodes().filter(|known| known.identity.name() == name);
+        let first = same.next()?;
+        if first.is_joined() { Some(first) } else { same.find(|known| known.is_joined()).or(Some(first)) }
+    }
+
+    /// The first node with this id, connected ones before others.
+    pub fn find_id(&self, id: u32) -> Option<&Known> {
+        self.table.with_id(id)
+    }
+
+    /// The nodes of one host.
+    pub fn find_address(&self, ip: IpAddr) -> impl Iterator<Item = &Known> {
+        self.table.with_address(ip)
+    }
+
+    /// The node at the other end of a link.
+    pub fn node_of(&self, link: LinkId) -> Option<&Known> {
+        let known = self.table.of_link(link).and_then(|place| self.table.node(place))?;
+        (known.link() == Some(link) || known.dialing == Some(link)).then_some(known)
+    }
+
+    /// How many nodes are connected.
+    pub const fn connected(&self) -> usize {
+        self.table.joined() as usize
+    }
+
+    /// How many s_units are connected (paper, listing line 4).
+    pub const fn number_of_s_units(&self) -> usize {
+        self.table.joined_as(Role::SUnit) as usize
+    }
+
+    /// How many m_units are connected.
+    pub const fn number_of_m_units(&self) -> usize {
+        self.table.joined_as(Role::MUnit) as usize
+    }
+}
