@@ -12,6 +12,7 @@ mod distribution;
 mod foundation;
 mod host;
 mod messages;
+mod node;
 mod services;
 mod shown;
 

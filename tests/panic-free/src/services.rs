@@ -57,7 +57,8 @@ entry!(session_asked, {
     keep((session.link(), session.dialed(), session.is_live(), session.is_ended(), session.hello()));
     keep((session.identity(), session.epoch(), session.address(), session.nonce(), session.deadline()));
     keep((session.their_function_list(), session.counters(), session.calls_in_flight(), session.calls_held()));
-    keep((session.wants_to_write(), session.has_next_call()));
+    keep((session.wants_to_write(), session.has_next_call(), session.is_acknowledged(*unknown())));
+    keep(session.constraints());
 });
 
 entry!(session_connected, {

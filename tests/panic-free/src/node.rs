@@ -1,0 +1,92 @@
+//! The node: discovery, admission, the table of nodes; its datagrams.
+
+use cara_core::distribution::connection_handler::{Known, Node, NodeConfig, NodeCounter, NodeStorage};
+use cara_core::distribution::datagram::{self, Announce, Datagram, WhoHas};
+use cara_core::distribution::hello::Manager;
+use cara_core::distribution::identity::Identity;
+use cara_core::storage::Lent;
+use core::mem::MaybeUninit;
+
+use crate::host::AnyMailman;
+use crate::linkage::{drain, keep, unknown, unknown_slice, unknown_text};
+
+type AnyNode = Node<Lent>;
+
+fn node() -> &'static mut AnyNode {
+    unknown()
+}
+
+fn identity() -> &'static Identity {
+    unknown()
+}
+
+entry!(node_made, {
+    let config = unknown::<Option<NodeConfig>>().take();
+    let storage = unknown::<Option<NodeStorage<Lent>>>().take();
+    if let (Some(config), Some(storage)) = (config, storage) {
+        unknown::<MaybeUninit<AnyNode>>().write(Node::new(*unknown(), config, storage));
+    }
+});
+
+entry!(node_asked, {
+    let node = node();
+    keep((node.identity(), node.fleet(), node.epoch(), node.constraints(), node.next_deadline()));
+    keep((node.connected(), node.number_of_s_units(), node.number_of_m_units()));
+    drain(node.findings());
+});
+
+entry!(node_set, {
+    node().set_constraints(*unknown());
+    node().set_maximum_nodes(*unknown());
+    keep(node().hello(*unknown(), *unknown()));
+});
+
+entry!(node_polled, {
+    keep(node().poll(*unknown(), &mut AnyMailman));
+    node().broadcast(*unknown());
+});
+
+entry!(node_hears, {
+    keep(node().datagram(*unknown(), *unknown(), unknown_slice()));
+});
+
+entry!(node_admits, {
+    keep(node().admit(*unknown(), *unknown(), *unknown(), unknown()));
+    keep(node().challenge_answered(*unknown(), *unknown()));
+});
+
+entry!(node_dials, {
+    node().dialing(Some(identity()), *unknown());
+    node().dial_failed(*unknown(), Some(identity()));
+    keep(node().left(*unknown(), *unknown(), *unknown()));
+});
+
+entry!(node_lists, {
+    let node = node();
+    drain(node.nodes());
+    drain(node.s_units());
+    drain(node.m_units());
+    drain(node.find_address(*unknown()));
+    keep((node.s_unit(*unknown()), node.m_unit(*unknown()), node.node(identity()), node.node_of(*unknown())));
+    keep((node.find(unknown_text()), node.find_id(*unknown())));
+    let known: &Known = unknown();
+    keep((known.is_joined(), known.state(), known.link(), known.index()));
+});
+
+entry!(node_counters, {
+    let counter: NodeCounter = *unknown();
+    keep(node().counters.value(counter));
+    drain(node().counters.iter());
+});
+
+entry!(managers, {
+    keep(Manager::new(unknown_text(), *unknown()));
+    keep(unknown::<Manager>().is(identity()));
+});
+
+entry!(datagrams, {
+    keep(Datagram::decode(unknown_slice(), *unknown()));
+    keep(unknown::<WhoHas>().encode(*unknown(), unknown_slice()));
+    keep(unknown::<Announce>().encode(*unknown(), unknown_slice()));
+    keep(datagram::short_hash(identity()));
+});
