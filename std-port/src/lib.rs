@@ -38,7 +38,7 @@ pub use builder::Builder;
 pub use cara_core::config::{Constraints, Priority};
 pub use cara_core::distribution::function::{Attributes, Definition, Signature};
 pub use cara_core::distribution::hello::Manager;
-pub use cara_core::distribution::identity::{Fleet, Identity, Role};
+pub use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
 pub use cara_core::distribution::parameters::{Parameters, ParametersView};
 pub use cara_core::error::{Cause, CloseReason, Error, Limit, Refusal, ServiceError};
 pub use cara_core::host::connections::LinkCounter;

@@ -3,7 +3,7 @@
 use std::fmt;
 use std::sync::Arc;
 
-use cara_core::distribution::identity::Identity;
+use cara_core::distribution::identity::{Epoch, Identity};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 use cara_core::services::requests::CallId;
@@ -96,6 +96,11 @@ impl<T: Send + 'static> Peer<T> {
     /// The other end of its link, while it is connected.
     pub fn address(&self) -> Option<SocketAddr> {
         self.cell.link().map(|link| link.lock().session.address())
+    }
+
+    /// Which of its runs is connected: it differs after each start of the node.
+    pub fn epoch(&self) -> Option<Epoch> {
+        self.cell.link().and_then(|link| link.lock().session.epoch())
     }
 
     pub(crate) fn link(&self) -> Result<Arc<LinkCell>, Error> {

@@ -1,0 +1,134 @@
+//! An AGV: an s_unit that keeps a position, drives while its manager wants it to, and calls a mechanic.
+
+use std::time::{Duration, Instant};
+
+use anyhow::Result;
+use cara_apps::agv::{Agv, BATTERY, GO_TO, GO_TO_LEASE, POS_INFO, Progress, STOP, TICK};
+use cara_apps::mechanic;
+use cara_examples::{NameAndId, Network, Stop, log_to_stderr, say};
+use cara_std::{Call, Definition, LeaseWatch, ParametersView, Priority, ServiceOptions, Unit, UnitEvent};
+use clap::Parser;
+
+/// How often the AGV says where it is.
+const POSITION_EVERY: Duration = Duration::from_millis(500);
+
+/// An AGV that joins one manager.
+#[derive(Parser)]
+struct Options {
+    #[arg(long, default_value = "agv-1")]
+    name: String,
+    #[arg(long, default_value_t = 11)]
+    id: u32,
+    /// The manager that it belongs to.
+    #[arg(long, value_name = "NAME/ID", default_value = "AGV_manager/1")]
+    manager: NameAndId,
+    #[command(flatten)]
+    network: Network,
+}
+
+fn main() -> Result<()> {
+    let Options { name, id, manager, network } = Options::parse();
+    log_to_stderr();
+    let stop = Stop::new(network.attended)?;
+    let builder = Unit::builder(&name, id, &manager.name, manager.id)?;
+    let builder = builder.fleet(network.fleet).interfaces(network.interfaces());
+    let unit = builder.state(Agv::new([0, 0])).build_unit()?;
+    let lease = offer(&unit)?;
+    unit.on_manager_lost(|_| say!("manager lost"));
+    follow(&unit);
+    unit.start()?;
+    say!("started {name}/{id} at {}", unit.with_state(|agv| agv.place())?);
+    drive(&unit, &lease, &stop)?;
+    unit.stop();
+    say!("ended at {}", unit.with_state(|agv| agv.place())?);
+    Ok(())
+}
+
+/// Publishes the AGV's services. Returns the lease of driving.
+fn offer(unit: &Unit<Agv>) -> Result<LeaseWatch> {
+    let pos_info = |agv: &mut Agv, _: &Call, pos: &mut ParametersView| agv.pos_info(pos);
+    let go_to = |agv: &mut Agv, _: &Call, pos: &mut ParametersView| {
+        agv.go_to(pos)?;
+        agv.target().into_iter().for_each(|target| say!("driving to {target}"));
+        Ok(())
+    };
+    let battery = |agv: &mut Agv, _: &Call, charge: &mut ParametersView| agv.battery(charge);
+    let stop = |agv: &mut Agv, call: &Call, _: &mut ParametersView| {
+        agv.stop().into_iter().for_each(|place| say!("stopped at {place}: {} said so", call.caller));
+        Ok(())
+    };
+    let safe = |agv: &mut Agv| agv.stop().into_iter().for_each(not_wanted);
+    let functions = unit.my_function_list();
+    let plain = ServiceOptions::new;
+    functions.add_service(&Definition::parse(POS_INFO)?, plain().idempotent(), pos_info)?;
+    functions.add_service(&Definition::parse(BATTERY)?, plain().idempotent(), battery)?;
+    functions.add_service(&Definition::parse(STOP)?, plain().idempotent().priority(Priority::Emergency), stop)?;
+    let lease = functions.add_service(&Definition::parse(GO_TO)?, plain().lease(GO_TO_LEASE, safe), go_to)?;
+    unit.publish_my_function_list()?;
+    Ok(lease)
+}
+
+/// The motors' loop: drives while the lease is live.
+fn drive(unit: &Unit<Agv>, lease: &LeaseWatch, stop: &Stop) -> Result<()> {
+    let (mut last, mut said) = (Instant::now(), Instant::now());
+    loop {
+        if let Some(outcome) = stop.wait_for(TICK.into()) {
+            return outcome;
+        }
+        let elapsed = last.elapsed();
+        last += elapsed;
+        let (progress, place) = unit.with_state(|agv| (agv.step(elapsed.into(), lease.is_live()), agv.place()))?;
+        match progress {
+            Some(Progress::Passed(place)) => say!("passed {place}"),
+            Some(Progress::Arrived(place)) => {
+                unit.my_function_list().end_lease("go_to");
+                say!("arrived at {place}");
+            }
+            Some(Progress::Stopped(place)) => not_wanted(place),
+            None => {}
+        }
+        if said.elapsed() >= POSITION_EVERY {
+            said = Instant::now();
+            say!("position {place}");
+        }
+    }
+}
+
+fn not_wanted(place: cara_apps::agv::Place) {
+    say!("stopped at {place}: nobody wants go_to any more");
+}
+
+/// Says what happens, and calls a mechanic, once, when the manager offers to send one.
+fn follow(unit: &Unit<Agv>) {
+    let events = unit.events();
+    let unit = unit.clone();
+    std::thread::spawn(move || {
+        let mut called = false;
+        for event in events {
+            match event {
+                UnitEvent::Joined { peer } => say!("joined {peer}"),
+                UnitEvent::Left { peer, reason } => say!("left {peer}: {reason}"),
+                UnitEvent::ListChanged { .. } if !called => called = offered(&unit) && call_mechanic(&unit),
+                _ => {}
+            }
+        }
+    });
+}
+
+fn offered(unit: &Unit<Agv>) -> bool {
+    unit.manager().is_some_and(|manager| manager.their_function_list().contains("call_mechanic"))
+}
+
+fn call_mechanic(unit: &Unit<Agv>) -> bool {
+    let answer = || -> Result<i64> {
+        let mut arguments = mechanic::arguments()?;
+        arguments.set_value("fault", "a wheel squeaks")?;
+        unit.block_request("call_mechanic", &mut arguments)?;
+        Ok(arguments.variable("minutes")?)
+    };
+    match answer() {
+        Ok(minutes) => say!("call_mechanic: one comes in {minutes} minutes"),
+        Err(error) => say!("call_mechanic failed: {error}"),
+    }
+    true
+}

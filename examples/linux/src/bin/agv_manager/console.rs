@@ -1,0 +1,95 @@
+//! Commands on standard input, one per line, each answered by one line that begins with `=`, or with `!` on an error.
+
+use std::fmt::Write;
+use std::io::BufRead;
+
+use anyhow::{Context, Result, anyhow, bail};
+use cara_examples::say;
+use cara_std::{CommunicationSystem, Parameters, Peer};
+
+const HELP: &str =
+    "units | functions N | pos_info N | go_to N X Y | release N | battery N | stop N | quit; N is an s_unit's index";
+
+/// Takes commands until `quit` or the end of the input.
+pub(crate) fn run(agv_manager: &CommunicationSystem) -> Result<()> {
+    say!("console: {HELP}");
+    for line in std::io::stdin().lock().lines() {
+        let line = line?;
+        let words: Vec<&str> = line.split_whitespace().collect();
+        match words.as_slice() {
+            [] => {}
+            ["quit"] => break,
+            words => match answer(agv_manager, words) {
+                Ok(answer) => say!("= {answer}"),
+                Err(error) => say!("! {error:#}"),
+            },
+        }
+    }
+    Ok(())
+}
+
+/// The s_units by their indexes.
+pub(crate) fn units(agv_manager: &CommunicationSystem) -> String {
+    let mut text = format!("{} s_units", agv_manager.number_of_s_units());
+    for (index, peer) in agv_manager.s_units().iter().enumerate() {
+        let epoch = peer.epoch().map_or("away".to_owned(), |epoch| format!("epoch {:016x}", epoch.0));
+        // Writing to a text cannot fail.
+        let _ = write!(text, "; {index} is {}, {epoch}", peer.identity());
+    }
+    text
+}
+
+fn answer(agv_manager: &CommunicationSystem, words: &[&str]) -> Result<String> {
+    match *words {
+        ["help"] => Ok(HELP.to_owned()),
+        ["units"] => Ok(units(agv_manager)),
+        ["functions", index] => Ok(functions(&s_unit(agv_manager, index)?)),
+        ["pos_info", index] => pos_info(&s_unit(agv_manager, index)?),
+        ["go_to", index, x, y] => go_to(&s_unit(agv_manager, index)?, [x.parse()?, y.parse()?]),
+        ["release", index] => Ok(s_unit(agv_manager, index)?.release("go_to").map(|()| "released".to_owned())?),
+        ["battery", index] => battery(&s_unit(agv_manager, index)?),
+        ["stop", index] => stop(&s_unit(agv_manager, index)?),
+        _ => bail!("no such command: {HELP}"),
+    }
+}
+
+fn s_unit(agv_manager: &CommunicationSystem, index: &str) -> Result<Peer> {
+    let index: usize = index.parse().context("the index is a number")?;
+    agv_manager.s_units().into_iter().nth(index).ok_or_else(|| anyhow!("no s_unit has the index {index}"))
+}
+
+fn functions(agv: &Peer) -> String {
+    let functions = agv.their_function_list();
+    functions.names().collect::<Vec<_>>().join(", ")
+}
+
+fn position() -> Result<Parameters> {
+    let mut pos = Parameters::new();
+    pos.add_int("position", 2)?;
+    Ok(pos)
+}
+
+fn pos_info(agv: &Peer) -> Result<String> {
+    let mut pos = position()?;
+    agv.block_request("pos_info", &mut pos)?;
+    Ok(format!("position {:?}", pos.variable::<[i64; 2]>("position")?))
+}
+
+fn go_to(agv: &Peer, target: [i64; 2]) -> Result<String> {
+    let mut pos = position()?;
+    pos.set_value("position", target)?;
+    agv.request("go_to", &pos)?;
+    Ok(format!("accepted {target:?}"))
+}
+
+fn battery(agv: &Peer) -> Result<String> {
+    let mut charge = Parameters::new();
+    charge.add_float("charge", 1)?;
+    agv.block_request("battery", &mut charge)?;
+    Ok(format!("charge {:.1} %", charge.variable::<f64>("charge")?))
+}
+
+fn stop(agv: &Peer) -> Result<String> {
+    agv.block_request("stop", &mut Parameters::new())?;
+    Ok("stopped".to_owned())
+}

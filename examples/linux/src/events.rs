@@ -1,0 +1,26 @@
+//! What happens without being asked for, as lines.
+
+use std::sync::mpsc::Receiver;
+
+use cara_std::UnitEvent;
+
+use crate::say;
+
+/// Prints each event, in a thread of its own.
+pub fn show_events(events: Receiver<UnitEvent>) {
+    std::thread::spawn(move || events.iter().for_each(|event| show(&event)));
+}
+
+fn show(event: &UnitEvent) {
+    match event {
+        UnitEvent::Joined { peer } => say!("joined {peer}"),
+        UnitEvent::Left { peer, reason } => say!("left {peer}: {reason}"),
+        UnitEvent::ListChanged { peer } => say!("new function list of {peer}"),
+        UnitEvent::RequestFailed { peer, error, .. } => say!("request to {peer} failed: {error}"),
+        UnitEvent::LeaseExpired { peer, function } => say!("lease of {function} expired, held by {peer}"),
+        UnitEvent::LeaseEnded { peer, function, expired: true } => say!("lease of {function} at {peer} expired"),
+        UnitEvent::LeaseEnded { peer, function, expired: false } => say!("{function} at {peer} is finished"),
+        UnitEvent::NotJoined { address, reason, .. } => say!("{address} did not join: {reason}"),
+        UnitEvent::FunctionsSkipped { peer, skipped } => say!("{peer} has no room for {skipped} functions"),
+    }
+}

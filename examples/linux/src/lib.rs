@@ -1,0 +1,22 @@
+//! What the examples share on Linux: options, output, signals. Their logic is in `cara-apps`.
+
+mod events;
+mod options;
+mod output;
+mod stop;
+
+pub use events::show_events;
+pub use options::{NameAndId, Network};
+pub use stop::{Stop, Stopper};
+
+/// Logs to standard error, as the environment's `RUST_LOG` asks; warnings unless it is set.
+pub fn log_to_stderr() {
+    use tracing_subscriber::EnvFilter;
+    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("warn"));
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+}
+
+/// The README's listing, so that it is compiled.
+#[cfg(doctest)]
+#[doc = include_str!("../../../README.md")]
+mod readme {}

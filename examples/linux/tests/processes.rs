@@ -1,0 +1,158 @@
+//! Each example as processes, in a fleet of its own on loopback, within bounds of time.
+
+use std::path::Path;
+use std::time::Duration;
+
+use cara_processes::{Process, random_fleet};
+
+/// How long a step may take on a machine that does other things as well.
+const STEP: Duration = Duration::from_secs(15);
+
+/// Starts examples of one fleet.
+struct Fleet(String);
+
+impl Fleet {
+    fn new() -> Self {
+        Self(random_fleet().to_string())
+    }
+
+    fn start(&self, name: &str, program: &str, arguments: &[&str]) -> Process {
+        let network = ["--loopback", "--fleet", &self.0];
+        Process::start(name, Path::new(program), network.iter().chain(arguments)).unwrap()
+    }
+}
+
+fn ends_well(process: &mut Process) {
+    let status = process.wait(STEP).unwrap();
+    assert!(status.success(), "{}: {status}", process.name());
+}
+
+#[test]
+fn the_listing_runs_and_both_end_when_asked_to() {
+    let fleet = Fleet::new();
+    let mut manager = fleet.start("manager", env!("CARGO_BIN_EXE_agv_manager"), &[]);
+    let mut agv = fleet.start("agv", env!("CARGO_BIN_EXE_agv"), &["--attended"]);
+    for (number, outcome) in [(1, "AGV_manager/1"), (2, "started"), (9, "0 is agv-1/11"), (10, "shown")] {
+        manager.expect(&format!("line {number}: "), STEP).unwrap();
+        assert!(manager.has(outcome), "{outcome}");
+    }
+    assert!(manager.has("pos_info(position: int[2]) -> (position: int[2])"));
+    for line in ["line 15: position [0, 0]", "line 19: accepted", "line 24: published to all"] {
+        manager.expect(line, STEP).unwrap();
+    }
+    agv.seen("driving to [1.000, 2.000]", STEP).unwrap();
+    agv.seen("call_mechanic: one comes in 5 minutes", STEP).unwrap();
+    agv.seen("arrived at [1.000, 2.000]", STEP).unwrap();
+    manager.seen("go_to at agv-1/11 is finished", STEP).unwrap();
+
+    assert!(manager.terminate(STEP).unwrap().success());
+    agv.seen("manager lost", STEP).unwrap();
+    agv.end_input();
+    ends_well(&mut agv);
+    agv.seen("ended at [1.000, 2.000]", STEP).unwrap();
+}
+
+#[test]
+fn a_manager_that_finds_nobody_ends_when_asked_to() {
+    let mut manager = Fleet::new().start("manager", env!("CARGO_BIN_EXE_agv_manager"), &[]);
+    manager.expect("line 6: searching", STEP).unwrap();
+    assert!(manager.terminate(STEP).unwrap().success());
+}
+
+#[test]
+fn the_console_answers_each_command() {
+    let fleet = Fleet::new();
+    let mut manager = fleet.start("manager", env!("CARGO_BIN_EXE_agv_manager"), &["--console"]);
+    let mut agv = fleet.start("agv", env!("CARGO_BIN_EXE_agv"), &["--name", "seven", "--id", "7", "--attended"]);
+    for number in [1, 2, 3, 9, 10, 12, 13, 15, 18, 19, 22, 23, 24] {
+        manager.expect(&format!("line {number}: "), STEP).unwrap();
+        manager.send("").unwrap();
+    }
+    manager.expect("console: ", STEP).unwrap();
+    agv.seen("arrived at", STEP).unwrap();
+    for (command, answer) in [
+        ("units", "= 1 s_units; 0 is seven/7, epoch "),
+        ("functions 0", "= pos_info, battery, stop, go_to"),
+        ("pos_info 0", "= position [1, 2]"),
+        ("battery 0", "= charge 99.9 %"),
+        ("go_to 0 100 100", "= accepted [100, 100]"),
+    ] {
+        manager.send(command).unwrap();
+        manager.expect(answer, STEP).unwrap();
+    }
+    agv.seen("driving to [100.000, 100.000]", STEP).unwrap();
+    manager.send("stop 0").unwrap();
+    manager.expect("= stopped", STEP).unwrap();
+    agv.seen("AGV_manager/1 said so", STEP).unwrap();
+    for mistake in ["pos_info 1", "pos_info", "go_to 0 a b", "dance"] {
+        manager.send(mistake).unwrap();
+        manager.expect("! ", STEP).unwrap();
+    }
+    manager.send("go_to 0 100000 0").unwrap();
+    manager.expect("request to seven/7 failed: ", STEP).unwrap();
+    manager.send("quit").unwrap();
+    ends_well(&mut manager);
+    assert!(agv.terminate(STEP).unwrap().success());
+}
+
+#[test]
+fn a_released_lease_stops_the_motion() {
+    let fleet = Fleet::new();
+    let mut manager = fleet.start("manager", env!("CARGO_BIN_EXE_agv_manager"), &["--console"]);
+    let agv = fleet.start("agv", env!("CARGO_BIN_EXE_agv"), &[]);
+    for _ in 0..13 {
+        manager.expect("line ", STEP).unwrap();
+        manager.send("").unwrap();
+    }
+    agv.seen("arrived at", STEP).unwrap();
+    manager.send("go_to 0 100 100").unwrap();
+    agv.seen("driving to [100", STEP).unwrap();
+    manager.send("release 0").unwrap();
+    agv.seen("nobody wants go_to any more", STEP).unwrap();
+}
+
+#[test]
+fn m_units_call_each_other() {
+    let fleet = Fleet::new();
+    let program = env!("CARGO_BIN_EXE_peers");
+    let mut one = fleet.start("zone-1", program, &["--name", "zone-1", "--id", "1", "--calls", "3"]);
+    let mut two = fleet.start("zone-2", program, &["--name", "zone-2", "--id", "2", "--calls", "3"]);
+    ends_well(&mut one);
+    ends_well(&mut two);
+    assert!(one.has("called zone-2/2: agv 2 taken over: true") && one.has("made 3 calls, served 3"));
+    assert!(two.has("called zone-1/1: agv 2 taken over: true") && two.has("made 3 calls, served 3"));
+}
+
+#[test]
+fn an_s_unit_joins_only_its_own_manager() {
+    let mut process = Fleet::new().start("two managers", env!("CARGO_BIN_EXE_two_managers"), &[]);
+    ends_well(&mut process);
+    assert!(process.has("north has 0 s_units [] and 1 m_units"));
+    assert!(process.has("south has 1 s_units [agv-1/11] and 1 m_units"));
+    assert!(process.has("the manager of agv-1 is Some(south/2)"));
+}
+
+#[test]
+fn methods_are_services() {
+    let mut process = Fleet::new().start("depot", env!("CARGO_BIN_EXE_method_service"), &[]);
+    ends_well(&mut process);
+    process.expect("store 5: 5 parcels are there", Duration::ZERO).unwrap();
+    process.expect("take 3: 2 parcels are there", Duration::ZERO).unwrap();
+    process.expect("take 3: the service is not ready", Duration::ZERO).unwrap();
+    process.expect("Depot { parcels: 2 }", Duration::ZERO).unwrap();
+}
+
+#[test]
+fn a_best_effort_stream_arrives() {
+    let fleet = Fleet::new();
+    let program = env!("CARGO_BIN_EXE_telemetry");
+    let mut receiver = fleet.start("receiver", program, &["receive"]);
+    let mut sender = fleet.start("sender", program, &["send", "--count", "100"]);
+    ends_well(&mut sender);
+    ends_well(&mut receiver);
+    assert!(sender.has("sent 100, refused here 0"));
+    let shown = receiver.lines().into_iter().rev().find(|line| line.text.starts_with("received ")).unwrap().text;
+    let count: u32 = shown["received ".len()..].split(',').next().unwrap().parse().unwrap();
+    // Datagrams may be lost, on a busy machine also on loopback; most are not.
+    assert!((50..=100).contains(&count), "{shown}");
+}
