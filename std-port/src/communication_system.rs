@@ -1,6 +1,6 @@
 //! The paper's `Communication_System`: an m_unit, which connects to many nodes.
 
-use std::sync::Arc;
+use std::sync::{Arc, Weak};
 use std::sync::mpsc::{Receiver, sync_channel};
 use std::task::{Poll, Wake, Waker};
 
@@ -46,6 +46,24 @@ impl<T: Send + 'static> Clone for CommunicationSystem<T> {
     }
 }
 
+/// A handle that does not keep the unit running: what a handler of the unit itself holds to call others.
+pub struct WeakSystem<T: Send + 'static = ()> {
+    owner: Weak<Owner<T>>,
+}
+
+impl<T: Send + 'static> Clone for WeakSystem<T> {
+    fn clone(&self) -> Self {
+        Self { owner: self.owner.clone() }
+    }
+}
+
+impl<T: Send + 'static> WeakSystem<T> {
+    /// The unit, unless its last handle has been dropped.
+    pub fn upgrade(&self) -> Option<CommunicationSystem<T>> {
+        self.owner.upgrade().map(|owner| CommunicationSystem { owner })
+    }
+}
+
 impl CommunicationSystem {
     /// An m_unit with defaults (paper, listing line 1).
     pub fn new(name: &str, id: u32) -> Result<Self, Error> {
@@ -76,6 +94,11 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     /// Ends every link in an orderly way and all threads.
     pub fn stop(&self) {
         self.engine().stop();
+    }
+
+    /// A handle for the unit's own handlers. One that owned a [`CommunicationSystem`] would keep it running for ever.
+    pub fn downgrade(&self) -> WeakSystem<T> {
+        WeakSystem { owner: Arc::downgrade(&self.owner) }
     }
 
     /// This unit's identity.

@@ -45,7 +45,7 @@ pub use cara_core::host::connections::LinkCounter;
 pub use cara_core::services::requests::CallId;
 pub use cara_core::services::unit::{Delivery, RequestOptions};
 pub use cara_core::time::Duration;
-pub use communication_system::CommunicationSystem;
+pub use communication_system::{CommunicationSystem, WeakSystem};
 pub use config::Capacities;
 pub use event::UnitEvent;
 #[cfg(feature = "async")]
@@ -55,4 +55,4 @@ pub use lease::LeaseWatch;
 pub use my_function_list::MyFunctionList;
 pub use peer::{FunctionNames, Peer};
 pub use sys::interfaces::Interfaces;
-pub use unit::Unit;
+pub use unit::{Unit, WeakUnit};

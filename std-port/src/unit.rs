@@ -1,6 +1,6 @@
 //! The paper's `Unit`: an s_unit, which connects to one m_unit, its manager.
 
-use std::sync::Arc;
+use std::sync::{Arc, Weak};
 use std::sync::mpsc::{Receiver, sync_channel};
 
 use cara_core::config::Constraints;
@@ -27,6 +27,24 @@ pub struct Unit<T: Send + 'static = ()> {
 impl<T: Send + 'static> Clone for Unit<T> {
     fn clone(&self) -> Self {
         Self { owner: self.owner.clone() }
+    }
+}
+
+/// A handle that does not keep the unit running: what a handler of the unit itself holds to call its manager.
+pub struct WeakUnit<T: Send + 'static = ()> {
+    owner: Weak<Owner<T>>,
+}
+
+impl<T: Send + 'static> Clone for WeakUnit<T> {
+    fn clone(&self) -> Self {
+        Self { owner: self.owner.clone() }
+    }
+}
+
+impl<T: Send + 'static> WeakUnit<T> {
+    /// The unit, unless its last handle has been dropped.
+    pub fn upgrade(&self) -> Option<Unit<T>> {
+        self.owner.upgrade().map(|owner| Unit { owner })
     }
 }
 
@@ -60,6 +78,11 @@ impl<T: Send + 'static> Unit<T> {
     /// Ends the link in an orderly way and all threads.
     pub fn stop(&self) {
         self.engine().stop();
+    }
+
+    /// A handle for the unit's own handlers. One that owned a [`Unit`] would keep it running for ever.
+    pub fn downgrade(&self) -> WeakUnit<T> {
+        WeakUnit { owner: Arc::downgrade(&self.owner) }
     }
 
     /// This unit's identity.

@@ -67,3 +67,22 @@ fn a_manager_finds_an_agv_and_calls_it() {
     until("the AGV has left", || manager.number_of_s_units() == 0);
     assert_eq!(peer.block_request("pos_info", &mut pos), Err(Error::NotConnected));
 }
+
+#[test]
+fn a_handler_that_holds_a_weak_handle_does_not_keep_the_unit() {
+    let (manager, agv) = pair();
+    let alive = std::sync::Arc::new(());
+    let (weak, held) = (agv.downgrade(), alive.clone());
+    let definition = "call_home()".parse().unwrap();
+    let call_home = move |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+        let _ = (&held, weak.upgrade());
+        Ok(())
+    };
+    agv.my_function_list().add_service(&definition, cara_std::ServiceOptions::new(), call_home).unwrap();
+    manager.start().unwrap();
+    agv.start().unwrap();
+    until("the AGV has joined", || manager.number_of_s_units() == 1);
+    drop(agv);
+    until("the AGV has left", || manager.number_of_s_units() == 0);
+    until("its handlers are gone", || std::sync::Arc::strong_count(&alive) == 1);
+}

@@ -349,7 +349,7 @@ impl<T: Send + 'static> Engine<T> {
         }
     }
 
-    /// Ends every link in an orderly way and all threads.
+    /// Ends every link in an orderly way and all threads. Within a handler it returns before the threads have ended.
     pub(crate) fn stop(&self) {
         if self.stopping.swap(true, Ordering::AcqRel) {
             return;
@@ -359,13 +359,24 @@ impl<T: Send + 'static> Engine<T> {
             self.with(&link, &mut state, |session, cx| session.close(cx, CloseReason::Stopped));
             self.settle(&link, state);
         }
+        self.state.stop();
         self.clock_waker.wake();
         self.pool_waker.wake();
         let threads = std::mem::take(&mut *lock(&self.threads));
+        // A handler that stops its unit does not wait for the others: one of them may wait for it.
         let own = std::thread::current().id();
-        for thread in threads.into_iter().filter(|thread| thread.thread().id() != own) {
-            let _ = thread.join();
+        if threads.iter().all(|thread| thread.thread().id() != own) {
+            threads.into_iter().for_each(|thread| drop(thread.join()));
         }
+        // A handler may own a handle to a peer of this unit, and so the unit itself: without handlers nothing is left.
+        let handlers = self.take_handlers();
+        drop(handlers);
+    }
+
+    fn take_handlers(&self) -> Vec<Handler<T>> {
+        let mut functions = write(&self.functions);
+        let names: Vec<String> = functions.iter().map(|function| function.name().to_owned()).collect();
+        names.iter().filter_map(|name| functions.remove(name).ok()).map(|(_, handler)| handler).collect()
     }
 
     fn now(&self) -> Instant {
