@@ -30,6 +30,9 @@ pub(crate) struct NodeCell {
     serial: u32,
 }
 
+/// Whom a link is dialled for, as far as it is known.
+struct Dialed<'i>(Option<&'i Identity>);
+
 impl NodeCell {
     pub(crate) fn new(node: Node<Boxed>, publications: Publications<Boxed>, capacities: Capacities) -> Self {
         Self { node, publications, capacities, serial: 0 }
@@ -62,7 +65,7 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     /// Puts a stream into the table of links. `None` when the table is full.
-    fn open_link(&self, stream: Stream, address: SocketAddr, dialed: bool) -> Option<Arc<LinkCell>> {
+    fn open_link(&self, stream: Stream, address: SocketAddr, dialed: Option<Dialed<'_>>) -> Option<Arc<LinkCell>> {
         let mut links = write(&self.links);
         let index = links.iter().position(Option::is_none)?;
         let id = LinkId(u16::try_from(index).ok()?);
@@ -71,8 +74,12 @@ impl<T: Send + 'static> Engine<T> {
             let mut cell = lock(&self.node);
             cell.serial = cell.serial.wrapping_add(1);
             let storage = Self::session_storage(&cell.capacities);
+            if let Some(Dialed(identity)) = dialed {
+                cell.node.dialing(identity, id);
+            }
             (cell.serial, cell.node.hello(now, id), *cell.node.constraints(), storage)
         };
+        let dialed = dialed.is_some();
         let config = SessionConfig { link: id, dialed, address, local, constraints };
         let session = Session::new(now, config, Plain, storage);
         let link = Arc::new(LinkCell::new(id, serial, stream, session, dialed));
@@ -87,19 +94,16 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     pub(super) fn accepted(&self, stream: Stream, address: SocketAddr) {
-        if self.open_link(stream, address, false).is_none() {
+        if self.open_link(stream, address, None).is_none() {
             tracing::warn!(%address, "a connection was dropped: as many links are open as may be");
         }
     }
 
     fn dial(&self, to: SocketAddr, identity: Option<&Identity>) {
-        let link = Stream::connect(to).ok().and_then(|stream| self.open_link(stream, to, true));
-        let mut cell = lock(&self.node);
-        match link {
-            Some(link) => cell.node.dialing(identity, link.id),
-            None => cell.node.dial_failed(self.clock.now(), identity),
+        let stream = Stream::connect(to).ok();
+        if stream.and_then(|stream| self.open_link(stream, to, Some(Dialed(identity)))).is_none() {
+            lock(&self.node).node.dial_failed(self.clock.now(), identity);
         }
-        drop(cell);
         self.clock_waker.wake();
     }
 
@@ -133,15 +137,15 @@ impl<T: Send + 'static> Engine<T> {
     fn join(&self, link: &Arc<LinkCell>, state: &mut LinkState) {
         let Some(identity) = state.session.identity().cloned() else { return };
         self.with(link, state, |session, cx| session.accept(cx));
+        let limit = usize::from(lock(&self.node).node.constraints().maximum_nodes);
+        let peer = write(&self.peers).join(&identity, limit, link);
+        let _ = link.peer.set(peer);
+        // Looked up last: who publishes from here on finds the peer, and waits for this link's lock to tell it.
         let visible: Vec<Slot> = {
             let cell = lock(&self.node);
             cell.publications.visible_to(&identity).collect()
         };
         self.with(link, state, |session, cx| session.publish(cx, visible.into_iter()));
-        let limit = usize::from(lock(&self.node).node.constraints().maximum_nodes);
-        let peer = write(&self.peers).of(&identity, limit);
-        peer.join(link.clone());
-        let _ = link.peer.set(peer);
         state.notices.push(Notice::Joined);
     }
 
@@ -208,21 +212,25 @@ impl<T: Send + 'static> Engine<T> {
         self.clock_waker.wake();
     }
 
+    /// The link's id is free for another link only when nothing here means the old one by it any more.
     fn link_ended(&self, link: &Arc<LinkCell>, reason: CloseReason) {
-        if let Some(place) = write(&self.links).get_mut(usize::from(link.id.0)) {
-            place.take_if(|current| current.serial == link.serial);
-        }
-        lock(&self.timers).cancel(u32::from(link.id.0));
         let _ = self.epoll.remove(&link.stream);
         if let Some(peer) = link.peer.get() {
             peer.leave(link);
             self.run_lost_hook();
             self.tell(UnitEvent::Left { peer: peer.identity.clone(), reason });
         } else {
-            let peer = link.lock().session.identity().cloned();
-            self.tell(UnitEvent::NotJoined { address: link.lock().session.address(), peer, reason });
+            let (peer, address) = {
+                let state = link.lock();
+                (state.session.identity().cloned(), state.session.address())
+            };
+            self.tell(UnitEvent::NotJoined { address, peer, reason });
         }
+        lock(&self.timers).cancel(u32::from(link.id.0));
         let action = lock(&self.node).node.left(self.clock.now(), link.id, reason);
+        if let Some(place) = write(&self.links).get_mut(usize::from(link.id.0)) {
+            place.take_if(|current| current.serial == link.serial);
+        }
         self.carry_out(action);
         // The node may have something to do earlier than before.
         self.clock_waker.wake();

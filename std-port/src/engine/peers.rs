@@ -24,7 +24,7 @@ impl PeerCell {
         self.link.lock().unwrap_or_else(PoisonError::into_inner).is_some()
     }
 
-    pub(crate) fn join(&self, link: Arc<LinkCell>) {
+    fn join(&self, link: Arc<LinkCell>) {
         *self.link.lock().unwrap_or_else(PoisonError::into_inner) = Some(link);
     }
 
@@ -45,9 +45,15 @@ pub(crate) struct Peers {
 }
 
 impl Peers {
-    /// The node of an identity; a new one gets the next place, or that of the first node that is away when there are
-    /// `limit` of them.
-    pub(crate) fn of(&mut self, identity: &Identity, limit: usize) -> Arc<PeerCell> {
+    /// The node of an identity is connected by `link`. A new one gets the next place, or that of the first node that is
+    /// away when there are `limit` of them.
+    pub(crate) fn join(&mut self, identity: &Identity, limit: usize, link: &Arc<LinkCell>) -> Arc<PeerCell> {
+        let peer = self.of(identity, limit);
+        peer.join(link.clone());
+        peer
+    }
+
+    fn of(&mut self, identity: &Identity, limit: usize) -> Arc<PeerCell> {
         if let Some(peer) = self.by_identity.get(identity).and_then(|&index| self.list.get(index)) {
             return peer.clone();
         }
