@@ -33,13 +33,8 @@ impl<T: Send + 'static> Engine<T> {
     pub(super) fn stay(&self, link: &Arc<LinkCell>, worker: &mut Worker) {
         let Some(turn) = self.begin_stay(link) else { return };
         while let Some(call) = self.await_call(link, turn, worker) {
-            let mut state = self.serve_one(link, &call, &mut worker.arguments);
-            state.reader.set_busy(turn, None);
-            let mut next = self.next_call(link, state, &mut worker.arguments);
-            while let Some(call) = next {
-                let state = self.serve_one(link, &call, &mut worker.arguments);
-                next = self.next_call(link, state, &mut worker.arguments);
-            }
+            // It is busy until the last of those that waited behind this call is done.
+            self.serve(link, call, &mut worker.arguments);
             if !self.may_stay(link, turn) {
                 break;
             }
@@ -70,7 +65,8 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     fn may_stay(&self, link: &LinkCell, turn: Turn) -> bool {
-        let state = link.lock();
+        let mut state = link.lock();
+        state.reader.set_busy(turn, None);
         state.quick && state.reader.is_leader(turn) && self.idle.load(Ordering::Acquire) > 0 && !self.is_stopping()
     }
 
@@ -113,7 +109,12 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     fn end_stay(&self, link: &Arc<LinkCell>, turn: Turn) {
-        lock(&self.stays).retain(|id| *id != link.id);
+        let mut stays = lock(&self.stays);
+        // Another thread may stay on the same link since this one lost the lead.
+        if let Some(index) = stays.iter().position(|id| *id == link.id) {
+            stays.swap_remove(index);
+        }
+        drop(stays);
         self.leave(link, link.lock(), Some(turn));
     }
 
