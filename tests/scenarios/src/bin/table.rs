@@ -1,0 +1,7 @@
+//! Writes `docs/scenarios.md`.
+
+use cara_scenarios::table;
+
+fn main() -> std::io::Result<()> {
+    std::fs::write(table::path(), table::text())
+}

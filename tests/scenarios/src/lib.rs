@@ -1,0 +1,34 @@
+//! Every rule of CARA as a scenario: written once, run on the simulator and on Linux over loopback.
+//!
+//! A [`Scenario`] is a function of a [`World`]: it builds a fleet in a few lines, lets time pass, injects faults, and
+//! asserts what the rule says. `cargo test` runs each once on every port that can; the program `seeds` runs each for
+//! many seeds on the simulator with faults on; `table` writes `docs/scenarios.md`; `planted` shows that bugs are found.
+//!
+//! ```
+//! use cara_scenarios::{Spec, Service, ports, secs};
+//! let mut world = ports::simulator(1, cara_scenarios::Weather::Rough);
+//! let world = &mut *world;
+//! let manager = world.add(Spec::manager("manager", 1));
+//! world.add(Spec::agv("agv", 7).service(&Service::new("ping()")));
+//! world.wait("the AGV offers ping", || manager.knows("agv", "ping"), secs(20));
+//! ```
+
+mod measured;
+pub mod ports;
+mod rules;
+pub mod run;
+mod scenario;
+mod service;
+mod spec;
+pub mod suite;
+pub mod table;
+mod values;
+mod world;
+
+pub use measured::measurements;
+pub use rules::all;
+pub use scenario::{Need, Scenario, Weather};
+pub use service::{Asked, Diary, Service};
+pub use spec::{Spec, SpecRole};
+pub use values::{boxed, millis, number, numbers, position, secs, text, variable};
+pub use world::{Fault, Node, Pending, PendingAll, Port, Seen, Unit, Unsupported, World};

@@ -1,0 +1,506 @@
+//! Scenarios on sockets of this machine, over loopback.
+
+use std::collections::BTreeMap;
+use std::hash::{BuildHasher, Hasher, RandomState};
+use std::rc::Rc;
+use std::sync::mpsc::Receiver;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::thread;
+
+use cara_core::config::Constraints;
+use cara_core::counters::Counter;
+use cara_core::distribution::connection_handler::NodeCounter;
+use cara_core::distribution::function::Definition;
+use cara_core::distribution::identity::Identity;
+use cara_core::distribution::parameters::{Parameters, ParametersView};
+use cara_core::error::{Error, ServiceError};
+use cara_core::host::connections::LinkCounter;
+use cara_core::services::requests::CallId;
+use cara_core::services::unit::RequestOptions;
+use cara_core::time::{Duration, Instant};
+use cara_std::{
+    Call, Capacities, CommunicationSystem, Interfaces, LeaseWatch, MyFunctionList, Peer, ServiceOptions, Unit as SUnit,
+    UnitEvent,
+};
+
+use crate::run::Report;
+use crate::{
+    Asked, Fault, Need, Node, Pending, PendingAll, Port, Seen, Service, Spec, SpecRole, Unit, Unsupported, World, boxed,
+};
+
+/// How often a waiting scenario looks.
+const LOOK: std::time::Duration = std::time::Duration::from_millis(1);
+
+pub(super) struct LinuxWorld {
+    start: std::time::Instant,
+    fleet: u32,
+    units: Vec<Arc<LinuxNode>>,
+    report: Report,
+}
+
+enum Machine {
+    Manager(CommunicationSystem),
+    Agv(SUnit),
+}
+
+/// What threads share of a unit.
+struct LinuxNode {
+    start: std::time::Instant,
+    fleet: u32,
+    spec: Spec,
+    machine: Mutex<Option<Arc<Machine>>>,
+    receiver: Mutex<Option<Receiver<UnitEvent>>>,
+    events: Mutex<Vec<(Instant, Seen)>>,
+    losses: Arc<Mutex<Vec<Instant>>>,
+    leases: Mutex<BTreeMap<String, LeaseWatch>>,
+}
+
+struct Handle {
+    number: usize,
+    node: Arc<LinuxNode>,
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn since(start: std::time::Instant) -> Instant {
+    Instant::from_micros(start.elapsed().as_micros() as u64)
+}
+
+impl LinuxWorld {
+    pub(super) fn new() -> Self {
+        let fleet = RandomState::new().build_hasher().finish() as u32;
+        Self { start: std::time::Instant::now(), fleet, units: Vec::new(), report: Report::default() }
+    }
+}
+
+impl Drop for LinuxWorld {
+    fn drop(&mut self) {
+        for unit in &self.units {
+            unit.stop();
+        }
+    }
+}
+
+impl World for LinuxWorld {
+    fn port(&self) -> Port {
+        Port::Linux
+    }
+
+    fn now(&self) -> Instant {
+        since(self.start)
+    }
+
+    fn add(&mut self, spec: Spec) -> Unit {
+        let node = Arc::new(LinuxNode {
+            start: self.start,
+            fleet: self.fleet.wrapping_add(spec.fleet),
+            spec,
+            machine: Mutex::new(None),
+            receiver: Mutex::new(None),
+            events: Mutex::default(),
+            losses: Arc::default(),
+            leases: Mutex::default(),
+        });
+        node.start();
+        self.units.push(Arc::clone(&node));
+        Rc::new(Handle { number: self.units.len() - 1, node })
+    }
+
+    fn run_until(&mut self, condition: &dyn Fn() -> bool, limit: Duration) -> bool {
+        let end = self.now() + limit;
+        loop {
+            self.units.iter().for_each(|unit| unit.drain());
+            if condition() {
+                return true;
+            }
+            if self.now() >= end {
+                return false;
+            }
+            thread::sleep(LOOK);
+        }
+    }
+
+    fn inject(&mut self, fault: Fault<'_>) -> Result<(), Unsupported> {
+        Err(Unsupported(match fault {
+            Fault::PowerCut(_) | Fault::Kill(_) | Fault::Restart(_) => Need::Crash,
+            Fault::Cut(..) | Fault::CutOneWay(..) | Fault::Heal => Need::Partition,
+            Fault::FreezeStreams(..) | Fault::FreezeLink(..) => Need::Freeze,
+            Fault::Reset(_) => Need::Reset,
+            Fault::Path(..) => Need::Path,
+            Fault::ChangeAddress(_) => Need::AddressChange,
+            Fault::Suspend(..) => Need::Suspend,
+            Fault::OtherVersion(_) => Need::OtherVersion,
+        }))
+    }
+
+    fn random(&mut self, bound: u64) -> u64 {
+        RandomState::new().build_hasher().finish().checked_rem(bound).unwrap_or(0)
+    }
+
+    fn reached(&mut self, state: &'static str) {
+        *self.report.states.entry(state.to_owned()).or_default() += 1;
+    }
+
+    fn measured(&mut self, what: &'static str, span: Duration) {
+        self.report.measured.entry(what).or_default().push(span);
+    }
+
+    fn report(&self) -> Report {
+        self.report.clone()
+    }
+}
+
+impl LinuxNode {
+    fn now(&self) -> Instant {
+        since(self.start)
+    }
+
+    fn machine(&self) -> Result<Arc<Machine>, Error> {
+        lock(&self.machine).clone().ok_or(Error::NotRunning)
+    }
+
+    fn start(self: &Arc<Self>) {
+        let machine = Arc::new(self.build().expect("a unit can be made"));
+        let receiver = match &*machine {
+            Machine::Manager(system) => system.events(),
+            Machine::Agv(unit) => unit.events(),
+        };
+        *lock(&self.receiver) = Some(receiver);
+        *lock(&self.machine) = Some(Arc::clone(&machine));
+        for service in &self.spec.services {
+            self.add(service, false).expect("a unit has room for its services");
+        }
+        if self.spec.published {
+            machine.publish().expect("what was added can be published");
+        }
+        match &*machine {
+            Machine::Manager(system) => system.start(),
+            Machine::Agv(unit) => unit.start(),
+        }
+        .expect("a unit can be started");
+    }
+
+    fn build(&self) -> Result<Machine, Error> {
+        let Spec { role, name, id, constraints, their_functions, message_buffers, .. } = &self.spec;
+        let builder = match role {
+            SpecRole::Manager => CommunicationSystem::builder(name, *id)?,
+            SpecRole::Agv(manager, manager_id) => SUnit::builder(name, *id, manager, *manager_id)?,
+        };
+        let capacities = Capacities {
+            their_functions: *their_functions,
+            message_buffers: *message_buffers,
+            ..Capacities::default()
+        };
+        let builder = builder.fleet(self.fleet).constraints(*constraints).capacities(capacities);
+        let builder = builder.interfaces(Interfaces::Loopback);
+        if *role == SpecRole::Manager {
+            return builder.build_system().map(Machine::Manager);
+        }
+        let unit = builder.build_unit()?;
+        let (losses, start) = (Arc::clone(&self.losses), self.start);
+        unit.on_manager_lost(move |()| lock(&losses).push(since(start)));
+        Ok(Machine::Agv(unit))
+    }
+
+    fn stop(&self) {
+        let machine = lock(&self.machine).take();
+        match machine.as_deref() {
+            Some(Machine::Manager(system)) => system.stop(),
+            Some(Machine::Agv(unit)) => unit.stop(),
+            None => {}
+        }
+        self.drain();
+    }
+
+    fn drain(&self) {
+        let receiver = lock(&self.receiver);
+        let Some(receiver) = receiver.as_ref() else { return };
+        let now = self.now();
+        lock(&self.events).extend(receiver.try_iter().filter_map(|event| Some((now, seen(event)?))));
+    }
+
+    fn peer(&self, name: &str) -> Result<Peer, Error> {
+        let peers = self.machine()?.peers();
+        let named = peers.into_iter().filter(|peer| peer.name() == name);
+        named.max_by_key(Peer::is_connected).ok_or(Error::NotConnected)
+    }
+
+    fn add(self: &Arc<Self>, service: &Service, replace: bool) -> Result<(), Error> {
+        let definition = Definition::parse(&service.signature).map_err(|_| Error::BadName)?;
+        let diary = service.diary();
+        let start = self.start;
+        let mut options = ServiceOptions::new().priority(service.priority);
+        if let Some(length) = service.lease {
+            options = options.lease(length, move |()| diary.stop(since(start)));
+        }
+        let (kept, node) = (service.clone(), Arc::downgrade(self));
+        let handler = move |call: &Call, parameters: &mut ParametersView| serve(&kept, &node, call, parameters);
+        let machine = self.machine()?;
+        let list = machine.functions();
+        let watch = match (list, replace) {
+            (list, true) => list.replace(&definition, options, handler),
+            (list, false) => list.add_service(&definition, options, handler),
+        }?;
+        lock(&self.leases).insert(service.name().to_owned(), watch);
+        Ok(())
+    }
+}
+
+fn serve(
+    service: &Service,
+    node: &Weak<LinuxNode>,
+    call: &Call,
+    parameters: &mut ParametersView,
+) -> Result<(), ServiceError> {
+    let node = node.upgrade().ok_or(ServiceError::NotReady)?;
+    service.diary().begin(node.now());
+    if let Some(function) = &service.calls_back {
+        let peer = node.peer(call.caller.name()).map_err(|_| ServiceError::NotReady)?;
+        peer.block_request(function, parameters).map_err(|_| ServiceError::NotReady)?;
+    }
+    (service.body)(&Asked { caller: call.caller.clone(), at: node.now() }, parameters)?;
+    if service.takes > Duration::ZERO {
+        thread::sleep(service.takes.into());
+    }
+    service.diary().end(node.now());
+    Ok(())
+}
+
+impl Machine {
+    fn functions(&self) -> MyFunctionList<'_, ()> {
+        match self {
+            Self::Manager(system) => system.my_function_list(),
+            Self::Agv(unit) => unit.my_function_list(),
+        }
+    }
+
+    fn publish(&self) -> Result<(), Error> {
+        match self {
+            Self::Manager(system) => system.publish_my_function_list(),
+            Self::Agv(unit) => unit.publish_my_function_list(),
+        }
+    }
+
+    fn peers(&self) -> Vec<Peer> {
+        match self {
+            Self::Manager(system) => system.s_units().into_iter().chain(system.m_units()).collect(),
+            Self::Agv(unit) => unit.manager().into_iter().collect(),
+        }
+    }
+
+    fn node_counters(&self) -> Vec<(&'static str, u64)> {
+        match self {
+            Self::Manager(system) => system.counters(),
+            Self::Agv(unit) => unit.counters(),
+        }
+    }
+}
+
+fn value(counters: &[(&'static str, u64)], name: &str) -> u64 {
+    counters.iter().filter(|(known, _)| *known == name).map(|(_, count)| count).sum()
+}
+
+impl Handle {
+    fn connected(&self) -> Vec<Peer> {
+        let peers = self.node.machine().map(|machine| machine.peers()).unwrap_or_default();
+        peers.into_iter().filter(Peer::is_connected).collect()
+    }
+
+    /// The unit as an m_unit.
+    fn system(&self) -> Result<CommunicationSystem, Error> {
+        match &*self.node.machine()? {
+            Machine::Manager(system) => Ok(system.clone()),
+            Machine::Agv(_) => Err(Error::NotConnected),
+        }
+    }
+}
+
+impl Node for Handle {
+    fn identity(&self) -> Identity {
+        let Spec { role, name, id, .. } = &self.node.spec;
+        let identity = match role {
+            SpecRole::Manager => Identity::m_unit(name, *id),
+            SpecRole::Agv(..) => Identity::s_unit(name, *id),
+        };
+        identity.expect("a unit was made of it")
+    }
+
+    fn broadcast(&self) {
+        match self.node.machine().as_deref() {
+            Ok(Machine::Manager(system)) => system.broadcast(),
+            Ok(Machine::Agv(unit)) => unit.broadcast(),
+            Err(_) => {}
+        }
+    }
+
+    fn stop(&self) {
+        self.node.stop();
+    }
+
+    fn start(&self) {
+        self.node.start();
+    }
+
+    fn add_service(&self, service: &Service) -> Result<(), Error> {
+        self.node.add(service, false)
+    }
+
+    fn replace_service(&self, service: &Service) -> Result<(), Error> {
+        self.node.add(service, true)
+    }
+
+    fn remove_service(&self, name: &str) -> Result<(), Error> {
+        self.node.machine()?.functions().remove(name)
+    }
+
+    fn publish(&self) -> Result<(), Error> {
+        self.node.machine()?.publish()
+    }
+
+    fn publish_to(&self, peer: &str) -> Result<(), Error> {
+        self.node.peer(peer)?.publish_my_function_list()
+    }
+
+    fn begin_publish(&self) -> Pending<Vec<Identity>> {
+        let pending = Pending::new();
+        let (node, told) = (Arc::clone(&self.node), pending.share());
+        thread::spawn(move || {
+            let missing = match node.machine().as_deref() {
+                Ok(Machine::Manager(system)) => system.publish_and_wait(Duration::from_secs(10)),
+                Ok(Machine::Agv(unit)) => unit.publish_my_function_list().map(|()| Vec::new()),
+                Err(error) => Err(*error),
+            };
+            told.end(missing, node.now());
+        });
+        pending
+    }
+
+    fn my_function_list(&self) -> String {
+        self.node.machine().map(|machine| machine.functions().show_functions()).unwrap_or_default()
+    }
+
+    fn s_units(&self) -> Vec<(Identity, bool)> {
+        let peers = self.system().map(|system| system.s_units()).unwrap_or_default();
+        peers.iter().map(|peer| (peer.identity().clone(), peer.is_connected())).collect()
+    }
+
+    fn peers(&self) -> Vec<Identity> {
+        self.connected().iter().map(|peer| peer.identity().clone()).collect()
+    }
+
+    fn nodes_offering(&self, function: &str) -> Vec<Identity> {
+        let connected = self.connected().into_iter();
+        let offering = connected.filter(|peer| peer.their_function_list().contains(function));
+        offering.map(|peer| peer.identity().clone()).collect()
+    }
+
+    fn their_function_list(&self, peer: &str) -> String {
+        let list = self.node.peer(peer).map(|peer| peer.their_function_list()).unwrap_or_default();
+        list.show_functions().to_string()
+    }
+
+    fn request_with(
+        &self,
+        peer: &str,
+        function: &str,
+        parameters: &ParametersView,
+        options: RequestOptions,
+    ) -> Result<CallId, Error> {
+        self.node.peer(peer)?.request_with(function, parameters, &options)
+    }
+
+    fn request_all(&self, function: &str, parameters: &ParametersView) -> Vec<(Identity, Result<CallId, Error>)> {
+        let requested = self.system().map(|system| system.request_all(function, parameters)).unwrap_or_default();
+        requested.into_iter().map(|(peer, result)| (peer.identity().clone(), result)).collect()
+    }
+
+    fn begin(&self, peer: &str, function: &str, parameters: &ParametersView, options: RequestOptions) -> Pending {
+        let pending = Pending::new();
+        let (node, told, mut parameters) = (Arc::clone(&self.node), pending.share(), boxed(parameters));
+        let (peer, function) = (peer.to_owned(), function.to_owned());
+        thread::spawn(move || {
+            let asked = node.peer(&peer);
+            let result = asked.and_then(|peer| peer.block_request_with(&function, &mut parameters, &options));
+            told.end(result.map(|()| parameters), node.now());
+        });
+        pending
+    }
+
+    fn begin_all(&self, function: &str, parameters: &ParametersView) -> PendingAll {
+        let pending = Pending::new();
+        let (node, told, function) = (Arc::clone(&self.node), pending.share(), function.to_owned());
+        let mut copy = Parameters::<512>::sized();
+        copy.copy_from(parameters).expect("what is asked of all is short");
+        let system = self.system();
+        thread::spawn(move || {
+            let outcomes = system.map(|system| system.block_request_all(&function, &copy, &RequestOptions::default()));
+            let short = |(peer, outcome): (Peer, Result<_, Error>)| (peer.identity().clone(), outcome.map(drop));
+            told.end(outcomes.map(|outcomes| outcomes.into_iter().map(short).collect()), node.now());
+        });
+        pending
+    }
+
+    fn release(&self, peer: &str, function: &str) -> Result<(), Error> {
+        self.node.peer(peer)?.release(function)
+    }
+
+    fn end_lease(&self, function: &str) {
+        if let Ok(machine) = self.node.machine() {
+            machine.functions().end_lease(function);
+        }
+    }
+
+    fn lease_is_live(&self, function: &str) -> bool {
+        lock(&self.node.leases).get(function).is_some_and(LeaseWatch::is_live)
+    }
+
+    fn constraints(&self) -> Constraints {
+        match &*self.node.machine().expect("the unit runs") {
+            Machine::Manager(system) => system.constraints(),
+            Machine::Agv(unit) => unit.constraints(),
+        }
+    }
+
+    fn set_constraints(&self, constraints: Constraints) -> Result<(), Error> {
+        match &*self.node.machine()? {
+            Machine::Manager(system) => system.set_constraints(constraints),
+            Machine::Agv(unit) => unit.set_constraints(constraints),
+        }
+    }
+
+    fn counted(&self, counter: LinkCounter) -> u64 {
+        self.connected().iter().map(|peer| value(&peer.counters(), counter.name())).sum()
+    }
+
+    fn node_counted(&self, counter: NodeCounter) -> u64 {
+        self.node.machine().map_or(0, |machine| value(&machine.node_counters(), counter.name()))
+    }
+
+    fn events(&self) -> Vec<(Instant, Seen)> {
+        self.node.drain();
+        lock(&self.node.events).clone()
+    }
+
+    fn manager_losses(&self) -> Vec<Instant> {
+        lock(&self.node.losses).clone()
+    }
+
+    fn number(&self) -> usize {
+        self.number
+    }
+}
+
+fn seen(event: UnitEvent) -> Option<Seen> {
+    Some(match event {
+        UnitEvent::Joined { peer } => Seen::Joined(peer),
+        UnitEvent::Left { peer, reason } => Seen::Left(peer, reason),
+        UnitEvent::NotJoined { reason, .. } => Seen::NotJoined(reason),
+        UnitEvent::ListChanged { peer } => Seen::ListChanged(peer),
+        UnitEvent::RequestFailed { call, error, .. } => Seen::Failed(call, error),
+        UnitEvent::LeaseExpired { function, .. } => Seen::LeaseExpired(function),
+        UnitEvent::LeaseEnded { function, expired, .. } => Seen::LeaseEnded(function, expired),
+        UnitEvent::FunctionsSkipped { .. } => return None,
+    })
+}

@@ -1,0 +1,435 @@
+//! Scenarios on the virtual network.
+
+use std::cell::RefCell;
+use std::collections::BTreeMap;
+use std::net::Ipv4Addr;
+use std::rc::Rc;
+
+use cara_core::config::{Constraints, PLAIN_MAGIC, VERSION};
+use cara_core::counters::Counter;
+use cara_core::distribution::connection_handler::NodeCounter;
+use cara_core::distribution::identity::Identity;
+use cara_core::distribution::parameters::ParametersView;
+use cara_core::error::{Error, ServiceError};
+use cara_core::host::connections::LinkCounter;
+use cara_core::random::Random;
+use cara_core::services::requests::CallId;
+use cara_core::services::unit::RequestOptions;
+use cara_core::time::{Duration, Instant};
+use cara_sim::{Action, Chance, Crash, Direction, HostId, Path, UnitEvent, UnitHandle};
+
+use crate::run::Report;
+use crate::{
+    Asked, Fault, Node, Pending, PendingAll, Port, Seen, Service, Spec, SpecRole, Unit, Unsupported, Weather, World,
+    boxed, millis, secs,
+};
+
+/// How long the weather of a run lasts: longer than any run.
+const ALWAYS: Duration = Duration::from_secs(24 * 3_600);
+/// Short partitions per unit that joins a world with rough weather.
+const PARTITIONS: u64 = 2;
+
+pub(super) struct SimWorld {
+    world: cara_sim::World,
+    units: Vec<Rc<SimNode>>,
+    weather: Weather,
+    random: Random,
+    report: Report,
+}
+
+struct SimNode {
+    number: usize,
+    handle: UnitHandle,
+    losses: Rc<RefCell<Vec<Instant>>>,
+}
+
+impl SimWorld {
+    pub(super) fn new(seed: u64, weather: Weather) -> Self {
+        let world = cara_sim::World::new(seed);
+        let mut random = Random::new(seed ^ 0x005C_E7A2_105E_ED00);
+        if weather != Weather::Own {
+            let path = path(&mut random, weather);
+            world.network(|network| {
+                network.set_weather(path, ALWAYS);
+                network.split_reads(Chance::percent(random.below(40) as f64));
+            });
+        }
+        Self { world, units: Vec::new(), weather, random, report: Report::default() }
+    }
+
+    fn host(&self, unit: &Unit) -> HostId {
+        self.node(unit).handle.host()
+    }
+
+    fn node(&self, unit: &Unit) -> &SimNode {
+        &self.units[unit.number()]
+    }
+
+    /// Cuts a new unit off from all others, a few times and never long enough to be lost.
+    fn schedule_partitions(&mut self, host: HostId) {
+        let now = self.world.now();
+        for _ in 0..PARTITIONS {
+            let at = now + self.random.jitter(secs(4));
+            let span = millis(20) + self.random.jitter(millis(180));
+            self.world.network(|network| {
+                let second = network.hosts().filter(|other| *other != host).collect();
+                let cut = Action::Partition { first: vec![host], second, direction: Direction::Both, span };
+                network.schedule(at, cut);
+            });
+        }
+    }
+
+    fn counters(&self) -> BTreeMap<&'static str, u64> {
+        let mut sums = BTreeMap::new();
+        for unit in &self.units {
+            for counter in LinkCounter::ALL {
+                *sums.entry(counter.name()).or_default() += unit.handle.link_counter(*counter);
+            }
+            for counter in NodeCounter::ALL {
+                *sums.entry(counter.name()).or_default() += unit.handle.node_counter(*counter);
+            }
+        }
+        sums
+    }
+}
+
+fn path(random: &mut Random, weather: Weather) -> Path {
+    let mut percent = |limit: u64| random.below(limit * 100) as f64 / 100.0;
+    let loss = if weather == Weather::Rough { percent(2) } else { 0.0 };
+    let path = Path::LAN.loss_percent(loss).duplicate_percent(percent(4)).reorder_percent(percent(4));
+    path.delay(Duration::from_micros(250) + random.jitter(millis(5))).jitter(random.jitter(millis(5)))
+}
+
+impl World for SimWorld {
+    fn port(&self) -> Port {
+        Port::Simulator
+    }
+
+    fn now(&self) -> Instant {
+        self.world.now()
+    }
+
+    fn add(&mut self, spec: Spec) -> Unit {
+        let Spec { role, name, id, fleet, constraints, services, published, their_functions, message_buffers, .. } =
+            spec;
+        let new = match role {
+            SpecRole::Manager => self.world.m_unit(&name, id),
+            SpecRole::Agv(manager, manager_id) => self.world.s_unit(&name, id).joins(&manager, manager_id),
+        };
+        let new = if spec.same_seed { new.boot_seed(4) } else { new };
+        let new = new.fleet(fleet).constraints(constraints).functions(their_functions).message_buffers(message_buffers);
+        let program = move |unit: &UnitHandle| {
+            for service in &services {
+                unit.add_function(&service.signature, simulated(service)).expect("a unit has room for its services");
+            }
+            if published {
+                unit.publish().expect("what was added can be published");
+            }
+        };
+        let handle = new.program(program).start();
+        let losses = Rc::new(RefCell::new(Vec::new()));
+        let noted = Rc::clone(&losses);
+        handle.on_event(move |unit, event| {
+            if matches!(event, UnitEvent::Left { .. }) {
+                noted.borrow_mut().push(unit.now());
+            }
+        });
+        if self.weather == Weather::Rough {
+            self.schedule_partitions(handle.host());
+        }
+        let node = Rc::new(SimNode { number: self.units.len(), handle, losses });
+        self.units.push(Rc::clone(&node));
+        node
+    }
+
+    fn run_until(&mut self, condition: &dyn Fn() -> bool, limit: Duration) -> bool {
+        self.world.run_until(|_| condition(), limit)
+    }
+
+    fn inject(&mut self, fault: Fault<'_>) -> Result<(), Unsupported> {
+        match fault {
+            Fault::PowerCut(unit) => {
+                let handle = self.node(unit).handle.clone();
+                self.world.crash(&handle, Crash::PowerCut);
+            }
+            Fault::Kill(unit) => {
+                let handle = self.node(unit).handle.clone();
+                self.world.crash(&handle, Crash::Process);
+            }
+            Fault::Restart(unit) => {
+                let handle = self.node(unit).handle.clone();
+                self.world.restart(&handle);
+            }
+            Fault::Suspend(unit, span) => {
+                let host = self.host(unit);
+                self.world.network(|network| network.suspend(host, span));
+            }
+            Fault::OtherVersion(unit) => {
+                let to = self.node(unit).handle.address();
+                let from =
+                    self.units.iter().find(|other| other.number != unit.number()).map(|other| other.handle.host());
+                let mut datagram = [0; 32];
+                datagram[..4].copy_from_slice(&PLAIN_MAGIC);
+                datagram[4] = VERSION + 1;
+                let from = from.expect("somebody else sends it");
+                self.world.network(|network| network.send_to(from, to, &datagram));
+            }
+            fault => self.inject_into_network(fault),
+        }
+        Ok(())
+    }
+
+    fn random(&mut self, bound: u64) -> u64 {
+        self.random.below(bound)
+    }
+
+    fn reached(&mut self, state: &'static str) {
+        *self.report.states.entry(state.to_owned()).or_default() += 1;
+    }
+
+    fn measured(&mut self, what: &'static str, span: Duration) {
+        self.report.measured.entry(what).or_default().push(span);
+    }
+
+    fn report(&self) -> Report {
+        let mut report = self.report.clone();
+        for (name, count) in self.world.counts().iter().filter(|(_, count)| *count > 0) {
+            *report.faults.entry(name).or_default() += count;
+        }
+        for (name, count) in self.counters().into_iter().filter(|(_, count)| *count > 0) {
+            *report.states.entry(name.to_owned()).or_default() += count;
+        }
+        report
+    }
+}
+
+impl SimWorld {
+    fn inject_into_network(&mut self, fault: Fault<'_>) {
+        let host = |unit: &Unit| self.host(unit);
+        match fault {
+            Fault::Cut(one, other) => {
+                let (one, other) = (host(one), host(other));
+                self.world.network(|network| network.partition(&[one], &[other], Direction::Both));
+            }
+            Fault::CutOneWay(from, to) => {
+                let (from, to) = (host(from), host(to));
+                self.world.network(|network| network.partition(&[from], &[to], Direction::FirstToSecond));
+            }
+            Fault::Heal => self.world.network(|network| network.heal_all()),
+            Fault::FreezeStreams(from, to, span) => {
+                let action = Action::FreezeStreams { from: host(from), to: host(to), span };
+                self.world.network(|network| network.inject(action));
+            }
+            Fault::FreezeLink(from, to, span) => {
+                let (from, to) = (host(from), host(to));
+                self.world.network(|network| network.freeze_link(from, to, span));
+            }
+            Fault::Reset(unit) => {
+                let action = Action::ResetStreams { host: host(unit) };
+                self.world.network(|network| network.inject(action));
+            }
+            Fault::Path(one, other, path) => {
+                let (one, other) = (host(one), host(other));
+                self.world.network(|network| network.set_paths_between(one, other, path));
+            }
+            Fault::ChangeAddress(unit) => {
+                let host = host(unit);
+                self.world.network(|network| network.change_address(host, Ipv4Addr::new(10, 77, 0, 7)));
+            }
+            _ => unreachable!("the rest is done by the world"),
+        }
+    }
+}
+
+/// A service of the scenario as the simulator runs it.
+fn simulated(service: &Service) -> cara_sim::Service {
+    let diary = service.diary();
+    let kept = service.clone();
+    let plain = service.takes == Duration::ZERO && service.calls_back.is_none();
+    let made = if plain {
+        cara_sim::Service::new(move |call, parameters| {
+            kept.diary().begin(call.unit.now());
+            let result = (kept.body)(&Asked { caller: call.caller.clone(), at: call.unit.now() }, parameters);
+            kept.diary().end(call.unit.now());
+            result
+        })
+        .survives_panics()
+    } else {
+        let kept = Rc::new(kept);
+        cara_sim::Service::future(move |call, mut parameters| {
+            let kept = Rc::clone(&kept);
+            async move {
+                kept.diary().begin(call.unit.now());
+                if let Some(function) = &kept.calls_back {
+                    let called = call.unit.block_request(&call.caller, function, &mut parameters).await;
+                    called.map_err(|_| ServiceError::NotReady)?;
+                }
+                (kept.body)(&Asked { caller: call.caller.clone(), at: call.unit.now() }, &mut parameters)?;
+                call.unit.sleep(kept.takes).await;
+                kept.diary().end(call.unit.now());
+                Ok(parameters)
+            }
+        })
+    };
+    let made = made.priority(service.priority);
+    let made = if service.detached { made.detached() } else { made };
+    match service.lease {
+        Some(length) => made.lease(length).on_lease_end(move |unit| diary.stop(unit.now())),
+        None => made,
+    }
+}
+
+impl Node for SimNode {
+    fn identity(&self) -> Identity {
+        self.handle.identity()
+    }
+
+    fn broadcast(&self) {
+        let _ = self.handle.broadcast();
+    }
+
+    fn stop(&self) {
+        self.handle.stop();
+    }
+
+    fn start(&self) {
+        self.handle.start();
+    }
+
+    fn add_service(&self, service: &Service) -> Result<(), Error> {
+        self.handle.add_function(&service.signature, simulated(service))
+    }
+
+    fn replace_service(&self, service: &Service) -> Result<(), Error> {
+        self.handle.replace_function(&service.signature, simulated(service))
+    }
+
+    fn remove_service(&self, name: &str) -> Result<(), Error> {
+        self.handle.remove_function(name)
+    }
+
+    fn publish(&self) -> Result<(), Error> {
+        self.handle.publish()
+    }
+
+    fn publish_to(&self, peer: &str) -> Result<(), Error> {
+        self.handle.publish_to(peer)
+    }
+
+    fn begin_publish(&self) -> Pending<Vec<Identity>> {
+        let pending = Pending::new();
+        let (unit, told) = (self.handle.clone(), pending.share());
+        self.handle.spawn(async move { told.end(unit.publish_and_wait().await, unit.now()) });
+        pending
+    }
+
+    fn my_function_list(&self) -> String {
+        self.handle.my_function_list()
+    }
+
+    fn s_units(&self) -> Vec<(Identity, bool)> {
+        self.handle.s_units_ever()
+    }
+
+    fn peers(&self) -> Vec<Identity> {
+        self.handle.peers()
+    }
+
+    fn nodes_offering(&self, function: &str) -> Vec<Identity> {
+        self.handle.nodes_offering(function)
+    }
+
+    fn their_function_list(&self, peer: &str) -> String {
+        self.handle.their_function_list(peer).unwrap_or_default()
+    }
+
+    fn request_with(
+        &self,
+        peer: &str,
+        function: &str,
+        parameters: &ParametersView,
+        options: RequestOptions,
+    ) -> Result<CallId, Error> {
+        self.handle.request_with(peer, function, parameters, options)
+    }
+
+    fn request_all(&self, function: &str, parameters: &ParametersView) -> Vec<(Identity, Result<CallId, Error>)> {
+        self.handle.request_all(function, parameters)
+    }
+
+    fn begin(&self, peer: &str, function: &str, parameters: &ParametersView, options: RequestOptions) -> Pending {
+        let pending = Pending::new();
+        let (unit, told, mut parameters) = (self.handle.clone(), pending.share(), boxed(parameters));
+        let (peer, function) = (peer.to_owned(), function.to_owned());
+        self.handle.spawn(async move {
+            let result = unit.block_request_with(peer.as_str(), &function, &mut parameters, options).await;
+            told.end(result.map(|()| parameters), unit.now());
+        });
+        pending
+    }
+
+    fn begin_all(&self, function: &str, parameters: &ParametersView) -> PendingAll {
+        let pending = Pending::new();
+        let (unit, told, parameters) = (self.handle.clone(), pending.share(), boxed(parameters));
+        let function = function.to_owned();
+        self.handle.spawn(async move {
+            let outcomes = unit.block_request_all(&function, &parameters).await;
+            let outcomes = outcomes.into_iter().map(|(peer, outcome)| (peer, outcome.map(drop))).collect();
+            told.end(Ok(outcomes), unit.now());
+        });
+        pending
+    }
+
+    fn release(&self, peer: &str, function: &str) -> Result<(), Error> {
+        self.handle.release(peer, function)
+    }
+
+    fn end_lease(&self, function: &str) {
+        let _ = self.handle.end_lease(function);
+    }
+
+    fn lease_is_live(&self, function: &str) -> bool {
+        self.handle.lease_is_live(function)
+    }
+
+    fn constraints(&self) -> Constraints {
+        self.handle.constraints().expect("the unit runs")
+    }
+
+    fn set_constraints(&self, constraints: Constraints) -> Result<(), Error> {
+        self.handle.set_constraints(constraints)
+    }
+
+    fn counted(&self, counter: LinkCounter) -> u64 {
+        self.handle.link_counter(counter)
+    }
+
+    fn node_counted(&self, counter: NodeCounter) -> u64 {
+        self.handle.node_counter(counter)
+    }
+
+    fn events(&self) -> Vec<(Instant, Seen)> {
+        self.handle.log().into_iter().filter_map(|(at, event)| Some((at, seen(event)?))).collect()
+    }
+
+    fn manager_losses(&self) -> Vec<Instant> {
+        self.losses.borrow().clone()
+    }
+
+    fn number(&self) -> usize {
+        self.number
+    }
+}
+
+fn seen(event: UnitEvent) -> Option<Seen> {
+    Some(match event {
+        UnitEvent::Joined { peer } => Seen::Joined(peer),
+        UnitEvent::Left { peer, reason } => Seen::Left(peer, reason),
+        UnitEvent::LinkEnded { reason } => Seen::NotJoined(reason),
+        UnitEvent::ListChanged { peer } => Seen::ListChanged(peer),
+        UnitEvent::Failed { id, error, .. } => Seen::Failed(id, error),
+        UnitEvent::LeaseExpired { function } => Seen::LeaseExpired(function),
+        UnitEvent::LeaseEnded { function, expired, .. } => Seen::LeaseEnded(function, expired),
+        UnitEvent::Started | UnitEvent::Stopped | UnitEvent::Called { .. } => return None,
+    })
+}

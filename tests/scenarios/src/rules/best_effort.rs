@@ -1,0 +1,52 @@
+//! Telemetry: now or never.
+
+use cara_core::error::Error;
+use cara_core::services::unit::{Delivery, RequestOptions};
+use cara_sim::Path;
+
+use super::pair;
+use crate::scenario::scenarios;
+use crate::{Fault, Service, World, millis, number, secs, text};
+
+scenarios![
+    best_effort_loses_without_blocking: "delivery", Own, [Path], ["loss", "lost some"];
+    best_effort_arrives_in_one_datagram: "delivery, 3", Rough, [], ["DatagramsReceived"];
+    best_effort_is_for_short_messages_without_a_reply: "delivery", Rough, [], ["RequestsWithheld"];
+];
+
+const BEST_EFFORT: RequestOptions =
+    RequestOptions { timeout: None, priority: None, delivery: Delivery::BestEffort, renew_lease: true };
+
+fn best_effort_loses_without_blocking(world: &mut dyn World) {
+    let service = Service::numbered("telemetry");
+    let (manager, agv) = pair(world, &service);
+    world.fault(Fault::Path(&manager, &agv, Path::LAN.loss_percent(40.0)));
+    for n in 0..100 {
+        manager.request_with("agv", "telemetry", &number("n", n), BEST_EFFORT).expect("it is accepted at once");
+        world.run_for(millis(1));
+    }
+    world.run_for(millis(200));
+    let runs = service.diary().runs();
+    assert!((20..100).contains(&runs), "{runs} of 100");
+    assert!(service.diary().values().windows(2).all(|pair| pair[0] < pair[1]), "nothing comes again later");
+    world.reached("lost some");
+}
+
+fn best_effort_arrives_in_one_datagram(world: &mut dyn World) {
+    let service = Service::numbered("telemetry");
+    let (manager, _agv) = pair(world, &service);
+    for n in 0..20 {
+        manager.request_with("agv", "telemetry", &number("n", n), BEST_EFFORT).expect("it is accepted");
+        world.run_for(millis(5));
+    }
+    world.wait("most of it arrives", || service.diary().runs() >= 5, secs(10));
+}
+
+fn best_effort_is_for_short_messages_without_a_reply(world: &mut dyn World) {
+    let service = Service::new("store(text: string[3000])");
+    let (manager, agv) = pair(world, &service);
+    let asked = world.ask_with(&manager, "agv", "store", &mut text(10), BEST_EFFORT);
+    assert_eq!(asked, Err(Error::BadConstraint));
+    assert!(matches!(manager.request_with("agv", "store", &text(2_000), BEST_EFFORT), Err(Error::TooLarge { .. })));
+    drop(agv);
+}

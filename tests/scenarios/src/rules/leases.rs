@@ -1,0 +1,142 @@
+//! A vehicle does only what its manager still wants.
+
+use cara_core::services::unit::RequestOptions;
+use cara_core::time::Duration;
+
+use super::{met, pair};
+use crate::scenario::scenarios;
+use crate::{Fault, Seen, Service, Spec, Unit, World, millis, number, secs};
+
+scenarios![
+    a_lease_lives_while_it_is_renewed: "lease of a service", Light, [], ["RequestsRun"];
+    motion_ends_when_the_manager_loses_power: "lease of a service, 29", Light, [Crash, ExactTime],
+        ["power-cut", "LeasesExpired"];
+    motion_ends_when_the_path_is_cut: "lease of a service", Light, [Partition, ExactTime],
+        ["partition", "LeasesExpired"];
+    motion_ends_when_the_link_freezes: "lease of a service", Light, [Freeze, ExactTime], ["freeze", "LeasesExpired"];
+    motion_ends_when_the_manager_stops: "lease of a service", Rough, [], ["stopped"];
+    without_a_lease_motion_goes_on: "lease of a service (lease removed)", Rough, [], ["went on"];
+    a_lease_that_is_not_renewed_ends: "lease of a service", Light, [], ["LeasesExpired"];
+    a_released_lease_stops_at_once: "lease of a service", Rough, [], ["stopped"];
+    what_is_finished_needs_no_safe_hook: "lease of a service", Rough, [], ["finished"];
+];
+
+/// The lease in this file.
+const LEASE: Duration = Duration::from_millis(400);
+/// What may come on top of the lease: one poll, in virtual time nothing.
+const SLACK: Duration = Duration::from_millis(1);
+
+/// An AGV that drives because its manager wants it.
+fn driving(world: &mut dyn World) -> (Service, Unit, Unit) {
+    let service = Service::new("drive(n: int[1])").lease(LEASE);
+    let (manager, agv) = pair(world, &service);
+    assert_eq!(world.ask(&manager, "agv", "drive", &mut number("n", 1)), Ok(()));
+    assert!(agv.lease_is_live("drive"));
+    (service, manager, agv)
+}
+
+fn a_lease_lives_while_it_is_renewed(world: &mut dyn World) {
+    let (service, manager, agv) = driving(world);
+    for _ in 0..15 {
+        world.run_for(millis(100));
+        assert!(agv.lease_is_live("drive"));
+    }
+    assert_eq!(service.diary().stops(), []);
+    drop(manager);
+}
+
+/// Injects a fault at a random instant and measures the time until the safe hook; nothing may start again.
+fn ends(world: &mut dyn World, what: &'static str, fault: impl Fn(&mut dyn World, &Unit, &Unit)) {
+    let (service, manager, agv) = driving(world);
+    let calm = millis(500) + Duration::from_micros(world.random(1_000_000));
+    world.run_for(calm);
+    let start = world.now();
+    fault(world, &manager, &agv);
+    let diary = service.diary();
+    world.wait("the safe hook runs", || !diary.stops().is_empty(), secs(20));
+    let took = diary.stops()[0].since(start);
+    assert!(took <= LEASE + SLACK, "{} us after the fault", took.as_micros());
+    assert!(!agv.lease_is_live("drive"));
+    world.measured(what, took);
+    world.run_for(secs(20));
+    assert_eq!((diary.runs(), diary.stops().len()), (1, 1), "nothing moves again by itself");
+    assert_eq!(agv.count(|event| matches!(event, Seen::LeaseExpired(_))), 1);
+    assert!(!agv.lease_is_live("drive"));
+}
+
+fn motion_ends_when_the_manager_loses_power(world: &mut dyn World) {
+    ends(world, "power cut of the manager to safe hook", |world, manager, _| {
+        world.fault(Fault::PowerCut(manager));
+    });
+}
+
+fn motion_ends_when_the_path_is_cut(world: &mut dyn World) {
+    ends(world, "cut path to safe hook", |world, manager, agv| world.fault(Fault::Cut(manager, agv)));
+}
+
+fn motion_ends_when_the_link_freezes(world: &mut dyn World) {
+    // What was held arrives at once after the thaw, old renewals and commands among it.
+    ends(world, "frozen link to safe hook", |world, manager, agv| {
+        world.fault(Fault::FreezeLink(manager, agv, secs(8)));
+        manager.request("agv", "drive", &number("n", 2)).expect("it is accepted");
+    });
+}
+
+fn motion_ends_when_the_manager_stops(world: &mut dyn World) {
+    let (service, manager, agv) = driving(world);
+    manager.stop();
+    world.wait("the safe hook runs", || service.diary().stops().len() == 1, secs(10));
+    assert!(!agv.lease_is_live("drive"));
+    world.run_for(millis(500));
+    assert_eq!(service.diary().stops().len(), 1);
+    world.reached("stopped");
+}
+
+fn without_a_lease_motion_goes_on(world: &mut dyn World) {
+    let service = Service::new("drive(n: int[1])");
+    let (manager, _agv) = pair(world, &service);
+    assert_eq!(world.ask(&manager, "agv", "drive", &mut number("n", 1)), Ok(()));
+    manager.stop();
+    world.run_for(LEASE.times(4));
+    assert_eq!(service.diary().stops(), [], "nobody stops it");
+    world.reached("went on");
+}
+
+fn a_lease_that_is_not_renewed_ends(world: &mut dyn World) {
+    let service = Service::new("drive(n: int[1])").lease(LEASE);
+    let (manager, agv) = pair(world, &service);
+    let options = RequestOptions { renew_lease: false, timeout: Some(secs(10)), ..RequestOptions::default() };
+    assert_eq!(world.ask_with(&manager, "agv", "drive", &mut number("n", 1), options), Ok(()));
+    world.wait("the safe hook runs", || service.diary().stops().len() == 1, secs(10));
+    assert!(!agv.lease_is_live("drive"));
+    let took = service.diary().stops()[0].since(service.diary().began()[0]);
+    assert!(took <= LEASE + millis(if world.is_virtual() { 1 } else { 200 }), "{} ms", took.as_millis());
+    let expired = || manager.count(|event| *event == Seen::LeaseEnded("drive".to_owned(), true));
+    // The caller holds no lease, so the news of its end is not its matter.
+    world.run_for(millis(200));
+    assert_eq!(expired(), 0);
+}
+
+fn a_released_lease_stops_at_once(world: &mut dyn World) {
+    let (service, manager, agv) = driving(world);
+    manager.release("agv", "drive").expect("it is held");
+    world.wait("the safe hook runs", || service.diary().stops().len() == 1, secs(10));
+    assert!(!agv.lease_is_live("drive"));
+    world.reached("stopped");
+}
+
+fn what_is_finished_needs_no_safe_hook(world: &mut dyn World) {
+    let service = Service::new("drive(n: int[1])").lease(LEASE);
+    let manager = world.add(Spec::manager("manager", 1));
+    let agv = world.add(Spec::agv("agv", 7).service(&service));
+    met(world, &manager, "agv", "drive");
+    assert_eq!(world.ask(&manager, "agv", "drive", &mut number("n", 1)), Ok(()));
+    agv.end_lease("drive");
+    assert!(!agv.lease_is_live("drive"));
+    let finished = |event: &Seen| *event == Seen::LeaseEnded("drive".to_owned(), false);
+    world.wait("the caller is told", || manager.count(finished) == 1, secs(10));
+    world.run_for(LEASE.times(3));
+    if service.diary().stops().is_empty() {
+        world.reached("finished");
+    }
+}

@@ -1,0 +1,118 @@
+//! Who connects to whom.
+
+use cara_core::distribution::connection_handler::NodeCounter;
+use cara_core::error::{CloseReason, Refusal};
+
+use super::met;
+use crate::scenario::scenarios;
+use crate::{Fault, Seen, Service, Spec, World, millis, number, secs};
+
+scenarios![
+    an_index_keeps_its_meaning_when_another_node_leaves: "47", Rough, [], ["agv came back"];
+    an_agv_joins_its_own_manager_only: "23", Rough, [], ["WrongManager"];
+    different_fleets_do_not_meet: "fleet", Rough, [], ["DatagramFleet"];
+    another_version_is_counted: "version", Rough, [OtherVersion], ["DatagramVersion"];
+    the_maximum_of_nodes_refuses_the_next: "51", Rough, [], ["RefusedFull"];
+    two_m_units_meet_and_call_both_ways: "18, 20", Rough, [], ["Dialled"];
+    an_m_unit_has_m_units_and_s_units: "16–17, 19", Rough, [], ["Joined"];
+    an_agv_finds_its_manager_at_a_new_address: "address change", Rough, [AddressChange], ["address-change"];
+];
+
+fn an_index_keeps_its_meaning_when_another_node_leaves(world: &mut dyn World) {
+    let manager = world.add(Spec::manager("manager", 1));
+    let mut agvs = Vec::new();
+    for (name, id) in [("one", 30), ("two", 20), ("three", 10)] {
+        agvs.push(world.add(Spec::agv(name, id)));
+        world.wait("it has joined", || manager.is_connected(name), secs(40));
+    }
+    let names = || manager.s_units().iter().map(|(identity, _)| identity.name().to_owned()).collect::<Vec<_>>();
+    assert_eq!(names(), ["one", "two", "three"]);
+    agvs[1].stop();
+    world.wait("two has left", || manager.number_of_s_units() == 2, secs(10));
+    assert_eq!(names(), ["one", "two", "three"]);
+    assert!(manager.s_units()[0].1 && !manager.s_units()[1].1 && manager.s_units()[2].1);
+    agvs[1].start();
+    world.wait("two is back", || manager.number_of_s_units() == 3, secs(40));
+    world.reached("agv came back");
+    assert_eq!(names(), ["one", "two", "three"]);
+}
+
+fn an_agv_joins_its_own_manager_only(world: &mut dyn World) {
+    let other_id = world.add(Spec::manager("manager", 2));
+    let other_name = world.add(Spec::manager("boss", 1));
+    let agv = world.add(Spec::agv("agv", 7));
+    world.run_for(millis(1_500));
+    assert!(agv.peers().is_empty() && other_id.number_of_s_units() + other_name.number_of_s_units() == 0);
+    let own = world.add(Spec::manager("manager", 1));
+    world.wait("it has joined its own", || own.number_of_s_units() == 1 && !agv.peers().is_empty(), secs(40));
+    assert_eq!(other_id.number_of_s_units() + other_name.number_of_s_units(), 0);
+    assert_eq!(agv.peers(), [own.identity()]);
+}
+
+fn different_fleets_do_not_meet(world: &mut dyn World) {
+    let here = world.add(Spec::manager("manager", 1));
+    let there = world.add(Spec::manager("manager", 1).fleet(1));
+    let agv = world.add(Spec::agv("agv", 7).fleet(1));
+    world.wait("the fleet of the two meets", || there.number_of_s_units() == 1 && !agv.peers().is_empty(), secs(40));
+    here.broadcast();
+    world.run_for(millis(500));
+    assert_eq!((here.peers(), agv.peers()), (vec![], vec![there.identity()]));
+}
+
+fn another_version_is_counted(world: &mut dyn World) {
+    let service = Service::numbered("note");
+    let (manager, _agv) = super::pair(world, &service);
+    let counted = || manager.node_counted(NodeCounter::DatagramVersion);
+    for _ in 0..100 {
+        world.fault(Fault::OtherVersion(&manager));
+        if world.run_until(&|| counted() > 0, millis(50)) {
+            break;
+        }
+    }
+    assert!(counted() > 0);
+    assert_eq!(world.ask(&manager, "agv", "note", &mut number("n", 1)), Ok(()));
+}
+
+fn the_maximum_of_nodes_refuses_the_next(world: &mut dyn World) {
+    let manager = world.add(Spec::manager("manager", 1).limits(|limits| limits.maximum_nodes = 2));
+    let _agvs = [world.add(Spec::agv("one", 1)), world.add(Spec::agv("two", 2))];
+    world.wait("two have joined", || manager.number_of_s_units() == 2, secs(40));
+    let third = world.add(Spec::agv("three", 3));
+    let full = Seen::NotJoined(CloseReason::Refused(Refusal::Full));
+    world.wait("the third is told", || third.count(|event| *event == full) > 0, secs(40));
+    assert_eq!(manager.number_of_s_units(), 2);
+    manager.change(|limits| limits.maximum_nodes = 3);
+    world.wait("the third joins", || manager.number_of_s_units() == 3, secs(60));
+}
+
+fn two_m_units_meet_and_call_both_ways(world: &mut dyn World) {
+    let service = Service::numbered("note");
+    let smaller = world.add(Spec::manager("a", 1).service(&service));
+    let larger = world.add(Spec::manager("b", 2).service(&service));
+    met(world, &smaller, "b", "note");
+    met(world, &larger, "a", "note");
+    assert_eq!(world.ask(&smaller, "b", "note", &mut number("n", 1)), Ok(()));
+    assert_eq!(world.ask(&larger, "a", "note", &mut number("n", 2)), Ok(()));
+    assert_eq!(service.diary().values(), [1, 2]);
+    assert!(smaller.node_counted(NodeCounter::Dialled) > 0);
+    assert_eq!(larger.node_counted(NodeCounter::Dialled), 0, "the smaller identity dials");
+}
+
+fn an_m_unit_has_m_units_and_s_units(world: &mut dyn World) {
+    let service = Service::numbered("note");
+    let manager = world.add(Spec::manager("manager", 1));
+    world.add(Spec::manager("station", 2).service(&service));
+    let agv = world.add(Spec::agv("agv", 7).service(&service));
+    world.wait("it knows both", || manager.nodes_offering("note").len() == 2, secs(40));
+    world.wait("it is known", || !agv.peers().is_empty(), secs(10));
+    assert_eq!(manager.number_of_s_units(), 1);
+    assert_eq!(agv.peers(), [manager.identity()], "an s_unit has exactly one peer");
+}
+
+fn an_agv_finds_its_manager_at_a_new_address(world: &mut dyn World) {
+    let (manager, agv) = super::pair(world, &Service::numbered("note"));
+    world.fault(Fault::ChangeAddress(&manager));
+    world.wait("the loss is seen", || !agv.is_connected("manager") && !manager.is_connected("agv"), secs(30));
+    met(world, &manager, "agv", "note");
+    assert_eq!(world.ask(&manager, "agv", "note", &mut number("n", 1)), Ok(()));
+}

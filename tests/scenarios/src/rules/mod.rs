@@ -1,0 +1,79 @@
+//! The rules, one file each.
+
+mod age;
+mod at_most_once;
+mod best_effort;
+mod deadlines;
+mod emergency;
+mod everybody;
+mod fleets;
+mod identity;
+mod interval;
+mod leases;
+mod limits;
+mod links;
+mod listing;
+mod membership;
+mod message_size;
+mod priorities;
+mod publishing;
+mod slow;
+
+use std::sync::{Arc, Mutex};
+
+use cara_core::error::ServiceError;
+
+use crate::{Scenario, Service, Spec, Unit, World, secs};
+
+/// Every scenario.
+pub fn all() -> Vec<Scenario> {
+    [
+        listing::SCENARIOS,
+        publishing::SCENARIOS,
+        membership::SCENARIOS,
+        identity::SCENARIOS,
+        fleets::SCENARIOS,
+        deadlines::SCENARIOS,
+        interval::SCENARIOS,
+        message_size::SCENARIOS,
+        limits::SCENARIOS,
+        at_most_once::SCENARIOS,
+        age::SCENARIOS,
+        leases::SCENARIOS,
+        links::SCENARIOS,
+        priorities::SCENARIOS,
+        emergency::SCENARIOS,
+        best_effort::SCENARIOS,
+        slow::SCENARIOS,
+        everybody::SCENARIOS,
+    ]
+    .concat()
+}
+
+/// The listing's services: `pos_info` tells the position that `go_to` sets.
+fn paper_services() -> (Service, Service) {
+    let position = Arc::new(Mutex::new([3_i64, 4]));
+    let told = Arc::clone(&position);
+    let pos_info = Service::new("pos_info(position: int[2]) -> (position: int[2])").does(move |_, parameters| {
+        let value = *told.lock().map_err(|_| ServiceError::Panicked)?;
+        parameters.set_value("position", value).map_err(|_| ServiceError::BadResults)
+    });
+    let go_to = Service::new("go_to(position: int[2])").does(move |_, parameters| {
+        let mut position = position.lock().map_err(|_| ServiceError::Panicked)?;
+        parameters.variable_into("position", &mut *position).map_err(|_| ServiceError::BadResults)
+    });
+    (pos_info, go_to)
+}
+
+/// A manager, and an AGV with one service that the manager knows.
+fn pair(world: &mut dyn World, service: &Service) -> (Unit, Unit) {
+    let manager = world.add(Spec::manager("manager", 1));
+    let agv = world.add(Spec::agv("agv", 7).service(service));
+    met(world, &manager, "agv", service.name());
+    (manager, agv)
+}
+
+/// Waits until `unit` knows a function of `peer`.
+fn met(world: &mut dyn World, unit: &Unit, peer: &str, function: &str) {
+    world.wait("the two have met", || unit.knows(peer, function), secs(40));
+}

@@ -1,0 +1,120 @@
+//! A handler that takes long delays nobody else.
+
+use cara_core::services::unit::RequestOptions;
+
+use super::{met, pair};
+use crate::scenario::scenarios;
+use crate::{Seen, Service, Spec, World, millis, number, secs};
+
+scenarios![
+    a_slow_handler_delays_no_other_peer: "handlers run outside", Light, [], ["RequestsRun"];
+    a_slow_handler_delays_no_keep_alive: "handlers run outside", Rough, [LongTime], ["DatagramsReceived"];
+    a_detached_service_does_not_block_the_next_call: "ticket", Light, [Detached], ["detached"];
+    without_detaching_the_next_call_waits: "ticket (ticket removed)", Light, [], ["waited"];
+    a_service_calls_its_caller_back: "handlers run outside", Rough, [], ["RequestsRun"];
+    two_peers_call_each_other_at_the_same_time: "handlers run outside, 6", Rough, [], ["RequestsRun"];
+    many_callers_share_one_link: "6", Rough, [], ["RequestsRun"];
+];
+
+const PATIENT: RequestOptions = RequestOptions {
+    timeout: Some(secs(30)),
+    priority: None,
+    delivery: cara_core::services::unit::Delivery::Reliable,
+    renew_lease: true,
+};
+
+fn a_slow_handler_delays_no_other_peer(world: &mut dyn World) {
+    let slow = Service::numbered("slow").takes(secs(1));
+    let quick = Service::numbered("quick");
+    let manager = world.add(Spec::manager("manager", 1));
+    world.add(Spec::agv("one", 1).service(&slow));
+    world.add(Spec::agv("two", 2).service(&quick));
+    met(world, &manager, "one", "slow");
+    met(world, &manager, "two", "quick");
+    let long = manager.begin("one", "slow", &number("n", 1), PATIENT);
+    world.wait("it runs", || slow.diary().runs() == 1, secs(10));
+    let start = world.now();
+    assert_eq!(world.ask(&manager, "two", "quick", &mut number("n", 1)), Ok(()));
+    assert!(world.now().since(start) < millis(500) && !long.is_over());
+    assert!(world.finish(&long).is_ok());
+}
+
+fn a_slow_handler_delays_no_keep_alive(world: &mut dyn World) {
+    let (manager, agv) = pair(world, &Service::numbered("slow").takes(secs(20)));
+    assert_eq!(world.ask_with(&manager, "agv", "slow", &mut number("n", 1), PATIENT), Ok(()));
+    let left = |event: &Seen| matches!(event, Seen::Left(..));
+    assert_eq!((manager.count(left), agv.count(left)), (0, 0));
+}
+
+/// A quick call of the same class behind one that takes long; whether it was answered before.
+fn overtakes(world: &mut dyn World, slow: Service) -> bool {
+    let manager = world.add(Spec::manager("manager", 1));
+    let quick = Service::numbered("quick");
+    world.add(Spec::agv("agv", 7).service(&slow).service(&quick));
+    met(world, &manager, "agv", "slow");
+    met(world, &manager, "agv", "quick");
+    let long = manager.begin("agv", "slow", &number("n", 1), PATIENT);
+    world.wait("it runs", || slow.diary().runs() == 1, secs(10));
+    assert_eq!(world.ask(&manager, "agv", "quick", &mut number("n", 1)), Ok(()));
+    let overtook = quick.diary().began()[0] < *slow.diary().ended().first().unwrap_or(&world.now());
+    assert!(world.finish(&long).is_ok());
+    overtook
+}
+
+fn a_detached_service_does_not_block_the_next_call(world: &mut dyn World) {
+    assert!(overtakes(world, Service::numbered("slow").takes(millis(500)).detached()));
+    world.reached("detached");
+}
+
+fn without_detaching_the_next_call_waits(world: &mut dyn World) {
+    assert!(!overtakes(world, Service::numbered("slow").takes(millis(500))));
+    world.reached("waited");
+}
+
+fn a_service_calls_its_caller_back(world: &mut dyn World) {
+    let order = Service::numbered("order");
+    let fetch = Service::numbered("fetch").calls_back("order");
+    let manager = world.add(Spec::manager("manager", 1).service(&order));
+    let agv = world.add(Spec::agv("agv", 7).service(&fetch));
+    met(world, &manager, "agv", "fetch");
+    met(world, &agv, "manager", "order");
+    for n in 0..5 {
+        assert_eq!(world.ask(&manager, "agv", "fetch", &mut number("n", n)), Ok(()));
+    }
+    assert_eq!((order.diary().runs(), fetch.diary().runs()), (5, 5));
+}
+
+fn two_peers_call_each_other_at_the_same_time(world: &mut dyn World) {
+    let (one, two) = (Service::numbered("one"), Service::numbered("two"));
+    let manager = world.add(Spec::manager("manager", 1).service(&one));
+    let agv = world.add(Spec::agv("agv", 7).service(&two));
+    met(world, &manager, "agv", "two");
+    met(world, &agv, "manager", "one");
+    for n in 0..20 {
+        let calls = [
+            manager.begin("agv", "two", &number("n", n), PATIENT),
+            agv.begin("manager", "one", &number("n", n), PATIENT),
+        ];
+        for call in &calls {
+            assert!(world.finish(call).is_ok());
+        }
+    }
+    assert_eq!((one.diary().runs(), two.diary().runs()), (20, 20));
+}
+
+fn many_callers_share_one_link(world: &mut dyn World) {
+    let service = Service::numbered("note");
+    let manager = world.add(Spec::manager("manager", 1));
+    world.add(Spec::agv("agv", 7).service(&service).limits(|limits| limits.calls_per_peer = 32));
+    met(world, &manager, "agv", "note");
+    for round in 0..20 {
+        let calls: Vec<_> =
+            (0..8).map(|n| manager.begin("agv", "note", &number("n", 8 * round + n), PATIENT)).collect();
+        for call in &calls {
+            assert_eq!(world.finish(call).map(drop), Ok(()));
+        }
+    }
+    let mut values = service.diary().values();
+    values.sort_unstable();
+    assert_eq!(values, (0..160).collect::<Vec<_>>());
+}

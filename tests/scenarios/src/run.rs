@@ -1,0 +1,91 @@
+//! Running scenarios: once on a port, or for a seed with the failure caught.
+
+use std::cell::RefCell;
+use std::collections::BTreeMap;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Once;
+
+use cara_core::time::Duration;
+
+use crate::{Port, Scenario, Weather, World, ports};
+
+/// What a run injected, reached and measured.
+#[derive(Clone, Debug, Default)]
+pub struct Report {
+    /// Faults by name.
+    pub faults: BTreeMap<&'static str, u64>,
+    /// Counters of all units, and states that the scenario noted, by name.
+    pub states: BTreeMap<String, u64>,
+    /// Spans by name.
+    pub measured: BTreeMap<&'static str, Vec<Duration>>,
+}
+
+impl Report {
+    /// Adds another run's.
+    pub fn merge(&mut self, other: Self) {
+        for (name, count) in other.faults {
+            *self.faults.entry(name).or_default() += count;
+        }
+        for (name, count) in other.states {
+            *self.states.entry(name).or_default() += count;
+        }
+        for (name, spans) in other.measured {
+            self.measured.entry(name).or_default().extend(spans);
+        }
+    }
+
+    /// Whether a fault or state of this name was counted.
+    pub fn has(&self, name: &str) -> bool {
+        self.faults.contains_key(name) || self.states.contains_key(name)
+    }
+}
+
+/// Why a run failed.
+pub type Failure = String;
+
+/// Runs a scenario once; a broken assertion comes back as text.
+pub fn once(scenario: &Scenario, port: Port, seed: u64, weather: Weather) -> Result<Report, Failure> {
+    catch_quietly(|| {
+        let mut world = match port {
+            Port::Simulator => ports::simulator(seed, weather),
+            Port::Linux => ports::linux(),
+        };
+        (scenario.run)(&mut *world);
+        world.report()
+    })
+}
+
+thread_local! {
+    static CAUGHT: RefCell<Option<String>> = const { RefCell::new(None) };
+    static CATCHING: RefCell<bool> = const { RefCell::new(false) };
+}
+
+/// Runs `act` with panics of this thread kept as text instead of printed.
+fn catch_quietly<T>(act: impl FnOnce() -> T) -> Result<T, Failure> {
+    static HOOK: Once = Once::new();
+    HOOK.call_once(|| {
+        let usual = std::panic::take_hook();
+        std::panic::set_hook(Box::new(move |info| {
+            if CATCHING.with_borrow(|catching| *catching) {
+                // The first panic tells more than one in a destructor behind it.
+                CAUGHT.with_borrow_mut(|caught| {
+                    caught.get_or_insert_with(|| info.to_string());
+                });
+            } else {
+                usual(info);
+            }
+        }));
+    });
+    CATCHING.set(true);
+    CAUGHT.take();
+    let result = catch_unwind(AssertUnwindSafe(act));
+    CATCHING.set(false);
+    result.map_err(|_| CAUGHT.take().unwrap_or_else(|| "panicked".to_owned()))
+}
+
+impl dyn World + '_ {
+    /// Whether it runs on virtual time.
+    pub fn is_virtual(&self) -> bool {
+        self.port() == Port::Simulator
+    }
+}

@@ -1,0 +1,136 @@
+//! A scenario as the registry holds it: its rule, what it needs from a port, and what its runs must reach.
+
+use crate::World;
+
+/// What a scenario needs from the port beyond a network.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Need {
+    /// Units that lose power or are killed, without a farewell.
+    Crash,
+    /// Paths that are cut and healed.
+    Partition,
+    /// Streams or links that hold what they carry.
+    Freeze,
+    /// Streams that are reset by the network.
+    Reset,
+    /// Datagrams that arrive twice, late or not at all, as the scenario says.
+    Path,
+    /// A unit that gets another address while it runs.
+    AddressChange,
+    /// A machine that sleeps.
+    Suspend,
+    /// Datagrams of another protocol version.
+    OtherVersion,
+    /// More units than a test on one machine should start.
+    ManyUnits,
+    /// Minutes of time.
+    LongTime,
+    /// Instants that do not depend on how busy the machine is.
+    ExactTime,
+    /// Services that let the next call begin.
+    Detached,
+    /// The same random numbers in each life.
+    SameSeed,
+}
+
+impl Need {
+    /// All of them.
+    pub const ALL: [Self; 13] = [
+        Self::Crash,
+        Self::Partition,
+        Self::Freeze,
+        Self::Reset,
+        Self::Path,
+        Self::AddressChange,
+        Self::Suspend,
+        Self::OtherVersion,
+        Self::ManyUnits,
+        Self::LongTime,
+        Self::ExactTime,
+        Self::Detached,
+        Self::SameSeed,
+    ];
+
+    /// Why Linux over loopback in one process lacks it; `None` where it does not.
+    pub const fn missing_on_linux(self) -> Option<&'static str> {
+        Some(match self {
+            Self::Crash => "units of one process cannot crash one by one",
+            Self::Partition => "loopback cannot be cut without root",
+            Self::Freeze => "loopback cannot be frozen without root",
+            Self::Reset => "loopback resets nothing by itself",
+            Self::Path => "loopback has one quality",
+            Self::AddressChange => "loopback has one address",
+            Self::Suspend => "units of one process cannot be suspended one by one",
+            Self::OtherVersion => "the version is fixed when compiling",
+            Self::ManyUnits => "too many threads and sockets for a test",
+            Self::LongTime => "minutes of real time",
+            Self::ExactTime => "instants depend on the machine's load",
+            Self::Detached => "the Linux port has no detached services",
+            Self::SameSeed => "seeds come from the operating system",
+        })
+    }
+}
+
+/// What the network does by itself during the runs over many seeds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Weather {
+    /// Loss, delay, jitter, reordering, duplication, short partitions, split reads.
+    Rough,
+    /// Delay, jitter, reordering, duplication, split reads; nothing is lost.
+    Light,
+    /// Only what the scenario injects.
+    Own,
+}
+
+/// One rule, shown on every port that can.
+#[derive(Clone, Copy)]
+pub struct Scenario {
+    /// What happens in it, as the function's name says.
+    pub name: &'static str,
+    /// The rule that it shows: numbers of `docs/paper.md`, or the name of a behaviour that the design decides.
+    pub rule: &'static str,
+    /// What the network does by itself.
+    pub weather: Weather,
+    /// What it needs from the port.
+    pub needs: &'static [Need],
+    /// Faults and states that its runs over many seeds must reach, beside those of its weather.
+    pub expects: &'static [&'static str],
+    /// Of a thousand seeds, how many it runs: all, or fewer for fleets of hundreds.
+    pub every: u64,
+    /// Runs it; panics where the rule is broken.
+    pub run: fn(&mut dyn World),
+}
+
+impl Scenario {
+    /// Why it does not run on Linux; nothing where it does.
+    pub fn missing_on_linux(&self) -> Option<&'static str> {
+        self.needs.iter().find_map(|need| need.missing_on_linux())
+    }
+
+    /// The faults that its weather injects.
+    pub fn weather_faults(&self) -> &'static [&'static str] {
+        match self.weather {
+            Weather::Rough => {
+                &["loss", "retransmission", "delay", "jitter", "reorder", "duplicate", "split-read", "partition"]
+            }
+            Weather::Light => &["delay", "jitter", "reorder", "duplicate", "split-read"],
+            Weather::Own => &[],
+        }
+    }
+}
+
+/// Declares the scenarios of a file: `scenarios![name: "rule", Weather, [needs], [expects]; …]`.
+macro_rules! scenarios {
+    ($($run:ident: $rule:literal, $weather:ident, [$($need:ident),*], [$($expects:literal),*] $(, every $every:literal)?;)*) => {
+        pub(super) const SCENARIOS: &[$crate::Scenario] = &[$($crate::Scenario {
+            name: stringify!($run),
+            rule: $rule,
+            weather: $crate::Weather::$weather,
+            needs: &[$($crate::Need::$need),*],
+            expects: &[$($expects),*],
+            every: 1 $(* $every)?,
+            run: $run,
+        }),*];
+    };
+}
+pub(crate) use scenarios;

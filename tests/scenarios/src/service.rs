@@ -1,0 +1,163 @@
+//! Services that both ports can run, and the diary of what they did.
+
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use cara_core::config::Priority;
+use cara_core::distribution::identity::Identity;
+use cara_core::distribution::parameters::ParametersView;
+use cara_core::error::ServiceError;
+use cara_core::time::{Duration, Instant};
+
+/// What a service's body is told.
+pub struct Asked {
+    /// Who calls.
+    pub caller: Identity,
+    /// When it runs, on the world's clock.
+    pub at: Instant,
+}
+
+type Body = dyn Fn(&Asked, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync;
+
+/// A service with its attributes; copies of it share one diary.
+#[derive(Clone)]
+pub struct Service {
+    pub(crate) signature: String,
+    pub(crate) body: Arc<Body>,
+    pub(crate) takes: Duration,
+    pub(crate) calls_back: Option<String>,
+    pub(crate) priority: Priority,
+    pub(crate) lease: Option<Duration>,
+    pub(crate) detached: bool,
+    diary: Arc<Diary>,
+}
+
+impl Service {
+    /// A service that leaves its arguments as they are. The signature is in the text form.
+    pub fn new(signature: &str) -> Self {
+        Self {
+            signature: signature.to_owned(),
+            body: Arc::new(|_, _| Ok(())),
+            takes: Duration::ZERO,
+            calls_back: None,
+            priority: Priority::Normal,
+            lease: None,
+            detached: false,
+            diary: Arc::new(Diary::default()),
+        }
+    }
+
+    /// What it does.
+    pub fn does(
+        self,
+        body: impl Fn(&Asked, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync + 'static,
+    ) -> Self {
+        Self { body: Arc::new(body), ..self }
+    }
+
+    /// How long it takes to answer.
+    pub fn takes(self, span: Duration) -> Self {
+        Self { takes: span, ..self }
+    }
+
+    /// Before it does anything, it calls this function of its caller with the same parameters.
+    pub fn calls_back(self, function: &str) -> Self {
+        Self { calls_back: Some(function.to_owned()), ..self }
+    }
+
+    /// The class that requests for it have.
+    pub fn priority(self, priority: Priority) -> Self {
+        Self { priority, ..self }
+    }
+
+    /// What it starts may go on only this long after the last renewal; then its safe hook notes the stop.
+    pub fn lease(self, length: Duration) -> Self {
+        Self { lease: Some(length), ..self }
+    }
+
+    /// The next call begins while this one still runs.
+    pub fn detached(self) -> Self {
+        Self { detached: true, ..self }
+    }
+
+    /// What it did so far, in all copies.
+    pub fn diary(&self) -> Arc<Diary> {
+        Arc::clone(&self.diary)
+    }
+
+    /// The function's name.
+    pub fn name(&self) -> &str {
+        self.signature.split('(').next().unwrap_or_default()
+    }
+}
+
+/// What a service did, and when.
+#[derive(Default)]
+pub struct Diary(Mutex<Pages>);
+
+#[derive(Default)]
+struct Pages {
+    began: Vec<Instant>,
+    ended: Vec<Instant>,
+    stops: Vec<Instant>,
+    values: Vec<i64>,
+}
+
+impl Diary {
+    fn pages(&self) -> MutexGuard<'_, Pages> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// How often its handler began.
+    pub fn runs(&self) -> usize {
+        self.pages().began.len()
+    }
+
+    /// When its handler began.
+    pub fn began(&self) -> Vec<Instant> {
+        self.pages().began.clone()
+    }
+
+    /// When its handler ended.
+    pub fn ended(&self) -> Vec<Instant> {
+        self.pages().ended.clone()
+    }
+
+    /// When its safe hook ran.
+    pub fn stops(&self) -> Vec<Instant> {
+        self.pages().stops.clone()
+    }
+
+    /// The first int of the variable `n` of each run, as noted by a body that calls [`Self::note`].
+    pub fn values(&self) -> Vec<i64> {
+        self.pages().values.clone()
+    }
+
+    /// Notes a value.
+    pub fn note(&self, value: i64) {
+        self.pages().values.push(value);
+    }
+
+    pub(crate) fn begin(&self, at: Instant) {
+        self.pages().began.push(at);
+    }
+
+    pub(crate) fn end(&self, at: Instant) {
+        self.pages().ended.push(at);
+    }
+
+    pub(crate) fn stop(&self, at: Instant) {
+        self.pages().stops.push(at);
+    }
+}
+
+impl Service {
+    /// A service with one int `n`, which its diary notes at each run.
+    pub fn numbered(name: &str) -> Self {
+        let service = Self::new(&format!("{name}(n: int[1]) -> (n: int[1])"));
+        let diary = service.diary();
+        service.does(move |_, parameters| {
+            diary.note(parameters.variable::<i64>("n").map_err(|_| ServiceError::BadResults)?);
+            Ok(())
+        })
+    }
+}

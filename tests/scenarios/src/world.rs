@@ -1,0 +1,319 @@
+//! What a scenario can do, whatever the port.
+
+use std::rc::Rc;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use cara_core::config::Constraints;
+use cara_core::distribution::connection_handler::NodeCounter;
+use cara_core::distribution::identity::Identity;
+use cara_core::distribution::parameters::ParametersView;
+use cara_core::error::{CloseReason, Error};
+use cara_core::host::connections::LinkCounter;
+use cara_core::services::requests::CallId;
+use cara_core::services::unit::RequestOptions;
+use cara_core::time::{Duration, Instant};
+use cara_sim::{BoxedParameters, Path};
+
+use crate::{Need, Service, Spec, boxed, secs};
+
+/// A unit of a world.
+pub type Unit = Rc<dyn Node>;
+
+/// Where a scenario runs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Port {
+    /// Virtual network and time.
+    Simulator,
+    /// Sockets of this machine, over loopback.
+    Linux,
+}
+
+/// A fault that a port cannot inject.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Unsupported(pub Need);
+
+/// What is done to a fleet.
+pub enum Fault<'u> {
+    /// The unit loses power: nothing is said.
+    PowerCut(&'u Unit),
+    /// Its process is killed: its machine closes the streams.
+    Kill(&'u Unit),
+    /// It begins another life.
+    Restart(&'u Unit),
+    /// Nothing passes between the two until [`Fault::Heal`].
+    Cut(&'u Unit, &'u Unit),
+    /// Nothing passes from the first to the second until [`Fault::Heal`].
+    CutOneWay(&'u Unit, &'u Unit),
+    /// All cuts end.
+    Heal,
+    /// What the streams from the first to the second carry is held for this long; datagrams pass.
+    FreezeStreams(&'u Unit, &'u Unit, Duration),
+    /// All that goes from the first to the second is held for this long.
+    FreezeLink(&'u Unit, &'u Unit, Duration),
+    /// All streams of the unit are reset.
+    Reset(&'u Unit),
+    /// The paths between the two have this quality.
+    Path(&'u Unit, &'u Unit, Path),
+    /// The unit gets another address.
+    ChangeAddress(&'u Unit),
+    /// The unit's machine sleeps for this long; what arrives waits.
+    Suspend(&'u Unit, Duration),
+    /// Datagrams of another protocol version arrive at the unit.
+    OtherVersion(&'u Unit),
+}
+
+/// Something that a unit saw happen.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Seen {
+    /// A peer is connected.
+    Joined(Identity),
+    /// A peer is no longer.
+    Left(Identity, CloseReason),
+    /// A link ended before its peer had joined.
+    NotJoined(CloseReason),
+    /// A peer's list was read anew.
+    ListChanged(Identity),
+    /// An asynchronous request was not run, or failed.
+    Failed(CallId, Error),
+    /// A service of the unit stopped because nobody renewed its lease.
+    LeaseExpired(String),
+    /// A lease that the unit held ended at the peer: not renewed in time, as opposed to finished.
+    LeaseEnded(String, bool),
+}
+
+/// How a call ended, and when.
+#[derive(Clone)]
+pub struct Pending<T = BoxedParameters>(Arc<Mutex<Option<(Result<T, Error>, Instant)>>>);
+
+/// How a call to many nodes ended.
+pub type PendingAll = Pending<Vec<(Identity, Result<(), Error>)>>;
+
+impl<T> Pending<T> {
+    pub(crate) fn new() -> Self {
+        Self(Arc::new(Mutex::new(None)))
+    }
+
+    pub(crate) fn share(&self) -> Self {
+        Self(Arc::clone(&self.0))
+    }
+
+    pub(crate) fn end(&self, result: Result<T, Error>, at: Instant) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Some((result, at));
+    }
+
+    /// Whether it has ended.
+    pub fn is_over(&self) -> bool {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).is_some()
+    }
+
+    /// When it ended.
+    pub fn ended_at(&self) -> Option<Instant> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).as_ref().map(|(_, at)| *at)
+    }
+
+    /// The error that it ended with; `None` while it has not ended, `Some(Ok)` without one.
+    pub fn outcome(&self) -> Option<Result<(), Error>> {
+        let ended = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        ended.as_ref().map(|(result, _)| result.as_ref().map(drop).map_err(|error| *error))
+    }
+
+    fn take(&self) -> Option<Result<T, Error>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).take().map(|(result, _)| result)
+    }
+}
+
+/// One unit, in the words of both ports. Peers are named by their names.
+pub trait Node {
+    /// Its name, id and role.
+    fn identity(&self) -> Identity;
+    /// Looks for nodes now.
+    fn broadcast(&self);
+    /// Ends its life in an orderly way.
+    fn stop(&self);
+    /// Begins another life, with the services of its [`Spec`].
+    fn start(&self);
+    /// Adds a service, which nobody sees before it is published.
+    fn add_service(&self, service: &Service) -> Result<(), Error>;
+    /// Puts a service in the place of the one of the same name.
+    fn replace_service(&self, service: &Service) -> Result<(), Error>;
+    /// Removes a service.
+    fn remove_service(&self, name: &str) -> Result<(), Error>;
+    /// Publishes all services to all nodes.
+    fn publish(&self) -> Result<(), Error>;
+    /// Publishes all services to one node.
+    fn publish_to(&self, peer: &str) -> Result<(), Error>;
+    /// Publishes all services to all nodes, and ends when they have read the list, with those that have not.
+    fn begin_publish(&self) -> Pending<Vec<Identity>>;
+    /// Its own functions in the text form.
+    fn my_function_list(&self) -> String;
+
+    /// The s_units that ever joined in the order of joining, and whether each is connected.
+    fn s_units(&self) -> Vec<(Identity, bool)>;
+    /// The connected nodes.
+    fn peers(&self) -> Vec<Identity>;
+    /// The connected nodes that offer a function to this unit.
+    fn nodes_offering(&self, function: &str) -> Vec<Identity>;
+    /// What a peer has published to this unit, one function in a line.
+    fn their_function_list(&self, peer: &str) -> String;
+
+    /// The asynchronous request.
+    fn request_with(
+        &self,
+        peer: &str,
+        function: &str,
+        parameters: &ParametersView,
+        options: RequestOptions,
+    ) -> Result<CallId, Error>;
+    /// The asynchronous request to every node that offers the function.
+    fn request_all(&self, function: &str, parameters: &ParametersView) -> Vec<(Identity, Result<CallId, Error>)>;
+    /// The synchronous request, made in a task of its own.
+    fn begin(&self, peer: &str, function: &str, parameters: &ParametersView, options: RequestOptions) -> Pending;
+    /// The synchronous request to every node that offers the function, in a task of its own.
+    fn begin_all(&self, function: &str, parameters: &ParametersView) -> PendingAll;
+    /// Gives up the lease on a function of a peer.
+    fn release(&self, peer: &str, function: &str) -> Result<(), Error>;
+    /// What a leased service started is finished.
+    fn end_lease(&self, function: &str);
+    /// Whether a service's lease is live.
+    fn lease_is_live(&self, function: &str) -> bool;
+
+    /// The constraints in force.
+    fn constraints(&self) -> Constraints;
+    /// Changes them.
+    fn set_constraints(&self, constraints: Constraints) -> Result<(), Error>;
+    /// A counter of its links.
+    fn counted(&self, counter: LinkCounter) -> u64;
+    /// A counter of discovery and membership.
+    fn node_counted(&self, counter: NodeCounter) -> u64;
+    /// What happened to it, in all its lives.
+    fn events(&self) -> Vec<(Instant, Seen)>;
+    /// When the hook for a lost manager ran.
+    fn manager_losses(&self) -> Vec<Instant>;
+    /// For the port that made it.
+    fn number(&self) -> usize;
+}
+
+impl dyn Node {
+    /// The asynchronous request with defaults.
+    pub fn request(&self, peer: &str, function: &str, parameters: &ParametersView) -> Result<CallId, Error> {
+        self.request_with(peer, function, parameters, RequestOptions::default())
+    }
+
+    /// Whether a peer of this name is connected.
+    pub fn is_connected(&self, peer: &str) -> bool {
+        self.peers().iter().any(|identity| identity.name() == peer)
+    }
+
+    /// Whether a peer of this name offers a function to this unit.
+    pub fn knows(&self, peer: &str, function: &str) -> bool {
+        self.nodes_offering(function).iter().any(|identity| identity.name() == peer)
+    }
+
+    /// How many s_units are connected.
+    pub fn number_of_s_units(&self) -> usize {
+        self.s_units().iter().filter(|(_, connected)| *connected).count()
+    }
+
+    /// How many events match.
+    pub fn count(&self, matches: impl Fn(&Seen) -> bool) -> usize {
+        self.events().iter().filter(|(_, event)| matches(event)).count()
+    }
+
+    /// When the first event that matches happened.
+    pub fn when(&self, matches: impl Fn(&Seen) -> bool) -> Option<Instant> {
+        self.events().iter().find(|(_, event)| matches(event)).map(|(at, _)| *at)
+    }
+
+    /// Changes some of its constraints.
+    pub fn change(&self, change: impl FnOnce(&mut Constraints)) {
+        let mut constraints = self.constraints();
+        change(&mut constraints);
+        self.set_constraints(constraints).expect("the constraints are sound");
+    }
+}
+
+/// A fleet on some port, and its time.
+pub trait World {
+    /// Which port.
+    fn port(&self) -> Port;
+    /// The time since the world began.
+    fn now(&self) -> Instant;
+    /// Adds a unit and starts it.
+    fn add(&mut self, spec: Spec) -> Unit;
+    /// Lets time pass until `condition` holds, at most `limit`; whether it held.
+    fn run_until(&mut self, condition: &dyn Fn() -> bool, limit: Duration) -> bool;
+    /// Injects a fault.
+    fn inject(&mut self, fault: Fault<'_>) -> Result<(), Unsupported>;
+    /// A random number below `bound`, from the seed where there is one.
+    fn random(&mut self, bound: u64) -> u64;
+    /// Notes that the scenario reached a state, for the report.
+    fn reached(&mut self, state: &'static str);
+    /// Notes a measured span under a name, for the report.
+    fn measured(&mut self, what: &'static str, span: Duration);
+    /// What was injected, reached and measured.
+    fn report(&self) -> crate::run::Report;
+}
+
+impl dyn World + '_ {
+    /// Lets a span of time pass.
+    pub fn run_for(&mut self, span: Duration) {
+        let _ = self.run_until(&|| false, span);
+    }
+
+    /// Lets time pass until `condition` holds.
+    ///
+    /// # Panics
+    /// When it does not within `limit`.
+    pub fn wait(&mut self, what: &str, condition: impl Fn() -> bool, limit: Duration) {
+        assert!(self.run_until(&condition, limit), "not within {} ms: {what}", limit.as_millis());
+    }
+
+    /// Injects a fault of which the scenario's needs say that the port can.
+    ///
+    /// # Panics
+    /// When it cannot.
+    pub fn fault(&mut self, fault: Fault<'_>) {
+        if let Err(unsupported) = self.inject(fault) {
+            panic!("the scenario does not say that it needs {unsupported:?}");
+        }
+    }
+
+    /// The synchronous request, with ten seconds to pass through whatever the network does.
+    pub fn ask(
+        &mut self,
+        unit: &Unit,
+        peer: &str,
+        function: &str,
+        parameters: &mut ParametersView,
+    ) -> Result<(), Error> {
+        let options = RequestOptions { timeout: Some(secs(10)), ..RequestOptions::default() };
+        self.ask_with(unit, peer, function, parameters, options)
+    }
+
+    /// The synchronous request with options.
+    ///
+    /// # Panics
+    /// When it ends neither with a reply nor with an error.
+    pub fn ask_with(
+        &mut self,
+        unit: &Unit,
+        peer: &str,
+        function: &str,
+        parameters: &mut ParametersView,
+        options: RequestOptions,
+    ) -> Result<(), Error> {
+        let pending = unit.begin(peer, function, &boxed(parameters), options);
+        self.wait("every call ends", || pending.is_over(), secs(60));
+        let results = pending.take().expect("it is over")?;
+        parameters.copy_from(&results)
+    }
+
+    /// Lets time pass until a call has ended; how it ended.
+    ///
+    /// # Panics
+    /// When it does not end.
+    pub fn finish<T>(&mut self, pending: &Pending<T>) -> Result<T, Error> {
+        self.wait("every call ends", || pending.is_over(), secs(60));
+        pending.take().expect("it is over")
+    }
+}
