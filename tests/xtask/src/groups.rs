@@ -36,7 +36,7 @@ pub(crate) enum Outcome {
 }
 
 /// All groups, in the order in which they run: cheap ones first.
-pub(crate) const GROUPS: [Group; 13] = [
+pub(crate) const GROUPS: [Group; 14] = [
     Group {
         name: "format",
         what: "every crate is formatted",
@@ -74,7 +74,7 @@ pub(crate) const GROUPS: [Group; 13] = [
         what: "every promise of the paper has its test, and the test exists",
         budget: 2,
         quick: Some(2),
-        by_default: false,
+        by_default: true,
         run: |_| paper::check().into(),
     },
     Group {
@@ -124,6 +124,14 @@ pub(crate) const GROUPS: [Group; 13] = [
         quick: Some(5),
         by_default: true,
         run: |_| needing(install::program("python3", "python3"), vectors),
+    },
+    Group {
+        name: "loom",
+        what: "the hand-over of a link's reader, in every order of its threads; and a lost wake-up is found",
+        budget: 180,
+        quick: None,
+        by_default: true,
+        run: |_| loom().into(),
     },
     Group {
         name: "scenarios",
@@ -197,6 +205,22 @@ fn thumb(extent: Extent) -> Result<()> {
 fn vectors() -> Result<()> {
     present("tests/vectors/decode.py")?;
     Run::new("python3").args(["tests/vectors/decode.py"]).stream()
+}
+
+/// The model must pass, and must fail with the bug that is planted for it.
+fn loom() -> Result<()> {
+    hand_over("--cfg loom").stream()?;
+    let (passed, output, _) = hand_over("--cfg loom --cfg cara_planted=\"lost_wakeup\"").captured()?;
+    if passed || !output.contains("nobody reads") {
+        bail!("the planted lost wake-up was not found: {output}");
+    }
+    println!("the planted lost wake-up is found");
+    Ok(())
+}
+
+fn hand_over(flags: &str) -> Run {
+    let test = ["test", "--package", "cara-std", "--release", "--target-dir", "target/loom", "--test", "hand_over"];
+    Run::cargo().args(test).env("RUSTFLAGS", flags)
 }
 
 fn scenarios(extent: Extent) -> Result<()> {

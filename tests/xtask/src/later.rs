@@ -8,10 +8,6 @@ pub(crate) struct Later {
     topic: &'static str,
 }
 
-pub(crate) const DEMO: Later = Later {
-    what: "the demonstration with real processes",
-    topic: "the main job: the paper's listing between real processes",
-};
 pub(crate) const SIZES: Later =
     Later { what: "the sizes of firmware images", topic: "s_unit firmware: the embassy port" };
 pub(crate) const FIRMWARE: Later =
