@@ -337,3 +337,140 @@ const fn queue_index(priority: Priority) -> Option<usize> {
         Priority::Low => Some(2),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::indexing_slicing, clippy::unwrap_used, clippy::panic, clippy::arithmetic_side_effects)]
+    use super::*;
+    use crate::storage::{Boxed, Pool};
+    use proptest::prelude::*;
+    use std::collections::BTreeSet;
+    use std::collections::VecDeque;
+    use std::vec;
+    use std::vec::Vec;
+
+    fn calls(slots: usize) -> Calls<Boxed> {
+        Calls::new(vec![None; slots].into_boxed_slice())
+    }
+
+    fn pool(count: usize, size: usize) -> Pool<Boxed> {
+        Pool::new((0..count).map(|_| Some(vec![0; size].into_boxed_slice())).collect())
+    }
+
+    fn head(id: u32, priority: Priority) -> CallHead {
+        CallHead {
+            id,
+            slot: Slot(id as u16 ^ 0x1234),
+            generation: Generation(id as u16),
+            priority,
+            wants_reply: id.is_multiple_of(2),
+            deadline: Instant::from_micros(u64::from(id) << 20),
+            made: Instant::from_micros(u64::from(id) << 10),
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn the_window_agrees_with_a_set(ids in prop::collection::vec(1..400_u32, 0..300)) {
+            let (mut window, mut seen) = (Window::default(), BTreeSet::new());
+            for id in ids {
+                let newest = seen.last().copied().unwrap_or(0);
+                let expected = match id {
+                    id if id + WINDOW <= newest => Seen::TooOld,
+                    id if !seen.insert(id) => Seen::Before,
+                    _ => Seen::Never,
+                };
+                prop_assert_eq!(window.note(id), expected);
+            }
+        }
+
+        #[test]
+        fn what_waits_comes_out_as_it_went_in(steps in prop::collection::vec((0..3_u8, 0..200_usize), 1..200)) {
+            let (mut calls, mut pool) = (calls(4), pool(1, 600));
+            let mut model: VecDeque<(CallHead, Vec<u8>)> = VecDeque::new();
+            for (id, (step, length)) in (1..).zip(steps) {
+                if step > 0 {
+                    let (head, block) = (head(id, Priority::Low), vec![id as u8; length]);
+                    let used: usize = model.iter().map(|(_, block)| block.len() + HEAD_BYTES).sum();
+                    let fits = used + block.len() + HEAD_BYTES <= 600;
+                    prop_assert_eq!(calls.wait(&mut pool, head, &block).is_ok(), fits);
+                    if fits {
+                        model.push_back((head, block));
+                    }
+                } else {
+                    let taken = calls.take_next(&mut pool, |_, block| block.to_vec());
+                    prop_assert_eq!(taken, model.pop_front());
+                }
+                prop_assert_eq!(usize::from(calls.held()), model.len());
+                prop_assert_eq!(pool.free(), usize::from(model.is_empty()));
+            }
+        }
+    }
+
+    #[test]
+    fn ids_far_ahead_forget_what_was_before() {
+        let mut window = Window::default();
+        assert_eq!([window.note(1), window.note(u32::MAX), window.note(1)], [Seen::Never, Seen::Never, Seen::TooOld]);
+        assert_eq!(window.note(u32::MAX - (WINDOW - 1)), Seen::Never);
+        assert_eq!(window.note(u32::MAX), Seen::Before);
+    }
+
+    #[test]
+    fn a_ticket_is_good_once_and_for_its_call_only() {
+        let mut calls = calls(2);
+        let first = calls.begin(head(1, Priority::Normal)).unwrap();
+        assert!(calls.end(first).is_some() && calls.end(first).is_none());
+        let second = calls.begin(head(2, Priority::Normal)).unwrap();
+        assert_eq!((calls.call(first), calls.held()), (None, 1));
+        assert!(calls.end(first).is_none());
+        assert_eq!(calls.call(second).unwrap().id, 2);
+    }
+
+    #[test]
+    fn an_emergency_finds_a_slot_when_all_others_are_taken() {
+        let mut calls = calls(3);
+        for id in 1..=2 {
+            let ticket = calls.begin(head(id, Priority::Normal)).unwrap();
+            calls.detach(ticket);
+        }
+        assert_eq!(calls.begin(head(3, Priority::High)), Err(Error::Busy));
+        assert!(calls.begin(head(4, Priority::Emergency)).is_ok());
+        assert_eq!(calls.admit(Priority::High, 3), Err(Error::Busy));
+        assert_eq!(calls.admit(Priority::Emergency, 3), Ok(()));
+    }
+
+    #[test]
+    fn one_emergency_waits_without_a_buffer() {
+        let (mut calls, mut pool) = (calls(3), pool(0, 0));
+        calls.begin(head(1, Priority::Emergency)).unwrap();
+        calls.wait(&mut pool, head(2, Priority::Emergency), b"stop").unwrap();
+        assert_eq!(calls.wait(&mut pool, head(3, Priority::Emergency), b"stop"), Err(Error::Busy));
+        assert_eq!(calls.wait(&mut pool, head(4, Priority::Normal), b"go"), Err(Error::Busy));
+        assert!(!calls.can_begin());
+    }
+
+    #[test]
+    fn one_request_may_come_early_by_an_interval() {
+        let (mut calls, interval) = (calls(1), Duration::from_millis(10));
+        let at = |millis: u64| Instant::from_micros(1_000_000 + millis * 1_000);
+        assert_eq!(calls.interval(at(0), interval), Ok(()));
+        assert_eq!(calls.interval(at(0), interval), Ok(()));
+        assert_eq!(calls.interval(at(4), interval), Err(Error::TooSoon { wait: Duration::from_millis(6) }));
+        assert_eq!(calls.interval(at(10), interval), Ok(()));
+        assert_eq!(calls.interval(at(10), Duration::ZERO), Ok(()));
+    }
+
+    #[test]
+    fn the_end_of_a_link_forgets_what_waits_and_keeps_what_runs() {
+        let (mut calls, mut pool) = (calls(3), pool(2, 100));
+        let running = calls.begin(head(1, Priority::Normal)).unwrap();
+        calls.wait(&mut pool, head(2, Priority::Normal), b"").unwrap();
+        calls.wait(&mut pool, head(3, Priority::High), b"").unwrap();
+        calls.wait(&mut pool, head(4, Priority::Emergency), b"").unwrap();
+        assert_eq!((calls.held(), pool.free()), (4, 0));
+        calls.release(&mut pool);
+        assert_eq!((calls.held(), pool.free()), (1, 2));
+        assert!(calls.end(running).is_some());
+        assert_eq!(calls.held(), 0);
+    }
+}

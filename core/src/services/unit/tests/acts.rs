@@ -6,7 +6,7 @@ use std::vec::Vec;
 
 use super::super::RequestOptions;
 use super::setup::{self, Handler, Run};
-use super::side::{Arguments, Happened, Side, context};
+use super::side::{Arguments, Begun, Happened, Side, context};
 use crate::config::{Constraints, Priority};
 use crate::distribution::function::Definition;
 use crate::distribution::function_list::{Generation, Slot};
@@ -84,7 +84,12 @@ impl Side {
     /// Answers the oldest call that waits.
     pub(super) fn answer_held(&mut self, result: Result<&ParametersView, Error>) {
         let call = self.held.remove(0);
-        self.session.answer(context!(self), call.ticket, result).unwrap();
+        let result = result.map(|results| {
+            let mut kept = Arguments::default();
+            kept.copy_from(results).unwrap();
+            kept
+        });
+        self.answer(call, result);
     }
 
     pub(super) fn close(&mut self, reason: CloseReason) {
@@ -173,7 +178,12 @@ impl Side {
 
     /// The functions whose handlers were begun, in order.
     pub(super) fn ran(&self) -> Vec<&str> {
-        self.happened.iter().filter_map(Happened::function).collect()
+        self.begun().map(|begun| begun.function.as_str()).collect()
+    }
+
+    /// The handlers that were begun, in order.
+    pub(super) fn begun(&self) -> impl Iterator<Item = &Begun> {
+        self.happened.iter().filter_map(Happened::begun)
     }
 
     pub(super) fn count(&self, wanted: impl Fn(&Happened) -> bool) -> usize {

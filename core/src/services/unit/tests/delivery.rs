@@ -201,7 +201,7 @@ fn an_emergency_overtakes_a_long_message_between_its_chunks() {
     let before = pair.agv.counter(LinkCounter::BytesReceived) as usize;
     pair.manager.request_with("stop", &none(), &urgent(Priority::Emergency), true).unwrap();
     pair.settle();
-    let began: Vec<usize> = pair.agv.happened.iter().filter_map(Happened::bytes_at_begin).collect();
+    let began: Vec<usize> = pair.agv.begun().map(|begun| begun.received).collect();
     assert_eq!(pair.agv.ran(), ["stop", "read"]);
     // The rest of one chunk, the emergency itself, and what the pipe held.
     assert!(began[0] - before <= 1_024 + EMERGENCY_BYTES + 200, "{} bytes", began[0] - before);

@@ -8,6 +8,7 @@
 )]
 
 mod acts;
+mod chaos;
 mod delivery;
 mod ends;
 mod gathering;

@@ -9,6 +9,7 @@ use std::vec::Vec;
 use super::super::{Call, Event, Session, SessionConfig};
 use super::net::{DATAGRAM_PORT, Net};
 use super::setup::{self, Handler, Run, Setup};
+use crate::config::Priority;
 use crate::distribution::function_list::{FunctionList, Slot};
 use crate::distribution::parameters::Parameters;
 use crate::error::{CloseReason, Error, Refusal};
@@ -40,8 +41,19 @@ pub(super) enum Happened {
     },
     Answered,
     Closed(CloseReason),
-    /// A handler was begun: its function, and how many bytes of the stream had arrived by then.
-    Ran(String, usize),
+    /// A handler was begun.
+    Ran(Begun),
+}
+
+/// A handler that was begun.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Begun {
+    pub(super) function: String,
+    pub(super) priority: Priority,
+    /// Bytes of the stream that had arrived by then.
+    pub(super) received: usize,
+    /// The argument `x`, if there is one.
+    pub(super) x: Option<i64>,
 }
 
 /// One end.
@@ -172,7 +184,12 @@ impl Side {
 
     fn run(&mut self, call: Call, arguments: &mut Arguments) {
         let function = self.functions.function(call.slot).unwrap();
-        self.happened.push(Happened::Ran(function.name().to_string(), self.received));
+        self.happened.push(Happened::Ran(Begun {
+            function: function.name().to_string(),
+            priority: call.priority,
+            received: self.received,
+            x: arguments.variable("x").ok(),
+        }));
         match function.handler.run {
             Run::Held => self.held.push(call),
             Run::Now(run) => {
@@ -182,7 +199,7 @@ impl Side {
         }
     }
 
-    fn answer(&mut self, call: Call, result: Result<Arguments, Error>) {
+    pub(super) fn answer(&mut self, call: Call, result: Result<Arguments, Error>) {
         let lent = result.as_ref().map(|results| results.as_view()).map_err(|error| *error);
         if self.session.answer(context!(self), call.ticket, lent).is_err() {
             self.unanswered.push((call, result));
@@ -207,13 +224,8 @@ impl Side {
 }
 
 impl Happened {
-    /// How many bytes of the stream had arrived when a handler was begun.
-    pub(super) fn bytes_at_begin(&self) -> Option<usize> {
-        if let Self::Ran(_, bytes) = self { Some(*bytes) } else { None }
-    }
-
-    pub(super) fn function(&self) -> Option<&str> {
-        if let Self::Ran(name, _) = self { Some(name) } else { None }
+    pub(super) fn begun(&self) -> Option<&Begun> {
+        if let Self::Ran(begun) = self { Some(begun) } else { None }
     }
 }
 

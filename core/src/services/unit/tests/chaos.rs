@@ -1,0 +1,203 @@
+//! Whatever the network does: every call ends once, runs at most once, in order of its class, and nothing leaks.
+
+use std::collections::BTreeMap;
+use std::vec;
+use std::vec::Vec;
+
+use proptest::prelude::*;
+
+use super::net::Datagrams;
+use super::pair::{Happened, Pair};
+use super::setup::Setup;
+use super::side::Side;
+use super::x;
+use crate::config::{Constraints, Priority};
+use crate::error::Error;
+use crate::services::requests::CallId;
+use crate::services::unit::{Delivery, RequestOptions};
+use crate::time::Duration;
+
+#[derive(Clone, Copy, Debug)]
+enum Act {
+    Request { function: &'static str, priority: Priority, wants_reply: bool, delivery: Delivery },
+    Freeze(bool),
+    Narrow(usize),
+    Datagrams(Datagrams),
+    Starve,
+    Feed,
+    Answer,
+    Detach,
+    Republish,
+    Pass(u64),
+    Suspend,
+    Cut,
+}
+
+fn act() -> impl Strategy<Value = Act> {
+    let function = prop::sample::select(&["now", "held"][..]);
+    let priority = prop::sample::select(&Priority::ALL[..]);
+    let delivery = prop::sample::select(&[Delivery::Reliable, Delivery::Reliable, Delivery::BestEffort][..]);
+    let request = (function, priority, any::<bool>(), delivery);
+    let request = request.prop_map(|(function, priority, wants_reply, delivery)| Act::Request {
+        function,
+        priority,
+        wants_reply,
+        delivery: if wants_reply { Delivery::Reliable } else { delivery },
+    });
+    let datagrams = prop::sample::select(&[Datagrams::Pass, Datagrams::Lost, Datagrams::Twice][..]);
+    prop_oneof![
+        12 => request,
+        2 => any::<bool>().prop_map(Act::Freeze),
+        1 => prop_oneof![1..60_usize, Just(1 << 20)].prop_map(Act::Narrow),
+        1 => datagrams.prop_map(Act::Datagrams),
+        1 => Just(Act::Starve),
+        2 => Just(Act::Feed),
+        4 => Just(Act::Answer),
+        1 => Just(Act::Detach),
+        1 => Just(Act::Republish),
+        4 => (0..300_000_u64).prop_map(Act::Pass),
+        1 => (0..3_000_000_u64).prop_map(Act::Pass),
+        1 => Just(Act::Suspend),
+    ]
+}
+
+/// What was requested of one end by the other.
+#[derive(Default)]
+struct Asked {
+    calls: BTreeMap<CallId, i64>,
+    starved: Vec<std::boxed::Box<[u8]>>,
+    next: i64,
+}
+
+fn apply(pair: &mut Pair, asked: &mut [Asked; 2], act: Act, manager: bool) {
+    let index = usize::from(manager);
+    let side = if manager { &mut pair.manager } else { &mut pair.agv };
+    let asked = &mut asked[index];
+    match act {
+        Act::Request { function, priority, wants_reply, delivery } => {
+            let options = RequestOptions { priority: Some(priority), delivery, ..RequestOptions::default() };
+            asked.next += 1;
+            if let Ok(id) = side.request_with(function, &x(asked.next), &options, wants_reply)
+                && wants_reply
+            {
+                asked.calls.insert(id, asked.next);
+            }
+        }
+        Act::Freeze(frozen) => side.net.frozen = frozen,
+        Act::Narrow(capacity) => side.net.capacity = capacity,
+        Act::Datagrams(datagrams) => side.net.datagrams = datagrams,
+        Act::Starve => asked.starved.extend(side.take_buffers()),
+        Act::Feed => side.give_buffers(core::mem::take(&mut asked.starved)),
+        Act::Answer if side.held.is_empty() => {}
+        Act::Answer => side.answer_held(Ok(&*x(0))),
+        Act::Detach => {
+            let tickets: Vec<_> = side.held.iter().map(|call| call.ticket).collect();
+            tickets.into_iter().for_each(|ticket| side.session.detach(ticket));
+        }
+        Act::Republish => {
+            side.replace("now(x: int) -> (x: int)");
+            side.publish();
+        }
+        Act::Pass(micros) => pair.run(Duration::from_micros(micros)),
+        Act::Suspend => pair.jump(Duration::from_secs(3_600)),
+        Act::Cut => pair.cut(),
+    }
+    pair.settle();
+}
+
+/// Everything comes right again, and every call that still runs is answered.
+fn recover(pair: &mut Pair, asked: &mut [Asked; 2]) {
+    for (index, asked) in asked.iter_mut().enumerate() {
+        let side = if index == 1 { &mut pair.manager } else { &mut pair.agv };
+        side.give_buffers(core::mem::take(&mut asked.starved));
+        (side.net.frozen, side.net.capacity) = (false, 1 << 20);
+    }
+    for _ in 0..20 {
+        pair.run(Duration::from_millis(1));
+        for side in [&mut pair.manager, &mut pair.agv] {
+            while !side.held.is_empty() {
+                side.answer_held(Ok(&*x(0)));
+            }
+        }
+    }
+    pair.run(Duration::from_secs(5));
+}
+
+/// The calls of `caller` against what `callee` ran.
+fn check(caller: &Side, callee: &Side, calls: &BTreeMap<CallId, i64>) {
+    let mut ran: BTreeMap<i64, usize> = BTreeMap::new();
+    for x in callee.begun().filter_map(|begun| begun.x) {
+        *ran.entry(x).or_default() += 1;
+    }
+    assert!(ran.values().all(|count| *count == 1), "something ran twice: {ran:?}");
+    for (id, x) in calls {
+        let ends = caller.count(|happened| matches!(happened, Happened::Reply(known, _) if known == id));
+        assert_eq!(ends, 1, "call {id:?} ended {ends} times");
+        match caller.outcome(*id).unwrap() {
+            Ok(_) => assert!(ran.contains_key(x), "{id:?} was answered and never ran"),
+            Err(Error::TimedOut | Error::Interrupted | Error::StaleFunction) => {}
+            Err(error) => assert!(!ran.contains_key(x), "{id:?} ran and was answered {error}"),
+        }
+    }
+    assert_eq!(caller.session.calls_in_flight(), 0);
+    assert_eq!(callee.session.calls_held(), 0);
+}
+
+fn check_order(callee: &Side) {
+    for class in [Priority::High, Priority::Normal, Priority::Low] {
+        let of_class: Vec<i64> =
+            callee.begun().filter(|begun| begun.priority == class).filter_map(|begun| begun.x).collect();
+        assert!(of_class.is_sorted(), "{class:?} calls ran as {of_class:?}");
+    }
+}
+
+fn chaos(acts: &[(Act, bool)], ordered: bool) {
+    let agv = Constraints { message_size: 32 * 1024, calls_per_peer: 4, ..Constraints::S_UNIT };
+    let mut pair = Pair::with(&Setup { agv, buffers: 4, ..Setup::default() });
+    for side in [&mut pair.manager, &mut pair.agv] {
+        side.offer("now(x: int) -> (x: int)", |_| Ok(()));
+        side.offer_held("held(x: int) -> (x: int)");
+        side.publish();
+    }
+    pair.settle();
+    let mut asked = [Asked::default(), Asked::default()];
+    for &(act, manager) in acts {
+        apply(&mut pair, &mut asked, act, manager);
+    }
+    recover(&mut pair, &mut asked);
+    check(&pair.manager, &pair.agv, &asked[1].calls);
+    check(&pair.agv, &pair.manager, &asked[0].calls);
+    if ordered {
+        check_order(&pair.manager);
+        check_order(&pair.agv);
+    }
+}
+
+fn is_ordered(act: &Act) -> bool {
+    // A detached call goes on beside its class, and a datagram may overtake the stream.
+    !matches!(act, Act::Request { delivery: Delivery::BestEffort, .. })
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 300, ..ProptestConfig::default() })]
+
+    #[test]
+    fn calls_survive_anything(acts in prop::collection::vec((act(), any::<bool>()), 1..80)) {
+        chaos(&acts, false);
+    }
+
+    #[test]
+    fn calls_in_the_stream_keep_their_order(
+        acts in prop::collection::vec((act().prop_filter("datagrams overtake", is_ordered), any::<bool>()), 1..80),
+    ) {
+        chaos(&acts, true);
+    }
+
+    #[test]
+    fn calls_survive_the_end_of_their_link(
+        mut acts in prop::collection::vec((act(), any::<bool>()), 1..40), at in any::<prop::sample::Index>(),
+    ) {
+        acts.insert(at.index(acts.len()), (Act::Cut, true));
+        chaos(&acts, false);
+    }
+}
