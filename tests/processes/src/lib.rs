@@ -109,11 +109,26 @@ impl Process {
         Ok(at)
     }
 
+    /// Holds it up, as a hung program: its connections stay open. When it was done.
+    pub fn freeze(&mut self) -> Result<Instant> {
+        let at = Instant::now();
+        self.signal(Signal::STOP).map(|()| at)
+    }
+
+    /// Lets it go on.
+    pub fn thaw(&mut self) -> Result<()> {
+        self.signal(Signal::CONT)
+    }
+
     /// Asks it to end, as Ctrl-C or a service manager does, and waits for its end.
     pub fn terminate(&mut self, within: Duration) -> Result<ExitStatus> {
-        let pid = Pid::from_child(&self.child);
-        kill_process(pid, Signal::TERM).with_context(|| format!("cannot end {}", self.name))?;
+        self.signal(Signal::TERM)?;
         self.wait(within)
+    }
+
+    fn signal(&self, signal: Signal) -> Result<()> {
+        let sent = kill_process(Pid::from_child(&self.child), signal);
+        sent.with_context(|| format!("{} takes no signal", self.name))
     }
 
     /// Waits for its end.
@@ -219,6 +234,17 @@ mod tests {
         let mut process = shell("echo one");
         let error = process.expect("two", LONG).unwrap_err().to_string();
         assert!(error.contains("`two` before it ended") && error.contains("\n    one"), "{error}");
+    }
+
+    #[test]
+    fn what_is_frozen_says_nothing() {
+        let mut process = shell("echo $$; cat");
+        process.expect("", LONG).unwrap();
+        process.freeze().unwrap();
+        process.send("one").unwrap();
+        assert!(process.expect("one", Duration::from_millis(100)).is_err());
+        process.thaw().unwrap();
+        process.expect("one", LONG).unwrap();
     }
 
     #[test]

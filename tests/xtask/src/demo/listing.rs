@@ -73,7 +73,8 @@ impl Listing<'_> {
         let came = line.text.strip_prefix(&prefix).unwrap_or_default();
         ensure!(came.contains(wanted), "line {number} brought `{came}` and not `{wanted}`");
         for quiet in self.shown + 1..number {
-            self.stage.line(quiet, self.code(quiet)?, "");
+            let code = Some(self.code(quiet)?).filter(|code| !code.is_empty());
+            self.stage.line(quiet, code.unwrap_or("(stands in the line before)"), "");
         }
         self.stage.line(number, self.code(number)?, came);
         self.shown = number;
