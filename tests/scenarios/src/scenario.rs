@@ -95,8 +95,6 @@ pub struct Scenario {
     pub needs: &'static [Need],
     /// Faults and states that its runs over many seeds must reach, beside those of its weather.
     pub expects: &'static [&'static str],
-    /// Of a thousand seeds, how many it runs: all, or fewer for fleets of hundreds.
-    pub every: u64,
     /// Runs it; panics where the rule is broken.
     pub run: fn(&mut dyn World),
 }
@@ -121,14 +119,13 @@ impl Scenario {
 
 /// Declares the scenarios of a file: `scenarios![name: "rule", Weather, [needs], [expects]; …]`.
 macro_rules! scenarios {
-    ($($run:ident: $rule:literal, $weather:ident, [$($need:ident),*], [$($expects:literal),*] $(, every $every:literal)?;)*) => {
+    ($($run:ident: $rule:literal, $weather:ident, [$($need:ident),*], [$($expects:literal),*];)*) => {
         pub(super) const SCENARIOS: &[$crate::Scenario] = &[$($crate::Scenario {
             name: stringify!($run),
             rule: $rule,
             weather: $crate::Weather::$weather,
             needs: &[$($crate::Need::$need),*],
             expects: &[$($expects),*],
-            every: 1 $(* $every)?,
             run: $run,
         }),*];
     };

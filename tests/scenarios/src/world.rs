@@ -4,6 +4,7 @@ use std::rc::Rc;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use cara_core::config::Constraints;
+use cara_core::counters::Counter;
 use cara_core::distribution::connection_handler::NodeCounter;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::ParametersView;
@@ -15,6 +16,9 @@ use cara_core::time::{Duration, Instant};
 use cara_sim::{BoxedParameters, Path};
 
 use crate::{Need, Service, Spec, boxed, secs};
+
+/// Events of each unit that a failure shows.
+const LAST_EVENTS: usize = 12;
 
 /// A unit of a world.
 pub type Unit = Rc<dyn Node>;
@@ -252,6 +256,8 @@ pub trait World {
     fn measured(&mut self, what: &'static str, span: Duration);
     /// What was injected, reached and measured.
     fn report(&self) -> crate::run::Report;
+    /// All units.
+    fn units(&self) -> Vec<Unit>;
 }
 
 impl dyn World + '_ {
@@ -265,7 +271,22 @@ impl dyn World + '_ {
     /// # Panics
     /// When it does not within `limit`.
     pub fn wait(&mut self, what: &str, condition: impl Fn() -> bool, limit: Duration) {
-        assert!(self.run_until(&condition, limit), "not within {} ms: {what}", limit.as_millis());
+        let came = self.run_until(&condition, limit);
+        assert!(came, "not within {} ms: {what}{}", limit.as_millis(), self.story());
+    }
+
+    /// What the units saw happen, for a failure's text: the last events of each, and what was counted.
+    pub(crate) fn story(&self) -> String {
+        let mut story = format!("; now {:?}", self.now());
+        for unit in self.units() {
+            let events = unit.events();
+            let last = events.len().saturating_sub(LAST_EVENTS);
+            story += &format!("\n  {:?} after {last} more: {:?}", unit.identity(), &events[last..]);
+            let counted = LinkCounter::ALL.iter().map(|counter| (counter.name(), unit.counted(*counter)));
+            let counted: Vec<_> = counted.filter(|(_, count)| *count > 0).collect();
+            story += &format!("\n    {counted:?}");
+        }
+        story
     }
 
     /// Injects a fault of which the scenario's needs say that the port can.

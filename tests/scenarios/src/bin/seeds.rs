@@ -68,7 +68,7 @@ fn arguments() -> Result<Wanted, String> {
 fn run(scenario: &Scenario, wanted: &Wanted) -> (u64, bool) {
     let seeds: Vec<u64> = match wanted.seed {
         Some(seed) => vec![seed],
-        None => (0..wanted.seeds).step_by(scenario.every as usize).collect(),
+        None => (0..wanted.seeds).collect(),
     };
     let start = Instant::now();
     let (mut report, mut failures) = (Report::default(), Vec::new());

@@ -147,6 +147,12 @@ impl World for LinuxWorld {
         self.report.measured.entry(what).or_default().push(span);
     }
 
+    fn units(&self) -> Vec<Unit> {
+        let handle =
+            |(number, node): (usize, &Arc<LinuxNode>)| Rc::new(Handle { number, node: Arc::clone(node) }) as Unit;
+        self.units.iter().enumerate().map(handle).collect()
+    }
+
     fn report(&self) -> Report {
         self.report.clone()
     }

@@ -191,6 +191,10 @@ impl World for SimWorld {
         self.report.measured.entry(what).or_default().push(span);
     }
 
+    fn units(&self) -> Vec<Unit> {
+        self.units.iter().map(|unit| Rc::clone(unit) as Unit).collect()
+    }
+
     fn report(&self) -> Report {
         let mut report = self.report.clone();
         for (name, count) in self.world.counts().iter().filter(|(_, count)| *count > 0) {

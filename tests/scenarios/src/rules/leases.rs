@@ -1,5 +1,6 @@
 //! A vehicle does only what its manager still wants.
 
+use cara_core::error::Error;
 use cara_core::services::unit::RequestOptions;
 use cara_core::time::Duration;
 
@@ -26,11 +27,23 @@ const LEASE: Duration = Duration::from_millis(400);
 /// What may come on top of the lease: one poll, in virtual time nothing.
 const SLACK: Duration = Duration::from_millis(1);
 
+/// Asks to drive, again where the network was so slow that the lease would have been over before it began.
+fn drive(world: &mut dyn World, manager: &Unit) {
+    let mut asked = Err(Error::Expired);
+    for _ in 0..10 {
+        asked = world.ask(manager, "agv", "drive", &mut number("n", 1));
+        if asked != Err(Error::Expired) {
+            break;
+        }
+    }
+    assert_eq!(asked, Ok(()));
+}
+
 /// An AGV that drives because its manager wants it.
 fn driving(world: &mut dyn World) -> (Service, Unit, Unit) {
     let service = Service::new("drive(n: int[1])").lease(LEASE);
     let (manager, agv) = pair(world, &service);
-    assert_eq!(world.ask(&manager, "agv", "drive", &mut number("n", 1)), Ok(()));
+    drive(world, &manager);
     assert!(agv.lease_is_live("drive"));
     (service, manager, agv)
 }
@@ -130,7 +143,7 @@ fn what_is_finished_needs_no_safe_hook(world: &mut dyn World) {
     let manager = world.add(Spec::manager("manager", 1));
     let agv = world.add(Spec::agv("agv", 7).service(&service));
     met(world, &manager, "agv", "drive");
-    assert_eq!(world.ask(&manager, "agv", "drive", &mut number("n", 1)), Ok(()));
+    drive(world, &manager);
     agv.end_lease("drive");
     assert!(!agv.lease_is_live("drive"));
     let finished = |event: &Seen| *event == Seen::LeaseEnded("drive".to_owned(), false);

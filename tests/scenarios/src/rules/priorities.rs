@@ -5,9 +5,9 @@ use cara_core::error::ServiceError;
 use cara_core::services::unit::RequestOptions;
 use cara_sim::Path;
 
-use super::pair;
+use super::met;
 use crate::scenario::scenarios;
-use crate::{Fault, Service, World, millis, secs, text};
+use crate::{Fault, Service, Spec, World, millis, secs, text};
 
 scenarios![
     high_goes_before_normal_before_low: "73", Own, [Path], ["bandwidth", "sorted"];
@@ -25,8 +25,13 @@ fn ran(world: &mut dyn World, classes: [Option<Priority>; 3]) -> Vec<i64> {
         diary.note(parameters.variable::<i64>("n").map_err(|_| ServiceError::BadResults)?);
         Ok(())
     });
-    let (manager, agv) = pair(world, &service);
-    agv.change(|limits| limits.calls_per_peer = 60);
+    let manager = world.add(Spec::manager("manager", 1));
+    let agv = Spec::agv("agv", 7).service(&service).limits(|limits| {
+        limits.calls_per_peer = 60;
+        limits.message_size = 32 * 1_024;
+    });
+    let agv = world.add(agv);
+    met(world, &manager, "agv", "store");
     world.run_for(millis(500));
     let bits = 64_000 + world.random(64_000);
     world.fault(Fault::Path(&manager, &agv, Path::LAN.bits_per_second(bits)));
