@@ -73,7 +73,6 @@ fn restart(stage: &Stage, manager: &mut Process, agv: &mut Process) -> Result<()
     *agv = stage.agv(2)?;
     stage.tell("agv-2 is started again");
     stage.heard(&manager.expect("joined agv-2/12", STEP)?, manager);
-    manager.expect("new function list of agv-2/12", STEP)?;
     let after = epoch(&stage.command(manager, "units", "1 is agv-2/12, epoch")?)?;
     ensure!(before != after, "agv-2 restarted and has the same epoch {after}");
     stage.command(manager, "pos_info 1", "= position [0, 0]")?;

@@ -2,11 +2,14 @@
 
 use std::fmt::Write;
 use std::io::BufRead;
+use std::time::Duration;
 
 use anyhow::{Context, Result, anyhow, bail};
 use cara_examples::say;
 use cara_std::{CommunicationSystem, Parameters, Peer};
 
+/// How long an s_unit may take to tell its functions.
+const PATIENCE: Duration = Duration::from_secs(2);
 const HELP: &str =
     "units | functions N | pos_info N | go_to N X Y | release N | battery N | stop N | quit; N is an s_unit's index";
 
@@ -55,7 +58,10 @@ fn answer(agv_manager: &CommunicationSystem, words: &[&str]) -> Result<String> {
 
 fn s_unit(agv_manager: &CommunicationSystem, index: &str) -> Result<Peer> {
     let index: usize = index.parse().context("the index is a number")?;
-    agv_manager.s_units().into_iter().nth(index).ok_or_else(|| anyhow!("no s_unit has the index {index}"))
+    let agv = agv_manager.s_units().into_iter().nth(index).ok_or_else(|| anyhow!("no s_unit has the index {index}"))?;
+    // One that has just come may not have told its functions yet.
+    let _ = agv.is_connected() && agv.wait_for_function("go_to", PATIENCE);
+    Ok(agv)
 }
 
 fn functions(agv: &Peer) -> String {
