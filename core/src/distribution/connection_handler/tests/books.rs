@@ -1,0 +1,188 @@
+//! Whatever a port and its peers do, the books agree: a plain model of the links beside the node.
+
+use std::collections::BTreeMap;
+
+use proptest::prelude::*;
+
+use super::*;
+
+const LINKS: u16 = 8;
+const MAXIMUM: u16 = 3;
+
+#[derive(Clone, Copy, Debug)]
+enum Step {
+    /// A peer of this number and life says hello on a new link.
+    Hello { peer: u8, life: u64 },
+    /// The n-th open link ends.
+    End(prop::sample::Index),
+    /// The n-th open link answers a challenge, whether it was asked or not.
+    Answer(prop::sample::Index),
+    /// A peer that this unit dials is heard.
+    Heard(u8),
+    /// Time passes.
+    Wait(u64),
+}
+
+fn step() -> impl Strategy<Value = Step> {
+    prop_oneof![
+        3 => (0u8..6, 1u64..3).prop_map(|(peer, life)| Step::Hello { peer, life }),
+        2 => any::<prop::sample::Index>().prop_map(Step::End),
+        1 => any::<prop::sample::Index>().prop_map(Step::Answer),
+        1 => (0u8..6).prop_map(Step::Heard),
+        2 => (0u64..2_000).prop_map(Step::Wait),
+    ]
+}
+
+fn peer(number: u8, life: u64) -> NodeConfig {
+    let id = u32::from(number) + 3;
+    let config = if number.is_multiple_of(2) { m_unit("m", id + 10) } else { s_unit("s", id) };
+    NodeConfig { epoch: Epoch(life), ..config }
+}
+
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Open {
+    Dialed,
+    Waiting,
+    Joined,
+}
+
+/// A port: which links are open, whose they are, and how far they are.
+struct Port {
+    node: Node<Boxed>,
+    now: Instant,
+    open: BTreeMap<u16, (u8, Open)>,
+}
+
+impl Port {
+    fn free(&self) -> Option<u16> {
+        (0..LINKS).find(|link| !self.open.contains_key(link))
+    }
+
+    fn step(&mut self, step: Step) {
+        match step {
+            Step::Hello { peer: number, life } => {
+                let dialed = self.open.iter().find(|(_, open)| **open == (number, Open::Dialed)).map(|(link, _)| *link);
+                if let Some(link) = dialed.or_else(|| self.free()) {
+                    self.hello(link, number, life);
+                }
+            }
+            Step::End(index) => {
+                if let Some(link) = self.choose(index) {
+                    self.end(link);
+                }
+            }
+            Step::Answer(index) => {
+                if let Some(link) = self.choose(index) {
+                    let action = self.node.challenge_answered(self.now, LinkId(link));
+                    self.act(action);
+                }
+            }
+            Step::Heard(number) => {
+                let bytes = announce_bytes(&announce_of(&peer(number, 1), self.now.as_micros() as u32, 0));
+                self.node.datagram(self.now, address(u32::from(number), 7_001), &bytes);
+            }
+            Step::Wait(millis) => self.now = self.now + Duration::from_millis(millis),
+        }
+        while let Some(action) = self.node.poll(self.now, &mut Outbox::default()) {
+            self.act(Some(action));
+        }
+        assert!(self.node.next_deadline() > self.now);
+        self.check();
+    }
+
+    fn choose(&self, index: prop::sample::Index) -> Option<u16> {
+        let links: Vec<_> = self.open.keys().copied().collect();
+        (!links.is_empty()).then(|| links[index.index(links.len())])
+    }
+
+    fn hello(&mut self, link: u16, number: u8, life: u64) {
+        let joined = self.joined(number);
+        let hello = hello_of(&peer(number, life));
+        match self.node.admit(self.now, LinkId(link), address(u32::from(number), 40_000), &hello) {
+            Admission::Accept => {
+                assert_eq!(joined, None, "a second link of one identity was taken");
+                self.open.insert(link, (number, Open::Joined));
+            }
+            Admission::Challenge { old } => {
+                assert_eq!(joined, Some(old.0));
+                self.open.insert(link, (number, Open::Waiting));
+            }
+            Admission::Refuse(_) => {
+                self.open.insert(link, (number, Open::Dialed));
+                self.end(link);
+            }
+        }
+    }
+
+    fn joined(&self, number: u8) -> Option<u16> {
+        self.open.iter().find(|(_, open)| **open == (number, Open::Joined)).map(|(link, _)| *link)
+    }
+
+    fn end(&mut self, link: u16) {
+        self.open.remove(&link);
+        let action = self.node.left(self.now, LinkId(link), CloseReason::Reset);
+        self.act(action);
+    }
+
+    fn act(&mut self, action: Option<Action>) {
+        match action {
+            None => {}
+            Some(Action::Dial { identity, .. }) => {
+                let number = (0..6).find(|number| Some(peer(*number, 1).identity) == identity).unwrap();
+                assert_eq!(self.joined(number), None, "a connected node is dialled");
+                match self.free() {
+                    Some(link) => {
+                        self.open.insert(link, (number, Open::Dialed));
+                        self.node.dialing(identity.as_ref(), LinkId(link));
+                    }
+                    None => self.node.dial_failed(self.now, identity.as_ref()),
+                }
+            }
+            Some(Action::Supersede { old, new, .. }) => {
+                assert_eq!(self.open[&old.0].1, Open::Joined);
+                self.take(new);
+                self.end(old.0);
+            }
+            Some(Action::Admit { new }) => self.take(new),
+            Some(Action::Refuse { new, .. }) => {
+                assert_eq!(self.open[&new.0].1, Open::Waiting);
+                self.end(new.0);
+            }
+        }
+    }
+
+    fn take(&mut self, new: LinkId) {
+        let open = self.open.get_mut(&new.0).unwrap();
+        assert_eq!(open.1, Open::Waiting, "only who waits is taken");
+        open.1 = Open::Joined;
+    }
+
+    fn check(&self) {
+        let joined: Vec<_> = self.open.iter().filter(|(_, open)| open.1 == Open::Joined).collect();
+        for (link, (number, _)) in &joined {
+            let known = self.node.node_of(LinkId(**link)).unwrap();
+            assert_eq!((&known.identity, known.link()), (&peer(*number, 1).identity, Some(LinkId(**link))));
+        }
+        assert_eq!(self.node.connected(), joined.len());
+        assert_eq!(self.node.number_of_s_units() + self.node.number_of_m_units(), joined.len());
+        assert_eq!(self.node.nodes().filter(|known| known.is_joined()).count(), joined.len());
+        assert!(joined.len() <= usize::from(MAXIMUM));
+    }
+}
+
+proptest! {
+    #[test]
+    fn the_books_agree_whatever_happens(steps in prop::collection::vec(step(), 1..80), nodes in 4usize..8) {
+        let storage = NodeStorage { nodes: slice(nodes), order: slice(nodes), links: slice(LINKS.into()), findings: slice(2) };
+        let mut node = Node::new(at(0), m_unit(MANAGER, MANAGER_ID), storage);
+        node.set_maximum_nodes(MAXIMUM);
+        let mut port = Port { node, now: at(0), open: BTreeMap::new() };
+        for step in steps {
+            port.step(step);
+        }
+        while let Some(link) = port.open.keys().next().copied() {
+            port.end(link);
+        }
+        prop_assert_eq!(port.node.connected(), 0);
+    }
+}
