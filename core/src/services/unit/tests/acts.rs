@@ -138,10 +138,14 @@ impl Side {
 
     /// A request arrives that the other end did not send.
     pub(super) fn hear_request(&mut self, header: &RequestHeader, priority: Priority, block: &[u8]) {
-        let message = [&header.encode()[..], block].concat();
+        self.hear_message(&[&header.encode()[..], block].concat(), priority);
+    }
+
+    /// A message arrives that the other end did not send.
+    pub(super) fn hear_message(&mut self, message: &[u8], priority: Priority) {
         let cut = Cut { chunk: 1_024, overhead: 0 };
         let mut frames = vec![0; cut.framed_length(message.len())];
-        ChunkWriter::new(&mut frames, cut, priority, message.len()).unwrap().put(&message);
+        ChunkWriter::new(&mut frames, cut, priority, message.len()).unwrap().put(message);
         self.hear(&frames);
     }
 

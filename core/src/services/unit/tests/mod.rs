@@ -13,6 +13,7 @@ mod delivery;
 mod ends;
 mod gathering;
 mod hello;
+mod hostile;
 mod leases;
 mod limits;
 mod lists;
