@@ -10,7 +10,7 @@ use crate::{Fault, Service, World, millis, number, secs, text};
 
 scenarios![
     best_effort_loses_without_blocking: "delivery", Own, [Path], ["loss", "lost some"];
-    best_effort_arrives_in_one_datagram: "delivery, 3", Rough, [], ["DatagramsReceived"];
+    best_effort_arrives_in_one_datagram: "delivery, 3", Light, [], ["DatagramsReceived"];
     best_effort_is_for_short_messages_without_a_reply: "delivery", Rough, [], ["RequestsWithheld"];
 ];
 

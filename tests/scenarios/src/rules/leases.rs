@@ -15,11 +15,11 @@ scenarios![
     motion_ends_when_the_path_is_cut: "lease of a service", Light, [Partition, ExactTime],
         ["partition", "LeasesExpired"];
     motion_ends_when_the_link_freezes: "lease of a service", Light, [Freeze, ExactTime], ["freeze", "LeasesExpired"];
-    motion_ends_when_the_manager_stops: "lease of a service", Rough, [], ["stopped"];
+    motion_ends_when_the_manager_stops: "lease of a service", Light, [], ["stopped"];
     without_a_lease_motion_goes_on: "lease of a service (lease removed)", Rough, [], ["went on"];
     a_lease_that_is_not_renewed_ends: "lease of a service", Light, [], ["LeasesExpired"];
-    a_released_lease_stops_at_once: "lease of a service", Rough, [], ["stopped"];
-    what_is_finished_needs_no_safe_hook: "lease of a service", Rough, [], ["finished"];
+    a_released_lease_stops_at_once: "lease of a service", Light, [], ["stopped"];
+    what_is_finished_needs_no_safe_hook: "lease of a service", Light, [], ["finished"];
 ];
 
 /// The lease in this file.

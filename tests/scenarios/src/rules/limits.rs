@@ -90,9 +90,9 @@ fn few_buffers_delay_and_lose_nothing(world: &mut dyn World) {
             Err(other) => panic!("{other:?}{}", world.story()),
         }
     }
-    assert_eq!(service.diary().runs(), executed);
+    assert_eq!(service.diary().runs(), executed, "{}", world.story());
     // A refusal for want of buffers may itself want one; then both sides count it.
-    assert_eq!(manager.counted(LinkCounter::RepliesDropped), unanswered);
+    assert_eq!(manager.counted(LinkCounter::RepliesDropped), unanswered, "{}", world.story());
     if executed > 0 {
         world.reached("executed");
     }

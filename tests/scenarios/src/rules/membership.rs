@@ -5,7 +5,7 @@ use cara_core::error::{CloseReason, Refusal};
 
 use super::met;
 use crate::scenario::scenarios;
-use crate::{Fault, Seen, Service, Spec, World, millis, number, secs};
+use crate::{Fault, Seen, Service, Spec, Unit, World, millis, number, secs};
 
 scenarios![
     an_index_keeps_its_meaning_when_another_node_leaves: "47", Rough, [], ["agv came back"];
@@ -112,7 +112,8 @@ fn an_m_unit_has_m_units_and_s_units(world: &mut dyn World) {
 fn an_agv_finds_its_manager_at_a_new_address(world: &mut dyn World) {
     let (manager, agv) = super::pair(world, &Service::numbered("note"));
     world.fault(Fault::ChangeAddress(&manager));
-    world.wait("the loss is seen", || !agv.is_connected("manager") && !manager.is_connected("agv"), secs(30));
+    let lost = |unit: &Unit| unit.count(|event| matches!(event, Seen::Left(..))) > 0;
+    world.wait("the loss is seen", || lost(&agv) && lost(&manager), secs(30));
     met(world, &manager, "agv", "note");
     assert_eq!(world.ask(&manager, "agv", "note", &mut number("n", 1)), Ok(()));
 }

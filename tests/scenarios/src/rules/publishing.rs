@@ -21,7 +21,8 @@ fn published_to_one_is_hidden_from_others(world: &mut dyn World) {
     let manager = world.add(Spec::manager("manager", 1));
     let one = world.add(Spec::agv("one", 1));
     let other = world.add(Spec::agv("other", 2));
-    world.wait("both have joined", || manager.number_of_s_units() == 2, secs(40));
+    let joined = || manager.number_of_s_units() == 2 && other.is_connected("manager");
+    world.wait("both have joined", joined, secs(40));
     let call_mechanic = Service::new("call_mechanic()");
     manager.add_service(&call_mechanic).expect("there is room");
     manager.publish_to("one").expect("it can be published");
