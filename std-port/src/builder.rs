@@ -9,15 +9,13 @@ use cara_core::distribution::function_list::{Entry, FunctionList};
 use cara_core::distribution::hello::Manager;
 use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
 use cara_core::error::Error;
-use cara_core::host::secure::{Plain, Secure};
 use cara_core::services::publications::Publications;
-use cara_core::services::unit::buffer_bytes;
 use core::net::SocketAddr;
 
 use crate::clock::Clock;
 use crate::communication_system::CommunicationSystem;
 use crate::config::Capacities;
-use crate::engine::{Engine, EngineParts, NodeCell};
+use crate::engine::{Engine, EngineParts, NodeCell, message_buffer_bytes};
 use crate::pool::MessagePool;
 use crate::storage::{filled, filled_with};
 use crate::sys::datagram::Datagrams;
@@ -169,10 +167,10 @@ impl<T: Send + 'static> Builder<T> {
             Publications::new(filled(capacities.functions, false), filled(capacities.published_to_one, None));
         let functions =
             FunctionList::new(filled_with(capacities.functions, Entry::empty), filled(capacities.signature_bytes, 0));
-        let size = 2 * buffer_bytes(self.constraints.message_size, Plain::OVERHEAD);
+        let size = message_buffer_bytes(&self.constraints);
         let parts = EngineParts {
             clock,
-            node: NodeCell::new(node, publications, capacities),
+            node: NodeCell::new(node, publications, capacities, nodes + REMEMBERED_NODES),
             functions,
             pool: MessagePool::new(size, capacities.message_buffers, KEPT_BUFFERS),
             state: self.state,

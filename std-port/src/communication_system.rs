@@ -236,8 +236,7 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     /// Changes the constraints; peers are told. [`Error::BadConstraint`] for values that this unit cannot hold.
     pub fn set_constraints(&self, constraints: Constraints) -> Result<(), Error> {
         builder::check(&constraints)?;
-        self.engine().set_constraints(constraints);
-        Ok(())
+        self.engine().set_constraints(constraints)
     }
 
     /// What no call returns: joined, left, failed. A subscriber that does not keep up loses events.

@@ -147,8 +147,7 @@ impl<T: Send + 'static> Unit<T> {
     /// Changes the constraints; the manager is told.
     pub fn set_constraints(&self, constraints: Constraints) -> Result<(), Error> {
         builder::check(&constraints)?;
-        self.engine().set_constraints(constraints);
-        Ok(())
+        self.engine().set_constraints(constraints)
     }
 
     /// What no call returns: joined, left, failed. A subscriber that does not keep up loses events.

@@ -27,6 +27,8 @@ pub(crate) struct NodeCell {
     pub(crate) node: Node<Boxed>,
     pub(crate) publications: Publications<Boxed>,
     pub(crate) capacities: Capacities,
+    /// Nodes that the tables have room for.
+    room: usize,
     serial: u32,
 }
 
@@ -34,12 +36,21 @@ pub(crate) struct NodeCell {
 struct Dialed<'i>(Option<&'i Identity>);
 
 impl NodeCell {
-    pub(crate) fn new(node: Node<Boxed>, publications: Publications<Boxed>, capacities: Capacities) -> Self {
-        Self { node, publications, capacities, serial: 0 }
+    pub(crate) fn new(
+        node: Node<Boxed>,
+        publications: Publications<Boxed>,
+        capacities: Capacities,
+        room: usize,
+    ) -> Self {
+        Self { node, publications, capacities, room, serial: 0 }
     }
 
-    pub(crate) fn set_constraints(&mut self, constraints: Constraints) {
+    pub(crate) fn set_constraints(&mut self, constraints: Constraints) -> Result<(), Error> {
+        if usize::from(constraints.maximum_nodes) > self.room {
+            return Err(Error::BadConstraint);
+        }
         self.node.set_constraints(constraints);
+        Ok(())
     }
 
     /// Longest block of parameters that this unit takes.

@@ -30,8 +30,8 @@ use cara_core::distribution::function_list::FunctionList;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error};
 use cara_core::host::mailman::LinkId;
-use cara_core::host::secure::Plain;
-use cara_core::services::unit::{Call, Event, Session};
+use cara_core::host::secure::{Plain, Secure};
+use cara_core::services::unit::{Call, Event, Session, buffer_bytes};
 use cara_core::services::{Context, requests::CallId};
 use cara_core::time::Instant;
 
@@ -74,6 +74,8 @@ pub(crate) struct Engine<T: 'static> {
     pool_waker: Waker,
     /// Links on which a call may begin that nobody runs yet.
     ready: Mutex<VecDeque<LinkId>>,
+    /// Longest block of parameters that this unit takes.
+    longest_message: AtomicUsize,
     /// Pool threads that wait for something to do.
     idle: AtomicUsize,
     workers: AtomicUsize,
@@ -121,6 +123,7 @@ pub(crate) struct EngineParts<T: 'static> {
 
 impl<T: Send + 'static> Engine<T> {
     pub(crate) fn new(parts: EngineParts<T>) -> std::io::Result<Arc<Self>> {
+        let longest_message = AtomicUsize::new(parts.node.longest_message());
         let (epoll, clock_waker, pool_waker) = (Epoll::new()?, Waker::new()?, Waker::new()?);
         Ok(Arc::new_cyclic(|this| Self {
             this: this.clone(),
@@ -138,6 +141,7 @@ impl<T: Send + 'static> Engine<T> {
             clock_waker,
             pool_waker,
             ready: Mutex::new(VecDeque::new()),
+            longest_message,
             idle: AtomicUsize::new(0),
             workers: AtomicUsize::new(0),
             stays: Mutex::new(Vec::new()),
@@ -339,14 +343,23 @@ impl<T: Send + 'static> Engine<T> {
         lock(&self.subscribers).push(subscriber);
     }
 
-    /// Changes the constraints of the unit and tells every peer.
-    pub(crate) fn set_constraints(&self, constraints: Constraints) {
-        lock(&self.node).set_constraints(constraints);
+    /// Changes the constraints of the unit and tells every peer. [`Error::BadConstraint`] for more nodes than the tables
+    /// have room for.
+    pub(crate) fn set_constraints(&self, constraints: Constraints) -> Result<(), Error> {
+        let longest = {
+            let mut cell = lock(&self.node);
+            cell.set_constraints(constraints)?;
+            cell.longest_message()
+        };
+        // Buffers first: peers send longer messages as soon as they are told.
+        self.pool.resize(message_buffer_bytes(&constraints));
+        self.longest_message.store(longest, Ordering::Release);
         for link in self.each_link() {
             let mut state = link.lock();
             self.with(&link, &mut state, |session, cx| session.set_constraints(cx, constraints));
             self.settle(&link, state);
         }
+        Ok(())
     }
 
     /// Ends every link in an orderly way and all threads. Within a handler it returns before the threads have ended.
@@ -387,6 +400,11 @@ impl<T: Send + 'static> Engine<T> {
     fn this(&self) -> Option<Arc<Self>> {
         self.this.upgrade()
     }
+}
+
+/// Bytes of a buffer of the pool.
+pub(crate) fn message_buffer_bytes(constraints: &Constraints) -> usize {
+    2 * buffer_bytes(constraints.message_size, Plain::OVERHEAD)
 }
 
 /// What one step of feeding led to.

@@ -74,6 +74,7 @@ impl<T: Send + 'static> Engine<T> {
     fn await_call(&self, link: &Arc<LinkCell>, turn: Turn, worker: &mut Worker) -> Option<Call> {
         loop {
             let received = link.stream.receive(&mut worker.buffer, Wait::Slice);
+            worker.fit(self.longest_message());
             let mut state = link.lock();
             let call = match received {
                 Received::Bytes(count) => {

@@ -29,6 +29,22 @@ pub(super) struct Worker {
     events: Events,
     pub(super) buffer: Vec<u8>,
     pub(super) arguments: Box<ParametersView>,
+    /// The longest message that `arguments` hold.
+    longest: usize,
+}
+
+impl Worker {
+    fn new(longest: usize) -> Self {
+        Self { events: Events::new(1), buffer: vec![0; READ_BYTES], arguments: arena(longest), longest }
+    }
+
+    /// The limit may have changed since the last call.
+    pub(super) fn fit(&mut self, longest: usize) {
+        if self.longest != longest {
+            self.arguments = arena(longest);
+            self.longest = longest;
+        }
+    }
 }
 
 impl<T: Send + 'static> Engine<T> {
@@ -61,9 +77,12 @@ impl<T: Send + 'static> Engine<T> {
         self.idle.load(Ordering::Acquire) > 0 || self.this().is_some_and(|engine| engine.start_worker())
     }
 
+    pub(super) fn longest_message(&self) -> usize {
+        self.longest_message.load(Ordering::Acquire)
+    }
+
     fn work(self: Arc<Self>) {
-        let message = lock(&self.node).longest_message();
-        let mut worker = Worker { events: Events::new(1), buffer: vec![0; READ_BYTES], arguments: arena(message) };
+        let mut worker = Worker::new(self.longest_message());
         while !self.is_stopping() {
             self.idle.fetch_add(1, Ordering::AcqRel);
             let waited = self.epoll.wait(&mut worker.events, None);
@@ -72,6 +91,7 @@ impl<T: Send + 'static> Engine<T> {
                 tracing::error!(%error, "waiting for links failed");
                 return;
             }
+            worker.fit(self.longest_message());
             let ready = worker.events.iter().next();
             match ready {
                 // While the unit stops, the waker stays set, so that every thread wakes.

@@ -1,0 +1,222 @@
+//! What runs a service: its forms, in both roles, and what happens when it panics or takes long.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::{Duration, Instant};
+
+use cara_std::{Call, Error, Parameters, ParametersView, Priority, RequestOptions, Role, ServiceError, ServiceOptions};
+
+use crate::support::{Gate, ask, fleet, meet, number, pair, publish, service, system, unit, until, value};
+
+fn free(mut parameters: Parameters) -> Parameters {
+    let doubled = 2 * value(&parameters);
+    parameters.set_value("number", doubled).unwrap();
+    parameters
+}
+
+fn method(state: &mut i64, mut parameters: Parameters) -> Parameters {
+    *state += value(&parameters);
+    parameters.set_value("number", *state).unwrap();
+    parameters
+}
+
+fn in_place(call: &Call, view: &mut ParametersView) -> Result<(), ServiceError> {
+    let sign = if call.caller.role() == Role::MUnit { 1 } else { -1 };
+    let number = sign * value(view);
+    view.set_value("number", number).map_err(|_| ServiceError::BadResults)
+}
+
+fn method_in_place(state: &mut i64, _: &Call, view: &mut ParametersView) -> Result<(), ServiceError> {
+    if value(view) == 0 {
+        return Err(ServiceError::Failed(9));
+    }
+    view.set_value("number", *state).map_err(|_| ServiceError::BadResults)
+}
+
+#[test]
+fn all_four_forms_serve_in_both_roles() {
+    let fleet = fleet();
+    let manager = system(fleet).state(100_i64).build_system().unwrap();
+    let agv = unit("agv", 7, fleet).state(200_i64).build_unit().unwrap();
+    for list in [manager.my_function_list(), agv.my_function_list()] {
+        list.add_function("free", &number(0), free).unwrap();
+        list.add_function("method", &number(0), method).unwrap();
+        list.add_function("in_place", &number(0), in_place).unwrap();
+        list.add_function("method_in_place", &number(0), method_in_place).unwrap();
+    }
+    let (peer, back) = meet(&manager, &agv);
+    for (peer_free, sign, start) in [(ask(&peer, "free", 21), 1, 200), (ask(&back, "free", 21), -1, 100)] {
+        assert_eq!(peer_free, Ok(42));
+        let call = |function: &str, number: i64| match sign {
+            1 => ask(&peer, function, number),
+            _ => ask(&back, function, number),
+        };
+        assert_eq!(call("method", 5), Ok(start + 5));
+        assert_eq!(call("method", 5), Ok(start + 10));
+        assert_eq!(call("in_place", 7), Ok(7 * sign));
+        assert_eq!(call("method_in_place", 1), Ok(start + 10));
+        assert_eq!(call("method_in_place", 0), Err(Error::Service(ServiceError::Failed(9))));
+    }
+    assert_eq!(manager.with_state(|state| *state), Ok(110));
+    assert_eq!(agv.with_state(|state| *state), Ok(210));
+}
+
+#[test]
+fn a_handler_that_panics_harms_nobody_else() {
+    let fleet = fleet();
+    let manager = system(fleet).build_system().unwrap();
+    let agv = unit("agv", 7, fleet).state(0_i64).build_unit().unwrap();
+    let list = agv.my_function_list();
+    list.add_function("free", &number(0), |_: &Call, _: &mut ParametersView| panic!("as the test wants")).unwrap();
+    list.add_function("method", &number(0), |_: &mut i64, _: Parameters| -> Parameters { panic!("likewise") }).unwrap();
+    list.add_function("echo", &number(0), service(|number| number)).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    for round in 0..20 {
+        assert_eq!(ask(&peer, "free", round), Err(Error::Service(ServiceError::Panicked)));
+        assert_eq!(ask(&peer, "method", round), Err(Error::Service(ServiceError::Panicked)));
+        assert_eq!(ask(&peer, "echo", round), Ok(round));
+    }
+    assert!(agv.with_state(|_| ()).is_ok());
+}
+
+/// One handler of one link hangs; everything else goes on, keep-alives included.
+#[test]
+fn a_slow_handler_delays_nobody_else() {
+    let fleet = fleet();
+    let constraints =
+        cara_std::Constraints { keep_alive: cara_std::Duration::from_millis(100), ..cara_std::Constraints::M_UNIT };
+    let manager = system(fleet).constraints(constraints).build_system().unwrap();
+    let gate = Arc::new(Gate::default());
+    let at_gate = gate.clone();
+    let blocks = service(move |number| {
+        at_gate.pass();
+        number
+    });
+    manager.my_function_list().add_function("slow", &number(0), blocks).unwrap();
+    manager.my_function_list().add_function("quick", &number(0), service(|number| number + 1)).unwrap();
+    let units: Vec<_> = (0..2)
+        .map(|index| {
+            let constraints = cara_std::Constraints { maximum_nodes: 1, ..constraints };
+            unit(&format!("agv{index}"), index, fleet).constraints(constraints).build_unit().unwrap()
+        })
+        .collect();
+    let [first, second] = [&units[0], &units[1]].map(|unit| meet(&manager, unit));
+    let options = RequestOptions { timeout: Some(cara_std::Duration::from_secs(20)), ..Default::default() };
+    std::thread::scope(|scope| {
+        let slow = scope.spawn(|| {
+            let mut parameters = number(1);
+            first.1.block_request_with("slow", &mut parameters, &options)
+        });
+        until("the slow handler runs", || gate.came() == 1);
+        // Longer than the three keep-alives after which a silent link is lost.
+        let began = Instant::now();
+        let mut worst = Duration::ZERO;
+        while began.elapsed() < Duration::from_millis(600) {
+            let asked = Instant::now();
+            assert_eq!(ask(&second.1, "quick", 1), Ok(2), "another link");
+            let high = RequestOptions { priority: Some(Priority::High), ..Default::default() };
+            let mut parameters = number(4);
+            assert_eq!(first.1.block_request_with("quick", &mut parameters, &high), Ok(()), "the same link");
+            assert_eq!(value(&parameters), 5);
+            worst = worst.max(asked.elapsed());
+        }
+        assert!(worst < Duration::from_secs(1), "{worst:?}");
+        assert!(first.0.is_connected() && second.0.is_connected());
+        gate.open();
+        assert_eq!(slow.join().unwrap(), Ok(()));
+    });
+}
+
+/// An emergency is served while a handler of each other class is busy.
+#[test]
+fn an_emergency_does_not_wait_for_other_handlers() {
+    let (manager, agv) = pair();
+    let gate = Arc::new(Gate::default());
+    let stops = Arc::new(AtomicUsize::new(0));
+    let (at_gate, stopped) = (gate.clone(), stops.clone());
+    let list = agv.my_function_list();
+    list.add_function(
+        "work",
+        &number(0),
+        service(move |number| {
+            at_gate.pass();
+            number
+        }),
+    )
+    .unwrap();
+    let definition = "stop(number: int[1]) -> (number: int[1])".parse().unwrap();
+    let stop = service(move |number| {
+        stopped.fetch_add(1, Ordering::SeqCst);
+        number
+    });
+    list.add_service(&definition, ServiceOptions::new().priority(Priority::Emergency), stop).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    let classes = [Priority::High, Priority::Normal, Priority::Low];
+    for priority in classes {
+        let timeout = Some(cara_std::Duration::from_secs(20));
+        let options = RequestOptions { priority: Some(priority), timeout, ..Default::default() };
+        peer.request_with("work", &number(1), &options).unwrap();
+        peer.request_with("work", &number(1), &options).unwrap();
+    }
+    until("all are busy", || gate.came() == classes.len());
+    let asked = Instant::now();
+    assert_eq!(ask(&peer, "stop", 3), Ok(3));
+    assert!(asked.elapsed() < Duration::from_millis(500), "{:?}", asked.elapsed());
+    assert_eq!(stops.load(Ordering::SeqCst), 1, "it came twice and ran once");
+    gate.open();
+    until("those behind run as well", || gate.came() == 2 * classes.len());
+}
+
+/// The first call of a burst is quick, the second is not: the thread that serves them must not keep the stream.
+#[test]
+fn a_burst_that_ends_slowly_leaves_the_stream_to_others() {
+    let (manager, agv) = pair();
+    let gate = Arc::new(Gate::default());
+    let at_gate = gate.clone();
+    let list = agv.my_function_list();
+    list.add_function("quick", &number(0), service(|number| number)).unwrap();
+    list.add_function(
+        "slow",
+        &number(0),
+        service(move |number| {
+            at_gate.pass();
+            number
+        }),
+    )
+    .unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    for round in 0..50 {
+        // A thread of the pool comes to stay.
+        for _ in 0..20 {
+            assert_eq!(ask(&peer, "quick", round), Ok(round));
+        }
+        peer.request("quick", &number(1)).unwrap();
+        peer.request("quick", &number(2)).unwrap();
+        peer.request("quick", &number(3)).unwrap();
+        peer.flush().unwrap();
+    }
+    peer.request("quick", &number(1)).unwrap();
+    peer.request("slow", &number(2)).unwrap();
+    peer.flush().unwrap();
+    until("the slow one runs", || gate.came() == 1);
+    let options = RequestOptions { priority: Some(Priority::High), ..Default::default() };
+    let asked = Instant::now();
+    let mut parameters = number(5);
+    assert_eq!(peer.block_request_with("quick", &mut parameters, &options), Ok(()));
+    assert!(asked.elapsed() < Duration::from_millis(500), "{:?}", asked.elapsed());
+    gate.open();
+}
+
+#[test]
+fn a_changed_function_is_stale_until_it_is_published_again() {
+    let (manager, agv) = pair();
+    agv.my_function_list().add_function("f", &number(0), service(|number| number)).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    let definition = "f(number: int[1]) -> (number: int[1])".parse().unwrap();
+    agv.my_function_list().replace(&definition, ServiceOptions::new(), service(|number| -number)).unwrap();
+    assert_eq!(ask(&peer, "f", 1), Err(Error::StaleFunction));
+    publish(&manager, &agv);
+    until("the new one is known", || ask(&peer, "f", 1) == Ok(-1));
+    agv.my_function_list().remove("f").unwrap();
+    until("it is gone", || ask(&peer, "f", 1) == Err(Error::UnknownFunction));
+}

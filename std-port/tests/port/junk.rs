@@ -1,0 +1,107 @@
+//! Bytes that mean nothing, on every port of a unit: nothing changes.
+
+use std::io::{Read, Write};
+use std::net::{Ipv4Addr, SocketAddr, TcpStream, UdpSocket};
+use std::time::Duration;
+
+use cara_std::Builder;
+
+use crate::support::{PATIENCE, ask, counter, fleet, meet, number, service, system, unit, until};
+
+/// Pseudo-random bytes from a fixed start.
+struct Noise(u64);
+
+impl Noise {
+    fn next(&mut self) -> u64 {
+        self.0 ^= self.0 << 13;
+        self.0 ^= self.0 >> 7;
+        self.0 ^= self.0 << 17;
+        self.0
+    }
+
+    fn bytes(&mut self) -> Vec<u8> {
+        let length = 1 + self.next() as usize % 700;
+        let mut bytes: Vec<u8> = (0..length).map(|_| self.next() as u8).collect();
+        // Some of it looks like a datagram or a hello at first.
+        if self.next() % 2 == 0 {
+            let magic = b"CARp\x01";
+            let length = magic.len().min(bytes.len());
+            bytes[..length].copy_from_slice(&magic[..length]);
+        }
+        bytes
+    }
+}
+
+/// The TCP port of a manager is where a vehicle's link leads.
+fn stream_port(agv: &cara_std::Unit) -> SocketAddr {
+    agv.manager().unwrap().address().unwrap()
+}
+
+/// The own UDP ports of this process, from the system's table.
+fn datagram_ports() -> Vec<u16> {
+    let table = std::fs::read_to_string("/proc/self/net/udp").unwrap();
+    let ports = table.lines().skip(1).filter_map(|line| line.split_whitespace().nth(1)?.rsplit(':').next());
+    ports.filter_map(|port| u16::from_str_radix(port, 16).ok()).collect()
+}
+
+#[test]
+fn junk_on_every_port_changes_nothing() {
+    let fleet = fleet();
+    let discovery = 40_000 + (fleet % 20_000) as u16;
+    let with_port = |builder: Builder<()>| builder.discovery_port(discovery);
+    let manager = with_port(system(fleet)).build_system().unwrap();
+    let agv = with_port(unit("agv", 7, fleet)).build_unit().unwrap();
+    agv.my_function_list().add_function("echo", &number(0), service(|number| number)).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    let stream_port = stream_port(&agv);
+    let mut noise = Noise(0x9e37_79b9_7f4a_7c15);
+    let socket = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
+    let mut ports = datagram_ports();
+    ports.push(discovery);
+    let mut half_open = Vec::new();
+    for round in 0..60 {
+        for port in &ports {
+            // A port that is closed meanwhile refuses; that harms only this socket.
+            let _ = socket.send_to(&noise.bytes(), (Ipv4Addr::LOCALHOST, *port));
+        }
+        let mut stream = TcpStream::connect(stream_port).unwrap();
+        if round % 3 != 0 {
+            let _ = stream.write_all(&noise.bytes());
+        }
+        if round % 5 == 0 {
+            half_open.push(stream);
+        }
+        assert_eq!(ask(&peer, "echo", round), Ok(round));
+    }
+    assert!(counter(&peer.counters(), "CallsTimedOut") == 0 && peer.is_connected());
+    assert_eq!(manager.s_units().len(), 1);
+    // Who says nothing is shown out.
+    for mut stream in half_open {
+        stream.set_read_timeout(Some(PATIENCE)).unwrap();
+        let mut rest = Vec::new();
+        match stream.read_to_end(&mut rest) {
+            Ok(_) => {}
+            Err(error) => assert_eq!(error.kind(), std::io::ErrorKind::ConnectionReset, "{error}"),
+        }
+    }
+    assert_eq!(ask(&peer, "echo", 5), Ok(5));
+}
+
+/// More half-open connections than there is room for: those that hold a link keep it, and units still come.
+#[test]
+fn half_open_connections_do_not_keep_units_out_for_ever() {
+    let fleet = fleet();
+    let manager = system(fleet).build_system().unwrap();
+    let first = unit("first", 1, fleet).build_unit().unwrap();
+    first.my_function_list().add_function("echo", &number(0), service(|number| number)).unwrap();
+    let (peer, _) = meet(&manager, &first);
+    let port = stream_port(&first);
+    let silent: Vec<_> =
+        (0..200).filter_map(|_| TcpStream::connect_timeout(&port, Duration::from_secs(5)).ok()).collect();
+    assert!(silent.len() > 150);
+    assert_eq!(ask(&peer, "echo", 5), Ok(5));
+    let second = unit("second", 2, fleet).build_unit().unwrap();
+    second.start().unwrap();
+    until("the second comes", || manager.number_of_s_units() == 2);
+    drop(silent);
+}

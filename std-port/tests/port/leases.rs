@@ -1,0 +1,169 @@
+//! Leases over real sockets: what was started stops when nobody wants it any more.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::{Duration, Instant};
+
+use cara_std::{CommunicationSystem, Error, LeaseWatch, Peer, RequestOptions, ServiceOptions, Unit, UnitEvent};
+
+use crate::support::{PATIENCE, fleet, meet, number, service, system, unit, until};
+
+const LEASE: Duration = Duration::from_millis(200);
+
+struct Vehicle {
+    manager: CommunicationSystem,
+    agv: Unit<i64>,
+    peer: Peer,
+    lease: LeaseWatch,
+    stops: Arc<AtomicUsize>,
+}
+
+/// A manager and a vehicle that offers `go_to` under a lease.
+fn vehicle() -> Vehicle {
+    let fleet = fleet();
+    let manager = system(fleet).build_system().unwrap();
+    let agv = unit("agv", 7, fleet).state(0_i64).build_unit().unwrap();
+    let stops = Arc::new(AtomicUsize::new(0));
+    let stopped = stops.clone();
+    let safe = move |speed: &mut i64| {
+        *speed = 0;
+        stopped.fetch_add(1, Ordering::SeqCst);
+    };
+    let go_to = |speed: &mut i64, mut parameters: cara_std::Parameters| {
+        *speed = 5;
+        parameters.set_value("number", *speed).unwrap();
+        parameters
+    };
+    let definition = "go_to(number: int[1]) -> (number: int[1])".parse().unwrap();
+    let lease =
+        agv.my_function_list().add_service(&definition, ServiceOptions::new().lease(LEASE, safe), go_to).unwrap();
+    agv.my_function_list().add_function("echo", &number(0), service(|number| number)).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    Vehicle { manager, agv, peer, lease, stops }
+}
+
+impl Vehicle {
+    fn go(&self, renew_lease: bool) {
+        assert!(!self.lease.is_live());
+        let options = RequestOptions { renew_lease, ..Default::default() };
+        self.peer.block_request_with("go_to", &mut number(1), &options).unwrap();
+        assert!(self.lease.is_live());
+        assert_eq!(self.speed(), 5);
+    }
+
+    fn speed(&self) -> i64 {
+        self.agv.with_state(|speed| *speed).unwrap()
+    }
+
+    fn stops(&self) -> usize {
+        self.stops.load(Ordering::SeqCst)
+    }
+
+    /// Stopped once, and not again.
+    fn assert_stopped(&self) {
+        until("the safe hook has run", || self.stops() == 1);
+        assert!(!self.lease.is_live());
+        assert_eq!(self.speed(), 0);
+    }
+}
+
+#[test]
+fn motion_goes_on_while_it_is_renewed_and_ends_when_it_is_released() {
+    let vehicle = vehicle();
+    vehicle.go(true);
+    let began = Instant::now();
+    while began.elapsed() < 4 * LEASE {
+        assert!(vehicle.lease.is_live());
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    assert_eq!((vehicle.stops(), vehicle.speed()), (0, 5));
+    let events = vehicle.agv.events();
+    vehicle.peer.release("go_to").unwrap();
+    vehicle.assert_stopped();
+    let told = events.recv_timeout(PATIENCE).unwrap();
+    assert!(matches!(told, UnitEvent::LeaseExpired { ref function, .. } if function == "go_to"), "{told:?}");
+    assert_eq!(vehicle.peer.release("no_such"), Err(Error::UnknownFunction));
+}
+
+#[test]
+fn without_renewal_motion_ends_with_the_lease() {
+    let vehicle = vehicle();
+    let events = vehicle.manager.events();
+    let began = Instant::now();
+    vehicle.go(false);
+    vehicle.assert_stopped();
+    let took = began.elapsed();
+    assert!(took >= LEASE && took < LEASE + Duration::from_secs(2), "{took:?}");
+    // The hook has run once, also after a second lease's time and with other work in between.
+    let mut parameters = number(4);
+    while began.elapsed() < 3 * LEASE {
+        vehicle.peer.block_request("echo", &mut parameters).unwrap();
+    }
+    assert_eq!(vehicle.stops(), 1);
+    drop(events);
+}
+
+#[test]
+fn a_manager_that_goes_away_stops_the_vehicle_at_once() {
+    let vehicle = vehicle();
+    vehicle.go(true);
+    let Vehicle { manager, peer, .. } = &vehicle;
+    assert!(peer.is_connected());
+    manager.stop();
+    vehicle.assert_stopped();
+    until("the vehicle knows", || !vehicle.agv.is_connected());
+    assert_eq!(vehicle.stops(), 1);
+}
+
+#[test]
+fn what_has_finished_ends_without_the_hook() {
+    let vehicle = vehicle();
+    let events = vehicle.manager.events();
+    vehicle.go(true);
+    vehicle.agv.my_function_list().end_lease("go_to");
+    assert!(!vehicle.lease.is_live());
+    loop {
+        if let UnitEvent::LeaseEnded { function, expired, .. } = events.recv_timeout(PATIENCE).unwrap() {
+            assert_eq!((function.as_str(), expired), ("go_to", false));
+            break;
+        }
+    }
+    assert_eq!((vehicle.stops(), vehicle.speed()), (0, 5));
+    vehicle.go(true);
+    vehicle.peer.release("go_to").unwrap();
+    vehicle.assert_stopped();
+}
+
+#[test]
+fn the_loss_of_the_manager_is_told_to_the_hook_once() {
+    let vehicle = vehicle();
+    let lost = Arc::new(AtomicUsize::new(0));
+    let told = lost.clone();
+    vehicle.agv.on_manager_lost(move |_| {
+        told.fetch_add(1, Ordering::SeqCst);
+    });
+    vehicle.manager.stop();
+    until("the hook has run", || lost.load(Ordering::SeqCst) == 1);
+    vehicle.agv.stop();
+    assert_eq!(lost.load(Ordering::SeqCst), 1);
+}
+
+/// The manager's process is gone without a goodbye: see `processes.rs` for the same with a kill. Here the method that
+/// moves is still running when the lease ends, and the hook comes right after it.
+#[test]
+fn a_hook_comes_right_after_a_method_that_holds_the_state() {
+    let vehicle = vehicle();
+    vehicle.go(false);
+    let agv = vehicle.agv.clone();
+    let stopped_inside = agv
+        .with_state(|speed| {
+            until("the lease has ended", || !vehicle.lease.is_live());
+            // The clock goes on meanwhile: the link is kept alive, and calls without the state are served.
+            assert_eq!(crate::support::ask(&vehicle.peer, "echo", 3), Ok(3));
+            *speed = 5;
+            vehicle.stops()
+        })
+        .unwrap();
+    assert_eq!(stopped_inside, 0);
+    vehicle.assert_stopped();
+}

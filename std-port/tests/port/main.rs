@@ -1,0 +1,18 @@
+//! The port over real sockets on loopback, one file per topic.
+//!
+//! Each test has a random fleet of its own, so that they run side by side. Waiting is waiting for a condition, with an
+//! end; nothing is assumed to have happened because time has passed.
+
+#[cfg(feature = "async")]
+mod asynchronous;
+mod callbacks;
+mod constraints;
+mod handlers;
+mod junk;
+mod leases;
+mod members;
+mod outcomes;
+mod processes;
+mod stopping;
+mod support;
+mod threads;

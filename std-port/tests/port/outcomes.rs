@@ -1,0 +1,176 @@
+//! How requests end: for all nodes, too soon, in time, too late, not at all.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use cara_std::{
+    CommunicationSystem, Constraints, Delivery, Error, Parameters, Peer, RequestOptions, ServiceError, Unit, UnitEvent,
+};
+
+use crate::support::{Gate, PATIENCE, ask, counter, fleet, meet, number, pair, service, system, unit, until, value};
+
+/// A manager and `count` s_units with a function `f`, which the last one fails.
+fn fleet_with_one_that_fails(count: u32) -> (CommunicationSystem, Vec<Unit>) {
+    let fleet = fleet();
+    let manager = system(fleet).build_system().unwrap();
+    manager.start().unwrap();
+    let units: Vec<_> = (0..count).map(|id| unit(&format!("agv{id}"), id, fleet).build_unit().unwrap()).collect();
+    for (id, agv) in units.iter().enumerate() {
+        let fails = id as u32 + 1 == count;
+        let f = move |_: &cara_std::Call, view: &mut cara_std::ParametersView| -> Result<(), ServiceError> {
+            let number = value(view) + id as i64;
+            if fails {
+                Err(ServiceError::Failed(4))
+            } else {
+                view.set_value("number", number).map_err(|_| ServiceError::BadResults)
+            }
+        };
+        agv.my_function_list().add_function("f", &number(0), f).unwrap();
+        agv.publish_my_function_list().unwrap();
+        agv.start().unwrap();
+    }
+    until("all have come", || manager.nodes_offering("f").len() == count as usize);
+    (manager, units)
+}
+
+#[test]
+fn a_request_to_all_has_an_outcome_for_each() {
+    let (manager, _units) = fleet_with_one_that_fails(3);
+    let outcomes = manager.block_request_all("f", &number(100), &RequestOptions::default());
+    assert_eq!(outcomes.len(), 3);
+    for (peer, outcome) in outcomes {
+        let expected =
+            if peer.id() == 2 { Err(Error::Service(ServiceError::Failed(4))) } else { Ok(100 + i64::from(peer.id())) };
+        assert_eq!(outcome.map(|parameters| value(&parameters)), expected, "{peer:?}");
+    }
+    assert!(manager.block_request_all("g", &number(1), &RequestOptions::default()).is_empty());
+}
+
+/// One that wants no replies: it comes back as an event what failed.
+#[test]
+fn a_request_to_all_without_waiting_reports_the_failure() {
+    let (manager, _units) = fleet_with_one_that_fails(3);
+    let events = manager.events();
+    let outcomes = manager.request_all("f", &number(100));
+    assert_eq!(outcomes.len(), 3);
+    let (_, failing) = outcomes.iter().find(|(peer, _)| peer.id() == 2).unwrap();
+    let failing = failing.unwrap();
+    loop {
+        if let UnitEvent::RequestFailed { peer, call, error } = events.recv_timeout(PATIENCE).unwrap() {
+            assert_eq!((peer.id(), call, error), (2, failing, Error::Service(ServiceError::Failed(4))));
+            return;
+        }
+    }
+}
+
+#[test]
+fn publishing_waits_until_all_have_acknowledged() {
+    let fleet = fleet();
+    let manager = system(fleet).build_system().unwrap();
+    let units: Vec<_> = (0..2).map(|id| unit(&format!("agv{id}"), id, fleet).build_unit().unwrap()).collect();
+    for agv in &units {
+        meet(&manager, agv);
+    }
+    let span = cara_std::Duration::from_secs(10);
+    manager.my_function_list().add_function("f", &number(0), service(|number| number)).unwrap();
+    assert_eq!(manager.publish_and_wait(span), Ok(vec![]));
+    assert_eq!(ask(&units[0].manager().unwrap(), "f", 3), Ok(3));
+    assert_eq!(manager.s_unit("agv1").unwrap().publish_and_wait(span), Ok(()));
+}
+
+#[test]
+fn a_blocking_request_waits_for_the_interval_and_another_is_told() {
+    let interval = Duration::from_millis(60);
+    let fleet = fleet();
+    let constraints = Constraints { minimum_interval: interval.into(), ..Constraints::M_UNIT };
+    let manager = system(fleet).constraints(constraints).build_system().unwrap();
+    let agv = unit("agv", 7, fleet).build_unit().unwrap();
+    agv.my_function_list().add_function("f", &number(0), service(|number| number)).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    assert_eq!(ask(&peer, "f", 1), Ok(1));
+    let began = Instant::now();
+    for round in 0..3 {
+        assert_eq!(ask(&peer, "f", round), Ok(round));
+    }
+    assert!(began.elapsed() >= 2 * interval, "{:?}", began.elapsed());
+    match peer.request("f", &number(1)) {
+        Err(Error::TooSoon { wait }) => assert!(wait <= interval.into()),
+        other => panic!("{other:?}"),
+    }
+    // A time-out shorter than the interval leaves no room to wait.
+    let options = RequestOptions { timeout: Some(cara_std::Duration::from_millis(1)), ..Default::default() };
+    let refused = peer.block_request_with("f", &mut number(1), &options);
+    assert!(matches!(refused, Err(Error::TooSoon { .. })), "{refused:?}");
+}
+
+#[test]
+fn a_time_out_frees_the_slot_and_leaves_the_parameters() {
+    let (manager, agv) = pair();
+    let gate = Arc::new(Gate::default());
+    let at_gate = gate.clone();
+    let slow = service(move |number| {
+        at_gate.pass();
+        number + 1
+    });
+    agv.my_function_list().add_function("slow", &number(0), slow).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    let options = RequestOptions { timeout: Some(cara_std::Duration::from_millis(20)), ..Default::default() };
+    let mut parameters = number(5);
+    let began = Instant::now();
+    // More than there are slots for calls in flight.
+    for _ in 0..80 {
+        let refused = peer.block_request_with("slow", &mut parameters, &options);
+        assert!(matches!(refused, Err(Error::TimedOut | Error::Busy | Error::Expired)), "{refused:?}");
+        assert_eq!(value(&parameters), 5);
+    }
+    assert!(began.elapsed() < Duration::from_secs(10));
+    gate.open();
+    until("a later call works", || ask(&peer, "slow", 1) == Ok(2));
+    assert!(counter(&peer.counters(), "CallsTimedOut") > 0);
+}
+
+#[test]
+fn best_effort_arrives_in_one_datagram_or_is_refused() {
+    let (manager, agv) = pair();
+    let came = Arc::new(std::sync::Mutex::new(Vec::new()));
+    let taken = came.clone();
+    let take = service(move |number| {
+        taken.lock().unwrap().push(number);
+        number
+    });
+    agv.my_function_list().add_function("telemetry", &number(0), take).unwrap();
+    let mut long = Parameters::<4000>::sized();
+    long.add_string("text", 2000).unwrap();
+    long.set_value("text", "x".repeat(2000).as_str()).unwrap();
+    agv.my_function_list()
+        .add_function("long", &long, |_: &cara_std::Call, _: &mut cara_std::ParametersView| Ok(()))
+        .unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    let options = RequestOptions { delivery: Delivery::BestEffort, ..Default::default() };
+    let sent = counter(&peer.counters(), "DatagramsSent");
+    for value in 0..20 {
+        peer.request_with("telemetry", &number(value), &options).unwrap();
+        // A vehicle holds a few calls at a time and drops the rest; loopback loses none.
+        until("it has come", || came.lock().unwrap().len() == value as usize + 1);
+    }
+    assert!(counter(&peer.counters(), "DatagramsSent") >= sent + 20);
+    assert_eq!(*came.lock().unwrap(), (0..20).collect::<Vec<_>>());
+    assert!(matches!(peer.request_with("long", &long, &options), Err(Error::TooLarge { .. })));
+    assert_eq!(peer.block_request_with("telemetry", &mut number(1), &options), Err(Error::BadConstraint));
+}
+
+#[test]
+fn what_cannot_work_is_refused_before_it_is_sent() {
+    let (manager, agv) = pair();
+    agv.my_function_list().add_function("f", &number(0), service(|number| number)).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    let sent = counter(&peer.counters(), "RequestsSent");
+    let empty = Parameters::new();
+    assert_eq!(peer.request("f", &empty), Err(Error::MissingArgument { index: 0 }));
+    assert_eq!(peer.request("g", &number(1)), Err(Error::UnknownFunction));
+    assert_eq!(counter(&peer.counters(), "RequestsSent"), sent);
+    let lost: Peer = peer.clone();
+    agv.stop();
+    until("it has left", || !lost.is_connected());
+    assert_eq!(lost.request("f", &number(1)), Err(Error::NotConnected));
+}

@@ -1,0 +1,202 @@
+//! Units in several processes on one host, which can be killed.
+//!
+//! The child is this test binary again, with [`as_child`] as its only test and its part in the environment. It ends when
+//! its standard input does, so that none is left behind.
+
+use std::io::Read;
+use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::{Duration, Instant};
+
+use cara_std::{Error, ServiceOptions};
+use rustix::process::{Pid, Signal, kill_process};
+
+use crate::support::{PATIENCE, ask, fleet, number, service, system, unit, until};
+
+const PART: &str = "CARA_TEST_PART";
+
+/// A process with one unit; killed when dropped.
+struct Process(Child);
+
+impl Process {
+    /// An s_unit whose `life` answers `life` and whose `hang` never does.
+    fn agv(fleet: u32, name: &str, id: u32, life: i64) -> Self {
+        Self::start(format!("agv {fleet} {name} {id} {life}"))
+    }
+
+    /// A manager that sends every vehicle which offers `go_to` on its way, under the lease.
+    fn manager(fleet: u32) -> Self {
+        Self::start(format!("manager {fleet} manager 1 0"))
+    }
+
+    fn start(part: String) -> Self {
+        let mut command = Command::new(std::env::current_exe().unwrap());
+        command.args(["--exact", "processes::as_child", "--ignored", "--test-threads=1"]).env(PART, part);
+        Self(command.stdin(Stdio::piped()).stdout(Stdio::null()).spawn().unwrap())
+    }
+
+    fn signal(&self, signal: Signal) {
+        kill_process(Pid::from_child(&self.0), signal).unwrap();
+    }
+
+    /// No goodbye: the system closes its sockets.
+    fn kill(&mut self) {
+        self.0.kill().unwrap();
+        self.0.wait().unwrap();
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+#[test]
+#[ignore = "run by the other tests here, in processes of their own"]
+fn as_child() {
+    let part = std::env::var(PART).expect("the part to play");
+    let words: Vec<&str> = part.split(' ').collect();
+    let [kind, fleet, name, id, life] = words[..] else { panic!("{part}") };
+    let (fleet, id, life) = (fleet.parse().unwrap(), id.parse().unwrap(), life.parse().unwrap());
+    match kind {
+        "agv" => {
+            let agv = unit(name, id, fleet).build_unit().unwrap();
+            let list = agv.my_function_list();
+            list.add_function("life", &number(0), service(move |_| life)).unwrap();
+            list.add_function(
+                "hang",
+                &number(0),
+                service(|_| {
+                    loop {
+                        std::thread::park()
+                    }
+                }),
+            )
+            .unwrap();
+            agv.publish_my_function_list().unwrap();
+            agv.start().unwrap();
+            until_input_ends();
+            // Its handlers may hang: nobody waits for them.
+            std::process::exit(0);
+        }
+        _ => {
+            let manager = system(fleet).build_system().unwrap();
+            manager.start().unwrap();
+            until("a vehicle has come", || manager.nodes_offering("go_to").len() == 1);
+            manager.nodes_offering("go_to")[0].block_request("go_to", &mut number(1)).unwrap();
+            until_input_ends();
+        }
+    }
+}
+
+fn until_input_ends() {
+    let _ = std::io::stdin().read_to_end(&mut Vec::new());
+}
+
+#[test]
+fn a_killed_peer_interrupts_its_callers_and_takes_its_place_again() {
+    let fleet = fleet();
+    let manager = system(fleet).build_system().unwrap();
+    manager.start().unwrap();
+    let mut first = Process::agv(fleet, "first", 1, 1);
+    until("the first has come", || manager.s_units().first().is_some_and(|peer| ask(peer, "life", 0) == Ok(1)));
+    let _second = Process::agv(fleet, "second", 2, 10);
+    until("the second has come", || manager.s_units().get(1).is_some_and(|peer| ask(peer, "life", 0) == Ok(10)));
+    let peer = manager.s_units()[0].clone();
+    for life in 2..4 {
+        std::thread::scope(|scope| {
+            let callers: Vec<_> = (0..3)
+                .map(|_| {
+                    scope.spawn(|| {
+                        let options = cara_std::RequestOptions { timeout: Some(PATIENCE.into()), ..Default::default() };
+                        peer.block_request_with("hang", &mut number(0), &options)
+                    })
+                })
+                .collect();
+            until("all have asked", || crate::support::counter(&peer.counters(), "RequestsSent") >= 4);
+            let killed = Instant::now();
+            first.kill();
+            for caller in callers {
+                assert_eq!(caller.join().unwrap(), Err(Error::Interrupted));
+            }
+            assert!(killed.elapsed() < Duration::from_secs(2), "{:?}", killed.elapsed());
+        });
+        until("it has left", || !peer.is_connected());
+        first = Process::agv(fleet, "first", 1, life);
+        until("it is back under the same handle", || ask(&peer, "life", 0) == Ok(life));
+        let names: Vec<_> = manager.s_units().iter().map(|peer| peer.name().to_owned()).collect();
+        assert_eq!(names, ["first", "second"]);
+    }
+}
+
+/// The discovery port belongs to no process alone: units in five of them find each other.
+#[test]
+fn several_processes_share_the_discovery_port() {
+    let fleet = fleet();
+    let _vehicles: Vec<_> = (0..3).map(|id| Process::agv(fleet, &format!("agv{id}"), id, i64::from(id))).collect();
+    let _stranger = Process::agv(fleet.wrapping_add(1), "stranger", 9, 9);
+    let manager = system(fleet).build_system().unwrap();
+    manager.start().unwrap();
+    until("all have come", || manager.nodes_offering("life").len() == 3);
+    for peer in manager.s_units() {
+        assert_eq!(ask(&peer, "life", 0), Ok(i64::from(peer.id())));
+    }
+}
+
+/// One process is frozen: it does not acknowledge, and is named.
+#[test]
+fn publishing_names_who_has_not_acknowledged() {
+    let fleet = fleet();
+    let manager = system(fleet).build_system().unwrap();
+    manager.start().unwrap();
+    let _quick = Process::agv(fleet, "quick", 1, 1);
+    let frozen = Process::agv(fleet, "frozen", 2, 2);
+    until("both have come", || manager.nodes_offering("life").len() == 2);
+    let span = cara_std::Duration::from_millis(300);
+    manager.my_function_list().add_function("f", &number(0), service(|number| number)).unwrap();
+    assert_eq!(manager.publish_and_wait(cara_std::Duration::from_secs(10)), Ok(vec![]));
+    frozen.signal(Signal::STOP);
+    manager.my_function_list().add_function("g", &number(0), service(|number| number)).unwrap();
+    let missing = manager.publish_and_wait(span).unwrap();
+    assert_eq!(missing.iter().map(|identity| identity.name()).collect::<Vec<_>>(), ["frozen"]);
+    let lost = manager.s_unit("frozen").unwrap();
+    assert_eq!(lost.publish_and_wait(span), Err(Error::TimedOut));
+    // Silent for three keep-alives, it is lost; it comes back when it goes on.
+    until("it is lost", || !lost.is_connected());
+    assert_eq!(manager.number_of_s_units(), 1);
+    frozen.signal(Signal::CONT);
+    until("it is back", || ask(&lost, "life", 0) == Ok(2));
+}
+
+#[test]
+fn a_vehicle_stops_once_when_its_manager_is_killed() {
+    let fleet = fleet();
+    let stops = Arc::new(AtomicUsize::new(0));
+    let stopped = stops.clone();
+    let agv = unit("agv", 7, fleet).build_unit().unwrap();
+    let definition = "go_to(number: int[1]) -> (number: int[1])".parse().unwrap();
+    let options = ServiceOptions::new().lease(Duration::from_millis(300), move |_| {
+        stopped.fetch_add(1, Ordering::SeqCst);
+    });
+    let lease = agv.my_function_list().add_service(&definition, options, service(|number| number)).unwrap();
+    agv.publish_my_function_list().unwrap();
+    agv.start().unwrap();
+    let mut manager = Process::manager(fleet);
+    until("it moves", || lease.is_live());
+    let began = Instant::now();
+    while began.elapsed() < Duration::from_millis(900) {
+        assert!(lease.is_live(), "the lease is renewed");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    let killed = Instant::now();
+    manager.kill();
+    until("it stops", || stops.load(Ordering::SeqCst) == 1);
+    assert!(!lease.is_live());
+    assert!(killed.elapsed() < Duration::from_secs(2), "{:?}", killed.elapsed());
+    until("it knows", || !agv.is_connected());
+    agv.stop();
+    assert_eq!(stops.load(Ordering::SeqCst), 1);
+}

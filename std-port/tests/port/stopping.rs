@@ -1,0 +1,124 @@
+//! Stopping a unit, from wherever.
+
+use std::sync::{Arc, OnceLock};
+use std::time::{Duration, Instant};
+
+use cara_std::{Error, Unit, UnitEvent};
+
+use crate::support::{Gate, PATIENCE, ask, fleet, meet, number, pair, service, system, unit, until};
+
+#[test]
+fn a_waiting_caller_returns_at_once_when_its_unit_stops() {
+    let (manager, agv) = pair();
+    let gate = Arc::new(Gate::default());
+    let at_gate = gate.clone();
+    let slow = service(move |number| {
+        at_gate.pass();
+        number
+    });
+    agv.my_function_list().add_function("slow", &number(0), slow).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    std::thread::scope(|scope| {
+        // One leads, the others wait for it.
+        let callers: Vec<_> = (0..4)
+            .map(|number| {
+                scope.spawn({
+                    let peer = &peer;
+                    move || {
+                        let options = cara_std::RequestOptions { timeout: Some(PATIENCE.into()), ..Default::default() };
+                        let mut parameters = crate::support::number(number);
+                        let outcome = peer.block_request_with("slow", &mut parameters, &options);
+                        (outcome, Instant::now())
+                    }
+                })
+            })
+            .collect();
+        until("the first one runs", || gate.came() == 1);
+        until("all have asked", || crate::support::counter(&peer.counters(), "RequestsSent") == 4);
+        let stopped = Instant::now();
+        manager.stop();
+        for caller in callers {
+            let (outcome, at) = caller.join().unwrap();
+            assert_eq!(outcome, Err(Error::Interrupted));
+            assert!(at.saturating_duration_since(stopped) < Duration::from_millis(500));
+        }
+        gate.open();
+    });
+    assert_eq!(ask(&peer, "slow", 1), Err(Error::NotConnected));
+}
+
+#[test]
+fn a_handler_may_stop_its_own_unit() {
+    let fleet = fleet();
+    let manager = system(fleet).build_system().unwrap();
+    let own: Arc<OnceLock<Unit<i64>>> = Arc::default();
+    let agv = unit("agv", 7, fleet).state(0_i64).build_unit().unwrap();
+    let unit = own.clone();
+    let stop = move |_: &mut i64, parameters: cara_std::Parameters| {
+        unit.get().unwrap().stop();
+        parameters
+    };
+    agv.my_function_list().add_function("stop", &number(0), stop).unwrap();
+    agv.my_function_list().add_function("wait", &number(0), |_: &mut i64, p: cara_std::Parameters| p).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    let events = agv.events();
+    assert!(own.set(agv).is_ok());
+    // Methods of another class wait for the state meanwhile.
+    let high = cara_std::RequestOptions { priority: Some(cara_std::Priority::High), ..Default::default() };
+    for _ in 0..4 {
+        peer.request_with("wait", &number(0), &high).unwrap();
+    }
+    let began = Instant::now();
+    assert_eq!(ask(&peer, "stop", 1), Err(Error::Interrupted));
+    until("it has left", || !peer.is_connected());
+    assert!(began.elapsed() < Duration::from_secs(1), "{:?}", began.elapsed());
+    assert!(events.try_iter().any(|event| matches!(event, UnitEvent::Left { .. })));
+}
+
+/// While a method runs that waits for its peer, and another method waits for the state, the application stops the unit.
+#[test]
+fn stopping_with_the_state_held_does_not_hang() {
+    let fleet = fleet();
+    let manager = system(fleet).build_system().unwrap();
+    let agv = unit("agv", 7, fleet).state(0_i64).build_unit().unwrap();
+    agv.my_function_list().add_function("method", &number(0), |_: &mut i64, p: cara_std::Parameters| p).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    let began = Instant::now();
+    agv.with_state(|_| {
+        peer.request("method", &number(0)).unwrap();
+        until("it runs", || crate::support::counter(&agv.manager().unwrap().counters(), "RequestsRun") == 1);
+        agv.stop();
+    })
+    .unwrap();
+    assert!(began.elapsed() < Duration::from_secs(2), "{:?}", began.elapsed());
+}
+
+#[test]
+fn dropping_the_last_handle_stops() {
+    let (manager, agv) = pair();
+    let (peer, _) = meet(&manager, &agv);
+    let clone = agv.clone();
+    drop(agv);
+    assert!(peer.is_connected() && clone.is_connected());
+    drop(clone);
+    until("it has left", || !peer.is_connected());
+}
+
+#[test]
+fn a_stopped_unit_says_so_and_stops_again_quietly() {
+    let (manager, agv) = pair();
+    let (peer, back) = meet(&manager, &agv);
+    let events = manager.events();
+    agv.stop();
+    agv.stop();
+    loop {
+        if let UnitEvent::Left { reason, .. } = events.recv_timeout(PATIENCE).unwrap() {
+            assert_eq!(reason, cara_std::CloseReason::Stopped);
+            break;
+        }
+    }
+    assert!(agv.start().is_err(), "it does not start again");
+    assert!(!back.is_connected() && !peer.is_connected());
+    let never_started = unit("never", 1, fleet()).build_unit().unwrap();
+    never_started.stop();
+}

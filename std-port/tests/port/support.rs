@@ -1,0 +1,139 @@
+//! Units on loopback, in a fleet of their own.
+
+use std::hash::{BuildHasher, Hasher, RandomState};
+use std::time::{Duration, Instant};
+
+use cara_std::{
+    Builder, Call, CommunicationSystem, Error, Interfaces, Parameters, ParametersView, Peer, ServiceError, Unit,
+};
+
+/// Longest wait for anything that is to happen.
+pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
+
+/// A fleet of its own, so that tests on one machine do not meet.
+pub(crate) fn fleet() -> u32 {
+    RandomState::new().build_hasher().finish() as u32
+}
+
+/// Waits until `condition` holds.
+pub(crate) fn until(what: &str, condition: impl FnMut() -> bool) {
+    assert!(within(PATIENCE, condition), "not in time: {what}");
+}
+
+/// Whether `condition` comes to hold within `span`.
+pub(crate) fn within(span: Duration, mut condition: impl FnMut() -> bool) -> bool {
+    let end = Instant::now() + span;
+    while !condition() {
+        if Instant::now() >= end {
+            return false;
+        }
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    true
+}
+
+/// The manager of a fleet, to be given a state or built.
+pub(crate) fn system(fleet: u32) -> Builder<()> {
+    system_named("manager", 1, fleet)
+}
+
+pub(crate) fn system_named(name: &str, id: u32, fleet: u32) -> Builder<()> {
+    CommunicationSystem::builder(name, id).unwrap().fleet(fleet).interfaces(Interfaces::Loopback)
+}
+
+/// An s_unit of that manager.
+pub(crate) fn unit(name: &str, id: u32, fleet: u32) -> Builder<()> {
+    Unit::builder(name, id, "manager", 1).unwrap().fleet(fleet).interfaces(Interfaces::Loopback)
+}
+
+/// A manager and an s_unit `agv`, not started.
+pub(crate) fn pair() -> (CommunicationSystem, Unit) {
+    let fleet = fleet();
+    (system(fleet).build_system().unwrap(), unit("agv", 7, fleet).build_unit().unwrap())
+}
+
+/// Starts both, publishes both lists and waits until they have met. Returns each one's view of the other.
+pub(crate) fn meet<T: Send + 'static, U: Send + 'static>(
+    manager: &CommunicationSystem<T>,
+    agv: &Unit<U>,
+) -> (Peer<T>, Peer<U>) {
+    publish(manager, agv);
+    // One that runs already refuses to start; one that does not will not be met.
+    let _ = manager.start();
+    agv.start().unwrap();
+    let name = agv.identity().name().to_owned();
+    until("the two have met", || manager.s_unit(&name).is_some_and(|peer| peer.is_connected()) && agv.is_connected());
+    let (peer, back) = (manager.s_unit(&name).unwrap(), agv.manager().unwrap());
+    until("lists have come", || {
+        peer.their_function_list().len() == agv.my_function_list().len()
+            && back.their_function_list().len() == manager.my_function_list().len()
+    });
+    (peer, back)
+}
+
+pub(crate) fn publish<T: Send + 'static, U: Send + 'static>(manager: &CommunicationSystem<T>, agv: &Unit<U>) {
+    manager.publish_my_function_list().unwrap();
+    agv.publish_my_function_list().unwrap();
+}
+
+/// One int.
+pub(crate) fn number(value: i64) -> Parameters {
+    let mut number = Parameters::new();
+    number.add_int("number", 1).unwrap();
+    number.set_value("number", value).unwrap();
+    number
+}
+
+pub(crate) fn value(parameters: &ParametersView) -> i64 {
+    parameters.variable("number").unwrap()
+}
+
+/// A service in place, free.
+pub(crate) fn service(
+    act: impl Fn(i64) -> i64 + Send + Sync + 'static,
+) -> impl Fn(&Call, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync + 'static {
+    move |_, view| {
+        let number = act(value(view));
+        view.set_value("number", number).map_err(|_| ServiceError::BadResults)
+    }
+}
+
+/// Calls `function` with a number.
+pub(crate) fn ask<T: Send + 'static>(peer: &Peer<T>, function: &str, number_in: i64) -> Result<i64, Error> {
+    let mut parameters = number(number_in);
+    peer.block_request(function, &mut parameters).map(|()| value(&parameters))
+}
+
+/// A counter of the peer's link, or of a unit's discovery.
+pub(crate) fn counter(counters: &[(&'static str, u64)], name: &str) -> u64 {
+    let found = counters.iter().find(|(known, _)| *known == name);
+    found.unwrap_or_else(|| panic!("no counter {name} in {counters:?}")).1
+}
+
+/// A gate that handlers wait at.
+#[derive(Default)]
+pub(crate) struct Gate {
+    open: std::sync::Mutex<bool>,
+    changed: std::sync::Condvar,
+    waiting: std::sync::atomic::AtomicUsize,
+}
+
+impl Gate {
+    /// Waits until the gate is opened.
+    pub(crate) fn pass(&self) {
+        self.waiting.fetch_add(1, std::sync::atomic::Ordering::SeqCst);
+        let open = self.open.lock().unwrap();
+        let (open, _) = self.changed.wait_timeout_while(open, PATIENCE, |open| !*open).unwrap();
+        assert!(*open, "nobody opened the gate");
+    }
+
+    pub(crate) fn open(&self) {
+        *self.open.lock().unwrap() = true;
+        self.changed.notify_all();
+    }
+
+    /// How many have come to the gate so far.
+    pub(crate) fn came(&self) -> usize {
+        self.waiting.load(std::sync::atomic::Ordering::SeqCst)
+    }
+}

@@ -1,0 +1,111 @@
+//! Many callers: over one link, over many, with the peer calling back.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use cara_std::{Constraints, Error, Peer};
+
+use crate::support::{ask, fleet, meet, number, pair, service, system, unit, until};
+
+/// Asks for the echo of numbers that no other caller uses; waits a moment where the peer is busy.
+fn echo<T: Send + 'static>(peer: &Peer<T>, caller: i64, calls: i64) {
+    for call in 0..calls {
+        let unique = caller * 1_000_000 + call;
+        loop {
+            match ask(peer, "echo", unique) {
+                Err(Error::Busy) => std::thread::yield_now(),
+                outcome => {
+                    assert_eq!(outcome, Ok(unique));
+                    break;
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn sixteen_threads_share_a_link_while_the_peer_calls_back() {
+    let (manager, agv) = pair();
+    manager.my_function_list().add_function("echo", &number(0), service(|number| number)).unwrap();
+    agv.my_function_list().add_function("echo", &number(0), service(|number| number)).unwrap();
+    let (peer, back) = meet(&manager, &agv);
+    std::thread::scope(|scope| {
+        for caller in 0..16 {
+            let peer = &peer;
+            scope.spawn(move || echo(peer, caller, 200));
+        }
+        for caller in 16..20 {
+            let back = &back;
+            scope.spawn(move || echo(back, caller, 200));
+        }
+    });
+    for counters in [peer.counters(), back.counters()] {
+        assert_eq!(crate::support::counter(&counters, "CallsTimedOut"), 0, "{counters:?}");
+    }
+}
+
+#[test]
+fn sixty_four_callers_have_a_link_each() {
+    let fleet = fleet();
+    let manager = system(fleet).constraints(Constraints { maximum_nodes: 64, ..Constraints::M_UNIT });
+    let manager = manager.build_system().unwrap();
+    manager.start().unwrap();
+    let units: Vec<_> = (0..64)
+        .map(|id| {
+            let agv = unit(&format!("agv{id}"), id, fleet).build_unit().unwrap();
+            agv.my_function_list()
+                .add_function("echo", &number(0), service(move |number| number + i64::from(id)))
+                .unwrap();
+            agv.publish_my_function_list().unwrap();
+            agv.start().unwrap();
+            agv
+        })
+        .collect();
+    until("all have come", || manager.nodes_offering("echo").len() == units.len());
+    std::thread::scope(|scope| {
+        for peer in manager.s_units() {
+            scope.spawn(move || {
+                for call in 0..50 {
+                    assert_eq!(ask(&peer, "echo", call), Ok(call + i64::from(peer.id())), "{peer:?}");
+                }
+            });
+        }
+    });
+}
+
+/// Calls of one thread in one class arrive in the order in which they were made, whoever reads and runs them.
+#[test]
+fn calls_of_a_class_run_in_order() {
+    let (manager, agv) = pair();
+    let last = std::sync::Arc::new(std::sync::Mutex::new(-1));
+    let seen = last.clone();
+    let in_order = service(move |number| {
+        let mut last = seen.lock().unwrap();
+        assert_eq!(number, *last + 1);
+        *last = number;
+        number
+    });
+    agv.my_function_list().add_function("in_order", &number(0), in_order).unwrap();
+    agv.my_function_list().add_function("echo", &number(0), service(|number| number)).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    let done = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        let (peer, done) = (&peer, &done);
+        // Leaders and pool threads take turns at both ends meanwhile.
+        scope.spawn(move || {
+            while !done.load(Ordering::Relaxed) {
+                let high = cara_std::RequestOptions { priority: Some(cara_std::Priority::High), ..Default::default() };
+                let mut parameters = number(1);
+                peer.block_request_with("echo", &mut parameters, &high).unwrap();
+            }
+        });
+        for call in 0..2_000 {
+            if call % 3 == 0 {
+                assert_eq!(ask(peer, "in_order", call), Ok(call));
+            } else {
+                until("there is room", || peer.request("in_order", &number(call)).is_ok());
+            }
+        }
+        done.store(true, Ordering::Relaxed);
+    });
+    until("all have run", || *last.lock().unwrap() == 1_999);
+}
