@@ -87,3 +87,103 @@ impl Peers {
         self.list.iter().filter(|peer| peer.is_connected())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use cara_core::config::Constraints;
+    use cara_core::distribution::hello::{Hello, Limits};
+    use cara_core::distribution::identity::{Epoch, Fleet};
+    use cara_core::host::mailman::LinkId;
+    use cara_core::host::secure::Plain;
+    use cara_core::services::unit::{Session, SessionConfig, SessionStorage};
+    use cara_core::time::Instant;
+
+    use super::*;
+    use crate::storage::{filled, filled_with};
+    use crate::sys::stream::Stream;
+
+    fn agv(id: u32) -> Identity {
+        Identity::s_unit("agv", id).unwrap()
+    }
+
+    /// A link that leads nowhere.
+    fn link(serial: u32) -> Arc<LinkCell> {
+        let listener = crate::sys::stream::Listener::open(std::net::Ipv4Addr::LOCALHOST, 0).unwrap();
+        let address = std::net::SocketAddr::from((std::net::Ipv4Addr::LOCALHOST, listener.port()));
+        let storage = SessionStorage {
+            small: filled(cara_core::config::LINK_BUFFER_BYTES, 0),
+            pending: filled(1, None),
+            running: filled(2, None),
+            publications: filled_with(1, Default::default),
+            their_functions: filled_with(1, cara_core::distribution::function_list::Entry::empty),
+            their_signatures: filled(64, 0),
+        };
+        let local = Hello {
+            fleet: Fleet(0),
+            identity: Identity::m_unit("manager", 1).unwrap(),
+            wanted: None,
+            epoch: Epoch(1),
+            nonce: 1,
+            term: 0,
+            capabilities: 0,
+            limits: Limits { message_size: 0, chunk_size: 0, calls: 0, minimum_interval: 0 },
+            link: 0,
+            udp_port: 0,
+            keep_alive: 0,
+            stamp: 0,
+        };
+        let config =
+            SessionConfig { link: LinkId(0), dialed: true, address, local, constraints: Constraints::M_UNIT };
+        let session = Session::new(Instant::START, config, Plain, storage);
+        Arc::new(LinkCell::new(LinkId(0), serial, Stream::connect(address).unwrap(), session, true))
+    }
+
+    fn ids(peers: &Peers) -> Vec<u32> {
+        peers.of_role(Role::SUnit).map(|peer| peer.identity.id()).collect()
+    }
+
+    #[test]
+    fn a_node_keeps_its_place_and_its_handle() {
+        let mut peers = Peers::default();
+        let (old, new) = (link(1), link(2));
+        let first = peers.join(&agv(1), 8, &old);
+        peers.join(&agv(2), 8, &link(3));
+        first.leave(&old);
+        assert!(!first.is_connected());
+        assert_eq!(ids(&peers), [1, 2]);
+        let again = peers.join(&agv(1), 8, &new);
+        assert!(Arc::ptr_eq(&first, &again) && first.is_connected());
+        assert_eq!(ids(&peers), [1, 2]);
+    }
+
+    #[test]
+    fn the_end_of_an_old_link_does_not_touch_a_newer_one() {
+        let mut peers = Peers::default();
+        let (old, new) = (link(1), link(2));
+        let peer = peers.join(&agv(1), 8, &old);
+        peers.join(&agv(1), 8, &new);
+        peer.leave(&old);
+        assert!(Arc::ptr_eq(&peer.link().unwrap(), &new));
+    }
+
+    #[test]
+    fn beyond_the_limit_a_newcomer_gets_the_place_of_one_that_is_away() {
+        let mut peers = Peers::default();
+        let links = [1, 2, 3].map(link);
+        peers.join(&agv(1), 2, &links[0]);
+        let second = peers.join(&agv(2), 2, &links[1]);
+        second.leave(&links[1]);
+        peers.join(&agv(3), 2, &links[2]);
+        assert_eq!(ids(&peers), [1, 3]);
+        assert!(peers.find(|identity| identity.id() == 2).is_none());
+        assert_eq!(peers.connected().count(), 2);
+    }
+
+    /// Nobody's place is taken while it is connected, even if there are more than the limit for a moment.
+    #[test]
+    fn who_is_connected_keeps_its_place() {
+        let mut peers = Peers::default();
+        (1..4).for_each(|id| drop(peers.join(&agv(id), 2, &link(id))));
+        assert_eq!(ids(&peers), [1, 2, 3]);
+    }
+}

@@ -89,3 +89,95 @@ impl Reader {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at(micros: u64) -> Instant {
+        Instant::from_micros(micros)
+    }
+
+    /// For `leave` where nobody must be asked.
+    fn nobody_asked() -> bool {
+        panic!("nobody is to be woken")
+    }
+
+    #[test]
+    fn the_pool_reads_unless_somebody_leads() {
+        let mut reader = Reader::default();
+        assert!(reader.pool_reads() && !reader.is_led());
+        let turn = reader.take_lead().unwrap();
+        assert!(!reader.pool_reads() && reader.is_led() && reader.is_leader(turn));
+        assert_eq!(reader.take_lead(), None);
+        reader.leave(Some(turn), || false);
+        assert!(reader.pool_reads());
+        assert_ne!(reader.take_lead(), Some(turn), "each turn is another one");
+    }
+
+    #[test]
+    fn a_lead_that_was_passed_keeps_the_pool_off_until_it_is_taken() {
+        let mut reader = Reader::default();
+        let turn = reader.take_lead().unwrap();
+        reader.leave(Some(turn), || true);
+        assert!(!reader.pool_reads() && !reader.is_led());
+        let next = reader.take_lead().unwrap();
+        reader.leave(Some(next), || false);
+        assert!(reader.pool_reads());
+    }
+
+    /// Whoever was woken may have its reply by then, or give up: it passes the lead on.
+    #[test]
+    fn who_was_woken_and_leaves_passes_the_lead_on() {
+        let mut reader = Reader::default();
+        let turn = reader.take_lead().unwrap();
+        reader.leave(Some(turn), || true);
+        let mut asked = 0;
+        reader.leave(None, || {
+            asked += 1;
+            true
+        });
+        assert_eq!(asked, 1);
+        assert!(!reader.pool_reads());
+        reader.leave(None, || false);
+        assert!(reader.pool_reads());
+    }
+
+    #[test]
+    fn who_leaves_without_the_lead_changes_nothing() {
+        let mut reader = Reader::default();
+        reader.leave(None, nobody_asked);
+        let turn = reader.take_lead().unwrap();
+        reader.leave(None, nobody_asked);
+        assert!(reader.is_leader(turn));
+    }
+
+    #[test]
+    fn only_a_busy_leader_is_relieved_and_only_after_the_limit() {
+        let mut reader = Reader::default();
+        let limit = Duration::from_micros(10);
+        assert!(!reader.relieve(at(1_000), limit, nobody_asked));
+        let turn = reader.take_lead().unwrap();
+        assert!(!reader.relieve(at(1_000), limit, nobody_asked), "it reads");
+        reader.set_busy(turn, Some(at(100)));
+        assert!(!reader.relieve(at(109), limit, nobody_asked));
+        reader.set_busy(turn, None);
+        assert!(!reader.relieve(at(1_000), limit, nobody_asked), "it reads again");
+        reader.set_busy(turn, Some(at(2_000)));
+        assert!(reader.relieve(at(2_010), limit, || false));
+        assert!(reader.pool_reads() && !reader.is_leader(turn));
+    }
+
+    #[test]
+    fn who_was_relieved_disturbs_the_next_leader_no_more() {
+        let mut reader = Reader::default();
+        let old = reader.take_lead().unwrap();
+        reader.set_busy(old, Some(at(1)));
+        assert!(reader.relieve(at(1), Duration::ZERO, || false));
+        let new = reader.take_lead().unwrap();
+        reader.set_busy(old, Some(at(2)));
+        assert!(!reader.relieve(at(5), Duration::ZERO, nobody_asked), "the new one is not busy");
+        reader.leave(Some(old), nobody_asked);
+        assert!(reader.is_leader(new));
+    }
+}
