@@ -242,7 +242,7 @@ CONTROLS = [
     ("list_end", [("serial", 32)]),
     ("list_ack", [("serial", 32), ("skipped", 16)]),
     ("limits", [("message_size", 32), ("minimum_interval", 32), ("calls", 16)]),
-    ("release", [("slot", 16)]),
+    ("release", [("slot", 16), ("id", 32)]),
     ("lease_ended", [("slot", 16), ("expired", "bool")]),
 ]
 

@@ -261,6 +261,9 @@ pub enum Control<'b> {
     Release {
         /// The function.
         slot: u16,
+        /// The newest request that the caller has made: this one and all before it are no longer wanted, wherever they
+        /// are.
+        id: u32,
     },
     /// The callee ended what the leased function started; renewing it is no use.
     LeaseEnded {

@@ -116,6 +116,11 @@ impl<S: Storage> Calls<S> {
         self.windows.get_mut(usize::from(priority.to_wire())).map_or(Seen::TooOld, |window| window.note(id))
     }
 
+    /// Whether any call has not begun yet.
+    pub(crate) fn any_waiting(&self) -> bool {
+        self.emergency.is_some() || self.queues.iter().any(Option::is_some)
+    }
+
     /// The callee's side of the minimum interval. One request may come early by a whole interval, because a network
     /// does not keep distances.
     pub(crate) fn interval(&mut self, now: Instant, interval: Duration) -> Result<(), Error> {
@@ -134,10 +139,10 @@ impl<S: Storage> Calls<S> {
     /// that came before and may begin.
     pub(crate) fn is_idle(&self, priority: Priority) -> bool {
         let active = self.active.get(usize::from(priority.to_wire())).is_some_and(Option::is_some);
-        !active && !self.is_waiting(priority) && (priority == Priority::Emergency || !self.can_begin())
+        !active && !self.class_waits(priority) && (priority == Priority::Emergency || !self.can_begin())
     }
 
-    fn is_waiting(&self, priority: Priority) -> bool {
+    fn class_waits(&self, priority: Priority) -> bool {
         match queue_index(priority) {
             None => self.emergency.is_some(),
             Some(index) => self.queues.get(index).is_some_and(Option::is_some),
@@ -249,7 +254,7 @@ impl<S: Storage> Calls<S> {
     fn next_class(&self) -> Option<Priority> {
         Priority::ALL.into_iter().find(|&class| {
             let idle = self.active.get(usize::from(class.to_wire())).is_some_and(Option::is_none);
-            idle && self.is_waiting(class)
+            idle && self.class_waits(class)
         })
     }
 

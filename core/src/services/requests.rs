@@ -53,6 +53,11 @@ impl<S: Storage> Requests<S> {
         Some(CallId(id))
     }
 
+    /// The newest id that was given; 0 before the first.
+    pub(crate) const fn newest(&self) -> CallId {
+        CallId(self.next_id.saturating_sub(1))
+    }
+
     /// An id and a slot for a call.
     pub(crate) fn open(
         &mut self,

@@ -298,7 +298,7 @@ fn leases() -> Vec<Answer> {
     let renewal = Renewal { slot: Slot(1), generation: Generation(0), stamp: 1_001_000, since: Duration::ZERO };
     let renew = frame(&Frame::Session(&SessionBody::renewal(&renewal)));
     let started = request(go_to, &position);
-    let released = vec![started.clone(), control(&Control::Release { slot: 1 })];
+    let released = vec![started.clone(), control(&Control::Release { slot: 1, id: 9 })];
     let ended = |expired: bool| json!([{ "priority": "high", "message": { "lease_ended": { "slot": 1, "expired": expired } } }]);
     let failure = json!([{ "priority": "normal", "message": { "failure": { "id": 1, "error": "expired" } } }]);
     let lease_released = answer(("lease_released", "it ends without an answer", "live", released, 600, json!([])));

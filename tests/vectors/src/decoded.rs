@@ -135,7 +135,7 @@ fn control(control: &Control<'_>) -> Value {
         Control::Limits { message_size, minimum_interval, calls } => json!({ "limits": {
             "message_size": message_size, "minimum_interval": minimum_interval, "calls": calls,
         }}),
-        Control::Release { slot } => json!({ "release": { "slot": slot } }),
+        Control::Release { slot, id } => json!({ "release": { "slot": slot, "id": id } }),
         Control::LeaseEnded { slot, expired } => json!({ "lease_ended": { "slot": slot, "expired": expired } }),
     }
 }

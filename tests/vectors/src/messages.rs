@@ -154,7 +154,7 @@ fn controls() -> Vec<Vector> {
             Control::Limits { message_size: 65_536, minimum_interval: 10_000, calls: 4 },
             json!({ "limits": { "message_size": 65_536, "minimum_interval": 10_000, "calls": 4 } }),
         ),
-        ("release", "a lease is given up", Control::Release { slot: 4 }, json!({ "release": { "slot": 4 } })),
+        ("release", "a lease is given up", Control::Release { slot: 4, id: 9 }, json!({ "release": { "slot": 4, "id": 9 } })),
         (
             "lease_ended",
             "a lease has expired at the callee",
@@ -170,13 +170,13 @@ fn controls() -> Vec<Vector> {
     vectors.push(
         message(
             ("long_varint", "a number in more bytes than needed is read all the same"),
-            &[3, 5, 0x84, 0x00],
-            &json!({ "release": { "slot": 4 } }),
+            &[3, 5, 0x84, 0x00, 9],
+            &json!({ "release": { "slot": 4, "id": 9 } }),
         )
         .lossy(),
     );
-    vectors.push(message(("varint_too_big", "refused: beyond 16 bits"), &[3, 5, 0x84, 0x80, 0x04], &Value::Null));
-    vectors.push(message(("control_behind", "refused: a byte follows"), &[3, 5, 4, 0], &Value::Null));
+    vectors.push(message(("varint_too_big", "refused: beyond 16 bits"), &[3, 5, 0x84, 0x80, 0x04, 9], &Value::Null));
+    vectors.push(message(("control_behind", "refused: a byte follows"), &[3, 5, 4, 9, 0], &Value::Null));
     vectors
 }
 

@@ -310,7 +310,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
                 }
                 Outcome::Nothing
             }
-            Control::Release { slot } => match self.released(cx, Slot(slot)) {
+            Control::Release { slot, id } => match self.released(cx, Slot(slot), id) {
                 true => Event::LeaseExpired(Slot(slot)).into(),
                 false => Outcome::Nothing,
             },
@@ -434,8 +434,12 @@ impl<S: Storage, C: Secure> Session<S, C> {
         cx: &mut Context<'_, S, M, B, H>,
         head: CallHead,
     ) -> Result<Call, Error> {
-        let ticket = self.calls.begin(head)?;
         let lease = cx.functions.function(head.slot).and_then(|function| function.attributes.lease);
+        // A command that waited for its turn is no longer wanted once its lease has been given up.
+        if lease.is_some() && self.publishing.is_released(head.slot, head.id) {
+            return Err(Error::Expired);
+        }
+        let ticket = self.calls.begin(head)?;
         if let Some(length) = lease {
             let end = head.made + length;
             let granted = Granted { slot: head.slot, generation: head.generation, length, end };

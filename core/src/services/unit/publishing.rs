@@ -17,6 +17,8 @@ pub struct Publication {
     told: Option<Generation>,
     /// It has been visible at some time, so a call of it is stale rather than unknown.
     ever: bool,
+    /// The peer gave up what its requests up to this one started, or would have started.
+    released: u32,
 }
 
 /// Whether a peer may call a function.
@@ -58,6 +60,18 @@ impl<S: Storage> Publishing<S> {
             Some(publication) if publication.ever => Told::Earlier,
             _ => Told::Never,
         }
+    }
+
+    /// The peer gives up what its requests up to `id` started or would start.
+    pub(super) fn release(&mut self, slot: Slot, id: u32) {
+        if let Some(publication) = self.table.get_mut(usize::from(slot.0)) {
+            publication.released = publication.released.max(id);
+        }
+    }
+
+    /// Whether the peer has given up what request `id` would start.
+    pub(super) fn is_released(&self, slot: Slot, id: u32) -> bool {
+        self.table.get(usize::from(slot.0)).is_some_and(|publication| id <= publication.released)
     }
 
     pub(super) fn acknowledge(&mut self, serial: u32) {

@@ -252,7 +252,10 @@ impl<S: Storage, C: Secure> Session<S, C> {
             self.granted.iter().find(|g| current && (g.slot, g.generation) == (renewal.slot, renewal.generation));
         let Some(granted) = known.copied() else {
             self.link.counters.add(LinkCounter::RenewalsIgnored, 1);
-            self.send_control(cx, &Control::LeaseEnded { slot: renewal.slot.0, expired: false });
+            // The call that the renewal is for may be one of those that wait for their turn.
+            if !self.calls.any_waiting() {
+                self.send_control(cx, &Control::LeaseEnded { slot: renewal.slot.0, expired: false });
+            }
             return;
         };
         let Some(made) = made_at(cx.now, renewal.stamp, renewal.since) else { return };
@@ -271,12 +274,15 @@ impl<S: Storage, C: Secure> Session<S, C> {
         }
     }
 
-    /// The caller gave up its lease: it ends now, as if it had expired.
+    /// The caller gave up its lease: it ends now, as if it had expired, and its
+    /// requests up to `id` that wait for their turn, or are still on their way, do not begin.
     pub(super) fn released<M: Mailman, B: Buffers<S>, H: Service>(
         &mut self,
         cx: &mut Context<'_, S, M, B, H>,
         slot: Slot,
+        id: u32,
     ) -> bool {
+        self.publishing.release(slot, id);
         let Some(index) = self.granted.iter().position(|granted| granted.slot == slot) else { return false };
         self.granted.swap_remove(index);
         end_service_lease(cx, slot);
@@ -320,7 +326,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     /// Gives up the lease on a function of the peer, which stops what it started.
     pub fn release<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>, slot: Slot) {
         self.forget_held(slot);
-        self.send_control(cx, &Control::Release { slot: slot.0 });
+        self.send_control(cx, &Control::Release { slot: slot.0, id: self.requests.newest().0 });
     }
 
     pub(super) fn forget_held(&mut self, slot: Slot) -> bool {

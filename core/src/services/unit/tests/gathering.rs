@@ -1,6 +1,7 @@
 //! One-way messages that go out together.
 
 use super::pair::Pair;
+use super::setup::Setup;
 use super::{none, text, x};
 use crate::config::GATHER;
 use crate::time::Duration;
@@ -59,6 +60,18 @@ fn what_gathers_goes_out_when_there_is_much_of_it() {
     assert_eq!(pair.manager.net.writes.len(), 2);
     pair.settle();
     assert_eq!(pair.agv.ran(), ["log", "read", "read"]);
+}
+
+#[test]
+fn what_gathers_makes_room_for_what_follows() {
+    let mut pair = Pair::with(&Setup { buffer_size: 3_000, ..Setup::default() });
+    pair.agv.offer("read(text: string[20000])", |_| Ok(()));
+    pair.publish();
+    for _ in 0..3 {
+        pair.manager.tell("read", &text(1_400)).unwrap();
+    }
+    pair.run(GATHER);
+    assert_eq!(pair.agv.ran(), ["read", "read", "read"]);
 }
 
 #[test]

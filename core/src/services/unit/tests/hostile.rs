@@ -48,7 +48,7 @@ fn message() -> impl Strategy<Value = Vec<u8>> {
             9 => control(&Control::ListEnd { serial: one }),
             10 if flag => control(&Control::Limits { message_size: one, minimum_interval: two, calls: three as u16 }),
             10 => control(&Control::ListAck { serial: one, skipped: two as u16 }),
-            _ if flag => control(&Control::Release { slot: two as u16 }),
+            _ if flag => control(&Control::Release { slot: two as u16, id: one }),
             _ => control(&Control::LeaseEnded { slot: two as u16, expired: one > 2 }),
         },
     )

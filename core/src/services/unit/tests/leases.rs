@@ -150,6 +150,26 @@ fn a_lease_that_is_released_ends_at_once() {
 }
 
 #[test]
+fn a_motion_that_is_given_up_before_it_began_does_not_begin() {
+    let mut pair = Pair::live();
+    pair.agv.offer_held("work()");
+    let slot = pair.agv.offer_leased("go()", LEASE);
+    pair.publish();
+    pair.manager.call("work", &none()).unwrap();
+    let told = pair.manager.tell("go", &none()).unwrap();
+    pair.settle();
+    pair.manager.release(slot);
+    pair.settle();
+    pair.agv.answer_held(Ok(&*none()));
+    pair.settle();
+    assert_eq!((pair.agv.ran().len(), pair.agv.is_live(slot)), (1, false));
+    assert!(pair.manager.has(&Happened::Failed(told, Error::Expired)));
+    pair.manager.tell("go", &none()).unwrap();
+    pair.settle();
+    assert_eq!((pair.agv.ran().len(), pair.agv.is_live(slot)), (2, true));
+}
+
+#[test]
 fn a_motion_that_is_finished_ends_its_lease_without_the_hook() {
     let (mut pair, slot) = moving(true);
     pair.agv.end_lease(slot);
