@@ -161,6 +161,10 @@ impl<S: Storage, C: Secure> Link<S, C> {
         hold: bool,
         write: impl FnOnce(&mut ChunkWriter<'_>),
     ) -> Result<(), Error> {
+        if !self.sender.has_room(priority, total) {
+            // What was held back may be in the way.
+            self.flush(mailman, buffers).map_err(Error::Closed)?;
+        }
         if let Err(error) = self.sender.accept(buffers, priority, total, write) {
             self.counters.add(LinkCounter::SendRefused, 1);
             return Err(error);

@@ -73,6 +73,14 @@ impl<S: Storage> Sender<S> {
         self.lanes.iter().flatten().map(Lane::waiting).fold(self.urgent.len(), usize::saturating_add)
     }
 
+    /// Whether the lane of a class holds one more message of `total` bytes, if it holds any.
+    pub(super) fn has_room(&self, priority: Priority, total: usize) -> bool {
+        match lane_index(priority).and_then(|index| self.lanes.get(index)) {
+            Some(Some(lane)) => self.cut.framed_length(total) <= lane.room(),
+            _ => true,
+        }
+    }
+
     pub(super) fn accept(
         &mut self,
         buffers: &mut impl Buffers<S>,
@@ -234,6 +242,11 @@ impl<S: Storage> Lane<S> {
         self.end.saturating_sub(self.start)
     }
 
+    /// Bytes that still fit, counting those that moving the rest to the front would free.
+    fn room(&self) -> usize {
+        self.buffer.len().saturating_sub(self.waiting())
+    }
+
     fn append(
         &mut self,
         cut: Cut,
@@ -247,7 +260,7 @@ impl<S: Storage> Lane<S> {
             let limit = size.saturating_sub(framed.saturating_sub(total));
             return Err(Error::TooLarge { limit: u32::try_from(limit).unwrap_or(u32::MAX) });
         }
-        if framed > size.saturating_sub(self.waiting()) {
+        if framed > self.room() {
             return Err(Error::Full(Limit::SendQueue));
         }
         if framed > size.saturating_sub(self.end) {
