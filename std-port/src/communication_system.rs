@@ -1,7 +1,7 @@
 //! The paper's `Communication_System`: an m_unit, which connects to many nodes.
 
-use std::sync::{Arc, Weak};
 use std::sync::mpsc::{Receiver, sync_channel};
+use std::sync::{Arc, Weak};
 use std::task::{Poll, Wake, Waker};
 
 use cara_core::config::Constraints;

@@ -1,7 +1,7 @@
 //! The paper's `Unit`: an s_unit, which connects to one m_unit, its manager.
 
-use std::sync::{Arc, Weak};
 use std::sync::mpsc::{Receiver, sync_channel};
+use std::sync::{Arc, Weak};
 
 use cara_core::config::Constraints;
 use cara_core::distribution::identity::{Identity, Role};

@@ -132,8 +132,7 @@ mod tests {
             keep_alive: 0,
             stamp: 0,
         };
-        let config =
-            SessionConfig { link: LinkId(0), dialed: true, address, local, constraints: Constraints::M_UNIT };
+        let config = SessionConfig { link: LinkId(0), dialed: true, address, local, constraints: Constraints::M_UNIT };
         let session = Session::new(Instant::START, config, Plain, storage);
         Arc::new(LinkCell::new(LinkId(0), serial, Stream::connect(address).unwrap(), session, true))
     }

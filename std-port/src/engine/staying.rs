@@ -50,7 +50,12 @@ impl<T: Send + 'static> Engine<T> {
         }
         let mut state = link.lock();
         let others = served.wrapping_sub(std::mem::replace(&mut state.served, served));
-        if others > FEW || !state.quick || !state.waiters.is_empty() || !state.session.is_live() || !state.reader.pool_reads() {
+        if others > FEW
+            || !state.quick
+            || !state.waiters.is_empty()
+            || !state.session.is_live()
+            || !state.reader.pool_reads()
+        {
             return None;
         }
         let turn = state.reader.take_lead()?;
