@@ -238,7 +238,7 @@ mod tests {
 
     #[test]
     fn what_is_frozen_says_nothing() {
-        let mut process = shell("echo $$; cat");
+        let mut process = shell("echo $$; exec cat");
         process.expect("", LONG).unwrap();
         process.freeze().unwrap();
         process.send("one").unwrap();

@@ -93,6 +93,7 @@ fn hang_manager(stage: &Stage, manager: &mut Process, agv: &mut Process) -> Resu
     let frozen = manager.freeze()?;
     stage.tell("the manager is held up (SIGSTOP); its connections stay open");
     let place = stops(stage, agv, frozen)?;
+    stage.heard(&agv.expect("lease of go_to expired", STEP)?, agv);
     manager.thaw()?;
     stage.tell("the manager goes on (SIGCONT)");
     stage.heard(&manager.expect("lease of go_to at agv-1/11 expired", STEP)?, manager);

@@ -108,6 +108,7 @@ fn follow(unit: &Unit<Agv>) {
             match event {
                 UnitEvent::Joined { peer } => say!("joined {peer}"),
                 UnitEvent::Left { peer, reason } => say!("left {peer}: {reason}"),
+                UnitEvent::LeaseExpired { peer, function } => say!("lease of {function} expired, held by {peer}"),
                 UnitEvent::ListChanged { .. } if !called => called = offered(&unit) && call_mechanic(&unit),
                 _ => {}
             }
