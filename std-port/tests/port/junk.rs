@@ -23,7 +23,7 @@ impl Noise {
         let length = 1 + self.next() as usize % 700;
         let mut bytes: Vec<u8> = (0..length).map(|_| self.next() as u8).collect();
         // Some of it looks like a datagram or a hello at first.
-        if self.next() % 2 == 0 {
+        if self.next().is_multiple_of(2) {
             let magic = b"CARp\x01";
             let length = magic.len().min(bytes.len());
             bytes[..length].copy_from_slice(&magic[..length]);
