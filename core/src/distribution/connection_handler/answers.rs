@@ -17,13 +17,15 @@ use crate::time::{Duration, Instant};
 /// longest time for which they do that is this one.
 const SAME_QUESTION: Duration = LONGEST_SEARCH.times(2);
 /// Two broadcast answers are at least this far apart.
-const ANSWER_PAUSE: Duration = FIRST_SEARCH;
+const ANSWER_PAUSE: Duration = FIRST_SEARCH.times(2);
 /// An answer waits up to this long, so that one broadcast serves all who ask meanwhile.
 const ANSWER_GATHER: Duration = Duration::from_millis(20);
 /// Answers to single nodes that may wait for their random delay.
 const WAITING_ANSWERS: usize = 8;
 /// Dials are spread over as many nodes at least: those that hold back are more than those that are expected.
 const LEAST_SPREAD: u16 = 50;
+/// Dials are spread over as many nodes at most, whatever is expected: the last one dials two seconds later.
+const MOST_SPREAD: u16 = 2_000;
 /// A link that is being opened is given up after this, however the network below thinks about it.
 pub(super) const DIAL_TIMEOUT: Duration = Duration::from_secs(6);
 
@@ -128,7 +130,7 @@ impl<S: Storage> Node<S> {
 
     /// A random span within the spread for `expected` nodes.
     pub(super) fn spread(&mut self, expected: u16) -> Duration {
-        self.random.jitter(ANSWER_SPREAD.times(u64::from(expected.max(LEAST_SPREAD))))
+        self.random.jitter(ANSWER_SPREAD.times(u64::from(expected.clamp(LEAST_SPREAD, MOST_SPREAD))))
     }
 
     /// Of two m_units the smaller identity dials; an s_unit always does.
@@ -150,7 +152,7 @@ impl<S: Storage> Node<S> {
             return;
         }
         let address = SocketAddr::new(from.ip(), tcp_port);
-        let Some((place, forgotten)) = self.table.place_of(identity, address, epoch) else {
+        let Some((place, forgotten)) = self.table.hear_of(identity, address, epoch) else {
             self.counters.add(NodeCounter::TableFull, 1);
             return;
         };
@@ -163,13 +165,17 @@ impl<S: Storage> Node<S> {
         known.hear(now, epoch, sequence);
         known.listens = Some(address);
         if !known.is_joined() {
+            if known.epoch != epoch {
+                known.not_before = Instant::START;
+            }
             (known.address, known.epoch) = (address, epoch);
         }
+        let not_before = known.not_before;
         if known.state == NodeState::Away
             && let Some(dial_at) = dial_at
         {
             let planned = if known.task.is_some() { known.due } else { Instant::FAR_FUTURE };
-            self.table.schedule(place, planned.min(dial_at), Task::Dial);
+            self.table.schedule(place, planned.min(dial_at.max(not_before)), Task::Dial);
         }
     }
 

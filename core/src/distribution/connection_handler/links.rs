@@ -1,5 +1,6 @@
 //! Links that are being opened, and links that have ended.
 
+use super::search::pause;
 use super::table::NodeState;
 use super::{Action, Node, Target};
 use crate::distribution::identity::Identity;
@@ -55,7 +56,7 @@ impl<S: Storage> Node<S> {
         let known = self.table.node_mut(place)?;
         if known.dialing.take_if(|dialing| *dialing == link).is_some() {
             if known.state == NodeState::Dialing {
-                self.lose_hope(place, reason);
+                self.lose_hope(now, place, reason);
                 self.dial_ended(now, place);
             }
             return None;
@@ -75,7 +76,11 @@ impl<S: Storage> Node<S> {
         let settled = now.since(known.since) >= SETTLED;
         if settled {
             known.attempts = 0;
+        } else {
+            // A peer's hello comes before its refusal.
+            self.lose_hope(now, place, reason);
         }
+        let known = self.table.node_mut(place)?;
         if let Some(newcomer) = known.newcomer.take() {
             self.take_place(now, place, newcomer);
             return Some(Action::Admit { new: newcomer.link });
@@ -91,14 +96,17 @@ impl<S: Storage> Node<S> {
     }
 
     /// Who was dialled has refused for a reason that does not pass by itself.
-    fn lose_hope(&mut self, place: usize, reason: CloseReason) {
+    fn lose_hope(&mut self, now: Instant, place: usize, reason: CloseReason) {
         let CloseReason::Refused(refusal) = reason else { return };
         if matches!(refusal, Refusal::Full | Refusal::AlreadyConnected) {
             return;
         }
-        self.search.attempt = self.search.attempt.max(HOPELESS);
+        if let Target::Manager(_) = self.config.target {
+            self.search.attempt = self.search.attempt.max(HOPELESS);
+        }
         if let Some(known) = self.table.node_mut(place) {
             known.attempts = known.attempts.max(HOPELESS);
+            known.not_before = now + pause(HOPELESS);
         }
     }
 }

@@ -196,7 +196,7 @@ impl<S: Storage> Node<S> {
             target,
             table: Table::new(storage.nodes, storage.order, storage.links),
             findings: storage.findings,
-            search: Search::new(now, &mut random),
+            search: Search::new(now, config.identity.role(), &mut random),
             budget: Budget::new(),
             answers: Answers::new(),
             sequence: 0,

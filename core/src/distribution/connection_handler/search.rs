@@ -15,13 +15,21 @@ use crate::random::Random;
 use crate::storage::Storage;
 use crate::time::{Duration, Instant};
 
-/// First searches wait a random part of this, so that a fleet that is switched on at once does not ask at once.
+/// First searches of m_units wait a random part of this: there are few, and their question serves a whole fleet.
 pub(super) const FIRST_DELAY: Duration = Duration::from_millis(50);
+/// First searches of s_units wait a random part of this, mostly a late one: of a fleet that is switched on within seconds
+/// most hear a manager's answer to another one first.
+const FIRST_LISTENING: Duration = Duration::from_millis(400);
 /// Searches that an m_unit makes after its start, or after it lost its last node, whoever has joined meanwhile: a lost
 /// datagram must not keep two managers apart.
 const M_UNIT_SEARCHES: u8 = 4;
 /// Pauses double until then.
 const LONGEST_PAUSE_AFTER: u8 = 5;
+/// One unit in so many that hold back for others does so no longer, once pauses are at their longest; it asks whatever
+/// it hears. Nobody who asks all the time silences a fleet for good, and a fleet that waits stays quiet.
+const STUBBORN: u64 = 1_024;
+/// Times in a row that a search is put off because of the budget.
+const DEFERRALS: u8 = 30;
 /// Steps of [`alone`]: among a thousand units about one falls into the earliest that is taken.
 const STEPS: u32 = 12;
 
@@ -37,16 +45,27 @@ pub(super) struct Search {
     round: Instant,
     /// Comes back in answers; the same until one has led to a link.
     pub(super) nonce: u64,
+    /// The next search goes out whatever is heard until then.
+    stubborn: bool,
+    /// Times in a row that the budget was used up.
+    deferred: u8,
 }
 
 impl Search {
-    pub(super) fn new(now: Instant, random: &mut Random) -> Self {
-        let next = now + alone(random, FIRST_DELAY);
-        Self { next, explicit: None, attempt: 0, round: now, nonce: fresh(random) }
+    pub(super) fn new(now: Instant, role: Role, random: &mut Random) -> Self {
+        let next = now + first_delay(role, random);
+        Self { next, explicit: None, attempt: 0, round: now, nonce: fresh(random), stubborn: false, deferred: 0 }
     }
 
     pub(super) fn next(&self) -> Instant {
         self.next.min(self.explicit.unwrap_or(Instant::FAR_FUTURE))
+    }
+}
+
+fn first_delay(role: Role, random: &mut Random) -> Duration {
+    match role {
+        Role::MUnit => random.jitter(FIRST_DELAY),
+        Role::SUnit => alone(random, FIRST_LISTENING),
     }
 }
 
@@ -139,7 +158,7 @@ impl<S: Storage> Node<S> {
         self.search.nonce = fresh(&mut self.random);
         if settled {
             self.search.attempt = 0;
-            self.search.next = now + alone(&mut self.random, FIRST_DELAY);
+            self.search.next = now + first_delay(self.config.identity.role(), &mut self.random);
         } else {
             self.plan_next(now);
         }
@@ -165,7 +184,9 @@ impl<S: Storage> Node<S> {
             return;
         }
         let allowed = self.budget.allowed_at(now);
-        if allowed > now {
+        if allowed > now && !self.search.stubborn {
+            self.search.deferred = self.search.deferred.saturating_add(1);
+            self.search.stubborn = self.search.deferred >= DEFERRALS;
             self.counters.add(NodeCounter::WhoHasDeferred, 1);
             self.search.next = allowed + alone(&mut self.random, FIRST_SEARCH);
             return;
@@ -175,6 +196,7 @@ impl<S: Storage> Node<S> {
 
     fn send_who_has(&mut self, now: Instant, mailman: &mut impl Mailman) {
         self.plan_next(now);
+        (self.search.stubborn, self.search.deferred) = (false, 0);
         self.budget.note(now);
         let known = self.table.iter().filter(|known| known.is_joined()).map(|known| short_hash(&known.identity));
         let who_has = WhoHas {
@@ -214,7 +236,11 @@ impl<S: Storage> Node<S> {
 
     /// Another unit asks this unit's question: the answer will reach both.
     fn hold_back(&mut self, now: Instant) {
-        if self.search.next == Instant::FAR_FUTURE || !self.is_searching() {
+        if self.search.next == Instant::FAR_FUTURE || self.search.stubborn || !self.is_searching() {
+            return;
+        }
+        if self.search.attempt > LONGEST_PAUSE_AFTER && self.random.below(STUBBORN) == 0 {
+            self.search.stubborn = true;
             return;
         }
         self.counters.add(NodeCounter::WhoHasDeferred, 1);

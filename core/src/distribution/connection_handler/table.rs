@@ -19,6 +19,10 @@ pub(super) const NONE: u16 = u16::MAX;
 /// comes first; after it whatever comes is news, since epochs of a board need not rise from boot to boot.
 const REORDERING: Duration = Duration::from_secs(1);
 
+/// Nodes that were only heard of and have never joined: the one heard of first gives way to the next. However many names
+/// somebody makes up, nodes that have been connected are not forgotten for them.
+pub(super) const STRANGERS: usize = 8;
+
 /// What is known of a node.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Known {
@@ -46,6 +50,8 @@ pub struct Known {
     pub(super) since: Instant,
     /// Dials that have failed in a row.
     pub(super) attempts: u8,
+    /// It has refused for a reason that stays: this life of it is not dialled earlier.
+    pub(super) not_before: Instant,
     index: u16,
     pub(super) task: Option<Task>,
     pub(super) due: Instant,
@@ -127,6 +133,7 @@ impl Known {
             newcomer: None,
             since: Instant::START,
             attempts: 0,
+            not_before: Instant::START,
             index: NONE,
             task: None,
             due: Instant::FAR_FUTURE,
@@ -183,11 +190,24 @@ pub(super) struct Table<S: Storage> {
     /// The node that has been away longest, and the one that left last.
     oldest: u16,
     youngest: u16,
+    /// Places of nodes that were heard of and have not joined, in that order.
+    strangers: heapless::Vec<u16, STRANGERS>,
 }
 
 impl<S: Storage> Table<S> {
     pub(super) fn new(nodes: S::Slice<Option<Known>>, order: S::Slice<Order>, links: S::Slice<Option<u16>>) -> Self {
-        Self { nodes, order, links, len: 0, due_len: 0, s_units: 0, m_units: 0, oldest: NONE, youngest: NONE }
+        Self {
+            nodes,
+            order,
+            links,
+            len: 0,
+            due_len: 0,
+            s_units: 0,
+            m_units: 0,
+            oldest: NONE,
+            youngest: NONE,
+            strangers: heapless::Vec::new(),
+        }
     }
 
     pub(super) fn iter(&self) -> impl Iterator<Item = &Known> {
@@ -262,8 +282,31 @@ impl<S: Storage> Table<S> {
         })
     }
 
-    /// The place of an identity, new if need be; `true` when the node that was away longest had to be forgotten for it.
-    /// `None` when every place is taken by a node that is connected or being dialled.
+    /// The place of a node that was heard of, new if need be; `true` when another one had to be forgotten for it. `None`
+    /// when there is no room for one more stranger.
+    pub(super) fn hear_of(&mut self, identity: &Identity, address: SocketAddr, epoch: Epoch) -> Option<(usize, bool)> {
+        if let Some(place) = self.find(identity) {
+            return Some((place, false));
+        }
+        let (place, forgotten) = if self.strangers.is_full() {
+            let stranger = self.idle_stranger()?;
+            self.forget(stranger)?;
+            (self.settle(stranger, identity, address, epoch)?, true)
+        } else {
+            self.place_of(identity, address, epoch)?
+        };
+        let _ = self.strangers.push(u16::try_from(place).ok()?);
+        Some((place, forgotten))
+    }
+
+    /// The stranger that was heard of first, of those that are not being dialled.
+    fn idle_stranger(&self) -> Option<usize> {
+        let away = |place: &usize| self.node(*place).is_some_and(|known| known.state == NodeState::Away);
+        self.strangers.iter().copied().map(usize::from).find(away)
+    }
+
+    /// The place of an identity, new if need be; `true` when a stranger, or else the node that was away longest, had to
+    /// be forgotten for it. `None` when every place is taken by a node that is connected or being dialled.
     pub(super) fn place_of(&mut self, identity: &Identity, address: SocketAddr, epoch: Epoch) -> Option<(usize, bool)> {
         if let Some(place) = self.find(identity) {
             return Some((place, false));
@@ -272,10 +315,15 @@ impl<S: Storage> Table<S> {
         let (place, forgotten) = if self.len < capacity {
             (self.len, false)
         } else {
-            let oldest = usize::from(self.oldest);
+            let oldest = self.idle_stranger().unwrap_or(usize::from(self.oldest));
             self.forget(oldest)?;
             (oldest, true)
         };
+        Some((self.settle(place, identity, address, epoch)?, forgotten))
+    }
+
+    /// Puts a new node into a free place.
+    fn settle(&mut self, place: usize, identity: &Identity, address: SocketAddr, epoch: Epoch) -> Option<usize> {
         let at = self.search(identity).err()?;
         let mut carried = u16::try_from(place).ok()?;
         for row in self.order.get_mut(at..=self.len)? {
@@ -284,7 +332,7 @@ impl<S: Storage> Table<S> {
         *self.nodes.get_mut(place)? = Some(Known::new(identity.clone(), address, epoch));
         self.len = self.len.saturating_add(1);
         self.begin_rest(place);
-        Some((place, forgotten))
+        Some(place)
     }
 
     /// Empties a place of a node that is away.
@@ -292,6 +340,7 @@ impl<S: Storage> Table<S> {
         let at = self.search(&self.node(place)?.identity).ok()?;
         self.cancel(place);
         self.end_rest(place);
+        self.strangers.retain(|stranger| usize::from(*stranger) != place);
         let mut carried = NONE;
         for row in self.order.get_mut(at..self.len)?.iter_mut().rev() {
             core::mem::swap(&mut row.sorted, &mut carried);
@@ -327,6 +376,7 @@ impl<S: Storage> Table<S> {
 
     /// Gives a node that joins for the first time the lowest index that is free among its role.
     pub(super) fn keep_index(&mut self, place: usize) {
+        self.strangers.retain(|stranger| usize::from(*stranger) != place);
         let Some(known) = self.node(place).filter(|known| known.index == NONE) else { return };
         let role = known.identity.role();
         let free = self.order.iter().position(|row| row.of(role) == NONE);

@@ -4,7 +4,7 @@ use super::*;
 use crate::config::{FIRST_SEARCH, LONGEST_SEARCH, SEARCH_BUDGET, SEARCH_WINDOW};
 use crate::distribution::datagram::short_hash;
 
-const SOON: u64 = 50;
+const SOON: u64 = 400;
 
 /// The times at which a node broadcasts up to `end`.
 fn search_times(node: &mut Node<Boxed>, end: Instant) -> Vec<Instant> {
@@ -204,6 +204,7 @@ fn an_s_unit_that_loses_its_manager_searches_again() {
     let depot = m_unit(MANAGER, MANAGER_ID);
     node.dialing(Some(&depot.identity), LinkId(0));
     join(&mut node, at(300), 0, &depot);
+    assert_eq!(run(&mut node, at(1_000), &mut Outbox::default()), []);
     assert_eq!((node.number_of_m_units(), node.next_deadline()), (1, Instant::FAR_FUTURE));
     node.left(at(10_000), LinkId(0), CloseReason::Silent);
     let times = search_times(&mut node, at(12_000));

@@ -8,8 +8,13 @@
 )]
 
 mod admission;
+mod books;
+mod chaos;
 mod discovery;
 mod fleet;
+mod hostile;
+mod load;
+mod network;
 mod ordering;
 mod restart;
 mod table;

@@ -43,20 +43,26 @@ struct Entry {
     rested: usize,
     index: Option<u16>,
     due: Option<u64>,
+    /// When it was heard of, of a node that has not joined.
+    stranger: Option<usize>,
 }
 
 type Model = BTreeMap<u8, Entry>;
 
-fn meet(model: &mut Model, clock: usize, who: u8) -> bool {
+fn meet(model: &mut Model, clock: usize, who: u8, joins: bool) -> bool {
     if model.contains_key(&who) {
         return true;
     }
     if model.len() == CAPACITY {
         let away = model.iter().filter(|(_, entry)| !entry.joined);
-        let Some(oldest) = away.min_by_key(|(_, entry)| entry.rested).map(|(who, _)| *who) else { return false };
+        let key = |entry: &Entry| (entry.stranger.is_none(), entry.stranger.unwrap_or(entry.rested));
+        let Some(oldest) = away.min_by_key(|(_, entry)| key(entry)).map(|(who, _)| *who) else { return false };
         model.remove(&oldest);
     }
-    model.insert(who, Entry { joined: false, rested: clock, index: None, due: None });
+    model.insert(
+        who,
+        Entry { joined: false, rested: clock, index: None, due: None, stranger: (!joins).then_some(clock) },
+    );
     true
 }
 
@@ -93,18 +99,19 @@ proptest! {
         for (clock, step) in steps.into_iter().enumerate() {
             match step {
                 Step::Meet(who) => {
-                    let place = table.place_of(&identity(who), address(1, 1), Epoch(1));
-                    prop_assert_eq!(place.is_some(), meet(&mut model, clock, who));
+                    let place = table.hear_of(&identity(who), address(1, 1), Epoch(1));
+                    prop_assert_eq!(place.is_some(), meet(&mut model, clock, who, false));
                 }
                 Step::Join(who) => {
                     let place = table.place_of(&identity(who), address(1, 1), Epoch(1));
-                    prop_assert_eq!(place.is_some(), meet(&mut model, clock, who));
+                    prop_assert_eq!(place.is_some(), meet(&mut model, clock, who, true));
                     let Some((place, _)) = place else { continue };
                     table.set_state(place, NodeState::Joined(LinkId(u16::from(who))));
                     table.keep_index(place);
                     let free = lowest_free(&model, identity(who).role());
                     let entry = model.get_mut(&who).unwrap();
                     entry.joined = true;
+                    entry.stranger = None;
                     entry.index.get_or_insert(free);
                 }
                 Step::Leave(who) => {

@@ -1,0 +1,160 @@
+//! What strangers on the network can do: fill tables, shout others down, keep a unit waiting.
+
+use super::*;
+use crate::config::LONGEST_SEARCH;
+
+fn announce(node: &mut Node<Boxed>, now: Instant, from: u32, announce: &Announce) {
+    node.datagram(now, address(from, 7_001), &announce_bytes(announce));
+}
+
+#[test]
+fn made_up_names_neither_push_out_known_nodes_nor_are_kept() {
+    let mut node = depot();
+    for link in 0..12 {
+        join(&mut node, at(1), link, &s_unit("agv", 100 + u32::from(link)));
+    }
+    for link in 0..6 {
+        node.left(at(2), LinkId(link), CloseReason::Reset);
+    }
+    for id in 0..2_000 {
+        announce(&mut node, at(3 + u64::from(id)), id + 1, &announce_of(&m_unit("made-up", 1_000 + id), 1, 0));
+        while node.poll(at(3 + u64::from(id)), &mut Outbox::default()).is_some() {}
+    }
+    assert_eq!(node.s_units().count(), 12, "each keeps its index");
+    assert!(node.nodes().count() <= 12 + 4, "what is left of the table is enough for strangers");
+    let real = m_unit("real", 9);
+    announce(&mut node, at(20_000), 9, &announce_of(&real, 1, 0));
+    assert!(node.node(&real.identity).is_some(), "a real one is heard all the same");
+}
+
+#[test]
+fn a_few_strangers_are_kept_even_where_there_is_room_for_more() {
+    let mut node: Node<Boxed> = Node::new(at(0), m_unit(MANAGER, MANAGER_ID), storage(64));
+    for id in 0..100 {
+        announce(&mut node, at(1), id + 1, &announce_of(&m_unit("made-up", 1_000 + id), 1, 0));
+    }
+    let ids: Vec<_> = node.nodes().map(|known| known.identity.id()).collect();
+    assert_eq!((ids.len(), ids.iter().min(), ids.iter().max()), (8, Some(&1_092), Some(&1_099)), "the last ones heard");
+    assert_eq!(node.counters.value(NodeCounter::Forgotten), 92);
+}
+
+#[test]
+fn strangers_that_are_being_dialled_leave_no_room_until_they_are_given_up() {
+    let mut node: Node<Boxed> = Node::new(at(0), m_unit(MANAGER, MANAGER_ID), storage(64));
+    for id in 0..8 {
+        announce(&mut node, at(1), id + 1, &announce_of(&m_unit("made-up", 1_000 + id), 1, 0));
+    }
+    assert_eq!(run(&mut node, at(200), &mut Outbox::default()).len(), 8);
+    announce(&mut node, at(201), 9, &announce_of(&m_unit("late", 9), 1, 0));
+    assert_eq!((node.nodes().count(), node.counters.value(NodeCounter::TableFull)), (8, 1));
+    join(&mut node, at(202), 0, &s_unit("agv", 1));
+    assert_eq!(node.nodes().count(), 9, "who joins needs no place among strangers");
+    // One that does not answer is dialled more and more seldom, and gives way between two tries.
+    let mut tries = 0;
+    while node.find("late").is_none() {
+        tries += 1;
+        run(&mut node, at(7_000 + tries * 1_000), &mut Outbox::default());
+        announce(&mut node, at(7_000 + tries * 1_000), 9, &announce_of(&m_unit("late", 9), 2, 0));
+    }
+    assert!(tries <= 10, "{tries} s");
+}
+
+#[test]
+fn a_thousand_junk_datagrams_change_nothing_but_counters() {
+    for config in [m_unit(MANAGER, MANAGER_ID), s_unit("agv", 1)] {
+        let mut node = node(config);
+        let before = node.next_deadline();
+        let mut random = Random::new(3);
+        for length in 0..1_000_usize {
+            let junk: Vec<u8> = (0..length % 600).map(|_| random.bits() as u8).collect();
+            node.datagram(at(1), address(9, 9), &junk);
+        }
+        assert_eq!((node.next_deadline(), node.nodes().count(), node.findings().count()), (before, 0, 0));
+        let counted = [NodeCounter::DatagramMagic, NodeCounter::DatagramMalformed].map(|c| node.counters.value(c));
+        assert_eq!(counted.iter().sum::<u64>(), 1_000);
+    }
+}
+
+/// How many searches a unit sends within ten minutes in which `others` ask every `pause`.
+fn searches_among(others: &NodeConfig, pause: Duration, seed: u64) -> usize {
+    let mut node = node(NodeConfig { seed, ..s_unit("agv", 1) });
+    let mut outbox = Outbox::default();
+    let mut now = at(0);
+    let mut sequence = 0;
+    while now < at(600_000) {
+        sequence += 1;
+        node.datagram(now, address(9, 7_001), &who_has_bytes(&search_of(others, sequence)));
+        now = now + pause;
+        run(&mut node, now, &mut outbox);
+    }
+    outbox.broadcasts.len()
+}
+
+#[test]
+fn who_asks_all_the_time_silences_nobody_for_good() {
+    let same_question = s_unit("shouter", 2);
+    let another = NodeConfig { target: Target::Manager(Manager::new("yard", 1).unwrap()), ..s_unit("shouter", 2) };
+    for seed in 0..4 {
+        let asked = searches_among(&same_question, Duration::from_millis(10), seed);
+        assert!((1..=400).contains(&asked), "{asked} while one asks the same all the time");
+        let asked = searches_among(&another, Duration::from_millis(50), seed);
+        assert!((10..=400).contains(&asked), "{asked} while one uses the budget up");
+    }
+}
+
+#[test]
+fn a_dial_waits_two_seconds_at_most_whatever_is_expected() {
+    for seed in 0..20 {
+        let mut node = node(NodeConfig { seed, ..s_unit("agv", 1) });
+        let crowded = Announce { expected: u16::MAX, ..announce_of(&m_unit(MANAGER, MANAGER_ID), 1, 0) };
+        announce(&mut node, at(0), 1, &crowded);
+        let actions = run(&mut node, at(2_000), &mut Outbox::default());
+        assert!(matches!(actions[..], [(_, Action::Dial { .. })]), "{actions:?}");
+    }
+}
+
+#[test]
+fn a_refusal_after_the_hello_keeps_the_unit_from_dialling_that_life_for_long() {
+    let depot = m_unit(MANAGER, MANAGER_ID);
+    let refused = |refusal| {
+        let mut node = node(s_unit("agv", 1));
+        dial_manager(&mut node, at(1), 1);
+        node.dialing(Some(&depot.identity), LinkId(0));
+        join(&mut node, at(300), 0, &depot);
+        node.left(at(301), LinkId(0), CloseReason::Refused(refusal));
+        node
+    };
+    for refusal in [Refusal::DuplicateIdentity, Refusal::WrongManager, Refusal::Role] {
+        let mut node = refused(refusal);
+        announce(&mut node, at(400), 1, &announce_of(&depot, 2, 0));
+        assert_eq!(run(&mut node, at(301) + LONGEST_SEARCH - Duration::from_millis(1), &mut Outbox::default()), []);
+        let dials = run(&mut node, at(20_000), &mut Outbox::default());
+        assert!(!dials.is_empty(), "but it does not give up");
+
+        let mut node = refused(refusal);
+        let restarted = NodeConfig { epoch: Epoch(200), ..depot.clone() };
+        announce(&mut node, at(400), 1, &announce_of(&restarted, 1, 0));
+        assert_eq!(run(&mut node, at(1_000), &mut Outbox::default()).len(), 1, "another life may think otherwise");
+    }
+    let mut node = refused(Refusal::Full);
+    assert!(node.next_deadline() < at(301) + LONGEST_SEARCH);
+    announce(&mut node, at(400), 1, &announce_of(&depot, 2, 0));
+    assert_eq!(run(&mut node, at(1_000), &mut Outbox::default()).len(), 1, "there is room now");
+}
+
+#[test]
+fn links_that_never_joined_start_no_search() {
+    let mut with_peers = depot();
+    join(&mut with_peers, at(1), 0, &s_unit("agv", 1));
+    run(&mut with_peers, at(60_000), &mut Outbox::default());
+    let mut joined = node(s_unit("agv", 1));
+    join(&mut joined, at(1), 0, &m_unit(MANAGER, MANAGER_ID));
+    run(&mut joined, at(60_000), &mut Outbox::default());
+    for mut node in [with_peers, joined] {
+        assert_eq!(node.next_deadline(), Instant::FAR_FUTURE);
+        for reason in [CloseReason::Refused(Refusal::Full), CloseReason::HelloTimeout, CloseReason::Reset] {
+            assert_eq!(node.left(at(60_001), LinkId(7), reason), None);
+        }
+        assert_eq!(node.next_deadline(), Instant::FAR_FUTURE);
+    }
+}
