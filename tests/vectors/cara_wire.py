@@ -461,6 +461,8 @@ def decode_session_body(data):
     elif kind == 2:
         slot, generation, stamp, since = reader.fixed("HHQI")
         body = {"renew": {"slot": slot, "generation": generation, "stamp": stamp, "since": since}}
+    elif kind in (4, 5):
+        body = {"ping" if kind == 4 else "pong": {}}
     else:
         require(kind == 3)
         priority = reader.u8()
@@ -474,6 +476,8 @@ def encode_session_body(body):
     (name, value), = body.items()
     if name == "keep_alive":
         return struct.pack("<BQ", 1, value["stamp"])
+    if name in ("ping", "pong"):
+        return bytes([4 if name == "ping" else 5])
     if name == "renew":
         return struct.pack("<BHHQI", 2, value["slot"], value["generation"], value["stamp"], value["since"])
     return bytes([3, PRIORITIES.index(value["priority"])]) + encode_message(value["message"])

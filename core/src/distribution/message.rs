@@ -296,6 +296,10 @@ pub enum SessionBody<'b> {
     Renew(Renewal),
     /// One whole message: a best-effort request, or an emergency's second copy. The priority's byte, the message.
     Message(u8, &'b [u8]),
+    /// To be answered at once, in a datagram.
+    Ping,
+    /// The answer.
+    Pong,
 }
 
 /// The caller still wants what a leased function started; aged like a request.
@@ -317,6 +321,8 @@ pub const SESSION_BODY_BYTES: usize = 20;
 const KEEP_ALIVE: u8 = 1;
 const RENEW: u8 = 2;
 const MESSAGE: u8 = 3;
+const PING: u8 = 4;
+const PONG: u8 = 5;
 
 impl<'b> SessionBody<'b> {
     /// Reads a session body.
@@ -339,6 +345,8 @@ impl<'b> SessionBody<'b> {
                 let (&priority, message) = rest.split_first()?;
                 Some(Self::Message(priority, message))
             }
+            PING if rest.is_empty() => Some(Self::Ping),
+            PONG if rest.is_empty() => Some(Self::Pong),
             _ => None,
         }
     }
@@ -357,6 +365,11 @@ impl<'b> SessionBody<'b> {
         let [w, x, y, z] = renewal.since.as_wire().to_le_bytes();
         [RENEW, s0, s1, g0, g1, a, b, c, d, e, f, g, h, w, x, y, z]
     }
+
+    /// A ping's byte.
+    pub const PING: [u8; 1] = [PING];
+    /// A pong's byte.
+    pub const PONG: [u8; 1] = [PONG];
 
     /// The two bytes before a message.
     pub const fn message_prefix(priority: u8) -> [u8; 2] {
@@ -426,6 +439,8 @@ mod tests {
 
     #[test]
     fn session_bodies_survive() {
+        assert_eq!(SessionBody::decode(&SessionBody::PING), Some(SessionBody::Ping));
+        assert_eq!(SessionBody::decode(&SessionBody::PONG), Some(SessionBody::Pong));
         assert_eq!(SessionBody::decode(&SessionBody::keep_alive(9)), Some(SessionBody::KeepAlive { stamp: 9 }));
         let renewal = Renewal { slot: Slot(1), generation: Generation(2), stamp: 3, since: Duration::from_micros(4) };
         assert_eq!(SessionBody::decode(&SessionBody::renewal(&renewal)), Some(SessionBody::Renew(renewal)));

@@ -183,6 +183,8 @@ fn variable(value: Variable<'_>) -> Value {
 pub(crate) fn session_body(bytes: &[u8]) -> Option<Value> {
     Some(match SessionBody::decode(bytes)? {
         SessionBody::KeepAlive { stamp } => json!({ "keep_alive": { "stamp": stamp } }),
+        SessionBody::Ping => json!({ "ping": {} }),
+        SessionBody::Pong => json!({ "pong": {} }),
         SessionBody::Renew(renewal) => json!({ "renew": {
             "slot": renewal.slot.0,
             "generation": renewal.generation.0,

@@ -196,6 +196,8 @@ fn session_bodies() -> Vec<Vector> {
             &SessionBody::keep_alive(0x0001_0203_0405_0607),
             &json!({ "keep_alive": { "stamp": 0x0001_0203_0405_0607_u64 } }),
         ),
+        body(("ping", "to be answered at once, in a datagram"), &SessionBody::PING, &json!({ "ping": {} })),
+        body(("pong", "the answer"), &SessionBody::PONG, &json!({ "pong": {} })),
         body(
             ("renew", "the caller still wants what a leased function started"),
             &SessionBody::renewal(&renewal),

@@ -162,8 +162,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
                 self.flush(cx);
                 Outcome::Nothing
             }
-            (Incoming::Pong, Phase::Live) if core::mem::take(&mut self.challenged) => Event::Answered.into(),
-            (Incoming::Pong, Phase::Live) => Outcome::Nothing,
+            (Incoming::Pong, Phase::Live) => self.answered(),
             (Incoming::Session(place), Phase::Live) => self.session_body(cx, place, lent),
             (Incoming::Message(priority, place), Phase::Live) => {
                 self.message_arrived(cx, priority, place, lent, arguments)
@@ -223,8 +222,18 @@ impl<S: Storage, C: Secure> Session<S, C> {
                     _ => self.unreadable_datagram(),
                 }
             }
+            Some(SessionBody::Ping) => {
+                self.send_datagram(cx, &SessionBody::PONG, &[]);
+                Outcome::Nothing
+            }
+            Some(SessionBody::Pong) => self.answered(),
             None => self.unreadable_datagram(),
         }
+    }
+
+    /// The first answer to a challenge is news; more of them are not.
+    fn answered(&mut self) -> Outcome {
+        if core::mem::take(&mut self.challenged) { Event::Answered.into() } else { Outcome::Nothing }
     }
 
     fn unreadable_datagram(&mut self) -> Outcome {

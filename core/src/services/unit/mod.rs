@@ -31,6 +31,7 @@ use crate::distribution::function_list::{Entry, Slot, TheirFunctionList};
 use crate::distribution::hello::Hello;
 use crate::distribution::identity::{Epoch, Identity};
 use crate::distribution::message::REQUEST_BYTES;
+use crate::distribution::message::SessionBody;
 use crate::error::{CloseReason, Error, Refusal};
 use crate::host::connections::{Link, LinkCounter, Liveness};
 use crate::host::frame::{self, Frame};
@@ -46,6 +47,9 @@ use timing::{PeerClock, Timers};
 
 /// Longest hello frame.
 const HELLO_BYTES: usize = 320;
+/// A challenge goes in the stream and in so many datagrams: one lost segment or datagram must not make a live peer look
+/// dead, and its place go to a twin.
+const CHALLENGE_DATAGRAMS: usize = 3;
 /// Most that a chunk adds to its piece of a message, without sealing.
 const FRAME_BYTES: usize = frame::HEADER_BYTES + 6;
 /// Messages of the protocol itself fit this, however small `message_size` is.
@@ -333,6 +337,9 @@ impl<S: Storage, C: Secure> Session<S, C> {
             self.challenged = true;
             self.link.send_frame(&Frame::Ping);
             self.flush(cx);
+            for _ in 0..CHALLENGE_DATAGRAMS {
+                self.send_datagram(cx, &SessionBody::PING, &[]);
+            }
         }
     }
 

@@ -156,16 +156,19 @@ fn a_motion_that_is_given_up_before_it_began_does_not_begin() {
     let slot = pair.agv.offer_leased("go()", LEASE);
     pair.publish();
     pair.manager.call("work", &none()).unwrap();
+    // One command waits at the callee for its turn, another one at the caller for company: both are given up.
     let told = pair.manager.tell("go", &none()).unwrap();
-    pair.settle();
+    pair.run(Duration::from_millis(1));
+    let late = pair.manager.tell("go", &none()).unwrap();
     pair.manager.release(slot);
-    pair.settle();
+    pair.run(Duration::from_millis(1));
     pair.agv.answer_held(Ok(&*none()));
     pair.settle();
     assert_eq!((pair.agv.ran().len(), pair.agv.is_live(slot)), (1, false));
     assert!(pair.manager.has(&Happened::Failed(told, Error::Expired)));
+    assert!(pair.manager.has(&Happened::Failed(late, Error::Expired)));
     pair.manager.tell("go", &none()).unwrap();
-    pair.settle();
+    pair.run(Duration::from_millis(1));
     assert_eq!((pair.agv.ran().len(), pair.agv.is_live(slot)), (2, true));
 }
 
