@@ -87,7 +87,10 @@ pub enum Seen {
 
 /// How a call ended, and when.
 #[derive(Clone)]
-pub struct Pending<T = BoxedParameters>(Arc<Mutex<Option<(Result<T, Error>, Instant)>>>);
+pub struct Pending<T = BoxedParameters>(Arc<Mutex<Option<Ended<T>>>>);
+
+/// A result, and when it came.
+type Ended<T> = (Result<T, Error>, Instant);
 
 /// How a call to many nodes ended.
 pub type PendingAll = Pending<Vec<(Identity, Result<(), Error>)>>;

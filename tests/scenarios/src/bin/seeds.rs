@@ -81,7 +81,7 @@ fn run(scenario: &Scenario, wanted: &Wanted) -> (u64, bool) {
     let missing = if wanted.seed.is_some() { Vec::new() } else { missing(scenario, &report) };
     show(scenario, seeds.len(), start.elapsed(), &report);
     for (seed, failure) in failures.iter().take(SHOWN) {
-        println!("  FAILED with seed {seed}: {failure}");
+        println!("  FAILED with seed {seed}: {}", failure.replace('\n', "\n    "));
         println!(
             "  replay: cargo run --release --package cara-scenarios --bin seeds -- --scenario {} --seed {seed}",
             scenario.name

@@ -1,5 +1,6 @@
 //! A handler that takes long delays nobody else.
 
+use cara_core::error::{Error, ServiceError};
 use cara_core::services::unit::RequestOptions;
 
 use super::{met, pair};
@@ -14,6 +15,7 @@ scenarios![
     a_service_calls_its_caller_back: "handlers run outside", Rough, [], ["RequestsRun"];
     two_peers_call_each_other_at_the_same_time: "handlers run outside, 6", Rough, [], ["RequestsRun"];
     many_callers_share_one_link: "6", Rough, [], ["RequestsRun"];
+    a_handler_that_panics_is_answered: "handler panics", Rough, [], ["panicked"];
 ];
 
 const PATIENT: RequestOptions = RequestOptions {
@@ -107,7 +109,7 @@ fn many_callers_share_one_link(world: &mut dyn World) {
     let manager = world.add(Spec::manager("manager", 1));
     world.add(Spec::agv("agv", 7).service(&service).limits(|limits| limits.calls_per_peer = 32));
     met(world, &manager, "agv", "note");
-    for round in 0..20 {
+    for round in 0..40 {
         let calls: Vec<_> =
             (0..8).map(|n| manager.begin("agv", "note", &number("n", 8 * round + n), PATIENT)).collect();
         for call in &calls {
@@ -116,5 +118,20 @@ fn many_callers_share_one_link(world: &mut dyn World) {
     }
     let mut values = service.diary().values();
     values.sort_unstable();
-    assert_eq!(values, (0..160).collect::<Vec<_>>());
+    assert_eq!(values, (0..320).collect::<Vec<_>>());
+}
+
+fn a_handler_that_panics_is_answered(world: &mut dyn World) {
+    let broken = Service::numbered("broken").does(|_, _| std::panic::panic_any(crate::run::ON_PURPOSE));
+    let sound = Service::numbered("sound");
+    let manager = world.add(Spec::manager("manager", 1));
+    world.add(Spec::agv("agv", 7).service(&broken).service(&sound));
+    met(world, &manager, "agv", "broken");
+    met(world, &manager, "agv", "sound");
+    for n in 0..3 {
+        let asked = world.ask(&manager, "agv", "broken", &mut number("n", n));
+        assert_eq!(asked, Err(Error::Service(ServiceError::Panicked)));
+        assert_eq!(world.ask(&manager, "agv", "sound", &mut number("n", n)), Ok(()), "the rest goes on");
+    }
+    world.reached("panicked");
 }

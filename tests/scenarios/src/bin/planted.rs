@@ -1,0 +1,99 @@
+//! Builds with each bug that is planted behind a test-only cfg, and requires that the scenarios find it.
+//!
+//! `planted [BUG…]`; all of them without a name. Each is built in `target/planted`, so that no other build sees it.
+
+use std::path::Path;
+use std::process::{Command, ExitCode, Output};
+use std::time::Instant;
+
+/// A bug, and the run that must find it.
+struct Planted {
+    bug: &'static str,
+    build: &'static [&'static str],
+    run: &'static [&'static str],
+}
+
+const SEEDS: &[&str] = &["run", "--package", "cara-scenarios", "--bin", "seeds", "--", "--seeds", "10"];
+const BUILD_SEEDS: &[&str] = &["build", "--package", "cara-scenarios", "--bin", "seeds"];
+const LINUX: &[&str] = &["test", "--package", "cara-scenarios", "--test", "linux", "--", "many_callers"];
+const BUILD_LINUX: &[&str] = &["test", "--no-run", "--package", "cara-scenarios", "--test", "linux"];
+
+const ALL: [Planted; 3] = [
+    Planted { bug: "double_execution", build: BUILD_SEEDS, run: SEEDS },
+    Planted { bug: "leaked_slot", build: BUILD_SEEDS, run: SEEDS },
+    Planted { bug: "lost_wakeup", build: BUILD_LINUX, run: LINUX },
+];
+
+fn main() -> ExitCode {
+    let names: Vec<String> = std::env::args().skip(1).collect();
+    let wanted: Vec<&Planted> =
+        ALL.iter().filter(|planted| names.is_empty() || names.iter().any(|name| name == planted.bug)).collect();
+    if wanted.is_empty() {
+        eprintln!("there is no such bug: {}", names.join(", "));
+        return ExitCode::from(2);
+    }
+    let found = wanted.iter().filter(|planted| finds(planted)).count();
+    println!("{found} of {} planted bugs found", wanted.len());
+    if found == wanted.len() { ExitCode::SUCCESS } else { ExitCode::FAILURE }
+}
+
+/// Whether the run fails because of the bug, rather than the build.
+fn finds(planted: &Planted) -> bool {
+    let start = Instant::now();
+    let built = cargo(planted.bug, planted.build);
+    if !built.status.success() {
+        println!("{}: does not build\n{}", planted.bug, String::from_utf8_lossy(&built.stderr));
+        return false;
+    }
+    let output = cargo(planted.bug, planted.run);
+    let text = String::from_utf8_lossy(&output.stdout);
+    let finders = finders(&text);
+    let found = !output.status.success() && !finders.is_empty();
+    let verdict = if found { "found" } else { "NOT FOUND" };
+    let seconds = start.elapsed().as_secs();
+    println!("{}: {verdict} in {seconds} s by {} scenarios: {}", planted.bug, finders.len(), finders.join(", "));
+    found
+}
+
+/// Scenarios of which the output says that a run of theirs failed.
+fn finders(text: &str) -> Vec<String> {
+    let mut current = "";
+    let mut finders: Vec<String> = Vec::new();
+    for line in text.lines() {
+        let word = line.split_whitespace().next().unwrap_or_default();
+        let linux = line.strip_prefix("test ").filter(|rest| rest.contains("... FAILED"));
+        if let Some(name) = linux.and_then(|rest| rest.split_whitespace().next()) {
+            finders.push(name.to_owned());
+        } else if !line.starts_with(' ') {
+            current = word;
+        } else if line.starts_with("  FAILED with seed") && finders.last().is_none_or(|last| last != current) {
+            finders.push(current.to_owned());
+        }
+    }
+    finders
+}
+
+fn cargo(bug: &str, arguments: &[&str]) -> Output {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
+    let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
+    Command::new(cargo)
+        .args(arguments)
+        .current_dir(&root)
+        .env("RUSTFLAGS", format!("--cfg cara_planted=\"{bug}\""))
+        .env("CARGO_TARGET_DIR", root.join("target/planted"))
+        .output()
+        .expect("cargo can be started")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::finders;
+
+    #[test]
+    fn failed_scenarios_are_named_once() {
+        let seeds = "a (1): 10 seeds, 0.1 s\n  faults: none\n  FAILED with seed 1: x\n    assertion\n  FAILED with seed 2: x\n\
+                     b (2): 10 seeds\n  FAILED: `x` was never reached\n";
+        assert_eq!(finders(seeds), ["a"]);
+        assert_eq!(finders("test c ... FAILED (3 ms)\ntest d ... ok (1 ms)\n"), ["c"]);
+    }
+}
