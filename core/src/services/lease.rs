@@ -30,17 +30,27 @@ impl Lease {
         end != 0 && (end.wrapping_sub(now) as i32) > 0
     }
 
-    /// Lets the service act until `end`.
+    /// Lets the service act until [`Lease::seen_end`] of `end`.
     pub fn renew(&self, end: Instant) {
-        let millis = (end.as_micros() / 1_000) as u32;
-        let odd = if millis & 1 == 0 { millis.wrapping_sub(1) } else { millis };
-        self.end.store(odd, Ordering::Release);
+        self.end.store(odd_millis(end) as u32, Ordering::Release);
+    }
+
+    /// When a lease that is granted until `end` is seen to be dead: up to 2 ms earlier. The unit ends it at that moment
+    /// too, so that what has been seen dead is not renewed.
+    pub fn seen_end(end: Instant) -> Instant {
+        Instant::from_micros(odd_millis(end).saturating_mul(1_000))
     }
 
     /// Ends it now.
     pub fn end(&self) {
         self.end.store(0, Ordering::Release);
     }
+}
+
+/// The end in milliseconds, rounded down to an odd number, which is never the 0 of "no lease".
+const fn odd_millis(end: Instant) -> u64 {
+    let millis = end.as_micros() / 1_000;
+    if millis & 1 == 0 { millis.saturating_sub(1) | 1 } else { millis }
 }
 
 /// What the core asks of a port's service: where its lease is, if it has one.

@@ -13,7 +13,7 @@ use crate::host::frame::Frame;
 use crate::host::mailman::Mailman;
 use crate::host::secure::Secure;
 use crate::services::Context;
-use crate::services::lease::{Granted, Service};
+use crate::services::lease::{Granted, Lease, Service};
 use crate::storage::{Buffers, Storage};
 use crate::time::{Duration, Instant};
 
@@ -230,6 +230,11 @@ impl<S: Storage, C: Secure> Session<S, C> {
         granted: Granted,
     ) -> Result<(), Error> {
         let known = self.granted.iter_mut().find(|known| known.slot == granted.slot);
+        // What has been seen dead is reported before anything begins in its place.
+        if known.as_ref().is_some_and(|known| known.end <= cx.now) {
+            return Err(Error::Busy);
+        }
+        let granted = Granted { end: Lease::seen_end(granted.end), ..granted };
         // What came late on its way takes nothing away from what came before it.
         let end = known.as_ref().map_or(granted.end, |known| known.end.max(granted.end));
         let granted = Granted { end, ..granted };
