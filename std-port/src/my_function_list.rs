@@ -8,7 +8,7 @@ use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 use cara_core::services::lease::Lease;
 
-use crate::engine::{Engine, read, write};
+use crate::engine::{Engine, arena_bytes, read, write};
 use crate::handler::{Handler, IntoHandler, ServiceOptions};
 use crate::lease::LeaseWatch;
 use crate::storage::Boxed;
@@ -32,12 +32,16 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
 
     /// Adds a function by its definition, as made by `"go_to(position: int[2])".parse()`, with attributes. Returns its
     /// lease, which is dead unless the options ask for one.
+    ///
+    /// [`Error::TooLarge`] when arguments and results are declared larger than calls are served with: raise
+    /// `message_size`, or declare less.
     pub fn add_service<Form>(
         &self,
         definition: &Definition,
         options: ServiceOptions<T>,
         handler: impl IntoHandler<T, Form>,
     ) -> Result<LeaseWatch, Error> {
+        self.check_size(definition)?;
         self.put(options, handler, |list, attributes, handler| list.add_function(definition, attributes, handler))
     }
 
@@ -48,7 +52,15 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
         options: ServiceOptions<T>,
         handler: impl IntoHandler<T, Form>,
     ) -> Result<LeaseWatch, Error> {
+        self.check_size(definition)?;
         self.put(options, handler, |list, attributes, handler| list.replace(definition, attributes, handler))
+    }
+
+    /// Arguments and results get their declared sizes when a call is served, so they must fit then.
+    fn check_size(&self, definition: &Definition) -> Result<(), Error> {
+        let limit = arena_bytes(self.engine.longest_message());
+        let fits = definition.signature().parameters_bytes() as usize <= limit;
+        if fits { Ok(()) } else { Err(Error::TooLarge { limit: limit as u32 }) }
     }
 
     fn put<Form>(

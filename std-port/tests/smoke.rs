@@ -86,3 +86,13 @@ fn a_handler_that_holds_a_weak_handle_does_not_keep_the_unit() {
     until("the AGV has left", || manager.number_of_s_units() == 0);
     until("its handlers are gone", || std::sync::Arc::strong_count(&alive) == 1);
 }
+
+#[test]
+fn a_function_that_could_not_be_served_is_refused_when_it_is_added() {
+    let (manager, _) = pair();
+    let definition = "log(text: string[1000000])".parse().unwrap();
+    let log = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+    let added = manager.my_function_list().add_service(&definition, cara_std::ServiceOptions::new(), log);
+    assert!(matches!(added, Err(Error::TooLarge { .. })), "{added:?}");
+    assert!(manager.my_function_list().is_empty());
+}

@@ -18,6 +18,7 @@ mod workers;
 #[cfg(feature = "async")]
 pub(crate) use calling::CallFuture;
 pub(crate) use membership::NodeCell;
+pub(crate) use workers::arena_bytes;
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -51,7 +52,7 @@ use state_gate::StateGate;
 /// Bytes that one read takes from a stream.
 pub(crate) const READ_BYTES: usize = 64 * 1024;
 /// A link on which reading is paused is looked at again after this.
-const RETRY: cara_core::time::Duration = cara_core::time::Duration::from_millis(1);
+pub(crate) const RETRY: cara_core::time::Duration = cara_core::time::Duration::from_millis(1);
 
 /// What a session call is lent on Linux.
 pub(crate) type Lent<'c, T> = Context<'c, Boxed, StdMailman<'c>, &'c MessagePool, Handler<T>>;
@@ -289,7 +290,7 @@ impl<T: Send + 'static> Engine<T> {
 
     fn set_timer(&self, link: &LinkCell, state: &mut LinkState) {
         let mut deadline = state.session.deadline();
-        if !state.leftover.is_empty() {
+        if state.is_paused() {
             deadline = deadline.min(self.clock.now() + RETRY);
         }
         // A timer that is early does no harm: it is set anew when it comes.
@@ -304,7 +305,7 @@ impl<T: Send + 'static> Engine<T> {
     /// Keeps the epoll registration in step with who reads and whether bytes wait to be written.
     fn set_interest(&self, link: &LinkCell, state: &mut LinkState) {
         let wanted = Registration {
-            readable: state.reader.pool_reads(),
+            readable: state.reader.pool_reads() && !state.is_paused(),
             writable: state.connecting || state.session.wants_to_write(),
         };
         if state.registration == wanted {

@@ -77,7 +77,7 @@ impl<T: Send + 'static> Engine<T> {
         self.idle.load(Ordering::Acquire) > 0 || self.this().is_some_and(|engine| engine.start_worker())
     }
 
-    pub(super) fn longest_message(&self) -> usize {
+    pub(crate) fn longest_message(&self) -> usize {
         self.longest_message.load(Ordering::Acquire)
     }
 
@@ -117,7 +117,7 @@ impl<T: Send + 'static> Engine<T> {
             link.room.notify_all();
         }
         let mut call = None;
-        if ready.readable && !state.connecting && !state.reader.is_led() {
+        if ready.readable && !state.connecting && !state.reader.is_led() && !state.is_paused() {
             call = self.drain(&link, &mut state, ready.hung_up, worker);
         }
         match call {
@@ -146,7 +146,7 @@ impl<T: Send + 'static> Engine<T> {
             let bytes = worker.buffer.get_mut(..count).unwrap_or_default();
             call = call.or(self.feed(link, state, bytes, arguments, None));
             // A short read has emptied the stream; a hang-up shows in one more.
-            if count < READ_BYTES && !hung_up {
+            if state.is_paused() || (count < READ_BYTES && !hung_up) {
                 return call;
             }
         }
@@ -175,13 +175,21 @@ impl<T: Send + 'static> Engine<T> {
     }
 }
 
-/// Parameters that hold a message of up to `bytes`, and as much again for results and names.
-fn arena(bytes: usize) -> Box<ParametersView> {
-    const KIB: usize = 1024;
-    match bytes {
-        0..=2048 => Box::new(Parameters::<{ 8 * KIB }>::sized()),
-        2049..=20_000 => Box::new(Parameters::<{ 48 * KIB }>::sized()),
-        20_001..=40_000 => Box::new(Parameters::<{ 96 * KIB }>::sized()),
-        _ => Box::new(Parameters::<{ 320 * KIB }>::sized()),
+/// Bytes of the parameters in which calls of up to `message` bytes are served: as much again for results and names.
+pub(crate) const fn arena_bytes(message: usize) -> usize {
+    match message {
+        0..=2048 => 8 * 1024,
+        2049..=20_000 => 48 * 1024,
+        20_001..=40_000 => 96 * 1024,
+        _ => 320 * 1024,
+    }
+}
+
+fn arena(message: usize) -> Box<ParametersView> {
+    match message {
+        0..=2048 => Box::new(Parameters::<{ arena_bytes(0) }>::sized()),
+        2049..=20_000 => Box::new(Parameters::<{ arena_bytes(20_000) }>::sized()),
+        20_001..=40_000 => Box::new(Parameters::<{ arena_bytes(40_000) }>::sized()),
+        _ => Box::new(Parameters::<{ arena_bytes(usize::MAX) }>::sized()),
     }
 }
