@@ -33,8 +33,7 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
     /// Adds a function by its definition, as made by `"go_to(position: int[2])".parse()`, with attributes. Returns its
     /// lease, which is dead unless the options ask for one.
     ///
-    /// [`Error::TooLarge`] when arguments and results are declared larger than calls are served with: raise
-    /// `message_size`, or declare less.
+    /// [`Error::TooLarge`] when arguments and results are declared larger than any call can be served with.
     pub fn add_service<Form>(
         &self,
         definition: &Definition,
@@ -56,11 +55,15 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
         self.put(options, handler, |list, attributes, handler| list.replace(definition, attributes, handler))
     }
 
-    /// Arguments and results get their declared sizes when a call is served, so they must fit then.
+    /// Arguments and results get their declared sizes when a call is served, however short the message.
     fn check_size(&self, definition: &Definition) -> Result<(), Error> {
-        let limit = arena_bytes(self.engine.longest_message());
-        let fits = definition.signature().parameters_bytes() as usize <= limit;
-        if fits { Ok(()) } else { Err(Error::TooLarge { limit: limit as u32 }) }
+        let bytes = definition.signature().parameters_bytes() as usize;
+        let limit = arena_bytes(usize::MAX);
+        if bytes > limit {
+            return Err(Error::TooLarge { limit: limit as u32 });
+        }
+        self.engine.make_room_for(bytes);
+        Ok(())
     }
 
     fn put<Form>(

@@ -77,6 +77,8 @@ pub(crate) struct Engine<T: 'static> {
     ready: Mutex<VecDeque<LinkId>>,
     /// Longest block of parameters that this unit takes.
     longest_message: AtomicUsize,
+    /// Bytes that the arguments and results of the largest function need.
+    largest_function: AtomicUsize,
     /// Pool threads that wait for something to do.
     idle: AtomicUsize,
     workers: AtomicUsize,
@@ -143,6 +145,7 @@ impl<T: Send + 'static> Engine<T> {
             pool_waker,
             ready: Mutex::new(VecDeque::new()),
             longest_message,
+            largest_function: AtomicUsize::new(0),
             idle: AtomicUsize::new(0),
             workers: AtomicUsize::new(0),
             stays: Mutex::new(Vec::new()),

@@ -54,6 +54,7 @@ impl<T: Send + 'static> Engine<T> {
             || !state.quick
             || !state.waiters.is_empty()
             || !state.session.is_live()
+            || state.is_paused()
             || !state.reader.pool_reads()
         {
             return None;
@@ -72,14 +73,15 @@ impl<T: Send + 'static> Engine<T> {
     fn may_stay(&self, link: &LinkCell, turn: Turn) -> bool {
         let mut state = link.lock();
         state.reader.set_busy(turn, None);
-        state.quick && state.reader.is_leader(turn) && self.idle.load(Ordering::Acquire) > 0 && !self.is_stopping()
+        let goes_on = state.quick && !state.is_paused() && state.reader.is_leader(turn);
+        goes_on && self.idle.load(Ordering::Acquire) > 0 && !self.is_stopping()
     }
 
     /// Reads until a call is to be run; `None` when nothing comes any more or the lead is lost.
     fn await_call(&self, link: &Arc<LinkCell>, turn: Turn, worker: &mut Worker) -> Option<Call> {
         loop {
             let received = link.stream.receive(&mut worker.buffer, Wait::Slice);
-            worker.fit(self.longest_message());
+            worker.fit(self.call_bytes());
             let mut state = link.lock();
             let call = match received {
                 Received::Bytes(count) => {
@@ -97,7 +99,7 @@ impl<T: Send + 'static> Engine<T> {
             if call.is_some() {
                 state.reader.set_busy(turn, Some(self.now()));
             }
-            let alive = state.session.is_live() && state.waiters.is_empty();
+            let alive = state.session.is_live() && state.waiters.is_empty() && !state.is_paused();
             self.settle(link, state);
             if call.is_some() {
                 return call;

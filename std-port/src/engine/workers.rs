@@ -77,12 +77,18 @@ impl<T: Send + 'static> Engine<T> {
         self.idle.load(Ordering::Acquire) > 0 || self.this().is_some_and(|engine| engine.start_worker())
     }
 
-    pub(crate) fn longest_message(&self) -> usize {
-        self.longest_message.load(Ordering::Acquire)
+    /// Bytes that the parameters of a served call may need: of a message, or of the largest function.
+    pub(super) fn call_bytes(&self) -> usize {
+        self.longest_message.load(Ordering::Acquire).max(self.largest_function.load(Ordering::Acquire))
+    }
+
+    /// Calls are served with room for at least so many bytes of arguments and results.
+    pub(crate) fn make_room_for(&self, bytes: usize) {
+        self.largest_function.fetch_max(bytes, Ordering::AcqRel);
     }
 
     fn work(self: Arc<Self>) {
-        let mut worker = Worker::new(self.longest_message());
+        let mut worker = Worker::new(self.call_bytes());
         while !self.is_stopping() {
             self.idle.fetch_add(1, Ordering::AcqRel);
             let waited = self.epoll.wait(&mut worker.events, None);
@@ -91,7 +97,7 @@ impl<T: Send + 'static> Engine<T> {
                 tracing::error!(%error, "waiting for links failed");
                 return;
             }
-            worker.fit(self.longest_message());
+            worker.fit(self.call_bytes());
             let ready = worker.events.iter().next();
             match ready {
                 // While the unit stops, the waker stays set, so that every thread wakes.
