@@ -14,7 +14,7 @@ use cara_core::time::{Duration, Instant};
 
 use super::link::{LinkCell, LinkState, Outcome, Waiter, Wake};
 use super::reader::Turn;
-use super::{Engine, OwnCall, READ_BYTES};
+use super::{Engine, OwnCall, READ_BYTES, RETRY};
 use crate::sys::stream::{Received, Wait};
 
 /// How long a caller waits at a time for room or for its turn, before it looks again.
@@ -143,9 +143,16 @@ impl<T: Send + 'static> Engine<T> {
                 buffer.resize(READ_BYTES, 0);
             }
             loop {
+                let paused = state.is_paused();
                 self.settle(link, state);
-                let wait = Wait::AtMost(deadline.since(self.now()));
-                let received = link.stream.receive(buffer, wait);
+                let left = deadline.since(self.now());
+                let received = if paused {
+                    // The clock looks at what waits; the reply may be in it.
+                    thread::park_timeout(left.min(RETRY).into());
+                    Received::WouldBlock
+                } else {
+                    link.stream.receive(buffer, Wait::AtMost(left))
+                };
                 state = link.lock();
                 match received {
                     Received::Bytes(count) => {

@@ -73,7 +73,7 @@ impl<T: Send + 'static> Engine<T> {
             let Some(link) = self.link(LinkId(due as u16)) else { continue };
             let mut state = link.lock();
             state.timer = Instant::FAR_FUTURE;
-            if !state.leftover.is_empty() {
+            if state.is_paused() {
                 self.feed(&link, &mut state, &mut [], None, None);
                 if state.session.has_next_call() {
                     self.hand_over(&link);

@@ -134,6 +134,11 @@ impl LinkCell {
 }
 
 impl LinkState {
+    /// What was read cannot be looked at yet: nothing more is read meanwhile, so that the peer feels it.
+    pub(crate) fn is_paused(&self) -> bool {
+        !self.leftover.is_empty()
+    }
+
     /// Notes how a call ended and wakes who waits for it.
     pub(crate) fn finish(&mut self, id: CallId, outcome: Outcome) {
         if let Some(waiter) = self.waiters.iter_mut().find(|waiter| waiter.id == id) {
