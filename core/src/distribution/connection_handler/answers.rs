@@ -26,6 +26,8 @@ const WAITING_ANSWERS: usize = 8;
 const LEAST_SPREAD: u16 = 50;
 /// Dials are spread over as many nodes at most, whatever is expected: the last one dials two seconds later.
 const MOST_SPREAD: u16 = 2_000;
+/// An m_unit that has dialled a peer in vain this often asks where it is.
+const MOVED_AFTER: u8 = 2;
 /// A link that is being opened is given up after this, however the network below thinks about it.
 pub(super) const DIAL_TIMEOUT: Duration = Duration::from_secs(6);
 
@@ -167,6 +169,7 @@ impl<S: Storage> Node<S> {
         if !known.is_joined() {
             if known.epoch != epoch {
                 known.not_before = Instant::START;
+                known.attempts = 0;
             }
             (known.address, known.epoch) = (address, epoch);
         }
@@ -208,17 +211,29 @@ impl<S: Storage> Node<S> {
 
     /// Tries again later, and later each time: an s_unit asks anew, who has an address dials it.
     pub(super) fn retry(&mut self, now: Instant, place: usize) {
-        if let Target::Manager(_) = self.config.target {
-            self.plan_next(now);
-            return;
-        }
         let Some(known) = self.table.node_mut(place) else { return };
-        let pause = pause(known.attempts);
-        known.attempts = known.attempts.saturating_add(1);
-        let identity = known.identity.clone();
-        if known.listens.is_some() && self.dials(&identity) {
-            let at = now + pause + self.random.jitter(pause);
-            self.table.schedule(place, at, Task::Dial);
+        let failed = known.attempts;
+        known.attempts = failed.saturating_add(1);
+        let dials = known.listens.is_some() && known.identity.role() == Role::MUnit;
+        let smaller = self.config.identity < known.identity;
+        match self.config.target {
+            Target::Manager(_) => {
+                if failed == 0 {
+                    // It has just been heard, so it may have moved: however long it was away, it is asked for soon.
+                    self.search.attempt = 0;
+                }
+                self.plan_next(now);
+            }
+            Target::Everybody if !smaller => {}
+            Target::Everybody | Target::Fixed(..) if dials => {
+                let pause = pause(failed);
+                let at = now + pause + self.random.jitter(pause);
+                self.table.schedule(place, at, Task::Dial);
+                if failed == MOVED_AFTER {
+                    self.look_around(now);
+                }
+            }
+            Target::Everybody | Target::Fixed(..) => {}
         }
     }
 }

@@ -164,6 +164,14 @@ impl<S: Storage> Node<S> {
         }
     }
 
+    /// Asks a few times, as after the start, whoever is connected. Only m_units do: one of them may have moved.
+    pub(super) fn look_around(&mut self, now: Instant) {
+        if self.config.target == Target::Everybody && !self.is_searching() {
+            self.search.attempt = 0;
+            self.search.next = now + self.random.jitter(FIRST_SEARCH);
+        }
+    }
+
     /// The next search comes after a pause that grows each time.
     pub(super) fn plan_next(&mut self, now: Instant) {
         let pause = pause(self.search.attempt);

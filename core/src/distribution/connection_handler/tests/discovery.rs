@@ -328,3 +328,61 @@ fn a_hello_that_is_quicker_than_the_ports_note_counts() {
     assert_eq!(run(&mut node, at(60_000), &mut Outbox::default()), []);
     assert_eq!(node.node(&depot.identity).map(Known::link), Some(Some(LinkId(0))));
 }
+
+#[test]
+fn a_manager_that_has_moved_is_asked_for_soon_however_long_it_was_away() {
+    for seed in 0..20 {
+        let mut node = node(NodeConfig { seed, ..s_unit("agv", 1) });
+        search_times(&mut node, at(100_000));
+        dial_manager(&mut node, at(100_000), 1);
+        node.dialing(Some(&m_unit(MANAGER, MANAGER_ID).identity), LinkId(0));
+        node.left(at(100_300), LinkId(0), CloseReason::DialFailed);
+        let next = node.next_deadline();
+        assert!(next <= at(100_300) + FIRST_SEARCH.times(2), "{next:?}");
+        // One that cannot be reached although it answers is not asked for that often.
+        let mut sequence = 1;
+        let mut pause = Duration::ZERO;
+        for _ in 0..8 {
+            let now = node.next_deadline();
+            sequence += 1;
+            dial_manager(&mut node, now, sequence);
+            node.dialing(Some(&m_unit(MANAGER, MANAGER_ID).identity), LinkId(0));
+            let ended = now + Duration::from_secs(1);
+            node.left(ended, LinkId(0), CloseReason::DialFailed);
+            pause = node.next_deadline().since(ended);
+        }
+        assert!(pause >= LONGEST_SEARCH, "{pause:?}");
+    }
+}
+
+#[test]
+fn an_m_unit_that_cannot_reach_a_peer_any_more_asks_where_it_is() {
+    let mut node = node(m_unit("a", 1));
+    let peer = m_unit("b", 2);
+    join(
+        &mut node,
+        at(0),
+        1,
+        &NodeConfig { target: Target::Manager(Manager::new("a", 1).unwrap()), ..s_unit("agv", 1) },
+    );
+    node.datagram(at(0), address(2, 7_001), &announce_bytes(&announce_of(&peer, 1, 0)));
+    // Its first searches are over before it loses the peer.
+    run(&mut node, at(100), &mut Outbox::default());
+    join(&mut node, at(100), 0, &peer);
+    run(&mut node, at(60_000), &mut Outbox::default());
+    node.left(at(60_000), LinkId(0), CloseReason::Silent);
+    let mut searches = Vec::new();
+    while node.next_deadline() < at(200_000) {
+        let now = node.next_deadline();
+        let mut outbox = Outbox::default();
+        if let Some(Action::Dial { identity, .. }) = node.poll(now, &mut outbox) {
+            node.dial_failed(now, identity.as_ref());
+        }
+        searches.extend(outbox.broadcasts.iter().map(|_| now));
+    }
+    assert_eq!(searches.len(), 4, "{searches:?}");
+    let moved = announce_of(&peer, 2, node.search.nonce);
+    node.datagram(at(200_000), address(3, 7_001), &announce_bytes(&moved));
+    let actions = run(&mut node, at(200_001), &mut Outbox::default());
+    assert!(matches!(actions[..], [(_, Action::Dial { to, .. })] if to == address(3, 7_000)), "{actions:?}");
+}

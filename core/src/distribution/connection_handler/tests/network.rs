@@ -132,7 +132,7 @@ impl Network {
             Happening::On => self.switch_on(index),
             Happening::Off => self.switch_off(index),
             Happening::Look => {
-                if !self.units[index].node.as_ref().is_some_and(|node| node.next_deadline() <= now) {
+                if self.units[index].node.as_ref().is_none_or(|node| node.next_deadline() > now) {
                     return;
                 }
             }
