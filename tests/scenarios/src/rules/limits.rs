@@ -76,7 +76,7 @@ fn few_buffers_delay_and_lose_nothing(world: &mut dyn World) {
         met(world, &caller, "manager", "store");
         callers.push(caller);
     }
-    let options = RequestOptions { timeout: Some(secs(30)), ..RequestOptions::default() };
+    let options = RequestOptions { timeout: Some(secs(6)), ..RequestOptions::default() };
     let mut calls = Vec::new();
     for _ in 0..5 {
         calls.extend(callers.iter().map(|caller| caller.begin("manager", "store", &text(4_000), options)));

@@ -1,6 +1,7 @@
 //! The rules, one file each.
 
 mod age;
+mod anything;
 mod at_most_once;
 mod best_effort;
 mod deadlines;
@@ -46,6 +47,7 @@ pub fn all() -> Vec<Scenario> {
         best_effort::SCENARIOS,
         slow::SCENARIOS,
         everybody::SCENARIOS,
+        anything::SCENARIOS,
     ]
     .concat()
 }
