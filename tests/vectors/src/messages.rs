@@ -154,7 +154,12 @@ fn controls() -> Vec<Vector> {
             Control::Limits { message_size: 65_536, minimum_interval: 10_000, calls: 4 },
             json!({ "limits": { "message_size": 65_536, "minimum_interval": 10_000, "calls": 4 } }),
         ),
-        ("release", "a lease is given up", Control::Release { slot: 4, id: 9 }, json!({ "release": { "slot": 4, "id": 9 } })),
+        (
+            "release",
+            "a lease is given up",
+            Control::Release { slot: 4, id: 9 },
+            json!({ "release": { "slot": 4, "id": 9 } }),
+        ),
         (
             "lease_ended",
             "a lease has expired at the callee",
