@@ -10,8 +10,9 @@ use cara_core::counters::Counter;
 use cara_core::distribution::connection_handler::NodeCounter;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::ParametersView;
-use cara_core::error::{Error, ServiceError};
+use cara_core::error::{Error, Refusal, ServiceError};
 use cara_core::host::connections::LinkCounter;
+use cara_core::host::frame::{self, Frame};
 use cara_core::random::Random;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::RequestOptions;
@@ -26,6 +27,8 @@ use crate::{
 
 /// How long the weather of a run lasts: longer than any run.
 const ALWAYS: Duration = Duration::from_secs(24 * 3_600);
+/// Where simulated m_units listen.
+const M_UNIT_PORT: u16 = 7_000;
 /// Short partitions per unit that joins a world with rough weather.
 const PARTITIONS: u64 = 2;
 
@@ -164,16 +167,7 @@ impl World for SimWorld {
                 let host = self.host(unit);
                 self.world.network(|network| network.suspend(host, span));
             }
-            Fault::OtherVersion(unit) => {
-                let to = self.node(unit).handle.address();
-                let from =
-                    self.units.iter().find(|other| other.number != unit.number()).map(|other| other.handle.host());
-                let mut datagram = [0; 32];
-                datagram[..4].copy_from_slice(&PLAIN_MAGIC);
-                datagram[4] = VERSION + 1;
-                let from = from.expect("somebody else sends it");
-                self.world.network(|network| network.send_to(from, to, &datagram));
-            }
+            Fault::OtherVersion(unit) => self.stranger(unit),
             fault => self.inject_into_network(fault),
         }
         Ok(())
@@ -208,6 +202,46 @@ impl World for SimWorld {
 }
 
 impl SimWorld {
+    /// Somebody who speaks another version broadcasts, dials the unit and says hello; notes how that is answered.
+    fn stranger(&mut self, unit: &Unit) {
+        let mut said = [0; 32];
+        said[..4].copy_from_slice(&PLAIN_MAGIC);
+        said[4] = VERSION + 1;
+        let mut hello = [0; 64];
+        let length = frame::encode(&Frame::Hello(&said), 0, &mut hello);
+        let mut to = self.node(unit).handle.address();
+        let stream = self.world.network(|network| {
+            let host = network.add_host();
+            network.send_to(host, to, &said);
+            to.set_port(M_UNIT_PORT);
+            network.connect(host, to)
+        });
+        let mut written = 0;
+        for _ in 0..1_000 {
+            self.world.run_for(millis(10));
+            let rest = &hello[written..length];
+            written += self.world.network(|network| network.write(stream, &[rest])).unwrap_or(0);
+            if written == length {
+                break;
+            }
+        }
+        self.world.run_for(secs(5));
+        let mut heard = Vec::new();
+        for _ in 0..64 {
+            self.world.network(|network| {
+                network.read(stream, |bytes| {
+                    heard.extend_from_slice(bytes);
+                    bytes.len()
+                });
+            });
+        }
+        let mut refused = [0; 16];
+        let length = frame::encode(&Frame::Refuse(Refusal::Version as u8), 0, &mut refused);
+        if heard == refused[..length] {
+            self.reached("stranger was told");
+        }
+    }
+
     fn inject_into_network(&mut self, fault: Fault<'_>) {
         let host = |unit: &Unit| self.host(unit);
         match fault {
