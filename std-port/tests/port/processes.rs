@@ -36,6 +36,18 @@ impl Process {
         Self(command.stdin(Stdio::piped()).stdout(Stdio::null()).spawn().unwrap())
     }
 
+    /// Returns when all its threads stand still.
+    fn freeze(&self) {
+        self.signal(Signal::STOP);
+        until("it stands still", || {
+            let tasks = std::fs::read_dir(format!("/proc/{}/task", self.0.id())).unwrap();
+            let stats =
+                tasks.map(|task| std::fs::read_to_string(task.unwrap().path().join("stat")).unwrap_or_default());
+            // The state follows the name, which ends with a bracket.
+            stats.into_iter().all(|stat| stat.rsplit(')').next().is_some_and(|rest| rest.starts_with(" T")))
+        });
+    }
+
     fn signal(&self, signal: Signal) {
         kill_process(Pid::from_child(&self.0), signal).unwrap();
     }
@@ -158,7 +170,7 @@ fn publishing_names_who_has_not_acknowledged() {
     let span = cara_std::Duration::from_millis(300);
     manager.my_function_list().add_function("f", &number(0), service(|number| number)).unwrap();
     assert_eq!(manager.publish_and_wait(cara_std::Duration::from_secs(10)), Ok(vec![]));
-    frozen.signal(Signal::STOP);
+    frozen.freeze();
     manager.my_function_list().add_function("g", &number(0), service(|number| number)).unwrap();
     let missing = manager.publish_and_wait(span).unwrap();
     assert_eq!(missing.iter().map(|identity| identity.name()).collect::<Vec<_>>(), ["frozen"]);

@@ -72,7 +72,7 @@ fn a_handler_may_stop_its_own_unit() {
     assert_eq!(ask(&peer, "stop", 1), Err(Error::Interrupted));
     until("it has left", || !peer.is_connected());
     assert!(began.elapsed() < Duration::from_secs(1), "{:?}", began.elapsed());
-    assert!(events.try_iter().any(|event| matches!(event, UnitEvent::Left { .. })));
+    until("it has told so itself", || events.try_iter().any(|event| matches!(event, UnitEvent::Left { .. })));
 }
 
 /// While a method runs that waits for its peer, and another method waits for the state, the application stops the unit.
@@ -107,7 +107,10 @@ fn dropping_the_last_handle_stops() {
 #[test]
 fn a_stopped_unit_says_so_and_stops_again_quietly() {
     let (manager, agv) = pair();
+    manager.my_function_list().add_function("echo", &number(0), service(|number| number)).unwrap();
     let (peer, back) = meet(&manager, &agv);
+    // Nothing is under way any more that could cross the goodbye: a write to a closed stream finds it reset.
+    assert_eq!(ask(&back, "echo", 1), Ok(1));
     let events = manager.events();
     agv.stop();
     agv.stop();
