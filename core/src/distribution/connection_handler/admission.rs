@@ -3,7 +3,7 @@
 
 use core::net::SocketAddr;
 
-use super::table::{Newcomer, NodeState};
+use super::known::{Newcomer, NodeState};
 use super::timetable::Task;
 use super::{Action, Finding, Node, NodeCounter};
 use crate::config::CHALLENGE_TIMEOUT;

@@ -2,8 +2,8 @@
 
 use core::net::SocketAddr;
 
+use super::known::NodeState;
 use super::search::pause;
-use super::table::NodeState;
 use super::timetable::Task;
 use super::{Action, Node, NodeCounter, Target};
 use crate::config::{ANSWER_SPREAD, FIRST_SEARCH, LONGEST_SEARCH};

@@ -1,7 +1,7 @@
 //! Links that are being opened, and links that have ended.
 
+use super::known::NodeState;
 use super::search::pause;
-use super::table::NodeState;
 use super::{Action, Node, Target};
 use crate::distribution::identity::Identity;
 use crate::error::{CloseReason, Refusal};

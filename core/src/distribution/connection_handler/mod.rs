@@ -14,6 +14,7 @@
 mod admission;
 mod answers;
 mod counter;
+mod known;
 mod links;
 mod search;
 mod table;
@@ -22,7 +23,8 @@ mod views;
 
 pub use admission::Admission;
 pub use counter::NodeCounter;
-pub use table::{Known, NodeState, Order};
+pub use known::{Known, NodeState};
+pub use table::Order;
 
 use core::net::SocketAddr;
 

@@ -3,7 +3,7 @@
 use core::net::SocketAddr;
 
 use super::answers::Found;
-use super::table::NodeState;
+use super::known::NodeState;
 use super::timetable::Task;
 use super::{Node, NodeCounter, Target};
 use crate::config::{FIRST_SEARCH, LONGEST_SEARCH, SEARCH_BUDGET, SEARCH_WINDOW};

@@ -5,144 +5,17 @@
 
 use core::net::{IpAddr, SocketAddr};
 
-use super::timetable::Task;
-use crate::distribution::hello::Limits;
+use super::known::{Known, NodeState};
 use crate::distribution::identity::{Epoch, Identity, Role};
 use crate::host::mailman::LinkId;
 use crate::storage::Storage;
-use crate::time::{Duration, Instant};
 
 /// No place, position or index.
 pub(super) const NONE: u16 = u16::MAX;
 
-/// Datagrams overtake each other by less than this. Within it the greater (epoch, sequence) is the newer one, whichever
-/// comes first; after it whatever comes is news, since epochs of a board need not rise from boot to boot.
-const REORDERING: Duration = Duration::from_secs(1);
-
 /// Nodes that were only heard of and have never joined: the one heard of first gives way to the next. However many names
-/// somebody makes up, nodes that have been connected are not forgotten for them.
+/// somebody makes up, a full table forgets at most this many nodes for them that have been connected and left.
 pub(super) const STRANGERS: usize = 8;
-
-/// What is known of a node.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Known {
-    /// Its name, id and role.
-    pub identity: Identity,
-    /// The other end of its link; while it is away, where it was last heard.
-    pub address: SocketAddr,
-    /// The life of it that is connected; while it is away, the newest that was heard.
-    pub epoch: Epoch,
-    /// What it takes, once it has joined.
-    pub limits: Option<Limits>,
-    /// Where it can be dialled, if that is known.
-    pub(super) listens: Option<SocketAddr>,
-    /// The newest datagram of it.
-    pub(super) newest: Option<(Epoch, u32)>,
-    heard: Instant,
-    pub(super) state: NodeState,
-    /// Its link was opened from here.
-    pub(super) dialed: bool,
-    /// The link that is being opened to it.
-    pub(super) dialing: Option<LinkId>,
-    /// A link with its identity that waits for the present one to show whether it lives.
-    pub(super) newcomer: Option<Newcomer>,
-    /// When it joined.
-    pub(super) since: Instant,
-    /// Dials that have failed in a row.
-    pub(super) attempts: u8,
-    /// It has refused for a reason that stays: this life of it is not dialled earlier.
-    pub(super) not_before: Instant,
-    index: u16,
-    pub(super) task: Option<Task>,
-    pub(super) due: Instant,
-    pub(super) heap: u16,
-    before: u16,
-    after: u16,
-}
-
-/// A link that waits until it is clear whether the older one of the same identity lives.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Newcomer {
-    pub(super) link: LinkId,
-    pub(super) epoch: Epoch,
-    pub(super) limits: Limits,
-    pub(super) address: SocketAddr,
-    /// It takes the place whether the older one answers or not.
-    pub(super) decided: bool,
-}
-
-/// Whether a node is connected.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum NodeState {
-    /// Heard of, or gone.
-    Away,
-    /// A link to it is being opened.
-    Dialing,
-    /// Connected.
-    Joined(LinkId),
-}
-
-impl Known {
-    /// Whether the node is connected.
-    pub const fn is_joined(&self) -> bool {
-        matches!(self.state, NodeState::Joined(_))
-    }
-
-    /// Whether the node is connected, or about to be.
-    pub const fn state(&self) -> NodeState {
-        self.state
-    }
-
-    /// The node's link, while it is connected.
-    pub const fn link(&self) -> Option<LinkId> {
-        match self.state {
-            NodeState::Joined(link) => Some(link),
-            NodeState::Away | NodeState::Dialing => None,
-        }
-    }
-
-    /// Its place among the nodes of its role, in the order of joining; `None` for a node that has never joined. It keeps
-    /// its meaning while other nodes come and go, and while this one is away.
-    pub const fn index(&self) -> Option<u16> {
-        if self.index == NONE { None } else { Some(self.index) }
-    }
-
-    /// Whether a datagram is newer than what is known.
-    pub(super) fn is_news(&self, now: Instant, epoch: Epoch, sequence: u32) -> bool {
-        self.newest.is_none_or(|newest| (epoch, sequence) > newest) || now >= self.heard + REORDERING
-    }
-
-    /// Notes the newest datagram.
-    pub(super) fn hear(&mut self, now: Instant, epoch: Epoch, sequence: u32) {
-        self.newest = Some((epoch, sequence));
-        self.heard = now;
-    }
-
-    fn new(identity: Identity, address: SocketAddr, epoch: Epoch) -> Self {
-        Self {
-            identity,
-            address,
-            epoch,
-            limits: None,
-            listens: None,
-            newest: None,
-            heard: Instant::START,
-            state: NodeState::Away,
-            dialed: false,
-            dialing: None,
-            newcomer: None,
-            since: Instant::START,
-            attempts: 0,
-            not_before: Instant::START,
-            index: NONE,
-            task: None,
-            due: Instant::FAR_FUTURE,
-            heap: NONE,
-            before: NONE,
-            after: NONE,
-        }
-    }
-}
 
 /// One row of the table's orders; ports allocate a slice of default ones. It belongs to no node in particular.
 #[derive(Clone, Copy, Debug)]

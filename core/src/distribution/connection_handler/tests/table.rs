@@ -4,7 +4,8 @@ use std::collections::BTreeMap;
 
 use proptest::prelude::*;
 
-use super::super::table::{NodeState, Table};
+use super::super::known::NodeState;
+use super::super::table::Table;
 use super::super::timetable::Task;
 use super::*;
 
