@@ -126,7 +126,7 @@ entry!(replies, {
 entry!(leases, {
     let lease = Lease::new();
     lease.renew(*unknown());
-    keep(lease.is_live(*unknown()));
+    keep((lease.is_live(*unknown()), Lease::seen_end(*unknown())));
     lease.end();
     keep(unknown::<Lease>().is_live(*unknown()));
 });
