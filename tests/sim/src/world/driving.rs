@@ -48,10 +48,8 @@ impl Inner {
     /// Passes an event of the network to its unit. Returns the host whose life it ended.
     pub(super) fn dispatch(&mut self, shared: &Rc<Shared>, event: NetEvent) -> Option<HostId> {
         let host = event.host();
-        if self.units.get(host.index()).is_none() {
-            // A host that a test has added to the network by itself, and looks after.
-            return None;
-        }
+        // A host without a unit is one that a test has added to the network, and looks after itself.
+        self.units.get(host.index())?;
         match event {
             NetEvent::Crashed { .. } => {
                 self.end(shared, host);
