@@ -50,7 +50,8 @@ pub enum UnitEvent {
         /// Why.
         error: Error,
     },
-    /// A service of this unit stopped because its caller no longer wanted it; its safe hook has run.
+    /// A service of this unit stopped because its caller no longer wanted it. Its lease is dead, and its safe hook has run,
+    /// or runs as soon as the method that holds the state leaves it.
     LeaseExpired {
         /// Whose call it was.
         peer: Identity,
