@@ -27,8 +27,17 @@ use crate::{
 
 /// How long the weather of a run lasts: longer than any run.
 const ALWAYS: Duration = Duration::from_secs(24 * 3_600);
+/// How a service calls its caller back.
+const PATIENT: RequestOptions = RequestOptions {
+    timeout: Some(Duration::from_secs(8)),
+    priority: None,
+    delivery: cara_core::services::unit::Delivery::Reliable,
+    renew_lease: true,
+};
 /// Where simulated m_units listen.
 const M_UNIT_PORT: u16 = 7_000;
+/// How long the beginning of a run is worse than the rest, in rough weather.
+const BEGINNING: Duration = Duration::from_millis(300);
 /// Short partitions per unit that joins a world with rough weather.
 const PARTITIONS: u64 = 2;
 
@@ -54,6 +63,13 @@ impl SimWorld {
             let path = path(&mut random, weather);
             world.network(|network| {
                 network.set_weather(path, ALWAYS);
+                if weather == Weather::Rough {
+                    // Discovery has to get through worse, and is over soon.
+                    let worse = path.loss_percent(random.below(20) as f64);
+                    network.set_weather(worse, BEGINNING);
+                    let now = network.now();
+                    network.schedule(now + BEGINNING, Action::Weather { path, span: ALWAYS });
+                }
                 network.split_reads(Chance::percent(random.below(40) as f64));
             });
         }
@@ -99,7 +115,7 @@ impl SimWorld {
 fn path(random: &mut Random, weather: Weather) -> Path {
     let mut percent = |limit: u64| random.below(limit * 100) as f64 / 100.0;
     let loss = if weather == Weather::Rough { percent(2) } else { 0.0 };
-    let path = Path::LAN.loss_percent(loss).duplicate_percent(percent(4)).reorder_percent(percent(4));
+    let path = Path::LAN.loss_percent(loss).duplicate_percent(percent(12)).reorder_percent(percent(12));
     path.delay(Duration::from_micros(250) + random.jitter(millis(5))).jitter(random.jitter(millis(5)))
 }
 
@@ -299,7 +315,7 @@ fn simulated(service: &Service) -> cara_sim::Service {
             async move {
                 kept.diary().begin(call.unit.now());
                 if let Some(function) = &kept.calls_back {
-                    let called = call.unit.block_request(&call.caller, function, &mut parameters).await;
+                    let called = call.unit.block_request_with(&call.caller, function, &mut parameters, PATIENT).await;
                     called.map_err(|_| ServiceError::NotReady)?;
                 }
                 (kept.body)(&Asked { caller: call.caller.clone(), at: call.unit.now() }, &mut parameters)?;

@@ -11,7 +11,7 @@ scenarios![
     whatever_happens_the_fleet_comes_back: "4, 13, 68", Rough,
         [Crash, Partition, Freeze, Reset, Path, AddressChange, Suspend],
         ["power-cut", "process-killed", "restart", "partition", "freeze", "reset", "address-change", "suspend",
-         "bandwidth", "Restarted", "LeasesExpired", "RequestsExpired", "ran"];
+         "bandwidth", "LeasesExpired", "RequestsExpired", "ran"];
 ];
 
 const AGVS: usize = 3;
