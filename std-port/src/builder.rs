@@ -39,6 +39,7 @@ pub struct Builder<T> {
     capacities: Capacities,
     interfaces: Interfaces,
     discovery_port: u16,
+    tcp_port: u16,
     state: T,
 }
 
@@ -60,6 +61,7 @@ impl Builder<()> {
             capacities: Capacities::default(),
             interfaces: Interfaces::from_environment(),
             discovery_port: PLAIN_PORT,
+            tcp_port: 0,
             state: (),
         }
     }
@@ -96,6 +98,13 @@ impl<T: Send + 'static> Builder<T> {
         self
     }
 
+    /// The TCP port on which an m_unit takes connections; one that is free unless set. For s_units that are told a
+    /// [`manager_address`](Self::manager_address).
+    pub fn tcp_port(mut self, port: u16) -> Self {
+        self.tcp_port = port;
+        self
+    }
+
     /// An s_unit's manager is at this address: it is dialled, and nothing is broadcast.
     pub fn manager_address(mut self, address: SocketAddr) -> Self {
         if let Target::Manager(manager) = self.target {
@@ -115,6 +124,7 @@ impl<T: Send + 'static> Builder<T> {
             capacities: self.capacities,
             interfaces: self.interfaces,
             discovery_port: self.discovery_port,
+            tcp_port: self.tcp_port,
             state,
         }
     }
@@ -140,7 +150,7 @@ impl<T: Send + 'static> Builder<T> {
         let clock = Clock::new();
         let datagrams = Datagrams::open(self.interfaces, self.discovery_port)?;
         let listener = match self.identity.role() {
-            Role::MUnit => Some(Listener::open(self.interfaces.bind_address(), 0).map_err(|_| Error::Network)?),
+            Role::MUnit => Some(Listener::open(self.interfaces.bind_address(), self.tcp_port).map_err(listen_error)?),
             Role::SUnit => None,
         };
         let capacities = self.capacities;
@@ -179,6 +189,13 @@ impl<T: Send + 'static> Builder<T> {
             maximum_links,
         };
         Engine::new(parts).map_err(|_| Error::Network)
+    }
+}
+
+fn listen_error(error: std::io::Error) -> Error {
+    match error.kind() {
+        std::io::ErrorKind::AddrInUse => Error::PortInUse,
+        _ => Error::Network,
     }
 }
 

@@ -106,6 +106,11 @@ impl<T: Send + 'static> CommunicationSystem<T> {
         lock(&self.engine().node).node.identity().clone()
     }
 
+    /// The TCP port on which the unit takes connections, for s_units that are told a fixed address.
+    pub fn tcp_port(&self) -> u16 {
+        self.engine().tcp_port()
+    }
+
     /// Searches for nodes now (paper, listing line 6).
     pub fn broadcast(&self) {
         self.engine().broadcast();

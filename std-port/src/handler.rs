@@ -53,6 +53,7 @@ pub(crate) struct Handler<T> {
     pub(crate) run: Run<T>,
     pub(crate) lease: Option<Arc<Lease>>,
     pub(crate) safe: Option<Arc<Hook<T>>>,
+    pub(crate) detached: bool,
 }
 
 impl<T: 'static> Service for Handler<T> {
@@ -66,12 +67,13 @@ pub struct ServiceOptions<T> {
     pub(crate) priority: Priority,
     pub(crate) lease: Option<Duration>,
     pub(crate) idempotent: bool,
+    pub(crate) detached: bool,
     pub(crate) safe: Option<Arc<Hook<T>>>,
 }
 
 impl<T> Default for ServiceOptions<T> {
     fn default() -> Self {
-        Self { priority: Priority::Normal, lease: None, idempotent: false, safe: None }
+        Self { priority: Priority::Normal, lease: None, idempotent: false, detached: false, safe: None }
     }
 }
 
@@ -92,6 +94,12 @@ impl<T> ServiceOptions<T> {
     pub fn lease(mut self, length: impl Into<Duration>, safe: impl Fn(&mut T) + Send + Sync + 'static) -> Self {
         self.lease = Some(length.into());
         self.safe = Some(Arc::new(safe));
+        self
+    }
+
+    /// It takes long: the caller's next call of the same class begins while it runs, in a thread of its own.
+    pub fn detached(mut self) -> Self {
+        self.detached = true;
         self
     }
 

@@ -320,6 +320,11 @@ impl<T: Send + 'static> Engine<T> {
         let _ = self.epoll.modify(&link.stream, link.token(), interest);
     }
 
+    /// Where the unit takes connections; 0 for nowhere.
+    pub(crate) fn tcp_port(&self) -> u16 {
+        self.listener.as_ref().map_or(0, Listener::port)
+    }
+
     /// The link of an id.
     pub(crate) fn link(&self, id: LinkId) -> Option<Arc<LinkCell>> {
         read(&self.links).get(usize::from(id.0)).cloned().flatten()

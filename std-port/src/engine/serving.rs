@@ -75,11 +75,14 @@ impl<T: Send + 'static> Engine<T> {
 
     fn run(&self, link: &LinkCell, call: &Call, arguments: &mut ParametersView) -> Result<(), Error> {
         let Some(peer) = link.peer.get() else { return Err(Error::NotConnected) };
-        let (run, lease) = {
+        let (run, lease, detached) = {
             let functions = read(&self.functions);
             let function = functions.function(call.slot).ok_or(Error::StaleFunction)?;
-            (function.handler.run.clone(), function.handler.lease.clone())
+            (function.handler.run.clone(), function.handler.lease.clone(), function.handler.detached)
         };
+        if detached {
+            self.detach(link, call);
+        }
         let told = handler::Call {
             caller: peer.identity.clone(),
             priority: call.priority,
@@ -98,6 +101,17 @@ impl<T: Send + 'static> Engine<T> {
             tracing::error!(slot = call.slot.0, caller = %peer.identity, "a handler panicked");
             Err(Error::Service(ServiceError::Panicked))
         })
+    }
+
+    /// Lets the caller's next call of the class begin while this one runs.
+    fn detach(&self, link: &LinkCell, call: &Call) {
+        let mut state = link.lock();
+        state.session.detach(call.ticket);
+        let next = state.session.has_next_call();
+        drop(state);
+        if next {
+            self.hand_over(link);
+        }
     }
 
     /// Answers, waiting for room while somebody waits for the answer.

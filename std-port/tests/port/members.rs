@@ -170,3 +170,16 @@ fn a_function_published_while_a_node_joins_is_told() {
         assert!(counter(&manager.counters(), "WhoHasHeard") < 1_000);
     }
 }
+
+/// Two fleets of one port number would meet by broadcast; this one does not broadcast at all.
+#[test]
+fn a_fixed_address_needs_no_broadcast() {
+    let fleet = fleet();
+    let manager = system(fleet).build_system().unwrap();
+    let port = manager.tcp_port();
+    let taken = system(fleet).tcp_port(port).build_system();
+    assert!(matches!(taken, Err(Error::PortInUse)), "the port is taken");
+    let agv = unit("agv", 7, fleet).manager_address(([127, 0, 0, 1], port).into()).build_unit().unwrap();
+    meet(&manager, &agv);
+    assert_eq!(counter(&agv.counters(), "WhoHasSent"), 0);
+}

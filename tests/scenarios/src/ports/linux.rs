@@ -238,6 +238,9 @@ impl LinuxNode {
         let diary = service.diary();
         let start = self.start;
         let mut options = ServiceOptions::new().priority(service.priority);
+        if service.detached {
+            options = options.detached();
+        }
         if let Some(length) = service.lease {
             options = options.lease(length, move |()| diary.stop(since(start)));
         }
