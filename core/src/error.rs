@@ -168,8 +168,9 @@ pub enum Error {
     /// A variable, function or node of this name exists already.
     #[error("the name is taken already")]
     NameTaken,
-    /// A name is empty or holds other characters than letters, digits, `_`, `-`, `.`, `/`.
-    #[error("a name has letters, digits, '_', '-', '.' or '/', and at least one of them")]
+    /// A name of a function or variable is empty or holds other characters than letters, digits, `_`, `-`, `.`, `/`; or a
+    /// name of a node is empty, longer than 32 bytes, or holds control characters.
+    #[error("a name has letters, digits, '_', '-', '.' or '/'; a node's has 1 to 32 bytes and no control characters")]
     BadName,
     /// A number does not fit the Rust type that it was asked as, or the variable that it is put into.
     #[error("the number does not fit the type it was asked as")]
@@ -243,7 +244,7 @@ pub enum Error {
     #[error("{0}")]
     Closed(CloseReason),
     /// The network refused a datagram or a connection.
-    #[error("the network refused: is the interface up?")]
+    #[error("the network refused: is the interface up, and are there descriptors left (ulimit -n)?")]
     Network,
     /// Another process owns the port.
     #[error("the port is in use by a program that does not share it")]

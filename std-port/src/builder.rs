@@ -15,7 +15,7 @@ use core::net::SocketAddr;
 use crate::clock::Clock;
 use crate::communication_system::CommunicationSystem;
 use crate::config::Capacities;
-use crate::engine::{Engine, EngineParts, NodeCell, message_buffer_bytes};
+use crate::engine::{Engine, EngineParts, NodeCell, message_buffer_bytes, system_refused};
 use crate::pool::MessagePool;
 use crate::storage::{filled, filled_with};
 use crate::sys::datagram::Datagrams;
@@ -188,14 +188,14 @@ impl<T: Send + 'static> Builder<T> {
             listener,
             maximum_links,
         };
-        Engine::new(parts).map_err(|_| Error::Network)
+        Engine::new(parts).map_err(system_refused)
     }
 }
 
 fn listen_error(error: std::io::Error) -> Error {
     match error.kind() {
         std::io::ErrorKind::AddrInUse => Error::PortInUse,
-        _ => Error::Network,
+        _ => system_refused(error),
     }
 }
 

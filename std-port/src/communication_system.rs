@@ -88,7 +88,7 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     /// Searches for nodes and keeps connections, in threads of its own (paper, listing line 2).
     #[doc(alias = "start_thread")]
     pub fn start(&self) -> Result<(), Error> {
-        self.engine().start().map_err(|_| Error::Network)
+        self.engine().start()
     }
 
     /// Ends every link in an orderly way and all threads.

@@ -76,7 +76,8 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
         let attributes =
             Attributes { priority: options.priority, lease: options.lease, idempotent: options.idempotent };
         let kept = options.lease.map(|_| lease.clone());
-        let handler = Handler { run: handler.into_run().0, lease: kept, safe: options.safe, detached: options.detached };
+        let handler =
+            Handler { run: handler.into_run().0, lease: kept, safe: options.safe, detached: options.detached };
         put(&mut write(&self.engine.functions), attributes, handler)?;
         Ok(LeaseWatch::new(lease, self.engine.clock))
     }

@@ -72,7 +72,7 @@ impl<T: Send + 'static> Unit<T> {
     /// Looks for the manager and keeps the connection, in threads of its own.
     #[doc(alias = "start_thread")]
     pub fn start(&self) -> Result<(), Error> {
-        self.engine().start().map_err(|_| Error::Network)
+        self.engine().start()
     }
 
     /// Ends the link in an orderly way and all threads.

@@ -104,10 +104,15 @@ def sized(data):
     return varint(len(data)) + data
 
 
+def is_node_name(name):
+    """Not empty, and without control characters."""
+    return name != "" and not any(ord(c) < 0x20 or 0x7F <= ord(c) < 0xA0 for c in name)
+
+
 def read_identity(reader):
     identity = {"id": reader.varint(32), "name": reader.text(32)}
     role = reader.varint(32)
-    require(role < len(ROLES) and identity["name"])
+    require(role < len(ROLES) and is_node_name(identity["name"]))
     identity["role"] = ROLES[role]
     return identity
 
@@ -156,7 +161,7 @@ def decode_hello(data):
     for name, bits in HELLO_TAIL:
         hello[name] = reader.varint(bits)
     reader.end()
-    require(hello["identity"]["name"] != "" and hello["chunk_size"] >= MINIMUM_CHUNK)
+    require(is_node_name(hello["identity"]["name"]) and hello["chunk_size"] >= MINIMUM_CHUNK)
     return hello
 
 

@@ -131,7 +131,7 @@ impl<'b> Datagram<'b> {
 /// The whole body, from a node that has a name.
 fn whole<'b, T: Deserialize<'b>>(body: &'b [u8], who: impl Fn(&T) -> &Identity) -> Result<T, DatagramError> {
     match postcard::take_from_bytes(body) {
-        Ok((value, [])) if !who(&value).name().is_empty() => Ok(value),
+        Ok((value, [])) if who(&value).is_sound() => Ok(value),
         _ => Err(DatagramError::Malformed),
     }
 }

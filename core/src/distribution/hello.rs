@@ -93,9 +93,8 @@ impl Hello {
             return Err(HelloError::Version(version));
         }
         let (hello, rest): (Self, _) = postcard::take_from_bytes(rest).map_err(|_| HelloError::Malformed)?;
-        let sound = rest.is_empty()
-            && !hello.identity.name().is_empty()
-            && usize::from(hello.limits.chunk_size) >= MINIMUM_CHUNK_BYTES;
+        let sound =
+            rest.is_empty() && hello.identity.is_sound() && usize::from(hello.limits.chunk_size) >= MINIMUM_CHUNK_BYTES;
         if sound { Ok(hello) } else { Err(HelloError::Malformed) }
     }
 }

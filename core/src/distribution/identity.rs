@@ -45,13 +45,17 @@ impl Identity {
         Self::new(name, id, Role::SUnit)
     }
 
-    /// An identity; [`Error::BadName`] for a name that is empty or longer than [`NODE_NAME_BYTES`].
+    /// An identity; [`Error::BadName`] for a name that is empty, longer than [`NODE_NAME_BYTES`], or has control
+    /// characters.
     pub fn new(name: &str, id: u32, role: Role) -> Result<Self, Error> {
-        if name.is_empty() {
-            return Err(Error::BadName);
-        }
         let name = heapless::String::try_from(name).map_err(|_| Error::BadName)?;
-        Ok(Self { id, name, role })
+        let identity = Self { id, name, role };
+        if identity.is_sound() { Ok(identity) } else { Err(Error::BadName) }
+    }
+
+    /// Whether the name is one: not empty, and without control characters, which could forge lines of a log.
+    pub(crate) fn is_sound(&self) -> bool {
+        !self.name.is_empty() && !self.name.chars().any(char::is_control)
     }
 
     /// The name.

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use cara_core::distribution::connection_handler::Sorted;
+use cara_core::error::Error;
 use cara_core::host::mailman::LinkId;
 use cara_core::time::Instant;
 use core::net::SocketAddr;
@@ -119,8 +120,13 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     /// Starts the unit's threads.
-    pub(crate) fn start(self: &Arc<Self>) -> std::io::Result<()> {
-        self.start_workers()?;
-        self.start_clock()
+    pub(crate) fn start(self: &Arc<Self>) -> Result<(), Error> {
+        self.start_workers().and_then(|()| self.start_clock()).map_err(system_refused)
     }
+}
+
+/// What the system says goes to the log; the error tells where to look.
+pub(crate) fn system_refused(error: std::io::Error) -> Error {
+    tracing::error!(%error, "the operating system refused a thread, a socket or a descriptor");
+    Error::Network
 }

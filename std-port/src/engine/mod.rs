@@ -17,6 +17,7 @@ mod workers;
 
 #[cfg(feature = "async")]
 pub(crate) use calling::CallFuture;
+pub(crate) use clock_thread::system_refused;
 pub(crate) use membership::NodeCell;
 pub(crate) use workers::arena_bytes;
 

@@ -17,8 +17,13 @@ impl Interfaces {
     /// What the environment variable `CARA_INTERFACES` says: `lo` for [`Self::Loopback`], anything else for all.
     pub fn from_environment() -> Self {
         match std::env::var_os("CARA_INTERFACES") {
+            None => Self::All,
+            Some(value) if value.is_empty() || value == "all" => Self::All,
             Some(value) if value == "lo" => Self::Loopback,
-            _ => Self::All,
+            Some(value) => {
+                tracing::warn!(?value, "CARA_INTERFACES is neither `lo` nor `all`: loopback alone is used");
+                Self::Loopback
+            }
         }
     }
 

@@ -487,6 +487,9 @@ impl<S: Storage, C: Secure> Session<S, C> {
                 return Err(error);
             }
         }
+        if result.is_err() {
+            self.cut_lease(cx, head.slot);
+        }
         if !cfg!(cara_planted = "leaked_slot") {
             self.calls.end(ticket);
         }

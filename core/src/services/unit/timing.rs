@@ -279,6 +279,19 @@ impl<S: Storage, C: Secure> Session<S, C> {
         }
     }
 
+    /// The caller's newest order has failed, so nothing that it wants is going on: the lease expires at once.
+    pub(super) fn cut_lease<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        slot: Slot,
+    ) {
+        if let Some(granted) = self.granted.iter_mut().find(|granted| granted.slot == slot) {
+            granted.end = cx.now;
+            self.timers.lease = cx.now;
+            end_service_lease(cx, slot);
+        }
+    }
+
     /// The caller gave up its lease: it ends now, as if it had expired, and its
     /// requests up to `id` that wait for their turn, or are still on their way, do not begin.
     pub(super) fn released<M: Mailman, B: Buffers<S>, H: Service>(

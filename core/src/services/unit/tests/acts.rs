@@ -12,7 +12,7 @@ use crate::distribution::function::Definition;
 use crate::distribution::function_list::{Generation, Slot};
 use crate::distribution::message::RequestHeader;
 use crate::distribution::parameters::ParametersView;
-use crate::error::{CloseReason, Error};
+use crate::error::{CloseReason, Error, ServiceError};
 use crate::host::connections::LinkCounter;
 use crate::host::frame::{ChunkWriter, Cut};
 use crate::services::Context;
@@ -38,6 +38,15 @@ impl Side {
     /// Adds a function with a lease, answered at once.
     pub(super) fn offer_leased(&mut self, definition: &str, lease: Duration) -> Slot {
         self.add(definition, lease.as_millis(), Run::Now(|_| Ok(())))
+    }
+
+    /// Adds a function with a lease, which fails for a negative `x`.
+    pub(super) fn offer_picky(&mut self, definition: &str, lease: Duration) -> Slot {
+        let run = |view: &mut ParametersView| match view.variable::<i64>("x") {
+            Ok(x) if x >= 0 => Ok(()),
+            _ => Err(Error::Service(ServiceError::Failed(1))),
+        };
+        self.add(definition, lease.as_millis(), Run::Now(run))
     }
 
     fn add(&mut self, definition: &str, lease: u64, run: Run) -> Slot {

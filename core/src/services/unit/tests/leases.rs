@@ -173,6 +173,24 @@ fn a_motion_that_is_given_up_before_it_began_does_not_begin() {
 }
 
 #[test]
+fn an_order_that_fails_leaves_nothing_going_on() {
+    let mut pair = Pair::live();
+    let slot = pair.agv.offer_picky("go_to(x: int)", LEASE);
+    pair.publish();
+    pair.manager.call("go_to", &x(1)).unwrap();
+    pair.settle();
+    assert!(pair.agv.is_live(slot));
+    // The newest order replaces the one before it, so when it fails, nobody wants the old motion either.
+    pair.manager.call("go_to", &x(-1)).unwrap();
+    pair.settle();
+    assert!(!pair.agv.is_live(slot));
+    assert_eq!(expirations(&pair), 1);
+    assert!(pair.manager.has(&Happened::LeaseEnded { slot, expired: true }));
+    pair.run(Duration::from_secs(2));
+    assert_eq!((expirations(&pair), pair.agv.is_live(slot)), (1, false));
+}
+
+#[test]
 fn a_motion_that_is_finished_ends_its_lease_without_the_hook() {
     let (mut pair, slot) = moving(true);
     pair.agv.end_lease(slot);

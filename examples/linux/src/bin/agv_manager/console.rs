@@ -16,8 +16,10 @@ const HELP: &str =
 /// Takes commands until `quit` or the end of the input.
 pub(crate) fn run(agv_manager: &CommunicationSystem) -> Result<()> {
     say!("console: {HELP}");
-    for line in std::io::stdin().lock().lines() {
+    for line in std::io::stdin().lock().split(b'\n') {
+        // What is no text is no command, and is answered as such.
         let line = line?;
+        let line = String::from_utf8_lossy(&line);
         let words: Vec<&str> = line.split_whitespace().collect();
         match words.as_slice() {
             [] => {}
