@@ -14,6 +14,7 @@
 //!   it returns `None`;
 //! - [`Event::Closed`] is the last event: the port forgets the link and tells the node that it left.
 
+mod answering;
 mod inbound;
 mod outbound;
 mod publishing;

@@ -1,0 +1,219 @@
+//! Calls of the peer: which one begins, and how it is answered or refused.
+
+use super::{Call, Phase, Session};
+use crate::config::Priority;
+use crate::distribution::block;
+use crate::distribution::function_list::Slot;
+use crate::distribution::message::{REPLY_BYTES, encode_failure, encode_reply};
+use crate::distribution::parameters::ParametersView;
+use crate::error::{Error, Limit, ServiceError};
+use crate::host::connections::LinkCounter;
+use crate::host::frame::ChunkWriter;
+use crate::host::mailman::Mailman;
+use crate::host::secure::Secure;
+use crate::services::Context;
+use crate::services::calls::{CallHead, Ticket};
+use crate::services::lease::{Granted, Service};
+use crate::storage::{Buffers, Storage};
+
+impl<S: Storage, C: Secure> Session<S, C> {
+    /// The next call that waited and may begin now, its arguments in `arguments`. Call it after
+    /// [`receive`](Self::receive) is through and after each [`answer`](Self::answer), until it returns `None`.
+    pub fn next_call<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        arguments: &mut ParametersView,
+    ) -> Option<Call> {
+        while self.phase == Phase::Live {
+            let (functions, now) = (cx.functions, cx.now);
+            let (head, read) = self.calls.take_next(cx.buffers, |head, block| {
+                if head.deadline <= now {
+                    return Err(Error::Expired);
+                }
+                let function = functions.lookup(head.slot, head.generation)?;
+                block::read_arguments(function.signature.arguments(), block, arguments)?;
+                block::prepare_results(function.signature.results(), arguments)
+            })?;
+            match read.and_then(|()| self.begin(cx, head)) {
+                Ok(call) => return Some(call),
+                Err(error) => self.refuse_request(cx, head.id, head.slot, head.priority, head.wants_reply, error),
+            }
+        }
+        None
+    }
+
+    /// Whether [`next_call`](Self::next_call) would look at a call.
+    pub fn has_next_call(&self) -> bool {
+        self.phase == Phase::Live && self.calls.can_begin()
+    }
+
+    pub(super) fn begin<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        head: CallHead,
+    ) -> Result<Call, Error> {
+        let lease = cx.functions.function(head.slot).and_then(|function| function.attributes.lease);
+        // A command that waited for its turn is no longer wanted once its lease has been given up.
+        if lease.is_some() && self.publishing.is_released(head.slot, head.id) {
+            return Err(Error::Expired);
+        }
+        let ticket = self.calls.begin(head)?;
+        if let Some(length) = lease {
+            let end = head.made + length;
+            let granted = Granted { slot: head.slot, generation: head.generation, length, end };
+            let result = if end > cx.now { self.grant(cx, granted) } else { Err(Error::Expired) };
+            if let Err(error) = result {
+                self.calls.end(ticket);
+                return Err(error);
+            }
+        }
+        self.link.counters.add(LinkCounter::RequestsRun, 1);
+        let CallHead { slot, priority, wants_reply, deadline, .. } = head;
+        Ok(Call { ticket, slot, priority, wants_reply, deadline })
+    }
+
+    /// Lets the next call of the class begin while this one goes on, as for a service that takes long.
+    pub fn detach(&mut self, ticket: Ticket) {
+        self.calls.detach(ticket);
+    }
+
+    /// Answers a call. [`Error::Full`] when the answer cannot be kept now: the call stays open, to be answered again
+    /// when the stream has taken bytes. A call that was answered, or whose link has ended, is passed over.
+    pub fn answer<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        ticket: Ticket,
+        result: Result<&ParametersView, Error>,
+    ) -> Result<(), Error> {
+        let Some(head) = self.calls.call(ticket) else { return Ok(()) };
+        if self.phase == Phase::Live {
+            let sent = match result {
+                Ok(results) if head.wants_reply => self.send_results(cx, &head, results),
+                Ok(_) => Ok(()),
+                Err(error) => self.send_error(cx, head.id, head.priority, head.wants_reply, error),
+            };
+            if let Err(error @ Error::Full(_)) = sent {
+                return Err(error);
+            }
+        }
+        if result.is_err() {
+            self.cut_lease(cx, head.slot);
+        }
+        if !cfg!(cara_planted = "leaked_slot") {
+            self.calls.end(ticket);
+        }
+        Ok(())
+    }
+
+    /// Gives up on answering a call whose answer could not be kept.
+    pub fn drop_answer(&mut self, ticket: Ticket) {
+        if self.calls.end(ticket).is_some() {
+            self.link.counters.add(LinkCounter::RepliesDropped, 1);
+        }
+    }
+
+    fn send_results<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        head: &CallHead,
+        results: &ParametersView,
+    ) -> Result<(), Error> {
+        let functions = cx.functions;
+        let specs = match functions.lookup(head.slot, head.generation) {
+            Ok(function) => function.signature.results(),
+            Err(error) => return self.send_error(cx, head.id, head.priority, true, error),
+        };
+        let Ok(length) = block::measure(specs, results) else {
+            return self.send_error(cx, head.id, head.priority, true, ServiceError::BadResults.into());
+        };
+        let limit = self.peer_message_size();
+        if length > limit as usize {
+            return self.send_error(cx, head.id, head.priority, true, Error::TooLarge { limit });
+        }
+        let header = encode_reply(head.id, Ok(()));
+        let total = REPLY_BYTES.saturating_add(length);
+        let sent = self.send(cx, head.priority, total, |writer| {
+            writer.put(&header);
+            block::write(specs, results, writer);
+        });
+        match sent {
+            Err(Error::TooLarge { limit }) => {
+                self.send_error(cx, head.id, head.priority, true, Error::TooLarge { limit })
+            }
+            sent => sent,
+        }
+    }
+
+    fn send_error<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        id: u32,
+        priority: Priority,
+        wants_reply: bool,
+        error: Error,
+    ) -> Result<(), Error> {
+        let header = if wants_reply { encode_reply(id, Err(error)) } else { encode_failure(id, error) };
+        self.send(cx, priority, REPLY_BYTES, |writer| writer.put(&header))
+    }
+
+    pub(super) fn send<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        priority: Priority,
+        total: usize,
+        write: impl FnOnce(&mut ChunkWriter<'_>),
+    ) -> Result<(), Error> {
+        self.timers.gathered = crate::time::Instant::FAR_FUTURE;
+        self.timers.last_write = cx.now;
+        let sent = self.link.send_message(cx.mailman, cx.buffers, priority, total, false, write);
+        if let Err(Error::Closed(reason)) = sent {
+            self.end(reason);
+        }
+        sent
+    }
+
+    pub(super) fn refuse_request<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        id: u32,
+        slot: Slot,
+        priority: Priority,
+        wants_reply: bool,
+        error: Error,
+    ) {
+        let counter = match error {
+            Error::Expired => LinkCounter::RequestsExpired,
+            Error::Stale => LinkCounter::RequestsRepeated,
+            Error::Busy | Error::Full(_) => LinkCounter::RequestsBusy,
+            Error::TooSoon { .. } => LinkCounter::RequestsTooSoon,
+            _ => LinkCounter::RequestsRejected,
+        };
+        self.link.counters.add(counter, 1);
+        let error = match error {
+            Error::Full(Limit::ParametersBytes | Limit::Variables) => {
+                Error::TooLarge { limit: self.constraints.message_size }
+            }
+            Error::Full(_) => Error::Busy,
+            error => error,
+        };
+        if self.send_error(cx, id, priority, wants_reply, error).is_err() {
+            self.link.counters.add(LinkCounter::RepliesDropped, 1);
+        }
+        if error == Error::StaleFunction {
+            self.publishing.tell_again(slot);
+            self.pump(cx);
+        }
+    }
+}
+
+/// Puts a call's arguments, and room for its results, into the lent parameters.
+pub(super) fn read_arguments<S: Storage, M: Mailman, B: Buffers<S>, H: Service>(
+    cx: &Context<'_, S, M, B, H>,
+    head: &CallHead,
+    block: &[u8],
+    arguments: &mut ParametersView,
+) -> Result<(), Error> {
+    let function = cx.functions.lookup(head.slot, head.generation)?;
+    block::read_arguments(function.signature.arguments(), block, arguments)?;
+    block::prepare_results(function.signature.results(), arguments)
+}
