@@ -40,8 +40,7 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
         options: ServiceOptions<T>,
         handler: impl IntoHandler<T, Form>,
     ) -> Result<LeaseWatch, Error> {
-        self.check_size(definition)?;
-        self.put(options, handler, |list, attributes, handler| list.add_function(definition, attributes, handler))
+        self.put(definition, options, handler, FunctionList::add_function)
     }
 
     /// Changes a function. Whoever knows the old one gets [`Error::StaleFunction`] until it is published again.
@@ -51,8 +50,7 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
         options: ServiceOptions<T>,
         handler: impl IntoHandler<T, Form>,
     ) -> Result<LeaseWatch, Error> {
-        self.check_size(definition)?;
-        self.put(options, handler, |list, attributes, handler| list.replace(definition, attributes, handler))
+        self.put(definition, options, handler, FunctionList::replace)
     }
 
     /// Arguments and results get their declared sizes when a call is served, however short the message.
@@ -68,17 +66,19 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
 
     fn put<Form>(
         &self,
+        definition: &Definition,
         options: ServiceOptions<T>,
         handler: impl IntoHandler<T, Form>,
-        put: impl FnOnce(&mut FunctionList<Boxed, Handler<T>>, Attributes, Handler<T>) -> Result<Slot, Error>,
+        put: impl FnOnce(&mut FunctionList<Boxed, Handler<T>>, &Definition, Attributes, Handler<T>) -> Result<Slot, Error>,
     ) -> Result<LeaseWatch, Error> {
+        self.check_size(definition)?;
         let lease = Arc::new(Lease::new());
         let attributes =
             Attributes { priority: options.priority, lease: options.lease, idempotent: options.idempotent };
         let kept = options.lease.map(|_| lease.clone());
         let handler =
             Handler { run: handler.into_run().0, lease: kept, safe: options.safe, detached: options.detached };
-        put(&mut write(&self.engine.functions), attributes, handler)?;
+        put(&mut write(&self.engine.functions), definition, attributes, handler)?;
         Ok(LeaseWatch::new(lease, self.engine.clock))
     }
 
