@@ -20,6 +20,8 @@ mod builder;
 mod clock;
 mod communication_system;
 mod config;
+#[cfg(feature = "control")]
+pub mod control;
 mod engine;
 mod event;
 #[cfg(feature = "async")]

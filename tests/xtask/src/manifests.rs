@@ -106,8 +106,8 @@ impl Manifest {
         match (folders.next()?, folders.next()?) {
             ("core", "Cargo.toml") => Some(Place::Core),
             ("core", _) => Some(Place::CoreMember),
+            ("std-port", "cli") => Some(Place::CommandLine),
             ("std-port" | "embassy-port", _) => Some(Place::Port),
-            ("cli", _) => Some(Place::CommandLine),
             ("examples", _) => Some(Place::Examples),
             ("tests", _) => Some(Place::Tests),
             _ => None,

@@ -1,0 +1,346 @@
+//! What travels over the control socket: one JSON object a line. Each [`Question`] is answered by any number of
+//! [`Answer`]s, of which the last one is [`Answer::Done`] or [`Answer::Failed`]. A line that is no question is answered
+//! with `Failed`, and the next line is read.
+
+use serde::{Deserialize, Serialize};
+
+/// First line from the manager's side, so that an older command and a newer manager tell each other apart.
+pub const CONTROL_VERSION: u32 = 1;
+
+/// Longest line in bytes, in either direction: a call with 256 KiB of parameters, written as text.
+pub const LONGEST_LINE: usize = 4 * 1024 * 1024;
+
+/// What an operator asks of a running unit.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "ask", rename_all = "snake_case", deny_unknown_fields)]
+pub enum Question {
+    /// Who are you? Answered by [`Answer::Unit`].
+    Unit,
+    /// Which nodes are known, and who was refused? An [`Answer::Node`] for each, an [`Answer::Refused`] for each refusal.
+    Nodes {
+        /// Only nodes that offer this function.
+        offering: Option<String>,
+    },
+    /// Search now.
+    Search,
+    /// An [`Answer::Function`] for each function that a node has published to this unit.
+    Functions {
+        /// `NAME`, `NAME/ID` or `#ID`.
+        node: String,
+    },
+    /// Call a function. An [`Answer::Called`] for each node.
+    Call(CallQuestion),
+    /// Publish this unit's functions. An [`Answer::Unread`] for each node that has not read the list in time.
+    Publish {
+        /// To this node alone; to all, also later ones, if absent.
+        node: Option<String>,
+        /// How long to wait for acknowledgements.
+        timeout_ms: u64,
+    },
+    /// Change a constraint of the unit, or of its traffic with one node. Answered by [`Answer::Constraints`].
+    Set {
+        /// Towards this node alone: the unit's side of that link.
+        node: Option<String>,
+        /// As in [`Constraints`].
+        constraint: String,
+        /// In the constraint's unit: a number, nodes, bytes or microseconds.
+        value: u64,
+    },
+    /// An [`Answer::Event`] for each event, until the connection is closed.
+    Watch,
+    /// Counters of the unit, or of the link to one node. Answered by an [`Answer::Counters`] for each.
+    Counters {
+        /// The unit and all connected nodes if absent.
+        node: Option<String>,
+    },
+    /// Measures round trips of the protocol's own ping, with no function involved. An [`Answer::Sample`] for each.
+    Ping {
+        /// `NAME`, `NAME/ID` or `#ID`.
+        node: String,
+        /// How many.
+        count: u32,
+        /// Between two of them.
+        pause_us: u64,
+        /// How long to wait for each.
+        timeout_ms: u64,
+    },
+    /// Measures round trips of blocking calls within this unit. An [`Answer::Sample`] for each.
+    Bench {
+        /// What is called, again and again; its `asynchronous` is not looked at.
+        call: CallQuestion,
+        /// How many calls.
+        count: u32,
+        /// Between two of them.
+        pause_us: u64,
+    },
+}
+
+/// A call as an operator makes it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CallQuestion {
+    /// `NAME`, `NAME/ID` or `#ID`; every node that offers the function if absent.
+    pub node: Option<String>,
+    /// The function's name.
+    pub function: String,
+    /// Its arguments, by name.
+    pub arguments: Vec<Argument>,
+    /// Return when the request is accepted.
+    pub asynchronous: bool,
+    /// The unit's constraint if absent.
+    pub timeout_ms: Option<u64>,
+    /// The function's own if absent: `emergency`, `high`, `normal` or `low`.
+    pub priority: Option<String>,
+    /// In one datagram, now or never; asynchronous calls only.
+    pub best_effort: bool,
+}
+
+/// A variable with its value.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Argument {
+    /// The variable's name.
+    pub name: String,
+    /// The variable's size: elements, or the most bytes of a string or of bytes.
+    pub size: u32,
+    /// Its value.
+    #[serde(flatten)]
+    pub value: ArgumentValue,
+}
+
+/// The value of a variable.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "type", content = "value", rename_all = "snake_case")]
+pub enum ArgumentValue {
+    /// Whole numbers.
+    Int(Vec<i64>),
+    /// Numbers with a fraction, as text where JSON has no number for them (`NaN`, `inf`, `-inf`).
+    Float(Vec<Number>),
+    /// Text.
+    String(String),
+    /// Truth values.
+    Bool(Vec<bool>),
+    /// Bytes in hexadecimal, two digits each.
+    Bytes(String),
+}
+
+/// A number with a fraction.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum Number {
+    /// A finite one.
+    Finite(f64),
+    /// `NaN`, `inf` or `-inf`.
+    Other(String),
+}
+
+/// What the unit answers.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "answer", rename_all = "snake_case")]
+pub enum Answer {
+    /// Sent once, before any question.
+    Hello {
+        /// [`CONTROL_VERSION`] of the unit.
+        control_version: u32,
+        /// The unit's `name/id`.
+        unit: String,
+    },
+    /// This unit.
+    Unit(UnitInfo),
+    /// A node that has joined, connected or not.
+    Node(NodeInfo),
+    /// A node that was refused, here or there.
+    Refused(RefusedInfo),
+    /// A function of a node.
+    Function(FunctionInfo),
+    /// How a call ended.
+    Called {
+        /// The node's name.
+        node: String,
+        /// The node's id.
+        id: u32,
+        /// The results of a blocking call.
+        results: Vec<Argument>,
+        /// The id under which a failure of an asynchronous call would be told.
+        call: Option<u32>,
+        /// Why it failed.
+        error: Option<Failure>,
+        /// From asking to the end, in microseconds.
+        took_us: u64,
+    },
+    /// A node that has not read the published list in time.
+    Unread {
+        /// The node's name.
+        node: String,
+        /// The node's id.
+        id: u32,
+    },
+    /// Constraints in force.
+    Constraints(ConstraintsInfo),
+    /// Something happened.
+    Event {
+        /// Milliseconds since the unit's start.
+        at_ms: u64,
+        /// Its name, as `joined` or `request_failed`.
+        event: String,
+        /// The node that it is about.
+        node: Option<String>,
+        /// The rest, in words.
+        text: String,
+    },
+    /// Counters by name, zeros included.
+    Counters {
+        /// The node at the other end of the link; the unit's own if absent.
+        node: Option<String>,
+        /// Name and count.
+        counters: Vec<(String, u64)>,
+    },
+    /// A round trip.
+    Sample {
+        /// Microseconds; absent if it failed.
+        us: Option<f64>,
+        /// Why it failed.
+        error: Option<Failure>,
+    },
+    /// The question has been answered.
+    Done,
+    /// The question could not be answered.
+    Failed(Failure),
+}
+
+/// An error as text, and who must act on it.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Failure {
+    /// `configuration`, `peer`, `resource` or `transport`.
+    pub cause: String,
+    /// The error's name, as `TimedOut`.
+    pub error: String,
+    /// What happened and what to do.
+    pub text: String,
+}
+
+/// A unit that is asked.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct UnitInfo {
+    /// Its name.
+    pub name: String,
+    /// Its ID number.
+    pub id: u32,
+    /// `m_unit` or `s_unit`.
+    pub role: String,
+    /// Its fleet.
+    pub fleet: u32,
+    /// Protocol version.
+    pub version: u8,
+    /// The UDP port of broadcasts.
+    pub discovery_port: u16,
+    /// Where it takes connections; 0 for nowhere.
+    pub tcp_port: u16,
+    /// Which of its runs this is, in hexadecimal.
+    pub epoch: String,
+    /// Since its start.
+    pub uptime_ms: u64,
+    /// The interfaces that it uses, with those that are down.
+    pub interfaces: Vec<InterfaceInfo>,
+    /// Constraints in force.
+    pub constraints: ConstraintsInfo,
+    /// Connected nodes.
+    pub connected: usize,
+}
+
+/// An address of an interface.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct InterfaceInfo {
+    /// The system's name of it.
+    pub name: String,
+    /// The unit's address there.
+    pub address: String,
+    /// Where broadcasts go; none on a point-to-point link.
+    pub broadcast: Option<String>,
+    /// Whether it is up and has a carrier.
+    pub up: bool,
+}
+
+/// Constraints (paper, section 2). Times in microseconds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ConstraintsInfo {
+    /// Time-out of a request.
+    pub request_timeout_us: u64,
+    /// Least time between two requests to one node.
+    pub minimum_interval_us: u64,
+    /// Most connected nodes.
+    pub maximum_nodes: u16,
+    /// Longest message in bytes.
+    pub message_size: u32,
+    /// Longest frame in bytes.
+    pub chunk_size: u16,
+    /// Between two signs of life.
+    pub keep_alive_us: u64,
+    /// Calls that one peer may have waiting or running here.
+    pub calls_per_peer: u16,
+}
+
+/// A node as the unit sees it.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct NodeInfo {
+    /// Its name.
+    pub name: String,
+    /// Its ID number.
+    pub id: u32,
+    /// `m_unit` or `s_unit`.
+    pub role: String,
+    /// Whether it is connected now.
+    pub connected: bool,
+    /// The other end of its link while it is connected.
+    pub address: Option<String>,
+    /// Protocol version that it speaks, while it is connected.
+    pub version: Option<u8>,
+    /// Which of its runs is connected, in hexadecimal.
+    pub epoch: Option<String>,
+    /// What it takes, while it is connected.
+    pub limits: Option<LimitsInfo>,
+    /// Functions that it has published to this unit.
+    pub functions: usize,
+}
+
+/// What a node takes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct LimitsInfo {
+    /// Longest message in bytes.
+    pub message_size: u32,
+    /// Longest frame in bytes.
+    pub chunk_size: u16,
+    /// Calls that this unit may have waiting or running there.
+    pub calls: u16,
+    /// Least time between two requests to it.
+    pub minimum_interval_us: u64,
+}
+
+/// A refusal.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RefusedInfo {
+    /// The other end.
+    pub address: String,
+    /// `NAME/ID`, if it said so.
+    pub node: Option<String>,
+    /// The reason's name, as `WrongManager`.
+    pub reason: String,
+    /// What to do.
+    pub text: String,
+    /// Since then.
+    pub ago_ms: u64,
+}
+
+/// A function that a node offers.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FunctionInfo {
+    /// Its name.
+    pub name: String,
+    /// Its text form, as `go_to(position: int[2]) -> (position: int[2])`.
+    pub signature: String,
+    /// Its class.
+    pub priority: String,
+    /// Its lease.
+    pub lease_us: Option<u64>,
+    /// Whether it may run twice without harm.
+    pub idempotent: bool,
+}
