@@ -183,6 +183,12 @@ impl<S: Storage> TheirFunctionList<S> {
         self.skipped = 0;
     }
 
+    /// The slices, with nothing in them.
+    pub(crate) fn into_slices(mut self) -> (S::Slice<Entry>, S::Slice<u8>) {
+        self.table.clear();
+        (self.table.entries, self.table.bytes)
+    }
+
     /// The place of the function of this name in the peer's list.
     pub fn find(&self, name: &str) -> Option<Slot> {
         self.table.find(name).and_then(|index| self.table.function(index)).map(|function| function.slot)

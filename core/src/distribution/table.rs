@@ -84,7 +84,7 @@ impl<H> Default for Entry<H> {
 /// Entries, and one arena for all their signatures without gaps.
 pub(super) struct Table<S: Storage, H: 'static> {
     pub(super) entries: S::Slice<Entry<H>>,
-    bytes: S::Slice<u8>,
+    pub(super) bytes: S::Slice<u8>,
     used: usize,
 }
 

@@ -267,6 +267,12 @@ impl<S: Storage> Calls<S> {
         self.held = self.running.iter().flatten().count() as u16;
     }
 
+    /// The slots, all empty.
+    pub(crate) fn into_slots(mut self) -> S::Slice<Option<CallHead>> {
+        self.running.iter_mut().for_each(|slot| *slot = None);
+        self.running
+    }
+
     /// Calls that run or wait.
     pub(crate) const fn held(&self) -> u16 {
         self.held

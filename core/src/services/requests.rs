@@ -112,6 +112,12 @@ impl<S: Storage> Requests<S> {
         self.close(id).map(|pending| pending.id)
     }
 
+    /// The slots, all empty.
+    pub(crate) fn into_slots(mut self) -> S::Slice<Option<Pending>> {
+        self.pending.iter_mut().for_each(|slot| *slot = None);
+        self.pending
+    }
+
     /// Calls that wait for a reply.
     pub const fn in_flight(&self) -> usize {
         self.in_flight

@@ -52,6 +52,15 @@ entry!(session_made, {
     }
 });
 
+entry!(session_dismantled, {
+    if let Some(session) = taken::<AnySession>() {
+        let buffers: &mut Pool<Lent> = unknown();
+        let storage = session.into_storage(buffers);
+        keep((storage.small, storage.pending, storage.running));
+        keep((storage.publications, storage.their_functions, storage.their_signatures));
+    }
+});
+
 entry!(session_asked, {
     let session = session();
     keep((session.link(), session.dialed(), session.is_live(), session.is_ended(), session.hello()));

@@ -204,6 +204,11 @@ impl<S: Storage, C: Secure> Link<S, C> {
         self.receiver.release(buffers);
         self.sender.release(buffers);
     }
+
+    /// Its own buffer, for the next link.
+    pub(crate) fn into_small(self) -> S::Slice<u8> {
+        self.receiver.into_small()
+    }
 }
 
 #[cfg(test)]

@@ -332,6 +332,10 @@ impl<S: Storage> Receiver<S> {
         self.partial = Partial::default();
         self.give_unused(buffers);
     }
+
+    pub(super) fn into_small(self) -> S::Slice<u8> {
+        self.small
+    }
 }
 
 impl Content {

@@ -208,6 +208,22 @@ impl<S: Storage, C: Secure> Session<S, C> {
         }
     }
 
+    /// The slices that the session lived in, for the next one: so a port without an allocator opens link after link.
+    /// For a session that has ended; of one that has not, what is in flight is forgotten without a word.
+    pub fn into_storage<B: Buffers<S>>(mut self, buffers: &mut B) -> SessionStorage<S> {
+        self.link.release(buffers);
+        self.calls.release(buffers);
+        let (their_functions, their_signatures) = self.theirs.into_slices();
+        SessionStorage {
+            small: self.link.into_small(),
+            pending: self.requests.into_slots(),
+            running: self.calls.into_slots(),
+            publications: self.publishing.into_table(),
+            their_functions,
+            their_signatures,
+        }
+    }
+
     /// The link's index.
     pub const fn link(&self) -> LinkId {
         self.link.id()

@@ -54,6 +54,12 @@ impl<S: Storage> Publishing<S> {
         }
     }
 
+    /// The table, with nothing in it.
+    pub(super) fn into_table(mut self) -> S::Slice<Publication> {
+        self.table.iter_mut().for_each(|publication| *publication = Publication::default());
+        self.table
+    }
+
     pub(super) fn told(&self, slot: Slot, generation: Generation) -> Told {
         match self.table.get(usize::from(slot.0)) {
             Some(publication) if publication.wanted == Some(generation) => Told::Now,

@@ -2,10 +2,14 @@
 
 use std::vec::Vec;
 
+use super::super::Publication;
 use super::pair::{Happened, Pair};
 use super::setup::Setup;
+use super::side::Side;
 use super::{none, text, x};
+use crate::distribution::function_list::TheirFunctionList;
 use crate::error::{CloseReason, Error};
+use crate::storage::Boxed;
 use crate::time::{Duration, Instant};
 
 #[test]
@@ -29,6 +33,28 @@ fn leases_end_first_then_calls_then_the_link_each_once() {
     pair.run(Duration::from_secs(20));
     assert_eq!(pair.agv.happened, expected);
     assert_eq!(pair.agv.session.deadline(), Instant::FAR_FUTURE);
+}
+
+#[test]
+fn the_slices_of_a_link_come_back_empty_for_the_next_one() {
+    let mut pair = Pair::with_position();
+    pair.manager.offer_held("ask(x: int)");
+    pair.manager.publish();
+    pair.settle();
+    pair.agv.call("ask", &x(1)).unwrap();
+    pair.settle();
+    assert_eq!(pair.manager.session.calls_held(), 1);
+    for (side, agv) in [(&mut pair.manager, false), (&mut pair.agv, true)] {
+        let next = Side::new(&Setup::default(), agv, 1).session;
+        let storage = std::mem::replace(&mut side.session, next).into_storage(&mut side.pool);
+        assert!(storage.pending.iter().all(Option::is_none) && storage.running.iter().all(Option::is_none));
+        assert!(storage.publications.iter().all(|publication| *publication == Publication::default()));
+        assert_eq!(storage.small.len(), crate::config::LINK_BUFFER_BYTES);
+        let theirs: TheirFunctionList<Boxed> =
+            TheirFunctionList::new(storage.their_functions, storage.their_signatures);
+        assert!(theirs.is_empty());
+        assert_eq!(side.pool.free(), side.buffers);
+    }
 }
 
 #[test]
