@@ -1,0 +1,141 @@
+//! A terminal of the reader: where it is, what it has exported, and what runs in it.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, bail, ensure};
+use cara_processes::Process;
+use tempfile::TempDir;
+
+use crate::document::Step;
+use crate::expectation::{line_matches, matches};
+
+/// How long a command that stays may take until it has printed what the guide shows.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+/// What all terminals share: the checkout, and a home of their own that is empty.
+pub(crate) struct Surroundings {
+    root: PathBuf,
+    home: TempDir,
+}
+
+impl Surroundings {
+    pub(crate) fn new(root: &Path) -> Result<Self> {
+        Ok(Self { root: root.to_owned(), home: tempfile::tempdir()? })
+    }
+
+    /// What differs from the environment of this program: nobody else's units are met, and nothing is left behind.
+    fn environment(&self) -> Vec<(&'static str, PathBuf)> {
+        let before = PathBuf::from(std::env::var_os("HOME").unwrap_or_default());
+        let kept = |name: &str, below: &str| std::env::var_os(name).map_or_else(|| before.join(below), PathBuf::from);
+        vec![
+            ("HOME", self.home.path().to_owned()),
+            ("CARGO_HOME", kept("CARGO_HOME", ".cargo")),
+            ("RUSTUP_HOME", kept("RUSTUP_HOME", ".rustup")),
+            ("CARA_CONTROL_DIR", self.home.path().join("control")),
+            ("CARA_INTERFACES", PathBuf::from("lo")),
+            ("NO_COLOR", PathBuf::from("1")),
+        ]
+    }
+}
+
+/// A terminal.
+pub(crate) struct Terminal<'s> {
+    name: &'s str,
+    surroundings: &'s Surroundings,
+    /// `cd` and `export`, which later commands begin with.
+    before: String,
+    running: Option<Process>,
+}
+
+impl<'s> Terminal<'s> {
+    pub(crate) fn new(name: &'s str, surroundings: &'s Surroundings) -> Self {
+        Self { name, surroundings, before: String::from("set -e\n"), running: None }
+    }
+
+    /// Does what the guide asks for.
+    pub(crate) fn take(&mut self, step: &Step) -> Result<()> {
+        match step {
+            Step::File { path, text, .. } => self.write(path, text),
+            Step::Interrupt { .. } => self.interrupt(),
+            Step::Command { text, .. } if text.starts_with("cd ") || text.starts_with("export ") => {
+                self.before += &format!("{text}\n");
+                self.run("true", &[])
+            }
+            Step::Command { text, output, stays: true, .. } => self.start(text, output),
+            Step::Command { text, output, .. } => self.run(text, output),
+        }
+    }
+
+    fn write(&self, path: &str, text: &str) -> Result<()> {
+        println!("{path} is written");
+        let directory = self.shell("pwd").output()?;
+        let path = Path::new(String::from_utf8(directory.stdout)?.trim()).join(path);
+        std::fs::write(&path, text).with_context(|| format!("cannot write {}", path.display()))
+    }
+
+    fn run(&mut self, text: &str, shown: &[String]) -> Result<()> {
+        ensure!(self.running.is_none(), "something runs in this terminal already");
+        println!("{}$ {text}", self.name);
+        let start = Instant::now();
+        let finished = self.shell(text).output()?;
+        let output = String::from_utf8_lossy(&finished.stdout).into_owned();
+        let errors = String::from_utf8_lossy(&finished.stderr).into_owned();
+        ensure!(finished.status.success(), "`{text}` failed: {}\n{output}{errors}", finished.status);
+        let printed: Vec<&str> = output.lines().collect();
+        if !shown.is_empty() && !matches(shown, &printed) {
+            bail!("`{text}` should print\n{}\nand printed\n{output}{errors}", shown.join("\n"));
+        }
+        println!("  {:.1} s", start.elapsed().as_secs_f64());
+        Ok(())
+    }
+
+    fn start(&mut self, text: &str, shown: &[String]) -> Result<()> {
+        ensure!(self.running.is_none(), "something runs in this terminal already");
+        println!("{}$ {text}", self.name);
+        // Standard error belongs to what the reader sees; a process in the background is read from one pipe.
+        let script = format!("{}exec 2>&1\nexec {text}", self.before);
+        let environment = self.surroundings.environment();
+        let variables = environment.iter().map(|(name, value)| format!("{name}={}", value.display()));
+        let directory = self.surroundings.root.display().to_string();
+        let arguments =
+            ["-C".into(), directory].into_iter().chain(variables).chain(["bash".into(), "-c".into(), script]);
+        let process = Process::start(text, Path::new("env"), arguments)?;
+        shown.iter().filter(|line| line.trim() != "…").try_for_each(|line| await_line(&process, line))?;
+        self.running = Some(process);
+        Ok(())
+    }
+
+    fn interrupt(&mut self) -> Result<()> {
+        let mut process = self.running.take().context("nothing runs in this terminal")?;
+        println!("{}^C", self.name);
+        let status = process.terminate(PATIENCE)?;
+        ensure!(status.success(), "it ended with {status}: {:?}", process.lines());
+        Ok(())
+    }
+
+    /// Ends what still runs.
+    pub(crate) fn close(&mut self) -> Result<()> {
+        self.running.take().map_or(Ok(()), |process| bail!("`{}` still runs at the guide's end", process.name()))
+    }
+
+    fn shell(&self, text: &str) -> Command {
+        let mut command = Command::new("bash");
+        command.args(["-c", &format!("{}{text}", self.before)]).current_dir(&self.surroundings.root);
+        command.envs(self.surroundings.environment());
+        command
+    }
+}
+
+fn await_line(process: &Process, shown: &str) -> Result<()> {
+    let deadline = Instant::now() + PATIENCE;
+    while !process.lines().iter().any(|line| line_matches(shown, &line.text)) {
+        if Instant::now() >= deadline {
+            let lines: Vec<String> = process.lines().into_iter().map(|line| line.text).collect();
+            bail!("it should print `{shown}` and printed\n{}", lines.join("\n"));
+        }
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    Ok(())
+}
