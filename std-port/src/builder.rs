@@ -12,7 +12,6 @@ use cara_core::error::Error;
 use cara_core::services::publications::Publications;
 use core::net::SocketAddr;
 
-use crate::clock::Clock;
 use crate::communication_system::CommunicationSystem;
 use crate::config::Capacities;
 use crate::engine::{Engine, EngineParts, NodeCell, message_buffer_bytes, system_refused};
@@ -21,6 +20,7 @@ use crate::storage::{filled, filled_with};
 use crate::sys::datagram::Datagrams;
 use crate::sys::interfaces::Interfaces;
 use crate::sys::stream::Listener;
+use crate::threads::Threads;
 use crate::unit::Unit;
 
 /// Message buffers that a unit keeps while it is idle.
@@ -40,6 +40,7 @@ pub struct Builder<T> {
     interfaces: Interfaces,
     discovery_port: u16,
     tcp_port: u16,
+    threads: Option<Threads>,
     state: T,
 }
 
@@ -62,6 +63,7 @@ impl Builder<()> {
             interfaces: Interfaces::from_environment(),
             discovery_port: PLAIN_PORT,
             tcp_port: 0,
+            threads: None,
             state: (),
         }
     }
@@ -105,6 +107,12 @@ impl<T: Send + 'static> Builder<T> {
         self
     }
 
+    /// The unit shares these threads with others of its process; unless set, it has threads of its own.
+    pub fn threads(mut self, threads: &Threads) -> Self {
+        self.threads = Some(threads.clone());
+        self
+    }
+
     /// An s_unit's manager is at this address: it is dialled, and nothing is broadcast.
     pub fn manager_address(mut self, address: SocketAddr) -> Self {
         if let Target::Manager(manager) = self.target {
@@ -125,6 +133,7 @@ impl<T: Send + 'static> Builder<T> {
             interfaces: self.interfaces,
             discovery_port: self.discovery_port,
             tcp_port: self.tcp_port,
+            threads: self.threads,
             state,
         }
     }
@@ -147,7 +156,8 @@ impl<T: Send + 'static> Builder<T> {
 
     fn engine(self) -> Result<Arc<Engine<T>>, Error> {
         check(&self.constraints)?;
-        let clock = Clock::new();
+        let own_threads = self.threads.is_none();
+        let threads = self.threads.map_or_else(Threads::new, Ok)?;
         let datagrams = Datagrams::open(self.interfaces, self.discovery_port)?;
         let listener = match self.identity.role() {
             Role::MUnit => Some(Listener::open(self.interfaces.bind_address(), self.tcp_port).map_err(listen_error)?),
@@ -172,14 +182,15 @@ impl<T: Send + 'static> Builder<T> {
             links: filled(maximum_links, None),
             findings: filled(FINDINGS, None),
         };
-        let node = Node::new(clock.now(), config, storage);
+        let node = Node::new(threads.crew().clock.now(), config, storage);
         let publications =
             Publications::new(filled(capacities.functions, false), filled(capacities.published_to_one, None));
         let functions =
             FunctionList::new(filled_with(capacities.functions, Entry::empty), filled(capacities.signature_bytes, 0));
         let size = message_buffer_bytes(&self.constraints);
         let parts = EngineParts {
-            clock,
+            threads,
+            own_threads,
             node: NodeCell::new(node, publications, capacities, nodes + REMEMBERED_NODES),
             functions,
             pool: MessagePool::new(size, capacities.message_buffers, KEPT_BUFFERS),
@@ -188,7 +199,7 @@ impl<T: Send + 'static> Builder<T> {
             listener,
             maximum_links,
         };
-        Engine::new(parts).map_err(system_refused)
+        Ok(Engine::new(parts))
     }
 }
 

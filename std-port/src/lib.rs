@@ -33,6 +33,7 @@ mod peer;
 pub mod pool;
 pub mod storage;
 pub mod sys;
+mod threads;
 pub mod timers;
 mod unit;
 
@@ -57,4 +58,5 @@ pub use lease::LeaseWatch;
 pub use my_function_list::MyFunctionList;
 pub use peer::{FunctionNames, Peer};
 pub use sys::interfaces::Interfaces;
+pub use threads::Threads;
 pub use unit::{Unit, WeakUnit};

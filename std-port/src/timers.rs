@@ -41,6 +41,12 @@ impl Timers {
         earliest.is_none_or(|earliest| deadline < earliest)
     }
 
+    /// As [`set`](Self::set), unless the deadline of `link` is earlier already.
+    pub fn bring_forward(&mut self, link: u32, deadline: Instant) -> bool {
+        let earlier = self.deadline(link).is_none_or(|known| deadline < known);
+        earlier && self.set(link, deadline)
+    }
+
     /// Forgets the deadline of `link`, if it has one.
     pub fn cancel(&mut self, link: u32) {
         if let Some(old) = self.deadlines.get_mut(link as usize).and_then(Option::take) {
@@ -110,6 +116,17 @@ mod tests {
         assert_eq!(timers.pop_due(at(49)), None);
         assert_eq!(timers.pop_due(at(50)), Some(1));
         assert!(timers.is_empty());
+    }
+
+    #[test]
+    fn a_deadline_is_brought_forward_and_never_put_off() {
+        let mut timers = Timers::new();
+        assert!(timers.bring_forward(1, at(10)));
+        assert!(!timers.bring_forward(1, at(20)));
+        assert_eq!(timers.deadline(1), Some(at(10)));
+        assert!(timers.bring_forward(1, at(5)));
+        assert!(!timers.bring_forward(1, Instant::FAR_FUTURE));
+        assert_eq!(timers.pop_due(at(5)), Some(1));
     }
 
     #[test]

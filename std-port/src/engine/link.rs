@@ -19,9 +19,12 @@ use super::reader::Reader;
 use crate::storage::Boxed;
 use crate::sys::datagram::Datagrams;
 use crate::sys::stream::Stream;
+use crate::threads;
 
 /// One link of the unit.
 pub(crate) struct LinkCell {
+    /// The unit's number among those that its threads drive.
+    seat: u16,
     pub(crate) id: LinkId,
     /// Tells this link from an earlier one with the same id.
     pub(crate) serial: u32,
@@ -92,6 +95,7 @@ pub(crate) enum Notice {
 
 impl LinkCell {
     pub(crate) fn new(
+        seat: u16,
         id: LinkId,
         serial: u32,
         stream: Stream,
@@ -110,12 +114,12 @@ impl LinkCell {
             timer: Instant::FAR_FUTURE,
             notices: Vec::new(),
         };
-        Self { id, serial, stream, peer: OnceLock::new(), state: Mutex::new(state), room: Condvar::new() }
+        Self { seat, id, serial, stream, peer: OnceLock::new(), state: Mutex::new(state), room: Condvar::new() }
     }
 
-    /// The epoll token: id and serial, so that an event of an earlier link with the same id is known.
+    /// The epoll token: unit, id and serial, so that an event of an earlier link with the same id is known.
     pub(crate) fn token(&self) -> u64 {
-        u64::from(self.serial) << 16 | u64::from(self.id.0)
+        threads::token(self.seat, u64::from(self.serial) << 16 | u64::from(self.id.0))
     }
 
     /// Handlers run outside of this lock, and no code under it leaves the state half changed.

@@ -93,11 +93,11 @@ impl<T: Send + 'static> Engine<T> {
         let dialed = dialed.is_some();
         let config = SessionConfig { link: id, dialed, address, local, constraints };
         let session = Session::new(now, config, Plain, storage);
-        let link = Arc::new(LinkCell::new(id, serial, stream, session, dialed));
+        let link = Arc::new(LinkCell::new(self.seat()?, id, serial, stream, session, dialed));
         *links.get_mut(index)? = Some(link.clone());
         drop(links);
         let interest = if dialed { Interest::READ_EDGE.and_writable() } else { Interest::READ_EDGE };
-        if self.epoll.add(&link.stream, link.token(), interest).is_err() {
+        if self.crew().epoll.add(&link.stream, link.token(), interest).is_err() {
             link.lock().session.disconnected(CloseReason::DialFailed);
         }
         self.settle(&link, link.lock());
@@ -115,7 +115,7 @@ impl<T: Send + 'static> Engine<T> {
         if stream.and_then(|stream| self.open_link(stream, to, Some(Dialed(identity)))).is_none() {
             lock(&self.node).node.dial_failed(self.clock.now(), identity);
         }
-        self.clock_waker.wake();
+        self.wake_clock();
     }
 
     /// The connection that this unit opened is there, or could not be opened.
@@ -220,12 +220,12 @@ impl<T: Send + 'static> Engine<T> {
         let mut state = link.lock();
         self.with(&link, &mut state, |session, cx| session.challenge(cx));
         self.settle(&link, state);
-        self.clock_waker.wake();
+        self.wake_clock();
     }
 
     /// The link's id is free for another link only when nothing here means the old one by it any more.
     fn link_ended(&self, link: &Arc<LinkCell>, reason: CloseReason) {
-        let _ = self.epoll.remove(&link.stream);
+        let _ = self.crew().epoll.remove(&link.stream);
         if let Some(peer) = link.peer.get() {
             peer.leave(link);
             self.run_lost_hook();
@@ -244,7 +244,7 @@ impl<T: Send + 'static> Engine<T> {
         }
         self.carry_out(action);
         // The node may have something to do earlier than before.
-        self.clock_waker.wake();
+        self.wake_clock();
     }
 
     /// Does what the node wants done.
@@ -283,7 +283,7 @@ impl<T: Send + 'static> Engine<T> {
     /// Searches for nodes now (paper, listing line 6).
     pub(crate) fn broadcast(&self) {
         lock(&self.node).node.broadcast(self.clock.now());
-        self.clock_waker.wake();
+        self.wake_clock();
     }
 
     /// Makes all functions of the unit's list visible: to one node, or to all and those that come later. Returns the

@@ -13,7 +13,7 @@ pub(crate) mod reader;
 mod serving;
 mod state_gate;
 mod staying;
-mod workers;
+pub(crate) mod workers;
 
 #[cfg(feature = "async")]
 pub(crate) use calling::CallFuture;
@@ -21,11 +21,9 @@ pub(crate) use clock_thread::system_refused;
 pub(crate) use membership::NodeCell;
 pub(crate) use workers::arena_bytes;
 
-use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::mpsc::SyncSender;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard, Weak};
-use std::thread::JoinHandle;
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 
 use cara_core::config::Constraints;
 use cara_core::distribution::function_list::FunctionList;
@@ -42,9 +40,10 @@ use crate::event::UnitEvent;
 use crate::handler::Handler;
 use crate::pool::MessagePool;
 use crate::storage::Boxed;
-use crate::sys::datagram::Datagrams;
-use crate::sys::epoll::{Epoll, Interest, Trigger, Waker};
+use crate::sys::datagram::{Datagrams, Socket};
+use crate::sys::epoll::{Interest, Ready, Trigger};
 use crate::sys::stream::Listener;
+use crate::threads::{Crew, Driven, Source, Threads};
 use crate::timers::Timers;
 use link::{LinkCell, LinkState, Notice, StdMailman};
 use peers::Peers;
@@ -60,7 +59,6 @@ pub(crate) type Lent<'c, T> = Context<'c, Boxed, StdMailman<'c>, &'c MessagePool
 
 /// Everything that a unit's threads and handles share.
 pub(crate) struct Engine<T: 'static> {
-    this: Weak<Self>,
     pub(crate) clock: Clock,
     pub(crate) node: Mutex<NodeCell>,
     pub(crate) functions: RwLock<FunctionList<Boxed, Handler<T>>>,
@@ -70,24 +68,19 @@ pub(crate) struct Engine<T: 'static> {
     pub(crate) state: StateGate<T>,
     datagrams: Datagrams,
     listener: Option<Listener>,
-    epoll: Epoll,
+    /// Whoever drives the unit: threads of its own, or of several units.
+    threads: Threads,
+    /// No other unit has them.
+    own_threads: bool,
+    /// The unit's number among those that the threads drive, once it has been started.
+    seat: OnceLock<u16>,
     timers: Mutex<Timers>,
-    clock_waker: Waker,
-    pool_waker: Waker,
-    /// Links on which a call may begin that nobody runs yet.
-    ready: Mutex<VecDeque<LinkId>>,
     /// Longest block of parameters that this unit takes.
     longest_message: AtomicUsize,
     /// Bytes that the arguments and results of the largest function need.
     largest_function: AtomicUsize,
-    /// Pool threads that wait for something to do.
-    idle: AtomicUsize,
-    workers: AtomicUsize,
     /// Links on which a thread of the pool stays.
     stays: Mutex<Vec<LinkId>>,
-    /// Calls that the pool has read and served, to tell a few busy links from many.
-    served: AtomicUsize,
-    threads: Mutex<Vec<JoinHandle<()>>>,
     stopping: AtomicBool,
     subscribers: Mutex<Vec<SyncSender<UnitEvent>>>,
     /// Runs when a peer is lost, before its loss is told.
@@ -115,7 +108,9 @@ pub(crate) fn write<V>(lock: &RwLock<V>) -> RwLockWriteGuard<'_, V> {
 
 /// The parts that [`Engine::new`] puts together.
 pub(crate) struct EngineParts<T: 'static> {
-    pub(crate) clock: Clock,
+    /// The threads that the unit shares with others, if any.
+    pub(crate) threads: Threads,
+    pub(crate) own_threads: bool,
     pub(crate) node: NodeCell,
     pub(crate) functions: FunctionList<Boxed, Handler<T>>,
     pub(crate) pool: MessagePool,
@@ -126,12 +121,10 @@ pub(crate) struct EngineParts<T: 'static> {
 }
 
 impl<T: Send + 'static> Engine<T> {
-    pub(crate) fn new(parts: EngineParts<T>) -> std::io::Result<Arc<Self>> {
+    pub(crate) fn new(parts: EngineParts<T>) -> Arc<Self> {
         let longest_message = AtomicUsize::new(parts.node.longest_message());
-        let (epoll, clock_waker, pool_waker) = (Epoll::new()?, Waker::new()?, Waker::new()?);
-        Ok(Arc::new_cyclic(|this| Self {
-            this: this.clone(),
-            clock: parts.clock,
+        Arc::new(Self {
+            clock: parts.threads.crew().clock,
             node: Mutex::new(parts.node),
             functions: RwLock::new(parts.functions),
             peers: RwLock::new(Peers::default()),
@@ -140,22 +133,56 @@ impl<T: Send + 'static> Engine<T> {
             state: StateGate::new(parts.state),
             datagrams: parts.datagrams,
             listener: parts.listener,
-            epoll,
+            threads: parts.threads,
+            own_threads: parts.own_threads,
+            seat: OnceLock::new(),
             timers: Mutex::new(Timers::new()),
-            clock_waker,
-            pool_waker,
-            ready: Mutex::new(VecDeque::new()),
             longest_message,
             largest_function: AtomicUsize::new(0),
-            idle: AtomicUsize::new(0),
-            workers: AtomicUsize::new(0),
             stays: Mutex::new(Vec::new()),
-            served: AtomicUsize::new(0),
-            threads: Mutex::new(Vec::new()),
             stopping: AtomicBool::new(false),
             subscribers: Mutex::new(Vec::new()),
             lost_hook: Mutex::new(None),
-        }))
+        })
+    }
+
+    fn crew(&self) -> &Arc<Crew> {
+        self.threads.crew()
+    }
+
+    fn seat(&self) -> Option<u16> {
+        self.seat.get().copied()
+    }
+
+    /// Begins to search and to serve, driven by the unit's threads. One that was stopped does not start again.
+    pub(crate) fn start(self: &Arc<Self>) -> Result<(), Error> {
+        if self.is_stopping() || self.seat().is_some() {
+            return Err(Error::NotRunning);
+        }
+        self.crew().start()?;
+        let seat = self.crew().seat(self.clone())?;
+        let _ = self.seat.set(seat);
+        self.watch(seat).map_err(system_refused)?;
+        self.wake_clock();
+        Ok(())
+    }
+
+    fn watch(&self, seat: u16) -> std::io::Result<()> {
+        for socket in [Socket::Shared, Socket::Own] {
+            self.crew().watch(seat, Source::Datagrams(socket), self.datagrams.fd(socket))?;
+        }
+        self.listener.as_ref().map_or(Ok(()), |listener| self.crew().watch(seat, Source::Listener, listener))
+    }
+
+    /// Something is to be done now, or the time of the next thing has changed.
+    fn wake_clock(&self) {
+        self.wake_clock_at(Instant::START);
+    }
+
+    fn wake_clock_at(&self, at: Instant) {
+        if let Some(seat) = self.seat() {
+            self.crew().wake_at(seat, at);
+        }
     }
 
     pub(crate) fn is_stopping(&self) -> bool {
@@ -301,7 +328,7 @@ impl<T: Send + 'static> Engine<T> {
         if deadline < state.timer {
             state.timer = deadline;
             if lock(&self.timers).set(u32::from(link.id.0), deadline) {
-                self.clock_waker.wake();
+                self.wake_clock_at(deadline);
             }
         }
     }
@@ -318,7 +345,7 @@ impl<T: Send + 'static> Engine<T> {
         state.registration = wanted;
         let interest = Interest { readable: wanted.readable, writable: wanted.writable, trigger: Trigger::Edge };
         // A descriptor that cannot be watched is one whose link has ended.
-        let _ = self.epoll.modify(&link.stream, link.token(), interest);
+        let _ = self.crew().epoll.modify(&link.stream, link.token(), interest);
     }
 
     /// Where the unit takes connections; 0 for nowhere.
@@ -383,17 +410,26 @@ impl<T: Send + 'static> Engine<T> {
             self.settle(&link, state);
         }
         self.state.stop();
-        self.clock_waker.wake();
-        self.pool_waker.wake();
-        let threads = std::mem::take(&mut *lock(&self.threads));
-        // A handler that stops its unit does not wait for the others: one of them may wait for it.
-        let own = std::thread::current().id();
-        if threads.iter().all(|thread| thread.thread().id() != own) {
-            threads.into_iter().for_each(|thread| drop(thread.join()));
-        }
+        self.release_threads();
         // A handler may own a handle to a peer of this unit, and so the unit itself: without handlers nothing is left.
         let handlers = self.take_handlers();
         drop(handlers);
+    }
+
+    /// From here on no thread works for the unit any more, except the one that calls.
+    fn release_threads(&self) {
+        for socket in [Socket::Shared, Socket::Own] {
+            self.crew().unwatch(self.datagrams.fd(socket));
+        }
+        if let Some(listener) = &self.listener {
+            self.crew().unwatch(listener);
+        }
+        if let Some(seat) = self.seat() {
+            self.crew().leave(seat);
+        }
+        if self.own_threads {
+            self.crew().stop();
+        }
     }
 
     fn take_handlers(&self) -> Vec<Handler<T>> {
@@ -405,10 +441,27 @@ impl<T: Send + 'static> Engine<T> {
     fn now(&self) -> Instant {
         self.clock.now()
     }
+}
 
-    /// The engine as its threads share it.
-    fn this(&self) -> Option<Arc<Self>> {
-        self.this.upgrade()
+impl<T: Send + 'static> Driven for Engine<T> {
+    fn ready(&self, ready: Ready, worker: &mut workers::Worker) {
+        self.link_ready(ready, worker);
+    }
+
+    fn serve_waiting(&self, token: u64, worker: &mut workers::Worker) {
+        self.serve_link(token, worker);
+    }
+
+    fn keep_time(&self) -> Instant {
+        self.poll_links().min(self.poll_node()).min(self.relieve_stays())
+    }
+
+    fn read_datagrams(&self, socket: Socket, buffer: &mut [u8]) {
+        self.datagrams_ready(socket, buffer);
+    }
+
+    fn accept(&self) {
+        self.connections_ready();
     }
 }
 

@@ -134,7 +134,7 @@ mod tests {
         };
         let config = SessionConfig { link: LinkId(0), dialed: true, address, local, constraints: Constraints::M_UNIT };
         let session = Session::new(Instant::START, config, Plain, storage);
-        Arc::new(LinkCell::new(LinkId(0), serial, Stream::connect(address).unwrap(), session, true))
+        Arc::new(LinkCell::new(0, LinkId(0), serial, Stream::connect(address).unwrap(), session, true))
     }
 
     fn ids(peers: &Peers) -> Vec<u32> {

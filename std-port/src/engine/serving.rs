@@ -65,12 +65,7 @@ impl<T: Send + 'static> Engine<T> {
 
     /// Leaves a link's calls to another thread of the pool.
     pub(super) fn hand_over(&self, link: &LinkCell) {
-        let mut ready = lock(&self.ready);
-        if !ready.contains(&link.id) {
-            ready.push_back(link.id);
-        }
-        drop(ready);
-        self.pool_waker.wake();
+        self.crew().hand_over(link.token());
     }
 
     fn run(&self, link: &LinkCell, call: &Call, arguments: &mut ParametersView) -> Result<(), Error> {

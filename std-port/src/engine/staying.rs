@@ -43,9 +43,9 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     fn begin_stay(&self, link: &Arc<LinkCell>) -> Option<Turn> {
-        let served = self.served.fetch_add(1, Ordering::Relaxed);
+        let served = self.crew().served.fetch_add(1, Ordering::Relaxed);
         let mut stays = lock(&self.stays);
-        if stays.len() >= MOST_STAYS || self.idle.load(Ordering::Acquire) == 0 {
+        if stays.len() >= MOST_STAYS || !self.crew().has_idle() {
             return None;
         }
         let mut state = link.lock();
@@ -65,7 +65,7 @@ impl<T: Send + 'static> Engine<T> {
         drop(stays);
         self.settle(link, state);
         if first {
-            self.clock_waker.wake();
+            self.wake_clock();
         }
         Some(turn)
     }
@@ -74,7 +74,7 @@ impl<T: Send + 'static> Engine<T> {
         let mut state = link.lock();
         state.reader.set_busy(turn, None);
         let goes_on = state.quick && !state.is_paused() && state.reader.is_leader(turn);
-        goes_on && self.idle.load(Ordering::Acquire) > 0 && !self.is_stopping()
+        goes_on && self.crew().has_idle() && !self.is_stopping()
     }
 
     /// Reads until a call is to be run; `None` when nothing comes any more or the lead is lost.
@@ -104,7 +104,7 @@ impl<T: Send + 'static> Engine<T> {
             if call.is_some() {
                 return call;
             }
-            if !alive || self.idle.load(Ordering::Acquire) == 0 || self.is_stopping() {
+            if !alive || !self.crew().has_idle() || self.is_stopping() {
                 return None;
             }
         }

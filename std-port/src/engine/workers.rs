@@ -1,4 +1,4 @@
-//! The pool: a few threads that wait in one epoll set, read what is ready, and run the calls that they read.
+//! What a thread of the pool does for a unit: it reads the link that is ready, and runs the calls that it read.
 //!
 //! There is always a thread that reads: one that is about to run a handler starts another if none is idle, up to a
 //! limit; beyond it calls wait in their sessions until a handler returns.
@@ -8,73 +8,42 @@ use std::sync::atomic::Ordering;
 
 use cara_core::distribution::parameters::{Parameters, ParametersView};
 use cara_core::error::CloseReason;
-use cara_core::host::mailman::LinkId;
 use cara_core::services::unit::Call;
 
 use super::link::{LinkCell, LinkState};
-use super::{Engine, READ_BYTES, lock};
-use crate::sys::epoll::{Events, Interest, Ready};
+use super::{Engine, READ_BYTES};
+use crate::sys::epoll::{Interest, Ready};
 use crate::sys::stream::{Received, Wait};
 
-/// Threads that a unit starts with.
-const FIRST_WORKERS: usize = 2;
-/// Most threads of a unit's pool.
-const MOST_WORKERS: usize = 14;
-/// The token of the waker.
-pub(super) const WAKER: u64 = u64::MAX;
 /// Reads of one link in a row, so that a busy one does not keep a thread from the others.
 const READS: usize = 8;
 
-pub(super) struct Worker {
-    events: Events,
+/// What a thread of the pool reads into and serves calls in, whichever unit they are for.
+pub(crate) struct Worker {
     pub(super) buffer: Vec<u8>,
     pub(super) arguments: Box<ParametersView>,
-    /// The longest message that `arguments` hold.
-    longest: usize,
+    /// The bytes that `arguments` hold.
+    room: usize,
 }
 
 impl Worker {
-    fn new(longest: usize) -> Self {
-        Self { events: Events::new(1), buffer: vec![0; READ_BYTES], arguments: arena(longest), longest }
+    pub(crate) fn new() -> Self {
+        Self { buffer: vec![0; READ_BYTES], arguments: arena(0), room: arena_bytes(0) }
     }
 
-    /// The limit may have changed since the last call.
+    /// The limit may have been raised since the last call.
     pub(super) fn fit(&mut self, longest: usize) {
-        if self.longest != longest {
+        if self.room < arena_bytes(longest) {
             self.arguments = arena(longest);
-            self.longest = longest;
+            self.room = arena_bytes(longest);
         }
     }
 }
 
 impl<T: Send + 'static> Engine<T> {
-    pub(super) fn start_workers(self: &Arc<Self>) -> std::io::Result<()> {
-        self.epoll.add(&self.pool_waker, WAKER, Interest::READ_LEVEL)?;
-        for _ in 0..FIRST_WORKERS {
-            self.start_worker();
-        }
-        Ok(())
-    }
-
-    fn start_worker(self: &Arc<Self>) -> bool {
-        let started = self.workers.fetch_add(1, Ordering::AcqRel) < MOST_WORKERS;
-        let engine = self.clone();
-        let thread = std::thread::Builder::new().name("cara-pool".into());
-        match started.then(|| thread.spawn(move || engine.work())) {
-            Some(Ok(thread)) => {
-                lock(&self.threads).push(thread);
-                true
-            }
-            _ => {
-                self.workers.fetch_sub(1, Ordering::AcqRel);
-                false
-            }
-        }
-    }
-
     /// Whether a call may be run: another thread goes on reading.
     pub(super) fn may_run(&self) -> bool {
-        self.idle.load(Ordering::Acquire) > 0 || self.this().is_some_and(|engine| engine.start_worker())
+        self.crew().may_run()
     }
 
     /// Bytes that the parameters of a served call may need: of a message, or of the largest function.
@@ -87,33 +56,9 @@ impl<T: Send + 'static> Engine<T> {
         self.largest_function.fetch_max(bytes, Ordering::AcqRel);
     }
 
-    fn work(self: Arc<Self>) {
-        let mut worker = Worker::new(self.call_bytes());
-        while !self.is_stopping() {
-            self.idle.fetch_add(1, Ordering::AcqRel);
-            let waited = self.epoll.wait(&mut worker.events, None);
-            self.idle.fetch_sub(1, Ordering::AcqRel);
-            if let Err(error) = waited {
-                tracing::error!(%error, "waiting for links failed");
-                return;
-            }
-            worker.fit(self.call_bytes());
-            let ready = worker.events.iter().next();
-            match ready {
-                // While the unit stops, the waker stays set, so that every thread wakes.
-                Some(ready) if ready.token == WAKER && self.is_stopping() => return,
-                Some(ready) if ready.token == WAKER => {
-                    self.pool_waker.reset();
-                }
-                Some(ready) => self.ready(ready, &mut worker),
-                None => {}
-            }
-            self.serve_waiting(&mut worker);
-        }
-    }
-
-    fn ready(&self, ready: Ready, worker: &mut Worker) {
+    pub(super) fn link_ready(&self, ready: Ready, worker: &mut Worker) {
         let Some(link) = self.link_of_token(ready.token) else { return };
+        worker.fit(self.call_bytes());
         let mut state = link.lock();
         if state.connecting && ready.writable {
             self.connected(&link, &mut state);
@@ -157,27 +102,18 @@ impl<T: Send + 'static> Engine<T> {
             }
         }
         let interest = Interest { writable: state.registration.writable, ..Interest::READ_EDGE };
-        let _ = self.epoll.modify(&link.stream, link.token(), interest);
+        let _ = self.crew().epoll.modify(&link.stream, link.token(), interest);
         call
     }
 
-    /// Runs the calls of links that nobody has run yet.
-    fn serve_waiting(&self, worker: &mut Worker) {
-        while let Some(id) = self.take_ready() {
-            let Some(link) = self.link(id) else { continue };
-            let state = link.lock();
-            if let Some(call) = self.next_call(&link, state, &mut worker.arguments) {
-                self.serve(&link, call, &mut worker.arguments);
-            }
+    /// Runs the calls of a link that nobody has run yet.
+    pub(super) fn serve_link(&self, token: u64, worker: &mut Worker) {
+        let Some(link) = self.link_of_token(token) else { return };
+        worker.fit(self.call_bytes());
+        let state = link.lock();
+        if let Some(call) = self.next_call(&link, state, &mut worker.arguments) {
+            self.serve(&link, call, &mut worker.arguments);
         }
-    }
-
-    fn take_ready(&self) -> Option<LinkId> {
-        let mut ready = lock(&self.ready);
-        if ready.is_empty() || !self.may_run() {
-            return None;
-        }
-        ready.pop_front()
     }
 }
 

@@ -1,0 +1,473 @@
+//! The threads that drive units: a pool that reads links and runs calls, and one that keeps time.
+//!
+//! A unit has threads of its own unless it is given [`Threads`] that several units of a process share. A token says
+//! which unit an event is for, so that the units of a process wait in one epoll set, whoever has the threads.
+
+use std::collections::VecDeque;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError, RwLock};
+use std::thread::JoinHandle;
+
+use cara_core::error::Error;
+use cara_core::time::Instant;
+
+use crate::clock::Clock;
+use crate::engine::workers::Worker;
+use crate::engine::{lock, read, system_refused, write};
+use crate::sys::datagram::Socket;
+use crate::sys::epoll::{Epoll, Events, Interest, Ready, Waker};
+use crate::timers::Timers;
+
+/// Threads of the pool to begin with.
+const FIRST_WORKERS: usize = 2;
+/// Most threads of a pool.
+const MOST_WORKERS: usize = 14;
+/// Longest datagram that counts, and one byte more.
+const DATAGRAM: usize = 2048;
+/// The token of both wakers; no unit has this number.
+const WAKER: u64 = u64::MAX;
+/// Events of sockets that are taken in one look.
+const CLOCK_EVENTS: usize = 64;
+/// Bits of a token below the unit's number: what the event is about.
+const UNIT_SHIFT: u32 = 48;
+
+/// Threads that several units of one process share: at most 15, however many units there are.
+///
+/// For processes with many s_units, such as simulations of a fleet and gateways. They share fate as well: a handler
+/// runs on a thread of all, and where 14 handlers wait, calls of all units wait. Units whose handlers call each other
+/// need threads of their own, which is what a unit has unless it is given these.
+///
+/// ```no_run
+/// use cara_std::{Threads, Unit};
+///
+/// let threads = Threads::new()?;
+/// for id in 0..1_000 {
+///     let agv = Unit::builder("agv", id, "depot", 1)?.threads(&threads).build_unit()?;
+///     agv.start()?;
+/// #   std::mem::forget(agv);
+/// }
+/// # Ok::<(), cara_std::Error>(())
+/// ```
+#[derive(Clone)]
+pub struct Threads {
+    owner: Arc<Owner>,
+}
+
+impl std::fmt::Debug for Threads {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Threads").field("running", &lock(&self.owner.crew.threads).len()).finish()
+    }
+}
+
+/// Ends the threads when the last unit and the last handle are gone.
+struct Owner {
+    crew: Arc<Crew>,
+}
+
+impl Drop for Owner {
+    fn drop(&mut self) {
+        self.crew.stop();
+    }
+}
+
+impl Threads {
+    /// Threads for any number of units; they begin with the first unit that starts, and end with the last one.
+    ///
+    /// [`Error::Network`] where the system refuses descriptors for them.
+    pub fn new() -> Result<Self, Error> {
+        Crew::new().map(|crew| Self { owner: Arc::new(Owner { crew: Arc::new(crew) }) }).map_err(system_refused)
+    }
+
+    pub(crate) fn crew(&self) -> &Arc<Crew> {
+        &self.owner.crew
+    }
+}
+
+/// What the threads do for a unit, whatever its application's state is.
+pub(crate) trait Driven: Send + Sync {
+    /// One of the unit's links can be read or written.
+    fn ready(&self, ready: Ready, worker: &mut Worker);
+    /// A call may begin on the link of a token.
+    fn serve_waiting(&self, token: u64, worker: &mut Worker);
+    /// Does what is due; returns when it is to be called again.
+    fn keep_time(&self) -> Instant;
+    /// Datagrams have come.
+    fn read_datagrams(&self, socket: Socket, buffer: &mut [u8]);
+    /// Connections have come.
+    fn accept(&self);
+}
+
+/// What a socket of a unit tells the clock's thread.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Source {
+    Datagrams(Socket),
+    Listener,
+}
+
+impl Source {
+    const fn code(self) -> u64 {
+        match self {
+            Self::Datagrams(Socket::Shared) => 1,
+            Self::Datagrams(Socket::Own) => 2,
+            Self::Listener => 3,
+        }
+    }
+
+    const fn of(token: u64) -> Self {
+        match token & 0xff {
+            1 => Self::Datagrams(Socket::Shared),
+            2 => Self::Datagrams(Socket::Own),
+            _ => Self::Listener,
+        }
+    }
+}
+
+/// A unit among those that the threads drive.
+struct Seat {
+    driven: Arc<dyn Driven>,
+    /// Held for reading by each thread that is inside the unit; who stops the unit waits for them.
+    gate: RwLock<()>,
+}
+
+/// The threads themselves and what they share.
+pub(crate) struct Crew {
+    pub(crate) clock: Clock,
+    /// The links of all units.
+    pub(crate) epoll: Epoll,
+    clock_epoll: Epoll,
+    clock_waker: Waker,
+    pool_waker: Waker,
+    seats: RwLock<Vec<Option<Arc<Seat>>>>,
+    /// When each unit's time has come.
+    due: Mutex<Timers>,
+    /// Links on which a call may begin that nobody runs yet.
+    ready: Mutex<VecDeque<u64>>,
+    /// Threads of the pool that wait for something to do.
+    idle: AtomicUsize,
+    workers: AtomicUsize,
+    /// Calls that the pool has read and served, to tell a few busy links from many.
+    pub(crate) served: AtomicUsize,
+    started: OnceLock<Result<(), Error>>,
+    threads: Mutex<Vec<JoinHandle<()>>>,
+    stopping: AtomicBool,
+}
+
+/// A unit's number and what the event is about, as an epoll set carries it.
+pub(crate) const fn token(seat: u16, what: u64) -> u64 {
+    ((seat as u64) << UNIT_SHIFT) | (what & ((1 << UNIT_SHIFT) - 1))
+}
+
+const fn seat_of(token: u64) -> u16 {
+    (token >> UNIT_SHIFT) as u16
+}
+
+impl Crew {
+    fn new() -> std::io::Result<Self> {
+        let (epoll, clock_epoll, pool_waker, clock_waker) =
+            (Epoll::new()?, Epoll::new()?, Waker::new()?, Waker::new()?);
+        epoll.add(&pool_waker, WAKER, Interest::READ_LEVEL)?;
+        clock_epoll.add(&clock_waker, WAKER, Interest::READ_LEVEL)?;
+        Ok(Self {
+            clock: Clock::new(),
+            epoll,
+            clock_epoll,
+            clock_waker,
+            pool_waker,
+            seats: RwLock::new(Vec::new()),
+            due: Mutex::new(Timers::new()),
+            ready: Mutex::new(VecDeque::new()),
+            idle: AtomicUsize::new(0),
+            workers: AtomicUsize::new(0),
+            served: AtomicUsize::new(0),
+            started: OnceLock::new(),
+            threads: Mutex::new(Vec::new()),
+            stopping: AtomicBool::new(false),
+        })
+    }
+
+    /// Gives a unit its number. Nothing happens to it before its sockets are watched and its clock is woken.
+    pub(crate) fn seat(&self, driven: Arc<dyn Driven>) -> Result<u16, Error> {
+        let mut seats = write(&self.seats);
+        let free = seats.iter().position(Option::is_none).unwrap_or(seats.len());
+        let number = u16::try_from(free).ok().filter(|number| *number < u16::MAX).ok_or(Error::BadConstraint)?;
+        let seat = Some(Arc::new(Seat { driven, gate: RwLock::new(()) }));
+        match seats.get_mut(free) {
+            Some(place) => *place = seat,
+            None => seats.push(seat),
+        }
+        Ok(number)
+    }
+
+    /// Watches one of the unit's sockets.
+    pub(crate) fn watch(&self, seat: u16, source: Source, fd: impl std::os::fd::AsFd) -> std::io::Result<()> {
+        self.clock_epoll.add(fd, token(seat, source.code()), Interest::READ_LEVEL)
+    }
+
+    /// Watches a socket no more.
+    pub(crate) fn unwatch(&self, fd: impl std::os::fd::AsFd) {
+        let _ = self.clock_epoll.remove(fd);
+    }
+
+    /// The unit has something to do at `at`.
+    pub(crate) fn wake_at(&self, seat: u16, at: Instant) {
+        if lock(&self.due).bring_forward(u32::from(seat), at) {
+            self.clock_waker.wake();
+        }
+    }
+
+    /// Leaves a link's calls to another thread of the pool.
+    pub(crate) fn hand_over(&self, link: u64) {
+        let mut ready = lock(&self.ready);
+        if !ready.contains(&link) {
+            ready.push_back(link);
+        }
+        drop(ready);
+        self.pool_waker.wake();
+    }
+
+    /// Whether a thread of the pool waits for something to do.
+    pub(crate) fn has_idle(&self) -> bool {
+        self.idle.load(Ordering::Acquire) > 0
+    }
+
+    /// Whether a call may be run: another thread goes on reading.
+    pub(crate) fn may_run(self: &Arc<Self>) -> bool {
+        self.has_idle() || self.start_worker()
+    }
+
+    /// Takes a unit out. Unless a thread of the crew does it itself, nobody is inside the unit any more when it returns.
+    pub(crate) fn leave(&self, seat: u16) {
+        let place = write(&self.seats).get_mut(usize::from(seat)).and_then(Option::take);
+        lock(&self.due).cancel(u32::from(seat));
+        if let Some(seat) = place.filter(|_| !self.is_own_thread()) {
+            drop(write(&seat.gate));
+        }
+    }
+
+    /// Starts the threads, once.
+    pub(crate) fn start(self: &Arc<Self>) -> Result<(), Error> {
+        *self.started.get_or_init(|| {
+            let crew = self.clone();
+            let clock = std::thread::Builder::new().name("cara-clock".into());
+            let clock = clock.spawn(move || crew.keep_time()).map_err(system_refused)?;
+            lock(&self.threads).push(clock);
+            if (0..FIRST_WORKERS).all(|_| self.start_worker()) { Ok(()) } else { Err(Error::Network) }
+        })
+    }
+
+    fn start_worker(self: &Arc<Self>) -> bool {
+        let started = self.workers.fetch_add(1, Ordering::AcqRel) < MOST_WORKERS;
+        let crew = self.clone();
+        let thread = std::thread::Builder::new().name("cara-pool".into());
+        match started.then(|| thread.spawn(move || crew.work())) {
+            Some(Ok(thread)) => {
+                lock(&self.threads).push(thread);
+                true
+            }
+            _ => {
+                self.workers.fetch_sub(1, Ordering::AcqRel);
+                false
+            }
+        }
+    }
+
+    fn is_stopping(&self) -> bool {
+        self.stopping.load(Ordering::Acquire)
+    }
+
+    fn is_own_thread(&self) -> bool {
+        let own = std::thread::current().id();
+        lock(&self.threads).iter().any(|thread| thread.thread().id() == own)
+    }
+
+    /// Ends all threads, and waits for it unless one of them calls.
+    pub(crate) fn stop(&self) {
+        if self.stopping.swap(true, Ordering::AcqRel) {
+            return;
+        }
+        self.clock_waker.wake();
+        self.pool_waker.wake();
+        let own = self.is_own_thread();
+        let threads = std::mem::take(&mut *lock(&self.threads));
+        // A handler that stops its unit does not wait for the others: one of them may wait for it.
+        if !own {
+            threads.into_iter().for_each(|thread| drop(thread.join()));
+        }
+    }
+
+    /// Does something in the unit that a token means, unless it is gone or going.
+    fn enter<R>(&self, token: u64, act: impl FnOnce(&dyn Driven) -> R) -> Option<R> {
+        let seat = read(&self.seats).get(usize::from(seat_of(token))).cloned().flatten()?;
+        let _inside = match seat.gate.try_read() {
+            Ok(inside) => inside,
+            Err(std::sync::TryLockError::Poisoned(poisoned)) => PoisonError::into_inner(poisoned),
+            Err(std::sync::TryLockError::WouldBlock) => return None,
+        };
+        Some(act(&*seat.driven))
+    }
+
+    fn work(self: Arc<Self>) {
+        let mut events = Events::new(1);
+        let mut worker = Worker::new();
+        while !self.is_stopping() {
+            self.idle.fetch_add(1, Ordering::AcqRel);
+            let waited = self.epoll.wait(&mut events, None);
+            self.idle.fetch_sub(1, Ordering::AcqRel);
+            if let Err(error) = waited {
+                tracing::error!(%error, "waiting for links failed");
+                return;
+            }
+            match events.iter().next() {
+                // While the crew stops, the waker stays set, so that every thread wakes.
+                Some(ready) if ready.token == WAKER && self.is_stopping() => return,
+                Some(ready) if ready.token == WAKER => {
+                    self.pool_waker.reset();
+                }
+                Some(ready) => drop(self.enter(ready.token, |driven| driven.ready(ready, &mut worker))),
+                None => {}
+            }
+            self.serve_waiting(&mut worker);
+        }
+    }
+
+    /// Runs the calls of links that nobody has run yet.
+    fn serve_waiting(self: &Arc<Self>, worker: &mut Worker) {
+        while let Some(link) = self.take_ready() {
+            self.enter(link, |driven| driven.serve_waiting(link, worker));
+        }
+    }
+
+    fn take_ready(self: &Arc<Self>) -> Option<u64> {
+        let mut ready = lock(&self.ready);
+        if ready.is_empty() || !self.may_run() {
+            return None;
+        }
+        ready.pop_front()
+    }
+
+    fn keep_time(&self) {
+        let mut events = Events::new(CLOCK_EVENTS);
+        let mut buffer = vec![0; DATAGRAM];
+        while !self.is_stopping() {
+            let next = self.poll_due();
+            let wait = (next != Instant::FAR_FUTURE).then(|| next.since(self.clock.now()));
+            if let Err(error) = self.clock_epoll.wait(&mut events, wait) {
+                tracing::error!(%error, "waiting for time failed");
+                return;
+            }
+            for ready in events.iter() {
+                if ready.token == WAKER {
+                    self.clock_waker.reset();
+                    continue;
+                }
+                self.enter(ready.token, |driven| match Source::of(ready.token) {
+                    Source::Datagrams(socket) => driven.read_datagrams(socket, &mut buffer),
+                    Source::Listener => driven.accept(),
+                });
+                // What was read may be acted upon at once.
+                lock(&self.due).bring_forward(u32::from(seat_of(ready.token)), Instant::START);
+            }
+        }
+    }
+
+    /// Lets every unit whose time has come do what is due; returns when the next one's comes.
+    fn poll_due(&self) -> Instant {
+        loop {
+            let seat = {
+                let mut due = lock(&self.due);
+                match due.pop_due(self.clock.now()) {
+                    Some(seat) => seat as u16,
+                    None => return due.next().unwrap_or(Instant::FAR_FUTURE),
+                }
+            };
+            if let Some(next) = self.enter(token(seat, 0), |driven| driven.keep_time()) {
+                lock(&self.due).bring_forward(u32::from(seat), next);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Counts what it is asked to do, and waits in it as long as the gate is closed.
+    #[derive(Default)]
+    struct Counting {
+        polls: AtomicUsize,
+        closed: Mutex<()>,
+    }
+
+    impl Driven for Counting {
+        fn ready(&self, _: Ready, _: &mut Worker) {}
+        fn serve_waiting(&self, _: u64, _: &mut Worker) {}
+        fn keep_time(&self) -> Instant {
+            self.polls.fetch_add(1, Ordering::SeqCst);
+            drop(lock(&self.closed));
+            Instant::FAR_FUTURE
+        }
+        fn read_datagrams(&self, _: Socket, _: &mut [u8]) {}
+        fn accept(&self) {}
+    }
+
+    fn until(condition: impl Fn() -> bool) {
+        let end = std::time::Instant::now() + std::time::Duration::from_secs(20);
+        while !condition() {
+            assert!(std::time::Instant::now() < end, "not in time");
+            std::thread::sleep(std::time::Duration::from_millis(1));
+        }
+    }
+
+    #[test]
+    fn tokens_keep_unit_and_meaning_apart() {
+        let longest = (u64::from(u32::MAX) << 16) | u64::from(u16::MAX);
+        assert_eq!(seat_of(token(7, longest)), 7);
+        assert_eq!(token(7, longest) & ((1 << UNIT_SHIFT) - 1), longest);
+        for source in [Source::Datagrams(Socket::Shared), Source::Datagrams(Socket::Own), Source::Listener] {
+            assert_eq!(Source::of(token(65_534, source.code())), source);
+        }
+    }
+
+    #[test]
+    fn a_unit_is_polled_when_its_time_comes_and_not_after_it_left() {
+        let threads = Threads::new().unwrap();
+        let crew = threads.crew();
+        crew.start().unwrap();
+        let (first, second) = (Arc::new(Counting::default()), Arc::new(Counting::default()));
+        let seats = [&first, &second].map(|unit| crew.seat(unit.clone()).unwrap());
+        assert_eq!(seats, [0, 1]);
+        crew.wake_at(1, crew.clock.now());
+        until(|| second.polls.load(Ordering::SeqCst) == 1);
+        crew.leave(1);
+        crew.wake_at(1, Instant::START);
+        crew.wake_at(0, Instant::START);
+        until(|| first.polls.load(Ordering::SeqCst) == 1);
+        assert_eq!(second.polls.load(Ordering::SeqCst), 1);
+        assert_eq!(Arc::strong_count(&second), 1, "who left is held by nobody");
+        assert_eq!(crew.seat(second).unwrap(), 1, "its number is free again");
+    }
+
+    #[test]
+    fn leaving_waits_for_the_threads_that_are_inside() {
+        let threads = Threads::new().unwrap();
+        let crew = threads.crew();
+        crew.start().unwrap();
+        let unit = Arc::new(Counting::default());
+        let seat = crew.seat(unit.clone()).unwrap();
+        let inside = lock(&unit.closed);
+        crew.wake_at(seat, Instant::START);
+        until(|| unit.polls.load(Ordering::SeqCst) == 1);
+        let left = AtomicBool::new(false);
+        std::thread::scope(|scope| {
+            scope.spawn(|| {
+                crew.leave(seat);
+                left.store(true, Ordering::SeqCst);
+            });
+            until(|| read(&crew.seats).iter().all(Option::is_none));
+            std::thread::sleep(std::time::Duration::from_millis(20));
+            assert!(!left.load(Ordering::SeqCst));
+            drop(inside);
+        });
+        assert!(left.load(Ordering::SeqCst));
+    }
+}
