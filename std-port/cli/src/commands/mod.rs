@@ -1,0 +1,13 @@
+//! The verbs, one file each.
+
+pub(crate) mod bench;
+pub(crate) mod call;
+pub(crate) mod completions;
+pub(crate) mod counters;
+pub(crate) mod functions;
+pub(crate) mod man;
+pub(crate) mod ping;
+pub(crate) mod publish;
+pub(crate) mod scan;
+pub(crate) mod set;
+pub(crate) mod watch;

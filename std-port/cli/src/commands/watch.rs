@@ -1,0 +1,13 @@
+//! `cara watch`.
+
+use std::process::ExitCode;
+
+use crate::global::Global;
+
+/// Shows events as they come.
+#[derive(clap::Args)]
+pub(crate) struct Arguments {}
+
+pub(crate) fn run(_: Arguments, _: &Global) -> anyhow::Result<ExitCode> {
+    Err(crate::exit::Ended::usage("being built"))
+}

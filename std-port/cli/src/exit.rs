@@ -1,0 +1,104 @@
+//! How a command ends: its exit code, and an error as text or JSON.
+
+use std::fmt;
+use std::io::Write;
+use std::process::ExitCode;
+
+use serde_json::json;
+
+use crate::global::Global;
+
+/// What `cara --help` says about exit codes.
+pub(crate) const EXIT_CODES: &str = "\
+Exit codes:
+  0  done
+  1  a node or the network failed it
+  2  wrong usage, a mistake in a call's arguments included
+  3  no unit to talk to: no m_unit runs on this host, and --as is not given
+  4  the doctor found something";
+
+/// The exit codes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Exit {
+    /// What was asked for is done.
+    Done = 0,
+    /// A node or the network failed it.
+    Failed = 1,
+    /// The command line, or a call's arguments, must change.
+    Usage = 2,
+    /// No unit to talk to.
+    NoUnit = 3,
+    /// The doctor found something.
+    Findings = 4,
+}
+
+impl From<Exit> for ExitCode {
+    fn from(exit: Exit) -> Self {
+        Self::from(exit as u8)
+    }
+}
+
+/// An error that knows its exit code. All other errors end with [`Exit::Failed`].
+#[derive(Debug)]
+pub(crate) struct Ended {
+    pub(crate) exit: Exit,
+    /// What happened and what to do.
+    pub(crate) text: String,
+    /// The error's name for programs, as `TimedOut` or `NoUnit`.
+    pub(crate) name: String,
+}
+
+impl Ended {
+    /// The command line must change.
+    pub(crate) fn usage(text: impl Into<String>) -> anyhow::Error {
+        Self { exit: Exit::Usage, text: text.into(), name: "Usage".into() }.into()
+    }
+
+    /// A node or the network failed it.
+    pub(crate) fn failed(name: impl Into<String>, text: impl Into<String>) -> anyhow::Error {
+        Self { exit: Exit::Failed, text: text.into(), name: name.into() }.into()
+    }
+
+    /// No unit to talk to.
+    pub(crate) fn no_unit(text: impl Into<String>) -> anyhow::Error {
+        Self { exit: Exit::NoUnit, text: text.into(), name: "NoUnit".into() }.into()
+    }
+}
+
+impl fmt::Display for Ended {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.text)
+    }
+}
+
+impl std::error::Error for Ended {}
+
+/// Prints an error, if there is one, and tells the exit code. A reader that has closed its pipe is no error.
+pub(crate) fn code_of(outcome: anyhow::Result<ExitCode>, global: &Global) -> ExitCode {
+    let error = match outcome {
+        Ok(code) => return code,
+        Err(error) => error,
+    };
+    if is_closed_pipe(&error) {
+        return Exit::Done.into();
+    }
+    let (exit, name) = match error.downcast_ref::<Ended>() {
+        Some(ended) => (ended.exit, ended.name.as_str()),
+        None => (Exit::Failed, "Failed"),
+    };
+    // Where not even standard error can be written to, the exit code has to do.
+    let _ = match global.json {
+        true => {
+            let told = json!({ "error": { "name": name, "exit": exit as u8, "text": format!("{error:#}") } });
+            writeln!(std::io::stderr(), "{told}")
+        }
+        false => writeln!(anstream::stderr(), "{}error:{:#} {error:#}", crate::output::BAD, crate::output::BAD),
+    };
+    exit.into()
+}
+
+fn is_closed_pipe(error: &anyhow::Error) -> bool {
+    error.chain().any(|cause| {
+        cause.downcast_ref::<std::io::Error>().is_some_and(|io| io.kind() == std::io::ErrorKind::BrokenPipe)
+    })
+}

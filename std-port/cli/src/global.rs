@@ -1,0 +1,53 @@
+//! Options that every verb has: which unit is asked, as whom, and in which form it is told.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use cara_std::Interfaces;
+use clap::Args;
+
+use crate::name_and_id::NameAndId;
+
+/// How long a command as a manager waits for nodes, unless told.
+const WAIT: Duration = Duration::from_secs(5);
+
+/// Options of every verb.
+#[derive(Args, Clone, Debug)]
+pub(crate) struct Global {
+    /// Print JSON: one object, or one a line where several come; an error as an object on standard error.
+    #[arg(long, global = true)]
+    pub(crate) json: bool,
+    /// Ask this one of the units that run on this host.
+    #[arg(long, global = true, value_name = "NAME/ID", conflicts_with_all = ["socket", "act_as"])]
+    pub(crate) unit: Option<NameAndId>,
+    /// Ask the unit with this control socket.
+    #[arg(long, global = true, value_name = "PATH", conflicts_with = "act_as")]
+    pub(crate) socket: Option<PathBuf>,
+    /// Be this m_unit for the time of the command. Refused while a unit of that identity runs on this host.
+    #[arg(id = "act_as", long = "as", global = true, value_name = "NAME/ID")]
+    pub(crate) act_as: Option<NameAndId>,
+    /// With --as: how long to wait for the nodes that the command is about [default: 5s].
+    #[arg(long, global = true, value_name = "TIME", value_parser = crate::units::parse_time, requires = "act_as")]
+    wait: Option<Duration>,
+    /// The fleet to be in; 0 unless told.
+    #[arg(long, global = true, value_name = "NUMBER")]
+    pub(crate) fleet: Option<u32>,
+    /// The UDP port of broadcasts; 21970 unless told.
+    #[arg(long, global = true, value_name = "PORT")]
+    pub(crate) discovery_port: Option<u16>,
+    /// Use loopback only.
+    #[arg(long, global = true)]
+    pub(crate) loopback: bool,
+}
+
+impl Global {
+    /// Where to look for nodes: what the options say, or else the environment.
+    pub(crate) fn interfaces(&self) -> Interfaces {
+        if self.loopback { Interfaces::Loopback } else { Interfaces::from_environment() }
+    }
+
+    /// How long a command as a manager waits for nodes.
+    pub(crate) fn wait(&self) -> Duration {
+        self.wait.unwrap_or(WAIT)
+    }
+}

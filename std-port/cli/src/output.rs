@@ -1,0 +1,65 @@
+//! Standard output: tables and lines for people, objects for programs. A closed pipe is an error, never a panic.
+
+use std::io::{self, Write};
+
+use anstyle::{AnsiColor, Style};
+use comfy_table::{ContentArrangement, Table, presets};
+use serde::Serialize;
+
+/// Headings.
+pub(crate) const HEADING: Style = Style::new().bold();
+/// What is in order.
+pub(crate) const GOOD: Style = AnsiColor::Green.on_default();
+/// What needs somebody to act.
+pub(crate) const BAD: Style = AnsiColor::Red.on_default().bold();
+/// What is of less interest.
+pub(crate) const FAINT: Style = Style::new().dimmed();
+/// What is neither good nor bad.
+pub(crate) const PLAIN: Style = Style::new();
+
+/// Prints a line for people. Colours reach terminals only, and not with `NO_COLOR`.
+pub(crate) fn line(text: impl std::fmt::Display) -> io::Result<()> {
+    let mut out = anstream::stdout().lock();
+    writeln!(out, "{text}")?;
+    out.flush()
+}
+
+/// Prints an object for programs, in one line.
+pub(crate) fn object(value: &impl Serialize) -> io::Result<()> {
+    let mut text = serde_json::to_string(value)?;
+    text.push('\n');
+    let mut out = io::stdout().lock();
+    out.write_all(text.as_bytes())?;
+    out.flush()
+}
+
+/// Rows in columns, each with a style of its own.
+pub(crate) struct Rows {
+    table: Table,
+    styles: Vec<Style>,
+}
+
+impl Rows {
+    pub(crate) fn new<const COLUMNS: usize>(headings: [&str; COLUMNS]) -> Self {
+        let mut table = Table::new();
+        table.load_style(presets::NOTHING).set_content_arrangement(ContentArrangement::Disabled);
+        table.set_header(headings);
+        Self { table, styles: vec![HEADING] }
+    }
+
+    pub(crate) fn add<const COLUMNS: usize>(&mut self, style: Style, cells: [String; COLUMNS]) {
+        // A line break in a cell would part the row from its style.
+        self.table.add_row(cells.map(|cell| cell.replace(['\n', '\r'], " ")));
+        self.styles.push(style);
+    }
+
+    /// Prints headings and rows; nothing if there are no rows.
+    pub(crate) fn print(&self) -> io::Result<()> {
+        if self.styles.len() < 2 {
+            return Ok(());
+        }
+        let text = self.table.to_string();
+        let styles = self.styles.iter();
+        text.lines().zip(styles).try_for_each(|(row, style)| line(format_args!("{style}{}{style:#}", row.trim_end())))
+    }
+}
