@@ -101,30 +101,54 @@ pub enum DatagramError {
     Malformed,
 }
 
-impl<'b> Datagram<'b> {
-    /// Reads a datagram of `fleet`.
-    pub fn decode(bytes: &'b [u8], fleet: Fleet) -> Result<Self, DatagramError> {
+/// The fixed part of a datagram of this mode, whatever its version and fleet: for who looks at a network without being
+/// one of its units. Units read with [`Datagram::decode`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Header {
+    /// The sender's version.
+    pub version: u8,
+    /// The sender's fleet.
+    pub fleet: Fleet,
+    kind: u8,
+    zero: [u8; 2],
+}
+
+impl Header {
+    /// The header and the bytes behind it; [`DatagramError::Magic`] or [`DatagramError::Malformed`] where there is none.
+    pub fn decode(bytes: &[u8]) -> Result<(Self, &[u8]), DatagramError> {
         let (header, body) = bytes.split_first_chunk::<HEADER_BYTES>().ok_or(DatagramError::Malformed)?;
         let [m0, m1, m2, m3, version, kind, z0, z1, f0, f1, f2, f3] = *header;
         if [m0, m1, m2, m3] != PLAIN_MAGIC {
             return Err(DatagramError::Magic);
         }
-        if version != VERSION {
-            return Err(DatagramError::Version(version));
-        }
-        let theirs = Fleet(u32::from_le_bytes([f0, f1, f2, f3]));
-        if theirs != fleet {
-            return Err(DatagramError::Fleet(theirs));
-        }
-        if [z0, z1] != [0, 0] {
+        Ok((Self { version, fleet: Fleet(u32::from_le_bytes([f0, f1, f2, f3])), kind, zero: [z0, z1] }, body))
+    }
+
+    /// The body as this version reads it, which says little about one of another version.
+    pub fn read<'b>(&self, body: &'b [u8]) -> Result<Datagram<'b>, DatagramError> {
+        if self.zero != [0, 0] {
             return Err(DatagramError::Malformed);
         }
-        match kind {
-            WHO_HAS => whole(body, |who_has: &WhoHas| &who_has.identity).map(Self::WhoHas),
-            ANNOUNCE => whole(body, |announce: &Announce| &announce.identity).map(Self::Announce),
+        match self.kind {
+            WHO_HAS => whole(body, |who_has: &WhoHas| &who_has.identity).map(Datagram::WhoHas),
+            ANNOUNCE => whole(body, |announce: &Announce| &announce.identity).map(Datagram::Announce),
             SESSION => session(body).ok_or(DatagramError::Malformed),
             _ => Err(DatagramError::Malformed),
         }
+    }
+}
+
+impl<'b> Datagram<'b> {
+    /// Reads a datagram of `fleet`.
+    pub fn decode(bytes: &'b [u8], fleet: Fleet) -> Result<Self, DatagramError> {
+        let (header, body) = Header::decode(bytes)?;
+        if header.version != VERSION {
+            return Err(DatagramError::Version(header.version));
+        }
+        if header.fleet != fleet {
+            return Err(DatagramError::Fleet(header.fleet));
+        }
+        header.read(body)
     }
 }
 
@@ -227,6 +251,20 @@ mod tests {
         assert_eq!(Datagram::decode(&out[..length], FLEET), Err(DatagramError::Version(9)));
         out[0] = b'X';
         assert_eq!(Datagram::decode(&out[..length], FLEET), Err(DatagramError::Magic));
+    }
+
+    #[test]
+    fn a_header_is_read_whatever_its_version_and_fleet() {
+        let mut out = [0; SEARCH_BYTES];
+        let length = who_has(0).encode(FLEET, &mut out).unwrap().len();
+        out[4] = 9;
+        let (header, body) = Header::decode(&out[..length]).unwrap();
+        assert_eq!((header.version, header.fleet), (9, FLEET));
+        assert_eq!(header.read(body), Ok(Datagram::WhoHas(who_has(0))));
+        assert_eq!(header.read(&body[..body.len() - 1]), Err(DatagramError::Malformed));
+        out[0] = b'X';
+        assert_eq!(Header::decode(&out[..length]), Err(DatagramError::Magic));
+        assert_eq!(Header::decode(&out[..HEADER_BYTES - 1]), Err(DatagramError::Malformed));
     }
 
     #[test]

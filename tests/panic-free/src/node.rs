@@ -86,6 +86,8 @@ entry!(managers, {
 
 entry!(datagrams, {
     keep(Datagram::decode(unknown_slice(), *unknown()));
+    keep(datagram::Header::decode(unknown_slice()));
+    keep(unknown::<datagram::Header>().read(unknown_slice()));
     keep(unknown::<WhoHas>().encode(*unknown(), unknown_slice()));
     keep(unknown::<Announce>().encode(*unknown(), unknown_slice()));
     keep(datagram::short_hash(identity()));
