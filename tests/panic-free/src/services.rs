@@ -74,6 +74,7 @@ entry!(session_connected, {
     session().connected(context());
     session().accept(context());
     session().challenge(context());
+    keep((session().ping(context()), session().round_trip()));
     session().writable(context());
 });
 

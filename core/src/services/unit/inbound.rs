@@ -61,7 +61,7 @@ impl<'b> ReplyBlock<'b> {
 }
 
 /// What a frame led to, before anything is borrowed for the port.
-enum Outcome {
+pub(super) enum Outcome {
     Nothing,
     Event(Event<'static>),
     Reply { id: CallId, slot: Slot, generation: Generation, block: Place },
@@ -161,7 +161,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
                 self.flush(cx);
                 Outcome::Nothing
             }
-            (Incoming::Pong, Phase::Live) => self.answered(),
+            (Incoming::Pong, Phase::Live) => self.pong_arrived(cx.now),
             (Incoming::Session(place), Phase::Live) => self.session_body(cx, place, lent),
             (Incoming::Message(priority, place), Phase::Live) => {
                 self.message_arrived(cx, priority, place, lent, arguments)

@@ -17,6 +17,7 @@
 mod answering;
 mod inbound;
 mod outbound;
+mod pinging;
 mod publishing;
 mod timing;
 
@@ -116,7 +117,7 @@ pub enum Event<'b> {
         /// It was not renewed in time.
         expired: bool,
     },
-    /// The peer answered a [`Session::challenge`].
+    /// The peer answered a [`Session::challenge`] or a [`Session::ping`].
     Answered,
     /// The link has ended; every call in flight and every lease has been reported before.
     Closed(CloseReason),
@@ -171,6 +172,7 @@ pub struct Session<S: Storage, C: Secure> {
     liveness: Liveness,
     /// The node waits for a sign of life.
     challenged: bool,
+    pings: pinging::Pings,
     clock: PeerClock,
     timers: Timers,
     requests: Requests<S>,
@@ -197,6 +199,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
             peer_address: address,
             liveness: Liveness::new(now, constraints.keep_alive),
             challenged: false,
+            pings: pinging::Pings::new(),
             clock: PeerClock::default(),
             timers: Timers::new(now),
             requests: Requests::new(storage.pending),
@@ -352,7 +355,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     pub fn challenge<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
         if self.phase == Phase::Live {
             self.challenged = true;
-            self.link.send_frame(&Frame::Ping);
+            self.send_ping(cx.now);
             self.flush(cx);
             for _ in 0..CHALLENGE_DATAGRAMS {
                 self.send_datagram(cx, &SessionBody::PING, &[]);

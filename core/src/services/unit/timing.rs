@@ -187,7 +187,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         if !self.liveness.datagrams_pass() {
             self.link.send_frame(&Frame::Session(&body));
             // A peer whose datagrams do not pass may hear ours, and then it sends nothing in the stream unless asked.
-            self.link.send_frame(&Frame::Ping);
+            self.send_ping(cx.now);
             self.flush(cx);
         }
     }
