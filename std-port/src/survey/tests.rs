@@ -1,0 +1,128 @@
+use std::net::Ipv4Addr;
+
+use super::*;
+
+/// Longest wait for a datagram on loopback.
+const PATIENCE: Duration = Duration::from_secs(10);
+
+fn survey() -> Survey {
+    Survey::open(Interfaces::Loopback, 0).unwrap()
+}
+
+/// A sender on loopback, and where the survey listens.
+fn sender(survey: &Survey) -> (UdpSocket, SocketAddr) {
+    let port = survey.ear.discovery_port();
+    (UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap(), (Ipv4Addr::LOCALHOST, port).into())
+}
+
+fn listen_until(survey: &mut Survey, enough: impl FnMut(&Survey) -> bool) {
+    survey.listen_until(Instant::now().checked_add(PATIENCE), enough);
+}
+
+fn search(name: &str, epoch: u64) -> WhoHas {
+    WhoHas {
+        identity: Identity::s_unit(name, 7).unwrap(),
+        epoch: Epoch(epoch),
+        sequence: 1,
+        nonce: 5,
+        wanted: Some(Manager::new("boss", 1).unwrap()),
+        tcp_port: 0,
+        expected: 1,
+        known: Default::default(),
+    }
+}
+
+fn bytes(fleet: u32, search: &WhoHas) -> Vec<u8> {
+    let mut out = [0; SEARCH_BYTES];
+    search.encode(Fleet(fleet), &mut out).unwrap().to_vec()
+}
+
+#[test]
+fn whatever_is_heard_is_told_with_fleet_version_and_wanted_manager() {
+    let mut survey = survey();
+    let (sender, to) = sender(&survey);
+    let mut other_version = bytes(8, &search("agv", 3));
+    other_version[4] = 9;
+    for datagram in
+        [bytes(7, &search("agv", 3)), other_version, bytes(7, &search("agv", 4)), bytes(7, &search("agv", 3))]
+    {
+        sender.send_to(&datagram, to).unwrap();
+    }
+    listen_until(&mut survey, |survey| survey.heard().iter().map(|heard| heard.searches).sum::<u32>() == 4);
+    let told: Vec<_> = survey
+        .heard()
+        .iter()
+        .map(|heard| (heard.version, heard.fleet.0, heard.epoch.unwrap().0, heard.searches))
+        .collect();
+    assert_eq!(told, [(VERSION, 7, 3, 2), (9, 8, 3, 1), (VERSION, 7, 4, 1)]);
+    let first = &survey.heard()[0];
+    assert_eq!(first.wanted, Some(Manager::new("boss", 1).unwrap()));
+    assert_eq!((first.source, first.by_broadcast), (sender.local_addr().unwrap(), true));
+    assert!(survey.foreign().is_empty() && survey.fleets().len() == 2);
+}
+
+#[test]
+fn what_is_not_ours_is_told_apart_from_what_cannot_be_read() {
+    let mut survey = survey();
+    let (sender, to) = sender(&survey);
+    sender.send_to(b"GET / HTTP/1.1", to).unwrap();
+    sender.send_to(b"x", to).unwrap();
+    let mut cut = bytes(7, &search("agv", 3));
+    cut.truncate(14);
+    sender.send_to(&cut, to).unwrap();
+    listen_until(&mut survey, |survey| !survey.heard().is_empty());
+    assert_eq!(survey.foreign(), [Foreign { source: sender.local_addr().unwrap(), datagrams: 2 }]);
+    assert_eq!((survey.heard()[0].identity.as_ref(), survey.heard()[0].others), (None, 1));
+}
+
+#[test]
+fn tables_are_bounded_and_what_is_dropped_is_counted() {
+    let mut survey = survey();
+    let source = SocketAddr::from((Ipv4Addr::new(127, 1, 2, 3), 9));
+    for epoch in 0..HEARD as u64 + 10 {
+        survey.note(source, &bytes(7, &search("agv", epoch)), true);
+    }
+    for port in 0..FOREIGN as u16 + 5 {
+        survey.note((Ipv4Addr::LOCALHOST, port).into(), b"junk", true);
+    }
+    assert_eq!((survey.heard().len(), survey.foreign().len()), (HEARD, FOREIGN));
+    // The survey's own port may be among the made-up ones only above 1023.
+    assert_eq!(survey.dropped(), 15);
+    survey.note(source, &bytes(7, &search("agv", 3)), true);
+    assert_eq!((survey.heard()[3].searches, survey.dropped()), (2, 15));
+}
+
+#[test]
+fn a_manager_answers_and_own_broadcasts_come_back() {
+    let mut survey = survey();
+    let port = survey.ear.discovery_port();
+    let fleet = random() as u32;
+    let manager = crate::CommunicationSystem::builder("boss", 1).unwrap().fleet(fleet).discovery_port(port);
+    let manager = manager.interfaces(Interfaces::Loopback).build_system().unwrap();
+    manager.start().unwrap();
+    assert!(survey.ask(Fleet(fleet)));
+    listen_until(&mut survey, |survey| survey.heard().iter().any(|heard| heard.answers > 0));
+    let boss = survey.heard().iter().find(|heard| heard.answers > 0).unwrap();
+    assert_eq!(boss.identity.as_ref(), Some(&manager.identity()));
+    assert_eq!(boss.listens_at().map(|at| at.port()), Some(manager.tcp_port()));
+    assert_eq!(boss.room, Some(64));
+    assert!(survey.reach().iter().any(|reach| reach.sent == 1 && reach.heard == 1), "{:?}", survey.reach());
+    assert!(survey.heard().iter().all(|heard| heard.identity.as_ref() == Some(&manager.identity())));
+}
+
+#[test]
+fn one_that_only_listens_sends_nothing() {
+    let (mut asked, mut silent) = {
+        let silent = survey();
+        let asked = Survey::open(Interfaces::Loopback, silent.ear.discovery_port()).unwrap();
+        (asked, silent)
+    };
+    silent.listen(Duration::from_millis(50));
+    silent.ask(Fleet(1));
+    listen_until(&mut asked, |asked| !asked.heard().is_empty());
+    // The first thing that the other one heard is the question, and it is its only one.
+    assert!(asked.heard().len() == 1 && asked.heard()[0].is_survey() && asked.heard()[0].searches == 1);
+    asked.ask_at(Fleet(1), silent.voice.local_addr().unwrap()).unwrap();
+    listen_until(&mut silent, |silent| !silent.heard().is_empty());
+    assert!(!silent.heard()[0].by_broadcast);
+}
