@@ -1,0 +1,71 @@
+//! One image for thirty vehicles: what differs from board to board is not compiled in, but stands in two pages of its
+//! flash, or comes as text where there is no flash to write.
+//!
+//! [`Settings`] is what a board is told. [`page`] is how it stands in flash: two copies, each with a generation and a
+//! checksum, so that a cut of power while one is written leaves the other. [`text`](Settings::from_str) is how a person,
+//! a command line or an emulator's arguments say it.
+//!
+//! It knows no flash controller and reads nothing by itself: a board lends the bytes of its pages.
+
+#![no_std]
+
+#[cfg(test)]
+extern crate std;
+
+pub mod page;
+mod text;
+
+use core::net::{Ipv4Addr, SocketAddrV4};
+
+use cara_core::distribution::hello::Manager;
+use cara_core::distribution::identity::{Fleet, Identity, Role};
+use serde::{Deserialize, Serialize};
+
+pub use text::{Field, TextError};
+
+/// What one board is told.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Settings {
+    /// Who it is.
+    pub identity: Identity,
+    /// The m_unit that it belongs to; none on a board that is an m_unit itself.
+    pub manager: Option<Manager>,
+    /// Where the manager is, for networks on which broadcasts do not pass.
+    pub manager_address: Option<SocketAddrV4>,
+    /// The fleet.
+    pub fleet: Fleet,
+    /// Its address.
+    pub network: Network,
+}
+
+/// How a board gets its address.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Network {
+    /// From a server on the network.
+    Dhcp,
+    /// Always the same one.
+    Static {
+        /// The address.
+        address: Ipv4Addr,
+        /// Bits of it that are the network's, at most 32.
+        prefix: u8,
+        /// Where other networks are reached.
+        gateway: Option<Ipv4Addr>,
+    },
+}
+
+impl Settings {
+    /// Whether a unit can be made of them: an s_unit has a manager, an m_unit has none; a name has 1 to 32 bytes.
+    pub fn is_sound(&self) -> bool {
+        let network = match self.network {
+            Network::Dhcp => true,
+            Network::Static { prefix, .. } => prefix <= 32,
+        };
+        let role = matches!(
+            (self.identity.role(), &self.manager),
+            (Role::SUnit, Some(manager)) if Manager::new(&manager.name, manager.id).is_ok()
+        ) || (self.identity.role() == Role::MUnit && self.manager.is_none());
+        let name = Identity::new(self.identity.name(), self.identity.id(), self.identity.role()).is_ok();
+        network && role && name
+    }
+}
