@@ -1,5 +1,6 @@
 //! The `cara` command: what is on the network, why something is not, and calls from the command line.
 
+mod close_names;
 mod commands;
 mod doctor;
 mod exit;
@@ -7,6 +8,7 @@ mod global;
 mod name_and_id;
 mod node;
 mod output;
+mod text;
 mod units;
 
 use std::process::ExitCode;

@@ -1,0 +1,177 @@
+//! A configuration file as it is written: every table and key that there is, each value with its place. What the values
+//! mean together is checked by [`settings`](super::settings).
+
+use serde::Deserialize;
+use toml::Spanned;
+
+use super::mistake::{Mistake, Source};
+use super::values::{Size, Time};
+
+/// A value that may be absent, with its place.
+pub(super) type Maybe<T> = Option<Spanned<T>>;
+
+/// The whole file.
+#[derive(Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct File {
+    pub(super) name: Maybe<String>,
+    pub(super) id: Maybe<u32>,
+    pub(super) role: Maybe<Role>,
+    pub(super) fleet: Option<u32>,
+    pub(super) interfaces: Option<Interfaces>,
+    pub(super) discovery_port: Maybe<u16>,
+    pub(super) tcp_port: Maybe<u16>,
+    pub(super) manager: Maybe<Manager>,
+    #[serde(default)]
+    pub(super) constraints: Constraints,
+    #[serde(default)]
+    pub(super) capacities: Capacities,
+    #[serde(default)]
+    pub(super) control: Control,
+    #[serde(default)]
+    pub(super) metrics: Metrics,
+    #[serde(default)]
+    pub(super) log: Log,
+    #[serde(default)]
+    pub(super) functions: Vec<Spanned<Function>>,
+}
+
+/// What the node is.
+#[derive(Clone, Copy, Debug, Default, Deserialize, PartialEq, Eq)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum Role {
+    #[default]
+    MUnit,
+    SUnit,
+}
+
+/// Where it looks for others.
+#[derive(Clone, Copy, Debug, Deserialize, PartialEq, Eq)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum Interfaces {
+    All,
+    Lo,
+}
+
+/// `[manager]`
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Manager {
+    pub(super) name: Maybe<String>,
+    pub(super) id: Maybe<u32>,
+    pub(super) address: Maybe<String>,
+}
+
+/// `[constraints]`
+#[derive(Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Constraints {
+    pub(super) request_timeout: Maybe<Time>,
+    pub(super) minimum_interval: Maybe<Time>,
+    pub(super) maximum_nodes: Maybe<Size>,
+    pub(super) message_size: Maybe<Size>,
+    pub(super) chunk_size: Maybe<Size>,
+    pub(super) keep_alive: Maybe<Time>,
+    pub(super) calls_per_peer: Maybe<Size>,
+}
+
+/// `[capacities]`
+#[derive(Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Capacities {
+    pub(super) functions: Maybe<Size>,
+    pub(super) signature_bytes: Maybe<Size>,
+    pub(super) published_to_one: Maybe<Size>,
+    pub(super) their_functions: Maybe<Size>,
+    pub(super) their_signature_bytes: Maybe<Size>,
+    pub(super) calls_in_flight: Maybe<Size>,
+    pub(super) calls_running: Maybe<Size>,
+    pub(super) pending_links: Maybe<Size>,
+    pub(super) message_buffers: Maybe<Size>,
+}
+
+/// `[control]`
+#[derive(Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Control {
+    pub(super) off: Maybe<bool>,
+    pub(super) path: Maybe<String>,
+}
+
+/// `[metrics]`
+#[derive(Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Metrics {
+    pub(super) listen: Maybe<String>,
+}
+
+/// `[log]`
+#[derive(Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Log {
+    pub(super) level: Maybe<String>,
+}
+
+/// `[[functions]]`
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Function {
+    pub(super) signature: Maybe<String>,
+    pub(super) run: Maybe<Vec<String>>,
+    pub(super) answer: Maybe<Answer>,
+    pub(super) timeout: Maybe<Time>,
+    pub(super) priority: Option<Priority>,
+    #[serde(default)]
+    pub(super) idempotent: bool,
+    pub(super) lease: Maybe<Time>,
+    pub(super) at_lease_end: Maybe<Vec<String>>,
+}
+
+/// What a function does without a program.
+#[derive(Clone, Copy, Debug, Deserialize, PartialEq, Eq)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum Answer {
+    Echo,
+    Log,
+}
+
+/// A function's class.
+#[derive(Clone, Copy, Debug, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum Priority {
+    Emergency,
+    High,
+    Normal,
+    Low,
+}
+
+impl From<Priority> for cara_std::Priority {
+    fn from(priority: Priority) -> Self {
+        match priority {
+            Priority::Emergency => Self::Emergency,
+            Priority::High => Self::High,
+            Priority::Normal => Self::Normal,
+            Priority::Low => Self::Low,
+        }
+    }
+}
+
+/// Reads a file's text; the first mistake in its form ends that.
+pub(super) fn read(source: &Source) -> Result<File, Mistake> {
+    toml::from_str(&source.text).map_err(|error| {
+        let help = nearest_of(error.message()).unwrap_or_else(|| "`cara node --example` shows every key".into());
+        Mistake::new(error.span().unwrap_or(0..0), error.message().trim_end(), help)
+    })
+}
+
+/// The word that was meant, where a word is none of those expected.
+fn nearest_of(message: &str) -> Option<String> {
+    if !message.starts_with("unknown ") {
+        return None;
+    }
+    let mut words = message.split('`').skip(1).step_by(2);
+    let wrong = words.next()?;
+    let likeness = |word: &str| strsim::jaro_winkler(wrong, word);
+    let nearest = words.max_by(|a, b| likeness(a).total_cmp(&likeness(b)))?;
+    (likeness(nearest) > 0.8).then(|| format!("did you mean `{nearest}`?"))
+}

@@ -1,0 +1,149 @@
+//! `[constraints]` and `[capacities]`: which values a unit can hold.
+
+use std::ops::{Range, RangeInclusive};
+
+use cara_std::{Capacities, Constraints, Duration};
+
+use super::file::{self, Maybe, Role};
+use super::mistake::Mistake;
+use super::values::{Size, Time};
+
+/// Longest message that a Linux unit takes.
+const LONGEST_MESSAGE: u64 = 256 * 1024;
+/// Chunks: an emergency fits into the shortest, and none is longer than what the protocol allows.
+const CHUNKS: RangeInclusive<u64> = 320..=4096;
+/// Entries of a table, so that no mistake asks for more memory than there is.
+const ENTRIES: RangeInclusive<u64> = 1..=65_535;
+/// Bytes of a table of signatures, likewise.
+const SIGNATURE_BYTES: RangeInclusive<u64> = 512..=16 * 1024 * 1024;
+
+/// The constraints of a role with what the file says.
+pub(super) fn constraints(table: &file::Constraints, role: Role, mistakes: &mut Vec<Mistake>) -> Constraints {
+    let mut limits = defaults(role);
+    let micros = |micros| Duration::from_micros(micros);
+    set_time(&mut limits.request_timeout, &table.request_timeout, micros(1), mistakes);
+    set_time(&mut limits.minimum_interval, &table.minimum_interval, Duration::ZERO, mistakes);
+    set_time(&mut limits.keep_alive, &table.keep_alive, Duration::from_millis(1), mistakes);
+    set(&mut limits.maximum_nodes, &table.maximum_nodes, 1..=65_535, mistakes);
+    set(&mut limits.message_size, &table.message_size, 0..=LONGEST_MESSAGE, mistakes);
+    set(&mut limits.chunk_size, &table.chunk_size, CHUNKS, mistakes);
+    set(&mut limits.calls_per_peer, &table.calls_per_peer, 1..=65_535, mistakes);
+    limits
+}
+
+/// The constraints of a unit on Linux that says nothing about them.
+pub(super) fn defaults(role: Role) -> Constraints {
+    let Constraints { message_size, chunk_size, .. } = Constraints::M_UNIT;
+    match role {
+        Role::MUnit => Constraints::M_UNIT,
+        Role::SUnit => Constraints { message_size, chunk_size, ..Constraints::S_UNIT },
+    }
+}
+
+/// The sizes of the unit's tables with what the file says.
+pub(super) fn capacities(table: &file::Capacities, mistakes: &mut Vec<Mistake>) -> Capacities {
+    let mut sizes = Capacities::default();
+    let entries = [
+        (&mut sizes.functions, &table.functions),
+        (&mut sizes.published_to_one, &table.published_to_one),
+        (&mut sizes.their_functions, &table.their_functions),
+        (&mut sizes.calls_in_flight, &table.calls_in_flight),
+        (&mut sizes.calls_running, &table.calls_running),
+        (&mut sizes.pending_links, &table.pending_links),
+        (&mut sizes.message_buffers, &table.message_buffers),
+    ];
+    entries.into_iter().for_each(|(place, value)| set(place, value, ENTRIES, mistakes));
+    set(&mut sizes.signature_bytes, &table.signature_bytes, SIGNATURE_BYTES, mistakes);
+    set(&mut sizes.their_signature_bytes, &table.their_signature_bytes, SIGNATURE_BYTES, mistakes);
+    sizes
+}
+
+fn set<T: TryFrom<u64>>(
+    place: &mut T,
+    value: &Maybe<Size>,
+    range: RangeInclusive<u64>,
+    mistakes: &mut Vec<Mistake>,
+) {
+    let Some(value) = value else { return };
+    let number = value.get_ref().0;
+    match T::try_from(number).ok().filter(|_| range.contains(&number)) {
+        Some(fitting) => *place = fitting,
+        None => mistakes.push(outside(value.span(), number, &range)),
+    }
+}
+
+fn outside(span: Range<usize>, number: u64, range: &RangeInclusive<u64>) -> Mistake {
+    let what = format!("{number} is outside what this unit can hold");
+    Mistake::new(span, what, format!("write a number from {} to {}", range.start(), range.end()))
+}
+
+fn set_time(place: &mut Duration, value: &Maybe<Time>, least: Duration, mistakes: &mut Vec<Mistake>) {
+    let Some(value) = value else { return };
+    *place = value.get_ref().0;
+    if *place < least {
+        let help = format!("write a time of at least {} us", least.as_micros());
+        mistakes.push(Mistake::new(value.span(), "this time is too short", help));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use cara_std::{CommunicationSystem, Error, Interfaces, Unit};
+
+    use super::*;
+
+    fn read(text: &str) -> Result<Constraints, Vec<Mistake>> {
+        let mut mistakes = Vec::new();
+        let limits = constraints(&toml::from_str(text).unwrap(), Role::MUnit, &mut mistakes);
+        if mistakes.is_empty() { Ok(limits) } else { Err(mistakes) }
+    }
+
+    /// Whether the file's checks and the library's are the same ones.
+    #[test]
+    fn the_library_takes_what_a_file_may_say_and_nothing_else() {
+        let system = CommunicationSystem::builder("limits", 1).unwrap().interfaces(Interfaces::Loopback);
+        let system = system.fleet(std::process::id()).build_system().unwrap();
+        let base = Constraints::M_UNIT;
+        let cases = [
+            ("maximum_nodes = 1", Some(Constraints { maximum_nodes: 1, ..base })),
+            ("maximum_nodes = 0", None),
+            ("message_size = \"256KiB\"", Some(Constraints { message_size: 256 * 1024, ..base })),
+            ("message_size = 262_145", None),
+            ("chunk_size = 320", Some(Constraints { chunk_size: 320, ..base })),
+            ("chunk_size = 4096", Some(Constraints { chunk_size: 4096, ..base })),
+            ("chunk_size = 319", None),
+            ("chunk_size = \"5KiB\"", None),
+            ("keep_alive = \"1ms\"", Some(Constraints { keep_alive: Duration::from_millis(1), ..base })),
+            ("keep_alive = \"999us\"", None),
+            ("calls_per_peer = 1", Some(Constraints { calls_per_peer: 1, ..base })),
+            ("calls_per_peer = 0", None),
+            ("minimum_interval = 0", Some(base)),
+        ];
+        for (text, expected) in cases {
+            assert_eq!(read(text).ok(), expected, "{text}");
+            if let Some(limits) = expected {
+                assert_eq!(system.set_constraints(limits), Ok(()), "{text}");
+            }
+        }
+        let refused = [
+            Constraints { maximum_nodes: 0, ..base },
+            Constraints { message_size: 262_145, ..base },
+            Constraints { chunk_size: 319, ..base },
+            Constraints { chunk_size: 5120, ..base },
+            Constraints { keep_alive: Duration::from_micros(999), ..base },
+            Constraints { calls_per_peer: 0, ..base },
+        ];
+        for limits in refused {
+            assert_eq!(system.set_constraints(limits), Err(Error::BadConstraint), "{limits:?}");
+        }
+    }
+
+    #[test]
+    fn the_defaults_are_those_of_the_library() {
+        let system = CommunicationSystem::builder("limits", 1).unwrap().interfaces(Interfaces::Loopback);
+        assert_eq!(system.build_system().unwrap().constraints(), defaults(Role::MUnit));
+        let unit = Unit::builder("limits", 1, "manager", 1).unwrap().interfaces(Interfaces::Loopback);
+        assert_eq!(unit.build_unit().unwrap().constraints(), defaults(Role::SUnit));
+        assert_eq!(capacities(&file::Capacities::default(), &mut Vec::new()), Capacities::default());
+    }
+}

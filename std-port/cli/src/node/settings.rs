@@ -1,0 +1,241 @@
+//! What a node runs with: the file's values, checked against each other, and the command line's above them.
+
+use std::net::SocketAddr;
+use std::ops::Range;
+use std::path::PathBuf;
+
+use cara_std::{Capacities, Constraints, Identity, Interfaces};
+
+use super::file::{self, File, Maybe, Role};
+use super::functions::{self, Service};
+use super::limits;
+use super::mistake::{Mistake, Mistakes, Source};
+
+/// A value, and its place if it comes from the file.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Placed<T> {
+    pub(super) value: T,
+    pub(super) span: Option<Range<usize>>,
+}
+
+/// Everything that a node needs to know.
+#[derive(Clone, Debug)]
+pub(super) struct Settings {
+    pub(super) source: Source,
+    pub(super) name: String,
+    pub(super) id: u32,
+    /// An s_unit's manager; none for an m_unit.
+    pub(super) manager: Option<Manager>,
+    pub(super) fleet: u32,
+    pub(super) interfaces: Interfaces,
+    pub(super) discovery_port: Option<Placed<u16>>,
+    pub(super) tcp_port: Option<Placed<u16>>,
+    pub(super) constraints: Constraints,
+    pub(super) capacities: Capacities,
+    pub(super) control: Control,
+    pub(super) metrics: Option<Placed<SocketAddr>>,
+    pub(super) log: Option<String>,
+    pub(super) services: Vec<Service>,
+}
+
+/// Which manager an s_unit joins.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Manager {
+    pub(super) name: String,
+    pub(super) id: u32,
+    pub(super) address: Option<SocketAddr>,
+}
+
+/// Where the control socket is.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum Control {
+    /// Where `cara` looks for it.
+    Usual,
+    /// Elsewhere.
+    At(Placed<PathBuf>),
+    /// Nowhere.
+    Off,
+}
+
+/// What the command line says instead of the file.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Overrides {
+    pub(super) name: Option<String>,
+    pub(super) id: Option<u32>,
+    pub(super) fleet: Option<u32>,
+    pub(super) interfaces: Option<Interfaces>,
+    pub(super) discovery_port: Option<u16>,
+    pub(super) tcp_port: Option<u16>,
+    pub(super) metrics: Option<SocketAddr>,
+    pub(super) metrics_anywhere: bool,
+    pub(super) log: Option<String>,
+}
+
+impl Settings {
+    /// Reads and checks a file; all mistakes of meaning are told at once.
+    pub(super) fn of(source: Source, over: &Overrides) -> Result<Self, Mistakes> {
+        let file = file::read(&source).map_err(|mistake| Mistakes::new(&source, vec![mistake]))?;
+        let mut mistakes = Vec::new();
+        let settings = checked(source, &file, over, &mut mistakes);
+        if mistakes.is_empty() { Ok(settings) } else { Err(Mistakes::new(&settings.source, mistakes)) }
+    }
+
+    /// A mistake that shows only when the node starts, such as a port in use.
+    pub(super) fn mistake(&self, span: Range<usize>, what: &str, help: &str) -> Mistakes {
+        Mistakes::new(&self.source, vec![Mistake::new(span, what, help)])
+    }
+}
+
+fn checked(source: Source, file: &File, over: &Overrides, mistakes: &mut Vec<Mistake>) -> Settings {
+    let role = file.role.as_ref().map_or(Role::MUnit, |role| *role.get_ref());
+    let capacities = limits::capacities(&file.capacities, mistakes);
+    Settings {
+        name: own_name(file, over, mistakes),
+        id: own_id(file, over, mistakes),
+        manager: manager(file, role, mistakes),
+        fleet: over.fleet.or(file.fleet).unwrap_or(0),
+        interfaces: over.interfaces.or_else(|| file.interfaces.map(Interfaces::from)).unwrap_or_else(from_environment),
+        discovery_port: discovery_port(file, over, mistakes),
+        tcp_port: tcp_port(file, role, over, mistakes),
+        constraints: limits::constraints(&file.constraints, role, mistakes),
+        control: control(&file.control, mistakes),
+        metrics: metrics(file, over, mistakes),
+        log: over.log.clone().or_else(|| log(file, mistakes)),
+        services: functions::services(&source, &file.functions, capacities.functions, mistakes),
+        capacities,
+        source,
+    }
+}
+
+fn from_environment() -> Interfaces {
+    Interfaces::from_environment()
+}
+
+impl From<file::Interfaces> for Interfaces {
+    fn from(interfaces: file::Interfaces) -> Self {
+        match interfaces {
+            file::Interfaces::All => Self::All,
+            file::Interfaces::Lo => Self::Loopback,
+        }
+    }
+}
+
+fn own_name(file: &File, over: &Overrides, mistakes: &mut Vec<Mistake>) -> String {
+    file.name.iter().for_each(|name| check_name(name, mistakes));
+    if file.name.is_none() && over.name.is_none() {
+        mistakes.push(Mistake::new(0..0, "the node has no name", "write name = \"AGV_manager\" in the first lines"));
+    }
+    let written = || file.name.as_ref().map(|name| name.get_ref().clone());
+    over.name.clone().or_else(written).unwrap_or_default()
+}
+
+fn own_id(file: &File, over: &Overrides, mistakes: &mut Vec<Mistake>) -> u32 {
+    let id = over.id.or(file.id.as_ref().map(|id| *id.get_ref()));
+    if id.is_none() {
+        mistakes.push(Mistake::new(0..0, "the node has no ID number", "write id = 1 in the first lines"));
+    }
+    id.unwrap_or_default()
+}
+
+fn check_name(name: &toml::Spanned<String>, mistakes: &mut Vec<Mistake>) {
+    if Identity::m_unit(name.get_ref(), 0).is_err() {
+        let help = "a node's name has 1 to 32 bytes and no control characters";
+        mistakes.push(Mistake::new(name.span(), "this cannot be a node's name", help));
+    }
+}
+
+fn manager(file: &File, role: Role, mistakes: &mut Vec<Mistake>) -> Option<Manager> {
+    match (role, &file.manager) {
+        (Role::MUnit, None) => None,
+        (Role::MUnit, Some(table)) => {
+            let help = "write role = \"s_unit\" in the first lines, or take [manager] out";
+            mistakes.push(Mistake::new(table.span(), "an m_unit has no manager", help));
+            None
+        }
+        (Role::SUnit, None) => {
+            let span = file.role.as_ref().map_or(0..0, toml::Spanned::span);
+            let help = "write below a line [manager] its name and id";
+            mistakes.push(Mistake::new(span, "an s_unit needs a manager", help));
+            None
+        }
+        (Role::SUnit, Some(table)) => Some(named_manager(table, mistakes)),
+    }
+}
+
+fn named_manager(table: &toml::Spanned<file::Manager>, mistakes: &mut Vec<Mistake>) -> Manager {
+    let file::Manager { name, id, address } = table.get_ref();
+    name.iter().for_each(|name| check_name(name, mistakes));
+    if name.is_none() || id.is_none() {
+        let help = "write its name = \"AGV_manager\" and its id = 1";
+        mistakes.push(Mistake::new(table.span(), "a manager has a name and an id", help));
+    }
+    Manager {
+        name: name.as_ref().map(|name| name.get_ref().clone()).unwrap_or_default(),
+        id: id.as_ref().map_or(0, |id| *id.get_ref()),
+        address: address_of(address, mistakes),
+    }
+}
+
+fn address_of(text: &Maybe<String>, mistakes: &mut Vec<Mistake>) -> Option<SocketAddr> {
+    let text = text.as_ref()?;
+    let address = text.get_ref().parse().ok();
+    if address.is_none() {
+        let help = "write an IP address and a port, as \"192.168.1.5:21971\" or \"127.0.0.1:9464\"";
+        mistakes.push(Mistake::new(text.span(), "this is no address", help));
+    }
+    address
+}
+
+fn discovery_port(file: &File, over: &Overrides, mistakes: &mut Vec<Mistake>) -> Option<Placed<u16>> {
+    if let Some(port) = file.discovery_port.as_ref().filter(|port| *port.get_ref() == 0) {
+        let help = "write the port that all units use, 21970 for instance";
+        mistakes.push(Mistake::new(port.span(), "units cannot meet on port 0", help));
+    }
+    placed(over.discovery_port, &file.discovery_port)
+}
+
+fn tcp_port(file: &File, role: Role, over: &Overrides, mistakes: &mut Vec<Mistake>) -> Option<Placed<u16>> {
+    if let Some(port) = file.tcp_port.as_ref().filter(|_| role == Role::SUnit) {
+        let help = "take the line out";
+        mistakes.push(Mistake::new(port.span(), "an s_unit takes no connections: it connects to its manager", help));
+    }
+    placed(over.tcp_port, &file.tcp_port)
+}
+
+fn placed<T: Copy>(over: Option<T>, written: &Maybe<T>) -> Option<Placed<T>> {
+    let written = || written.as_ref().map(|value| Placed { value: *value.get_ref(), span: Some(value.span()) });
+    over.map(|value| Placed { value, span: None }).or_else(written)
+}
+
+fn control(table: &file::Control, mistakes: &mut Vec<Mistake>) -> Control {
+    let off = table.off.as_ref().is_some_and(|off| *off.get_ref());
+    let Some(path) = &table.path else { return if off { Control::Off } else { Control::Usual } };
+    if off || path.get_ref().is_empty() || path.get_ref().contains('\0') {
+        let help = "write a path, or off = true, or neither for the usual place";
+        mistakes.push(Mistake::new(path.span(), "there is no control socket at this path", help));
+    }
+    Control::At(Placed { value: path.get_ref().into(), span: Some(path.span()) })
+}
+
+fn metrics(file: &File, over: &Overrides, mistakes: &mut Vec<Mistake>) -> Option<Placed<SocketAddr>> {
+    let listen = &file.metrics.listen;
+    let written = address_of(listen, mistakes);
+    if over.metrics.is_some() {
+        return placed(over.metrics, &None);
+    }
+    let (value, span) = (written?, listen.as_ref().map(toml::Spanned::span));
+    if !value.ip().is_loopback() && !over.metrics_anywhere {
+        let help = "write \"127.0.0.1:9464\", or start with --metrics-anywhere: everybody who reaches it can read it";
+        mistakes.push(Mistake::new(span.clone().unwrap_or(0..0), "metrics are read on this host only", help));
+    }
+    Some(Placed { value, span })
+}
+
+fn log(file: &File, mistakes: &mut Vec<Mistake>) -> Option<String> {
+    let level = file.log.level.as_ref()?;
+    if let Err(error) = super::logging::filter(level.get_ref()) {
+        let help = "write error, warn, info, debug or trace, or with a part: \"info,cara_std=debug\"";
+        mistakes.push(Mistake::new(level.span(), format!("this is no level: {error}"), help));
+    }
+    Some(level.get_ref().clone())
+}

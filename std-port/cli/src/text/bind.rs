@@ -1,0 +1,192 @@
+//! A call as it is written, against the function's signature.
+
+use std::ops::Range;
+
+use cara_std::control::protocol::{Argument, ArgumentValue, Number};
+use cara_std::{Signature, Type, VariableSpec};
+
+use super::read::{Literal, Placed, Value, Written};
+use super::{Mistake, print};
+use crate::close_names;
+
+/// The arguments of a call in the signature's order.
+pub(crate) fn bind(written: &Written, signature: &Signature) -> Result<Vec<Argument>, Mistake> {
+    check_names(written, signature)?;
+    signature.arguments().map(|spec| argument(written, spec)).collect()
+}
+
+fn check_names(written: &Written, signature: &Signature) -> Result<(), Mistake> {
+    let names = || signature.arguments().map(|spec| spec.name);
+    for (index, (name, _)) in written.arguments.iter().enumerate() {
+        let place = name.at.clone();
+        if !names().any(|known| known == name.value) {
+            let what = format!("{} has no argument `{}`", signature.name(), name.value);
+            return Err(Mistake::new(place, what, close_names::either(name.value, names())));
+        }
+        if written.arguments.iter().take(index).any(|(earlier, _)| earlier.value == name.value) {
+            return Err(Mistake::new(place, format!("`{}` is there twice", name.value), "each argument once"));
+        }
+    }
+    Ok(())
+}
+
+fn argument(written: &Written, spec: VariableSpec) -> Result<Argument, Mistake> {
+    let found = written.arguments.iter().find(|(name, _)| name.value == spec.name);
+    let Some((_, value)) = found else {
+        let what = format!("the argument `{}` is missing", spec.name);
+        let example = format!("{}: {}", spec.name, example(spec));
+        let expected = if written.text.contains('(') { example } else { format!("({example})") };
+        return Err(Mistake::new(written.end..written.end, what, expected));
+    };
+    Ok(Argument { name: spec.name.to_owned(), size: spec.size, value: bound(value, spec)? })
+}
+
+fn bound(value: &Placed<Value>, spec: VariableSpec) -> Result<ArgumentValue, Mistake> {
+    let at = &value.at;
+    Ok(match spec.kind {
+        Type::Int => ArgumentValue::Int(elements(value, spec, int)?),
+        Type::Float => ArgumentValue::Float(elements(value, spec, float)?),
+        Type::Bool => ArgumentValue::Bool(elements(value, spec, truth)?),
+        Type::String => match &value.value {
+            Value::One(Literal::Text(text)) => {
+                check_length(text.len(), at, spec)?;
+                ArgumentValue::String(text.clone())
+            }
+            _ => return Err(wrong_type(at, spec)),
+        },
+        Type::Bytes => match &value.value {
+            Value::One(Literal::Number(digits)) => {
+                let digits = hexadecimal(digits).ok_or_else(|| wrong_type(at, spec))?;
+                check_length(digits.len() / 2, at, spec)?;
+                ArgumentValue::Bytes(digits.to_ascii_lowercase())
+            }
+            _ => return Err(wrong_type(at, spec)),
+        },
+    })
+}
+
+/// Text and bytes have at most the signature's size.
+fn check_length(length: usize, at: &Range<usize>, spec: VariableSpec) -> Result<(), Mistake> {
+    if length <= spec.size as usize {
+        return Ok(());
+    }
+    let what = format!("`{}` takes at most {} bytes, and this has {length}", spec.name, spec.size);
+    Err(Mistake::new(at.clone(), what, describe(spec)))
+}
+
+/// As many elements as the signature's size, each read by `element`.
+fn elements<T>(
+    value: &Placed<Value>,
+    spec: VariableSpec,
+    element: impl Fn(&Literal, &Range<usize>, VariableSpec) -> Result<T, Mistake>,
+) -> Result<Vec<T>, Mistake> {
+    let (count, read) = match &value.value {
+        Value::One(literal) => (1, element(literal, &value.at, spec).map(|one| vec![one])),
+        Value::Several(several) => {
+            (several.len(), several.iter().map(|one| element(&one.value, &one.at, spec)).collect())
+        }
+    };
+    let read = read?;
+    if count == spec.size as usize {
+        return Ok(read);
+    }
+    let what = format!("`{}` has {}, and this has {count}", spec.name, print::plural(spec.size as usize, "element"));
+    Err(Mistake::new(value.at.clone(), what, describe(spec)))
+}
+
+fn int(literal: &Literal, at: &Range<usize>, spec: VariableSpec) -> Result<i64, Mistake> {
+    let Literal::Number(text) = literal else { return Err(wrong_type(at, spec)) };
+    let (sign, unsigned) = match text.strip_prefix('-') {
+        Some(unsigned) => (-1, unsigned),
+        None => (1, text.strip_prefix('+').unwrap_or(text)),
+    };
+    let (digits, radix) = match unsigned.strip_prefix("0x") {
+        Some(digits) => (digits, 16),
+        None => (unsigned, 10),
+    };
+    if digits.is_empty() || !digits.chars().all(|c| c.is_digit(radix)) {
+        return Err(wrong_type(at, spec));
+    }
+    let value = i128::from_str_radix(digits, radix).ok().and_then(|value| i64::try_from(value * sign).ok());
+    value.ok_or_else(|| {
+        let what = format!("`{text}` does not fit `{}`", spec.name);
+        Mistake::new(at.clone(), what, format!("a whole number from {} to {}", i64::MIN, i64::MAX))
+    })
+}
+
+fn float(literal: &Literal, at: &Range<usize>, spec: VariableSpec) -> Result<Number, Mistake> {
+    let Literal::Number(text) = literal else { return Err(wrong_type(at, spec)) };
+    let value: f64 = match text.parse() {
+        Ok(value) => value,
+        // Hexadecimal is for whole numbers, which a float takes as well.
+        Err(_) => int(literal, at, spec)? as f64,
+    };
+    if value.is_infinite() && !text.ends_with("inf") {
+        let what = format!("`{text}` does not fit `{}`", spec.name);
+        return Err(Mistake::new(at.clone(), what, "a number of at most 1.7976931348623157e308, or inf"));
+    }
+    Ok(print::number(value))
+}
+
+fn truth(literal: &Literal, at: &Range<usize>, spec: VariableSpec) -> Result<bool, Mistake> {
+    match literal {
+        Literal::Truth(value) => Ok(*value),
+        _ => Err(wrong_type(at, spec)),
+    }
+}
+
+/// The digits of `0x…`, two for each byte.
+fn hexadecimal(text: &str) -> Option<&str> {
+    let digits = text.strip_prefix("0x")?;
+    (digits.len().is_multiple_of(2) && digits.chars().all(|c| c.is_ascii_hexdigit())).then_some(digits)
+}
+
+fn wrong_type(at: &Range<usize>, spec: VariableSpec) -> Mistake {
+    let what = format!("`{}` is {}, and this is not", spec.name, article(spec.kind));
+    Mistake::new(at.clone(), what, describe(spec))
+}
+
+const fn article(kind: Type) -> &'static str {
+    match kind {
+        Type::Int => "an int",
+        Type::Float => "a float",
+        Type::String => "a string",
+        Type::Bool => "a bool",
+        Type::Bytes => "of the type bytes",
+    }
+}
+
+/// What a variable takes, with an example.
+fn describe(spec: VariableSpec) -> String {
+    let size = spec.size as usize;
+    let count = |one: &str| if size == 1 { format!("a {one}") } else { print::plural(size, one) };
+    let takes = match spec.kind {
+        Type::Int => count("whole number"),
+        Type::Float => count("number"),
+        Type::Bool => {
+            if size == 1 {
+                "true or false".into()
+            } else {
+                count("truth value")
+            }
+        }
+        Type::String => format!("text of at most {}", print::plural(size, "byte")),
+        Type::Bytes => format!("at most {}, two hexadecimal digits each", print::plural(size, "byte")),
+    };
+    format!("{takes}, as in {}: {}", spec.name, example(spec))
+}
+
+fn example(spec: VariableSpec) -> String {
+    let one = match spec.kind {
+        Type::Int => "1",
+        Type::Float => "0.5",
+        Type::Bool => "true",
+        Type::String => return "\"text\"".into(),
+        Type::Bytes => return "0x01ff".into(),
+    };
+    match spec.size as usize {
+        1 => one.into(),
+        size if size <= 4 => format!("[{}]", vec![one; size].join(", ")),
+        _ => format!("[{one}, {one}, …]"),
+    }
+}
