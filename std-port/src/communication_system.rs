@@ -263,7 +263,7 @@ impl<T: Send + 'static> CommunicationSystem<T> {
 
     /// The last refusals.
     pub fn findings(&self) -> Vec<Finding> {
-        lock(&self.engine().node).node.findings().copied().collect()
+        lock(&self.engine().node).node.findings().cloned().collect()
     }
 }
 

@@ -5,7 +5,7 @@ use core::net::SocketAddr;
 
 use super::known::{Newcomer, NodeState};
 use super::timetable::Task;
-use super::{Action, Finding, Node, NodeCounter};
+use super::{Action, Node, NodeCounter};
 use crate::config::CHALLENGE_TIMEOUT;
 use crate::distribution::hello::Hello;
 use crate::distribution::identity::{Identity, Role};
@@ -32,14 +32,14 @@ impl<S: Storage> Node<S> {
     /// Decides about a link whose hello has come. `from` is the other end of the stream.
     pub fn admit(&mut self, now: Instant, link: LinkId, from: SocketAddr, hello: &Hello) -> Admission {
         if let Err(refusal) = self.check(hello) {
-            return self.refuse(now, from, refusal);
+            return self.refuse(now, from, &hello.identity, refusal);
         }
         let newcomer = Newcomer { link, epoch: hello.epoch, limits: hello.limits, address: from, decided: false };
         let old = self.table.find(&hello.identity).and_then(|place| Some((place, self.table.node(place)?.link()?)));
         match old {
             Some((_, old)) if old == link => Admission::Accept,
-            Some((place, old)) => self.meet(now, place, old, newcomer),
-            None if self.is_full() => self.refuse(now, from, Refusal::Full),
+            Some((place, old)) => self.meet(now, place, old, &hello.identity, newcomer),
+            None if self.is_full() => self.refuse(now, from, &hello.identity, Refusal::Full),
             None => self.join(now, &hello.identity, newcomer),
         }
     }
@@ -71,7 +71,7 @@ impl<S: Storage> Node<S> {
     fn join(&mut self, now: Instant, identity: &Identity, newcomer: Newcomer) -> Admission {
         let Newcomer { link, epoch, limits, address, .. } = newcomer;
         let Some((place, forgotten)) = self.table.place_of(identity, address, epoch) else {
-            return self.refuse(now, address, Refusal::Full);
+            return self.refuse(now, address, identity, Refusal::Full);
         };
         self.count_forgotten(forgotten);
         let Some(known) = self.table.node_mut(place) else { return Admission::Refuse(Refusal::Full) };
@@ -95,19 +95,26 @@ impl<S: Storage> Node<S> {
     }
 
     /// Another link has the identity of a node that is connected.
-    fn meet(&mut self, now: Instant, place: usize, old: LinkId, mut newcomer: Newcomer) -> Admission {
-        let smaller = self.table.node(place).is_some_and(|known| self.config.identity < known.identity);
+    fn meet(
+        &mut self,
+        now: Instant,
+        place: usize,
+        old: LinkId,
+        identity: &Identity,
+        mut newcomer: Newcomer,
+    ) -> Admission {
+        let smaller = self.config.identity < *identity;
         let Some(known) = self.table.node_mut(place) else { return Admission::Refuse(Refusal::Full) };
         let same_life = known.epoch == newcomer.epoch;
         let dialed = known.dialing == Some(newcomer.link);
         if known.newcomer.is_some() {
             // One waits already: a second one is one too many, whoever it is.
-            return self.refuse(now, newcomer.address, Refusal::DuplicateIdentity);
+            return self.refuse(now, newcomer.address, identity, Refusal::DuplicateIdentity);
         }
         // Both ends have dialled each other at once: both keep the link that the smaller one opened.
         let crossing = same_life && dialed != known.dialed;
         if crossing && dialed != smaller {
-            return self.refuse(now, newcomer.address, Refusal::AlreadyConnected);
+            return self.refuse(now, newcomer.address, identity, Refusal::AlreadyConnected);
         }
         newcomer.decided = crossing;
         known.newcomer = Some(newcomer);
@@ -124,11 +131,11 @@ impl<S: Storage> Node<S> {
         let known = self.table.node_mut(place).filter(|known| known.link() == Some(old))?;
         let newcomer = known.newcomer.take_if(|newcomer| !newcomer.decided)?;
         known.dialing.take_if(|dialing| *dialing == newcomer.link);
-        let same_life = known.epoch == newcomer.epoch;
+        let (same_life, identity) = (known.epoch == newcomer.epoch, known.identity.clone());
         let refusal = if same_life { Refusal::AlreadyConnected } else { Refusal::DuplicateIdentity };
         self.table.cancel(place);
         self.table.set_link(newcomer.link, None);
-        self.refuse(now, newcomer.address, refusal);
+        self.refuse(now, newcomer.address, &identity, refusal);
         Some(Action::Refuse { new: newcomer.link, refusal })
     }
 
@@ -154,7 +161,7 @@ impl<S: Storage> Node<S> {
         }
     }
 
-    fn refuse(&mut self, now: Instant, address: SocketAddr, refusal: Refusal) -> Admission {
+    fn refuse(&mut self, now: Instant, address: SocketAddr, identity: &Identity, refusal: Refusal) -> Admission {
         let counter = match refusal {
             Refusal::Version | Refusal::Malformed => NodeCounter::RefusedVersion,
             Refusal::Fleet => NodeCounter::RefusedFleet,
@@ -165,7 +172,7 @@ impl<S: Storage> Node<S> {
             Refusal::AlreadyConnected => NodeCounter::RefusedConnected,
         };
         self.counters.add(counter, 1);
-        self.note(Finding { at: now, address, refusal });
+        self.note_of(now, address, identity, refusal);
         Admission::Refuse(refusal)
     }
 }

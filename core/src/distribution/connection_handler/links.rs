@@ -44,14 +44,14 @@ impl<S: Storage> Node<S> {
         let place = self.table.of_link(link)?;
         self.table.set_link(link, None);
         let known = self.table.node_mut(place)?;
-        let address = known.address;
+        let (address, identity) = (known.address, known.identity.clone());
         if known.newcomer.take_if(|newcomer| newcomer.link == link).is_some() {
             known.dialing.take_if(|dialing| *dialing == link);
             self.table.cancel(place);
             return None;
         }
         if let CloseReason::Refused(refusal) = reason {
-            self.note_at(now, address, refusal);
+            self.note_of(now, address, &identity, refusal);
         }
         let known = self.table.node_mut(place)?;
         if known.dialing.take_if(|dialing| *dialing == link).is_some() {

@@ -144,13 +144,15 @@ pub enum Sorted<'b> {
     },
 }
 
-/// The last time that something was refused, for the operator.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+/// The last time that something was refused, here or there, for the operator.
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Finding {
     /// When.
     pub at: Instant,
-    /// Who was refused.
+    /// The other end.
     pub address: SocketAddr,
+    /// Who the other end is, if it said so.
+    pub identity: Option<Identity>,
     /// Why.
     pub refusal: Refusal,
 }
@@ -337,23 +339,27 @@ impl<S: Storage> Node<S> {
         };
         self.counters.add(counter, 1);
         if let DatagramError::Version(_) = error {
-            self.note(Finding { at: now, address: from, refusal: Refusal::Version });
+            self.note(Finding { at: now, address: from, identity: None, refusal: Refusal::Version });
         }
     }
 
-    /// Keeps a refusal for the operator: the newest of each address and reason, the oldest of all gives way.
+    /// Keeps a refusal for the operator: the newest of each host, unit and reason, the oldest of all gives way.
     fn note(&mut self, finding: Finding) {
-        let same = |known: &Finding| known.address.ip() == finding.address.ip() && known.refusal == finding.refusal;
+        let same = |known: &Finding| {
+            known.address.ip() == finding.address.ip()
+                && known.refusal == finding.refusal
+                && known.identity == finding.identity
+        };
         let place = self.findings.iter().position(|known| known.as_ref().is_none_or(same));
-        let oldest = || self.findings.iter().enumerate().min_by_key(|(_, known)| known.map(|known| known.at));
+        let oldest = || self.findings.iter().enumerate().min_by_key(|(_, known)| known.as_ref().map(|known| known.at));
         let index = place.or_else(|| oldest().map(|(index, _)| index));
         if let Some(place) = index.and_then(|index| self.findings.get_mut(index)) {
             *place = Some(finding);
         }
     }
 
-    fn note_at(&mut self, at: Instant, address: SocketAddr, refusal: Refusal) {
-        self.note(Finding { at, address, refusal });
+    fn note_of(&mut self, at: Instant, address: SocketAddr, identity: &Identity, refusal: Refusal) {
+        self.note(Finding { at, address, identity: Some(identity.clone()), refusal });
     }
 
     fn count_forgotten(&mut self, forgotten: bool) {

@@ -288,7 +288,7 @@ impl<S: Storage> Node<S> {
         self.counters.add(NodeCounter::AnnounceHeard, 1);
         if announce.identity.role() != Role::MUnit || !self.is_wanted(&announce.identity) {
             self.counters.add(NodeCounter::WrongManager, 1);
-            self.note_at(now, from, Refusal::WrongManager);
+            self.note_of(now, from, &announce.identity, Refusal::WrongManager);
             return;
         }
         let broadcast = announce.nonce == 0;
@@ -302,7 +302,7 @@ impl<S: Storage> Node<S> {
         // A full manager's broadcast is no invitation; who asked it itself may be the one whose place is being kept.
         let invited = !broadcast || announce.room > 0;
         if !invited {
-            self.note_at(now, from, Refusal::Full);
+            self.note_of(now, from, &announce.identity, Refusal::Full);
         }
         let delay = if broadcast { self.spread(announce.expected) } else { Duration::ZERO };
         let found = Found { epoch: announce.epoch, sequence: announce.sequence, tcp_port: announce.tcp_port };
@@ -324,7 +324,7 @@ impl<S: Storage> Node<S> {
         }
         if epoch != self.config.epoch {
             self.counters.add(NodeCounter::OwnIdentity, 1);
-            self.note_at(now, from, Refusal::DuplicateIdentity);
+            self.note_of(now, from, identity, Refusal::DuplicateIdentity);
         }
         true
     }

@@ -30,6 +30,7 @@ fn an_old_link_that_answers_stays_and_the_newcomer_is_a_duplicate() {
     assert_eq!((known.epoch, node.connected()), (Epoch(1), 1));
     let finding = node.findings().next().unwrap();
     assert_eq!((finding.refusal, finding.address), (Refusal::DuplicateIdentity, address(1, 41_000)));
+    assert_eq!(finding.identity, Some(known.identity.clone()));
 }
 
 #[test]
