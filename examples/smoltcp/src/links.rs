@@ -1,0 +1,213 @@
+//! The core's two machines, driven: the node's decisions are carried out, the session is given what has arrived, and
+//! what comes of it goes to the program.
+
+use core::net::SocketAddr;
+
+use cara_core::distribution::connection_handler::{Action, Admission, Sorted};
+use cara_core::distribution::identity::Identity;
+use cara_core::error::{CloseReason, Error, Refusal};
+use cara_core::host::mailman::LinkId;
+use cara_core::host::secure::Plain;
+use cara_core::services::unit::{Call, Event, Session, SessionConfig};
+use cara_core::services::{Context, Ticket};
+use cara_core::time::Instant;
+
+use crate::program::{News, Program, Served};
+use crate::stack::Stream;
+use crate::unit::{SUnit, Standing, context};
+
+/// The only link.
+const LINK: LinkId = LinkId(0);
+/// Bytes lent to the core at a time: a datagram of the longest message.
+const LENT_BYTES: usize = 1_472;
+
+impl SUnit {
+    /// Does what is due, and what waited for something: leases first.
+    pub(crate) fn work<P: Program>(&mut self, now: Instant, program: &mut P) {
+        self.poll_session(now, program);
+        self.poll_node(now);
+        self.read(now, program);
+        self.poll_session(now, program);
+    }
+
+    fn poll_node(&mut self, now: Instant) {
+        while let Some(action) = self.node.poll(now, &mut self.stack) {
+            // With one link there is never a second one that could be in its way.
+            if let Action::Dial { to, identity } = action {
+                self.dial(now, to, identity.as_ref());
+            }
+        }
+    }
+
+    fn dial(&mut self, now: Instant, to: SocketAddr, identity: Option<&Identity>) {
+        if self.session.is_some() || !self.stack.connect(to) {
+            return self.node.dial_failed(now, identity);
+        }
+        let Some(storage) = self.spare.take() else { return };
+        let constraints = *self.node.constraints();
+        let local = self.node.hello(now, LINK);
+        let config = SessionConfig { link: LINK, dialed: true, address: to, local, constraints };
+        self.session = Some(Session::new(now, config, Plain, storage));
+        self.standing = Standing::Dialing;
+        self.node.dialing(identity, LINK);
+    }
+
+    fn poll_session<P: Program>(&mut self, now: Instant, program: &mut P) {
+        while let Some(event) = self.session.as_mut().and_then(|session| session.poll(context!(self, now))) {
+            let rest = tell(event, program);
+            self.go_on(now, rest, program);
+        }
+    }
+
+    /// Takes everything that has arrived.
+    pub(crate) fn read<P: Program>(&mut self, now: Instant, program: &mut P) {
+        let mut lent = [0; LENT_BYTES];
+        while let Some((from, length)) = self.stack.datagram(&mut lent) {
+            self.take_datagram(now, from, &lent[..length], program);
+        }
+        self.follow_stream(now);
+        while self.take_bytes(now, &mut lent, program) {}
+        self.serve_waiting(now, program);
+    }
+
+    fn take_datagram<P: Program>(&mut self, now: Instant, from: SocketAddr, bytes: &[u8], program: &mut P) {
+        let Sorted::Session { nonce, body, .. } = self.node.datagram(now, from, bytes) else { return };
+        let Some(session) = &mut self.session else { return };
+        if let Some(event) = session.datagram(context!(self, now), from, nonce, body) {
+            let rest = tell(event, program);
+            self.go_on(now, rest, program);
+        }
+    }
+
+    /// Tells the session what has become of its stream.
+    fn follow_stream(&mut self, now: Instant) {
+        let Some(session) = &mut self.session else { return };
+        match (self.stack.stream(), self.standing) {
+            (Stream::Opening, _) => {}
+            (Stream::Open, Standing::Dialing) => {
+                self.standing = Standing::Connected;
+                session.connected(context!(self, now));
+            }
+            (Stream::Open, _) => {
+                if session.wants_to_write() && self.stack.stream_takes_bytes() {
+                    session.writable(context!(self, now));
+                }
+            }
+            (Stream::Ended, Standing::Dialing) => session.disconnected(CloseReason::DialFailed),
+            (Stream::Ended, _) => session.disconnected(CloseReason::Reset),
+        }
+    }
+
+    /// Lends the session what the stream has; `false` when nothing came of it.
+    fn take_bytes<P: Program>(&mut self, now: Instant, lent: &mut [u8], program: &mut P) -> bool {
+        let Some(session) = &mut self.session else { return false };
+        let length = self.stack.peek(lent);
+        // While results wait in the arguments for room, calls wait in the session.
+        let arguments = self.unanswered.is_none().then_some(self.arguments.as_mut_view());
+        let receipt = session.receive(context!(self, now), &mut lent[..length], arguments);
+        let (consumed, moved) = (receipt.consumed, receipt.consumed > 0 || receipt.event.is_some());
+        let rest = receipt.event.map_or(Rest::Nothing, |event| tell(event, program));
+        self.stack.consume(consumed);
+        self.go_on(now, rest, program);
+        moved
+    }
+
+    /// Serves the calls that waited for their turn, as long as their answers find room.
+    fn serve_waiting<P: Program>(&mut self, now: Instant, program: &mut P) {
+        loop {
+            if let Some((ticket, outcome)) = self.unanswered.take() {
+                self.answer_served(now, ticket, outcome);
+            }
+            let Some(session) = self.session.as_mut().filter(|_| self.unanswered.is_none()) else { return };
+            let Some(call) = session.next_call(context!(self, now), self.arguments.as_mut_view()) else { return };
+            self.serve(now, &call, program);
+        }
+    }
+
+    fn go_on<P: Program>(&mut self, now: Instant, rest: Rest, program: &mut P) {
+        match rest {
+            Rest::Nothing => {}
+            Rest::Greet => self.greet(now, program),
+            Rest::Serve(call) => self.serve(now, &call, program),
+            Rest::Leave(reason) => self.leave(now, reason, program),
+        }
+    }
+
+    /// The manager has introduced itself, or somebody at its address.
+    fn greet<P: Program>(&mut self, now: Instant, program: &mut P) {
+        let Some(session) = &mut self.session else { return };
+        let Some(hello) = session.hello() else { return };
+        let refusal = match self.node.admit(now, LINK, session.address(), hello) {
+            Admission::Accept => None,
+            Admission::Refuse(refusal) => Some(refusal),
+            Admission::Challenge { .. } => Some(Refusal::AlreadyConnected),
+        };
+        if let Some(refusal) = refusal {
+            return session.refuse(context!(self, now), refusal);
+        }
+        session.accept(context!(self, now));
+        if session.is_live() {
+            self.standing = Standing::Joined;
+            self.publish(now);
+            program.hear(News::Joined);
+        }
+    }
+
+    /// Shows the manager every function, on this link.
+    pub(crate) fn publish(&mut self, now: Instant) {
+        if let Some(session) = self.session.as_mut().filter(|session| session.is_live()) {
+            session.publish(context!(self, now), self.functions.iter().map(|function| function.slot));
+        }
+    }
+
+    fn serve<P: Program>(&mut self, now: Instant, call: &Call, program: &mut P) {
+        if let Served::Now(outcome) = program.serve(call, self.arguments.as_mut_view()) {
+            self.answer_served(now, call.ticket, outcome.map_err(Error::Service));
+        }
+    }
+
+    fn answer_served(&mut self, now: Instant, ticket: Ticket, outcome: Result<(), Error>) {
+        let Some(session) = &mut self.session else { return };
+        let results = outcome.map(|()| self.arguments.as_view());
+        if session.answer(context!(self, now), ticket, results).is_err() {
+            self.unanswered = Some((ticket, outcome));
+        }
+    }
+
+    /// The link has ended, and everything of it has been told: its memory serves the next one.
+    fn leave<P: Program>(&mut self, now: Instant, reason: CloseReason, program: &mut P) {
+        let Some(session) = self.session.take() else { return };
+        self.spare = Some(session.into_storage(&mut self.buffers));
+        self.unanswered = None;
+        self.stack.close();
+        // With one link nobody can have waited for its end.
+        let _ = self.node.left(now, LINK, reason);
+        if self.standing == Standing::Joined {
+            program.hear(News::Left(reason));
+        }
+    }
+}
+
+/// What is left for the unit to do about an event.
+enum Rest {
+    Nothing,
+    Greet,
+    Serve(Call),
+    Leave(CloseReason),
+}
+
+/// Tells the program what concerns it.
+fn tell<P: Program>(event: Event<'_>, program: &mut P) -> Rest {
+    match event {
+        Event::LeaseExpired(function) => program.make_safe(function),
+        Event::Reply(id, outcome) => program.replied(id, outcome),
+        Event::Failed(id, error) => program.hear(News::Failed(id, error)),
+        Event::ListChanged => program.hear(News::ListChanged),
+        Event::LeaseEnded { slot, expired } => program.hear(News::LeaseEnded { function: slot, expired }),
+        Event::Acknowledged { .. } | Event::Answered => {}
+        Event::Hello => return Rest::Greet,
+        Event::Call(call) => return Rest::Serve(call),
+        Event::Closed(reason) => return Rest::Leave(reason),
+    }
+    Rest::Nothing
+}

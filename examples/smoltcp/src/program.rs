@@ -1,0 +1,56 @@
+//! What the program does for its unit: it serves calls, makes things safe, and hears news.
+
+use cara_core::distribution::function_list::Slot;
+use cara_core::distribution::parameters::ParametersView;
+use cara_core::error::{CloseReason, Error, ServiceError};
+use cara_core::services::requests::CallId;
+use cara_core::services::unit::{Call, ReplyBlock};
+
+/// The program around a unit, as [`SUnit::poll`](crate::SUnit::poll) sees it. Each method runs inside of `poll`, so each
+/// returns soon: nothing is read and no keep-alive leaves meanwhile.
+pub trait Program {
+    /// Serves a call: the arguments are in `parameters`, and the results go there.
+    fn serve(&mut self, call: &Call, parameters: &mut ParametersView) -> Served;
+
+    /// Nobody wants any more what this function started: stop it. Runs before anything else that is due.
+    fn make_safe(&mut self, function: Slot);
+
+    /// A call of this unit has ended; [`ReplyBlock::read_into`] gives the results.
+    fn replied(&mut self, call: CallId, outcome: Result<ReplyBlock<'_>, Error>) {
+        let _ = (call, outcome);
+    }
+
+    /// Something else has happened.
+    fn hear(&mut self, news: News) {
+        let _ = news;
+    }
+}
+
+/// How a call is served.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Served {
+    /// It is done, or has failed.
+    Now(Result<(), ServiceError>),
+    /// The program answers it with [`SUnit::answer`](crate::SUnit::answer) when it is done.
+    Later,
+}
+
+/// What a program may want to know.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum News {
+    /// The manager has taken the unit.
+    Joined,
+    /// The link to the manager has ended; leases and calls of it have been reported before.
+    Left(CloseReason),
+    /// The manager has published or withdrawn functions.
+    ListChanged,
+    /// A request that wanted no reply was refused, or its service has failed.
+    Failed(CallId, Error),
+    /// The manager has ended the lease that this unit held on a function of it.
+    LeaseEnded {
+        /// The manager's function.
+        function: Slot,
+        /// It was not renewed in time.
+        expired: bool,
+    },
+}
