@@ -11,6 +11,8 @@ pub trait Counter: Copy + 'static {
     fn index(self) -> usize;
     /// The name, in words joined by `_`, as the command line and metrics show it.
     fn name(self) -> &'static str;
+    /// What is counted, in a sentence.
+    fn help(self) -> &'static str;
 }
 
 /// A set of counters, all zero at first. `N` is the enum's `COUNT`.
@@ -65,10 +67,10 @@ impl<C: Counter, const N: usize> fmt::Debug for Counters<C, N> {
 
 /// Declares an enum of counters: `counters! { /// doc  pub enum Name { /// doc  Variant, … } }`.
 macro_rules! counters {
-    ($(#[$meta:meta])* pub enum $name:ident { $($(#[$doc:meta])* $variant:ident,)+ }) => {
+    ($(#[$meta:meta])* pub enum $name:ident { $(#[doc = $help:literal] $variant:ident,)+ }) => {
         $(#[$meta])*
         #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-        pub enum $name { $($(#[$doc])* $variant,)+ }
+        pub enum $name { $(#[doc = $help] $variant,)+ }
 
         impl $name {
             /// How many counters there are.
@@ -82,6 +84,9 @@ macro_rules! counters {
             }
             fn name(self) -> &'static str {
                 match self { $(Self::$variant => stringify!($variant),)+ }
+            }
+            fn help(self) -> &'static str {
+                match self { $(Self::$variant => $help.trim_ascii(),)+ }
             }
         }
     };

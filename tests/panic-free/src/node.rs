@@ -1,5 +1,6 @@
 //! The node: discovery, admission, the table of nodes; its datagrams.
 
+use cara_core::counters::Counter;
 use cara_core::distribution::connection_handler::{Known, Node, NodeConfig, NodeCounter, NodeStorage};
 use cara_core::distribution::datagram::{self, Announce, Datagram, WhoHas};
 use cara_core::distribution::hello::Manager;
@@ -75,7 +76,7 @@ entry!(node_lists, {
 
 entry!(node_counters, {
     let counter: NodeCounter = *unknown();
-    keep(node().counters.value(counter));
+    keep((node().counters.value(counter), counter.help()));
     drain(node().counters.iter());
 });
 
