@@ -157,7 +157,7 @@ impl<T: Send + 'static> Builder<T> {
     fn engine(self) -> Result<Arc<Engine<T>>, Error> {
         check(&self.constraints)?;
         let own_threads = self.threads.is_none();
-        let threads = self.threads.map_or_else(Threads::new, Ok)?;
+        let threads = self.threads.map_or_else(Threads::of_one, Ok)?;
         let datagrams = Datagrams::open(self.interfaces, self.discovery_port)?;
         let listener = match self.identity.role() {
             Role::MUnit => Some(Listener::open(self.interfaces.bind_address(), self.tcp_port).map_err(listen_error)?),
@@ -166,6 +166,7 @@ impl<T: Send + 'static> Builder<T> {
         let capacities = self.capacities;
         let nodes = usize::from(self.constraints.maximum_nodes);
         let maximum_links = nodes + capacities.pending_links;
+        crate::sys::limits::make_room_for(maximum_links);
         let config = NodeConfig {
             identity: self.identity,
             fleet: self.fleet,

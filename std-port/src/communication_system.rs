@@ -256,6 +256,11 @@ impl<T: Send + 'static> CommunicationSystem<T> {
         self.engine().state.enter(None).map(|mut state| act(&mut state))
     }
 
+    /// Gives back the memory of message buffers that nobody uses; a few are kept otherwise, for the next long messages.
+    pub fn trim_buffers(&self) {
+        self.engine().pool.shrink();
+    }
+
     /// What happened in discovery and membership: (name, count), zeros included.
     pub fn counters(&self) -> Vec<(&'static str, u64)> {
         lock(&self.engine().node).node.counters.iter().collect()

@@ -73,8 +73,15 @@ impl Drop for Owner {
 impl Threads {
     /// Threads for any number of units; they begin with the first unit that starts, and end with the last one.
     ///
-    /// [`Error::Network`] where the system refuses descriptors for them.
+    /// Raises the process's soft limit of open files to the hard one: an s_unit takes three.
+    /// [`Error::Network`] where the system refuses descriptors for the threads themselves.
     pub fn new() -> Result<Self, Error> {
+        crate::sys::limits::raise();
+        Self::of_one()
+    }
+
+    /// Threads for one unit.
+    pub(crate) fn of_one() -> Result<Self, Error> {
         Crew::new().map(|crew| Self { owner: Arc::new(Owner { crew: Arc::new(crew) }) }).map_err(system_refused)
     }
 

@@ -5,6 +5,7 @@
 pub mod datagram;
 pub mod epoll;
 pub mod interfaces;
+pub mod limits;
 pub mod stream;
 
 use cara_core::time::Duration;

@@ -1,0 +1,56 @@
+//! How many descriptors the process may have: each link takes one.
+
+use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
+
+/// Descriptors that a process has besides the links: its own files, and the sockets and wakers of a few units.
+const BESIDES: u64 = 64;
+
+/// Raises the soft limit of open files to the hard one, so that as many links fit as the administrator allows.
+///
+/// Most systems begin with 1,024, for programs that still use `select`. Returns the limit in force.
+pub fn raise() -> u64 {
+    let Rlimit { current, maximum } = getrlimit(Resource::Nofile);
+    let Some(soft) = current else { return u64::MAX };
+    if maximum.is_some_and(|hard| hard <= soft) {
+        return soft;
+    }
+    match setrlimit(Resource::Nofile, Rlimit { current: maximum, maximum }) {
+        Ok(()) => maximum.unwrap_or(u64::MAX),
+        Err(errno) => {
+            tracing::debug!(%errno, "the limit of open files could not be raised");
+            soft
+        }
+    }
+}
+
+/// Makes room for so many links where the soft limit is too low, and tells where the hard one is.
+pub fn make_room_for(links: usize) {
+    let needed = (links as u64).saturating_add(BESIDES);
+    if !is_enough(getrlimit(Resource::Nofile).current, needed) && !is_enough(Some(raise()), needed) {
+        tracing::warn!(needed, limit = raise(), "fewer files may be open than links are allowed: raise ulimit -Hn");
+    }
+}
+
+fn is_enough(limit: Option<u64>, needed: u64) -> bool {
+    limit.is_none_or(|limit| limit >= needed)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_soft_limit_becomes_the_hard_one() {
+        let limit = raise();
+        let Rlimit { current, maximum } = getrlimit(Resource::Nofile);
+        assert_eq!((current, current), (maximum, Some(limit)));
+        // Too many for any system: it warns, and goes on with what there is.
+        make_room_for(usize::MAX);
+        assert_eq!(getrlimit(Resource::Nofile).current, current);
+    }
+
+    #[test]
+    fn no_limit_is_enough() {
+        assert!(is_enough(None, u64::MAX) && is_enough(Some(7), 7) && !is_enough(Some(7), 8));
+    }
+}
