@@ -15,35 +15,51 @@ pub enum Cause {
     Transport,
 }
 
-/// A limit of [`crate::config`] or of the storage that the port lent.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+/// A limit of [`crate::config`] or of the storage that the port lent. The text says which setting raises it; `Capacities`
+/// are those of the Linux port, on a board they are the lengths of the lent slices.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, thiserror::Error)]
 #[repr(u8)]
 pub enum Limit {
     /// `Constraints::maximum_nodes`, or the table of nodes.
+    #[error("as many nodes are connected as may be: raise maximum_nodes")]
     Nodes = 0,
     /// The table of links.
+    #[error("every link is in use: raise maximum_nodes or Capacities::pending_links")]
     Links = 1,
     /// Calls in flight to one peer.
+    #[error("too many calls to this peer wait for their replies: let one end, or raise Capacities::calls_in_flight")]
     Calls = 2,
     /// `Constraints::calls_per_peer`: calls of one peer that wait or run.
+    #[error("too many calls of this peer run here: let one end, or raise Capacities::calls_running")]
     IncomingCalls = 3,
     /// The pool of message buffers.
+    #[error("every message buffer is in use: try again later, or raise Capacities::message_buffers")]
     Buffers = 4,
     /// Messages that wait to be written to one peer.
+    #[error("the peer reads more slowly than this unit sends: try again later, send less, or raise message_size here")]
     SendQueue = 5,
     /// The table of functions.
+    #[error(
+        "the list of functions is full: remove one, or raise Capacities::functions (published_to_one for one node)"
+    )]
     Functions = 6,
     /// Bytes for signatures.
+    #[error("the signatures are too long: use shorter or fewer names, or raise Capacities::signature_bytes")]
     SignatureBytes = 7,
     /// Variables in one `Parameters`.
+    #[error("a Parameters, and the arguments or results of a function, have 16 variables at most: use arrays")]
     Variables = 8,
     /// Bytes in one `Parameters`.
+    #[error("the Parameters has no room for this: make a larger one, as in Parameters::<20000>::sized()")]
     ParametersBytes = 9,
     /// Bytes in a name.
+    #[error("a name has 32 bytes at most: use a shorter one")]
     NameBytes = 10,
     /// Leases held by one peer.
+    #[error("a unit holds 4 leases at one peer at most: release one first")]
     Leases = 11,
     /// Handlers running at the same time.
+    #[error("every thread for handlers is busy: try again later, or let handlers take less time")]
     Handlers = 12,
 }
 
@@ -67,10 +83,10 @@ pub enum Refusal {
     #[error("another live node has the same name and id: give each node its own")]
     DuplicateIdentity = 5,
     /// Both ends have the same role or identity where that cannot be.
-    #[error("the two roles cannot be joined: an s_unit joins an m_unit")]
+    #[error("the two roles cannot be joined: make one of them an m_unit, which s_units join")]
     Role = 6,
     /// The peers are connected already.
-    #[error("the two nodes are connected already")]
+    #[error("the two nodes are connected already by another link: nothing need be done")]
     AlreadyConnected = 7,
     /// The hello could not be read.
     #[error("the peer's hello could not be read: is it a CARA unit?")]
@@ -82,25 +98,25 @@ pub enum Refusal {
 #[repr(u8)]
 pub enum CloseReason {
     /// The other unit was stopped in an orderly way.
-    #[error("the peer was stopped")]
+    #[error("the peer was stopped: start it again if it is wanted")]
     Stopped = 1,
     /// The connection was reset or closed below.
-    #[error("the connection was closed by the network")]
+    #[error("the connection was closed below: the peer's process ended, or the network reset it; it is opened again")]
     Reset = 2,
     /// Nothing was heard for the time of three keep-alives (8 s where only TCP passes).
     #[error("nothing was heard from the peer: check power, cable and manager")]
     Silent = 3,
     /// The same identity came back with a new boot epoch.
-    #[error("the peer restarted")]
+    #[error("the peer restarted: it is taken again, ask it anew")]
     PeerRestarted = 4,
     /// The other end broke the protocol.
     #[error("the peer broke the protocol: check its version")]
     Protocol = 5,
     /// A frame or message above the told limit.
-    #[error("the peer sent more than the limit that it was told")]
+    #[error("the peer sent more than the limit that it was told: check its version, or raise message_size here")]
     Oversize = 6,
     /// No hello came in time.
-    #[error("no hello came in time")]
+    #[error("no hello came in time: whoever connected said nothing, or is no CARA unit")]
     HelloTimeout = 7,
     /// The unit refused the link.
     #[error("{0}")]
@@ -109,7 +125,7 @@ pub enum CloseReason {
     #[error("the connection could not be opened: is the peer's port reachable?")]
     DialFailed = 9,
     /// Request ids ran out; the pair connects again.
-    #[error("request ids ran out; the link is opened anew")]
+    #[error("request ids ran out: the link is opened anew, ask again")]
     Exhausted = 10,
 }
 
@@ -117,7 +133,7 @@ pub enum CloseReason {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, thiserror::Error)]
 pub enum ServiceError {
     /// The service failed with a code of its own.
-    #[error("the service failed with code {0}")]
+    #[error("the service failed with code {0}: see the peer's documentation for its meaning")]
     Failed(u16),
     /// The handler panicked; the unit runs on.
     #[error("the service's handler panicked: see the peer's log")]
@@ -126,7 +142,7 @@ pub enum ServiceError {
     #[error("the service is not ready: try again later")]
     NotReady,
     /// The handler set results that the signature does not hold.
-    #[error("the service's results do not match its published signature")]
+    #[error("the service's results do not match its published signature: correct its handler")]
     BadResults,
 }
 
@@ -135,7 +151,9 @@ pub enum ServiceError {
 pub enum Error {
     // --- configuration
     /// The peer has published no function of this name to this unit.
-    #[error("the peer has not published this function: see its function list")]
+    #[error(
+        "the peer has not published this function to this unit: check the name against its list, and publish it there"
+    )]
     UnknownFunction,
     /// The function was removed or changed since its list was read; the news follows.
     #[error("the function was removed or changed: look at the new list and call again")]
@@ -147,13 +165,13 @@ pub enum Error {
         index: u8,
     },
     /// A variable has another type than asked for.
-    #[error("variable {index} has another type than the signature says")]
+    #[error("variable {index} has another type than is asked for: use the type of the signature")]
     WrongType {
         /// Position in the signature (or table), from 0.
         index: u8,
     },
     /// A variable has another size than asked for.
-    #[error("variable {index} has size {found}, and {expected} is needed")]
+    #[error("variable {index} has size {found}, and {expected} is needed: give it that size")]
     WrongSize {
         /// Position in the signature (or table), from 0.
         index: u8,
@@ -163,20 +181,20 @@ pub enum Error {
         found: u32,
     },
     /// No variable of this name.
-    #[error("there is no variable of this name")]
+    #[error("there is no variable of this name: add it first, or check its name")]
     UnknownVariable,
     /// A variable, function or node of this name exists already.
-    #[error("the name is taken already")]
+    #[error("the name is taken already: choose another, or replace what has it")]
     NameTaken,
     /// A name of a function or variable is empty or holds other characters than letters, digits, `_`, `-`, `.`, `/`; or a
     /// name of a node is empty, longer than 32 bytes, or holds control characters.
     #[error("a name has letters, digits, '_', '-', '.' or '/'; a node's has 1 to 32 bytes and no control characters")]
     BadName,
     /// A number does not fit the Rust type that it was asked as, or the variable that it is put into.
-    #[error("the number does not fit the type it was asked as")]
+    #[error("the number does not fit the type it was asked as: use a wider one")]
     OutOfRange,
     /// The caller's parameters cannot hold the result.
-    #[error("the result needs {need} bytes, and the parameters have room for {have}")]
+    #[error("the result needs {need} bytes, and the parameters have room for {have}: make them larger")]
     ResultWouldNotFit {
         /// Bytes that the result needs.
         need: u32,
@@ -184,7 +202,7 @@ pub enum Error {
         have: u32,
     },
     /// The message is longer than the receiver allows.
-    #[error("the message is longer than the receiver's limit of {limit} bytes: raise message_size there")]
+    #[error("the message is longer than the receiver's limit of {limit} bytes: send less, or raise message_size there")]
     TooLarge {
         /// The receiver's limit in bytes.
         limit: u32,
@@ -193,25 +211,30 @@ pub enum Error {
     #[error("the request would wait for itself: answer first, or request without blocking")]
     WouldDeadlock,
     /// A constraint outside what its type or the lent storage allows.
-    #[error("the constraint's value is outside what this unit can hold")]
+    #[error("a constraint or option is outside what this unit can do: compare it with the bounds in its documentation")]
     BadConstraint,
 
     // --- peer
     /// No node of this name, id or index is connected.
-    #[error("the node is not connected")]
+    #[error("the node is not connected: wait until it has joined, or check its name, power and network")]
     NotConnected,
     /// No answer within the deadline; the service may have run.
-    #[error("no answer came in time: the service may have run")]
+    #[error(
+        "no answer came in time, and the service may have run: ask for its state, or wait longer (request_timeout)"
+    )]
     TimedOut,
     /// The link ended while the call was in flight; the service may have run.
-    #[error("the link ended during the call: the service may have run")]
+    #[error("the link ended during the call, and the service may have run: ask for its state when the peer is back")]
     Interrupted,
     /// The callee found the request older than its remaining time and did not run it.
-    #[error("the request arrived too late and was not run")]
+    #[error("the request arrived too late and was not run: ask again, or allow more time")]
     Expired,
     /// The callee saw this id, or a much newer one, before and did not run it again.
-    #[error("the request was seen before and was not run again")]
+    #[error("the request is older than 64 others and was not run: ask again")]
     Stale,
+    /// The function was replaced or removed while the call ran: its results cannot be read any more.
+    #[error("the service ran, but was replaced meanwhile and its results are lost: look at the new list")]
+    ResultLost,
     /// The callee holds as many calls of this unit as it may; it did not run it.
     #[error("the peer is busy and did not run the request: try again later")]
     Busy,
@@ -219,7 +242,7 @@ pub enum Error {
     #[error("the peer could not read the request: check its version")]
     Malformed,
     /// The callee's rules do not let this unit call the function.
-    #[error("the peer does not allow this call")]
+    #[error("the peer does not allow this call: change its rules, or ask with another unit")]
     NotAllowed,
     /// The service answered with an error.
     #[error("{0}")]
@@ -230,10 +253,10 @@ pub enum Error {
 
     // --- resource
     /// A table or queue of this unit is full.
-    #[error("full: {0:?}")]
+    #[error("no room: {0}")]
     Full(Limit),
     /// The minimum interval between requests to this node has not passed.
-    #[error("too soon after the last request: wait {} us", wait.as_micros())]
+    #[error("too soon after the last request: wait {} us, or lower minimum_interval", wait.as_micros())]
     TooSoon {
         /// How long to wait.
         wait: Duration,
@@ -247,10 +270,10 @@ pub enum Error {
     #[error("the network refused: is the interface up, and are there descriptors left (ulimit -n)?")]
     Network,
     /// Another process owns the port.
-    #[error("the port is in use by a program that does not share it")]
+    #[error("the port is in use by a program that does not share it: choose another port, or end that program")]
     PortInUse,
-    /// The unit has been stopped.
-    #[error("the unit has been stopped")]
+    /// The unit has been stopped, or cannot be started (again).
+    #[error("the unit does not run: it was stopped or runs already; make a new one")]
     NotRunning,
 }
 
@@ -276,6 +299,7 @@ impl Error {
             | Self::Interrupted
             | Self::Expired
             | Self::Stale
+            | Self::ResultLost
             | Self::Busy
             | Self::Malformed
             | Self::NotAllowed

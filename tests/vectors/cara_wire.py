@@ -236,6 +236,7 @@ ERRORS = {
     4: ("wrong_type", ("index",)), 5: ("wrong_size", ("index", "expected", "found")), 6: ("expired", ()),
     7: ("stale", ()), 8: ("busy", ()), 9: ("malformed", ()), 10: ("not_allowed", ()), 11: ("would_deadlock", ()),
     12: ("too_large", ("limit",)), 13: ("too_soon", ("wait",)), 14: ("result_would_not_fit", ("need", "have")),
+    15: ("result_lost", ()),
     20: ("service_failed", ("code",)), 21: ("service_panicked", ()), 22: ("service_not_ready", ()),
     23: ("service_bad_results", ()),
 }

@@ -116,6 +116,7 @@ fn error(error: Error) -> Value {
         Error::ResultWouldNotFit { need, have } => {
             json!({ "result_would_not_fit": { "need": need, "have": have } })
         }
+        Error::ResultLost => json!("result_lost"),
         Error::Service(ServiceError::Failed(code)) => json!({ "service_failed": { "code": code } }),
         Error::Service(ServiceError::Panicked) => json!("service_panicked"),
         Error::Service(ServiceError::NotReady) => json!("service_not_ready"),

@@ -70,7 +70,7 @@ fn messages() -> Vec<Vector> {
 fn errors() -> Vec<Vector> {
     let wait = Duration::from_millis(30);
     let service = |error: ServiceError| Error::Service(error);
-    let answers: [(&'static str, Error, Value); 19] = [
+    let answers: [(&'static str, Error, Value); 20] = [
         ("error_unknown_function", Error::UnknownFunction, json!("unknown_function")),
         ("error_stale_function", Error::StaleFunction, json!("stale_function")),
         ("error_missing_argument", Error::MissingArgument { index: 3 }, json!({ "missing_argument": { "index": 3 } })),
@@ -93,6 +93,7 @@ fn errors() -> Vec<Vector> {
             Error::ResultWouldNotFit { need: 40, have: 16 },
             json!({ "result_would_not_fit": { "need": 40, "have": 16 } }),
         ),
+        ("error_result_lost", Error::ResultLost, json!("result_lost")),
         ("error_service_failed", service(ServiceError::Failed(513)), json!({ "service_failed": { "code": 513 } })),
         ("error_service_panicked", service(ServiceError::Panicked), json!("service_panicked")),
         ("error_service_not_ready", service(ServiceError::NotReady), json!("service_not_ready")),

@@ -173,6 +173,19 @@ impl<S: Storage, C: Secure> Link<S, C> {
         if hold { Ok(()) } else { self.flush(mailman, buffers).map_err(Error::Closed) }
     }
 
+    /// Accepts a message of one short chunk into the link's own bytes, for an answer that finds no buffer. It may overtake
+    /// other messages. `false` when there is no room.
+    pub(crate) fn send_short(
+        &mut self,
+        priority: Priority,
+        total: usize,
+        write: impl FnOnce(&mut ChunkWriter<'_>),
+    ) -> bool {
+        let accepted = self.sender.accept_short(priority, total, write);
+        self.counters.add(if accepted { LinkCounter::MessagesSent } else { LinkCounter::FramesWithheld }, 1);
+        accepted
+    }
+
     /// Accepts a frame that is no chunk. `false` when the room reserved for such frames is full.
     pub fn send_frame(&mut self, frame: &Frame<'_>) -> bool {
         let accepted = self.sender.accept_frame(frame);

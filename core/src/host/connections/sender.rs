@@ -107,14 +107,35 @@ impl<S: Storage> Sender<S> {
         if total > EMERGENCY_BYTES {
             return Err(Error::TooLarge { limit: EMERGENCY_BYTES as u32 });
         }
+        if self.append_urgent(Priority::Emergency, total, write) { Ok(()) } else { Err(Error::Full(Limit::SendQueue)) }
+    }
+
+    /// A whole message of one chunk that goes with the urgent frames. It leaves the room of an emergency.
+    pub(super) fn accept_short(
+        &mut self,
+        priority: Priority,
+        total: usize,
+        write: impl FnOnce(&mut ChunkWriter<'_>),
+    ) -> bool {
+        let framed = self.cut.framed_length(total);
+        let end = self.urgent.len().saturating_add(framed);
+        framed <= MINIMUM_CHUNK_BYTES
+            && end <= URGENT_BYTES.saturating_sub(EMERGENCY_RESERVE)
+            && self.append_urgent(priority, total, write)
+    }
+
+    fn append_urgent(&mut self, priority: Priority, total: usize, write: impl FnOnce(&mut ChunkWriter<'_>)) -> bool {
         let start = self.urgent.len();
         let end = start.saturating_add(self.cut.framed_length(total));
-        self.urgent.resize(end, 0).map_err(|_| Error::Full(Limit::SendQueue))?;
+        if self.urgent.resize(end, 0).is_err() {
+            return false;
+        }
         let place = self.urgent.get_mut(start..end).unwrap_or(&mut []);
-        let mut writer =
-            ChunkWriter::new(place, self.cut, Priority::Emergency, total).ok_or(Error::Full(Limit::SendQueue))?;
-        write(&mut writer);
-        Ok(())
+        match ChunkWriter::new(place, self.cut, priority, total) {
+            Some(mut writer) => write(&mut writer),
+            None => self.urgent.truncate(start),
+        }
+        self.urgent.len() == end
     }
 
     pub(super) fn accept_frame(&mut self, frame: &Frame<'_>) -> bool {

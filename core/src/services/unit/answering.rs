@@ -121,7 +121,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         let functions = cx.functions;
         let specs = match functions.lookup(head.slot, head.generation) {
             Ok(function) => function.signature.results(),
-            Err(error) => return self.send_error(cx, head.id, head.priority, true, error),
+            Err(_) => return self.send_error(cx, head.id, head.priority, true, Error::ResultLost),
         };
         let Ok(length) = block::measure(specs, results) else {
             return self.send_error(cx, head.id, head.priority, true, ServiceError::BadResults.into());
@@ -153,7 +153,13 @@ impl<S: Storage, C: Secure> Session<S, C> {
         error: Error,
     ) -> Result<(), Error> {
         let header = if wants_reply { encode_reply(id, Err(error)) } else { encode_failure(id, error) };
-        self.send(cx, priority, REPLY_BYTES, |writer| writer.put(&header))
+        match self.send(cx, priority, REPLY_BYTES, |writer| writer.put(&header)) {
+            Err(Error::Full(_)) if self.link.send_short(priority, REPLY_BYTES, |writer| writer.put(&header)) => {
+                self.flush(cx);
+                Ok(())
+            }
+            sent => sent,
+        }
     }
 
     pub(super) fn send<M: Mailman, B: Buffers<S>, H: Service>(

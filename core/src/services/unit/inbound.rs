@@ -134,7 +134,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
                 let function = self.theirs.function(slot).filter(|function| function.generation == generation);
                 let block = function
                     .map(|function| ReplyBlock { signature: function.signature, bytes: self.link.view(block, lent) });
-                Some(Event::Reply(id, block.ok_or(Error::StaleFunction)))
+                Some(Event::Reply(id, block.ok_or(Error::ResultLost)))
             }
         }
     }

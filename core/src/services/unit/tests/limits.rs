@@ -1,6 +1,6 @@
 //! The limits that each end tells the other, and keeps.
 
-use super::pair::Pair;
+use super::pair::{Happened, Pair};
 use super::setup::Setup;
 use super::{none, text, x};
 use crate::config::{Constraints, Priority};
@@ -121,18 +121,48 @@ fn a_callee_with_its_hands_full_is_busy_except_for_an_emergency() {
 }
 
 #[test]
-fn a_call_that_finds_no_buffer_to_wait_in_is_not_run_and_counted() {
+fn a_call_that_finds_no_buffer_to_wait_in_is_refused_without_one() {
     let mut pair = Pair::live();
     pair.agv.offer_held("work()");
     pair.publish();
     let others = pair.agv.take_buffers();
-    let first = pair.manager.call("work", &none()).unwrap();
-    pair.manager.tell("work", &none()).unwrap();
+    // Of three in one read the last one can be run out of it.
+    let told = pair.manager.tell("work", &none()).unwrap();
+    let second = pair.manager.call("work", &none()).unwrap();
+    let last = pair.manager.call("work", &none()).unwrap();
     pair.run(Duration::from_millis(1));
     pair.agv.give_buffers(others);
     assert_eq!(pair.agv.ran(), ["work"]);
-    assert_eq!(pair.agv.counter(LinkCounter::RequestsBusy), 1);
-    assert_eq!(pair.manager.outcome(first), None);
-    // Nor is there a buffer to say so.
-    assert_eq!(pair.agv.counter(LinkCounter::RepliesDropped), 1);
+    assert_eq!(pair.agv.counter(LinkCounter::RequestsBusy), 2);
+    assert_eq!(pair.manager.outcome(last), None);
+    assert_eq!(pair.manager.outcome(second).unwrap().unwrap_err(), Error::Busy);
+    assert!(pair.manager.has(&Happened::Failed(told, Error::Busy)));
+    assert_eq!(pair.agv.counter(LinkCounter::RepliesDropped), 0);
+}
+
+/// The bytes that refusals may use are few, and none of them are those of an emergency.
+#[test]
+fn refusals_without_a_buffer_are_bounded_and_leave_room_for_an_emergency() {
+    let mut pair = Pair::live();
+    pair.agv.offer_held("work()");
+    pair.manager.offer("stop()", |_| Ok(()));
+    pair.manager.publish();
+    pair.publish();
+    let others = pair.agv.take_buffers();
+    pair.agv.net.capacity = 0;
+    for _ in 0..40 {
+        pair.manager.tell("work", &none()).unwrap();
+    }
+    pair.run(Duration::from_millis(1));
+    let dropped = pair.agv.counter(LinkCounter::RepliesDropped);
+    assert!(dropped > 0 && dropped < 39, "{dropped}");
+    let stop = pair.agv.request_with("stop", &none(), &emergency(), true).unwrap();
+    pair.agv.net.capacity = 1 << 20;
+    pair.run(Duration::from_millis(5));
+    pair.agv.give_buffers(others);
+    assert!(pair.agv.outcome(stop).unwrap().is_ok());
+    assert_eq!(
+        pair.manager.count(|happened| matches!(happened, Happened::Failed(_, Error::Busy))) as u64,
+        39 - dropped
+    );
 }

@@ -59,6 +59,22 @@ fn a_call_that_crosses_a_withdrawal_is_stale() {
     assert!(pair.agv.ran().is_empty());
 }
 
+/// It ran, so it is not stale: asking again would run it twice.
+#[test]
+fn a_function_that_is_replaced_while_it_runs_has_lost_its_results() {
+    let mut pair = Pair::live();
+    pair.agv.offer_held("turn(x: int) -> (x: int)");
+    pair.publish();
+    let id = pair.manager.call("turn", &x(1)).unwrap();
+    pair.settle();
+    assert_eq!(pair.agv.ran(), ["turn"]);
+    pair.agv.replace("turn(angle: float)");
+    pair.publish();
+    pair.agv.answer_held(Ok(&*x(2)));
+    pair.settle();
+    assert_eq!(pair.manager.outcome(id).unwrap().unwrap_err(), Error::ResultLost);
+}
+
 #[test]
 fn a_function_that_was_replaced_is_stale_and_the_news_follows() {
     let mut pair = Pair::live();
