@@ -19,6 +19,8 @@
 //! # Ok::<(), cara_std::Error>(())
 //! ```
 
+mod heard;
+
 use std::collections::HashSet;
 use std::hash::{BuildHasher, Hasher, RandomState};
 use std::io;
@@ -26,12 +28,12 @@ use std::net::{SocketAddr, SocketAddrV4, UdpSocket};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use cara_core::config::VERSION;
 use cara_core::distribution::datagram::{Announce, Datagram, Header, SEARCH_BYTES, WhoHas};
-use cara_core::distribution::hello::Manager;
-use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
+use cara_core::distribution::identity::{Epoch, Fleet, Identity};
 use cara_core::error::Error;
 
+use self::heard::News;
+pub use self::heard::{Foreign, Heard, Reach};
 use crate::sys::datagram::{Datagrams, Socket};
 use crate::sys::epoll::{Epoll, Events, Interest};
 use crate::sys::interfaces::{Interface, Interfaces};
@@ -50,86 +52,6 @@ const BATCH: usize = 256;
 const SHARED: u64 = 0;
 const VOICE: u64 = 1;
 
-/// One life of a unit, as it was heard from one address.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Heard {
-    /// Where its datagrams came from.
-    pub source: SocketAddr,
-    /// Its protocol version. What is said below of another version than this one's is read as if it were of this one.
-    pub version: u8,
-    /// Its fleet.
-    pub fleet: Fleet,
-    /// Who it is; `None` where its datagrams could not be read beyond their header.
-    pub identity: Option<Identity>,
-    /// Its life.
-    pub epoch: Option<Epoch>,
-    /// The manager that it looks for.
-    pub wanted: Option<Manager>,
-    /// Where it takes connections, at the source's address.
-    pub tcp_port: Option<u16>,
-    /// How many more nodes it takes, as it said last.
-    pub room: Option<u16>,
-    /// Searches of it.
-    pub searches: u32,
-    /// Answers of it.
-    pub answers: u32,
-    /// All other datagrams of it.
-    pub others: u32,
-    /// When it was first heard, since the survey was opened.
-    pub first: Duration,
-    /// When it was last heard, since the survey was opened.
-    pub last: Duration,
-    /// It was heard on the discovery port at least once, as all broadcasts are.
-    pub by_broadcast: bool,
-}
-
-impl Heard {
-    /// Where it takes connections.
-    pub fn listens_at(&self) -> Option<SocketAddr> {
-        self.tcp_port.map(|port| SocketAddr::new(self.source.ip(), port))
-    }
-
-    /// Whether it speaks this version.
-    pub const fn same_version(&self) -> bool {
-        self.version == VERSION
-    }
-
-    /// Whether it is a survey, of this or another host.
-    pub fn is_survey(&self) -> bool {
-        self.identity.as_ref().is_some_and(|identity| identity.name() == NAME && identity.role() == Role::SUnit)
-    }
-
-    fn is(&self, news: &News) -> bool {
-        self.source == news.source
-            && self.version == news.header.version
-            && self.fleet == news.header.fleet
-            && self.identity.as_ref() == news.identity
-            && self.epoch == news.epoch
-    }
-}
-
-/// A sender of datagrams that are not CARA's.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Foreign {
-    /// Where they came from.
-    pub source: SocketAddr,
-    /// How many.
-    pub datagrams: u32,
-}
-
-/// Whether broadcasts leave through an interface, and come back to this host.
-#[derive(Clone, Debug)]
-pub struct Reach {
-    /// The interface.
-    pub interface: Interface,
-    /// Broadcasts that the system took.
-    pub sent: u32,
-    /// Why the system did not take a broadcast, the last time.
-    pub refused: Option<io::ErrorKind>,
-    /// Own broadcasts that a second socket of this host heard.
-    pub heard: u32,
-}
-
 /// One who looks at a network. See the [module](self).
 #[derive(Debug)]
 pub struct Survey {
@@ -144,16 +66,6 @@ pub struct Survey {
     foreign: Vec<Foreign>,
     reach: Vec<Reach>,
     dropped: u64,
-}
-
-/// What one datagram says.
-struct News<'n> {
-    source: SocketAddr,
-    header: Header,
-    identity: Option<&'n Identity>,
-    epoch: Option<Epoch>,
-    datagram: Option<&'n Datagram<'n>>,
-    by_broadcast: bool,
 }
 
 impl Survey {
@@ -337,26 +249,12 @@ impl Survey {
                 return;
             }
             None => {
-                self.heard.push(new(news, now));
+                self.heard.push(Heard::new(news, now));
                 self.heard.len().saturating_sub(1)
             }
         };
         let Some(heard) = self.heard.get_mut(place) else { return };
-        heard.last = now;
-        heard.by_broadcast |= news.by_broadcast;
-        match news.datagram {
-            Some(Datagram::WhoHas(search)) => {
-                heard.searches = heard.searches.saturating_add(1);
-                heard.wanted.clone_from(&search.wanted);
-                heard.tcp_port = Some(search.tcp_port).filter(|port| *port > 0);
-            }
-            Some(Datagram::Announce(answer)) => {
-                heard.answers = heard.answers.saturating_add(1);
-                heard.tcp_port = Some(answer.tcp_port).filter(|port| *port > 0);
-                heard.room = Some(answer.room);
-            }
-            Some(Datagram::Session { .. }) | None => heard.others = heard.others.saturating_add(1),
-        }
+        heard.take(news, now);
     }
 
     fn note_foreign(&mut self, source: SocketAddr) {
@@ -366,25 +264,6 @@ impl Survey {
             None if full => self.dropped = self.dropped.saturating_add(1),
             None => self.foreign.push(Foreign { source, datagrams: 1 }),
         }
-    }
-}
-
-fn new(news: &News, now: Duration) -> Heard {
-    Heard {
-        source: news.source,
-        version: news.header.version,
-        fleet: news.header.fleet,
-        identity: news.identity.cloned(),
-        epoch: news.epoch,
-        wanted: None,
-        tcp_port: None,
-        room: None,
-        searches: 0,
-        answers: 0,
-        others: 0,
-        first: now,
-        last: now,
-        by_broadcast: false,
     }
 }
 

@@ -1,5 +1,8 @@
 use std::net::Ipv4Addr;
 
+use cara_core::config::VERSION;
+use cara_core::distribution::hello::Manager;
+
 use super::*;
 
 /// Longest wait for a datagram on loopback.

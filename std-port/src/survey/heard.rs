@@ -1,0 +1,140 @@
+//! What a survey keeps of what it hears.
+
+use std::io;
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use cara_core::config::VERSION;
+use cara_core::distribution::datagram::{Datagram, Header};
+use cara_core::distribution::hello::Manager;
+use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
+
+use super::NAME;
+use crate::sys::interfaces::Interface;
+
+/// One life of a unit, as it was heard from one address.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Heard {
+    /// Where its datagrams came from.
+    pub source: SocketAddr,
+    /// Its protocol version. What is said below of another version than this one's is read as if it were of this one.
+    pub version: u8,
+    /// Its fleet.
+    pub fleet: Fleet,
+    /// Who it is; `None` where its datagrams could not be read beyond their header.
+    pub identity: Option<Identity>,
+    /// Its life.
+    pub epoch: Option<Epoch>,
+    /// The manager that it looks for.
+    pub wanted: Option<Manager>,
+    /// Where it takes connections, at the source's address.
+    pub tcp_port: Option<u16>,
+    /// How many more nodes it takes, as it said last.
+    pub room: Option<u16>,
+    /// Searches of it.
+    pub searches: u32,
+    /// Answers of it.
+    pub answers: u32,
+    /// All other datagrams of it.
+    pub others: u32,
+    /// When it was first heard, since the survey was opened.
+    pub first: Duration,
+    /// When it was last heard, since the survey was opened.
+    pub last: Duration,
+    /// It was heard on the discovery port at least once, as all broadcasts are.
+    pub by_broadcast: bool,
+}
+
+impl Heard {
+    /// Where it takes connections.
+    pub fn listens_at(&self) -> Option<SocketAddr> {
+        self.tcp_port.map(|port| SocketAddr::new(self.source.ip(), port))
+    }
+
+    /// Whether it speaks this version.
+    pub const fn same_version(&self) -> bool {
+        self.version == VERSION
+    }
+
+    /// Whether it is a survey, of this or another host.
+    pub fn is_survey(&self) -> bool {
+        self.identity.as_ref().is_some_and(|identity| identity.name() == NAME && identity.role() == Role::SUnit)
+    }
+
+    pub(super) fn is(&self, news: &News) -> bool {
+        self.source == news.source
+            && self.version == news.header.version
+            && self.fleet == news.header.fleet
+            && self.identity.as_ref() == news.identity
+            && self.epoch == news.epoch
+    }
+
+    pub(super) fn new(news: &News, now: Duration) -> Self {
+        Self {
+            source: news.source,
+            version: news.header.version,
+            fleet: news.header.fleet,
+            identity: news.identity.cloned(),
+            epoch: news.epoch,
+            wanted: None,
+            tcp_port: None,
+            room: None,
+            searches: 0,
+            answers: 0,
+            others: 0,
+            first: now,
+            last: now,
+            by_broadcast: false,
+        }
+    }
+
+    pub(super) fn take(&mut self, news: &News, now: Duration) {
+        self.last = now;
+        self.by_broadcast |= news.by_broadcast;
+        match news.datagram {
+            Some(Datagram::WhoHas(search)) => {
+                self.searches = self.searches.saturating_add(1);
+                self.wanted.clone_from(&search.wanted);
+                self.tcp_port = Some(search.tcp_port).filter(|port| *port > 0);
+            }
+            Some(Datagram::Announce(answer)) => {
+                self.answers = self.answers.saturating_add(1);
+                self.tcp_port = Some(answer.tcp_port).filter(|port| *port > 0);
+                self.room = Some(answer.room);
+            }
+            Some(Datagram::Session { .. }) | None => self.others = self.others.saturating_add(1),
+        }
+    }
+}
+
+/// A sender of datagrams that are not CARA's.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Foreign {
+    /// Where they came from.
+    pub source: SocketAddr,
+    /// How many.
+    pub datagrams: u32,
+}
+
+/// Whether broadcasts leave through an interface, and come back to this host.
+#[derive(Clone, Debug)]
+pub struct Reach {
+    /// The interface.
+    pub interface: Interface,
+    /// Broadcasts that the system took.
+    pub sent: u32,
+    /// Why the system did not take a broadcast, the last time.
+    pub refused: Option<io::ErrorKind>,
+    /// Own broadcasts that a second socket of this host heard.
+    pub heard: u32,
+}
+
+/// What one datagram says.
+pub(super) struct News<'n> {
+    pub(super) source: SocketAddr,
+    pub(super) header: Header,
+    pub(super) identity: Option<&'n Identity>,
+    pub(super) epoch: Option<Epoch>,
+    pub(super) datagram: Option<&'n Datagram<'n>>,
+    pub(super) by_broadcast: bool,
+}
