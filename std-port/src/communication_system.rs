@@ -6,7 +6,7 @@ use std::task::{Poll, Wake, Waker};
 
 use cara_core::config::Constraints;
 use cara_core::distribution::connection_handler::{Finding, Target};
-use cara_core::distribution::identity::{Identity, Role};
+use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
 use cara_core::distribution::parameters::{Parameters, ParametersView};
 use cara_core::error::Error;
 use cara_core::services::requests::CallId;
@@ -15,10 +15,11 @@ use cara_core::time::Duration;
 use core::net::IpAddr;
 
 use crate::builder::{self, Builder};
-use crate::engine::{Engine, lock, read};
+use crate::engine::{Engine, lock, pairs, read};
 use crate::event::UnitEvent;
 use crate::my_function_list::MyFunctionList;
 use crate::peer::Peer;
+use crate::sys::interfaces::Interface;
 
 /// Events that wait for a subscriber before it loses some.
 const EVENTS: usize = 4096;
@@ -104,6 +105,31 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     /// This unit's identity.
     pub fn identity(&self) -> Identity {
         lock(&self.engine().node).node.identity().clone()
+    }
+
+    /// The fleet that it belongs to.
+    pub fn fleet(&self) -> Fleet {
+        lock(&self.engine().node).node.fleet()
+    }
+
+    /// Which of its runs this is: peers tell a restart by it.
+    pub fn epoch(&self) -> Epoch {
+        lock(&self.engine().node).node.epoch()
+    }
+
+    /// Time since it was made.
+    pub fn uptime(&self) -> Duration {
+        self.engine().uptime()
+    }
+
+    /// The UDP port of broadcasts.
+    pub fn discovery_port(&self) -> u16 {
+        self.engine().discovery_port()
+    }
+
+    /// The interfaces that it uses, with those that are down, as they were at most a few seconds ago.
+    pub fn interfaces(&self) -> Vec<Interface> {
+        self.engine().interfaces().to_vec()
     }
 
     /// The TCP port on which the unit takes connections, for s_units that are told a fixed address.
@@ -261,14 +287,22 @@ impl<T: Send + 'static> CommunicationSystem<T> {
         self.engine().pool.shrink();
     }
 
-    /// What happened in discovery and membership: (name, count), zeros included.
+    /// Everything that is counted for the unit as a whole: (name, number), zeros included. What happened in discovery and
+    /// membership; on all links together, those that have ended included; in the port. The last six (`BuffersInUse`,
+    /// `BuffersPeak`, `LinksOpen`, `NodesConnected`, `CallsHeld`, `CallsInFlight`) tell how it is now; no other ever goes
+    /// back.
     pub fn counters(&self) -> Vec<(&'static str, u64)> {
-        lock(&self.engine().node).node.counters.iter().collect()
+        pairs(self.engine().readings())
     }
 
-    /// The last refusals.
+    /// The last refusals, here or there.
     pub fn findings(&self) -> Vec<Finding> {
         lock(&self.engine().node).node.findings().cloned().collect()
+    }
+
+    /// Time since a refusal.
+    pub fn age(&self, finding: &Finding) -> Duration {
+        self.engine().clock.now().since(finding.at)
     }
 }
 

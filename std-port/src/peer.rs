@@ -3,6 +3,9 @@
 use std::fmt;
 use std::sync::Arc;
 
+use cara_core::config::Constraints;
+use cara_core::distribution::function::{Attributes, Definition};
+use cara_core::distribution::hello::Limits;
 use cara_core::distribution::identity::{Epoch, Identity};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
@@ -11,9 +14,10 @@ use cara_core::services::unit::RequestOptions;
 use cara_core::time::Duration;
 use core::net::SocketAddr;
 
-use crate::engine::Engine;
+use crate::builder;
 use crate::engine::link::LinkCell;
 use crate::engine::peers::PeerCell;
+use crate::engine::{Engine, lock, pairs};
 
 /// A node, connected or not. Stays valid when the node leaves, and works again when it comes back.
 pub struct Peer<T: Send + 'static = ()> {
@@ -72,6 +76,15 @@ impl fmt::Display for FunctionNames {
     }
 }
 
+/// A function that a node has published to this unit.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct TheirFunction {
+    /// Its name, arguments and results.
+    pub definition: Definition,
+    /// How it wants to be called.
+    pub attributes: Attributes,
+}
+
 impl<T: Send + 'static> Peer<T> {
     /// Its name, id and role.
     pub fn identity(&self) -> &Identity {
@@ -103,6 +116,31 @@ impl<T: Send + 'static> Peer<T> {
         self.cell.link().and_then(|link| link.lock().session.epoch())
     }
 
+    /// What the node takes, as it last told; `None` while it is not connected.
+    pub fn limits(&self) -> Option<Limits> {
+        self.cell.link().and_then(|link| link.lock().session.hello().map(|hello| hello.limits))
+    }
+
+    /// The constraints in force towards this node: the unit's own, unless they were changed for it.
+    pub fn constraints(&self) -> Constraints {
+        let unit = *lock(&self.engine.node).node.constraints();
+        self.cell.constraints(unit)
+    }
+
+    /// Changes the time-out, the minimum interval and the calls that it may have here for this node alone. They stay when
+    /// it leaves and comes back, also when the unit's own are changed later. [`Error::BadConstraint`] where any other
+    /// constraint differs from the unit's: nodes share the unit's tables and buffers.
+    pub fn set_constraints(&self, constraints: Constraints) -> Result<(), Error> {
+        builder::check(&constraints)?;
+        self.engine.set_peer_constraints(&self.cell, constraints)
+    }
+
+    /// Measures a round trip of the protocol itself, with no function involved: what the network and the two ports take.
+    /// [`Error::TimedOut`] when no answer comes in time.
+    pub fn ping(&self, timeout: impl Into<Duration>) -> Result<Duration, Error> {
+        self.engine.ping(&self.link()?, timeout.into())
+    }
+
     pub(crate) fn link(&self) -> Result<Arc<LinkCell>, Error> {
         self.cell.link().ok_or(Error::NotConnected)
     }
@@ -113,6 +151,19 @@ impl<T: Send + 'static> Peer<T> {
         let state = link.lock();
         let functions = state.session.their_function_list().iter();
         FunctionNames { functions: functions.map(|f| (f.name().to_owned(), f.signature.to_string())).collect() }
+    }
+
+    /// The same with everything that is known of each.
+    pub fn functions(&self) -> Vec<TheirFunction> {
+        let Ok(link) = self.link() else { return Vec::new() };
+        let state = link.lock();
+        let functions = state.session.their_function_list().iter();
+        // What was checked when it came reads back from its text form.
+        let known = functions.filter_map(|function| {
+            let definition = Definition::parse(&function.signature.to_string()).ok()?;
+            Some(TheirFunction { definition, attributes: function.attributes })
+        });
+        known.collect()
     }
 
     /// Waits until the node has published `function`; `false` after `timeout`.
@@ -207,8 +258,8 @@ impl<T: Send + 'static> Peer<T> {
         }
     }
 
-    /// What happened on its link: (name, count), zeros included. Empty while it is not connected.
+    /// What happened on its links, the earlier ones included: (name, count), zeros included.
     pub fn counters(&self) -> Vec<(&'static str, u64)> {
-        self.link().map(|link| link.lock().session.counters().iter().collect()).unwrap_or_default()
+        pairs(self.engine.peer_readings(&self.cell))
     }
 }

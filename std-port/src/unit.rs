@@ -4,17 +4,19 @@ use std::sync::mpsc::{Receiver, sync_channel};
 use std::sync::{Arc, Weak};
 
 use cara_core::config::Constraints;
-use cara_core::distribution::identity::{Identity, Role};
+use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 use cara_core::services::requests::CallId;
+use cara_core::time::Duration;
 
 use crate::builder::{self, Builder, manager};
 use crate::communication_system::Owner;
-use crate::engine::{Engine, lock, read};
+use crate::engine::{Engine, lock, pairs, read};
 use crate::event::UnitEvent;
 use crate::my_function_list::MyFunctionList;
 use crate::peer::Peer;
+use crate::sys::interfaces::Interface;
 
 /// Events that wait for a subscriber before it loses some.
 const EVENTS: usize = 256;
@@ -90,6 +92,31 @@ impl<T: Send + 'static> Unit<T> {
         lock(&self.engine().node).node.identity().clone()
     }
 
+    /// The fleet that it belongs to.
+    pub fn fleet(&self) -> Fleet {
+        lock(&self.engine().node).node.fleet()
+    }
+
+    /// Which of its runs this is: peers tell a restart by it.
+    pub fn epoch(&self) -> Epoch {
+        lock(&self.engine().node).node.epoch()
+    }
+
+    /// Time since it was made.
+    pub fn uptime(&self) -> Duration {
+        self.engine().uptime()
+    }
+
+    /// The UDP port of broadcasts.
+    pub fn discovery_port(&self) -> u16 {
+        self.engine().discovery_port()
+    }
+
+    /// The interfaces that it uses, with those that are down, as they were at most a few seconds ago.
+    pub fn interfaces(&self) -> Vec<Interface> {
+        self.engine().interfaces().to_vec()
+    }
+
     /// The manager, once it has been met.
     pub fn manager(&self) -> Option<Peer<T>> {
         let peers = read(&self.engine().peers);
@@ -157,8 +184,11 @@ impl<T: Send + 'static> Unit<T> {
         receiver
     }
 
-    /// What happened in discovery: (name, count), zeros included.
+    /// Everything that is counted for the unit as a whole: (name, number), zeros included. What happened in discovery and
+    /// membership; on all links together, those that have ended included; in the port. The last six (`BuffersInUse`,
+    /// `BuffersPeak`, `LinksOpen`, `NodesConnected`, `CallsHeld`, `CallsInFlight`) tell how it is now; no other ever goes
+    /// back.
     pub fn counters(&self) -> Vec<(&'static str, u64)> {
-        lock(&self.engine().node).node.counters.iter().collect()
+        pairs(self.engine().readings())
     }
 }

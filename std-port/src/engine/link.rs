@@ -52,6 +52,10 @@ pub(crate) struct LinkState {
     pub(crate) leftover: Vec<u8>,
     /// The timer that is set for the session.
     pub(crate) timer: Instant,
+    /// Somebody waits for the answer to a ping.
+    pub(crate) pinging: bool,
+    /// What it has counted is among the sums of links that have ended.
+    pub(crate) retired: bool,
     /// What is to be done when the lock is given up.
     pub(crate) notices: Vec<Notice>,
 }
@@ -112,6 +116,8 @@ impl LinkCell {
             connecting,
             leftover: Vec::new(),
             timer: Instant::FAR_FUTURE,
+            pinging: false,
+            retired: false,
             notices: Vec::new(),
         };
         Self { seat, id, serial, stream, peer: OnceLock::new(), state: Mutex::new(state), room: Condvar::new() }

@@ -106,6 +106,7 @@ impl<T: Send + 'static> Engine<T> {
 
     pub(super) fn accepted(&self, stream: Stream, address: SocketAddr) {
         if self.open_link(stream, address, None).is_none() {
+            self.accounts.connection_refused();
             tracing::warn!(%address, "a connection was dropped: as many links are open as may be");
         }
     }
@@ -150,6 +151,9 @@ impl<T: Send + 'static> Engine<T> {
         self.with(link, state, |session, cx| session.accept(cx));
         let limit = usize::from(lock(&self.node).node.constraints().maximum_nodes);
         let peer = write(&self.peers).join(&identity, limit, link);
+        if let Some(own) = peer.own_constraints(*state.session.constraints()) {
+            self.with(link, state, |session, cx| session.set_constraints(cx, own));
+        }
         let _ = link.peer.set(peer);
         // Looked up last: who publishes from here on finds the peer, and waits for this link's lock to tell it.
         let visible: Vec<Slot> = {
@@ -176,6 +180,7 @@ impl<T: Send + 'static> Engine<T> {
         match notice {
             Notice::Challenge(old) => self.challenge(old),
             Notice::Answered => {
+                link.room.notify_all();
                 let action = lock(&self.node).node.challenge_answered(self.clock.now(), link.id);
                 self.carry_out(action);
             }
@@ -226,6 +231,7 @@ impl<T: Send + 'static> Engine<T> {
     /// The link's id is free for another link only when nothing here means the old one by it any more.
     fn link_ended(&self, link: &Arc<LinkCell>, reason: CloseReason) {
         let _ = self.crew().epoll.remove(&link.stream);
+        self.retire(link);
         if let Some(peer) = link.peer.get() {
             peer.leave(link);
             self.run_lost_hook();

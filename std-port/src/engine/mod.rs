@@ -1,14 +1,16 @@
 //! What a unit's threads share, and the few ways in which they touch a link.
 //!
-//! Locks, in the order in which they may be taken: a link, then the node, then anything else; never two links. Handlers,
+//! Locks, in the order in which they may be taken: the accounts, a link, then the node, then anything else; never two links. Handlers,
 //! hooks and subscribers run without any of them. A function that has worked on a link ends with [`Engine::settle`],
 //! which gives the lock up and acts on what happened.
 
+mod accounts;
 mod calling;
 mod clock_thread;
 pub(crate) mod link;
 mod membership;
 pub(crate) mod peers;
+mod pinging;
 pub(crate) mod reader;
 mod serving;
 mod state_gate;
@@ -17,12 +19,13 @@ pub(crate) mod workers;
 
 #[cfg(feature = "async")]
 pub(crate) use calling::CallFuture;
+pub(crate) use accounts::pairs;
 pub(crate) use clock_thread::system_refused;
 pub(crate) use membership::NodeCell;
 pub(crate) use workers::arena_bytes;
 
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::sync::mpsc::SyncSender;
+use std::sync::mpsc::{SyncSender, TrySendError};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 
 use cara_core::config::Constraints;
@@ -33,7 +36,7 @@ use cara_core::host::mailman::LinkId;
 use cara_core::host::secure::{Plain, Secure};
 use cara_core::services::unit::{Call, Event, Session, buffer_bytes};
 use cara_core::services::{Context, requests::CallId};
-use cara_core::time::Instant;
+use cara_core::time::{Duration, Instant};
 
 use crate::clock::Clock;
 use crate::event::UnitEvent;
@@ -42,11 +45,12 @@ use crate::pool::MessagePool;
 use crate::storage::Boxed;
 use crate::sys::datagram::{Datagrams, Socket};
 use crate::sys::epoll::{Interest, Ready, Trigger};
+use crate::sys::interfaces::Interface;
 use crate::sys::stream::Listener;
 use crate::threads::{Crew, Driven, Source, Threads};
 use crate::timers::Timers;
 use link::{LinkCell, LinkState, Notice, StdMailman};
-use peers::Peers;
+use peers::{PeerCell, Peers};
 use state_gate::StateGate;
 
 /// Bytes that one read takes from a stream.
@@ -82,6 +86,9 @@ pub(crate) struct Engine<T: 'static> {
     /// Links on which a thread of the pool stays.
     stays: Mutex<Vec<LinkId>>,
     stopping: AtomicBool,
+    /// When the unit was made.
+    born: Instant,
+    accounts: accounts::Accounts,
     subscribers: Mutex<Vec<SyncSender<UnitEvent>>>,
     /// Runs when a peer is lost, before its loss is told.
     pub(crate) lost_hook: Mutex<Option<Arc<crate::handler::Hook<T>>>>,
@@ -123,6 +130,7 @@ pub(crate) struct EngineParts<T: 'static> {
 impl<T: Send + 'static> Engine<T> {
     pub(crate) fn new(parts: EngineParts<T>) -> Arc<Self> {
         let longest_message = AtomicUsize::new(parts.node.longest_message());
+        let born = parts.threads.crew().clock.now();
         Arc::new(Self {
             clock: parts.threads.crew().clock,
             node: Mutex::new(parts.node),
@@ -141,6 +149,8 @@ impl<T: Send + 'static> Engine<T> {
             largest_function: AtomicUsize::new(0),
             stays: Mutex::new(Vec::new()),
             stopping: AtomicBool::new(false),
+            born,
+            accounts: accounts::Accounts::default(),
             subscribers: Mutex::new(Vec::new()),
             lost_hook: Mutex::new(None),
         })
@@ -371,8 +381,13 @@ impl<T: Send + 'static> Engine<T> {
     /// Tells subscribers; one that does not keep up loses the event, and one that is gone is forgotten.
     pub(crate) fn tell(&self, event: UnitEvent) {
         tracing::debug!(?event);
-        lock(&self.subscribers).retain(|subscriber| {
-            !matches!(subscriber.try_send(event.clone()), Err(std::sync::mpsc::TrySendError::Disconnected(_)))
+        lock(&self.subscribers).retain(|subscriber| match subscriber.try_send(event.clone()) {
+            Ok(()) => true,
+            Err(TrySendError::Full(_)) => {
+                self.accounts.event_lost();
+                true
+            }
+            Err(TrySendError::Disconnected(_)) => false,
         });
     }
 
@@ -393,10 +408,38 @@ impl<T: Send + 'static> Engine<T> {
         self.longest_message.store(longest, Ordering::Release);
         for link in self.each_link() {
             let mut state = link.lock();
+            let own = link.peer.get().map_or(constraints, |peer| peer.constraints(constraints));
+            self.with(&link, &mut state, |session, cx| session.set_constraints(cx, own));
+            self.settle(&link, state);
+        }
+        Ok(())
+    }
+
+    /// Changes what differs for one node from the unit's constraints.
+    pub(crate) fn set_peer_constraints(&self, peer: &PeerCell, constraints: Constraints) -> Result<(), Error> {
+        let unit = *lock(&self.node).node.constraints();
+        peer.set_constraints(unit, constraints)?;
+        if let Some(link) = peer.link() {
+            let mut state = link.lock();
             self.with(&link, &mut state, |session, cx| session.set_constraints(cx, constraints));
             self.settle(&link, state);
         }
         Ok(())
+    }
+
+    /// Time since the unit was made.
+    pub(crate) fn uptime(&self) -> Duration {
+        self.clock.now().since(self.born)
+    }
+
+    /// The port of broadcasts.
+    pub(crate) fn discovery_port(&self) -> u16 {
+        self.datagrams.discovery_port()
+    }
+
+    /// The interfaces that are used, with those that are down.
+    pub(crate) fn interfaces(&self) -> Arc<[Interface]> {
+        self.datagrams.targets()
     }
 
     /// Ends every link in an orderly way and all threads. Within a handler it returns before the threads have ended.

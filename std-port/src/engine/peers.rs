@@ -4,14 +4,30 @@
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
+use cara_core::config::Constraints;
 use cara_core::distribution::identity::{Identity, Role};
+use cara_core::error::Error;
+use cara_core::time::Duration;
 
+use super::accounts::Earlier;
 use super::link::LinkCell;
+use super::lock;
 
 /// A node, connected or not.
 pub(crate) struct PeerCell {
     pub(crate) identity: Identity,
     link: Mutex<Option<Arc<LinkCell>>>,
+    /// What differs for this node from the unit's constraints, whether it is connected or not.
+    own: Mutex<Option<OwnConstraints>>,
+    pub(super) earlier: Earlier,
+}
+
+/// The constraints that a node may have of its own.
+#[derive(Clone, Copy)]
+struct OwnConstraints {
+    request_timeout: Duration,
+    minimum_interval: Duration,
+    calls_per_peer: u16,
 }
 
 impl PeerCell {
@@ -22,6 +38,27 @@ impl PeerCell {
 
     pub(crate) fn is_connected(&self) -> bool {
         self.link.lock().unwrap_or_else(PoisonError::into_inner).is_some()
+    }
+
+    /// The unit's constraints with what this node has of its own.
+    pub(crate) fn constraints(&self, unit: Constraints) -> Constraints {
+        self.own_constraints(unit).unwrap_or(unit)
+    }
+
+    pub(super) fn own_constraints(&self, unit: Constraints) -> Option<Constraints> {
+        let own = (*lock(&self.own))?;
+        let OwnConstraints { request_timeout, minimum_interval, calls_per_peer } = own;
+        Some(Constraints { request_timeout, minimum_interval, calls_per_peer, ..unit })
+    }
+
+    /// [`Error::BadConstraint`] for what cannot differ from node to node.
+    pub(super) fn set_constraints(&self, unit: Constraints, wanted: Constraints) -> Result<(), Error> {
+        let Constraints { request_timeout, minimum_interval, calls_per_peer, .. } = wanted;
+        if wanted != (Constraints { request_timeout, minimum_interval, calls_per_peer, ..unit }) {
+            return Err(Error::BadConstraint);
+        }
+        *lock(&self.own) = Some(OwnConstraints { request_timeout, minimum_interval, calls_per_peer });
+        Ok(())
     }
 
     fn join(&self, link: Arc<LinkCell>) {
@@ -57,7 +94,12 @@ impl Peers {
         if let Some(peer) = self.by_identity.get(identity).and_then(|&index| self.list.get(index)) {
             return peer.clone();
         }
-        let peer = Arc::new(PeerCell { identity: identity.clone(), link: Mutex::new(None) });
+        let peer = Arc::new(PeerCell {
+            identity: identity.clone(),
+            link: Mutex::new(None),
+            own: Mutex::new(None),
+            earlier: Mutex::new(None),
+        });
         let away = if self.list.len() < limit { None } else { self.list.iter().position(|peer| !peer.is_connected()) };
         let index = match away.and_then(|index| self.list.get_mut(index).map(|place| (index, place))) {
             Some((index, place)) => {
@@ -90,7 +132,6 @@ impl Peers {
 
 #[cfg(test)]
 mod tests {
-    use cara_core::config::Constraints;
     use cara_core::distribution::hello::{Hello, Limits};
     use cara_core::distribution::identity::{Epoch, Fleet};
     use cara_core::host::mailman::LinkId;

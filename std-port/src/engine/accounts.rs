@@ -1,0 +1,187 @@
+//! What a unit has counted: in discovery, on each link, over all links that it ever had, and in the port itself.
+//!
+//! A link's counters are added to those of the links before it when it ends, so that a sum never goes back. The lock of
+//! the sums is taken before any other.
+
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use cara_core::counters::{Counter, Counters};
+use cara_core::host::connections::LinkCounter;
+
+use super::link::LinkCell;
+use super::peers::PeerCell;
+use super::{Engine, lock, read};
+
+/// The counters of a link, or of many.
+pub(crate) type LinkCounters = Counters<LinkCounter, { LinkCounter::COUNT }>;
+
+/// What outlives the links, and what is counted outside of the core.
+#[derive(Default)]
+pub(crate) struct Accounts {
+    /// Of links that have ended.
+    ended: Mutex<LinkCounters>,
+    events_lost: AtomicU64,
+    connections_refused: AtomicU64,
+}
+
+impl Accounts {
+    /// A subscriber did not keep up.
+    pub(super) fn event_lost(&self) {
+        self.events_lost.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// A connection found no room.
+    pub(super) fn connection_refused(&self) {
+        self.connections_refused.fetch_add(1, Ordering::Relaxed);
+    }
+}
+
+/// One number about a unit or a link.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Reading {
+    pub(crate) group: Group,
+    pub(crate) name: &'static str,
+    /// What is counted, in a sentence.
+    pub(crate) help: &'static str,
+    /// It tells how it is now, so it goes down as well.
+    pub(crate) gauge: bool,
+    pub(crate) value: u64,
+}
+
+/// What a number is about.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Group {
+    /// Discovery and membership.
+    Node,
+    /// All links together, those that have ended included.
+    Links,
+    /// The port: tables, buffers, threads.
+    Unit,
+    /// The links to one node.
+    Link,
+}
+
+/// What the links hold now.
+#[derive(Default)]
+struct Held {
+    links: u64,
+    calls: u64,
+    in_flight: u64,
+}
+
+impl<T: Send + 'static> Engine<T> {
+    /// Everything that is counted for the unit as a whole.
+    pub(crate) fn readings(&self) -> Vec<Reading> {
+        let (links, held) = self.sum_links();
+        let node = lock(&self.node).node.counters.clone();
+        let mut readings: Vec<_> = of(Group::Node, &node).chain(of(Group::Links, &links)).collect();
+        readings.extend(self.port_readings(&held));
+        readings
+    }
+
+    /// What the links to a node have counted.
+    pub(crate) fn peer_readings(&self, peer: &PeerCell) -> Vec<Reading> {
+        let _accounts = lock(&self.accounts.ended);
+        let mut counters = peer.earlier();
+        if let Some(link) = peer.link() {
+            let state = link.lock();
+            if !state.retired {
+                counters.merge(state.session.counters());
+            }
+        }
+        of(Group::Link, &counters).collect()
+    }
+
+    /// A link has ended: what it has counted is kept.
+    pub(super) fn retire(&self, link: &LinkCell) {
+        let mut ended = lock(&self.accounts.ended);
+        let mut state = link.lock();
+        if !std::mem::replace(&mut state.retired, true) {
+            ended.merge(state.session.counters());
+            if let Some(peer) = link.peer.get() {
+                peer.keep(state.session.counters());
+            }
+        }
+    }
+
+    fn sum_links(&self) -> (LinkCounters, Held) {
+        let ended = lock(&self.accounts.ended);
+        let (mut sum, mut held) = (ended.clone(), Held::default());
+        for link in self.each_link() {
+            let state = link.lock();
+            if !state.retired {
+                sum.merge(state.session.counters());
+                held.links += 1;
+                held.calls += u64::from(state.session.calls_held());
+                held.in_flight += state.session.calls_in_flight() as u64;
+            }
+        }
+        (sum, held)
+    }
+
+    fn port_readings(&self, held: &Held) -> [Reading; 9] {
+        let pool = self.pool.counters();
+        let connected = read(&self.peers).connected().count() as u64;
+        let load = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
+        [
+            count(
+                "EventsLost",
+                "Events that a subscriber lost because it did not keep up.",
+                load(&self.accounts.events_lost),
+            ),
+            count(
+                "ConnectionsRefused",
+                "Connections dropped because as many links were open as may be.",
+                load(&self.accounts.connections_refused),
+            ),
+            count(
+                "BuffersRefused",
+                "Times that all message buffers were in use when one was asked for.",
+                pool.exhausted,
+            ),
+            gauge("BuffersInUse", "Message buffers in use.", pool.in_use as u64),
+            gauge("BuffersPeak", "Most message buffers that were in use at a time.", pool.peak as u64),
+            gauge("LinksOpen", "Links that are open, those that have not joined yet included.", held.links),
+            gauge("NodesConnected", "Nodes that are connected.", connected),
+            gauge("CallsHeld", "Calls of other nodes that run or wait here.", held.calls),
+            gauge("CallsInFlight", "Calls of this unit that wait for a reply.", held.in_flight),
+        ]
+    }
+}
+
+fn of<C: Counter, const N: usize>(group: Group, counters: &Counters<C, N>) -> impl Iterator<Item = Reading> {
+    C::ALL.iter().map(move |&counter| Reading {
+        group,
+        name: counter.name(),
+        help: counter.help(),
+        gauge: false,
+        value: counters.value(counter),
+    })
+}
+
+const fn count(name: &'static str, help: &'static str, value: u64) -> Reading {
+    Reading { group: Group::Unit, name, help, gauge: false, value }
+}
+
+const fn gauge(name: &'static str, help: &'static str, value: u64) -> Reading {
+    Reading { group: Group::Unit, name, help, gauge: true, value }
+}
+
+/// Readings as the API shows them: name and number.
+pub(crate) fn pairs(readings: Vec<Reading>) -> Vec<(&'static str, u64)> {
+    readings.into_iter().map(|reading| (reading.name, reading.value)).collect()
+}
+
+/// The counters that a node's earlier links have left.
+pub(super) type Earlier = Mutex<Option<Box<LinkCounters>>>;
+
+impl PeerCell {
+    fn earlier(&self) -> LinkCounters {
+        lock(&self.earlier).as_deref().cloned().unwrap_or_default()
+    }
+
+    fn keep(&self, counters: &LinkCounters) {
+        lock(&self.earlier).get_or_insert_default().merge(counters);
+    }
+}
