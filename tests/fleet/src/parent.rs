@@ -1,0 +1,91 @@
+//! The child processes as the one that measures sees them.
+
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, anyhow};
+use cara_processes::Process;
+use serde::de::DeserializeOwned;
+
+use crate::child::{Counters, Question, Ready};
+
+/// Longest wait for an answer; the longest question waits a minute itself.
+const PATIENCE: Duration = Duration::from_secs(180);
+
+/// A running child.
+pub(crate) struct Child {
+    process: Process,
+    pub(crate) pid: u32,
+    /// When its process was started.
+    pub(crate) started: Instant,
+}
+
+/// Which fleet, and on which port its units look for each other.
+#[derive(Clone, Copy)]
+pub(crate) struct Place {
+    pub(crate) fleet: u32,
+    pub(crate) port: u16,
+}
+
+impl Place {
+    /// One of its own, so that several runs on one machine do not meet.
+    pub(crate) fn new() -> Self {
+        let fleet = cara_processes::random_fleet();
+        // Below the ports that the kernel gives out.
+        Self { fleet, port: 20_000 + (fleet % 10_000) as u16 }
+    }
+}
+
+impl Child {
+    pub(crate) fn manager(place: Place, nodes: u16) -> Result<Self> {
+        Self::start("manager", place, &["--nodes", &nodes.to_string()])
+    }
+
+    /// S_units with ID numbers from `first` on.
+    pub(crate) fn units(place: Place, first: u32, count: u32) -> Result<Self> {
+        Self::start("units", place, &["--first", &first.to_string(), "--count", &count.to_string()])
+    }
+
+    fn start(role: &str, place: Place, more: &[&str]) -> Result<Self> {
+        let (fleet, port) = (place.fleet.to_string(), place.port.to_string());
+        let arguments = [role, "--fleet", &fleet, "--port", &port];
+        let started = Instant::now();
+        let mut process = Process::start(role, &std::env::current_exe()?, arguments.iter().chain(more))?;
+        let ready = process.expect("pid", PATIENCE)?;
+        let Ready { pid } = serde_json::from_str(&ready.text)?;
+        Ok(Self { process, pid, started })
+    }
+
+    /// Asks and waits for the answer.
+    pub(crate) fn ask<A: DeserializeOwned>(&mut self, question: &Question) -> Result<A> {
+        self.ask_when(question).map(|(answer, _)| answer)
+    }
+
+    /// Also tells when the answer came.
+    pub(crate) fn ask_when<A: DeserializeOwned>(&mut self, question: &Question) -> Result<(A, Instant)> {
+        self.process.send(&serde_json::to_string(question)?)?;
+        let line = self.process.expect("{\"", PATIENCE)?;
+        let answer: Result<A, String> = serde_json::from_str(&line.text)?;
+        Ok((answer.map_err(|error| anyhow!("{}: {error}", self.process.name()))?, line.at))
+    }
+
+    pub(crate) fn counters(&mut self) -> Result<Counters> {
+        self.ask(&Question::Counters)
+    }
+
+    /// Ends it as a loss of power would; when.
+    pub(crate) fn kill(mut self) -> Result<Instant> {
+        self.process.kill()
+    }
+}
+
+/// Broadcasts that the units of these processes have sent: questions of all, and the managers' answers to all.
+pub(crate) fn broadcasts<'c>(children: impl IntoIterator<Item = &'c mut Child>) -> Result<u64> {
+    let mut sum = 0;
+    for child in children {
+        let counters = child.counters()?;
+        for name in ["WhoHasSent", "AnnounceBroadcast"] {
+            sum += counters.get(name).with_context(|| format!("no counter {name}"))?;
+        }
+    }
+    Ok(sum)
+}

@@ -1,0 +1,199 @@
+//! The run, phase by phase.
+
+use std::time::{Duration, Instant};
+
+use anyhow::{Result, ensure};
+
+use crate::Plan;
+use crate::child::{Block, Called, Question};
+use crate::parent::{Child, Place, broadcasts};
+use crate::proc::{self, Memory, ThreadWatch};
+use crate::report::{Comparison, Figures, Joining};
+use crate::units::TEXT_BYTES;
+
+/// How long everybody may take before the run is given up.
+const PATIENCE_MS: u64 = 60_000;
+/// Broadcasts are counted for so long after a start: the last of the four questions of a manager is among them.
+const COUNTED: Duration = Duration::from_secs(12);
+/// Calls of one block.
+const CALLS: usize = 400;
+/// How long nothing happens before memory is looked at.
+const REST: Duration = Duration::from_secs(1);
+
+/// The processes of the fleet that is measured.
+struct Fleet {
+    manager: Child,
+    /// All s_units but the first.
+    many: Child,
+    /// The first one, in a process of its own, as those that it is compared with.
+    single: Child,
+}
+
+/// The ID number of the s_unit that has a process of its own, and of one that does not.
+const SINGLE: u32 = 1;
+const AMONG: u32 = 2;
+
+impl Fleet {
+    fn broadcasts(&mut self) -> Result<u64> {
+        broadcasts([&mut self.manager, &mut self.many, &mut self.single])
+    }
+}
+
+/// Measures everything.
+pub(crate) fn run(plan: &Plan) -> Result<Figures> {
+    let nodes = usize::from(plan.nodes);
+    let place = Place::new();
+    say("starting");
+    let mut manager = Child::manager(place, plan.nodes)?;
+    let threads = ThreadWatch::new(manager.pid);
+    let empty = empty_manager()?;
+    let single = Child::units(place, SINGLE, 1)?;
+    let began = single.started;
+    let many = Child::units(place, AMONG, u32::from(plan.nodes) - 1)?;
+    let unit_threads = ThreadWatch::new(many.pid);
+    let connected_ms = connected(&mut manager, nodes, began)?;
+    let mut fleet = Fleet { manager, many, single };
+    say("calling each, and all");
+    let exchanged: Called = fleet.manager.ask(&Question::Exchange { chars: TEXT_BYTES as usize })?;
+    std::thread::sleep(REST);
+    let after = proc::memory(fleet.manager.pid)?;
+    let () = fleet.manager.ask(&Question::Trim)?;
+    let trimmed = proc::memory(fleet.manager.pid)?;
+    let called: Called = fleet.manager.ask(&Question::CallAll)?;
+    let runs = fleet.runs()?;
+    std::thread::sleep(COUNTED.saturating_sub(began.elapsed()));
+    let joining = Joining { all_ms: connected_ms, broadcasts: fleet.broadcasts()?, most_in_a_second: None };
+    say("comparing the cost of a request");
+    let costs = compare(plan, &mut fleet)?;
+    let threads_before = threads.most();
+    drop(threads);
+    say("restarting the manager");
+    let (restart, threads_after) = restart(plan, place, fleet)?;
+    Ok(Figures {
+        nodes,
+        joining,
+        exchanged,
+        called,
+        runs,
+        memory: per_node(nodes, empty, after),
+        memory_trimmed: per_node(nodes, empty, trimmed),
+        manager_threads: threads_before.max(threads_after),
+        unit_threads: unit_threads.most(),
+        costs,
+        restart,
+    })
+}
+
+fn say(what: &str) {
+    eprintln!("fleet: {what}");
+}
+
+impl Fleet {
+    /// Fewest and most runs of `touch` on a node.
+    fn runs(&mut self) -> Result<(u32, u32)> {
+        let (many, single): ((u32, u32), (u32, u32)) =
+            (self.many.ask(&Question::Runs)?, self.single.ask(&Question::Runs)?);
+        Ok((many.0.min(single.0), many.1.max(single.1)))
+    }
+}
+
+/// Milliseconds from `began` until all are connected; they offer their functions then as well.
+fn connected(manager: &mut Child, count: usize, began: Instant) -> Result<f64> {
+    let (in_time, at): (bool, Instant) = manager.ask_when(&Question::Connected { count, within_ms: PATIENCE_MS })?;
+    ensure!(in_time, "not all of {count} nodes were connected after {PATIENCE_MS} ms");
+    let in_time: bool = manager.ask(&Question::Offering { count, within_ms: PATIENCE_MS })?;
+    ensure!(in_time, "not all of {count} nodes offered their functions after {PATIENCE_MS} ms");
+    Ok(at.saturating_duration_since(began).as_secs_f64() * 1e3)
+}
+
+/// The memory of a manager's process that has no node, and tables for one only.
+fn empty_manager() -> Result<Memory> {
+    let manager = Child::manager(Place::new(), 1)?;
+    std::thread::sleep(REST);
+    proc::memory(manager.pid)
+}
+
+/// KiB of resident memory and of anonymous memory that each node added.
+fn per_node(nodes: usize, empty: Memory, full: Memory) -> [f64; 2] {
+    [(empty.resident_kib, full.resident_kib), (empty.anonymous_kib, full.anonymous_kib)]
+        .map(|(before, after)| (after as f64 - before as f64) / nodes as f64)
+}
+
+/// The cost of a request with one node, with one node again, and with all of them, in turns: on one CPU, where the time
+/// is the work of both ends, and on two, where it includes waking the other one.
+fn compare(plan: &Plan, fleet: &mut Fleet) -> Result<[Comparison; 2]> {
+    let mut alone = Pair::start()?;
+    let mut again = Pair::start()?;
+    let [first, second] = proc::two_cpus()?;
+    let mut both = [Comparison::default(), Comparison::default()];
+    for (comparison, other) in both.iter_mut().zip([first, second]) {
+        let managers = [&alone.manager, &again.manager, &fleet.manager].map(|child| (child.pid, first));
+        let units = [&alone.unit, &again.unit, &fleet.many, &fleet.single].map(|child| (child.pid, other));
+        managers.into_iter().chain(units).try_for_each(|(pid, cpu)| proc::pin(pid, Some(cpu)))?;
+        turns(plan.rounds, comparison, &mut alone, &mut again, fleet)?;
+    }
+    [&fleet.many, &fleet.single].iter().try_for_each(|child| proc::pin(child.pid, None))?;
+    Ok(both)
+}
+
+fn turns(
+    rounds: u32,
+    comparison: &mut Comparison,
+    alone: &mut Pair,
+    again: &mut Pair,
+    fleet: &mut Fleet,
+) -> Result<()> {
+    let node = |node| Question::Block { node, calls: CALLS };
+    // The first turn warms up and does not count.
+    for turn in 0..=rounds {
+        let one: Block = alone.manager.ask(&node(Some(SINGLE)))?;
+        let blocks = [
+            again.manager.ask(&node(Some(SINGLE)))?,
+            fleet.manager.ask(&node(Some(SINGLE)))?,
+            fleet.manager.ask(&node(Some(AMONG)))?,
+            fleet.manager.ask(&node(None))?,
+        ];
+        if turn > 0 {
+            comparison.add(one, blocks);
+        }
+    }
+    Ok(())
+}
+
+/// A manager with one node.
+struct Pair {
+    manager: Child,
+    unit: Child,
+}
+
+impl Pair {
+    fn start() -> Result<Self> {
+        let place = Place::new();
+        let mut manager = Child::manager(place, 1)?;
+        let unit = Child::units(place, SINGLE, 1)?;
+        connected(&mut manager, 1, Instant::now())?;
+        Ok(Self { manager, unit })
+    }
+}
+
+/// Kills the manager's process and starts a new one.
+fn restart(plan: &Plan, place: Place, fleet: Fleet) -> Result<(Joining, usize)> {
+    let Fleet { manager, mut many, mut single } = fleet;
+    let before = broadcasts([&mut many, &mut single])?;
+    let killed = manager.kill()?;
+    let mut manager = Child::manager(place, plan.nodes)?;
+    let threads = ThreadWatch::new(manager.pid);
+    let all_ms = connected(&mut manager, usize::from(plan.nodes), killed)?;
+    let (mut last, mut most) = (before, 0);
+    loop {
+        let total = broadcasts([&mut manager, &mut many, &mut single])?;
+        most = most.max(total.saturating_sub(last));
+        last = total;
+        if killed.elapsed() >= COUNTED {
+            break;
+        }
+        std::thread::sleep(Duration::from_secs(1));
+    }
+    let joining = Joining { all_ms, broadcasts: last - before, most_in_a_second: Some(most) };
+    Ok((joining, threads.most()))
+}
