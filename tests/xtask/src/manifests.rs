@@ -169,7 +169,10 @@ fn allowed(from: Place, to: Place, for_tests: bool) -> bool {
         // Typed services are a macro that the core re-exports.
         (Place::Core, to) => to == Place::CoreMember,
         (Place::CoreMember, to) => matches!(to, Place::Core | Place::CoreMember),
-        (Place::Port, to) => matches!(to, Place::Core | Place::CoreMember),
+        (Place::Port, Place::Core | Place::CoreMember) => true,
+        // What tests of ports stand on: networks, processes, applications.
+        (Place::Port | Place::CommandLine, Place::Tests | Place::Examples) => for_tests,
+        (Place::Port, _) => false,
         (_, Place::Core | Place::CoreMember | Place::Port) => true,
         // The simulator is there for an application's own tests.
         (Place::Examples, Place::Tests) => for_tests,

@@ -1,0 +1,36 @@
+//! An executor that sleeps with WFI. embassy's own sleeps with WFE, which QEMU does not wait at: an idle board would
+//! keep a core of the host busy.
+#![allow(unsafe_code)]
+
+use core::ptr::null_mut;
+use core::sync::atomic::{AtomicBool, Ordering};
+
+use embassy_executor::{Spawner, raw};
+use static_cell::StaticCell;
+
+/// A task has been woken since the executor last looked.
+static WOKEN: AtomicBool = AtomicBool::new(false);
+
+#[unsafe(export_name = "__pender")]
+fn pender(_context: *mut ()) {
+    WOKEN.store(true, Ordering::Release);
+}
+
+/// Runs tasks for ever, beginning with those that `first` spawns.
+pub fn run(first: impl FnOnce(Spawner)) -> ! {
+    static EXECUTOR: StaticCell<raw::Executor> = StaticCell::new();
+    let executor = EXECUTOR.init_with(|| raw::Executor::new(null_mut()));
+    first(executor.spawner());
+    loop {
+        // SAFETY: called here only, and not from within itself: `run` does not return, and `EXECUTOR` is taken once.
+        unsafe { executor.poll() };
+        cortex_m::interrupt::disable();
+        // An interrupt that comes after this look still ends the wait, and runs when interrupts are on again.
+        if !WOKEN.load(Ordering::Acquire) {
+            cortex_m::asm::wfi();
+        }
+        WOKEN.store(false, Ordering::Relaxed);
+        // SAFETY: this is no part of a critical section.
+        unsafe { cortex_m::interrupt::enable() };
+    }
+}

@@ -1,0 +1,28 @@
+//! What the board lm3s6965evb needs below embassy: Ethernet controller, clock, executor, stack paint, faults, watchdog,
+//! and its settings. The board exists for QEMU's sake: an emulated Cortex-M3 on which firmware is tested.
+//!
+//! "Data sheet" is Texas Instruments, *Stellaris LM3S6965 Microcontroller*, DS-LM3S6965; register names are as there.
+
+#![no_std]
+
+pub mod arguments;
+pub mod clock;
+pub mod ethernet;
+pub mod executor;
+pub mod fault;
+mod register;
+pub mod reset;
+pub mod stack;
+pub mod watchdog;
+
+/// Starts the clock and paints the stack; call it first, once.
+///
+/// The core's peripherals, for whoever needs more of them; `None` if they were taken before.
+pub fn start() -> Option<cortex_m::Peripherals> {
+    stack::paint();
+    let mut peripherals = cortex_m::Peripherals::take()?;
+    clock::start(&mut peripherals.SYST);
+    Some(peripherals)
+}
+
+defmt::timestamp!("{=u64:us}", embassy_time::Instant::now().as_micros());

@@ -1,0 +1,58 @@
+//! Registers of the chip's peripherals: the one place that reads and writes addresses.
+#![allow(unsafe_code)]
+
+use cortex_m::peripheral::NVIC;
+use lm3s6965::Interrupt;
+
+/// A register of 32 bits.
+#[derive(Clone, Copy)]
+pub(crate) struct Register(*mut u32);
+
+// SAFETY: a register is the same for everybody; who may touch it when is the business of its peripheral's module.
+unsafe impl Sync for Register {}
+
+/// The registers of a peripheral.
+#[derive(Clone, Copy)]
+pub(crate) struct Block(usize);
+
+/// Ethernet controller.
+pub(crate) const ETHERNET: Block = Block(0x4004_8000);
+/// General-purpose timer 0.
+pub(crate) const TIMER_0: Block = Block(0x4003_0000);
+/// System control.
+pub(crate) const SYSTEM: Block = Block(0x400F_E000);
+/// Watchdog timer.
+pub(crate) const WATCHDOG: Block = Block(0x4000_0000);
+
+impl Block {
+    /// The register at an offset in bytes. An offset beyond the block's 4 KiB does not compile.
+    pub(crate) const fn at(self, offset: usize) -> Register {
+        assert!(offset < 0x1000 && offset.is_multiple_of(4));
+        Register((self.0 + offset) as *mut u32)
+    }
+}
+
+impl Register {
+    /// Reads it.
+    pub(crate) fn read(self) -> u32 {
+        // SAFETY: `Block::at` makes aligned addresses within the peripherals of this chip, which are always mapped.
+        unsafe { self.0.read_volatile() }
+    }
+
+    /// Writes it.
+    pub(crate) fn write(self, value: u32) {
+        // SAFETY: as for `read`; no peripheral named here writes to memory by itself.
+        unsafe { self.0.write_volatile(value) }
+    }
+
+    /// Sets bits, and leaves the others. Not for registers that an interrupt changes, unless interrupts are off.
+    pub(crate) fn set(self, bits: u32) {
+        self.write(self.read() | bits);
+    }
+}
+
+/// Lets an interrupt through.
+pub(crate) fn unmask(interrupt: Interrupt) {
+    // SAFETY: no critical section here is built on masked interrupts; they disable all of them.
+    unsafe { NVIC::unmask(interrupt) }
+}

@@ -1,0 +1,42 @@
+//! Why the board started (data sheet, System Control: RESC).
+
+use crate::register::{Register, SYSTEM};
+
+const RESC: Register = SYSTEM.at(0x05C);
+const EXTERNAL: u32 = 1;
+const POWER_ON: u32 = 1 << 1;
+const BROWN_OUT: u32 = 1 << 2;
+const WATCHDOG: u32 = 1 << 3;
+const SOFTWARE: u32 = 1 << 4;
+
+/// Why the board started.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, defmt::Format)]
+pub enum Reason {
+    /// Power came.
+    PowerOn,
+    /// The reset pin.
+    Pin,
+    /// The voltage was too low.
+    BrownOut,
+    /// The program hung.
+    Watchdog,
+    /// The program asked for it.
+    Program,
+    /// The chip does not say.
+    Unknown,
+}
+
+/// The reason of this start. The register keeps reasons until they are cleared, which this does: ask once.
+pub fn reason() -> Reason {
+    let cause = RESC.read();
+    RESC.write(0);
+    let has = |bit| cause & bit != 0;
+    match () {
+        () if has(WATCHDOG) => Reason::Watchdog,
+        () if has(SOFTWARE) => Reason::Program,
+        () if has(BROWN_OUT) => Reason::BrownOut,
+        () if has(POWER_ON) => Reason::PowerOn,
+        () if has(EXTERNAL) => Reason::Pin,
+        () => Reason::Unknown,
+    }
+}

@@ -1,0 +1,45 @@
+//! How much of the stack has been used: it is painted at the start, and what is still painted was never reached.
+#![allow(unsafe_code)]
+
+const PAINT: u32 = 0xC0FF_EE11;
+/// Bytes below the stack pointer that painting itself may need.
+const MARGIN: usize = 64;
+
+unsafe extern "C" {
+    static mut __sheap: u32;
+    static mut _stack_start: u32;
+}
+
+/// Bytes of the stack.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, defmt::Format)]
+pub struct Stack {
+    /// Used at some time since the start.
+    pub used: usize,
+    /// There are.
+    pub size: usize,
+}
+
+/// Paints what is not in use.
+#[inline(never)]
+pub(crate) fn paint() {
+    let end = cortex_m::register::msp::read() as usize - MARGIN;
+    let mut place = &raw mut __sheap;
+    while (place as usize) < end {
+        // SAFETY: between the end of static memory and the stack pointer nobody has anything.
+        unsafe {
+            place.write_volatile(PAINT);
+            place = place.add(1);
+        }
+    }
+}
+
+/// Looks how far the paint reaches.
+pub fn used() -> Stack {
+    let (bottom, top) = (&raw const __sheap, &raw const _stack_start as usize);
+    let mut place = bottom;
+    // SAFETY: reads words between the end of static memory and the start of the stack, which are RAM.
+    while (place as usize) < top && unsafe { place.read_volatile() } == PAINT {
+        place = unsafe { place.add(1) };
+    }
+    Stack { used: top - place as usize, size: top - bottom as usize }
+}
