@@ -10,7 +10,7 @@ mod receiver;
 mod sender;
 
 pub use counters::LinkCounter;
-pub use liveness::Liveness;
+pub use liveness::{Liveness, Look};
 
 use crate::config::{MINIMUM_CHUNK_BYTES, Priority};
 use crate::counters::Counters;

@@ -146,16 +146,29 @@ impl<S: Storage, C: Secure> Session<S, C> {
         if cx.now >= self.timers.keep_alive {
             self.send_keep_alive(cx);
         }
-        let (missed, lost) = self.liveness.poll(cx.now);
-        if missed {
-            self.link.counters.add(LinkCounter::KeepAlivesMissed, 1);
-        }
-        if lost {
-            self.close(cx, CloseReason::Silent);
-        }
+        self.look_for_peer(cx);
         match self.phase {
             Phase::Ending(reason) => self.poll_ending(cx, reason),
             _ => None,
+        }
+    }
+
+    /// Asks a peer that has missed a keep-alive for a sign of life, and gives it up when none comes.
+    fn look_for_peer<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+        let look = self.liveness.poll(cx.now);
+        if look.missed {
+            self.link.counters.add(LinkCounter::KeepAlivesMissed, 1);
+        }
+        if look.lost {
+            return self.close(cx, CloseReason::Silent);
+        }
+        if look.ask {
+            self.send_datagram(cx, &SessionBody::PING, &[]);
+        }
+        if look.ask && look.missed {
+            // Datagrams may have ceased to pass while the stream goes on; it needs no more than one question each time.
+            self.send_ping(cx.now);
+            self.flush(cx);
         }
     }
 
