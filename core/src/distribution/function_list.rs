@@ -183,6 +183,17 @@ impl<S: Storage> TheirFunctionList<S> {
         self.skipped = 0;
     }
 
+    /// Entries and bytes of signatures that are free.
+    pub fn room(&self) -> (usize, usize) {
+        (self.table.free_entries(), self.table.free_bytes())
+    }
+
+    /// Moves to longer slices and gives those back that are not needed any more, which are the new ones where they are
+    /// shorter.
+    pub(crate) fn grow(&mut self, entries: S::Slice<Entry>, bytes: S::Slice<u8>) -> (S::Slice<Entry>, S::Slice<u8>) {
+        self.table.grow(entries, bytes)
+    }
+
     /// The slices, with nothing in them.
     pub(crate) fn into_slices(mut self) -> (S::Slice<Entry>, S::Slice<u8>) {
         self.table.clear();

@@ -81,20 +81,44 @@ impl<H> Default for Entry<H> {
     }
 }
 
+/// What a table is lent.
+pub(super) type Slices<S, H> = (<S as Storage>::Slice<Entry<H>>, <S as Storage>::Slice<u8>);
+
 /// Entries, and one arena for all their signatures without gaps.
 pub(super) struct Table<S: Storage, H: 'static> {
     pub(super) entries: S::Slice<Entry<H>>,
     pub(super) bytes: S::Slice<u8>,
     used: usize,
+    len: usize,
 }
 
 impl<S: Storage, H: 'static> Table<S, H> {
     pub(super) fn new(entries: S::Slice<Entry<H>>, bytes: S::Slice<u8>) -> Self {
-        Self { entries, bytes, used: 0 }
+        Self { entries, bytes, used: 0, len: 0 }
     }
 
     pub(super) fn free_index(&self) -> Option<usize> {
         self.entries.iter().position(|entry| entry.function.is_none())
+    }
+
+    pub(super) fn free_entries(&self) -> usize {
+        self.entries.len().saturating_sub(self.len)
+    }
+
+    /// Moves to longer slices; shorter ones are given back as they are.
+    pub(super) fn grow(&mut self, mut entries: S::Slice<Entry<H>>, mut bytes: S::Slice<u8>) -> Slices<S, H> {
+        if entries.len() < self.entries.len() || bytes.len() < self.bytes.len() {
+            return (entries, bytes);
+        }
+        for (new, old) in entries.iter_mut().zip(self.entries.iter_mut()) {
+            core::mem::swap(new, old);
+        }
+        if let (Some(old), Some(new)) = (self.bytes.get(..self.used), bytes.get_mut(..self.used)) {
+            copy(old, new);
+        }
+        core::mem::swap(&mut self.entries, &mut entries);
+        core::mem::swap(&mut self.bytes, &mut bytes);
+        (entries, bytes)
     }
 
     pub(super) fn free_bytes(&self) -> usize {
@@ -117,12 +141,14 @@ impl<S: Storage, H: 'static> Table<S, H> {
         let length = signature.len() as u16;
         entry.function = Some(Stored { slot, at: saturate(self.used), length, attributes, handler });
         self.used = end;
+        self.len = self.len.saturating_add(1);
         Ok(())
     }
 
     /// Empties an entry and closes the gap in the arena.
     pub(super) fn take(&mut self, index: usize) -> Option<Stored<H>> {
         let removed = self.entries.get_mut(index)?.function.take()?;
+        self.len = self.len.saturating_sub(1);
         let length = usize::from(removed.length);
         if let Some(tail) = self.bytes.get_mut(removed.at as usize..self.used) {
             let end = tail.len();
@@ -141,6 +167,7 @@ impl<S: Storage, H: 'static> Table<S, H> {
         for entry in self.entries.iter_mut() {
             entry.function = None;
         }
+        self.len = 0;
         self.used = 0;
     }
 

@@ -112,6 +112,28 @@ impl<S: Storage> Requests<S> {
         self.close(id).map(|pending| pending.id)
     }
 
+    /// Moves to more slots: a multiple of those before, since the slot of an id follows from their number. Returns the
+    /// slots that are not needed any more, which are the new ones where they do not fit.
+    pub(crate) fn grow(&mut self, mut pending: S::Slice<Option<Pending>>) -> S::Slice<Option<Pending>> {
+        let times = pending.len().checked_rem(self.pending.len());
+        if pending.len() < self.pending.len() || times.is_some_and(|rest| rest != 0) {
+            return pending;
+        }
+        pending.iter_mut().for_each(|slot| *slot = None);
+        core::mem::swap(&mut self.pending, &mut pending);
+        for call in pending.iter().flatten() {
+            if let Some(place) = self.place(call.id) {
+                *place = Some(*call);
+            }
+        }
+        pending
+    }
+
+    /// How many calls may be in flight.
+    pub(crate) fn slots(&self) -> usize {
+        self.pending.len()
+    }
+
     /// The slots, all empty.
     pub(crate) fn into_slots(mut self) -> S::Slice<Option<Pending>> {
         self.pending.iter_mut().for_each(|slot| *slot = None);
@@ -171,6 +193,21 @@ mod tests {
         assert_eq!(requests.gate(later, interval), Err(Error::TooSoon { wait: Duration::from_millis(6) }));
         assert_eq!(requests.gate(Instant::from_micros(10_000), interval), Ok(()));
         assert_eq!(requests.gate(later, Duration::ZERO), Ok(()));
+    }
+
+    #[test]
+    fn calls_in_flight_keep_their_ids_when_there_are_more_slots() {
+        let mut requests = table(2);
+        let ids = [30, 10].map(|deadline| open(&mut requests, deadline).unwrap().unwrap());
+        assert_eq!(requests.grow(vec![None; 1].into_boxed_slice()).len(), 1, "fewer are given back");
+        assert_eq!(requests.grow(vec![None; 3].into_boxed_slice()).len(), 3, "no multiple");
+        assert_eq!(requests.grow(vec![None; 6].into_boxed_slice()).len(), 2);
+        assert_eq!((requests.slots(), requests.in_flight()), (6, 2));
+        (0..4).for_each(|_| assert!(open(&mut requests, 50).is_ok()));
+        assert_eq!(open(&mut requests, 50), Err(Error::Full(Limit::Calls)));
+        assert_eq!(requests.expire(Instant::from_micros(20)), Some(ids[1]));
+        assert_eq!(requests.close(ids[0]).unwrap().deadline, Instant::from_micros(30));
+        assert_eq!(requests.in_flight(), 4);
     }
 
     proptest! {

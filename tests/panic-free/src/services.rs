@@ -61,6 +61,14 @@ entry!(session_dismantled, {
     }
 });
 
+entry!(session_grown, {
+    let session = session();
+    keep((session.call_slots(), session.publication_slots()));
+    keep(session.lend_calls(unknown_slice()));
+    keep(session.lend_functions((unknown_slice(), unknown_slice())));
+    keep(session.lend_publications(unknown_slice()));
+});
+
 entry!(session_asked, {
     let session = session();
     keep((session.link(), session.dialed(), session.is_live(), session.is_ended(), session.hello()));

@@ -72,6 +72,32 @@ fn replacing_makes_old_requests_stale() {
 }
 
 #[test]
+fn a_peers_list_keeps_its_functions_in_longer_slices() {
+    let mut list = theirs(2, 8);
+    let tell = |list: &mut Theirs, slot: u16, text: &str| {
+        list.insert(Slot(slot), Generation(7), usual(), parse(text).as_bytes())
+    };
+    tell(&mut list, 0, "a()").unwrap();
+    assert_eq!(list.room(), (1, 8 - parse("a()").as_bytes().len()));
+    assert!(tell(&mut list, 1, "b(position: int[2])").is_err());
+    let slices = |functions: usize, bytes: usize| {
+        ((0..functions).map(|_| Entry::empty()).collect::<Vec<_>>().into_boxed_slice(), vec![0; bytes].into())
+    };
+    let (entries, bytes) = slices(1, 100);
+    assert_eq!(list.grow(entries, bytes).0.len(), 1, "shorter ones are given back");
+    let (entries, bytes) = slices(8, 100);
+    assert_eq!(list.grow(entries, bytes).0.len(), 2);
+    tell(&mut list, 1, "b(position: int[2])").unwrap();
+    tell(&mut list, 9, "c()").unwrap();
+    assert_eq!(format!("{}", list.show_functions()), "a()\nb(position: int[2])\nc()\n");
+    assert!(list.iter().all(|function| function.generation == Generation(7)));
+    assert!(list.remove(Slot(0)));
+    assert_eq!((list.room().0, list.len(), list.skipped()), (6, 2, 1));
+    list.clear();
+    assert_eq!(list.room(), (8, 100));
+}
+
+#[test]
 fn full_names_the_limit_and_changes_nothing() {
     let mut list = mine(2, 9);
     list.add_function(&parse("a()"), usual(), 1).unwrap();

@@ -16,12 +16,14 @@
 
 mod answering;
 mod inbound;
+mod lending;
 mod outbound;
 mod pinging;
 mod publishing;
 mod timing;
 
 pub use inbound::{Receipt, ReplyBlock};
+pub use lending::ListSlices;
 pub use outbound::{Delivery, RequestOptions};
 pub use publishing::Publication;
 

@@ -60,6 +60,21 @@ impl<S: Storage> Publishing<S> {
         self.table
     }
 
+    pub(super) fn slots(&self) -> usize {
+        self.table.len()
+    }
+
+    pub(super) fn grow(&mut self, mut table: S::Slice<Publication>) -> S::Slice<Publication> {
+        if table.len() < self.table.len() {
+            return table;
+        }
+        for (new, old) in table.iter_mut().zip(self.table.iter()) {
+            *new = *old;
+        }
+        core::mem::swap(&mut self.table, &mut table);
+        table
+    }
+
     pub(super) fn told(&self, slot: Slot, generation: Generation) -> Told {
         match self.table.get(usize::from(slot.0)) {
             Some(publication) if publication.wanted == Some(generation) => Told::Now,

@@ -114,3 +114,18 @@ fn a_list_that_finds_no_room_goes_out_when_there_is_some() {
     pair.settle();
     assert!(pair.agv.has(&Happened::Acknowledged { serial, skipped: 8 }));
 }
+
+#[test]
+fn what_was_published_stays_so_in_a_longer_table() {
+    let mut pair = Pair::with_position();
+    let longer = |slots: usize| std::vec![Default::default(); slots].into_boxed_slice();
+    let before = pair.agv.session.publication_slots();
+    assert_eq!(pair.agv.session.lend_publications(longer(before - 1)).len(), before - 1, "fewer are given back");
+    assert_eq!(pair.agv.session.lend_publications(longer(before + 8)).len(), before);
+    let id = pair.manager.call("pos_info", &none()).unwrap();
+    pair.settle();
+    assert!(pair.manager.outcome(id).unwrap().is_ok());
+    let serial = pair.agv.publish();
+    pair.settle();
+    assert!(pair.agv.has(&Happened::Acknowledged { serial, skipped: 0 }));
+}

@@ -1,0 +1,40 @@
+//! Longer tables for a session that is open: a port with an allocator begins with short ones, so that a link costs what
+//! its peer needs and no more.
+
+use super::publishing::Publication;
+use super::{Entry, Pending, Session};
+use crate::host::secure::Secure;
+use crate::storage::Storage;
+
+/// A peer's list: one entry per function, and the bytes of their signatures.
+pub type ListSlices<S> = (<S as Storage>::Slice<Entry>, <S as Storage>::Slice<u8>);
+
+impl<S: Storage, C: Secure> Session<S, C> {
+    /// How many calls of this unit may be in flight.
+    pub fn call_slots(&self) -> usize {
+        self.requests.slots()
+    }
+
+    /// Lends more slots for calls of this unit, a multiple of those before. Returns the slots that are not needed any
+    /// more: the new ones if they are no such multiple.
+    pub fn lend_calls(&mut self, pending: S::Slice<Option<Pending>>) -> S::Slice<Option<Pending>> {
+        self.requests.grow(pending)
+    }
+
+    /// Lends more room for the peer's list; functions that were skipped before stay so until the peer tells them again.
+    /// Returns the slices that are not needed any more: the new ones if one of them is shorter than before.
+    pub fn lend_functions(&mut self, (entries, bytes): ListSlices<S>) -> ListSlices<S> {
+        self.theirs.grow(entries, bytes)
+    }
+
+    /// Functions of this unit's own list that the peer can be told of.
+    pub fn publication_slots(&self) -> usize {
+        self.publishing.slots()
+    }
+
+    /// Lends more slots for functions of this unit's own list. Returns the slots that are not needed any more: the new
+    /// ones if they are fewer.
+    pub fn lend_publications(&mut self, publications: S::Slice<Publication>) -> S::Slice<Publication> {
+        self.publishing.grow(publications)
+    }
+}
