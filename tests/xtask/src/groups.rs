@@ -211,7 +211,8 @@ fn doc() -> Result<()> {
 }
 
 fn thumb(extent: Extent) -> Result<()> {
-    Run::cargo().args(["build", "--package", "cara-core", "--target", panic_free::TARGET]).stream()?;
+    let packages = ["--package", "cara-core", "--package", "cara-smoltcp"];
+    Run::cargo().args(["build", "--target", panic_free::TARGET]).args(packages).stream()?;
     if extent == Extent::Full { panic_free::check() } else { Ok(()) }
 }
 

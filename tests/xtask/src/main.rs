@@ -9,10 +9,10 @@ mod bench;
 mod command;
 mod demo;
 mod dependencies;
+mod firmware;
 mod groups;
 mod hygiene;
 mod install;
-mod later;
 mod layers;
 mod licences;
 mod links;
@@ -67,9 +67,6 @@ enum Task {
         /// Which board.
         #[arg(value_name = "BOARD")]
         board: Option<String>,
-        /// Also runs the image in QEMU.
-        #[arg(long)]
-        run: bool,
     },
 }
 
@@ -78,9 +75,9 @@ fn main() -> ExitCode {
         Task::Demo => demo::run(),
         Task::Test { list: true, .. } => runner::list(),
         Task::Test { groups, quick, list: false } => runner::run(&groups, quick),
-        Task::Sizes { .. } => Ok(later::SIZES.refuse()),
+        Task::Sizes { json } => firmware::sizes(json.as_deref()),
         Task::Bench { quick, json } => bench::run(quick, json.as_deref()),
-        Task::Firmware { .. } => Ok(later::FIRMWARE.refuse()),
+        Task::Firmware { board } => firmware::build(board.as_deref()),
     };
     finished.unwrap_or_else(|error| {
         eprintln!("xtask: {error:#}");
