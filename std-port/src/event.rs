@@ -20,14 +20,21 @@ pub enum UnitEvent {
         /// Why.
         reason: CloseReason,
     },
-    /// A link ended before it joined: refused here or there, or silent.
+    /// A link ended before it joined: refused here or there, silent, or it could not be opened. `DuplicateIdentity` with
+    /// this unit's own identity in `peer`: another live unit has it, and one of the two waits for the other's end.
     NotJoined {
         /// The other end.
         address: SocketAddr,
-        /// Who it said it is.
+        /// Who it said it is, or is thought to be.
         peer: Option<Identity>,
         /// Why.
         reason: CloseReason,
+    },
+    /// The interfaces that can be used have changed, or the unit has found none at its start. It searches again by itself.
+    InterfacesChanged {
+        /// Names of those that are up, `lo` among them. Where there is no other one, no node on another host can be found;
+        /// where there is none at all, no node.
+        up: Vec<String>,
     },
     /// A node published or withdrew functions.
     ListChanged {

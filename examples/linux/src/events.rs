@@ -21,6 +21,7 @@ fn show(event: &UnitEvent) {
         UnitEvent::LeaseEnded { peer, function, expired: true } => say!("lease of {function} at {peer} expired"),
         UnitEvent::LeaseEnded { peer, function, expired: false } => say!("{function} at {peer} is finished"),
         UnitEvent::NotJoined { address, reason, .. } => say!("{address} did not join: {reason}"),
+        UnitEvent::InterfacesChanged { up } => say!("interfaces that are up: {}", up.join(" ")),
         UnitEvent::FunctionsSkipped { peer, skipped } => say!("{peer} has no room for {skipped} functions"),
     }
 }

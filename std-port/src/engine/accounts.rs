@@ -31,9 +31,9 @@ impl Accounts {
         self.events_lost.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// A connection found no room.
-    pub(super) fn connection_refused(&self) {
-        self.connections_refused.fetch_add(1, Ordering::Relaxed);
+    /// A connection found no room. Returns how many did so before.
+    pub(super) fn connection_refused(&self) -> u64 {
+        self.connections_refused.fetch_add(1, Ordering::Relaxed)
     }
 }
 

@@ -45,7 +45,13 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     fn datagram(&self, from: SocketAddr, bytes: &[u8]) {
-        let sorted = lock(&self.node).node.datagram(self.clock.now(), from, bytes);
+        let (sorted, twin) = {
+            let mut cell = lock(&self.node);
+            (cell.node.datagram(self.clock.now(), from, bytes), cell.node.take_twin())
+        };
+        if let Some(address) = twin {
+            self.twin_heard(address);
+        }
         let Sorted::Session { link, nonce, body } = sorted else { return };
         let Some(link) = self.link(link) else { return };
         let mut state = link.lock();

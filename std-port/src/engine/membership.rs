@@ -3,10 +3,10 @@
 use std::sync::Arc;
 
 use cara_core::config::Constraints;
-use cara_core::distribution::connection_handler::{Action, Admission, Node};
+use cara_core::distribution::connection_handler::{Action, Admission, Node, NodeCounter};
 use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::identity::Identity;
-use cara_core::error::{CloseReason, Error, Refusal};
+use cara_core::error::{CloseReason, Error, Limit, Refusal};
 use cara_core::host::mailman::LinkId;
 use cara_core::host::secure::Plain;
 use cara_core::services::publications::Publications;
@@ -105,9 +105,31 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     pub(super) fn accepted(&self, stream: Stream, address: SocketAddr) {
+        if read(&self.links).iter().all(Option::is_some) {
+            self.make_room();
+        }
         if self.open_link(stream, address, None).is_none() {
-            self.accounts.connection_refused();
-            tracing::warn!(%address, "a connection was dropped: as many links are open as may be");
+            if self.accounts.connection_refused() == 0 {
+                tracing::warn!(%address, "a connection was dropped, as others may be from now on: {}", Limit::Links);
+            }
+        }
+    }
+
+    /// Ends the link that has waited longest for its peer's first word, so that nobody who connects and says nothing
+    /// keeps others out. One whose hello waits to be read has spoken.
+    fn make_room(&self) {
+        let mut unproven = self.each_link();
+        unproven.retain(|link| link.peer.get().is_none());
+        unproven.sort_unstable_by_key(|link| link.serial);
+        for link in unproven {
+            let Some(mut state) = link.try_lock() else { continue };
+            if state.session.dialed() || state.session.hello().is_some() || link.stream.has_unread() {
+                continue;
+            }
+            self.with(&link, &mut state, |session, cx| session.close(cx, CloseReason::HelloTimeout));
+            self.settle(&link, state);
+            lock(&self.node).node.counters.add(NodeCounter::GaveWay, 1);
+            return;
         }
     }
 
@@ -115,8 +137,18 @@ impl<T: Send + 'static> Engine<T> {
         let stream = Stream::connect(to).ok();
         if stream.and_then(|stream| self.open_link(stream, to, Some(Dialed(identity)))).is_none() {
             lock(&self.node).node.dial_failed(self.clock.now(), identity);
+            let (peer, reason) = (identity.cloned(), CloseReason::DialFailed);
+            self.tell(UnitEvent::NotJoined { address: to, peer, reason });
         }
         self.wake_clock();
+    }
+
+    /// Another live unit has this one's identity.
+    pub(super) fn twin_heard(&self, address: SocketAddr) {
+        let refusal = Refusal::DuplicateIdentity;
+        let own = lock(&self.node).node.identity().clone();
+        tracing::warn!(%address, name = own.name(), id = own.id(), "{refusal}");
+        self.tell(UnitEvent::NotJoined { address, peer: Some(own), reason: CloseReason::Refused(refusal) });
     }
 
     /// The connection that this unit opened is there, or could not be opened.

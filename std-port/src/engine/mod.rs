@@ -7,6 +7,7 @@
 mod accounts;
 mod calling;
 mod clock_thread;
+mod interfaces;
 pub(crate) mod link;
 mod membership;
 pub(crate) mod peers;
@@ -17,9 +18,9 @@ mod state_gate;
 mod staying;
 pub(crate) mod workers;
 
+pub(crate) use accounts::pairs;
 #[cfg(feature = "async")]
 pub(crate) use calling::CallFuture;
-pub(crate) use accounts::pairs;
 pub(crate) use clock_thread::system_refused;
 pub(crate) use membership::NodeCell;
 pub(crate) use workers::arena_bytes;
@@ -85,6 +86,7 @@ pub(crate) struct Engine<T: 'static> {
     largest_function: AtomicUsize,
     /// Links on which a thread of the pool stays.
     stays: Mutex<Vec<LinkId>>,
+    interfaces: Mutex<interfaces::InterfaceWatch>,
     stopping: AtomicBool,
     /// When the unit was made.
     born: Instant,
@@ -148,6 +150,7 @@ impl<T: Send + 'static> Engine<T> {
             longest_message,
             largest_function: AtomicUsize::new(0),
             stays: Mutex::new(Vec::new()),
+            interfaces: Mutex::default(),
             stopping: AtomicBool::new(false),
             born,
             accounts: accounts::Accounts::default(),
@@ -496,7 +499,7 @@ impl<T: Send + 'static> Driven for Engine<T> {
     }
 
     fn keep_time(&self) -> Instant {
-        self.poll_links().min(self.poll_node()).min(self.relieve_stays())
+        self.poll_links().min(self.poll_node()).min(self.relieve_stays()).min(self.watch_interfaces())
     }
 
     fn read_datagrams(&self, socket: Socket, buffer: &mut [u8]) {

@@ -125,7 +125,8 @@ impl Datagrams {
     /// Sends one datagram to the discovery port of all nodes on each interface. `false` when no interface took it.
     pub fn broadcast(&self, datagram: &[u8]) -> bool {
         let mut sent = false;
-        for target in self.targets().iter().filter(|interface| interface.up).filter_map(|interface| interface.broadcast)
+        for target in
+            self.targets().iter().filter(|interface| interface.is_usable()).filter_map(|interface| interface.broadcast)
         {
             sent |= self.send_to(SocketAddrV4::new(target, self.discovery_port).into(), datagram);
         }
@@ -139,6 +140,24 @@ impl Datagrams {
             *targets = Targets { list: look(self.interfaces).into(), asked: Instant::now() };
         }
         targets.list.clone()
+    }
+
+    /// Names of the interfaces on which broadcasts can go out now, asked of the system.
+    pub fn usable(&self) -> Vec<String> {
+        let list: Arc<[Interface]> = look(self.interfaces).into();
+        *self.targets.lock().unwrap_or_else(PoisonError::into_inner) =
+            Targets { list: list.clone(), asked: Instant::now() };
+        list.iter().filter(|interface| interface.is_usable()).map(|interface| interface.name.clone()).collect()
+    }
+
+    /// Whether nodes that this unit may look for can be reached on the interfaces of these names.
+    pub fn reaches_others(&self, usable: &[String]) -> bool {
+        let targets = self.targets();
+        let elsewhere = |interface: &Interface| !interface.address.is_loopback() && usable.contains(&interface.name);
+        match self.interfaces {
+            Interfaces::Loopback => !usable.is_empty(),
+            Interfaces::All => targets.iter().any(elsewhere),
+        }
     }
 
     fn is_own(&self, source: SocketAddrV4) -> bool {

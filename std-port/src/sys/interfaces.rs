@@ -57,6 +57,13 @@ pub struct Interface {
     pub up: bool,
 }
 
+impl Interface {
+    /// Whether broadcasts can go out here.
+    pub const fn is_usable(&self) -> bool {
+        self.up && self.broadcast.is_some()
+    }
+}
+
 /// All IPv4 addresses of all interfaces, those that are down included.
 pub fn interfaces() -> io::Result<Vec<Interface>> {
     let found = if_addrs::get_if_addrs()?;

@@ -9,7 +9,7 @@ use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 
 use cara_core::error::CloseReason;
 use cara_core::time::Duration;
-use rustix::io::{Errno, ioctl_fionbio};
+use rustix::io::{Errno, ioctl_fionbio, ioctl_fionread};
 use rustix::net::{
     AddressFamily, RecvFlags, SendAncillaryBuffer, SendFlags, Shutdown, SocketFlags, SocketType, accept_with, bind,
     connect, getpeername, getsockname, listen, recv, send, sendmsg, shutdown, socket_with, sockopt,
@@ -148,6 +148,11 @@ impl Stream {
             Err(Errno::AGAIN | Errno::INTR | Errno::NOBUFS | Errno::NOMEM) => Received::WouldBlock,
             Err(_) => Received::Closed,
         }
+    }
+
+    /// Whether bytes, or the stream's end, wait to be received.
+    pub fn has_unread(&self) -> bool {
+        ioctl_fionread(&self.socket).is_ok_and(|count| count > 0)
     }
 
     /// Ends both directions: what was sent still goes out, a thread that waits in a receive returns, and both ends

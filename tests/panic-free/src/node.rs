@@ -45,10 +45,12 @@ entry!(node_set, {
 entry!(node_polled, {
     keep(node().poll(*unknown(), &mut AnyMailman));
     node().broadcast(*unknown());
+    node().network_changed(*unknown());
 });
 
 entry!(node_hears, {
     keep(node().datagram(*unknown(), *unknown(), unknown_slice()));
+    keep(node().take_twin());
 });
 
 entry!(node_admits, {

@@ -75,6 +75,8 @@ pub enum Seen {
     Left(Identity, CloseReason),
     /// A link ended before its peer had joined.
     NotJoined(CloseReason),
+    /// The unit's interface has come, or gone.
+    InterfaceChanged(bool),
     /// A peer's list was read anew.
     ListChanged(Identity),
     /// An asynchronous request was not run, or failed.

@@ -116,7 +116,7 @@ pub enum NetEvent {
         /// The host.
         host: HostId,
     },
-    /// The host has another address; its streams lead nowhere.
+    /// The host has another address, and its streams lead nowhere; or its interface went down or came up.
     AddressChanged {
         /// The host.
         host: HostId,

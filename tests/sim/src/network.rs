@@ -61,6 +61,8 @@ struct Host {
     /// The machine is on: it answers strays with a reset even where no process runs.
     power: bool,
     running: bool,
+    /// Its cable is in.
+    plugged: bool,
     /// Counts crashes, so that timers of an earlier life do not go off in a later one.
     life: u32,
     /// Until then it neither sees nor does anything.

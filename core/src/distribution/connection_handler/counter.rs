@@ -63,5 +63,7 @@ crate::counters::counters! {
         Forgotten,
         /// Nodes heard for which the table has no room.
         TableFull,
+        /// Links whose peers had said nothing yet, ended to make room for newer ones.
+        GaveWay,
     }
 }

@@ -19,6 +19,7 @@ mod links;
 mod search;
 mod table;
 mod timetable;
+mod twins;
 mod views;
 
 pub use admission::Admission;
@@ -42,6 +43,7 @@ use answers::Answers;
 use search::{Budget, Search};
 use table::Table;
 use timetable::Task;
+use twins::Twins;
 
 /// Whom a unit wants to reach.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -182,6 +184,7 @@ pub struct Node<S: Storage> {
     search: Search,
     budget: Budget,
     answers: Answers,
+    twins: Twins,
     /// Of the last search or answer.
     sequence: u32,
     /// What happened.
@@ -203,6 +206,7 @@ impl<S: Storage> Node<S> {
             search: Search::new(now, config.identity.role(), &mut random),
             budget: Budget::new(),
             answers: Answers::new(),
+            twins: Twins::default(),
             sequence: 0,
             counters: Counters::new(),
             config,

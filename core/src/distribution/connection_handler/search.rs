@@ -164,6 +164,15 @@ impl<S: Storage> Node<S> {
         }
     }
 
+    /// The port has an interface again, or another one: what is searched for may be there, and pauses begin anew.
+    pub fn network_changed(&mut self, now: Instant) {
+        match self.config.target {
+            Target::Fixed(..) if self.table.joined() == 0 => self.dial_target(now),
+            Target::Fixed(..) => {}
+            Target::Everybody | Target::Manager(_) => self.search_again(now, true),
+        }
+    }
+
     /// Asks a few times, as after the start, whoever is connected. Only m_units do: one of them may have moved.
     pub(super) fn look_around(&mut self, now: Instant) {
         if self.config.target == Target::Everybody && !self.is_searching() {
@@ -224,7 +233,7 @@ impl<S: Storage> Node<S> {
     }
 
     pub(super) fn heard_who_has(&mut self, now: Instant, from: SocketAddr, who_has: &WhoHas) {
-        if self.is_own(now, from, &who_has.identity, who_has.epoch) {
+        if self.is_own(now, from, &who_has.identity, who_has.epoch, Some(who_has.nonce)) {
             return;
         }
         self.counters.add(NodeCounter::WhoHasHeard, 1);
@@ -282,7 +291,7 @@ impl<S: Storage> Node<S> {
     }
 
     pub(super) fn heard_announce(&mut self, now: Instant, from: SocketAddr, announce: &Announce) {
-        if self.is_own(now, from, &announce.identity, announce.epoch) {
+        if self.is_own(now, from, &announce.identity, announce.epoch, None) {
             return;
         }
         self.counters.add(NodeCounter::AnnounceHeard, 1);
@@ -316,16 +325,5 @@ impl<S: Storage> Node<S> {
 
     fn is_connected(&self, identity: &Identity, epoch: Epoch) -> bool {
         self.node(identity).is_some_and(|known| known.is_joined() && known.epoch == epoch)
-    }
-
-    fn is_own(&mut self, now: Instant, from: SocketAddr, identity: &Identity, epoch: Epoch) -> bool {
-        if *identity != self.config.identity {
-            return false;
-        }
-        if epoch != self.config.epoch {
-            self.counters.add(NodeCounter::OwnIdentity, 1);
-            self.note_of(now, from, identity, Refusal::DuplicateIdentity);
-        }
-        true
     }
 }

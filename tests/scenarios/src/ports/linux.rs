@@ -510,6 +510,7 @@ fn seen(event: UnitEvent) -> Option<Seen> {
         UnitEvent::RequestFailed { call, error, .. } => Seen::Failed(call, error),
         UnitEvent::LeaseExpired { function, .. } => Seen::LeaseExpired(function),
         UnitEvent::LeaseEnded { function, expired, .. } => Seen::LeaseEnded(function, expired),
+        UnitEvent::InterfacesChanged { up } => Seen::InterfaceChanged(!up.is_empty()),
         UnitEvent::FunctionsSkipped { .. } => return None,
     })
 }

@@ -484,6 +484,7 @@ fn seen(event: UnitEvent) -> Option<Seen> {
         UnitEvent::Failed { id, error, .. } => Seen::Failed(id, error),
         UnitEvent::LeaseExpired { function } => Seen::LeaseExpired(function),
         UnitEvent::LeaseEnded { function, expired, .. } => Seen::LeaseEnded(function, expired),
+        UnitEvent::InterfaceChanged { up } => Seen::InterfaceChanged(up),
         UnitEvent::Started | UnitEvent::Stopped | UnitEvent::Called { .. } => return None,
     })
 }

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use cara_core::config::PLAIN_PORT;
 use cara_core::time::{Duration, Instant};
 
-use super::{Happening, Network};
+use super::{Happening, Host, Network};
 use crate::event::{HostId, NetEvent};
 use crate::faults::Fault;
 
@@ -16,14 +16,14 @@ const LONGEST_DATAGRAM: usize = 65_507;
 const KEPT_BACK: Duration = Duration::from_millis(5);
 
 impl Network {
-    /// Sends one datagram from the host's own UDP port. `false` when the host is down, the datagram is too long or
+    /// Sends one datagram from the host's own UDP port. `false` when the host or its interface is down, the datagram is too long or
     /// the address is no IPv4 one; `true` says nothing of its arrival.
     pub fn send_to(&mut self, host: HostId, to: SocketAddr, datagram: &[u8]) -> bool {
         let SocketAddr::V4(to) = to else { return false };
         if !self.can_send(host, datagram) {
             return false;
         }
-        let wants = |port| move |host: &super::Host| host.udp_port == port || Self::is_discovery_port(port);
+        let wants = |port| move |host: &Host| host.udp_port == port || Self::is_discovery_port(port);
         if let Some(receiver) = self.find(*to.ip(), wants(to.port())) {
             let leaves = self.leave(host, receiver, self.path(host, receiver), datagram.len());
             self.send_datagram(host, receiver, to.port(), &Arc::from(datagram), leaves);
@@ -58,7 +58,8 @@ impl Network {
     }
 
     fn can_send(&self, host: HostId, datagram: &[u8]) -> bool {
-        self.host(host).running && datagram.len() <= LONGEST_DATAGRAM
+        let Host { running, plugged, .. } = *self.host(host);
+        running && plugged && datagram.len() <= LONGEST_DATAGRAM
     }
 
     fn send_datagram(&mut self, from_host: HostId, to: HostId, port: u16, bytes: &Arc<[u8]>, leaves: Instant) {

@@ -38,6 +38,7 @@ impl Network {
             segment,
             power: true,
             running: true,
+            plugged: true,
             life: 0,
             suspended: Instant::START,
             udp_port,
@@ -95,6 +96,11 @@ impl Network {
     /// for a firewall that drops strays.
     pub fn answer_strays(&mut self, host: HostId, answers: bool) {
         self.host_mut(host).answers_strays = answers;
+    }
+
+    /// Whether the host has an interface that is up.
+    pub fn is_plugged(&self, host: HostId) -> bool {
+        self.host(host).plugged
     }
 
     /// Whether a process runs on the host.

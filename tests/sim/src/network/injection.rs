@@ -132,7 +132,18 @@ impl Network {
     }
 
     pub(super) fn is_cut(&self, from: HostId, to: HostId) -> bool {
-        self.partitions.iter().any(|partition| partition.cuts(from, to))
+        let plugged = self.host(from).plugged && self.host(to).plugged;
+        !plugged || self.partitions.iter().any(|partition| partition.cuts(from, to))
+    }
+
+    /// Takes the host's only interface down or up again: unlike under a partition the host knows, and its sends fail.
+    /// [`NetEvent::AddressChanged`] follows. Streams stall, as with a partition.
+    pub fn plug(&mut self, host: HostId, plugged: bool) {
+        if !plugged {
+            self.counts.count(Fault::Partition);
+        }
+        self.host_mut(host).plugged = plugged;
+        self.ready.push_back(NetEvent::AddressChanged { host });
     }
 
     // --- freezing

@@ -3,7 +3,7 @@
 use std::net::SocketAddr;
 use std::rc::Rc;
 
-use cara_core::distribution::connection_handler::{Action, Admission, Sorted};
+use cara_core::distribution::connection_handler::{Action, Admission, NodeCounter, Sorted};
 use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::identity::Identity;
 use cara_core::error::{CloseReason, Error, Refusal};
@@ -56,7 +56,7 @@ impl Inner {
                 return Some(host);
             }
             NetEvent::Restarted { .. } => self.start(shared, host),
-            NetEvent::AddressChanged { .. } => (),
+            NetEvent::AddressChanged { .. } => self.network_changed(shared, host),
             NetEvent::Timer { token: NODE_TIMER, .. } => self.work_node(shared, host),
             NetEvent::Timer { token, .. } => self.work(shared, host, (token - 1) as u16),
             NetEvent::Datagram { from, bytes, .. } => self.datagram(shared, host, from, &bytes),
@@ -101,6 +101,12 @@ impl Inner {
         let unit = &mut self.units[host.index()];
         let functions = unit.settings.functions;
         let Some(machine) = &mut unit.machine else { return };
+        let silent = if machine.links.free_index().is_none() { machine.links.oldest_silent() } else { None };
+        if let Some(index) = silent {
+            machine.node.counters.add(NodeCounter::GaveWay, 1);
+            self.close(shared, host, index, CloseReason::HelloTimeout);
+        }
+        let Some(machine) = &mut self.units[host.index()].machine else { return };
         match machine.open(&mut self.network, functions, stream, from, false) {
             None => self.network.reset(stream),
             Some(index) => {
@@ -113,13 +119,30 @@ impl Inner {
     fn datagram(&mut self, shared: &Rc<Shared>, host: HostId, from: SocketAddr, bytes: &[u8]) {
         let Some(machine) = &mut self.units[host.index()].machine else { return };
         match machine.node.datagram(self.network.now(), from, bytes) {
-            Sorted::Done => self.work_node(shared, host),
+            Sorted::Done => {
+                if machine.node.take_twin().is_some() {
+                    let reason = CloseReason::Refused(Refusal::DuplicateIdentity);
+                    self.log(shared, host, UnitEvent::LinkEnded { reason });
+                }
+                self.work_node(shared, host);
+            }
             Sorted::Session { link, nonce, body } => {
                 let happened = machine.links.datagram(&mut self.network, link.0, from, nonce, body);
                 self.happened(shared, host, link.0, happened);
                 self.resume(shared, host);
             }
         }
+    }
+
+    /// The host's interface went or came, or has another address.
+    fn network_changed(&mut self, shared: &Rc<Shared>, host: HostId) {
+        let Some(machine) = &mut self.units[host.index()].machine else { return };
+        let up = self.network.is_plugged(host);
+        if up {
+            machine.node.network_changed(self.network.now());
+        }
+        self.log(shared, host, UnitEvent::InterfaceChanged { up });
+        self.work_node(shared, host);
     }
 
     /// Lets the node do what is due.

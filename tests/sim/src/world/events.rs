@@ -23,10 +23,15 @@ pub enum UnitEvent {
         /// Why.
         reason: CloseReason,
     },
-    /// A link ended before its peer had joined.
+    /// A link ended before its peer had joined, or another live unit has this one's identity.
     LinkEnded {
         /// Why.
         reason: CloseReason,
+    },
+    /// The unit's host has lost its interface, has it back, or has another address.
+    InterfaceChanged {
+        /// It can be used now.
+        up: bool,
     },
     /// A peer's list of functions has been read anew.
     ListChanged {

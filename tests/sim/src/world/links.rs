@@ -82,6 +82,15 @@ impl Links {
         self.links.iter().position(Option::is_none).map(|index| index as u16)
     }
 
+    /// The link, of those that others have opened, that has waited longest for its peer's hello.
+    pub(super) fn oldest_silent(&self) -> Option<u16> {
+        let silent = |index: &&u16| {
+            let link = self.link(**index);
+            link.is_some_and(|link| !link.session.dialed() && link.session.hello().is_none())
+        };
+        self.by_stream.values().find(silent).copied()
+    }
+
     pub(super) fn insert(&mut self, index: u16, session: SimSession, stream: StreamId) {
         self.streams[usize::from(index)] = Some(stream);
         self.by_stream.insert(stream, index);

@@ -195,6 +195,43 @@ fn own_datagrams_are_ignored_and_a_double_is_told() {
     node.datagram(at(0), address(2, 7_001), &who_has_bytes(&search_of(&double, 1)));
     assert_eq!(node.counters.value(NodeCounter::OwnIdentity), 1);
     assert_eq!(node.findings().next().map(|finding| finding.refusal), Some(Refusal::DuplicateIdentity));
+    // It is told once, and the double is answered, since it would hear nothing otherwise.
+    assert_eq!((node.take_twin(), node.take_twin()), (Some(address(2, 7_001)), None));
+    let mut outbox = Outbox::default();
+    run(&mut node, at(1), &mut outbox);
+    assert_eq!(outbox.sent.iter().map(|(to, _)| *to).collect::<Vec<_>>(), [address(2, 7_001)]);
+    node.datagram(at(2), address(2, 7_001), &who_has_bytes(&search_of(&double, 2)));
+    assert_eq!(node.take_twin(), None);
+    let announce = as_announce(&outbox.sent[0].1);
+    let mut other = super::node(double);
+    other.datagram(at(3), address(1, 7_001), &announce_bytes(&announce));
+    assert_eq!(other.take_twin(), Some(address(1, 7_001)));
+}
+
+/// Whoever claims one life after the other does not fill the application's log.
+#[test]
+fn doubles_are_told_now_and_then_only() {
+    let mut node = depot();
+    let own = m_unit(MANAGER, MANAGER_ID);
+    let mut told = 0;
+    for life in 0..1_000 {
+        let double = NodeConfig { epoch: Epoch(1_000 + life), ..own.clone() };
+        node.datagram(at(life * 20), address(2, 7_001), &who_has_bytes(&search_of(&double, 1)));
+        told += u32::from(node.take_twin().is_some());
+    }
+    assert_eq!(told, 3, "in 20 s");
+}
+
+#[test]
+fn a_network_that_comes_back_is_searched_soon() {
+    let mut node = node(s_unit("agv", 1));
+    let mut outbox = Outbox::default();
+    run(&mut node, at(60_000), &mut outbox);
+    let before = outbox.broadcasts.len();
+    assert!(node.next_deadline() > at(61_000), "pauses have grown");
+    node.network_changed(at(60_000));
+    run(&mut node, at(60_400), &mut outbox);
+    assert_eq!(outbox.broadcasts.len(), before + 1);
 }
 
 #[test]

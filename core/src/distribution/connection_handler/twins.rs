@@ -1,0 +1,60 @@
+//! Another live node with this unit's own name and id: noticed on both sides, and told to the application.
+
+use core::net::SocketAddr;
+
+use super::{Node, NodeCounter};
+use crate::config::LONGEST_SEARCH;
+use crate::distribution::identity::{Epoch, Identity, Role};
+use crate::error::Refusal;
+use crate::storage::Storage;
+use crate::time::Instant;
+
+/// What has been heard of others with this unit's identity.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Twins {
+    /// To be told.
+    news: Option<SocketAddr>,
+    /// The life that was told last, and when: whoever claims many lives is told of now and then only.
+    told: Option<(Epoch, Instant)>,
+}
+
+impl Twins {
+    fn hear(&mut self, now: Instant, from: SocketAddr, epoch: Epoch) {
+        let known = self.told.is_some_and(|(told, at)| told == epoch || now < at + LONGEST_SEARCH);
+        if !known {
+            (self.news, self.told) = (Some(from), Some((epoch, now)));
+        }
+    }
+}
+
+impl<S: Storage> Node<S> {
+    /// Where another live node with this unit's own name and id was heard, told once for each life of it. It waits until
+    /// this unit stops, or this one waits for it: give each node its own name or id.
+    pub fn take_twin(&mut self) -> Option<SocketAddr> {
+        self.twins.news.take()
+    }
+
+    /// This unit's own datagrams are ignored; another's in its name are noted. A manager answers the `question` of one,
+    /// which would hear nothing otherwise.
+    pub(super) fn is_own(
+        &mut self,
+        now: Instant,
+        from: SocketAddr,
+        identity: &Identity,
+        epoch: Epoch,
+        question: Option<u64>,
+    ) -> bool {
+        if *identity != self.config.identity {
+            return false;
+        }
+        if epoch != self.config.epoch {
+            self.counters.add(NodeCounter::OwnIdentity, 1);
+            self.note_of(now, from, identity, Refusal::DuplicateIdentity);
+            self.twins.hear(now, from, epoch);
+            if let Some(nonce) = question.filter(|_| identity.role() == Role::MUnit) {
+                self.answer_later(now, from, nonce);
+            }
+        }
+        true
+    }
+}
