@@ -192,7 +192,8 @@ impl<T: Send + 'static> Builder<T> {
         let parts = EngineParts {
             threads,
             own_threads,
-            node: NodeCell::new(node, publications, capacities, nodes + REMEMBERED_NODES),
+            capacities,
+            node: NodeCell::new(node, publications, nodes + REMEMBERED_NODES),
             functions,
             pool: MessagePool::new(size, capacities.message_buffers, KEPT_BUFFERS),
             state: self.state,

@@ -188,6 +188,11 @@ impl<S: Storage> TheirFunctionList<S> {
         (self.table.free_entries(), self.table.free_bytes())
     }
 
+    /// Entries and bytes of signatures in all.
+    pub fn capacity(&self) -> (usize, usize) {
+        (self.table.entries.len(), self.table.bytes.len())
+    }
+
     /// Moves to longer slices and gives those back that are not needed any more, which are the new ones where they are
     /// shorter.
     pub(crate) fn grow(&mut self, entries: S::Slice<Entry>, bytes: S::Slice<u8>) -> (S::Slice<Entry>, S::Slice<u8>) {

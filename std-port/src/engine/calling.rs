@@ -35,8 +35,7 @@ impl<T: Send + 'static> Engine<T> {
         options: &RequestOptions,
     ) -> Result<CallId, Error> {
         let mut state = link.lock();
-        let result =
-            self.with(link, &mut state, |session, cx| session.request(cx, function, parameters, options, false));
+        let result = self.request_on(link, &mut state, function, parameters, options, false);
         self.settle(link, state);
         result
     }
@@ -70,8 +69,7 @@ impl<T: Send + 'static> Engine<T> {
         let deadline = started + timeout;
         loop {
             let options = RequestOptions { timeout: Some(deadline.since(self.now())), ..*options };
-            let sent =
-                self.with(link, &mut state, |session, cx| session.request(cx, function, parameters, &options, true));
+            let sent = self.request_on(link, &mut state, function, parameters, &options, true);
             let (error, wait) = match sent {
                 Ok(id) => {
                     state.waiters.push(Waiter { id, wake: Wake::Thread(thread::current()), outcome: None });
@@ -191,7 +189,7 @@ impl<T: Send + 'static> Engine<T> {
         options: &RequestOptions,
     ) -> Result<CallFuture<T>, Error> {
         let mut state = link.lock();
-        let sent = self.with(&link, &mut state, |session, cx| session.request(cx, function, parameters, options, true));
+        let sent = self.request_on(&link, &mut state, function, parameters, options, true);
         if let Ok(id) = sent {
             state.waiters.push(Waiter { id, wake: Wake::Task(None), outcome: None });
         }

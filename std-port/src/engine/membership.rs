@@ -10,15 +10,14 @@ use cara_core::error::{CloseReason, Error, Limit, Refusal};
 use cara_core::host::mailman::LinkId;
 use cara_core::host::secure::Plain;
 use cara_core::services::publications::Publications;
-use cara_core::services::unit::{Session, SessionConfig, SessionStorage};
+use cara_core::services::unit::{Session, SessionConfig};
 use cara_core::time::{Duration, Instant};
 use core::net::SocketAddr;
 
 use super::link::{LinkCell, LinkState, Notice, StdMailman};
 use super::{Engine, lock, read, write};
-use crate::config::Capacities;
 use crate::event::UnitEvent;
-use crate::storage::{Boxed, filled, filled_with};
+use crate::storage::Boxed;
 use crate::sys::epoll::Interest;
 use crate::sys::stream::Stream;
 
@@ -26,7 +25,6 @@ use crate::sys::stream::Stream;
 pub(crate) struct NodeCell {
     pub(crate) node: Node<Boxed>,
     pub(crate) publications: Publications<Boxed>,
-    pub(crate) capacities: Capacities,
     /// Nodes that the tables have room for.
     room: usize,
     serial: u32,
@@ -36,13 +34,8 @@ pub(crate) struct NodeCell {
 struct Dialed<'i>(Option<&'i Identity>);
 
 impl NodeCell {
-    pub(crate) fn new(
-        node: Node<Boxed>,
-        publications: Publications<Boxed>,
-        capacities: Capacities,
-        room: usize,
-    ) -> Self {
-        Self { node, publications, capacities, room, serial: 0 }
+    pub(crate) fn new(node: Node<Boxed>, publications: Publications<Boxed>, room: usize) -> Self {
+        Self { node, publications, room, serial: 0 }
     }
 
     pub(crate) fn set_constraints(&mut self, constraints: Constraints) -> Result<(), Error> {
@@ -60,35 +53,20 @@ impl NodeCell {
 }
 
 impl<T: Send + 'static> Engine<T> {
-    /// The slices of one session.
-    fn session_storage(capacities: &Capacities) -> SessionStorage<Boxed> {
-        SessionStorage {
-            small: filled(cara_core::config::LINK_BUFFER_BYTES, 0),
-            pending: filled(capacities.calls_in_flight, None),
-            running: filled(capacities.calls_running + 1, None),
-            publications: filled_with(capacities.functions, Default::default),
-            their_functions: filled_with(
-                capacities.their_functions,
-                cara_core::distribution::function_list::Entry::empty,
-            ),
-            their_signatures: filled(capacities.their_signature_bytes, 0),
-        }
-    }
-
     /// Puts a stream into the table of links. `None` when the table is full.
     fn open_link(&self, stream: Stream, address: SocketAddr, dialed: Option<Dialed<'_>>) -> Option<Arc<LinkCell>> {
         let mut links = write(&self.links);
         let index = links.iter().position(Option::is_none)?;
         let id = LinkId(u16::try_from(index).ok()?);
         let now = self.clock.now();
-        let (serial, local, constraints, storage) = {
+        let storage = self.session_storage();
+        let (serial, local, constraints) = {
             let mut cell = lock(&self.node);
             cell.serial = cell.serial.wrapping_add(1);
-            let storage = Self::session_storage(&cell.capacities);
             if let Some(Dialed(identity)) = dialed {
                 cell.node.dialing(identity, id);
             }
-            (cell.serial, cell.node.hello(now, id), *cell.node.constraints(), storage)
+            (cell.serial, cell.node.hello(now, id), *cell.node.constraints())
         };
         let dialed = dialed.is_some();
         let config = SessionConfig { link: id, dialed, address, local, constraints };
@@ -192,6 +170,7 @@ impl<T: Send + 'static> Engine<T> {
             let cell = lock(&self.node);
             cell.publications.visible_to(&identity).collect()
         };
+        self.make_publication_room(state);
         self.with(link, state, |session, cx| session.publish(cx, visible.into_iter()));
         state.notices.push(Notice::Joined);
     }
@@ -347,6 +326,7 @@ impl<T: Send + 'static> Engine<T> {
         if !state.session.is_live() {
             return None;
         }
+        self.make_publication_room(&mut state);
         let serial = self.with(link, &mut state, |session, cx| session.publish(cx, slots.iter().copied()));
         self.settle(link, state);
         Some((link.clone(), serial))

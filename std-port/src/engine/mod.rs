@@ -16,6 +16,7 @@ pub(crate) mod reader;
 mod serving;
 mod state_gate;
 mod staying;
+mod tables;
 pub(crate) mod workers;
 
 pub(crate) use accounts::pairs;
@@ -40,6 +41,7 @@ use cara_core::services::{Context, requests::CallId};
 use cara_core::time::{Duration, Instant};
 
 use crate::clock::Clock;
+use crate::config::Capacities;
 use crate::event::UnitEvent;
 use crate::handler::Handler;
 use crate::pool::MessagePool;
@@ -65,6 +67,7 @@ pub(crate) type Lent<'c, T> = Context<'c, Boxed, StdMailman<'c>, &'c MessagePool
 /// Everything that a unit's threads and handles share.
 pub(crate) struct Engine<T: 'static> {
     pub(crate) clock: Clock,
+    capacities: Capacities,
     pub(crate) node: Mutex<NodeCell>,
     pub(crate) functions: RwLock<FunctionList<Boxed, Handler<T>>>,
     pub(crate) peers: RwLock<Peers>,
@@ -120,6 +123,7 @@ pub(crate) struct EngineParts<T: 'static> {
     /// The threads that the unit shares with others, if any.
     pub(crate) threads: Threads,
     pub(crate) own_threads: bool,
+    pub(crate) capacities: Capacities,
     pub(crate) node: NodeCell,
     pub(crate) functions: FunctionList<Boxed, Handler<T>>,
     pub(crate) pool: MessagePool,
@@ -135,6 +139,7 @@ impl<T: Send + 'static> Engine<T> {
         let born = parts.threads.crew().clock.now();
         Arc::new(Self {
             clock: parts.threads.crew().clock,
+            capacities: parts.capacities,
             node: Mutex::new(parts.node),
             functions: RwLock::new(parts.functions),
             peers: RwLock::new(Peers::default()),
@@ -263,6 +268,7 @@ impl<T: Send + 'static> Engine<T> {
         arguments: Option<&mut ParametersView>,
         own: Option<&mut OwnCall<'_>>,
     ) -> Step {
+        self.make_list_room(state);
         let functions = read(&self.functions);
         let mut mailman = StdMailman { stream: Some(&link.stream), datagrams: &self.datagrams };
         let mut buffers = &self.pool;

@@ -94,8 +94,7 @@ impl<T: Send + 'static> Engine<T> {
                 }
             };
             // Where nobody else waits to read on, the call waits in the session: most of what is read is none.
-            let arguments =
-                if call.is_none() && self.crew().has_idle() { Some(&mut *worker.arguments) } else { None };
+            let arguments = if call.is_none() && self.crew().has_idle() { Some(&mut *worker.arguments) } else { None };
             let bytes = worker.buffer.get_mut(..count).unwrap_or_default();
             call = call.or(self.feed(link, state, bytes, arguments, None));
             // A short read has emptied the stream; a hang-up shows in one more.

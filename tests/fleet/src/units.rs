@@ -14,6 +14,9 @@ pub(crate) const MANAGER: (&str, u32) = ("depot", 1);
 /// Longest text that is sent there and back.
 pub(crate) const TEXT_BYTES: u32 = 20_000;
 
+/// Functions that every node offers as well, and nobody calls: a list of usual length.
+const FURTHER: [&str; 6] = ["go_to", "pos_info", "battery_state", "stop", "load", "unload"];
+
 struct Node {
     unit: Unit,
     /// How often `touch` ran.
@@ -46,6 +49,9 @@ fn start(arguments: &crate::Units, id: u32, threads: &Threads) -> Result<Node> {
     };
     unit.my_function_list().add_function("echo", &*text()?, echo)?;
     unit.my_function_list().add_function("touch", &number()?, touch)?;
+    for name in FURTHER {
+        unit.my_function_list().add_function(name, &further()?, |parameters: Parameters| parameters)?;
+    }
     unit.publish_my_function_list()?;
     unit.start()?;
     Ok(Node { unit, runs })
@@ -72,6 +78,14 @@ pub(crate) fn number() -> Result<Parameters> {
     let mut number = Parameters::new();
     number.add_int("number", 1)?;
     Ok(number)
+}
+
+/// The arguments and results of the [`FURTHER`] functions.
+fn further() -> Result<Parameters> {
+    let mut parameters = Parameters::new();
+    parameters.add_int("position", 2)?;
+    parameters.add_float("speed", 1)?;
+    Ok(parameters)
 }
 
 fn counters(nodes: &[Node]) -> Counters {

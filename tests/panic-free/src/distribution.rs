@@ -114,7 +114,7 @@ entry!(their_list, {
     keep(list.insert(*unknown(), *unknown(), *unknown(), unknown_slice()));
     keep(list.remove(*unknown()));
     keep((list.find(unknown_text()), list.named(unknown_text()), list.function(*unknown())));
-    keep((list.len(), list.is_empty(), list.skipped(), list.room()));
+    keep((list.len(), list.is_empty(), list.skipped(), list.room(), list.capacity()));
     drain(list.iter());
     list.clear();
 });

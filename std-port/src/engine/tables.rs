@@ -1,0 +1,114 @@
+//! The tables of a link: short ones when it opens, longer ones when its peer or this unit needs them, up to the
+//! unit's capacities. A manager of a thousand nodes pays for what its nodes offer, not for the most that they could.
+
+use cara_core::config::{LINK_BUFFER_BYTES, SIGNATURE_BYTES};
+use cara_core::distribution::function_list::Entry;
+use cara_core::distribution::parameters::ParametersView;
+use cara_core::error::{Error, Limit};
+use cara_core::services::requests::CallId;
+use cara_core::services::unit::{RequestOptions, SessionStorage};
+
+use super::link::{LinkCell, LinkState};
+use super::{Engine, read};
+use crate::config::Capacities;
+use crate::storage::{Boxed, filled, filled_with};
+
+/// Calls in flight to a peer that a link begins with room for.
+const FIRST_CALLS: usize = 8;
+/// Functions of a peer that a link begins with room for.
+const FIRST_FUNCTIONS: usize = 8;
+/// Bytes of their signatures.
+const FIRST_SIGNATURES: usize = 512;
+
+/// Slots for calls to begin with: at most [`FIRST_CALLS`], and so many that `most` is a multiple of them.
+fn first_calls(most: usize) -> usize {
+    (1..=FIRST_CALLS).rev().find(|slots| most.checked_rem(*slots) == Some(0)).unwrap_or(most).min(most)
+}
+
+/// Twice as much, and not more than `most`.
+fn doubled(length: usize, most: usize) -> usize {
+    length.saturating_mul(2).max(1).min(most)
+}
+
+impl<T: Send + 'static> Engine<T> {
+    /// The slices that a session begins with.
+    pub(super) fn session_storage(&self) -> SessionStorage<Boxed> {
+        let Capacities { calls_in_flight, calls_running, their_functions, their_signature_bytes, .. } = self.capacities;
+        SessionStorage {
+            small: filled(LINK_BUFFER_BYTES, 0),
+            pending: filled(first_calls(calls_in_flight), None),
+            running: filled(calls_running + 1, None),
+            publications: filled_with(self.own_functions(), Default::default),
+            their_functions: filled_with(their_functions.min(FIRST_FUNCTIONS), Entry::empty),
+            their_signatures: filled(their_signature_bytes.min(FIRST_SIGNATURES), 0),
+        }
+    }
+
+    /// Slots of the unit's own list that are in use: those up to its last function.
+    fn own_functions(&self) -> usize {
+        let functions = read(&self.functions);
+        functions.iter().map(|function| usize::from(function.slot.0) + 1).max().unwrap_or(0)
+    }
+
+    /// A request on a link, with more slots for calls if all of those are taken that it has.
+    pub(super) fn request_on(
+        &self,
+        link: &LinkCell,
+        state: &mut LinkState,
+        function: &str,
+        parameters: &ParametersView,
+        options: &RequestOptions,
+        wait: bool,
+    ) -> Result<CallId, Error> {
+        let mut attempt =
+            || self.with(link, state, |session, cx| session.request(cx, function, parameters, options, wait));
+        match attempt() {
+            Err(Error::Full(Limit::Calls)) => {}
+            outcome => return outcome,
+        }
+        let most = self.capacities.calls_in_flight;
+        if state.session.call_slots() >= most {
+            return Err(Error::Full(Limit::Calls));
+        }
+        drop(state.session.lend_calls(filled(most, None)));
+        self.with(link, state, |session, cx| session.request(cx, function, parameters, options, wait))
+    }
+
+    /// Makes room for one more function of the peer, which may be what comes next.
+    pub(super) fn make_list_room(&self, state: &mut LinkState) {
+        let (entries, bytes) = state.session.their_function_list().room();
+        if entries > 0 && bytes >= SIGNATURE_BYTES {
+            return;
+        }
+        let Capacities { their_functions, their_signature_bytes, .. } = self.capacities;
+        let (all_entries, all_bytes) = state.session.their_function_list().capacity();
+        let longer = |length, short, most| if short { doubled(length, most) } else { length };
+        let entries = longer(all_entries, entries == 0, their_functions);
+        let bytes = longer(all_bytes, bytes < SIGNATURE_BYTES, their_signature_bytes);
+        if (entries, bytes) != (all_entries, all_bytes) {
+            drop(state.session.lend_functions((filled_with(entries, Entry::empty), filled(bytes, 0))));
+        }
+    }
+
+    /// Makes room for all functions of the unit's own list, which may be published next.
+    pub(super) fn make_publication_room(&self, state: &mut LinkState) {
+        let functions = self.own_functions();
+        if functions > state.session.publication_slots() {
+            drop(state.session.lend_publications(filled_with(functions, Default::default)));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn tables_begin_short_and_reach_their_capacity() {
+        assert_eq!([64, 20, 7, 1, 0, 11].map(first_calls), [8, 5, 7, 1, 0, 1]);
+        assert_eq!(
+            [doubled(8, 48), doubled(32, 48), doubled(0, 48), doubled(48, 48), doubled(0, 0)],
+            [16, 48, 1, 48, 0]
+        );
+    }
+}
