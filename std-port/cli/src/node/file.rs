@@ -6,6 +6,7 @@ use toml::Spanned;
 
 use super::mistake::{Mistake, Source};
 use super::values::{Size, Time};
+use crate::close_names::close;
 
 /// A value that may be absent, with its place.
 pub(super) type Maybe<T> = Option<Spanned<T>>;
@@ -171,7 +172,5 @@ fn nearest_of(message: &str) -> Option<String> {
     }
     let mut words = message.split('`').skip(1).step_by(2);
     let wrong = words.next()?;
-    let likeness = |word: &str| strsim::jaro_winkler(wrong, word);
-    let nearest = words.max_by(|a, b| likeness(a).total_cmp(&likeness(b)))?;
-    (likeness(nearest) > 0.8).then(|| format!("did you mean `{nearest}`?"))
+    close(wrong, words).first().map(|nearest| format!("did you mean `{nearest}`?"))
 }

@@ -175,9 +175,7 @@ fn lease(function: &file::Function, mistakes: &mut Vec<Mistake>) -> Option<Lease
             mistakes.push(Mistake::new(lease.span(), "nothing stops what the program began when its lease ends", help));
             None
         }
-        (lease, _) => {
-            lease.as_ref().map(|_| Lease { length: nonzero(lease, Duration::ZERO, mistakes), at_end })
-        }
+        (lease, _) => lease.as_ref().map(|_| Lease { length: nonzero(lease, Duration::ZERO, mistakes), at_end }),
     }
 }
 

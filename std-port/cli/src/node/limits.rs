@@ -58,12 +58,7 @@ pub(super) fn capacities(table: &file::Capacities, mistakes: &mut Vec<Mistake>) 
     sizes
 }
 
-fn set<T: TryFrom<u64>>(
-    place: &mut T,
-    value: &Maybe<Size>,
-    range: RangeInclusive<u64>,
-    mistakes: &mut Vec<Mistake>,
-) {
+fn set<T: TryFrom<u64>>(place: &mut T, value: &Maybe<Size>, range: RangeInclusive<u64>, mistakes: &mut Vec<Mistake>) {
     let Some(value) = value else { return };
     let number = value.get_ref().0;
     match T::try_from(number).ok().filter(|_| range.contains(&number)) {

@@ -120,10 +120,7 @@ mod tests {
     #[test]
     fn the_mark_stands_below_the_place() {
         let shown = mistakes("one = 1\n\tzwölf = drölf # no\nthree = 3\n", 18..24).to_string();
-        assert_eq!(
-            shown,
-            "a.toml:2:10: wrong\n  |\n2 | \tzwölf = drölf # no\n  | \t        ^^^^^\n  = do better"
-        );
+        assert_eq!(shown, "a.toml:2:10: wrong\n  |\n2 | \tzwölf = drölf # no\n  | \t        ^^^^^\n  = do better");
     }
 
     #[test]

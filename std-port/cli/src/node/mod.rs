@@ -1,13 +1,137 @@
-//! `cara node`.
+//! `cara node`: a unit that stays up, with a configuration file instead of code.
 
+mod file;
+mod functions;
+mod http;
+mod json;
+mod limits;
+mod logging;
+mod mistake;
+mod offer;
+mod program;
+mod running;
+mod settings;
+mod unit;
+mod values;
+
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
+use cara_std::Interfaces;
+use serde_json::json;
+
+use crate::exit::{Ended, Exit};
 use crate::global::Global;
+use crate::output;
+use mistake::{Mistakes, Source};
+use settings::{Overrides, Settings};
 
-/// To come.
+/// What `--example` prints.
+const EXAMPLE: &str = include_str!("example.toml");
+
+/// Stays up as an m_unit, or as an s_unit, until SIGINT or SIGTERM.
+///
+/// FILE says who it is, which limits it has and which functions it offers; options stand above the file. SIGHUP takes over
+/// [constraints] and [log] of a file that has changed.
 #[derive(clap::Args)]
-pub(crate) struct Arguments {}
-
-pub(crate) fn run(_: Arguments, _: &Global) -> anyhow::Result<ExitCode> {
-    Err(crate::exit::Ended::usage("being built"))
+pub(crate) struct Arguments {
+    /// The configuration, in TOML; without one, --name and --id suffice.
+    file: Option<PathBuf>,
+    /// Only check the file: 0 if it is correct, 2 with each mistake's line and column if not.
+    #[arg(long, requires = "file")]
+    check: bool,
+    /// Print a configuration with every key, explained.
+    #[arg(long, conflicts_with_all = ["file", "check"])]
+    example: bool,
+    /// The node's name.
+    #[arg(long)]
+    name: Option<String>,
+    /// The node's ID number.
+    #[arg(long)]
+    id: Option<u32>,
+    /// The TCP port for connections of others; a free one unless told.
+    #[arg(long, value_name = "PORT")]
+    tcp_port: Option<u16>,
+    /// Serve http://ADDR/metrics for Prometheus, as 127.0.0.1:9464.
+    #[arg(long, value_name = "ADDR")]
+    metrics: Option<SocketAddr>,
+    /// Serve metrics at an address that other hosts reach too: plain HTTP, for everybody.
+    #[arg(long)]
+    metrics_anywhere: bool,
+    /// What to log: error, warn, info, debug, trace, or as RUST_LOG.
+    #[arg(long, value_name = "LEVEL")]
+    log: Option<String>,
 }
+
+pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
+    if arguments.example {
+        output::line(EXAMPLE.trim_end())?;
+        return Ok(Exit::Done.into());
+    }
+    let over = overrides(&arguments, global)?;
+    let settings = Settings::of(read(arguments.file.as_deref())?, &over).map_err(wrong)?;
+    if arguments.check {
+        tell_correct(&settings, global)?;
+        return Ok(Exit::Done.into());
+    }
+    let logging = logging::Logging::start(over.log.as_deref(), settings.file_log.as_deref())?;
+    running::run(settings, &over, &logging, global)?;
+    Ok(Exit::Done.into())
+}
+
+/// Mistakes in a configuration are the user's to correct.
+fn wrong(mistakes: Mistakes) -> anyhow::Error {
+    Ended::usage(mistakes.to_string())
+}
+
+fn read(path: Option<&Path>) -> anyhow::Result<Source> {
+    let Some(path) = path else { return Ok(Source::default()) };
+    let text = std::fs::read_to_string(path).map_err(|error| {
+        let shown = path.display();
+        Ended::usage(format!("{shown} cannot be read: {error}; `cara node --example` prints a configuration"))
+    })?;
+    Ok(Source { name: path.display().to_string(), text })
+}
+
+fn overrides(arguments: &Arguments, global: &Global) -> anyhow::Result<Overrides> {
+    if global.unit.is_some() || global.socket.is_some() {
+        return Err(Ended::usage("a node is a unit itself: --unit and --socket are for commands that ask one"));
+    }
+    let named = global.act_as.clone();
+    let over = Overrides {
+        name: arguments.name.clone().or(named.as_ref().map(|named| named.name.clone())),
+        id: arguments.id.or(named.map(|named| named.id)),
+        fleet: global.fleet,
+        interfaces: global.loopback.then_some(Interfaces::Loopback),
+        discovery_port: global.discovery_port,
+        tcp_port: arguments.tcp_port,
+        metrics: arguments.metrics,
+        metrics_anywhere: arguments.metrics_anywhere,
+        log: arguments.log.clone(),
+    };
+    over.check().map_err(Ended::usage)?;
+    if arguments.file.is_none() && (over.name.is_none() || over.id.is_none()) {
+        return Err(Ended::usage(
+            "who is the node? write --name and --id, or a FILE as `cara node --example` prints it",
+        ));
+    }
+    Ok(over)
+}
+
+fn tell_correct(settings: &Settings, global: &Global) -> anyhow::Result<()> {
+    let role = if settings.manager.is_some() { "s_unit" } else { "m_unit" };
+    let (name, id, functions) = (&settings.name, settings.id, settings.services.len());
+    if global.json {
+        output::object(&json!({ "correct": true, "name": name, "id": id, "role": role, "functions": functions }))?;
+    } else {
+        output::line(format_args!(
+            "{}: correct: {role} {name}/{id}, functions of its own: {functions}",
+            settings.source.name
+        ))?;
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests;

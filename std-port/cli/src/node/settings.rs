@@ -34,7 +34,8 @@ pub(super) struct Settings {
     pub(super) capacities: Capacities,
     pub(super) control: Control,
     pub(super) metrics: Option<Placed<SocketAddr>>,
-    pub(super) log: Option<String>,
+    /// The file's level of the log.
+    pub(super) file_log: Option<String>,
     pub(super) services: Vec<Service>,
 }
 
@@ -71,6 +72,28 @@ pub(super) struct Overrides {
     pub(super) log: Option<String>,
 }
 
+impl Overrides {
+    /// What is wrong with the command line's values, and what to do.
+    pub(super) fn check(&self) -> Result<(), String> {
+        if self.name.as_ref().is_some_and(|name| Identity::m_unit(name, 0).is_err()) {
+            return Err("--name: a node's name has 1 to 32 bytes and no control characters".into());
+        }
+        if self.discovery_port == Some(0) {
+            return Err("--discovery-port: units cannot meet on port 0: write the port that all use".into());
+        }
+        if let Some(Err(error)) = self.log.as_deref().map(super::logging::filter) {
+            return Err(format!("--log: {error}; write error, warn, info, debug or trace"));
+        }
+        let reached = self.metrics.filter(|address| !address.ip().is_loopback());
+        match reached {
+            Some(address) if !self.metrics_anywhere => Err(format!(
+                "--metrics: other hosts reach {address}, and everybody could read: add --metrics-anywhere if that is wanted"
+            )),
+            _ => Ok(()),
+        }
+    }
+}
+
 impl Settings {
     /// Reads and checks a file; all mistakes of meaning are told at once.
     pub(super) fn of(source: Source, over: &Overrides) -> Result<Self, Mistakes> {
@@ -94,21 +117,20 @@ fn checked(source: Source, file: &File, over: &Overrides, mistakes: &mut Vec<Mis
         id: own_id(file, over, mistakes),
         manager: manager(file, role, mistakes),
         fleet: over.fleet.or(file.fleet).unwrap_or(0),
-        interfaces: over.interfaces.or_else(|| file.interfaces.map(Interfaces::from)).unwrap_or_else(from_environment),
+        interfaces: over
+            .interfaces
+            .or_else(|| file.interfaces.map(Interfaces::from))
+            .unwrap_or_else(Interfaces::from_environment),
         discovery_port: discovery_port(file, over, mistakes),
         tcp_port: tcp_port(file, role, over, mistakes),
         constraints: limits::constraints(&file.constraints, role, mistakes),
         control: control(&file.control, mistakes),
         metrics: metrics(file, over, mistakes),
-        log: over.log.clone().or_else(|| log(file, mistakes)),
+        file_log: log(file, mistakes),
         services: functions::services(&source, &file.functions, capacities.functions, mistakes),
         capacities,
         source,
     }
-}
-
-fn from_environment() -> Interfaces {
-    Interfaces::from_environment()
 }
 
 impl From<file::Interfaces> for Interfaces {

@@ -1,0 +1,101 @@
+//! The services of the file, put into the unit's list of functions.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use cara_std::{Call, Definition, Error, MyFunctionList, ParametersView, ServiceError, ServiceOptions};
+
+use super::functions::{Lease, Service, Work};
+use super::json;
+use super::program::{Programs, Task};
+
+/// How long a program that makes safe may run.
+const SAFE_TIMEOUT: Duration = Duration::from_secs(5);
+/// Longest text of arguments in a line of the log.
+const LOGGED_BYTES: usize = 1024;
+
+/// Adds a service to the list.
+pub(super) fn offer(
+    list: &MyFunctionList<'_, ()>,
+    number: usize,
+    service: &Service,
+    programs: &Arc<Programs>,
+) -> Result<(), Error> {
+    let definition = service.definition.clone();
+    let mut options = ServiceOptions::new().priority(service.priority);
+    if service.idempotent {
+        options = options.idempotent();
+    }
+    if let Some(lease) = &service.lease {
+        options = options.lease(lease.length, make_safe(number, &definition, lease, programs));
+    }
+    match &service.work {
+        Work::Echo => list.add_service(&service.definition, options, echo)?,
+        Work::Log => {
+            let log = move |call: &Call, view: &mut ParametersView| log(&definition, call, view);
+            list.add_service(&service.definition, options, log)?
+        }
+        Work::Program { command, timeout } => {
+            let (command, timeout, programs) = (command.clone(), (*timeout).into(), programs.clone());
+            let run = move |call: &Call, view: &mut ParametersView| {
+                let task = Serving { number, definition: &definition, command: &command, timeout };
+                task.run(&programs, call, view)
+            };
+            // Programs take long, and must not keep the caller's next call waiting.
+            list.add_service(&service.definition, options.detached(), run)?
+        }
+    };
+    Ok(())
+}
+
+fn echo(_: &Call, _: &mut ParametersView) -> Result<(), ServiceError> {
+    Ok(())
+}
+
+fn log(definition: &Definition, call: &Call, view: &ParametersView) -> Result<(), ServiceError> {
+    let mut arguments = json::arguments(definition.signature(), view).to_string();
+    arguments.truncate(arguments.floor_char_boundary(LOGGED_BYTES));
+    tracing::info!(function = definition.name(), caller = %call.caller, arguments, "called");
+    Ok(())
+}
+
+/// What the unit runs at the end of a lease, also when it is stopped.
+fn make_safe(
+    number: usize,
+    definition: &Definition,
+    lease: &Lease,
+    programs: &Arc<Programs>,
+) -> impl Fn(&mut ()) + Send + Sync + 'static {
+    let (name, command, programs) = (definition.name().to_owned(), lease.at_end.clone(), programs.clone());
+    move |()| {
+        let Some(command) = &command else { return };
+        let environment = [("CARA_FUNCTION", name.clone()), ("CARA_CALLER", String::new())];
+        programs.make_safe(number, &Task { command, environment, input: b"{}" }, SAFE_TIMEOUT);
+    }
+}
+
+/// A call that a program serves.
+struct Serving<'a> {
+    number: usize,
+    definition: &'a Definition,
+    command: &'a [String],
+    timeout: Duration,
+}
+
+impl Serving<'_> {
+    fn run(&self, programs: &Arc<Programs>, call: &Call, view: &mut ParametersView) -> Result<(), ServiceError> {
+        let signature = self.definition.signature();
+        let function = signature.name();
+        let input = json::arguments(signature, view).to_string();
+        let environment = [("CARA_FUNCTION", function.to_owned()), ("CARA_CALLER", call.caller.to_string())];
+        let task = Task { command: self.command, environment, input: input.as_bytes() };
+        let output = programs.serve(self.number, &task, self.timeout, call.lease.as_ref()).map_err(|failure| {
+            tracing::warn!(function, caller = %call.caller, program = self.command.join(" "), "{failure}");
+            failure.to_service_error()
+        })?;
+        json::set_results(signature, &output, view).map_err(|bad| {
+            tracing::warn!(function, caller = %call.caller, program = self.command.join(" "), "{bad}");
+            ServiceError::BadResults
+        })
+    }
+}

@@ -1,0 +1,157 @@
+//! A node's life: built, started, told of signals, ended.
+
+use std::net::TcpListener;
+use std::sync::Arc;
+use std::sync::mpsc::Receiver;
+
+use anyhow::Context;
+use cara_std::{Error, PLAIN_PORT, UnitEvent};
+use serde_json::json;
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+use signal_hook::iterator::Signals;
+
+use super::logging::Logging;
+use super::mistake::Mistakes;
+use super::offer::offer;
+use super::program::Programs;
+use super::settings::{Overrides, Placed, Settings};
+use super::unit::Node;
+use super::{http, wrong};
+use crate::exit::Ended;
+use crate::global::Global;
+use crate::output;
+
+/// Runs a node until it is asked to end.
+pub(super) fn run(settings: Settings, over: &Overrides, logging: &Logging, global: &Global) -> anyhow::Result<()> {
+    // First, so that a signal during the start ends the node in an orderly way too.
+    let mut signals = Signals::new([SIGINT, SIGTERM, SIGHUP]).context("signals cannot be waited for")?;
+    let programs = Arc::new(Programs::default());
+    let node = Node::build(&settings).map_err(|error| not_built(error, &settings))?;
+    offer_all(&node, &settings, &programs)?;
+    let metrics = settings.metrics.as_ref().map(|place| listen(place, &settings)).transpose()?;
+    log_events(node.events())?;
+    node.start().map_err(|error| Ended::failed(format!("{error:?}"), error.to_string()))?;
+    if let Some(listener) = metrics {
+        http::serve(listener, node.metrics()).context("metrics cannot be served")?;
+    }
+    tell_up(&settings, &node, global)?;
+    let mut settings = settings;
+    for signal in signals.forever() {
+        tracing::info!(signal = signal_hook::low_level::signal_name(signal), "signal");
+        if signal != SIGHUP || settings.source.name.is_empty() {
+            break;
+        }
+        reload(&mut settings, over, &node, logging);
+    }
+    // Programs first, so that what makes safe is the last one to act; stopping ends the leases that are live.
+    programs.end_calls();
+    node.stop();
+    programs.finish();
+    Ok(())
+}
+
+/// Puts the file's services into the unit's list, and publishes them to all.
+fn offer_all(node: &Node, settings: &Settings, programs: &Arc<Programs>) -> anyhow::Result<()> {
+    let list = node.my_function_list();
+    for (number, service) in settings.services.iter().enumerate() {
+        offer(&list, number, service, programs).map_err(|error| {
+            let help = "the unit does not take this function; [capacities] says how much it has room for";
+            wrong(settings.mistake(service.span.clone(), &error.to_string(), help))
+        })?;
+    }
+    node.publish_my_function_list().map_err(|error| Ended::failed(format!("{error:?}"), error.to_string()))
+}
+
+/// Which value of the file the unit could not be built with.
+fn not_built(error: Error, settings: &Settings) -> anyhow::Error {
+    let in_use = error == Error::PortInUse;
+    let address = settings.interfaces.bind_address();
+    let is_free = |port: &Placed<u16>| TcpListener::bind((address, port.value)).is_ok();
+    let tcp = settings.tcp_port.as_ref().filter(|port| in_use && port.value != 0 && !is_free(port));
+    let port = tcp.or(settings.discovery_port.as_ref()).filter(|_| in_use);
+    if let Some(Placed { value, span: Some(span) }) = port {
+        let what = format!("port {value} is in use by another program");
+        let help = format!("choose another one; `ss -lntup | grep :{value}` shows who has it");
+        return wrong(settings.mistake(span.clone(), &what, &help));
+    }
+    let which = port.map_or(String::new(), |port| format!("port {}: ", port.value));
+    Ended::failed(format!("{error:?}"), format!("{which}{error}"))
+}
+
+fn listen(place: &Placed<std::net::SocketAddr>, settings: &Settings) -> anyhow::Result<TcpListener> {
+    http::listen(place.value).map_err(|error| {
+        let what = format!("metrics cannot be served at {}: {error}", place.value);
+        match &place.span {
+            Some(span) => {
+                wrong(settings.mistake(span.clone(), &what, "choose an address of this host with a free port"))
+            }
+            None => Ended::failed("Network", what),
+        }
+    })
+}
+
+/// One line for whoever waits for the node.
+fn tell_up(settings: &Settings, node: &Node, global: &Global) -> anyhow::Result<()> {
+    let Settings { name, id, fleet, .. } = settings;
+    let discovery = settings.discovery_port.as_ref().map_or(PLAIN_PORT, |port| port.value);
+    let metrics = settings.metrics.as_ref().map(|place| format!("http://{}/metrics", place.value));
+    let (tcp, control) = (node.tcp_port(), node.control_path());
+    if global.json {
+        let control = control.map(|path| path.display().to_string());
+        output::object(&json!({
+            "up": true, "name": name, "id": id, "fleet": fleet, "discovery_port": discovery, "tcp_port": tcp,
+            "control": control, "metrics": metrics,
+        }))?;
+        return Ok(());
+    }
+    let tcp = tcp.map_or(String::new(), |port| format!(", TCP port {port}"));
+    let control = control.map_or("none".into(), |path| path.display().to_string());
+    let metrics = metrics.map_or(String::new(), |url| format!(", metrics {url}"));
+    output::line(format_args!(
+        "{name}/{id} is up: fleet {fleet}, discovery port {discovery}{tcp}, control socket {control}{metrics}"
+    ))?;
+    Ok(())
+}
+
+/// Takes over constraints and the log's level of a file that has changed. A mistake changes nothing.
+fn reload(settings: &mut Settings, over: &Overrides, node: &Node, logging: &Logging) {
+    let fresh = match read_again(settings, over) {
+        Ok(fresh) => fresh,
+        Err(error) => return tracing::error!("the old configuration stays: {error}"),
+    };
+    if let Err(error) = node.set_constraints(fresh.constraints) {
+        return tracing::error!(%error, "the old configuration stays; more nodes than at the start need a restart");
+    }
+    logging.change(fresh.file_log.as_deref());
+    *settings = fresh;
+    tracing::info!("constraints and log are those of the file again; the rest of it waits for a restart");
+}
+
+fn read_again(settings: &Settings, over: &Overrides) -> Result<Settings, String> {
+    let path = std::path::Path::new(&settings.source.name);
+    let source = super::read(Some(path)).map_err(|error| format!("{error:#}"))?;
+    Settings::of(source, over).map_err(|mistakes: Mistakes| mistakes.to_string())
+}
+
+/// Tells what happens to the node, in a thread that ends with the unit.
+fn log_events(events: Receiver<UnitEvent>) -> anyhow::Result<()> {
+    let log = move || events.into_iter().for_each(log_event);
+    std::thread::Builder::new().name("cara-log".into()).spawn(log)?;
+    Ok(())
+}
+
+fn log_event(event: UnitEvent) {
+    match event {
+        UnitEvent::Joined { peer } => tracing::info!(node = %peer, "joined"),
+        UnitEvent::Left { peer, reason } => tracing::warn!(node = %peer, "left: {reason}"),
+        UnitEvent::NotJoined { address, peer, reason } => {
+            let node = peer.map(|peer| peer.to_string());
+            tracing::warn!(%address, node, "not joined: {reason}");
+        }
+        UnitEvent::FunctionsSkipped { peer, skipped } => {
+            tracing::warn!(node = %peer, skipped, "it has no room for some of this node's functions");
+        }
+        UnitEvent::LeaseExpired { peer, function } => tracing::warn!(node = %peer, function, "lease expired"),
+        event => tracing::debug!(?event, "event"),
+    }
+}

@@ -1,0 +1,140 @@
+use cara_std::{Capacities, Definition, Parameters};
+use proptest::prelude::*;
+
+use super::file::Role;
+use super::json::{self, BadOutput};
+use super::mistake::Source;
+use super::settings::{Control, Overrides, Settings};
+use super::{EXAMPLE, limits};
+
+fn settings(text: &str) -> Result<Settings, String> {
+    let source = Source { name: "test.toml".into(), text: text.into() };
+    Settings::of(source, &Overrides::default()).map_err(|mistakes| mistakes.to_string())
+}
+
+#[test]
+fn the_example_shows_the_defaults() {
+    let example = settings(EXAMPLE).unwrap();
+    let least = settings("name = \"AGV_manager\"\nid = 1\n").unwrap();
+    assert_eq!(example.constraints, limits::defaults(Role::MUnit));
+    assert_eq!(example.capacities, Capacities::default());
+    assert_eq!((example.fleet, &example.control), (least.fleet, &Control::Usual));
+    assert_eq!(example.discovery_port.unwrap().value, cara_std::PLAIN_PORT);
+    assert_eq!(
+        (least.constraints, least.capacities, least.control),
+        (example.constraints, example.capacities, example.control)
+    );
+}
+
+/// With the comment signs of keys and tables taken out, the example is that of an s_unit.
+#[test]
+fn what_the_example_leaves_out_is_right_too() {
+    let vehicle = EXAMPLE
+        .replace("role = \"m_unit\"", "role = \"s_unit\"")
+        .replace("# [manager]", "[manager]")
+        .replace("# name = \"AGV_manager\"", "name = \"AGV_manager\"")
+        .replace("# id = 1", "id = 1")
+        .replace("# address = ", "address = ")
+        .replace("# path = ", "path = ")
+        .replace("off = false\n", "");
+    let manager = settings(&vehicle).unwrap().manager.unwrap();
+    assert_eq!((manager.name.as_str(), manager.id, manager.address.is_some()), ("AGV_manager", 1, true));
+    assert!(settings(&EXAMPLE.replace("# tcp_port", "tcp_port")).unwrap().tcp_port.is_some());
+}
+
+#[test]
+fn the_command_line_stands_above_the_file() {
+    let text = "name = \"a\"\nid = 1\nfleet = 1\ntcp_port = 1\nmetrics.listen = \"127.0.0.1:1\"\n";
+    let source = Source { name: "test.toml".into(), text: text.into() };
+    let over = Overrides {
+        name: Some("b".into()),
+        id: Some(2),
+        fleet: Some(3),
+        tcp_port: Some(4),
+        discovery_port: Some(5),
+        metrics: Some(([127, 0, 0, 1], 6).into()),
+        ..Overrides::default()
+    };
+    let settings = Settings::of(source, &over).unwrap();
+    assert_eq!((settings.name.as_str(), settings.id, settings.fleet), ("b", 2, 3));
+    let port = |port: Option<super::settings::Placed<u16>>| port.map(|port| port.value);
+    assert_eq!((port(settings.tcp_port), port(settings.discovery_port)), (Some(4), Some(5)));
+    assert_eq!(settings.metrics.map(|metrics| metrics.value.port()), Some(6));
+}
+
+fn all_types() -> Definition {
+    let list = "(n: int, ns: int[2], x: float[3], b: bool, s: string[8], d: bytes[4])";
+    Definition::parse(&format!("f{list} -> {list}")).unwrap()
+}
+
+fn parameters(definition: &Definition) -> Parameters {
+    let mut parameters = Parameters::new();
+    for result in definition.signature().results() {
+        parameters.add(result.name, result.kind, result.size).unwrap();
+    }
+    parameters
+}
+
+#[test]
+fn parameters_travel_through_json() {
+    let definition = all_types();
+    let mut sent = parameters(&definition);
+    sent.set_value("n", -1).unwrap();
+    sent.set_value("ns", [i64::MIN, i64::MAX]).unwrap();
+    sent.set_value("x", [0.1, f64::INFINITY, f64::NAN]).unwrap();
+    sent.set_value("b", true).unwrap();
+    sent.set_value("s", "grün\"").unwrap();
+    sent.set_value("d", &[0_u8, 0xFF][..]).unwrap();
+    let text = json::arguments(definition.signature(), &sent).to_string();
+    let expected = r#"{"b":true,"d":"00ff","n":-1,"ns":[-9223372036854775808,9223372036854775807],"s":"grün\"","x":[0.1,"inf","NaN"]}"#;
+    assert_eq!(text, expected);
+    let mut received = parameters(&definition);
+    json::set_results(definition.signature(), text.as_bytes(), &mut received).unwrap();
+    assert_eq!(json::arguments(definition.signature(), &received).to_string(), expected);
+}
+
+#[test]
+fn results_that_do_not_fit_are_told_by_name() {
+    let definition = Definition::parse("f() -> (n: int, s: string[2])").unwrap();
+    let outcome = |text: &str| json::set_results(definition.signature(), text.as_bytes(), &mut parameters(&definition));
+    assert_eq!(outcome(r#"{"n": [1], "s": "ab", "more": 1}"#), Ok(()));
+    assert!(matches!(outcome("no"), Err(BadOutput::NotJson(_))));
+    assert!(matches!(outcome(""), Err(BadOutput::NotJson(_))));
+    assert_eq!(outcome("[1]"), Err(BadOutput::NotAnObject));
+    assert_eq!(outcome(r#"{"n": 1}"#), Err(BadOutput::Missing("s".into())));
+    for wrong in [r#"{"n": 1.5, "s": ""}"#, r#"{"n": [1, 2], "s": ""}"#, r#"{"n": 9223372036854775808, "s": ""}"#] {
+        assert!(matches!(outcome(wrong), Err(BadOutput::Wrong { name, .. }) if name == "n"), "{wrong}");
+    }
+    for wrong in [r#"{"n": 1, "s": "abc"}"#, r#"{"n": 1, "s": 1}"#, r#"{"n": 1, "s": null}"#] {
+        let bad = outcome(wrong).unwrap_err().to_string();
+        assert_eq!(bad, "its output has for the result `s` something else than s: string[2]");
+    }
+}
+
+/// A line of a file that is anything at all.
+fn line() -> impl Strategy<Value = String> {
+    prop_oneof![
+        "[a-z_]{1,8} = .{0,12}",
+        r#"(name|role|interfaces|tcp_port|id) = ["']?[ -~]{0,8}["']?"#,
+        r#"signature = "[a-z(): ,\[\]>0-9-]{0,30}""#,
+        r"\[{1,2}(manager|constraints|capacities|control|metrics|log|functions)\]{1,2}",
+        r#"(chunk_size|keep_alive|maximum_nodes|message_size) = "?-?[0-9]{1,20}(ms|KiB|s)?"?"#,
+    ]
+}
+
+proptest! {
+    #[test]
+    fn no_file_makes_it_panic(lines in prop::collection::vec(line(), 0..12)) {
+        if let Err(shown) = settings(&lines.join("\n")) {
+            prop_assert!(shown.starts_with("test.toml:"), "{}", shown);
+        }
+    }
+
+    #[test]
+    fn no_output_makes_it_panic(output in prop::collection::vec(any::<u8>(), 0..64), text in r#"\{"[nsxbd]": .{0,12}\}"#) {
+        let definition = all_types();
+        for output in [&output[..], text.as_bytes()] {
+            let _ = json::set_results(definition.signature(), output, &mut parameters(&definition));
+        }
+    }
+}

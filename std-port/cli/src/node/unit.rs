@@ -1,0 +1,107 @@
+//! The node's unit, whichever role it has.
+
+use std::sync::Arc;
+use std::sync::mpsc::Receiver;
+
+use cara_std::{Builder, CommunicationSystem, Constraints, Error, MyFunctionList, Unit, UnitEvent};
+
+use super::http::Metrics;
+use super::settings::Settings;
+
+/// An m_unit or an s_unit.
+pub(super) enum Node {
+    Manager(CommunicationSystem),
+    Vehicle(Unit),
+}
+
+impl Node {
+    /// Builds the unit; it does nothing until it is started.
+    pub(super) fn build(settings: &Settings) -> Result<Self, Error> {
+        let Settings { name, id, .. } = settings;
+        let Some(manager) = &settings.manager else {
+            let builder = CommunicationSystem::builder(name, *id)?;
+            return with(builder, settings).build_system().map(Self::Manager);
+        };
+        let builder = Unit::builder(name, *id, &manager.name, manager.id)?;
+        let builder = match manager.address {
+            Some(address) => builder.manager_address(address),
+            None => builder,
+        };
+        with(builder, settings).build_unit().map(Self::Vehicle)
+    }
+
+    pub(super) fn start(&self) -> Result<(), Error> {
+        match self {
+            Self::Manager(system) => system.start(),
+            Self::Vehicle(unit) => unit.start(),
+        }
+    }
+
+    pub(super) fn stop(&self) {
+        match self {
+            Self::Manager(system) => system.stop(),
+            Self::Vehicle(unit) => unit.stop(),
+        }
+    }
+
+    pub(super) fn my_function_list(&self) -> MyFunctionList<'_, ()> {
+        match self {
+            Self::Manager(system) => system.my_function_list(),
+            Self::Vehicle(unit) => unit.my_function_list(),
+        }
+    }
+
+    pub(super) fn publish_my_function_list(&self) -> Result<(), Error> {
+        match self {
+            Self::Manager(system) => system.publish_my_function_list(),
+            Self::Vehicle(unit) => unit.publish_my_function_list(),
+        }
+    }
+
+    pub(super) fn set_constraints(&self, constraints: Constraints) -> Result<(), Error> {
+        match self {
+            Self::Manager(system) => system.set_constraints(constraints),
+            Self::Vehicle(unit) => unit.set_constraints(constraints),
+        }
+    }
+
+    pub(super) fn events(&self) -> Receiver<UnitEvent> {
+        match self {
+            Self::Manager(system) => system.events(),
+            Self::Vehicle(unit) => unit.events(),
+        }
+    }
+
+    /// Where it takes connections; an s_unit takes none.
+    pub(super) fn tcp_port(&self) -> Option<u16> {
+        match self {
+            Self::Manager(system) => Some(system.tcp_port()),
+            Self::Vehicle(_) => None,
+        }
+    }
+}
+
+impl Node {
+    /// Where operators reach it.
+    pub(super) fn control_path(&self) -> Option<std::path::PathBuf> {
+        None
+    }
+
+    /// What is served as metrics; holds no unit alive.
+    pub(super) fn metrics(&self) -> Metrics {
+        Arc::new(|| None)
+    }
+}
+
+fn with(builder: Builder<()>, settings: &Settings) -> Builder<()> {
+    let builder = builder.fleet(settings.fleet).interfaces(settings.interfaces);
+    let builder = builder.constraints(settings.constraints).capacities(settings.capacities);
+    let builder = match &settings.discovery_port {
+        Some(port) => builder.discovery_port(port.value),
+        None => builder,
+    };
+    match &settings.tcp_port {
+        Some(port) => builder.tcp_port(port.value),
+        None => builder,
+    }
+}

@@ -1,0 +1,390 @@
+//! `cara node` as a process: mistakes in its file, what it offers, programs that misbehave, metrics, its end.
+
+use std::net::TcpListener;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use std::time::{Duration, Instant};
+
+use cara_processes::{Process, random_fleet};
+use cara_std::{Error, Interfaces, Parameters, Peer, ServiceError, Unit};
+use tempfile::TempDir;
+
+/// Longest wait for anything that is to happen.
+const PATIENCE: Duration = Duration::from_secs(30);
+
+fn cara() -> &'static Path {
+    Path::new(env!("CARGO_BIN_EXE_cara"))
+}
+
+/// Runs `cara node` to its end.
+fn outcome(folder: &Path, arguments: &[&str]) -> Output {
+    let mut command = Command::new(cara());
+    command.arg("node").args(arguments).current_dir(folder).env("CARA_CONTROL_DIR", folder);
+    command.output().unwrap()
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8_lossy(bytes).into_owned()
+}
+
+/// Waits until `condition` holds.
+fn until(what: &str, mut condition: impl FnMut() -> bool) {
+    let end = Instant::now() + PATIENCE;
+    while !condition() {
+        assert!(Instant::now() < end, "not in time: {what}");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+// --- mistakes
+
+/// A file, where its mistake is, and a part of what is said about it.
+const MISTAKES: [(&str, &str, &str); 43] = [
+    ("name = \"a", "1:10", "expected `\"`"),
+    ("name = \"a\"\nid = \n", "2:6", "value"),
+    ("name = \"a\"\nid = 1\nid = 2", "3:1", "duplicate key"),
+    ("name = \"a\"\nid = 1\n[constraints\n", "3:13", "]"),
+    ("nam = \"a\"\nid = 1", "1:1", "did you mean `name`?"),
+    ("id = 1", "1:1", "no name"),
+    ("name = \"a\"", "1:1", "no ID number"),
+    ("name = \"\"\nid = 1", "1:8", "cannot be a node's name"),
+    ("id = 1\nname = \"aaaaaaaaaabbbbbbbbbbccccccccccddd\"", "2:8", "1 to 32 bytes"),
+    ("name = \"a\\nb\"\nid = 1", "1:8", "control characters"),
+    ("name = 5\nid = 1", "1:8", "expected a string"),
+    ("name = \"a\"\nid = -1", "2:6", "-1"),
+    ("name = \"a\"\nid = 4294967296", "2:6", "4294967296"),
+    ("name = \"a\"\nid = \"1\"", "2:6", "u32"),
+    ("name = \"a\"\nid = 1\nrole = \"manager\"", "3:8", "`m_unit`"),
+    ("name = \"a\"\nid = 1\nrole = \"s_unit\"", "3:8", "needs a manager"),
+    ("name = \"a\"\nid = 1\n[manager]\nname = \"m\"\nid = 1", "3:1", "has no manager"),
+    ("name = \"a\"\nid = 1\nrole = \"s_unit\"\n[manager]\nname = \"m\"", "4:1", "a name and an id"),
+    (
+        "name = \"a\"\nid = 1\nrole = \"s_unit\"\n[manager]\nname = \"m\"\nid = 1\naddress = \"host:1\"",
+        "7:11",
+        "no address",
+    ),
+    ("name = \"a\"\nid = 1\nrole = \"s_unit\"\ntcp_port = 1\n[manager]\nname = \"m\"\nid = 1", "4:12", "takes no"),
+    ("name = \"a\"\nid = 1\ninterfaces = \"eth0\"", "3:14", "`lo`"),
+    ("name = \"a\"\nid = 1\ndiscovery_port = 0", "3:18", "port 0"),
+    ("name = \"a\"\nid = 1\ntcp_port = 65536", "3:12", "65536"),
+    ("name = \"a\"\nid = 1\n[constraints]\nchunk_size = 100", "4:14", "from 320 to 4096"),
+    ("name = \"a\"\nid = 1\n[constraints]\n\n\tmessage_size = \"1MiB\"", "5:17", "from 0 to 262144"),
+    ("name = \"a\"\nid = 1\n[constraints]\nmaximum_nodes = 0", "4:17", "from 1 to 65535"),
+    ("name = \"a\"\nid = 1\nconstraints.keep_alive = \"1us\"", "3:26", "at least 1000 us"),
+    ("name = \"a\"\nid = 1\nconstraints = { request_timeout = 5 }", "3:35", "\"50ms\""),
+    ("name = \"a\"\nid = 1\n[constraints]\nkeep_alive = \"5 parsecs\"", "4:14", "5 parsecs"),
+    ("name = \"a\"\nid = 1\n[constraints]\nkeepalive = \"1s\"", "4:1", "did you mean `keep_alive`?"),
+    ("name = \"a\"\nid = 1\n[capacities]\nfunctions = 0", "4:13", "from 1 to 65535"),
+    ("name = \"a\"\nid = 1\n[control]\noff = true\npath = \"x\"", "5:8", "no control socket"),
+    ("name = \"a\"\nid = 1\n[metrics]\nlisten = \"9464\"", "4:10", "no address"),
+    ("name = \"a\"\nid = 1\n[metrics]\nlisten = \"0.0.0.0:9464\"", "4:10", "--metrics-anywhere"),
+    ("name = \"a\"\nid = 1\n[log]\nlevel = \"a=b=c\"", "4:9", "no level"),
+    ("name = \"a\"\nid = 1\n[[functions]]\nanswer = \"echo\"", "3:1", "no signature"),
+    ("name = \"a\"\nid = 1\n[[functions]]\nsignature = \"f(n: integer)\"\nanswer = \"echo\"", "4:19", "a type"),
+    ("name = \"a\"\nid = 1\n[[functions]]\nsignature = '''f(ä: int)'''\nanswer = \"echo\"", "4:18", "a name"),
+    ("name = \"a\"\nid = 1\n[[functions]]\nsignature = \"f() -> (n: int)\"\nanswer = \"log\"", "4:13", "result `n`"),
+    ("name = \"a\"\nid = 1\n[[functions]]\nsignature = \"f()\"", "4:13", "does nothing"),
+    ("name = \"a\"\nid = 1\n[[functions]]\nsignature = \"f()\"\nrun = [\"/no/program\"]", "5:7", "no program"),
+    (
+        "name = \"a\"\nid = 1\n[[functions]]\nsignature = \"f()\"\nrun = [\"true\"]\nlease = \"1s\"",
+        "6:9",
+        "at_lease_end",
+    ),
+    (
+        "name = \"a\"\nid = 1\nfunctions = [{ signature = \"f()\", answer = \"echo\" }, { signature = \"f(n: int)\", answer = \"log\" }]",
+        "3:68",
+        "two functions",
+    ),
+];
+
+#[test]
+fn each_mistake_is_told_with_its_line_and_column() {
+    let folder = TempDir::new().unwrap();
+    for (file, place, part) in MISTAKES {
+        std::fs::write(folder.path().join("bad.toml"), file).unwrap();
+        let checked = outcome(folder.path(), &["--check", "bad.toml"]);
+        let told = text(&checked.stderr);
+        assert_eq!(checked.status.code(), Some(2), "{file}\n{told}");
+        let start = format!("error: bad.toml:{place}: ");
+        assert!(told.starts_with(&start), "{file}\nexpected at {place}:\n{told}");
+        assert!(told.contains(part), "{file}\nexpected `{part}`:\n{told}");
+        let line = file.lines().nth(place.split(':').next().unwrap().parse::<usize>().unwrap() - 1).unwrap();
+        assert!(told.contains(&format!(" | {line}\n")) && told.contains('^'), "{told}");
+        // A node does not start with it either.
+        assert_eq!(text(&outcome(folder.path(), &["bad.toml"]).stderr), told);
+    }
+}
+
+#[test]
+fn all_mistakes_of_meaning_are_told_at_once() {
+    let folder = TempDir::new().unwrap();
+    let file = "name = \"\"\nid = 1\ndiscovery_port = 0\n[constraints]\nchunk_size = 1\n";
+    std::fs::write(folder.path().join("bad.toml"), file).unwrap();
+    let told = text(&outcome(folder.path(), &["--check", "bad.toml"]).stderr);
+    for place in ["bad.toml:1:8: ", "bad.toml:3:18: ", "bad.toml:5:14: "] {
+        assert!(told.contains(place), "{told}");
+    }
+}
+
+#[test]
+fn the_example_is_correct() {
+    let folder = TempDir::new().unwrap();
+    let example = outcome(folder.path(), &["--example"]).stdout;
+    std::fs::write(folder.path().join("example.toml"), example).unwrap();
+    let checked = outcome(folder.path(), &["--check", "example.toml"]);
+    assert_eq!(text(&checked.stderr), "");
+    assert_eq!(text(&checked.stdout), "example.toml: correct: m_unit AGV_manager/1, functions of its own: 4\n");
+    assert!(checked.status.success());
+}
+
+#[test]
+fn wrong_options_are_told_with_what_to_do() {
+    let folder = TempDir::new().unwrap();
+    let cases: [(&[&str], &str); 6] = [
+        (&[], "--name and --id"),
+        (&["--id", "1"], "--name and --id"),
+        (&["no.toml"], "no.toml cannot be read"),
+        (&["--name", "", "--id", "1"], "1 to 32 bytes"),
+        (&["--name", "a", "--id", "1", "--metrics", "0.0.0.0:0"], "--metrics-anywhere"),
+        (&["--name", "a", "--id", "1", "--log", "a=b=c"], "debug"),
+    ];
+    for (arguments, part) in cases {
+        let refused = outcome(folder.path(), arguments);
+        assert_eq!(refused.status.code(), Some(2), "{arguments:?}");
+        assert!(text(&refused.stderr).contains(part), "{arguments:?}: {}", text(&refused.stderr));
+    }
+}
+
+#[test]
+fn a_port_in_use_is_told_where_the_file_says_it() {
+    let folder = TempDir::new().unwrap();
+    let taken = TcpListener::bind("127.0.0.1:0").unwrap();
+    let port = taken.local_addr().unwrap().port();
+    let start = format!("name = \"a\"\nid = 1\nfleet = {}\ninterfaces = \"lo\"\n", random_fleet());
+    for (line, place) in
+        [(format!("tcp_port = {port}"), "5:12"), (format!("metrics.listen = \"127.0.0.1:{port}\""), "5:18")]
+    {
+        std::fs::write(folder.path().join("bad.toml"), format!("{start}{line}\n")).unwrap();
+        let refused = outcome(folder.path(), &["bad.toml"]);
+        let told = text(&refused.stderr);
+        assert_eq!(refused.status.code(), Some(2), "{told}");
+        assert!(told.starts_with(&format!("error: bad.toml:{place}: ")) && told.contains("in use"), "{told}");
+    }
+}
+
+// --- a node that runs
+
+/// A node as a process, with a folder of its own.
+struct Node {
+    folder: TempDir,
+    process: Process,
+    fleet: u32,
+    /// What it says when it is up.
+    up: String,
+}
+
+impl Node {
+    /// Starts an m_unit `plant/1` with this in its file, behind its first lines.
+    fn start(rest: &str) -> Self {
+        Self::start_with(rest, &[])
+    }
+
+    fn start_with(rest: &str, options: &[&str]) -> Self {
+        let folder = TempDir::new().unwrap();
+        let fleet = random_fleet();
+        let file = format!("name = \"plant\"\nid = 1\nfleet = {fleet}\ninterfaces = \"lo\"\n{rest}\n");
+        std::fs::write(folder.path().join("plant.toml"), file).unwrap();
+        Self::run(folder, fleet, options)
+    }
+
+    fn run(folder: TempDir, fleet: u32, options: &[&str]) -> Self {
+        let script = "cd \"$1\"; cara=$2; shift 2; export CARA_CONTROL_DIR=.; echo $$ > pid; exec \"$cara\" node plant.toml \"$@\" 2>>log";
+        let arguments = ["-c", script, "sh"].map(PathBuf::from).into_iter();
+        let arguments = arguments.chain([folder.path().to_owned(), cara().to_owned()]);
+        let arguments = arguments.chain(options.iter().map(PathBuf::from));
+        let mut process = Process::start("node", Path::new("sh"), arguments).unwrap();
+        let up = process.expect(" is up: ", PATIENCE).unwrap_or_else(|error| {
+            let log = std::fs::read_to_string(folder.path().join("log")).unwrap_or_default();
+            panic!("{error}\n{log}");
+        });
+        Self { folder, process, fleet, up: up.text }
+    }
+
+    fn log(&self) -> String {
+        std::fs::read_to_string(self.folder.path().join("log")).unwrap_or_default()
+    }
+
+    /// An s_unit of this node that has joined and read its list.
+    fn vehicle(&self, name: &str, id: u32) -> (Unit, Peer) {
+        let unit = Unit::builder(name, id, "plant", 1).unwrap().fleet(self.fleet).interfaces(Interfaces::Loopback);
+        let unit = unit.build_unit().unwrap();
+        unit.start().unwrap();
+        until("the vehicle has joined", || {
+            unit.manager().is_some_and(|manager| !manager.their_function_list().is_empty())
+        });
+        let manager = unit.manager().unwrap();
+        (unit, manager)
+    }
+}
+
+/// One int.
+fn number(value: i64) -> Parameters {
+    let mut number = Parameters::new();
+    number.add_int("n", 1).unwrap();
+    number.set_value("n", value).unwrap();
+    number
+}
+
+fn call(peer: &Peer, function: &str, n: i64) -> Result<i64, Error> {
+    let options = cara_std::RequestOptions { timeout: Some(PATIENCE.into()), ..Default::default() };
+    let mut parameters = number(n);
+    parameters.add_int("m", 1).unwrap();
+    peer.block_request_with(function, &mut parameters, &options).map(|()| parameters.variable("m").unwrap())
+}
+
+/// A function `NAME(n: int) -> (m: int)` that a shell serves.
+fn shell(name: &str, script: &str) -> String {
+    format!("[[functions]]\nsignature = \"{name}(n: int) -> (m: int)\"\nrun = [\"sh\", \"-c\", '''{script}''']\n")
+}
+
+const SERVED: &str = r#"
+[[functions]]
+signature = "echo(data: string[64], n: int) -> (data: string[64], n: int)"
+answer = "echo"
+[[functions]]
+signature = "report(text: string[64])"
+answer = "log"
+"#;
+
+#[test]
+fn a_vehicle_joins_and_calls_what_the_file_offers() {
+    let script = r#"IFS= read -r line; echo "called with $line by $CARA_CALLER" >&2; echo '{"m": 42}'"#;
+    let mut node = Node::start(&format!("{SERVED}{}", shell("answer", script)));
+    assert!(node.up.starts_with("plant/1 is up: "), "{}", node.up);
+    let (unit, manager) = node.vehicle("agv", 7);
+    assert_eq!(manager.their_function_list().len(), 3);
+    let mut parameters = number(5);
+    parameters.add_string("data", 64).unwrap();
+    parameters.set_value("data", "there and back").unwrap();
+    manager.block_request("echo", &mut parameters).unwrap();
+    assert_eq!((parameters.variable("n"), parameters.variable("data")), (Ok(5), Ok("there and back")));
+    let mut report = Parameters::new();
+    report.add_string("text", 64).unwrap();
+    report.set_value("text", "a wheel\nsqueaks").unwrap();
+    manager.block_request("report", &mut report).unwrap();
+    assert_eq!(call(&manager, "answer", 6), Ok(42));
+    let log = node.log();
+    assert!(log.contains(r#"called with {"n":6} by agv/7"#), "{log}");
+    assert!(log.contains("joined") && log.contains(r"a wheel\\nsqueaks"), "{log}");
+    unit.stop();
+    assert!(node.process.terminate(PATIENCE).unwrap().success());
+}
+
+#[test]
+fn programs_that_misbehave_are_errors_of_their_own_calls() {
+    let functions = [
+        shell("hangs", "sleep 1000") + "timeout = \"200ms\"\n",
+        shell("hangs_behind", "sleep 1000 & echo '{\"m\": 3}'"),
+        shell("fails", "exit 7"),
+        shell("crashes", "kill -SEGV $$"),
+        shell("garbage", "echo '{\"m\": '"),
+        shell("nothing", ":"),
+        shell("wrong", "echo '{\"m\": \"four\"}'"),
+        shell("endless", "yes"),
+        shell("deaf", "exec <&-; sleep 0.1; echo '{\"m\": 1}'"),
+        shell("right", "cat >/dev/null; echo '{\"m\": 2, \"more\": []}'"),
+    ];
+    let node = Node::start(&functions.concat());
+    let (_unit, manager) = node.vehicle("agv", 7);
+    let failed = |code| Err(Error::Service(ServiceError::Failed(code)));
+    let bad = Err(Error::Service(ServiceError::BadResults));
+    let expected = [
+        ("hangs", failed(124)),
+        ("hangs_behind", Ok(3)),
+        ("fails", failed(7)),
+        ("crashes", failed(128 + 11)),
+        ("garbage", bad),
+        ("nothing", bad),
+        ("wrong", bad),
+        ("endless", bad),
+        ("deaf", Ok(1)),
+        ("right", Ok(2)),
+    ];
+    for (function, outcome) in expected {
+        assert_eq!(call(&manager, function, 1), outcome, "{function}\n{}", node.log());
+    }
+    // Nothing of what they started is left.
+    until("no program is left", || children_of(&node).is_empty());
+    let log = node.log();
+    for told in ["its time was up", "exit status: 7", "SIGSEGV", "no JSON", "something else than m: int", "more than"] {
+        assert!(log.contains(told), "`{told}` in\n{log}");
+    }
+}
+
+/// Processes that sleep on behalf of a node: their environment has the node's folder of sockets.
+fn children_of(node: &Node) -> Vec<String> {
+    let mut found = Vec::new();
+    for process in std::fs::read_dir("/proc").unwrap().flatten() {
+        let is_in_folder = std::fs::read_link(process.path().join("cwd"))
+            .is_ok_and(|folder| folder == node.folder.path().canonicalize().unwrap());
+        let name = std::fs::read_to_string(process.path().join("comm")).unwrap_or_default();
+        if is_in_folder && name.trim() != "cara" {
+            found.push(name);
+        }
+    }
+    found
+}
+
+#[test]
+fn a_program_that_hangs_keeps_no_other_call_waiting() {
+    let node = Node::start(&format!("{SERVED}{}timeout = \"1h\"\n", shell("hangs", "sleep 1000")));
+    let (_unit, manager) = node.vehicle("agv", 7);
+    // As many as may run, and one more, all from one caller.
+    for _ in 0..7 {
+        let mut parameters = number(1);
+        parameters.add_int("m", 1).unwrap();
+        manager.request("hangs", &parameters).unwrap();
+    }
+    until("the seventh is refused", || node.log().contains("6 calls run programs already"));
+    let mut parameters = number(5);
+    parameters.add_string("data", 64).unwrap();
+    assert_eq!(manager.block_request("echo", &mut parameters), Ok(()));
+    assert_eq!(call(&manager, "hangs", 1), Err(Error::Service(ServiceError::NotReady)));
+    let mut node = node;
+    assert!(node.process.terminate(PATIENCE).unwrap().success());
+    assert!(children_of(&node).is_empty(), "{:?}", children_of(&node));
+}
+
+/// A node whose function `go` writes `going` into a file, and whose lease's end writes `stopped`.
+fn leased(folder_of: &str) -> Node {
+    let go = shell(folder_of, "echo going >> motion; echo '{\"m\": 1}'");
+    Node::start(&format!("{go}lease = \"500ms\"\nat_lease_end = [\"sh\", \"-c\", \"echo stopped >> motion\"]\n"))
+}
+
+fn motion(node: &Node) -> String {
+    std::fs::read_to_string(node.folder.path().join("motion")).unwrap_or_default()
+}
+
+#[test]
+fn the_end_of_a_lease_runs_what_makes_safe() {
+    let node = leased("go");
+    let (unit, manager) = node.vehicle("agv", 7);
+    assert_eq!(call(&manager, "go", 1), Ok(1));
+    // Its caller is there, so that it goes on for longer than the lease.
+    std::thread::sleep(Duration::from_millis(1500));
+    assert_eq!(motion(&node), "going\n");
+    manager.release("go").unwrap();
+    until("the release stops it", || motion(&node) == "going\nstopped\n");
+    assert_eq!(call(&manager, "go", 1), Ok(1));
+    unit.stop();
+    until("the caller's end stops it", || motion(&node) == "going\nstopped\ngoing\nstopped\n");
+}
+
+#[test]
+fn the_end_of_the_node_makes_safe_once() {
+    let mut node = leased("go");
+    let (_unit, manager) = node.vehicle("agv", 7);
+    assert_eq!(call(&manager, "go", 1), Ok(1));
+    assert!(node.process.terminate(PATIENCE).unwrap().success());
+    assert_eq!(motion(&node), "going\nstopped\n");
+}
