@@ -64,6 +64,7 @@ pub enum Limit {
 }
 
 /// What a unit tells the other end when it does not take a link.
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, thiserror::Error)]
 #[repr(u8)]
 pub enum Refusal {
@@ -94,6 +95,7 @@ pub enum Refusal {
 }
 
 /// Why a link ended.
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, thiserror::Error)]
 #[repr(u8)]
 pub enum CloseReason {

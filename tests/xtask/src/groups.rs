@@ -211,7 +211,7 @@ fn doc() -> Result<()> {
 }
 
 fn thumb(extent: Extent) -> Result<()> {
-    let packages = ["--package", "cara-core", "--package", "cara-smoltcp"];
+    let packages = ["--package", "cara-core", "--package", "cara-smoltcp", "--package", "cara-embassy"];
     Run::cargo().args(["build", "--target", panic_free::TARGET]).args(packages).stream()?;
     if extent == Extent::Full { panic_free::check() } else { Ok(()) }
 }

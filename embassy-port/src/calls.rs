@@ -1,0 +1,111 @@
+//! Requests that are awaited.
+
+use core::future::poll_fn;
+use core::task::Poll;
+
+use cara_core::distribution::parameters::ParametersView;
+use cara_core::error::{Error, Limit};
+use cara_core::services::unit::RequestOptions;
+use cara_core::time::{Duration, Instant};
+
+use crate::handle::Handle;
+use crate::machine::Machine;
+use crate::peer::Peer;
+use crate::replies::InFlight;
+use crate::time::{now, timer};
+
+/// How long a request waits for room at a time.
+const PAUSE: Duration = Duration::from_millis(5);
+
+impl<T> Peer<T> {
+    /// Calls a function and waits for its results, which update `parameters` (paper, listing line 13). On an error they
+    /// are unchanged.
+    ///
+    /// Cancelled before the request was sent, nothing has happened. Cancelled later, the reply is lost, and the service may
+    /// still run, once; a lease that the request began is renewed until [`release`](Self::release).
+    #[doc(alias = "block_request_their_function")]
+    pub async fn block_request(&self, function: &str, parameters: &mut ParametersView) -> Result<(), Error> {
+        self.block_request_with(function, parameters, &RequestOptions::default()).await
+    }
+
+    /// As [`block_request`](Self::block_request), with a time-out, class or lease of its own.
+    pub async fn block_request_with(
+        &self,
+        function: &str,
+        parameters: &mut ParametersView,
+        options: &RequestOptions,
+    ) -> Result<(), Error> {
+        let timeout = options.timeout.unwrap_or(self.unit.constraints().request_timeout);
+        let deadline = now() + timeout;
+        let call = self.begin(function, parameters, options, deadline).await?;
+        poll_fn(|cx| {
+            let mut machine = self.unit.shared.machine.borrow_mut();
+            machine.outcome(&call.call, parameters, cx.waker()).map_or(Poll::Pending, Poll::Ready)
+        })
+        .await
+    }
+
+    /// Sends the request as soon as the interval and the room allow, within the deadline.
+    async fn begin(
+        &self,
+        function: &str,
+        parameters: &ParametersView,
+        options: &RequestOptions,
+        deadline: Instant,
+    ) -> Result<CallGuard<T>, Error> {
+        loop {
+            let options = RequestOptions { timeout: Some(deadline.since(now())), ..*options };
+            let link = self.link()?;
+            let sent = self.unit.act(|machine| machine.call(link, function, parameters, &options, deadline));
+            let (error, wait) = match sent {
+                Ok(call) => return Ok(CallGuard { unit: self.unit, call }),
+                Err(error @ Error::TooSoon { wait }) => (error, wait),
+                Err(error @ Error::Full(Limit::SendQueue | Limit::Buffers | Limit::Calls)) => (error, PAUSE),
+                Err(error) => return Err(error),
+            };
+            if now() + wait >= deadline {
+                return Err(error);
+            }
+            timer(now() + wait).await;
+        }
+    }
+}
+
+/// A call in flight, which is given up when this is dropped.
+struct CallGuard<T: 'static> {
+    unit: Handle<T>,
+    call: InFlight,
+}
+
+impl<T> Drop for CallGuard<T> {
+    fn drop(&mut self) {
+        if let Ok(mut machine) = self.unit.shared.machine.try_borrow_mut() {
+            machine.give_up(&self.call);
+        }
+    }
+}
+
+impl<T> Machine<T> {
+    fn call(
+        &mut self,
+        link: u16,
+        function: &str,
+        parameters: &ParametersView,
+        options: &RequestOptions,
+        deadline: Instant,
+    ) -> Result<InFlight, Error> {
+        if !self.can_wait(link) {
+            return Err(Error::Full(Limit::Calls));
+        }
+        let serial = self.link(link).map_or(0, |link| link.serial);
+        let called = self.with(link, |session, cx, _| {
+            let theirs = session.their_function_list().named(function).ok_or(Error::UnknownFunction)?;
+            let (slot, generation) = (theirs.slot, theirs.generation);
+            let id = session.request(cx, function, parameters, options, true)?;
+            Ok(InFlight { link, serial, id, slot, generation, deadline })
+        });
+        let call = called.unwrap_or(Err(Error::NotConnected))?;
+        self.wait(call);
+        Ok(call)
+    }
+}

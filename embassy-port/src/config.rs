@@ -1,0 +1,89 @@
+//! Who a unit is, before it starts.
+
+use cara_core::config::{CHUNK_BYTES, Constraints, MINIMUM_CHUNK_BYTES, PLAIN_PORT};
+use cara_core::distribution::connection_handler::Target;
+use cara_core::distribution::hello::Manager;
+use cara_core::distribution::identity::{Fleet, Identity};
+use cara_core::error::Error;
+use cara_core::services::unit::buffer_bytes;
+use core::net::SocketAddr;
+
+/// Bytes that `MESSAGE` of [`Resources`](crate::Resources) needs for messages of `message_size`.
+pub const fn message_buffer(message_size: u32) -> usize {
+    buffer_bytes(message_size, 0)
+}
+
+/// Who a unit is and what limits it has.
+#[derive(Clone, Debug)]
+pub struct Config {
+    pub(crate) identity: Identity,
+    pub(crate) target: Target,
+    pub(crate) fleet: Fleet,
+    pub(crate) constraints: Constraints,
+    pub(crate) seed: u64,
+    pub(crate) epoch: u64,
+    pub(crate) tcp_port: u16,
+}
+
+impl Config {
+    /// An s_unit, which joins the manager of the given name and id and no other. `seed` should differ from boot to boot:
+    /// the controller's source of noise, or a count of its starts.
+    pub fn s_unit(name: &str, id: u32, manager_name: &str, manager_id: u32, seed: u64) -> Result<Self, Error> {
+        let manager = Manager::new(manager_name, manager_id)?;
+        Ok(Self::new(Identity::s_unit(name, id)?, Target::Manager(manager), Constraints::S_UNIT, seed))
+    }
+
+    /// An m_unit.
+    pub fn m_unit(name: &str, id: u32, seed: u64) -> Result<Self, Error> {
+        let constraints = Constraints { maximum_nodes: 4, ..Constraints::S_UNIT };
+        Ok(Self::new(Identity::m_unit(name, id)?, Target::Everybody, constraints, seed))
+    }
+
+    fn new(identity: Identity, target: Target, constraints: Constraints, seed: u64) -> Self {
+        Self { identity, target, fleet: Fleet(0), constraints, seed, epoch: seed, tcp_port: PLAIN_PORT }
+    }
+
+    /// Units of different fleets on one network do not meet; 0 unless set.
+    pub fn fleet(mut self, fleet: u32) -> Self {
+        self.fleet = Fleet(fleet);
+        self
+    }
+
+    /// The limits to begin with; those of an s_unit unless set, with four nodes for an m_unit.
+    pub fn constraints(mut self, constraints: Constraints) -> Self {
+        self.constraints = constraints;
+        self
+    }
+
+    /// This life of the unit, if it is not to be the seed: a count of starts, on a board without a source of noise.
+    pub fn epoch(mut self, epoch: u64) -> Self {
+        self.epoch = epoch;
+        self
+    }
+
+    /// The TCP port on which an m_unit takes connections; that of discovery unless set.
+    pub fn tcp_port(mut self, port: u16) -> Self {
+        self.tcp_port = port;
+        self
+    }
+
+    /// An s_unit's manager is at this address: it is dialled, and nothing is broadcast.
+    pub fn manager_address(mut self, address: SocketAddr) -> Self {
+        if let Target::Manager(manager) = self.target {
+            self.target = Target::Fixed(manager, address);
+        }
+        self
+    }
+}
+
+/// [`Error::BadConstraint`] for constraints that so much memory cannot hold.
+pub(crate) fn check(constraints: &Constraints, links: usize, buffer: usize) -> Result<(), Error> {
+    let chunk = usize::from(constraints.chunk_size);
+    let sound = constraints.maximum_nodes > 0
+        && usize::from(constraints.maximum_nodes) <= links
+        && buffer_bytes(constraints.message_size, 0) <= buffer
+        && (MINIMUM_CHUNK_BYTES..=CHUNK_BYTES).contains(&chunk)
+        && constraints.keep_alive.as_millis() > 0
+        && constraints.calls_per_peer > 0;
+    if sound { Ok(()) } else { Err(Error::BadConstraint) }
+}

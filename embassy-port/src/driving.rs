@@ -1,0 +1,340 @@
+//! What happened on a link goes to the machine of its unit, and what comes of it is done, as
+//! `docs/notes/driving-the-core.md` says. Nothing here waits or runs a handler.
+
+use cara_core::distribution::connection_handler::{Action, Admission, Sorted};
+use cara_core::distribution::function_list::Slot;
+use cara_core::distribution::identity::Identity;
+use cara_core::distribution::parameters::ParametersView;
+use cara_core::error::{CloseReason, Error, Refusal};
+use cara_core::host::mailman::LinkId;
+use cara_core::services::Context;
+use cara_core::services::requests::CallId;
+use cara_core::services::unit::{Call, Event};
+use core::net::SocketAddr;
+use core::task::{Context as TaskContext, Poll};
+
+use crate::event::{Name, UnitEvent};
+use crate::line::Progress;
+use crate::machine::{LinkSession, Machine};
+use crate::mail::EmbassyMailman;
+use crate::replies::ended;
+use crate::taken::Running;
+use crate::time::now;
+
+/// What happened on a link, without what it borrowed.
+pub(crate) enum News {
+    Hello,
+    Call(Call),
+    Failed(CallId, Error),
+    ListChanged,
+    Skipped(u16),
+    Acknowledged,
+    LeaseExpired(Slot),
+    LeaseEnded(Slot, bool),
+    Answered,
+    Closed(CloseReason),
+    Reply,
+}
+
+/// What the runner has to do outside of the machine.
+pub(crate) enum Job {
+    /// Run a call, whose arguments are in the runner's parameters.
+    Serve(Running, Call),
+    /// Run the safe hook of a service.
+    Safe(Slot),
+    /// Run the hook for a lost peer.
+    Lost,
+}
+
+impl News {
+    /// Of all events but replies.
+    fn of(event: Event<'_>) -> Self {
+        match event {
+            Event::Hello => Self::Hello,
+            Event::Call(call) => Self::Call(call),
+            Event::Reply(..) => Self::Reply,
+            Event::Failed(id, error) => Self::Failed(id, error),
+            Event::ListChanged => Self::ListChanged,
+            Event::Acknowledged { skipped: 0, .. } => Self::Acknowledged,
+            Event::Acknowledged { skipped, .. } => Self::Skipped(skipped),
+            Event::LeaseExpired(slot) => Self::LeaseExpired(slot),
+            Event::LeaseEnded { slot, expired } => Self::LeaseEnded(slot, expired),
+            Event::Answered => Self::Answered,
+            Event::Closed(reason) => Self::Closed(reason),
+        }
+    }
+}
+
+impl<T> Machine<T> {
+    /// Lets the session of a link do what is due: `None` when nothing is.
+    pub(crate) fn poll_link(&mut self, index: u16) -> Option<News> {
+        let Self { links, lines, udp, stack, pool, functions, reply, .. } = self;
+        let link = links.get_mut(usize::from(index))?;
+        let session = link.session.as_mut()?;
+        let mut mailman = EmbassyMailman { lines, udp, stack: *stack };
+        let mut cx = Context { now: now(), mailman: &mut mailman, buffers: pool, functions };
+        if cx.now < session.deadline() {
+            return None;
+        }
+        match session.poll(&mut cx)? {
+            Event::Reply(id, result) => {
+                ended(link.waiters, reply, link.serial, id, result);
+                Some(News::Reply)
+            }
+            event => Some(News::of(event)),
+        }
+    }
+
+    /// Reads what has arrived on a link: `None` when there was nothing that led anywhere.
+    pub(crate) fn read_link(
+        &mut self,
+        index: u16,
+        scratch: &mut [u8],
+        arguments: Option<&mut ParametersView>,
+    ) -> Option<Option<News>> {
+        let Self { links, lines, udp, stack, pool, functions, reply, .. } = self;
+        let link = links.get_mut(usize::from(index))?;
+        if link.session.is_none() || (reply.is_taken() && link.awaits_reply()) {
+            return None;
+        }
+        let session = link.session.as_mut()?;
+        let peeked = lines.get_mut(usize::from(index))?.peek(scratch);
+        let lent = scratch.get_mut(..peeked)?;
+        let mut mailman = EmbassyMailman { lines, udp, stack: *stack };
+        let mut cx = Context { now: now(), mailman: &mut mailman, buffers: pool, functions };
+        let receipt = session.receive(&mut cx, lent, arguments);
+        let consumed = receipt.consumed;
+        let news = match receipt.event {
+            Some(Event::Reply(id, result)) => {
+                ended(link.waiters, reply, link.serial, id, result);
+                Some(News::Reply)
+            }
+            event => event.map(News::of),
+        };
+        lines.get_mut(usize::from(index))?.take(consumed);
+        if consumed == 0 && news.is_none() { None } else { Some(news) }
+    }
+
+    /// Takes a datagram that has arrived: `None` when there is none.
+    pub(crate) fn read_datagram(
+        &mut self,
+        scratch: &mut [u8],
+        context: &mut TaskContext<'_>,
+    ) -> Option<Option<(u16, News)>> {
+        let (length, from) = match self.udp.poll_recv_from(scratch, context) {
+            Poll::Pending => return None,
+            Poll::Ready(Err(_)) => return Some(None),
+            Poll::Ready(Ok((length, from))) => (length, from.endpoint),
+        };
+        let from = SocketAddr::new(from.addr.into(), from.port);
+        let bytes = scratch.get(..length).unwrap_or_default();
+        match self.node.datagram(now(), from, bytes) {
+            Sorted::Done => Some(None),
+            Sorted::Session { link, nonce, body } => {
+                let event = self.with(link.0, |session, cx, _| session.datagram(cx, from, nonce, body)).flatten();
+                Some(event.map(|event| (link.0, News::of(event))))
+            }
+        }
+    }
+
+    /// Looks what became of the sockets.
+    pub(crate) fn look_at_lines(&mut self) {
+        let now = now();
+        for index in self.indices() {
+            let Some(line) = self.lines.get_mut(usize::from(index)) else { continue };
+            match line.progress(now) {
+                Progress::None => {}
+                Progress::Connected => {
+                    self.with(index, |session, cx, _| session.connected(cx));
+                }
+                Progress::Broken => self.disconnected(index, CloseReason::DialFailed),
+                Progress::Accepted(from) => match self.open(index, from, false) {
+                    Some(()) => {
+                        self.with(index, |session, cx, _| session.connected(cx));
+                    }
+                    None => self.hang_up(index),
+                },
+            }
+            if self.lines.get(usize::from(index)).is_some_and(crate::line::Line::has_ended) {
+                self.disconnected(index, CloseReason::Reset);
+            }
+        }
+        self.listen();
+    }
+
+    fn disconnected(&mut self, index: u16, reason: CloseReason) {
+        if let Some(session) = self.link_mut(index).and_then(|link| link.session.as_mut()) {
+            session.disconnected(reason);
+        }
+    }
+
+    fn hang_up(&mut self, index: u16) {
+        let up = self.address.is_some();
+        if let Some(line) = self.lines.get_mut(usize::from(index)) {
+            if up { line.close() } else { line.abort() }
+        }
+    }
+
+    /// Writes what waits for room, where there is some now.
+    pub(crate) fn write_links(&mut self) {
+        for index in self.indices() {
+            let wants =
+                self.link(index).and_then(|link| link.session.as_ref()).is_some_and(LinkSession::wants_to_write);
+            if wants && self.lines.get(usize::from(index)).is_some_and(crate::line::Line::can_write) {
+                self.with(index, |session, cx, _| session.writable(cx));
+            }
+        }
+    }
+
+    /// The cable was pulled or plugged in, or the address changed: every connection is dead, whatever TCP still hopes.
+    pub(crate) fn look_at_network(&mut self) {
+        let config = if self.stack.is_link_up() { self.stack.config_v4() } else { None };
+        let address = config.map(|config| config.address);
+        if address == self.address {
+            return;
+        }
+        self.address = address;
+        log!("the address is now {:?}", address.map(|address| address.address().octets()));
+        for index in self.indices() {
+            self.disconnected(index, CloseReason::Reset);
+            if let Some(line) = self.lines.get_mut(usize::from(index)) {
+                line.abort();
+            }
+        }
+    }
+
+    /// Does what the news ask for, or leaves it to the runner.
+    pub(crate) fn noted(&mut self, index: u16, news: News) -> Option<Job> {
+        match news {
+            News::Reply => {}
+            News::Hello => self.greet(index),
+            News::Answered => {
+                let action = self.node.challenge_answered(now(), LinkId(index));
+                self.act(action);
+            }
+            News::Closed(reason) => return self.closed(index, reason),
+            News::Call(call) => {
+                let serial = self.link(index)?.serial;
+                let running = Running { link: index, serial, ticket: call.ticket, deadline: call.deadline };
+                return Some(Job::Serve(running, call));
+            }
+            News::LeaseExpired(slot) => {
+                let function = self.functions.function(slot).map_or("", |function| function.name());
+                let function = Name::try_from(function).unwrap_or_default();
+                self.tell_of(index, |peer| UnitEvent::LeaseExpired { peer, function });
+                return Some(Job::Safe(slot));
+            }
+            News::ListChanged => self.tell_of(index, |peer| UnitEvent::ListChanged { peer }),
+            News::Acknowledged => self.wakers.news.wake(),
+            News::Skipped(skipped) => self.tell_of(index, |peer| UnitEvent::FunctionsSkipped { peer, skipped }),
+            News::Failed(call, error) => self.tell_of(index, |peer| UnitEvent::RequestFailed { peer, call, error }),
+            News::LeaseEnded(slot, expired) => {
+                let session = self.link(index).and_then(|link| link.session.as_ref());
+                let function = session.and_then(|session| session.their_function_list().function(slot));
+                let function = Name::try_from(function.map_or("", |function| function.name())).unwrap_or_default();
+                self.tell_of(index, |peer| UnitEvent::LeaseEnded { peer, function, expired });
+            }
+        }
+        None
+    }
+
+    fn tell_of(&mut self, index: u16, event: impl FnOnce(Identity) -> UnitEvent) {
+        if let Some(peer) = self.link(index).and_then(|link| link.peer.clone()) {
+            self.tell(event(peer));
+        }
+    }
+
+    /// The peer of a link has introduced itself.
+    fn greet(&mut self, index: u16) {
+        let Some(session) = self.link(index).and_then(|link| link.session.as_ref()) else { return };
+        let (Some(hello), address) = (session.hello().cloned(), session.address()) else { return };
+        match self.node.admit(now(), LinkId(index), address, &hello) {
+            Admission::Accept => self.accept(index),
+            Admission::Refuse(refusal) => self.refuse(index, refusal),
+            Admission::Challenge { old } => {
+                self.with(old.0, |session, cx, _| session.challenge(cx));
+            }
+        }
+    }
+
+    /// Does what the node wants done.
+    pub(crate) fn act(&mut self, action: Option<Action>) {
+        match action {
+            None => {}
+            Some(Action::Dial { to, identity }) => self.dial(to, identity.as_ref()),
+            Some(Action::Supersede { old, new, reason }) => {
+                self.with(old.0, |session, cx, _| session.close(cx, reason));
+                self.accept(new.0);
+            }
+            Some(Action::Admit { new }) => self.accept(new.0),
+            Some(Action::Refuse { new, refusal }) => self.refuse(new.0, refusal),
+        }
+    }
+
+    fn dial(&mut self, to: SocketAddr, identity: Option<&Identity>) {
+        let dialed = self.free_link().filter(|index| {
+            let line = self.lines.get_mut(usize::from(*index));
+            line.is_some_and(|line| line.dial(to))
+        });
+        match dialed {
+            Some(index) => {
+                if self.open(index, to, true).is_some() {
+                    self.node.dialing(identity, LinkId(index));
+                }
+            }
+            None => self.node.dial_failed(now(), identity),
+        }
+    }
+
+    fn refuse(&mut self, index: u16, refusal: Refusal) {
+        self.with(index, |session, cx, _| session.refuse(cx, refusal));
+    }
+
+    /// The link is live: the peer sees what is published to it.
+    fn accept(&mut self, index: u16) {
+        let session = self.link(index).and_then(|link| link.session.as_ref());
+        let Some(identity) = session.and_then(|session| session.identity().cloned()) else { return };
+        let live = self.with(index, |session, cx, publications| {
+            session.accept(cx);
+            if session.is_live() {
+                session.publish(cx, publications.visible_to(&identity));
+            }
+            session.is_live()
+        });
+        if live == Some(true)
+            && let Some(link) = self.link_mut(index)
+        {
+            link.peer = Some(identity.clone());
+            log!("{} has joined", identity.name());
+            self.tell(UnitEvent::Joined { peer: identity });
+        }
+    }
+
+    /// A link has ended.
+    fn closed(&mut self, index: u16, reason: CloseReason) -> Option<Job> {
+        let Self { links, pool, counters, .. } = self;
+        let link = links.get_mut(usize::from(index))?;
+        let session = link.session.take()?;
+        counters.merge(session.counters());
+        let (peer, told, address) = (link.peer.take(), session.identity().cloned(), session.address());
+        link.storage = Some(session.into_storage(pool));
+        link.interrupt();
+        link.told = None;
+        link.serial = link.serial.wrapping_add(1);
+        self.forget_calls_of(index);
+        self.hang_up(index);
+        let action = self.node.left(now(), LinkId(index), reason);
+        self.act(action);
+        match peer {
+            Some(peer) => {
+                log!("{} has left", peer.name());
+                self.tell(UnitEvent::Left { peer, reason });
+                Some(Job::Lost)
+            }
+            None => {
+                self.tell(UnitEvent::NotJoined { address, peer: told, reason });
+                None
+            }
+        }
+    }
+}

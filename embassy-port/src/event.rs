@@ -1,0 +1,132 @@
+//! What a unit tells its application.
+
+use cara_core::config::NAME_BYTES;
+use cara_core::distribution::identity::Identity;
+use cara_core::error::{CloseReason, Error};
+use cara_core::services::requests::CallId;
+use core::net::SocketAddr;
+
+/// The name of a function.
+pub type Name = heapless::String<NAME_BYTES>;
+
+/// Something happened that no call returned.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum UnitEvent {
+    /// A node is connected.
+    Joined {
+        /// Which.
+        peer: Identity,
+    },
+    /// A node is no longer connected.
+    Left {
+        /// Which.
+        peer: Identity,
+        /// Why.
+        reason: CloseReason,
+    },
+    /// A link ended before it joined: refused here or there, or silent.
+    NotJoined {
+        /// The other end.
+        address: SocketAddr,
+        /// Who it said it is.
+        peer: Option<Identity>,
+        /// Why.
+        reason: CloseReason,
+    },
+    /// A node published or withdrew functions.
+    ListChanged {
+        /// Which.
+        peer: Identity,
+    },
+    /// A node keeps no room for some of this unit's functions.
+    FunctionsSkipped {
+        /// Which.
+        peer: Identity,
+        /// How many.
+        skipped: u16,
+    },
+    /// An asynchronous request was not run, or its service failed.
+    RequestFailed {
+        /// Asked of this node.
+        peer: Identity,
+        /// As returned by the request.
+        call: CallId,
+        /// Why.
+        error: Error,
+    },
+    /// A service of this unit stopped because its caller no longer wanted it. Its lease is dead, and its safe hook has run.
+    LeaseExpired {
+        /// Whose call it was.
+        peer: Identity,
+        /// The service.
+        function: Name,
+    },
+    /// A node ended what this unit's call of a leased service started.
+    LeaseEnded {
+        /// Which.
+        peer: Identity,
+        /// The service.
+        function: Name,
+        /// It was not renewed in time, as opposed to: it is finished.
+        expired: bool,
+    },
+}
+
+/// Events that nobody has read yet; when it is full, new ones are lost and counted.
+pub(crate) struct Events {
+    slots: &'static mut [Option<UnitEvent>],
+    first: usize,
+    count: usize,
+    pub(crate) lost: u32,
+}
+
+impl Events {
+    pub(crate) fn new(slots: &'static mut [Option<UnitEvent>]) -> Self {
+        Self { slots, first: 0, count: 0, lost: 0 }
+    }
+
+    pub(crate) fn put(&mut self, event: UnitEvent) {
+        let length = self.slots.len();
+        if self.count >= length {
+            self.lost = self.lost.saturating_add(1);
+            return;
+        }
+        let place = self.first.wrapping_add(self.count).checked_rem(length).unwrap_or(0);
+        if let Some(slot) = self.slots.get_mut(place) {
+            *slot = Some(event);
+            self.count = self.count.saturating_add(1);
+        }
+    }
+
+    pub(crate) fn take(&mut self) -> Option<UnitEvent> {
+        let event = self.slots.get_mut(self.first)?.take()?;
+        self.first = self.first.wrapping_add(1).checked_rem(self.slots.len()).unwrap_or(0);
+        self.count = self.count.saturating_sub(1);
+        Some(event)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    extern crate std;
+
+    use super::*;
+    use std::boxed::Box;
+    use std::vec::Vec;
+
+    fn skipped(count: u16) -> UnitEvent {
+        UnitEvent::FunctionsSkipped { peer: Identity::s_unit("agv", 1).unwrap(), skipped: count }
+    }
+
+    #[test]
+    fn events_come_in_order_and_the_lost_ones_are_counted() {
+        let mut events = Events::new(Box::leak(Box::new([const { None }; 3])));
+        (0..4).for_each(|count| events.put(skipped(count)));
+        assert_eq!(events.lost, 1);
+        assert_eq!(events.take(), Some(skipped(0)));
+        events.put(skipped(9));
+        let rest: Vec<_> = core::iter::from_fn(|| events.take()).collect();
+        assert_eq!(rest, [skipped(1), skipped(2), skipped(9)]);
+    }
+}

@@ -1,0 +1,128 @@
+//! A unit's own list of functions (paper: `my_function_list`).
+
+use core::fmt;
+use core::future::poll_fn;
+use core::task::Poll;
+
+use cara_core::distribution::function::Definition;
+use cara_core::distribution::function_list::{FunctionList, Slot};
+use cara_core::error::Error;
+use cara_core::storage::Lent;
+
+use crate::handle::Handle;
+use crate::handler::{Handler, Listed, ServiceOptions};
+use crate::machine::Machine;
+
+type Put<T> = fn(
+    &mut FunctionList<Lent, Listed<T>>,
+    &Definition,
+    cara_core::distribution::function::Attributes,
+    Listed<T>,
+) -> Result<Slot, Error>;
+
+impl<T> Handle<T> {
+    /// Adds a service, which nobody sees before it is published. The signature is in the text form, as in
+    /// `go_to(position: int[2])`.
+    ///
+    /// [`Error::BadName`] for a signature that cannot be read, [`Error::TooLarge`] when arguments and results are declared
+    /// larger than what services have room for, [`Error::Full`] when the list is full.
+    #[doc(alias = "add_function")]
+    pub fn add_service(&self, signature: &str, options: ServiceOptions<T>, handler: Handler<T>) -> Result<(), Error> {
+        self.put(signature, options, handler, FunctionList::add_function)
+    }
+
+    /// Changes a service. Whoever knows the old one gets [`Error::StaleFunction`] until it is published again.
+    pub fn replace_service(
+        &self,
+        signature: &str,
+        options: ServiceOptions<T>,
+        handler: Handler<T>,
+    ) -> Result<(), Error> {
+        self.put(signature, options, handler, FunctionList::replace)
+    }
+
+    fn put(&self, signature: &str, options: ServiceOptions<T>, handler: Handler<T>, put: Put<T>) -> Result<(), Error> {
+        let definition = Definition::parse(signature).map_err(|_| Error::BadName)?;
+        let ServiceOptions { attributes, lease, safe, detached } = options;
+        self.act(|machine| {
+            let limit = machine.room.parameters;
+            if definition.signature().parameters_bytes() as usize > limit {
+                return Err(Error::TooLarge { limit: u32::try_from(limit).unwrap_or(u32::MAX) });
+            }
+            let listed = Listed { handler, lease, safe, detached };
+            put(&mut machine.functions, &definition, attributes, listed).map(drop)
+        })
+    }
+
+    /// Removes a service; peers that saw it are told.
+    pub fn remove_service(&self, name: &str) -> Result<(), Error> {
+        self.act(|machine| {
+            let (slot, _) = machine.functions.remove(name)?;
+            machine.publications.withdraw(slot);
+            machine.each_live(|session, cx, _| {
+                session.withdraw(cx, slot);
+            });
+            Ok(())
+        })
+    }
+
+    /// The service has finished what its caller started: the lease ends, and no hook runs.
+    pub fn end_lease(&self, name: &str) {
+        self.act(|machine| {
+            let Some(slot) = machine.functions.find(name) else { return };
+            machine.each_live(|session, cx, _| session.end_lease(cx, slot));
+        });
+    }
+
+    /// Makes the unit's functions visible to all nodes, also to those that come later (paper, listing line 24).
+    pub fn publish_my_function_list(&self) -> Result<(), Error> {
+        self.act(Machine::publish)
+    }
+
+    /// As [`publish_my_function_list`](Self::publish_my_function_list), and returns when every node that is connected
+    /// now has read the list or left. Cancelling loses nothing. Join it with a timer to bound it.
+    pub async fn publish_and_wait(&self) -> Result<(), Error> {
+        self.publish_my_function_list()?;
+        for link in 0..self.links() {
+            let Some((serial, told)) = self.look(|machine| machine.told(link)) else { continue };
+            poll_fn(|cx| {
+                let mut machine = self.shared.machine.borrow_mut();
+                if machine.has_read(link, serial, told) {
+                    return Poll::Ready(());
+                }
+                machine.wakers.news.register(cx.waker());
+                Poll::Pending
+            })
+            .await;
+        }
+        Ok(())
+    }
+
+    /// The unit's own functions, one in a line.
+    pub fn my_function_list(&self) -> MyFunctionList<T> {
+        MyFunctionList { unit: *self }
+    }
+}
+
+/// The functions that a unit offers, looked at now.
+pub struct MyFunctionList<T: 'static> {
+    unit: Handle<T>,
+}
+
+impl<T> MyFunctionList<T> {
+    /// How many functions there are.
+    pub fn len(&self) -> usize {
+        self.unit.look(|machine| machine.functions.len())
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+}
+
+impl<T> fmt::Display for MyFunctionList<T> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.unit.look(|machine| write!(f, "{}", machine.functions.show_functions()))
+    }
+}

@@ -1,0 +1,188 @@
+//! What runs a service: the runner itself, or a task that takes the calls.
+
+use cara_core::config::Priority;
+use cara_core::distribution::function::Attributes;
+use cara_core::distribution::identity::Identity;
+use cara_core::distribution::parameters::{Parameters, ParametersView};
+use cara_core::error::ServiceError;
+use cara_core::services::lease::{Lease, Service};
+use cara_core::time::{Duration, Instant};
+
+use crate::handle::Handle;
+use crate::lease::LeaseWatch;
+
+/// What a handler is told about the call that it serves.
+pub struct Call<T: 'static> {
+    /// Who calls.
+    pub caller: Identity,
+    /// The call's class.
+    pub priority: Priority,
+    /// After this nobody waits for the answer; on the clock of [`now`](crate::now).
+    pub deadline: Instant,
+    /// Whether the caller waits.
+    pub wants_reply: bool,
+    /// The service's lease, if it has one: what the call starts may go on while it is live.
+    pub lease: Option<LeaseWatch>,
+    /// The unit that serves, which can request from any other, the caller among them.
+    pub unit: Handle<T>,
+}
+
+/// A service that the runner runs, with the application's state.
+pub type Method<T> = dyn Fn(&mut T, &Call<T>, &mut ParametersView) -> Result<(), ServiceError>;
+/// Runs when something was lost.
+pub type Hook<T> = dyn Fn(&mut T);
+
+/// What runs a service.
+///
+/// | form | example |
+/// |---|---|
+/// | in place | `Handler::method(&\|agv: &mut Agv, call, parameters\| agv.pos_info(parameters))` |
+/// | the paper's, free | `Handler::paper(echo)` with `fn echo(parameters: Parameters) -> Parameters` |
+/// | the paper's, method | `Handler::paper_method(Agv::pos_info)` |
+/// | by a task that awaits | `Handler::task()`, and there `unit.next_call("go_to", &mut parameters).await` |
+pub struct Handler<T: 'static> {
+    run: Run<T>,
+}
+
+impl<T> Clone for Handler<T> {
+    fn clone(&self) -> Self {
+        *self
+    }
+}
+
+impl<T> Copy for Handler<T> {}
+
+enum Run<T: 'static> {
+    Method(&'static Method<T>),
+    Paper(fn(Parameters) -> Parameters),
+    PaperMethod(fn(&mut T, Parameters) -> Parameters),
+    Task,
+}
+
+impl<T> Clone for Run<T> {
+    fn clone(&self) -> Self {
+        *self
+    }
+}
+
+impl<T> Copy for Run<T> {}
+
+impl<T> Handler<T> {
+    /// A service in place: arguments come in the parameters, results go there. It runs in the runner, so it must be
+    /// short; a closure without captures or a function will do.
+    pub const fn method(run: &'static Method<T>) -> Self {
+        Self { run: Run::Method(run) }
+    }
+
+    /// A function of the paper's form.
+    pub const fn paper(run: fn(Parameters) -> Parameters) -> Self {
+        Self { run: Run::Paper(run) }
+    }
+
+    /// A method of the paper's form.
+    pub const fn paper_method(run: fn(&mut T, Parameters) -> Parameters) -> Self {
+        Self { run: Run::PaperMethod(run) }
+    }
+
+    /// A task takes the calls with [`Handle::next_call`], and may await before it replies.
+    pub const fn task() -> Self {
+        Self { run: Run::Task }
+    }
+
+    pub(crate) fn is_task(&self) -> bool {
+        matches!(self.run, Run::Task)
+    }
+
+    pub(crate) fn run(
+        &self,
+        state: &mut T,
+        call: &Call<T>,
+        parameters: &mut ParametersView,
+    ) -> Result<(), ServiceError> {
+        match self.run {
+            Run::Method(run) => run(state, call, parameters),
+            Run::Paper(run) => by_value(parameters, run),
+            Run::PaperMethod(run) => by_value(parameters, |arguments| run(state, arguments)),
+            Run::Task => Err(ServiceError::NotReady),
+        }
+    }
+}
+
+/// Runs a service of the paper's form on the parameters of a call.
+fn by_value(view: &mut ParametersView, service: impl FnOnce(Parameters) -> Parameters) -> Result<(), ServiceError> {
+    let mut arguments = Parameters::new();
+    arguments.copy_from(view).map_err(|_| ServiceError::BadResults)?;
+    view.copy_from(&service(arguments)).map_err(|_| ServiceError::BadResults)
+}
+
+/// How a service wants to be called, and what makes it safe.
+pub struct ServiceOptions<T: 'static> {
+    pub(crate) attributes: Attributes,
+    pub(crate) lease: Option<&'static Lease>,
+    pub(crate) safe: Option<&'static Hook<T>>,
+    pub(crate) detached: bool,
+}
+
+impl<T> Default for ServiceOptions<T> {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl<T> ServiceOptions<T> {
+    /// Normal priority, no lease.
+    pub const fn new() -> Self {
+        let attributes = Attributes { priority: Priority::Normal, lease: None, idempotent: false };
+        Self { attributes, lease: None, safe: None, detached: false }
+    }
+
+    /// The class of calls that name none.
+    pub const fn priority(mut self, priority: Priority) -> Self {
+        self.attributes.priority = priority;
+        self
+    }
+
+    /// What the service starts goes on for this long after the caller's last sign that it wants it; then `safe` runs,
+    /// once, before any other work. It must be short. `lease` is a static of this service alone, which a motor's
+    /// interrupt can read: it is dead in time also when no task runs any more.
+    pub fn lease(mut self, length: impl Into<Duration>, lease: &'static Lease, safe: &'static Hook<T>) -> Self {
+        self.attributes.lease = Some(length.into());
+        self.lease = Some(lease);
+        self.safe = Some(safe);
+        self
+    }
+
+    /// It takes long: the caller's next call of the same class begins while it runs.
+    pub const fn detached(mut self) -> Self {
+        self.detached = true;
+        self
+    }
+
+    /// Running it twice is as good as running it once.
+    pub const fn idempotent(mut self) -> Self {
+        self.attributes.idempotent = true;
+        self
+    }
+}
+
+/// A service as the list of functions holds it.
+pub(crate) struct Listed<T: 'static> {
+    pub(crate) handler: Handler<T>,
+    pub(crate) lease: Option<&'static Lease>,
+    pub(crate) safe: Option<&'static Hook<T>>,
+    pub(crate) detached: bool,
+}
+
+impl<T> Clone for Listed<T> {
+    fn clone(&self) -> Self {
+        *self
+    }
+}
+
+impl<T> Copy for Listed<T> {}
+
+impl<T> Service for Listed<T> {
+    fn lease(&self) -> Option<&Lease> {
+        self.lease
+    }
+}

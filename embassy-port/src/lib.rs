@@ -1,0 +1,94 @@
+//! CARA on microcontrollers: s_units and m_units over embassy-net.
+//!
+//! [`new`] makes a unit from a network stack and static memory ([`Resources`]): a [`Handle`], which every task may copy,
+//! and a [`Runner`], which wants a task of its own and drives everything. Nothing allocates, and nothing is sized at run
+//! time.
+//!
+//! ```no_run
+//! use cara_core::services::lease::Lease;
+//! use cara_core::time::Duration;
+//! use cara_embassy::{Config, Handle, Handler, Resources, Runner, ServiceOptions};
+//!
+//! /// The application's state, which services get.
+//! #[derive(Default)]
+//! struct Agv { position: [i64; 2], target: Option<[i64; 2]> }
+//!
+//! /// Read by the motor's interrupt as well: `GO_TO.is_live(cara_embassy::now())`.
+//! static GO_TO: Lease = Lease::new();
+//!
+//! fn start(
+//!     stack: embassy_net::Stack<'static>,
+//!     resources: &'static mut Resources<Agv>,
+//!     seed: u64,
+//! ) -> Result<(Handle<Agv>, Runner<Agv>), cara_core::error::Error> {
+//!     let config = Config::s_unit("agv-07", 7, "manager", 1, seed)?;
+//!     let (unit, runner) = cara_embassy::new(stack, resources, config, Agv::default())?;
+//!     unit.add_service("pos_info() -> (position: int[2])", ServiceOptions::new(), Handler::method(&|agv: &mut Agv, _, p| {
+//!         p.set_value("position", agv.position).map_err(|_| cara_core::error::ServiceError::BadResults)
+//!     }))?;
+//!     let stop: &'static cara_embassy::Hook<Agv> = &|agv| agv.target = None;
+//!     let leased = ServiceOptions::new().lease(Duration::from_millis(400), &GO_TO, stop);
+//!     unit.add_service("go_to(position: int[2])", leased, Handler::task())?;
+//!     unit.on_manager_lost(stop);
+//!     unit.publish_my_function_list()?;
+//!     Ok((unit, runner))
+//! }
+//!
+//! /// A task that drives, and answers when the vehicle has arrived.
+//! async fn drive(unit: Handle<Agv>) -> Result<(), cara_core::error::Error> {
+//!     let mut parameters = cara_core::distribution::parameters::Parameters::new();
+//!     loop {
+//!         let call = unit.next_call("go_to", &mut parameters).await?;
+//!         let target = parameters.variable::<[i64; 2]>("position")?;
+//!         unit.with_state(|agv| agv.target = Some(target))?;
+//!         // … await the motors, as long as `call.lease` is live …
+//!         call.reply(Ok(&parameters)).await;
+//!     }
+//! }
+//! ```
+//!
+//! What stops a vehicle when nothing runs any more is the lease, which a motor's interrupt reads; when a handler or a
+//! task hangs, the watchdog. See `docs/notes/embassy-port.md`.
+
+#![no_std]
+
+/// A log line through `defmt`, or nothing.
+macro_rules! log {
+    ($($arg:tt)*) => {{
+        #[cfg(feature = "defmt")]
+        ::defmt::info!($($arg)*);
+        #[cfg(not(feature = "defmt"))]
+        { let _ = ::core::format_args!($($arg)*); }
+    }};
+}
+
+mod calls;
+mod config;
+mod driving;
+mod event;
+mod functions;
+mod handle;
+mod handler;
+mod lease;
+mod line;
+mod machine;
+mod mail;
+mod peer;
+mod publishing;
+mod replies;
+mod resources;
+mod runner;
+mod taken;
+mod time;
+
+pub use config::{Config, message_buffer};
+pub use event::{Name, UnitEvent};
+pub use functions::MyFunctionList;
+pub use handle::Handle;
+pub use handler::{Call, Handler, Hook, Method, ServiceOptions};
+pub use lease::LeaseWatch;
+pub use peer::{Peer, TheirFunctionList};
+pub use resources::{Resources, new};
+pub use runner::Runner;
+pub use taken::TakenCall;
+pub use time::now;

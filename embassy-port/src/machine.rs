@@ -1,0 +1,214 @@
+//! The core's two machines of one unit, in one cell, with the sockets and tables that they use.
+
+use cara_core::counters::Counters;
+use cara_core::distribution::connection_handler::Node;
+use cara_core::distribution::function_list::FunctionList;
+use cara_core::distribution::identity::{Identity, Role};
+use cara_core::host::connections::LinkCounter;
+use cara_core::host::mailman::LinkId;
+use cara_core::host::secure::Plain;
+use cara_core::services::Context;
+use cara_core::services::publications::Publications;
+use cara_core::services::unit::{Session, SessionConfig, SessionStorage};
+use cara_core::storage::{Lent, Pool};
+use core::cell::RefCell;
+use core::net::SocketAddr;
+use embassy_net::udp::UdpSocket;
+use embassy_net::{Ipv4Cidr, Stack};
+use embassy_sync::waitqueue::{MultiWakerRegistration, WakerRegistration};
+
+use crate::event::{Events, UnitEvent};
+use crate::handler::{Hook, Listed};
+use crate::line::Line;
+use crate::mail::EmbassyMailman;
+use crate::replies::{ReplyBox, Waiter};
+use crate::taken::TaskSlot;
+use crate::time::now;
+
+/// Tasks that can wait for the same thing without waking each other.
+const TASKS_WAITING: usize = 4;
+
+pub(crate) type LinkSession = Session<Lent, Plain>;
+pub(crate) type LinkContext<'c, 'm, T> = Context<'c, Lent, EmbassyMailman<'m>, Pool<Lent>, Listed<T>>;
+pub(crate) type LinkCounters = Counters<LinkCounter, { LinkCounter::COUNT }>;
+
+/// What a handle points to.
+pub(crate) struct Shared<T: 'static> {
+    pub(crate) machine: RefCell<Machine<T>>,
+    /// The application's state, which has a cell of its own: a service that runs with it may use the unit.
+    pub(crate) state: RefCell<T>,
+}
+
+/// One link: the session while it is open, its memory while it is not.
+pub(crate) struct Link {
+    pub(crate) session: Option<LinkSession>,
+    pub(crate) storage: Option<SessionStorage<Lent>>,
+    /// Tells this link from an earlier one with the same index.
+    pub(crate) serial: u32,
+    /// The peer, from joining to leaving.
+    pub(crate) peer: Option<Identity>,
+    pub(crate) waiters: &'static mut [Option<Waiter>],
+    /// The serial of the list that the peer was last told, for those who wait until it is read.
+    pub(crate) told: Option<u32>,
+}
+
+impl Link {
+    pub(crate) fn new(storage: SessionStorage<Lent>, waiters: &'static mut [Option<Waiter>]) -> Self {
+        Self { session: None, storage: Some(storage), serial: 0, peer: None, waiters, told: None }
+    }
+
+    /// Whether it leads to a peer that requests can be made of.
+    pub(crate) fn is_live(&self) -> bool {
+        self.session.as_ref().is_some_and(LinkSession::is_live)
+    }
+}
+
+/// What the unit is made of.
+pub(crate) struct Machine<T: 'static> {
+    pub(crate) node: Node<Lent>,
+    pub(crate) publications: Publications<Lent>,
+    pub(crate) functions: FunctionList<Lent, Listed<T>>,
+    pub(crate) pool: Pool<Lent>,
+    pub(crate) links: &'static mut [Link],
+    /// The socket of each link.
+    pub(crate) lines: &'static mut [Line],
+    pub(crate) udp: UdpSocket<'static>,
+    pub(crate) stack: Stack<'static>,
+    pub(crate) reply: ReplyBox,
+    pub(crate) tasks: &'static mut [TaskSlot],
+    pub(crate) events: Events,
+    pub(crate) lost_hook: Option<&'static Hook<T>>,
+    /// Where an m_unit listens.
+    pub(crate) tcp_port: u16,
+    /// The unit's own address; none while the cable is out or no address is known.
+    pub(crate) address: Option<Ipv4Cidr>,
+    /// It has been stopped, and does nothing any more but end its connections.
+    pub(crate) stopped: bool,
+    /// Of the links that have ended.
+    pub(crate) counters: LinkCounters,
+    /// Longest message, and bytes of arguments and results, that the memory allows.
+    pub(crate) room: Room,
+    pub(crate) wakers: Wakers,
+}
+
+/// What the lent memory allows.
+#[derive(Clone, Copy)]
+pub(crate) struct Room {
+    /// Of a message buffer.
+    pub(crate) buffer: usize,
+    /// Of the parameters that a service runs with.
+    pub(crate) parameters: usize,
+}
+
+/// Who waits for what.
+pub(crate) struct Wakers {
+    /// The runner: something was asked of the unit.
+    pub(crate) runner: WakerRegistration,
+    /// Whoever reads events.
+    pub(crate) events: WakerRegistration,
+    /// A peer came, went or was told something.
+    pub(crate) news: MultiWakerRegistration<TASKS_WAITING>,
+    /// A call waits for a task.
+    pub(crate) calls: MultiWakerRegistration<TASKS_WAITING>,
+}
+
+impl Wakers {
+    pub(crate) const fn new() -> Self {
+        Self {
+            runner: WakerRegistration::new(),
+            events: WakerRegistration::new(),
+            news: MultiWakerRegistration::new(),
+            calls: MultiWakerRegistration::new(),
+        }
+    }
+}
+
+impl<T> Machine<T> {
+    pub(crate) fn link(&self, index: u16) -> Option<&Link> {
+        self.links.get(usize::from(index))
+    }
+
+    pub(crate) fn link_mut(&mut self, index: u16) -> Option<&mut Link> {
+        self.links.get_mut(usize::from(index))
+    }
+
+    /// The index of each link.
+    pub(crate) fn indices(&self) -> core::ops::Range<u16> {
+        0..u16::try_from(self.links.len()).unwrap_or(u16::MAX)
+    }
+
+    /// The live link to a peer.
+    pub(crate) fn link_to(&self, peer: &Identity) -> Option<u16> {
+        self.indices()
+            .find(|index| self.link(*index).is_some_and(|link| link.is_live() && link.peer.as_ref() == Some(peer)))
+    }
+
+    /// Lends the session of a link with its context, and what is published to whom.
+    pub(crate) fn with<R>(
+        &mut self,
+        index: u16,
+        act: impl FnOnce(&mut LinkSession, &mut LinkContext<'_, '_, T>, &Publications<Lent>) -> R,
+    ) -> Option<R> {
+        let Self { links, lines, udp, stack, pool, functions, publications, .. } = self;
+        let session = links.get_mut(usize::from(index))?.session.as_mut()?;
+        let mut mailman = EmbassyMailman { lines, udp, stack: *stack };
+        let mut context = Context { now: now(), mailman: &mut mailman, buffers: pool, functions };
+        Some(act(session, &mut context, publications))
+    }
+
+    /// Lets the node do what is due.
+    pub(crate) fn poll_node(&mut self) -> Option<cara_core::distribution::connection_handler::Action> {
+        let Self { node, lines, udp, stack, .. } = self;
+        node.poll(now(), &mut EmbassyMailman { lines, udp, stack: *stack })
+    }
+
+    /// Makes the session of a link. `None` when the link is in use.
+    pub(crate) fn open(&mut self, index: u16, address: SocketAddr, dialed: bool) -> Option<()> {
+        let storage = self.link_mut(index)?.storage.take()?;
+        let local = self.node.hello(now(), LinkId(index));
+        let constraints = *self.node.constraints();
+        let config = SessionConfig { link: LinkId(index), dialed, address, local, constraints };
+        let link = self.link_mut(index)?;
+        link.session = Some(Session::new(now(), config, Plain, storage));
+        Some(())
+    }
+
+    /// A link that could dial: one whose socket is idle, if there is any.
+    pub(crate) fn free_link(&self) -> Option<u16> {
+        let free = |index: &u16| {
+            let line = self.lines.get(usize::from(*index)).is_some_and(Line::is_free);
+            line && self.link(*index).is_some_and(|link| link.storage.is_some())
+        };
+        let closing = |index: &u16| self.lines.get(usize::from(*index)).is_some_and(Line::is_closing);
+        let mut candidates = self.indices().filter(free);
+        let first = candidates.next()?;
+        if closing(&first) { candidates.find(|index| !closing(index)).or(Some(first)) } else { Some(first) }
+    }
+
+    /// Takes connections with every socket that has nothing else to do, if the unit is one that is dialled.
+    pub(crate) fn listen(&mut self) {
+        if self.node.identity().role() == Role::MUnit && self.address.is_some() && !self.stopped {
+            let port = self.tcp_port;
+            self.lines.iter_mut().for_each(|line| line.listen(port));
+        }
+    }
+
+    /// Tells the application.
+    pub(crate) fn tell(&mut self, event: UnitEvent) {
+        self.events.put(event);
+        self.wakers.events.wake();
+        self.wakers.news.wake();
+    }
+
+    /// The runner has to look again.
+    pub(crate) fn wake_runner(&mut self) {
+        self.wakers.runner.wake();
+    }
+
+    /// What happened on all links, also those that have ended.
+    pub(crate) fn counted(&self, counter: LinkCounter) -> u64 {
+        let live = self.links.iter().filter_map(|link| link.session.as_ref());
+        let live: u64 = live.map(|session| session.counters().value(counter)).sum();
+        live.saturating_add(self.counters.value(counter))
+    }
+}

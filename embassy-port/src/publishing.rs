@@ -1,0 +1,64 @@
+//! Which of the unit's functions are visible to whom.
+
+use cara_core::distribution::identity::Identity;
+use cara_core::error::Error;
+use cara_core::services::publications::Publications;
+use cara_core::storage::Lent;
+
+use crate::machine::{LinkContext, LinkSession, Machine};
+
+impl<T> Machine<T> {
+    /// Does something on each link to a peer.
+    pub(crate) fn each_live(
+        &mut self,
+        mut act: impl FnMut(&mut LinkSession, &mut LinkContext<'_, '_, T>, &Publications<Lent>),
+    ) {
+        for index in self.indices() {
+            if self.link(index).is_some_and(crate::machine::Link::is_live) {
+                self.with(index, &mut act);
+            }
+        }
+    }
+
+    /// Shows all functions to all nodes.
+    pub(crate) fn publish(&mut self) -> Result<(), Error> {
+        let Self { functions, publications, .. } = self;
+        functions.iter().try_for_each(|function| publications.publish_to_all(function.slot))?;
+        for index in self.indices() {
+            self.tell_list(index);
+        }
+        Ok(())
+    }
+
+    /// Shows all functions to one node.
+    pub(crate) fn publish_to(&mut self, identity: &Identity) -> Result<(), Error> {
+        let Self { functions, publications, .. } = self;
+        functions.iter().try_for_each(|function| publications.publish_to(identity, function.slot))?;
+        if let Some(index) = self.link_to(identity) {
+            self.tell_list(index);
+        }
+        Ok(())
+    }
+
+    fn tell_list(&mut self, index: u16) {
+        let Some(link) = self.link(index).filter(|link| link.is_live()) else { return };
+        let Some(identity) = link.peer.clone() else { return };
+        let serial =
+            self.with(index, |session, cx, publications| session.publish(cx, publications.visible_to(&identity)));
+        if let Some(link) = self.link_mut(index) {
+            link.told = serial;
+        }
+    }
+
+    /// The life of a link, and the serial of the list that its peer was last told.
+    pub(crate) fn told(&self, index: u16) -> Option<(u32, u32)> {
+        let link = self.link(index).filter(|link| link.is_live())?;
+        Some((link.serial, link.told?))
+    }
+
+    /// Whether the peer of that life of the link has read the list, or has left.
+    pub(crate) fn has_read(&self, index: u16, serial: u32, told: u32) -> bool {
+        let link = self.link(index).filter(|link| link.serial == serial && link.is_live());
+        link.and_then(|link| link.session.as_ref()).is_none_or(|session| session.is_acknowledged(told))
+    }
+}

@@ -1,0 +1,185 @@
+//! Replies on their way to the tasks that wait for them.
+//!
+//! A task's parameters cannot be written by the runner, so a reply waits in one box until the task has read it. While
+//! the box is taken, links with callers are not read: the network keeps what follows, and nothing is lost.
+
+use core::task::Waker;
+
+use cara_core::distribution::block;
+use cara_core::distribution::function_list::{Generation, Slot};
+use cara_core::distribution::parameters::ParametersView;
+use cara_core::error::Error;
+use cara_core::services::requests::CallId;
+use cara_core::services::unit::ReplyBlock;
+use cara_core::time::Instant;
+
+use crate::line::copy;
+use crate::machine::{Link, Machine};
+
+/// A task that waits for a reply.
+pub(crate) struct Waiter {
+    pub(crate) call: InFlight,
+    waker: Option<Waker>,
+    /// How the call ended; with `Ok`, its results are in the box.
+    outcome: Option<Result<(), Error>>,
+}
+
+/// Names a call of this unit.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct InFlight {
+    pub(crate) link: u16,
+    pub(crate) serial: u32,
+    pub(crate) id: CallId,
+    pub(crate) slot: Slot,
+    pub(crate) generation: Generation,
+    /// Nobody waits for the reply after this.
+    pub(crate) deadline: Instant,
+}
+
+/// Room for the results of one call.
+pub(crate) struct ReplyBox {
+    bytes: &'static mut [u8],
+    held: Option<(InFlight, usize)>,
+}
+
+impl ReplyBox {
+    pub(crate) fn new(bytes: &'static mut [u8]) -> Self {
+        Self { bytes, held: None }
+    }
+
+    pub(crate) fn is_taken(&self) -> bool {
+        self.held.is_some()
+    }
+
+    fn put(&mut self, call: InFlight, block: &[u8]) -> Result<(), Error> {
+        let limit = self.bytes.len();
+        if block.len() > limit {
+            return Err(Error::TooLarge { limit: u32::try_from(limit).unwrap_or(u32::MAX) });
+        }
+        self.held = Some((call, copy(block, self.bytes)));
+        Ok(())
+    }
+
+    fn take(&mut self, call: &InFlight) -> Option<&[u8]> {
+        let (_, length) = self.held.take_if(|(held, _)| held == call)?;
+        self.bytes.get(..length)
+    }
+}
+
+impl Link {
+    /// Whether a reply could come that somebody waits for.
+    pub(crate) fn awaits_reply(&self) -> bool {
+        self.waiters.iter().flatten().any(|waiter| waiter.call.serial == self.serial && waiter.outcome.is_none())
+    }
+
+    /// Ends all calls of the link that have not ended.
+    pub(crate) fn interrupt(&mut self) {
+        let serial = self.serial;
+        for waiter in self.waiters.iter_mut().flatten().filter(|waiter| waiter.call.serial == serial) {
+            waiter.end(Err(Error::Interrupted));
+        }
+    }
+}
+
+impl Waiter {
+    fn end(&mut self, outcome: Result<(), Error>) {
+        if self.outcome.is_none() {
+            self.outcome = Some(outcome);
+            if let Some(waker) = self.waker.take() {
+                waker.wake();
+            }
+        }
+    }
+}
+
+/// Keeps the end of a call for the task that waits for it; nobody may.
+pub(crate) fn ended(
+    waiters: &mut [Option<Waiter>],
+    reply: &mut ReplyBox,
+    serial: u32,
+    id: CallId,
+    result: Result<ReplyBlock<'_>, Error>,
+) {
+    let mut waiting = waiters.iter_mut().flatten();
+    if let Some(waiter) = waiting.find(|waiter| waiter.call.serial == serial && waiter.call.id == id) {
+        let kept = result.and_then(|block| reply.put(waiter.call, block.bytes()));
+        waiter.end(kept);
+    }
+}
+
+impl<T> Machine<T> {
+    /// A place for a call that is about to be made; `None` when as many are in flight as may be.
+    pub(crate) fn can_wait(&self, link: u16) -> bool {
+        self.link(link).is_some_and(|link| link.waiters.iter().any(Option::is_none))
+    }
+
+    pub(crate) fn wait(&mut self, call: InFlight) {
+        let link = self.link_mut(call.link);
+        if let Some(place) = link.and_then(|link| link.waiters.iter_mut().find(|place| place.is_none())) {
+            *place = Some(Waiter { call, waker: None, outcome: None });
+        }
+    }
+
+    /// How a call ended, its results in `parameters`; `None` while it goes on, and `waker` is woken then.
+    pub(crate) fn outcome(
+        &mut self,
+        call: &InFlight,
+        parameters: &mut ParametersView,
+        waker: &Waker,
+    ) -> Option<Result<(), Error>> {
+        let link = self.links.get_mut(usize::from(call.link))?;
+        let place = link.waiters.iter_mut().find(|place| place.as_ref().is_some_and(|waiter| waiter.call == *call));
+        let Some(place) = place else { return Some(Err(Error::Interrupted)) };
+        let waiter = place.as_mut()?;
+        let Some(outcome) = waiter.outcome else {
+            waiter.waker = Some(waker.clone());
+            return None;
+        };
+        *place = None;
+        self.wakers.runner.wake();
+        Some(outcome.and_then(|()| self.read(call, parameters)))
+    }
+
+    fn read(&mut self, call: &InFlight, parameters: &mut ParametersView) -> Result<(), Error> {
+        let Self { links, reply, .. } = self;
+        let bytes = reply.take(call).ok_or(Error::ResultLost)?;
+        let link = links.get(usize::from(call.link)).filter(|link| link.serial == call.serial);
+        let session = link.and_then(|link| link.session.as_ref()).ok_or(Error::ResultLost)?;
+        let function = session.their_function_list().function(call.slot).ok_or(Error::ResultLost)?;
+        if function.generation != call.generation {
+            return Err(Error::ResultLost);
+        }
+        block::read(function.signature.results(), bytes, parameters)
+    }
+
+    /// Nobody waits for a call any more.
+    pub(crate) fn give_up(&mut self, call: &InFlight) {
+        let Some(link) = self.links.get_mut(usize::from(call.link)) else { return };
+        for place in link.waiters.iter_mut() {
+            place.take_if(|waiter| waiter.call == *call);
+        }
+        if link.serial == call.serial
+            && let Some(session) = &mut link.session
+        {
+            session.cancel(call.id);
+        }
+        let _ = self.reply.take(call);
+        self.wakers.runner.wake();
+    }
+
+    /// A reply that its task has not fetched by its deadline makes room for others.
+    pub(crate) fn expire_reply(&mut self, now: Instant) {
+        let Some((call, _)) = self.reply.held.filter(|(call, _)| call.deadline <= now) else { return };
+        self.reply.held = None;
+        let link = self.links.get_mut(usize::from(call.link));
+        let mut waiters = link.into_iter().flat_map(|link| link.waiters.iter_mut().flatten());
+        if let Some(waiter) = waiters.find(|waiter| waiter.call == call) {
+            waiter.outcome = Some(Err(Error::TimedOut));
+        }
+    }
+
+    /// When that is due.
+    pub(crate) fn reply_deadline(&self) -> Instant {
+        self.reply.held.map_or(Instant::FAR_FUTURE, |(call, _)| call.deadline)
+    }
+}

@@ -1,0 +1,212 @@
+//! The task that drives a unit.
+
+use core::convert::Infallible;
+use core::future::{Future, poll_fn};
+use core::pin::pin;
+use core::task::{Context, Poll};
+
+use cara_core::distribution::parameters::ParametersView;
+use cara_core::error::Error;
+use cara_core::services::unit::Call as CoreCall;
+use cara_core::time::{Duration, Instant};
+
+use crate::driving::Job;
+use crate::handle::Handle;
+use crate::handler::{Call, Hook, Listed};
+use crate::lease::LeaseWatch;
+use crate::machine::{LinkSession, Machine, Shared};
+use crate::taken::Running;
+use crate::time::{now, timer};
+
+/// Steps in a row before other tasks get their turn.
+const BUDGET: usize = 64;
+/// How often the cable and the address are looked at, since the stack wakes one task only for them: it is left to the
+/// application's `wait_config_up`.
+const LOOK: Duration = Duration::from_millis(50);
+
+/// Drives a unit; the one that [`new`](crate::new) returns. It needs a task of its own.
+pub struct Runner<T: 'static> {
+    pub(crate) shared: &'static Shared<T>,
+    /// What arrives is looked at in here.
+    pub(crate) scratch: &'static mut [u8],
+    /// The arguments and results of the call that runs.
+    pub(crate) arguments: &'static mut ParametersView,
+    /// A call whose results are still in there, because they could be kept nowhere else.
+    pub(crate) unanswered: Option<(Running, Result<(), Error>)>,
+}
+
+/// What a step led to.
+enum Step {
+    Job(Job),
+    Again,
+    Idle,
+}
+
+impl<T> Runner<T> {
+    /// Searches, connects, serves, for ever.
+    ///
+    /// In a task of its own: joined with the application in one task, the two wake each other for ever.
+    pub async fn run(&mut self) -> ! {
+        match poll_fn(|cx| self.poll(cx)).await {}
+    }
+
+    fn poll(&mut self, context: &mut Context<'_>) -> Poll<Infallible> {
+        for _ in 0..BUDGET {
+            match self.step(context) {
+                Step::Job(job) => self.run_job(job),
+                Step::Again => {}
+                Step::Idle => {
+                    if self.rest(context) {
+                        return Poll::Pending;
+                    }
+                }
+            }
+        }
+        context.waker().wake_by_ref();
+        Poll::Pending
+    }
+
+    /// Leases first, so that what moves stops before anything else is done.
+    fn step(&mut self, context: &mut Context<'_>) -> Step {
+        let shared = self.shared;
+        let machine = &mut *shared.machine.borrow_mut();
+        machine.look_at_network();
+        for index in machine.indices() {
+            if let Some(news) = machine.poll_link(index) {
+                return machine.noted(index, news).map_or(Step::Again, Step::Job);
+            }
+        }
+        machine.expire_reply(now());
+        self.answer_again(machine);
+        machine.look_at_lines();
+        if machine.address.is_some() && !machine.stopped {
+            let action = machine.poll_node();
+            if action.is_some() {
+                machine.act(action);
+                return Step::Again;
+            }
+        }
+        if let Some(news) = machine.read_datagram(self.scratch, context) {
+            let job = news.and_then(|(index, news)| machine.noted(index, news));
+            return job.map_or(Step::Again, Step::Job);
+        }
+        machine.write_links();
+        self.read(machine)
+    }
+
+    fn read(&mut self, machine: &mut Machine<T>) -> Step {
+        let busy = self.unanswered.is_some();
+        for index in machine.indices() {
+            let arguments = if busy { None } else { Some(&mut *self.arguments) };
+            if let Some(news) = machine.read_link(index, self.scratch, arguments) {
+                let job = news.and_then(|news| machine.noted(index, news));
+                return job.map_or(Step::Again, Step::Job);
+            }
+            if !busy
+                && let Some(Some(call)) = machine.with(index, |session, cx, _| session.next_call(cx, self.arguments))
+            {
+                let job = machine.noted(index, crate::driving::News::Call(call));
+                return job.map_or(Step::Again, Step::Job);
+            }
+        }
+        Step::Idle
+    }
+
+    /// Whether nothing is due before the task is woken.
+    fn rest(&mut self, context: &mut Context<'_>) -> bool {
+        let machine = &mut *self.shared.machine.borrow_mut();
+        machine.wakers.runner.register(context.waker());
+        for (link, line) in machine.links.iter().zip(machine.lines.iter()) {
+            line.wake_on_news(context, link.session.as_ref().is_some_and(LinkSession::wants_to_write));
+        }
+        let deadline = machine.deadline(now());
+        pin!(timer(deadline)).poll(context).is_pending()
+    }
+
+    fn run_job(&mut self, job: Job) {
+        match job {
+            Job::Serve(running, call) => self.serve(running, &call),
+            Job::Safe(slot) => {
+                let machine = self.shared.machine.borrow();
+                let hook = machine.functions.function(slot).and_then(|function| function.handler.safe);
+                drop(machine);
+                self.run_hook(hook);
+            }
+            Job::Lost => {
+                let hook = self.shared.machine.borrow().lost_hook;
+                self.run_hook(hook);
+            }
+        }
+    }
+
+    fn run_hook(&self, hook: Option<&'static Hook<T>>) {
+        // The state is lent for the length of one call only, and never across an await.
+        if let (Some(hook), Ok(mut state)) = (hook, self.shared.state.try_borrow_mut()) {
+            hook(&mut state);
+        }
+    }
+
+    fn serve(&mut self, running: Running, call: &CoreCall) {
+        let result = self.begin(running, call);
+        let Some(result) = result else { return };
+        let machine = &mut *self.shared.machine.borrow_mut();
+        let answer = result.map(|()| &*self.arguments);
+        if !machine.answer(&running, answer) && !machine.park(running, answer) {
+            self.unanswered = Some((running, result));
+        }
+    }
+
+    /// Runs a call; `None` when a task is left to answer it.
+    fn begin(&mut self, running: Running, call: &CoreCall) -> Option<Result<(), Error>> {
+        let (told, handler) = {
+            let machine = &mut *self.shared.machine.borrow_mut();
+            let Some(function) = machine.functions.function(call.slot) else {
+                return Some(Err(Error::StaleFunction));
+            };
+            let Listed { handler, lease, detached, .. } = *function.handler;
+            let Some(caller) = machine.link(running.link).and_then(|link| link.peer.clone()) else {
+                return Some(Err(Error::NotConnected));
+            };
+            if detached {
+                machine.with(running.link, |session, _, _| session.detach(running.ticket));
+            }
+            if handler.is_task() {
+                return machine.leave_to_task(running, *call, caller, self.arguments).err().map(Err);
+            }
+            let told = Call {
+                caller,
+                priority: call.priority,
+                deadline: call.deadline,
+                wants_reply: call.wants_reply,
+                lease: lease.map(|lease| LeaseWatch { lease }),
+                unit: Handle { shared: self.shared },
+            };
+            (told, handler)
+        };
+        let Ok(mut state) = self.shared.state.try_borrow_mut() else { return Some(Err(Error::WouldDeadlock)) };
+        Some(handler.run(&mut state, &told, self.arguments).map_err(Error::Service))
+    }
+
+    fn answer_again(&mut self, machine: &mut Machine<T>) {
+        machine.answer_parked();
+        if let Some((running, result)) = self.unanswered {
+            let answer = result.map(|()| &*self.arguments);
+            if machine.answer(&running, answer) || machine.park(running, answer) {
+                self.unanswered = None;
+            }
+        }
+    }
+}
+
+impl<T> Machine<T> {
+    /// When something is due.
+    fn deadline(&self, now: Instant) -> Instant {
+        let sessions = self.links.iter().filter_map(|link| link.session.as_ref());
+        let sessions = sessions.map(LinkSession::deadline).min().unwrap_or(Instant::FAR_FUTURE);
+        let lines = self.lines.iter().map(crate::line::Line::deadline).min().unwrap_or(Instant::FAR_FUTURE);
+        let searches = self.address.is_some() && !self.stopped;
+        let node = if searches { self.node.next_deadline() } else { Instant::FAR_FUTURE };
+        let kept = self.reply_deadline().min(self.parked_deadline());
+        sessions.min(lines).min(node).min(kept).min(now + LOOK)
+    }
+}

@@ -1,0 +1,273 @@
+//! Calls that a task takes: they wait here until it does, and answers wait here that could not be kept.
+
+use cara_core::config::Priority;
+use cara_core::distribution::function_list::Slot;
+use cara_core::distribution::identity::Identity;
+use cara_core::distribution::parameters::ParametersView;
+use cara_core::error::{Error, ServiceError};
+use cara_core::services::Ticket;
+use cara_core::services::unit::Call as CoreCall;
+use cara_core::time::{Duration, Instant};
+
+use crate::handle::Handle;
+use crate::lease::LeaseWatch;
+use crate::machine::Machine;
+use crate::time::{now, timer};
+
+/// How long an answer waits for room at a time.
+const PAUSE: Duration = Duration::from_millis(5);
+
+/// Names a call of a peer that runs here.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Running {
+    pub(crate) link: u16,
+    pub(crate) serial: u32,
+    pub(crate) ticket: Ticket,
+    /// Nobody waits for the answer after this.
+    pub(crate) deadline: Instant,
+}
+
+/// Room for one call.
+pub(crate) struct TaskSlot {
+    parameters: &'static mut ParametersView,
+    holds: Holds,
+}
+
+enum Holds {
+    Nothing,
+    /// Its arguments wait for a task.
+    Call {
+        running: Running,
+        call: CoreCall,
+        caller: Identity,
+    },
+    /// Its results wait for room on the link.
+    Answer {
+        running: Running,
+        result: Result<(), Error>,
+    },
+}
+
+impl TaskSlot {
+    pub(crate) fn new(parameters: &'static mut ParametersView) -> Self {
+        Self { parameters, holds: Holds::Nothing }
+    }
+
+    fn is_free(&self) -> bool {
+        matches!(self.holds, Holds::Nothing)
+    }
+
+    fn running(&self) -> Option<Running> {
+        match self.holds {
+            Holds::Nothing => None,
+            Holds::Call { running, .. } | Holds::Answer { running, .. } => Some(running),
+        }
+    }
+
+    fn function(&self) -> Option<Slot> {
+        match &self.holds {
+            Holds::Call { call, .. } => Some(call.slot),
+            _ => None,
+        }
+    }
+}
+
+impl<T> Machine<T> {
+    fn free_slot(&mut self) -> Option<&mut TaskSlot> {
+        self.tasks.iter_mut().find(|slot| slot.is_free())
+    }
+
+    /// Keeps a call for a task; [`Error::Busy`] when there is no room.
+    pub(crate) fn leave_to_task(
+        &mut self,
+        running: Running,
+        call: CoreCall,
+        caller: Identity,
+        arguments: &ParametersView,
+    ) -> Result<(), Error> {
+        let slot = self.free_slot().ok_or(Error::Busy)?;
+        slot.parameters.copy_from(arguments).map_err(|_| Error::Busy)?;
+        slot.holds = Holds::Call { running, call, caller };
+        self.wakers.calls.wake();
+        Ok(())
+    }
+
+    /// Answers a call; `false` when the answer cannot be kept now.
+    pub(crate) fn answer(&mut self, running: &Running, result: Result<&ParametersView, Error>) -> bool {
+        if self.link(running.link).is_none_or(|link| link.serial != running.serial) {
+            return true;
+        }
+        let late = now() >= running.deadline;
+        let kept = self.with(running.link, |session, cx, _| {
+            let kept = session.answer(cx, running.ticket, result).is_ok();
+            if !kept && late {
+                session.drop_answer(running.ticket);
+            }
+            kept || late
+        });
+        kept.unwrap_or(true)
+    }
+
+    /// Keeps an answer until there is room for it; `false` when there is no room here either.
+    pub(crate) fn park(&mut self, running: Running, result: Result<&ParametersView, Error>) -> bool {
+        let Some(slot) = self.free_slot() else { return false };
+        let kept = match result {
+            Ok(results) => slot.parameters.copy_from(results),
+            Err(error) => Err(error),
+        };
+        slot.holds = Holds::Answer { running, result: kept };
+        true
+    }
+
+    /// Tries again to answer what could not be answered.
+    pub(crate) fn answer_parked(&mut self) {
+        for index in 0..self.tasks.len() {
+            let Self { tasks, links, lines, udp, stack, pool, functions, .. } = self;
+            let Some(TaskSlot { parameters, holds }) = tasks.get_mut(index) else { return };
+            let Holds::Answer { running, result } = *holds else { continue };
+            let link = links.get_mut(usize::from(running.link)).filter(|link| link.serial == running.serial);
+            let kept = link.and_then(|link| link.session.as_mut()).is_none_or(|session| {
+                let mut mailman = crate::mail::EmbassyMailman { lines, udp, stack: *stack };
+                let mut cx =
+                    cara_core::services::Context { now: now(), mailman: &mut mailman, buffers: pool, functions };
+                let answer = result.map(|()| &**parameters);
+                session.answer(&mut cx, running.ticket, answer).is_ok() || {
+                    let late = cx.now >= running.deadline;
+                    if late {
+                        session.drop_answer(running.ticket);
+                    }
+                    late
+                }
+            });
+            if kept {
+                *holds = Holds::Nothing;
+            }
+        }
+    }
+
+    /// When an answer that waits for room is given up.
+    pub(crate) fn parked_deadline(&self) -> Instant {
+        let parked = self.tasks.iter().filter(|slot| matches!(slot.holds, Holds::Answer { .. }));
+        parked.filter_map(TaskSlot::running).map(|running| running.deadline).min().unwrap_or(Instant::FAR_FUTURE)
+    }
+
+    /// What waits for a task is not begun once its link has ended.
+    pub(crate) fn forget_calls_of(&mut self, link: u16) {
+        for slot in self.tasks.iter_mut() {
+            if slot.running().is_some_and(|running| running.link == link) {
+                slot.holds = Holds::Nothing;
+            }
+        }
+    }
+
+    /// Gives a call of `function` to a task. One that is no longer wanted is answered instead.
+    fn take_call(
+        &mut self,
+        function: &str,
+        parameters: &mut ParametersView,
+    ) -> Option<Result<(Running, CoreCall, Identity), Error>> {
+        let wanted = self.functions.find(function);
+        if wanted.is_none() {
+            return Some(Err(Error::UnknownFunction));
+        }
+        loop {
+            let slot = self.tasks.iter_mut().find(|slot| slot.function() == wanted)?;
+            let copied = parameters.copy_from(slot.parameters);
+            let Holds::Call { running, call, caller } = core::mem::replace(&mut slot.holds, Holds::Nothing) else {
+                return None;
+            };
+            // Room for another call.
+            self.wakers.runner.wake();
+            let listed = self.functions.function(call.slot)?;
+            let ended = listed.handler.lease.is_some_and(|lease| !lease.is_live(now()));
+            if ended || now() >= running.deadline {
+                self.answer(&running, Err(Error::Expired));
+                continue;
+            }
+            if let Err(error) = copied {
+                self.answer(&running, Err(Error::Service(ServiceError::NotReady)));
+                return Some(Err(error));
+            }
+            return Some(Ok((running, call, caller)));
+        }
+    }
+}
+
+/// A call that a task has taken, and replies to. Dropped without a reply, it is answered with
+/// [`ServiceError::NotReady`].
+#[must_use = "the caller waits for the reply"]
+pub struct TakenCall<T: 'static> {
+    unit: Handle<T>,
+    running: Option<Running>,
+    /// Who calls.
+    pub caller: Identity,
+    /// The call's class.
+    pub priority: Priority,
+    /// After this nobody waits for the answer; on the clock of [`now`](crate::now).
+    pub deadline: Instant,
+    /// Whether the caller waits.
+    pub wants_reply: bool,
+    /// The service's lease, if it has one: what the call starts may go on while it is live.
+    pub lease: Option<LeaseWatch>,
+}
+
+impl<T> Handle<T> {
+    /// Takes the next call of one of this unit's services that was added with
+    /// [`Handler::task`](crate::Handler::task); its arguments are in `parameters`, with room for its results.
+    ///
+    /// Cancelling loses nothing: the call waits for the next one who takes it, until its deadline or its lease ends.
+    ///
+    /// [`Error::UnknownFunction`] when there is no such service; an error of `parameters` when the arguments do not fit,
+    /// in which case the caller gets [`ServiceError::NotReady`].
+    pub async fn next_call(&self, function: &str, parameters: &mut ParametersView) -> Result<TakenCall<T>, Error> {
+        let (running, call, caller) = core::future::poll_fn(|cx| {
+            let mut machine = self.shared.machine.borrow_mut();
+            match machine.take_call(function, parameters) {
+                Some(taken) => core::task::Poll::Ready(taken),
+                None => {
+                    machine.wakers.calls.register(cx.waker());
+                    core::task::Poll::Pending
+                }
+            }
+        })
+        .await?;
+        let machine = self.shared.machine.borrow();
+        let lease = machine.functions.function(call.slot).and_then(|function| function.handler.lease);
+        Ok(TakenCall {
+            unit: *self,
+            running: Some(running),
+            caller,
+            priority: call.priority,
+            deadline: call.deadline,
+            wants_reply: call.wants_reply,
+            lease: lease.map(|lease| LeaseWatch { lease }),
+        })
+    }
+}
+
+impl<T> TakenCall<T> {
+    /// Answers with results, or with why there are none; waits for room on the link while the caller waits for the
+    /// answer. Cancelled, the caller gets [`ServiceError::NotReady`] instead.
+    pub async fn reply(mut self, result: Result<&ParametersView, ServiceError>) {
+        let result = result.map_err(Error::Service);
+        while let Some(running) = self.running {
+            if self.unit.act(|machine| machine.answer(&running, result)) {
+                self.running = None;
+                return;
+            }
+            timer(now() + PAUSE).await;
+        }
+    }
+}
+
+impl<T> Drop for TakenCall<T> {
+    fn drop(&mut self) {
+        let Some(running) = self.running.take() else { return };
+        let Ok(mut machine) = self.unit.shared.machine.try_borrow_mut() else { return };
+        machine.wake_runner();
+        let error = Err(Error::Service(ServiceError::NotReady));
+        if !machine.answer(&running, error) && !machine.park(running, error) {
+            machine.with(running.link, |session, _, _| session.drop_answer(running.ticket));
+        }
+    }
+}
