@@ -37,6 +37,7 @@ pub use self::heard::{Foreign, Heard, Reach};
 use crate::sys::datagram::{Datagrams, Socket};
 use crate::sys::epoll::{Epoll, Events, Interest};
 use crate::sys::interfaces::{Interface, Interfaces};
+pub use cara_core::config::VERSION;
 
 /// Most lives of units that are kept; beyond them only those that are kept already are counted on.
 pub const HEARD: usize = 4096;

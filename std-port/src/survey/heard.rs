@@ -43,6 +43,8 @@ pub struct Heard {
     pub last: Duration,
     /// It was heard on the discovery port at least once, as all broadcasts are.
     pub by_broadcast: bool,
+    /// Datagrams that it sent to the survey alone: its answers to questions of the survey.
+    pub to_us: u32,
 }
 
 impl Heard {
@@ -85,12 +87,14 @@ impl Heard {
             first: now,
             last: now,
             by_broadcast: false,
+            to_us: 0,
         }
     }
 
     pub(super) fn take(&mut self, news: &News, now: Duration) {
         self.last = now;
         self.by_broadcast |= news.by_broadcast;
+        self.to_us = self.to_us.saturating_add(u32::from(!news.by_broadcast));
         match news.datagram {
             Some(Datagram::WhoHas(search)) => {
                 self.searches = self.searches.saturating_add(1);

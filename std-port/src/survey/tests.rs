@@ -1,6 +1,5 @@
 use std::net::Ipv4Addr;
 
-use cara_core::config::VERSION;
 use cara_core::distribution::hello::Manager;
 
 use super::*;
@@ -108,7 +107,7 @@ fn a_manager_answers_and_own_broadcasts_come_back() {
     let boss = survey.heard().iter().find(|heard| heard.answers > 0).unwrap();
     assert_eq!(boss.identity.as_ref(), Some(&manager.identity()));
     assert_eq!(boss.listens_at().map(|at| at.port()), Some(manager.tcp_port()));
-    assert_eq!(boss.room, Some(64));
+    assert_eq!((boss.room, boss.to_us), (Some(64), 1));
     assert!(survey.reach().iter().any(|reach| reach.sent == 1 && reach.heard == 1), "{:?}", survey.reach());
     assert!(survey.heard().iter().all(|heard| heard.identity.as_ref() == Some(&manager.identity())));
 }
