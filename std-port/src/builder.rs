@@ -12,7 +12,7 @@ use cara_core::error::Error;
 use cara_core::services::publications::Publications;
 use core::net::SocketAddr;
 
-use crate::communication_system::CommunicationSystem;
+use crate::communication_system::{CommunicationSystem, Owner};
 use crate::config::Capacities;
 use crate::engine::{Engine, EngineParts, NodeCell, message_buffer_bytes, system_refused};
 use crate::pool::MessagePool;
@@ -41,6 +41,8 @@ pub struct Builder<T> {
     discovery_port: u16,
     tcp_port: u16,
     threads: Option<Threads>,
+    #[cfg(feature = "control")]
+    control: crate::control::Control,
     state: T,
 }
 
@@ -64,6 +66,8 @@ impl Builder<()> {
             discovery_port: PLAIN_PORT,
             tcp_port: 0,
             threads: None,
+            #[cfg(feature = "control")]
+            control: crate::control::Control::Default,
             state: (),
         }
     }
@@ -134,14 +138,30 @@ impl<T: Send + 'static> Builder<T> {
             discovery_port: self.discovery_port,
             tcp_port: self.tcp_port,
             threads: self.threads,
+            #[cfg(feature = "control")]
+            control: self.control,
             state,
         }
+    }
+
+    /// Where an m_unit answers its operator once it is started; in the default directory unless set.
+    #[cfg(feature = "control")]
+    pub fn control(mut self, control: crate::control::Control) -> Self {
+        self.control = control;
+        self
     }
 
     /// An m_unit; it does nothing until it is started.
     pub fn build_system(self) -> Result<CommunicationSystem<T>, Error> {
         match self.identity.role() {
-            Role::MUnit => Ok(CommunicationSystem::of(self.engine()?)),
+            Role::MUnit => {
+                #[cfg(feature = "control")]
+                let control = self.control.clone();
+                let system = Owner::new(self.engine()?);
+                #[cfg(feature = "control")]
+                let system = system.with_control(control);
+                Ok(CommunicationSystem::of(system))
+            }
             Role::SUnit => Err(Error::BadConstraint),
         }
     }
@@ -149,7 +169,7 @@ impl<T: Send + 'static> Builder<T> {
     /// An s_unit; it does nothing until it is started.
     pub fn build_unit(self) -> Result<Unit<T>, Error> {
         match self.identity.role() {
-            Role::SUnit => Ok(Unit::of(self.engine()?)),
+            Role::SUnit => Ok(Unit::of(Owner::new(self.engine()?))),
             Role::MUnit => Err(Error::BadConstraint),
         }
     }

@@ -1,5 +1,11 @@
 //! The paper's `Communication_System`: an m_unit, which connects to many nodes.
 
+#[cfg(feature = "control")]
+use std::path::PathBuf;
+#[cfg(feature = "control")]
+use std::sync::Mutex;
+#[cfg(feature = "control")]
+use std::sync::atomic::AtomicU64;
 use std::sync::mpsc::{Receiver, sync_channel};
 use std::sync::{Arc, Weak};
 use std::task::{Poll, Wake, Waker};
@@ -15,6 +21,8 @@ use cara_core::time::Duration;
 use core::net::IpAddr;
 
 use crate::builder::{self, Builder};
+#[cfg(feature = "control")]
+use crate::control::{self, Control, Server};
 use crate::engine::{Engine, lock, pairs, read};
 use crate::event::UnitEvent;
 use crate::my_function_list::MyFunctionList;
@@ -33,11 +41,63 @@ pub struct CommunicationSystem<T: Send + 'static = ()> {
 /// Stops the unit's threads when the last handle goes.
 pub(crate) struct Owner<T: Send + 'static> {
     pub(crate) engine: Arc<Engine<T>>,
+    /// It does not keep the unit running.
+    guest: bool,
+    #[cfg(feature = "control")]
+    control: Control,
+    #[cfg(feature = "control")]
+    server: Mutex<Option<Server>>,
+}
+
+impl<T: Send + 'static> Owner<T> {
+    pub(crate) fn new(engine: Arc<Engine<T>>) -> Self {
+        Self {
+            engine,
+            guest: false,
+            #[cfg(feature = "control")]
+            control: Control::Off,
+            #[cfg(feature = "control")]
+            server: Mutex::new(None),
+        }
+    }
+
+    fn stop(&self) {
+        self.engine.stop();
+        #[cfg(feature = "control")]
+        {
+            let server = lock(&self.server).take();
+            if let Some(server) = server {
+                server.stop();
+            }
+        }
+    }
+}
+
+#[cfg(feature = "control")]
+impl<T: Send + 'static> Owner<T> {
+    pub(crate) fn with_control(mut self, control: Control) -> Self {
+        self.control = control;
+        self
+    }
+
+    fn guest(engine: Arc<Engine<T>>) -> Self {
+        let mut guest = Self::new(engine);
+        guest.guest = true;
+        guest
+    }
+
+    /// Opens the socket for the unit's operator.
+    fn open_control(&self) {
+        let guest = Self::guest(self.engine.clone());
+        *lock(&self.server) = control::open(&self.control, CommunicationSystem::of(guest));
+    }
 }
 
 impl<T: Send + 'static> Drop for Owner<T> {
     fn drop(&mut self) {
-        self.engine.stop();
+        if !self.guest {
+            self.stop();
+        }
     }
 }
 
@@ -78,8 +138,8 @@ impl CommunicationSystem {
 }
 
 impl<T: Send + 'static> CommunicationSystem<T> {
-    pub(crate) fn of(engine: Arc<Engine<T>>) -> Self {
-        Self { owner: Arc::new(Owner { engine }) }
+    pub(crate) fn of(owner: Owner<T>) -> Self {
+        Self { owner: Arc::new(owner) }
     }
 
     fn engine(&self) -> &Arc<Engine<T>> {
@@ -89,12 +149,26 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     /// Searches for nodes and keeps connections, in threads of its own (paper, listing line 2).
     #[doc(alias = "start_thread")]
     pub fn start(&self) -> Result<(), Error> {
-        self.engine().start()
+        self.engine().start()?;
+        #[cfg(feature = "control")]
+        self.owner.open_control();
+        Ok(())
     }
 
     /// Ends every link in an orderly way and all threads.
     pub fn stop(&self) {
-        self.engine().stop();
+        self.owner.stop();
+    }
+
+    /// Where it answers its operator; `None` if nowhere.
+    #[cfg(feature = "control")]
+    pub fn control_path(&self) -> Option<PathBuf> {
+        lock(&self.owner.server).as_ref().map(|server| server.path().to_owned())
+    }
+
+    #[cfg(feature = "control")]
+    pub(crate) fn is_stopped(&self) -> bool {
+        self.engine().is_stopping()
     }
 
     /// A handle for the unit's own handlers. One that owned a [`CommunicationSystem`] would keep it running for ever.
@@ -277,6 +351,13 @@ impl<T: Send + 'static> CommunicationSystem<T> {
         receiver
     }
 
+    /// Events with room for so many, and how many have found none since it was last set to 0.
+    #[cfg(feature = "control")]
+    pub(crate) fn events_with_losses(&self, room: usize) -> (Receiver<UnitEvent>, Arc<AtomicU64>) {
+        let (sender, receiver) = sync_channel(room);
+        (receiver, self.engine().subscribe(sender))
+    }
+
     /// Runs `act` with the application's state.
     pub fn with_state<R>(&self, act: impl FnOnce(&mut T) -> R) -> Result<R, Error> {
         self.engine().state.enter(None).map(|mut state| act(&mut state))
@@ -306,15 +387,20 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     }
 }
 
-/// Blocks this thread until `poll` is ready.
-pub(crate) fn wait<R>(mut poll: impl FnMut(&mut std::task::Context<'_>) -> Poll<R>) -> R {
+/// Unparks the thread that makes it.
+pub(crate) fn thread_waker() -> Waker {
     struct Unpark(std::thread::Thread);
     impl Wake for Unpark {
         fn wake(self: Arc<Self>) {
             self.0.unpark();
         }
     }
-    let waker = Waker::from(Arc::new(Unpark(std::thread::current())));
+    Waker::from(Arc::new(Unpark(std::thread::current())))
+}
+
+/// Blocks this thread until `poll` is ready.
+pub(crate) fn wait<R>(mut poll: impl FnMut(&mut std::task::Context<'_>) -> Poll<R>) -> R {
+    let waker = thread_waker();
     let mut cx = std::task::Context::from_waker(&waker);
     loop {
         if let Poll::Ready(result) = poll(&mut cx) {

@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use cara_core::config::Constraints;
 use cara_core::distribution::function::{Attributes, Definition};
+use cara_core::distribution::function_list::Function;
 use cara_core::distribution::hello::Limits;
 use cara_core::distribution::identity::{Epoch, Identity};
 use cara_core::distribution::parameters::ParametersView;
@@ -15,6 +16,8 @@ use cara_core::time::Duration;
 use core::net::SocketAddr;
 
 use crate::builder;
+#[cfg(feature = "control")]
+use crate::engine::CallFuture;
 use crate::engine::link::LinkCell;
 use crate::engine::peers::PeerCell;
 use crate::engine::{Engine, lock, pairs};
@@ -83,6 +86,14 @@ pub struct TheirFunction {
     pub definition: Definition,
     /// How it wants to be called.
     pub attributes: Attributes,
+}
+
+impl TheirFunction {
+    /// What was checked when it came reads back from its text form.
+    fn of(function: Function<'_>) -> Option<Self> {
+        let definition = Definition::parse(&function.signature.to_string()).ok()?;
+        Some(Self { definition, attributes: function.attributes })
+    }
 }
 
 impl<T: Send + 'static> Peer<T> {
@@ -158,12 +169,14 @@ impl<T: Send + 'static> Peer<T> {
         let Ok(link) = self.link() else { return Vec::new() };
         let state = link.lock();
         let functions = state.session.their_function_list().iter();
-        // What was checked when it came reads back from its text form.
-        let known = functions.filter_map(|function| {
-            let definition = Definition::parse(&function.signature.to_string()).ok()?;
-            Some(TheirFunction { definition, attributes: function.attributes })
-        });
-        known.collect()
+        functions.filter_map(TheirFunction::of).collect()
+    }
+
+    /// One of them.
+    pub fn function(&self, name: &str) -> Option<TheirFunction> {
+        let link = self.link().ok()?;
+        let state = link.lock();
+        state.session.their_function_list().named(name).and_then(TheirFunction::of)
     }
 
     /// Waits until the node has published `function`; `false` after `timeout`.
@@ -222,6 +235,17 @@ impl<T: Send + 'static> Peer<T> {
     ) -> Result<crate::future::PendingReply<'p, T>, Error> {
         let call = self.engine.call_future(self.link()?, function, parameters, options)?;
         Ok(crate::future::PendingReply::new(call, parameters))
+    }
+
+    /// The end of a call, to be polled for.
+    #[cfg(feature = "control")]
+    pub(crate) fn call_future(
+        &self,
+        function: &str,
+        parameters: &ParametersView,
+        options: &RequestOptions,
+    ) -> Result<CallFuture<T>, Error> {
+        self.engine.call_future(self.link()?, function, parameters, options)
     }
 
     /// Gives up the lease that a call of `function` began: what it started stops.

@@ -63,8 +63,8 @@ impl Unit {
 }
 
 impl<T: Send + 'static> Unit<T> {
-    pub(crate) fn of(engine: Arc<Engine<T>>) -> Self {
-        Self { owner: Arc::new(Owner { engine }) }
+    pub(crate) fn of(owner: Owner<T>) -> Self {
+        Self { owner: Arc::new(owner) }
     }
 
     fn engine(&self) -> &Arc<Engine<T>> {

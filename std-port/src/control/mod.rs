@@ -1,4 +1,59 @@
 //! The operator's way in (design, section 7): a running m_unit answers questions on a Unix socket that only its owner
 //! can open.
+//!
+//! A unit opens its socket when it is started, unless its [`Builder`](crate::Builder) says otherwise ([`Control`]), and
+//! removes it when it is stopped. [`Client`] is the other end; [`execute`] answers the same questions against a unit of
+//! this process. What travels is in [`protocol`].
+//!
+//! Whoever can open the socket can do what the program can: there is no finer right. So the directory is the owner's
+//! alone, and each connection must come from the same user or from root.
 
+mod answering;
+mod call;
+mod client;
+mod constraint;
+mod describe;
+mod failure;
+mod lines;
+mod place;
 pub mod protocol;
+mod select;
+mod server;
+mod values;
+
+use std::path::PathBuf;
+
+pub use answering::execute;
+pub use client::{Answers, Client, ControlError, RunningUnit, running, running_in};
+pub use place::directory;
+pub(crate) use server::Server;
+
+use crate::CommunicationSystem;
+
+/// Where a running m_unit answers its operator.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub enum Control {
+    /// In the [directory] of control sockets, under the unit's name, id and fleet.
+    #[default]
+    Default,
+    /// At this path. Its directory is made if it is not there, and must be the owner's alone.
+    Path(PathBuf),
+    /// Nowhere.
+    Off,
+}
+
+/// Opens the socket of a unit that has been started. A unit that cannot have one runs without: it is warned of.
+pub(crate) fn open<T: Send + 'static>(control: &Control, guest: CommunicationSystem<T>) -> Option<Server> {
+    let path = match control {
+        Control::Off => return None,
+        Control::Path(path) => path.clone(),
+        Control::Default => directory().join(place::file_name(&guest.identity(), guest.fleet())),
+    };
+    match Server::open(&path, guest) {
+        Ok(server) => Some(server),
+        Err(error) => {
+            tracing::warn!(%error, "there is no control socket: the `cara` command will not find this unit");
+            None
+        }
+    }
+}

@@ -143,6 +143,8 @@ pub enum Answer {
         control_version: u32,
         /// The unit's `name/id`.
         unit: String,
+        /// Its fleet.
+        fleet: u32,
     },
     /// This unit.
     Unit(UnitInfo),

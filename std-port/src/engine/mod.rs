@@ -20,13 +20,13 @@ mod tables;
 pub(crate) mod workers;
 
 pub(crate) use accounts::pairs;
-#[cfg(feature = "async")]
+#[cfg(any(feature = "async", feature = "control"))]
 pub(crate) use calling::CallFuture;
 pub(crate) use clock_thread::system_refused;
 pub(crate) use membership::NodeCell;
 pub(crate) use workers::arena_bytes;
 
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{SyncSender, TrySendError};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 
@@ -94,9 +94,16 @@ pub(crate) struct Engine<T: 'static> {
     /// When the unit was made.
     born: Instant,
     accounts: accounts::Accounts,
-    subscribers: Mutex<Vec<SyncSender<UnitEvent>>>,
+    subscribers: Mutex<Vec<Subscriber>>,
     /// Runs when a peer is lost, before its loss is told.
     pub(crate) lost_hook: Mutex<Option<Arc<crate::handler::Hook<T>>>>,
+}
+
+/// Somebody who is told what happens.
+struct Subscriber {
+    sender: SyncSender<UnitEvent>,
+    /// Events that found no room.
+    lost: Arc<AtomicU64>,
 }
 
 /// The call of its own that a leader reads for.
@@ -390,9 +397,10 @@ impl<T: Send + 'static> Engine<T> {
     /// Tells subscribers; one that does not keep up loses the event, and one that is gone is forgotten.
     pub(crate) fn tell(&self, event: UnitEvent) {
         tracing::debug!(?event);
-        lock(&self.subscribers).retain(|subscriber| match subscriber.try_send(event.clone()) {
+        lock(&self.subscribers).retain(|subscriber| match subscriber.sender.try_send(event.clone()) {
             Ok(()) => true,
             Err(TrySendError::Full(_)) => {
+                subscriber.lost.fetch_add(1, Ordering::Relaxed);
                 self.accounts.event_lost();
                 true
             }
@@ -400,8 +408,11 @@ impl<T: Send + 'static> Engine<T> {
         });
     }
 
-    pub(crate) fn subscribe(&self, subscriber: SyncSender<UnitEvent>) {
-        lock(&self.subscribers).push(subscriber);
+    /// Tells `sender` what happens from here on; what is returned counts the events that found no room.
+    pub(crate) fn subscribe(&self, sender: SyncSender<UnitEvent>) -> Arc<AtomicU64> {
+        let lost = Arc::new(AtomicU64::new(0));
+        lock(&self.subscribers).push(Subscriber { sender, lost: lost.clone() });
+        lost
     }
 
     /// Changes the constraints of the unit and tells every peer. [`Error::BadConstraint`] for more nodes than the tables

@@ -1,0 +1,233 @@
+//! One question, answered against a system of this process.
+
+use std::ops::ControlFlow;
+use std::sync::mpsc::RecvTimeoutError;
+
+use cara_core::config::Constraints;
+use cara_core::error::Error;
+use cara_core::time::Duration;
+
+use super::protocol::{Answer, Failure, Question};
+use super::{call, constraint, describe, select};
+use crate::CommunicationSystem;
+
+/// Where answers go; `Break` when nobody reads them any more.
+pub(super) type Sink<'s> = &'s mut dyn FnMut(Answer) -> ControlFlow<()>;
+
+/// Events that wait to be written before some are lost.
+const EVENTS: usize = 1024;
+/// How often a watch without events looks whether it is still wanted, and a pause whether the unit still runs.
+const LOOK: std::time::Duration = std::time::Duration::from_millis(100);
+
+/// Why an answer ends early.
+pub(super) enum End {
+    /// Nobody reads it.
+    Gone,
+    /// It could not be given.
+    Failed(Failure),
+}
+
+impl From<Failure> for End {
+    fn from(failure: Failure) -> Self {
+        Self::Failed(failure)
+    }
+}
+
+impl From<Error> for End {
+    fn from(error: Error) -> Self {
+        Self::Failed(error.into())
+    }
+}
+
+/// Answers one question: any number of answers, of which the last is [`Answer::Done`] or [`Answer::Failed`]. It returns
+/// when all are given, or when `answer` says `Break`. It takes as long as what was asked for: a call until its reply, a
+/// watch until the unit stops.
+pub fn execute<T: Send + 'static>(
+    system: &CommunicationSystem<T>,
+    question: &Question,
+    answer: &mut dyn FnMut(Answer) -> ControlFlow<()>,
+) {
+    execute_while(system, question, answer, &|| true);
+}
+
+/// As [`execute`]; a watch ends as well when `wanted` says no.
+pub(super) fn execute_while<T: Send + 'static>(
+    system: &CommunicationSystem<T>,
+    question: &Question,
+    sink: Sink<'_>,
+    wanted: &dyn Fn() -> bool,
+) {
+    // Whoever is gone does not hear it.
+    let _ = match attempt(system, question, sink, wanted) {
+        Ok(()) => sink(Answer::Done),
+        Err(End::Failed(failure)) => sink(Answer::Failed(failure)),
+        Err(End::Gone) => ControlFlow::Break(()),
+    };
+}
+
+fn attempt<T: Send + 'static>(
+    system: &CommunicationSystem<T>,
+    question: &Question,
+    sink: Sink<'_>,
+    wanted: &dyn Fn() -> bool,
+) -> Result<(), End> {
+    match question {
+        Question::Unit => send(sink, Answer::Unit(describe::unit(system))),
+        Question::Nodes { offering } => nodes(system, offering.as_deref(), sink),
+        Question::Search => {
+            system.broadcast();
+            Ok(())
+        }
+        Question::Functions { node } => functions(system, node, sink),
+        Question::Call(question) => call::call(system, question, sink),
+        Question::Publish { node, timeout_ms } => {
+            publish(system, node.as_deref(), Duration::from_millis(*timeout_ms), sink)
+        }
+        Question::Set { node, constraint, value } => {
+            let constraints = set(system, node.as_deref(), constraint, *value)?;
+            send(sink, Answer::Constraints(describe::constraints(&constraints)))
+        }
+        Question::Watch => watch(system, sink, wanted),
+        Question::Counters { node } => counters(system, node.as_deref(), sink),
+        Question::Ping { node, count, pause_us, timeout_ms } => {
+            let times = (*count, Duration::from_micros(*pause_us), Duration::from_millis(*timeout_ms));
+            call::ping(system, node, times, sink)
+        }
+        Question::Bench { call, count, pause_us } => {
+            call::bench(system, call, (*count, Duration::from_micros(*pause_us)), sink)
+        }
+    }
+}
+
+pub(super) fn send(sink: Sink<'_>, answer: Answer) -> Result<(), End> {
+    match sink(answer) {
+        ControlFlow::Continue(()) => Ok(()),
+        ControlFlow::Break(()) => Err(End::Gone),
+    }
+}
+
+/// Waits; [`Error::NotRunning`] when the unit has been stopped.
+pub(super) fn pause<T: Send + 'static>(system: &CommunicationSystem<T>, span: Duration) -> Result<(), End> {
+    let mut left: std::time::Duration = span.into();
+    while !system.is_stopped() {
+        let step = left.min(LOOK);
+        if step.is_zero() {
+            return Ok(());
+        }
+        std::thread::sleep(step);
+        left -= step;
+    }
+    Err(Error::NotRunning.into())
+}
+
+fn nodes<T: Send + 'static>(
+    system: &CommunicationSystem<T>,
+    offering: Option<&str>,
+    sink: Sink<'_>,
+) -> Result<(), End> {
+    let all = match offering {
+        Some(function) => system.nodes_offering(function),
+        None => select::nodes(system),
+    };
+    for peer in &all {
+        send(sink, Answer::Node(describe::node(peer)))?;
+    }
+    for finding in system.findings() {
+        send(sink, Answer::Refused(describe::refused(&finding, system.age(&finding))))?;
+    }
+    Ok(())
+}
+
+fn functions<T: Send + 'static>(system: &CommunicationSystem<T>, node: &str, sink: Sink<'_>) -> Result<(), End> {
+    let peer = select::node(system, node)?;
+    if !peer.is_connected() {
+        return Err(Error::NotConnected.into());
+    }
+    peer.functions().iter().try_for_each(|function| send(sink, Answer::Function(describe::function(function))))
+}
+
+fn publish<T: Send + 'static>(
+    system: &CommunicationSystem<T>,
+    node: Option<&str>,
+    timeout: Duration,
+    sink: Sink<'_>,
+) -> Result<(), End> {
+    let unread = match node {
+        None => system.publish_and_wait(timeout)?,
+        Some(node) => {
+            let peer = select::node(system, node)?;
+            match peer.publish_and_wait(timeout) {
+                Ok(()) => Vec::new(),
+                Err(Error::TimedOut) => vec![peer.identity().clone()],
+                Err(error) => return Err(error.into()),
+            }
+        }
+    };
+    unread
+        .iter()
+        .try_for_each(|identity| send(sink, Answer::Unread { node: identity.name().to_owned(), id: identity.id() }))
+}
+
+fn set<T: Send + 'static>(
+    system: &CommunicationSystem<T>,
+    node: Option<&str>,
+    name: &str,
+    value: u64,
+) -> Result<Constraints, Failure> {
+    let Some(node) = node else {
+        let changed = constraint::changed(system.constraints(), name, value)?;
+        system.set_constraints(changed).map_err(|error| constraint::refused(error, name, value))?;
+        return Ok(system.constraints());
+    };
+    let peer = select::node(system, node)?;
+    constraint::check_for_one(name)?;
+    let changed = constraint::changed(peer.constraints(), name, value)?;
+    peer.set_constraints(changed).map_err(|error| constraint::refused(error, name, value))?;
+    Ok(peer.constraints())
+}
+
+fn watch<T: Send + 'static>(
+    system: &CommunicationSystem<T>,
+    sink: Sink<'_>,
+    wanted: &dyn Fn() -> bool,
+) -> Result<(), End> {
+    let (events, lost) = system.events_with_losses(EVENTS);
+    let tell = |event: &str, text: String| Answer::Event {
+        at_ms: system.uptime().as_millis(),
+        event: event.to_owned(),
+        node: None,
+        text,
+    };
+    send(sink, tell("watching", "events from here on".to_owned()))?;
+    loop {
+        match events.recv_timeout(LOOK) {
+            Ok(event) => send(sink, describe::event(&event, system.uptime()))?,
+            Err(RecvTimeoutError::Timeout) if system.is_stopped() => return Ok(()),
+            Err(RecvTimeoutError::Timeout) if !wanted() => return Err(End::Gone),
+            Err(RecvTimeoutError::Timeout) => {}
+            Err(RecvTimeoutError::Disconnected) => return Ok(()),
+        }
+        let missed = lost.swap(0, std::sync::atomic::Ordering::Relaxed);
+        if missed > 0 {
+            send(sink, tell("lost", format!("{missed} events came faster than they were read")))?;
+        }
+    }
+}
+
+fn counters<T: Send + 'static>(system: &CommunicationSystem<T>, node: Option<&str>, sink: Sink<'_>) -> Result<(), End> {
+    let peers = match node {
+        Some(node) => vec![select::node(system, node)?],
+        None => {
+            send(sink, Answer::Counters { node: None, counters: named(system.counters()) })?;
+            select::nodes(system).into_iter().filter(|peer| peer.is_connected()).collect()
+        }
+    };
+    peers.iter().try_for_each(|peer| {
+        let counters = named(peer.counters());
+        send(sink, Answer::Counters { node: Some(peer.identity().to_string()), counters })
+    })
+}
+
+fn named(counters: Vec<(&'static str, u64)>) -> Vec<(String, u64)> {
+    counters.into_iter().map(|(name, count)| (name.to_owned(), count)).collect()
+}

@@ -1,0 +1,256 @@
+//! Calls that an operator makes: to one node or to all, once or again and again.
+
+use std::time::Instant;
+
+use cara_core::distribution::parameters::ParametersView;
+use cara_core::error::{Cause, Error};
+use cara_core::time::Duration;
+
+use super::answering::{End, Sink, pause, send};
+use super::protocol::{Answer, Argument, CallQuestion, Failure};
+use super::{describe, select, values};
+use crate::communication_system::thread_waker;
+use crate::{CommunicationSystem, Delivery, Peer, RequestOptions, TheirFunction};
+
+/// Most bytes of parameters that are under way at a time when all nodes are called.
+const BYTES_AT_A_TIME: usize = 64 * 1024 * 1024;
+
+/// Calls one node, or all that offer the function.
+pub(super) fn call<T: Send + 'static>(
+    system: &CommunicationSystem<T>,
+    question: &CallQuestion,
+    sink: Sink<'_>,
+) -> Result<(), End> {
+    let options = options(question)?;
+    match &question.node {
+        Some(node) => {
+            let peer = select::node(system, node)?;
+            let started = Instant::now();
+            let outcome = call_one(&peer, question, &options);
+            send(sink, called(&peer, outcome, started))
+        }
+        None => call_all(system, question, &options, sink),
+    }
+}
+
+/// What a call has led to.
+#[derive(Default)]
+struct Outcome {
+    results: Vec<Argument>,
+    call: Option<u32>,
+}
+
+/// A call that could be made.
+struct Prepared {
+    function: TheirFunction,
+    parameters: Box<ParametersView>,
+}
+
+fn options(question: &CallQuestion) -> Result<RequestOptions, Failure> {
+    let priority = question.priority.as_deref().map(|word| {
+        describe::priority_of(word).ok_or_else(|| {
+            let text = format!("'{word}' is no priority: it is emergency, high, normal or low");
+            Failure::configuration("UnknownPriority", text)
+        })
+    });
+    if question.best_effort && !question.asynchronous {
+        let text = "a call in one datagram has no reply: ask for it as asynchronous";
+        return Err(Failure::configuration("BadQuestion", text));
+    }
+    Ok(RequestOptions {
+        timeout: question.timeout_ms.map(Duration::from_millis),
+        priority: priority.transpose()?,
+        delivery: if question.best_effort { Delivery::BestEffort } else { Delivery::Reliable },
+        // What an operator starts goes on for its lease and no longer: nobody would release it.
+        renew_lease: false,
+    })
+}
+
+fn call_one<T: Send + 'static>(
+    peer: &Peer<T>,
+    question: &CallQuestion,
+    options: &RequestOptions,
+) -> Result<Outcome, Failure> {
+    let mut prepared = prepare(peer, question)?;
+    if question.asynchronous {
+        let id = peer.request_with(&question.function, &prepared.parameters, options);
+        return id
+            .map(|id| Outcome { call: Some(id.0), ..Outcome::default() })
+            .map_err(|error| prepared.explain(error));
+    }
+    let outcome = peer.block_request_with(&question.function, &mut prepared.parameters, options);
+    prepared.outcome(outcome)
+}
+
+fn prepare<T: Send + 'static>(peer: &Peer<T>, question: &CallQuestion) -> Result<Prepared, Failure> {
+    if !peer.is_connected() {
+        return Err(Error::NotConnected.into());
+    }
+    let function = peer.function(&question.function).ok_or_else(|| unknown(peer, &question.function))?;
+    let results = values::bytes_of(function.definition.signature().results())?;
+    let parameters = values::parameters(&question.arguments, results).map_err(|failure| signed(failure, &function))?;
+    Ok(Prepared { function, parameters })
+}
+
+fn unknown<T: Send + 'static>(peer: &Peer<T>, function: &str) -> Failure {
+    let list = peer.their_function_list();
+    let names: Vec<&str> = list.names().collect();
+    let offered = if names.is_empty() { "nothing yet".to_owned() } else { names.join(", ") };
+    let peer = peer.identity();
+    Failure::configuration(
+        "UnknownFunction",
+        format!("{peer} does not offer '{function}' to this unit; it offers {offered}"),
+    )
+}
+
+fn signed(failure: Failure, function: &TheirFunction) -> Failure {
+    failure.and(format_args!("the signature is {}", function.definition.signature()))
+}
+
+impl Prepared {
+    fn outcome(&self, outcome: Result<(), Error>) -> Result<Outcome, Failure> {
+        outcome.map_err(|error| self.explain(error))?;
+        let results = values::arguments(self.function.definition.signature().results(), &self.parameters);
+        Ok(Outcome { results, call: None })
+    }
+
+    /// Whoever wrote the arguments wants to see what was asked for.
+    fn explain(&self, error: Error) -> Failure {
+        let failure = Failure::from(error);
+        if error.cause() == Cause::Configuration { signed(failure, &self.function) } else { failure }
+    }
+}
+
+fn called<T: Send + 'static>(peer: &Peer<T>, outcome: Result<Outcome, Failure>, started: Instant) -> Answer {
+    let took_us = u64::try_from(started.elapsed().as_micros()).unwrap_or(u64::MAX);
+    let (outcome, error) = match outcome {
+        Ok(outcome) => (outcome, None),
+        Err(failure) => (Outcome::default(), Some(failure)),
+    };
+    let (node, id) = (peer.name().to_owned(), peer.id());
+    Answer::Called { node, id, results: outcome.results, call: outcome.call, error, took_us }
+}
+
+fn call_all<T: Send + 'static>(
+    system: &CommunicationSystem<T>,
+    question: &CallQuestion,
+    options: &RequestOptions,
+    sink: Sink<'_>,
+) -> Result<(), End> {
+    let peers = system.nodes_offering(&question.function);
+    if peers.is_empty() {
+        let text = format!("no connected node offers '{}' to this unit", question.function);
+        return Err(Failure::configuration("UnknownFunction", text).into());
+    }
+    if !question.asynchronous {
+        return block_all(&peers, question, options, sink);
+    }
+    peers.iter().try_for_each(|peer| {
+        let started = Instant::now();
+        let outcome = call_one(peer, question, options);
+        send(sink, called(peer, outcome, started))
+    })
+}
+
+/// All at the same time, as far as the memory for their parameters reaches; answers come in the order of the replies.
+fn block_all<T: Send + 'static>(
+    peers: &[Peer<T>],
+    question: &CallQuestion,
+    options: &RequestOptions,
+    sink: Sink<'_>,
+) -> Result<(), End> {
+    let mut peers = peers.iter();
+    let mut under_way = Vec::new();
+    let mut bytes = 0;
+    let waker = thread_waker();
+    let mut cx = std::task::Context::from_waker(&waker);
+    loop {
+        while bytes < BYTES_AT_A_TIME
+            && let Some(peer) = peers.next()
+        {
+            let started = Instant::now();
+            let begun = prepare(peer, question).and_then(|prepared| {
+                let call = peer.call_future(&question.function, &prepared.parameters, options);
+                call.map_err(|error| prepared.explain(error)).map(|call| (prepared, call))
+            });
+            match begun {
+                Ok((prepared, call)) => {
+                    bytes += size_of_val(&*prepared.parameters);
+                    under_way.push((peer, started, prepared, call));
+                }
+                Err(failure) => send(sink, called(peer, Err(failure), started))?,
+            }
+        }
+        if under_way.is_empty() {
+            return Ok(());
+        }
+        let before = under_way.len();
+        let mut index = 0;
+        while let Some((peer, started, prepared, call)) = under_way.get_mut(index) {
+            if let std::task::Poll::Ready(outcome) = call.poll(&mut cx, &mut prepared.parameters) {
+                bytes -= size_of_val(&*prepared.parameters);
+                let answer = called(peer, prepared.outcome(outcome), *started);
+                drop(under_way.swap_remove(index));
+                send(sink, answer)?;
+            } else {
+                index += 1;
+            }
+        }
+        if under_way.len() == before {
+            std::thread::park();
+        }
+    }
+}
+
+/// Calls again and again, and tells how long each took.
+pub(super) fn bench<T: Send + 'static>(
+    system: &CommunicationSystem<T>,
+    question: &CallQuestion,
+    (count, between): (u32, Duration),
+    sink: Sink<'_>,
+) -> Result<(), End> {
+    let Some(node) = &question.node else {
+        return Err(Failure::configuration("BadQuestion", "name the node whose round trips are measured").into());
+    };
+    let options = RequestOptions { delivery: Delivery::Reliable, ..options(question)? };
+    let peer = select::node(system, node)?;
+    let prepared = prepare(&peer, question)?;
+    let mut parameters =
+        values::parameters(&question.arguments, values::bytes_of(prepared.function.definition.signature().results())?)?;
+    for number in 0..count {
+        if number > 0 {
+            pause(system, between)?;
+        }
+        parameters.copy_from(&prepared.parameters)?;
+        let started = Instant::now();
+        let outcome = peer.block_request_with(&question.function, &mut parameters, &options);
+        let took = started.elapsed();
+        send(sink, sample(outcome.map(|()| took).map_err(|error| prepared.explain(error))))?;
+    }
+    Ok(())
+}
+
+/// Sends pings, and tells how long each took.
+pub(super) fn ping<T: Send + 'static>(
+    system: &CommunicationSystem<T>,
+    node: &str,
+    (count, between, timeout): (u32, Duration, Duration),
+    sink: Sink<'_>,
+) -> Result<(), End> {
+    let peer = select::node(system, node)?;
+    for number in 0..count {
+        if number > 0 {
+            pause(system, between)?;
+        }
+        let took = peer.ping(timeout);
+        send(sink, sample(took.map(Into::into).map_err(Failure::from)))?;
+    }
+    Ok(())
+}
+
+fn sample(took: Result<std::time::Duration, Failure>) -> Answer {
+    match took {
+        Ok(took) => Answer::Sample { us: Some(took.as_secs_f64() * 1e6), error: None },
+        Err(failure) => Answer::Sample { us: None, error: Some(failure) },
+    }
+}

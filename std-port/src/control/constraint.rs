@@ -1,0 +1,70 @@
+//! Constraints by name, as an operator sets them.
+
+use cara_core::config::{CHUNK_BYTES, Constraints, MINIMUM_CHUNK_BYTES};
+use cara_core::error::Error;
+use cara_core::time::Duration;
+
+use super::protocol::Failure;
+use crate::builder::LONGEST_MESSAGE;
+
+const NAMES: &str =
+    "request_timeout, minimum_interval, maximum_nodes, message_size, chunk_size, keep_alive, calls_per_peer";
+/// What may differ from node to node.
+const FOR_ONE: [&str; 3] = ["request_timeout", "minimum_interval", "calls_per_peer"];
+
+/// The constraints with one of them changed.
+pub(super) fn changed(before: Constraints, name: &str, value: u64) -> Result<Constraints, Failure> {
+    let mut after = before;
+    match plain(name) {
+        "request_timeout" => after.request_timeout = Duration::from_micros(value),
+        "minimum_interval" => after.minimum_interval = Duration::from_micros(value),
+        "maximum_nodes" => after.maximum_nodes = narrow(name, value)?,
+        "message_size" => after.message_size = narrow(name, value)?,
+        "chunk_size" => after.chunk_size = narrow(name, value)?,
+        "keep_alive" => after.keep_alive = Duration::from_micros(value),
+        "calls_per_peer" => after.calls_per_peer = narrow(name, value)?,
+        _ => {
+            let text = format!("there is no constraint '{name}'; there are {NAMES}");
+            return Err(Failure::configuration("UnknownConstraint", text));
+        }
+    }
+    Ok(after)
+}
+
+/// Whether a constraint may be set towards one node.
+pub(super) fn check_for_one(name: &str) -> Result<(), Failure> {
+    if FOR_ONE.contains(&plain(name)) || !NAMES.split(", ").any(|known| known == plain(name)) {
+        return Ok(());
+    }
+    let text = format!("'{name}' is one for all nodes; towards one node there are {}", FOR_ONE.join(", "));
+    Err(Failure::configuration("BadConstraint", text))
+}
+
+/// Why the unit does not take the value.
+pub(super) fn refused(error: Error, name: &str, value: u64) -> Failure {
+    match error {
+        Error::BadConstraint => bad(name, value),
+        error => error.into(),
+    }
+}
+
+/// The name in the answer has its unit behind it.
+fn plain(name: &str) -> &str {
+    name.strip_suffix("_us").unwrap_or(name)
+}
+
+fn narrow<N: TryFrom<u64>>(name: &str, value: u64) -> Result<N, Failure> {
+    N::try_from(value).map_err(|_| bad(name, value))
+}
+
+fn bad(name: &str, value: u64) -> Failure {
+    let bounds = match plain(name) {
+        "maximum_nodes" => "it is at least 1, and at most what the unit was made with and 16 more".to_owned(),
+        "message_size" => format!("it is at most {LONGEST_MESSAGE} bytes"),
+        "chunk_size" => format!("it is {MINIMUM_CHUNK_BYTES} to {CHUNK_BYTES} bytes"),
+        "keep_alive" => "it is at least 1000 microseconds".to_owned(),
+        "calls_per_peer" => format!("it is 1 to {}", u16::MAX),
+        _ => "this unit cannot hold it".to_owned(),
+    };
+    Failure::configuration("BadConstraint", format!("{name} cannot be {value}: {bounds}"))
+}

@@ -1,0 +1,150 @@
+//! Units, nodes, refusals and events in the control socket's form.
+
+use cara_core::config::{Constraints, Priority, VERSION};
+use cara_core::distribution::connection_handler::Finding;
+use cara_core::distribution::identity::{Epoch, Identity, Role};
+use cara_core::time::Duration;
+
+use super::failure::name_of;
+use super::protocol::{
+    Answer, ConstraintsInfo, FunctionInfo, InterfaceInfo, LimitsInfo, NodeInfo, RefusedInfo, UnitInfo,
+};
+use crate::{CommunicationSystem, Interface, Limits, Peer, TheirFunction, UnitEvent};
+
+pub(super) fn unit<T: Send + 'static>(system: &CommunicationSystem<T>) -> UnitInfo {
+    let identity = system.identity();
+    UnitInfo {
+        name: identity.name().to_owned(),
+        id: identity.id(),
+        role: role(identity.role()).to_owned(),
+        fleet: system.fleet().0,
+        version: VERSION,
+        discovery_port: system.discovery_port(),
+        tcp_port: system.tcp_port(),
+        epoch: epoch(system.epoch()),
+        uptime_ms: system.uptime().as_millis(),
+        interfaces: system.interfaces().iter().map(interface).collect(),
+        constraints: constraints(&system.constraints()),
+        connected: system.number_of_s_units() + system.number_of_m_units(),
+    }
+}
+
+fn interface(interface: &Interface) -> InterfaceInfo {
+    InterfaceInfo {
+        name: interface.name.clone(),
+        address: interface.address.to_string(),
+        broadcast: interface.broadcast.map(|address| address.to_string()),
+        up: interface.up,
+    }
+}
+
+pub(super) fn node<T: Send + 'static>(peer: &Peer<T>) -> NodeInfo {
+    let limits = peer.limits();
+    NodeInfo {
+        name: peer.name().to_owned(),
+        id: peer.id(),
+        role: role(peer.identity().role()).to_owned(),
+        connected: peer.is_connected(),
+        address: peer.address().map(|address| address.to_string()),
+        // Nodes of another version are refused.
+        version: limits.map(|_| VERSION),
+        epoch: peer.epoch().map(epoch),
+        limits: limits.map(self::limits),
+        functions: peer.their_function_list().len(),
+    }
+}
+
+fn limits(limits: Limits) -> LimitsInfo {
+    LimitsInfo {
+        message_size: limits.message_size,
+        chunk_size: limits.chunk_size,
+        calls: limits.calls,
+        minimum_interval_us: u64::from(limits.minimum_interval),
+    }
+}
+
+pub(super) fn refused(finding: &Finding, age: Duration) -> RefusedInfo {
+    RefusedInfo {
+        address: finding.address.to_string(),
+        node: finding.identity.as_ref().map(Identity::to_string),
+        reason: name_of(&finding.refusal),
+        text: finding.refusal.to_string(),
+        ago_ms: age.as_millis(),
+    }
+}
+
+pub(super) fn function(function: &TheirFunction) -> FunctionInfo {
+    FunctionInfo {
+        name: function.definition.name().to_owned(),
+        signature: function.definition.signature().to_string(),
+        priority: priority(function.attributes.priority).to_owned(),
+        lease_us: function.attributes.lease.map(Duration::as_micros),
+        idempotent: function.attributes.idempotent,
+    }
+}
+
+pub(super) const fn constraints(constraints: &Constraints) -> ConstraintsInfo {
+    ConstraintsInfo {
+        request_timeout_us: constraints.request_timeout.as_micros(),
+        minimum_interval_us: constraints.minimum_interval.as_micros(),
+        maximum_nodes: constraints.maximum_nodes,
+        message_size: constraints.message_size,
+        chunk_size: constraints.chunk_size,
+        keep_alive_us: constraints.keep_alive.as_micros(),
+        calls_per_peer: constraints.calls_per_peer,
+    }
+}
+
+/// An event in words; `at` is the time since the unit was made.
+pub(super) fn event(event: &UnitEvent, at: Duration) -> Answer {
+    let (name, node, text) = match event {
+        UnitEvent::Joined { peer } => ("joined", Some(peer), "is connected".to_owned()),
+        UnitEvent::Left { peer, reason } => ("left", Some(peer), reason.to_string()),
+        UnitEvent::NotJoined { address, peer, reason } => ("not_joined", peer.as_ref(), format!("{address}: {reason}")),
+        UnitEvent::ListChanged { peer } => ("list_changed", Some(peer), "published or withdrew functions".to_owned()),
+        UnitEvent::InterfacesChanged { up } => {
+            ("interfaces_changed", None, format!("interfaces that are up: {}", up.join(" ")))
+        }
+        UnitEvent::FunctionsSkipped { peer, skipped } => {
+            ("functions_skipped", Some(peer), format!("keeps no room for {skipped} functions of this unit"))
+        }
+        UnitEvent::RequestFailed { peer, call, error } => {
+            ("request_failed", Some(peer), format!("call {}: {error}", call.0))
+        }
+        UnitEvent::LeaseExpired { peer, function } => {
+            ("lease_expired", Some(peer), format!("'{function}' of this unit stopped: its caller no longer wants it"))
+        }
+        UnitEvent::LeaseEnded { peer, function, expired: true } => {
+            ("lease_ended", Some(peer), format!("'{function}' stopped there: it was not renewed in time"))
+        }
+        UnitEvent::LeaseEnded { peer, function, expired: false } => {
+            ("lease_ended", Some(peer), format!("'{function}' is finished there"))
+        }
+    };
+    Answer::Event { at_ms: at.as_millis(), event: name.to_owned(), node: node.map(Identity::to_string), text }
+}
+
+pub(super) const fn role(role: Role) -> &'static str {
+    match role {
+        Role::MUnit => "m_unit",
+        Role::SUnit => "s_unit",
+    }
+}
+
+const fn priority(priority: Priority) -> &'static str {
+    match priority {
+        Priority::Emergency => "emergency",
+        Priority::High => "high",
+        Priority::Normal => "normal",
+        Priority::Low => "low",
+    }
+}
+
+/// The class of a word.
+pub(super) fn priority_of(word: &str) -> Option<Priority> {
+    Priority::ALL.into_iter().find(|class| priority(*class) == word)
+}
+
+fn epoch(epoch: Epoch) -> String {
+    format!("{:016x}", epoch.0)
+}

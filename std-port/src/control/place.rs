@@ -1,0 +1,359 @@
+//! Where control sockets are: a directory that only its owner enters, and one socket in it for each running unit.
+
+use std::fs::{DirBuilder, Permissions, set_permissions};
+use std::io;
+use std::os::fd::{AsFd, AsRawFd, OwnedFd};
+use std::os::unix::fs::{DirBuilderExt, FileTypeExt, MetadataExt, PermissionsExt};
+use std::os::unix::net::{UnixListener, UnixStream};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use cara_core::distribution::identity::{Fleet, Identity};
+use rustix::fs::{FlockOperation, Mode, OFlags, flock, fstat, open};
+use rustix::io::Errno;
+use rustix::net::{
+    AddressFamily, SocketAddrUnix, SocketFlags, SocketType, bind, connect, listen, socket_with, sockopt,
+};
+use rustix::process::geteuid;
+
+/// Ends the name of a control socket.
+const SUFFIX: &str = ".sock";
+/// Bytes of a unit's name in the name of its socket; of a longer one a piece and a hash.
+const NAME_BYTES: usize = 40;
+const PIECE_BYTES: usize = 23;
+/// Connections that wait to be accepted.
+const BACKLOG: i32 = 16;
+/// How long another process may hold the directory's lock.
+const PATIENCE: Duration = Duration::from_secs(1);
+
+/// Why there is no control socket.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum PlaceError {
+    #[error("{0} has no directory above it: give the socket's whole path")]
+    NoDirectory(PathBuf),
+    #[error("{path} belongs to user {owner}: remove it, or set CARA_CONTROL_DIR to a directory of your own")]
+    Foreign { path: PathBuf, owner: u32 },
+    #[error("others can enter {path} (mode {mode:o}): `chmod 700` it, or set CARA_CONTROL_DIR to one of your own")]
+    Open { path: PathBuf, mode: u32 },
+    #[error("another process answers on {0}: does a unit of the same name, id and fleet run already?")]
+    InUse(PathBuf),
+    #[error("{0} is there and no socket: move it away")]
+    NotASocket(PathBuf),
+    #[error("{path}: {error}")]
+    System { path: PathBuf, error: io::Error },
+}
+
+impl PlaceError {
+    fn system(path: &Path, error: impl Into<io::Error>) -> Self {
+        Self::System { path: path.to_owned(), error: error.into() }
+    }
+}
+
+/// The directory of control sockets: `$CARA_CONTROL_DIR`, else `$XDG_RUNTIME_DIR/cara`, else one of the user's in the
+/// directory for temporary files.
+pub fn directory() -> PathBuf {
+    let set = |name| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
+    set("CARA_CONTROL_DIR")
+        .or_else(|| set("XDG_RUNTIME_DIR").map(|runtime| runtime.join("cara")))
+        .unwrap_or_else(|| std::env::temp_dir().join(format!("cara-{}", own_uid())))
+}
+
+pub(super) fn own_uid() -> u32 {
+    geteuid().as_raw()
+}
+
+/// The name of a unit's socket.
+pub(super) fn file_name(identity: &Identity, fleet: Fleet) -> String {
+    let mut name = escape(identity.name());
+    if name.len() > NAME_BYTES {
+        let hash = fnv(identity.name().as_bytes());
+        let end =
+            (0..=PIECE_BYTES).rev().find(|&end| !name[..end].ends_with('%') && !name[..end.max(1) - 1].ends_with('%'));
+        name.truncate(end.unwrap_or(0));
+        name = format!("{name}~{hash:016x}");
+    }
+    format!("{name}-{}-{}{SUFFIX}", identity.id(), fleet.0)
+}
+
+/// Letters, digits, `_` and `-` stay, and `.` behind the first character; of the rest each byte in hexadecimal.
+fn escape(name: &str) -> String {
+    let mut escaped = String::new();
+    for (index, byte) in name.bytes().enumerate() {
+        match byte {
+            b'a'..=b'z' | b'A'..=b'Z' | b'0'..=b'9' | b'_' | b'-' => escaped.push(char::from(byte)),
+            b'.' if index > 0 => escaped.push('.'),
+            _ => escaped.push_str(&format!("%{byte:02X}")),
+        }
+    }
+    escaped
+}
+
+fn fnv(bytes: &[u8]) -> u64 {
+    bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, &byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3))
+}
+
+/// The sockets in a directory, whether somebody answers on them or not; none where others could have put them.
+pub(super) fn sockets(directory: &Path) -> Result<Vec<PathBuf>, PlaceError> {
+    match enter(directory) {
+        Ok(_) => {}
+        Err(PlaceError::System { error, .. }) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
+        Err(error) => return Err(error),
+    }
+    let entries = std::fs::read_dir(directory).map_err(|error| PlaceError::system(directory, error))?;
+    let mut sockets: Vec<PathBuf> = entries
+        .filter_map(|entry| entry.ok().map(|entry| entry.path()))
+        .filter(|path| path.to_string_lossy().ends_with(SUFFIX))
+        .collect();
+    sockets.sort();
+    Ok(sockets)
+}
+
+/// A listening socket and its file.
+#[derive(Debug)]
+pub(super) struct Place {
+    path: PathBuf,
+    /// What tells it from another one, so that nobody else's is removed.
+    file: Mark,
+}
+
+/// Device and number of a file, which may be used again, and the time of its last change.
+type Mark = (u64, u64, i64, i64);
+
+fn mark(path: &Path) -> io::Result<Mark> {
+    let file = path.symlink_metadata()?;
+    Ok((file.dev(), file.ino(), file.ctime(), file.ctime_nsec()))
+}
+
+impl Place {
+    pub(super) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Opens the socket at `path`, in the place of one on which nobody answers.
+    pub(super) fn open(path: &Path) -> Result<(Self, UnixListener), PlaceError> {
+        let directory = parent(path)?;
+        let made = DirBuilder::new().recursive(true).mode(0o700).create(directory);
+        made.map_err(|error| PlaceError::system(directory, error))?;
+        let directory = enter(directory)?;
+        let _lock = lock(&directory).map_err(|error| PlaceError::system(path, error))?;
+        make_room(path)?;
+        let listener = listen_at(path, &directory).map_err(|error| PlaceError::system(path, error))?;
+        // Nobody else enters the directory, so nobody has come in between.
+        set_permissions(path, Permissions::from_mode(0o600)).map_err(|error| PlaceError::system(path, error))?;
+        let file = mark(path).map_err(|error| PlaceError::system(path, error))?;
+        Ok((Self { path: path.to_owned(), file }, listener))
+    }
+
+    /// Removes the file, unless it is another one by now.
+    pub(super) fn remove(&self) {
+        let Some(directory) = self.path.parent().and_then(|directory| enter(directory).ok()) else { return };
+        let Ok(_lock) = lock(&directory) else { return };
+        if mark(&self.path).is_ok_and(|file| file == self.file) {
+            let _ = std::fs::remove_file(&self.path);
+        }
+    }
+}
+
+fn parent(path: &Path) -> Result<&Path, PlaceError> {
+    let directory = path.parent().filter(|directory| !directory.as_os_str().is_empty());
+    directory.ok_or_else(|| PlaceError::NoDirectory(path.to_owned()))
+}
+
+/// Opens a directory that belongs to this user and that nobody else can enter.
+fn enter(path: &Path) -> Result<OwnedFd, PlaceError> {
+    let flags = OFlags::DIRECTORY | OFlags::NOFOLLOW | OFlags::RDONLY | OFlags::CLOEXEC;
+    let directory = open(path, flags, Mode::empty()).map_err(|errno| PlaceError::system(path, errno))?;
+    let found = fstat(&directory).map_err(|errno| PlaceError::system(path, errno))?;
+    let mode = found.st_mode & 0o777;
+    if found.st_uid != own_uid() {
+        return Err(PlaceError::Foreign { path: path.to_owned(), owner: found.st_uid });
+    }
+    if mode & 0o077 != 0 {
+        return Err(PlaceError::Open { path: path.to_owned(), mode });
+    }
+    Ok(directory)
+}
+
+/// Whoever opens or removes a socket in a directory holds its lock; the descriptor that is returned holds it.
+fn lock(directory: &OwnedFd) -> io::Result<OwnedFd> {
+    let own = rustix::fs::openat(directory, ".", OFlags::DIRECTORY | OFlags::RDONLY | OFlags::CLOEXEC, Mode::empty())?;
+    let end = Instant::now() + PATIENCE;
+    loop {
+        match flock(&own, FlockOperation::NonBlockingLockExclusive) {
+            Ok(()) => return Ok(own),
+            Err(Errno::WOULDBLOCK) if Instant::now() < end => std::thread::sleep(Duration::from_millis(2)),
+            Err(errno) => return Err(errno.into()),
+        }
+    }
+}
+
+/// Removes a socket on which nobody answers.
+fn make_room(path: &Path) -> Result<(), PlaceError> {
+    let Ok(found) = path.symlink_metadata() else { return Ok(()) };
+    if !found.file_type().is_socket() {
+        return Err(PlaceError::NotASocket(path.to_owned()));
+    }
+    match dial(path) {
+        Err(error) if error.kind() == io::ErrorKind::ConnectionRefused => {
+            std::fs::remove_file(path).map_err(|error| PlaceError::system(path, error))
+        }
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
+        // A full queue of connections is a sign of life, too.
+        _ => Err(PlaceError::InUse(path.to_owned())),
+    }
+}
+
+fn listen_at(path: &Path, directory: &OwnedFd) -> io::Result<UnixListener> {
+    let socket = unix_socket()?;
+    bind(&socket, &address(path, directory)?)?;
+    listen(&socket, BACKLOG)?;
+    Ok(UnixListener::from(socket))
+}
+
+/// Connects without waiting; what comes back waits when it reads and writes.
+pub(super) fn dial(path: &Path) -> io::Result<UnixStream> {
+    let flags = OFlags::DIRECTORY | OFlags::PATH | OFlags::CLOEXEC;
+    let above = path.parent().filter(|above| !above.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let directory = open(above, flags, Mode::empty())?;
+    let socket = unix_socket()?;
+    connect(&socket, &address(path, &directory)?)?;
+    let stream = UnixStream::from(socket);
+    stream.set_nonblocking(false)?;
+    Ok(stream)
+}
+
+fn unix_socket() -> io::Result<OwnedFd> {
+    let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
+    Ok(socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None)?)
+}
+
+/// A path that is too long for a socket's address is taken from its directory on.
+fn address(path: &Path, directory: &OwnedFd) -> io::Result<SocketAddrUnix> {
+    match SocketAddrUnix::new(path) {
+        Err(Errno::NAMETOOLONG) => {
+            let name = path.file_name().unwrap_or_default();
+            let short = Path::new("/proc/self/fd").join(directory.as_raw_fd().to_string()).join(name);
+            Ok(SocketAddrUnix::new(short)?)
+        }
+        address => Ok(address?),
+    }
+}
+
+/// The user at the other end of a connection.
+pub(super) fn peer_uid(stream: &UnixStream) -> io::Result<u32> {
+    Ok(sockopt::socket_peercred(stream.as_fd())?.uid.as_raw())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn directory() -> tempfile::TempDir {
+        let directory = tempfile::tempdir().unwrap();
+        set_permissions(directory.path(), Permissions::from_mode(0o700)).unwrap();
+        directory
+    }
+
+    fn mode(path: &Path) -> u32 {
+        path.symlink_metadata().unwrap().mode() & 0o777
+    }
+
+    fn name_of(name: &str) -> String {
+        file_name(&Identity::m_unit(name, 7).unwrap(), Fleet(3))
+    }
+
+    #[test]
+    fn a_socket_is_named_after_its_unit() {
+        assert_eq!(name_of("AGV_manager"), "AGV_manager-7-3.sock");
+        assert_eq!(name_of("../../etc"), "%2E.%2F..%2Fetc-7-3.sock");
+        assert_eq!(name_of("."), "%2E-7-3.sock");
+        assert_eq!(name_of("Fähre 1"), "F%C3%A4hre%201-7-3.sock");
+    }
+
+    #[test]
+    fn long_names_are_cut_and_stay_apart() {
+        let (one, other) = (name_of(&"ä".repeat(16)), name_of(&format!("{}b", "ä".repeat(15))));
+        assert_ne!(one, other);
+        for name in [&one, &other] {
+            assert!(name.len() <= NAME_BYTES + "-4294967295-4294967295.sock".len(), "{name}");
+            let piece = name.split_once('~').unwrap().0;
+            assert_eq!(piece.len() % 3, 0, "an escape is not cut: {name}");
+        }
+    }
+
+    #[test]
+    fn the_directory_is_made_for_its_owner_alone_and_so_is_the_socket() {
+        let above = directory();
+        let path = above.path().join("deep").join("unit.sock");
+        let (place, _listener) = Place::open(&path).unwrap();
+        assert_eq!((mode(path.parent().unwrap()), mode(&path)), (0o700, 0o600));
+        assert!(dial(&path).is_ok());
+        place.remove();
+        assert!(!path.exists());
+    }
+
+    #[test]
+    fn a_directory_that_others_can_enter_is_refused() {
+        let above = directory();
+        let open = above.path().join("open");
+        std::fs::create_dir(&open).unwrap();
+        set_permissions(&open, Permissions::from_mode(0o750)).unwrap();
+        assert!(matches!(Place::open(&open.join("unit.sock")), Err(PlaceError::Open { mode: 0o750, .. })));
+        assert!(matches!(sockets(&open), Err(PlaceError::Open { .. })));
+    }
+
+    #[test]
+    fn a_link_in_the_place_of_the_directory_is_not_followed() {
+        let above = directory();
+        let link = above.path().join("link");
+        std::os::unix::fs::symlink(above.path(), &link).unwrap();
+        assert!(matches!(Place::open(&link.join("unit.sock")), Err(PlaceError::System { .. })));
+    }
+
+    /// Some directory of another user; there is none that root does not own in every container, so root looks on.
+    #[test]
+    fn a_directory_of_somebody_else_is_refused() {
+        let foreign = Path::new("/proc/1");
+        let owner = foreign.metadata().unwrap().uid();
+        if owner == own_uid() {
+            println!("skipped: the process of number 1 belongs to this user");
+            return;
+        }
+        assert!(matches!(enter(foreign), Err(PlaceError::Foreign { owner: found, .. }) if found == owner));
+    }
+
+    #[test]
+    fn a_socket_without_a_process_is_replaced_and_a_live_one_is_not() {
+        let above = directory();
+        let path = above.path().join("unit.sock");
+        let (stale, listener) = Place::open(&path).unwrap();
+        assert!(matches!(Place::open(&path), Err(PlaceError::InUse(_))));
+        drop(listener);
+        let (place, _listener) = Place::open(&path).unwrap();
+        stale.remove();
+        assert!(path.exists(), "it is another's by now");
+        place.remove();
+        assert!(!path.exists());
+    }
+
+    #[test]
+    fn what_is_no_socket_is_left_alone() {
+        let above = directory();
+        let path = above.path().join("unit.sock");
+        std::fs::write(&path, "precious").unwrap();
+        assert!(matches!(Place::open(&path), Err(PlaceError::NotASocket(_))));
+        assert_eq!(std::fs::read(&path).unwrap(), b"precious");
+        assert!(matches!(Place::open(Path::new("unit.sock")), Err(PlaceError::NoDirectory(_))));
+    }
+
+    #[test]
+    fn a_path_longer_than_a_sockets_address_serves() {
+        let above = directory();
+        let path = above.path().join("d".repeat(120)).join("unit.sock");
+        let (place, _listener) = Place::open(&path).unwrap();
+        assert!(dial(&path).is_ok());
+        assert_eq!(sockets(path.parent().unwrap()).unwrap(), [path.clone()]);
+        place.remove();
+        assert!(!path.exists());
+    }
+}

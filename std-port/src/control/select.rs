@@ -1,0 +1,72 @@
+//! Which node a question means: `NAME`, `NAME/ID` or `#ID`.
+
+use crate::{CommunicationSystem, Peer};
+
+use super::protocol::Failure;
+
+/// Most nodes that a failure lists.
+const LISTED: usize = 20;
+
+/// The node that `selector` means; a failure lists what there is.
+pub(super) fn node<T: Send + 'static>(system: &CommunicationSystem<T>, selector: &str) -> Result<Peer<T>, Failure> {
+    let all = nodes(system);
+    let mut meant: Vec<Peer<T>> = all.iter().filter(|peer| means(selector, peer.name(), peer.id())).cloned().collect();
+    match (meant.pop(), meant.is_empty()) {
+        (Some(peer), true) => Ok(peer),
+        (Some(peer), false) => {
+            meant.push(peer);
+            let text = format!("'{selector}' means several nodes ({}): ask for one as NAME/ID", list(&meant));
+            Err(Failure::configuration("AmbiguousNode", text))
+        }
+        (None, _) if all.is_empty() => {
+            Err(Failure::configuration("UnknownNode", format!("there is no node '{selector}': none has joined yet")))
+        }
+        (None, _) => {
+            let text = format!("there is no node '{selector}'; there are {}", list(&all));
+            Err(Failure::configuration("UnknownNode", text))
+        }
+    }
+}
+
+/// All nodes that have joined, connected or not.
+pub(super) fn nodes<T: Send + 'static>(system: &CommunicationSystem<T>) -> Vec<Peer<T>> {
+    let mut nodes = system.s_units();
+    nodes.extend(system.m_units());
+    nodes
+}
+
+/// A name may hold `/` and `#` itself, so each reading counts.
+fn means(selector: &str, name: &str, id: u32) -> bool {
+    let by_both = selector.rsplit_once('/').is_some_and(|(wanted, number)| wanted == name && is(number, id));
+    selector == name || by_both || selector.strip_prefix('#').is_some_and(|number| is(number, id))
+}
+
+fn is(number: &str, id: u32) -> bool {
+    number.parse() == Ok(id)
+}
+
+fn list<T: Send + 'static>(peers: &[Peer<T>]) -> String {
+    let mut names: Vec<String> = peers.iter().map(|peer| peer.identity().to_string()).collect();
+    names.sort();
+    let more = names.len().saturating_sub(LISTED);
+    names.truncate(LISTED);
+    let names = names.join(", ");
+    if more == 0 { names } else { format!("{names} and {more} more") }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::means;
+
+    #[test]
+    fn a_node_is_meant_by_name_by_both_or_by_id() {
+        assert!(means("agv", "agv", 7) && means("agv/7", "agv", 7) && means("#7", "agv", 7));
+        assert!(!means("agv/8", "agv", 7) && !means("#8", "agv", 7) && !means("ag", "agv", 7) && !means("", "agv", 7));
+        assert!(!means("7", "agv", 7), "a number alone may be a name");
+    }
+
+    #[test]
+    fn a_name_may_look_like_a_selector() {
+        assert!(means("hall/2", "hall/2", 9) && means("hall/2/9", "hall/2", 9) && means("#7", "#7", 1));
+    }
+}

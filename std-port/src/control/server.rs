@@ -1,0 +1,244 @@
+//! The socket of a running unit: one thread that accepts, and one for each open connection.
+
+use std::collections::HashMap;
+use std::io::{self, BufWriter, Write};
+use std::net::Shutdown;
+use std::ops::ControlFlow;
+use std::os::unix::net::{UnixListener, UnixStream};
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+
+use super::answering::execute_while;
+use super::lines::{Line, Lines};
+use super::place::{Place, PlaceError, own_uid, peer_uid};
+use super::protocol::{Answer, CONTROL_VERSION, Failure, LONGEST_LINE, Question};
+use crate::CommunicationSystem;
+use crate::engine::lock;
+use crate::sys::epoll::{Epoll, Events, Interest, Waker};
+
+/// Connections at a time.
+pub(super) const MOST_CONNECTIONS: usize = 8;
+/// A client that takes nothing for so long is cut off.
+const WRITE_TIMEOUT: Duration = Duration::from_secs(2);
+/// Samples gather for at most so long, so that writing them disturbs what they measure less.
+const GATHER: Duration = Duration::from_millis(50);
+const WAKER: u64 = 0;
+const LISTENER: u64 = 1;
+
+/// The server of one unit. Dropping it ends nothing: [`Server::stop`] does.
+pub(crate) struct Server {
+    place: Place,
+    shared: Arc<Shared>,
+}
+
+struct Shared {
+    waker: Waker,
+    stopping: AtomicBool,
+    connections: Mutex<Connections>,
+}
+
+#[derive(Default)]
+struct Connections {
+    next: u64,
+    open: HashMap<u64, UnixStream>,
+    threads: Vec<JoinHandle<()>>,
+}
+
+impl Server {
+    /// Answers questions about `system` at `path`. The handle must not be one that keeps the unit running.
+    pub(super) fn open<T: Send + 'static>(path: &Path, system: CommunicationSystem<T>) -> Result<Self, PlaceError> {
+        let (place, listener) = Place::open(path)?;
+        let started = accept_with(listener, system);
+        match started {
+            Ok(shared) => Ok(Self { place, shared }),
+            Err(error) => {
+                place.remove();
+                Err(PlaceError::System { path: path.to_owned(), error })
+            }
+        }
+    }
+
+    pub(crate) fn path(&self) -> &Path {
+        self.place.path()
+    }
+
+    /// Ends all connections and threads, except the one that calls.
+    pub(crate) fn stop(&self) {
+        self.place.remove();
+        self.shared.stopping.store(true, Ordering::Release);
+        self.shared.waker.wake();
+        let threads = {
+            let mut connections = lock(&self.shared.connections);
+            connections.open.values().for_each(|stream| drop(stream.shutdown(Shutdown::Both)));
+            std::mem::take(&mut connections.threads)
+        };
+        let own = std::thread::current().id();
+        threads.into_iter().filter(|thread| thread.thread().id() != own).for_each(|thread| drop(thread.join()));
+    }
+}
+
+fn accept_with<T: Send + 'static>(listener: UnixListener, system: CommunicationSystem<T>) -> io::Result<Arc<Shared>> {
+    let (waker, epoll) = (Waker::new()?, Epoll::new()?);
+    epoll.add(&waker, WAKER, Interest::READ_LEVEL)?;
+    epoll.add(&listener, LISTENER, Interest::READ_LEVEL)?;
+    let shared =
+        Arc::new(Shared { waker, stopping: AtomicBool::new(false), connections: Mutex::new(Connections::default()) });
+    let own = shared.clone();
+    let thread = std::thread::Builder::new().name("cara-control".into());
+    let thread = thread.spawn(move || own.accept(&listener, &epoll, &system))?;
+    lock(&shared.connections).threads.push(thread);
+    Ok(shared)
+}
+
+impl Shared {
+    fn is_stopping(&self) -> bool {
+        self.stopping.load(Ordering::Acquire)
+    }
+
+    fn accept<T: Send + 'static>(
+        self: &Arc<Self>,
+        listener: &UnixListener,
+        epoll: &Epoll,
+        system: &CommunicationSystem<T>,
+    ) {
+        let mut events = Events::new(2);
+        while !self.is_stopping() {
+            if let Err(error) = epoll.wait(&mut events, None) {
+                tracing::error!(%error, "waiting for control connections failed");
+                return;
+            }
+            if events.iter().all(|ready| ready.token == WAKER) {
+                continue;
+            }
+            match listener.accept() {
+                Ok((stream, _)) => self.accepted(stream, system),
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
+                Err(error) => {
+                    tracing::warn!(%error, "a control connection could not be taken");
+                    std::thread::sleep(Duration::from_millis(100));
+                }
+            }
+        }
+    }
+
+    /// Serves a connection in a thread of its own, or says why not.
+    fn accepted<T: Send + 'static>(self: &Arc<Self>, stream: UnixStream, system: &CommunicationSystem<T>) {
+        // Everything that is refused is small enough for an empty socket's buffer.
+        let refuse = |failure| drop(write(&mut &stream, &Answer::Failed(failure)));
+        if !peer_uid(&stream).is_ok_and(|uid| uid == own_uid() || uid == 0) {
+            return refuse(Failure::configuration("NotAllowed", "only the user who runs the unit may ask it"));
+        }
+        let mut connections = lock(&self.connections);
+        connections.threads.retain(|thread| !thread.is_finished());
+        if connections.open.len() >= MOST_CONNECTIONS {
+            let text = format!("{MOST_CONNECTIONS} connections are open already: close one");
+            return refuse(Failure::resource("Full", text));
+        }
+        let Ok(kept) = stream.try_clone() else { return };
+        let number = connections.next;
+        let (own, system) = (self.clone(), system.clone());
+        let thread = std::thread::Builder::new().name("cara-control".into());
+        let thread = thread.spawn(move || {
+            // An end of the connection is not worth a word: the client knows.
+            let _ = own.serve(stream, &system);
+            lock(&own.connections).open.remove(&number);
+        });
+        if let Ok(thread) = thread {
+            connections.next += 1;
+            connections.open.insert(number, kept);
+            connections.threads.push(thread);
+        }
+    }
+
+    fn serve<T: Send + 'static>(&self, stream: UnixStream, system: &CommunicationSystem<T>) -> io::Result<()> {
+        stream.set_nonblocking(false)?;
+        stream.set_write_timeout(Some(WRITE_TIMEOUT))?;
+        let mut writer = Answers::new(&stream);
+        let mut lines = Lines::new(&stream);
+        let unit = system.identity();
+        writer.give(&Answer::Hello {
+            control_version: CONTROL_VERSION,
+            unit: unit.to_string(),
+            fleet: system.fleet().0,
+        })?;
+        while !self.is_stopping()
+            && let Some(line) = lines.next()?
+        {
+            match question(line) {
+                Ok(question) => {
+                    let wanted = || !self.is_stopping() && !has_hung_up(&stream);
+                    execute_while(system, &question, &mut |answer| writer.sink(&answer), &wanted);
+                }
+                Err(failure) => drop(writer.sink(&Answer::Failed(failure))),
+            }
+            writer.outcome()?;
+        }
+        Ok(())
+    }
+}
+
+fn question(line: Line<'_>) -> Result<Question, Failure> {
+    match line {
+        Line::Text(text) => serde_json::from_slice(text).map_err(|error| {
+            let text = format!("the line is no question: {error}");
+            Failure::configuration("BadQuestion", text)
+        }),
+        Line::TooLong => {
+            let text = format!("the line is longer than {LONGEST_LINE} bytes");
+            Err(Failure::configuration("TooLong", text))
+        }
+    }
+}
+
+/// Whether the client has closed its end altogether, as opposed to: asks nothing more.
+fn has_hung_up(stream: &UnixStream) -> bool {
+    let mut fds = [PollFd::new(stream, PollFlags::empty())];
+    let now = Timespec { tv_sec: 0, tv_nsec: 0 };
+    poll(&mut fds, Some(&now)).is_ok() && fds[0].revents().intersects(PollFlags::HUP | PollFlags::ERR)
+}
+
+fn write(writer: &mut impl Write, answer: &Answer) -> io::Result<()> {
+    serde_json::to_writer(&mut *writer, answer)?;
+    writer.write_all(b"\n")
+}
+
+/// Answers on their way to one client.
+struct Answers<'s> {
+    writer: BufWriter<&'s UnixStream>,
+    flushed: Instant,
+    error: Option<io::Error>,
+}
+
+impl<'s> Answers<'s> {
+    fn new(stream: &'s UnixStream) -> Self {
+        Self { writer: BufWriter::new(stream), flushed: Instant::now(), error: None }
+    }
+
+    fn give(&mut self, answer: &Answer) -> io::Result<()> {
+        write(&mut self.writer, answer)?;
+        if matches!(answer, Answer::Sample { .. }) && self.flushed.elapsed() < GATHER {
+            return Ok(());
+        }
+        self.flushed = Instant::now();
+        self.writer.flush()
+    }
+
+    fn sink(&mut self, answer: &Answer) -> ControlFlow<()> {
+        match self.give(answer) {
+            Ok(()) => ControlFlow::Continue(()),
+            Err(error) => {
+                self.error = Some(error);
+                ControlFlow::Break(())
+            }
+        }
+    }
+
+    fn outcome(&mut self) -> io::Result<()> {
+        self.error.take().map_or(Ok(()), Err)
+    }
+}
