@@ -7,6 +7,7 @@ use std::process::ExitCode;
 use serde_json::json;
 
 use crate::global::Global;
+use crate::output::BAD;
 
 /// What `cara --help` says about exit codes.
 pub(crate) const EXIT_CODES: &str = "\
@@ -75,24 +76,25 @@ impl std::error::Error for Ended {}
 
 /// Prints an error, if there is one, and tells the exit code. A reader that has closed its pipe is no error.
 pub(crate) fn code_of(outcome: anyhow::Result<ExitCode>, global: &Global) -> ExitCode {
-    let error = match outcome {
-        Ok(code) => return code,
-        Err(error) => error,
-    };
-    if is_closed_pipe(&error) {
-        return Exit::Done.into();
+    match outcome {
+        Ok(code) => code,
+        Err(error) if is_closed_pipe(&error) => Exit::Done.into(),
+        Err(error) => tell(&error, global.json),
     }
+}
+
+/// Prints an error and tells its exit code.
+pub(crate) fn tell(error: &anyhow::Error, json: bool) -> ExitCode {
     let (exit, name) = match error.downcast_ref::<Ended>() {
         Some(ended) => (ended.exit, ended.name.as_str()),
         None => (Exit::Failed, "Failed"),
     };
     // Where not even standard error can be written to, the exit code has to do.
-    let _ = match global.json {
-        true => {
-            let told = json!({ "error": { "name": name, "exit": exit as u8, "text": format!("{error:#}") } });
-            writeln!(std::io::stderr(), "{told}")
-        }
-        false => writeln!(anstream::stderr(), "{}error:{:#} {error:#}", crate::output::BAD, crate::output::BAD),
+    let _ = if json {
+        let told = json!({ "error": { "name": name, "exit": exit as u8, "text": format!("{error:#}") } });
+        writeln!(std::io::stderr(), "{told}")
+    } else {
+        writeln!(anstream::stderr(), "{BAD}error:{BAD:#} {error:#}")
     };
     exit.into()
 }

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use cara_std::Interfaces;
+use cara_std::{Interfaces, PLAIN_PORT};
 use clap::Args;
 
 use crate::name_and_id::NameAndId;
@@ -13,6 +13,7 @@ const WAIT: Duration = Duration::from_secs(5);
 
 /// Options of every verb.
 #[derive(Args, Clone, Debug)]
+#[command(next_help_heading = "Options of every verb")]
 pub(crate) struct Global {
     /// Print JSON: one object, or one a line where several come; an error as an object on standard error.
     #[arg(long, global = true)]
@@ -44,6 +45,11 @@ impl Global {
     /// Where to look for nodes: what the options say, or else the environment.
     pub(crate) fn interfaces(&self) -> Interfaces {
         if self.loopback { Interfaces::Loopback } else { Interfaces::from_environment() }
+    }
+
+    /// The UDP port of broadcasts.
+    pub(crate) fn port(&self) -> u16 {
+        self.discovery_port.unwrap_or(PLAIN_PORT)
     }
 
     /// How long a command as a manager waits for nodes.

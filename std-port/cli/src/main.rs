@@ -1,52 +1,30 @@
 //! The `cara` command: what is on the network, why something is not, and calls from the command line.
 
 mod close_names;
+mod command_line;
 mod commands;
 mod doctor;
 mod exit;
 mod global;
 mod name_and_id;
 mod node;
+mod nodes;
+mod operator;
 mod output;
+mod statistics;
 mod text;
 mod units;
 
 use std::process::ExitCode;
 
-use clap::{Parser, Subcommand};
-
-use crate::exit::EXIT_CODES;
+use crate::command_line::{CommandLine, Verb};
 use crate::global::Global;
 
-/// Shows and calls the nodes of a CARA fleet, through the m_unit that runs on this host or as an m_unit itself.
-#[derive(Parser)]
-#[command(name = "cara", version, max_term_width = 100, after_long_help = EXIT_CODES, subcommand_required = true)]
-pub(crate) struct CommandLine {
-    #[command(flatten)]
-    global: Global,
-    #[command(subcommand)]
-    verb: Verb,
-}
-
-#[derive(Subcommand)]
-enum Verb {
-    Scan(commands::scan::Arguments),
-    Functions(commands::functions::Arguments),
-    Call(commands::call::Arguments),
-    Publish(commands::publish::Arguments),
-    Set(commands::set::Arguments),
-    Watch(commands::watch::Arguments),
-    Counters(commands::counters::Arguments),
-    Ping(commands::ping::Arguments),
-    Bench(commands::bench::Arguments),
-    Node(node::Arguments),
-    Doctor(doctor::Arguments),
-    Completions(commands::completions::Arguments),
-    Man(commands::man::Arguments),
-}
-
 fn main() -> ExitCode {
-    let CommandLine { global, verb } = CommandLine::parse();
+    let CommandLine { global, verb } = match command_line::parse() {
+        Ok(line) => line,
+        Err(code) => return code,
+    };
     let outcome = run(verb, &global);
     exit::code_of(outcome, &global)
 }

@@ -63,3 +63,10 @@ impl Rows {
         text.lines().zip(styles).try_for_each(|(row, style)| line(format_args!("{style}{}{style:#}", row.trim_end())))
     }
 }
+
+/// Prints bytes as they are.
+pub(crate) fn bytes(bytes: &[u8]) -> io::Result<()> {
+    let mut out = io::stdout().lock();
+    out.write_all(bytes)?;
+    out.flush()
+}

@@ -1,16 +1,182 @@
-//! `cara call`.
+//! `cara call`: a function of one node, or of all that offer it.
 
 use std::process::ExitCode;
+use std::time::Duration;
 
+use cara_std::Definition;
+use cara_std::control::protocol::{Answer, Argument, CallQuestion, Failure, FunctionInfo, Question};
+use clap::ValueEnum;
+use serde_json::json;
+
+use crate::exit::{Ended, Exit};
 use crate::global::Global;
+use crate::nodes::{self, full_name};
+use crate::operator::{Need, Operator, exit_of};
+use crate::output::{self, BAD};
+use crate::text::{Mistake, Written, bind, read, show_call};
+use crate::units::{parse_time, show_micros};
 
-/// Calls a function.
+/// Calls a function and prints its results in the form of a call.
+///
+/// A call is written with its arguments by name, as 'go_to(position: [1, 2])', and checked against what the node has
+/// published before anything is sent. Texts go in double quotes, bytes are written as 0x01ff, several numbers in brackets.
 #[derive(clap::Args)]
+#[command(
+    allow_missing_positional = true,
+    override_usage = "cara call [OPTIONS] <NODE> <CALL>\n       cara call [OPTIONS] --all <CALL>"
+)]
 pub(crate) struct Arguments {
-    /// NAME, NAME/ID or #ID.
+    /// The node: NAME, NAME/ID or #ID.
+    #[arg(required_unless_present = "all", conflicts_with = "all")]
     node: Option<String>,
+    /// The call: 'go_to(position: [1, 2])'; the name alone where there are no arguments.
+    #[arg(required = true)]
+    call: String,
+    /// Call every node that offers the function.
+    #[arg(long)]
+    all: bool,
+    /// Do not wait for results: return when the request is accepted.
+    #[arg(long = "async")]
+    asynchronous: bool,
+    /// How long to wait for results, instead of the unit's constraint.
+    #[arg(long, value_name = "TIME", value_parser = parse_time)]
+    timeout: Option<Duration>,
+    /// The class of the request, instead of the function's own.
+    #[arg(long, value_enum)]
+    priority: Option<Class>,
+    /// In one datagram, now or never.
+    #[arg(long, requires = "asynchronous")]
+    best_effort: bool,
 }
 
-pub(crate) fn run(_: Arguments, _: &Global) -> anyhow::Result<ExitCode> {
-    Err(crate::exit::Ended::usage("being built"))
+#[derive(Clone, Copy, ValueEnum)]
+enum Class {
+    Emergency,
+    High,
+    Normal,
+    Low,
+}
+
+impl Class {
+    fn word(self) -> String {
+        let word = match self {
+            Self::Emergency => "emergency",
+            Self::High => "high",
+            Self::Normal => "normal",
+            Self::Low => "low",
+        };
+        word.into()
+    }
+}
+
+pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
+    let text = arguments.call.as_str();
+    let written = read(text).map_err(|mistake| wrong(&mistake, text, None))?;
+    let function = written.function.value;
+    let need = arguments.node.as_deref().map_or(Need::Offering(function), |node| Need::Function(node, function));
+    let mut operator = Operator::open(global, &need)?;
+    let node = match arguments.node.as_deref() {
+        Some(node) => Some(full_name(&nodes::connected(&mut operator, node)?)),
+        None => None,
+    };
+    let published = match &node {
+        Some(node) => of_node(&mut operator, node, function)?,
+        None => of_any(&mut operator, function)?,
+    };
+    let question = CallQuestion {
+        node,
+        function: function.to_owned(),
+        arguments: bound(&written, &published)?,
+        asynchronous: arguments.asynchronous,
+        timeout_ms: arguments.timeout.map(|span| span.as_millis() as u64),
+        priority: arguments.priority.map(Class::word),
+        best_effort: arguments.best_effort,
+    };
+    let exit = call(&mut operator, question, global)?;
+    Ok(exit.into())
+}
+
+fn call(operator: &mut Operator, question: CallQuestion, global: &Global) -> anyhow::Result<Exit> {
+    let (function, asynchronous, one) = (question.function.clone(), question.asynchronous, question.node.is_some());
+    let mut worst = Exit::Done;
+    operator.ask(&Question::Call(question), |answer| {
+        let Answer::Called { node, id, results, call, error, took_us } = answer else { return Ok(()) };
+        let node = format!("{node}/{id}");
+        if let Some(failure) = &error {
+            worst = exit_of(failure);
+        }
+        if global.json {
+            let text = (error.is_none() && !asynchronous).then(|| show_call(&function, &results));
+            output::object(&json!({
+                "node": node, "text": text, "results": results, "call": call, "error": error, "took_us": took_us,
+            }))?;
+        } else {
+            show(&node, &function, &results, call, error.as_ref(), took_us, one)?;
+        }
+        Ok(())
+    })?;
+    if asynchronous {
+        operator.deliver();
+    }
+    Ok(worst)
+}
+
+/// What came of the call of one node; its name goes before where there are several.
+fn show(
+    node: &str,
+    function: &str,
+    results: &[Argument],
+    call: Option<u32>,
+    error: Option<&Failure>,
+    took_us: u64,
+    one: bool,
+) -> std::io::Result<()> {
+    let before = if one { String::new() } else { format!("{node}  ") };
+    match (error, call) {
+        (Some(Failure { error, text, .. }), _) => output::line(format_args!("{BAD}{node}: {error}:{BAD:#} {text}")),
+        (None, Some(call)) => {
+            output::line(format_args!("{before}accepted as call {call}; `cara watch` tells if it fails"))
+        }
+        (None, None) if one => output::line(show_call(function, results)),
+        (None, None) => {
+            let took = show_micros(took_us as f64);
+            output::line(format_args!("{before}{}  {took}", show_call(function, results)))
+        }
+    }
+}
+
+/// The function as a node has published it.
+fn of_node(operator: &mut Operator, node: &str, function: &str) -> anyhow::Result<FunctionInfo> {
+    let functions = nodes::functions(operator, node)?;
+    let found = functions.iter().find(|info| info.name == function).cloned();
+    found.ok_or_else(|| nodes::no_such_function(node, function, &functions))
+}
+
+/// The function as the first of the nodes that offer it has published it.
+fn of_any(operator: &mut Operator, function: &str) -> anyhow::Result<FunctionInfo> {
+    let offering = nodes::all(operator, Some(function))?;
+    if let Some(node) = offering.iter().find(|node| node.connected) {
+        return of_node(operator, &full_name(node), function);
+    }
+    let mut functions: Vec<FunctionInfo> = Vec::new();
+    for node in nodes::all(operator, None)?.iter().filter(|node| node.connected) {
+        let more = nodes::functions(operator, &full_name(node))?.into_iter();
+        functions.extend(more);
+    }
+    functions.sort_by(|a, b| a.signature.cmp(&b.signature));
+    functions.dedup_by(|a, b| a.signature == b.signature);
+    Err(nodes::no_such_function("no connected node", function, &functions))
+}
+
+/// The arguments as the signature asks for them.
+fn bound(written: &Written, published: &FunctionInfo) -> anyhow::Result<Vec<Argument>> {
+    let signature = &published.signature;
+    let definition = Definition::parse(signature).map_err(|error| {
+        Ended::failed("Malformed", format!("the published signature `{signature}` cannot be read: {error}"))
+    })?;
+    bind(written, &definition.signature()).map_err(|mistake| wrong(&mistake, written.text, Some(signature)))
+}
+
+fn wrong(mistake: &Mistake, text: &str, signature: Option<&str>) -> anyhow::Error {
+    Ended::usage(mistake.show(text, signature))
 }

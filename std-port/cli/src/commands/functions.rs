@@ -1,16 +1,44 @@
-//! `cara functions`.
+//! `cara functions`: what a node has published to the unit that is asked.
 
 use std::process::ExitCode;
 
-use crate::global::Global;
+use cara_std::control::protocol::FunctionInfo;
+use serde_json::json;
 
-/// Shows what a node has published.
+use crate::exit::Exit;
+use crate::global::Global;
+use crate::nodes::{self, full_name};
+use crate::operator::{Need, Operator};
+use crate::output::{self, PLAIN, Rows};
+use crate::units::show_micros;
+
+/// Shows what a node has published, with the form in which it is called.
 #[derive(clap::Args)]
 pub(crate) struct Arguments {
-    /// NAME, NAME/ID or #ID.
+    /// The node: NAME, NAME/ID or #ID.
     node: String,
 }
 
-pub(crate) fn run(_: Arguments, _: &Global) -> anyhow::Result<ExitCode> {
-    Err(crate::exit::Ended::usage("being built"))
+pub(crate) fn run(Arguments { node }: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
+    let mut operator = Operator::open(global, &Need::Node(&node))?;
+    let node = full_name(&nodes::connected(&mut operator, &node)?);
+    let functions = nodes::functions(&mut operator, &node)?;
+    if global.json {
+        output::object(&json!({ "node": node, "functions": functions }))?;
+    } else if functions.is_empty() {
+        output::line(format_args!("{node} has published nothing to this unit"))?;
+    } else {
+        table(&functions).print()?;
+    }
+    Ok(Exit::Done.into())
+}
+
+fn table(functions: &[FunctionInfo]) -> Rows {
+    let mut rows = Rows::new(["FUNCTION", "PRIORITY", "LEASE", "IDEMPOTENT"]);
+    for FunctionInfo { signature, priority, lease_us, idempotent, .. } in functions {
+        let lease = lease_us.map_or("-".into(), |micros| show_micros(micros as f64));
+        let idempotent = if *idempotent { "yes" } else { "no" };
+        rows.add(PLAIN, [signature.clone(), priority.clone(), lease, idempotent.into()]);
+    }
+    rows
 }

@@ -1,13 +1,61 @@
-//! `cara man`.
+//! `cara man`: the man page, made of the help texts.
 
+use std::path::PathBuf;
 use std::process::ExitCode;
 
+use anyhow::Context;
+use clap::Command;
+use clap_mangen::Man;
+use serde_json::json;
+
+use crate::command_line;
+use crate::exit::Exit;
 use crate::global::Global;
+use crate::output;
 
-/// Prints the man page.
+/// Prints the man page, or writes it with one page for each verb into a folder.
 #[derive(clap::Args)]
-pub(crate) struct Arguments {}
+pub(crate) struct Arguments {
+    /// Write cara.1 and a page for each verb there.
+    #[arg(long, value_name = "FOLDER")]
+    dir: Option<PathBuf>,
+}
 
-pub(crate) fn run(_: Arguments, _: &Global) -> anyhow::Result<ExitCode> {
-    Err(crate::exit::Ended::usage("being built"))
+pub(crate) fn run(Arguments { dir }: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
+    let mut command = command_line::command();
+    command.build();
+    match dir {
+        Some(dir) => write(command, &dir, global)?,
+        None => {
+            let page = page(command)?;
+            match global.json {
+                true => output::object(&json!({ "page": String::from_utf8_lossy(&page) }))?,
+                false => output::bytes(&page)?,
+            }
+        }
+    }
+    Ok(Exit::Done.into())
+}
+
+fn page(command: Command) -> anyhow::Result<Vec<u8>> {
+    let mut page = Vec::new();
+    Man::new(command).render(&mut page)?;
+    Ok(page)
+}
+
+fn write(command: Command, dir: &std::path::Path, global: &Global) -> anyhow::Result<()> {
+    std::fs::create_dir_all(dir).with_context(|| format!("{} cannot be made", dir.display()))?;
+    let verbs: Vec<_> = command.get_subcommands().filter(|verb| verb.get_name() != "help").cloned().collect();
+    let pages = verbs.into_iter().map(|verb| (format!("cara-{}.1", verb.get_name()), verb));
+    let mut written = Vec::new();
+    for (name, command) in [("cara.1".to_owned(), command)].into_iter().chain(pages) {
+        let path = dir.join(name);
+        std::fs::write(&path, page(command)?).with_context(|| format!("{} cannot be written", path.display()))?;
+        written.push(path.display().to_string());
+    }
+    match global.json {
+        true => output::object(&json!({ "written": written }))?,
+        false => written.iter().try_for_each(output::line)?,
+    }
+    Ok(())
 }

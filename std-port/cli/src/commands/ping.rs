@@ -1,16 +1,66 @@
-//! `cara ping`.
+//! `cara ping`: round trips of the protocol's own ping, with no function involved.
 
 use std::process::ExitCode;
+use std::time::Duration;
 
+use cara_std::control::protocol::{Answer, Question};
+use serde_json::json;
+
+use crate::exit::Exit;
 use crate::global::Global;
+use crate::nodes::{self, full_name};
+use crate::operator::{Need, Operator};
+use crate::output::{self, BAD};
+use crate::statistics::Times;
+use crate::units::{parse_time, show_micros};
 
-/// Measures round trips.
+/// Measures round trips to a node, with no function of it involved.
 #[derive(clap::Args)]
 pub(crate) struct Arguments {
-    /// NAME, NAME/ID or #ID.
+    /// The node: NAME, NAME/ID or #ID.
     node: String,
+    /// How many.
+    #[arg(long, short, value_name = "NUMBER", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..))]
+    count: u32,
+    /// Between two of them.
+    #[arg(long, short, value_name = "TIME", default_value = "1s", value_parser = parse_time)]
+    interval: Duration,
+    /// How long to wait for each.
+    #[arg(long, value_name = "TIME", default_value = "1s", value_parser = parse_time)]
+    timeout: Duration,
 }
 
-pub(crate) fn run(_: Arguments, _: &Global) -> anyhow::Result<ExitCode> {
-    Err(crate::exit::Ended::usage("being built"))
+pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
+    let mut operator = Operator::open(global, &Need::Node(&arguments.node))?;
+    let node = full_name(&nodes::connected(&mut operator, &arguments.node)?);
+    let question = Question::Ping {
+        node: node.clone(),
+        count: arguments.count,
+        pause_us: arguments.interval.as_micros() as u64,
+        timeout_ms: arguments.timeout.as_millis() as u64,
+    };
+    let mut samples = Vec::new();
+    operator.ask(&question, |answer| {
+        let Answer::Sample { us, error } = answer else { return Ok(()) };
+        samples.push(us);
+        if global.json {
+            return Ok(());
+        }
+        let number = samples.len();
+        match (us, error) {
+            (Some(us), _) => output::line(format_args!("{node} {number}: {}", show_micros(us)))?,
+            (None, Some(failure)) => output::line(format_args!("{BAD}{node} {number}:{BAD:#} {}", failure.text))?,
+            (None, None) => output::line(format_args!("{BAD}{node} {number}:{BAD:#} no answer"))?,
+        }
+        Ok(())
+    })?;
+    let times = Times::of(samples);
+    if global.json {
+        output::object(&json!({ "node": node, "times": times }))?;
+    } else {
+        let [median, p99, max] = times.shown();
+        let answered = times.tried - times.failed;
+        output::line(format_args!("{answered} of {} answered: median {median}, p99 {p99}, max {max}", times.tried))?;
+    }
+    Ok(if times.failed == 0 { Exit::Done } else { Exit::Failed }.into())
 }

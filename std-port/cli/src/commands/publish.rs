@@ -1,16 +1,50 @@
-//! `cara publish`.
+//! `cara publish`: the unit's own functions become visible to others.
 
 use std::process::ExitCode;
+use std::time::Duration;
 
+use cara_std::control::protocol::{Answer, Question};
+use serde_json::json;
+
+use crate::exit::Exit;
 use crate::global::Global;
+use crate::nodes::{self, full_name};
+use crate::operator::{Need, Operator};
+use crate::output::{self, BAD};
+use crate::units::parse_time;
 
-/// Publishes the unit's functions.
+/// Makes the unit's own functions visible: to one node, or to all, also later ones.
 #[derive(clap::Args)]
 pub(crate) struct Arguments {
-    /// NAME, NAME/ID or #ID.
+    /// To this node only: NAME, NAME/ID or #ID.
     node: Option<String>,
+    /// How long to wait until the nodes have read the list.
+    #[arg(long, value_name = "TIME", default_value = "2s", value_parser = parse_time)]
+    timeout: Duration,
 }
 
-pub(crate) fn run(_: Arguments, _: &Global) -> anyhow::Result<ExitCode> {
-    Err(crate::exit::Ended::usage("being built"))
+pub(crate) fn run(Arguments { node, timeout }: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
+    let need = node.as_deref().map_or(Need::Everybody, Need::Node);
+    let mut operator = Operator::open(global, &need)?;
+    let node = match node {
+        Some(node) => Some(full_name(&nodes::connected(&mut operator, &node)?)),
+        None => None,
+    };
+    let question = Question::Publish { node: node.clone(), timeout_ms: timeout.as_millis() as u64 };
+    let unread: Vec<_> = operator.answers(&question)?.into_iter().filter_map(unread).collect();
+    let to = node.as_deref().unwrap_or("all nodes, also those that come later");
+    if global.json {
+        output::object(&json!({ "to": node, "unread": unread }))?;
+    } else {
+        output::line(format_args!("published to {to}"))?;
+        unread.iter().try_for_each(|node| output::line(format_args!("{BAD}not read in time:{BAD:#} {node}")))?;
+    }
+    Ok(if unread.is_empty() { Exit::Done } else { Exit::Failed }.into())
+}
+
+fn unread(answer: Answer) -> Option<String> {
+    match answer {
+        Answer::Unread { node, id } => Some(format!("{node}/{id}")),
+        _ => None,
+    }
 }

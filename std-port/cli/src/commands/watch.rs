@@ -1,13 +1,55 @@
-//! `cara watch`.
+//! `cara watch`: events as they come.
 
 use std::process::ExitCode;
+use std::time::Duration;
 
+use cara_std::control::protocol::{Answer, Question};
+use serde_json::json;
+
+use crate::exit::Exit;
 use crate::global::Global;
+use crate::operator::{Need, Operator};
+use crate::output::{self, BAD, FAINT, GOOD, PLAIN};
+use crate::units::parse_time;
 
-/// Shows events as they come.
+/// Shows what happens, as it happens: joined, left, refused, failed requests, leases that end. Ctrl-C ends it.
 #[derive(clap::Args)]
-pub(crate) struct Arguments {}
+pub(crate) struct Arguments {
+    /// End after this time.
+    #[arg(long = "for", value_name = "TIME", value_parser = parse_time)]
+    span: Option<Duration>,
+    /// End after so many events.
+    #[arg(long, value_name = "NUMBER")]
+    count: Option<u64>,
+}
 
-pub(crate) fn run(_: Arguments, _: &Global) -> anyhow::Result<ExitCode> {
-    Err(crate::exit::Ended::usage("being built"))
+pub(crate) fn run(Arguments { span, count }: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
+    let mut operator = Operator::open(global, &Need::Nothing)?;
+    let mut left = count.unwrap_or(u64::MAX);
+    if left == 0 {
+        return Ok(Exit::Done.into());
+    }
+    operator.watch(&Question::Watch, span, |answer| {
+        let Answer::Event { at_ms, event, node, text } = answer else { return Ok(true) };
+        match global.json {
+            true => output::object(&json!({ "at_ms": at_ms, "event": event, "node": node, "text": text }))?,
+            false => show(at_ms, &event, node.as_deref(), &text)?,
+        }
+        left -= u64::from(event != "watching");
+        Ok(left > 0)
+    })?;
+    Ok(Exit::Done.into())
+}
+
+fn show(at_ms: u64, event: &str, node: Option<&str>, text: &str) -> std::io::Result<()> {
+    let style = match event {
+        "joined" => GOOD,
+        "left" | "not_joined" | "request_failed" | "lease_expired" => BAD,
+        _ => PLAIN,
+    };
+    let (seconds, millis) = (at_ms / 1000, at_ms % 1000);
+    let node = node.unwrap_or("-");
+    output::line(format_args!(
+        "{FAINT}{seconds:>7}.{millis:03} s{FAINT:#}  {style}{event:<17}{style:#} {node:<20} {text}"
+    ))
 }

@@ -17,7 +17,7 @@ mod read;
 
 pub(crate) use bind::bind;
 pub(crate) use mistake::Mistake;
-pub(crate) use print::{show_arguments, show_call};
+pub(crate) use print::show_call;
 pub(crate) use read::{Written, read};
 
 #[cfg(test)]

@@ -8,7 +8,7 @@ pub(crate) fn show_call(function: &str, arguments: &[Argument]) -> String {
 }
 
 /// Arguments or results without what surrounds them: `position: [1, 2]`.
-pub(crate) fn show_arguments(arguments: &[Argument]) -> String {
+fn show_arguments(arguments: &[Argument]) -> String {
     let shown = arguments.iter().map(|argument| format!("{}: {}", argument.name, value(&argument.value)));
     shown.collect::<Vec<_>>().join(", ")
 }

@@ -1,0 +1,117 @@
+//! `cara scan`: who is there, and who was refused and why.
+
+mod survey;
+
+use std::process::ExitCode;
+use std::time::Duration;
+
+use cara_std::control::protocol::{Answer, LimitsInfo, NodeInfo, Question, RefusedInfo};
+use serde_json::json;
+
+use crate::exit::{Ended, Exit};
+use crate::global::Global;
+use crate::operator::{Need, Operator};
+use crate::output::{self, BAD, FAINT, PLAIN, Rows};
+use crate::units::{parse_time, show_bytes, show_micros};
+
+/// Shows who is there: name, ID, role, address, version and limits; and who was refused, with the reason.
+///
+/// Through the m_unit that runs on this host: the nodes that it knows. With --as: those that join. Without either, a survey
+/// of the network: whoever answers.
+#[derive(clap::Args)]
+pub(crate) struct Arguments {
+    /// Only nodes that offer this function.
+    #[arg(long, value_name = "FUNCTION")]
+    offering: Option<String>,
+    /// Survey the network, also where an m_unit runs on this host.
+    #[arg(long, conflicts_with_all = ["unit", "socket", "act_as", "offering"])]
+    survey: bool,
+    /// How long a survey listens.
+    #[arg(long, value_name = "TIME", default_value = "2s", value_parser = parse_time)]
+    listen: Duration,
+}
+
+pub(crate) fn run(Arguments { offering, survey, listen }: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
+    let operator = if survey { None } else { Operator::open_if_any(global, &Need::Everybody)? };
+    match (operator, offering) {
+        (Some(operator), offering) => of_unit(operator, offering, global)?,
+        (None, None) => survey::show(listen, global)?,
+        (None, Some(_)) => {
+            let text = "no m_unit runs on this host, and a survey does not see functions: start a manager \
+                        (`cara node …`), or be one with `--as NAME/ID --fleet NUMBER`";
+            return Err(Ended::no_unit(text));
+        }
+    }
+    Ok(Exit::Done.into())
+}
+
+/// What a unit knows.
+fn of_unit(mut operator: Operator, offering: Option<String>, global: &Global) -> anyhow::Result<()> {
+    let unit = operator.unit()?;
+    let (mut nodes, mut refused) = (Vec::new(), Vec::new());
+    operator.ask(&Question::Nodes { offering }, |answer| {
+        match answer {
+            Answer::Node(node) => nodes.push(node),
+            Answer::Refused(refusal) => refused.push(refusal),
+            _ => {}
+        }
+        Ok(())
+    })?;
+    if global.json {
+        return Ok(output::object(&json!({ "unit": unit, "nodes": nodes, "refused": refused }))?);
+    }
+    if nodes.is_empty() {
+        output::line("no such node has joined; `cara doctor` looks for reasons")?;
+    }
+    joined(&nodes).print()?;
+    if !refused.is_empty() {
+        output::line("")?;
+    }
+    turned_away(&refused).print()?;
+    Ok(())
+}
+
+fn joined(nodes: &[NodeInfo]) -> Rows {
+    let mut rows = Rows::new(["NODE", "ID", "ROLE", "STATE", "ADDRESS", "VERSION", "FUNCTIONS", "LIMITS"]);
+    for node in nodes {
+        let (style, state) = if node.connected { (PLAIN, "connected") } else { (FAINT, "left") };
+        let or_dash = |text: Option<String>| text.unwrap_or_else(|| "-".into());
+        rows.add(
+            style,
+            [
+                node.name.clone(),
+                node.id.to_string(),
+                node.role.clone(),
+                state.into(),
+                or_dash(node.address.clone()),
+                or_dash(node.version.map(|version| version.to_string())),
+                node.functions.to_string(),
+                or_dash(node.limits.as_ref().map(limits)),
+            ],
+        );
+    }
+    rows
+}
+
+fn limits(limits: &LimitsInfo) -> String {
+    let mut text = format!(
+        "message {}, frame {}, {} calls",
+        show_bytes(limits.message_size.into()),
+        show_bytes(limits.chunk_size.into()),
+        limits.calls
+    );
+    if limits.minimum_interval_us > 0 {
+        text += &format!(", {} apart", show_micros(limits.minimum_interval_us as f64));
+    }
+    text
+}
+
+fn turned_away(refused: &[RefusedInfo]) -> Rows {
+    let mut rows = Rows::new(["REFUSED", "ADDRESS", "WHEN", "REASON", "WHAT TO DO"]);
+    for RefusedInfo { address, node, reason, text, ago_ms } in refused {
+        let ago = format!("{} ago", show_micros(*ago_ms as f64 * 1000.0));
+        let node = node.clone().unwrap_or_else(|| "-".into());
+        rows.add(BAD, [node, address.clone(), ago, reason.clone(), text.clone()]);
+    }
+    rows
+}

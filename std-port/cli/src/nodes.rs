@@ -1,0 +1,147 @@
+//! Which node is meant, and what it offers.
+
+use cara_std::control::protocol::{Answer, FunctionInfo, NodeInfo, Question};
+
+use crate::close_names::close;
+use crate::exit::Ended;
+use crate::operator::Operator;
+
+/// A node in the form in which a unit is asked about it: `NAME/ID`.
+pub(crate) fn full_name(node: &NodeInfo) -> String {
+    format!("{}/{}", node.name, node.id)
+}
+
+/// The nodes that the unit knows.
+pub(crate) fn all(operator: &mut Operator, offering: Option<&str>) -> anyhow::Result<Vec<NodeInfo>> {
+    let question = Question::Nodes { offering: offering.map(str::to_owned) };
+    let answers = operator.answers(&question)?.into_iter();
+    Ok(answers.filter_map(|answer| if let Answer::Node(node) = answer { Some(node) } else { None }).collect())
+}
+
+/// The node that is meant; one that is not connected is an error that says so.
+pub(crate) fn connected(operator: &mut Operator, meant: &str) -> anyhow::Result<NodeInfo> {
+    let known = known(operator, meant)?;
+    if known.connected {
+        return Ok(known);
+    }
+    let name = full_name(&known);
+    let text = format!("{name} was here and is not connected now; `cara doctor {}` looks for the reason", known.name);
+    Err(Ended::failed("NotConnected", text))
+}
+
+/// The node that is meant, connected or not.
+pub(crate) fn known(operator: &mut Operator, meant: &str) -> anyhow::Result<NodeInfo> {
+    let nodes = all(operator, None)?;
+    match choose(&nodes, meant) {
+        Choice::One(node) => Ok(node.clone()),
+        Choice::Several(names) => {
+            Err(Ended::usage(format!("several nodes are called `{meant}`: write {}", names.join(" or "))))
+        }
+        Choice::None => Err(Ended::failed("NotConnected", not_there(&nodes, meant, &operator.waited()))),
+    }
+}
+
+enum Choice<'n> {
+    One(&'n NodeInfo),
+    Several(Vec<String>),
+    None,
+}
+
+fn choose<'n>(nodes: &'n [NodeInfo], meant: &str) -> Choice<'n> {
+    let matches = |wanted: &dyn Fn(&NodeInfo) -> bool| nodes.iter().filter(|node| wanted(node)).collect::<Vec<_>>();
+    let mut found = matches(&|node| full_name(node) == meant);
+    if found.is_empty() {
+        found = matches(&|node| node.name == meant);
+    }
+    if found.is_empty() {
+        found = matches(&|node| meant.strip_prefix('#').and_then(|id| id.parse().ok()) == Some(node.id));
+    }
+    // One that is here goes before one of the same name that has left.
+    if found.len() > 1 && found.iter().filter(|node| node.connected).count() == 1 {
+        found.retain(|node| node.connected);
+    }
+    match found.as_slice() {
+        [] => Choice::None,
+        [node] => Choice::One(node),
+        several => Choice::Several(several.iter().map(|node| full_name(node)).collect()),
+    }
+}
+
+fn not_there(nodes: &[NodeInfo], meant: &str, waited: &str) -> String {
+    let name = meant.rsplit_once('/').map_or(meant, |(name, _)| name);
+    let hint = match nodes {
+        [] => "no node is".to_owned(),
+        nodes => {
+            let close = close(name, nodes.iter().map(|node| node.name.as_str()));
+            let is_close = |node: &&NodeInfo| close.is_empty() || close.contains(&node.name.as_str());
+            let names: Vec<_> = nodes.iter().filter(is_close).map(full_name).take(SHOWN).collect();
+            format!("there {} {}", if names.len() == 1 { "is" } else { "are" }, names.join(", "))
+        }
+    };
+    format!("no node `{meant}` is connected{waited}; {hint}. `cara doctor {name}` looks for the reason")
+}
+
+/// Nodes that an error lists.
+const SHOWN: usize = 8;
+
+/// What a node has published to the unit.
+pub(crate) fn functions(operator: &mut Operator, node: &str) -> anyhow::Result<Vec<FunctionInfo>> {
+    let answers = operator.answers(&Question::Functions { node: node.to_owned() })?.into_iter();
+    Ok(answers.filter_map(|answer| if let Answer::Function(info) = answer { Some(info) } else { None }).collect())
+}
+
+/// A function that a node does not offer: close names, and all that it does.
+pub(crate) fn no_such_function(node: &str, name: &str, functions: &[FunctionInfo]) -> anyhow::Error {
+    let close = close(name, functions.iter().map(|function| function.name.as_str()));
+    let mut text = format!("{node} has not published `{name}`");
+    if let Some(nearest) = close.first() {
+        text += &format!("; did you mean `{nearest}`?");
+    }
+    match functions {
+        [] => text += "\n  it has published nothing to this unit",
+        functions => {
+            text += "\n  it has published:";
+            functions.iter().for_each(|function| text += &format!("\n    {}", function.signature));
+        }
+    }
+    Ended::usage(text)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Choice, NodeInfo, choose, full_name, not_there};
+
+    fn node(name: &str, id: u32, connected: bool) -> NodeInfo {
+        let (role, functions) = ("s_unit".into(), 0);
+        let name = name.into();
+        NodeInfo { name, id, role, connected, address: None, version: None, epoch: None, limits: None, functions }
+    }
+
+    fn chosen(nodes: &[NodeInfo], meant: &str) -> String {
+        match choose(nodes, meant) {
+            Choice::One(node) => full_name(node),
+            Choice::Several(names) => names.join("|"),
+            Choice::None => "none".into(),
+        }
+    }
+
+    #[test]
+    fn a_node_is_meant_by_name_id_or_both() {
+        let nodes = [node("agv", 1, true), node("agv", 2, true), node("a/1", 3, true), node("a", 1, false)];
+        assert_eq!(chosen(&nodes, "agv"), "agv/1|agv/2");
+        assert_eq!(chosen(&nodes, "agv/2"), "agv/2");
+        assert_eq!(chosen(&nodes, "#3"), "a/1/3");
+        assert_eq!(chosen(&nodes, "a/1/3"), "a/1/3");
+        assert_eq!(chosen(&nodes, "a/1"), "a/1");
+        assert_eq!(chosen(&nodes, "#1"), "agv/1", "the other one of this id has left");
+        assert_eq!(chosen(&nodes, "#x"), "none");
+    }
+
+    #[test]
+    fn who_is_not_there_is_told_with_who_is() {
+        let nodes = [node("agv-1", 11, true), node("lift", 2, true)];
+        assert!(not_there(&nodes, "agv1/11", "").contains("there is agv-1/11."));
+        assert!(not_there(&nodes, "zz", "").contains("there are agv-1/11, lift/2."));
+        assert!(not_there(&[], "zz", "").contains("no node is."));
+    }
+}

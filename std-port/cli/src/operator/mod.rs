@@ -1,0 +1,191 @@
+//! Who is asked: the m_unit that runs on this host, through its control socket, or one of this process. The same
+//! questions, the same answers.
+
+mod own;
+mod running;
+
+use std::ops::ControlFlow;
+use std::time::Duration;
+
+use cara_std::CommunicationSystem;
+use cara_std::control::protocol::{Answer, Failure, Question, UnitInfo};
+use cara_std::control::{Client, execute};
+
+use crate::exit::{Ended, Exit};
+use crate::global::Global;
+
+/// What a command is about: as a manager of its own it waits until that is there.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Need<'n> {
+    /// No node.
+    Nothing,
+    /// All that come.
+    Everybody,
+    /// A node, with functions.
+    Node(&'n str),
+    /// The unit itself, or a node.
+    UnitOrNode(&'n str),
+    /// A node with this function.
+    Function(&'n str, &'n str),
+    /// All that come and offer this function.
+    Offering(&'n str),
+}
+
+/// A unit that answers questions.
+pub(crate) struct Operator {
+    unit: Unit,
+    /// How long nodes were waited for.
+    waited: Option<Duration>,
+}
+
+enum Unit {
+    /// In another process of this host.
+    Running(Client),
+    /// In this process.
+    Own(CommunicationSystem),
+}
+
+/// What becomes of an answer; `false` when no more are wanted.
+type Each<'e> = &'e mut dyn FnMut(Answer) -> anyhow::Result<bool>;
+
+impl Operator {
+    /// The unit that the options choose; with none there, an error that names the ways out.
+    pub(crate) fn open(global: &Global, need: &Need) -> anyhow::Result<Self> {
+        let found = Self::open_if_any(global, need)?;
+        found.ok_or_else(|| {
+            let others = running::not_meant();
+            let text = format!(
+                "no such m_unit runs on this host{others}. Start a manager (`cara node --name NAME --id ID`), or be one \
+                 for the time of this command: --as NAME/ID with the fleet's --fleet NUMBER"
+            );
+            Ended::no_unit(text)
+        })
+    }
+
+    /// The unit that the options choose; `None` if they choose none and none runs.
+    pub(crate) fn open_if_any(global: &Global, need: &Need) -> anyhow::Result<Option<Self>> {
+        let Some(identity) = &global.act_as else {
+            let client = running::choose(global)?;
+            return Ok(client.map(|client| Self { unit: Unit::Running(client), waited: None }));
+        };
+        let system = own::start(identity, global)?;
+        let mut operator = Self { unit: Unit::Own(system), waited: None };
+        own::wait_for(&mut operator, need, global.wait())?;
+        operator.waited = Some(global.wait());
+        Ok(Some(operator))
+    }
+
+    /// How long nodes were waited for, as a remark on who is not there.
+    pub(crate) fn waited(&self) -> String {
+        own::within(self.waited)
+    }
+
+    /// Asks, and has each answer looked at. A question that could not be answered is an error.
+    pub(crate) fn ask(
+        &mut self,
+        question: &Question,
+        mut each: impl FnMut(Answer) -> anyhow::Result<()>,
+    ) -> anyhow::Result<()> {
+        self.converse(question, &mut |answer| each(answer).map(|()| true))
+    }
+
+    /// All answers to a question.
+    pub(crate) fn answers(&mut self, question: &Question) -> anyhow::Result<Vec<Answer>> {
+        let mut answers = Vec::new();
+        self.ask(question, |answer| {
+            answers.push(answer);
+            Ok(())
+        })?;
+        Ok(answers)
+    }
+
+    /// The unit that is asked.
+    pub(crate) fn unit(&mut self) -> anyhow::Result<UnitInfo> {
+        let answers = self.answers(&Question::Unit)?.into_iter();
+        let unit = answers.filter_map(|answer| if let Answer::Unit(unit) = answer { Some(unit) } else { None }).next();
+        unit.ok_or_else(|| Ended::failed("Malformed", "the unit does not say who it is: update cara or the unit"))
+    }
+
+    /// Whether that is the unit which is asked: `.`, its name, or its name and ID.
+    pub(crate) fn is_itself(&mut self, meant: &str) -> anyhow::Result<bool> {
+        if meant == "." {
+            return Ok(true);
+        }
+        let unit = self.unit()?;
+        Ok(meant == unit.name || meant == format!("{}/{}", unit.name, unit.id))
+    }
+
+    /// Asks until `each` says `false`, or until `span` has passed: then the process ends.
+    pub(crate) fn watch(
+        &mut self,
+        question: &Question,
+        span: Option<Duration>,
+        mut each: impl FnMut(Answer) -> anyhow::Result<bool>,
+    ) -> anyhow::Result<()> {
+        if let Some(span) = span {
+            let system = match &self.unit {
+                Unit::Own(system) => Some(system.clone()),
+                Unit::Running(_) => None,
+            };
+            std::thread::Builder::new().name("end".into()).spawn(move || {
+                std::thread::sleep(span);
+                system.inspect(CommunicationSystem::stop);
+                std::process::exit(Exit::Done as i32);
+            })?;
+        }
+        self.converse(question, &mut each)
+    }
+
+    /// A second way to the same unit, for questions that are answered at the same time.
+    pub(crate) fn another(&self) -> anyhow::Result<Self> {
+        let unit = match &self.unit {
+            Unit::Running(client) => Unit::Running(running::again(client)?),
+            Unit::Own(system) => Unit::Own(system.clone()),
+        };
+        Ok(Self { unit, waited: self.waited })
+    }
+
+    /// Requests that were accepted leave this process before it ends.
+    pub(crate) fn deliver(&self) {
+        if let Unit::Own(system) = &self.unit {
+            own::deliver(system);
+        }
+    }
+
+    fn converse(&mut self, question: &Question, each: Each) -> anyhow::Result<()> {
+        let (mut failure, mut wrong) = (None, None);
+        let mut sink = |answer| match answer {
+            Answer::Done => ControlFlow::Continue(()),
+            Answer::Failed(why) => {
+                failure = Some(why);
+                ControlFlow::Continue(())
+            }
+            answer => match each(answer) {
+                Ok(true) => ControlFlow::Continue(()),
+                Ok(false) => ControlFlow::Break(()),
+                Err(error) => {
+                    wrong = Some(error);
+                    ControlFlow::Break(())
+                }
+            },
+        };
+        match &mut self.unit {
+            Unit::Own(system) => execute(system, question, &mut sink),
+            Unit::Running(client) => running::ask(client, question, &mut sink)?,
+        }
+        match (wrong, failure) {
+            (Some(error), _) => Err(error),
+            (None, Some(failure)) => Err(error_of(failure)),
+            (None, None) => Ok(()),
+        }
+    }
+}
+
+/// The exit code of a failure: whoever typed the command must act on those of the configuration.
+pub(crate) fn exit_of(failure: &Failure) -> Exit {
+    if failure.cause == "configuration" { Exit::Usage } else { Exit::Failed }
+}
+
+fn error_of(failure: Failure) -> anyhow::Error {
+    Ended { exit: exit_of(&failure), text: failure.text, name: failure.error }.into()
+}

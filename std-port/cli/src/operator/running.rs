@@ -1,0 +1,91 @@
+//! A unit that runs on this host, through its control socket.
+
+use std::ops::ControlFlow;
+use std::path::Path;
+
+use cara_std::control::protocol::{Answer, Question};
+use cara_std::control::{Client, ControlError, RunningUnit, running};
+
+use super::error_of;
+use crate::exit::{Ended, Exit};
+use crate::global::Global;
+use crate::name_and_id::NameAndId;
+
+/// The unit that the options choose; `None` if they choose none and none runs.
+pub(super) fn choose(global: &Global) -> anyhow::Result<Option<Client>> {
+    if let Some(path) = &global.socket {
+        return Client::connect(path).map(Some).map_err(error);
+    }
+    let all = running().map_err(error)?;
+    let wanted = global.unit.as_ref().map(NameAndId::to_string);
+    let is_meant = |unit: &&RunningUnit| {
+        global.fleet.is_none_or(|fleet| fleet == unit.fleet)
+            && wanted.as_ref().is_none_or(|wanted| *wanted == unit.unit)
+    };
+    let meant: Vec<_> = all.iter().filter(is_meant).collect();
+    match (meant.as_slice(), wanted) {
+        ([], None) => Ok(None),
+        ([], Some(wanted)) => Err(Ended::no_unit(format!("{wanted} does not run on this host{}", others(&all)))),
+        ([only], _) => Client::connect(&only.path).map(Some).map_err(error),
+        (several, _) => Err(Ended::usage(format!(
+            "several units run on this host: {}; choose one with --unit, --fleet or --socket",
+            list(several.iter().copied())
+        ))),
+    }
+}
+
+/// Which units run although none of them is meant.
+pub(super) fn not_meant() -> String {
+    running().map(|all| others(&all)).unwrap_or_default()
+}
+
+fn others(all: &[RunningUnit]) -> String {
+    if all.is_empty() { String::new() } else { format!(" (there is {})", list(all.iter())) }
+}
+
+fn list<'u>(units: impl Iterator<Item = &'u RunningUnit>) -> String {
+    units.map(RunningUnit::to_string).collect::<Vec<_>>().join(", ")
+}
+
+/// Whether a unit of that identity answers on this host.
+pub(super) fn runs(identity: &NameAndId, fleet: u32) -> anyhow::Result<bool> {
+    let all = running().map_err(error)?;
+    Ok(all.iter().any(|unit| unit.unit == identity.to_string() && unit.fleet == fleet))
+}
+
+/// A second connection to the same unit.
+pub(super) fn again(client: &Client) -> anyhow::Result<Client> {
+    let path: &Path = &client.unit().path;
+    Client::connect(path).map_err(error)
+}
+
+/// Asks, and has each answer looked at until it says `Break`.
+pub(super) fn ask(
+    client: &mut Client,
+    question: &Question,
+    each: &mut dyn FnMut(Answer) -> ControlFlow<()>,
+) -> anyhow::Result<()> {
+    for answer in client.ask(question).map_err(error)? {
+        if each(answer.map_err(error)?).is_break() {
+            break;
+        }
+    }
+    Ok(())
+}
+
+/// With the exit code that fits.
+fn error(error: ControlError) -> anyhow::Error {
+    let (exit, name) = match error {
+        ControlError::Failed(failure) => return error_of(failure),
+        ControlError::NoneRunning(path) => {
+            let text = format!("no unit answers at {}: start it, or be the manager with --as NAME/ID", path.display());
+            return Ended::no_unit(text);
+        }
+        ControlError::NotRunning { .. } | ControlError::NotAllowed { .. } | ControlError::Version { .. } => {
+            (Exit::NoUnit, "NoUnit")
+        }
+        ControlError::Several(_) => (Exit::Usage, "Usage"),
+        _ => (Exit::Failed, "Broken"),
+    };
+    Ended { exit, text: error.to_string(), name: name.into() }.into()
+}

@@ -1,0 +1,100 @@
+//! Without a manager on this host: what then is said, and `--as`.
+
+use crate::support::{Stage, private_folder};
+
+const VERBS: [&[&str]; 8] = [
+    &["functions", "agv-1"],
+    &["call", "agv-1", "fail"],
+    &["publish"],
+    &["set", ".", "request_timeout", "2s"],
+    &["watch"],
+    &["counters"],
+    &["ping", "agv-1"],
+    &["bench", "agv-1"],
+];
+
+#[test]
+fn with_no_unit_the_two_ways_out_are_named() {
+    let stage = Stage::empty();
+    for verb in VERBS {
+        stage.ends(3, verb).says("cara node").says("--as NAME/ID");
+        let told = stage.ends(3, &[verb, &["--json"]].concat()).error();
+        assert_eq!((&told["exit"], &told["name"]), (&3.into(), &"NoUnit".into()), "{told}");
+    }
+}
+
+#[test]
+fn a_unit_that_is_named_and_not_there_is_an_error() {
+    let stage = Stage::with(&[]);
+    stage.ends(3, &["counters", "--unit", "manager/2"]).says("manager/1");
+    let nothing = stage.control().join("nothing");
+    stage.ends(3, &["counters", "--socket", nothing.to_str().unwrap()]).says("nothing");
+    let not_a_socket = stage.control().join("file");
+    std::fs::write(&not_a_socket, "").unwrap();
+    stage.ends(3, &["counters", "--socket", not_a_socket.to_str().unwrap()]);
+}
+
+#[test]
+fn a_unit_is_chosen_where_several_run() {
+    let stage = Stage::with(&[]);
+    let mut other = stage.command(&["node", "--name", "other", "--id", "2"]).spawn().unwrap();
+    let start = std::time::Instant::now();
+    while stage.cara(&["counters", "--unit", "other/2"]).code != 0 {
+        assert!(start.elapsed() < crate::support::PATIENCE, "the other unit does not answer");
+        std::thread::sleep(std::time::Duration::from_millis(50));
+    }
+    let several = stage.cara(&["counters"]);
+    let chosen = stage.cara(&["scan", "--unit", "other/2", "--json"]);
+    other.kill().unwrap();
+    other.wait().unwrap();
+    assert_eq!(several.code, 2, "{}", several.everything());
+    several.says("manager/1").says("other/2").says("--unit");
+    assert_eq!(chosen.json()["unit"]["name"], "other");
+}
+
+#[test]
+fn as_a_manager_the_same_questions_have_the_same_answers() {
+    let mut stage = Stage::empty();
+    stage.start_agv("agv-1", 11);
+    stage.start_agv("agv-2", 12);
+    fn own<'v>(verb: &[&'v str]) -> Vec<&'v str> {
+        [verb, &["--as", "manager/1", "--wait", "30s"]].concat()
+    }
+    let told = stage.ends(0, &own(&["scan", "--json"])).json();
+    assert_eq!((told["nodes"].as_array().unwrap().len(), &told["unit"]["name"]), (2, &"manager".into()), "{told}");
+    stage.ends(0, &own(&["functions", "agv-1"])).says("go_to(position: int[2])");
+    let called = stage.ends(0, &own(&["call", "agv-2", "go_to(position: [1, 2])"]));
+    assert_eq!(called.out, "go_to(position: [1, 2])\n");
+    stage.ends(0, &own(&["call", "--all", "go_to(position: [1, 2])"])).says("agv-1/11").says("agv-2/12");
+    stage.ends(0, &own(&["call", "agv-2", "echo(text: \"x\")", "--async"])).says("accepted");
+    stage.ends(0, &own(&["ping", "agv-1", "-c", "1", "--timeout", "20s"])).says("1 of 1 answered");
+    stage.ends(0, &own(&["counters", "agv-1", "--json"]));
+    stage.ends(0, &own(&["publish", "agv-1", "--timeout", "20s"]));
+    stage.ends(0, &own(&["set", "agv-1", "request_timeout", "1s"]));
+    stage.ends(0, &own(&["set", ".", "request_timeout", "1s"]));
+    stage.ends(0, &own(&["watch", "--count", "1"])).says("joined");
+    let sizes = ["bench", "agv-1", "--sizes", "10", "--count", "3", "--periods", "5ms", "--group", "5"];
+    stage.ends(0, &own(&sizes)).says("availability");
+}
+
+#[test]
+fn who_does_not_join_in_the_stated_time_is_told() {
+    let stage = Stage::empty();
+    let ran = stage.ends(1, &["functions", "agv-1", "--as", "manager/1", "--wait", "200ms"]);
+    ran.says("no node `agv-1` is connected").says("waited 200 ms");
+}
+
+#[test]
+fn cara_does_not_pretend_to_be_a_unit_that_runs() {
+    let stage = Stage::with(&["agv-1"]);
+    for verb in VERBS {
+        let ran = stage.ends(2, &[verb, &["--as", "manager/1"]].concat());
+        ran.says("manager/1 runs on this host").says("without --as");
+    }
+    // Its control socket is elsewhere, yet it answers on the network.
+    let elsewhere = private_folder();
+    let mut command = stage.command(&["scan", "--as", "manager/1"]);
+    let ran = crate::support::Ran::of(command.env("CARA_CONTROL_DIR", elsewhere.path()).output().unwrap());
+    assert_eq!(ran.code, 2, "{}", ran.everything());
+    ran.says("manager/1 answers at");
+}

@@ -1,0 +1,122 @@
+//! `cara functions` and `cara call`.
+
+use crate::support::{FUNCTIONS, Stage};
+
+#[test]
+fn functions_are_shown_as_they_are_called() {
+    let stage = Stage::with(&["agv-1"]);
+    for form in ["agv-1", "agv-1/11", "#11"] {
+        let shown = stage.ends(0, &["functions", form]);
+        FUNCTIONS.iter().for_each(|signature| {
+            shown.says(signature);
+        });
+    }
+    let told = stage.ends(0, &["functions", "agv-1", "--json"]).json();
+    assert_eq!(told["node"], "agv-1/11");
+    assert_eq!(told["functions"].as_array().unwrap().len(), FUNCTIONS.len());
+}
+
+#[test]
+fn results_can_be_pasted_back() {
+    let stage = Stage::with(&["agv-1"]);
+    let calls = [
+        "go_to(position: [1, -2])",
+        r#"echo(text: "größe: \"3\"\n")"#,
+        "mix(f: 0.5, fs: [NaN, -inf], b: true, data: 0x01ff)",
+        "mix(f: 1e300, fs: [0.1, 2.0], b: false, data: 0x)",
+    ];
+    for call in calls {
+        let ran = stage.ends(0, &["call", "agv-1", call]);
+        assert_eq!(ran.out, format!("{call}\n"));
+        assert_eq!(stage.ends(0, &["call", "agv-1", ran.out.trim()]).out, ran.out);
+    }
+    let told = stage.ends(0, &["call", "agv-1", "go_to(position: [1, -2])", "--json"]).json();
+    assert_eq!(told["text"], "go_to(position: [1, -2])");
+    assert_eq!(told["node"], "agv-1/11");
+    assert_eq!(told["results"][0]["value"], serde_json::json!([1, -2]));
+}
+
+#[test]
+fn twenty_thousand_characters_travel() {
+    let stage = Stage::with(&["agv-1"]);
+    let call = format!("echo(text: \"{}\")", "x".repeat(20_000));
+    assert_eq!(stage.ends(0, &["call", "agv-1", &call]).out.trim(), call);
+    let longer = format!("echo(text: \"{}\")", "x".repeat(20_001));
+    stage.ends(2, &["call", "agv-1", &longer]).says("at most 20000 bytes, and this has 20001").says("signature: echo(");
+}
+
+#[test]
+fn all_nodes_are_called_at_once() {
+    let stage = Stage::with(&["agv-1", "agv-2"]);
+    let shown = stage.ends(0, &["call", "--all", "go_to(position: [1, 2])"]);
+    shown.says("agv-1/11  go_to(position: [1, 2])").says("agv-2/12  go_to(position: [1, 2])");
+    let told = stage.ends(0, &["call", "--all", "go_to(position: [1, 2])", "--json"]).lines();
+    assert_eq!(told.len(), 2);
+    stage.ends(1, &["call", "--all", "fail"]).says("agv-1/11: Service").says("agv-2/12: Service");
+    stage.ends(2, &["call", "--all", "goto"]).says("did you mean `go_to`?");
+}
+
+#[test]
+fn an_asynchronous_call_returns_when_it_is_accepted() {
+    let stage = Stage::with(&["agv-1"]);
+    stage.ends(0, &["call", "agv-1", "slow", "--async"]).says("accepted as call ");
+    stage.ends(0, &["call", "agv-1", "fail", "--async", "--priority", "high"]).says("accepted as call ");
+    let told =
+        stage.ends(0, &["call", "agv-1", "go_to(position: [1, 2])", "--async", "--best-effort", "--json"]).json();
+    assert!(told["call"].is_u64() && told["error"].is_null(), "{told}");
+    stage.ends(0, &["call", "--all", "go_to(position: [1, 2])", "--async"]).says("agv-1/11  accepted");
+}
+
+#[test]
+fn a_failure_of_the_node_is_told_by_name() {
+    let stage = Stage::with(&["agv-1"]);
+    stage.ends(1, &["call", "agv-1", "fail"]).says("agv-1/11: Service").says("code 7");
+    stage.ends(1, &["call", "agv-1", "slow", "--timeout", "100ms"]).says("TimedOut");
+    let told = stage.ends(1, &["call", "agv-1", "slow", "--timeout", "100ms", "--json"]).json();
+    assert_eq!((&told["error"]["error"], &told["text"]), (&"TimedOut".into(), &serde_json::Value::Null));
+}
+
+#[test]
+fn a_mistake_is_pointed_at_and_nothing_is_sent() {
+    let stage = Stage::with(&["agv-1"]);
+    let mistakes = [
+        ("go_to(position: [1, 2, 3])", "                  ^^^^^^^^^"),
+        ("go_to(positon: [1, 2])", "`position`"),
+        ("go_to()", "the argument `position` is missing"),
+        ("go_to(position: [1, 2", "ends too early"),
+        ("go_to(position: \"x\")", "is an int"),
+    ];
+    for (call, said) in mistakes {
+        stage.ends(2, &["call", "agv-1", call]).says(said);
+        let error = stage.ends(2, &["call", "agv-1", call, "--json"]).error();
+        assert!(error["exit"] == 2 && error["text"].as_str().unwrap().contains(said.trim()), "{error}");
+    }
+    stage.ends(2, &["call", "agv-1", "go_to(position: [1])"]).says("signature: go_to(position: int[2])");
+    stage.ends(2, &["call", "agv-1", "goto(position: [1, 2])"]).says("did you mean `go_to`?").says("swallow(text");
+}
+
+#[test]
+fn who_is_not_there_is_told_with_who_is() {
+    let stage = Stage::with(&["agv-1"]);
+    stage.ends(1, &["functions", "agv1"]).says("no node `agv1` is connected; there is agv-1/11");
+    stage.ends(1, &["call", "agv-9", "fail"]).says("agv-1/11");
+    stage.ends(1, &["ping", "#99"]).says("cara doctor");
+}
+
+#[test]
+fn wrong_usage_ends_with_2() {
+    let stage = Stage::empty();
+    let usages: [&[&str]; 8] = [
+        &[],
+        &["fly"],
+        &["call"],
+        &["call", "agv-1"],
+        &["call", "--all", "agv-1", "fail"],
+        &["call", "agv-1", "fail", "--best-effort"],
+        &["call", "agv-1", "fail", "--timeout", "5"],
+        &["scan", "--unit", "manager"],
+    ];
+    for usage in usages {
+        stage.ends(2, usage);
+    }
+}

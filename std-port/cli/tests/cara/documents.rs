@@ -1,0 +1,96 @@
+//! Help, completions, man page and docs/cara.md.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use crate::support::Stage;
+
+const VERBS: [&str; 13] = [
+    "scan",
+    "functions",
+    "call",
+    "publish",
+    "set",
+    "watch",
+    "counters",
+    "ping",
+    "bench",
+    "node",
+    "doctor",
+    "completions",
+    "man",
+];
+
+#[test]
+fn every_verb_has_help() {
+    let stage = Stage::empty();
+    let help = stage.ends(0, &["--help"]);
+    let listed: BTreeSet<_> = help.out.lines().filter_map(|line| line.strip_prefix("  ")?.split(' ').next()).collect();
+    for verb in VERBS {
+        assert!(listed.contains(verb), "{verb}: {}", help.out);
+        stage.ends(0, &[verb, "--help"]).says("Usage: cara ").says("--json").says("Exit codes:");
+    }
+}
+
+#[test]
+fn every_shell_has_completions() {
+    let stage = Stage::empty();
+    for (shell, sign) in [("bash", "complete -F"), ("zsh", "#compdef cara"), ("fish", "complete -c cara")] {
+        let script = stage.ends(0, &["completions", shell]);
+        script.says(sign);
+        VERBS.iter().for_each(|verb| {
+            script.says(verb);
+        });
+        assert_eq!(
+            stage.ends(0, &["completions", shell, "--json"]).json()["script"].as_str(),
+            Some(script.out.as_str())
+        );
+    }
+    stage.ends(2, &["completions", "abacus"]);
+}
+
+#[test]
+fn the_bash_completion_is_read_by_bash() {
+    let stage = Stage::empty();
+    let script = stage.ends(0, &["completions", "bash"]).out;
+    let complete = "COMP_WORDS=(cara sc); COMP_CWORD=1; _cara cara sc cara; echo \"${COMPREPLY[@]}\"";
+    let ran = std::process::Command::new("bash").args(["-c", &format!("{script}\n{complete}")]).output();
+    let Ok(ran) = ran else { return println!("skipped: no bash here") };
+    assert_eq!(String::from_utf8_lossy(&ran.stdout).trim(), "scan", "{}", String::from_utf8_lossy(&ran.stderr));
+}
+
+#[test]
+fn the_man_page_renders() {
+    let stage = Stage::empty();
+    let page = stage.ends(0, &["man"]).out;
+    assert!(page.contains(".TH cara 1"), "{page}");
+    assert_eq!(stage.ends(0, &["man", "--json"]).json()["page"].as_str(), Some(page.as_str()));
+    let folder = tempfile::TempDir::new().unwrap();
+    stage.ends(0, &["man", "--dir", folder.path().to_str().unwrap()]).says("cara-scan.1");
+    for verb in VERBS {
+        let page = std::fs::read_to_string(folder.path().join(format!("cara-{verb}.1"))).unwrap();
+        assert!(page.contains(&format!(".TH cara-{verb} 1")) && page.contains(".SH OPTIONS"), "{page}");
+    }
+}
+
+#[test]
+fn the_reference_has_every_verb_option_and_exit_code() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/cara.md");
+    let reference = std::fs::read_to_string(path).unwrap();
+    let stage = Stage::empty();
+    for verb in VERBS {
+        assert!(reference.contains(&format!("## `cara {verb}")), "no section for {verb}");
+        let help = stage.ends(0, &[verb, "-h"]).out;
+        let options =
+            help.split(|c: char| !c.is_ascii_alphanumeric() && c != '-').filter(|word| word.starts_with("--"));
+        for option in options.filter(|option| option.len() > 2) {
+            assert!(reference.contains(&format!("`{option}")), "no {option} of cara {verb}");
+        }
+    }
+    let help = stage.ends(0, &["--help"]).out;
+    let codes = help.split("Exit codes:").nth(1).unwrap();
+    for line in codes.lines().filter(|line| !line.trim().is_empty()) {
+        let (code, meaning) = line.trim().split_once("  ").unwrap();
+        assert!(reference.contains(&format!("| {code} | {meaning} |")), "no `| {code} | {meaning} |`");
+    }
+}

@@ -1,0 +1,10 @@
+//! The built `cara` command against a manager in a process of its own and AGVs on loopback, in a fleet of their own.
+
+mod alone;
+mod calls;
+mod constraints;
+mod documents;
+mod measuring;
+mod scanning;
+mod support;
+mod watching;

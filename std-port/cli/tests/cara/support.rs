@@ -1,0 +1,233 @@
+//! A manager, AGVs, and what a user types.
+
+use std::hash::{BuildHasher, Hasher, RandomState};
+use std::io::{BufRead, BufReader};
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+use std::process::{Child, Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+use cara_std::{Call, Interfaces, ParametersView, ServiceError, ServiceOptions, Unit};
+use serde_json::Value;
+use tempfile::TempDir;
+
+/// Longest wait for anything that is to happen.
+pub(crate) const PATIENCE: Duration = Duration::from_secs(30);
+
+/// What an AGV of these tests offers.
+pub(crate) const FUNCTIONS: [&str; 6] = [
+    "go_to(position: int[2]) -> (position: int[2])",
+    "echo(text: string[20000]) -> (text: string[20000])",
+    "mix(f: float, fs: float[2], b: bool, data: bytes[4]) -> (f: float, fs: float[2], b: bool, data: bytes[4])",
+    "fail()",
+    "slow()",
+    "swallow(text: string[100])",
+];
+
+/// A manager in a process of its own, with a control socket of its own.
+pub(crate) struct Stage {
+    pub(crate) fleet: u32,
+    control: TempDir,
+    manager: Option<Child>,
+    agvs: Vec<Unit>,
+}
+
+impl Stage {
+    /// Nobody there.
+    pub(crate) fn empty() -> Self {
+        let fleet = RandomState::new().build_hasher().finish() as u32;
+        let control = private_folder();
+        Self { fleet, control, manager: None, agvs: Vec::new() }
+    }
+
+    /// `manager/1` and these AGVs, connected, with IDs from 11 on.
+    pub(crate) fn with(agvs: &[&str]) -> Self {
+        let mut stage = Self::empty();
+        stage.start_manager();
+        agvs.iter().zip(11..).for_each(|(name, id)| stage.start_agv(name, id));
+        let start = Instant::now();
+        while stage.ready() < agvs.len() {
+            assert!(start.elapsed() < PATIENCE, "the AGVs have not joined: {}", stage.cara(&["scan"]).everything());
+            std::thread::sleep(Duration::from_millis(50));
+        }
+        stage
+    }
+
+    /// AGVs whose lists the manager has.
+    fn ready(&self) -> usize {
+        let scan = self.cara(&["scan", "--json"]);
+        let nodes = if scan.code == 0 { scan.json()["nodes"].clone() } else { Value::Null };
+        let ready = |node: &&Value| node["functions"].as_u64() == Some(FUNCTIONS.len() as u64);
+        nodes.as_array().map_or(0, |nodes| nodes.iter().filter(ready).count())
+    }
+
+    pub(crate) fn start_manager(&mut self) {
+        let mut command = self.command(&["node", "--name", "manager", "--id", "1"]);
+        let manager = command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::inherit()).spawn().unwrap();
+        self.manager = Some(manager);
+        let start = Instant::now();
+        while self.cara(&["scan", "--unit", "manager/1"]).code != 0 {
+            assert!(start.elapsed() < PATIENCE, "the manager does not answer");
+            std::thread::sleep(Duration::from_millis(50));
+        }
+    }
+
+    pub(crate) fn start_agv(&mut self, name: &str, id: u32) {
+        self.agvs.push(agv(name, id, self.fleet));
+    }
+
+    pub(crate) fn stop_agvs(&mut self) {
+        self.agvs.drain(..).for_each(|agv| agv.stop());
+    }
+
+    /// The command with the stage's fleet, on loopback, to be run.
+    pub(crate) fn command(&self, arguments: &[&str]) -> Command {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_cara"));
+        command.args(arguments).args(["--loopback", "--fleet", &self.fleet.to_string()]);
+        command.env("CARA_CONTROL_DIR", self.control.path()).env_remove("CARA_INTERFACES").stdin(Stdio::null());
+        command
+    }
+
+    /// What a user types, run to its end.
+    pub(crate) fn cara(&self, arguments: &[&str]) -> Ran {
+        Ran::of(self.command(arguments).output().unwrap())
+    }
+
+    /// As [`cara`](Self::cara), and it ends with `code`.
+    #[track_caller]
+    pub(crate) fn ends(&self, code: i32, arguments: &[&str]) -> Ran {
+        let ran = self.cara(arguments);
+        assert_eq!(ran.code, code, "cara {}\n{}", arguments.join(" "), ran.everything());
+        ran
+    }
+
+    pub(crate) fn control(&self) -> &Path {
+        self.control.path()
+    }
+}
+
+/// A folder for control sockets; one that others can enter would be refused.
+pub(crate) fn private_folder() -> TempDir {
+    let folder = TempDir::new().unwrap();
+    std::fs::set_permissions(folder.path(), std::fs::Permissions::from_mode(0o700)).unwrap();
+    folder
+}
+
+impl Drop for Stage {
+    fn drop(&mut self) {
+        self.stop_agvs();
+        if let Some(mut manager) = self.manager.take() {
+            // One that has ended cannot be killed, which is what is wanted.
+            let _ = manager.kill();
+            let _ = manager.wait();
+        }
+    }
+}
+
+/// How a command ended, and what it printed.
+pub(crate) struct Ran {
+    pub(crate) code: i32,
+    pub(crate) out: String,
+    pub(crate) err: String,
+}
+
+impl Ran {
+    pub(crate) fn of(output: Output) -> Self {
+        let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+        Self { code: output.status.code().unwrap_or(-1), out: text(&output.stdout), err: text(&output.stderr) }
+    }
+
+    pub(crate) fn everything(&self) -> String {
+        format!("code {}\n--- stdout\n{}\n--- stderr\n{}", self.code, self.out, self.err)
+    }
+
+    /// The one object that it printed.
+    #[track_caller]
+    pub(crate) fn json(&self) -> Value {
+        serde_json::from_str(self.out.trim()).unwrap_or_else(|error| panic!("{error}: {}", self.everything()))
+    }
+
+    /// The objects that it printed, one a line.
+    #[track_caller]
+    pub(crate) fn lines(&self) -> Vec<Value> {
+        let parse = |line| serde_json::from_str(line).unwrap_or_else(|error| panic!("{error}: {}", self.everything()));
+        self.out.lines().map(parse).collect()
+    }
+
+    /// The error that it printed as JSON.
+    #[track_caller]
+    pub(crate) fn error(&self) -> Value {
+        let told: Value = serde_json::from_str(self.err.trim()).unwrap_or_else(|_| panic!("{}", self.everything()));
+        told["error"].clone()
+    }
+
+    #[track_caller]
+    pub(crate) fn says(&self, text: &str) -> &Self {
+        assert!(self.out.contains(text) || self.err.contains(text), "no `{text}` in\n{}", self.everything());
+        self
+    }
+}
+
+/// A command that runs on, read line by line.
+pub(crate) struct Running {
+    child: Child,
+    lines: std::io::Lines<BufReader<std::process::ChildStdout>>,
+}
+
+impl Running {
+    pub(crate) fn start(mut command: Command) -> Self {
+        let mut child = command.stdout(Stdio::piped()).spawn().unwrap();
+        let lines = BufReader::new(child.stdout.take().unwrap()).lines();
+        Self { child, lines }
+    }
+
+    /// The next line that contains `text`; all before it are dropped.
+    pub(crate) fn expect(&mut self, text: &str) -> String {
+        let found = self.lines.by_ref().map_while(Result::ok).find(|line| line.contains(text));
+        found.unwrap_or_else(|| panic!("it ended without a line with `{text}`"))
+    }
+
+    /// Waits for its end.
+    pub(crate) fn end(mut self) -> i32 {
+        self.child.wait().unwrap().code().unwrap_or(-1)
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        // One that has ended cannot be killed, which is what is wanted.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+fn agv(name: &str, id: u32, fleet: u32) -> Unit {
+    let builder = Unit::builder(name, id, "manager", 1).unwrap();
+    let unit = builder.fleet(fleet).interfaces(Interfaces::Loopback).build_unit().unwrap();
+    for signature in FUNCTIONS {
+        let definition = signature.parse::<cara_std::Definition>().unwrap();
+        let options = ServiceOptions::new();
+        let list = unit.my_function_list();
+        match definition.name() {
+            "fail" => list.add_service(&definition, options, failing).map(drop).unwrap(),
+            "slow" => list.add_service(&definition, options, slow).map(drop).unwrap(),
+            _ => list.add_service(&definition, options, unchanged).map(drop).unwrap(),
+        }
+    }
+    unit.publish_my_function_list().unwrap();
+    unit.start().unwrap();
+    unit
+}
+
+fn unchanged(_: &Call, _: &mut ParametersView) -> Result<(), ServiceError> {
+    Ok(())
+}
+
+fn failing(_: &Call, _: &mut ParametersView) -> Result<(), ServiceError> {
+    Err(ServiceError::Failed(7))
+}
+
+fn slow(_: &Call, _: &mut ParametersView) -> Result<(), ServiceError> {
+    std::thread::sleep(Duration::from_secs(3));
+    Ok(())
+}
