@@ -1,0 +1,284 @@
+//! Datagrams beside a link: they are lost, doubled and overtake each other, so each tells its number, and a window
+//! tells those that came before.
+//!
+//! Their keys are never those of the stream: each end draws its own and tells it in the first sealed frames of the link.
+//! When an end tells a new key, datagrams of the one before are taken for as long as its owner lets them.
+
+use noise_protocol::Cipher;
+use noise_protocol::U8Array;
+use noise_rust_crypto::sensitive::Sensitive;
+use zeroize::{Zeroize, ZeroizeOnDrop};
+
+use crate::channel::TAG_BYTES;
+use crate::keys::KEY_BYTES;
+use crate::suite::ChaCha20Poly1305;
+
+/// Bytes in front of a sealed body: the key's generation, and the datagram's number, little-endian.
+pub const HEADER_BYTES: usize = 1 + 8;
+/// Bytes that sealing adds in all.
+pub const OVERHEAD: usize = HEADER_BYTES + TAG_BYTES;
+/// Numbers behind the newest one that can still be told apart.
+pub const WINDOW: u64 = 64;
+
+/// A key for datagrams of one direction.
+#[derive(Clone, Zeroize, ZeroizeOnDrop)]
+pub struct DatagramKey([u8; KEY_BYTES]);
+
+impl DatagramKey {
+    /// A key from 32 bytes that were drawn for it.
+    pub const fn new(bytes: [u8; KEY_BYTES]) -> Self {
+        Self(bytes)
+    }
+
+    /// Its bytes, to be told in a sealed frame.
+    pub const fn expose(&self) -> &[u8; KEY_BYTES] {
+        &self.0
+    }
+
+    fn cipher_key(&self) -> Sensitive<[u8; 32]> {
+        Sensitive::from_slice(&self.0)
+    }
+}
+
+/// Why a datagram is not taken.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum DatagramError {
+    /// Shorter than any sealed one.
+    #[error("the datagram is too short")]
+    Short,
+    /// Of a key that is not known, or no longer.
+    #[error("the datagram is sealed with a key that is not in use")]
+    Key,
+    /// It, or one much newer, came before.
+    #[error("the datagram came before")]
+    Repeated,
+    /// Not sealed by the other end, or changed on the way.
+    #[error("the datagram is not from the other end of the link")]
+    Forged,
+}
+
+/// Seals the datagrams of one direction.
+pub struct Sealer {
+    key: DatagramKey,
+    generation: u8,
+    next: u64,
+}
+
+impl Sealer {
+    /// Begins with a key that has sealed nothing yet.
+    pub const fn new(key: DatagramKey, generation: u8) -> Self {
+        Self { key, generation, next: 0 }
+    }
+
+    /// Seals `datagram` in place: [`HEADER_BYTES`] of room, the body, [`TAG_BYTES`] of room. `bound` is what the
+    /// datagram's plain header says; it is not sealed, and cannot be changed. `None` without that room.
+    pub fn seal(&mut self, bound: &[u8], datagram: &mut [u8]) -> Option<()> {
+        let length = datagram.len().checked_sub(OVERHEAD)?;
+        let number = self.next;
+        self.next = number.checked_add(1)?;
+        let (header, body) = datagram.split_first_chunk_mut::<HEADER_BYTES>()?;
+        *header = header_of(self.generation, number);
+        ChaCha20Poly1305::encrypt_in_place(&self.key.cipher_key(), number, &Bound::of(bound, header)?.0, body, length);
+        Some(())
+    }
+}
+
+/// Longest plain header that is bound.
+const BOUND_BYTES: usize = 48;
+
+/// What is authenticated beside the body, in one piece.
+struct Bound([u8; BOUND_BYTES + HEADER_BYTES + 1]);
+
+impl Bound {
+    fn of(plain: &[u8], header: &[u8; HEADER_BYTES]) -> Option<Self> {
+        let mut whole = [0; BOUND_BYTES + HEADER_BYTES + 1];
+        let (length, rest) = whole.split_first_mut()?;
+        *length = u8::try_from(plain.len()).ok()?;
+        let (to_header, to_plain) = rest.split_first_chunk_mut::<HEADER_BYTES>()?;
+        *to_header = *header;
+        to_plain.get_mut(..plain.len())?.copy_from_slice(plain);
+        Some(Self(whole))
+    }
+}
+
+const fn header_of(generation: u8, number: u64) -> [u8; HEADER_BYTES] {
+    let [a, b, c, d, e, f, g, h] = number.to_le_bytes();
+    [generation, a, b, c, d, e, f, g, h]
+}
+
+/// Opens the datagrams of one direction.
+pub struct Opener {
+    current: Keyed,
+    previous: Option<Keyed>,
+}
+
+struct Keyed {
+    key: DatagramKey,
+    generation: u8,
+    window: Window,
+}
+
+impl Opener {
+    /// Begins with the key that the other end has told.
+    pub const fn new(key: DatagramKey, generation: u8) -> Self {
+        Self { current: Keyed { key, generation, window: Window::NEW }, previous: None }
+    }
+
+    /// The other end has told a new key. Datagrams of the old one are taken until [`Self::forget_previous`].
+    pub fn replace(&mut self, key: DatagramKey, generation: u8) {
+        let new = Keyed { key, generation, window: Window::NEW };
+        self.previous = Some(core::mem::replace(&mut self.current, new));
+    }
+
+    /// Datagrams of the key before are taken no longer.
+    pub fn forget_previous(&mut self) {
+        self.previous = None;
+    }
+
+    /// Opens a datagram in place; its body. One that is forged changes nothing, so that nobody can shut the window.
+    pub fn open<'d>(&mut self, bound: &[u8], datagram: &'d mut [u8]) -> Result<&'d mut [u8], DatagramError> {
+        let (header, body) = datagram.split_first_chunk_mut::<HEADER_BYTES>().ok_or(DatagramError::Short)?;
+        let length = body.len();
+        if length < TAG_BYTES {
+            return Err(DatagramError::Short);
+        }
+        let [generation, number @ ..] = *header;
+        let number = u64::from_le_bytes(number);
+        let keyed = match &mut self.previous {
+            _ if self.current.generation == generation => &mut self.current,
+            Some(previous) if previous.generation == generation => previous,
+            _ => return Err(DatagramError::Key),
+        };
+        if !keyed.window.is_new(number) {
+            return Err(DatagramError::Repeated);
+        }
+        let bound = Bound::of(bound, header).ok_or(DatagramError::Forged)?;
+        let opened = ChaCha20Poly1305::decrypt_in_place(&keyed.key.cipher_key(), number, &bound.0, body, length);
+        let opened = opened.map_err(|()| DatagramError::Forged)?;
+        keyed.window.take(number);
+        body.get_mut(..opened).ok_or(DatagramError::Short)
+    }
+}
+
+/// Which numbers have come: the newest one, and a bit for each of those behind it.
+struct Window {
+    /// One above the newest.
+    end: u64,
+    /// Bit n: `end - 1 - n` has come.
+    seen: u64,
+}
+
+impl Window {
+    const NEW: Self = Self { end: 0, seen: 0 };
+
+    fn is_new(&self, number: u64) -> bool {
+        match self.end.checked_sub(number) {
+            None | Some(0) => true,
+            Some(behind) => behind <= WINDOW && self.seen & bit(behind) == 0,
+        }
+    }
+
+    fn take(&mut self, number: u64) {
+        if number >= self.end {
+            let end = number.saturating_add(1);
+            let moved = end.saturating_sub(self.end);
+            self.seen = u32::try_from(moved).ok().and_then(|moved| self.seen.checked_shl(moved)).unwrap_or(0);
+            self.end = end;
+        }
+        self.seen |= bit(self.end.saturating_sub(number));
+    }
+}
+
+/// The bit of a number that is `behind` the end, 1 to [`WINDOW`].
+fn bit(behind: u64) -> u64 {
+    u32::try_from(behind.saturating_sub(1)).ok().and_then(|at| 1_u64.checked_shl(at)).unwrap_or(0)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::indexing_slicing, clippy::unwrap_used)]
+    use super::*;
+    use proptest::prelude::*;
+    use std::collections::HashSet;
+    use std::vec::Vec;
+
+    const PLAIN: &[u8] = b"plain header";
+
+    fn key(byte: u8) -> DatagramKey {
+        DatagramKey::new([byte; KEY_BYTES])
+    }
+
+    fn sealed(sealer: &mut Sealer, body: &[u8]) -> Vec<u8> {
+        let mut datagram = std::vec![0; body.len() + OVERHEAD];
+        datagram[HEADER_BYTES..HEADER_BYTES + body.len()].copy_from_slice(body);
+        sealer.seal(PLAIN, &mut datagram).unwrap();
+        datagram
+    }
+
+    #[test]
+    fn what_is_sealed_opens_once() {
+        let (mut sealer, mut opener) = (Sealer::new(key(1), 0), Opener::new(key(1), 0));
+        let datagram = sealed(&mut sealer, b"stop");
+        assert!(!datagram.windows(4).any(|window| window == b"stop"));
+        assert_eq!(opener.open(PLAIN, &mut datagram.clone()).unwrap(), b"stop");
+        assert_eq!(opener.open(PLAIN, &mut datagram.clone()), Err(DatagramError::Repeated));
+    }
+
+    #[test]
+    fn every_flipped_bit_is_noticed_and_shuts_nothing() {
+        let (mut sealer, mut opener) = (Sealer::new(key(1), 3), Opener::new(key(1), 3));
+        let datagram = sealed(&mut sealer, b"stop");
+        for bit in 0..datagram.len() * 8 {
+            let mut changed = datagram.clone();
+            changed[bit / 8] ^= 1 << (bit % 8);
+            assert!(opener.open(PLAIN, &mut changed).is_err(), "bit {bit}");
+        }
+        assert_eq!(opener.open(b"other header", &mut datagram.clone()), Err(DatagramError::Forged));
+        assert!((0..datagram.len()).all(|length| opener.open(PLAIN, &mut datagram.clone()[..length]).is_err()));
+        assert_eq!(opener.open(PLAIN, &mut datagram.clone()).unwrap(), b"stop");
+    }
+
+    #[test]
+    fn the_key_before_is_taken_until_it_is_forgotten() {
+        let (mut old, mut new) = (Sealer::new(key(1), 0), Sealer::new(key(2), 1));
+        let mut opener = Opener::new(key(1), 0);
+        let late = [sealed(&mut old, b"one"), sealed(&mut old, b"two")];
+        opener.replace(key(2), 1);
+        assert_eq!(opener.open(PLAIN, &mut sealed(&mut new, b"new")).unwrap(), b"new");
+        assert_eq!(opener.open(PLAIN, &mut late[0].clone()).unwrap(), b"one");
+        assert_eq!(opener.open(PLAIN, &mut late[0].clone()), Err(DatagramError::Repeated));
+        opener.forget_previous();
+        assert_eq!(opener.open(PLAIN, &mut late[1].clone()), Err(DatagramError::Key));
+    }
+
+    #[test]
+    fn the_last_number_is_not_used_twice() {
+        let mut sealer = Sealer { key: key(1), generation: 0, next: u64::MAX };
+        assert_eq!(sealer.seal(PLAIN, &mut [0; OVERHEAD]), None);
+    }
+
+    proptest! {
+        /// Against a set that remembers everything.
+        #[test]
+        fn the_window_takes_each_number_once(numbers in prop::collection::vec(0_u64..200, 0..200)) {
+            let mut window = Window::NEW;
+            let mut taken = HashSet::new();
+            let mut newest = 0;
+            for number in numbers {
+                newest = newest.max(number);
+                let too_old = newest - number >= WINDOW;
+                prop_assert_eq!(window.is_new(number), !taken.contains(&number) && !too_old);
+                if window.is_new(number) {
+                    window.take(number);
+                    taken.insert(number);
+                }
+            }
+        }
+
+        #[test]
+        fn nothing_panics(mut bytes in prop::collection::vec(any::<u8>(), 0..80), plain in prop::collection::vec(any::<u8>(), 0..80)) {
+            let mut opener = Opener::new(key(1), 0);
+            prop_assert!(opener.open(&plain, &mut bytes).is_err());
+        }
+    }
+}

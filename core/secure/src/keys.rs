@@ -1,0 +1,155 @@
+//! The keys of a fleet.
+//!
+//! A **root** stays with whoever provisions units. From it comes a **pair key** for each two units that may talk, and a
+//! **discovery key** for all of the fleet. Who has a pair key can speak as either of the two, to the other one only.
+//! Revoking a unit is leaving its pairs out when the generation is raised.
+
+use core::fmt;
+
+use blake2::Blake2sMac256;
+use blake2::digest::{KeyInit, Mac};
+use cara_core::distribution::identity::{Fleet, Identity, Role};
+use zeroize::{Zeroize, ZeroizeOnDrop};
+
+/// Bytes of each key.
+pub const KEY_BYTES: usize = 32;
+
+macro_rules! key {
+    ($(#[$meta:meta])* $name:ident) => {
+        $(#[$meta])*
+        #[derive(Clone, Zeroize, ZeroizeOnDrop)]
+        pub struct $name([u8; KEY_BYTES]);
+
+        impl $name {
+            /// A key from its bytes.
+            pub const fn new(bytes: [u8; KEY_BYTES]) -> Self {
+                Self(bytes)
+            }
+
+            /// Its bytes, for whoever writes them to where they belong.
+            pub const fn expose(&self) -> &[u8; KEY_BYTES] {
+                &self.0
+            }
+        }
+
+        /// Tells that there is a key, and nothing of it.
+        impl fmt::Debug for $name {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str(concat!(stringify!($name), "(…)"))
+            }
+        }
+    };
+}
+
+key! {
+    /// The root of a fleet's keys. It never leaves whoever provisions.
+    RootKey
+}
+key! {
+    /// The key of two units.
+    PairKey
+}
+key! {
+    /// The key with which all units of a fleet ask and answer who is there.
+    DiscoveryKey
+}
+
+impl RootKey {
+    /// The key of two units, whichever is named first.
+    pub fn pair(&self, fleet: Fleet, generation: u32, one: &Identity, other: &Identity) -> PairKey {
+        let (first, second) = if one <= other { (one, other) } else { (other, one) };
+        let mut mac = self.begin(b"pair", fleet, generation);
+        [first, second].into_iter().for_each(|identity| name(&mut mac, identity));
+        PairKey(mac.finalize().into_bytes().into())
+    }
+
+    /// The fleet's key for discovery.
+    pub fn discovery(&self, fleet: Fleet, generation: u32) -> DiscoveryKey {
+        DiscoveryKey(self.begin(b"disc", fleet, generation).finalize().into_bytes().into())
+    }
+
+    fn begin(&self, purpose: &[u8; 4], fleet: Fleet, generation: u32) -> Blake2sMac256 {
+        let mut mac = keyed(&self.0);
+        mac.update(purpose);
+        mac.update(&fleet.0.to_le_bytes());
+        mac.update(&generation.to_le_bytes());
+        mac
+    }
+}
+
+/// Every identity has one form, and no two share one.
+fn name(mac: &mut Blake2sMac256, identity: &Identity) {
+    let role = match identity.role() {
+        Role::MUnit => 0,
+        Role::SUnit => 1,
+    };
+    mac.update(&[role, identity.name().len() as u8]);
+    mac.update(identity.name().as_bytes());
+    mac.update(&identity.id().to_le_bytes());
+}
+
+pub(crate) fn keyed(key: &[u8; KEY_BYTES]) -> Blake2sMac256 {
+    <Blake2sMac256 as KeyInit>::new(key.into())
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use std::collections::HashSet;
+    use std::format;
+
+    fn root() -> RootKey {
+        RootKey::new([7; KEY_BYTES])
+    }
+
+    fn agv(id: u32) -> Identity {
+        Identity::s_unit("agv", id).unwrap()
+    }
+
+    #[test]
+    fn both_ends_derive_the_same_key() {
+        let manager = Identity::m_unit("depot", 1).unwrap();
+        let one = root().pair(Fleet(3), 1, &manager, &agv(17));
+        assert_eq!(one.expose(), root().pair(Fleet(3), 1, &agv(17), &manager).expose());
+    }
+
+    #[test]
+    fn whatever_differs_makes_another_key() {
+        let manager = Identity::m_unit("depot", 1).unwrap();
+        let twin = Identity::m_unit("agv", 17).unwrap();
+        let longer = Identity::s_unit("agv1", 7).unwrap();
+        let pair = |root: &RootKey, fleet, generation, other: &Identity| {
+            *root.pair(Fleet(fleet), generation, &manager, other).expose()
+        };
+        let keys = [
+            pair(&root(), 3, 1, &agv(17)),
+            pair(&RootKey::new([8; KEY_BYTES]), 3, 1, &agv(17)),
+            pair(&root(), 4, 1, &agv(17)),
+            pair(&root(), 3, 2, &agv(17)),
+            pair(&root(), 3, 1, &agv(18)),
+            pair(&root(), 3, 1, &twin),
+            pair(&root(), 3, 1, &longer),
+            *root().discovery(Fleet(3), 1).expose(),
+            *root().discovery(Fleet(4), 1).expose(),
+            *root().discovery(Fleet(3), 2).expose(),
+        ];
+        assert_eq!(HashSet::from(keys).len(), keys.len());
+    }
+
+    /// A change of the derivation would lock out every unit that was provisioned before.
+    #[test]
+    fn the_derivation_stays() {
+        let manager = Identity::m_unit("depot", 1).unwrap();
+        let key = root().pair(Fleet(3), 1, &manager, &agv(17));
+        let shown = key.expose().iter().fold(std::string::String::new(), |text, byte| text + &format!("{byte:02x}"));
+        // Computed with another implementation, Python's `hashlib.blake2s(…, key=bytes([7] * 32))`.
+        assert_eq!(shown, "2be3d533d8d6234ec6a1992b8b145520cc16b1587ea980a8d609282c2b18f4f2");
+    }
+
+    #[test]
+    fn nothing_of_a_key_is_shown() {
+        assert_eq!(format!("{:?}", root()), "RootKey(…)");
+        assert_eq!(format!("{:?}", root().discovery(Fleet(1), 1)), "DiscoveryKey(…)");
+    }
+}

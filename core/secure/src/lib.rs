@@ -1,0 +1,23 @@
+//! The cipher of CARA: one suite, `Noise_NNpsk0_25519_ChaChaPoly_BLAKE2s`, with a key for each pair of units.
+//!
+//! - [`keys`]: the keys of a fleet, derived from one root that stays where they are made;
+//! - [`handshake`]: two messages that prove the pair's key, and agree on keys of this link alone;
+//! - [`channel`]: the frames of a link, sealed in place;
+//! - [`datagram`]: the datagrams beside it, with keys of their own and a window against replays;
+//! - [`mac`]: codes for discovery, which is authenticated and not secret.
+//!
+//! Another suite would be another version of the protocol; nothing is negotiated. This crate draws no random numbers,
+//! reads no file and allocates nothing: whoever calls brings 32 fresh bytes for each handshake. What it does not do:
+//! decide who may speak, which is the business of the tables above.
+
+#![no_std]
+
+#[cfg(test)]
+extern crate std;
+
+pub mod channel;
+pub mod datagram;
+pub mod handshake;
+pub mod keys;
+pub mod mac;
+mod suite;

@@ -1,0 +1,59 @@
+//! The primitives in the form that `noise-protocol` asks for. X25519 and BLAKE2s stand here, since the ready-made glue
+//! draws its own random numbers and does not build without an operating system.
+
+use blake2::{Blake2s256, Digest};
+use noise_protocol::{DH, Hash, U8Array};
+use noise_rust_crypto::sensitive::Sensitive;
+use x25519_dalek::{PublicKey, StaticSecret};
+
+pub(crate) use noise_rust_crypto::ChaCha20Poly1305;
+
+/// X25519.
+pub(crate) enum X25519 {}
+
+impl DH for X25519 {
+    type Key = Sensitive<[u8; 32]>;
+    type Pubkey = [u8; 32];
+    type Output = Sensitive<[u8; 32]>;
+
+    fn name() -> &'static str {
+        "25519"
+    }
+
+    /// Never asked for: every handshake is given its key. A constant would not be a secret, so this one is refused by
+    /// [`Self::dh`] at the other end and here.
+    fn genkey() -> Self::Key {
+        Self::Key::new()
+    }
+
+    fn pubkey(key: &Self::Key) -> Self::Pubkey {
+        PublicKey::from(&StaticSecret::from(**key)).to_bytes()
+    }
+
+    fn dh(key: &Self::Key, public: &Self::Pubkey) -> Result<Self::Output, ()> {
+        let shared = StaticSecret::from(**key).diffie_hellman(&PublicKey::from(*public));
+        // A point of small order makes the same secret with every key.
+        if shared.was_contributory() { Ok(Self::Output::from_slice(shared.as_bytes())) } else { Err(()) }
+    }
+}
+
+/// BLAKE2s with 32 bytes.
+#[derive(Default)]
+pub(crate) struct Blake2s(Blake2s256);
+
+impl Hash for Blake2s {
+    type Block = [u8; 64];
+    type Output = Sensitive<[u8; 32]>;
+
+    fn name() -> &'static str {
+        "BLAKE2s"
+    }
+
+    fn input(&mut self, data: &[u8]) {
+        self.0.update(data);
+    }
+
+    fn result(&mut self) -> Self::Output {
+        Self::Output::from_slice(&self.0.finalize_reset())
+    }
+}

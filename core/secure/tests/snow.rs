@@ -1,0 +1,78 @@
+//! Another implementation of Noise understands this one, in both roles.
+#![allow(clippy::unwrap_used, clippy::indexing_slicing)]
+
+use cara_core::host::secure::Secure;
+use cara_secure::channel::{Channel, FRAMES_PER_KEY, TAG_BYTES};
+use cara_secure::handshake::{Initiator, MESSAGE_BYTES, answer, prologue};
+use cara_secure::keys::PairKey;
+
+const SUITE: &str = "Noise_NNpsk0_25519_ChaChaPoly_BLAKE2s";
+const KEY: [u8; 32] = [9; 32];
+
+fn snow(prologue: &[u8; 32], initiates: bool) -> snow::HandshakeState {
+    let builder = snow::Builder::new(SUITE.parse().unwrap()).psk(0, &KEY).unwrap().prologue(prologue).unwrap();
+    if initiates { builder.build_initiator().unwrap() } else { builder.build_responder().unwrap() }
+}
+
+fn seal(channel: &mut Channel, text: &[u8]) -> Vec<u8> {
+    let mut frame = [text, &[0; TAG_BYTES]].concat();
+    channel.seal(&mut frame).unwrap();
+    frame
+}
+
+/// Frames go both ways, past the point where keys change.
+fn talk(mut channel: Channel, theirs: snow::HandshakeState) {
+    let mut theirs = theirs.into_transport_mode().unwrap();
+    let mut buffer = [0; 128];
+    for number in 0..3_u32 {
+        let text = number.to_le_bytes();
+        let length = theirs.read_message(&seal(&mut channel, &text), &mut buffer).unwrap();
+        assert_eq!(buffer[..length], text);
+        let length = theirs.write_message(&text, &mut buffer).unwrap();
+        assert_eq!(channel.open(&mut buffer[..length]).unwrap(), text);
+    }
+}
+
+#[test]
+fn snow_answers() {
+    let prologue = prologue(b"hello of one", b"hello of the other");
+    let (initiator, message) = Initiator::begin(&PairKey::new(KEY), &prologue, &[3; 32]).unwrap();
+    let mut theirs = snow(&prologue, false);
+    assert_eq!(theirs.read_message(&message, &mut []).unwrap(), 0);
+    let mut reply = [0; MESSAGE_BYTES];
+    assert_eq!(theirs.write_message(&[], &mut reply).unwrap(), MESSAGE_BYTES);
+    talk(initiator.finish(&reply).unwrap(), theirs);
+}
+
+#[test]
+fn snow_begins() {
+    let prologue = prologue(b"hello of one", b"hello of the other");
+    let mut theirs = snow(&prologue, true);
+    let mut message = [0; MESSAGE_BYTES];
+    assert_eq!(theirs.write_message(&[], &mut message).unwrap(), MESSAGE_BYTES);
+    let (channel, reply) = answer(&PairKey::new(KEY), &prologue, &[4; 32], &message).unwrap();
+    assert_eq!(theirs.read_message(&reply, &mut []).unwrap(), 0);
+    talk(channel, theirs);
+}
+
+/// Both ends change keys after the same frame, as snow does when it is told to.
+#[test]
+fn keys_change_after_a_million_frames() {
+    let prologue = prologue(b"", b"");
+    let mut theirs = snow(&prologue, true);
+    let mut message = [0; MESSAGE_BYTES];
+    theirs.write_message(&[], &mut message).unwrap();
+    let (mut channel, reply) = answer(&PairKey::new(KEY), &prologue, &[4; 32], &message).unwrap();
+    theirs.read_message(&reply, &mut []).unwrap();
+    let mut theirs = theirs.into_transport_mode().unwrap();
+    let mut frame = [0; TAG_BYTES];
+    let mut nothing = [0; TAG_BYTES];
+    for _ in 0..FRAMES_PER_KEY {
+        channel.seal(&mut frame).unwrap();
+        theirs.read_message(&frame, &mut nothing).unwrap();
+    }
+    channel.seal(&mut frame).unwrap();
+    assert!(theirs.read_message(&frame, &mut nothing).is_err(), "the key has not changed");
+    theirs.rekey_incoming();
+    assert_eq!(theirs.read_message(&frame, &mut nothing).unwrap(), 0);
+}
