@@ -6,7 +6,7 @@ use serde_json::Value;
 use crate::command::Run;
 
 /// Licences that MIT OR Apache-2.0 software may be linked with.
-const ALLOWED: [&str; 11] = [
+const ALLOWED: [&str; 12] = [
     "0BSD",
     "Apache-2.0",
     "Apache-2.0 WITH LLVM-exception",
@@ -17,6 +17,7 @@ const ALLOWED: [&str; 11] = [
     "ISC",
     "MIT",
     "Unicode-3.0",
+    "Unlicense",
     "Zlib",
 ];
 
