@@ -45,13 +45,18 @@ impl Service for Offered {
 /// A buffer for arguments and results, names included.
 pub(crate) type Arguments = Parameters<{ 2 * MESSAGE_BYTES }>;
 
-/// The memory of one unit, which is lent to it for good.
-pub struct Resources {
+/// What the sockets live in: received, then sent.
+pub(crate) struct StackMemory {
     pub(crate) sockets: [SocketStorage<'static>; 2],
     pub(crate) stream: [[u8; STREAM_BYTES]; 2],
     pub(crate) datagrams: [[u8; DATAGRAM_BYTES]; 2],
     pub(crate) datagram_heads: [[udp::PacketMetadata; 8]; 2],
-    pub(crate) arguments: Arguments,
+}
+
+/// The memory of one unit, which is lent to it for good.
+pub struct Resources {
+    stack: StackMemory,
+    arguments: Arguments,
     nodes: [Option<Known>; NODES],
     order: [Order; NODES],
     links: [Option<u16>; 1],
@@ -70,6 +75,7 @@ pub struct Resources {
 
 /// The slices of the resources in the shape in which the core takes them.
 pub(crate) struct Parts {
+    pub(crate) stack: &'static mut StackMemory,
     pub(crate) node: NodeStorage<Lent>,
     pub(crate) link: SessionStorage<Lent>,
     pub(crate) functions: FunctionList<Lent, Offered>,
@@ -77,22 +83,16 @@ pub(crate) struct Parts {
     pub(crate) arguments: &'static mut Arguments,
 }
 
-/// What the sockets live in.
-pub(crate) struct StackParts {
-    pub(crate) sockets: &'static mut [SocketStorage<'static>],
-    pub(crate) stream: &'static mut [[u8; STREAM_BYTES]; 2],
-    pub(crate) datagrams: &'static mut [[u8; DATAGRAM_BYTES]; 2],
-    pub(crate) datagram_heads: &'static mut [[udp::PacketMetadata; 8]; 2],
-}
-
 impl Resources {
     /// Empty resources.
     pub fn new() -> Self {
         Self {
-            sockets: [SocketStorage::EMPTY; 2],
-            stream: [[0; STREAM_BYTES]; 2],
-            datagrams: [[0; DATAGRAM_BYTES]; 2],
-            datagram_heads: [[udp::PacketMetadata::EMPTY; 8]; 2],
+            stack: StackMemory {
+                sockets: [SocketStorage::EMPTY; 2],
+                stream: [[0; STREAM_BYTES]; 2],
+                datagrams: [[0; DATAGRAM_BYTES]; 2],
+                datagram_heads: [[udp::PacketMetadata::EMPTY; 8]; 2],
+            },
             arguments: Arguments::sized(),
             nodes: [const { None }; NODES],
             order: from_fn(|_| Order::default()),
@@ -111,38 +111,30 @@ impl Resources {
         }
     }
 
-    pub(crate) fn split(&'static mut self) -> (Parts, StackParts) {
+    pub(crate) fn split(&'static mut self) -> Parts {
         for (place, buffer) in self.pool.iter_mut().zip(&mut self.buffers) {
             *place = Some(buffer);
         }
-        let link = SessionStorage {
-            small: &mut self.small[..],
-            pending: &mut self.pending[..],
-            running: &mut self.running[..],
-            publications: &mut self.publications[..],
-            their_functions: &mut self.their_functions[..],
-            their_signatures: &mut self.their_signatures[..],
-        };
-        let node = NodeStorage {
-            nodes: &mut self.nodes[..],
-            order: &mut self.order[..],
-            links: &mut self.links[..],
-            findings: &mut self.findings[..],
-        };
-        let parts = Parts {
-            node,
-            link,
+        Parts {
+            stack: &mut self.stack,
+            node: NodeStorage {
+                nodes: &mut self.nodes[..],
+                order: &mut self.order[..],
+                links: &mut self.links[..],
+                findings: &mut self.findings[..],
+            },
+            link: SessionStorage {
+                small: &mut self.small[..],
+                pending: &mut self.pending[..],
+                running: &mut self.running[..],
+                publications: &mut self.publications[..],
+                their_functions: &mut self.their_functions[..],
+                their_signatures: &mut self.their_signatures[..],
+            },
             functions: FunctionList::new(&mut self.functions[..], &mut self.signatures[..]),
             buffers: Pool::new(&mut self.pool[..]),
             arguments: &mut self.arguments,
-        };
-        let stack = StackParts {
-            sockets: &mut self.sockets,
-            stream: &mut self.stream,
-            datagrams: &mut self.datagrams,
-            datagram_heads: &mut self.datagram_heads,
-        };
-        (parts, stack)
+        }
     }
 }
 

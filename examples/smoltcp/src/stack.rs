@@ -11,7 +11,7 @@ use smoltcp::phy::Device;
 use smoltcp::socket::{tcp, udp};
 use smoltcp::wire::{EthernetAddress, HardwareAddress, IpCidr, IpEndpoint, Ipv4Cidr};
 
-use crate::resources::{DATAGRAM_PORT, StackParts};
+use crate::resources::{DATAGRAM_PORT, StackMemory};
 
 /// First of the ports that links are opened from.
 const FIRST_PORT: u16 = 49_152;
@@ -37,22 +37,28 @@ pub(crate) enum Stream {
 }
 
 impl Stack {
-    pub(crate) fn new<D: Device>(now: Instant, mac: [u8; 6], seed: u64, device: &mut D, parts: StackParts) -> Self {
+    pub(crate) fn new<D: Device>(
+        now: Instant,
+        mac: [u8; 6],
+        seed: u64,
+        device: &mut D,
+        memory: &'static mut StackMemory,
+    ) -> Self {
         let mut config = Config::new(HardwareAddress::Ethernet(EthernetAddress(mac)));
         config.random_seed = seed;
-        let [received, sent] = parts.stream;
+        let [received, sent] = &mut memory.stream;
         let mut stream =
             tcp::Socket::new(tcp::SocketBuffer::new(&mut received[..]), tcp::SocketBuffer::new(&mut sent[..]));
         // The core writes whole frames, and the first message after a silence is to leave at once.
         stream.set_nagle_enabled(false);
-        let ([received, sent], [received_heads, sent_heads]) = (parts.datagrams, parts.datagram_heads);
+        let ([received, sent], [received_heads, sent_heads]) = (&mut memory.datagrams, &mut memory.datagram_heads);
         let mut datagrams = udp::Socket::new(
             udp::PacketBuffer::new(&mut received_heads[..], &mut received[..]),
             udp::PacketBuffer::new(&mut sent_heads[..], &mut sent[..]),
         );
         let bound = datagrams.bind(DATAGRAM_PORT);
         debug_assert_eq!(bound, Ok(()));
-        let mut sockets = SocketSet::new(parts.sockets);
+        let mut sockets = SocketSet::new(&mut memory.sockets[..]);
         let (stream, datagrams) = (sockets.add(stream), sockets.add(datagrams));
         // Two boots in a row do not open their first link from the same port.
         let port = FIRST_PORT | seed as u16;

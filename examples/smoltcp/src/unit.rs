@@ -64,8 +64,8 @@ impl SUnit {
         device: &mut D,
         resources: &'static mut Resources,
     ) -> Self {
-        let (parts, sockets) = resources.split();
-        let mut stack = Stack::new(now, mac, settings.node.seed, device, sockets);
+        let parts = resources.split();
+        let mut stack = Stack::new(now, mac, settings.node.seed, device, parts.stack);
         stack.set_address(settings.address);
         Self {
             stack,
