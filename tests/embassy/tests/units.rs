@@ -1,0 +1,287 @@
+//! What the port does beside the rules that scenarios show: memory, tasks that take calls, cable and address, cancelling.
+
+use std::cell::RefCell;
+use std::net::Ipv4Addr;
+use std::rc::Rc;
+use std::task::Poll;
+
+use cara_core::config::Constraints;
+use cara_core::distribution::parameters::Parameters;
+use cara_core::error::{CloseReason, Error, ServiceError};
+use cara_core::host::connections::LinkCounter;
+use cara_core::services::lease::Lease;
+use cara_core::services::unit::RequestOptions;
+use cara_core::time::Duration;
+use cara_embassy::{Config, Handle, Handler, Resources, ServiceOptions, UnitEvent, message_buffer};
+use cara_embassy_host::{Bench, Board};
+use embassy_net::{ConfigV4, Ipv4Cidr, StaticConfigV4};
+use embassy_time::{Timer, with_timeout};
+
+const SHORT: Duration = Duration::from_secs(5);
+const LONG: Duration = Duration::from_secs(30);
+
+/// The state of each unit here.
+#[derive(Default)]
+struct State {
+    stops: u32,
+    losses: u32,
+}
+
+type Unit = Handle<State>;
+type Manager = Resources<State, 4, { message_buffer(1024) }, 6, 1536, 8, 8, 8, 2>;
+
+fn start(board: &Board, config: Config) -> Unit {
+    let memory = Box::leak(Box::new(Manager::new()));
+    let (unit, mut runner) = cara_embassy::new(board.stack(), memory, config, State::default()).unwrap();
+    board.spawn(async move { runner.run().await });
+    unit
+}
+
+fn manager(bench: &Bench) -> (Board, Unit) {
+    let board = bench.board();
+    let unit = start(&board, Config::m_unit("manager", 1, bench.random(u64::MAX)).unwrap());
+    (board, unit)
+}
+
+fn agv(bench: &Bench) -> (Board, Unit) {
+    let board = bench.board();
+    let unit = start(&board, Config::s_unit("agv", 7, "manager", 1, bench.random(u64::MAX)).unwrap());
+    unit.on_manager_lost(&|state| state.losses += 1);
+    (board, unit)
+}
+
+fn number(value: i64) -> Parameters {
+    let mut parameters = Parameters::new();
+    parameters.add_int("n", 1).unwrap();
+    parameters.set_value("n", value).unwrap();
+    parameters
+}
+
+fn doubling(unit: Unit) {
+    let double = Handler::method(&|_, _, parameters| {
+        let n: i64 = parameters.variable("n").map_err(|_| ServiceError::BadResults)?;
+        parameters.set_value("n", 2 * n).map_err(|_| ServiceError::BadResults)
+    });
+    unit.add_service("double(n: int) -> (n: int)", ServiceOptions::new(), double).unwrap();
+}
+
+/// Runs a future on a board, and time until it is over.
+fn finish<R: 'static>(bench: &Bench, board: &Board, future: impl Future<Output = R> + 'static) -> R {
+    let result = Rc::new(RefCell::new(None));
+    let told = Rc::clone(&result);
+    board.spawn(async move {
+        let ended = future.await;
+        told.replace(Some(ended));
+    });
+    assert!(bench.run_until(|| result.borrow().is_some(), LONG), "it ends");
+    result.take().unwrap()
+}
+
+fn ask(bench: &Bench, board: &Board, unit: Unit, peer: &str, function: &str, n: i64) -> Result<i64, Error> {
+    let (peer, function) = (unit.peer(peer).unwrap(), function.to_owned());
+    finish(bench, board, async move {
+        let mut parameters = number(n);
+        peer.block_request(&function, &mut parameters).await?;
+        parameters.variable("n")
+    })
+}
+
+fn knows(unit: Unit, peer: &str, function: &str) -> bool {
+    unit.nodes_offering(function).any(|found| found.identity().name() == peer)
+}
+
+#[test]
+fn a_board_serves_its_manager_and_asks_it() {
+    let bench = Bench::new(1);
+    let ((manager_board, manager), (agv_board, agv)) = (manager(&bench), agv(&bench));
+    for unit in [manager, agv] {
+        doubling(unit);
+        unit.publish_my_function_list().unwrap();
+    }
+    assert!(bench.run_until(|| knows(manager, "agv", "double") && knows(agv, "manager", "double"), SHORT));
+    assert_eq!(ask(&bench, &manager_board, manager, "agv", "double", 21), Ok(42));
+    assert_eq!(ask(&bench, &agv_board, agv, "manager", "double", 4), Ok(8));
+    assert_eq!(ask(&bench, &agv_board, agv, "manager", "halve", 4), Err(Error::UnknownFunction));
+    let list = manager.peer("agv").unwrap().their_function_list().show_functions().to_string();
+    assert_eq!(list, "double(n: int) -> (n: int)\n");
+}
+
+static GO_TO: Lease = Lease::new();
+
+/// Drives for as long as its lease is live, at most as many ticks of 20 ms as it was told.
+async fn drive(unit: Unit) {
+    let mut parameters = Parameters::new();
+    while let Ok(call) = unit.next_call("go_to", &mut parameters).await {
+        let ticks: i64 = parameters.variable("n").unwrap_or(0);
+        let lease = call.lease.expect("it has one");
+        let mut driven = 0;
+        while driven < ticks && lease.is_live() {
+            Timer::after_millis(20).await;
+            driven += 1;
+        }
+        let result = parameters.set_value("n", driven).map_err(|_| ServiceError::BadResults);
+        unit.end_lease("go_to");
+        call.reply(result.map(|()| &*parameters)).await;
+    }
+}
+
+fn driving(board: &Board, unit: Unit) {
+    let options =
+        ServiceOptions::new().lease(Duration::from_millis(400), &GO_TO, &|state: &mut State| state.stops += 1);
+    unit.add_service("go_to(n: int) -> (n: int)", options.detached(), Handler::task()).unwrap();
+    board.spawn(drive(unit));
+}
+
+#[test]
+fn a_task_takes_calls_and_awaits_before_it_replies() {
+    let bench = Bench::new(2);
+    let ((manager_board, manager), (agv_board, agv)) = (manager(&bench), agv(&bench));
+    driving(&agv_board, agv);
+    doubling(agv);
+    agv.publish_my_function_list().unwrap();
+    assert!(bench.run_until(|| knows(manager, "agv", "go_to"), SHORT));
+    let before = bench.now();
+    let driven = Rc::new(RefCell::new(None));
+    let (told, peer) = (Rc::clone(&driven), manager.peer("agv").unwrap());
+    manager_board.spawn(async move {
+        let mut parameters = number(50);
+        told.replace(Some(peer.block_request("go_to", &mut parameters).await.and_then(|()| parameters.variable("n"))));
+    });
+    bench.run_for(Duration::from_millis(100));
+    assert_eq!(ask(&bench, &manager_board, manager, "agv", "double", 1), Ok(2), "other services run meanwhile");
+    assert!(driven.borrow().is_none());
+    assert!(bench.run_until(|| driven.borrow().is_some(), LONG));
+    assert_eq!(*driven.borrow(), Some(Ok(50_i64)));
+    assert!(bench.now().since(before) >= Duration::from_secs(1));
+    assert_eq!(agv.with_state(|state| state.stops), Ok(0), "what is finished needs no safe hook");
+}
+
+#[test]
+fn a_pulled_cable_runs_each_hook_once_and_the_board_comes_back() {
+    let bench = Bench::new(3);
+    let ((_, manager), (agv_board, agv)) = (manager(&bench), agv(&bench));
+    static STANDING: Lease = Lease::new();
+    let options =
+        ServiceOptions::new().lease(Duration::from_millis(400), &STANDING, &|state: &mut State| state.stops += 1);
+    agv.add_service("go(n: int) -> (n: int)", options, Handler::method(&|_, _, _| Ok(()))).unwrap();
+    agv.publish_my_function_list().unwrap();
+    for round in 1..4 {
+        assert!(bench.run_until(|| knows(manager, "agv", "go"), LONG), "round {round}");
+        manager.peer("agv").unwrap().request("go", &number(round)).unwrap();
+        assert!(bench.run_until(|| STANDING.is_live(cara_embassy::now()), SHORT));
+        agv_board.set_cable(false);
+        assert!(bench.run_until(|| !STANDING.is_live(cara_embassy::now()), SHORT));
+        bench.run_for(LONG);
+        assert_eq!(agv.with_state(|state| (state.losses, state.stops)), Ok((round as u32, round as u32)));
+        agv_board.set_cable(true);
+    }
+}
+
+#[test]
+fn a_new_address_ends_the_link_and_the_board_is_found_there() {
+    let bench = Bench::new(4);
+    let ((_, manager), (agv_board, agv)) = (manager(&bench), agv(&bench));
+    assert!(bench.run_until(|| manager.number_of_s_units() == 1 && agv.is_connected(), SHORT));
+    let moved = StaticConfigV4 {
+        address: Ipv4Cidr::new(Ipv4Addr::new(10, 77, 9, 9), 16),
+        gateway: None,
+        dns_servers: Default::default(),
+    };
+    agv_board.stack().set_config_v4(ConfigV4::Static(moved));
+    let there = || manager.peer("agv").unwrap().address().is_some_and(|at| at.ip() == Ipv4Addr::new(10, 77, 9, 9));
+    assert!(bench.run_until(there, LONG));
+    assert_eq!(agv.with_state(|state| state.losses), Ok(1));
+}
+
+#[test]
+fn what_is_cancelled_makes_room_for_the_next() {
+    let bench = Bench::new(5);
+    let ((manager_board, manager), (agv_board, agv)) = (manager(&bench), agv(&bench));
+    driving(&agv_board, agv);
+    agv.publish_my_function_list().unwrap();
+    assert!(bench.run_until(|| knows(manager, "agv", "go_to"), SHORT));
+    let peer = manager.peer("agv").unwrap();
+    // More calls than may be in flight, each given up.
+    finish(&bench, &manager_board, async move {
+        for _ in 0..20 {
+            let mut parameters = number(1);
+            let options = RequestOptions { timeout: Some(LONG), ..RequestOptions::default() };
+            let call = peer.block_request_with("go_to", &mut parameters, &options);
+            assert!(with_timeout(embassy_time::Duration::from_millis(1), call).await.is_err());
+            Timer::after_millis(200).await;
+        }
+    });
+    assert_eq!(manager.counted(LinkCounter::RequestsSent), 20);
+    assert_eq!(ask(&bench, &manager_board, manager, "agv", "go_to", 3), Ok(3));
+}
+
+#[test]
+fn a_reply_that_is_not_fetched_delays_others_only_until_its_deadline() {
+    let bench = Bench::new(6);
+    let ((manager_board, manager), (_, agv)) = (manager(&bench), agv(&bench));
+    doubling(agv);
+    agv.publish_my_function_list().unwrap();
+    assert!(bench.run_until(|| knows(manager, "agv", "double"), SHORT));
+    let peer = manager.peer("agv").unwrap();
+    finish(&bench, &manager_board, async move {
+        let mut parameters = number(1);
+        let options = RequestOptions { timeout: Some(Duration::from_secs(1)), ..RequestOptions::default() };
+        let mut forgotten = Box::pin(peer.block_request_with("double", &mut parameters, &options));
+        // It is sent, and polled again only when its time is over.
+        assert!(poll_once(&mut forgotten).await.is_none());
+        Timer::after_millis(100).await;
+        let mut other = number(5);
+        let patient = RequestOptions { timeout: Some(LONG), ..RequestOptions::default() };
+        assert_eq!(peer.block_request_with("double", &mut other, &patient).await, Ok(()));
+        assert_eq!(other.variable::<i64>("n"), Ok(10));
+        assert_eq!(forgotten.await, Err(Error::TimedOut));
+    });
+}
+
+async fn poll_once<F: Future + Unpin>(future: &mut F) -> Option<F::Output> {
+    std::future::poll_fn(|cx| {
+        Poll::Ready(match std::pin::Pin::new(&mut *future).poll(cx) {
+            Poll::Ready(output) => Some(output),
+            Poll::Pending => None,
+        })
+    })
+    .await
+}
+
+#[test]
+fn events_tell_who_came_and_why_it_left() {
+    let bench = Bench::new(7);
+    let ((manager_board, manager), (_, agv)) = (manager(&bench), agv(&bench));
+    let events = Rc::new(RefCell::new(Vec::new()));
+    let noted = Rc::clone(&events);
+    manager_board.spawn(async move {
+        loop {
+            let event = manager.next_event().await;
+            noted.borrow_mut().push(event);
+        }
+    });
+    assert!(bench.run_until(|| manager.is_connected(), SHORT));
+    agv.stop();
+    assert!(bench.run_until(|| !manager.is_connected(), SHORT));
+    bench.run_for(SHORT);
+    let peer = agv.identity();
+    let left = UnitEvent::Left { peer: peer.clone(), reason: CloseReason::Stopped };
+    let told = events.borrow();
+    assert_eq!((told.first(), told.last()), (Some(&UnitEvent::Joined { peer }), Some(&left)));
+    assert!(!agv.is_connected(), "it looks for nobody any more");
+}
+
+#[test]
+fn memory_that_cannot_hold_the_constraints_is_refused() {
+    let bench = Bench::new(8);
+    let config = Config::m_unit("manager", 1, 1).unwrap();
+    let constraints = Constraints { maximum_nodes: 4, ..Constraints::M_UNIT };
+    let memory = Box::leak(Box::new(Manager::new()));
+    let refused = cara_embassy::new(bench.board().stack(), memory, config.constraints(constraints), State::default());
+    assert_eq!(refused.err(), Some(Error::BadConstraint));
+    let (_, unit) = manager(&bench);
+    let huge = "huge(text: string[9000])";
+    let refused = unit.add_service(huge, ServiceOptions::new(), Handler::task());
+    assert!(matches!(refused, Err(Error::TooLarge { .. })), "{refused:?}");
+    assert_eq!(unit.add_service("half(", ServiceOptions::new(), Handler::task()), Err(Error::BadName));
+}
