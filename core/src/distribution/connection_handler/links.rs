@@ -1,7 +1,7 @@
 //! Links that are being opened, and links that have ended.
 
 use super::known::NodeState;
-use super::search::pause;
+use super::search::{LOST_LISTENING, pause};
 use super::{Action, Node, Target};
 use crate::distribution::identity::Identity;
 use crate::error::{CloseReason, Refusal};
@@ -91,7 +91,7 @@ impl<S: Storage> Node<S> {
             Target::Everybody | Target::Fixed(..) => self.retry(now, place),
             Target::Manager(_) => {}
         }
-        self.search_again(now, settled);
+        self.search_again(now, settled.then_some(LOST_LISTENING));
         None
     }
 

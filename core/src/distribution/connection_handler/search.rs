@@ -20,6 +20,9 @@ pub(super) const FIRST_DELAY: Duration = Duration::from_millis(50);
 /// First searches of s_units wait a random part of this, mostly a late one: of a fleet that is switched on within seconds
 /// most hear a manager's answer to another one first.
 const FIRST_LISTENING: Duration = Duration::from_millis(400);
+/// The same where a manager has been lost: a whole fleet loses it, each unit when it notices, so that they begin within
+/// seconds of each other; and who has just gone takes a moment to return.
+pub(super) const LOST_LISTENING: Duration = Duration::from_millis(800);
 /// Searches that an m_unit makes after its start, or after it lost its last node, whoever has joined meanwhile: a lost
 /// datagram must not keep two managers apart.
 const M_UNIT_SEARCHES: u8 = 4;
@@ -53,7 +56,7 @@ pub(super) struct Search {
 
 impl Search {
     pub(super) fn new(now: Instant, role: Role, random: &mut Random) -> Self {
-        let next = now + first_delay(role, random);
+        let next = now + first_delay(role, FIRST_LISTENING, random);
         Self { next, explicit: None, attempt: 0, round: now, nonce: fresh(random), stubborn: false, deferred: 0 }
     }
 
@@ -62,10 +65,10 @@ impl Search {
     }
 }
 
-fn first_delay(role: Role, random: &mut Random) -> Duration {
+fn first_delay(role: Role, listening: Duration, random: &mut Random) -> Duration {
     match role {
         Role::MUnit => random.jitter(FIRST_DELAY),
-        Role::SUnit => alone(random, FIRST_LISTENING),
+        Role::SUnit => alone(random, listening),
     }
 }
 
@@ -150,15 +153,15 @@ impl<S: Storage> Node<S> {
         }
     }
 
-    /// Looks again for what has been lost: soon, unless it was lost at once.
-    pub(super) fn search_again(&mut self, now: Instant, settled: bool) {
+    /// Looks again for what has been lost: an s_unit listens for so long first. `None`: it was lost at once.
+    pub(super) fn search_again(&mut self, now: Instant, listening: Option<Duration>) {
         if self.table.joined() > 0 {
             return;
         }
         self.search.nonce = fresh(&mut self.random);
-        if settled {
+        if let Some(listening) = listening {
             self.search.attempt = 0;
-            self.search.next = now + first_delay(self.config.identity.role(), &mut self.random);
+            self.search.next = now + first_delay(self.config.identity.role(), listening, &mut self.random);
         } else {
             self.plan_next(now);
         }
@@ -169,7 +172,7 @@ impl<S: Storage> Node<S> {
         match self.config.target {
             Target::Fixed(..) if self.table.joined() == 0 => self.dial_target(now),
             Target::Fixed(..) => {}
-            Target::Everybody | Target::Manager(_) => self.search_again(now, true),
+            Target::Everybody | Target::Manager(_) => self.search_again(now, Some(FIRST_LISTENING)),
         }
     }
 
