@@ -8,9 +8,12 @@ use cara_core::error::Error;
 use cara_core::services::unit::buffer_bytes;
 use core::net::SocketAddr;
 
+/// Most that a session datagram adds to what a message in chunks takes.
+const DATAGRAM_SLACK: usize = 8;
+
 /// Bytes that `MESSAGE` of [`Resources`](crate::Resources) needs for messages of `message_size`.
 pub const fn message_buffer(message_size: u32) -> usize {
-    buffer_bytes(message_size, 0)
+    buffer_bytes(message_size, 0) + DATAGRAM_SLACK
 }
 
 /// Who a unit is and what limits it has.
@@ -81,9 +84,24 @@ pub(crate) fn check(constraints: &Constraints, links: usize, buffer: usize) -> R
     let chunk = usize::from(constraints.chunk_size);
     let sound = constraints.maximum_nodes > 0
         && usize::from(constraints.maximum_nodes) <= links
-        && buffer_bytes(constraints.message_size, 0) <= buffer
+        && message_buffer(constraints.message_size) <= buffer
         && (MINIMUM_CHUNK_BYTES..=CHUNK_BYTES).contains(&chunk)
         && constraints.keep_alive.as_millis() > 0
         && constraints.calls_per_peer > 0;
     if sound { Ok(()) } else { Err(Error::BadConstraint) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::message_buffer;
+    use cara_core::distribution::datagram::SESSION_HEADER_BYTES;
+    use cara_core::distribution::message::{REQUEST_BYTES, SessionBody};
+
+    #[test]
+    fn a_message_in_one_datagram_fits_the_buffers_of_datagrams() {
+        let around = SESSION_HEADER_BYTES + SessionBody::message_prefix(0).len() + REQUEST_BYTES;
+        for size in 0..2_000 {
+            assert!(message_buffer(size) >= around + size as usize, "{size}");
+        }
+    }
 }

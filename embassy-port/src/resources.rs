@@ -3,7 +3,7 @@
 use core::cell::RefCell;
 use core::mem::MaybeUninit;
 
-use cara_core::config::{DATAGRAM_BYTES, LINK_BUFFER_BYTES, PLAIN_PORT};
+use cara_core::config::{LINK_BUFFER_BYTES, PLAIN_PORT};
 use cara_core::counters::Counters;
 use cara_core::distribution::connection_handler::{Finding, Known, Node, NodeConfig, NodeStorage, Order};
 use cara_core::distribution::function_list::{Entry, FunctionList};
@@ -34,11 +34,9 @@ const KNOWN: usize = 2;
 /// Bytes of signatures for each function; a list shares them.
 const SIGNATURE: usize = 64;
 /// Events that wait for the application.
-const EVENTS: usize = 8;
+const EVENTS: usize = 6;
 /// Refusals that are remembered.
 const FINDINGS: usize = 2;
-/// A datagram of a message with what the protocol puts around it.
-const DATAGRAM: usize = DATAGRAM_BYTES + 72;
 /// Datagrams that wait to be read or sent.
 const DATAGRAMS: usize = 8;
 
@@ -48,21 +46,22 @@ const DATAGRAMS: usize = 8;
 /// | parameter | what | bytes for each |
 /// |---|---|---|
 /// | `T` | the application's state | its size |
-/// | `LINKS` | connections; for an m_unit one more than its nodes, so that it can refuse one by name | about 3,000 and twice `STREAM` |
-/// | `MESSAGE` | [`message_buffer`] of the longest message, also room for a service's arguments and results | 2 and one for each of `BUFFERS` and `TASKS` |
+/// | `LINKS` | connections; for an m_unit one more than its nodes, so that it can refuse one by name | about 5,000 and twice `STREAM` |
+/// | `MESSAGE` | [`message_buffer`] of the longest message, which is also that of datagrams | 4, and 1 for each of `BUFFERS` |
 /// | `BUFFERS` | message buffers that all links share, at least 2 | `MESSAGE` |
 /// | `STREAM` | bytes that TCP keeps, in each direction of each link | 2 for each of `LINKS` |
 /// | `FUNCTIONS` | its own functions, with 64 bytes of signature each | about 180 |
 /// | `THEIR` | functions kept of each peer's list, with as much; others are counted as skipped | about 120 for each of `LINKS` |
 /// | `CALLS` | calls in flight to one peer; calls of one peer that run here, one of which is kept for an emergency | about 250 for each of `LINKS` |
-/// | `TASKS` | calls that wait for a task of the application, and answers that wait for room | `MESSAGE` and 300 |
+/// | `TASKS` | calls that wait for a task of the application, and answers that wait for room | `ARGUMENTS` and 350 |
+/// | `ARGUMENTS` | bytes of the arguments and results of a service, with their names | 1, and 1 for each of `TASKS` |
 ///
 /// ```
 /// use cara_embassy::{Resources, message_buffer};
 /// struct Agv;
 /// // An s_unit with messages of 1 KiB: the default.
 /// type AgvResources = Resources<Agv>;
-/// const { assert!(AgvResources::BYTES <= 20 * 1024) };
+/// const { assert!(AgvResources::BYTES <= 24 * 1024) };
 /// // An m_unit of three nodes with shorter messages.
 /// type DepotResources = Resources<Agv, 4, { message_buffer(256) }, 4, 768>;
 /// const { assert!(DepotResources::SOCKETS == 5) };
@@ -80,6 +79,7 @@ pub struct Resources<
     const THEIR: usize = 8,
     const CALLS: usize = 4,
     const TASKS: usize = 1,
+    const ARGUMENTS: usize = 512,
 > {
     shared: MaybeUninit<Shared<T>>,
     links: MaybeUninit<[Link; LINKS]>,
@@ -97,12 +97,12 @@ pub struct Resources<
     buffers: [MaybeUninit<[u8; MESSAGE]>; BUFFERS],
     pool: MaybeUninit<[Option<&'static mut [u8]>; BUFFERS]>,
     reply: MaybeUninit<[u8; MESSAGE]>,
-    arguments: MaybeUninit<Parameters<MESSAGE>>,
-    task_parameters: [MaybeUninit<Parameters<MESSAGE>>; TASKS],
+    arguments: MaybeUninit<Parameters<ARGUMENTS>>,
+    task_parameters: [MaybeUninit<Parameters<ARGUMENTS>>; TASKS],
     tasks: MaybeUninit<[TaskSlot; TASKS]>,
     events: MaybeUninit<[Option<UnitEvent>; EVENTS]>,
-    scratch: MaybeUninit<[u8; DATAGRAM]>,
-    udp: UdpMemory,
+    scratch: MaybeUninit<[u8; MESSAGE]>,
+    udp: UdpMemory<MESSAGE>,
 }
 
 /// The memory of one TCP socket.
@@ -123,9 +123,9 @@ struct SessionMemory<const FUNCTIONS: usize, const THEIR: usize, const CALLS: us
 }
 
 /// The memory of the UDP socket.
-struct UdpMemory {
-    receive: MaybeUninit<[u8; DATAGRAM]>,
-    send: MaybeUninit<[u8; DATAGRAM]>,
+struct UdpMemory<const MESSAGE: usize> {
+    receive: MaybeUninit<[u8; MESSAGE]>,
+    send: MaybeUninit<[u8; MESSAGE]>,
     received: MaybeUninit<[PacketMetadata; DATAGRAMS]>,
     sent: MaybeUninit<[PacketMetadata; DATAGRAMS]>,
 }
@@ -140,7 +140,8 @@ impl<
     const THEIR: usize,
     const CALLS: usize,
     const TASKS: usize,
-> Resources<T, LINKS, MESSAGE, BUFFERS, STREAM, FUNCTIONS, THEIR, CALLS, TASKS>
+    const ARGUMENTS: usize,
+> Resources<T, LINKS, MESSAGE, BUFFERS, STREAM, FUNCTIONS, THEIR, CALLS, TASKS, ARGUMENTS>
 {
     /// All memory of the unit, but for the stack and embassy-net's own.
     pub const BYTES: usize = size_of::<Self>();
@@ -197,7 +198,8 @@ impl<
     const THEIR: usize,
     const CALLS: usize,
     const TASKS: usize,
-> Default for Resources<T, LINKS, MESSAGE, BUFFERS, STREAM, FUNCTIONS, THEIR, CALLS, TASKS>
+    const ARGUMENTS: usize,
+> Default for Resources<T, LINKS, MESSAGE, BUFFERS, STREAM, FUNCTIONS, THEIR, CALLS, TASKS, ARGUMENTS>
 {
     fn default() -> Self {
         Self::new()
@@ -240,14 +242,14 @@ impl<const FUNCTIONS: usize, const THEIR: usize, const CALLS: usize> SessionMemo
     }
 }
 
-impl UdpMemory {
+impl<const MESSAGE: usize> UdpMemory<MESSAGE> {
     fn socket(&'static mut self, stack: Stack<'static>) -> Result<UdpSocket<'static>, Error> {
         let mut socket = UdpSocket::new(
             stack,
             self.received.write([PacketMetadata::EMPTY; DATAGRAMS]),
-            self.receive.write([0; DATAGRAM]),
+            self.receive.write([0; MESSAGE]),
             self.sent.write([PacketMetadata::EMPTY; DATAGRAMS]),
-            self.send.write([0; DATAGRAM]),
+            self.send.write([0; MESSAGE]),
         );
         socket.bind(PLAIN_PORT).map_err(|_| Error::PortInUse)?;
         Ok(socket)
@@ -275,9 +277,10 @@ pub fn new<
     const THEIR: usize,
     const CALLS: usize,
     const TASKS: usize,
+    const ARGUMENTS: usize,
 >(
     stack: Stack<'static>,
-    resources: &'static mut Resources<T, LINKS, MESSAGE, BUFFERS, STREAM, FUNCTIONS, THEIR, CALLS, TASKS>,
+    resources: &'static mut Resources<T, LINKS, MESSAGE, BUFFERS, STREAM, FUNCTIONS, THEIR, CALLS, TASKS, ARGUMENTS>,
     config: Config,
     state: T,
 ) -> Result<(Handle<T>, Runner<T>), Error> {
@@ -317,13 +320,13 @@ pub fn new<
         address: None,
         stopped: false,
         counters: Counters::new(),
-        room: Room { buffer: MESSAGE, parameters: MESSAGE },
+        room: Room { buffer: MESSAGE, parameters: ARGUMENTS },
         wakers: Wakers::new(),
     };
     let shared = resources.shared.write(Shared { machine: RefCell::new(machine), state: RefCell::new(state) });
     let runner = Runner {
         shared,
-        scratch: resources.scratch.write([0; DATAGRAM]),
+        scratch: resources.scratch.write([0; MESSAGE]),
         arguments: resources.arguments.write(Parameters::sized()),
         unanswered: None,
     };
