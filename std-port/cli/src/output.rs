@@ -60,7 +60,9 @@ impl Rows {
         }
         let text = self.table.to_string();
         let styles = self.styles.iter();
-        text.lines().zip(styles).try_for_each(|(row, style)| line(format_args!("{style}{}{style:#}", row.trim_end())))
+        // Each cell is padded on both sides, and the first one needs no distance from anything.
+        let row = |row: &str| row.strip_prefix(' ').unwrap_or(row).trim_end().to_owned();
+        text.lines().zip(styles).try_for_each(|(text, style)| line(format_args!("{style}{}{style:#}", row(text))))
     }
 }
 

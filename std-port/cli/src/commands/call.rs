@@ -103,7 +103,7 @@ fn call(operator: &mut Operator, question: CallQuestion, global: &Global) -> any
         let Answer::Called { node, id, results, call, error, took_us } = answer else { return Ok(()) };
         let node = format!("{node}/{id}");
         if let Some(failure) = &error {
-            worst = exit_of(failure);
+            worst = if worst == Exit::Failed { worst } else { exit_of(failure) };
         }
         if global.json {
             let text = (error.is_none() && !asynchronous).then(|| show_call(&function, &results));

@@ -19,10 +19,13 @@ pub(crate) struct Placed<T> {
 pub(crate) struct Written<'t> {
     pub(crate) text: &'t str,
     pub(crate) function: Placed<&'t str>,
-    pub(crate) arguments: Vec<(Placed<&'t str>, Placed<Value<'t>>)>,
+    pub(crate) arguments: Vec<Argument<'t>>,
     /// Where another argument could be put.
     pub(crate) end: usize,
 }
+
+/// An argument's name and value.
+type Argument<'t> = (Placed<&'t str>, Placed<Value<'t>>);
 
 /// An argument's value.
 #[derive(Clone, Debug, PartialEq)]
@@ -98,7 +101,7 @@ impl<'t> Reader<'t> {
     }
 
     /// What follows the opening parenthesis, up to and with the closing one.
-    fn arguments(&mut self) -> Result<Vec<(Placed<&'t str>, Placed<Value<'t>>)>, Mistake> {
+    fn arguments(&mut self) -> Result<Vec<Argument<'t>>, Mistake> {
         let mut arguments = Vec::new();
         while !self.takes(')') {
             let name = self.name("an argument begins with its name")?;

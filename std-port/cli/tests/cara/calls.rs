@@ -117,6 +117,8 @@ fn wrong_usage_ends_with_2() {
         &["scan", "--unit", "manager"],
     ];
     for usage in usages {
-        stage.ends(2, usage);
+        assert!(!stage.ends(2, usage).err.is_empty(), "{usage:?}");
+        let error = stage.ends(2, &[usage, &["--json"]].concat()).error();
+        assert_eq!((&error["exit"], &error["name"]), (&2.into(), &"Usage".into()), "{error}");
     }
 }

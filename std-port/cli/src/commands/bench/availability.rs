@@ -4,7 +4,7 @@
 //! behind the last request of a group returns after all of them, since calls of one peer and class stay in order; what has
 //! not been reported as failed by then was executed.
 
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, mpsc};
 use std::time::{Duration, Instant};
 
@@ -14,6 +14,7 @@ use serde::Serialize;
 
 use super::subject::Subject;
 use super::{Arguments, show};
+use crate::exit::Ended;
 use crate::operator::Operator;
 
 /// How long events are waited for after the blocking call behind a group.
@@ -92,9 +93,27 @@ fn row(characters: usize, period: Duration, groups: Vec<Group>) -> Row {
     Row { characters, period_us: period.as_micros() as u64, groups, availability, least }
 }
 
+/// Failed asynchronous requests of a node.
+#[derive(Default)]
+struct Failures {
+    counted: AtomicUsize,
+    /// Events came faster than they were read, so that some are not counted.
+    lost: AtomicBool,
+}
+
+impl Failures {
+    fn counted(&self) -> anyhow::Result<usize> {
+        if self.lost.load(Ordering::SeqCst) {
+            let text = "failures came faster than they could be counted: measure smaller groups (--group)";
+            return Err(Ended::failed("EventsLost", text));
+        }
+        Ok(self.counted.load(Ordering::SeqCst))
+    }
+}
+
 /// Counts failed asynchronous requests of a node from now on, in a thread that lasts as long as the command.
-fn count_failures(operator: &Operator, node: &str) -> anyhow::Result<Arc<AtomicUsize>> {
-    let failures = Arc::new(AtomicUsize::new(0));
+fn count_failures(operator: &Operator, node: &str) -> anyhow::Result<Arc<Failures>> {
+    let failures = Arc::new(Failures::default());
     let (counted, node) = (failures.clone(), Some(node.to_owned()));
     let mut second = operator.another()?;
     let (ready, is_ready) = mpsc::channel();
@@ -104,7 +123,8 @@ fn count_failures(operator: &Operator, node: &str) -> anyhow::Result<Arc<AtomicU
             let Answer::Event { event, node: of, .. } = answer else { return Ok(()) };
             match event.as_str() {
                 "watching" => ready.send(())?,
-                "request_failed" if of == node => _ = counted.fetch_add(1, Ordering::SeqCst),
+                "request_failed" if of == node => _ = counted.counted.fetch_add(1, Ordering::SeqCst),
+                "lost" => counted.lost.store(true, Ordering::SeqCst),
                 _ => {}
             }
             Ok(())
@@ -122,21 +142,21 @@ struct Plan<'s> {
 }
 
 impl Plan<'_> {
-    fn run(&self, operator: &mut Operator, failures: &AtomicUsize) -> anyhow::Result<Group> {
-        let before = failures.load(Ordering::SeqCst);
+    fn run(&self, operator: &mut Operator, failures: &Failures) -> anyhow::Result<Group> {
+        let before = failures.counted()?;
         let question = Question::Call(self.subject.call(self.characters, true));
         let start = Instant::now();
         let (mut refused, mut last) = (0, start);
         for number in 0..self.requests {
-            let due = start + self.period * number;
-            std::thread::sleep(due.saturating_duration_since(Instant::now()));
+            let due = self.period.saturating_mul(number);
+            std::thread::sleep(due.saturating_sub(start.elapsed()));
             last = Instant::now();
             refused += usize::from(!accepted(operator, &question)?);
         }
         let sent = self.requests as usize;
         let executed_until = self.barrier(operator)?;
         std::thread::sleep(STRAGGLERS);
-        let failed = failures.load(Ordering::SeqCst).saturating_sub(before);
+        let failed = failures.counted()?.saturating_sub(before);
         let executed = if executed_until { sent.saturating_sub(refused + failed) } else { 0 };
         let gaps = f64::from(self.requests.saturating_sub(1).max(1));
         let real_period_us = last.duration_since(start).as_secs_f64() * 1e6 / gaps;

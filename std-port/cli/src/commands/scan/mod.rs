@@ -57,6 +57,7 @@ fn of_unit(mut operator: Operator, offering: Option<String>, global: &Global) ->
         }
         Ok(())
     })?;
+    nodes.sort_by(|a: &NodeInfo, b| (&a.name, a.id).cmp(&(&b.name, b.id)));
     if global.json {
         return Ok(output::object(&json!({ "unit": unit, "nodes": nodes, "refused": refused }))?);
     }
