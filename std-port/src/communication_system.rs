@@ -376,6 +376,13 @@ impl<T: Send + 'static> CommunicationSystem<T> {
         pairs(self.engine().readings())
     }
 
+    /// Everything that is counted, for the unit and for each node that it knows, in the text form that Prometheus reads:
+    /// see [`metrics`](crate::metrics).
+    #[cfg(feature = "metrics")]
+    pub fn metrics(&self) -> String {
+        crate::metrics::text(self.engine(), &self.identity())
+    }
+
     /// The last refusals, here or there.
     pub fn findings(&self) -> Vec<Finding> {
         lock(&self.engine().node).node.findings().cloned().collect()

@@ -28,6 +28,8 @@ mod event;
 mod future;
 mod handler;
 mod lease;
+#[cfg(feature = "metrics")]
+pub mod metrics;
 mod my_function_list;
 mod peer;
 pub mod pool;

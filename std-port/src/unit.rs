@@ -191,4 +191,11 @@ impl<T: Send + 'static> Unit<T> {
     pub fn counters(&self) -> Vec<(&'static str, u64)> {
         pairs(self.engine().readings())
     }
+
+    /// Everything that is counted, for the unit and for each node that it knows, in the text form that Prometheus reads:
+    /// see [`metrics`](crate::metrics).
+    #[cfg(feature = "metrics")]
+    pub fn metrics(&self) -> String {
+        crate::metrics::text(self.engine(), &self.identity())
+    }
 }

@@ -20,6 +20,8 @@ mod tables;
 pub(crate) mod workers;
 
 pub(crate) use accounts::pairs;
+#[cfg(feature = "metrics")]
+pub(crate) use accounts::{Group, Reading};
 #[cfg(any(feature = "async", feature = "control"))]
 pub(crate) use calling::CallFuture;
 pub(crate) use clock_thread::system_refused;
