@@ -1,5 +1,7 @@
 //! The node's log: lines on standard error, at a level that can change while it runs.
 
+use std::io::IsTerminal;
+
 use tracing_subscriber::EnvFilter;
 use tracing_subscriber::filter::ParseError;
 
@@ -24,7 +26,10 @@ impl Logging {
         let environment = std::env::var(EnvFilter::DEFAULT_ENV).ok().filter(|text| !text.is_empty());
         let above = command_line.or(environment.as_deref());
         let filter = filter(above.or(file).unwrap_or(LEVEL))?;
-        let builder = tracing_subscriber::fmt().with_writer(std::io::stderr).with_env_filter(filter);
+        let builder = tracing_subscriber::fmt()
+            .with_writer(std::io::stderr)
+            .with_ansi(std::io::stderr().is_terminal())
+            .with_env_filter(filter);
         let builder = builder.with_filter_reloading();
         let handle = builder.reload_handle();
         // Another one is there only if a test has set it; that one may stay.

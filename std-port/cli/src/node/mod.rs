@@ -8,12 +8,15 @@ mod limits;
 mod logging;
 mod mistake;
 mod offer;
+mod places;
 mod program;
 mod running;
 mod settings;
 mod unit;
 mod values;
 
+use std::fs::File;
+use std::io::Read;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -29,6 +32,8 @@ use settings::{Overrides, Settings};
 
 /// What `--example` prints.
 const EXAMPLE: &str = include_str!("example.toml");
+/// Longest configuration in bytes.
+const LONGEST_FILE: u64 = 1024 * 1024;
 
 /// Stays up as an m_unit, or as an s_unit, until SIGINT or SIGTERM.
 ///
@@ -87,11 +92,16 @@ fn wrong(mistakes: Mistakes) -> anyhow::Error {
 
 fn read(path: Option<&Path>) -> anyhow::Result<Source> {
     let Some(path) = path else { return Ok(Source::default()) };
-    let text = std::fs::read_to_string(path).map_err(|error| {
-        let shown = path.display();
+    let shown = path.display();
+    let mut text = String::new();
+    let read = File::open(path).and_then(|file| file.take(LONGEST_FILE + 1).read_to_string(&mut text));
+    read.map_err(|error| {
         Ended::usage(format!("{shown} cannot be read: {error}; `cara node --example` prints a configuration"))
     })?;
-    Ok(Source { name: path.display().to_string(), text })
+    if text.len() as u64 > LONGEST_FILE {
+        return Err(Ended::usage(format!("{shown} has more than {LONGEST_FILE} bytes: is it a configuration?")));
+    }
+    Ok(Source { name: shown.to_string(), text })
 }
 
 fn overrides(arguments: &Arguments, global: &Global) -> anyhow::Result<Overrides> {

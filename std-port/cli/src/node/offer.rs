@@ -55,7 +55,7 @@ fn echo(_: &Call, _: &mut ParametersView) -> Result<(), ServiceError> {
 fn log(definition: &Definition, call: &Call, view: &ParametersView) -> Result<(), ServiceError> {
     let mut arguments = json::arguments(definition.signature(), view).to_string();
     arguments.truncate(arguments.floor_char_boundary(LOGGED_BYTES));
-    tracing::info!(function = definition.name(), caller = %call.caller, arguments, "called");
+    tracing::info!(function = definition.name(), caller = %call.caller, %arguments, "called");
     Ok(())
 }
 

@@ -25,10 +25,10 @@ pub(super) const OUTPUT_BYTES: usize = 1024 * 1024;
 pub(super) enum Failure {
     #[error("it could not be started: {0}")]
     NotStarted(#[source] io::Error),
-    #[error("{CALLS} calls run programs already")]
+    #[error("it was not started: {CALLS} calls run programs already")]
     TooMany,
-    #[error("the lease of the call has ended")]
-    LeaseEnded,
+    #[error("it was not started: the lease of the call has ended, or the node ends")]
+    NotWanted,
     #[error("it was ended: its time was up")]
     TimedOut,
     #[error("it was ended: it printed more than {OUTPUT_BYTES} bytes")]
@@ -45,7 +45,7 @@ impl Failure {
         match self {
             Self::NotStarted(error) if error.kind() == io::ErrorKind::NotFound => ServiceError::Failed(127),
             Self::NotStarted(_) | Self::Lost(_) => ServiceError::Failed(126),
-            Self::TooMany | Self::LeaseEnded => ServiceError::NotReady,
+            Self::TooMany | Self::NotWanted => ServiceError::NotReady,
             Self::TimedOut => ServiceError::Failed(124),
             Self::TooMuchOutput => ServiceError::BadResults,
             Self::Ended(status) => ServiceError::Failed(code(*status)),
@@ -99,7 +99,7 @@ impl Programs {
             let mut state = self.lock();
             // Looked at under the lock: what ends a lease ends the programs that are listed, and then makes safe.
             if state.ending || lease.is_some_and(|lease| !lease.is_live()) {
-                return Err(Failure::LeaseEnded);
+                return Err(Failure::NotWanted);
             }
             if state.calls.len() >= CALLS {
                 return Err(Failure::TooMany);
@@ -260,4 +260,41 @@ fn as_file(bytes: &[u8]) -> io::Result<File> {
     file.write_all(bytes)?;
     file.rewind()?;
     Ok(file)
+}
+
+#[cfg(test)]
+mod tests {
+    use cara_std::{Call, CommunicationSystem, Definition, Interfaces, ParametersView, ServiceOptions};
+
+    use super::*;
+
+    const LONG: Duration = Duration::from_secs(30);
+
+    fn serve(programs: &Arc<Programs>, script: &str, lease: Option<&LeaseWatch>) -> Result<Vec<u8>, Failure> {
+        let command = ["sh", "-c", script].map(String::from);
+        let environment = [("CARA_FUNCTION", "f".into()), ("CARA_CALLER", "a/1".into())];
+        programs.serve(0, &Task { command: &command, environment, input: b"{}" }, LONG, lease)
+    }
+
+    #[test]
+    fn a_program_reads_its_input_and_environment() {
+        let programs = Arc::default();
+        let output = serve(&programs, "cat; echo \" $CARA_FUNCTION $CARA_CALLER\"", None).unwrap();
+        assert_eq!(output, b"{} f a/1\n");
+        assert!(programs.lock().calls.is_empty());
+    }
+
+    #[test]
+    fn nothing_is_started_for_a_lease_that_has_ended_or_a_node_that_ends() {
+        let system = CommunicationSystem::builder("program", 1).unwrap().interfaces(Interfaces::Loopback);
+        let system = system.build_system().unwrap();
+        let nothing = |_: &Call, _: &mut ParametersView| Ok(());
+        let options = ServiceOptions::new().lease(LONG, |_: &mut ()| {});
+        let dead = system.my_function_list().add_service(&Definition::parse("f()").unwrap(), options, nothing).unwrap();
+        let programs = Arc::default();
+        assert!(matches!(serve(&programs, ":", Some(&dead)), Err(Failure::NotWanted)));
+        assert!(serve(&programs, ":", None).is_ok());
+        programs.end_calls();
+        assert!(matches!(serve(&programs, ":", None), Err(Failure::NotWanted)));
+    }
 }

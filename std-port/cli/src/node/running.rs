@@ -1,6 +1,6 @@
 //! A node's life: built, started, told of signals, ended.
 
-use std::net::TcpListener;
+use std::net::{SocketAddr, TcpListener};
 use std::sync::Arc;
 use std::sync::mpsc::Receiver;
 
@@ -31,10 +31,13 @@ pub(super) fn run(settings: Settings, over: &Overrides, logging: &Logging, globa
     let metrics = settings.metrics.as_ref().map(|place| listen(place, &settings)).transpose()?;
     log_events(node.events())?;
     node.start().map_err(|error| Ended::failed(format!("{error:?}"), error.to_string()))?;
+    let served = metrics.as_ref().map(TcpListener::local_addr).transpose()?;
     if let Some(listener) = metrics {
         http::serve(listener, node.metrics()).context("metrics cannot be served")?;
     }
-    tell_up(&settings, &node, global)?;
+    if let Err(error) = tell_up(&settings, &node, served, global) {
+        tracing::warn!(%error, "nobody reads that the node is up");
+    }
     let mut settings = settings;
     for signal in signals.forever() {
         tracing::info!(signal = signal_hook::low_level::signal_name(signal), "signal");
@@ -72,18 +75,19 @@ fn not_built(error: Error, settings: &Settings) -> anyhow::Error {
     if let Some(Placed { value, span: Some(span) }) = port {
         let what = format!("port {value} is in use by another program");
         let help = format!("choose another one; `ss -lntup | grep :{value}` shows who has it");
-        return wrong(settings.mistake(span.clone(), &what, &help));
+        return Ended::failed("PortInUse", settings.mistake(span.clone(), &what, &help).to_string());
     }
     let which = port.map_or(String::new(), |port| format!("port {}: ", port.value));
     Ended::failed(format!("{error:?}"), format!("{which}{error}"))
 }
 
-fn listen(place: &Placed<std::net::SocketAddr>, settings: &Settings) -> anyhow::Result<TcpListener> {
+fn listen(place: &Placed<SocketAddr>, settings: &Settings) -> anyhow::Result<TcpListener> {
     http::listen(place.value).map_err(|error| {
         let what = format!("metrics cannot be served at {}: {error}", place.value);
         match &place.span {
             Some(span) => {
-                wrong(settings.mistake(span.clone(), &what, "choose an address of this host with a free port"))
+                let help = "choose an address of this host with a free port";
+                Ended::failed("Network", settings.mistake(span.clone(), &what, help).to_string())
             }
             None => Ended::failed("Network", what),
         }
@@ -91,10 +95,10 @@ fn listen(place: &Placed<std::net::SocketAddr>, settings: &Settings) -> anyhow::
 }
 
 /// One line for whoever waits for the node.
-fn tell_up(settings: &Settings, node: &Node, global: &Global) -> anyhow::Result<()> {
+fn tell_up(settings: &Settings, node: &Node, metrics: Option<SocketAddr>, global: &Global) -> anyhow::Result<()> {
     let Settings { name, id, fleet, .. } = settings;
     let discovery = settings.discovery_port.as_ref().map_or(PLAIN_PORT, |port| port.value);
-    let metrics = settings.metrics.as_ref().map(|place| format!("http://{}/metrics", place.value));
+    let metrics = metrics.map(|address| format!("http://{address}/metrics"));
     let (tcp, control) = (node.tcp_port(), node.control_path());
     if global.json {
         let control = control.map(|path| path.display().to_string());

@@ -2,8 +2,8 @@
 
 use std::net::SocketAddr;
 use std::ops::Range;
-use std::path::PathBuf;
 
+use cara_std::control::Control;
 use cara_std::{Capacities, Constraints, Identity, Interfaces};
 
 use super::file::{self, File, Maybe, Role};
@@ -45,17 +45,6 @@ pub(super) struct Manager {
     pub(super) name: String,
     pub(super) id: u32,
     pub(super) address: Option<SocketAddr>,
-}
-
-/// Where the control socket is.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) enum Control {
-    /// Where `cara` looks for it.
-    Usual,
-    /// Elsewhere.
-    At(Placed<PathBuf>),
-    /// Nowhere.
-    Off,
 }
 
 /// What the command line says instead of the file.
@@ -124,7 +113,7 @@ fn checked(source: Source, file: &File, over: &Overrides, mistakes: &mut Vec<Mis
         discovery_port: discovery_port(file, over, mistakes),
         tcp_port: tcp_port(file, role, over, mistakes),
         constraints: limits::constraints(&file.constraints, role, mistakes),
-        control: control(&file.control, mistakes),
+        control: control(&file.control, role, mistakes),
         metrics: metrics(file, over, mistakes),
         file_log: log(file, mistakes),
         services: functions::services(&source, &file.functions, capacities.functions, mistakes),
@@ -229,14 +218,17 @@ fn placed<T: Copy>(over: Option<T>, written: &Maybe<T>) -> Option<Placed<T>> {
     over.map(|value| Placed { value, span: None }).or_else(written)
 }
 
-fn control(table: &file::Control, mistakes: &mut Vec<Mistake>) -> Control {
+fn control(table: &file::Control, role: Role, mistakes: &mut Vec<Mistake>) -> Control {
     let off = table.off.as_ref().is_some_and(|off| *off.get_ref());
-    let Some(path) = &table.path else { return if off { Control::Off } else { Control::Usual } };
-    if off || path.get_ref().is_empty() || path.get_ref().contains('\0') {
+    let Some(path) = &table.path else { return if off { Control::Off } else { Control::Default } };
+    if role == Role::SUnit {
+        let help = "take the line out; operators reach the vehicle through its manager";
+        mistakes.push(Mistake::new(path.span(), "an s_unit has no control socket", help));
+    } else if off || path.get_ref().is_empty() || path.get_ref().contains('\0') {
         let help = "write a path, or off = true, or neither for the usual place";
         mistakes.push(Mistake::new(path.span(), "there is no control socket at this path", help));
     }
-    Control::At(Placed { value: path.get_ref().into(), span: Some(path.span()) })
+    Control::Path(path.get_ref().into())
 }
 
 fn metrics(file: &File, over: &Overrides, mistakes: &mut Vec<Mistake>) -> Option<Placed<SocketAddr>> {

@@ -1,10 +1,11 @@
+use cara_std::control::Control;
 use cara_std::{Capacities, Definition, Parameters};
 use proptest::prelude::*;
 
 use super::file::Role;
 use super::json::{self, BadOutput};
 use super::mistake::Source;
-use super::settings::{Control, Overrides, Settings};
+use super::settings::{Overrides, Settings};
 use super::{EXAMPLE, limits};
 
 fn settings(text: &str) -> Result<Settings, String> {
@@ -18,7 +19,7 @@ fn the_example_shows_the_defaults() {
     let least = settings("name = \"AGV_manager\"\nid = 1\n").unwrap();
     assert_eq!(example.constraints, limits::defaults(Role::MUnit));
     assert_eq!(example.capacities, Capacities::default());
-    assert_eq!((example.fleet, &example.control), (least.fleet, &Control::Usual));
+    assert_eq!((example.fleet, &example.control), (least.fleet, &Control::Default));
     assert_eq!(example.discovery_port.unwrap().value, cara_std::PLAIN_PORT);
     assert_eq!(
         (least.constraints, least.capacities, least.control),
@@ -34,12 +35,12 @@ fn what_the_example_leaves_out_is_right_too() {
         .replace("# [manager]", "[manager]")
         .replace("# name = \"AGV_manager\"", "name = \"AGV_manager\"")
         .replace("# id = 1", "id = 1")
-        .replace("# address = ", "address = ")
-        .replace("# path = ", "path = ")
-        .replace("off = false\n", "");
+        .replace("# address = ", "address = ");
     let manager = settings(&vehicle).unwrap().manager.unwrap();
     assert_eq!((manager.name.as_str(), manager.id, manager.address.is_some()), ("AGV_manager", 1, true));
-    assert!(settings(&EXAMPLE.replace("# tcp_port", "tcp_port")).unwrap().tcp_port.is_some());
+    let manager = EXAMPLE.replace("# tcp_port", "tcp_port").replace("# path = ", "path = ");
+    let manager = settings(&manager).unwrap();
+    assert!(manager.tcp_port.is_some() && matches!(manager.control, Control::Path(_)));
 }
 
 #[test]

@@ -1,5 +1,6 @@
 //! The node's unit, whichever role it has.
 
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::mpsc::Receiver;
 
@@ -83,19 +84,32 @@ impl Node {
 
 impl Node {
     /// Where operators reach it.
-    pub(super) fn control_path(&self) -> Option<std::path::PathBuf> {
-        None
+    pub(super) fn control_path(&self) -> Option<PathBuf> {
+        match self {
+            Self::Manager(system) => system.control_path(),
+            Self::Vehicle(_) => None,
+        }
     }
 
     /// What is served as metrics; holds no unit alive.
     pub(super) fn metrics(&self) -> Metrics {
-        Arc::new(|| None)
+        match self {
+            Self::Manager(system) => {
+                let system = system.downgrade();
+                Arc::new(move || system.upgrade().map(|system| system.metrics()))
+            }
+            Self::Vehicle(unit) => {
+                let unit = unit.downgrade();
+                Arc::new(move || unit.upgrade().map(|unit| unit.metrics()))
+            }
+        }
     }
 }
 
 fn with(builder: Builder<()>, settings: &Settings) -> Builder<()> {
     let builder = builder.fleet(settings.fleet).interfaces(settings.interfaces);
     let builder = builder.constraints(settings.constraints).capacities(settings.capacities);
+    let builder = builder.control(settings.control.clone());
     let builder = match &settings.discovery_port {
         Some(port) => builder.discovery_port(port.value),
         None => builder,
