@@ -45,3 +45,10 @@ pub fn read() -> Result<Told, ArgumentError> {
     let settings = text.parse().map_err(ArgumentError::Settings)?;
     Ok(Told { settings, seed })
 }
+
+/// A seed from the host's clock: an emulated board has no source of noise.
+pub fn seed() -> u64 {
+    let centiseconds = semihosting::sys::arm_compat::sys_clock().unwrap_or(0) as u64;
+    let seconds = semihosting::sys::arm_compat::sys_time().unwrap_or(0) as u64;
+    seconds << 32 | centiseconds << 16 | embassy_time::Instant::now().as_micros() & 0xFFFF
+}

@@ -25,7 +25,7 @@ pub(crate) const BOARDS: [Board; 1] = [Board {
     folder: "lm3s6965evb",
     feature: None,
     target: "thumbv7m-none-eabi",
-    images: &["echo"],
+    images: &["agv", "echo"],
 }];
 
 /// The board of a name; the error lists all.

@@ -1,0 +1,162 @@
+//! The AGV of the examples as firmware, whatever the board. What it does is `cara_apps::agv`, the same as on Linux; a
+//! board adds its network, its clock, its settings and its button.
+//!
+//! [`vehicle`] makes the unit and its services. A board then runs three tasks beside that of its network: the unit's
+//! [`Runner`], [`drive`] and [`call_mechanic`].
+
+#![no_std]
+
+use core::net::SocketAddr;
+
+use cara_apps::agv::{Agv, BATTERY, GO_TO, GO_TO_LEASE, POS_INFO, Progress, STOP, TICK};
+use cara_apps::mechanic;
+use cara_core::config::Priority;
+use cara_core::error::{Cause, Error};
+use cara_core::services::lease::Lease;
+use cara_embassy::{Config, Handle, Handler, Hook, Resources, Runner, ServiceOptions, now};
+use cara_settings::{Network, Settings};
+use embassy_net::{Ipv4Cidr, Stack, StaticConfigV4};
+use embassy_time::{Duration, Ticker};
+
+macro_rules! info {
+    ($($arg:tt)*) => {{
+        #[cfg(feature = "defmt")]
+        ::defmt::info!($($arg)*);
+        #[cfg(not(feature = "defmt"))]
+        { let _ = ::core::format_args!($($arg)*); }
+    }};
+}
+
+/// An AGV.
+pub type Vehicle = Handle<Agv>;
+/// Its memory: one manager, messages of 1 KiB.
+pub type VehicleResources = Resources<Agv>;
+
+/// Sockets of the network stack that the vehicle needs, with one for DHCP.
+pub const SOCKETS: usize = VehicleResources::SOCKETS + 1;
+
+/// Whether somebody wants the vehicle to drive. An interrupt of the motors can read it: `DRIVING.is_live(now())` is
+/// false in time also when no task runs any more.
+pub static DRIVING: Lease = Lease::new();
+
+/// Why there is no vehicle.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum VehicleError {
+    /// The settings are those of an m_unit.
+    #[error("a vehicle belongs to a manager, and the settings name none")]
+    NoManager,
+    /// The unit could not be made.
+    #[error("{0}")]
+    Unit(#[from] Error),
+}
+
+/// How the network stack gets its address.
+pub fn network(settings: &Settings) -> embassy_net::Config {
+    match settings.network {
+        Network::Dhcp => embassy_net::Config::dhcpv4(Default::default()),
+        Network::Static { address, prefix, gateway } => embassy_net::Config::ipv4_static(StaticConfigV4 {
+            address: Ipv4Cidr::new(address, prefix),
+            gateway,
+            dns_servers: Default::default(),
+        }),
+    }
+}
+
+/// Makes the AGV that the settings describe. `seed` should differ from boot to boot.
+pub fn vehicle(
+    stack: Stack<'static>,
+    resources: &'static mut VehicleResources,
+    settings: &Settings,
+    seed: u64,
+) -> Result<(Vehicle, Runner<Agv>), VehicleError> {
+    let manager = settings.manager.as_ref().ok_or(VehicleError::NoManager)?;
+    let identity = &settings.identity;
+    let config = Config::s_unit(identity.name(), identity.id(), &manager.name, manager.id, seed)?;
+    let config = config.fleet(settings.fleet.0);
+    let config = match settings.manager_address {
+        Some(address) => config.manager_address(SocketAddr::V4(address)),
+        None => config,
+    };
+    let (vehicle, runner) = cara_embassy::new(stack, resources, config, Agv::new([0, 0]))?;
+    offer(vehicle)?;
+    Ok((vehicle, runner))
+}
+
+/// Publishes the AGV's services.
+fn offer(vehicle: Vehicle) -> Result<(), Error> {
+    let plain = ServiceOptions::new;
+    let stand: &'static Hook<Agv> = &stand_still;
+    let pos_info = Handler::method(&|agv: &mut Agv, _, pos| agv.pos_info(pos));
+    let battery = Handler::method(&|agv: &mut Agv, _, charge| agv.battery(charge));
+    let stop = Handler::method(&|agv: &mut Agv, _, _| {
+        stand_still(agv);
+        Ok(())
+    });
+    let go_to = Handler::method(&|agv: &mut Agv, _, pos| {
+        agv.go_to(pos)?;
+        info!("driving");
+        Ok(())
+    });
+    vehicle.add_service(POS_INFO, plain().idempotent(), pos_info)?;
+    vehicle.add_service(BATTERY, plain().idempotent(), battery)?;
+    vehicle.add_service(STOP, plain().idempotent().priority(Priority::Emergency), stop)?;
+    vehicle.add_service(GO_TO, plain().lease(GO_TO_LEASE, &DRIVING, stand), go_to)?;
+    vehicle.on_manager_lost(stand);
+    vehicle.publish_my_function_list()
+}
+
+/// Stops the motors.
+fn stand_still(agv: &mut Agv) {
+    if let Some(place) = agv.stop() {
+        let [_x, _y] = place.rounded();
+        info!("stopped at {} {}", _x, _y);
+    }
+}
+
+/// The motors' loop: drives while the lease is live.
+pub async fn drive(vehicle: Vehicle) -> ! {
+    let mut ticker = Ticker::every(Duration::from_micros(TICK.as_micros()));
+    loop {
+        ticker.next().await;
+        // The state is lent to services between awaits only, so it is free here.
+        let progress = vehicle.with_state(|agv| agv.step(TICK, DRIVING.is_live(now())));
+        match progress {
+            Ok(Some(Progress::Arrived(place))) => {
+                let [_x, _y] = place.rounded();
+                vehicle.end_lease("go_to");
+                info!("arrived at {} {}", _x, _y);
+            }
+            Ok(Some(Progress::Stopped(_))) => info!("stopped: nobody wants it to drive"),
+            _ => {}
+        }
+    }
+}
+
+/// Calls a mechanic each time that the button is pressed, once the manager offers one.
+pub async fn call_mechanic(vehicle: Vehicle, mut pressed: impl AsyncFnMut()) -> ! {
+    loop {
+        pressed().await;
+        vehicle.wait_until(|vehicle| vehicle.nodes_offering("call_mechanic").next().is_some()).await;
+        match ask_mechanic(vehicle).await {
+            Ok(_minutes) => info!("a mechanic comes in {} minutes", _minutes),
+            Err(_error) => info!("no mechanic: ask the {}", who_must_act(&_error)),
+        }
+    }
+}
+
+/// Texts of errors stay out of the image.
+fn who_must_act(error: &Error) -> &'static str {
+    match error.cause() {
+        Cause::Configuration => "programmer",
+        Cause::Peer => "manager",
+        Cause::Resource => "programmer for more room, or wait",
+        Cause::Transport => "network",
+    }
+}
+
+async fn ask_mechanic(vehicle: Vehicle) -> Result<i64, Error> {
+    let mut arguments = mechanic::arguments()?;
+    arguments.set_value("fault", "a wheel squeaks")?;
+    vehicle.block_request("call_mechanic", &mut arguments).await?;
+    arguments.variable("minutes")
+}

@@ -1,0 +1,93 @@
+//! The AGV of the examples on the emulated board. A timer presses its button.
+
+#![no_std]
+#![no_main]
+
+use cara_apps::agv::Agv;
+use cara_embassy::Runner as UnitRunner;
+use cara_lm3s6965evb::arguments::{self, Told};
+use cara_lm3s6965evb::ethernet::Ethernet;
+use cara_lm3s6965evb::watchdog::Watchdog;
+use cara_lm3s6965evb::{executor, fault, reset, stack, start};
+use cara_vehicle::{SOCKETS, Vehicle, VehicleResources};
+use defmt_semihosting as _;
+use embassy_executor::Spawner;
+use embassy_net::{Runner, StackResources};
+use embassy_time::{Duration, Timer};
+use static_cell::StaticCell;
+
+/// A board that hangs for so long starts again.
+const HANGS: Duration = Duration::from_secs(4);
+/// How often the timer presses the button.
+const PRESSED_EVERY: Duration = Duration::from_secs(10);
+
+#[cortex_m_rt::entry]
+fn main() -> ! {
+    let _core = start();
+    defmt::info!("started because of {}", reset::reason());
+    executor::run(|spawner| {
+        if let Err(text) = spawn(spawner) {
+            defmt::error!("{=str}", text);
+            semihosting::process::exit(fault::PANICKED)
+        }
+    })
+}
+
+fn spawn(spawner: Spawner) -> Result<(), &'static str> {
+    static ETHERNET: StaticCell<Ethernet> = StaticCell::new();
+    static SOCKETS_MEMORY: StaticCell<StackResources<SOCKETS>> = StaticCell::new();
+    static RESOURCES: StaticCell<VehicleResources> = StaticCell::new();
+    const NO_ROOM: &str = "no room for a task";
+    let Told { settings, seed } = arguments::read().map_err(|_| "who am I? The arguments are no settings")?;
+    let seed = seed.unwrap_or_else(arguments::seed);
+    let ethernet = ETHERNET.init_with(Ethernet::new);
+    ethernet.start();
+    let sockets = SOCKETS_MEMORY.init_with(StackResources::new);
+    let (stack, network_runner) = embassy_net::new(ethernet, cara_vehicle::network(&settings), sockets, seed);
+    let resources = RESOURCES.init_with(VehicleResources::new);
+    let made = cara_vehicle::vehicle(stack, resources, &settings, seed);
+    let (vehicle, unit_runner) = made.map_err(|_| "the settings are of no vehicle")?;
+    defmt::info!("{=str}/{=u32}", settings.identity.name(), settings.identity.id());
+    spawner.spawn(network(network_runner).map_err(|_| NO_ROOM)?);
+    spawner.spawn(unit(unit_runner).map_err(|_| NO_ROOM)?);
+    spawner.spawn(drive(vehicle).map_err(|_| NO_ROOM)?);
+    spawner.spawn(button(vehicle).map_err(|_| NO_ROOM)?);
+    spawner.spawn(watch().map_err(|_| NO_ROOM)?);
+    Ok(())
+}
+
+#[embassy_executor::task]
+async fn network(mut runner: Runner<'static, &'static mut Ethernet>) -> ! {
+    runner.run().await
+}
+
+#[embassy_executor::task]
+async fn unit(mut runner: UnitRunner<Agv>) -> ! {
+    runner.run().await
+}
+
+#[embassy_executor::task]
+async fn drive(vehicle: Vehicle) -> ! {
+    cara_vehicle::drive(vehicle).await
+}
+
+#[embassy_executor::task]
+async fn button(vehicle: Vehicle) -> ! {
+    cara_vehicle::call_mechanic(vehicle, async || Timer::after(PRESSED_EVERY).await).await
+}
+
+/// Feeds the watchdog for as long as tasks get their turn, and tells how deep the stack has been.
+#[embassy_executor::task]
+async fn watch() -> ! {
+    let mut watchdog = Watchdog::start(HANGS.as_millis() as u32);
+    let mut deepest = 0;
+    loop {
+        watchdog.feed();
+        let stack = stack::used();
+        if stack.used > deepest {
+            deepest = stack.used;
+            defmt::info!("stack {=usize} of {=usize} bytes", stack.used, stack.size);
+        }
+        Timer::after(Duration::from_secs(1)).await;
+    }
+}
