@@ -19,11 +19,17 @@ pub(crate) struct Arguments {
     /// Show zeros too.
     #[arg(long)]
     zeros: bool,
+    /// Print them in Prometheus' text form, as `cara node --metrics` serves them.
+    #[arg(long, conflicts_with_all = ["node", "zeros", "json"])]
+    prometheus: bool,
 }
 
-pub(crate) fn run(Arguments { node, zeros }: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
+pub(crate) fn run(Arguments { node, zeros, prometheus }: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
     let need = node.as_deref().map_or(Need::Everybody, Need::Node);
     let mut operator = Operator::open(global, &need)?;
+    if prometheus {
+        return print_metrics(&mut operator);
+    }
     let node = match node {
         Some(node) => Some(full_name(&nodes::connected(&mut operator, &node)?)),
         None => None,
@@ -35,6 +41,15 @@ pub(crate) fn run(Arguments { node, zeros }: Arguments, global: &Global) -> anyh
     } else {
         for (node, counters) in &counters {
             show(node.as_deref(), counters, zeros)?;
+        }
+    }
+    Ok(Exit::Done.into())
+}
+
+fn print_metrics(operator: &mut Operator) -> anyhow::Result<ExitCode> {
+    for answer in operator.answers(&Question::Metrics)? {
+        if let Answer::Metrics { text } = answer {
+            output::bytes(text.as_bytes())?;
         }
     }
     Ok(Exit::Done.into())

@@ -1,6 +1,9 @@
 //! Without a manager on this host: what then is said, and `--as`.
 
-use crate::support::{Stage, private_folder};
+use std::io::Write;
+use std::process::Stdio;
+
+use crate::support::{Ran, Stage, private_folder};
 
 const VERBS: [&[&str]; 8] = [
     &["functions", "agv-1"],
@@ -94,7 +97,33 @@ fn cara_does_not_pretend_to_be_a_unit_that_runs() {
     // Its control socket is elsewhere, yet it answers on the network.
     let elsewhere = private_folder();
     let mut command = stage.command(&["scan", "--as", "manager/1"]);
-    let ran = crate::support::Ran::of(command.env("CARA_CONTROL_DIR", elsewhere.path()).output().unwrap());
+    let ran = Ran::of(command.env("CARA_CONTROL_DIR", elsewhere.path()).output().unwrap());
     assert_eq!(ran.code, 2, "{}", ran.everything());
     ran.says("manager/1 answers at");
+}
+
+#[test]
+fn what_else_may_answer_on_a_socket_does_not_panic() {
+    let stage = Stage::empty();
+    let path = stage.control().join("other.sock");
+    let listener = std::os::unix::net::UnixListener::bind(&path).unwrap();
+    let hello = r#"{"answer":"hello","control_version":1,"unit":"manager/1","fleet":0}"#;
+    let says: [(String, i32); 6] = [
+        (String::new(), 1),
+        ("\0\u{ff} garbage\n".into(), 1),
+        (r#"{"answer":"hello","control_version":99,"unit":"manager/1","fleet":0}"#.to_owned() + "\n", 3),
+        (format!("{hello}\n"), 1),
+        (format!("{hello}\ngarbage\n"), 1),
+        (format!("{hello}\n{{\"answer\":\"failed\",\"cause\":\"peer\",\"error\":\"Odd\",\"text\":\"odd\"}}\n"), 1),
+    ];
+    for (text, code) in says {
+        let mut command = stage.command(&["functions", "agv-1", "--socket", path.to_str().unwrap()]);
+        let cara = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        let (mut stream, _) = listener.accept().unwrap();
+        // A command that is content with less may have ended.
+        let _ = stream.write_all(text.as_bytes());
+        drop(stream.shutdown(std::net::Shutdown::Write));
+        let ran = Ran::of(cara.wait_with_output().unwrap());
+        assert!(ran.code == code && ran.err.starts_with("error: "), "{text:?}: {}", ran.everything());
+    }
 }

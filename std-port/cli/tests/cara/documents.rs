@@ -3,8 +3,11 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
+use serde_json::Value;
+
 use crate::support::Stage;
 
+const REFERENCE: &str = "../../docs/cara.md";
 const VERBS: [&str; 13] = [
     "scan",
     "functions",
@@ -73,10 +76,52 @@ fn the_man_page_renders() {
     }
 }
 
+/// All keys of an object and of what it holds, except those that are names of counters and nodes.
+fn keys(value: &Value, found: &mut BTreeSet<String>) {
+    match value {
+        Value::Array(values) => values.iter().for_each(|value| keys(value, found)),
+        Value::Object(object) => object.iter().for_each(|(key, value)| {
+            if !key.contains('/') && !key.starts_with(|c: char| c.is_ascii_uppercase()) {
+                found.insert(key.clone());
+            }
+            keys(value, found);
+        }),
+        _ => {}
+    }
+}
+
+#[test]
+fn the_reference_has_every_key_of_the_json() {
+    let reference = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(REFERENCE)).unwrap();
+    let words: BTreeSet<_> = reference.split(|c: char| !c.is_ascii_alphanumeric() && c != '_').collect();
+    let stage = Stage::with(&["agv-1"]);
+    let verbs: [&[&str]; 13] = [
+        &["scan"],
+        &["scan", "--survey", "--listen", "3s"],
+        &["functions", "agv-1"],
+        &["call", "agv-1", "go_to(position: [1, 2])"],
+        &["call", "agv-1", "fail"],
+        &["publish"],
+        &["set", ".", "request_timeout", "2s"],
+        &["watch", "--for", "100ms"],
+        &["counters"],
+        &["ping", "agv-1", "-c", "1"],
+        &["bench", "agv-1", "--sizes", "1", "--count", "1", "--periods", "1ms", "--group", "1"],
+        &["completions", "bash"],
+        &["man"],
+    ];
+    for verb in verbs {
+        let mut found = BTreeSet::new();
+        stage.cara(&[verb, &["--json"]].concat()).lines().iter().for_each(|object| keys(object, &mut found));
+        assert!(!found.is_empty(), "{verb:?}");
+        let missing: Vec<_> = found.iter().filter(|key| !words.contains(key.as_str())).collect();
+        assert!(missing.is_empty(), "{verb:?}: {missing:?} not in docs/cara.md");
+    }
+}
+
 #[test]
 fn the_reference_has_every_verb_option_and_exit_code() {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/cara.md");
-    let reference = std::fs::read_to_string(path).unwrap();
+    let reference = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(REFERENCE)).unwrap();
     let stage = Stage::empty();
     for verb in VERBS {
         assert!(reference.contains(&format!("## `cara {verb}")), "no section for {verb}");

@@ -63,6 +63,13 @@ fn requests_that_are_not_executed_lower_availability() {
 }
 
 #[test]
+fn availability_can_be_left_out() {
+    let stage = Stage::with(&["agv-1"]);
+    let told = stage.ends(0, &["bench", "agv-1", "--sizes", "1", "--count", "2", "--groups", "0", "--json"]).json();
+    assert_eq!((told["availability"].as_array().unwrap().len(), told["response"].as_array().unwrap().len()), (0, 1));
+}
+
+#[test]
 fn a_function_that_cannot_be_measured_ends_with_2() {
     let stage = Stage::with(&["agv-1"]);
     stage.ends(2, &["bench", "agv-1", "--function", "go_to"]).says("does not take one string").says("go_to(position");

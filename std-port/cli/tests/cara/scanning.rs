@@ -18,6 +18,7 @@ fn a_scan_shows_who_is_there() {
     assert!(names.len() == 2 && names.contains(&"agv-1") && names.contains(&"agv-2"), "{names:?}");
     assert_eq!(stage.ends(0, &["scan", "--offering", "go_to", "--json"]).json()["nodes"].as_array().unwrap().len(), 2);
     stage.ends(0, &["scan", "--offering", "fly"]).says("no such node");
+    stage.ends(0, &["scan", "--search", "--listen", "10ms"]).says("agv-2");
 }
 
 #[test]

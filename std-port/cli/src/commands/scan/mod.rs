@@ -23,18 +23,28 @@ pub(crate) struct Arguments {
     /// Only nodes that offer this function.
     #[arg(long, value_name = "FUNCTION")]
     offering: Option<String>,
+    /// Let the unit search now, before it is asked.
+    #[arg(long, conflicts_with = "survey")]
+    search: bool,
     /// Survey the network, also where an m_unit runs on this host.
     #[arg(long, conflicts_with_all = ["unit", "socket", "act_as", "offering"])]
     survey: bool,
-    /// How long a survey listens.
+    /// How long a survey listens, and what is found by --search is waited for.
     #[arg(long, value_name = "TIME", default_value = "2s", value_parser = parse_time)]
     listen: Duration,
 }
 
-pub(crate) fn run(Arguments { offering, survey, listen }: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
+pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
+    let Arguments { offering, search, survey, listen } = arguments;
     let operator = if survey { None } else { Operator::open_if_any(global, &Need::Everybody)? };
     match (operator, offering) {
-        (Some(operator), offering) => of_unit(operator, offering, global)?,
+        (Some(mut operator), offering) => {
+            if search {
+                operator.ask(&Question::Search, |_| Ok(()))?;
+                std::thread::sleep(listen);
+            }
+            of_unit(operator, offering, global)?;
+        }
         (None, None) => survey::show(listen, global)?,
         (None, Some(_)) => {
             let text = "no m_unit runs on this host, and a survey does not see functions: start a manager \
