@@ -515,6 +515,11 @@ fn lower(name: &str) -> String {
     lower
 }
 
+fn without_values(metrics: &str) -> Vec<&str> {
+    let names = metrics.lines().map(|line| if line.starts_with('#') { Some(line) } else { line.rsplit(' ').nth(1) });
+    names.map(Option::unwrap).collect()
+}
+
 #[test]
 fn metrics_are_the_counters() {
     let node = Node::start(&format!("[metrics]\nlisten = \"127.0.0.1:0\"\n{SERVED}"));
@@ -556,6 +561,9 @@ fn metrics_are_the_counters() {
         compared += 1;
     }
     assert!(compared > 40, "{compared}");
+    let printed = Command::new(cara()).args(["counters", "--prometheus", "--socket"]).arg(&socket).output().unwrap();
+    assert!(printed.status.success(), "{}", text(&printed.stderr));
+    assert_eq!(without_values(&text(&printed.stdout)), without_values(body));
     let received = before.iter().find(|(of, name, _)| of.is_some() && name == "RequestsReceived").unwrap().2;
     assert_eq!(received, 5);
 }

@@ -16,6 +16,9 @@ pub(super) type Sink<'s> = &'s mut dyn FnMut(Answer) -> ControlFlow<()>;
 
 /// Events that wait to be written before some are lost.
 const EVENTS: usize = 1024;
+/// Bytes of metrics in one answer.
+#[cfg(feature = "metrics")]
+const PIECE_BYTES: usize = 256 * 1024;
 /// How often a watch without events looks whether it is still wanted, and a pause whether the unit still runs.
 const LOOK: std::time::Duration = std::time::Duration::from_millis(100);
 
@@ -89,6 +92,7 @@ fn attempt<T: Send + 'static>(
         }
         Question::Watch => watch(system, sink, wanted),
         Question::Counters { node } => counters(system, node.as_deref(), sink),
+        Question::Metrics => metrics(system, sink),
         Question::Ping { node, count, pause_us, timeout_ms } => {
             let times = (*count, Duration::from_micros(*pause_us), Duration::from_millis(*timeout_ms));
             call::ping(system, node, times, sink)
@@ -226,6 +230,26 @@ fn counters<T: Send + 'static>(system: &CommunicationSystem<T>, node: Option<&st
         let counters = named(peer.counters());
         send(sink, Answer::Counters { node: Some(peer.identity().to_string()), counters })
     })
+}
+
+/// The whole text may be longer than a line may be, with many nodes.
+#[cfg(feature = "metrics")]
+fn metrics<T: Send + 'static>(system: &CommunicationSystem<T>, sink: Sink<'_>) -> Result<(), End> {
+    let text = system.metrics();
+    let mut piece = String::new();
+    for line in text.split_inclusive('\n') {
+        if piece.len() + line.len() > PIECE_BYTES {
+            send(sink, Answer::Metrics { text: std::mem::take(&mut piece) })?;
+        }
+        piece.push_str(line);
+    }
+    send(sink, Answer::Metrics { text: piece })
+}
+
+#[cfg(not(feature = "metrics"))]
+fn metrics<T: Send + 'static>(_: &CommunicationSystem<T>, _: Sink<'_>) -> Result<(), End> {
+    let text = "the unit is built without metrics: build it with the feature `metrics` of cara-std";
+    Err(Failure::configuration("NoMetrics", text).into())
 }
 
 fn named(counters: Vec<(&'static str, u64)>) -> Vec<(String, u64)> {

@@ -53,6 +53,8 @@ pub enum Question {
         /// The unit and all connected nodes if absent.
         node: Option<String>,
     },
+    /// All counters in Prometheus' text form, of units that are built with it. In pieces, each an [`Answer::Metrics`].
+    Metrics,
     /// Measures round trips of the protocol's own ping, with no function involved. An [`Answer::Sample`] for each.
     Ping {
         /// `NAME`, `NAME/ID` or `#ID`.
@@ -195,6 +197,11 @@ pub enum Answer {
         node: Option<String>,
         /// Name and count.
         counters: Vec<(String, u64)>,
+    },
+    /// The next lines of the counters in Prometheus' text form.
+    Metrics {
+        /// Whole lines.
+        text: String,
     },
     /// A round trip.
     Sample {
