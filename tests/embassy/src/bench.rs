@@ -7,11 +7,12 @@ use std::rc::Rc;
 
 use cara_core::random::Random;
 use cara_core::time::{Duration, Instant};
-use cara_ethernet::{FaultCounts, Faults, Mac, PortId, Switch};
-use embassy_net::{Config, Ipv4Cidr, Stack, StackResources, StaticConfigV4};
+use cara_ethernet::{FaultCounts, Faults, Mac, Switch};
+use embassy_net::{Config, ConfigV4, Ipv4Cidr, Stack, StackResources, StaticConfigV4};
 
 use crate::clock;
-use crate::driver::{Cable, Listener};
+use crate::driver::{Cable, Plug};
+use crate::gate::Rule;
 use crate::tasks::{Job, Task, Tasks};
 
 /// What a poll costs: without it, a task that wakes itself would hold the clock.
@@ -31,9 +32,18 @@ struct Inner {
     switch: Rc<RefCell<Switch>>,
     tasks: RefCell<Tasks>,
     spawned: RefCell<Vec<(usize, Job)>>,
-    boards: RefCell<Vec<(PortId, Listener)>>,
+    plugs: RefCell<Vec<Plug>>,
+    asleep: RefCell<Vec<Asleep>>,
     random: RefCell<Random>,
     running: Cell<Option<usize>>,
+}
+
+/// A board whose tasks are not polled.
+struct Asleep {
+    board: usize,
+    until: Instant,
+    /// Those that were woken meanwhile.
+    tasks: Vec<Task>,
 }
 
 /// A board: its cable, its network stack and its tasks.
@@ -41,7 +51,7 @@ struct Inner {
 pub struct Board {
     inner: Rc<Inner>,
     index: usize,
-    port: PortId,
+    plug: Plug,
     address: Ipv4Addr,
     stack: Stack<'static>,
 }
@@ -54,7 +64,8 @@ impl Bench {
             switch: Rc::new(RefCell::new(Switch::new(seed))),
             tasks: RefCell::default(),
             spawned: RefCell::default(),
-            boards: RefCell::default(),
+            plugs: RefCell::default(),
+            asleep: RefCell::default(),
             random: RefCell::new(Random::new(seed ^ 0x00B0_A4D5)),
             running: Cell::new(None),
         };
@@ -63,34 +74,19 @@ impl Bench {
 
     /// Another board, with power and an address of its own.
     pub fn board(&self) -> Board {
-        let number = self.inner.boards.borrow().len() as u16 + 1;
-        let [high, low] = number.to_be_bytes();
-        let address = Ipv4Addr::new(10, 77, high, low);
-        let config =
-            StaticConfigV4 { address: Ipv4Cidr::new(address, PREFIX), gateway: None, dns_servers: Default::default() };
-        self.board_with(address, Config::ipv4_static(config))
-    }
-
-    /// Another board with a network configuration of one's choice; `address` is what [`Board::address`] tells.
-    pub fn board_with(&self, address: Ipv4Addr, config: Config) -> Board {
-        let index = self.inner.boards.borrow().len();
+        let index = self.inner.plugs.borrow().len();
         let [high, low] = (index as u16 + 1).to_be_bytes();
         let mac = Mac([2, 0, 0, 0, high, low]);
         let port = self.inner.switch.borrow_mut().add_port(mac);
-        let listener = Listener::default();
-        self.inner.boards.borrow_mut().push((port, Rc::clone(&listener)));
         let switch = Rc::clone(&self.inner.switch);
-        let cable = Cable { switch, port, mac, listener };
-        let resources = Box::leak(Box::new(StackResources::<SOCKETS>::new()));
-        let (stack, mut runner) = embassy_net::new(cable, config, resources, self.random(u64::MAX));
-        let board = Board { inner: Rc::clone(&self.inner), index, port, address, stack };
-        board.spawn(async move { runner.run().await });
-        board
+        let plug = Plug { switch, port, mac, gate: Rc::default(), listener: Rc::default() };
+        self.inner.plugs.borrow_mut().push(plug.clone());
+        Board::boot(&self.inner, index, plug, Ipv4Addr::new(10, 77, high, low))
     }
 
     /// A random number below `bound`, from the seed.
     pub fn random(&self, bound: u64) -> u64 {
-        self.inner.random.borrow_mut().below(bound)
+        self.inner.random(bound)
     }
 
     /// The time.
@@ -130,39 +126,54 @@ impl Bench {
     /// Polls one task, or jumps to what comes next.
     fn step(&self, end: Instant) {
         clock::wake_due();
-        self.wake_receivers();
+        self.inner.wake_receivers();
+        self.inner.wake_sleepers();
         if let Some(task) = self.inner.next_task() {
             self.inner.poll(task);
             clock::pass(POLL);
             return;
         }
-        let boards = self.inner.boards.borrow();
-        let arrivals = boards.iter().filter_map(|(port, listener)| {
-            let listens = listener.borrow().is_some();
-            listens.then(|| self.inner.switch.borrow().next_arrival(*port)).flatten()
-        });
-        let next = arrivals.chain(clock::next_timer()).min().unwrap_or(end);
+        let plugs = self.inner.plugs.borrow();
+        let arrivals = plugs.iter().filter_map(Plug::next_arrival);
+        let asleep = self.inner.asleep.borrow();
+        let wakings = asleep.iter().map(|asleep| asleep.until);
+        let next = arrivals.chain(wakings).chain(clock::next_timer()).min().unwrap_or(end);
         clock::set(next.min(end));
-    }
-
-    fn wake_receivers(&self) {
-        let now = clock::now();
-        for (port, listener) in self.inner.boards.borrow().iter() {
-            if self.inner.switch.borrow().next_arrival(*port).is_some_and(|at| at <= now)
-                && let Some(waker) = listener.take()
-            {
-                waker.wake();
-            }
-        }
     }
 }
 
 impl Inner {
+    fn random(&self, bound: u64) -> u64 {
+        self.random.borrow_mut().below(bound)
+    }
+
+    fn wake_receivers(&self) {
+        let now = clock::now();
+        let plugs = self.plugs.borrow();
+        plugs.iter().filter(|plug| plug.next_arrival().is_some_and(|at| at <= now)).for_each(Plug::wake);
+    }
+
+    fn wake_sleepers(&self) {
+        let now = clock::now();
+        let awake: Vec<Asleep> = self.asleep.borrow_mut().extract_if(.., |asleep| asleep.until <= now).collect();
+        for task in awake.into_iter().flat_map(|asleep| asleep.tasks) {
+            task.wake();
+            self.tasks.borrow_mut().keep(task);
+        }
+    }
+
     fn next_task(&self) -> Option<Task> {
         for (board, job) in self.spawned.take() {
             self.tasks.borrow_mut().spawn(board, job);
         }
-        self.tasks.borrow_mut().next()
+        loop {
+            let task = self.tasks.borrow_mut().next()?;
+            let mut asleep = self.asleep.borrow_mut();
+            match asleep.iter_mut().find(|asleep| asleep.board == task.board()) {
+                Some(asleep) => asleep.tasks.push(task),
+                None => return Some(task),
+            }
+        }
     }
 
     fn poll(&self, task: Task) {
@@ -177,6 +188,22 @@ impl Inner {
 }
 
 impl Board {
+    fn boot(inner: &Rc<Inner>, index: usize, plug: Plug, address: Ipv4Addr) -> Self {
+        let config = Config::ipv4_static(fixed(address));
+        let resources = Box::leak(Box::new(StackResources::<SOCKETS>::new()));
+        let (stack, mut runner) = embassy_net::new(Cable(plug.clone()), config, resources, inner.random(u64::MAX));
+        let board = Self { inner: Rc::clone(inner), index, plug, address, stack };
+        board.spawn(async move { runner.run().await });
+        board
+    }
+
+    /// Begins another life with the same cable and address: a board that was without power.
+    pub fn reboot(&self) -> Self {
+        self.cut_power();
+        self.set_cable(true);
+        Self::boot(&self.inner, self.index, self.plug.clone(), self.address)
+    }
+
     /// Its network stack.
     pub fn stack(&self) -> Stack<'static> {
         self.stack
@@ -194,26 +221,58 @@ impl Board {
 
     /// Pulls its cable, or plugs it in.
     pub fn set_cable(&self, up: bool) {
-        self.inner.switch.borrow_mut().set_link(self.port, up);
-        if let Some(waker) = self.inner.boards.borrow().get(self.index).and_then(|(_, listener)| listener.take()) {
-            waker.wake();
-        }
+        self.inner.switch.borrow_mut().set_link(self.plug.port, up);
+        self.plug.wake();
+    }
+
+    /// Gives it another address while it runs.
+    pub fn move_to(&self, address: Ipv4Addr) {
+        self.stack.set_config_v4(ConfigV4::Static(fixed(address)));
     }
 
     /// What happens from now on to the frames that it sends.
     pub fn set_faults(&self, faults: Faults) {
-        self.inner.switch.borrow_mut().set_faults_from(self.port, faults);
+        self.inner.switch.borrow_mut().set_faults_from(self.plug.port, faults);
     }
 
-    /// Ends all its tasks, and pulls its cable: nothing is said. Another life is another board.
+    /// It does not hear `other` until [`heal`](Self::heal).
+    pub fn lose_frames_of(&self, other: &Self) {
+        self.plug.gate.borrow_mut().add(Rule { from: other.plug.mac, until: None, tcp_only: false });
+    }
+
+    /// What `other` sends to it within `span` comes at the end of it: all, or what TCP sends.
+    pub fn hold_frames_of(&self, other: &Self, span: Duration, tcp_only: bool) {
+        let until = Some(clock::now() + span);
+        self.plug.gate.borrow_mut().add(Rule { from: other.plug.mac, until, tcp_only });
+    }
+
+    /// It hears everybody again.
+    pub fn heal(&self) {
+        self.plug.gate.borrow_mut().heal();
+    }
+
+    /// Its tasks stand still for a span, while the world goes on.
+    pub fn suspend(&self, span: Duration) {
+        let until = clock::now() + span;
+        self.inner.asleep.borrow_mut().push(Asleep { board: self.index, until, tasks: Vec::new() });
+    }
+
+    /// Ends all its tasks, and pulls its cable: nothing is said.
     pub fn cut_power(&self) {
         if self.inner.running.get() == Some(self.index) {
             self.inner.running.set(None);
         }
         self.inner.spawned.borrow_mut().retain(|(board, _)| *board != self.index);
+        let asleep: Vec<Asleep> =
+            self.inner.asleep.borrow_mut().extract_if(.., |asleep| asleep.board == self.index).collect();
         let tasks = self.inner.tasks.borrow_mut().take_all_of(self.index);
-        drop(tasks);
-        self.inner.boards.borrow()[self.index].1.take();
-        self.inner.switch.borrow_mut().set_link(self.port, false);
+        drop((tasks, asleep));
+        self.plug.listener.take();
+        self.plug.gate.borrow_mut().clear();
+        self.inner.switch.borrow_mut().set_link(self.plug.port, false);
     }
+}
+
+fn fixed(address: Ipv4Addr) -> StaticConfigV4 {
+    StaticConfigV4 { address: Ipv4Cidr::new(address, PREFIX), gateway: None, dns_servers: Default::default() }
 }

@@ -4,47 +4,79 @@ use std::cell::RefCell;
 use std::rc::Rc;
 use std::task::{Context, Waker};
 
+use cara_core::time::Instant;
 use cara_ethernet::{Mac, PortId, Switch};
 use embassy_net_driver::{Capabilities, Driver, HardwareAddress, LinkState, RxToken, TxToken};
 
 use crate::clock;
+use crate::gate::Gate;
 
 /// Two addresses, a type and 1,500 bytes.
 const FRAME: usize = 1_514;
 
-/// Who is told when a frame has come or the cable was moved.
-pub(crate) type Listener = Rc<RefCell<Option<Waker>>>;
-
-pub(crate) struct Cable {
+/// Where a board is plugged in, in all its lives.
+#[derive(Clone)]
+pub(crate) struct Plug {
     pub(crate) switch: Rc<RefCell<Switch>>,
     pub(crate) port: PortId,
     pub(crate) mac: Mac,
-    pub(crate) listener: Listener,
+    pub(crate) gate: Rc<RefCell<Gate>>,
+    /// Who is told when a frame has come or the cable was moved.
+    pub(crate) listener: Rc<RefCell<Option<Waker>>>,
 }
 
-impl Cable {
+impl Plug {
     fn listen(&self, context: &Context<'_>) {
         *self.listener.borrow_mut() = Some(context.waker().clone());
     }
+
+    /// Has the board's stack look at its device.
+    pub(crate) fn wake(&self) {
+        if let Some(waker) = self.listener.take() {
+            waker.wake();
+        }
+    }
+
+    /// When the next frame comes, unless nobody has looked for the one before.
+    pub(crate) fn next_arrival(&self) -> Option<Instant> {
+        self.listener.borrow().as_ref()?;
+        let held = self.gate.borrow().next();
+        self.switch.borrow().next_arrival(self.port).into_iter().chain(held).min()
+    }
+
+    fn receive(&self) -> Option<Vec<u8>> {
+        let mut gate = self.gate.borrow_mut();
+        loop {
+            if let Some(frame) = gate.take(clock::now()) {
+                return Some(frame);
+            }
+            let frame = self.switch.borrow_mut().receive(clock::now(), self.port)?;
+            if let Some(frame) = gate.pass(clock::now(), frame) {
+                return Some(frame);
+            }
+        }
+    }
 }
+
+pub(crate) struct Cable(pub(crate) Plug);
 
 impl Driver for Cable {
     type RxToken<'a> = Received;
     type TxToken<'a> = Sending<'a>;
 
     fn receive(&mut self, context: &mut Context<'_>) -> Option<(Received, Sending<'_>)> {
-        self.listen(context);
-        let frame = self.switch.borrow_mut().receive(clock::now(), self.port)?;
-        Some((Received(frame), Sending(self)))
+        self.0.listen(context);
+        let frame = self.0.receive()?;
+        Some((Received(frame), Sending(&self.0)))
     }
 
     fn transmit(&mut self, _: &mut Context<'_>) -> Option<Sending<'_>> {
-        Some(Sending(self))
+        Some(Sending(&self.0))
     }
 
     fn link_state(&mut self, context: &mut Context<'_>) -> LinkState {
-        self.listen(context);
-        if self.switch.borrow().is_up(self.port) { LinkState::Up } else { LinkState::Down }
+        self.0.listen(context);
+        if self.0.switch.borrow().is_up(self.0.port) { LinkState::Up } else { LinkState::Down }
     }
 
     fn capabilities(&self) -> Capabilities {
@@ -54,7 +86,7 @@ impl Driver for Cable {
     }
 
     fn hardware_address(&self) -> HardwareAddress {
-        HardwareAddress::Ethernet(self.mac.0)
+        HardwareAddress::Ethernet(self.0.mac.0)
     }
 }
 
@@ -68,7 +100,7 @@ impl RxToken for Received {
 }
 
 /// Leave to send a frame.
-pub(crate) struct Sending<'c>(&'c Cable);
+pub(crate) struct Sending<'c>(&'c Plug);
 
 impl TxToken for Sending<'_> {
     fn consume<R, F: FnOnce(&mut [u8]) -> R>(self, length: usize, write: F) -> R {

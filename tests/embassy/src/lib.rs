@@ -20,6 +20,7 @@
 mod bench;
 mod clock;
 mod driver;
+mod gate;
 mod tasks;
 
 pub use bench::{Bench, Board};

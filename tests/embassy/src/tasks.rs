@@ -49,6 +49,10 @@ impl Task {
         self.board
     }
 
+    pub(crate) fn wake(&self) {
+        self.waker.wake_by_ref();
+    }
+
     /// Polls it; gives it back unless it is over.
     pub(crate) fn poll(mut self) -> Option<Self> {
         match self.job.as_mut().poll(&mut Context::from_waker(&self.waker)) {

@@ -14,7 +14,6 @@ use cara_core::services::unit::RequestOptions;
 use cara_core::time::Duration;
 use cara_embassy::{Config, Handle, Handler, Resources, ServiceOptions, UnitEvent, message_buffer};
 use cara_embassy_host::{Bench, Board};
-use embassy_net::{ConfigV4, Ipv4Cidr, StaticConfigV4};
 use embassy_time::{Timer, with_timeout};
 
 const SHORT: Duration = Duration::from_secs(5);
@@ -182,12 +181,7 @@ fn a_new_address_ends_the_link_and_the_board_is_found_there() {
     let bench = Bench::new(4);
     let ((_, manager), (agv_board, agv)) = (manager(&bench), agv(&bench));
     assert!(bench.run_until(|| manager.number_of_s_units() == 1 && agv.is_connected(), SHORT));
-    let moved = StaticConfigV4 {
-        address: Ipv4Cidr::new(Ipv4Addr::new(10, 77, 9, 9), 16),
-        gateway: None,
-        dns_servers: Default::default(),
-    };
-    agv_board.stack().set_config_v4(ConfigV4::Static(moved));
+    agv_board.move_to(Ipv4Addr::new(10, 77, 9, 9));
     let there = || manager.peer("agv").unwrap().address().is_some_and(|at| at.ip() == Ipv4Addr::new(10, 77, 9, 9));
     assert!(bench.run_until(there, LONG));
     assert_eq!(agv.with_state(|state| state.losses), Ok(1));
