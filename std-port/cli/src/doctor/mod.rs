@@ -1,13 +1,67 @@
-//! `cara doctor`.
+//! `cara doctor`: why is a node not there, and what is strange on this host and its network?
+//!
+//! [`look`] gathers evidence: a survey of the network, connections that are tried, the units of this host through their
+//! control sockets. [`node`], [`connected`], [`network`] and [`host`] judge it; they are pure.
+
+mod causes;
+mod connected;
+mod dial;
+mod evidence;
+mod finding;
+mod holder;
+mod host;
+mod look;
+mod network;
+mod node;
+mod report;
+mod running;
+mod which;
 
 use std::process::ExitCode;
+use std::time::Duration;
 
+use cara_std::Role;
+use cara_std::survey::VERSION;
+
+use crate::exit::{Ended, Exit};
 use crate::global::Global;
+use crate::output;
+use crate::units::parse_time;
 
-/// To come.
+use self::finding::Severity;
+use self::which::Which;
+
+/// Finds out why a node is not there; or, without NAME, what is strange on this host and its network.
+///
+/// It asks the m_units of the network to show themselves, listens, tries to connect to those that do, and asks the units
+/// that run on this host. It joins nothing and is nobody's manager. Each finding is explained in docs/troubleshooting.md.
+/// The exit code is 4 if something was found.
 #[derive(clap::Args)]
-pub(crate) struct Arguments {}
+pub(crate) struct Arguments {
+    /// NAME, NAME/ID or #ID of a node.
+    #[arg(value_name = "NAME")]
+    node: Option<String>,
+    /// How long to listen at most. A node that looks for its manager says something every 16 s at the latest.
+    #[arg(long, value_name = "TIME", default_value = "17s", value_parser = parse_time)]
+    listen: Duration,
+}
 
-pub(crate) fn run(_: Arguments, _: &Global) -> anyhow::Result<ExitCode> {
-    Err(crate::exit::Ended::usage("being built"))
+pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
+    if global.act_as.is_some() {
+        return Err(Ended::usage("the doctor is nobody's manager: leave --as away"));
+    }
+    let looked = look::look(arguments.node.map(Which), arguments.listen, global)?;
+    match global.json {
+        true => output::object(&report::object(&looked))?,
+        false => report::text(&looked)?,
+    }
+    let found = looked.findings.iter().any(|finding| finding.severity != Severity::Info);
+    Ok(if found { Exit::Findings } else { Exit::Done }.into())
+}
+
+const fn role(role: Role) -> &'static str {
+    match role {
+        Role::MUnit => "m_unit",
+        Role::SUnit => "s_unit",
+    }
 }

@@ -1,0 +1,166 @@
+//! What the doctor knows when it judges: plain values, so that each judgement can be tested by itself.
+
+use std::collections::BTreeMap;
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use cara_std::survey::{Foreign, Heard, Reach};
+use cara_std::{Fleet, Identity, Interfaces, Manager, Role};
+
+use super::dial::Dial;
+use super::running::Running;
+use super::which::Which;
+
+/// Two lives that overlap by less than this may be one after the other: datagrams overtake each other.
+const OVERTAKING: Duration = Duration::from_millis(200);
+
+/// All that was seen.
+#[derive(Clone, Debug)]
+pub(crate) struct Evidence {
+    /// The node that is asked about; the host and the whole network without one.
+    pub(crate) which: Option<Which>,
+    pub(crate) fleet: Fleet,
+    pub(crate) interfaces: Interfaces,
+    /// Loopback alone is used because the environment says so, not the command line.
+    pub(crate) loopback_by_environment: bool,
+    pub(crate) port: u16,
+    /// How long was listened.
+    pub(crate) listened: Duration,
+    pub(crate) heard: Vec<Heard>,
+    pub(crate) foreign: Vec<Foreign>,
+    pub(crate) reach: Vec<Reach>,
+    /// Network devices that the system has, with or without an address, loopback left out.
+    pub(crate) devices: Vec<String>,
+    pub(crate) dials: Vec<Dial>,
+    /// Units of this host that can be asked, as they were last.
+    pub(crate) running: Vec<Running>,
+    /// Why units of this host could not be asked.
+    pub(crate) control_refused: Option<String>,
+    /// Lives of connected nodes as those units saw them.
+    pub(crate) connected_lives: Vec<Life>,
+    /// Nodes that answered when they were asked alone, and not when all were.
+    pub(crate) answered_alone: Vec<SocketAddr>,
+}
+
+/// One life of a node, between two times at which it was seen.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Life {
+    /// `NAME/ID`.
+    pub(crate) node: String,
+    pub(crate) epoch: u64,
+    /// Where it was seen.
+    pub(crate) at: String,
+    pub(crate) first: Duration,
+    pub(crate) last: Duration,
+}
+
+impl Evidence {
+    /// Units of our fleet and version.
+    pub(crate) fn ours(&self) -> impl Iterator<Item = (&Heard, &Identity)> {
+        self.units().filter(|(heard, _)| heard.same_version() && heard.fleet == self.fleet)
+    }
+
+    /// Everybody who has a name, other surveys left out.
+    pub(crate) fn units(&self) -> impl Iterator<Item = (&Heard, &Identity)> {
+        self.heard
+            .iter()
+            .filter(|heard| !heard.is_survey())
+            .filter_map(|heard| heard.identity.as_ref().map(|identity| (heard, identity)))
+    }
+
+    /// What was heard from the node that is asked about, in any fleet and version.
+    pub(crate) fn of<'e>(&'e self, which: &'e Which) -> impl Iterator<Item = (&'e Heard, &'e Identity)> {
+        self.units().filter(|(_, identity)| which.is_identity(identity))
+    }
+
+    /// M_units of our fleet that were heard, each once, as it was heard last.
+    pub(crate) fn m_units(&self) -> Vec<(&Heard, &Identity)> {
+        let mut found: Vec<(&Heard, &Identity)> = Vec::new();
+        for (heard, identity) in self.ours().filter(|(_, identity)| identity.role() == Role::MUnit) {
+            match found.iter_mut().find(|(_, known)| *known == identity) {
+                Some(known) if known.0.last < heard.last => *known = (heard, identity),
+                Some(_) => {}
+                None => found.push((heard, identity)),
+            }
+        }
+        found
+    }
+
+    /// Names of the m_units of our fleet that run, heard or on this host.
+    pub(crate) fn managers(&self) -> Vec<String> {
+        let here = self.running.iter().filter(|running| running.is_m_unit() && running.unit.fleet == self.fleet.0);
+        let mut names: Vec<String> = here.map(Running::name).collect();
+        names.extend(self.m_units().iter().map(|(_, identity)| identity.to_string()));
+        names.sort();
+        names.dedup();
+        names
+    }
+
+    /// Names of m_units that were heard and do not run on this host, or cannot be asked.
+    pub(crate) fn managers_elsewhere(&self) -> Vec<String> {
+        let here: Vec<String> = self.running.iter().map(Running::name).collect();
+        self.managers().into_iter().filter(|name| !here.contains(name)).collect()
+    }
+
+    /// What was heard of a manager, in our fleet.
+    pub(crate) fn manager(&self, wanted: &Manager) -> Option<&Heard> {
+        self.m_units().into_iter().find(|(_, identity)| wanted.is(identity)).map(|(heard, _)| heard)
+    }
+
+    /// The lives of a node of our fleet, heard or connected, the earliest first.
+    pub(crate) fn lives(&self, node: &str) -> Vec<Life> {
+        let mut lives: BTreeMap<u64, Life> = BTreeMap::new();
+        let heard = self.ours().filter(|(_, identity)| identity.to_string() == node).filter_map(|(heard, _)| {
+            let (node, at) = (node.to_owned(), heard.source.to_string());
+            Some(Life { node, epoch: heard.epoch?.0, at, first: heard.first, last: heard.last })
+        });
+        let connected = self.connected_lives.iter().filter(|life| life.node == node).cloned();
+        for life in heard.chain(connected) {
+            let known = lives.entry(life.epoch).or_insert_with(|| life.clone());
+            known.first = known.first.min(life.first);
+            known.last = known.last.max(life.last);
+        }
+        let mut lives: Vec<Life> = lives.into_values().collect();
+        lives.sort_by_key(|life| life.first);
+        lives
+    }
+}
+
+/// Two lives that were going on at the same time.
+pub(crate) fn overlapping(lives: &[Life]) -> Option<(&Life, &Life)> {
+    let pairs = lives
+        .iter()
+        .enumerate()
+        .flat_map(|(index, first)| lives.iter().skip(index + 1).map(move |second| (first, second)));
+    pairs.into_iter().find(|(first, second)| first.last > second.first + OVERTAKING)
+}
+
+#[cfg(test)]
+pub(crate) mod samples;
+
+#[cfg(test)]
+mod tests {
+    use super::samples::{evidence, life};
+    use super::*;
+
+    #[test]
+    fn lives_overlap_when_the_earlier_one_is_seen_again() {
+        let (first, second) = (life("a/1", 1, 0, 900), life("a/1", 2, 1000, 1000));
+        assert_eq!(overlapping(&[first.clone(), second.clone()]), None);
+        let again = Life { last: Duration::from_millis(3000), ..first };
+        assert_eq!(overlapping(&[again.clone(), second.clone()]), Some((&again, &second)));
+    }
+
+    #[test]
+    fn a_node_that_is_heard_and_then_connected_has_one_life() {
+        let mut seen = evidence();
+        seen.connected_lives =
+            vec![life("agv/7", 5, 1000, 2000), life("agv/7", 5, 500, 800), life("agv/7", 6, 3000, 3000)];
+        let lives = seen.lives("agv/7");
+        assert_eq!(
+            lives.iter().map(|life| (life.epoch, life.first.as_millis(), life.last.as_millis())).collect::<Vec<_>>(),
+            [(5, 500, 2000), (6, 3000, 3000)]
+        );
+        assert!(seen.lives("agv/8").is_empty());
+    }
+}

@@ -1,0 +1,219 @@
+//! What on this host keeps every node away: interfaces, broadcasts, firewall, descriptors.
+
+use std::io::ErrorKind;
+
+use cara_std::Interfaces;
+use cara_std::survey::Reach;
+
+use super::evidence::Evidence;
+use super::finding::{Finding, Id};
+use super::holder::Holder;
+use super::running::Running;
+
+/// Own broadcasts that are sent before one that does not come back means something.
+const ENOUGH: u32 = 2;
+/// Descriptors that a unit needs beside those of its nodes: pending links, sockets, files.
+const OTHER_DESCRIPTORS: u64 = 96;
+
+/// The port of broadcasts could not be opened.
+pub(crate) fn port_in_use(port: u16, holders: &[Holder]) -> Finding {
+    let who: Vec<String> = holders.iter().map(|holder| format!("{} (process {})", holder.name, holder.pid)).collect();
+    let found = match who.is_empty() {
+        true => format!("UDP port {port} belongs to a program that does not share it and that this user may not see"),
+        false => format!("UDP port {port} belongs to {}, which does not share it", who.join(", ")),
+    };
+    let advice = "stop that program, or give it another port; as long as it runs no unit of this host starts \
+                  (run the doctor as root to see whose it is, if it is not named)";
+    Finding::error(Id::PortInUse, found, advice).about(format!("UDP port {port}")).certain(true)
+}
+
+/// What keeps nodes of the network from being heard here, the gravest first.
+pub(crate) fn check(seen: &Evidence) -> Vec<Finding> {
+    let no_way = if seen.interfaces == Interfaces::All { no_interface(seen) } else { loopback_only(seen) };
+    let mut found: Vec<Finding> = no_way.into_iter().collect();
+    let own_way: Vec<&Reach> = seen.reach.iter().filter(|reach| reach.interface.up).collect();
+    found.extend(own_way.iter().filter_map(|reach| send_refused(seen, reach)));
+    found.extend(own_way.iter().filter_map(|reach| broadcast_lost(seen, reach)));
+    found.extend(seen.running.iter().filter_map(exhausted));
+    found
+}
+
+fn loopback_only(seen: &Evidence) -> Option<Finding> {
+    seen.loopback_by_environment.then(|| {
+        Finding::error(
+            Id::LoopbackOnly,
+            "the environment variable CARA_INTERFACES keeps this command to loopback, and units that are started with it",
+            "unset CARA_INTERFACES, here and where the manager is started",
+        )
+    })
+}
+
+/// Nodes on other hosts need an interface beside loopback; on a host without one units still meet each other.
+fn no_interface(seen: &Evidence) -> Option<Finding> {
+    let real: Vec<&Reach> = seen.reach.iter().filter(|reach| !reach.interface.address.is_loopback()).collect();
+    let names = |reaches: &[&Reach]| {
+        let named: Vec<_> =
+            reaches.iter().map(|reach| format!("{} ({})", reach.interface.name, reach.interface.address)).collect();
+        named.join(", ")
+    };
+    if real.is_empty() {
+        let devices = match seen.devices.is_empty() {
+            true => "the system has no network device beside loopback".to_owned(),
+            false => format!("none of the network devices ({}) has an IPv4 address", seen.devices.join(", ")),
+        };
+        return Some(
+            Finding::error(
+                Id::NoInterface,
+                devices,
+                "give the device an IPv4 address (DHCP, or `ip address add`) and switch it on (`ip link set NAME up`)",
+            )
+            // Without loopback there is not even a node of this host to be heard.
+            .certain(seen.reach.is_empty()),
+        );
+    }
+    let up: Vec<&Reach> = real.iter().copied().filter(|reach| reach.interface.up).collect();
+    if up.is_empty() {
+        return Some(Finding::error(
+            Id::InterfaceDown,
+            format!("{}: down, or without a carrier", names(&real)),
+            "check cable and switch, or the Wi-Fi; `ip link set NAME up` if it was switched off",
+        ));
+    }
+    up.iter().all(|reach| reach.interface.broadcast.is_none()).then(|| {
+        Finding::error(
+            Id::NoBroadcastAddress,
+            format!("{}: point-to-point, or a network of one address, which carries no broadcasts", names(&up)),
+            "use an interface of a network with a broadcast address, or tell s_units their manager's address",
+        )
+    })
+}
+
+fn send_refused(seen: &Evidence, reach: &Reach) -> Option<Finding> {
+    let kind = reach.refused.filter(|_| reach.sent == 0)?;
+    let name = &reach.interface.name;
+    let (found, advice) = match kind {
+        ErrorKind::PermissionDenied => (
+            format!("the system does not let broadcasts to UDP port {} out of {name}", seen.port),
+            format!(
+                "let UDP port {} out in this host's firewall (`nft list ruleset`, `iptables -S OUTPUT`)",
+                seen.port
+            ),
+        ),
+        kind => (
+            format!("the system does not take broadcasts on {name}: {kind}"),
+            format!("look at the routes of {name} (`ip route`), and whether its address and netmask are right"),
+        ),
+    };
+    Some(Finding::error(Id::SendRefused, found, advice).about(name).certain(kind == ErrorKind::PermissionDenied))
+}
+
+fn broadcast_lost(seen: &Evidence, reach: &Reach) -> Option<Finding> {
+    (reach.sent >= ENOUGH && reach.heard == 0).then(|| {
+        let name = &reach.interface.name;
+        let found =
+            format!("{} broadcasts left through {name}, and none came back to another socket of this host", reach.sent);
+        let advice = format!(
+            "let UDP port {} in in this host's firewall, broadcasts included (`nft list ruleset`, `iptables -S INPUT`)",
+            seen.port
+        );
+        Finding::error(Id::BroadcastLost, found, advice).about(name)
+    })
+}
+
+/// Units of this host may know the answer, and cannot be asked.
+pub(crate) fn control_refused(seen: &Evidence) -> Option<Finding> {
+    let reason = seen.control_refused.as_ref()?;
+    let found = format!("units of this host could not be asked: {reason}");
+    let advice = "run the doctor as the user whose units they are, or set CARA_CONTROL_DIR as it is set for them";
+    Some(Finding::warning(Id::ControlRefused, found, advice))
+}
+
+/// A unit that has no descriptor left for one more node.
+fn exhausted(running: &Running) -> Option<Finding> {
+    let files = running.files?;
+    (files.open.saturating_add(2) >= files.limit).then(|| descriptors(running, files.open, files.limit, Finding::error))
+}
+
+/// A unit whose limit is below what its nodes may need.
+pub(crate) fn few_descriptors(running: &Running) -> Option<Finding> {
+    let files = running.files?;
+    let needed = u64::from(running.unit.constraints.maximum_nodes).saturating_add(OTHER_DESCRIPTORS);
+    (files.limit < needed).then(|| descriptors(running, files.open, files.limit, Finding::warning))
+}
+
+fn descriptors(running: &Running, open: u64, limit: u64, finding: fn(Id, String, String) -> Finding) -> Finding {
+    let maximum = running.unit.constraints.maximum_nodes;
+    let found = format!(
+        "{} may have {limit} files open and has {open}; with maximum_nodes {maximum} it needs up to {}",
+        running.name(),
+        u64::from(maximum).saturating_add(OTHER_DESCRIPTORS)
+    );
+    let advice = "raise the limit where it is started: `ulimit -n`, or LimitNOFILE= of its service";
+    finding(Id::FewDescriptors, found, advice.into()).about(running.name())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::evidence::samples::{evidence, reach, running};
+    use super::super::running::Files;
+    use super::*;
+
+    fn ids(seen: &Evidence) -> Vec<Id> {
+        check(seen).iter().map(|finding| finding.id).collect()
+    }
+
+    #[test]
+    fn a_host_in_order_has_no_findings() {
+        assert_eq!(ids(&evidence()), []);
+    }
+
+    #[test]
+    fn each_way_to_have_no_interface_is_told_apart() {
+        let mut seen = evidence();
+        seen.reach = vec![reach("lo", "127.0.0.1")];
+        assert_eq!(ids(&seen), [Id::NoInterface]);
+        seen.reach = vec![reach("eth0", "10.0.0.1")];
+        seen.reach[0].interface.up = false;
+        assert_eq!(ids(&seen), [Id::InterfaceDown]);
+        seen.reach[0].interface.up = true;
+        seen.reach[0].interface.broadcast = None;
+        assert_eq!(ids(&seen), [Id::NoBroadcastAddress]);
+        seen.interfaces = Interfaces::Loopback;
+        seen.reach = vec![reach("lo", "127.0.0.1")];
+        assert_eq!(ids(&seen), [], "whoever says --loopback means it");
+        seen.loopback_by_environment = true;
+        assert_eq!(ids(&seen), [Id::LoopbackOnly]);
+    }
+
+    #[test]
+    fn a_broadcast_that_is_not_sent_and_one_that_does_not_come_back_are_told_apart() {
+        let mut seen = evidence();
+        seen.reach[0].heard = 0;
+        assert_eq!(ids(&seen), [Id::BroadcastLost]);
+        seen.reach[0].sent = 1;
+        assert_eq!(ids(&seen), [], "one may get lost");
+        seen.reach[0].sent = 0;
+        seen.reach[0].refused = Some(ErrorKind::PermissionDenied);
+        assert_eq!(ids(&seen), [Id::SendRefused]);
+    }
+
+    #[test]
+    fn descriptors_are_compared_with_the_nodes_that_may_come() {
+        let mut unit = running("boss", 1);
+        assert_eq!(few_descriptors(&unit), None, "what cannot be seen is not found");
+        unit.files = Some(Files { limit: 100, open: 20 });
+        assert_eq!(few_descriptors(&unit).unwrap().id, Id::FewDescriptors);
+        assert_eq!(exhausted(&unit), None);
+        unit.files = Some(Files { limit: 1024, open: 20 });
+        assert_eq!(few_descriptors(&unit), None);
+        unit.files = Some(Files { limit: 1024, open: 1023 });
+        assert_eq!(exhausted(&unit).unwrap().id, Id::FewDescriptors);
+    }
+
+    #[test]
+    fn the_holder_of_the_port_is_named() {
+        let finding = port_in_use(5, &[Holder { pid: 77, name: "other".into() }]);
+        assert!(finding.found.contains("other (process 77)") && finding.found.contains("port 5"));
+        assert!(port_in_use(5, &[]).found.contains("may not see"));
+    }
+}

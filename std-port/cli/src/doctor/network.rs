@@ -1,0 +1,236 @@
+//! All that is strange on the network and on this host, for who asks about no node.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::net::IpAddr;
+
+use cara_std::Role;
+
+use super::causes::{
+    dial_of, duplicate, full, missing_manager, one_way, other_version, refusal, restarting, tcp_blocked, text_of,
+};
+use super::connected::lossy;
+use super::evidence::Evidence;
+use super::finding::{Finding, Id, Severity};
+use super::host;
+use super::running::Running;
+
+/// Findings of one kind that are listed.
+const MOST: usize = 8;
+/// Returns of nodes with a new epoch, per hour, above which a manager's counter is strange; and at least so many.
+const RETURNS_PER_HOUR: u64 = 6;
+const RETURNS: u64 = 3;
+
+/// All that is strange, the gravest first.
+pub(crate) fn check(seen: &Evidence) -> Vec<Finding> {
+    let mut found = host::check(seen);
+    // A host without a network may run a whole fleet on loopback.
+    found
+        .iter_mut()
+        .filter(|finding| finding.id == Id::NoInterface)
+        .for_each(|finding| finding.severity = Severity::Warning);
+    found.extend(lives(seen));
+    found.extend(managers(seen));
+    found.extend(searching(seen));
+    found.extend(versions(seen));
+    found.extend(seen.running.iter().flat_map(|unit| running(seen, unit)));
+    found.extend(fleets(seen));
+    found.extend(foreign(seen));
+    found.extend(host::control_refused(seen));
+    found.extend(several(seen));
+    found.sort_by_key(|finding| finding.severity);
+    found
+}
+
+fn lives(seen: &Evidence) -> Vec<Finding> {
+    let mut nodes: BTreeSet<String> = seen.ours().map(|(_, identity)| identity.to_string()).collect();
+    nodes.extend(seen.connected_lives.iter().map(|life| life.node.clone()));
+    let judged = nodes.iter().filter_map(|node| {
+        let lives = seen.lives(node);
+        duplicate(node, &lives).or_else(|| restarting(node, &lives))
+    });
+    judged.take(MOST).collect()
+}
+
+fn managers(seen: &Evidence) -> Vec<Finding> {
+    let mut found = Vec::new();
+    for (heard, identity) in seen.m_units() {
+        let name = identity.to_string();
+        found.extend(dial_of(seen, heard).and_then(|dial| tcp_blocked(&name, dial)));
+        let here = seen.running.iter().any(|unit| unit.name() == name);
+        if heard.room == Some(0) && !here {
+            found.push(Finding { severity: Severity::Warning, ..full(&name, None) });
+        }
+    }
+    if seen.managers().is_empty() {
+        let text = format!("no m_unit of fleet {} answers, and none runs on this host", seen.fleet.0);
+        let advice = "start the manager, or say with --fleet which fleet is meant";
+        found.push(Finding::warning(Id::NoManager, text, advice));
+    }
+    found.extend(seen.answered_alone.iter().map(|at| one_way(seen, *at)));
+    found.truncate(MOST);
+    found
+}
+
+/// Nodes that look for a manager which does not run.
+fn searching(seen: &Evidence) -> Vec<Finding> {
+    let managers = seen.managers();
+    if managers.is_empty() {
+        return Vec::new();
+    }
+    let mut found: Vec<Finding> = Vec::new();
+    let s_units = seen.ours().filter(|(_, identity)| identity.role() == Role::SUnit);
+    for (heard, identity) in s_units {
+        let Some(wanted) = heard.wanted.as_ref().filter(|wanted| !managers.contains(&text_of(wanted))) else {
+            continue;
+        };
+        let name = identity.to_string();
+        if found.iter().all(|known| known.about.as_deref() != Some(&name)) {
+            found.push(missing_manager(seen, &name, wanted));
+        }
+    }
+    found.truncate(MOST);
+    found
+}
+
+fn versions(seen: &Evidence) -> Vec<Finding> {
+    let mut told = BTreeSet::new();
+    let strange = seen.heard.iter().filter(|heard| !heard.same_version());
+    let first = strange.filter(|heard| told.insert(heard.source));
+    first
+        .take(MOST)
+        .map(|heard| {
+            let about = heard.identity.as_ref().map_or("a node".to_owned(), ToString::to_string);
+            Finding { severity: Severity::Warning, ..other_version(&about, heard) }
+        })
+        .collect()
+}
+
+/// What a unit of this host has met.
+fn running(seen: &Evidence, unit: &Running) -> Vec<Finding> {
+    let mut found: Vec<Finding> = host::few_descriptors(unit).into_iter().collect();
+    if unit.is_full() {
+        let limit = Some(unit.unit.constraints.maximum_nodes);
+        found.push(Finding { severity: Severity::Warning, ..full(&unit.name(), limit) });
+    }
+    // A refused version that was heard here as well is told already.
+    let told =
+        |address: &str| seen.heard.iter().any(|heard| !heard.same_version() && heard.source.to_string() == address);
+    let refusals = unit
+        .refused
+        .iter()
+        .filter(|refused| !told(&refused.address))
+        .filter_map(|refused| refusal(&unit.name(), refused));
+    found.extend(refusals.take(MOST).map(|finding| Finding { severity: Severity::Warning, ..finding }));
+    let connected = unit.nodes.iter().filter(|node| node.connected);
+    found.extend(connected.filter_map(|node| lossy(unit, &format!("{}/{}", node.name, node.id))).take(MOST));
+    found.extend(returns(unit));
+    found
+}
+
+/// Nodes that come back with a new epoch again and again, by the unit's counter.
+fn returns(unit: &Running) -> Option<Finding> {
+    let count = unit.own_counter("Restarted")?;
+    let hours = unit.unit.uptime_ms / 3_600_000 + 1;
+    (count >= RETURNS && count >= hours * RETURNS_PER_HOUR).then(|| {
+        let found =
+            format!("nodes of {} have started anew {count} times in {} s", unit.name(), unit.unit.uptime_ms / 1000);
+        let advice = "see which with `cara watch`; look at power supply, watchdog and log of those";
+        Finding::warning(Id::Restarting, found, advice).about(unit.name())
+    })
+}
+
+fn fleets(seen: &Evidence) -> Vec<Finding> {
+    let mut fleets: BTreeMap<u32, BTreeSet<String>> = BTreeMap::new();
+    for heard in seen.heard.iter().filter(|heard| heard.fleet != seen.fleet && !heard.is_survey()) {
+        let who = heard.identity.as_ref().map_or_else(|| heard.source.to_string(), ToString::to_string);
+        fleets.entry(heard.fleet.0).or_default().insert(who);
+    }
+    let told = fleets.iter().take(MOST).map(|(fleet, nodes)| {
+        let names: Vec<&str> = nodes.iter().take(3).map(String::as_str).collect();
+        let more = if nodes.len() > names.len() { " and others" } else { "" };
+        let found =
+            format!("fleet {fleet} is on this network too: {}{more}; this is fleet {}", names.join(", "), seen.fleet.0);
+        let advice = "in order if that is meant; a node of it that should be here needs this fleet";
+        Finding::info(Id::OtherFleet, found, advice).about(format!("fleet {fleet}"))
+    });
+    told.collect()
+}
+
+fn foreign(seen: &Evidence) -> Vec<Finding> {
+    let mut hosts: BTreeMap<IpAddr, u64> = BTreeMap::new();
+    for foreign in &seen.foreign {
+        *hosts.entry(foreign.source.ip()).or_default() += u64::from(foreign.datagrams);
+    }
+    let told = hosts.iter().take(MOST).map(|(host, datagrams)| {
+        let found = format!("{host} sent {datagrams} datagrams to UDP port {} that are not CARA's", seen.port);
+        let advice = "they are dropped; if they are many, find the program there and give it another port";
+        Finding::warning(Id::ForeignDatagrams, found, advice).about(host)
+    });
+    told.collect()
+}
+
+fn several(seen: &Evidence) -> Option<Finding> {
+    (seen.running.len() > 1).then(|| {
+        let names: Vec<String> = seen.running.iter().map(Running::name).collect();
+        let found = format!("{} units run on this host: {}", names.len(), names.join(", "));
+        Finding::info(Id::SeveralUnits, found, "say with --unit which one is meant")
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use cara_std::survey::{Foreign, Heard};
+    use cara_std::{Epoch, Fleet};
+    use std::time::Duration;
+
+    use super::super::evidence::samples::{answering, evidence, node_info, running, searching};
+    use super::super::running::Counted;
+    use super::*;
+
+    fn ids(seen: &Evidence) -> Vec<Id> {
+        check(seen).iter().map(|finding| finding.id).collect()
+    }
+
+    fn in_order() -> Evidence {
+        let mut unit = running("boss", 1);
+        unit.nodes = vec![node_info("agv", 7, true)];
+        Evidence { heard: vec![answering("boss", 3)], running: vec![unit], ..evidence() }
+    }
+
+    #[test]
+    fn a_network_in_order_has_no_findings() {
+        assert_eq!(ids(&in_order()), []);
+        assert_eq!(ids(&evidence()), [Id::NoManager]);
+    }
+
+    #[test]
+    fn all_that_is_strange_is_listed_the_gravest_first() {
+        let mut seen = in_order();
+        seen.heard.push(Heard { fleet: Fleet(9), ..searching("far", 1, "chief") });
+        seen.heard.push(Heard { version: 9, source: "10.0.0.8:1".parse().unwrap(), ..searching("old", 2, "boss") });
+        seen.heard.push(searching("lost", 3, "boos"));
+        seen.heard.push(Heard { epoch: Some(Epoch(5)), first: Duration::from_secs(4), ..searching("lost", 3, "boos") });
+        seen.foreign = vec![Foreign { source: "10.0.0.5:1".parse().unwrap(), datagrams: 3 }];
+        let unit = &mut seen.running[0];
+        unit.count("agv/7", &[("KeepAlivesMissed", 50), ("DatagramsReceived", 100)]);
+        unit.counters.push(Counted { node: None, counters: vec![("Restarted".into(), 100)] });
+        let expected = [
+            Id::Restarting,
+            Id::WrongManager,
+            Id::OtherVersion,
+            Id::LossyLink,
+            Id::Restarting,
+            Id::ForeignDatagrams,
+            Id::OtherFleet,
+        ];
+        assert_eq!(ids(&seen), expected);
+    }
+
+    #[test]
+    fn a_full_manager_and_a_second_unit_are_told() {
+        let mut seen = in_order();
+        seen.running[0].unit.connected = 64;
+        seen.running.push(running("second", 2));
+        assert_eq!(ids(&seen), [Id::Full, Id::SeveralUnits]);
+    }
+}

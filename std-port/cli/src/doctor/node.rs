@@ -1,0 +1,250 @@
+//! Why one node is not there: the causes in the order in which they exclude each other.
+
+use std::time::Duration;
+
+use cara_std::control::protocol::RefusedInfo;
+use cara_std::survey::Heard;
+use cara_std::{Identity, Manager, Role};
+
+use super::causes::{
+    deaf, dial_of, duplicate, full, missing_manager, one_way, other_fleet, other_version, refusal, restarting,
+    tcp_blocked, text_of,
+};
+use super::connected;
+use super::evidence::Evidence;
+use super::finding::{Finding, Id};
+use super::host;
+use super::running::Running;
+use super::which::Which;
+use crate::close_names::close;
+
+/// M_units answer a survey within milliseconds: whoever has not after this does not.
+const ANSWERED: Duration = Duration::from_millis(2_500);
+/// Refusals of this long before the listening are looked at: the longest pause of a node that tries again, and a bit.
+const BEFORE: Duration = Duration::from_secs(20);
+
+/// Why a node is not there, the likeliest cause first; or that it is.
+pub(crate) fn check(seen: &Evidence, which: &Which) -> Vec<Finding> {
+    if let Some(unit) = seen.running.iter().find(|running| which.is(&running.unit.name, running.unit.id)) {
+        return vec![runs_here(unit)];
+    }
+    let connections = seen.running.iter().flat_map(|unit| unit.nodes.iter().map(move |node| (unit, node)));
+    if let Some((unit, node)) =
+        connections.filter(|(_, node)| node.connected).find(|(_, node)| which.is(&node.name, node.id))
+    {
+        return connected::check(seen, unit, node);
+    }
+    let mut ours: Vec<_> = seen.of(which).filter(|(heard, _)| is_ours(seen, heard)).collect();
+    ours.sort_by_key(|(heard, _)| heard.last);
+    match ours.last() {
+        Some((heard, identity)) if identity.role() == Role::MUnit => heard_m_unit(seen, heard, identity),
+        Some((heard, identity)) => heard_s_unit(seen, which, heard, identity),
+        None => strange(seen, which).unwrap_or_else(|| silent(seen, which)),
+    }
+}
+
+fn is_ours(seen: &Evidence, heard: &Heard) -> bool {
+    heard.same_version() && heard.fleet == seen.fleet
+}
+
+fn runs_here(unit: &Running) -> Finding {
+    let found = format!("{} is a unit of this host and has run for {} s", unit.name(), unit.unit.uptime_ms / 1000);
+    Finding::info(Id::Answers, found, "nothing needs to be done").about(unit.name()).certain(true)
+}
+
+/// In another fleet or of another version, and in ours not at all.
+fn strange(seen: &Evidence, which: &Which) -> Option<Vec<Finding>> {
+    let (heard, identity) = seen.of(which).last()?;
+    let about = identity.to_string();
+    let finding = match heard.same_version() {
+        true => other_fleet(&about, heard, seen.fleet.0),
+        false => other_version(&about, heard),
+    };
+    // It could be of ours as well until that has had time to show itself.
+    let certain = seen.listened >= ANSWERED;
+    Some(vec![finding.certain(certain)])
+}
+
+/// Nothing was heard of it: host and network come before the node itself.
+fn silent(seen: &Evidence, which: &Which) -> Vec<Finding> {
+    let refused = refusals(seen, which, None);
+    if !refused.is_empty() {
+        return refused;
+    }
+    let mut found = host::check(seen);
+    found.extend(seen.answered_alone.first().map(|alone| one_way(seen, *alone)));
+    if !found.is_empty() {
+        return found;
+    }
+    // Who cannot be read may be the one that is missed.
+    let unreadable = seen.heard.iter().filter(|heard| heard.identity.is_none() && !heard.same_version());
+    found.extend(unreadable.map(|heard| other_version("a node", heard)));
+    found.truncate(8);
+    let elsewhere = seen.managers_elsewhere();
+    found.push(if elsewhere.is_empty() { not_heard(seen, which) } else { ask_its_manager(seen, which, &elsewhere) });
+    found.extend(waiting_for_another(seen));
+    found
+}
+
+fn not_heard(seen: &Evidence, which: &Which) -> Finding {
+    let used = seen.reach.iter().filter(|reach| reach.interface.up).map(|reach| reach.interface.name.clone());
+    let mut used: Vec<String> = used.collect();
+    used.dedup();
+    let mut found = format!(
+        "nothing was heard from {} in {:.0} s on {}, fleet {}",
+        which.0,
+        seen.listened.as_secs_f32(),
+        used.join(", "),
+        seen.fleet.0
+    );
+    let known = seen.units().map(|(_, identity)| identity.name());
+    let nodes = seen.running.iter().flat_map(|unit| unit.nodes.iter().map(|node| node.name.as_str()));
+    let names: Vec<&str> = known.chain(nodes).collect();
+    if let Some(name) = close(&which.0, names).first() {
+        found.push_str(&format!("; there is {name}"));
+    }
+    if let Some((unit, _)) = left(seen, which) {
+        found.push_str(&format!("; it has been connected to {}", unit.name()));
+    }
+    let advice = "check that it is switched on, cabled to this network and started; that its fleet is this one; a node that \
+                  was told its manager's address is silent here, and another cable or network carries no broadcast to here";
+    Finding::error(Id::NotHeard, found, advice).about(&which.0)
+}
+
+/// A unit of this host that has had the node connected.
+fn left<'e>(seen: &'e Evidence, which: &Which) -> Option<(&'e Running, &'e str)> {
+    let mut nodes = seen.running.iter().flat_map(|unit| unit.nodes.iter().map(move |node| (unit, node)));
+    nodes.find(|(_, node)| which.is(&node.name, node.id)).map(|(unit, node)| (unit, node.name.as_str()))
+}
+
+fn ask_its_manager(seen: &Evidence, which: &Which, managers: &[String]) -> Finding {
+    let found = format!(
+        "nothing was heard from {} in {:.0} s; it may be connected, since a connected node says nothing to others",
+        which.0,
+        seen.listened.as_secs_f32()
+    );
+    let advice = format!("run `cara doctor {}` on the host of {}", which.0, managers.join(" or "));
+    Finding::warning(Id::AskItsManager, found, advice).about(&which.0)
+}
+
+/// Nodes that look for the same manager hold back for each other, so one may speak for those that are not heard.
+fn waiting_for_another(seen: &Evidence) -> Option<Finding> {
+    let searching = seen.ours().filter_map(|(heard, identity)| Some((heard.wanted.as_ref()?, identity)));
+    let missing = |wanted: &Manager| !seen.managers().contains(&text_of(wanted));
+    let (wanted, identity) = searching.into_iter().find(|(wanted, _)| missing(wanted))?;
+    let found = missing_manager(seen, &identity.to_string(), wanted);
+    Some(Finding { severity: super::finding::Severity::Warning, ..found })
+}
+
+fn heard_m_unit(seen: &Evidence, heard: &Heard, identity: &Identity) -> Vec<Finding> {
+    let name = identity.to_string();
+    let lives = seen.lives(&name);
+    let mut found: Vec<Finding> = duplicate(&name, &lives).into_iter().chain(restarting(&name, &lives)).collect();
+    let dial = dial_of(seen, heard);
+    found.extend(dial.and_then(|dial| tcp_blocked(&name, dial)));
+    let answers = seen.ours().any(|(heard, other)| other == identity && heard.to_us > 0);
+    if found.is_empty() && seen.answered_alone.contains(&heard.source) {
+        found.push(one_way(seen, heard.source));
+    } else if found.is_empty() && !answers {
+        found.push(deaf(seen, &name, heard.source));
+    } else if found.is_empty() {
+        let text = format!("{name} is there: it answers at {}, and takes connections", heard.source);
+        let open = dial.is_some_and(|dial| dial.outcome.is_some());
+        let advice = "nothing needs to be done";
+        found.push(Finding::info(Id::Answers, text, advice).about(&name).certain(open));
+    }
+    found
+}
+
+/// It looks for its manager, and is not connected to one that can be asked.
+fn heard_s_unit(seen: &Evidence, which: &Which, heard: &Heard, identity: &Identity) -> Vec<Finding> {
+    let name = identity.to_string();
+    let lives = seen.lives(&name);
+    let twins = duplicate(&name, &lives);
+    if let Some(found) = twins {
+        return vec![found.certain(true)];
+    }
+    let refused = refusals(seen, which, Some(heard));
+    if !refused.is_empty() {
+        return refused;
+    }
+    let restarts = restarting(&name, &lives);
+    let Some(wanted) = &heard.wanted else { return restarts.into_iter().collect() };
+    let mut found: Vec<Finding> = restarts.into_iter().collect();
+    found.extend(of_its_manager(seen, &name, wanted));
+    if found.is_empty() {
+        found.push(not_joining(seen, &name, wanted));
+    }
+    found
+}
+
+/// What is wrong with the manager that a node looks for, as seen from here.
+fn of_its_manager(seen: &Evidence, name: &str, wanted: &Manager) -> Option<Finding> {
+    let manager = text_of(wanted);
+    let here =
+        seen.running.iter().find(|unit| unit.name() == manager && unit.is_m_unit() && unit.unit.fleet == seen.fleet.0);
+    let Some(heard) = seen.manager(wanted) else {
+        if here.is_some() {
+            return None;
+        }
+        let abroad = seen.units().find(|(_, identity)| wanted.is(identity));
+        let found = match abroad {
+            Some((heard, _)) if !heard.same_version() => other_version(&manager, heard),
+            Some((heard, _)) => other_fleet(&manager, heard, seen.fleet.0),
+            None => missing_manager(seen, name, wanted),
+        };
+        return Some(found.certain(seen.listened >= ANSWERED));
+    };
+    if let Some(blocked) = dial_of(seen, heard).and_then(|dial| tcp_blocked(&manager, dial)) {
+        return Some(blocked);
+    }
+    let limit = here.filter(|unit| unit.is_full()).map(|unit| unit.unit.constraints.maximum_nodes);
+    if heard.room == Some(0) || limit.is_some() {
+        return Some(full(&manager, limit).certain(true));
+    }
+    seen.answered_alone.contains(&heard.source).then(|| one_way(seen, heard.source))
+}
+
+/// What the units of this host say about why they refused it.
+fn refusals(seen: &Evidence, which: &Which, heard: Option<&Heard>) -> Vec<Finding> {
+    let recent = u64::try_from((seen.listened + BEFORE).as_millis()).unwrap_or(u64::MAX);
+    let same_host = |refused: &RefusedInfo| {
+        let ip = refused.address.parse().ok().map(|address: std::net::SocketAddr| address.ip());
+        refused.node.is_none()
+            && heard.is_some_and(|heard| ip == Some(heard.source.ip()) && !ip.is_some_and(|ip| ip.is_loopback()))
+    };
+    let of_it = |refused: &&RefusedInfo| {
+        refused.ago_ms <= recent
+            && (refused.node.as_deref().is_some_and(|node| which.is_text(node)) || same_host(refused))
+    };
+    let told =
+        seen.running.iter().flat_map(|unit| unit.refused.iter().filter(of_it).map(move |refused| (unit, refused)));
+    let mut told: Vec<_> = told.collect();
+    told.sort_by_key(|(_, refused)| refused.ago_ms);
+    let mut found: Vec<Finding> = Vec::new();
+    for finding in told.iter().filter_map(|(unit, refused)| refusal(&unit.name(), refused)) {
+        if found.iter().all(|known| known.id != finding.id) {
+            found.push(finding.certain(true));
+        }
+    }
+    found
+}
+
+fn not_joining(seen: &Evidence, name: &str, wanted: &Manager) -> Finding {
+    let manager = text_of(wanted);
+    let port = seen.manager(wanted).and_then(|heard| heard.tcp_port);
+    let port = port.map_or("its TCP port".to_owned(), |port| format!("TCP port {port}"));
+    let found = format!(
+        "{name} and its manager {manager} are both heard here, and {name} still looks for it after {:.0} s",
+        seen.listened.as_secs_f32()
+    );
+    let advice = format!(
+        "if it does not join within the next seconds: what {manager} sends (UDP port {}) does not reach {name}, or {port} of \
+         {manager} is closed to it; look at the firewalls of both, and run `cara doctor {name}` on the manager's host",
+        seen.port
+    );
+    Finding::error(Id::NotJoining, found, advice).about(name)
+}
+
+#[cfg(test)]
+mod tests;

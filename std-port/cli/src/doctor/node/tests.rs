@@ -1,0 +1,147 @@
+use std::net::SocketAddr;
+
+use cara_std::Fleet;
+
+use super::super::dial::{Dial, Outcome};
+use super::super::evidence::samples::{answering, evidence, node_info, running, searching};
+use super::*;
+
+fn ids(seen: &Evidence) -> Vec<Id> {
+    check(seen, &Which("agv".into())).iter().map(|finding| finding.id).collect()
+}
+
+fn refused(reason: &str, node: Option<&str>, address: &str) -> RefusedInfo {
+    RefusedInfo {
+        address: address.into(),
+        node: node.map(Into::into),
+        reason: reason.into(),
+        text: "do this".into(),
+        ago_ms: 1000,
+    }
+}
+
+/// `agv` looks for `boss/1`, which answers.
+fn both() -> Evidence {
+    let mut seen = evidence();
+    seen.heard = vec![searching("agv", 7, "boss"), answering("boss", 3)];
+    seen.dials = vec![Dial { to: seen.heard[1].listens_at().unwrap(), outcome: Some(Outcome::Open) }];
+    seen
+}
+
+#[test]
+fn silence_is_explained_by_the_host_before_the_node() {
+    let mut seen = evidence();
+    assert_eq!(ids(&seen), [Id::NotHeard]);
+    seen.reach[0].heard = 0;
+    assert_eq!(ids(&seen), [Id::BroadcastLost]);
+    seen.reach[0].heard = 1;
+    seen.answered_alone = vec!["10.0.0.9:21970".parse().unwrap()];
+    assert_eq!(ids(&seen), [Id::BroadcastOneWay]);
+}
+
+#[test]
+fn a_manager_elsewhere_may_have_it() {
+    let mut seen = evidence();
+    seen.heard = vec![answering("boss", 3)];
+    assert_eq!(ids(&seen), [Id::AskItsManager]);
+    seen.running = vec![running("boss", 1)];
+    assert_eq!(ids(&seen), [Id::NotHeard], "that manager runs here and does not have it");
+}
+
+#[test]
+fn who_holds_back_behind_another_is_named_after_the_silence() {
+    let mut seen = evidence();
+    seen.heard = vec![searching("other", 8, "boss")];
+    assert_eq!(ids(&seen), [Id::NotHeard, Id::NoManager]);
+}
+
+#[test]
+fn another_fleet_or_version_counts_only_where_ours_is_silent() {
+    let mut seen = evidence();
+    seen.heard = vec![Heard { fleet: Fleet(9), ..searching("agv", 7, "boss") }];
+    assert_eq!(ids(&seen), [Id::OtherFleet]);
+    seen.heard = vec![Heard { version: 9, ..searching("agv", 7, "boss") }];
+    assert_eq!(ids(&seen), [Id::OtherVersion]);
+    seen.heard.extend(both().heard);
+    seen.dials = both().dials;
+    assert_eq!(ids(&seen), [Id::NotJoining]);
+    seen.heard = vec![Heard { version: 9, identity: None, ..searching("agv", 7, "boss") }];
+    assert_eq!(ids(&seen), [Id::OtherVersion, Id::NotHeard], "one that cannot be read may be the one");
+}
+
+#[test]
+fn the_manager_that_it_looks_for_is_compared_with_those_that_run() {
+    let mut seen = both();
+    assert_eq!(ids(&seen), [Id::NotJoining]);
+    seen.heard[1] = answering("bos", 3);
+    assert_eq!(ids(&seen), [Id::WrongManager]);
+    seen.heard.truncate(1);
+    assert_eq!(ids(&seen), [Id::NoManager]);
+    seen.heard.push(Heard { fleet: Fleet(9), ..answering("boss", 3) });
+    assert_eq!(ids(&seen), [Id::OtherFleet]);
+    seen.heard[1] = Heard { version: 9, ..answering("boss", 3) };
+    assert_eq!(ids(&seen), [Id::OtherVersion]);
+}
+
+#[test]
+fn a_closed_port_or_a_full_manager_is_named() {
+    let mut seen = both();
+    seen.dials[0].outcome = Some(Outcome::TimedOut);
+    assert_eq!(ids(&seen), [Id::TcpBlocked]);
+    seen.dials[0].outcome = Some(Outcome::Open);
+    seen.heard[1].room = Some(0);
+    assert_eq!(ids(&seen), [Id::Full]);
+    seen.heard[1].room = Some(1);
+    let mut unit = running("boss", 1);
+    unit.unit.connected = 64;
+    seen.running = vec![unit];
+    assert_eq!(ids(&seen), [Id::Full]);
+}
+
+#[test]
+fn a_refusal_of_the_manager_says_it_itself() {
+    let mut seen = both();
+    let mut unit = running("boss", 1);
+    unit.refused =
+        vec![refused("DuplicateIdentity", Some("agv/7"), "10.0.0.3:1"), refused("Full", Some("other/8"), "10.0.0.4:1")];
+    seen.running = vec![unit];
+    assert_eq!(ids(&seen), [Id::Duplicate]);
+    seen.running[0].refused[0].ago_ms = 1_000_000;
+    assert_eq!(ids(&seen), [Id::NotJoining], "that was long ago");
+    seen.running[0].refused = vec![refused("Malformed", None, "10.0.0.9:33333")];
+    assert_eq!(ids(&seen), [Id::Refused], "the host is the same");
+}
+
+#[test]
+fn twins_and_restarts_are_told_apart() {
+    let mut seen = both();
+    let second = Heard {
+        epoch: Some(cara_std::Epoch(2)),
+        first: Duration::from_secs(3),
+        last: Duration::from_secs(3),
+        ..searching("agv", 7, "boss")
+    };
+    seen.heard.push(second);
+    assert_eq!(ids(&seen), [Id::Restarting]);
+    seen.heard[0].last = Duration::from_secs(6);
+    assert_eq!(ids(&seen), [Id::Duplicate]);
+}
+
+#[test]
+fn connected_answering_and_own_units_are_no_trouble() {
+    let mut seen = both();
+    let mut unit = running("boss", 1);
+    unit.nodes = vec![node_info("agv", 7, true)];
+    seen.running = vec![unit];
+    assert_eq!(ids(&seen), [Id::Connected]);
+    seen.running[0].nodes[0].connected = false;
+    assert_eq!(ids(&seen), [Id::NotJoining]);
+    let boss = |seen: &Evidence| check(seen, &Which("boss".into()))[0].id;
+    assert_eq!(boss(&seen), Id::Answers);
+    seen.running.clear();
+    assert_eq!(boss(&seen), Id::Answers);
+    seen.heard[1].to_us = 0;
+    assert_eq!(boss(&seen), Id::BroadcastOneWay, "it is heard, and answers nobody");
+    seen.dials = vec![Dial { to: SocketAddr::new(seen.heard[1].source.ip(), 4000), outcome: Some(Outcome::Refused) }];
+    assert_eq!(boss(&seen), Id::TcpBlocked);
+}

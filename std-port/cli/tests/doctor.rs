@@ -1,0 +1,299 @@
+//! `cara doctor` names the right cause first, and no wrong one, in each case that is set up here for real: units over
+//! loopback, programs beside them, and network namespaces with interfaces and firewalls of their own.
+
+#[path = "doctor/datagrams.rs"]
+mod datagrams;
+#[path = "doctor/namespace.rs"]
+mod namespace;
+#[path = "doctor/support.rs"]
+mod support;
+
+use std::net::{Ipv4Addr, UdpSocket};
+use std::time::Duration;
+
+use crate::datagrams::{MANAGER, Search};
+use crate::namespace::{Peer, ip, nft};
+use crate::support::{Clinic, until, while_running};
+
+#[test]
+fn a_program_that_does_not_share_the_port_is_named_with_its_process() {
+    let clinic = Clinic::new();
+    let _other = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, clinic.port)).unwrap();
+    for arguments in [&["agv"][..], &[]] {
+        let told = clinic.doctor(arguments);
+        told.is(&["port-in-use"], 4);
+        let process = format!("process {}", std::process::id());
+        assert!(told.found(0).contains(&process) && told.found(0).contains(&clinic.port.to_string()), "{told:?}");
+    }
+}
+
+#[test]
+fn a_node_of_another_fleet_is_told_with_both_fleets() {
+    let clinic = Clinic::new();
+    let _manager = clinic.manager("boss", 64);
+    let other = clinic.fleet.wrapping_add(1);
+    let _agv = clinic.started(clinic.unit("agv", 7, "boss").fleet(other));
+    let told = clinic.doctor(&["agv"]);
+    told.is(&["other-fleet"], 4);
+    let both = [clinic.fleet, other].map(|fleet| format!("fleet {fleet}"));
+    assert!(both.iter().all(|fleet| told.found(0).contains(fleet)), "{told:?}");
+}
+
+#[test]
+fn a_manager_of_another_fleet_is_why_its_node_waits() {
+    let clinic = Clinic::new();
+    let _agv = clinic.started(clinic.unit("agv", 7, "boss"));
+    let far = clinic.system("boss").fleet(clinic.fleet.wrapping_add(1)).build_system().unwrap();
+    far.start().unwrap();
+    let told = clinic.doctor(&["agv"]);
+    told.is(&["other-fleet"], 4);
+    assert!(told.found(0).starts_with("boss/1 "), "{told:?}");
+}
+
+#[test]
+fn a_node_of_another_manager_is_told_with_both_names() {
+    let clinic = Clinic::new();
+    let _manager = clinic.manager("boss", 64);
+    let _agv = clinic.started(clinic.unit("agv", 7, "chief"));
+    let told = clinic.doctor(&["agv/7"]);
+    told.is(&["wrong-manager"], 4);
+    assert!(["chief/1", "boss/1"].iter().all(|name| told.found(0).contains(name)), "{told:?}");
+}
+
+#[test]
+fn a_node_whose_manager_does_not_run_waits_for_it() {
+    let clinic = Clinic::new();
+    let _agv = clinic.started(clinic.unit("agv", 7, "boss"));
+    clinic.doctor(&["agv"]).is(&["no-manager"], 4);
+}
+
+#[test]
+fn a_node_of_another_version_is_told_with_its_version() {
+    let clinic = Clinic::new();
+    let _manager = clinic.manager("boss", 64);
+    let search = clinic.search("agv", 7, 1).of_version(9);
+    while_running(
+        || search.send(),
+        || {
+            let told = clinic.doctor(&["agv"]);
+            told.is(&["other-version"], 4);
+            assert!(told.found(0).contains("version 9"), "{told:?}");
+        },
+    );
+}
+
+#[test]
+fn of_two_nodes_with_one_identity_the_manager_tells() {
+    let clinic = Clinic::new();
+    let manager = clinic.manager("boss", 64);
+    let _first = clinic.started(clinic.unit("agv", 7, "boss"));
+    until("the first has come", || manager.number_of_s_units() == 1);
+    let _second = clinic.started(clinic.unit("agv", 7, "boss"));
+    until("the second was refused", || !manager.findings().is_empty());
+    // The first one is connected all the same.
+    clinic.doctor(&["agv"]).is(&["duplicate", "connected"], 4);
+}
+
+#[test]
+fn two_lives_of_one_identity_at_the_same_time_are_two_nodes() {
+    let clinic = Clinic::new();
+    let twins = [1, 2].map(|epoch| clinic.search("agv", 7, epoch));
+    let say = || twins.iter().for_each(Search::send);
+    while_running(say, || clinic.doctor(&["agv"]).is(&["duplicate"], 4));
+}
+
+#[test]
+fn a_full_manager_is_told_by_itself_and_by_what_it_says_on_the_network() {
+    let clinic = Clinic::new();
+    let manager = clinic.manager("boss", 1);
+    let _first = clinic.started(clinic.unit("first", 1, "boss"));
+    until("the first has come", || manager.number_of_s_units() == 1);
+    let _second = clinic.started(clinic.unit("second", 2, "boss"));
+    until("the second was refused", || !manager.findings().is_empty());
+    clinic.doctor(&["second"]).is(&["full"], 4);
+    // As from another host: the manager cannot be asked.
+    clinic.stranger(&["second"]).is(&["full"], 4);
+    clinic.doctor(&["first"]).is(&["connected"], 0);
+}
+
+#[test]
+fn a_node_that_is_not_there_at_all_is_not_heard() {
+    let clinic = Clinic::new();
+    let _manager = clinic.manager("boss", 64);
+    let _other = clinic.started(clinic.unit("agv-8", 8, "boss"));
+    let told = clinic.doctor(&["agv-7", "--listen", "3s"]);
+    told.is(&["not-heard"], 4);
+    assert!(told.found(0).contains("there is agv-8"), "{told:?}");
+    // From another host nobody can know.
+    clinic.stranger(&["agv-7", "--listen", "3s"]).is(&["ask-its-manager"], 4);
+}
+
+#[test]
+fn a_node_that_is_connected_is_told_with_its_address() {
+    let clinic = Clinic::new();
+    let manager = clinic.manager("boss", 64);
+    let _agv = clinic.started(clinic.unit("agv", 7, "boss"));
+    until("it has come", || manager.number_of_s_units() == 1);
+    let address = manager.s_unit("agv").unwrap().address().unwrap().to_string();
+    for name in ["agv", "agv/7", "#7"] {
+        let told = clinic.doctor(&[name]);
+        told.is(&["connected"], 0);
+        assert!(told.found(0).contains(&address) && told.found(0).contains("boss/1"), "{told:?}");
+    }
+    clinic.doctor(&["boss"]).is(&["answers"], 0);
+    clinic.stranger(&["boss"]).is(&["answers"], 0);
+    clinic.doctor(&["--listen", "3s"]).is(&[], 0);
+}
+
+#[test]
+fn a_node_that_starts_again_and_again_is_restarting() {
+    let clinic = Clinic::new();
+    let manager = clinic.manager("boss", 64);
+    let life = || {
+        let agv = clinic.started(clinic.unit("agv", 7, "boss"));
+        until("it has come", || agv.is_connected());
+        std::thread::sleep(Duration::from_millis(1200));
+        agv.stop();
+    };
+    while_running(life, || {
+        let told = clinic.doctor(&["agv"]);
+        assert_eq!(told.ids()[0], "restarting", "{told:?}");
+        assert!(told.ids()[1..].iter().all(|id| *id == "connected"), "{told:?}");
+        assert_eq!(told.code, 4);
+    });
+    assert_eq!(manager.number_of_m_units(), 0);
+}
+
+#[test]
+fn without_a_name_all_that_is_strange_is_listed() {
+    let clinic = Clinic::new();
+    let _manager = clinic.manager("boss", 64);
+    let _lost = clinic.started(clinic.unit("lost", 3, "bos"));
+    let _far = clinic.started(clinic.unit("far", 4, "boss").fleet(clinic.fleet.wrapping_add(1)));
+    let old = clinic.search("old", 5, 1).of_version(9);
+    let say = || {
+        old.send();
+        clinic.send(b"not ours");
+    };
+    while_running(say, || {
+        clinic.doctor(&[]).is(&["wrong-manager", "other-version", "foreign-datagrams", "other-fleet"], 4)
+    });
+}
+
+#[test]
+fn a_directory_of_sockets_that_others_can_enter_is_told() {
+    let clinic = Clinic::new();
+    let _manager = clinic.manager("boss", 64);
+    clinic.open_sockets_to_others();
+    clinic.doctor(&["agv", "--listen", "3s"]).is(&["ask-its-manager", "control-refused"], 4);
+}
+
+#[test]
+fn mistakes_on_the_command_line_are_told_and_nothing_is_looked_at() {
+    let clinic = Clinic::new();
+    for (arguments, code) in
+        [(&["--as", "boss/1"][..], 2), (&["agv", "--listen", "soon"], 2), (&["--unit", "nobody/1"], 3)]
+    {
+        let (found, _, errors) = clinic.output(arguments);
+        assert_eq!(found, code, "{arguments:?}: {errors}");
+        assert!(!errors.is_empty());
+    }
+}
+
+#[test]
+fn a_host_without_an_interface_is_told_so() {
+    namespace::inside("a_host_without_an_interface_is_told_so", &[], || {
+        let clinic = Clinic::on_all_interfaces();
+        clinic.doctor(&["agv"]).is(&["no-interface"], 4);
+        // With loopback alone it still listens, for units of its own.
+        ip("link set lo up");
+        clinic.doctor(&["agv", "--listen", "3s"]).is(&["no-interface"], 4);
+    });
+}
+
+#[test]
+fn an_interface_that_is_down_is_told_by_its_name() {
+    namespace::inside("an_interface_that_is_down_is_told_by_its_name", &[], || {
+        ip("link set lo up");
+        ip("link add v0 type veth peer name v1");
+        ip("address add 10.77.0.1/24 dev v0");
+        let clinic = Clinic::on_all_interfaces();
+        let told = clinic.doctor(&["agv", "--listen", "3s"]);
+        told.is(&["interface-down"], 4);
+        assert!(told.found(0).contains("v0"), "{told:?}");
+    });
+}
+
+#[test]
+fn a_firewall_that_drops_the_tcp_port_is_told_with_the_port() {
+    namespace::inside("a_firewall_that_drops_the_tcp_port_is_told_with_the_port", &["nft"], || {
+        ip("link set lo up");
+        let clinic = Clinic::new();
+        let manager = clinic.manager("boss", 64);
+        nft("input", &format!("tcp dport {} drop", manager.tcp_port()));
+        let _agv = clinic.started(clinic.unit("agv", 7, "boss"));
+        let told = clinic.doctor(&["agv"]);
+        told.is(&["tcp-blocked"], 4);
+        assert!(told.found(0).contains(&format!("TCP port {}", manager.tcp_port())), "{told:?}");
+    });
+}
+
+#[test]
+fn a_firewall_that_rejects_the_tcp_port_is_told_with_the_port() {
+    namespace::inside("a_firewall_that_rejects_the_tcp_port_is_told_with_the_port", &["nft"], || {
+        ip("link set lo up");
+        let clinic = Clinic::new();
+        let manager = clinic.manager("boss", 64);
+        nft("input", &format!("tcp dport {} reject with tcp reset", manager.tcp_port()));
+        let _agv = clinic.started(clinic.unit("agv", 7, "boss"));
+        clinic.doctor(&["agv"]).is(&["tcp-blocked"], 4);
+    });
+}
+
+#[test]
+fn broadcasts_that_the_own_firewall_drops_are_told() {
+    namespace::inside("broadcasts_that_the_own_firewall_drops_are_told", &["nft"], || {
+        ip("link set lo up");
+        let clinic = Clinic::new();
+        nft("input", &format!("udp dport {} drop", clinic.port));
+        clinic.doctor(&["agv", "--listen", "3s"]).is(&["broadcast-lost"], 4);
+    });
+}
+
+#[test]
+fn broadcasts_that_the_own_firewall_does_not_let_out_are_told() {
+    namespace::inside("broadcasts_that_the_own_firewall_does_not_let_out_are_told", &["nft"], || {
+        ip("link set lo up");
+        let clinic = Clinic::new();
+        nft("output", &format!("udp dport {} drop", clinic.port));
+        clinic.doctor(&["agv"]).is(&["send-refused"], 4);
+    });
+}
+
+/// Two hosts with a cable between them; the far one hears no broadcasts.
+#[test]
+fn broadcasts_that_do_not_reach_the_other_host_are_told() {
+    namespace::inside("broadcasts_that_do_not_reach_the_other_host_are_told", &["nft", "nsenter"], || {
+        let clinic = Clinic::on_all_interfaces();
+        let far = Peer::start(&[MANAGER, &clinic.fleet.to_string(), &clinic.port.to_string()]);
+        for command in [
+            "link set lo up",
+            "link add v0 type veth peer name v1",
+            "link set v0 up",
+            "address add 10.77.0.1/24 broadcast + dev v0",
+        ] {
+            ip(command);
+        }
+        ip(&format!("link set v1 netns {}", far.process()));
+        far.ip("address add 10.77.0.2/24 broadcast + dev v1");
+        far.ip("link set v1 up");
+        far.nft("input", "meta pkttype broadcast udp dport 0-65535 drop");
+        far.go();
+        let told = clinic.doctor(&["boss"]);
+        told.is(&["broadcast-one-way"], 4);
+        assert!(told.found(0).contains("10.77.0.2:"), "{told:?}");
+        // Without what keeps them away it answers.
+        far.no_firewall();
+        clinic.doctor(&["boss"]).is(&["answers"], 0);
+    });
+}

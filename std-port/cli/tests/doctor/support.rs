@@ -1,0 +1,190 @@
+//! Units on loopback with a fleet and a port of their own, and the doctor that is called to them.
+
+use std::fs::Permissions;
+use std::net::{Ipv4Addr, UdpSocket};
+use std::os::unix::fs::PermissionsExt;
+use std::process::Command;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use cara_std::control::Control;
+use cara_std::{Builder, CommunicationSystem, Constraints, Interfaces, Unit};
+use serde_json::Value;
+
+use crate::datagrams::Search;
+
+/// Longest wait for anything that is to happen.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+/// A network that nobody else is on.
+pub(crate) struct Clinic {
+    pub(crate) fleet: u32,
+    pub(crate) port: u16,
+    sockets: tempfile::TempDir,
+    loopback: bool,
+}
+
+impl Clinic {
+    pub(crate) fn new() -> Self {
+        Self { loopback: true, ..Self::on_all_interfaces() }
+    }
+
+    /// For inside a namespace alone.
+    pub(crate) fn on_all_interfaces() -> Self {
+        let sockets = private_directory();
+        // Free now, and hardly taken by another in the meantime.
+        let port = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).unwrap().local_addr().unwrap().port();
+        Self { fleet: random() as u32, port, sockets, loopback: false }
+    }
+
+    /// A builder of an m_unit `name/1`.
+    pub(crate) fn system(&self, name: &str) -> Builder<()> {
+        let system = CommunicationSystem::builder(name, 1).unwrap().fleet(self.fleet).discovery_port(self.port);
+        let socket = self.sockets.path().join(format!("{name}.sock"));
+        system.interfaces(Interfaces::Loopback).control(Control::Path(socket))
+    }
+
+    /// A running manager `name/1`.
+    pub(crate) fn manager(&self, name: &str, maximum_nodes: u16) -> CommunicationSystem {
+        let constraints = Constraints { maximum_nodes, ..Constraints::M_UNIT };
+        let manager = self.system(name).constraints(constraints).build_system().unwrap();
+        manager.start().unwrap();
+        manager
+    }
+
+    /// An s_unit of the manager `manager/1`.
+    pub(crate) fn unit(&self, name: &str, id: u32, manager: &str) -> Builder<()> {
+        let unit = Unit::builder(name, id, manager, 1).unwrap().fleet(self.fleet).discovery_port(self.port);
+        unit.interfaces(Interfaces::Loopback)
+    }
+
+    pub(crate) fn started(&self, unit: Builder<()>) -> Unit {
+        let unit = unit.build_unit().unwrap();
+        unit.start().unwrap();
+        unit
+    }
+
+    /// A search of an s_unit that is not there, for `boss/1`.
+    pub(crate) fn search(&self, name: &'static str, id: u8, epoch: u8) -> Search {
+        Search::new(self.fleet, self.port, name, id, epoch)
+    }
+
+    /// Any datagram.
+    pub(crate) fn send(&self, bytes: &[u8]) {
+        let socket = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
+        socket.send_to(bytes, (Ipv4Addr::LOCALHOST, self.port)).unwrap();
+    }
+
+    /// What the doctor says on this host.
+    pub(crate) fn doctor(&self, arguments: &[&str]) -> Told {
+        self.told(arguments, self.sockets.path())
+    }
+
+    /// What it says where no unit can be asked.
+    pub(crate) fn stranger(&self, arguments: &[&str]) -> Told {
+        self.told(arguments, private_directory().path())
+    }
+
+    fn told(&self, arguments: &[&str], sockets: &std::path::Path) -> Told {
+        let (code, output, errors) = self.run(arguments, sockets);
+        let told = serde_json::from_str(&output).unwrap_or_else(|_| panic!("{output}{errors}"));
+        Told { told, code }
+    }
+
+    /// From then on no unit can be asked.
+    pub(crate) fn open_sockets_to_others(&self) {
+        std::fs::set_permissions(self.sockets.path(), Permissions::from_mode(0o755)).unwrap();
+    }
+
+    /// Exit code, standard output and standard error.
+    pub(crate) fn output(&self, arguments: &[&str]) -> (i32, String, String) {
+        self.run(arguments, self.sockets.path())
+    }
+
+    fn run(&self, arguments: &[&str], sockets: &std::path::Path) -> (i32, String, String) {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_cara"));
+        command.args([
+            "doctor",
+            "--json",
+            "--fleet",
+            &self.fleet.to_string(),
+            "--discovery-port",
+            &self.port.to_string(),
+        ]);
+        command.args(self.loopback.then_some("--loopback")).args(arguments);
+        command.env("CARA_CONTROL_DIR", sockets).env_remove("CARA_INTERFACES");
+        let output = command.output().unwrap();
+        let text = |bytes| String::from_utf8(bytes).unwrap();
+        (output.status.code().unwrap(), text(output.stdout), text(output.stderr))
+    }
+}
+
+/// What the doctor said.
+#[derive(Debug)]
+pub(crate) struct Told {
+    told: Value,
+    pub(crate) code: i32,
+}
+
+impl Told {
+    /// The names of the findings, in their order.
+    pub(crate) fn ids(&self) -> Vec<&str> {
+        self.findings().iter().map(|finding| finding["id"].as_str().unwrap()).collect()
+    }
+
+    /// These findings and no others, in this order.
+    #[track_caller]
+    pub(crate) fn is(&self, ids: &[&str], code: i32) {
+        assert_eq!((self.ids(), self.code), (ids.to_vec(), code), "{}", self.told);
+        assert!(self.findings().iter().all(|finding| !finding["advice"].as_str().unwrap().is_empty()));
+    }
+
+    /// What was seen.
+    pub(crate) fn found(&self, index: usize) -> &str {
+        self.findings()[index]["found"].as_str().unwrap()
+    }
+
+    fn findings(&self) -> &Vec<Value> {
+        self.told["findings"].as_array().unwrap()
+    }
+}
+
+/// Waits until `condition` holds.
+pub(crate) fn until(what: &str, mut condition: impl FnMut() -> bool) {
+    let end = Instant::now() + PATIENCE;
+    while !condition() {
+        assert!(Instant::now() < end, "not in time: {what}");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+}
+
+/// Does `again` over and over, beside `once`.
+pub(crate) fn while_running(again: impl Fn() + Sync, once: impl FnOnce()) {
+    struct Stop<'s>(&'s AtomicBool);
+    impl Drop for Stop<'_> {
+        fn drop(&mut self) {
+            self.0.store(true, Ordering::Relaxed);
+        }
+    }
+    let stopped = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            while !stopped.load(Ordering::Relaxed) {
+                again();
+                std::thread::sleep(Duration::from_millis(100));
+            }
+        });
+        // Also when an assertion fails.
+        let _stop = Stop(&stopped);
+        once();
+    });
+}
+
+fn private_directory() -> tempfile::TempDir {
+    tempfile::Builder::new().permissions(Permissions::from_mode(0o700)).tempdir().unwrap()
+}
+
+fn random() -> u64 {
+    use std::hash::{BuildHasher, Hasher, RandomState};
+    RandomState::new().build_hasher().finish()
+}
