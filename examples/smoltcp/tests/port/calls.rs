@@ -75,6 +75,28 @@ fn a_call_may_be_answered_later_and_the_link_lives_meanwhile() {
 }
 
 #[test]
+fn answers_that_find_no_room_wait_for_it() {
+    let mut world = joined();
+    world.run(SECOND.times(2));
+    let link = world.manager().links()[0];
+    let vehicle_port = world.vehicles[0].cable.port;
+    // What the manager sends arrives; nothing that the vehicle sends does, so that it fills up.
+    world.switch.borrow_mut().set_faults_from(vehicle_port, Faults::loss(1.0));
+    let options = RequestOptions { timeout: Some(SECOND.times(30)), ..RequestOptions::default() };
+    for _ in 0..6 {
+        let now = world.now;
+        world.manager().request(now, link, "report", 1, &options, true).unwrap();
+        world.run(MILLISECOND.times(100));
+    }
+    assert!(world.vehicles[0].program.reports < 6, "there was room for all answers");
+    world.set_faults(Faults::NONE);
+    world.run(SECOND.times(20));
+    let replies: Vec<_> = world.manager().replies.iter().map(|(_, _, outcome)| *outcome).collect();
+    assert_eq!(replies, [Ok(1); 6]);
+    assert_eq!(world.vehicles[0].program.reports, 6);
+}
+
+#[test]
 fn whatever_the_network_does_a_call_runs_once_at_most_and_ends_once() {
     let mut counts = [0; 3];
     for seed in 0..10 {

@@ -66,6 +66,19 @@ fn a_manager_that_is_gone_is_noticed_in_time_and_found_again() {
 }
 
 #[test]
+fn a_manager_that_was_away_for_long_is_found_again() {
+    for mut world in [joined(11), World::dialing(12)] {
+        world.join();
+        let cable = world.power_cut();
+        world.run(SECOND.times(300));
+        assert!(!world.vehicles[0].unit.is_connected());
+        world.power_on(cable, 13);
+        world.join();
+        talk(&mut world);
+    }
+}
+
+#[test]
 fn one_direction_that_fails_ends_the_link_on_both_sides() {
     for deaf in [true, false] {
         let mut world = joined(3);

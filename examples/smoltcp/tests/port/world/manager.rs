@@ -35,9 +35,10 @@ pub(crate) fn address() -> SocketAddr {
     SocketAddr::new(IP.into(), TCP_PORT)
 }
 
-/// Parameters with one number, which both ends' functions take, and a text.
-pub(crate) fn number(value: i64) -> Parameters<1024> {
+/// Parameters with one number, which both ends' functions take, and texts.
+pub(crate) fn number(value: i64) -> Parameters<2048> {
     let mut parameters = Parameters::sized();
+    parameters.add_string("report", 900).unwrap();
     parameters.add_int("number", 1).unwrap();
     parameters.add_string("text", 400).unwrap();
     parameters.set_value("number", [value]).unwrap();

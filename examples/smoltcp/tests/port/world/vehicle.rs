@@ -31,6 +31,9 @@ pub(crate) struct Vehicle {
 pub(crate) struct Notes {
     pub(crate) now: Instant,
     pub(crate) slow: Option<Slot>,
+    pub(crate) report: Option<Slot>,
+    /// How often `report` was called.
+    pub(crate) reports: usize,
     pub(crate) go_to: Option<Slot>,
     /// Numbers that `echo` was called with.
     pub(crate) echoed: Vec<i64>,
@@ -46,6 +49,11 @@ impl Program for Notes {
         if Some(call.slot) == self.slow {
             self.waiting = Some(call.ticket);
             return Served::Later;
+        }
+        if Some(call.slot) == self.report {
+            self.reports += 1;
+            let text = "r".repeat(900);
+            return Served::Now(parameters.set_value("report", &text[..]).map_err(|_| ServiceError::BadResults));
         }
         let [number] = match parameters.variable::<[i64; 1]>("number") {
             Ok(number) => number,
@@ -94,9 +102,11 @@ impl Vehicle {
         let echo = define("echo(number: int, text: string[400]) -> (number: int)");
         unit.offer(now, &echo, plain, None).unwrap();
         let slow = unit.offer(now, &define("slow(number: int) -> (number: int)"), plain, None);
+        let report = define("report(number: int) -> (number: int, report: string[900])");
+        let report = unit.offer(now, &report, plain, None);
         let leased = Attributes { lease: Some(LEASE), ..plain };
         let go_to = unit.offer(now, &define("go_to(number: int)"), leased, Some(lease));
-        let program = Notes { slow: slow.ok(), go_to: go_to.ok(), ..Notes::default() };
+        let program = Notes { slow: slow.ok(), report: report.ok(), go_to: go_to.ok(), ..Notes::default() };
         Self { unit, cable, program, lease, due: now }
     }
 
