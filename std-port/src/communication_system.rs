@@ -216,19 +216,20 @@ impl<T: Send + 'static> CommunicationSystem<T> {
         self.engine().broadcast();
     }
 
-    /// How many s_units are connected (paper, listing line 3).
+    /// How many s_units are connected and have told what they offer (paper, listing line 3).
     #[doc(alias = "get_number_s_units")]
     pub fn number_of_s_units(&self) -> usize {
         self.number_of(Role::SUnit)
     }
 
-    /// How many m_units are connected.
+    /// How many m_units are connected and have told what they offer.
     pub fn number_of_m_units(&self) -> usize {
         self.number_of(Role::MUnit)
     }
 
     fn number_of(&self, role: Role) -> usize {
-        read(&self.engine().peers).of_role(role).filter(|peer| peer.is_connected()).count()
+        let now = self.engine().clock.now();
+        read(&self.engine().peers).of_role(role).filter(|peer| peer.is_introduced(now)).count()
     }
 
     /// The s_units in the order in which they joined. One that has left keeps its place, so an index goes on to mean the
@@ -316,21 +317,15 @@ impl<T: Send + 'static> CommunicationSystem<T> {
         options: &RequestOptions,
     ) -> Vec<(Peer<T>, Result<Parameters<BYTES>, Error>)> {
         let peers = self.nodes_offering(function);
-        let calls: Vec<_> = peers
-            .into_iter()
-            .map(|peer| {
-                let call = peer.link().and_then(|link| self.engine().call_future(link, function, parameters, options));
-                (peer, call)
-            })
-            .collect();
-        calls
-            .into_iter()
-            .map(|(peer, call)| {
-                let mut results = parameters.clone();
-                let outcome = call.and_then(|mut call| wait(|cx| call.poll(cx, &mut results)));
-                (peer, outcome.map(|()| results))
-            })
-            .collect()
+        let links = peers.iter().map(Peer::link).collect();
+        let calls = self.engine().call_each(links, function, parameters, options);
+        let each = peers.into_iter().zip(calls);
+        each.map(|(peer, call)| {
+            let mut results = parameters.clone();
+            let outcome = call.and_then(|mut call| wait(|cx| call.poll(cx, &mut results)));
+            (peer, outcome.map(|()| results))
+        })
+        .collect()
     }
 
     /// The constraints in force.

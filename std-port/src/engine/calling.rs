@@ -20,6 +20,9 @@ use crate::sys::stream::{Received, Wait};
 /// How long a caller waits at a time for room or for its turn, before it looks again.
 const PAUSE: Duration = Duration::from_millis(20);
 
+/// The same for calls of many links, of which one or the other soon has room.
+const SHORT_PAUSE: Duration = Duration::from_millis(2);
+
 thread_local! {
     /// What a leader reads into. A leader runs no handlers, so there is one at a time in a thread.
     static READ_BUFFER: std::cell::RefCell<Vec<u8>> = const { std::cell::RefCell::new(Vec::new()) };
@@ -75,9 +78,7 @@ impl<T: Send + 'static> Engine<T> {
                     state.waiters.push(Waiter { id, wake: Wake::Thread(thread::current()), outcome: None });
                     return Ok((state, id, deadline));
                 }
-                Err(error @ Error::TooSoon { wait }) => (error, wait),
-                Err(error @ Error::Full(Limit::SendQueue | Limit::Buffers | Limit::Calls)) => (error, PAUSE),
-                Err(error) => (error, Duration::MAX),
+                Err(error) => (error, worth_waiting(&error, PAUSE).unwrap_or(Duration::MAX)),
             };
             self.settle(link, state);
             if self.now() + wait >= deadline {
@@ -195,6 +196,48 @@ impl<T: Send + 'static> Engine<T> {
         }
         self.settle(&link, state);
         sent.map(|id| CallFuture { engine: self.clone(), link, id })
+    }
+}
+
+impl<T: Send + 'static> Engine<T> {
+    /// Begins a call on each of many links. One that has no room, or whose interval has not passed, is tried again
+    /// within the deadline, while the others run.
+    pub(crate) fn call_each(
+        self: &Arc<Self>,
+        links: Vec<Result<Arc<LinkCell>, Error>>,
+        function: &str,
+        parameters: &ParametersView,
+        options: &RequestOptions,
+    ) -> Vec<Result<CallFuture<T>, Error>> {
+        let began = self.now();
+        let mut calls: Vec<_> = links.iter().map(|_| None).collect();
+        loop {
+            let mut pause = Duration::MAX;
+            for (link, call) in links.iter().zip(&mut calls).filter(|(_, call)| call.is_none()) {
+                let Ok(link) = link.as_ref().map_err(|error| *call = Some(Err(*error))) else { continue };
+                let usual = || link.lock().session.constraints().request_timeout;
+                let deadline = began + options.timeout.unwrap_or_else(usual);
+                let options = RequestOptions { timeout: Some(deadline.since(self.now())), ..*options };
+                let attempt = self.call_future(link.clone(), function, parameters, &options);
+                match attempt.as_ref().err().and_then(|error| worth_waiting(error, SHORT_PAUSE)) {
+                    Some(wait) if self.now() + wait < deadline => pause = pause.min(wait),
+                    _ => *call = Some(attempt),
+                }
+            }
+            if pause == Duration::MAX {
+                return calls.into_iter().flatten().collect();
+            }
+            thread::sleep(pause.into());
+        }
+    }
+}
+
+/// After what time a request that failed so may succeed; after `pause` where only somebody else's end makes room.
+fn worth_waiting(error: &Error, pause: Duration) -> Option<Duration> {
+    match *error {
+        Error::TooSoon { wait } => Some(wait),
+        Error::Full(Limit::SendQueue | Limit::Buffers | Limit::Calls) => Some(pause),
+        _ => None,
     }
 }
 

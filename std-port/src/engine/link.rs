@@ -1,5 +1,6 @@
 //! One link as the threads share it: the session under its lock, who waits for what, and who reads.
 
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError, TryLockError};
 use std::task::Waker;
 use std::thread::Thread;
@@ -30,6 +31,8 @@ pub(crate) struct LinkCell {
     pub(crate) serial: u32,
     pub(crate) stream: Stream,
     pub(crate) peer: OnceLock<Arc<PeerCell>>,
+    /// When the peer counts as introduced, in microseconds: at once when its list has come.
+    introduced_at: AtomicU64,
     state: Mutex<LinkState>,
     /// The stream took bytes, or the link ended.
     pub(crate) room: Condvar,
@@ -58,6 +61,8 @@ pub(crate) struct LinkState {
     pub(crate) retired: bool,
     /// What is to be done when the lock is given up.
     pub(crate) notices: Vec<Notice>,
+    /// A thread acts on earlier ones.
+    pub(crate) telling: bool,
 }
 
 /// Somebody who waits for a reply.
@@ -87,10 +92,18 @@ pub(crate) type Outcome = Result<(Box<[u8]>, Box<[u8]>), Error>;
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Notice {
     LeaseExpired(Slot),
-    LeaseEnded { slot: Slot, expired: bool },
+    /// Its safe hook has run.
+    MadeSafe(Slot),
+    LeaseEnded {
+        slot: Slot,
+        expired: bool,
+    },
     Failed(CallId, Error),
     ListChanged,
-    Acknowledged { serial: u32, skipped: u16 },
+    Acknowledged {
+        serial: u32,
+        skipped: u16,
+    },
     Joined,
     Challenge(LinkId),
     Answered,
@@ -119,8 +132,29 @@ impl LinkCell {
             pinging: false,
             retired: false,
             notices: Vec::new(),
+            telling: false,
         };
-        Self { seat, id, serial, stream, peer: OnceLock::new(), state: Mutex::new(state), room: Condvar::new() }
+        let introduced_at = AtomicU64::new(u64::MAX);
+        Self {
+            seat,
+            id,
+            serial,
+            stream,
+            peer: OnceLock::new(),
+            introduced_at,
+            state: Mutex::new(state),
+            room: Condvar::new(),
+        }
+    }
+
+    /// The peer counts from `at` on; an earlier time that was set before stays.
+    pub(crate) fn introduced(&self, at: Instant) {
+        self.introduced_at.fetch_min(at.as_micros(), Ordering::Relaxed);
+    }
+
+    /// Whether the peer's list has come, or it has had its time to tell it.
+    pub(crate) fn is_introduced(&self, now: Instant) -> bool {
+        now.as_micros() >= self.introduced_at.load(Ordering::Relaxed)
     }
 
     /// The epoll token: unit, id and serial, so that an event of an earlier link with the same id is known.

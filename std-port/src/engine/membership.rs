@@ -30,6 +30,9 @@ pub(crate) struct NodeCell {
     serial: u32,
 }
 
+/// A node that has not told its list by then counts as one that has none.
+const INTRODUCTION: Duration = Duration::from_secs(1);
+
 /// Whom a link is dialled for, as far as it is known.
 struct Dialed<'i>(Option<&'i Identity>);
 
@@ -160,6 +163,7 @@ impl<T: Send + 'static> Engine<T> {
         let Some(identity) = state.session.identity().cloned() else { return };
         self.with(link, state, |session, cx| session.accept(cx));
         let limit = usize::from(lock(&self.node).node.constraints().maximum_nodes);
+        link.introduced(self.clock.now() + INTRODUCTION);
         let peer = write(&self.peers).join(&identity, limit, link);
         if let Some(own) = peer.own_constraints(*state.session.constraints()) {
             self.with(link, state, |session, cx| session.set_constraints(cx, own));
@@ -175,19 +179,8 @@ impl<T: Send + 'static> Engine<T> {
         state.notices.push(Notice::Joined);
     }
 
-    /// Acts on what happened under a link's lock: safe hooks first.
-    pub(super) fn act(&self, link: &Arc<LinkCell>, notices: Vec<Notice>) {
-        for notice in &notices {
-            if let Notice::LeaseExpired(slot) = notice {
-                self.make_safe(*slot);
-            }
-        }
-        for notice in notices {
-            self.act_on(link, notice);
-        }
-    }
-
-    fn act_on(&self, link: &Arc<LinkCell>, notice: Notice) {
+    /// Does what a notice asks for, or tells it.
+    pub(super) fn act_on(&self, link: &Arc<LinkCell>, notice: Notice) {
         match notice {
             Notice::Challenge(old) => self.challenge(old),
             Notice::Answered => {
@@ -220,10 +213,11 @@ impl<T: Send + 'static> Engine<T> {
             Notice::Joined => UnitEvent::Joined { peer },
             Notice::ListChanged => UnitEvent::ListChanged { peer },
             Notice::Failed(call, error) => UnitEvent::RequestFailed { peer, call, error },
-            Notice::LeaseExpired(slot) => UnitEvent::LeaseExpired { peer, function: own_name(slot) },
+            Notice::MadeSafe(slot) => UnitEvent::LeaseExpired { peer, function: own_name(slot) },
             Notice::LeaseEnded { slot, expired } => UnitEvent::LeaseEnded { peer, function: their_name(slot), expired },
             Notice::Acknowledged { skipped, .. } if skipped > 0 => UnitEvent::FunctionsSkipped { peer, skipped },
-            Notice::Acknowledged { .. } | Notice::Challenge(_) | Notice::Answered | Notice::Left(_) => return None,
+            Notice::LeaseExpired(_) | Notice::Acknowledged { .. } => return None,
+            Notice::Challenge(_) | Notice::Answered | Notice::Left(_) => return None,
         })
     }
 

@@ -17,6 +17,7 @@ mod serving;
 mod state_gate;
 mod staying;
 mod tables;
+mod telling;
 pub(crate) mod workers;
 
 pub(crate) use accounts::pairs;
@@ -306,26 +307,28 @@ impl<T: Send + 'static> Engine<T> {
                     }
                 }
             },
-            Some(event) => notices.extend(notice(&event)),
+            Some(event) => {
+                if let Event::ListChanged = event {
+                    link.introduced(Instant::START);
+                }
+                notices.extend(notice(&event));
+            }
         }
         step
     }
 
     /// Polls the session as far as something is due, sets its timer and epoll interest, gives the lock up, and acts on
     /// what happened: safe hooks first.
-    pub(crate) fn settle(&self, link: &Arc<LinkCell>, mut guard: MutexGuard<'_, LinkState>) {
+    pub(crate) fn settle<'l>(&self, link: &'l Arc<LinkCell>, mut guard: MutexGuard<'l, LinkState>) {
         let state = &mut *guard;
         if state.session.deadline() <= self.clock.now() {
             self.poll_session(link, state);
         }
         self.set_timer(link, state);
         self.set_interest(link, state);
-        if state.notices.is_empty() {
-            return;
+        if !state.notices.is_empty() {
+            self.act(link, guard);
         }
-        let notices = std::mem::take(&mut state.notices);
-        drop(guard);
-        self.act(link, notices);
     }
 
     fn poll_session(&self, link: &Arc<LinkCell>, state: &mut LinkState) {

@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use cara_core::config::Constraints;
 use cara_core::distribution::identity::{Identity, Role};
 use cara_core::error::Error;
-use cara_core::time::Duration;
+use cara_core::time::{Duration, Instant};
 
 use super::accounts::Earlier;
 use super::link::LinkCell;
@@ -38,6 +38,11 @@ impl PeerCell {
 
     pub(crate) fn is_connected(&self) -> bool {
         self.link.lock().unwrap_or_else(PoisonError::into_inner).is_some()
+    }
+
+    /// Whether it is connected and what it offers is known.
+    pub(crate) fn is_introduced(&self, now: Instant) -> bool {
+        self.link().is_some_and(|link| link.is_introduced(now))
     }
 
     /// The unit's constraints with what this node has of its own.

@@ -10,6 +10,7 @@ mod constraints;
 mod handlers;
 mod junk;
 mod leases;
+mod many;
 mod members;
 mod outcomes;
 mod processes;
