@@ -73,7 +73,18 @@ fn the_man_page_renders() {
     for verb in VERBS {
         let page = std::fs::read_to_string(folder.path().join(format!("cara-{verb}.1"))).unwrap();
         assert!(page.contains(&format!(".TH cara-{verb} 1")) && page.contains(".SH OPTIONS"), "{page}");
+        formats(&folder.path().join(format!("cara-{verb}.1")));
     }
+    formats(&folder.path().join("cara.1"));
+}
+
+/// The formatter of man pages, where there is one, has nothing to say about a page.
+fn formats(page: &Path) {
+    let groff = std::process::Command::new("groff").args(["-man", "-Tascii", "-ww"]).arg(page).output();
+    let Ok(ran) = groff else { return println!("not formatted: no groff here") };
+    let said = String::from_utf8_lossy(&ran.stderr);
+    assert!(ran.status.success() && said.is_empty(), "{}: {said}", page.display());
+    assert!(ran.stdout.len() > 500, "{}", page.display());
 }
 
 /// All keys of an object and of what it holds, except those that are names of counters and nodes.

@@ -85,6 +85,9 @@ fn counters_are_shown() {
     let (few, all) = (stage.ends(0, &["counters", "agv-1"]), stage.ends(0, &["counters", "agv-1", "--zeros"]));
     assert!(few.out.lines().count() < all.out.lines().count(), "{}", all.out);
     assert!(!few.out.contains("unit\n"), "{}", few.out);
+    let metrics = stage.ends(0, &["counters", "--prometheus"]);
+    metrics.says("# TYPE ").says("# HELP ");
+    stage.ends(2, &["counters", "--prometheus", "--zeros"]);
 }
 
 #[test]
@@ -101,10 +104,17 @@ fn a_reader_that_goes_is_no_error() {
 }
 
 #[test]
-fn a_pipe_gets_no_colours() {
+fn a_pipe_gets_no_colours_and_nobody_with_no_color() {
     let stage = Stage::with(&["agv-1"]);
     for verb in [&["scan"][..], &["counters"], &["functions", "agv-9"], &["call", "agv-1", "fail"]] {
         let ran = stage.cara(verb);
         assert!(!ran.out.contains('\x1b') && !ran.err.contains('\x1b'), "{}", ran.everything());
+        let forced = |no_colour: &str| {
+            let mut command = stage.command(verb);
+            Ran::of(command.env("CLICOLOR_FORCE", "1").env("NO_COLOR", no_colour).output().unwrap())
+        };
+        let (coloured, plain) = (forced(""), forced("1"));
+        assert!(coloured.out.contains('\x1b') || coloured.err.contains('\x1b'), "{}", coloured.everything());
+        assert!(!plain.out.contains('\x1b') && !plain.err.contains('\x1b'), "{}", plain.everything());
     }
 }
