@@ -1,7 +1,7 @@
 //! `cara node` as a process: mistakes in its file, what it offers, programs that misbehave, metrics, its end.
 
 use std::io::{Read, Write};
-use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::net::{SocketAddr, TcpListener, TcpStream, UdpSocket};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::time::{Duration, Instant};
@@ -81,7 +81,7 @@ const MISTAKES: [(&str, &str, &str); 44] = [
     ("name = \"a\"\nid = 1\n[capacities]\nfunctions = 0", "4:13", "from 1 to 65535"),
     ("name = \"a\"\nid = 1\n[control]\noff = true\npath = \"x\"", "5:8", "no control socket"),
     (
-        "name = \"a\"\nid = 1\nrole = \"s_unit\"\nmanager = { name = \"m\", id = 1 }\n[control]\npath = \"/tmp/x\"",
+        "name = \"a\"\nid = 1\nrole = \"s_unit\"\nmanager = { name = \"m\", id = 1 }\n[control]\npath = \"/x\"",
         "6:8",
         "an s_unit has no control socket",
     ),
@@ -171,10 +171,14 @@ fn a_port_in_use_is_told_where_the_file_says_it() {
     let folder = TempDir::new().unwrap();
     let taken = TcpListener::bind("127.0.0.1:0").unwrap();
     let port = taken.local_addr().unwrap().port();
+    let taken_by_broadcasts = UdpSocket::bind("0.0.0.0:0").unwrap();
+    let udp_port = taken_by_broadcasts.local_addr().unwrap().port();
     let start = format!("name = \"a\"\nid = 1\nfleet = {}\ninterfaces = \"lo\"\n", random_fleet());
-    for (line, place) in
-        [(format!("tcp_port = {port}"), "5:12"), (format!("metrics.listen = \"127.0.0.1:{port}\""), "5:18")]
-    {
+    for (line, place) in [
+        (format!("tcp_port = {port}"), "5:12"),
+        (format!("metrics.listen = \"127.0.0.1:{port}\""), "5:18"),
+        (format!("discovery_port = {udp_port}"), "5:18"),
+    ] {
         std::fs::write(folder.path().join("bad.toml"), format!("{start}{line}\n")).unwrap();
         let refused = outcome(folder.path(), &["bad.toml"]);
         let told = text(&refused.stderr);

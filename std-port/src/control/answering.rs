@@ -232,18 +232,22 @@ fn counters<T: Send + 'static>(system: &CommunicationSystem<T>, node: Option<&st
     })
 }
 
-/// The whole text may be longer than a line may be, with many nodes.
 #[cfg(feature = "metrics")]
 fn metrics<T: Send + 'static>(system: &CommunicationSystem<T>, sink: Sink<'_>) -> Result<(), End> {
     let text = system.metrics();
-    let mut piece = String::new();
-    for line in text.split_inclusive('\n') {
-        if piece.len() + line.len() > PIECE_BYTES {
-            send(sink, Answer::Metrics { text: std::mem::take(&mut piece) })?;
-        }
-        piece.push_str(line);
-    }
-    send(sink, Answer::Metrics { text: piece })
+    pieces(&text, PIECE_BYTES).try_for_each(|piece| send(sink, Answer::Metrics { text: piece.to_owned() }))
+}
+
+/// Whole lines in pieces of about so many bytes: with many nodes the text is longer than an answer may be.
+#[cfg(feature = "metrics")]
+fn pieces(mut text: &str, bytes: usize) -> impl Iterator<Item = &str> {
+    std::iter::from_fn(move || {
+        let from = text.floor_char_boundary(bytes);
+        let end = text.get(from..).and_then(|rest| rest.find('\n')).map_or(text.len(), |end| from + end + 1);
+        let (piece, rest) = text.split_at_checked(end)?;
+        text = rest;
+        (!piece.is_empty()).then_some(piece)
+    })
 }
 
 #[cfg(not(feature = "metrics"))]
@@ -254,4 +258,22 @@ fn metrics<T: Send + 'static>(_: &CommunicationSystem<T>, _: Sink<'_>) -> Result
 
 fn named(counters: Vec<(&'static str, u64)>) -> Vec<(String, u64)> {
     counters.into_iter().map(|(name, count)| (name.to_owned(), count)).collect()
+}
+
+#[cfg(all(test, feature = "metrics"))]
+mod tests {
+    use super::pieces;
+
+    #[test]
+    fn pieces_are_whole_lines_and_lose_nothing() {
+        for text in ["", "one\n", "one", "ä\nzwei\n\ndrei\n", "a\nb\nc\nd"] {
+            for bytes in 0..12 {
+                let all: Vec<&str> = pieces(text, bytes).collect();
+                assert_eq!(all.concat(), text, "{bytes}");
+                let (_, whole) = all.split_last().unwrap_or((&"", &[]));
+                assert!(whole.iter().all(|piece| piece.ends_with('\n')), "{all:?}");
+            }
+        }
+        assert_eq!(pieces("a\nb\nc\n", 2).collect::<Vec<_>>(), ["a\nb\n", "c\n"]);
+    }
 }
