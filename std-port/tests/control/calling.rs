@@ -1,0 +1,201 @@
+//! Calls, round trips and events.
+
+use cara_std::control::protocol::{Answer, ArgumentValue, CallQuestion, Failure, Number, Question};
+
+use crate::support::{Depot, argument, ask, call, ping, refused, until};
+
+fn every_type() -> Vec<cara_std::control::protocol::Argument> {
+    let floats = vec![
+        Number::Finite(0.1),
+        Number::Other("NaN".into()),
+        Number::Other("-inf".into()),
+        Number::Finite(f64::MIN_POSITIVE),
+    ];
+    vec![
+        argument("i", 2, ArgumentValue::Int(vec![i64::MIN, i64::MAX])),
+        argument("f", 4, ArgumentValue::Float(floats)),
+        argument("s", 20, ArgumentValue::String("Fähre \"7\"\n".into())),
+        argument("b", 2, ArgumentValue::Bool(vec![true, false])),
+        argument("y", 8, ArgumentValue::Bytes("00ff7f".into())),
+    ]
+}
+
+/// The only outcome.
+fn outcome(answers: &[Answer]) -> Result<Vec<cara_std::control::protocol::Argument>, Failure> {
+    let [Answer::Called { node, id, results, error, .. }] = answers else { panic!("{answers:?}") };
+    assert_eq!((node.as_str(), *id), ("agv", 7));
+    error.clone().map_or(Ok(results.clone()), Err)
+}
+
+#[test]
+fn a_call_takes_every_type_both_ways() {
+    let (depot, _agv) = Depot::with_agv();
+    let answers = ask(&mut depot.client(), Question::Call(call(Some("agv"), "echo", every_type()))).unwrap();
+    assert_eq!(outcome(&answers).unwrap(), every_type());
+    assert!(matches!(&answers[..], [Answer::Called { call: None, took_us, .. }] if *took_us > 0));
+}
+
+#[test]
+fn a_call_that_cannot_be_says_what_is_wrong_and_shows_the_signature() {
+    let (depot, _agv) = Depot::with_agv();
+    let mut client = depot.client();
+    let mut failure = |function: &str, arguments| {
+        outcome(&ask(&mut client, Question::Call(call(Some("agv"), function, arguments))).unwrap()).unwrap_err()
+    };
+    let unknown = failure("fly", vec![]);
+    assert_eq!(unknown.error, "UnknownFunction");
+    assert!(unknown.text.contains("go_to"), "{unknown}");
+    let position = |size, value| vec![argument("position", size, value)];
+    let missing = failure("go_to", vec![]);
+    assert_eq!(missing.error, "MissingArgument");
+    assert!(missing.text.contains("go_to(position: int[2])"), "{missing}");
+    assert_eq!(failure("go_to", position(2, ArgumentValue::Float(vec![Number::Finite(0.0); 2]))).error, "WrongType");
+    assert_eq!(failure("go_to", position(3, ArgumentValue::Int(vec![1, 2, 3]))).error, "WrongSize");
+    let short = failure("go_to", position(2, ArgumentValue::Int(vec![1])));
+    assert!(short.error == "WrongSize" && short.text.contains("'position'"), "{short}");
+    assert_eq!(failure("go_to", position(8, ArgumentValue::Bytes("zz".into()))).error, "BadBytes");
+    assert_eq!(failure("go_to", position(u32::MAX, ArgumentValue::Int(vec![1]))).error, "TooLarge");
+    let bad_name = failure("go_to", vec![argument("posi tion", 1, ArgumentValue::Int(vec![1]))]);
+    assert_eq!(bad_name.error, "BadName");
+    let service = failure("fail", vec![]);
+    assert_eq!((service.error.as_str(), service.cause.as_str()), ("Service", "peer"));
+}
+
+#[test]
+fn a_call_that_takes_long_ends_in_time() {
+    let (depot, _agv) = Depot::with_agv();
+    let question = CallQuestion { timeout_ms: Some(50), ..call(Some("agv"), "slow", vec![]) };
+    let failure = outcome(&ask(&mut depot.client(), Question::Call(question)).unwrap()).unwrap_err();
+    assert_eq!((failure.error.as_str(), failure.cause.as_str()), ("TimedOut", "peer"));
+    depot.gate.open();
+}
+
+#[test]
+fn options_that_cannot_be_are_refused() {
+    let (depot, _agv) = Depot::with_agv();
+    let mut client = depot.client();
+    let plain = || call(Some("agv"), "fail", vec![]);
+    let priority = CallQuestion { priority: Some("urgent".into()), ..plain() };
+    assert_eq!(refused(&mut client, Question::Call(priority)), "UnknownPriority");
+    let datagram = CallQuestion { best_effort: true, ..plain() };
+    assert_eq!(refused(&mut client, Question::Call(datagram)), "BadQuestion");
+    assert_eq!(refused(&mut client, Question::Call(call(Some("x"), "fail", vec![]))), "UnknownNode");
+    assert_eq!(refused(&mut client, Question::Call(call(None, "fly", vec![]))), "UnknownFunction");
+    let nobody = Question::Bench { call: call(None, "fail", vec![]), count: 1, pause_us: 0 };
+    assert_eq!(refused(&mut client, nobody), "BadQuestion");
+}
+
+#[test]
+fn all_are_called_at_the_same_time() {
+    let depot = Depot::new();
+    let _agvs: Vec<_> = (0..4).map(|id| depot.agv(&format!("agv{id}"), id)).collect();
+    let mut client = depot.client();
+    let slow = CallQuestion { timeout_ms: Some(20_000), ..call(None, "slow", vec![]) };
+    let system = depot.system.clone();
+    let waiting = || {
+        let counters = system.counters();
+        counters.iter().find(|(name, _)| *name == "CallsInFlight").unwrap().1
+    };
+    std::thread::scope(|scope| {
+        let asking = scope.spawn(|| ask(&mut client, Question::Call(slow)).unwrap());
+        until("all four are under way", || waiting() == 4);
+        depot.gate.open();
+        let mut ids: Vec<_> = asking
+            .join()
+            .unwrap()
+            .iter()
+            .map(|answer| match answer {
+                Answer::Called { id, error: None, .. } => *id,
+                other => panic!("{other:?}"),
+            })
+            .collect();
+        ids.sort();
+        assert_eq!(ids, [0, 1, 2, 3]);
+    });
+    let answers = ask(&mut client, Question::Call(call(None, "echo", every_type()))).unwrap();
+    assert_eq!(answers.len(), 4);
+    assert!(
+        answers
+            .iter()
+            .all(|answer| matches!(answer, Answer::Called { results, error: None, .. } if *results == every_type()))
+    );
+    let asynchronous = CallQuestion { asynchronous: true, ..call(None, "fail", vec![]) };
+    let answers = ask(&mut client, Question::Call(asynchronous)).unwrap();
+    assert!(
+        answers.len() == 4
+            && answers.iter().all(|answer| matches!(answer, Answer::Called { call: Some(_), error: None, .. }))
+    );
+}
+
+#[test]
+fn round_trips_are_measured_with_and_without_a_function() {
+    let (depot, _agv) = Depot::with_agv();
+    let mut client = depot.client();
+    let measured = |answers: Vec<Answer>| {
+        let times: Vec<f64> = answers
+            .iter()
+            .map(|answer| match answer {
+                Answer::Sample { us: Some(us), error: None } => *us,
+                other => panic!("{other:?}"),
+            })
+            .collect();
+        assert!(times.iter().all(|us| *us > 0.0 && us.is_finite()), "{times:?}");
+        times.len()
+    };
+    assert_eq!(measured(ask(&mut client, ping("agv", 20, 20_000)).unwrap()), 20);
+    let before = depot.system.s_unit("agv").unwrap().counters();
+    let bench = Question::Bench { call: call(Some("agv"), "echo", every_type()), count: 300, pause_us: 0 };
+    assert_eq!(measured(ask(&mut client, bench).unwrap()), 300);
+    let sent = |counters: &[(&'static str, u64)]| counters.iter().find(|(name, _)| *name == "RequestsSent").unwrap().1;
+    assert_eq!(sent(&before), 0, "a ping calls no function");
+    assert_eq!(sent(&depot.system.s_unit("agv").unwrap().counters()), 300);
+    let failing = Question::Bench { call: call(Some("agv"), "fail", vec![]), count: 3, pause_us: 0 };
+    let answers = ask(&mut client, failing).unwrap();
+    assert!(
+        answers.len() == 3
+            && answers.iter().all(|answer| matches!(answer, Answer::Sample { us: None, error: Some(_) }))
+    );
+    assert_eq!(refused(&mut client, ping("x", 1, 1)), "UnknownNode");
+}
+
+/// Callers of one link have their turns.
+#[test]
+fn many_ping_a_node_at_the_same_time() {
+    let (depot, agv) = Depot::with_agv();
+    let peer = depot.system.s_unit("agv").unwrap();
+    let back = agv.manager().unwrap();
+    std::thread::scope(|scope| {
+        for _ in 0..8 {
+            scope.spawn(|| (0..20).for_each(|_| assert!(peer.ping(crate::support::PATIENCE).is_ok())));
+            scope.spawn(|| (0..20).for_each(|_| assert!(back.ping(crate::support::PATIENCE).is_ok())));
+        }
+    });
+}
+
+#[test]
+fn a_watch_sees_what_happens() {
+    let depot = Depot::new();
+    let (mut watching, mut other) = (depot.client(), depot.client());
+    let mut answers = watching.ask(&Question::Watch).unwrap();
+    let mut next = |wanted: &str| loop {
+        match answers.next().unwrap().unwrap() {
+            Answer::Event { event, node, text, .. } if event == wanted => return (node, text),
+            Answer::Event { .. } => {}
+            other => panic!("{other:?}"),
+        }
+    };
+    next("watching");
+    let agv = depot.agv("agv", 7);
+    assert_eq!(next("joined").0.as_deref(), Some("agv/7"));
+    assert_eq!(next("list_changed").0.as_deref(), Some("agv/7"));
+    let failing = CallQuestion { asynchronous: true, ..call(Some("agv"), "fail", vec![]) };
+    let answers = ask(&mut other, Question::Call(failing)).unwrap();
+    let [Answer::Called { call: Some(id), .. }] = answers[..] else { panic!("{answers:?}") };
+    let (node, text) = next("request_failed");
+    assert!(node.as_deref() == Some("agv/7") && text.contains(&format!("call {id}")), "{text}");
+    agv.stop();
+    assert_eq!(next("left").0.as_deref(), Some("agv/7"));
+    depot.system.stop();
+    // What is on its way comes; then the connection ends.
+    assert!(watching.ask(&Question::Unit).is_err() || watching.ask(&Question::Unit).is_err());
+}

@@ -1,0 +1,278 @@
+//! Clients that misbehave, that are too many, and that find their unit or not.
+
+use std::io::{BufRead, BufReader, Read, Write};
+use std::os::unix::net::{UnixListener, UnixStream};
+use std::time::Duration;
+
+use cara_std::control::protocol::{Answer, LONGEST_LINE, Question};
+use cara_std::control::{Client, Control, ControlError, running_in};
+
+use crate::support::{Depot, PATIENCE, ask, call, manager, until};
+
+/// A client by hand, behind the hello.
+struct Raw {
+    stream: UnixStream,
+    reader: BufReader<UnixStream>,
+}
+
+impl Raw {
+    fn new(depot: &Depot) -> Self {
+        let stream = UnixStream::connect(depot.path()).unwrap();
+        stream.set_read_timeout(Some(PATIENCE)).unwrap();
+        let reader = BufReader::new(stream.try_clone().unwrap());
+        let mut raw = Self { stream, reader };
+        assert!(matches!(raw.read(), Answer::Hello { .. }));
+        raw
+    }
+
+    fn write(&mut self, bytes: &[u8]) {
+        self.stream.write_all(bytes).unwrap();
+    }
+
+    fn read(&mut self) -> Answer {
+        let mut line = String::new();
+        self.reader.read_line(&mut line).unwrap();
+        serde_json::from_str(&line).unwrap_or_else(|error| panic!("{line}: {error}"))
+    }
+
+    fn is_refused_with(&mut self, name: &str) {
+        assert!(matches!(self.read(), Answer::Failed(failure) if failure.error == name));
+    }
+
+    /// The connection serves as before.
+    fn goes_on(&mut self) {
+        self.write(b"{\"ask\":\"search\"}\n");
+        assert_eq!(self.read(), Answer::Done);
+    }
+}
+
+#[test]
+fn what_is_no_question_is_told_so_and_the_next_line_is_read() {
+    let depot = Depot::new();
+    let mut raw = Raw::new(&depot);
+    let deep = format!("{}\n", "[".repeat(100_000));
+    for garbage in [
+        &b"\n"[..],
+        b"hello\n",
+        b"{}\n",
+        b"{\"ask\":\"fly\"}\n",
+        b"{\"ask\":\"functions\"}\n",
+        b"{\"ask\":\"functions\",\"node\":7}\n",
+        b"{\"ask\":\"functions\",\"node\":\"a\",\"more\":1}\n",
+        b"\xff\xfe\x00\n",
+        b"{\"ask\":\"ping\",\"node\":\"a\",\"count\":-1,\"pause_us\":0,\"timeout_ms\":0}\n",
+        deep.as_bytes(),
+    ] {
+        raw.write(garbage);
+        raw.is_refused_with("BadQuestion");
+        raw.goes_on();
+    }
+}
+
+#[test]
+fn a_line_that_is_too_long_is_passed_over() {
+    let depot = Depot::new();
+    let mut raw = Raw::new(&depot);
+    let mut long = vec![b' '; LONGEST_LINE + 1];
+    long.push(b'\n');
+    raw.write(&long);
+    raw.is_refused_with("TooLong");
+    raw.goes_on();
+    // As long as may be is read.
+    let question = b"{\"ask\":\"search\"}\n";
+    let mut longest = vec![b' '; LONGEST_LINE + 1 - question.len()];
+    longest.extend_from_slice(question);
+    raw.write(&longest);
+    assert_eq!(raw.read(), Answer::Done);
+}
+
+#[test]
+fn half_a_line_is_no_question_and_costs_nothing() {
+    let depot = Depot::new();
+    for _ in 0..20 {
+        let mut raw = Raw::new(&depot);
+        raw.write(b"{\"ask\":\"sea");
+        drop(raw);
+    }
+    // The threads of those that are gone leave their places.
+    until("there is room", || Client::connect(&depot.path()).is_ok());
+    let mut raw = Raw::new(&depot);
+    raw.write(b"{\"ask\":\"sea");
+    raw.write(b"rch\"}\n");
+    assert_eq!(raw.read(), Answer::Done);
+    // Whoever asks nothing more still gets what it has asked.
+    raw.write(b"{\"ask\":\"unit\"}\n{\"ask\":\"sea");
+    raw.stream.shutdown(std::net::Shutdown::Write).unwrap();
+    assert!(matches!(raw.read(), Answer::Unit(_)));
+    assert_eq!(raw.read(), Answer::Done);
+    assert_eq!(raw.reader.read(&mut [0; 1]).unwrap(), 0);
+}
+
+#[test]
+fn a_client_that_does_not_read_is_cut_off_and_disturbs_nobody() {
+    let (depot, _agv) = Depot::with_agv();
+    let mut deaf = Raw::new(&depot);
+    deaf.stream.set_write_timeout(Some(PATIENCE)).unwrap();
+    std::thread::scope(|scope| {
+        let flood = scope.spawn(move || {
+            let question = b"{\"ask\":\"counters\"}\n".repeat(100);
+            while deaf.stream.write_all(&question).is_ok() {}
+        });
+        let mut client = depot.client();
+        while !flood.is_finished() {
+            let answers = ask(&mut client, Question::Call(call(Some("agv"), "echo", crate_arguments()))).unwrap();
+            assert!(matches!(&answers[..], [Answer::Called { error: None, .. }]), "{answers:?}");
+        }
+        flood.join().unwrap();
+    });
+}
+
+fn crate_arguments() -> Vec<cara_std::control::protocol::Argument> {
+    use crate::support::argument;
+    use cara_std::control::protocol::{ArgumentValue, Number};
+    vec![
+        argument("i", 2, ArgumentValue::Int(vec![1, 2])),
+        argument("f", 4, ArgumentValue::Float(vec![Number::Finite(1.0); 4])),
+        argument("s", 20, ArgumentValue::String(String::new())),
+        argument("b", 2, ArgumentValue::Bool(vec![true, false])),
+        argument("y", 8, ArgumentValue::Bytes(String::new())),
+    ]
+}
+
+#[test]
+fn the_ninth_client_is_told_why_it_is_not_taken() {
+    let depot = Depot::new();
+    let mut clients: Vec<_> = (0..8).map(|_| depot.client()).collect();
+    match Client::connect(&depot.path()) {
+        Err(ControlError::Failed(failure)) => {
+            assert_eq!((failure.error.as_str(), failure.cause.as_str()), ("Full", "resource"))
+        }
+        other => panic!("{:?}", other.map(|client| client.unit().clone())),
+    }
+    for client in &mut clients {
+        assert_eq!(ask(client, Question::Search).unwrap(), []);
+    }
+    clients.pop();
+    until("there is room again", || Client::connect(&depot.path()).is_ok());
+}
+
+#[test]
+fn a_slow_call_keeps_nobody_else_waiting() {
+    let (depot, _agv) = Depot::with_agv();
+    let mut slow = depot.client();
+    std::thread::scope(|scope| {
+        let waiting = scope.spawn(|| ask(&mut slow, Question::Call(call(Some("agv"), "slow", vec![]))).unwrap());
+        let mut client = depot.client();
+        for _ in 0..50 {
+            assert!(ask(&mut client, Question::Unit).is_ok());
+            assert!(matches!(
+                ask(&mut client, crate::support::ping("agv", 1, 20_000)).unwrap()[..],
+                [Answer::Sample { us: Some(_), .. }]
+            ));
+        }
+        assert!(!waiting.is_finished());
+        depot.gate.open();
+        assert!(matches!(waiting.join().unwrap()[..], [Answer::Called { error: None, .. }]));
+    });
+}
+
+#[test]
+fn a_unit_that_is_dropped_stops_though_a_client_is_connected() {
+    let (depot, agv) = Depot::with_agv();
+    let mut watching = depot.client();
+    let mut idle = depot.client();
+    let path = depot.path();
+    let mut watch = watching.ask(&Question::Watch).unwrap();
+    assert!(matches!(watch.next(), Some(Ok(Answer::Event { event, .. })) if event == "watching"));
+    // The directory must outlive the unit, which removes its socket there.
+    let Depot { directory: _directory, system, .. } = depot;
+    drop(system);
+    assert!(!path.exists());
+    assert!(watch.filter(Result::is_err).count() <= 1, "it ends, whether it is told or not");
+    until("the vehicle has noticed", || !agv.is_connected());
+    let broken = match idle.ask(&Question::Unit) {
+        Ok(mut answers) => answers.any(|answer| matches!(answer, Err(ControlError::Broken(_)))),
+        Err(error) => matches!(error, ControlError::Broken(_)),
+    };
+    assert!(broken);
+}
+
+#[test]
+fn what_was_left_unread_does_not_answer_the_next_question() {
+    let (depot, _agv) = Depot::with_agv();
+    let mut client = depot.client();
+    assert!(matches!(
+        client.ask(&Question::Functions { node: "agv".into() }).unwrap().next(),
+        Some(Ok(Answer::Function(_)))
+    ));
+    assert!(matches!(ask(&mut client, Question::Unit).unwrap()[..], [Answer::Unit(_)]));
+    let _ = client.ask(&Question::Functions { node: "x".into() }).unwrap();
+    assert!(matches!(ask(&mut client, Question::Unit).unwrap()[..], [Answer::Unit(_)]));
+}
+
+#[test]
+fn a_client_finds_the_unit_that_runs_or_says_which_there_are() {
+    let depot = Depot::new();
+    let directory = depot.directory.path();
+    assert_eq!(Client::find_in(directory, None).unwrap().unit().unit, "manager/1");
+    let beside = |name: &str, id, file: &str| {
+        let system =
+            manager(name, id, depot.fleet).control(Control::Path(directory.join(file))).build_system().unwrap();
+        system.start().unwrap();
+        system
+    };
+    let (_second, _third) = (beside("manager", 2, "b.sock"), beside("other", 3, "c.sock"));
+    // What nobody answers on is not there.
+    drop(UnixListener::bind(directory.join("stale.sock")).unwrap());
+    let units: Vec<_> = running_in(directory).unwrap().into_iter().map(|unit| unit.unit).collect();
+    assert_eq!(units, ["manager/2", "other/3", "manager/1"]);
+    match Client::find_in(directory, None) {
+        Err(error @ ControlError::Several(_)) => assert!(error.to_string().contains("other/3"), "{error}"),
+        other => panic!("{:?}", other.err()),
+    }
+    assert!(
+        matches!(Client::find_in(directory, Some("manager")), Err(ControlError::Several(units)) if units.len() == 2)
+    );
+    assert_eq!(Client::find_in(directory, Some("manager/2")).unwrap().unit().unit, "manager/2");
+    assert_eq!(Client::find_in(directory, Some("other")).unwrap().unit().unit, "other/3");
+    match Client::find_in(directory, Some("nobody")) {
+        Err(ControlError::NotRunning { wanted, running }) => {
+            assert_eq!((wanted.as_str(), running.len()), ("nobody", 3))
+        }
+        other => panic!("{:?}", other.err()),
+    }
+    let empty = crate::support::directory();
+    assert!(matches!(Client::find_in(empty.path(), None), Err(ControlError::NoneRunning(_))));
+    assert!(matches!(Client::find_in(&empty.path().join("none"), None), Err(ControlError::NoneRunning(_))));
+    assert!(matches!(Client::connect(&empty.path().join("none.sock")), Err(ControlError::NoneRunning(_))));
+}
+
+/// Something that answers with `line` on a socket.
+fn impostor(line: &'static [u8]) -> (tempfile::TempDir, Result<Client, ControlError>) {
+    let directory = crate::support::directory();
+    let path = directory.path().join("x.sock");
+    let listener = UnixListener::bind(&path).unwrap();
+    let answering = std::thread::spawn(move || {
+        let (mut stream, _) = listener.accept().unwrap();
+        let _ = stream.write_all(line);
+        // Until the client is gone.
+        stream.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
+        let _ = stream.read(&mut [0; 1]);
+    });
+    let client = Client::connect(&path);
+    let client = client.map(|client| {
+        drop(client);
+        unreachable!("it is no unit")
+    });
+    answering.join().unwrap();
+    (directory, client)
+}
+
+#[test]
+fn a_client_says_what_is_wrong_with_the_other_end() {
+    let newer = impostor(b"{\"answer\":\"hello\",\"control_version\":2,\"unit\":\"x/1\",\"fleet\":0}\n").1;
+    assert!(matches!(newer, Err(ControlError::Version { theirs: 2 })));
+    for line in [&b"SSH-2.0\n"[..], b"{\"answer\":\"done\"}\n", b""] {
+        assert!(matches!(impostor(line).1, Err(ControlError::Broken(_))), "{line:?}");
+    }
+}

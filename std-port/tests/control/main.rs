@@ -1,0 +1,8 @@
+//! The control socket of a running m_unit, from its client's side and below it.
+
+mod asking;
+mod calling;
+mod clients;
+mod frozen;
+mod places;
+mod support;
