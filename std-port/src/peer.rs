@@ -122,6 +122,11 @@ impl<T: Send + 'static> Peer<T> {
         self.cell.link().map(|link| link.lock().session.address())
     }
 
+    /// How long it has been connected without a break; `None` while it is not.
+    pub fn connected_for(&self) -> Option<Duration> {
+        self.cell.connected_for().map(Into::into)
+    }
+
     /// Which of its runs is connected: it differs after each start of the node.
     pub fn epoch(&self) -> Option<Epoch> {
         self.cell.link().and_then(|link| link.lock().session.epoch())

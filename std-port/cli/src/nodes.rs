@@ -114,7 +114,8 @@ mod tests {
     fn node(name: &str, id: u32, connected: bool) -> NodeInfo {
         let (role, functions) = ("s_unit".into(), 0);
         let name = name.into();
-        NodeInfo { name, id, role, connected, address: None, version: None, epoch: None, limits: None, functions }
+        let (address, version, epoch, connected_ms, limits) = (None, None, None, None, None);
+        NodeInfo { name, id, role, connected, address, version, epoch, connected_ms, limits, functions }
     }
 
     fn chosen(nodes: &[NodeInfo], meant: &str) -> String {

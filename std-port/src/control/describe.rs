@@ -49,6 +49,7 @@ pub(super) fn node<T: Send + 'static>(peer: &Peer<T>) -> NodeInfo {
         // Nodes of another version are refused.
         version: limits.map(|_| VERSION),
         epoch: peer.epoch().map(epoch),
+        connected_ms: peer.connected_for().map(Duration::as_millis),
         limits: limits.map(self::limits),
         functions: peer.their_function_list().len(),
     }

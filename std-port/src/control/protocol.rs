@@ -305,6 +305,8 @@ pub struct NodeInfo {
     pub version: Option<u8>,
     /// Which of its runs is connected, in hexadecimal.
     pub epoch: Option<String>,
+    /// For how long it has been connected without a break.
+    pub connected_ms: Option<u64>,
     /// What it takes, while it is connected.
     pub limits: Option<LimitsInfo>,
     /// Functions that it has published to this unit.

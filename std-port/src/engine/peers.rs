@@ -17,6 +17,8 @@ use super::lock;
 pub(crate) struct PeerCell {
     pub(crate) identity: Identity,
     link: Mutex<Option<Arc<LinkCell>>>,
+    /// When it joined last.
+    joined: Mutex<Option<std::time::Instant>>,
     /// What differs for this node from the unit's constraints, whether it is connected or not.
     own: Mutex<Option<OwnConstraints>>,
     pub(super) earlier: Earlier,
@@ -38,6 +40,12 @@ impl PeerCell {
 
     pub(crate) fn is_connected(&self) -> bool {
         self.link.lock().unwrap_or_else(PoisonError::into_inner).is_some()
+    }
+
+    /// How long it has been connected.
+    pub(crate) fn connected_for(&self) -> Option<std::time::Duration> {
+        self.link()?;
+        lock(&self.joined).map(|joined| joined.elapsed())
     }
 
     /// Whether it is connected and what it offers is known.
@@ -67,6 +75,7 @@ impl PeerCell {
     }
 
     fn join(&self, link: Arc<LinkCell>) {
+        *lock(&self.joined) = Some(std::time::Instant::now());
         *self.link.lock().unwrap_or_else(PoisonError::into_inner) = Some(link);
     }
 
@@ -102,6 +111,7 @@ impl Peers {
         let peer = Arc::new(PeerCell {
             identity: identity.clone(),
             link: Mutex::new(None),
+            joined: Mutex::new(None),
             own: Mutex::new(None),
             earlier: Mutex::new(None),
         });

@@ -3,14 +3,16 @@
 use cara_std::control::protocol::NodeInfo;
 
 use super::causes::{duplicate, refusal, restarting};
-use super::evidence::{Evidence, Life};
+use super::evidence::Evidence;
 use super::finding::{Finding, Id};
 use super::running::Running;
 
 use std::time::Duration;
 
-/// A connected node is watched for this long before it is called in order.
-const SETTLED: Duration = Duration::from_secs(3);
+/// A node that has been connected for less is watched for as long as may be listened: it may come and go.
+const SETTLED: Duration = Duration::from_secs(10);
+/// And any one for this long, since another one may show itself in its name.
+const WATCHED: Duration = Duration::from_secs(2);
 /// Missed signs of life below which nothing is said.
 const FEW_MISSES: u64 = 3;
 /// Missed signs of life per datagram received above which a link loses too much: one in fifty.
@@ -25,17 +27,17 @@ pub(crate) fn check(seen: &Evidence, unit: &Running, node: &NodeInfo) -> Vec<Fin
     found.extend(restarting(&name, &lives));
     found.extend(lossy(unit, &name));
     let address = node.address.as_deref().unwrap_or("an unknown address");
-    let text = format!("{name} is connected to {} at {address}{}", unit.name(), since(&lives));
-    let certain = seen.listened >= SETTLED && found.is_empty();
+    let text = format!("{name} is connected to {} at {address}{}", unit.name(), since(node));
+    let settled = node.connected_ms.is_some_and(|ms| Duration::from_millis(ms) >= SETTLED);
+    let certain = settled && seen.listened >= WATCHED && found.is_empty();
     found.push(Finding::info(Id::Connected, text, "nothing needs to be done").about(&name).certain(certain));
     found
 }
 
-/// How long it has been seen connected, in one life.
-fn since(lives: &[Life]) -> String {
-    lives
-        .last()
-        .map_or(String::new(), |life| format!(", without a break for {:.1} s", (life.last - life.first).as_secs_f32()))
+/// For how long.
+fn since(node: &NodeInfo) -> String {
+    node.connected_ms
+        .map_or(String::new(), |ms| format!(", without a break for {:.1} s", Duration::from_millis(ms).as_secs_f32()))
 }
 
 /// Somebody else came in its name a short while ago, and was refused.
@@ -72,15 +74,14 @@ mod tests {
     fn connected() -> Evidence {
         let mut unit = running("boss", 1);
         unit.nodes = vec![node_info("agv", 7, true)];
-        Evidence { running: vec![unit], listened: SETTLED, ..evidence() }
+        Evidence { running: vec![unit], listened: WATCHED, ..evidence() }
     }
 
     #[test]
     fn in_order_is_told_with_address_and_time() {
-        let mut seen = connected();
-        seen.connected_lives = vec![life("agv/7", 1, 0, 3000)];
+        let seen = connected();
         let found = check(&seen, &seen.running[0], &seen.running[0].nodes[0]);
-        assert_eq!(found[0].found, "agv/7 is connected to boss/1 at 10.0.0.7:5000, without a break for 3.0 s");
+        assert_eq!(found[0].found, "agv/7 is connected to boss/1 at 10.0.0.7:5000, without a break for 61.5 s");
         assert!(found.len() == 1 && found[0].certain);
     }
 

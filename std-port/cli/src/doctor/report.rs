@@ -1,5 +1,7 @@
 //! What the doctor prints.
 
+use std::collections::HashSet;
+
 use serde_json::{Value, json};
 
 use super::finding::{Finding, Severity};
@@ -52,7 +54,7 @@ pub(crate) fn text(looked: &Looked) -> std::io::Result<()> {
     if looked.findings.is_empty() {
         output::line(format_args!("{GOOD}nothing strange was found{GOOD:#}"))?;
     }
-    let heard = seen.units().map(|(_, identity)| identity).collect::<std::collections::HashSet<_>>().len();
+    let heard = seen.units().map(|(heard, identity)| (heard.fleet, identity)).collect::<HashSet<_>>().len();
     let asked: Vec<String> = seen.running.iter().map(|running| running.name()).collect();
     let asked = if asked.is_empty() {
         "no unit of this host could be asked".to_owned()
@@ -60,7 +62,7 @@ pub(crate) fn text(looked: &Looked) -> std::io::Result<()> {
         format!("asked {}", asked.join(", "))
     };
     output::line(format_args!(
-        "{FAINT}listened {:.1} s on UDP port {}, fleet {}: {heard} nodes heard; {asked}{FAINT:#}",
+        "{FAINT}listened {:.1} s on UDP port {}, fleet {}; nodes heard: {heard}; {asked}{FAINT:#}",
         seen.listened.as_secs_f32(),
         seen.port,
         seen.fleet.0

@@ -115,6 +115,7 @@ pub(crate) fn node_info(name: &str, id: u32, connected: bool) -> NodeInfo {
         address: connected.then(|| "10.0.0.7:5000".into()),
         version: None,
         epoch: None,
+        connected_ms: connected.then_some(61_500),
         limits: None,
         functions: 0,
     }
