@@ -26,12 +26,12 @@ pub(super) fn parameters(arguments: &[Argument], results: usize) -> Result<Box<P
 }
 
 fn sized(bytes: usize) -> Option<Box<ParametersView>> {
-    Some(match bytes {
-        0..=SMALL => Box::new(Parameters::<SMALL>::sized()),
-        0..=MIDDLE => Box::new(Parameters::<MIDDLE>::sized()),
-        0..=LARGE => Box::new(Parameters::<LARGE>::sized()),
-        _ => return None,
-    })
+    match bytes {
+        bytes if bytes <= SMALL => Some(Box::new(Parameters::<SMALL>::sized())),
+        bytes if bytes <= MIDDLE => Some(Box::new(Parameters::<MIDDLE>::sized())),
+        bytes if bytes <= LARGE => Some(Box::new(Parameters::<LARGE>::sized())),
+        _ => None,
+    }
 }
 
 fn put(parameters: &mut ParametersView, argument: &Argument) -> Result<(), Failure> {
