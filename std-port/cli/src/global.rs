@@ -30,6 +30,9 @@ pub(crate) struct Global {
     /// With --as: how long to wait for the nodes that the command is about [default: 5s].
     #[arg(long, global = true, value_name = "TIME", value_parser = crate::units::parse_time, requires = "act_as")]
     wait: Option<Duration>,
+    /// With --as: the TCP port for nodes that are told their manager's address; a free one unless told.
+    #[arg(long, global = true, value_name = "PORT", requires = "act_as")]
+    pub(crate) as_port: Option<u16>,
     /// The fleet to be in; 0 unless told.
     #[arg(long, global = true, value_name = "NUMBER")]
     pub(crate) fleet: Option<u32>,

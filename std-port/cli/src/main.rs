@@ -6,6 +6,7 @@ mod commands;
 mod doctor;
 mod exit;
 mod global;
+mod interrupt;
 mod name_and_id;
 mod node;
 mod nodes;

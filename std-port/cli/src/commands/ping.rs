@@ -8,13 +8,14 @@ use serde_json::json;
 
 use crate::exit::Exit;
 use crate::global::Global;
+use crate::interrupt::Interrupt;
 use crate::nodes::{self, full_name};
 use crate::operator::{Need, Operator};
 use crate::output::{self, BAD};
 use crate::statistics::Times;
 use crate::units::{parse_time, show_micros};
 
-/// Measures round trips to a node, with no function of it involved.
+/// Measures round trips to a node, with no function of it involved. Ctrl-C ends it with its summary.
 #[derive(clap::Args)]
 pub(crate) struct Arguments {
     /// The node: NAME, NAME/ID or #ID.
@@ -33,27 +34,17 @@ pub(crate) struct Arguments {
 pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
     let mut operator = Operator::open(global, &Need::Node(&arguments.node))?;
     let node = full_name(&nodes::connected(&mut operator, &arguments.node)?);
-    let question = Question::Ping {
-        node: node.clone(),
-        count: arguments.count,
-        pause_us: arguments.interval.as_micros() as u64,
-        timeout_ms: arguments.timeout.as_millis() as u64,
-    };
+    let interrupt = Interrupt::catch()?;
     let mut samples = Vec::new();
-    operator.ask(&question, |answer| {
-        let Answer::Sample { us, error } = answer else { return Ok(()) };
-        samples.push(us);
-        if global.json {
-            return Ok(());
+    for number in 1..=arguments.count {
+        samples.extend(round_trip(&mut operator, &node, number, arguments.timeout, global)?);
+        if number < arguments.count {
+            interrupt.pause(arguments.interval);
         }
-        let number = samples.len();
-        match (us, error) {
-            (Some(us), _) => output::line(format_args!("{node} {number}: {}", show_micros(us)))?,
-            (None, Some(failure)) => output::line(format_args!("{BAD}{node} {number}:{BAD:#} {}", failure.text))?,
-            (None, None) => output::line(format_args!("{BAD}{node} {number}:{BAD:#} no answer"))?,
+        if interrupt.came() {
+            break;
         }
-        Ok(())
-    })?;
+    }
     let times = Times::of(samples);
     if global.json {
         output::object(&json!({ "node": node, "times": times }))?;
@@ -63,4 +54,31 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
         output::line(format_args!("{answered} of {} answered: median {median}, p99 {p99}, max {max}", times.tried))?;
     }
     Ok(if times.failed == 0 { Exit::Done } else { Exit::Failed }.into())
+}
+
+/// One of them, shown to people; without a time if it failed.
+fn round_trip(
+    operator: &mut Operator,
+    node: &str,
+    number: u32,
+    timeout: Duration,
+    global: &Global,
+) -> anyhow::Result<Option<Option<f64>>> {
+    let question =
+        Question::Ping { node: node.to_owned(), count: 1, pause_us: 0, timeout_ms: timeout.as_millis() as u64 };
+    let mut sample = None;
+    operator.ask(&question, |answer| {
+        let Answer::Sample { us, error } = answer else { return Ok(()) };
+        sample = Some(us);
+        if global.json {
+            return Ok(());
+        }
+        match (us, error) {
+            (Some(us), _) => output::line(format_args!("{node} {number}: {}", show_micros(us)))?,
+            (None, Some(failure)) => output::line(format_args!("{BAD}{node} {number}:{BAD:#} {}", failure.text))?,
+            (None, None) => output::line(format_args!("{BAD}{node} {number}:{BAD:#} no answer"))?,
+        }
+        Ok(())
+    })?;
+    Ok(sample)
 }

@@ -33,7 +33,11 @@ pub(super) fn start(identity: &NameAndId, global: &Global) -> anyhow::Result<Com
         .map_err(|error| Ended::usage(format!("{identity}: {error}")))?;
     let constraints = Constraints { maximum_nodes: MAXIMUM_NODES, ..Constraints::M_UNIT };
     let builder = builder.fleet(global.fleet.unwrap_or(0)).interfaces(global.interfaces());
-    let builder = builder.discovery_port(global.port()).constraints(constraints).control(Control::Off);
+    let builder = builder
+        .discovery_port(global.port())
+        .constraints(constraints)
+        .control(Control::Off)
+        .tcp_port(global.as_port.unwrap_or(0));
     let system = builder.build_system().map_err(network)?;
     system.start().map_err(network)?;
     Ok(system)

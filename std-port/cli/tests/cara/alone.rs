@@ -3,6 +3,8 @@
 use std::io::Write;
 use std::process::Stdio;
 
+use cara_std::{Interfaces, Unit};
+
 use crate::support::{Ran, Stage, private_folder};
 
 const VERBS: [&[&str]; 8] = [
@@ -78,6 +80,23 @@ fn as_a_manager_the_same_questions_have_the_same_answers() {
     stage.ends(0, &own(&["watch", "--count", "1"])).says("joined");
     let sizes = ["bench", "agv-1", "--sizes", "10", "--count", "3", "--periods", "5ms", "--group", "5"];
     stage.ends(0, &own(&sizes)).says("availability");
+}
+
+#[test]
+fn a_node_that_is_told_an_address_is_met_there() {
+    let stage = Stage::empty();
+    let address = {
+        let free = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        free.local_addr().unwrap()
+    };
+    let builder = Unit::builder("fixed", 5, "manager", 1).unwrap().fleet(stage.fleet);
+    let agv = builder.interfaces(Interfaces::Loopback).manager_address(address).build_unit().unwrap();
+    agv.start().unwrap();
+    let port = address.port().to_string();
+    let verb =
+        ["ping", "fixed", "-c", "1", "--timeout", "20s", "--as", "manager/1", "--as-port", &port, "--wait", "30s"];
+    stage.ends(0, &verb).says("1 of 1 answered");
+    agv.stop();
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! `cara ping` and `cara bench`.
 
-use crate::support::Stage;
+use crate::support::{Running, Stage};
 
 #[test]
 fn a_ping_tells_each_round_trip_and_a_summary() {
@@ -15,6 +15,16 @@ fn a_ping_tells_each_round_trip_and_a_summary() {
     assert_eq!(told["times"]["samples_us"].as_array().unwrap().len(), 4);
     assert!(told["times"]["median_us"].as_f64().unwrap() > 0.0);
     stage.ends(2, &["ping", "agv-1", "--count", "0"]);
+}
+
+#[test]
+fn ctrl_c_ends_a_ping_with_its_summary() {
+    let stage = Stage::with(&["agv-1"]);
+    let mut ping = Running::start(stage.command(&["ping", "agv-1", "--count", "1000", "--interval", "1h"]));
+    ping.expect("agv-1/11 1: ");
+    ping.interrupt();
+    ping.expect("1 of 1 answered: median ");
+    assert_eq!(ping.end(), 0);
 }
 
 const SHORT: [&str; 8] = ["--count", "5", "--pause", "1ms", "--periods", "5ms", "--group", "10"];
