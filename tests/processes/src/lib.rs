@@ -1,6 +1,8 @@
 //! Processes under test: what they print as lines with the time at which they came, waits with deadlines, and no
 //! process that outlives its owner. Nothing here knows CARA.
 
+pub mod network;
+
 use std::ffi::OsStr;
 use std::io::{BufRead, BufReader, Write};
 use std::path::Path;

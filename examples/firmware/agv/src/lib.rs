@@ -32,6 +32,9 @@ pub type Vehicle = Handle<Agv>;
 /// Its memory: one manager, messages of 1 KiB.
 pub type VehicleResources = Resources<Agv>;
 
+/// Returns a text, for whoever measures the way to the vehicle and back.
+const ECHO: &str = "echo(text: string[400]) -> (text: string[400])";
+
 /// Sockets of the network stack that the vehicle needs, with one for DHCP.
 pub const SOCKETS: usize = VehicleResources::SOCKETS + 1;
 
@@ -100,6 +103,7 @@ fn offer(vehicle: Vehicle) -> Result<(), Error> {
     vehicle.add_service(POS_INFO, plain().idempotent(), pos_info)?;
     vehicle.add_service(BATTERY, plain().idempotent(), battery)?;
     vehicle.add_service(STOP, plain().idempotent().priority(Priority::Emergency), stop)?;
+    vehicle.add_service(ECHO, plain().idempotent(), Handler::method(&|_, _, _| Ok(())))?;
     vehicle.add_service(GO_TO, plain().lease(GO_TO_LEASE, &DRIVING, stand), go_to)?;
     vehicle.on_manager_lost(stand);
     vehicle.publish_my_function_list()

@@ -1,0 +1,211 @@
+//! Boards in QEMU, each behind a virtual cable to one bridge, and what they log.
+
+use std::cell::Cell;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, bail};
+use cara_processes::network;
+use defmt_decoder::{DecodeError, Table};
+use rustix::process::{Pid, Signal, kill_process};
+
+/// Long enough for the slowest machine.
+pub(crate) const LONG: Duration = Duration::from_secs(60);
+/// The fleet of all units here; nobody else is in this network.
+pub(crate) const FLEET: u32 = 4711;
+/// The manager's address.
+const MANAGER: &str = "10.77.0.1/24";
+
+/// The desk on which boards are put: image, bridge, names.
+pub(crate) struct Bench {
+    image: PathBuf,
+    table: Arc<Table>,
+    shows_logs: bool,
+    cables: Cell<u8>,
+}
+
+impl Bench {
+    /// Makes the network.
+    pub(crate) fn new(image: &Path, shows_logs: bool) -> Result<Self> {
+        let elf = std::fs::read(image).with_context(|| format!("cannot read {}", image.display()))?;
+        let table = Table::parse(&elf)?.with_context(|| format!("{} has no defmt table", image.display()))?;
+        network::run("ip link add bridge0 type bridge")?;
+        network::run(&format!("ip address add {MANAGER} brd + dev bridge0"))?;
+        network::run("ip link set bridge0 up")?;
+        Ok(Self { image: image.to_owned(), table: Arc::new(table), shows_logs, cables: Cell::new(0) })
+    }
+
+    /// A cable with nothing at its end yet.
+    pub(crate) fn cable(&self) -> Result<Cable> {
+        let number = self.cables.get() + 1;
+        self.cables.set(number);
+        let name = format!("tap{number}");
+        network::run(&format!("ip tuntap add name {name} mode tap"))?;
+        network::run(&format!("ip link set {name} master bridge0"))?;
+        let cable = Cable { name, number };
+        cable.plug_in()?;
+        Ok(cable)
+    }
+
+    /// Puts power on a board.
+    pub(crate) fn board(&self, cable: &Cable, who: &Who) -> Result<Board> {
+        let Who { name, id, seed } = who;
+        let number = cable.number;
+        let address = format!("10.77.0.{}/24", 100 + u32::from(number));
+        let seed = seed.map_or_else(String::new, |seed| format!(" seed={seed}"));
+        let told = format!("name={name} id={id} manager=depot/1 fleet={FLEET} address={address}{seed}");
+        let mut child = Command::new("qemu-system-arm")
+            .args(["-M", "lm3s6965evb", "-display", "none", "-monitor", "none", "-serial", "none", "-no-reboot"])
+            .arg("-semihosting-config")
+            .arg(format!("enable=on,target=native,arg=agv,arg={told}"))
+            .arg("-kernel")
+            .arg(&self.image)
+            .arg("-nic")
+            .arg(format!(
+                "tap,ifname={},script=no,downscript=no,model=stellaris,mac=52:54:00:00:00:{number:02x}",
+                cable.name
+            ))
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::null())
+            .spawn()
+            .context("cannot start qemu-system-arm")?;
+        let log = Arc::new(Log::default());
+        if let Some(output) = child.stdout.take() {
+            let (log, table) = (log.clone(), self.table.clone());
+            let shown = self.shows_logs.then(|| name.clone());
+            std::thread::spawn(move || log.read(output, &table, shown.as_deref()));
+        }
+        Ok(Board { child, log, name: name.clone() })
+    }
+}
+
+/// A virtual cable between a board and the bridge.
+pub(crate) struct Cable {
+    name: String,
+    number: u8,
+}
+
+impl Cable {
+    pub(crate) fn plug_in(&self) -> Result<()> {
+        network::run(&format!("ip link set {} up", self.name))
+    }
+
+    pub(crate) fn pull(&self) -> Result<()> {
+        network::run(&format!("ip link set {} down", self.name))
+    }
+}
+
+/// What a board is told.
+#[derive(Clone, Debug)]
+pub(crate) struct Who {
+    pub(crate) name: String,
+    pub(crate) id: u32,
+    /// The same numbers in each life.
+    pub(crate) seed: Option<u64>,
+}
+
+impl Who {
+    pub(crate) fn agv(id: u32) -> Self {
+        Self { name: format!("agv-{id}"), id, seed: None }
+    }
+}
+
+/// A board that has power. Dropping it takes the power away.
+pub(crate) struct Board {
+    child: Child,
+    log: Arc<Log>,
+    name: String,
+}
+
+impl Board {
+    /// Waits until the board has logged `text`, among all that it has logged in this life.
+    pub(crate) fn logs(&self, text: &str) -> Result<()> {
+        self.logs_behind(0, text).map(drop)
+    }
+
+    /// Waits until the board has logged `text` at or behind line `from`; the number of the line behind it.
+    pub(crate) fn logs_behind(&self, from: usize, text: &str) -> Result<usize> {
+        let deadline = Instant::now() + LONG;
+        let mut lines = self.log.lock();
+        loop {
+            if let Some(at) = lines.iter().skip(from).position(|line| line.contains(text)) {
+                return Ok(from + at + 1);
+            }
+            let left = deadline.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                bail!("{} did not log `{text}`; it logged:\n    {}", self.name, lines.join("\n    "));
+            }
+            lines = self.log.news.wait_timeout(lines, left).unwrap_or_else(PoisonError::into_inner).0;
+        }
+    }
+
+    /// Lines logged so far.
+    pub(crate) fn line(&self) -> usize {
+        self.log.lock().len()
+    }
+
+    /// Holds it up, as a hung processor.
+    pub(crate) fn freeze(&self) -> Result<()> {
+        self.signal(Signal::STOP)
+    }
+
+    /// Lets it go on.
+    pub(crate) fn thaw(&self) -> Result<()> {
+        self.signal(Signal::CONT)
+    }
+
+    fn signal(&self, signal: Signal) -> Result<()> {
+        kill_process(Pid::from_child(&self.child), signal).with_context(|| format!("{} takes no signal", self.name))
+    }
+
+    /// Takes its power.
+    pub(crate) fn cut_power(mut self) -> Result<()> {
+        self.child.kill()?;
+        self.child.wait()?;
+        Ok(())
+    }
+}
+
+impl Drop for Board {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// What a board has logged, decoded.
+#[derive(Default)]
+struct Log {
+    lines: Mutex<Vec<String>>,
+    news: Condvar,
+}
+
+impl Log {
+    fn lock(&self) -> std::sync::MutexGuard<'_, Vec<String>> {
+        self.lines.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn read(&self, mut from: impl Read, table: &Table, shown: Option<&str>) {
+        let mut decoder = table.new_stream_decoder();
+        let mut bytes = [0; 1024];
+        while let Ok(length @ 1..) = from.read(&mut bytes) {
+            decoder.received(&bytes[..length]);
+            loop {
+                match decoder.decode() {
+                    Ok(frame) => {
+                        let line = frame.display(false).to_string();
+                        shown.into_iter().for_each(|name| println!("    {name}: {line}"));
+                        self.lock().push(line);
+                        self.news.notify_all();
+                    }
+                    Err(DecodeError::UnexpectedEof) => break,
+                    Err(DecodeError::Malformed) => {}
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,113 @@
+//! The manager: the Linux port, within this process and, where it is to be killed, in one of its own.
+
+use std::sync::Mutex;
+use std::sync::mpsc::Receiver;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, bail, ensure};
+use cara_apps::mechanic;
+use cara_std::control::Control;
+use cara_std::{CommunicationSystem, Parameters, Peer, UnitEvent};
+
+use crate::board::{FLEET, LONG, Who};
+
+/// A manager with its events.
+pub(crate) struct Manager {
+    pub(crate) system: CommunicationSystem,
+    events: Mutex<Receiver<UnitEvent>>,
+}
+
+impl Manager {
+    pub(crate) fn start() -> Result<Self> {
+        let builder = CommunicationSystem::builder("depot", 1)?.fleet(FLEET).control(Control::Off);
+        let system = builder.build_system()?;
+        let events = Mutex::new(system.events());
+        system.start()?;
+        Ok(Self { system, events })
+    }
+
+    /// Offers `call_mechanic` to everybody.
+    pub(crate) fn offer_mechanic(&self) -> Result<()> {
+        let functions = self.system.my_function_list();
+        functions.add_function("call_mechanic", &mechanic::arguments()?, mechanic::call_mechanic)?;
+        self.system.publish_my_function_list()?;
+        Ok(())
+    }
+
+    /// Waits until a board has joined and offers its functions.
+    pub(crate) fn meet(&self, who: &Who) -> Result<Peer> {
+        let deadline = Instant::now() + LONG;
+        while Instant::now() < deadline {
+            let peer = self.system.s_unit(&who.name).filter(Peer::is_connected);
+            if let Some(peer) = peer.filter(|peer| peer.their_function_list().contains("go_to")) {
+                return Ok(peer);
+            }
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        bail!("{} has not joined", who.name)
+    }
+
+    /// Waits for an event that `wanted` accepts; others are passed over.
+    pub(crate) fn event(&self, what: &str, wanted: impl Fn(&UnitEvent) -> bool) -> Result<UnitEvent> {
+        let events = self.events.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        let deadline = Instant::now() + LONG;
+        let mut passed = Vec::new();
+        loop {
+            let left = deadline.saturating_duration_since(Instant::now());
+            let event = events.recv_timeout(left).ok().with_context(|| format!("no {what}, but {passed:?}"))?;
+            if wanted(&event) {
+                return Ok(event);
+            }
+            passed.push(event);
+        }
+    }
+
+    /// What happened until now is no news.
+    pub(crate) fn forget_events(&self) {
+        let events = self.events.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        events.try_iter().for_each(drop);
+    }
+
+    /// Waits until a board has left.
+    pub(crate) fn left(&self, who: &Who) -> Result<()> {
+        let is = |event: &UnitEvent| matches!(event, UnitEvent::Left { peer, .. } if peer.name() == who.name);
+        self.event("loss", is).map(drop)
+    }
+}
+
+/// Where a vehicle says it is.
+pub(crate) fn position(peer: &Peer) -> Result<[i64; 2]> {
+    let mut parameters = at([0, 0])?;
+    peer.block_request("pos_info", &mut parameters)?;
+    Ok(parameters.variable("position")?)
+}
+
+/// Parameters with a position.
+pub(crate) fn at(position: [i64; 2]) -> Result<Parameters> {
+    let mut parameters = Parameters::new();
+    parameters.add_int("position", 2)?;
+    parameters.set_value("position", position)?;
+    Ok(parameters)
+}
+
+/// Waits until a vehicle is somewhere.
+pub(crate) fn arrives(peer: &Peer, target: [i64; 2]) -> Result<()> {
+    let deadline = Instant::now() + LONG;
+    let mut now_at = position(peer)?;
+    while now_at != target {
+        ensure!(Instant::now() < deadline, "it should come to {target:?} and is at {now_at:?}");
+        std::thread::sleep(Duration::from_millis(50));
+        now_at = position(peer)?;
+    }
+    Ok(())
+}
+
+/// A manager for itself, until it is killed or its standard input ends: it sends the vehicle of its fleet on a long way.
+pub(crate) fn stand_alone() -> Result<()> {
+    let manager = Manager::start()?;
+    let agv = manager.meet(&Who::agv(17))?;
+    agv.block_request("go_to", &mut *at([1_000, 0])?)?;
+    println!("driving");
+    let _ = std::io::stdin().lines().next();
+    Ok(())
+}
