@@ -203,10 +203,12 @@ pub enum Error {
         /// Bytes that are free.
         have: u32,
     },
-    /// The message is longer than the receiver allows.
-    #[error("the message is longer than the receiver's limit of {limit} bytes: send less, or raise message_size there")]
+    /// The message is longer than the receiver allows, or than the sender's own buffers are.
+    #[error(
+        "the message is longer than the {limit} bytes that one of the two units holds: send less, or raise its message_size"
+    )]
     TooLarge {
-        /// The receiver's limit in bytes.
+        /// The limit in bytes.
         limit: u32,
     },
     /// A blocking request that would wait for itself.

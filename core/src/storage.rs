@@ -40,7 +40,29 @@ pub trait Buffers<S: Storage> {
     fn take(&mut self) -> Option<Buffer<S>>;
     /// Gives a buffer back.
     fn give(&mut self, buffer: Buffer<S>);
+    /// Takes a buffer out of the pool if at least `left` others remain in it.
+    fn take_leaving(&mut self, left: usize) -> Option<Buffer<S>> {
+        let buffer = self.take()?;
+        if left == 0 {
+            return Some(buffer);
+        }
+        match self.take_leaving(left.saturating_sub(1)) {
+            Some(other) => {
+                self.give(other);
+                Some(buffer)
+            }
+            None => {
+                self.give(buffer);
+                None
+            }
+        }
+    }
 }
+
+/// Buffers that messages to be sent leave in the pool: two units that are full of messages to each other still read.
+pub const LEFT_BY_SENDING: usize = 1;
+/// Buffers that calls leave which wait for their turn: they go on only when answers go out, and those need one.
+pub const LEFT_BY_WAITING: usize = 2;
 
 /// A pool over lent slots, for one-cell ports.
 pub struct Pool<S: Storage> {

@@ -49,8 +49,13 @@ impl MessagePool {
 
     /// Takes a buffer of zeros or of an earlier message's bytes; `None` when `capacity` are out.
     pub fn take(&self) -> Option<Box<[u8]>> {
+        self.take_leaving(0)
+    }
+
+    /// Takes a buffer if `left` others may still be taken after it.
+    pub fn take_leaving(&self, left: usize) -> Option<Box<[u8]>> {
         let mut state = self.lock();
-        if state.in_use >= self.capacity {
+        if state.in_use.saturating_add(left) >= self.capacity {
             state.exhausted = state.exhausted.saturating_add(1);
             return None;
         }
@@ -109,6 +114,10 @@ impl Buffers<Boxed> for &MessagePool {
 
     fn give(&mut self, buffer: Box<[u8]>) {
         MessagePool::give(self, buffer);
+    }
+
+    fn take_leaving(&mut self, left: usize) -> Option<Box<[u8]>> {
+        MessagePool::take_leaving(self, left)
     }
 }
 

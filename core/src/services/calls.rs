@@ -7,7 +7,7 @@ use crate::bytes;
 use crate::config::{EMERGENCY_BYTES, Priority, WINDOW};
 use crate::distribution::function_list::{Generation, Slot};
 use crate::error::{Error, Limit};
-use crate::storage::{Buffer, Buffers, Storage};
+use crate::storage::{Buffer, Buffers, LEFT_BY_WAITING, Storage};
 use crate::time::{Duration, Instant};
 
 /// Which ids of one class have been seen. Serves the stream and datagrams alike.
@@ -199,7 +199,11 @@ impl<S: Storage> Calls<S> {
         let slot = self.queues.get_mut(index).ok_or(Error::Busy)?;
         let queue = match slot {
             Some(queue) => queue,
-            None => slot.insert(Queue { buffer: take_but_the_last(buffers).ok_or(Error::Busy)?, start: 0, end: 0 }),
+            None => slot.insert(Queue {
+                buffer: buffers.take_leaving(LEFT_BY_WAITING).ok_or(Error::Busy)?,
+                start: 0,
+                end: 0,
+            }),
         };
         let result = queue.push(head, block);
         if result.is_ok() {
@@ -312,21 +316,6 @@ impl<S: Storage> Queue<S> {
     }
 }
 
-/// A buffer, unless it is the last one: what waits here goes on only when answers go out, and those need one.
-fn take_but_the_last<S: Storage>(buffers: &mut impl Buffers<S>) -> Option<Buffer<S>> {
-    let buffer = buffers.take()?;
-    match buffers.take() {
-        Some(other) => {
-            buffers.give(other);
-            Some(buffer)
-        }
-        None => {
-            buffers.give(buffer);
-            None
-        }
-    }
-}
-
 fn encode_head(head: &CallHead, block: usize) -> impl Iterator<Item = u8> {
     let length = (block as u32).to_le_bytes();
     let wants_reply = [u8::from(head.wants_reply), 0, 0, 0];
@@ -412,7 +401,7 @@ mod tests {
 
         #[test]
         fn what_waits_comes_out_as_it_went_in(steps in prop::collection::vec((0..3_u8, 0..200_usize), 1..200)) {
-            let (mut calls, mut pool) = (calls(4), pool(2, 600));
+            let (mut calls, mut pool) = (calls(4), pool(3, 600));
             let mut model: VecDeque<(CallHead, Vec<u8>)> = VecDeque::new();
             for (id, (step, length)) in (1..).zip(steps) {
                 if step > 0 {
@@ -428,7 +417,7 @@ mod tests {
                     prop_assert_eq!(taken, model.pop_front());
                 }
                 prop_assert_eq!(usize::from(calls.held()), model.len());
-                prop_assert_eq!(pool.free(), 1 + usize::from(model.is_empty()));
+                prop_assert_eq!(pool.free(), LEFT_BY_WAITING + usize::from(model.is_empty()));
             }
         }
     }
@@ -488,22 +477,22 @@ mod tests {
 
     #[test]
     fn the_end_of_a_link_forgets_what_waits_and_keeps_what_runs() {
-        let (mut calls, mut pool) = (calls(3), pool(3, 100));
+        let (mut calls, mut pool) = (calls(3), pool(4, 100));
         let running = calls.begin(head(1, Priority::Normal)).unwrap();
         calls.wait(&mut pool, head(2, Priority::Normal), b"").unwrap();
         calls.wait(&mut pool, head(3, Priority::High), b"").unwrap();
         calls.wait(&mut pool, head(4, Priority::Emergency), b"").unwrap();
-        assert_eq!((calls.held(), pool.free()), (4, 1));
+        assert_eq!((calls.held(), pool.free()), (4, LEFT_BY_WAITING));
         calls.release(&mut pool);
-        assert_eq!((calls.held(), pool.free()), (1, 3));
+        assert_eq!((calls.held(), pool.free()), (1, 4));
         assert!(calls.end(running).is_some());
         assert_eq!(calls.held(), 0);
     }
 
     #[test]
-    fn the_last_buffer_is_left_to_answers() {
-        let (mut calls, mut pool) = (calls(3), pool(1, 100));
+    fn the_last_buffers_are_left_to_answers_and_to_what_is_received() {
+        let (mut calls, mut pool) = (calls(3), pool(LEFT_BY_WAITING, 100));
         assert_eq!(calls.wait(&mut pool, head(1, Priority::Normal), b""), Err(Error::Busy));
-        assert_eq!((calls.held(), pool.free()), (0, 1));
+        assert_eq!((calls.held(), pool.free()), (0, LEFT_BY_WAITING));
     }
 }

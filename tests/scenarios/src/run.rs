@@ -51,7 +51,7 @@ pub fn once(scenario: &Scenario, port: Port, seed: u64, weather: Weather) -> Res
     catch_quietly(|| {
         let mut world = match port {
             Port::Simulator => ports::simulator(seed, weather),
-            Port::Linux => ports::linux(),
+            Port::Linux => ports::linux(scenario.needs),
         };
         (scenario.run)(&mut *world);
         world.report()

@@ -9,8 +9,12 @@ pub enum Need {
     Crash,
     /// Paths that are cut and healed.
     Partition,
-    /// Streams or links that hold what they carry.
+    /// Streams that hold what they carry.
     Freeze,
+    /// Links that hold all that they carry, datagrams among it.
+    FreezeLink,
+    /// A peer that reads a stream slowly.
+    SlowReader,
     /// Streams that are reset by the network.
     Reset,
     /// Datagrams that arrive twice, late or not at all, as the scenario says.
@@ -19,8 +23,10 @@ pub enum Need {
     AddressChange,
     /// A machine that sleeps.
     Suspend,
-    /// Datagrams of another protocol version.
-    OtherVersion,
+    /// Somebody who connects and is no unit, or none of this version or fleet.
+    Strangers,
+    /// An interface that goes and comes.
+    Interface,
     /// More units than a test on one machine should start.
     ManyUnits,
     /// Minutes of time.
@@ -35,15 +41,18 @@ pub enum Need {
 
 impl Need {
     /// All of them.
-    pub const ALL: [Self; 13] = [
+    pub const ALL: [Self; 16] = [
         Self::Crash,
         Self::Partition,
         Self::Freeze,
+        Self::FreezeLink,
+        Self::SlowReader,
         Self::Reset,
         Self::Path,
         Self::AddressChange,
         Self::Suspend,
-        Self::OtherVersion,
+        Self::Strangers,
+        Self::Interface,
         Self::ManyUnits,
         Self::LongTime,
         Self::ExactTime,
@@ -56,16 +65,15 @@ impl Need {
         Some(match self {
             Self::Crash => "units of one process cannot crash one by one",
             Self::Partition => "loopback cannot be cut without root",
-            Self::Freeze => "loopback cannot be frozen without root",
-            Self::Reset => "loopback resets nothing by itself",
+            Self::FreezeLink => "datagrams on loopback cannot be frozen without root",
             Self::Path => "loopback has one quality",
             Self::AddressChange => "loopback has one address",
             Self::Suspend => "units of one process cannot be suspended one by one",
-            Self::OtherVersion => "the version is fixed when compiling",
+            Self::Interface => "loopback is always up; `std-port/tests/namespaces.rs` has interfaces of its own",
             Self::ManyUnits => "too many threads and sockets for a test",
             Self::LongTime => "minutes of real time",
             Self::ExactTime => "instants depend on the machine's load",
-            Self::Detached => return None,
+            Self::Detached | Self::Freeze | Self::Reset | Self::SlowReader | Self::Strangers => return None,
             Self::SameSeed => "seeds come from the operating system",
         })
     }

@@ -15,7 +15,7 @@ use cara_core::services::unit::RequestOptions;
 use cara_core::time::{Duration, Instant};
 use cara_sim::{BoxedParameters, Path};
 
-use crate::{Need, Service, Spec, boxed, secs};
+use crate::{Need, Service, Spec, Stranger, boxed, secs};
 
 /// Events of each unit that a failure shows.
 const LAST_EVENTS: usize = 12;
@@ -62,8 +62,14 @@ pub enum Fault<'u> {
     ChangeAddress(&'u Unit),
     /// The unit's machine sleeps for this long; what arrives waits.
     Suspend(&'u Unit, Duration),
-    /// Datagrams of another protocol version arrive at the unit.
-    OtherVersion(&'u Unit),
+    /// What the first sends in streams is read at so many bytes a second by the second.
+    SlowReader(&'u Unit, &'u Unit, usize),
+    /// Somebody comes to the manager who is no unit, or behaves as none should.
+    Stranger(&'u Unit, Stranger),
+    /// The unit's only interface goes down.
+    Unplug(&'u Unit),
+    /// It comes back up.
+    Plug(&'u Unit),
 }
 
 /// Something that a unit saw happen.

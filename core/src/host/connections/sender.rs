@@ -11,7 +11,7 @@ use crate::error::{CloseReason, Error, Limit};
 use crate::host::frame::{self, ChunkWriter, Cut, Frame};
 use crate::host::mailman::{LinkId, Mailman};
 use crate::host::secure::Secure;
-use crate::storage::{Buffer, Buffers, Storage};
+use crate::storage::{Buffer, Buffers, LEFT_BY_SENDING, Storage};
 
 /// Room for one emergency and the frames that keep a link going.
 const URGENT_BYTES: usize = 2 * EMERGENCY_RESERVE;
@@ -92,7 +92,7 @@ impl<S: Storage> Sender<S> {
         let slot = self.lanes.get_mut(index).ok_or(Error::Full(Limit::SendQueue))?;
         let lane = match slot {
             Some(lane) => lane,
-            None => slot.insert(Lane::new(buffers.take().ok_or(Error::Full(Limit::Buffers))?)),
+            None => slot.insert(Lane::new(buffers.take_leaving(LEFT_BY_SENDING).ok_or(Error::Full(Limit::Buffers))?)),
         };
         let result = lane.append(self.cut, priority, total, write);
         if lane.waiting() == 0

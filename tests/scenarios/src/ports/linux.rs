@@ -2,12 +2,14 @@
 
 use std::collections::BTreeMap;
 use std::hash::{BuildHasher, Hasher, RandomState};
+use std::io::{Read, Write};
+use std::net::{Ipv4Addr, SocketAddr, TcpStream, UdpSocket};
 use std::rc::Rc;
 use std::sync::mpsc::Receiver;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::thread;
 
-use cara_core::config::Constraints;
+use cara_core::config::{Constraints, PLAIN_PORT};
 use cara_core::counters::Counter;
 use cara_core::distribution::connection_handler::NodeCounter;
 use cara_core::distribution::function::Definition;
@@ -23,18 +25,29 @@ use cara_std::{
     UnitEvent,
 };
 
+use super::relay::{Relay, Way};
 use crate::run::Report;
 use crate::{
-    Asked, Fault, Need, Node, Pending, PendingAll, Port, Seen, Service, Spec, SpecRole, Unit, Unsupported, World, boxed,
+    Asked, Fault, Need, Node, Pending, PendingAll, Port, Seen, Service, Spec, SpecRole, Stranger, Unit, Unsupported,
+    World, boxed,
 };
 
 /// How often a waiting scenario looks.
 const LOOK: std::time::Duration = std::time::Duration::from_millis(1);
 
+/// How long a stranger waits for an answer.
+const ANSWER: std::time::Duration = std::time::Duration::from_secs(5);
+
 pub(super) struct LinuxWorld {
     start: std::time::Instant,
     fleet: u32,
     units: Vec<Arc<LinuxNode>>,
+    /// AGVs dial through relays.
+    relayed: bool,
+    /// The relay of a unit, by its number.
+    relays: BTreeMap<usize, Relay>,
+    /// Connections on which nothing is said.
+    silent: Vec<TcpStream>,
     report: Report,
 }
 
@@ -47,6 +60,8 @@ enum Machine {
 struct LinuxNode {
     start: std::time::Instant,
     fleet: u32,
+    /// The manager's address, for one that is to dial a relay.
+    dials: Option<SocketAddr>,
     spec: Spec,
     machine: Mutex<Option<Arc<Machine>>>,
     receiver: Mutex<Option<Receiver<UnitEvent>>>,
@@ -69,9 +84,65 @@ fn since(start: std::time::Instant) -> Instant {
 }
 
 impl LinuxWorld {
-    pub(super) fn new() -> Self {
-        let fleet = RandomState::new().build_hasher().finish() as u32;
-        Self { start: std::time::Instant::now(), fleet, units: Vec::new(), report: Report::default() }
+    pub(super) fn new(relayed: bool) -> Self {
+        Self {
+            start: std::time::Instant::now(),
+            fleet: RandomState::new().build_hasher().finish() as u32,
+            units: Vec::new(),
+            relayed,
+            relays: BTreeMap::new(),
+            silent: Vec::new(),
+            report: Report::default(),
+        }
+    }
+
+    /// The relay through which a new unit dials its manager.
+    fn relay(&mut self, spec: &Spec) -> Option<SocketAddr> {
+        let SpecRole::Agv(manager, _) = &spec.role else { return None };
+        let manager = self.units.iter().find(|unit| unit.spec.name == *manager).filter(|_| self.relayed)?;
+        let relay = Relay::to(manager.tcp_port()?);
+        let address = relay.address();
+        self.relays.insert(self.units.len(), relay);
+        Some(address)
+    }
+
+    /// What happens to the stream between two units, one of which dials through a relay.
+    fn on_relay(&self, from: &Unit, to: &Unit, act: impl FnOnce(&Relay, Way), need: Need) -> Result<(), Unsupported> {
+        let down = self.relays.get(&to.number()).map(|relay| (relay, Way::Down));
+        let up = self.relays.get(&from.number()).map(|relay| (relay, Way::Up));
+        let (relay, way) = down.or(up).ok_or(Unsupported(need))?;
+        act(relay, way);
+        Ok(())
+    }
+
+    fn stranger(&mut self, unit: &Unit, stranger: Stranger) {
+        let node = Arc::clone(&self.units[unit.number()]);
+        let manager = (Ipv4Addr::LOCALHOST, node.tcp_port().expect("a manager runs"));
+        let socket = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).expect("a socket");
+        socket.set_broadcast(true).expect("it may broadcast");
+        for datagram in stranger.datagrams(node.fleet) {
+            socket.send_to(&datagram, (Ipv4Addr::new(127, 255, 255, 255), PLAIN_PORT)).expect("loopback is up");
+        }
+        let mut heard = Vec::new();
+        for visit in stranger.visits(&unit.identity(), node.fleet) {
+            let mut stream = TcpStream::connect(manager).expect("the manager listens");
+            stream.set_read_timeout(Some(ANSWER)).expect("a span above zero");
+            // Who says what nobody understands may be shown out while it speaks.
+            let _ = stream.write_all(&visit.says);
+            if visit.closes {
+                let _ = stream.read(&mut [0; 512]);
+            } else {
+                let _ = stream.read_to_end(&mut heard);
+            }
+        }
+        if stranger.is_told().is_some_and(|told| told == heard) {
+            self.reached("stranger was told");
+        }
+        if let Stranger::Silent(count) = stranger {
+            for _ in 0..count {
+                self.silent.push(TcpStream::connect(manager).expect("the manager listens"));
+            }
+        }
     }
 }
 
@@ -95,6 +166,7 @@ impl World for LinuxWorld {
     fn add(&mut self, spec: Spec) -> Unit {
         let node = Arc::new(LinuxNode {
             start: self.start,
+            dials: self.relay(&spec),
             fleet: self.fleet.wrapping_add(spec.fleet),
             spec,
             machine: Mutex::new(None),
@@ -124,14 +196,24 @@ impl World for LinuxWorld {
 
     fn inject(&mut self, fault: Fault<'_>) -> Result<(), Unsupported> {
         Err(Unsupported(match fault {
+            Fault::FreezeStreams(from, to, span) => {
+                return self.on_relay(from, to, |relay, way| relay.freeze(way, span.into()), Need::Freeze);
+            }
+            Fault::SlowReader(from, to, pace) => {
+                return self.on_relay(from, to, |relay, way| relay.slow_down(way, pace), Need::SlowReader);
+            }
+            Fault::Reset(unit) => return self.on_relay(unit, unit, |relay, _| relay.reset(), Need::Reset),
+            Fault::Stranger(unit, stranger) => {
+                self.stranger(unit, stranger);
+                return Ok(());
+            }
             Fault::PowerCut(_) | Fault::Kill(_) | Fault::Restart(_) => Need::Crash,
             Fault::Cut(..) | Fault::CutOneWay(..) | Fault::Heal => Need::Partition,
-            Fault::FreezeStreams(..) | Fault::FreezeLink(..) => Need::Freeze,
-            Fault::Reset(_) => Need::Reset,
+            Fault::FreezeLink(..) => Need::FreezeLink,
             Fault::Path(..) => Need::Path,
             Fault::ChangeAddress(_) => Need::AddressChange,
             Fault::Suspend(..) => Need::Suspend,
-            Fault::OtherVersion(_) => Need::OtherVersion,
+            Fault::Unplug(_) | Fault::Plug(_) => Need::Interface,
         }))
     }
 
@@ -188,6 +270,13 @@ impl LinuxNode {
         .expect("a unit can be started");
     }
 
+    fn tcp_port(&self) -> Option<u16> {
+        match &*self.machine().ok()? {
+            Machine::Manager(system) => Some(system.tcp_port()),
+            Machine::Agv(_) => None,
+        }
+    }
+
     fn build(&self) -> Result<Machine, Error> {
         let Spec { role, name, id, constraints, their_functions, message_buffers, .. } = &self.spec;
         let builder = match role {
@@ -204,6 +293,10 @@ impl LinuxNode {
         if *role == SpecRole::Manager {
             return builder.build_system().map(Machine::Manager);
         }
+        let builder = match self.dials {
+            Some(address) => builder.manager_address(address),
+            None => builder,
+        };
         let unit = builder.build_unit()?;
         let (losses, start) = (Arc::clone(&self.losses), self.start);
         unit.on_manager_lost(move |()| lock(&losses).push(since(start)));

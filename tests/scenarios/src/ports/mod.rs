@@ -1,16 +1,19 @@
 //! The ports as scenarios see them.
 
 mod linux;
+mod relay;
 mod simulator;
 
-use crate::{Weather, World};
+use crate::{Need, Weather, World};
 
 /// A fleet on the virtual network; the seed decides everything.
 pub fn simulator(seed: u64, weather: Weather) -> Box<dyn World> {
     Box::new(simulator::SimWorld::new(seed, weather))
 }
 
-/// A fleet of its own over loopback, with a random number.
-pub fn linux() -> Box<dyn World> {
-    Box::new(linux::LinuxWorld::new())
+/// A fleet of its own over loopback, with a random number. Where a scenario needs streams that can be disturbed, AGVs
+/// dial their managers through a relay.
+pub fn linux(needs: &[Need]) -> Box<dyn World> {
+    let disturbed = [Need::Freeze, Need::Reset, Need::SlowReader];
+    Box::new(linux::LinuxWorld::new(needs.iter().any(|need| disturbed.contains(need))))
 }

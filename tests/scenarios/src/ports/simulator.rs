@@ -5,24 +5,23 @@ use std::collections::BTreeMap;
 use std::net::Ipv4Addr;
 use std::rc::Rc;
 
-use cara_core::config::{Constraints, PLAIN_MAGIC, VERSION};
+use cara_core::config::Constraints;
 use cara_core::counters::Counter;
 use cara_core::distribution::connection_handler::NodeCounter;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::ParametersView;
-use cara_core::error::{Error, Refusal, ServiceError};
+use cara_core::error::{Error, ServiceError};
 use cara_core::host::connections::LinkCounter;
-use cara_core::host::frame::{self, Frame};
 use cara_core::random::Random;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::RequestOptions;
 use cara_core::time::{Duration, Instant};
-use cara_sim::{Action, Chance, Crash, Direction, HostId, Path, UnitEvent, UnitHandle};
+use cara_sim::{Action, Chance, Crash, Direction, HostId, Path, StreamId, UnitEvent, UnitHandle};
 
 use crate::run::Report;
 use crate::{
-    Asked, Fault, Node, Pending, PendingAll, Port, Seen, Service, Spec, SpecRole, Unit, Unsupported, Weather, World,
-    boxed, millis, secs,
+    Asked, Fault, Node, Pending, PendingAll, Port, Seen, Service, Spec, SpecRole, Stranger, Unit, Unsupported, Weather,
+    World, boxed, millis, secs,
 };
 
 /// How long the weather of a run lasts: longer than any run.
@@ -183,7 +182,7 @@ impl World for SimWorld {
                 let host = self.host(unit);
                 self.world.network(|network| network.suspend(host, span));
             }
-            Fault::OtherVersion(unit) => self.stranger(unit),
+            Fault::Stranger(unit, stranger) => self.stranger(unit, stranger),
             fault => self.inject_into_network(fault),
         }
         Ok(())
@@ -218,31 +217,48 @@ impl World for SimWorld {
 }
 
 impl SimWorld {
-    /// Somebody who speaks another version broadcasts, dials the unit and says hello; notes how that is answered.
-    fn stranger(&mut self, unit: &Unit) {
-        let mut said = [0; 32];
-        said[..4].copy_from_slice(&PLAIN_MAGIC);
-        said[4] = VERSION + 1;
-        let mut hello = [0; 64];
-        let length = frame::encode(&Frame::Hello(&said), 0, &mut hello);
-        let mut to = self.node(unit).handle.address();
-        let stream = self.world.network(|network| {
-            let host = network.add_host();
-            network.send_to(host, to, &said);
-            to.set_port(M_UNIT_PORT);
-            network.connect(host, to)
-        });
+    fn stranger(&mut self, unit: &Unit, stranger: Stranger) {
+        let (manager, mut to) = (unit.identity(), self.node(unit).handle.address());
+        let host = self.world.network(|network| network.add_host());
+        for datagram in stranger.datagrams(0) {
+            self.world.network(|network| network.send_to(host, to, &datagram));
+        }
+        to.set_port(M_UNIT_PORT);
+        let mut heard = Vec::new();
+        for visit in stranger.visits(&manager, 0) {
+            let stream = self.world.network(|network| network.connect(host, to));
+            self.say(stream, &visit.says);
+            if visit.closes {
+                self.world.run_for(millis(200));
+                self.world.network(|network| network.close(stream));
+            } else {
+                self.world.run_for(secs(5));
+                self.hear(stream, &mut heard);
+            }
+        }
+        if stranger.is_told().is_some_and(|told| told == heard) {
+            self.reached("stranger was told");
+        }
+        if let Stranger::Silent(count) = stranger {
+            for _ in 0..count {
+                self.world.network(|network| network.connect(host, to));
+            }
+        }
+    }
+
+    /// Writes as the network takes it, which may have closed meanwhile.
+    fn say(&mut self, stream: StreamId, says: &[u8]) {
         let mut written = 0;
         for _ in 0..1_000 {
             self.world.run_for(millis(10));
-            let rest = &hello[written..length];
-            written += self.world.network(|network| network.write(stream, &[rest])).unwrap_or(0);
-            if written == length {
-                break;
+            written += self.world.network(|network| network.write(stream, &[&says[written..]])).unwrap_or(0);
+            if written == says.len() {
+                return;
             }
         }
-        self.world.run_for(secs(5));
-        let mut heard = Vec::new();
+    }
+
+    fn hear(&mut self, stream: StreamId, heard: &mut Vec<u8>) {
         for _ in 0..64 {
             self.world.network(|network| {
                 network.read(stream, |bytes| {
@@ -250,11 +266,6 @@ impl SimWorld {
                     bytes.len()
                 });
             });
-        }
-        let mut refused = [0; 16];
-        let length = frame::encode(&Frame::Refuse(Refusal::Version as u8), 0, &mut refused);
-        if heard == refused[..length] {
-            self.reached("stranger was told");
         }
     }
 
@@ -285,6 +296,19 @@ impl SimWorld {
             Fault::Path(one, other, path) => {
                 let (one, other) = (host(one), host(other));
                 self.world.network(|network| network.set_paths_between(one, other, path));
+            }
+            Fault::SlowReader(from, to, pace) => {
+                let (from, to) = (host(from), host(to));
+                let path = Path::LAN.bits_per_second(8 * pace as u64);
+                self.world.network(|network| network.set_path(from, to, path));
+            }
+            Fault::Unplug(unit) => {
+                let host = host(unit);
+                self.world.network(|network| network.plug(host, false));
+            }
+            Fault::Plug(unit) => {
+                let host = host(unit);
+                self.world.network(|network| network.plug(host, true));
             }
             Fault::ChangeAddress(unit) => {
                 let host = host(unit);

@@ -52,7 +52,8 @@ fn a_blocking_command_from_a_frozen_link_does_not_run(world: &mut dyn World) {
     world.fault(Fault::FreezeStreams(&manager, &agv, secs(8)));
     let start = world.now();
     let asked = world.ask_with(&manager, "agv", "go", &mut number("n", 1), life(2));
-    assert_eq!((asked, world.now().since(start)), (Err(Error::TimedOut), secs(2)));
+    assert_eq!(asked, Err(Error::TimedOut));
+    assert!(!world.is_virtual() || world.now().since(start) == secs(2));
     world.run_for(secs(10));
     assert_eq!(service.diary().runs(), 0);
     assert_eq!(agv.counted(LinkCounter::RequestsExpired), 1);

@@ -14,7 +14,7 @@ scenarios![
         ["power-cut", "LeasesExpired"];
     motion_ends_when_the_path_is_cut: "lease of a service", Light, [Partition, ExactTime],
         ["partition", "LeasesExpired"];
-    motion_ends_when_the_link_freezes: "lease of a service", Light, [Freeze, ExactTime], ["freeze", "LeasesExpired"];
+    motion_ends_when_the_link_freezes: "lease of a service", Light, [FreezeLink, ExactTime], ["freeze", "LeasesExpired"];
     motion_ends_when_the_manager_stops: "lease of a service", Light, [], ["stopped"];
     without_a_lease_motion_goes_on: "lease of a service (lease removed)", Rough, [], ["went on"];
     a_lease_that_is_not_renewed_ends: "lease of a service", Light, [], ["LeasesExpired"];

@@ -5,13 +5,13 @@ use cara_core::error::{CloseReason, Refusal};
 
 use super::met;
 use crate::scenario::scenarios;
-use crate::{Fault, Seen, Service, Spec, Unit, World, millis, number, secs};
+use crate::{Fault, Seen, Service, Spec, Stranger, Unit, World, millis, number, secs};
 
 scenarios![
     an_index_keeps_its_meaning_when_another_node_leaves: "47", Rough, [], ["agv came back"];
     an_agv_joins_its_own_manager_only: "23", Rough, [], ["WrongManager"];
     different_fleets_do_not_meet: "fleet", Rough, [], ["DatagramFleet"];
-    another_version_is_refused_by_name: "version", Rough, [OtherVersion],
+    another_version_is_refused_by_name: "version", Rough, [Strangers],
         ["DatagramVersion", "datagram was counted", "stranger was told"];
     the_maximum_of_nodes_refuses_the_next: "51", Rough, [], ["RefusedFull"];
     two_m_units_meet_and_call_both_ways: "18, 20", Rough, [], ["Dialled"];
@@ -63,7 +63,7 @@ fn different_fleets_do_not_meet(world: &mut dyn World) {
 fn another_version_is_refused_by_name(world: &mut dyn World) {
     let service = Service::numbered("note");
     let (manager, _agv) = super::pair(world, &service);
-    world.fault(Fault::OtherVersion(&manager));
+    world.fault(Fault::Stranger(&manager, Stranger::OtherVersion));
     if manager.node_counted(NodeCounter::DatagramVersion) > 0 {
         world.reached("datagram was counted");
     }

@@ -3,6 +3,7 @@
 mod age;
 mod anything;
 mod at_most_once;
+mod bad_input;
 mod best_effort;
 mod deadlines;
 mod emergency;
@@ -24,7 +25,7 @@ use std::sync::{Arc, Mutex};
 
 use cara_core::error::ServiceError;
 
-use crate::{Scenario, Service, Spec, Unit, World, secs};
+use crate::{Scenario, Service, Spec, Unit, World, number, secs};
 
 /// Every scenario.
 pub fn all() -> Vec<Scenario> {
@@ -38,6 +39,7 @@ pub fn all() -> Vec<Scenario> {
         interval::SCENARIOS,
         message_size::SCENARIOS,
         limits::SCENARIOS,
+        bad_input::SCENARIOS,
         at_most_once::SCENARIOS,
         age::SCENARIOS,
         leases::SCENARIOS,
@@ -73,6 +75,29 @@ fn pair(world: &mut dyn World, service: &Service) -> (Unit, Unit) {
     let agv = world.add(Spec::agv("agv", 7).service(service));
     met(world, &manager, "agv", service.name());
     (manager, agv)
+}
+
+/// An AGV that has nothing to do with what goes wrong: its calls go on.
+struct Bystander {
+    service: Service,
+    calls: usize,
+}
+
+impl Bystander {
+    fn add(world: &mut dyn World, manager: &Unit) -> Self {
+        let service = Service::numbered("count");
+        world.add(Spec::agv("bystander", 99).service(&service));
+        met(world, manager, "bystander", "count");
+        Self { service, calls: 0 }
+    }
+
+    /// Calls it.
+    fn goes_on(&mut self, world: &mut dyn World, manager: &Unit) {
+        self.calls += 1;
+        let asked = world.ask(manager, "bystander", "count", &mut number("n", self.calls as i64));
+        assert_eq!(asked, Ok(()), "another node's calls go on{}", world.story());
+        assert_eq!(self.service.diary().runs(), self.calls);
+    }
 }
 
 /// Waits until `unit` knows a function of `peer`.

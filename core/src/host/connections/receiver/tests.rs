@@ -126,7 +126,7 @@ proptest! {
 
 #[test]
 fn sealed_frames_are_opened_in_whatever_pieces_they_come() {
-    let (mut sender, mut wire, mut buffers) = (link(Numbered::default()), Wire::open(), pool(1, 9000));
+    let (mut sender, mut wire, mut buffers) = (link(Numbered::default()), Wire::open(), pool(2, 9000));
     let payload = pattern(1, 2500);
     for _ in 0..2 {
         let write = |writer: &mut ChunkWriter<'_>| writer.put(&payload);

@@ -104,7 +104,7 @@ fn functions_beyond_the_readers_room_are_skipped_and_told() {
 
 #[test]
 fn a_list_that_finds_no_room_goes_out_when_there_is_some() {
-    let mut pair = Pair::with(&Setup { buffers: 1, buffer_size: 600, ..Setup::default() });
+    let mut pair = Pair::with(&Setup { buffers: 2, buffer_size: 600, ..Setup::default() });
     for index in 0..16 {
         pair.agv.offer(&std::format!("function_with_a_long_name_{index}(position: int[2])"), |_| Ok(()));
     }

@@ -164,7 +164,7 @@ fn a_failing_service_says_why() {
 
 #[test]
 fn an_answer_that_finds_no_room_goes_out_when_there_is_some() {
-    let mut pair = Pair::with(&Setup { buffers: 1, ..Setup::default() });
+    let mut pair = Pair::with(&Setup { buffers: 2, ..Setup::default() });
     pair.agv.offer("echo(text: string[20000]) -> (text: string[20000])", |_| Ok(()));
     pair.publish();
     pair.agv.net.capacity = 10;

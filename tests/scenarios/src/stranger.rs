@@ -1,0 +1,153 @@
+//! Whoever connects to a unit and is none, or behaves as none should: what it says, byte by byte, on any port.
+
+use cara_core::config::{PLAIN_MAGIC, Priority, VERSION};
+use cara_core::distribution::datagram::{SEARCH_BYTES, WhoHas};
+use cara_core::distribution::hello::{Hello, Limits, Manager};
+use cara_core::distribution::identity::{Epoch, Fleet, Identity};
+use cara_core::error::Refusal;
+use cara_core::host::frame::{self, ChunkWriter, Cut, Frame};
+use cara_core::random::Random;
+
+/// Streams and datagrams of garbage.
+const GARBAGE: usize = 24;
+/// The message that is broken off.
+const MESSAGE: usize = 900;
+
+/// Who comes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Stranger {
+    /// Somebody who speaks another version of the protocol.
+    OtherVersion,
+    /// An s_unit of another fleet that dials this manager all the same.
+    OtherFleet,
+    /// Bytes that mean nothing, some of which look like a datagram or a hello at first.
+    Garbage,
+    /// An s_unit that joins, begins a message and closes in the middle of a chunk.
+    ClosesInMidChunk,
+    /// So many connections on which nothing is said, held as long as the world is there.
+    Silent(usize),
+}
+
+/// What somebody does on one connection.
+pub(crate) struct Visit {
+    /// Said at once.
+    pub(crate) says: Vec<u8>,
+    /// Whether to close after that, rather than to listen to what comes back.
+    pub(crate) closes: bool,
+}
+
+impl Stranger {
+    /// Datagrams for the discovery port.
+    pub(crate) fn datagrams(self, fleet: u32) -> Vec<Vec<u8>> {
+        match self {
+            Self::OtherVersion => vec![other_version()],
+            Self::OtherFleet => vec![who_has(fleet.wrapping_add(1))],
+            Self::Garbage => garbage(),
+            Self::ClosesInMidChunk | Self::Silent(_) => Vec::new(),
+        }
+    }
+
+    /// What is done on connections to the manager.
+    pub(crate) fn visits(self, manager: &Identity, fleet: u32) -> Vec<Visit> {
+        let hear = |says: Vec<u8>| vec![Visit { says, closes: false }];
+        match self {
+            Self::OtherVersion => hear(framed(&other_version())),
+            Self::OtherFleet => hear(hello(manager, fleet.wrapping_add(1))),
+            Self::Garbage => garbage().into_iter().map(|says| Visit { says, closes: true }).collect(),
+            Self::ClosesInMidChunk => {
+                vec![Visit { says: [hello(manager, fleet), half_a_message()].concat(), closes: true }]
+            }
+            Self::Silent(_) => Vec::new(),
+        }
+    }
+
+    /// What it must be told before the end.
+    pub(crate) fn is_told(self) -> Option<Vec<u8>> {
+        let refusal = match self {
+            Self::OtherVersion => Refusal::Version,
+            Self::OtherFleet => Refusal::Fleet,
+            _ => return None,
+        };
+        let mut refused = [0; 16];
+        let length = frame::encode(&Frame::Refuse(refusal as u8), 0, &mut refused);
+        Some(refused[..length].to_vec())
+    }
+}
+
+fn other_version() -> Vec<u8> {
+    let mut said = vec![0; 32];
+    said[..4].copy_from_slice(&PLAIN_MAGIC);
+    said[4] = VERSION + 1;
+    said
+}
+
+fn framed(hello: &[u8]) -> Vec<u8> {
+    let mut bytes = vec![0; hello.len() + 16];
+    let length = frame::encode(&Frame::Hello(hello), 0, &mut bytes);
+    bytes.truncate(length);
+    bytes
+}
+
+fn hello(manager: &Identity, fleet: u32) -> Vec<u8> {
+    let hello = Hello {
+        fleet: Fleet(fleet),
+        identity: Identity::s_unit("stranger", 66).expect("a short name"),
+        wanted: Manager::new(manager.name(), manager.id()).ok(),
+        epoch: Epoch(6),
+        nonce: 6,
+        term: 0,
+        capabilities: 0,
+        limits: Limits { message_size: 1024, chunk_size: 1024, calls: 8, minimum_interval: 0 },
+        link: 0,
+        udp_port: 0,
+        stamp: 0,
+        keep_alive: 1_000,
+    };
+    let mut bytes = [0; 320];
+    let length = hello.encode(&mut bytes).expect("a hello fits");
+    framed(&bytes[..length])
+}
+
+fn who_has(fleet: u32) -> Vec<u8> {
+    let who_has = WhoHas {
+        identity: Identity::m_unit("stranger", 66).expect("a short name"),
+        epoch: Epoch(6),
+        sequence: 1,
+        nonce: 6,
+        wanted: None,
+        tcp_port: 0,
+        expected: 1,
+        known: Default::default(),
+    };
+    let mut bytes = [0; SEARCH_BYTES];
+    who_has.encode(Fleet(fleet), &mut bytes).expect("a search fits").to_vec()
+}
+
+/// All of the first chunk of a message but its last bytes.
+fn half_a_message() -> Vec<u8> {
+    let cut = Cut { chunk: 500, overhead: 0 };
+    let mut bytes = vec![0; cut.framed_length(MESSAGE)];
+    let writer = ChunkWriter::new(&mut bytes, cut, Priority::Normal, MESSAGE);
+    writer.expect("there is room").put(&[1; MESSAGE]);
+    bytes.truncate(400);
+    bytes
+}
+
+/// A third of it is noise, a third begins like a datagram, a third is a hello's frame around noise.
+fn garbage() -> Vec<Vec<u8>> {
+    let mut random = Random::new(0x6A2B_A6E5);
+    let mut one = |number: usize| {
+        let length = 8 + random.below(1_200) as usize;
+        let mut bytes: Vec<u8> = (0..length).map(|_| random.bits() as u8).collect();
+        if !number.is_multiple_of(3) {
+            bytes[..4].copy_from_slice(&PLAIN_MAGIC);
+            bytes[4] = VERSION;
+        }
+        if number % 3 == 2 {
+            bytes.truncate(200);
+            bytes = framed(&bytes);
+        }
+        bytes
+    };
+    (0..GARBAGE).map(&mut one).collect()
+}
