@@ -465,7 +465,7 @@ fn sighup_takes_over_constraints_and_log_of_a_file_without_mistakes() {
     std::fs::write(&file, fresh).unwrap();
     node.signal(Signal::HUP);
     until("the vehicle is told", || matches!(twice(), Err(Error::TooSoon { .. })));
-    assert!(node.log().contains(" INFO "), "{}", node.log());
+    until("the log has the file's level", || node.log().contains(" INFO "));
     assert!(node.process.terminate(PATIENCE).unwrap().success());
 }
 
@@ -570,4 +570,30 @@ fn metrics_are_the_counters() {
     assert_eq!(without_values(&text(&printed.stdout)), without_values(body));
     let received = before.iter().find(|(of, name, _)| of.is_some() && name == "RequestsReceived").unwrap().2;
     assert_eq!(received, 5);
+}
+
+#[test]
+fn an_s_unit_is_a_node_too() {
+    let manager = Node::start("");
+    let vehicle = TempDir::new().unwrap();
+    let file = format!(
+        "name = \"agv\"\nid = 7\nrole = \"s_unit\"\nfleet = {}\ninterfaces = \"lo\"\n[manager]\nname = \"plant\"\nid = 1\n\
+         [[functions]]\nsignature = \"echo(text: string[20000]) -> (text: string[20000])\"\nanswer = \"echo\"\n",
+        manager.fleet
+    );
+    std::fs::write(vehicle.path().join("plant.toml"), file).unwrap();
+    let vehicle = Node::run(vehicle, manager.fleet, &["--metrics", "127.0.0.1:0"]);
+    assert!(vehicle.up.starts_with("agv/7 is up: ") && vehicle.up.contains("control socket none"), "{}", vehicle.up);
+    let ask = |arguments: &[&str]| {
+        let mut command = Command::new(cara());
+        let asked = command.args(arguments).arg("--socket").arg(manager.control_socket()).output().unwrap();
+        (asked.status.success(), text(&asked.stdout))
+    };
+    until("its function is there", || ask(&["functions", "agv"]).1.contains("echo"));
+    let (called, results) = ask(&["call", "agv", "echo(text: \"there and back\")"]);
+    assert!(called && results.contains("there and back"), "{results}");
+    let (measured, times) = ask(&["bench", "agv", "--count", "2", "--groups", "0", "--pause", "0", "--json"]);
+    assert!(measured && times.contains("\"characters\":20000"), "{times}");
+    let address = vehicle.up.split("metrics http://").nth(1).unwrap().strip_suffix("/metrics").unwrap();
+    assert!(scrape(address.parse().unwrap()).contains("unit=\"agv/7\",peer=\"plant/1\",role=\"m_unit\"} 1\n"));
 }
