@@ -77,6 +77,8 @@ pub(crate) struct Machine<T: 'static> {
     pub(crate) reply: ReplyBox,
     pub(crate) tasks: &'static mut [TaskSlot],
     pub(crate) events: Events,
+    /// The runner is to let other tasks run.
+    pub(crate) yields: bool,
     pub(crate) lost_hook: Option<&'static Hook<T>>,
     /// Where an m_unit listens.
     pub(crate) tcp_port: u16,
@@ -196,6 +198,8 @@ impl<T> Machine<T> {
     /// Tells the application.
     pub(crate) fn tell(&mut self, event: UnitEvent) {
         self.events.put(event);
+        // Whoever reads events gets its turn, so that few of them have room for any number.
+        self.yields |= self.wakers.events.occupied();
         self.wakers.events.wake();
         self.wakers.news.wake();
     }

@@ -55,11 +55,11 @@ impl<T> Runner<T> {
             match self.step(context) {
                 Step::Job(job) => self.run_job(job),
                 Step::Again => {}
-                Step::Idle => {
-                    if self.rest(context) {
-                        return Poll::Pending;
-                    }
-                }
+                Step::Idle if self.rest(context) => return Poll::Pending,
+                Step::Idle => {}
+            }
+            if core::mem::take(&mut self.shared.machine.borrow_mut().yields) {
+                break;
             }
         }
         context.waker().wake_by_ref();

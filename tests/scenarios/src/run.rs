@@ -52,6 +52,7 @@ pub fn once(scenario: &Scenario, port: Port, seed: u64, weather: Weather) -> Res
         let mut world = match port {
             Port::Simulator => ports::simulator(seed, weather),
             Port::Linux => ports::linux(scenario.needs),
+            Port::Embassy => ports::embassy(seed, weather),
         };
         (scenario.run)(&mut *world);
         world.report()
@@ -89,6 +90,15 @@ fn catch_quietly<T>(act: impl FnOnce() -> T) -> Result<T, Failure> {
 impl dyn World + '_ {
     /// Whether it runs on virtual time.
     pub fn is_virtual(&self) -> bool {
-        self.port() == Port::Simulator
+        self.slack().is_some()
+    }
+
+    /// By how much what is due may be late because of the port itself; unknown on real time.
+    pub fn slack(&self) -> Option<Duration> {
+        match self.port() {
+            Port::Simulator => Some(Duration::ZERO),
+            Port::Embassy => Some(Duration::from_millis(1)),
+            Port::Linux => None,
+        }
     }
 }

@@ -1,6 +1,6 @@
 //! A scenario as the registry holds it: its rule, what it needs from a port, and what its runs must reach.
 
-use crate::World;
+use crate::{Port, World};
 
 /// What a scenario needs from the port beyond a network.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -37,11 +37,13 @@ pub enum Need {
     Detached,
     /// The same random numbers in each life.
     SameSeed,
+    /// A unit that goes on when a handler panics.
+    Panics,
 }
 
 impl Need {
     /// All of them.
-    pub const ALL: [Self; 16] = [
+    pub const ALL: [Self; 17] = [
         Self::Crash,
         Self::Partition,
         Self::Freeze,
@@ -58,10 +60,20 @@ impl Need {
         Self::ExactTime,
         Self::Detached,
         Self::SameSeed,
+        Self::Panics,
     ];
 
-    /// Why Linux over loopback in one process lacks it; `None` where it does not.
-    pub const fn missing_on_linux(self) -> Option<&'static str> {
+    /// Why a port lacks it; `None` where it does not.
+    pub const fn missing_on(self, port: Port) -> Option<&'static str> {
+        match port {
+            Port::Simulator => None,
+            Port::Linux => self.missing_on_linux(),
+            Port::Embassy => self.missing_on_embassy(),
+        }
+    }
+
+    /// Of Linux over loopback in one process.
+    const fn missing_on_linux(self) -> Option<&'static str> {
         Some(match self {
             Self::Crash => "units of one process cannot crash one by one",
             Self::Partition => "loopback cannot be cut without root",
@@ -73,8 +85,24 @@ impl Need {
             Self::ManyUnits => "too many threads and sockets for a test",
             Self::LongTime => "minutes of real time",
             Self::ExactTime => "instants depend on the machine's load",
-            Self::Detached | Self::Freeze | Self::Reset | Self::SlowReader | Self::Strangers => return None,
+            Self::Detached | Self::Panics | Self::Freeze | Self::Reset | Self::SlowReader | Self::Strangers => {
+                return None;
+            }
             Self::SameSeed => "seeds come from the operating system",
+        })
+    }
+
+    /// Of boards on a switch in memory.
+    const fn missing_on_embassy(self) -> Option<&'static str> {
+        Some(match self {
+            Self::Reset => "nobody on the switch forges a reset",
+            Self::Path => "the switch's faults are those of a board, not of a pair",
+            Self::SlowReader => "the switch carries frames, and a board's stack reads what it can",
+            Self::Strangers => "a stranger needs sockets of its own, and the switch has boards only",
+            Self::Interface => "the switch does not take a board's link down",
+            Self::ManyUnits => "more nodes than a board has links for",
+            Self::Panics => "a panic restarts a board",
+            _ => return None,
         })
     }
 }
@@ -108,9 +136,9 @@ pub struct Scenario {
 }
 
 impl Scenario {
-    /// Why it does not run on Linux; nothing where it does.
-    pub fn missing_on_linux(&self) -> Option<&'static str> {
-        self.needs.iter().find_map(|need| need.missing_on_linux())
+    /// Why it does not run on a port; nothing where it does.
+    pub fn missing_on(&self, port: Port) -> Option<&'static str> {
+        self.needs.iter().find_map(|need| need.missing_on(port))
     }
 
     /// The faults that its weather injects.

@@ -20,7 +20,7 @@ pub fn main(port: Port, threads: usize) -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let words: Vec<&String> = arguments.iter().filter(|word| !word.starts_with('-')).collect();
     let wanted = |scenario: &Scenario| words.is_empty() || words.iter().any(|word| scenario.name.contains(*word));
-    let can = |scenario: &Scenario| port == Port::Simulator || scenario.missing_on_linux().is_none();
+    let can = |scenario: &Scenario| scenario.missing_on(port).is_none();
     let scenarios: Vec<Scenario> = all().into_iter().filter(|scenario| can(scenario) && wanted(scenario)).collect();
     if arguments.iter().any(|word| word == "--list") {
         scenarios.iter().for_each(|scenario| println!("{}: test", scenario.name));

@@ -3,7 +3,7 @@
 use std::fmt::Write;
 use std::path::PathBuf;
 
-use crate::{Need, Scenario, all};
+use crate::{Need, Port, Scenario, all};
 
 /// Where the table is kept.
 pub fn path() -> PathBuf {
@@ -19,9 +19,13 @@ the simulator. A rule's numbers are those of [paper.md](paper.md). Weather is wh
 runs: rough is loss, delay, jitter, reordering, duplication, short partitions and split reads; light is the same without
 loss and partitions; own is only what the scenario injects. A letter instead of a port's ✓ leads to the reason below.
 
-| scenario | rule | weather | simulator | Linux |
-|---|---|---|---|---|
+| scenario | rule | weather | simulator | Linux | embassy |
+|---|---|---|---|---|---|
 ";
+
+/// The ports that lack something, with what they are.
+const PORTS: [(Port, &str); 2] =
+    [(Port::Linux, "Linux over loopback"), (Port::Embassy, "boards with embassy on a switch in memory")];
 
 /// The whole file.
 pub fn text() -> String {
@@ -29,32 +33,36 @@ pub fn text() -> String {
     for scenario in all() {
         let Scenario { name, rule, weather, .. } = scenario;
         let weather = format!("{weather:?}").to_lowercase();
-        let _ = writeln!(text, "| `{name}` | {rule} | {weather} | ✓ | {} |", on_linux(&scenario));
+        let cells: Vec<String> = PORTS.iter().map(|(port, _)| cell(&scenario, *port)).collect();
+        let _ = writeln!(text, "| `{name}` | {rule} | {weather} | ✓ | {} |", cells.join(" | "));
     }
-    text.push_str("\nWhy a scenario does not run on Linux over loopback:\n\n");
-    for (letter, need) in letters() {
-        if let (true, Some(reason)) = (is_reason(need), need.missing_on_linux()) {
-            let _ = writeln!(text, "- {letter}: {reason}.");
+    for (port, what) in PORTS {
+        let _ = writeln!(text, "\nWhy a scenario does not run on {what}:\n");
+        for (letter, need) in letters() {
+            if let (true, Some(reason)) = (is_reason(need, port), need.missing_on(port)) {
+                let _ = writeln!(text, "- {letter}: {reason}.");
+            }
         }
     }
     text
 }
 
-/// The need that keeps a scenario from Linux.
-fn blank(scenario: &Scenario) -> Option<Need> {
-    scenario.needs.iter().copied().find(|need| need.missing_on_linux().is_some())
+/// The need that keeps a scenario from a port.
+fn blank(scenario: &Scenario, port: Port) -> Option<Need> {
+    scenario.needs.iter().copied().find(|need| need.missing_on(port).is_some())
 }
 
-fn is_reason(need: Need) -> bool {
-    all().iter().any(|scenario| blank(scenario) == Some(need))
+fn is_reason(need: Need, port: Port) -> bool {
+    all().iter().any(|scenario| blank(scenario, port) == Some(need))
 }
 
 fn letters() -> impl Iterator<Item = (char, Need)> {
-    ('a'..).zip(Need::ALL.into_iter().filter(|need| is_reason(*need)))
+    let reasons = |need: &Need| PORTS.iter().any(|(port, _)| is_reason(*need, *port));
+    ('a'..).zip(Need::ALL.into_iter().filter(reasons))
 }
 
-fn on_linux(scenario: &Scenario) -> String {
-    let Some(need) = blank(scenario) else { return "✓".to_owned() };
+fn cell(scenario: &Scenario, port: Port) -> String {
+    let Some(need) = blank(scenario, port) else { return "✓".to_owned() };
     let letter = letters().find(|(_, other)| *other == need).map(|(letter, _)| letter);
     letter.map_or_else(String::new, String::from)
 }
@@ -75,6 +83,6 @@ mod tests {
         let scenarios = all();
         let names: BTreeSet<&str> = scenarios.iter().map(|scenario| scenario.name).collect();
         assert_eq!(names.len(), scenarios.len());
-        assert!(scenarios.iter().all(|scenario| !on_linux(scenario).is_empty()));
+        assert!(scenarios.iter().all(|scenario| PORTS.iter().all(|(port, _)| !cell(scenario, *port).is_empty())));
     }
 }

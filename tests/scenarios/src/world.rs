@@ -30,6 +30,8 @@ pub enum Port {
     Simulator,
     /// Sockets of this machine, over loopback.
     Linux,
+    /// Boards with embassy-net, on a switch in memory and in virtual time.
+    Embassy,
 }
 
 /// A fault that a port cannot inject.

@@ -1,5 +1,6 @@
 //! The ports as scenarios see them.
 
+mod embassy;
 mod linux;
 mod relay;
 mod simulator;
@@ -16,4 +17,9 @@ pub fn simulator(seed: u64, weather: Weather) -> Box<dyn World> {
 pub fn linux(needs: &[Need]) -> Box<dyn World> {
     let disturbed = [Need::Freeze, Need::Reset, Need::SlowReader];
     Box::new(linux::LinuxWorld::new(needs.iter().any(|need| disturbed.contains(need))))
+}
+
+/// A fleet of boards on a switch in memory; the seed decides everything.
+pub fn embassy(seed: u64, weather: Weather) -> Box<dyn World> {
+    Box::new(embassy::EmbassyWorld::new(seed, weather))
 }

@@ -15,7 +15,7 @@ scenarios![
     a_service_calls_its_caller_back: "handlers run outside", Rough, [], ["RequestsRun"];
     two_peers_call_each_other_at_the_same_time: "handlers run outside, 6", Rough, [], ["RequestsRun"];
     many_callers_share_one_link: "6", Rough, [], ["RequestsRun"];
-    a_handler_that_panics_is_answered: "handler panics", Rough, [], ["panicked"];
+    a_handler_that_panics_is_answered: "handler panics", Rough, [Panics], ["panicked"];
 ];
 
 const PATIENT: RequestOptions = RequestOptions {

@@ -1,0 +1,120 @@
+//! Scenarios on boards: the embassy port over embassy-net, on a switch in memory and in virtual time.
+
+mod memory;
+mod node;
+mod services;
+
+use std::rc::Rc;
+
+use cara_core::random::Random;
+use cara_core::time::{Duration, Instant};
+use cara_embassy_host::{Bench, Faults};
+
+use self::node::BoardNode;
+use crate::run::Report;
+use crate::{Fault, Need, Port, Spec, Unit, Unsupported, Weather, World};
+
+pub(super) struct EmbassyWorld {
+    bench: Bench,
+    units: Vec<Rc<BoardNode>>,
+    random: Random,
+    report: Report,
+}
+
+impl EmbassyWorld {
+    pub(super) fn new(seed: u64, weather: Weather) -> Self {
+        let bench = Bench::new(seed);
+        let mut random = Random::new(seed ^ 0x00E3_BA55);
+        bench.set_faults(faults(&mut random, weather));
+        Self { bench, units: Vec::new(), random, report: Report::default() }
+    }
+
+    fn node(&self, unit: &Unit) -> &Rc<BoardNode> {
+        &self.units[unit.number()]
+    }
+}
+
+fn faults(random: &mut Random, weather: Weather) -> Faults {
+    let mut percent = |limit: u64| random.below(limit * 100) as f64 / 10_000.0;
+    match weather {
+        Weather::Own => Faults::NONE,
+        _ => Faults {
+            loss: if weather == Weather::Rough { percent(2) } else { 0.0 },
+            duplication: percent(5),
+            reordering: percent(5),
+            delay: Duration::from_micros(250) + random.jitter(Duration::from_millis(2)),
+            jitter: random.jitter(Duration::from_millis(2)),
+            ..Faults::NONE
+        },
+    }
+}
+
+impl World for EmbassyWorld {
+    fn port(&self) -> Port {
+        Port::Embassy
+    }
+
+    fn now(&self) -> Instant {
+        self.bench.now()
+    }
+
+    fn add(&mut self, spec: Spec) -> Unit {
+        let node = BoardNode::new(self.units.len(), &self.bench, spec);
+        self.units.push(Rc::clone(&node));
+        Rc::new(node)
+    }
+
+    fn run_until(&mut self, condition: &dyn Fn() -> bool, limit: Duration) -> bool {
+        self.bench.run_until(condition, limit)
+    }
+
+    fn inject(&mut self, fault: Fault<'_>) -> Result<(), Unsupported> {
+        match fault {
+            Fault::PowerCut(unit) | Fault::Kill(unit) => self.node(unit).cut_power(),
+            Fault::Restart(unit) => self.node(unit).boot(),
+            Fault::Cut(one, other) => {
+                let (one, other) = (self.node(one).board(), self.node(other).board());
+                one.lose_frames_of(&other);
+                other.lose_frames_of(&one);
+            }
+            Fault::CutOneWay(from, to) => self.node(to).board().lose_frames_of(&self.node(from).board()),
+            Fault::Heal => self.units.iter().for_each(|unit| unit.board().heal()),
+            Fault::FreezeStreams(from, to, span) => {
+                self.node(to).board().hold_frames_of(&self.node(from).board(), span, true);
+            }
+            Fault::FreezeLink(from, to, span) => {
+                self.node(to).board().hold_frames_of(&self.node(from).board(), span, false);
+            }
+            Fault::ChangeAddress(unit) => self.node(unit).board().move_to(std::net::Ipv4Addr::new(10, 77, 0, 207)),
+            Fault::Suspend(unit, span) => self.node(unit).board().suspend(span),
+            Fault::Reset(_) => return Err(Unsupported(Need::Reset)),
+            Fault::Path(..) => return Err(Unsupported(Need::Path)),
+            Fault::OtherVersion(_) => return Err(Unsupported(Need::OtherVersion)),
+        }
+        Ok(())
+    }
+
+    fn random(&mut self, bound: u64) -> u64 {
+        self.random.below(bound)
+    }
+
+    fn reached(&mut self, state: &'static str) {
+        *self.report.states.entry(state.to_owned()).or_default() += 1;
+    }
+
+    fn measured(&mut self, what: &'static str, span: Duration) {
+        self.report.measured.entry(what).or_default().push(span);
+    }
+
+    fn report(&self) -> Report {
+        let mut report = self.report.clone();
+        for (name, count) in self.bench.counts().iter().filter(|(_, count)| *count > 0) {
+            *report.faults.entry(name).or_default() += count;
+        }
+        report
+    }
+
+    fn units(&self) -> Vec<Unit> {
+        self.units.iter().map(|unit| Rc::new(Rc::clone(unit)) as Unit).collect()
+    }
+}

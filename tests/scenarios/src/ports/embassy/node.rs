@@ -1,0 +1,321 @@
+//! One unit on its board, in all its lives.
+
+use std::cell::RefCell;
+use std::collections::BTreeMap;
+use std::rc::Rc;
+
+use cara_core::config::Constraints;
+use cara_core::distribution::connection_handler::NodeCounter;
+use cara_core::distribution::identity::{Identity, Role};
+use cara_core::distribution::parameters::ParametersView;
+use cara_core::error::Error;
+use cara_core::host::connections::LinkCounter;
+use cara_core::services::lease::Lease;
+use cara_core::services::requests::CallId;
+use cara_core::services::unit::RequestOptions;
+use cara_core::time::Instant;
+use cara_embassy::{Config, Handle, Peer, UnitEvent};
+use cara_embassy_host::{Bench, Board, now};
+use embassy_time::with_timeout;
+
+use super::memory::{self, LINKS};
+use super::services;
+use crate::{Node, Pending, PendingAll, Seen, Service, Spec, SpecRole, boxed};
+
+pub(super) struct BoardNode {
+    number: usize,
+    bench: Bench,
+    spec: Spec,
+    board: RefCell<Board>,
+    unit: RefCell<Option<Handle>>,
+    /// Services of this life, with their leases.
+    services: RefCell<BTreeMap<String, (Service, &'static Lease)>>,
+    events: Rc<RefCell<Vec<(Instant, Seen)>>>,
+    losses: Rc<RefCell<Vec<Instant>>>,
+}
+
+impl BoardNode {
+    pub(super) fn new(number: usize, bench: &Bench, spec: Spec) -> Rc<Self> {
+        let node = Rc::new(Self {
+            number,
+            bench: bench.clone(),
+            spec,
+            board: RefCell::new(bench.board()),
+            unit: RefCell::new(None),
+            services: RefCell::default(),
+            events: Rc::default(),
+            losses: Rc::default(),
+        });
+        node.begin();
+        node
+    }
+
+    pub(super) fn board(&self) -> Board {
+        self.board.borrow().clone()
+    }
+
+    pub(super) fn unit(&self) -> Result<Handle, Error> {
+        (*self.unit.borrow()).ok_or(Error::NotRunning)
+    }
+
+    pub(super) fn cut_power(&self) {
+        self.unit.take();
+        self.board().cut_power();
+    }
+
+    /// Begins another life.
+    pub(super) fn boot(self: &Rc<Self>) {
+        let board = self.board().reboot();
+        self.board.replace(board);
+        self.services.take();
+        self.begin();
+    }
+
+    /// Notes a service; whether one of its name was there.
+    pub(super) fn keep(&self, service: &Service, lease: &'static Lease) -> bool {
+        self.services.borrow_mut().insert(service.name().to_owned(), (service.clone(), lease)).is_some()
+    }
+
+    pub(super) fn service(&self, name: &str) -> Option<Service> {
+        self.services.borrow().get(name).map(|(service, _)| service.clone())
+    }
+
+    fn begin(self: &Rc<Self>) {
+        let board = self.board();
+        let made = self.config().and_then(|config| memory::unit(&self.spec, board.stack(), config));
+        let (unit, mut runner) = made.expect("a unit can be made");
+        self.unit.replace(Some(unit));
+        let losses = Rc::clone(&self.losses);
+        unit.on_manager_lost(Box::leak(Box::new(move |_: &mut ()| losses.borrow_mut().push(now()))));
+        for service in &self.spec.services {
+            services::put(self, service, false).expect("a unit has room for its services");
+        }
+        if self.spec.published {
+            unit.publish_my_function_list().expect("what was added can be published");
+        }
+        let events = Rc::clone(&self.events);
+        board.spawn(async move {
+            loop {
+                let seen = seen(unit.next_event().await);
+                events.borrow_mut().extend(seen.map(|seen| (now(), seen)));
+            }
+        });
+        board.spawn(async move { runner.run().await });
+    }
+
+    fn config(&self) -> Result<Config, Error> {
+        let Spec { role, name, id, fleet, mut constraints, same_seed, .. } = self.spec.clone();
+        let seed = if same_seed { 4 } else { self.bench.random(u64::MAX) };
+        constraints.maximum_nodes = constraints.maximum_nodes.min(LINKS as u16);
+        let config = match role {
+            SpecRole::Manager => Config::m_unit(&name, id, seed)?,
+            SpecRole::Agv(manager, manager_id) => Config::s_unit(&name, id, &manager, manager_id, seed)?,
+        };
+        let epoch = self.bench.random(u64::MAX);
+        Ok(config.fleet(fleet).constraints(constraints).epoch(epoch))
+    }
+
+    fn peer(&self, name: &str) -> Result<Peer, Error> {
+        self.unit()?.peer(name).ok_or(Error::NotConnected)
+    }
+
+    fn connected(&self) -> Vec<Peer> {
+        self.unit().map(|unit| unit.peers().collect()).unwrap_or_default()
+    }
+
+    fn offering(&self, function: &str) -> Vec<Peer> {
+        self.unit().map(|unit| unit.nodes_offering(function).collect()).unwrap_or_default()
+    }
+}
+
+impl Node for Rc<BoardNode> {
+    fn identity(&self) -> Identity {
+        let Spec { role, name, id, .. } = &self.spec;
+        let identity = match role {
+            SpecRole::Manager => Identity::m_unit(name, *id),
+            SpecRole::Agv(..) => Identity::s_unit(name, *id),
+        };
+        identity.expect("a unit was made of it")
+    }
+
+    fn broadcast(&self) {
+        if let Ok(unit) = self.unit() {
+            unit.broadcast();
+        }
+    }
+
+    fn stop(&self) {
+        if let Some(unit) = self.unit.take() {
+            unit.stop();
+        }
+    }
+
+    fn start(&self) {
+        self.boot();
+    }
+
+    fn add_service(&self, service: &Service) -> Result<(), Error> {
+        services::put(self, service, false)
+    }
+
+    fn replace_service(&self, service: &Service) -> Result<(), Error> {
+        services::put(self, service, true)
+    }
+
+    fn remove_service(&self, name: &str) -> Result<(), Error> {
+        self.unit()?.remove_service(name)?;
+        self.services.borrow_mut().remove(name);
+        Ok(())
+    }
+
+    fn publish(&self) -> Result<(), Error> {
+        self.unit()?.publish_my_function_list()
+    }
+
+    fn publish_to(&self, peer: &str) -> Result<(), Error> {
+        self.peer(peer)?.publish_my_function_list()
+    }
+
+    fn begin_publish(&self) -> Pending<Vec<Identity>> {
+        let pending = Pending::new();
+        let (unit, told) = (self.unit(), pending.share());
+        self.board().spawn(async move {
+            let result = match unit {
+                Ok(unit) => with_timeout(embassy_time::Duration::from_secs(10), unit.publish_and_wait()).await,
+                Err(error) => Ok(Err(error)),
+            };
+            told.end(result.unwrap_or(Err(Error::TimedOut)).map(|()| Vec::new()), now());
+        });
+        pending
+    }
+
+    fn my_function_list(&self) -> String {
+        self.unit().map(|unit| unit.my_function_list().to_string()).unwrap_or_default()
+    }
+
+    fn s_units(&self) -> Vec<(Identity, bool)> {
+        let Ok(unit) = self.unit() else { return Vec::new() };
+        let s_units = (0..).map_while(|index| unit.s_unit(index));
+        s_units.map(|peer| (peer.identity().clone(), peer.is_connected())).collect()
+    }
+
+    fn peers(&self) -> Vec<Identity> {
+        self.connected().iter().map(|peer| peer.identity().clone()).collect()
+    }
+
+    fn nodes_offering(&self, function: &str) -> Vec<Identity> {
+        self.offering(function).iter().map(|peer| peer.identity().clone()).collect()
+    }
+
+    fn their_function_list(&self, peer: &str) -> String {
+        self.peer(peer).map(|peer| peer.their_function_list().show_functions().to_string()).unwrap_or_default()
+    }
+
+    fn request_with(
+        &self,
+        peer: &str,
+        function: &str,
+        parameters: &ParametersView,
+        options: RequestOptions,
+    ) -> Result<CallId, Error> {
+        self.peer(peer)?.request_with(function, parameters, &options)
+    }
+
+    fn request_all(&self, function: &str, parameters: &ParametersView) -> Vec<(Identity, Result<CallId, Error>)> {
+        let offering = self.offering(function).into_iter();
+        offering.map(|peer| (peer.identity().clone(), peer.request(function, parameters))).collect()
+    }
+
+    fn begin(&self, peer: &str, function: &str, parameters: &ParametersView, options: RequestOptions) -> Pending {
+        let pending = Pending::new();
+        let (asked, told, mut parameters) = (self.peer(peer), pending.share(), boxed(parameters));
+        let function = function.to_owned();
+        self.board().spawn(async move {
+            let result = match asked {
+                Ok(peer) => peer.block_request_with(&function, &mut parameters, &options).await,
+                Err(error) => Err(error),
+            };
+            told.end(result.map(|()| parameters), now());
+        });
+        pending
+    }
+
+    fn begin_all(&self, function: &str, parameters: &ParametersView) -> PendingAll {
+        let pending = Pending::new();
+        let peers = self.offering(function);
+        let (count, outcomes) = (peers.len(), Rc::new(RefCell::new(Vec::new())));
+        for peer in peers {
+            let (told, outcomes) = (pending.share(), Rc::clone(&outcomes));
+            let (function, mut parameters) = (function.to_owned(), boxed(parameters));
+            self.board().spawn(async move {
+                let outcome = peer.block_request(&function, &mut parameters).await;
+                outcomes.borrow_mut().push((peer.identity().clone(), outcome));
+                if outcomes.borrow().len() == count {
+                    told.end(Ok(outcomes.take()), now());
+                }
+            });
+        }
+        if count == 0 {
+            pending.end(Ok(Vec::new()), now());
+        }
+        pending
+    }
+
+    fn release(&self, peer: &str, function: &str) -> Result<(), Error> {
+        self.peer(peer)?.release(function)
+    }
+
+    fn end_lease(&self, function: &str) {
+        if let Ok(unit) = self.unit() {
+            unit.end_lease(function);
+        }
+    }
+
+    fn lease_is_live(&self, function: &str) -> bool {
+        self.services.borrow().get(function).is_some_and(|(_, lease)| lease.is_live(now()))
+    }
+
+    fn constraints(&self) -> Constraints {
+        self.unit().expect("the unit runs").constraints()
+    }
+
+    fn set_constraints(&self, constraints: Constraints) -> Result<(), Error> {
+        self.unit()?.set_constraints(constraints)
+    }
+
+    fn counted(&self, counter: LinkCounter) -> u64 {
+        self.unit().map_or(0, |unit| unit.counted(counter))
+    }
+
+    fn node_counted(&self, counter: NodeCounter) -> u64 {
+        self.unit().map_or(0, |unit| unit.node_counted(counter))
+    }
+
+    fn events(&self) -> Vec<(Instant, Seen)> {
+        self.events.borrow().clone()
+    }
+
+    fn manager_losses(&self) -> Vec<Instant> {
+        match self.identity().role() {
+            Role::SUnit => self.losses.borrow().clone(),
+            Role::MUnit => Vec::new(),
+        }
+    }
+
+    fn number(&self) -> usize {
+        self.number
+    }
+}
+
+fn seen(event: UnitEvent) -> Option<Seen> {
+    Some(match event {
+        UnitEvent::Joined { peer } => Seen::Joined(peer),
+        UnitEvent::Left { peer, reason } => Seen::Left(peer, reason),
+        UnitEvent::NotJoined { reason, .. } => Seen::NotJoined(reason),
+        UnitEvent::ListChanged { peer } => Seen::ListChanged(peer),
+        UnitEvent::RequestFailed { call, error, .. } => Seen::Failed(call, error),
+        UnitEvent::LeaseExpired { function, .. } => Seen::LeaseExpired(function.to_string()),
+        UnitEvent::LeaseEnded { function, expired, .. } => Seen::LeaseEnded(function.to_string(), expired),
+        UnitEvent::FunctionsSkipped { .. } => return None,
+    })
+}

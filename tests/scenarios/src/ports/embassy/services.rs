@@ -1,0 +1,98 @@
+//! Services of scenarios on boards: those that end at once run in the runner, the others in a task of each call.
+
+use std::rc::Rc;
+
+use cara_core::distribution::identity::Identity;
+use cara_core::distribution::parameters::ParametersView;
+use cara_core::error::{Error, ServiceError};
+use cara_core::services::lease::Lease;
+use cara_core::services::unit::RequestOptions;
+use cara_core::time::Duration;
+use cara_embassy::{Handle, Handler, ServiceOptions, TakenCall};
+use cara_embassy_host::{Board, now};
+use cara_sim::boxed_parameters;
+
+use super::node::BoardNode;
+use crate::{Asked, Service};
+
+/// Bytes of the parameters that a task takes calls in.
+const PARAMETERS: usize = 48 * 1024;
+
+/// Whether a task serves it.
+fn awaits(service: &Service) -> bool {
+    service.takes > Duration::ZERO || service.calls_back.is_some()
+}
+
+/// Puts a service into a unit's list.
+pub(super) fn put(node: &Rc<BoardNode>, service: &Service, replace: bool) -> Result<(), Error> {
+    let (unit, board) = (node.unit()?, node.board());
+    let lease: &'static Lease = Box::leak(Box::new(Lease::new()));
+    let mut options = ServiceOptions::new().priority(service.priority);
+    if service.detached {
+        options = options.detached();
+    }
+    if let Some(length) = service.lease {
+        let diary = service.diary();
+        options = options.lease(length, lease, Box::leak(Box::new(move |_: &mut ()| diary.stop(now()))));
+    }
+    let handler = if awaits(service) { Handler::task() } else { at_once(service.clone()) };
+    match replace {
+        true => unit.replace_service(&service.signature, options, handler),
+        false => unit.add_service(&service.signature, options, handler),
+    }?;
+    let known = node.keep(service, lease);
+    if awaits(service) && !known {
+        board.spawn(take_calls(Rc::clone(node), board.clone(), unit, service.name().to_owned()));
+    }
+    Ok(())
+}
+
+fn at_once(service: Service) -> Handler<()> {
+    Handler::method(Box::leak(Box::new(move |(): &mut (), call: &cara_embassy::Call<()>, parameters: &mut _| {
+        service.diary().begin(now());
+        let result = (service.body)(&Asked { caller: call.caller.clone(), at: now() }, parameters);
+        service.diary().end(now());
+        result
+    })))
+}
+
+/// Takes the calls of one name, for as long as there is such a service, and begins a task for each.
+async fn take_calls(node: Rc<BoardNode>, board: Board, unit: Handle, function: String) {
+    let mut parameters = boxed_parameters(PARAMETERS);
+    loop {
+        match unit.next_call(&function, &mut parameters).await {
+            Err(_) => return,
+            Ok(call) => {
+                let Some(service) = node.service(&function) else { return };
+                let mut own = boxed_parameters(PARAMETERS);
+                own.copy_from(&parameters).expect("there is as much room");
+                board.spawn(async move { serve(unit, &service, call, &mut own).await });
+            }
+        }
+    }
+}
+
+async fn serve(unit: Handle, service: &Service, call: TakenCall<()>, parameters: &mut ParametersView) {
+    service.diary().begin(now());
+    let result = run(unit, service, &call.caller, parameters).await;
+    if result.is_ok() {
+        service.diary().end(now());
+    }
+    call.reply(result.map(|()| &*parameters)).await;
+}
+
+async fn run(
+    unit: Handle,
+    service: &Service,
+    caller: &Identity,
+    parameters: &mut ParametersView,
+) -> Result<(), ServiceError> {
+    if let Some(function) = &service.calls_back {
+        let patient = RequestOptions { timeout: Some(Duration::from_secs(8)), ..RequestOptions::default() };
+        let called = unit.peer_of(caller).block_request_with(function, parameters, &patient).await;
+        called.map_err(|_| ServiceError::NotReady)?;
+    }
+    (service.body)(&Asked { caller: caller.clone(), at: now() }, parameters)?;
+    embassy_time::Timer::after_micros(service.takes.as_micros()).await;
+    Ok(())
+}
