@@ -1,5 +1,9 @@
 //! Calls, round trips and events.
 
+use std::ops::ControlFlow;
+
+use cara_std::Parameters;
+use cara_std::control::execute;
 use cara_std::control::protocol::{Answer, ArgumentValue, CallQuestion, Failure, Number, Question};
 
 use crate::support::{Depot, argument, ask, call, ping, refused, until};
@@ -198,4 +202,38 @@ fn a_watch_sees_what_happens() {
     depot.system.stop();
     // What is on its way comes; then the connection ends.
     assert!(watching.ask(&Question::Unit).is_err() || watching.ask(&Question::Unit).is_err());
+}
+
+/// Who reads events more slowly than they come is told how many it has missed.
+#[test]
+fn a_slow_watch_loses_events_and_is_told_how_many() {
+    let (depot, _agv) = Depot::with_agv();
+    let peer = depot.system.s_unit("agv").unwrap();
+    let lost = || depot.system.counters().iter().find(|(name, _)| *name == "EventsLost").unwrap().1;
+    let (begun, begins) = std::sync::mpsc::channel();
+    std::thread::scope(|scope| {
+        let watching = scope.spawn(|| {
+            let mut told = 0;
+            execute(&depot.system, &Question::Watch, &mut |answer| match answer {
+                Answer::Event { event, .. } if event == "watching" => {
+                    begun.send(()).unwrap();
+                    until("events are lost", || lost() > 0);
+                    ControlFlow::Continue(())
+                }
+                Answer::Event { event, text, .. } if event == "lost" => {
+                    told = text.split(' ').next().unwrap().parse().unwrap();
+                    ControlFlow::Break(())
+                }
+                _ => ControlFlow::Continue(()),
+            });
+            told
+        });
+        begins.recv().unwrap();
+        while lost() == 0 {
+            // A full queue makes room by and by.
+            let _ = peer.request("fail", &Parameters::new());
+        }
+        let told: u64 = watching.join().unwrap();
+        assert!(told > 0 && told <= lost());
+    });
 }
