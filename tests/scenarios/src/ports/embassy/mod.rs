@@ -89,7 +89,9 @@ impl World for EmbassyWorld {
             Fault::Suspend(unit, span) => self.node(unit).board().suspend(span),
             Fault::Reset(_) => return Err(Unsupported(Need::Reset)),
             Fault::Path(..) => return Err(Unsupported(Need::Path)),
-            Fault::OtherVersion(_) => return Err(Unsupported(Need::OtherVersion)),
+            Fault::SlowReader(..) => return Err(Unsupported(Need::SlowReader)),
+            Fault::Stranger(..) => return Err(Unsupported(Need::Strangers)),
+            Fault::Unplug(_) | Fault::Plug(_) => return Err(Unsupported(Need::Interface)),
         }
         Ok(())
     }
