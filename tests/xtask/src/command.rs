@@ -47,6 +47,14 @@ impl Run {
         Ok(())
     }
 
+    /// Streams the output through; the exit code, or `None` after a signal.
+    pub(crate) fn code(mut self) -> Result<Option<i32>> {
+        let shown = self.shown();
+        println!("$ {shown}");
+        let status = self.command.status().with_context(|| format!("cannot start `{shown}`"))?;
+        Ok(status.code())
+    }
+
     /// Standard output as text; an error, with the standard error in it, unless the command succeeds.
     pub(crate) fn text(self) -> Result<String> {
         let shown = self.shown();

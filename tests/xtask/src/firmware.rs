@@ -6,8 +6,10 @@ mod sizes;
 
 use std::process::ExitCode;
 
-use anyhow::Result;
+use anyhow::{Result, bail};
 
+use crate::command::Run;
+use crate::groups::Outcome;
 use crate::install;
 use boards::{BOARDS, Board};
 pub(crate) use sizes::sizes;
@@ -21,6 +23,33 @@ pub(crate) fn build(name: Option<&str>) -> Result<ExitCode> {
         }
     }
     Ok(ExitCode::SUCCESS)
+}
+
+/// The emulated board, whose firmware is tested.
+const TESTED: &str = "lm3s6965evb";
+/// Exit code of a test that the system does not allow.
+const NOT_ALLOWED: i32 = 77;
+
+/// Runs the emulated board's firmware against the Linux manager.
+pub(crate) fn test() -> Outcome {
+    if let Err(reason) = install::program("qemu-system-arm", "qemu-system-arm") {
+        return Outcome::Skipped(reason);
+    }
+    match tested() {
+        Ok(Some(NOT_ALLOWED)) => Outcome::Skipped("this user cannot make a network with virtual devices".into()),
+        Ok(Some(0)) => Outcome::Passed,
+        Ok(code) => Outcome::Failed(format!("exit code {code:?}")),
+        Err(error) => Outcome::Failed(format!("{error:#}")),
+    }
+}
+
+fn tested() -> Result<Option<i32>> {
+    let board = boards::find(TESTED)?;
+    install::rust_target(board.target).map_err(anyhow::Error::msg)?;
+    let Some(image) = board.images.first() else { bail!("{TESTED} has no image") };
+    let image = board.build(image)?;
+    let run = ["run", "--quiet", "--package", "cara-firmware-tests", "--", "--image"];
+    Run::cargo().args(run).args([image]).code()
 }
 
 fn chosen(name: Option<&str>) -> Result<Vec<&'static Board>> {

@@ -5,7 +5,10 @@ use std::path::Path;
 use anyhow::{Result, bail};
 
 use crate::command::Run;
-use crate::{dependencies, hygiene, install, layers, licences, links, manifests, names, panic_free, paper, workspace};
+use crate::{
+    dependencies, firmware, fleet, hygiene, install, layers, licences, links, manifests, names, panic_free, paper,
+    workspace,
+};
 
 /// A group of checks that is run and reported as one.
 pub(crate) struct Group {
@@ -39,7 +42,7 @@ pub(crate) enum Outcome {
 }
 
 /// All groups, in the order in which they run: cheap ones first.
-pub(crate) const GROUPS: [Group; 15] = [
+pub(crate) const GROUPS: [Group; 18] = [
     Group {
         name: "format",
         what: "every crate is formatted",
@@ -155,12 +158,36 @@ pub(crate) const GROUPS: [Group; 15] = [
         },
     },
     Group {
+        name: "fleet",
+        what: "1,000 s_units on one manager (quick: 200): broadcasts, threads, memory; times far beyond their goals",
+        budget: 60,
+        quick: Some(60),
+        by_default: true,
+        run: |extent| fleet::check(extent).into(),
+    },
+    Group {
         name: "demo",
         what: "cargo xtask demo: the listing between real processes",
         budget: 90,
         quick: None,
         by_default: true,
         run: |_| Run::cargo().args(["xtask", "demo"]).stream().into(),
+    },
+    Group {
+        name: "guide",
+        what: "every command of the guide does what it says",
+        budget: 120,
+        quick: None,
+        by_default: true,
+        run: |_| guide().into(),
+    },
+    Group {
+        name: "firmware",
+        what: "firmware in QEMU against the Linux manager: calls, cables, losses of power",
+        budget: 300,
+        quick: None,
+        by_default: true,
+        run: |_| firmware::test(),
     },
 ];
 
@@ -242,6 +269,10 @@ fn scenarios(extent: Extent) -> Result<()> {
     let seeds = if extent == Extent::Full { "1000" } else { "50" };
     let run = ["run", "--release", "--package", "cara-scenarios", "--bin", "seeds", "--", "--seeds", seeds];
     Run::cargo().args(run).stream()
+}
+
+fn guide() -> Result<()> {
+    Run::cargo().args(["run", "--quiet", "--package", "cara-guide", "--", "docs/guide.md"]).stream()
 }
 
 fn present(file: &str) -> Result<()> {

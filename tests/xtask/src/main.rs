@@ -10,6 +10,7 @@ mod command;
 mod demo;
 mod dependencies;
 mod firmware;
+mod fleet;
 mod groups;
 mod hygiene;
 mod install;
@@ -62,6 +63,15 @@ enum Task {
         #[arg(long, value_name = "FILE")]
         json: Option<PathBuf>,
     },
+    /// Puts many s_units on one manager and measures how they join, what they cost, and how they come back.
+    Fleet {
+        /// How many s_units; 1,000 if not given.
+        #[arg(long, value_parser = clap::value_parser!(u16).range(2..=5_000))]
+        nodes: Option<u16>,
+        /// Also writes the figures here.
+        #[arg(long, value_name = "FILE")]
+        json: Option<PathBuf>,
+    },
     /// Builds the firmware of a board, or of all boards.
     Firmware {
         /// Which board.
@@ -76,6 +86,7 @@ fn main() -> ExitCode {
         Task::Test { list: true, .. } => runner::list(),
         Task::Test { groups, quick, list: false } => runner::run(&groups, quick),
         Task::Sizes { json } => firmware::sizes(json.as_deref()),
+        Task::Fleet { nodes, json } => fleet::run(nodes, json.as_deref()),
         Task::Bench { quick, json } => bench::run(quick, json.as_deref()),
         Task::Firmware { board } => firmware::build(board.as_deref()),
     };

@@ -1,0 +1,38 @@
+//! `cargo xtask fleet`: a manager with many nodes, measured in a release build.
+
+use std::path::Path;
+use std::process::ExitCode;
+
+use anyhow::Result;
+
+use crate::command::Run;
+use crate::groups::Extent;
+
+/// Turns of the comparison of costs where it is one check among many.
+const CHECKED_ROUNDS: &str = "5";
+
+/// All figures, for as many nodes as are asked for.
+pub(crate) fn run(nodes: Option<u16>, json: Option<&Path>) -> Result<ExitCode> {
+    let nodes = nodes.map(|nodes| nodes.to_string());
+    let mut run = measured();
+    if let Some(nodes) = &nodes {
+        run = run.args(["--nodes", nodes]);
+    }
+    let run = match json {
+        // The child runs in the project's root, wherever this command was started.
+        Some(path) => run.args(["--json".as_ref(), std::path::absolute(path)?.as_os_str()]),
+        None => run,
+    };
+    run.stream()?;
+    Ok(ExitCode::SUCCESS)
+}
+
+/// The group: whether a bound is broken.
+pub(crate) fn check(extent: Extent) -> Result<()> {
+    let nodes = if extent == Extent::Full { "1000" } else { "200" };
+    measured().args(["--nodes", nodes, "--rounds", CHECKED_ROUNDS]).stream()
+}
+
+fn measured() -> Run {
+    Run::cargo().args(["run", "--release", "--quiet", "--package", "cara-fleet", "--"])
+}
