@@ -68,9 +68,12 @@ fn as_a_manager_the_same_questions_have_the_same_answers() {
     let told = stage.ends(0, &own(&["scan", "--json"])).json();
     assert_eq!((told["nodes"].as_array().unwrap().len(), &told["unit"]["name"]), (2, &"manager".into()), "{told}");
     stage.ends(0, &own(&["functions", "agv-1"])).says("go_to(position: int[2])");
-    let called = stage.ends(0, &own(&["call", "agv-2", "go_to(position: [1, 2])"]));
+    let called = stage.ends(0, &own(&["call", "agv-2", "go_to(position: [1, 2])", "--timeout", "20s"]));
     assert_eq!(called.out, "go_to(position: [1, 2])\n");
-    stage.ends(0, &own(&["call", "--all", "go_to(position: [1, 2])"])).says("agv-1/11").says("agv-2/12");
+    stage
+        .ends(0, &own(&["call", "--all", "go_to(position: [1, 2])", "--timeout", "20s"]))
+        .says("agv-1/11")
+        .says("agv-2/12");
     stage.ends(0, &own(&["call", "agv-2", "echo(text: \"x\")", "--async"])).says("accepted");
     stage.ends(0, &own(&["ping", "agv-1", "-c", "1", "--timeout", "20s"])).says("1 of 1 answered");
     stage.ends(0, &own(&["counters", "agv-1", "--json"]));

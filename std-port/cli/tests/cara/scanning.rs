@@ -68,9 +68,9 @@ fn a_survey_can_be_had_beside_a_manager() {
 #[test]
 fn what_is_published_is_read() {
     let stage = Stage::with(&["agv-1"]);
-    stage.ends(0, &["publish", "agv-1"]).says("published to agv-1/11");
+    stage.ends(0, &["publish", "agv-1", "--timeout", "20s"]).says("published to agv-1/11");
     stage.ends(0, &["publish", "--timeout", "20s"]).says("published to all nodes");
-    let told = stage.ends(0, &["publish", "--json"]).json();
+    let told = stage.ends(0, &["publish", "--json", "--timeout", "20s"]).json();
     assert_eq!(told["unread"], serde_json::json!([]));
     stage.ends(1, &["publish", "agv-2"]).says("agv-1/11");
 }

@@ -70,6 +70,8 @@ impl Stage {
             assert!(start.elapsed() < PATIENCE, "the manager does not answer");
             std::thread::sleep(Duration::from_millis(50));
         }
+        // Other tests run at the same time.
+        self.ends(0, &["set", ".", "request_timeout", "20s"]);
     }
 
     pub(crate) fn start_agv(&mut self, name: &str, id: u32) {
