@@ -16,6 +16,9 @@ use crate::resources::{DATAGRAM_PORT, StackMemory};
 /// First of the ports that links are opened from.
 const FIRST_PORT: u16 = 49_152;
 
+/// A stream that is closed is forgotten after this, if the other end does not answer.
+const FAREWELL: smoltcp::time::Duration = smoltcp::time::Duration::from_secs(3);
+
 /// Interface and sockets.
 pub(crate) struct Stack {
     interface: Interface,
@@ -101,6 +104,8 @@ impl Stack {
     pub(crate) fn connect(&mut self, to: SocketAddr) -> bool {
         let (Some(to), stream) = (endpoint(to), self.sockets.get_mut::<tcp::Socket>(self.stream)) else { return false };
         stream.abort();
+        // A live link's end is the core's to find out.
+        stream.set_timeout(None);
         self.port = self.port.wrapping_add(1) | FIRST_PORT;
         stream.connect(self.interface.context(), to, self.port).is_ok()
     }
@@ -118,9 +123,11 @@ impl Stack {
         self.sockets.get::<tcp::Socket>(self.stream).can_send()
     }
 
-    /// Closes the stream behind what it still has to send.
+    /// Closes the stream behind what it still has to send, or without it when nobody takes that for a while.
     pub(crate) fn close(&mut self) {
-        self.sockets.get_mut::<tcp::Socket>(self.stream).close();
+        let stream = self.sockets.get_mut::<tcp::Socket>(self.stream);
+        stream.set_timeout(Some(FAREWELL));
+        stream.close();
     }
 
     /// Bytes that have come, which stay in the stream until they are [consumed](Self::consume).

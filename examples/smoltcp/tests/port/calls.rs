@@ -83,17 +83,45 @@ fn answers_that_find_no_room_wait_for_it() {
     // What the manager sends arrives; nothing that the vehicle sends does, so that it fills up.
     world.switch.borrow_mut().set_faults_from(vehicle_port, Faults::loss(1.0));
     let options = RequestOptions { timeout: Some(SECOND.times(30)), ..RequestOptions::default() };
-    for _ in 0..6 {
+    for value in 0..6 {
         let now = world.now;
-        world.manager().request(now, link, "report", 1, &options, true).unwrap();
+        world.manager().request(now, link, "report", value, &options, true).unwrap();
         world.run(MILLISECOND.times(100));
     }
     assert!(world.vehicles[0].program.reports < 6, "there was room for all answers");
     world.set_faults(Faults::NONE);
     world.run(SECOND.times(20));
     let replies: Vec<_> = world.manager().replies.iter().map(|(_, _, outcome)| *outcome).collect();
-    assert_eq!(replies, [Ok(1); 6]);
+    assert_eq!(replies, [0, 1, 2, 3, 4, 5].map(Ok));
     assert_eq!(world.vehicles[0].program.reports, 6);
+}
+
+#[test]
+fn an_answer_that_the_stream_takes_in_parts_goes_on_when_there_is_room() {
+    let mut world = joined();
+    world.set_faults(Faults { delay: MILLISECOND.times(50), ..Faults::NONE });
+    let (now, link) = (world.now, world.manager().links()[0]);
+    for value in 0..3 {
+        world.manager().call(now, link, "report", value).unwrap();
+    }
+    // Three of them are longer than the stream's buffer, and nothing else is said meanwhile.
+    assert!(world.run_until(MILLISECOND.times(700), |world| world.manager().replies.len() == 3));
+}
+
+#[test]
+fn what_has_ended_is_made_safe_before_anything_is_served() {
+    let mut world = joined();
+    drive(&mut world);
+    // The program is busy for longer than the lease, while the manager goes on.
+    world.vehicles[0].asleep = true;
+    world.run(LEASE + LEASE);
+    let (now, link) = (world.now, world.manager().links()[0]);
+    world.manager().call(now, link, "echo", 3).unwrap();
+    world.run(SECOND.divided_by(10));
+    world.vehicles[0].program.order.clear();
+    world.vehicles[0].asleep = false;
+    world.run(SECOND);
+    assert_eq!(world.vehicles[0].program.order, ["made safe", "echo"]);
 }
 
 #[test]

@@ -79,6 +79,42 @@ fn a_manager_that_was_away_for_long_is_found_again() {
 }
 
 #[test]
+fn a_manager_that_restarts_at_once_resets_the_link() {
+    let mut world = joined(14);
+    let gone = world.now;
+    let cable = world.power_cut();
+    world.power_on(cable, 15);
+    assert!(world.run_until(SECOND.times(10), |world| world.vehicles[0].left() == 1));
+    let left = world.vehicles[0].program.news.iter().find(|(_, news)| matches!(news, News::Left(_))).unwrap();
+    assert_eq!(left.1, News::Left(CloseReason::Reset));
+    // A question in the stream follows the first missed keep-alive. The new manager knows nothing of the stream, and is
+    // asked twice, since it must find out first where to answer.
+    assert!(left.0.since(gone).as_millis() <= 2_600, "{:?}", left.0.since(gone));
+    world.join();
+    talk(&mut world);
+}
+
+#[test]
+fn a_manager_that_has_moved_to_another_host_is_found() {
+    let mut world = joined(16);
+    world.power_cut();
+    world.power_on_elsewhere(17);
+    world.join();
+    talk(&mut world);
+}
+
+#[test]
+fn without_a_manager_it_goes_on_looking() {
+    let mut world = joined(18);
+    world.power_cut();
+    world.run(SECOND.times(10));
+    let before = world.switch.borrow().frames();
+    world.run(SECOND.times(120));
+    let sent = world.switch.borrow().frames() - before;
+    assert!((8..30).contains(&sent), "{sent} frames in two minutes");
+}
+
+#[test]
 fn one_direction_that_fails_ends_the_link_on_both_sides() {
     for deaf in [true, false] {
         let mut world = joined(3);

@@ -23,8 +23,8 @@ use smoltcp::wire::{EthernetAddress, HardwareAddress, IpCidr, Ipv4Cidr};
 
 use super::Cable;
 
-pub(crate) const MAC: [u8; 6] = [2, 0, 0, 0, 0, 250];
-const IP: Ipv4Addr = Ipv4Addr::new(10, 0, 0, 250);
+/// The last part of its addresses, unless it moves.
+pub(crate) const HOST: u8 = 250;
 const TCP_PORT: u16 = 7_000;
 /// Links, each with a socket that listens as long as it has none.
 const LINKS: usize = 8;
@@ -32,7 +32,11 @@ const FUNCTIONS: usize = 8;
 const CALLS: usize = 16;
 
 pub(crate) fn address() -> SocketAddr {
-    SocketAddr::new(IP.into(), TCP_PORT)
+    SocketAddr::from(([10, 0, 0, HOST], TCP_PORT))
+}
+
+pub(crate) fn mac(host: u8) -> [u8; 6] {
+    [2, 0, 0, 0, 0, host]
 }
 
 /// Parameters with one number, which both ends' functions take, and texts.
@@ -94,12 +98,12 @@ impl Mailman for Net {
 }
 
 impl Net {
-    fn new(now: Instant, cable: &mut Cable, seed: u64) -> Self {
-        let mut config = Config::new(HardwareAddress::Ethernet(EthernetAddress(MAC)));
+    fn new(now: Instant, cable: &mut Cable, host: u8, seed: u64) -> Self {
+        let mut config = Config::new(HardwareAddress::Ethernet(EthernetAddress(mac(host))));
         config.random_seed = seed;
         let mut interface = Interface::new(config, cable, smol(now));
         interface.update_ip_addrs(|addresses| {
-            addresses.push(IpCidr::Ipv4(Ipv4Cidr::new(IP, 24))).unwrap();
+            addresses.push(IpCidr::Ipv4(Ipv4Cidr::new(Ipv4Addr::new(10, 0, 0, host), 24))).unwrap();
         });
         let bytes = |count| vec![0; count];
         let packets = || udp::PacketBuffer::new(vec![udp::PacketMetadata::EMPTY; 64], bytes(32 * 1024));
@@ -134,7 +138,7 @@ macro_rules! context {
 }
 
 impl Manager {
-    pub(crate) fn new(now: Instant, mut cable: Cable, seed: u64) -> Self {
+    pub(crate) fn new(now: Instant, mut cable: Cable, host: u8, seed: u64) -> Self {
         let config = NodeConfig {
             identity: Identity::m_unit("manager", 1).unwrap(),
             fleet: Fleet(0),
@@ -156,7 +160,7 @@ impl Manager {
         functions.add_function(&mechanic, Attributes::default(), ()).unwrap();
         let size = buffer_bytes(Constraints::M_UNIT.message_size, 0);
         Self {
-            net: Net::new(now, &mut cable, seed),
+            net: Net::new(now, &mut cable, host, seed),
             cable,
             node: Node::new(now, config, storage),
             sessions: (0..LINKS).map(|_| None).collect(),

@@ -91,7 +91,7 @@ impl World {
     pub(crate) fn new(seed: u64, vehicles: usize, faults: Faults) -> Self {
         let switch: SharedSwitch = Rc::new(RefCell::new(Switch::new(seed)));
         let now = Instant::from_micros(1_000);
-        let manager = Some(Manager::new(now, Cable::new(&switch, manager::MAC), seed));
+        let manager = Some(Manager::new(now, Cable::new(&switch, manager::mac(manager::HOST)), manager::HOST, seed));
         let vehicle = |number| Vehicle::new(now, &switch, number, seed, vehicle::by_broadcast());
         let vehicles = (1..=vehicles as u8).map(vehicle).collect();
         switch.borrow_mut().set_faults(faults);
@@ -163,7 +163,14 @@ impl World {
     pub(crate) fn power_on(&mut self, cable: Cable, seed: u64) {
         // What has arrived meanwhile was heard by nobody.
         while self.switch.borrow_mut().receive(self.now, cable.port).is_some() {}
-        self.manager = Some(Manager::new(self.now, cable, seed));
+        self.manager = Some(Manager::new(self.now, cable, manager::HOST, seed));
+    }
+
+    /// The manager comes back on another host; the old one stays dark.
+    pub(crate) fn power_on_elsewhere(&mut self, seed: u64) {
+        let host = manager::HOST + 1;
+        let cable = Cable::new(&self.switch, manager::mac(host));
+        self.manager = Some(Manager::new(self.now, cable, host, seed));
     }
 
     pub(crate) fn set_link(&mut self, vehicle: usize, up: bool) {

@@ -23,6 +23,8 @@ pub(crate) struct Vehicle {
     pub(crate) cable: Cable,
     pub(crate) program: Notes,
     pub(crate) lease: &'static Lease,
+    /// The program does something else, and polls nothing.
+    pub(crate) asleep: bool,
     due: Instant,
 }
 
@@ -39,6 +41,8 @@ pub(crate) struct Notes {
     pub(crate) echoed: Vec<i64>,
     pub(crate) driving: bool,
     pub(crate) made_safe: Vec<Instant>,
+    /// What came first.
+    pub(crate) order: Vec<&'static str>,
     pub(crate) news: Vec<(Instant, News)>,
     pub(crate) replies: Vec<(CallId, Result<i64, Error>)>,
     pub(crate) waiting: Option<Ticket>,
@@ -63,6 +67,7 @@ impl Program for Notes {
             self.driving = true;
         } else {
             self.echoed.push(number);
+            self.order.push("echo");
         }
         Served::Now(if number < 0 { Err(ServiceError::Failed(2)) } else { Ok(()) })
     }
@@ -71,6 +76,7 @@ impl Program for Notes {
         assert_eq!(Some(function), self.go_to);
         self.driving = false;
         self.made_safe.push(self.now);
+        self.order.push("made safe");
     }
 
     fn replied(&mut self, call: CallId, outcome: Result<ReplyBlock<'_>, Error>) {
@@ -107,7 +113,7 @@ impl Vehicle {
         let leased = Attributes { lease: Some(LEASE), ..plain };
         let go_to = unit.offer(now, &define("go_to(number: int)"), leased, Some(lease));
         let program = Notes { slow: slow.ok(), report: report.ok(), go_to: go_to.ok(), ..Notes::default() };
-        Self { unit, cable, program, lease, due: now }
+        Self { unit, cable, program, lease, asleep: false, due: now }
     }
 
     pub(crate) fn poll(&mut self, now: Instant) {
@@ -117,6 +123,9 @@ impl Vehicle {
 
     /// When it is to be polled: at its deadline, or when a frame arrives.
     pub(crate) fn next(&self) -> Instant {
+        if self.asleep {
+            return Instant::FAR_FUTURE;
+        }
         let arrival = self.cable.switch.borrow().next_arrival(self.cable.port);
         self.due.min(arrival.unwrap_or(Instant::FAR_FUTURE))
     }
