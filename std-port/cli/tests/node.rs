@@ -302,9 +302,10 @@ fn a_vehicle_joins_and_calls_what_the_file_offers() {
     report.set_value("text", "a wheel\nsqueaks").unwrap();
     manager.block_request("report", &mut report).unwrap();
     assert_eq!(call(&manager, "answer", 6), Ok(42));
+    until("who joined is logged", || node.log().contains("joined"));
     let log = node.log();
     assert!(log.contains(r#"called with {"n":6} by agv/7"#), "{log}");
-    assert!(log.contains("joined") && log.contains(r"a wheel\nsqueaks"), "{log}");
+    assert!(log.contains(r"a wheel\nsqueaks"), "{log}");
     unit.stop();
     assert!(node.process.terminate(PATIENCE).unwrap().success());
 }
@@ -390,7 +391,9 @@ const GO: &str = "echo going >> motion; echo '{\"m\": 1}'";
 /// A node whose function `go` runs a script, and whose lease's end writes `stopped` into a file.
 fn leased(script: &str) -> Node {
     let go = shell("go", script);
-    Node::start(&format!("{go}lease = \"500ms\"\nat_lease_end = [\"sh\", \"-c\", \"echo stopped >> motion\"]\n"))
+    Node::start(&format!(
+        "{go}lease = \"500ms\"\nat_lease_end = [\"sh\", \"-c\", \"sleep 0.2; echo stopped >> motion\"]\n"
+    ))
 }
 
 fn motion(node: &Node) -> String {
