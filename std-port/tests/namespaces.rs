@@ -1,0 +1,170 @@
+//! Interfaces that are not there, go and come: each test in a network namespace of its own.
+//!
+//! A test runs this binary again under `unshare`, as `ip` would need root otherwise. Where that is not possible it says
+//! that it was skipped, and with `CI` set it fails.
+
+use std::process::Command;
+use std::sync::mpsc::Receiver;
+use std::time::{Duration, Instant};
+
+use cara_std::{CloseReason, CommunicationSystem, Error, Interfaces, Parameters, Unit, UnitEvent};
+
+const INSIDE: &str = "CARA_TEST_NAMESPACE";
+const PATIENCE: Duration = Duration::from_secs(30);
+
+/// Runs the test of this name in a namespace of its own; `true` inside of it.
+fn inside(test: &str) -> bool {
+    if std::env::var_os(INSIDE).is_some() {
+        return true;
+    }
+    let possible = |options: &str| {
+        let tried = Command::new("unshare").args([options, "ip", "link"]).output();
+        tried.is_ok_and(|output| output.status.success())
+    };
+    let Some(options) = ["-n", "-rn"].into_iter().find(|options| possible(options)) else {
+        let said = "skipped: no network namespace can be made here (unshare and ip, as root or with user namespaces)";
+        assert!(std::env::var_os("CI").is_none(), "{said}");
+        eprintln!("{test}: {said}");
+        return false;
+    };
+    let binary = std::env::current_exe().expect("this test has a file");
+    let mut child = Command::new("unshare");
+    child.arg(options).arg(binary).args(["--exact", test, "--nocapture", "--test-threads=1"]).env(INSIDE, "1");
+    let output = child.output().expect("unshare was just there");
+    let said = [output.stdout, output.stderr].concat();
+    let said = String::from_utf8_lossy(&said);
+    assert!(output.status.success() && said.contains("1 passed"), "{said}");
+    false
+}
+
+fn ip(arguments: &str) {
+    let output = Command::new("ip").args(arguments.split(' ')).output().expect("ip was there before");
+    assert!(output.status.success(), "ip {arguments}: {}", String::from_utf8_lossy(&output.stderr));
+}
+
+/// A pair of interfaces, one of which is the far end of the cable.
+fn plug_in() {
+    ip("link add eth7 type veth peer name far7");
+    ip("addr add 10.77.0.1/24 dev eth7");
+    ip("link set far7 up");
+    ip("link set eth7 up");
+}
+
+fn manager() -> (CommunicationSystem, Receiver<UnitEvent>) {
+    let manager = CommunicationSystem::builder("manager", 1).unwrap().interfaces(Interfaces::All);
+    let manager = manager.build_system().unwrap();
+    let events = manager.events();
+    manager.start().unwrap();
+    (manager, events)
+}
+
+fn agv() -> (Unit, Receiver<UnitEvent>) {
+    let agv = Unit::builder("agv", 7, "manager", 1).unwrap().interfaces(Interfaces::All).build_unit().unwrap();
+    agv.my_function_list().add_function("ping", &Parameters::new(), |parameters: Parameters| parameters).unwrap();
+    agv.publish_my_function_list().unwrap();
+    let events = agv.events();
+    agv.start().unwrap();
+    (agv, events)
+}
+
+/// Waits until it is told which interfaces are up.
+fn told(events: &Receiver<UnitEvent>) -> Vec<String> {
+    let end = Instant::now() + PATIENCE;
+    loop {
+        let left = end.saturating_duration_since(Instant::now());
+        match events.recv_timeout(left).expect("it is told in time") {
+            UnitEvent::InterfacesChanged { up } => return up,
+            _ => {}
+        }
+    }
+}
+
+fn until(what: &str, condition: impl Fn() -> bool) {
+    let end = Instant::now() + PATIENCE;
+    while !condition() {
+        assert!(Instant::now() < end, "not in time: {what}");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+}
+
+fn ping(manager: &CommunicationSystem) -> Result<(), Error> {
+    manager.s_unit("agv").ok_or(Error::NotConnected)?.block_request("ping", &mut Parameters::new())
+}
+
+#[test]
+fn without_an_interface_a_unit_says_so_once_and_goes_on_when_there_is_one() {
+    if !inside("without_an_interface_a_unit_says_so_once_and_goes_on_when_there_is_one") {
+        return;
+    }
+    let (manager, of_manager) = manager();
+    let (agv, of_agv) = agv();
+    for events in [&of_manager, &of_agv] {
+        assert_eq!(told(events), Vec::<String>::new());
+    }
+    // It goes on searching, and says nothing more.
+    until("the AGV has tried several times", || {
+        let counters = agv.counters();
+        counters.iter().any(|(name, count)| *name == "SendFailed" && *count >= 3)
+    });
+    let again = |events: &Receiver<UnitEvent>| {
+        events.try_iter().filter(|event| matches!(event, UnitEvent::InterfacesChanged { .. })).count()
+    };
+    assert_eq!((again(&of_manager), again(&of_agv)), (0, 0));
+    assert!(!agv.is_connected());
+
+    // Both are on one host here, so loopback is what they meet over. Found or not, it is told that there is no other.
+    ip("link set lo up");
+    for events in [&of_manager, &of_agv] {
+        assert_eq!(told(events), ["lo"]);
+    }
+    until("the two meet", || ping(&manager) == Ok(()));
+}
+
+#[test]
+fn an_interface_goes_and_comes() {
+    if !inside("an_interface_goes_and_comes") {
+        return;
+    }
+    ip("link set lo up");
+    let (manager, of_manager) = manager();
+    let (agv, _of_agv) = agv();
+    assert_eq!(told(&of_manager), ["lo"], "no other host can be reached");
+    until("the two meet over loopback", || ping(&manager) == Ok(()));
+    agv.stop();
+    until("it has left", || manager.number_of_s_units() == 0);
+
+    plug_in();
+    assert_eq!(told(&of_manager), ["eth7", "lo"]);
+    ip("link set eth7 down");
+    assert_eq!(told(&of_manager), ["lo"]);
+    ip("link set eth7 up");
+    assert_eq!(told(&of_manager), ["eth7", "lo"]);
+    let (_second, _events) = self::agv();
+    until("the two meet again", || ping(&manager) == Ok(()));
+}
+
+/// A vehicle that knows its manager's address has no route to it, and says so each time that it tries.
+#[test]
+fn a_fixed_address_without_a_route_is_told() {
+    if !inside("a_fixed_address_without_a_route_is_told") {
+        return;
+    }
+    ip("link set lo up");
+    let agv = Unit::builder("agv", 7, "manager", 1).unwrap().manager_address(([10, 77, 0, 1], 7_000).into());
+    let agv = agv.build_unit().unwrap();
+    let events = agv.events();
+    agv.start().unwrap();
+    let end = Instant::now() + PATIENCE;
+    loop {
+        let left = end.saturating_duration_since(Instant::now());
+        if let UnitEvent::NotJoined { address, reason, .. } = events.recv_timeout(left).expect("it is told in time") {
+            assert_eq!((address, reason), (([10, 77, 0, 1], 7_000).into(), CloseReason::DialFailed));
+            break;
+        }
+    }
+    // The manager comes to be there, with the cable.
+    plug_in();
+    let manager = CommunicationSystem::builder("manager", 1).unwrap().tcp_port(7_000).build_system().unwrap();
+    manager.start().unwrap();
+    until("it has joined", || manager.number_of_s_units() == 1);
+}
