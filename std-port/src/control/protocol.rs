@@ -28,7 +28,8 @@ pub enum Question {
         /// `NAME`, `NAME/ID` or `#ID`.
         node: String,
     },
-    /// Call a function. An [`Answer::Called`] for each node.
+    /// Call a function. An [`Answer::Called`] for each node. No lease is renewed: what the call starts goes on for the
+    /// length of its lease.
     Call(CallQuestion),
     /// Publish this unit's functions. An [`Answer::Unread`] for each node that has not read the list in time.
     Publish {
@@ -41,12 +42,13 @@ pub enum Question {
     Set {
         /// Towards this node alone: the unit's side of that link.
         node: Option<String>,
-        /// As in [`Constraints`].
+        /// Its name in [`Constraints`](crate::Constraints); with `_us` behind it as well.
         constraint: String,
         /// In the constraint's unit: a number, nodes, bytes or microseconds.
         value: u64,
     },
-    /// An [`Answer::Event`] for each event, until the connection is closed.
+    /// An [`Answer::Event`] for each event, until the connection is closed. The first is `watching`, behind which nothing
+    /// is missed; `lost` tells how many came faster than they were read.
     Watch,
     /// Counters of the unit, or of the link to one node. Answered by an [`Answer::Counters`] for each.
     Counters {

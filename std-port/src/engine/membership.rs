@@ -89,10 +89,8 @@ impl<T: Send + 'static> Engine<T> {
         if read(&self.links).iter().all(Option::is_some) {
             self.make_room();
         }
-        if self.open_link(stream, address, None).is_none() {
-            if self.accounts.connection_refused() == 0 {
-                tracing::warn!(%address, "a connection was dropped, as others may be from now on: {}", Limit::Links);
-            }
+        if self.open_link(stream, address, None).is_none() && self.accounts.connection_refused() == 0 {
+            tracing::warn!(%address, "a connection was dropped, as others may be from now on: {}", Limit::Links);
         }
     }
 
