@@ -72,9 +72,8 @@ fn told(events: &Receiver<UnitEvent>) -> Vec<String> {
     let end = Instant::now() + PATIENCE;
     loop {
         let left = end.saturating_duration_since(Instant::now());
-        match events.recv_timeout(left).expect("it is told in time") {
-            UnitEvent::InterfacesChanged { up } => return up,
-            _ => {}
+        if let UnitEvent::InterfacesChanged { up } = events.recv_timeout(left).expect("it is told in time") {
+            return up;
         }
     }
 }

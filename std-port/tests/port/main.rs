@@ -8,6 +8,7 @@ mod asynchronous;
 mod callbacks;
 mod constraints;
 mod handlers;
+mod in_use;
 mod junk;
 mod leases;
 mod many;

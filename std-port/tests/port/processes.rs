@@ -9,7 +9,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-use cara_std::{Error, ServiceOptions};
+use cara_std::{CloseReason, Error, Refusal, ServiceOptions, UnitEvent};
 use rustix::process::{Pid, Signal, kill_process};
 
 use crate::support::{PATIENCE, ask, fleet, number, service, system, unit, until};
@@ -183,6 +183,45 @@ fn publishing_names_who_has_not_acknowledged() {
     assert_eq!(manager.number_of_s_units(), 1);
     frozen.signal(Signal::CONT);
     until("it is back", || ask(&lost, "life", 0) == Ok(2));
+}
+
+/// A board that loses power does not say goodbye: its process stands still here, and one of the same identity begins. Then
+/// a third of that identity comes while the second is well: that one is a double.
+#[test]
+fn a_restart_and_a_twin_are_told_apart() {
+    let fleet = fleet();
+    let manager = system(fleet).build_system().unwrap();
+    let events = manager.events();
+    manager.start().unwrap();
+    let _bystander = Process::agv(fleet, "bystander", 2, 20);
+    let first = Process::agv(fleet, "agv", 7, 1);
+    let life = |name: &str| manager.s_unit(name).and_then(|peer| ask(&peer, "life", 0).ok());
+    until("both have come", || (life("agv"), life("bystander")) == (Some(1), Some(20)));
+
+    first.freeze();
+    let _second = Process::agv(fleet, "agv", 7, 2);
+    until("the second has the first one's place", || life("agv") == Some(2));
+    let left = events.try_iter().find_map(|event| match event {
+        UnitEvent::Left { peer, reason } if peer.name() == "agv" => Some(reason),
+        _ => None,
+    });
+    assert_eq!(left, Some(CloseReason::PeerRestarted), "it did not take three keep-alives to notice");
+    assert_eq!(life("bystander"), Some(20));
+
+    let twin = unit("agv", 7, fleet).build_unit().unwrap();
+    let told = twin.events();
+    twin.start().unwrap();
+    loop {
+        match told.recv_timeout(PATIENCE).unwrap() {
+            UnitEvent::NotJoined { reason: CloseReason::Refused(refusal), .. } => {
+                assert_eq!(refusal, Refusal::DuplicateIdentity);
+                break;
+            }
+            UnitEvent::Joined { .. } => panic!("the twin was taken while the second lives"),
+            _ => {}
+        }
+    }
+    assert_eq!((life("agv"), life("bystander"), manager.number_of_s_units()), (Some(2), Some(20), 2));
 }
 
 #[test]
