@@ -1,5 +1,7 @@
 //! Licences and sources of everything in the lock file: what may be linked, and from the registry only.
 
+use std::collections::{HashMap, HashSet};
+
 use anyhow::{Result, bail};
 use serde_json::Value;
 
@@ -21,6 +23,9 @@ const ALLOWED: [&str; 12] = [
     "Zlib",
 ];
 
+/// Licences of what only tests use, unchanged, and nobody gets from us.
+const ALLOWED_IN_TESTS: [&str; 1] = ["MPL-2.0"];
+
 const REGISTRY: &str = "registry+https://github.com/rust-lang/crates.io-index";
 
 /// Asks cargo for all packages and fails with those that may not be used.
@@ -28,7 +33,9 @@ pub(crate) fn check() -> Result<()> {
     let text = Run::cargo().args(["metadata", "--format-version", "1", "--locked"]).text()?;
     let metadata: Value = serde_json::from_str(&text)?;
     let packages = metadata.get("packages").and_then(Value::as_array).map_or(&[][..], Vec::as_slice);
-    let wrong: Vec<String> = packages.iter().filter_map(objection).collect();
+    let shipped = shipped(&metadata);
+    let is_shipped = |package: &Value| package.get("id").and_then(Value::as_str).is_none_or(|id| shipped.contains(id));
+    let wrong: Vec<String> = packages.iter().filter_map(|package| objection(package, is_shipped(package))).collect();
     if packages.is_empty() {
         bail!("cargo metadata names no packages");
     }
@@ -40,7 +47,27 @@ pub(crate) fn check() -> Result<()> {
     bail!("{} packages may not be used", wrong.len())
 }
 
-fn objection(package: &Value) -> Option<String> {
+/// Everything that is linked into a crate outside `tests`.
+fn shipped(metadata: &Value) -> HashSet<&str> {
+    let list = |value: &'_ Value, key: &str| value.get(key).and_then(Value::as_array).cloned().unwrap_or_default();
+    let nodes = metadata.get("resolve").and_then(|resolve| resolve.get("nodes")).and_then(Value::as_array);
+    let edges: HashMap<&str, &Value> =
+        nodes.into_iter().flatten().filter_map(|node| Some((node.get("id")?.as_str()?, node))).collect();
+    let members = metadata.get("workspace_members").and_then(Value::as_array).into_iter().flatten();
+    let mut left: Vec<&str> = members.filter_map(Value::as_str).filter(|id| !id.contains("/tests/")).collect();
+    let mut found = HashSet::new();
+    while let Some(id) = left.pop() {
+        if found.insert(id) {
+            let dependencies = edges.get(id).and_then(|node| node.get("deps")).and_then(Value::as_array);
+            let linked = |dependency: &&Value| list(dependency, "dep_kinds").iter().any(|kind| kind["kind"] != "dev");
+            let ids = dependencies.into_iter().flatten().filter(linked).filter_map(|one| one.get("pkg")?.as_str());
+            left.extend(ids);
+        }
+    }
+    found
+}
+
+fn objection(package: &Value, is_shipped: bool) -> Option<String> {
     let text = |key: &str| package.get(key).and_then(Value::as_str);
     let name = format!("{} {}", text("name").unwrap_or("?"), text("version").unwrap_or("?"));
     if let Some(source) = text("source").filter(|source| *source != REGISTRY) {
@@ -48,6 +75,7 @@ fn objection(package: &Value) -> Option<String> {
     }
     match text("license") {
         None => Some(format!("{name}: names no licence")),
+        Some(licence) if !is_shipped && ALLOWED_IN_TESTS.contains(&licence) => None,
         Some(licence) if !is_allowed(licence) => Some(format!("{name}: licence {licence}")),
         Some(_) => None,
     }
@@ -83,7 +111,7 @@ fn split<'t>(text: &'t str, separator: &str) -> Vec<&'t str> {
 
 #[cfg(test)]
 mod tests {
-    use super::{is_allowed, objection};
+    use super::{is_allowed, objection, shipped};
     use serde_json::json;
 
     #[test]
@@ -99,8 +127,28 @@ mod tests {
 
     #[test]
     fn git_sources_are_refused() {
-        assert!(objection(&json!({"name": "a", "license": "MIT", "source": "git+https://example.org/a"})).is_some());
-        assert!(objection(&json!({"name": "a", "license": "MIT", "source": null})).is_none());
-        assert!(objection(&json!({"name": "a", "source": null})).is_some());
+        assert!(
+            objection(&json!({"name": "a", "license": "MIT", "source": "git+https://example.org/a"}), true).is_some()
+        );
+        assert!(objection(&json!({"name": "a", "license": "MIT", "source": null}), true).is_none());
+        assert!(objection(&json!({"name": "a", "source": null}), true).is_some());
+    }
+
+    #[test]
+    fn what_only_tests_use_may_have_a_licence_of_its_own() {
+        let package = json!({"name": "a", "license": "MPL-2.0", "source": null});
+        assert!(objection(&package, true).is_some() && objection(&package, false).is_none());
+        let (kept, dev) = (json!([{"kind": null}]), json!([{"kind": "dev"}]));
+        let metadata = json!({
+            "workspace_members": ["path+file:///x/core#a@1", "path+file:///x/tests/b#b@1"],
+            "resolve": {"nodes": [
+                {"id": "path+file:///x/core#a@1", "deps": [{"pkg": "linked", "dep_kinds": kept}, {"pkg": "dev", "dep_kinds": dev}]},
+                {"id": "path+file:///x/tests/b#b@1", "deps": [{"pkg": "mpl", "dep_kinds": kept}]},
+                {"id": "linked", "deps": [{"pkg": "deep", "dep_kinds": kept}]},
+            ]},
+        });
+        let mut found: Vec<&str> = shipped(&metadata).into_iter().collect();
+        found.sort_unstable();
+        assert_eq!(found, ["deep", "linked", "path+file:///x/core#a@1"]);
     }
 }
