@@ -4,6 +4,7 @@
 
 use std::collections::BTreeMap;
 use std::io::{BufRead, Write, stdin, stdout};
+use std::time::Duration;
 
 use anyhow::Result;
 use serde::{Deserialize, Serialize};
@@ -53,6 +54,15 @@ pub(crate) struct Block {
     pub(crate) median_ns: u64,
     /// CPU time of the manager's process per call.
     pub(crate) cpu_ns: u64,
+}
+
+impl Block {
+    /// Of calls that took these times, in nanoseconds, and so much CPU time in all.
+    pub(crate) fn new(mut round_trips: Vec<u64>, cpu: Duration) -> Self {
+        round_trips.sort_unstable();
+        let median_ns = round_trips.get(round_trips.len() / 2).copied().unwrap_or(0);
+        Self { median_ns, cpu_ns: cpu.as_nanos() as u64 / round_trips.len().max(1) as u64 }
+    }
 }
 
 /// Says that the process is ready, then answers each question until there are no more.

@@ -8,6 +8,7 @@
 //! Only a release build measures anything: `cargo run --release -p cara-fleet -- --help`.
 
 mod child;
+mod floor;
 mod manager;
 mod parent;
 mod phases;
@@ -53,6 +54,12 @@ enum Role {
     /// A process with s_units; started by the others.
     #[command(hide = true)]
     Units(Units),
+    /// A process that answers on raw sockets; started by the others.
+    #[command(hide = true)]
+    FloorServer(Floor),
+    /// A process that calls over raw sockets; started by the others.
+    #[command(hide = true)]
+    FloorClient(Floor),
 }
 
 /// What a manager's process is told.
@@ -82,11 +89,26 @@ pub(crate) struct Units {
     count: u32,
 }
 
+/// What a process with raw sockets is told.
+#[derive(Args)]
+pub(crate) struct Floor {
+    /// The fleet that it belongs to, as told to every child.
+    #[arg(long)]
+    fleet: u32,
+    /// The TCP port.
+    #[arg(long)]
+    port: u16,
+    #[arg(long)]
+    count: usize,
+}
+
 fn main() -> Result<ExitCode> {
     let arguments = Arguments::parse();
     match arguments.role {
         Some(Role::Manager(manager)) => manager::run(&manager).map(|()| ExitCode::SUCCESS),
         Some(Role::Units(units)) => units::run(&units).map(|()| ExitCode::SUCCESS),
+        Some(Role::FloorServer(floor)) => floor::serve(floor.port, floor.count).map(|()| ExitCode::SUCCESS),
+        Some(Role::FloorClient(floor)) => floor::call(floor.port, floor.count).map(|()| ExitCode::SUCCESS),
         None => measure(&arguments.plan),
     }
 }

@@ -107,10 +107,7 @@ fn block(manager: &CommunicationSystem, node: Option<u32>, calls: usize) -> Resu
         peer.block_request_with("touch", &mut number, &options())?;
         round_trips.push(began.elapsed().as_nanos() as u64);
     }
-    let cpu = proc::own_cpu_time()?.saturating_sub(cpu).as_nanos() as u64;
-    round_trips.sort_unstable();
-    let median_ns = round_trips.get(round_trips.len() / 2).copied().unwrap_or(0);
-    Ok(Block { median_ns, cpu_ns: cpu / calls.max(1) as u64 })
+    Ok(Block::new(round_trips, proc::own_cpu_time()?.saturating_sub(cpu)))
 }
 
 fn counters(manager: &CommunicationSystem) -> Counters {

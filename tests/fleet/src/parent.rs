@@ -45,6 +45,11 @@ impl Child {
         Self::start("units", place, &["--first", &first.to_string(), "--count", &count.to_string()])
     }
 
+    /// One end of so many raw connections: `floor-server` first, then `floor-client`.
+    pub(crate) fn floor(role: &str, place: Place, count: u16) -> Result<Self> {
+        Self::start(role, place, &["--count", &count.to_string()])
+    }
+
     fn start(role: &str, place: Place, more: &[&str]) -> Result<Self> {
         let (fleet, port) = (place.fleet.to_string(), place.port.to_string());
         let arguments = [role, "--fleet", &fleet, "--port", &port];

@@ -44,9 +44,9 @@ pub(crate) fn run(plan: &Plan) -> Result<Figures> {
     let nodes = usize::from(plan.nodes);
     let place = Place::new();
     say("starting");
+    let [empty, one] = small_manager()?;
     let mut manager = Child::manager(place, plan.nodes)?;
     let threads = ThreadWatch::new(manager.pid);
-    let empty = empty_manager()?;
     let single = Child::units(place, SINGLE, 1)?;
     let began = single.started;
     let many = Child::units(place, AMONG, u32::from(plan.nodes) - 1)?;
@@ -76,6 +76,7 @@ pub(crate) fn run(plan: &Plan) -> Result<Figures> {
         called,
         runs,
         memory: per_node(nodes, empty, after),
+        memory_of_others: per_node(nodes - 1, one, after),
         memory_trimmed: per_node(nodes, empty, trimmed),
         manager_threads: threads_before.max(threads_after),
         unit_threads: unit_threads.most(),
@@ -106,11 +107,18 @@ fn connected(manager: &mut Child, count: usize, began: Instant) -> Result<f64> {
     Ok(at.saturating_duration_since(began).as_secs_f64() * 1e3)
 }
 
-/// The memory of a manager's process that has no node, and tables for one only.
-fn empty_manager() -> Result<Memory> {
-    let manager = Child::manager(Place::new(), 1)?;
+/// The memory of a manager's process that has no node, and tables for one only; and when one has come and has been
+/// sent what each of the others is sent.
+fn small_manager() -> Result<[Memory; 2]> {
+    let place = Place::new();
+    let mut manager = Child::manager(place, 1)?;
     std::thread::sleep(REST);
-    proc::memory(manager.pid)
+    let empty = proc::memory(manager.pid)?;
+    let _unit = Child::units(place, SINGLE, 1)?;
+    connected(&mut manager, 1, Instant::now())?;
+    let _: Called = manager.ask(&Question::Exchange { chars: TEXT_BYTES as usize })?;
+    std::thread::sleep(REST);
+    Ok([empty, proc::memory(manager.pid)?])
 }
 
 /// KiB of resident memory and of anonymous memory that each node added.
@@ -124,37 +132,37 @@ fn per_node(nodes: usize, empty: Memory, full: Memory) -> [f64; 2] {
 fn compare(plan: &Plan, fleet: &mut Fleet) -> Result<[Comparison; 2]> {
     let mut alone = Pair::start()?;
     let mut again = Pair::start()?;
+    let place = Place::new();
+    let raw_server = Child::floor("floor-server", place, plan.nodes)?;
+    let mut raw = Child::floor("floor-client", place, plan.nodes)?;
     let [first, second] = proc::two_cpus()?;
     let mut both = [Comparison::default(), Comparison::default()];
     for (comparison, other) in both.iter_mut().zip([first, second]) {
-        let managers = [&alone.manager, &again.manager, &fleet.manager].map(|child| (child.pid, first));
-        let units = [&alone.unit, &again.unit, &fleet.many, &fleet.single].map(|child| (child.pid, other));
+        let managers = [&alone.manager, &again.manager, &fleet.manager, &raw].map(|child| (child.pid, first));
+        let units = [&alone.unit, &again.unit, &fleet.many, &fleet.single, &raw_server].map(|child| (child.pid, other));
         managers.into_iter().chain(units).try_for_each(|(pid, cpu)| proc::pin(pid, Some(cpu)))?;
-        turns(plan.rounds, comparison, &mut alone, &mut again, fleet)?;
+        let managers = [&mut alone.manager, &mut again.manager, &mut fleet.manager, &mut raw];
+        turns(plan.rounds, comparison, managers)?;
     }
     [&fleet.many, &fleet.single].iter().try_for_each(|child| proc::pin(child.pid, None))?;
     Ok(both)
 }
 
-fn turns(
-    rounds: u32,
-    comparison: &mut Comparison,
-    alone: &mut Pair,
-    again: &mut Pair,
-    fleet: &mut Fleet,
-) -> Result<()> {
+fn turns(rounds: u32, comparison: &mut Comparison, callers: [&mut Child; 4]) -> Result<()> {
+    let [alone, again, all, raw] = callers;
     let node = |node| Question::Block { node, calls: CALLS };
     // The first turn warms up and does not count.
     for turn in 0..=rounds {
-        let one: Block = alone.manager.ask(&node(Some(SINGLE)))?;
+        let one: Block = alone.ask(&node(Some(SINGLE)))?;
         let blocks = [
-            again.manager.ask(&node(Some(SINGLE)))?,
-            fleet.manager.ask(&node(Some(SINGLE)))?,
-            fleet.manager.ask(&node(Some(AMONG)))?,
-            fleet.manager.ask(&node(None))?,
+            again.ask(&node(Some(SINGLE)))?,
+            all.ask(&node(Some(SINGLE)))?,
+            all.ask(&node(Some(AMONG)))?,
+            all.ask(&node(None))?,
         ];
+        let raw = [raw.ask(&node(Some(SINGLE)))?, raw.ask(&node(None))?];
         if turn > 0 {
-            comparison.add(one, blocks);
+            comparison.add(one, blocks, raw);
         }
     }
     Ok(())
