@@ -1,7 +1,7 @@
 //! What happened on a link goes to the machine of its unit, and what comes of it is done, as
 //! `docs/notes/driving-the-core.md` says. Nothing here waits or runs a handler.
 
-use cara_core::distribution::connection_handler::{Action, Admission, Sorted};
+use cara_core::distribution::connection_handler::{Action, Admission, NodeCounter, Sorted};
 use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::ParametersView;
@@ -10,6 +10,7 @@ use cara_core::host::mailman::LinkId;
 use cara_core::services::Context;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::{Call, Event};
+use cara_core::time::{Duration, Instant};
 use core::net::SocketAddr;
 use core::task::{Context as TaskContext, Poll};
 
@@ -20,6 +21,9 @@ use crate::mail::EmbassyMailman;
 use crate::replies::ended;
 use crate::taken::Running;
 use crate::time::now;
+
+/// How long somebody who has dialled may say nothing while nobody else could dial.
+const PATIENCE: Duration = Duration::from_millis(100);
 
 /// What happened on a link, without what it borrowed.
 pub(crate) enum News {
@@ -129,7 +133,14 @@ impl<T> Machine<T> {
         let from = SocketAddr::new(from.addr.into(), from.port);
         let bytes = scratch.get(..length).unwrap_or_default();
         match self.node.datagram(now(), from, bytes) {
-            Sorted::Done => Some(None),
+            Sorted::Done => {
+                if let Some(address) = self.node.take_twin() {
+                    let peer = Some(self.node.identity().clone());
+                    let reason = CloseReason::Refused(Refusal::DuplicateIdentity);
+                    self.tell(UnitEvent::NotJoined { address, peer, reason });
+                }
+                Some(None)
+            }
             Sorted::Session { link, nonce, body } => {
                 let event = self.with(link.0, |session, cx, _| session.datagram(cx, from, nonce, body)).flatten();
                 Some(event.map(|event| (link.0, News::of(event))))
@@ -159,7 +170,21 @@ impl<T> Machine<T> {
                 self.disconnected(index, CloseReason::Reset);
             }
         }
+        self.show_one_out(now);
         self.listen();
+    }
+
+    /// The stack refuses who dials while no socket listens, so whoever says nothing gives way.
+    fn show_one_out(&mut self, now: Instant) {
+        if self.lines.iter().any(crate::line::Line::takes_connections) {
+            return;
+        }
+        let since = |machine: &Self, index: u16| machine.link(index).map_or(now, |link| link.since);
+        let silent = self.oldest_silent().filter(|index| now >= since(self, *index) + PATIENCE);
+        if let Some(index) = silent {
+            self.node.counters.add(NodeCounter::GaveWay, 1);
+            self.with(index, |session, cx, _| session.close(cx, CloseReason::HelloTimeout));
+        }
     }
 
     fn disconnected(&mut self, index: u16, reason: CloseReason) {
@@ -194,7 +219,15 @@ impl<T> Machine<T> {
             return;
         }
         self.address = address;
-        log!("the address is now {:?}", address.map(|address| address.address().octets()));
+        let address = address.map(|address| address.address());
+        log!("the address is now {:?}", address.map(|address| address.octets()));
+        if address.is_some() {
+            self.node.network_changed(now());
+        }
+        // That there is one at last is no news at the start.
+        if core::mem::replace(&mut self.has_begun, true) {
+            self.tell(UnitEvent::AddressChanged { address });
+        }
         for index in self.indices() {
             self.disconnected(index, CloseReason::Reset);
             if let Some(line) = self.lines.get_mut(usize::from(index)) {

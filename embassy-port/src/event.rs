@@ -4,7 +4,7 @@ use cara_core::config::NAME_BYTES;
 use cara_core::distribution::identity::Identity;
 use cara_core::error::{CloseReason, Error};
 use cara_core::services::requests::CallId;
-use core::net::SocketAddr;
+use core::net::{Ipv4Addr, SocketAddr};
 
 /// The name of a function.
 pub type Name = heapless::String<NAME_BYTES>;
@@ -24,7 +24,8 @@ pub enum UnitEvent {
         /// Why.
         reason: CloseReason,
     },
-    /// A link ended before it joined: refused here or there, or silent.
+    /// A link ended before it joined: refused here or there, silent, or it could not be opened. `DuplicateIdentity` with
+    /// this unit's own identity in `peer`: another live unit has it, and one of the two waits for the other's end.
     NotJoined {
         /// The other end.
         address: SocketAddr,
@@ -32,6 +33,12 @@ pub enum UnitEvent {
         peer: Option<Identity>,
         /// Why.
         reason: CloseReason,
+    },
+    /// The cable was plugged in or pulled, or the address changed; links that there were have ended. The unit's first
+    /// address is no news.
+    AddressChanged {
+        /// The address now; none while nobody can be reached.
+        address: Option<Ipv4Addr>,
     },
     /// A node published or withdrew functions.
     ListChanged {

@@ -14,7 +14,7 @@ use embassy_net::{IpAddress, IpEndpoint, Stack};
 use crate::time::now;
 
 /// How long a socket may take to say farewell before it is reset.
-const FAREWELL: Duration = Duration::from_millis(1_000);
+const FAREWELL: Duration = Duration::from_millis(500);
 
 /// What the socket is doing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -56,14 +56,19 @@ impl Line {
         Self { socket, doing: Doing::Nothing }
     }
 
-    /// A link could dial with it.
-    pub(crate) fn is_free(&self) -> bool {
-        !matches!(self.doing, Doing::Open | Doing::Dialing)
-    }
-
     /// It is better not disturbed as long as another one is free.
     pub(crate) fn is_closing(&self) -> bool {
         matches!(self.doing, Doing::Closing { .. })
+    }
+
+    /// A link has it, from its dialling on.
+    pub(crate) fn is_in_use(&self) -> bool {
+        matches!(self.doing, Doing::Open | Doing::Dialing)
+    }
+
+    /// Somebody could dial it.
+    pub(crate) fn takes_connections(&self) -> bool {
+        matches!(self.doing, Doing::Listening | Doing::Nothing)
     }
 
     /// Waits for somebody to dial, unless it does something else.

@@ -11,6 +11,7 @@ use cara_core::services::Context;
 use cara_core::services::publications::Publications;
 use cara_core::services::unit::{Session, SessionConfig, SessionStorage};
 use cara_core::storage::{Lent, Pool};
+use cara_core::time::Instant;
 use core::cell::RefCell;
 use core::net::SocketAddr;
 use embassy_net::udp::UdpSocket;
@@ -45,6 +46,8 @@ pub(crate) struct Link {
     pub(crate) storage: Option<SessionStorage<Lent>>,
     /// Tells this link from an earlier one with the same index.
     pub(crate) serial: u32,
+    /// When it was opened.
+    pub(crate) since: Instant,
     /// The peer, from joining to leaving.
     pub(crate) peer: Option<Identity>,
     pub(crate) waiters: &'static mut [Option<Waiter>],
@@ -54,7 +57,15 @@ pub(crate) struct Link {
 
 impl Link {
     pub(crate) fn new(storage: SessionStorage<Lent>, waiters: &'static mut [Option<Waiter>]) -> Self {
-        Self { session: None, storage: Some(storage), serial: 0, peer: None, waiters, told: None }
+        Self {
+            session: None,
+            storage: Some(storage),
+            serial: 0,
+            since: Instant::START,
+            peer: None,
+            waiters,
+            told: None,
+        }
     }
 
     /// Whether it leads to a peer that requests can be made of.
@@ -84,6 +95,8 @@ pub(crate) struct Machine<T: 'static> {
     pub(crate) tcp_port: u16,
     /// The unit's own address; none while the cable is out or no address is known.
     pub(crate) address: Option<Ipv4Cidr>,
+    /// It has had an address.
+    pub(crate) has_begun: bool,
     /// It has been stopped, and does nothing any more but end its connections.
     pub(crate) stopped: bool,
     /// Of the links that have ended.
@@ -172,19 +185,31 @@ impl<T> Machine<T> {
         let config = SessionConfig { link: LinkId(index), dialed, address, local, constraints };
         let link = self.link_mut(index)?;
         link.session = Some(Session::new(now(), config, Plain, storage));
+        link.since = now();
         Some(())
     }
 
     /// A link that could dial: one whose socket is idle, if there is any.
     pub(crate) fn free_link(&self) -> Option<u16> {
         let free = |index: &u16| {
-            let line = self.lines.get(usize::from(*index)).is_some_and(Line::is_free);
+            let line = self.lines.get(usize::from(*index)).is_some_and(|line| !line.is_in_use());
             line && self.link(*index).is_some_and(|link| link.storage.is_some())
         };
         let closing = |index: &u16| self.lines.get(usize::from(*index)).is_some_and(Line::is_closing);
         let mut candidates = self.indices().filter(free);
         let first = candidates.next()?;
         if closing(&first) { candidates.find(|index| !closing(index)).or(Some(first)) } else { Some(first) }
+    }
+
+    /// The link, of those that others have opened, that has waited longest for its peer's hello.
+    pub(crate) fn oldest_silent(&self) -> Option<u16> {
+        let since = |index: &u16| {
+            let link = self.link(*index)?;
+            let session = link.session.as_ref()?;
+            (!session.dialed() && session.hello().is_none()).then_some(link.since)
+        };
+        let silent = self.indices().filter_map(|index| Some((since(&index)?, index)));
+        silent.min().map(|(_, index)| index)
     }
 
     /// Takes connections with every socket that has nothing else to do, if the unit is one that is dialled.

@@ -29,7 +29,7 @@ impl Mailman for EmbassyMailman<'_> {
     }
 
     fn broadcast(&mut self, datagram: &[u8]) -> bool {
-        let Some(config) = self.stack.config_v4() else { return false };
+        let Some(config) = self.stack.config_v4().filter(|_| self.stack.is_link_up()) else { return false };
         let all = config.address.broadcast().unwrap_or(Ipv4Addr::BROADCAST);
         send(self.udp, all, PLAIN_PORT, datagram)
     }

@@ -319,6 +319,7 @@ pub fn new<
         lost_hook: None,
         tcp_port,
         address: None,
+        has_begun: false,
         stopped: false,
         counters: Counters::new(),
         room: Room { buffer: MESSAGE, parameters: ARGUMENTS },

@@ -79,7 +79,7 @@ impl<T> Runner<T> {
         machine.expire_reply(now());
         self.answer_again(machine);
         machine.look_at_lines();
-        if machine.address.is_some() && !machine.stopped {
+        if !machine.stopped {
             let action = machine.poll_node();
             if action.is_some() {
                 machine.act(action);
@@ -204,8 +204,7 @@ impl<T> Machine<T> {
         let sessions = self.links.iter().filter_map(|link| link.session.as_ref());
         let sessions = sessions.map(LinkSession::deadline).min().unwrap_or(Instant::FAR_FUTURE);
         let lines = self.lines.iter().map(crate::line::Line::deadline).min().unwrap_or(Instant::FAR_FUTURE);
-        let searches = self.address.is_some() && !self.stopped;
-        let node = if searches { self.node.next_deadline() } else { Instant::FAR_FUTURE };
+        let node = if self.stopped { Instant::FAR_FUTURE } else { self.node.next_deadline() };
         let kept = self.reply_deadline().min(self.parked_deadline());
         sessions.min(lines).min(node).min(kept).min(now + LOOK)
     }

@@ -5,7 +5,8 @@ use std::net::Ipv4Addr;
 use std::rc::Rc;
 use std::task::Poll;
 
-use cara_core::config::Constraints;
+use cara_core::config::{Constraints, PLAIN_PORT};
+use cara_core::distribution::connection_handler::NodeCounter;
 use cara_core::distribution::parameters::Parameters;
 use cara_core::error::{CloseReason, Error, ServiceError};
 use cara_core::host::connections::LinkCounter;
@@ -14,6 +15,7 @@ use cara_core::services::unit::RequestOptions;
 use cara_core::time::Duration;
 use cara_embassy::{Config, Handle, Handler, Resources, ServiceOptions, UnitEvent, message_buffer};
 use cara_embassy_host::{Bench, Board};
+use embassy_net::tcp::TcpSocket;
 use embassy_time::{Timer, with_timeout};
 
 const SHORT: Duration = Duration::from_secs(5);
@@ -278,4 +280,26 @@ fn memory_that_cannot_hold_the_constraints_is_refused() {
     let refused = unit.add_service(huge, ServiceOptions::new(), Handler::task());
     assert!(matches!(refused, Err(Error::TooLarge { .. })), "{refused:?}");
     assert_eq!(unit.add_service("half(", ServiceOptions::new(), Handler::task()), Err(Error::BadName));
+}
+
+/// Nothing is said on as many connections as the manager has links for; its node comes all the same.
+#[test]
+fn silent_connections_give_way_to_nodes() {
+    let bench = Bench::new(9);
+    let (_, manager) = manager(&bench);
+    let stranger = bench.board();
+    bench.run_for(Duration::from_millis(10));
+    for _ in 0..8 {
+        let stack = stranger.stack();
+        stranger.spawn(async move {
+            let (receive, send) = (Box::leak(Box::new([0; 64])), Box::leak(Box::new([0; 64])));
+            let mut socket = TcpSocket::new(stack, receive, send);
+            let _ = socket.connect((Ipv4Addr::new(10, 77, 0, 1), PLAIN_PORT)).await;
+            std::future::pending::<()>().await;
+        });
+    }
+    bench.run_for(Duration::from_millis(10));
+    let (_, agv) = agv(&bench);
+    assert!(bench.run_until(|| agv.is_connected(), Duration::from_secs(2)));
+    assert!(manager.node_counted(NodeCounter::GaveWay) > 0);
 }

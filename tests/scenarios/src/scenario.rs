@@ -25,6 +25,8 @@ pub enum Need {
     Suspend,
     /// Somebody who connects and is no unit, or none of this version or fleet.
     Strangers,
+    /// Connections that wait to be accepted, as many as come.
+    Backlog,
     /// An interface that goes and comes.
     Interface,
     /// More units than a test on one machine should start.
@@ -43,7 +45,7 @@ pub enum Need {
 
 impl Need {
     /// All of them.
-    pub const ALL: [Self; 17] = [
+    pub const ALL: [Self; 18] = [
         Self::Crash,
         Self::Partition,
         Self::Freeze,
@@ -54,6 +56,7 @@ impl Need {
         Self::AddressChange,
         Self::Suspend,
         Self::Strangers,
+        Self::Backlog,
         Self::Interface,
         Self::ManyUnits,
         Self::LongTime,
@@ -85,7 +88,13 @@ impl Need {
             Self::ManyUnits => "too many threads and sockets for a test",
             Self::LongTime => "minutes of real time",
             Self::ExactTime => "instants depend on the machine's load",
-            Self::Detached | Self::Panics | Self::Freeze | Self::Reset | Self::SlowReader | Self::Strangers => {
+            Self::Detached
+            | Self::Panics
+            | Self::Freeze
+            | Self::Reset
+            | Self::SlowReader
+            | Self::Strangers
+            | Self::Backlog => {
                 return None;
             }
             Self::SameSeed => "seeds come from the operating system",
@@ -98,8 +107,7 @@ impl Need {
             Self::Reset => "nobody on the switch forges a reset",
             Self::Path => "the switch's faults are those of a board, not of a pair",
             Self::SlowReader => "the switch carries frames, and a board's stack reads what it can",
-            Self::Strangers => "a stranger needs sockets of its own, and the switch has boards only",
-            Self::Interface => "the switch does not take a board's link down",
+            Self::Backlog => "a board refuses connections while its few sockets are busy",
             Self::ManyUnits => "more nodes than a board has links for",
             Self::Panics => "a panic restarts a board",
             _ => return None,

@@ -22,7 +22,7 @@ scenarios![
         ["DatagramFleet", "RefusedFleet", "stranger was told"];
     garbage_on_every_port_harms_nobody: "garbage", Rough, [Strangers], ["DatagramMagic", "DatagramFleet"];
     a_peer_that_closes_in_mid_chunk_harms_nobody_else: "half a message", Rough, [Strangers], ["left"];
-    a_thousand_silent_connections_keep_nobody_out: "half-open connections", Light, [Strangers], ["GaveWay"];
+    a_thousand_silent_connections_keep_nobody_out: "half-open connections", Light, [Strangers, Backlog], ["GaveWay"];
     a_reader_of_one_byte_a_second_harms_nobody_else: "slow reader", Own, [SlowReader], ["SendRefused"];
     a_unit_without_an_interface_finds_its_manager_when_it_has_one: "no interface", Light, [Interface],
         ["SendFailed", "unplugged"];

@@ -3,6 +3,7 @@
 mod memory;
 mod node;
 mod services;
+mod visitor;
 
 use std::rc::Rc;
 
@@ -11,8 +12,9 @@ use cara_core::time::{Duration, Instant};
 use cara_embassy_host::{Bench, Faults};
 
 use self::node::BoardNode;
+use self::visitor::Visitor;
 use crate::run::Report;
-use crate::{Fault, Need, Port, Spec, Unit, Unsupported, Weather, World};
+use crate::{Fault, Need, Port, Spec, Stranger, Unit, Unsupported, Weather, World};
 
 pub(super) struct EmbassyWorld {
     bench: Bench,
@@ -46,6 +48,23 @@ fn faults(random: &mut Random, weather: Weather) -> Faults {
             jitter: random.jitter(Duration::from_millis(2)),
             ..Faults::NONE
         },
+    }
+}
+
+impl EmbassyWorld {
+    fn stranger(&mut self, unit: &Unit, stranger: Stranger) {
+        let visitor = Visitor::new(&self.bench, self.node(unit).board().address());
+        visitor.sends(stranger.datagrams(0));
+        let mut heard = Vec::new();
+        for visit in stranger.visits(&unit.identity(), 0) {
+            heard.extend(visitor.pays(&self.bench, visit));
+        }
+        if stranger.is_told().is_some_and(|told| told == heard) {
+            self.reached("stranger was told");
+        }
+        if let Stranger::Silent(count) = stranger {
+            visitor.stays(count);
+        }
     }
 }
 
@@ -90,8 +109,9 @@ impl World for EmbassyWorld {
             Fault::Reset(_) => return Err(Unsupported(Need::Reset)),
             Fault::Path(..) => return Err(Unsupported(Need::Path)),
             Fault::SlowReader(..) => return Err(Unsupported(Need::SlowReader)),
-            Fault::Stranger(..) => return Err(Unsupported(Need::Strangers)),
-            Fault::Unplug(_) | Fault::Plug(_) => return Err(Unsupported(Need::Interface)),
+            Fault::Stranger(unit, stranger) => self.stranger(unit, stranger),
+            Fault::Unplug(unit) => self.node(unit).board().set_cable(false),
+            Fault::Plug(unit) => self.node(unit).board().set_cable(true),
         }
         Ok(())
     }

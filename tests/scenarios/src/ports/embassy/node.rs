@@ -18,7 +18,7 @@ use cara_embassy::{Config, Handle, Peer, UnitEvent};
 use cara_embassy_host::{Bench, Board, now};
 use embassy_time::with_timeout;
 
-use super::memory::{self, LINKS};
+use super::memory;
 use super::services;
 use crate::{Node, Pending, PendingAll, Seen, Service, Spec, SpecRole, boxed};
 
@@ -106,7 +106,7 @@ impl BoardNode {
     fn config(&self) -> Result<Config, Error> {
         let Spec { role, name, id, fleet, mut constraints, same_seed, .. } = self.spec.clone();
         let seed = if same_seed { 4 } else { self.bench.random(u64::MAX) };
-        constraints.maximum_nodes = constraints.maximum_nodes.min(LINKS as u16);
+        constraints.maximum_nodes = constraints.maximum_nodes.min(memory::links(&self.spec));
         let config = match role {
             SpecRole::Manager => Config::m_unit(&name, id, seed)?,
             SpecRole::Agv(manager, manager_id) => Config::s_unit(&name, id, &manager, manager_id, seed)?,
@@ -316,6 +316,7 @@ fn seen(event: UnitEvent) -> Option<Seen> {
         UnitEvent::RequestFailed { call, error, .. } => Seen::Failed(call, error),
         UnitEvent::LeaseExpired { function, .. } => Seen::LeaseExpired(function.to_string()),
         UnitEvent::LeaseEnded { function, expired, .. } => Seen::LeaseEnded(function.to_string(), expired),
+        UnitEvent::AddressChanged { address } => Seen::InterfaceChanged(address.is_some()),
         UnitEvent::FunctionsSkipped { .. } => return None,
     })
 }
