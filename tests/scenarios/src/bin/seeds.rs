@@ -1,6 +1,7 @@
-//! Runs every scenario for many seeds on the simulator, with faults on.
+//! Runs every scenario for many seeds on the simulator, with faults on; or on boards, where each run keeps its memory
+//! until the end, so that a scenario at a time suits.
 //!
-//! `seeds [--seeds N] [--quick] [--scenario NAME] [--seed N]`
+//! `seeds [--seeds N] [--quick] [--scenario NAME] [--seed N] [--embassy]`
 
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
@@ -20,20 +21,22 @@ struct Wanted {
     seeds: u64,
     seed: Option<u64>,
     scenario: Option<String>,
+    port: Port,
 }
 
 fn main() -> ExitCode {
     let wanted = match arguments() {
         Ok(wanted) => wanted,
         Err(problem) => {
-            eprintln!("{problem}\nseeds [--seeds N] [--quick] [--scenario NAME] [--seed N]");
+            eprintln!("{problem}\nseeds [--seeds N] [--quick] [--scenario NAME] [--seed N] [--embassy]");
             return ExitCode::from(2);
         }
     };
     let named = |scenario: &Scenario| wanted.scenario.as_ref().is_none_or(|name| scenario.name == name);
-    let scenarios: Vec<Scenario> = all().into_iter().filter(named).collect();
+    let can = |scenario: &Scenario| scenario.missing_on(wanted.port).is_none();
+    let scenarios: Vec<Scenario> = all().into_iter().filter(|scenario| named(scenario) && can(scenario)).collect();
     if scenarios.is_empty() {
-        eprintln!("there is no scenario of this name");
+        eprintln!("there is no scenario of this name that the port can run");
         return ExitCode::from(2);
     }
     let start = Instant::now();
@@ -50,7 +53,7 @@ fn main() -> ExitCode {
 }
 
 fn arguments() -> Result<Wanted, String> {
-    let mut wanted = Wanted { seeds: 1_000, seed: None, scenario: None };
+    let mut wanted = Wanted { seeds: 1_000, seed: None, scenario: None, port: Port::Simulator };
     let mut words = std::env::args().skip(1);
     while let Some(word) = words.next() {
         let mut value = || words.next().ok_or_else(|| format!("{word} needs a value"));
@@ -59,6 +62,7 @@ fn arguments() -> Result<Wanted, String> {
             "--seeds" => wanted.seeds = number(value()?)?,
             "--seed" => wanted.seed = Some(number(value()?)?),
             "--scenario" => wanted.scenario = Some(value()?),
+            "--embassy" => wanted.port = Port::Embassy,
             "--quick" => wanted.seeds = QUICK,
             other => return Err(format!("{other} is unknown")),
         }
@@ -75,17 +79,19 @@ fn run(scenario: &Scenario, wanted: &Wanted) -> (u64, bool) {
     let start = Instant::now();
     let (mut report, mut failures) = (Report::default(), Vec::new());
     for &seed in &seeds {
-        match once(scenario, Port::Simulator, seed, scenario.weather) {
+        match once(scenario, wanted.port, seed, scenario.weather) {
             Ok(run) => report.merge(run),
             Err(failure) => failures.push((seed, failure)),
         }
     }
-    let missing = if wanted.seed.is_some() { Vec::new() } else { missing(scenario, &report, wanted.seeds < FEW) };
+    let all_faults = wanted.seed.is_none() && wanted.port == Port::Simulator;
+    let missing = if !all_faults { Vec::new() } else { missing(scenario, &report, wanted.seeds < FEW) };
     show(scenario, seeds.len(), start.elapsed(), &report);
     for (seed, failure) in failures.iter().take(SHOWN) {
         println!("  FAILED with seed {seed}: {}", failure.replace('\n', "\n    "));
+        let port = if wanted.port == Port::Embassy { " --embassy" } else { "" };
         println!(
-            "  replay: cargo run --release --package cara-scenarios --bin seeds -- --scenario {} --seed {seed}",
+            "  replay: cargo run --release --package cara-scenarios --bin seeds -- --scenario {} --seed {seed}{port}",
             scenario.name
         );
     }
