@@ -102,8 +102,7 @@ impl SUnit {
     fn take_bytes<P: Program>(&mut self, now: Instant, lent: &mut [u8], program: &mut P) -> bool {
         let Some(session) = &mut self.session else { return false };
         let length = self.stack.peek(lent);
-        // While results wait in the arguments for room, calls wait in the session.
-        let arguments = self.unanswered.is_none().then_some(self.arguments.as_mut_view());
+        let arguments = Some(self.arguments.as_mut_view());
         let receipt = session.receive(context!(self, now), &mut lent[..length], arguments);
         let (consumed, moved) = (receipt.consumed, receipt.consumed > 0 || receipt.event.is_some());
         let rest = receipt.event.map_or(Rest::Nothing, |event| tell(event, program));
@@ -112,14 +111,12 @@ impl SUnit {
         moved
     }
 
-    /// Serves the calls that waited for their turn, as long as their answers find room.
+    /// Serves the calls that waited for their turn.
     fn serve_waiting<P: Program>(&mut self, now: Instant, program: &mut P) {
-        loop {
-            if let Some((ticket, outcome)) = self.unanswered.take() {
-                self.answer_served(now, ticket, outcome);
-            }
-            let Some(session) = self.session.as_mut().filter(|_| self.unanswered.is_none()) else { return };
-            let Some(call) = session.next_call(context!(self, now), self.arguments.as_mut_view()) else { return };
+        self.answer_again(now);
+        while let Some(session) = &mut self.session
+            && let Some(call) = session.next_call(context!(self, now), self.arguments.as_mut_view())
+        {
             self.serve(now, &call, program);
         }
     }
@@ -169,8 +166,23 @@ impl SUnit {
     fn answer_served(&mut self, now: Instant, ticket: Ticket, outcome: Result<(), Error>) {
         let Some(session) = &mut self.session else { return };
         let results = outcome.map(|()| self.arguments.as_view());
-        if session.answer(context!(self, now), ticket, results).is_err() {
-            self.unanswered = Some((ticket, outcome));
+        if session.answer(context!(self, now), ticket, results).is_ok() {
+            return;
+        }
+        if self.unanswered.is_some() {
+            // A second class whose answer finds no room: its caller waits in vain, and a counter says so.
+            return session.drop_answer(ticket);
+        }
+        // The results step aside, so that an emergency is served meanwhile. Calls of the same class wait for this one.
+        core::mem::swap(&mut self.arguments, &mut self.results);
+        self.unanswered = Some((ticket, outcome));
+    }
+
+    fn answer_again(&mut self, now: Instant) {
+        let (Some((ticket, outcome)), Some(session)) = (self.unanswered, &mut self.session) else { return };
+        let results = outcome.map(|()| self.results.as_view());
+        if session.answer(context!(self, now), ticket, results).is_ok() {
+            self.unanswered = None;
         }
     }
 

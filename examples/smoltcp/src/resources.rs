@@ -57,6 +57,7 @@ pub(crate) struct StackMemory {
 pub struct Resources {
     stack: StackMemory,
     arguments: Arguments,
+    results: Arguments,
     nodes: [Option<Known>; NODES],
     order: [Order; NODES],
     links: [Option<u16>; 1],
@@ -81,6 +82,7 @@ pub(crate) struct Parts {
     pub(crate) functions: FunctionList<Lent, Offered>,
     pub(crate) buffers: Pool<Lent>,
     pub(crate) arguments: &'static mut Arguments,
+    pub(crate) results: &'static mut Arguments,
 }
 
 impl Resources {
@@ -94,6 +96,7 @@ impl Resources {
                 datagram_heads: [[udp::PacketMetadata::EMPTY; 8]; 2],
             },
             arguments: Arguments::sized(),
+            results: Arguments::sized(),
             nodes: [const { None }; NODES],
             order: from_fn(|_| Order::default()),
             links: [None; 1],
@@ -134,6 +137,7 @@ impl Resources {
             functions: FunctionList::new(&mut self.functions[..], &mut self.signatures[..]),
             buffers: Pool::new(&mut self.pool[..]),
             arguments: &mut self.arguments,
+            results: &mut self.results,
         }
     }
 }

@@ -35,7 +35,8 @@ pub struct SUnit {
     /// What the next link will live in.
     pub(crate) spare: Option<SessionStorage<Lent>>,
     pub(crate) standing: Standing,
-    /// A call that was served and whose answer found no room yet; its results are in the arguments.
+    /// A call that was served and whose answer found no room yet, and its results.
+    pub(crate) results: &'static mut Arguments,
     pub(crate) unanswered: Option<(Ticket, Result<(), Error>)>,
 }
 
@@ -76,6 +77,7 @@ impl SUnit {
             session: None,
             spare: Some(parts.link),
             standing: Standing::Dialing,
+            results: parts.results,
             unanswered: None,
         }
     }
