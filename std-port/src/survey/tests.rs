@@ -8,7 +8,14 @@ use super::*;
 const PATIENCE: Duration = Duration::from_secs(10);
 
 fn survey() -> Survey {
-    Survey::open(Interfaces::Loopback, 0).unwrap()
+    Survey::open(Interfaces::Loopback, free_port()).unwrap()
+}
+
+/// A free port below those that the system gives away: it gives one that is shared to several.
+fn free_port() -> u16 {
+    let ports = std::iter::repeat_with(|| 22_000 + (random() % 10_000) as u16);
+    let mut free = ports.filter(|port| UdpSocket::bind((Ipv4Addr::UNSPECIFIED, *port)).is_ok());
+    free.next().unwrap()
 }
 
 /// A sender on loopback, and where the survey listens.

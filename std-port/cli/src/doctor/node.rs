@@ -73,6 +73,12 @@ fn silent(seen: &Evidence, which: &Which) -> Vec<Finding> {
     }
     let mut found = host::check(seen);
     found.extend(seen.answered_alone.first().map(|alone| one_way(seen, *alone)));
+    // A node that knows where its manager is dials it, again and again, and asks nobody meanwhile.
+    let m_units = seen.m_units();
+    let dials = m_units.iter().filter_map(|(heard, identity)| Some((dial_of(seen, heard)?, identity)));
+    let blocked = dials.filter_map(|(dial, identity)| tcp_blocked(&identity.to_string(), dial));
+    // It may still turn out to look for somebody else.
+    found.extend(blocked.map(|finding| finding.certain(false)));
     if !found.is_empty() {
         return found;
     }
@@ -81,6 +87,9 @@ fn silent(seen: &Evidence, which: &Which) -> Vec<Finding> {
     found.extend(unreadable.map(|heard| other_version("a node", heard)));
     found.truncate(8);
     let elsewhere = seen.managers_elsewhere();
+    let no_room =
+        m_units.iter().filter(|(heard, identity)| heard.room == Some(0) && elsewhere.contains(&identity.to_string()));
+    found.extend(no_room.map(|(_, identity)| full(&identity.to_string(), None)));
     found.push(if elsewhere.is_empty() { not_heard(seen, which) } else { ask_its_manager(seen, which, &elsewhere) });
     found.extend(waiting_for_another(seen));
     found

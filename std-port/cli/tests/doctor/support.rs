@@ -32,9 +32,7 @@ impl Clinic {
     /// For inside a namespace alone.
     pub(crate) fn on_all_interfaces() -> Self {
         let sockets = private_directory();
-        // Free now, and hardly taken by another in the meantime.
-        let port = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).unwrap().local_addr().unwrap().port();
-        Self { fleet: random() as u32, port, sockets, loopback: false }
+        Self { fleet: random() as u32, port: free_port(), sockets, loopback: false }
     }
 
     /// A builder of an m_unit `name/1`.
@@ -178,6 +176,13 @@ pub(crate) fn while_running(again: impl Fn() + Sync, once: impl FnOnce()) {
         let _stop = Stop(&stopped);
         once();
     });
+}
+
+/// A free UDP port below those that the system gives away: it gives one that is shared to several.
+fn free_port() -> u16 {
+    let ports = std::iter::repeat_with(|| 22_000 + (random() % 10_000) as u16);
+    let mut free = ports.filter(|port| UdpSocket::bind((Ipv4Addr::UNSPECIFIED, *port)).is_ok());
+    free.next().unwrap()
 }
 
 fn private_directory() -> tempfile::TempDir {

@@ -40,6 +40,17 @@ fn silence_is_explained_by_the_host_before_the_node() {
 }
 
 #[test]
+fn a_node_that_dials_in_vain_is_silent() {
+    let mut seen = both();
+    seen.heard.remove(0);
+    seen.dials[0].outcome = Some(Outcome::Refused);
+    assert_eq!(ids(&seen), [Id::TcpBlocked]);
+    seen.dials[0].outcome = None;
+    seen.heard[0].room = Some(0);
+    assert_eq!(ids(&seen), [Id::Full, Id::AskItsManager]);
+}
+
+#[test]
 fn a_manager_elsewhere_may_have_it() {
     let mut seen = evidence();
     seen.heard = vec![answering("boss", 3)];
