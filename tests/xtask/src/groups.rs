@@ -6,8 +6,8 @@ use anyhow::{Result, bail};
 
 use crate::command::Run;
 use crate::{
-    dependencies, firmware, fleet, hygiene, install, layers, licences, links, manifests, names, panic_free, paper,
-    workspace,
+    bad_input, dependencies, firmware, fleet, hygiene, install, layers, licences, links, manifests, names, panic_free,
+    paper, workspace,
 };
 
 /// A group of checks that is run and reported as one.
@@ -77,11 +77,11 @@ pub(crate) const GROUPS: [Group; 18] = [
     },
     Group {
         name: "paper",
-        what: "every promise of the paper has its test, and the test exists",
+        what: "every promise of the paper and every item of bad input has its test, and the test exists",
         budget: 2,
         quick: Some(2),
         by_default: true,
-        run: |_| paper::check().into(),
+        run: |_| all(&[paper::check, bad_input::check]),
     },
     Group {
         name: "names",

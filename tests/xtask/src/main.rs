@@ -5,6 +5,7 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
+mod bad_input;
 mod bench;
 mod command;
 mod demo;

@@ -87,7 +87,7 @@ fn objection(
 }
 
 /// Why a reference `path` or `path::name` leads nowhere.
-fn broken(reference: &str, exists: impl Fn(&str) -> bool, read: impl Fn(&str) -> String) -> Option<String> {
+pub(crate) fn broken(reference: &str, exists: impl Fn(&str) -> bool, read: impl Fn(&str) -> String) -> Option<String> {
     let (path, name) = reference.split_once("::").map_or((reference, None), |(path, name)| (path, Some(name)));
     if !exists(path) {
         return Some(format!("{path} does not exist"));

@@ -4,7 +4,7 @@ use cara_core::error::Error;
 use cara_core::host::connections::LinkCounter;
 use cara_core::services::unit::RequestOptions;
 
-use super::pair;
+use super::{Bystander, pair};
 use crate::scenario::scenarios;
 use crate::{Fault, Seen, Service, Unit, World, millis, number, secs};
 
@@ -26,11 +26,15 @@ fn life(seconds: u64) -> RequestOptions {
 /// A command into a stream that is frozen for eight seconds, while keep-alives pass.
 fn frozen(world: &mut dyn World, service: &Service, options: RequestOptions) -> (Unit, Unit) {
     let (manager, agv) = pair(world, service);
+    let mut bystander = Bystander::add(world, &manager);
     let calm = secs(2) + millis(world.random(1_000));
     world.run_for(calm);
     world.fault(Fault::FreezeStreams(&manager, &agv, secs(8)));
     manager.request_with("agv", "go", &number("n", 1), options).expect("it is accepted");
-    world.run_for(secs(12));
+    for _ in 0..12 {
+        world.run_for(secs(1));
+        bystander.goes_on(world, &manager);
+    }
     assert!(agv.is_connected("manager"), "keep-alives passed");
     (manager, agv)
 }

@@ -4,7 +4,7 @@ use cara_core::error::Error;
 use cara_core::host::connections::LinkCounter;
 use cara_core::services::unit::RequestOptions;
 
-use super::pair;
+use super::{Bystander, pair};
 use crate::scenario::scenarios;
 use crate::{Service, World, millis, number, secs};
 
@@ -18,6 +18,7 @@ fn a_time_out_frees_its_slot_and_the_late_reply_is_dropped(world: &mut dyn World
         parameters.set_value("n", 99_i64).map_err(|_| cara_core::error::ServiceError::BadResults)
     });
     let (manager, _agv) = pair(world, &service.takes(millis(40)));
+    let mut bystander = Bystander::add(world, &manager);
     let options = RequestOptions { timeout: Some(millis(20)), ..RequestOptions::default() };
     // More calls than the table has slots: one that leaked its slot would fill it.
     for _ in 0..70 {
@@ -31,6 +32,7 @@ fn a_time_out_frees_its_slot_and_the_late_reply_is_dropped(world: &mut dyn World
             assert!(world.now().since(start) <= millis(20) + slack);
         }
         world.run_for(millis(25));
+        bystander.goes_on(world, &manager);
     }
     world.wait("late replies are counted", || manager.counted(LinkCounter::RepliesLate) > 0, secs(10));
     let mut parameters = number("n", 1);

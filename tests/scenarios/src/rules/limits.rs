@@ -91,7 +91,7 @@ fn few_buffers_delay_and_lose_nothing(world: &mut dyn World) {
         }
     }
     assert_eq!(service.diary().runs(), executed, "{}", world.story());
-    // A refusal for want of buffers may itself want one; then both sides count it.
+    // A refusal that finds room nowhere is counted on both sides.
     assert_eq!(manager.counted(LinkCounter::RepliesDropped), unanswered, "{}", world.story());
     if executed > 0 {
         world.reached("executed");

@@ -74,14 +74,17 @@ fn another_version_is_refused_by_name(world: &mut dyn World) {
 
 fn the_maximum_of_nodes_refuses_the_next(world: &mut dyn World) {
     let manager = world.add(Spec::manager("manager", 1).limits(|limits| limits.maximum_nodes = 2));
-    let _agvs = [world.add(Spec::agv("one", 1)), world.add(Spec::agv("two", 2))];
+    let _agvs = [world.add(Spec::agv("one", 1).service(&Service::numbered("note"))), world.add(Spec::agv("two", 2))];
     world.wait("two have joined", || manager.number_of_s_units() == 2, secs(40));
+    met(world, &manager, "one", "note");
     let third = world.add(Spec::agv("three", 3));
     let full = Seen::NotJoined(CloseReason::Refused(Refusal::Full));
     world.wait("the third is told", || third.count(|event| *event == full) > 0, secs(40));
     assert_eq!(manager.number_of_s_units(), 2);
+    assert_eq!(world.ask(&manager, "one", "note", &mut number("n", 1)), Ok(()), "those that are there go on");
     manager.change(|limits| limits.maximum_nodes = 3);
     world.wait("the third joins", || manager.number_of_s_units() == 3, secs(60));
+    assert_eq!(world.ask(&manager, "one", "note", &mut number("n", 2)), Ok(()));
 }
 
 fn two_m_units_meet_and_call_both_ways(world: &mut dyn World) {
