@@ -8,7 +8,7 @@ use cara_core::error::Error;
 use cara_core::time::Duration;
 
 use super::protocol::{Answer, Failure, Question};
-use super::{call, constraint, describe, select};
+use super::{call, constraint, describe, hold, select};
 use crate::CommunicationSystem;
 
 /// Where answers go; `Break` when nobody reads them any more.
@@ -20,7 +20,7 @@ const EVENTS: usize = 1024;
 #[cfg(feature = "metrics")]
 const PIECE_BYTES: usize = 256 * 1024;
 /// How often a watch without events looks whether it is still wanted, and a pause whether the unit still runs.
-const LOOK: std::time::Duration = std::time::Duration::from_millis(100);
+pub(super) const LOOK: std::time::Duration = std::time::Duration::from_millis(100);
 
 /// Why an answer ends early.
 pub(super) enum End {
@@ -83,6 +83,7 @@ fn attempt<T: Send + 'static>(
         }
         Question::Functions { node } => functions(system, node, sink),
         Question::Call(question) => call::call(system, question, sink),
+        Question::Hold(question) => hold::hold(system, question, sink, wanted),
         Question::Publish { node, timeout_ms } => {
             publish(system, node.as_deref(), Duration::from_millis(*timeout_ms), sink)
         }

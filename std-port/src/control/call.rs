@@ -35,7 +35,7 @@ pub(super) fn call<T: Send + 'static>(
 
 /// What a call has led to.
 #[derive(Default)]
-struct Outcome {
+pub(super) struct Outcome {
     results: Vec<Argument>,
     call: Option<u32>,
 }
@@ -46,7 +46,7 @@ struct Prepared {
     parameters: Box<ParametersView>,
 }
 
-fn options(question: &CallQuestion) -> Result<RequestOptions, Failure> {
+pub(super) fn options(question: &CallQuestion) -> Result<RequestOptions, Failure> {
     let priority = question.priority.as_deref().map(|word| {
         describe::priority_of(word).ok_or_else(|| {
             let text = format!("'{word}' is no priority: it is emergency, high, normal or low");
@@ -66,7 +66,7 @@ fn options(question: &CallQuestion) -> Result<RequestOptions, Failure> {
     })
 }
 
-fn call_one<T: Send + 'static>(
+pub(super) fn call_one<T: Send + 'static>(
     peer: &Peer<T>,
     question: &CallQuestion,
     options: &RequestOptions,
@@ -121,7 +121,7 @@ impl Prepared {
     }
 }
 
-fn called<T: Send + 'static>(peer: &Peer<T>, outcome: Result<Outcome, Failure>, started: Instant) -> Answer {
+pub(super) fn called<T: Send + 'static>(peer: &Peer<T>, outcome: Result<Outcome, Failure>, started: Instant) -> Answer {
     let took_us = u64::try_from(started.elapsed().as_micros()).unwrap_or(u64::MAX);
     let (outcome, error) = match outcome {
         Ok(outcome) => (outcome, None),

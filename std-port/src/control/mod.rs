@@ -14,6 +14,7 @@ mod client;
 mod constraint;
 mod describe;
 mod failure;
+mod hold;
 mod lines;
 mod place;
 pub mod protocol;

@@ -31,6 +31,9 @@ pub enum Question {
     /// Call a function. An [`Answer::Called`] for each node. No lease is renewed: what the call starts goes on for the
     /// length of its lease.
     Call(CallQuestion),
+    /// Call a function of one node and keep its lease, until what it started has ended there, or the connection is closed:
+    /// then it stops. An [`Answer::Called`], then an [`Answer::Ended`].
+    Hold(CallQuestion),
     /// Publish this unit's functions. An [`Answer::Unread`] for each node that has not read the list in time.
     Publish {
         /// To this node alone; to all, also later ones, if absent.
@@ -172,6 +175,11 @@ pub enum Answer {
         error: Option<Failure>,
         /// From asking to the end, in microseconds.
         took_us: u64,
+    },
+    /// What a call started has ended.
+    Ended {
+        /// Its lease ended there without being renewed, or the node was lost, as opposed to: it has finished.
+        expired: bool,
     },
     /// A node that has not read the published list in time.
     Unread {

@@ -21,17 +21,12 @@ use crate::units::{parse_time, show_micros};
 /// A call is written with its arguments by name, as 'go_to(position: [1, 2])', and checked against what the node has
 /// published before anything is sent. Texts go in double quotes, bytes are written as 0x01ff, several numbers in brackets.
 #[derive(clap::Args)]
-#[command(
-    allow_missing_positional = true,
-    override_usage = "cara call [OPTIONS] <NODE> <CALL>\n       cara call [OPTIONS] --all <CALL>"
-)]
+#[command(override_usage = "cara call [OPTIONS] <NODE> <CALL>\n       cara call [OPTIONS] --all <CALL>")]
 pub(crate) struct Arguments {
-    /// The node: NAME, NAME/ID or #ID.
-    #[arg(required_unless_present = "all", conflicts_with = "all")]
-    node: Option<String>,
-    /// The call: 'go_to(position: [1, 2])'; the name alone where there are no arguments.
-    #[arg(required = true)]
-    call: String,
+    /// The node (NAME, NAME/ID or #ID), unless all are called; and the call, as 'go_to(position: [1, 2])', or the name
+    /// alone where there are no arguments.
+    #[arg(required = true, num_args = 1..=2, value_names = ["NODE", "CALL"])]
+    words: Vec<String>,
     /// Call every node that offers the function.
     #[arg(long)]
     all: bool,
@@ -47,6 +42,9 @@ pub(crate) struct Arguments {
     /// In one datagram, now or never.
     #[arg(long, requires = "asynchronous")]
     best_effort: bool,
+    /// Keep the lease of what the call starts until it has finished, or until Ctrl-C: then it stops.
+    #[arg(long, conflicts_with_all = ["all", "asynchronous"])]
+    hold: bool,
 }
 
 #[derive(Clone, Copy, ValueEnum)]
@@ -69,13 +67,25 @@ impl Class {
     }
 }
 
+impl Arguments {
+    /// Options may stand between the two, so they are told apart here and not by their places.
+    fn node_and_call(&self) -> anyhow::Result<(Option<&str>, &str)> {
+        match (self.all, self.words.as_slice()) {
+            (true, [call]) => Ok((None, call)),
+            (false, [node, call]) => Ok((Some(node), call)),
+            (true, _) => Err(Ended::usage("with --all no node is named: cara call --all 'go_to(position: [1, 2])'")),
+            (false, _) => Err(Ended::usage("name the node and the call: cara call agv-1 'go_to(position: [1, 2])'")),
+        }
+    }
+}
+
 pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
-    let text = arguments.call.as_str();
+    let (node, text) = arguments.node_and_call()?;
     let written = read(text).map_err(|mistake| wrong(&mistake, text, None))?;
     let function = written.function.value;
-    let need = arguments.node.as_deref().map_or(Need::Offering(function), |node| Need::Function(node, function));
+    let need = node.map_or(Need::Offering(function), |node| Need::Function(node, function));
     let mut operator = Operator::open(global, &need)?;
-    let node = match arguments.node.as_deref() {
+    let node = match node {
         Some(node) => Some(full_name(&nodes::connected(&mut operator, node)?)),
         None => None,
     };
@@ -92,14 +102,19 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
         priority: arguments.priority.map(Class::word),
         best_effort: arguments.best_effort,
     };
-    let exit = call(&mut operator, question, global)?;
+    let exit = call(&mut operator, question, arguments.hold, global)?;
     Ok(exit.into())
 }
 
-fn call(operator: &mut Operator, question: CallQuestion, global: &Global) -> anyhow::Result<Exit> {
+fn call(operator: &mut Operator, question: CallQuestion, hold: bool, global: &Global) -> anyhow::Result<Exit> {
     let (function, asynchronous, one) = (question.function.clone(), question.asynchronous, question.node.is_some());
     let mut worst = Exit::Done;
-    operator.ask(&Question::Call(question), |answer| {
+    let question = if hold { Question::Hold(question) } else { Question::Call(question) };
+    operator.ask(&question, |answer| {
+        if let Answer::Ended { expired } = answer {
+            worst = if expired { Exit::Failed } else { worst };
+            return Ok(show_end(expired, global)?);
+        }
         let Answer::Called { node, id, results, call, error, took_us } = answer else { return Ok(()) };
         let node = format!("{node}/{id}");
         if let Some(failure) = &error {
@@ -142,6 +157,15 @@ fn show(
             let took = show_micros(took_us as f64);
             output::line(format_args!("{before}{}  {took}", show_call(function, results)))
         }
+    }
+}
+
+/// How what the call started has ended.
+fn show_end(expired: bool, global: &Global) -> std::io::Result<()> {
+    match (global.json, expired) {
+        (true, _) => output::object(&json!({ "finished": !expired })),
+        (false, false) => output::line("finished"),
+        (false, true) => output::line(format_args!("{BAD}it stopped there:{BAD:#} the node was lost, or stopped it")),
     }
 }
 

@@ -4,6 +4,7 @@ mod alone;
 mod calls;
 mod constraints;
 mod documents;
+mod holding;
 mod measuring;
 mod scanning;
 mod support;

@@ -1,0 +1,101 @@
+//! `cara call --hold`: the operator keeps the lease, and gives it up by going away.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::{Duration, Instant};
+
+use cara_std::{Call, Definition, Interfaces, LeaseWatch, ParametersView, ServiceError, ServiceOptions, Unit};
+
+use crate::support::{PATIENCE, Running, Stage};
+
+const LEASE: Duration = Duration::from_millis(300);
+
+/// A vehicle that drives until it is told that it has arrived, or until nobody wants it to.
+struct Driver {
+    unit: Unit,
+    lease: LeaseWatch,
+    made_safe: Arc<AtomicU32>,
+}
+
+impl Driver {
+    fn join(stage: &Stage) -> Self {
+        let builder = Unit::builder("driver", 99, "manager", 1).unwrap().fleet(stage.fleet);
+        let unit = builder.interfaces(Interfaces::Loopback).build_unit().unwrap();
+        let drive = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+        let made_safe = Arc::new(AtomicU32::new(0));
+        let counted = made_safe.clone();
+        let safe = move |_: &mut ()| drop(counted.fetch_add(1, Ordering::SeqCst));
+        let options = ServiceOptions::new().lease(LEASE, safe);
+        let functions = unit.my_function_list();
+        let lease = functions.add_service(&Definition::parse("drive()").unwrap(), options, drive).unwrap();
+        functions.add_service(&Definition::parse("look()").unwrap(), ServiceOptions::new(), drive).unwrap();
+        unit.publish_my_function_list().unwrap();
+        unit.start().unwrap();
+        until(|| stage.cara(&["functions", "driver"]).out.contains("drive()"));
+        Self { unit, lease, made_safe }
+    }
+
+    /// `cara call driver --hold drive`, when the vehicle has driven for some lengths of its lease.
+    fn held(&self, stage: &Stage) -> Running {
+        let mut running = Running::start(stage.command(&["call", "driver", "--hold", "drive"]));
+        running.expect("drive()");
+        let start = Instant::now();
+        while start.elapsed() < 4 * LEASE {
+            assert!(self.lease.is_live() || start.elapsed() > PATIENCE, "the lease was not renewed");
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        running
+    }
+
+    fn made_safe(&self) -> u32 {
+        self.made_safe.load(Ordering::SeqCst)
+    }
+}
+
+fn until(mut done: impl FnMut() -> bool) {
+    let start = Instant::now();
+    while !done() {
+        assert!(start.elapsed() < PATIENCE, "it does not happen");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+#[test]
+fn what_is_held_goes_on_until_it_has_finished() {
+    let stage = Stage::with(&[]);
+    let driver = Driver::join(&stage);
+    let mut held = driver.held(&stage);
+    driver.unit.my_function_list().end_lease("drive");
+    held.expect("finished");
+    assert_eq!(held.end(), 0);
+    assert_eq!(driver.made_safe(), 0, "what has finished needs no safe hook");
+}
+
+#[test]
+fn who_goes_away_stops_what_is_held() {
+    let stage = Stage::with(&[]);
+    let driver = Driver::join(&stage);
+    let held = driver.held(&stage);
+    held.interrupt();
+    until(|| driver.made_safe() == 1);
+    assert!(!driver.lease.is_live());
+    held.end();
+}
+
+#[test]
+fn a_lost_vehicle_ends_the_holding() {
+    let stage = Stage::with(&[]);
+    let driver = Driver::join(&stage);
+    let mut held = driver.held(&stage);
+    driver.unit.stop();
+    held.expect("it stopped there");
+    assert_eq!(held.end(), 1);
+}
+
+#[test]
+fn without_a_lease_there_is_nothing_to_hold() {
+    let stage = Stage::with(&[]);
+    let _driver = Driver::join(&stage);
+    stage.ends(2, &["call", "driver", "--hold", "look"]).says("has no lease");
+    stage.ends(2, &["call", "driver", "--hold", "--async", "drive"]);
+}
