@@ -150,6 +150,8 @@ class SUnit:
         """Serves until the manager closes the link."""
         self.tcp.settimeout(None)
         next_keep_alive, heard = time.monotonic(), time.monotonic()
+        pause = self.peer["keep_alive"] / 1000
+        next_question, missed = 0, 0
         while True:
             now = time.monotonic()
             if now >= next_keep_alive:
@@ -157,9 +159,15 @@ class SUnit:
                 next_keep_alive = now + KEEP_ALIVE
             if self.lease_end is not None and clock() >= self.lease_end:
                 self.end_lease(expired=True)
-            if now - heard > 3.5 * self.peer["keep_alive"] / 1000:
+            if now - heard > 3.5 * pause:
                 self.close(3, "silence")
-            due = min(next_keep_alive - now, 0.01 if self.lease_end is not None else 1)
+            before, missed = missed, int((now - heard) / pause + 0.5) - 1
+            if self.datagrams_pass and missed > 0 and now >= next_question:
+                self.send_datagram(wire.encode_session_body({"ping": {}}))
+                next_question = now + pause / 4
+            if self.datagrams_pass and missed > max(before, 0):
+                self.write(wire.encode_frame("ping"))
+            due = min(next_keep_alive - now, 0.01 if self.lease_end is not None else pause / 4)
             ready, _, _ = select.select([self.tcp, self.udp], [], [], max(due, 0))
             heard = now if ready else heard
             if self.udp in ready:

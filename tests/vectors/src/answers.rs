@@ -314,7 +314,14 @@ fn leases() -> Vec<Answer> {
 
 fn silence() -> Vec<Answer> {
     answers([
-        ("silence", "datagrams have come before: 3.5 pauses of 1 s", "live", Vec::new(), 3_500, close(3)),
-        ("not_yet_silence", "1 ms less", "live", Vec::new(), 3_499, json!([])),
+        (
+            "silence",
+            "datagrams have come before: 3.5 pauses of 1 s, and a question with each keep-alive that is missed",
+            "live",
+            Vec::new(),
+            3_500,
+            json!(["ping", "ping", { "close": 3 }]),
+        ),
+        ("not_yet_silence", "1 ms less", "live", Vec::new(), 3_499, json!(["ping", "ping"])),
     ])
 }
