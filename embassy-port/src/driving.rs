@@ -1,5 +1,8 @@
 //! What happened on a link goes to the machine of its unit, and what comes of it is done, as
 //! `docs/notes/driving-the-core.md` says. Nothing here waits or runs a handler.
+//!
+//! The large functions are kept apart: merged into their callers, the frames of all of them would lie on the stack at
+//! once, though only one runs at a time.
 
 use cara_core::distribution::connection_handler::{Action, Admission, NodeCounter, Sorted};
 use cara_core::distribution::function_list::Slot;
@@ -71,6 +74,7 @@ impl News {
 
 impl<T> Machine<T> {
     /// Lets the session of a link do what is due: `None` when nothing is.
+    #[inline(never)]
     pub(crate) fn poll_link(&mut self, index: u16) -> Option<News> {
         let Self { links, lines, udp, stack, pool, functions, reply, .. } = self;
         let link = links.get_mut(usize::from(index))?;
@@ -120,6 +124,7 @@ impl<T> Machine<T> {
     }
 
     /// Takes a datagram that has arrived: `None` when there is none.
+    #[inline(never)]
     pub(crate) fn read_datagram(
         &mut self,
         scratch: &mut [u8],
@@ -149,6 +154,7 @@ impl<T> Machine<T> {
     }
 
     /// Looks what became of the sockets.
+    #[inline(never)]
     pub(crate) fn look_at_lines(&mut self) {
         let now = now();
         for index in self.indices() {
@@ -212,6 +218,7 @@ impl<T> Machine<T> {
     }
 
     /// The cable was pulled or plugged in, or the address changed: every connection is dead, whatever TCP still hopes.
+    #[inline(never)]
     pub(crate) fn look_at_network(&mut self) {
         let config = if self.stack.is_link_up() { self.stack.config_v4() } else { None };
         let address = config.map(|config| config.address);
@@ -278,6 +285,7 @@ impl<T> Machine<T> {
     }
 
     /// The peer of a link has introduced itself.
+    #[inline(never)]
     fn greet(&mut self, index: u16) {
         let Some(session) = self.link(index).and_then(|link| link.session.as_ref()) else { return };
         let (Some(hello), address) = (session.hello().cloned(), session.address()) else { return };
@@ -304,6 +312,7 @@ impl<T> Machine<T> {
         }
     }
 
+    #[inline(never)]
     fn dial(&mut self, to: SocketAddr, identity: Option<&Identity>) {
         let dialed = self.free_link().filter(|index| {
             let line = self.lines.get_mut(usize::from(*index));
@@ -324,6 +333,7 @@ impl<T> Machine<T> {
     }
 
     /// The link is live: the peer sees what is published to it.
+    #[inline(never)]
     fn accept(&mut self, index: u16) {
         let session = self.link(index).and_then(|link| link.session.as_ref());
         let Some(identity) = session.and_then(|session| session.identity().cloned()) else { return };
@@ -345,15 +355,7 @@ impl<T> Machine<T> {
 
     /// A link has ended.
     fn closed(&mut self, index: u16, reason: CloseReason) -> Option<Job> {
-        let Self { links, pool, counters, .. } = self;
-        let link = links.get_mut(usize::from(index))?;
-        let session = link.session.take()?;
-        counters.merge(session.counters());
-        let (peer, told, address) = (link.peer.take(), session.identity().cloned(), session.address());
-        link.storage = Some(session.into_storage(pool));
-        link.interrupt();
-        link.told = None;
-        link.serial = link.serial.wrapping_add(1);
+        let (peer, told, address) = self.end(index)?;
         self.forget_calls_of(index);
         self.hang_up(index);
         let action = self.node.left(now(), LinkId(index), reason);
@@ -369,5 +371,20 @@ impl<T> Machine<T> {
                 None
             }
         }
+    }
+
+    /// Gives the memory of a link's session back; whose it was, who it said it is, and where.
+    #[inline(never)]
+    fn end(&mut self, index: u16) -> Option<(Option<Identity>, Option<Identity>, SocketAddr)> {
+        let Self { links, pool, counters, .. } = self;
+        let link = links.get_mut(usize::from(index))?;
+        let session = link.session.as_ref()?;
+        counters.merge(session.counters());
+        let (told, address) = (session.identity().cloned(), session.address());
+        link.storage = link.session.take().map(|session| session.into_storage(pool));
+        link.interrupt();
+        link.told = None;
+        link.serial = link.serial.wrapping_add(1);
+        Some((link.peer.take(), told, address))
     }
 }

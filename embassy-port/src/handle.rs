@@ -231,8 +231,9 @@ impl<T> Handle<T> {
         self.look(|machine| machine.node.counters.value(counter))
     }
 
-    /// Shows each of the last refusals.
-    pub fn findings(&self, mut show: impl FnMut(&Finding)) {
-        self.look(|machine| machine.node.findings().for_each(&mut show));
+    /// The last refusals.
+    pub fn findings(&self) -> impl Iterator<Item = Finding> + use<T> {
+        let unit = *self;
+        (0..).map_while(move |index| unit.look(|machine| machine.node.findings().nth(index).cloned()))
     }
 }

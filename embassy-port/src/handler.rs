@@ -108,7 +108,8 @@ impl<T> Handler<T> {
     }
 }
 
-/// Runs a service of the paper's form on the parameters of a call.
+/// Runs a service of the paper's form on the parameters of a call. Kept apart: only such services pay for copies.
+#[inline(never)]
 fn by_value(view: &mut ParametersView, service: impl FnOnce(Parameters) -> Parameters) -> Result<(), ServiceError> {
     let mut arguments = Parameters::new();
     arguments.copy_from(view).map_err(|_| ServiceError::BadResults)?;

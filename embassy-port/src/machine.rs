@@ -172,12 +172,14 @@ impl<T> Machine<T> {
     }
 
     /// Lets the node do what is due.
+    #[inline(never)]
     pub(crate) fn poll_node(&mut self) -> Option<cara_core::distribution::connection_handler::Action> {
         let Self { node, lines, udp, stack, .. } = self;
         node.poll(now(), &mut EmbassyMailman { lines, udp, stack: *stack })
     }
 
     /// Makes the session of a link. `None` when the link is in use.
+    #[inline(never)]
     pub(crate) fn open(&mut self, index: u16, address: SocketAddr, dialed: bool) -> Option<()> {
         let storage = self.link_mut(index)?.storage.take()?;
         let local = self.node.hello(now(), LinkId(index));

@@ -6,6 +6,7 @@ use core::net::SocketAddr;
 use cara_core::distribution::identity::{Epoch, Identity};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
+use cara_core::host::connections::LinkCounter;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::RequestOptions;
 
@@ -118,9 +119,9 @@ impl<T> Peer<T> {
         self.unit.act(|machine| machine.publish_to(&self.identity)).map(drop)
     }
 
-    /// Shows each counter of its link, zeros included; none while it is not connected.
-    pub fn counters(&self, mut show: impl FnMut(&'static str, u64)) {
-        self.session(|session| session.counters().iter().for_each(|(name, count)| show(name, count)));
+    /// What happened on its link; nothing while it is not connected.
+    pub fn counted(&self, counter: LinkCounter) -> u64 {
+        self.session(|session| session.counters().value(counter)).unwrap_or(0)
     }
 }
 

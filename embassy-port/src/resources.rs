@@ -67,8 +67,9 @@ const DATAGRAMS: usize = 8;
 /// const { assert!(DepotResources::SOCKETS == 5) };
 /// ```
 ///
-/// In firmware it is a static: `static RESOURCES: ConstStaticCell<AgvResources> = ConstStaticCell::new(Resources::new());`,
-/// and `RESOURCES.take()` is the `&'static mut` that [`new`] wants. It costs no flash, since nothing is initialised before.
+/// In firmware it is a static: `static RESOURCES: StaticCell<AgvResources> = StaticCell::new();`, and
+/// `RESOURCES.init_with(Resources::new)` is the `&'static mut` that [`new`] wants. It costs no flash and nothing is
+/// copied, since nothing is initialised before.
 pub struct Resources<
     T: 'static = (),
     const LINKS: usize = 1,
@@ -267,6 +268,7 @@ impl<const MESSAGE: usize> UdpMemory<MESSAGE> {
 ///
 /// # Panics
 /// In embassy-net, when the stack was made with fewer sockets than [`Resources::SOCKETS`] asks for.
+#[inline(never)]
 pub fn new<
     T: 'static,
     const LINKS: usize,

@@ -67,6 +67,7 @@ impl<T> Runner<T> {
     }
 
     /// Leases first, so that what moves stops before anything else is done.
+    #[inline(never)]
     fn step(&mut self, context: &mut Context<'_>) -> Step {
         let shared = self.shared;
         let machine = &mut *shared.machine.borrow_mut();
@@ -113,6 +114,7 @@ impl<T> Runner<T> {
     }
 
     /// Whether nothing is due before the task is woken.
+    #[inline(never)]
     fn rest(&mut self, context: &mut Context<'_>) -> bool {
         let machine = &mut *self.shared.machine.borrow_mut();
         machine.wakers.runner.register(context.waker());
@@ -146,6 +148,7 @@ impl<T> Runner<T> {
         }
     }
 
+    #[inline(never)]
     fn serve(&mut self, running: Running, call: &CoreCall) {
         let result = self.begin(running, call);
         let Some(result) = result else { return };

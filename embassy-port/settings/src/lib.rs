@@ -5,6 +5,8 @@
 //! checksum, so that a cut of power while one is written leaves the other. [`text`](Settings::from_str) is how a person,
 //! a command line or an emulator's arguments say it.
 //!
+//! [`board`] is the table of boards and of where their pages are; [`uf2`] is the file form that some boot loaders take.
+//!
 //! It knows no flash controller and reads nothing by itself: a board lends the bytes of its pages.
 
 #![no_std]
@@ -12,8 +14,11 @@
 #[cfg(test)]
 extern crate std;
 
+pub mod board;
 pub mod page;
 mod text;
+pub mod uf2;
+mod wifi;
 
 use core::net::{Ipv4Addr, SocketAddrV4};
 
@@ -22,6 +27,7 @@ use cara_core::distribution::identity::{Fleet, Identity, Role};
 use serde::{Deserialize, Serialize};
 
 pub use text::{Field, TextError};
+pub use wifi::{Wifi, WifiError};
 
 /// What one board is told.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -36,6 +42,8 @@ pub struct Settings {
     pub fleet: Fleet,
     /// Its address.
     pub network: Network,
+    /// The access point, for a board on Wi-Fi. Text never holds it, because its password is secret.
+    pub wifi: Option<Wifi>,
 }
 
 /// How a board gets its address.
@@ -66,6 +74,6 @@ impl Settings {
             (Role::SUnit, Some(manager)) if Manager::new(&manager.name, manager.id).is_ok()
         ) || (self.identity.role() == Role::MUnit && self.manager.is_none());
         let name = Identity::new(self.identity.name(), self.identity.id(), self.identity.role()).is_ok();
-        network && role && name
+        network && role && name && self.wifi.as_ref().is_none_or(Wifi::is_sound)
     }
 }

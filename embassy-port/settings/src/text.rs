@@ -10,7 +10,8 @@
 //! ```
 //!
 //! `address=dhcp` is the default, as are fleet 0 and no gateway; a unit without `manager` is an m_unit;
-//! `manager_address=10.0.0.1:4000` replaces broadcasts. Names with spaces cannot be written so.
+//! `manager_address=10.0.0.1:4000` replaces broadcasts. Names with spaces cannot be written so; an access point is no
+//! part of it, because its password is secret.
 
 use core::fmt;
 use core::net::Ipv4Addr;
@@ -103,7 +104,7 @@ impl FromStr for Settings {
         let identity = Identity::new(name, id, role).map_err(|_| TextError::Value(Field::Name))?;
         let fleet = words.of_field(Field::Fleet).map_or(Ok(0), |word| number(Field::Fleet, word))?;
         let manager_address = words.parsed(Field::ManagerAddress)?;
-        Ok(Self { identity, manager, manager_address, fleet: Fleet(fleet), network: network(&words)? })
+        Ok(Self { identity, manager, manager_address, fleet: Fleet(fleet), network: network(&words)?, wifi: None })
     }
 }
 
@@ -244,6 +245,7 @@ mod tests {
                 network: network.map_or(Network::Dhcp, |(address, prefix, gateway)| Network::Static {
                     address: Ipv4Addr::from_bits(address), prefix, gateway: gateway.map(Ipv4Addr::from_bits),
                 }),
+                wifi: None,
             };
             prop_assert_eq!(settings.to_string().parse(), Ok(settings));
         }

@@ -1,9 +1,10 @@
 //! What the port does beside the rules that scenarios show: memory, tasks that take calls, cable and address, cancelling.
 
-use std::cell::RefCell;
+use std::cell::{Cell, RefCell};
 use std::net::Ipv4Addr;
+use std::pin::Pin;
 use std::rc::Rc;
-use std::task::Poll;
+use std::task::{Context, Poll};
 
 use cara_core::config::{Constraints, PLAIN_PORT};
 use cara_core::distribution::connection_handler::NodeCounter;
@@ -302,4 +303,38 @@ fn silent_connections_give_way_to_nodes() {
     let (_, agv) = agv(&bench);
     assert!(bench.run_until(|| agv.is_connected(), Duration::from_secs(2)));
     assert!(manager.node_counted(NodeCounter::GaveWay) > 0);
+}
+
+/// Counts how often a task is polled.
+struct Counted<F> {
+    task: F,
+    polls: Rc<Cell<u32>>,
+}
+
+impl<F: Future + Unpin> Future for Counted<F> {
+    type Output = F::Output;
+
+    fn poll(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<F::Output> {
+        self.polls.set(self.polls.get() + 1);
+        Pin::new(&mut self.task).poll(context)
+    }
+}
+
+#[test]
+fn an_idle_unit_lets_its_controller_sleep() {
+    let bench = Bench::new(10);
+    let (_, manager) = manager(&bench);
+    let board = bench.board();
+    let config = Config::s_unit("agv", 7, "manager", 1, 7).unwrap();
+    let memory = Box::leak(Box::new(Manager::new()));
+    let (agv, mut runner) = cara_embassy::new(board.stack(), memory, config, State::default()).unwrap();
+    let polls = Rc::new(Cell::new(0));
+    let task = Box::pin(async move { runner.run().await });
+    board.spawn(Counted { task, polls: Rc::clone(&polls) });
+    assert!(bench.run_until(|| agv.is_connected() && manager.is_connected(), SHORT));
+    bench.run_for(SHORT);
+    polls.set(0);
+    bench.run_for(Duration::from_secs(10));
+    // It looks at the cable 20 times a second, and at its keep-alives.
+    assert!(polls.get() <= 300, "{} times in 10 s", polls.get());
 }
