@@ -29,6 +29,7 @@ impl<C: Counter, const N: usize> Counters<C, N> {
     }
 
     /// Adds `count`; saturates.
+    #[cfg_attr(target_os = "none", inline(never))]
     pub fn add(&mut self, counter: C, count: u64) {
         if let Some(value) = self.values.get_mut(counter.index()) {
             *value = value.saturating_add(count);

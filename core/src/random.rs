@@ -27,6 +27,7 @@ impl Random {
     }
 
     /// A span in `[0, limit)`.
+    #[cfg_attr(target_os = "none", inline(never))]
     pub fn jitter(&mut self, limit: Duration) -> Duration {
         Duration::from_micros(self.below(limit.as_micros()))
     }

@@ -152,6 +152,7 @@ impl<S: Storage, C: Secure> Link<S, C> {
     /// Accepts one message of `total` bytes, which `write` puts into the send buffer, and writes what the network takes
     /// unless it is to `hold`. Refused before the first byte when it cannot be kept: [`Error::Full`] when it can be
     /// later, [`Error::TooLarge`] when it never can.
+    #[cfg_attr(target_os = "none", inline(never))]
     pub fn send_message(
         &mut self,
         mailman: &mut impl Mailman,
