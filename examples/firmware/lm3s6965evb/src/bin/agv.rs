@@ -14,7 +14,7 @@ use defmt_semihosting as _;
 use embassy_executor::Spawner;
 use embassy_net::{Runner, StackResources};
 use embassy_time::{Duration, Timer};
-use static_cell::StaticCell;
+use static_cell::{ConstStaticCell, StaticCell};
 
 /// A board that hangs for so long starts again.
 const HANGS: Duration = Duration::from_secs(4);
@@ -33,16 +33,18 @@ fn main() -> ! {
     })
 }
 
+/// Not merged into `main`: what it needs of the stack is free again once the tasks run.
+#[inline(never)]
 fn spawn(spawner: Spawner) -> Result<(), &'static str> {
-    static ETHERNET: StaticCell<Ethernet> = StaticCell::new();
-    static SOCKETS_MEMORY: StaticCell<StackResources<SOCKETS>> = StaticCell::new();
+    static ETHERNET: ConstStaticCell<Ethernet> = ConstStaticCell::new(Ethernet::new());
+    static SOCKETS_MEMORY: ConstStaticCell<StackResources<SOCKETS>> = ConstStaticCell::new(StackResources::new());
     static RESOURCES: StaticCell<VehicleResources> = StaticCell::new();
     const NO_ROOM: &str = "no room for a task";
     let Told { settings, seed } = arguments::read().map_err(|_| "who am I? The arguments are no settings")?;
     let seed = seed.unwrap_or_else(arguments::seed);
-    let ethernet = ETHERNET.init_with(Ethernet::new);
+    let ethernet = ETHERNET.take();
     ethernet.start();
-    let sockets = SOCKETS_MEMORY.init_with(StackResources::new);
+    let sockets = SOCKETS_MEMORY.take();
     let (stack, network_runner) = embassy_net::new(ethernet, cara_vehicle::network(&settings), sockets, seed);
     let resources = RESOURCES.init_with(VehicleResources::new);
     let made = cara_vehicle::vehicle(stack, resources, &settings, seed);

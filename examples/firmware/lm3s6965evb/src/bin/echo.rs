@@ -12,7 +12,7 @@ use embassy_net::tcp::TcpSocket;
 use embassy_net::{Config, Ipv4Cidr, Runner, Stack, StackResources, StaticConfigV4};
 use embassy_time::{Duration, Timer};
 use embedded_io_async::Write;
-use static_cell::StaticCell;
+use static_cell::ConstStaticCell;
 
 const PORT: u16 = 7777;
 const BUFFER: usize = 2048;
@@ -29,11 +29,12 @@ fn main() -> ! {
     })
 }
 
+#[inline(never)]
 fn spawn(spawner: Spawner) -> Result<(), &'static str> {
-    static ETHERNET: StaticCell<Ethernet> = StaticCell::new();
-    static RESOURCES: StaticCell<StackResources<4>> = StaticCell::new();
+    static ETHERNET: ConstStaticCell<Ethernet> = ConstStaticCell::new(Ethernet::new());
+    static RESOURCES: ConstStaticCell<StackResources<4>> = ConstStaticCell::new(StackResources::new());
     let told = arguments::read().map_err(|_| "the arguments are no settings")?;
-    let ethernet = ETHERNET.init_with(Ethernet::new);
+    let ethernet = ETHERNET.take();
     let [.., last] = ethernet.start();
     let config = match told.settings.network {
         Network::Dhcp => Config::dhcpv4(Default::default()),
@@ -43,7 +44,7 @@ fn spawn(spawner: Spawner) -> Result<(), &'static str> {
             dns_servers: Default::default(),
         }),
     };
-    let resources = RESOURCES.init_with(StackResources::new);
+    let resources = RESOURCES.take();
     let seed = told.seed.unwrap_or(u64::from(last));
     let (stack, runner) = embassy_net::new(ethernet, config, resources, seed);
     spawner.spawn(network(runner).map_err(|_| "no room for a task")?);
@@ -59,11 +60,11 @@ async fn network(mut runner: Runner<'static, &'static mut Ethernet>) -> ! {
 
 #[embassy_executor::task]
 async fn echo(stack: Stack<'static>) -> ! {
-    static RECEIVE: StaticCell<[u8; BUFFER]> = StaticCell::new();
-    static SEND: StaticCell<[u8; BUFFER]> = StaticCell::new();
-    static PIECE: StaticCell<[u8; BUFFER]> = StaticCell::new();
-    let mut socket = TcpSocket::new(stack, RECEIVE.init([0; BUFFER]), SEND.init([0; BUFFER]));
-    let piece = PIECE.init([0; BUFFER]);
+    static RECEIVE: ConstStaticCell<[u8; BUFFER]> = ConstStaticCell::new([0; BUFFER]);
+    static SEND: ConstStaticCell<[u8; BUFFER]> = ConstStaticCell::new([0; BUFFER]);
+    static PIECE: ConstStaticCell<[u8; BUFFER]> = ConstStaticCell::new([0; BUFFER]);
+    let mut socket = TcpSocket::new(stack, RECEIVE.take(), SEND.take());
+    let piece = PIECE.take();
     socket.set_nagle_enabled(false);
     loop {
         socket.set_timeout(Some(Duration::from_secs(10)));
