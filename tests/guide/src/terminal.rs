@@ -1,11 +1,13 @@
 //! A terminal of the reader: where it is, what it has exported, and what runs in it.
 
+use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail, ensure};
 use cara_processes::Process;
+use rustix::process::Signal;
 use tempfile::TempDir;
 
 use crate::document::Step;
@@ -111,7 +113,9 @@ impl<'s> Terminal<'s> {
         let mut process = self.running.take().context("nothing runs in this terminal")?;
         println!("{}^C", self.name);
         let status = process.terminate(PATIENCE)?;
-        ensure!(status.success(), "it ended with {status}: {:?}", process.lines());
+        // A program that does not care for signals is ended by one.
+        let by_signal = status.signal() == Some(Signal::TERM.as_raw());
+        ensure!(status.success() || by_signal, "it ended with {status}: {:?}", process.lines());
         Ok(())
     }
 

@@ -176,7 +176,7 @@ pub(crate) const GROUPS: [Group; 18] = [
     Group {
         name: "guide",
         what: "every command of the guide does what it says",
-        budget: 120,
+        budget: 240,
         quick: None,
         by_default: true,
         run: |_| guide().into(),
