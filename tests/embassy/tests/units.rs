@@ -14,7 +14,7 @@ use cara_core::host::connections::LinkCounter;
 use cara_core::services::lease::Lease;
 use cara_core::services::unit::RequestOptions;
 use cara_core::time::Duration;
-use cara_embassy::{Config, Handle, Handler, Resources, ServiceOptions, UnitEvent, message_buffer};
+use cara_embassy::{Config, Handle, Handler, Hook, Resources, ServiceOptions, UnitEvent, message_buffer};
 use cara_embassy_host::{Bench, Board};
 use embassy_net::tcp::TcpSocket;
 use embassy_time::{Timer, with_timeout};
@@ -27,6 +27,8 @@ const LONG: Duration = Duration::from_secs(30);
 struct State {
     stops: u32,
     losses: u32,
+    /// What was done, in order.
+    done: Vec<&'static str>,
 }
 
 type Unit = Handle<State>;
@@ -209,6 +211,7 @@ fn what_is_cancelled_makes_room_for_the_next() {
         }
     });
     assert_eq!(manager.counted(LinkCounter::RequestsSent), 20);
+    assert_eq!(manager.counted(LinkCounter::CallsTimedOut), 20, "none waits for its reply any more");
     assert_eq!(ask(&bench, &manager_board, manager, "agv", "go_to", 3), Ok(3));
 }
 
@@ -337,4 +340,36 @@ fn an_idle_unit_lets_its_controller_sleep() {
     bench.run_for(Duration::from_secs(10));
     // It looks at the cable 20 times a second, and at its keep-alives.
     assert!(polls.get() <= 300, "{} times in 10 s", polls.get());
+}
+
+/// No task of the vehicle runs any more, as when a handler hangs: its motor sees the lease end in time all the same, and
+/// what is to be made safe is made so before anything else that waits.
+#[test]
+fn a_starved_vehicle_stops_by_its_lease_and_is_made_safe_first() {
+    let bench = Bench::new(11);
+    let ((manager_board, manager), (agv_board, agv)) = (manager(&bench), agv(&bench));
+    static MOVING: Lease = Lease::new();
+    let length = Duration::from_millis(400);
+    let safe: &'static Hook<State> = &|state| state.done.push("made safe");
+    let options = ServiceOptions::new().lease(length, &MOVING, safe);
+    agv.add_service("go(n: int) -> (n: int)", options, Handler::method(&|_, _, _| Ok(()))).unwrap();
+    let noted = Handler::method(&|state: &mut State, _, _| {
+        state.done.push("served");
+        Ok(())
+    });
+    agv.add_service("note(n: int)", ServiceOptions::new(), noted).unwrap();
+    agv.publish_my_function_list().unwrap();
+    assert!(bench.run_until(|| knows(manager, "agv", "note"), SHORT));
+    assert_eq!(ask(&bench, &manager_board, manager, "agv", "go", 1), Ok(1));
+    bench.run_for(Duration::from_secs(1));
+    let live = || MOVING.is_live(cara_embassy::now());
+    assert!(live(), "the manager renews it");
+    agv_board.suspend(Duration::from_millis(1_500));
+    let starved = bench.now();
+    manager.peer("agv").unwrap().request("note", &number(1)).unwrap();
+    assert!(bench.run_until(|| !live(), SHORT));
+    assert!(bench.now().since(starved) <= length, "the bound is the lease");
+    assert_eq!(agv.with_state(|state| state.done.len()), Ok(0), "nothing runs yet");
+    assert!(bench.run_until(|| agv.with_state(|state| state.done.len()) == Ok(2), SHORT));
+    assert_eq!(agv.with_state(|state| state.done.clone()), Ok(vec!["made safe", "served"]));
 }
