@@ -167,6 +167,17 @@ fn a_node_that_starts_again_and_again_is_restarting() {
 }
 
 #[test]
+fn a_manager_that_may_open_too_few_files_is_told_with_its_limit() {
+    let clinic = Clinic::new();
+    let _manager = clinic.manager_of_few_files(120);
+    // It is up once it has a socket.
+    until("it is up", || clinic.doctor(&["boss", "--listen", "0s"]).ids() == ["answers"]);
+    let told = clinic.doctor(&["--listen", "3s"]);
+    told.is(&["few-descriptors"], 4);
+    assert!(told.found(0).contains("may have 120 files open"), "{told:?}");
+}
+
+#[test]
 fn without_a_name_all_that_is_strange_is_listed() {
     let clinic = Clinic::new();
     let _manager = clinic.manager("boss", 64);
@@ -269,6 +280,24 @@ fn broadcasts_that_the_own_firewall_does_not_let_out_are_told() {
         let clinic = Clinic::new();
         nft("output", &format!("udp dport {} drop", clinic.port));
         clinic.doctor(&["agv"]).is(&["send-refused"], 4);
+    });
+}
+
+#[test]
+fn a_link_on_which_signs_of_life_get_lost_is_told() {
+    namespace::inside("a_link_on_which_signs_of_life_get_lost_is_told", &["nft"], || {
+        ip("link set lo up");
+        let clinic = Clinic::new();
+        let manager = clinic.manager("boss", 64);
+        let _agv = clinic.started(clinic.unit("agv", 7, "boss"));
+        until("it has come", || manager.number_of_s_units() == 1);
+        let agv = manager.s_unit("agv").unwrap();
+        // Signs of life are datagrams beside the stream; discovery goes on.
+        nft("input", &format!("udp dport != {} drop", clinic.port));
+        let missed = || agv.counters().iter().find(|(name, _)| *name == "KeepAlivesMissed").map(|(_, count)| *count);
+        until("signs of life are missed", || missed().is_some_and(|missed| missed >= 5));
+        let told = clinic.doctor(&["agv"]);
+        assert_eq!((told.ids()[0], told.code), ("lossy-link", 4), "{told:?}");
     });
 }
 

@@ -148,7 +148,7 @@ fn descriptors(running: &Running, open: u64, limit: u64, finding: fn(Id, String,
         running.name(),
         u64::from(maximum).saturating_add(OTHER_DESCRIPTORS)
     );
-    let advice = "raise the limit where it is started: `ulimit -n`, or LimitNOFILE= of its service";
+    let advice = "raise the hard limit where it is started: `ulimit -Hn`, or LimitNOFILE= of its service";
     finding(Id::FewDescriptors, found, advice.into()).about(running.name())
 }
 

@@ -3,7 +3,7 @@
 use std::fs::Permissions;
 use std::net::{Ipv4Addr, UdpSocket};
 use std::os::unix::fs::PermissionsExt;
-use std::process::Command;
+use std::process::{Child, Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
@@ -48,6 +48,22 @@ impl Clinic {
         let manager = self.system(name).constraints(constraints).build_system().unwrap();
         manager.start().unwrap();
         manager
+    }
+
+    /// A manager `boss/1` in a process of its own, which may open few files.
+    pub(crate) fn manager_of_few_files(&self, files: u32) -> Killed {
+        let mut command = Command::new("sh");
+        command.args([
+            "-c",
+            "ulimit -n \"$1\"; shift; exec \"$@\"",
+            "sh",
+            &files.to_string(),
+            env!("CARGO_BIN_EXE_cara"),
+        ]);
+        command.args(["node", "--name", "boss", "--id", "1", "--loopback", "--fleet", &self.fleet.to_string()]);
+        command.args(["--discovery-port", &self.port.to_string()]).env("CARA_CONTROL_DIR", self.sockets.path());
+        command.stdout(Stdio::null()).stderr(Stdio::null());
+        Killed(command.spawn().unwrap())
     }
 
     /// An s_unit of the manager `manager/1`.
@@ -114,6 +130,16 @@ impl Clinic {
         let output = command.output().unwrap();
         let text = |bytes| String::from_utf8(bytes).unwrap();
         (output.status.code().unwrap(), text(output.stdout), text(output.stderr))
+    }
+}
+
+/// A process that ends with its owner.
+pub(crate) struct Killed(Child);
+
+impl Drop for Killed {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
     }
 }
 
