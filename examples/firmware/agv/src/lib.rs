@@ -2,9 +2,19 @@
 //! board adds its network, its clock, its settings and its button.
 //!
 //! [`vehicle`] makes the unit and its services. A board then runs three tasks beside that of its network: the unit's
-//! [`Runner`], [`drive`] and [`call_mechanic`].
+//! [`Runner`], [`drive`] and [`call_mechanic`]. [`lamp`] and [`reset`] say how a board tells what goes on; [`echo`] is a
+//! program without CARA to compare with.
 
 #![no_std]
+
+#[cfg(test)]
+extern crate std;
+
+pub mod echo;
+pub mod lamp;
+pub mod reset;
+#[cfg(feature = "tasks")]
+pub mod tasks;
 
 use core::net::SocketAddr;
 
@@ -14,6 +24,7 @@ use cara_core::config::Priority;
 use cara_core::error::{Cause, Error};
 use cara_core::services::lease::Lease;
 use cara_embassy::{Config, Handle, Handler, Hook, Resources, Runner, ServiceOptions, now};
+use cara_settings::page::PageError;
 use cara_settings::{Network, Settings};
 use embassy_net::{Ipv4Cidr, Stack, StaticConfigV4};
 use embassy_time::{Duration, Ticker};
@@ -62,6 +73,25 @@ pub fn network(settings: &Settings) -> embassy_net::Config {
             gateway,
             dns_servers: Default::default(),
         }),
+    }
+}
+
+/// A hardware address from a chip's own number, for chips that are delivered without one: administered locally, the same
+/// at each start, and different from chip to chip with a likelihood of 2^-40 per pair.
+pub fn hardware_address(chip: &[u8]) -> [u8; 6] {
+    // FNV-1a.
+    let mix = |sum: u64, byte: &u8| (sum ^ u64::from(*byte)).wrapping_mul(0x0000_0100_0000_01B3);
+    let [first, second, third, fourth, fifth, ..] = chip.iter().fold(0xCBF2_9CE4_8422_2325, mix).to_be_bytes();
+    [0x02, first, second, third, fourth, fifth]
+}
+
+/// Logs why a board does not know who it is.
+pub fn tell_unprovisioned(error: PageError) {
+    match error {
+        PageError::Absent => info!("who am I? There are no settings: write them with cara provision"),
+        PageError::Layout(_layout) => info!("settings of layout {}: write them again, or update the image", _layout),
+        PageError::Damaged => info!("who am I? The settings are damaged: write them again with cara provision"),
+        PageError::Unsound => info!("who am I? The settings are of no unit: write them again with cara provision"),
     }
 }
 
@@ -163,4 +193,18 @@ async fn ask_mechanic(vehicle: Vehicle) -> Result<i64, Error> {
     arguments.set_value("fault", "a wheel squeaks")?;
     vehicle.block_request("call_mechanic", &mut arguments).await?;
     arguments.variable("minutes")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::hardware_address;
+    use std::collections::HashSet;
+
+    #[test]
+    fn chips_have_addresses_of_their_own() {
+        let addresses: HashSet<[u8; 6]> = (0..1_000_u32).map(|chip| hardware_address(&chip.to_le_bytes())).collect();
+        assert_eq!(addresses.len(), 1_000);
+        // Administered locally, and of one station.
+        assert!(addresses.iter().all(|[first, ..]| first & 0b11 == 0b10));
+    }
 }

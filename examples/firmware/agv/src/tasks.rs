@@ -1,0 +1,19 @@
+//! Tasks that every board spawns as they are. Those of its network, button, lamp and watchdog are the board's own,
+//! because their types are.
+
+use cara_apps::agv::Agv;
+use cara_embassy::Runner;
+
+use crate::Vehicle;
+
+/// The unit's task.
+#[embassy_executor::task]
+pub async fn unit(mut runner: Runner<Agv>) -> ! {
+    runner.run().await
+}
+
+/// The motors' task.
+#[embassy_executor::task]
+pub async fn drive(vehicle: Vehicle) -> ! {
+    crate::drive(vehicle).await
+}

@@ -1,0 +1,73 @@
+//! The AGV of the examples on a Nucleo board. The blue button calls the mechanic.
+
+#![no_std]
+#![no_main]
+
+use cara_nucleo::Board;
+use cara_nucleo::board::{Button, Device, Lamp, Watchdog};
+use cara_settings::Settings;
+use cara_vehicle::{SOCKETS, Vehicle, VehicleResources, lamp, tasks};
+use defmt_rtt as _;
+use embassy_executor::{SpawnError, Spawner};
+use embassy_net::{Runner, StackResources};
+use static_cell::StaticCell;
+
+#[embassy_executor::main]
+async fn main(spawner: Spawner) {
+    let mut board = Board::start();
+    defmt::info!("started because of {}", board.reason);
+    let settings = match board.settings {
+        Ok(settings) => settings,
+        Err(error) => {
+            cara_vehicle::tell_unprovisioned(error);
+            lamp::unprovisioned(async |on| board.lamp.set(on)).await
+        }
+    };
+    defmt::unwrap!(spawn(spawner, settings, board.seed, board.device, board.lamp, board.button, board.watchdog));
+}
+
+fn spawn(
+    spawner: Spawner,
+    settings: Settings,
+    seed: u64,
+    device: Device,
+    lamp: Lamp,
+    button: Button,
+    watchdog: Watchdog,
+) -> Result<(), SpawnError> {
+    static SOCKETS_MEMORY: StaticCell<StackResources<SOCKETS>> = StaticCell::new();
+    static RESOURCES: StaticCell<VehicleResources> = StaticCell::new();
+    let sockets = SOCKETS_MEMORY.init_with(StackResources::new);
+    let (stack, network_runner) = embassy_net::new(device, cara_vehicle::network(&settings), sockets, seed);
+    let resources = RESOURCES.init_with(VehicleResources::new);
+    let made = cara_vehicle::vehicle(stack, resources, &settings, seed);
+    let Ok((vehicle, unit)) = made else { defmt::panic!("the settings are of no vehicle: provision the board again") };
+    defmt::info!("{=str}/{=u32}", settings.identity.name(), settings.identity.id());
+    spawner.spawn(network(network_runner)?);
+    spawner.spawn(tasks::unit(unit)?);
+    spawner.spawn(tasks::drive(vehicle)?);
+    spawner.spawn(call_mechanic(vehicle, button)?);
+    spawner.spawn(shine(vehicle, lamp)?);
+    spawner.spawn(watch(watchdog)?);
+    Ok(())
+}
+
+#[embassy_executor::task]
+async fn network(mut runner: Runner<'static, Device>) -> ! {
+    runner.run().await
+}
+
+#[embassy_executor::task]
+async fn call_mechanic(vehicle: Vehicle, mut button: Button) -> ! {
+    cara_vehicle::call_mechanic(vehicle, async || button.pressed().await).await
+}
+
+#[embassy_executor::task]
+async fn shine(vehicle: Vehicle, mut lamp: Lamp) -> ! {
+    lamp::show(vehicle, async |on| lamp.set(on)).await
+}
+
+#[embassy_executor::task]
+async fn watch(watchdog: Watchdog) -> ! {
+    watchdog.run().await
+}
