@@ -7,6 +7,7 @@
 mod accounts;
 mod calling;
 mod clock_thread;
+mod driving;
 mod interfaces;
 pub(crate) mod link;
 mod membership;
@@ -49,11 +50,11 @@ use crate::event::UnitEvent;
 use crate::handler::Handler;
 use crate::pool::MessagePool;
 use crate::storage::Boxed;
-use crate::sys::datagram::{Datagrams, Socket};
-use crate::sys::epoll::{Interest, Ready, Trigger};
+use crate::sys::datagram::Datagrams;
+use crate::sys::epoll::{Interest, Trigger};
 use crate::sys::interfaces::Interface;
 use crate::sys::stream::Listener;
-use crate::threads::{Crew, Driven, Source, Threads};
+use crate::threads::Threads;
 use crate::timers::Timers;
 use link::{LinkCell, LinkState, Notice, StdMailman};
 use peers::{PeerCell, Peers};
@@ -172,45 +173,6 @@ impl<T: Send + 'static> Engine<T> {
             subscribers: Mutex::new(Vec::new()),
             lost_hook: Mutex::new(None),
         })
-    }
-
-    fn crew(&self) -> &Arc<Crew> {
-        self.threads.crew()
-    }
-
-    fn seat(&self) -> Option<u16> {
-        self.seat.get().copied()
-    }
-
-    /// Begins to search and to serve, driven by the unit's threads. One that was stopped does not start again.
-    pub(crate) fn start(self: &Arc<Self>) -> Result<(), Error> {
-        if self.is_stopping() || self.seat().is_some() {
-            return Err(Error::NotRunning);
-        }
-        self.crew().start()?;
-        let seat = self.crew().seat(self.clone())?;
-        let _ = self.seat.set(seat);
-        self.watch(seat).map_err(system_refused)?;
-        self.wake_clock();
-        Ok(())
-    }
-
-    fn watch(&self, seat: u16) -> std::io::Result<()> {
-        for socket in [Socket::Shared, Socket::Own] {
-            self.crew().watch(seat, Source::Datagrams(socket), self.datagrams.fd(socket))?;
-        }
-        self.listener.as_ref().map_or(Ok(()), |listener| self.crew().watch(seat, Source::Listener, listener))
-    }
-
-    /// Something is to be done now, or the time of the next thing has changed.
-    fn wake_clock(&self) {
-        self.wake_clock_at(Instant::START);
-    }
-
-    fn wake_clock_at(&self, at: Instant) {
-        if let Some(seat) = self.seat() {
-            self.crew().wake_at(seat, at);
-        }
     }
 
     pub(crate) fn is_stopping(&self) -> bool {
@@ -484,22 +446,6 @@ impl<T: Send + 'static> Engine<T> {
         drop(handlers);
     }
 
-    /// From here on no thread works for the unit any more, except the one that calls.
-    fn release_threads(&self) {
-        for socket in [Socket::Shared, Socket::Own] {
-            self.crew().unwatch(self.datagrams.fd(socket));
-        }
-        if let Some(listener) = &self.listener {
-            self.crew().unwatch(listener);
-        }
-        if let Some(seat) = self.seat() {
-            self.crew().leave(seat);
-        }
-        if self.own_threads {
-            self.crew().stop();
-        }
-    }
-
     fn take_handlers(&self) -> Vec<Handler<T>> {
         let mut functions = write(&self.functions);
         let names: Vec<String> = functions.iter().map(|function| function.name().to_owned()).collect();
@@ -508,28 +454,6 @@ impl<T: Send + 'static> Engine<T> {
 
     fn now(&self) -> Instant {
         self.clock.now()
-    }
-}
-
-impl<T: Send + 'static> Driven for Engine<T> {
-    fn ready(&self, ready: Ready, worker: &mut workers::Worker) {
-        self.link_ready(ready, worker);
-    }
-
-    fn serve_waiting(&self, token: u64, worker: &mut workers::Worker) {
-        self.serve_link(token, worker);
-    }
-
-    fn keep_time(&self) -> Instant {
-        self.poll_links().min(self.poll_node()).min(self.relieve_stays()).min(self.watch_interfaces())
-    }
-
-    fn read_datagrams(&self, socket: Socket, buffer: &mut [u8]) {
-        self.datagrams_ready(socket, buffer);
-    }
-
-    fn accept(&self) {
-        self.connections_ready();
     }
 }
 

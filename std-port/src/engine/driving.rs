@@ -1,0 +1,90 @@
+//! The unit among those that its threads drive: how it begins, what wakes it, and how the threads let go of it.
+
+use std::sync::Arc;
+
+use cara_core::error::Error;
+use cara_core::time::Instant;
+
+use super::{Engine, system_refused, workers};
+use crate::sys::datagram::Socket;
+use crate::sys::epoll::Ready;
+use crate::threads::{Crew, Driven, Source};
+
+impl<T: Send + 'static> Engine<T> {
+    pub(super) fn crew(&self) -> &Arc<Crew> {
+        self.threads.crew()
+    }
+
+    pub(super) fn seat(&self) -> Option<u16> {
+        self.seat.get().copied()
+    }
+
+    /// Begins to search and to serve, driven by the unit's threads. One that was stopped does not start again.
+    pub(crate) fn start(self: &Arc<Self>) -> Result<(), Error> {
+        if self.is_stopping() || self.seat().is_some() {
+            return Err(Error::NotRunning);
+        }
+        self.crew().start()?;
+        let seat = self.crew().seat(self.clone())?;
+        let _ = self.seat.set(seat);
+        self.watch(seat).map_err(system_refused)?;
+        self.wake_clock();
+        Ok(())
+    }
+
+    fn watch(&self, seat: u16) -> std::io::Result<()> {
+        for socket in [Socket::Shared, Socket::Own] {
+            self.crew().watch(seat, Source::Datagrams(socket), self.datagrams.fd(socket))?;
+        }
+        self.listener.as_ref().map_or(Ok(()), |listener| self.crew().watch(seat, Source::Listener, listener))
+    }
+
+    /// Something is to be done now, or the time of the next thing has changed.
+    pub(super) fn wake_clock(&self) {
+        self.wake_clock_at(Instant::START);
+    }
+
+    pub(super) fn wake_clock_at(&self, at: Instant) {
+        if let Some(seat) = self.seat() {
+            self.crew().wake_at(seat, at);
+        }
+    }
+
+    /// From here on no thread works for the unit any more, except the one that calls.
+    pub(super) fn release_threads(&self) {
+        for socket in [Socket::Shared, Socket::Own] {
+            self.crew().unwatch(self.datagrams.fd(socket));
+        }
+        if let Some(listener) = &self.listener {
+            self.crew().unwatch(listener);
+        }
+        if let Some(seat) = self.seat() {
+            self.crew().leave(seat);
+        }
+        if self.own_threads {
+            self.crew().stop();
+        }
+    }
+}
+
+impl<T: Send + 'static> Driven for Engine<T> {
+    fn ready(&self, ready: Ready, worker: &mut workers::Worker) {
+        self.link_ready(ready, worker);
+    }
+
+    fn serve_waiting(&self, token: u64, worker: &mut workers::Worker) {
+        self.serve_link(token, worker);
+    }
+
+    fn keep_time(&self) -> Instant {
+        self.poll_links().min(self.poll_node()).min(self.relieve_stays()).min(self.watch_interfaces())
+    }
+
+    fn read_datagrams(&self, socket: Socket, buffer: &mut [u8]) {
+        self.datagrams_ready(socket, buffer);
+    }
+
+    fn accept(&self) {
+        self.connections_ready();
+    }
+}
