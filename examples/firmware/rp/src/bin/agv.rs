@@ -1,0 +1,74 @@
+//! The AGV of the examples on an RP2040 or RP2350. A button on a pin calls the mechanic.
+
+#![no_std]
+#![no_main]
+
+use cara_rp::Board;
+use cara_rp::board::{Device, Lamp};
+use cara_rp::parts::{Button, Watchdog};
+use cara_vehicle::{SOCKETS, Vehicle, VehicleResources, lamp, tasks};
+use defmt_rtt as _;
+use embassy_executor::{SpawnError, Spawner};
+use embassy_net::{Runner, StackResources};
+use static_cell::StaticCell;
+
+#[embassy_executor::main]
+async fn main(spawner: Spawner) {
+    defmt::unwrap!(run(spawner).await);
+}
+
+async fn run(spawner: Spawner) -> Result<(), SpawnError> {
+    static SOCKETS_MEMORY: StaticCell<StackResources<SOCKETS>> = StaticCell::new();
+    static RESOURCES: StaticCell<VehicleResources> = StaticCell::new();
+    let Board { reason, settings, seed, lamp, button, watchdog, network } = Board::start(spawner).await;
+    defmt::info!("started because of {}", reason);
+    let settings = match settings {
+        Ok(settings) => settings,
+        Err(error) => {
+            cara_vehicle::tell_unprovisioned(error);
+            spawner.spawn(flicker(lamp)?);
+            let (_, uplink) = network.start(spawner).await?;
+            uplink.only_lamp().await
+        }
+    };
+    let (device, uplink) = network.start(spawner).await?;
+    let sockets = SOCKETS_MEMORY.init_with(StackResources::new);
+    let (stack, runner) = embassy_net::new(device, cara_vehicle::network(&settings), sockets, seed);
+    uplink.keep(spawner, stack, Some(&settings))?;
+    let resources = RESOURCES.init_with(VehicleResources::new);
+    let made = cara_vehicle::vehicle(stack, resources, &settings, seed);
+    let Ok((vehicle, unit)) = made else { defmt::panic!("the settings are of no vehicle: provision the board again") };
+    defmt::info!("{=str}/{=u32}", settings.identity.name(), settings.identity.id());
+    spawner.spawn(talk(runner)?);
+    spawner.spawn(tasks::unit(unit)?);
+    spawner.spawn(tasks::drive(vehicle)?);
+    spawner.spawn(call_mechanic(vehicle, button)?);
+    spawner.spawn(shine(vehicle, lamp)?);
+    spawner.spawn(watch(watchdog)?);
+    Ok(())
+}
+
+#[embassy_executor::task]
+async fn talk(mut runner: Runner<'static, Device>) -> ! {
+    runner.run().await
+}
+
+#[embassy_executor::task]
+async fn call_mechanic(vehicle: Vehicle, mut button: Button) -> ! {
+    cara_vehicle::call_mechanic(vehicle, async || button.pressed().await).await
+}
+
+#[embassy_executor::task]
+async fn shine(vehicle: Vehicle, mut lamp: Lamp) -> ! {
+    lamp::show(vehicle, async |on| lamp.set(on).await).await
+}
+
+#[embassy_executor::task]
+async fn flicker(mut lamp: Lamp) -> ! {
+    lamp::unprovisioned(async |on| lamp.set(on).await).await
+}
+
+#[embassy_executor::task]
+async fn watch(watchdog: Watchdog) -> ! {
+    watchdog.run().await
+}
