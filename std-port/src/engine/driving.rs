@@ -19,10 +19,14 @@ impl<T: Send + 'static> Engine<T> {
         self.seat.get().copied()
     }
 
-    /// Begins to search and to serve, driven by the unit's threads. One that was stopped does not start again.
+    /// Begins to search and to serve, driven by the unit's threads. One that runs already goes on; one that was stopped
+    /// does not start again.
     pub(crate) fn start(self: &Arc<Self>) -> Result<(), Error> {
-        if self.is_stopping() || self.seat().is_some() {
+        if self.is_stopping() {
             return Err(Error::NotRunning);
+        }
+        if self.seat().is_some() {
+            return Ok(());
         }
         self.crew().start()?;
         let seat = self.crew().seat(self.clone())?;

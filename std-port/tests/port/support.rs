@@ -58,8 +58,7 @@ pub(crate) fn meet<T: Send + 'static, U: Send + 'static>(
     agv: &Unit<U>,
 ) -> (Peer<T>, Peer<U>) {
     publish(manager, agv);
-    // One that runs already refuses to start; one that does not will not be met.
-    let _ = manager.start();
+    manager.start().unwrap();
     agv.start().unwrap();
     let name = agv.identity().name().to_owned();
     until("the two have met", || manager.s_unit(&name).is_some_and(|peer| peer.is_connected()) && agv.is_connected());
