@@ -36,12 +36,12 @@ fn main() {
 fn take_radio_files(place: &Path) {
     println!("cargo::rerun-if-env-changed={RADIO}");
     let Some(folder) = env::var_os(RADIO) else {
-        panic!(
+        return refuse(&format!(
             "the radio of a Pico 2 W needs files whose licence keeps them out of this project: fetch {} from \
              https://github.com/embassy-rs/embassy/tree/main/cyw43-firmware and set {RADIO} to their folder; or set it \
              to {NONE} to link an image that only tells that it has none",
             RADIO_FILES.join(", ")
-        );
+        ));
     };
     for file in RADIO_FILES {
         let copy = place.join(file);
@@ -51,11 +51,18 @@ fn take_radio_files(place: &Path) {
         }
         let source = Path::new(&folder).join(file);
         println!("cargo::rerun-if-changed={}", source.display());
-        let bytes = fs::read(&source).unwrap_or_else(|error| panic!("{RADIO}: {}: {error}", source.display()));
-        assert!(!bytes.is_empty(), "{RADIO}: {} is empty", source.display());
-        fs::write(copy, bytes).expect("the file is copied");
+        match fs::read(&source) {
+            Ok(bytes) if !bytes.is_empty() => fs::write(copy, bytes).expect("the file is copied"),
+            Ok(_) => refuse(&format!("{RADIO}: {} is empty", source.display())),
+            Err(error) => refuse(&format!("{RADIO}: {}: {error}", source.display())),
+        }
     }
     if folder == NONE {
         println!("cargo::warning={RADIO}={NONE}: this image has no radio firmware; it says so and does nothing else");
     }
+}
+
+/// Ends the build with an error; cargo waits for the script to end.
+fn refuse(why: &str) {
+    println!("cargo::error={why}");
 }

@@ -1,8 +1,10 @@
 //! `cargo xtask firmware` and `cargo xtask sizes`: what runs on boards is built, measured and put on a desk.
 
 mod boards;
+mod flash;
 mod image;
 mod sizes;
+mod uf2;
 
 use std::process::ExitCode;
 
@@ -12,17 +14,32 @@ use crate::command::Run;
 use crate::groups::Outcome;
 use crate::install;
 use boards::{BOARDS, Board};
+pub(crate) use flash::flash;
 pub(crate) use sizes::sizes;
 
-/// Builds the images of one board, or of all of them.
+/// Builds the images of one board, or of all of them, with the files that are flashed beside them.
 pub(crate) fn build(name: Option<&str>) -> Result<ExitCode> {
     for board in chosen(name)? {
         install::rust_target(board.target).map_err(anyhow::Error::msg)?;
         for image in board.images {
-            println!("{}", board.build(image)?.display());
+            let elf = board.build(image)?;
+            println!("{}", elf.display());
+            if let Some(place) = cara_settings::board::find(board.name) {
+                println!("{}", uf2::write_beside(&elf, place)?.display());
+            }
         }
     }
     Ok(ExitCode::SUCCESS)
+}
+
+/// Builds and links the images of all boards.
+pub(crate) fn link() -> Outcome {
+    for board in &BOARDS {
+        if let Err(reason) = install::rust_target(board.target) {
+            return Outcome::Skipped(reason);
+        }
+    }
+    build(None).map(drop).into()
 }
 
 /// The emulated board, whose firmware is tested.

@@ -42,7 +42,7 @@ pub(crate) enum Outcome {
 }
 
 /// All groups, in the order in which they run: cheap ones first.
-pub(crate) const GROUPS: [Group; 18] = [
+pub(crate) const GROUPS: [Group; 19] = [
     Group {
         name: "format",
         what: "every crate is formatted",
@@ -180,6 +180,14 @@ pub(crate) const GROUPS: [Group; 18] = [
         quick: None,
         by_default: true,
         run: |_| guide().into(),
+    },
+    Group {
+        name: "boards",
+        what: "firmware of every board links, and leaves the pages of its settings free",
+        budget: 420,
+        quick: None,
+        by_default: true,
+        run: |_| firmware::link(),
     },
     Group {
         name: "firmware",

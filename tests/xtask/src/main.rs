@@ -78,6 +78,9 @@ enum Task {
         /// Which board.
         #[arg(value_name = "BOARD")]
         board: Option<String>,
+        /// Also puts the vehicle's image on the board, through a debug probe.
+        #[arg(long, requires = "board")]
+        flash: bool,
     },
 }
 
@@ -89,7 +92,8 @@ fn main() -> ExitCode {
         Task::Sizes { json } => firmware::sizes(json.as_deref()),
         Task::Fleet { nodes, json } => fleet::run(nodes, json.as_deref()),
         Task::Bench { quick, json } => bench::run(quick, json.as_deref()),
-        Task::Firmware { board } => firmware::build(board.as_deref()),
+        Task::Firmware { board: Some(board), flash: true } => firmware::flash(&board),
+        Task::Firmware { board, .. } => firmware::build(board.as_deref()),
     };
     finished.unwrap_or_else(|error| {
         eprintln!("xtask: {error:#}");

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use anyhow::{Result, bail};
+use anyhow::{Context, Result, bail};
 
 use crate::command::Run;
 use crate::workspace;
@@ -17,16 +17,68 @@ pub(crate) struct Board {
     pub(crate) target: &'static str,
     /// The last one is the bare echo, with which the others are compared.
     pub(crate) images: &'static [&'static str],
+    /// Whether it has a radio that is loaded with files which are no part of the project.
+    pub(crate) has_radio: bool,
 }
 
+/// The environment variable with the folder of the radio's files, or with [`NO_RADIO`].
+pub(crate) const RADIO: &str = "CARA_CYW43_FIRMWARE";
+/// The image is linked without them: it only tells that it has none.
+const NO_RADIO: &str = "none";
+
+const IMAGES: &[&str] = &["agv", "echo"];
+
 /// All of them.
-pub(crate) const BOARDS: [Board; 1] = [Board {
-    name: "lm3s6965evb",
-    folder: "lm3s6965evb",
-    feature: None,
-    target: "thumbv7m-none-eabi",
-    images: &["agv", "echo"],
-}];
+pub(crate) const BOARDS: [Board; 6] = [
+    Board {
+        name: "lm3s6965evb",
+        folder: "lm3s6965evb",
+        feature: None,
+        target: "thumbv7m-none-eabi",
+        images: IMAGES,
+        has_radio: false,
+    },
+    Board {
+        name: "nucleo-f767zi",
+        folder: "nucleo",
+        feature: Some("f767zi"),
+        target: "thumbv7em-none-eabihf",
+        images: IMAGES,
+        has_radio: false,
+    },
+    Board {
+        name: "nucleo-h743zi",
+        folder: "nucleo",
+        feature: Some("h743zi"),
+        target: "thumbv7em-none-eabihf",
+        images: IMAGES,
+        has_radio: false,
+    },
+    Board {
+        name: "rp2040",
+        folder: "rp",
+        feature: Some("rp2040"),
+        target: "thumbv6m-none-eabi",
+        images: IMAGES,
+        has_radio: false,
+    },
+    Board {
+        name: "rp2350",
+        folder: "rp",
+        feature: Some("rp2350"),
+        target: "thumbv8m.main-none-eabihf",
+        images: IMAGES,
+        has_radio: false,
+    },
+    Board {
+        name: "pico2w",
+        folder: "rp",
+        feature: Some("pico2w"),
+        target: "thumbv8m.main-none-eabihf",
+        images: IMAGES,
+        has_radio: true,
+    },
+];
 
 /// The board of a name; the error lists all.
 pub(crate) fn find(name: &str) -> Result<&'static Board> {
@@ -52,10 +104,35 @@ impl Board {
             .args(["--manifest-path".as_ref(), manifest.as_os_str(), "--target-dir".as_ref(), place.as_os_str()])
             .env("RUSTFLAGS", &remap)
             .env("DEFMT_LOG", "info");
+        let build = match (self.has_radio, std::env::var(RADIO)) {
+            (true, Err(_)) => build.env(RADIO, NO_RADIO),
+            _ => build,
+        };
         match self.feature {
             Some(feature) => build.args(["--no-default-features", "--features", feature]).stream()?,
             None => build.stream()?,
         }
-        Ok(place.join(self.target).join("release").join(image))
+        self.kept(image, &place)
+    }
+
+    /// Copies an image to the board's own folder: boards with one processor build into the same file.
+    fn kept(&self, image: &str, place: &std::path::Path) -> Result<PathBuf> {
+        let folder = place.join("images").join(self.name);
+        std::fs::create_dir_all(&folder).with_context(|| format!("cannot make {}", folder.display()))?;
+        let (built, kept) = (place.join(self.target).join("release").join(image), folder.join(image));
+        std::fs::copy(&built, &kept).with_context(|| format!("cannot copy {}", built.display()))?;
+        Ok(kept)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::BOARDS;
+
+    /// What is provisioned can be built, and what is built can be provisioned or is emulated.
+    #[test]
+    fn boards_are_those_with_settings() {
+        let built: Vec<&str> = BOARDS.iter().map(|board| board.name).filter(|name| *name != "lm3s6965evb").collect();
+        assert_eq!(built, cara_settings::board::BOARDS.map(|board| board.name));
     }
 }
