@@ -8,7 +8,7 @@ use std::rc::Rc;
 use cara_core::random::Random;
 use cara_core::time::{Duration, Instant};
 use cara_ethernet::{FaultCounts, Faults, Mac, Switch};
-use embassy_net::{Config, ConfigV4, Ipv4Cidr, Stack, StackResources, StaticConfigV4};
+use embassy_net::{Config, Ipv4Cidr, Stack, StackResources, StaticConfigV4};
 
 use crate::clock;
 use crate::driver::{Cable, Plug};
@@ -53,6 +53,7 @@ pub struct Board {
     index: usize,
     plug: Plug,
     address: Ipv4Addr,
+    config: fn(Ipv4Addr) -> Config,
     stack: Stack<'static>,
 }
 
@@ -74,6 +75,15 @@ impl Bench {
 
     /// Another board, with power and an address of its own.
     pub fn board(&self) -> Board {
+        self.plug_in(fixed)
+    }
+
+    /// Another board, which asks for its address; [`Board::address`] tells none of any use.
+    pub fn board_on_dhcp(&self) -> Board {
+        self.plug_in(|_| Config::dhcpv4(Default::default()))
+    }
+
+    fn plug_in(&self, config: fn(Ipv4Addr) -> Config) -> Board {
         let index = self.inner.plugs.borrow().len();
         let [high, low] = (index as u16 + 1).to_be_bytes();
         let mac = Mac([2, 0, 0, 0, high, low]);
@@ -81,7 +91,7 @@ impl Bench {
         let switch = Rc::clone(&self.inner.switch);
         let plug = Plug { switch, port, mac, gate: Rc::default(), listener: Rc::default() };
         self.inner.plugs.borrow_mut().push(plug.clone());
-        Board::boot(&self.inner, index, plug, Ipv4Addr::new(10, 77, high, low))
+        Board::boot(&self.inner, index, plug, Ipv4Addr::new(10, 77, high, low), config)
     }
 
     /// A random number below `bound`, from the seed.
@@ -188,11 +198,11 @@ impl Inner {
 }
 
 impl Board {
-    fn boot(inner: &Rc<Inner>, index: usize, plug: Plug, address: Ipv4Addr) -> Self {
-        let config = Config::ipv4_static(fixed(address));
+    fn boot(inner: &Rc<Inner>, index: usize, plug: Plug, address: Ipv4Addr, config: fn(Ipv4Addr) -> Config) -> Self {
         let resources = Box::leak(Box::new(StackResources::<SOCKETS>::new()));
-        let (stack, mut runner) = embassy_net::new(Cable(plug.clone()), config, resources, inner.random(u64::MAX));
-        let board = Self { inner: Rc::clone(inner), index, plug, address, stack };
+        let (stack, mut runner) =
+            embassy_net::new(Cable(plug.clone()), config(address), resources, inner.random(u64::MAX));
+        let board = Self { inner: Rc::clone(inner), index, plug, address, config, stack };
         board.spawn(async move { runner.run().await });
         board
     }
@@ -201,7 +211,7 @@ impl Board {
     pub fn reboot(&self) -> Self {
         self.cut_power();
         self.set_cable(true);
-        Self::boot(&self.inner, self.index, self.plug.clone(), self.address)
+        Self::boot(&self.inner, self.index, self.plug.clone(), self.address, self.config)
     }
 
     /// Its network stack.
@@ -227,7 +237,7 @@ impl Board {
 
     /// Gives it another address while it runs.
     pub fn move_to(&self, address: Ipv4Addr) {
-        self.stack.set_config_v4(ConfigV4::Static(fixed(address)));
+        self.stack.set_config_v4(fixed(address).ipv4);
     }
 
     /// What happens from now on to the frames that it sends.
@@ -273,6 +283,7 @@ impl Board {
     }
 }
 
-fn fixed(address: Ipv4Addr) -> StaticConfigV4 {
-    StaticConfigV4 { address: Ipv4Cidr::new(address, PREFIX), gateway: None, dns_servers: Default::default() }
+fn fixed(address: Ipv4Addr) -> Config {
+    let address = Ipv4Cidr::new(address, PREFIX);
+    Config::ipv4_static(StaticConfigV4 { address, gateway: None, dns_servers: Default::default() })
 }
