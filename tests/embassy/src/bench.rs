@@ -8,11 +8,12 @@ use std::rc::Rc;
 use cara_core::random::Random;
 use cara_core::time::{Duration, Instant};
 use cara_ethernet::{FaultCounts, Faults, Mac, Switch};
+use cara_sim::Path;
 use embassy_net::{Config, Ipv4Cidr, Stack, StackResources, StaticConfigV4};
 
 use crate::clock;
 use crate::driver::{Cable, Plug};
-use crate::gate::Rule;
+use crate::gate::{Gate, Rule};
 use crate::tasks::{Job, Task, Tasks};
 
 /// What a poll costs: without it, a task that wakes itself would hold the clock.
@@ -89,7 +90,8 @@ impl Bench {
         let mac = Mac([2, 0, 0, 0, high, low]);
         let port = self.inner.switch.borrow_mut().add_port(mac);
         let switch = Rc::clone(&self.inner.switch);
-        let plug = Plug { switch, port, mac, gate: Rc::default(), listener: Rc::default() };
+        let gate = Rc::new(RefCell::new(Gate::new(self.random(u64::MAX))));
+        let plug = Plug { switch, port, mac, gate, listener: Rc::default() };
         self.inner.plugs.borrow_mut().push(plug.clone());
         Board::boot(&self.inner, index, plug, Ipv4Addr::new(10, 77, high, low), config)
     }
@@ -254,6 +256,11 @@ impl Board {
     pub fn hold_frames_of(&self, other: &Self, span: Duration, tcp_only: bool) {
         let until = Some(clock::now() + span);
         self.plug.gate.borrow_mut().add(Rule { from: other.plug.mac, until, tcp_only });
+    }
+
+    /// What `other` sends to it comes over this path from now on.
+    pub fn set_path_from(&self, other: &Self, path: Path) {
+        self.plug.gate.borrow_mut().set_path(other.plug.mac, path);
     }
 
     /// It hears everybody again.

@@ -1,9 +1,11 @@
-//! What a board is kept from hearing of single other boards; the faults of the switch are those of a whole port.
+//! What a board does not hear, or hears late, of single other boards; the faults of the switch are those of a whole port.
 
 use std::collections::BTreeMap;
 
-use cara_core::time::Instant;
+use cara_core::random::Random;
+use cara_core::time::{Duration, Instant};
 use cara_ethernet::Mac;
+use cara_sim::Path;
 
 /// Where a frame says who sent it.
 const SOURCE: std::ops::Range<usize> = 6..12;
@@ -27,15 +29,36 @@ impl Rule {
     }
 }
 
+/// The way from one sender, on top of that through the switch.
+struct Way {
+    from: Mac,
+    path: Path,
+    /// What was sent before is on the wire by then.
+    sent_at: Instant,
+    /// What keeps the order arrives no earlier.
+    in_order: Instant,
+}
+
 /// The rules of one board, and the frames that are held.
-#[derive(Default)]
 pub(crate) struct Gate {
+    random: Random,
     rules: Vec<Rule>,
+    ways: Vec<Way>,
     held: BTreeMap<(Instant, u64), Vec<u8>>,
     sequence: u64,
 }
 
 impl Gate {
+    pub(crate) fn new(seed: u64) -> Self {
+        Self { random: Random::new(seed), rules: Vec::new(), ways: Vec::new(), held: BTreeMap::new(), sequence: 0 }
+    }
+
+    /// Frames of a sender come over this path from now on.
+    pub(crate) fn set_path(&mut self, from: Mac, path: Path) {
+        self.ways.retain(|way| way.from != from);
+        self.ways.push(Way { from, path, sent_at: Instant::START, in_order: Instant::START });
+    }
+
     pub(crate) fn add(&mut self, rule: Rule) {
         self.rules.push(rule);
     }
@@ -48,6 +71,7 @@ impl Gate {
     /// Forgets everything.
     pub(crate) fn clear(&mut self) {
         self.rules.clear();
+        self.ways.clear();
         self.held.clear();
     }
 
@@ -55,14 +79,42 @@ impl Gate {
     pub(crate) fn pass(&mut self, now: Instant, frame: Vec<u8>) -> Option<Vec<u8>> {
         self.rules.retain(|rule| rule.until.is_none_or(|until| until > now));
         match self.rules.iter().find(|rule| rule.concerns(&frame)).map(|rule| rule.until) {
-            None => Some(frame),
+            None => self.travel(now, frame),
             Some(None) => None,
             Some(Some(until)) => {
-                self.sequence += 1;
-                self.held.insert((until, self.sequence), frame);
+                self.hold(until, frame);
                 None
             }
         }
+    }
+
+    fn hold(&mut self, until: Instant, frame: Vec<u8>) {
+        self.sequence += 1;
+        self.held.insert((until, self.sequence), frame);
+    }
+
+    /// The frame at once where its sender has no path of its own.
+    fn travel(&mut self, now: Instant, frame: Vec<u8>) -> Option<Vec<u8>> {
+        let random = &mut self.random;
+        let Some(way) = self.ways.iter_mut().find(|way| frame.get(SOURCE) == Some(&way.from.0[..])) else {
+            return Some(frame);
+        };
+        let path = way.path;
+        let micros = (frame.len() as u64 * 1_000_000).checked_div(path.bytes_per_second).unwrap_or(0);
+        way.sent_at = way.sent_at.max(now) + Duration::from_micros(micros);
+        if path.loss.hits(random) {
+            return None;
+        }
+        let mut at = way.sent_at + path.delay + random.jitter(path.jitter);
+        if !path.reorder.hits(random) {
+            at = at.max(way.in_order);
+            way.in_order = at;
+        }
+        if path.duplicate.hits(random) {
+            self.hold(at, frame.clone());
+        }
+        self.hold(at, frame);
+        None
     }
 
     /// A frame that has been held long enough.
@@ -92,7 +144,7 @@ mod tests {
 
     #[test]
     fn streams_are_held_in_order_while_datagrams_pass() {
-        let mut gate = Gate::default();
+        let mut gate = Gate::new(1);
         let until = Instant::from_micros(10);
         gate.add(Rule { from: SENDER, until: Some(until), tcp_only: true });
         assert_eq!(gate.pass(Instant::START, frame(17)), Some(frame(17)));
@@ -106,8 +158,23 @@ mod tests {
     }
 
     #[test]
+    fn a_path_has_its_own_delay_and_pace() {
+        let mut gate = Gate::new(1);
+        let path = Path { bytes_per_second: 1_000, ..Path::LAN.delay(Duration::from_millis(5)).jitter(Duration::ZERO) };
+        gate.set_path(SENDER, path);
+        for _ in 0..2 {
+            assert_eq!(gate.pass(Instant::START, frame(17)), None);
+        }
+        let at = |millis: u64| Instant::from_micros(millis * 1_000);
+        assert_eq!((gate.take(at(64)), gate.take(at(65))), (None, Some(frame(17))));
+        assert_eq!((gate.take(at(124)), gate.take(at(125))), (None, Some(frame(17))));
+        gate.set_path(SENDER, path.loss_percent(100.0));
+        assert_eq!((gate.pass(at(200), frame(17)), gate.next()), (None, None));
+    }
+
+    #[test]
     fn a_cut_loses_one_sender_until_it_heals() {
-        let mut gate = Gate::default();
+        let mut gate = Gate::new(1);
         gate.add(Rule { from: SENDER, until: None, tcp_only: false });
         let mut other = frame(17);
         other[SOURCE.start] ^= 1;

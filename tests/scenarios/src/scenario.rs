@@ -105,7 +105,6 @@ impl Need {
     const fn missing_on_embassy(self) -> Option<&'static str> {
         Some(match self {
             Self::Reset => "nobody on the switch forges a reset",
-            Self::Path => "the switch's faults are those of a board, not of a pair",
             Self::SlowReader => "the switch carries frames, and a board's stack reads what it can",
             Self::Backlog => "a board refuses connections while its few sockets are busy",
             Self::ManyUnits => "more nodes than a board has links for",

@@ -19,7 +19,7 @@ const SMALL: usize = message_buffer(SHORT);
 const HUGE: usize = message_buffer(128 * 1024);
 const LARGE: usize = message_buffer(32 * 1024);
 
-type Agv = Resources<(), 2, SMALL, FEW, 2048, 16, 48, 10, 4, 8_192>;
+type Agv = Resources<(), 2, SMALL, FEW, 4096, 16, 48, 10, 4, 8_192>;
 type Manager = Resources<(), LINKS, LARGE, 12, 8192, 32, 48, 66, 4, 90_000>;
 type Forgetful = Resources<(), LINKS, LARGE, 12, 8192, 32, 4, 66, 4, 90_000>;
 type Tight = Resources<(), LINKS, LARGE, 2, 8192, 32, 48, 66, 4, 90_000>;

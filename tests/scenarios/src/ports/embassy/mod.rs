@@ -43,7 +43,8 @@ fn faults(random: &mut Random, weather: Weather) -> Faults {
         _ => Faults {
             loss: if weather == Weather::Rough { percent(2) } else { 0.0 },
             duplication: percent(5),
-            reordering: percent(5),
+            // A segment that overtakes another costs smoltcp a retransmission, thus a second, as a lost one does.
+            reordering: if weather == Weather::Rough { percent(5) } else { 0.0 },
             delay: Duration::from_micros(250) + random.jitter(Duration::from_millis(2)),
             jitter: random.jitter(Duration::from_millis(2)),
             ..Faults::NONE
@@ -107,7 +108,11 @@ impl World for EmbassyWorld {
             Fault::ChangeAddress(unit) => self.node(unit).board().move_to(std::net::Ipv4Addr::new(10, 77, 0, 207)),
             Fault::Suspend(unit, span) => self.node(unit).board().suspend(span),
             Fault::Reset(_) => return Err(Unsupported(Need::Reset)),
-            Fault::Path(..) => return Err(Unsupported(Need::Path)),
+            Fault::Path(one, other, path) => {
+                let (one, other) = (self.node(one).board(), self.node(other).board());
+                one.set_path_from(&other, path);
+                other.set_path_from(&one, path);
+            }
             Fault::SlowReader(..) => return Err(Unsupported(Need::SlowReader)),
             Fault::Stranger(unit, stranger) => self.stranger(unit, stranger),
             Fault::Unplug(unit) => self.node(unit).board().set_cable(false),
