@@ -263,6 +263,15 @@ impl Board {
         self.plug.gate.borrow_mut().set_path(other.plug.mac, path);
     }
 
+    /// Resets all its streams, at both ends.
+    pub fn reset_streams(&self) {
+        let now = clock::now();
+        for plug in self.inner.plugs.borrow().iter() {
+            let from = (plug.port != self.plug.port).then_some(self.plug.mac);
+            plug.gate.borrow_mut().reset(now, from);
+        }
+    }
+
     /// It hears everybody again.
     pub fn heal(&self) {
         self.plug.gate.borrow_mut().heal();

@@ -47,11 +47,15 @@ impl Plug {
     fn receive(&self) -> Option<Vec<u8>> {
         let mut gate = self.gate.borrow_mut();
         loop {
-            if let Some(frame) = gate.take(clock::now()) {
-                return Some(frame);
-            }
-            let frame = self.switch.borrow_mut().receive(clock::now(), self.port)?;
-            if let Some(frame) = gate.pass(clock::now(), frame) {
+            let heard = match gate.take(clock::now()) {
+                Some(frame) => Some(frame),
+                None => {
+                    let frame = self.switch.borrow_mut().receive(clock::now(), self.port)?;
+                    gate.pass(clock::now(), frame)
+                }
+            };
+            if let Some(frame) = heard {
+                gate.hear(&frame);
                 return Some(frame);
             }
         }

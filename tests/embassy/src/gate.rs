@@ -6,9 +6,12 @@ use cara_core::random::Random;
 use cara_core::time::{Duration, Instant};
 use cara_ethernet::Mac;
 use cara_sim::Path;
+use smoltcp::wire::{EthernetFrame, EthernetProtocol, IpAddress, IpProtocol, Ipv4Packet, TcpPacket};
 
 /// Where a frame says who sent it.
 const SOURCE: std::ops::Range<usize> = 6..12;
+/// Both addresses and ports of a TCP segment in a frame.
+const FLOW: std::ops::Range<usize> = 26..38;
 /// Where an IPv4 packet in a frame says what it carries, and what TCP is there.
 const PROTOCOL: usize = 23;
 const TCP: u8 = 6;
@@ -45,12 +48,21 @@ pub(crate) struct Gate {
     rules: Vec<Rule>,
     ways: Vec<Way>,
     held: BTreeMap<(Instant, u64), Vec<u8>>,
+    /// The last segment of each stream that the board has heard.
+    last: BTreeMap<Vec<u8>, Vec<u8>>,
     sequence: u64,
 }
 
 impl Gate {
     pub(crate) fn new(seed: u64) -> Self {
-        Self { random: Random::new(seed), rules: Vec::new(), ways: Vec::new(), held: BTreeMap::new(), sequence: 0 }
+        Self {
+            random: Random::new(seed),
+            rules: Vec::new(),
+            ways: Vec::new(),
+            held: BTreeMap::new(),
+            last: BTreeMap::new(),
+            sequence: 0,
+        }
     }
 
     /// Frames of a sender come over this path from now on.
@@ -73,6 +85,7 @@ impl Gate {
         self.rules.clear();
         self.ways.clear();
         self.held.clear();
+        self.last.clear();
     }
 
     /// The frame, unless it is lost or held.
@@ -117,6 +130,21 @@ impl Gate {
         None
     }
 
+    /// The board hears a frame.
+    pub(crate) fn hear(&mut self, frame: &[u8]) {
+        if let Some(flow) = frame.get(FLOW).filter(|_| frame.get(PROTOCOL) == Some(&TCP)) {
+            self.last.insert(flow.to_vec(), frame.to_vec());
+        }
+    }
+
+    /// The board hears resets of its streams: of all, or of those from one sender.
+    pub(crate) fn reset(&mut self, now: Instant, from: Option<Mac>) {
+        let of_sender = |frame: &&Vec<u8>| from.is_none_or(|from| frame.get(SOURCE) == Some(&from.0[..]));
+        let resets: Vec<Vec<u8>> = self.last.values().filter(of_sender).filter_map(|frame| reset_of(frame)).collect();
+        self.last.clear();
+        resets.into_iter().for_each(|frame| self.hold(now, frame));
+    }
+
     /// A frame that has been held long enough.
     pub(crate) fn take(&mut self, now: Instant) -> Option<Vec<u8>> {
         let first = self.held.first_entry()?;
@@ -127,6 +155,27 @@ impl Gate {
     pub(crate) fn next(&self) -> Option<Instant> {
         self.held.keys().next().map(|(until, _)| *until)
     }
+}
+
+/// A reset by the sender of a segment, right behind it.
+fn reset_of(frame: &[u8]) -> Option<Vec<u8>> {
+    let mut reset = frame.to_vec();
+    let mut ethernet = EthernetFrame::new_checked(&mut reset[..]).ok()?;
+    if ethernet.ethertype() != EthernetProtocol::Ipv4 {
+        return None;
+    }
+    let mut packet = Ipv4Packet::new_checked(ethernet.payload_mut()).ok()?;
+    if packet.next_header() != IpProtocol::Tcp {
+        return None;
+    }
+    let (from, to) = (IpAddress::from(packet.src_addr()), IpAddress::from(packet.dst_addr()));
+    let mut segment = TcpPacket::new_checked(packet.payload_mut()).ok()?;
+    let next = segment.seq_number() + segment.segment_len();
+    segment.set_seq_number(next);
+    segment.clear_flags();
+    segment.set_rst(true);
+    segment.fill_checksum(&from, &to);
+    Some(reset)
 }
 
 #[cfg(test)]

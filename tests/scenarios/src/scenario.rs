@@ -104,7 +104,6 @@ impl Need {
     /// Of boards on a switch in memory.
     const fn missing_on_embassy(self) -> Option<&'static str> {
         Some(match self {
-            Self::Reset => "nobody on the switch forges a reset",
             Self::SlowReader => "the switch carries frames, and a board's stack reads what it can",
             Self::Backlog => "a board refuses connections while its few sockets are busy",
             Self::ManyUnits => "more nodes than a board has links for",

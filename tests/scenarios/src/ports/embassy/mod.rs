@@ -107,7 +107,7 @@ impl World for EmbassyWorld {
             }
             Fault::ChangeAddress(unit) => self.node(unit).board().move_to(std::net::Ipv4Addr::new(10, 77, 0, 207)),
             Fault::Suspend(unit, span) => self.node(unit).board().suspend(span),
-            Fault::Reset(_) => return Err(Unsupported(Need::Reset)),
+            Fault::Reset(unit) => self.node(unit).board().reset_streams(),
             Fault::Path(one, other, path) => {
                 let (one, other) = (self.node(one).board(), self.node(other).board());
                 one.set_path_from(&other, path);
