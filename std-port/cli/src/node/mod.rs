@@ -38,7 +38,7 @@ const LONGEST_FILE: u64 = 1024 * 1024;
 /// Stays up as an m_unit, or as an s_unit, until SIGINT or SIGTERM.
 ///
 /// FILE says who it is, which limits it has and which functions it offers; options stand above the file. SIGHUP takes over
-/// [constraints] and [log] of a file that has changed.
+/// the tables `constraints` and `log` of a file that has changed.
 #[derive(clap::Args)]
 pub(crate) struct Arguments {
     /// The configuration, in TOML; without one, --name and --id suffice.
