@@ -21,8 +21,8 @@ impl<T> Peer<T> {
     /// Calls a function and waits for its results, which update `parameters` (paper, listing line 13). On an error they
     /// are unchanged.
     ///
-    /// Cancelled before the request was sent, nothing has happened. Cancelled later, the reply is lost, and the service may
-    /// still run, once; a lease that the request began is renewed until [`release`](Self::release).
+    /// Cancelled before the request was sent, nothing has happened. Cancelled later, the reply is lost, and the service
+    /// may still run, once; a lease that the request began is renewed until [`release`](Self::release).
     #[doc(alias = "block_request_their_function")]
     pub async fn block_request(&self, function: &str, parameters: &mut ParametersView) -> Result<(), Error> {
         self.block_request_with(function, parameters, &RequestOptions::default()).await

@@ -29,8 +29,8 @@ pub struct Config {
 }
 
 impl Config {
-    /// An s_unit, which joins the manager of the given name and id and no other. `seed` should differ from boot to boot:
-    /// the controller's source of noise, or a count of its starts.
+    /// An s_unit, which joins the manager of the given name and id and no other. `seed` should differ from boot to
+    /// boot: the controller's source of noise, or a count of its starts.
     pub fn s_unit(name: &str, id: u32, manager_name: &str, manager_id: u32, seed: u64) -> Result<Self, Error> {
         let manager = Manager::new(manager_name, manager_id)?;
         Ok(Self::new(Identity::s_unit(name, id)?, Target::Manager(manager), Constraints::S_UNIT, seed))

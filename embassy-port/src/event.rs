@@ -24,8 +24,8 @@ pub enum UnitEvent {
         /// Why.
         reason: CloseReason,
     },
-    /// A link ended before it joined: refused here or there, silent, or it could not be opened. `DuplicateIdentity` with
-    /// this unit's own identity in `peer`: another live unit has it, and one of the two waits for the other's end.
+    /// A link ended before it joined: refused here or there, silent, or it could not be opened. `DuplicateIdentity`
+    /// with this unit's own identity in `peer`: another live unit has it, and one of the two waits for the other's end.
     NotJoined {
         /// The other end.
         address: SocketAddr,
@@ -61,7 +61,8 @@ pub enum UnitEvent {
         /// Why.
         error: Error,
     },
-    /// A service of this unit stopped because its caller no longer wanted it. Its lease is dead, and its safe hook has run.
+    /// A service of this unit stopped because its caller no longer wanted it. Its lease is dead, and its safe hook has
+    /// run.
     LeaseExpired {
         /// Whose call it was.
         peer: Identity,

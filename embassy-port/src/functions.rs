@@ -24,8 +24,8 @@ impl<T> Handle<T> {
     /// Adds a service, which nobody sees before it is published. The signature is in the text form, as in
     /// `go_to(position: int[2])`.
     ///
-    /// [`Error::BadName`] for a signature that cannot be read, [`Error::TooLarge`] when arguments and results are declared
-    /// larger than what services have room for, [`Error::Full`] when the list is full.
+    /// [`Error::BadName`] for a signature that cannot be read, [`Error::TooLarge`] when arguments and results are
+    /// declared larger than what services have room for, [`Error::Full`] when the list is full.
     #[doc(alias = "add_function")]
     pub fn add_service(&self, signature: &str, options: ServiceOptions<T>, handler: Handler<T>) -> Result<(), Error> {
         self.put(signature, options, handler, FunctionList::add_function)

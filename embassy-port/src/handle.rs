@@ -60,7 +60,8 @@ impl<T> Handle<T> {
         self.act(|machine| machine.node.broadcast(crate::now()));
     }
 
-    /// Ends every link in an orderly way, and looks for nobody any more. Another life begins with a restart of the board.
+    /// Ends every link in an orderly way, and looks for nobody any more. Another life begins with a restart of the
+    /// board.
     pub fn stop(&self) {
         self.act(|machine| {
             machine.stopped = true;
@@ -157,7 +158,8 @@ impl<T> Handle<T> {
 
     // --- requests to the manager
 
-    /// Calls a function of the manager and waits for its results; see [`Peer::block_request`] for what cancelling loses.
+    /// Calls a function of the manager and waits for its results; see [`Peer::block_request`] for what cancelling
+    /// loses.
     #[doc(alias = "block_request_their_function")]
     pub async fn block_request(&self, function: &str, parameters: &mut ParametersView) -> Result<(), Error> {
         self.manager().ok_or(Error::NotConnected)?.block_request(function, parameters).await
@@ -177,8 +179,8 @@ impl<T> Handle<T> {
         Ok(act(&mut state))
     }
 
-    /// Runs `hook` each time a peer, such as the manager, is lost, once, before anything else is done about it. It must be
-    /// short.
+    /// Runs `hook` each time a peer, such as the manager, is lost, once, before anything else is done about it. It must
+    /// be short.
     pub fn on_manager_lost(&self, hook: &'static Hook<T>) {
         self.act(|machine| machine.lost_hook = Some(hook));
     }

@@ -1,8 +1,8 @@
 //! CARA on microcontrollers: s_units and m_units over embassy-net.
 //!
-//! [`new`] makes a unit from a network stack and static memory ([`Resources`]): a [`Handle`], which every task may copy,
-//! and a [`Runner`], which wants a task of its own and drives everything. Nothing allocates, and nothing is sized at run
-//! time.
+//! [`new`] makes a unit from a network stack and static memory ([`Resources`]): a [`Handle`], which every task may
+//! copy, and a [`Runner`], which wants a task of its own and drives everything. Nothing allocates, and nothing is sized
+//! at run time.
 //!
 //! ```no_run
 //! use cara_core::services::lease::Lease;
@@ -23,9 +23,10 @@
 //! ) -> Result<(Handle<Agv>, Runner<Agv>), cara_core::error::Error> {
 //!     let config = Config::s_unit("agv-07", 7, "manager", 1, seed)?;
 //!     let (unit, runner) = cara_embassy::new(stack, resources, config, Agv::default())?;
-//!     unit.add_service("pos_info() -> (position: int[2])", ServiceOptions::new(), Handler::method(&|agv: &mut Agv, _, p| {
+//!     let pos_info = Handler::method(&|agv: &mut Agv, _, p| {
 //!         p.set_value("position", agv.position).map_err(|_| cara_core::error::ServiceError::BadResults)
-//!     }))?;
+//!     });
+//!     unit.add_service("pos_info() -> (position: int[2])", ServiceOptions::new(), pos_info)?;
 //!     let stop: &'static cara_embassy::Hook<Agv> = &|agv| agv.target = None;
 //!     let leased = ServiceOptions::new().lease(Duration::from_millis(400), &GO_TO, stop);
 //!     unit.add_service("go_to(position: int[2])", leased, Handler::task())?;

@@ -259,12 +259,12 @@ impl<const MESSAGE: usize> UdpMemory<MESSAGE> {
 
 /// Makes a unit on a network stack, with the application's state. It does nothing until the runner runs.
 ///
-/// The stack is the application's: it brings the driver, and an address, fixed or by DHCP. The unit notices when the cable
-/// is pulled or the address changes: its connections end, the hook for the lost manager runs once, and it searches again
-/// when there is an address again. One unit fits on one stack.
+/// The stack is the application's: it brings the driver, and an address, fixed or by DHCP. The unit notices when the
+/// cable is pulled or the address changes: its connections end, the hook for the lost manager runs once, and it
+/// searches again when there is an address again. One unit fits on one stack.
 ///
-/// [`Error::BadConstraint`] when the memory cannot hold the constraints, [`Error::PortInUse`] when the discovery port is
-/// bound already.
+/// [`Error::BadConstraint`] when the memory cannot hold the constraints, [`Error::PortInUse`] when the discovery port
+/// is bound already.
 ///
 /// # Panics
 /// In embassy-net, when the stack was made with fewer sockets than [`Resources::SOCKETS`] asks for.

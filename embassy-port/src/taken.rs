@@ -217,8 +217,8 @@ impl<T> Handle<T> {
     ///
     /// Cancelling loses nothing: the call waits for the next one who takes it, until its deadline or its lease ends.
     ///
-    /// [`Error::UnknownFunction`] when there is no such service; an error of `parameters` when the arguments do not fit,
-    /// in which case the caller gets [`ServiceError::NotReady`].
+    /// [`Error::UnknownFunction`] when there is no such service; an error of `parameters` when the arguments do not
+    /// fit, in which case the caller gets [`ServiceError::NotReady`].
     pub async fn next_call(&self, function: &str, parameters: &mut ParametersView) -> Result<TakenCall<T>, Error> {
         let (running, call, caller) = core::future::poll_fn(|cx| {
             let mut machine = self.shared.machine.borrow_mut();

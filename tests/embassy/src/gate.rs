@@ -1,4 +1,5 @@
-//! What a board does not hear, or hears late, of single other boards; the faults of the switch are those of a whole port.
+//! What a board does not hear, or hears late, of single other boards; the faults of the switch are those of a whole
+//! port.
 
 use std::collections::BTreeMap;
 

@@ -1,4 +1,5 @@
-//! What the port does beside the rules that scenarios show: memory, tasks that take calls, cable and address, cancelling.
+//! What the port does beside the rules that scenarios show: memory, tasks that take calls, cable and address,
+//! cancelling.
 
 use std::cell::{Cell, RefCell};
 use std::net::Ipv4Addr;
@@ -342,8 +343,8 @@ fn an_idle_unit_lets_its_controller_sleep() {
     assert!(polls.get() <= 300, "{} times in 10 s", polls.get());
 }
 
-/// No task of the vehicle runs any more, as when a handler hangs: its motor sees the lease end in time all the same, and
-/// what is to be made safe is made so before anything else that waits.
+/// No task of the vehicle runs any more, as when a handler hangs: its motor sees the lease end in time all the same,
+/// and what is to be made safe is made so before anything else that waits.
 #[test]
 fn a_starved_vehicle_stops_by_its_lease_and_is_made_safe_first() {
     let bench = Bench::new(11);
