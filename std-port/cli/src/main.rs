@@ -12,6 +12,7 @@ mod node;
 mod nodes;
 mod operator;
 mod output;
+mod provision;
 mod statistics;
 mod text;
 mod units;
@@ -43,6 +44,7 @@ fn run(verb: Verb, global: &Global) -> anyhow::Result<ExitCode> {
         Verb::Bench(arguments) => commands::bench::run(arguments, global),
         Verb::Node(arguments) => node::run(arguments, global),
         Verb::Doctor(arguments) => doctor::run(arguments, global),
+        Verb::Provision(arguments) => provision::run(arguments, global),
         Verb::Completions(arguments) => commands::completions::run(arguments, global),
         Verb::Man(arguments) => commands::man::run(arguments, global),
     }

@@ -1,0 +1,196 @@
+//! `cara provision` as a process: what it writes, what it refuses, and what it asks of `probe-rs`, which a script plays.
+
+use std::fs;
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+use std::process::{Command, Output};
+
+use cara_core::distribution::identity::Fleet;
+use cara_settings::page::{BYTES, decode};
+use cara_settings::{Settings, board};
+use tempfile::TempDir;
+
+/// What every board is told here.
+const WHO: [&str; 6] = ["--name", "agv-17", "--id", "17", "--manager", "depot/1"];
+
+/// A `probe-rs` that notes what it is asked, reads pages from the folder and writes them there.
+const PROBE: &str = r#"#!/bin/sh
+echo "$@" >> asked
+case "$1" in
+read) for last; do address=$before; before=$last; done
+      test -f "page-$address" && cp "page-$address" "$5" ;;
+download) test ! -f broken && cp "$8" "page-$7" ;;
+esac
+"#;
+
+fn cara(folder: &Path, arguments: &[&str]) -> Output {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_cara"));
+    command.arg("provision").args(arguments).current_dir(folder);
+    // Only what a test puts there can be started, and what scripts need.
+    command.env("PATH", format!("{}:/usr/bin:/bin", folder.join("programs").display()));
+    command.output().unwrap()
+}
+
+/// The standard output of what must succeed.
+fn done(folder: &Path, arguments: &[&str]) -> String {
+    let ran = cara(folder, arguments);
+    assert!(ran.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&ran.stderr));
+    String::from_utf8(ran.stdout).unwrap()
+}
+
+/// Must end with `code` and say `text`.
+fn refused(folder: &Path, arguments: &[&str], code: i32, text: &str) {
+    let ran = cara(folder, arguments);
+    let said = String::from_utf8_lossy(&ran.stderr).into_owned();
+    assert_eq!(ran.status.code(), Some(code), "{arguments:?}: {said}");
+    assert!(said.contains(text), "{arguments:?}: {said}");
+}
+
+fn told<'a>(board: &'a str, more: &[&'a str]) -> Vec<&'a str> {
+    [&[board], &WHO[..], more].concat()
+}
+
+fn folder() -> TempDir {
+    TempDir::new().unwrap()
+}
+
+/// A folder with a `probe-rs`.
+fn with_probe() -> TempDir {
+    let folder = folder();
+    let programs = folder.path().join("programs");
+    fs::create_dir(&programs).unwrap();
+    fs::write(programs.join("probe-rs"), PROBE).unwrap();
+    fs::set_permissions(programs.join("probe-rs"), fs::Permissions::from_mode(0o755)).unwrap();
+    folder
+}
+
+#[test]
+fn a_file_has_what_the_command_line_says() {
+    let folder = folder();
+    let more = ["--fleet", "7", "--address", "10.0.0.17/24", "--gateway", "10.0.0.1", "--output", "page.bin"];
+    let said = done(folder.path(), &told("nucleo-f767zi", &more));
+    assert!(said.contains("0x8180000, generation 1") && said.contains("0x81c0000 would count as newer"), "{said}");
+    let page = fs::read(folder.path().join("page.bin")).unwrap();
+    let expected: Settings =
+        "name=agv-17 id=17 manager=depot/1 fleet=7 address=10.0.0.17/24 gateway=10.0.0.1".parse().unwrap();
+    assert_eq!((page.len(), decode(&page)), (BYTES, Ok((expected, 1))));
+    let shown = done(folder.path(), &["--read", "page.bin"]);
+    assert!(shown.starts_with("generation 1: name=agv-17 id=17 manager=depot/1"), "{shown}");
+}
+
+#[test]
+fn the_older_copy_is_replaced() {
+    let folder = folder();
+    done(folder.path(), &told("rp2040", &["--output", "1.bin"]));
+    fs::write(folder.path().join("0.bin"), [0xFF; BYTES]).unwrap();
+    let next = |name: &str, first: &str, second: &str| {
+        done(folder.path(), &told("rp2040", &["--output", name, "--json", "--previous", first, second]))
+    };
+    let second = next("2.bin", "1.bin", "0.bin");
+    assert!(second.contains(r#""address":270528512"#) && second.contains(r#""generation":2"#), "{second}");
+    let third = next("3.bin", "1.bin", "2.bin");
+    assert!(third.contains(r#""address":270524416"#) && third.contains(r#""generation":3"#), "{third}");
+}
+
+#[test]
+fn a_uf2_file_holds_both_copies() {
+    let folder = folder();
+    for (name, family) in [("rp2040", 0xE48B_FF56_u32), ("rp2350", 0xE48B_FF57)] {
+        done(folder.path(), &told(name, &["--uf2", "--output", "settings.uf2"]));
+        let file = fs::read(folder.path().join("settings.uf2")).unwrap();
+        let word = |at: usize| u32::from_le_bytes(file[at..at + 4].try_into().unwrap());
+        let pages = board::find(name).unwrap().pages;
+        assert_eq!((file.len(), [word(12), word(512 + 12)], word(28)), (1024, pages, family));
+        assert_eq!(decode(&file[32..288]).unwrap().1 + 1, decode(&file[544..800]).unwrap().1);
+        assert_eq!(done(folder.path(), &["--read", "settings.uf2"]).lines().count(), 2);
+    }
+    refused(folder.path(), &told("nucleo-h743zi", &["--uf2", "--output", "x"]), 2, "no boot loader that takes UF2");
+}
+
+#[test]
+fn a_board_on_wifi_is_told_its_access_point() {
+    let folder = folder();
+    fs::write(folder.path().join("password"), "open sesame\n").unwrap();
+    let access = ["--wifi", "hall 3", "--wifi-password-file", "password", "--output", "page.bin"];
+    done(folder.path(), &told("pico2w", &access));
+    let page = fs::read(folder.path().join("page.bin")).unwrap();
+    let wifi = decode(&page).unwrap().0.wifi.unwrap();
+    assert_eq!((wifi.name(), wifi.password()), ("hall 3", "open sesame"));
+    let shown = done(folder.path(), &["--read", "page.bin"]);
+    assert!(shown.contains("Wi-Fi hall 3") && !shown.contains("sesame"), "{shown}");
+    refused(folder.path(), &told("pico2w", &[]), 2, "name its access point with --wifi");
+    refused(folder.path(), &told("rp2040", &["--wifi", "hall"]), 2, "has no Wi-Fi");
+    fs::write(folder.path().join("password"), "short").unwrap();
+    refused(folder.path(), &told("pico2w", &access), 2, "8 to 63 bytes");
+}
+
+#[test]
+fn every_mistake_is_told() {
+    let folder = folder();
+    let output = ["--output", "page.bin"];
+    let long = "n".repeat(33);
+    refused(folder.path(), &[], 2, "BOARD");
+    refused(folder.path(), &told("toaster", &output), 2, "there are: nucleo-f767zi, nucleo-h743zi, rp2040");
+    refused(folder.path(), &told("lm3s6965evb", &output), 2, "argument of QEMU");
+    refused(folder.path(), &["rp2040", "--output", "page.bin"], 2, "--name and an --id");
+    refused(folder.path(), &["rp2040", "--name", "a"], 2, "--id");
+    refused(folder.path(), &["rp2040", "--name", &long, "--id", "1", "--output", "x"], 2, "--name");
+    refused(folder.path(), &told("rp2040", &["--address", "10.0.0.1"]), 2, "10.0.0.17/24");
+    refused(folder.path(), &told("rp2040", &["--gateway", "10.0.0.1", "--output", "x"]), 2, "the server tells");
+    refused(folder.path(), &told("rp2040", &["--uf2"]), 2, "--output");
+    refused(folder.path(), &told("rp2040", &["--output", "absent/page.bin"]), 1, "cannot write absent/page.bin");
+    refused(folder.path(), &["--read", "absent.bin"], 1, "cannot read absent.bin");
+    fs::write(folder.path().join("empty.bin"), [0xFF; BYTES]).unwrap();
+    refused(folder.path(), &["--read", "empty.bin"], 1, "holds no settings");
+    assert!(!folder.path().join("page.bin").exists());
+}
+
+#[test]
+fn boards_are_listed() {
+    let folder = folder();
+    let shown = done(folder.path(), &["--list"]);
+    for board in board::BOARDS {
+        assert!(shown.contains(board.name) && shown.contains(&format!("{:#x}", board.pages[1])), "{shown}");
+    }
+    assert_eq!(done(folder.path(), &["--list", "--json"]).lines().count(), board::BOARDS.len());
+}
+
+#[test]
+fn without_a_probe_it_says_what_to_do() {
+    refused(folder().path(), &told("nucleo-f767zi", &[]), 1, "cargo install probe-rs-tools");
+}
+
+#[test]
+fn the_board_on_the_probe_is_told_and_started_again() {
+    let folder = with_probe();
+    let path = folder.path();
+    let pages = ["page-0x8180000", "page-0x81c0000"].map(|page| path.join(page));
+    pages.iter().for_each(|page| fs::write(page, [0xFF; BYTES]).unwrap());
+    let fleets = ["1", "2", "3"];
+    for fleet in fleets {
+        done(path, &told("nucleo-f767zi", &["--fleet", fleet]));
+    }
+    let held = pages.map(|page| decode(&fs::read(page).unwrap()).unwrap());
+    assert_eq!(held.each_ref().map(|(settings, _)| settings.fleet), [Fleet(3), Fleet(2)]);
+    assert_eq!(held.map(|(_, generation)| generation), [3, 2]);
+    let asked = fs::read_to_string(path.join("asked")).unwrap();
+    assert!(asked.lines().all(|line| line.contains("--chip STM32F767ZITx")), "{asked}");
+    assert!(asked.contains("download --chip STM32F767ZITx --binary-format bin --base-address 0x8180000"), "{asked}");
+    assert!(asked.ends_with("reset --chip STM32F767ZITx\n"), "{asked}");
+}
+
+/// An STM32H7 cannot read what it was writing when its power was cut.
+#[test]
+fn a_page_that_cannot_be_read_is_written_again_with_the_other_one() {
+    let folder = with_probe();
+    let said = done(folder.path(), &told("nucleo-h743zi", &[]));
+    assert!(said.contains("generation 1") && said.contains("generation 2"), "{said}");
+    assert!(folder.path().join("page-0x81c0000").exists() && folder.path().join("page-0x81e0000").exists());
+}
+
+#[test]
+fn a_probe_that_fails_is_told() {
+    let folder = with_probe();
+    fs::write(folder.path().join("broken"), "").unwrap();
+    refused(folder.path(), &told("nucleo-h743zi", &[]), 1, "Is the board connected");
+}
