@@ -358,8 +358,8 @@ impl<T> Machine<T> {
         let (peer, told, address) = self.end(index)?;
         self.forget_calls_of(index);
         self.hang_up(index);
-        let action = self.node.left(now(), LinkId(index), reason);
-        self.act(action);
+        // Done in the next step, so that the hook for the loss comes first.
+        self.due = self.node.left(now(), LinkId(index), reason);
         match peer {
             Some(peer) => {
                 log!("{} has left", peer.name());

@@ -1,7 +1,7 @@
 //! The core's two machines of one unit, in one cell, with the sockets and tables that they use.
 
 use cara_core::counters::Counters;
-use cara_core::distribution::connection_handler::Node;
+use cara_core::distribution::connection_handler::{Action, Node};
 use cara_core::distribution::function_list::FunctionList;
 use cara_core::distribution::identity::{Identity, Role};
 use cara_core::host::connections::LinkCounter;
@@ -88,6 +88,8 @@ pub(crate) struct Machine<T: 'static> {
     pub(crate) reply: ReplyBox,
     pub(crate) tasks: &'static mut [TaskSlot],
     pub(crate) events: Events,
+    /// What the node wants done next.
+    pub(crate) due: Option<Action>,
     /// The runner is to let other tasks run.
     pub(crate) yields: bool,
     pub(crate) lost_hook: Option<&'static Hook<T>>,
@@ -173,7 +175,7 @@ impl<T> Machine<T> {
 
     /// Lets the node do what is due.
     #[inline(never)]
-    pub(crate) fn poll_node(&mut self) -> Option<cara_core::distribution::connection_handler::Action> {
+    pub(crate) fn poll_node(&mut self) -> Option<Action> {
         let Self { node, lines, udp, stack, .. } = self;
         node.poll(now(), &mut EmbassyMailman { lines, udp, stack: *stack })
     }

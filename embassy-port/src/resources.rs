@@ -317,6 +317,7 @@ pub fn new<
             .tasks
             .write(resources.task_parameters.each_mut().map(|memory| TaskSlot::new(memory.write(Parameters::sized())))),
         events: Events::new(resources.events.write([const { None }; EVENTS])),
+        due: None,
         yields: false,
         lost_hook: None,
         tcp_port,

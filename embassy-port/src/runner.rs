@@ -71,6 +71,8 @@ impl<T> Runner<T> {
     fn step(&mut self, context: &mut Context<'_>) -> Step {
         let shared = self.shared;
         let machine = &mut *shared.machine.borrow_mut();
+        let due = machine.due.take();
+        machine.act(due);
         machine.look_at_network();
         for index in machine.indices() {
             if let Some(news) = machine.poll_link(index) {
