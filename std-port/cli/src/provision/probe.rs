@@ -2,7 +2,7 @@
 
 use std::io::ErrorKind;
 use std::path::Path;
-use std::process::{Command, Output};
+use std::process::{Command, Output, Stdio};
 
 use anyhow::Context;
 use cara_settings::Settings;
@@ -56,7 +56,8 @@ fn succeeded(arguments: &[&str]) -> anyhow::Result<()> {
     }
     let said = String::from_utf8_lossy(&ran.stderr);
     let text = format!(
-        "`{PROGRAM} {}` failed: {}. Is the board connected, and the probe's only one? `{PROGRAM} list` shows probes",
+        "`{PROGRAM} {}` failed: {}. Is the board connected? `{PROGRAM} list` shows probes, and where there are several, \
+         PROBE_RS_PROBE in the environment says which",
         arguments.join(" "),
         said.trim().trim_end_matches('.')
     );
@@ -64,7 +65,10 @@ fn succeeded(arguments: &[&str]) -> anyhow::Result<()> {
 }
 
 fn run(arguments: &[&str]) -> anyhow::Result<Output> {
-    Command::new(PROGRAM).args(arguments).output().map_err(|error| match error.kind() {
+    let mut command = Command::new(PROGRAM);
+    // It would ask which of several probes, where nobody sees the question.
+    command.args(arguments).env("PROBE_RS_NON_INTERACTIVE", "true").stdin(Stdio::null());
+    command.output().map_err(|error| match error.kind() {
         ErrorKind::NotFound => Ended::failed(
             "NoProbe",
             format!(

@@ -26,11 +26,16 @@ pub(crate) fn flash(name: &str) -> Result<ExitCode> {
         bail!("{}", without_probe(&file.display().to_string(), place.uf2.is_some()));
     }
     let path = elf.display().to_string();
-    Run::new("probe-rs").args(["download", "--chip", place.chip, &path]).stream()?;
-    Run::new("probe-rs").args(["reset", "--chip", place.chip]).stream()?;
+    probe().args(["download", "--chip", place.chip, &path]).stream()?;
+    probe().args(["reset", "--chip", place.chip]).stream()?;
     println!("{name} runs; its log: probe-rs attach --chip {} {path}", place.chip);
     println!("it does nothing until it is told who it is: cara provision {name} --help");
     Ok(ExitCode::SUCCESS)
+}
+
+/// It would ask which of several probes, where nobody can answer; `PROBE_RS_PROBE` says which.
+fn probe() -> Run {
+    Run::new("probe-rs").env("PROBE_RS_NON_INTERACTIVE", "true")
 }
 
 /// What to do where `probe-rs` is not installed.
