@@ -2,6 +2,7 @@
 
 use std::cell::Cell;
 use std::io::Read;
+use std::net::Ipv4Addr;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
@@ -52,13 +53,13 @@ impl Bench {
 
     /// Puts power on a board.
     pub(crate) fn board(&self, cable: &Cable, who: &Who) -> Result<Board> {
-        let Who { name, id, seed } = who;
+        let Who { name, id, manager, fleet, seed, more } = who;
         let number = cable.number;
-        let address = format!("10.77.0.{}/24", 100 + u32::from(number));
+        let address = address(cable);
         let seed = seed.map_or_else(String::new, |seed| format!(" seed={seed}"));
-        let told = format!("name={name} id={id} manager=depot/1 fleet={FLEET} address={address}{seed}");
+        let told = format!("name={name} id={id} manager={manager} fleet={fleet} address={address}/24{seed} {more}");
         let mut child = Command::new("qemu-system-arm")
-            .args(["-M", "lm3s6965evb", "-display", "none", "-monitor", "none", "-serial", "none", "-no-reboot"])
+            .args(["-M", "lm3s6965evb", "-display", "none", "-monitor", "none", "-serial", "none"])
             .arg("-semihosting-config")
             .arg(format!("enable=on,target=native,arg=agv,arg={told}"))
             .arg("-kernel")
@@ -83,6 +84,11 @@ impl Bench {
     }
 }
 
+/// The address of the board at the end of a cable.
+pub(crate) fn address(cable: &Cable) -> Ipv4Addr {
+    Ipv4Addr::new(10, 77, 0, 100 + cable.number)
+}
+
 /// A virtual cable between a board and the bridge.
 pub(crate) struct Cable {
     name: String,
@@ -104,13 +110,18 @@ impl Cable {
 pub(crate) struct Who {
     pub(crate) name: String,
     pub(crate) id: u32,
+    /// Its manager, as NAME/ID.
+    pub(crate) manager: String,
+    pub(crate) fleet: u32,
     /// The same numbers in each life.
     pub(crate) seed: Option<u64>,
+    /// Further words that only the emulated board understands.
+    pub(crate) more: &'static str,
 }
 
 impl Who {
     pub(crate) fn agv(id: u32) -> Self {
-        Self { name: format!("agv-{id}"), id, seed: None }
+        Self { name: format!("agv-{id}"), id, manager: "depot/1".into(), fleet: FLEET, seed: None, more: "" }
     }
 }
 
@@ -141,6 +152,11 @@ impl Board {
             }
             lines = self.log.news.wait_timeout(lines, left).unwrap_or_else(PoisonError::into_inner).0;
         }
+    }
+
+    /// The last line so far that contains `text`.
+    pub(crate) fn last_with(&self, text: &str) -> Option<String> {
+        self.log.lock().iter().rev().find(|line| line.contains(text)).cloned()
     }
 
     /// Lines logged so far.

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, bail, ensure};
 use cara_apps::mechanic;
 use cara_std::control::Control;
-use cara_std::{CommunicationSystem, Parameters, Peer, UnitEvent};
+use cara_std::{CloseReason, CommunicationSystem, Parameters, Peer, UnitEvent};
 
 use crate::board::{FLEET, LONG, Who};
 
@@ -66,6 +66,15 @@ impl Manager {
     pub(crate) fn forget_events(&self) {
         let events = self.events.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
         events.try_iter().for_each(drop);
+    }
+
+    /// Waits until a board has been given up because nothing came from it any more.
+    pub(crate) fn missed(&self, who: &Who) -> Result<()> {
+        let is = |event: &UnitEvent| matches!(event, UnitEvent::Left { peer, .. } if peer.name() == who.name);
+        let event = self.event("loss", is)?;
+        let silent = matches!(event, UnitEvent::Left { reason: CloseReason::Silent, .. });
+        ensure!(silent, "it was not missed: {event:?}");
+        Ok(())
     }
 
     /// Waits until a board has left.

@@ -36,6 +36,12 @@ impl Run {
         self
     }
 
+    /// With the standard input of this program.
+    pub(crate) fn interactive(mut self) -> Self {
+        self.command.stdin(Stdio::inherit());
+        self
+    }
+
     /// Streams the output through; an error unless the command succeeds.
     pub(crate) fn stream(mut self) -> Result<()> {
         let shown = self.shown();
@@ -53,6 +59,15 @@ impl Run {
         println!("$ {shown}");
         let status = self.command.status().with_context(|| format!("cannot start `{shown}`"))?;
         Ok(status.code())
+    }
+
+    /// The exit code, and standard output as text; errors stream through.
+    pub(crate) fn output(mut self) -> Result<(Option<i32>, String)> {
+        let shown = self.shown();
+        println!("$ {shown}");
+        self.command.stderr(Stdio::inherit());
+        let output = self.command.output().with_context(|| format!("cannot start `{shown}`"))?;
+        Ok((output.status.code(), String::from_utf8_lossy(&output.stdout).into_owned()))
     }
 
     /// Standard output as text; an error, with the standard error in it, unless the command succeeds.

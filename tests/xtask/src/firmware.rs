@@ -1,11 +1,14 @@
 //! `cargo xtask firmware` and `cargo xtask sizes`: what runs on boards is built, measured and put on a desk.
 
+mod bill;
 mod boards;
+mod desk;
 mod flash;
 mod image;
 mod sizes;
 mod uf2;
 
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use anyhow::{Result, bail};
@@ -14,8 +17,9 @@ use crate::command::Run;
 use crate::groups::Outcome;
 use crate::install;
 use boards::{BOARDS, Board};
+pub(crate) use desk::{Who, desk};
 pub(crate) use flash::flash;
-pub(crate) use sizes::sizes;
+pub(crate) use sizes::{check as check_sizes, sizes};
 
 /// Builds the images of one board, or of all of them, with the files that are flashed beside them.
 pub(crate) fn build(name: Option<&str>) -> Result<ExitCode> {
@@ -61,12 +65,27 @@ pub(crate) fn test() -> Outcome {
 }
 
 fn tested() -> Result<Option<i32>> {
+    let image = tested_image()?;
+    build_command()?;
+    tests(&image).code()
+}
+
+/// The AGV's image of the emulated board.
+fn tested_image() -> Result<PathBuf> {
     let board = boards::find(TESTED)?;
     install::rust_target(board.target).map_err(anyhow::Error::msg)?;
     let Some(image) = board.images.first() else { bail!("{TESTED} has no image") };
-    let image = board.build(image)?;
-    let run = ["run", "--quiet", "--package", "cara-firmware-tests", "--", "--image"];
-    Run::cargo().args(run).args([image]).code()
+    board.build(image)
+}
+
+/// The program that runs images, about to be run with one.
+fn tests(image: &Path) -> Run {
+    Run::cargo().args(["run", "--quiet", "--package", "cara-firmware-tests", "--", "--image"]).args([image])
+}
+
+/// The `cara` command, which is used beside boards.
+fn build_command() -> Result<()> {
+    Run::cargo().args(["build", "--quiet", "--package", "cara-cli"]).stream()
 }
 
 fn chosen(name: Option<&str>) -> Result<Vec<&'static Board>> {

@@ -42,7 +42,7 @@ pub(crate) enum Outcome {
 }
 
 /// All groups, in the order in which they run: cheap ones first.
-pub(crate) const GROUPS: [Group; 19] = [
+pub(crate) const GROUPS: [Group; 20] = [
     Group {
         name: "format",
         what: "every crate is formatted",
@@ -196,6 +196,14 @@ pub(crate) const GROUPS: [Group; 19] = [
         quick: None,
         by_default: true,
         run: |_| firmware::test(),
+    },
+    Group {
+        name: "sizes",
+        what: "no firmware takes 2 % more flash, RAM or stack than docs/sizes.md says",
+        budget: 600,
+        quick: None,
+        by_default: true,
+        run: |_| firmware::check_sizes(),
     },
 ];
 

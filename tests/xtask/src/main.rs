@@ -54,6 +54,9 @@ enum Task {
         /// Also writes the figures here.
         #[arg(long, value_name = "FILE")]
         json: Option<PathBuf>,
+        /// Also writes them to docs/sizes.md, with which the checks compare.
+        #[arg(long)]
+        write: bool,
     },
     /// Measures the round trip against a raw socket, interleaved with its control.
     Bench {
@@ -73,7 +76,7 @@ enum Task {
         #[arg(long, value_name = "FILE")]
         json: Option<PathBuf>,
     },
-    /// Builds the firmware of a board, or of all boards.
+    /// Builds the firmware of a board, or of all boards; or runs the emulated one.
     Firmware {
         /// Which board.
         #[arg(value_name = "BOARD")]
@@ -81,6 +84,8 @@ enum Task {
         /// Also puts the vehicle's image on the board, through a debug probe.
         #[arg(long, requires = "board")]
         flash: bool,
+        #[command(flatten)]
+        desk: firmware::Who,
     },
 }
 
@@ -89,10 +94,11 @@ fn main() -> ExitCode {
         Task::Demo => demo::run(),
         Task::Test { list: true, .. } => runner::list(),
         Task::Test { groups, quick, list: false } => runner::run(&groups, quick),
-        Task::Sizes { json } => firmware::sizes(json.as_deref()),
+        Task::Sizes { json, write } => firmware::sizes(json.as_deref(), write),
         Task::Fleet { nodes, json } => fleet::run(nodes, json.as_deref()),
         Task::Bench { quick, json } => bench::run(quick, json.as_deref()),
-        Task::Firmware { board: Some(board), flash: true } => firmware::flash(&board),
+        Task::Firmware { board: Some(board), flash: true, .. } => firmware::flash(&board),
+        Task::Firmware { board, desk, .. } if desk.run => firmware::desk(board.as_deref(), &desk),
         Task::Firmware { board, .. } => firmware::build(board.as_deref()),
     };
     finished.unwrap_or_else(|error| {

@@ -31,31 +31,64 @@ const STATES: [State; 6] =
 /// Longer than three keep-alives: the manager has noticed.
 const MISSED: Duration = Duration::from_secs(5);
 
+/// How long a board is without power.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+enum Absence {
+    /// It is back before anybody has missed it: the manager challenges the old link.
+    Short,
+    /// The manager has given it up.
+    Missed,
+}
+
+/// One loss of power.
+struct Loss {
+    state: State,
+    absence: Absence,
+    /// Both lives draw the same numbers, and all such lives do: boards without a source of noise are like that.
+    seed: Option<u64>,
+}
+
+impl Loss {
+    /// Every 24 of them have each state with each absence, with and without a seed.
+    fn of(number: u32) -> Self {
+        let round = number / STATES.len() as u32;
+        let seeded = (number + round + round / 2).is_multiple_of(2);
+        Self {
+            state: STATES[number as usize % STATES.len()],
+            absence: if round.is_multiple_of(2) { Absence::Short } else { Absence::Missed },
+            seed: seeded.then_some(7),
+        }
+    }
+}
+
 pub(super) fn run(bench: &Bench, restarts: u32) -> Result<String> {
     let cable = bench.cable()?;
     let manager = Manager::start()?;
-    let mut counted: BTreeMap<State, u32> = BTreeMap::new();
+    let mut counted: BTreeMap<(Absence, State), u32> = BTreeMap::new();
+    let mut seeded = 0;
     for number in 0..restarts {
-        let state = STATES[number as usize % STATES.len()];
-        // Every second life draws the same numbers as all of these: boards without a source of noise do.
-        let seed = number.is_multiple_of(2).then_some(7);
+        let Loss { state, absence, seed } = Loss::of(number);
         let who = Who { seed, ..Who::agv(17) };
+        let at = || format!("restart {number}, {state:?}, {absence:?}, seed {seed:?}");
         manager.forget_events();
         let board = bench.board(&cable, &who)?;
-        let at = || format!("restart {number}, {state:?}, seed {seed:?}");
         reach(state, &manager, &board, &who).with_context(at)?;
         board.cut_power()?;
-        let long = number / STATES.len() as u32 % 2 == 1;
-        if long {
-            std::thread::sleep(MISSED);
+        if absence == Absence::Missed {
+            // Whoever has joined is known to be missed; of one that has not, nobody can tell.
+            if state >= State::Joined { manager.missed(&who).with_context(at)? } else { std::thread::sleep(MISSED) }
         }
         let board = bench.board(&cable, &who)?;
         works(&manager, &board, &who).with_context(at)?;
-        *counted.entry(state).or_default() += 1;
+        *counted.entry((absence, state)).or_default() += 1;
+        seeded += u32::from(seed.is_some());
     }
     let links = manager.system.number_of_s_units();
     ensure!(links == 1, "{links} s_units are connected");
-    Ok(format!("{restarts} restarts: {counted:?}"))
+    let short: u32 =
+        counted.iter().filter(|((absence, _), _)| *absence == Absence::Short).map(|(_, count)| count).sum();
+    let missed = restarts - short;
+    Ok(format!("{restarts} restarts, {short} not missed, {missed} missed, {seeded} with one seed: {counted:?}"))
 }
 
 fn reach(state: State, manager: &Manager, board: &Board, who: &Who) -> Result<()> {

@@ -3,66 +3,147 @@
 use std::path::Path;
 use std::process::ExitCode;
 
-use anyhow::Result;
+use anyhow::{Context, Result, bail};
 use serde_json::{Value, json};
 
-use super::boards::{BOARDS, Board};
+use super::bill::{Row, compared, compiler_in, replaced, rows_in, table};
+use super::boards::{BOARDS, Board, RADIO};
 use super::image::{Footprint, footprint};
-use crate::install;
+use super::{NOT_ALLOWED, TESTED, tests};
+use crate::command::Run;
+use crate::groups::Outcome;
+use crate::{install, workspace};
 
-/// A line of the bill.
-struct Row {
-    board: &'static str,
-    image: &'static str,
-    footprint: Footprint,
-    /// The difference to the bare echo on the same board.
-    cara: Footprint,
-}
+/// Where the bill is committed.
+const DOCUMENT: &str = "docs/sizes.md";
 
-/// Builds every firmware, prints what it takes, and writes the same as JSON.
-pub(crate) fn sizes(json: Option<&Path>) -> Result<ExitCode> {
-    let mut rows = Vec::new();
-    for board in &BOARDS {
-        rows.extend(of_board(board)?);
-    }
-    println!("{:16} {:8} {:>9} {:>11} {:>11} {:>9}", "board", "image", "flash", "static RAM", "CARA flash", "CARA RAM");
-    for Row { board, image, footprint, cara } in &rows {
-        let Footprint { flash, static_ram } = footprint;
-        println!("{board:16} {image:8} {flash:>9} {static_ram:>11} {:>11} {:>9}", cara.flash, cara.static_ram);
-    }
+/// Builds every firmware, prints what it takes, and writes the same as JSON or into the document.
+pub(crate) fn sizes(json: Option<&Path>, write: bool) -> Result<ExitCode> {
+    let rows = measured()?;
+    println!("{}", table(&rows));
+    println!("The stack is measured on the emulated board only; the others were linked, and not run.");
+    print_resources()?;
     if let Some(path) = json {
-        let rows: Vec<Value> = rows.iter().map(Row::to_json).collect();
+        let rows: Vec<Value> = rows.iter().map(to_json).collect();
         std::fs::write(path, serde_json::to_string_pretty(&rows)? + "\n")?;
+    }
+    if write {
+        let head = [("Compiler", compiler()?), ("Date", date()?), ("Commit", commit()?)];
+        std::fs::write(document(), replaced(&std::fs::read_to_string(document())?, &rows, &head)?)?;
     }
     Ok(ExitCode::SUCCESS)
 }
 
-fn of_board(board: &'static Board) -> Result<Vec<Row>> {
-    install::rust_target(board.target).map_err(anyhow::Error::msg)?;
-    let mut footprints = Vec::new();
-    for image in board.images {
-        footprints.push((*image, footprint(&board.build(image)?)?));
+/// Fails when a figure has grown by more than 2 % since the document was written.
+pub(crate) fn check() -> Outcome {
+    if let Err(reason) = BOARDS.iter().try_for_each(|board| install::rust_target(board.target)) {
+        return Outcome::Skipped(reason);
     }
-    let bare = footprints.last().map_or_else(Footprint::default, |(_, bare)| *bare);
-    let row = |(image, footprint): (&'static str, Footprint)| Row {
-        board: board.name,
-        image,
-        footprint,
-        cara: Footprint {
-            flash: footprint.flash.saturating_sub(bare.flash),
-            static_ram: footprint.static_ram.saturating_sub(bare.static_ram),
-        },
-    };
-    Ok(footprints.into_iter().map(row).collect())
+    grown().into()
 }
 
-impl Row {
-    fn to_json(&self) -> Value {
-        let Self { board, image, footprint, cara } = self;
-        json!({
-            "board": board, "image": image,
-            "flash": footprint.flash, "static_ram": footprint.static_ram, "stack": null,
-            "cara_flash": cara.flash, "cara_ram": cara.static_ram,
-        })
+fn grown() -> Result<()> {
+    let text = std::fs::read_to_string(document()).with_context(|| format!("{DOCUMENT} is absent"))?;
+    let rows = measured()?;
+    let found = compared(&rows, &rows_in(&text));
+    let compiler = compiler()?;
+    if compiler_in(&text) == Some(&*compiler) {
+        return found;
     }
+    // Another compiler makes other code, for which nobody is to blame.
+    println!("warning: {DOCUMENT} was made by another compiler than {compiler}");
+    if let Err(error) = found {
+        println!("warning: {error:#}");
+    }
+    Ok(())
+}
+
+fn measured() -> Result<Vec<Row>> {
+    let mut rows = Vec::new();
+    for board in &BOARDS {
+        if board.has_radio && std::env::var_os(RADIO).is_none() {
+            println!("{} is left out: {RADIO} does not say where its radio's files are", board.name);
+            continue;
+        }
+        rows.extend(of_board(board)?);
+    }
+    Ok(rows)
+}
+
+fn of_board(board: &'static Board) -> Result<Vec<Row>> {
+    install::rust_target(board.target).map_err(anyhow::Error::msg)?;
+    let mut found = Vec::new();
+    for image in board.images {
+        let path = board.build(image)?;
+        let stack = if board.name == TESTED { stack(&path, image)? } else { None };
+        found.push((*image, footprint(&path)?, stack));
+    }
+    let bare = found.last().map_or_else(Footprint::default, |(_, bare, _)| *bare);
+    let row = |(image, footprint, stack): (&str, Footprint, Option<u64>)| Row {
+        board: board.name.to_owned(),
+        image: image.to_owned(),
+        flash: footprint.flash,
+        static_ram: footprint.static_ram,
+        stack,
+        cara_flash: footprint.flash.saturating_sub(bare.flash),
+        cara_ram: footprint.static_ram.saturating_sub(bare.static_ram),
+    };
+    Ok(found.into_iter().map(row).collect())
+}
+
+/// The deepest stack under load; none, with the reason printed, where nothing can be run.
+fn stack(path: &Path, image: &str) -> Result<Option<u64>> {
+    if let Err(reason) = install::program("qemu-system-arm", "qemu-system-arm") {
+        println!("warning: no stack is measured: {reason}");
+        return Ok(None);
+    }
+    let (code, output) = tests(path).args(["stack", image]).output()?;
+    match code {
+        Some(0) => {}
+        Some(NOT_ALLOWED) => {
+            println!("warning: no stack is measured: this user cannot make a network with virtual devices");
+            return Ok(None);
+        }
+        code => bail!("the load ended with code {code:?}"),
+    }
+    let used = output.split_once("stack ").and_then(|(_, behind)| behind.split(' ').next());
+    Ok(Some(used.context("the board says nothing of its stack")?.parse()?))
+}
+
+/// Prints what each capacity of `Resources` costs, as the board itself tells.
+fn print_resources() -> Result<()> {
+    let board = super::boards::find(TESTED)?;
+    let image = board.build("resources")?;
+    if install::program("qemu-system-arm", "qemu-system-arm").is_err() {
+        return Ok(());
+    }
+    let machine = ["-M", TESTED, "-display", "none", "-monitor", "none", "-serial", "none", "-nic", "none"];
+    let semihosting = ["-semihosting-config", "enable=on,target=native", "-kernel"];
+    let told = Run::new("qemu-system-arm").args(machine).args(semihosting).args([image]).text()?;
+    println!("\nBytes of static RAM, and what more of each capacity adds:\n{}", told.trim());
+    Ok(())
+}
+
+fn to_json(row: &Row) -> Value {
+    let Row { board, image, flash, static_ram, stack, cara_flash, cara_ram } = row;
+    json!({
+        "board": board, "image": image, "flash": flash, "static_ram": static_ram, "stack": stack,
+        "cara_flash": cara_flash, "cara_ram": cara_ram,
+    })
+}
+
+fn document() -> std::path::PathBuf {
+    workspace::root().join(DOCUMENT)
+}
+
+fn compiler() -> Result<String> {
+    Ok(Run::new("rustc").args(["--version"]).text()?.trim().to_owned())
+}
+
+fn date() -> Result<String> {
+    Ok(Run::new("date").args(["-u", "+%Y-%m-%d"]).text()?.trim().to_owned())
+}
+
+fn commit() -> Result<String> {
+    Ok(Run::new("git").args(["rev-parse", "--short", "HEAD"]).text()?.trim().to_owned())
 }

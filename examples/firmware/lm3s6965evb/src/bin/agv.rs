@@ -4,7 +4,7 @@
 #![no_main]
 
 use cara_apps::agv::Agv;
-use cara_embassy::Runner as UnitRunner;
+use cara_embassy::{Handler, Runner as UnitRunner, ServiceOptions};
 use cara_lm3s6965evb::arguments::{self, Told};
 use cara_lm3s6965evb::ethernet::Ethernet;
 use cara_lm3s6965evb::watchdog::Watchdog;
@@ -40,7 +40,7 @@ fn spawn(spawner: Spawner) -> Result<(), &'static str> {
     static SOCKETS_MEMORY: ConstStaticCell<StackResources<SOCKETS>> = ConstStaticCell::new(StackResources::new());
     static RESOURCES: StaticCell<VehicleResources> = StaticCell::new();
     const NO_ROOM: &str = "no room for a task";
-    let Told { settings, seed } = arguments::read().map_err(|_| "who am I? The arguments are no settings")?;
+    let Told { settings, seed, hang } = arguments::read().map_err(|_| "who am I? The arguments are no settings")?;
     let seed = seed.unwrap_or_else(arguments::seed);
     let ethernet = ETHERNET.take();
     ethernet.start();
@@ -49,6 +49,9 @@ fn spawn(spawner: Spawner) -> Result<(), &'static str> {
     let resources = RESOURCES.init_with(VehicleResources::new);
     let made = cara_vehicle::vehicle(stack, resources, &settings, seed);
     let (vehicle, unit_runner) = made.map_err(|_| "the settings are of no vehicle")?;
+    if hang {
+        offer_to_hang(vehicle)?;
+    }
     defmt::info!("{=str}/{=u32}", settings.identity.name(), settings.identity.id());
     spawner.spawn(network(network_runner).map_err(|_| NO_ROOM)?);
     spawner.spawn(unit(unit_runner).map_err(|_| NO_ROOM)?);
@@ -56,6 +59,17 @@ fn spawn(spawner: Spawner) -> Result<(), &'static str> {
     spawner.spawn(button(vehicle).map_err(|_| NO_ROOM)?);
     spawner.spawn(watch().map_err(|_| NO_ROOM)?);
     Ok(())
+}
+
+/// A service that never returns: the watchdog has to act.
+fn offer_to_hang(vehicle: Vehicle) -> Result<(), &'static str> {
+    let hang = Handler::method(&|_: &mut Agv, _, _| {
+        loop {
+            cortex_m::asm::nop();
+        }
+    });
+    let added = vehicle.add_service("hang()", ServiceOptions::new(), hang);
+    added.and_then(|()| vehicle.publish_my_function_list()).map_err(|_| "no room for a function")
 }
 
 #[embassy_executor::task]

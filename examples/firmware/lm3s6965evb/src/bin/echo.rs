@@ -86,6 +86,7 @@ async fn echo(stack: Stack<'static>) -> ! {
 async fn report() -> ! {
     loop {
         Timer::after(Duration::from_secs(5)).await;
-        defmt::info!("{}", stack::used());
+        let stack = stack::used();
+        defmt::info!("stack {=usize} of {=usize} bytes", stack.used, stack.size);
     }
 }

@@ -1,0 +1,171 @@
+//! A board on the desk: the firmware, its manager and a prompt for `cara` beside it, in a network of their own.
+
+use std::fs::Permissions;
+use std::io::{BufRead, IsTerminal, Write};
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, bail, ensure};
+use cara_processes::Process;
+use clap::Args;
+use tempfile::TempDir;
+
+use crate::board::{Bench, LONG, Who};
+
+/// What is on the desk.
+#[derive(Args, Clone, Debug)]
+pub(crate) struct Desk {
+    /// The vehicle's name.
+    #[arg(long, default_value = "agv-17")]
+    name: String,
+    /// The vehicle's ID number.
+    #[arg(long, default_value_t = 17)]
+    id: u32,
+    /// Its manager, as NAME/ID.
+    #[arg(long, default_value = "depot/1")]
+    manager: String,
+    /// Their fleet.
+    #[arg(long, default_value_t = 0)]
+    fleet: u32,
+    /// The `cara` command; the one beside this program if not given.
+    #[arg(long)]
+    cara: Option<PathBuf>,
+}
+
+/// What a line is prompted with.
+const PROMPT: &str = "cara> ";
+
+/// Starts everything, then runs what is typed until the input ends.
+pub(crate) fn run(image: &Path, desk: &Desk) -> Result<()> {
+    let bench = Bench::new(image, true)?;
+    let cable = bench.cable()?;
+    let cara = Cara::new(desk)?;
+    let _manager = cara.manager(&desk.manager, desk.fleet)?;
+    let Desk { name, id, manager, fleet, .. } = desk.clone();
+    let board = bench.board(&cable, &Who { name, id, manager, fleet, ..Who::agv(id) })?;
+    board.logs("has joined")?;
+    cara.wait_for(&desk.name)?;
+    println!("verbs of cara can be typed, as scan, or: call {0} stop; Ctrl-D ends it", desk.name);
+    let input = std::io::stdin();
+    let typed = input.is_terminal();
+    prompt()?;
+    for line in input.lock().lines() {
+        let line = line?;
+        if !typed {
+            println!("{line}");
+        }
+        cara.run(&line)?;
+        prompt()?;
+    }
+    println!();
+    Ok(())
+}
+
+fn prompt() -> Result<()> {
+    print!("{PROMPT}");
+    Ok(std::io::stdout().flush()?)
+}
+
+/// The command, with a folder of control sockets for this desk only.
+struct Cara {
+    program: PathBuf,
+    sockets: TempDir,
+}
+
+impl Cara {
+    fn new(desk: &Desk) -> Result<Self> {
+        let beside = || Ok::<_, anyhow::Error>(std::env::current_exe()?.with_file_name("cara"));
+        let program = desk.cara.clone().map_or_else(beside, Ok)?;
+        ensure!(program.is_file(), "{} is not there: cargo build --package cara-cli", program.display());
+        // Control sockets are not made where others could enter.
+        let owner_only = Permissions::from_mode(0o700);
+        let sockets = tempfile::Builder::new().permissions(owner_only).tempdir();
+        let sockets = sockets.context("cannot make a folder for sockets")?;
+        Ok(Self { program, sockets })
+    }
+
+    fn command(&self) -> Command {
+        let mut command = Command::new(&self.program);
+        command.env("CARA_CONTROL_DIR", self.sockets.path()).stdin(Stdio::null());
+        command
+    }
+
+    fn manager(&self, who: &str, fleet: u32) -> Result<Manager> {
+        let (name, id) = who.split_once('/').with_context(|| format!("a manager is NAME/ID, not `{who}`"))?;
+        let fleet = fleet.to_string();
+        let mut command = self.command();
+        command.args(["node", "--name", name, "--id", id, "--fleet", &fleet]);
+        Ok(Manager(command.spawn().context("cannot start cara")?))
+    }
+
+    /// Waits until the manager shows the functions of a vehicle.
+    fn wait_for(&self, name: &str) -> Result<()> {
+        let deadline = Instant::now() + LONG;
+        let shown = || self.command().args(["functions", name]).stderr(Stdio::null()).output();
+        while !shown()?.stdout.windows(5).any(|text| text == b"go_to") {
+            ensure!(Instant::now() < deadline, "{name} has published nothing");
+            std::thread::sleep(Duration::from_millis(100));
+        }
+        Ok(())
+    }
+
+    /// Runs a line. What it says on its error output comes with the rest, in order.
+    fn run(&self, line: &str) -> Result<()> {
+        let words = match shlex::split(line) {
+            None => {
+                println!("a quote is open");
+                return Ok(());
+            }
+            Some(words) if words.is_empty() => return Ok(()),
+            Some(words) => words,
+        };
+        let output = self.command().args(words).output().context("cannot start cara")?;
+        let mut shown = std::io::stdout().lock();
+        shown.write_all(&output.stdout)?;
+        shown.write_all(&output.stderr)?;
+        Ok(())
+    }
+}
+
+/// The manager's process; dropping it ends it.
+struct Manager(Child);
+
+impl Drop for Manager {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// What is typed in the test, and what must come of it, in this order.
+const TYPED: [(&str, &str); 6] = [
+    ("scan", "agv-17"),
+    ("functions agv-17", "go_to(position: int[2])"),
+    ("call agv-17 'pos_info(position: [7, 7])'", "position: [0, 0]"),
+    ("call agv-17 'go_to(position: [1, 0])' --hold", "agv-17: "),
+    ("call agv-17 fly_to", "fly_to"),
+    ("call 'agv-17", "a quote is open"),
+];
+
+/// The desk, with what somebody might type piped into it.
+pub(crate) fn test(image: &Path, cara: Option<&Path>) -> Result<String> {
+    let program = std::env::current_exe()?;
+    let mut arguments = vec!["--image".into(), image.as_os_str().to_owned(), "desk".into()];
+    arguments.extend(cara.into_iter().flat_map(|cara| ["--cara".into(), cara.as_os_str().to_owned()]));
+    let mut desk = Process::start("the desk", &program, arguments)?;
+    desk.seen("INFO started because of", LONG)?;
+    for (line, answer) in TYPED {
+        desk.send(line)?;
+        desk.expect(&format!("{PROMPT}{line}"), LONG)?;
+        desk.expect(answer, LONG)?;
+    }
+    desk.seen("INFO arrived at 1 0", LONG)?;
+    desk.end_input();
+    let ended = desk.wait(LONG)?;
+    if !ended.success() {
+        bail!("it ended with {ended}");
+    }
+    Ok("what is typed is run, what the board logs is shown".into())
+}

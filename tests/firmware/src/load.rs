@@ -1,0 +1,111 @@
+//! What makes the stack of a board deepest: everything that an image does, one after the other. How deep it was, the
+//! board finds by painting its stack.
+
+use std::io::{Read, Write};
+use std::net::{Shutdown, SocketAddr, TcpStream};
+use std::time::Duration;
+
+use anyhow::{Context, Result, bail, ensure};
+use cara_std::Parameters;
+use clap::ValueEnum;
+
+use crate::board::{self, Bench, Board, Cable, LONG, Who};
+use crate::manager::{Manager, at, position};
+
+/// An image.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Image {
+    /// The AGV.
+    Agv,
+    /// The bare TCP echo.
+    Echo,
+}
+
+/// How often everything is done: interrupts come at other places each time.
+const ROUNDS: u32 = 3;
+/// Where the echo listens, and how much it is sent.
+const ECHO_PORT: u16 = 7777;
+const ECHO_BYTES: usize = 20_000;
+/// The board looks at its stack every second, the echo every five.
+const LOOKED: Duration = Duration::from_secs(6);
+
+/// Puts an image under load and prints the board's line about its stack, `stack N of M bytes`.
+pub(crate) fn run(bench: &Bench, image: Image) -> Result<()> {
+    let cable = bench.cable()?;
+    let board = bench.board(&cable, &Who::agv(17))?;
+    for round in 0..ROUNDS {
+        match image {
+            Image::Agv => vehicle(&board, &cable, round)?,
+            Image::Echo => echo(&cable)?,
+        }
+    }
+    std::thread::sleep(LOOKED);
+    println!("{}", board.last_with("stack ").context("the board says nothing of its stack")?);
+    Ok(())
+}
+
+/// Joining, lists in both directions, calls in both directions, refusals, a lost manager and a pulled cable.
+fn vehicle(board: &Board, cable: &Cable, round: u32) -> Result<()> {
+    let who = Who::agv(17);
+    let line = board.line();
+    let manager = Manager::start()?;
+    let functions = manager.system.my_function_list();
+    for number in 0..40 {
+        let name = format!("a_function_with_a_long_name_{number}");
+        functions.add_function(&name, &Parameters::<512>::new(), |parameters: Parameters| parameters)?;
+    }
+    manager.system.publish_my_function_list()?;
+    let agv = manager.meet(&who)?;
+    for x in 1..=2 {
+        agv.block_request("go_to", &mut *at([x + 2 * i64::from(round), 0])?)?;
+        agv.request("pos_info", &*at([0, 0])?)?;
+        position(&agv)?;
+        let mut text = Parameters::<1024>::sized();
+        text.add_string("text", 400)?;
+        text.set_value("text", "a".repeat(400).as_str())?;
+        agv.block_request("echo", &mut text)?;
+    }
+    ensure!(agv.block_request("fly_to", &mut *at([0, 0])?).is_err(), "it flies");
+    agv.block_request("stop", &mut Parameters::<512>::new())?;
+    drop(manager);
+    board.logs_behind(line, "depot has left")?;
+    // A list that is full with other functions has no room for the mechanic.
+    let manager = Manager::start()?;
+    manager.offer_mechanic()?;
+    manager.meet(&who)?;
+    board.logs_behind(line, "a mechanic comes in 5 minutes")?;
+    let line = board.line();
+    cable.pull()?;
+    board.logs_behind(line, "depot has left")?;
+    cable.plug_in()
+}
+
+/// More than fits its buffers, there and back.
+fn echo(cable: &Cable) -> Result<()> {
+    let address = SocketAddr::new(board::address(cable).into(), ECHO_PORT);
+    let mut stream = connected(address)?;
+    stream.set_read_timeout(Some(LONG))?;
+    let mut writer = stream.try_clone()?;
+    let writing = std::thread::spawn(move || -> Result<()> {
+        writer.write_all(&[7; ECHO_BYTES])?;
+        Ok(writer.shutdown(Shutdown::Write)?)
+    });
+    let mut back = Vec::new();
+    stream.read_to_end(&mut back)?;
+    ensure!(back.len() == ECHO_BYTES, "{} bytes came back", back.len());
+    match writing.join() {
+        Ok(written) => written,
+        Err(_) => bail!("the writer ended"),
+    }
+}
+
+fn connected(address: SocketAddr) -> Result<TcpStream> {
+    let mut tries = 0;
+    loop {
+        match TcpStream::connect_timeout(&address, Duration::from_secs(1)) {
+            Err(_) if tries < 60 => tries += 1,
+            connected => return connected.with_context(|| format!("nobody answers at {address}")),
+        }
+        std::thread::sleep(Duration::from_millis(200));
+    }
+}

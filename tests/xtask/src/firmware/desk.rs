@@ -1,0 +1,46 @@
+//! `cargo xtask firmware BOARD --run`: a board in QEMU, its manager, and a prompt for `cara` beside them.
+
+use std::process::ExitCode;
+
+use anyhow::{Result, bail};
+use clap::Args;
+
+use super::{NOT_ALLOWED, TESTED, build_command, tested_image, tests};
+use crate::install;
+
+/// Who is put on the desk.
+#[derive(Args)]
+pub(crate) struct Who {
+    /// Runs the emulated board, with a manager and a prompt that takes verbs of `cara`; Ctrl-D ends it.
+    #[arg(long)]
+    pub(crate) run: bool,
+    /// The vehicle's name.
+    #[arg(long, requires = "run", default_value = "agv-17")]
+    name: String,
+    /// The vehicle's ID number.
+    #[arg(long, requires = "run", default_value_t = 17)]
+    id: u32,
+    /// Its manager, as NAME/ID.
+    #[arg(long, requires = "run", value_name = "NAME/ID", default_value = "depot/1")]
+    manager: String,
+    /// Their fleet.
+    #[arg(long, requires = "run", default_value_t = 0)]
+    fleet: u32,
+}
+
+/// Builds what is needed and runs it until the input ends.
+pub(crate) fn desk(board: Option<&str>, who: &Who) -> Result<ExitCode> {
+    if board != Some(TESTED) {
+        bail!("only the emulated board runs here: cargo xtask firmware {TESTED} --run");
+    }
+    install::program("qemu-system-arm", "qemu-system-arm").map_err(anyhow::Error::msg)?;
+    let image = tested_image()?;
+    build_command()?;
+    let (id, fleet) = (who.id.to_string(), who.fleet.to_string());
+    let told = ["desk", "--name", &who.name, "--id", &id, "--manager", &who.manager, "--fleet", &fleet];
+    match tests(&image).args(told).interactive().code()? {
+        Some(0) => Ok(ExitCode::SUCCESS),
+        Some(NOT_ALLOWED) => bail!("the board needs a network of its own, see above"),
+        code => bail!("the desk ended with code {code:?}"),
+    }
+}
