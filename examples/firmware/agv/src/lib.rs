@@ -85,14 +85,23 @@ pub fn hardware_address(chip: &[u8]) -> [u8; 6] {
     [0x02, first, second, third, fourth, fifth]
 }
 
-/// Logs why a board does not know who it is.
-pub fn tell_unprovisioned(error: PageError) {
-    match error {
-        PageError::Absent => info!("who am I? There are no settings: write them with cara provision"),
-        PageError::Layout(_layout) => info!("settings of layout {}: write them again, or update the image", _layout),
-        PageError::Damaged => info!("who am I? The settings are damaged: write them again with cara provision"),
-        PageError::Unsound => info!("who am I? The settings are of no unit: write them again with cara provision"),
+/// The settings of a vehicle; where there are none the log tells why.
+pub fn provisioned(read: Result<Settings, PageError>) -> Option<Settings> {
+    match read {
+        Ok(settings) if settings.manager.is_some() => return Some(settings),
+        Ok(_) => info!("a vehicle belongs to a manager, and the settings name none: give cara provision a --manager"),
+        Err(PageError::Absent) => info!("who am I? There are no settings: write them with cara provision"),
+        Err(PageError::Layout(_layout)) => {
+            info!("settings of layout {}: write them again, or update the image", _layout)
+        }
+        Err(PageError::Damaged) => {
+            info!("who am I? The settings are damaged: write them again with cara provision")
+        }
+        Err(PageError::Unsound) => {
+            info!("who am I? The settings are of no unit: write them again with cara provision")
+        }
     }
+    None
 }
 
 /// Makes the AGV that the settings describe. `seed` should differ from boot to boot.
@@ -197,8 +206,16 @@ async fn ask_mechanic(vehicle: Vehicle) -> Result<i64, Error> {
 
 #[cfg(test)]
 mod tests {
-    use super::hardware_address;
+    use super::{PageError, Settings, hardware_address, provisioned};
     use std::collections::HashSet;
+
+    #[test]
+    fn a_vehicle_without_a_manager_is_not_provisioned() {
+        let told = |text: &str| -> Settings { text.parse().unwrap() };
+        assert!(provisioned(Ok(told("name=agv id=1 manager=depot/1"))).is_some());
+        assert!(provisioned(Ok(told("name=agv id=1"))).is_none());
+        assert!(provisioned(Err(PageError::Damaged)).is_none());
+    }
 
     #[test]
     fn chips_have_addresses_of_their_own() {

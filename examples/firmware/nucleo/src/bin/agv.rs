@@ -16,12 +16,8 @@ use static_cell::StaticCell;
 async fn main(spawner: Spawner) {
     let mut board = Board::start();
     defmt::info!("started because of {}", board.reason);
-    let settings = match board.settings {
-        Ok(settings) => settings,
-        Err(error) => {
-            cara_vehicle::tell_unprovisioned(error);
-            lamp::unprovisioned(async |on| board.lamp.set(on)).await
-        }
+    let Some(settings) = cara_vehicle::provisioned(board.settings) else {
+        lamp::unprovisioned(async |on| board.lamp.set(on)).await
     };
     defmt::unwrap!(spawn(spawner, settings, board.seed, board.device, board.lamp, board.button, board.watchdog));
 }
@@ -41,7 +37,7 @@ fn spawn(
     let (stack, network_runner) = embassy_net::new(device, cara_vehicle::network(&settings), sockets, seed);
     let resources = RESOURCES.init_with(VehicleResources::new);
     let made = cara_vehicle::vehicle(stack, resources, &settings, seed);
-    let Ok((vehicle, unit)) = made else { defmt::panic!("the settings are of no vehicle: provision the board again") };
+    let Ok((vehicle, unit)) = made else { defmt::panic!("no vehicle can be made of the settings") };
     defmt::info!("{=str}/{=u32}", settings.identity.name(), settings.identity.id());
     spawner.spawn(network(network_runner)?);
     spawner.spawn(tasks::unit(unit)?);

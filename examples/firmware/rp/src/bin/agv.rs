@@ -22,14 +22,10 @@ async fn run(spawner: Spawner) -> Result<(), SpawnError> {
     static RESOURCES: StaticCell<VehicleResources> = StaticCell::new();
     let Board { reason, settings, seed, lamp, button, watchdog, network } = Board::start(spawner).await;
     defmt::info!("started because of {}", reason);
-    let settings = match settings {
-        Ok(settings) => settings,
-        Err(error) => {
-            cara_vehicle::tell_unprovisioned(error);
-            spawner.spawn(flicker(lamp)?);
-            let (_, uplink) = network.start(spawner).await?;
-            uplink.only_lamp().await
-        }
+    let Some(settings) = cara_vehicle::provisioned(settings) else {
+        spawner.spawn(flicker(lamp)?);
+        let (_, uplink) = network.start(spawner).await?;
+        uplink.only_lamp().await
     };
     let (device, uplink) = network.start(spawner).await?;
     let sockets = SOCKETS_MEMORY.init_with(StackResources::new);
@@ -37,7 +33,7 @@ async fn run(spawner: Spawner) -> Result<(), SpawnError> {
     uplink.keep(spawner, stack, Some(&settings))?;
     let resources = RESOURCES.init_with(VehicleResources::new);
     let made = cara_vehicle::vehicle(stack, resources, &settings, seed);
-    let Ok((vehicle, unit)) = made else { defmt::panic!("the settings are of no vehicle: provision the board again") };
+    let Ok((vehicle, unit)) = made else { defmt::panic!("no vehicle can be made of the settings") };
     defmt::info!("{=str}/{=u32}", settings.identity.name(), settings.identity.id());
     spawner.spawn(talk(runner)?);
     spawner.spawn(tasks::unit(unit)?);
