@@ -7,7 +7,8 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, ensure};
 use serde::{Deserialize, Serialize};
 
-use crate::peers::{Caller, Peer};
+use crate::clock::cpu_time;
+use crate::peers::{Caller, Peer, Place};
 
 /// Calls of each caller before those that count.
 const WARM_UP: u32 = 3;
@@ -19,6 +20,8 @@ pub(crate) struct Order {
     pub(crate) callers: u32,
     pub(crate) calls_per_caller: u32,
     pub(crate) pause_ms: u64,
+    /// Wait before the first call, so that several peers that pause can take turns.
+    pub(crate) delay_us: u64,
 }
 
 /// What came of it.
@@ -36,24 +39,41 @@ pub(crate) struct Outcome {
 /// The callers of a client process; those once connected stay so from block to block.
 pub(crate) struct Callers<'a> {
     peer: &'a dyn Peer,
-    run: u32,
+    place: &'a Place,
     address: &'a str,
     connected: Vec<Box<dyn Caller>>,
 }
 
 impl<'a> Callers<'a> {
-    pub(crate) fn new(peer: &'a dyn Peer, run: u32, address: &'a str) -> Self {
-        Self { peer, run, address, connected: Vec::new() }
+    pub(crate) fn new(peer: &'a dyn Peer, place: &'a Place, address: &'a str) -> Self {
+        Self { peer, place, address, connected: Vec::new() }
+    }
+
+    /// The first caller.
+    pub(crate) fn first(&mut self) -> Result<&mut dyn Caller> {
+        self.connect(1)?;
+        Ok(&mut **self.connected.first_mut().context("no callers")?)
+    }
+
+    fn connect(&mut self, wanted: usize) -> Result<()> {
+        let missing = self.connected.len()..wanted;
+        // All at the same time: units that look for each other wait for answers.
+        let (peer, place, address) = (self.peer, self.place, self.address);
+        let fresh: Vec<Result<_>> = thread::scope(|scope| {
+            let threads: Vec<_> = missing.map(|_| scope.spawn(move || peer.connect(place, address))).collect();
+            threads.into_iter().map(|thread| thread.join().expect("connecting does not panic")).collect()
+        });
+        for caller in fresh {
+            self.connected.push(caller.context("connecting")?);
+        }
+        Ok(())
     }
 
     /// Makes the calls of one block.
     pub(crate) fn run(&mut self, order: &Order) -> Result<Outcome> {
         let wanted = order.callers as usize;
-        while self.connected.len() < wanted {
-            let caller = self.peer.connect(self.run, self.address).context("connecting")?;
-            self.connected.push(caller);
-        }
-        let text: String = ('a'..='z').cycle().take(order.chars as usize).collect();
+        self.connect(wanted)?;
+        let text = text(order.chars);
         let barrier = Barrier::new(wanted);
         let used = cpu_time();
         let (barrier, text) = (&barrier, text.as_str());
@@ -71,6 +91,11 @@ impl<'a> Callers<'a> {
         let cpu_calls = u64::from(order.callers) * u64::from(WARM_UP + order.calls_per_caller);
         Ok(Outcome { round_trips, elapsed: nanoseconds(end - start), cpu, cpu_calls })
     }
+}
+
+/// What is sent: so many characters of one byte each.
+pub(crate) fn text(chars: u32) -> String {
+    ('a'..='z').cycle().take(chars as usize).collect()
 }
 
 struct Timed {
@@ -91,6 +116,7 @@ fn make_calls(caller: &mut dyn Caller, order: &Order, text: &str, barrier: &Barr
     if let Some(error) = failed {
         return Err(error);
     }
+    thread::sleep(Duration::from_micros(order.delay_us));
     let start = Instant::now();
     let mut end = start;
     for _ in 0..order.calls_per_caller {
@@ -110,12 +136,6 @@ fn call(caller: &mut dyn Caller, text: &str) -> Result<()> {
     let length = caller.echo(text)?;
     ensure!(length == text.len(), "{length} bytes came back of {}", text.len());
     Ok(())
-}
-
-/// Nanoseconds of all CPUs that this process has used so far.
-pub(crate) fn cpu_time() -> u64 {
-    let used = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
-    u64::try_from(used.tv_sec * 1_000_000_000 + used.tv_nsec).unwrap_or(0)
 }
 
 fn nanoseconds(span: Duration) -> u64 {

@@ -41,6 +41,8 @@ pub(crate) struct Figures {
     /// Nanoseconds.
     pub(crate) p99: u64,
     /// Nanoseconds.
+    pub(crate) p999: u64,
+    /// Nanoseconds.
     pub(crate) longest: u64,
     /// Middle turn.
     pub(crate) per_second: f64,
@@ -56,6 +58,7 @@ impl Cell {
             calls: all.len(),
             median: percentile(&all, 50.0),
             p99: percentile(&all, 99.0),
+            p999: percentile(&all, 99.9),
             longest: all.last().copied().unwrap_or(0),
             per_second: quartile(self.turns.iter().map(|turn| turn.per_second).collect(), 2),
             cpu_per_call: quartile(self.turns.iter().map(|turn| turn.cpu_per_call).collect(), 2),
@@ -66,6 +69,11 @@ impl Cell {
     pub(crate) fn ratios(&self, floor: &Self) -> [f64; 3] {
         let ratios = || pairs(self, floor).map(|(own, floor)| own.median as f64 / floor.median.max(1) as f64).collect();
         [1, 2, 3].map(|which| quartile(ratios(), which))
+    }
+
+    /// CPU time per call of both processes, divided by that of `floor` in the same turn; the median.
+    pub(crate) fn cpu_ratio(&self, floor: &Self) -> f64 {
+        quartile(pairs(self, floor).map(|(own, floor)| own.cpu_per_call / floor.cpu_per_call.max(1e-9)).collect(), 2)
     }
 
     /// Requests per second divided by those of `floor` in the same turn; the median.
@@ -79,13 +87,13 @@ fn pairs<'a>(own: &'a Cell, floor: &'a Cell) -> impl Iterator<Item = (&'a Turn, 
 }
 
 /// The value below which `percent` of `sorted` lie; 0 for none.
-fn percentile(sorted: &[u64], percent: f64) -> u64 {
+pub(crate) fn percentile(sorted: &[u64], percent: f64) -> u64 {
     let place = (sorted.len().saturating_sub(1) as f64 * percent / 100.0).round() as usize;
     sorted.get(place).copied().unwrap_or(0)
 }
 
 /// Quartile 1, 2 (the median) or 3; 0 for no values.
-fn quartile(mut values: Vec<f64>, which: usize) -> f64 {
+pub(crate) fn quartile(mut values: Vec<f64>, which: usize) -> f64 {
     values.sort_by(f64::total_cmp);
     let place = (values.len().saturating_sub(1) * which).div_ceil(4);
     values.get(place).copied().unwrap_or(0.0)
@@ -117,6 +125,7 @@ mod tests {
         let [low, middle, high] = cell(&[20, 200, 24]).ratios(&cell(&[10, 100, 10]));
         assert_eq!((middle, high), (2.0, 2.4));
         assert!(low <= middle);
+        assert_eq!(cell(&[10, 20]).cpu_ratio(&cell(&[10, 20])), 1.0);
         assert_eq!(cell(&[10, 20]).throughput_ratio(&cell(&[10, 20])), 1.0);
     }
 

@@ -1,30 +1,51 @@
-//! `cargo xtask bench`: the round trip against a raw socket, interleaved, with its control. The paper's whole series of
-//! experiments comes with later work.
+//! `cargo xtask bench`: the paper's experiments, in a release build.
 
+use std::os::unix::process::CommandExt;
 use std::path::Path;
-use std::process::ExitCode;
+use std::process::{Command, ExitCode};
 
-use anyhow::Result;
+use anyhow::{Context, Result};
 
 use crate::command::Run;
+use crate::workspace;
 
-/// Without the one that needs a thousand idle links.
-const QUICK_PEERS: &str = "floor,floor_again,cara,cara_one_link";
+/// What is asked of the experiments.
+#[derive(clap::Args)]
+pub(crate) struct Options {
+    /// Every kind of row within 4 minutes: fewer calls, and the slowest cells left out.
+    #[arg(long)]
+    quick: bool,
+    /// The passive node prints in every cell of the response time, not only in some.
+    #[arg(long)]
+    print: bool,
+    /// Also writes all rows here, after each experiment anew.
+    #[arg(long, value_name = "FILE")]
+    json: Option<std::path::PathBuf>,
+    /// Draws the paper's figures 6, 7 and 8 and the ratios here, as SVG and PNG.
+    #[arg(long, value_name = "DIR")]
+    plots: Option<std::path::PathBuf>,
+    /// Further options of `cara-bench experiments`, such as `--only response --chars 100`.
+    #[arg(last = true)]
+    more: Vec<String>,
+}
 
-pub(crate) fn run(quick: bool, json: Option<&Path>) -> Result<ExitCode> {
-    let bench = Run::cargo().args(["run", "--release", "--quiet", "--package", "cara-bench", "--", "skeleton"]);
-    let bench = bench.args(["--chars", "100,1000,20000", "--pins", "same,split"]);
-    let bench = if quick {
-        bench.args(["--callers", "1,8", "--calls", "200", "--rounds", "4", "--peers", QUICK_PEERS])
-    } else {
-        bench.args(["--callers", "1,8,64", "--calls", "400", "--rounds", "20", "--pause-ms", "0,10"])
-    };
-    let bench = match json {
-        // The child runs in the project's root, wherever this command was started.
-        Some(path) => bench.args(["--json".as_ref(), std::path::absolute(path)?.as_os_str()]),
-        None => bench,
-    };
-    bench.stream()?;
-    println!("note: availability, distribution 2 and the other systems come with the paper's experiments");
-    Ok(ExitCode::SUCCESS)
+/// Builds the program and becomes it, so that Ctrl-C reaches it alone and it can write what it has.
+pub(crate) fn run(options: &Options) -> Result<ExitCode> {
+    Run::cargo().args(["build", "--release", "--quiet", "--package", "cara-bench"]).stream()?;
+    let folder = std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| workspace::root().join("target"), Into::into);
+    let program = folder.join("release").join("cara-bench");
+    let mut command = Command::new(&program);
+    command.arg("experiments").args(options.quick.then_some("--quick")).args(options.print.then_some("--print"));
+    for (name, path) in [("--json", &options.json), ("--plots", &options.plots)] {
+        if let Some(path) = path {
+            // The program runs in the project's root, wherever this command was started.
+            command.arg(name).arg(absolute(path)?);
+        }
+    }
+    command.args(&options.more).current_dir(workspace::root());
+    Err(command.exec()).with_context(|| format!("cannot start {}", program.display()))
+}
+
+fn absolute(path: &Path) -> Result<std::path::PathBuf> {
+    std::path::absolute(path).with_context(|| format!("{} is no path", path.display()))
 }

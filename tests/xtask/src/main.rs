@@ -58,15 +58,8 @@ enum Task {
         #[arg(long)]
         write: bool,
     },
-    /// Measures the round trip against a raw socket, interleaved with its control.
-    Bench {
-        /// Fewer requests per configuration.
-        #[arg(long)]
-        quick: bool,
-        /// Also writes the figures here.
-        #[arg(long, value_name = "FILE")]
-        json: Option<PathBuf>,
-    },
+    /// Repeats the paper's experiments against raw sockets, interleaved with a control, and draws its figures.
+    Bench(bench::Options),
     /// Puts many s_units on one manager and measures how they join, what they cost, and how they come back.
     Fleet {
         /// How many s_units; 1,000 if not given.
@@ -96,7 +89,7 @@ fn main() -> ExitCode {
         Task::Test { groups, quick, list: false } => runner::run(&groups, quick),
         Task::Sizes { json, write } => firmware::sizes(json.as_deref(), write),
         Task::Fleet { nodes, json } => fleet::run(nodes, json.as_deref()),
-        Task::Bench { quick, json } => bench::run(quick, json.as_deref()),
+        Task::Bench(options) => bench::run(&options),
         Task::Firmware { board: Some(board), flash: true, .. } => firmware::flash(&board),
         Task::Firmware { board, desk, .. } if desk.run => firmware::desk(board.as_deref(), &desk),
         Task::Firmware { board, .. } => firmware::build(board.as_deref()),

@@ -1,32 +1,38 @@
-//! CARA through its public API, discovery on: a passive m_unit that echoes, and main m_units that call it. Both ends
-//! read the string as `&str`.
+//! CARA through its public API, discovery on: a passive m_unit that echoes and takes, main m_units that call it, and
+//! the s_units of distribution 2. Both ends read the string as `&str`.
 
 use std::process::{Child, Command, Stdio};
-use std::sync::OnceLock;
-use std::time::Duration;
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
 use cara_std::{
-    Call, CommunicationSystem, Constraints, Interfaces, Parameters, ParametersView, Peer as Node, ServiceError, Unit,
+    Builder, Call, CommunicationSystem, Constraints, Delivery as CaraDelivery, Interfaces, Parameters, ParametersView,
+    Peer as Node, RequestOptions, ServiceError, Threads, Unit, UnitEvent,
 };
 
-use super::{Caller, Peer, Server};
+use super::{Caller, Delivery, Executed, Limits, Peer, Place, Server};
+use crate::print::Printer;
 
 /// Longest text in bytes.
-const TEXT_BYTES: u32 = 100_000;
+pub(crate) const TEXT_BYTES: u32 = 100_000;
 /// Longest block: the text and its length.
 const MESSAGE_BYTES: u32 = TEXT_BYTES + 64;
 /// Room of the caller's parameters.
 const PARAMETERS_BYTES: usize = TEXT_BYTES as usize + 1_024;
 /// How long the two may take to find each other.
-const PATIENCE: Duration = Duration::from_secs(10);
+const PATIENCE: Duration = Duration::from_secs(20);
+
+/// Parameters with one text.
+pub(crate) type Text = Parameters<PARAMETERS_BYTES>;
 
 /// How callers share links.
 pub(crate) enum Cara {
     /// Each caller is an m_unit of its own.
     LinkEach,
     /// All callers of a process use one link.
-    OneLink(OnceLock<CommunicationSystem>),
+    OneLink(Mutex<Option<CommunicationSystem>>),
     /// As `LinkEach`, and [`IDLE_LINKS`] s_units are connected to the passive m_unit and do nothing.
     AmongIdle,
 }
@@ -35,11 +41,12 @@ pub(crate) enum Cara {
 const IDLE_LINKS: usize = 1_000;
 
 /// The process that holds the idle s_units; ends when its standard input does.
-pub(crate) fn idle(run: u32) -> Result<()> {
+pub(crate) fn idle(place: &Place) -> Result<()> {
+    let threads = Threads::new()?;
     let mut units = Vec::new();
     for id in 0..IDLE_LINKS {
         let builder = Unit::builder(&format!("idle-{id}"), id as u32, "passive", 1)?;
-        let unit = builder.fleet(run).interfaces(Interfaces::Loopback).build_unit()?;
+        let unit = placed(builder, place).threads(&threads).build_unit()?;
         unit.start()?;
         units.push(unit);
     }
@@ -48,89 +55,147 @@ pub(crate) fn idle(run: u32) -> Result<()> {
 }
 
 /// Starts the idle s_units and waits until they have joined.
-fn start_idle(run: u32, passive: &CommunicationSystem) -> Result<Child> {
+fn start_idle(place: &Place, passive: &CommunicationSystem) -> Result<Child> {
     let program = std::env::current_exe()?;
     let mut command = Command::new(program);
-    command.args(["idle", "--peer", "cara", "--run", &run.to_string()]).stdin(Stdio::piped());
+    command.args(["idle", "--run", &place.run.to_string()]).stdin(Stdio::piped());
     let child = command.spawn()?;
-    let end = std::time::Instant::now() + 6 * PATIENCE;
+    let end = Instant::now() + 3 * PATIENCE;
     while passive.number_of_s_units() < IDLE_LINKS {
-        ensure!(std::time::Instant::now() < end, "only {} idle s_units joined", passive.number_of_s_units());
+        ensure!(Instant::now() < end, "only {} idle s_units joined", passive.number_of_s_units());
         std::thread::sleep(Duration::from_millis(20));
     }
     Ok(child)
 }
 
-fn system(run: u32, name: &str, id: u32) -> Result<CommunicationSystem> {
+fn placed(builder: Builder<()>, place: &Place) -> Builder<()> {
+    builder.fleet(place.run).discovery_port(place.discovery_port()).interfaces(Interfaces::Loopback)
+}
+
+fn system(place: &Place, name: &str, id: u32) -> Result<CommunicationSystem> {
     let constraints = Constraints { message_size: MESSAGE_BYTES, maximum_nodes: 2_000, ..Constraints::M_UNIT };
-    let builder = CommunicationSystem::builder(name, id)?.fleet(run).interfaces(Interfaces::Loopback);
+    let builder = placed(CommunicationSystem::builder(name, id)?, place);
     let system = builder.constraints(constraints).build_system()?;
     system.start()?;
     Ok(system)
 }
 
-fn echo(_: &Call, view: &mut ParametersView) -> Result<(), ServiceError> {
+/// What the service does with a text: reads it, and prints it where that is asked for.
+fn look_at(view: &ParametersView, printer: Printer) -> Result<(), ServiceError> {
     let text: &str = view.variable("text").map_err(|_| ServiceError::BadResults)?;
     std::hint::black_box(text.len());
+    printer.print(text);
     Ok(())
 }
 
 impl Peer for Cara {
-    fn start_server(&self, run: u32) -> Result<Server> {
-        let passive = system(run, "passive", 1)?;
-        let text = parameters()?;
-        passive.my_function_list().add_function("echo", &*text, echo)?;
+    fn start_server(&self, place: &Place) -> Result<Server> {
+        let passive = system(place, "passive", 1)?;
+        let (text, printer, executed) = (parameters()?, place.printer(), Arc::new(Executed::default()));
+        let counted = executed.clone();
+        let functions = passive.my_function_list();
+        functions.add_function("echo", &*text, move |_: &Call, view: &mut ParametersView| look_at(view, printer))?;
+        functions.add_function("take", &*text, move |_: &Call, view: &mut ParametersView| {
+            counted.note();
+            look_at(view, printer)
+        })?;
         passive.publish_my_function_list()?;
         let idle = match self {
-            Self::AmongIdle => Some(start_idle(run, &passive)?),
+            Self::AmongIdle => Some(start_idle(place, &passive)?),
             _ => None,
         };
-        Ok(Server { address: String::from("by discovery"), keep: Box::new((passive, idle)) })
+        let constrained = passive.clone();
+        let constrain = move |limits: Limits| -> Result<()> {
+            let minimum_interval = cara_std::Duration::from_millis(limits.minimum_interval_ms);
+            let wanted =
+                Constraints { minimum_interval, message_size: limits.message_size, ..constrained.constraints() };
+            Ok(constrained.set_constraints(wanted)?)
+        };
+        let address = String::from("by discovery");
+        Ok(Server { address, executed, constrain: Some(Box::new(constrain)), keep: Box::new((passive, idle)) })
     }
 
-    fn connect(&self, run: u32, _address: &str) -> Result<Box<dyn Caller>> {
-        static NEXT: std::sync::atomic::AtomicU32 = std::sync::atomic::AtomicU32::new(2);
+    fn connect(&self, place: &Place, _address: &str) -> Result<Box<dyn Caller>> {
+        static NEXT: AtomicU32 = AtomicU32::new(2);
         let new = || {
-            let id = NEXT.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
-            system(run, &format!("main-{}-{id}", std::process::id()), id)
+            let id = NEXT.fetch_add(1, Ordering::Relaxed);
+            system(place, &format!("main-{}-{id}", std::process::id()), id)
         };
         let main = match self {
             Self::LinkEach | Self::AmongIdle => new()?,
-            Self::OneLink(shared) => match shared.get() {
-                Some(main) => main.clone(),
-                None => {
-                    let main = new()?;
-                    shared.get_or_init(|| main).clone()
-                }
-            },
+            Self::OneLink(shared) => {
+                let mut shared = shared.lock().unwrap_or_else(PoisonError::into_inner);
+                let main = match shared.take() {
+                    Some(main) => main,
+                    None => new()?,
+                };
+                shared.insert(main).clone()
+            }
         };
-        let passive = find(&main)?;
-        Ok(Box::new(Echo { _main: main, passive, parameters: parameters()? }))
+        let failures = Failures::watch(main.events());
+        let passive = found(|| main.m_unit("passive"))?;
+        Ok(Box::new(Echo { _kept: Kept::Main(main), passive, parameters: parameters()?, failures }))
+    }
+
+    fn connect_further(&self, place: &Place, _address: &str, number: u32) -> Result<Box<dyn Caller>> {
+        let builder = Unit::builder(&format!("further-{number}"), 100 + number, "passive", 1)?;
+        let constraints = Constraints { message_size: MESSAGE_BYTES, ..Constraints::M_UNIT };
+        let unit = placed(builder, place).constraints(Constraints { maximum_nodes: 1, ..constraints }).build_unit()?;
+        let failures = Failures::watch(unit.events());
+        unit.start()?;
+        let passive = found(|| unit.manager())?;
+        Ok(Box::new(Echo { _kept: Kept::Further(unit), passive, parameters: parameters()?, failures }))
     }
 }
 
-fn parameters() -> Result<Box<Parameters<PARAMETERS_BYTES>>> {
-    let mut parameters = Box::new(Parameters::<PARAMETERS_BYTES>::sized());
+/// An argument and result with one text.
+pub(crate) fn parameters() -> Result<Box<Text>> {
+    let mut parameters = Box::new(Text::sized());
     parameters.add_string("text", TEXT_BYTES)?;
     Ok(parameters)
 }
 
-fn find(main: &CommunicationSystem) -> Result<Node> {
-    let end = std::time::Instant::now() + PATIENCE;
+fn found(passive: impl Fn() -> Option<Node>) -> Result<Node> {
+    let end = Instant::now() + PATIENCE;
     loop {
-        if let Some(passive) = main.m_unit("passive") {
-            ensure!(passive.wait_for_function("echo", cara_std::Duration::from(PATIENCE)), "nothing was published");
+        if let Some(passive) = passive().filter(Node::is_connected) {
+            ensure!(passive.wait_for_function("take", PATIENCE), "nothing was published");
             return Ok(passive);
         }
-        ensure!(std::time::Instant::now() < end, "the passive m_unit was not found");
+        ensure!(Instant::now() < end, "the passive m_unit was not found");
         std::thread::sleep(Duration::from_millis(2));
     }
 }
 
+/// Counts requests that were reported as not executed.
+struct Failures(Arc<AtomicU64>);
+
+impl Failures {
+    /// In a thread of its own, so that none of the events finds the channel full.
+    fn watch(events: std::sync::mpsc::Receiver<UnitEvent>) -> Self {
+        let count = Arc::new(AtomicU64::new(0));
+        let counted = count.clone();
+        std::thread::spawn(move || {
+            let failed = events.iter().filter(|event| matches!(event, UnitEvent::RequestFailed { .. }));
+            failed.for_each(|_| {
+                counted.fetch_add(1, Ordering::Relaxed);
+            });
+        });
+        Self(count)
+    }
+}
+
+/// Keeps the unit of a caller.
+enum Kept {
+    Main(#[expect(dead_code, reason = "kept, not read")] CommunicationSystem),
+    Further(#[expect(dead_code, reason = "kept, not read")] Unit),
+}
+
 struct Echo {
-    _main: CommunicationSystem,
+    _kept: Kept,
     passive: Node,
-    parameters: Box<Parameters<PARAMETERS_BYTES>>,
+    parameters: Box<Text>,
+    failures: Failures,
 }
 
 impl Caller for Echo {
@@ -138,5 +203,25 @@ impl Caller for Echo {
         self.parameters.set_value("text", text)?;
         self.passive.block_request("echo", &mut *self.parameters).context("the call failed")?;
         Ok(self.parameters.variable::<&str>("text")?.len())
+    }
+
+    fn send(&mut self, text: &str, delivery: Delivery) -> Result<(), String> {
+        let delivery = match delivery {
+            Delivery::Reliable => CaraDelivery::Reliable,
+            Delivery::BestEffort => CaraDelivery::BestEffort,
+        };
+        let options = RequestOptions { delivery, ..RequestOptions::default() };
+        let sent = self.parameters.set_value("text", text);
+        let sent = sent.and_then(|()| self.passive.request_with("take", &*self.parameters, &options));
+        sent.map(|_| ()).map_err(|error| error.to_string())
+    }
+
+    fn flush(&mut self) {
+        // A link that has ended has nothing to flush, and its requests are reported.
+        let _ = self.passive.flush();
+    }
+
+    fn failed(&mut self) -> u64 {
+        self.failures.0.swap(0, Ordering::Relaxed)
     }
 }

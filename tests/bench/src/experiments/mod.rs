@@ -1,0 +1,198 @@
+//! The experiments of the paper's section 3, one after the other, and what goes beyond them.
+
+mod availability;
+mod constraints;
+mod plan;
+mod response;
+mod scale;
+mod share;
+mod throughput;
+
+use std::path::{Path, PathBuf};
+use std::time::{Instant, SystemTime, UNIX_EPOCH};
+
+use anyhow::{Result, bail};
+use clap::{Args, ValueEnum};
+
+use crate::pin::Pin;
+use crate::plots;
+use crate::progress::{is_stopped, stop_at_interrupt, was_stopped};
+use crate::results::{About, Results};
+use crate::table;
+use plan::{Extent, Plan};
+
+/// What to run.
+#[derive(Args)]
+pub(crate) struct Options {
+    /// Every kind of row in a few minutes: fewer calls, and the slowest cells left out.
+    #[arg(long)]
+    quick: bool,
+    /// Every kind of row in seconds, to see that the program works. The figures mean nothing.
+    #[arg(long, conflicts_with = "quick")]
+    tiny: bool,
+    /// The passive node prints in every cell of the response time, not only in some.
+    #[arg(long)]
+    print: bool,
+    /// Only these experiments.
+    #[arg(long, value_delimiter = ',')]
+    only: Vec<Experiment>,
+    /// Only these places, where an experiment has several.
+    #[arg(long, value_delimiter = ',')]
+    pins: Vec<Pin>,
+    /// Only these lengths of the text in the response time.
+    #[arg(long, value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    chars: Vec<u32>,
+    /// So many turns of each cell of the response time instead of the usual.
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    rounds: Option<u32>,
+    /// Writes all rows there as one JSON object, after each experiment anew.
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+    /// Draws the paper's figures 6, 7 and 8 and the ratios there, as SVG and PNG.
+    #[arg(long, value_name = "DIR")]
+    plots: Option<PathBuf>,
+}
+
+/// One kind of row each.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Experiment {
+    Response,
+    Throughput,
+    Share,
+    Scale,
+    Constraints,
+    Availability,
+}
+
+impl Experiment {
+    fn measure(self, plan: &Plan, results: &mut Results) -> Result<()> {
+        match self {
+            Self::Response => response::measure(plan, &mut results.response),
+            Self::Throughput => throughput::measure(plan, &mut results.throughput),
+            Self::Share => share::measure(plan, &mut results.share),
+            Self::Scale => scale::measure(plan, &mut results.scale),
+            Self::Constraints => constraints::measure(plan, &mut results.constraints),
+            Self::Availability => availability::measure(plan, &mut results.availability),
+        }
+    }
+}
+
+/// Runs them; what was measured is written and shown even where the run is stopped or an experiment fails.
+pub(crate) fn run(options: &Options) -> Result<()> {
+    stop_at_interrupt()?;
+    let plan = plan(options)?;
+    let began = Instant::now();
+    let mut results = Results { run: about(&plan), ..Results::default() };
+    let mut failures = Vec::new();
+    for experiment in Experiment::value_variants() {
+        if is_stopped() || !(options.only.is_empty() || options.only.contains(experiment)) {
+            continue;
+        }
+        match experiment.measure(&plan, &mut results) {
+            Err(error) if !was_stopped() => failures.push(format!("{experiment:?}: {error:#}")),
+            _ => {}
+        }
+        results.run.seconds = began.elapsed().as_secs_f64().round();
+        results.run.load_after = load();
+        write(&results, options.json.as_deref())?;
+    }
+    results.run.is_complete = !is_stopped() && failures.is_empty() && options.only.is_empty();
+    results.run.notes.extend(failures.iter().cloned());
+    write(&results, options.json.as_deref())?;
+    table::show(&results);
+    if let Some(folder) = &options.plots {
+        plots::draw(&results, folder)?;
+    }
+    failures.extend(silent_losses(&results));
+    if failures.is_empty() { Ok(()) } else { bail!("{}", failures.join("\n")) }
+}
+
+fn plan(options: &Options) -> Result<Plan> {
+    let extent = match (options.quick, options.tiny) {
+        (true, _) => Extent::Quick,
+        (_, true) => Extent::Tiny,
+        _ => Extent::Full,
+    };
+    let mut plan = Plan::new(extent, options.print)?;
+    plan.narrow(&options.pins, &options.chars, options.rounds);
+    Ok(plan)
+}
+
+fn write(results: &Results, path: Option<&Path>) -> Result<()> {
+    path.map_or(Ok(()), |path| results.write(path))
+}
+
+fn about(plan: &Plan) -> About {
+    let started = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    let git = std::process::Command::new("git").args(["rev-parse", "--short", "HEAD"]).output().ok();
+    let commit = git.filter(|git| git.status.success()).and_then(|git| String::from_utf8(git.stdout).ok());
+    About {
+        version: env!("CARGO_PKG_VERSION").into(),
+        commit: commit.unwrap_or_default().trim().into(),
+        extent: plan.extent.name().into(),
+        is_release_build: !cfg!(debug_assertions),
+        started_unix_s: started.as_secs(),
+        cpus: std::thread::available_parallelism().map_or(1, usize::from),
+        load_before: load(),
+        notes: plan.notes.clone(),
+        ..About::default()
+    }
+}
+
+/// Processes that ran or wanted to, over the last minute.
+fn load() -> f64 {
+    let text = std::fs::read_to_string("/proc/loadavg").unwrap_or_default();
+    text.split_whitespace().next().and_then(|load| load.parse().ok()).unwrap_or(0.0)
+}
+
+/// Reliable requests that neither ran nor were refused: none may be, at any load.
+fn silent_losses(results: &Results) -> Vec<String> {
+    let reliable = results.availability.iter().filter(|row| row.delivery == crate::peers::Delivery::Reliable);
+    let lost = reliable.map(|row| (&row.counts, row.chars, row.period_ms));
+    let constrained = results.constraints.iter().map(|row| (&row.counts, row.chars, row.period_ms));
+    lost.chain(constrained)
+        .filter(|(counts, ..)| counts.lost > 0 || counts.executed > counts.sent)
+        .map(|(counts, chars, period_ms)| {
+            format!(
+                "{chars} characters every {period_ms} ms: {} sent, {} executed, {} vanished",
+                counts.sent, counts.executed, counts.lost
+            )
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::peers::Delivery;
+    use crate::results::{Availability, Counts, MODE};
+
+    fn row(delivery: Delivery, counts: Counts) -> Availability {
+        Availability {
+            distribution: 1,
+            chars: 100,
+            period_ms: 1,
+            delivery,
+            pin: Pin::Same,
+            mode: MODE,
+            counts,
+            worst_group: 1.0,
+            executed_per_s: 1.0,
+            floor_per_s: None,
+            ratio: None,
+        }
+    }
+
+    fn losses(delivery: Delivery, counts: Counts) -> usize {
+        silent_losses(&Results { availability: vec![row(delivery, counts)], ..Results::default() }).len()
+    }
+
+    #[test]
+    fn what_vanishes_or_is_doubled_fails_the_run() {
+        let counts = |executed, lost| Counts { offered: 10, sent: 9, refused: 1, executed, lost, ..Counts::default() };
+        assert_eq!(losses(Delivery::Reliable, counts(9, 0)), 0);
+        assert_eq!(losses(Delivery::Reliable, counts(8, 1)), 1);
+        assert_eq!(losses(Delivery::Reliable, counts(10, 0)), 1);
+        assert_eq!(losses(Delivery::BestEffort, counts(8, 1)), 0);
+    }
+}

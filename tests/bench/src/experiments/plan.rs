@@ -1,0 +1,221 @@
+//! How much of each experiment is run: in full, in minutes, or just enough to see that it works.
+
+use anyhow::Result;
+
+use crate::block::Order;
+use crate::pair::Setting;
+use crate::pin::{self, Pin};
+
+/// How much is run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Extent {
+    Full,
+    Quick,
+    Tiny,
+}
+
+impl Extent {
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            Self::Full => "full",
+            Self::Quick => "quick",
+            Self::Tiny => "tiny",
+        }
+    }
+
+    /// The value for this extent.
+    fn of<T>(self, full: T, quick: T, tiny: T) -> T {
+        match self {
+            Self::Full => full,
+            Self::Quick => quick,
+            Self::Tiny => tiny,
+        }
+    }
+}
+
+/// Everything that is to be measured.
+#[derive(Debug, Clone)]
+pub(crate) struct Plan {
+    pub(crate) extent: Extent,
+    pub(crate) response: Vec<Group>,
+    pub(crate) throughput: Group,
+    pub(crate) throughput_pins: Vec<Pin>,
+    /// One-way messages of each turn.
+    pub(crate) one_way: u32,
+    /// Calls of each turn whose time is taken apart.
+    pub(crate) share_calls: u32,
+    pub(crate) share_rounds: u32,
+    pub(crate) nodes: Vec<u32>,
+    pub(crate) scale_rounds: u32,
+    pub(crate) scale_calls: u32,
+    pub(crate) availability: Vec<Bursts>,
+    pub(crate) constrained: Constrained,
+    /// Where the experiments run that have one place only.
+    pub(crate) pin: Pin,
+    /// What could not be planned.
+    pub(crate) notes: Vec<String>,
+}
+
+/// Cells of echo calls that share their processes.
+#[derive(Debug, Clone)]
+pub(crate) struct Group {
+    pub(crate) setting: Setting,
+    pub(crate) peers: Vec<&'static str>,
+    pub(crate) orders: Vec<Order>,
+    pub(crate) rounds: u32,
+}
+
+/// Availability at these sizes and periods.
+#[derive(Debug, Clone)]
+pub(crate) struct Bursts {
+    pub(crate) distribution: u8,
+    pub(crate) delivery: crate::peers::Delivery,
+    pub(crate) chars: Vec<u32>,
+    pub(crate) periods_ms: Vec<u64>,
+    pub(crate) groups: u32,
+    pub(crate) group: u32,
+}
+
+/// The sweep over constraints: every interval with every message size.
+#[derive(Debug, Clone)]
+pub(crate) struct Constrained {
+    pub(crate) intervals_ms: Vec<u64>,
+    pub(crate) message_sizes: Vec<u32>,
+    pub(crate) chars: Vec<u32>,
+    pub(crate) period_ms: u64,
+    pub(crate) count: u32,
+}
+
+const COMPARED: [&str; 3] = ["floor", "floor_again", "cara"];
+const AMONG: [&str; 4] = ["floor", "floor_again", "cara", "cara_among_1000_idle"];
+const SHARED: [&str; 4] = ["floor", "floor_again", "cara", "cara_one_link"];
+/// The paper's sizes, and one beyond them.
+const CHARS: [u32; 8] = [1, 10, 100, 1_000, 5_000, 10_000, 20_000, 100_000];
+const SOME_CHARS: [u32; 3] = [100, 1_000, 20_000];
+
+impl Plan {
+    /// The plan for a machine with these CPUs; `print` in all cells of the response time instead of some.
+    pub(crate) fn new(extent: Extent, print: bool) -> Result<Self> {
+        let has_two = pin::cpus(Pin::Split).is_ok();
+        let pins: &[Pin] = if has_two { &[Pin::Same, Pin::Split, Pin::None] } else { &[Pin::Same, Pin::None] };
+        let notes = if has_two { Vec::new() } else { vec!["one CPU only: no rows with pin split".into()] };
+        let pin = if has_two { Pin::Split } else { Pin::Same };
+        let response = match extent {
+            Extent::Tiny => vec![tiny_group(1, false), tiny_group(2, false), tiny_group(1, true)],
+            _ => response(extent, pins, pin, print),
+        };
+        let callers = extent.of(vec![1, 8, 64], vec![1, 8, 64], vec![1, 2]);
+        let orders = callers.into_iter().map(|callers| busy_order(callers, extent.of(3_200, 1_600, 8))).collect();
+        let setting = Setting { pin, distribution: 1, print: false };
+        Ok(Self {
+            extent,
+            response,
+            throughput: Group { setting, peers: SHARED.to_vec(), orders, rounds: extent.of(15, 3, 1) },
+            throughput_pins: if extent == Extent::Tiny { vec![pin] } else { pins[..pins.len() - 1].to_vec() },
+            one_way: extent.of(200_000, 20_000, 50),
+            share_calls: extent.of(400, 200, 5),
+            share_rounds: extent.of(20, 5, 1),
+            nodes: extent.of(vec![1, 10, 100, 1_000, 5_000], vec![1, 10, 100, 1_000], vec![1, 3]),
+            scale_rounds: extent.of(20, 4, 1),
+            scale_calls: extent.of(400, 200, 5),
+            availability: availability(extent),
+            constrained: constrained(extent),
+            pin,
+            notes,
+        })
+    }
+
+    /// Leaves out what is not among `pins` and `chars`, where these are given, and changes the number of turns.
+    pub(crate) fn narrow(&mut self, pins: &[Pin], chars: &[u32], rounds: Option<u32>) {
+        if !pins.is_empty() {
+            self.response.retain(|group| pins.contains(&group.setting.pin));
+            self.throughput_pins.retain(|pin| pins.contains(pin));
+        }
+        for group in &mut self.response {
+            group.orders.retain(|order| chars.is_empty() || chars.contains(&order.chars));
+            group.rounds = rounds.unwrap_or(group.rounds);
+        }
+        self.response.retain(|group| !group.orders.is_empty());
+    }
+}
+
+fn order(chars: u32, calls_per_caller: u32, pause_ms: u64) -> Order {
+    Order { chars, callers: 1, calls_per_caller, pause_ms, delay_us: 0 }
+}
+
+/// Calls of 100 characters, shared among so many callers; fewer than 25 each would measure how threads start.
+fn busy_order(callers: u32, calls: u32) -> Order {
+    let fewest = calls.min(25);
+    Order { callers, ..order(100, (calls / callers).max(fewest), 0) }
+}
+
+fn tiny_group(distribution: u8, print: bool) -> Group {
+    let orders = vec![order(1, 5, 0), order(20_000, 5, 0), order(100, 2, 10)];
+    Group { setting: Setting { pin: Pin::None, distribution, print }, peers: COMPARED.to_vec(), orders, rounds: 1 }
+}
+
+/// Back to back at every size, everywhere, also among idle links; then spaced; then with the service printing.
+fn response(extent: Extent, pins: &[Pin], pin: Pin, print: bool) -> Vec<Group> {
+    let mut groups = Vec::new();
+    let mut add = |setting, peers: &[&'static str], rounds, orders| {
+        groups.push(Group { setting, peers: peers.to_vec(), orders, rounds });
+    };
+    let orders = |chars: &[u32], calls, pause_ms| chars.iter().map(|&chars| order(chars, calls, pause_ms)).collect();
+    let calls = extent.of(200, 100, 5);
+    for distribution in [1, 2] {
+        for &pin in pins {
+            let setting = Setting { pin, distribution, print };
+            let peers = if distribution == 1 && pin != Pin::None { &AMONG[..] } else { &COMPARED[..] };
+            add(setting, peers, extent.of(30, 4, 1), orders(&CHARS, calls, 0));
+        }
+        let setting = Setting { pin, distribution, print };
+        let (spaced, rounds) = extent.of((&CHARS[..], 10), (&SOME_CHARS[..], 1), (&SOME_CHARS[..], 1));
+        add(setting, &COMPARED, rounds, orders(spaced, 10, 10));
+        let (far, calls, rounds) = extent.of((&CHARS[..], 5, 20), (&[1_000, 20_000][..], 2, 1), (&[100][..], 1, 1));
+        add(setting, &COMPARED, rounds, orders(far, calls, 2_000));
+    }
+    if !print {
+        let setting = Setting { pin, distribution: 1, print: true };
+        add(setting, &COMPARED, extent.of(30, 4, 1), orders(&CHARS, calls, 0));
+    }
+    groups
+}
+
+fn availability(extent: Extent) -> Vec<Bursts> {
+    use crate::peers::Delivery::{BestEffort, Reliable};
+    let (groups, group) = extent.of((10, 100), (1, 100), (1, 5));
+    let bursts = |distribution, delivery, chars: &[u32], periods_ms: &[u64]| Bursts {
+        distribution,
+        delivery,
+        chars: chars.to_vec(),
+        periods_ms: periods_ms.to_vec(),
+        groups,
+        group,
+    };
+    let all = [0, 1, 2, 5, 10, 20, 50, 70, 80, 100];
+    let periods: &[u64] = extent.of(&all[..], &[0, 1, 10, 20, 70], &[0, 1]);
+    let chars: &[u32] = extent.of(&[100, 1_000, 5_000, 10_000, 20_000], &[100, 20_000], &[100, 20_000]);
+    // A datagram holds at most 1,400 bytes: a longer text is refused at once, whatever the period.
+    let short: &[u32] = extent.of(&[100, 1_000], &[1_000], &[100]);
+    let short_periods: &[u64] = extent.of(&all[..], &[0, 1, 10], &[0]);
+    [1, 2]
+        .into_iter()
+        .flat_map(|distribution| {
+            [
+                bursts(distribution, Reliable, chars, periods),
+                bursts(distribution, BestEffort, short, short_periods),
+                bursts(distribution, BestEffort, &[5_000], &[0]),
+            ]
+        })
+        .collect()
+}
+
+fn constrained(extent: Extent) -> Constrained {
+    Constrained {
+        intervals_ms: extent.of(vec![0, 1, 2, 5, 10, 20, 50], vec![0, 2, 10], vec![0, 5]),
+        message_sizes: extent.of(vec![1_024, 8_192, 32_768], vec![1_024, 32_768], vec![1_024, 32_768]),
+        chars: extent.of(vec![100, 1_000, 5_000, 20_000], vec![100, 20_000], vec![100, 20_000]),
+        period_ms: extent.of(2, 2, 1),
+        count: extent.of(1_000, 100, 5),
+    }
+}

@@ -1,0 +1,107 @@
+//! Response time: echo calls of each peer in each cell, turn by turn.
+
+use anyhow::{Context, Result};
+
+use super::plan::{Group, Plan};
+use crate::block::Order;
+use crate::pair::{Pair, Setting};
+use crate::progress::{bar, is_stopped};
+use crate::results::{MODE, Response, micros, ratio};
+use crate::statistics::Cell;
+
+/// Cells by order, then by peer; the first peer is the floor.
+pub(super) type Cells = Vec<Vec<Cell>>;
+
+/// All groups; the rows of those that are complete, and of what there is of the one that is not.
+pub(super) fn measure(plan: &Plan, rows: &mut Vec<Response>) -> Result<()> {
+    for (index, group) in plan.response.iter().enumerate() {
+        if is_stopped() {
+            break;
+        }
+        let Setting { pin, distribution, .. } = group.setting;
+        let of = format!("{} of {}", index + 1, plan.response.len());
+        let mut cells = Cells::new();
+        let outcome = turns(group, &mut cells, &format!("response {of}: {pin}, distribution {distribution}"));
+        rows.extend(self::rows(group, &cells));
+        outcome?;
+    }
+    Ok(())
+}
+
+/// Every peer in every cell, once per turn.
+pub(super) fn turns(group: &Group, cells: &mut Cells, what: &str) -> Result<()> {
+    let bar = bar(what, group.rounds as usize * group.orders.len());
+    let pairs = group.peers.iter().map(|peer| Pair::start(peer, group.setting));
+    let mut pairs = pairs.collect::<Result<Vec<_>>>()?;
+    *cells = group.orders.iter().map(|_| pairs.iter().map(|_| Cell::default()).collect()).collect();
+    for _ in 0..group.rounds {
+        for (order, cells) in group.orders.iter().zip(cells.iter_mut()) {
+            if is_stopped() {
+                return Ok(());
+            }
+            let shared = order.pause_ms > 0 && group.setting.distribution == 1;
+            let turn = if shared { spaced_turn(&mut pairs, order, cells) } else { turn(&mut pairs, order, cells) };
+            turn.with_context(|| format!("{} characters, {} callers", order.chars, order.callers))?;
+            bar.inc(1);
+        }
+    }
+    bar.finish_and_clear();
+    Ok(())
+}
+
+fn turn(pairs: &mut [Pair], order: &Order, cells: &mut [Cell]) -> Result<()> {
+    pairs.iter_mut().zip(cells).try_for_each(|(pair, cell)| {
+        cell.turns.push(pair.block(order)?);
+        Ok(())
+    })
+}
+
+/// Peers that pause are under way together: each calls while the others pause.
+fn spaced_turn(pairs: &mut [Pair], order: &Order, cells: &mut [Cell]) -> Result<()> {
+    let offset = order.pause_ms * 1_000 / pairs.len().max(1) as u64;
+    let begun = pairs.iter_mut().zip(0..).map(|(pair, place): (_, u64)| {
+        let delayed = Order { delay_us: offset * place, ..order.clone() };
+        pair.begin_block(&delayed)
+    });
+    let begun = begun.collect::<Result<Vec<_>>>()?;
+    let turns = pairs.iter_mut().zip(begun).map(|(pair, used)| pair.end_block(used));
+    let turns = turns.collect::<Result<Vec<_>>>()?;
+    cells.iter_mut().zip(turns).for_each(|(cell, turn)| cell.turns.push(turn));
+    Ok(())
+}
+
+/// Cells without any complete turn have no row.
+fn rows(group: &Group, cells: &Cells) -> Vec<Response> {
+    let mut rows = Vec::new();
+    for (order, cells) in group.orders.iter().zip(cells) {
+        let Some(floor) = cells.first() else { continue };
+        let measured = group.peers.iter().zip(cells).filter(|(_, cell)| !cell.turns.is_empty());
+        rows.extend(measured.map(|(peer, cell)| row(peer, group.setting, order, cell, floor)));
+    }
+    rows
+}
+
+fn row(peer: &str, setting: Setting, order: &Order, cell: &Cell, floor: &Cell) -> Response {
+    let figures = cell.figures();
+    let [lower, middle, upper] = cell.ratios(floor).map(ratio);
+    Response {
+        peer: peer.to_owned(),
+        distribution: setting.distribution,
+        chars: order.chars,
+        pin: setting.pin,
+        mode: MODE,
+        print: setting.print,
+        pause_ms: order.pause_ms,
+        n: figures.calls,
+        p50_us: micros(figures.median),
+        p99_us: micros(figures.p99),
+        p999_us: micros(figures.p999),
+        max_us: micros(figures.longest),
+        ratio: middle,
+        ratio_lower_quartile: lower,
+        ratio_upper_quartile: upper,
+        p99_ratio: ratio(figures.p99 as f64 / floor.figures().p99.max(1) as f64),
+        cpu_us_per_call: micros(figures.cpu_per_call as u64),
+        cpu_ratio: ratio(cell.cpu_ratio(floor)),
+    }
+}

@@ -1,0 +1,100 @@
+//! Throughput: requests per second with several callers, and one-way messages per second over one connection.
+
+use anyhow::{Result, ensure};
+
+use super::plan::{Group, Plan};
+use super::response::{Cells, turns};
+use crate::burst::Burst;
+use crate::pair::{Pair, Setting};
+use crate::peers::Delivery;
+use crate::pin::Pin;
+use crate::progress::{bar, is_stopped};
+use crate::results::{Kind, MODE, Throughput, ratio};
+use crate::statistics::quartile;
+
+/// Peers of the one-way part; the first is the floor.
+const ONE_WAY_PEERS: [&str; 3] = ["floor", "floor_again", "cara"];
+/// Characters of a one-way message.
+const CHARS: u32 = 100;
+
+pub(super) fn measure(plan: &Plan, rows: &mut Vec<Throughput>) -> Result<()> {
+    for &pin in &plan.throughput_pins {
+        if is_stopped() {
+            break;
+        }
+        let setting = Setting { pin, ..plan.throughput.setting };
+        let group = Group { setting, ..plan.throughput.clone() };
+        let mut cells = Cells::new();
+        let outcome = turns(&group, &mut cells, &format!("throughput: {pin}"));
+        rows.extend(requests(&group, &cells));
+        outcome?;
+        one_way(plan, setting, rows)?;
+    }
+    Ok(())
+}
+
+fn requests(group: &Group, cells: &Cells) -> Vec<Throughput> {
+    let mut rows = Vec::new();
+    for (order, cells) in group.orders.iter().zip(cells) {
+        let Some(floor) = cells.first() else { continue };
+        let measured = group.peers.iter().zip(cells).filter(|(_, cell)| !cell.turns.is_empty());
+        rows.extend(measured.map(|(peer, cell)| {
+            let figures = cell.figures();
+            let found = Found { n: figures.calls, per_second: figures.per_second, refused: 0 };
+            row(Kind::Request, peer, order.callers, group.setting.pin, found, cell.throughput_ratio(floor))
+        }));
+    }
+    rows
+}
+
+struct Found {
+    n: usize,
+    per_second: f64,
+    refused: u64,
+}
+
+fn row(kind: Kind, peer: &str, callers: u32, pin: Pin, found: Found, ratio_to_floor: f64) -> Throughput {
+    Throughput {
+        kind,
+        peer: peer.to_owned(),
+        callers,
+        chars: CHARS,
+        pin,
+        mode: MODE,
+        n: found.n,
+        requests_per_s: found.per_second.round(),
+        ratio: ratio(ratio_to_floor),
+        refused: found.refused,
+    }
+}
+
+fn one_way(plan: &Plan, setting: Setting, rows: &mut Vec<Throughput>) -> Result<()> {
+    let mut pairs = ONE_WAY_PEERS.iter().map(|peer| Pair::start(peer, setting)).collect::<Result<Vec<_>>>()?;
+    let count = plan.one_way;
+    let burst = Burst { chars: CHARS, count, period_ms: 0, delivery: Delivery::Reliable, insist: true };
+    let bar = bar(&format!("one-way messages: {}", setting.pin), plan.throughput.rounds as usize);
+    let mut speeds: Vec<Vec<f64>> = vec![Vec::new(); pairs.len()];
+    let mut refused = vec![0; pairs.len()];
+    for _ in 0..plan.throughput.rounds {
+        if is_stopped() {
+            break;
+        }
+        for ((pair, speeds), refused) in pairs.iter_mut().zip(&mut speeds).zip(&mut refused) {
+            let delivered = pair.burst(&burst)?;
+            let known = delivered.executed + delivered.failed;
+            ensure!(known == u64::from(count), "{known} of {count} one-way messages were executed or reported");
+            speeds.push(delivered.executed as f64 * 1e9 / delivered.elapsed.max(1) as f64);
+            *refused += delivered.offered.refused + delivered.failed;
+        }
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
+    let floor = speeds.first().cloned().unwrap_or_default();
+    for ((peer, own), refused) in ONE_WAY_PEERS.iter().zip(speeds).zip(refused).filter(|((_, own), _)| !own.is_empty())
+    {
+        let ratios = own.iter().zip(&floor).map(|(own, floor)| own / floor.max(1e-9)).collect();
+        let found = Found { n: own.len() * count as usize, per_second: quartile(own, 2), refused };
+        rows.push(row(Kind::OneWay, peer, 1, setting.pin, found, quartile(ratios, 2)));
+    }
+    Ok(())
+}

@@ -1,0 +1,147 @@
+//! The processes of one peer at one place: server, client and, in distribution 2, the further nodes.
+
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+use crate::Child;
+use crate::block::{Order, Outcome};
+use crate::burst::{Burst, Offered};
+use crate::child::{ClientQuestion, Handle, ServerQuestion};
+use crate::peers::{Limits, Place};
+use crate::pin::{self, Pin};
+use crate::statistics::Turn;
+
+/// The further nodes are left alone for so long before anything is measured, so that all of them are under way.
+const UNDER_WAY: Duration = Duration::from_millis(20);
+/// A message that was neither executed nor reported for so long is lost. Longer than a request may take.
+const QUIET: Duration = Duration::from_secs(4);
+
+/// Where and among whom a pair is measured.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Setting {
+    pub(crate) pin: Pin,
+    /// The paper's node distribution, 1 or 2.
+    pub(crate) distribution: u8,
+    /// The service prints what it gets.
+    pub(crate) print: bool,
+}
+
+/// One peer's processes.
+pub(crate) struct Pair {
+    peer: String,
+    server: Handle,
+    client: Handle,
+    further: Option<Handle>,
+}
+
+/// A burst, as both ends saw it.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Delivered {
+    pub(crate) offered: Offered,
+    /// Counted by the service.
+    pub(crate) executed: u64,
+    /// Taken, and reported as not executed later.
+    pub(crate) failed: u64,
+    /// From the first offer to the last execution, in nanoseconds.
+    pub(crate) elapsed: u64,
+}
+
+impl Pair {
+    /// Starts the processes of `peer`; they share no network with any other pair.
+    pub(crate) fn start(peer: &str, setting: Setting) -> Result<Self> {
+        let [client_cpu, server_cpu] = pin::cpus(setting.pin)?;
+        let place = Place { run: fastrand::u32(1..), print: setting.print };
+        let mut child = Child { peer: peer.to_owned(), cpu: server_cpu, place, address: String::new() };
+        let mut server = Handle::of_pair("serve", &child)?;
+        child.address = server.line().with_context(|| format!("starting the server of {peer}"))?;
+        child.cpu = client_cpu;
+        let client = Handle::of_pair("call", &child)?;
+        let further = (setting.distribution == 2).then(|| Handle::of_pair("further", &child)).transpose()?;
+        Ok(Self { peer: peer.to_owned(), server, client, further })
+    }
+
+    /// One block of echo calls.
+    pub(crate) fn block(&mut self, order: &Order) -> Result<Turn> {
+        let used = self.begin_block(order)?;
+        self.end_block(used)
+    }
+
+    /// As [`block`](Self::block) in two parts, so that several pairs can be under way; returns what the end needs.
+    pub(crate) fn begin_block(&mut self, order: &Order) -> Result<u64> {
+        self.begin_further()?;
+        let used = self.ask_server(&ServerQuestion::CpuTime)?;
+        self.client.ask(&ClientQuestion::Echo(order.clone()))?;
+        Ok(used)
+    }
+
+    pub(crate) fn end_block(&mut self, used: u64) -> Result<Turn> {
+        let outcome: Outcome = self.client.answer().with_context(|| format!("calls of {}", self.peer))?;
+        let server_cpu = self.ask_server::<u64>(&ServerQuestion::CpuTime)?.saturating_sub(used);
+        self.end_further()?;
+        Ok(Turn::new(outcome, server_cpu))
+    }
+
+    /// One burst of one-way messages, and what became of each.
+    pub(crate) fn burst(&mut self, burst: &Burst) -> Result<Delivered> {
+        self.begin_further()?;
+        let (before, _): (u64, u64) = self.ask_server(&ServerQuestion::Executed)?;
+        let offered: Offered = self.client.order(&ClientQuestion::Burst(burst.clone()))?;
+        let mut delivered = Delivered { offered, ..Delivered::default() };
+        self.settle(before, &mut delivered)?;
+        self.end_further()?;
+        Ok(delivered)
+    }
+
+    /// Waits until each message was executed or reported, or nothing has happened for long.
+    fn settle(&mut self, before: u64, delivered: &mut Delivered) -> Result<()> {
+        let mut changed = Instant::now();
+        loop {
+            let known = (delivered.executed, delivered.failed);
+            delivered.failed += self.client.order::<u64>(&ClientQuestion::Failed)?;
+            let (count, last): (u64, u64) = self.ask_server(&ServerQuestion::Executed)?;
+            delivered.executed = count - before;
+            delivered.elapsed = last.saturating_sub(delivered.offered.start);
+            if delivered.executed + delivered.failed >= delivered.offered.taken {
+                return Ok(());
+            }
+            if known != (delivered.executed, delivered.failed) {
+                changed = Instant::now();
+            }
+            if changed.elapsed() > QUIET {
+                return Ok(());
+            }
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+
+    /// Tells the server's callers other limits, and leaves time for them to hear of it.
+    pub(crate) fn constrain(&mut self, limits: Limits) -> Result<()> {
+        self.ask_server::<()>(&ServerQuestion::Constrain(limits))?;
+        std::thread::sleep(10 * UNDER_WAY);
+        Ok(())
+    }
+
+    /// Asks the client anything else.
+    pub(crate) fn ask_client<T: DeserializeOwned>(&mut self, question: &impl Serialize) -> Result<T> {
+        self.client.order(question)
+    }
+
+    fn ask_server<T: DeserializeOwned>(&mut self, question: &ServerQuestion) -> Result<T> {
+        self.server.order(question)
+    }
+
+    fn begin_further(&mut self) -> Result<()> {
+        let Some(further) = &mut self.further else { return Ok(()) };
+        let () = further.order(&true)?;
+        std::thread::sleep(UNDER_WAY);
+        Ok(())
+    }
+
+    fn end_further(&mut self) -> Result<()> {
+        let Some(further) = &mut self.further else { return Ok(()) };
+        further.order(&false).map(|_: u64| ())
+    }
+}

@@ -1,0 +1,49 @@
+//! How far the run is, and whether somebody wants it to end.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use anyhow::Result;
+use indicatif::{ProgressBar, ProgressStyle};
+
+/// Set by Ctrl-C or SIGTERM.
+static STOP: AtomicBool = AtomicBool::new(false);
+/// How long after a failure Ctrl-C may still be its reason: the children get it as well, and end sooner.
+const TOGETHER: Duration = Duration::from_millis(300);
+
+/// Ctrl-C ends the run with what there is; a second one ends it at once.
+pub(crate) fn stop_at_interrupt() -> Result<()> {
+    Ok(ctrlc::set_handler(|| {
+        if STOP.swap(true, Ordering::Relaxed) {
+            std::process::exit(130);
+        }
+        eprintln!("\nstopping; what was measured so far is kept");
+    })?)
+}
+
+/// Whether the run is to end.
+pub(crate) fn is_stopped() -> bool {
+    STOP.load(Ordering::Relaxed)
+}
+
+/// Whether a failure comes from the run being stopped.
+pub(crate) fn was_stopped() -> bool {
+    let end = Instant::now() + TOGETHER;
+    while !is_stopped() && Instant::now() < end {
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    is_stopped()
+}
+
+/// A bar of `steps` steps. Without a terminal, one line when it begins.
+pub(crate) fn bar(what: &str, steps: usize) -> ProgressBar {
+    let bar = ProgressBar::new(steps as u64).with_message(what.to_owned());
+    let style = ProgressStyle::with_template("{msg:40} {bar:30} {pos}/{len} {elapsed} (left: {eta})");
+    let bar = style.map_or_else(|_| bar.clone(), |style| bar.clone().with_style(style));
+    if bar.is_hidden() {
+        eprintln!("{what}");
+    } else {
+        bar.tick();
+    }
+    bar
+}

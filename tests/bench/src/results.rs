@@ -1,0 +1,185 @@
+//! Everything that a run finds, as the one JSON object that `docs/performance.md` describes key by key.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use anyhow::{Context, Result};
+use serde::Serialize;
+
+use crate::peers::Delivery;
+use crate::pin::Pin;
+
+/// How messages are protected. Plain is the only mode so far.
+pub(crate) const MODE: &str = "plain";
+
+/// A whole run, complete or not.
+#[derive(Debug, Clone, Default, Serialize)]
+pub(crate) struct Results {
+    pub(crate) run: About,
+    pub(crate) response: Vec<Response>,
+    pub(crate) availability: Vec<Availability>,
+    /// `null` until it is measured.
+    pub(crate) share: Option<Share>,
+    pub(crate) scale: Vec<Scale>,
+    pub(crate) throughput: Vec<Throughput>,
+    pub(crate) constraints: Vec<Constrained>,
+}
+
+/// What was run, where and when.
+#[derive(Debug, Clone, Default, Serialize)]
+pub(crate) struct About {
+    pub(crate) version: String,
+    pub(crate) commit: String,
+    pub(crate) extent: String,
+    pub(crate) is_release_build: bool,
+    pub(crate) is_complete: bool,
+    pub(crate) started_unix_s: u64,
+    pub(crate) seconds: f64,
+    pub(crate) cpus: usize,
+    pub(crate) load_before: f64,
+    pub(crate) load_after: f64,
+    pub(crate) notes: Vec<String>,
+}
+
+/// Round trips of one peer in one cell.
+#[derive(Debug, Clone, Serialize)]
+pub(crate) struct Response {
+    pub(crate) peer: String,
+    pub(crate) distribution: u8,
+    pub(crate) chars: u32,
+    pub(crate) pin: Pin,
+    pub(crate) mode: &'static str,
+    pub(crate) print: bool,
+    pub(crate) pause_ms: u64,
+    pub(crate) n: usize,
+    pub(crate) p50_us: f64,
+    pub(crate) p99_us: f64,
+    pub(crate) p999_us: f64,
+    pub(crate) max_us: f64,
+    pub(crate) ratio: f64,
+    pub(crate) ratio_lower_quartile: f64,
+    pub(crate) ratio_upper_quartile: f64,
+    pub(crate) p99_ratio: f64,
+    pub(crate) cpu_us_per_call: f64,
+    pub(crate) cpu_ratio: f64,
+}
+
+/// One-way requests at one period.
+#[derive(Debug, Clone, Serialize)]
+pub(crate) struct Availability {
+    pub(crate) distribution: u8,
+    pub(crate) chars: u32,
+    pub(crate) period_ms: u64,
+    pub(crate) delivery: Delivery,
+    pub(crate) pin: Pin,
+    pub(crate) mode: &'static str,
+    #[serde(flatten)]
+    pub(crate) counts: Counts,
+    pub(crate) worst_group: f64,
+    pub(crate) executed_per_s: f64,
+    pub(crate) floor_per_s: Option<f64>,
+    pub(crate) ratio: Option<f64>,
+}
+
+/// What became of one-way requests.
+#[derive(Debug, Clone, Default, Serialize)]
+pub(crate) struct Counts {
+    pub(crate) offered: u64,
+    pub(crate) sent: u64,
+    pub(crate) refused: u64,
+    pub(crate) executed: u64,
+    pub(crate) lost: u64,
+    pub(crate) executed_of_offered: f64,
+    pub(crate) executed_of_sent: f64,
+    pub(crate) reasons: BTreeMap<String, u64>,
+}
+
+/// Where the time of a round trip goes.
+#[derive(Debug, Clone, Serialize)]
+pub(crate) struct Share {
+    pub(crate) chars: u32,
+    pub(crate) pin: Pin,
+    pub(crate) mode: &'static str,
+    pub(crate) n: usize,
+    pub(crate) round_trip_us: f64,
+    pub(crate) generate_us: f64,
+    pub(crate) process_us: f64,
+    pub(crate) generate: f64,
+    pub(crate) process: f64,
+}
+
+/// A manager with so many nodes.
+#[derive(Debug, Clone, Serialize)]
+pub(crate) struct Scale {
+    pub(crate) nodes: u32,
+    pub(crate) pin: Pin,
+    pub(crate) mode: &'static str,
+    pub(crate) n: usize,
+    pub(crate) request_us: f64,
+    pub(crate) request_ratio: f64,
+    pub(crate) each_us: f64,
+    pub(crate) each_ratio: f64,
+    pub(crate) rss_per_node_bytes: i64,
+    pub(crate) discovery_s: f64,
+}
+
+/// Requests or one-way messages per second.
+#[derive(Debug, Clone, Serialize)]
+pub(crate) struct Throughput {
+    pub(crate) kind: Kind,
+    pub(crate) peer: String,
+    pub(crate) callers: u32,
+    pub(crate) chars: u32,
+    pub(crate) pin: Pin,
+    pub(crate) mode: &'static str,
+    pub(crate) n: usize,
+    pub(crate) requests_per_s: f64,
+    pub(crate) ratio: f64,
+    pub(crate) refused: u64,
+}
+
+/// What is counted per second.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum Kind {
+    Request,
+    OneWay,
+}
+
+/// One-way requests under constraints of the paper.
+#[derive(Debug, Clone, Serialize)]
+pub(crate) struct Constrained {
+    pub(crate) minimum_interval_ms: u64,
+    pub(crate) message_size: u32,
+    pub(crate) chars: u32,
+    pub(crate) period_ms: u64,
+    pub(crate) pin: Pin,
+    pub(crate) mode: &'static str,
+    #[serde(flatten)]
+    pub(crate) counts: Counts,
+    pub(crate) executed_per_s: f64,
+}
+
+impl Results {
+    /// Writes all of it; a reader finds the old file or the new one, never a part.
+    pub(crate) fn write(&self, path: &Path) -> Result<()> {
+        let text = serde_json::to_string_pretty(self)? + "\n";
+        let fresh = path.with_extension("part");
+        std::fs::write(&fresh, text).with_context(|| format!("writing {}", fresh.display()))?;
+        std::fs::rename(&fresh, path).with_context(|| format!("writing {}", path.display()))
+    }
+}
+
+/// Microseconds with two digits behind the point.
+pub(crate) fn micros(nanos: u64) -> f64 {
+    rounded(nanos as f64 / 1e3, 1e2)
+}
+
+/// A ratio with four digits.
+pub(crate) fn ratio(value: f64) -> f64 {
+    rounded(value, 1e4)
+}
+
+fn rounded(value: f64, steps: f64) -> f64 {
+    (value * steps).round() / steps
+}

@@ -1,0 +1,150 @@
+//! The rows for people.
+
+use comfy_table::{Table, presets};
+
+use crate::results::{Counts, Results};
+
+/// Prints a table for each kind of row that there is.
+pub(crate) fn show(results: &Results) {
+    response(results);
+    throughput(results);
+    if let Some(share) = &results.share {
+        let [generate, process] = [share.generate, share.process].map(|part| part * 100.0);
+        println!(
+            "{} characters, round trip {} µs: {generate:.1} % to make the messages, {process:.1} % to read them\n",
+            share.chars, share.round_trip_us
+        );
+    }
+    scale(results);
+    constraints(results);
+    availability(results);
+    let run = &results.run;
+    let state = if run.is_complete { "complete" } else { "not complete" };
+    println!("{} run, {state}, {} s, load {} to {}", run.extent, run.seconds, run.load_before, run.load_after);
+    run.notes.iter().for_each(|note| println!("note: {note}"));
+}
+
+fn print(header: &[&str], rows: impl Iterator<Item = Vec<String>>) {
+    let mut table = Table::new();
+    table.load_style(presets::ASCII_MARKDOWN).set_header(header.iter().copied());
+    rows.for_each(|row| {
+        table.add_row(row);
+    });
+    if !table.is_empty() {
+        println!("{table}\n");
+    }
+}
+
+fn response(results: &Results) {
+    let header = [
+        "pin",
+        "distr.",
+        "pause",
+        "print",
+        "chars",
+        "peer",
+        "n",
+        "p50 µs",
+        "p99 µs",
+        "p99.9 µs",
+        "max µs",
+        "ratio",
+        "quartiles",
+        "p99 ratio",
+        "CPU µs",
+        "CPU ratio",
+    ];
+    let rows = results.response.iter().map(|row| {
+        vec![
+            row.pin.to_string(),
+            row.distribution.to_string(),
+            row.pause_ms.to_string(),
+            row.print.to_string(),
+            row.chars.to_string(),
+            row.peer.clone(),
+            row.n.to_string(),
+            format!("{:.1}", row.p50_us),
+            format!("{:.1}", row.p99_us),
+            format!("{:.1}", row.p999_us),
+            format!("{:.1}", row.max_us),
+            format!("{:.3}", row.ratio),
+            format!("{:.3}-{:.3}", row.ratio_lower_quartile, row.ratio_upper_quartile),
+            format!("{:.3}", row.p99_ratio),
+            format!("{:.1}", row.cpu_us_per_call),
+            format!("{:.2}", row.cpu_ratio),
+        ]
+    });
+    print(&header, rows);
+}
+
+fn throughput(results: &Results) {
+    let rows = results.throughput.iter().map(|row| {
+        vec![
+            format!("{:?}", row.kind),
+            row.pin.to_string(),
+            row.callers.to_string(),
+            row.peer.clone(),
+            format!("{:.0}", row.requests_per_s),
+            format!("{:.3}", row.ratio),
+        ]
+    });
+    print(&["kind", "pin", "callers", "peer", "per second", "ratio"], rows);
+}
+
+fn scale(results: &Results) {
+    let rows = results.scale.iter().map(|row| {
+        vec![
+            row.nodes.to_string(),
+            format!("{:.1}", row.request_us),
+            format!("{:.3}", row.request_ratio),
+            format!("{:.1}", row.each_us),
+            format!("{:.3}", row.each_ratio),
+            row.rss_per_node_bytes.to_string(),
+            row.discovery_s.to_string(),
+        ]
+    });
+    let header = ["nodes", "one: µs", "ratio", "each in turn: µs", "ratio", "bytes per node", "discovery s"];
+    print(&header, rows);
+}
+
+fn constraints(results: &Results) {
+    let rows = results.constraints.iter().map(|row| {
+        let mut cells = vec![
+            row.minimum_interval_ms.to_string(),
+            row.message_size.to_string(),
+            row.chars.to_string(),
+            row.period_ms.to_string(),
+        ];
+        cells.extend(counts(&row.counts));
+        cells.push(row.executed_per_s.to_string());
+        cells
+    });
+    let first = ["interval ms", "message size", "chars", "period ms"];
+    print(&[&first[..], &COUNTS, &["per second"]].concat(), rows);
+}
+
+fn availability(results: &Results) {
+    let rows = results.availability.iter().map(|row| {
+        let mut cells = vec![
+            row.distribution.to_string(),
+            format!("{:?}", row.delivery),
+            row.chars.to_string(),
+            row.period_ms.to_string(),
+        ];
+        cells.extend(counts(&row.counts));
+        cells.push(row.executed_per_s.to_string());
+        cells.push(row.ratio.map(|ratio| format!("{ratio:.3}")).unwrap_or_default());
+        cells
+    });
+    let first = ["distr.", "delivery", "chars", "period ms"];
+    print(&[&first[..], &COUNTS, &["per second", "to the floor's"]].concat(), rows);
+}
+
+const COUNTS: [&str; 6] = ["offered", "refused", "sent", "executed", "lost", "executed/offered"];
+
+fn counts(counts: &Counts) -> [String; 6] {
+    let Counts { offered, refused, sent, executed, lost, executed_of_offered, .. } = counts;
+    let numbers = [offered, refused, sent, executed, lost].map(u64::to_string);
+    let [offered, refused, sent, executed, lost] = numbers;
+    [offered, refused, sent, executed, lost, format!("{executed_of_offered:.3}")]
+}

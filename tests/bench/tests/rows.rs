@@ -1,0 +1,100 @@
+//! A tiny run of the experiments yields every kind of row, with the keys that `docs/performance.md` describes and no
+//! others. Nothing here looks at a figure.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+use std::process::Command;
+
+use serde_json::{Map, Value};
+
+/// Kinds of rows, each with the keys of its table.
+fn documented() -> BTreeMap<String, BTreeSet<String>> {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/performance.md");
+    let text = std::fs::read_to_string(path).unwrap();
+    let mut kinds: BTreeMap<String, BTreeSet<String>> = BTreeMap::new();
+    let mut kind = None;
+    for line in text.lines() {
+        if line.starts_with('#') {
+            kind = line.strip_prefix("### `").and_then(|rest| rest.strip_suffix('`')).map(str::to_owned);
+        }
+        let key = line.strip_prefix("| `").and_then(|rest| rest.split_once('`'));
+        if let (Some(kind), Some((key, _))) = (&kind, key) {
+            kinds.entry(kind.clone()).or_default().insert(key.to_owned());
+        }
+    }
+    kinds
+}
+
+fn run() -> (Map<String, Value>, Vec<String>) {
+    let folder = tempfile::tempdir().unwrap();
+    let (json, plots) = (folder.path().join("rows.json"), folder.path().join("plots"));
+    let mut bench = Command::new(env!("CARGO_BIN_EXE_cara-bench"));
+    let bench = bench.args(["experiments", "--tiny", "--json"]).arg(&json).arg("--plots").arg(&plots);
+    let output = bench.output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let rows: Value = serde_json::from_str(&std::fs::read_to_string(&json).unwrap()).unwrap();
+    let drawn = std::fs::read_dir(&plots).unwrap().map(|entry| entry.unwrap());
+    let whole = drawn.filter(|entry| entry.metadata().unwrap().len() > 1_000);
+    (rows.as_object().unwrap().clone(), whole.map(|entry| entry.file_name().into_string().unwrap()).collect())
+}
+
+/// The rows of a kind: a list, or one object.
+fn rows<'v>(all: &'v Map<String, Value>, kind: &str) -> Vec<&'v Map<String, Value>> {
+    match &all[kind] {
+        Value::Array(rows) => rows.iter().map(|row| row.as_object().unwrap()).collect(),
+        Value::Object(row) => vec![row],
+        other => panic!("{kind} is {other}"),
+    }
+}
+
+/// The values of a key in all rows of a kind.
+fn values(all: &Map<String, Value>, kind: &str, key: &str) -> BTreeSet<String> {
+    rows(all, kind).iter().map(|row| row[key].to_string().trim_matches('"').to_owned()).collect()
+}
+
+#[test]
+fn every_kind_of_row_has_the_documented_keys() {
+    let (all, drawn) = run();
+    let kinds = documented();
+    assert_eq!(all.keys().collect::<BTreeSet<_>>(), kinds.keys().collect::<BTreeSet<_>>());
+    for (kind, keys) in &kinds {
+        let rows = rows(&all, kind);
+        assert!(!rows.is_empty(), "no row of {kind}");
+        for row in rows {
+            assert_eq!(&row.keys().cloned().collect::<BTreeSet<_>>(), keys, "{kind}");
+        }
+    }
+    covers(&all);
+    for figure in ["figure-6", "figure-7", "figure-8"] {
+        for ending in ["svg", "png"] {
+            assert!(drawn.contains(&format!("{figure}.{ending}")), "{drawn:?}");
+        }
+    }
+}
+
+/// What a kind must show has its rows.
+fn covers(all: &Map<String, Value>) {
+    let set = |values: &[&str]| values.iter().map(|value| (*value).to_owned()).collect::<BTreeSet<_>>();
+    assert_eq!(values(all, "run", "is_complete"), set(&["true"]));
+    assert_eq!(values(all, "response", "peer"), set(&["floor", "floor_again", "cara"]));
+    assert_eq!(values(all, "response", "distribution"), set(&["1", "2"]));
+    assert_eq!(values(all, "response", "print"), set(&["true", "false"]));
+    assert_eq!(values(all, "availability", "delivery"), set(&["reliable", "best_effort"]));
+    assert_eq!(values(all, "availability", "distribution"), set(&["1", "2"]));
+    assert_eq!(values(all, "throughput", "kind"), set(&["request", "one_way"]));
+    for kind in ["response", "availability", "share", "scale", "throughput", "constraints"] {
+        assert_eq!(values(all, kind, "mode"), set(&["plain"]), "{kind}");
+    }
+    for row in rows(all, "availability") {
+        let count = |key: &str| row[key].as_u64().unwrap();
+        assert_eq!(count("offered"), count("sent") + count("refused"), "{row:?}");
+        assert_eq!(count("sent"), count("executed") + count("lost"), "{row:?}");
+    }
+    // A text that no datagram holds is refused, and said to be.
+    let long =
+        rows(all, "availability").into_iter().filter(|row| row["delivery"] == "best_effort" && row["chars"] == 5_000);
+    assert!(long.clone().count() > 0);
+    for row in long {
+        assert_eq!(row["refused"], row["offered"], "{row:?}");
+    }
+}
