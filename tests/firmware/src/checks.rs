@@ -1,6 +1,7 @@
 //! The checks, in their order. Each begins with an empty network and says in a word what it has seen.
 
 mod calls;
+mod limits;
 mod losses;
 mod restarts;
 
@@ -15,14 +16,19 @@ pub(crate) struct Check {
 }
 
 /// All of them.
-pub(crate) const CHECKS: [Check; 10] = [
+pub(crate) const CHECKS: [Check; 15] = [
     Check { name: "it is found by broadcast and shows its functions", run: calls::found },
     Check { name: "it drives where it is sent, and arrives", run: calls::driven },
     Check { name: "it stops when nobody renews its lease", run: calls::not_renewed },
     Check { name: "wrong calls are refused and the rest goes on", run: calls::wrong },
+    Check { name: "what is too long is refused on either side", run: limits::oversize },
+    Check { name: "a peer that sends too much loses its link only", run: limits::breaks_its_limit },
+    Check { name: "a best-effort request is served", run: calls::best_effort },
     Check { name: "it calls the manager's mechanic", run: calls::mechanic },
     Check { name: "of forty functions it keeps what it has room for", run: calls::many_functions },
     Check { name: "a call to a hung board ends in time", run: losses::hung },
+    Check { name: "a handler that never returns ends in a reset", run: losses::hanging_handler },
+    Check { name: "an idle cable is pulled and plugged in again", run: losses::idle_cable },
     Check { name: "a pulled cable stops it, and it returns", run: losses::cable },
     Check { name: "a killed manager stops it, and a new one finds it", run: losses::manager },
     Check { name: "it comes back from every loss of power", run: restarts::run },

@@ -52,6 +52,8 @@ const PHY_STATUS: u32 = 1;
 const PHY_IDENTIFIER: u32 = 2;
 const PHY_LINK_UP: u32 = 1 << 2;
 
+/// Most frames in the receive FIFO.
+const FRAMES: usize = 31;
 /// Longest frame without its checksum.
 const FRAME_BYTES: usize = 1514;
 /// Length word and header share the first word; the checksum follows the frame.
@@ -85,6 +87,7 @@ impl Ethernet {
         MACRIS.write(ALL_INTERRUPTS);
         MACTHR.write(WHEN_ASKED);
         MACTCTL.write(TRANSMIT);
+        discard_received();
         MACRCTL.write(RESET_RECEIVER);
         MACRCTL.write(REJECT_BAD_CHECKSUM | RECEIVE);
         MACIM.write(RECEIVED | OVERRUN);
@@ -184,6 +187,18 @@ impl TxToken for Free<'_> {
         }
         MACTR.write(NEW_TRANSMISSION);
         result
+    }
+}
+
+/// Takes what an earlier life of the board has left in the receive FIFO. Resetting the receiver would do on the chip;
+/// the emulator stops to deliver when its FIFO is full, and only goes on when a frame is read.
+fn discard_received() {
+    for _ in 0..FRAMES {
+        if MACNP.read() == 0 {
+            return;
+        }
+        let words = ((MACDATA.read() & 0xFFFF) as usize).div_ceil(4).saturating_sub(1);
+        (0..words).for_each(|_| _ = MACDATA.read());
     }
 }
 

@@ -1,6 +1,7 @@
 //! Why the board started (data sheet, System Control: RESC).
 
 use crate::register::{Register, SYSTEM};
+use crate::watchdog;
 
 const RESC: Register = SYSTEM.at(0x05C);
 const EXTERNAL: u32 = 1;
@@ -31,8 +32,9 @@ pub fn reason() -> Reason {
     let cause = RESC.read();
     RESC.write(0);
     let has = |bit| cause & bit != 0;
+    let ran_out = watchdog::has_reset();
     match () {
-        () if has(WATCHDOG) => Reason::Watchdog,
+        () if has(WATCHDOG) || ran_out => Reason::Watchdog,
         () if has(SOFTWARE) => Reason::Program,
         () if has(BROWN_OUT) => Reason::BrownOut,
         () if has(POWER_ON) => Reason::PowerOn,

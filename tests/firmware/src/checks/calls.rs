@@ -1,7 +1,7 @@
 //! A board and its manager while nothing is broken.
 
 use anyhow::{Context, Result, ensure};
-use cara_std::{Error, Parameters, RequestOptions, UnitEvent};
+use cara_std::{Delivery, Error, Parameters, RequestOptions, UnitEvent};
 
 use crate::board::{Bench, Who};
 use crate::manager::{Manager, arrives, at, position};
@@ -103,6 +103,17 @@ pub(super) fn wrong(bench: &Bench, _: u32) -> Result<String> {
     ensure!(refused.is_err(), "a text of 2,000 characters passes a limit of 400");
     ensure!(position(&agv)? == [0, 0], "it has moved");
     Ok(format!("unknown, missing, type, size; oversize: {refused:?}"))
+}
+
+pub(super) fn best_effort(bench: &Bench, _: u32) -> Result<String> {
+    let cable = bench.cable()?;
+    let manager = Manager::start()?;
+    let board = bench.board(&cable, &Who::agv(17))?;
+    let agv = manager.meet(&Who::agv(17))?;
+    let one_datagram = RequestOptions { delivery: Delivery::BestEffort, ..RequestOptions::default() };
+    agv.request_with("go_to", &*at([1, 1])?, &one_datagram)?;
+    board.logs("arrived at 1 1")?;
+    Ok("in one datagram".into())
 }
 
 pub(super) fn mechanic(bench: &Bench, _: u32) -> Result<String> {
