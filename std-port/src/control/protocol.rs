@@ -2,7 +2,8 @@
 //! [`Answer`]s, of which the last one is [`Answer::Done`] or [`Answer::Failed`]. A line that is no question is answered
 //! with `Failed`, and the next line is read.
 
-use serde::{Deserialize, Serialize};
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer, Serialize};
 
 /// First line from the manager's side, so that an older command and a newer manager tell each other apart.
 pub const CONTROL_VERSION: u32 = 1;
@@ -131,13 +132,30 @@ pub enum ArgumentValue {
 }
 
 /// A number with a fraction.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(untagged)]
 pub enum Number {
     /// A finite one.
     Finite(f64),
     /// `NaN`, `inf` or `-inf`.
     Other(String),
+}
+
+/// Through serde_json's own types: where any crate of a program asks serde_json for numbers of arbitrary precision, a
+/// number inside a tagged structure reads as no `f64`.
+impl<'de> Deserialize<'de> for Number {
+    fn deserialize<D: Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
+        match serde_json::Value::deserialize(from)? {
+            serde_json::Value::Number(number) => number.as_f64().map(Self::Finite),
+            serde_json::Value::String(text) => Some(Self::Other(text)),
+            _ => None,
+        }
+        .ok_or_else(|| D::Error::custom("a number is a JSON number, or `NaN`, `inf` or `-inf` as text"))
+    }
+}
+
+fn real<'de, D: Deserializer<'de>>(from: D) -> Result<Option<f64>, D::Error> {
+    Ok(Option::<serde_json::Number>::deserialize(from)?.and_then(|number| number.as_f64()))
 }
 
 /// What the unit answers.
@@ -216,6 +234,7 @@ pub enum Answer {
     /// A round trip.
     Sample {
         /// Microseconds; absent if it failed.
+        #[serde(default, deserialize_with = "real")]
         us: Option<f64>,
         /// Why it failed.
         error: Option<Failure>,

@@ -24,7 +24,9 @@ impl Driver {
         let drive = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
         let made_safe = Arc::new(AtomicU32::new(0));
         let counted = made_safe.clone();
-        let safe = move |_: &mut ()| drop(counted.fetch_add(1, Ordering::SeqCst));
+        let safe = move |_: &mut ()| {
+            counted.fetch_add(1, Ordering::SeqCst);
+        };
         let options = ServiceOptions::new().lease(LEASE, safe);
         let functions = unit.my_function_list();
         let lease = functions.add_service(&Definition::parse("drive()").unwrap(), options, drive).unwrap();
