@@ -2,7 +2,7 @@
 //! flash, or comes as text where there is no flash to write.
 //!
 //! [`Settings`] is what a board is told. [`page`] is how it stands in flash: two copies, each with a generation and a
-//! checksum, so that a cut of power while one is written leaves the other. [`text`](Settings::from_str) is how a person,
+//! checksum, so that a cut of power while one is written leaves the other. Its text (`FromStr` and `Display`) is how a person,
 //! a command line or an emulator's arguments say it.
 //!
 //! [`board`] is the table of boards and of where their pages are; [`uf2`] is the file form that some boot loaders take.
