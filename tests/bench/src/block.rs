@@ -13,6 +13,9 @@ use crate::peers::{Caller, Peer, Place};
 /// Calls of each caller before those that count.
 const WARM_UP: u32 = 3;
 
+/// Callers that connect together: units that look for each other wait, and many that look at once hold each other up.
+const AT_A_TIME: usize = 8;
+
 /// What a client process is told to do.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(crate) struct Order {
@@ -56,15 +59,16 @@ impl<'a> Callers<'a> {
     }
 
     fn connect(&mut self, wanted: usize) -> Result<()> {
-        let missing = self.connected.len()..wanted;
-        // All at the same time: units that look for each other wait for answers.
         let (peer, place, address) = (self.peer, self.place, self.address);
-        let fresh: Vec<Result<_>> = thread::scope(|scope| {
-            let threads: Vec<_> = missing.map(|_| scope.spawn(move || peer.connect(place, address))).collect();
-            threads.into_iter().map(|thread| thread.join().expect("connecting does not panic")).collect()
-        });
-        for caller in fresh {
-            self.connected.push(caller.context("connecting")?);
+        while self.connected.len() < wanted {
+            let missing = (wanted - self.connected.len()).min(AT_A_TIME);
+            let fresh: Vec<Result<_>> = thread::scope(|scope| {
+                let threads: Vec<_> = (0..missing).map(|_| scope.spawn(|| peer.connect(place, address))).collect();
+                threads.into_iter().map(|thread| thread.join().expect("connecting does not panic")).collect()
+            });
+            for caller in fresh {
+                self.connected.push(caller.context("connecting")?);
+            }
         }
         Ok(())
     }

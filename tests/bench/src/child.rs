@@ -23,6 +23,8 @@ pub(crate) enum ServerQuestion {
     CpuTime,
     /// What the one-way service counted, and when it last did.
     Executed,
+    /// What the peer counts of its own accord.
+    Counters,
     /// Constraints towards all callers.
     Constrain(Limits),
 }
@@ -46,6 +48,7 @@ pub(crate) fn serve(child: &Child) -> Result<()> {
         Ok(match question {
             ServerQuestion::CpuTime => json!(clock::cpu_time()),
             ServerQuestion::Executed => json!(server.executed.read()),
+            ServerQuestion::Counters => json!((server.counters)()),
             ServerQuestion::Constrain(limits) => {
                 let constrain = server.constrain.as_ref().context("this peer has no constraints")?;
                 json!(constrain(limits)?)

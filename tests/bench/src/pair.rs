@@ -10,7 +10,7 @@ use crate::Child;
 use crate::block::{Order, Outcome};
 use crate::burst::{Burst, Offered};
 use crate::child::{ClientQuestion, Handle, ServerQuestion};
-use crate::peers::{Limits, Place};
+use crate::peers::{Counters, Limits, Place};
 use crate::pin::{self, Pin};
 use crate::statistics::Turn;
 
@@ -47,6 +47,13 @@ pub(crate) struct Delivered {
     pub(crate) failed: u64,
     /// From the first offer to the last execution, in nanoseconds.
     pub(crate) elapsed: u64,
+}
+
+impl Delivered {
+    /// Taken, and neither executed nor reported.
+    pub(crate) fn lost(&self) -> u64 {
+        self.offered.taken.saturating_sub(self.executed + self.failed)
+    }
 }
 
 impl Pair {
@@ -92,6 +99,10 @@ impl Pair {
         let mut delivered = Delivered { offered, ..Delivered::default() };
         self.settle(before, &mut delivered)?;
         self.end_further()?;
+        if delivered.lost() > 0 {
+            let counters = self.server_counters()?;
+            eprintln!("{}: {} messages vanished; the server counts {counters:?}", self.peer, delivered.lost());
+        }
         Ok(delivered)
     }
 
@@ -122,6 +133,13 @@ impl Pair {
         self.ask_server::<()>(&ServerQuestion::Constrain(limits))?;
         std::thread::sleep(10 * UNDER_WAY);
         Ok(())
+    }
+
+    /// What the server has counted of its own accord, without zeros.
+    pub(crate) fn server_counters(&mut self) -> Result<Counters> {
+        let mut counters: Counters = self.ask_server(&ServerQuestion::Counters)?;
+        counters.retain(|_, count| *count > 0);
+        Ok(counters)
     }
 
     /// Asks the client anything else.

@@ -136,6 +136,7 @@ pub(crate) struct Throughput {
     pub(crate) requests_per_s: f64,
     pub(crate) ratio: f64,
     pub(crate) refused: u64,
+    pub(crate) lost: u64,
 }
 
 /// What is counted per second.

@@ -150,7 +150,10 @@ fn silent_losses(results: &Results) -> Vec<String> {
     let reliable = results.availability.iter().filter(|row| row.delivery == crate::peers::Delivery::Reliable);
     let lost = reliable.map(|row| (&row.counts, row.chars, row.period_ms));
     let constrained = results.constraints.iter().map(|row| (&row.counts, row.chars, row.period_ms));
-    lost.chain(constrained)
+    let one_way = results.throughput.iter().filter(|row| row.lost > 0);
+    let one_way = one_way.map(|row| format!("{}, one-way messages on {}: {} vanished", row.peer, row.pin, row.lost));
+    let counted = lost.chain(constrained);
+    counted
         .filter(|(counts, ..)| counts.lost > 0 || counts.executed > counts.sent)
         .map(|(counts, chars, period_ms)| {
             format!(
@@ -158,6 +161,7 @@ fn silent_losses(results: &Results) -> Vec<String> {
                 counts.sent, counts.executed, counts.lost
             )
         })
+        .chain(one_way)
         .collect()
 }
 

@@ -40,7 +40,8 @@ pub(crate) struct Plan {
     pub(crate) response: Vec<Group>,
     pub(crate) throughput: Group,
     pub(crate) throughput_pins: Vec<Pin>,
-    /// One-way messages of each turn.
+    /// One-way messages of each turn; fewer than the events that a subscriber may have waiting, 4,096, so that each that
+    /// is refused can be told.
     pub(crate) one_way: u32,
     /// Calls of each turn whose time is taken apart.
     pub(crate) share_calls: u32,
@@ -112,7 +113,7 @@ impl Plan {
             response,
             throughput: Group { setting, peers: SHARED.to_vec(), orders, rounds: extent.of(15, 3, 1) },
             throughput_pins: if extent == Extent::Tiny { vec![pin] } else { pins[..pins.len() - 1].to_vec() },
-            one_way: extent.of(200_000, 20_000, 50),
+            one_way: extent.of(4_000, 4_000, 50),
             share_calls: extent.of(400, 200, 5),
             share_rounds: extent.of(20, 5, 1),
             nodes: extent.of(vec![1, 10, 100, 1_000, 5_000], vec![1, 10, 100, 1_000], vec![1, 3]),

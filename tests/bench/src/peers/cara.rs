@@ -22,7 +22,7 @@ const MESSAGE_BYTES: u32 = TEXT_BYTES + 64;
 /// Room of the caller's parameters.
 const PARAMETERS_BYTES: usize = TEXT_BYTES as usize + 1_024;
 /// How long the two may take to find each other.
-const PATIENCE: Duration = Duration::from_secs(20);
+const PATIENCE: Duration = Duration::from_secs(60);
 
 /// Parameters with one text.
 pub(crate) type Text = Parameters<PARAMETERS_BYTES>;
@@ -60,7 +60,7 @@ fn start_idle(place: &Place, passive: &CommunicationSystem) -> Result<Child> {
     let mut command = Command::new(program);
     command.args(["idle", "--run", &place.run.to_string()]).stdin(Stdio::piped());
     let child = command.spawn()?;
-    let end = Instant::now() + 3 * PATIENCE;
+    let end = Instant::now() + PATIENCE;
     while passive.number_of_s_units() < IDLE_LINKS {
         ensure!(Instant::now() < end, "only {} idle s_units joined", passive.number_of_s_units());
         std::thread::sleep(Duration::from_millis(20));
@@ -111,8 +111,11 @@ impl Peer for Cara {
                 Constraints { minimum_interval, message_size: limits.message_size, ..constrained.constraints() };
             Ok(constrained.set_constraints(wanted)?)
         };
+        let counted = passive.clone();
+        let counters = move || counted.counters().into_iter().map(|(name, count)| (name.to_owned(), count)).collect();
         let address = String::from("by discovery");
-        Ok(Server { address, executed, constrain: Some(Box::new(constrain)), keep: Box::new((passive, idle)) })
+        let (constrain, counters) = (Some(Box::new(constrain) as _), Box::new(counters));
+        Ok(Server { address, executed, constrain, counters, keep: Box::new((passive, idle)) })
     }
 
     fn connect(&self, place: &Place, _address: &str) -> Result<Box<dyn Caller>> {

@@ -9,7 +9,7 @@ use std::thread;
 
 use anyhow::{Result, ensure};
 
-use super::{Caller, Delivery, Executed, Peer, Place, Server};
+use super::{Caller, Counters, Delivery, Executed, Peer, Place, Server};
 use crate::print::Printer;
 
 /// Longest text in bytes.
@@ -34,7 +34,7 @@ impl Peer for Floor {
                 thread::spawn(move || answer(stream, &counted, printer));
             }
         });
-        Ok(Server { address, executed, constrain: None, keep: Box::new(()) })
+        Ok(Server { address, executed, constrain: None, counters: Box::new(Counters::new), keep: Box::new(()) })
     }
 
     fn connect(&self, _place: &Place, address: &str) -> Result<Box<dyn Caller>> {

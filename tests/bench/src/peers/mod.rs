@@ -4,6 +4,7 @@ pub(crate) mod cara;
 mod floor;
 
 use std::any::Any;
+use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
@@ -61,9 +62,14 @@ pub(crate) struct Server {
     pub(crate) executed: Arc<Executed>,
     /// Changes what callers may do; `None` where there are no such limits.
     pub(crate) constrain: Option<Box<dyn Fn(Limits) -> Result<()>>>,
+    /// What the server counts of its own accord, by name; a run that loses something tells it.
+    pub(crate) counters: Box<dyn Fn() -> Counters>,
     /// Whatever must not be dropped.
     pub(crate) keep: Box<dyn Any>,
 }
+
+/// Counters by name.
+pub(crate) type Counters = BTreeMap<String, u64>;
 
 /// The constraints of the paper that a server can tell its callers.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
