@@ -57,15 +57,15 @@ fn vehicle(board: &Board, cable: &Cable, round: u32) -> Result<()> {
     manager.system.publish_my_function_list()?;
     let agv = manager.meet(&who)?;
     for x in 1..=2 {
-        agv.block_request("go_to", &mut *at([x + 2 * i64::from(round), 0])?)?;
-        agv.request("pos_info", &*at([0, 0])?)?;
+        agv.block_request("go_to", &mut at([x + 2 * i64::from(round), 0])?)?;
+        agv.request("pos_info", &at([0, 0])?)?;
         position(&agv)?;
         let mut text = Parameters::<1024>::sized();
         text.add_string("text", 400)?;
         text.set_value("text", "a".repeat(400).as_str())?;
         agv.block_request("echo", &mut text)?;
     }
-    ensure!(agv.block_request("fly_to", &mut *at([0, 0])?).is_err(), "it flies");
+    ensure!(agv.block_request("fly_to", &mut at([0, 0])?).is_err(), "it flies");
     agv.block_request("stop", &mut Parameters::<512>::new())?;
     drop(manager);
     board.logs_behind(line, "depot has left")?;

@@ -115,7 +115,7 @@ pub(crate) fn arrives(peer: &Peer, target: [i64; 2]) -> Result<()> {
 pub(crate) fn stand_alone() -> Result<()> {
     let manager = Manager::start()?;
     let agv = manager.meet(&Who::agv(17))?;
-    agv.block_request("go_to", &mut *at([1_000, 0])?)?;
+    agv.block_request("go_to", &mut at([1_000, 0])?)?;
     println!("driving");
     let _ = std::io::stdin().lines().next();
     Ok(())

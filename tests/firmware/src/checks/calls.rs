@@ -35,10 +35,10 @@ pub(super) fn driven(bench: &Bench, _: u32) -> Result<String> {
     let board = bench.board(&cable, &Who::agv(17))?;
     let agv = manager.meet(&Who::agv(17))?;
     ensure!(position(&agv)? == [0, 0], "it begins elsewhere");
-    agv.request("go_to", &*at([1, 2])?)?;
+    agv.request("go_to", &at([1, 2])?)?;
     board.logs("arrived at 1 2")?;
     arrives(&agv, [1, 2])?;
-    agv.block_request("go_to", &mut *at([0, 2])?)?;
+    agv.block_request("go_to", &mut at([0, 2])?)?;
     arrives(&agv, [0, 2])?;
     let mut charge = Parameters::new();
     charge.add_float("charge", 1)?;
@@ -62,16 +62,16 @@ pub(super) fn not_renewed(bench: &Bench, _: u32) -> Result<String> {
     let board = bench.board(&cable, &Who::agv(17))?;
     let agv = manager.meet(&Who::agv(17))?;
     let once = RequestOptions { renew_lease: false, ..RequestOptions::default() };
-    agv.block_request_with("go_to", &mut *at([1_000, 0])?, &once)?;
+    agv.block_request_with("go_to", &mut at([1_000, 0])?, &once)?;
     board.logs("stopped at")?;
     let [x, _] = position(&agv)?;
     ensure!((0..10).contains(&x), "it stands at {x}");
-    agv.block_request("go_to", &mut *at([1_000, 0])?)?;
+    agv.block_request("go_to", &mut at([1_000, 0])?)?;
     let line = board.line();
     agv.release("go_to")?;
     board.logs_behind(line, "stopped at")?;
     let line = board.line();
-    agv.block_request("go_to", &mut *at([1_000, 0])?)?;
+    agv.block_request("go_to", &mut at([1_000, 0])?)?;
     agv.block_request("stop", &mut Parameters::<512>::new())?;
     board.logs_behind(line, "stopped at")?;
     Ok(format!("without renewal after {x} units; on release; by an emergency"))
@@ -111,7 +111,7 @@ pub(super) fn best_effort(bench: &Bench, _: u32) -> Result<String> {
     let board = bench.board(&cable, &Who::agv(17))?;
     let agv = manager.meet(&Who::agv(17))?;
     let one_datagram = RequestOptions { delivery: Delivery::BestEffort, ..RequestOptions::default() };
-    agv.request_with("go_to", &*at([1, 1])?, &one_datagram)?;
+    agv.request_with("go_to", &at([1, 1])?, &one_datagram)?;
     board.logs("arrived at 1 1")?;
     Ok("in one datagram".into())
 }
@@ -142,7 +142,7 @@ pub(super) fn many_functions(bench: &Bench, _: u32) -> Result<String> {
     let event = manager.event("skipped functions", |event| matches!(event, UnitEvent::FunctionsSkipped { .. }))?;
     let UnitEvent::FunctionsSkipped { skipped, .. } = event else { return Err(Error::NotConnected.into()) };
     ensure!((1..40).contains(&skipped), "{skipped} skipped");
-    agv.block_request("go_to", &mut *at([1, 0])?).context("it no longer serves")?;
+    agv.block_request("go_to", &mut at([1, 0])?).context("it no longer serves")?;
     board.logs("arrived at 1 0")?;
     Ok(format!("{} kept, {skipped} skipped", 40 - skipped))
 }

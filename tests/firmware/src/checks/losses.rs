@@ -17,7 +17,7 @@ pub(super) fn hung(bench: &Bench, _: u32) -> Result<String> {
     let agv = manager.meet(&Who::agv(17))?;
     board.freeze()?;
     let soon = RequestOptions { timeout: Some(Duration::from_millis(300).into()), ..RequestOptions::default() };
-    let ended = agv.block_request_with("pos_info", &mut *at([0, 0])?, &soon);
+    let ended = agv.block_request_with("pos_info", &mut at([0, 0])?, &soon);
     ensure!(ended == Err(Error::TimedOut), "{ended:?}");
     board.thaw()?;
     let agv = manager.meet(&Who::agv(17))?;
@@ -32,10 +32,10 @@ pub(super) fn hanging_handler(bench: &Bench, _: u32) -> Result<String> {
     let who = Who { more: "hang", ..Who::agv(17) };
     let board = bench.board(&cable, &who)?;
     let agv = manager.meet(&who)?;
-    agv.block_request("go_to", &mut *at([1_000, 0])?)?;
+    agv.block_request("go_to", &mut at([1_000, 0])?)?;
     manager.forget_events();
     let line = board.line();
-    let ended = agv.block_request("hang", &mut *at([0, 0])?);
+    let ended = agv.block_request("hang", &mut at([0, 0])?);
     ensure!(matches!(ended, Err(Error::TimedOut | Error::Interrupted)), "{ended:?}");
     let line = board.logs_behind(line, "started because of Watchdog")?;
     manager.left(&who)?;
@@ -69,7 +69,7 @@ pub(super) fn cable(bench: &Bench, _: u32) -> Result<String> {
     let who = Who::agv(17);
     let board = bench.board(&cable, &who)?;
     let agv = manager.meet(&who)?;
-    agv.block_request("go_to", &mut *at([1_000, 0])?)?;
+    agv.block_request("go_to", &mut at([1_000, 0])?)?;
     cable.pull()?;
     let line = board.logs_behind(0, "stopped at")?;
     manager.left(&who)?;

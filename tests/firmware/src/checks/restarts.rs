@@ -106,9 +106,9 @@ fn reach(state: State, manager: &Manager, board: &Board, who: &Who) -> Result<()
     }
     let agv = manager.meet(who)?;
     match state {
-        State::Calling => drop(agv.request("pos_info", &*at([0, 0])?)?),
+        State::Calling => drop(agv.request("pos_info", &at([0, 0])?)?),
         State::Driving => {
-            agv.block_request("go_to", &mut *at([1_000, 0])?)?;
+            agv.block_request("go_to", &mut at([1_000, 0])?)?;
             board.logs("driving")?;
         }
         _ => {}
@@ -122,7 +122,7 @@ fn works(manager: &Manager, board: &Board, who: &Who) -> Result<()> {
     let agv: Peer = manager.meet(who)?;
     let found = retried(|| position(&agv))?;
     ensure!(found == [0, 0], "a fresh board is at {found:?}");
-    agv.block_request("go_to", &mut *at([1, 0])?)?;
+    agv.block_request("go_to", &mut at([1, 0])?)?;
     board.logs("arrived at 1 0")
 }
 
