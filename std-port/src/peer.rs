@@ -9,7 +9,7 @@ use cara_core::distribution::function_list::Function;
 use cara_core::distribution::hello::Limits;
 use cara_core::distribution::identity::{Epoch, Identity};
 use cara_core::distribution::parameters::ParametersView;
-use cara_core::error::Error;
+use cara_core::error::{CloseReason, Error};
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::RequestOptions;
 use cara_core::time::Duration;
@@ -125,6 +125,11 @@ impl<T: Send + 'static> Peer<T> {
     /// How long it has been connected without a break; `None` while it is not.
     pub fn connected_for(&self) -> Option<Duration> {
         self.cell.connected_for().map(Into::into)
+    }
+
+    /// How long ago it left, and why; `None` while it is connected.
+    pub fn left(&self) -> Option<(Duration, CloseReason)> {
+        self.cell.left().map(|(ago, reason)| (ago.into(), reason))
     }
 
     /// Which of its runs is connected: it differs after each start of the node.

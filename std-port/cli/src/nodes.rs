@@ -115,7 +115,22 @@ mod tests {
         let (role, functions) = ("s_unit".into(), 0);
         let name = name.into();
         let (address, version, epoch, connected_ms, limits) = (None, None, None, None, None);
-        NodeInfo { name, id, role, connected, address, version, epoch, connected_ms, limits, functions }
+        let (left_ms, left_reason, left_text) = (None, None, None);
+        NodeInfo {
+            name,
+            id,
+            role,
+            connected,
+            address,
+            version,
+            epoch,
+            connected_ms,
+            left_ms,
+            left_reason,
+            left_text,
+            limits,
+            functions,
+        }
     }
 
     fn chosen(nodes: &[NodeInfo], meant: &str) -> String {

@@ -39,7 +39,7 @@ fn interface(interface: &Interface) -> InterfaceInfo {
 }
 
 pub(super) fn node<T: Send + 'static>(peer: &Peer<T>) -> NodeInfo {
-    let limits = peer.limits();
+    let (limits, left) = (peer.limits(), peer.left());
     NodeInfo {
         name: peer.name().to_owned(),
         id: peer.id(),
@@ -50,6 +50,9 @@ pub(super) fn node<T: Send + 'static>(peer: &Peer<T>) -> NodeInfo {
         version: limits.map(|_| VERSION),
         epoch: peer.epoch().map(epoch),
         connected_ms: peer.connected_for().map(Duration::as_millis),
+        left_ms: left.map(|(ago, _)| ago.as_millis()),
+        left_reason: left.map(|(_, reason)| name_of(&reason)),
+        left_text: left.map(|(_, reason)| reason.to_string()),
         limits: limits.map(self::limits),
         functions: peer.their_function_list().len(),
     }

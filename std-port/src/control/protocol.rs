@@ -336,6 +336,15 @@ pub struct NodeInfo {
     pub epoch: Option<String>,
     /// For how long it has been connected without a break.
     pub connected_ms: Option<u64>,
+    /// How long ago it left, while it is not connected.
+    #[serde(default)]
+    pub left_ms: Option<u64>,
+    /// Why it left, as `Silent`.
+    #[serde(default)]
+    pub left_reason: Option<String>,
+    /// Likewise in words.
+    #[serde(default)]
+    pub left_text: Option<String>,
     /// What it takes, while it is connected.
     pub limits: Option<LimitsInfo>,
     /// Functions that it has published to this unit.

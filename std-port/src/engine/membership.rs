@@ -236,7 +236,7 @@ impl<T: Send + 'static> Engine<T> {
         let _ = self.crew().epoll.remove(&link.stream);
         self.retire(link);
         if let Some(peer) = link.peer.get() {
-            peer.leave(link);
+            peer.leave(link, reason);
             self.run_lost_hook();
             self.tell(UnitEvent::Left { peer: peer.identity.clone(), reason });
         } else {

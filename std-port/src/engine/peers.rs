@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use cara_core::config::Constraints;
 use cara_core::distribution::identity::{Identity, Role};
-use cara_core::error::Error;
+use cara_core::error::{CloseReason, Error};
 use cara_core::time::{Duration, Instant};
 
 use super::accounts::Earlier;
@@ -19,6 +19,8 @@ pub(crate) struct PeerCell {
     link: Mutex<Option<Arc<LinkCell>>>,
     /// When it joined last.
     joined: Mutex<Option<std::time::Instant>>,
+    /// When and why its last link ended.
+    left: Mutex<Option<(std::time::Instant, CloseReason)>>,
     /// What differs for this node from the unit's constraints, whether it is connected or not.
     own: Mutex<Option<OwnConstraints>>,
     pub(super) earlier: Earlier,
@@ -46,6 +48,12 @@ impl PeerCell {
     pub(crate) fn connected_for(&self) -> Option<std::time::Duration> {
         self.link()?;
         lock(&self.joined).map(|joined| joined.elapsed())
+    }
+
+    /// How long ago it left, and why, while it is not connected.
+    pub(crate) fn left(&self) -> Option<(std::time::Duration, CloseReason)> {
+        let left = *lock(&self.left);
+        left.filter(|_| !self.is_connected()).map(|(at, reason)| (at.elapsed(), reason))
     }
 
     /// Whether it is connected and what it offers is known.
@@ -80,9 +88,10 @@ impl PeerCell {
     }
 
     /// The link has ended; a newer one stays.
-    pub(crate) fn leave(&self, link: &LinkCell) {
+    pub(crate) fn leave(&self, link: &LinkCell, reason: CloseReason) {
         let mut current = self.link.lock().unwrap_or_else(PoisonError::into_inner);
         if current.as_ref().is_some_and(|current| current.serial == link.serial) {
+            *lock(&self.left) = Some((std::time::Instant::now(), reason));
             *current = None;
         }
     }
@@ -112,6 +121,7 @@ impl Peers {
             identity: identity.clone(),
             link: Mutex::new(None),
             joined: Mutex::new(None),
+            left: Mutex::new(None),
             own: Mutex::new(None),
             earlier: Mutex::new(None),
         });
@@ -203,11 +213,13 @@ mod tests {
         let (old, new) = (link(1), link(2));
         let first = peers.join(&agv(1), 8, &old);
         peers.join(&agv(2), 8, &link(3));
-        first.leave(&old);
+        assert_eq!(first.left(), None);
+        first.leave(&old, CloseReason::Silent);
         assert!(!first.is_connected());
+        assert_eq!(first.left().unwrap().1, CloseReason::Silent);
         assert_eq!(ids(&peers), [1, 2]);
         let again = peers.join(&agv(1), 8, &new);
-        assert!(Arc::ptr_eq(&first, &again) && first.is_connected());
+        assert!(Arc::ptr_eq(&first, &again) && first.is_connected() && first.left().is_none());
         assert_eq!(ids(&peers), [1, 2]);
     }
 
@@ -217,7 +229,7 @@ mod tests {
         let (old, new) = (link(1), link(2));
         let peer = peers.join(&agv(1), 8, &old);
         peers.join(&agv(1), 8, &new);
-        peer.leave(&old);
+        peer.leave(&old, CloseReason::Reset);
         assert!(Arc::ptr_eq(&peer.link().unwrap(), &new));
     }
 
@@ -227,7 +239,7 @@ mod tests {
         let links = [1, 2, 3].map(link);
         peers.join(&agv(1), 2, &links[0]);
         let second = peers.join(&agv(2), 2, &links[1]);
-        second.leave(&links[1]);
+        second.leave(&links[1], CloseReason::Reset);
         peers.join(&agv(3), 2, &links[2]);
         assert_eq!(ids(&peers), [1, 3]);
         assert!(peers.find(|identity| identity.id() == 2).is_none());

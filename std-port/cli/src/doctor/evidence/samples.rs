@@ -116,6 +116,9 @@ pub(crate) fn node_info(name: &str, id: u32, connected: bool) -> NodeInfo {
         version: None,
         epoch: None,
         connected_ms: connected.then_some(61_500),
+        left_ms: (!connected).then_some(9_000),
+        left_reason: (!connected).then(|| "Silent".into()),
+        left_text: (!connected).then(|| "nothing was heard".into()),
         limits: None,
         functions: 0,
     }
