@@ -3,24 +3,40 @@
 use std::io::{self, Write};
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use super::lines::{Line, Lines};
 use super::place::{self, PlaceError, directory, own_uid, peer_uid};
 use super::protocol::{Answer, CONTROL_VERSION, Failure, Question};
+use super::server::FULL;
 
 /// How long a unit may take to introduce itself.
 const HELLO_TIMEOUT: Duration = Duration::from_secs(2);
+/// Between two looks at a queue of connections that is full.
+const DIAL_PAUSE: Duration = Duration::from_millis(20);
 
-/// A unit that answers on a control socket.
+/// A unit that has a control socket.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RunningUnit {
-    /// Its `NAME/ID`.
+    /// Its `NAME/ID`; of one that does not say, as the name of its socket has it.
     pub unit: String,
     /// Its fleet.
     pub fleet: u32,
     /// Its socket.
     pub path: PathBuf,
+    /// Whether it can be asked.
+    pub state: UnitState,
+}
+
+/// Whether a unit with a control socket can be asked.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum UnitState {
+    /// It answers.
+    Answers,
+    /// It runs, and as many ask as may at a time: what it says to one more.
+    Full(String),
+    /// It holds its socket and does not answer: the process hangs or is stopped.
+    Silent,
 }
 
 impl std::fmt::Display for RunningUnit {
@@ -30,6 +46,22 @@ impl std::fmt::Display for RunningUnit {
 }
 
 impl RunningUnit {
+    /// Why it cannot be asked, if it cannot.
+    pub fn refusal(&self) -> Option<ControlError> {
+        let unit = self.unit.clone();
+        match &self.state {
+            UnitState::Answers => None,
+            UnitState::Full(text) => Some(ControlError::Full { unit, text: text.clone() }),
+            UnitState::Silent => Some(ControlError::Silent { unit, path: self.path.clone() }),
+        }
+    }
+
+    /// What can be told of a unit that does not introduce itself.
+    fn unasked(path: &Path, state: UnitState) -> Self {
+        let (unit, fleet) = place::told_by_name(path);
+        Self { unit, fleet, path: path.to_owned(), state }
+    }
+
     /// Whether `wanted` is its `NAME/ID` or its `NAME`.
     fn is(&self, wanted: &str) -> bool {
         self.unit == wanted || self.unit.rsplit_once('/').is_some_and(|(name, _)| name == wanted)
@@ -70,6 +102,24 @@ pub enum ControlError {
         /// The unit's version.
         theirs: u32,
     },
+    /// The unit runs, and as many ask as may at a time.
+    #[error("{unit} runs here, and its control socket has no connection free: {text}")]
+    Full {
+        /// Its `NAME/ID`.
+        unit: String,
+        /// What it says.
+        text: String,
+    },
+    /// The unit holds its socket and does not answer.
+    #[error(
+        "the control socket of {unit} is open ({path}) and does not answer: the process hangs or is stopped; restart it"
+    )]
+    Silent {
+        /// Its `NAME/ID`.
+        unit: String,
+        /// Its socket.
+        path: PathBuf,
+    },
     /// The unit could not answer.
     #[error("{0}")]
     Failed(Failure),
@@ -97,16 +147,25 @@ impl From<PlaceError> for ControlError {
     }
 }
 
-/// The units that answer in the [directory] of control sockets.
+/// The units with a socket in the [directory] of control sockets; see [`running_in`].
 pub fn running() -> Result<Vec<RunningUnit>, ControlError> {
     running_in(&directory())
 }
 
-/// The units that answer in a directory.
+/// The units with a socket in a directory: those that answer, and those that run and cannot be asked now.
 pub fn running_in(directory: &Path) -> Result<Vec<RunningUnit>, ControlError> {
     let sockets = place::sockets(directory)?;
-    // One that is being stopped, or stands still, is none that answers.
-    Ok(sockets.iter().filter_map(|path| Client::connect(path).ok()).map(|client| client.unit).collect())
+    Ok(sockets.iter().filter_map(|path| look(path)).collect())
+}
+
+/// The unit behind a socket. One that is just being stopped, or that speaks otherwise, is none.
+fn look(path: &Path) -> Option<RunningUnit> {
+    match Client::connect(path) {
+        Ok(client) => Some(client.unit),
+        Err(ControlError::Full { text, .. }) => Some(RunningUnit::unasked(path, UnitState::Full(text))),
+        Err(ControlError::Silent { .. }) => Some(RunningUnit::unasked(path, UnitState::Silent)),
+        Err(_) => None,
+    }
 }
 
 /// A connection to a running unit.
@@ -133,13 +192,7 @@ pub struct Client {
 impl Client {
     /// Connects to the socket at a path.
     pub fn connect(path: &Path) -> Result<Self, ControlError> {
-        let stream = place::dial(path).map_err(|error| match error.kind() {
-            io::ErrorKind::NotFound | io::ErrorKind::ConnectionRefused => ControlError::NoneRunning(path.to_owned()),
-            io::ErrorKind::PermissionDenied => {
-                ControlError::NotAllowed { path: path.to_owned(), reason: error.to_string() }
-            }
-            _ => ControlError::Broken(error),
-        })?;
+        let stream = dial(path)?;
         let owner = peer_uid(&stream)?;
         if ![owner, own_uid()].contains(&0) && owner != own_uid() {
             let reason = format!("user {owner} answers there, and this is user {}", own_uid());
@@ -147,9 +200,10 @@ impl Client {
         }
         stream.set_read_timeout(Some(HELLO_TIMEOUT))?;
         let mut lines = Lines::new(stream);
-        let (unit, fleet) = hello(&mut lines)?;
+        let (unit, fleet) = hello(&mut lines).map_err(|error| refused(path, error))?;
         lines.source().set_read_timeout(None)?;
-        Ok(Self { lines, unit: RunningUnit { unit, fleet, path: path.to_owned() }, open: false })
+        let unit = RunningUnit { unit, fleet, path: path.to_owned(), state: UnitState::Answers };
+        Ok(Self { lines, unit, open: false })
     }
 
     /// Connects to the only unit that runs, or to the one that is meant by `NAME/ID` or `NAME`.
@@ -171,7 +225,7 @@ impl Client {
             running = meant;
         }
         match &running[..] {
-            [only] => Self::connect(&only.path),
+            [only] => only.refusal().map_or_else(|| Self::connect(&only.path), Err),
             _ => Err(ControlError::Several(running)),
         }
     }
@@ -205,6 +259,40 @@ impl Client {
             Answer::Failed(failure) => Err(ControlError::Failed(failure)),
             answer => Ok(Some(answer)),
         }
+    }
+}
+
+/// Connects; a queue of connections that stays full is a unit that takes none of them.
+fn dial(path: &Path) -> Result<UnixStream, ControlError> {
+    let start = Instant::now();
+    loop {
+        let error = match place::dial(path) {
+            Ok(stream) => return Ok(stream),
+            Err(error) => error,
+        };
+        return Err(match error.kind() {
+            io::ErrorKind::NotFound | io::ErrorKind::ConnectionRefused => ControlError::NoneRunning(path.to_owned()),
+            io::ErrorKind::PermissionDenied => {
+                ControlError::NotAllowed { path: path.to_owned(), reason: error.to_string() }
+            }
+            io::ErrorKind::WouldBlock if start.elapsed() < HELLO_TIMEOUT => {
+                std::thread::sleep(DIAL_PAUSE);
+                continue;
+            }
+            _ => refused(path, ControlError::Broken(error)),
+        });
+    }
+}
+
+/// What it means that a unit did not introduce itself.
+fn refused(path: &Path, error: ControlError) -> ControlError {
+    let unit = place::told_by_name(path).0;
+    match error {
+        ControlError::Failed(failure) if failure.error == FULL => ControlError::Full { unit, text: failure.text },
+        ControlError::Broken(error) if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut) => {
+            ControlError::Silent { unit, path: path.to_owned() }
+        }
+        error => error,
     }
 }
 

@@ -25,7 +25,7 @@ mod values;
 use std::path::PathBuf;
 
 pub use answering::execute;
-pub use client::{Answers, Client, ControlError, RunningUnit, running, running_in};
+pub use client::{Answers, Client, ControlError, RunningUnit, UnitState, running, running_in};
 pub use place::directory;
 pub(crate) use server::Server;
 

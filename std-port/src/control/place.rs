@@ -88,6 +88,39 @@ fn escape(name: &str) -> String {
     escaped
 }
 
+/// The `NAME/ID` and the fleet that the name of a unit's socket tells; of another name, that and fleet 0.
+pub(super) fn told_by_name(path: &Path) -> (String, u32) {
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    told(&name).unwrap_or_else(|| (path.display().to_string(), 0))
+}
+
+fn told(file: &str) -> Option<(String, u32)> {
+    let (rest, fleet) = file.strip_suffix(SUFFIX)?.rsplit_once('-')?;
+    let (name, id) = rest.rsplit_once('-')?;
+    let id: u32 = id.parse().ok()?;
+    Some((format!("{}/{id}", unescape(name)), fleet.parse().ok()?))
+}
+
+/// What [`escape`] was given, as far as it can be told.
+fn unescape(name: &str) -> String {
+    let mut bytes = Vec::new();
+    let mut rest = name.as_bytes();
+    while let Some((&first, behind)) = rest.split_first() {
+        let digits = behind.get(..2).and_then(|digits| std::str::from_utf8(digits).ok());
+        match digits.and_then(|digits| u8::from_str_radix(digits, 16).ok()).filter(|_| first == b'%') {
+            Some(byte) => {
+                bytes.push(byte);
+                rest = behind.get(2..).unwrap_or_default();
+            }
+            None => {
+                bytes.push(first);
+                rest = behind;
+            }
+        }
+    }
+    String::from_utf8_lossy(&bytes).into_owned()
+}
+
 fn fnv(bytes: &[u8]) -> u64 {
     bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, &byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3))
 }
@@ -268,6 +301,18 @@ mod tests {
         assert_eq!(name_of("../../etc"), "%2E.%2F..%2Fetc-7-3.sock");
         assert_eq!(name_of("."), "%2E-7-3.sock");
         assert_eq!(name_of("Fähre 1"), "F%C3%A4hre%201-7-3.sock");
+    }
+
+    #[test]
+    fn the_name_of_a_socket_tells_its_unit() {
+        for name in ["AGV_manager", "a-b", "../../etc", "Fähre 1"] {
+            assert_eq!(told_by_name(&Path::new("/x").join(name_of(name))), (format!("{name}/7"), 3));
+        }
+        for odd in ["unit.sock", "a-b.sock", "a-1-x.sock", "a-1-2"] {
+            assert_eq!(told_by_name(&Path::new("/x").join(odd)), (format!("/x/{odd}"), 0));
+        }
+        assert_eq!(unescape("%"), "%");
+        assert_eq!(unescape("%4"), "%4");
     }
 
     #[test]

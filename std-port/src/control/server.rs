@@ -23,6 +23,8 @@ use crate::sys::epoll::{Epoll, Events, Interest, Waker};
 
 /// Connections at a time.
 pub(super) const MOST_CONNECTIONS: usize = 8;
+/// The name of the failure that one more connection ends with.
+pub(super) const FULL: &str = "Full";
 /// A client that takes nothing for so long is cut off.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(2);
 /// Samples gather for at most so long, so that writing them disturbs what they measure less.
@@ -137,7 +139,7 @@ impl Shared {
         connections.threads.retain(|thread| !thread.is_finished());
         if connections.open.len() >= MOST_CONNECTIONS {
             let text = format!("{MOST_CONNECTIONS} connections are open already: close one");
-            return refuse(Failure::resource("Full", text));
+            return refuse(Failure::resource(FULL, text));
         }
         let Ok(kept) = stream.try_clone() else { return };
         let number = connections.next;

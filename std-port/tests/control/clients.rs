@@ -5,7 +5,7 @@ use std::os::unix::net::{UnixListener, UnixStream};
 use std::time::Duration;
 
 use cara_std::control::protocol::{Answer, LONGEST_LINE, Question};
-use cara_std::control::{Client, Control, ControlError, running_in};
+use cara_std::control::{Client, Control, ControlError, RunningUnit, UnitState, running_in};
 
 use crate::support::{Depot, PATIENCE, ask, call, manager, until};
 
@@ -151,16 +151,33 @@ fn the_ninth_client_is_told_why_it_is_not_taken() {
     let depot = Depot::new();
     let mut clients: Vec<_> = (0..8).map(|_| depot.client()).collect();
     match Client::connect(&depot.path()) {
-        Err(ControlError::Failed(failure)) => {
-            assert_eq!((failure.error.as_str(), failure.cause.as_str()), ("Full", "resource"))
-        }
+        Err(error @ ControlError::Full { .. }) => assert!(error.to_string().contains("close one"), "{error}"),
         other => panic!("{:?}", other.map(|client| client.unit().clone())),
     }
+    let units = running_in(depot.directory.path()).unwrap();
+    assert!(matches!(&units[..], [RunningUnit { state: UnitState::Full(_), .. }]), "{units:?}");
+    assert!(matches!(Client::find_in(depot.directory.path(), None), Err(ControlError::Full { .. })));
     for client in &mut clients {
         assert_eq!(ask(client, Question::Search).unwrap(), []);
     }
     clients.pop();
     until("there is room again", || Client::connect(&depot.path()).is_ok());
+}
+
+#[test]
+fn a_unit_that_takes_no_connection_is_said_to_stand_still() {
+    let directory = crate::support::directory();
+    let _listener = UnixListener::bind(directory.path().join("m_1-7-3.sock")).unwrap();
+    let units = running_in(directory.path()).unwrap();
+    let expected = ("m_1/7".to_owned(), 3, UnitState::Silent);
+    assert_eq!(
+        units.iter().map(|unit| (unit.unit.clone(), unit.fleet, unit.state.clone())).collect::<Vec<_>>(),
+        [expected]
+    );
+    match Client::find_in(directory.path(), Some("m_1")) {
+        Err(error @ ControlError::Silent { .. }) => assert!(error.to_string().contains("restart it"), "{error}"),
+        other => panic!("{:?}", other.err()),
+    }
 }
 
 #[test]
@@ -279,7 +296,8 @@ fn impostor(line: &'static [u8]) -> (tempfile::TempDir, Result<Client, ControlEr
 fn a_client_says_what_is_wrong_with_the_other_end() {
     let newer = impostor(b"{\"answer\":\"hello\",\"control_version\":2,\"unit\":\"x/1\",\"fleet\":0}\n").1;
     assert!(matches!(newer, Err(ControlError::Version { theirs: 2 })));
-    for line in [&b"SSH-2.0\n"[..], b"{\"answer\":\"done\"}\n", b""] {
+    for line in [&b"SSH-2.0\n"[..], b"{\"answer\":\"done\"}\n"] {
         assert!(matches!(impostor(line).1, Err(ControlError::Broken(_))), "{line:?}");
     }
+    assert!(matches!(impostor(b"").1, Err(ControlError::Silent { .. })));
 }

@@ -26,7 +26,7 @@ pub(super) fn choose(global: &Global) -> anyhow::Result<Option<Client>> {
     match (meant.as_slice(), wanted) {
         ([], None) => Ok(None),
         ([], Some(wanted)) => Err(Ended::no_unit(format!("{wanted} does not run on this host{}", others(&all)))),
-        ([only], _) => Client::connect(&only.path).map(Some).map_err(error),
+        ([only], _) => only.refusal().map_or_else(|| Client::connect(&only.path), Err).map(Some).map_err(error),
         (several, _) => Err(Ended::usage(format!(
             "several units run on this host: {}; choose one with --unit, --fleet or --socket",
             list(several.iter().copied())
@@ -47,7 +47,7 @@ fn list<'u>(units: impl Iterator<Item = &'u RunningUnit>) -> String {
     units.map(RunningUnit::to_string).collect::<Vec<_>>().join(", ")
 }
 
-/// Whether a unit of that identity answers on this host.
+/// Whether a unit of that identity runs on this host.
 pub(super) fn runs(identity: &NameAndId, fleet: u32) -> anyhow::Result<bool> {
     let all = running().map_err(error)?;
     Ok(all.iter().any(|unit| unit.unit == identity.to_string() && unit.fleet == fleet))
@@ -85,6 +85,8 @@ fn error(error: ControlError) -> anyhow::Error {
             (Exit::NoUnit, "NoUnit")
         }
         ControlError::Several(_) => (Exit::Usage, "Usage"),
+        ControlError::Full { .. } => (Exit::Failed, "Full"),
+        ControlError::Silent { .. } => (Exit::Failed, "Silent"),
         _ => (Exit::Failed, "Broken"),
     };
     Ended { exit, text: error.to_string(), name: name.into() }.into()
