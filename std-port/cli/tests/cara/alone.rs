@@ -125,6 +125,22 @@ fn cara_does_not_pretend_to_be_a_unit_that_runs() {
 }
 
 #[test]
+fn a_unit_that_cannot_be_asked_now_is_not_overlooked() {
+    let stage = Stage::with(&[]);
+    let socket = std::fs::read_dir(stage.control()).unwrap().next().unwrap().unwrap().path();
+    let connect = || std::os::unix::net::UnixStream::connect(&socket).unwrap();
+    // Some may be refused, as those of commands that have just ended still count; the others stay.
+    let _held: Vec<_> = (0..12).map(|_| connect()).collect();
+    for verb in [&["scan"][..], &["call", "agv-1", "fail"]] {
+        stage.ends(1, verb).says("manager/1 runs here").says("close one");
+    }
+    let hung = Stage::empty();
+    let path = hung.control().join(format!("hung-7-{}.sock", hung.fleet));
+    let _listener = std::os::unix::net::UnixListener::bind(path).unwrap();
+    hung.ends(1, &["scan"]).says("hung/7").says("restart it");
+}
+
+#[test]
 fn what_else_may_answer_on_a_socket_does_not_panic() {
     let stage = Stage::empty();
     let path = stage.control().join("other.sock");
