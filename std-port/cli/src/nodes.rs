@@ -6,9 +6,31 @@ use crate::close_names::close;
 use crate::exit::Ended;
 use crate::operator::Operator;
 
-/// A node in the form in which a unit is asked about it: `NAME/ID`.
+/// A node that is meant, and in which form a unit is asked about it.
+#[derive(Clone, Debug)]
+pub(crate) struct Chosen {
+    pub(crate) node: NodeInfo,
+    /// `NAME/ID`, with its role behind it where another connected node has the same.
+    pub(crate) selector: String,
+}
+
+impl Chosen {
+    pub(crate) fn among(nodes: &[NodeInfo], node: &NodeInfo) -> Self {
+        let twins = nodes.iter().filter(|other| other.connected && full_name(other) == full_name(node)).count();
+        let selector = if twins > 1 { format!("{}@{}", full_name(node), node.role) } else { full_name(node) };
+        Self { node: node.clone(), selector }
+    }
+}
+
+/// Its `NAME/ID`.
 pub(crate) fn full_name(node: &NodeInfo) -> String {
     format!("{}/{}", node.name, node.id)
+}
+
+/// A [selector](Chosen::selector) as `NAME/ID`.
+pub(crate) fn without_role(selector: &str) -> &str {
+    let plain = selector.strip_suffix("@m_unit").or_else(|| selector.strip_suffix("@s_unit"));
+    plain.unwrap_or(selector)
 }
 
 /// The nodes that the unit knows.
@@ -19,21 +41,21 @@ pub(crate) fn all(operator: &mut Operator, offering: Option<&str>) -> anyhow::Re
 }
 
 /// The node that is meant; one that is not connected is an error that says so.
-pub(crate) fn connected(operator: &mut Operator, meant: &str) -> anyhow::Result<NodeInfo> {
+pub(crate) fn connected(operator: &mut Operator, meant: &str) -> anyhow::Result<Chosen> {
     let known = known(operator, meant)?;
-    if known.connected {
+    if known.node.connected {
         return Ok(known);
     }
-    let name = full_name(&known);
-    let text = format!("{name} was here and is not connected now; `cara doctor {}` looks for the reason", known.name);
+    let (name, plain) = (&known.selector, &known.node.name);
+    let text = format!("{name} was here and is not connected now; `cara doctor {plain}` looks for the reason");
     Err(Ended::failed("NotConnected", text))
 }
 
 /// The node that is meant, connected or not.
-pub(crate) fn known(operator: &mut Operator, meant: &str) -> anyhow::Result<NodeInfo> {
+pub(crate) fn known(operator: &mut Operator, meant: &str) -> anyhow::Result<Chosen> {
     let nodes = all(operator, None)?;
     match choose(&nodes, meant) {
-        Choice::One(node) => Ok(node.clone()),
+        Choice::One(node) => Ok(Chosen::among(&nodes, node)),
         Choice::Several(names) => {
             Err(Ended::usage(format!("several nodes are called `{meant}`: write {}", names.join(" or "))))
         }
@@ -48,6 +70,33 @@ enum Choice<'n> {
 }
 
 fn choose<'n>(nodes: &'n [NodeInfo], meant: &str) -> Choice<'n> {
+    let mut found = found(nodes, meant);
+    if found.is_empty()
+        && let Some((meant, role)) = meant.rsplit_once('@')
+    {
+        found = self::found(nodes, meant);
+        found.retain(|node| node.role == role);
+    }
+    // One that is here goes before one of the same name that has left.
+    if found.len() > 1 && found.iter().any(|node| node.connected) {
+        found.retain(|node| node.connected);
+    }
+    match found.as_slice() {
+        [] => Choice::None,
+        [node] => Choice::One(node),
+        several => {
+            let same = |node: &NodeInfo| several.iter().filter(|other| full_name(other) == full_name(node)).count();
+            let name = |node: &NodeInfo| match same(node) {
+                1 => full_name(node),
+                _ => format!("{}@{}", full_name(node), node.role),
+            };
+            Choice::Several(several.iter().map(|node| name(node)).collect())
+        }
+    }
+}
+
+/// By both, else by name, else by ID.
+fn found<'n>(nodes: &'n [NodeInfo], meant: &str) -> Vec<&'n NodeInfo> {
     let matches = |wanted: &dyn Fn(&NodeInfo) -> bool| nodes.iter().filter(|node| wanted(node)).collect::<Vec<_>>();
     let mut found = matches(&|node| full_name(node) == meant);
     if found.is_empty() {
@@ -56,15 +105,7 @@ fn choose<'n>(nodes: &'n [NodeInfo], meant: &str) -> Choice<'n> {
     if found.is_empty() {
         found = matches(&|node| meant.strip_prefix('#').and_then(|id| id.parse().ok()) == Some(node.id));
     }
-    // One that is here goes before one of the same name that has left.
-    if found.len() > 1 && found.iter().filter(|node| node.connected).count() == 1 {
-        found.retain(|node| node.connected);
-    }
-    match found.as_slice() {
-        [] => Choice::None,
-        [node] => Choice::One(node),
-        several => Choice::Several(several.iter().map(|node| full_name(node)).collect()),
-    }
+    found
 }
 
 fn not_there(nodes: &[NodeInfo], meant: &str, waited: &str) -> String {
@@ -109,7 +150,7 @@ pub(crate) fn no_such_function(node: &str, name: &str, functions: &[FunctionInfo
 
 #[cfg(test)]
 mod tests {
-    use super::{Choice, NodeInfo, choose, full_name, not_there};
+    use super::{Choice, Chosen, NodeInfo, choose, full_name, not_there};
 
     fn node(name: &str, id: u32, connected: bool) -> NodeInfo {
         let (role, functions) = ("s_unit".into(), 0);
@@ -151,6 +192,18 @@ mod tests {
         assert_eq!(chosen(&nodes, "a/1"), "a/1");
         assert_eq!(chosen(&nodes, "#1"), "agv/1", "the other one of this id has left");
         assert_eq!(chosen(&nodes, "#x"), "none");
+    }
+
+    #[test]
+    fn one_name_in_two_roles_is_told_apart() {
+        let manager = |connected| NodeInfo { role: "m_unit".into(), ..node("veh", 50, connected) };
+        let nodes = [node("veh", 50, true), manager(false)];
+        assert_eq!(chosen(&nodes, "veh/50"), "veh/50", "the other one has left");
+        assert_eq!(Chosen::among(&nodes, &nodes[0]).selector, "veh/50");
+        let nodes = [node("veh", 50, true), manager(true)];
+        assert_eq!(chosen(&nodes, "veh"), "veh/50@s_unit|veh/50@m_unit");
+        assert!(matches!(choose(&nodes, "veh/50@m_unit"), Choice::One(node) if node.role == "m_unit"));
+        assert_eq!(Chosen::among(&nodes, &nodes[1]).selector, "veh/50@m_unit");
     }
 
     #[test]

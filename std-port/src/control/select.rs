@@ -1,7 +1,8 @@
-//! Which node a question means: `NAME`, `NAME/ID` or `#ID`.
+//! Which node a question means: `NAME`, `NAME/ID` or `#ID`, where needed with `@m_unit` or `@s_unit` behind it.
 
 use crate::{CommunicationSystem, Peer};
 
+use super::describe::role;
 use super::protocol::Failure;
 
 /// Most nodes that a failure lists.
@@ -10,12 +11,17 @@ const LISTED: usize = 20;
 /// The node that `selector` means; a failure lists what there is.
 pub(super) fn node<T: Send + 'static>(system: &CommunicationSystem<T>, selector: &str) -> Result<Peer<T>, Failure> {
     let all = nodes(system);
-    let mut meant: Vec<Peer<T>> = all.iter().filter(|peer| means(selector, peer.name(), peer.id())).cloned().collect();
+    let is_meant = |peer: &&Peer<T>| means(selector, peer.name(), peer.id(), role(peer.identity().role()));
+    let mut meant: Vec<Peer<T>> = all.iter().filter(is_meant).cloned().collect();
+    // One that is here goes before one that has left.
+    if meant.len() > 1 && meant.iter().any(Peer::is_connected) {
+        meant.retain(Peer::is_connected);
+    }
     match (meant.pop(), meant.is_empty()) {
         (Some(peer), true) => Ok(peer),
         (Some(peer), false) => {
             meant.push(peer);
-            let text = format!("'{selector}' means several nodes ({}): ask for one as NAME/ID", list(&meant));
+            let text = format!("'{selector}' means several nodes ({}): ask for one of them", list(&meant));
             Err(Failure::configuration("AmbiguousNode", text))
         }
         (None, _) if all.is_empty() => {
@@ -35,10 +41,14 @@ pub(super) fn nodes<T: Send + 'static>(system: &CommunicationSystem<T>) -> Vec<P
     nodes
 }
 
-/// A name may hold `/` and `#` itself, so each reading counts.
-fn means(selector: &str, name: &str, id: u32) -> bool {
-    let by_both = selector.rsplit_once('/').is_some_and(|(wanted, number)| wanted == name && is(number, id));
-    selector == name || by_both || selector.strip_prefix('#').is_some_and(|number| is(number, id))
+/// A name may hold `/`, `#` and `@` itself, so each reading counts.
+fn means(selector: &str, name: &str, id: u32, role: &str) -> bool {
+    let of_role = selector.rsplit_once('@').filter(|(_, wanted)| *wanted == role);
+    let is_it = |selector: &str| {
+        let by_both = selector.rsplit_once('/').is_some_and(|(wanted, number)| wanted == name && is(number, id));
+        selector == name || by_both || selector.strip_prefix('#').is_some_and(|number| is(number, id))
+    };
+    is_it(selector) || of_role.is_some_and(|(selector, _)| is_it(selector))
 }
 
 fn is(number: &str, id: u32) -> bool {
@@ -46,7 +56,12 @@ fn is(number: &str, id: u32) -> bool {
 }
 
 fn list<T: Send + 'static>(peers: &[Peer<T>]) -> String {
-    let mut names: Vec<String> = peers.iter().map(|peer| peer.identity().to_string()).collect();
+    let same = |name: &str| peers.iter().filter(|other| other.identity().to_string() == name).count();
+    let full = |peer: &Peer<T>| match same(&peer.identity().to_string()) {
+        1 => peer.identity().to_string(),
+        _ => format!("{}@{}", peer.identity(), role(peer.identity().role())),
+    };
+    let mut names: Vec<String> = peers.iter().map(full).collect();
     names.sort();
     let more = names.len().saturating_sub(LISTED);
     names.truncate(LISTED);
@@ -56,7 +71,16 @@ fn list<T: Send + 'static>(peers: &[Peer<T>]) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::means;
+    fn means(selector: &str, name: &str, id: u32) -> bool {
+        super::means(selector, name, id, "s_unit")
+    }
+
+    #[test]
+    fn a_role_may_stand_behind() {
+        assert!(means("agv/7@s_unit", "agv", 7) && means("agv@s_unit", "agv", 7) && means("#7@s_unit", "agv", 7));
+        assert!(!means("agv/7@m_unit", "agv", 7) && !means("agv/7@", "agv", 7));
+        assert!(means("agv@s_unit", "agv@s_unit", 1));
+    }
 
     #[test]
     fn a_node_is_meant_by_name_by_both_or_by_id() {

@@ -10,7 +10,7 @@ use serde_json::json;
 
 use crate::exit::{Ended, Exit};
 use crate::global::Global;
-use crate::nodes::{self, full_name};
+use crate::nodes::{self, Chosen};
 use crate::operator::{Need, Operator, exit_of};
 use crate::output::{self, BAD};
 use crate::text::{Mistake, Written, bind, read, show_call};
@@ -86,7 +86,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
     let need = node.map_or(Need::Offering(function), |node| Need::Function(node, function));
     let mut operator = Operator::open(global, &need)?;
     let node = match node {
-        Some(node) => Some(full_name(&nodes::connected(&mut operator, node)?)),
+        Some(node) => Some(nodes::connected(&mut operator, node)?.selector),
         None => None,
     };
     let published = match &node {
@@ -180,11 +180,13 @@ fn of_node(operator: &mut Operator, node: &str, function: &str) -> anyhow::Resul
 fn of_any(operator: &mut Operator, function: &str) -> anyhow::Result<FunctionInfo> {
     let offering = nodes::all(operator, Some(function))?;
     if let Some(node) = offering.iter().find(|node| node.connected) {
-        return of_node(operator, &full_name(node), function);
+        let all = nodes::all(operator, None)?;
+        return of_node(operator, &Chosen::among(&all, node).selector, function);
     }
     let mut functions: Vec<FunctionInfo> = Vec::new();
-    for node in nodes::all(operator, None)?.iter().filter(|node| node.connected) {
-        let more = nodes::functions(operator, &full_name(node))?.into_iter();
+    let all = nodes::all(operator, None)?;
+    for node in all.iter().filter(|node| node.connected) {
+        let more = nodes::functions(operator, &Chosen::among(&all, node).selector)?.into_iter();
         functions.extend(more);
     }
     functions.sort_by(|a, b| a.signature.cmp(&b.signature));

@@ -7,7 +7,7 @@ use serde_json::{Map, Value, json};
 
 use crate::exit::Exit;
 use crate::global::Global;
-use crate::nodes::{self, full_name};
+use crate::nodes;
 use crate::operator::{Need, Operator};
 use crate::output::{self, FAINT, HEADING, PLAIN};
 
@@ -31,7 +31,7 @@ pub(crate) fn run(Arguments { node, zeros, prometheus }: Arguments, global: &Glo
         return print_metrics(&mut operator);
     }
     let node = match node {
-        Some(node) => Some(full_name(&nodes::connected(&mut operator, &node)?)),
+        Some(node) => Some(nodes::connected(&mut operator, &node)?.selector),
         None => None,
     };
     let answers = operator.answers(&Question::Counters { node })?.into_iter();

@@ -7,7 +7,7 @@ use serde_json::json;
 
 use crate::exit::Exit;
 use crate::global::Global;
-use crate::nodes::{self, full_name};
+use crate::nodes;
 use crate::operator::{Need, Operator};
 use crate::output::{self, PLAIN, Rows};
 use crate::units::show_micros;
@@ -21,7 +21,7 @@ pub(crate) struct Arguments {
 
 pub(crate) fn run(Arguments { node }: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
     let mut operator = Operator::open(global, &Need::Node(&node))?;
-    let node = full_name(&nodes::connected(&mut operator, &node)?);
+    let node = nodes::connected(&mut operator, &node)?.selector;
     let functions = nodes::functions(&mut operator, &node)?;
     if global.json {
         output::object(&json!({ "node": node, "functions": functions }))?;

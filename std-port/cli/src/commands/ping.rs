@@ -9,7 +9,7 @@ use serde_json::json;
 use crate::exit::Exit;
 use crate::global::Global;
 use crate::interrupt::Interrupt;
-use crate::nodes::{self, full_name};
+use crate::nodes;
 use crate::operator::{Need, Operator};
 use crate::output::{self, BAD};
 use crate::statistics::Times;
@@ -33,7 +33,7 @@ pub(crate) struct Arguments {
 
 pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
     let mut operator = Operator::open(global, &Need::Node(&arguments.node))?;
-    let node = full_name(&nodes::connected(&mut operator, &arguments.node)?);
+    let node = nodes::connected(&mut operator, &arguments.node)?.selector;
     let interrupt = Interrupt::catch()?;
     let mut samples = Vec::new();
     for number in 1..=arguments.count {

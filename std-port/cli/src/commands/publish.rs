@@ -8,7 +8,7 @@ use serde_json::json;
 
 use crate::exit::Exit;
 use crate::global::Global;
-use crate::nodes::{self, full_name};
+use crate::nodes;
 use crate::operator::{Need, Operator};
 use crate::output::{self, BAD};
 use crate::units::parse_time;
@@ -27,7 +27,7 @@ pub(crate) fn run(Arguments { node, timeout }: Arguments, global: &Global) -> an
     let need = node.as_deref().map_or(Need::Everybody, Need::Node);
     let mut operator = Operator::open(global, &need)?;
     let node = match node {
-        Some(node) => Some(full_name(&nodes::connected(&mut operator, &node)?)),
+        Some(node) => Some(nodes::connected(&mut operator, &node)?.selector),
         None => None,
     };
     let question = Question::Publish { node: node.clone(), timeout_ms: timeout.as_millis() as u64 };

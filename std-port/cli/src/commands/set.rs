@@ -7,7 +7,7 @@ use cara_std::control::protocol::{Answer, ConstraintsInfo, Question};
 use crate::close_names;
 use crate::exit::{Ended, Exit};
 use crate::global::Global;
-use crate::nodes::{self, full_name};
+use crate::nodes;
 use crate::operator::{Need, Operator};
 use crate::output::{self, HEADING, PLAIN, Rows};
 use crate::units::{parse_bytes, parse_micros, show_bytes, show_micros};
@@ -59,7 +59,7 @@ pub(crate) fn run(Arguments { node, constraint, value }: Arguments, global: &Glo
     let mut operator = Operator::open(global, &towards)?;
     let node = match operator.is_itself(&node)? {
         true => None,
-        false => Some(full_name(&nodes::known(&mut operator, &node)?)),
+        false => Some(nodes::known(&mut operator, &node)?.selector),
     };
     let question = Question::Set { node: node.clone(), constraint: name.into(), value };
     let answers = operator.answers(&question)?.into_iter();

@@ -3,15 +3,15 @@
 use std::time::{Duration, Instant};
 
 use cara_std::control::Control;
-use cara_std::control::protocol::{FunctionInfo, NodeInfo};
+use cara_std::control::protocol::FunctionInfo;
 use cara_std::survey::Survey;
-use cara_std::{CommunicationSystem, Constraints, Fleet, Role};
+use cara_std::{CommunicationSystem, Constraints, Fleet};
 
 use super::{Need, Operator, running};
 use crate::exit::Ended;
 use crate::global::Global;
 use crate::name_and_id::NameAndId;
-use crate::nodes;
+use crate::nodes::{self, Chosen};
 use crate::units::show_micros;
 
 /// Most nodes of such a unit: it should see everybody.
@@ -67,7 +67,8 @@ fn refuse_if_it_answers(identity: &NameAndId, global: &Global) -> anyhow::Result
     let is_it = |survey: &Survey| {
         let twin = survey.heard().iter().find(|heard| {
             let same = heard.identity.as_ref().is_some_and(|other| {
-                other.role() == Role::MUnit && other.name() == identity.name && other.id() == identity.id
+                // A vehicle of the same name and ID would be mistaken for it, too.
+                other.name() == identity.name && other.id() == identity.id
             });
             same && heard.fleet == fleet
         });
@@ -102,9 +103,9 @@ fn is_met(operator: &mut Operator, need: &Need, seen: &mut Seen) -> anyhow::Resu
     match *need {
         Need::Nothing => Ok(true),
         Need::UnitOrNode(meant) => Ok(operator.is_itself(meant)? || is_there(operator, meant)?.is_some()),
-        Need::Node(meant) => Ok(is_there(operator, meant)?.is_some_and(|node| node.functions > 0)),
+        Need::Node(meant) => Ok(is_there(operator, meant)?.is_some_and(|node| node.node.functions > 0)),
         Need::Function(meant, function) => match is_there(operator, meant)? {
-            Some(node) => Ok(offers(&nodes::functions(operator, &nodes::full_name(&node))?, function)),
+            Some(node) => Ok(offers(&nodes::functions(operator, &node.selector)?, function)),
             None => Ok(false),
         },
         Need::Everybody => settled(operator, None, seen),
@@ -116,7 +117,7 @@ fn offers(functions: &[FunctionInfo], wanted: &str) -> bool {
     functions.iter().any(|function| function.name == wanted)
 }
 
-fn is_there(operator: &mut Operator, meant: &str) -> anyhow::Result<Option<NodeInfo>> {
+fn is_there(operator: &mut Operator, meant: &str) -> anyhow::Result<Option<Chosen>> {
     // Not yet there is no error while it is waited for.
     Ok(nodes::connected(operator, meant).ok())
 }

@@ -15,6 +15,7 @@ use serde::Serialize;
 use super::subject::Subject;
 use super::{Arguments, show};
 use crate::exit::Ended;
+use crate::nodes;
 use crate::operator::Operator;
 
 /// How long events are waited for after the blocking call behind a group.
@@ -114,7 +115,7 @@ impl Failures {
 /// Counts failed asynchronous requests of a node from now on, in a thread that lasts as long as the command.
 fn count_failures(operator: &Operator, node: &str) -> anyhow::Result<Arc<Failures>> {
     let failures = Arc::new(Failures::default());
-    let (counted, node) = (failures.clone(), Some(node.to_owned()));
+    let (counted, node) = (failures.clone(), Some(nodes::without_role(node).to_owned()));
     let mut second = operator.another()?;
     let (ready, is_ready) = mpsc::channel();
     std::thread::Builder::new().name("failures".into()).spawn(move || {

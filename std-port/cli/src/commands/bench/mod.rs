@@ -16,7 +16,7 @@ use clap::ArgAction;
 
 use crate::exit::Exit;
 use crate::global::Global;
-use crate::nodes::{self, full_name};
+use crate::nodes;
 use crate::operator::{Need, Operator};
 use crate::output;
 use crate::units::parse_time;
@@ -59,7 +59,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
         None => Need::Node(&arguments.node),
     };
     let mut operator = Operator::open(global, &need)?;
-    let node = full_name(&nodes::connected(&mut operator, &arguments.node)?);
+    let node = nodes::connected(&mut operator, &arguments.node)?.selector;
     let subject = subject::choose(&mut operator, &node, arguments.function.as_deref())?;
     let (sizes, left_out): (Vec<_>, Vec<_>) = arguments.sizes.iter().partition(|size| **size <= subject.longest());
     let shown = !global.json;
