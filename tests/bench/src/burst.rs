@@ -44,7 +44,7 @@ pub(crate) fn offer(caller: &mut dyn Caller, burst: &Burst) -> Offered {
         thread::sleep(due.saturating_duration_since(Instant::now()));
         while let Err(reason) = caller.send(&text, burst.delivery) {
             offered.refused += 1;
-            *offered.reasons.entry(reason).or_default() += 1;
+            *offered.reasons.entry(without_numbers(&reason)).or_default() += 1;
             if !burst.insist {
                 break;
             }
@@ -57,9 +57,27 @@ pub(crate) fn offer(caller: &mut dyn Caller, burst: &Burst) -> Offered {
     offered
 }
 
+/// The kind of a refusal: its text with an N for each number, which differs from one to the next.
+fn without_numbers(reason: &str) -> String {
+    let mut kind = String::new();
+    for c in reason.chars() {
+        match c.is_ascii_digit() {
+            true if kind.ends_with('N') => {}
+            true => kind.push('N'),
+            false => kind.push(c),
+        }
+    }
+    kind
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn refusals_are_grouped_by_kind() {
+        assert_eq!(without_numbers("wait 1203 µs of 2 ms"), "wait N µs of N ms");
+    }
 
     /// Refuses every second message.
     struct Moody(u32);

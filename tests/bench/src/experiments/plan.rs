@@ -112,7 +112,7 @@ impl Plan {
             extent,
             response,
             throughput: Group { setting, peers: SHARED.to_vec(), orders, rounds: extent.of(15, 3, 1) },
-            throughput_pins: if extent == Extent::Tiny { vec![pin] } else { pins[..pins.len() - 1].to_vec() },
+            throughput_pins: if extent == Extent::Full { pins[..pins.len() - 1].to_vec() } else { vec![pin] },
             one_way: extent.of(4_000, 4_000, 50),
             share_calls: extent.of(400, 200, 5),
             share_rounds: extent.of(20, 5, 1),

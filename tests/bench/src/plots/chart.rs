@@ -84,6 +84,8 @@ impl Chart {
         let points = || self.lines.iter().flat_map(|line| &line.points);
         let x = self.x.range(points().map(|point| self.x.place(point.0)));
         let y = self.y.range(points().map(|point| self.y.place(point.1)));
+        // The legend stands below the lines.
+        let y = if self.y.scale == Scale::Log { (y.start - (y.end - y.start) * 0.4)..y.end } else { y };
         let mut builder = ChartBuilder::on(area);
         builder.caption(&self.title, (FONT, 20)).margin(12).x_label_area_size(44).y_label_area_size(64);
         let mut chart = builder.build_cartesian_2d(x, y).map_err(told)?;
