@@ -90,8 +90,9 @@ fn of_two_nodes_with_one_identity_the_manager_tells() {
     until("the first has come", || manager.number_of_s_units() == 1);
     let _second = clinic.started(clinic.unit("agv", 7, "boss"));
     until("the second was refused", || !manager.findings().is_empty());
-    // The first one is connected all the same.
-    clinic.doctor(&["agv"]).is(&["duplicate", "connected"], 4);
+    // That the first one is connected is no comfort.
+    clinic.doctor(&["agv"]).is(&["duplicate"], 4);
+    clinic.doctor(&["--listen", "3s"]).is(&["duplicate"], 4);
 }
 
 #[test]
@@ -116,6 +117,49 @@ fn a_full_manager_is_told_by_itself_and_by_what_it_says_on_the_network() {
     // If it kept silent for so long, it could be connected as well.
     assert!(matches!(told.ids()[..], ["full"] | ["full", "ask-its-manager"]), "{told:?}");
     clinic.doctor(&["first"]).is(&["connected"], 0);
+    let told = clinic.doctor(&["--listen", "3s"]);
+    told.is(&["full"], 4);
+    assert!(told.found(0).contains("boss/1") && told.found(0).contains("second/2"), "{told:?}");
+}
+
+#[test]
+fn of_two_managers_with_one_name_is_told_first() {
+    let clinic = Clinic::new();
+    let _first = clinic.manager("boss", 64);
+    // Its socket is another one's, as of a manager in a container.
+    let second = clinic.system("boss").control(cara_std::control::Control::Off).build_system().unwrap();
+    second.start().unwrap();
+    clinic.doctor(&["boss"]).is(&["duplicate"], 4);
+    assert_eq!(clinic.doctor(&["agv", "--listen", "4s"]).ids()[0], "duplicate");
+    clinic.doctor(&["--listen", "3s"]).is(&["duplicate"], 4);
+}
+
+#[test]
+fn a_manager_that_stands_still_is_told_and_nobody_is_to_start_a_second_one() {
+    let clinic = Clinic::new();
+    let manager = clinic.manager_of_few_files(1024);
+    until("it is up", || clinic.doctor(&["boss", "--listen", "0s"]).ids() == ["answers"]);
+    manager.stand_still();
+    for arguments in [&["agv", "--listen", "3s"][..], &["boss"], &["--listen", "3s"]] {
+        let told = clinic.doctor(arguments);
+        told.is(&["unit-hangs"], 4);
+        assert!(told.found(0).starts_with("boss/1 "), "{told:?}");
+    }
+}
+
+#[test]
+fn a_node_that_was_lost_is_told_with_time_and_reason() {
+    let clinic = Clinic::new();
+    let manager = clinic.manager("boss", 64);
+    let agv = clinic.started(clinic.unit("agv", 7, "boss"));
+    until("it has come", || manager.number_of_s_units() == 1);
+    agv.stop();
+    until("it has left", || manager.number_of_s_units() == 0);
+    let told = clinic.doctor(&["agv", "--listen", "3s"]);
+    told.is(&["lost"], 4);
+    assert!(told.found(0).starts_with("agv/7 left boss/1 "), "{told:?}");
+    // Whoever stopped it knows.
+    clinic.doctor(&["--listen", "3s"]).is(&["lost"], 0);
 }
 
 #[test]
@@ -125,7 +169,7 @@ fn a_node_that_is_not_there_at_all_is_not_heard() {
     let _other = clinic.started(clinic.unit("agv-8", 8, "boss"));
     let told = clinic.doctor(&["agv-7", "--listen", "3s"]);
     told.is(&["not-heard"], 4);
-    assert!(told.found(0).contains("there is agv-8"), "{told:?}");
+    assert!(told.found(0).contains("there is agv-8/8"), "{told:?}");
     // From another host nobody can know.
     clinic.stranger(&["agv-7", "--listen", "3s"]).is(&["ask-its-manager"], 4);
 }
@@ -204,9 +248,14 @@ fn a_directory_of_sockets_that_others_can_enter_is_told() {
 #[test]
 fn mistakes_on_the_command_line_are_told_and_nothing_is_looked_at() {
     let clinic = Clinic::new();
-    for (arguments, code) in
-        [(&["--as", "boss/1"][..], 2), (&["agv", "--listen", "soon"], 2), (&["--unit", "nobody/1"], 3)]
-    {
+    for (arguments, code) in [
+        (&["--as", "boss/1"][..], 2),
+        (&["agv", "--listen", "soon"], 2),
+        (&[""], 2),
+        (&["#x"], 2),
+        (&["agv/x"], 2),
+        (&["--unit", "nobody/1"], 3),
+    ] {
         let (found, _, errors) = clinic.output(arguments);
         assert_eq!(found, code, "{arguments:?}: {errors}");
         assert!(!errors.is_empty());

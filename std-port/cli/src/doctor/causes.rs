@@ -24,9 +24,13 @@ pub(crate) fn other_version(about: &str, heard: &Heard) -> Finding {
     Finding::error(Id::OtherVersion, found, advice).about(about)
 }
 
-pub(crate) fn other_fleet(about: &str, heard: &Heard, ours: u32) -> Finding {
+pub(crate) fn other_fleet(seen: &Evidence, about: &str, heard: &Heard) -> Finding {
+    let ours = seen.fleet.0;
     let found = format!("{about} at {} is in fleet {}, and this is fleet {ours}", heard.source, heard.fleet.0);
-    let advice = format!("set the same fleet in both (`--fleet {}` shows that one's nodes)", heard.fleet.0);
+    let advice = match seen.fleet_known {
+        true => format!("set the same fleet in both (`--fleet {}` shows that one's nodes)", heard.fleet.0),
+        false => format!("no --fleet was given: try `--fleet {}`", heard.fleet.0),
+    };
     Finding::error(Id::OtherFleet, found, advice).about(about)
 }
 
@@ -41,6 +45,15 @@ pub(crate) fn duplicate(node: &str, lives: &[Life]) -> Option<Finding> {
 }
 
 const DUPLICATE_ADVICE: &str = "give each node a name and id of its own; the one that was connected first stays";
+
+/// Managers of which there are two.
+pub(crate) fn twin_managers(seen: &Evidence) -> Vec<Finding> {
+    let twins = seen.managers().into_iter().filter_map(|name| duplicate(&name, &seen.lives(&name)));
+    twins.map(|finding| Finding { advice: TWIN_MANAGERS.to_owned(), ..finding }).collect()
+}
+
+const TWIN_MANAGERS: &str =
+    "stop one of the two, or give each a name and id of its own: as it is, each has some of the nodes";
 
 /// A node that has come with one epoch after the other.
 pub(crate) fn restarting(node: &str, lives: &[Life]) -> Option<Finding> {

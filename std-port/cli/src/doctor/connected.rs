@@ -26,12 +26,14 @@ pub(crate) fn check(seen: &Evidence, unit: &Running, node: &NodeInfo) -> Vec<Fin
     let mut found: Vec<Finding> = twins.map(|finding| finding.certain(true)).into_iter().collect();
     found.extend(restarting(&name, &lives));
     found.extend(lossy(unit, &name));
+    if !found.is_empty() {
+        return found;
+    }
     let address = node.address.as_deref().unwrap_or("an unknown address");
     let text = format!("{name} is connected to {} at {address}{}", unit.name(), since(node));
     let settled = node.connected_ms.is_some_and(|ms| Duration::from_millis(ms) >= SETTLED);
-    let certain = settled && seen.listened >= WATCHED && found.is_empty();
-    found.push(Finding::info(Id::Connected, text, "nothing needs to be done").about(&name).certain(certain));
-    found
+    let certain = settled && seen.listened >= WATCHED;
+    vec![Finding::info(Id::Connected, text, "nothing needs to be done").about(&name).certain(certain)]
 }
 
 /// For how long.
@@ -90,7 +92,7 @@ mod tests {
         let mut seen = connected();
         for (missed, received, lossy) in [(2, 10, false), (3, 150, true), (3, 151, false), (40, 1000, true)] {
             seen.running[0].count("agv/7", &[("KeepAlivesMissed", missed), ("DatagramsReceived", received)]);
-            let expected = if lossy { vec![Id::LossyLink, Id::Connected] } else { vec![Id::Connected] };
+            let expected = if lossy { vec![Id::LossyLink] } else { vec![Id::Connected] };
             assert_eq!(ids(&seen), expected, "{missed} of {received}");
         }
     }
@@ -99,8 +101,8 @@ mod tests {
     fn a_life_that_goes_on_beside_the_connected_one_is_a_twin() {
         let mut seen = connected();
         seen.connected_lives = vec![life("agv/7", 1, 0, 9000), life("agv/7", 2, 3000, 3000)];
-        assert_eq!(ids(&seen), [Id::Duplicate, Id::Connected]);
+        assert_eq!(ids(&seen), [Id::Duplicate]);
         seen.connected_lives[0].last = seen.connected_lives[0].first;
-        assert_eq!(ids(&seen), [Id::Restarting, Id::Connected]);
+        assert_eq!(ids(&seen), [Id::Restarting]);
     }
 }

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::time::Duration;
 
+use cara_std::control::RunningUnit;
 use cara_std::survey::{Foreign, Heard, Reach};
 use cara_std::{Fleet, Identity, Interfaces, Manager, Role};
 
@@ -20,6 +21,8 @@ pub(crate) struct Evidence {
     /// The node that is asked about; the host and the whole network without one.
     pub(crate) which: Option<Which>,
     pub(crate) fleet: Fleet,
+    /// The fleet was given, or is that of a unit of this host.
+    pub(crate) fleet_known: bool,
     pub(crate) interfaces: Interfaces,
     /// Loopback alone is used because the environment says so, not the command line.
     pub(crate) loopback_by_environment: bool,
@@ -34,6 +37,8 @@ pub(crate) struct Evidence {
     pub(crate) dials: Vec<Dial>,
     /// Units of this host that can be asked, as they were last.
     pub(crate) running: Vec<Running>,
+    /// Units of this host that hold a control socket and cannot be asked.
+    pub(crate) unasked: Vec<RunningUnit>,
     /// Why units of this host could not be asked.
     pub(crate) control_refused: Option<String>,
     /// Lives of connected nodes as those units saw them.
@@ -90,6 +95,7 @@ impl Evidence {
     pub(crate) fn managers(&self) -> Vec<String> {
         let here = self.running.iter().filter(|running| running.is_m_unit() && running.unit.fleet == self.fleet.0);
         let mut names: Vec<String> = here.map(Running::name).collect();
+        names.extend(self.unasked.iter().filter(|unit| unit.fleet == self.fleet.0).map(|unit| unit.unit.clone()));
         names.extend(self.m_units().iter().map(|(_, identity)| identity.to_string()));
         names.sort();
         names.dedup();
@@ -98,7 +104,8 @@ impl Evidence {
 
     /// Names of m_units that were heard and do not run on this host, or cannot be asked.
     pub(crate) fn managers_elsewhere(&self) -> Vec<String> {
-        let here: Vec<String> = self.running.iter().map(Running::name).collect();
+        let mut here: Vec<String> = self.running.iter().map(Running::name).collect();
+        here.extend(self.unasked.iter().map(|unit| unit.unit.clone()));
         self.managers().into_iter().filter(|name| !here.contains(name)).collect()
     }
 

@@ -36,6 +36,10 @@ pub(crate) enum Id {
     BroadcastOneWay,
     /// An m_unit that shows itself cannot be connected to.
     TcpBlocked,
+    /// A unit of this host holds its control socket and does not answer.
+    UnitHangs,
+    /// Too many ask a unit of this host.
+    ControlFull,
     /// Another version of the protocol.
     OtherVersion,
     /// Another fleet.
@@ -54,6 +58,8 @@ pub(crate) enum Id {
     Refused,
     /// Node and manager are both there, and no link is.
     NotJoining,
+    /// The node was connected, left, and has not come back.
+    Lost,
     /// Nothing was heard from the node.
     NotHeard,
     /// The node may be connected to a manager that cannot be asked from here.
@@ -77,7 +83,7 @@ pub(crate) enum Id {
 impl Id {
     /// All of them, in the order of the documentation.
     #[cfg(test)]
-    pub(crate) const ALL: [Self; 27] = [
+    pub(crate) const ALL: [Self; 30] = [
         Self::PortInUse,
         Self::NoInterface,
         Self::InterfaceDown,
@@ -87,6 +93,8 @@ impl Id {
         Self::BroadcastLost,
         Self::BroadcastOneWay,
         Self::TcpBlocked,
+        Self::UnitHangs,
+        Self::ControlFull,
         Self::OtherVersion,
         Self::OtherFleet,
         Self::Duplicate,
@@ -96,6 +104,7 @@ impl Id {
         Self::NoManager,
         Self::Refused,
         Self::NotJoining,
+        Self::Lost,
         Self::NotHeard,
         Self::AskItsManager,
         Self::LossyLink,
@@ -119,6 +128,8 @@ impl Id {
             Self::BroadcastLost => "broadcast-lost",
             Self::BroadcastOneWay => "broadcast-one-way",
             Self::TcpBlocked => "tcp-blocked",
+            Self::UnitHangs => "unit-hangs",
+            Self::ControlFull => "control-full",
             Self::OtherVersion => "other-version",
             Self::OtherFleet => "other-fleet",
             Self::Duplicate => "duplicate",
@@ -128,6 +139,7 @@ impl Id {
             Self::NoManager => "no-manager",
             Self::Refused => "refused",
             Self::NotJoining => "not-joining",
+            Self::Lost => "lost",
             Self::NotHeard => "not-heard",
             Self::AskItsManager => "ask-its-manager",
             Self::LossyLink => "lossy-link",

@@ -13,7 +13,7 @@ use super::evidence::{Evidence, Life};
 use super::finding::Finding;
 use super::running::Sources;
 use super::which::Which;
-use super::{holder, host, network, node};
+use super::{holder, host, network, node, unasked};
 use crate::global::Global;
 
 /// Between two looks at what has come.
@@ -40,13 +40,15 @@ pub(crate) struct Looked {
 pub(crate) fn look(which: Option<Which>, listen: Duration, global: &Global) -> anyhow::Result<Looked> {
     let mut sources = Sources::open(which.as_ref(), global)?;
     let running = sources.look();
-    let fleets: HashSet<u32> = running.iter().map(|running| running.unit.fleet).collect();
+    let silent = sources.unasked.iter().map(|unit| unit.fleet);
+    let fleets: HashSet<u32> = running.iter().map(|running| running.unit.fleet).chain(silent).collect();
     let ports: HashSet<u16> = running.iter().map(|running| running.unit.discovery_port).collect();
     let fleet = global.fleet.or_else(|| only(&fleets)).unwrap_or(0);
     let port = global.discovery_port.or_else(|| only(&ports)).unwrap_or_else(|| global.port());
     let evidence = Evidence {
         which,
         fleet: Fleet(fleet),
+        fleet_known: global.fleet.is_some() || !fleets.is_empty(),
         interfaces: global.interfaces(),
         loopback_by_environment: !global.loopback && global.interfaces() == Interfaces::Loopback,
         port,
@@ -57,6 +59,7 @@ pub(crate) fn look(which: Option<Which>, listen: Duration, global: &Global) -> a
         devices: devices(&fs::read_to_string("/proc/net/dev").unwrap_or_default()),
         dials: Vec::new(),
         running,
+        unasked: sources.unasked.clone(),
         control_refused: sources.refused.clone(),
         connected_lives: Vec::new(),
         answered_alone: Vec::new(),
@@ -77,10 +80,12 @@ fn only<T: Copy>(set: &HashSet<T>) -> Option<T> {
 
 /// What it means.
 fn judge(evidence: &Evidence) -> Vec<Finding> {
-    match &evidence.which {
+    let which = evidence.which.as_ref();
+    let found = match which {
         Some(which) => node::check(evidence, which).into_iter().chain(host::control_refused(evidence)).collect(),
         None => network::check(evidence),
-    }
+    };
+    unasked::above(evidence, which, found)
 }
 
 struct Looking {

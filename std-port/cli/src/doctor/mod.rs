@@ -10,11 +10,13 @@ mod evidence;
 mod finding;
 mod holder;
 mod host;
+mod left;
 mod look;
 mod network;
 mod node;
 mod report;
 mod running;
+mod unasked;
 mod which;
 
 use std::process::ExitCode;
@@ -39,8 +41,8 @@ use self::which::Which;
 #[derive(clap::Args)]
 pub(crate) struct Arguments {
     /// NAME, NAME/ID or #ID of a node.
-    #[arg(value_name = "NAME")]
-    node: Option<String>,
+    #[arg(value_name = "NAME", value_parser = which::parse)]
+    node: Option<Which>,
     /// How long to listen at most. A node that looks for its manager says something every 16 s at the latest.
     #[arg(long, value_name = "TIME", default_value = "17s", value_parser = parse_time)]
     listen: Duration,
@@ -50,7 +52,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
     if global.act_as.is_some() {
         return Err(Ended::usage("the doctor is nobody's manager: leave --as away"));
     }
-    let looked = look::look(arguments.node.map(Which), arguments.listen, global)?;
+    let looked = look::look(arguments.node, arguments.listen, global)?;
     match global.json {
         true => output::object(&report::object(&looked))?,
         false => report::text(&looked)?,

@@ -7,11 +7,13 @@ use cara_std::Role;
 
 use super::causes::{
     dial_of, duplicate, full, missing_manager, one_way, other_version, refusal, restarting, tcp_blocked, text_of,
+    twin_managers,
 };
 use super::connected::lossy;
 use super::evidence::Evidence;
 use super::finding::{Finding, Id, Severity};
 use super::host;
+use super::left;
 use super::running::Running;
 
 /// Findings of one kind that are listed.
@@ -38,15 +40,24 @@ pub(crate) fn check(seen: &Evidence) -> Vec<Finding> {
     found.extend(host::control_refused(seen));
     found.extend(several(seen));
     found.sort_by_key(|finding| finding.severity);
-    found
+    once(found)
+}
+
+/// A duplicate that a unit has refused and that was heard as well is one.
+fn once(found: Vec<Finding>) -> Vec<Finding> {
+    let mut told = BTreeSet::new();
+    let is_new = |finding: &Finding| finding.id != Id::Duplicate || told.insert(finding.about.clone());
+    found.into_iter().filter(is_new).collect()
 }
 
 fn lives(seen: &Evidence) -> Vec<Finding> {
     let mut nodes: BTreeSet<String> = seen.ours().map(|(_, identity)| identity.to_string()).collect();
     nodes.extend(seen.connected_lives.iter().map(|life| life.node.clone()));
+    let twins = twin_managers(seen);
     let judged = nodes.iter().filter_map(|node| {
         let lives = seen.lives(node);
-        duplicate(node, &lives).or_else(|| restarting(node, &lives))
+        let managers = twins.iter().find(|twin| twin.about.as_ref() == Some(node)).cloned();
+        managers.or_else(|| duplicate(node, &lives)).or_else(|| restarting(node, &lives))
     });
     judged.take(MOST).collect()
 }
@@ -109,8 +120,7 @@ fn versions(seen: &Evidence) -> Vec<Finding> {
 fn running(seen: &Evidence, unit: &Running) -> Vec<Finding> {
     let mut found: Vec<Finding> = host::few_descriptors(unit).into_iter().collect();
     if unit.is_full() {
-        let limit = Some(unit.unit.constraints.maximum_nodes);
-        found.push(Finding { severity: Severity::Warning, ..full(&unit.name(), limit) });
+        found.push(no_room(unit));
     }
     // A refused version that was heard here as well is told already.
     let told =
@@ -119,12 +129,24 @@ fn running(seen: &Evidence, unit: &Running) -> Vec<Finding> {
         .refused
         .iter()
         .filter(|refused| !told(&refused.address))
+        .filter(|refused| !(unit.is_full() && refused.reason == "Full"))
         .filter_map(|refused| refusal(&unit.name(), refused));
     found.extend(refusals.take(MOST).map(|finding| Finding { severity: Severity::Warning, ..finding }));
     let connected = unit.nodes.iter().filter(|node| node.connected);
     found.extend(connected.filter_map(|node| lossy(unit, &format!("{}/{}", node.name, node.id))).take(MOST));
     found.extend(returns(unit));
+    found.extend(left::all(seen, unit).into_iter().take(MOST));
     found
+}
+
+/// A unit that is full, and whom it has refused for that.
+fn no_room(unit: &Running) -> Finding {
+    let finding = full(&unit.name(), Some(unit.unit.constraints.maximum_nodes));
+    let refused = unit.refused.iter().filter(|refused| refused.reason == "Full");
+    let names: BTreeSet<&str> = refused.filter_map(|refused| refused.node.as_deref()).take(MOST).collect();
+    let names: Vec<&str> = names.into_iter().collect();
+    let more = if names.is_empty() { String::new() } else { format!("; it refused {}", names.join(", ")) };
+    Finding { severity: Severity::Warning, found: finding.found.clone() + &more, ..finding }
 }
 
 /// Nodes that come back with a new epoch again and again, by the unit's counter.

@@ -8,25 +8,28 @@ use cara_std::{Identity, Manager, Role};
 
 use super::causes::{
     deaf, dial_of, duplicate, full, missing_manager, one_way, other_fleet, other_version, refusal, restarting,
-    tcp_blocked, text_of,
+    tcp_blocked, text_of, twin_managers,
 };
 use super::connected;
 use super::evidence::Evidence;
 use super::finding::{Finding, Id};
 use super::host;
+use super::left;
 use super::running::Running;
-use super::which::Which;
+use super::which::{Which, quoted};
 use crate::close_names::close;
 
 /// M_units answer a survey within milliseconds: whoever has not after this does not.
-const ANSWERED: Duration = Duration::from_millis(2_500);
+pub(crate) const ANSWERED: Duration = Duration::from_millis(2_500);
+/// Two live m_units of one name have answered two questions each by then.
+const TWINS: Duration = Duration::from_millis(1_500);
 /// Refusals of this long before the listening are looked at: the longest pause of a node that tries again, and a bit.
 const BEFORE: Duration = Duration::from_secs(20);
 
 /// Why a node is not there, the likeliest cause first; or that it is.
 pub(crate) fn check(seen: &Evidence, which: &Which) -> Vec<Finding> {
     if let Some(unit) = seen.running.iter().find(|running| which.is(&running.unit.name, running.unit.id)) {
-        return vec![runs_here(unit)];
+        return runs_here(seen, unit);
     }
     let connections = seen.running.iter().flat_map(|unit| unit.nodes.iter().map(move |node| (unit, node)));
     if let Some((unit, node)) =
@@ -36,20 +39,31 @@ pub(crate) fn check(seen: &Evidence, which: &Which) -> Vec<Finding> {
     }
     let mut ours: Vec<_> = seen.of(which).filter(|(heard, _)| is_ours(seen, heard)).collect();
     ours.sort_by_key(|(heard, _)| heard.last);
-    match ours.last() {
-        Some((heard, identity)) if identity.role() == Role::MUnit => heard_m_unit(seen, heard, identity),
+    if let Some((heard, identity)) = ours.last().filter(|(_, identity)| identity.role() == Role::MUnit) {
+        return heard_m_unit(seen, heard, identity);
+    }
+    let mut found = twin_managers(seen);
+    found.extend(match ours.last() {
         Some((heard, identity)) => heard_s_unit(seen, which, heard, identity),
         None => strange(seen, which).unwrap_or_else(|| silent(seen, which)),
-    }
+    });
+    found
 }
 
 fn is_ours(seen: &Evidence, heard: &Heard) -> bool {
     heard.same_version() && heard.fleet == seen.fleet
 }
 
-fn runs_here(unit: &Running) -> Finding {
+fn runs_here(seen: &Evidence, unit: &Running) -> Vec<Finding> {
+    let mut twins = twin_managers(seen);
+    twins.retain(|finding| finding.about.as_deref() == Some(&unit.name()));
+    if !twins.is_empty() {
+        return twins.into_iter().map(|finding| finding.certain(true)).collect();
+    }
     let found = format!("{} is a unit of this host and has run for {} s", unit.name(), unit.unit.uptime_ms / 1000);
-    Finding::info(Id::Answers, found, "nothing needs to be done").about(unit.name()).certain(true)
+    // Another one of its name has had time to show itself twice.
+    let certain = seen.listened >= TWINS;
+    vec![Finding::info(Id::Answers, found, "nothing needs to be done").about(unit.name()).certain(certain)]
 }
 
 /// In another fleet or of another version, and in ours not at all.
@@ -57,12 +71,26 @@ fn strange(seen: &Evidence, which: &Which) -> Option<Vec<Finding>> {
     let (heard, identity) = seen.of(which).last()?;
     let about = identity.to_string();
     let finding = match heard.same_version() {
-        true => other_fleet(&about, heard, seen.fleet.0),
+        true => and_its_manager(seen, heard, other_fleet(seen, &about, heard)),
         false => other_version(&about, heard),
     };
     // It could be of ours as well until that has had time to show itself.
     let certain = seen.listened >= ANSWERED;
     Some(vec![finding.certain(certain)])
+}
+
+/// A node of another fleet may look for another manager as well.
+fn and_its_manager(seen: &Evidence, heard: &Heard, finding: Finding) -> Finding {
+    let managers = seen.managers();
+    let Some(wanted) = heard.wanted.as_ref().map(text_of).filter(|wanted| !managers.contains(wanted)) else {
+        return finding;
+    };
+    if managers.is_empty() || !seen.fleet_known {
+        return finding;
+    }
+    let found = format!("{}; and it looks for the manager {wanted}, and {} runs", finding.found, managers.join(", "));
+    let advice = format!("{}, and set the manager's name and id in it to those of the one that runs", finding.advice);
+    Finding { found, advice, ..finding }
 }
 
 /// Nothing was heard of it: host and network come before the node itself.
@@ -79,7 +107,9 @@ fn silent(seen: &Evidence, which: &Which) -> Vec<Finding> {
     let blocked = dials.filter_map(|(dial, identity)| tcp_blocked(&identity.to_string(), dial));
     // It may still turn out to look for somebody else.
     found.extend(blocked.map(|finding| finding.certain(false)));
+    let lost = left::of(seen, which);
     if !found.is_empty() {
+        found.extend(lost);
         return found;
     }
     // Who cannot be read may be the one that is missed.
@@ -90,7 +120,11 @@ fn silent(seen: &Evidence, which: &Which) -> Vec<Finding> {
     let no_room =
         m_units.iter().filter(|(heard, identity)| heard.room == Some(0) && elsewhere.contains(&identity.to_string()));
     found.extend(no_room.map(|(_, identity)| full(&identity.to_string(), None)));
-    found.push(if elsewhere.is_empty() { not_heard(seen, which) } else { ask_its_manager(seen, which, &elsewhere) });
+    match lost {
+        Some(lost) => found.push(lost),
+        None if elsewhere.is_empty() => found.push(not_heard(seen, which)),
+        None => found.push(ask_its_manager(seen, which, &elsewhere)),
+    }
     found.extend(waiting_for_another(seen));
     found
 }
@@ -106,10 +140,7 @@ fn not_heard(seen: &Evidence, which: &Which) -> Finding {
         used.join(", "),
         seen.fleet.0
     );
-    let known = seen.units().map(|(_, identity)| identity.name());
-    let nodes = seen.running.iter().flat_map(|unit| unit.nodes.iter().map(|node| node.name.as_str()));
-    let names: Vec<&str> = known.chain(nodes).collect();
-    if let Some(name) = close(&which.0, names).first() {
+    if let Some(name) = nearest(seen, which) {
         found.push_str(&format!("; there is {name}"));
     }
     if let Some((unit, _)) = left(seen, which) {
@@ -118,6 +149,17 @@ fn not_heard(seen: &Evidence, which: &Which) -> Finding {
     let advice = "check that it is switched on, cabled to this network and started; that its fleet is this one; a node that \
                   was told its manager's address is silent here, and another cable or network carries no broadcast to here";
     Finding::error(Id::NotHeard, found, advice).about(&which.0)
+}
+
+/// `NAME/ID` of the node whose name is closest.
+fn nearest(seen: &Evidence, which: &Which) -> Option<String> {
+    let nodes = seen.running.iter().flat_map(|unit| &unit.nodes).map(|node| format!("{}/{}", node.name, node.id));
+    let known: Vec<String> = seen.units().map(|(_, identity)| identity.to_string()).chain(nodes).collect();
+    let wanted = which.0.rsplit_once('/').map_or(which.0.as_str(), |(name, _)| name);
+    let name_of = |full: &'_ str| full.rsplit_once('/').map_or(0, |(name, _)| name.len());
+    let names = known.iter().filter_map(|full| full.get(..name_of(full)));
+    let closest = *close(wanted, names).first()?;
+    known.iter().find(|full| full.get(..name_of(full)) == Some(closest)).cloned()
 }
 
 /// A unit of this host that has had the node connected.
@@ -132,7 +174,7 @@ fn ask_its_manager(seen: &Evidence, which: &Which, managers: &[String]) -> Findi
         which.0,
         seen.listened.as_secs_f32()
     );
-    let advice = format!("run `cara doctor {}` on the host of {}", which.0, managers.join(" or "));
+    let advice = format!("run `cara doctor {}` on the host of {}", quoted(&which.0), managers.join(" or "));
     Finding::warning(Id::AskItsManager, found, advice).about(&which.0)
 }
 
@@ -193,13 +235,14 @@ fn of_its_manager(seen: &Evidence, name: &str, wanted: &Manager) -> Option<Findi
     let here =
         seen.running.iter().find(|unit| unit.name() == manager && unit.is_m_unit() && unit.unit.fleet == seen.fleet.0);
     let Some(heard) = seen.manager(wanted) else {
-        if here.is_some() {
+        // What hangs, or cannot be asked, is told of by itself.
+        if here.is_some() || seen.unasked.iter().any(|unit| unit.unit == manager) {
             return None;
         }
         let abroad = seen.units().find(|(_, identity)| wanted.is(identity));
         let found = match abroad {
             Some((heard, _)) if !heard.same_version() => other_version(&manager, heard),
-            Some((heard, _)) => other_fleet(&manager, heard, seen.fleet.0),
+            Some((heard, _)) => other_fleet(seen, &manager, heard),
             None => missing_manager(seen, name, wanted),
         };
         return Some(found.certain(seen.listened >= ANSWERED));
@@ -249,8 +292,9 @@ fn not_joining(seen: &Evidence, name: &str, wanted: &Manager) -> Finding {
     );
     let advice = format!(
         "if it does not join within the next seconds: what {manager} sends (UDP port {}) does not reach {name}, or {port} of \
-         {manager} is closed to it; look at the firewalls of both, and run `cara doctor {name}` on the manager's host",
-        seen.port
+         {manager} is closed to it; look at the firewalls of both, and run `cara doctor {}` on the manager's host",
+        seen.port,
+        quoted(name)
     );
     Finding::error(Id::NotJoining, found, advice).about(name)
 }

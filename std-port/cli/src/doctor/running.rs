@@ -6,7 +6,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use cara_std::control::protocol::{Answer, NodeInfo, Question, RefusedInfo, UnitInfo};
-use cara_std::control::{self, Client, ControlError};
+use cara_std::control::{self, Client, ControlError, RunningUnit, UnitState};
 
 pub(crate) use super::holder::Files;
 use super::holder::files_of_tcp_port;
@@ -72,6 +72,8 @@ fn count(counted: &Counted, name: &str) -> Option<u64> {
 pub(crate) struct Sources {
     news: Receiver<(usize, Option<Running>)>,
     latest: Vec<Option<Running>>,
+    /// Those that run and cannot be asked now.
+    pub(crate) unasked: Vec<RunningUnit>,
     /// Why units could not be asked.
     pub(crate) refused: Option<String>,
 }
@@ -80,9 +82,9 @@ impl Sources {
     /// Begins to ask the units that the options mean, or all of the fleet that they mean. Whoever names one that does not
     /// answer gets an error; that none runs is none.
     pub(crate) fn open(which: Option<&Which>, global: &Global) -> anyhow::Result<Self> {
-        let (clients, refused) = clients(global)?;
+        let (clients, unasked, refused) = clients(global)?;
         let (sender, news) = channel();
-        let mut sources = Self { news, latest: vec![None; clients.len()], refused };
+        let mut sources = Self { news, latest: vec![None; clients.len()], unasked, refused };
         for (index, client) in clients.into_iter().enumerate() {
             let (sender, which) = (sender.clone(), which.cloned());
             thread::spawn(move || report(client, which.as_ref(), |told| sender.send((index, told)).is_ok()));
@@ -118,21 +120,22 @@ impl Sources {
     }
 }
 
-/// Those that are meant, and why there may be others that cannot be asked.
-fn clients(global: &Global) -> anyhow::Result<(Vec<Client>, Option<String>)> {
+/// Those that are meant, those that cannot be asked now, and why there may be others that cannot be asked at all.
+fn clients(global: &Global) -> anyhow::Result<(Vec<Client>, Vec<RunningUnit>, Option<String>)> {
     let no_unit = |error: ControlError| Ended::no_unit(error.to_string());
     if let Some(path) = &global.socket {
-        return Ok((vec![Client::connect(path).map_err(no_unit)?], None));
+        return Ok((vec![Client::connect(path).map_err(no_unit)?], Vec::new(), None));
     }
     if let Some(unit) = &global.unit {
-        return Ok((vec![Client::find(Some(&unit.to_string())).map_err(no_unit)?], None));
+        return Ok((vec![Client::find(Some(&unit.to_string())).map_err(no_unit)?], Vec::new(), None));
     }
     let (running, refused) = match control::running() {
         Ok(running) => (running, None),
         Err(error) => (Vec::new(), Some(error.to_string())),
     };
-    let ours = running.iter().filter(|unit| global.fleet.is_none_or(|fleet| fleet == unit.fleet));
-    Ok((ours.filter_map(|unit| Client::connect(&unit.path).ok()).collect(), refused))
+    let ours = running.into_iter().filter(|unit| global.fleet.is_none_or(|fleet| fleet == unit.fleet));
+    let (asked, unasked): (Vec<_>, Vec<_>) = ours.partition(|unit| unit.state == UnitState::Answers);
+    Ok((asked.iter().filter_map(|unit| Client::connect(&unit.path).ok()).collect(), unasked, refused))
 }
 
 /// Asks a unit again and again, until it stops or nobody wants to know.

@@ -25,9 +25,49 @@ impl Which {
     }
 }
 
+/// What the command line says, unless no node can be called so.
+pub(crate) fn parse(text: &str) -> Result<Which, String> {
+    let number = |id: &str| id.parse::<u32>().is_ok();
+    let (name, sound) = match (text.strip_prefix('#'), text.rsplit_once('/')) {
+        (Some(id), _) => ("node", number(id)),
+        (None, Some((name, id))) => (name, number(id)),
+        (None, None) => (text, true),
+    };
+    if !sound {
+        return Err("write NAME, NAME/ID or #ID; the ID is a number from 0 to 4294967295".to_owned());
+    }
+    Identity::s_unit(name, 0).map_err(|error| error.to_string())?;
+    Ok(Which(text.to_owned()))
+}
+
+/// A text as one word of a shell's command line.
+pub(crate) fn quoted(text: &str) -> String {
+    let plain = |character: char| character.is_ascii_alphanumeric() || "_-./".contains(character);
+    if !text.is_empty() && !text.starts_with('-') && text.chars().all(plain) {
+        return text.to_owned();
+    }
+    format!("'{}'", text.replace('\'', r"'\''"))
+}
+
 #[cfg(test)]
 mod tests {
-    use super::Which;
+    use super::{Which, parse, quoted};
+
+    #[test]
+    fn what_no_node_can_be_called_is_refused() {
+        for text in ["", "#", "#x", "agv-17/x", "agv-17/", "/17", "agv/4294967296", "a\nb"] {
+            assert!(parse(text).is_err(), "{text:?}");
+        }
+        for text in ["agv-17", "agv-17/17", "#17", "a/b/7", "two words"] {
+            assert_eq!(parse(text).unwrap().0, text);
+        }
+    }
+
+    #[test]
+    fn what_a_shell_would_read_otherwise_is_quoted() {
+        let told = ["agv-17/17", "#7", "$(reboot)", "it's"].map(quoted);
+        assert_eq!(told, ["agv-17/17", "'#7'", "'$(reboot)'", r"'it'\''s'"]);
+    }
 
     #[test]
     fn a_node_is_meant_by_name_id_or_both() {

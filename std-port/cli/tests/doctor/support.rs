@@ -136,6 +136,14 @@ impl Clinic {
 /// A process that ends with its owner.
 pub(crate) struct Killed(Child);
 
+impl Killed {
+    /// As a program that hangs: it holds what it has, and does nothing.
+    pub(crate) fn stand_still(&self) {
+        let stopped = Command::new("kill").args(["-STOP", &self.0.id().to_string()]).status().unwrap();
+        assert!(stopped.success());
+    }
+}
+
 impl Drop for Killed {
     fn drop(&mut self) {
         let _ = self.0.kill();

@@ -19,6 +19,7 @@ pub(crate) fn evidence() -> Evidence {
     Evidence {
         which: None,
         fleet: FLEET,
+        fleet_known: true,
         interfaces: Interfaces::All,
         loopback_by_environment: false,
         port: 21_970,
@@ -29,6 +30,7 @@ pub(crate) fn evidence() -> Evidence {
         devices: vec!["eth0".into()],
         dials: Vec::new(),
         running: Vec::new(),
+        unasked: Vec::new(),
         control_refused: None,
         connected_lives: Vec::new(),
         answered_alone: Vec::new(),

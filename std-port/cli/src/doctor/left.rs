@@ -1,0 +1,98 @@
+//! Nodes that were connected to a unit of this host, have left, and have not come back.
+
+use cara_std::control::protocol::NodeInfo;
+
+use super::evidence::Evidence;
+use super::finding::{Finding, Id, Severity};
+use super::running::Running;
+use super::which::Which;
+
+/// A node that is asked about and has left.
+pub(crate) fn of(seen: &Evidence, which: &Which) -> Option<Finding> {
+    let nodes = seen.running.iter().flat_map(|unit| unit.nodes.iter().map(move |node| (unit, node)));
+    let mut left: Vec<_> = nodes.filter(|(_, node)| which.is(&node.name, node.id) && node.left_ms.is_some()).collect();
+    left.sort_by_key(|(_, node)| node.left_ms);
+    left.first().and_then(|(unit, node)| finding(unit, node))
+}
+
+/// All that have left a unit, and are neither heard nor connected to another one; the latest first.
+pub(crate) fn all(seen: &Evidence, unit: &Running) -> Vec<Finding> {
+    let is_there = |node: &NodeInfo| {
+        let mut others = seen.running.iter().flat_map(|unit| &unit.nodes).filter(|other| other.connected);
+        others.any(|other| (&other.name, other.id) == (&node.name, node.id))
+            || seen.ours().any(|(_, identity)| (identity.name(), identity.id()) == (node.name.as_str(), node.id))
+    };
+    let mut left: Vec<&NodeInfo> = unit.nodes.iter().filter(|node| !node.connected && !is_there(node)).collect();
+    left.sort_by_key(|node| node.left_ms);
+    let severity = |node: &NodeInfo| if was_stopped(node) { Severity::Info } else { Severity::Warning };
+    left.iter().filter_map(|node| Some(Finding { severity: severity(node), ..finding(unit, node)? })).collect()
+}
+
+fn was_stopped(node: &NodeInfo) -> bool {
+    node.left_reason.as_deref() == Some("Stopped")
+}
+
+fn finding(unit: &Running, node: &NodeInfo) -> Option<Finding> {
+    let name = format!("{}/{}", node.name, node.id);
+    let ago = span(node.left_ms.filter(|_| !node.connected)? / 1000);
+    let (why, advice) = match node.left_reason.as_deref() {
+        Some("Silent") => ("nothing was heard from it any more", HUNG),
+        Some("Stopped") => ("its program was stopped in an orderly way", "start it again if it is wanted"),
+        Some("Reset") => ("its connection was closed: its program ended, or the network reset it", ENDED),
+        _ => (node.left_text.as_deref().unwrap_or("why is not known"), ENDED),
+    };
+    let found = format!("{name} left {} {ago} ago and has not come back: {why}", unit.name());
+    Some(Finding::error(Id::Lost, found, advice).about(name))
+}
+
+const HUNG: &str = "look at its power supply, cable or radio, and whether its program hangs or is stopped; it comes back by \
+                    itself once that is mended";
+const ENDED: &str = "look whether its program runs, and at its log, power supply and network; it comes back by itself";
+
+/// A time for people.
+fn span(seconds: u64) -> String {
+    match seconds {
+        0..=119 => format!("{seconds} s"),
+        120..=7_199 => format!("{} min", seconds / 60),
+        _ => format!("{} h", seconds / 3600),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::evidence::samples::{evidence, node_info, running, searching};
+    use super::*;
+
+    fn lost() -> Evidence {
+        let mut unit = running("boss", 1);
+        unit.nodes = vec![node_info("agv", 7, false), node_info("other", 8, true)];
+        Evidence { running: vec![unit], ..evidence() }
+    }
+
+    #[test]
+    fn who_has_left_is_told_with_time_and_reason() {
+        let mut seen = lost();
+        let found = of(&seen, &Which("agv".into())).unwrap();
+        let text = "agv/7 left boss/1 9 s ago and has not come back: nothing was heard from it any more";
+        assert_eq!((found.id, found.found.as_str()), (Id::Lost, text));
+        assert_eq!(of(&seen, &Which("other".into())), None, "it is connected");
+        seen.running[0].nodes[0].left_ms = None;
+        assert_eq!(of(&seen, &Which("agv".into())), None, "an older manager does not say");
+    }
+
+    #[test]
+    fn whoever_is_heard_is_not_lost_and_whoever_was_stopped_is_no_trouble() {
+        let mut seen = lost();
+        let severities = |seen: &Evidence| all(seen, &seen.running[0]).iter().map(|f| f.severity).collect::<Vec<_>>();
+        assert_eq!(severities(&seen), [Severity::Warning]);
+        seen.running[0].nodes[0].left_reason = Some("Stopped".into());
+        assert_eq!(severities(&seen), [Severity::Info]);
+        seen.heard = vec![searching("agv", 7, "boss")];
+        assert_eq!(severities(&seen), []);
+    }
+
+    #[test]
+    fn times_are_short() {
+        assert_eq!([119, 120, 7_200].map(span), ["119 s", "2 min", "2 h"]);
+    }
+}
