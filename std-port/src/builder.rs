@@ -235,11 +235,15 @@ fn listen_error(error: std::io::Error) -> Error {
 /// The longest message that a Linux unit's parameters can hold.
 pub(crate) const LONGEST_MESSAGE: u32 = 256 * 1024;
 
+/// Shortest `message_size`: with less nearly every request is refused.
+pub(crate) const SHORTEST_MESSAGE: u32 = 64;
+
 /// What this port can hold.
 pub(crate) fn check(constraints: &Constraints) -> Result<(), Error> {
     let chunk = usize::from(constraints.chunk_size);
     let sound = constraints.maximum_nodes > 0
-        && constraints.message_size <= LONGEST_MESSAGE
+        && (SHORTEST_MESSAGE..=LONGEST_MESSAGE).contains(&constraints.message_size)
+        && constraints.request_timeout.as_millis() > 0
         && (cara_core::config::MINIMUM_CHUNK_BYTES..=cara_core::config::CHUNK_BYTES).contains(&chunk)
         && constraints.keep_alive.as_millis() > 0
         && constraints.calls_per_peer > 0;

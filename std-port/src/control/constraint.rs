@@ -5,7 +5,7 @@ use cara_core::error::Error;
 use cara_core::time::Duration;
 
 use super::protocol::Failure;
-use crate::builder::LONGEST_MESSAGE;
+use crate::builder::{LONGEST_MESSAGE, SHORTEST_MESSAGE};
 
 const NAMES: &str =
     "request_timeout, minimum_interval, maximum_nodes, message_size, chunk_size, keep_alive, calls_per_peer";
@@ -60,9 +60,9 @@ fn narrow<N: TryFrom<u64>>(name: &str, value: u64) -> Result<N, Failure> {
 fn bad(name: &str, value: u64) -> Failure {
     let bounds = match plain(name) {
         "maximum_nodes" => "it is at least 1, and at most what the unit was made with and 16 more".to_owned(),
-        "message_size" => format!("it is at most {LONGEST_MESSAGE} bytes"),
+        "message_size" => format!("it is {SHORTEST_MESSAGE} to {LONGEST_MESSAGE} bytes"),
         "chunk_size" => format!("it is {MINIMUM_CHUNK_BYTES} to {CHUNK_BYTES} bytes"),
-        "keep_alive" => "it is at least 1000 microseconds".to_owned(),
+        "keep_alive" | "request_timeout" => "it is at least 1000 microseconds".to_owned(),
         "calls_per_peer" => format!("it is 1 to {}", u16::MAX),
         _ => "this unit cannot hold it".to_owned(),
     };
