@@ -91,16 +91,38 @@ pub(crate) fn tell(error: &anyhow::Error, json: bool) -> ExitCode {
     };
     // Where not even standard error can be written to, the exit code has to do.
     let _ = if json {
-        let told = json!({ "error": { "name": name, "exit": exit as u8, "text": format!("{error:#}") } });
+        let text = format!("{error:#}");
+        let text = text.strip_prefix("error: ").unwrap_or(&text);
+        let told = json!({ "error": { "name": name, "exit": exit as u8, "text": text } });
         writeln!(std::io::stderr(), "{told}")
     } else {
-        writeln!(anstream::stderr(), "{BAD}error:{BAD:#} {error:#}")
+        writeln!(anstream::stderr(), "{BAD}error:{BAD:#} {}", harmless(&format!("{error:#}")))
     };
     exit.into()
+}
+
+/// A terminal would obey control characters, which a name or an argument may hold.
+fn harmless(text: &str) -> String {
+    let is_harmful = |character: char| character.is_control() && !matches!(character, '\n' | '\t');
+    let pieces = text.chars().map(|character| match is_harmful(character) {
+        true => character.escape_default().to_string(),
+        false => character.to_string(),
+    });
+    pieces.collect()
 }
 
 fn is_closed_pipe(error: &anyhow::Error) -> bool {
     error.chain().any(|cause| {
         cause.downcast_ref::<std::io::Error>().is_some_and(|io| io.kind() == std::io::ErrorKind::BrokenPipe)
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::harmless;
+
+    #[test]
+    fn control_characters_are_written_out() {
+        assert_eq!(harmless("a\u{1b}[2Jb\n  c\u{9b}"), "a\\u{1b}[2Jb\n  c\\u{9b}");
+    }
 }

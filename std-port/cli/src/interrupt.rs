@@ -1,17 +1,32 @@
-//! Ctrl-C, for commands that have something to say before they go.
+//! Ctrl-C, for commands that have something to say or to give up before they go.
 
 use std::io;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use signal_hook::consts::SIGINT;
+use signal_hook::consts::{SIGINT, SIGTERM};
 use signal_hook::flag;
+use signal_hook::iterator::Signals;
 
 /// How often is looked whether it came.
 const LOOK: Duration = Duration::from_millis(20);
 /// The exit code when it comes a second time: that of a shell for a process that a signal ended.
-const ENDED: i32 = 130;
+const ENDED: i32 = SHELL + SIGINT;
+/// A shell adds the number of the signal to it.
+const SHELL: i32 = 128;
+
+/// Ends the process at Ctrl-C and at SIGTERM, also where whoever started it has them ignored, as a shell does for what it
+/// starts in the background.
+pub(crate) fn end_at_signals() -> io::Result<()> {
+    let mut signals = Signals::new([SIGINT, SIGTERM])?;
+    std::thread::Builder::new().name("signals".into()).spawn(move || {
+        if let Some(signal) = signals.forever().next() {
+            std::process::exit(SHELL.saturating_add(signal));
+        }
+    })?;
+    Ok(())
+}
 
 /// Whether Ctrl-C came. A second one ends the process at once.
 pub(crate) struct Interrupt {

@@ -133,15 +133,23 @@ pub(crate) fn functions(operator: &mut Operator, node: &str) -> anyhow::Result<V
 
 /// A function that a node does not offer: close names, and all that it does.
 pub(crate) fn no_such_function(node: &str, name: &str, functions: &[FunctionInfo]) -> anyhow::Error {
+    not_offered(format!("{node} has not published `{name}`"), "it has", name, functions)
+}
+
+/// A function that no connected node offers.
+pub(crate) fn offered_nowhere(name: &str, functions: &[FunctionInfo]) -> anyhow::Error {
+    not_offered(format!("no connected node has published `{name}`"), "they have", name, functions)
+}
+
+fn not_offered(mut text: String, they_have: &str, name: &str, functions: &[FunctionInfo]) -> anyhow::Error {
     let close = close(name, functions.iter().map(|function| function.name.as_str()));
-    let mut text = format!("{node} has not published `{name}`");
     if let Some(nearest) = close.first() {
         text += &format!("; did you mean `{nearest}`?");
     }
     match functions {
-        [] => text += "\n  it has published nothing to this unit",
+        [] => text += &format!("\n  {they_have} published nothing to this unit"),
         functions => {
-            text += "\n  it has published:";
+            text += &format!("\n  {they_have} published:");
             functions.iter().for_each(|function| text += &format!("\n    {}", function.signature));
         }
     }

@@ -10,6 +10,7 @@ use serde_json::json;
 
 use crate::exit::{Ended, Exit};
 use crate::global::Global;
+use crate::interrupt;
 use crate::nodes::{self, Chosen};
 use crate::operator::{Need, Operator, exit_of};
 use crate::output::{self, BAD};
@@ -102,6 +103,9 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
         priority: arguments.priority.map(Class::word),
         best_effort: arguments.best_effort,
     };
+    if arguments.hold {
+        interrupt::end_at_signals()?;
+    }
     let exit = call(&mut operator, question, arguments.hold, global)?;
     Ok(exit.into())
 }
@@ -191,7 +195,7 @@ fn of_any(operator: &mut Operator, function: &str) -> anyhow::Result<FunctionInf
     }
     functions.sort_by(|a, b| a.signature.cmp(&b.signature));
     functions.dedup_by(|a, b| a.signature == b.signature);
-    Err(nodes::no_such_function("no connected node", function, &functions))
+    Err(nodes::offered_nowhere(function, &functions))
 }
 
 /// The arguments as the signature asks for them.

@@ -5,7 +5,7 @@ use std::process::ExitCode;
 use cara_std::control::protocol::{Answer, Question};
 use serde_json::{Map, Value, json};
 
-use crate::exit::Exit;
+use crate::exit::{Ended, Exit};
 use crate::global::Global;
 use crate::nodes;
 use crate::operator::{Need, Operator};
@@ -20,7 +20,7 @@ pub(crate) struct Arguments {
     #[arg(long)]
     zeros: bool,
     /// Print them in Prometheus' text form, as `cara node --metrics` serves them.
-    #[arg(long, conflicts_with_all = ["node", "zeros", "json"])]
+    #[arg(long, conflicts_with_all = ["node", "zeros"])]
     prometheus: bool,
 }
 
@@ -28,6 +28,9 @@ pub(crate) fn run(Arguments { node, zeros, prometheus }: Arguments, global: &Glo
     let need = node.as_deref().map_or(Need::Everybody, Need::Node);
     let mut operator = Operator::open(global, &need)?;
     if prometheus {
+        if global.json {
+            return Err(Ended::usage("--prometheus is a form of its own: leave out --json"));
+        }
         return print_metrics(&mut operator);
     }
     let node = match node {

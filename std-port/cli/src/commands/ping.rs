@@ -75,6 +75,9 @@ fn round_trip(
         }
         match (us, error) {
             (Some(us), _) => output::line(format_args!("{node} {number}: {}", show_micros(us)))?,
+            (None, Some(failure)) if failure.error == "TimedOut" => {
+                output::line(format_args!("{BAD}{node} {number}:{BAD:#} no answer within --timeout"))?
+            }
             (None, Some(failure)) => output::line(format_args!("{BAD}{node} {number}:{BAD:#} {}", failure.text))?,
             (None, None) => output::line(format_args!("{BAD}{node} {number}:{BAD:#} no answer"))?,
         }

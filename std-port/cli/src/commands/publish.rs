@@ -36,7 +36,10 @@ pub(crate) fn run(Arguments { node, timeout }: Arguments, global: &Global) -> an
     if global.json {
         output::object(&json!({ "to": node, "unread": unread }))?;
     } else {
-        output::line(format_args!("published to {to}"))?;
+        let all_read = node.is_none() || unread.is_empty();
+        if all_read {
+            output::line(format_args!("published to {to}"))?;
+        }
         unread.iter().try_for_each(|node| output::line(format_args!("{BAD}not read in time:{BAD:#} {node}")))?;
     }
     Ok(if unread.is_empty() { Exit::Done } else { Exit::Failed }.into())

@@ -84,6 +84,9 @@ fn error(error: ControlError) -> anyhow::Error {
         ControlError::NotRunning { .. } | ControlError::NotAllowed { .. } | ControlError::Version { .. } => {
             (Exit::NoUnit, "NoUnit")
         }
+        ControlError::Broken(io) if io.kind() == std::io::ErrorKind::UnexpectedEof => {
+            return Ended::failed("Broken", "the unit has ended, or closed the connection");
+        }
         ControlError::Several(_) => (Exit::Usage, "Usage"),
         ControlError::Full { .. } => (Exit::Failed, "Full"),
         ControlError::Silent { .. } => (Exit::Failed, "Silent"),

@@ -59,6 +59,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
 fn of_unit(mut operator: Operator, offering: Option<String>, global: &Global) -> anyhow::Result<()> {
     let unit = operator.unit()?;
     let (mut nodes, mut refused) = (Vec::new(), Vec::new());
+    let filtered = offering.is_some();
     operator.ask(&Question::Nodes { offering }, |answer| {
         match answer {
             Answer::Node(node) => nodes.push(node),
@@ -72,7 +73,8 @@ fn of_unit(mut operator: Operator, offering: Option<String>, global: &Global) ->
         return Ok(output::object(&json!({ "unit": unit, "nodes": nodes, "refused": refused }))?);
     }
     if nodes.is_empty() {
-        output::line("no such node has joined; `cara doctor` looks for reasons")?;
+        let who = if filtered { "no such node has joined" } else { "no node has joined yet" };
+        output::line(format_args!("{who}; `cara doctor` looks for reasons"))?;
     }
     joined(&nodes).print()?;
     if !refused.is_empty() {
