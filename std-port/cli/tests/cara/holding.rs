@@ -101,3 +101,30 @@ fn without_a_lease_there_is_nothing_to_hold() {
     stage.ends(2, &["call", "driver", "--hold", "look"]).says("has no lease");
     stage.ends(2, &["call", "driver", "--hold", "--async", "drive"]);
 }
+
+#[test]
+fn a_newer_holding_takes_over() {
+    let stage = Stage::with(&[]);
+    let driver = Driver::join(&stage);
+    let (older, newer) = (driver.held(&stage), driver.held(&stage));
+    assert_eq!(older.end(), 1);
+    assert!(driver.lease.is_live());
+    newer.interrupt();
+    until(|| driver.made_safe() == 1);
+    newer.end();
+}
+
+#[test]
+fn ctrl_c_ends_it_also_where_the_shell_ignores_it() {
+    let stage = Stage::with(&[]);
+    let driver = Driver::join(&stage);
+    let cara = stage.command(&["call", "driver", "--hold", "drive"]);
+    let mut shell = std::process::Command::new("sh");
+    shell.args(["-c", "trap '' INT; exec \"$@\"", "sh"]).arg(cara.get_program()).args(cara.get_args());
+    shell.env("CARA_CONTROL_DIR", stage.control());
+    let mut held = Running::start(shell);
+    held.expect("drive()");
+    held.interrupt();
+    assert_eq!(held.end(), 130);
+    until(|| driver.made_safe() == 1);
+}
