@@ -9,6 +9,7 @@ use cara_std::survey::Heard;
 use super::dial::{Dial, Outcome};
 use super::evidence::{Evidence, Life, overlapping};
 use super::finding::{Finding, Id};
+use super::which::quoted;
 
 /// As the documentation and the command line write a manager.
 pub(crate) fn text_of(manager: &Manager) -> String {
@@ -72,7 +73,11 @@ pub(crate) fn full(manager: &str, limit: Option<u16>) -> Finding {
         Some(limit) => format!("{manager} has as many nodes connected as it takes: maximum_nodes is {limit}"),
         None => format!("{manager} says that it has room for no more nodes"),
     };
-    let advice = "raise maximum_nodes of the manager (`cara set`, or its configuration), or take a node away";
+    let advice = format!(
+        "raise maximum_nodes of {manager}, or take a node away: `cara --unit {} set . maximum_nodes NUMBER` on its host takes \
+         up to 16 more than it was started with; more needs its configuration and a restart",
+        quoted(manager)
+    );
     Finding::error(Id::Full, found, advice).about(manager)
 }
 
