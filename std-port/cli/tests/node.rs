@@ -72,7 +72,7 @@ const MISTAKES: [(&str, &str, &str); 44] = [
     ("name = \"a\"\nid = 1\ndiscovery_port = 0", "3:18", "port 0"),
     ("name = \"a\"\nid = 1\ntcp_port = 65536", "3:12", "65536"),
     ("name = \"a\"\nid = 1\n[constraints]\nchunk_size = 100", "4:14", "from 320 to 4096"),
-    ("name = \"a\"\nid = 1\n[constraints]\n\n\tmessage_size = \"1MiB\"", "5:17", "from 0 to 262144"),
+    ("name = \"a\"\nid = 1\n[constraints]\n\n\tmessage_size = \"1MiB\"", "5:17", "from 64 to 262144"),
     ("name = \"a\"\nid = 1\n[constraints]\nmaximum_nodes = 0", "4:17", "from 1 to 65535"),
     ("name = \"a\"\nid = 1\nconstraints.keep_alive = \"1us\"", "3:26", "at least 1000 us"),
     ("name = \"a\"\nid = 1\nconstraints = { request_timeout = 5 }", "3:35", "\"50ms\""),
@@ -149,7 +149,7 @@ fn the_example_is_correct() {
 #[test]
 fn wrong_options_are_told_with_what_to_do() {
     let folder = TempDir::new().unwrap();
-    let cases: [(&[&str], &str); 8] = [
+    let cases: [(&[&str], &str); 11] = [
         (&["/dev/zero"], "more than 1048576 bytes"),
         (&["--socket", "x", "--name", "a", "--id", "1"], "a node is a unit itself"),
         (&[], "--name and --id"),
@@ -158,12 +158,27 @@ fn wrong_options_are_told_with_what_to_do() {
         (&["--name", "", "--id", "1"], "1 to 32 bytes"),
         (&["--name", "a", "--id", "1", "--metrics", "0.0.0.0:0"], "--metrics-anywhere"),
         (&["--name", "a", "--id", "1", "--log", "a=b=c"], "debug"),
+        (&["--name", "a", "--id", "1", "--as", "b/1"], "contradict"),
+        (&["--name", "a", "--id", "1", "--as", "a/2"], "contradict"),
+        (&["--name", "a", "--id", "1", "--metrics", "localhost:9464"], "write an IP address and a port"),
     ];
     for (arguments, part) in cases {
         let refused = outcome(folder.path(), arguments);
         assert_eq!(refused.status.code(), Some(2), "{arguments:?}");
         assert!(text(&refused.stderr).contains(part), "{arguments:?}: {}", text(&refused.stderr));
     }
+}
+
+#[test]
+fn a_port_in_use_of_the_command_line_is_told_with_what_to_do() {
+    let folder = TempDir::new().unwrap();
+    let taken = TcpListener::bind("127.0.0.1:0").unwrap();
+    let (address, fleet) = (taken.local_addr().unwrap().to_string(), random_fleet().to_string());
+    let arguments = ["--name", "a", "--id", "1", "--loopback", "--fleet", &fleet, "--metrics", &address];
+    let refused = outcome(folder.path(), &arguments);
+    let told = text(&refused.stderr);
+    assert_eq!(refused.status.code(), Some(1), "{told}");
+    assert!(told.contains("in use") && told.contains("with a free port"), "{told}");
 }
 
 #[test]

@@ -1,5 +1,6 @@
 //! `cara node`: a unit that stays up, with a configuration file instead of code.
 
+mod events;
 mod file;
 mod functions;
 mod http;
@@ -59,7 +60,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "PORT")]
     tcp_port: Option<u16>,
     /// Serve http://ADDR/metrics for Prometheus, as 127.0.0.1:9464.
-    #[arg(long, value_name = "ADDR")]
+    #[arg(long, value_name = "ADDR", value_parser = address)]
     metrics: Option<SocketAddr>,
     /// Serve metrics at an address that other hosts reach too: plain HTTP, for everybody.
     #[arg(long)]
@@ -109,6 +110,14 @@ fn overrides(arguments: &Arguments, global: &Global) -> anyhow::Result<Overrides
         return Err(Ended::usage("a node is a unit itself: --unit and --socket are for commands that ask one"));
     }
     let named = global.act_as.clone();
+    if let Some(named) = &named
+        && (arguments.name.as_ref().is_some_and(|name| *name != named.name)
+            || arguments.id.is_some_and(|id| id != named.id))
+    {
+        return Err(Ended::usage(format!(
+            "--as {named} and --name or --id contradict each other: write one of the two"
+        )));
+    }
     let over = Overrides {
         name: arguments.name.clone().or(named.as_ref().map(|named| named.name.clone())),
         id: arguments.id.or(named.map(|named| named.id)),
@@ -127,6 +136,11 @@ fn overrides(arguments: &Arguments, global: &Global) -> anyhow::Result<Overrides
         ));
     }
     Ok(over)
+}
+
+/// An address is not looked up by a name: the host could have several of it.
+fn address(text: &str) -> Result<SocketAddr, String> {
+    text.parse().map_err(|_| "write an IP address and a port, as 127.0.0.1:9464; names are not looked up".to_owned())
 }
 
 fn tell_correct(settings: &Settings, global: &Global) -> anyhow::Result<()> {

@@ -2,10 +2,9 @@
 
 use std::net::{SocketAddr, TcpListener};
 use std::sync::Arc;
-use std::sync::mpsc::Receiver;
 
 use anyhow::Context;
-use cara_std::{Error, PLAIN_PORT, UnitEvent};
+use cara_std::{Error, PLAIN_PORT};
 use serde_json::json;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::iterator::Signals;
@@ -16,7 +15,7 @@ use super::offer::offer;
 use super::program::Programs;
 use super::settings::{Overrides, Placed, Settings};
 use super::unit::Node;
-use super::{http, wrong};
+use super::{events, http, wrong};
 use crate::exit::Ended;
 use crate::global::Global;
 use crate::output;
@@ -29,7 +28,7 @@ pub(super) fn run(settings: Settings, over: &Overrides, logging: &Logging, globa
     let node = Node::build(&settings).map_err(|error| not_built(error, &settings))?;
     offer_all(&node, &settings, &programs)?;
     let metrics = settings.metrics.as_ref().map(|place| listen(place, &settings)).transpose()?;
-    log_events(node.events())?;
+    events::log(node.events())?;
     node.start().map_err(|error| Ended::failed(format!("{error:?}"), error.to_string()))?;
     let served = metrics.as_ref().map(TcpListener::local_addr).transpose()?;
     if let Some(listener) = metrics {
@@ -86,10 +85,13 @@ fn listen(place: &Placed<SocketAddr>, settings: &Settings) -> anyhow::Result<Tcp
         let what = format!("metrics cannot be served at {}: {error}", place.value);
         match &place.span {
             Some(span) => {
-                let help = "choose an address of this host with a free port";
+                let help = "choose an address of this host with a free port; `ss -lntp` shows who has which";
                 Ended::failed("Network", settings.mistake(span.clone(), &what, help).to_string())
             }
-            None => Ended::failed("Network", what),
+            None => {
+                let help = "choose an address of this host with a free port; `ss -lntp` shows who has which";
+                Ended::failed("Network", format!("{what}; {help}"))
+            }
         }
     })
 }
@@ -124,7 +126,7 @@ fn reload(settings: &mut Settings, over: &Overrides, node: &Node, logging: &Logg
         Err(error) => return tracing::error!("the old configuration stays: {error}"),
     };
     if let Err(error) = node.set_constraints(fresh.constraints) {
-        return tracing::error!(%error, "the old configuration stays; more nodes than at the start need a restart");
+        return tracing::error!(%error, "the old configuration stays; more nodes than at the start and 16 need a restart");
     }
     logging.change(fresh.file_log.as_deref());
     *settings = fresh;
@@ -135,27 +137,4 @@ fn read_again(settings: &Settings, over: &Overrides) -> Result<Settings, String>
     let path = std::path::Path::new(&settings.source.name);
     let source = super::read(Some(path)).map_err(|error| format!("{error:#}"))?;
     Settings::of(source, over).map_err(|mistakes: Mistakes| mistakes.to_string())
-}
-
-/// Tells what happens to the node, in a thread that ends with the unit.
-fn log_events(events: Receiver<UnitEvent>) -> anyhow::Result<()> {
-    let log = move || events.into_iter().for_each(log_event);
-    std::thread::Builder::new().name("cara-log".into()).spawn(log)?;
-    Ok(())
-}
-
-fn log_event(event: UnitEvent) {
-    match event {
-        UnitEvent::Joined { peer } => tracing::info!(node = %peer, "joined"),
-        UnitEvent::Left { peer, reason } => tracing::warn!(node = %peer, "left: {reason}"),
-        UnitEvent::NotJoined { address, peer, reason } => {
-            let node = peer.map(|peer| peer.to_string());
-            tracing::warn!(%address, node, "not joined: {reason}");
-        }
-        UnitEvent::FunctionsSkipped { peer, skipped } => {
-            tracing::warn!(node = %peer, skipped, "it has no room for some of this node's functions");
-        }
-        UnitEvent::LeaseExpired { peer, function } => tracing::warn!(node = %peer, function, "lease expired"),
-        event => tracing::debug!(?event, "event"),
-    }
 }
