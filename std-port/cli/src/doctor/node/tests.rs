@@ -156,3 +156,25 @@ fn connected_answering_and_own_units_are_no_trouble() {
     seen.dials = vec![Dial { to: SocketAddr::new(seen.heard[1].source.ip(), 4000), outcome: Some(Outcome::Refused) }];
     assert_eq!(boss(&seen), Id::TcpBlocked);
 }
+
+#[test]
+fn another_fleet_and_another_manager_are_told_together() {
+    let mut seen = evidence();
+    seen.heard = vec![Heard { fleet: Fleet(9), ..searching("agv", 7, "bos") }, answering("boss", 3)];
+    let told = |seen: &Evidence| check(seen, &Which("agv".into())).remove(0);
+    assert!(told(&seen).found.ends_with("and it looks for the manager bos/1, and boss/1 runs"), "{:?}", told(&seen));
+    seen.heard[0] = Heard { fleet: Fleet(9), ..searching("agv", 7, "boss") };
+    assert!(!told(&seen).found.contains("looks for"));
+    seen.fleet_known = false;
+    assert_eq!(told(&seen).advice, "no --fleet was given: try `--fleet 9`");
+}
+
+#[test]
+fn a_node_of_the_same_name_and_another_id_is_named() {
+    let mut seen = evidence();
+    let mut unit = running("boss", 1);
+    unit.nodes = vec![node_info("agv-17", 17, true)];
+    seen.running = vec![unit];
+    let found = check(&seen, &Which("agv-17/18".into())).remove(0);
+    assert!(found.found.ends_with("; there is agv-17/17"), "{found:?}");
+}
