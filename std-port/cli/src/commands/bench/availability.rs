@@ -53,6 +53,8 @@ pub(crate) struct Group {
     pub(crate) executed: usize,
     /// From the first request to the last, divided by their number less one.
     pub(crate) real_period_us: f64,
+    /// Why the first of those that were refused was, or the call behind them.
+    pub(crate) error: Option<String>,
 }
 
 pub(crate) fn measure(
@@ -147,43 +149,50 @@ impl Plan<'_> {
         let before = failures.counted()?;
         let question = Question::Call(self.subject.call(self.characters, true));
         let start = Instant::now();
-        let (mut refused, mut last) = (0, start);
+        let (mut refused, mut last, mut first) = (0, start, None);
         for number in 0..self.requests {
             let due = self.period.saturating_mul(number);
             std::thread::sleep(due.saturating_sub(start.elapsed()));
             last = Instant::now();
-            refused += usize::from(!accepted(operator, &question)?);
+            let error = refusal(operator, &question)?;
+            refused += usize::from(error.is_some());
+            first = first.or(error);
         }
         let sent = self.requests as usize;
-        let executed_until = self.barrier(operator)?;
+        let unfinished = self.barrier(operator)?;
         std::thread::sleep(STRAGGLERS);
         let failed = failures.counted()?.saturating_sub(before);
-        let executed = if executed_until { sent.saturating_sub(refused + failed) } else { 0 };
+        let executed = if unfinished.is_none() { sent.saturating_sub(refused + failed) } else { 0 };
         let gaps = f64::from(self.requests.saturating_sub(1).max(1));
         let real_period_us = last.duration_since(start).as_secs_f64() * 1e6 / gaps;
-        Ok(Group { sent, refused, failed, executed, real_period_us })
+        Ok(Group { sent, refused, failed, executed, real_period_us, error: first.or(unfinished) })
     }
 
-    /// Whether a blocking call came through behind the group.
-    fn barrier(&self, operator: &mut Operator) -> anyhow::Result<bool> {
+    /// Why no blocking call came through behind the group, if none did.
+    fn barrier(&self, operator: &mut Operator) -> anyhow::Result<Option<String>> {
+        let mut error = None;
         let question = Question::Call(self.subject.call(self.characters.min(1), false));
         for _ in 0..BARRIERS {
-            if accepted(operator, &question)? {
-                return Ok(true);
+            error = refusal(operator, &question)?;
+            if error.is_none() {
+                return Ok(None);
             }
             std::thread::sleep(STRAGGLERS);
         }
-        Ok(false)
+        Ok(error)
     }
 }
 
-fn accepted(operator: &mut Operator, question: &Question) -> anyhow::Result<bool> {
-    let mut accepted = false;
+/// Why a call was not accepted; `None` if it was.
+fn refusal(operator: &mut Operator, question: &Question) -> anyhow::Result<Option<String>> {
+    let mut refusal = Some("no answer".to_owned());
     operator.ask(question, |answer| {
-        accepted |= matches!(answer, Answer::Called { error: None, .. });
+        if let Answer::Called { error, .. } = answer {
+            refusal = error.map(|failure| format!("{}: {}", failure.error, failure.text));
+        }
         Ok(())
     })?;
-    Ok(accepted)
+    Ok(refusal)
 }
 
 #[cfg(test)]
@@ -194,7 +203,10 @@ mod tests {
 
     #[test]
     fn availability_is_executed_over_sent() {
-        let group = |executed| Group { sent: 100, refused: 0, failed: 100 - executed, executed, real_period_us: 5.0 };
+        let group = |executed| {
+            let (failed, real_period_us) = (100 - executed, 5.0);
+            Group { sent: 100, refused: 0, failed, executed, real_period_us, error: None }
+        };
         let row = row(10, Duration::from_millis(5), vec![group(100), group(90)]);
         assert_eq!((row.availability, row.least, row.is_whole(), row.period_us), (0.95, 0.9, false, 5_000));
     }

@@ -51,5 +51,7 @@ pub(crate) fn availability(row: &availability::Row) -> io::Result<()> {
     let (characters, least, availability) = (row.characters, row.least, row.availability);
     line(format_args!(
         "{characters:>10}  {period:>8}  {real:>10}  {sent:>8}  {refused:>7}  {failed:>7}  {least:>6.3}  {availability:>12.4}"
-    ))
+    ))?;
+    let error = row.groups.iter().find_map(|group| group.error.as_deref());
+    error.map_or(Ok(()), |error| line(format_args!("{:>10}  {error}", "")))
 }
