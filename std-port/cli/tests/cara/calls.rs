@@ -121,5 +121,6 @@ fn wrong_usage_ends_with_2() {
         assert!(!stage.ends(2, usage).err.is_empty(), "{usage:?}");
         let error = stage.ends(2, &[usage, &["--json"]].concat()).error();
         assert_eq!((&error["exit"], &error["name"]), (&2.into(), &"Usage".into()), "{error}");
+        assert!(!error["text"].as_str().unwrap().starts_with("error"), "{error}");
     }
 }

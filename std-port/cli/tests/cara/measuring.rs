@@ -70,6 +70,7 @@ fn requests_that_are_not_executed_lower_availability() {
         group["refused"].as_u64().unwrap() >= 4 && told["availability"][0]["availability"].as_f64() < Some(0.3),
         "{told}"
     );
+    assert!(group["error"].as_str().is_some_and(|error| error.contains(": ")), "{told}");
 }
 
 #[test]
