@@ -45,6 +45,10 @@ pub(super) fn hold<T: Send + 'static>(
             let text = format!("another call of '{function}' took over what was held at {}", peer.identity());
             return Err(Failure::resource("TakenOver", text).into());
         }
+        // Before each event: however many there are, who has gone away holds nothing any more.
+        if !wanted() || system.is_stopped() {
+            return Err(End::Gone);
+        }
         match events.recv_timeout(LOOK) {
             Ok(event) => {
                 if let Some(expired) = held.end(&event) {
@@ -52,8 +56,8 @@ pub(super) fn hold<T: Send + 'static>(
                     send(sink, Answer::Ended { expired })?;
                 }
             }
-            Err(RecvTimeoutError::Timeout) if wanted() && !system.is_stopped() => {}
-            Err(_) => return Err(End::Gone),
+            Err(RecvTimeoutError::Timeout) => {}
+            Err(RecvTimeoutError::Disconnected) => return Err(End::Gone),
         }
     }
     Ok(())

@@ -1,7 +1,7 @@
 //! `cara call --hold`: the operator keeps the lease, and gives it up by going away.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use cara_std::{Call, Definition, Interfaces, LeaseWatch, ParametersView, ServiceError, ServiceOptions, Unit};
@@ -81,6 +81,31 @@ fn who_goes_away_stops_what_is_held() {
     held.interrupt();
     until(|| driver.made_safe() == 1);
     assert!(!driver.lease.is_live());
+    held.end();
+}
+
+/// The manager has events all the time, and still sees at once that nobody holds any more.
+#[test]
+fn who_goes_away_is_noticed_among_many_events() {
+    let stage = Stage::with(&[]);
+    let driver = Driver::join(&stage);
+    let held = driver.held(&stage);
+    let (unit, busy) = (driver.unit.clone(), Arc::new(AtomicBool::new(true)));
+    let goes_on = busy.clone();
+    let events = std::thread::spawn(move || {
+        let functions = unit.my_function_list();
+        let nothing = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+        while goes_on.load(Ordering::SeqCst) {
+            functions.add_service(&Definition::parse("news()").unwrap(), ServiceOptions::new(), nothing).unwrap();
+            unit.publish_my_function_list().unwrap();
+            std::thread::sleep(Duration::from_millis(5));
+            functions.remove("news").unwrap();
+        }
+    });
+    held.interrupt();
+    until(|| driver.made_safe() == 1);
+    busy.store(false, Ordering::SeqCst);
+    events.join().unwrap();
     held.end();
 }
 
