@@ -344,7 +344,7 @@ fn a_link_on_which_signs_of_life_get_lost_is_told() {
         // Signs of life are datagrams beside the stream; discovery goes on.
         nft("input", &format!("udp dport != {} drop", clinic.port));
         let missed = || agv.counters().iter().find(|(name, _)| *name == "KeepAlivesMissed").map(|(_, count)| *count);
-        until("signs of life are missed", || missed().is_some_and(|missed| missed >= 5));
+        until("signs of life are missed", || missed().is_some_and(|missed| missed >= 3));
         let told = clinic.doctor(&["agv"]);
         assert_eq!((told.ids()[0], told.code), ("lossy-link", 4), "{told:?}");
     });

@@ -211,8 +211,9 @@ impl Listener {
     pub fn open(address: Ipv4Addr, port: u16) -> io::Result<Self> {
         let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
         let socket = socket_with(AddressFamily::INET, SocketType::STREAM, flags, None)?;
-        // Connections of an earlier process that linger must not keep a restarted one from its port.
-        sockopt::set_socket_reuseaddr(&socket, true)?;
+        // Connections of an earlier process that linger must not keep a restarted one from its port. Where the kernel
+        // chooses, it would give one port to several that allow it, of which the second cannot listen.
+        sockopt::set_socket_reuseaddr(&socket, port != 0)?;
         bind(&socket, &SocketAddrV4::new(address, port))?;
         listen(&socket, BACKLOG)?;
         let port = local_port(&socket)?;

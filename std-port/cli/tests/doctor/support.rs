@@ -14,7 +14,7 @@ use serde_json::Value;
 use crate::datagrams::Search;
 
 /// Longest wait for anything that is to happen.
-const PATIENCE: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_secs(180);
 
 /// A network that nobody else is on.
 pub(crate) struct Clinic {
