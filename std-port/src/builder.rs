@@ -236,7 +236,7 @@ fn listen_error(error: std::io::Error) -> Error {
 pub(crate) const LONGEST_MESSAGE: u32 = 256 * 1024;
 
 /// Shortest `message_size`: with less nearly every request is refused.
-pub(crate) const SHORTEST_MESSAGE: u32 = 64;
+pub(crate) const SHORTEST_MESSAGE: u32 = 16;
 
 /// What this port can hold.
 pub(crate) fn check(constraints: &Constraints) -> Result<(), Error> {

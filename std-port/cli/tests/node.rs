@@ -72,7 +72,7 @@ const MISTAKES: [(&str, &str, &str); 44] = [
     ("name = \"a\"\nid = 1\ndiscovery_port = 0", "3:18", "port 0"),
     ("name = \"a\"\nid = 1\ntcp_port = 65536", "3:12", "65536"),
     ("name = \"a\"\nid = 1\n[constraints]\nchunk_size = 100", "4:14", "from 320 to 4096"),
-    ("name = \"a\"\nid = 1\n[constraints]\n\n\tmessage_size = \"1MiB\"", "5:17", "from 64 to 262144"),
+    ("name = \"a\"\nid = 1\n[constraints]\n\n\tmessage_size = \"1MiB\"", "5:17", "from 16 to 262144"),
     ("name = \"a\"\nid = 1\n[constraints]\nmaximum_nodes = 0", "4:17", "from 1 to 65535"),
     ("name = \"a\"\nid = 1\nconstraints.keep_alive = \"1us\"", "3:26", "at least 1000 us"),
     ("name = \"a\"\nid = 1\nconstraints = { request_timeout = 5 }", "3:35", "\"50ms\""),

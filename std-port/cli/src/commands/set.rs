@@ -19,7 +19,7 @@ Constraints:
   request_timeout   how long a request may take; a time from 1ms, as 2s
   minimum_interval  least time between two requests to one node; a time, 0 for none
   maximum_nodes     most connected nodes; a number
-  message_size      longest message received; a size from 64 B to 256 KiB
+  message_size      longest message received; a size from 16 B to 256 KiB
   chunk_size        longest frame received; a size from 320 B to 4 KiB
   keep_alive        between two signs of life; a time
   calls_per_peer    calls that one peer may have waiting or running here; a number")]

@@ -24,7 +24,7 @@ pub(super) fn constraints(table: &file::Constraints, role: Role, mistakes: &mut 
     set_time(&mut limits.minimum_interval, &table.minimum_interval, Duration::ZERO, mistakes);
     set_time(&mut limits.keep_alive, &table.keep_alive, Duration::from_millis(1), mistakes);
     set(&mut limits.maximum_nodes, &table.maximum_nodes, 1..=65_535, mistakes);
-    set(&mut limits.message_size, &table.message_size, 64..=LONGEST_MESSAGE, mistakes);
+    set(&mut limits.message_size, &table.message_size, 16..=LONGEST_MESSAGE, mistakes);
     set(&mut limits.chunk_size, &table.chunk_size, CHUNKS, mistakes);
     set(&mut limits.calls_per_peer, &table.calls_per_peer, 1..=65_535, mistakes);
     limits
@@ -103,8 +103,8 @@ mod tests {
             ("maximum_nodes = 0", None),
             ("message_size = \"256KiB\"", Some(Constraints { message_size: 256 * 1024, ..base })),
             ("message_size = 262_145", None),
-            ("message_size = 64", Some(Constraints { message_size: 64, ..base })),
-            ("message_size = 63", None),
+            ("message_size = 16", Some(Constraints { message_size: 16, ..base })),
+            ("message_size = 15", None),
             ("request_timeout = \"999us\"", None),
             ("chunk_size = 320", Some(Constraints { chunk_size: 320, ..base })),
             ("chunk_size = 4096", Some(Constraints { chunk_size: 4096, ..base })),
@@ -125,7 +125,7 @@ mod tests {
         let refused = [
             Constraints { maximum_nodes: 0, ..base },
             Constraints { message_size: 262_145, ..base },
-            Constraints { message_size: 63, ..base },
+            Constraints { message_size: 15, ..base },
             Constraints { request_timeout: Duration::from_micros(999), ..base },
             Constraints { chunk_size: 319, ..base },
             Constraints { chunk_size: 5120, ..base },

@@ -34,7 +34,7 @@ fn a_wrong_constraint_or_value_ends_with_2() {
     stage.ends(2, &["set", ".", "maximum_nodes", "many"]).says("a whole number");
     stage.ends(2, &["set", ".", "chunk_size", "1MiB"]);
     stage.ends(2, &["set", ".", "request_timeout", "0s"]).says("at least 1000 microseconds");
-    stage.ends(2, &["set", ".", "message_size", "1"]).says("it is 64 to ");
+    stage.ends(2, &["set", ".", "message_size", "1"]).says("it is 16 to ");
     stage.ends(2, &["set", ".", "maximum_nodes", "99999999"]);
     stage.ends(1, &["set", "agv-9", "request_timeout", "2s"]).says("no node `agv-9`");
 }
