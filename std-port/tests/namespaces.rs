@@ -3,43 +3,16 @@
 //! A test runs this binary again under `unshare`, as `ip` would need root otherwise. Where that is not possible it says
 //! that it was skipped, and with `CI` set it fails.
 
-use std::process::Command;
 use std::sync::mpsc::Receiver;
 use std::time::{Duration, Instant};
 
+use cara_processes::network;
 use cara_std::{CloseReason, CommunicationSystem, Error, Interfaces, Parameters, Unit, UnitEvent};
 
-const INSIDE: &str = "CARA_TEST_NAMESPACE";
 const PATIENCE: Duration = Duration::from_secs(30);
 
-/// Runs the test of this name in a namespace of its own; `true` inside of it.
-fn inside(test: &str) -> bool {
-    if std::env::var_os(INSIDE).is_some() {
-        return true;
-    }
-    let possible = |options: &str| {
-        let tried = Command::new("unshare").args([options, "ip", "link"]).output();
-        tried.is_ok_and(|output| output.status.success())
-    };
-    let Some(options) = ["-n", "-rn"].into_iter().find(|options| possible(options)) else {
-        let said = "skipped: no network namespace can be made here (unshare and ip, as root or with user namespaces)";
-        assert!(std::env::var_os("CI").is_none(), "{said}");
-        eprintln!("{test}: {said}");
-        return false;
-    };
-    let binary = std::env::current_exe().expect("this test has a file");
-    let mut child = Command::new("unshare");
-    child.arg(options).arg(binary).args(["--exact", test, "--nocapture", "--test-threads=1"]).env(INSIDE, "1");
-    let output = child.output().expect("unshare was just there");
-    let said = [output.stdout, output.stderr].concat();
-    let said = String::from_utf8_lossy(&said);
-    assert!(output.status.success() && said.contains("1 passed"), "{said}");
-    false
-}
-
-fn ip(arguments: &str) {
-    let output = Command::new("ip").args(arguments.split(' ')).output().expect("ip was there before");
-    assert!(output.status.success(), "ip {arguments}: {}", String::from_utf8_lossy(&output.stderr));
+fn ip(words: &str) {
+    network::run(&format!("ip {words}")).unwrap();
 }
 
 /// A pair of interfaces, one of which is the far end of the cable.
@@ -92,7 +65,7 @@ fn ping(manager: &CommunicationSystem) -> Result<(), Error> {
 
 #[test]
 fn without_an_interface_a_unit_says_so_once_and_goes_on_when_there_is_one() {
-    if !inside("without_an_interface_a_unit_says_so_once_and_goes_on_when_there_is_one") {
+    if !network::test("without_an_interface_a_unit_says_so_once_and_goes_on_when_there_is_one", &[], false) {
         return;
     }
     let (manager, of_manager) = manager();
@@ -121,7 +94,7 @@ fn without_an_interface_a_unit_says_so_once_and_goes_on_when_there_is_one() {
 
 #[test]
 fn an_interface_goes_and_comes() {
-    if !inside("an_interface_goes_and_comes") {
+    if !network::test("an_interface_goes_and_comes", &[], false) {
         return;
     }
     ip("link set lo up");
@@ -145,7 +118,7 @@ fn an_interface_goes_and_comes() {
 /// A vehicle that knows its manager's address has no route to it, and says so each time that it tries.
 #[test]
 fn a_fixed_address_without_a_route_is_told() {
-    if !inside("a_fixed_address_without_a_route_is_told") {
+    if !network::test("a_fixed_address_without_a_route_is_told", &[], false) {
         return;
     }
     ip("link set lo up");

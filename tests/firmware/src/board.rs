@@ -33,6 +33,7 @@ impl Bench {
     pub(crate) fn new(image: &Path, shows_logs: bool) -> Result<Self> {
         let elf = std::fs::read(image).with_context(|| format!("cannot read {}", image.display()))?;
         let table = Table::parse(&elf)?.with_context(|| format!("{} has no defmt table", image.display()))?;
+        network::run("ip link set lo up")?;
         network::run("ip link add bridge0 type bridge")?;
         network::run(&format!("ip address add {MANAGER} brd + dev bridge0"))?;
         network::run("ip link set bridge0 up")?;

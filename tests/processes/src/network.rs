@@ -1,7 +1,8 @@
 //! A network of one's own: the program runs itself again in a namespace, where it may do as it likes with interfaces,
-//! addresses and firewalls, and meets nobody. It ends with the process.
+//! addresses and firewalls, and meets nobody. No interface is up there, loopback included. It ends with the process.
 
 use std::ffi::OsStr;
+use std::io::Write;
 use std::process::{Command, ExitStatus, Stdio};
 
 use anyhow::{Context, Result, bail, ensure};
@@ -22,22 +23,53 @@ pub enum Own {
 }
 
 /// Runs this program again, with these arguments, in a network of its own, unless it is there already. `needs` are
-/// programs that must be there; with `tap`, the network must be able to hold virtual Ethernet devices.
+/// programs that must be there; with `tap`, the network must be able to hold virtual Ethernet devices and bridges.
 pub fn own<A: AsRef<OsStr>>(arguments: impl IntoIterator<Item = A>, needs: &[&str], tap: bool) -> Result<Own> {
     if std::env::var_os(INSIDE).is_some() {
-        run("ip link set lo up")?;
         return Ok(Own::Inside);
     }
-    if let Some(absent) = ["unshare", "ip"].iter().chain(needs).find(|program| !is_there(program)) {
-        return Ok(Own::Impossible(format!("the program `{absent}` is not installed")));
+    match again(needs, tap)? {
+        Ok(mut again) => Ok(Own::Ended(again.args(arguments).status().context("cannot start `unshare`")?)),
+        Err(reason) => Ok(Own::Impossible(reason)),
     }
-    let trial = if tap { "ip tuntap add name trial mode tap" } else { "ip link set lo up" };
+}
+
+/// Whether the test of this name goes on: `true` in a network of its own, in which it is run once more. What cannot be had
+/// is said, and fails where `CI` is set, as does a name that is no test's.
+pub fn test(name: &str, needs: &[&str], tap: bool) -> bool {
+    if std::env::var_os(INSIDE).is_some() {
+        return true;
+    }
+    let mut again = match again(needs, tap).expect("this test has a file") {
+        Ok(again) => again,
+        Err(reason) => {
+            // Past the test's captured output, so that it is seen.
+            std::io::stderr().write_all(format!("skipped {name}: {reason}\n").as_bytes()).expect("it is open");
+            assert!(std::env::var_os("CI").is_none(), "skipped, which counts as failed where CI is set: {reason}");
+            return false;
+        }
+    };
+    let output = again.args(["--exact", name, "--nocapture", "--test-threads=1"]).output();
+    let output = output.expect("`unshare` was just there");
+    let said = [output.stdout, output.stderr].concat();
+    let said = String::from_utf8_lossy(&said);
+    assert!(output.status.success() && said.contains("1 passed"), "it failed in its own network:\n{said}");
+    false
+}
+
+/// This program in a network of its own, or why there can be none.
+fn again(needs: &[&str], tap: bool) -> Result<std::result::Result<Command, String>> {
+    if let Some(absent) = ["unshare", "ip"].iter().chain(needs).find(|program| !is_there(program)) {
+        return Ok(Err(format!("the program `{absent}` is not installed")));
+    }
+    let devices = "ip tuntap add name trial mode tap && ip link add trial0 type bridge";
+    let trial = if tap { devices } else { "ip link set lo up" };
     let Some(kind) = KINDS.iter().find(|kind| works(unshare(kind).args(["sh", "-c", trial]))) else {
-        return Ok(Own::Impossible(format!("`unshare` and then `{trial}` does not work for this user")));
+        return Ok(Err(format!("`unshare` and then `{trial}` does not work for this user")));
     };
     let mut again = unshare(kind);
-    again.arg(std::env::current_exe()?).args(arguments).env(INSIDE, "1");
-    Ok(Own::Ended(again.status().context("cannot start `unshare`")?))
+    again.arg(std::env::current_exe()?).env(INSIDE, "1");
+    Ok(Ok(again))
 }
 
 /// As root, and as a user who is root inside only.

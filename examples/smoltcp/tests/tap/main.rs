@@ -3,56 +3,24 @@
 #[path = "../../examples/tap_agv.rs"]
 mod tap_agv;
 
-use std::fs::OpenOptions;
-use std::process::Command;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use cara_processes::network;
 use cara_std::{CommunicationSystem, Interfaces, Parameters};
 
 /// Long enough for the slowest machine; nothing here is timed.
 const LONG: Duration = Duration::from_secs(60);
-/// Set in the process that runs inside the namespace.
-const INSIDE: &str = "CARA_TAP_INSIDE";
 
 #[test]
 fn a_linux_manager_meets_a_vehicle_on_smoltcp() {
-    if std::env::var_os(INSIDE).is_some() {
-        return meet();
-    }
-    if let Err(reason) = run_inside("a_linux_manager_meets_a_vehicle_on_smoltcp") {
-        assert!(std::env::var_os("CI").is_none(), "skipped, which counts as failed where CI is set: {reason}");
-        eprintln!("skipped: {reason}");
+    if network::test("a_linux_manager_meets_a_vehicle_on_smoltcp", &[], true) {
+        meet();
     }
 }
 
-/// Runs a test of this file once more in a network of its own; why it cannot be run.
-fn run_inside(test: &str) -> Result<(), String> {
-    let tun = OpenOptions::new().read(true).write(true).open("/dev/net/tun");
-    tun.map_err(|error| format!("/dev/net/tun cannot be opened: {error}"))?;
-    let own = if is_root() { "-n" } else { "-rn" };
-    let devices = "ip tuntap add tap0 mode tap && ip link add br0 type bridge";
-    let possible = Command::new("unshare").args([own, "sh", "-c", devices]).output();
-    let possible = possible.map_err(|error| format!("no `unshare`: {error}"))?;
-    if !possible.status.success() {
-        let why = String::from_utf8_lossy(&possible.stderr).into_owned();
-        return Err(format!("a TAP device and a bridge in a namespace of one's own cannot be made here: {why}"));
-    }
-    let this = std::env::current_exe().expect("a test knows where it is");
-    let mut again = Command::new("unshare");
-    again.arg(own).arg(this).args(["--exact", test, "--nocapture"]).env(INSIDE, "1");
-    assert!(again.status().expect("it ran before").success(), "failed inside the namespace");
-    Ok(())
-}
-
-/// Only root can look into root's own things.
-fn is_root() -> bool {
-    std::fs::read_dir("/proc/1/fd").is_ok()
-}
-
-fn ip(arguments: &str) {
-    let done = Command::new("ip").args(arguments.split(' ')).status();
-    assert!(done.expect("ip is there").success(), "ip {arguments}");
+fn ip(words: &str) {
+    network::run(&format!("ip {words}")).unwrap();
 }
 
 fn until(what: &str, mut done: impl FnMut() -> bool) {

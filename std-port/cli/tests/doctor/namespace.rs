@@ -3,55 +3,22 @@
 use std::io::{Read, Write};
 use std::process::{Child, ChildStdin, Command, Stdio};
 
+use cara_processes::network;
 use cara_std::CommunicationSystem;
 use cara_std::control::Control;
 
 use crate::datagrams::MANAGER;
 
-/// Set inside the namespace.
-const INSIDE: &str = "CARA_TEST_INSIDE";
 /// What a far host is.
 const PART: &str = "CARA_TEST_PART";
 /// Where Debian keeps the programs, which is not on everybody's path.
 const PATHS: &str = "/usr/sbin:/sbin:/usr/bin:/bin";
 
-/// Runs `test`, which has this `name`, in a network namespace of its own, if the system lets this user make one and has
-/// the programs that the test needs. What cannot be had is said, and fails where `CI` is set.
+/// Runs `test`, which has this `name`, in a network namespace of its own.
 pub(crate) fn inside(name: &str, programs: &[&str], test: impl FnOnce()) {
-    if std::env::var_os(INSIDE).is_some() {
-        return test();
+    if network::test(name, programs, false) {
+        test();
     }
-    if let Some(reason) = missing(programs) {
-        // Past the test's captured output, so that it is seen.
-        std::io::stderr().write_all(format!("skipped {name}: {reason}\n").as_bytes()).unwrap();
-        assert!(std::env::var_os("CI").is_none(), "skipped: {reason}");
-        return;
-    }
-    let status = unshare(&["--user", "--map-root-user", "--net"])
-        .arg(std::env::current_exe().unwrap())
-        .args(["--exact", name, "--nocapture", "--test-threads=1"])
-        .env(INSIDE, "1")
-        .status()
-        .unwrap();
-    assert!(status.success(), "it failed inside the namespace");
-}
-
-fn unshare(arguments: &[&str]) -> Command {
-    let mut command = Command::new("unshare");
-    command.env("PATH", PATHS).arg("--kill-child").arg("--fork").args(arguments);
-    command
-}
-
-fn missing(programs: &[&str]) -> Option<String> {
-    let works = |command: &mut Command| {
-        command.stdout(Stdio::null()).stderr(Stdio::null()).status().is_ok_and(|status| status.success())
-    };
-    if !works(unshare(&["--user", "--map-root-user", "--net"]).arg("true")) {
-        return Some("`unshare --user --net` does not work here".into());
-    }
-    let there = |program: &&&str| PATHS.split(':').any(|path| std::path::Path::new(path).join(program).is_file());
-    let absent = ["ip"].iter().chain(programs).find(|program| !there(program))?;
-    Some(format!("the program `{absent}` is not installed"))
 }
 
 /// `ip` with these words.
