@@ -13,6 +13,8 @@ use zeroize::{Zeroize, ZeroizeOnDrop};
 
 /// Bytes of each key.
 pub const KEY_BYTES: usize = 32;
+/// Bytes of a key's fingerprint.
+pub const FINGERPRINT_BYTES: usize = 6;
 
 macro_rules! key {
     ($(#[$meta:meta])* $name:ident) => {
@@ -29,6 +31,11 @@ macro_rules! key {
             /// Its bytes, for whoever writes them to where they belong.
             pub const fn expose(&self) -> &[u8; KEY_BYTES] {
                 &self.0
+            }
+
+            /// What may be shown of it: the same for the same key, and nothing of the key can be computed from it.
+            pub fn fingerprint(&self) -> [u8; FINGERPRINT_BYTES] {
+                fingerprint(&self.0)
             }
         }
 
@@ -52,6 +59,11 @@ key! {
 key! {
     /// The key with which all units of a fleet ask and answer who is there.
     DiscoveryKey
+}
+key! {
+    /// The secret from which a board draws its random numbers. It is drawn anew whenever a board is provisioned and
+    /// does not come from the root: whoever gets the root cannot compute what the board drew.
+    DeviceSecret
 }
 
 impl RootKey {
@@ -86,6 +98,13 @@ fn name(mac: &mut Blake2sMac256, identity: &Identity) {
     mac.update(&[role, identity.name().len() as u8]);
     mac.update(identity.name().as_bytes());
     mac.update(&identity.id().to_le_bytes());
+}
+
+fn fingerprint(key: &[u8; KEY_BYTES]) -> [u8; FINGERPRINT_BYTES] {
+    let mut mac = keyed(key);
+    mac.update(b"show");
+    let whole: [u8; KEY_BYTES] = mac.finalize().into_bytes().into();
+    whole.first_chunk().copied().unwrap_or_default()
 }
 
 pub(crate) fn keyed(key: &[u8; KEY_BYTES]) -> Blake2sMac256 {
@@ -151,5 +170,14 @@ mod tests {
     fn nothing_of_a_key_is_shown() {
         assert_eq!(format!("{:?}", root()), "RootKey(…)");
         assert_eq!(format!("{:?}", root().discovery(Fleet(1), 1)), "DiscoveryKey(…)");
+        assert_eq!(format!("{:?}", DeviceSecret::new([7; KEY_BYTES])), "DeviceSecret(…)");
+    }
+
+    #[test]
+    fn keys_are_told_apart_by_their_fingerprints() {
+        let shown = RootKey::new([7; KEY_BYTES]).fingerprint();
+        assert_eq!(shown, PairKey::new([7; KEY_BYTES]).fingerprint());
+        assert_ne!(shown, RootKey::new([8; KEY_BYTES]).fingerprint());
+        assert!(!shown.contains(&7));
     }
 }

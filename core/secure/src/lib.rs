@@ -4,11 +4,12 @@
 //! - [`handshake`]: two messages that prove the pair's key, and agree on keys of this link alone;
 //! - [`channel`]: the frames of a link, sealed in place;
 //! - [`datagram`]: the datagrams beside it, with keys of their own and a window against replays;
-//! - [`mac`]: codes for discovery, which is authenticated and not secret.
+//! - [`mac`]: codes for discovery, which is authenticated and not secret;
+//! - [`random`]: random numbers for boards, whose sources of noise may be poor.
 //!
-//! Another suite would be another version of the protocol; nothing is negotiated. This crate draws no random numbers,
-//! reads no file and allocates nothing: whoever calls brings 32 fresh bytes for each handshake. What it does not do:
-//! decide who may speak, which is the business of the tables above.
+//! Another suite would be another version of the protocol; nothing is negotiated. This crate has no source
+//! of noise, reads no file and allocates nothing: whoever calls brings 32 fresh bytes for each handshake. What it does not
+//! do: decide who may speak, which is the business of the tables above.
 
 #![no_std]
 
@@ -20,4 +21,5 @@ pub mod datagram;
 pub mod handshake;
 pub mod keys;
 pub mod mac;
+pub mod random;
 mod suite;

@@ -1,0 +1,250 @@
+//! Random numbers for a board, whose sources of noise may be poor, or constant.
+//!
+//! What is drawn comes from a keyed hash over all that may differ: the board's own secret as the key, which life of the
+//! board this is, how often it has drawn in this life, noise of the hardware, and what a peer has drawn. The secret
+//! makes it unpredictable, the two counters make it unique. Each of the two is enough for what it does:
+//!
+//! - with noise that never changes, no two draws are alike as long as the boot counter moves;
+//! - where the counter has stood still as well, what a peer has drawn still tells two lives apart, for all that is drawn
+//!   after [`Random::stir`];
+//! - with a secret that others know, only the noise is left.
+//!
+//! A [`BootCounter`] is therefore moved, and its new value kept where a loss of power leaves it, before the network
+//! starts.
+
+use blake2::digest::Mac;
+use zeroize::Zeroize;
+
+use crate::keys::{DeviceSecret, KEY_BYTES, keyed};
+
+/// Bytes of one draw.
+pub const DRAW_BYTES: usize = 32;
+
+/// Which life of the board this is, kept where a loss of power leaves it.
+pub trait BootCounter {
+    /// Why the counter could not be kept.
+    type Error;
+
+    /// Moves the counter on, and returns the new value once it is kept: no value is returned twice. With an error the
+    /// board must not start its network, since it could draw what it has drawn before.
+    fn advance(&mut self) -> Result<u64, Self::Error>;
+}
+
+/// Where a board's random numbers come from. One for each life of the board; it cannot be copied.
+pub struct Random {
+    secret: DeviceSecret,
+    boot: u64,
+    drawn: u64,
+    /// All noise that came, and what peers have drawn.
+    pool: [u8; DRAW_BYTES],
+}
+
+impl Random {
+    /// Begins a life: moves the counter, and takes what noise there is.
+    pub fn start<C: BootCounter>(secret: DeviceSecret, counter: &mut C, noise: &[u32]) -> Result<Self, C::Error> {
+        let mut random = Self { secret, boot: counter.advance()?, drawn: 0, pool: [0; DRAW_BYTES] };
+        random.stir_words(noise);
+        Ok(random)
+    }
+
+    /// A generator for tests that must draw the same in each life: a known secret, and life 0.
+    pub const fn constant() -> Self {
+        Self { secret: DeviceSecret::new([0; KEY_BYTES]), boot: 0, drawn: 0, pool: [0; DRAW_BYTES] }
+    }
+
+    /// What the hardware's noise was, goes into all that is drawn from now on.
+    pub fn stir_words(&mut self, noise: &[u32]) {
+        let mut mac = keyed(self.secret.expose());
+        mac.update(b"stir");
+        mac.update(&self.pool);
+        noise.iter().for_each(|word| mac.update(&word.to_le_bytes()));
+        self.pool = mac.finalize().into_bytes().into();
+    }
+
+    /// What a peer has drawn, as the nonce of its hello, goes into all that is drawn from now on.
+    pub fn stir(&mut self, nonce: &[u8]) {
+        let mut mac = keyed(self.secret.expose());
+        mac.update(b"peer");
+        mac.update(&self.pool);
+        mac.update(nonce);
+        self.pool = mac.finalize().into_bytes().into();
+    }
+
+    /// Draws 32 bytes.
+    pub fn draw(&mut self) -> [u8; DRAW_BYTES] {
+        let mut mac = keyed(self.secret.expose());
+        mac.update(b"draw");
+        mac.update(&self.boot.to_le_bytes());
+        mac.update(&self.drawn.to_le_bytes());
+        mac.update(&self.pool);
+        // At a million draws a second it wraps after half a million years.
+        self.drawn = self.drawn.wrapping_add(1);
+        mac.finalize().into_bytes().into()
+    }
+
+    /// Fills `bytes`.
+    pub fn fill(&mut self, bytes: &mut [u8]) {
+        for piece in bytes.chunks_mut(DRAW_BYTES) {
+            let mut drawn = self.draw();
+            piece.iter_mut().zip(drawn).for_each(|(to, from)| *to = from);
+            drawn.zeroize();
+        }
+    }
+}
+
+impl Drop for Random {
+    fn drop(&mut self) {
+        self.pool.zeroize();
+    }
+}
+
+/// Tells that there is one, and nothing of what it draws.
+impl core::fmt::Debug for Random {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.write_str("Random(…)")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, clippy::indexing_slicing)]
+    use super::*;
+    use crate::channel::TAG_BYTES;
+    use crate::handshake::{Initiator, answer};
+    use crate::keys::PairKey;
+    use cara_core::host::secure::Secure;
+    use std::collections::HashSet;
+    use std::vec::Vec;
+
+    /// Noise that never changes.
+    const NOISE: [u32; 4] = [0; 4];
+    const BOOTS: u64 = 10_000;
+
+    /// A counter that moves, or does not.
+    struct Kept {
+        value: u64,
+        step: u64,
+    }
+
+    impl BootCounter for Kept {
+        type Error = &'static str;
+
+        fn advance(&mut self) -> Result<u64, Self::Error> {
+            self.value += self.step;
+            if self.value < u64::MAX / 2 { Ok(self.value) } else { Err("the page is worn out") }
+        }
+    }
+
+    fn secret() -> DeviceSecret {
+        DeviceSecret::new([9; KEY_BYTES])
+    }
+
+    fn life(counter: &mut Kept) -> Random {
+        Random::start(secret(), counter, &NOISE).unwrap()
+    }
+
+    /// What a board draws in a life: for two handshakes and their datagrams.
+    fn drawn(random: &mut Random) -> [[u8; DRAW_BYTES]; 4] {
+        core::array::from_fn(|_| random.draw())
+    }
+
+    #[test]
+    fn with_constant_noise_nothing_is_drawn_twice_while_the_counter_moves() {
+        let mut counter = Kept { value: 0, step: 1 };
+        let all: HashSet<_> = (0..BOOTS).flat_map(|_| drawn(&mut life(&mut counter))).collect();
+        assert_eq!(all.len() as u64, BOOTS * 4);
+    }
+
+    #[test]
+    fn where_the_counter_stands_still_the_peer_still_tells_lives_apart() {
+        let mut counter = Kept { value: 5, step: 0 };
+        let alike: HashSet<_> = (0..BOOTS).flat_map(|_| drawn(&mut life(&mut counter))).collect();
+        assert_eq!(alike.len(), 4, "this is what the counter is for");
+        let told_apart = (0..BOOTS).flat_map(|peer| {
+            let mut random = life(&mut counter);
+            random.stir(&peer.to_le_bytes());
+            drawn(&mut random)
+        });
+        assert_eq!(told_apart.collect::<HashSet<_>>().len() as u64, BOOTS * 4);
+    }
+
+    /// The keys of a link are new if one end's draw is: whatever is sealed under the same number differs.
+    fn first_frame(board: &mut Random, manager: [u8; 32]) -> Vec<u8> {
+        let (pair, prologue) = (PairKey::new([3; KEY_BYTES]), [4; 32]);
+        let (initiator, message) = Initiator::begin(&pair, &prologue, &board.draw()).unwrap();
+        let (_, message) = answer(&pair, &prologue, &manager, &message).unwrap();
+        let mut channel = initiator.finish(&message).unwrap();
+        let mut frame = std::vec![0; 64 + TAG_BYTES];
+        channel.seal(&mut frame).unwrap();
+        frame
+    }
+
+    #[test]
+    fn no_key_and_number_repeat_with_a_manager_that_draws_the_same_too() {
+        const LIVES: usize = 20;
+        let mut counter = Kept { value: 0, step: 1 };
+        let moved: HashSet<_> = (0..LIVES).map(|_| first_frame(&mut life(&mut counter), [8; 32])).collect();
+        assert_eq!(moved.len(), LIVES);
+        // With nothing that moves, the same key seals the same number again.
+        let mut still = Kept { value: 0, step: 0 };
+        let repeated: HashSet<_> = (0..LIVES).map(|_| first_frame(&mut life(&mut still), [8; 32])).collect();
+        assert_eq!(repeated.len(), 1);
+        // One end that draws well is enough.
+        let other = (0..LIVES as u8).map(|drawn| first_frame(&mut life(&mut still), [drawn + 1; 32]));
+        assert_eq!(other.collect::<HashSet<_>>().len(), LIVES);
+    }
+
+    #[test]
+    fn whatever_differs_changes_what_is_drawn() {
+        let counter = || Kept { value: 0, step: 1 };
+        let of = |secret, noise: &[u32]| Random::start(secret, &mut counter(), noise).unwrap().draw();
+        let mut fed = life(&mut counter());
+        fed.stir(&[0; 16]);
+        let mut words = life(&mut counter());
+        words.stir_words(&[0; 4]);
+        let draws = [
+            of(secret(), &NOISE),
+            of(DeviceSecret::new([8; KEY_BYTES]), &NOISE),
+            of(secret(), &[0, 0, 0, 1]),
+            of(secret(), &[]),
+            fed.draw(),
+            words.draw(),
+        ];
+        assert_eq!(HashSet::from(draws).len(), draws.len());
+    }
+
+    #[test]
+    fn a_counter_that_is_not_kept_starts_nothing() {
+        let mut worn = Kept { value: u64::MAX / 2, step: 1 };
+        assert_eq!(Random::start(secret(), &mut worn, &NOISE).map(drop), Err("the page is worn out"));
+    }
+
+    #[test]
+    fn pieces_of_any_length_are_filled() {
+        for length in [0, 1, 31, 32, 33, 100] {
+            let (mut one, mut other) = (std::vec![0; length], std::vec![0; length]);
+            Random::constant().fill(&mut one);
+            Random::constant().fill(&mut other);
+            assert_eq!(one, other);
+            assert!(length < 16 || one.iter().any(|byte| *byte != 0));
+        }
+        let mut random = Random::constant();
+        assert_ne!(random.draw(), random.draw());
+    }
+
+    /// The generator is a keyed hash as it stands in the design; computed with another implementation, Python's
+    /// `hashlib.blake2s(b"draw" + bytes(48), key=bytes(32))`.
+    #[test]
+    fn the_generator_stays() {
+        let shown = Random::constant()
+            .draw()
+            .iter()
+            .fold(std::string::String::new(), |text, byte| text + &std::format!("{byte:02x}"));
+        assert_eq!(shown, "b487b497a398ba081f0d87b663e6e87b038296d939b40b0b0b1796877dc1e47d");
+    }
+
+    #[test]
+    fn nothing_of_it_is_shown() {
+        assert_eq!(std::format!("{:?}", Random::constant()), "Random(…)");
+    }
+}
