@@ -1,147 +1,109 @@
-//! The child processes, and how the scheduler talks with them: one line of JSON each way per question.
-//!
-//! A child ends when its standard input does, so none outlives the scheduler.
+//! The child processes as the scheduler sees them: one line of JSON each way per question.
 
-use std::io::{BufRead, BufReader, Read, Write, stdin, stdout};
-use std::process::{self, ChildStdin, ChildStdout, Command, Stdio};
+use std::io::{BufRead, BufReader, Read};
+use std::process::{self, ChildStdin, Command, Stdio};
+use std::sync::mpsc::{self, Receiver, RecvTimeoutError};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread;
+use std::time::Duration;
 
-use anyhow::{Context, Result, anyhow, ensure};
+use anyhow::{Context, Result, bail};
+use cara_bench_ends::{Callers, ClientQuestion, End, answer_all, answer_client, pin};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
-use serde_json::{Value, json};
+use serde_json::json;
+use std::io::Write;
 
-use crate::block::{Callers, Order};
-use crate::burst::{self, Burst};
-use crate::further::Further;
-use crate::peers::{self, Limits};
-use crate::{Child, clock, pin, share};
+use crate::peers::{self, Contender};
+use crate::share;
 
-/// What a server process is asked.
+/// Characters of what a child says last that are kept, to tell why it ended.
+const LAST_WORDS: usize = 300;
+
+/// What a client process of our own is asked.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub(crate) enum ServerQuestion {
-    /// CPU time so far, in nanoseconds.
-    CpuTime,
-    /// What the one-way service counted, and when it last did.
-    Executed,
-    /// What the peer counts of its own accord.
-    Counters,
-    /// Constraints towards all callers.
-    Constrain(Limits),
-}
-
-/// What a client process is asked.
-#[derive(Debug, Clone, Serialize, Deserialize)]
-pub(crate) enum ClientQuestion {
-    Echo(Order),
-    Burst(Burst),
-    /// Messages of bursts that were reported as not executed since this was last asked.
-    Failed,
-    Share(share::Order),
-}
-
-/// The server process: tells its address, then answers.
-pub(crate) fn serve(child: &Child) -> Result<()> {
-    pin::stay_on(child.cpu)?;
-    let server = peers::named(&child.peer)?.start_server(&child.place)?;
-    say(&server.address)?;
-    answer_all(|question| {
-        Ok(match question {
-            ServerQuestion::CpuTime => json!(clock::cpu_time()),
-            ServerQuestion::Executed => json!(server.executed.read()),
-            ServerQuestion::Counters => json!((server.counters)()),
-            ServerQuestion::Constrain(limits) => {
-                let constrain = server.constrain.as_ref().context("this peer has no constraints")?;
-                json!(constrain(limits)?)
-            }
-        })
-    })?;
-    drop(server.keep);
-    Ok(())
+#[serde(untagged)]
+pub(crate) enum OwnQuestion {
+    Shared(ClientQuestion),
+    Share { share: share::Order },
 }
 
 /// The client process: makes the calls that each line orders.
-pub(crate) fn call(child: &Child) -> Result<()> {
-    pin::stay_on(child.cpu)?;
-    let peer = peers::named(&child.peer)?;
-    let mut callers = Callers::new(&*peer, &child.place, &child.address);
-    answer_all(|question| {
-        Ok(match question {
-            ClientQuestion::Echo(order) => json!(callers.run(&order)?),
-            ClientQuestion::Burst(burst) => json!(burst::offer(callers.first()?, &burst)),
-            ClientQuestion::Failed => json!(callers.first()?.failed()),
-            ClientQuestion::Share(order) => json!(share::measure(callers.first()?, &order)?),
-        })
+pub(crate) fn call(end: &End) -> Result<()> {
+    pin::stay_on(end.cpu)?;
+    let peer = peers::named(&end.peer)?;
+    let mut callers = Callers::new(&*peer, &end.place, &end.address);
+    answer_all(|question| match question {
+        OwnQuestion::Shared(question) => answer_client(&mut callers, &question),
+        OwnQuestion::Share { share } => Ok(json!(share::measure(callers.first()?, &share)?)),
     })
 }
 
-/// The process of the further nodes of distribution 2: they call while told to.
-pub(crate) fn further(child: &Child) -> Result<()> {
-    pin::stay_on(child.cpu)?;
-    let further = Further::connect(&*peers::named(&child.peer)?, &child.place, &child.address)?;
-    answer_all(|is_calling: bool| {
-        Ok(match is_calling {
-            true => json!(further.begin()),
-            false => json!(further.end()?),
-        })
-    })
-}
+/// A question that a child answered with an error; it goes on and can be asked something else.
+#[derive(Debug)]
+pub(crate) struct Refused(String);
 
-/// Answers each question until there are no more.
-pub(crate) fn answer_all<Q: DeserializeOwned>(mut answer: impl FnMut(Q) -> Result<Value>) -> Result<()> {
-    for line in stdin().lines() {
-        let question = serde_json::from_str(&line?)?;
-        say(&answer(question).map_err(|error| format!("{error:#}")))?;
+impl std::fmt::Display for Refused {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(&self.0)
     }
-    Ok(())
 }
 
-fn say(answer: &impl Serialize) -> Result<()> {
-    let mut line = serde_json::to_string(answer)?;
-    line.push('\n');
-    let mut out = stdout().lock();
-    out.write_all(line.as_bytes())?;
-    Ok(out.flush()?)
-}
+impl std::error::Error for Refused {}
 
 /// A child process as the scheduler sees it.
 pub(crate) struct Handle {
     process: process::Child,
     questions: Option<ChildStdin>,
-    answers: BufReader<ChildStdout>,
+    answers: Receiver<String>,
+    last_words: Arc<Mutex<String>>,
+    /// How long it may take to answer; our own may take what they need.
+    patience: Option<Duration>,
 }
 
 impl Handle {
-    /// Starts this program again with `arguments`; what it prints as a service is read and thrown away.
-    pub(crate) fn start(arguments: &[String], prints: bool) -> Result<Self> {
+    /// Starts this program again with `arguments`.
+    pub(crate) fn start(arguments: &[String]) -> Result<Self> {
         let mut command = Command::new(std::env::current_exe()?);
-        command.args(arguments).stdin(Stdio::piped()).stdout(Stdio::piped());
-        if prints {
-            command.stderr(Stdio::piped());
-        }
-        let mut process = command.spawn()?;
-        if let Some(mut printed) = process.stderr.take() {
-            std::thread::spawn(move || {
-                let mut buffer = [0; 1 << 16];
-                while printed.read(&mut buffer).is_ok_and(|count| count > 0) {}
-            });
-        }
-        let questions = process.stdin.take();
-        let answers = process.stdout.take().context("the child has no output")?;
-        Ok(Self { process, questions, answers: BufReader::new(answers) })
+        command.args(arguments);
+        Self::spawn(command, None)
     }
 
-    /// Starts this program again as `role` of a pair.
-    pub(crate) fn of_pair(role: &str, child: &Child) -> Result<Self> {
-        let run = child.place.run.to_string();
-        let mut arguments =
-            [role, "--peer", &child.peer, "--run", &run, "--address", &child.address].map(String::from).to_vec();
-        if let Some(cpu) = child.cpu {
-            arguments.extend(["--cpu".into(), cpu.to_string()]);
+    /// Starts `role` of a pair. What it prints as a service is read and thrown away.
+    pub(crate) fn of_pair(role: &str, contender: &Contender, end: &End) -> Result<Self> {
+        let mut command = contender.command()?;
+        command.args([role, "--peer", &end.peer, "--run", &end.place.run.to_string(), "--address", &end.address]);
+        command.args(end.place.print.then_some("--print"));
+        let patience = match contender {
+            Contender::Own(_) => None,
+            Contender::Outside(outside) => Some(outside.patience()),
+        };
+        if patience.is_some() || (end.place.print && role == "serve") {
+            command.stderr(Stdio::piped());
         }
-        if child.place.print {
-            arguments.push("--print".into());
+        // Children inherit the CPU of the thread that starts them, so a program need not know how to stay on one.
+        thread::scope(|scope| {
+            let starter = scope.spawn(|| {
+                pin::stay_on(end.cpu)?;
+                Self::spawn(command, patience)
+            });
+            starter.join().expect("starting does not panic")
+        })
+    }
+
+    fn spawn(mut command: Command, patience: Option<Duration>) -> Result<Self> {
+        command.stdin(Stdio::piped()).stdout(Stdio::piped());
+        let mut process = command.spawn().with_context(|| format!("cannot start {:?}", command.get_program()))?;
+        let last_words = Arc::new(Mutex::new(String::new()));
+        if let Some(said) = process.stderr.take() {
+            let kept = last_words.clone();
+            thread::spawn(move || listen(said, &kept));
         }
-        Self::start(&arguments, child.place.print && role == "serve")
+        let questions = process.stdin.take();
+        let lines = BufReader::new(process.stdout.take().context("the child has no output")?).lines();
+        let (sender, answers) = mpsc::channel();
+        thread::spawn(move || lines.map_while(Result::ok).try_for_each(|line| sender.send(line)));
+        Ok(Self { process, questions, answers, last_words, patience })
     }
 
     /// Sends one line.
@@ -149,25 +111,55 @@ impl Handle {
         let mut line = serde_json::to_string(question)?;
         line.push('\n');
         let questions = self.questions.as_mut().context("the child is being stopped")?;
-        Ok(questions.write_all(line.as_bytes())?)
+        questions.write_all(line.as_bytes()).with_context(|| self.end("a child process does not listen any more"))
     }
 
     /// Waits for one line.
     pub(crate) fn line<T: DeserializeOwned>(&mut self) -> Result<T> {
-        let mut line = String::new();
-        ensure!(self.answers.read_line(&mut line)? > 0, "a child process ended before it answered");
-        Ok(serde_json::from_str(&line)?)
+        let line = match self.patience {
+            None => self.answers.recv().map_err(|_| RecvTimeoutError::Disconnected),
+            Some(patience) => self.answers.recv_timeout(patience),
+        };
+        match line {
+            Ok(line) => serde_json::from_str(&line).with_context(|| format!("a child process said {line:?}")),
+            Err(RecvTimeoutError::Disconnected) => bail!(self.end("a child process ended before it answered")),
+            Err(RecvTimeoutError::Timeout) => {
+                bail!(self.end(&format!("no answer for {} s", self.patience.unwrap_or_default().as_secs())))
+            }
+        }
     }
 
     /// Waits for what came of the last question.
     pub(crate) fn answer<T: DeserializeOwned>(&mut self) -> Result<T> {
-        self.line::<Result<T, String>>()?.map_err(|error| anyhow!(error))
+        Ok(self.line::<Result<T, String>>()?.map_err(Refused)?)
     }
 
     /// Sends a question and waits for its answer.
     pub(crate) fn order<T: DeserializeOwned>(&mut self, question: &impl Serialize) -> Result<T> {
         self.ask(question)?;
         self.answer()
+    }
+
+    /// What happened, with what the child said last.
+    fn end(&self, what: &str) -> String {
+        // What it said before it ended may still be on its way.
+        thread::sleep(Duration::from_millis(50));
+        let said = self.last_words.lock().unwrap_or_else(PoisonError::into_inner);
+        let last = said.trim().lines().next_back().unwrap_or_default();
+        if last.is_empty() { what.to_owned() } else { format!("{what}: {last}") }
+    }
+}
+
+/// Reads what a child prints, and keeps the end of it.
+fn listen(mut said: impl Read, kept: &Mutex<String>) {
+    let mut buffer = [0; 1 << 16];
+    while let Ok(count @ 1..) = said.read(&mut buffer) {
+        let mut kept = kept.lock().unwrap_or_else(PoisonError::into_inner);
+        let fresh = buffer.get(count.saturating_sub(LAST_WORDS)..count).unwrap_or_default();
+        kept.push_str(&String::from_utf8_lossy(fresh));
+        let surplus = kept.len().saturating_sub(LAST_WORDS);
+        let cut = (surplus..kept.len()).find(|at| kept.is_char_boundary(*at)).unwrap_or(kept.len());
+        kept.drain(..cut);
     }
 }
 
@@ -179,7 +171,7 @@ impl Drop for Handle {
             if !matches!(self.process.try_wait(), Ok(None)) {
                 return;
             }
-            std::thread::sleep(std::time::Duration::from_millis(10));
+            thread::sleep(Duration::from_millis(10));
         }
         let _ = self.process.kill();
         let _ = self.process.wait();

@@ -7,18 +7,12 @@
 //!
 //! Only a release build measures anything: `cargo xtask bench --help`.
 
-mod block;
-mod burst;
 mod child;
-mod clock;
 mod experiments;
-mod further;
 mod nodes;
 mod pair;
 mod peers;
-mod pin;
 mod plots;
-mod print;
 mod progress;
 mod results;
 mod share;
@@ -26,7 +20,8 @@ mod statistics;
 mod table;
 
 use anyhow::Result;
-use clap::{Args, Parser, Subcommand};
+use cara_bench_ends::{End, Place, further, serve};
+use clap::{Parser, Subcommand};
 
 /// Measures CARA against raw sockets.
 #[derive(Parser)]
@@ -42,38 +37,22 @@ enum Command {
     Experiments(experiments::Options),
     /// The process that answers; started by the others.
     #[command(hide = true)]
-    Serve(Child),
+    Serve(End),
     /// The process that calls; started by the others.
     #[command(hide = true)]
-    Call(Child),
+    Call(End),
     /// The process of the five further nodes; started by the others.
     #[command(hide = true)]
-    Further(Child),
+    Further(End),
     /// The process that holds idle s_units; started by the others.
     #[command(hide = true)]
-    Idle(peers::Place),
+    Idle(Place),
     /// The process of a manager; started by the others.
     #[command(hide = true)]
     Manager(nodes::Nodes),
     /// The process of a manager's s_units; started by the others.
     #[command(hide = true)]
     Units(nodes::Nodes),
-}
-
-/// What a child process of a pair is told.
-#[derive(Args)]
-pub(crate) struct Child {
-    /// Whom to play.
-    #[arg(long)]
-    peer: String,
-    /// The CPU to stay on.
-    #[arg(long)]
-    cpu: Option<usize>,
-    #[command(flatten)]
-    place: peers::Place,
-    /// Where the server listens, as it told.
-    #[arg(long, default_value = "")]
-    address: String,
 }
 
 fn main() -> Result<()> {
@@ -84,9 +63,9 @@ fn main() -> Result<()> {
             }
             experiments::run(&options)
         }
-        Command::Serve(child) => child::serve(&child),
-        Command::Call(child) => child::call(&child),
-        Command::Further(child) => child::further(&child),
+        Command::Serve(end) => serve(&*peers::named(&end.peer)?, &end),
+        Command::Call(end) => child::call(&end),
+        Command::Further(end) => further(&*peers::named(&end.peer)?, &end),
         Command::Idle(place) => peers::cara::idle(&place),
         Command::Manager(nodes) => nodes::manager(&nodes),
         Command::Units(nodes) => nodes::units(&nodes),

@@ -3,6 +3,7 @@
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
+use cara_bench_ends::{Place, answer_all, clock, pin, text};
 use cara_std::{
     Builder, Call, CommunicationSystem, Constraints, Interfaces, Parameters, ParametersView, Peer, RequestOptions,
     ServiceError, Threads, Unit,
@@ -10,12 +11,6 @@ use cara_std::{
 use clap::Args;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
-
-use crate::block::text;
-use crate::child::answer_all;
-use crate::clock;
-use crate::peers::Place;
-use crate::pin;
 
 /// The manager's name and ID number.
 const MANAGER: (&str, u32) = ("depot", 1);

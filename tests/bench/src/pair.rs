@@ -3,15 +3,14 @@
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
+use cara_bench_ends::{
+    Burst, ClientQuestion, Counters, End, Limits, Offered, Order, Outcome, Pin, Place, ServerQuestion, pin,
+};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-use crate::Child;
-use crate::block::{Order, Outcome};
-use crate::burst::{Burst, Offered};
-use crate::child::{ClientQuestion, Handle, ServerQuestion};
-use crate::peers::{Counters, Limits, Place};
-use crate::pin::{self, Pin};
+use crate::child::Handle;
+use crate::peers::Contender;
 use crate::statistics::Turn;
 
 /// The further nodes are left alone for so long before anything is measured, so that all of them are under way.
@@ -58,15 +57,16 @@ impl Delivered {
 
 impl Pair {
     /// Starts the processes of `peer`; they share no network with any other pair.
-    pub(crate) fn start(peer: &str, setting: Setting) -> Result<Self> {
+    pub(crate) fn start(contender: &Contender, setting: Setting) -> Result<Self> {
+        let peer = contender.name();
         let [client_cpu, server_cpu] = pin::cpus(setting.pin)?;
         let place = Place { run: fastrand::u32(1..), print: setting.print };
-        let mut child = Child { peer: peer.to_owned(), cpu: server_cpu, place, address: String::new() };
-        let mut server = Handle::of_pair("serve", &child)?;
-        child.address = server.line().with_context(|| format!("starting the server of {peer}"))?;
-        child.cpu = client_cpu;
-        let client = Handle::of_pair("call", &child)?;
-        let further = (setting.distribution == 2).then(|| Handle::of_pair("further", &child)).transpose()?;
+        let mut end = End { peer: peer.to_owned(), cpu: server_cpu, place, address: String::new() };
+        let mut server = Handle::of_pair("serve", contender, &end)?;
+        end.address = server.line().with_context(|| format!("starting the server of {peer}"))?;
+        end.cpu = client_cpu;
+        let client = Handle::of_pair("call", contender, &end)?;
+        let further = (setting.distribution == 2).then(|| Handle::of_pair("further", contender, &end)).transpose()?;
         Ok(Self { peer: peer.to_owned(), server, client, further })
     }
 
@@ -85,10 +85,10 @@ impl Pair {
     }
 
     pub(crate) fn end_block(&mut self, used: u64) -> Result<Turn> {
-        let outcome: Outcome = self.client.answer().with_context(|| format!("calls of {}", self.peer))?;
+        let outcome: Result<Outcome> = self.client.answer().with_context(|| format!("calls of {}", self.peer));
         let server_cpu = self.ask_server::<u64>(&ServerQuestion::CpuTime)?.saturating_sub(used);
         self.end_further()?;
-        Ok(Turn::new(outcome, server_cpu))
+        Ok(Turn::new(outcome?, server_cpu))
     }
 
     /// One burst of one-way messages, and what became of each.

@@ -7,9 +7,9 @@ use std::path::Path;
 
 use anyhow::{Context, Result};
 
-use crate::peers::Delivery;
-use crate::pin::Pin;
 use crate::results::{Availability, Response, Results};
+use cara_bench_ends::Delivery;
+use cara_bench_ends::Pin;
 use chart::{Axis, Chart, Line};
 
 /// The size of figure 8.

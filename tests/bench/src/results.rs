@@ -6,8 +6,10 @@ use std::path::Path;
 use anyhow::{Context, Result};
 use serde::Serialize;
 
-use crate::peers::Delivery;
-use crate::pin::Pin;
+use crate::peers::OutsideReport;
+
+use cara_bench_ends::Delivery;
+use cara_bench_ends::Pin;
 
 /// How messages are protected. Plain is the only mode so far.
 pub(crate) const MODE: &str = "plain";
@@ -39,6 +41,7 @@ pub(crate) struct About {
     pub(crate) load_before: f64,
     pub(crate) load_after: f64,
     pub(crate) notes: Vec<String>,
+    pub(crate) peers: Vec<OutsideReport>,
 }
 
 /// Round trips of one peer in one cell.

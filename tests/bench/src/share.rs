@@ -11,9 +11,9 @@ use cara_core::distribution::block::{self, SliceWriter};
 use cara_core::distribution::function::Definition;
 use serde::{Deserialize, Serialize};
 
-use crate::block::text;
-use crate::peers::Caller;
 use crate::peers::cara::{TEXT_BYTES, Text, parameters};
+use cara_bench_ends::Caller;
+use cara_bench_ends::text;
 
 /// What a client process is told.
 #[derive(Debug, Clone, Serialize, Deserialize)]

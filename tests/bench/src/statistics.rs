@@ -1,6 +1,6 @@
 //! From turns to figures.
 
-use crate::block::Outcome;
+use cara_bench_ends::Outcome;
 
 /// All turns of one peer in one cell.
 #[derive(Debug, Default)]

@@ -22,6 +22,14 @@ pub(crate) fn show(results: &Results) {
     let state = if run.is_complete { "complete" } else { "not complete" };
     println!("{} run, {state}, {} s, load {} to {}", run.extent, run.seconds, run.load_before, run.load_after);
     run.notes.iter().for_each(|note| println!("note: {note}"));
+    for outside in &run.peers {
+        println!(
+            "{}: {} {}",
+            outside.peer,
+            outside.system,
+            [&[outside.state.to_owned()][..], &outside.notes].concat().join("; ")
+        );
+    }
 }
 
 fn print(header: &[&str], rows: impl Iterator<Item = Vec<String>>) {

@@ -5,17 +5,19 @@ use std::collections::BTreeMap;
 use anyhow::{Context, Result};
 
 use super::plan::{Bursts, Plan};
-use crate::burst::Burst;
 use crate::pair::{Delivered, Pair, Setting};
-use crate::peers::Delivery;
+use crate::peers::Contender;
 use crate::progress::{bar, is_stopped};
 use crate::results::{Availability, Counts, MODE, ratio};
 use crate::statistics::quartile;
+use cara_bench_ends::Burst;
+use cara_bench_ends::Delivery;
 
 pub(super) fn measure(plan: &Plan, rows: &mut Vec<Availability>) -> Result<()> {
     for distribution in [1, 2] {
         let setting = Setting { pin: plan.pin, distribution, print: false };
-        let mut pairs = [Pair::start("floor", setting)?, Pair::start("cara", setting)?];
+        let start = |peer| Pair::start(&Contender::Own(peer), setting);
+        let mut pairs = [start("floor")?, start("cara")?];
         for bursts in plan.availability.iter().filter(|bursts| bursts.distribution == distribution) {
             of(setting, &mut pairs, bursts, rows)?;
         }
@@ -119,7 +121,7 @@ pub(super) fn counts(groups: &[Delivered]) -> Counts {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::burst::Offered;
+    use cara_bench_ends::Offered;
 
     #[test]
     fn refused_and_lost_are_told_apart() {

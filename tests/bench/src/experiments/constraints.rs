@@ -4,17 +4,18 @@ use anyhow::{Context, Result};
 
 use super::availability::{counts, per_second};
 use super::plan::Plan;
-use crate::burst::Burst;
 use crate::pair::{Pair, Setting};
-use crate::peers::{Delivery, Limits};
-use crate::pin::Pin;
+use crate::peers::Contender;
 use crate::progress::{bar, is_stopped};
 use crate::results::{Constrained, MODE};
+use cara_bench_ends::Burst;
+use cara_bench_ends::Pin;
+use cara_bench_ends::{Delivery, Limits};
 
 pub(super) fn measure(plan: &Plan, rows: &mut Vec<Constrained>) -> Result<()> {
     let sweep = &plan.constrained;
     let setting = Setting { pin: plan.pin, distribution: 1, print: false };
-    let mut pair = Pair::start("cara", setting)?;
+    let mut pair = Pair::start(&Contender::Own("cara"), setting)?;
     let settings = sweep.intervals_ms.len() * sweep.message_sizes.len();
     let bar = bar("constraints", settings * sweep.chars.len());
     for &minimum_interval_ms in &sweep.intervals_ms {

@@ -9,16 +9,18 @@ mod share;
 mod throughput;
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Result, bail};
 use clap::{Args, ValueEnum};
 
-use crate::pin::Pin;
+use crate::peers::{Outside, Selection};
 use crate::plots;
 use crate::progress::{is_stopped, stop_at_interrupt, was_stopped};
 use crate::results::{About, Results};
 use crate::table;
+use cara_bench_ends::Pin;
 use plan::{Extent, Plan};
 
 /// What to run.
@@ -45,6 +47,8 @@ pub(crate) struct Options {
     /// So many turns of each cell of the response time instead of the usual.
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     rounds: Option<u32>,
+    #[command(flatten)]
+    outside: Selection,
     /// Writes all rows there as one JSON object, after each experiment anew.
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
@@ -80,7 +84,8 @@ impl Experiment {
 /// Runs them; what was measured is written and shown even where the run is stopped or an experiment fails.
 pub(crate) fn run(options: &Options) -> Result<()> {
     stop_at_interrupt()?;
-    let plan = plan(options)?;
+    let (outside, absent) = options.outside.find()?;
+    let plan = plan(options, &outside)?;
     let began = Instant::now();
     let mut results = Results { run: about(&plan), ..Results::default() };
     let mut failures = Vec::new();
@@ -92,6 +97,7 @@ pub(crate) fn run(options: &Options) -> Result<()> {
             Err(error) if !was_stopped() => failures.push(format!("{experiment:?}: {error:#}")),
             _ => {}
         }
+        results.run.peers = outside.iter().map(|outside| outside.report()).chain(absent.iter().cloned()).collect();
         results.run.seconds = began.elapsed().as_secs_f64().round();
         results.run.load_after = load();
         write(&results, options.json.as_deref())?;
@@ -107,13 +113,13 @@ pub(crate) fn run(options: &Options) -> Result<()> {
     if failures.is_empty() { Ok(()) } else { bail!("{}", failures.join("\n")) }
 }
 
-fn plan(options: &Options) -> Result<Plan> {
+fn plan(options: &Options, outside: &[Arc<Outside>]) -> Result<Plan> {
     let extent = match (options.quick, options.tiny) {
         (true, _) => Extent::Quick,
         (_, true) => Extent::Tiny,
         _ => Extent::Full,
     };
-    let mut plan = Plan::new(extent, options.print)?;
+    let mut plan = Plan::new(extent, options.print, outside)?;
     plan.narrow(&options.pins, &options.chars, options.rounds);
     Ok(plan)
 }
@@ -147,7 +153,7 @@ fn load() -> f64 {
 
 /// Reliable requests that neither ran nor were refused: none may be, at any load.
 fn silent_losses(results: &Results) -> Vec<String> {
-    let reliable = results.availability.iter().filter(|row| row.delivery == crate::peers::Delivery::Reliable);
+    let reliable = results.availability.iter().filter(|row| row.delivery == cara_bench_ends::Delivery::Reliable);
     let lost = reliable.map(|row| (&row.counts, row.chars, row.period_ms));
     let constrained = results.constraints.iter().map(|row| (&row.counts, row.chars, row.period_ms));
     let one_way = results.throughput.iter().filter(|row| row.lost > 0);
@@ -168,8 +174,8 @@ fn silent_losses(results: &Results) -> Vec<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::peers::Delivery;
     use crate::results::{Availability, Counts, MODE};
+    use cara_bench_ends::Delivery;
 
     fn row(delivery: Delivery, counts: Counts) -> Availability {
         Availability {

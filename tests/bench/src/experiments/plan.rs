@@ -1,10 +1,13 @@
 //! How much of each experiment is run: in full, in minutes, or just enough to see that it works.
 
+use std::sync::Arc;
+
 use anyhow::Result;
 
-use crate::block::Order;
 use crate::pair::Setting;
-use crate::pin::{self, Pin};
+use crate::peers::{Contender, Outside};
+use cara_bench_ends::Order;
+use cara_bench_ends::{Pin, pin};
 
 /// How much is run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -40,6 +43,7 @@ pub(crate) struct Plan {
     pub(crate) response: Vec<Group>,
     pub(crate) throughput: Group,
     pub(crate) throughput_pins: Vec<Pin>,
+    pub(crate) one_way_peers: Vec<Contender>,
     /// One-way messages of each turn; fewer than the events that a subscriber may have waiting, 4,096, so that each that
     /// is refused can be told.
     pub(crate) one_way: u32,
@@ -61,7 +65,7 @@ pub(crate) struct Plan {
 #[derive(Debug, Clone)]
 pub(crate) struct Group {
     pub(crate) setting: Setting,
-    pub(crate) peers: Vec<&'static str>,
+    pub(crate) peers: Vec<Contender>,
     pub(crate) orders: Vec<Order>,
     pub(crate) rounds: u32,
 }
@@ -70,7 +74,7 @@ pub(crate) struct Group {
 #[derive(Debug, Clone)]
 pub(crate) struct Bursts {
     pub(crate) distribution: u8,
-    pub(crate) delivery: crate::peers::Delivery,
+    pub(crate) delivery: cara_bench_ends::Delivery,
     pub(crate) chars: Vec<u32>,
     pub(crate) periods_ms: Vec<u64>,
     pub(crate) groups: u32,
@@ -96,14 +100,14 @@ const SOME_CHARS: [u32; 3] = [100, 1_000, 20_000];
 
 impl Plan {
     /// The plan for a machine with these CPUs; `print` in all cells of the response time instead of some.
-    pub(crate) fn new(extent: Extent, print: bool) -> Result<Self> {
+    pub(crate) fn new(extent: Extent, print: bool, outside: &[Arc<Outside>]) -> Result<Self> {
         let has_two = pin::cpus(Pin::Split).is_ok();
         let pins: &[Pin] = if has_two { &[Pin::Same, Pin::Split, Pin::None] } else { &[Pin::Same, Pin::None] };
         let notes = if has_two { Vec::new() } else { vec!["one CPU only: no rows with pin split".into()] };
         let pin = if has_two { Pin::Split } else { Pin::Same };
         let response = match extent {
-            Extent::Tiny => vec![tiny_group(1, false), tiny_group(2, false), tiny_group(1, true)],
-            _ => response(extent, pins, pin, print),
+            Extent::Tiny => tiny(outside),
+            _ => response(extent, pins, pin, print, outside),
         };
         let callers = extent.of(vec![1, 8, 64], vec![1, 8, 64], vec![1, 2]);
         let orders = callers.into_iter().map(|callers| busy_order(callers, extent.of(3_200, 1_600, 8))).collect();
@@ -111,8 +115,9 @@ impl Plan {
         Ok(Self {
             extent,
             response,
-            throughput: Group { setting, peers: SHARED.to_vec(), orders, rounds: extent.of(15, 3, 1) },
+            throughput: Group { setting, peers: with(&SHARED, outside.iter()), orders, rounds: extent.of(15, 3, 1) },
             throughput_pins: if extent == Extent::Full { pins[..pins.len() - 1].to_vec() } else { vec![pin] },
+            one_way_peers: with(&COMPARED, outside.iter().filter(|outside| outside.is_one_way())),
             one_way: extent.of(4_000, 4_000, 50),
             share_calls: extent.of(400, 200, 5),
             share_rounds: extent.of(20, 5, 1),
@@ -150,40 +155,61 @@ fn busy_order(callers: u32, calls: u32) -> Order {
     Order { callers, ..order(100, (calls / callers).max(fewest), 0) }
 }
 
-fn tiny_group(distribution: u8, print: bool) -> Group {
-    let orders = vec![order(1, 5, 0), order(20_000, 5, 0), order(100, 2, 10)];
-    Group { setting: Setting { pin: Pin::None, distribution, print }, peers: COMPARED.to_vec(), orders, rounds: 1 }
+/// Our own peers, then these other systems.
+fn with<'o>(own: &[&'static str], outside: impl Iterator<Item = &'o Arc<Outside>>) -> Vec<Contender> {
+    let own = own.iter().map(|name| Contender::Own(name));
+    own.chain(outside.map(|outside| Contender::Outside(outside.clone()))).collect()
 }
 
-/// Back to back at every size, everywhere, also among idle links; then spaced; then with the service printing.
-fn response(extent: Extent, pins: &[Pin], pin: Pin, print: bool) -> Vec<Group> {
-    let mut groups = Vec::new();
-    let mut add = |setting, peers: &[&'static str], rounds, orders| {
-        groups.push(Group { setting, peers: peers.to_vec(), orders, rounds });
+fn tiny(outside: &[Arc<Outside>]) -> Vec<Group> {
+    let own = || with(&COMPARED, [].iter());
+    let group = |distribution, print, peers, orders| {
+        let setting = Setting { pin: Pin::None, distribution, print };
+        Group { setting, peers, orders, rounds: 1 }
     };
+    let orders = || vec![order(1, 5, 0), order(20_000, 5, 0), order(100, 2, 10)];
+    let mut groups =
+        vec![group(1, false, own(), orders()), group(2, false, own(), orders()), group(1, true, own(), orders())];
+    if !outside.is_empty() {
+        let floor = with(&["floor"], outside.iter());
+        groups.extend([1, 2].map(|distribution| group(distribution, false, floor.clone(), vec![order(1_000, 5, 0)])));
+    }
+    groups
+}
+
+/// Back to back at every size, everywhere, also among idle links and beside other systems; then spaced; then with the
+/// service printing.
+fn response(extent: Extent, pins: &[Pin], pin: Pin, print: bool, outside: &[Arc<Outside>]) -> Vec<Group> {
+    let mut groups = Vec::new();
+    let mut add = |setting, peers: Vec<Contender>, rounds, orders| {
+        groups.push(Group { setting, peers, orders, rounds });
+    };
+    let own = || with(&COMPARED, [].iter());
     let orders = |chars: &[u32], calls, pause_ms| chars.iter().map(|&chars| order(chars, calls, pause_ms)).collect();
     let calls = extent.of(200, 100, 5);
     for distribution in [1, 2] {
         for &pin in pins {
             let setting = Setting { pin, distribution, print };
             let peers = if distribution == 1 && pin != Pin::None { &AMONG[..] } else { &COMPARED[..] };
-            add(setting, peers, extent.of(30, 4, 1), orders(&CHARS, calls, 0));
+            let is_shortened = extent == Extent::Quick && (pin == Pin::None || distribution == 2);
+            let outside = if is_shortened || print { &[] } else { outside };
+            add(setting, with(peers, outside.iter()), extent.of(30, 4, 1), orders(&CHARS, calls, 0));
         }
         let setting = Setting { pin, distribution, print };
         let (spaced, rounds) = extent.of((&CHARS[..], 10), (&SOME_CHARS[..], 1), (&SOME_CHARS[..], 1));
-        add(setting, &COMPARED, rounds, orders(spaced, 10, 10));
+        add(setting, own(), rounds, orders(spaced, 10, 10));
         let (far, calls, rounds) = extent.of((&CHARS[..], 5, 20), (&[1_000, 20_000][..], 2, 1), (&[100][..], 1, 1));
-        add(setting, &COMPARED, rounds, orders(far, calls, 2_000));
+        add(setting, own(), rounds, orders(far, calls, 2_000));
     }
     if !print {
         let setting = Setting { pin, distribution: 1, print: true };
-        add(setting, &COMPARED, extent.of(30, 4, 1), orders(&CHARS, calls, 0));
+        add(setting, own(), extent.of(30, 4, 1), orders(&CHARS, calls, 0));
     }
     groups
 }
 
 fn availability(extent: Extent) -> Vec<Bursts> {
-    use crate::peers::Delivery::{BestEffort, Reliable};
+    use cara_bench_ends::Delivery::{BestEffort, Reliable};
     let (groups, group) = extent.of((10, 100), (1, 100), (1, 5));
     let bursts = |distribution, delivery, chars: &[u32], periods_ms: &[u64]| Bursts {
         distribution,

@@ -3,11 +3,12 @@
 use anyhow::{Context, Result};
 
 use super::plan::{Group, Plan};
-use crate::block::Order;
 use crate::pair::{Pair, Setting};
+use crate::peers::Contender;
 use crate::progress::{bar, is_stopped};
 use crate::results::{MODE, Response, micros, ratio};
 use crate::statistics::Cell;
+use cara_bench_ends::Order;
 
 /// Cells by order, then by peer; the first peer is the floor.
 pub(super) type Cells = Vec<Vec<Cell>>;
@@ -31,16 +32,18 @@ pub(super) fn measure(plan: &Plan, rows: &mut Vec<Response>) -> Result<()> {
 /// Every peer in every cell, once per turn.
 pub(super) fn turns(group: &Group, cells: &mut Cells, what: &str) -> Result<()> {
     let bar = bar(what, group.rounds as usize * group.orders.len());
-    let pairs = group.peers.iter().map(|peer| Pair::start(peer, group.setting));
-    let mut pairs = pairs.collect::<Result<Vec<_>>>()?;
+    let mut pairs = start(&group.peers, group.setting)?;
     *cells = group.orders.iter().map(|_| pairs.iter().map(|_| Cell::default()).collect()).collect();
-    for _ in 0..group.rounds {
+    for round in 0..group.rounds as usize {
         for (order, cells) in group.orders.iter().zip(cells.iter_mut()) {
             if is_stopped() {
                 return Ok(());
             }
             let shared = order.pause_ms > 0 && group.setting.distribution == 1;
-            let turn = if shared { spaced_turn(&mut pairs, order, cells) } else { turn(&mut pairs, order, cells) };
+            let turn = match shared {
+                true => spaced_turn(&mut pairs, order, cells),
+                false => turn(&group.peers, &mut pairs, order, round, cells),
+            };
             turn.with_context(|| format!("{} characters, {} callers", order.chars, order.callers))?;
             bar.inc(1);
         }
@@ -49,15 +52,35 @@ pub(super) fn turns(group: &Group, cells: &mut Cells, what: &str) -> Result<()> 
     Ok(())
 }
 
-fn turn(pairs: &mut [Pair], order: &Order, cells: &mut [Cell]) -> Result<()> {
-    pairs.iter_mut().zip(cells).try_for_each(|(pair, cell)| {
-        cell.turns.push(pair.block(order)?);
-        Ok(())
-    })
+/// The processes of all contenders; none for another system that does not start.
+pub(super) fn start(contenders: &[Contender], setting: Setting) -> Result<Vec<Option<Pair>>> {
+    let start = |contender: &Contender| match contender.works() {
+        true => contender.tolerate(Pair::start(contender, setting)),
+        false => Ok(None),
+    };
+    contenders.iter().map(start).collect()
 }
 
-/// Peers that pause are under way together: each calls while the others pause.
-fn spaced_turn(pairs: &mut [Pair], order: &Order, cells: &mut [Cell]) -> Result<()> {
+/// Who missed a turn of this cell gets no further one, so that the turns of a cell are the first ones of the floor's.
+fn turn(
+    contenders: &[Contender],
+    pairs: &mut [Option<Pair>],
+    order: &Order,
+    round: usize,
+    cells: &mut [Cell],
+) -> Result<()> {
+    for ((contender, pair), cell) in contenders.iter().zip(pairs).zip(cells) {
+        let Some(running) = pair.as_mut().filter(|_| cell.turns.len() == round) else { continue };
+        let outcome = running.block(order).with_context(|| format!("{} characters", order.chars));
+        cell.turns.extend(contender.tolerate(outcome)?);
+        pair.take_if(|_| !contender.works());
+    }
+    Ok(())
+}
+
+/// Peers that pause are under way together: each calls while the others pause. All of them are our own.
+fn spaced_turn(pairs: &mut [Option<Pair>], order: &Order, cells: &mut [Cell]) -> Result<()> {
+    let mut pairs: Vec<&mut Pair> = pairs.iter_mut().flatten().collect();
     let offset = order.pause_ms * 1_000 / pairs.len().max(1) as u64;
     let begun = pairs.iter_mut().zip(0..).map(|(pair, place): (_, u64)| {
         let delayed = Order { delay_us: offset * place, ..order.clone() };
@@ -76,7 +99,7 @@ fn rows(group: &Group, cells: &Cells) -> Vec<Response> {
     for (order, cells) in group.orders.iter().zip(cells) {
         let Some(floor) = cells.first() else { continue };
         let measured = group.peers.iter().zip(cells).filter(|(_, cell)| !cell.turns.is_empty());
-        rows.extend(measured.map(|(peer, cell)| row(peer, group.setting, order, cell, floor)));
+        rows.extend(measured.map(|(peer, cell)| row(peer.name(), group.setting, order, cell, floor)));
     }
     rows
 }

@@ -6,12 +6,12 @@ use anyhow::{Context, Result};
 
 use super::plan::Plan;
 use crate::child::Handle;
-use crate::clock;
 use crate::nodes::Question;
-use crate::pin::{self, Pin};
 use crate::progress::{bar, is_stopped};
 use crate::results::{MODE, Scale, micros, ratio};
 use crate::statistics::{percentile, quartile};
+use cara_bench_ends::clock;
+use cara_bench_ends::{Pin, pin};
 
 /// How long all nodes may take to join.
 const WITHIN_S: u64 = 90;
@@ -63,7 +63,7 @@ impl Fleet {
         let start = |role: &str, cpu: Option<usize>| {
             let mut arguments = [role, "--run", &run, "--count", &nodes.to_string()].map(String::from).to_vec();
             arguments.extend(cpu.into_iter().flat_map(|cpu| ["--cpu".into(), cpu.to_string()]));
-            Handle::start(&arguments, false)
+            Handle::start(&arguments)
         };
         let mut manager = start("manager", manager_cpu)?;
         std::thread::sleep(REST);

@@ -3,13 +3,14 @@
 use anyhow::Result;
 
 use super::plan::Plan;
-use crate::child::ClientQuestion;
+use crate::child::OwnQuestion;
 use crate::pair::{Pair, Setting};
-use crate::pin::Pin;
+use crate::peers::Contender;
 use crate::progress::{bar, is_stopped};
 use crate::results::{MODE, Share, micros, ratio};
 use crate::share::{Order, Times};
 use crate::statistics::percentile;
+use cara_bench_ends::Pin;
 
 /// As in the paper.
 const CHARS: u32 = 20_000;
@@ -17,7 +18,7 @@ const CHARS: u32 = 20_000;
 const PIN: Pin = Pin::Same;
 
 pub(super) fn measure(plan: &Plan, share: &mut Option<Share>) -> Result<()> {
-    let mut pair = Pair::start("cara", Setting { pin: PIN, distribution: 1, print: false })?;
+    let mut pair = Pair::start(&Contender::Own("cara"), Setting { pin: PIN, distribution: 1, print: false })?;
     let bar = bar("share of making and reading messages", plan.share_rounds as usize);
     let mut all = Times::default();
     for _ in 0..plan.share_rounds {
@@ -25,7 +26,7 @@ pub(super) fn measure(plan: &Plan, share: &mut Option<Share>) -> Result<()> {
             break;
         }
         let order = Order { chars: CHARS, calls: plan.share_calls };
-        let times: Times = pair.ask_client(&ClientQuestion::Share(order))?;
+        let times: Times = pair.ask_client(&OwnQuestion::Share { share: order })?;
         all.round_trips.extend(times.round_trips);
         all.generate.extend(times.generate);
         all.process.extend(times.process);

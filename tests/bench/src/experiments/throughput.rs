@@ -1,19 +1,17 @@
 //! Throughput: requests per second with several callers, and one-way messages per second over one connection.
 
-use anyhow::Result;
+use anyhow::{Context, Result};
 
 use super::plan::{Group, Plan};
-use super::response::{Cells, turns};
-use crate::burst::Burst;
-use crate::pair::{Pair, Setting};
-use crate::peers::Delivery;
-use crate::pin::Pin;
+use super::response::{Cells, start, turns};
+use crate::pair::Setting;
 use crate::progress::{bar, is_stopped};
 use crate::results::{Kind, MODE, Throughput, ratio};
 use crate::statistics::quartile;
+use cara_bench_ends::Burst;
+use cara_bench_ends::Delivery;
+use cara_bench_ends::Pin;
 
-/// Peers of the one-way part; the first is the floor.
-const ONE_WAY_PEERS: [&str; 3] = ["floor", "floor_again", "cara"];
 /// Characters of a one-way message.
 const CHARS: u32 = 100;
 
@@ -39,6 +37,7 @@ fn requests(group: &Group, cells: &Cells) -> Vec<Throughput> {
         let Some(floor) = cells.first() else { continue };
         let measured = group.peers.iter().zip(cells).filter(|(_, cell)| !cell.turns.is_empty());
         rows.extend(measured.map(|(peer, cell)| {
+            let peer = peer.name();
             let figures = cell.figures();
             let found = Found { n: figures.calls, per_second: figures.per_second, refused: 0, lost: 0 };
             row(Kind::Request, peer, order.callers, group.setting.pin, found, cell.throughput_ratio(floor))
@@ -71,7 +70,8 @@ fn row(kind: Kind, peer: &str, callers: u32, pin: Pin, found: Found, ratio_to_fl
 }
 
 fn one_way(plan: &Plan, setting: Setting, rows: &mut Vec<Throughput>) -> Result<()> {
-    let mut pairs = ONE_WAY_PEERS.iter().map(|peer| Pair::start(peer, setting)).collect::<Result<Vec<_>>>()?;
+    let contenders = &plan.one_way_peers;
+    let mut pairs = start(contenders, setting)?;
     let count = plan.one_way;
     let burst = Burst { chars: CHARS, count, period_ms: 0, delivery: Delivery::Reliable, insist: true };
     let bar = bar(&format!("one-way messages: {}", setting.pin), plan.throughput.rounds as usize);
@@ -81,8 +81,14 @@ fn one_way(plan: &Plan, setting: Setting, rows: &mut Vec<Throughput>) -> Result<
         if is_stopped() {
             break;
         }
-        for ((pair, speeds), (refused, lost)) in pairs.iter_mut().zip(&mut speeds).zip(&mut missing) {
-            let delivered = pair.burst(&burst)?;
+        for (((contender, pair), speeds), (refused, lost)) in
+            contenders.iter().zip(&mut pairs).zip(&mut speeds).zip(&mut missing)
+        {
+            let Some(running) = pair else { continue };
+            let Some(delivered) = contender.tolerate(running.burst(&burst).context("one-way messages"))? else {
+                *pair = None;
+                continue;
+            };
             speeds.push(delivered.executed as f64 * 1e9 / delivered.elapsed.max(1) as f64);
             *refused += delivered.offered.refused + delivered.failed;
             *lost += delivered.lost();
@@ -92,11 +98,11 @@ fn one_way(plan: &Plan, setting: Setting, rows: &mut Vec<Throughput>) -> Result<
     bar.finish_and_clear();
     let floor = speeds.first().cloned().unwrap_or_default();
     for ((peer, own), (refused, lost)) in
-        ONE_WAY_PEERS.iter().zip(speeds).zip(missing).filter(|((_, own), _)| !own.is_empty())
+        contenders.iter().zip(speeds).zip(missing).filter(|((_, own), _)| !own.is_empty())
     {
         let ratios = own.iter().zip(&floor).map(|(own, floor)| own / floor.max(1e-9)).collect();
         let found = Found { n: own.len() * count as usize, per_second: quartile(own, 2), refused, lost };
-        rows.push(row(Kind::OneWay, peer, 1, setting.pin, found, quartile(ratios, 2)));
+        rows.push(row(Kind::OneWay, peer.name(), 1, setting.pin, found, quartile(ratios, 2)));
     }
     Ok(())
 }

@@ -7,13 +7,11 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
+use cara_bench_ends::{Caller, Delivery, Executed, Limits, Peer, Place, Printer, Server};
 use cara_std::{
     Builder, Call, CommunicationSystem, Constraints, Delivery as CaraDelivery, Interfaces, Parameters, ParametersView,
     Peer as Node, RequestOptions, ServiceError, Threads, Unit, UnitEvent,
 };
-
-use super::{Caller, Delivery, Executed, Limits, Peer, Place, Server};
-use crate::print::Printer;
 
 /// Longest text in bytes.
 pub(crate) const TEXT_BYTES: u32 = 100_000;

@@ -8,9 +8,7 @@ use std::sync::Arc;
 use std::thread;
 
 use anyhow::{Result, ensure};
-
-use super::{Caller, Counters, Delivery, Executed, Peer, Place, Server};
-use crate::print::Printer;
+use cara_bench_ends::{Caller, Delivery, Executed, Peer, Place, Printer, Server};
 
 /// Longest text in bytes.
 const TEXT_BYTES: usize = 100_000;
@@ -34,7 +32,7 @@ impl Peer for Floor {
                 thread::spawn(move || answer(stream, &counted, printer));
             }
         });
-        Ok(Server { address, executed, constrain: None, counters: Box::new(Counters::new), keep: Box::new(()) })
+        Ok(Server::new(address, executed, ()))
     }
 
     fn connect(&self, _place: &Place, address: &str) -> Result<Box<dyn Caller>> {

@@ -8,7 +8,7 @@ use std::time::Duration;
 use anyhow::{Result, ensure};
 
 use crate::block::text;
-use crate::peers::{Caller, Peer, Place};
+use crate::peer::{Caller, Peer, Place};
 
 /// How many there are.
 const NODES: u32 = 5;

@@ -6,10 +6,11 @@ use std::sync::{Mutex, OnceLock, PoisonError};
 /// Prints as a service does, or not at all. A child's standard output carries answers, so this takes standard error,
 /// buffered by lines as standard output would be.
 #[derive(Clone, Copy)]
-pub(crate) struct Printer(pub(crate) bool);
+pub struct Printer(pub(crate) bool);
 
 impl Printer {
-    pub(crate) fn print(self, text: &str) {
+    /// One line.
+    pub fn print(self, text: &str) {
         static OUT: OnceLock<Mutex<LineWriter<Stderr>>> = OnceLock::new();
         if !self.0 {
             return;

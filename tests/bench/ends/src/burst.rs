@@ -8,30 +8,34 @@ use serde::{Deserialize, Serialize};
 
 use crate::block::text;
 use crate::clock;
-use crate::peers::{Caller, Delivery};
+use crate::peer::{Caller, Delivery};
 
 /// What a client process is told to offer.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub(crate) struct Burst {
-    pub(crate) chars: u32,
-    pub(crate) count: u32,
-    pub(crate) period_ms: u64,
-    pub(crate) delivery: Delivery,
+pub struct Burst {
+    /// Length of the text.
+    pub chars: u32,
+    /// How many messages.
+    pub count: u32,
+    /// From one offer to the next.
+    pub period_ms: u64,
+    /// How they travel.
+    pub delivery: Delivery,
     /// A message that is refused is offered again until it is taken.
-    pub(crate) insist: bool,
+    pub insist: bool,
 }
 
 /// What became of it on the sender's side.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
-pub(crate) struct Offered {
+pub struct Offered {
     /// Taken by the middleware.
-    pub(crate) taken: u64,
+    pub taken: u64,
     /// Not taken, and told so.
-    pub(crate) refused: u64,
+    pub refused: u64,
     /// How often each refusal was given.
-    pub(crate) reasons: BTreeMap<String, u64>,
+    pub reasons: BTreeMap<String, u64>,
     /// When the first was offered, on the clock of [`clock::now`].
-    pub(crate) start: u64,
+    pub start: u64,
 }
 
 /// Offers the messages of a burst, each at its time; one that is late does not delay those after it.

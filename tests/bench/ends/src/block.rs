@@ -8,7 +8,7 @@ use anyhow::{Context, Result, ensure};
 use serde::{Deserialize, Serialize};
 
 use crate::clock::cpu_time;
-use crate::peers::{Caller, Peer, Place};
+use crate::peer::{Caller, Peer, Place};
 
 /// Calls of each caller before those that count.
 const WARM_UP: u32 = 3;
@@ -18,29 +18,34 @@ const AT_A_TIME: usize = 8;
 
 /// What a client process is told to do.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub(crate) struct Order {
-    pub(crate) chars: u32,
-    pub(crate) callers: u32,
-    pub(crate) calls_per_caller: u32,
-    pub(crate) pause_ms: u64,
+pub struct Order {
+    /// Length of the text.
+    pub chars: u32,
+    /// Who call at the same time.
+    pub callers: u32,
+    /// Calls of each that are timed.
+    pub calls_per_caller: u32,
+    /// From a reply to the next request.
+    pub pause_ms: u64,
     /// Wait before the first call, so that several peers that pause can take turns.
-    pub(crate) delay_us: u64,
+    pub delay_us: u64,
 }
 
 /// What came of it.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub(crate) struct Outcome {
+pub struct Outcome {
     /// Of each call, in nanoseconds.
-    pub(crate) round_trips: Vec<u64>,
+    pub round_trips: Vec<u64>,
     /// From the common start to the last answer, in nanoseconds.
-    pub(crate) elapsed: u64,
+    pub elapsed: u64,
     /// Time of all CPUs that this process used, in nanoseconds, for this many calls: those before the start count, too.
-    pub(crate) cpu: u64,
-    pub(crate) cpu_calls: u64,
+    pub cpu: u64,
+    /// The calls of `cpu`.
+    pub cpu_calls: u64,
 }
 
 /// The callers of a client process; those once connected stay so from block to block.
-pub(crate) struct Callers<'a> {
+pub struct Callers<'a> {
     peer: &'a dyn Peer,
     place: &'a Place,
     address: &'a str,
@@ -48,12 +53,13 @@ pub(crate) struct Callers<'a> {
 }
 
 impl<'a> Callers<'a> {
-    pub(crate) fn new(peer: &'a dyn Peer, place: &'a Place, address: &'a str) -> Self {
+    /// None is connected yet.
+    pub fn new(peer: &'a dyn Peer, place: &'a Place, address: &'a str) -> Self {
         Self { peer, place, address, connected: Vec::new() }
     }
 
     /// The first caller.
-    pub(crate) fn first(&mut self) -> Result<&mut dyn Caller> {
+    pub fn first(&mut self) -> Result<&mut dyn Caller> {
         self.connect(1)?;
         Ok(&mut **self.connected.first_mut().context("no callers")?)
     }
@@ -74,7 +80,7 @@ impl<'a> Callers<'a> {
     }
 
     /// Makes the calls of one block.
-    pub(crate) fn run(&mut self, order: &Order) -> Result<Outcome> {
+    pub fn run(&mut self, order: &Order) -> Result<Outcome> {
         let wanted = order.callers as usize;
         self.connect(wanted)?;
         let text = text(order.chars);
@@ -98,7 +104,7 @@ impl<'a> Callers<'a> {
 }
 
 /// What is sent: so many characters of one byte each.
-pub(crate) fn text(chars: u32) -> String {
+pub fn text(chars: u32) -> String {
     ('a'..='z').cycle().take(chars as usize).collect()
 }
 

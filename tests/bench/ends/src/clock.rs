@@ -4,12 +4,12 @@ use anyhow::{Context, Result};
 use rustix::time::{ClockId, clock_gettime};
 
 /// Nanoseconds of the clock that all processes of this machine share.
-pub(crate) fn now() -> u64 {
+pub fn now() -> u64 {
     nanoseconds(ClockId::Monotonic)
 }
 
 /// Nanoseconds of all CPUs that this process has used so far.
-pub(crate) fn cpu_time() -> u64 {
+pub fn cpu_time() -> u64 {
     nanoseconds(ClockId::ProcessCPUTime)
 }
 
@@ -19,7 +19,7 @@ fn nanoseconds(clock: ClockId) -> u64 {
 }
 
 /// Bytes of this process that are resident, from `/proc/self/status`.
-pub(crate) fn resident_bytes() -> Result<u64> {
+pub fn resident_bytes() -> Result<u64> {
     let text = std::fs::read_to_string("/proc/self/status")?;
     let line = text.lines().find_map(|line| line.strip_prefix("VmRSS:"));
     let kib: u64 = line.and_then(|line| line.split_whitespace().next()).context("no VmRSS")?.parse()?;

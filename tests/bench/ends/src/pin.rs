@@ -10,7 +10,7 @@ use serde::Serialize;
 /// Which CPUs client and server stay on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
 #[serde(rename_all = "snake_case")]
-pub(crate) enum Pin {
+pub enum Pin {
     /// Both on one CPU: the time is the total work of both.
     Same,
     /// One CPU each: the time includes waking the other CPU.
@@ -30,7 +30,7 @@ impl fmt::Display for Pin {
 }
 
 /// The CPUs of client and server; an error where the machine has too few.
-pub(crate) fn cpus(pin: Pin) -> Result<[Option<usize>; 2]> {
+pub fn cpus(pin: Pin) -> Result<[Option<usize>; 2]> {
     let allowed = sched_getaffinity(None)?;
     let mut allowed = (0..CpuSet::MAX_CPU).filter(|cpu| allowed.is_set(*cpu));
     let (first, second) = (allowed.next(), allowed.next());
@@ -45,7 +45,7 @@ pub(crate) fn cpus(pin: Pin) -> Result<[Option<usize>; 2]> {
 }
 
 /// Keeps this thread, and those that it starts from now on, on `cpu`.
-pub(crate) fn stay_on(cpu: Option<usize>) -> Result<()> {
+pub fn stay_on(cpu: Option<usize>) -> Result<()> {
     let Some(cpu) = cpu else { return Ok(()) };
     ensure!(cpu < CpuSet::MAX_CPU, "there is no CPU {cpu}");
     let mut set = CpuSet::new();
