@@ -17,6 +17,7 @@ use crate::command::Run;
 use crate::groups::Outcome;
 use crate::install;
 use boards::{BOARDS, Board};
+pub(crate) use boards::{built, image_build};
 pub(crate) use desk::{Who, desk};
 pub(crate) use flash::flash;
 pub(crate) use sizes::{check as check_sizes, sizes};

@@ -6,7 +6,7 @@ use anyhow::{Result, bail};
 
 use crate::command::Run;
 use crate::{
-    bad_input, dependencies, firmware, fleet, hygiene, install, layers, licences, links, manifests, names, panic_free,
+    bad_input, dependencies, firmware, fleet, hygiene, install, instructions, layers, licences, links, manifests, names, panic_free,
     paper, workspace,
 };
 
@@ -42,7 +42,7 @@ pub(crate) enum Outcome {
 }
 
 /// All groups, in the order in which they run: cheap ones first.
-pub(crate) const GROUPS: [Group; 20] = [
+pub(crate) const GROUPS: [Group; 21] = [
     Group {
         name: "format",
         what: "every crate is formatted",
@@ -204,6 +204,14 @@ pub(crate) const GROUPS: [Group; 20] = [
         quick: None,
         by_default: true,
         run: |_| firmware::check_sizes(),
+    },
+    Group {
+        name: "instructions",
+        what: "no operation takes 3 % more instructions than docs/instructions.md says, on this host and a Cortex-M3",
+        budget: 120,
+        quick: None,
+        by_default: true,
+        run: |_| instructions::check(),
     },
 ];
 

@@ -10,11 +10,13 @@ mod bench;
 mod command;
 mod demo;
 mod dependencies;
+mod figures;
 mod firmware;
 mod fleet;
 mod groups;
 mod hygiene;
 mod install;
+mod instructions;
 mod layers;
 mod licences;
 mod links;
@@ -58,6 +60,15 @@ enum Task {
         #[arg(long)]
         write: bool,
     },
+    /// Prints how many instructions the core's operations take, on this host and on an emulated Cortex-M3.
+    Instructions {
+        /// Also writes the figures here.
+        #[arg(long, value_name = "FILE")]
+        json: Option<PathBuf>,
+        /// Also writes them to docs/instructions.md, with which the checks compare.
+        #[arg(long)]
+        write: bool,
+    },
     /// Repeats the paper's experiments against raw sockets, interleaved with a control, and draws its figures.
     Bench(bench::Options),
     /// Puts many s_units on one manager and measures how they join, what they cost, and how they come back.
@@ -88,6 +99,7 @@ fn main() -> ExitCode {
         Task::Test { list: true, .. } => runner::list(),
         Task::Test { groups, quick, list: false } => runner::run(&groups, quick),
         Task::Sizes { json, write } => firmware::sizes(json.as_deref(), write),
+        Task::Instructions { json, write } => instructions::run(json.as_deref(), write),
         Task::Fleet { nodes, json } => fleet::run(nodes, json.as_deref()),
         Task::Bench(options) => bench::run(&options),
         Task::Firmware { board: Some(board), flash: true, .. } => firmware::flash(&board),

@@ -1,6 +1,6 @@
-//! The bill in `docs/sizes.md`: written there, read from there, and compared with what is built now.
+//! The bill in `docs/sizes.md`: what a line of it is, and by how much it may grow.
 
-use anyhow::{Context, Result, ensure};
+use crate::figures::{self, cells};
 
 /// A line of the bill, in bytes.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -16,12 +16,12 @@ pub(crate) struct Row {
     pub(crate) cara_ram: u64,
 }
 
-/// Columns of the table.
-const COLUMNS: &str = "| board | image | flash | static RAM | stack | CARA flash | CARA RAM |";
 /// What a stack may differ by beside: an interrupt comes at its deepest place or does not.
 const INTERRUPT: u64 = 256;
 
-impl Row {
+impl figures::Row for Row {
+    const COLUMNS: &'static str = "| board | image | flash | static RAM | stack | CARA flash | CARA RAM |";
+
     fn line(&self) -> String {
         let Self { board, image, flash, static_ram, stack, cara_flash, cara_ram } = self;
         let stack = stack.map_or("not measured".to_owned(), |stack| stack.to_string());
@@ -29,8 +29,7 @@ impl Row {
     }
 
     fn parse(line: &str) -> Option<Self> {
-        let cells: Vec<&str> = line.trim().trim_matches('|').split('|').map(str::trim).collect();
-        let [board, image, flash, static_ram, stack, cara_flash, cara_ram] = cells[..] else { return None };
+        let [board, image, flash, static_ram, stack, cara_flash, cara_ram] = cells(line)[..] else { return None };
         Some(Self {
             board: board.to_owned(),
             image: image.to_owned(),
@@ -42,16 +41,16 @@ impl Row {
         })
     }
 
-    fn is_of(&self, other: &Self) -> bool {
-        self.board == other.board && self.image == other.image
+    fn name(&self) -> String {
+        format!("{} {}", self.board, self.image)
     }
 
-    /// What has grown since `before` by more than may be.
+    /// More than 2 %.
     fn growth(&self, before: &Self) -> Vec<String> {
         let mut grown = Vec::new();
         let mut compare = |what: &str, now: u64, before: u64, beside: u64| {
             if now > before + before / 50 + beside {
-                grown.push(format!("{what} of {} {}: {now}, and {before} in docs/sizes.md", self.board, self.image));
+                grown.push(format!("{what} of {}: {now}, and {before}", self.name()));
             }
         };
         compare("flash", self.flash, before.flash, 0);
@@ -65,56 +64,10 @@ impl Row {
     }
 }
 
-/// The table for the document.
-pub(crate) fn table(rows: &[Row]) -> String {
-    let mut text = format!("{COLUMNS}\n|---|---|---|---|---|---|---|\n");
-    for row in rows {
-        text += &row.line();
-        text.push('\n');
-    }
-    text
-}
-
-/// The rows in a document.
-pub(crate) fn rows_in(document: &str) -> Vec<Row> {
-    document.lines().filter_map(Row::parse).collect()
-}
-
-/// The compiler that a document names.
-pub(crate) fn compiler_in(document: &str) -> Option<&str> {
-    document.lines().find_map(|line| line.strip_prefix("Compiler: "))
-}
-
-/// A document with another table, compiler, date and commit.
-pub(crate) fn replaced(document: &str, rows: &[Row], head: &[(&str, String)]) -> Result<String> {
-    let (before, behind) = document.split_once(COLUMNS).context("docs/sizes.md has no table")?;
-    let behind = behind.split_once("\n\n").map_or("", |(_, behind)| behind);
-    let mut text = format!("{before}{}\n{behind}", table(rows));
-    for (word, value) in head {
-        let start = format!("{word}: ");
-        let line = text.lines().find(|line| line.starts_with(&start)).map(str::to_owned);
-        let line = line.with_context(|| format!("docs/sizes.md has no line `{word}: …`"))?;
-        text = text.replacen(&line, &format!("{start}{value}"), 1);
-    }
-    Ok(text)
-}
-
-/// An error that names everything that has grown by more than 2 % and every image that the document does not have.
-pub(crate) fn compared(rows: &[Row], document: &[Row]) -> Result<()> {
-    let mut wrong = Vec::new();
-    for row in rows {
-        match document.iter().find(|before| before.is_of(row)) {
-            Some(before) => wrong.extend(row.growth(before)),
-            None => wrong.push(format!("{} {} is not in docs/sizes.md", row.board, row.image)),
-        }
-    }
-    ensure!(wrong.is_empty(), "{}; if that must be: cargo xtask sizes --write", wrong.join("; "));
-    Ok(())
-}
-
 #[cfg(test)]
 mod tests {
-    use super::{Row, compared, compiler_in, replaced, rows_in, table};
+    use super::Row;
+    use crate::figures::Row as _;
 
     fn row(flash: u64, stack: Option<u64>) -> Row {
         let (board, image) = ("board".to_owned(), "agv".to_owned());
@@ -122,26 +75,19 @@ mod tests {
     }
 
     #[test]
-    fn a_table_is_read_as_it_was_written() {
-        let rows = [row(1000, Some(7)), row(2000, None)];
-        assert_eq!(rows_in(&table(&rows)), rows);
+    fn a_row_is_read_as_it_was_written() {
+        for row in [row(1000, Some(7)), row(2000, None)] {
+            assert_eq!(Row::parse(&row.line()), Some(row));
+        }
+        assert_eq!(Row::parse(Row::COLUMNS), None);
     }
 
     #[test]
     fn two_per_cent_pass_and_more_does_not() {
-        let before = [row(1000, Some(1000))];
-        compared(&[row(1020, Some(1276))], &before).unwrap();
-        let error = compared(&[row(1021, Some(1277))], &before).unwrap_err().to_string();
-        assert!(error.contains("flash of board agv: 1021, and 1000") && error.contains("stack of"), "{error}");
-        assert!(compared(&[row(1, None)], &[]).is_err());
-        compared(&[row(1, None)], &before).unwrap();
-    }
-
-    #[test]
-    fn a_document_keeps_what_is_around_its_table() {
-        let document = format!("Compiler: old\n\n{}\nBelow.\n", table(&[row(1, None)]));
-        let replaced = replaced(&document, &[row(2, None)], &[("Compiler", "new".into())]).unwrap();
-        assert_eq!(replaced, format!("Compiler: new\n\n{}\nBelow.\n", table(&[row(2, None)])));
-        assert_eq!(compiler_in(&replaced), Some("new"));
+        let before = row(1000, Some(1000));
+        assert!(row(1020, Some(1276)).growth(&before).is_empty());
+        let grown = row(1021, Some(1277)).growth(&before).join("; ");
+        assert!(grown.contains("flash of board agv: 1021, and 1000") && grown.contains("stack of"), "{grown}");
+        assert!(row(1, None).growth(&before).is_empty());
     }
 }

@@ -1,6 +1,6 @@
 //! The boards: where their firmware is and for which processor.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 
@@ -92,18 +92,8 @@ pub(crate) fn find(name: &str) -> Result<&'static Board> {
 impl Board {
     /// Builds an image; where it is.
     pub(crate) fn build(&self, image: &str) -> Result<PathBuf> {
-        let folder = workspace::root().join("examples/firmware").join(self.folder);
-        let manifest = folder.join("Cargo.toml");
-        // Folders of the machine stand in the text of panics: without this, sizes would differ from machine to machine.
-        let remap = format!("--remap-path-prefix={}=.", workspace::root().display());
-        let registry = std::env::var("CARGO_HOME").or_else(|_| std::env::var("HOME").map(|home| home + "/.cargo"));
-        let remap = registry.map_or(remap.clone(), |home| format!("{remap} --remap-path-prefix={home}=cargo"));
-        let place = workspace::root().join("target/firmware");
-        let build = Run::cargo()
-            .args(["build", "--quiet", "--release", "--locked", "--target", self.target, "--bin", image])
-            .args(["--manifest-path".as_ref(), manifest.as_os_str(), "--target-dir".as_ref(), place.as_os_str()])
-            .env("RUSTFLAGS", &remap)
-            .env("DEFMT_LOG", "info");
+        let folder = Path::new("examples/firmware").join(self.folder);
+        let build = image_build(&folder, self.target, image);
         let build = match (self.has_radio, std::env::var(RADIO)) {
             (true, Err(_)) => build.env(RADIO, NO_RADIO),
             _ => build,
@@ -112,17 +102,40 @@ impl Board {
             Some(feature) => build.args(["--no-default-features", "--features", feature]).stream()?,
             None => build.stream()?,
         }
-        self.kept(image, &place)
+        self.kept(image)
     }
 
     /// Copies an image to the board's own folder: boards with one processor build into the same file.
-    fn kept(&self, image: &str, place: &std::path::Path) -> Result<PathBuf> {
-        let folder = place.join("images").join(self.name);
+    fn kept(&self, image: &str) -> Result<PathBuf> {
+        let folder = place().join("images").join(self.name);
         std::fs::create_dir_all(&folder).with_context(|| format!("cannot make {}", folder.display()))?;
-        let (built, kept) = (place.join(self.target).join("release").join(image), folder.join(image));
+        let (built, kept) = (built(self.target, image), folder.join(image));
         std::fs::copy(&built, &kept).with_context(|| format!("cannot copy {}", built.display()))?;
         Ok(kept)
     }
+}
+
+/// The build of an image whose crate is in a folder of the project, optimised.
+pub(crate) fn image_build(folder: &Path, target: &str, image: &str) -> Run {
+    let manifest = workspace::root().join(folder).join("Cargo.toml");
+    // Folders of the machine stand in the text of panics: without this, sizes would differ from machine to machine.
+    let remap = format!("--remap-path-prefix={}=.", workspace::root().display());
+    let registry = std::env::var("CARGO_HOME").or_else(|_| std::env::var("HOME").map(|home| home + "/.cargo"));
+    let remap = registry.map_or(remap.clone(), |home| format!("{remap} --remap-path-prefix={home}=cargo"));
+    Run::cargo()
+        .args(["build", "--quiet", "--release", "--locked", "--target", target, "--bin", image])
+        .args(["--manifest-path".as_ref(), manifest.as_os_str(), "--target-dir".as_ref(), place().as_os_str()])
+        .env("RUSTFLAGS", &remap)
+        .env("DEFMT_LOG", "info")
+}
+
+/// Where [`image_build`] puts an image.
+pub(crate) fn built(target: &str, image: &str) -> PathBuf {
+    place().join(target).join("release").join(image)
+}
+
+fn place() -> PathBuf {
+    workspace::root().join("target/firmware")
 }
 
 #[cfg(test)]

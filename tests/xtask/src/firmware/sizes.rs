@@ -6,16 +6,17 @@ use std::process::ExitCode;
 use anyhow::{Context, Result, bail};
 use serde_json::{Value, json};
 
-use super::bill::{Row, compared, compiler_in, replaced, rows_in, table};
+use super::bill::Row;
 use super::boards::{BOARDS, Board, RADIO};
 use super::image::{Footprint, footprint};
 use super::{NOT_ALLOWED, TESTED, tests};
 use crate::command::Run;
+use crate::figures::{Document, table};
 use crate::groups::Outcome;
-use crate::{install, workspace};
+use crate::install;
 
 /// Where the bill is committed.
-const DOCUMENT: &str = "docs/sizes.md";
+const DOCUMENT: Document = Document { file: "docs/sizes.md", command: "cargo xtask sizes --write" };
 
 /// Builds every firmware, prints what it takes, and writes the same as JSON or into the document.
 pub(crate) fn sizes(json: Option<&Path>, write: bool) -> Result<ExitCode> {
@@ -28,8 +29,7 @@ pub(crate) fn sizes(json: Option<&Path>, write: bool) -> Result<ExitCode> {
         std::fs::write(path, serde_json::to_string_pretty(&rows)? + "\n")?;
     }
     if write {
-        let head = [("Compiler", compiler()?), ("Date", date()?), ("Commit", commit()?)];
-        std::fs::write(document(), replaced(&std::fs::read_to_string(document())?, &rows, &head)?)?;
+        DOCUMENT.write(&rows)?;
     }
     Ok(ExitCode::SUCCESS)
 }
@@ -39,23 +39,7 @@ pub(crate) fn check() -> Outcome {
     if let Err(reason) = BOARDS.iter().try_for_each(|board| install::rust_target(board.target)) {
         return Outcome::Skipped(reason);
     }
-    grown().into()
-}
-
-fn grown() -> Result<()> {
-    let text = std::fs::read_to_string(document()).with_context(|| format!("{DOCUMENT} is absent"))?;
-    let rows = measured()?;
-    let found = compared(&rows, &rows_in(&text));
-    let compiler = compiler()?;
-    if compiler_in(&text) == Some(&*compiler) {
-        return found;
-    }
-    // Another compiler makes other code, for which nobody is to blame.
-    println!("warning: {DOCUMENT} was made by another compiler than {compiler}");
-    if let Err(error) = found {
-        println!("warning: {error:#}");
-    }
-    Ok(())
+    measured().and_then(|rows| DOCUMENT.check(&rows)).into()
 }
 
 fn measured() -> Result<Vec<Row>> {
@@ -130,20 +114,4 @@ fn to_json(row: &Row) -> Value {
         "board": board, "image": image, "flash": flash, "static_ram": static_ram, "stack": stack,
         "cara_flash": cara_flash, "cara_ram": cara_ram,
     })
-}
-
-fn document() -> std::path::PathBuf {
-    workspace::root().join(DOCUMENT)
-}
-
-fn compiler() -> Result<String> {
-    Ok(Run::new("rustc").args(["--version"]).text()?.trim().to_owned())
-}
-
-fn date() -> Result<String> {
-    Ok(Run::new("date").args(["-u", "+%Y-%m-%d"]).text()?.trim().to_owned())
-}
-
-fn commit() -> Result<String> {
-    Ok(Run::new("git").args(["rev-parse", "--short", "HEAD"]).text()?.trim().to_owned())
 }

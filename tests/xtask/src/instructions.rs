@@ -1,0 +1,191 @@
+//! `cargo xtask instructions`: how many instructions the core's operations take, on the host and on a Cortex-M3.
+//!
+//! On the host callgrind counts what happens within one function of `tests/instructions`. On the board an emulator gives
+//! every instruction the same time, and the image measures time. Both are the same in every run of one compiler.
+
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use anyhow::{Context, Result};
+use serde_json::{Value, json};
+
+use crate::command::Run;
+use crate::figures::{self, Document, cells, table};
+use crate::firmware::{built, image_build};
+use crate::groups::Outcome;
+use crate::{install, workspace};
+
+const DOCUMENT: Document = Document { file: "docs/instructions.md", command: "cargo xtask instructions --write" };
+/// Counts on any other processor are not compared: another one has other instructions.
+const HOST: &str = "x86_64";
+const BOARD: &str = "Cortex-M3";
+const TARGET: &str = "thumbv7m-none-eabi";
+/// The image of the operations, and where its crate is.
+const OPERATIONS: &str = "operations";
+const FOLDER: &str = "tests/instructions/board";
+/// Of a hundred instructions, how many more may be.
+const GROWTH: u64 = 3;
+/// glibc copies with other instructions on other processors, and callgrind counts `rep movsb` byte by byte.
+const TUNABLES: &str = "glibc.cpu.hwcaps=-AVX512F,-AVX512VL,-AVX512BW,-AVX2,-AVX,-ERMS,-FSRM,-AVX_Fast_Unaligned_Load";
+
+/// Counts, prints, and writes the same as JSON or into the document.
+pub(crate) fn run(json: Option<&Path>, write: bool) -> Result<ExitCode> {
+    installed().map_err(anyhow::Error::msg)?;
+    let rows = counted()?;
+    println!("{}", table(&rows));
+    if let Some(path) = json {
+        let rows: Vec<Value> = rows.iter().map(Row::to_json).collect();
+        std::fs::write(path, serde_json::to_string_pretty(&rows)? + "\n")?;
+    }
+    if write {
+        DOCUMENT.write(&rows)?;
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Fails when an operation takes more instructions than the document allows.
+pub(crate) fn check() -> Outcome {
+    match installed() {
+        Ok(()) => counted().and_then(|rows| DOCUMENT.check(&rows)).into(),
+        Err(reason) => Outcome::Skipped(reason),
+    }
+}
+
+fn installed() -> Result<(), String> {
+    install::program("valgrind", "valgrind")?;
+    install::program("qemu-system-arm", "qemu-system-arm")?;
+    install::rust_target(TARGET)
+}
+
+fn counted() -> Result<Vec<Row>> {
+    let mut rows = host()?;
+    rows.extend(board()?);
+    Ok(rows)
+}
+
+/// What callgrind counts.
+fn host() -> Result<Vec<Row>> {
+    if std::env::consts::ARCH != HOST {
+        println!("warning: this host is no {HOST}: its instructions are not counted");
+        return Ok(Vec::new());
+    }
+    Run::cargo().args(["build", "--quiet", "--profile", "counted", "--package", "cara-instructions"]).stream()?;
+    let program = target().join("counted/cara-instructions");
+    let listed = Run::new(&program.to_string_lossy()).text()?;
+    listed.lines().enumerate().map(|(number, line)| of_host(&program, number, line)).collect()
+}
+
+fn of_host(program: &Path, number: usize, line: &str) -> Result<Row> {
+    let (operation, of) = line.split_once('\t').context("an operation has a name and a size")?;
+    let folder = target().join("instructions");
+    std::fs::create_dir_all(&folder)?;
+    let profile = folder.join(format!("callgrind.{number}"));
+    let counted = ["--tool=callgrind", "--quiet", "--toggle-collect=*counted_by_callgrind*"];
+    Run::new("valgrind")
+        .args(counted)
+        .args([format!("--callgrind-out-file={}", profile.display())])
+        .args([program.as_os_str(), number.to_string().as_ref()])
+        .env("GLIBC_TUNABLES", TUNABLES)
+        .text()?;
+    let text = std::fs::read_to_string(&profile)?;
+    let total = text.lines().find_map(|line| line.strip_prefix("totals: "));
+    let instructions = total.context("callgrind tells no total")?.trim().parse()?;
+    Ok(Row { machine: HOST.into(), operation: operation.into(), of: of.into(), instructions })
+}
+
+/// What the emulated board counts itself.
+fn board() -> Result<Vec<Row>> {
+    image_build(Path::new(FOLDER), TARGET, OPERATIONS).stream()?;
+    let machine = ["-M", "lm3s6965evb", "-display", "none", "-monitor", "none", "-serial", "none", "-nic", "none"];
+    let told = Run::new("qemu-system-arm")
+        .args(machine)
+        .args(["-icount", "shift=10,sleep=off", "-semihosting-config", "enable=on,target=native", "-kernel"])
+        .args([built(TARGET, OPERATIONS)])
+        .text()?;
+    told.lines().map(of_board).collect()
+}
+
+fn of_board(line: &str) -> Result<Row> {
+    let [operation, of, instructions] = line.split('\t').collect::<Vec<_>>()[..] else {
+        anyhow::bail!("the board says: {line}")
+    };
+    Ok(Row {
+        machine: BOARD.into(),
+        operation: operation.into(),
+        of: of.into(),
+        instructions: instructions.trim().parse()?,
+    })
+}
+
+fn target() -> PathBuf {
+    std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| workspace::root().join("target"), Into::into)
+}
+
+/// How many instructions an operation takes.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Row {
+    machine: String,
+    operation: String,
+    of: String,
+    instructions: u64,
+}
+
+impl Row {
+    fn to_json(&self) -> Value {
+        let Self { machine, operation, of, instructions } = self;
+        json!({ "machine": machine, "operation": operation, "of": of, "instructions": instructions })
+    }
+}
+
+impl figures::Row for Row {
+    const COLUMNS: &'static str = "| machine | operation | of | instructions |";
+
+    fn line(&self) -> String {
+        format!("| {} | {} | {} | {} |", self.machine, self.operation, self.of, self.instructions)
+    }
+
+    fn parse(line: &str) -> Option<Self> {
+        let [machine, operation, of, instructions] = cells(line)[..] else { return None };
+        let instructions = instructions.parse().ok()?;
+        Some(Self { machine: machine.into(), operation: operation.into(), of: of.into(), instructions })
+    }
+
+    fn name(&self) -> String {
+        format!("{}: {}, {}", self.machine, self.operation, self.of)
+    }
+
+    fn growth(&self, before: &Self) -> Vec<String> {
+        let (now, before) = (self.instructions, before.instructions);
+        let has_grown = now > before + before * GROWTH / 100;
+        has_grown.then(|| format!("{}: {now} instructions, and {before}", self.name())).into_iter().collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Row, of_board};
+    use crate::figures::Row as _;
+
+    fn row(instructions: u64) -> Row {
+        Row { machine: "Z80".into(), operation: "encode".into(), of: "2 ints".into(), instructions }
+    }
+
+    #[test]
+    fn a_row_is_read_as_it_was_written() {
+        assert_eq!(Row::parse(&row(7).line()), Some(row(7)));
+        assert_eq!(Row::parse(Row::COLUMNS), None);
+    }
+
+    #[test]
+    fn three_per_cent_pass_and_more_does_not() {
+        assert!(row(1030).growth(&row(1000)).is_empty());
+        assert_eq!(row(1031).growth(&row(1000)), ["Z80: encode, 2 ints: 1031 instructions, and 1000"]);
+        assert!(row(1).growth(&row(1000)).is_empty());
+    }
+
+    #[test]
+    fn a_board_tells_a_row_in_each_line() {
+        assert_eq!(of_board("encode\t2 ints\t2519").unwrap().instructions, 2519);
+        assert!(of_board("panic at src/main.rs:1").is_err());
+    }
+}
