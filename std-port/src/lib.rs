@@ -24,9 +24,11 @@ mod config;
 pub mod control;
 mod engine;
 mod event;
+mod file_name;
 #[cfg(feature = "async")]
 mod future;
 mod handler;
+pub mod keys;
 mod lease;
 #[cfg(feature = "metrics")]
 pub mod metrics;

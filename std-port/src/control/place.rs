@@ -16,6 +16,8 @@ use rustix::net::{
 };
 use rustix::process::geteuid;
 
+use crate::file_name::escape;
+
 /// Ends the name of a control socket.
 const SUFFIX: &str = ".sock";
 /// Bytes of a unit's name in the name of its socket; of a longer one a piece and a hash.
@@ -73,19 +75,6 @@ pub(super) fn file_name(identity: &Identity, fleet: Fleet) -> String {
         name = format!("{name}~{hash:016x}");
     }
     format!("{name}-{}-{}{SUFFIX}", identity.id(), fleet.0)
-}
-
-/// Letters, digits, `_` and `-` stay, and `.` behind the first character; of the rest each byte in hexadecimal.
-fn escape(name: &str) -> String {
-    let mut escaped = String::new();
-    for (index, byte) in name.bytes().enumerate() {
-        match byte {
-            b'a'..=b'z' | b'A'..=b'Z' | b'0'..=b'9' | b'_' | b'-' => escaped.push(char::from(byte)),
-            b'.' if index > 0 => escaped.push('.'),
-            _ => escaped.push_str(&format!("%{byte:02X}")),
-        }
-    }
-    escaped
 }
 
 /// The `NAME/ID` and the fleet that the name of a unit's socket tells; of another name, that and fleet 0.

@@ -1,0 +1,204 @@
+//! Files that only their owner reads: read so, or not at all; written whole, or not at all.
+
+use std::fs::{DirBuilder, File, Metadata, OpenOptions};
+use std::io::{self, Read, Write};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
+use std::path::{Path, PathBuf};
+
+use rustix::fs::OFlags;
+use rustix::process::geteuid;
+use tempfile::NamedTempFile;
+use zeroize::{Zeroize, Zeroizing};
+
+use super::KeyError;
+use super::text::FormError;
+
+/// Longest file that is read: the ring of ten thousand nodes in all its generations.
+const BYTES: u64 = 8 << 20;
+/// Permissions of others than the owner.
+const OTHERS: u32 = 0o077;
+
+/// What tells one state of a file from another.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Mark([i64; 2], [u64; 3]);
+
+impl Mark {
+    /// Of the file at a path.
+    pub(super) fn of(path: &Path) -> io::Result<Self> {
+        path.metadata().map(|found| Self::from(&found))
+    }
+}
+
+impl From<&Metadata> for Mark {
+    fn from(found: &Metadata) -> Self {
+        Self([found.ctime(), found.ctime_nsec()], [found.dev(), found.ino(), found.len()])
+    }
+}
+
+pub(super) fn system(path: &Path, error: impl Into<io::Error>) -> KeyError {
+    KeyError::System { path: path.to_owned(), error: error.into() }
+}
+
+pub(super) fn form(path: &Path, FormError { line, what }: FormError) -> KeyError {
+    KeyError::Form { path: path.to_owned(), line, what }
+}
+
+/// The text of a file that belongs to this user and that nobody else can read.
+pub(super) fn read(path: &Path) -> Result<(Zeroizing<String>, Mark), KeyError> {
+    let mut file = open(path)?;
+    let found = file.metadata().map_err(|error| system(path, error))?;
+    check(path, &found)?;
+    // All of it at once: a buffer that grows leaves pieces behind.
+    let mut bytes = Zeroizing::new(vec![0; found.len() as usize]);
+    file.read_exact(&mut bytes).map_err(|error| system(path, error))?;
+    match String::from_utf8(std::mem::take(&mut *bytes)) {
+        Ok(text) => Ok((Zeroizing::new(text), Mark::from(&found))),
+        Err(error) => {
+            error.into_bytes().zeroize();
+            Err(form(path, FormError { line: 1, what: "this is no text" }))
+        }
+    }
+}
+
+fn open(path: &Path) -> Result<File, KeyError> {
+    // A pipe would keep us waiting for somebody to write.
+    let flags = OFlags::NONBLOCK | OFlags::NOCTTY;
+    let opened = OpenOptions::new().read(true).custom_flags(flags.bits() as i32).open(path);
+    opened.map_err(|error| match (error.kind(), path.metadata()) {
+        (io::ErrorKind::PermissionDenied, Ok(found)) if found.uid() != own() => foreign(path, found.uid()),
+        _ => system(path, error),
+    })
+}
+
+fn check(path: &Path, found: &Metadata) -> Result<(), KeyError> {
+    if !found.is_file() {
+        return Err(KeyError::NoFile(path.to_owned()));
+    }
+    if found.uid() != own() {
+        return Err(foreign(path, found.uid()));
+    }
+    if found.mode() & OTHERS != 0 {
+        return Err(KeyError::Open { path: path.to_owned(), mode: found.mode() & 0o777 });
+    }
+    if found.len() > BYTES {
+        return Err(form(path, FormError { line: 1, what: "the file is longer than any with keys" }));
+    }
+    Ok(())
+}
+
+fn own() -> u32 {
+    geteuid().as_raw()
+}
+
+fn foreign(path: &Path, owner: u32) -> KeyError {
+    KeyError::Foreign { path: path.to_owned(), owner, own: own() }
+}
+
+/// Makes a folder that only this user enters, unless there is one.
+pub(super) fn make_folder(path: &Path) -> Result<(), KeyError> {
+    DirBuilder::new().recursive(true).mode(0o700).create(path).map_err(|error| system(path, error))
+}
+
+/// Puts a file in the place of the one at `path`, if there is one.
+pub(super) fn replace(path: &Path, text: &str) -> Result<(), KeyError> {
+    let kept = written(path, text)?.persist(path).map_err(|error| system(path, error.error));
+    kept.and_then(|_| keep_folder(path))
+}
+
+/// Puts a file at `path`, where there must be none.
+pub(super) fn create(path: &Path, text: &str) -> Result<(), KeyError> {
+    let kept = written(path, text)?.persist_noclobber(path).map_err(|error| system(path, error.error));
+    kept.and_then(|_| keep_folder(path))
+}
+
+/// Takes a file away, if there is one.
+pub(super) fn remove(path: &Path) -> Result<bool, KeyError> {
+    match std::fs::remove_file(path) {
+        Ok(()) => Ok(true),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
+        Err(error) => Err(system(path, error)),
+    }
+}
+
+/// A file beside `path`, opened with `O_EXCL` for this user alone, and on the disk.
+fn written(path: &Path, text: &str) -> Result<NamedTempFile, KeyError> {
+    let file = tempfile::Builder::new().prefix(".keys-").tempfile_in(folder_of(path));
+    let mut file = file.map_err(|error| system(path, error))?;
+    let result = file.write_all(text.as_bytes()).and_then(|()| file.as_file().sync_all());
+    result.map_err(|error| system(path, error))?;
+    Ok(file)
+}
+
+/// A name is on the disk when its folder is.
+fn keep_folder(path: &Path) -> Result<(), KeyError> {
+    let folder = folder_of(path);
+    File::open(&folder).and_then(|folder| folder.sync_all()).map_err(|error| system(&folder, error))
+}
+
+fn folder_of(path: &Path) -> PathBuf {
+    match path.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => folder.to_owned(),
+        _ => PathBuf::from("."),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::fs::{Permissions, set_permissions};
+    use std::os::unix::fs::PermissionsExt;
+
+    #[test]
+    fn what_is_written_is_for_its_owner_alone() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a");
+        create(&path, "one").unwrap();
+        assert_eq!(path.metadata().unwrap().mode() & 0o777, 0o600);
+        assert!(matches!(create(&path, "two"), Err(KeyError::System { .. })));
+        assert_eq!(*read(&path).unwrap().0, "one");
+        let before = Mark::of(&path).unwrap();
+        replace(&path, "two").unwrap();
+        assert_eq!((path.metadata().unwrap().mode() & 0o777, &**read(&path).unwrap().0), (0o600, "two"));
+        assert_ne!(Mark::of(&path).unwrap(), before);
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "nothing is left beside it");
+        assert!(remove(&path).unwrap() && !remove(&path).unwrap());
+    }
+
+    #[test]
+    fn every_permission_of_others_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("it's keys");
+        create(&path, "secret").unwrap();
+        for bit in 0..6 {
+            set_permissions(&path, Permissions::from_mode(0o600 | 1 << bit)).unwrap();
+            let error = read(&path).unwrap_err();
+            assert!(matches!(error, KeyError::Open { .. }), "{error}");
+            let text = error.to_string();
+            assert!(text.contains("chmod 600 \"") || text.contains("chmod 600 '"), "{text}");
+        }
+        for mode in [0o600, 0o400, 0o700] {
+            set_permissions(&path, Permissions::from_mode(mode)).unwrap();
+            assert_eq!(*read(&path).unwrap().0, "secret");
+        }
+    }
+
+    #[test]
+    fn what_is_no_file_of_ours_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        assert!(matches!(read(folder.path()), Err(KeyError::NoFile(_))));
+        assert!(matches!(read(Path::new("/dev/zero")), Err(KeyError::NoFile(_))));
+        assert!(matches!(read(&folder.path().join("absent")), Err(KeyError::System { .. })));
+        let pipe = folder.path().join("pipe");
+        rustix::fs::mknodat(rustix::fs::CWD, &pipe, rustix::fs::FileType::Fifo, rustix::fs::Mode::RWXU, 0).unwrap();
+        assert!(matches!(read(&pipe), Err(KeyError::NoFile(_))));
+        let bytes = folder.path().join("bytes");
+        create(&bytes, "").unwrap();
+        std::fs::write(&bytes, [0xFF, 0xFE]).unwrap();
+        assert!(matches!(read(&bytes), Err(KeyError::Form { .. })));
+        if own() == 0 {
+            std::os::unix::fs::chown(&bytes, Some(1), None).unwrap();
+            let text = read(&bytes).unwrap_err().to_string();
+            assert!(text.contains("belongs to user 1") && text.contains("sudo chown 0 "), "{text}");
+        }
+    }
+}

@@ -1,0 +1,125 @@
+//! A ring that a running node holds, and that follows its file.
+
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use cara_core::distribution::identity::{Fleet, Identity};
+
+use super::file::Mark;
+use super::{KeyError, KeyRing, place};
+
+/// The ring of a running node. When its file is another one than before, [`refresh`](Self::refresh) takes that: a vehicle
+/// that is added or revoked, or a new generation, restarts nothing.
+#[derive(Debug)]
+pub struct LiveRing {
+    /// None where the ring was made in this process.
+    path: Option<PathBuf>,
+    held: Mutex<Held>,
+}
+
+#[derive(Debug)]
+struct Held {
+    ring: Arc<KeyRing>,
+    /// The file that was read last, taken or not. None when it could not even be found.
+    mark: Option<Mark>,
+}
+
+impl LiveRing {
+    /// The ring of a node, from where [`place`] says.
+    pub fn find(identity: &Identity, fleet: Fleet) -> Result<Self, KeyError> {
+        Self::open(&place::find(identity, fleet)?, identity, fleet)
+    }
+
+    /// The ring of a node, from this file.
+    pub fn open(path: &Path, identity: &Identity, fleet: Fleet) -> Result<Self, KeyError> {
+        let (ring, mark) = KeyRing::load_marked(path)?;
+        let ring = ring.belonging_to(path, identity, fleet)?;
+        let held = Mutex::new(Held { ring: Arc::new(ring), mark: Some(mark) });
+        Ok(Self { path: Some(path.to_owned()), held })
+    }
+
+    /// A ring that was made in this process, and that follows no file.
+    pub fn fixed(ring: KeyRing) -> Self {
+        Self { path: None, held: Mutex::new(Held { ring: Arc::new(ring), mark: None }) }
+    }
+
+    /// Its file.
+    pub fn path(&self) -> Option<&Path> {
+        self.path.as_deref()
+    }
+
+    /// The ring as it is now.
+    pub fn ring(&self) -> Arc<KeyRing> {
+        self.held.lock().unwrap_or_else(PoisonError::into_inner).ring.clone()
+    }
+
+    /// Looks at the file, which costs one system call, and reads it if it has changed. Whether there is another ring now.
+    /// A file that is refused, or gone, leaves the ring as it was; it is an error once, and tried again when it changes.
+    pub fn refresh(&self) -> Result<bool, KeyError> {
+        let Some(path) = &self.path else { return Ok(false) };
+        let mut held = self.held.lock().unwrap_or_else(PoisonError::into_inner);
+        let mark = Mark::of(path).ok();
+        if mark == held.mark {
+            return Ok(false);
+        }
+        held.mark = mark;
+        let (ring, mark) = KeyRing::load_marked(path)?;
+        let ring = ring.belonging_to(path, held.ring.identity(), held.ring.fleet())?;
+        *held = Held { ring: Arc::new(ring), mark: Some(mark) };
+        Ok(true)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{FleetKeys, Store};
+    use super::*;
+    use std::fs;
+    use std::os::unix::fs::PermissionsExt;
+
+    fn depot() -> Identity {
+        Identity::m_unit("depot", 1).unwrap()
+    }
+
+    #[test]
+    fn a_vehicle_that_is_added_is_known_without_a_restart() {
+        let folder = tempfile::tempdir().unwrap();
+        let agv = |id| Identity::s_unit("agv", id).unwrap();
+        let mut store = Store::create(folder.path(), FleetKeys::draw(Fleet(7)).unwrap()).unwrap();
+        store.keys_mut().add(&depot(), &[]).unwrap();
+        store.save().unwrap();
+        let path = folder.path().join(place::file_name(&depot(), Fleet(7)));
+        let live = LiveRing::open(&path, &depot(), Fleet(7)).unwrap();
+        assert!(!live.refresh().unwrap() && live.ring().pair(&agv(1)).is_none());
+        let before = live.ring();
+
+        store.keys_mut().add(&agv(1), &[]).unwrap();
+        store.save().unwrap();
+        assert!(live.refresh().unwrap() && live.ring().pair(&agv(1)).is_some());
+        assert!(before.pair(&agv(1)).is_none(), "who holds the old one keeps it");
+
+        for wrong in ["", "cara-ring 1\n"] {
+            let kept = fs::read(&path).unwrap();
+            fs::write(&path, wrong).unwrap();
+            assert!(live.refresh().is_err() && live.ring().pair(&agv(1)).is_some(), "{wrong:?}");
+            assert!(!live.refresh().unwrap(), "a mistake is told once");
+            fs::write(&path, kept).unwrap();
+            assert!(live.refresh().unwrap());
+        }
+        fs::set_permissions(&path, fs::Permissions::from_mode(0o640)).unwrap();
+        assert!(matches!(live.refresh(), Err(KeyError::Open { .. })));
+        fs::remove_file(&path).unwrap();
+        assert!(live.refresh().is_err() && !live.refresh().unwrap());
+        fs::rename(folder.path().join(place::file_name(&agv(1), Fleet(7))), &path).unwrap();
+        assert!(matches!(live.refresh(), Err(KeyError::OtherNode { .. })));
+        assert!(live.ring().pair(&agv(1)).is_some());
+    }
+
+    #[test]
+    fn a_ring_without_a_file_stays() {
+        let mut keys = FleetKeys::draw(Fleet(7)).unwrap();
+        keys.add(&depot(), &[]).unwrap();
+        let live = LiveRing::fixed(keys.ring(&depot()).unwrap());
+        assert!(!live.refresh().unwrap() && live.path().is_none());
+    }
+}

@@ -1,0 +1,380 @@
+//! Who belongs to a fleet, and which generations of keys are in use. Nothing of it is secret.
+//!
+//! ```text
+//! cara-fleet 1
+//! fleet 7
+//! generations 1 2
+//! node 1 m_unit 1 depot
+//! node 2 s_unit 17 agv-17
+//! manager m_unit 1 depot
+//! revoked 2 s_unit 18 agv-18
+//! ```
+//!
+//! `node` tells the first generation in which it has keys, `manager` whom the node above belongs to, and `revoked` the
+//! first generation without the node.
+
+use std::fmt::Write;
+
+use cara_core::distribution::identity::{Fleet, Identity, Role};
+
+use super::FleetError;
+use super::text::{FormError, Line, Lines, push_identity};
+
+/// Most generations of keys that are in use at a time.
+pub const GENERATIONS: u32 = 4;
+/// Which form this is.
+const FORM: u32 = 1;
+
+/// A node of the fleet.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Member {
+    /// Who it is.
+    pub identity: Identity,
+    /// The first generation in which it has keys.
+    pub since: u32,
+    /// Of an s_unit: the m_units that it belongs to. None after the last of them was revoked.
+    pub managers: Vec<Identity>,
+}
+
+/// A node that was taken out.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Revoked {
+    /// Who it was.
+    pub identity: Identity,
+    /// The first generation without it.
+    pub from: u32,
+}
+
+/// The nodes of a fleet, in the order of their identities.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Members {
+    fleet: Fleet,
+    oldest: u32,
+    newest: u32,
+    nodes: Vec<Member>,
+    revoked: Vec<Revoked>,
+}
+
+impl Members {
+    /// A fleet without nodes, in its first generation.
+    pub(super) fn new(fleet: Fleet) -> Self {
+        Self { fleet, oldest: 1, newest: 1, nodes: Vec::new(), revoked: Vec::new() }
+    }
+
+    /// The fleet.
+    pub fn fleet(&self) -> Fleet {
+        self.fleet
+    }
+
+    /// The newest generation.
+    pub fn generation(&self) -> u32 {
+        self.newest
+    }
+
+    /// All generations in use, the newest first.
+    pub fn generations(&self) -> impl Iterator<Item = u32> {
+        (self.oldest..=self.newest).rev()
+    }
+
+    /// Those that have keys.
+    pub fn nodes(&self) -> &[Member] {
+        &self.nodes
+    }
+
+    /// Those that were taken out, and have not come back.
+    pub fn revoked(&self) -> &[Revoked] {
+        &self.revoked
+    }
+
+    /// A node.
+    pub fn node(&self, identity: &Identity) -> Result<&Member, FleetError> {
+        self.nodes.iter().find(|node| node.identity == *identity).ok_or_else(|| FleetError::Unknown(identity.clone()))
+    }
+
+    /// Those that a node talks to: m_units to each other, and an s_unit to those that it belongs to.
+    pub fn peers<'m>(&'m self, of: &'m Member) -> impl Iterator<Item = &'m Member> {
+        self.nodes.iter().filter(|node| node.identity != of.identity && are_peers(node, of))
+    }
+
+    /// Adds a node; one that is there already gets other managers, if any are named.
+    pub(super) fn add(&mut self, identity: &Identity, managers: &[Identity]) -> Result<(), FleetError> {
+        let named = self.checked(identity, managers)?;
+        if let Some(node) = self.nodes.iter_mut().find(|node| node.identity == *identity) {
+            if !named.is_empty() {
+                node.managers = named;
+            }
+            // One that lost its last manager belongs to the only one that is left, if there is one.
+            return self.settle(identity);
+        }
+        self.revoked.retain(|revoked| revoked.identity != *identity);
+        let at = self.nodes.partition_point(|node| node.identity < *identity);
+        self.nodes.insert(at, Member { identity: identity.clone(), since: self.newest, managers: named });
+        self.settle(identity).inspect_err(|_| drop(self.nodes.remove(at)))
+    }
+
+    /// Without repetitions, each of them an m_unit of the fleet.
+    fn checked(&self, identity: &Identity, managers: &[Identity]) -> Result<Vec<Identity>, FleetError> {
+        if identity.role() == Role::MUnit && !managers.is_empty() {
+            return Err(FleetError::MUnit(identity.clone()));
+        }
+        let is_m_unit = |manager: &&Identity| manager.role() == Role::MUnit && self.node(manager).is_ok();
+        if let Some(wrong) = managers.iter().find(|manager| !is_m_unit(manager)) {
+            return Err(FleetError::NotAManager(wrong.clone()));
+        }
+        let mut managers = managers.to_vec();
+        managers.sort();
+        managers.dedup();
+        Ok(managers)
+    }
+
+    /// An s_unit for which nothing was said belongs to the fleet's only m_unit.
+    fn settle(&mut self, identity: &Identity) -> Result<(), FleetError> {
+        let m_units: Vec<_> = self.m_units().cloned().collect();
+        let Some(node) = self.nodes.iter_mut().find(|node| node.identity == *identity) else { return Ok(()) };
+        if identity.role() == Role::MUnit || !node.managers.is_empty() {
+            return Ok(());
+        }
+        match m_units.as_slice() {
+            [] => Err(FleetError::NoManager(identity.clone())),
+            [only] => {
+                node.managers = vec![only.clone()];
+                Ok(())
+            }
+            _ => Err(FleetError::WhichManager { node: identity.clone(), managers: m_units }),
+        }
+    }
+
+    /// The m_units.
+    pub fn m_units(&self) -> impl Iterator<Item = &Identity> {
+        self.nodes.iter().map(|node| &node.identity).filter(|identity| identity.role() == Role::MUnit)
+    }
+
+    /// Takes a node out, and begins a generation that it has nothing of. Of more generations than may be in use the
+    /// oldest ends: a node must never stay in because others are slow.
+    pub(super) fn revoke(&mut self, identity: &Identity) -> Result<(), FleetError> {
+        self.node(identity)?;
+        let newest = self.newest.checked_add(1).ok_or(FleetError::Exhausted)?;
+        self.nodes.retain(|node| node.identity != *identity);
+        self.nodes.iter_mut().for_each(|node| node.managers.retain(|manager| manager != identity));
+        self.revoked.push(Revoked { identity: identity.clone(), from: newest });
+        self.newest = newest;
+        self.oldest = self.oldest.max(newest.saturating_sub(GENERATIONS - 1));
+        Ok(())
+    }
+
+    /// Begins a generation.
+    pub(super) fn rotate(&mut self) -> Result<(), FleetError> {
+        let in_use = self.newest - self.oldest + 1;
+        if in_use >= GENERATIONS {
+            return Err(FleetError::Generations(in_use));
+        }
+        self.newest = self.newest.checked_add(1).ok_or(FleetError::Exhausted)?;
+        Ok(())
+    }
+
+    /// Ends all generations but the newest.
+    pub(super) fn finish(&mut self) -> Result<(), FleetError> {
+        if self.oldest == self.newest {
+            return Err(FleetError::NothingToFinish(self.newest));
+        }
+        self.oldest = self.newest;
+        Ok(())
+    }
+
+    /// The text of its file.
+    pub(super) fn text(&self) -> String {
+        let (fleet, oldest, newest) = (self.fleet.0, self.oldest, self.newest);
+        let mut text = format!(
+            "# The nodes of fleet {fleet}, as `cara keys` keeps them beside the root.\n\
+             cara-fleet {FORM}\nfleet {fleet}\ngenerations {oldest} {newest}\n"
+        );
+        for node in &self.nodes {
+            push(&mut text, format_args!("node {} ", node.since), &node.identity);
+            node.managers.iter().for_each(|manager| push(&mut text, format_args!("manager "), manager));
+        }
+        self.revoked.iter().for_each(|one| push(&mut text, format_args!("revoked {} ", one.from), &one.identity));
+        text
+    }
+
+    pub(super) fn parse(text: &str) -> Result<Self, FormError> {
+        let mut lines = Lines::of(text);
+        let head = lines.expect("cara-fleet", "here `cara-fleet 1` is expected: this is no list of a fleet's nodes")?;
+        if head.number()? != FORM {
+            return Err(head.wrong("this list is written in a form that this version does not know"));
+        }
+        let fleet = Fleet(lines.expect("fleet", "here `fleet` is expected")?.number()?);
+        let line = lines.expect("generations", "here `generations` is expected")?;
+        let (oldest, behind) = line.numbered()?;
+        let newest = behind.number()?;
+        if oldest == 0 || newest < oldest || newest - oldest >= GENERATIONS {
+            return Err(
+                line.wrong("here the oldest and the newest generation in use are expected, at most four in all")
+            );
+        }
+        let mut members = Self { fleet, oldest, newest, nodes: Vec::new(), revoked: Vec::new() };
+        lines.try_for_each(|line| members.read(line))?;
+        members.nodes.sort_by(|one, other| one.identity.cmp(&other.identity));
+        Ok(members)
+    }
+
+    fn read(&mut self, line: Line<'_>) -> Result<(), FormError> {
+        match line.word {
+            "node" => {
+                let (since, behind) = line.numbered()?;
+                let identity = behind.identity()?;
+                if self.node(&identity).is_ok() {
+                    return Err(line.wrong("this node stands above already"));
+                }
+                self.nodes.push(Member { identity, since, managers: Vec::new() });
+            }
+            "manager" => {
+                let node =
+                    self.nodes.last_mut().ok_or_else(|| line.wrong("here the node of this manager is missing"))?;
+                node.managers.push(line.identity()?);
+            }
+            "revoked" => {
+                let (from, behind) = line.numbered()?;
+                self.revoked.push(Revoked { identity: behind.identity()?, from });
+            }
+            _ => return Err(line.wrong("here `node`, `manager` or `revoked` is expected")),
+        }
+        Ok(())
+    }
+}
+
+fn push(text: &mut String, head: std::fmt::Arguments<'_>, identity: &Identity) {
+    // Writing to text does not fail.
+    let _ = text.write_fmt(head);
+    push_identity(text, identity);
+    text.push('\n');
+}
+
+fn are_peers(one: &Member, other: &Member) -> bool {
+    let manages = |manager: &Member, node: &Member| node.managers.contains(&manager.identity);
+    let both_manage = [one, other].iter().all(|member| member.identity.role() == Role::MUnit);
+    both_manage || manages(one, other) || manages(other, one)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn m_unit(name: &str) -> Identity {
+        Identity::m_unit(name, 1).unwrap()
+    }
+
+    fn agv(id: u32) -> Identity {
+        Identity::s_unit("agv", id).unwrap()
+    }
+
+    /// Two m_units, an AGV of the first and one of both.
+    fn fleet() -> Members {
+        let mut members = Members::new(Fleet(7));
+        members.add(&m_unit("depot"), &[]).unwrap();
+        members.add(&agv(1), &[]).unwrap();
+        members.add(&m_unit("hall"), &[]).unwrap();
+        members.add(&agv(2), &[m_unit("hall"), m_unit("depot"), m_unit("hall")]).unwrap();
+        members
+    }
+
+    fn peers(members: &Members, of: &Identity) -> Vec<String> {
+        members.peers(members.node(of).unwrap()).map(|peer| peer.identity.to_string()).collect()
+    }
+
+    #[test]
+    fn an_s_unit_talks_to_its_m_units_and_those_to_each_other() {
+        let members = fleet();
+        assert_eq!(peers(&members, &m_unit("depot")), ["agv/1", "hall/1", "agv/2"]);
+        assert_eq!(peers(&members, &m_unit("hall")), ["depot/1", "agv/2"]);
+        assert_eq!(peers(&members, &agv(1)), ["depot/1"]);
+        assert_eq!(peers(&members, &agv(2)), ["depot/1", "hall/1"]);
+    }
+
+    #[test]
+    fn what_cannot_be_added_is_told_and_changes_nothing() {
+        let mut members = Members::new(Fleet(7));
+        assert_eq!(members.add(&agv(1), &[]), Err(FleetError::NoManager(agv(1))));
+        assert_eq!(members, Members::new(Fleet(7)));
+        let mut members = fleet();
+        let before = members.clone();
+        let managers = vec![m_unit("depot"), m_unit("hall")];
+        let error = members.add(&agv(3), &[]).unwrap_err();
+        assert_eq!(error, FleetError::WhichManager { node: agv(3), managers });
+        assert!(error.to_string().ends_with("Say `--manager depot/1` or `--manager hall/1`"), "{error}");
+        assert_eq!(members.add(&agv(3), &[m_unit("yard")]), Err(FleetError::NotAManager(m_unit("yard"))));
+        assert_eq!(members.add(&agv(3), &[agv(1)]), Err(FleetError::NotAManager(agv(1))));
+        assert_eq!(members.add(&m_unit("yard"), &[m_unit("hall")]), Err(FleetError::MUnit(m_unit("yard"))));
+        assert_eq!(members, before);
+        members.add(&agv(1), &[]).unwrap();
+        assert_eq!(members, before, "what is there stays as it is");
+        members.add(&agv(1), &[m_unit("hall")]).unwrap();
+        assert_eq!(peers(&members, &agv(1)), ["hall/1"]);
+    }
+
+    #[test]
+    fn who_is_revoked_is_in_no_generation_and_comes_back_in_the_newest() {
+        let mut members = fleet();
+        members.revoke(&agv(1)).unwrap();
+        assert_eq!(members.generations().collect::<Vec<_>>(), [2, 1]);
+        assert_eq!(members.revoked(), [Revoked { identity: agv(1), from: 2 }]);
+        assert_eq!(members.revoke(&agv(1)), Err(FleetError::Unknown(agv(1))));
+        members.add(&agv(1), &[m_unit("depot")]).unwrap();
+        assert_eq!((members.node(&agv(1)).unwrap().since, members.revoked().len()), (2, 0));
+    }
+
+    #[test]
+    fn without_its_manager_a_node_talks_to_nobody() {
+        let mut members = fleet();
+        members.revoke(&m_unit("depot")).unwrap();
+        assert_eq!((peers(&members, &agv(1)), peers(&members, &agv(2))), (vec![], vec!["hall/1".to_owned()]));
+        members.add(&agv(1), &[]).unwrap();
+        assert_eq!(peers(&members, &agv(1)), ["hall/1"]);
+    }
+
+    #[test]
+    fn generations_are_bounded_and_revoking_is_never_held_up() {
+        let mut members = fleet();
+        assert_eq!(members.finish(), Err(FleetError::NothingToFinish(1)));
+        (1..GENERATIONS).for_each(|_| members.rotate().unwrap());
+        assert_eq!(members.rotate(), Err(FleetError::Generations(GENERATIONS)));
+        members.revoke(&agv(1)).unwrap();
+        assert_eq!(members.generations().collect::<Vec<_>>(), [5, 4, 3, 2]);
+        members.finish().unwrap();
+        assert_eq!(members.generations().collect::<Vec<_>>(), [5]);
+        members.newest = u32::MAX;
+        members.oldest = u32::MAX;
+        assert_eq!(
+            (members.rotate(), members.revoke(&agv(2))),
+            (Err(FleetError::Exhausted), Err(FleetError::Exhausted))
+        );
+        assert!(members.node(&agv(2)).is_ok());
+    }
+
+    #[test]
+    fn what_is_written_is_read() {
+        let mut members = fleet();
+        members.add(&Identity::s_unit("a b/c #1", 9).unwrap(), &[m_unit("hall")]).unwrap();
+        members.rotate().unwrap();
+        members.revoke(&agv(1)).unwrap();
+        assert_eq!(Members::parse(&members.text()), Ok(members));
+    }
+
+    #[test]
+    fn every_line_that_is_wrong_is_told_by_its_number() {
+        let mut members = fleet();
+        members.revoke(&agv(1)).unwrap();
+        let text = members.text();
+        let parse = |text: &str| Members::parse(text).map(drop).map_err(|error| error.line);
+        for (index, line) in text.lines().enumerate().skip(1) {
+            for wrong in ["strange 1", line.split(' ').next().unwrap()] {
+                assert_eq!(parse(&text.replace(line, wrong)), Err(index + 1), "{line}");
+            }
+        }
+        for generations in ["0 1", "2 1", "1 5", "1"] {
+            assert_eq!(parse(&text.replace("generations 1 2", &format!("generations {generations}"))), Err(4));
+        }
+        assert_eq!(parse(""), Err(1));
+        assert_eq!(parse("cara-fleet 1\nfleet 7\ngenerations 1 1\nmanager m_unit 1 depot\n"), Err(4));
+        assert_eq!(parse(&format!("{text}node 1 m_unit 1 depot\n")), Err(text.lines().count() + 1));
+    }
+}
