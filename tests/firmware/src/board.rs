@@ -13,6 +13,8 @@ use cara_processes::network;
 use defmt_decoder::{DecodeError, Table};
 use rustix::process::{Pid, Signal, kill_process};
 
+use crate::trace::Trace;
+
 /// Long enough for the slowest machine.
 pub(crate) const LONG: Duration = Duration::from_secs(60);
 /// The fleet of all units here; nobody else is in this network.
@@ -54,12 +56,25 @@ impl Bench {
 
     /// Puts power on a board.
     pub(crate) fn board(&self, cable: &Cable, who: &Who) -> Result<Board> {
+        self.start(self.emulator(cable, who).stderr(Stdio::null()), who)
+    }
+
+    /// The same with everything that it executes, instruction by instruction.
+    pub(crate) fn traced_board(&self, cable: &Cable, who: &Who) -> Result<(Board, Trace)> {
+        let mut emulator = self.emulator(cable, who);
+        let mut board = self.start(emulator.args(Trace::ARGUMENTS).stderr(Stdio::piped()), who)?;
+        let output = board.child.stderr.take().context("the emulator has no standard error")?;
+        Ok((board, Trace::read(output)))
+    }
+
+    fn emulator(&self, cable: &Cable, who: &Who) -> Command {
         let Who { name, id, manager, fleet, seed, more } = who;
         let number = cable.number;
         let address = address(cable);
         let seed = seed.map_or_else(String::new, |seed| format!(" seed={seed}"));
         let told = format!("name={name} id={id} manager={manager} fleet={fleet} address={address}/24{seed} {more}");
-        let mut child = Command::new("qemu-system-arm")
+        let mut command = Command::new("qemu-system-arm");
+        command
             .args(["-M", "lm3s6965evb", "-display", "none", "-monitor", "none", "-serial", "none"])
             .arg("-semihosting-config")
             .arg(format!("enable=on,target=native,arg=agv,arg={told}"))
@@ -69,19 +84,20 @@ impl Bench {
             .arg(format!(
                 "tap,ifname={},script=no,downscript=no,model=stellaris,mac=52:54:00:00:00:{number:02x}",
                 cable.name
-            ))
-            .stdin(Stdio::null())
-            .stdout(Stdio::piped())
-            .stderr(Stdio::null())
-            .spawn()
-            .context("cannot start qemu-system-arm")?;
+            ));
+        command
+    }
+
+    fn start(&self, emulator: &mut Command, who: &Who) -> Result<Board> {
+        let emulator = emulator.stdin(Stdio::null()).stdout(Stdio::piped());
+        let mut child = emulator.spawn().context("cannot start qemu-system-arm")?;
         let log = Arc::new(Log::default());
         if let Some(output) = child.stdout.take() {
             let (log, table) = (log.clone(), self.table.clone());
-            let shown = self.shows_logs.then(|| name.clone());
+            let shown = self.shows_logs.then(|| who.name.clone());
             std::thread::spawn(move || log.read(output, &table, shown.as_deref()));
         }
-        Ok(Board { child, log, name: name.clone() })
+        Ok(Board { child, log, name: who.name.clone() })
     }
 }
 

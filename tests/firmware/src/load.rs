@@ -24,7 +24,7 @@ pub(crate) enum Image {
 /// How often everything is done: interrupts come at other places each time.
 const ROUNDS: u32 = 3;
 /// Where the echo listens, and how much it is sent.
-const ECHO_PORT: u16 = 7777;
+pub(crate) const ECHO_PORT: u16 = 7777;
 const ECHO_BYTES: usize = 20_000;
 /// The board looks at its stack every second, the echo every five.
 const LOOKED: Duration = Duration::from_secs(6);
@@ -99,7 +99,8 @@ fn echo(cable: &Cable) -> Result<()> {
     }
 }
 
-fn connected(address: SocketAddr) -> Result<TcpStream> {
+/// A connection, as soon as the board takes one.
+pub(crate) fn connected(address: SocketAddr) -> Result<TcpStream> {
     let mut tries = 0;
     loop {
         match TcpStream::connect_timeout(&address, Duration::from_secs(1)) {

@@ -6,9 +6,12 @@
 
 mod board;
 mod checks;
+mod count;
 mod desk;
 mod load;
 mod manager;
+mod places;
+mod trace;
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -52,6 +55,14 @@ enum Part {
         /// What the image is.
         of: load::Image,
     },
+    /// Prints how many instructions a board executes between a request and its reply, and whose they are.
+    Instructions {
+        /// What the image is.
+        of: count::Image,
+        /// Prints the functions with the most instructions instead.
+        #[arg(long)]
+        profile: bool,
+    },
     /// Puts a board on the desk, with its manager and a prompt for `cara`.
     Desk(desk::Desk),
 }
@@ -89,6 +100,9 @@ fn in_own_network(arguments: &Arguments) -> Result<ExitCode> {
 fn inside(arguments: &Arguments) -> Result<()> {
     match &arguments.part {
         Some(Part::Desk(desk)) => desk::run(&arguments.image, desk),
+        Some(Part::Instructions { of, profile }) => {
+            count::run(&Bench::new(&arguments.image, arguments.logs)?, &arguments.image, *of, *profile)
+        }
         Some(Part::Stack { of }) => load::run(&Bench::new(&arguments.image, arguments.logs)?, *of),
         _ => run(arguments),
     }
