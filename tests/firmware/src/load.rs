@@ -17,6 +17,8 @@ use crate::manager::{Manager, at, position};
 pub(crate) enum Image {
     /// The AGV.
     Agv,
+    /// The least unit.
+    Unit,
     /// The bare TCP echo.
     Echo,
 }
@@ -36,6 +38,7 @@ pub(crate) fn run(bench: &Bench, image: Image) -> Result<()> {
     for round in 0..ROUNDS {
         match image {
             Image::Agv => vehicle(&board, &cable, round)?,
+            Image::Unit => least(&board, &cable)?,
             Image::Echo => echo(&cable)?,
         }
     }
@@ -78,6 +81,41 @@ fn vehicle(board: &Board, cable: &Cable, round: u32) -> Result<()> {
     cable.pull()?;
     board.logs_behind(line, "depot has left")?;
     cable.plug_in()
+}
+
+/// Joining, a list, calls, refusals, a lost manager and a pulled cable.
+fn least(board: &Board, cable: &Cable) -> Result<()> {
+    let who = Who::agv(17);
+    let mut line = board.line();
+    for loss in [Loss::OfManager, Loss::OfCable] {
+        let manager = Manager::start()?;
+        manager.offer_mechanic()?;
+        let unit = manager.meet_offering(&who, "add")?;
+        for number in 0..10 {
+            let mut sum = Parameters::<256>::sized();
+            for name in ["a", "b", "sum"] {
+                sum.add_int(name, 1)?;
+                sum.set_value(name, number)?;
+            }
+            unit.request("add", &sum)?;
+            unit.block_request("add", &mut sum)?;
+            ensure!(sum.variable::<i64>("sum")? == 2 * number, "it cannot add");
+        }
+        ensure!(unit.block_request("add", &mut at([0, 0])?).is_err(), "it adds a position");
+        match loss {
+            Loss::OfManager => drop(manager),
+            Loss::OfCable => cable.pull()?,
+        }
+        board.logs_behind(line, "depot has left")?;
+        line = board.line();
+        cable.plug_in()?;
+    }
+    Ok(())
+}
+
+enum Loss {
+    OfManager,
+    OfCable,
 }
 
 /// More than fits its buffers, there and back.

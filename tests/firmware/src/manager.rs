@@ -34,12 +34,17 @@ impl Manager {
         Ok(())
     }
 
-    /// Waits until a board has joined and offers its functions.
+    /// Waits until a vehicle has joined and offers its functions.
     pub(crate) fn meet(&self, who: &Who) -> Result<Peer> {
+        self.meet_offering(who, "go_to")
+    }
+
+    /// Waits until a board has joined and offers a function.
+    pub(crate) fn meet_offering(&self, who: &Who, function: &str) -> Result<Peer> {
         let deadline = Instant::now() + LONG;
         while Instant::now() < deadline {
             let peer = self.system.s_unit(&who.name).filter(Peer::is_connected);
-            if let Some(peer) = peer.filter(|peer| peer.their_function_list().contains("go_to")) {
+            if let Some(peer) = peer.filter(|peer| peer.their_function_list().contains(function)) {
                 return Ok(peer);
             }
             std::thread::sleep(Duration::from_millis(2));

@@ -12,6 +12,8 @@ extern crate std;
 
 pub mod echo;
 pub mod lamp;
+pub mod least;
+mod log;
 pub mod reset;
 #[cfg(feature = "tasks")]
 pub mod tasks;
@@ -28,15 +30,6 @@ use cara_settings::page::PageError;
 use cara_settings::{Network, Settings};
 use embassy_net::{Ipv4Cidr, Stack, StaticConfigV4};
 use embassy_time::{Duration, Ticker};
-
-macro_rules! info {
-    ($($arg:tt)*) => {{
-        #[cfg(feature = "defmt")]
-        ::defmt::info!($($arg)*);
-        #[cfg(not(feature = "defmt"))]
-        { let _ = ::core::format_args!($($arg)*); }
-    }};
-}
 
 /// An AGV.
 pub type Vehicle = Handle<Agv>;
@@ -111,17 +104,22 @@ pub fn vehicle(
     settings: &Settings,
     seed: u64,
 ) -> Result<(Vehicle, Runner<Agv>), VehicleError> {
+    let config = unit_config(settings, seed)?;
+    let (vehicle, runner) = cara_embassy::new(stack, resources, config, Agv::new([0, 0]))?;
+    offer(vehicle)?;
+    Ok((vehicle, runner))
+}
+
+/// Who the unit of the settings is.
+fn unit_config(settings: &Settings, seed: u64) -> Result<Config, VehicleError> {
     let manager = settings.manager.as_ref().ok_or(VehicleError::NoManager)?;
     let identity = &settings.identity;
     let config = Config::s_unit(identity.name(), identity.id(), &manager.name, manager.id, seed)?;
     let config = config.fleet(settings.fleet.0);
-    let config = match settings.manager_address {
+    Ok(match settings.manager_address {
         Some(address) => config.manager_address(SocketAddr::V4(address)),
         None => config,
-    };
-    let (vehicle, runner) = cara_embassy::new(stack, resources, config, Agv::new([0, 0]))?;
-    offer(vehicle)?;
-    Ok((vehicle, runner))
+    })
 }
 
 /// Publishes the AGV's services.

@@ -11,14 +11,14 @@ pub const FAULTED: i32 = 102;
 fn panic(information: &core::panic::PanicInfo<'_>) -> ! {
     cortex_m::interrupt::disable();
     match information.location() {
-        Some(place) => defmt::error!("panic at {=str}:{=u32}", place.file(), place.line()),
-        None => defmt::error!("panic"),
+        Some(place) => cara_vehicle::error!("panic at {=str}:{=u32}", place.file(), place.line()),
+        None => cara_vehicle::error!("panic"),
     }
     semihosting::process::exit(PANICKED)
 }
 
 #[cortex_m_rt::exception]
 unsafe fn HardFault(frame: &cortex_m_rt::ExceptionFrame) -> ! {
-    defmt::error!("fault at {=u32:#x}, called from {=u32:#x}", frame.pc(), frame.lr());
+    cara_vehicle::error!("fault at {=u32:#x}, called from {=u32:#x}", frame.pc(), frame.lr());
     semihosting::process::exit(FAULTED)
 }

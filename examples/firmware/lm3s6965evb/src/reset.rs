@@ -1,5 +1,7 @@
 //! Why the board started (data sheet, System Control: RESC).
 
+use cara_vehicle::reset::Reason;
+
 use crate::register::{Register, SYSTEM};
 use crate::watchdog;
 
@@ -9,23 +11,6 @@ const POWER_ON: u32 = 1 << 1;
 const BROWN_OUT: u32 = 1 << 2;
 const WATCHDOG: u32 = 1 << 3;
 const SOFTWARE: u32 = 1 << 4;
-
-/// Why the board started.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, defmt::Format)]
-pub enum Reason {
-    /// Power came.
-    PowerOn,
-    /// The reset pin.
-    Pin,
-    /// The voltage was too low.
-    BrownOut,
-    /// The program hung.
-    Watchdog,
-    /// The program asked for it.
-    Program,
-    /// The chip does not say.
-    Unknown,
-}
 
 /// The reason of this start. The register keeps reasons until they are cleared, which this does: ask once.
 pub fn reason() -> Reason {

@@ -1,6 +1,10 @@
 //! How much of the stack has been used: it is painted at the start, and what is still painted was never reached.
 #![allow(unsafe_code)]
 
+use embassy_time::{Duration, Ticker};
+
+/// How often the stack is looked at.
+const LOOKED_AT: Duration = Duration::from_secs(1);
 const PAINT: u32 = 0xC0FF_EE11;
 /// Bytes below the stack pointer that painting itself may need.
 const MARGIN: usize = 64;
@@ -11,7 +15,8 @@ unsafe extern "C" {
 }
 
 /// Bytes of the stack.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, defmt::Format)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct Stack {
     /// Used at some time since the start.
     pub used: usize,
@@ -42,4 +47,19 @@ pub fn used() -> Stack {
         place = unsafe { place.add(1) };
     }
     Stack { used: top - place as usize, size: top - bottom as usize }
+}
+
+/// Tells how deep the stack has been, each time that it was deeper.
+#[embassy_executor::task]
+pub async fn report() -> ! {
+    let mut ticker = Ticker::every(LOOKED_AT);
+    let mut deepest = 0;
+    loop {
+        let stack = used();
+        if stack.used > deepest {
+            deepest = stack.used;
+            cara_vehicle::info!("stack {=usize} of {=usize} bytes", stack.used, stack.size);
+        }
+        ticker.next().await;
+    }
 }

@@ -15,10 +15,34 @@ pub(crate) struct Board {
     /// Chooses the board within its family.
     pub(crate) feature: Option<&'static str>,
     pub(crate) target: &'static str,
-    /// The last one is the bare echo, with which the others are compared.
-    pub(crate) images: &'static [&'static str],
+    pub(crate) images: &'static [Image],
     /// Whether it has a radio that is loaded with files which are no part of the project.
     pub(crate) has_radio: bool,
+}
+
+/// What is built for a board.
+#[derive(Debug)]
+pub(crate) struct Image {
+    pub(crate) name: &'static str,
+    /// The binary of the board's crate.
+    pub(crate) program: &'static str,
+    /// Whether it tells what it does. An image without logs is built with none of the default features.
+    pub(crate) has_logs: bool,
+}
+
+impl Image {
+    const fn with_logs(program: &'static str) -> Self {
+        Self { name: program, program, has_logs: true }
+    }
+
+    const fn quiet(name: &'static str, program: &'static str) -> Self {
+        Self { name, program, has_logs: false }
+    }
+
+    /// Whether the other images of its kind are compared with it.
+    pub(crate) fn is_bare(&self) -> bool {
+        self.program == "echo"
+    }
 }
 
 /// The environment variable with the folder of the radio's files, or with [`NO_RADIO`].
@@ -26,7 +50,19 @@ pub(crate) const RADIO: &str = "CARA_CYW43_FIRMWARE";
 /// The image is linked without them: it only tells that it has none.
 const NO_RADIO: &str = "none";
 
-const IMAGES: &[&str] = &["agv", "echo"];
+/// Of every board.
+const IMAGES: &[Image] = &[Image::with_logs("agv"), Image::with_logs("echo")];
+/// Of the emulated board, on which also the least unit and images without logs are measured.
+const EMULATED: &[Image] = &[
+    Image::with_logs("agv"),
+    Image::with_logs("unit"),
+    Image::with_logs("echo"),
+    Image::quiet("agv-quiet", "agv"),
+    Image::quiet("unit-quiet", "unit"),
+    Image::quiet("echo-quiet", "echo"),
+];
+/// Says what each capacity of a unit costs.
+pub(crate) const RESOURCES: Image = Image::with_logs("resources");
 
 /// All of them.
 pub(crate) const BOARDS: [Board; 6] = [
@@ -35,7 +71,7 @@ pub(crate) const BOARDS: [Board; 6] = [
         folder: "lm3s6965evb",
         feature: None,
         target: "thumbv7m-none-eabi",
-        images: IMAGES,
+        images: EMULATED,
         has_radio: false,
     },
     Board {
@@ -91,25 +127,31 @@ pub(crate) fn find(name: &str) -> Result<&'static Board> {
 
 impl Board {
     /// Builds an image; where it is.
-    pub(crate) fn build(&self, image: &str) -> Result<PathBuf> {
+    pub(crate) fn build(&self, image: &Image) -> Result<PathBuf> {
         let folder = Path::new("examples/firmware").join(self.folder);
-        let build = image_build(&folder, self.target, image);
+        // Boards with one processor, and an image with and without logs, are built into the same file: another build must
+        // not begin before this one's is copied.
+        std::fs::create_dir_all(place()).with_context(|| format!("cannot make {}", place().display()))?;
+        let lock = std::fs::File::create(place().join("images.lock"))?;
+        lock.lock()?;
+        let build = image_build(&folder, self.target, image.program);
         let build = match (self.has_radio, std::env::var(RADIO)) {
             (true, Err(_)) => build.env(RADIO, NO_RADIO),
             _ => build,
         };
-        match self.feature {
-            Some(feature) => build.args(["--no-default-features", "--features", feature]).stream()?,
-            None => build.stream()?,
+        match (self.feature, image.has_logs) {
+            (Some(feature), _) => build.args(["--no-default-features", "--features", feature]).stream()?,
+            (None, false) => build.args(["--no-default-features"]).stream()?,
+            (None, true) => build.stream()?,
         }
         self.kept(image)
     }
 
-    /// Copies an image to the board's own folder: boards with one processor build into the same file.
-    fn kept(&self, image: &str) -> Result<PathBuf> {
+    /// Copies an image to the board's own folder.
+    fn kept(&self, image: &Image) -> Result<PathBuf> {
         let folder = place().join("images").join(self.name);
         std::fs::create_dir_all(&folder).with_context(|| format!("cannot make {}", folder.display()))?;
-        let (built, kept) = (built(self.target, image), folder.join(image));
+        let (built, kept) = (built(self.target, image.program), folder.join(image.name));
         std::fs::copy(&built, &kept).with_context(|| format!("cannot copy {}", built.display()))?;
         Ok(kept)
     }

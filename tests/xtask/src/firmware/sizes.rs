@@ -7,7 +7,7 @@ use anyhow::{Context, Result, bail};
 use serde_json::{Value, json};
 
 use super::bill::Row;
-use super::boards::{BOARDS, Board, RADIO};
+use super::boards::{BOARDS, Board, Image, RADIO, RESOURCES};
 use super::image::{Footprint, footprint};
 use super::{NOT_ALLOWED, TESTED, tests};
 use crate::command::Run;
@@ -59,20 +59,24 @@ fn of_board(board: &'static Board) -> Result<Vec<Row>> {
     let mut found = Vec::new();
     for image in board.images {
         let path = board.build(image)?;
-        let stack = if board.name == TESTED { stack(&path, image)? } else { None };
-        found.push((*image, footprint(&path)?, stack));
+        // A board tells by its logs how deep its stack has been.
+        let stack = if board.name == TESTED && image.has_logs { stack(&path, image.program)? } else { None };
+        found.push((image, footprint(&path)?, stack));
     }
-    let bare = found.last().map_or_else(Footprint::default, |(_, bare, _)| *bare);
-    let row = |(image, footprint, stack): (&str, Footprint, Option<u64>)| Row {
-        board: board.name.to_owned(),
-        image: image.to_owned(),
-        flash: footprint.flash,
-        static_ram: footprint.static_ram,
-        stack,
-        cara_flash: footprint.flash.saturating_sub(bare.flash),
-        cara_ram: footprint.static_ram.saturating_sub(bare.static_ram),
+    let row = |(image, footprint, stack): &(&Image, Footprint, Option<u64>)| {
+        let bare = found.iter().find(|(other, ..)| other.is_bare() && other.has_logs == image.has_logs);
+        let bare = bare.map_or_else(Footprint::default, |(_, bare, _)| *bare);
+        Row {
+            board: board.name.to_owned(),
+            image: image.name.to_owned(),
+            flash: footprint.flash,
+            static_ram: footprint.static_ram,
+            stack: *stack,
+            cara_flash: footprint.flash.saturating_sub(bare.flash),
+            cara_ram: footprint.static_ram.saturating_sub(bare.static_ram),
+        }
     };
-    Ok(found.into_iter().map(row).collect())
+    Ok(found.iter().map(row).collect())
 }
 
 /// The deepest stack under load; none, with the reason printed, where nothing can be run.
@@ -97,7 +101,7 @@ fn stack(path: &Path, image: &str) -> Result<Option<u64>> {
 /// Prints what each capacity of `Resources` costs, as the board itself tells.
 fn print_resources() -> Result<()> {
     let board = super::boards::find(TESTED)?;
-    let image = board.build("resources")?;
+    let image = board.build(&RESOURCES)?;
     if install::program("qemu-system-arm", "qemu-system-arm").is_err() {
         return Ok(());
     }

@@ -10,7 +10,6 @@ use cara_lm3s6965evb::ethernet::Ethernet;
 use cara_lm3s6965evb::watchdog::Watchdog;
 use cara_lm3s6965evb::{executor, fault, reset, stack, start};
 use cara_vehicle::{SOCKETS, Vehicle, VehicleResources};
-use defmt_semihosting as _;
 use embassy_executor::Spawner;
 use embassy_net::{Runner, StackResources};
 use embassy_time::{Duration, Timer};
@@ -24,10 +23,10 @@ const PRESSED_EVERY: Duration = Duration::from_secs(10);
 #[cortex_m_rt::entry]
 fn main() -> ! {
     let _core = start();
-    defmt::info!("started because of {}", reset::reason());
+    cara_vehicle::info!("started because of {}", reset::reason());
     executor::run(|spawner| {
         if let Err(text) = spawn(spawner) {
-            defmt::error!("{=str}", text);
+            cara_vehicle::error!("{=str}", text);
             semihosting::process::exit(fault::PANICKED)
         }
     })
@@ -52,12 +51,13 @@ fn spawn(spawner: Spawner) -> Result<(), &'static str> {
     if hang {
         offer_to_hang(vehicle)?;
     }
-    defmt::info!("{=str}/{=u32}", settings.identity.name(), settings.identity.id());
+    cara_vehicle::info!("{=str}/{=u32}", settings.identity.name(), settings.identity.id());
     spawner.spawn(network(network_runner).map_err(|_| NO_ROOM)?);
     spawner.spawn(unit(unit_runner).map_err(|_| NO_ROOM)?);
     spawner.spawn(drive(vehicle).map_err(|_| NO_ROOM)?);
     spawner.spawn(button(vehicle).map_err(|_| NO_ROOM)?);
     spawner.spawn(watch().map_err(|_| NO_ROOM)?);
+    spawner.spawn(stack::report().map_err(|_| NO_ROOM)?);
     Ok(())
 }
 
@@ -92,18 +92,12 @@ async fn button(vehicle: Vehicle) -> ! {
     cara_vehicle::call_mechanic(vehicle, async || Timer::after(PRESSED_EVERY).await).await
 }
 
-/// Feeds the watchdog for as long as tasks get their turn, and tells how deep the stack has been.
+/// Feeds the watchdog for as long as tasks get their turn.
 #[embassy_executor::task]
 async fn watch() -> ! {
     let mut watchdog = Watchdog::start(HANGS.as_millis() as u32);
-    let mut deepest = 0;
     loop {
         watchdog.feed();
-        let stack = stack::used();
-        if stack.used > deepest {
-            deepest = stack.used;
-            defmt::info!("stack {=usize} of {=usize} bytes", stack.used, stack.size);
-        }
-        Timer::after(Duration::from_secs(1)).await;
+        Timer::after(HANGS / 4).await;
     }
 }

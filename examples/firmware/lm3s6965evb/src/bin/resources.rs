@@ -6,7 +6,6 @@
 use cara_apps::agv::Agv;
 use cara_embassy::{Resources, message_buffer};
 use cara_lm3s6965evb as _;
-use defmt_semihosting as _;
 use semihosting::println;
 
 type Unit<
