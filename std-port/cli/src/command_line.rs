@@ -6,7 +6,7 @@ use clap::{Command, CommandFactory, FromArgMatches, Parser, Subcommand};
 
 use crate::exit::{self, EXIT_CODES, Ended};
 use crate::global::Global;
-use crate::{commands, doctor, node, provision};
+use crate::{commands, doctor, keys, node, provision};
 
 /// Shows and calls the nodes of a CARA fleet, through the m_unit that runs on this host or as an m_unit itself.
 #[derive(Parser)]
@@ -31,6 +31,7 @@ pub(crate) enum Verb {
     Bench(commands::bench::Arguments),
     Node(node::Arguments),
     Doctor(doctor::Arguments),
+    Keys(keys::Arguments),
     Provision(provision::Arguments),
     Completions(commands::completions::Arguments),
     Man(commands::man::Arguments),

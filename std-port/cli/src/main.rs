@@ -7,6 +7,7 @@ mod doctor;
 mod exit;
 mod global;
 mod interrupt;
+mod keys;
 mod name_and_id;
 mod node;
 mod nodes;
@@ -44,6 +45,7 @@ fn run(verb: Verb, global: &Global) -> anyhow::Result<ExitCode> {
         Verb::Bench(arguments) => commands::bench::run(arguments, global),
         Verb::Node(arguments) => node::run(arguments, global),
         Verb::Doctor(arguments) => doctor::run(arguments, global),
+        Verb::Keys(arguments) => keys::run(arguments, global),
         Verb::Provision(arguments) => provision::run(arguments, global),
         Verb::Completions(arguments) => commands::completions::run(arguments, global),
         Verb::Man(arguments) => commands::man::run(arguments, global),

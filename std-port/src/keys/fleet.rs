@@ -45,11 +45,11 @@ impl FleetKeys {
         self.members.add(identity, managers)
     }
 
-    /// Takes a node out of all rings, and begins a generation that it has nothing of. Until older generations are
-    /// [finished](Self::finish) it can still make discovery messages that others take for the fleet's; nobody opens a
-    /// link to it.
-    pub fn revoke(&mut self, identity: &Identity) -> Result<(), FleetError> {
-        self.members.revoke(identity)
+    /// Takes nodes out of all rings, and begins a generation that they have nothing of. Until older generations are
+    /// [finished](Self::finish) they can still make discovery messages that others take for the fleet's; nobody opens a
+    /// link to them. Where one of them is no node of the fleet, nothing changes.
+    pub fn revoke(&mut self, identities: &[Identity]) -> Result<(), FleetError> {
+        self.members.revoke(identities)
     }
 
     /// Begins a generation. Those before it stay in use until they are [finished](Self::finish).
@@ -149,7 +149,7 @@ mod tests {
     fn who_is_revoked_shares_no_key_with_anybody() {
         let mut keys = fleet();
         let stolen = keys.ring(&agv(1)).unwrap();
-        keys.revoke(&agv(1)).unwrap();
+        keys.revoke(&[agv(1)]).unwrap();
         assert_eq!(keys.ring(&agv(1)).map(drop), Err(FleetError::Unknown(agv(1))));
         let manager = keys.ring(&depot()).unwrap();
         assert!(manager.pair(&agv(1)).is_none());

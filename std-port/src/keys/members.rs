@@ -149,14 +149,17 @@ impl Members {
         self.nodes.iter().map(|node| &node.identity).filter(|identity| identity.role() == Role::MUnit)
     }
 
-    /// Takes a node out, and begins a generation that it has nothing of. Of more generations than may be in use the
+    /// Takes nodes out, and begins a generation that they have nothing of. Of more generations than may be in use the
     /// oldest ends: a node must never stay in because others are slow.
-    pub(super) fn revoke(&mut self, identity: &Identity) -> Result<(), FleetError> {
-        self.node(identity)?;
+    pub(super) fn revoke(&mut self, identities: &[Identity]) -> Result<(), FleetError> {
+        identities.iter().try_for_each(|identity| self.node(identity).map(drop))?;
         let newest = self.newest.checked_add(1).ok_or(FleetError::Exhausted)?;
-        self.nodes.retain(|node| node.identity != *identity);
-        self.nodes.iter_mut().for_each(|node| node.managers.retain(|manager| manager != identity));
-        self.revoked.push(Revoked { identity: identity.clone(), from: newest });
+        self.nodes.retain(|node| !identities.contains(&node.identity));
+        self.nodes.iter_mut().for_each(|node| node.managers.retain(|manager| !identities.contains(manager)));
+        let mut revoked = identities.to_vec();
+        revoked.sort();
+        revoked.dedup();
+        self.revoked.extend(revoked.into_iter().map(|identity| Revoked { identity, from: newest }));
         self.newest = newest;
         self.oldest = self.oldest.max(newest.saturating_sub(GENERATIONS - 1));
         Ok(())
@@ -314,10 +317,11 @@ mod tests {
     #[test]
     fn who_is_revoked_is_in_no_generation_and_comes_back_in_the_newest() {
         let mut members = fleet();
-        members.revoke(&agv(1)).unwrap();
+        members.revoke(&[agv(1)]).unwrap();
         assert_eq!(members.generations().collect::<Vec<_>>(), [2, 1]);
         assert_eq!(members.revoked(), [Revoked { identity: agv(1), from: 2 }]);
-        assert_eq!(members.revoke(&agv(1)), Err(FleetError::Unknown(agv(1))));
+        assert_eq!(members.revoke(&[agv(2), agv(1)]), Err(FleetError::Unknown(agv(1))));
+        assert!(members.node(&agv(2)).is_ok(), "all of them or none");
         members.add(&agv(1), &[m_unit("depot")]).unwrap();
         assert_eq!((members.node(&agv(1)).unwrap().since, members.revoked().len()), (2, 0));
     }
@@ -325,7 +329,7 @@ mod tests {
     #[test]
     fn without_its_manager_a_node_talks_to_nobody() {
         let mut members = fleet();
-        members.revoke(&m_unit("depot")).unwrap();
+        members.revoke(&[m_unit("depot")]).unwrap();
         assert_eq!((peers(&members, &agv(1)), peers(&members, &agv(2))), (vec![], vec!["hall/1".to_owned()]));
         members.add(&agv(1), &[]).unwrap();
         assert_eq!(peers(&members, &agv(1)), ["hall/1"]);
@@ -337,14 +341,14 @@ mod tests {
         assert_eq!(members.finish(), Err(FleetError::NothingToFinish(1)));
         (1..GENERATIONS).for_each(|_| members.rotate().unwrap());
         assert_eq!(members.rotate(), Err(FleetError::Generations(GENERATIONS)));
-        members.revoke(&agv(1)).unwrap();
+        members.revoke(&[agv(1)]).unwrap();
         assert_eq!(members.generations().collect::<Vec<_>>(), [5, 4, 3, 2]);
         members.finish().unwrap();
         assert_eq!(members.generations().collect::<Vec<_>>(), [5]);
         members.newest = u32::MAX;
         members.oldest = u32::MAX;
         assert_eq!(
-            (members.rotate(), members.revoke(&agv(2))),
+            (members.rotate(), members.revoke(&[agv(2)])),
             (Err(FleetError::Exhausted), Err(FleetError::Exhausted))
         );
         assert!(members.node(&agv(2)).is_ok());
@@ -355,14 +359,14 @@ mod tests {
         let mut members = fleet();
         members.add(&Identity::s_unit("a b/c #1", 9).unwrap(), &[m_unit("hall")]).unwrap();
         members.rotate().unwrap();
-        members.revoke(&agv(1)).unwrap();
+        members.revoke(&[agv(1)]).unwrap();
         assert_eq!(Members::parse(&members.text()), Ok(members));
     }
 
     #[test]
     fn every_line_that_is_wrong_is_told_by_its_number() {
         let mut members = fleet();
-        members.revoke(&agv(1)).unwrap();
+        members.revoke(&[agv(1)]).unwrap();
         let text = members.text();
         let parse = |text: &str| Members::parse(text).map(drop).map_err(|error| error.line);
         for (index, line) in text.lines().enumerate().skip(1) {

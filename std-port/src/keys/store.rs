@@ -253,7 +253,7 @@ mod tests {
         store.keys_mut().add(&agv(3), &[]).unwrap();
         let expected = [("depot/1".into(), Change::Replaced), ("agv/3".into(), Change::New)];
         assert_eq!(changes(&store.save().unwrap()), expected);
-        store.keys_mut().revoke(&agv(1)).unwrap();
+        store.keys_mut().revoke(&[agv(1)]).unwrap();
         let written = changes(&store.save().unwrap());
         assert_eq!(written.first(), Some(&("agv/1".into(), Change::Removed)));
         assert_eq!(written.len(), 4);

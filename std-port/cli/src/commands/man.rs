@@ -43,13 +43,17 @@ fn page(command: Command) -> anyhow::Result<Vec<u8>> {
     Ok(page)
 }
 
+/// The command, its verbs, and theirs.
+fn with_verbs(command: Command) -> Vec<Command> {
+    let verbs: Vec<_> = command.get_subcommands().filter(|verb| verb.get_name() != "help").cloned().collect();
+    [command].into_iter().chain(verbs.into_iter().flat_map(with_verbs)).collect()
+}
+
 fn write(command: Command, dir: &std::path::Path, global: &Global) -> anyhow::Result<()> {
     std::fs::create_dir_all(dir).with_context(|| format!("{} cannot be made", dir.display()))?;
-    let verbs: Vec<_> = command.get_subcommands().filter(|verb| verb.get_name() != "help").cloned().collect();
-    let pages = verbs.into_iter().map(|verb| (format!("cara-{}.1", verb.get_name()), verb));
     let mut written = Vec::new();
-    for (name, command) in [("cara.1".to_owned(), command)].into_iter().chain(pages) {
-        let path = dir.join(name);
+    for command in with_verbs(command) {
+        let path = dir.join(format!("{}.1", command.get_display_name().unwrap_or_else(|| command.get_name())));
         std::fs::write(&path, page(command)?).with_context(|| format!("{} cannot be written", path.display()))?;
         written.push(path.display().to_string());
     }

@@ -8,7 +8,7 @@ use serde_json::Value;
 use crate::support::Stage;
 
 const REFERENCE: &str = "../../docs/cara.md";
-const VERBS: [&str; 14] = [
+const VERBS: [&str; 15] = [
     "scan",
     "functions",
     "call",
@@ -20,6 +20,7 @@ const VERBS: [&str; 14] = [
     "bench",
     "node",
     "doctor",
+    "keys",
     "provision",
     "completions",
     "man",

@@ -1,0 +1,154 @@
+//! `cara keys`: makes the keys of a fleet and of its nodes. All of the work is in `cara_std::keys`; [`told`] says what was
+//! changed and what to do next, and [`show`] what there is, never a key.
+
+mod show;
+mod told;
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use cara_core::distribution::identity::{Fleet, Identity, Role};
+use cara_std::keys::place::own_folder;
+use cara_std::keys::{FleetError, FleetKeys, KeyError, Store, parse_node};
+
+use crate::exit::{Ended, Exit};
+use crate::global::Global;
+use crate::name_and_id::NameAndId;
+
+/// Makes the keys of a fleet and of its nodes, shows whose there are, takes nodes out, and changes keys.
+///
+/// A fleet has one root, from which the keys of all nodes come; it stays in its folder. Each node has a file, which is
+/// brought to where the node runs.
+#[derive(clap::Args)]
+#[command(
+    flatten_help = true,
+    after_help = "\
+cara keys new-fleet --fleet 7 depot/1@m_unit agv-17/17
+cara keys derive --fleet 7 agv-18/18
+cara keys revoke --fleet 7 agv-17/17
+cara keys rotate --fleet 7 --finish"
+)]
+pub(crate) struct Arguments {
+    #[command(subcommand)]
+    action: Action,
+    /// The folder with the fleet's root [default: cara/keys in XDG_CONFIG_HOME or ~/.config; or CARA_KEYS].
+    #[arg(long, global = true, value_name = "FOLDER")]
+    dir: Option<PathBuf>,
+}
+
+#[derive(clap::Subcommand)]
+enum Action {
+    /// Draws the root of a fleet that has none yet, and makes the keys of its first nodes.
+    NewFleet(Nodes),
+    /// Makes the keys of nodes, or writes again what is missing, and updates the files of those that they talk to.
+    Derive(Nodes),
+    /// Shows the fleet's nodes, or what is in the file of one; fingerprints and never keys.
+    Show {
+        /// The file of a node.
+        file: Option<PathBuf>,
+    },
+    /// Takes nodes out: begins a generation of keys that they have nothing of.
+    Revoke {
+        /// NAME/ID of an s_unit, NAME/ID@m_unit of an m_unit.
+        #[arg(required = true, value_name = "NODE", value_parser = parse_node)]
+        nodes: Vec<Identity>,
+    },
+    /// Begins a generation of keys for all nodes, beside those in use.
+    Rotate {
+        /// End all generations but the newest instead: when all nodes have their new files.
+        #[arg(long)]
+        finish: bool,
+    },
+}
+
+/// Nodes that are added.
+#[derive(clap::Args)]
+struct Nodes {
+    /// NAME/ID of an s_unit, NAME/ID@m_unit of an m_unit.
+    #[arg(value_name = "NODE", value_parser = parse_node)]
+    nodes: Vec<Identity>,
+    /// The m_unit that these s_units belong to; may be repeated. Unless told, the only one of the fleet.
+    #[arg(long, value_name = "NAME/ID")]
+    manager: Vec<NameAndId>,
+}
+
+pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
+    let folder = || arguments.dir.clone().or_else(own_folder).ok_or_else(|| Ended::usage("say where: --dir FOLDER"));
+    match &arguments.action {
+        Action::NewFleet(nodes) => new_fleet(nodes, folder()?, global)?,
+        Action::Derive(nodes) => change(folder()?, global, told::Done::Derived, |keys| nodes.add_to(keys))?,
+        Action::Show { file: Some(file) } => show::ring(file, global)?,
+        Action::Show { file: None } => show::fleet(&open(folder()?, global)?, global)?,
+        Action::Revoke { nodes } => {
+            change(folder()?, global, told::Done::Revoked, |keys| keys.revoke(nodes).map_err(wrong))?;
+        }
+        Action::Rotate { finish: false } => {
+            change(folder()?, global, told::Done::Rotated, |keys| keys.rotate().map_err(wrong))?;
+        }
+        Action::Rotate { finish: true } => {
+            change(folder()?, global, told::Done::Finished, |keys| keys.finish().map_err(wrong))?;
+        }
+    }
+    Ok(Exit::Done.into())
+}
+
+impl Nodes {
+    fn add_to(&self, keys: &mut FleetKeys) -> anyhow::Result<()> {
+        let managers: Result<Vec<_>, _> = self.manager.iter().map(m_unit).collect();
+        let managers = managers?;
+        let mut nodes: Vec<_> = self.nodes.iter().collect();
+        // M_units first, so that others can belong to them.
+        nodes.sort_by_key(|identity| identity.role());
+        let has_s_units = nodes.iter().any(|identity| identity.role() == Role::SUnit);
+        nodes.into_iter().try_for_each(|identity| {
+            let is_meant = identity.role() == Role::SUnit || !has_s_units;
+            keys.add(identity, if is_meant { &managers } else { &[] }).map_err(wrong)
+        })
+    }
+}
+
+fn m_unit(NameAndId { name, id }: &NameAndId) -> anyhow::Result<Identity> {
+    Identity::m_unit(name, *id).map_err(|error| Ended::usage(format!("--manager {name}/{id}: {error}")))
+}
+
+fn new_fleet(nodes: &Nodes, folder: PathBuf, global: &Global) -> anyhow::Result<()> {
+    let mut keys = FleetKeys::draw(Fleet(global.fleet.unwrap_or(0))).map_err(failed)?;
+    nodes.add_to(&mut keys)?;
+    let store = Store::create(&folder, keys).map_err(failed)?;
+    told::tell(told::Done::Made, &store, &store.save().map_err(failed)?, global)
+}
+
+fn change(
+    folder: PathBuf,
+    global: &Global,
+    done: told::Done,
+    change: impl FnOnce(&mut FleetKeys) -> anyhow::Result<()>,
+) -> anyhow::Result<()> {
+    let mut store = open(folder, global)?;
+    change(store.keys_mut())?;
+    told::tell(done, &store, &store.save().map_err(failed)?, global)
+}
+
+/// The keys of the fleet that is meant: of the only one in the folder, unless one is named.
+fn open(folder: PathBuf, global: &Global) -> anyhow::Result<Store> {
+    let fleet = match (global.fleet, Store::fleets(&folder).as_slice()) {
+        (Some(fleet), _) => Fleet(fleet),
+        (None, [only]) => *only,
+        (None, []) => Fleet(0),
+        (None, several) => {
+            let options: Vec<_> = several.iter().map(|fleet| format!("--fleet {}", fleet.0)).collect();
+            let text = format!("{} has several fleets: say {}", folder.display(), options.join(" or "));
+            return Err(Ended::usage(text));
+        }
+    };
+    Store::open(&folder, fleet).map_err(failed)
+}
+
+/// What is wrong with keys, as the end of a command.
+pub(crate) fn failed(error: KeyError) -> anyhow::Error {
+    Ended::failed("Keys", error.to_string())
+}
+
+fn wrong(error: FleetError) -> anyhow::Error {
+    Ended::usage(error.to_string())
+}

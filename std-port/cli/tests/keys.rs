@@ -1,0 +1,283 @@
+//! `cara keys` as a process: what it makes, what it shows, what it refuses, and that docs/keys.md says what it prints.
+
+use std::fs;
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use cara_std::keys::{KeyRing, parse_node, place};
+use cara_std::{Fleet, Identity};
+use serde_json::Value;
+use tempfile::TempDir;
+
+const GUIDE: &str = "../../docs/keys.md";
+
+/// A home without keys.
+struct Home(TempDir);
+
+impl Home {
+    fn new() -> Self {
+        Self(TempDir::new().unwrap())
+    }
+
+    /// One with fleet 7: a manager and two AGVs.
+    fn with_fleet() -> Self {
+        let home = Self::new();
+        home.done(&["new-fleet", "--fleet", "7", "depot/1@m_unit", "agv/1", "agv/2"]);
+        home
+    }
+
+    fn cara(&self, arguments: &[&str]) -> Output {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_cara"));
+        command.arg("keys").args(arguments).current_dir(self.0.path()).env("HOME", self.0.path());
+        command.env_remove("XDG_CONFIG_HOME").env_remove("CARA_KEYS").output().unwrap()
+    }
+
+    /// The standard output of what must succeed.
+    #[track_caller]
+    fn done(&self, arguments: &[&str]) -> String {
+        let ran = self.cara(arguments);
+        assert!(ran.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&ran.stderr));
+        String::from_utf8(ran.stdout).unwrap()
+    }
+
+    #[track_caller]
+    fn json(&self, arguments: &[&str]) -> Value {
+        serde_json::from_str(&self.done(&[arguments, &["--json"]].concat())).unwrap()
+    }
+
+    /// Must end with `code` and say `text`.
+    #[track_caller]
+    fn refused(&self, arguments: &[&str], code: i32, text: &str) {
+        let ran = self.cara(arguments);
+        let said = String::from_utf8_lossy(&ran.stderr).into_owned();
+        assert_eq!(ran.status.code(), Some(code), "{arguments:?}: {said}");
+        assert!(said.contains(text), "{arguments:?}: {said}");
+    }
+
+    fn folder(&self) -> PathBuf {
+        self.0.path().join(".config/cara/keys")
+    }
+
+    fn file(&self, node: &str) -> PathBuf {
+        self.folder().join(place::file_name(&named(node), Fleet(7)))
+    }
+
+    fn ring(&self, node: &str) -> KeyRing {
+        KeyRing::load_of(&self.file(node), &named(node), Fleet(7)).unwrap()
+    }
+}
+
+fn named(node: &str) -> Identity {
+    parse_node(node).unwrap()
+}
+
+/// The generations of the keys of two nodes, as the first one has them.
+fn generations(ring: &KeyRing, peer: &str) -> Vec<u32> {
+    ring.pairs(&named(peer)).map(|(number, _)| number).collect()
+}
+
+#[test]
+fn nodes_of_a_new_fleet_have_each_others_keys() {
+    let home = Home::with_fleet();
+    let (depot, agv) = (home.ring("depot/1@m_unit"), home.ring("agv/1"));
+    assert_eq!(depot.pair(&named("agv/1")).unwrap().expose(), agv.pair(&named("depot/1@m_unit")).unwrap().expose());
+    assert_eq!(depot.discovery().expose(), agv.discovery().expose());
+    assert!(agv.pair(&named("agv/2")).is_none());
+    let mode = |path: &Path| fs::metadata(path).unwrap().permissions().mode() & 0o777;
+    assert_eq!(mode(&home.folder()), 0o700);
+    for file in fs::read_dir(home.folder()).unwrap() {
+        assert_eq!(mode(&file.unwrap().path()), 0o600);
+    }
+    let other = Home::with_fleet();
+    assert_ne!(other.ring("agv/1").discovery().expose(), agv.discovery().expose(), "roots are drawn");
+}
+
+#[test]
+fn managers_know_each_other_and_their_own_vehicles() {
+    let home = Home::with_fleet();
+    home.refused(&["derive", "hall/2@m_unit", "agv/3"], 2, "Say `--manager depot/1` or `--manager hall/2`");
+    assert!(!home.file("hall/2@m_unit").exists(), "a mistake changes nothing");
+    home.done(&["derive", "agv/3", "hall/2@m_unit", "--manager", "hall/2"]);
+    let (depot, hall) = (home.ring("depot/1@m_unit"), home.ring("hall/2@m_unit"));
+    assert_eq!(hall.peers(), [&named("depot/1@m_unit"), &named("agv/3")]);
+    assert_eq!(
+        depot.pair(&named("hall/2@m_unit")).unwrap().expose(),
+        hall.pair(&named("depot/1@m_unit")).unwrap().expose()
+    );
+    assert!(depot.pair(&named("agv/3")).is_none());
+    home.done(&["derive", "agv/3", "--manager", "hall/2", "--manager", "depot/1"]);
+    assert!(home.ring("depot/1@m_unit").pair(&named("agv/3")).is_some());
+}
+
+#[test]
+fn who_is_revoked_is_in_nobody_s_file() {
+    let home = Home::with_fleet();
+    let stolen = home.ring("agv/1");
+    let told = home.json(&["revoke", "agv/1"]);
+    let changes: Vec<_> =
+        told["written"].as_array().unwrap().iter().map(|one| [&one["node"], &one["change"]]).collect();
+    assert_eq!(changes, [["agv/1", "removed"], ["depot/1@m_unit", "replaced"], ["agv/2", "replaced"]]);
+    assert_eq!((&told["generations"], told["next"].as_array().unwrap().len()), (&serde_json::json!([2, 1]), 2));
+    let depot = home.ring("depot/1@m_unit");
+    assert!(generations(&depot, "agv/1").is_empty() && !home.file("agv/1").exists());
+    assert_eq!(generations(&depot, "agv/2"), [2, 1]);
+    let files = fs::read_dir(home.folder()).unwrap().map(|file| fs::read_to_string(file.unwrap().path()).unwrap());
+    let key: String =
+        stolen.pair(&named("depot/1@m_unit")).unwrap().expose().iter().map(|byte| format!("{byte:02x}")).collect();
+    assert!(files.into_iter().all(|text| !text.contains(&key)));
+
+    home.done(&["derive", "agv/1"]);
+    assert_eq!(generations(&home.ring("depot/1@m_unit"), "agv/1"), [2]);
+    assert_eq!(home.json(&["show"])["revoked"], serde_json::json!([]));
+    home.refused(&["revoke", "agv/9"], 2, "agv/9 is not in the fleet");
+    home.refused(&["revoke"], 2, "NODE");
+}
+
+#[test]
+fn without_its_manager_a_vehicle_is_told() {
+    let home = Home::with_fleet();
+    let said = home.done(&["revoke", "depot/1@m_unit"]);
+    assert!(said.contains("`cara keys derive --fleet 7 agv/1 --manager NAME/ID`"), "{said}");
+    home.done(&["derive", "yard/1@m_unit", "agv/1", "agv/2"]);
+    assert_eq!(home.ring("yard/1@m_unit").peers().len(), 2);
+}
+
+#[test]
+fn a_change_of_keys_begins_and_is_finished() {
+    let home = Home::with_fleet();
+    home.refused(&["rotate", "--finish"], 2, "nothing to finish");
+    home.done(&["rotate"]);
+    assert_eq!(generations(&home.ring("agv/1"), "depot/1@m_unit"), [2, 1]);
+    home.done(&["rotate"]);
+    home.done(&["rotate"]);
+    home.refused(&["rotate"], 2, "`cara keys rotate --finish`");
+    home.done(&["revoke", "agv/2"]);
+    assert_eq!(generations(&home.ring("agv/1"), "depot/1@m_unit"), [5, 4, 3, 2]);
+    home.done(&["rotate", "--finish"]);
+    assert_eq!(generations(&home.ring("agv/1"), "depot/1@m_unit"), [5]);
+}
+
+#[test]
+fn what_is_missing_is_written_again() {
+    let home = Home::with_fleet();
+    let before = fs::read(home.file("agv/1")).unwrap();
+    fs::remove_file(home.file("agv/1")).unwrap();
+    assert!(home.done(&["show"]).contains("not here"));
+    home.done(&["derive"]);
+    assert_eq!(fs::read(home.file("agv/1")).unwrap(), before);
+    assert!(home.done(&["derive"]).contains("every file is as it should be"));
+}
+
+/// No command prints a byte of a key, whatever the form.
+#[test]
+fn no_key_is_printed() {
+    let home = Home::with_fleet();
+    let (depot, root) = (home.file("depot/1@m_unit"), home.folder().join("fleet-7.root"));
+    let mut said = vec![home.done(&["rotate"])];
+    let shown: [&[&str]; 4] =
+        [&["show"], &["show", "--json"], &["show", depot.to_str().unwrap()], &["derive", "agv/3", "--json"]];
+    said.extend(shown.map(|arguments| home.done(arguments)));
+    said.push(home.done(&["show", depot.to_str().unwrap(), "--json"]));
+    // Errors neither: each line of the file is cut short in its turn.
+    for file in [&depot, &root] {
+        let text = fs::read_to_string(file).unwrap();
+        for line in text.lines().filter(|line| line.len() > 64) {
+            fs::write(file, text.replace(line, &line[..line.len() / 2])).unwrap();
+            let ran = home.cara(&if file == &root { vec!["show"] } else { vec!["show", depot.to_str().unwrap()] });
+            said.push(String::from_utf8_lossy(&ran.stderr).into_owned());
+        }
+        fs::write(file, text).unwrap();
+    }
+    let files = [depot, root, home.file("agv/1")].map(|file| fs::read_to_string(file).unwrap());
+    let keys: Vec<_> = files.iter().flat_map(|text| text.split_whitespace()).filter(|word| word.len() == 64).collect();
+    assert!(keys.len() >= 8);
+    for key in keys {
+        // Eight digits of a key in a row are no accident.
+        let pieces = (0..=56).step_by(8).map(|at| &key[at..at + 8]);
+        pieces.for_each(|piece| assert!(said.iter().all(|said| !said.contains(piece)), "{piece} of {key}"));
+    }
+}
+
+#[test]
+fn every_mistake_is_told() {
+    let home = Home::new();
+    home.refused(&[], 2, "cara keys");
+    home.refused(&["derive", "agv/1"], 1, "`cara keys new-fleet --fleet 0`");
+    home.refused(&["new-fleet", "agv/1"], 2, "name one with it");
+    home.refused(&["new-fleet", "agv"], 2, "NAME/ID@m_unit for an m_unit");
+    home.refused(&["new-fleet", "agv/1@manager"], 2, "0 to 4294967295");
+    home.refused(&["new-fleet", "depot/1@m_unit", "--manager", "depot/1"], 2, "leave --manager away");
+    assert!(!home.folder().exists());
+    let home = Home::with_fleet();
+    home.refused(&["new-fleet", "--fleet", "7"], 1, "is there already");
+    home.refused(&["derive", "agv/3", "--manager", "agv/1"], 2, "agv/1 is no m_unit of the fleet");
+    home.refused(&["show", "--fleet", "8"], 1, "`cara keys new-fleet --fleet 8`");
+    home.refused(&["show", "agv/1"], 2, "is no file");
+    home.refused(&["show", "absent.keys"], 1, "absent.keys");
+    home.done(&["new-fleet", "--fleet", "9"]);
+    home.refused(&["show"], 2, "say --fleet 7 or --fleet 9");
+    fs::set_permissions(home.file("agv/1"), fs::Permissions::from_mode(0o640)).unwrap();
+    let text = format!("chmod 600 {}", home.file("agv/1").display());
+    home.refused(&["show", home.file("agv/1").to_str().unwrap()], 1, &text);
+    home.refused(&["rotate", "--fleet", "7"], 1, &text);
+    let error: Value = serde_json::from_slice(&home.cara(&["show", "--fleet", "8", "--json"]).stderr).unwrap();
+    assert_eq!((&error["error"]["name"], &error["error"]["exit"]), (&"Keys".into(), &1.into()));
+}
+
+#[test]
+fn another_folder_is_another_store() {
+    let home = Home::with_fleet();
+    let other = home.0.path().join("other folder");
+    home.done(&["--dir", other.to_str().unwrap(), "new-fleet", "--fleet", "7", "depot/1@m_unit"]);
+    assert!(other.join("depot-1-m_unit-7.keys").exists());
+    let ran = Command::new(env!("CARGO_BIN_EXE_cara"))
+        .args(["keys", "show", "--json"])
+        .env("CARA_KEYS", &other)
+        .output()
+        .unwrap();
+    let shown: Value = serde_json::from_slice(&ran.stdout).unwrap();
+    assert_eq!(shown["nodes"].as_array().unwrap().len(), 1);
+}
+
+/// What a guide shows after `$ `, run in order, prints what it shows; keys are drawn, so their fingerprints differ.
+#[test]
+fn the_guide_shows_what_is_printed() {
+    let home = Home::new();
+    let text = fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(GUIDE)).unwrap();
+    let blocks: Vec<_> = text.split("```console\n").skip(1).map(|block| block.split("```").next().unwrap()).collect();
+    assert!(blocks.len() >= 5);
+    for block in blocks {
+        let (line, expected) = block.strip_prefix("$ cara keys ").unwrap().split_once('\n').unwrap();
+        let printed = home.done(&line.split(' ').collect::<Vec<_>>());
+        let printed = printed.replace(home.0.path().to_str().unwrap(), "/home/me");
+        assert_eq!(without_fingerprints(&printed), without_fingerprints(expected), "cara keys {line}");
+    }
+}
+
+#[test]
+fn the_reference_has_every_key_of_the_json() {
+    let reference = fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/cara.md")).unwrap();
+    let section = reference.split("## `cara keys`").nth(1).unwrap().split("\n## ").next().unwrap();
+    let words: Vec<_> = section.split(|c: char| !c.is_ascii_alphanumeric()).collect();
+    let home = Home::with_fleet();
+    let file = home.file("depot/1@m_unit");
+    let told = [home.json(&["revoke", "agv/1"]), home.json(&["show"]), home.json(&["show", file.to_str().unwrap()])];
+    for told in told.map(|told| told.to_string()) {
+        let keys: Vec<_> =
+            told.split("\":").filter_map(|before| before.rsplit('"').next()).filter(|key| !key.contains('}')).collect();
+        assert!(keys.len() > 3);
+        keys.iter().for_each(|key| assert!(words.contains(key), "{key} is not in docs/cara.md"));
+    }
+}
+
+/// With every word of 12 hexadecimal digits as the same one.
+fn without_fingerprints(text: &str) -> String {
+    let is_one = |word: &str| word.len() == 12 && word.chars().all(|c| c.is_ascii_hexdigit());
+    let pieces = text.split_inclusive(|c: char| !c.is_ascii_alphanumeric());
+    let replaced = pieces.map(|piece| {
+        let word = piece.trim_end_matches(|c: char| !c.is_ascii_alphanumeric());
+        if is_one(word) { piece.replace(word, "FINGERPRINT") } else { piece.to_owned() }
+    });
+    replaced.collect()
+}
