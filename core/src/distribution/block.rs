@@ -170,7 +170,7 @@ pub fn prepare_results<'s>(
     for (position, spec) in specs.enumerate() {
         let index = position as u8;
         let Ok(value) = parameters.value(spec.name) else {
-            parameters.add(spec.name, spec.kind, spec.size)?;
+            parameters.add_checked(spec.name, spec.kind, spec.size)?;
             continue;
         };
         if value.kind() != spec.kind {
@@ -258,7 +258,7 @@ fn commit<'s>(
         let index = match parameters.find(spec.name) {
             Some(index) => index,
             None => {
-                parameters.add(spec.name, spec.kind, spec.size)?;
+                parameters.add_checked(spec.name, spec.kind, spec.size)?;
                 parameters.len().saturating_sub(1)
             }
         };

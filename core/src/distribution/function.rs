@@ -35,10 +35,8 @@ pub struct Definition {
 /// A signature in somebody else's bytes; `Display` is its text form.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub struct Signature<'a> {
+    /// Checked: what is looked at often is not read as a whole first.
     bytes: &'a [u8],
-    name: &'a str,
-    arguments: VariableSpecs<'a>,
-    results: VariableSpecs<'a>,
 }
 
 /// Name, type and size of one argument or result.
@@ -86,7 +84,7 @@ impl Definition {
 
     /// The function's name.
     pub fn name(&self) -> &str {
-        self.signature().name
+        self.signature().name()
     }
 
     /// The signature.
@@ -123,24 +121,30 @@ fn specs_of(parameters: &ParametersView) -> impl Iterator<Item = VariableSpec<'_
 impl<'a> Signature<'a> {
     /// Checks an encoded signature; [`Error::Malformed`] for anything that [`Definition`] could not have made.
     pub fn decode(bytes: &'a [u8]) -> Result<Self, Error> {
-        let signature = Self::split(bytes).ok_or(Error::Malformed)?;
-        let rebuilt = Definition::build(signature.name, signature.arguments(), signature.results());
-        rebuilt.map(|_| signature).map_err(|_| Error::Malformed)
+        let (name, arguments, results) = Self::split(bytes).ok_or(Error::Malformed)?;
+        let rebuilt = Definition::build(name, arguments, results);
+        rebuilt.map(|_| Self { bytes }).map_err(|_| Error::Malformed)
     }
 
     /// The function's name.
-    pub const fn name(&self) -> &'a str {
-        self.name
+    pub fn name(&self) -> &'a str {
+        let name = self.behind_length().and_then(|(length, rest)| rest.get(..length));
+        name.and_then(|name| core::str::from_utf8(name).ok()).unwrap_or_default()
     }
 
     /// What a caller must pass.
-    pub const fn arguments(&self) -> VariableSpecs<'a> {
-        self.arguments
+    pub fn arguments(&self) -> VariableSpecs<'a> {
+        VariableSpecs::of_checked(self.behind_length().and_then(|(length, rest)| rest.get(length..)))
     }
 
     /// What a caller gets back.
-    pub const fn results(&self) -> VariableSpecs<'a> {
-        self.results
+    pub fn results(&self) -> VariableSpecs<'a> {
+        VariableSpecs::of_checked(self.arguments().behind())
+    }
+
+    /// The length of the name, and what follows it.
+    fn behind_length(&self) -> Option<(usize, &'a [u8])> {
+        self.bytes.split_first().map(|(length, rest)| (usize::from(*length), rest))
     }
 
     /// The encoded signature.
@@ -150,27 +154,27 @@ impl<'a> Signature<'a> {
 
     /// Bytes of a `Parameters` that holds all arguments and results, as the callee's does.
     pub fn parameters_bytes(&self) -> u32 {
-        let only_results = self.results().filter(|result| self.arguments.named(result.name).is_none());
-        let bytes = self
-            .arguments()
+        let arguments = self.arguments();
+        let only_results = self.results().filter(|result| arguments.named(result.name).is_none());
+        let bytes = arguments
             .chain(only_results)
             .try_fold(0_usize, |sum, spec| sum.checked_add(bytes_of_variable(spec.name, spec.kind, spec.size)?));
         bytes.map_or(u32::MAX, saturate)
     }
 
     /// The signature in bytes that were checked when they were stored.
-    pub(crate) fn of_checked(bytes: &'a [u8]) -> Self {
-        let none = VariableSpecs { left: 0, rest: &[] };
-        Self::split(bytes).unwrap_or(Self { bytes: &[], name: "", arguments: none, results: none })
+    pub(crate) const fn of_checked(bytes: &'a [u8]) -> Self {
+        Self { bytes }
     }
 
-    fn split(bytes: &'a [u8]) -> Option<Self> {
+    /// Name, arguments and results, all of which can be read.
+    fn split(bytes: &'a [u8]) -> Option<(&'a str, VariableSpecs<'a>, VariableSpecs<'a>)> {
         let (&length, rest) = bytes.split_first()?;
         let (name, rest) = rest.split_at_checked(usize::from(length))?;
         let name = core::str::from_utf8(name).ok()?;
         let (arguments, rest) = VariableSpecs::split(rest)?;
         let (results, rest) = VariableSpecs::split(rest)?;
-        rest.is_empty().then_some(Self { bytes, name, arguments, results })
+        rest.is_empty().then_some((name, arguments, results))
     }
 }
 
@@ -178,6 +182,21 @@ impl<'a> VariableSpecs<'a> {
     /// The variable of this name.
     pub fn named(mut self, name: &str) -> Option<VariableSpec<'a>> {
         self.find(|spec| spec.name == name)
+    }
+
+    fn of_checked(bytes: Option<&'a [u8]>) -> Self {
+        match bytes.and_then(<[u8]>::split_first) {
+            Some((&left, rest)) => Self { left, rest },
+            None => Self { left: 0, rest: &[] },
+        }
+    }
+
+    /// What follows the variables, none of which is read.
+    fn behind(&self) -> Option<&'a [u8]> {
+        (0..self.left).try_fold(self.rest, |rest, _| {
+            let (&[_, length, _, _, _, _], rest) = rest.split_first_chunk()?;
+            rest.get(usize::from(length)..)
+        })
     }
 
     fn split(bytes: &'a [u8]) -> Option<(Self, &'a [u8])> {
@@ -348,8 +367,9 @@ impl fmt::Display for VariableSpecs<'_> {
 
 impl fmt::Display for Signature<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}{}", self.name, self.arguments)?;
-        if self.results.left == 0 { Ok(()) } else { write!(f, " -> {}", self.results) }
+        let results = self.results();
+        write!(f, "{}{}", self.name(), self.arguments())?;
+        if results.left == 0 { Ok(()) } else { write!(f, " -> {results}") }
     }
 }
 

@@ -96,23 +96,17 @@ pub struct RequestHeader {
 impl RequestHeader {
     /// The header's bytes.
     pub fn encode(&self) -> [u8; REQUEST_BYTES] {
-        let mut out = [0; REQUEST_BYTES];
         let flags = if self.wants_reply { WANTS_REPLY } else { 0 };
-        let fields: [&[u8]; 7] = [
-            &[REQUEST, flags],
-            &self.slot.0.to_le_bytes(),
-            &self.generation.0.to_le_bytes(),
-            &[0, 0],
-            &self.id.to_le_bytes(),
-            &self.remaining.as_wire().to_le_bytes(),
-            &self.stamp.to_le_bytes(),
-        ];
-        let since = self.since.as_wire().to_le_bytes();
-        let bytes = fields.into_iter().flatten().chain(&since);
-        for (place, byte) in out.iter_mut().zip(bytes) {
-            *place = *byte;
-        }
-        out
+        let [s0, s1] = self.slot.0.to_le_bytes();
+        let [g0, g1] = self.generation.0.to_le_bytes();
+        let [i0, i1, i2, i3] = self.id.to_le_bytes();
+        let [r0, r1, r2, r3] = self.remaining.as_wire().to_le_bytes();
+        let [t0, t1, t2, t3, t4, t5, t6, t7] = self.stamp.to_le_bytes();
+        let [e0, e1, e2, e3] = self.since.as_wire().to_le_bytes();
+        [
+            REQUEST, flags, s0, s1, g0, g1, 0, 0, i0, i1, i2, i3, r0, r1, r2, r3, t0, t1, t2, t3, t4, t5, t6, t7, e0,
+            e1, e2, e3, 0, 0, 0, 0,
+        ]
     }
 
     fn decode(bytes: &[u8; REQUEST_BYTES]) -> Option<Self> {

@@ -255,6 +255,11 @@ impl ParametersView {
         if self.find(name).is_some() {
             return Err(Error::NameTaken);
         }
+        self.add_checked(name, kind, size)
+    }
+
+    /// Adds a variable whose name may be one, and is not there.
+    pub(crate) fn add_checked(&mut self, name: &str, kind: Type, size: u32) -> Result<(), Error> {
         let place = self.table.get_mut(usize::from(self.count)).ok_or(Error::Full(Limit::Variables))?;
         let full = Error::Full(Limit::ParametersBytes);
         let length = kind.bytes_of(size).ok_or(full)?;

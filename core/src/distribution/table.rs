@@ -35,7 +35,7 @@ pub struct Function<'a, H = ()> {
 
 impl<'a, H> Function<'a, H> {
     /// Its name.
-    pub const fn name(&self) -> &'a str {
+    pub fn name(&self) -> &'a str {
         self.signature.name()
     }
 }

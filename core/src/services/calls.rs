@@ -256,6 +256,9 @@ impl<S: Storage> Calls<S> {
     }
 
     fn next_class(&self) -> Option<Priority> {
+        if !self.any_waiting() {
+            return None;
+        }
         Priority::ALL.into_iter().find(|&class| {
             let idle = self.active.get(usize::from(class.to_wire())).is_some_and(Option::is_none);
             idle && self.class_waits(class)
