@@ -30,6 +30,8 @@ pub(crate) enum Image {
 }
 
 const REQUESTS: usize = 25;
+/// Functions of a profile.
+const SHOWN: usize = 60;
 const CHARACTERS: u32 = 512;
 /// Longer than a delayed acknowledgement of Linux, which takes 40 ms.
 const REST: Duration = Duration::from_millis(90);
@@ -113,7 +115,8 @@ fn tell(places: &Places, exchanges: &[Vec<u32>], what: &str, of: &str, profile: 
         }
         return;
     }
-    for (owner, name) in [(Owner::Cara, "CARA"), (Owner::Network, "TCP/IP"), (Owner::Board, "driver, clock, executor")] {
+    for (owner, name) in [(Owner::Cara, "CARA"), (Owner::Network, "TCP/IP"), (Owner::Board, "driver, clock, executor")]
+    {
         let has = |executed: &[(u32, Owner)]| executed.iter().filter(|(_, of)| *of == owner).count();
         let counts = exchanges.iter().map(|executed| has(executed)).collect();
         println!("{what}, {name}\t{of}\t{}", middle(counts, |count| *count).unwrap_or_default());
@@ -147,15 +150,23 @@ fn functions(places: &Places, executed: &[(u32, Owner)]) {
             last.clone_from(&place.function);
         }
         let name = if place.owner.is_some() { last.clone() } else { format!("{last} > {}", place.innermost) };
-        *written.entry(name).or_insert(0_u32) += 1;
-        *linked.entry(place.symbol.clone()).or_insert(0_u32) += 1;
+        written.entry(name).or_insert_with(Vec::new).push(*address);
+        linked.entry(place.symbol.clone()).or_insert_with(Vec::new).push(*address);
     }
-    for (title, counts) in [("as written", written), ("as linked", linked)] {
-        println!("  {title}, {} in all:", counts.values().sum::<u32>());
-        let mut counts: Vec<(String, u32)> = counts.into_iter().collect();
-        counts.sort_by_key(|(_, count)| std::cmp::Reverse(*count));
-        counts.iter().take(40).for_each(|(name, count)| println!("    {count:6} {name}"));
+    for (title, functions) in [("as written", written), ("as linked", linked)] {
+        println!("  {title}: instructions, calls, function");
+        let mut functions: Vec<(String, Vec<u32>)> = functions.into_iter().collect();
+        functions.sort_by_key(|(_, addresses)| std::cmp::Reverse(addresses.len()));
+        for (name, addresses) in functions.iter().take(SHOWN) {
+            println!("    {:6} {:4} {name}", addresses.len(), calls(addresses));
+        }
     }
+}
+
+/// How often a function's first instruction was executed.
+fn calls(addresses: &[u32]) -> usize {
+    let first = addresses.iter().min();
+    addresses.iter().filter(|address| Some(*address) == first).count()
 }
 
 /// The one in the middle.

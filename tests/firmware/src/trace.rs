@@ -10,8 +10,9 @@ pub(crate) struct Trace {
 }
 
 impl Trace {
-    /// With these, the emulator writes a line for each instruction to its standard error.
-    pub(crate) const ARGUMENTS: [&str; 3] = ["-singlestep", "-d", "exec,nochain"];
+    /// With these, the emulator writes a line for each instruction to its standard error. It is slow then, so the
+    /// board's time goes by instructions, 64 ns each: otherwise timers would fire in the middle of everything.
+    pub(crate) const ARGUMENTS: [&str; 5] = ["-singlestep", "-icount", "shift=6", "-d", "exec,nochain"];
 
     /// Keeps what is read until it ends.
     pub(crate) fn read(from: impl Read + Send + 'static) -> Self {
