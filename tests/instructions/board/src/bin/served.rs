@@ -1,0 +1,70 @@
+//! An s_unit that serves and does nothing else: what it executes between a request and its reply is counted from outside.
+
+#![no_std]
+#![no_main]
+
+use cara_embassy::{Config, Handler, Resources, Runner as UnitRunner, ServiceOptions, message_buffer};
+use cara_lm3s6965evb::arguments;
+use cara_lm3s6965evb::ethernet::Ethernet;
+use cara_lm3s6965evb::{executor, fault, start};
+use defmt_semihosting as _;
+use embassy_executor::Spawner;
+use embassy_net::{Runner, StackResources};
+use static_cell::{ConstStaticCell, StaticCell};
+
+/// The usual memory of an s_unit, with room for a text of 512 characters.
+type Memory = Resources<(), 1, { message_buffer(1024) }, 3, 1536, 8, 8, 4, 1, 640>;
+
+const SERVICES: [&str; 2] =
+    ["pos_info(position: int[2]) -> (position: int[2])", "echo(text: string[512]) -> (text: string[512])"];
+
+#[cortex_m_rt::entry]
+fn main() -> ! {
+    let _core = start();
+    executor::run(|spawner| {
+        if let Err(text) = spawn(spawner) {
+            defmt::error!("{=str}", text);
+            semihosting::process::exit(fault::PANICKED)
+        }
+    })
+}
+
+#[inline(never)]
+fn spawn(spawner: Spawner) -> Result<(), &'static str> {
+    static ETHERNET: ConstStaticCell<Ethernet> = ConstStaticCell::new(Ethernet::new());
+    static SOCKETS: ConstStaticCell<StackResources<{ Memory::SOCKETS + 1 }>> =
+        ConstStaticCell::new(StackResources::new());
+    static MEMORY: StaticCell<Memory> = StaticCell::new();
+    const NO_ROOM: &str = "no room for a task";
+    let settings = arguments::read().map_err(|_| "who am I? The arguments are no settings")?.settings;
+    let manager = settings.manager.as_ref().ok_or("the arguments name no manager")?;
+    let ethernet = ETHERNET.take();
+    ethernet.start();
+    // The same numbers in every run, as far as the network lets them be.
+    let seed = 1;
+    let (stack, network_runner) = embassy_net::new(ethernet, cara_vehicle::network(&settings), SOCKETS.take(), seed);
+    let (name, id) = (settings.identity.name(), settings.identity.id());
+    let config = Config::s_unit(name, id, &manager.name, manager.id, seed).map_err(|_| "the settings are of no unit")?;
+    let config = config.fleet(settings.fleet.0);
+    let (unit, unit_runner) =
+        cara_embassy::new(stack, MEMORY.init_with(Memory::new), config, ()).map_err(|_| "no such unit")?;
+    for service in SERVICES {
+        let nothing = Handler::method(&|(), _, _| Ok(()));
+        unit.add_service(service, ServiceOptions::new().idempotent(), nothing).map_err(|_| "no room for a service")?;
+    }
+    unit.publish_my_function_list().map_err(|_| "nothing is published")?;
+    spawner.spawn(network(network_runner).map_err(|_| NO_ROOM)?);
+    spawner.spawn(serve(unit_runner).map_err(|_| NO_ROOM)?);
+    defmt::info!("started");
+    Ok(())
+}
+
+#[embassy_executor::task]
+async fn network(mut runner: Runner<'static, &'static mut Ethernet>) -> ! {
+    runner.run().await
+}
+
+#[embassy_executor::task]
+async fn serve(mut runner: UnitRunner<()>) -> ! {
+    runner.run().await
+}
