@@ -18,6 +18,9 @@ pub(crate) struct Options {
     /// The passive node prints in every cell of the response time, not only in some.
     #[arg(long)]
     print: bool,
+    /// Only these other systems instead of all that `cargo xtask peers` has built; `none` for none.
+    #[arg(long, value_name = "PEER", value_delimiter = ',')]
+    peers: Vec<String>,
     /// Also writes all rows here, after each experiment anew.
     #[arg(long, value_name = "FILE")]
     json: Option<std::path::PathBuf>,
@@ -36,6 +39,9 @@ pub(crate) fn run(options: &Options) -> Result<ExitCode> {
     let program = folder.join("release").join("cara-bench");
     let mut command = Command::new(&program);
     command.arg("experiments").args(options.quick.then_some("--quick")).args(options.print.then_some("--print"));
+    if !options.peers.is_empty() {
+        command.arg("--peers").arg(options.peers.join(","));
+    }
     for (name, path) in [("--json", &options.json), ("--plots", &options.plots)] {
         if let Some(path) = path {
             // The program runs in the project's root, wherever this command was started.

@@ -24,6 +24,7 @@ mod manifests;
 mod names;
 mod panic_free;
 mod paper;
+mod peers;
 mod runner;
 mod source;
 mod workspace;
@@ -71,6 +72,12 @@ enum Task {
     },
     /// Repeats the paper's experiments against raw sockets, interleaved with a control, and draws its figures.
     Bench(bench::Options),
+    /// Builds the other systems that `bench` measures beside CARA, and says which are absent and what brings them.
+    Peers {
+        /// Only these; `omniorb`, `zenoh` and so on.
+        #[arg(value_name = "PEER")]
+        names: Vec<String>,
+    },
     /// Puts many s_units on one manager and measures how they join, what they cost, and how they come back.
     Fleet {
         /// How many s_units; 1,000 if not given.
@@ -101,6 +108,7 @@ fn main() -> ExitCode {
         Task::Sizes { json, write } => firmware::sizes(json.as_deref(), write),
         Task::Instructions { json, write } => instructions::run(json.as_deref(), write),
         Task::Fleet { nodes, json } => fleet::run(nodes, json.as_deref()),
+        Task::Peers { names } => peers::run(&names),
         Task::Bench(options) => bench::run(&options),
         Task::Firmware { board: Some(board), flash: true, .. } => firmware::flash(&board),
         Task::Firmware { board, desk, .. } if desk.run => firmware::desk(board.as_deref(), &desk),

@@ -18,4 +18,4 @@ pub use burst::{Burst, Offered};
 pub use peer::{Caller, Constrain, Counters, Delivery, Executed, Limits, Peer, Place, Server};
 pub use pin::Pin;
 pub use print::Printer;
-pub use questions::{ClientQuestion, End, Role, ServerQuestion, answer_all, answer_client, further, serve};
+pub use questions::{ClientQuestion, End, ServerQuestion, answer_all, answer_client, further, main, main_with, serve};

@@ -5,7 +5,7 @@
 use std::io::{Write, stdin, stdout};
 
 use anyhow::{Context, Result};
-use clap::{Args, Subcommand};
+use clap::{Args, Parser, Subcommand};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -57,9 +57,25 @@ pub struct End {
     pub address: String,
 }
 
+/// Plays the process of a pair that the command line names. All that the program of another system does.
+pub fn main(peer: &dyn Peer) -> Result<()> {
+    main_with(peer, &std::env::args().collect::<Vec<_>>())
+}
+
+/// As [`main`] with this command line.
+pub fn main_with(peer: &dyn Peer, arguments: &[String]) -> Result<()> {
+    Arguments::parse_from(arguments).role.play(peer)
+}
+
+#[derive(Parser)]
+struct Arguments {
+    #[command(subcommand)]
+    role: Role,
+}
+
 /// Which process of a pair.
 #[derive(Debug, Clone, Subcommand)]
-pub enum Role {
+enum Role {
     /// The process that answers.
     Serve(End),
     /// The process that calls.
@@ -69,8 +85,7 @@ pub enum Role {
 }
 
 impl Role {
-    /// Plays it until standard input ends.
-    pub fn play(&self, peer: &dyn Peer) -> Result<()> {
+    fn play(&self, peer: &dyn Peer) -> Result<()> {
         match self {
             Self::Serve(end) => serve(peer, end),
             Self::Call(end) => call(peer, end),

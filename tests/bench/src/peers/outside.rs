@@ -82,11 +82,11 @@ impl Selection {
         for name in &self.names {
             ensure!(name == "none" || known.contains(&name.as_str()), "no other system is called {name}: {known:?}");
         }
-        let folder = file.parent().unwrap_or(Path::new("."));
+        let folder = std::path::absolute(file.parent().unwrap_or(Path::new(".")))?;
         let (mut built, mut absent) = (Vec::new(), Vec::new());
         for entry in listed.peer.into_iter().filter(|entry| self.names.is_empty() || self.names.contains(&entry.name)) {
             match entry.files.iter().find(|file| !folder.join(file).exists()) {
-                None => built.push(Arc::new(Outside::new(entry, folder, Duration::from_secs(self.patience_s)))),
+                None => built.push(Arc::new(Outside::new(entry, &folder, Duration::from_secs(self.patience_s)))),
                 Some(file) => absent.push(entry.absent(file)),
             }
         }
@@ -123,7 +123,9 @@ impl Outside {
 
     pub(crate) fn command(&self) -> Command {
         let mut words = self.entry.start.iter();
-        let mut command = Command::new(words.next().map_or("false", String::as_str));
+        let program = words.next().map_or("", String::as_str);
+        let program = if program.contains('/') { self.folder.join(program) } else { program.into() };
+        let mut command = Command::new(program);
         command.args(words).current_dir(&self.folder);
         command
     }
