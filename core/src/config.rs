@@ -6,8 +6,12 @@ use crate::time::Duration;
 pub const VERSION: u8 = 1;
 /// First four bytes of every datagram and hello in plain mode. Secured mode has its own, so the two never meet.
 pub const PLAIN_MAGIC: [u8; 4] = *b"CARp";
+/// First four bytes of every datagram and hello in secured mode.
+pub const SECURED_MAGIC: [u8; 4] = *b"CARs";
 /// UDP port on which units of plain mode listen for broadcasts. Secured mode uses the next one.
 pub const PLAIN_PORT: u16 = 21_970;
+/// UDP port on which units of secured mode listen for broadcasts.
+pub const SECURED_PORT: u16 = 21_971;
 
 /// Longest name of a node, in bytes of UTF-8. Costs this much per known node.
 pub const NODE_NAME_BYTES: usize = 32;
@@ -37,7 +41,7 @@ pub const LEASES: usize = 4;
 
 /// Ids behind the newest one that the at-most-once window of a priority remembers.
 pub const WINDOW: u32 = 64;
-/// How long a unit waits for the peer's hello on a new link before it closes it.
+/// How long a unit waits on a new link for the peer's hello, and in secured mode for the whole proof, before it closes it.
 pub const HELLO_TIMEOUT: Duration = Duration::from_secs(2);
 /// How long an old link may take to answer the challenge that tells a restarted peer from a duplicate one.
 pub const CHALLENGE_TIMEOUT: Duration = Duration::from_millis(300);
@@ -98,6 +102,42 @@ impl Constraints {
         keep_alive: Duration::from_secs(1),
         calls_per_peer: 8,
     };
+}
+
+/// Whether units prove who they are and seal what they say. Units of different modes have nothing to do with each other.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Mode {
+    /// Everything travels as it is, and everybody is believed.
+    Plain,
+    /// Nobody is believed who does not prove the key of the pair.
+    Secured,
+}
+
+impl Mode {
+    /// First four bytes of every datagram and hello.
+    pub const fn magic(self) -> [u8; 4] {
+        match self {
+            Self::Plain => PLAIN_MAGIC,
+            Self::Secured => SECURED_MAGIC,
+        }
+    }
+
+    /// The mode of these first four bytes.
+    pub const fn of_magic(magic: [u8; 4]) -> Option<Self> {
+        match magic {
+            PLAIN_MAGIC => Some(Self::Plain),
+            SECURED_MAGIC => Some(Self::Secured),
+            _ => None,
+        }
+    }
+
+    /// UDP port on which units listen for broadcasts.
+    pub const fn port(self) -> u16 {
+        match self {
+            Self::Plain => PLAIN_PORT,
+            Self::Secured => SECURED_PORT,
+        }
+    }
 }
 
 /// Class of a request. An emergency goes between the chunks of other messages, ignores the minimum interval and has

@@ -92,6 +92,12 @@ pub enum Refusal {
     /// The hello could not be read.
     #[error("the peer's hello could not be read: is it a CARA unit?")]
     Malformed = 8,
+    /// One of the two is plain, and the other one secured.
+    #[error("one of the two units is plain and the other one secured: give both keys, or start both in plain mode")]
+    Mode = 9,
+    /// There is no key for these two units.
+    #[error("there is no key for this pair of units: derive one, and give it to both")]
+    NoKey = 10,
 }
 
 /// Why a link ended.
@@ -117,8 +123,8 @@ pub enum CloseReason {
     /// A frame or message above the told limit.
     #[error("the peer sent more than the limit that it was told: check its version, or raise message_size here")]
     Oversize = 6,
-    /// No hello came in time.
-    #[error("no hello came in time: whoever connected said nothing, or is no CARA unit")]
+    /// No hello came in time, or no proof behind it.
+    #[error("no hello or no proof came in time: whoever is there said nothing, or is no CARA unit of this mode")]
     HelloTimeout = 7,
     /// The unit refused the link.
     #[error("{0}")]
@@ -129,6 +135,12 @@ pub enum CloseReason {
     /// Request ids ran out; the pair connects again.
     #[error("request ids ran out: the link is opened anew, ask again")]
     Exhausted = 10,
+    /// The other end ended the link before it had proven who it is, so its reason counts for nothing.
+    #[error("the other end went before it proved who it is: has it the key of this pair, and the same version?")]
+    Unproven = 11,
+    /// The other end has another key for this pair, or somebody changed what was sent.
+    #[error("the two have different keys for this pair, or somebody changed what they sent: derive and give keys anew")]
+    BadProof = 12,
 }
 
 /// What a handler answers instead of results.

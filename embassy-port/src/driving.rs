@@ -10,6 +10,7 @@ use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error, Refusal};
 use cara_core::host::mailman::LinkId;
+use cara_core::host::secure::Plain;
 use cara_core::services::Context;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::{Call, Event};
@@ -57,7 +58,8 @@ impl News {
     /// Of all events but replies.
     fn of(event: Event<'_>) -> Self {
         match event {
-            Event::Hello => Self::Hello,
+            // Plain links prove nothing.
+            Event::Introduced | Event::Hello => Self::Hello,
             Event::Call(call) => Self::Call(call),
             Event::Reply(..) => Self::Reply,
             Event::Failed(id, error) => Self::Failed(id, error),
@@ -136,8 +138,8 @@ impl<T> Machine<T> {
             Poll::Ready(Ok((length, from))) => (length, from.endpoint),
         };
         let from = SocketAddr::new(from.addr.into(), from.port);
-        let bytes = scratch.get(..length).unwrap_or_default();
-        match self.node.datagram(now(), from, bytes) {
+        let bytes = scratch.get_mut(..length).unwrap_or_default();
+        match self.node.datagram(now(), from, bytes, &Plain) {
             Sorted::Done => {
                 if let Some(address) = self.node.take_twin() {
                     let peer = Some(self.node.identity().clone());

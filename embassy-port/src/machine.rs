@@ -177,7 +177,7 @@ impl<T> Machine<T> {
     #[inline(never)]
     pub(crate) fn poll_node(&mut self) -> Option<Action> {
         let Self { node, lines, udp, stack, .. } = self;
-        node.poll(now(), &mut EmbassyMailman { lines, udp, stack: *stack })
+        node.poll(now(), &mut EmbassyMailman { lines, udp, stack: *stack }, &Plain)
     }
 
     /// Makes the session of a link. `None` when the link is in use.
@@ -210,7 +210,7 @@ impl<T> Machine<T> {
         let since = |index: &u16| {
             let link = self.link(*index)?;
             let session = link.session.as_ref()?;
-            (!session.dialed() && session.hello().is_none()).then_some(link.since)
+            (!session.dialed() && !session.is_proven()).then_some(link.since)
         };
         let silent = self.indices().filter_map(|index| Some((since(&index)?, index)));
         silent.min().map(|(_, index)| index)

@@ -28,6 +28,7 @@ use std::net::{SocketAddr, SocketAddrV4, UdpSocket};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use cara_core::config::Mode;
 use cara_core::distribution::datagram::{Announce, Datagram, Header, SEARCH_BYTES, WhoHas};
 use cara_core::distribution::identity::{Epoch, Fleet, Identity};
 use cara_core::error::Error;
@@ -189,7 +190,7 @@ impl Survey {
             known: Default::default(),
         };
         let mut bytes = [0; SEARCH_BYTES];
-        let length = question.encode(fleet, &mut bytes).map_or(0, <[u8]>::len);
+        let length = question.encode(Mode::Plain, fleet, &mut bytes).map_or(0, <[u8]>::len);
         (bytes, length)
     }
 

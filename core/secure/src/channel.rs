@@ -2,7 +2,7 @@
 //! repeated or moved.
 
 use cara_core::error::CloseReason;
-use cara_core::host::secure::Secure;
+use cara_core::host::secure::Seal;
 use noise_protocol::CipherState;
 
 use crate::suite::ChaCha20Poly1305;
@@ -41,8 +41,10 @@ impl Direction {
     }
 }
 
-impl Secure for Channel {
-    const OVERHEAD: usize = TAG_BYTES;
+impl Seal for Channel {
+    fn overhead(&self) -> usize {
+        TAG_BYTES
+    }
 
     fn seal(&mut self, frame: &mut [u8]) -> Result<(), CloseReason> {
         let length = frame.len().checked_sub(TAG_BYTES).ok_or(CloseReason::Protocol)?;

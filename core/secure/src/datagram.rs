@@ -70,6 +70,11 @@ impl Sealer {
         Self { key, generation, next: 0 }
     }
 
+    /// The key, to be told to the other end.
+    pub const fn key(&self) -> &DatagramKey {
+        &self.key
+    }
+
     /// Seals `datagram` in place: [`HEADER_BYTES`] of room, the body, [`TAG_BYTES`] of room. `bound` is what the
     /// datagram's plain header says; it is not sealed, and cannot be changed. `None` without that room.
     pub fn seal(&mut self, bound: &[u8], datagram: &mut [u8]) -> Option<()> {

@@ -28,15 +28,47 @@ pub struct Initiator(State);
 
 type State = HandshakeState<X25519, ChaCha20Poly1305, Blake2s>;
 
+/// What both ends have agreed on.
+pub struct Agreed {
+    /// The frames of the link.
+    pub channel: Channel,
+    /// A number that is this link's alone: it depends on all that both ends have sent, and on the pair's key.
+    pub binding: [u8; 32],
+}
+
 /// What both ends have seen, in the order initiator, responder.
 pub fn prologue(initiator: &[u8], responder: &[u8]) -> [u8; 32] {
-    let mut hash = Blake2s256::new();
-    hash.update(b"CARA prologue 1");
-    for part in [initiator, responder] {
-        hash.update((part.len() as u64).to_le_bytes());
-        hash.update(part);
+    let mut transcript = Transcript::new();
+    transcript.add(initiator);
+    transcript.add(responder);
+    transcript.prologue()
+}
+
+/// The prologue while it is being seen.
+pub struct Transcript(Blake2s256);
+
+impl Transcript {
+    /// Nothing seen yet.
+    pub fn new() -> Self {
+        Self(Blake2s256::new_with_prefix(b"CARA prologue 1"))
     }
-    hash.finalize().into()
+
+    /// The next part: the initiator's, then the responder's.
+    pub fn add(&mut self, part: &[u8]) {
+        self.0.update((part.len() as u64).to_le_bytes());
+        self.0.update(part);
+    }
+
+    /// The prologue of what was seen.
+    pub fn prologue(self) -> [u8; 32] {
+        self.0.finalize().into()
+    }
+}
+
+impl Default for Transcript {
+    fn default() -> Self {
+        Self::new()
+    }
 }
 
 fn state(initiates: bool, key: &PairKey, prologue: &[u8; 32], ephemeral: &[u8; 32]) -> State {
@@ -72,10 +104,10 @@ impl Initiator {
     }
 
     /// The responder has answered: it is who it says it is.
-    pub fn finish(mut self, message: &[u8]) -> Result<Channel, HandshakeError> {
+    pub fn finish(mut self, message: &[u8]) -> Result<Agreed, HandshakeError> {
         read(&mut self.0, message)?;
         let (to_responder, to_initiator) = self.0.get_ciphers();
-        Ok(Channel::new(to_responder, to_initiator))
+        Ok(Agreed { channel: Channel::new(to_responder, to_initiator), binding: binding(&self.0) })
     }
 }
 
@@ -86,10 +118,16 @@ pub fn answer(
     prologue: &[u8; 32],
     ephemeral: &[u8; 32],
     message: &[u8],
-) -> Result<(Channel, [u8; MESSAGE_BYTES]), HandshakeError> {
+) -> Result<(Agreed, [u8; MESSAGE_BYTES]), HandshakeError> {
     let mut state = state(false, key, prologue, ephemeral);
     read(&mut state, message)?;
     let answer = write(&mut state)?;
     let (to_responder, to_initiator) = state.get_ciphers();
-    Ok((Channel::new(to_initiator, to_responder), answer))
+    Ok((Agreed { channel: Channel::new(to_initiator, to_responder), binding: binding(&state) }, answer))
+}
+
+fn binding(state: &State) -> [u8; 32] {
+    let mut binding = [0; 32];
+    binding.iter_mut().zip(state.get_hash()).for_each(|(to, from)| *to = *from);
+    binding
 }

@@ -4,6 +4,8 @@
 //! - [`handshake`]: two messages that prove the pair's key, and agree on keys of this link alone;
 //! - [`channel`]: the frames of a link, sealed in place;
 //! - [`datagram`]: the datagrams beside it, with keys of their own and a window against replays;
+//! - [`link`]: the cipher of one link, which joins the two above and the datagrams;
+//! - [`keyring`]: where a unit finds its keys, and the codes that it makes with them;
 //! - [`mac`]: codes for discovery, which is authenticated and not secret;
 //! - [`random`]: random numbers for boards, whose sources of noise may be poor.
 //!
@@ -19,7 +21,9 @@ extern crate std;
 pub mod channel;
 pub mod datagram;
 pub mod handshake;
+pub mod keyring;
 pub mod keys;
+pub mod link;
 pub mod mac;
 pub mod random;
 mod suite;

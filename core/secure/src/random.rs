@@ -112,7 +112,7 @@ mod tests {
     use crate::channel::TAG_BYTES;
     use crate::handshake::{Initiator, answer};
     use crate::keys::PairKey;
-    use cara_core::host::secure::Secure;
+    use cara_core::host::secure::Seal;
     use std::collections::HashSet;
     use std::vec::Vec;
 
@@ -173,7 +173,7 @@ mod tests {
         let (pair, prologue) = (PairKey::new([3; KEY_BYTES]), [4; 32]);
         let (initiator, message) = Initiator::begin(&pair, &prologue, &board.draw()).unwrap();
         let (_, message) = answer(&pair, &prologue, &manager, &message).unwrap();
-        let mut channel = initiator.finish(&message).unwrap();
+        let mut channel = initiator.finish(&message).unwrap().channel;
         let mut frame = std::vec![0; 64 + TAG_BYTES];
         channel.seal(&mut frame).unwrap();
         frame

@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used, clippy::indexing_slicing)]
 
 use cara_core::error::CloseReason;
-use cara_core::host::secure::Secure;
+use cara_core::host::secure::Seal;
 use cara_secure::channel::{Channel, TAG_BYTES};
 use cara_secure::handshake::{HandshakeError, Initiator, MESSAGE_BYTES, answer, prologue};
 use cara_secure::keys::PairKey;
@@ -19,7 +19,7 @@ fn channels() -> (Channel, Channel) {
     let prologue = prologue(b"a", b"b");
     let (initiator, message) = Initiator::begin(&key(), &prologue, &ONE).unwrap();
     let (responder, reply) = answer(&key(), &prologue, &OTHER, &message).unwrap();
-    (initiator.finish(&reply).unwrap(), responder)
+    (initiator.finish(&reply).unwrap().channel, responder.channel)
 }
 
 fn seal(channel: &mut Channel, text: &[u8]) -> Vec<u8> {
@@ -72,9 +72,9 @@ fn a_recorded_handshake_leads_to_no_channel() {
     let prologue = prologue(b"a", b"b");
     let (initiator, message) = Initiator::begin(&key(), &prologue, &ONE).unwrap();
     let (_, reply) = answer(&key(), &prologue, &OTHER, &message).unwrap();
-    let recorded = seal(&mut initiator.finish(&reply).unwrap(), b"go_to");
+    let recorded = seal(&mut initiator.finish(&reply).unwrap().channel, b"go_to");
     let (mut later, _) = answer(&key(), &prologue, &[5; 32], &message).unwrap();
-    assert_eq!(later.open(&mut recorded.clone()), Err(CloseReason::Protocol));
+    assert_eq!(later.channel.open(&mut recorded.clone()), Err(CloseReason::Protocol));
 }
 
 /// Points of small order would make the same secret with every key.

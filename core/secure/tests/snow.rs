@@ -1,7 +1,7 @@
 //! Another implementation of Noise understands this one, in both roles.
 #![allow(clippy::unwrap_used, clippy::indexing_slicing)]
 
-use cara_core::host::secure::Secure;
+use cara_core::host::secure::Seal;
 use cara_secure::channel::{Channel, FRAMES_PER_KEY, TAG_BYTES};
 use cara_secure::handshake::{Initiator, MESSAGE_BYTES, answer, prologue};
 use cara_secure::keys::PairKey;
@@ -41,7 +41,7 @@ fn snow_answers() {
     assert_eq!(theirs.read_message(&message, &mut []).unwrap(), 0);
     let mut reply = [0; MESSAGE_BYTES];
     assert_eq!(theirs.write_message(&[], &mut reply).unwrap(), MESSAGE_BYTES);
-    talk(initiator.finish(&reply).unwrap(), theirs);
+    talk(initiator.finish(&reply).unwrap().channel, theirs);
 }
 
 #[test]
@@ -50,9 +50,9 @@ fn snow_begins() {
     let mut theirs = snow(&prologue, true);
     let mut message = [0; MESSAGE_BYTES];
     assert_eq!(theirs.write_message(&[], &mut message).unwrap(), MESSAGE_BYTES);
-    let (channel, reply) = answer(&PairKey::new(KEY), &prologue, &[4; 32], &message).unwrap();
+    let (agreed, reply) = answer(&PairKey::new(KEY), &prologue, &[4; 32], &message).unwrap();
     assert_eq!(theirs.read_message(&reply, &mut []).unwrap(), 0);
-    talk(channel, theirs);
+    talk(agreed.channel, theirs);
 }
 
 /// Both ends change keys after the same frame, as snow does when it is told to.
@@ -62,7 +62,8 @@ fn keys_change_after_a_million_frames() {
     let mut theirs = snow(&prologue, true);
     let mut message = [0; MESSAGE_BYTES];
     theirs.write_message(&[], &mut message).unwrap();
-    let (mut channel, reply) = answer(&PairKey::new(KEY), &prologue, &[4; 32], &message).unwrap();
+    let (agreed, reply) = answer(&PairKey::new(KEY), &prologue, &[4; 32], &message).unwrap();
+    let mut channel = agreed.channel;
     theirs.read_message(&reply, &mut []).unwrap();
     let mut theirs = theirs.into_transport_mode().unwrap();
     let mut frame = [0; TAG_BYTES];

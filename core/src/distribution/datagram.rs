@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 
 use super::hello::Manager;
 use super::identity::{Epoch, Fleet, Identity, Role};
-use crate::config::{PLAIN_MAGIC, VERSION};
+use crate::config::{Mode, VERSION};
 
 const WHO_HAS: u8 = 1;
 const ANNOUNCE: u8 = 2;
@@ -101,10 +101,12 @@ pub enum DatagramError {
     Malformed,
 }
 
-/// The fixed part of a datagram of this mode, whatever its version and fleet: for who looks at a network without being
-/// one of its units. Units read with [`Datagram::decode`].
+/// The fixed part of a datagram, whatever its mode, version and fleet: for who looks at a network without being one of its
+/// units. Units read with [`Datagram::decode`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Header {
+    /// The sender's mode.
+    pub mode: Mode,
     /// The sender's version.
     pub version: u8,
     /// The sender's fleet.
@@ -118,10 +120,9 @@ impl Header {
     pub fn decode(bytes: &[u8]) -> Result<(Self, &[u8]), DatagramError> {
         let (header, body) = bytes.split_first_chunk::<HEADER_BYTES>().ok_or(DatagramError::Malformed)?;
         let [m0, m1, m2, m3, version, kind, z0, z1, f0, f1, f2, f3] = *header;
-        if [m0, m1, m2, m3] != PLAIN_MAGIC {
-            return Err(DatagramError::Magic);
-        }
-        Ok((Self { version, fleet: Fleet(u32::from_le_bytes([f0, f1, f2, f3])), kind, zero: [z0, z1] }, body))
+        let mode = Mode::of_magic([m0, m1, m2, m3]).ok_or(DatagramError::Magic)?;
+        let fleet = Fleet(u32::from_le_bytes([f0, f1, f2, f3]));
+        Ok((Self { mode, version, fleet, kind, zero: [z0, z1] }, body))
     }
 
     /// The body as this version reads it, which says little about one of another version.
@@ -139,9 +140,12 @@ impl Header {
 }
 
 impl<'b> Datagram<'b> {
-    /// Reads a datagram of `fleet`.
-    pub fn decode(bytes: &'b [u8], fleet: Fleet) -> Result<Self, DatagramError> {
+    /// Reads a datagram of this mode and fleet.
+    pub fn decode(bytes: &'b [u8], mode: Mode, fleet: Fleet) -> Result<Self, DatagramError> {
         let (header, body) = Header::decode(bytes)?;
+        if header.mode != mode {
+            return Err(DatagramError::Magic);
+        }
         if header.version != VERSION {
             return Err(DatagramError::Version(header.version));
         }
@@ -167,36 +171,36 @@ fn session(body: &[u8]) -> Option<Datagram<'_>> {
     Some(Datagram::Session { link: u16::from_le_bytes([l0, l1]), nonce, body })
 }
 
-fn header(kind: u8, fleet: Fleet) -> [u8; HEADER_BYTES] {
-    let [m0, m1, m2, m3] = PLAIN_MAGIC;
+fn header(kind: u8, mode: Mode, fleet: Fleet) -> [u8; HEADER_BYTES] {
+    let [m0, m1, m2, m3] = mode.magic();
     let [f0, f1, f2, f3] = fleet.0.to_le_bytes();
     [m0, m1, m2, m3, VERSION, kind, 0, 0, f0, f1, f2, f3]
 }
 
-fn encode<'o>(kind: u8, fleet: Fleet, body: &impl Serialize, out: &'o mut [u8]) -> Option<&'o [u8]> {
+fn encode<'o>(kind: u8, mode: Mode, fleet: Fleet, body: &impl Serialize, out: &'o mut [u8]) -> Option<&'o [u8]> {
     let (head, rest) = out.split_first_chunk_mut()?;
-    *head = header(kind, fleet);
+    *head = header(kind, mode, fleet);
     let length = postcard::to_slice(body, rest).ok()?.len().checked_add(HEADER_BYTES)?;
     out.get(..length)
 }
 
 impl WhoHas {
     /// The datagram, in `out`; `None` where it does not fit.
-    pub fn encode<'o>(&self, fleet: Fleet, out: &'o mut [u8]) -> Option<&'o [u8]> {
-        encode(WHO_HAS, fleet, self, out)
+    pub fn encode<'o>(&self, mode: Mode, fleet: Fleet, out: &'o mut [u8]) -> Option<&'o [u8]> {
+        encode(WHO_HAS, mode, fleet, self, out)
     }
 }
 
 impl Announce {
     /// The datagram, in `out`; `None` where it does not fit.
-    pub fn encode<'o>(&self, fleet: Fleet, out: &'o mut [u8]) -> Option<&'o [u8]> {
-        encode(ANNOUNCE, fleet, self, out)
+    pub fn encode<'o>(&self, mode: Mode, fleet: Fleet, out: &'o mut [u8]) -> Option<&'o [u8]> {
+        encode(ANNOUNCE, mode, fleet, self, out)
     }
 }
 
 /// The header of a session datagram to `link` of the receiver, named by the receiver's `nonce`.
-pub fn session_header(fleet: Fleet, link: u16, nonce: u64) -> [u8; SESSION_HEADER_BYTES] {
-    let [h0, h1, h2, h3, h4, h5, h6, h7, h8, h9, h10, h11] = header(SESSION, fleet);
+pub fn session_header(mode: Mode, fleet: Fleet, link: u16, nonce: u64) -> [u8; SESSION_HEADER_BYTES] {
+    let [h0, h1, h2, h3, h4, h5, h6, h7, h8, h9, h10, h11] = header(SESSION, mode, fleet);
     let [l0, l1] = link.to_le_bytes();
     let [n0, n1, n2, n3, n4, n5, n6, n7] = nonce.to_le_bytes();
     [h0, h1, h2, h3, h4, h5, h6, h7, h8, h9, h10, h11, l0, l1, 0, 0, n0, n1, n2, n3, n4, n5, n6, n7]
@@ -219,6 +223,7 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
+    const PLAIN: Mode = Mode::Plain;
     const FLEET: Fleet = Fleet(7);
 
     fn who_has(known: usize) -> WhoHas {
@@ -238,25 +243,27 @@ mod tests {
     fn the_longest_search_fits_and_survives() {
         let search = who_has(KNOWN_NODES);
         let mut out = [0; SEARCH_BYTES];
-        let bytes = search.encode(FLEET, &mut out).unwrap();
-        assert_eq!(Datagram::decode(bytes, FLEET), Ok(Datagram::WhoHas(search)));
+        let bytes = search.encode(PLAIN, FLEET, &mut out).unwrap();
+        assert_eq!(Datagram::decode(bytes, PLAIN, FLEET), Ok(Datagram::WhoHas(search)));
     }
 
     #[test]
     fn another_fleet_version_or_magic_is_named() {
         let mut out = [0; SEARCH_BYTES];
-        let length = who_has(0).encode(FLEET, &mut out).unwrap().len();
-        assert_eq!(Datagram::decode(&out[..length], Fleet(8)), Err(DatagramError::Fleet(FLEET)));
+        let length = who_has(0).encode(PLAIN, FLEET, &mut out).unwrap().len();
+        assert_eq!(Datagram::decode(&out[..length], PLAIN, Fleet(8)), Err(DatagramError::Fleet(FLEET)));
         out[4] = 9;
-        assert_eq!(Datagram::decode(&out[..length], FLEET), Err(DatagramError::Version(9)));
-        out[0] = b'X';
-        assert_eq!(Datagram::decode(&out[..length], FLEET), Err(DatagramError::Magic));
+        assert_eq!(Datagram::decode(&out[..length], PLAIN, FLEET), Err(DatagramError::Version(9)));
+        for other in [*b"Xarp", Mode::Secured.magic()] {
+            out[..4].copy_from_slice(&other);
+            assert_eq!(Datagram::decode(&out[..length], PLAIN, FLEET), Err(DatagramError::Magic));
+        }
     }
 
     #[test]
     fn a_header_is_read_whatever_its_version_and_fleet() {
         let mut out = [0; SEARCH_BYTES];
-        let length = who_has(0).encode(FLEET, &mut out).unwrap().len();
+        let length = who_has(0).encode(PLAIN, FLEET, &mut out).unwrap().len();
         out[4] = 9;
         let (header, body) = Header::decode(&out[..length]).unwrap();
         assert_eq!((header.version, header.fleet), (9, FLEET));
@@ -269,40 +276,40 @@ mod tests {
 
     #[test]
     fn a_session_datagram_carries_its_link_and_nonce() {
-        let mut bytes = std::vec::Vec::from(session_header(FLEET, 300, 0x0102_0304_0506_0708));
+        let mut bytes = std::vec::Vec::from(session_header(PLAIN, FLEET, 300, 0x0102_0304_0506_0708));
         bytes.push(42);
         let expected = Datagram::Session { link: 300, nonce: 0x0102_0304_0506_0708, body: &[42] };
-        assert_eq!(Datagram::decode(&bytes, FLEET), Ok(expected));
+        assert_eq!(Datagram::decode(&bytes, PLAIN, FLEET), Ok(expected));
     }
 
     #[test]
     fn every_cut_every_tail_and_every_unknown_kind_is_refused() {
         let mut out = [0; SEARCH_BYTES];
-        let length = who_has(2).encode(FLEET, &mut out).unwrap().len();
+        let length = who_has(2).encode(PLAIN, FLEET, &mut out).unwrap().len();
         for cut in 0..length {
-            assert_eq!(Datagram::decode(&out[..cut], FLEET), Err(DatagramError::Malformed));
+            assert_eq!(Datagram::decode(&out[..cut], PLAIN, FLEET), Err(DatagramError::Malformed));
         }
-        assert_eq!(Datagram::decode(&out[..length + 1], FLEET), Err(DatagramError::Malformed));
+        assert_eq!(Datagram::decode(&out[..length + 1], PLAIN, FLEET), Err(DatagramError::Malformed));
         for (place, byte) in [(5, 0), (5, 4), (6, 1), (7, 1)] {
             let mut changed = out;
             changed[place] = byte;
-            assert_eq!(Datagram::decode(&changed[..length], FLEET), Err(DatagramError::Malformed));
+            assert_eq!(Datagram::decode(&changed[..length], PLAIN, FLEET), Err(DatagramError::Malformed));
         }
-        let session = session_header(FLEET, 1, 2);
-        assert_eq!(Datagram::decode(&session[..SESSION_HEADER_BYTES - 1], FLEET), Err(DatagramError::Malformed));
+        let session = session_header(PLAIN, FLEET, 1, 2);
+        assert_eq!(Datagram::decode(&session[..SESSION_HEADER_BYTES - 1], PLAIN, FLEET), Err(DatagramError::Malformed));
     }
 
     #[test]
     fn a_node_without_a_name_is_refused() {
         let mut out = [0; SEARCH_BYTES];
-        let length = who_has(0).encode(FLEET, &mut out).unwrap().len();
+        let length = who_has(0).encode(PLAIN, FLEET, &mut out).unwrap().len();
         // The identity begins with its id in five bytes; the name's length follows.
         let at = HEADER_BYTES + 5;
         assert_eq!(out[at], 32);
         out[at] = 0;
         let mut bytes = std::vec::Vec::from(&out[..length]);
         bytes.drain(at + 1..=at + 32);
-        assert_eq!(Datagram::decode(&bytes, FLEET), Err(DatagramError::Malformed));
+        assert_eq!(Datagram::decode(&bytes, PLAIN, FLEET), Err(DatagramError::Malformed));
     }
 
     #[test]
@@ -324,15 +331,15 @@ mod tests {
             known in 0..KNOWN_NODES,
         ) {
             let mut out = [0; SEARCH_BYTES];
-            let length = who_has(known).encode(FLEET, &mut out).unwrap().len();
+            let length = who_has(known).encode(PLAIN, FLEET, &mut out).unwrap().len();
             for (place, byte) in changes {
                 out[place] = byte;
             }
-            let _ = Datagram::decode(&out[..length.min(cut)], FLEET);
-            if let Ok(Datagram::WhoHas(read)) = Datagram::decode(&out[..length], FLEET) {
+            let _ = Datagram::decode(&out[..length.min(cut)], PLAIN, FLEET);
+            if let Ok(Datagram::WhoHas(read)) = Datagram::decode(&out[..length], PLAIN, FLEET) {
                 let mut again = [0; SEARCH_BYTES];
-                let bytes = read.encode(FLEET, &mut again).unwrap();
-                prop_assert_eq!(Datagram::decode(bytes, FLEET), Ok(Datagram::WhoHas(read)));
+                let bytes = read.encode(PLAIN, FLEET, &mut again).unwrap();
+                prop_assert_eq!(Datagram::decode(bytes, PLAIN, FLEET), Ok(Datagram::WhoHas(read)));
             }
         }
     }

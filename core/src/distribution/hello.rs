@@ -6,7 +6,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::identity::{Epoch, Fleet, Identity};
-use crate::config::{MINIMUM_CHUNK_BYTES, NODE_NAME_BYTES, PLAIN_MAGIC, VERSION};
+use crate::config::{MINIMUM_CHUNK_BYTES, Mode, NODE_NAME_BYTES, VERSION};
 
 /// Bytes of magic and version.
 const PREFIX_BYTES: usize = 5;
@@ -65,8 +65,10 @@ pub struct Hello {
 /// Why a hello cannot be used.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum HelloError {
-    /// Not a unit of this mode, or no unit at all.
+    /// No unit at all.
     Magic,
+    /// A unit of the other mode.
+    Mode,
     /// Another version, this one.
     Version(u8),
     /// The rest cannot be read.
@@ -75,19 +77,21 @@ pub enum HelloError {
 
 impl Hello {
     /// Encodes into `out`; the length, or `None` where it does not fit.
-    pub fn encode(&self, out: &mut [u8]) -> Option<usize> {
+    pub fn encode(&self, mode: Mode, out: &mut [u8]) -> Option<usize> {
         let (prefix, rest) = out.split_first_chunk_mut::<PREFIX_BYTES>()?;
-        let [m0, m1, m2, m3] = PLAIN_MAGIC;
+        let [m0, m1, m2, m3] = mode.magic();
         *prefix = [m0, m1, m2, m3, VERSION];
         postcard::to_slice(self, rest).ok()?.len().checked_add(PREFIX_BYTES)
     }
 
-    /// Reads a hello: all of it, nothing behind it.
-    pub fn decode(bytes: &[u8]) -> Result<Self, HelloError> {
+    /// Reads a hello of this mode: all of it, nothing behind it.
+    pub fn decode(bytes: &[u8], mode: Mode) -> Result<Self, HelloError> {
         let (prefix, rest) = bytes.split_first_chunk::<PREFIX_BYTES>().ok_or(HelloError::Malformed)?;
         let [m0, m1, m2, m3, version] = *prefix;
-        if [m0, m1, m2, m3] != PLAIN_MAGIC {
-            return Err(HelloError::Magic);
+        match Mode::of_magic([m0, m1, m2, m3]) {
+            None => return Err(HelloError::Magic),
+            Some(other) if other != mode => return Err(HelloError::Mode),
+            Some(_) => {}
         }
         if version != VERSION {
             return Err(HelloError::Version(version));
@@ -106,6 +110,7 @@ mod tests {
     use proptest::prelude::*;
 
     const ROOM: usize = 256;
+    const PLAIN: Mode = Mode::Plain;
 
     fn longest() -> Hello {
         let name = "a-manager-with-a-name-of-32-byte";
@@ -133,29 +138,30 @@ mod tests {
     #[test]
     fn the_longest_hello_fits_256_bytes_and_survives() {
         let mut out = [0; ROOM];
-        let length = longest().encode(&mut out).unwrap();
-        assert_eq!(Hello::decode(&out[..length]), Ok(longest()));
-        assert_eq!(longest().encode(&mut out[..length - 1]), None);
-        assert_eq!(Hello::decode(&out[..length + 1]), Err(HelloError::Malformed), "nothing may follow");
+        let length = longest().encode(PLAIN, &mut out).unwrap();
+        assert_eq!(Hello::decode(&out[..length], PLAIN), Ok(longest()));
+        assert_eq!(longest().encode(PLAIN, &mut out[..length - 1]), None);
+        assert_eq!(Hello::decode(&out[..length + 1], PLAIN), Err(HelloError::Malformed), "nothing may follow");
     }
 
     #[test]
     fn each_fault_of_a_hello_is_named() {
         let mut out = [0; ROOM];
-        let length = longest().encode(&mut out).unwrap();
+        let length = longest().encode(PLAIN, &mut out).unwrap();
         let with = |place: usize, byte| {
             let mut bytes = out;
             bytes[place] = byte;
-            Hello::decode(&bytes[..length])
+            Hello::decode(&bytes[..length], PLAIN)
         };
         assert_eq!(with(0, b'X'), Err(HelloError::Magic));
+        assert_eq!(with(3, b's'), Err(HelloError::Mode));
         assert_eq!(with(4, VERSION + 1), Err(HelloError::Version(VERSION + 1)));
         for cut in 0..length {
-            assert_eq!(Hello::decode(&out[..cut]), Err(HelloError::Malformed));
+            assert_eq!(Hello::decode(&out[..cut], PLAIN), Err(HelloError::Malformed));
         }
         let small = Limits { chunk_size: (MINIMUM_CHUNK_BYTES - 1) as u16, ..longest().limits };
-        let length = Hello { limits: small, ..longest() }.encode(&mut out).unwrap();
-        assert_eq!(Hello::decode(&out[..length]), Err(HelloError::Malformed), "an emergency would not fit");
+        let length = Hello { limits: small, ..longest() }.encode(PLAIN, &mut out).unwrap();
+        assert_eq!(Hello::decode(&out[..length], PLAIN), Err(HelloError::Malformed), "an emergency would not fit");
     }
 
     proptest! {
@@ -165,15 +171,15 @@ mod tests {
             cut in 0..ROOM,
         ) {
             let mut out = [0; ROOM];
-            let length = longest().encode(&mut out).unwrap();
+            let length = longest().encode(PLAIN, &mut out).unwrap();
             for (place, byte) in changes {
                 out[place] = byte;
             }
-            let _ = Hello::decode(&out[..cut]);
-            if let Ok(hello) = Hello::decode(&out[..length]) {
+            let _ = Hello::decode(&out[..cut], PLAIN);
+            if let Ok(hello) = Hello::decode(&out[..length], PLAIN) {
                 let mut again = [0; ROOM];
-                let length = hello.encode(&mut again).unwrap();
-                prop_assert_eq!(Hello::decode(&again[..length]), Ok(hello));
+                let length = hello.encode(PLAIN, &mut again).unwrap();
+                prop_assert_eq!(Hello::decode(&again[..length], PLAIN), Ok(hello));
             }
         }
     }

@@ -1,6 +1,7 @@
 //! DISTRIBUTION (paper, section 2): the IDL, the encoding of messages, discovery and the table of nodes.
 
 mod attributes;
+pub mod authenticator;
 pub mod block;
 pub mod connection_handler;
 pub mod datagram;

@@ -21,6 +21,8 @@ const CLOSE: u8 = 3;
 const PING: u8 = 4;
 const PONG: u8 = 5;
 const SESSION: u8 = 6;
+const PROOF: u8 = 7;
+const CONFIRM: u8 = 8;
 const CHUNK: u8 = 0x10;
 const FIRST: u8 = 0x01;
 const LAST: u8 = 0x02;
@@ -40,6 +42,10 @@ pub enum Frame<'b> {
     Pong,
     /// A session body (keep-alive, renewal), as it otherwise travels in a datagram.
     Session(&'b [u8]),
+    /// A message of the proof that opens a secured link.
+    Proof(&'b [u8]),
+    /// The first sealed frame of an end: it has proven itself, and tells what is needed for its datagrams.
+    Confirm(&'b [u8]),
     /// A piece of a message.
     Chunk(Chunk<'b>),
 }
@@ -68,6 +74,8 @@ impl<'b> Frame<'b> {
             PING if rest.is_empty() => Ok(Self::Ping),
             PONG if rest.is_empty() => Ok(Self::Pong),
             SESSION => Ok(Self::Session(rest)),
+            PROOF => Ok(Self::Proof(rest)),
+            CONFIRM => Ok(Self::Confirm(rest)),
             kind if kind & !(FIRST | LAST) == CHUNK => Chunk::parse(kind, body.len(), rest).map(Self::Chunk),
             _ => Err(CloseReason::Protocol),
         }
@@ -112,6 +120,8 @@ pub fn encode(frame: &Frame<'_>, overhead: usize, out: &mut [u8]) -> usize {
         Frame::Ping => (PING, &[]),
         Frame::Pong => (PONG, &[]),
         Frame::Session(bytes) => (SESSION, bytes),
+        Frame::Proof(bytes) => (PROOF, bytes),
+        Frame::Confirm(bytes) => (CONFIRM, bytes),
         Frame::Chunk(_) => return 0,
     };
     let body_length = payload.len().saturating_add(1).saturating_add(overhead);

@@ -1,26 +1,92 @@
-//! The place of the cipher: a trait for sealing and opening frames in place, and the plain mode that does nothing.
+//! The place of the cipher: traits for proving who is at the other end and for sealing and opening in place, and the
+//! plain mode, which does nothing of that.
+//!
+//! # How a secured link begins
+//! Both hellos travel in clear, the dialler's first; each end gives both to [`Secure::introduce`] in that order. When
+//! the peer's has come, the port brings the pair's key, and the cipher proves it with one message in each direction
+//! ([`Secure::prove`], [`Secure::answer`]). From then on all frames are sealed. The first sealed frame of each end
+//! confirms that it has the keys, and tells the key of its datagrams ([`Secure::confirmation`]). Nothing that the peer
+//! has said counts before that frame has opened.
 
+use crate::config::Mode;
 use crate::error::CloseReason;
 
-/// Seals and opens the frames of one link, in place, without IO.
-pub trait Secure {
-    /// Bytes that sealing adds behind a frame's body. With 0, sealing changes nothing, and frames may be written in
-    /// another order than they were sealed in.
-    const OVERHEAD: usize;
+/// Bytes of a message of the proof.
+pub const PROOF_BYTES: usize = 48;
+/// Bytes of what each end tells in its first sealed frame.
+pub const CONFIRMATION_BYTES: usize = 33;
+/// Most bytes that sealing adds to a datagram, in front and behind.
+pub const DATAGRAM_OVERHEAD: usize = 25;
 
-    /// Seals `frame`, whose last [`OVERHEAD`](Self::OVERHEAD) bytes are room for the tag.
+/// Seals and opens the frames of one link, in place, without IO.
+pub trait Seal {
+    /// Bytes that sealing adds behind a frame's body, the same for all of a link's life. With 0, sealing changes nothing,
+    /// and frames may be written in another order than they were sealed in.
+    fn overhead(&self) -> usize;
+
+    /// Seals `frame`, whose last [`overhead`](Self::overhead) bytes are room for the tag.
     fn seal(&mut self, frame: &mut [u8]) -> Result<(), CloseReason>;
 
-    /// Opens `frame` and returns its body, which is [`OVERHEAD`](Self::OVERHEAD) bytes shorter.
+    /// Opens `frame` and returns its body. Until both ends have proven themselves that is the frame as it is.
     fn open<'f>(&mut self, frame: &'f mut [u8]) -> Result<&'f mut [u8], CloseReason>;
 }
 
-/// Plain mode: frames travel as they are. It has its own magic and port and never talks to a secured unit.
+/// All that one link needs of a cipher.
+pub trait Secure: Seal {
+    /// What the port brings once it knows whom the peer claims to be: the pair's key, and random bytes.
+    type Credentials;
+
+    /// The mode of the link.
+    fn mode(&self) -> Mode;
+
+    /// Frames are sealed from here on. Always so in plain mode, where there is nothing to prove.
+    fn is_sealing(&self) -> bool;
+
+    /// A hello as it travels: first the dialler's, then the other one's. The proof covers both.
+    fn introduce(&mut self, hello: &[u8]);
+
+    /// Begins the proof. The end that dialled gets the message to send.
+    fn prove(&mut self, dialed: bool, credentials: Self::Credentials)
+    -> Result<Option<[u8; PROOF_BYTES]>, CloseReason>;
+
+    /// Takes the other end's message. The end that was dialled gets the answer to send, which is not sealed; everything
+    /// behind it is.
+    fn answer(&mut self, message: &[u8]) -> Result<Option<[u8; PROOF_BYTES]>, CloseReason>;
+
+    /// What this end tells in its first sealed frame.
+    fn confirmation(&self) -> [u8; CONFIRMATION_BYTES];
+
+    /// What the other end told in its first sealed frame.
+    fn confirmed(&mut self, confirmation: &[u8]) -> Result<(), CloseReason>;
+
+    /// Room that a datagram needs in front of its body and behind it, at most [`DATAGRAM_OVERHEAD`] in all.
+    fn datagram_room(&self) -> (usize, usize);
+
+    /// Seals `datagram`, a body with that room around it. `bound` travels in clear and cannot be changed. `false` when
+    /// there can be none.
+    fn seal_datagram(&mut self, bound: &[u8], datagram: &mut [u8]) -> bool;
+
+    /// Opens `datagram` in place and returns its body.
+    fn open_datagram<'d>(&mut self, bound: &[u8], datagram: &'d mut [u8]) -> Result<&'d mut [u8], Unopened>;
+}
+
+/// Why a datagram was not opened.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Unopened {
+    /// The same, or one much newer, came before.
+    Repeated,
+    /// It is not the peer's, or somebody changed it.
+    Forged,
+}
+
+/// Plain mode: everything travels as it is. It has its own magic and port and never talks to a secured unit.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Plain;
 
-impl Secure for Plain {
-    const OVERHEAD: usize = 0;
+impl Seal for Plain {
+    fn overhead(&self) -> usize {
+        0
+    }
 
     fn seal(&mut self, _frame: &mut [u8]) -> Result<(), CloseReason> {
         Ok(())
@@ -28,5 +94,47 @@ impl Secure for Plain {
 
     fn open<'f>(&mut self, frame: &'f mut [u8]) -> Result<&'f mut [u8], CloseReason> {
         Ok(frame)
+    }
+}
+
+impl Secure for Plain {
+    type Credentials = ();
+
+    fn mode(&self) -> Mode {
+        Mode::Plain
+    }
+
+    fn is_sealing(&self) -> bool {
+        true
+    }
+
+    fn introduce(&mut self, _hello: &[u8]) {}
+
+    fn prove(&mut self, _dialed: bool, (): ()) -> Result<Option<[u8; PROOF_BYTES]>, CloseReason> {
+        Err(CloseReason::Protocol)
+    }
+
+    fn answer(&mut self, _message: &[u8]) -> Result<Option<[u8; PROOF_BYTES]>, CloseReason> {
+        Err(CloseReason::Protocol)
+    }
+
+    fn confirmation(&self) -> [u8; CONFIRMATION_BYTES] {
+        [0; CONFIRMATION_BYTES]
+    }
+
+    fn confirmed(&mut self, _confirmation: &[u8]) -> Result<(), CloseReason> {
+        Err(CloseReason::Protocol)
+    }
+
+    fn datagram_room(&self) -> (usize, usize) {
+        (0, 0)
+    }
+
+    fn seal_datagram(&mut self, _bound: &[u8], _datagram: &mut [u8]) -> bool {
+        true
+    }
+
+    fn open_datagram<'d>(&mut self, _bound: &[u8], datagram: &'d mut [u8]) -> Result<&'d mut [u8], Unopened> {
+        Ok(datagram)
     }
 }

@@ -31,7 +31,7 @@ impl SUnit {
     }
 
     fn poll_node(&mut self, now: Instant) {
-        while let Some(action) = self.node.poll(now, &mut self.stack) {
+        while let Some(action) = self.node.poll(now, &mut self.stack, &Plain) {
             // With one link there is never a second one that could be in its way.
             if let Action::Dial { to, identity } = action {
                 self.dial(now, to, identity.as_ref());
@@ -63,15 +63,15 @@ impl SUnit {
     pub(crate) fn read<P: Program>(&mut self, now: Instant, program: &mut P) {
         let mut lent = [0; LENT_BYTES];
         while let Some((from, length)) = self.stack.datagram(&mut lent) {
-            self.take_datagram(now, from, &lent[..length], program);
+            self.take_datagram(now, from, &mut lent[..length], program);
         }
         self.follow_stream(now);
         while self.take_bytes(now, &mut lent, program) {}
         self.serve_waiting(now, program);
     }
 
-    fn take_datagram<P: Program>(&mut self, now: Instant, from: SocketAddr, bytes: &[u8], program: &mut P) {
-        let Sorted::Session { nonce, body, .. } = self.node.datagram(now, from, bytes) else { return };
+    fn take_datagram<P: Program>(&mut self, now: Instant, from: SocketAddr, bytes: &mut [u8], program: &mut P) {
+        let Sorted::Session { nonce, body, .. } = self.node.datagram(now, from, bytes, &Plain) else { return };
         let Some(session) = &mut self.session else { return };
         if let Some(event) = session.datagram(context!(self, now), from, nonce, body) {
             let rest = tell(event, program);
@@ -216,7 +216,8 @@ fn tell<P: Program>(event: Event<'_>, program: &mut P) -> Rest {
         Event::Failed(id, error) => program.hear(News::Failed(id, error)),
         Event::ListChanged => program.hear(News::ListChanged),
         Event::LeaseEnded { slot, expired } => program.hear(News::LeaseEnded { function: slot, expired }),
-        Event::Acknowledged { .. } | Event::Answered => {}
+        // Plain links prove nothing.
+        Event::Acknowledged { .. } | Event::Answered | Event::Introduced => {}
         Event::Hello => return Rest::Greet,
         Event::Call(call) => return Rest::Serve(call),
         Event::Closed(reason) => return Rest::Leave(reason),

@@ -3,6 +3,7 @@
 use cara_core::distribution::connection_handler::Sorted;
 use cara_core::error::Error;
 use cara_core::host::mailman::LinkId;
+use cara_core::host::secure::Plain;
 use cara_core::time::Instant;
 use core::net::SocketAddr;
 
@@ -40,14 +41,14 @@ impl<T: Send + 'static> Engine<T> {
     pub(super) fn datagrams_ready(&self, socket: Socket, buffer: &mut [u8]) {
         for _ in 0..BATCH {
             let Some((count, from)) = self.datagrams.receive(socket, buffer) else { return };
-            self.datagram(from, buffer.get(..count).unwrap_or_default());
+            self.datagram(from, buffer.get_mut(..count).unwrap_or_default());
         }
     }
 
-    fn datagram(&self, from: SocketAddr, bytes: &[u8]) {
+    fn datagram(&self, from: SocketAddr, bytes: &mut [u8]) {
         let (sorted, twin) = {
             let mut cell = lock(&self.node);
-            (cell.node.datagram(self.clock.now(), from, bytes), cell.node.take_twin())
+            (cell.node.datagram(self.clock.now(), from, bytes, &Plain), cell.node.take_twin())
         };
         if let Some(address) = twin {
             self.twin_heard(address);

@@ -102,7 +102,7 @@ impl<T: Send + 'static> Engine<T> {
         unproven.sort_unstable_by_key(|link| link.serial);
         for link in unproven {
             let Some(mut state) = link.try_lock() else { continue };
-            if state.session.dialed() || state.session.hello().is_some() || link.stream.has_unread() {
+            if state.session.dialed() || state.session.is_proven() || link.stream.has_unread() {
                 continue;
             }
             self.with(&link, &mut state, |session, cx| session.close(cx, CloseReason::HelloTimeout));
@@ -365,7 +365,7 @@ impl<T: Send + 'static> Engine<T> {
             let (action, next) = {
                 let mut cell = lock(&self.node);
                 let mut mailman = StdMailman { stream: None, datagrams: &self.datagrams };
-                let action = cell.node.poll(self.clock.now(), &mut mailman);
+                let action = cell.node.poll(self.clock.now(), &mut mailman, &Plain);
                 (action, cell.node.next_deadline())
             };
             if action.is_none() {

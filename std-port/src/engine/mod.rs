@@ -39,7 +39,7 @@ use cara_core::distribution::function_list::FunctionList;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error};
 use cara_core::host::mailman::LinkId;
-use cara_core::host::secure::{Plain, Secure};
+use cara_core::host::secure::{Plain, Seal};
 use cara_core::services::unit::{Call, Event, Session, buffer_bytes};
 use cara_core::services::{Context, requests::CallId};
 use cara_core::time::{Duration, Instant};
@@ -256,7 +256,8 @@ impl<T: Send + 'static> Engine<T> {
             call: None,
         };
         match receipt.event {
-            None => {}
+            // Plain links prove nothing.
+            None | Some(Event::Introduced) => {}
             Some(Event::Hello) => step.hello = true,
             Some(Event::Call(call)) => step.call = Some(call),
             Some(Event::Reply(id, outcome)) => match own.filter(|own| own.id == id) {
@@ -459,7 +460,7 @@ impl<T: Send + 'static> Engine<T> {
 
 /// Bytes of a buffer of the pool.
 pub(crate) fn message_buffer_bytes(constraints: &Constraints) -> usize {
-    2 * buffer_bytes(constraints.message_size, Plain::OVERHEAD)
+    2 * buffer_bytes(constraints.message_size, Plain.overhead())
 }
 
 /// What one step of feeding led to.
@@ -489,6 +490,6 @@ fn notice(event: &Event<'_>) -> Option<Notice> {
         Event::Acknowledged { serial, skipped } => Notice::Acknowledged { serial, skipped },
         Event::Answered => Notice::Answered,
         Event::Closed(reason) => Notice::Left(reason),
-        Event::Hello | Event::Call(_) | Event::Reply(..) => return None,
+        Event::Introduced | Event::Hello | Event::Call(_) | Event::Reply(..) => return None,
     })
 }

@@ -1,5 +1,6 @@
 use std::net::Ipv4Addr;
 
+use cara_core::config::Mode;
 use cara_core::distribution::hello::Manager;
 
 use super::*;
@@ -43,7 +44,7 @@ fn search(name: &str, epoch: u64) -> WhoHas {
 
 fn bytes(fleet: u32, search: &WhoHas) -> Vec<u8> {
     let mut out = [0; SEARCH_BYTES];
-    search.encode(Fleet(fleet), &mut out).unwrap().to_vec()
+    search.encode(Mode::Plain, Fleet(fleet), &mut out).unwrap().to_vec()
 }
 
 #[test]

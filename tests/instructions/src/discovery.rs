@@ -2,7 +2,7 @@
 
 use core::net::SocketAddr;
 
-use cara_core::config::Constraints;
+use cara_core::config::{Constraints, Mode};
 use cara_core::distribution::connection_handler::{
     Admission, Finding, Known, Node, NodeConfig, NodeStorage, Order, Target,
 };
@@ -11,6 +11,7 @@ use cara_core::distribution::hello::{Hello, Manager};
 use cara_core::distribution::identity::{Epoch, Fleet, Identity};
 use cara_core::error::CloseReason;
 use cara_core::host::mailman::{LinkId, Mailman};
+use cara_core::host::secure::Plain;
 use cara_core::storage::Lent;
 use cara_core::time::{Duration, Instant};
 
@@ -103,8 +104,7 @@ impl Discovery {
             let admitted = node.admit(Instant::START, LinkId(number), address(&hello.identity), &hello);
             assert_eq!(admitted, Admission::Accept);
         }
-        let mut discovery =
-            Self { node, now: Instant::START, link: LinkId(connected as u16), hello, sequence: 0 };
+        let mut discovery = Self { node, now: Instant::START, link: LinkId(connected as u16), hello, sequence: 0 };
         discovery.rest(&mut Outbox(0));
         discovery
     }
@@ -114,7 +114,7 @@ impl Discovery {
         let end = self.now + Duration::from_secs(1);
         while self.node.next_deadline() <= end {
             self.now = self.now.max(self.node.next_deadline());
-            while self.node.poll(self.now, outbox).is_some() {}
+            while self.node.poll(self.now, outbox, &Plain).is_some() {}
         }
         self.now = end;
     }
@@ -140,12 +140,12 @@ impl Discovery {
             known: Default::default(),
         };
         let mut bytes = [0; SEARCH_BYTES];
-        let length = who_has.encode(FLEET, &mut bytes).expect("room for it").len();
+        let length = who_has.encode(Mode::Plain, FLEET, &mut bytes).expect("room for it").len();
         let mut outbox = Outbox(0);
         meter.count(&mut || {
-            self.node.datagram(self.now, from, &bytes[..length]);
+            self.node.datagram(self.now, from, &mut bytes[..length], &Plain);
             self.now = self.now.max(self.node.next_deadline());
-            while self.node.poll(self.now, &mut outbox).is_some() {}
+            while self.node.poll(self.now, &mut outbox, &Plain).is_some() {}
         });
         assert!(outbox.0 > 0, "the manager answers");
         self.rest(&mut outbox);
@@ -157,13 +157,12 @@ impl Discovery {
         let identity = Identity::m_unit("other", 500_000 + self.sequence).expect("a name");
         let from = address(&identity);
         // Nowhere to be dialled, so that nothing follows from it.
-        let announce =
-            Announce { identity, epoch: Epoch(1), sequence: 1, nonce: 0, tcp_port: 0, room: 8, expected: 8 };
+        let announce = Announce { identity, epoch: Epoch(1), sequence: 1, nonce: 0, tcp_port: 0, room: 8, expected: 8 };
         let mut bytes = [0; SEARCH_BYTES];
-        let length = announce.encode(FLEET, &mut bytes).expect("room for it").len();
+        let length = announce.encode(Mode::Plain, FLEET, &mut bytes).expect("room for it").len();
         meter.count(&mut || {
-            self.node.datagram(self.now, from, &bytes[..length]);
-            while self.node.poll(self.now, &mut Outbox(0)).is_some() {}
+            self.node.datagram(self.now, from, &mut bytes[..length], &Plain);
+            while self.node.poll(self.now, &mut Outbox(0), &Plain).is_some() {}
         });
         self.rest(&mut Outbox(0));
     }

@@ -3,7 +3,7 @@
 use core::hint::black_box;
 
 use cara_core::distribution::identity::{Fleet, Identity};
-use cara_core::host::secure::Secure;
+use cara_core::host::secure::Seal;
 use cara_secure::channel::{Channel, TAG_BYTES};
 use cara_secure::handshake::{self, Initiator, MESSAGE_BYTES};
 use cara_secure::keys::{KEY_BYTES, PairKey, RootKey};
@@ -70,12 +70,7 @@ impl Sealing {
     }
 }
 
-fn agree(
-    key: &PairKey,
-    prologue: &[u8; 32],
-    initiator: &mut dyn Meter,
-    responder: &mut dyn Meter,
-) -> [Channel; 2] {
+fn agree(key: &PairKey, prologue: &[u8; 32], initiator: &mut dyn Meter, responder: &mut dyn Meter) -> [Channel; 2] {
     let mut begun = None;
     initiator.count(&mut || begun = Some(Initiator::begin(key, prologue, black_box(&[1; 32])).expect("it begins")));
     let (waiting, message) = begun.take().expect("it has begun");
@@ -85,6 +80,6 @@ fn agree(
     });
     let (to_initiator, answer) = answered.take().expect("it was answered");
     let (mut waiting, mut finished) = (Some(waiting), None);
-    initiator.count(&mut || finished = waiting.take().map(|waiting| waiting.finish(&answer).expect("it ends")));
-    [finished.expect("it has ended"), to_initiator]
+    initiator.count(&mut || finished = waiting.take().map(|waiting| waiting.finish(&answer).expect("it ends").channel));
+    [finished.expect("it has ended"), to_initiator.channel]
 }

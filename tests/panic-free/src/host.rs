@@ -6,10 +6,10 @@ use cara_core::error::CloseReason;
 use cara_core::host::connections::{Incoming, Link, Liveness, Place};
 use cara_core::host::frame::{self, ChunkWriter, Cut, Frame};
 use cara_core::host::mailman::{LinkId, Mailman};
-use cara_core::host::secure::{Plain, Secure};
 use cara_core::storage::{Lent, Pool};
 
 use crate::linkage::{drain, keep, unknown, unknown_slice};
+use crate::secure::AnyCipher;
 
 /// A network that does anything.
 pub struct AnyMailman;
@@ -31,7 +31,7 @@ impl Mailman for AnyMailman {
     }
 }
 
-type AnyLink = Link<Lent, Plain>;
+type AnyLink = Link<Lent, AnyCipher>;
 
 entry!(frames, {
     keep(Frame::parse(unknown_slice()));
@@ -48,12 +48,8 @@ entry!(chunks, {
     }
 });
 
-entry!(plain, {
-    keep((Plain.seal(unknown_slice()), Plain.open(unknown_slice())));
-});
-
 entry!(link_made, {
-    keep(AnyLink::new(*unknown(), Plain, unknown_slice(), *unknown(), *unknown()));
+    keep(AnyLink::new(*unknown(), AnyCipher, unknown_slice(), *unknown(), *unknown()));
 });
 
 entry!(link_receives, {

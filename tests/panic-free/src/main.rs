@@ -13,6 +13,7 @@ mod foundation;
 mod host;
 mod messages;
 mod node;
+mod secure;
 mod services;
 mod shown;
 

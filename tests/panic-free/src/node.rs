@@ -10,6 +10,7 @@ use core::mem::MaybeUninit;
 
 use crate::host::AnyMailman;
 use crate::linkage::{drain, keep, unknown, unknown_slice, unknown_text};
+use crate::secure::AnyCodes;
 
 type AnyNode = Node<Lent>;
 
@@ -43,18 +44,19 @@ entry!(node_set, {
 });
 
 entry!(node_polled, {
-    keep(node().poll(*unknown(), &mut AnyMailman));
+    keep(node().poll(*unknown(), &mut AnyMailman, &AnyCodes));
     node().broadcast(*unknown());
     node().network_changed(*unknown());
 });
 
 entry!(node_hears, {
-    keep(node().datagram(*unknown(), *unknown(), unknown_slice()));
+    keep(node().datagram(*unknown(), *unknown(), unknown_slice(), &AnyCodes));
     keep(node().take_twin());
 });
 
 entry!(node_admits, {
     keep(node().admit(*unknown(), *unknown(), *unknown(), unknown()));
+    node().refuse_without_key(*unknown(), *unknown(), identity());
     keep(node().challenge_answered(*unknown(), *unknown()));
 });
 
@@ -88,10 +90,10 @@ entry!(managers, {
 });
 
 entry!(datagrams, {
-    keep(Datagram::decode(unknown_slice(), *unknown()));
+    keep(Datagram::decode(unknown_slice(), *unknown(), *unknown()));
     keep(datagram::Header::decode(unknown_slice()));
     keep(unknown::<datagram::Header>().read(unknown_slice()));
-    keep(unknown::<WhoHas>().encode(*unknown(), unknown_slice()));
-    keep(unknown::<Announce>().encode(*unknown(), unknown_slice()));
+    keep(unknown::<WhoHas>().encode(*unknown(), *unknown(), unknown_slice()));
+    keep(unknown::<Announce>().encode(*unknown(), *unknown(), unknown_slice()));
     keep(datagram::short_hash(identity()));
 });

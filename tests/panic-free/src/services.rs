@@ -6,7 +6,6 @@ use cara_core::distribution::datagram;
 use cara_core::distribution::hello::Hello;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::{Parameters, ParametersView};
-use cara_core::host::secure::Plain;
 use cara_core::services::lease::{Lease, Service};
 use cara_core::services::publications::Publications;
 use cara_core::services::requests::Requests;
@@ -16,6 +15,7 @@ use cara_core::storage::{Lent, Pool};
 
 use crate::host::AnyMailman;
 use crate::linkage::{drain, keep, unknown, unknown_slice, unknown_text};
+use crate::secure::AnyCipher;
 
 /// A handler that may have a lease.
 struct Handler;
@@ -26,7 +26,7 @@ impl Service for Handler {
     }
 }
 
-type AnySession = Session<Lent, Plain>;
+type AnySession = Session<Lent, AnyCipher>;
 type AnyContext = Context<'static, Lent, AnyMailman, Pool<Lent>, Handler>;
 
 fn session() -> &'static mut AnySession {
@@ -48,7 +48,7 @@ fn taken<T: 'static>() -> Option<T> {
 
 entry!(session_made, {
     if let (Some(config), Some(storage)) = (taken::<SessionConfig>(), taken::<SessionStorage<Lent>>()) {
-        unknown::<MaybeUninit<AnySession>>().write(Session::new(*unknown(), config, Plain, storage));
+        unknown::<MaybeUninit<AnySession>>().write(Session::new(*unknown(), config, AnyCipher, storage));
     }
 });
 
@@ -71,7 +71,14 @@ entry!(session_grown, {
 
 entry!(session_asked, {
     let session = session();
-    keep((session.link(), session.dialed(), session.is_live(), session.is_ended(), session.hello()));
+    keep((
+        session.link(),
+        session.dialed(),
+        session.is_live(),
+        session.is_proven(),
+        session.is_ended(),
+        session.hello(),
+    ));
     keep((session.identity(), session.epoch(), session.address(), session.nonce(), session.deadline()));
     keep((session.their_function_list(), session.counters(), session.calls_in_flight(), session.calls_held()));
     keep((session.wants_to_write(), session.has_next_call(), session.is_acknowledged(*unknown())));
@@ -87,6 +94,7 @@ entry!(session_connected, {
 });
 
 entry!(session_ended, {
+    session().prove(context(), *unknown());
     session().refuse(context(), *unknown());
     session().close(context(), *unknown());
     session().disconnected(*unknown());
@@ -166,7 +174,7 @@ entry!(requests, {
 });
 
 entry!(hellos, {
-    keep(Hello::decode(unknown_slice()));
-    keep(unknown::<Hello>().encode(unknown_slice()));
-    keep(datagram::session_header(*unknown(), *unknown(), *unknown()));
+    keep(Hello::decode(unknown_slice(), *unknown()));
+    keep(unknown::<Hello>().encode(*unknown(), unknown_slice()));
+    keep(datagram::session_header(*unknown(), *unknown(), *unknown(), *unknown()));
 });

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Once;
 
+use cara_core::config::Mode;
 use cara_core::time::Duration;
 
 use crate::{Port, Scenario, Weather, World, ports};
@@ -50,7 +51,8 @@ pub type Failure = String;
 pub fn once(scenario: &Scenario, port: Port, seed: u64, weather: Weather) -> Result<Report, Failure> {
     catch_quietly(|| {
         let mut world = match port {
-            Port::Simulator => ports::simulator(seed, weather),
+            Port::Simulator => ports::simulator(seed, weather, Mode::Plain),
+            Port::Secured => ports::simulator(seed, weather, Mode::Secured),
             Port::Linux => ports::linux(scenario.needs),
             Port::Embassy => ports::embassy(seed, weather),
         };
@@ -96,7 +98,7 @@ impl dyn World + '_ {
     /// By how much what is due may be late because of the port itself; unknown on real time.
     pub fn slack(&self) -> Option<Duration> {
         match self.port() {
-            Port::Simulator => Some(Duration::ZERO),
+            Port::Simulator | Port::Secured => Some(Duration::ZERO),
             Port::Embassy => Some(Duration::from_millis(1)),
             Port::Linux => None,
         }

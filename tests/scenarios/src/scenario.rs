@@ -70,8 +70,17 @@ impl Need {
     pub const fn missing_on(self, port: Port) -> Option<&'static str> {
         match port {
             Port::Simulator => None,
+            Port::Secured => self.missing_on_secured(),
             Port::Linux => self.missing_on_linux(),
             Port::Embassy => self.missing_on_embassy(),
+        }
+    }
+
+    /// Of the simulator with secured units.
+    const fn missing_on_secured(self) -> Option<&'static str> {
+        match self {
+            Self::Strangers => Some("strangers speak plain; `tests/sim/tests/security` has its own for secured units"),
+            _ => None,
         }
     }
 

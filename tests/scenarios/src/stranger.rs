@@ -1,6 +1,6 @@
 //! Whoever connects to a unit and is none, or behaves as none should: what it says, byte by byte, on any port.
 
-use cara_core::config::{PLAIN_MAGIC, Priority, VERSION};
+use cara_core::config::{Mode, PLAIN_MAGIC, Priority, VERSION};
 use cara_core::distribution::datagram::{SEARCH_BYTES, WhoHas};
 use cara_core::distribution::hello::{Hello, Limits, Manager};
 use cara_core::distribution::identity::{Epoch, Fleet, Identity};
@@ -104,7 +104,7 @@ fn hello(manager: &Identity, fleet: u32) -> Vec<u8> {
         keep_alive: 1_000,
     };
     let mut bytes = [0; 320];
-    let length = hello.encode(&mut bytes).expect("a hello fits");
+    let length = hello.encode(Mode::Plain, &mut bytes).expect("a hello fits");
     framed(&bytes[..length])
 }
 
@@ -120,7 +120,7 @@ fn who_has(fleet: u32) -> Vec<u8> {
         known: Default::default(),
     };
     let mut bytes = [0; SEARCH_BYTES];
-    who_has.encode(Fleet(fleet), &mut bytes).expect("a search fits").to_vec()
+    who_has.encode(Mode::Plain, Fleet(fleet), &mut bytes).expect("a search fits").to_vec()
 }
 
 /// All of the first chunk of a message but its last bytes.

@@ -28,6 +28,8 @@ pub type Unit = Rc<dyn Node>;
 pub enum Port {
     /// Virtual network and time.
     Simulator,
+    /// The same with units that prove who they are and seal what they say.
+    Secured,
     /// Sockets of this machine, over loopback.
     Linux,
     /// Boards with embassy-net, on a switch in memory and in virtual time.

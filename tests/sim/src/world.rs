@@ -9,6 +9,7 @@ use std::rc::Rc;
 use std::sync::{Mutex, PoisonError};
 use std::task::{Context, Poll, Waker};
 
+use cara_core::config::Mode;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 use cara_core::time::{Duration, Instant};
@@ -23,6 +24,7 @@ mod builder;
 mod driving;
 mod events;
 mod handle;
+mod keys;
 mod links;
 mod looking;
 mod mail;
@@ -73,6 +75,8 @@ struct Inner {
     /// By host.
     units: Vec<UnitState>,
     sleepers: Queue<(HostId, Promise<()>)>,
+    /// Of the units to come.
+    mode: Mode,
     /// Hooks that run before anything else.
     urgent: VecDeque<Box<dyn FnOnce()>>,
     spawned: Vec<(Owner, Job)>,
@@ -118,11 +122,23 @@ fn number_in_environment(name: &str) -> Option<u64> {
 impl World {
     /// An empty world; `CARA_SIM_SEED` in the environment overrides `seed`.
     pub fn new(seed: u64) -> Self {
+        Self::of_mode(seed, Mode::Plain)
+    }
+
+    /// The same with units that prove who they are and seal what they say. Units of one fleet have keys for each other,
+    /// unless they are told otherwise.
+    pub fn secured(seed: u64) -> Self {
+        Self::of_mode(seed, Mode::Secured)
+    }
+
+    /// An empty world of either mode.
+    pub fn of_mode(seed: u64, mode: Mode) -> Self {
         let seed = number_in_environment(SEED).unwrap_or(seed);
         let inner = Inner {
             network: Network::new(seed),
             units: Vec::new(),
             sleepers: Queue::new(),
+            mode,
             urgent: VecDeque::new(),
             spawned: Vec::new(),
         };

@@ -1,6 +1,6 @@
 //! What bytes mean, as JSON: the core's decoders, and nothing beside them.
 
-use cara_core::config::Priority;
+use cara_core::config::{Mode, Priority};
 use cara_core::distribution::block;
 use cara_core::distribution::datagram::{Announce, Datagram, DatagramError, WhoHas};
 use cara_core::distribution::function::{Attributes, Signature};
@@ -42,7 +42,7 @@ pub(crate) const fn priority(priority: Priority) -> &'static str {
 }
 
 pub(crate) fn hello(bytes: &[u8]) -> Option<Value> {
-    match Hello::decode(bytes) {
+    match Hello::decode(bytes, Mode::Plain) {
         Ok(hello) => Some(json!({
             "fleet": hello.fleet.0,
             "identity": identity(&hello.identity),
@@ -61,7 +61,7 @@ pub(crate) fn hello(bytes: &[u8]) -> Option<Value> {
             "keep_alive": hello.keep_alive,
         })),
         Err(HelloError::Version(version)) => Some(json!({ "other_version": version })),
-        Err(HelloError::Magic | HelloError::Malformed) => None,
+        Err(HelloError::Magic | HelloError::Mode | HelloError::Malformed) => None,
     }
 }
 
@@ -199,7 +199,7 @@ pub(crate) fn session_body(bytes: &[u8]) -> Option<Value> {
 }
 
 pub(crate) fn datagram(fleet: u32, bytes: &[u8]) -> Option<Value> {
-    match Datagram::decode(bytes, Fleet(fleet)) {
+    match Datagram::decode(bytes, Mode::Plain, Fleet(fleet)) {
         Ok(Datagram::WhoHas(search)) => Some(json!({ "who_has": who_has(&search) })),
         Ok(Datagram::Announce(answer)) => Some(json!({ "announce": announce(&answer) })),
         Ok(Datagram::Session { link, nonce, body }) => {

@@ -1,5 +1,6 @@
 //! Vectors of the hello and of datagrams.
 
+use cara_core::config::Mode;
 use cara_core::distribution::datagram::{Announce, WhoHas, session_header, short_hash};
 use cara_core::distribution::hello::{Hello, Limits, Manager};
 use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
@@ -57,7 +58,7 @@ fn manager(name: &str, id: u32) -> Manager {
 
 pub(crate) fn encoded_hello(hello: &Hello) -> Vec<u8> {
     let mut bytes = vec![0; 320];
-    let length = hello.encode(&mut bytes).unwrap_or(0);
+    let length = hello.encode(Mode::Plain, &mut bytes).unwrap_or(0);
     bytes.truncate(length);
     bytes
 }
@@ -126,11 +127,12 @@ fn datagrams() -> Vec<Vector> {
         expected: 1,
     };
     let mut out = [0; 512];
-    let search = search.encode(Fleet(7), &mut out).unwrap_or(&[]).to_vec();
-    let wish = wish.encode(Fleet(7), &mut out).unwrap_or(&[]).to_vec();
-    let answer = answer.encode(Fleet(7), &mut out).unwrap_or(&[]).to_vec();
+    let search = search.encode(Mode::Plain, Fleet(7), &mut out).unwrap_or(&[]).to_vec();
+    let wish = wish.encode(Mode::Plain, Fleet(7), &mut out).unwrap_or(&[]).to_vec();
+    let answer = answer.encode(Mode::Plain, Fleet(7), &mut out).unwrap_or(&[]).to_vec();
     let session =
-        [&session_header(Fleet(7), 300, 0xA1A2_A3A4_A5A6_A7A8)[..], &SessionBody::keep_alive(1_000_000)].concat();
+        [&session_header(Mode::Plain, Fleet(7), 300, 0xA1A2_A3A4_A5A6_A7A8)[..], &SessionBody::keep_alive(1_000_000)]
+            .concat();
     let manager = json!({ "name": "manager", "id": 1, "role": "m_unit" });
     let datagram = |names, fleet, bytes: &[u8], value: &Value| {
         Vector::new(names, Kind::Datagram, Context::fleet(fleet), bytes, value)

@@ -173,8 +173,8 @@ impl Side {
     fn hear_datagram(&mut self, bytes: &[u8]) {
         let nonce = self.session.nonce();
         let from = self.session.address();
-        let body = bytes.get(24..).unwrap_or(&[]).to_vec();
-        if let Some(event) = self.with(|session, cx| session.datagram(cx, from, nonce, &body)) {
+        let mut body = bytes.get(24..).unwrap_or(&[]).to_vec();
+        if let Some(event) = self.with(|session, cx| session.datagram(cx, from, nonce, &mut body)) {
             self.note(&event);
         }
         self.take_calls();

@@ -75,6 +75,8 @@ fn value(link: &Link<Boxed, Plain>, incoming: Incoming, lent: &[u8]) -> Option<V
         Incoming::Close(code) => json!({ "close": code }),
         Incoming::Ping => json!("ping"),
         Incoming::Pong => json!("pong"),
+        // Of secured links only.
+        Incoming::Proof(_) | Incoming::Confirm(_) => return None,
         Incoming::Session(place) => {
             let bytes = link.view(place, lent);
             json!({ "session": decoded::session_body(bytes).unwrap_or_else(|| unreadable(bytes)) })

@@ -44,6 +44,11 @@ impl<S: Storage> Node<S> {
         }
     }
 
+    /// There is no key for this unit and the peer of a link, which the port refuses. The identity may be anybody's.
+    pub fn refuse_without_key(&mut self, now: Instant, from: SocketAddr, identity: &Identity) {
+        self.refuse(now, from, identity, Refusal::NoKey);
+    }
+
     fn check(&self, hello: &Hello) -> Result<(), Refusal> {
         if hello.fleet != self.config.fleet {
             return Err(Refusal::Fleet);
@@ -170,6 +175,8 @@ impl<S: Storage> Node<S> {
             Refusal::DuplicateIdentity => NodeCounter::RefusedDuplicate,
             Refusal::Role => NodeCounter::RefusedRole,
             Refusal::AlreadyConnected => NodeCounter::RefusedConnected,
+            Refusal::Mode => NodeCounter::RefusedMode,
+            Refusal::NoKey => NodeCounter::RefusedKey,
         };
         self.counters.add(counter, 1);
         self.note_of(now, address, identity, refusal);

@@ -7,6 +7,7 @@ use super::search::pause;
 use super::timetable::Task;
 use super::{Action, Node, NodeCounter, Target};
 use crate::config::{ANSWER_SPREAD, FIRST_SEARCH, LONGEST_SEARCH};
+use crate::distribution::authenticator::Authenticator;
 use crate::distribution::datagram::{Announce, SEARCH_BYTES, WhoHas, short_hash};
 use crate::distribution::identity::{Epoch, Identity, Role};
 use crate::host::mailman::Mailman;
@@ -90,18 +91,33 @@ impl<S: Storage> Node<S> {
         }
     }
 
-    pub(super) fn poll_answers(&mut self, now: Instant, mailman: &mut impl Mailman) {
+    pub(super) fn poll_answers(
+        &mut self,
+        now: Instant,
+        mailman: &mut impl Mailman,
+        authenticator: &impl Authenticator,
+    ) {
         while let Some(index) = self.answers.single.iter().position(|answer| answer.at <= now) {
             let Answer { to, nonce, .. } = self.answers.single.swap_remove(index);
-            self.send_announce(nonce, NodeCounter::AnnounceSent, |datagram| mailman.send_to(to, datagram));
+            self.send_announce(authenticator, nonce, NodeCounter::AnnounceSent, |datagram| {
+                mailman.send_to(to, datagram)
+            });
         }
         if self.answers.broadcast.take_if(|at| *at <= now).is_some() {
             self.answers.last_broadcast = Some(now);
-            self.send_announce(0, NodeCounter::AnnounceBroadcast, |datagram| mailman.broadcast(datagram));
+            self.send_announce(authenticator, 0, NodeCounter::AnnounceBroadcast, |datagram| {
+                mailman.broadcast(datagram)
+            });
         }
     }
 
-    fn send_announce(&mut self, nonce: u64, counter: NodeCounter, send: impl FnOnce(&[u8]) -> bool) {
+    fn send_announce(
+        &mut self,
+        authenticator: &impl Authenticator,
+        nonce: u64,
+        counter: NodeCounter,
+        send: impl FnOnce(&[u8]) -> bool,
+    ) {
         let announce = Announce {
             identity: self.config.identity.clone(),
             epoch: self.config.epoch,
@@ -113,7 +129,7 @@ impl<S: Storage> Node<S> {
         };
         self.sequence = announce.sequence;
         let mut bytes = [0; SEARCH_BYTES];
-        let sent = announce.encode(self.config.fleet, &mut bytes).is_some_and(send);
+        let sent = announce.encode(authenticator.mode(), self.config.fleet, &mut bytes).is_some_and(send);
         self.counters.add(if sent { counter } else { NodeCounter::SendFailed }, 1);
     }
 

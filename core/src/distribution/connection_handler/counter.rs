@@ -55,6 +55,10 @@ crate::counters::counters! {
         RefusedDuplicate,
         /// Links refused because the two are connected already.
         RefusedConnected,
+        /// Links refused because one end is plain and the other one secured.
+        RefusedMode,
+        /// Links refused because there is no key for the pair.
+        RefusedKey,
         /// Links that had to show whether they live, because another one had the same identity.
         Challenged,
         /// Nodes that came back with a new epoch.

@@ -31,7 +31,8 @@ use core::net::SocketAddr;
 
 use crate::config::{Constraints, NODE_NAME_BYTES};
 use crate::counters::Counters;
-use crate::distribution::datagram::{Datagram, DatagramError};
+use crate::distribution::authenticator::Authenticator;
+use crate::distribution::datagram::{Datagram, DatagramError, SESSION_HEADER_BYTES};
 use crate::distribution::hello::{Hello, Limits, Manager};
 use crate::distribution::identity::{Epoch, Fleet, Identity, Role};
 use crate::error::{CloseReason, Error, Refusal};
@@ -142,7 +143,7 @@ pub enum Sorted<'b> {
         /// To be compared with the session's.
         nonce: u64,
         /// For [`Session::datagram`](crate::services::unit::Session::datagram).
-        body: &'b [u8],
+        body: &'b mut [u8],
     },
 }
 
@@ -298,7 +299,12 @@ impl<S: Storage> Node<S> {
     }
 
     /// Does what is due. Returns one action at a time; call it until it returns `None`.
-    pub fn poll(&mut self, now: Instant, mailman: &mut impl Mailman) -> Option<Action> {
+    pub fn poll(
+        &mut self,
+        now: Instant,
+        mailman: &mut impl Mailman,
+        authenticator: &impl Authenticator,
+    ) -> Option<Action> {
         while let Some((place, task)) = self.table.pop_due(now) {
             let action = match task {
                 Task::Supersede => self.supersede(now, place),
@@ -312,26 +318,36 @@ impl<S: Storage> Node<S> {
                 return action;
             }
         }
-        self.poll_answers(now, mailman);
-        self.poll_search(now, mailman);
+        self.poll_answers(now, mailman, authenticator);
+        self.poll_search(now, mailman, authenticator);
         None
     }
 
     /// Takes a datagram that arrived at any of the unit's sockets.
-    pub fn datagram<'b>(&mut self, now: Instant, from: SocketAddr, bytes: &'b [u8]) -> Sorted<'b> {
-        match Datagram::decode(bytes, self.config.fleet) {
-            Ok(Datagram::Session { link, nonce, body }) => {
-                let link = LinkId(link);
-                if self.table.of_link(link).is_some() {
-                    return Sorted::Session { link, nonce, body };
-                }
-                self.counters.add(NodeCounter::DatagramUnknownLink, 1);
-            }
+    pub fn datagram<'b>(
+        &mut self,
+        now: Instant,
+        from: SocketAddr,
+        bytes: &'b mut [u8],
+        authenticator: &impl Authenticator,
+    ) -> Sorted<'b> {
+        match Datagram::decode(bytes, authenticator.mode(), self.config.fleet) {
+            Ok(Datagram::Session { link, nonce, .. }) => return self.sort(LinkId(link), nonce, bytes),
             Ok(Datagram::WhoHas(who_has)) => self.heard_who_has(now, from, &who_has),
             Ok(Datagram::Announce(announce)) => self.heard_announce(now, from, &announce),
             Err(error) => self.unreadable(now, from, error),
         }
         Sorted::Done
+    }
+
+    fn sort<'b>(&mut self, link: LinkId, nonce: u64, bytes: &'b mut [u8]) -> Sorted<'b> {
+        match bytes.get_mut(SESSION_HEADER_BYTES..) {
+            Some(body) if self.table.of_link(link).is_some() => Sorted::Session { link, nonce, body },
+            _ => {
+                self.counters.add(NodeCounter::DatagramUnknownLink, 1);
+                Sorted::Done
+            }
+        }
     }
 
     fn unreadable(&mut self, now: Instant, from: SocketAddr, error: DatagramError) {

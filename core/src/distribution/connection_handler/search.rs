@@ -7,6 +7,7 @@ use super::known::NodeState;
 use super::timetable::Task;
 use super::{Node, NodeCounter, Target};
 use crate::config::{FIRST_SEARCH, LONGEST_SEARCH, SEARCH_BUDGET, SEARCH_WINDOW};
+use crate::distribution::authenticator::Authenticator;
 use crate::distribution::datagram::{Announce, KNOWN_NODES, SEARCH_BYTES, WhoHas, short_hash};
 use crate::distribution::identity::{Epoch, Identity, Role};
 use crate::error::Refusal;
@@ -191,9 +192,9 @@ impl<S: Storage> Node<S> {
         self.search.next = now + pause + alone(&mut self.random, pause);
     }
 
-    pub(super) fn poll_search(&mut self, now: Instant, mailman: &mut impl Mailman) {
+    pub(super) fn poll_search(&mut self, now: Instant, mailman: &mut impl Mailman, authenticator: &impl Authenticator) {
         if self.search.explicit.take_if(|at| *at <= now).is_some() {
-            self.send_who_has(now, mailman);
+            self.send_who_has(now, mailman, authenticator);
             return;
         }
         if now < self.search.next {
@@ -211,10 +212,10 @@ impl<S: Storage> Node<S> {
             self.search.next = allowed + alone(&mut self.random, FIRST_SEARCH);
             return;
         }
-        self.send_who_has(now, mailman);
+        self.send_who_has(now, mailman, authenticator);
     }
 
-    fn send_who_has(&mut self, now: Instant, mailman: &mut impl Mailman) {
+    fn send_who_has(&mut self, now: Instant, mailman: &mut impl Mailman, authenticator: &impl Authenticator) {
         self.plan_next(now);
         (self.search.stubborn, self.search.deferred) = (false, 0);
         self.budget.note(now);
@@ -231,7 +232,8 @@ impl<S: Storage> Node<S> {
         };
         self.sequence = who_has.sequence;
         let mut bytes = [0; SEARCH_BYTES];
-        let sent = who_has.encode(self.config.fleet, &mut bytes).is_some_and(|datagram| mailman.broadcast(datagram));
+        let datagram = who_has.encode(authenticator.mode(), self.config.fleet, &mut bytes);
+        let sent = datagram.is_some_and(|datagram| mailman.broadcast(datagram));
         self.counters.add(if sent { NodeCounter::WhoHasSent } else { NodeCounter::SendFailed }, 1);
     }
 

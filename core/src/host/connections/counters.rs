@@ -25,6 +25,16 @@ crate::counters::counters! {
         DatagramsSent,
         /// Session datagrams that could not be read, or were not of this session.
         DatagramsDropped,
+        /// Session datagrams that are not the peer's, or were changed on their way.
+        DatagramsForged,
+        /// Session datagrams that came before, or are far older than others that came.
+        DatagramsRepeated,
+        /// Links whose peers did not prove that they have the key of the pair.
+        ProofsFailed,
+        /// Links that were ended in clear by somebody who had not proven who it is.
+        FarewellsInClear,
+        /// Links refused because there is no key for the pair.
+        KeysMissing,
         /// Keep-alives that did not come in time.
         KeepAlivesMissed,
         /// Requests sent.

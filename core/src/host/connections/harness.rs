@@ -10,7 +10,7 @@ use crate::config::{LINK_BUFFER_BYTES, Priority};
 use crate::error::CloseReason;
 use crate::host::frame::{self, ChunkWriter, Cut, Frame};
 use crate::host::mailman::{LinkId, Mailman};
-use crate::host::secure::Secure;
+use crate::host::secure::Seal;
 use crate::storage::{Boxed, Pool};
 
 /// A pool of `count` buffers of `size` bytes.
@@ -58,12 +58,14 @@ pub(super) struct Numbered {
     opened: u8,
 }
 
-impl Secure for Numbered {
-    const OVERHEAD: usize = 16;
+impl Seal for Numbered {
+    fn overhead(&self) -> usize {
+        16
+    }
 
     fn seal(&mut self, frame: &mut [u8]) -> Result<(), CloseReason> {
         self.sealed = self.sealed.wrapping_add(1);
-        let tag = frame.len() - Self::OVERHEAD;
+        let tag = frame.len() - self.overhead();
         frame[tag..].fill(self.sealed);
         frame.iter_mut().for_each(|byte| *byte ^= 0x5A);
         Ok(())
@@ -71,7 +73,7 @@ impl Secure for Numbered {
 
     fn open<'f>(&mut self, frame: &'f mut [u8]) -> Result<&'f mut [u8], CloseReason> {
         self.opened = self.opened.wrapping_add(1);
-        let tag = frame.len().checked_sub(Self::OVERHEAD).ok_or(CloseReason::Protocol)?;
+        let tag = frame.len().checked_sub(self.overhead()).ok_or(CloseReason::Protocol)?;
         frame.iter_mut().for_each(|byte| *byte ^= 0x5A);
         if frame[tag..].iter().any(|byte| *byte != self.opened) {
             return Err(CloseReason::Protocol);
@@ -81,7 +83,7 @@ impl Secure for Numbered {
 }
 
 /// A link that takes chunks of 1 KiB and messages of 8 KiB.
-pub(super) fn link<C: Secure>(cipher: C) -> Link<Boxed, C> {
+pub(super) fn link<C: Seal>(cipher: C) -> Link<Boxed, C> {
     let mut link = Link::new(LinkId(0), cipher, vec![0; LINK_BUFFER_BYTES].into_boxed_slice(), 1024, 8192);
     link.set_peer_limits(1024);
     link
@@ -98,7 +100,7 @@ pub(super) enum Item {
 }
 
 /// Gives `piece` to the link as a port does; `false` when it paused, and then `piece` is what remains.
-pub(super) fn offer<C: Secure>(
+pub(super) fn offer<C: Seal>(
     link: &mut Link<Boxed, C>,
     pool: &mut Pool<Boxed>,
     piece: &mut Vec<u8>,
@@ -119,7 +121,7 @@ pub(super) fn offer<C: Secure>(
     }
 }
 
-fn item<C: Secure>(link: &Link<Boxed, C>, incoming: Incoming, lent: &[u8]) -> Item {
+fn item<C: Seal>(link: &Link<Boxed, C>, incoming: Incoming, lent: &[u8]) -> Item {
     match incoming {
         Incoming::Message(priority, place) => Item::Message(priority, link.view(place, lent).to_vec()),
         Incoming::Session(place) => Item::Session(link.view(place, lent).to_vec()),
@@ -130,7 +132,7 @@ fn item<C: Secure>(link: &Link<Boxed, C>, incoming: Incoming, lent: &[u8]) -> It
 }
 
 /// Everything that `bytes` hold, read by a link of its own.
-pub(super) fn read<C: Secure>(cipher: C, bytes: &[u8]) -> Vec<Item> {
+pub(super) fn read<C: Seal>(cipher: C, bytes: &[u8]) -> Vec<Item> {
     let (mut link, mut pool, mut items) = (link(cipher), pool(1, 9000), Vec::new());
     assert!(offer(&mut link, &mut pool, &mut bytes.to_vec(), &mut items).unwrap());
     items

@@ -17,7 +17,7 @@ use crate::counters::Counters;
 use crate::error::{CloseReason, Error};
 use crate::host::frame::{ChunkWriter, Frame};
 use crate::host::mailman::{LinkId, Mailman};
-use crate::host::secure::Secure;
+use crate::host::secure::{PROOF_BYTES, Seal, Secure};
 use crate::storage::{Buffers, Storage};
 use receiver::Receiver;
 use sender::Sender;
@@ -37,6 +37,10 @@ pub enum Incoming {
     Pong,
     /// A session body that came in the stream.
     Session(Place),
+    /// A message of the proof.
+    Proof(Place),
+    /// What the peer tells in its first sealed frame.
+    Confirm(Place),
     /// A whole message.
     Message(Priority, Place),
 }
@@ -89,7 +93,7 @@ pub struct Received {
 
 /// One end of a stream.
 #[doc(alias = "Connections")]
-pub struct Link<S: Storage, C: Secure> {
+pub struct Link<S: Storage, C: Seal> {
     id: LinkId,
     cipher: C,
     receiver: Receiver<S>,
@@ -98,14 +102,15 @@ pub struct Link<S: Storage, C: Secure> {
     pub counters: Counters<LinkCounter, { LinkCounter::COUNT }>,
 }
 
-impl<S: Storage, C: Secure> Link<S, C> {
+impl<S: Storage, C: Seal> Link<S, C> {
     /// A link; `small` is its own buffer of [`crate::config::LINK_BUFFER_BYTES`], the limits are what this unit told.
     pub fn new(id: LinkId, cipher: C, small: S::Slice<u8>, chunk_limit: usize, message_limit: usize) -> Self {
+        let overhead = cipher.overhead();
         Self {
             id,
             cipher,
             receiver: Receiver::new(small, chunk_limit.max(MINIMUM_CHUNK_BYTES), message_limit),
-            sender: Sender::new(C::OVERHEAD),
+            sender: Sender::new(overhead),
             counters: Counters::new(),
         }
     }
@@ -113,6 +118,17 @@ impl<S: Storage, C: Secure> Link<S, C> {
     /// The link's index.
     pub const fn id(&self) -> LinkId {
         self.id
+    }
+
+    /// The link's cipher.
+    pub(crate) const fn cipher(&mut self) -> &mut C {
+        &mut self.cipher
+    }
+
+    /// Sets the longest chunk that this unit takes. While the peer has proven nothing that is little, so that it costs
+    /// little.
+    pub(crate) fn set_chunk_limit(&mut self, limit: usize) {
+        self.receiver.set_chunk_limit(limit);
     }
 
     /// Sets the longest chunk that the peer takes, as its hello told.
@@ -146,7 +162,7 @@ impl<S: Storage, C: Secure> Link<S, C> {
 
     /// The bytes at `place`; `lent` is the slice that was lent to [`receive`](Self::receive).
     pub fn view<'b>(&'b self, place: Place, lent: &'b [u8]) -> &'b [u8] {
-        self.receiver.store(place.store, lent).get(place.start..place.end).unwrap_or(&[])
+        view(&self.receiver, place, lent)
     }
 
     /// Accepts one message of `total` bytes, which `write` puts into the send buffer, and writes what the network takes
@@ -196,6 +212,13 @@ impl<S: Storage, C: Secure> Link<S, C> {
         accepted
     }
 
+    /// Accepts a frame that is no chunk and is not sealed: before the proof. `false` as above.
+    pub(crate) fn send_clear(&mut self, frame: &Frame<'_>) -> bool {
+        let accepted = self.sender.accept_clear(frame);
+        self.counters.add(LinkCounter::FramesWithheld, u64::from(!accepted));
+        accepted
+    }
+
     /// Writes what the network takes now.
     pub fn flush(&mut self, mailman: &mut impl Mailman, buffers: &mut impl Buffers<S>) -> Result<(), CloseReason> {
         let written = self.sender.flush(self.id, &mut self.cipher, mailman, buffers)?;
@@ -223,6 +246,27 @@ impl<S: Storage, C: Secure> Link<S, C> {
     pub(crate) fn into_small(self) -> S::Slice<u8> {
         self.receiver.into_small()
     }
+}
+
+impl<S: Storage, C: Secure> Link<S, C> {
+    /// Gives the hello at `place` to the cipher.
+    pub(crate) fn introduce(&mut self, place: Place, lent: &[u8]) {
+        self.cipher.introduce(view(&self.receiver, place, lent));
+    }
+
+    /// Gives the message of the proof at `place` to the cipher; the answer to send, if there is one.
+    pub(crate) fn answer(&mut self, place: Place, lent: &[u8]) -> Result<Option<[u8; PROOF_BYTES]>, CloseReason> {
+        self.cipher.answer(view(&self.receiver, place, lent))
+    }
+
+    /// Gives the confirmation at `place` to the cipher.
+    pub(crate) fn confirmed(&mut self, place: Place, lent: &[u8]) -> Result<(), CloseReason> {
+        self.cipher.confirmed(view(&self.receiver, place, lent))
+    }
+}
+
+fn view<'b, S: Storage>(receiver: &'b Receiver<S>, place: Place, lent: &'b [u8]) -> &'b [u8] {
+    receiver.store(place.store, lent).get(place.start..place.end).unwrap_or(&[])
 }
 
 #[cfg(test)]

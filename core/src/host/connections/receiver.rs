@@ -9,7 +9,7 @@ use crate::bytes;
 use crate::config::{MINIMUM_CHUNK_BYTES, Priority};
 use crate::error::CloseReason;
 use crate::host::frame::{self, Chunk, Frame};
-use crate::host::secure::Secure;
+use crate::host::secure::Seal;
 use crate::storage::{Buffer, Buffers, Storage};
 
 pub(super) struct Receiver<S: Storage> {
@@ -54,12 +54,18 @@ enum Content {
     Ping,
     Pong,
     Session,
+    Proof,
+    Confirm,
     Piece(Piece),
 }
 
 impl<S: Storage> Receiver<S> {
     pub(super) fn new(small: S::Slice<u8>, chunk_limit: usize, message_limit: usize) -> Self {
         Self { small, buffer: None, partial: Partial::default(), assembly: None, chunk_limit, message_limit }
+    }
+
+    pub(super) const fn set_chunk_limit(&mut self, limit: usize) {
+        self.chunk_limit = limit;
     }
 
     pub(super) fn raise_message_limit(&mut self, limit: usize) {
@@ -74,7 +80,7 @@ impl<S: Storage> Receiver<S> {
         }
     }
 
-    pub(super) fn receive<C: Secure>(
+    pub(super) fn receive<C: Seal>(
         &mut self,
         cipher: &mut C,
         buffers: &mut impl Buffers<S>,
@@ -88,7 +94,7 @@ impl<S: Storage> Receiver<S> {
         Ok(received)
     }
 
-    fn step<C: Secure>(
+    fn step<C: Seal>(
         &mut self,
         cipher: &mut C,
         buffers: &mut impl Buffers<S>,
@@ -105,7 +111,7 @@ impl<S: Storage> Receiver<S> {
     }
 
     /// The frame lies whole in the lent bytes: it is opened there.
-    fn take_whole<C: Secure>(
+    fn take_whole<C: Seal>(
         &mut self,
         cipher: &mut C,
         buffers: &mut impl Buffers<S>,
@@ -122,7 +128,7 @@ impl<S: Storage> Receiver<S> {
     }
 
     /// The frame came in pieces: it is collected, and opened when it is whole.
-    fn take_partial<C: Secure>(
+    fn take_partial<C: Seal>(
         &mut self,
         cipher: &mut C,
         buffers: &mut impl Buffers<S>,
@@ -216,7 +222,7 @@ impl<S: Storage> Receiver<S> {
     }
 
     /// Opens the frame of `length` bytes at `start` of `store`.
-    fn open<C: Secure>(
+    fn open<C: Seal>(
         &mut self,
         cipher: &mut C,
         store: Store,
@@ -245,6 +251,8 @@ impl<S: Storage> Receiver<S> {
             Content::Ping => Incoming::Ping,
             Content::Pong => Incoming::Pong,
             Content::Session => Incoming::Session(place),
+            Content::Proof => Incoming::Proof(place),
+            Content::Confirm => Incoming::Confirm(place),
             Content::Piece(Piece { priority, total: Some(total), last: true }) => {
                 self.check_whole(place, total as usize)?;
                 Incoming::Message(priority, place)
@@ -348,6 +356,8 @@ impl Content {
             Frame::Ping => (Self::Ping, 0),
             Frame::Pong => (Self::Pong, 0),
             Frame::Session(bytes) => (Self::Session, bytes.len()),
+            Frame::Proof(bytes) => (Self::Proof, bytes.len()),
+            Frame::Confirm(bytes) => (Self::Confirm, bytes.len()),
             Frame::Chunk(Chunk { priority, total, last, bytes }) => {
                 (Self::Piece(Piece { priority, total, last }), bytes.len())
             }

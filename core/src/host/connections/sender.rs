@@ -10,7 +10,7 @@ use crate::config::{EMERGENCY_BYTES, MINIMUM_CHUNK_BYTES, Priority};
 use crate::error::{CloseReason, Error, Limit};
 use crate::host::frame::{self, ChunkWriter, Cut, Frame};
 use crate::host::mailman::{LinkId, Mailman};
-use crate::host::secure::Secure;
+use crate::host::secure::Seal;
 use crate::storage::{Buffer, Buffers, LEFT_BY_SENDING, Storage};
 
 /// Room for one emergency and the frames that keep a link going.
@@ -139,8 +139,19 @@ impl<S: Storage> Sender<S> {
     }
 
     pub(super) fn accept_frame(&mut self, frame: &Frame<'_>) -> bool {
+        self.append_frame(frame, self.cut.overhead)
+    }
+
+    /// A frame that is not to be sealed, while there is none yet that is.
+    pub(super) fn accept_clear(&mut self, frame: &Frame<'_>) -> bool {
+        let accepted = self.urgent_sealed == self.urgent.len() && self.append_frame(frame, 0);
+        self.urgent_sealed = if accepted { self.urgent.len() } else { self.urgent_sealed };
+        accepted
+    }
+
+    fn append_frame(&mut self, frame: &Frame<'_>, overhead: usize) -> bool {
         let mut scratch = [0; EMERGENCY_RESERVE];
-        let length = frame::encode(frame, self.cut.overhead, &mut scratch);
+        let length = frame::encode(frame, overhead, &mut scratch);
         let end = self.urgent.len().saturating_add(length);
         if length == 0 || end > URGENT_BYTES.saturating_sub(EMERGENCY_RESERVE) {
             return false;
@@ -149,7 +160,7 @@ impl<S: Storage> Sender<S> {
     }
 
     /// Writes what the network takes now; returns how many bytes that were.
-    pub(super) fn flush<C: Secure>(
+    pub(super) fn flush<C: Seal>(
         &mut self,
         id: LinkId,
         cipher: &mut C,
@@ -157,7 +168,7 @@ impl<S: Storage> Sender<S> {
         buffers: &mut impl Buffers<S>,
     ) -> Result<u64, CloseReason> {
         let mut written = 0;
-        while self.write_sealed::<C>(id, mailman, &mut written)? == Progress::Through {
+        while self.write_sealed(id, mailman, &mut written)? == Progress::Through {
             self.give_drained(buffers);
             if !self.seal_next(cipher)? {
                 self.blocked = false;
@@ -169,7 +180,7 @@ impl<S: Storage> Sender<S> {
     }
 
     /// Writes what is sealed: the rest of the current lane's frames, then sealed urgent ones.
-    fn write_sealed<C: Secure>(
+    fn write_sealed(
         &mut self,
         id: LinkId,
         mailman: &mut impl Mailman,
@@ -178,7 +189,7 @@ impl<S: Storage> Sender<S> {
         if let Some(Some(lane)) = self.current.and_then(|index| self.lanes.get_mut(index)) {
             let progress = lane.write(id, mailman, written)?;
             if progress == Progress::Blocked {
-                if C::OVERHEAD == 0 {
+                if self.cut.overhead == 0 {
                     lane.unseal();
                 }
                 return Ok(progress);
@@ -204,7 +215,7 @@ impl<S: Storage> Sender<S> {
     }
 
     /// Seals what is to be written next: urgent frames before all others. `false` when nothing waits.
-    fn seal_next<C: Secure>(&mut self, cipher: &mut C) -> Result<bool, CloseReason> {
+    fn seal_next<C: Seal>(&mut self, cipher: &mut C) -> Result<bool, CloseReason> {
         while self.urgent_sealed < self.urgent.len() {
             let rest = self.urgent.get_mut(self.urgent_sealed..).unwrap_or(&mut []);
             let length = seal_first(cipher, rest)?;
@@ -215,7 +226,7 @@ impl<S: Storage> Sender<S> {
         }
         self.current = self.next_lane();
         let Some(Some(lane)) = self.current.and_then(|index| self.lanes.get_mut(index)) else { return Ok(false) };
-        let enough = match C::OVERHEAD {
+        let enough = match self.cut.overhead {
             0 => usize::MAX,
             _ if self.blocked => 1,
             _ => self.cut.chunk,
@@ -304,7 +315,7 @@ impl<S: Storage> Lane<S> {
     }
 
     /// Seals frames until `enough` bytes of them are ready.
-    fn seal<C: Secure>(&mut self, cipher: &mut C, enough: usize) -> Result<(), CloseReason> {
+    fn seal<C: Seal>(&mut self, cipher: &mut C, enough: usize) -> Result<(), CloseReason> {
         self.before = (self.sealed, self.at_boundary);
         while self.sealed < self.end && self.sealed.saturating_sub(self.start) < enough {
             let rest = self.buffer.get_mut(self.sealed..self.end).unwrap_or(&mut []);
@@ -344,7 +355,7 @@ impl<S: Storage> Lane<S> {
 }
 
 /// Seals the first of `frames`; returns its length.
-fn seal_first<C: Secure>(cipher: &mut C, frames: &mut [u8]) -> Result<usize, CloseReason> {
+fn seal_first<C: Seal>(cipher: &mut C, frames: &mut [u8]) -> Result<usize, CloseReason> {
     let length = frame::first_frame_length(frames).ok_or(CloseReason::Protocol)?;
     let body = frames.get_mut(frame::HEADER_BYTES..length).ok_or(CloseReason::Protocol)?;
     cipher.seal(body)?;

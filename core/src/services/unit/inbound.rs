@@ -5,25 +5,23 @@ use core::net::SocketAddr;
 use super::answering::read_arguments;
 use super::publishing::Told;
 use super::timing::made_at;
-use super::{Event, Phase, Remote, Session, close_reason};
+use super::{Event, Phase, Session, close_reason};
 use crate::config::Priority;
-use crate::distribution::block;
 use crate::distribution::function::{Attributes, Signature};
 use crate::distribution::function_list::{Generation, Slot};
-use crate::distribution::hello::{Hello, HelloError};
 use crate::distribution::message::{Control, Message, REPLY_BYTES, REQUEST_BYTES, RequestHeader, SessionBody};
 use crate::distribution::parameters::ParametersView;
+use crate::distribution::{block, datagram};
 use crate::error::{CloseReason, Error, Refusal};
-use crate::host::connections::{Incoming, LinkCounter, Liveness, Place};
+use crate::host::connections::{Incoming, LinkCounter, Place};
 use crate::host::frame::Frame;
 use crate::host::mailman::Mailman;
-use crate::host::secure::Secure;
+use crate::host::secure::{Secure, Unopened};
 use crate::services::Context;
 use crate::services::calls::{CallHead, Seen};
 use crate::services::lease::Service;
 use crate::services::requests::CallId;
 use crate::storage::{Buffers, Storage};
-use crate::time::Duration;
 
 /// Result of [`Session::receive`].
 #[derive(Debug)]
@@ -87,13 +85,18 @@ impl<S: Storage, C: Secure> Session<S, C> {
     ) -> Receipt<'b> {
         match self.phase {
             Phase::Ending(_) | Phase::Ended => return Receipt { consumed: lent.len(), event: None, paused: false },
-            Phase::Deciding => return Receipt { consumed: 0, event: None, paused: true },
-            Phase::AwaitingHello { .. } | Phase::Live => {}
+            Phase::Introduced { .. } | Phase::Deciding => {
+                return Receipt { consumed: 0, event: None, paused: true };
+            }
+            Phase::AwaitingHello { .. } | Phase::Proving { .. } | Phase::Live => {}
         }
         let received = match self.link.receive(cx.buffers, lent) {
             Ok(received) => received,
             Err(reason) => {
-                self.close(cx, reason);
+                match self.phase {
+                    Phase::Proving { .. } => self.fail(cx),
+                    _ => self.close(cx, reason),
+                }
                 return Receipt { consumed: lent.len(), event: None, paused: false };
             }
         };
@@ -106,18 +109,26 @@ impl<S: Storage, C: Secure> Session<S, C> {
         Receipt { consumed: received.consumed, event: self.event(outcome, lent), paused: received.paused }
     }
 
-    /// Takes the body of a session datagram, which the node has found to be this link's.
+    /// Takes the body of a session datagram, which the node has found to be this link's. It is opened where it is.
     pub fn datagram<M: Mailman, B: Buffers<S>, H: Service>(
         &mut self,
         cx: &mut Context<'_, S, M, B, H>,
         from: SocketAddr,
         nonce: u64,
-        body: &[u8],
+        body: &mut [u8],
     ) -> Option<Event<'static>> {
         if self.phase != Phase::Live || nonce != self.local.nonce || from.ip() != self.peer_address.ip() {
             self.link.counters.add(LinkCounter::DatagramsDropped, 1);
             return None;
         }
+        let header = datagram::session_header(self.mode(), self.local.fleet, self.link.id().0, nonce);
+        let body = match self.link.cipher().open_datagram(&header, body) {
+            Ok(body) => &*body,
+            Err(error) => {
+                self.link.counters.add(counter_of(error), 1);
+                return None;
+            }
+        };
         self.link.counters.add(LinkCounter::DatagramsReceived, 1);
         self.liveness.heard_datagram(cx.now);
         match self.session_body(cx, Place::lent(body.len()), body) {
@@ -147,6 +158,10 @@ impl<S: Storage, C: Secure> Session<S, C> {
         arguments: Option<&mut ParametersView>,
     ) -> Outcome {
         match (incoming, self.phase) {
+            (Incoming::Refuse(_) | Incoming::Close(_), _) if !self.link.cipher().is_sealing() => {
+                self.ended_in_clear();
+                Outcome::Nothing
+            }
             (Incoming::Refuse(code), _) => {
                 self.end(CloseReason::Refused(refusal(code)));
                 Outcome::Nothing
@@ -155,7 +170,11 @@ impl<S: Storage, C: Secure> Session<S, C> {
                 self.end(close_reason(code));
                 Outcome::Nothing
             }
-            (Incoming::Hello(place), Phase::AwaitingHello { .. }) => self.hello_arrived(cx, place, lent),
+            (Incoming::Hello(place), Phase::AwaitingHello { until }) => self.hello_arrived(cx, until, place, lent),
+            (Incoming::Proof(place), Phase::Proving { .. }) => self.proof_arrived(cx, place, lent),
+            (Incoming::Confirm(place), Phase::Proving { .. }) if self.link.cipher().is_sealing() => {
+                self.confirmation_arrived(cx, place, lent)
+            }
             (Incoming::Ping, Phase::Live) => {
                 self.link.send_frame(&Frame::Pong);
                 self.flush(cx);
@@ -171,29 +190,6 @@ impl<S: Storage, C: Secure> Session<S, C> {
                 Outcome::Nothing
             }
         }
-    }
-
-    fn hello_arrived<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        place: Place,
-        lent: &[u8],
-    ) -> Outcome {
-        let hello = match Hello::decode(self.link.view(place, lent)) {
-            Ok(hello) => hello,
-            Err(error) => {
-                let version = matches!(error, HelloError::Version(_));
-                self.refuse(cx, if version { Refusal::Version } else { Refusal::Malformed });
-                return Outcome::Nothing;
-            }
-        };
-        self.link.set_peer_limits(usize::from(hello.limits.chunk_size));
-        self.liveness = Liveness::new(cx.now, Duration::from_millis(u64::from(hello.keep_alive)));
-        self.clock.hear(cx.now, hello.stamp);
-        let datagrams = SocketAddr::new(self.peer_address.ip(), hello.udp_port);
-        self.remote = Some(Remote { hello, datagrams });
-        self.phase = Phase::Deciding;
-        Event::Hello.into()
     }
 
     fn session_body<M: Mailman, B: Buffers<S>, H: Service>(
@@ -408,6 +404,13 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 }
 
+const fn counter_of(error: Unopened) -> LinkCounter {
+    match error {
+        Unopened::Repeated => LinkCounter::DatagramsRepeated,
+        Unopened::Forged => LinkCounter::DatagramsForged,
+    }
+}
+
 fn refusal(code: u8) -> Refusal {
     match code {
         1 => Refusal::Version,
@@ -417,6 +420,7 @@ fn refusal(code: u8) -> Refusal {
         5 => Refusal::DuplicateIdentity,
         6 => Refusal::Role,
         7 => Refusal::AlreadyConnected,
+        9 => Refusal::Mode,
         _ => Refusal::Malformed,
     }
 }

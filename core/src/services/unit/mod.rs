@@ -6,6 +6,8 @@
 //! returned events: after [`Event::Hello`] the port asks the node and calls [`Session::accept`] or [`Session::refuse`].
 //!
 //! # What a port does
+//! - [`Event::Introduced`], which only secured links have: look the key of the pair up, then [`Session::prove`], or
+//!   [`Session::refuse`] with [`Refusal::NoKey`];
 //! - bytes arrive: [`Session::receive`] until they are consumed and nothing more comes out, then [`Session::next_call`]
 //!   until it returns `None`, running what it returns;
 //! - the stream is writable: [`Session::writable`];
@@ -19,6 +21,7 @@ mod inbound;
 mod lending;
 mod outbound;
 mod pinging;
+mod proving;
 mod publishing;
 mod timing;
 
@@ -29,7 +32,7 @@ pub use publishing::Publication;
 
 use core::net::SocketAddr;
 
-use crate::config::{Constraints, HELLO_TIMEOUT, LINK_BUFFER_BYTES, Priority};
+use crate::config::{Constraints, HELLO_TIMEOUT, LINK_BUFFER_BYTES, Mode, Priority};
 use crate::counters::Counters;
 use crate::distribution::function_list::{Entry, Slot, TheirFunctionList};
 use crate::distribution::hello::Hello;
@@ -51,6 +54,8 @@ use timing::{PeerClock, Timers};
 
 /// Longest hello frame.
 const HELLO_BYTES: usize = 320;
+/// Longest frame body of a peer that has proven nothing: with its header too short to need a buffer of the pool.
+const UNPROVEN_BYTES: usize = crate::config::MINIMUM_CHUNK_BYTES - frame::HEADER_BYTES - 1;
 /// A challenge goes in the stream and in so many datagrams: one lost segment or datagram must not make a live peer look
 /// dead, and its place go to a twin.
 const CHALLENGE_DATAGRAMS: usize = 3;
@@ -93,7 +98,11 @@ pub struct SessionStorage<S: Storage> {
 /// What happened on a link.
 #[derive(Debug)]
 pub enum Event<'b> {
-    /// The peer introduced itself: ask the node, then [`Session::accept`] or [`Session::refuse`].
+    /// The peer says who it is ([`Session::identity`]) and is to prove it: [`Session::prove`] with the key of the pair, or
+    /// [`Session::refuse`] with [`Refusal::NoKey`]. Nothing else that it says counts yet. Never in plain mode.
+    Introduced,
+    /// The peer introduced itself, and has proven who it is where links are secured: ask the node, then
+    /// [`Session::accept`] or [`Session::refuse`].
     Hello,
     /// A call whose arguments are in the lent parameters: run its handler, then [`Session::answer`].
     Call(Call),
@@ -145,6 +154,10 @@ pub struct Call {
 enum Phase {
     /// The port is opening the connection, or waits for the peer's hello.
     AwaitingHello { until: Instant },
+    /// The port looks for the key of the pair.
+    Introduced { until: Instant },
+    /// The peer is to prove that it has the key: with a message, then with a sealed frame.
+    Proving { until: Instant },
     /// The node decides about the peer.
     Deciding,
     /// Both have accepted.
@@ -158,6 +171,8 @@ enum Phase {
 /// What is known of the peer since its hello.
 struct Remote {
     hello: Hello,
+    /// When its hello came.
+    heard: Instant,
     /// Where its session datagrams go.
     datagrams: SocketAddr,
 }
@@ -191,8 +206,10 @@ impl<S: Storage, C: Secure> Session<S, C> {
         let SessionConfig { link, dialed, address, local, constraints } = config;
         let chunk_limit = usize::from(constraints.chunk_size);
         debug_assert!(storage.small.len() >= LINK_BUFFER_BYTES);
+        // Whoever has proven nothing gets no more than the link's own bytes.
+        let first_limit = if cipher.is_sealing() { chunk_limit } else { UNPROVEN_BYTES };
         Self {
-            link: Link::new(link, cipher, storage.small, chunk_limit, message_limit(&constraints)),
+            link: Link::new(link, cipher, storage.small, first_limit, message_limit(&constraints)),
             phase: Phase::AwaitingHello { until: now + HELLO_TIMEOUT },
             dialed,
             local,
@@ -249,12 +266,18 @@ impl<S: Storage, C: Secure> Session<S, C> {
         self.phase == Phase::Ended
     }
 
-    /// The peer's hello, once it has come.
+    /// The peer has proven who it is, or has said it where nobody has to prove it. Of links that have not come so far, the
+    /// oldest gives way to a new one.
+    pub const fn is_proven(&self) -> bool {
+        self.remote.is_some() && !matches!(self.phase, Phase::Introduced { .. } | Phase::Proving { .. })
+    }
+
+    /// The peer's hello, once it has come. It may be anybody's before [`Event::Hello`].
     pub fn hello(&self) -> Option<&Hello> {
         self.remote.as_ref().map(|remote| &remote.hello)
     }
 
-    /// The peer's identity, once it has told it.
+    /// The peer's identity, once it has told it. It may be anybody's before [`Event::Hello`].
     pub fn identity(&self) -> Option<&Identity> {
         self.hello().map(|hello| &hello.identity)
     }
@@ -318,7 +341,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
             return;
         }
         if !self.dialed {
-            self.send_hello(cx);
+            self.reply_to_hello(cx);
         }
         if self.phase != Phase::Deciding {
             return;
@@ -334,7 +357,14 @@ impl<S: Storage, C: Secure> Session<S, C> {
         cx: &mut Context<'_, S, M, B, H>,
         refusal: Refusal,
     ) {
-        self.farewell(cx, &Frame::Refuse(refusal as u8));
+        match refusal {
+            Refusal::NoKey => {
+                // Whoever tries identities does not learn for which of them there are keys.
+                self.link.counters.add(LinkCounter::KeysMissing, 1);
+                self.farewell(cx, &Frame::Close(close_code(CloseReason::BadProof)));
+            }
+            _ => self.farewell(cx, &Frame::Refuse(refusal as u8)),
+        }
         self.end(CloseReason::Refused(refusal));
     }
 
@@ -386,9 +416,21 @@ impl<S: Storage, C: Secure> Session<S, C> {
     fn send_hello<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
         self.local.stamp = cx.now.as_micros();
         let mut bytes = [0; HELLO_BYTES];
-        let length = self.local.encode(&mut bytes).unwrap_or(0);
-        self.link.send_frame(&Frame::Hello(bytes.get(..length).unwrap_or(&[])));
+        let mode = self.mode();
+        let length = self.local.encode(mode, &mut bytes).unwrap_or(0);
+        let bytes = bytes.get(..length).unwrap_or(&[]);
+        self.link.cipher().introduce(bytes);
+        self.send_frame(&Frame::Hello(bytes));
         self.flush(cx);
+    }
+
+    /// Puts a frame into the stream, sealed if frames are.
+    fn send_frame(&mut self, frame: &Frame<'_>) -> bool {
+        if self.link.cipher().is_sealing() { self.link.send_frame(frame) } else { self.link.send_clear(frame) }
+    }
+
+    fn mode(&mut self) -> Mode {
+        self.link.cipher().mode()
     }
 
     /// A last frame, behind what is being written, as far as the network takes it now.
@@ -396,7 +438,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         if !matches!(self.phase, Phase::Ending(_) | Phase::Ended) {
             // What was accepted goes first: a frame would overtake it.
             let _ = self.link.flush(cx.mailman, cx.buffers);
-            self.link.send_frame(frame);
+            self.send_frame(frame);
             let _ = self.link.flush(cx.mailman, cx.buffers);
         }
     }
@@ -455,6 +497,8 @@ const fn close_code(reason: CloseReason) -> u8 {
         CloseReason::Refused(_) => 8,
         CloseReason::DialFailed => 9,
         CloseReason::Exhausted => 10,
+        CloseReason::Unproven => 11,
+        CloseReason::BadProof => 12,
     }
 }
 
@@ -467,6 +511,7 @@ const fn close_reason(code: u8) -> CloseReason {
         6 => CloseReason::Oversize,
         7 => CloseReason::HelloTimeout,
         10 => CloseReason::Exhausted,
+        12 => CloseReason::BadProof,
         _ => CloseReason::Reset,
     }
 }

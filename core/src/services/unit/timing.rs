@@ -3,7 +3,7 @@
 use core::net::SocketAddr;
 
 use super::{Event, Phase, Session};
-use crate::config::GATHER;
+use crate::config::{DATAGRAM_BYTES, GATHER};
 use crate::distribution::datagram;
 use crate::distribution::function_list::Slot;
 use crate::distribution::message::{Control, Renewal, SESSION_BODY_BYTES, SessionBody};
@@ -11,7 +11,7 @@ use crate::error::{CloseReason, Error};
 use crate::host::connections::LinkCounter;
 use crate::host::frame::Frame;
 use crate::host::mailman::Mailman;
-use crate::host::secure::Secure;
+use crate::host::secure::{DATAGRAM_OVERHEAD, Secure};
 use crate::services::Context;
 use crate::services::lease::{Granted, Lease, Service};
 use crate::storage::{Buffers, Storage};
@@ -25,6 +25,9 @@ pub(super) struct PeerClock {
     heard: Option<Instant>,
 }
 
+/// Longest session datagram.
+const LONGEST_DATAGRAM: usize =
+    datagram::SESSION_HEADER_BYTES + SESSION_BODY_BYTES + DATAGRAM_BYTES + DATAGRAM_OVERHEAD;
 /// A sample of the peer's clock counts for this long, however late the newer ones came.
 const SAMPLE_LIFE: Duration = Duration::from_secs(10);
 /// Part of the time since a sample by which the two clocks may have drifted apart.
@@ -92,7 +95,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     /// When [`poll`](Self::poll) has something to do next.
     pub fn deadline(&self) -> Instant {
         match self.phase {
-            Phase::AwaitingHello { until } => until,
+            Phase::AwaitingHello { until } | Phase::Introduced { until } | Phase::Proving { until } => until,
             Phase::Deciding => Instant::FAR_FUTURE,
             Phase::Ending(_) => Instant::START,
             Phase::Ended => Instant::FAR_FUTURE,
@@ -110,11 +113,14 @@ impl<S: Storage, C: Secure> Session<S, C> {
         cx: &mut Context<'_, S, M, B, H>,
     ) -> Option<Event<'static>> {
         match self.phase {
-            Phase::AwaitingHello { until } if cx.now >= until => {
+            Phase::AwaitingHello { until } | Phase::Introduced { until } | Phase::Proving { until } => {
+                if cx.now < until {
+                    return None;
+                }
                 self.close(cx, CloseReason::HelloTimeout);
                 self.poll_ending(cx, CloseReason::HelloTimeout)
             }
-            Phase::AwaitingHello { .. } | Phase::Deciding | Phase::Ended => None,
+            Phase::Deciding | Phase::Ended => None,
             Phase::Ending(reason) => self.poll_ending(cx, reason),
             Phase::Live => self.poll_live(cx),
         }
@@ -213,25 +219,35 @@ impl<S: Storage, C: Secure> Session<S, C> {
         rest: &[u8],
     ) -> bool {
         let Some((to, header)) = self.datagram_header() else { return false };
-        let mut bytes = [0; datagram::SESSION_HEADER_BYTES + SESSION_BODY_BYTES + crate::config::DATAGRAM_BYTES];
-        let length = header.len().saturating_add(body.len()).saturating_add(rest.len());
-        let Some(place) = bytes.get_mut(..length) else { return false };
-        for (place, byte) in place.iter_mut().zip(header.iter().chain(body).chain(rest)) {
+        let (front, back) = self.link.cipher().datagram_room();
+        let mut bytes = [0; LONGEST_DATAGRAM];
+        let start = header.len().saturating_add(front);
+        let end = start.saturating_add(body.len()).saturating_add(rest.len());
+        let Some(place) = bytes.get_mut(start..end) else { return false };
+        for (place, byte) in place.iter_mut().zip(body.iter().chain(rest)) {
             *place = *byte;
         }
-        let sent = cx.mailman.send_to(to, place);
+        let Some(whole) = bytes.get_mut(..end.saturating_add(back)) else { return false };
+        let Some((head, sealed)) = whole.split_first_chunk_mut() else { return false };
+        *head = header;
+        if !self.link.cipher().seal_datagram(&header, sealed) {
+            return false;
+        }
+        let sent = cx.mailman.send_to(to, whole);
         if sent {
             self.link.counters.add(LinkCounter::DatagramsSent, 1);
         }
         sent
     }
 
-    fn datagram_header(&self) -> Option<(SocketAddr, [u8; datagram::SESSION_HEADER_BYTES])> {
+    fn datagram_header(&mut self) -> Option<(SocketAddr, [u8; datagram::SESSION_HEADER_BYTES])> {
+        let mode = self.mode();
         let remote = self.remote.as_ref()?;
         if remote.datagrams.port() == 0 {
             return None;
         }
-        Some((remote.datagrams, datagram::session_header(self.local.fleet, remote.hello.link, remote.hello.nonce)))
+        let header = datagram::session_header(mode, self.local.fleet, remote.hello.link, remote.hello.nonce);
+        Some((remote.datagrams, header))
     }
 
     // --- leases that the peer holds here

@@ -62,6 +62,7 @@ fn arguments() -> Result<Wanted, String> {
             "--seeds" => wanted.seeds = number(value()?)?,
             "--seed" => wanted.seed = Some(number(value()?)?),
             "--scenario" => wanted.scenario = Some(value()?),
+            "--secured" => wanted.port = Port::Secured,
             "--embassy" => wanted.port = Port::Embassy,
             "--quick" => wanted.seeds = QUICK,
             other => return Err(format!("{other} is unknown")),
@@ -89,7 +90,11 @@ fn run(scenario: &Scenario, wanted: &Wanted) -> (u64, bool) {
     show(scenario, seeds.len(), start.elapsed(), &report);
     for (seed, failure) in failures.iter().take(SHOWN) {
         println!("  FAILED with seed {seed}: {}", failure.replace('\n', "\n    "));
-        let port = if wanted.port == Port::Embassy { " --embassy" } else { "" };
+        let port = match wanted.port {
+            Port::Embassy => " --embassy",
+            Port::Secured => " --secured",
+            Port::Simulator | Port::Linux => "",
+        };
         println!(
             "  replay: cargo run --release --package cara-scenarios --bin seeds -- --scenario {} --seed {seed}{port}",
             scenario.name

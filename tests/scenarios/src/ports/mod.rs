@@ -5,11 +5,13 @@ mod linux;
 mod relay;
 mod simulator;
 
+use cara_core::config::Mode;
+
 use crate::{Need, Weather, World};
 
 /// A fleet on the virtual network; the seed decides everything.
-pub fn simulator(seed: u64, weather: Weather) -> Box<dyn World> {
-    Box::new(simulator::SimWorld::new(seed, weather))
+pub fn simulator(seed: u64, weather: Weather, mode: Mode) -> Box<dyn World> {
+    Box::new(simulator::SimWorld::new(seed, weather, mode))
 }
 
 /// A fleet of its own over loopback, with a random number. Where a scenario needs streams that can be disturbed, AGVs

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::net::Ipv4Addr;
 use std::rc::Rc;
 
-use cara_core::config::Constraints;
+use cara_core::config::{Constraints, Mode};
 use cara_core::counters::Counter;
 use cara_core::distribution::connection_handler::NodeCounter;
 use cara_core::distribution::identity::Identity;
@@ -42,6 +42,7 @@ const PARTITIONS: u64 = 2;
 
 pub(super) struct SimWorld {
     world: cara_sim::World,
+    mode: Mode,
     units: Vec<Rc<SimNode>>,
     weather: Weather,
     random: Random,
@@ -55,8 +56,8 @@ struct SimNode {
 }
 
 impl SimWorld {
-    pub(super) fn new(seed: u64, weather: Weather) -> Self {
-        let world = cara_sim::World::new(seed);
+    pub(super) fn new(seed: u64, weather: Weather, mode: Mode) -> Self {
+        let world = cara_sim::World::of_mode(seed, mode);
         let mut random = Random::new(seed ^ 0x005C_E7A2_105E_ED00);
         if weather != Weather::Own {
             let path = path(&mut random, weather);
@@ -72,7 +73,7 @@ impl SimWorld {
                 network.split_reads(Chance::percent(random.below(40) as f64));
             });
         }
-        Self { world, units: Vec::new(), weather, random, report: Report::default() }
+        Self { world, mode, units: Vec::new(), weather, random, report: Report::default() }
     }
 
     fn host(&self, unit: &Unit) -> HostId {
@@ -120,7 +121,10 @@ fn path(random: &mut Random, weather: Weather) -> Path {
 
 impl World for SimWorld {
     fn port(&self) -> Port {
-        Port::Simulator
+        match self.mode {
+            Mode::Plain => Port::Simulator,
+            Mode::Secured => Port::Secured,
+        }
     }
 
     fn now(&self) -> Instant {

@@ -3,13 +3,14 @@
 use std::net::SocketAddr;
 use std::rc::{Rc, Weak};
 
-use cara_core::config::Constraints;
+use cara_core::config::{Constraints, Mode};
 use cara_core::distribution::connection_handler::Target;
 use cara_core::distribution::hello::Manager;
 use cara_core::distribution::identity::{Fleet, Identity};
 
 use super::Shared;
 use super::handle::UnitHandle;
+use super::keys::Given;
 use super::state::{Program, Settings, UnitState};
 
 /// A unit that has not started; made by [`World::m_unit`](super::World::m_unit) and
@@ -33,6 +34,7 @@ impl NewUnit {
     }
 
     fn new(shared: &Rc<Shared>, identity: Identity, constraints: Constraints) -> Self {
+        let mode = shared.with(|inner| inner.mode);
         let settings = Settings {
             identity,
             fleet: Fleet(0),
@@ -42,6 +44,7 @@ impl NewUnit {
             links: usize::from(constraints.maximum_nodes) + 4,
             functions: 64,
             boot_seed: None,
+            given: Given::new(mode),
             program: None,
         };
         Self { shared: Rc::downgrade(shared), settings, segment: 0 }
@@ -87,6 +90,24 @@ impl NewUnit {
     /// Every life of it draws the same random numbers, as a board without a source of noise does.
     pub fn boot_seed(mut self, seed: u64) -> Self {
         self.settings.boot_seed = Some(seed);
+        self
+    }
+
+    /// Plain or secured, whatever the world's other units are.
+    pub fn mode(mut self, mode: Mode) -> Self {
+        self.settings.given.mode = mode;
+        self
+    }
+
+    /// Its keys come from this root instead of 0, so it has none in common with units of another root.
+    pub fn keys_of_root(mut self, root: u8) -> Self {
+        self.settings.given.root = root;
+        self
+    }
+
+    /// It has no key for units of this name.
+    pub fn without_key_for(mut self, name: &str) -> Self {
+        self.settings.given.missing.insert(name.to_owned());
         self
     }
 

@@ -59,7 +59,7 @@ impl Inner {
             NetEvent::AddressChanged { .. } => self.network_changed(shared, host),
             NetEvent::Timer { token: NODE_TIMER, .. } => self.work_node(shared, host),
             NetEvent::Timer { token, .. } => self.work(shared, host, (token - 1) as u16),
-            NetEvent::Datagram { from, bytes, .. } => self.datagram(shared, host, from, &bytes),
+            NetEvent::Datagram { from, bytes, .. } => self.datagram(shared, host, from, &mut bytes.to_vec()),
             NetEvent::Accepted { stream, from, .. } => self.accepted(shared, host, stream, from),
             NetEvent::Connected { stream, .. } => self.on_stream(shared, host, stream, |links, network, index| {
                 links.with(network, index, |session, cx| session.connected(cx));
@@ -116,9 +116,9 @@ impl Inner {
         }
     }
 
-    fn datagram(&mut self, shared: &Rc<Shared>, host: HostId, from: SocketAddr, bytes: &[u8]) {
+    fn datagram(&mut self, shared: &Rc<Shared>, host: HostId, from: SocketAddr, bytes: &mut [u8]) {
         let Some(machine) = &mut self.units[host.index()].machine else { return };
-        match machine.node.datagram(self.network.now(), from, bytes) {
+        match machine.node.datagram(self.network.now(), from, bytes, &machine.keys.codes) {
             Sorted::Done => {
                 if machine.node.take_twin().is_some() {
                     let reason = CloseReason::Refused(Refusal::DuplicateIdentity);
@@ -185,6 +185,7 @@ impl Inner {
         let Some(machine) = &mut unit.machine else { return };
         let peer = machine.links.link(index).and_then(|link| link.peer.clone());
         match happened {
+            Happened::Introduced => self.prove(shared, host, index),
             Happened::Hello => self.greet(shared, host, index),
             Happened::Answered => {
                 let action = machine.node.challenge_answered(self.network.now(), LinkId(index));
@@ -204,6 +205,20 @@ impl Inner {
                 self.log_of(shared, host, peer, |peer| UnitEvent::LeaseEnded { peer, function, expired });
             }
         }
+    }
+
+    /// The peer of a secured link says who it is: each proves to the other that it has the pair's key.
+    fn prove(&mut self, shared: &Rc<Shared>, host: HostId, index: u16) {
+        let now = self.network.now();
+        let Some(machine) = &mut self.units[host.index()].machine else { return };
+        let Some(session) = machine.links.link(index).map(|link| &link.session) else { return };
+        let (Some(peer), address) = (session.identity().cloned(), session.address()) else { return };
+        let Some(credentials) = machine.keys.credentials(&peer) else {
+            machine.node.refuse_without_key(now, address, &peer);
+            return self.refuse(shared, host, index, Refusal::NoKey);
+        };
+        machine.links.with(&mut self.network, index, |session, cx| session.prove(cx, credentials));
+        self.work(shared, host, index);
     }
 
     /// The peer of a link has introduced itself.

@@ -6,11 +6,11 @@ use cara_core::distribution::function_list::{FunctionList, Slot};
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error};
-use cara_core::host::secure::Plain;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::{Event, Session};
 use cara_core::services::{Context, Ticket};
 use cara_core::time::Instant;
+use cara_secure::link::Cipher;
 
 use super::mail::{LazyPool, SimMailman};
 use super::replies::{Promise, Waiting};
@@ -19,11 +19,12 @@ use crate::event::{HostId, StreamId};
 use crate::network::Network;
 use crate::storage::Boxed;
 
-pub(super) type SimSession = Session<Boxed, Plain>;
+pub(super) type SimSession = Session<Boxed, Cipher>;
 pub(super) type SimContext<'c, 'n> = Context<'c, Boxed, SimMailman<'n>, LazyPool, Handler>;
 
 /// What a link led to that concerns more than the link.
 pub(super) enum Happened {
+    Introduced,
     Hello,
     Call(cara_core::services::unit::Call, BoxedParameters),
     Failed(CallId, Error),
@@ -82,11 +83,11 @@ impl Links {
         self.links.iter().position(Option::is_none).map(|index| index as u16)
     }
 
-    /// The link, of those that others have opened, that has waited longest for its peer's hello.
+    /// The link, of those that others have opened, that has waited longest for its peer to say, or prove, who it is.
     pub(super) fn oldest_silent(&self) -> Option<u16> {
         let silent = |index: &&u16| {
             let link = self.link(**index);
-            link.is_some_and(|link| !link.session.dialed() && link.session.hello().is_none())
+            link.is_some_and(|link| !link.session.dialed() && !link.session.is_proven())
         };
         self.by_stream.values().find(silent).copied()
     }
@@ -283,7 +284,7 @@ impl Links {
         index: u16,
         from: std::net::SocketAddr,
         nonce: u64,
-        body: &[u8],
+        body: &mut [u8],
     ) -> Vec<Happened> {
         let mut happened = Vec::new();
         if let Some(event) = self.with(network, index, |session, cx| session.datagram(cx, from, nonce, body)) {
@@ -380,6 +381,7 @@ fn note(
             return;
         }
         Some(Event::Call(call)) => Happened::Call(call, own(functions, call.slot, arguments)),
+        Some(Event::Introduced) => Happened::Introduced,
         Some(Event::Hello) => Happened::Hello,
         Some(Event::Failed(id, error)) => Happened::Failed(id, error),
         Some(Event::ListChanged) => Happened::ListChanged,

@@ -3,20 +3,22 @@
 use std::net::SocketAddr;
 use std::rc::Rc;
 
-use cara_core::config::Constraints;
+use cara_core::config::{Constraints, Mode};
 use cara_core::counters::Counters;
 use cara_core::distribution::connection_handler::{Action, Node, NodeConfig, NodeStorage, Target};
 use cara_core::distribution::function_list::FunctionList;
 use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
 use cara_core::host::connections::LinkCounter;
 use cara_core::host::mailman::LinkId;
-use cara_core::host::secure::Plain;
+use cara_core::host::secure::Seal;
+use cara_core::random::Random;
 use cara_core::services::publications::Publications;
 use cara_core::services::unit::{Session, SessionConfig, SessionStorage, buffer_bytes};
 use cara_core::time::Instant;
 
 use super::UnitEvent;
 use super::handle::UnitHandle;
+use super::keys::{Given, Keys};
 use super::links::Links;
 use super::mail::{LazyPool, SimMailman};
 use super::service::boxed_parameters;
@@ -48,6 +50,7 @@ pub(super) struct Settings {
     pub(super) links: usize,
     pub(super) functions: usize,
     pub(super) boot_seed: Option<u64>,
+    pub(super) given: Given,
     pub(super) program: Option<Program>,
 }
 
@@ -69,7 +72,19 @@ pub(super) struct Machine {
     pub(super) links: Links,
     pub(super) publications: Publications<Boxed>,
     pub(super) constraints: Constraints,
+    pub(super) keys: Keys,
     node_timer: Instant,
+}
+
+impl Settings {
+    fn keys(&self, network: &mut Network) -> Keys {
+        // Runs in plain mode draw what they always drew.
+        let seed = match self.given.mode {
+            Mode::Plain => 0,
+            Mode::Secured => self.boot_seed.unwrap_or_else(|| network.random().bits()),
+        };
+        Keys::new(self.given.clone(), self.identity.clone(), self.fleet, Random::new(seed))
+    }
 }
 
 impl UnitState {
@@ -104,7 +119,8 @@ impl UnitState {
         let functions =
             FunctionList::new(Boxed::slice(settings.functions), Boxed::slice(settings.functions * SIGNATURE_BYTES));
         let message_size = settings.constraints.message_size;
-        let buffers = LazyPool::new(buffer_bytes(message_size, 0), settings.message_buffers);
+        let keys = settings.keys(network);
+        let buffers = LazyPool::new(buffer_bytes(message_size, keys.cipher().overhead()), settings.message_buffers);
         // A block reserves what its signature declares, which may be more than what it holds.
         let arguments = boxed_parameters(2 * message_size as usize + 1_024);
         self.machine = Some(Machine {
@@ -112,6 +128,7 @@ impl UnitState {
             links: Links::new(self.host, settings.links, functions, buffers, arguments),
             publications: Publications::new(Boxed::slice(settings.functions), Boxed::slice(4 * settings.functions)),
             constraints: settings.constraints,
+            keys,
             node_timer: Instant::FAR_FUTURE,
         });
     }
@@ -141,13 +158,13 @@ impl Machine {
         };
         let link = LinkId(index);
         let config = SessionConfig { link, dialed, address: peer, local: hello, constraints: self.constraints };
-        self.links.insert(index, Session::new(now, config, Plain, storage), stream);
+        self.links.insert(index, Session::new(now, config, self.keys.cipher(), storage), stream);
         Some(index)
     }
 
     pub(super) fn poll_node(&mut self, network: &mut Network, host: HostId) -> Option<Action> {
         let now = network.now();
-        self.node.poll(now, &mut SimMailman { network, host, streams: &[] })
+        self.node.poll(now, &mut SimMailman { network, host, streams: &[] }, &self.keys.codes)
     }
 
     pub(super) fn arm_node(&mut self, network: &mut Network, host: HostId) {

@@ -95,7 +95,7 @@ fn of_crossing_links_both_ends_keep_the_one_that_the_smaller_dialled() {
         let mut of_large = node(large.clone());
         // Link 0 is the one that `small` dials, link 1 the one that `large` dials.
         let hear = |node: &mut Node<Boxed>, peer: &NodeConfig| {
-            node.datagram(at(1), address(peer.identity.id(), 7_001), &announce_bytes(&announce_of(peer, 1, 0)));
+            node.hear(at(1), address(peer.identity.id(), 7_001), &announce_bytes(&announce_of(peer, 1, 0)));
         };
         hear(&mut of_small, &large);
         run(&mut of_small, at(100), &mut Outbox::default());
@@ -116,7 +116,7 @@ fn of_crossing_links_both_ends_keep_the_one_that_the_smaller_dialled() {
         let mut outbox = Outbox::default();
         for node in [&mut of_small, &mut of_large] {
             assert_eq!(node.challenge_answered(at(101), LinkId(1)), None, "it is decided whatever is answered");
-            while let Some(action) = node.poll(at(101), &mut outbox) {
+            while let Some(action) = node.poll(at(101), &mut outbox, &Plain) {
                 let reason = CloseReason::Refused(Refusal::AlreadyConnected);
                 assert_eq!(action, Action::Supersede { old: LinkId(1), new: LinkId(0), reason });
             }
@@ -160,7 +160,7 @@ fn a_datagram_of_another_version_is_told() {
     let mut node = depot();
     let mut bytes = who_has_bytes(&search_of(&s_unit("agv", 1), 1));
     bytes[4] = 9;
-    assert_eq!(node.datagram(at(1), address(1, 7_001), &bytes), Sorted::Done);
+    node.hear(at(1), address(1, 7_001), &bytes);
     let finding = node.findings().next().unwrap();
     assert_eq!((finding.refusal, finding.address), (Refusal::Version, address(1, 7_001)));
     assert_eq!(node.counters.value(NodeCounter::DatagramVersion), 1);
@@ -171,13 +171,12 @@ fn session_datagrams_reach_links_that_exist() {
     let mut node = depot();
     join(&mut node, at(1), 3, &s_unit("agv", 1));
     let datagram = |link| {
-        let mut bytes = crate::distribution::datagram::session_header(FLEET, link, 42).to_vec();
+        let mut bytes = crate::distribution::datagram::session_header(Mode::Plain, FLEET, link, 42).to_vec();
         bytes.push(1);
         bytes
     };
-    let (known, unknown) = (datagram(3), datagram(4));
-    let expected = Sorted::Session { link: LinkId(3), nonce: 42, body: &[1] };
-    assert_eq!(node.datagram(at(2), address(1, 1), &known), expected);
-    assert_eq!(node.datagram(at(2), address(1, 1), &unknown), Sorted::Done);
+    let expected = Sorted::Session { link: LinkId(3), nonce: 42, body: &mut [1] };
+    assert_eq!(node.datagram(at(2), address(1, 1), &mut datagram(3), &Plain), expected);
+    node.hear(at(2), address(1, 1), &datagram(4));
     assert_eq!(node.counters.value(NodeCounter::DatagramUnknownLink), 1);
 }

@@ -79,11 +79,11 @@ impl Port {
             }
             Step::Heard(number) => {
                 let bytes = announce_bytes(&announce_of(&peer(number, 1), self.now.as_micros() as u32, 0));
-                self.node.datagram(self.now, address(u32::from(number), 7_001), &bytes);
+                self.node.hear(self.now, address(u32::from(number), 7_001), &bytes);
             }
             Step::Wait(millis) => self.now = self.now + Duration::from_millis(millis),
         }
-        while let Some(action) = self.node.poll(self.now, &mut Outbox::default()) {
+        while let Some(action) = self.node.poll(self.now, &mut Outbox::default(), &Plain) {
             self.act(Some(action));
         }
         assert!(self.node.next_deadline() > self.now);

@@ -73,7 +73,7 @@ struct Port {
 impl Port {
     fn poll(&mut self, dial: u64) {
         let mut actions = 0;
-        while let Some(action) = self.node.poll(self.now, &mut self.outbox) {
+        while let Some(action) = self.node.poll(self.now, &mut self.outbox, &Plain) {
             actions += 1;
             assert!(actions < 100, "polling ends");
             self.act(action, dial);
@@ -130,12 +130,12 @@ impl Port {
             }
             Step::WhoHas { who, epoch, sequence, port } => {
                 let search = search_of(&who_is(who, epoch, port), sequence);
-                self.node.datagram(self.now, address(u32::from(who) + 1, 7_001), &who_has_bytes(&search));
+                self.node.hear(self.now, address(u32::from(who) + 1, 7_001), &who_has_bytes(&search));
             }
             Step::Announce { who, epoch, sequence, port, own_question, room } => {
                 let nonce = if own_question { self.node.search.nonce } else { 0 };
                 let announce = Announce { room, ..announce_of(&who_is(who, epoch, port), sequence, nonce) };
-                self.node.datagram(self.now, address(u32::from(who) + 1, 7_001), &announce_bytes(&announce));
+                self.node.hear(self.now, address(u32::from(who) + 1, 7_001), &announce_bytes(&announce));
             }
             Step::Admit { who, epoch, link } => self.admit(who, epoch, link),
             Step::Answered(link) => {

@@ -12,7 +12,7 @@ fn search_times(node: &mut Node<Boxed>, end: Instant) -> Vec<Instant> {
     while node.next_deadline() <= end {
         let now = node.next_deadline();
         let mut outbox = Outbox::default();
-        assert_eq!(node.poll(now, &mut outbox), None);
+        assert_eq!(node.poll(now, &mut outbox, &Plain), None);
         times.extend(outbox.broadcasts.iter().map(|_| now));
     }
     times
@@ -56,7 +56,7 @@ fn a_broadcast_that_is_asked_for_goes_out_at_once_or_when_the_budget_allows() {
     let mut outbox = Outbox::default();
     for _ in 0..SEARCH_BUDGET {
         node.broadcast(at(100));
-        node.poll(at(100), &mut outbox);
+        node.poll(at(100), &mut outbox, &Plain);
     }
     assert_eq!(outbox.broadcasts.len(), usize::from(SEARCH_BUDGET));
     node.broadcast(at(101));
@@ -73,7 +73,7 @@ fn searches_of_others_count_against_the_budget() {
             &NodeConfig { target: Target::Manager(Manager::new("yard", 1).unwrap()), ..s_unit("agv", host) },
             1,
         ));
-        node.datagram(at(0), address(host, 7_001), &bytes);
+        node.hear(at(0), address(host, 7_001), &bytes);
     }
     let times = search_times(&mut node, at(4_000));
     assert!(times[0] >= at(0) + SEARCH_WINDOW, "{times:?}");
@@ -86,8 +86,8 @@ fn an_s_unit_holds_back_while_another_asks_the_same() {
     for seed in 0..50 {
         let mut node = node(NodeConfig { seed, ..s_unit("agv", 1) });
         let bytes = who_has_bytes(&search_of(&s_unit("agv", 2), 1));
-        node.datagram(at(0), address(2, 7_001), &bytes);
-        node.datagram(at(2), address(3, 7_001), &who_has_bytes(&search_of(&s_unit("agv", 3), 1)));
+        node.hear(at(0), address(2, 7_001), &bytes);
+        node.hear(at(2), address(3, 7_001), &who_has_bytes(&search_of(&s_unit("agv", 3), 1)));
         let first = search_times(&mut node, at(2_000))[0];
         let earliest = at(0) + FIRST_SEARCH;
         assert!(first >= earliest && first <= at(2) + FIRST_SEARCH.times(2), "{first:?}");
@@ -100,13 +100,13 @@ fn the_first_seeker_is_answered_alone_and_the_second_with_all_others() {
     let mut outbox = Outbox::default();
     run(&mut node, at(40_000), &mut Outbox::default());
     let ask = |node: &mut Node<Boxed>, millis, host| {
-        node.datagram(at(millis), address(host, 7_001), &who_has_bytes(&search_of(&s_unit("agv", host), 1)));
+        node.hear(at(millis), address(host, 7_001), &who_has_bytes(&search_of(&s_unit("agv", host), 1)));
     };
     ask(&mut node, 40_001, 1);
     ask(&mut node, 40_002, 1);
     let mut before = Outbox::default();
     while node.next_deadline() <= at(40_030) {
-        node.poll(node.next_deadline(), &mut before);
+        node.poll(node.next_deadline(), &mut before, &Plain);
     }
     assert_eq!((before.sent.len(), before.broadcasts.len()), (1, 0));
     let (to, bytes) = &before.sent[0];
@@ -128,21 +128,21 @@ fn an_answer_to_this_units_question_is_dialled_at_once_and_to_another_never() {
     run(&mut node, at(SOON), &mut outbox);
     let nonce = as_who_has(&outbox.broadcasts[0]).nonce;
     let depot = m_unit(MANAGER, MANAGER_ID);
-    node.datagram(at(60), address(1, 7_001), &announce_bytes(&announce_of(&depot, 1, nonce ^ 2)));
+    node.hear(at(60), address(1, 7_001), &announce_bytes(&announce_of(&depot, 1, nonce ^ 2)));
     assert_eq!(node.counters.value(NodeCounter::Unasked), 1);
-    assert_eq!(node.poll(at(60), &mut outbox), None);
-    node.datagram(at(61), address(1, 7_001), &announce_bytes(&announce_of(&depot, 1, nonce)));
+    assert_eq!(node.poll(at(60), &mut outbox, &Plain), None);
+    node.hear(at(61), address(1, 7_001), &announce_bytes(&announce_of(&depot, 1, nonce)));
     let dial = Action::Dial { to: address(1, 7_000), identity: Some(depot.identity) };
-    assert_eq!(node.poll(at(61), &mut outbox), Some(dial));
+    assert_eq!(node.poll(at(61), &mut outbox, &Plain), Some(dial));
 }
 
 #[test]
 fn the_wrong_manager_is_ignored() {
     let mut node = node(s_unit("agv", 1));
     for wrong in [m_unit(MANAGER, 6), m_unit("yard", MANAGER_ID), s_unit(MANAGER, MANAGER_ID)] {
-        node.datagram(at(1), address(9, 7_001), &announce_bytes(&announce_of(&wrong, 1, 0)));
+        node.hear(at(1), address(9, 7_001), &announce_bytes(&announce_of(&wrong, 1, 0)));
         let asks = WhoHas { wanted: None, ..search_of(&wrong, 2) };
-        node.datagram(at(1), address(9, 7_001), &who_has_bytes(&asks));
+        node.hear(at(1), address(9, 7_001), &who_has_bytes(&asks));
     }
     assert_eq!(run(&mut node, at(500), &mut Outbox::default()), []);
     assert_eq!(node.counters.value(NodeCounter::WrongManager), 6);
@@ -157,7 +157,7 @@ fn own_s_units_dial_a_manager_that_asks_unless_it_knows_them() {
     let dials = |known: &[u32]| {
         let mut node = node(config.clone());
         let who_has = WhoHas { known: known.iter().copied().collect(), ..ask.clone() };
-        node.datagram(at(0), address(1, 7_001), &who_has_bytes(&who_has));
+        node.hear(at(0), address(1, 7_001), &who_has_bytes(&who_has));
         let actions = run(&mut node, at(500), &mut Outbox::default());
         actions.into_iter().map(|(when, action)| (when, matches!(action, Action::Dial { .. }))).collect::<Vec<_>>()
     };
@@ -170,7 +170,7 @@ fn own_s_units_dial_a_manager_that_asks_unless_it_knows_them() {
 fn of_two_m_units_the_smaller_dials_and_the_larger_answers() {
     let (small, large) = (m_unit("a", 1), m_unit("b", 1));
     let mut of_small = node(small.clone());
-    of_small.datagram(at(0), address(2, 7_001), &who_has_bytes(&search_of(&large, 1)));
+    of_small.hear(at(0), address(2, 7_001), &who_has_bytes(&search_of(&large, 1)));
     let mut outbox = Outbox::default();
     let actions = run(&mut of_small, at(100), &mut outbox);
     let dial = Action::Dial { to: address(2, 7_000), identity: Some(large.identity.clone()) };
@@ -178,7 +178,7 @@ fn of_two_m_units_the_smaller_dials_and_the_larger_answers() {
     assert!(outbox.sent.is_empty());
 
     let mut of_large = node(large);
-    of_large.datagram(at(0), address(1, 7_001), &who_has_bytes(&search_of(&small, 1)));
+    of_large.hear(at(0), address(1, 7_001), &who_has_bytes(&search_of(&small, 1)));
     let mut outbox = Outbox::default();
     assert_eq!(run(&mut of_large, at(100), &mut outbox), []);
     assert_eq!(outbox.sent.iter().map(|(to, _)| *to).collect::<Vec<_>>(), [address(1, 7_001)]);
@@ -189,10 +189,10 @@ fn of_two_m_units_the_smaller_dials_and_the_larger_answers() {
 fn own_datagrams_are_ignored_and_a_double_is_told() {
     let mut node = depot();
     let own = m_unit(MANAGER, MANAGER_ID);
-    node.datagram(at(0), address(1, 7_001), &who_has_bytes(&search_of(&own, 1)));
+    node.hear(at(0), address(1, 7_001), &who_has_bytes(&search_of(&own, 1)));
     assert_eq!((node.counters.value(NodeCounter::OwnIdentity), node.findings().count()), (0, 0));
     let double = NodeConfig { epoch: Epoch(3), ..own };
-    node.datagram(at(0), address(2, 7_001), &who_has_bytes(&search_of(&double, 1)));
+    node.hear(at(0), address(2, 7_001), &who_has_bytes(&search_of(&double, 1)));
     assert_eq!(node.counters.value(NodeCounter::OwnIdentity), 1);
     assert_eq!(node.findings().next().map(|finding| finding.refusal), Some(Refusal::DuplicateIdentity));
     // It is told once, and the double is answered, since it would hear nothing otherwise.
@@ -200,11 +200,11 @@ fn own_datagrams_are_ignored_and_a_double_is_told() {
     let mut outbox = Outbox::default();
     run(&mut node, at(1), &mut outbox);
     assert_eq!(outbox.sent.iter().map(|(to, _)| *to).collect::<Vec<_>>(), [address(2, 7_001)]);
-    node.datagram(at(2), address(2, 7_001), &who_has_bytes(&search_of(&double, 2)));
+    node.hear(at(2), address(2, 7_001), &who_has_bytes(&search_of(&double, 2)));
     assert_eq!(node.take_twin(), None);
     let announce = as_announce(&outbox.sent[0].1);
     let mut other = super::node(double);
-    other.datagram(at(3), address(1, 7_001), &announce_bytes(&announce));
+    other.hear(at(3), address(1, 7_001), &announce_bytes(&announce));
     assert_eq!(other.take_twin(), Some(address(1, 7_001)));
 }
 
@@ -216,7 +216,7 @@ fn doubles_are_told_now_and_then_only() {
     let mut told = 0;
     for life in 0..1_000 {
         let double = NodeConfig { epoch: Epoch(1_000 + life), ..own.clone() };
-        node.datagram(at(life * 20), address(2, 7_001), &who_has_bytes(&search_of(&double, 1)));
+        node.hear(at(life * 20), address(2, 7_001), &who_has_bytes(&search_of(&double, 1)));
         told += u32::from(node.take_twin().is_some());
     }
     assert_eq!(told, 3, "in 20 s");
@@ -303,7 +303,7 @@ fn a_refusal_that_only_people_can_remove_is_asked_about_seldom() {
 fn the_smaller_m_unit_dials_again_and_again() {
     let mut node = node(m_unit("a", 1));
     let peer = m_unit("b", 2);
-    node.datagram(at(0), address(2, 7_001), &announce_bytes(&announce_of(&peer, 1, 0)));
+    node.hear(at(0), address(2, 7_001), &announce_bytes(&announce_of(&peer, 1, 0)));
     let mut now = at(100);
     let mut pauses = Vec::new();
     run(&mut node, now, &mut Outbox::default());
@@ -313,7 +313,7 @@ fn the_smaller_m_unit_dials_again_and_again() {
     let mut last = now + Duration::from_secs(5);
     while pauses.len() < 8 {
         now = node.next_deadline();
-        if let Some(Action::Dial { to, .. }) = node.poll(now, &mut Outbox::default()) {
+        if let Some(Action::Dial { to, .. }) = node.poll(now, &mut Outbox::default(), &Plain) {
             assert_eq!(to, address(2, 7_000));
             pauses.push(now.since(last));
             last = now;
@@ -331,7 +331,7 @@ fn a_fixed_address_is_dialled_without_any_broadcast() {
     let mut dials = 0;
     while dials < 5 {
         let now = node.next_deadline();
-        if let Some(action) = node.poll(now, &mut outbox) {
+        if let Some(action) = node.poll(now, &mut outbox, &Plain) {
             assert_eq!(action, Action::Dial { to, identity: Some(m_unit(MANAGER, MANAGER_ID).identity) });
             node.dialing(Some(&m_unit(MANAGER, MANAGER_ID).identity), LinkId(0));
             node.left(now + Duration::from_secs(1), LinkId(0), CloseReason::DialFailed);
@@ -339,7 +339,7 @@ fn a_fixed_address_is_dialled_without_any_broadcast() {
         }
     }
     // What is heard of the manager elsewhere does not change the address.
-    node.datagram(at(100), address(1, 7_001), &announce_bytes(&announce_of(&m_unit(MANAGER, MANAGER_ID), 1, 0)));
+    node.hear(at(100), address(1, 7_001), &announce_bytes(&announce_of(&m_unit(MANAGER, MANAGER_ID), 1, 0)));
     node.broadcast(at(101));
     let action = run(&mut node, at(101), &mut outbox).pop().map(|(_, action)| action);
     assert!(matches!(action, Some(Action::Dial { to: found, .. }) if found == to), "{action:?}");
@@ -350,7 +350,7 @@ fn a_fixed_address_is_dialled_without_any_broadcast() {
 fn a_full_managers_broadcast_is_no_invitation() {
     let mut node = node(s_unit("agv", 1));
     let full = Announce { room: 0, expected: 0, ..announce_of(&m_unit(MANAGER, MANAGER_ID), 1, 0) };
-    node.datagram(at(0), address(1, 7_001), &announce_bytes(&full));
+    node.hear(at(0), address(1, 7_001), &announce_bytes(&full));
     assert_eq!(run(&mut node, at(400), &mut Outbox::default()), []);
     assert_eq!(node.findings().next().map(|finding| finding.refusal), Some(Refusal::Full));
 }
@@ -402,7 +402,7 @@ fn an_m_unit_that_cannot_reach_a_peer_any_more_asks_where_it_is() {
         1,
         &NodeConfig { target: Target::Manager(Manager::new("a", 1).unwrap()), ..s_unit("agv", 1) },
     );
-    node.datagram(at(0), address(2, 7_001), &announce_bytes(&announce_of(&peer, 1, 0)));
+    node.hear(at(0), address(2, 7_001), &announce_bytes(&announce_of(&peer, 1, 0)));
     // Its first searches are over before it loses the peer.
     run(&mut node, at(100), &mut Outbox::default());
     join(&mut node, at(100), 0, &peer);
@@ -412,14 +412,14 @@ fn an_m_unit_that_cannot_reach_a_peer_any_more_asks_where_it_is() {
     while node.next_deadline() < at(200_000) {
         let now = node.next_deadline();
         let mut outbox = Outbox::default();
-        if let Some(Action::Dial { identity, .. }) = node.poll(now, &mut outbox) {
+        if let Some(Action::Dial { identity, .. }) = node.poll(now, &mut outbox, &Plain) {
             node.dial_failed(now, identity.as_ref());
         }
         searches.extend(outbox.broadcasts.iter().map(|_| now));
     }
     assert_eq!(searches.len(), 4, "{searches:?}");
     let moved = announce_of(&peer, 2, node.search.nonce);
-    node.datagram(at(200_000), address(3, 7_001), &announce_bytes(&moved));
+    node.hear(at(200_000), address(3, 7_001), &announce_bytes(&moved));
     let actions = run(&mut node, at(200_001), &mut Outbox::default());
     assert!(matches!(actions[..], [(_, Action::Dial { to, .. })] if to == address(3, 7_000)), "{actions:?}");
 }

@@ -74,7 +74,7 @@ impl Fleet1000 {
             if flight <= timer {
                 let Reverse((now, _, to, from, bytes)) = self.flying.pop().unwrap();
                 if now >= self.on[to] {
-                    self.units[to].datagram(now, Self::host(from), &bytes);
+                    self.units[to].hear(now, Self::host(from), &bytes);
                     self.work(to, now);
                 }
             } else {
@@ -88,7 +88,7 @@ impl Fleet1000 {
 
     fn work(&mut self, index: usize, now: Instant) {
         let mut outbox = Outbox::default();
-        while let Some(action) = self.units[index].poll(now, &mut outbox) {
+        while let Some(action) = self.units[index].poll(now, &mut outbox, &Plain) {
             let Action::Dial { to, .. } = action else { panic!("{action:?}") };
             assert_eq!(to, address(1, 7_000));
             self.connect(index, now);

@@ -4,7 +4,7 @@ use super::*;
 use crate::config::LONGEST_SEARCH;
 
 fn announce(node: &mut Node<Boxed>, now: Instant, from: u32, announce: &Announce) {
-    node.datagram(now, address(from, 7_001), &announce_bytes(announce));
+    node.hear(now, address(from, 7_001), &announce_bytes(announce));
 }
 
 #[test]
@@ -18,7 +18,7 @@ fn made_up_names_neither_push_out_known_nodes_nor_are_kept() {
     }
     for id in 0..2_000 {
         announce(&mut node, at(3 + u64::from(id)), id + 1, &announce_of(&m_unit("made-up", 1_000 + id), 1, 0));
-        while node.poll(at(3 + u64::from(id)), &mut Outbox::default()).is_some() {}
+        while node.poll(at(3 + u64::from(id)), &mut Outbox::default(), &Plain).is_some() {}
     }
     assert_eq!(node.s_units().count(), 12, "each keeps its index");
     assert!(node.nodes().count() <= 12 + 4, "what is left of the table is enough for strangers");
@@ -67,7 +67,7 @@ fn a_thousand_junk_datagrams_change_nothing_but_counters() {
         let mut random = Random::new(3);
         for length in 0..1_000_usize {
             let junk: Vec<u8> = (0..length % 600).map(|_| random.bits() as u8).collect();
-            node.datagram(at(1), address(9, 9), &junk);
+            node.hear(at(1), address(9, 9), &junk);
         }
         assert_eq!((node.next_deadline(), node.nodes().count(), node.findings().count()), (before, 0, 0));
         let counted = [NodeCounter::DatagramMagic, NodeCounter::DatagramMalformed].map(|c| node.counters.value(c));
@@ -83,7 +83,7 @@ fn searches_among(others: &NodeConfig, pause: Duration, seed: u64) -> usize {
     let mut sequence = 0;
     while now < at(600_000) {
         sequence += 1;
-        node.datagram(now, address(9, 7_001), &who_has_bytes(&search_of(others, sequence)));
+        node.hear(now, address(9, 7_001), &who_has_bytes(&search_of(others, sequence)));
         now = now + pause;
         run(&mut node, now, &mut outbox);
     }

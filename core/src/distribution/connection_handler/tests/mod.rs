@@ -23,13 +23,22 @@ use std::boxed::Box;
 use std::vec::Vec;
 
 use super::*;
+use crate::config::Mode;
 use crate::distribution::datagram::{Announce, SEARCH_BYTES, WhoHas};
+use crate::host::secure::Plain;
 use crate::storage::Boxed;
 use crate::time::Duration;
 
 pub(super) const FLEET: Fleet = Fleet(7);
 pub(super) const MANAGER: &str = "depot";
 pub(super) const MANAGER_ID: u32 = 5;
+
+impl Node<Boxed> {
+    /// Takes a datagram in plain mode that is for no link.
+    pub(super) fn hear(&mut self, now: Instant, from: SocketAddr, bytes: &[u8]) {
+        assert_eq!(self.datagram(now, from, &mut bytes.to_vec(), &Plain), Sorted::Done);
+    }
+}
 
 /// Keeps datagrams instead of sending them.
 #[derive(Default)]
@@ -145,15 +154,15 @@ pub(super) fn announce_of(config: &NodeConfig, sequence: u32, nonce: u64) -> Ann
 }
 
 pub(super) fn who_has_bytes(who_has: &WhoHas) -> Vec<u8> {
-    who_has.encode(FLEET, &mut [0; SEARCH_BYTES]).unwrap().to_vec()
+    who_has.encode(Mode::Plain, FLEET, &mut [0; SEARCH_BYTES]).unwrap().to_vec()
 }
 
 pub(super) fn announce_bytes(announce: &Announce) -> Vec<u8> {
-    announce.encode(FLEET, &mut [0; SEARCH_BYTES]).unwrap().to_vec()
+    announce.encode(Mode::Plain, FLEET, &mut [0; SEARCH_BYTES]).unwrap().to_vec()
 }
 
 pub(super) fn read(bytes: &[u8]) -> Datagram<'_> {
-    Datagram::decode(bytes, FLEET).unwrap()
+    Datagram::decode(bytes, Mode::Plain, FLEET).unwrap()
 }
 
 pub(super) fn as_who_has(bytes: &[u8]) -> WhoHas {
@@ -178,7 +187,7 @@ pub(super) fn run(node: &mut Node<Boxed>, end: Instant, outbox: &mut Outbox) -> 
         if now > end {
             return actions;
         }
-        while let Some(action) = node.poll(now, outbox) {
+        while let Some(action) = node.poll(now, outbox, &Plain) {
             actions.push((now, action));
         }
         assert!(node.next_deadline() > now, "nothing due remains after a poll");
@@ -195,7 +204,7 @@ pub(super) fn join(node: &mut Node<Boxed>, now: Instant, link: u16, config: &Nod
 /// Lets an s_unit be found by its manager's answer; returns where it dials.
 pub(super) fn dial_manager(node: &mut Node<Boxed>, now: Instant, sequence: u32) -> SocketAddr {
     let announce = announce_of(&m_unit(MANAGER, MANAGER_ID), sequence, 0);
-    node.datagram(now, address(1, 7_001), &announce_bytes(&announce));
+    node.hear(now, address(1, 7_001), &announce_bytes(&announce));
     let actions = run(node, now + Duration::from_millis(200), &mut Outbox::default());
     match actions.as_slice() {
         [(_, Action::Dial { to, identity: Some(identity) })] if manager().is(identity) => *to,

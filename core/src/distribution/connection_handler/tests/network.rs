@@ -138,7 +138,7 @@ impl Network {
             }
             Happening::Datagram { from, bytes } => {
                 if let Some(node) = &mut self.units[index].node {
-                    node.datagram(now, Self::address_of(from, 7_001), &bytes);
+                    node.hear(now, Self::address_of(from, 7_001), &bytes);
                 }
             }
             Happening::Dialled { from, life } => self.connect(from, index, life),
@@ -184,7 +184,7 @@ impl Network {
         let now = self.now;
         let mut outbox = Outbox::default();
         while let Some(node) = &mut self.units[index].node {
-            let Some(action) = node.poll(now, &mut outbox) else { break };
+            let Some(action) = node.poll(now, &mut outbox, &Plain) else { break };
             let Action::Dial { to, identity } = action else { panic!("{action:?}") };
             node.dialing(identity.as_ref(), LinkId(0));
             self.dials += 1;

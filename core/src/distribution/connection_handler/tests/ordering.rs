@@ -43,7 +43,7 @@ fn any_order_of_six_datagrams_ends_in_the_same_state() {
     orders(&datagrams, &mut Vec::new(), &mut |order| {
         let mut node = depot();
         for (millis, bytes) in (1..).zip(order) {
-            node.datagram(at(millis), address(3, 7_001), bytes);
+            node.hear(at(millis), address(3, 7_001), bytes);
         }
         let state = state(&node);
         assert_eq!(expected.get_or_insert_with(|| state.clone()), &state);
@@ -52,7 +52,7 @@ fn any_order_of_six_datagrams_ends_in_the_same_state() {
     assert_eq!(count, 720);
     let mut node = depot();
     datagrams.iter().for_each(|bytes| {
-        node.datagram(at(1), address(3, 7_001), bytes);
+        node.hear(at(1), address(3, 7_001), bytes);
     });
     let dialled: Vec<_> = run(&mut node, at(200), &mut Outbox::default())
         .into_iter()
@@ -69,12 +69,12 @@ fn any_order_of_six_datagrams_ends_in_the_same_state() {
 fn after_a_while_a_smaller_epoch_is_news() {
     let mut node = depot();
     let peer = m_unit("one", 11);
-    node.datagram(at(1), address(3, 7_001), &announce_bytes(&announce_of(&peer, 9, 0)));
+    node.hear(at(1), address(3, 7_001), &announce_bytes(&announce_of(&peer, 9, 0)));
     let reborn = NodeConfig { epoch: Epoch(2), tcp_port: 7_777, ..peer.clone() };
     let bytes = announce_bytes(&announce_of(&reborn, 1, 0));
-    node.datagram(at(500), address(3, 7_001), &bytes);
+    node.hear(at(500), address(3, 7_001), &bytes);
     assert_eq!(node.counters.value(NodeCounter::Outdated), 1);
-    node.datagram(at(1_100), address(3, 7_001), &bytes);
+    node.hear(at(1_100), address(3, 7_001), &bytes);
     let known = node.node(&peer.identity).unwrap();
     assert_eq!((known.epoch, known.address.port()), (Epoch(2), 7_777));
 }
@@ -98,14 +98,14 @@ proptest! {
     ) {
         for config in [m_unit(MANAGER, MANAGER_ID), s_unit("agv", 1)] {
             let mut node: Node<Boxed> = Node::new(at(0), config, storage(4));
-            node.datagram(at(1), address(9, 9), &noise);
+            node.hear(at(1), address(9, 9), &noise);
             for (kind, mutations) in &kinds {
                 let mut bytes = valid(*kind);
                 for (place, value) in mutations {
                     let place = place.index(bytes.len());
                     bytes[place] = *value;
                 }
-                node.datagram(at(2), address(9, 9), &bytes);
+                node.hear(at(2), address(9, 9), &bytes);
             }
             run(&mut node, at(1_000), &mut Outbox::default());
         }

@@ -10,7 +10,7 @@ use super::super::{Link, LinkCounter};
 use crate::config::{EMERGENCY_BYTES, Priority};
 use crate::error::{Error, Limit};
 use crate::host::frame::Frame;
-use crate::host::secure::{Plain, Secure};
+use crate::host::secure::{Plain, Seal};
 use crate::storage::{Boxed, LEFT_BY_SENDING, Pool};
 
 /// As many buffers for messages to be sent, and those that these leave.
@@ -23,7 +23,7 @@ fn spare(pool: &Pool<Boxed>) -> usize {
     pool.free().saturating_sub(LEFT_BY_SENDING)
 }
 
-fn send<C: Secure>(
+fn send<C: Seal>(
     link: &mut Link<Boxed, C>,
     wire: &mut Wire,
     pool: &mut Pool<Boxed>,
@@ -33,7 +33,7 @@ fn send<C: Secure>(
     link.send_message(wire, pool, priority, message.len(), false, |writer| writer.put(message))
 }
 
-fn drain<C: Secure>(link: &mut Link<Boxed, C>, wire: &mut Wire, pool: &mut Pool<Boxed>) {
+fn drain<C: Seal>(link: &mut Link<Boxed, C>, wire: &mut Wire, pool: &mut Pool<Boxed>) {
     wire.budget = usize::MAX;
     link.flush(wire, pool).unwrap();
     assert!(!link.wants_to_write());
@@ -87,7 +87,7 @@ fn a_message_that_was_not_begun_is_overtaken() {
 }
 
 /// Bytes between an emergency's acceptance and its last byte on a network that takes `step` bytes at a time.
-fn emergency_behind_a_long_message<C: Secure + Default>(step: usize) -> usize {
+fn emergency_behind_a_long_message<C: Seal + Default>(step: usize) -> usize {
     let (mut link, mut wire, mut pool) = (link(C::default()), Wire { budget: step, ..Wire::default() }, pool(1, 9000));
     let (long, stop) = (pattern(1, 8000), pattern(2, EMERGENCY_BYTES));
     send(&mut link, &mut wire, &mut pool, Priority::Normal, &long).unwrap();
@@ -162,7 +162,7 @@ fn a_link_that_ends_gives_every_buffer_back() {
 }
 
 /// Sends, flushes and stalls in any order; returns what was accepted.
-fn exercise<C: Secure>(link: &mut Link<Boxed, C>, wire: &mut Wire, steps: &[(u8, usize)]) -> Vec<Item> {
+fn exercise<C: Seal>(link: &mut Link<Boxed, C>, wire: &mut Wire, steps: &[(u8, usize)]) -> Vec<Item> {
     let (mut pool, mut accepted) = (pool(2, 4000), Vec::new());
     for &(kind, amount) in steps {
         match Priority::from_wire(kind) {

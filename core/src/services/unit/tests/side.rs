@@ -26,6 +26,7 @@ pub(super) type Arguments = Box<Parameters<24_576>>;
 /// An event without what it borrows.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Happened {
+    Introduced,
     Hello,
     Reply(CallId, Result<(), Error>),
     Failed(CallId, Error),
@@ -121,8 +122,8 @@ impl Side {
     pub(super) fn work(&mut self, datagrams: Vec<(u64, Vec<u8>)>) -> bool {
         let mut worked = !datagrams.is_empty();
         let from = SocketAddr::new(self.session.address().ip(), DATAGRAM_PORT);
-        for (nonce, body) in datagrams {
-            let event = self.session.datagram(context!(self), from, nonce, &body).map(own);
+        for (nonce, mut body) in datagrams {
+            let event = self.session.datagram(context!(self), from, nonce, &mut body).map(own);
             self.note(event);
             self.run_calls();
         }
@@ -231,6 +232,7 @@ impl Happened {
 
 fn own(event: Event<'_>) -> Happened {
     match event {
+        Event::Introduced => Happened::Introduced,
         Event::Hello => Happened::Hello,
         Event::Reply(id, Err(error)) => Happened::Reply(id, Err(error)),
         Event::Failed(id, error) => Happened::Failed(id, error),

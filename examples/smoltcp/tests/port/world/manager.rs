@@ -224,7 +224,7 @@ impl Manager {
         for index in 0..LINKS {
             self.work(now, index);
         }
-        while let Some(action) = self.node.poll(now, &mut self.net) {
+        while let Some(action) = self.node.poll(now, &mut self.net, &Plain) {
             self.act(now, action);
         }
         self.net.interface.poll(smol(now), &mut self.cable, &mut self.net.sockets);
@@ -240,7 +240,7 @@ impl Manager {
             let received = self.net.sockets.get_mut::<udp::Socket>(self.net.datagrams).recv_slice(&mut bytes);
             let Ok((length, from)) = received else { return };
             let from = from.endpoint.into();
-            if let Sorted::Session { link, nonce, body } = self.node.datagram(now, from, &bytes[..length]) {
+            if let Sorted::Session { link, nonce, body } = self.node.datagram(now, from, &mut bytes[..length], &Plain) {
                 let index = usize::from(link.0);
                 let Some(session) = &mut self.sessions[index] else { continue };
                 let event = session.datagram(context!(self, now), from, nonce, body);

@@ -1,0 +1,163 @@
+//! How a link begins: both ends introduce themselves, and on a secured link prove that they have the key of the pair.
+//!
+//! Until the peer's first sealed frame has opened, what it says costs a bounded time and the link's own bytes, and reaches
+//! nobody: no limit, no clock and no decision of the node depends on it.
+
+use core::net::SocketAddr;
+
+use super::inbound::Outcome;
+use super::{Event, Phase, Remote, Session};
+use crate::config::Mode;
+use crate::distribution::hello::{Hello, HelloError};
+use crate::error::{CloseReason, Refusal};
+use crate::host::connections::{LinkCounter, Liveness, Place};
+use crate::host::frame::Frame;
+use crate::host::mailman::Mailman;
+use crate::host::secure::Secure;
+use crate::services::Context;
+use crate::services::lease::Service;
+use crate::storage::{Buffers, Storage};
+use crate::time::{Duration, Instant};
+
+impl<S: Storage, C: Secure> Session<S, C> {
+    /// Proves to the peer of [`Event::Introduced`] that this unit has the pair's key, and waits for the same from it. It
+    /// comes as [`Event::Hello`]; if it does not, the link ends with [`CloseReason::BadProof`],
+    /// [`CloseReason::Unproven`] or [`CloseReason::HelloTimeout`].
+    pub fn prove<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        credentials: C::Credentials,
+    ) {
+        let Phase::Introduced { until } = self.phase else { return };
+        match self.link.cipher().prove(self.dialed, credentials) {
+            Ok(message) => {
+                self.phase = Phase::Proving { until };
+                self.send_proof(cx, message.as_ref().map(|message| &message[..]));
+            }
+            Err(_) => self.fail(cx),
+        }
+    }
+
+    pub(super) fn hello_arrived<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        until: Instant,
+        place: Place,
+        lent: &[u8],
+    ) -> Outcome {
+        let mode = self.mode();
+        let hello = match Hello::decode(self.link.view(place, lent), mode) {
+            Ok(hello) => hello,
+            Err(error) => {
+                self.refuse(cx, refusal_of(error));
+                return Outcome::Nothing;
+            }
+        };
+        self.link.introduce(place, lent);
+        let datagrams = SocketAddr::new(self.peer_address.ip(), hello.udp_port);
+        self.remote = Some(Remote { hello, heard: cx.now, datagrams });
+        if mode == Mode::Plain {
+            return self.peer_known(cx.now);
+        }
+        if !self.dialed {
+            self.send_hello(cx);
+        }
+        if !matches!(self.phase, Phase::AwaitingHello { .. }) {
+            return Outcome::Nothing;
+        }
+        self.phase = Phase::Introduced { until };
+        Event::Introduced.into()
+    }
+
+    /// The peer's message of the proof. The end that dialled confirms at once that it has the keys.
+    pub(super) fn proof_arrived<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        place: Place,
+        lent: &[u8],
+    ) -> Outcome {
+        match self.link.answer(place, lent) {
+            Ok(answer) => self.send_proof(cx, answer.as_ref().map(|answer| &answer[..])),
+            Err(_) => self.fail(cx),
+        }
+        if self.dialed && matches!(self.phase, Phase::Proving { .. }) {
+            self.send_confirmation(cx);
+        }
+        Outcome::Nothing
+    }
+
+    /// The peer's first sealed frame has opened: it is who it says it is.
+    pub(super) fn confirmation_arrived<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        place: Place,
+        lent: &[u8],
+    ) -> Outcome {
+        if self.link.confirmed(place, lent).is_err() {
+            self.fail(cx);
+            return Outcome::Nothing;
+        }
+        self.link.set_chunk_limit(usize::from(self.constraints.chunk_size));
+        self.peer_known(cx.now)
+    }
+
+    /// The node has taken the peer: it is told so with this end's hello, or on a secured link with its confirmation.
+    pub(super) fn reply_to_hello<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+        match self.mode() {
+            Mode::Plain => self.send_hello(cx),
+            Mode::Secured => self.send_confirmation(cx),
+        }
+    }
+
+    /// Ends a link whose peer has not proven who it is.
+    pub(super) fn fail<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+        self.link.counters.add(LinkCounter::ProofsFailed, 1);
+        self.close(cx, CloseReason::BadProof);
+    }
+
+    /// What somebody who has proven nothing says about the end of the link is no more than its end.
+    pub(super) fn ended_in_clear(&mut self) {
+        self.link.counters.add(LinkCounter::FarewellsInClear, 1);
+        self.end(CloseReason::Unproven);
+    }
+
+    /// What the hello told counts from here on.
+    fn peer_known(&mut self, now: Instant) -> Outcome {
+        let Some(Remote { hello, heard, .. }) = &self.remote else { return Outcome::Nothing };
+        self.link.set_peer_limits(usize::from(hello.limits.chunk_size));
+        self.liveness = Liveness::new(now, Duration::from_millis(u64::from(hello.keep_alive)));
+        self.clock.hear(*heard, hello.stamp);
+        self.phase = Phase::Deciding;
+        Event::Hello.into()
+    }
+
+    fn send_proof<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        message: Option<&[u8]>,
+    ) {
+        let Some(message) = message else { return };
+        if self.link.send_clear(&Frame::Proof(message)) {
+            self.flush(cx);
+        } else {
+            self.close(cx, CloseReason::Protocol);
+        }
+    }
+
+    fn send_confirmation<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+        let confirmation = self.link.cipher().confirmation();
+        if self.link.send_frame(&Frame::Confirm(&confirmation)) {
+            self.flush(cx);
+        } else {
+            self.close(cx, CloseReason::Protocol);
+        }
+    }
+}
+
+const fn refusal_of(error: HelloError) -> Refusal {
+    match error {
+        HelloError::Version(_) => Refusal::Version,
+        HelloError::Mode => Refusal::Mode,
+        HelloError::Magic | HelloError::Malformed => Refusal::Malformed,
+    }
+}
