@@ -5,6 +5,8 @@
 //! checksum, so that a cut of power while one is written leaves the other. Its text (`FromStr` and `Display`) is how a person,
 //! a command line or an emulator's arguments say it.
 //!
+//! With the feature `keys`, [`keys`] stand behind the settings in the same copy.
+//!
 //! [`board`] is the table of boards and of where their pages are; [`uf2`] is the file form that some boot loaders take.
 //!
 //! It knows no flash controller and reads nothing by itself: a board lends the bytes of its pages.
@@ -15,6 +17,8 @@
 extern crate std;
 
 pub mod board;
+#[cfg(feature = "keys")]
+pub mod keys;
 pub mod page;
 mod text;
 pub mod uf2;

@@ -3,11 +3,11 @@
 //! | offset | size | field |
 //! |---|---|---|
 //! | 0 | 4 | `CARs` |
-//! | 4 | 1 | version of this layout, 1 |
+//! | 4 | 1 | version of this layout: 1, or 2 if keys stand behind the settings |
 //! | 5 | 1 | zero |
-//! | 6 | 2 | n, bytes of the settings, little-endian |
+//! | 6 | 2 | n, bytes of settings and keys, little-endian |
 //! | 8 | 4 | generation, little-endian |
-//! | 12 | n | the settings, in postcard |
+//! | 12 | n | the settings, in postcard, and the keys behind them, in a form of their own |
 //! | 12 + n | 4 | CRC-32 (ISO-HDLC) of all before, little-endian |
 //!
 //! A board keeps two copies in pages that are erased separately. [`newest`] takes the sound one with the higher
@@ -18,10 +18,15 @@ use crc::{CRC_32_ISO_HDLC, Crc, NoTable};
 use crate::Settings;
 
 /// Most bytes of a copy; a page of flash is at least as long.
-pub const BYTES: usize = 256;
+pub const BYTES: usize = 1280;
+/// Most bytes of settings in a copy.
+const SETTINGS_BYTES: usize = 240;
+/// Most bytes of keys in a copy.
+pub const KEYS_BYTES: usize = BYTES - HEADER - SETTINGS_BYTES - CHECKSUM;
 
 const MAGIC: [u8; 4] = *b"CARs";
-const LAYOUT: u8 = 1;
+const SETTINGS_ONLY: u8 = 1;
+const WITH_KEYS: u8 = 2;
 const HEADER: usize = 12;
 const CHECKSUM: usize = 4;
 /// Without a table: a few hundred bytes are summed once per boot, and a table takes 1 KiB of flash.
@@ -35,7 +40,7 @@ pub enum PageError {
     Absent,
     /// Another version of the layout.
     #[error(
-        "the page holds settings of layout {0}, and this image knows layout 1: write them again, or update the image"
+        "the page holds settings of layout {0}, and this image knows 1 and 2: write them again, or update the image"
     )]
     Layout(u8),
     /// The checksum does not fit: a bit has changed, or power was cut while it was written.
@@ -55,15 +60,24 @@ pub enum Copy {
     Second,
 }
 
-/// Writes a copy; how many bytes of `page` it takes. `None` only if the page is shorter than [`BYTES`].
+/// Writes a copy of settings alone; how many bytes of `page` it takes. `None` only if the page is shorter than [`BYTES`].
 pub fn encode(settings: &Settings, generation: u32, page: &mut [u8; BYTES]) -> Option<usize> {
+    encode_with(settings, &[], generation, page)
+}
+
+/// Writes a copy with keys in the form in which they stand in flash, or with none where `keys` is empty; how many bytes of
+/// `page` it takes. `None` for more than [`KEYS_BYTES`] of them.
+pub fn encode_with(settings: &Settings, keys: &[u8], generation: u32, page: &mut [u8; BYTES]) -> Option<usize> {
+    let layout = if keys.is_empty() { SETTINGS_ONLY } else { WITH_KEYS };
     let length = {
         let body = page.get_mut(HEADER..BYTES - CHECKSUM)?;
-        postcard::to_slice(settings, body).ok()?.len()
+        let settings = postcard::to_slice(settings, body.get_mut(..SETTINGS_BYTES)?).ok()?.len();
+        body.get_mut(settings..settings.checked_add(keys.len())?)?.copy_from_slice(keys);
+        settings + keys.len()
     };
     let header = page.get_mut(..HEADER)?;
     header.get_mut(..4)?.copy_from_slice(&MAGIC);
-    header.get_mut(4..6)?.copy_from_slice(&[LAYOUT, 0]);
+    header.get_mut(4..6)?.copy_from_slice(&[layout, 0]);
     header.get_mut(6..8)?.copy_from_slice(&(length as u16).to_le_bytes());
     header.get_mut(8..HEADER)?.copy_from_slice(&generation.to_le_bytes());
     let (summed, rest) = page.split_at_mut_checked(HEADER + length)?;
@@ -71,8 +85,31 @@ pub fn encode(settings: &Settings, generation: u32, page: &mut [u8; BYTES]) -> O
     Some(HEADER + length + CHECKSUM)
 }
 
-/// Reads a copy with its generation.
+/// A sound copy.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Found<'p> {
+    pub(crate) settings: Settings,
+    generation: u32,
+    /// In the form in which they stand in flash; empty where there are none. They are never shown.
+    pub(crate) keys: KeyBytes<'p>,
+}
+
+/// Bytes that hold keys.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(crate) struct KeyBytes<'p>(pub(crate) &'p [u8]);
+
+impl core::fmt::Debug for KeyBytes<'_> {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        write!(f, "{} bytes", self.0.len())
+    }
+}
+
+/// Reads the settings of a copy with its generation.
 pub fn decode(page: &[u8]) -> Result<(Settings, u32), PageError> {
+    found(page).map(|found| (found.settings, found.generation))
+}
+
+fn found(page: &[u8]) -> Result<Found<'_>, PageError> {
     let (header, rest) = page.split_at_checked(HEADER).ok_or(PageError::Absent)?;
     let [magic @ .., layout, _, low, high, first, second, third, fourth] = header else {
         return Err(PageError::Absent);
@@ -87,19 +124,28 @@ pub fn decode(page: &[u8]) -> Result<(Settings, u32), PageError> {
     if SUM.checksum(summed) != u32::from_le_bytes(*checksum) {
         return Err(PageError::Damaged);
     }
-    if *layout != LAYOUT {
+    if !matches!(*layout, SETTINGS_ONLY | WITH_KEYS) {
         return Err(PageError::Layout(*layout));
     }
-    let (settings, left) = postcard::take_from_bytes::<Settings>(body).map_err(|_| PageError::Unsound)?;
+    let (settings, keys) = postcard::take_from_bytes::<Settings>(body).map_err(|_| PageError::Unsound)?;
     let generation = u32::from_le_bytes([*first, *second, *third, *fourth]);
-    if left.is_empty() && settings.is_sound() { Ok((settings, generation)) } else { Err(PageError::Unsound) }
+    if settings.is_sound() && keys.is_empty() == (*layout == SETTINGS_ONLY) {
+        Ok(Found { settings, generation, keys: KeyBytes(keys) })
+    } else {
+        Err(PageError::Unsound)
+    }
 }
 
 /// The settings of the newest sound copy; why there are none, of the copy that came nearest.
 pub fn newest(first: &[u8], second: &[u8]) -> Result<Settings, PageError> {
-    match (decode(first), decode(second)) {
-        (Ok((first, one)), Ok((second, two))) => Ok(if is_newer(two, one) { second } else { first }),
-        (Ok((settings, _)), Err(_)) | (Err(_), Ok((settings, _))) => Ok(settings),
+    newest_found(first, second).map(|found| found.settings)
+}
+
+/// The newest sound copy.
+pub(crate) fn newest_found<'p>(first: &'p [u8], second: &'p [u8]) -> Result<Found<'p>, PageError> {
+    match (found(first), found(second)) {
+        (Ok(one), Ok(two)) => Ok(if is_newer(two.generation, one.generation) { two } else { one }),
+        (Ok(found), Err(_)) | (Err(_), Ok(found)) => Ok(found),
         (Err(PageError::Absent), Err(error)) | (Err(error), Err(_)) => Err(error),
     }
 }
@@ -154,6 +200,18 @@ mod tests {
         assert_eq!(decode(&page(&written, 5)), Ok((written, 5)));
     }
 
+    /// An image that knows no keys still reads who it is.
+    #[test]
+    fn keys_stand_behind_the_settings() {
+        let written = settings("agv-07", 7);
+        let mut page = [0xFF; BYTES];
+        encode_with(&written, &[0xC7; 100], 5, &mut page).unwrap();
+        assert_eq!(decode(&page), Ok((written, 5)));
+        let found = found(&page).unwrap();
+        assert_eq!(found.keys.0, [0xC7; 100]);
+        assert!(!std::format!("{found:?}").contains("199"), "{found:?}");
+    }
+
     #[test]
     fn the_longest_settings_fit() {
         let longest = String::from_utf8([b'n'; 32].to_vec()).unwrap();
@@ -163,6 +221,8 @@ mod tests {
         settings.network = network;
         settings.wifi = Some(Wifi::new(&longest, &"p".repeat(63)).unwrap());
         assert!(encode(&settings, u32::MAX, &mut [0; BYTES]).is_some());
+        assert!(encode_with(&settings, &[1; KEYS_BYTES], u32::MAX, &mut [0; BYTES]).is_some());
+        assert!(encode_with(&settings, &[1; BYTES], u32::MAX, &mut [0; BYTES]).is_none());
     }
 
     /// Power may be cut, or a bit flip, anywhere in one copy: the other one counts, and never something between.
@@ -224,10 +284,10 @@ mod tests {
 
         /// A checksum that fits does not make settings sound.
         #[test]
-        fn nothing_summed_panics(body in prop::collection::vec(any::<u8>(), 0..200)) {
+        fn nothing_summed_panics(body in prop::collection::vec(any::<u8>(), 0..200), layout in 0_u8..4) {
             let mut page = [0; BYTES];
             page[..4].copy_from_slice(&MAGIC);
-            page[4] = LAYOUT;
+            page[4] = layout;
             page[6..8].copy_from_slice(&(body.len() as u16).to_le_bytes());
             page[HEADER..HEADER + body.len()].copy_from_slice(&body);
             let end = HEADER + body.len();

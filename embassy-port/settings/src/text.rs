@@ -39,11 +39,21 @@ pub enum Field {
     Address,
     /// `gateway=10.0.0.1`
     Gateway,
+    /// `keys=` and digits: the keys, which are no part of the settings and are never shown.
+    Keys,
 }
 
 impl Field {
-    const ALL: [Self; 7] =
-        [Self::Name, Self::Id, Self::Manager, Self::ManagerAddress, Self::Fleet, Self::Address, Self::Gateway];
+    const ALL: [Self; 8] = [
+        Self::Name,
+        Self::Id,
+        Self::Manager,
+        Self::ManagerAddress,
+        Self::Fleet,
+        Self::Address,
+        Self::Gateway,
+        Self::Keys,
+    ];
 
     const fn word(self) -> &'static str {
         match self {
@@ -54,6 +64,7 @@ impl Field {
             Self::Fleet => "fleet",
             Self::Address => "address",
             Self::Gateway => "gateway",
+            Self::Keys => "keys",
         }
     }
 
@@ -65,6 +76,7 @@ impl Field {
             Self::ManagerAddress => "ADDRESS:PORT",
             Self::Address => "dhcp, or ADDRESS/BITS as in 10.0.0.17/24",
             Self::Gateway => "an IPv4 address; with address=ADDRESS/BITS only",
+            Self::Keys => "hexadecimal digits, as `cara provision` writes them",
         }
     }
 }
@@ -79,7 +91,9 @@ impl fmt::Display for Field {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum TextError {
     /// A word that is no `field=value`, or of a field that does not exist.
-    #[error("word {0} is no field=value: fields are name, id, manager, manager_address, fleet, address and gateway")]
+    #[error(
+        "word {0} is no field=value: fields are name, id, manager, manager_address, fleet, address, gateway and keys"
+    )]
     Word(usize),
     /// The same field twice.
     #[error("{0} stands there twice")]
@@ -106,6 +120,12 @@ impl FromStr for Settings {
         let manager_address = words.parsed(Field::ManagerAddress)?;
         Ok(Self { identity, manager, manager_address, fleet: Fleet(fleet), network: network(&words)?, wifi: None })
     }
+}
+
+/// The value of one field.
+#[cfg(feature = "keys")]
+pub(crate) fn value_of(text: &str, field: Field) -> Result<Option<&str>, TextError> {
+    Words::of(text).map(|words| words.of_field(field))
 }
 
 /// The values of a text, by field.

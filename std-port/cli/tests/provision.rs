@@ -6,8 +6,11 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use cara_core::distribution::identity::Fleet;
+use cara_settings::keys::{Keys, KeysError, newest, of_text};
 use cara_settings::page::{BYTES, decode};
 use cara_settings::{Settings, board};
+use cara_std::Identity;
+use cara_std::keys::{FleetKeys, KeyRing, Store};
 use tempfile::TempDir;
 
 /// What every board is told here.
@@ -131,7 +134,7 @@ fn every_mistake_is_told() {
     let long = "n".repeat(33);
     refused(folder.path(), &[], 2, "BOARD");
     refused(folder.path(), &told("toaster", &output), 2, "there are: nucleo-f767zi, nucleo-h743zi, rp2040");
-    refused(folder.path(), &told("lm3s6965evb", &output), 2, "argument of QEMU");
+    refused(folder.path(), &told("lm3s6965evb", &[]), 2, "argument of QEMU");
     refused(folder.path(), &["rp2040", "--output", "page.bin"], 2, "--name and an --id");
     refused(folder.path(), &["rp2040", "--name", "a"], 2, "--id");
     refused(folder.path(), &["rp2040", "--name", &long, "--id", "1", "--output", "x"], 2, "--name");
@@ -193,4 +196,158 @@ fn a_probe_that_fails_is_told() {
     let folder = with_probe();
     fs::write(folder.path().join("broken"), "").unwrap();
     refused(folder.path(), &told("nucleo-h743zi", &[]), 1, "Is the board connected");
+}
+
+fn depot() -> Identity {
+    Identity::m_unit("depot", 1).unwrap()
+}
+
+fn agv() -> Identity {
+    Identity::s_unit("agv-17", 17).unwrap()
+}
+
+/// Makes fleet 7 with `depot/1` and `agv-17/17` in the folder; the path of the AGV's file.
+fn with_keys(folder: &Path) -> (Store, String) {
+    let mut store = Store::create(&folder.join("keys"), FleetKeys::draw(Fleet(7)).unwrap()).unwrap();
+    [depot(), agv()].iter().for_each(|node| store.keys_mut().add(node, &[]).unwrap());
+    store.save().unwrap();
+    let file = store.file_of(&agv()).display().to_string();
+    (store, file)
+}
+
+/// Settings and keys of a file with a page.
+fn held(file: &Path) -> (Settings, Keys) {
+    newest(&fs::read(file).unwrap(), &[]).unwrap()
+}
+
+#[test]
+fn a_file_with_keys_tells_who_the_board_is() {
+    let folder = folder();
+    let (mut store, keys) = with_keys(folder.path());
+    store.keys_mut().rotate().unwrap();
+    store.save().unwrap();
+    let page = folder.path().join("page.bin");
+    fs::write(&page, "").unwrap();
+    let said = done(folder.path(), &["nucleo-f767zi", "--keys", &keys, "--output", "page.bin"]);
+    assert!(said.contains("settings and keys for nucleo-f767zi"), "{said}");
+    assert_eq!(fs::metadata(&page).unwrap().permissions().mode() & 0o777, 0o600);
+    let (settings, held_keys) = held(&page);
+    assert_eq!(settings, "name=agv-17 id=17 manager=depot/1 fleet=7".parse().unwrap());
+    let ring = KeyRing::load(Path::new(&keys)).unwrap();
+    for (number, key) in ring.pairs(&depot()) {
+        let (_, held) = held_keys.pairs(&depot()).find(|(held, _)| *held == number).unwrap();
+        assert_eq!(held.expose(), key.expose());
+    }
+    let discoveries: Vec<_> = held_keys.discoveries().map(|(number, key)| (number, *key.expose())).collect();
+    assert_eq!(discoveries, ring.discoveries().map(|(number, key)| (number, *key.expose())).collect::<Vec<_>>());
+
+    let shown = done(folder.path(), &["--read", "page.bin"]);
+    assert!(shown.contains("keys of generation 2 and 1 with depot/1@m_unit"), "{shown}");
+    let json = done(folder.path(), &["--read", "page.bin", "--json"]);
+    assert!(json.contains(r#""keys":{"generations":[2,1],"peers":["depot/1@m_unit"]}"#), "{json}");
+    let secrets = [held_keys.secret().expose(), held_keys.pair(&depot()).unwrap().expose()];
+    for secret in secrets {
+        let digits: String = secret.iter().take(4).map(|byte| format!("{byte:02x}")).collect();
+        let numbers = format!("{},{}", secret[0], secret[1]);
+        assert!(!shown.contains(&digits) && !json.contains(&digits) && !json.contains(&numbers));
+    }
+    // Each board gets a secret of its own, also of the same node.
+    done(folder.path(), &["nucleo-f767zi", "--keys", &keys, "--output", "other.bin"]);
+    assert_ne!(held(&folder.path().join("other.bin")).1.secret().expose(), held_keys.secret().expose());
+}
+
+#[test]
+fn a_uf2_file_with_keys_holds_both_copies() {
+    let folder = folder();
+    let (_store, keys) = with_keys(folder.path());
+    done(folder.path(), &["rp2040", "--keys", &keys, "--uf2", "--output", "settings.uf2"]);
+    let file = fs::read(folder.path().join("settings.uf2")).unwrap();
+    let pages = board::find("rp2040").unwrap().pages;
+    let word = |block: &[u8], at: usize| u32::from_le_bytes(block[at..at + 4].try_into().unwrap());
+    for page in pages {
+        let mut copy = [0xFF; BYTES];
+        for block in file.chunks(512).filter(|block| (page..page + BYTES as u32).contains(&word(block, 12))) {
+            let at = (word(block, 12) - page) as usize;
+            copy[at..at + 256].copy_from_slice(&block[32..288]);
+        }
+        assert!(newest::<1>(&copy, &[]).is_ok());
+    }
+    assert!(file.chunks(512).enumerate().all(|(number, block)| word(block, 20) == number as u32));
+    let shown = done(folder.path(), &["--read", "settings.uf2"]);
+    assert_eq!(shown.lines().filter(|line| line.contains("keys of generation 1 with depot/1")).count(), 2, "{shown}");
+}
+
+#[test]
+fn keys_stay_on_the_board_as_long_as_it_is_the_same_unit() {
+    let folder = with_probe();
+    let path = folder.path();
+    let (_store, keys) = with_keys(path);
+    let pages = ["page-0x8180000", "page-0x81c0000"].map(|page| path.join(page));
+    pages.iter().for_each(|page| fs::write(page, [0xFF; BYTES]).unwrap());
+    done(path, &["nucleo-f767zi", "--keys", &keys]);
+    let first = held(&pages[0]).1;
+    let said = done(path, &told("nucleo-f767zi", &["--fleet", "7", "--address", "10.0.0.17/24"]));
+    assert!(said.contains("settings and keys"), "{said}");
+    let (settings, kept) = held(&pages[1]);
+    assert!(settings.to_string().contains("10.0.0.17/24"), "{settings}");
+    assert_eq!(kept.secret().expose(), first.secret().expose());
+    let said = done(path, &told("nucleo-f767zi", &["--fleet", "8"]));
+    assert!(said.contains("settings without keys"), "{said}");
+    assert_eq!(newest::<1>(&fs::read(&pages[0]).unwrap(), &[]).map(drop), Err(KeysError::Absent));
+}
+
+#[test]
+fn keys_of_another_unit_are_refused() {
+    let folder = folder();
+    let (mut store, keys) = with_keys(folder.path());
+    let with = |more: &[&'static str]| [&["rp2040", "--keys", &keys, "--output", "x"], more].concat();
+    refused(folder.path(), &with(&["--fleet", "8"]), 2, "--keys are those of agv-17/17 in fleet 7");
+    refused(folder.path(), &with(&["--name", "agv-18", "--id", "17"]), 2, "the board would be agv-18/17");
+    let command = "`cara keys derive --fleet 7 agv-17/17 --manager hall/2@m_unit`";
+    refused(folder.path(), &with(&["--manager", "hall/2"]), 2, &command.replace("@m_unit", ""));
+    let hall = Identity::m_unit("hall", 2).unwrap();
+    store.keys_mut().add(&hall, &[]).unwrap();
+    store.keys_mut().add(&agv(), &[depot(), hall]).unwrap();
+    store.save().unwrap();
+    refused(folder.path(), &with(&[]), 2, "say --manager depot/1 or --manager hall/2");
+    done(folder.path(), &with(&["--manager", "hall/2"]));
+    let peers: Vec<_> = held(&folder.path().join("x")).1.peers().map(ToString::to_string).collect();
+    assert_eq!(peers, ["hall/2"]);
+    fs::set_permissions(&keys, fs::Permissions::from_mode(0o644)).unwrap();
+    refused(folder.path(), &with(&[]), 1, "chmod 600");
+    refused(folder.path(), &["rp2040", "--keys", "absent.keys", "--output", "y"], 1, "absent.keys");
+    assert!(!folder.path().join("y").exists());
+}
+
+#[test]
+fn the_emulated_board_is_told_by_text() {
+    let folder = folder();
+    let (_store, keys) = with_keys(folder.path());
+    done(folder.path(), &["lm3s6965evb", "--keys", &keys, "--output", "argument"]);
+    let file = folder.path().join("argument");
+    let text = fs::read_to_string(&file).unwrap();
+    assert_eq!(text.parse(), "name=agv-17 id=17 manager=depot/1 fleet=7".parse::<Settings>());
+    let held = of_text::<1>(&text).unwrap().unwrap();
+    let ring = KeyRing::load(Path::new(&keys)).unwrap();
+    assert_eq!(held.pair(&depot()).unwrap().expose(), ring.pair(&depot()).unwrap().expose());
+    assert_eq!(fs::metadata(&file).unwrap().permissions().mode() & 0o777, 0o600);
+    done(folder.path(), &told("lm3s6965evb", &["--output", "plain"]));
+    let plain = fs::read_to_string(folder.path().join("plain")).unwrap();
+    assert_eq!(plain, "name=agv-17 id=17 manager=depot/1 fleet=0 address=dhcp");
+    refused(folder.path(), &told("lm3s6965evb", &["--uf2", "--output", "x"]), 2, "no boot loader that takes UF2");
+}
+
+#[test]
+fn an_m_unit_on_a_board_has_keys_with_all_that_fit() {
+    let folder = folder();
+    let (mut store, _) = with_keys(folder.path());
+    let file = store.file_of(&depot()).display().to_string();
+    let arguments = ["rp2350", "--keys", &file, "--output", "page.bin"];
+    done(folder.path(), &arguments);
+    let page = fs::read(folder.path().join("page.bin")).unwrap();
+    let (settings, keys) = newest::<8>(&page, &[]).unwrap();
+    assert_eq!((settings.identity, keys.peers().count()), (depot(), 1));
+    (1..30).for_each(|id| store.keys_mut().add(&Identity::s_unit("agv", id).unwrap(), &[]).unwrap());
+    store.save().unwrap();
+    refused(folder.path(), &arguments, 2, "with as many as fit");
 }

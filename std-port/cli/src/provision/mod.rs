@@ -1,19 +1,21 @@
 //! `cara provision`: tells a board who it is. One image serves all boards of a kind; what differs is written to two pages
 //! of the board's flash.
 //!
-//! [`told`] makes settings of the command line, [`copy`] the bytes of the next copy and [`probe`] brings them to the
-//! board. [`show`] reads what a page says.
+//! [`told`] makes settings of the command line and [`secrets`] keys of a node's file, [`copy`] the bytes of the next copy and
+//! [`probe`] brings them to the board. [`show`] reads what a page says.
 
 mod copy;
 mod probe;
+mod secrets;
 mod show;
+mod text;
 mod told;
 
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use anyhow::Context;
-use cara_settings::Settings;
 use cara_settings::board::{BOARDS, Board, find};
 use serde_json::json;
 
@@ -21,7 +23,10 @@ use crate::exit::{Ended, Exit};
 use crate::global::Global;
 use crate::output;
 
-use self::copy::Written;
+use zeroize::Zeroizing;
+
+use self::copy::{Content, Written};
+use self::secrets::Secrets;
 
 /// Writes to a board's flash who it is, whom it belongs to and how it gets its address.
 ///
@@ -29,7 +34,7 @@ use self::copy::Written;
 /// board then starts again. The board keeps two copies, and the newest one is never overwritten.
 #[derive(clap::Args)]
 #[command(after_help = "\
-cara provision nucleo-f767zi --name agv-17 --id 17 --manager depot/1 --fleet 7
+cara provision nucleo-f767zi --keys ~/.config/cara/keys/agv-17-17-s_unit-7.keys
 cara provision rp2040 --name agv-18 --id 18 --manager depot/1 --address 10.0.0.18/24 --uf2 --output settings.uf2
 cara provision --read settings.uf2")]
 pub(crate) struct Arguments {
@@ -38,6 +43,10 @@ pub(crate) struct Arguments {
     board: Option<String>,
     #[command(flatten)]
     told: told::Told,
+    /// The file with the board's keys, as `cara keys` makes it. It tells name, id, fleet and manager where these are not
+    /// given. Without it, keys that the board has stay, where its pages can be read.
+    #[arg(long, value_name = "FILE", requires = "board")]
+    keys: Option<PathBuf>,
     /// Write a file instead of the board.
     #[arg(long, value_name = "FILE", requires = "board")]
     output: Option<PathBuf>,
@@ -67,49 +76,54 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
 }
 
 fn write(arguments: &Arguments, global: &Global) -> anyhow::Result<()> {
-    let board = known(arguments.board.as_deref().unwrap_or_default())?;
+    let name = arguments.board.as_deref().unwrap_or_default();
+    let board = if name == text::EMULATED.name { &text::EMULATED } else { known(name)? };
     if arguments.uf2 && board.uf2.is_none() {
         let text = format!("{} has no boot loader that takes UF2: leave --uf2 away", board.name);
         return Err(Ended::usage(text));
     }
-    let settings = arguments.told.settings(board, global.fleet.unwrap_or(0))?;
+    let ring = arguments.keys.as_deref().map(secrets::load).transpose()?;
+    let settings = arguments.told.settings(board, global.fleet, ring.as_ref())?;
+    let secrets = ring.as_ref().map(|ring| Secrets::draw(ring, &settings)).transpose()?;
+    let content = Content { settings, secrets };
     match &arguments.output {
-        Some(file) => write_file(arguments, board, &settings, file, global),
-        None => report(board, &probe::provision(board, &settings)?, None, global),
+        _ if *board == text::EMULATED => text::write(&content, arguments.output.as_deref(), global),
+        Some(file) => write_file(arguments, board, &content, file, global),
+        None => report(board, &probe::provision(board, &content)?, None, global),
     }
 }
 
 fn known(name: &str) -> anyhow::Result<&'static Board> {
     find(name).ok_or_else(|| {
         let names = BOARDS.map(|board| board.name).join(", ");
-        let text = match name {
-            "lm3s6965evb" => "lm3s6965evb is emulated: it is told as an argument of QEMU, not in flash".to_owned(),
-            _ => format!("there is no board {name}; there are: {names}"),
-        };
-        Ended::usage(text)
+        Ended::usage(format!("there is no board {name}; there are: {names}"))
     })
 }
 
 fn write_file(
     arguments: &Arguments,
     board: &Board,
-    settings: &Settings,
+    content: &Content,
     file: &Path,
     global: &Global,
 ) -> anyhow::Result<()> {
     let previous = arguments.previous.as_deref().map(pages).transpose()?;
     let written = match (&previous, arguments.uf2) {
-        (Some([first, second]), _) => vec![copy::next(board, settings, first, second)?],
+        (Some([first, second]), _) => vec![copy::next(board, content, first, second)?],
         // Whatever the pages hold, these are newer than nothing.
-        (None, true) => copy::both(board, settings)?,
-        (None, false) => vec![copy::next(board, settings, &[], &[])?],
+        (None, true) => copy::both(board, content)?,
+        (None, false) => vec![copy::next(board, content, &[], &[])?],
     };
     let bytes = match board.uf2.filter(|_| arguments.uf2) {
         Some(families) => copy::uf2(&written, families.data),
-        None => written.iter().flat_map(|copy| copy.bytes).collect(),
+        None => Zeroizing::new(written.iter().flat_map(|copy| copy.bytes.iter().copied()).collect()),
     };
-    std::fs::write(file, bytes).with_context(|| format!("cannot write {}", file.display()))?;
+    let has_keys = written.iter().any(|copy| copy.has_keys);
+    store(file, &bytes, has_keys).with_context(|| format!("cannot write {}", file.display()))?;
     report(board, &written, Some(file), global)?;
+    if previous.is_none() && arguments.uf2 && !has_keys && !global.json {
+        output::line("keys that the board has are gone with it: give --keys if it is to keep any")?;
+    }
     if previous.is_none() && !arguments.uf2 && !global.json {
         let [_, second] = board.pages;
         output::line(format_args!(
@@ -119,9 +133,24 @@ fn write_file(
     Ok(())
 }
 
+/// Writes a file; one with keys for its owner alone, whatever stood there before.
+fn store(file: &Path, bytes: &[u8], has_keys: bool) -> std::io::Result<()> {
+    if !has_keys {
+        return std::fs::write(file, bytes);
+    }
+    let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let mut private = tempfile::NamedTempFile::new_in(folder)?;
+    private.write_all(bytes)?;
+    private.persist(file)?;
+    Ok(())
+}
+
 /// What the two files hold.
-fn pages(files: &[PathBuf]) -> anyhow::Result<[Vec<u8>; 2]> {
-    let read = |file: &PathBuf| std::fs::read(file).with_context(|| format!("cannot read {}", file.display()));
+fn pages(files: &[PathBuf]) -> anyhow::Result<[Zeroizing<Vec<u8>>; 2]> {
+    let read = |file: &PathBuf| {
+        let page = std::fs::read(file).with_context(|| format!("cannot read {}", file.display()))?;
+        anyhow::Ok(Zeroizing::new(page))
+    };
     match files {
         [first, second] => Ok([read(first)?, read(second)?]),
         _ => Err(Ended::usage("--previous takes two files")),
@@ -129,16 +158,19 @@ fn pages(files: &[PathBuf]) -> anyhow::Result<[Vec<u8>; 2]> {
 }
 
 fn report(board: &Board, written: &[Written], file: Option<&Path>, global: &Global) -> anyhow::Result<()> {
-    for Written { address, generation, .. } in written {
+    for copy in written {
+        let Written { address, generation, has_keys, .. } = copy;
         let place = file.map_or_else(|| "the board".to_owned(), |file| file.display().to_string());
+        let keys = secrets::told(&copy.bytes).ok().flatten().map(|keys| keys.generations);
         match global.json {
             true => output::object(&json!({
-                "board": board.name, "file": file, "address": address, "generation": generation,
+                "board": board.name, "file": file, "address": address, "generation": generation, "keys": keys,
             }))?,
-            false => output::line(format_args!(
-                "{place}: settings for {} at {address:#x}, generation {generation}",
-                board.name
-            ))?,
+            false => {
+                let what = if *has_keys { "settings and keys" } else { "settings without keys" };
+                let name = board.name;
+                output::line(format_args!("{place}: {what} for {name} at {address:#x}, generation {generation}"))?;
+            }
         }
     }
     Ok(())

@@ -5,11 +5,13 @@ use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
 use anyhow::Context;
-use cara_settings::Settings;
 use cara_settings::board::Board;
 use cara_settings::page::BYTES;
+use tempfile::TempDir;
 
-use super::copy::{self, Written};
+use zeroize::Zeroizing;
+
+use super::copy::{self, Content, Written};
 use crate::exit::Ended;
 
 const PROGRAM: &str = "probe-rs";
@@ -17,13 +19,12 @@ const PROGRAM: &str = "probe-rs";
 /// Writes the next copy to the board on the probe, and starts the board again.
 ///
 /// Where its pages cannot be read, as on an STM32H7 whose power was cut while one was written, both copies are.
-pub(super) fn provision(board: &Board, settings: &Settings) -> anyhow::Result<Vec<Written>> {
-    // For this user alone: there is a password in it.
-    let folder = tempfile::TempDir::new().context("cannot make a folder for the copies")?;
+pub(super) fn provision(board: &Board, content: &Content) -> anyhow::Result<Vec<Written>> {
+    let folder = folder().context("cannot make a folder for the copies")?;
     let [first, second] = board.pages.map(|address| read(board, address, &folder.path().join("read.bin")));
     let written = match (first?, second?) {
-        (Some(first), Some(second)) => vec![copy::next(board, settings, &first, &second)?],
-        _ => copy::both(board, settings)?,
+        (Some(first), Some(second)) => vec![copy::next(board, content, &first, &second)?],
+        _ => copy::both(board, content)?,
     };
     for copy in &written {
         download(board, copy, &folder.path().join("settings.bin"))?;
@@ -32,19 +33,25 @@ pub(super) fn provision(board: &Board, settings: &Settings) -> anyhow::Result<Ve
     Ok(written)
 }
 
+/// A folder for this user alone, since passwords and keys go through it; in memory where the system has such a place.
+fn folder() -> std::io::Result<TempDir> {
+    let in_memory = std::env::var_os("XDG_RUNTIME_DIR").and_then(|folder| TempDir::new_in(folder).ok());
+    in_memory.map_or_else(TempDir::new, Ok)
+}
+
 /// What a page holds; `None` where the probe cannot read it.
-fn read(board: &Board, address: u32, file: &Path) -> anyhow::Result<Option<Vec<u8>>> {
+fn read(board: &Board, address: u32, file: &Path) -> anyhow::Result<Option<Zeroizing<Vec<u8>>>> {
     let (address, bytes, path) = (format!("{address:#x}"), BYTES.to_string(), file.display().to_string());
     let output = ["--output", &path, "--format", "binary"];
     let ran = run(&[&["read", "--chip", board.chip], &output[..], &["b8", &address, &bytes]].concat())?;
     if !ran.status.success() {
         return Ok(None);
     }
-    Ok(std::fs::read(file).ok().filter(|page| page.len() >= BYTES))
+    Ok(std::fs::read(file).ok().map(Zeroizing::new).filter(|page| page.len() >= BYTES))
 }
 
 fn download(board: &Board, copy: &Written, file: &Path) -> anyhow::Result<()> {
-    std::fs::write(file, copy.bytes).with_context(|| format!("cannot write {}", file.display()))?;
+    std::fs::write(file, &copy.bytes).with_context(|| format!("cannot write {}", file.display()))?;
     let (address, path) = (format!("{:#x}", copy.address), file.display().to_string());
     succeeded(&["download", "--chip", board.chip, "--binary-format", "bin", "--base-address", &address, &path])
 }

@@ -7,9 +7,10 @@ use std::str::FromStr;
 
 use anyhow::Context;
 use cara_core::distribution::hello::Manager;
-use cara_core::distribution::identity::{Fleet, Identity};
+use cara_core::distribution::identity::{Fleet, Identity, Role};
 use cara_settings::board::Board;
 use cara_settings::{Network, Settings, Wifi};
+use cara_std::keys::{KeyRing, full_name};
 
 use crate::exit::Ended;
 use crate::name_and_id::NameAndId;
@@ -65,25 +66,45 @@ impl FromStr for Address {
 }
 
 impl Told {
-    /// Makes settings, or tells what is wrong with them.
-    pub(super) fn settings(&self, board: &Board, fleet: u32) -> anyhow::Result<Settings> {
-        let (Some(name), Some(id)) = (&self.name, self.id) else {
-            return Err(Ended::usage("the board needs a --name and an --id"));
-        };
-        let manager = self.manager.as_ref().map(manager).transpose()?;
-        let identity = match manager {
-            Some(_) => Identity::s_unit(name, id),
-            None => Identity::m_unit(name, id),
-        };
+    /// Makes settings, or tells what is wrong with them. What is not said comes from the board's keys.
+    pub(super) fn settings(
+        &self,
+        board: &Board,
+        fleet: Option<u32>,
+        ring: Option<&KeyRing>,
+    ) -> anyhow::Result<Settings> {
+        let manager = self.manager(ring)?;
+        let identity = self.identity(manager.is_some(), ring)?;
+        let fleet = fleet.map(Fleet).or(ring.map(KeyRing::fleet)).unwrap_or(Fleet(0));
+        ring.map_or(Ok(()), |ring| agree(ring, &identity, fleet, manager.as_ref()))?;
         let settings = Settings {
-            identity: identity.map_err(|error| Ended::usage(format!("--name {name}: {error}")))?,
+            identity,
             manager,
             manager_address: self.manager_address,
-            fleet: Fleet(fleet),
+            fleet,
             network: self.network()?,
             wifi: self.wifi(board)?,
         };
         if settings.is_sound() { Ok(settings) } else { Err(Ended::usage("no unit can be made of these settings")) }
+    }
+
+    fn identity(&self, has_manager: bool, ring: Option<&KeyRing>) -> anyhow::Result<Identity> {
+        let (name, id) = match (&self.name, self.id, ring) {
+            (Some(name), Some(id), _) => (name, id),
+            (_, _, Some(ring)) => return Ok(ring.identity().clone()),
+            _ => return Err(Ended::usage("the board needs a --name and an --id, or the --keys of a node")),
+        };
+        let role = if has_manager { Role::SUnit } else { Role::MUnit };
+        Identity::new(name, id, role).map_err(|error| Ended::usage(format!("--name {name}: {error}")))
+    }
+
+    fn manager(&self, ring: Option<&KeyRing>) -> anyhow::Result<Option<Manager>> {
+        let Some(NameAndId { name, id }) = &self.manager else {
+            let vehicle = ring.filter(|ring| ring.identity().role() == Role::SUnit);
+            return vehicle.map(manager_of).transpose();
+        };
+        let named = Manager::new(name, *id);
+        named.map(Some).map_err(|error| Ended::usage(format!("--manager {name}/{id}: {error}")))
     }
 
     fn network(&self) -> anyhow::Result<Network> {
@@ -110,8 +131,42 @@ impl Told {
     }
 }
 
-fn manager(NameAndId { name, id }: &NameAndId) -> anyhow::Result<Manager> {
-    Manager::new(name, *id).map_err(|error| Ended::usage(format!("--manager {name}/{id}: {error}")))
+/// The only m_unit that a vehicle has keys with.
+fn manager_of(ring: &KeyRing) -> anyhow::Result<Manager> {
+    match ring.peers().as_slice() {
+        [only] => Manager::new(only.name(), only.id()).map_err(|error| Ended::usage(error.to_string())),
+        [] => Err(Ended::usage(format!(
+            "{} has keys with nobody: give it an m_unit with `cara keys derive`",
+            full_name(ring.identity())
+        ))),
+        several => {
+            let names: Vec<_> = several.iter().map(|peer| format!("--manager {peer}")).collect();
+            Err(Ended::usage(format!("{} has several m_units: say {}", ring.identity(), names.join(" or "))))
+        }
+    }
+}
+
+/// Keys are of no use to another unit than theirs, and without the one with the manager.
+fn agree(ring: &KeyRing, identity: &Identity, fleet: Fleet, manager: Option<&Manager>) -> anyhow::Result<()> {
+    if (ring.identity(), ring.fleet()) != (identity, fleet) {
+        let (found, wanted) = (full_name(ring.identity()), full_name(identity));
+        let text = format!(
+            "--keys are those of {found} in fleet {}, and the board would be {wanted} in fleet {}: leave --name, --id and \
+             --fleet away, or give its own file",
+            ring.fleet().0,
+            fleet.0
+        );
+        return Err(Ended::usage(text));
+    }
+    let Some(manager) = manager.and_then(|manager| Identity::m_unit(&manager.name, manager.id).ok()) else {
+        return Ok(());
+    };
+    if ring.pair(&manager).is_some() {
+        return Ok(());
+    }
+    let (node, fleet) = (full_name(identity), fleet.0);
+    let command = format!("cara keys derive --fleet {fleet} {node} --manager {manager}");
+    Err(Ended::usage(format!("{node} has no key with {manager}: `{command}`")))
 }
 
 /// The first line: passwords on a command line are seen by everybody on the computer.

@@ -1,0 +1,60 @@
+//! The emulated board, which is told by an argument of QEMU: the text of its settings, and its keys behind it.
+
+use std::path::Path;
+
+use anyhow::Context;
+use cara_settings::board::Board;
+use serde_json::json;
+use zeroize::Zeroizing;
+
+use super::copy::Content;
+use super::store;
+use crate::exit::Ended;
+use crate::global::Global;
+use crate::output;
+
+/// The emulated board. It has no pages.
+pub(super) const EMULATED: Board = Board {
+    name: "lm3s6965evb",
+    description: "emulated Cortex-M3",
+    chip: "LM3S6965",
+    pages: [0; 2],
+    erase_bytes: 0,
+    uf2: None,
+    wireless: false,
+};
+
+/// Begins the word with the keys.
+const WORD: &str = " keys=";
+
+/// Writes the argument to a file.
+pub(super) fn write(content: &Content, file: Option<&Path>, global: &Global) -> anyhow::Result<()> {
+    let name = EMULATED.name;
+    let file = file.ok_or_else(|| {
+        Ended::usage(format!("{name} is emulated: it is told as an argument of QEMU, which --output FILE writes"))
+    })?;
+    let text = text(content);
+    store(file, text.as_bytes(), content.secrets.is_some())
+        .with_context(|| format!("cannot write {}", file.display()))?;
+    match global.json {
+        true => output::object(&json!({ "board": name, "file": file }))?,
+        false => output::line(format_args!("{0}: for QEMU's -semihosting-config, arg=\"$(cat {0})\"", file.display()))?,
+    }
+    Ok(())
+}
+
+fn text(Content { settings, secrets }: &Content) -> Zeroizing<String> {
+    let (settings, keys) = (settings.to_string(), secrets.as_ref().map_or(&[][..], |secrets| secrets.bytes()));
+    let mut digits = Zeroizing::new(vec![0; 2 * keys.len()]);
+    // There is room for each byte's two digits, and digits are text.
+    let _ = hex::encode_to_slice(keys, &mut digits);
+    let digits = std::str::from_utf8(&digits).unwrap_or_default();
+    // All of it at once: a text that grows leaves keys behind.
+    let mut text = Zeroizing::new(String::with_capacity(settings.len() + WORD.len() + digits.len()));
+    text.push_str(&settings);
+    if !digits.is_empty() {
+        text.push_str(WORD);
+        text.push_str(digits);
+    }
+    text
+}
