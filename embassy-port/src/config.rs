@@ -5,7 +5,9 @@ use cara_core::distribution::connection_handler::Target;
 use cara_core::distribution::hello::Manager;
 use cara_core::distribution::identity::{Fleet, Identity};
 use cara_core::error::Error;
+use cara_core::services::access::Access;
 use cara_core::services::unit::buffer_bytes;
+use core::fmt;
 use core::net::SocketAddr;
 
 /// Most that a session datagram adds to what a message in chunks takes.
@@ -26,6 +28,17 @@ pub struct Config {
     pub(crate) seed: u64,
     pub(crate) epoch: u64,
     pub(crate) tcp_port: u16,
+    pub(crate) access: Table,
+}
+
+/// The access table, if there is one.
+#[derive(Clone, Copy, Default)]
+pub(crate) struct Table(pub(crate) Option<&'static dyn Access>);
+
+impl fmt::Debug for Table {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(if self.0.is_some() { "set" } else { "none" })
+    }
 }
 
 impl Config {
@@ -43,7 +56,16 @@ impl Config {
     }
 
     fn new(identity: Identity, target: Target, constraints: Constraints, seed: u64) -> Self {
-        Self { identity, target, fleet: Fleet(0), constraints, seed, epoch: seed, tcp_port: PLAIN_PORT }
+        Self {
+            identity,
+            target,
+            fleet: Fleet(0),
+            constraints,
+            seed,
+            epoch: seed,
+            tcp_port: PLAIN_PORT,
+            access: Table(None),
+        }
     }
 
     /// Units of different fleets on one network do not meet; 0 unless set.
@@ -67,6 +89,25 @@ impl Config {
     /// The TCP port on which an m_unit takes connections; that of discovery unless set.
     pub fn tcp_port(mut self, port: u16) -> Self {
         self.tcp_port = port;
+        self
+    }
+
+    /// Who may do what; without a table whoever has joined may do everything. A `static`, or a `const` array of
+    /// [`Rule`](cara_core::services::access::Rule)s:
+    ///
+    /// ```
+    /// use cara_core::services::access::{Functions, Rule, Verbs, Who};
+    /// use cara_embassy::Config;
+    ///
+    /// const RULES: [Rule; 2] = [
+    ///     Rule::new(Who::node("AGV_manager", 1), Functions::All, Verbs::CALL),
+    ///     Rule::new(Who::M_UNITS, Functions::Named(&["pos_info"]), Verbs::CALL),
+    /// ];
+    /// let config = Config::s_unit("agv-07", 7, "AGV_manager", 1, 0x5EED)?.access(&RULES);
+    /// # Ok::<(), cara_core::error::Error>(())
+    /// ```
+    pub fn access(mut self, table: &'static dyn Access) -> Self {
+        self.access = Table(Some(table));
         self
     }
 

@@ -78,11 +78,11 @@ impl<T> Machine<T> {
     /// Lets the session of a link do what is due: `None` when nothing is.
     #[inline(never)]
     pub(crate) fn poll_link(&mut self, index: u16) -> Option<News> {
-        let Self { links, lines, udp, stack, pool, functions, reply, .. } = self;
+        let Self { links, lines, udp, stack, pool, functions, reply, access, .. } = self;
         let link = links.get_mut(usize::from(index))?;
         let session = link.session.as_mut()?;
         let mut mailman = EmbassyMailman { lines, udp, stack: *stack };
-        let mut cx = Context { now: now(), mailman: &mut mailman, buffers: pool, functions };
+        let mut cx = Context { now: now(), mailman: &mut mailman, buffers: pool, functions, access: access.0 };
         if cx.now < session.deadline() {
             return None;
         }
@@ -102,7 +102,7 @@ impl<T> Machine<T> {
         scratch: &mut [u8],
         arguments: Option<&mut ParametersView>,
     ) -> Option<Option<News>> {
-        let Self { links, lines, udp, stack, pool, functions, reply, .. } = self;
+        let Self { links, lines, udp, stack, pool, functions, reply, access, .. } = self;
         let link = links.get_mut(usize::from(index))?;
         if link.session.is_none() || (reply.is_taken() && link.awaits_reply()) {
             return None;
@@ -111,7 +111,7 @@ impl<T> Machine<T> {
         let peeked = lines.get_mut(usize::from(index))?.peek(scratch);
         let lent = scratch.get_mut(..peeked)?;
         let mut mailman = EmbassyMailman { lines, udp, stack: *stack };
-        let mut cx = Context { now: now(), mailman: &mut mailman, buffers: pool, functions };
+        let mut cx = Context { now: now(), mailman: &mut mailman, buffers: pool, functions, access: access.0 };
         let receipt = session.receive(&mut cx, lent, arguments);
         let consumed = receipt.consumed;
         let news = match receipt.event {

@@ -10,9 +10,10 @@ use cara_core::distribution::identity::{Identity, Role};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error};
 use cara_core::host::connections::LinkCounter;
+use cara_core::services::access::Access;
 use cara_core::services::requests::CallId;
 
-use crate::config::check;
+use crate::config::{Table, check};
 use crate::event::UnitEvent;
 use crate::handler::Hook;
 use crate::machine::{Machine, Shared};
@@ -221,6 +222,16 @@ impl<T> Handle<T> {
             }
             Ok(())
         })
+    }
+
+    /// Another access table, or none: in force when this returns.
+    pub fn set_access(&self, table: Option<&'static dyn Access>) {
+        self.act(|machine| {
+            machine.access = Table(table);
+            machine.each_live(|session, cx, _| {
+                session.access_changed(cx);
+            });
+        });
     }
 
     /// What happened on all links, also on those that have ended.

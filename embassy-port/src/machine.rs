@@ -18,6 +18,7 @@ use embassy_net::udp::UdpSocket;
 use embassy_net::{Ipv4Cidr, Stack};
 use embassy_sync::waitqueue::{MultiWakerRegistration, WakerRegistration};
 
+use crate::config::Table;
 use crate::event::{Events, UnitEvent};
 use crate::handler::{Hook, Listed};
 use crate::line::Line;
@@ -78,6 +79,8 @@ impl Link {
 pub(crate) struct Machine<T: 'static> {
     pub(crate) node: Node<Lent>,
     pub(crate) publications: Publications<Lent>,
+    /// Who may do what.
+    pub(crate) access: Table,
     pub(crate) functions: FunctionList<Lent, Listed<T>>,
     pub(crate) pool: Pool<Lent>,
     pub(crate) links: &'static mut [Link],
@@ -166,10 +169,10 @@ impl<T> Machine<T> {
         index: u16,
         act: impl FnOnce(&mut LinkSession, &mut LinkContext<'_, '_, T>, &Publications<Lent>) -> R,
     ) -> Option<R> {
-        let Self { links, lines, udp, stack, pool, functions, publications, .. } = self;
+        let Self { links, lines, udp, stack, pool, functions, publications, access, .. } = self;
         let session = links.get_mut(usize::from(index))?.session.as_mut()?;
         let mut mailman = EmbassyMailman { lines, udp, stack: *stack };
-        let mut context = Context { now: now(), mailman: &mut mailman, buffers: pool, functions };
+        let mut context = Context { now: now(), mailman: &mut mailman, buffers: pool, functions, access: access.0 };
         Some(act(session, &mut context, publications))
     }
 

@@ -294,7 +294,7 @@ pub fn new<
         links: resources.node_links.write([None; LINKS]).as_mut_slice(),
         findings: resources.findings.write([const { None }; FINDINGS]).as_mut_slice(),
     };
-    let tcp_port = config.tcp_port;
+    let (tcp_port, access) = (config.tcp_port, config.access);
     let node = Node::new(now(), node_config(config), storage);
     let buffers = resources.buffers.each_mut().map(|buffer| Some(buffer.write([0; MESSAGE]).as_mut_slice()));
     let machine = Machine {
@@ -303,6 +303,7 @@ pub fn new<
             resources.to_all.write([false; FUNCTIONS]).as_mut_slice(),
             resources.to_one.write([const { [const { None }; FUNCTIONS] }; LINKS]).as_flattened_mut(),
         ),
+        access,
         functions: FunctionList::new(
             resources.functions.write([const { Entry::empty() }; FUNCTIONS]).as_mut_slice(),
             resources.signatures.write([[0; SIGNATURE]; FUNCTIONS]).as_flattened_mut(),
@@ -339,7 +340,7 @@ pub fn new<
 }
 
 fn node_config(config: Config) -> NodeConfig {
-    let Config { identity, target, fleet, constraints, seed, epoch, tcp_port } = config;
+    let Config { identity, target, fleet, constraints, seed, epoch, tcp_port, .. } = config;
     let listens = identity.role() == Role::MUnit;
     NodeConfig {
         identity,

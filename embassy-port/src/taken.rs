@@ -122,14 +122,19 @@ impl<T> Machine<T> {
     /// Tries again to answer what could not be answered.
     pub(crate) fn answer_parked(&mut self) {
         for index in 0..self.tasks.len() {
-            let Self { tasks, links, lines, udp, stack, pool, functions, .. } = self;
+            let Self { tasks, links, lines, udp, stack, pool, functions, access, .. } = self;
             let Some(TaskSlot { parameters, holds }) = tasks.get_mut(index) else { return };
             let Holds::Answer { running, result } = *holds else { continue };
             let link = links.get_mut(usize::from(running.link)).filter(|link| link.serial == running.serial);
             let kept = link.and_then(|link| link.session.as_mut()).is_none_or(|session| {
                 let mut mailman = crate::mail::EmbassyMailman { lines, udp, stack: *stack };
-                let mut cx =
-                    cara_core::services::Context { now: now(), mailman: &mut mailman, buffers: pool, functions };
+                let mut cx = cara_core::services::Context {
+                    now: now(),
+                    mailman: &mut mailman,
+                    buffers: pool,
+                    functions,
+                    access: access.0,
+                };
                 let answer = result.map(|()| &**parameters);
                 session.answer(&mut cx, running.ticket, answer).is_ok() || {
                     let late = cx.now >= running.deadline;

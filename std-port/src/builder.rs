@@ -1,6 +1,8 @@
 //! How a unit is made: identity first, then whatever differs from the defaults.
 
 use std::hash::{BuildHasher, Hasher, RandomState};
+#[cfg(feature = "access")]
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use cara_core::config::{Constraints, PLAIN_PORT};
@@ -12,6 +14,9 @@ use cara_core::error::Error;
 use cara_core::services::publications::Publications;
 use core::net::SocketAddr;
 
+use crate::access::AccessTable;
+#[cfg(feature = "access")]
+use crate::access::{AccessError, watch::FileWatch};
 use crate::communication_system::{CommunicationSystem, Owner};
 use crate::config::Capacities;
 use crate::engine::{Engine, EngineParts, NodeCell, message_buffer_bytes, system_refused};
@@ -43,6 +48,9 @@ pub struct Builder<T> {
     threads: Option<Threads>,
     #[cfg(feature = "control")]
     control: crate::control::Control,
+    access: Option<AccessTable>,
+    #[cfg(feature = "access")]
+    access_file: Option<FileWatch>,
     state: T,
 }
 
@@ -68,6 +76,9 @@ impl Builder<()> {
             threads: None,
             #[cfg(feature = "control")]
             control: crate::control::Control::Default,
+            access: None,
+            #[cfg(feature = "access")]
+            access_file: None,
             state: (),
         }
     }
@@ -140,6 +151,9 @@ impl<T: Send + 'static> Builder<T> {
             threads: self.threads,
             #[cfg(feature = "control")]
             control: self.control,
+            access: self.access,
+            #[cfg(feature = "access")]
+            access_file: self.access_file,
             state,
         }
     }
@@ -149,6 +163,21 @@ impl<T: Send + 'static> Builder<T> {
     pub fn control(mut self, control: crate::control::Control) -> Self {
         self.control = control;
         self
+    }
+
+    /// Who may do what, from the start: see [`access`](crate::access). Without a table whoever has joined may do everything.
+    pub fn access(mut self, table: AccessTable) -> Self {
+        self.access = Some(table);
+        self
+    }
+
+    /// As [`access`](Self::access), from a file: see `docs/access.md`. What is written to it while the unit runs is taken
+    /// over within a second or two; a mistake keeps the table that is in force, and is told in the log and counted.
+    #[cfg(feature = "access")]
+    pub fn access_file(mut self, path: impl Into<PathBuf>) -> Result<Self, AccessError> {
+        let (watch, table) = FileWatch::open(path.into())?;
+        self.access_file = Some(watch);
+        Ok(self.access(table))
     }
 
     /// An m_unit; it does nothing until it is started.
@@ -221,7 +250,15 @@ impl<T: Send + 'static> Builder<T> {
             listener,
             maximum_links,
         };
-        Ok(Engine::new(parts))
+        let engine = Engine::new(parts);
+        if self.access.is_some() {
+            engine.set_access(self.access);
+        }
+        #[cfg(feature = "access")]
+        if let Some(watch) = self.access_file {
+            engine.follow(watch)?;
+        }
+        Ok(engine)
     }
 }
 

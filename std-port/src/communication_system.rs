@@ -15,11 +15,14 @@ use cara_core::distribution::connection_handler::{Finding, Target};
 use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
 use cara_core::distribution::parameters::{Parameters, ParametersView};
 use cara_core::error::Error;
+#[cfg(feature = "control")]
+use cara_core::services::access::Verb;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::RequestOptions;
 use cara_core::time::Duration;
 use core::net::IpAddr;
 
+use crate::access::AccessTable;
 use crate::builder::{self, Builder};
 #[cfg(feature = "control")]
 use crate::control::{self, Control, Server};
@@ -164,6 +167,22 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     #[cfg(feature = "control")]
     pub fn control_path(&self) -> Option<PathBuf> {
         lock(&self.owner.server).as_ref().map(|server| server.path().to_owned())
+    }
+
+    #[cfg(feature = "control")]
+    pub(crate) fn operator_may(&self, function: &str, verb: Verb) -> Result<(), Error> {
+        self.engine().operator_may(function, verb)
+    }
+
+    /// Whether what the operator has begun may go on.
+    #[cfg(feature = "control")]
+    pub(crate) fn operator_may_go_on(&self, function: &str) -> bool {
+        self.engine().operator_may_go_on(function)
+    }
+
+    #[cfg(feature = "control")]
+    pub(crate) fn operator_sees(&self, function: &str) -> bool {
+        self.engine().operator_sees(function)
     }
 
     #[cfg(feature = "control")]
@@ -339,6 +358,17 @@ impl<T: Send + 'static> CommunicationSystem<T> {
         self.engine().set_constraints(constraints)
     }
 
+    /// Another access table, or none: in force when this returns. A file that the unit follows is taken over again when it
+    /// changes.
+    pub fn set_access(&self, table: Option<AccessTable>) {
+        self.engine().set_access(table);
+    }
+
+    /// The access table in force; without one whoever has joined may do everything.
+    pub fn access(&self) -> Option<Arc<AccessTable>> {
+        self.engine().access()
+    }
+
     /// What no call returns: joined, left, failed. A subscriber that does not keep up loses events.
     pub fn events(&self) -> Receiver<UnitEvent> {
         let (sender, receiver) = sync_channel(EVENTS);
@@ -364,9 +394,9 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     }
 
     /// Everything that is counted for the unit as a whole: (name, number), zeros included. What happened in discovery and
-    /// membership; on all links together, those that have ended included; in the port. The last six (`BuffersInUse`,
-    /// `BuffersPeak`, `LinksOpen`, `NodesConnected`, `CallsHeld`, `CallsInFlight`) tell how it is now; no other ever goes
-    /// back.
+    /// membership; on all links together, those that have ended included; in the port. The last seven
+    /// (`AccessFileWrong`, `BuffersInUse`, `BuffersPeak`, `LinksOpen`, `NodesConnected`, `CallsHeld`, `CallsInFlight`) tell
+    /// how it is now; no other ever goes back.
     pub fn counters(&self) -> Vec<(&'static str, u64)> {
         pairs(self.engine().readings())
     }

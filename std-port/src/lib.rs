@@ -16,6 +16,7 @@
 //! # Ok::<(), cara_std::Error>(())
 //! ```
 
+pub mod access;
 mod builder;
 mod clock;
 mod communication_system;

@@ -107,6 +107,11 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
         self.len() == 0
     }
 
+    #[cfg(feature = "control")]
+    pub(crate) fn names(&self) -> Vec<String> {
+        read(&self.engine.functions).iter().map(|function| function.name().to_owned()).collect()
+    }
+
     /// One line per function.
     pub fn show_functions(&self) -> String {
         read(&self.engine.functions).show_functions().to_string()

@@ -10,6 +10,7 @@ use cara_core::error::Error;
 use cara_core::services::requests::CallId;
 use cara_core::time::Duration;
 
+use crate::access::AccessTable;
 use crate::builder::{self, Builder, manager};
 use crate::communication_system::Owner;
 use crate::engine::{Engine, lock, pairs, read};
@@ -175,6 +176,17 @@ impl<T: Send + 'static> Unit<T> {
     pub fn set_constraints(&self, constraints: Constraints) -> Result<(), Error> {
         builder::check(&constraints)?;
         self.engine().set_constraints(constraints)
+    }
+
+    /// Another access table, or none: in force when this returns. A file that the unit follows is taken over again when it
+    /// changes.
+    pub fn set_access(&self, table: Option<AccessTable>) {
+        self.engine().set_access(table);
+    }
+
+    /// The access table in force; without one whoever has joined may do everything.
+    pub fn access(&self) -> Option<Arc<AccessTable>> {
+        self.engine().access()
     }
 
     /// What no call returns: joined, left, failed. A subscriber that does not keep up loses events.

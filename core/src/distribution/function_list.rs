@@ -177,6 +177,23 @@ impl<S: Storage> TheirFunctionList<S> {
         self.index_of(slot).and_then(|index| self.table.take(index)).is_some()
     }
 
+    /// Shows the functions whose names are wanted and hides the others, which keep their room: they can be shown again.
+    pub(crate) fn show_only(&mut self, mut wanted: impl FnMut(&str) -> bool) {
+        for index in 0..self.table.entries.len() {
+            let Some(hidden) = self.table.function(index).map(|function| !wanted(function.name())) else { continue };
+            if let Some(entry) = self.table.entries.get_mut(index) {
+                entry.hidden = hidden;
+            }
+        }
+    }
+
+    /// Hides a function.
+    pub(crate) fn hide(&mut self, slot: Slot) {
+        if let Some(entry) = self.index_of(slot).and_then(|index| self.table.entries.get_mut(index)) {
+            entry.hidden = true;
+        }
+    }
+
     /// Removes everything and forgets what was skipped.
     pub fn clear(&mut self) {
         self.table.clear();
@@ -207,25 +224,25 @@ impl<S: Storage> TheirFunctionList<S> {
 
     /// The place of the function of this name in the peer's list.
     pub fn find(&self, name: &str) -> Option<Slot> {
-        self.table.find(name).and_then(|index| self.table.function(index)).map(|function| function.slot)
+        self.named(name).map(|function| function.slot)
     }
 
     /// The function of this name.
     pub fn named(&self, name: &str) -> Option<Function<'_>> {
-        self.table.find(name).and_then(|index| self.table.function(index))
+        self.table.find(name).and_then(|index| self.shown(index))
     }
 
     /// The function in a place of the peer's list.
     pub fn function(&self, slot: Slot) -> Option<Function<'_>> {
-        self.index_of(slot).and_then(|index| self.table.function(index))
+        self.index_of(slot).and_then(|index| self.shown(index))
     }
 
     /// The functions in no particular order.
     pub fn iter(&self) -> impl Iterator<Item = Function<'_>> + Clone {
-        self.table.iter()
+        (0..self.table.entries.len()).filter_map(|index| self.shown(index))
     }
 
-    /// Number of functions that are kept.
+    /// Number of functions that are kept and shown.
     pub fn len(&self) -> usize {
         self.iter().count()
     }
@@ -243,6 +260,11 @@ impl<S: Storage> TheirFunctionList<S> {
     /// The text form of each function on a line.
     pub fn show_functions(&self) -> impl fmt::Display + '_ {
         Lines(self.iter())
+    }
+
+    fn shown(&self, index: usize) -> Option<Function<'_>> {
+        let hidden = self.table.entries.get(index)?.hidden;
+        if hidden { None } else { self.table.function(index) }
     }
 
     fn put(

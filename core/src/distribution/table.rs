@@ -57,6 +57,8 @@ impl<H> fmt::Debug for Function<'_, H> {
 /// Room for one function; ports allocate a slice of empty ones.
 pub struct Entry<H = ()> {
     pub(super) generation: Generation,
+    /// It is kept and not shown.
+    pub(super) hidden: bool,
     pub(super) function: Option<Stored<H>>,
 }
 
@@ -71,7 +73,7 @@ pub(super) struct Stored<H> {
 impl<H> Entry<H> {
     /// Room without a function.
     pub const fn empty() -> Self {
-        Self { generation: Generation(0), function: None }
+        Self { generation: Generation(0), hidden: false, function: None }
     }
 }
 
@@ -139,6 +141,7 @@ impl<S: Storage, H: 'static> Table<S, H> {
         let place = self.bytes.get_mut(self.used..end).ok_or(Error::Full(Limit::SignatureBytes))?;
         copy(signature, place);
         let length = signature.len() as u16;
+        entry.hidden = false;
         entry.function = Some(Stored { slot, at: saturate(self.used), length, attributes, handler });
         self.used = end;
         self.len = self.len.saturating_add(1);

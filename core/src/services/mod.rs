@@ -1,5 +1,6 @@
 //! COMMON SERVICES (paper, section 2): requesting, serving, publishing; the m_unit's and the s_unit's view of a peer.
 
+pub mod access;
 mod calls;
 pub mod lease;
 pub mod publications;
@@ -23,4 +24,6 @@ pub struct Context<'c, S: Storage, M: Mailman, B: Buffers<S>, H: 'static> {
     pub buffers: &'c mut B,
     /// The unit's own functions.
     pub functions: &'c FunctionList<S, H>,
+    /// Who may do what; without a table whoever has joined may do everything.
+    pub access: Option<&'c dyn access::Access>,
 }

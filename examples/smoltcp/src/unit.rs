@@ -51,7 +51,13 @@ pub(crate) enum Standing {
 /// Lends a session what it needs. A macro, since it borrows the unit's parts one by one.
 macro_rules! context {
     ($unit:expr, $now:expr) => {
-        &mut Context { now: $now, mailman: &mut $unit.stack, buffers: &mut $unit.buffers, functions: &$unit.functions }
+        &mut Context {
+            now: $now,
+            mailman: &mut $unit.stack,
+            buffers: &mut $unit.buffers,
+            functions: &$unit.functions,
+            access: None,
+        }
     };
 }
 pub(crate) use context;

@@ -5,6 +5,7 @@ use std::sync::mpsc::RecvTimeoutError;
 
 use cara_core::config::Constraints;
 use cara_core::error::Error;
+use cara_core::services::access::Verb;
 use cara_core::time::Duration;
 
 use super::protocol::{Answer, Failure, Question};
@@ -82,9 +83,17 @@ fn attempt<T: Send + 'static>(
             Ok(())
         }
         Question::Functions { node } => functions(system, node, sink),
-        Question::Call(question) => call::call(system, question, sink),
-        Question::Hold(question) => hold::hold(system, question, sink, wanted),
+        Question::Call(question) => {
+            permit(system, &question.function, Verb::Call)?;
+            call::call(system, question, sink)
+        }
+        Question::Hold(question) => {
+            permit(system, &question.function, Verb::Call)?;
+            hold::hold(system, question, sink, wanted)
+        }
         Question::Publish { node, timeout_ms } => {
+            let own = system.my_function_list().names();
+            own.iter().try_for_each(|function| permit(system, function, Verb::Publish))?;
             publish(system, node.as_deref(), Duration::from_millis(*timeout_ms), sink)
         }
         Question::Set { node, constraint, value } => {
@@ -125,12 +134,27 @@ pub(super) fn pause<T: Send + 'static>(system: &CommunicationSystem<T>, span: Du
     Err(Error::NotRunning.into())
 }
 
+/// Whether the operator may do something with a function.
+pub(super) fn permit<T: Send + 'static>(
+    system: &CommunicationSystem<T>,
+    function: &str,
+    verb: Verb,
+) -> Result<(), Failure> {
+    system.operator_may(function, verb).map_err(|error| match error {
+        Error::NotAllowed => Failure::not_allowed(function, verb),
+        error => error.into(),
+    })
+}
+
 fn nodes<T: Send + 'static>(
     system: &CommunicationSystem<T>,
     offering: Option<&str>,
     sink: Sink<'_>,
 ) -> Result<(), End> {
     let all = match offering {
+        Some(function) if !system.operator_sees(function) => {
+            return Err(Failure::not_allowed(function, Verb::List).into());
+        }
         Some(function) => system.nodes_offering(function),
         None => select::nodes(system),
     };
@@ -148,7 +172,9 @@ fn functions<T: Send + 'static>(system: &CommunicationSystem<T>, node: &str, sin
     if !peer.is_connected() {
         return Err(Error::NotConnected.into());
     }
-    peer.functions().iter().try_for_each(|function| send(sink, Answer::Function(describe::function(function))))
+    let functions = peer.functions();
+    let mut seen = functions.iter().filter(|function| system.operator_sees(function.definition.name()));
+    seen.try_for_each(|function| send(sink, Answer::Function(describe::function(function))))
 }
 
 fn publish<T: Send + 'static>(

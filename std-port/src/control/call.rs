@@ -4,9 +4,10 @@ use std::time::Instant;
 
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Cause, Error};
+use cara_core::services::access::Verb;
 use cara_core::time::Duration;
 
-use super::answering::{End, Sink, pause, send};
+use super::answering::{End, Sink, pause, permit, send};
 use super::protocol::{Answer, Argument, CallQuestion, Failure};
 use super::{describe, select, values};
 use crate::communication_system::thread_waker;
@@ -221,6 +222,7 @@ pub(super) fn bench<T: Send + 'static>(
         if number > 0 {
             pause(system, between)?;
         }
+        permit(system, &question.function, Verb::Call)?;
         parameters.copy_from(&prepared.parameters)?;
         let started = Instant::now();
         let outcome = peer.block_request_with(&question.function, &mut parameters, &options);

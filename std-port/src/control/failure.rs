@@ -3,6 +3,7 @@
 use std::fmt::Display;
 
 use cara_core::error::{Cause, Error};
+use cara_core::services::access::Verb;
 
 use super::protocol::Failure;
 
@@ -15,6 +16,20 @@ impl Failure {
     /// A failure for which the unit lacks something.
     pub fn resource(error: &str, text: impl Display) -> Self {
         Self::new(Cause::Resource, error, text)
+    }
+
+    /// The unit's access table does not let the operator do this.
+    pub(super) fn not_allowed(function: &str, verb: Verb) -> Self {
+        let verb = match verb {
+            Verb::List => "list",
+            Verb::Call => "call",
+            Verb::Publish => "publish",
+        };
+        let text = format!(
+            "the unit's access table does not let the operator {verb} '{function}': \
+             add a rule with who = \"operator\" to it"
+        );
+        Self::new(Error::NotAllowed.cause(), &name_of(&Error::NotAllowed), text)
     }
 
     fn new(cause: Cause, error: &str, text: impl Display) -> Self {

@@ -7,6 +7,7 @@ use std::sync::{LazyLock, Mutex};
 use std::time::Instant;
 
 use cara_core::distribution::identity::Identity;
+use cara_core::services::access::Verb;
 
 use super::answering::{End, LOOK, Sink, send};
 use super::call::{call_one, called, options};
@@ -44,6 +45,10 @@ pub(super) fn hold<T: Send + 'static>(
             held.ended = true;
             let text = format!("another call of '{function}' took over what was held at {}", peer.identity());
             return Err(Failure::resource("TakenOver", text).into());
+        }
+        // The table may have changed since.
+        if !system.operator_may_go_on(function) {
+            return Err(Failure::not_allowed(function, Verb::Call).into());
         }
         // Before each event: however many there are, who has gone away holds nothing any more.
         if !wanted() || system.is_stopped() {

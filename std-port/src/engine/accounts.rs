@@ -120,9 +120,10 @@ impl<T: Send + 'static> Engine<T> {
         (sum, held)
     }
 
-    fn port_readings(&self, held: &Held) -> [Reading; 9] {
+    fn port_readings(&self, held: &Held) -> [Reading; 13] {
         let pool = self.pool.counters();
         let connected = read(&self.peers).connected().count() as u64;
+        let file = &self.guard.file;
         let load = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
         [
             count(
@@ -139,6 +140,22 @@ impl<T: Send + 'static> Engine<T> {
                 "BuffersRefused",
                 "Times that all message buffers were in use when one was asked for.",
                 pool.exhausted,
+            ),
+            count(
+                "OperatorForbidden",
+                "Questions of the operator that the access table does not allow.",
+                self.guard.operator_refused(),
+            ),
+            count("AccessReloads", "Times that the access table was taken over from its file.", load(&file.reloads)),
+            count(
+                "AccessMistakes",
+                "Times that the access table's file could not be taken over because of a mistake.",
+                load(&file.mistakes),
+            ),
+            gauge(
+                "AccessFileWrong",
+                "Whether the access table's file has a mistake, so that an earlier table is in force.",
+                u64::from(file.is_wrong.load(Ordering::Relaxed)),
             ),
             gauge("BuffersInUse", "Message buffers in use.", pool.in_use as u64),
             gauge("BuffersPeak", "Most message buffers that were in use at a time.", pool.peak as u64),

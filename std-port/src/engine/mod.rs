@@ -4,6 +4,7 @@
 //! hooks and subscribers run without any of them. A function that has worked on a link ends with [`Engine::settle`],
 //! which gives the lock up and acts on what happened.
 
+mod access;
 mod accounts;
 mod calling;
 mod clock_thread;
@@ -40,6 +41,7 @@ use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error};
 use cara_core::host::mailman::LinkId;
 use cara_core::host::secure::{Plain, Seal};
+use cara_core::services::access::Access;
 use cara_core::services::unit::{Call, Event, Session, buffer_bytes};
 use cara_core::services::{Context, requests::CallId};
 use cara_core::time::{Duration, Instant};
@@ -98,6 +100,7 @@ pub(crate) struct Engine<T: 'static> {
     /// When the unit was made.
     born: Instant,
     accounts: accounts::Accounts,
+    guard: access::Guard,
     subscribers: Mutex<Vec<Subscriber>>,
     /// Runs when a peer is lost, before its loss is told.
     pub(crate) lost_hook: Mutex<Option<Arc<crate::handler::Hook<T>>>>,
@@ -170,6 +173,7 @@ impl<T: Send + 'static> Engine<T> {
             stopping: AtomicBool::new(false),
             born,
             accounts: accounts::Accounts::default(),
+            guard: access::Guard::default(),
             subscribers: Mutex::new(Vec::new()),
             lost_hook: Mutex::new(None),
         })
@@ -189,8 +193,10 @@ impl<T: Send + 'static> Engine<T> {
         let functions = read(&self.functions);
         let mut mailman = StdMailman { stream: Some(&link.stream), datagrams: &self.datagrams };
         let mut buffers = &self.pool;
-        let mut cx =
-            Context { now: self.clock.now(), mailman: &mut mailman, buffers: &mut buffers, functions: &functions };
+        let asked = self.guard.ask();
+        let access = asked.as_ref().map(|asked| asked as &dyn Access);
+        let now = self.clock.now();
+        let mut cx = Context { now, mailman: &mut mailman, buffers: &mut buffers, functions: &functions, access };
         act(&mut state.session, &mut cx)
     }
 
@@ -244,8 +250,10 @@ impl<T: Send + 'static> Engine<T> {
         let functions = read(&self.functions);
         let mut mailman = StdMailman { stream: Some(&link.stream), datagrams: &self.datagrams };
         let mut buffers = &self.pool;
-        let mut cx =
-            Context { now: self.clock.now(), mailman: &mut mailman, buffers: &mut buffers, functions: &functions };
+        let asked = self.guard.ask();
+        let access = asked.as_ref().map(|asked| asked as &dyn Access);
+        let now = self.clock.now();
+        let mut cx = Context { now, mailman: &mut mailman, buffers: &mut buffers, functions: &functions, access };
         let LinkState { session, waiters, notices, .. } = state;
         let receipt = session.receive(&mut cx, bytes, arguments);
         let mut step = Step {

@@ -20,11 +20,11 @@ const OTHERS: u32 = 0o077;
 
 /// What tells one state of a file from another.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Mark([i64; 2], [u64; 3]);
+pub(crate) struct Mark([i64; 2], [u64; 3]);
 
 impl Mark {
     /// Of the file at a path.
-    pub(super) fn of(path: &Path) -> io::Result<Self> {
+    pub(crate) fn of(path: &Path) -> io::Result<Self> {
         path.metadata().map(|found| Self::from(&found))
     }
 }

@@ -34,6 +34,8 @@ mod text;
 
 pub use cara_secure::keys::{DeviceSecret, DiscoveryKey, KEY_BYTES, PairKey, RootKey};
 pub use error::{FleetError, KeyError, Owner};
+#[cfg(feature = "access")]
+pub(crate) use file::Mark;
 pub use fleet::FleetKeys;
 pub use live::LiveRing;
 pub use members::{GENERATIONS, Member, Members, Revoked};

@@ -4,5 +4,6 @@ mod asking;
 mod calling;
 mod clients;
 mod frozen;
+mod operator;
 mod places;
 mod support;

@@ -3,6 +3,8 @@
 //! Each test has a random fleet of its own, so that they run side by side. Waiting is waiting for a condition, with an
 //! end; nothing is assumed to have happened because time has passed.
 
+#[cfg(feature = "access")]
+mod access;
 #[cfg(feature = "async")]
 mod asynchronous;
 mod callbacks;

@@ -12,6 +12,7 @@ use cara_core::distribution::connection_handler::NodeCounter;
 use cara_core::distribution::parameters::Parameters;
 use cara_core::error::{CloseReason, Error, ServiceError};
 use cara_core::host::connections::LinkCounter;
+use cara_core::services::access::{Functions, Rule, Verbs, Who};
 use cara_core::services::lease::Lease;
 use cara_core::services::unit::RequestOptions;
 use cara_core::time::Duration;
@@ -109,6 +110,32 @@ fn a_board_serves_its_manager_and_asks_it() {
     assert_eq!(ask(&bench, &agv_board, agv, "manager", "halve", 4), Err(Error::UnknownFunction));
     let list = manager.peer("agv").unwrap().their_function_list().show_functions().to_string();
     assert_eq!(list, "double(n: int) -> (n: int)\n");
+}
+
+/// Whom the tables of a board let call what.
+const DOUBLERS: [Rule; 1] = [Rule::new(Who::node("manager", 1), Functions::Named(&["double"]), Verbs::CALL)];
+const OTHERS: [Rule; 1] = [Rule::new(Who::node("manager", 2), Functions::All, Verbs::CALL)];
+
+#[test]
+fn a_board_has_a_table_from_the_start_and_gets_another_while_it_runs() {
+    let bench = Bench::new(8);
+    let (manager_board, manager) = manager(&bench);
+    let board = bench.board();
+    let config = Config::s_unit("agv", 7, "manager", 1, bench.random(u64::MAX)).unwrap().access(&DOUBLERS);
+    let agv = start(&board, config);
+    doubling(agv);
+    agv.add_service("secret(n: int) -> (n: int)", ServiceOptions::new(), Handler::method(&|_, _, _| Ok(()))).unwrap();
+    agv.publish_my_function_list().unwrap();
+    assert!(bench.run_until(|| knows(manager, "agv", "double"), SHORT));
+    assert_eq!(ask(&bench, &manager_board, manager, "agv", "double", 21), Ok(42));
+    assert_eq!(ask(&bench, &manager_board, manager, "agv", "secret", 1), Err(Error::UnknownFunction));
+    agv.set_access(Some(&OTHERS));
+    assert_eq!(ask(&bench, &manager_board, manager, "agv", "double", 1), Err(Error::NotAllowed));
+    assert_eq!(agv.counted(LinkCounter::RequestsForbidden), 1);
+    assert!(bench.run_until(|| !knows(manager, "agv", "double"), SHORT));
+    agv.set_access(None);
+    assert!(bench.run_until(|| knows(manager, "agv", "secret") && knows(manager, "agv", "double"), SHORT));
+    assert_eq!(ask(&bench, &manager_board, manager, "agv", "secret", 3), Ok(3));
 }
 
 static GO_TO: Lease = Lease::new();

@@ -165,7 +165,13 @@ struct Side {
 
 macro_rules! context {
     ($side:expr) => {
-        &mut Context { now: $side.now, mailman: &mut $side.pipe, buffers: &mut $side.pool, functions: &$side.functions }
+        &mut Context {
+            now: $side.now,
+            mailman: &mut $side.pipe,
+            buffers: &mut $side.pool,
+            functions: &$side.functions,
+            access: None,
+        }
     };
 }
 

@@ -6,6 +6,7 @@ use cara_core::distribution::datagram;
 use cara_core::distribution::hello::Hello;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::{Parameters, ParametersView};
+use cara_core::services::access::{self, Access, Bucket, Functions, Principal, Rate, Rule, Verbs, Who};
 use cara_core::services::lease::{Lease, Service};
 use cara_core::services::publications::Publications;
 use cara_core::services::requests::Requests;
@@ -166,6 +167,24 @@ entry!(publications, {
     publications.withdraw(*unknown());
     keep(publications.is_visible(identity, *unknown()));
     drain(publications.visible_to(identity));
+});
+
+entry!(access, {
+    let rate = Rate::per_second(*unknown());
+    keep((rate.parts(), Rate::new(*unknown(), *unknown())));
+    let rule = Rule::new(Who::node(unknown_text(), *unknown()), Functions::Named(*unknown()), *unknown()).at(rate);
+    let principal: Principal<'static> = *unknown();
+    keep((rule.who.means(principal), rule.functions.contain::<&str>(unknown_text())));
+    let rules: &[Rule] = unknown_slice();
+    keep((access::decide(rules, principal, unknown_text(), *unknown()), rule));
+    keep(rules.decide(principal, unknown_text(), *unknown()).is_allowed());
+    keep(unknown::<[Rule; 4]>().decide(principal, unknown_text(), *unknown()));
+    keep((unknown::<Bucket>().take(*unknown(), rate), unknown::<Bucket>().is_full(*unknown())));
+    keep((Verbs::ALL.and(*unknown()).contains(*unknown()), unknown::<[Rule; 4]>().may_log(*unknown())));
+});
+
+entry!(session_under_another_table, {
+    keep(session().access_changed(context()));
 });
 
 entry!(requests, {

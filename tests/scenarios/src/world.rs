@@ -10,6 +10,7 @@ use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error};
 use cara_core::host::connections::LinkCounter;
+use cara_core::services::access::Rule;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::RequestOptions;
 use cara_core::time::{Duration, Instant};
@@ -195,6 +196,9 @@ pub trait Node {
     fn end_lease(&self, function: &str);
     /// Whether a service's lease is live.
     fn lease_is_live(&self, function: &str) -> bool;
+
+    /// Another access table for this life, or none.
+    fn set_access(&self, table: Option<&'static [Rule]>) -> Result<(), Error>;
 
     /// The constraints in force.
     fn constraints(&self) -> Constraints;

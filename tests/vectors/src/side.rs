@@ -163,8 +163,13 @@ impl Side {
     }
 
     fn receive(&mut self, rest: &mut [u8]) -> (usize, Option<String>, Option<Call>) {
-        let mut cx =
-            Context { now: self.now, mailman: &mut self.kept, buffers: &mut self.pool, functions: &self.functions };
+        let mut cx = Context {
+            now: self.now,
+            mailman: &mut self.kept,
+            buffers: &mut self.pool,
+            functions: &self.functions,
+            access: None,
+        };
         let receipt = self.session.receive(&mut cx, rest, None);
         let call = if let Some(Event::Call(call)) = &receipt.event { Some(*call) } else { None };
         (receipt.consumed, receipt.event.as_ref().map(told), call)
@@ -225,8 +230,13 @@ impl Side {
     }
 
     fn with<R>(&mut self, act: impl FnOnce(&mut Session<Boxed, Plain>, &mut OwnContext<'_>) -> R) -> R {
-        let mut cx =
-            Context { now: self.now, mailman: &mut self.kept, buffers: &mut self.pool, functions: &self.functions };
+        let mut cx = Context {
+            now: self.now,
+            mailman: &mut self.kept,
+            buffers: &mut self.pool,
+            functions: &self.functions,
+            access: None,
+        };
         act(&mut self.session, &mut cx)
     }
 }

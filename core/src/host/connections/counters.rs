@@ -51,6 +51,8 @@ crate::counters::counters! {
         RequestsBusy,
         /// Requests refused because they came too soon.
         RequestsTooSoon,
+        /// Requests refused because the access table does not allow them.
+        RequestsForbidden,
         /// Requests that did not fit a published function.
         RequestsRejected,
         /// Requests of this unit that it did not send itself because of its own limits.
@@ -63,6 +65,8 @@ crate::counters::counters! {
         RepliesDropped,
         /// Functions of the peer's list that did not fit here.
         FunctionsSkipped,
+        /// Functions that the peer published and the access table does not let it publish.
+        FunctionsForbidden,
         /// Leases that ended without being renewed.
         LeasesExpired,
         /// Renewals that came for no running lease.

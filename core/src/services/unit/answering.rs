@@ -1,5 +1,6 @@
 //! Calls of the peer: which one begins, and how it is answered or refused.
 
+use super::permitting::{decide, log_refusal};
 use super::{Call, Phase, Session};
 use crate::config::Priority;
 use crate::distribution::block;
@@ -12,6 +13,7 @@ use crate::host::frame::ChunkWriter;
 use crate::host::mailman::Mailman;
 use crate::host::secure::Secure;
 use crate::services::Context;
+use crate::services::access::Verb;
 use crate::services::calls::{CallHead, Ticket};
 use crate::services::lease::{Granted, Service};
 use crate::storage::{Buffers, Storage};
@@ -25,12 +27,16 @@ impl<S: Storage, C: Secure> Session<S, C> {
         arguments: &mut ParametersView,
     ) -> Option<Call> {
         while self.phase == Phase::Live {
-            let (functions, now) = (cx.functions, cx.now);
+            let (functions, now, access, remote) = (cx.functions, cx.now, cx.access, self.remote.as_ref());
             let (head, read) = self.calls.take_next(cx.buffers, |head, block| {
                 if head.deadline <= now {
                     return Err(Error::Expired);
                 }
                 let function = functions.lookup(head.slot, head.generation)?;
+                // The table may have changed while the call waited.
+                if !decide(access, remote, function.name(), Verb::Call).is_allowed() {
+                    return Err(Error::NotAllowed);
+                }
                 block::read_arguments(function.signature.arguments(), block, arguments)?;
                 block::prepare_results(function.signature.results(), arguments)
             })?;
@@ -192,9 +198,15 @@ impl<S: Storage, C: Secure> Session<S, C> {
             Error::Stale => LinkCounter::RequestsRepeated,
             Error::Busy | Error::Full(_) => LinkCounter::RequestsBusy,
             Error::TooSoon { .. } => LinkCounter::RequestsTooSoon,
+            Error::NotAllowed => LinkCounter::RequestsForbidden,
             _ => LinkCounter::RequestsRejected,
         };
         self.link.counters.add(counter, 1);
+        if error == Error::NotAllowed
+            && let Some(function) = cx.functions.function(slot)
+        {
+            log_refusal(cx, self.remote.as_ref(), &mut self.publishing.refusals, function.name(), "call");
+        }
         let error = match error {
             Error::Full(Limit::ParametersBytes | Limit::Variables) => {
                 Error::TooLarge { limit: self.constraints.message_size }

@@ -3,6 +3,7 @@
 use core::net::SocketAddr;
 
 use super::answering::read_arguments;
+use super::permitting::may_publish;
 use super::publishing::Told;
 use super::timing::made_at;
 use super::{Event, Phase, Session, close_reason};
@@ -286,8 +287,13 @@ impl<S: Storage, C: Secure> Session<S, C> {
                 let kept = Attributes::decode(&attributes).and_then(|attributes| {
                     self.theirs.insert(Slot(slot), Generation(generation), attributes, signature)
                 });
+                let allowed = may_publish(cx, self.remote.as_ref(), &mut self.publishing.refusals, signature);
                 match kept {
-                    Ok(()) => {}
+                    Ok(()) if allowed => {}
+                    Ok(()) => {
+                        self.theirs.hide(Slot(slot));
+                        self.link.counters.add(LinkCounter::FunctionsForbidden, 1);
+                    }
                     Err(Error::Full(_)) => self.link.counters.add(LinkCounter::FunctionsSkipped, 1),
                     Err(_) => self.close(cx, CloseReason::Protocol),
                 }
@@ -386,7 +392,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         match self.publishing.told(header.slot, header.generation) {
             Told::Never => return Err(Error::UnknownFunction),
             Told::Earlier => return Err(Error::StaleFunction),
-            Told::Now => cx.functions.lookup(header.slot, header.generation)?,
+            Told::Now => self.permit_call(cx, header.slot, header.generation)?,
         };
         if priority != Priority::Emergency {
             self.calls.interval(cx.now, self.constraints.minimum_interval)?;

@@ -20,6 +20,7 @@ mod answering;
 mod inbound;
 mod lending;
 mod outbound;
+mod permitting;
 mod pinging;
 mod proving;
 mod publishing;

@@ -7,8 +7,10 @@ use crate::distribution::message::{CONTROL_BYTES, Control, PUBLISH_BYTES};
 use crate::host::mailman::Mailman;
 use crate::host::secure::Secure;
 use crate::services::Context;
+use crate::services::access::Bucket;
 use crate::services::lease::Service;
 use crate::storage::{Buffers, Storage};
+use crate::time::{Duration, Instant};
 
 /// One of this unit's functions, as one peer sees it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -19,6 +21,8 @@ pub struct Publication {
     ever: bool,
     /// The peer gave up what its requests up to this one started, or would have started.
     released: u32,
+    /// What the peer has left of the rate that it may call at.
+    bucket: Bucket,
 }
 
 /// Whether a peer may call a function.
@@ -39,6 +43,27 @@ pub(super) struct Publishing<S: Storage> {
     acknowledged: u32,
     acknowledgement_due: Option<u32>,
     limits_due: bool,
+    pub(super) refusals: Refusals,
+}
+
+/// What the access table refused the peer, for the log.
+pub(super) struct Refusals {
+    /// Since the last line.
+    count: u32,
+    logged: Option<Instant>,
+}
+
+impl Refusals {
+    /// Counts one; how many there were since the last line, if there may be one now.
+    pub(super) fn count(&mut self, now: Instant) -> Option<u32> {
+        self.count = self.count.saturating_add(1);
+        let due = self.logged.is_none_or(|logged| now >= logged + Duration::from_secs(1));
+        due.then_some(self.count)
+    }
+
+    pub(super) fn was_logged(&mut self, now: Instant) {
+        *self = Self { count: 0, logged: Some(now) };
+    }
 }
 
 impl<S: Storage> Publishing<S> {
@@ -51,6 +76,7 @@ impl<S: Storage> Publishing<S> {
             acknowledged: 0,
             acknowledgement_due: None,
             limits_due: false,
+            refusals: Refusals { count: 0, logged: None },
         }
     }
 
@@ -95,6 +121,16 @@ impl<S: Storage> Publishing<S> {
         self.table.get(usize::from(slot.0)).is_some_and(|publication| id <= publication.released)
     }
 
+    /// What the peer has left of the rate of a function.
+    pub(super) fn bucket(&mut self, slot: Slot) -> Option<&mut Bucket> {
+        self.table.get_mut(usize::from(slot.0)).map(|publication| &mut publication.bucket)
+    }
+
+    /// Every rate is whole again.
+    pub(super) fn fill_buckets(&mut self) {
+        self.table.iter_mut().for_each(|publication| publication.bucket = Bucket::default());
+    }
+
     pub(super) fn acknowledge(&mut self, serial: u32) {
         self.acknowledgement_due = Some(serial);
     }
@@ -118,7 +154,8 @@ impl<S: Storage> Publishing<S> {
 }
 
 impl<S: Storage, C: Secure> Session<S, C> {
-    /// Makes functions of this unit visible to the peer, as they are now. Returns the serial that comes back with
+    /// Makes functions of this unit visible to the peer, as they are now and as far as the access table lets it see them.
+    /// Returns the serial that comes back with
     /// [`Event::Acknowledged`](super::Event::Acknowledged).
     pub fn publish<M: Mailman, B: Buffers<S>, H: Service>(
         &mut self,
@@ -152,7 +189,10 @@ impl<S: Storage, C: Secure> Session<S, C> {
         self.end_of_changes(cx)
     }
 
-    fn end_of_changes<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) -> u32 {
+    pub(super) fn end_of_changes<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+    ) -> u32 {
         self.publishing.serial = self.publishing.serial.wrapping_add(1);
         self.publishing.dirty = true;
         self.publishing.end_due = true;
@@ -202,11 +242,12 @@ impl<S: Storage, C: Secure> Session<S, C> {
     fn send_news<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) -> bool {
         for index in 0..self.publishing.table.len() {
             let Some(&publication) = self.publishing.table.get(index) else { break };
-            if publication.wanted == publication.told {
+            let slot = Slot(index as u16);
+            let wanted = publication.wanted.filter(|_| self.may_see(cx, slot));
+            if wanted == publication.told {
                 continue;
             }
-            let slot = Slot(index as u16);
-            let function = publication.wanted.and_then(|generation| cx.functions.lookup(slot, generation).ok());
+            let function = wanted.and_then(|generation| cx.functions.lookup(slot, generation).ok());
             let sent = match function {
                 None => self.send_control(cx, &Control::Withdraw { slot: slot.0 }),
                 Some(function) => {
@@ -223,7 +264,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
                 return false;
             }
             if let Some(publication) = self.publishing.table.get_mut(index) {
-                publication.told = publication.wanted;
+                publication.told = wanted;
             }
         }
         true

@@ -17,9 +17,11 @@ use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::{Parameters, ParametersView};
 use cara_core::error::{Error, ServiceError};
 use cara_core::host::connections::LinkCounter;
+use cara_core::services::access::Rule;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::RequestOptions;
 use cara_core::time::{Duration, Instant};
+use cara_std::access::AccessTable;
 use cara_std::{
     Call, Capacities, CommunicationSystem, Interfaces, LeaseWatch, MyFunctionList, Peer, ServiceOptions, Unit as SUnit,
     UnitEvent,
@@ -563,6 +565,15 @@ impl Node for Handle {
             Machine::Manager(system) => system.constraints(),
             Machine::Agv(unit) => unit.constraints(),
         }
+    }
+
+    fn set_access(&self, table: Option<&'static [Rule]>) -> Result<(), Error> {
+        let table = table.map(AccessTable::from);
+        match &*self.node.machine()? {
+            Machine::Manager(system) => system.set_access(table),
+            Machine::Agv(unit) => unit.set_access(table),
+        }
+        Ok(())
     }
 
     fn set_constraints(&self, constraints: Constraints) -> Result<(), Error> {

@@ -6,6 +6,7 @@ mod relay;
 mod simulator;
 
 use cara_core::config::Mode;
+use cara_core::services::access::{Access, Rule};
 
 use crate::{Need, Weather, World};
 
@@ -24,4 +25,9 @@ pub fn linux(needs: &[Need]) -> Box<dyn World> {
 /// A fleet of boards on a switch in memory; the seed decides everything.
 pub fn embassy(seed: u64, weather: Weather) -> Box<dyn World> {
     Box::new(embassy::EmbassyWorld::new(seed, weather))
+}
+
+/// A table as a board has it: there for good.
+fn lent(table: Option<&'static [Rule]>) -> Option<&'static dyn Access> {
+    table.map(|rules| &*Box::leak(Box::new(rules)) as &'static dyn Access)
 }

@@ -13,11 +13,13 @@ use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, ServiceError};
 use cara_core::host::connections::LinkCounter;
 use cara_core::random::Random;
+use cara_core::services::access::Rule;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::RequestOptions;
 use cara_core::time::{Duration, Instant};
 use cara_sim::{Action, Chance, Crash, Direction, HostId, Path, StreamId, UnitEvent, UnitHandle};
 
+use super::lent;
 use crate::run::Report;
 use crate::{
     Asked, Fault, Node, Pending, PendingAll, Port, Seen, Service, Spec, SpecRole, Stranger, Unit, Unsupported, Weather,
@@ -476,6 +478,10 @@ impl Node for SimNode {
 
     fn constraints(&self) -> Constraints {
         self.handle.constraints().expect("the unit runs")
+    }
+
+    fn set_access(&self, table: Option<&'static [Rule]>) -> Result<(), Error> {
+        self.handle.set_access(lent(table))
     }
 
     fn set_constraints(&self, constraints: Constraints) -> Result<(), Error> {

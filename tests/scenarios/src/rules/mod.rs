@@ -1,5 +1,6 @@
 //! The rules, one file each.
 
+mod access;
 mod age;
 mod anything;
 mod at_most_once;
@@ -32,6 +33,7 @@ pub fn all() -> Vec<Scenario> {
     [
         listing::SCENARIOS,
         publishing::SCENARIOS,
+        access::SCENARIOS,
         membership::SCENARIOS,
         identity::SCENARIOS,
         fleets::SCENARIOS,

@@ -6,6 +6,7 @@ use cara_core::distribution::function_list::{FunctionList, Slot};
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error};
+use cara_core::services::access::Access;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::{Event, Session};
 use cara_core::services::{Context, Ticket};
@@ -60,6 +61,8 @@ pub(super) struct Links {
     by_stream: BTreeMap<StreamId, u16>,
     pub(super) functions: FunctionList<Boxed, Handler>,
     pub(super) buffers: LazyPool,
+    /// Who may do what.
+    pub(super) access: Option<&'static dyn Access>,
     arguments: BoxedParameters,
 }
 
@@ -75,7 +78,16 @@ impl Links {
         arguments: BoxedParameters,
     ) -> Self {
         let links = (0..count).map(|_| None).collect();
-        Self { host, links, streams: vec![None; count], by_stream: BTreeMap::new(), functions, buffers, arguments }
+        Self {
+            host,
+            links,
+            streams: vec![None; count],
+            by_stream: BTreeMap::new(),
+            functions,
+            buffers,
+            access: None,
+            arguments,
+        }
     }
 
     /// An index that no link has.
@@ -135,8 +147,13 @@ impl Links {
         let link = self.links.get_mut(usize::from(index))?.as_mut()?;
         let now = network.now();
         let mut mailman = SimMailman { network, host: self.host, streams: &self.streams };
-        let mut context =
-            Context { now, mailman: &mut mailman, buffers: &mut self.buffers, functions: &self.functions };
+        let mut context = Context {
+            now,
+            mailman: &mut mailman,
+            buffers: &mut self.buffers,
+            functions: &self.functions,
+            access: self.access,
+        };
         Some(act(&mut link.session, &mut context))
     }
 
@@ -235,7 +252,13 @@ impl Links {
         let Some(link) = self.links.get_mut(usize::from(index)).and_then(Option::as_mut) else { return false };
         let now = network.now();
         let mut mailman = SimMailman { network, host: self.host, streams: &self.streams };
-        let mut cx = Context { now, mailman: &mut mailman, buffers: &mut self.buffers, functions: &self.functions };
+        let mut cx = Context {
+            now,
+            mailman: &mut mailman,
+            buffers: &mut self.buffers,
+            functions: &self.functions,
+            access: self.access,
+        };
         let Link { session, unread, waiting, acknowledgements, paused, .. } = link;
         let (mut start, mut any) = (0, false);
         loop {

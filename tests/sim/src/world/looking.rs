@@ -6,6 +6,7 @@ use cara_core::config::Constraints;
 use cara_core::distribution::connection_handler::NodeCounter;
 use cara_core::error::Error;
 use cara_core::host::connections::LinkCounter;
+use cara_core::services::access::Access;
 use cara_core::time::Instant;
 
 use super::UnitEvent;
@@ -35,6 +36,15 @@ impl UnitHandle {
         })?;
         self.each_live_link(|links, network, index| {
             links.with(network, index, |session, cx| session.set_constraints(cx, constraints));
+        });
+        Ok(())
+    }
+
+    /// Another access table for this life of the unit, or none: in force when this returns, and peers are told.
+    pub fn set_access(&self, table: Option<&'static dyn Access>) -> Result<(), Error> {
+        self.machine(|machine, _| machine.links.access = table)?;
+        self.each_live_link(|links, network, index| {
+            links.with(network, index, |session, cx| session.access_changed(cx));
         });
         Ok(())
     }

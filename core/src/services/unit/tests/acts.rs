@@ -6,7 +6,7 @@ use std::vec::Vec;
 
 use super::super::RequestOptions;
 use super::setup::{self, Handler, Run};
-use super::side::{Arguments, Begun, Happened, Side, context};
+use super::side::{Arguments, Begun, Happened, Side, Table, context};
 use crate::config::{Constraints, Priority};
 use crate::distribution::function::Definition;
 use crate::distribution::function_list::{Generation, Slot};
@@ -123,6 +123,12 @@ impl Side {
 
     pub(super) fn withdraw(&mut self, slot: Slot) -> u32 {
         self.session.withdraw(context!(self), slot)
+    }
+
+    /// Another table, or none.
+    pub(super) fn set_table(&mut self, table: Option<Table>) -> u32 {
+        self.table = table;
+        self.session.access_changed(context!(self))
     }
 
     pub(super) fn flush_gathered(&mut self) {

@@ -7,6 +7,7 @@
     clippy::arithmetic_side_effects
 )]
 
+mod access;
 mod acts;
 mod chaos;
 mod delivery;

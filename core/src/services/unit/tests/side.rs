@@ -16,6 +16,7 @@ use crate::error::{CloseReason, Error, Refusal};
 use crate::host::mailman::LinkId;
 use crate::host::secure::Plain;
 use crate::services::Context;
+use crate::services::access::{Access, Decision, Principal, Rule, Verb, decide};
 use crate::services::requests::CallId;
 use crate::storage::{Boxed, Pool};
 use crate::time::{Duration, Instant};
@@ -57,12 +58,24 @@ pub(super) struct Begun {
     pub(super) x: Option<i64>,
 }
 
+/// A table that a test owns.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Table(pub(super) Vec<Rule<&'static str, Vec<&'static str>>>);
+
+impl Access for Table {
+    fn decide(&self, who: Principal<'_>, function: &str, verb: Verb) -> Decision {
+        decide(&self.0, who, function, verb)
+    }
+}
+
 /// One end.
 pub(super) struct Side {
     pub(super) now: Instant,
     pub(super) session: Session<Boxed, Plain>,
     pub(super) functions: FunctionList<Boxed, Handler>,
     pub(super) pool: Pool<Boxed>,
+    /// Who may do what here.
+    pub(super) table: Option<Table>,
     pub(super) net: Net,
     pub(super) happened: Vec<Happened>,
     /// Calls that wait for an answer of the test.
@@ -82,7 +95,13 @@ pub(super) struct Side {
 /// The context of a side, whose parts are borrowed one by one.
 macro_rules! context {
     ($side:expr) => {
-        &mut Context { now: $side.now, mailman: &mut $side.net, buffers: &mut $side.pool, functions: &$side.functions }
+        &mut Context {
+            now: $side.now,
+            mailman: &mut $side.net,
+            buffers: &mut $side.pool,
+            functions: &$side.functions,
+            access: $side.table.as_ref().map(|table| table as &dyn crate::services::access::Access),
+        }
     };
 }
 pub(super) use context;
@@ -104,6 +123,7 @@ impl Side {
             now,
             session: Session::new(now, config, Plain, setup::storage(&constraints, setup.their_functions)),
             functions: setup::functions(),
+            table: None,
             pool: setup::pool(setup.buffers, setup.buffer_size),
             net: Net::default(),
             happened: Vec::new(),

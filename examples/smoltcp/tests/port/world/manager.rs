@@ -133,6 +133,7 @@ macro_rules! context {
             mailman: &mut $manager.net,
             buffers: &mut $manager.buffers,
             functions: &$manager.functions,
+            access: None,
         }
     };
 }

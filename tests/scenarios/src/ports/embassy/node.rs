@@ -10,6 +10,7 @@ use cara_core::distribution::identity::{Identity, Role};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 use cara_core::host::connections::LinkCounter;
+use cara_core::services::access::Rule;
 use cara_core::services::lease::Lease;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::RequestOptions;
@@ -18,6 +19,7 @@ use cara_embassy::{Config, Handle, Peer, UnitEvent};
 use cara_embassy_host::{Bench, Board, now};
 use embassy_time::with_timeout;
 
+use super::super::lent;
 use super::memory;
 use super::services;
 use crate::{Node, Pending, PendingAll, Seen, Service, Spec, SpecRole, boxed};
@@ -277,6 +279,11 @@ impl Node for Rc<BoardNode> {
 
     fn constraints(&self) -> Constraints {
         self.unit().expect("the unit runs").constraints()
+    }
+
+    fn set_access(&self, table: Option<&'static [Rule]>) -> Result<(), Error> {
+        self.unit()?.set_access(lent(table));
+        Ok(())
     }
 
     fn set_constraints(&self, constraints: Constraints) -> Result<(), Error> {

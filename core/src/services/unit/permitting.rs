@@ -1,0 +1,108 @@
+//! What the access table lets the peer do.
+
+use super::publishing::Refusals;
+use super::{Remote, Session};
+use crate::distribution::function::Signature;
+use crate::distribution::function_list::{Generation, Slot};
+use crate::error::Error;
+use crate::host::mailman::Mailman;
+use crate::host::secure::Secure;
+use crate::services::Context;
+use crate::services::access::{Access, Decision, Principal, Verb};
+use crate::services::lease::Service;
+use crate::storage::{Buffers, Storage};
+
+/// What the table says about the peer; without a table everything is allowed.
+pub(super) fn decide(access: Option<&dyn Access>, remote: Option<&Remote>, function: &str, verb: Verb) -> Decision {
+    match (access, remote) {
+        (None, _) => Decision::Allowed { rule: 0, rate: None },
+        (Some(access), Some(remote)) => access.decide(Principal::Node(&remote.hello.identity), function, verb),
+        (Some(_), None) => Decision::Denied,
+    }
+}
+
+impl<S: Storage, C: Secure> Session<S, C> {
+    /// The access table of the context is another one than before: the peer is told what it may see from here on,
+    /// leases end that it may not hold any more, and of what it has published this unit sees what it may. For a live link; before that, what is published is under the new table anyway.
+    /// Returns the serial that comes back with [`Event::Acknowledged`](super::Event::Acknowledged).
+    pub fn access_changed<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) -> u32 {
+        self.publishing.fill_buckets();
+        self.cut_forbidden_leases(cx);
+        let remote = self.remote.as_ref();
+        self.theirs.show_only(|name| decide(cx.access, remote, name, Verb::Publish).is_allowed());
+        self.end_of_changes(cx)
+    }
+
+    fn cut_forbidden_leases<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+        for index in 0..self.granted.len() {
+            let Some(slot) = self.granted.get(index).map(|granted| granted.slot) else { return };
+            if !self.may(cx, slot, Verb::Call) {
+                self.cut_lease(cx, slot);
+            }
+        }
+    }
+
+    /// Whether the peer sees a function: one that it may call, or list.
+    pub(super) fn may_see<M: Mailman, B: Buffers<S>, H: Service>(
+        &self,
+        cx: &Context<'_, S, M, B, H>,
+        slot: Slot,
+    ) -> bool {
+        cx.access.is_none() || self.may(cx, slot, Verb::Call) || self.may(cx, slot, Verb::List)
+    }
+
+    fn may<M: Mailman, B: Buffers<S>, H: Service>(&self, cx: &Context<'_, S, M, B, H>, slot: Slot, verb: Verb) -> bool {
+        let function = cx.functions.function(slot);
+        function.is_none_or(|function| decide(cx.access, self.remote.as_ref(), function.name(), verb).is_allowed())
+    }
+
+    /// A request has arrived for a function that the peer was told of: may it be called, and so soon?
+    pub(super) fn permit_call<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &Context<'_, S, M, B, H>,
+        slot: Slot,
+        generation: Generation,
+    ) -> Result<(), Error> {
+        let function = cx.functions.lookup(slot, generation)?;
+        match decide(cx.access, self.remote.as_ref(), function.name(), Verb::Call) {
+            Decision::Denied => Err(Error::NotAllowed),
+            Decision::Allowed { rate: None, .. } => Ok(()),
+            Decision::Allowed { rate: Some(rate), .. } => match self.publishing.bucket(slot) {
+                Some(bucket) => bucket.take(cx.now, rate),
+                None => Err(Error::UnknownFunction),
+            },
+        }
+    }
+}
+
+/// Whether what the peer publishes is shown here.
+pub(super) fn may_publish<S: Storage, M: Mailman, B: Buffers<S>, H: Service>(
+    cx: &Context<'_, S, M, B, H>,
+    remote: Option<&Remote>,
+    refusals: &mut Refusals,
+    signature: &[u8],
+) -> bool {
+    // What cannot be read is refused by the list.
+    let Some(signature) = cx.access.and_then(|_| Signature::decode(signature).ok()) else { return true };
+    let allowed = decide(cx.access, remote, signature.name(), Verb::Publish).is_allowed();
+    if !allowed {
+        log_refusal(cx, remote, refusals, signature.name(), "publish");
+    }
+    allowed
+}
+
+/// Says in the log what was refused, once a second at most.
+pub(super) fn log_refusal<S: Storage, M: Mailman, B: Buffers<S>, H: Service>(
+    cx: &Context<'_, S, M, B, H>,
+    remote: Option<&Remote>,
+    refusals: &mut Refusals,
+    function: &str,
+    verb: &str,
+) {
+    let Some(count) = refusals.count(cx.now) else { return };
+    if cx.access.is_some_and(|access| access.may_log(cx.now)) {
+        refusals.was_logged(cx.now);
+        let (name, id) = remote.map_or(("", 0), |remote| (remote.hello.identity.name(), remote.hello.identity.id()));
+        warning!("{}/{} may not {} {}: {} refused", name, id, verb, function, count);
+    }
+}

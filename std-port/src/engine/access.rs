@@ -1,0 +1,198 @@
+//! The unit's access table: lent to every session, changed while the unit runs, asked for the operator.
+
+use std::collections::HashMap;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, RwLock};
+
+use cara_core::error::Error;
+use cara_core::services::access::{Access, Bucket, Decision, Principal, Rate, Verb};
+use cara_core::time::{Duration, Instant};
+
+use super::link::Notice;
+use super::{Engine, lock, read, write};
+use crate::access::AccessTable;
+
+/// Functions of which the operator's use of a rate is remembered, before those are forgotten whose rate is whole again.
+const OPERATOR_BUCKETS: usize = 256;
+
+/// The table in force, and what came of it.
+#[derive(Default)]
+pub(crate) struct Guard {
+    /// Whether there is a table: looked at for every event, without a lock.
+    is_set: AtomicBool,
+    table: RwLock<Option<Arc<AccessTable>>>,
+    logged: Mutex<Option<Instant>>,
+    operator: Mutex<HashMap<String, Bucket>>,
+    operator_refused: AtomicU64,
+    pub(super) file: FileCounts,
+}
+
+/// What came of the file that the table is read from.
+#[derive(Default)]
+pub(super) struct FileCounts {
+    pub(super) reloads: AtomicU64,
+    pub(super) mistakes: AtomicU64,
+    /// The file is not what is in force.
+    pub(super) is_wrong: AtomicBool,
+}
+
+/// The table while a session has it.
+pub(crate) struct Asked<'g> {
+    table: Arc<AccessTable>,
+    guard: &'g Guard,
+}
+
+impl Access for Asked<'_> {
+    fn decide(&self, who: Principal<'_>, function: &str, verb: Verb) -> Decision {
+        self.table.decide(who, function, verb)
+    }
+
+    fn may_log(&self, now: Instant) -> bool {
+        self.guard.may_log(now)
+    }
+}
+
+impl Guard {
+    /// The table, for a session.
+    pub(super) fn ask(&self) -> Option<Asked<'_>> {
+        let table = self.table()?;
+        Some(Asked { table, guard: self })
+    }
+
+    pub(super) fn table(&self) -> Option<Arc<AccessTable>> {
+        if !self.is_set.load(Ordering::Acquire) {
+            return None;
+        }
+        read(&self.table).clone()
+    }
+
+    pub(super) fn set(&self, table: Option<AccessTable>) {
+        let is_set = table.is_some();
+        let mut current = write(&self.table);
+        *current = table.map(Arc::new);
+        self.is_set.store(is_set, Ordering::Release);
+        lock(&self.operator).clear();
+    }
+
+    pub(super) fn operator_refused(&self) -> u64 {
+        self.operator_refused.load(Ordering::Relaxed)
+    }
+
+    /// One line a second of the whole unit, however many links have something to tell.
+    fn may_log(&self, now: Instant) -> bool {
+        let mut logged = lock(&self.logged);
+        let due = logged.is_none_or(|logged| now >= logged + Duration::from_secs(1));
+        if due {
+            *logged = Some(now);
+        }
+        due
+    }
+
+    fn take(&self, now: Instant, function: &str, rate: Rate) -> Result<(), Error> {
+        let mut buckets = lock(&self.operator);
+        if buckets.len() >= OPERATOR_BUCKETS {
+            buckets.retain(|_, bucket| !bucket.is_full(now));
+        }
+        buckets.entry(function.to_owned()).or_default().take(now, rate)
+    }
+}
+
+#[cfg(feature = "control")]
+impl<T: Send + 'static> Engine<T> {
+    /// Whether the operator may do something; a refusal is counted, and told in the log once a second at most.
+    pub(crate) fn operator_may(&self, function: &str, verb: Verb) -> Result<(), Error> {
+        let Some(table) = self.guard.table() else { return Ok(()) };
+        match table.decide(Principal::Operator, function, verb) {
+            Decision::Allowed { rate: Some(rate), .. } if verb == Verb::Call => {
+                self.guard.take(self.now(), function, rate)
+            }
+            Decision::Allowed { .. } => Ok(()),
+            Decision::Denied => {
+                self.guard.operator_refused.fetch_add(1, Ordering::Relaxed);
+                if self.guard.may_log(self.now()) {
+                    tracing::warn!(function, ?verb, "the access table does not let the operator do this");
+                }
+                Err(Error::NotAllowed)
+            }
+        }
+    }
+
+    /// Whether the operator may call a function, whatever its rate.
+    pub(crate) fn operator_may_go_on(&self, function: &str) -> bool {
+        self.operator_has(function, Verb::Call)
+    }
+
+    /// Whether the operator may see a function of another node.
+    pub(crate) fn operator_sees(&self, function: &str) -> bool {
+        self.operator_has(function, Verb::Call) || self.operator_has(function, Verb::List)
+    }
+
+    fn operator_has(&self, function: &str, verb: Verb) -> bool {
+        let table = self.guard.table();
+        table.is_none_or(|table| table.decide(Principal::Operator, function, verb).is_allowed())
+    }
+}
+
+impl<T: Send + 'static> Engine<T> {
+    /// Another table, or none: in force when this returns, and every peer is told what it may see.
+    pub(crate) fn set_access(&self, table: Option<AccessTable>) {
+        self.guard.set(table);
+        for link in self.each_link() {
+            let mut state = link.lock();
+            if state.session.is_live() {
+                self.with(&link, &mut state, |session, cx| session.access_changed(cx));
+                state.notices.push(Notice::ListChanged);
+            }
+            self.settle(&link, state);
+        }
+    }
+
+    /// The table in force.
+    pub(crate) fn access(&self) -> Option<Arc<AccessTable>> {
+        self.guard.table()
+    }
+}
+
+#[cfg(feature = "access")]
+mod following {
+    use super::*;
+    use crate::access::watch::FileWatch;
+
+    /// Between two looks at the file. A change counts when two looks have found it the same.
+    const LOOK: std::time::Duration = std::time::Duration::from_millis(400);
+
+    impl<T: Send + 'static> Engine<T> {
+        /// Takes over what is written to a table's file, in a thread of its own: a disk may take its time.
+        pub(crate) fn follow(self: &Arc<Self>, mut watch: FileWatch) -> Result<(), Error> {
+            let engine = Arc::downgrade(self);
+            let thread = std::thread::Builder::new().name("cara-access".into());
+            let run = move || {
+                while let Some(engine) = engine.upgrade().filter(|engine| !engine.is_stopping()) {
+                    if let Some(read) = watch.look() {
+                        engine.take_over(read);
+                    }
+                    drop(engine);
+                    std::thread::park_timeout(LOOK);
+                }
+            };
+            thread.spawn(run).map(drop).map_err(crate::engine::system_refused)
+        }
+
+        /// A mistake keeps the table that is in force.
+        fn take_over(&self, read: Result<AccessTable, crate::access::AccessError>) {
+            let counts = &self.guard.file;
+            counts.is_wrong.store(read.is_err(), Ordering::Relaxed);
+            match read {
+                Ok(table) => {
+                    tracing::info!(file = table.source(), rules = table.rules().len(), "the access table has changed");
+                    self.set_access(Some(table));
+                    counts.reloads.fetch_add(1, Ordering::Relaxed);
+                }
+                Err(error) => {
+                    counts.mistakes.fetch_add(1, Ordering::Relaxed);
+                    tracing::error!("the access table stays as it was:\n{error}");
+                }
+            }
+        }
+    }
+}

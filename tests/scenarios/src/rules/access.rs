@@ -1,0 +1,72 @@
+//! Who may do what.
+
+use cara_core::error::Error;
+use cara_core::services::access::{Functions, Rule, Verbs, Who};
+
+use super::{met, pair};
+use crate::scenario::scenarios;
+use crate::{Service, Spec, World, number, secs};
+
+scenarios![
+    a_peer_without_permission_is_refused_and_sees_nothing: "access control", Rough, [], ["RequestsForbidden"];
+    a_change_of_the_access_table_takes_effect: "access control", Rough, [], ["RequestsRun"];
+    what_a_peer_may_not_publish_is_not_seen: "access control", Rough, [], ["FunctionsForbidden"];
+];
+
+/// `one` may call the mechanic.
+const ONE: &[Rule] = &[Rule::new(Who::node("one", 1), Functions::Named(&["call_mechanic"]), Verbs::CALL)];
+const MANAGER: &[Rule] = &[Rule::new(Who::node("manager", 1), Functions::All, Verbs::CALL)];
+const NOBODY: &[Rule] = &[];
+const ANYTHING_BUT_NOTES: &[Rule] = &[Rule::new(Who::S_UNITS, Functions::Named(&["go_to"]), Verbs::ALL)];
+
+fn a_peer_without_permission_is_refused_and_sees_nothing(world: &mut dyn World) {
+    let mechanic = Service::numbered("call_mechanic");
+    let manager = world.add(Spec::manager("manager", 1).service(&mechanic));
+    let one = world.add(Spec::agv("one", 1));
+    let other = world.add(Spec::agv("other", 2));
+    met(world, &one, "manager", "call_mechanic");
+    met(world, &other, "manager", "call_mechanic");
+    manager.set_access(Some(ONE)).expect("the manager runs");
+    // It may have read the news by now, or not.
+    let refused = world.ask(&other, "manager", "call_mechanic", &mut number("n", 1));
+    assert!(matches!(refused, Err(Error::NotAllowed | Error::UnknownFunction)), "{refused:?}{}", world.story());
+    assert_eq!(mechanic.diary().runs(), 0);
+    world.wait("it is not seen any more", || !other.knows("manager", "call_mechanic"), secs(20));
+    assert_eq!(world.ask(&one, "manager", "call_mechanic", &mut number("n", 2)), Ok(()));
+    let late = world.add(Spec::agv("late", 3));
+    world.wait("the late one has joined", || late.is_connected("manager"), secs(40));
+    world.run_for(secs(1));
+    assert!(!late.knows("manager", "call_mechanic"));
+    assert_eq!(mechanic.diary().runs(), 1);
+}
+
+fn a_change_of_the_access_table_takes_effect(world: &mut dyn World) {
+    let note = Service::numbered("note");
+    let (manager, agv) = pair(world, &note);
+    assert_eq!(world.ask(&manager, "agv", "note", &mut number("n", 1)), Ok(()));
+    agv.set_access(Some(NOBODY)).expect("the AGV runs");
+    world.wait("it is not seen any more", || !manager.knows("agv", "note"), secs(20));
+    assert_eq!(world.ask(&manager, "agv", "note", &mut number("n", 2)), Err(Error::UnknownFunction));
+    for table in [Some(MANAGER), None] {
+        agv.set_access(table).expect("the AGV runs");
+        met(world, &manager, "agv", "note");
+        assert_eq!(world.ask(&manager, "agv", "note", &mut number("n", 3)), Ok(()));
+    }
+    assert_eq!(note.diary().runs(), 3);
+}
+
+fn what_a_peer_may_not_publish_is_not_seen(world: &mut dyn World) {
+    let note = Service::numbered("note");
+    let (manager, _agv) = pair(world, &note);
+    manager.set_access(Some(ANYTHING_BUT_NOTES)).expect("the manager runs");
+    assert_eq!(world.ask(&manager, "agv", "note", &mut number("n", 1)), Err(Error::UnknownFunction));
+    let other = Service::numbered("note");
+    world.add(Spec::agv("other", 8).service(&other));
+    world.wait("the other has joined", || manager.is_connected("other"), secs(40));
+    world.run_for(secs(1));
+    assert!(!manager.knows("other", "note"));
+    manager.set_access(None).expect("the manager runs");
+    met(world, &manager, "other", "note");
+    assert_eq!(world.ask(&manager, "agv", "note", &mut number("n", 2)), Ok(()));
+    assert_eq!((note.diary().runs(), other.diary().runs()), (1, 0));
+}
