@@ -2,7 +2,7 @@
 //! its last one, the acknowledgement of the reply included; and whose instructions they are.
 //!
 //! Each request stands alone: the next one follows when the connection has come to rest. Wake-ups by timers are left
-//! out. Given is the median of many requests, since a frame of somebody else or a timer can fall into one.
+//! out. Given is the lower quartile of many requests: what a frame of somebody else or a timer adds to some is left out.
 
 use std::collections::BTreeMap;
 use std::io::{Read, Write};
@@ -29,7 +29,7 @@ pub(crate) enum Image {
     Echo,
 }
 
-const REQUESTS: usize = 25;
+const REQUESTS: usize = 32;
 /// Functions of a profile.
 const SHOWN: usize = 60;
 const CHARACTERS: u32 = 512;
@@ -105,12 +105,12 @@ fn exchanges(trace: &Trace, mut exchange: impl FnMut() -> Result<()>) -> Result<
     Ok(executed)
 }
 
-/// Prints the median of what each owner has, or the functions that have most.
+/// Prints the quartile of what each owner has, or the functions that have most.
 fn tell(places: &Places, exchanges: &[Vec<u32>], what: &str, of: &str, profile: bool) {
     let exchanges: Vec<Vec<(u32, Owner)>> = exchanges.iter().map(|executed| of_network(places, executed)).collect();
     if profile {
         println!("{what}, {of}:");
-        if let Some(typical) = middle(exchanges, Vec::len) {
+        if let Some(typical) = quartile(exchanges, Vec::len) {
             functions(places, &typical);
         }
         return;
@@ -119,7 +119,10 @@ fn tell(places: &Places, exchanges: &[Vec<u32>], what: &str, of: &str, profile: 
     {
         let has = |executed: &[(u32, Owner)]| executed.iter().filter(|(_, of)| *of == owner).count();
         let counts = exchanges.iter().map(|executed| has(executed)).collect();
-        println!("{what}, {name}\t{of}\t{}", middle(counts, |count| *count).unwrap_or_default());
+        match quartile(counts, |count| *count) {
+            None | Some(0) => {}
+            Some(count) => println!("{what}, {name}\t{of}\t{count}"),
+        }
     }
 }
 
@@ -169,20 +172,20 @@ fn calls(addresses: &[u32]) -> usize {
     addresses.iter().filter(|address| Some(*address) == first).count()
 }
 
-/// The one in the middle.
-fn middle<T>(mut all: Vec<T>, key: impl Fn(&T) -> usize) -> Option<T> {
+/// The one that a quarter of them do not exceed.
+fn quartile<T>(mut all: Vec<T>, key: impl Fn(&T) -> usize) -> Option<T> {
     all.sort_by_key(key);
-    let at = all.len() / 2;
+    let at = all.len() / 4;
     (at < all.len()).then(|| all.swap_remove(at))
 }
 
 #[cfg(test)]
 mod tests {
-    use super::middle;
+    use super::quartile;
 
     #[test]
     fn one_that_is_disturbed_does_not_count() {
-        assert_eq!(middle(vec![7, 900, 7, 7, 8], |count| *count), Some(7));
-        assert_eq!(middle(Vec::<usize>::new(), |count| *count), None);
+        assert_eq!(quartile(vec![900, 7, 950, 7, 8], |count| *count), Some(7));
+        assert_eq!(quartile(Vec::<usize>::new(), |count| *count), None);
     }
 }

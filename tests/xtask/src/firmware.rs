@@ -17,7 +17,7 @@ use crate::command::Run;
 use crate::groups::Outcome;
 use crate::install;
 use boards::{BOARDS, Board};
-pub(crate) use boards::{built, image_build};
+pub(crate) use boards::{built, find, image_build};
 pub(crate) use desk::{Who, desk};
 pub(crate) use flash::flash;
 pub(crate) use sizes::{check as check_sizes, sizes};
@@ -48,9 +48,9 @@ pub(crate) fn link() -> Outcome {
 }
 
 /// The emulated board, whose firmware is tested.
-const TESTED: &str = "lm3s6965evb";
+pub(crate) const TESTED: &str = "lm3s6965evb";
 /// Exit code of a test that the system does not allow.
-const NOT_ALLOWED: i32 = 77;
+pub(crate) const NOT_ALLOWED: i32 = 77;
 
 /// Runs the emulated board's firmware against the Linux manager.
 pub(crate) fn test() -> Outcome {
@@ -80,7 +80,7 @@ fn tested_image() -> Result<PathBuf> {
 }
 
 /// The program that runs images, about to be run with one.
-fn tests(image: &Path) -> Run {
+pub(crate) fn tests(image: &Path) -> Run {
     Run::cargo().args(["run", "--quiet", "--package", "cara-firmware-tests", "--", "--image"]).args([image])
 }
 
