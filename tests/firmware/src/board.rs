@@ -27,8 +27,13 @@ pub(crate) struct Bench {
     image: PathBuf,
     table: Arc<Table>,
     shows_logs: bool,
+    /// The board's clock counts instructions.
+    counts: bool,
     cables: Cell<u8>,
 }
+
+/// Where a board's clock counts instructions, each takes 2 to this power of nanoseconds: 1.6 cycles of its 12.5 MHz.
+pub(crate) const INSTRUCTION: u32 = 7;
 
 impl Bench {
     /// Makes the network.
@@ -39,7 +44,12 @@ impl Bench {
         network::run("ip link add bridge0 type bridge")?;
         network::run(&format!("ip address add {MANAGER} brd + dev bridge0"))?;
         network::run("ip link set bridge0 up")?;
-        Ok(Self { image: image.to_owned(), table: Arc::new(table), shows_logs, cables: Cell::new(0) })
+        Ok(Self { image: image.to_owned(), table: Arc::new(table), shows_logs, counts: false, cables: Cell::new(0) })
+    }
+
+    /// Times on its boards are counted in instructions, and do not depend on how busy this machine is.
+    pub(crate) fn counting(self) -> Self {
+        Self { counts: true, ..self }
     }
 
     /// A cable with nothing at its end yet.
@@ -80,6 +90,7 @@ impl Bench {
             .arg(format!("enable=on,target=native,arg=agv,arg={told}"))
             .arg("-kernel")
             .arg(&self.image)
+            .args(self.counts.then(|| ["-icount".to_owned(), format!("shift={INSTRUCTION}")]).into_iter().flatten())
             .arg("-nic")
             .arg(format!(
                 "tap,ifname={},script=no,downscript=no,model=stellaris,mac=52:54:00:00:00:{number:02x}",
@@ -120,6 +131,30 @@ impl Cable {
     pub(crate) fn pull(&self) -> Result<()> {
         network::run(&format!("ip link set {} down", self.name))
     }
+
+    /// Cuts one of its wires: nothing goes that way any more, and neither end is told.
+    pub(crate) fn cut(&self, way: Way) -> Result<()> {
+        let Self { name, .. } = self;
+        let (hook, port) = match way {
+            Way::ToBoard => ("output", "oifname"),
+            Way::FromBoard => ("input", "iifname"),
+        };
+        network::run(&format!("nft add table bridge {name}"))?;
+        network::run(&format!("nft add chain bridge {name} cut {{ type filter hook {hook} priority 0 ; }}"))?;
+        network::run(&format!("nft add rule bridge {name} cut {port} {name} drop"))
+    }
+
+    /// Joins the wire that was cut.
+    pub(crate) fn join(&self) -> Result<()> {
+        network::run(&format!("nft delete table bridge {}", self.name))
+    }
+}
+
+/// One of the ways through a cable.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Way {
+    ToBoard,
+    FromBoard,
 }
 
 /// What a board is told.
@@ -157,11 +192,16 @@ impl Board {
 
     /// Waits until the board has logged `text` at or behind line `from`; the number of the line behind it.
     pub(crate) fn logs_behind(&self, from: usize, text: &str) -> Result<usize> {
+        self.finds(from, text).map(|(line, _)| line)
+    }
+
+    /// As [`logs_behind`](Self::logs_behind), with what the line says.
+    pub(crate) fn finds(&self, from: usize, text: &str) -> Result<(usize, String)> {
         let deadline = Instant::now() + LONG;
         let mut lines = self.log.lock();
         loop {
-            if let Some(at) = lines.iter().skip(from).position(|line| line.contains(text)) {
-                return Ok(from + at + 1);
+            if let Some((at, line)) = lines.iter().enumerate().skip(from).find(|(_, line)| line.contains(text)) {
+                return Ok((at + 1, line.clone()));
             }
             let left = deadline.saturating_duration_since(Instant::now());
             if left.is_zero() {
@@ -174,6 +214,11 @@ impl Board {
     /// The last line so far that contains `text`.
     pub(crate) fn last_with(&self, text: &str) -> Option<String> {
         self.log.lock().iter().rev().find(|line| line.contains(text)).cloned()
+    }
+
+    /// The lines logged at or behind line `from`.
+    pub(crate) fn lines(&self, from: usize) -> Vec<String> {
+        self.log.lock().iter().skip(from).cloned().collect()
     }
 
     /// Lines logged so far.

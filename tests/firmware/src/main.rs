@@ -8,6 +8,7 @@ mod board;
 mod checks;
 mod count;
 mod desk;
+mod faults;
 mod load;
 mod manager;
 mod places;
@@ -63,6 +64,8 @@ enum Part {
         #[arg(long)]
         profile: bool,
     },
+    /// Makes things fail while a vehicle drives, and measures how long its motors go on.
+    Faults(faults::Faults),
     /// Puts a board on the desk, with its manager and a prompt for `cara`.
     Desk(desk::Desk),
 }
@@ -103,6 +106,7 @@ fn inside(arguments: &Arguments) -> Result<()> {
         Some(Part::Instructions { of, profile }) => {
             count::run(&Bench::new(&arguments.image, arguments.logs)?, &arguments.image, *of, *profile)
         }
+        Some(Part::Faults(faults)) => faults::run(Bench::new(&arguments.image, arguments.logs)?.counting(), faults),
         Some(Part::Stack { of }) => load::run(&Bench::new(&arguments.image, arguments.logs)?, *of),
         _ => run(arguments),
     }

@@ -116,12 +116,29 @@ pub(crate) fn arrives(peer: &Peer, target: [i64; 2]) -> Result<()> {
     Ok(())
 }
 
-/// A manager for itself, until it is killed or its standard input ends: it sends the vehicle of its fleet on a long way.
+/// A call that announces a fault to a board's test image, or makes it fail.
+pub(crate) fn fault(kind: i64) -> Result<Parameters> {
+    let mut parameters = Parameters::new();
+    parameters.add_int("kind", 1)?;
+    parameters.set_value("kind", kind)?;
+    Ok(parameters)
+}
+
+/// A manager for itself, until it is killed or its standard input ends: it sends the vehicle of its fleet on a long way,
+/// and announces its end when it is told to.
 pub(crate) fn stand_alone() -> Result<()> {
     let manager = Manager::start()?;
     let agv = manager.meet(&Who::agv(17))?;
     agv.block_request("go_to", &mut at([1_000, 0])?)?;
     println!("driving");
-    let _ = std::io::stdin().lines().next();
+    for line in std::io::stdin().lines() {
+        if line? == ANNOUNCE {
+            agv.block_request("fault", &mut fault(0)?)?;
+            println!("announced");
+        }
+    }
     Ok(())
 }
+
+/// Tells a manager for itself to announce its end.
+pub(crate) const ANNOUNCE: &str = "announce";

@@ -19,6 +19,7 @@ pub mod reset;
 pub mod tasks;
 
 use core::net::SocketAddr;
+use core::sync::atomic::{AtomicBool, Ordering};
 
 use cara_apps::agv::{Agv, BATTERY, GO_TO, GO_TO_LEASE, POS_INFO, Progress, STOP, TICK};
 use cara_apps::mechanic;
@@ -45,6 +46,14 @@ pub const SOCKETS: usize = VehicleResources::SOCKETS + 1;
 /// Whether somebody wants the vehicle to drive. An interrupt of the motors can read it: `DRIVING.is_live(now())` is
 /// false in time also when no task runs any more.
 pub static DRIVING: Lease = Lease::new();
+/// Whether the vehicle has somewhere to go.
+static HAS_TARGET: AtomicBool = AtomicBool::new(false);
+
+/// Whether the motors may run now: the vehicle has somewhere to go, and somebody wants it to. The interrupt of a board's
+/// motors asks this each time, and cuts them off otherwise; so they stand in time also when no task runs any more.
+pub fn may_move() -> bool {
+    HAS_TARGET.load(Ordering::Acquire) && DRIVING.is_live(now())
+}
 
 /// Why there is no vehicle.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
@@ -134,6 +143,7 @@ fn offer(vehicle: Vehicle) -> Result<(), Error> {
     });
     let go_to = Handler::method(&|agv: &mut Agv, _, pos| {
         agv.go_to(pos)?;
+        HAS_TARGET.store(true, Ordering::Release);
         info!("driving");
         Ok(())
     });
@@ -147,7 +157,8 @@ fn offer(vehicle: Vehicle) -> Result<(), Error> {
 }
 
 /// Stops the motors.
-fn stand_still(agv: &mut Agv) {
+pub fn stand_still(agv: &mut Agv) {
+    HAS_TARGET.store(false, Ordering::Release);
     if let Some(place) = agv.stop() {
         let [_x, _y] = place.rounded();
         info!("stopped at {} {}", _x, _y);
@@ -160,7 +171,11 @@ pub async fn drive(vehicle: Vehicle) -> ! {
     loop {
         ticker.next().await;
         // The state is lent to services between awaits only, so it is free here.
-        let progress = vehicle.with_state(|agv| agv.step(TICK, DRIVING.is_live(now())));
+        let progress = vehicle.with_state(|agv| {
+            let progress = agv.step(TICK, DRIVING.is_live(now()));
+            HAS_TARGET.store(agv.target().is_some(), Ordering::Release);
+            progress
+        });
         match progress {
             Ok(Some(Progress::Arrived(place))) => {
                 let [_x, _y] = place.rounded();

@@ -2,8 +2,7 @@
 //! command line (QEMU: `-semihosting-config …,arg=agv,arg="name=agv-17 id=17 manager=depot/1 address=dhcp"`), in the
 //! text form of [`Settings`].
 //!
-//! `seed=N` among them replaces the random seed, for tests in which each life draws the same numbers; `hang` adds a
-//! service that never returns, for tests of the watchdog.
+//! `seed=N` among them replaces the random seed, for tests in which each life draws the same numbers.
 
 use cara_settings::{Settings, TextError};
 use heapless::String;
@@ -17,8 +16,6 @@ pub struct Told {
     pub settings: Settings,
     /// The random seed, if it is to be a certain one.
     pub seed: Option<u64>,
-    /// Whether a service is wanted that never returns.
-    pub hang: bool,
 }
 
 /// Why the board does not know who it is.
@@ -35,14 +32,9 @@ pub fn read() -> Result<Told, ArgumentError> {
     let arguments = semihosting::experimental::env::args::<BYTES>().map_err(|_| ArgumentError::None)?;
     let mut text: String<BYTES> = String::new();
     let mut seed = None;
-    let mut hang = false;
     // The first one is the program's name.
     for argument in (&arguments).into_iter().skip(1) {
         for word in argument.unwrap_or_default().split_whitespace() {
-            if word == "hang" {
-                hang = true;
-                continue;
-            }
             match word.strip_prefix("seed=").map(str::parse) {
                 Some(Ok(number)) => seed = Some(number),
                 Some(Err(_)) => return Err(ArgumentError::None),
@@ -51,7 +43,7 @@ pub fn read() -> Result<Told, ArgumentError> {
         }
     }
     let settings = text.parse().map_err(ArgumentError::Settings)?;
-    Ok(Told { settings, seed, hang })
+    Ok(Told { settings, seed })
 }
 
 /// A seed from the host's clock: an emulated board has no source of noise.

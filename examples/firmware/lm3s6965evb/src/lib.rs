@@ -1,5 +1,5 @@
 //! What the board lm3s6965evb needs below embassy: Ethernet controller, clock, executor, stack paint, faults, watchdog,
-//! and its settings. The board exists for QEMU's sake: an emulated Cortex-M3 on which firmware is tested.
+//! motors, and its settings. The board exists for QEMU's sake: an emulated Cortex-M3 on which firmware is tested.
 //!
 //! "Data sheet" is Texas Instruments, *Stellaris LM3S6965 Microcontroller*, DS-LM3S6965; register names are as there.
 
@@ -10,6 +10,10 @@ pub mod clock;
 pub mod ethernet;
 pub mod executor;
 pub mod fault;
+#[cfg(feature = "faults")]
+pub mod faults;
+pub mod motor;
+mod note;
 mod register;
 pub mod reset;
 pub mod stack;

@@ -19,6 +19,10 @@ pub(crate) struct Block(usize);
 pub(crate) const ETHERNET: Block = Block(0x4004_8000);
 /// General-purpose timer 0.
 pub(crate) const TIMER_0: Block = Block(0x4003_0000);
+/// General-purpose timer 1.
+pub(crate) const TIMER_1: Block = Block(0x4003_1000);
+/// General-purpose inputs and outputs, port F.
+pub(crate) const PORT_F: Block = Block(0x4002_5000);
 /// System control.
 pub(crate) const SYSTEM: Block = Block(0x400F_E000);
 /// Watchdog timer.

@@ -2,8 +2,8 @@
 
 use cara_vehicle::reset::Reason;
 
+use crate::note::{self, Note};
 use crate::register::{Register, SYSTEM};
-use crate::watchdog;
 
 const RESC: Register = SYSTEM.at(0x05C);
 const EXTERNAL: u32 = 1;
@@ -17,10 +17,10 @@ pub fn reason() -> Reason {
     let cause = RESC.read();
     RESC.write(0);
     let has = |bit| cause & bit != 0;
-    let ran_out = watchdog::has_reset();
+    let note = note::take();
     match () {
-        () if has(WATCHDOG) || ran_out => Reason::Watchdog,
-        () if has(SOFTWARE) => Reason::Program,
+        () if has(WATCHDOG) || note == Some(Note::Watchdog) => Reason::Watchdog,
+        () if has(SOFTWARE) || note == Some(Note::Program) => Reason::Program,
         () if has(BROWN_OUT) => Reason::BrownOut,
         () if has(POWER_ON) => Reason::PowerOn,
         () if has(EXTERNAL) => Reason::Pin,

@@ -1,11 +1,11 @@
 //! Starts the board again when nobody feeds it (data sheet, Watchdog Timer). A handler that hangs ends so.
 //!
-//! When it runs out for the first time its interrupt leaves a note in memory that a reset does not clear; when it runs
-//! out for the second time, it resets. The note tells the next life why it began: the emulated chip's own register does
-//! not.
+//! When it runs out for the first time its interrupt leaves a note for the next life (`note.rs`); when it runs out
+//! for the second time, it resets.
 
 use lm3s6965::{Interrupt, interrupt};
 
+use crate::note::{self, Note};
 use crate::register::{Register, SYSTEM, WATCHDOG, unmask};
 
 const RCGC0: Register = SYSTEM.at(0x100);
@@ -50,39 +50,13 @@ impl Watchdog {
     }
 }
 
-/// Whether the life before this one ended because nobody fed the watchdog. Asking clears the note.
-pub(crate) fn has_reset() -> bool {
-    note::take()
-}
-
 #[allow(unsafe_code)]
-mod note {
+mod handlers {
     use super::*;
-    use core::cell::UnsafeCell;
-    use core::mem::MaybeUninit;
 
-    struct Note(UnsafeCell<MaybeUninit<u32>>);
-
-    // SAFETY: a word, written whole by the interrupt and read whole before the watchdog runs.
-    unsafe impl Sync for Note {}
-
-    /// Not touched when the program starts.
-    #[unsafe(link_section = ".uninit.watchdog")]
-    static NOTE: Note = Note(UnsafeCell::new(MaybeUninit::uninit()));
-    /// What power leaves in memory is hardly this.
-    const RAN_OUT: u32 = 0x0DD_F00D;
-
-    pub(super) fn take() -> bool {
-        let place = NOTE.0.get().cast::<u32>();
-        // SAFETY: RAM that nobody else uses; volatile, so that whatever power has left there is read as it is.
-        let found = unsafe { place.read_volatile() };
-        unsafe { place.write_volatile(0) };
-        found == RAN_OUT
-    }
-
+    /// The interrupt stays pending: nothing but the reset is to come.
     #[interrupt]
     fn WATCHDOG_TIMER_0() {
-        // SAFETY: as above. The interrupt stays pending: nothing but the reset is to come.
-        unsafe { NOTE.0.get().cast::<u32>().write_volatile(RAN_OUT) };
+        note::leave(Note::Watchdog);
     }
 }

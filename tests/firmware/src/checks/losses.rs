@@ -25,26 +25,6 @@ pub(super) fn hung(bench: &Bench, _: u32) -> Result<String> {
     Ok("TimedOut; it answers again".into())
 }
 
-/// The watchdog ends it, the next life says why it began, and the manager has its vehicle back.
-pub(super) fn hanging_handler(bench: &Bench, _: u32) -> Result<String> {
-    let cable = bench.cable()?;
-    let manager = Manager::start()?;
-    let who = Who { more: "hang", ..Who::agv(17) };
-    let board = bench.board(&cable, &who)?;
-    let agv = manager.meet(&who)?;
-    agv.block_request("go_to", &mut at([1_000, 0])?)?;
-    manager.forget_events();
-    let line = board.line();
-    let ended = agv.block_request("hang", &mut at([0, 0])?);
-    ensure!(matches!(ended, Err(Error::TimedOut | Error::Interrupted)), "{ended:?}");
-    let line = board.logs_behind(line, "started because of Watchdog")?;
-    manager.left(&who)?;
-    board.logs_behind(line, "has joined")?;
-    let agv = manager.meet(&who)?;
-    ensure!(position(&agv)? == [0, 0], "a fresh board has moved");
-    Ok(format!("{ended:?}, started because of Watchdog, stands still"))
-}
-
 pub(super) fn idle_cable(bench: &Bench, _: u32) -> Result<String> {
     let cable = bench.cable()?;
     let manager = Manager::start()?;

@@ -4,11 +4,11 @@
 #![no_main]
 
 use cara_apps::agv::Agv;
-use cara_embassy::{Handler, Runner as UnitRunner, ServiceOptions};
+use cara_embassy::Runner as UnitRunner;
 use cara_lm3s6965evb::arguments::{self, Told};
 use cara_lm3s6965evb::ethernet::Ethernet;
 use cara_lm3s6965evb::watchdog::Watchdog;
-use cara_lm3s6965evb::{executor, fault, reset, stack, start};
+use cara_lm3s6965evb::{executor, fault, motor, reset, stack, start};
 use cara_vehicle::{SOCKETS, Vehicle, VehicleResources};
 use embassy_executor::Spawner;
 use embassy_net::{Runner, StackResources};
@@ -23,11 +23,12 @@ const PRESSED_EVERY: Duration = Duration::from_secs(10);
 #[cortex_m_rt::entry]
 fn main() -> ! {
     let _core = start();
-    cara_vehicle::info!("started because of {}", reset::reason());
+    let motors = if motor::start() { "on" } else { "off" };
+    cara_vehicle::info!("started because of {}, with the motors {=str}", reset::reason(), motors);
     executor::run(|spawner| {
         if let Err(text) = spawn(spawner) {
             cara_vehicle::error!("{=str}", text);
-            semihosting::process::exit(fault::PANICKED)
+            semihosting::process::exit(fault::NOT_STARTED)
         }
     })
 }
@@ -39,7 +40,7 @@ fn spawn(spawner: Spawner) -> Result<(), &'static str> {
     static SOCKETS_MEMORY: ConstStaticCell<StackResources<SOCKETS>> = ConstStaticCell::new(StackResources::new());
     static RESOURCES: StaticCell<VehicleResources> = StaticCell::new();
     const NO_ROOM: &str = "no room for a task";
-    let Told { settings, seed, hang } = arguments::read().map_err(|_| "who am I? The arguments are no settings")?;
+    let Told { settings, seed } = arguments::read().map_err(|_| "who am I? The arguments are no settings")?;
     let seed = seed.unwrap_or_else(arguments::seed);
     let ethernet = ETHERNET.take();
     ethernet.start();
@@ -48,9 +49,8 @@ fn spawn(spawner: Spawner) -> Result<(), &'static str> {
     let resources = RESOURCES.init_with(VehicleResources::new);
     let made = cara_vehicle::vehicle(stack, resources, &settings, seed);
     let (vehicle, unit_runner) = made.map_err(|_| "the settings are of no vehicle")?;
-    if hang {
-        offer_to_hang(vehicle)?;
-    }
+    #[cfg(feature = "faults")]
+    cara_lm3s6965evb::faults::offer(vehicle).map_err(|_| "no room for the test's functions")?;
     cara_vehicle::info!("{=str}/{=u32}", settings.identity.name(), settings.identity.id());
     spawner.spawn(network(network_runner).map_err(|_| NO_ROOM)?);
     spawner.spawn(unit(unit_runner).map_err(|_| NO_ROOM)?);
@@ -58,18 +58,9 @@ fn spawn(spawner: Spawner) -> Result<(), &'static str> {
     spawner.spawn(button(vehicle).map_err(|_| NO_ROOM)?);
     spawner.spawn(watch().map_err(|_| NO_ROOM)?);
     spawner.spawn(stack::report().map_err(|_| NO_ROOM)?);
+    #[cfg(feature = "faults")]
+    spawner.spawn(cara_lm3s6965evb::faults::starve().map_err(|_| NO_ROOM)?);
     Ok(())
-}
-
-/// A service that never returns: the watchdog has to act.
-fn offer_to_hang(vehicle: Vehicle) -> Result<(), &'static str> {
-    let hang = Handler::method(&|_: &mut Agv, _, _| {
-        loop {
-            cortex_m::asm::nop();
-        }
-    });
-    let added = vehicle.add_service("hang()", ServiceOptions::new(), hang);
-    added.and_then(|()| vehicle.publish_my_function_list()).map_err(|_| "no room for a function")
 }
 
 #[embassy_executor::task]

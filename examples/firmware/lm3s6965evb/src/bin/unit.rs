@@ -20,7 +20,7 @@ fn main() -> ! {
         Ok(()) => cara_vehicle::info!("started"),
         Err(text) => {
             cara_vehicle::error!("{=str}", text);
-            semihosting::process::exit(fault::PANICKED)
+            semihosting::process::exit(fault::NOT_STARTED)
         }
     })
 }

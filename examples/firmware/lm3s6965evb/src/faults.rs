@@ -1,0 +1,152 @@
+//! For test images only: a service that makes the board fail, and a record of how long the motors went on behind that.
+//!
+//! All times are read from the board's own clock, so that it does not matter how busy the emulator's host is. A fault is
+//! counted from the last sign before it that the manager wants the vehicle to drive: the call that announced the fault,
+//! or a renewal of the lease that came behind it. The fault itself is later than either, so the motors stand no later
+//! behind it than is measured.
+//!
+//! Log lines are read by `tests/firmware`.
+
+use core::cell::Cell;
+
+use cara_apps::agv::{Agv, GO_TO_LEASE};
+use cara_core::error::{Error, ServiceError};
+use cara_core::time::{Duration as CoreDuration, Instant};
+use cara_embassy::{Handler, Hook, ServiceOptions, now};
+use cara_vehicle::{DRIVING, Vehicle};
+use critical_section::Mutex;
+use embassy_sync::blocking_mutex::raw::CriticalSectionRawMutex;
+use embassy_sync::signal::Signal;
+
+use crate::motor;
+
+/// Makes the board fail: 0 notes that something outside is about to fail, 1 hangs in the handler, 2 starves all tasks,
+/// 3 panics.
+const FAULT: &str = "fault(kind: int)";
+/// Longest turn of the executor while nothing is broken: until it ends, a frame that has arrived may wait.
+const POLL: CoreDuration = CoreDuration::from_millis(20);
+/// A millisecond, to which a lease is exact.
+const STEP: CoreDuration = CoreDuration::from_millis(1);
+
+static STARVING: Signal<CriticalSectionRawMutex, ()> = Signal::new();
+static RECORD: Mutex<Cell<Record>> = Mutex::new(Cell::new(Record::NEW));
+
+#[derive(Clone, Copy)]
+struct Record {
+    /// When the fault was announced.
+    marked: Instant,
+    /// The last tick before which a renewal of the lease was seen.
+    renewed: Instant,
+    /// How far the lease is known to reach.
+    reaches: Instant,
+    /// The last tick.
+    ticked: Instant,
+    /// Longest turn of the executor that has ended.
+    turn: CoreDuration,
+    /// Losses of the manager for which the hook has run.
+    losses: u32,
+}
+
+impl Record {
+    const NEW: Self = Self {
+        marked: Instant::START,
+        renewed: Instant::START,
+        reaches: Instant::START,
+        ticked: Instant::START,
+        turn: CoreDuration::ZERO,
+        losses: 0,
+    };
+
+    fn change<R>(act: impl FnOnce(&mut Self) -> R) -> R {
+        critical_section::with(|section| {
+            let place = RECORD.borrow(section);
+            let mut record = place.get();
+            let result = act(&mut record);
+            place.set(record);
+            result
+        })
+    }
+}
+
+/// Offers the service, and counts losses of the manager.
+pub fn offer(vehicle: Vehicle) -> Result<(), Error> {
+    let fault = Handler::method(&|_: &mut Agv, _, parameters| {
+        let kind = parameters.variable::<i64>("kind").map_err(|_| ServiceError::BadResults)?;
+        Record::change(|record| record.marked = now());
+        fail(kind);
+        Ok(())
+    });
+    vehicle.add_service(FAULT, ServiceOptions::new(), fault)?;
+    let lost: &'static Hook<Agv> = &|agv| {
+        cara_vehicle::stand_still(agv);
+        let losses = Record::change(|record| {
+            record.losses += 1;
+            record.losses
+        });
+        defmt::info!("hook for the lost manager: {=u32}", losses);
+    };
+    vehicle.publish_my_function_list()?;
+    vehicle.on_manager_lost(lost);
+    let [lease, poll, tick] = [GO_TO_LEASE.as_micros(), POLL.as_micros(), motor::TICK.as_micros()];
+    defmt::info!("bound: lease={=u64} poll={=u64} tick={=u64}", lease, poll, tick);
+    Ok(())
+}
+
+fn fail(kind: i64) {
+    match kind {
+        1 => hang(),
+        2 => STARVING.signal(()),
+        3 => panic!("asked for"),
+        _ => {}
+    }
+}
+
+fn hang() -> ! {
+    loop {
+        cortex_m::asm::nop();
+    }
+}
+
+/// Once told to, keeps the processor for itself: interrupts run, tasks do not.
+#[embassy_executor::task]
+pub async fn starve() -> ! {
+    STARVING.wait().await;
+    Record::change(|record| record.marked = now());
+    hang()
+}
+
+/// A turn of the executor has ended.
+pub(crate) fn turned(began: Instant) {
+    let turn = now().since(began);
+    Record::change(|record| record.turn = record.turn.max(turn));
+}
+
+/// The motors' interrupt looks: has the lease become longer since the last tick?
+pub(crate) fn tick() {
+    Record::change(|record| {
+        let now = now();
+        if record.reaches <= now || DRIVING.is_live(record.reaches) {
+            record.reaches = record.reaches.max(now);
+            while DRIVING.is_live(record.reaches) {
+                record.reaches = record.reaches + STEP;
+                record.renewed = record.ticked;
+            }
+        }
+        record.ticked = now;
+    });
+}
+
+/// The motors were, and are, on.
+pub(crate) fn switched(before: bool, on: bool) {
+    if before == on {
+        return;
+    }
+    let now = now();
+    let Record { marked, renewed, turn, .. } = Record::change(|record| *record);
+    if on {
+        defmt::info!("motors on");
+        return;
+    }
+    let [marked, renewed] = [marked, renewed].map(|sign| now.since(sign).as_micros());
+    defmt::info!("motors off: announced={=u64} renewed={=u64} turn={=u64}", marked, renewed, turn.as_micros());
+}

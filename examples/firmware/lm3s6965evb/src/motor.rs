@@ -1,0 +1,91 @@
+//! The motors' enable: a pin, and the interrupt that decides about it each millisecond.
+//!
+//! Nothing but the interrupt switches it on, and only while [`cara_vehicle::may_move`]. So the motors stand in time when
+//! a handler hangs, when the unit's task gets no turn, and when the manager is gone; a panic switches them off at once.
+//! At a reset the pin becomes an input: the motors' driver has to pull it down (data sheet, General-Purpose
+//! Input/Outputs; General-Purpose Timers).
+
+use embassy_time::Duration;
+use lm3s6965::{Interrupt, interrupt};
+
+use crate::register::{PORT_F, Register, SYSTEM, TIMER_1, unmask};
+
+/// How often the interrupt looks.
+pub const TICK: Duration = Duration::from_millis(1);
+
+const RCGC1: Register = SYSTEM.at(0x104);
+const RCGC1_TIMER_1: u32 = 1 << 17;
+const RCGC2: Register = SYSTEM.at(0x108);
+const RCGC2_PORT_F: u32 = 1 << 5;
+
+const GPTMCFG: Register = TIMER_1.at(0x000);
+const GPTMTAMR: Register = TIMER_1.at(0x004);
+const GPTMCTL: Register = TIMER_1.at(0x00C);
+const GPTMIMR: Register = TIMER_1.at(0x018);
+const GPTMICR: Register = TIMER_1.at(0x024);
+const GPTMTAILR: Register = TIMER_1.at(0x028);
+const PERIODIC: u32 = 2;
+const ENABLE: u32 = 1;
+const TIMEOUT: u32 = 1;
+
+/// The pin, PF0, at which the board has its LED; its data register reads and writes no other.
+const PIN: u32 = 1;
+const PIN_DATA: Register = PORT_F.at((PIN as usize) << 2);
+const GPIODIR: Register = PORT_F.at(0x400);
+const GPIODEN: Register = PORT_F.at(0x51C);
+
+/// Cycles of the system clock in a microsecond, doubled.
+const CYCLES_DOUBLED: u32 = 25;
+
+/// Makes the pin an output that is off, and lets the interrupt look at the lease. Once, at the start; `true` if the pin
+/// was on before, as nothing but a missing reset could have left it.
+pub fn start() -> bool {
+    RCGC1.set(RCGC1_TIMER_1);
+    RCGC2.set(RCGC2_PORT_F);
+    let was_on = is_on();
+    PIN_DATA.write(0);
+    GPIODIR.set(PIN);
+    GPIODEN.set(PIN);
+    GPTMCTL.write(0);
+    GPTMCFG.write(0);
+    GPTMTAMR.write(PERIODIC);
+    GPTMTAILR.write(TICK.as_micros() as u32 * CYCLES_DOUBLED / 2 - 1);
+    GPTMICR.write(u32::MAX);
+    GPTMIMR.write(TIMEOUT);
+    unmask(Interrupt::TIMER_1A);
+    GPTMCTL.write(ENABLE);
+    was_on
+}
+
+/// Whether the motors run.
+pub fn is_on() -> bool {
+    PIN_DATA.read() & PIN != 0
+}
+
+/// Cuts them off: for whoever has stopped the interrupts for good.
+pub(crate) fn cut_off() {
+    if RCGC2.read() & RCGC2_PORT_F != 0 {
+        switch(false);
+    }
+}
+
+fn switch(on: bool) {
+    #[cfg(feature = "faults")]
+    let before = is_on();
+    PIN_DATA.write(if on { PIN } else { 0 });
+    #[cfg(feature = "faults")]
+    crate::faults::switched(before, on);
+}
+
+#[allow(unsafe_code)]
+mod handlers {
+    use super::*;
+
+    #[interrupt]
+    fn TIMER_1A() {
+        GPTMICR.write(TIMEOUT);
+        #[cfg(feature = "faults")]
+        crate::faults::tick();
+        switch(cara_vehicle::may_move());
+    }
+}

@@ -1,0 +1,94 @@
+//! From a fault to motors that stand: how long that takes at most, beside the bound that follows from the image's constants.
+//!
+//! The image is the AGV's with the feature `faults`. Its clock counts instructions (QEMU's `-icount`), and it measures by
+//! itself, so that a busy host changes nothing but the phase of each fault. A fault is counted from the last sign before
+//! it that the manager wants the vehicle to drive, as the image's `faults` module says.
+
+mod inject;
+mod kind;
+
+use anyhow::{Result, ensure};
+use clap::Args;
+
+use crate::board::{Bench, INSTRUCTION};
+use inject::Desk;
+use kind::{Bound, KINDS, Kind};
+
+/// How often what fails.
+#[derive(Args, Clone, Debug)]
+pub(crate) struct Faults {
+    /// Faults of each kind.
+    #[arg(long, default_value_t = 6)]
+    each: u32,
+    /// Only kinds whose names contain this.
+    #[arg(long, default_value = "")]
+    kind: String,
+    /// From which the moments of the faults follow; drawn if not given.
+    #[arg(long)]
+    seed: Option<u64>,
+}
+
+/// What a fault led to, in microseconds of the board's clock.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Stop {
+    /// From the call that announced the fault until the motors were off.
+    announced: u64,
+    /// From the last renewal of the lease until then.
+    renewed: u64,
+    /// The longest turn of the executor so far.
+    turn: u64,
+}
+
+/// Makes everything fail, prints the table, and fails if any stop took longer than its bound.
+pub(crate) fn run(bench: Bench, faults: &Faults) -> Result<()> {
+    let seed = faults.seed.unwrap_or_else(|| fastrand::u64(..));
+    println!("seed {seed}");
+    let mut dice = fastrand::Rng::with_seed(seed);
+    let kinds: Vec<&Kind> = KINDS.iter().filter(|kind| kind.name.contains(&faults.kind)).collect();
+    ensure!(!kinds.is_empty(), "no kind of fault has `{}` in its name", faults.kind);
+    let mut rows = Vec::new();
+    for kind in kinds {
+        let desk = Desk::new(&bench)?;
+        let bound = desk.bound(kind)?;
+        let stops = (0..faults.each).map(|number| desk.fail(kind, number, &mut dice)).collect::<Result<Vec<Stop>>>()?;
+        rows.push(Row::of(kind, bound, &stops));
+        println!("{}", rows.last().map_or_else(String::new, Row::to_string));
+    }
+    println!("\n{HEAD}");
+    rows.iter().for_each(|row| println!("{row}"));
+    let faults: usize = rows.iter().map(|row| row.faults).sum();
+    println!("\n{faults} faults; one instruction is {} ns of the board's clock", 1 << INSTRUCTION);
+    let late: Vec<&str> = rows.iter().filter(|row| row.longest > row.bound.micros).map(|row| row.kind.name).collect();
+    ensure!(late.is_empty(), "motors went on beyond the bound: {}", late.join(", "));
+    Ok(())
+}
+
+const HEAD: &str = "\
+| fault | times | longest, ms | longest, instructions | bound, ms | of | left, ms |
+|---|---|---|---|---|---|---|";
+
+/// A row of the table.
+struct Row {
+    kind: &'static Kind,
+    bound: Bound,
+    faults: usize,
+    longest: u64,
+}
+
+impl Row {
+    fn of(kind: &'static Kind, bound: Bound, stops: &[Stop]) -> Self {
+        let longest = stops.iter().map(|stop| kind.took(stop)).max().unwrap_or(0);
+        Self { kind, bound, faults: stops.len(), longest }
+    }
+}
+
+impl std::fmt::Display for Row {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { kind, bound, faults, longest } = self;
+        let millis = |micros: i64| micros as f64 / 1_000.0;
+        let instructions = (longest * 1_000) >> INSTRUCTION;
+        let left = bound.micros as i64 - *longest as i64;
+        let (took, allowed, left) = (millis(*longest as i64), millis(bound.micros as i64), millis(left));
+        write!(f, "| {} | {faults} | {took:.1} | {instructions} | {allowed:.1} | {} | {left:.1} |", kind.name, bound.of)
+    }
+}

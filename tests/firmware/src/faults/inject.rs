@@ -1,0 +1,222 @@
+//! One fault after the other, and what has to be so behind each: the motors stand, the hook for a lost manager has run once
+//! and first, no old command moves the vehicle, and a new one does.
+
+use std::path::Path;
+use std::time::Duration;
+
+use anyhow::{Context, Result, ensure};
+use cara_apps::agv::GO_TO_LEASE;
+use cara_processes::Process;
+use cara_std::{CloseReason, Peer, UnitEvent};
+
+use super::Stop;
+use super::kind::{Bound, Failing, Kind};
+use crate::board::{Bench, Board, Cable, LONG, Way, Who};
+use crate::manager::{ANNOUNCE, Manager, at, fault, position};
+
+/// Longer than the pause between two renewals: faults come in every phase of it.
+const PHASES: u64 = 250;
+/// In which a vehicle that drives would be seen to.
+const STANDS: Duration = Duration::from_millis(300);
+/// Times that a drive is begun anew because this machine was too busy to renew a lease in time.
+const TRIES: u32 = 5;
+/// What the board logs.
+const ON: &str = "motors on";
+const OFF: &str = "motors off:";
+const LEFT: &str = "depot has left";
+const HOOK: &str = "hook for the lost manager";
+
+/// A board with its cable.
+pub(super) struct Desk {
+    board: Board,
+    cable: Cable,
+    who: Who,
+    /// The constants that the image has logged.
+    constants: String,
+}
+
+/// A vehicle that drives, and whose fault has been announced.
+struct Drive {
+    agv: Peer,
+    /// Where the log of its motors begins.
+    line: usize,
+}
+
+impl Desk {
+    pub(super) fn new(bench: &Bench) -> Result<Self> {
+        let cable = bench.cable()?;
+        let who = Who::agv(17);
+        let board = bench.board(&cable, &who)?;
+        let (_, constants) = board.finds(0, "bound:")?;
+        Ok(Self { board, cable, who, constants })
+    }
+
+    pub(super) fn bound(&self, kind: &Kind) -> Result<Bound> {
+        Bound::of(kind, &self.constants)
+    }
+
+    /// Makes something fail.
+    pub(super) fn fail(&self, kind: &Kind, number: u32, dice: &mut fastrand::Rng) -> Result<Stop> {
+        let stop = match kind.failing {
+            Failing::Manager { frozen } => self.manager_fails(frozen, dice),
+            Failing::Wire(_) | Failing::Cable => self.link_cut(kind, number, dice),
+            Failing::Board { asked, reason } => self.board_fails(asked, reason, dice),
+        };
+        let stop = stop.with_context(|| format!("{}, number {number}", kind.name))?;
+        stop.check_turn(&self.constants)?;
+        Ok(stop)
+    }
+
+    fn manager_fails(&self, frozen: bool, dice: &mut fastrand::Rng) -> Result<Stop> {
+        let line = self.board.line();
+        let program = std::env::current_exe()?;
+        let mut process = Process::start("manager", Path::new(&program), ["--image", "none", "manager"])?;
+        process.expect("driving", LONG)?;
+        let line = self.board.logs_behind(line, ON)?;
+        pause(dice);
+        process.send(ANNOUNCE)?;
+        process.expect("announced", LONG)?;
+        if frozen {
+            process.freeze()?
+        } else {
+            process.kill()?
+        };
+        let (behind, stop) = self.stopped(line)?;
+        if frozen {
+            // It goes on where it was, which must not move the vehicle; then it ends too.
+            process.thaw()?;
+            process.send(ANNOUNCE)?;
+            process.expect("announced", LONG)?;
+            ensure!(!self.has_logged(behind, ON), "a manager that was frozen moves it");
+        }
+        drop(process);
+        self.lost_once(line)?;
+        let manager = Manager::start()?;
+        let agv = manager.meet(&self.who)?;
+        self.stands(&agv, behind)?;
+        Ok(stop)
+    }
+
+    fn link_cut(&self, kind: &Kind, number: u32, dice: &mut fastrand::Rng) -> Result<Stop> {
+        let manager = Manager::start()?;
+        let Drive { agv, line } = self.drive(&manager, dice)?;
+        self.cut(kind.failing)?;
+        let hears_nothing = kind.failing != Failing::Wire(Way::FromBoard);
+        if hears_nothing {
+            agv.request("go_to", &at([-9_000, 0])?)?;
+        }
+        let (behind, stop) = self.stopped(line)?;
+        if hears_nothing && number.is_multiple_of(2) {
+            // The link is there again before anybody has missed it, and the command comes through, too late.
+            std::thread::sleep(GO_TO_LEASE.into());
+            self.mend(kind.failing)?;
+            manager.event("end of the old command", |event| {
+                matches!(event, UnitEvent::RequestFailed { .. } | UnitEvent::Left { .. })
+            })?;
+        } else {
+            manager.left(&self.who)?;
+            self.lost_once(line)?;
+            self.mend(kind.failing)?;
+        }
+        let agv = manager.meet(&self.who)?;
+        self.stands(&agv, behind)?;
+        self.hooks_follow_losses(line)?;
+        Ok(stop)
+    }
+
+    fn board_fails(&self, asked: i64, reason: &str, dice: &mut fastrand::Rng) -> Result<Stop> {
+        let manager = Manager::start()?;
+        let Drive { agv, line } = self.drive(&manager, dice)?;
+        manager.forget_events();
+        agv.request("fault", &fault(asked)?)?;
+        // Whatever becomes of it, the next life of the board does not run it.
+        let _ = agv.request("go_to", &at([-9_000, 0])?);
+        let (behind, stop) = self.stopped(line)?;
+        let told = format!("started because of {reason}, with the motors off");
+        let started = self.board.logs_behind(behind, &told)?;
+        let left = manager.event("loss", |event| matches!(event, UnitEvent::Left { .. }))?;
+        let restarted = matches!(left, UnitEvent::Left { reason: CloseReason::PeerRestarted | CloseReason::Reset, .. });
+        ensure!(restarted || reason == "Watchdog", "the manager was told {left:?}");
+        self.board.logs_behind(started, "has joined")?;
+        let agv = manager.meet(&self.who)?;
+        ensure!(position(&agv)? == [0, 0], "a fresh board has moved");
+        self.stands(&agv, behind)?;
+        Ok(stop)
+    }
+
+    /// Sends the vehicle on its way, and announces a fault at some moment.
+    fn drive(&self, manager: &Manager, dice: &mut fastrand::Rng) -> Result<Drive> {
+        for _ in 0..TRIES {
+            let agv = manager.meet(&self.who)?;
+            let line = self.board.line();
+            agv.block_request("go_to", &mut at([9_000, 0])?)?;
+            let line = self.board.logs_behind(line, ON)?;
+            pause(dice);
+            agv.block_request("fault", &mut fault(0)?)?;
+            if !self.has_logged(line, OFF) {
+                return Ok(Drive { agv, line });
+            }
+        }
+        anyhow::bail!("in {TRIES} tries no lease was renewed in time")
+    }
+
+    fn cut(&self, failing: Failing) -> Result<()> {
+        match failing {
+            Failing::Wire(way) => self.cable.cut(way),
+            _ => self.cable.pull(),
+        }
+    }
+
+    fn mend(&self, failing: Failing) -> Result<()> {
+        match failing {
+            Failing::Wire(_) => self.cable.join(),
+            _ => self.cable.plug_in(),
+        }
+    }
+
+    /// Waits until the motors stand; the line behind that, and how long it took.
+    fn stopped(&self, line: usize) -> Result<(usize, Stop)> {
+        let (behind, said) = self.board.finds(line, OFF)?;
+        Ok((behind, Stop::read(&said)?))
+    }
+
+    /// Waits until the hook for the lost manager has run, and looks that it ran once and before anything else.
+    fn lost_once(&self, line: usize) -> Result<()> {
+        self.board.logs_behind(line, HOOK)?;
+        let losses = self.hooks_follow_losses(line)?;
+        ensure!(losses == 1, "{losses} losses of one manager");
+        Ok(())
+    }
+
+    /// Behind each loss of the manager comes its hook, once, and nothing in between; how many losses there were.
+    fn hooks_follow_losses(&self, line: usize) -> Result<usize> {
+        // Interrupts run whenever they like.
+        let lines: Vec<String> = self.board.lines(line).into_iter().filter(|line| !line.contains(OFF)).collect();
+        let has = |text: &'static str| move |line: &&String| line.contains(text);
+        let [losses, hooks] = [LEFT, HOOK].map(|text| lines.iter().filter(has(text)).count());
+        let in_order = lines.windows(2).filter(|pair| pair[0].contains(LEFT) && pair[1].contains(HOOK)).count();
+        ensure!(
+            losses == hooks && hooks == in_order,
+            "losses and their hooks do not match:\n    {}",
+            lines.join("\n    ")
+        );
+        Ok(losses)
+    }
+
+    /// Nothing has moved the vehicle since, and nothing does while it is looked at.
+    fn stands(&self, agv: &Peer, behind: usize) -> Result<()> {
+        let place = position(agv)?;
+        std::thread::sleep(STANDS);
+        let still = position(agv)? == place && !self.has_logged(behind, ON);
+        ensure!(still, "it drives again, and nobody told it to");
+        Ok(())
+    }
+
+    fn has_logged(&self, line: usize, text: &str) -> bool {
+        self.board.lines(line).iter().any(|line| line.contains(text))
+    }
+}
+
+fn pause(dice: &mut fastrand::Rng) {
+    std::thread::sleep(Duration::from_millis(dice.u64(..PHASES)));
+}

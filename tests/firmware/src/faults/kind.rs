@@ -1,0 +1,105 @@
+//! What fails, and within which time the motors must stand then.
+
+use anyhow::{Context, Result, ensure};
+use cara_std::Constraints;
+
+use super::Stop;
+use crate::board::Way;
+
+/// What fails.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Failing {
+    /// The manager's process.
+    Manager {
+        /// It gets no turn any more, and its connections stay open; otherwise it is killed.
+        frozen: bool,
+    },
+    /// One wire of the cable is cut.
+    Wire(Way),
+    /// The cable is pulled.
+    Cable,
+    /// The board itself, by what its service does.
+    Board {
+        /// What the service is asked for.
+        asked: i64,
+        /// Why the board says that it started again.
+        reason: &'static str,
+    },
+}
+
+/// A kind of fault.
+pub(super) struct Kind {
+    pub(super) name: &'static str,
+    pub(super) failing: Failing,
+}
+
+/// All of them.
+pub(super) const KINDS: [Kind; 8] = [
+    Kind { name: "manager killed", failing: Failing::Manager { frozen: false } },
+    Kind { name: "manager frozen", failing: Failing::Manager { frozen: true } },
+    Kind { name: "link cut towards the board", failing: Failing::Wire(Way::ToBoard) },
+    Kind { name: "link cut towards the manager", failing: Failing::Wire(Way::FromBoard) },
+    Kind { name: "link cut in both directions", failing: Failing::Cable },
+    Kind { name: "handler in an endless loop", failing: Failing::Board { asked: 1, reason: "Watchdog" } },
+    Kind { name: "runner starved", failing: Failing::Board { asked: 2, reason: "Watchdog" } },
+    Kind { name: "handler panics", failing: Failing::Board { asked: 3, reason: "Program" } },
+];
+
+impl Kind {
+    /// From the last sign before the fault until the motors stood.
+    pub(super) fn took(&self, stop: &Stop) -> u64 {
+        match self.failing {
+            // The manager goes on renewing until it notices.
+            Failing::Wire(Way::FromBoard) => stop.announced,
+            _ => stop.announced.min(stop.renewed),
+        }
+    }
+}
+
+/// Within which time the motors must stand.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Bound {
+    pub(super) micros: u64,
+    /// What it is the sum of.
+    pub(super) of: &'static str,
+}
+
+/// Half periods of keep-alives after which a peer is given up: one and a half until the first is missed, and two more.
+const HALF_PERIODS: u64 = 7;
+
+impl Bound {
+    /// From the constants that the image has logged.
+    pub(super) fn of(kind: &Kind, said: &str) -> Result<Self> {
+        let lease = value(said, "lease=")?;
+        let [poll, tick] = [value(said, "poll=")?, value(said, "tick=")?];
+        let silence = HALF_PERIODS * Constraints::M_UNIT.keep_alive.as_micros() / 2;
+        Ok(match kind.failing {
+            Failing::Board { reason: "Program", .. } => Self { micros: tick, of: "tick" },
+            Failing::Wire(Way::FromBoard) => {
+                Self { micros: silence + lease + poll + tick, of: "silence + lease + poll + tick" }
+            }
+            _ => Self { micros: lease + poll + tick, of: "lease + poll + tick" },
+        })
+    }
+}
+
+impl Stop {
+    /// What the image has logged about one.
+    pub(super) fn read(said: &str) -> Result<Self> {
+        let [announced, renewed, turn] = ["announced=", "renewed=", "turn="].map(|name| value(said, name));
+        Ok(Self { announced: announced?, renewed: renewed?, turn: turn? })
+    }
+
+    /// No turn of the executor may be longer than the bound takes it to be.
+    pub(super) fn check_turn(&self, said: &str) -> Result<()> {
+        let poll = value(said, "poll=")?;
+        ensure!(self.turn <= poll, "a turn of the executor took {} µs, and the bound has {poll} of them", self.turn);
+        Ok(())
+    }
+}
+
+/// The number behind a name in a log line.
+fn value(said: &str, name: &str) -> Result<u64> {
+    let word = said.split_whitespace().find_map(|word| word.strip_prefix(name));
+    word.and_then(|word| word.parse().ok()).with_context(|| format!("no `{name}` in `{said}`"))
+}
