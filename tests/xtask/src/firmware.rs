@@ -3,6 +3,7 @@
 mod bill;
 mod boards;
 mod desk;
+mod faults;
 mod flash;
 mod image;
 mod sizes;
@@ -19,6 +20,7 @@ use crate::install;
 use boards::{BOARDS, Board};
 pub(crate) use boards::{built, find, image_build};
 pub(crate) use desk::{Who, desk};
+pub(crate) use faults::{Faults, check as check_faults, faults};
 pub(crate) use flash::flash;
 pub(crate) use sizes::{check as check_sizes, sizes};
 
@@ -54,10 +56,15 @@ pub(crate) const NOT_ALLOWED: i32 = 77;
 
 /// Runs the emulated board's firmware against the Linux manager.
 pub(crate) fn test() -> Outcome {
+    emulated(tested)
+}
+
+/// What came of a test on the emulated board, which ends with an exit code.
+fn emulated(test: impl FnOnce() -> Result<Option<i32>>) -> Outcome {
     if let Err(reason) = install::program("qemu-system-arm", "qemu-system-arm") {
         return Outcome::Skipped(reason);
     }
-    match tested() {
+    match test() {
         Ok(Some(NOT_ALLOWED)) => Outcome::Skipped("this user cannot make a network with virtual devices".into()),
         Ok(Some(0)) => Outcome::Passed,
         Ok(code) => Outcome::Failed(format!("exit code {code:?}")),

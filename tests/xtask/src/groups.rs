@@ -6,8 +6,8 @@ use anyhow::{Result, bail};
 
 use crate::command::Run;
 use crate::{
-    bad_input, dependencies, firmware, fleet, hygiene, install, instructions, layers, licences, links, manifests, names, panic_free,
-    paper, workspace,
+    bad_input, dependencies, firmware, fleet, hygiene, install, instructions, layers, licences, links, manifests,
+    names, panic_free, paper, workspace,
 };
 
 /// A group of checks that is run and reported as one.
@@ -42,7 +42,7 @@ pub(crate) enum Outcome {
 }
 
 /// All groups, in the order in which they run: cheap ones first.
-pub(crate) const GROUPS: [Group; 21] = [
+pub(crate) const GROUPS: [Group; 22] = [
     Group {
         name: "format",
         what: "every crate is formatted",
@@ -196,6 +196,14 @@ pub(crate) const GROUPS: [Group; 21] = [
         quick: None,
         by_default: true,
         run: |_| firmware::test(),
+    },
+    Group {
+        name: "faults",
+        what: "an emulated vehicle's motors stand within the bound, whatever fails; cargo xtask faults does it 208 times",
+        budget: 300,
+        quick: None,
+        by_default: true,
+        run: |_| firmware::check_faults(),
     },
     Group {
         name: "sizes",

@@ -87,6 +87,8 @@ enum Task {
         #[arg(long, value_name = "FILE")]
         json: Option<PathBuf>,
     },
+    /// Makes things fail while an emulated vehicle drives, and prints how long its motors went on, beside the bound.
+    Faults(firmware::Faults),
     /// Builds the firmware of a board, or of all boards; or runs the emulated one.
     Firmware {
         /// Which board.
@@ -109,6 +111,7 @@ fn main() -> ExitCode {
         Task::Instructions { json, write } => instructions::run(json.as_deref(), write),
         Task::Fleet { nodes, json } => fleet::run(nodes, json.as_deref()),
         Task::Peers { names } => peers::run(&names),
+        Task::Faults(faults) => firmware::faults(&faults),
         Task::Bench(options) => bench::run(&options),
         Task::Firmware { board: Some(board), flash: true, .. } => firmware::flash(&board),
         Task::Firmware { board, desk, .. } if desk.run => firmware::desk(board.as_deref(), &desk),

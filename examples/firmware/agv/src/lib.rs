@@ -21,7 +21,7 @@ pub mod tasks;
 use core::net::SocketAddr;
 use core::sync::atomic::{AtomicBool, Ordering};
 
-use cara_apps::agv::{Agv, BATTERY, GO_TO, GO_TO_LEASE, POS_INFO, Progress, STOP, TICK};
+use cara_apps::agv::{Agv, BATTERY, GO_TO, GO_TO_LEASE, POS_INFO, Place, Progress, STOP, TICK};
 use cara_apps::mechanic;
 use cara_core::config::Priority;
 use cara_core::error::{Cause, Error};
@@ -160,9 +160,13 @@ fn offer(vehicle: Vehicle) -> Result<(), Error> {
 pub fn stand_still(agv: &mut Agv) {
     HAS_TARGET.store(false, Ordering::Release);
     if let Some(place) = agv.stop() {
-        let [_x, _y] = place.rounded();
-        info!("stopped at {} {}", _x, _y);
+        tell_stop(place);
     }
+}
+
+fn tell_stop(place: Place) {
+    let [_x, _y] = place.rounded();
+    info!("stopped at {} {}", _x, _y);
 }
 
 /// The motors' loop: drives while the lease is live.
@@ -182,7 +186,7 @@ pub async fn drive(vehicle: Vehicle) -> ! {
                 vehicle.end_lease("go_to");
                 info!("arrived at {} {}", _x, _y);
             }
-            Ok(Some(Progress::Stopped(_))) => info!("stopped: nobody wants it to drive"),
+            Ok(Some(Progress::Stopped(place))) => tell_stop(place),
             _ => {}
         }
     }

@@ -28,15 +28,17 @@ pub(crate) struct Image {
     pub(crate) program: &'static str,
     /// Whether it tells what it does. An image without logs is built with none of the default features.
     pub(crate) has_logs: bool,
+    /// What only tests want of it, on the emulated board.
+    pub(crate) feature: Option<&'static str>,
 }
 
 impl Image {
     const fn with_logs(program: &'static str) -> Self {
-        Self { name: program, program, has_logs: true }
+        Self { name: program, program, has_logs: true, feature: None }
     }
 
     const fn quiet(name: &'static str, program: &'static str) -> Self {
-        Self { name, program, has_logs: false }
+        Self { name, program, has_logs: false, feature: None }
     }
 
     /// Whether the other images of its kind are compared with it.
@@ -61,6 +63,8 @@ const EMULATED: &[Image] = &[
     Image::quiet("unit-quiet", "unit"),
     Image::quiet("echo-quiet", "echo"),
 ];
+/// The AGV of the emulated board with a service that makes it fail.
+pub(crate) const FAULTS: Image = Image { name: "agv-faults", feature: Some("faults"), ..Image::with_logs("agv") };
 /// Says what each capacity of a unit costs.
 pub(crate) const RESOURCES: Image = Image::with_logs("resources");
 
@@ -139,11 +143,10 @@ impl Board {
             (true, Err(_)) => build.env(RADIO, NO_RADIO),
             _ => build,
         };
-        match (self.feature, image.has_logs) {
-            (Some(feature), _) => build.args(["--no-default-features", "--features", feature]).stream()?,
-            (None, false) => build.args(["--no-default-features"]).stream()?,
-            (None, true) => build.stream()?,
-        }
+        let build =
+            if self.feature.is_some() || !image.has_logs { build.args(["--no-default-features"]) } else { build };
+        let features = self.feature.iter().chain(&image.feature);
+        features.fold(build, |build, feature| build.args(["--features", feature])).stream()?;
         self.kept(image)
     }
 
