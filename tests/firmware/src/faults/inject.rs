@@ -59,7 +59,8 @@ impl Desk {
     pub(super) fn fail(&self, kind: &Kind, number: u32, dice: &mut fastrand::Rng) -> Result<Stop> {
         let stop = match kind.failing {
             Failing::Manager { frozen } => self.manager_fails(frozen, dice),
-            Failing::Wire(_) | Failing::Cable => self.link_cut(kind, number, dice),
+            Failing::Wire(Way::FromBoard) => self.manager_hears_nothing(dice),
+            Failing::Wire(Way::ToBoard) | Failing::Cable => self.link_cut(kind.failing, number, dice),
             Failing::Board { asked, reason } => self.board_fails(asked, reason, dice),
         };
         let stop = stop.with_context(|| format!("{}, number {number}", kind.name))?;
@@ -97,30 +98,41 @@ impl Desk {
         Ok(stop)
     }
 
-    fn link_cut(&self, kind: &Kind, number: u32, dice: &mut fastrand::Rng) -> Result<Stop> {
+    fn link_cut(&self, failing: Failing, number: u32, dice: &mut fastrand::Rng) -> Result<Stop> {
         let manager = Manager::start()?;
         let Drive { agv, line } = self.drive(&manager, dice)?;
-        self.cut(kind.failing)?;
-        let hears_nothing = kind.failing != Failing::Wire(Way::FromBoard);
-        if hears_nothing {
-            agv.request("go_to", &at([-9_000, 0])?)?;
-        }
+        self.cut(failing)?;
+        agv.request("go_to", &at([-9_000, 0])?)?;
         let (behind, stop) = self.stopped(line)?;
-        if hears_nothing && number.is_multiple_of(2) {
+        if number.is_multiple_of(2) {
             // The link is there again before anybody has missed it, and the command comes through, too late.
             std::thread::sleep(GO_TO_LEASE.into());
-            self.mend(kind.failing)?;
-            manager.event("end of the old command", |event| {
-                matches!(event, UnitEvent::RequestFailed { .. } | UnitEvent::Left { .. })
-            })?;
+            self.mend(failing)?;
+            let ends = |event: &UnitEvent| matches!(event, UnitEvent::RequestFailed { .. } | UnitEvent::Left { .. });
+            manager.event("end of the old command", ends)?;
         } else {
             manager.left(&self.who)?;
             self.lost_once(line)?;
-            self.mend(kind.failing)?;
+            self.mend(failing)?;
         }
         let agv = manager.meet(&self.who)?;
         self.stands(&agv, behind)?;
         self.hooks_follow_losses(line)?;
+        Ok(stop)
+    }
+
+    /// The manager hears nothing any more, and wants the vehicle to drive until it notices.
+    fn manager_hears_nothing(&self, dice: &mut fastrand::Rng) -> Result<Stop> {
+        let failing = Failing::Wire(Way::FromBoard);
+        let manager = Manager::start()?;
+        let Drive { line, .. } = self.drive(&manager, dice)?;
+        self.cut(failing)?;
+        manager.left(&self.who)?;
+        let (behind, stop) = self.stopped(line)?;
+        self.lost_once(line)?;
+        self.mend(failing)?;
+        let agv = manager.meet(&self.who)?;
+        self.stands(&agv, behind)?;
         Ok(stop)
     }
 

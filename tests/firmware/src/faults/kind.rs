@@ -1,7 +1,7 @@
 //! What fails, and within which time the motors must stand then.
 
 use anyhow::{Context, Result, ensure};
-use cara_std::Constraints;
+use cara_std::{Constraints, Duration};
 
 use super::Stop;
 use crate::board::Way;
@@ -49,8 +49,9 @@ impl Kind {
     /// From the last sign before the fault until the motors stood.
     pub(super) fn took(&self, stop: &Stop) -> u64 {
         match self.failing {
-            // The manager goes on renewing until it notices.
-            Failing::Wire(Way::FromBoard) => stop.announced,
+            // The manager goes on renewing until it notices, by its own clock: where that took longer, or seems to, its
+            // machine was busy.
+            Failing::Wire(Way::FromBoard) => stop.announced.min(SILENCE.as_micros() + stop.renewed),
             _ => stop.announced.min(stop.renewed),
         }
     }
@@ -64,15 +65,15 @@ pub(super) struct Bound {
     pub(super) of: &'static str,
 }
 
-/// Half periods of keep-alives after which a peer is given up: one and a half until the first is missed, and two more.
-const HALF_PERIODS: u64 = 7;
+/// A peer is given up after so long: one and a half keep-alives until the first is missed, and two more.
+const SILENCE: Duration = Constraints::M_UNIT.keep_alive.times(7).divided_by(2);
 
 impl Bound {
     /// From the constants that the image has logged.
     pub(super) fn of(kind: &Kind, said: &str) -> Result<Self> {
         let lease = value(said, "lease=")?;
         let [poll, tick] = [value(said, "poll=")?, value(said, "tick=")?];
-        let silence = HALF_PERIODS * Constraints::M_UNIT.keep_alive.as_micros() / 2;
+        let silence = SILENCE.as_micros();
         Ok(match kind.failing {
             Failing::Board { reason: "Program", .. } => Self { micros: tick, of: "tick" },
             Failing::Wire(Way::FromBoard) => {
