@@ -47,7 +47,8 @@ pub type ParametersView = ParametersInner<[u8]>;
 #[derive(Clone)]
 pub struct ParametersInner<B: ?Sized> {
     table: [Entry; VARIABLES],
-    count: u8,
+    /// As wide as `used`, so that the bytes behind are aligned and copied word by word.
+    count: u32,
     used: u32,
     bytes: B,
 }
@@ -260,7 +261,7 @@ impl ParametersView {
 
     /// Adds a variable whose name may be one, and is not there.
     pub(crate) fn add_checked(&mut self, name: &str, kind: Type, size: u32) -> Result<(), Error> {
-        let place = self.table.get_mut(usize::from(self.count)).ok_or(Error::Full(Limit::Variables))?;
+        let place = self.table.get_mut(self.count as usize).ok_or(Error::Full(Limit::Variables))?;
         let full = Error::Full(Limit::ParametersBytes);
         let length = kind.bytes_of(size).ok_or(full)?;
         let (_, free) = self.bytes.split_at_mut_checked(self.used as usize).ok_or(full)?;
