@@ -24,7 +24,7 @@ fn main() -> ! {
     executor::run(|spawner| {
         if let Err(text) = spawn(spawner) {
             defmt::error!("{=str}", text);
-            semihosting::process::exit(fault::PANICKED)
+            semihosting::process::exit(fault::NOT_STARTED)
         }
     })
 }
