@@ -1,11 +1,10 @@
 //! How a unit is made: identity first, then whatever differs from the defaults.
 
 use std::hash::{BuildHasher, Hasher, RandomState};
-#[cfg(feature = "access")]
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use cara_core::config::{Constraints, PLAIN_PORT};
+use cara_core::config::Constraints;
 use cara_core::distribution::connection_handler::{Node, NodeConfig, NodeStorage, Target};
 use cara_core::distribution::function_list::{Entry, FunctionList};
 use cara_core::distribution::hello::Manager;
@@ -19,7 +18,8 @@ use crate::access::AccessTable;
 use crate::access::{AccessError, watch::FileWatch};
 use crate::communication_system::{CommunicationSystem, Owner};
 use crate::config::Capacities;
-use crate::engine::{Engine, EngineParts, NodeCell, message_buffer_bytes, system_refused};
+use crate::engine::{Engine, EngineParts, Keys, NodeCell, message_buffer_bytes, system_refused};
+use crate::keys::{KeyError, KeyRing, LiveRing};
 use crate::pool::MessagePool;
 use crate::storage::{filled, filled_with};
 use crate::sys::datagram::Datagrams;
@@ -43,7 +43,8 @@ pub struct Builder<T> {
     constraints: Constraints,
     capacities: Capacities,
     interfaces: Interfaces,
-    discovery_port: u16,
+    keys: KeySource,
+    discovery_port: Option<u16>,
     tcp_port: u16,
     threads: Option<Threads>,
     #[cfg(feature = "control")]
@@ -71,7 +72,8 @@ impl Builder<()> {
             constraints,
             capacities: Capacities::default(),
             interfaces: Interfaces::from_environment(),
-            discovery_port: PLAIN_PORT,
+            keys: KeySource::Insecure,
+            discovery_port: None,
             tcp_port: 0,
             threads: None,
             #[cfg(feature = "control")]
@@ -109,9 +111,28 @@ impl<T: Send + 'static> Builder<T> {
         self
     }
 
-    /// The UDP port of broadcasts, equal for all units that are to meet.
+    /// The file with the unit's keys, instead of where [`place`](crate::keys::place) looks.
+    pub fn key_file(mut self, path: impl Into<PathBuf>) -> Self {
+        self.keys = KeySource::File(path.into());
+        self
+    }
+
+    /// The unit's keys, which follow no file.
+    pub fn keys(mut self, ring: KeyRing) -> Self {
+        self.keys = KeySource::Ring(Box::new(ring));
+        self
+    }
+
+    /// Plain mode: whoever is on the network can read what the unit says, and speak as anybody. It has a port of its own,
+    /// and does not meet units with keys.
+    pub fn insecure(mut self) -> Self {
+        self.keys = KeySource::Insecure;
+        self
+    }
+
+    /// The UDP port of broadcasts, equal for all units that are to meet. Unless set, the port of the unit's mode.
     pub fn discovery_port(mut self, port: u16) -> Self {
-        self.discovery_port = port;
+        self.discovery_port = Some(port);
         self
     }
 
@@ -146,6 +167,7 @@ impl<T: Send + 'static> Builder<T> {
             constraints: self.constraints,
             capacities: self.capacities,
             interfaces: self.interfaces,
+            keys: self.keys,
             discovery_port: self.discovery_port,
             tcp_port: self.tcp_port,
             threads: self.threads,
@@ -181,7 +203,7 @@ impl<T: Send + 'static> Builder<T> {
     }
 
     /// An m_unit; it does nothing until it is started.
-    pub fn build_system(self) -> Result<CommunicationSystem<T>, Error> {
+    pub fn build_system(self) -> Result<CommunicationSystem<T>, BuildError> {
         match self.identity.role() {
             Role::MUnit => {
                 #[cfg(feature = "control")]
@@ -191,23 +213,25 @@ impl<T: Send + 'static> Builder<T> {
                 let system = system.with_control(control);
                 Ok(CommunicationSystem::of(system))
             }
-            Role::SUnit => Err(Error::BadConstraint),
+            Role::SUnit => Err(Error::BadConstraint.into()),
         }
     }
 
     /// An s_unit; it does nothing until it is started.
-    pub fn build_unit(self) -> Result<Unit<T>, Error> {
+    pub fn build_unit(self) -> Result<Unit<T>, BuildError> {
         match self.identity.role() {
             Role::SUnit => Ok(Unit::of(Owner::new(self.engine()?))),
-            Role::MUnit => Err(Error::BadConstraint),
+            Role::MUnit => Err(Error::BadConstraint.into()),
         }
     }
 
-    fn engine(self) -> Result<Arc<Engine<T>>, Error> {
+    fn engine(self) -> Result<Arc<Engine<T>>, BuildError> {
         check(&self.constraints)?;
+        let keys = self.keys.open(&self.identity, self.fleet)?;
+        let discovery_port = self.discovery_port.unwrap_or(keys.mode().port());
         let own_threads = self.threads.is_none();
         let threads = self.threads.map_or_else(Threads::of_one, Ok)?;
-        let datagrams = Datagrams::open(self.interfaces, self.discovery_port)?;
+        let datagrams = Datagrams::open(self.interfaces, discovery_port)?;
         let listener = match self.identity.role() {
             Role::MUnit => Some(Listener::open(self.interfaces.bind_address(), self.tcp_port).map_err(listen_error)?),
             Role::SUnit => None,
@@ -237,11 +261,12 @@ impl<T: Send + 'static> Builder<T> {
             Publications::new(filled(capacities.functions, false), filled(capacities.published_to_one, None));
         let functions =
             FunctionList::new(filled_with(capacities.functions, Entry::empty), filled(capacities.signature_bytes, 0));
-        let size = message_buffer_bytes(&self.constraints);
+        let size = message_buffer_bytes(&self.constraints, keys.mode());
         let parts = EngineParts {
             threads,
             own_threads,
             capacities,
+            keys,
             node: NodeCell::new(node, publications, nodes + REMEMBERED_NODES),
             functions,
             pool: MessagePool::new(size, capacities.message_buffers, KEPT_BUFFERS),
@@ -259,6 +284,35 @@ impl<T: Send + 'static> Builder<T> {
             engine.follow(watch)?;
         }
         Ok(engine)
+    }
+}
+
+/// Why a unit is not made.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum BuildError {
+    /// Something about the unit itself, or what the system refuses.
+    #[error(transparent)]
+    Unit(#[from] Error),
+    /// It has no keys, or none that can be used.
+    #[error(transparent)]
+    Keys(#[from] KeyError),
+}
+
+/// Where the keys of a unit are to come from.
+enum KeySource {
+    Insecure,
+    File(PathBuf),
+    Ring(Box<KeyRing>),
+}
+
+impl KeySource {
+    fn open(self, identity: &Identity, fleet: Fleet) -> Result<Keys, KeyError> {
+        Ok(Keys::Ring(match self {
+            Self::Insecure => return Ok(Keys::Insecure),
+            Self::File(path) => LiveRing::open(&path, identity, fleet)?,
+            Self::Ring(ring) => LiveRing::fixed(*ring),
+        }))
     }
 }
 

@@ -23,7 +23,7 @@ use cara_core::time::Duration;
 use core::net::IpAddr;
 
 use crate::access::AccessTable;
-use crate::builder::{self, Builder};
+use crate::builder::{self, BuildError, Builder};
 #[cfg(feature = "control")]
 use crate::control::{self, Control, Server};
 use crate::engine::{Engine, lock, pairs, read};
@@ -130,7 +130,7 @@ impl<T: Send + 'static> WeakSystem<T> {
 
 impl CommunicationSystem {
     /// An m_unit with defaults (paper, listing line 1).
-    pub fn new(name: &str, id: u32) -> Result<Self, Error> {
+    pub fn new(name: &str, id: u32) -> Result<Self, BuildError> {
         Self::builder(name, id)?.build_system()
     }
 

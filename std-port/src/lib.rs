@@ -43,8 +43,8 @@ mod threads;
 pub mod timers;
 mod unit;
 
-pub use builder::Builder;
-pub use cara_core::config::{Constraints, PLAIN_PORT, Priority};
+pub use builder::{BuildError, Builder};
+pub use cara_core::config::{Constraints, Mode, PLAIN_PORT, Priority, SECURED_PORT};
 pub use cara_core::distribution::connection_handler::Finding;
 pub use cara_core::distribution::function::{Attributes, Definition, Signature, VariableSpec};
 pub use cara_core::distribution::hello::{Limits, Manager};

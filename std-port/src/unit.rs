@@ -11,7 +11,7 @@ use cara_core::services::requests::CallId;
 use cara_core::time::Duration;
 
 use crate::access::AccessTable;
-use crate::builder::{self, Builder, manager};
+use crate::builder::{self, BuildError, Builder, manager};
 use crate::communication_system::Owner;
 use crate::engine::{Engine, lock, pairs, read};
 use crate::event::UnitEvent;
@@ -53,7 +53,7 @@ impl<T: Send + 'static> WeakUnit<T> {
 
 impl Unit {
     /// An s_unit with defaults, which joins the manager of the given name and id and no other.
-    pub fn new(name: &str, id: u32, manager_name: &str, manager_id: u32) -> Result<Self, Error> {
+    pub fn new(name: &str, id: u32, manager_name: &str, manager_id: u32) -> Result<Self, BuildError> {
         Self::builder(name, id, manager_name, manager_id)?.build_unit()
     }
 

@@ -3,7 +3,6 @@
 use cara_core::distribution::connection_handler::Sorted;
 use cara_core::error::Error;
 use cara_core::host::mailman::LinkId;
-use cara_core::host::secure::Plain;
 use cara_core::time::Instant;
 use core::net::SocketAddr;
 
@@ -46,9 +45,10 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     fn datagram(&self, from: SocketAddr, bytes: &mut [u8]) {
+        let codes = self.keys.codes();
         let (sorted, twin) = {
             let mut cell = lock(&self.node);
-            (cell.node.datagram(self.clock.now(), from, bytes, &Plain), cell.node.take_twin())
+            (cell.node.datagram(self.clock.now(), from, bytes, &codes), cell.node.take_twin())
         };
         if let Some(address) = twin {
             self.twin_heard(address);

@@ -8,10 +8,10 @@ use std::thread::Thread;
 use cara_core::distribution::function_list::Slot;
 use cara_core::error::{CloseReason, Error};
 use cara_core::host::mailman::{LinkId, Mailman};
-use cara_core::host::secure::Plain;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::Session;
 use cara_core::time::Instant;
+use cara_secure::link::Cipher;
 use core::net::SocketAddr;
 
 use super::Registration;
@@ -40,7 +40,7 @@ pub(crate) struct LinkCell {
 
 /// What the lock of a link protects.
 pub(crate) struct LinkState {
-    pub(crate) session: Session<Boxed, Plain>,
+    pub(crate) session: Session<Boxed, Cipher>,
     pub(crate) waiters: Vec<Waiter>,
     pub(crate) reader: Reader,
     /// The last handler that ran for this link was quick.
@@ -116,7 +116,7 @@ impl LinkCell {
         id: LinkId,
         serial: u32,
         stream: Stream,
-        session: Session<Boxed, Plain>,
+        session: Session<Boxed, Cipher>,
         connecting: bool,
     ) -> Self {
         let state = LinkState {

@@ -8,7 +8,6 @@ use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::identity::Identity;
 use cara_core::error::{CloseReason, Error, Limit, Refusal};
 use cara_core::host::mailman::LinkId;
-use cara_core::host::secure::Plain;
 use cara_core::services::publications::Publications;
 use cara_core::services::unit::{Session, SessionConfig};
 use cara_core::time::{Duration, Instant};
@@ -73,7 +72,7 @@ impl<T: Send + 'static> Engine<T> {
         };
         let dialed = dialed.is_some();
         let config = SessionConfig { link: id, dialed, address, local, constraints };
-        let session = Session::new(now, config, Plain, storage);
+        let session = Session::new(now, config, self.keys.cipher(), storage);
         let link = Arc::new(LinkCell::new(self.seat()?, id, serial, stream, session, dialed));
         *links.get_mut(index)? = Some(link.clone());
         drop(links);
@@ -365,7 +364,7 @@ impl<T: Send + 'static> Engine<T> {
             let (action, next) = {
                 let mut cell = lock(&self.node);
                 let mut mailman = StdMailman { stream: None, datagrams: &self.datagrams };
-                let action = cell.node.poll(self.clock.now(), &mut mailman, &Plain);
+                let action = cell.node.poll(self.clock.now(), &mut mailman, &self.keys.codes());
                 (action, cell.node.next_deadline())
             };
             if action.is_none() {

@@ -10,6 +10,7 @@ mod calling;
 mod clock_thread;
 mod driving;
 mod interfaces;
+mod keys;
 pub(crate) mod link;
 mod membership;
 pub(crate) mod peers;
@@ -28,6 +29,7 @@ pub(crate) use accounts::{Group, Reading};
 #[cfg(any(feature = "async", feature = "control"))]
 pub(crate) use calling::CallFuture;
 pub(crate) use clock_thread::system_refused;
+pub(crate) use keys::Keys;
 pub(crate) use membership::NodeCell;
 pub(crate) use workers::arena_bytes;
 
@@ -35,16 +37,17 @@ use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{SyncSender, TrySendError};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 
-use cara_core::config::Constraints;
+use cara_core::config::{Constraints, Mode};
 use cara_core::distribution::function_list::FunctionList;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error};
 use cara_core::host::mailman::LinkId;
-use cara_core::host::secure::{Plain, Seal};
+use cara_core::host::secure::Seal;
 use cara_core::services::access::Access;
 use cara_core::services::unit::{Call, Event, Session, buffer_bytes};
 use cara_core::services::{Context, requests::CallId};
 use cara_core::time::{Duration, Instant};
+use cara_secure::link::Cipher;
 
 use crate::clock::Clock;
 use crate::config::Capacities;
@@ -96,6 +99,9 @@ pub(crate) struct Engine<T: 'static> {
     /// Links on which a thread of the pool stays.
     stays: Mutex<Vec<LinkId>>,
     interfaces: Mutex<interfaces::InterfaceWatch>,
+    pub(crate) keys: Keys,
+    /// When the file with the keys is looked at.
+    keys_due: Mutex<Instant>,
     stopping: AtomicBool,
     /// When the unit was made.
     born: Instant,
@@ -138,6 +144,7 @@ pub(crate) struct EngineParts<T: 'static> {
     pub(crate) threads: Threads,
     pub(crate) own_threads: bool,
     pub(crate) capacities: Capacities,
+    pub(crate) keys: Keys,
     pub(crate) node: NodeCell,
     pub(crate) functions: FunctionList<Boxed, Handler<T>>,
     pub(crate) pool: MessagePool,
@@ -170,6 +177,8 @@ impl<T: Send + 'static> Engine<T> {
             largest_function: AtomicUsize::new(0),
             stays: Mutex::new(Vec::new()),
             interfaces: Mutex::default(),
+            keys: parts.keys,
+            keys_due: Mutex::new(born),
             stopping: AtomicBool::new(false),
             born,
             accounts: accounts::Accounts::default(),
@@ -188,7 +197,7 @@ impl<T: Send + 'static> Engine<T> {
         &self,
         link: &LinkCell,
         state: &mut LinkState,
-        act: impl FnOnce(&mut Session<Boxed, Plain>, &mut Lent<'_, T>) -> R,
+        act: impl FnOnce(&mut Session<Boxed, Cipher>, &mut Lent<'_, T>) -> R,
     ) -> R {
         let functions = read(&self.functions);
         let mut mailman = StdMailman { stream: Some(&link.stream), datagrams: &self.datagrams };
@@ -224,6 +233,9 @@ impl<T: Send + 'static> Engine<T> {
                 self.step(link, state, rest, arguments.as_deref_mut().filter(|_| call.is_none()), own.as_deref_mut());
             position += step.consumed;
             call = call.or(step.call);
+            if step.introduced {
+                self.prove(link, state);
+            }
             if step.hello {
                 self.admit(link, state);
             }
@@ -260,12 +272,13 @@ impl<T: Send + 'static> Engine<T> {
             consumed: receipt.consumed,
             paused: receipt.paused,
             progress: receipt.consumed > 0 || receipt.event.is_some(),
+            introduced: false,
             hello: false,
             call: None,
         };
         match receipt.event {
-            // Plain links prove nothing.
-            None | Some(Event::Introduced) => {}
+            None => {}
+            Some(Event::Introduced) => step.introduced = true,
             Some(Event::Hello) => step.hello = true,
             Some(Event::Call(call)) => step.call = Some(call),
             Some(Event::Reply(id, outcome)) => match own.filter(|own| own.id == id) {
@@ -400,7 +413,7 @@ impl<T: Send + 'static> Engine<T> {
             cell.longest_message()
         };
         // Buffers first: peers send longer messages as soon as they are told.
-        self.pool.resize(message_buffer_bytes(&constraints));
+        self.pool.resize(message_buffer_bytes(&constraints, self.keys.mode()));
         self.longest_message.store(longest, Ordering::Release);
         for link in self.each_link() {
             let mut state = link.lock();
@@ -467,8 +480,8 @@ impl<T: Send + 'static> Engine<T> {
 }
 
 /// Bytes of a buffer of the pool.
-pub(crate) fn message_buffer_bytes(constraints: &Constraints) -> usize {
-    2 * buffer_bytes(constraints.message_size, Plain.overhead())
+pub(crate) fn message_buffer_bytes(constraints: &Constraints, mode: Mode) -> usize {
+    2 * buffer_bytes(constraints.message_size, Cipher::new(mode).overhead())
 }
 
 /// What one step of feeding led to.
@@ -477,6 +490,7 @@ struct Step {
     paused: bool,
     /// Something was consumed or came out: there may be more.
     progress: bool,
+    introduced: bool,
     hello: bool,
     call: Option<Call>,
 }

@@ -160,9 +160,9 @@ mod tests {
     use cara_core::distribution::hello::{Hello, Limits};
     use cara_core::distribution::identity::{Epoch, Fleet};
     use cara_core::host::mailman::LinkId;
-    use cara_core::host::secure::Plain;
     use cara_core::services::unit::{Session, SessionConfig, SessionStorage};
     use cara_core::time::Instant;
+    use cara_secure::link::Cipher;
 
     use super::*;
     use crate::storage::{filled, filled_with};
@@ -199,7 +199,7 @@ mod tests {
             stamp: 0,
         };
         let config = SessionConfig { link: LinkId(0), dialed: true, address, local, constraints: Constraints::M_UNIT };
-        let session = Session::new(Instant::START, config, Plain, storage);
+        let session = Session::new(Instant::START, config, Cipher::new(cara_core::config::Mode::Plain), storage);
         Arc::new(LinkCell::new(0, LinkId(0), serial, Stream::connect(address).unwrap(), session, true))
     }
 

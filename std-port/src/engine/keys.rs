@@ -1,0 +1,132 @@
+//! The keys of a unit that runs: what proves it on each link, and how they follow their file.
+
+use std::sync::Arc;
+
+use cara_core::config::Mode;
+use cara_core::distribution::identity::Identity;
+use cara_core::error::Refusal;
+use cara_core::time::{Duration, Instant};
+use cara_secure::keyring::{Codes, Keyring};
+use cara_secure::link::{Cipher, Credentials};
+
+use super::link::{LinkCell, LinkState};
+use super::{Engine, lock};
+use crate::keys::{DiscoveryKey, KeyRing, LiveRing, PairKey, draw};
+
+/// The file is looked at this often, and whenever somebody comes for whom there is no key.
+const REFRESH: Duration = Duration::from_secs(3);
+
+/// Where a unit's keys come from.
+#[derive(Debug)]
+pub(crate) enum Keys {
+    /// Plain mode.
+    Insecure,
+    Ring(LiveRing),
+}
+
+/// What the core sees of a ring: the newest generation and the one before it.
+#[derive(Clone, Debug)]
+pub(crate) struct View(Arc<KeyRing>);
+
+impl Keyring for View {
+    fn discovery(&self) -> (&DiscoveryKey, Option<&DiscoveryKey>) {
+        (self.0.discovery(), self.0.discoveries().nth(1).map(|(_, key)| key))
+    }
+
+    fn pair(&self, peer: &Identity) -> Option<(PairKey, Option<PairKey>)> {
+        let mut keys = self.0.pairs(peer).map(|(_, key)| key.clone());
+        keys.next().map(|key| (key, keys.next()))
+    }
+}
+
+impl Keys {
+    pub(crate) const fn mode(&self) -> Mode {
+        match self {
+            Self::Insecure => Mode::Plain,
+            Self::Ring(_) => Mode::Secured,
+        }
+    }
+
+    /// The cipher of a link that begins.
+    pub(crate) fn cipher(&self) -> Cipher {
+        Cipher::new(self.mode())
+    }
+
+    /// The codes of discovery, with the keys as they are now.
+    pub(crate) fn codes(&self) -> Codes<View> {
+        match self {
+            Self::Insecure => Codes::Plain,
+            Self::Ring(live) => Codes::Keyed(View(live.ring())),
+        }
+    }
+
+    /// What proves this unit to `peer`; of a vehicle that was added just now as well.
+    fn credentials(&self, peer: &Identity) -> Option<Credentials> {
+        let Self::Ring(live) = self else { return None };
+        let fresh = draw().inspect_err(|error| tracing::error!(%error, "no link can be proven")).ok()?;
+        let found = View(live.ring()).credentials(peer, *fresh);
+        if found.is_some() || !refresh(live) {
+            return found;
+        }
+        View(live.ring()).credentials(peer, *fresh)
+    }
+}
+
+/// Whether there is another ring now. A file that is refused is told once, and the ring stays as it was.
+fn refresh(live: &LiveRing) -> bool {
+    match live.refresh() {
+        Ok(changed) => {
+            if changed {
+                let ring = live.ring();
+                tracing::info!(generation = ring.generation(), peers = ring.peers().len(), "the keys have changed");
+            }
+            changed
+        }
+        Err(error) => {
+            tracing::error!(%error, "the keys stay as they were");
+            false
+        }
+    }
+}
+
+impl<T: Send + 'static> Engine<T> {
+    /// The peer of a secured link says who it is: each proves to the other that it has the pair's key.
+    pub(super) fn prove(&self, link: &Arc<LinkCell>, state: &mut LinkState) {
+        let Some(peer) = state.session.identity().cloned() else { return };
+        match self.keys.credentials(&peer) {
+            Some(credentials) => self.with(link, state, |session, cx| session.prove(cx, credentials)),
+            None => {
+                lock(&self.node).node.refuse_without_key(self.now(), state.session.address(), &peer);
+                self.with(link, state, |session, cx| session.refuse(cx, Refusal::NoKey));
+            }
+        }
+    }
+
+    /// Looks at the file with the keys if it is time; returns when it will be.
+    pub(super) fn watch_keys(&self) -> Instant {
+        let Keys::Ring(live) = &self.keys else { return Instant::FAR_FUTURE };
+        let now = self.now();
+        {
+            let mut due = lock(&self.keys_due);
+            if now < *due {
+                return *due;
+            }
+            *due = now + REFRESH;
+        }
+        if refresh(live) {
+            self.end_links_without_keys(&live.ring());
+        }
+        now + REFRESH
+    }
+
+    /// Who was revoked loses its link.
+    fn end_links_without_keys(&self, ring: &KeyRing) {
+        for link in self.each_link() {
+            let mut state = link.lock();
+            if state.session.identity().is_some_and(|peer| ring.pair(peer).is_none()) {
+                self.with(&link, &mut state, |session, cx| session.refuse(cx, Refusal::NoKey));
+            }
+            self.settle(&link, state);
+        }
+    }
+}

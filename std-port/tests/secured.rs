@@ -1,0 +1,179 @@
+//! Units with keys, over real sockets on loopback: who has the key of the pair gets in, and nobody else.
+
+use std::hash::{BuildHasher, Hasher, RandomState};
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use cara_std::keys::{FleetKeys, Store, place};
+use cara_std::{
+    BuildError, Builder, Call, CloseReason, CommunicationSystem, Fleet, Identity, Interfaces, Parameters,
+    ParametersView, Refusal, ServiceError, Unit, UnitEvent,
+};
+
+const PATIENCE: Duration = Duration::from_secs(20);
+/// Long enough for a vehicle to search, to be answered and to dial several times.
+const LONG_ENOUGH: Duration = Duration::from_secs(3);
+
+fn until(what: &str, condition: impl Fn() -> bool) {
+    let end = Instant::now() + PATIENCE;
+    while !condition() {
+        assert!(Instant::now() < end, "not in time: {what}");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+}
+
+fn fleet() -> Fleet {
+    Fleet(RandomState::new().build_hasher().finish() as u32)
+}
+
+fn depot() -> Identity {
+    Identity::m_unit("depot", 1).unwrap()
+}
+
+fn agv(id: u32) -> Identity {
+    Identity::s_unit("agv", id).unwrap()
+}
+
+/// The keys of a depot and its vehicles.
+fn keys(fleet: Fleet, vehicles: &[u32]) -> FleetKeys {
+    let mut keys = FleetKeys::draw(fleet).unwrap();
+    keys.add(&depot(), &[]).unwrap();
+    vehicles.iter().for_each(|id| keys.add(&agv(*id), &[]).unwrap());
+    keys
+}
+
+fn manager(fleet: Fleet) -> Builder<()> {
+    CommunicationSystem::builder("depot", 1).unwrap().fleet(fleet.0).interfaces(Interfaces::Loopback)
+}
+
+fn vehicle(fleet: Fleet, id: u32) -> Builder<()> {
+    Unit::builder("agv", id, "depot", 1).unwrap().fleet(fleet.0).interfaces(Interfaces::Loopback)
+}
+
+fn started_manager(builder: Builder<()>) -> CommunicationSystem {
+    let manager = builder.build_system().unwrap();
+    manager.start().unwrap();
+    manager
+}
+
+/// A vehicle that doubles a number and sends a text back.
+fn started_vehicle(builder: Builder<()>) -> Unit {
+    let agv = builder.build_unit().unwrap();
+    let double = |_: &Call, view: &mut ParametersView| -> Result<(), ServiceError> {
+        let number: i64 = view.variable("number").map_err(|_| ServiceError::BadResults)?;
+        view.set_value("number", 2 * number).map_err(|_| ServiceError::BadResults)
+    };
+    agv.my_function_list().add_function("double", &number(0), double).unwrap();
+    let echo = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+    agv.my_function_list().add_function("echo", &text(""), echo).unwrap();
+    agv.publish_my_function_list().unwrap();
+    agv.start().unwrap();
+    agv
+}
+
+fn number(value: i64) -> Parameters {
+    let mut number = Parameters::new();
+    number.add_int("number", 1).unwrap();
+    number.set_value("number", value).unwrap();
+    number
+}
+
+fn text(value: &str) -> Parameters<40_000> {
+    let mut text = Parameters::<40_000>::sized();
+    text.add_string("text", 20_000).unwrap();
+    text.set_value("text", value).unwrap();
+    text
+}
+
+fn joined(manager: &CommunicationSystem, count: usize) {
+    until("the vehicles have joined", || manager.number_of_s_units() == count);
+    for peer in manager.s_units() {
+        assert!(peer.wait_for_function("echo", cara_std::Duration::from_secs(5)));
+    }
+}
+
+fn stays_out(manager: &CommunicationSystem) {
+    std::thread::sleep(LONG_ENOUGH);
+    assert_eq!(manager.number_of_s_units(), 0);
+}
+
+#[test]
+fn units_with_the_pair_s_key_meet_and_call_each_other() {
+    let fleet = fleet();
+    let keys = keys(fleet, &[7]);
+    let manager = started_manager(manager(fleet).keys(keys.ring(&depot()).unwrap()));
+    let agv = started_vehicle(vehicle(fleet, 7).keys(keys.ring(&agv(7)).unwrap()));
+    joined(&manager, 1);
+    let peer = manager.s_units().remove(0);
+    for value in 0..100 {
+        let mut parameters = number(value);
+        peer.block_request("double", &mut parameters).unwrap();
+        assert_eq!(parameters.variable::<i64>("number"), Ok(2 * value));
+    }
+    let long = "x".repeat(20_000);
+    let mut parameters = text(&long);
+    peer.block_request("echo", &mut parameters).unwrap();
+    assert_eq!(parameters.variable::<&str>("text"), Ok(&*long));
+    // Keep-alives are sealed as well: the link outlives the time in which silence would end it.
+    std::thread::sleep(Duration::from_secs(4));
+    assert!(peer.is_connected() && agv.is_connected());
+}
+
+#[test]
+fn a_vehicle_of_another_root_stays_out() {
+    let fleet = fleet();
+    let manager = started_manager(manager(fleet).keys(keys(fleet, &[7]).ring(&depot()).unwrap()));
+    let _foreign = started_vehicle(vehicle(fleet, 7).keys(keys(fleet, &[7]).ring(&agv(7)).unwrap()));
+    stays_out(&manager);
+}
+
+#[test]
+fn plain_and_secured_units_do_not_meet_even_on_one_port() {
+    let fleet = fleet();
+    let keys = keys(fleet, &[7, 8]);
+    for port in [None, Some(24_971)] {
+        let on = |builder: Builder<()>| port.into_iter().fold(builder, Builder::discovery_port);
+        let secured = started_manager(on(manager(fleet).keys(keys.ring(&depot()).unwrap())));
+        let plain = started_vehicle(on(vehicle(fleet, 7).insecure()));
+        stays_out(&secured);
+        secured.stop();
+        plain.stop();
+        let plain = started_manager(on(manager(fleet).insecure()));
+        let _secured = started_vehicle(on(vehicle(fleet, 8).keys(keys.ring(&agv(8)).unwrap())));
+        stays_out(&plain);
+    }
+}
+
+/// Adding a vehicle restarts nothing, and who is revoked is gone.
+#[test]
+fn a_running_manager_follows_its_key_file() {
+    let fleet = fleet();
+    let folder = tempfile::tempdir().unwrap();
+    let mut store = Store::create(folder.path(), keys(fleet, &[7])).unwrap();
+    store.save().unwrap();
+    let file = |node: &Identity| folder.path().join(place::file_name(node, fleet));
+    let manager = started_manager(manager(fleet).key_file(file(&depot())));
+    let events = manager.events();
+    let start = |id| started_vehicle(vehicle(fleet, id).key_file(file(&agv(id))));
+    let _first = start(7);
+    joined(&manager, 1);
+
+    store.keys_mut().add(&agv(8), &[]).unwrap();
+    store.save().unwrap();
+    let _second = start(8);
+    joined(&manager, 2);
+
+    store.keys_mut().revoke(&[agv(7)]).unwrap();
+    store.save().unwrap();
+    until("the revoked one is gone", || manager.number_of_s_units() == 1);
+    assert_eq!(manager.s_units()[0].identity(), &agv(8));
+    let left = UnitEvent::Left { peer: agv(7), reason: CloseReason::Refused(Refusal::NoKey) };
+    assert!(events.try_iter().any(|event| event == left));
+}
+
+#[test]
+fn without_keys_the_error_says_which_command_makes_them() {
+    let missing = Path::new("/nonexistent/depot.keys");
+    let error = manager(fleet()).key_file(missing).build_system().map(drop).unwrap_err();
+    assert!(matches!(error, BuildError::Keys(_)), "{error}");
+}
