@@ -2,7 +2,7 @@
 
 use std::net::{Ipv4Addr, TcpListener, UdpSocket};
 
-use cara_std::{Capacities, CommunicationSystem, Error, Limit};
+use cara_std::{BuildError, Capacities, CommunicationSystem, Error, Limit};
 
 use crate::support::{ask, fleet, meet, number, service, system, unit};
 
@@ -15,7 +15,10 @@ fn a_port_in_use_is_an_error_that_says_what_to_do() {
     agv.my_function_list().add_function("echo", &number(0), service(|number| number)).unwrap();
     let (peer, _) = meet(&manager, &agv);
 
-    let refused = |system: Result<CommunicationSystem, Error>| system.map(drop).unwrap_err();
+    let refused = |system: Result<CommunicationSystem, BuildError>| match system.map(drop).unwrap_err() {
+        BuildError::Unit(error) => error,
+        other => panic!("{other}"),
+    };
     let stream = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
     let taken = stream.local_addr().unwrap().port();
     assert_eq!(refused(system(fleet).tcp_port(taken).build_system()), Error::PortInUse);

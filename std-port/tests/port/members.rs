@@ -3,7 +3,7 @@
 use std::sync::mpsc::Receiver;
 use std::time::Duration;
 
-use cara_std::{CloseReason, Constraints, Error, Refusal, UnitEvent};
+use cara_std::{BuildError, CloseReason, Constraints, Error, Refusal, UnitEvent};
 
 use crate::support::{PATIENCE, ask, counter, fleet, meet, number, service, system, system_named, unit, until};
 
@@ -178,7 +178,7 @@ fn a_fixed_address_needs_no_broadcast() {
     let manager = system(fleet).build_system().unwrap();
     let port = manager.tcp_port();
     let taken = system(fleet).tcp_port(port).build_system();
-    assert!(matches!(taken, Err(Error::PortInUse)), "the port is taken");
+    assert!(matches!(taken, Err(BuildError::Unit(Error::PortInUse))), "the port is taken");
     let agv = unit("agv", 7, fleet).manager_address(([127, 0, 0, 1], port).into()).build_unit().unwrap();
     meet(&manager, &agv);
     assert_eq!(counter(&agv.counters(), "WhoHasSent"), 0);
