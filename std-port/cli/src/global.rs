@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use cara_std::{Interfaces, PLAIN_PORT};
+use cara_std::{Interfaces, PLAIN_PORT, SECURED_PORT};
 use clap::Args;
 
 use crate::name_and_id::NameAndId;
@@ -36,9 +36,13 @@ pub(crate) struct Global {
     /// The fleet to be in; 0 unless told.
     #[arg(long, global = true, value_name = "NUMBER")]
     pub(crate) fleet: Option<u32>,
-    /// The UDP port of broadcasts; 21970 unless told.
+    /// The UDP port of broadcasts; 21970 unless told, 21971 with keys.
     #[arg(long, global = true, value_name = "PORT")]
     pub(crate) discovery_port: Option<u16>,
+    /// With --as, and for `node`: the file with the unit's keys. Without one it is in plain mode, where anybody on the
+    /// network can speak as anybody.
+    #[arg(long, global = true, value_name = "FILE")]
+    pub(crate) key_file: Option<PathBuf>,
     /// Use loopback only.
     #[arg(long, global = true)]
     pub(crate) loopback: bool,
@@ -52,7 +56,7 @@ impl Global {
 
     /// The UDP port of broadcasts.
     pub(crate) fn port(&self) -> u16 {
-        self.discovery_port.unwrap_or(PLAIN_PORT)
+        self.discovery_port.unwrap_or(if self.key_file.is_some() { SECURED_PORT } else { PLAIN_PORT })
     }
 
     /// How long a command as a manager waits for nodes.

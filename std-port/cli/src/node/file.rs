@@ -20,6 +20,7 @@ pub(super) struct File {
     pub(super) role: Maybe<Role>,
     pub(super) fleet: Option<u32>,
     pub(super) interfaces: Option<Interfaces>,
+    pub(super) keys: Option<String>,
     pub(super) discovery_port: Maybe<u16>,
     pub(super) tcp_port: Maybe<u16>,
     pub(super) manager: Maybe<Manager>,

@@ -4,7 +4,7 @@ use std::net::{SocketAddr, TcpListener};
 use std::sync::Arc;
 
 use anyhow::Context;
-use cara_std::{Error, PLAIN_PORT};
+use cara_std::{BuildError, Error, PLAIN_PORT, SECURED_PORT};
 use serde_json::json;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::iterator::Signals;
@@ -65,7 +65,15 @@ fn offer_all(node: &Node, settings: &Settings, programs: &Arc<Programs>) -> anyh
 }
 
 /// Which value of the file the unit could not be built with.
-fn not_built(error: Error, settings: &Settings) -> anyhow::Error {
+fn not_built(error: BuildError, settings: &Settings) -> anyhow::Error {
+    match error {
+        BuildError::Unit(error) => not_made(error, settings),
+        BuildError::Keys(error) => crate::keys::failed(error),
+        other => Ended::failed("Failed", other.to_string()),
+    }
+}
+
+fn not_made(error: Error, settings: &Settings) -> anyhow::Error {
     let in_use = error == Error::PortInUse;
     let address = settings.interfaces.bind_address();
     let is_free = |port: &Placed<u16>| TcpListener::bind((address, port.value)).is_ok();
@@ -99,7 +107,8 @@ fn listen(place: &Placed<SocketAddr>, settings: &Settings) -> anyhow::Result<Tcp
 /// One line for whoever waits for the node.
 fn tell_up(settings: &Settings, node: &Node, metrics: Option<SocketAddr>, global: &Global) -> anyhow::Result<()> {
     let Settings { name, id, fleet, .. } = settings;
-    let discovery = settings.discovery_port.as_ref().map_or(PLAIN_PORT, |port| port.value);
+    let usual = if settings.key_file.is_some() { SECURED_PORT } else { PLAIN_PORT };
+    let discovery = settings.discovery_port.as_ref().map_or(usual, |port| port.value);
     let metrics = metrics.map(|address| format!("http://{address}/metrics"));
     let (tcp, control) = (node.tcp_port(), node.control_path());
     if global.json {

@@ -2,6 +2,7 @@
 
 use std::net::SocketAddr;
 use std::ops::Range;
+use std::path::PathBuf;
 
 use cara_std::control::Control;
 use cara_std::{Capacities, Constraints, Identity, Interfaces};
@@ -28,6 +29,8 @@ pub(super) struct Settings {
     pub(super) manager: Option<Manager>,
     pub(super) fleet: u32,
     pub(super) interfaces: Interfaces,
+    /// The file with its keys; none for plain mode.
+    pub(super) key_file: Option<PathBuf>,
     pub(super) discovery_port: Option<Placed<u16>>,
     pub(super) tcp_port: Option<Placed<u16>>,
     pub(super) constraints: Constraints,
@@ -54,6 +57,7 @@ pub(super) struct Overrides {
     pub(super) id: Option<u32>,
     pub(super) fleet: Option<u32>,
     pub(super) interfaces: Option<Interfaces>,
+    pub(super) key_file: Option<PathBuf>,
     pub(super) discovery_port: Option<u16>,
     pub(super) tcp_port: Option<u16>,
     pub(super) metrics: Option<SocketAddr>,
@@ -110,6 +114,7 @@ fn checked(source: Source, file: &File, over: &Overrides, mistakes: &mut Vec<Mis
             .interfaces
             .or_else(|| file.interfaces.map(Interfaces::from))
             .unwrap_or_else(Interfaces::from_environment),
+        key_file: over.key_file.clone().or_else(|| file.keys.as_ref().map(PathBuf::from)),
         discovery_port: discovery_port(file, over, mistakes),
         tcp_port: tcp_port(file, role, over, mistakes),
         constraints: limits::constraints(&file.constraints, role, mistakes),

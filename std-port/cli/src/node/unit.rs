@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::mpsc::Receiver;
 
-use cara_std::{Builder, CommunicationSystem, Constraints, Error, MyFunctionList, Unit, UnitEvent};
+use cara_std::{BuildError, Builder, CommunicationSystem, Constraints, Error, MyFunctionList, Unit, UnitEvent};
 
 use super::http::Metrics;
 use super::settings::Settings;
@@ -17,18 +17,18 @@ pub(super) enum Node {
 
 impl Node {
     /// Builds the unit; it does nothing until it is started.
-    pub(super) fn build(settings: &Settings) -> Result<Self, Error> {
+    pub(super) fn build(settings: &Settings) -> Result<Self, BuildError> {
         let Settings { name, id, .. } = settings;
         let Some(manager) = &settings.manager else {
             let builder = CommunicationSystem::builder(name, *id)?;
-            return with(builder, settings).build_system().map(Self::Manager);
+            return Ok(Self::Manager(with(builder, settings).build_system()?));
         };
         let builder = Unit::builder(name, *id, &manager.name, manager.id)?;
         let builder = match manager.address {
             Some(address) => builder.manager_address(address),
             None => builder,
         };
-        with(builder, settings).build_unit().map(Self::Vehicle)
+        Ok(Self::Vehicle(with(builder, settings).build_unit()?))
     }
 
     pub(super) fn start(&self) -> Result<(), Error> {
@@ -110,6 +110,7 @@ fn with(builder: Builder<()>, settings: &Settings) -> Builder<()> {
     let builder = builder.fleet(settings.fleet).interfaces(settings.interfaces);
     let builder = builder.constraints(settings.constraints).capacities(settings.capacities);
     let builder = builder.control(settings.control.clone());
+    let builder = settings.key_file.iter().fold(builder, Builder::key_file);
     let builder = match &settings.discovery_port {
         Some(port) => builder.discovery_port(port.value),
         None => builder,

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use cara_std::control::Control;
 use cara_std::control::protocol::FunctionInfo;
 use cara_std::survey::Survey;
-use cara_std::{CommunicationSystem, Constraints, Fleet};
+use cara_std::{BuildError, Builder, CommunicationSystem, Constraints, Fleet};
 
 use super::{Need, Operator, running};
 use crate::exit::Ended;
@@ -38,7 +38,12 @@ pub(super) fn start(identity: &NameAndId, global: &Global) -> anyhow::Result<Com
         .constraints(constraints)
         .control(Control::Off)
         .tcp_port(global.as_port.unwrap_or(0));
-    let system = builder.build_system().map_err(network)?;
+    let builder = global.key_file.iter().fold(builder, Builder::key_file);
+    let system = builder.build_system().map_err(|error| match error {
+        BuildError::Keys(error) => crate::keys::failed(error),
+        BuildError::Unit(error) => network(error),
+        other => Ended::failed("Failed", other.to_string()),
+    })?;
     system.start().map_err(network)?;
     Ok(system)
 }

@@ -23,7 +23,7 @@ use cara_core::services::unit::RequestOptions;
 use cara_core::time::{Duration, Instant};
 use cara_std::access::AccessTable;
 use cara_std::{
-    Call, Capacities, CommunicationSystem, Interfaces, LeaseWatch, MyFunctionList, Peer, ServiceOptions, Unit as SUnit,
+    BuildError, Call, Capacities, CommunicationSystem, Interfaces, LeaseWatch, MyFunctionList, Peer, ServiceOptions, Unit as SUnit,
     UnitEvent,
 };
 
@@ -279,7 +279,7 @@ impl LinuxNode {
         }
     }
 
-    fn build(&self) -> Result<Machine, Error> {
+    fn build(&self) -> Result<Machine, BuildError> {
         let Spec { role, name, id, constraints, their_functions, message_buffers, .. } = &self.spec;
         let builder = match role {
             SpecRole::Manager => CommunicationSystem::builder(name, *id)?,
@@ -293,7 +293,7 @@ impl LinuxNode {
         let builder = builder.fleet(self.fleet).constraints(*constraints).capacities(capacities);
         let builder = builder.interfaces(Interfaces::Loopback);
         if *role == SpecRole::Manager {
-            return builder.build_system().map(Machine::Manager);
+            return Ok(Machine::Manager(builder.build_system()?));
         }
         let builder = match self.dials {
             Some(address) => builder.manager_address(address),
