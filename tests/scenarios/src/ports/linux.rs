@@ -23,8 +23,8 @@ use cara_core::services::unit::RequestOptions;
 use cara_core::time::{Duration, Instant};
 use cara_std::access::AccessTable;
 use cara_std::{
-    BuildError, Call, Capacities, CommunicationSystem, Interfaces, LeaseWatch, MyFunctionList, Peer, ServiceOptions, Unit as SUnit,
-    UnitEvent,
+    BuildError, Call, Capacities, CommunicationSystem, Interfaces, LeaseWatch, MyFunctionList, Peer, ServiceOptions,
+    Unit as SUnit, UnitEvent,
 };
 
 use super::relay::{Relay, Way};
