@@ -64,7 +64,7 @@ impl Desk {
             Failing::Board { asked, reason } => self.board_fails(asked, reason, dice),
         };
         let stop = stop.with_context(|| format!("{}, number {number}", kind.name))?;
-        stop.check_turn(&self.constants)?;
+        stop.check(&self.constants)?;
         Ok(stop)
     }
 

@@ -91,10 +91,14 @@ impl Stop {
         Ok(Self { announced: announced?, renewed: renewed?, turn: turn? })
     }
 
-    /// No turn of the executor may be longer than the bound takes it to be.
-    pub(super) fn check_turn(&self, said: &str) -> Result<()> {
-        let poll = value(said, "poll=")?;
-        ensure!(self.turn <= poll, "a turn of the executor took {} µs, and the bound has {poll} of them", self.turn);
+    /// No turn of the executor may be longer than the bound takes it to be, and no lease may last longer than it does.
+    pub(super) fn check(&self, said: &str) -> Result<()> {
+        let [lease, poll, tick] = ["lease=", "poll=", "tick="].map(|name| value(said, name));
+        let (poll, tick) = (poll?, tick?);
+        let allowed = lease? + poll + tick;
+        let Self { renewed, turn, .. } = self;
+        ensure!(*turn <= poll, "a turn of the executor took {turn} µs, and the bound has {poll} of them");
+        ensure!(*renewed <= allowed, "motors off {renewed} µs behind the last renewal, and {allowed} are allowed");
         Ok(())
     }
 }
