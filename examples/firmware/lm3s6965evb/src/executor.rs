@@ -31,10 +31,14 @@ pub fn run(first: impl FnOnce(Spawner)) -> ! {
         cortex_m::interrupt::disable();
         // An interrupt that comes after this look still ends the wait, and runs when interrupts are on again.
         if !WOKEN.load(Ordering::Acquire) {
+            #[cfg(feature = "faults")]
+            crate::faults::sleeps(true);
             cortex_m::asm::wfi();
         }
         WOKEN.store(false, Ordering::Relaxed);
         // SAFETY: this is no part of a critical section.
         unsafe { cortex_m::interrupt::enable() };
+        #[cfg(feature = "faults")]
+        crate::faults::sleeps(false);
     }
 }

@@ -41,6 +41,10 @@ struct Record {
     reaches: Instant,
     /// The last tick.
     ticked: Instant,
+    /// The processor sleeps, or has just been woken by an interrupt.
+    sleeps: bool,
+    /// How late the emulator was to wake the processor for the last tick, because its host was busy: no chip is.
+    late: CoreDuration,
     /// Longest turn of the executor that has ended.
     turn: CoreDuration,
     /// Losses of the manager for which the hook has run.
@@ -53,6 +57,8 @@ impl Record {
         renewed: Instant::START,
         reaches: Instant::START,
         ticked: Instant::START,
+        sleeps: false,
+        late: CoreDuration::ZERO,
         turn: CoreDuration::ZERO,
         losses: 0,
     };
@@ -121,6 +127,11 @@ pub(crate) fn turned(began: Instant) {
     Record::change(|record| record.turn = record.turn.max(turn));
 }
 
+/// The processor is going to sleep, or has run the interrupts that woke it.
+pub(crate) fn sleeps(it_does: bool) {
+    Record::change(|record| record.sleeps = it_does);
+}
+
 /// The motors' interrupt looks: has the lease become longer since the last tick?
 pub(crate) fn tick() {
     Record::change(|record| {
@@ -132,6 +143,13 @@ pub(crate) fn tick() {
                 record.renewed = record.ticked;
             }
         }
+        let gap = now.since(record.ticked);
+        let tick = CoreDuration::from_micros(motor::TICK.as_micros());
+        record.late = if record.sleeps {
+            CoreDuration::from_micros(gap.as_micros().saturating_sub(tick.as_micros()))
+        } else {
+            CoreDuration::ZERO
+        };
         record.ticked = now;
     });
 }
@@ -142,11 +160,12 @@ pub(crate) fn switched(before: bool, on: bool) {
         return;
     }
     let now = now();
-    let Record { marked, renewed, turn, .. } = Record::change(|record| *record);
+    let Record { marked, renewed, turn, late, .. } = Record::change(|record| *record);
     if on {
         defmt::info!("motors on");
         return;
     }
     let [marked, renewed] = [marked, renewed].map(|sign| now.since(sign).as_micros());
-    defmt::info!("motors off: announced={=u64} renewed={=u64} turn={=u64}", marked, renewed, turn.as_micros());
+    let [turn, late] = [turn, late].map(CoreDuration::as_micros);
+    defmt::info!("motors off: announced={=u64} renewed={=u64} late={=u64} turn={=u64}", marked, renewed, late, turn);
 }

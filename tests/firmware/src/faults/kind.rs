@@ -87,8 +87,9 @@ impl Bound {
 impl Stop {
     /// What the image has logged about one.
     pub(super) fn read(said: &str) -> Result<Self> {
-        let [announced, renewed, turn] = ["announced=", "renewed=", "turn="].map(|name| value(said, name));
-        Ok(Self { announced: announced?, renewed: renewed?, turn: turn? })
+        let late = value(said, "late=")?;
+        let since = |name| value(said, name).map(|micros| micros.saturating_sub(late));
+        Ok(Self { announced: since("announced=")?, renewed: since("renewed=")?, turn: value(said, "turn=")? })
     }
 
     /// No turn of the executor may be longer than the bound takes it to be, and no lease may last longer than it does.
