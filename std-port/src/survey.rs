@@ -28,10 +28,10 @@ use std::net::{SocketAddr, SocketAddrV4, UdpSocket};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use cara_core::config::Mode;
 use cara_core::distribution::datagram::{Announce, Datagram, Header, SEARCH_BYTES, WhoHas};
 use cara_core::distribution::identity::{Epoch, Fleet, Identity};
 use cara_core::error::Error;
+use cara_core::host::secure::Plain;
 
 use self::heard::News;
 pub use self::heard::{Foreign, Heard, Reach};
@@ -190,7 +190,7 @@ impl Survey {
             known: Default::default(),
         };
         let mut bytes = [0; SEARCH_BYTES];
-        let length = question.encode(Mode::Plain, fleet, &mut bytes).map_or(0, <[u8]>::len);
+        let length = question.encode(fleet, &Plain, &mut bytes).map_or(0, <[u8]>::len);
         (bytes, length)
     }
 

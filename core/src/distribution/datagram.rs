@@ -8,9 +8,14 @@
 //! | 6–7 | zero |
 //! | 8–11 | fleet, little-endian |
 //! | 12– | who-has, announce: postcard; session: link u16, zero u16, nonce u64, body |
+//!
+//! In secured mode codes follow who-has and announce: at the end the fleet's, over all before it; before it, in an answer
+//! to one unit, that of the pair. A who-has is filled with zeros to the length of the longest answer, so that nobody is
+//! sent more because somebody asked in its name.
 
 use serde::{Deserialize, Serialize};
 
+use super::authenticator::{Authenticator, CODE_BYTES};
 use super::hello::Manager;
 use super::identity::{Epoch, Fleet, Identity, Role};
 use crate::config::{Mode, VERSION};
@@ -27,6 +32,8 @@ pub const SESSION_HEADER_BYTES: usize = 24;
 pub const KNOWN_NODES: usize = 64;
 /// Longest who-has.
 pub const SEARCH_BYTES: usize = 512;
+/// Longest announce of secured mode, and the shortest who-has.
+pub const ANSWER_BYTES: usize = 120;
 
 /// "Who is there?", broadcast (paper: "one node broadcasts a message containing its identifier").
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -97,6 +104,10 @@ pub enum DatagramError {
     Version(u8),
     /// Another fleet, this one.
     Fleet(Fleet),
+    /// The code that shows that it comes from the fleet is wrong, or there is none.
+    Forged,
+    /// It is an answer to one unit, and the code that shows that it is for this one is wrong.
+    NotForUs,
     /// The rest cannot be read.
     Malformed,
 }
@@ -125,25 +136,46 @@ impl Header {
         Ok((Self { mode, version, fleet, kind, zero: [z0, z1] }, body))
     }
 
-    /// The body as this version reads it, which says little about one of another version.
+    /// The body as this version reads it, which says little about one of another version. Codes are not looked at.
     pub fn read<'b>(&self, body: &'b [u8]) -> Result<Datagram<'b>, DatagramError> {
         if self.zero != [0, 0] {
             return Err(DatagramError::Malformed);
         }
         match self.kind {
-            WHO_HAS => whole(body, |who_has: &WhoHas| &who_has.identity).map(Datagram::WhoHas),
-            ANNOUNCE => whole(body, |announce: &Announce| &announce.identity).map(Datagram::Announce),
-            SESSION => session(body).ok_or(DatagramError::Malformed),
-            _ => Err(DatagramError::Malformed),
+            WHO_HAS => self.who_has(body).map(Datagram::WhoHas),
+            ANNOUNCE => self.announce(body).map(Datagram::Announce),
+            SESSION => session(body).map(|(link, nonce, body)| Datagram::Session { link, nonce, body }),
+            _ => None,
         }
+        .ok_or(DatagramError::Malformed)
+    }
+
+    fn who_has(&self, body: &[u8]) -> Option<WhoHas> {
+        let (who_has, rest): (WhoHas, _) = postcard::take_from_bytes(body).ok()?;
+        let filled = match self.mode {
+            Mode::Plain => rest.is_empty(),
+            Mode::Secured => rest.split_last_chunk::<CODE_BYTES>()?.0.iter().all(|byte| *byte == 0),
+        };
+        (filled && who_has.identity.is_sound()).then_some(who_has)
+    }
+
+    fn announce(&self, body: &[u8]) -> Option<Announce> {
+        let (announce, rest): (Announce, _) = postcard::take_from_bytes(body).ok()?;
+        let codes = match self.mode {
+            Mode::Plain => 0,
+            Mode::Secured if announce.nonce == 0 => CODE_BYTES,
+            Mode::Secured => 2 * CODE_BYTES,
+        };
+        (rest.len() == codes && announce.identity.is_sound()).then_some(announce)
     }
 }
 
 impl<'b> Datagram<'b> {
-    /// Reads a datagram of this mode and fleet.
-    pub fn decode(bytes: &'b [u8], mode: Mode, fleet: Fleet) -> Result<Self, DatagramError> {
+    /// Reads a datagram of this fleet. In secured mode nothing of a who-has or announce is read before the fleet's code is
+    /// found right, and an answer counts only with the code of the pair. Session datagrams are opened by their session.
+    pub fn decode(bytes: &'b [u8], fleet: Fleet, authenticator: &impl Authenticator) -> Result<Self, DatagramError> {
         let (header, body) = Header::decode(bytes)?;
-        if header.mode != mode {
+        if header.mode != authenticator.mode() {
             return Err(DatagramError::Magic);
         }
         if header.version != VERSION {
@@ -152,23 +184,37 @@ impl<'b> Datagram<'b> {
         if header.fleet != fleet {
             return Err(DatagramError::Fleet(header.fleet));
         }
-        header.read(body)
+        if header.mode == Mode::Plain || header.kind == SESSION {
+            return header.read(body);
+        }
+        let signed = of_fleet(bytes, authenticator).ok_or(DatagramError::Forged)?;
+        let datagram = header.read(body)?;
+        match &datagram {
+            Self::Announce(announce) if announce.nonce != 0 && !is_for_us(signed, announce, authenticator) => {
+                Err(DatagramError::NotForUs)
+            }
+            _ => Ok(datagram),
+        }
     }
 }
 
-/// The whole body, from a node that has a name.
-fn whole<'b, T: Deserialize<'b>>(body: &'b [u8], who: impl Fn(&T) -> &Identity) -> Result<T, DatagramError> {
-    match postcard::take_from_bytes(body) {
-        Ok((value, [])) if who(&value).is_sound() => Ok(value),
-        _ => Err(DatagramError::Malformed),
-    }
+/// All but the fleet's code, if that is right.
+fn of_fleet<'b>(bytes: &'b [u8], authenticator: &impl Authenticator) -> Option<&'b [u8]> {
+    let (signed, code) = bytes.split_last_chunk()?;
+    authenticator.is_of_fleet(signed, code).then_some(signed)
 }
 
-fn session(body: &[u8]) -> Option<Datagram<'_>> {
+fn is_for_us(signed: &[u8], announce: &Announce, authenticator: &impl Authenticator) -> bool {
+    let Some((signed, code)) = signed.split_last_chunk() else { return false };
+    authenticator.is_of(&announce.identity, signed, code)
+}
+
+/// Link, nonce and body of a session datagram.
+fn session(body: &[u8]) -> Option<(u16, u64, &[u8])> {
     let (head, body) = body.split_first_chunk::<{ SESSION_HEADER_BYTES - HEADER_BYTES }>()?;
     let [l0, l1, 0, 0, n0, n1, n2, n3, n4, n5, n6, n7] = *head else { return None };
     let nonce = u64::from_le_bytes([n0, n1, n2, n3, n4, n5, n6, n7]);
-    Some(Datagram::Session { link: u16::from_le_bytes([l0, l1]), nonce, body })
+    Some((u16::from_le_bytes([l0, l1]), nonce, body))
 }
 
 fn header(kind: u8, mode: Mode, fleet: Fleet) -> [u8; HEADER_BYTES] {
@@ -177,24 +223,56 @@ fn header(kind: u8, mode: Mode, fleet: Fleet) -> [u8; HEADER_BYTES] {
     [m0, m1, m2, m3, VERSION, kind, 0, 0, f0, f1, f2, f3]
 }
 
-fn encode<'o>(kind: u8, mode: Mode, fleet: Fleet, body: &impl Serialize, out: &'o mut [u8]) -> Option<&'o [u8]> {
+/// Header and body; their length.
+fn encode(kind: u8, mode: Mode, fleet: Fleet, body: &impl Serialize, out: &mut [u8]) -> Option<usize> {
     let (head, rest) = out.split_first_chunk_mut()?;
     *head = header(kind, mode, fleet);
-    let length = postcard::to_slice(body, rest).ok()?.len().checked_add(HEADER_BYTES)?;
-    out.get(..length)
+    postcard::to_slice(body, rest).ok()?.len().checked_add(HEADER_BYTES)
+}
+
+/// Puts a code behind the first `length` bytes of `out`; the length with it.
+fn append(code: [u8; CODE_BYTES], length: usize, out: &mut [u8]) -> Option<usize> {
+    *out.get_mut(length..)?.first_chunk_mut()? = code;
+    length.checked_add(CODE_BYTES)
+}
+
+fn sign_for_fleet(length: usize, authenticator: &impl Authenticator, out: &mut [u8]) -> Option<usize> {
+    append(authenticator.sign_for_fleet(out.get(..length)?), length, out)
 }
 
 impl WhoHas {
     /// The datagram, in `out`; `None` where it does not fit.
-    pub fn encode<'o>(&self, mode: Mode, fleet: Fleet, out: &'o mut [u8]) -> Option<&'o [u8]> {
-        encode(WHO_HAS, mode, fleet, self, out)
+    pub fn encode<'o>(&self, fleet: Fleet, authenticator: &impl Authenticator, out: &'o mut [u8]) -> Option<&'o [u8]> {
+        let mode = authenticator.mode();
+        let mut length = encode(WHO_HAS, mode, fleet, self, out)?;
+        if mode == Mode::Secured {
+            let filled = length.max(ANSWER_BYTES.saturating_sub(CODE_BYTES));
+            out.get_mut(length..filled)?.fill(0);
+            length = sign_for_fleet(filled, authenticator, out)?;
+        }
+        out.get(..length)
     }
 }
 
 impl Announce {
-    /// The datagram, in `out`; `None` where it does not fit.
-    pub fn encode<'o>(&self, mode: Mode, fleet: Fleet, out: &'o mut [u8]) -> Option<&'o [u8]> {
-        encode(ANNOUNCE, mode, fleet, self, out)
+    /// The datagram, in `out`; `None` where it does not fit, or in secured mode where it answers `to` and there is no key
+    /// for the pair.
+    pub fn encode<'o>(
+        &self,
+        fleet: Fleet,
+        authenticator: &impl Authenticator,
+        to: Option<&Identity>,
+        out: &'o mut [u8],
+    ) -> Option<&'o [u8]> {
+        let mode = authenticator.mode();
+        let mut length = encode(ANNOUNCE, mode, fleet, self, out)?;
+        if mode == Mode::Secured {
+            if let Some(to) = to.filter(|_| self.nonce != 0) {
+                length = append(authenticator.sign_for(to, out.get(..length)?)?, length, out)?;
+            }
+            length = sign_for_fleet(length, authenticator, out)?;
+        }
+        out.get(..length)
     }
 }
 
@@ -221,9 +299,9 @@ pub fn short_hash(identity: &Identity) -> u32 {
 mod tests {
     #![allow(clippy::unwrap_used, clippy::indexing_slicing, clippy::arithmetic_side_effects)]
     use super::*;
+    use crate::host::secure::Plain;
     use proptest::prelude::*;
 
-    const PLAIN: Mode = Mode::Plain;
     const FLEET: Fleet = Fleet(7);
 
     fn who_has(known: usize) -> WhoHas {
@@ -243,27 +321,27 @@ mod tests {
     fn the_longest_search_fits_and_survives() {
         let search = who_has(KNOWN_NODES);
         let mut out = [0; SEARCH_BYTES];
-        let bytes = search.encode(PLAIN, FLEET, &mut out).unwrap();
-        assert_eq!(Datagram::decode(bytes, PLAIN, FLEET), Ok(Datagram::WhoHas(search)));
+        let bytes = search.encode(FLEET, &Plain, &mut out).unwrap();
+        assert_eq!(Datagram::decode(bytes, FLEET, &Plain), Ok(Datagram::WhoHas(search)));
     }
 
     #[test]
     fn another_fleet_version_or_magic_is_named() {
         let mut out = [0; SEARCH_BYTES];
-        let length = who_has(0).encode(PLAIN, FLEET, &mut out).unwrap().len();
-        assert_eq!(Datagram::decode(&out[..length], PLAIN, Fleet(8)), Err(DatagramError::Fleet(FLEET)));
+        let length = who_has(0).encode(FLEET, &Plain, &mut out).unwrap().len();
+        assert_eq!(Datagram::decode(&out[..length], Fleet(8), &Plain), Err(DatagramError::Fleet(FLEET)));
         out[4] = 9;
-        assert_eq!(Datagram::decode(&out[..length], PLAIN, FLEET), Err(DatagramError::Version(9)));
+        assert_eq!(Datagram::decode(&out[..length], FLEET, &Plain), Err(DatagramError::Version(9)));
         for other in [*b"Xarp", Mode::Secured.magic()] {
             out[..4].copy_from_slice(&other);
-            assert_eq!(Datagram::decode(&out[..length], PLAIN, FLEET), Err(DatagramError::Magic));
+            assert_eq!(Datagram::decode(&out[..length], FLEET, &Plain), Err(DatagramError::Magic));
         }
     }
 
     #[test]
     fn a_header_is_read_whatever_its_version_and_fleet() {
         let mut out = [0; SEARCH_BYTES];
-        let length = who_has(0).encode(PLAIN, FLEET, &mut out).unwrap().len();
+        let length = who_has(0).encode(FLEET, &Plain, &mut out).unwrap().len();
         out[4] = 9;
         let (header, body) = Header::decode(&out[..length]).unwrap();
         assert_eq!((header.version, header.fleet), (9, FLEET));
@@ -276,40 +354,43 @@ mod tests {
 
     #[test]
     fn a_session_datagram_carries_its_link_and_nonce() {
-        let mut bytes = std::vec::Vec::from(session_header(PLAIN, FLEET, 300, 0x0102_0304_0506_0708));
+        let mut bytes = std::vec::Vec::from(session_header(Mode::Plain, FLEET, 300, 0x0102_0304_0506_0708));
         bytes.push(42);
         let expected = Datagram::Session { link: 300, nonce: 0x0102_0304_0506_0708, body: &[42] };
-        assert_eq!(Datagram::decode(&bytes, PLAIN, FLEET), Ok(expected));
+        assert_eq!(Datagram::decode(&bytes, FLEET, &Plain), Ok(expected));
     }
 
     #[test]
     fn every_cut_every_tail_and_every_unknown_kind_is_refused() {
         let mut out = [0; SEARCH_BYTES];
-        let length = who_has(2).encode(PLAIN, FLEET, &mut out).unwrap().len();
+        let length = who_has(2).encode(FLEET, &Plain, &mut out).unwrap().len();
         for cut in 0..length {
-            assert_eq!(Datagram::decode(&out[..cut], PLAIN, FLEET), Err(DatagramError::Malformed));
+            assert_eq!(Datagram::decode(&out[..cut], FLEET, &Plain), Err(DatagramError::Malformed));
         }
-        assert_eq!(Datagram::decode(&out[..length + 1], PLAIN, FLEET), Err(DatagramError::Malformed));
+        assert_eq!(Datagram::decode(&out[..length + 1], FLEET, &Plain), Err(DatagramError::Malformed));
         for (place, byte) in [(5, 0), (5, 4), (6, 1), (7, 1)] {
             let mut changed = out;
             changed[place] = byte;
-            assert_eq!(Datagram::decode(&changed[..length], PLAIN, FLEET), Err(DatagramError::Malformed));
+            assert_eq!(Datagram::decode(&changed[..length], FLEET, &Plain), Err(DatagramError::Malformed));
         }
-        let session = session_header(PLAIN, FLEET, 1, 2);
-        assert_eq!(Datagram::decode(&session[..SESSION_HEADER_BYTES - 1], PLAIN, FLEET), Err(DatagramError::Malformed));
+        let session = session_header(Mode::Plain, FLEET, 1, 2);
+        assert_eq!(
+            Datagram::decode(&session[..SESSION_HEADER_BYTES - 1], FLEET, &Plain),
+            Err(DatagramError::Malformed)
+        );
     }
 
     #[test]
     fn a_node_without_a_name_is_refused() {
         let mut out = [0; SEARCH_BYTES];
-        let length = who_has(0).encode(PLAIN, FLEET, &mut out).unwrap().len();
+        let length = who_has(0).encode(FLEET, &Plain, &mut out).unwrap().len();
         // The identity begins with its id in five bytes; the name's length follows.
         let at = HEADER_BYTES + 5;
         assert_eq!(out[at], 32);
         out[at] = 0;
         let mut bytes = std::vec::Vec::from(&out[..length]);
         bytes.drain(at + 1..=at + 32);
-        assert_eq!(Datagram::decode(&bytes, PLAIN, FLEET), Err(DatagramError::Malformed));
+        assert_eq!(Datagram::decode(&bytes, FLEET, &Plain), Err(DatagramError::Malformed));
     }
 
     #[test]
@@ -331,15 +412,15 @@ mod tests {
             known in 0..KNOWN_NODES,
         ) {
             let mut out = [0; SEARCH_BYTES];
-            let length = who_has(known).encode(PLAIN, FLEET, &mut out).unwrap().len();
+            let length = who_has(known).encode(FLEET, &Plain, &mut out).unwrap().len();
             for (place, byte) in changes {
                 out[place] = byte;
             }
-            let _ = Datagram::decode(&out[..length.min(cut)], PLAIN, FLEET);
-            if let Ok(Datagram::WhoHas(read)) = Datagram::decode(&out[..length], PLAIN, FLEET) {
+            let _ = Datagram::decode(&out[..length.min(cut)], FLEET, &Plain);
+            if let Ok(Datagram::WhoHas(read)) = Datagram::decode(&out[..length], FLEET, &Plain) {
                 let mut again = [0; SEARCH_BYTES];
-                let bytes = read.encode(PLAIN, FLEET, &mut again).unwrap();
-                prop_assert_eq!(Datagram::decode(bytes, PLAIN, FLEET), Ok(Datagram::WhoHas(read)));
+                let bytes = read.encode(FLEET, &Plain, &mut again).unwrap();
+                prop_assert_eq!(Datagram::decode(bytes, FLEET, &Plain), Ok(Datagram::WhoHas(read)));
             }
         }
     }

@@ -1,7 +1,7 @@
 use std::net::Ipv4Addr;
 
-use cara_core::config::Mode;
 use cara_core::distribution::hello::Manager;
+use cara_core::host::secure::Plain;
 
 use super::*;
 
@@ -44,7 +44,7 @@ fn search(name: &str, epoch: u64) -> WhoHas {
 
 fn bytes(fleet: u32, search: &WhoHas) -> Vec<u8> {
     let mut out = [0; SEARCH_BYTES];
-    search.encode(Mode::Plain, Fleet(fleet), &mut out).unwrap().to_vec()
+    search.encode(Fleet(fleet), &Plain, &mut out).unwrap().to_vec()
 }
 
 #[test]

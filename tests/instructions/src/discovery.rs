@@ -2,7 +2,7 @@
 
 use core::net::SocketAddr;
 
-use cara_core::config::{Constraints, Mode};
+use cara_core::config::Constraints;
 use cara_core::distribution::connection_handler::{
     Admission, Finding, Known, Node, NodeConfig, NodeStorage, Order, Target,
 };
@@ -140,7 +140,7 @@ impl Discovery {
             known: Default::default(),
         };
         let mut bytes = [0; SEARCH_BYTES];
-        let length = who_has.encode(Mode::Plain, FLEET, &mut bytes).expect("room for it").len();
+        let length = who_has.encode(FLEET, &Plain, &mut bytes).expect("room for it").len();
         let mut outbox = Outbox(0);
         meter.count(&mut || {
             self.node.datagram(self.now, from, &mut bytes[..length], &Plain);
@@ -159,7 +159,7 @@ impl Discovery {
         // Nowhere to be dialled, so that nothing follows from it.
         let announce = Announce { identity, epoch: Epoch(1), sequence: 1, nonce: 0, tcp_port: 0, room: 8, expected: 8 };
         let mut bytes = [0; SEARCH_BYTES];
-        let length = announce.encode(Mode::Plain, FLEET, &mut bytes).expect("room for it").len();
+        let length = announce.encode(FLEET, &Plain, None, &mut bytes).expect("room for it").len();
         meter.count(&mut || {
             self.node.datagram(self.now, from, &mut bytes[..length], &Plain);
             while self.node.poll(self.now, &mut Outbox(0), &Plain).is_some() {}

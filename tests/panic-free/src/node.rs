@@ -90,10 +90,10 @@ entry!(managers, {
 });
 
 entry!(datagrams, {
-    keep(Datagram::decode(unknown_slice(), *unknown(), *unknown()));
+    keep(Datagram::decode(unknown_slice(), *unknown(), &AnyCodes));
     keep(datagram::Header::decode(unknown_slice()));
     keep(unknown::<datagram::Header>().read(unknown_slice()));
-    keep(unknown::<WhoHas>().encode(*unknown(), *unknown(), unknown_slice()));
-    keep(unknown::<Announce>().encode(*unknown(), *unknown(), unknown_slice()));
+    keep(unknown::<WhoHas>().encode(*unknown(), &AnyCodes, unknown_slice()));
+    keep(unknown::<Announce>().encode(*unknown(), &AnyCodes, unknown::<Option<Identity>>().as_ref(), unknown_slice()));
     keep(datagram::short_hash(identity()));
 });

@@ -6,6 +6,7 @@ use cara_core::distribution::hello::{Hello, Limits, Manager};
 use cara_core::distribution::identity::{Epoch, Fleet, Identity};
 use cara_core::error::Refusal;
 use cara_core::host::frame::{self, ChunkWriter, Cut, Frame};
+use cara_core::host::secure::Plain;
 use cara_core::random::Random;
 
 /// Streams and datagrams of garbage.
@@ -120,7 +121,7 @@ fn who_has(fleet: u32) -> Vec<u8> {
         known: Default::default(),
     };
     let mut bytes = [0; SEARCH_BYTES];
-    who_has.encode(Mode::Plain, Fleet(fleet), &mut bytes).expect("a search fits").to_vec()
+    who_has.encode(Fleet(fleet), &Plain, &mut bytes).expect("a search fits").to_vec()
 }
 
 /// All of the first chunk of a message but its last bytes.

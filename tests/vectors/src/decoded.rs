@@ -9,6 +9,7 @@ use cara_core::distribution::identity::{Fleet, Identity, Role};
 use cara_core::distribution::message::{Control, Message, SessionBody};
 use cara_core::distribution::parameters::{Parameters, Type, Value as Variable};
 use cara_core::error::{Error, ServiceError};
+use cara_core::host::secure::Plain;
 use serde_json::{Value, json};
 
 use crate::stream;
@@ -199,7 +200,7 @@ pub(crate) fn session_body(bytes: &[u8]) -> Option<Value> {
 }
 
 pub(crate) fn datagram(fleet: u32, bytes: &[u8]) -> Option<Value> {
-    match Datagram::decode(bytes, Mode::Plain, Fleet(fleet)) {
+    match Datagram::decode(bytes, Fleet(fleet), &Plain) {
         Ok(Datagram::WhoHas(search)) => Some(json!({ "who_has": who_has(&search) })),
         Ok(Datagram::Announce(answer)) => Some(json!({ "announce": announce(&answer) })),
         Ok(Datagram::Session { link, nonce, body }) => {
@@ -207,7 +208,7 @@ pub(crate) fn datagram(fleet: u32, bytes: &[u8]) -> Option<Value> {
         }
         Err(DatagramError::Version(version)) => Some(json!({ "other_version": version })),
         Err(DatagramError::Fleet(fleet)) => Some(json!({ "other_fleet": fleet.0 })),
-        Err(DatagramError::Magic | DatagramError::Malformed) => None,
+        Err(DatagramError::Magic | DatagramError::Forged | DatagramError::NotForUs | DatagramError::Malformed) => None,
     }
 }
 

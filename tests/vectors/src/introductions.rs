@@ -5,6 +5,7 @@ use cara_core::distribution::datagram::{Announce, WhoHas, session_header, short_
 use cara_core::distribution::hello::{Hello, Limits, Manager};
 use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
 use cara_core::distribution::message::SessionBody;
+use cara_core::host::secure::Plain;
 use serde_json::{Value, json};
 
 use crate::vector::{Context, Kind, Vector};
@@ -127,9 +128,9 @@ fn datagrams() -> Vec<Vector> {
         expected: 1,
     };
     let mut out = [0; 512];
-    let search = search.encode(Mode::Plain, Fleet(7), &mut out).unwrap_or(&[]).to_vec();
-    let wish = wish.encode(Mode::Plain, Fleet(7), &mut out).unwrap_or(&[]).to_vec();
-    let answer = answer.encode(Mode::Plain, Fleet(7), &mut out).unwrap_or(&[]).to_vec();
+    let search = search.encode(Fleet(7), &Plain, &mut out).unwrap_or(&[]).to_vec();
+    let wish = wish.encode(Fleet(7), &Plain, &mut out).unwrap_or(&[]).to_vec();
+    let answer = answer.encode(Fleet(7), &Plain, None, &mut out).unwrap_or(&[]).to_vec();
     let session =
         [&session_header(Mode::Plain, Fleet(7), 300, 0xA1A2_A3A4_A5A6_A7A8)[..], &SessionBody::keep_alive(1_000_000)]
             .concat();

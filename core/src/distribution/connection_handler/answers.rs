@@ -6,10 +6,11 @@ use super::known::NodeState;
 use super::search::pause;
 use super::timetable::Task;
 use super::{Action, Node, NodeCounter, Target};
-use crate::config::{ANSWER_SPREAD, FIRST_SEARCH, LONGEST_SEARCH};
+use crate::config::{ANSWER_SPREAD, FIRST_SEARCH, LONGEST_SEARCH, Mode};
 use crate::distribution::authenticator::Authenticator;
 use crate::distribution::datagram::{Announce, SEARCH_BYTES, WhoHas, short_hash};
 use crate::distribution::identity::{Epoch, Identity, Role};
+use crate::error::Refusal;
 use crate::host::mailman::Mailman;
 use crate::storage::Storage;
 use crate::time::{Duration, Instant};
@@ -33,10 +34,12 @@ const MOVED_AFTER: u8 = 2;
 pub(super) const DIAL_TIMEOUT: Duration = Duration::from_secs(6);
 
 /// An answer to a single node.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 struct Answer {
     at: Instant,
     to: SocketAddr,
+    /// Who asked.
+    who: Identity,
     nonce: u64,
 }
 
@@ -67,6 +70,8 @@ pub(super) struct Found {
     pub(super) epoch: Epoch,
     pub(super) sequence: u32,
     pub(super) tcp_port: u16,
+    /// In secured mode whoever cannot make a datagram may still send one again.
+    pub(super) mode: Mode,
 }
 
 impl<S: Storage> Node<S> {
@@ -76,7 +81,7 @@ impl<S: Storage> Node<S> {
         let another = self.answers.asked.is_some_and(|(at, asked)| asked != who && now < at + SAME_QUESTION);
         self.answers.asked = Some((now, who));
         let delay = self.random.jitter(ANSWER_GATHER);
-        self.answer_later(now + delay, from, who_has.nonce);
+        self.answer_later(now + delay, from, who_has);
         if another && self.answers.broadcast.is_none() {
             let earliest = self.answers.last_broadcast.map_or(now, |last| last + ANSWER_PAUSE);
             self.answers.broadcast = Some(earliest.max(now + ANSWER_GATHER));
@@ -84,9 +89,10 @@ impl<S: Storage> Node<S> {
     }
 
     /// Plans an answer to one node. One that finds no room is left to the broadcast, or to the next question.
-    pub(super) fn answer_later(&mut self, at: Instant, to: SocketAddr, nonce: u64) {
+    pub(super) fn answer_later(&mut self, at: Instant, to: SocketAddr, who_has: &WhoHas) {
+        let (nonce, who) = (who_has.nonce, who_has.identity.clone());
         let waiting = self.answers.single.iter().any(|answer| answer.to == to && answer.nonce == nonce);
-        if !waiting && self.answers.single.push(Answer { at, to, nonce }).is_err() {
+        if !waiting && self.answers.single.push(Answer { at, to, who, nonce }).is_err() {
             self.counters.add(NodeCounter::AnnounceDropped, 1);
         }
     }
@@ -98,26 +104,30 @@ impl<S: Storage> Node<S> {
         authenticator: &impl Authenticator,
     ) {
         while let Some(index) = self.answers.single.iter().position(|answer| answer.at <= now) {
-            let Answer { to, nonce, .. } = self.answers.single.swap_remove(index);
-            self.send_announce(authenticator, nonce, NodeCounter::AnnounceSent, |datagram| {
-                mailman.send_to(to, datagram)
-            });
+            let Answer { to, who, nonce, .. } = self.answers.single.swap_remove(index);
+            let send = |datagram: &[u8]| mailman.send_to(to, datagram);
+            if !self.send_announce(authenticator, nonce, Some(&who), NodeCounter::AnnounceSent, send) {
+                self.counters.add(NodeCounter::AnnounceWithheld, 1);
+                self.note_of(now, to, &who, Refusal::NoKey);
+            }
         }
         if self.answers.broadcast.take_if(|at| *at <= now).is_some() {
             self.answers.last_broadcast = Some(now);
-            self.send_announce(authenticator, 0, NodeCounter::AnnounceBroadcast, |datagram| {
+            self.send_announce(authenticator, 0, None, NodeCounter::AnnounceBroadcast, |datagram| {
                 mailman.broadcast(datagram)
             });
         }
     }
 
+    /// `false` where there is no key to sign the answer with.
     fn send_announce(
         &mut self,
         authenticator: &impl Authenticator,
         nonce: u64,
+        to: Option<&Identity>,
         counter: NodeCounter,
         send: impl FnOnce(&[u8]) -> bool,
-    ) {
+    ) -> bool {
         let announce = Announce {
             identity: self.config.identity.clone(),
             epoch: self.config.epoch,
@@ -129,8 +139,9 @@ impl<S: Storage> Node<S> {
         };
         self.sequence = announce.sequence;
         let mut bytes = [0; SEARCH_BYTES];
-        let sent = announce.encode(authenticator.mode(), self.config.fleet, &mut bytes).is_some_and(send);
-        self.counters.add(if sent { counter } else { NodeCounter::SendFailed }, 1);
+        let Some(datagram) = announce.encode(self.config.fleet, authenticator, to, &mut bytes) else { return false };
+        self.counters.add(if send(datagram) { counter } else { NodeCounter::SendFailed }, 1);
+        true
     }
 
     /// How many nodes this unit still takes.
@@ -165,7 +176,7 @@ impl<S: Storage> Node<S> {
         found: Found,
         dial_at: Option<Instant>,
     ) {
-        let Found { epoch, sequence, tcp_port } = found;
+        let Found { epoch, sequence, tcp_port, mode } = found;
         if tcp_port == 0 || matches!(self.config.target, Target::Fixed(..)) {
             return;
         }
@@ -176,7 +187,7 @@ impl<S: Storage> Node<S> {
         };
         self.count_forgotten(forgotten);
         let Some(known) = self.table.node_mut(place) else { return };
-        if !known.is_news(now, epoch, sequence) {
+        if !known.is_news(now, epoch, sequence, mode) {
             self.counters.add(NodeCounter::Outdated, 1);
             return;
         }

@@ -11,6 +11,10 @@ crate::counters::counters! {
         DatagramFleet,
         /// Datagrams that could not be read.
         DatagramMalformed,
+        /// Searches and answers without the right code of the fleet.
+        DatagramForged,
+        /// Answers without the right code of this unit and their sender.
+        DatagramNotForUs,
         /// Session datagrams for links that this unit does not have.
         DatagramUnknownLink,
         /// Searches sent.
@@ -27,6 +31,8 @@ crate::counters::counters! {
         AnnounceHeard,
         /// Answers not sent because too many waited already.
         AnnounceDropped,
+        /// Answers not sent because there is no key for the pair.
+        AnnounceWithheld,
         /// Answers to another question than this unit's last one.
         Unasked,
         /// Searches and answers that the network did not take.

@@ -4,6 +4,7 @@ use core::net::SocketAddr;
 
 use super::table::NONE;
 use super::timetable::Task;
+use crate::config::Mode;
 use crate::distribution::hello::Limits;
 use crate::distribution::identity::{Epoch, Identity};
 use crate::host::mailman::LinkId;
@@ -98,8 +99,12 @@ impl Known {
     }
 
     /// Whether a datagram is newer than what is known.
-    pub(super) fn is_news(&self, now: Instant, epoch: Epoch, sequence: u32) -> bool {
-        self.newest.is_none_or(|newest| (epoch, sequence) > newest) || now >= self.heard + REORDERING
+    pub(super) fn is_news(&self, now: Instant, epoch: Epoch, sequence: u32, mode: Mode) -> bool {
+        let Some(newest) = self.newest else { return true };
+        let late = now >= self.heard + REORDERING;
+        // Within a life numbers rise: the same datagram once more is somebody else's who has recorded it.
+        let again = mode == Mode::Secured && epoch == newest.0;
+        (epoch, sequence) > newest || (late && !again)
     }
 
     /// Notes the newest datagram.

@@ -331,10 +331,10 @@ impl<S: Storage> Node<S> {
         bytes: &'b mut [u8],
         authenticator: &impl Authenticator,
     ) -> Sorted<'b> {
-        match Datagram::decode(bytes, authenticator.mode(), self.config.fleet) {
+        match Datagram::decode(bytes, self.config.fleet, authenticator) {
             Ok(Datagram::Session { link, nonce, .. }) => return self.sort(LinkId(link), nonce, bytes),
-            Ok(Datagram::WhoHas(who_has)) => self.heard_who_has(now, from, &who_has),
-            Ok(Datagram::Announce(announce)) => self.heard_announce(now, from, &announce),
+            Ok(Datagram::WhoHas(who_has)) => self.heard_who_has(now, from, &who_has, authenticator.mode()),
+            Ok(Datagram::Announce(announce)) => self.heard_announce(now, from, &announce, authenticator.mode()),
             Err(error) => self.unreadable(now, from, error),
         }
         Sorted::Done
@@ -355,6 +355,8 @@ impl<S: Storage> Node<S> {
             DatagramError::Magic => NodeCounter::DatagramMagic,
             DatagramError::Version(_) => NodeCounter::DatagramVersion,
             DatagramError::Fleet(_) => NodeCounter::DatagramFleet,
+            DatagramError::Forged => NodeCounter::DatagramForged,
+            DatagramError::NotForUs => NodeCounter::DatagramNotForUs,
             DatagramError::Malformed => NodeCounter::DatagramMalformed,
         };
         self.counters.add(counter, 1);

@@ -6,7 +6,7 @@ use super::answers::Found;
 use super::known::NodeState;
 use super::timetable::Task;
 use super::{Node, NodeCounter, Target};
-use crate::config::{FIRST_SEARCH, LONGEST_SEARCH, SEARCH_BUDGET, SEARCH_WINDOW};
+use crate::config::{FIRST_SEARCH, LONGEST_SEARCH, Mode, SEARCH_BUDGET, SEARCH_WINDOW};
 use crate::distribution::authenticator::Authenticator;
 use crate::distribution::datagram::{Announce, KNOWN_NODES, SEARCH_BYTES, WhoHas, short_hash};
 use crate::distribution::identity::{Epoch, Identity, Role};
@@ -232,13 +232,13 @@ impl<S: Storage> Node<S> {
         };
         self.sequence = who_has.sequence;
         let mut bytes = [0; SEARCH_BYTES];
-        let datagram = who_has.encode(authenticator.mode(), self.config.fleet, &mut bytes);
+        let datagram = who_has.encode(self.config.fleet, authenticator, &mut bytes);
         let sent = datagram.is_some_and(|datagram| mailman.broadcast(datagram));
         self.counters.add(if sent { NodeCounter::WhoHasSent } else { NodeCounter::SendFailed }, 1);
     }
 
-    pub(super) fn heard_who_has(&mut self, now: Instant, from: SocketAddr, who_has: &WhoHas) {
-        if self.is_own(now, from, &who_has.identity, who_has.epoch, Some(who_has.nonce)) {
+    pub(super) fn heard_who_has(&mut self, now: Instant, from: SocketAddr, who_has: &WhoHas, mode: Mode) {
+        if self.is_own(now, from, &who_has.identity, who_has.epoch, Some(who_has)) {
             return;
         }
         self.counters.add(NodeCounter::WhoHasHeard, 1);
@@ -247,10 +247,10 @@ impl<S: Storage> Node<S> {
         match &who_has.wanted {
             Some(manager) if manager.is(&self.config.identity) => self.answer_seeker(now, from, who_has),
             Some(manager) if self.manager() == Some(manager) => self.hold_back(now),
-            None if who_has.identity.role() == Role::MUnit => self.heard_m_unit(now, from, who_has),
+            None if who_has.identity.role() == Role::MUnit => self.heard_m_unit(now, from, who_has, mode),
             None if here => {
                 let delay = self.spread(who_has.expected);
-                self.answer_later(now + delay, from, who_has.nonce);
+                self.answer_later(now + delay, from, who_has);
             }
             _ => self.counters.add(NodeCounter::WrongManager, 1),
         }
@@ -276,7 +276,7 @@ impl<S: Storage> Node<S> {
     }
 
     /// An m_unit asks for everybody: its own s_units dial it, and of two m_units the smaller one dials.
-    fn heard_m_unit(&mut self, now: Instant, from: SocketAddr, who_has: &WhoHas) {
+    fn heard_m_unit(&mut self, now: Instant, from: SocketAddr, who_has: &WhoHas, mode: Mode) {
         if !self.is_wanted(&who_has.identity) {
             self.counters.add(NodeCounter::WrongManager, 1);
             return;
@@ -287,15 +287,15 @@ impl<S: Storage> Node<S> {
         let delay = self.spread(who_has.expected);
         if !self.dials(&who_has.identity) {
             if !self.is_connected(&who_has.identity, who_has.epoch) {
-                self.answer_later(now + delay, from, who_has.nonce);
+                self.answer_later(now + delay, from, who_has);
             }
             return;
         }
-        let found = Found { epoch: who_has.epoch, sequence: who_has.sequence, tcp_port: who_has.tcp_port };
+        let found = Found { epoch: who_has.epoch, sequence: who_has.sequence, tcp_port: who_has.tcp_port, mode };
         self.found(now, &who_has.identity, from, found, Some(now + delay));
     }
 
-    pub(super) fn heard_announce(&mut self, now: Instant, from: SocketAddr, announce: &Announce) {
+    pub(super) fn heard_announce(&mut self, now: Instant, from: SocketAddr, announce: &Announce, mode: Mode) {
         if self.is_own(now, from, &announce.identity, announce.epoch, None) {
             return;
         }
@@ -319,7 +319,7 @@ impl<S: Storage> Node<S> {
             self.note_of(now, from, &announce.identity, Refusal::Full);
         }
         let delay = if broadcast { self.spread(announce.expected) } else { Duration::ZERO };
-        let found = Found { epoch: announce.epoch, sequence: announce.sequence, tcp_port: announce.tcp_port };
+        let found = Found { epoch: announce.epoch, sequence: announce.sequence, tcp_port: announce.tcp_port, mode };
         self.found(now, &announce.identity, from, found, invited.then_some(now + delay));
     }
 

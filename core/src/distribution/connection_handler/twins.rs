@@ -4,6 +4,7 @@ use core::net::SocketAddr;
 
 use super::{Node, NodeCounter};
 use crate::config::LONGEST_SEARCH;
+use crate::distribution::datagram::WhoHas;
 use crate::distribution::identity::{Epoch, Identity, Role};
 use crate::error::Refusal;
 use crate::storage::Storage;
@@ -42,7 +43,7 @@ impl<S: Storage> Node<S> {
         from: SocketAddr,
         identity: &Identity,
         epoch: Epoch,
-        question: Option<u64>,
+        question: Option<&WhoHas>,
     ) -> bool {
         if *identity != self.config.identity {
             return false;
@@ -51,8 +52,8 @@ impl<S: Storage> Node<S> {
             self.counters.add(NodeCounter::OwnIdentity, 1);
             self.note_of(now, from, identity, Refusal::DuplicateIdentity);
             self.twins.hear(now, from, epoch);
-            if let Some(nonce) = question.filter(|_| identity.role() == Role::MUnit) {
-                self.answer_later(now, from, nonce);
+            if let Some(who_has) = question.filter(|_| identity.role() == Role::MUnit) {
+                self.answer_later(now, from, who_has);
             }
         }
         true

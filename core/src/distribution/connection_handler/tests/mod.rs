@@ -154,15 +154,15 @@ pub(super) fn announce_of(config: &NodeConfig, sequence: u32, nonce: u64) -> Ann
 }
 
 pub(super) fn who_has_bytes(who_has: &WhoHas) -> Vec<u8> {
-    who_has.encode(Mode::Plain, FLEET, &mut [0; SEARCH_BYTES]).unwrap().to_vec()
+    who_has.encode(FLEET, &Plain, &mut [0; SEARCH_BYTES]).unwrap().to_vec()
 }
 
 pub(super) fn announce_bytes(announce: &Announce) -> Vec<u8> {
-    announce.encode(Mode::Plain, FLEET, &mut [0; SEARCH_BYTES]).unwrap().to_vec()
+    announce.encode(FLEET, &Plain, None, &mut [0; SEARCH_BYTES]).unwrap().to_vec()
 }
 
 pub(super) fn read(bytes: &[u8]) -> Datagram<'_> {
-    Datagram::decode(bytes, Mode::Plain, FLEET).unwrap()
+    Datagram::decode(bytes, FLEET, &Plain).unwrap()
 }
 
 pub(super) fn as_who_has(bytes: &[u8]) -> WhoHas {
