@@ -7,7 +7,7 @@ use std::time::Duration;
 use anyhow::{Context, Result, ensure};
 use cara_apps::agv::GO_TO_LEASE;
 use cara_processes::Process;
-use cara_std::{CloseReason, Peer, UnitEvent};
+use cara_std::{CloseReason, Error, Peer, UnitEvent};
 
 use super::Stop;
 use super::kind::{Bound, Failing, Kind};
@@ -109,7 +109,9 @@ impl Desk {
             std::thread::sleep(GO_TO_LEASE.into());
             self.mend(failing)?;
             let ends = |event: &UnitEvent| matches!(event, UnitEvent::RequestFailed { .. } | UnitEvent::Left { .. });
-            manager.event("end of the old command", ends)?;
+            let ended = manager.event("end of the old command", ends)?;
+            let refused = matches!(ended, UnitEvent::RequestFailed { error: Error::Expired, .. });
+            ensure!(refused || matches!(ended, UnitEvent::Left { .. }), "the old command came to {ended:?}");
         } else {
             manager.left(&self.who)?;
             self.lost_once(line)?;
