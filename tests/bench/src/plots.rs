@@ -1,5 +1,5 @@
 //! The paper's figures from a run: 6 and 7 (response time and availability in each distribution), 8 (availability at
-//! 20,000 characters in both), and the ratios to the floor.
+//! 20,000 characters in both), the ratios to the floor, and those of other systems.
 
 mod chart;
 
@@ -33,6 +33,7 @@ fn figures(results: &Results) -> Vec<(&'static str, Vec<Chart>)> {
         ("figure-7", vec![response(results, 2), availability(results, 2)]),
         ("figure-8", vec![both(results)]),
         ("ratios", vec![ratios(results, Pin::Same), ratios(results, Pin::Split)]),
+        ("other-systems", vec![others(results, Pin::Same), others(results, Pin::Split)]),
     ]
 }
 
@@ -97,6 +98,22 @@ fn both(results: &Results) -> Chart {
     let title = format!("Availability, {LONG} characters");
     let lines = vec![line(1), line(2)];
     Chart { title, x: Axis::linear("period, ms"), y: Axis::share("executed / offered"), lines }
+}
+
+/// Median round trips of CARA and other systems in proportion to the floor's; none where no other system was measured.
+fn others(results: &Results, pin: Pin) -> Chart {
+    let line = |peer: &str| {
+        let rows = calls(results, peer, 1, pin, 0);
+        let points = rows.iter().map(|row| (f64::from(row.chars), row.ratio)).collect();
+        Line { name: peer.to_owned(), points }
+    };
+    let mut lines: Vec<Line> = results.run.peers.iter().map(|outside| line(&outside.peer)).collect();
+    lines.retain(|line| !line.points.is_empty());
+    if !lines.is_empty() {
+        lines.insert(0, line("cara"));
+    }
+    let title = format!("Round trip / floor, back to back, {pin}, distribution 1");
+    Chart { title, x: Axis::log("characters"), y: Axis::log("ratio"), lines }
 }
 
 /// Median round trips in proportion to the floor's, with the control.

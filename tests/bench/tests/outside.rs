@@ -21,11 +21,16 @@ fn table(scripts: &[(&str, &str)]) -> String {
 /// A tiny run of the experiments `only` beside these systems.
 fn run(scripts: &[(&str, &str)], only: &str) -> (bool, Value) {
     let folder = tempfile::tempdir().unwrap();
-    let (json, file) = (folder.path().join("rows.json"), folder.path().join("peers.toml"));
+    let file = folder.path().join("peers.toml");
     std::fs::write(&file, table(scripts)).unwrap();
+    bench(&["--patience-s", "3", "--only", only, "--peers-file", file.to_str().unwrap()])
+}
+
+fn bench(options: &[&str]) -> (bool, Value) {
+    let folder = tempfile::tempdir().unwrap();
+    let json = folder.path().join("rows.json");
     let mut bench = Command::new(env!("CARGO_BIN_EXE_cara-bench"));
-    bench.args(["experiments", "--tiny", "--patience-s", "3", "--only", only]);
-    let output = bench.arg("--peers-file").arg(&file).arg("--json").arg(&json).output().unwrap();
+    let output = bench.args(["experiments", "--tiny", "--json"]).arg(&json).args(options).output().unwrap();
     let rows = std::fs::read_to_string(&json).unwrap();
     (output.status.success(), serde_json::from_str(&rows).unwrap())
 }
@@ -92,4 +97,21 @@ fn one_that_breaks_is_told_and_the_others_go_on() {
         assert!(!has_rows(&all, "response", peer), "{peer}");
     }
     assert!(has_rows(&all, "response", "works") && has_rows(&all, "response", "cara"));
+}
+
+#[test]
+fn whatever_is_built_here_is_measured_and_the_rest_is_told() {
+    let (is_fine, all) = bench(&["--only", "response"]);
+    assert!(is_fine);
+    let reports = all["run"]["peers"].as_array().unwrap();
+    assert!(reports.len() >= 8, "{reports:?}");
+    for report in reports {
+        let peer = report["peer"].as_str().unwrap();
+        println!("{report}");
+        match report["state"].as_str().unwrap() {
+            "measured" => assert!(has_rows(&all, "response", peer), "{report}"),
+            "absent" => assert!(!has_rows(&all, "response", peer), "{report}"),
+            _ => assert!(report["notes"][0].is_string(), "{report}: why?"),
+        }
+    }
 }

@@ -29,7 +29,8 @@ fn run() -> (Map<String, Value>, Vec<String>) {
     let folder = tempfile::tempdir().unwrap();
     let (json, plots) = (folder.path().join("rows.json"), folder.path().join("plots"));
     let mut bench = Command::new(env!("CARGO_BIN_EXE_cara-bench"));
-    let bench = bench.args(["experiments", "--tiny", "--json"]).arg(&json).arg("--plots").arg(&plots);
+    let bench =
+        bench.args(["experiments", "--tiny", "--peers", "none", "--json"]).arg(&json).arg("--plots").arg(&plots);
     let output = bench.output().unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let rows: Value = serde_json::from_str(&std::fs::read_to_string(&json).unwrap()).unwrap();
