@@ -1,0 +1,317 @@
+//! A manager and a vehicle whose frames and datagrams go through the attacker's hands.
+
+use std::collections::VecDeque;
+use std::net::SocketAddr;
+
+use cara_core::config::{Constraints, Mode, Priority};
+use cara_core::distribution::function::{Attributes, Definition};
+use cara_core::distribution::function_list::{Entry, FunctionList, Slot};
+use cara_core::distribution::hello::{Hello, Limits};
+use cara_core::distribution::identity::{Epoch, Fleet, Identity};
+use cara_core::distribution::parameters::Parameters;
+use cara_core::error::CloseReason;
+use cara_core::host::connections::LinkCounter;
+use cara_core::host::mailman::{LinkId, Mailman};
+use cara_core::services::Context;
+use cara_core::services::unit::{Event, RequestOptions, Session, SessionConfig, SessionStorage, buffer_bytes};
+use cara_core::storage::Pool;
+use cara_core::time::{Duration, Instant};
+use cara_secure::keys::{PairKey, RootKey};
+use cara_secure::link::{Cipher, Credentials};
+use cara_sim::Boxed;
+
+const FLEET: Fleet = Fleet(7);
+const BUFFERS: usize = 6;
+
+/// What an end has sent.
+#[derive(Default)]
+struct Sent {
+    stream: Vec<u8>,
+    datagrams: VecDeque<Vec<u8>>,
+}
+
+impl Mailman for Sent {
+    fn write(&mut self, _: LinkId, slices: &[&[u8]]) -> Result<usize, CloseReason> {
+        let bytes = slices.concat();
+        self.stream.extend(&bytes);
+        Ok(bytes.len())
+    }
+
+    fn send_to(&mut self, _: SocketAddr, datagram: &[u8]) -> bool {
+        self.datagrams.push_back(datagram.to_vec());
+        true
+    }
+
+    fn broadcast(&mut self, _: &[u8]) -> bool {
+        false
+    }
+}
+
+/// One end.
+pub(crate) struct End {
+    pub(crate) session: Session<Boxed, Cipher>,
+    functions: FunctionList<Boxed, ()>,
+    pool: Pool<Boxed>,
+    sent: Sent,
+    now: Instant,
+    credentials: Option<Credentials>,
+    /// The node was asked about the peer.
+    pub(crate) greeted: bool,
+    /// Services that ran.
+    pub(crate) ran: u32,
+    pub(crate) closed: Option<CloseReason>,
+}
+
+macro_rules! context {
+    ($end:expr) => {
+        &mut Context {
+            now: $end.now,
+            mailman: &mut $end.sent,
+            buffers: &mut $end.pool,
+            functions: &$end.functions,
+            access: None,
+        }
+    };
+}
+
+fn names() -> [Identity; 2] {
+    [Identity::m_unit("depot", 1), Identity::s_unit("agv", 17)].map(|name| name.expect("a name"))
+}
+
+/// The key of the two.
+pub(crate) fn key() -> PairKey {
+    let [manager, agv] = names();
+    RootKey::new([1; 32]).pair(FLEET, 1, &manager, &agv)
+}
+
+fn hello(agv: bool, run: u8) -> Hello {
+    let [manager, vehicle] = names();
+    let limits = Limits { message_size: 1_024, chunk_size: 1_024, calls: 4, minimum_interval: 0 };
+    Hello {
+        fleet: FLEET,
+        identity: if agv { vehicle } else { manager },
+        wanted: None,
+        epoch: Epoch(1),
+        nonce: 0x1_0000 + u64::from(run) * 2 + u64::from(agv),
+        term: 0,
+        capabilities: 0,
+        limits,
+        link: u16::from(agv),
+        udp_port: 7_001,
+        stamp: 0,
+        keep_alive: 1_000,
+    }
+}
+
+impl End {
+    fn new(agv: bool, run: u8, key: PairKey, fresh: u8) -> Self {
+        let constraints = Constraints { chunk_size: 1_024, ..Constraints::S_UNIT };
+        let storage = SessionStorage {
+            small: Boxed::slice(512),
+            pending: Boxed::slice(8),
+            running: Boxed::slice(9),
+            publications: Boxed::slice(4),
+            their_functions: (0..4).map(|_| Entry::empty()).collect(),
+            their_signatures: Boxed::slice(256),
+        };
+        let config = SessionConfig {
+            link: LinkId(u16::from(agv)),
+            dialed: agv,
+            address: SocketAddr::from(([10, 0, 0, 1], 7_001)),
+            local: hello(agv, run),
+            constraints,
+        };
+        let now = Instant::START + Duration::from_secs(5);
+        let size = buffer_bytes(1_024, 16);
+        let mut functions = FunctionList::new((0..4).map(|_| Entry::empty()).collect(), Boxed::slice(512));
+        let stop = Definition::parse("stop(n: int)").expect("a signature");
+        functions.add_function(&stop, Attributes::default(), ()).expect("room for it");
+        Self {
+            session: Session::new(now, config, Cipher::new(Mode::Secured), storage),
+            functions,
+            pool: Pool::new((0..BUFFERS).map(|_| Some(Boxed::slice(size))).collect()),
+            sent: Sent::default(),
+            now,
+            credentials: Some(Credentials::new(key, [fresh; 32])),
+            greeted: false,
+            ran: 0,
+            closed: None,
+        }
+    }
+
+    /// Takes bytes of the stream, whole or not.
+    pub(crate) fn hear(&mut self, bytes: &[u8]) {
+        let mut bytes = bytes.to_vec();
+        let mut arguments = Parameters::<256>::sized();
+        loop {
+            let receipt = self.session.receive(context!(self), &mut bytes, Some(&mut arguments));
+            let quiet = receipt.consumed == 0 && receipt.event.is_none();
+            let consumed = receipt.consumed;
+            match receipt.event {
+                Some(Event::Introduced) => {
+                    if let Some(credentials) = self.credentials.take() {
+                        self.session.prove(context!(self), credentials);
+                    }
+                }
+                Some(Event::Hello) => self.greet(),
+                Some(Event::Call(call)) => {
+                    self.ran += 1;
+                    let _ = self.session.answer(context!(self), call.ticket, Ok(&arguments));
+                }
+                _ => {}
+            }
+            bytes.drain(..consumed);
+            if quiet {
+                break;
+            }
+        }
+        self.work();
+    }
+
+    /// Takes a datagram, if it is for this end's link.
+    pub(crate) fn hear_datagram(&mut self, datagram: &[u8]) {
+        let mut body = datagram.get(24..).unwrap_or(&[]).to_vec();
+        let from = self.session.address();
+        let nonce = datagram.get(16..24).and_then(|nonce| nonce.try_into().ok()).map_or(0, u64::from_le_bytes);
+        let _ = self.session.datagram(context!(self), from, nonce, &mut body);
+        self.work();
+    }
+
+    fn greet(&mut self) {
+        self.greeted = true;
+        self.session.accept(context!(self));
+        self.session.publish(context!(self), [Slot(0)].into_iter());
+    }
+
+    fn work(&mut self) {
+        let mut arguments = Parameters::<256>::sized();
+        while let Some(call) = self.session.next_call(context!(self), &mut arguments) {
+            self.ran += 1;
+            let _ = self.session.answer(context!(self), call.ticket, Ok(&arguments));
+        }
+        while let Some(event) = self.session.poll(context!(self)) {
+            if let Event::Closed(reason) = event {
+                self.closed = Some(reason);
+            }
+        }
+    }
+
+    /// Requests `stop` of the peer; an emergency goes as a datagram as well.
+    pub(crate) fn call(&mut self, priority: Priority) {
+        let mut parameters = Parameters::<64>::sized();
+        parameters.add_int("n", 1).expect("room for it");
+        let options = RequestOptions { priority: Some(priority), ..RequestOptions::default() };
+        let _ = self.session.request(context!(self), "stop", &parameters, &options, false);
+        self.session.flush_gathered(context!(self));
+    }
+
+    pub(crate) fn wait(&mut self, span: Duration) {
+        self.now = self.now + span;
+        self.work();
+    }
+
+    pub(crate) fn counted(&self, counter: LinkCounter) -> u64 {
+        self.session.counters().value(counter)
+    }
+
+    pub(crate) fn has_all_buffers(&self) -> bool {
+        self.pool.free() == BUFFERS
+    }
+
+    /// The next whole frame that it has sent.
+    fn next_frame(&mut self) -> Option<Vec<u8>> {
+        let length = usize::from(u16::from_le_bytes(*self.sent.stream.first_chunk()?)) + 2;
+        (self.sent.stream.len() >= length).then(|| self.sent.stream.drain(..length).collect())
+    }
+}
+
+/// Something on its way.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Carried {
+    pub(crate) to_manager: bool,
+    pub(crate) datagram: bool,
+    pub(crate) bytes: Vec<u8>,
+}
+
+/// Both ends.
+pub(crate) struct Ends {
+    pub(crate) manager: End,
+    pub(crate) agv: End,
+}
+
+impl Ends {
+    /// Two ends of the right key whose connection is open. The random numbers of each run are its own.
+    pub(crate) fn new(run: u8) -> Self {
+        Self::with_keys(run, key(), key())
+    }
+
+    pub(crate) fn with_keys(run: u8, manager: PairKey, agv: PairKey) -> Self {
+        Self::made(End::new(false, run, manager, run), End::new(true, run, agv, run | 0x80))
+    }
+
+    /// Two ends that draw the same numbers, the same in each run; only the nonces of their hellos differ.
+    pub(crate) fn repeating(run: u8) -> Self {
+        Self::made(End::new(false, run, key(), 9), End::new(true, run, key(), 9))
+    }
+
+    fn made(manager: End, agv: End) -> Self {
+        let mut ends = Self { manager, agv };
+        ends.manager.session.connected(context!(ends.manager));
+        ends.agv.session.connected(context!(ends.agv));
+        ends
+    }
+
+    pub(crate) fn end(&mut self, manager: bool) -> &mut End {
+        if manager { &mut self.manager } else { &mut self.agv }
+    }
+
+    /// The next thing on its way: the vehicle's before the manager's, frames before datagrams.
+    pub(crate) fn next(&mut self) -> Option<Carried> {
+        for to_manager in [true, false] {
+            if let Some(bytes) = self.end(!to_manager).next_frame() {
+                return Some(Carried { to_manager, datagram: false, bytes });
+            }
+        }
+        for to_manager in [true, false] {
+            if let Some(bytes) = self.end(!to_manager).sent.datagrams.pop_front() {
+                return Some(Carried { to_manager, datagram: true, bytes });
+            }
+        }
+        None
+    }
+
+    pub(crate) fn deliver(&mut self, carried: &Carried) {
+        let end = self.end(carried.to_manager);
+        if carried.datagram { end.hear_datagram(&carried.bytes) } else { end.hear(&carried.bytes) }
+    }
+
+    /// A whole conversation: both join and publish, then the manager calls twice, once in an emergency. `carry` sees
+    /// everything on its way, with its number, and delivers what it likes.
+    pub(crate) fn converse(&mut self, mut carry: impl FnMut(&mut Self, usize, Carried)) {
+        let mut number = 0;
+        for step in 0..4 {
+            match step {
+                1 => self.manager.call(Priority::Normal),
+                2 => self.manager.call(Priority::Emergency),
+                3 => [true, false].into_iter().for_each(|end| self.end(end).wait(Duration::from_secs(1))),
+                _ => {}
+            }
+            while let Some(carried) = self.next() {
+                carry(self, number, carried);
+                number += 1;
+            }
+        }
+    }
+
+    /// The same, undisturbed; all that was carried.
+    pub(crate) fn recorded(run: u8) -> Vec<Carried> {
+        let (mut ends, mut record) = (Self::new(run), Vec::new());
+        ends.converse(|ends, _, carried| {
+            ends.deliver(&carried);
+            record.push(carried);
+        });
+        assert!(ends.manager.session.is_live() && ends.agv.session.is_live());
+        assert_eq!(ends.agv.ran, 2, "each call ran once");
+        record
+    }
+}

@@ -1,0 +1,165 @@
+//! Wrong keys, no keys, plain against secured, floods: whole fleets on the virtual network.
+
+use cara_core::config::Mode;
+use cara_core::distribution::connection_handler::NodeCounter;
+use cara_core::distribution::hello::{Hello, Limits};
+use cara_core::distribution::identity::{Epoch, Fleet, Identity};
+use cara_core::distribution::parameters::Parameters;
+use cara_core::error::CloseReason;
+use cara_core::host::connections::LinkCounter;
+use cara_core::host::frame::{self, Frame};
+use cara_core::services::unit::RequestOptions;
+use cara_core::time::Duration;
+use cara_sim::{HostId, Service, StreamId, UnitEvent, UnitHandle, World};
+
+use super::Tally;
+
+const PORT: u16 = 7_000;
+
+fn secs(secs: u64) -> Duration {
+    Duration::from_secs(secs)
+}
+
+fn program(unit: &UnitHandle) {
+    unit.add_function("stop()", Service::new(|_, _| Ok(()))).expect("room for it");
+    unit.publish().expect("it was added");
+}
+
+fn address(manager: &UnitHandle) -> std::net::SocketAddr {
+    let mut address = manager.address();
+    address.set_port(PORT);
+    address
+}
+
+/// Two units that should have nothing to do with each other, for a minute.
+fn strangers(tally: &mut Tally, world: &mut World, manager: &UnitHandle, agv: &UnitHandle) {
+    world.run_for(secs(60));
+    let joined = |unit: &UnitHandle| unit.count(|event| matches!(event, UnitEvent::Joined { .. })) > 0;
+    tally.note(joined(manager) || joined(agv));
+}
+
+#[test]
+fn whoever_lacks_the_key_joins_nobody() {
+    let mut tally = Tally::new("units with a wrong key, none, or another fleet's");
+    for seed in 0..8 {
+        let mut world = World::secured(seed);
+        let manager = world.m_unit("depot", 1).program(program).start();
+        let to = address(&manager);
+        let other_root = world.s_unit("agv", 7).joins_at("depot", 1, to).keys_of_root(3).program(program).start();
+        strangers(&mut tally, &mut world, &manager, &other_root);
+        assert!(manager.link_counter(LinkCounter::ProofsFailed) > 0);
+        let found = world.s_unit("agv", 8).joins("depot", 1).keys_of_root(3).program(program).start();
+        strangers(&mut tally, &mut world, &manager, &found);
+        assert!(manager.node_counter(NodeCounter::DatagramForged) > 0);
+        let keyless = world.s_unit("agv", 9).joins_at("depot", 1, to).without_key_for("depot").start();
+        strangers(&mut tally, &mut world, &manager, &keyless);
+        assert!(keyless.node_counter(NodeCounter::RefusedKey) > 0);
+        let fleet = world.s_unit("agv", 10).joins_at("depot", 1, to).fleet(5).program(program).start();
+        strangers(&mut tally, &mut world, &manager, &fleet);
+    }
+    tally.close();
+}
+
+#[test]
+fn a_manager_without_a_key_for_a_vehicle_says_so_to_its_operator_only() {
+    let mut world = World::secured(1);
+    let manager = world.m_unit("depot", 1).without_key_for("agv").start();
+    let agv = world.s_unit("agv", 7).joins_at("depot", 1, address(&manager)).start();
+    world.run_for(secs(20));
+    assert!(manager.node_counter(NodeCounter::RefusedKey) > 0 && manager.link_counter(LinkCounter::KeysMissing) > 0);
+    let reasons = |unit: &UnitHandle, reason| unit.count(|event| *event == UnitEvent::LinkEnded { reason });
+    assert!(reasons(&agv, CloseReason::Unproven) > 0);
+}
+
+#[test]
+fn plain_and_secured_units_never_meet() {
+    let mut tally = Tally::new("plain against secured");
+    for (manager_mode, agv_mode) in [(Mode::Plain, Mode::Secured), (Mode::Secured, Mode::Plain)] {
+        for seed in 0..8 {
+            let mut world = World::new(seed);
+            let manager = world.m_unit("depot", 1).mode(manager_mode).program(program).start();
+            let found = world.s_unit("agv", 7).joins("depot", 1).mode(agv_mode).program(program).start();
+            let to = address(&manager);
+            let dials = world.s_unit("agv", 8).joins_at("depot", 1, to).mode(agv_mode).program(program).start();
+            strangers(&mut tally, &mut world, &manager, &found);
+            strangers(&mut tally, &mut world, &manager, &dials);
+        }
+    }
+    tally.close();
+}
+
+/// The hello of a vehicle that does not exist, or of one that is connected.
+fn hello(id: u32, nonce: u64) -> Vec<u8> {
+    let limits = Limits { message_size: 1_024, chunk_size: 1_024, calls: 8, minimum_interval: 0 };
+    let hello = Hello {
+        fleet: Fleet(0),
+        identity: Identity::s_unit("agv", id).expect("a name"),
+        wanted: Some(cara_core::distribution::hello::Manager::new("depot", 1).expect("a name")),
+        epoch: Epoch(nonce),
+        nonce,
+        term: 0,
+        capabilities: 0,
+        limits,
+        link: 0,
+        udp_port: 7_001,
+        stamp: 0,
+        keep_alive: 1_000,
+    };
+    let (mut bytes, mut framed) = ([0; 300], [0; 320]);
+    let length = hello.encode(Mode::Secured, &mut bytes).expect("it fits");
+    let length = frame::encode(&Frame::Hello(&bytes[..length]), 0, &mut framed);
+    framed[..length].to_vec()
+}
+
+/// Opens connections and says hello on each, with the identity of a unit that is connected every other time.
+fn flood(world: &mut World, host: HostId, to: std::net::SocketAddr, round: u64) -> Vec<StreamId> {
+    let streams: Vec<_> = (0..8).map(|_| world.network(|network| network.connect(host, to))).collect();
+    world.run_for(Duration::from_millis(5));
+    for (number, stream) in streams.iter().enumerate() {
+        let says = hello(if number % 2 == 0 { 7 } else { 1_000 }, round * 100 + number as u64);
+        let _ = world.network(|network| network.write(*stream, &[&says]));
+    }
+    streams
+}
+
+/// Calls to a vehicle that is connected keep their deadline, and another one joins, while somebody opens link after link.
+#[test]
+fn a_flood_of_half_open_links_keeps_nobody_out() {
+    let mut tally = Tally::new("half-open links of a flood");
+    for seed in 0..4 {
+        let mut world = World::secured(seed);
+        let manager = world.m_unit("depot", 1).start();
+        let agv = world.s_unit("agv", 7).joins("depot", 1).program(program).start();
+        assert!(world.run_until(|_| manager.knows(&agv, "stop"), secs(20)));
+        let attacker = world.network(|network| network.add_host());
+        let (to, mut late) = (address(&manager), None);
+        for round in 0..200 {
+            let streams = flood(&mut world, attacker, to, round);
+            if round == 50 {
+                late = Some(world.s_unit("agv", 8).joins("depot", 1).program(program).start());
+            }
+            let options = RequestOptions { timeout: Some(Duration::from_millis(50)), ..RequestOptions::default() };
+            let mut parameters = Parameters::<64>::sized();
+            let called = world.block_on(manager.block_request_with(&agv, "stop", &mut parameters, options));
+            assert_eq!(called, Ok(()), "round {round} of seed {seed}");
+            for stream in streams {
+                tally.note(false);
+                world.network(|network| {
+                    if network.is_open(stream) && round % 3 == 0 {
+                        network.close(stream)
+                    }
+                });
+            }
+        }
+        let late = late.expect("it was started");
+        assert!(
+            world.run_until(|_| manager.knows(&late, "stop"), secs(30)),
+            "nobody joins during a flood, seed {seed}"
+        );
+        let joined = manager.count(|event| matches!(event, UnitEvent::Joined { .. }));
+        assert_eq!(joined, 2, "the two vehicles, once each");
+        assert_eq!(manager.node_counter(NodeCounter::Challenged), 0, "an identity alone challenges nobody");
+        assert!(manager.node_counter(NodeCounter::GaveWay) > 0);
+    }
+    tally.close();
+}

@@ -1,0 +1,35 @@
+//! What somebody without the keys can do to secured units: each test counts what was tried and what came of it.
+//!
+//! - [`ends`]: two secured sessions, with every frame and datagram between them in the attacker's hands;
+//! - [`frames`]: changed, cut, moved, left out and repeated frames;
+//! - [`discovery`]: changed, spoofed and repeated datagrams of discovery;
+//! - [`fleet`]: wrong keys, no keys, plain against secured, floods, on the virtual network.
+
+mod discovery;
+mod ends;
+mod fleet;
+mod frames;
+
+/// Attempts of one kind, and how many of them came to something.
+struct Tally {
+    what: &'static str,
+    attempts: u64,
+    successes: u64,
+}
+
+impl Tally {
+    fn new(what: &'static str) -> Self {
+        Self { what, attempts: 0, successes: 0 }
+    }
+
+    fn note(&mut self, success: bool) {
+        self.attempts += 1;
+        self.successes += u64::from(success);
+    }
+
+    /// Prints the figures; none may have come to anything, and there must have been some.
+    fn close(self) {
+        println!("{}: {} attempts, {} successes", self.what, self.attempts, self.successes);
+        assert!(self.attempts > 0 && self.successes == 0, "{}: {} of {}", self.what, self.successes, self.attempts);
+    }
+}
