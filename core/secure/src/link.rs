@@ -41,12 +41,13 @@ impl Credentials {
         mac.finalize().into_bytes().into()
     }
 
-    fn ephemeral(&self) -> [u8; KEY_BYTES] {
-        self.secret(b"ephe", &[])
+    /// The handshake's own secret. The keys that come of it do not depend on the prologue by themselves; made like this
+    /// they do, so two links have two keys even if both ends draw what they drew before.
+    fn ephemeral(&self, prologue: &[u8; 32]) -> [u8; KEY_BYTES] {
+        self.secret(b"ephe", prologue)
     }
 
-    /// The key of this end's datagrams. Two links have two keys even if the random numbers of both are the same, and so
-    /// have both ends.
+    /// The key of this end's datagrams, another one than that of the other end whatever is drawn.
     fn datagrams(&self, dialed: bool, binding: &[u8; 32]) -> DatagramKey {
         DatagramKey::new(self.secret(if dialed { b"dgrI" } else { b"dgrR" }, binding))
     }
@@ -141,7 +142,7 @@ impl Secure for Noise {
             self.0 = State::Responding(prologue, credentials);
             return Ok(None);
         }
-        let begun = Initiator::begin(&credentials.key, &prologue, &credentials.ephemeral());
+        let begun = Initiator::begin(&credentials.key, &prologue, &credentials.ephemeral(&prologue));
         let (initiator, message) = begun.map_err(|_| CloseReason::BadProof)?;
         self.0 = State::Initiating(initiator, credentials);
         Ok(Some(message))
@@ -202,7 +203,7 @@ fn respond(
     credentials: &Credentials,
     message: &[u8],
 ) -> Result<(Agreed, [u8; PROOF_BYTES]), CloseReason> {
-    let ephemeral = credentials.ephemeral();
+    let ephemeral = credentials.ephemeral(prologue);
     let keys = core::iter::once(&credentials.key).chain(&credentials.other);
     let mut answers = keys.filter_map(|key| handshake::answer(key, prologue, &ephemeral, message).ok());
     answers.next().ok_or(CloseReason::BadProof)

@@ -6,7 +6,7 @@ use cara_core::time::Duration;
 use cara_secure::keys::PairKey;
 
 use super::Tally;
-use super::ends::{Carried, Ends};
+use super::ends::{Carried, End, Ends};
 
 /// Hellos, proofs and confirmations.
 const HANDSHAKE: usize = 6;
@@ -49,6 +49,11 @@ fn every_flipped_bit_of_a_handshake_fails_it() {
     tally.close();
 }
 
+/// Datagrams whose seal or number was wrong.
+fn refused(end: &End) -> u64 {
+    end.counted(LinkCounter::DatagramsForged) + end.counted(LinkCounter::DatagramsRepeated)
+}
+
 #[test]
 fn every_flipped_bit_of_a_sealed_frame_ends_the_link_and_of_a_datagram_changes_nothing() {
     let mut tally = Tally::new("bits of sealed frames and datagrams flipped");
@@ -61,7 +66,7 @@ fn every_flipped_bit_of_a_sealed_frame_ends_the_link_and_of_a_datagram_changes_n
             let ran = ends.agv.ran;
             let victim = ends.end(original.to_manager);
             let noticed = match original.datagram {
-                true => victim.counted(LinkCounter::DatagramsForged) > 0 && victim.session.is_live(),
+                true => refused(victim) > 0 && victim.session.is_live(),
                 false => victim.closed.is_some(),
             };
             tally.note(!noticed || ran > 2);
@@ -162,7 +167,8 @@ fn frames_that_are_left_out_or_change_places_end_the_link() {
                 }
             });
             let victim = ends.end(original.to_manager);
-            tally.note((followed && victim.closed.is_none()) || victim.ran > 1);
+            // The emergency also travels as a datagram, so it may run although its frame is missing.
+            tally.note((followed && victim.closed.is_none()) || victim.ran > 2);
         }
     }
     tally.close();
@@ -211,7 +217,9 @@ fn a_generator_that_repeats_itself_repeats_no_key() {
         record.into_iter().skip(HANDSHAKE).map(|carried| carried.bytes).collect::<Vec<_>>()
     };
     let (one, other) = (record(RECORDED), record(ATTACKED));
-    assert!(one.iter().all(|bytes| !other.contains(bytes)));
+    for (number, bytes) in one.iter().enumerate() {
+        assert!(!other.contains(bytes), "number {number}: {bytes:02x?}");
+    }
     let mut alone = one.clone();
     alone.sort();
     alone.dedup();
