@@ -21,7 +21,6 @@ use core::task::{Context as TaskContext, Poll};
 use crate::event::{Name, UnitEvent};
 use crate::line::Progress;
 use crate::machine::{LinkSession, Machine};
-use crate::mail::EmbassyMailman;
 use crate::replies::ended;
 use crate::taken::Running;
 use crate::time::now;
@@ -78,11 +77,10 @@ impl<T> Machine<T> {
     /// Lets the session of a link do what is due: `None` when nothing is.
     #[inline(never)]
     pub(crate) fn poll_link(&mut self, index: u16) -> Option<News> {
-        let Self { links, lines, udp, stack, pool, functions, reply, access, .. } = self;
+        let Self { links, mail, pool, functions, reply, access, .. } = self;
         let link = links.get_mut(usize::from(index))?;
         let session = link.session.as_mut()?;
-        let mut mailman = EmbassyMailman { lines, udp, stack: *stack };
-        let mut cx = Context { now: now(), mailman: &mut mailman, buffers: pool, functions, access: access.0 };
+        let mut cx = Context { now: now(), mailman: mail, buffers: pool, functions, access: access.0 };
         if cx.now < session.deadline() {
             return None;
         }
@@ -102,16 +100,15 @@ impl<T> Machine<T> {
         scratch: &mut [u8],
         arguments: Option<&mut ParametersView>,
     ) -> Option<Option<News>> {
-        let Self { links, lines, udp, stack, pool, functions, reply, access, .. } = self;
+        let Self { links, mail, pool, functions, reply, access, .. } = self;
         let link = links.get_mut(usize::from(index))?;
         if link.session.is_none() || (reply.is_taken() && link.awaits_reply()) {
             return None;
         }
         let session = link.session.as_mut()?;
-        let peeked = lines.get_mut(usize::from(index))?.peek(scratch);
+        let peeked = mail.lines.get_mut(usize::from(index))?.peek(scratch);
         let lent = scratch.get_mut(..peeked)?;
-        let mut mailman = EmbassyMailman { lines, udp, stack: *stack };
-        let mut cx = Context { now: now(), mailman: &mut mailman, buffers: pool, functions, access: access.0 };
+        let mut cx = Context { now: now(), mailman: mail, buffers: pool, functions, access: access.0 };
         let receipt = session.receive(&mut cx, lent, arguments);
         let consumed = receipt.consumed;
         let news = match receipt.event {
@@ -121,7 +118,7 @@ impl<T> Machine<T> {
             }
             event => event.map(News::of),
         };
-        lines.get_mut(usize::from(index))?.take(consumed);
+        mail.lines.get_mut(usize::from(index))?.take(consumed);
         if consumed == 0 && news.is_none() { None } else { Some(news) }
     }
 
@@ -132,7 +129,7 @@ impl<T> Machine<T> {
         scratch: &mut [u8],
         context: &mut TaskContext<'_>,
     ) -> Option<Option<(u16, News)>> {
-        let (length, from) = match self.udp.poll_recv_from(scratch, context) {
+        let (length, from) = match self.mail.udp.poll_recv_from(scratch, context) {
             Poll::Pending => return None,
             Poll::Ready(Err(_)) => return Some(None),
             Poll::Ready(Ok((length, from))) => (length, from.endpoint),
@@ -160,7 +157,7 @@ impl<T> Machine<T> {
     pub(crate) fn look_at_lines(&mut self) {
         let now = now();
         for index in self.indices() {
-            let Some(line) = self.lines.get_mut(usize::from(index)) else { continue };
+            let Some(line) = self.mail.lines.get_mut(usize::from(index)) else { continue };
             match line.progress(now) {
                 Progress::None => {}
                 Progress::Connected => {
@@ -174,7 +171,7 @@ impl<T> Machine<T> {
                     None => self.hang_up(index),
                 },
             }
-            if self.lines.get(usize::from(index)).is_some_and(crate::line::Line::has_ended) {
+            if self.mail.lines.get(usize::from(index)).is_some_and(crate::line::Line::has_ended) {
                 self.disconnected(index, CloseReason::Reset);
             }
         }
@@ -184,7 +181,7 @@ impl<T> Machine<T> {
 
     /// The stack refuses who dials while no socket listens, so whoever says nothing gives way.
     fn show_one_out(&mut self, now: Instant) {
-        if self.lines.iter().any(crate::line::Line::takes_connections) {
+        if self.mail.lines.iter().any(crate::line::Line::takes_connections) {
             return;
         }
         let since = |machine: &Self, index: u16| machine.link(index).map_or(now, |link| link.since);
@@ -203,7 +200,7 @@ impl<T> Machine<T> {
 
     fn hang_up(&mut self, index: u16) {
         let up = self.address.is_some();
-        if let Some(line) = self.lines.get_mut(usize::from(index)) {
+        if let Some(line) = self.mail.lines.get_mut(usize::from(index)) {
             if up { line.close() } else { line.abort() }
         }
     }
@@ -213,7 +210,7 @@ impl<T> Machine<T> {
         for index in self.indices() {
             let wants =
                 self.link(index).and_then(|link| link.session.as_ref()).is_some_and(LinkSession::wants_to_write);
-            if wants && self.lines.get(usize::from(index)).is_some_and(crate::line::Line::can_write) {
+            if wants && self.mail.lines.get(usize::from(index)).is_some_and(crate::line::Line::can_write) {
                 self.with(index, |session, cx, _| session.writable(cx));
             }
         }
@@ -222,7 +219,7 @@ impl<T> Machine<T> {
     /// The cable was pulled or plugged in, or the address changed: every connection is dead, whatever TCP still hopes.
     #[inline(never)]
     pub(crate) fn look_at_network(&mut self) {
-        let config = if self.stack.is_link_up() { self.stack.config_v4() } else { None };
+        let config = if self.mail.stack.is_link_up() { self.mail.stack.config_v4() } else { None };
         let address = config.map(|config| config.address);
         if address == self.address {
             return;
@@ -239,7 +236,7 @@ impl<T> Machine<T> {
         }
         for index in self.indices() {
             self.disconnected(index, CloseReason::Reset);
-            if let Some(line) = self.lines.get_mut(usize::from(index)) {
+            if let Some(line) = self.mail.lines.get_mut(usize::from(index)) {
                 line.abort();
             }
         }
@@ -317,7 +314,7 @@ impl<T> Machine<T> {
     #[inline(never)]
     fn dial(&mut self, to: SocketAddr, identity: Option<&Identity>) {
         let dialed = self.free_link().filter(|index| {
-            let line = self.lines.get_mut(usize::from(*index));
+            let line = self.mail.lines.get_mut(usize::from(*index));
             line.is_some_and(|line| line.dial(to))
         });
         match dialed {

@@ -14,8 +14,7 @@ use cara_core::storage::{Lent, Pool};
 use cara_core::time::Instant;
 use core::cell::RefCell;
 use core::net::SocketAddr;
-use embassy_net::udp::UdpSocket;
-use embassy_net::{Ipv4Cidr, Stack};
+use embassy_net::Ipv4Cidr;
 use embassy_sync::waitqueue::{MultiWakerRegistration, WakerRegistration};
 
 use crate::config::Table;
@@ -31,7 +30,7 @@ use crate::time::now;
 const TASKS_WAITING: usize = 4;
 
 pub(crate) type LinkSession = Session<Lent, Plain>;
-pub(crate) type LinkContext<'c, 'm, T> = Context<'c, Lent, EmbassyMailman<'m>, Pool<Lent>, Listed<T>>;
+pub(crate) type LinkContext<'c, T> = Context<'c, Lent, EmbassyMailman, Pool<Lent>, Listed<T>>;
 pub(crate) type LinkCounters = Counters<LinkCounter, { LinkCounter::COUNT }>;
 
 /// What a handle points to.
@@ -84,10 +83,7 @@ pub(crate) struct Machine<T: 'static> {
     pub(crate) functions: FunctionList<Lent, Listed<T>>,
     pub(crate) pool: Pool<Lent>,
     pub(crate) links: &'static mut [Link],
-    /// The socket of each link.
-    pub(crate) lines: &'static mut [Line],
-    pub(crate) udp: UdpSocket<'static>,
-    pub(crate) stack: Stack<'static>,
+    pub(crate) mail: EmbassyMailman,
     pub(crate) reply: ReplyBox,
     pub(crate) tasks: &'static mut [TaskSlot],
     pub(crate) events: Events,
@@ -167,20 +163,24 @@ impl<T> Machine<T> {
     pub(crate) fn with<R>(
         &mut self,
         index: u16,
-        act: impl FnOnce(&mut LinkSession, &mut LinkContext<'_, '_, T>, &Publications<Lent>) -> R,
+        act: impl FnOnce(&mut LinkSession, &mut LinkContext<'_, T>, &Publications<Lent>) -> R,
     ) -> Option<R> {
-        let Self { links, lines, udp, stack, pool, functions, publications, access, .. } = self;
-        let session = links.get_mut(usize::from(index))?.session.as_mut()?;
-        let mut mailman = EmbassyMailman { lines, udp, stack: *stack };
-        let mut context = Context { now: now(), mailman: &mut mailman, buffers: pool, functions, access: access.0 };
+        let (session, mut context, publications) = self.lend(index)?;
         Some(act(session, &mut context, publications))
+    }
+
+    /// Kept apart from the many that use it.
+    #[inline(never)]
+    fn lend(&mut self, index: u16) -> Option<(&mut LinkSession, LinkContext<'_, T>, &Publications<Lent>)> {
+        let Self { links, mail, pool, functions, publications, access, .. } = self;
+        let session = links.get_mut(usize::from(index))?.session.as_mut()?;
+        Some((session, Context { now: now(), mailman: mail, buffers: pool, functions, access: access.0 }, publications))
     }
 
     /// Lets the node do what is due.
     #[inline(never)]
     pub(crate) fn poll_node(&mut self) -> Option<Action> {
-        let Self { node, lines, udp, stack, .. } = self;
-        node.poll(now(), &mut EmbassyMailman { lines, udp, stack: *stack }, &Plain)
+        self.node.poll(now(), &mut self.mail, &Plain)
     }
 
     /// Makes the session of a link. `None` when the link is in use.
@@ -199,10 +199,10 @@ impl<T> Machine<T> {
     /// A link that could dial: one whose socket is idle, if there is any.
     pub(crate) fn free_link(&self) -> Option<u16> {
         let free = |index: &u16| {
-            let line = self.lines.get(usize::from(*index)).is_some_and(|line| !line.is_in_use());
+            let line = self.mail.lines.get(usize::from(*index)).is_some_and(|line| !line.is_in_use());
             line && self.link(*index).is_some_and(|link| link.storage.is_some())
         };
-        let closing = |index: &u16| self.lines.get(usize::from(*index)).is_some_and(Line::is_closing);
+        let closing = |index: &u16| self.mail.lines.get(usize::from(*index)).is_some_and(Line::is_closing);
         let mut candidates = self.indices().filter(free);
         let first = candidates.next()?;
         if closing(&first) { candidates.find(|index| !closing(index)).or(Some(first)) } else { Some(first) }
@@ -223,7 +223,7 @@ impl<T> Machine<T> {
     pub(crate) fn listen(&mut self) {
         if self.node.identity().role() == Role::MUnit && self.address.is_some() && !self.stopped {
             let port = self.tcp_port;
-            self.lines.iter_mut().for_each(|line| line.listen(port));
+            self.mail.lines.iter_mut().for_each(|line| line.listen(port));
         }
     }
 

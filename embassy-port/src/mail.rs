@@ -12,26 +12,27 @@ use embassy_net::{IpAddress, IpEndpoint, Stack};
 use crate::line::Line;
 
 /// Sends for one unit: its links over their sockets, everything else over one UDP socket.
-pub(crate) struct EmbassyMailman<'m> {
-    pub(crate) lines: &'m mut [Line],
-    pub(crate) udp: &'m UdpSocket<'static>,
+pub(crate) struct EmbassyMailman {
+    /// The socket of each link.
+    pub(crate) lines: &'static mut [Line],
+    pub(crate) udp: UdpSocket<'static>,
     pub(crate) stack: Stack<'static>,
 }
 
-impl Mailman for EmbassyMailman<'_> {
+impl Mailman for EmbassyMailman {
     fn write(&mut self, link: LinkId, slices: &[&[u8]]) -> Result<usize, CloseReason> {
         self.lines.get_mut(usize::from(link.0)).ok_or(CloseReason::Reset)?.write(slices)
     }
 
     fn send_to(&mut self, to: SocketAddr, datagram: &[u8]) -> bool {
         let IpAddr::V4(address) = to.ip() else { return false };
-        send(self.udp, address, to.port(), datagram)
+        send(&self.udp, address, to.port(), datagram)
     }
 
     fn broadcast(&mut self, datagram: &[u8]) -> bool {
         let Some(config) = self.stack.config_v4().filter(|_| self.stack.is_link_up()) else { return false };
         let all = config.address.broadcast().unwrap_or(Ipv4Addr::BROADCAST);
-        send(self.udp, all, PLAIN_PORT, datagram)
+        send(&self.udp, all, PLAIN_PORT, datagram)
     }
 }
 

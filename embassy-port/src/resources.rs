@@ -6,6 +6,7 @@ use core::mem::MaybeUninit;
 use cara_core::config::{LINK_BUFFER_BYTES, PLAIN_PORT};
 use cara_core::counters::Counters;
 use cara_core::distribution::connection_handler::{Finding, Known, Node, NodeConfig, NodeStorage, Order};
+use cara_core::distribution::datagram::SEARCH_BYTES;
 use cara_core::distribution::function_list::{Entry, FunctionList};
 use cara_core::distribution::identity::{Epoch, Role};
 use cara_core::distribution::parameters::Parameters;
@@ -24,6 +25,7 @@ use crate::handle::Handle;
 use crate::handler::Listed;
 use crate::line::Line;
 use crate::machine::{Link, Machine, Room, Shared, Wakers};
+use crate::mail::EmbassyMailman;
 use crate::replies::{ReplyBox, Waiter};
 use crate::runner::Runner;
 use crate::taken::TaskSlot;
@@ -47,7 +49,7 @@ const DATAGRAMS: usize = 8;
 /// |---|---|---|
 /// | `T` | the application's state | its size |
 /// | `LINKS` | connections; for an m_unit one more than its nodes, so that it can refuse one by name | about 5,000 and twice `STREAM` |
-/// | `MESSAGE` | [`message_buffer`] of the longest message, which is also that of datagrams | 4, and 1 for each of `BUFFERS` |
+/// | `MESSAGE` | [`message_buffer`] of the longest message | 1 for each of `BUFFERS`; 4 with `DATAGRAM` and `REPLY` as they are |
 /// | `BUFFERS` | message buffers that all links share, at least 2 | `MESSAGE` |
 /// | `STREAM` | bytes that TCP keeps, in each direction of each link | 2 for each of `LINKS` |
 /// | `FUNCTIONS` | its own functions, with 64 bytes of signature each | about 180 |
@@ -55,6 +57,8 @@ const DATAGRAMS: usize = 8;
 /// | `CALLS` | calls in flight to one peer; calls of one peer that run here, one of which is kept for an emergency | about 250 for each of `LINKS` |
 /// | `TASKS` | calls that wait for a task of the application, and answers that wait for room | `ARGUMENTS` and 350 |
 /// | `ARGUMENTS` | bytes of the arguments and results of a service, with their names | 1, and 1 for each of `TASKS` |
+/// | `DATAGRAM` | the longest datagram, at least 512; best-effort requests that are longer are lost; `MESSAGE` unless set | 3 |
+/// | `REPLY` | the longest results that come back from a peer, encoded; `MESSAGE` unless set | 1 |
 ///
 /// ```
 /// use cara_embassy::{Resources, message_buffer};
@@ -81,6 +85,8 @@ pub struct Resources<
     const CALLS: usize = 4,
     const TASKS: usize = 1,
     const ARGUMENTS: usize = 512,
+    const DATAGRAM: usize = MESSAGE,
+    const REPLY: usize = MESSAGE,
 > {
     shared: MaybeUninit<Shared<T>>,
     links: MaybeUninit<[Link; LINKS]>,
@@ -97,13 +103,13 @@ pub struct Resources<
     to_one: MaybeUninit<[[Option<PublishedToOne>; FUNCTIONS]; LINKS]>,
     buffers: [MaybeUninit<[u8; MESSAGE]>; BUFFERS],
     pool: MaybeUninit<[Option<&'static mut [u8]>; BUFFERS]>,
-    reply: MaybeUninit<[u8; MESSAGE]>,
+    reply: MaybeUninit<[u8; REPLY]>,
     arguments: MaybeUninit<Parameters<ARGUMENTS>>,
     task_parameters: [MaybeUninit<Parameters<ARGUMENTS>>; TASKS],
     tasks: MaybeUninit<[TaskSlot; TASKS]>,
     events: MaybeUninit<[Option<UnitEvent>; EVENTS]>,
-    scratch: MaybeUninit<[u8; MESSAGE]>,
-    udp: UdpMemory<MESSAGE>,
+    scratch: MaybeUninit<[u8; DATAGRAM]>,
+    udp: UdpMemory<DATAGRAM>,
 }
 
 /// The memory of one TCP socket.
@@ -124,9 +130,9 @@ struct SessionMemory<const FUNCTIONS: usize, const THEIR: usize, const CALLS: us
 }
 
 /// The memory of the UDP socket.
-struct UdpMemory<const MESSAGE: usize> {
-    receive: MaybeUninit<[u8; MESSAGE]>,
-    send: MaybeUninit<[u8; MESSAGE]>,
+struct UdpMemory<const DATAGRAM: usize> {
+    receive: MaybeUninit<[u8; DATAGRAM]>,
+    send: MaybeUninit<[u8; DATAGRAM]>,
     received: MaybeUninit<[PacketMetadata; DATAGRAMS]>,
     sent: MaybeUninit<[PacketMetadata; DATAGRAMS]>,
 }
@@ -142,7 +148,9 @@ impl<
     const CALLS: usize,
     const TASKS: usize,
     const ARGUMENTS: usize,
-> Resources<T, LINKS, MESSAGE, BUFFERS, STREAM, FUNCTIONS, THEIR, CALLS, TASKS, ARGUMENTS>
+    const DATAGRAM: usize,
+    const REPLY: usize,
+> Resources<T, LINKS, MESSAGE, BUFFERS, STREAM, FUNCTIONS, THEIR, CALLS, TASKS, ARGUMENTS, DATAGRAM, REPLY>
 {
     /// All memory of the unit, but for the stack and embassy-net's own.
     pub const BYTES: usize = size_of::<Self>();
@@ -156,6 +164,7 @@ impl<
             assert!(BUFFERS > 1, "what waits in a buffer needs another one to be answered with");
             assert!(CALLS > 1, "one call is kept for emergencies");
             assert!(MESSAGE >= message_buffer(0), "a buffer holds the longest message of the protocol itself");
+            assert!(DATAGRAM >= SEARCH_BYTES, "a datagram holds the longest search");
         }
         Self {
             shared: MaybeUninit::uninit(),
@@ -200,7 +209,10 @@ impl<
     const CALLS: usize,
     const TASKS: usize,
     const ARGUMENTS: usize,
-> Default for Resources<T, LINKS, MESSAGE, BUFFERS, STREAM, FUNCTIONS, THEIR, CALLS, TASKS, ARGUMENTS>
+    const DATAGRAM: usize,
+    const REPLY: usize,
+> Default
+    for Resources<T, LINKS, MESSAGE, BUFFERS, STREAM, FUNCTIONS, THEIR, CALLS, TASKS, ARGUMENTS, DATAGRAM, REPLY>
 {
     fn default() -> Self {
         Self::new()
@@ -243,14 +255,14 @@ impl<const FUNCTIONS: usize, const THEIR: usize, const CALLS: usize> SessionMemo
     }
 }
 
-impl<const MESSAGE: usize> UdpMemory<MESSAGE> {
+impl<const DATAGRAM: usize> UdpMemory<DATAGRAM> {
     fn socket(&'static mut self, stack: Stack<'static>) -> Result<UdpSocket<'static>, Error> {
         let mut socket = UdpSocket::new(
             stack,
             self.received.write([PacketMetadata::EMPTY; DATAGRAMS]),
-            self.receive.write([0; MESSAGE]),
+            self.receive.write([0; DATAGRAM]),
             self.sent.write([PacketMetadata::EMPTY; DATAGRAMS]),
-            self.send.write([0; MESSAGE]),
+            self.send.write([0; DATAGRAM]),
         );
         socket.bind(PLAIN_PORT).map_err(|_| Error::PortInUse)?;
         Ok(socket)
@@ -280,9 +292,24 @@ pub fn new<
     const CALLS: usize,
     const TASKS: usize,
     const ARGUMENTS: usize,
+    const DATAGRAM: usize,
+    const REPLY: usize,
 >(
     stack: Stack<'static>,
-    resources: &'static mut Resources<T, LINKS, MESSAGE, BUFFERS, STREAM, FUNCTIONS, THEIR, CALLS, TASKS, ARGUMENTS>,
+    resources: &'static mut Resources<
+        T,
+        LINKS,
+        MESSAGE,
+        BUFFERS,
+        STREAM,
+        FUNCTIONS,
+        THEIR,
+        CALLS,
+        TASKS,
+        ARGUMENTS,
+        DATAGRAM,
+        REPLY,
+    >,
     config: Config,
     state: T,
 ) -> Result<(Handle<T>, Runner<T>), Error> {
@@ -310,10 +337,12 @@ pub fn new<
         ),
         pool: Pool::new(resources.pool.write(buffers).as_mut_slice()),
         links: resources.links.write(resources.sessions.each_mut().map(SessionMemory::link)),
-        lines: resources.lines.write(resources.streams.each_mut().map(|memory| memory.line(stack))),
-        udp,
-        stack,
-        reply: ReplyBox::new(resources.reply.write([0; MESSAGE])),
+        mail: EmbassyMailman {
+            lines: resources.lines.write(resources.streams.each_mut().map(|memory| memory.line(stack))),
+            udp,
+            stack,
+        },
+        reply: ReplyBox::new(resources.reply.write([0; REPLY])),
         tasks: resources
             .tasks
             .write(resources.task_parameters.each_mut().map(|memory| TaskSlot::new(memory.write(Parameters::sized())))),
@@ -332,7 +361,7 @@ pub fn new<
     let shared = resources.shared.write(Shared { machine: RefCell::new(machine), state: RefCell::new(state) });
     let runner = Runner {
         shared,
-        scratch: resources.scratch.write([0; MESSAGE]),
+        scratch: resources.scratch.write([0; DATAGRAM]),
         arguments: resources.arguments.write(Parameters::sized()),
         unanswered: None,
     };

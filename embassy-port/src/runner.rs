@@ -120,7 +120,7 @@ impl<T> Runner<T> {
     fn rest(&mut self, context: &mut Context<'_>) -> bool {
         let machine = &mut *self.shared.machine.borrow_mut();
         machine.wakers.runner.register(context.waker());
-        for (link, line) in machine.links.iter().zip(machine.lines.iter()) {
+        for (link, line) in machine.links.iter().zip(machine.mail.lines.iter()) {
             line.wake_on_news(context, link.session.as_ref().is_some_and(LinkSession::wants_to_write));
         }
         let deadline = machine.deadline(now());
@@ -208,7 +208,7 @@ impl<T> Machine<T> {
     fn deadline(&self, now: Instant) -> Instant {
         let sessions = self.links.iter().filter_map(|link| link.session.as_ref());
         let sessions = sessions.map(LinkSession::deadline).min().unwrap_or(Instant::FAR_FUTURE);
-        let lines = self.lines.iter().map(crate::line::Line::deadline).min().unwrap_or(Instant::FAR_FUTURE);
+        let lines = self.mail.lines.iter().map(crate::line::Line::deadline).min().unwrap_or(Instant::FAR_FUTURE);
         let node = if self.stopped { Instant::FAR_FUTURE } else { self.node.next_deadline() };
         let kept = self.reply_deadline().min(self.parked_deadline());
         sessions.min(lines).min(node).min(kept).min(now + LOOK)

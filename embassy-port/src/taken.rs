@@ -5,13 +5,13 @@ use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, ServiceError};
-use cara_core::services::Ticket;
 use cara_core::services::unit::Call as CoreCall;
+use cara_core::services::{Context, Ticket};
 use cara_core::time::{Duration, Instant};
 
 use crate::handle::Handle;
 use crate::lease::LeaseWatch;
-use crate::machine::Machine;
+use crate::machine::{LinkContext, LinkSession, Machine};
 use crate::time::{now, timer};
 
 /// How long an answer waits for room at a time.
@@ -72,6 +72,22 @@ impl TaskSlot {
     }
 }
 
+/// Answers a call, or gives that up once nobody waits any more; `false` when the answer cannot be kept now.
+#[inline(never)]
+fn answer<T>(
+    session: &mut LinkSession,
+    cx: &mut LinkContext<'_, T>,
+    running: &Running,
+    result: Result<&ParametersView, Error>,
+) -> bool {
+    let kept = session.answer(cx, running.ticket, result).is_ok();
+    let late = cx.now >= running.deadline;
+    if !kept && late {
+        session.drop_answer(running.ticket);
+    }
+    kept || late
+}
+
 impl<T> Machine<T> {
     fn free_slot(&mut self) -> Option<&mut TaskSlot> {
         self.tasks.iter_mut().find(|slot| slot.is_free())
@@ -97,15 +113,7 @@ impl<T> Machine<T> {
         if self.link(running.link).is_none_or(|link| link.serial != running.serial) {
             return true;
         }
-        let late = now() >= running.deadline;
-        let kept = self.with(running.link, |session, cx, _| {
-            let kept = session.answer(cx, running.ticket, result).is_ok();
-            if !kept && late {
-                session.drop_answer(running.ticket);
-            }
-            kept || late
-        });
-        kept.unwrap_or(true)
+        self.with(running.link, |session, cx, _| answer(session, cx, running, result)).unwrap_or(true)
     }
 
     /// Keeps an answer until there is room for it; `false` when there is no room here either.
@@ -122,27 +130,13 @@ impl<T> Machine<T> {
     /// Tries again to answer what could not be answered.
     pub(crate) fn answer_parked(&mut self) {
         for index in 0..self.tasks.len() {
-            let Self { tasks, links, lines, udp, stack, pool, functions, access, .. } = self;
+            let Self { tasks, links, mail, pool, functions, access, .. } = self;
             let Some(TaskSlot { parameters, holds }) = tasks.get_mut(index) else { return };
             let Holds::Answer { running, result } = *holds else { continue };
             let link = links.get_mut(usize::from(running.link)).filter(|link| link.serial == running.serial);
             let kept = link.and_then(|link| link.session.as_mut()).is_none_or(|session| {
-                let mut mailman = crate::mail::EmbassyMailman { lines, udp, stack: *stack };
-                let mut cx = cara_core::services::Context {
-                    now: now(),
-                    mailman: &mut mailman,
-                    buffers: pool,
-                    functions,
-                    access: access.0,
-                };
-                let answer = result.map(|()| &**parameters);
-                session.answer(&mut cx, running.ticket, answer).is_ok() || {
-                    let late = cx.now >= running.deadline;
-                    if late {
-                        session.drop_answer(running.ticket);
-                    }
-                    late
-                }
+                let mut cx = Context { now: now(), mailman: mail, buffers: pool, functions, access: access.0 };
+                answer(session, &mut cx, &running, result.map(|()| &**parameters))
             });
             if kept {
                 *holds = Holds::Nothing;

@@ -8,11 +8,24 @@ use embassy_net::Stack;
 
 use crate::{VehicleError, unit_config};
 
-/// The longest message.
+/// One manager, messages of 1 KiB, four functions of its own and four of the manager's. What it gives up for being small:
+/// a request that is to be executed at best effort is lost above 480 bytes, results above 512 bytes are refused when they come
+/// back, and no call can wait for a task.
+const LINKS: usize = 1;
 const MESSAGE: usize = message_buffer(1024);
+const BUFFERS: usize = 2;
+const STREAM: usize = 1024;
+const FUNCTIONS: usize = 4;
+const THEIR: usize = 4;
+const CALLS: usize = 3;
+const TASKS: usize = 0;
+const ARGUMENTS: usize = 256;
+const DATAGRAM: usize = 512;
+const REPLY: usize = 512;
 
 /// Its memory.
-pub type LeastResources = Resources<(), 1, MESSAGE>;
+pub type LeastResources =
+    Resources<(), LINKS, MESSAGE, BUFFERS, STREAM, FUNCTIONS, THEIR, CALLS, TASKS, ARGUMENTS, DATAGRAM, REPLY>;
 
 /// Sockets of the network stack that it needs, with one for DHCP.
 pub const SOCKETS: usize = LeastResources::SOCKETS + 1;
