@@ -87,6 +87,7 @@ impl Duration {
 
 impl Add<Duration> for Instant {
     type Output = Self;
+    #[cfg_attr(target_os = "none", inline(never))]
     fn add(self, span: Duration) -> Self {
         Self(self.0.saturating_add(span.0))
     }

@@ -4,6 +4,7 @@ use core::fmt;
 
 use serde::{Deserialize, Serialize};
 
+use super::compact::{Reader, Writer};
 use crate::config::NODE_NAME_BYTES;
 use crate::error::Error;
 
@@ -51,6 +52,17 @@ impl Identity {
         let name = heapless::String::try_from(name).map_err(|_| Error::BadName)?;
         let identity = Self { id, name, role };
         if identity.is_sound() { Ok(identity) } else { Err(Error::BadName) }
+    }
+
+    pub(super) fn put(&self, writer: &mut Writer<'_>) {
+        writer.number(self.id.into());
+        writer.text(self.name.as_bytes());
+        writer.flag(self.role == Role::SUnit);
+    }
+
+    pub(super) fn take(reader: &mut Reader<'_>) -> Self {
+        let (id, name) = (reader.u32(), reader.name());
+        Self { id, name, role: if reader.choice(2) == 0 { Role::MUnit } else { Role::SUnit } }
     }
 
     /// Whether the name is one: not empty, and without control characters, which could forge lines of a log.

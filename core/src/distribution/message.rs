@@ -2,9 +2,11 @@
 //! in postcard. With [`hello`](super::hello), [`datagram`](super::datagram) and [`block`](super::block) the only code
 //! that knows the encoding; `docs/wire.md` says it in words.
 
+#[cfg(test)]
 use serde::{Deserialize, Serialize};
 
 use super::block::Put;
+use super::compact::{Reader, Writer};
 use super::function_list::{Generation, Slot};
 use crate::error::{Error, ServiceError};
 use crate::host::frame::ChunkWriter;
@@ -60,8 +62,9 @@ impl<'b> Message<'b> {
                 Some(Self::Failure(id, status.err()?))
             }
             CONTROL => {
-                let (control, rest) = postcard::take_from_bytes(bytes.get(1..)?).ok()?;
-                rest.is_empty().then_some(Self::Control(control))
+                let mut reader = Reader::new(bytes.get(1..)?);
+                let control = Control::take(&mut reader);
+                reader.is_through().then_some(Self::Control(control))
             }
             _ => None,
         }
@@ -213,7 +216,8 @@ fn error_of(code: u8, index: u8, first: u32, second: u32) -> Error {
 }
 
 /// Messages that keep two units' views of each other in step.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(test, derive(Serialize, Deserialize))]
 pub enum Control<'b> {
     /// A function of the sender may now be called.
     Publish {
@@ -224,7 +228,7 @@ pub enum Control<'b> {
         /// [`Attributes`](super::function::Attributes) in their wire form.
         attributes: [u8; 8],
         /// The encoded [`Signature`](super::function::Signature).
-        #[serde(borrow)]
+        #[cfg_attr(test, serde(borrow))]
         signature: &'b [u8],
     },
     /// A function of the sender may no longer be called.
@@ -270,13 +274,49 @@ pub enum Control<'b> {
     },
 }
 
-impl Control<'_> {
+impl<'b> Control<'b> {
     /// Encodes into `out`, whole message; `None` where it does not fit.
     pub fn encode<'o>(&self, out: &'o mut [u8]) -> Option<&'o [u8]> {
-        let (kind, rest) = out.split_first_mut()?;
-        *kind = CONTROL;
-        let used = postcard::to_slice(self, rest).ok()?.len().checked_add(1)?;
+        let mut writer = Writer::new(out);
+        writer.byte(CONTROL);
+        self.put(&mut writer);
+        let used = writer.finish()?;
         out.get(..used)
+    }
+
+    fn put(&self, writer: &mut Writer<'_>) {
+        match *self {
+            Self::Publish { slot, generation, attributes, signature } => {
+                writer.numbers(&[0, slot.into(), generation.into()]);
+                writer.bytes(&attributes);
+                writer.text(signature);
+            }
+            Self::Withdraw { slot } => writer.numbers(&[1, slot.into()]),
+            Self::ListEnd { serial } => writer.numbers(&[2, serial]),
+            Self::ListAck { serial, skipped } => writer.numbers(&[3, serial, skipped.into()]),
+            Self::Limits { message_size, minimum_interval, calls } => {
+                writer.numbers(&[4, message_size, minimum_interval, calls.into()]);
+            }
+            Self::Release { slot, id } => writer.numbers(&[5, slot.into(), id]),
+            Self::LeaseEnded { slot, expired } => writer.numbers(&[6, slot.into(), expired.into()]),
+        }
+    }
+
+    fn take(reader: &mut Reader<'b>) -> Self {
+        match reader.choice(7) {
+            0 => Self::Publish {
+                slot: reader.u16(),
+                generation: reader.u16(),
+                attributes: reader.bytes(8).try_into().unwrap_or_default(),
+                signature: reader.text(),
+            },
+            1 => Self::Withdraw { slot: reader.u16() },
+            2 => Self::ListEnd { serial: reader.u32() },
+            3 => Self::ListAck { serial: reader.u32(), skipped: reader.u16() },
+            4 => Self::Limits { message_size: reader.u32(), minimum_interval: reader.u32(), calls: reader.u16() },
+            5 => Self::Release { slot: reader.u16(), id: reader.u32() },
+            _ => Self::LeaseEnded { slot: reader.u16(), expired: reader.flag() },
+        }
     }
 }
 
@@ -408,6 +448,23 @@ mod tests {
             bytes.insert(0, kind);
             let _ = Message::decode(&bytes);
             let _ = SessionBody::decode(&bytes);
+        }
+
+        #[test]
+        fn control_messages_are_as_postcard_has_them(
+            bytes in prop::collection::vec(prop_oneof![any::<u8>(), 0..8_u8], 0..40),
+        ) {
+            let mut reader = Reader::new(&bytes);
+            let ours = Control::take(&mut reader);
+            let ours = reader.is_through().then_some(ours);
+            let theirs = postcard::take_from_bytes::<Control<'_>>(&bytes).ok();
+            let theirs = theirs.and_then(|(control, rest)| rest.is_empty().then_some(control));
+            prop_assert_eq!(ours, theirs);
+            if let Some(control) = ours {
+                let (mut ours, mut theirs) = ([0; 80], [0; 80]);
+                let written = &control.encode(&mut ours).unwrap()[1..];
+                prop_assert_eq!(written, &*postcard::to_slice(&control, &mut theirs).unwrap());
+            }
         }
 
         #[test]

@@ -3,6 +3,7 @@
 mod attributes;
 pub mod authenticator;
 pub mod block;
+mod compact;
 pub mod connection_handler;
 pub mod datagram;
 mod element;

@@ -87,10 +87,12 @@ impl<S: Storage> Table<S> {
         self.nodes.iter().flatten()
     }
 
+    #[cfg_attr(target_os = "none", inline(never))]
     pub(super) fn node(&self, place: usize) -> Option<&Known> {
         self.nodes.get(place)?.as_ref()
     }
 
+    #[cfg_attr(target_os = "none", inline(never))]
     pub(super) fn node_mut(&mut self, place: usize) -> Option<&mut Known> {
         self.nodes.get_mut(place)?.as_mut()
     }
