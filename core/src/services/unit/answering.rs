@@ -4,6 +4,7 @@ use super::permitting::{decide, log_refusal};
 use super::{Call, Phase, Session};
 use crate::config::Priority;
 use crate::distribution::block;
+use crate::distribution::function::Signature;
 use crate::distribution::function_list::Slot;
 use crate::distribution::message::{REPLY_BYTES, encode_failure, encode_reply};
 use crate::distribution::parameters::ParametersView;
@@ -37,8 +38,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
                 if !decide(access, remote, function.name(), Verb::Call).is_allowed() {
                     return Err(Error::NotAllowed);
                 }
-                block::read_arguments(function.signature.arguments(), block, arguments)?;
-                block::prepare_results(function.signature.results(), arguments)
+                read_arguments(function.signature, block, arguments)
             })?;
             match read.and_then(|()| self.begin(cx, head)) {
                 Ok(call) => return Some(call),
@@ -138,7 +138,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         }
         let header = encode_reply(head.id, Ok(()));
         let total = REPLY_BYTES.saturating_add(length);
-        let sent = self.send(cx, head.priority, total, |writer| {
+        let sent = self.send(cx, head.priority, total, &mut |writer| {
             writer.put(&header);
             block::write(specs, results, writer);
         });
@@ -159,7 +159,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         error: Error,
     ) -> Result<(), Error> {
         let header = if wants_reply { encode_reply(id, Err(error)) } else { encode_failure(id, error) };
-        match self.send(cx, priority, REPLY_BYTES, |writer| writer.put(&header)) {
+        match self.send(cx, priority, REPLY_BYTES, &mut |writer| writer.put(&header)) {
             Err(Error::Full(_)) if self.link.send_short(priority, REPLY_BYTES, |writer| writer.put(&header)) => {
                 self.flush(cx);
                 Ok(())
@@ -168,12 +168,13 @@ impl<S: Storage, C: Secure> Session<S, C> {
         }
     }
 
+    /// One piece of code whatever is written, which is a third of what it would be for each kind.
     pub(super) fn send<M: Mailman, B: Buffers<S>, H: Service>(
         &mut self,
         cx: &mut Context<'_, S, M, B, H>,
         priority: Priority,
         total: usize,
-        write: impl FnOnce(&mut ChunkWriter<'_>),
+        write: &mut dyn FnMut(&mut ChunkWriter<'_>),
     ) -> Result<(), Error> {
         self.timers.gathered = crate::time::Instant::FAR_FUTURE;
         self.timers.last_write = cx.now;
@@ -225,13 +226,11 @@ impl<S: Storage, C: Secure> Session<S, C> {
 }
 
 /// Puts a call's arguments, and room for its results, into the lent parameters.
-pub(super) fn read_arguments<S: Storage, M: Mailman, B: Buffers<S>, H: Service>(
-    cx: &Context<'_, S, M, B, H>,
-    head: &CallHead,
+pub(super) fn read_arguments(
+    signature: Signature<'_>,
     block: &[u8],
     arguments: &mut ParametersView,
 ) -> Result<(), Error> {
-    let function = cx.functions.lookup(head.slot, head.generation)?;
-    block::read_arguments(function.signature.arguments(), block, arguments)?;
-    block::prepare_results(function.signature.results(), arguments)
+    block::read_arguments(signature.arguments(), block, arguments)?;
+    block::prepare_results(signature.results(), arguments)
 }

@@ -351,7 +351,8 @@ impl<S: Storage, C: Secure> Session<S, C> {
             let block = self.link.view(block, lent);
             match arguments.filter(|_| self.calls.is_idle(priority)) {
                 Some(arguments) => {
-                    read_arguments(cx, &head, block, arguments)?;
+                    let function = cx.functions.lookup(head.slot, head.generation)?;
+                    read_arguments(function.signature, block, arguments)?;
                     self.begin(cx, head).map(Some)
                 }
                 None => self.calls.wait(cx.buffers, head, block).map(|()| None),

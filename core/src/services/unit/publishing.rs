@@ -281,6 +281,6 @@ impl<S: Storage, C: Secure> Session<S, C> {
         }
         let mut bytes = [0; CONTROL_BYTES + PUBLISH_BYTES + SIGNATURE_BYTES];
         let Some(message) = control.encode(&mut bytes) else { return false };
-        self.send(cx, Priority::High, message.len(), |writer| writer.put(message)).is_ok()
+        self.send(cx, Priority::High, message.len(), &mut |writer| writer.put(message)).is_ok()
     }
 }
