@@ -8,15 +8,15 @@ use embassy_net::Stack;
 
 use crate::{VehicleError, unit_config};
 
-/// One manager, messages of 1 KiB, four functions of its own and four of the manager's. What it gives up for being small:
-/// a request that is to be executed at best effort is lost above 480 bytes, results above 512 bytes are refused when they come
-/// back, and no call can wait for a task.
+/// One manager, messages of 1 KiB, four functions of its own and two of the manager's. What it gives up for being small:
+/// a best-effort request above 480 bytes is lost, results above 512 bytes are refused when they come back, and no call
+/// can wait for a task.
 const LINKS: usize = 1;
 const MESSAGE: usize = message_buffer(1024);
 const BUFFERS: usize = 2;
 const STREAM: usize = 1024;
 const FUNCTIONS: usize = 4;
-const THEIR: usize = 4;
+const THEIR: usize = 2;
 const CALLS: usize = 3;
 const TASKS: usize = 0;
 const ARGUMENTS: usize = 256;
