@@ -195,11 +195,11 @@ mod tests {
     #[test]
     fn the_longest_hello_fits_256_bytes_and_survives() {
         let mut out = [0; ROOM];
-        let length = longest().encode(&mut out).unwrap();
-        assert_eq!(Hello::decode(&out[..length]), Ok(longest()));
+        let length = longest().encode(PLAIN, &mut out).unwrap();
+        assert_eq!(Hello::decode(&out[..length], PLAIN), Ok(longest()));
         assert_eq!(postcard::from_bytes(&out[PREFIX_BYTES..length]), Ok(longest()));
-        assert_eq!(longest().encode(&mut out[..length - 1]), None);
-        assert_eq!(Hello::decode(&out[..length + 1]), Err(HelloError::Malformed), "nothing may follow");
+        assert_eq!(longest().encode(PLAIN, &mut out[..length - 1]), None);
+        assert_eq!(Hello::decode(&out[..length + 1], PLAIN), Err(HelloError::Malformed), "nothing may follow");
     }
 
     #[test]
@@ -233,14 +233,14 @@ mod tests {
             for (place, byte) in changes {
                 out[place] = byte;
             }
-            let _ = Hello::decode(&out[..cut]);
+            let _ = Hello::decode(&out[..cut], PLAIN);
             // Whatever the bytes are, postcard reads the same.
             let mut reader = Reader::new(&out[PREFIX_BYTES..length]);
             let hello = Hello::take(&mut reader);
             let theirs = postcard::take_from_bytes::<Hello>(&out[PREFIX_BYTES..length]).ok();
             let theirs = theirs.and_then(|(hello, rest)| rest.is_empty().then_some(hello));
             prop_assert_eq!(reader.is_through().then_some(hello), theirs);
-            if let Ok(hello) = Hello::decode(&out[..length]) {
+            if let Ok(hello) = Hello::decode(&out[..length], PLAIN) {
                 let mut again = [0; ROOM];
                 let length = hello.encode(PLAIN, &mut again).unwrap();
                 prop_assert_eq!(Hello::decode(&again[..length], PLAIN), Ok(hello));
