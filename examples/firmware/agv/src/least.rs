@@ -8,14 +8,14 @@ use embassy_net::Stack;
 
 use crate::{VehicleError, unit_config};
 
-/// One manager, messages of 1 KiB, four functions of its own and two of the manager's. What it gives up for being small:
+/// One manager, messages of 1 KiB, two functions of its own and two of the manager's. What it gives up for being small:
 /// a best-effort request above 480 bytes is lost, results above 512 bytes are refused when they come back, and no call
 /// can wait for a task.
 const LINKS: usize = 1;
 const MESSAGE: usize = message_buffer(1024);
 const BUFFERS: usize = 2;
 const STREAM: usize = 1024;
-const FUNCTIONS: usize = 4;
+const FUNCTIONS: usize = 2;
 const THEIR: usize = 2;
 const CALLS: usize = 3;
 const TASKS: usize = 0;
