@@ -3,12 +3,14 @@
 //! - [`ends`]: two secured sessions, with every frame and datagram between them in the attacker's hands;
 //! - [`frames`]: changed, cut, moved, left out and repeated frames;
 //! - [`discovery`]: changed, spoofed and repeated datagrams of discovery;
+//! - [`vectors`]: the bytes of a conversation, as committed;
 //! - [`fleet`]: wrong keys, no keys, plain against secured, floods, on the virtual network.
 
 mod discovery;
 mod ends;
 mod fleet;
 mod frames;
+mod vectors;
 
 /// Attempts of one kind, and how many of them came to something.
 struct Tally {
