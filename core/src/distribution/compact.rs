@@ -1,6 +1,5 @@
 //! postcard's layout, written and read by hand: numbers of several bytes as varints, texts and lists behind their length,
-//! one byte for a choice. What serde derives of it for four kinds of message takes three times as much of a board's flash;
-//! the tests compare the two.
+//! one byte for a choice. What serde derives of it takes far more of a board's flash; the tests compare the two.
 //!
 //! Neither side stops at the first fault: it is noticed, and told at the end.
 
