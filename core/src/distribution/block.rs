@@ -5,7 +5,7 @@
 //! their length as u32, four bytes of zero, then the bytes, padded with zeros to 8. There is one encoding of each
 //! list of values; anything else is malformed.
 
-use super::function::VariableSpec;
+use super::function::{RawSpec, VariableSpecs};
 use super::parameters::{ParametersView, Type, Value, bytes_of_variable};
 use super::value::saturate;
 use crate::bytes::copy;
@@ -67,11 +67,11 @@ const ZEROS: [u8; 8] = [0; 8];
 /// assert_eq!(block::check(arguments, &bytes), Ok(()));
 /// # Ok::<(), cara_core::error::Error>(())
 /// ```
-pub fn measure<'s>(specs: impl Iterator<Item = VariableSpec<'s>>, parameters: &ParametersView) -> Result<usize, Error> {
+pub fn measure(specs: VariableSpecs<'_>, parameters: &ParametersView) -> Result<usize, Error> {
     let mut length = 0_usize;
-    for (position, spec) in specs.enumerate() {
+    for (position, spec) in specs.raw().enumerate() {
         let index = position as u8;
-        let value = parameters.value(spec.name).map_err(|_| Error::MissingArgument { index })?;
+        let value = parameters.named(spec.name).ok_or(Error::MissingArgument { index })?;
         if value.kind() != spec.kind {
             return Err(Error::WrongType { index });
         }
@@ -85,9 +85,9 @@ pub fn measure<'s>(specs: impl Iterator<Item = VariableSpec<'s>>, parameters: &P
 }
 
 /// Writes the block of `parameters`, which [`measure`] accepted.
-pub fn write<'s>(specs: impl Iterator<Item = VariableSpec<'s>>, parameters: &ParametersView, to: &mut impl Put) {
-    for spec in specs {
-        let Ok(value) = parameters.value(spec.name) else { continue };
+pub fn write(specs: VariableSpecs<'_>, parameters: &ParametersView, to: &mut impl Put) {
+    for spec in specs.raw() {
+        let Some(value) = parameters.named(spec.name) else { continue };
         let bytes = value.raw();
         if !spec.kind.is_fixed() {
             to.put(&u64::from(saturate(bytes.len())).to_le_bytes());
@@ -98,15 +98,15 @@ pub fn write<'s>(specs: impl Iterator<Item = VariableSpec<'s>>, parameters: &Par
 }
 
 /// The longest block that `specs` allow, in bytes; `None` where that exceeds the address space.
-pub fn longest<'s>(mut specs: impl Iterator<Item = VariableSpec<'s>>) -> Option<usize> {
-    specs.try_fold(0_usize, |sum, spec| {
+pub fn longest(specs: VariableSpecs<'_>) -> Option<usize> {
+    specs.raw().try_fold(0_usize, |sum, spec| {
         let head = if spec.kind.is_fixed() { 0 } else { 8 };
         sum.checked_add(head)?.checked_add(spec.kind.bytes_of(spec.size)?.checked_next_multiple_of(8)?)
     })
 }
 
 /// Validates all of a block, UTF-8 included; [`Error::Malformed`] for any block that [`write()`] can't have made.
-pub fn check<'s>(specs: impl Iterator<Item = VariableSpec<'s>>, block: &[u8]) -> Result<(), Error> {
+pub fn check(specs: VariableSpecs<'_>, block: &[u8]) -> Result<(), Error> {
     each(specs, block, |_, _, _| Ok(()))
 }
 
@@ -115,13 +115,9 @@ pub fn check<'s>(specs: impl Iterator<Item = VariableSpec<'s>>, block: &[u8]) ->
 /// Variables of the same name take the new value; missing ones are added with their declared size. Everything is
 /// validated first, UTF-8 once: [`Error::Malformed`], or [`Error::ResultWouldNotFit`], [`Error::WrongType`],
 /// [`Error::WrongSize`] and [`Error::Full`] if the parameters can't hold the results. On any error they are unchanged.
-pub fn read<'s>(
-    specs: impl Iterator<Item = VariableSpec<'s>> + Clone,
-    block: &[u8],
-    parameters: &mut ParametersView,
-) -> Result<(), Error> {
+pub fn read(specs: VariableSpecs<'_>, block: &[u8], parameters: &mut ParametersView) -> Result<(), Error> {
     let mut room = Room::of(parameters);
-    each(specs.clone(), block, |index, spec, value| {
+    each(specs, block, |index, spec, value| {
         let needed = if spec.kind.is_fixed() { spec.size } else { saturate(value.len()) };
         room.take(parameters, index, spec, needed)
     })?;
@@ -130,12 +126,9 @@ pub fn read<'s>(
 }
 
 /// Whether `parameters` can hold every result that `specs` allow, before the call is sent; the errors of [`read`].
-pub fn check_results_fit<'s>(
-    specs: impl Iterator<Item = VariableSpec<'s>>,
-    parameters: &ParametersView,
-) -> Result<(), Error> {
+pub fn check_results_fit(specs: VariableSpecs<'_>, parameters: &ParametersView) -> Result<(), Error> {
     let mut room = Room::of(parameters);
-    for (position, spec) in specs.enumerate() {
+    for (position, spec) in specs.raw().enumerate() {
         room.take(parameters, position as u8, spec, spec.size)?;
     }
     room.check()
@@ -145,14 +138,13 @@ pub fn check_results_fit<'s>(
 /// gets to see.
 ///
 /// [`Error::Malformed`], or [`Error::Full`] if the parameters are too small; they may be empty after an error.
-pub fn read_arguments<'s>(
-    specs: impl Iterator<Item = VariableSpec<'s>> + Clone,
-    block: &[u8],
-    parameters: &mut ParametersView,
-) -> Result<(), Error> {
-    check(specs.clone(), block)?;
+pub fn read_arguments(specs: VariableSpecs<'_>, block: &[u8], parameters: &mut ParametersView) -> Result<(), Error> {
     parameters.clear();
-    let read = commit(specs, block, parameters);
+    let read = each(specs, block, |index, spec, value| {
+        parameters.add_checked(spec.name, spec.kind, spec.size)?;
+        parameters.set_checked(usize::from(index), value);
+        Ok(())
+    });
     if read.is_err() {
         parameters.clear();
     }
@@ -163,13 +155,10 @@ pub fn read_arguments<'s>(
 ///
 /// [`Error::Full`] if the parameters are too small, [`Error::WrongType`] and [`Error::WrongSize`] for a variable that is
 /// another one than the result of its name.
-pub fn prepare_results<'s>(
-    specs: impl Iterator<Item = VariableSpec<'s>>,
-    parameters: &mut ParametersView,
-) -> Result<(), Error> {
-    for (position, spec) in specs.enumerate() {
+pub fn prepare_results(specs: VariableSpecs<'_>, parameters: &mut ParametersView) -> Result<(), Error> {
+    for (position, spec) in specs.raw().enumerate() {
         let index = position as u8;
-        let Ok(value) = parameters.value(spec.name) else {
+        let Some(value) = parameters.named(spec.name) else {
             parameters.add_checked(spec.name, spec.kind, spec.size)?;
             continue;
         };
@@ -196,8 +185,8 @@ impl Room {
     }
 
     /// Takes the room for one result of `size` elements; a variable of its name must be able to hold it.
-    fn take(&mut self, parameters: &ParametersView, index: u8, spec: VariableSpec<'_>, size: u32) -> Result<(), Error> {
-        let Ok(value) = parameters.value(spec.name) else {
+    fn take(&mut self, parameters: &ParametersView, index: u8, spec: RawSpec<'_>, size: u32) -> Result<(), Error> {
+        let Some(value) = parameters.named(spec.name) else {
             self.variables = self.variables.checked_sub(1).ok_or(Error::Full(Limit::Variables))?;
             let bytes = bytes_of_variable(spec.name, spec.kind, spec.size).unwrap_or(usize::MAX);
             self.needed = self.needed.saturating_add(bytes);
@@ -227,13 +216,13 @@ impl Room {
 
 /// Validates a block and shows each value, its UTF-8 included, to `visit`.
 fn each<'s>(
-    specs: impl Iterator<Item = VariableSpec<'s>>,
+    specs: VariableSpecs<'s>,
     block: &[u8],
-    mut visit: impl FnMut(u8, VariableSpec<'s>, &[u8]) -> Result<(), Error>,
+    mut visit: impl FnMut(u8, RawSpec<'s>, &[u8]) -> Result<(), Error>,
 ) -> Result<(), Error> {
     let mut rest = block;
     let mut refusal = Ok(());
-    for (index, spec) in specs.enumerate() {
+    for (index, spec) in specs.raw().enumerate() {
         let value;
         (value, rest) = split(spec, rest).ok_or(Error::Malformed)?;
         if !is_canonical(spec.kind, value) {
@@ -246,13 +235,9 @@ fn each<'s>(
 }
 
 /// Stores the values of a validated block.
-fn commit<'s>(
-    specs: impl Iterator<Item = VariableSpec<'s>>,
-    block: &[u8],
-    parameters: &mut ParametersView,
-) -> Result<(), Error> {
+fn commit(specs: VariableSpecs<'_>, block: &[u8], parameters: &mut ParametersView) -> Result<(), Error> {
     let mut rest = block;
-    for spec in specs {
+    for spec in specs.raw() {
         let value;
         (value, rest) = split(spec, rest).ok_or(Error::Malformed)?;
         let index = match parameters.find(spec.name) {
@@ -268,7 +253,7 @@ fn commit<'s>(
 }
 
 /// The value at the start of `block`, and what follows it; `None` if it is cut off, too long or not padded with zeros.
-fn split<'b>(spec: VariableSpec<'_>, block: &'b [u8]) -> Option<(&'b [u8], &'b [u8])> {
+fn split<'b>(spec: RawSpec<'_>, block: &'b [u8]) -> Option<(&'b [u8], &'b [u8])> {
     let (length, rest) = if spec.kind.is_fixed() {
         (spec.kind.bytes_of(spec.size)?, block)
     } else {

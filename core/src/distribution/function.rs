@@ -50,6 +50,14 @@ pub struct VariableSpec<'a> {
     pub size: u32,
 }
 
+/// A [`VariableSpec`] whose name is only compared: a look at its UTF-8 would cost a short request more than anything else.
+#[derive(Clone, Copy)]
+pub(super) struct RawSpec<'a> {
+    pub(super) name: &'a [u8],
+    pub(super) kind: Type,
+    pub(super) size: u32,
+}
+
 /// The arguments or the results of a [`Signature`], in its order.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct VariableSpecs<'a> {
@@ -155,8 +163,9 @@ impl<'a> Signature<'a> {
     /// Bytes of a `Parameters` that holds all arguments and results, as the callee's does.
     pub fn parameters_bytes(&self) -> u32 {
         let arguments = self.arguments();
-        let only_results = self.results().filter(|result| arguments.named(result.name).is_none());
+        let only_results = self.results().raw().filter(|result| arguments.raw().all(|known| known.name != result.name));
         let bytes = arguments
+            .raw()
             .chain(only_results)
             .try_fold(0_usize, |sum, spec| sum.checked_add(bytes_of_variable(spec.name, spec.kind, spec.size)?));
         bytes.map_or(u32::MAX, saturate)
@@ -182,6 +191,16 @@ impl<'a> VariableSpecs<'a> {
     /// The variable of this name.
     pub fn named(mut self, name: &str) -> Option<VariableSpec<'a>> {
         self.find(|spec| spec.name == name)
+    }
+
+    /// The same, without a look at the names.
+    pub(super) fn raw(mut self) -> impl Iterator<Item = RawSpec<'a>> + Clone {
+        core::iter::from_fn(move || {
+            self.left = self.left.checked_sub(1)?;
+            let (spec, rest) = RawSpec::split(self.rest)?;
+            self.rest = rest;
+            Some(spec)
+        })
     }
 
     fn of_checked(bytes: Option<&'a [u8]>) -> Self {
@@ -224,13 +243,20 @@ impl<'a> Iterator for VariableSpecs<'a> {
     }
 }
 
-impl<'a> VariableSpec<'a> {
+impl<'a> RawSpec<'a> {
     fn split(bytes: &'a [u8]) -> Option<(Self, &'a [u8])> {
         let (&[kind, length], rest) = bytes.split_first_chunk::<2>()?;
         let (&size, rest) = rest.split_first_chunk::<4>()?;
         let (name, rest) = rest.split_at_checked(usize::from(length))?;
-        let name = core::str::from_utf8(name).ok()?;
         Some((Self { name, kind: Type::from_wire(kind)?, size: u32::from_le_bytes(size) }, rest))
+    }
+}
+
+impl<'a> VariableSpec<'a> {
+    fn split(bytes: &'a [u8]) -> Option<(Self, &'a [u8])> {
+        let (RawSpec { name, kind, size }, rest) = RawSpec::split(bytes)?;
+        let name = core::str::from_utf8(name).ok()?;
+        Some((Self { name, kind, size }, rest))
     }
 }
 

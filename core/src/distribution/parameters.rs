@@ -155,7 +155,7 @@ impl<B: Arena + ?Sized> ParametersInner<B> {
     /// ```
     pub fn set_value(&mut self, name: &str, value: impl IntoValue) -> Result<(), Error> {
         let view = self.as_mut_view();
-        let index = view.find(name).ok_or(Error::UnknownVariable)?;
+        let index = view.find(name.as_bytes()).ok_or(Error::UnknownVariable)?;
         value.into_value(view.target(index).ok_or(Error::UnknownVariable)?)
     }
 
@@ -236,7 +236,7 @@ impl<B: Arena + ?Sized> ParametersInner<B> {
     /// The value of a variable of any type.
     pub fn value(&self, name: &str) -> Result<Value<'_>, Error> {
         let view = self.as_view();
-        view.find(name).and_then(|index| view.value_at(index)).ok_or(Error::UnknownVariable)
+        view.named(name.as_bytes()).ok_or(Error::UnknownVariable)
     }
 
     /// The parameters without their size as a type.
@@ -253,21 +253,20 @@ impl<B: Arena + ?Sized> ParametersInner<B> {
 impl ParametersView {
     fn add_variable(&mut self, name: &str, kind: Type, size: u32) -> Result<(), Error> {
         check_name(name)?;
-        if self.find(name).is_some() {
+        if self.find(name.as_bytes()).is_some() {
             return Err(Error::NameTaken);
         }
-        self.add_checked(name, kind, size)
+        self.add_checked(name.as_bytes(), kind, size)
     }
 
-    /// Adds a variable whose name may be one, and is not there.
-    pub(crate) fn add_checked(&mut self, name: &str, kind: Type, size: u32) -> Result<(), Error> {
+    pub(super) fn add_checked(&mut self, name: &[u8], kind: Type, size: u32) -> Result<(), Error> {
         let place = self.table.get_mut(self.count as usize).ok_or(Error::Full(Limit::Variables))?;
         let full = Error::Full(Limit::ParametersBytes);
         let length = kind.bytes_of(size).ok_or(full)?;
         let (_, free) = self.bytes.split_at_mut_checked(self.used as usize).ok_or(full)?;
         let (name_place, free) = free.split_at_mut_checked(name.len()).ok_or(full)?;
         let value = free.get_mut(..length).ok_or(full)?;
-        copy(name.as_bytes(), name_place);
+        copy(name, name_place);
         if kind.is_fixed() {
             value.fill(0);
         }
@@ -295,8 +294,12 @@ impl ParametersView {
         Ok(())
     }
 
-    pub(crate) fn find(&self, name: &str) -> Option<usize> {
-        self.table.iter().take(self.len()).position(|entry| self.name_of(entry) == name.as_bytes())
+    pub(super) fn find(&self, name: &[u8]) -> Option<usize> {
+        self.table.iter().take(self.len()).position(|entry| self.name_of(entry) == name)
+    }
+
+    pub(super) fn named(&self, name: &[u8]) -> Option<Value<'_>> {
+        self.find(name).and_then(|index| self.value_at(index))
     }
 
     pub(crate) fn value_at(&self, index: usize) -> Option<Value<'_>> {
@@ -365,7 +368,7 @@ impl Arena for [u8] {
 }
 
 /// Bytes of a [`Parameters`] that one variable takes; `None` where that exceeds the address space.
-pub(crate) fn bytes_of_variable(name: &str, kind: Type, size: u32) -> Option<usize> {
+pub(crate) fn bytes_of_variable(name: &[u8], kind: Type, size: u32) -> Option<usize> {
     kind.bytes_of(size)?.checked_add(name.len())
 }
 

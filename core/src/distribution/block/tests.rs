@@ -274,6 +274,8 @@ fn a_service_sees_its_arguments_and_its_results_to_be() {
     // It may grow to the declared maximum.
     p.set_value("text", "123456789").unwrap();
     assert_eq!(read_arguments(signature.arguments(), &block[..8], &mut p), Err(Error::Malformed));
+    assert!(p.is_empty());
+    read_arguments(signature.arguments(), &block, &mut p).unwrap();
     let mut small = Parameters::<12>::sized();
     let full = Err(Error::Full(Limit::ParametersBytes));
     assert_eq!(read_arguments(signature.arguments(), &block, &mut small), full);
