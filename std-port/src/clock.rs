@@ -16,7 +16,8 @@ impl Clock {
 
     /// The time now.
     pub(crate) fn now(&self) -> Instant {
-        let micros = u64::try_from(self.start.elapsed().as_micros()).unwrap_or(u64::MAX);
+        let elapsed = self.start.elapsed();
+        let micros = elapsed.as_secs().saturating_mul(1_000_000).saturating_add(elapsed.subsec_micros().into());
         Instant::from_micros(micros.saturating_add(1_000_000))
     }
 }

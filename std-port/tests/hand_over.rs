@@ -1,7 +1,7 @@
 //! The hand-over of a link's lead, in every order in which threads can run it.
 //!
-//! `Reader` is the port's own; around it stand the few steps of `calling.rs`, `workers.rs` and `staying.rs` that it is
-//! used in, with a queue in the place of the socket and no time-outs: a wake-up that is lost blocks for ever, and the
+//! `Reader` is the port's own; around it stand the few steps of `calling.rs`, `keeping.rs`, `workers.rs` and `staying.rs`
+//! that it is used in, with a queue in the place of the socket and no time-outs: a wake-up that is lost blocks for ever, and the
 //! model reports that. With `--cfg cara_planted="lost_wakeup"` it must fail.
 //!
 //! ```text
@@ -75,6 +75,8 @@ struct State {
     told: Vec<u32>,
     busy: bool,
     stopped: bool,
+    /// Calls of the peer that the pool has read.
+    called: u32,
 }
 
 struct Link {
@@ -86,13 +88,20 @@ struct Link {
     changed: Condvar,
     /// The peer answers when it has this many requests, the last one first; 0: each at once.
     together: usize,
+    /// Callers expect to be back at once, and the clock looks after what they keep.
+    keeps: bool,
     /// Somebody reads; not part of the model, it adds no orders.
     reading: AtomicBool,
 }
 
 impl Link {
     fn new(together: usize) -> Arc<Self> {
-        let state = State { reader: Reader::default(), waiters: vec![], told: vec![], busy: false, stopped: false };
+        Self::build(together, false)
+    }
+
+    fn build(together: usize, keeps: bool) -> Arc<Self> {
+        let (reader, waiters, told) = (Reader::default(), vec![], vec![]);
+        let state = State { reader, waiters, told, busy: false, stopped: false, called: 0 };
         let wire = Wire { armed: true, ..Wire::default() };
         Arc::new(Self {
             wire: Mutex::new(wire),
@@ -100,6 +109,7 @@ impl Link {
             state: Mutex::new(state),
             changed: Condvar::new(),
             together,
+            keeps,
             reading: AtomicBool::new(false),
         })
     }
@@ -110,8 +120,13 @@ impl Link {
 
     /// `Engine::settle`: the epoll set follows who reads. Somebody always does, or was told to.
     fn settle(&self, state: MutexGuard<'_, State>) {
+        self.set_interest(&state);
+    }
+
+    fn set_interest(&self, state: &State) {
         let armed = state.reader.pool_reads();
-        assert!(state.reader.is_led() || armed || !state.told.is_empty(), "nobody reads");
+        let expected = !state.told.is_empty() || (self.keeps && state.reader.is_kept());
+        assert!(state.reader.is_led() || armed || expected, "nobody reads");
         let mut wire = self.wire.lock().unwrap();
         if wire.armed != armed {
             wire.armed = armed;
@@ -155,7 +170,11 @@ impl Link {
 
     /// `Engine::feed`: notes a reply and wakes who waits for it.
     fn feed(&self, state: &mut State, item: Item) {
-        let Item::Reply(id) = item else { return };
+        let Item::Reply(id) = item else {
+            state.called += 1;
+            self.changed.notify_all();
+            return;
+        };
         if let Some(waiter) = state.waiters.iter_mut().find(|waiter| waiter.id == id) {
             waiter.done = true;
             match &waiter.thread {
@@ -178,18 +197,32 @@ impl Link {
         self.settle(guard);
     }
 
+    /// `Engine::leave_with_reply`.
+    fn leave_with_reply(&self, mut guard: MutexGuard<'_, State>, turn: Turn) {
+        let State { reader, waiters, told, .. } = &mut *guard;
+        reader.keep(turn, || pass_lead(waiters, told));
+        if reader.is_kept() {
+            self.changed.notify_all();
+        }
+        self.settle(guard);
+    }
+
     /// `Engine::block_request`. A caller without `patience` gives up when it has looked twice.
     fn call(&self, id: u32, patience: bool) -> bool {
         let parker = Arc::new(Parker::default());
         let mut state = self.lock();
+        let mut turn = if patience { state.reader.take_lead() } else { None };
+        self.set_interest(&state);
         state.waiters.push(Waiter { id, thread: Some(parker.clone()), done: false });
         self.send(id);
-        let mut turn = None;
         let mut looks = 0;
         loop {
             state.told.retain(|told| *told != id);
             if self.take_outcome(&mut state, id) {
-                self.leave(state, turn);
+                match turn.filter(|_| self.keeps) {
+                    Some(turn) => self.leave_with_reply(state, turn),
+                    None => self.leave(state, turn),
+                }
                 return true;
             }
             if !patience && looks == 1 {
@@ -229,6 +262,7 @@ impl Link {
     /// `Engine::call_future`, awaited.
     fn call_future(&self, id: u32) {
         let mut state = self.lock();
+        state.reader.give_up_keeping();
         state.waiters.push(Waiter { id, thread: None, done: false });
         self.send(id);
         self.settle(state);
@@ -299,22 +333,31 @@ impl Link {
         self.leave(self.lock(), Some(turn));
     }
 
-    /// `Engine::relieve_stays`: the clock comes back as long as a leader is busy.
+    /// `Engine::watch_links`: the clock comes back as long as a leader is busy, or a link is kept.
     fn clock(&self) {
         let mut state = self.lock();
         loop {
-            while !state.busy && !state.stopped {
+            while !state.busy && !state.reader.is_kept() && !state.stopped {
                 state = self.changed.wait(state).unwrap();
             }
             if state.stopped {
                 return;
             }
+            state.reader.give_up_keeping();
             let State { reader, waiters, told, .. } = &mut *state;
             reader.relieve(Instant::from_micros(10), Duration::ZERO, || pass_lead(waiters, told));
             // It has been seen; the clock need not see it again.
             state.busy = false;
             self.settle(state);
             state = self.lock();
+        }
+    }
+
+    /// Waits until the pool, or a leader, has read a call of the peer.
+    fn await_call(&self) {
+        let mut state = self.lock();
+        while state.called == 0 {
+            state = self.changed.wait(state).unwrap();
         }
     }
 
@@ -413,6 +456,51 @@ fn what_is_left_when_a_caller_gives_up_is_read_by_the_pool() {
         });
         link.call_future(1);
         hasty.join().unwrap();
+        link.close();
+        pool.join().unwrap();
+    });
+}
+
+/// A caller keeps the link from call to call; what the peer sends when no further call comes is read by the pool.
+#[test]
+fn a_link_that_is_kept_comes_back_to_the_pool() {
+    check(3, || {
+        let link = Link::build(0, true);
+        let pool = spawn(&link, Link::pool);
+        let clock = spawn(&link, Link::clock);
+        assert!(link.call(1, true));
+        assert!(link.call(2, true));
+        link.wire.lock().unwrap().items.push_back(Item::Call);
+        link.readable.notify_all();
+        link.await_call();
+        link.close();
+        pool.join().unwrap();
+        clock.join().unwrap();
+    });
+}
+
+/// Two callers of whom each would keep the link: the other one gets the lead, or takes it.
+#[test]
+fn a_link_that_is_kept_is_led_by_whoever_comes() {
+    check(2, || {
+        let link = Link::build(0, true);
+        let clock = spawn(&link, Link::clock);
+        let other = spawn(&link, |link| assert!(link.call(2, true)));
+        assert!(link.call(1, true));
+        other.join().unwrap();
+        link.close();
+        clock.join().unwrap();
+    });
+}
+
+/// A future needs somebody who reads: nobody keeps the link while one waits, or it is given up.
+#[test]
+fn a_future_on_a_link_that_was_kept_gets_its_reply() {
+    check(3, || {
+        let link = Link::build(0, true);
+        let pool = spawn(&link, Link::pool);
+        assert!(link.call(1, true));
+        link.call_future(2);
         link.close();
         pool.join().unwrap();
     });

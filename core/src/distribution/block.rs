@@ -269,7 +269,8 @@ fn split<'b>(spec: RawSpec<'_>, block: &'b [u8]) -> Option<(&'b [u8], &'b [u8])>
 
 fn is_canonical(kind: Type, value: &[u8]) -> bool {
     match kind {
-        Type::String => core::str::from_utf8(value).is_ok(),
+        // Most text is ASCII, which is found out in a third of the time.
+        Type::String => value.is_ascii() || core::str::from_utf8(value).is_ok(),
         Type::Bool => value.iter().all(|&byte| byte <= 1),
         Type::Int | Type::Float | Type::Bytes => true,
     }

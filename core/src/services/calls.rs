@@ -155,6 +155,12 @@ impl<S: Storage> Calls<S> {
         if free { Ok(()) } else { Err(Error::Busy) }
     }
 
+    /// Whether one more call of any class with a block of `bytes` could wait, as far as this peer's own calls go.
+    pub(crate) fn has_room(&self, limit: u16, bytes: usize) -> bool {
+        let needed = HEAD_BYTES.saturating_add(bytes);
+        self.held < limit && self.queues.iter().flatten().all(|queue| queue.room() >= needed)
+    }
+
     /// Begins a call.
     pub(crate) fn begin(&mut self, head: CallHead) -> Result<Ticket, Error> {
         let reserve = if head.priority == Priority::Emergency { 0 } else { 1 };
@@ -287,6 +293,10 @@ impl<S: Storage> Calls<S> {
 }
 
 impl<S: Storage> Queue<S> {
+    fn room(&self) -> usize {
+        self.buffer.len().saturating_sub(self.end.saturating_sub(self.start))
+    }
+
     fn is_empty(&self) -> bool {
         self.start >= self.end
     }
@@ -455,6 +465,15 @@ mod tests {
         assert!(calls.begin(head(4, Priority::Emergency)).is_ok());
         assert_eq!(calls.admit(Priority::High, 3), Err(Error::Busy));
         assert_eq!(calls.admit(Priority::Emergency, 3), Ok(()));
+    }
+
+    #[test]
+    fn room_ends_with_the_calls_that_may_wait_or_with_the_bytes() {
+        let (mut calls, mut pool) = (calls(3), pool(4, 100));
+        assert!(calls.has_room(1, 68) && !calls.has_room(0, 0));
+        calls.wait(&mut pool, head(1, Priority::Normal), b"12345678").unwrap();
+        assert_eq!([(1, 0), (2, 28), (2, 29)].map(|(limit, bytes)| calls.has_room(limit, bytes)), [false, true, false]);
+        assert!(calls.wait(&mut pool, head(2, Priority::Normal), &[0; 28]).is_ok());
     }
 
     #[test]

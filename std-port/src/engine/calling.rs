@@ -28,6 +28,15 @@ thread_local! {
     static READ_BUFFER: std::cell::RefCell<Vec<u8>> = const { std::cell::RefCell::new(Vec::new()) };
 }
 
+/// A call whose request has gone out.
+struct Begun<'l> {
+    state: MutexGuard<'l, LinkState>,
+    turn: Option<Turn>,
+    id: CallId,
+    now: Instant,
+    deadline: Instant,
+}
+
 impl<T: Send + 'static> Engine<T> {
     /// Requests without waiting: an id at once, or why not.
     pub(crate) fn request(
@@ -37,9 +46,10 @@ impl<T: Send + 'static> Engine<T> {
         parameters: &ParametersView,
         options: &RequestOptions,
     ) -> Result<CallId, Error> {
+        let now = self.now();
         let mut state = link.lock();
-        let result = self.request_on(link, &mut state, function, parameters, options, false);
-        self.settle(link, state);
+        let result = self.request_on(now, link, &mut state, function, parameters, options, false);
+        self.settle_at(now, link, state);
         result
     }
 
@@ -52,9 +62,8 @@ impl<T: Send + 'static> Engine<T> {
         options: &RequestOptions,
     ) -> Result<(), Error> {
         self.state.waiting_for(link.id, || {
-            let started = self.now();
-            let (state, id, deadline) = self.begin_call(link, function, parameters, options, started)?;
-            self.await_reply(link, state, id, parameters, deadline)
+            let begun = self.begin_call(link, function, parameters, options)?;
+            self.await_reply(link, begun, parameters)
         })
     }
 
@@ -65,47 +74,53 @@ impl<T: Send + 'static> Engine<T> {
         function: &str,
         parameters: &ParametersView,
         options: &RequestOptions,
-        started: Instant,
-    ) -> Result<(MutexGuard<'l, LinkState>, CallId, Instant), Error> {
+    ) -> Result<Begun<'l>, Error> {
+        let mut now = self.now();
         let mut state = link.lock();
         let timeout = options.timeout.unwrap_or(state.session.constraints().request_timeout);
-        let deadline = started + timeout;
+        let deadline = now + timeout;
         loop {
-            let options = RequestOptions { timeout: Some(deadline.since(self.now())), ..*options };
-            let sent = self.request_on(link, &mut state, function, parameters, &options, true);
+            // Before the request goes out: a thread of the pool must not wake for the reply.
+            let turn = self.take_lead(link, &mut state);
+            let options = RequestOptions { timeout: Some(deadline.since(now)), ..*options };
+            let sent = self.request_on(now, link, &mut state, function, parameters, &options, true);
             let (error, wait) = match sent {
                 Ok(id) => {
                     state.waiters.push(Waiter { id, wake: Wake::Thread(thread::current()), outcome: None });
-                    return Ok((state, id, deadline));
+                    return Ok(Begun { state, turn, id, now, deadline });
                 }
                 Err(error) => (error, worth_waiting(&error, PAUSE).unwrap_or(Duration::MAX)),
             };
-            self.settle(link, state);
+            self.leave(link, state, turn);
             if self.now() + wait >= deadline {
                 return Err(error);
             }
             state = link.lock();
             let waited = link.room.wait_timeout(state, wait.into());
             state = waited.unwrap_or_else(PoisonError::into_inner).0;
+            now = self.now();
         }
     }
 
-    fn await_reply<'l>(
+    fn take_lead(&self, link: &LinkCell, state: &mut LinkState) -> Option<Turn> {
+        let turn = if state.session.is_live() { state.reader.take_lead() } else { None };
+        self.set_interest(link, state);
+        turn
+    }
+
+    fn await_reply(
         &self,
-        link: &'l Arc<LinkCell>,
-        mut state: MutexGuard<'l, LinkState>,
-        id: CallId,
+        link: &Arc<LinkCell>,
+        begun: Begun<'_>,
         parameters: &mut ParametersView,
-        deadline: Instant,
     ) -> Result<(), Error> {
-        let mut turn = None;
+        let Begun { mut state, mut turn, id, mut now, deadline } = begun;
         loop {
             // The reply may have come through another thread before this one took the lead.
             if let Some(outcome) = state.take_outcome(id) {
                 self.leave(link, state, turn);
                 return read_outcome(outcome, parameters);
             }
-            let now = self.now();
             if now >= deadline {
                 state.session.cancel(id);
                 state.forget(id);
@@ -113,65 +128,85 @@ impl<T: Send + 'static> Engine<T> {
                 return Err(Error::TimedOut);
             }
             turn = turn.or_else(|| state.reader.take_lead());
-            if turn.is_some() {
+            if let Some(turn) = turn {
                 let mut own = OwnCall { id, parameters, result: None };
-                state = self.lead(link, state, &mut own, deadline);
+                (state, now) = self.lead(link, state, &mut own, now, deadline);
                 if let Some(result) = own.result {
                     state.forget(id);
-                    self.leave(link, state, turn);
+                    self.leave_with_reply(now, link, state, turn);
                     return result;
                 }
             } else {
-                self.settle(link, state);
+                self.settle_at(now, link, state);
                 thread::park_timeout(deadline.since(now).into());
                 state = link.lock();
+                now = self.now();
             }
         }
     }
 
-    /// Reads the link until the own reply has come, the deadline has passed, or somebody else has noted the end.
+    /// Reads the link until the own reply has come, the deadline has passed, or somebody else has noted the end. Returns
+    /// the time of its last look at the clock as well.
     fn lead<'l>(
         &self,
         link: &'l Arc<LinkCell>,
         mut state: MutexGuard<'l, LinkState>,
         own: &mut OwnCall<'_>,
+        mut now: Instant,
         deadline: Instant,
-    ) -> MutexGuard<'l, LinkState> {
+    ) -> (MutexGuard<'l, LinkState>, Instant) {
         READ_BUFFER.with_borrow_mut(|buffer| {
             if buffer.is_empty() {
-                buffer.resize(READ_BYTES, 0);
+                // Zeros of the system, none of which is touched before something is read.
+                *buffer = vec![0; READ_BYTES];
             }
             loop {
+                if state.is_paused() {
+                    // The reply may be in what waits to be looked at.
+                    self.take_in(now, link, &mut state, &mut [], own);
+                    if own.result.is_some() {
+                        return (state, now);
+                    }
+                }
                 let paused = state.is_paused();
-                self.settle(link, state);
-                let left = deadline.since(self.now());
+                self.settle_at(now, link, state);
+                let left = deadline.since(now);
                 let received = if paused {
-                    // The clock looks at what waits; the reply may be in it.
                     thread::park_timeout(left.min(RETRY).into());
                     Received::WouldBlock
                 } else {
                     link.stream.receive(buffer, Wait::AtMost(left))
                 };
+                now = self.now();
                 state = link.lock();
                 match received {
                     Received::Bytes(count) => {
-                        let bytes = buffer.get_mut(..count).unwrap_or_default();
-                        let call = self.feed(link, &mut state, bytes, None, Some(own));
-                        debug_assert!(call.is_none(), "a leader lends no room for arguments");
-                        if state.session.has_next_call() {
-                            self.hand_over(link);
-                        }
+                        self.take_in(now, link, &mut state, buffer.get_mut(..count).unwrap_or_default(), own);
                     }
                     Received::WouldBlock => {}
                     Received::Closed => state.session.disconnected(CloseReason::Reset),
                 }
-                let ended = state.session.deadline() == Instant::START || state.session.is_ended();
-                let done = own.result.is_some() || state.waiters.iter().any(|w| w.id == own.id && w.outcome.is_some());
-                if ended || done || self.now() >= deadline {
-                    return state;
+                if own.result.is_some() || now >= deadline || is_over(&state, own.id) {
+                    return (state, now);
                 }
             }
         })
+    }
+
+    /// Looks at what a leader has read; calls of the peer are left to the pool.
+    fn take_in(
+        &self,
+        now: Instant,
+        link: &Arc<LinkCell>,
+        state: &mut LinkState,
+        bytes: &mut [u8],
+        own: &mut OwnCall<'_>,
+    ) {
+        let call = self.feed(now, link, state, bytes, None, Some(own));
+        debug_assert!(call.is_none(), "a leader lends no room for arguments");
+        if state.session.has_next_call() {
+            self.hand_over(link);
+        }
     }
 
     /// A caller is through: it passes the lead on if it has it, or was to have it.
@@ -179,6 +214,20 @@ impl<T: Send + 'static> Engine<T> {
         let LinkState { reader, waiters, .. } = &mut *guard;
         reader.leave(turn, || pass_lead(waiters));
         self.settle(link, guard);
+    }
+
+    /// The same for a leader who has had its reply: if its calls follow each other at once, it keeps the link.
+    fn leave_with_reply(&self, now: Instant, link: &Arc<LinkCell>, mut guard: MutexGuard<'_, LinkState>, turn: Turn) {
+        let keeps = self.may_keep(now, &mut guard);
+        let LinkState { reader, waiters, .. } = &mut *guard;
+        match keeps {
+            true => reader.keep(turn, || pass_lead(waiters)),
+            false => reader.leave(Some(turn), || pass_lead(waiters)),
+        }
+        if guard.reader.is_kept() {
+            self.watch_kept(link, &mut guard);
+        }
+        self.settle_at(now, link, guard);
     }
 
     /// A request as a future: the pool reads its reply.
@@ -190,7 +239,9 @@ impl<T: Send + 'static> Engine<T> {
         options: &RequestOptions,
     ) -> Result<CallFuture<T>, Error> {
         let mut state = link.lock();
-        let sent = self.request_on(&link, &mut state, function, parameters, options, true);
+        // Nobody may come to read for it.
+        state.reader.give_up_keeping();
+        let sent = self.request_on(self.now(), &link, &mut state, function, parameters, options, true);
         if let Ok(id) = sent {
             state.waiters.push(Waiter { id, wake: Wake::Task(None), outcome: None });
         }
@@ -239,6 +290,12 @@ fn worth_waiting(error: &Error, pause: Duration) -> Option<Duration> {
         Error::Full(Limit::SendQueue | Limit::Buffers | Limit::Calls) => Some(pause),
         _ => None,
     }
+}
+
+/// Whether a leader need not read on: the link has ended, or another thread has noted the end of its call.
+fn is_over(state: &LinkState, id: CallId) -> bool {
+    let ended = state.session.deadline() == Instant::START || state.session.is_ended();
+    ended || state.waiters.iter().any(|waiter| waiter.id == id && waiter.outcome.is_some())
 }
 
 /// Wakes one thread that waits for a reply, so that it takes the lead. `false` when there is none.

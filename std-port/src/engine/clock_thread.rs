@@ -28,7 +28,7 @@ impl<T: Send + 'static> Engine<T> {
             let mut state = link.lock();
             state.timer = Instant::FAR_FUTURE;
             if state.is_paused() {
-                self.feed(&link, &mut state, &mut [], None, None);
+                self.feed(self.now(), &link, &mut state, &mut [], None, None);
                 if state.session.has_next_call() {
                     self.hand_over(&link);
                 }

@@ -83,7 +83,7 @@ impl<T: Send + 'static> Driven for Engine<T> {
     fn keep_time(&self) -> Instant {
         self.poll_links()
             .min(self.poll_node())
-            .min(self.relieve_stays())
+            .min(self.watch_links())
             .min(self.watch_interfaces())
             .min(self.watch_keys())
     }

@@ -10,7 +10,7 @@ use cara_core::error::{CloseReason, Error};
 use cara_core::host::mailman::{LinkId, Mailman};
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::Session;
-use cara_core::time::Instant;
+use cara_core::time::{Duration, Instant};
 use cara_secure::link::Cipher;
 use core::net::SocketAddr;
 
@@ -21,6 +21,9 @@ use crate::storage::Boxed;
 use crate::sys::datagram::Datagrams;
 use crate::sys::stream::Stream;
 use crate::threads;
+
+/// Calls that leave no room for more hold up what follows them for so long after the last one has ended.
+const STALLED: Duration = Duration::from_millis(20);
 
 /// One link of the unit.
 pub(crate) struct LinkCell {
@@ -45,14 +48,25 @@ pub(crate) struct LinkState {
     pub(crate) reader: Reader,
     /// The last handler that ran for this link was quick.
     pub(crate) quick: bool,
+    /// The peer has called here.
+    pub(crate) is_called: bool,
     /// The pool's count of calls when it last served this link.
     pub(crate) served: usize,
+    /// When it did.
+    pub(crate) served_at: Option<Instant>,
+    /// When a caller last had its reply.
+    pub(crate) replied_at: Option<Instant>,
+    /// It is among the links that the clock looks at because they are left to a caller.
+    pub(crate) kept: bool,
     /// What the epoll set watches the stream for.
     pub(crate) registration: Registration,
     /// The connection is still being opened.
     pub(crate) connecting: bool,
-    /// Bytes that were read and cannot be looked at yet.
+    /// Bytes that were read and cannot be looked at yet, behind those that were.
     pub(crate) leftover: Vec<u8>,
+    pub(crate) leftover_at: usize,
+    /// When a call last ended, or there was no room for more of them.
+    pub(crate) moved_at: Instant,
     /// The timer that is set for the session.
     pub(crate) timer: Instant,
     /// Somebody waits for the answer to a ping.
@@ -124,10 +138,16 @@ impl LinkCell {
             waiters: Vec::new(),
             reader: Reader::default(),
             quick: false,
+            is_called: false,
             served: 0,
+            served_at: None,
+            replied_at: None,
+            kept: false,
             registration: Registration { readable: true, writable: connecting },
             connecting,
             leftover: Vec::new(),
+            leftover_at: 0,
+            moved_at: Instant::START,
             timer: Instant::FAR_FUTURE,
             pinging: false,
             retired: false,
@@ -180,7 +200,19 @@ impl LinkCell {
 impl LinkState {
     /// What was read cannot be looked at yet: nothing more is read meanwhile, so that the peer feels it.
     pub(crate) fn is_paused(&self) -> bool {
-        !self.leftover.is_empty()
+        self.leftover_at < self.leftover.len()
+    }
+
+    /// Whether to look no further at what was read, because the calls that wait leave no room for more: they run, and
+    /// what follows stays where it is, so that the peer feels it. Replies may be among what follows, so it is looked at
+    /// where somebody waits for one, and requests that find no room are refused.
+    pub(crate) fn holds_back(&self) -> bool {
+        self.waiters.is_empty() && self.session.is_live() && !self.session.has_call_room()
+    }
+
+    /// The calls that leave no room do not get on: what follows them is to be looked at.
+    pub(crate) fn is_stalled(&self, now: Instant) -> bool {
+        self.is_paused() && now >= self.moved_at + STALLED
     }
 
     /// Notes how a call ended and wakes who waits for it.

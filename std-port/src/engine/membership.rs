@@ -277,7 +277,7 @@ impl<T: Send + 'static> Engine<T> {
         let Some(link) = self.link(new) else { return };
         let mut state = link.lock();
         self.join(&link, &mut state);
-        self.feed(&link, &mut state, &mut [], None, None);
+        self.feed(self.now(), &link, &mut state, &mut [], None, None);
         self.settle(&link, state);
     }
 

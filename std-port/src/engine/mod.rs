@@ -10,6 +10,7 @@ mod calling;
 mod clock_thread;
 mod driving;
 mod interfaces;
+mod keeping;
 mod keys;
 pub(crate) mod link;
 mod membership;
@@ -66,7 +67,7 @@ use peers::{PeerCell, Peers};
 use state_gate::StateGate;
 
 /// Bytes that one read takes from a stream.
-pub(crate) const READ_BYTES: usize = 64 * 1024;
+pub(crate) const READ_BYTES: usize = 128 * 1024;
 /// A link on which reading is paused is looked at again after this.
 pub(crate) const RETRY: cara_core::time::Duration = cara_core::time::Duration::from_millis(1);
 
@@ -98,6 +99,10 @@ pub(crate) struct Engine<T: 'static> {
     largest_function: AtomicUsize,
     /// Links on which a thread of the pool stays.
     stays: Mutex<Vec<LinkId>>,
+    /// Links that are left to a caller who calls back to back.
+    kept: Mutex<Vec<LinkId>>,
+    /// Whether the clock looks at these.
+    watch: staying::Watch,
     interfaces: Mutex<interfaces::InterfaceWatch>,
     pub(crate) keys: Keys,
     /// When the file with the keys is looked at.
@@ -176,6 +181,8 @@ impl<T: Send + 'static> Engine<T> {
             longest_message,
             largest_function: AtomicUsize::new(0),
             stays: Mutex::new(Vec::new()),
+            kept: Mutex::new(Vec::new()),
+            watch: staying::Watch::default(),
             interfaces: Mutex::default(),
             keys: parts.keys,
             keys_due: Mutex::new(born),
@@ -199,12 +206,22 @@ impl<T: Send + 'static> Engine<T> {
         state: &mut LinkState,
         act: impl FnOnce(&mut Session<Boxed, Cipher>, &mut Lent<'_, T>) -> R,
     ) -> R {
+        self.with_at(self.now(), link, state, act)
+    }
+
+    /// The same at a time that was read a moment ago: each look at the clock is some percent of a small request.
+    fn with_at<R>(
+        &self,
+        now: Instant,
+        link: &LinkCell,
+        state: &mut LinkState,
+        act: impl FnOnce(&mut Session<Boxed, Cipher>, &mut Lent<'_, T>) -> R,
+    ) -> R {
         let functions = read(&self.functions);
         let mut mailman = StdMailman { stream: Some(&link.stream), datagrams: &self.datagrams };
         let mut buffers = &self.pool;
         let asked = self.guard.ask();
         let access = asked.as_ref().map(|asked| asked as &dyn Access);
-        let now = self.clock.now();
         let mut cx = Context { now, mailman: &mut mailman, buffers: &mut buffers, functions: &functions, access };
         act(&mut state.session, &mut cx)
     }
@@ -212,25 +229,31 @@ impl<T: Send + 'static> Engine<T> {
     /// Gives the session what was read. Returns the call that is to be run, its arguments in `arguments`.
     fn feed(
         &self,
+        now: Instant,
         link: &Arc<LinkCell>,
         state: &mut LinkState,
         bytes: &mut [u8],
         mut arguments: Option<&mut ParametersView>,
         mut own: Option<&mut OwnCall<'_>>,
     ) -> Option<Call> {
+        let (was_paused, stalled) = (state.is_paused(), state.is_stalled(now));
         let mut earlier = std::mem::take(&mut state.leftover);
-        let bytes = if earlier.is_empty() {
-            bytes
-        } else {
+        let mut position = std::mem::take(&mut state.leftover_at);
+        let bytes = if was_paused {
             earlier.extend_from_slice(bytes);
             &mut earlier[..]
+        } else {
+            bytes
         };
-        let mut position = 0;
         let mut call = None;
         loop {
             let rest = bytes.get_mut(position..).unwrap_or_default();
-            let step =
-                self.step(link, state, rest, arguments.as_deref_mut().filter(|_| call.is_none()), own.as_deref_mut());
+            let step = if !rest.is_empty() && !stalled && state.holds_back() {
+                Step::PAUSED
+            } else {
+                let arguments = arguments.as_deref_mut().filter(|_| call.is_none());
+                self.step(now, link, state, rest, arguments, own.as_deref_mut())
+            };
             position += step.consumed;
             call = call.or(step.call);
             if step.introduced {
@@ -239,11 +262,17 @@ impl<T: Send + 'static> Engine<T> {
             if step.hello {
                 self.admit(link, state);
             }
-            if step.paused {
-                state.leftover = bytes.get(position..).unwrap_or_default().to_vec();
+            if step.paused && was_paused {
+                (state.leftover, state.leftover_at) = (earlier, position);
                 return call;
             }
-            if !step.progress {
+            if step.paused {
+                state.leftover = bytes.get(position..).unwrap_or_default().to_vec();
+                state.moved_at = now;
+                return call;
+            }
+            let through = position == bytes.len() && !state.session.holds_received();
+            if through || !step.progress {
                 return call;
             }
         }
@@ -252,6 +281,7 @@ impl<T: Send + 'static> Engine<T> {
     /// One call of `Session::receive`, with its event taken apart.
     fn step(
         &self,
+        now: Instant,
         link: &Arc<LinkCell>,
         state: &mut LinkState,
         bytes: &mut [u8],
@@ -264,7 +294,6 @@ impl<T: Send + 'static> Engine<T> {
         let mut buffers = &self.pool;
         let asked = self.guard.ask();
         let access = asked.as_ref().map(|asked| asked as &dyn Access);
-        let now = self.clock.now();
         let mut cx = Context { now, mailman: &mut mailman, buffers: &mut buffers, functions: &functions, access };
         let LinkState { session, waiters, notices, .. } = state;
         let receipt = session.receive(&mut cx, bytes, arguments);
@@ -303,12 +332,16 @@ impl<T: Send + 'static> Engine<T> {
 
     /// Polls the session as far as something is due, sets its timer and epoll interest, gives the lock up, and acts on
     /// what happened: safe hooks first.
-    pub(crate) fn settle<'l>(&self, link: &'l Arc<LinkCell>, mut guard: MutexGuard<'l, LinkState>) {
+    pub(crate) fn settle<'l>(&self, link: &'l Arc<LinkCell>, guard: MutexGuard<'l, LinkState>) {
+        self.settle_at(self.now(), link, guard);
+    }
+
+    fn settle_at<'l>(&self, now: Instant, link: &'l Arc<LinkCell>, mut guard: MutexGuard<'l, LinkState>) {
         let state = &mut *guard;
-        if state.session.deadline() <= self.clock.now() {
+        if state.session.deadline() <= now {
             self.poll_session(link, state);
         }
-        self.set_timer(link, state);
+        self.set_timer(now, link, state);
         self.set_interest(link, state);
         if !state.notices.is_empty() {
             self.act(link, guard);
@@ -334,10 +367,10 @@ impl<T: Send + 'static> Engine<T> {
         }
     }
 
-    fn set_timer(&self, link: &LinkCell, state: &mut LinkState) {
+    fn set_timer(&self, now: Instant, link: &LinkCell, state: &mut LinkState) {
         let mut deadline = state.session.deadline();
         if state.is_paused() {
-            deadline = deadline.min(self.clock.now() + RETRY);
+            deadline = deadline.min(now + RETRY);
         }
         // A timer that is early does no harm: it is set anew when it comes.
         if deadline < state.timer {
@@ -493,6 +526,11 @@ struct Step {
     introduced: bool,
     hello: bool,
     call: Option<Call>,
+}
+
+impl Step {
+    /// Nothing was looked at.
+    const PAUSED: Self = Self { consumed: 0, paused: true, progress: false, hello: false, introduced: false, call: None };
 }
 
 /// What a link is watched for.

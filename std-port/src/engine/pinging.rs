@@ -29,6 +29,8 @@ impl<T: Send + 'static> Engine<T> {
         mut state: MutexGuard<'l, LinkState>,
         deadline: Instant,
     ) -> Result<Duration, Error> {
+        // Nobody may come to read for it.
+        state.reader.give_up_keeping();
         loop {
             match self.with(link, &mut state, |session, cx| session.ping(cx)) {
                 Ok(()) => break,

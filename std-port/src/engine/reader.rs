@@ -3,11 +3,12 @@
 //! Two kinds of threads lead. A caller that waits for a reply takes the lead if nobody has it and reads its own reply.
 //! A thread of the pool that has just served a link, quickly, stays on it and waits for the next call. A link that is
 //! led is out of the pool's hands (disarmed); when the leader leaves, it passes the lead to a waiting caller, or gives
-//! the link back to the pool (arms it). A thread of the pool that runs a handler while it leads can lose the lead: then
-//! others read on.
+//! the link back to the pool (arms it). A caller whose calls follow each other at once does neither: it keeps the link,
+//! until the clock finds that no further call has come. A thread of the pool that runs a handler while it leads can lose
+//! the lead: then others read on.
 //!
 //! The decisions stand here, without any threads, so that they can be checked by a model: at every moment somebody reads
-//! the link, or has been told to.
+//! the link, has been told to, or is expected back under the eyes of the clock.
 
 use cara_core::time::{Duration, Instant};
 
@@ -17,6 +18,8 @@ pub(crate) struct Reader {
     lead: Option<Lead>,
     /// A caller has been woken to take the lead and has not yet done so.
     passed: bool,
+    /// The last leader is expected back at once; if it does not come, the clock gives the link to the pool.
+    kept: bool,
     turns: u32,
 }
 
@@ -39,7 +42,7 @@ impl Reader {
 
     /// The pool is to be told when there is something to read.
     pub(crate) const fn pool_reads(self) -> bool {
-        self.lead.is_none() && !self.passed
+        self.lead.is_none() && !self.passed && !self.kept
     }
 
     /// Asks for the lead.
@@ -51,6 +54,7 @@ impl Reader {
         let turn = Turn(self.turns);
         self.lead = Some(Lead { turn, busy_since: None });
         self.passed = false;
+        self.kept = false;
         Some(turn)
     }
 
@@ -66,6 +70,11 @@ impl Reader {
         }
     }
 
+    /// The leader runs a handler.
+    pub(crate) fn is_busy(self) -> bool {
+        self.lead.is_some_and(|lead| lead.busy_since.is_some())
+    }
+
     /// Takes the lead from a thread that has been busy for longer than `limit`; others read from here on.
     pub(crate) fn relieve(&mut self, now: Instant, limit: Duration, pass: impl FnOnce() -> bool) -> bool {
         let overdue = self.lead.and_then(|lead| lead.busy_since).is_some_and(|since| now >= since + limit);
@@ -74,6 +83,23 @@ impl Reader {
             self.passed = pass();
         }
         overdue
+    }
+
+    /// The leader leaves and comes back at once, unless somebody else waits for the lead.
+    pub(crate) fn keep(&mut self, turn: Turn, pass: impl FnOnce() -> bool) {
+        self.kept = self.is_leader(turn);
+        self.leave(Some(turn), pass);
+        self.kept &= !self.passed;
+    }
+
+    /// Whether the link is kept for its last leader.
+    pub(crate) const fn is_kept(self) -> bool {
+        self.kept
+    }
+
+    /// The last leader has not come back, or somebody waits who does not read: the pool reads.
+    pub(crate) fn give_up_keeping(&mut self) {
+        self.kept = false;
     }
 
     /// A thread leaves. If it led, or if the lead was passed on and not taken yet, `pass` wakes the next waiting caller
@@ -166,6 +192,24 @@ mod tests {
         reader.set_busy(turn, Some(at(2_000)));
         assert!(reader.relieve(at(2_010), limit, || false));
         assert!(reader.pool_reads() && !reader.is_leader(turn));
+    }
+
+    #[test]
+    fn a_link_is_kept_until_its_leader_is_back_or_the_clock_gives_up() {
+        let mut reader = Reader::default();
+        let turn = reader.take_lead().unwrap();
+        reader.keep(turn, || false);
+        assert!(reader.is_kept() && !reader.pool_reads() && !reader.is_led());
+        let turn = reader.take_lead().unwrap();
+        assert!(!reader.is_kept());
+        reader.keep(turn, || true);
+        assert!(!reader.is_kept(), "somebody else has the lead");
+        let next = reader.take_lead().unwrap();
+        reader.keep(turn, nobody_asked);
+        assert!(!reader.is_kept() && reader.is_leader(next), "only the leader keeps");
+        reader.keep(next, || false);
+        reader.give_up_keeping();
+        assert!(reader.pool_reads());
     }
 
     #[test]

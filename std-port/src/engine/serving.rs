@@ -7,7 +7,7 @@ use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, ServiceError};
 use cara_core::services::unit::Call;
-use cara_core::time::Duration;
+use cara_core::time::{Duration, Instant};
 
 use super::link::{LinkCell, LinkState};
 use super::{Engine, lock, read};
@@ -25,24 +25,26 @@ impl<T: Send + 'static> Engine<T> {
     pub(super) fn serve(&self, link: &Arc<LinkCell>, call: Call, arguments: &mut ParametersView) {
         let mut next = Some(call);
         while let Some(call) = next {
-            let state = self.serve_one(link, &call, arguments);
+            let (state, _) = self.serve_one(self.now(), link, &call, arguments);
             next = self.next_call(link, state, arguments);
         }
     }
 
-    /// Runs one call and answers it.
+    /// Runs one call and answers it. Returns the time of its last look at the clock as well.
     pub(super) fn serve_one<'l>(
         &self,
+        began: Instant,
         link: &'l Arc<LinkCell>,
         call: &Call,
         arguments: &mut ParametersView,
-    ) -> MutexGuard<'l, LinkState> {
-        let began = self.now();
+    ) -> (MutexGuard<'l, LinkState>, Instant) {
         let result = self.run(link, call, arguments);
-        let quick = self.now().since(began) < QUICK;
+        let now = self.now();
         let mut state = link.lock();
-        state.quick = quick;
-        self.answer(link, state, call, result, arguments)
+        state.quick = now.since(began) < QUICK;
+        state.is_called = true;
+        state.moved_at = now;
+        (self.answer(now, link, state, call, result, arguments), now)
     }
 
     /// Takes the next call that may begin on a link; another thread is told if there is one more.
@@ -53,6 +55,9 @@ impl<T: Send + 'static> Engine<T> {
         arguments: &mut ParametersView,
     ) -> Option<Call> {
         let mut next = None;
+        if state.is_paused() && !state.session.has_next_call() {
+            self.feed(self.now(), link, &mut state, &mut [], None, None);
+        }
         if state.session.has_next_call() && self.may_run() {
             next = self.with(link, &mut state, |session, cx| session.next_call(cx, arguments));
         }
@@ -112,6 +117,7 @@ impl<T: Send + 'static> Engine<T> {
     /// Answers, waiting for room while somebody waits for the answer.
     fn answer<'l>(
         &self,
+        mut now: Instant,
         link: &'l Arc<LinkCell>,
         mut state: MutexGuard<'l, LinkState>,
         call: &Call,
@@ -123,17 +129,18 @@ impl<T: Send + 'static> Engine<T> {
                 Ok(()) => Ok(results),
                 Err(error) => Err(error),
             };
-            let kept = self.with(link, &mut state, |session, cx| session.answer(cx, call.ticket, answer));
+            let kept = self.with_at(now, link, &mut state, |session, cx| session.answer(cx, call.ticket, answer));
             if kept.is_ok() {
                 return state;
             }
-            if self.now() >= call.deadline {
+            if now >= call.deadline {
                 state.session.drop_answer(call.ticket);
                 return state;
             }
             self.settle(link, state);
             state = link.lock();
             state = link.room.wait_timeout(state, PAUSE).unwrap_or_else(PoisonError::into_inner).0;
+            now = self.now();
         }
     }
 

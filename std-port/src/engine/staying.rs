@@ -2,12 +2,12 @@
 //!
 //! Going back to the epoll set after each call costs a system call, and on a busy CPU a second thread that is woken for
 //! the next call while the first has not yet returned. A thread stays only while another one waits in the epoll set, and
-//! only on links whose handlers are quick. Should one take long after all, [`Engine::relieve_stays`] takes the lead away
-//! within [`RELIEF`], so that other threads read on; until then that link's stream waits, but not its datagrams, which
-//! carry emergencies and keep-alives as well, and no other link.
+//! only on links whose calls follow each other at once and are quick. Should one take long after all, the clock takes the
+//! lead away ([`Engine::watch_links`]), so that other threads read on; until then that link's stream waits, but not its
+//! datagrams, which carry emergencies and keep-alives as well, and no other link.
 
-use std::sync::Arc;
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, MutexGuard};
 
 use cara_core::error::CloseReason;
 use cara_core::services::unit::Call;
@@ -21,21 +21,66 @@ use super::{Engine, lock};
 use crate::sys::stream::{Received, Wait};
 
 /// Threads of the pool that may stay on links.
-const MOST_STAYS: usize = 4;
+const MOST_STAYS: usize = 8;
 /// A thread stays on a link that is served again after at most this many calls of other links. With more busy links than
 /// that, staying would keep threads from those that have something to read.
-const FEW: usize = 4;
+const FEW: usize = 8;
+/// Calls that come within this time of each other follow each other at once.
+const AT_ONCE: Duration = Duration::from_millis(1);
 /// A handler that runs longer than this while its thread has the lead loses it.
 const RELIEF: Duration = Duration::from_millis(1);
+/// How often the clock looks at links that are led or kept, as long as anything happens there.
+pub(super) const LOOK: Duration = Duration::from_millis(2);
+
+/// Whether the clock looks at links that are read, or kept, without its being told of each call.
+#[derive(Debug, Default)]
+pub(super) struct Watch {
+    /// Something has happened since it last looked.
+    used: AtomicBool,
+    looking: AtomicBool,
+}
+
+impl Watch {
+    /// Something happens on a link. `true` where the clock must be told to look again.
+    pub(super) fn begins(&self) -> bool {
+        self.used.store(true, Ordering::SeqCst);
+        !self.looking.load(Ordering::SeqCst) && !self.looking.swap(true, Ordering::SeqCst)
+    }
+
+    /// Whether anything has happened since the last look. If not, whatever happens next tells the clock anew.
+    fn look(&self) -> bool {
+        self.looking.store(false, Ordering::SeqCst);
+        let used = self.used.swap(false, Ordering::SeqCst);
+        if used {
+            self.go_on();
+        }
+        used
+    }
+
+    fn go_on(&self) {
+        self.looking.store(true, Ordering::SeqCst);
+    }
+
+    fn is_on(&self) -> bool {
+        self.looking.load(Ordering::SeqCst)
+    }
+}
 
 impl<T: Send + 'static> Engine<T> {
     /// Waits on `link` for more calls, as long as they come and are quick, and another thread looks after the rest.
     pub(super) fn stay(&self, link: &Arc<LinkCell>, worker: &mut Worker) {
         let Some(turn) = self.begin_stay(link) else { return };
-        while let Some(call) = self.await_call(link, turn, worker) {
-            // It is busy until the last of those that waited behind this call is done.
-            self.serve(link, call, &mut worker.arguments);
-            if !self.may_stay(link, turn) {
+        while let Some((call, began)) = self.await_call(link, turn, worker) {
+            let (state, now) = self.serve_one(began, link, &call, &mut worker.arguments);
+            if state.session.has_next_call() || state.is_paused() {
+                // It is busy until the last of those that waited behind this call is done.
+                if let Some(call) = self.next_call(link, state, &mut worker.arguments) {
+                    self.serve(link, call, &mut worker.arguments);
+                }
+                if !self.goes_on(self.now(), link, link.lock(), turn) {
+                    break;
+                }
+            } else if !self.goes_on(now, link, state, turn) {
                 break;
             }
         }
@@ -48,9 +93,12 @@ impl<T: Send + 'static> Engine<T> {
         if stays.len() >= MOST_STAYS || !self.crew().has_idle() {
             return None;
         }
+        let now = self.now();
         let mut state = link.lock();
         let others = served.wrapping_sub(std::mem::replace(&mut state.served, served));
+        let before = state.served_at.replace(now);
         if others > FEW
+            || before.is_none_or(|before| now >= before + AT_ONCE)
             || !state.quick
             || !state.waiters.is_empty()
             || !state.session.is_live()
@@ -61,32 +109,36 @@ impl<T: Send + 'static> Engine<T> {
         }
         let turn = state.reader.take_lead()?;
         stays.push(link.id);
-        let first = stays.len() == 1;
         drop(stays);
-        self.settle(link, state);
-        if first {
-            self.wake_clock();
-        }
+        self.settle_at(now, link, state);
         Some(turn)
     }
 
-    fn may_stay(&self, link: &LinkCell, turn: Turn) -> bool {
-        let mut state = link.lock();
+    /// The thread has served a call: whether it stays.
+    fn goes_on<'l>(
+        &self,
+        now: Instant,
+        link: &'l Arc<LinkCell>,
+        mut state: MutexGuard<'l, LinkState>,
+        turn: Turn,
+    ) -> bool {
         state.reader.set_busy(turn, None);
-        let goes_on = state.quick && !state.is_paused() && state.reader.is_leader(turn);
-        goes_on && self.crew().has_idle() && !self.is_stopping()
+        let stays = state.quick && !state.is_paused() && state.reader.is_leader(turn);
+        self.settle_at(now, link, state);
+        stays && self.crew().has_idle() && !self.is_stopping()
     }
 
     /// Reads until a call is to be run; `None` when nothing comes any more or the lead is lost.
-    fn await_call(&self, link: &Arc<LinkCell>, turn: Turn, worker: &mut Worker) -> Option<Call> {
+    fn await_call(&self, link: &Arc<LinkCell>, turn: Turn, worker: &mut Worker) -> Option<(Call, Instant)> {
         loop {
             let received = link.stream.receive(&mut worker.buffer, Wait::Slice);
+            let now = self.now();
             worker.fit(self.call_bytes());
             let mut state = link.lock();
             let call = match received {
                 Received::Bytes(count) => {
                     let bytes = worker.buffer.get_mut(..count).unwrap_or_default();
-                    self.feed(link, &mut state, bytes, Some(&mut worker.arguments), None)
+                    self.feed(now, link, &mut state, bytes, Some(&mut worker.arguments), None)
                 }
                 Received::WouldBlock => return None,
                 Received::Closed => {
@@ -97,12 +149,13 @@ impl<T: Send + 'static> Engine<T> {
             };
             let call = call.or_else(|| self.waiting_call(link, &mut state, worker));
             if call.is_some() {
-                state.reader.set_busy(turn, Some(self.now()));
+                state.reader.set_busy(turn, Some(now));
             }
             let alive = state.session.is_live() && state.waiters.is_empty() && !state.is_paused();
-            self.settle(link, state);
-            if call.is_some() {
-                return call;
+            self.settle_at(now, link, state);
+            if let Some(call) = call {
+                self.begin_watch();
+                return Some((call, now));
             }
             if !alive || !self.crew().has_idle() || self.is_stopping() {
                 return None;
@@ -126,21 +179,46 @@ impl<T: Send + 'static> Engine<T> {
         self.leave(link, link.lock(), Some(turn));
     }
 
-    /// Takes the lead from threads whose handlers take long; returns when to look again.
-    pub(super) fn relieve_stays(&self) -> Instant {
-        let stays = lock(&self.stays).clone();
-        if stays.is_empty() {
+    /// The clock is to look at the links that are led or kept, until nothing happens there any more.
+    pub(super) fn begin_watch(&self) {
+        if self.watch.begins() {
+            self.wake_clock();
+        }
+    }
+
+    /// Gives to the pool what is led by a thread whose handler takes long, and what is kept for a caller who does not come
+    /// back; returns when to look again.
+    pub(super) fn watch_links(&self) -> Instant {
+        if !self.watch.is_on() {
             return Instant::FAR_FUTURE;
         }
         let now = self.now();
+        let used = self.watch.look();
+        let busy = self.relieve_stays(now);
+        if !self.look_at_kept(now) && !busy && !used {
+            return Instant::FAR_FUTURE;
+        }
+        self.watch.go_on();
+        now + LOOK
+    }
+
+    /// Takes the lead from threads whose handlers take long; whether others may soon take as long.
+    fn relieve_stays(&self, now: Instant) -> bool {
+        let stays = lock(&self.stays).clone();
+        let mut busy = false;
         for link in stays.into_iter().filter_map(|id| self.link(id)) {
             // Whoever holds the lock is not inside a handler; the next look comes soon.
-            let Some(mut state) = link.try_lock() else { continue };
+            let Some(mut state) = link.try_lock() else {
+                busy = true;
+                continue;
+            };
             let LinkState { reader, waiters, .. } = &mut *state;
             if reader.relieve(now, RELIEF, || pass_lead(waiters)) {
                 self.settle(&link, state);
+            } else {
+                busy |= reader.is_busy();
             }
         }
-        now + RELIEF
+        busy
     }
 }

@@ -7,6 +7,7 @@ use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, Limit};
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::{RequestOptions, SessionStorage};
+use cara_core::time::Instant;
 
 use super::link::{LinkCell, LinkState};
 use super::{Engine, read};
@@ -50,9 +51,11 @@ impl<T: Send + 'static> Engine<T> {
         functions.iter().map(|function| usize::from(function.slot.0) + 1).max().unwrap_or(0)
     }
 
+    #[expect(clippy::too_many_arguments, reason = "those of a request, and where and when it is made")]
     /// A request on a link, with more slots for calls if all of those are taken that it has.
     pub(super) fn request_on(
         &self,
+        now: Instant,
         link: &LinkCell,
         state: &mut LinkState,
         function: &str,
@@ -61,7 +64,7 @@ impl<T: Send + 'static> Engine<T> {
         wait: bool,
     ) -> Result<CallId, Error> {
         let mut attempt =
-            || self.with(link, state, |session, cx| session.request(cx, function, parameters, options, wait));
+            || self.with_at(now, link, state, |session, cx| session.request(cx, function, parameters, options, wait));
         match attempt() {
             Err(Error::Full(Limit::Calls)) => {}
             outcome => return outcome,

@@ -22,20 +22,20 @@ const READS: usize = 8;
 pub(crate) struct Worker {
     pub(super) buffer: Vec<u8>,
     pub(super) arguments: Box<ParametersView>,
-    /// The bytes that `arguments` hold.
-    room: usize,
+    /// The longest call that `arguments` have room for.
+    longest: usize,
 }
 
 impl Worker {
     pub(crate) fn new() -> Self {
-        Self { buffer: vec![0; READ_BYTES], arguments: arena(0), room: arena_bytes(0) }
+        Self { buffer: vec![0; READ_BYTES], arguments: arena(0), longest: 0 }
     }
 
     /// The limit may have been raised since the last call.
     pub(super) fn fit(&mut self, longest: usize) {
-        if self.room < arena_bytes(longest) {
+        if self.longest < longest {
             self.arguments = arena(longest);
-            self.room = arena_bytes(longest);
+            self.longest = longest;
         }
     }
 }
@@ -96,7 +96,7 @@ impl<T: Send + 'static> Engine<T> {
             // Where nobody else waits to read on, the call waits in the session: most of what is read is none.
             let arguments = if call.is_none() && self.crew().has_idle() { Some(&mut *worker.arguments) } else { None };
             let bytes = worker.buffer.get_mut(..count).unwrap_or_default();
-            call = call.or(self.feed(link, state, bytes, arguments, None));
+            call = call.or(self.feed(self.now(), link, state, bytes, arguments, None));
             // A short read has emptied the stream; a hang-up shows in one more.
             if state.is_paused() || (count < READ_BYTES && !hung_up) {
                 return call;

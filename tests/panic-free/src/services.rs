@@ -82,7 +82,13 @@ entry!(session_asked, {
     ));
     keep((session.identity(), session.epoch(), session.address(), session.nonce(), session.deadline()));
     keep((session.their_function_list(), session.counters(), session.calls_in_flight(), session.calls_held()));
-    keep((session.wants_to_write(), session.has_next_call(), session.is_acknowledged(*unknown())));
+    keep((
+        session.wants_to_write(),
+        session.has_next_call(),
+        session.holds_received(),
+        session.has_call_room(),
+        session.is_acknowledged(*unknown()),
+    ));
     keep(session.constraints());
 });
 

@@ -160,6 +160,11 @@ impl<S: Storage, C: Seal> Link<S, C> {
         Ok(received)
     }
 
+    /// Whether anything is kept of what came: otherwise a [`receive`](Self::receive) of nothing does nothing.
+    pub fn holds_received(&self) -> bool {
+        self.receiver.holds_anything()
+    }
+
     /// The bytes at `place`; `lent` is the slice that was lent to [`receive`](Self::receive).
     pub fn view<'b>(&'b self, place: Place, lent: &'b [u8]) -> &'b [u8] {
         view(&self.receiver, place, lent)

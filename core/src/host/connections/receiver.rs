@@ -72,6 +72,11 @@ impl<S: Storage> Receiver<S> {
         self.message_limit = self.message_limit.max(limit);
     }
 
+    /// Whether anything is kept of what came: a frame in pieces, a message, or the buffer of one that was handed up.
+    pub(super) fn holds_anything(&self) -> bool {
+        self.partial.length > 0 || self.buffer.is_some()
+    }
+
     pub(super) fn store<'b>(&'b self, store: Store, lent: &'b [u8]) -> &'b [u8] {
         match store {
             Store::Lent => lent,

@@ -53,6 +53,12 @@ impl<S: Storage, C: Secure> Session<S, C> {
         self.phase == Phase::Live && self.calls.can_begin()
     }
 
+    /// Whether a request that comes now would be kept if it cannot run at once. A port that stops looking at what it has
+    /// read while there is no room lets a peer that sends faster than its calls run feel it, in place of refusing.
+    pub fn has_call_room(&self) -> bool {
+        self.calls.has_room(self.constraints.calls_per_peer, self.constraints.message_size as usize)
+    }
+
     pub(super) fn begin<M: Mailman, B: Buffers<S>, H: Service>(
         &mut self,
         cx: &mut Context<'_, S, M, B, H>,

@@ -328,6 +328,12 @@ impl<S: Storage, C: Secure> Session<S, C> {
         self.link.wants_to_write()
     }
 
+    /// Whether anything is kept of the bytes that came. Otherwise [`receive`](Self::receive) has nothing more to say after
+    /// it has taken all of them, and need not be called with nothing.
+    pub fn holds_received(&self) -> bool {
+        self.link.holds_received()
+    }
+
     /// The connection is open: the one who dialed introduces itself first.
     pub fn connected<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
         self.phase = Phase::AwaitingHello { until: cx.now + HELLO_TIMEOUT };
