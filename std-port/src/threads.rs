@@ -3,6 +3,7 @@
 //! A unit has threads of its own unless it is given [`Threads`] that several units of a process share. A token says
 //! which unit an event is for, so that the units of a process wait in one epoll set, whoever has the threads.
 
+use std::cell::Cell;
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError, RwLock};
@@ -136,6 +137,11 @@ struct Seat {
     gate: RwLock<()>,
 }
 
+thread_local! {
+    /// The address of the crew whose clock this thread is.
+    static CLOCK_OF: Cell<usize> = const { Cell::new(0) };
+}
+
 /// The threads themselves and what they share.
 pub(crate) struct Crew {
     pub(crate) clock: Clock,
@@ -217,9 +223,14 @@ impl Crew {
 
     /// The unit has something to do at `at`.
     pub(crate) fn wake_at(&self, seat: u16, at: Instant) {
-        if lock(&self.due).bring_forward(u32::from(seat), at) {
+        if lock(&self.due).bring_forward(u32::from(seat), at) && !self.keeps_time_here() {
             self.clock_waker.wake();
         }
+    }
+
+    /// This thread is the crew's clock, which looks at what is due before it next waits.
+    fn keeps_time_here(&self) -> bool {
+        CLOCK_OF.get() == std::ptr::from_ref(self).addr()
     }
 
     /// Leaves a link's calls to another thread of the pool.
@@ -353,6 +364,7 @@ impl Crew {
     }
 
     fn keep_time(&self) {
+        CLOCK_OF.set(std::ptr::from_ref(self).addr());
         let mut events = Events::new(CLOCK_EVENTS);
         let mut buffer = vec![0; DATAGRAM];
         while !self.is_stopping() {
