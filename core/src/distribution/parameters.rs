@@ -259,6 +259,7 @@ impl ParametersView {
         self.add_checked(name.as_bytes(), kind, size)
     }
 
+    /// Adds a variable whose name may be one, and is not there.
     pub(super) fn add_checked(&mut self, name: &[u8], kind: Type, size: u32) -> Result<(), Error> {
         let place = self.table.get_mut(self.count as usize).ok_or(Error::Full(Limit::Variables))?;
         let full = Error::Full(Limit::ParametersBytes);

@@ -530,7 +530,8 @@ struct Step {
 
 impl Step {
     /// Nothing was looked at.
-    const PAUSED: Self = Self { consumed: 0, paused: true, progress: false, hello: false, introduced: false, call: None };
+    const PAUSED: Self =
+        Self { consumed: 0, paused: true, progress: false, hello: false, introduced: false, call: None };
 }
 
 /// What a link is watched for.

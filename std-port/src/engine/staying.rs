@@ -21,10 +21,10 @@ use super::{Engine, lock};
 use crate::sys::stream::{Received, Wait};
 
 /// Threads of the pool that may stay on links.
-const MOST_STAYS: usize = 8;
+const MOST_STAYS: usize = 4;
 /// A thread stays on a link that is served again after at most this many calls of other links. With more busy links than
 /// that, staying would keep threads from those that have something to read.
-const FEW: usize = 8;
+const FEW: usize = 4;
 /// Calls that come within this time of each other follow each other at once.
 const AT_ONCE: Duration = Duration::from_millis(1);
 /// A handler that runs longer than this while its thread has the lead loses it.
