@@ -5,7 +5,7 @@
 //! |---|---|
 //! | 32 | the secret for random numbers |
 //! | 1 | g, how many generations of keys, 1 or 2 |
-//! | 36 g | each generation, the newest first: its number, little-endian, and the key for discovery |
+//! | 36 g | each generation, the one in use first: its number, little-endian, and the key for discovery |
 //! | 1 | p, how many peers |
 //! | … | each peer: role (0 m_unit, 1 s_unit), length of its name, name, id, little-endian; then for each generation 0, or 1 and 32 bytes of the pair's key |
 //!
@@ -15,6 +15,7 @@
 use core::fmt;
 
 use cara_core::distribution::identity::{Identity, Role};
+use cara_secure::keyring::Keyring;
 use cara_secure::keys::{DeviceSecret, DiscoveryKey, PairKey};
 use heapless::Vec;
 use zeroize::Zeroizing;
@@ -23,15 +24,15 @@ pub use crate::page::KEYS_BYTES;
 use crate::page::{PageError, newest_found};
 use crate::{Field, Settings, TextError, text};
 
-/// Most generations of keys that a board holds: while a fleet changes its keys, the new one and the one before.
+/// Most generations of keys that a board holds: the one in use, and while a fleet changes its keys the one beside it.
 pub const GENERATIONS: usize = 2;
 
 /// The keys of a board with at most `PEERS` peers: one for a vehicle, which has one manager.
 #[derive(Debug)]
 pub struct Keys<const PEERS: usize = 1> {
     secret: DeviceSecret,
-    /// The newest first.
-    generations: Vec<(u32, DiscoveryKey), GENERATIONS>,
+    used: (u32, DiscoveryKey),
+    beside: Option<(u32, DiscoveryKey)>,
     peers: Vec<Peer, PEERS>,
 }
 
@@ -68,17 +69,18 @@ pub enum KeysError {
 }
 
 impl<const PEERS: usize> Keys<PEERS> {
-    /// Without any keys yet. `secret` is drawn for this board and for nothing else.
-    pub const fn new(secret: DeviceSecret) -> Self {
-        Self { secret, generations: Vec::new(), peers: Vec::new() }
+    /// The generation in use, without peers yet. `secret` is drawn for this board and for nothing else.
+    pub const fn new(secret: DeviceSecret, generation: u32, discovery: DiscoveryKey) -> Self {
+        Self { secret, used: (generation, discovery), beside: None, peers: Vec::new() }
     }
 
-    /// Adds a generation, which is older than those that are there.
-    pub fn push_generation(&mut self, number: u32, discovery: DiscoveryKey) -> Result<(), KeysError> {
-        if self.generations.last().is_some_and(|(newer, _)| *newer <= number) {
+    /// Adds the generation that is taken beside the one in use.
+    pub fn push_beside(&mut self, generation: u32, discovery: DiscoveryKey) -> Result<(), KeysError> {
+        if generation == self.used.0 || self.beside.is_some() {
             return Err(KeysError::Unsound);
         }
-        self.generations.push((number, discovery)).map_err(|_| KeysError::Full)
+        self.beside = Some((generation, discovery));
+        Ok(())
     }
 
     /// Adds the key with a peer of one of the generations that are there.
@@ -94,7 +96,7 @@ impl<const PEERS: usize> Keys<PEERS> {
     }
 
     fn position(&self, generation: u32) -> Option<usize> {
-        self.generations.iter().position(|(number, _)| *number == generation)
+        self.discoveries().position(|(number, _)| number == generation)
     }
 
     /// The secret from which the board draws its random numbers.
@@ -102,21 +104,21 @@ impl<const PEERS: usize> Keys<PEERS> {
         &self.secret
     }
 
-    /// All keys for discovery and their generations, the newest first.
+    /// All keys for discovery and their generations, the one in use first.
     pub fn discoveries(&self) -> impl Iterator<Item = (u32, &DiscoveryKey)> {
-        self.generations.iter().map(|(number, key)| (*number, key))
+        core::iter::once(&self.used).chain(&self.beside).map(|(number, key)| (*number, key))
     }
 
-    /// The newest key with a peer; `None` for a node that this one may not talk to.
+    /// The key in use with a peer; `None` for a node that this one may not talk to.
     pub fn pair(&self, peer: &Identity) -> Option<&PairKey> {
         self.pairs(peer).next().map(|(_, key)| key)
     }
 
-    /// All keys with a peer and their generations, the newest first.
+    /// All keys with a peer and their generations, the one in use first.
     pub fn pairs(&self, peer: &Identity) -> impl Iterator<Item = (u32, &PairKey)> {
         let known = self.peers.iter().find(|known| known.identity == *peer);
         let keys = known.into_iter().flat_map(|known| &known.pairs);
-        self.generations.iter().zip(keys).filter_map(|((number, _), key)| Some((*number, key.as_ref()?)))
+        self.discoveries().zip(keys).filter_map(|((number, _), key)| Some((number, key.as_ref()?)))
     }
 
     /// Whom it may talk to.
@@ -128,13 +130,14 @@ impl<const PEERS: usize> Keys<PEERS> {
     pub fn encode(&self, bytes: &mut [u8; KEYS_BYTES]) -> Result<usize, KeysError> {
         let mut left = bytes.as_mut_slice();
         put(&mut left, self.secret.expose())?;
-        put(&mut left, &[self.generations.len() as u8])?;
-        for (number, key) in &self.generations {
+        let generations = self.discoveries().count();
+        put(&mut left, &[generations as u8])?;
+        for (number, key) in self.discoveries() {
             put(&mut left, &number.to_le_bytes())?;
             put(&mut left, key.expose())?;
         }
         put(&mut left, &[u8::try_from(self.peers.len()).map_err(|_| KeysError::Full)?])?;
-        self.peers.iter().try_for_each(|peer| peer.encode(&mut left, self.generations.len()))?;
+        self.peers.iter().try_for_each(|peer| peer.encode(&mut left, generations))?;
         let left = left.len();
         Ok(KEYS_BYTES.saturating_sub(left))
     }
@@ -142,21 +145,26 @@ impl<const PEERS: usize> Keys<PEERS> {
     /// Reads what [`encode`](Self::encode) has written, and nothing behind it.
     pub fn decode(mut bytes: &[u8]) -> Result<Self, KeysError> {
         let left = &mut bytes;
-        let mut keys = Self::new(DeviceSecret::new(*take(left)?));
+        let secret = DeviceSecret::new(*take(left)?);
         let [generations] = *take(left)?;
-        for _ in 0..generations {
-            let number = u32::from_le_bytes(*take(left)?);
-            keys.push_generation(number, DiscoveryKey::new(*take(left)?))?;
+        if !(1..=GENERATIONS as u8).contains(&generations) {
+            return Err(KeysError::Unsound);
+        }
+        let used = u32::from_le_bytes(*take(left)?);
+        let mut keys = Self::new(secret, used, DiscoveryKey::new(*take(left)?));
+        if usize::from(generations) == GENERATIONS {
+            let beside = u32::from_le_bytes(*take(left)?);
+            keys.push_beside(beside, DiscoveryKey::new(*take(left)?))?;
         }
         let [peers] = *take(left)?;
         for _ in 0..peers {
-            let peer = Peer::decode(left, keys.generations.len())?;
+            let peer = Peer::decode(left, generations.into())?;
             if keys.peers().any(|known| *known == peer.identity) {
                 return Err(KeysError::Unsound);
             }
             keys.peers.push(peer).map_err(|_| KeysError::Full)?;
         }
-        if left.is_empty() && generations > 0 { Ok(keys) } else { Err(KeysError::Unsound) }
+        if left.is_empty() { Ok(keys) } else { Err(KeysError::Unsound) }
     }
 }
 
@@ -194,6 +202,17 @@ impl Peer {
             };
         }
         Ok(Self { identity, pairs })
+    }
+}
+
+impl<const PEERS: usize> Keyring for Keys<PEERS> {
+    fn discovery(&self) -> (&DiscoveryKey, Option<&DiscoveryKey>) {
+        (&self.used.1, self.beside.as_ref().map(|(_, key)| key))
+    }
+
+    fn pair(&self, peer: &Identity) -> Option<(PairKey, Option<PairKey>)> {
+        let mut keys = self.pairs(peer).map(|(_, key)| key.clone());
+        keys.next().map(|key| (key, keys.next()))
     }
 }
 
@@ -253,9 +272,8 @@ mod tests {
 
     /// Keys in two generations with one peer.
     fn keys() -> Keys {
-        let mut keys = Keys::new(DeviceSecret::new([0xA1; KEY_BYTES]));
-        keys.push_generation(2, DiscoveryKey::new([0xB2; KEY_BYTES])).unwrap();
-        keys.push_generation(1, DiscoveryKey::new([0xB1; KEY_BYTES])).unwrap();
+        let mut keys = Keys::new(DeviceSecret::new([0xA1; KEY_BYTES]), 2, DiscoveryKey::new([0xB2; KEY_BYTES]));
+        keys.push_beside(1, DiscoveryKey::new([0xB1; KEY_BYTES])).unwrap();
         keys.push_pair(2, &named("depot", 1), PairKey::new([0xC2; KEY_BYTES])).unwrap();
         keys.push_pair(1, &named("depot", 1), PairKey::new([0xC1; KEY_BYTES])).unwrap();
         keys
@@ -294,9 +312,8 @@ mod tests {
 
     #[test]
     fn a_peer_may_lack_the_older_generation() {
-        let mut keys = Keys::<2>::new(DeviceSecret::new([1; KEY_BYTES]));
-        keys.push_generation(9, DiscoveryKey::new([2; KEY_BYTES])).unwrap();
-        keys.push_generation(8, DiscoveryKey::new([3; KEY_BYTES])).unwrap();
+        let mut keys = Keys::<2>::new(DeviceSecret::new([1; KEY_BYTES]), 9, DiscoveryKey::new([2; KEY_BYTES]));
+        keys.push_beside(8, DiscoveryKey::new([3; KEY_BYTES])).unwrap();
         keys.push_pair(9, &named("new", 1), PairKey::new([4; KEY_BYTES])).unwrap();
         keys.push_pair(8, &named("old", 1), PairKey::new([5; KEY_BYTES])).unwrap();
         let read = Keys::<2>::decode(&bytes(&keys)).unwrap();
@@ -309,12 +326,11 @@ mod tests {
     fn what_does_not_fit_is_told() {
         let mut keys = keys();
         let key = || PairKey::new([0; KEY_BYTES]);
-        assert_eq!(keys.push_generation(0, DiscoveryKey::new([0; KEY_BYTES])), Err(KeysError::Full));
-        assert_eq!(keys.push_generation(1, DiscoveryKey::new([0; KEY_BYTES])), Err(KeysError::Unsound));
+        assert_eq!(keys.push_beside(3, DiscoveryKey::new([0; KEY_BYTES])), Err(KeysError::Unsound));
         assert_eq!(keys.push_pair(3, &named("depot", 1), key()), Err(KeysError::Unsound));
         assert_eq!(keys.push_pair(2, &named("other", 1), key()), Err(KeysError::Full));
-        let mut many = Keys::<99>::new(DeviceSecret::new([0; KEY_BYTES]));
-        many.push_generation(1, DiscoveryKey::new([0; KEY_BYTES])).unwrap();
+        let mut many = Keys::<99>::new(DeviceSecret::new([0; KEY_BYTES]), 1, DiscoveryKey::new([0; KEY_BYTES]));
+        assert_eq!(many.push_beside(1, DiscoveryKey::new([0; KEY_BYTES])), Err(KeysError::Unsound));
         (0..99).for_each(|id| many.push_pair(1, &named("manager", id), key()).unwrap());
         assert_eq!(many.encode(&mut [0; KEYS_BYTES]), Err(KeysError::Full));
     }
@@ -322,10 +338,8 @@ mod tests {
     /// With the longest names a copy holds this many peers.
     #[test]
     fn eight_peers_fit() {
-        let mut keys = Keys::<8>::new(DeviceSecret::new([0; KEY_BYTES]));
-        for number in [2, 1] {
-            keys.push_generation(number, DiscoveryKey::new([0; KEY_BYTES])).unwrap();
-        }
+        let mut keys = Keys::<8>::new(DeviceSecret::new([0; KEY_BYTES]), 2, DiscoveryKey::new([0; KEY_BYTES]));
+        keys.push_beside(1, DiscoveryKey::new([0; KEY_BYTES])).unwrap();
         for (number, id) in [2, 1].into_iter().flat_map(|number| (0..8).map(move |id| (number, id))) {
             keys.push_pair(number, &named(&"n".repeat(32), id), PairKey::new([0; KEY_BYTES])).unwrap();
         }
@@ -335,11 +349,8 @@ mod tests {
     /// Power may be cut, or a bit flip, anywhere in one copy: settings and keys of the other one count, never a mixture.
     #[test]
     fn every_flipped_bit_and_every_cut_leaves_the_other_copy() {
-        let (old, new) = (bytes(&keys()), {
-            let mut keys = Keys::<1>::new(DeviceSecret::new([0xD1; KEY_BYTES]));
-            keys.push_generation(3, DiscoveryKey::new([0xD2; KEY_BYTES])).unwrap();
-            bytes(&keys)
-        });
+        let other = Keys::<1>::new(DeviceSecret::new([0xD1; KEY_BYTES]), 3, DiscoveryKey::new([0xD2; KEY_BYTES]));
+        let (old, new) = (bytes(&keys()), bytes(&other));
         let (first, second) = (page(1, &old, 1), page(2, &new, 2));
         let used = encode_with(&settings(2), &new, 2, &mut [0; BYTES]).unwrap();
         let secret = |first: &[u8], second: &[u8]| {

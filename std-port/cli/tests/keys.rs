@@ -118,10 +118,10 @@ fn who_is_revoked_is_in_nobody_s_file() {
     let changes: Vec<_> =
         told["written"].as_array().unwrap().iter().map(|one| [&one["node"], &one["change"]]).collect();
     assert_eq!(changes, [["agv/1", "removed"], ["depot/1@m_unit", "replaced"], ["agv/2", "replaced"]]);
-    assert_eq!((&told["generations"], told["next"].as_array().unwrap().len()), (&serde_json::json!([2, 1]), 2));
+    assert_eq!((&told["generations"], told["next"].as_array().unwrap().len()), (&serde_json::json!([1, 2]), 2));
     let depot = home.ring("depot/1@m_unit");
     assert!(generations(&depot, "agv/1").is_empty() && !home.file("agv/1").exists());
-    assert_eq!(generations(&depot, "agv/2"), [2, 1]);
+    assert_eq!(generations(&depot, "agv/2"), [1, 2]);
     let files = fs::read_dir(home.folder()).unwrap().map(|file| fs::read_to_string(file.unwrap().path()).unwrap());
     let key: String =
         stolen.pair(&named("depot/1@m_unit")).unwrap().expose().iter().map(|byte| format!("{byte:02x}")).collect();
@@ -146,16 +146,22 @@ fn without_its_manager_a_vehicle_is_told() {
 #[test]
 fn a_change_of_keys_begins_and_is_finished() {
     let home = Home::with_fleet();
-    home.refused(&["rotate", "--finish"], 2, "nothing to finish");
+    let held = || generations(&home.ring("agv/1"), "depot/1@m_unit");
+    home.refused(&["rotate", "--finish"], 2, "`cara keys rotate` begins another");
+    home.refused(&["rotate", "--switch"], 2, "`cara keys rotate` begins another");
     home.done(&["rotate"]);
-    assert_eq!(generations(&home.ring("agv/1"), "depot/1@m_unit"), [2, 1]);
-    home.done(&["rotate"]);
-    home.done(&["rotate"]);
-    home.refused(&["rotate"], 2, "`cara keys rotate --finish`");
+    assert_eq!(held(), [1, 2]);
+    home.refused(&["rotate"], 2, "a change to generation 2 is under way");
+    home.refused(&["rotate", "--finish"], 2, "`cara keys rotate --switch`");
+    home.done(&["rotate", "--switch"]);
+    assert_eq!(held(), [2, 1]);
+    home.refused(&["rotate", "--switch"], 2, "`cara keys rotate --finish`");
+    home.refused(&["rotate", "--switch", "--finish"], 2, "cannot be used with");
     home.done(&["revoke", "agv/2"]);
-    assert_eq!(generations(&home.ring("agv/1"), "depot/1@m_unit"), [5, 4, 3, 2]);
+    assert_eq!(held(), [2, 3]);
+    home.done(&["rotate", "--switch"]);
     home.done(&["rotate", "--finish"]);
-    assert_eq!(generations(&home.ring("agv/1"), "depot/1@m_unit"), [5]);
+    assert_eq!(held(), [3]);
 }
 
 #[test]

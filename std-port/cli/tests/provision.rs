@@ -242,9 +242,9 @@ fn a_file_with_keys_tells_who_the_board_is() {
     assert_eq!(discoveries, ring.discoveries().map(|(number, key)| (number, *key.expose())).collect::<Vec<_>>());
 
     let shown = done(folder.path(), &["--read", "page.bin"]);
-    assert!(shown.contains("keys of generation 2 and 1 with depot/1@m_unit"), "{shown}");
+    assert!(shown.contains("keys of generation 1 and 2 with depot/1@m_unit"), "{shown}");
     let json = done(folder.path(), &["--read", "page.bin", "--json"]);
-    assert!(json.contains(r#""keys":{"generations":[2,1],"peers":["depot/1@m_unit"]}"#), "{json}");
+    assert!(json.contains(r#""keys":{"generations":[1,2],"peers":["depot/1@m_unit"]}"#), "{json}");
     let secrets = [held_keys.secret().expose(), held_keys.pair(&depot()).unwrap().expose()];
     for secret in secrets {
         let digits: String = secret.iter().take(4).map(|byte| format!("{byte:02x}")).collect();

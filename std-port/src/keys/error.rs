@@ -152,14 +152,20 @@ pub enum FleetError {
     /// An m_unit belongs to nobody.
     #[error("{0} is an m_unit, and those belong to nobody: leave --manager away")]
     MUnit(Identity),
-    /// As many generations are valid as a ring holds.
+    /// A change of keys has begun and is not finished.
     #[error(
-        "{0} generations of keys are in use: when all nodes have the newest, `cara keys rotate --finish` ends the others"
+        "a change to generation {0} is under way: `cara keys rotate --switch` and `cara keys rotate --finish` complete it"
     )]
-    Generations(u32),
-    /// Only one generation is in use.
-    #[error("only generation {0} is in use: there is nothing to finish")]
-    NothingToFinish(u32),
+    UnderWay(u32),
+    /// No change of keys has begun.
+    #[error("only generation {0} is there: `cara keys rotate` begins another")]
+    NotBegun(u32),
+    /// The new generation is not used yet.
+    #[error("generation {0} is not used yet: when all nodes have their files, `cara keys rotate --switch`")]
+    NotSwitched(u32),
+    /// The new generation is used already.
+    #[error("generation {0} is used already: when all nodes have their files, `cara keys rotate --finish`")]
+    Switched(u32),
     /// Generations have an end.
     #[error("there are no more generations: make the fleet's keys anew with `cara keys new-fleet`")]
     Exhausted,

@@ -45,19 +45,24 @@ impl FleetKeys {
         self.members.add(identity, managers)
     }
 
-    /// Takes nodes out of all rings, and begins a generation that they have nothing of. Until older generations are
+    /// Takes nodes out of all rings, and [begins](Self::rotate) a generation that they have nothing of. Until the change is
     /// [finished](Self::finish) they can still make discovery messages that others take for the fleet's; nobody opens a
     /// link to them. Where one of them is no node of the fleet, nothing changes.
     pub fn revoke(&mut self, identities: &[Identity]) -> Result<(), FleetError> {
         self.members.revoke(identities)
     }
 
-    /// Begins a generation. Those before it stay in use until they are [finished](Self::finish).
+    /// Begins a generation. Nodes go on speaking with the one in use, and take the new one as well.
     pub fn rotate(&mut self) -> Result<(), FleetError> {
         self.members.rotate()
     }
 
-    /// Ends all generations but the newest. A node that has not been given that one is locked out.
+    /// Uses the generation that has begun: when all nodes take it. They take the one before as well.
+    pub fn switch(&mut self) -> Result<(), FleetError> {
+        self.members.switch()
+    }
+
+    /// Ends the generation before: when all nodes use the new one. A node that does not is locked out.
     pub fn finish(&mut self) -> Result<(), FleetError> {
         self.members.finish()
     }
@@ -65,15 +70,14 @@ impl FleetKeys {
     /// The ring of a node.
     pub fn ring(&self, identity: &Identity) -> Result<KeyRing, FleetError> {
         let node = self.members.node(identity)?;
-        let older = self.members.generations().skip(1).filter(|number| *number >= node.since);
-        let older = older.map(|number| self.generation(node, number)).collect();
-        let newest = self.generation(node, self.members.generation());
-        Ok(KeyRing::new(self.members.fleet(), identity.clone(), newest, older))
+        let used = self.generation(node, self.members.generation());
+        let beside = self.members.beside().map(|number| self.generation(node, number));
+        Ok(KeyRing::new(self.members.fleet(), identity.clone(), used, beside))
     }
 
     fn generation(&self, node: &Member, number: u32) -> Generation {
         let fleet = self.members.fleet();
-        let peers = || self.members.peers(node).filter(|peer| peer.since <= number);
+        let peers = || self.members.peers(node).filter(|peer| peer.since.max(node.since) <= number);
         let mut pairs = Vec::with_capacity(peers().count());
         pairs.extend(peers().map(|Member { identity, .. }| {
             (identity.clone(), self.root.pair(fleet, number, &node.identity, identity))
@@ -118,31 +122,40 @@ mod tests {
         assert_ne!(fleet().fingerprint(), keys.fingerprint(), "roots are drawn");
     }
 
-    /// At every moment of a change each two nodes have a generation in common, whoever of them has been given its ring.
+    /// Whether a node that speaks with the first of its keys is understood by another one, and so the other way round.
+    fn understand(one: &KeyRing, other: &KeyRing) -> bool {
+        let hears = |listener: &KeyRing, speaker: &KeyRing| {
+            let said = speaker.pair(listener.identity()).map(|key| *key.expose());
+            let pairs: Vec<_> = listener.pairs(speaker.identity()).map(|(_, key)| *key.expose()).collect();
+            let discovery = listener.discoveries().any(|(_, key)| key.expose() == speaker.discovery().expose());
+            said.is_some_and(|said| pairs.contains(&said)) && discovery
+        };
+        hears(one, other) && hears(other, one)
+    }
+
+    /// A file of one step and one of the next are good for each other, whoever of the nodes has been given its own.
     #[test]
-    fn a_change_of_keys_locks_nobody_out_before_it_is_finished() {
+    fn a_change_of_keys_locks_nobody_out_in_whatever_order_files_come() {
         let mut keys = fleet();
         let rings = |keys: &FleetKeys| [depot(), agv(1)].map(|node| keys.ring(&node).unwrap());
-        let mut states = vec![rings(&keys)];
+        let mut steps = vec![rings(&keys)];
         keys.rotate().unwrap();
-        states.push(rings(&keys));
-        assert_eq!(states[1][0].generations().collect::<Vec<_>>(), [2, 1]);
-        for (manager, vehicle) in [(0, 1), (1, 0), (1, 1)] {
-            let (manager, vehicle) = (&states[manager][0], &states[vehicle][1]);
-            let common: Vec<_> =
-                manager.pairs(&agv(1)).filter(|(number, _)| vehicle.pair_in(*number, &depot()).is_some()).collect();
-            assert!(!common.is_empty());
-            for (number, key) in common {
-                assert_eq!(key.expose(), vehicle.pair_in(number, &depot()).unwrap().expose());
-                assert_eq!(
-                    manager.discovery_in(number).unwrap().expose(),
-                    vehicle.discovery_in(number).unwrap().expose()
-                );
+        steps.push(rings(&keys));
+        keys.switch().unwrap();
+        steps.push(rings(&keys));
+        keys.finish().unwrap();
+        steps.push(rings(&keys));
+        keys.revoke(&[agv(2)]).unwrap();
+        steps.push(rings(&keys));
+        for pair in steps.windows(2) {
+            let [before, after] = pair else { unreachable!("pairs") };
+            for (manager, vehicle) in [(before, before), (before, after), (after, before), (after, after)] {
+                assert!(understand(&manager[0], &vehicle[1]));
             }
         }
-        keys.finish().unwrap();
-        let [manager, _] = rings(&keys);
-        assert_eq!((generations(&manager, &agv(1)), manager.discovery_in(1).is_none()), (vec![2], true));
+        assert!(!understand(&steps[0][0], &steps[3][1]), "two steps at once lock out");
+        let used: Vec<_> = steps.iter().map(|[manager, _]| generations(manager, &agv(1))).collect();
+        assert_eq!(used, [vec![1], vec![1, 2], vec![2, 1], vec![2], vec![2, 3]]);
     }
 
     #[test]
@@ -153,14 +166,17 @@ mod tests {
         assert_eq!(keys.ring(&agv(1)).map(drop), Err(FleetError::Unknown(agv(1))));
         let manager = keys.ring(&depot()).unwrap();
         assert!(manager.pair(&agv(1)).is_none());
-        assert_eq!(generations(&manager, &agv(2)), [2, 1]);
-        assert_ne!(manager.discovery().expose(), stolen.discovery().expose());
-        // Its successor has nothing that it had.
+        assert_eq!(generations(&manager, &agv(2)), [1, 2]);
+        // Its successor has no key with anybody that it had, and speaks with all.
         keys.add(&agv(1), &[]).unwrap();
         let (manager, successor) = (keys.ring(&depot()).unwrap(), keys.ring(&agv(1)).unwrap());
         assert_eq!((generations(&manager, &agv(1)), generations(&successor, &depot())), (vec![2], vec![2]));
-        assert_eq!(successor.generations().collect::<Vec<_>>(), [2]);
         assert_ne!(successor.pair(&depot()).unwrap().expose(), stolen.pair(&depot()).unwrap().expose());
+        assert!(understand(&manager, &successor) && !understand(&manager, &stolen));
+        keys.switch().unwrap();
+        keys.finish().unwrap();
+        let manager = keys.ring(&depot()).unwrap();
+        assert!(manager.discoveries().all(|(_, key)| key.expose() != stolen.discovery().expose()));
     }
 
     #[test]

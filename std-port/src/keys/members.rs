@@ -10,8 +10,8 @@
 //! revoked 2 s_unit 18 agv-18
 //! ```
 //!
-//! `node` tells the first generation in which it has keys, `manager` whom the node above belongs to, and `revoked` the
-//! first generation without the node.
+//! `generations` tells the one in use, and behind it the one beside it if keys are being changed. `node` tells the first
+//! generation in which it has keys, `manager` whom the node above belongs to, and `revoked` the first one without the node.
 
 use std::fmt::Write;
 
@@ -20,8 +20,6 @@ use cara_core::distribution::identity::{Fleet, Identity, Role};
 use super::FleetError;
 use super::text::{FormError, Line, Lines, push_identity};
 
-/// Most generations of keys that are in use at a time.
-pub const GENERATIONS: u32 = 4;
 /// Which form this is.
 const FORM: u32 = 1;
 
@@ -49,8 +47,10 @@ pub struct Revoked {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Members {
     fleet: Fleet,
-    oldest: u32,
-    newest: u32,
+    /// The generation with which nodes speak.
+    used: u32,
+    /// The one that they take as well: the next one while a change of keys has begun, then the one before.
+    beside: Option<u32>,
     nodes: Vec<Member>,
     revoked: Vec<Revoked>,
 }
@@ -58,7 +58,7 @@ pub struct Members {
 impl Members {
     /// A fleet without nodes, in its first generation.
     pub(super) fn new(fleet: Fleet) -> Self {
-        Self { fleet, oldest: 1, newest: 1, nodes: Vec::new(), revoked: Vec::new() }
+        Self { fleet, used: 1, beside: None, nodes: Vec::new(), revoked: Vec::new() }
     }
 
     /// The fleet.
@@ -66,14 +66,28 @@ impl Members {
         self.fleet
     }
 
-    /// The newest generation.
+    /// The generation with which nodes speak.
     pub fn generation(&self) -> u32 {
-        self.newest
+        self.used
     }
 
-    /// All generations in use, the newest first.
-    pub fn generations(&self) -> impl Iterator<Item = u32> {
-        (self.oldest..=self.newest).rev()
+    /// The generation that nodes take beside the one in use: a newer one while a change of keys has begun, the older one
+    /// between the switch and its end.
+    pub fn beside(&self) -> Option<u32> {
+        self.beside
+    }
+
+    /// Both, the one in use first.
+    pub fn generations(&self) -> impl Iterator<Item = u32> + use<> {
+        std::iter::once(self.used).chain(self.beside)
+    }
+
+    fn newest(&self) -> u32 {
+        self.beside.map_or(self.used, |beside| beside.max(self.used))
+    }
+
+    fn oldest(&self) -> u32 {
+        self.beside.map_or(self.used, |beside| beside.min(self.used))
     }
 
     /// Those that have keys.
@@ -106,10 +120,13 @@ impl Members {
             // One that lost its last manager belongs to the only one that is left, if there is one.
             return self.settle(identity);
         }
-        self.revoked.retain(|revoked| revoked.identity != *identity);
+        let before = self.revoked.iter().find(|revoked| revoked.identity == *identity);
+        let since = before.map_or(self.oldest(), |revoked| revoked.from);
         let at = self.nodes.partition_point(|node| node.identity < *identity);
-        self.nodes.insert(at, Member { identity: identity.clone(), since: self.newest, managers: named });
-        self.settle(identity).inspect_err(|_| drop(self.nodes.remove(at)))
+        self.nodes.insert(at, Member { identity: identity.clone(), since, managers: named });
+        self.settle(identity).inspect_err(|_| drop(self.nodes.remove(at)))?;
+        self.revoked.retain(|revoked| revoked.identity != *identity);
+        Ok(())
     }
 
     /// Without repetitions, each of them an m_unit of the fleet.
@@ -149,47 +166,62 @@ impl Members {
         self.nodes.iter().map(|node| &node.identity).filter(|identity| identity.role() == Role::MUnit)
     }
 
-    /// Takes nodes out, and begins a generation that they have nothing of. Of more generations than may be in use the
-    /// oldest ends: a node must never stay in because others are slow.
+    /// Takes nodes out, and begins a generation that they have nothing of. It stands beside the one in use in the place of
+    /// any other: a node must never stay in because a change of keys is under way.
     pub(super) fn revoke(&mut self, identities: &[Identity]) -> Result<(), FleetError> {
         identities.iter().try_for_each(|identity| self.node(identity).map(drop))?;
-        let newest = self.newest.checked_add(1).ok_or(FleetError::Exhausted)?;
+        let newest = self.newest().checked_add(1).ok_or(FleetError::Exhausted)?;
         self.nodes.retain(|node| !identities.contains(&node.identity));
         self.nodes.iter_mut().for_each(|node| node.managers.retain(|manager| !identities.contains(manager)));
         let mut revoked = identities.to_vec();
         revoked.sort();
         revoked.dedup();
         self.revoked.extend(revoked.into_iter().map(|identity| Revoked { identity, from: newest }));
-        self.newest = newest;
-        self.oldest = self.oldest.max(newest.saturating_sub(GENERATIONS - 1));
+        self.beside = Some(newest);
         Ok(())
     }
 
-    /// Begins a generation.
+    /// Begins a generation beside the one in use.
     pub(super) fn rotate(&mut self) -> Result<(), FleetError> {
-        let in_use = self.newest - self.oldest + 1;
-        if in_use >= GENERATIONS {
-            return Err(FleetError::Generations(in_use));
+        if self.beside.is_some() {
+            return Err(FleetError::UnderWay(self.newest()));
         }
-        self.newest = self.newest.checked_add(1).ok_or(FleetError::Exhausted)?;
+        self.beside = Some(self.used.checked_add(1).ok_or(FleetError::Exhausted)?);
         Ok(())
     }
 
-    /// Ends all generations but the newest.
-    pub(super) fn finish(&mut self) -> Result<(), FleetError> {
-        if self.oldest == self.newest {
-            return Err(FleetError::NothingToFinish(self.newest));
+    /// Uses the generation that has begun, and keeps the one before beside it.
+    pub(super) fn switch(&mut self) -> Result<(), FleetError> {
+        match self.beside {
+            None => Err(FleetError::NotBegun(self.used)),
+            Some(beside) if beside < self.used => Err(FleetError::Switched(self.used)),
+            Some(beside) => {
+                self.beside = Some(std::mem::replace(&mut self.used, beside));
+                Ok(())
+            }
         }
-        self.oldest = self.newest;
-        Ok(())
+    }
+
+    /// Ends the generation before the one in use.
+    pub(super) fn finish(&mut self) -> Result<(), FleetError> {
+        match self.beside {
+            None => Err(FleetError::NotBegun(self.used)),
+            Some(beside) if beside > self.used => Err(FleetError::NotSwitched(beside)),
+            Some(_) => {
+                self.beside = None;
+                Ok(())
+            }
+        }
     }
 
     /// The text of its file.
     pub(super) fn text(&self) -> String {
-        let (fleet, oldest, newest) = (self.fleet.0, self.oldest, self.newest);
+        let fleet = self.fleet.0;
+        let generations: Vec<_> = self.generations().map(|number| number.to_string()).collect();
         let mut text = format!(
             "# The nodes of fleet {fleet}, as `cara keys` keeps them beside the root.\n\
-             cara-fleet {FORM}\nfleet {fleet}\ngenerations {oldest} {newest}\n"
+             cara-fleet {FORM}\nfleet {fleet}\ngenerations {}\n",
+            generations.join(" ")
         );
         for node in &self.nodes {
             push(&mut text, format_args!("node {} ", node.since), &node.identity);
@@ -207,14 +239,12 @@ impl Members {
         }
         let fleet = Fleet(lines.expect("fleet", "here `fleet` is expected")?.number()?);
         let line = lines.expect("generations", "here `generations` is expected")?;
-        let (oldest, behind) = line.numbered()?;
-        let newest = behind.number()?;
-        if oldest == 0 || newest < oldest || newest - oldest >= GENERATIONS {
-            return Err(
-                line.wrong("here the oldest and the newest generation in use are expected, at most four in all")
-            );
+        let (used, behind) = line.numbered()?;
+        let beside = if behind.is_empty() { None } else { Some(behind.number()?) };
+        if used == 0 || beside.is_some_and(|beside| beside == 0 || beside == used) {
+            return Err(line.wrong("here the generation in use is expected, and perhaps another one beside it"));
         }
-        let mut members = Self { fleet, oldest, newest, nodes: Vec::new(), revoked: Vec::new() };
+        let mut members = Self { fleet, used, beside, nodes: Vec::new(), revoked: Vec::new() };
         lines.try_for_each(|line| members.read(line))?;
         members.nodes.sort_by(|one, other| one.identity.cmp(&other.identity));
         Ok(members)
@@ -315,15 +345,18 @@ mod tests {
     }
 
     #[test]
-    fn who_is_revoked_is_in_no_generation_and_comes_back_in_the_newest() {
+    fn who_is_revoked_comes_back_with_keys_that_it_never_had() {
         let mut members = fleet();
         members.revoke(&[agv(1)]).unwrap();
-        assert_eq!(members.generations().collect::<Vec<_>>(), [2, 1]);
+        assert_eq!(members.generations().collect::<Vec<_>>(), [1, 2]);
         assert_eq!(members.revoked(), [Revoked { identity: agv(1), from: 2 }]);
         assert_eq!(members.revoke(&[agv(2), agv(1)]), Err(FleetError::Unknown(agv(1))));
         assert!(members.node(&agv(2)).is_ok(), "all of them or none");
+        assert!(members.add(&agv(1), &[]).is_err(), "there are two m_units");
         members.add(&agv(1), &[m_unit("depot")]).unwrap();
         assert_eq!((members.node(&agv(1)).unwrap().since, members.revoked().len()), (2, 0));
+        members.add(&agv(3), &[m_unit("depot")]).unwrap();
+        assert_eq!(members.node(&agv(3)).unwrap().since, 1, "a new node speaks as all do");
     }
 
     #[test]
@@ -336,29 +369,42 @@ mod tests {
     }
 
     #[test]
-    fn generations_are_bounded_and_revoking_is_never_held_up() {
+    fn a_change_of_keys_has_three_steps_and_revoking_is_never_held_up() {
         let mut members = fleet();
-        assert_eq!(members.finish(), Err(FleetError::NothingToFinish(1)));
-        (1..GENERATIONS).for_each(|_| members.rotate().unwrap());
-        assert_eq!(members.rotate(), Err(FleetError::Generations(GENERATIONS)));
-        members.revoke(&[agv(1)]).unwrap();
-        assert_eq!(members.generations().collect::<Vec<_>>(), [5, 4, 3, 2]);
-        members.finish().unwrap();
-        assert_eq!(members.generations().collect::<Vec<_>>(), [5]);
-        members.newest = u32::MAX;
-        members.oldest = u32::MAX;
+        let generations = |members: &Members| members.generations().collect::<Vec<_>>();
+        assert_eq!((members.switch(), members.finish()), (Err(FleetError::NotBegun(1)), Err(FleetError::NotBegun(1))));
+        members.rotate().unwrap();
+        assert_eq!(generations(&members), [1, 2]);
         assert_eq!(
-            (members.rotate(), members.revoke(&[agv(2)])),
+            (members.rotate(), members.finish()),
+            (Err(FleetError::UnderWay(2)), Err(FleetError::NotSwitched(2)))
+        );
+        members.revoke(&[agv(1)]).unwrap();
+        assert_eq!(generations(&members), [1, 3], "nobody speaks with 2 yet");
+        members.switch().unwrap();
+        assert_eq!(generations(&members), [3, 1]);
+        assert_eq!((members.rotate(), members.switch()), (Err(FleetError::UnderWay(3)), Err(FleetError::Switched(3))));
+        members.revoke(&[agv(2)]).unwrap();
+        assert_eq!(generations(&members), [3, 4]);
+        members.switch().unwrap();
+        members.finish().unwrap();
+        assert_eq!(generations(&members), [4]);
+        members.used = u32::MAX;
+        let depot = [m_unit("depot")];
+        assert_eq!(
+            (members.rotate(), members.revoke(&depot)),
             (Err(FleetError::Exhausted), Err(FleetError::Exhausted))
         );
-        assert!(members.node(&agv(2)).is_ok());
+        assert!(members.node(&depot[0]).is_ok());
     }
 
     #[test]
     fn what_is_written_is_read() {
         let mut members = fleet();
         members.add(&Identity::s_unit("a b/c #1", 9).unwrap(), &[m_unit("hall")]).unwrap();
+        assert_eq!(Members::parse(&members.text()), Ok(members.clone()));
         members.rotate().unwrap();
+        members.switch().unwrap();
         members.revoke(&[agv(1)]).unwrap();
         assert_eq!(Members::parse(&members.text()), Ok(members));
     }
@@ -374,11 +420,11 @@ mod tests {
                 assert_eq!(parse(&text.replace(line, wrong)), Err(index + 1), "{line}");
             }
         }
-        for generations in ["0 1", "2 1", "1 5", "1"] {
+        for generations in ["0 1", "1 1", "1 0", "1 2 3", "x"] {
             assert_eq!(parse(&text.replace("generations 1 2", &format!("generations {generations}"))), Err(4));
         }
         assert_eq!(parse(""), Err(1));
-        assert_eq!(parse("cara-fleet 1\nfleet 7\ngenerations 1 1\nmanager m_unit 1 depot\n"), Err(4));
+        assert_eq!(parse("cara-fleet 1\nfleet 7\ngenerations 1\nmanager m_unit 1 depot\n"), Err(4));
         assert_eq!(parse(&format!("{text}node 1 m_unit 1 depot\n")), Err(text.lines().count() + 1));
     }
 }

@@ -38,7 +38,7 @@ pub use error::{FleetError, KeyError, Owner};
 pub(crate) use file::Mark;
 pub use fleet::FleetKeys;
 pub use live::LiveRing;
-pub use members::{GENERATIONS, Member, Members, Revoked};
+pub use members::{Member, Members, Revoked};
 pub use named::{full_name, parse_node};
 pub use ring::KeyRing;
 pub use store::{Change, Store, Written};

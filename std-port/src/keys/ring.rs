@@ -5,19 +5,21 @@
 //! cara-ring 1
 //! fleet 7
 //! node s_unit 17 agv-17
-//! generation 2
+//! generation 1
 //! discovery 64 hexadecimal digits
 //! pair 64 hexadecimal digits m_unit 1 depot
-//! generation 1
+//! generation 2
 //! …
 //! ```
 //!
-//! Generations stand from the newest to the oldest, pairs in the order of their identities.
+//! The generation in use stands first, and behind it the one beside it, if keys are being changed; pairs in the order of
+//! their identities.
 
 use std::fmt::Write;
 use std::path::Path;
 
 use cara_core::distribution::identity::{Fleet, Identity};
+use cara_secure::keyring::Keyring;
 use cara_secure::keys::{DiscoveryKey, PairKey};
 use zeroize::Zeroizing;
 
@@ -29,14 +31,14 @@ const LINE_BYTES: usize = 160;
 /// Which form this is.
 const FORM: u32 = 1;
 
-/// The keys of one node: of the newest generation, and of those before it that are still in use.
+/// The keys of one node: of the generation in use, with which it speaks, and while the fleet changes its keys of the one
+/// beside it, which it takes as well.
 #[derive(Debug)]
 pub struct KeyRing {
     fleet: Fleet,
     identity: Identity,
-    newest: Generation,
-    /// Those before it that are still in use, the newest first.
-    older: Vec<Generation>,
+    used: Generation,
+    beside: Option<Generation>,
 }
 
 /// What a node has of one generation.
@@ -56,12 +58,12 @@ impl Generation {
 }
 
 impl KeyRing {
-    pub(super) fn new(fleet: Fleet, identity: Identity, newest: Generation, older: Vec<Generation>) -> Self {
-        Self { fleet, identity, newest, older }
+    pub(super) fn new(fleet: Fleet, identity: Identity, used: Generation, beside: Option<Generation>) -> Self {
+        Self { fleet, identity, used, beside }
     }
 
     fn all(&self) -> impl Iterator<Item = &Generation> {
-        std::iter::once(&self.newest).chain(&self.older)
+        std::iter::once(&self.used).chain(&self.beside)
     }
 
     /// Reads a ring from a file that only its owner can read.
@@ -98,17 +100,17 @@ impl KeyRing {
         self.fleet
     }
 
-    /// The newest generation.
+    /// The generation in use.
     pub fn generation(&self) -> u32 {
-        self.newest.number
+        self.used.number
     }
 
-    /// All generations in use, the newest first.
+    /// All generations, the one in use first.
     pub fn generations(&self) -> impl Iterator<Item = u32> {
         self.all().map(|generation| generation.number)
     }
 
-    /// The newest key with a peer; `None` for a node that this one may not talk to.
+    /// The key in use with a peer; `None` for a node that this one may not talk to.
     pub fn pair(&self, peer: &Identity) -> Option<&PairKey> {
         self.pairs(peer).next().map(|(_, key)| key)
     }
@@ -118,15 +120,14 @@ impl KeyRing {
         self.pairs(peer).find(|(number, _)| *number == generation).map(|(_, key)| key)
     }
 
-    /// All keys with a peer and their generations, the newest first. While a fleet changes its keys, one end may have a
-    /// generation that the other has not been given yet: both have the one before.
+    /// All keys with a peer and their generations: what is said is said with the first, what is heard may be of any.
     pub fn pairs(&self, peer: &Identity) -> impl Iterator<Item = (u32, &PairKey)> {
         self.all().filter_map(|generation| Some((generation.number, generation.pair(peer)?)))
     }
 
-    /// The newest key for discovery.
+    /// The key in use for discovery.
     pub fn discovery(&self) -> &DiscoveryKey {
-        &self.newest.discovery
+        &self.used.discovery
     }
 
     /// The key for discovery of one generation.
@@ -134,7 +135,7 @@ impl KeyRing {
         self.discoveries().find(|(number, _)| *number == generation).map(|(_, key)| key)
     }
 
-    /// All keys for discovery and their generations, the newest first.
+    /// All keys for discovery and their generations, the one in use first.
     pub fn discoveries(&self) -> impl Iterator<Item = (u32, &DiscoveryKey)> {
         self.all().map(|generation| (generation.number, &generation.discovery))
     }
@@ -187,18 +188,24 @@ impl KeyRing {
         let fleet = Fleet(lines.expect("fleet", "here `fleet` is expected")?.number()?);
         let identity = lines.expect("node", "here `node` is expected")?.identity()?;
         let first = lines.expect("generation", "here `generation` is expected")?;
-        let (newest, mut next) = read_generation(&mut lines, first)?;
-        let left = lines.clone().filter(|line| line.word == "generation").count();
-        let mut older: Vec<Generation> = Vec::with_capacity(left + usize::from(next.is_some()));
-        while let Some(line) = next {
-            if older.last().unwrap_or(&newest).number <= line.number()? {
-                return Err(line.wrong("generations stand from the newest to the oldest"));
-            }
-            let (generation, behind) = read_generation(&mut lines, line)?;
-            older.push(generation);
-            next = behind;
+        let (used, next) = read_generation(&mut lines, first)?;
+        let Some(second) = next else { return Ok(Self { fleet, identity, used, beside: None }) };
+        let (beside, third) = read_generation(&mut lines, second)?;
+        if beside.number == used.number || third.is_some() {
+            return Err(third.unwrap_or(second).wrong("here are more than two generations, or one twice"));
         }
-        Ok(Self { fleet, identity, newest, older })
+        Ok(Self { fleet, identity, used, beside: Some(beside) })
+    }
+}
+
+impl Keyring for KeyRing {
+    fn discovery(&self) -> (&DiscoveryKey, Option<&DiscoveryKey>) {
+        (&self.used.discovery, self.beside.as_ref().map(|beside| &beside.discovery))
+    }
+
+    fn pair(&self, peer: &Identity) -> Option<(PairKey, Option<PairKey>)> {
+        let mut keys = self.pairs(peer).map(|(_, key)| key.clone());
+        keys.next().map(|key| (key, keys.next()))
     }
 }
 
@@ -250,12 +257,12 @@ mod tests {
     }
 
     fn ring() -> KeyRing {
-        let (newest, before) = (generation(2, &[agv(1), agv(2)]), generation(1, &[agv(1), agv(3)]));
-        KeyRing::new(Fleet(7), Identity::m_unit("depot", 1).unwrap(), newest, vec![before])
+        let (used, beside) = (generation(2, &[agv(1), agv(2)]), generation(1, &[agv(1), agv(3)]));
+        KeyRing::new(Fleet(7), Identity::m_unit("depot", 1).unwrap(), used, Some(beside))
     }
 
     #[test]
-    fn the_newest_key_comes_first_and_the_others_are_there() {
+    fn the_key_in_use_comes_first_and_the_other_is_there() {
         let ring = ring();
         let newest = |id| ring.pairs(&agv(id)).map(|(number, _)| number).collect::<Vec<_>>();
         assert_eq!([newest(1), newest(2), newest(3), newest(4)], [vec![2, 1], vec![2], vec![1], vec![]]);
@@ -293,7 +300,10 @@ mod tests {
             parse(lines)
         };
         assert_eq!(swapped(6, 7), Err(8), "two pairs");
-        assert_eq!(swapped(4, 8), Err(9), "two generations");
+        let (again, third) =
+            (text.replace("generation 1", "generation 2"), text.replacen("generation 2", "generation 3", 1));
+        assert_eq!(parse(again.lines().collect()), Err(9), "one generation twice");
+        assert_eq!(parse(third.lines().chain(lines[4..8].iter().copied()).collect()), Err(13), "three generations");
     }
 
     #[test]
@@ -313,8 +323,8 @@ mod tests {
     fn no_debug_or_error_shows_a_key() {
         let key = |byte: u8| [byte; 32];
         let pairs = vec![(agv(2), PairKey::new(key(0xB9)))];
-        let newest = Generation { number: 1, discovery: DiscoveryKey::new(key(0xC7)), pairs };
-        let ring = KeyRing::new(Fleet(7), agv(1), newest, vec![]);
+        let used = Generation { number: 1, discovery: DiscoveryKey::new(key(0xC7)), pairs };
+        let ring = KeyRing::new(Fleet(7), agv(1), used, None);
         let text = ring.text();
         let mut shown = vec![format!("{ring:?} {ring:#?}")];
         for (index, line) in text.lines().enumerate() {
@@ -355,10 +365,10 @@ mod tests {
     proptest! {
         #[test]
         fn what_is_written_is_read(
-            fleet: u32, own in identity(), newest in 3_u32.., peers in prop::collection::vec(prop::collection::vec(identity(), 0..6), 1..4),
+            fleet: u32, own in identity(), newest in 3_u32.., peers in prop::collection::vec(prop::collection::vec(identity(), 0..6), 1..3),
         ) {
             let mut generations = (0..).zip(&peers).map(|(before, peers)| generation(newest - before, peers));
-            let ring = KeyRing::new(Fleet(fleet), own, generations.next().unwrap(), generations.collect());
+            let ring = KeyRing::new(Fleet(fleet), own, generations.next().unwrap(), generations.next());
             let text = ring.text();
             let read = KeyRing::parse(&text).unwrap();
             prop_assert_eq!(&*read.text(), &*text);

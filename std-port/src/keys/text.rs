@@ -61,6 +61,11 @@ impl<'t> Line<'t> {
         FormError { line: self.number, what }
     }
 
+    /// Whether nothing is left of it.
+    pub(super) fn is_empty(&self) -> bool {
+        self.rest.is_empty()
+    }
+
     /// The whole value as a number.
     pub(super) fn number(&self) -> Result<u32, FormError> {
         self.rest.parse().map_err(|_| self.wrong("here a number of 32 bits is expected"))

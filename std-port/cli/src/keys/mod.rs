@@ -53,10 +53,13 @@ enum Action {
         #[arg(required = true, value_name = "NODE", value_parser = parse_node)]
         nodes: Vec<Identity>,
     },
-    /// Begins a generation of keys for all nodes, beside those in use.
+    /// Changes all keys, in three steps: begins a generation that all nodes take beside the one in use.
     Rotate {
-        /// End all generations but the newest instead: when all nodes have their new files.
+        /// The second step, when all nodes have their files: the new generation is used, and the older one still taken.
         #[arg(long)]
+        switch: bool,
+        /// The last step, when all nodes have their files: the older generation ends.
+        #[arg(long, conflicts_with = "switch")]
         finish: bool,
     },
 }
@@ -82,11 +85,14 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
         Action::Revoke { nodes } => {
             change(folder()?, global, told::Done::Revoked, |keys| keys.revoke(nodes).map_err(wrong))?;
         }
-        Action::Rotate { finish: false } => {
-            change(folder()?, global, told::Done::Rotated, |keys| keys.rotate().map_err(wrong))?;
+        Action::Rotate { switch: true, .. } => {
+            change(folder()?, global, told::Done::Switched, |keys| keys.switch().map_err(wrong))?;
         }
-        Action::Rotate { finish: true } => {
+        Action::Rotate { finish: true, .. } => {
             change(folder()?, global, told::Done::Finished, |keys| keys.finish().map_err(wrong))?;
+        }
+        Action::Rotate { .. } => {
+            change(folder()?, global, told::Done::Rotated, |keys| keys.rotate().map_err(wrong))?;
         }
     }
     Ok(Exit::Done.into())

@@ -6,6 +6,7 @@ use cara_std::keys::{KeyRing, Member, Store, full_name, shown};
 use serde_json::json;
 
 use super::failed;
+use super::told::generations;
 use crate::exit::Ended;
 use crate::global::Global;
 use crate::output::{self, FAINT, PLAIN, Rows};
@@ -17,9 +18,8 @@ pub(super) fn fleet(store: &Store, global: &Global) -> anyhow::Result<()> {
     }
     let keys = store.keys();
     let members = keys.members();
-    let generations: Vec<_> = members.generations().map(|number| number.to_string()).collect();
-    let (fleet, generations, root) = (members.fleet().0, generations.join(" and "), shown(keys.fingerprint()));
-    output::line(format_args!("fleet {fleet}, generation {generations}, root {root}"))?;
+    let (fleet, generations, root) = (members.fleet().0, generations(members), shown(keys.fingerprint()));
+    output::line(format_args!("fleet {fleet}, {generations}, root {root}"))?;
     let mut rows = Rows::new(["node", "since", "belongs to", "talks to", "file"]);
     for node in members.nodes() {
         let path = store.file_of(&node.identity);
@@ -71,7 +71,7 @@ pub(super) fn ring(file: &Path, global: &Global) -> anyhow::Result<()> {
         return Ok(output::object(&ring_object(&ring))?);
     }
     let (node, fleet) = (full_name(ring.identity()), ring.fleet().0);
-    output::line(format_args!("{node} in fleet {fleet}, generation {}", ring.generation()))?;
+    output::line(format_args!("{node} in fleet {fleet}, generation {} is in use", ring.generation()))?;
     let mut rows = Rows::new(["generation", "with", "fingerprint"]);
     for (number, key) in ring.discoveries() {
         rows.add(PLAIN, [number.to_string(), "discovery".into(), shown(key.fingerprint())]);

@@ -18,7 +18,9 @@ pub(super) enum Done {
     Revoked,
     /// A generation has begun.
     Rotated,
-    /// All generations but the newest have ended.
+    /// The generation that had begun is used.
+    Switched,
+    /// The generation before has ended.
     Finished,
 }
 
@@ -45,7 +47,7 @@ pub(super) fn tell(done: Done, store: &Store, written: &[Written], global: &Glob
 
 fn headline(done: Done, store: &Store) -> String {
     let members = store.keys().members();
-    let (fleet, newest) = (members.fleet().0, members.generation());
+    let (fleet, generations) = (members.fleet().0, generations(members));
     match done {
         Done::Made => format!(
             "fleet {fleet} has its root: {} ({}). Whoever reads it can speak as every node: keep a copy where nobody else \
@@ -53,24 +55,19 @@ fn headline(done: Done, store: &Store) -> String {
             store.root_file().display(),
             shown(store.keys().fingerprint())
         ),
-        Done::Derived => format!("fleet {fleet}, generation {newest}"),
         Done::Revoked => {
-            let revoked = members.revoked().iter().filter(|revoked| revoked.from == newest);
+            let revoked = members.revoked().iter().filter(|revoked| Some(revoked.from) == members.beside());
             let names: Vec<_> = revoked.map(|revoked| full_name(&revoked.identity)).collect();
-            format!("fleet {fleet}, generation {newest}: without {}", names.join(", "))
+            format!("fleet {fleet}, {generations}: without {}", names.join(", "))
         }
-        Done::Rotated => format!("fleet {fleet}, generation {newest} has begun: {}", in_use(members)),
-        Done::Finished => format!("fleet {fleet}: only generation {newest} is in use"),
+        Done::Derived | Done::Rotated | Done::Switched | Done::Finished => format!("fleet {fleet}, {generations}"),
     }
 }
 
-fn in_use(members: &Members) -> String {
-    let older: Vec<_> = members.generations().skip(1).map(|number| number.to_string()).collect();
-    match older.as_slice() {
-        [] => "no other is in use".into(),
-        [one] => format!("{one} stays in use"),
-        several => format!("{} stay in use", several.join(" and ")),
-    }
+/// The generation in use, and the one beside it.
+pub(super) fn generations(members: &Members) -> String {
+    let beside = members.beside().map(|beside| format!(", and {beside} is taken too"));
+    format!("generation {} is in use{}", members.generation(), beside.unwrap_or_default())
 }
 
 fn next(done: Done, store: &Store, written: &[Written]) -> Vec<String> {
@@ -93,14 +90,12 @@ fn next(done: Done, store: &Store, written: &[Written]) -> Vec<String> {
                 .into(),
         );
     }
-    match done {
-        Done::Revoked | Done::Rotated => {
-            let finish = format!("`cara keys rotate --fleet {fleet} --finish`");
-            next.push(format!("when all nodes have theirs: {finish}; until then {}", in_use(members)));
-        }
-        Done::Finished => next.push("a node takes older keys until it has its file".into()),
-        Done::Made | Done::Derived => {}
-    }
+    let step = match done {
+        Done::Revoked | Done::Rotated => Some("--switch"),
+        Done::Switched => Some("--finish"),
+        Done::Made | Done::Derived | Done::Finished => None,
+    };
+    next.extend(step.map(|step| format!("when all nodes have theirs: `cara keys rotate --fleet {fleet} {step}`")));
     next
 }
 

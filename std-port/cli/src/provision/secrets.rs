@@ -4,7 +4,7 @@ use std::path::Path;
 
 use cara_core::distribution::identity::Identity;
 use cara_settings::Settings;
-use cara_settings::keys::{GENERATIONS, KEYS_BYTES, Keys, KeysError};
+use cara_settings::keys::{KEYS_BYTES, Keys, KeysError};
 use cara_std::keys::{DeviceSecret, KeyRing, draw, full_name};
 use zeroize::Zeroizing;
 
@@ -21,7 +21,8 @@ pub(super) struct Secrets(Zeroizing<Vec<u8>>);
 impl Secrets {
     /// The keys of the unit that settings tell, with a secret that is drawn now.
     pub(super) fn draw(ring: &KeyRing, settings: &Settings) -> anyhow::Result<Self> {
-        let mut keys = Keys::<PEERS>::new(DeviceSecret::new(*draw().map_err(failed)?));
+        let secret = DeviceSecret::new(*draw().map_err(failed)?);
+        let mut keys = Keys::<PEERS>::new(secret, ring.generation(), ring.discovery().clone());
         fill(&mut keys, ring, settings).map_err(|error| Ended::usage(error.to_string()))?;
         // All of it at once: a list that grows leaves keys behind.
         let mut bytes = Zeroizing::new([0; KEYS_BYTES]);
@@ -46,8 +47,10 @@ fn fill<const N: usize>(keys: &mut Keys<N>, ring: &KeyRing, settings: &Settings)
         Some(manager) => vec![manager],
         None => ring.peers(),
     };
-    for (generation, discovery) in ring.discoveries().take(GENERATIONS) {
-        keys.push_generation(generation, discovery.clone())?;
+    for (generation, discovery) in ring.discoveries() {
+        if generation != ring.generation() {
+            keys.push_beside(generation, discovery.clone())?;
+        }
         for peer in &peers {
             let key = ring.pair_in(generation, peer).cloned();
             key.map_or(Ok(()), |key| keys.push_pair(generation, peer, key))?;
