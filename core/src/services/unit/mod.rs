@@ -207,10 +207,14 @@ impl<S: Storage, C: Secure> Session<S, C> {
         let SessionConfig { link, dialed, address, local, constraints } = config;
         let chunk_limit = usize::from(constraints.chunk_size);
         debug_assert!(storage.small.len() >= LINK_BUFFER_BYTES);
-        // Whoever has proven nothing gets no more than the link's own bytes.
-        let first_limit = if cipher.is_sealing() { chunk_limit } else { UNPROVEN_BYTES };
+        let proven = cipher.is_sealing();
+        let mut link = Link::new(link, cipher, storage.small, chunk_limit, message_limit(&constraints));
+        if !proven {
+            // Whoever has proven nothing gets no more than the link's own bytes.
+            link.set_chunk_limit(UNPROVEN_BYTES);
+        }
         Self {
-            link: Link::new(link, cipher, storage.small, first_limit, message_limit(&constraints)),
+            link,
             phase: Phase::AwaitingHello { until: now + HELLO_TIMEOUT },
             dialed,
             local,

@@ -7,7 +7,7 @@ use core::net::SocketAddr;
 
 use super::inbound::Outcome;
 use super::{Event, Phase, Remote, Session};
-use crate::config::Mode;
+use crate::config::{MINIMUM_CHUNK_BYTES, Mode};
 use crate::distribution::hello::{Hello, HelloError};
 use crate::error::{CloseReason, Refusal};
 use crate::host::connections::{LinkCounter, Liveness, Place};
@@ -97,7 +97,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
             self.fail(cx);
             return Outcome::Nothing;
         }
-        self.link.set_chunk_limit(usize::from(self.constraints.chunk_size));
+        self.link.set_chunk_limit(usize::from(self.constraints.chunk_size).max(MINIMUM_CHUNK_BYTES));
         self.peer_known(cx.now)
     }
 

@@ -193,6 +193,29 @@ fn what_is_cut_or_too_long_before_the_proof_costs_no_buffer() {
     tally.close();
 }
 
+/// The length alone ends the link: nobody waits, with a buffer in hand, for the rest of a frame that is too long.
+#[test]
+fn the_beginning_of_an_oversize_frame_before_the_proof_ends_the_link() {
+    let mut tally = Tally::new("beginnings of oversize frames before the proof");
+    for at in 0..HANDSHAKE - 1 {
+        for length in [318_u16, 600, 1_024, 4_096, 65_535] {
+            let mut ends = Ends::new(ATTACKED);
+            ends.converse(|ends, number, carried| {
+                if number < at {
+                    ends.deliver(&carried);
+                } else if number == at {
+                    let victim = ends.end(carried.to_manager);
+                    victim.hear(&[&length.to_le_bytes()[..], &[0x13; 40]].concat());
+                    tally.note(victim.closed.is_none());
+                    assert!(victim.closed.is_some(), "{at} {length}");
+                    tally.note(!victim.has_all_buffers());
+                }
+            });
+        }
+    }
+    tally.close();
+}
+
 #[test]
 fn two_keys_are_told_by_both_ends() {
     let mut ends = Ends::with_keys(ATTACKED, PairKey::new([1; 32]), PairKey::new([2; 32]));
