@@ -258,7 +258,7 @@ pub enum Error {
     #[error("the peer could not read the request: check its version")]
     Malformed,
     /// The callee's rules do not let this unit call the function.
-    #[error("the peer does not allow this call: change its rules, or ask with another unit")]
+    #[error("the peer's access table does not let this unit call the function: change the table, or ask with another unit")]
     NotAllowed,
     /// The service answered with an error.
     #[error("{0}")]
@@ -271,8 +271,8 @@ pub enum Error {
     /// A table or queue of this unit is full.
     #[error("no room: {0}")]
     Full(Limit),
-    /// The minimum interval between requests to this node has not passed.
-    #[error("too soon after the last request: wait {} us, or lower minimum_interval", wait.as_micros())]
+    /// The minimum interval between requests to this node has not passed, or its access table's rate is used up.
+    #[error("too soon after the last request: wait {} us, or lower minimum_interval, or raise the rate in the peer's access table", wait.as_micros())]
     TooSoon {
         /// How long to wait.
         wait: Duration,

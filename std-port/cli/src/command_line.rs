@@ -32,6 +32,7 @@ pub(crate) enum Verb {
     Node(node::Arguments),
     Doctor(doctor::Arguments),
     Keys(keys::Arguments),
+    Access(commands::access::Arguments),
     Provision(provision::Arguments),
     Completions(commands::completions::Arguments),
     Man(commands::man::Arguments),

@@ -46,6 +46,7 @@ fn run(verb: Verb, global: &Global) -> anyhow::Result<ExitCode> {
         Verb::Node(arguments) => node::run(arguments, global),
         Verb::Doctor(arguments) => doctor::run(arguments, global),
         Verb::Keys(arguments) => keys::run(arguments, global),
+        Verb::Access(arguments) => commands::access::run(arguments, global),
         Verb::Provision(arguments) => provision::run(arguments, global),
         Verb::Completions(arguments) => commands::completions::run(arguments, global),
         Verb::Man(arguments) => commands::man::run(arguments, global),

@@ -68,6 +68,8 @@ pub(crate) enum Id {
     LossyLink,
     /// Too few files may be open for the nodes that may connect.
     FewDescriptors,
+    /// A unit's access table has a mistake, so that an earlier one is in force.
+    AccessTable,
     /// Something else is sent to the port of broadcasts.
     ForeignDatagrams,
     /// Units of this host cannot be asked.
@@ -83,7 +85,7 @@ pub(crate) enum Id {
 impl Id {
     /// All of them, in the order of the documentation.
     #[cfg(test)]
-    pub(crate) const ALL: [Self; 30] = [
+    pub(crate) const ALL: [Self; 31] = [
         Self::PortInUse,
         Self::NoInterface,
         Self::InterfaceDown,
@@ -109,6 +111,7 @@ impl Id {
         Self::AskItsManager,
         Self::LossyLink,
         Self::FewDescriptors,
+        Self::AccessTable,
         Self::ForeignDatagrams,
         Self::ControlRefused,
         Self::SeveralUnits,
@@ -144,6 +147,7 @@ impl Id {
             Self::AskItsManager => "ask-its-manager",
             Self::LossyLink => "lossy-link",
             Self::FewDescriptors => "few-descriptors",
+            Self::AccessTable => "access-table",
             Self::ForeignDatagrams => "foreign-datagrams",
             Self::ControlRefused => "control-refused",
             Self::SeveralUnits => "several-units",

@@ -141,6 +141,17 @@ pub(crate) fn few_descriptors(running: &Running) -> Option<Finding> {
     (files.limit < needed).then(|| descriptors(running, files.open, files.limit, Finding::warning))
 }
 
+/// What is in force is not what the file says.
+pub(crate) fn access_table(unit: &Running) -> Option<Finding> {
+    let wrong = unit.own_counter("AccessFileWrong").is_some_and(|wrong| wrong > 0);
+    wrong.then(|| {
+        let found = "its access table has a mistake, so that the table before it is in force";
+        let advice = "correct the file: `cara access check FILE` tells each mistake, as the unit's log does; it is taken \
+                      over by itself";
+        Finding::warning(Id::AccessTable, found, advice).about(unit.name())
+    })
+}
+
 fn descriptors(running: &Running, open: u64, limit: u64, finding: fn(Id, String, String) -> Finding) -> Finding {
     let maximum = running.unit.constraints.maximum_nodes;
     let found = format!(
@@ -155,7 +166,7 @@ fn descriptors(running: &Running, open: u64, limit: u64, finding: fn(Id, String,
 #[cfg(test)]
 mod tests {
     use super::super::evidence::samples::{evidence, reach, running};
-    use super::super::running::Files;
+    use super::super::running::{Counted, Files};
     use super::*;
 
     fn ids(seen: &Evidence) -> Vec<Id> {
@@ -215,5 +226,17 @@ mod tests {
         let finding = port_in_use(5, &[Holder { pid: 77, name: "other".into() }]);
         assert!(finding.found.contains("other (process 77)") && finding.found.contains("port 5"));
         assert!(port_in_use(5, &[]).found.contains("may not see"));
+    }
+
+    #[test]
+    fn a_table_that_is_not_in_force_is_told() {
+        let mut unit = running("manager", 1);
+        let count = |wrong| vec![Counted { node: None, counters: vec![("AccessFileWrong".into(), wrong)] }];
+        assert_eq!(access_table(&unit), None, "an older unit counts nothing");
+        unit.counters = count(0);
+        assert_eq!(access_table(&unit), None);
+        unit.counters = count(1);
+        let found = access_table(&unit).unwrap();
+        assert_eq!((found.id, found.about.as_deref()), (Id::AccessTable, Some("manager/1")));
     }
 }

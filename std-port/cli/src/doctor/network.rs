@@ -118,7 +118,7 @@ fn versions(seen: &Evidence) -> Vec<Finding> {
 
 /// What a unit of this host has met.
 fn running(seen: &Evidence, unit: &Running) -> Vec<Finding> {
-    let mut found: Vec<Finding> = host::few_descriptors(unit).into_iter().collect();
+    let mut found: Vec<Finding> = host::few_descriptors(unit).into_iter().chain(host::access_table(unit)).collect();
     if unit.is_full() {
         found.push(no_room(unit));
     }

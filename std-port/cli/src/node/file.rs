@@ -24,6 +24,7 @@ pub(super) struct File {
     pub(super) discovery_port: Maybe<u16>,
     pub(super) tcp_port: Maybe<u16>,
     pub(super) manager: Maybe<Manager>,
+    pub(super) access: Maybe<String>,
     #[serde(default)]
     pub(super) constraints: Constraints,
     #[serde(default)]

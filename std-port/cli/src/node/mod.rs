@@ -65,6 +65,9 @@ pub(crate) struct Arguments {
     /// Serve metrics at an address that other hosts reach too: plain HTTP, for everybody.
     #[arg(long)]
     metrics_anywhere: bool,
+    /// Who may see, call and publish what: an access table, which may change while the node runs.
+    #[arg(long, value_name = "TABLE")]
+    access: Option<PathBuf>,
     /// What to log: error, warn, info, debug, trace, or as RUST_LOG.
     #[arg(long, value_name = "LEVEL")]
     log: Option<String>,
@@ -128,6 +131,7 @@ fn overrides(arguments: &Arguments, global: &Global) -> anyhow::Result<Overrides
         tcp_port: arguments.tcp_port,
         metrics: arguments.metrics,
         metrics_anywhere: arguments.metrics_anywhere,
+        access: arguments.access.clone(),
         log: arguments.log.clone(),
     };
     over.check().map_err(Ended::usage)?;

@@ -14,7 +14,7 @@ use super::mistake::Mistakes;
 use super::offer::offer;
 use super::program::Programs;
 use super::settings::{Overrides, Placed, Settings};
-use super::unit::Node;
+use super::unit::{Node, NotBuilt};
 use super::{events, http, wrong};
 use crate::exit::Ended;
 use crate::global::Global;
@@ -25,7 +25,10 @@ pub(super) fn run(settings: Settings, over: &Overrides, logging: &Logging, globa
     // First, so that a signal during the start ends the node in an orderly way too.
     let mut signals = Signals::new([SIGINT, SIGTERM, SIGHUP]).context("signals cannot be waited for")?;
     let programs = Arc::new(Programs::default());
-    let node = Node::build(&settings).map_err(|error| not_built(error, &settings))?;
+    let node = Node::build(&settings).map_err(|error| match error {
+        NotBuilt::Unit(error) => not_built(error, &settings),
+        NotBuilt::Access(error) => Ended::usage(error.to_string()),
+    })?;
     offer_all(&node, &settings, &programs)?;
     let metrics = settings.metrics.as_ref().map(|place| listen(place, &settings)).transpose()?;
     events::log(node.events())?;

@@ -4,6 +4,7 @@ use std::net::SocketAddr;
 use std::ops::Range;
 use std::path::PathBuf;
 
+use cara_std::access::AccessTable;
 use cara_std::control::Control;
 use cara_std::{Capacities, Constraints, Identity, Interfaces};
 
@@ -37,6 +38,8 @@ pub(super) struct Settings {
     pub(super) capacities: Capacities,
     pub(super) control: Control,
     pub(super) metrics: Option<Placed<SocketAddr>>,
+    /// The file of the access table.
+    pub(super) access: Option<PathBuf>,
     /// The file's level of the log.
     pub(super) file_log: Option<String>,
     pub(super) services: Vec<Service>,
@@ -62,6 +65,7 @@ pub(super) struct Overrides {
     pub(super) tcp_port: Option<u16>,
     pub(super) metrics: Option<SocketAddr>,
     pub(super) metrics_anywhere: bool,
+    pub(super) access: Option<PathBuf>,
     pub(super) log: Option<String>,
 }
 
@@ -76,6 +80,9 @@ impl Overrides {
         }
         if let Some(Err(error)) = self.log.as_deref().map(super::logging::filter) {
             return Err(format!("--log: {error}; write error, warn, info, debug or trace"));
+        }
+        if let Some(Err(error)) = self.access.as_ref().map(AccessTable::read) {
+            return Err(format!("--access: {error}"));
         }
         let reached = self.metrics.filter(|address| !address.ip().is_loopback());
         match reached {
@@ -120,6 +127,7 @@ fn checked(source: Source, file: &File, over: &Overrides, mistakes: &mut Vec<Mis
         constraints: limits::constraints(&file.constraints, role, mistakes),
         control: control(&file.control, role, mistakes),
         metrics: metrics(file, over, mistakes),
+        access: access(file, over, mistakes),
         file_log: log(file, mistakes),
         services: functions::services(&source, &file.functions, capacities.functions, mistakes),
         capacities,
@@ -248,6 +256,19 @@ fn metrics(file: &File, over: &Overrides, mistakes: &mut Vec<Mistake>) -> Option
         mistakes.push(Mistake::new(span.clone().unwrap_or(0..0), "metrics are read on this host only", help));
     }
     Some(Placed { value, span })
+}
+
+/// The table is looked at already here, so that `--check` finds its mistakes.
+fn access(file: &File, over: &Overrides, mistakes: &mut Vec<Mistake>) -> Option<PathBuf> {
+    if over.access.is_some() {
+        return over.access.clone();
+    }
+    let written = file.access.as_ref()?;
+    if let Err(error) = AccessTable::read(written.get_ref()) {
+        let help = "`cara access check FILE` checks the table alone";
+        mistakes.push(Mistake::new(written.span(), format!("the access table is wrong: {error}"), help));
+    }
+    Some(written.get_ref().into())
 }
 
 fn log(file: &File, mistakes: &mut Vec<Mistake>) -> Option<String> {

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::mpsc::Receiver;
 
+use cara_std::access::AccessError;
 use cara_std::{BuildError, Builder, CommunicationSystem, Constraints, Error, MyFunctionList, Unit, UnitEvent};
 
 use super::http::Metrics;
@@ -15,20 +16,33 @@ pub(super) enum Node {
     Vehicle(Unit),
 }
 
+/// Why a node could not be built.
+pub(super) enum NotBuilt {
+    Unit(BuildError),
+    /// Its access table was correct when it was looked at first.
+    Access(AccessError),
+}
+
+impl<E: Into<BuildError>> From<E> for NotBuilt {
+    fn from(error: E) -> Self {
+        Self::Unit(error.into())
+    }
+}
+
 impl Node {
     /// Builds the unit; it does nothing until it is started.
-    pub(super) fn build(settings: &Settings) -> Result<Self, BuildError> {
+    pub(super) fn build(settings: &Settings) -> Result<Self, NotBuilt> {
         let Settings { name, id, .. } = settings;
         let Some(manager) = &settings.manager else {
             let builder = CommunicationSystem::builder(name, *id)?;
-            return Ok(Self::Manager(with(builder, settings).build_system()?));
+            return Ok(Self::Manager(with(builder, settings).map_err(NotBuilt::Access)?.build_system()?));
         };
         let builder = Unit::builder(name, *id, &manager.name, manager.id)?;
         let builder = match manager.address {
             Some(address) => builder.manager_address(address),
             None => builder,
         };
-        Ok(Self::Vehicle(with(builder, settings).build_unit()?))
+        Ok(Self::Vehicle(with(builder, settings).map_err(NotBuilt::Access)?.build_unit()?))
     }
 
     pub(super) fn start(&self) -> Result<(), Error> {
@@ -106,7 +120,7 @@ impl Node {
     }
 }
 
-fn with(builder: Builder<()>, settings: &Settings) -> Builder<()> {
+fn with(builder: Builder<()>, settings: &Settings) -> Result<Builder<()>, AccessError> {
     let builder = builder.fleet(settings.fleet).interfaces(settings.interfaces);
     let builder = builder.constraints(settings.constraints).capacities(settings.capacities);
     let builder = builder.control(settings.control.clone());
@@ -115,8 +129,12 @@ fn with(builder: Builder<()>, settings: &Settings) -> Builder<()> {
         Some(port) => builder.discovery_port(port.value),
         None => builder,
     };
-    match &settings.tcp_port {
+    let builder = match &settings.tcp_port {
         Some(port) => builder.tcp_port(port.value),
         None => builder,
+    };
+    match &settings.access {
+        Some(path) => builder.access_file(path),
+        None => Ok(builder),
     }
 }

@@ -8,7 +8,7 @@ use serde_json::Value;
 use crate::support::Stage;
 
 const REFERENCE: &str = "../../docs/cara.md";
-const VERBS: [&str; 15] = [
+const VERBS: [&str; 16] = [
     "scan",
     "functions",
     "call",
@@ -21,6 +21,7 @@ const VERBS: [&str; 15] = [
     "node",
     "doctor",
     "keys",
+    "access",
     "provision",
     "completions",
     "man",

@@ -1,5 +1,6 @@
 //! The built `cara` command against a manager in a process of its own and AGVs on loopback, in a fleet of their own.
 
+mod access;
 mod alone;
 mod calls;
 mod constraints;

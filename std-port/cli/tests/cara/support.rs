@@ -54,7 +54,7 @@ impl Stage {
     }
 
     /// AGVs whose lists the manager has.
-    fn ready(&self) -> usize {
+    pub(crate) fn ready(&self) -> usize {
         let scan = self.cara(&["scan", "--json"]);
         let nodes = if scan.code == 0 { scan.json()["nodes"].clone() } else { Value::Null };
         let ready = |node: &&Value| node["functions"].as_u64() == Some(FUNCTIONS.len() as u64);
@@ -62,7 +62,12 @@ impl Stage {
     }
 
     pub(crate) fn start_manager(&mut self) {
+        self.start_manager_with(&[]);
+    }
+
+    pub(crate) fn start_manager_with(&mut self, more: &[&str]) {
         let mut command = self.command(&["node", "--name", "manager", "--id", "1"]);
+        command.args(more);
         let manager = command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::inherit()).spawn().unwrap();
         self.manager = Some(manager);
         let start = Instant::now();
@@ -105,6 +110,15 @@ impl Stage {
 
     pub(crate) fn control(&self) -> &Path {
         self.control.path()
+    }
+}
+
+/// Waits until `condition` holds.
+pub(crate) fn until(what: &str, mut condition: impl FnMut() -> bool) {
+    let start = Instant::now();
+    while !condition() {
+        assert!(start.elapsed() < PATIENCE, "not in time: {what}");
+        std::thread::sleep(Duration::from_millis(50));
     }
 }
 
