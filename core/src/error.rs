@@ -258,7 +258,9 @@ pub enum Error {
     #[error("the peer could not read the request: check its version")]
     Malformed,
     /// The callee's rules do not let this unit call the function.
-    #[error("the peer's access table does not let this unit call the function: change the table, or ask with another unit")]
+    #[error(
+        "the peer's access table does not let this unit call the function: change the table, or ask with another unit"
+    )]
     NotAllowed,
     /// The service answered with an error.
     #[error("{0}")]

@@ -102,7 +102,11 @@ impl Blocks {
         [
             encode,
             decode,
-            Operation { name: "round trip, generating", of, run: |blocks, meter| meter.count(&mut || blocks.generate()) },
+            Operation {
+                name: "round trip, generating",
+                of,
+                run: |blocks, meter| meter.count(&mut || blocks.generate()),
+            },
             Operation {
                 name: "round trip, processing",
                 of,
