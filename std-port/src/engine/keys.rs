@@ -24,18 +24,17 @@ pub(crate) enum Keys {
     Ring(LiveRing),
 }
 
-/// What the core sees of a ring: the newest generation and the one before it.
+/// A ring as it is now, for as long as the core needs it.
 #[derive(Clone, Debug)]
 pub(crate) struct View(Arc<KeyRing>);
 
 impl Keyring for View {
     fn discovery(&self) -> (&DiscoveryKey, Option<&DiscoveryKey>) {
-        (self.0.discovery(), self.0.discoveries().nth(1).map(|(_, key)| key))
+        Keyring::discovery(&*self.0)
     }
 
     fn pair(&self, peer: &Identity) -> Option<(PairKey, Option<PairKey>)> {
-        let mut keys = self.0.pairs(peer).map(|(_, key)| key.clone());
-        keys.next().map(|key| (key, keys.next()))
+        Keyring::pair(&*self.0, peer)
     }
 }
 

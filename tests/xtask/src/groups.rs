@@ -240,7 +240,7 @@ fn unit() -> Result<()> {
             println!("some tests will be skipped: {reason}");
         }
     }
-    Run::cargo().args(["test", "--workspace", "--features", FEATURES]).stream()
+    Run::cargo().args(["test", "--workspace", "--no-fail-fast", "--features", FEATURES]).stream()
 }
 
 /// Runs a check once what it needs is there; what cannot be had is a reason to skip it.
