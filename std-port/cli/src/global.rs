@@ -3,7 +3,8 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use cara_std::{Interfaces, PLAIN_PORT, SECURED_PORT};
+use cara_std::keys::place;
+use cara_std::{Fleet, Identity, Interfaces, PLAIN_PORT, SECURED_PORT};
 use clap::Args;
 
 use crate::name_and_id::NameAndId;
@@ -39,8 +40,8 @@ pub(crate) struct Global {
     /// The UDP port of broadcasts; 21970 unless told, 21971 with keys.
     #[arg(long, global = true, value_name = "PORT")]
     pub(crate) discovery_port: Option<u16>,
-    /// With --as, and for `node`: the file with the unit's keys. Without one it is in plain mode, where anybody on the
-    /// network can speak as anybody.
+    /// With --as, and for `node`: the file with the unit's keys, instead of where they are looked for. A unit without
+    /// keys is in plain mode, where anybody on the network can speak as anybody.
     #[arg(long, global = true, value_name = "FILE")]
     pub(crate) key_file: Option<PathBuf>,
     /// Use loopback only.
@@ -57,6 +58,11 @@ impl Global {
     /// The UDP port of broadcasts.
     pub(crate) fn port(&self) -> u16 {
         self.discovery_port.unwrap_or(if self.key_file.is_some() { SECURED_PORT } else { PLAIN_PORT })
+    }
+
+    /// The file with a unit's keys: the one that is told, or one where such files are looked for. `None` for plain mode.
+    pub(crate) fn keys_of(&self, identity: &Identity, fleet: u32) -> Option<PathBuf> {
+        self.key_file.clone().or_else(|| place::find(identity, Fleet(fleet)).ok())
     }
 
     /// How long a command as a manager waits for nodes.

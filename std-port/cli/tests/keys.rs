@@ -1,9 +1,10 @@
 //! `cara keys` as a process: what it makes, what it shows, what it refuses, and that docs/keys.md says what it prints.
 
 use std::fs;
+use std::io::{BufRead, BufReader};
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::{Child, Command, Output, Stdio};
 
 use cara_std::keys::{KeyRing, parse_node, place};
 use cara_std::{Fleet, Identity};
@@ -286,4 +287,63 @@ fn without_fingerprints(text: &str) -> String {
         if is_one(word) { piece.replace(word, "FINGERPRINT") } else { piece.to_owned() }
     });
     replaced.collect()
+}
+
+/// What the file of the vehicle's node says.
+const VEHICLE: &str = "\
+name = \"agv\"
+id = 1
+role = \"s_unit\"
+interfaces = \"lo\"
+manager = { name = \"depot\", id = 1 }
+[[functions]]
+signature = \"echo(n: int) -> (n: int)\"
+answer = \"echo\"
+";
+
+/// A node finds its keys where `cara keys` has put them, and from then on nobody reaches it who has none.
+#[test]
+fn a_node_takes_the_keys_that_are_there_and_is_called_with_keys_alone() {
+    let home = Home::new();
+    let fleet = cara_processes::random_fleet().to_string();
+    home.done(&["new-fleet", "--fleet", &fleet, "depot/1@m_unit", "agv/1"]);
+    fs::write(home.0.path().join("agv.toml"), VEHICLE).unwrap();
+    let cara = |arguments: &[&str], home: &Path| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_cara"));
+        command
+            .args(["--fleet", &fleet, "--loopback"])
+            .args(arguments)
+            .env("HOME", home)
+            .env("CARA_CONTROL_DIR", home.join("control"));
+        command.env_remove("XDG_CONFIG_HOME").env_remove("CARA_KEYS").current_dir(home);
+        command
+    };
+    let node = cara(&["node", "agv.toml"], home.0.path()).stdout(Stdio::piped()).spawn().unwrap();
+    let mut node = Ended(node);
+    let mut up = String::new();
+    BufReader::new(node.0.stdout.take().unwrap()).read_line(&mut up).unwrap();
+    assert!(up.contains("discovery port 21971"), "{up}");
+
+    let call = ["--as", "depot/1", "call", "agv", "echo(n: 3)"];
+    let called = cara(&[&["--wait", "30s"], &call[..]].concat(), home.0.path()).output().unwrap();
+    assert!(called.status.success(), "{}", String::from_utf8_lossy(&called.stderr));
+    assert_eq!(String::from_utf8(called.stdout).unwrap().trim(), "echo(n: 3)");
+    let stranger = Home::new();
+    let called = cara(&[&["--wait", "2s"], &call[..]].concat(), stranger.0.path()).output().unwrap();
+    assert_eq!(called.status.code(), Some(1), "{}", String::from_utf8_lossy(&called.stdout));
+    fs::set_permissions(home.folder().join(format!("depot-1-m_unit-{fleet}.keys")), PermissionsExt::from_mode(0o640))
+        .unwrap();
+    let called = cara(&call, home.0.path()).output().unwrap();
+    let said = String::from_utf8_lossy(&called.stderr).into_owned();
+    assert!(called.status.code() == Some(1) && said.contains("chmod 600"), "{said}");
+}
+
+/// A process that ends with the test.
+struct Ended(Child);
+
+impl Drop for Ended {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
 }

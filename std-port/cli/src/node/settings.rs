@@ -6,7 +6,8 @@ use std::path::PathBuf;
 
 use cara_std::access::AccessTable;
 use cara_std::control::Control;
-use cara_std::{Capacities, Constraints, Identity, Interfaces};
+use cara_std::keys::place;
+use cara_std::{Capacities, Constraints, Fleet, Identity, Interfaces};
 
 use super::file::{self, File, Maybe, Role};
 use super::functions::{self, Service};
@@ -99,8 +100,18 @@ impl Settings {
     pub(super) fn of(source: Source, over: &Overrides) -> Result<Self, Mistakes> {
         let file = file::read(&source).map_err(|mistake| Mistakes::new(&source, vec![mistake]))?;
         let mut mistakes = Vec::new();
-        let settings = checked(source, &file, over, &mut mistakes);
+        let mut settings = checked(source, &file, over, &mut mistakes);
+        settings.key_file = settings.key_file.take().or_else(|| settings.found_keys());
         if mistakes.is_empty() { Ok(settings) } else { Err(Mistakes::new(&settings.source, mistakes)) }
+    }
+
+    /// The node's keys where such files are looked for.
+    fn found_keys(&self) -> Option<PathBuf> {
+        let identity = match self.manager {
+            None => Identity::m_unit(&self.name, self.id),
+            Some(_) => Identity::s_unit(&self.name, self.id),
+        };
+        place::find(&identity.ok()?, Fleet(self.fleet)).ok()
     }
 
     /// A mistake that shows only when the node starts, such as a port in use.

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use cara_std::control::Control;
 use cara_std::control::protocol::FunctionInfo;
 use cara_std::survey::Survey;
-use cara_std::{BuildError, Builder, CommunicationSystem, Constraints, Fleet};
+use cara_std::{BuildError, Builder, CommunicationSystem, Constraints, Fleet, Identity};
 
 use super::{Need, Operator, running};
 use crate::exit::Ended;
@@ -33,12 +33,10 @@ pub(super) fn start(identity: &NameAndId, global: &Global) -> anyhow::Result<Com
         .map_err(|error| Ended::usage(format!("{identity}: {error}")))?;
     let constraints = Constraints { maximum_nodes: MAXIMUM_NODES, ..Constraints::M_UNIT };
     let builder = builder.fleet(global.fleet.unwrap_or(0)).interfaces(global.interfaces());
-    let builder = builder
-        .discovery_port(global.port())
-        .constraints(constraints)
-        .control(Control::Off)
-        .tcp_port(global.as_port.unwrap_or(0));
-    let builder = global.key_file.iter().fold(builder, Builder::key_file);
+    let keys = Identity::m_unit(&identity.name, identity.id).map(|own| global.keys_of(&own, global.fleet.unwrap_or(0)));
+    let builder = global.discovery_port.into_iter().fold(builder, Builder::discovery_port);
+    let builder = builder.constraints(constraints).control(Control::Off).tcp_port(global.as_port.unwrap_or(0));
+    let builder = keys.ok().flatten().into_iter().fold(builder, Builder::key_file);
     let system = builder.build_system().map_err(|error| match error {
         BuildError::Keys(error) => crate::keys::failed(error),
         BuildError::Unit(error) => network(error),

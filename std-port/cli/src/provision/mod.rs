@@ -11,7 +11,8 @@ mod show;
 mod text;
 mod told;
 
-use std::io::Write;
+use std::fs::File;
+use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -119,7 +120,8 @@ fn write_file(
         None => Zeroizing::new(written.iter().flat_map(|copy| copy.bytes.iter().copied()).collect()),
     };
     let has_keys = written.iter().any(|copy| copy.has_keys);
-    store(file, &bytes, has_keys).with_context(|| format!("cannot write {}", file.display()))?;
+    let is_secret = has_keys || content.settings.wifi.is_some();
+    store(file, &bytes, is_secret).with_context(|| format!("cannot write {}", file.display()))?;
     report(board, &written, Some(file), global)?;
     if previous.is_none() && arguments.uf2 && !has_keys && !global.json {
         output::line("keys that the board has are gone with it: give --keys if it is to keep any")?;
@@ -133,9 +135,9 @@ fn write_file(
     Ok(())
 }
 
-/// Writes a file; one with keys for its owner alone, whatever stood there before.
-fn store(file: &Path, bytes: &[u8], has_keys: bool) -> std::io::Result<()> {
-    if !has_keys {
+/// Writes a file; one with keys or a password for its owner alone, whatever stood there before.
+fn store(file: &Path, bytes: &[u8], is_secret: bool) -> std::io::Result<()> {
+    if !is_secret {
         return std::fs::write(file, bytes);
     }
     let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
@@ -145,12 +147,24 @@ fn store(file: &Path, bytes: &[u8], has_keys: bool) -> std::io::Result<()> {
     Ok(())
 }
 
+/// Longest file that is read: the pages of any board as UF2 are far shorter.
+const LONGEST_FILE: u64 = 1 << 20;
+
+/// A file with pages of a board.
+fn read_whole(file: &Path) -> anyhow::Result<Zeroizing<Vec<u8>>> {
+    let mut bytes = Zeroizing::new(Vec::new());
+    let read = File::open(file).and_then(|opened| opened.take(LONGEST_FILE + 1).read_to_end(&mut bytes));
+    read.with_context(|| format!("cannot read {}", file.display()))?;
+    if bytes.len() as u64 > LONGEST_FILE {
+        let text = format!("{} has more than {LONGEST_FILE} bytes: it holds no pages of a board", file.display());
+        return Err(Ended::usage(text));
+    }
+    Ok(bytes)
+}
+
 /// What the two files hold.
 fn pages(files: &[PathBuf]) -> anyhow::Result<[Zeroizing<Vec<u8>>; 2]> {
-    let read = |file: &PathBuf| {
-        let page = std::fs::read(file).with_context(|| format!("cannot read {}", file.display()))?;
-        anyhow::Ok(Zeroizing::new(page))
-    };
+    let read = |file: &PathBuf| read_whole(file);
     match files {
         [first, second] => Ok([read(first)?, read(second)?]),
         _ => Err(Ended::usage("--previous takes two files")),

@@ -2,7 +2,6 @@
 
 use std::path::Path;
 
-use anyhow::Context;
 use cara_settings::board::BOARDS;
 use cara_settings::keys::KeysError;
 use cara_settings::page::{BYTES, decode};
@@ -38,7 +37,7 @@ pub(super) fn boards(global: &Global) -> anyhow::Result<()> {
 
 /// Prints what the pages in a file say. Passwords and keys are not shown.
 pub(super) fn file(file: &Path, global: &Global) -> anyhow::Result<()> {
-    let bytes = Zeroizing::new(std::fs::read(file).with_context(|| format!("cannot read {}", file.display()))?);
+    let bytes = super::read_whole(file)?;
     for page in pages(&bytes) {
         page_of(&page, global).map_err(|error| Ended::failed("Page", format!("{}: {error}", file.display())))??;
     }
