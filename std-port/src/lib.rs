@@ -13,7 +13,7 @@
 //! let mut pos = Parameters::new();
 //! pos.add_int("position", 2)?;
 //! agv_manager.s_units()[0].block_request("pos_info", &mut pos)?;
-//! # Ok::<(), cara_std::Error>(())
+//! # Ok::<(), cara_std::BuildError>(())
 //! ```
 
 pub mod access;

@@ -47,7 +47,7 @@ const UNIT_SHIFT: u32 = 48;
 ///     agv.start()?;
 /// #   std::mem::forget(agv);
 /// }
-/// # Ok::<(), cara_std::Error>(())
+/// # Ok::<(), cara_std::BuildError>(())
 /// ```
 #[derive(Clone)]
 pub struct Threads {

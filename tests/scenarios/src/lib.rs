@@ -7,7 +7,7 @@
 //!
 //! ```
 //! use cara_scenarios::{Spec, Service, ports, secs};
-//! let mut world = ports::simulator(1, cara_scenarios::Weather::Rough);
+//! let mut world = ports::simulator(1, cara_scenarios::Weather::Rough, cara_core::config::Mode::Secured);
 //! let world = &mut *world;
 //! let manager = world.add(Spec::manager("manager", 1));
 //! world.add(Spec::agv("agv", 7).service(&Service::new("ping()")));
