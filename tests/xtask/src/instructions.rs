@@ -29,6 +29,10 @@ const NO_NETWORK: &str = "this user cannot make a network with virtual devices";
 const FOLDER: &str = "tests/instructions/board";
 /// Of a hundred instructions, how many more may be.
 const GROWTH: u64 = 3;
+/// Two checkouts differed by 108 in the same operation.
+const LAYOUT_CHANCE: u64 = 128;
+/// Texts at other places differed by up to 2,300.
+const TEXT_CHANCE: u64 = 2_300;
 /// Owners of instructions, as the last word of an operation over a network.
 const NOT_OURS: [&str; 2] = [", TCP/IP", ", driver, clock, executor"];
 /// glibc copies with other instructions on other processors, and callgrind counts `rep movsb` byte by byte.
@@ -178,6 +182,19 @@ impl Row {
     }
 }
 
+impl Row {
+    /// What the same code may take more by chance. On a board: bytes are copied and compared word by word where both begin
+    /// with a word, which for constants is the linker's choice and differs between checkouts in two folders; a text that
+    /// comes over the network begins anywhere in the socket's buffer.
+    fn chance(&self) -> u64 {
+        match (self.machine.as_str(), self.operation.starts_with(SERVED)) {
+            (BOARD, true) if self.of.ends_with("characters") => TEXT_CHANCE,
+            (BOARD, _) => LAYOUT_CHANCE,
+            _ => 0,
+        }
+    }
+}
+
 impl figures::Row for Row {
     const COLUMNS: &'static str = "| machine | operation | of | instructions |";
 
@@ -202,7 +219,7 @@ impl figures::Row for Row {
             return Vec::new();
         }
         let (now, before) = (self.instructions, before.instructions);
-        let has_grown = now > before + before * GROWTH / 100;
+        let has_grown = now > before + before * GROWTH / 100 + self.chance();
         has_grown.then(|| format!("{}: {now} instructions, and {before}", self.name())).into_iter().collect()
     }
 }
@@ -229,6 +246,20 @@ mod tests {
         assert!(row(1).growth(&row(1000)).is_empty());
         let network = |instructions| Row { operation: "served request, TCP/IP".into(), ..row(instructions) };
         assert!(network(2000).growth(&network(1000)).is_empty());
+    }
+
+    #[test]
+    fn on_a_board_chance_has_its_part() {
+        let board = |instructions| Row { machine: "Cortex-M3".into(), ..row(instructions) };
+        assert!(board(1158).growth(&board(1000)).is_empty());
+        assert_eq!(board(1159).growth(&board(1000)).len(), 1);
+        let served = |instructions| Row {
+            operation: "served request, CARA".into(),
+            of: "512 characters".into(),
+            ..board(instructions)
+        };
+        assert!(served(12_600).growth(&served(10_000)).is_empty());
+        assert_eq!(served(12_601).growth(&served(10_000)).len(), 1);
     }
 
     #[test]
