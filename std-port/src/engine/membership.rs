@@ -360,11 +360,13 @@ impl<T: Send + 'static> Engine<T> {
 
     /// Lends the node the mailman of the unit's datagrams.
     pub(super) fn poll_node(&self) -> Instant {
+        // Before the node's lock: whoever reads a new key file keeps the ring to itself meanwhile.
+        let codes = self.keys.codes();
         loop {
             let (action, next) = {
                 let mut cell = lock(&self.node);
                 let mut mailman = StdMailman { stream: None, datagrams: &self.datagrams };
-                let action = cell.node.poll(self.clock.now(), &mut mailman, &self.keys.codes());
+                let action = cell.node.poll(self.clock.now(), &mut mailman, &codes);
                 (action, cell.node.next_deadline())
             };
             if action.is_none() {
