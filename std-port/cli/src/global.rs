@@ -44,6 +44,10 @@ pub(crate) struct Global {
     /// keys is in plain mode, where anybody on the network can speak as anybody.
     #[arg(long, global = true, value_name = "FILE")]
     pub(crate) key_file: Option<PathBuf>,
+    /// With --as, and for `node`, `scan` and `doctor`: plain mode, without keys, where anybody on the network can read what
+    /// units say and speak as any of them. It meets units in plain mode alone.
+    #[arg(long, global = true, conflicts_with = "key_file")]
+    pub(crate) insecure: bool,
     /// Use loopback only.
     #[arg(long, global = true)]
     pub(crate) loopback: bool,
@@ -62,6 +66,9 @@ impl Global {
 
     /// The file with a unit's keys: the one that is told, or one where such files are looked for. `None` for plain mode.
     pub(crate) fn keys_of(&self, identity: &Identity, fleet: u32) -> Option<PathBuf> {
+        if self.insecure {
+            return None;
+        }
         self.key_file.clone().or_else(|| place::find(identity, Fleet(fleet)).ok())
     }
 
