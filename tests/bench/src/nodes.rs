@@ -46,7 +46,7 @@ pub(crate) enum Question {
 }
 
 fn placed(builder: Builder<()>, place: &Place) -> Builder<()> {
-    builder.fleet(place.run).discovery_port(place.discovery_port()).interfaces(Interfaces::Loopback)
+    builder.insecure().fleet(place.run).discovery_port(place.discovery_port()).interfaces(Interfaces::Loopback)
 }
 
 /// The manager's process, with defaults but for the number of nodes.

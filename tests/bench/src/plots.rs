@@ -7,7 +7,7 @@ use std::path::Path;
 
 use anyhow::{Context, Result};
 
-use crate::results::{Availability, Response, Results};
+use crate::results::{Availability, Mode, Response, Results};
 use cara_bench_ends::Delivery;
 use cara_bench_ends::Pin;
 use chart::{Axis, Chart, Line};
@@ -37,10 +37,22 @@ fn figures(results: &Results) -> Vec<(&'static str, Vec<Chart>)> {
     ]
 }
 
-/// Rows of these calls, at one place without printing.
+/// Rows of these calls in plain mode, at one place without printing.
 fn calls<'r>(results: &'r Results, peer: &str, distribution: u8, pin: Pin, pause_ms: u64) -> Vec<&'r Response> {
+    calls_in(Mode::Plain, results, peer, distribution, pin, pause_ms)
+}
+
+fn calls_in<'r>(
+    mode: Mode,
+    results: &'r Results,
+    peer: &str,
+    distribution: u8,
+    pin: Pin,
+    pause_ms: u64,
+) -> Vec<&'r Response> {
     let is_wanted = |row: &&Response| {
-        row.peer == peer && (row.distribution, row.pin, row.pause_ms) == (distribution, pin, pause_ms) && !row.print
+        let cell = (row.mode, row.distribution, row.pin, row.pause_ms);
+        row.peer == peer && cell == (mode, distribution, pin, pause_ms) && !row.print
     };
     results.response.iter().filter(is_wanted).collect()
 }
@@ -118,12 +130,18 @@ fn others(results: &Results, pin: Pin) -> Chart {
 
 /// Median round trips in proportion to the floor's, with the control.
 fn ratios(results: &Results, pin: Pin) -> Chart {
+    let peers = [
+        (Mode::Plain, "floor_again", ""),
+        (Mode::Plain, "cara", ""),
+        (Mode::Secured, "cara", ", secured"),
+        (Mode::Plain, "cara_among_1000_idle", ""),
+    ];
     let mut lines = Vec::new();
     for distribution in [1, 2] {
-        for peer in ["floor_again", "cara", "cara_among_1000_idle"] {
-            let rows = calls(results, peer, distribution, pin, 0);
+        for (mode, peer, label) in peers {
+            let rows = calls_in(mode, results, peer, distribution, pin, 0);
             let points = rows.iter().map(|row| (f64::from(row.chars), row.ratio)).collect();
-            lines.push(Line { name: format!("{peer}, distribution {distribution}"), points });
+            lines.push(Line { name: format!("{peer}{label}, distribution {distribution}"), points });
         }
     }
     lines.retain(|line| !line.points.is_empty());

@@ -11,8 +11,13 @@ use crate::peers::OutsideReport;
 use cara_bench_ends::Delivery;
 use cara_bench_ends::Pin;
 
-/// How messages are protected. Plain is the only mode so far.
-pub(crate) const MODE: &str = "plain";
+/// How messages are protected.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum Mode {
+    Plain,
+    Secured,
+}
 
 /// A whole run, complete or not.
 #[derive(Debug, Clone, Default, Serialize)]
@@ -51,7 +56,7 @@ pub(crate) struct Response {
     pub(crate) distribution: u8,
     pub(crate) chars: u32,
     pub(crate) pin: Pin,
-    pub(crate) mode: &'static str,
+    pub(crate) mode: Mode,
     pub(crate) print: bool,
     pub(crate) pause_ms: u64,
     pub(crate) n: usize,
@@ -63,6 +68,7 @@ pub(crate) struct Response {
     pub(crate) ratio_lower_quartile: f64,
     pub(crate) ratio_upper_quartile: f64,
     pub(crate) p99_ratio: f64,
+    pub(crate) plain_ratio: Option<f64>,
     pub(crate) cpu_us_per_call: f64,
     pub(crate) cpu_ratio: f64,
 }
@@ -75,7 +81,7 @@ pub(crate) struct Availability {
     pub(crate) period_ms: u64,
     pub(crate) delivery: Delivery,
     pub(crate) pin: Pin,
-    pub(crate) mode: &'static str,
+    pub(crate) mode: Mode,
     #[serde(flatten)]
     pub(crate) counts: Counts,
     pub(crate) worst_group: f64,
@@ -102,7 +108,7 @@ pub(crate) struct Counts {
 pub(crate) struct Share {
     pub(crate) chars: u32,
     pub(crate) pin: Pin,
-    pub(crate) mode: &'static str,
+    pub(crate) mode: Mode,
     pub(crate) n: usize,
     pub(crate) round_trip_us: f64,
     pub(crate) generate_us: f64,
@@ -116,7 +122,7 @@ pub(crate) struct Share {
 pub(crate) struct Scale {
     pub(crate) nodes: u32,
     pub(crate) pin: Pin,
-    pub(crate) mode: &'static str,
+    pub(crate) mode: Mode,
     pub(crate) n: usize,
     pub(crate) request_us: f64,
     pub(crate) request_ratio: f64,
@@ -134,7 +140,7 @@ pub(crate) struct Throughput {
     pub(crate) callers: u32,
     pub(crate) chars: u32,
     pub(crate) pin: Pin,
-    pub(crate) mode: &'static str,
+    pub(crate) mode: Mode,
     pub(crate) n: usize,
     pub(crate) requests_per_s: f64,
     pub(crate) ratio: f64,
@@ -158,7 +164,7 @@ pub(crate) struct Constrained {
     pub(crate) chars: u32,
     pub(crate) period_ms: u64,
     pub(crate) pin: Pin,
-    pub(crate) mode: &'static str,
+    pub(crate) mode: Mode,
     #[serde(flatten)]
     pub(crate) counts: Counts,
     pub(crate) executed_per_s: f64,

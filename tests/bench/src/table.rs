@@ -2,7 +2,7 @@
 
 use comfy_table::{Table, presets};
 
-use crate::results::{Counts, Results};
+use crate::results::{Counts, Mode, Results};
 
 /// Prints a table for each kind of row that there is.
 pub(crate) fn show(results: &Results) {
@@ -43,6 +43,14 @@ fn print(header: &[&str], rows: impl Iterator<Item = Vec<String>>) {
     }
 }
 
+/// A peer's name, and its mode where that is not plain.
+fn of_mode(peer: &str, mode: Mode) -> String {
+    match mode {
+        Mode::Plain => peer.to_owned(),
+        Mode::Secured => format!("{peer}, secured"),
+    }
+}
+
 fn response(results: &Results) {
     let header = [
         "pin",
@@ -59,6 +67,7 @@ fn response(results: &Results) {
         "ratio",
         "quartiles",
         "p99 ratio",
+        "to plain",
         "CPU µs",
         "CPU ratio",
     ];
@@ -69,7 +78,7 @@ fn response(results: &Results) {
             row.pause_ms.to_string(),
             row.print.to_string(),
             row.chars.to_string(),
-            row.peer.clone(),
+            of_mode(&row.peer, row.mode),
             row.n.to_string(),
             format!("{:.1}", row.p50_us),
             format!("{:.1}", row.p99_us),
@@ -78,6 +87,7 @@ fn response(results: &Results) {
             format!("{:.3}", row.ratio),
             format!("{:.3}-{:.3}", row.ratio_lower_quartile, row.ratio_upper_quartile),
             format!("{:.3}", row.p99_ratio),
+            row.plain_ratio.map_or_else(String::new, |ratio| format!("{ratio:.3}")),
             format!("{:.1}", row.cpu_us_per_call),
             format!("{:.2}", row.cpu_ratio),
         ]
@@ -91,7 +101,7 @@ fn throughput(results: &Results) {
             format!("{:?}", row.kind),
             row.pin.to_string(),
             row.callers.to_string(),
-            row.peer.clone(),
+            of_mode(&row.peer, row.mode),
             format!("{:.0}", row.requests_per_s),
             format!("{:.3}", row.ratio),
         ]

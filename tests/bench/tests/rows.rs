@@ -83,9 +83,16 @@ fn covers(all: &Map<String, Value>) {
     assert_eq!(values(all, "availability", "delivery"), set(&["reliable", "best_effort"]));
     assert_eq!(values(all, "availability", "distribution"), set(&["1", "2"]));
     assert_eq!(values(all, "throughput", "kind"), set(&["request", "one_way"]));
-    for kind in ["response", "availability", "share", "scale", "throughput", "constraints"] {
+    for kind in ["response", "throughput"] {
+        assert_eq!(values(all, kind, "mode"), set(&["plain", "secured"]), "{kind}");
+    }
+    for kind in ["availability", "share", "scale", "constraints"] {
         assert_eq!(values(all, kind, "mode"), set(&["plain"]), "{kind}");
     }
+    let secured = |row: &&Map<String, Value>| row["mode"] == "secured";
+    assert!(
+        rows(all, "response").iter().filter(secured).all(|row| row["plain_ratio"].is_f64() && row["peer"] == "cara")
+    );
     for row in rows(all, "availability") {
         let count = |key: &str| row[key].as_u64().unwrap();
         assert_eq!(count("offered"), count("sent") + count("refused"), "{row:?}");

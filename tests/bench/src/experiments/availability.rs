@@ -8,7 +8,7 @@ use super::plan::{Bursts, Plan};
 use crate::pair::{Delivered, Pair, Setting};
 use crate::peers::Contender;
 use crate::progress::{bar, is_stopped};
-use crate::results::{Availability, Counts, MODE, ratio};
+use crate::results::{Availability, Counts, Mode, ratio};
 use crate::statistics::quartile;
 use cara_bench_ends::Burst;
 use cara_bench_ends::Delivery;
@@ -77,7 +77,7 @@ impl Groups {
             period_ms: burst.period_ms,
             delivery: burst.delivery,
             pin: setting.pin,
-            mode: MODE,
+            mode: Mode::Plain,
             counts: counts(&self.cara),
             worst_group: ratio(worst as f64 / group),
             executed_per_s: quartile(speeds, 2).round(),

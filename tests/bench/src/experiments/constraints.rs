@@ -7,7 +7,7 @@ use super::plan::Plan;
 use crate::pair::{Pair, Setting};
 use crate::peers::Contender;
 use crate::progress::{bar, is_stopped};
-use crate::results::{Constrained, MODE};
+use crate::results::{Constrained, Mode};
 use cara_bench_ends::Burst;
 use cara_bench_ends::Pin;
 use cara_bench_ends::{Delivery, Limits};
@@ -49,7 +49,7 @@ fn row(pair: &mut Pair, pin: Pin, limits: Limits, burst: &Burst) -> Result<Const
         chars: burst.chars,
         period_ms: burst.period_ms,
         pin,
-        mode: MODE,
+        mode: Mode::Plain,
         counts: counts(&[delivered]),
         executed_per_s,
     })

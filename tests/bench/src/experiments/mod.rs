@@ -175,7 +175,7 @@ fn silent_losses(results: &Results) -> Vec<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::results::{Availability, Counts, MODE};
+    use crate::results::{Availability, Counts, Mode};
     use cara_bench_ends::Delivery;
 
     fn row(delivery: Delivery, counts: Counts) -> Availability {
@@ -185,7 +185,7 @@ mod tests {
             period_ms: 1,
             delivery,
             pin: Pin::Same,
-            mode: MODE,
+            mode: Mode::Plain,
             counts,
             worst_group: 1.0,
             executed_per_s: 1.0,

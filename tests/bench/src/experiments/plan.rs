@@ -5,7 +5,7 @@ use std::sync::Arc;
 use anyhow::Result;
 
 use crate::pair::Setting;
-use crate::peers::{Contender, Outside};
+use crate::peers::{Contender, Outside, SECURED};
 use cara_bench_ends::Order;
 use cara_bench_ends::{Pin, pin};
 
@@ -91,9 +91,9 @@ pub(crate) struct Constrained {
     pub(crate) count: u32,
 }
 
-const COMPARED: [&str; 3] = ["floor", "floor_again", "cara"];
-const AMONG: [&str; 4] = ["floor", "floor_again", "cara", "cara_among_1000_idle"];
-const SHARED: [&str; 4] = ["floor", "floor_again", "cara", "cara_one_link"];
+const COMPARED: [&str; 4] = ["floor", "floor_again", "cara", SECURED];
+const AMONG: [&str; 5] = ["floor", "floor_again", "cara", SECURED, "cara_among_1000_idle"];
+const SHARED: [&str; 5] = ["floor", "floor_again", "cara", SECURED, "cara_one_link"];
 /// The paper's sizes, and one beyond them.
 const CHARS: [u32; 8] = [1, 10, 100, 1_000, 5_000, 10_000, 20_000, 100_000];
 const SOME_CHARS: [u32; 3] = [100, 1_000, 20_000];

@@ -6,7 +6,7 @@ use super::plan::{Group, Plan};
 use crate::pair::{Pair, Setting};
 use crate::peers::Contender;
 use crate::progress::{bar, is_stopped};
-use crate::results::{MODE, Response, micros, ratio};
+use crate::results::{Mode, Response, micros, ratio};
 use crate::statistics::Cell;
 use cara_bench_ends::Order;
 
@@ -98,12 +98,19 @@ fn rows(group: &Group, cells: &Cells) -> Vec<Response> {
     let mut rows = Vec::new();
     for (order, cells) in group.orders.iter().zip(cells) {
         let Some(floor) = cells.first() else { continue };
-        let measured = group.peers.iter().zip(cells).filter(|(_, cell)| !cell.turns.is_empty());
-        rows.extend(measured.map(|(peer, cell)| row(peer.name(), group.setting, order, cell, floor)));
+        let named = || group.peers.iter().map(Contender::name_and_mode).zip(cells);
+        let plain = |name: &str| named().find(|(known, _)| *known == (name, Mode::Plain)).map(|(_, cell)| cell);
+        for ((peer, mode), cell) in named().filter(|(_, cell)| !cell.turns.is_empty()) {
+            let row = row(peer, group.setting, order, cell, floor);
+            let plain = plain(peer).filter(|_| mode == Mode::Secured);
+            let plain_ratio = plain.map(|plain| ratio(cell.ratios(plain)[1]));
+            rows.push(Response { mode, plain_ratio, ..row });
+        }
     }
     rows
 }
 
+/// The row of a peer in plain mode.
 fn row(peer: &str, setting: Setting, order: &Order, cell: &Cell, floor: &Cell) -> Response {
     let figures = cell.figures();
     let [lower, middle, upper] = cell.ratios(floor).map(ratio);
@@ -112,7 +119,7 @@ fn row(peer: &str, setting: Setting, order: &Order, cell: &Cell, floor: &Cell) -
         distribution: setting.distribution,
         chars: order.chars,
         pin: setting.pin,
-        mode: MODE,
+        mode: Mode::Plain,
         print: setting.print,
         pause_ms: order.pause_ms,
         n: figures.calls,
@@ -124,6 +131,7 @@ fn row(peer: &str, setting: Setting, order: &Order, cell: &Cell, floor: &Cell) -
         ratio_lower_quartile: lower,
         ratio_upper_quartile: upper,
         p99_ratio: ratio(figures.p99 as f64 / floor.figures().p99.max(1) as f64),
+        plain_ratio: None,
         cpu_us_per_call: micros(figures.cpu_per_call as u64),
         cpu_ratio: ratio(cell.cpu_ratio(floor)),
     }

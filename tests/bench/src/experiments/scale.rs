@@ -8,7 +8,7 @@ use super::plan::Plan;
 use crate::child::Handle;
 use crate::nodes::Question;
 use crate::progress::{bar, is_stopped};
-use crate::results::{MODE, Scale, micros, ratio};
+use crate::results::{Mode, Scale, micros, ratio};
 use crate::statistics::{percentile, quartile};
 use cara_bench_ends::clock;
 use cara_bench_ends::{Pin, pin};
@@ -99,7 +99,7 @@ impl Fleet {
         Scale {
             nodes: self.nodes,
             pin: plan.pin,
-            mode: MODE,
+            mode: Mode::Plain,
             n: self.one.len() * plan.scale_calls as usize,
             request_us: middle(&self.one),
             request_ratio: compared(&self.one),

@@ -7,7 +7,7 @@ use crate::child::OwnQuestion;
 use crate::pair::{Pair, Setting};
 use crate::peers::Contender;
 use crate::progress::{bar, is_stopped};
-use crate::results::{MODE, Share, micros, ratio};
+use crate::results::{Mode, Share, micros, ratio};
 use crate::share::{Order, Times};
 use crate::statistics::percentile;
 use cara_bench_ends::Pin;
@@ -48,7 +48,7 @@ fn of(mut times: Times) -> Share {
     Share {
         chars: CHARS,
         pin: PIN,
-        mode: MODE,
+        mode: Mode::Plain,
         n,
         round_trip_us: micros(round_trip),
         generate_us: micros(generate),

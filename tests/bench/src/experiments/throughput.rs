@@ -6,7 +6,7 @@ use super::plan::{Group, Plan};
 use super::response::{Cells, start, turns};
 use crate::pair::Setting;
 use crate::progress::{bar, is_stopped};
-use crate::results::{Kind, MODE, Throughput, ratio};
+use crate::results::{Kind, Mode, Throughput, ratio};
 use crate::statistics::quartile;
 use cara_bench_ends::Burst;
 use cara_bench_ends::Delivery;
@@ -37,10 +37,16 @@ fn requests(group: &Group, cells: &Cells) -> Vec<Throughput> {
         let Some(floor) = cells.first() else { continue };
         let measured = group.peers.iter().zip(cells).filter(|(_, cell)| !cell.turns.is_empty());
         rows.extend(measured.map(|(peer, cell)| {
-            let peer = peer.name();
             let figures = cell.figures();
             let found = Found { n: figures.calls, per_second: figures.per_second, refused: 0, lost: 0 };
-            row(Kind::Request, peer, order.callers, group.setting.pin, found, cell.throughput_ratio(floor))
+            row(
+                Kind::Request,
+                peer.name_and_mode(),
+                order.callers,
+                group.setting.pin,
+                found,
+                cell.throughput_ratio(floor),
+            )
         }));
     }
     rows
@@ -53,14 +59,21 @@ struct Found {
     lost: u64,
 }
 
-fn row(kind: Kind, peer: &str, callers: u32, pin: Pin, found: Found, ratio_to_floor: f64) -> Throughput {
+fn row(
+    kind: Kind,
+    (peer, mode): (&str, Mode),
+    callers: u32,
+    pin: Pin,
+    found: Found,
+    ratio_to_floor: f64,
+) -> Throughput {
     Throughput {
         kind,
         peer: peer.to_owned(),
         callers,
         chars: CHARS,
         pin,
-        mode: MODE,
+        mode,
         n: found.n,
         requests_per_s: found.per_second.round(),
         ratio: ratio(ratio_to_floor),
@@ -102,7 +115,7 @@ fn one_way(plan: &Plan, setting: Setting, rows: &mut Vec<Throughput>) -> Result<
     {
         let ratios = own.iter().zip(&floor).map(|(own, floor)| own / floor.max(1e-9)).collect();
         let found = Found { n: own.len() * count as usize, per_second: quartile(own, 2), refused, lost };
-        rows.push(row(Kind::OneWay, peer.name(), 1, setting.pin, found, quartile(ratios, 2)));
+        rows.push(row(Kind::OneWay, peer.name_and_mode(), 1, setting.pin, found, quartile(ratios, 2)));
     }
     Ok(())
 }

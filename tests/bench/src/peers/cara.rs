@@ -1,6 +1,7 @@
 //! CARA through its public API, discovery on: a passive m_unit that echoes and takes, main m_units that call it, and
 //! the s_units of distribution 2. Both ends read the string as `&str`.
 
+use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -8,9 +9,10 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
 use cara_bench_ends::{Caller, Delivery, Executed, Limits, Peer, Place, Printer, Server};
+use cara_std::keys::{FleetKeys, Store, place::file_name};
 use cara_std::{
-    Builder, Call, CommunicationSystem, Constraints, Delivery as CaraDelivery, Interfaces, Parameters, ParametersView,
-    Peer as Node, RequestOptions, ServiceError, Threads, Unit, UnitEvent,
+    Builder, Call, CommunicationSystem, Constraints, Delivery as CaraDelivery, Fleet, Identity, Interfaces, Parameters,
+    ParametersView, Peer as Node, RequestOptions, ServiceError, Threads, Unit, UnitEvent,
 };
 
 /// Longest text in bytes.
@@ -25,15 +27,25 @@ const PATIENCE: Duration = Duration::from_secs(60);
 /// Parameters with one text.
 pub(crate) type Text = Parameters<PARAMETERS_BYTES>;
 
-/// How callers share links.
+/// How callers share links. All but [`Secured`](Self::Secured) are in plain mode.
 pub(crate) enum Cara {
     /// Each caller is an m_unit of its own.
     LinkEach,
+    /// As `LinkEach`, with keys.
+    Secured,
     /// All callers of a process use one link.
     OneLink(Mutex<Option<CommunicationSystem>>),
     /// As `LinkEach`, and [`IDLE_LINKS`] s_units are connected to the passive m_unit and do nothing.
     AmongIdle,
 }
+
+/// Most callers of one process.
+const CALLERS: u32 = 64;
+/// The ID number of the first caller.
+const FIRST_CALLER: u32 = 2;
+/// The ID number of the first of the further nodes of distribution 2.
+const FIRST_FURTHER: u32 = 100;
+const FURTHER: u32 = 5;
 
 /// Links that do nothing but keep alive, for [`Cara::AmongIdle`].
 const IDLE_LINKS: usize = 1_000;
@@ -44,7 +56,7 @@ pub(crate) fn idle(place: &Place) -> Result<()> {
     let mut units = Vec::new();
     for id in 0..IDLE_LINKS {
         let builder = Unit::builder(&format!("idle-{id}"), id as u32, "passive", 1)?;
-        let unit = placed(builder, place).threads(&threads).build_unit()?;
+        let unit = placed(builder, place).insecure().threads(&threads).build_unit()?;
         unit.start()?;
         units.push(unit);
     }
@@ -70,12 +82,49 @@ fn placed(builder: Builder<()>, place: &Place) -> Builder<()> {
     builder.fleet(place.run).discovery_port(place.discovery_port()).interfaces(Interfaces::Loopback)
 }
 
-fn system(place: &Place, name: &str, id: u32) -> Result<CommunicationSystem> {
-    let constraints = Constraints { message_size: MESSAGE_BYTES, maximum_nodes: 2_000, ..Constraints::M_UNIT };
-    let builder = placed(CommunicationSystem::builder(name, id)?, place);
-    let system = builder.constraints(constraints).build_system()?;
-    system.start()?;
-    Ok(system)
+fn main_name(id: u32) -> String {
+    format!("main-{id}")
+}
+
+fn further_name(number: u32) -> String {
+    format!("further-{number}")
+}
+
+/// Draws keys for a run's units into a folder of their own.
+fn draw_keys(place: &Place) -> Result<tempfile::TempDir> {
+    let folder = tempfile::tempdir()?;
+    let mut keys = FleetKeys::draw(Fleet(place.run))?;
+    let passive = Identity::m_unit("passive", 1)?;
+    keys.add(&passive, &[])?;
+    for id in FIRST_CALLER..FIRST_CALLER + CALLERS {
+        keys.add(&Identity::m_unit(&main_name(id), id)?, &[])?;
+    }
+    for number in 0..FURTHER {
+        let further = Identity::s_unit(&further_name(number), FIRST_FURTHER + number)?;
+        keys.add(&further, std::slice::from_ref(&passive))?;
+    }
+    Store::create(folder.path(), keys)?.save()?;
+    Ok(folder)
+}
+
+impl Cara {
+    /// Its keys from the folder that the server's address tells, or none.
+    fn keyed(&self, builder: Builder<()>, place: &Place, address: &str, identity: &Identity) -> Builder<()> {
+        let builder = placed(builder, place);
+        match self {
+            Self::Secured => builder.key_file(Path::new(address).join(file_name(identity, Fleet(place.run)))),
+            _ => builder.insecure(),
+        }
+    }
+
+    fn system(&self, place: &Place, address: &str, name: &str, id: u32) -> Result<CommunicationSystem> {
+        let constraints = Constraints { message_size: MESSAGE_BYTES, maximum_nodes: 2_000, ..Constraints::M_UNIT };
+        let builder = CommunicationSystem::builder(name, id)?;
+        let builder = self.keyed(builder, place, address, &Identity::m_unit(name, id)?);
+        let system = builder.constraints(constraints).build_system()?;
+        system.start()?;
+        Ok(system)
+    }
 }
 
 /// What the service does with a text: reads it, and prints it where that is asked for.
@@ -88,7 +137,10 @@ fn look_at(view: &ParametersView, printer: Printer) -> Result<(), ServiceError> 
 
 impl Peer for Cara {
     fn start_server(&self, place: &Place) -> Result<Server> {
-        let passive = system(place, "passive", 1)?;
+        let keys = matches!(self, Self::Secured).then(|| draw_keys(place)).transpose()?;
+        let address = keys.as_ref().map_or("by discovery", |keys| keys.path().to_str().unwrap_or_default());
+        let address = address.to_owned();
+        let passive = self.system(place, &address, "passive", 1)?;
         let (text, printer, executed) = (parameters()?, place.printer(), Arc::new(Executed::default()));
         let counted = executed.clone();
         let functions = passive.my_function_list();
@@ -111,19 +163,18 @@ impl Peer for Cara {
         };
         let counted = passive.clone();
         let counters = move || counted.counters().into_iter().map(|(name, count)| (name.to_owned(), count)).collect();
-        let address = String::from("by discovery");
         let (constrain, counters) = (Some(Box::new(constrain) as _), Box::new(counters));
-        Ok(Server { address, executed, constrain, counters, keep: Box::new((passive, idle)) })
+        Ok(Server { address, executed, constrain, counters, keep: Box::new((passive, idle, keys)) })
     }
 
-    fn connect(&self, place: &Place, _address: &str) -> Result<Box<dyn Caller>> {
-        static NEXT: AtomicU32 = AtomicU32::new(2);
+    fn connect(&self, place: &Place, address: &str) -> Result<Box<dyn Caller>> {
+        static NEXT: AtomicU32 = AtomicU32::new(FIRST_CALLER);
         let new = || {
             let id = NEXT.fetch_add(1, Ordering::Relaxed);
-            system(place, &format!("main-{}-{id}", std::process::id()), id)
+            self.system(place, address, &main_name(id), id)
         };
         let main = match self {
-            Self::LinkEach | Self::AmongIdle => new()?,
+            Self::LinkEach | Self::Secured | Self::AmongIdle => new()?,
             Self::OneLink(shared) => {
                 let mut shared = shared.lock().unwrap_or_else(PoisonError::into_inner);
                 let main = match shared.take() {
@@ -138,10 +189,12 @@ impl Peer for Cara {
         Ok(Box::new(Echo { _kept: Kept::Main(main), passive, parameters: parameters()?, failures }))
     }
 
-    fn connect_further(&self, place: &Place, _address: &str, number: u32) -> Result<Box<dyn Caller>> {
-        let builder = Unit::builder(&format!("further-{number}"), 100 + number, "passive", 1)?;
-        let constraints = Constraints { message_size: MESSAGE_BYTES, ..Constraints::M_UNIT };
-        let unit = placed(builder, place).constraints(Constraints { maximum_nodes: 1, ..constraints }).build_unit()?;
+    fn connect_further(&self, place: &Place, address: &str, number: u32) -> Result<Box<dyn Caller>> {
+        let (name, id) = (further_name(number), FIRST_FURTHER + number);
+        let builder = Unit::builder(&name, id, "passive", 1)?;
+        let builder = self.keyed(builder, place, address, &Identity::s_unit(&name, id)?);
+        let constraints = Constraints { message_size: MESSAGE_BYTES, maximum_nodes: 1, ..Constraints::M_UNIT };
+        let unit = builder.constraints(constraints).build_unit()?;
         let failures = Failures::watch(unit.events());
         unit.start()?;
         let passive = found(|| unit.manager())?;

@@ -10,16 +10,22 @@ use std::sync::{Arc, Mutex};
 use anyhow::{Context, Result};
 use cara_bench_ends::Peer;
 
+use crate::results::Mode;
+
 pub(crate) use outside::{Outside, OutsideReport, Selection};
+
+/// CARA with keys; in the rows it is `cara` in secured mode.
+pub(crate) const SECURED: &str = "cara_secured";
 
 type Make = fn() -> Box<dyn Peer>;
 
 /// All peers that this program plays, in the order in which they take turns. The first is the one that the others are
 /// compared with.
-const PEERS: [(&str, Make); 5] = [
+const PEERS: [(&str, Make); 6] = [
     ("floor", || Box::new(floor::Floor)),
     ("floor_again", || Box::new(floor::Floor)),
     ("cara", || Box::new(cara::Cara::LinkEach)),
+    (SECURED, || Box::new(cara::Cara::Secured)),
     ("cara_one_link", || Box::new(cara::Cara::OneLink(Mutex::new(None)))),
     ("cara_among_1000_idle", || Box::new(cara::Cara::AmongIdle)),
 ];
@@ -41,11 +47,19 @@ pub(crate) enum Contender {
 }
 
 impl Contender {
-    /// As the rows say it.
+    /// What its processes are told to play.
     pub(crate) fn name(&self) -> &str {
         match self {
             Self::Own(name) => name,
             Self::Outside(outside) => outside.name(),
+        }
+    }
+
+    /// Its name as the rows say it, and how its messages are protected.
+    pub(crate) fn name_and_mode(&self) -> (&str, Mode) {
+        match self.name() {
+            SECURED => ("cara", Mode::Secured),
+            name => (name, Mode::Plain),
         }
     }
 
