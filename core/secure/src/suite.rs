@@ -6,6 +6,9 @@ use noise_protocol::{DH, Hash, U8Array};
 use noise_rust_crypto::sensitive::Sensitive;
 use x25519_dalek::{PublicKey, StaticSecret};
 
+#[cfg(feature = "ring")]
+pub(crate) use crate::fast::ChaCha20Poly1305;
+#[cfg(not(feature = "ring"))]
 pub(crate) use noise_rust_crypto::ChaCha20Poly1305;
 
 /// X25519.
