@@ -81,16 +81,24 @@ impl<S: Storage> Node<S> {
         let another = self.answers.asked.is_some_and(|(at, asked)| asked != who && now < at + SAME_QUESTION);
         self.answers.asked = Some((now, who));
         let delay = self.random.jitter(ANSWER_GATHER);
-        self.answer_later(now + delay, from, who_has);
+        self.answer_later(now + delay, from, &who_has.identity, who_has.nonce);
         if another && self.answers.broadcast.is_none() {
             let earliest = self.answers.last_broadcast.map_or(now, |last| last + ANSWER_PAUSE);
             self.answers.broadcast = Some(earliest.max(now + ANSWER_GATHER));
         }
     }
 
+    /// An s_unit that looks for no manager looks at the network. There is no key of it and this unit: in secured mode it
+    /// gets the answer of a broadcast, which the fleet's code alone is for.
+    pub(super) fn answer_survey(&mut self, now: Instant, from: SocketAddr, who_has: &WhoHas, mode: Mode) {
+        let delay = self.spread(who_has.expected);
+        let nonce = if mode == Mode::Secured { 0 } else { who_has.nonce };
+        self.answer_later(now + delay, from, &who_has.identity, nonce);
+    }
+
     /// Plans an answer to one node. One that finds no room is left to the broadcast, or to the next question.
-    pub(super) fn answer_later(&mut self, at: Instant, to: SocketAddr, who_has: &WhoHas) {
-        let (nonce, who) = (who_has.nonce, who_has.identity.clone());
+    pub(super) fn answer_later(&mut self, at: Instant, to: SocketAddr, who: &Identity, nonce: u64) {
+        let who = who.clone();
         let waiting = self.answers.single.iter().any(|answer| answer.to == to && answer.nonce == nonce);
         if !waiting && self.answers.single.push(Answer { at, to, who, nonce }).is_err() {
             self.counters.add(NodeCounter::AnnounceDropped, 1);

@@ -248,10 +248,7 @@ impl<S: Storage> Node<S> {
             Some(manager) if manager.is(&self.config.identity) => self.answer_seeker(now, from, who_has),
             Some(manager) if self.manager() == Some(manager) => self.hold_back(now),
             None if who_has.identity.role() == Role::MUnit => self.heard_m_unit(now, from, who_has, mode),
-            None if here => {
-                let delay = self.spread(who_has.expected);
-                self.answer_later(now + delay, from, who_has);
-            }
+            None if here => self.answer_survey(now, from, who_has, mode),
             _ => self.counters.add(NodeCounter::WrongManager, 1),
         }
     }
@@ -287,7 +284,7 @@ impl<S: Storage> Node<S> {
         let delay = self.spread(who_has.expected);
         if !self.dials(&who_has.identity) {
             if !self.is_connected(&who_has.identity, who_has.epoch) {
-                self.answer_later(now + delay, from, who_has);
+                self.answer_later(now + delay, from, &who_has.identity, who_has.nonce);
             }
             return;
         }

@@ -53,7 +53,7 @@ impl<S: Storage> Node<S> {
             self.note_of(now, from, identity, Refusal::DuplicateIdentity);
             self.twins.hear(now, from, epoch);
             if let Some(who_has) = question.filter(|_| identity.role() == Role::MUnit) {
-                self.answer_later(now, from, who_has);
+                self.answer_later(now, from, identity, who_has.nonce);
             }
         }
         true

@@ -2,7 +2,8 @@
 
 use super::*;
 use crate::config::{FIRST_SEARCH, LONGEST_SEARCH, SEARCH_BUDGET, SEARCH_WINDOW};
-use crate::distribution::datagram::short_hash;
+use crate::distribution::authenticator::{Authenticator, CODE_BYTES};
+use crate::distribution::datagram::{Datagram, short_hash};
 
 const SOON: u64 = 400;
 
@@ -422,4 +423,54 @@ fn an_m_unit_that_cannot_reach_a_peer_any_more_asks_where_it_is() {
     node.hear(at(200_000), address(3, 7_001), &announce_bytes(&moved));
     let actions = run(&mut node, at(200_001), &mut Outbox::default());
     assert!(matches!(actions[..], [(_, Action::Dial { to, .. })] if to == address(3, 7_000)), "{actions:?}");
+}
+
+/// Secured mode with the fleet's code alone: there is no key of any pair.
+struct FleetOnly;
+
+impl Authenticator for FleetOnly {
+    fn mode(&self) -> Mode {
+        Mode::Secured
+    }
+
+    fn sign_for_fleet(&self, _: &[u8]) -> [u8; CODE_BYTES] {
+        [7; CODE_BYTES]
+    }
+
+    fn is_of_fleet(&self, _: &[u8], code: &[u8; CODE_BYTES]) -> bool {
+        *code == [7; CODE_BYTES]
+    }
+
+    fn sign_for(&self, _: &Identity, _: &[u8]) -> Option<[u8; CODE_BYTES]> {
+        None
+    }
+
+    fn is_of(&self, _: &Identity, _: &[u8], _: &[u8; CODE_BYTES]) -> bool {
+        false
+    }
+}
+
+/// Asks a secured manager; what it answered, and how many it has withheld.
+fn answers_of_secured(search: &WhoHas) -> (Vec<(SocketAddr, Vec<u8>)>, u64) {
+    let mut node = depot();
+    let (mut bytes, mut outbox) = ([0; SEARCH_BYTES], Outbox::default());
+    let length = search.encode(FLEET, &FleetOnly, &mut bytes).unwrap().len();
+    assert_eq!(node.datagram(at(0), address(3, 7_001), &mut bytes[..length], &FleetOnly), Sorted::Done);
+    while node.next_deadline() <= at(3_000) {
+        node.poll(node.next_deadline(), &mut outbox, &FleetOnly);
+    }
+    (outbox.sent, node.counters.value(NodeCounter::AnnounceWithheld))
+}
+
+#[test]
+fn whoever_looks_at_a_secured_network_needs_the_fleets_key_alone() {
+    let survey = WhoHas { wanted: None, ..search_of(&s_unit("survey", 9), 1) };
+    let (sent, withheld) = answers_of_secured(&survey);
+    assert_eq!((sent.len(), sent[0].0, withheld), (1, address(3, 7_001), 0));
+    let read = Datagram::decode(&sent[0].1, FLEET, &FleetOnly);
+    let Ok(Datagram::Announce(answer)) = read else { panic!("{read:?}") };
+    assert_eq!((answer.nonce, answer.identity.name()), (0, MANAGER));
+    // A vehicle without a key of the pair gets none, and the operator is told.
+    let (sent, withheld) = answers_of_secured(&search_of(&s_unit("agv", 9), 1));
+    assert_eq!((sent.len(), withheld), (0, 1));
 }
