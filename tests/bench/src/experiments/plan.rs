@@ -44,8 +44,7 @@ pub(crate) struct Plan {
     pub(crate) throughput: Group,
     pub(crate) throughput_pins: Vec<Pin>,
     pub(crate) one_way_peers: Vec<Contender>,
-    /// One-way messages of each turn; fewer than the events that a subscriber may have waiting, 4,096, so that each that
-    /// is refused can be told.
+    /// One-way messages of each turn: enough that the first and the last ones do not count.
     pub(crate) one_way: u32,
     /// Calls of each turn whose time is taken apart.
     pub(crate) share_calls: u32,
@@ -118,7 +117,7 @@ impl Plan {
             throughput: Group { setting, peers: with(&SHARED, outside.iter()), orders, rounds: extent.of(15, 3, 1) },
             throughput_pins: if extent == Extent::Full { pins[..pins.len() - 1].to_vec() } else { vec![pin] },
             one_way_peers: with(&COMPARED, outside.iter().filter(|outside| outside.is_one_way())),
-            one_way: extent.of(4_000, 4_000, 50),
+            one_way: extent.of(40_000, 40_000, 50),
             share_calls: extent.of(400, 200, 5),
             share_rounds: extent.of(20, 5, 1),
             nodes: extent.of(vec![1, 10, 100, 1_000, 5_000], vec![1, 10, 100, 1_000], vec![1, 3]),
