@@ -43,6 +43,15 @@ pub const LEASES: usize = 4;
 pub const WINDOW: u32 = 64;
 /// How long a unit waits on a new link for the peer's hello, and in secured mode for the whole proof, before it closes it.
 pub const HELLO_TIMEOUT: Duration = Duration::from_secs(2);
+/// A secured link makes its keys anew, in a new handshake, before they are so old. Up to an eighth less, by chance, so that a
+/// fleet that joined at once does not do it at once.
+pub const HANDSHAKE_LIFE: Duration = Duration::from_secs(12 * 3_600);
+/// The least time from one handshake of a link to the next.
+pub const SHORTEST_HANDSHAKE_LIFE: Duration = Duration::from_secs(1);
+/// How long a peer that is heard may take for its part of a new handshake on a live link before the link is given up.
+pub const RENEWAL_TIMEOUT: Duration = Duration::from_secs(60);
+/// Datagrams under the key before are taken for so long after the first one under the new key.
+pub const PREVIOUS_KEY_LIFE: Duration = Duration::from_secs(5);
 /// How long an old link may take to answer the challenge that tells a restarted peer from a duplicate one.
 pub const CHALLENGE_TIMEOUT: Duration = Duration::from_millis(300);
 /// Keep-alives that may be missed in a row.

@@ -11,6 +11,8 @@ use crate::suite::ChaCha20Poly1305;
 pub const TAG_BYTES: usize = 16;
 /// Frames that are sealed with one key; then both ends derive the next one from it.
 pub const FRAMES_PER_KEY: u64 = 1 << 20;
+/// Frames of one direction after which a new handshake is due, however young the keys are.
+pub const FRAMES_PER_HANDSHAKE: u64 = 1 << 32;
 
 /// The two directions of a link after its handshake.
 pub struct Channel {
@@ -18,6 +20,7 @@ pub struct Channel {
     receiving: Direction,
 }
 
+#[derive(Clone)]
 struct Direction {
     cipher: CipherState<ChaCha20Poly1305>,
     /// A frame that did not open ends the channel: what comes after it cannot be told from noise.
@@ -28,6 +31,29 @@ impl Channel {
     pub(crate) fn new(sending: CipherState<ChaCha20Poly1305>, receiving: CipherState<ChaCha20Poly1305>) -> Self {
         let direction = |cipher| Direction { cipher, broken: false };
         Self { sending: direction(sending), receiving: direction(receiving) }
+    }
+
+    /// What is sent from here on is sealed with the key of the other channel, and the old one is with that.
+    pub(crate) const fn swap_sending(&mut self, other: &mut Self) {
+        core::mem::swap(&mut self.sending, &mut other.sending);
+    }
+
+    /// The same for what comes.
+    pub(crate) const fn swap_receiving(&mut self, other: &mut Self) {
+        core::mem::swap(&mut self.receiving, &mut other.receiving);
+    }
+
+    pub(crate) fn is_worn(&self) -> bool {
+        let numbers = [&self.sending, &self.receiving].map(|direction| direction.cipher.get_next_n());
+        numbers.into_iter().any(|number| number >= FRAMES_PER_HANDSHAKE)
+    }
+
+    /// The key and the number of the next frame that is sealed.
+    pub(crate) fn next_seal(&self) -> ([u8; 32], u64) {
+        let mut sending = self.sending.clone();
+        sending.turn();
+        let (key, number) = sending.cipher.extract();
+        (*key, number)
     }
 }
 

@@ -17,6 +17,8 @@ use crate::suite::ChaCha20Poly1305;
 pub const HEADER_BYTES: usize = 1 + 8;
 /// Bytes that sealing adds in all.
 pub const OVERHEAD: usize = HEADER_BYTES + TAG_BYTES;
+/// Datagrams of one direction after which a new key is due, however young it is.
+pub const DATAGRAMS_PER_KEY: u64 = 1 << 32;
 /// Numbers behind the newest one that can still be told apart.
 pub const WINDOW: u64 = 64;
 
@@ -73,6 +75,20 @@ impl Sealer {
     /// The key, to be told to the other end.
     pub const fn key(&self) -> &DatagramKey {
         &self.key
+    }
+
+    /// The key's generation.
+    pub const fn generation(&self) -> u8 {
+        self.generation
+    }
+
+    pub(crate) const fn is_worn(&self) -> bool {
+        self.next >= DATAGRAMS_PER_KEY
+    }
+
+    /// The number of the next datagram.
+    pub(crate) const fn next_number(&self) -> u64 {
+        self.next
     }
 
     /// Seals `datagram` in place: [`HEADER_BYTES`] of room, the body, [`TAG_BYTES`] of room. `bound` is what the
@@ -133,6 +149,20 @@ impl Opener {
     pub fn replace(&mut self, key: DatagramKey, generation: u8) {
         let new = Keyed { key, generation, window: Window::NEW };
         self.previous = Some(core::mem::replace(&mut self.current, new));
+    }
+
+    /// The generation of the newest key.
+    pub const fn generation(&self) -> u8 {
+        self.current.generation
+    }
+
+    /// A datagram of the newest key has been opened.
+    pub const fn hears_newest(&self) -> bool {
+        self.current.window.end > 0
+    }
+
+    pub(crate) const fn is_worn(&self) -> bool {
+        self.current.window.end >= DATAGRAMS_PER_KEY
     }
 
     /// Datagrams of the key before are taken no longer.

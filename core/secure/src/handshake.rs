@@ -23,8 +23,13 @@ pub const MESSAGE_BYTES: usize = 48;
 #[error("the handshake failed: the other end has another key for this pair, or somebody changed what was sent")]
 pub struct HandshakeError;
 
-/// The end that opened the connection, until the other one has answered.
-pub struct Initiator(State);
+/// The end that opened the connection, until the other one has answered. It keeps what its message was made of, and makes
+/// it again when the answer comes: the state of a handshake is three times as large.
+pub struct Initiator {
+    key: PairKey,
+    prologue: [u8; 32],
+    ephemeral: Sensitive<[u8; 32]>,
+}
 
 type State = HandshakeState<X25519, ChaCha20Poly1305, Blake2s>;
 
@@ -42,6 +47,12 @@ pub fn prologue(initiator: &[u8], responder: &[u8]) -> [u8; 32] {
     transcript.add(initiator);
     transcript.add(responder);
     transcript.prologue()
+}
+
+/// The prologue of a handshake that makes the keys of a link anew: it covers the one before, and by that all that this one
+/// covered.
+pub fn renewal(binding: &[u8; 32]) -> [u8; 32] {
+    Blake2s256::new_with_prefix(b"CARA renewal 1").chain_update(binding).finalize().into()
 }
 
 /// The prologue while it is being seen.
@@ -98,16 +109,25 @@ impl Initiator {
         prologue: &[u8; 32],
         ephemeral: &[u8; 32],
     ) -> Result<(Self, [u8; MESSAGE_BYTES]), HandshakeError> {
-        let mut state = state(true, key, prologue, ephemeral);
+        let begun =
+            Self { key: key.clone(), prologue: *prologue, ephemeral: Sensitive::<[u8; 32]>::from_slice(ephemeral) };
+        let (_, message) = begun.state()?;
+        Ok((begun, message))
+    }
+
+    /// As it is when the message has been made.
+    fn state(&self) -> Result<(State, [u8; MESSAGE_BYTES]), HandshakeError> {
+        let mut state = state(true, &self.key, &self.prologue, &self.ephemeral);
         let message = write(&mut state)?;
-        Ok((Self(state), message))
+        Ok((state, message))
     }
 
     /// The responder has answered: it is who it says it is.
-    pub fn finish(mut self, message: &[u8]) -> Result<Agreed, HandshakeError> {
-        read(&mut self.0, message)?;
-        let (to_responder, to_initiator) = self.0.get_ciphers();
-        Ok(Agreed { channel: Channel::new(to_responder, to_initiator), binding: binding(&self.0) })
+    pub fn finish(self, message: &[u8]) -> Result<Agreed, HandshakeError> {
+        let (mut state, _) = self.state()?;
+        read(&mut state, message)?;
+        let (to_responder, to_initiator) = state.get_ciphers();
+        Ok(Agreed { channel: Channel::new(to_responder, to_initiator), binding: binding(&state) })
     }
 }
 

@@ -12,18 +12,18 @@ use crate::datagram::{self, DatagramError, DatagramKey, Opener, Sealer};
 use crate::handshake::{self, Agreed, Initiator, Transcript};
 use crate::keys::{KEY_BYTES, PairKey, keyed};
 
-/// What a link is proven with: the pair's key, and 32 bytes that were drawn for this link and are used for nothing else.
+/// What a link is proven with: the pair's key, and 32 bytes that were drawn for this proof and are used for nothing else.
 #[derive(Zeroize, ZeroizeOnDrop)]
 pub struct Credentials {
     key: PairKey,
     other: Option<PairKey>,
-    fresh: [u8; KEY_BYTES],
+    fresh: Fresh,
 }
 
 impl Credentials {
     /// To prove `key`.
     pub const fn new(key: PairKey, fresh: [u8; KEY_BYTES]) -> Self {
-        Self { key, other: None, fresh }
+        Self { key, other: None, fresh: Fresh(fresh) }
     }
 
     /// Also takes a peer that dials with `other`, the key of the generation before or behind: so keys are changed in a
@@ -33,9 +33,15 @@ impl Credentials {
         self.other = other;
         self
     }
+}
 
+/// What was drawn for one proof.
+#[derive(Clone, Zeroize, ZeroizeOnDrop)]
+struct Fresh([u8; KEY_BYTES]);
+
+impl Fresh {
     fn secret(&self, purpose: &[u8; 4], binding: &[u8]) -> [u8; KEY_BYTES] {
-        let mut mac = keyed(&self.fresh);
+        let mut mac = keyed(&self.0);
         mac.update(purpose);
         mac.update(binding);
         mac.finalize().into_bytes().into()
@@ -60,24 +66,173 @@ pub struct Noise(State);
 #[allow(clippy::large_enum_variant)]
 enum State {
     Introducing(Transcript),
-    Initiating(Initiator, Credentials),
-    Responding([u8; 32], Credentials),
+    Proving(Proving),
     Sealing(Sealing),
     Ended,
+}
+
+/// A proof that has begun.
+#[allow(clippy::large_enum_variant)]
+enum Proving {
+    Initiating(Initiator, Fresh),
+    Responding([u8; 32], Credentials),
+}
+
+/// A message, where there is one to send.
+type Message = Option<[u8; PROOF_BYTES]>;
+
+impl Proving {
+    /// What was begun, and the message of the end that dialled.
+    fn begin(dialed: bool, prologue: [u8; 32], credentials: Credentials) -> Result<(Self, Message), CloseReason> {
+        if !dialed {
+            return Ok((Self::Responding(prologue, credentials), None));
+        }
+        let begun = Initiator::begin(&credentials.key, &prologue, &credentials.fresh.ephemeral(&prologue));
+        let (initiator, message) = begun.map_err(|_| CloseReason::BadProof)?;
+        Ok((Self::Initiating(initiator, credentials.fresh.clone()), Some(message)))
+    }
+
+    /// What both ends have agreed on, the key of this end's datagrams, and the answer of the end that was dialled.
+    fn finish(self, message: &[u8]) -> Result<(Agreed, DatagramKey, Message), CloseReason> {
+        match self {
+            Self::Initiating(initiator, fresh) => {
+                let agreed = initiator.finish(message).map_err(|_| CloseReason::BadProof)?;
+                let own = fresh.datagrams(true, &agreed.binding);
+                Ok((agreed, own, None))
+            }
+            Self::Responding(prologue, credentials) => {
+                let (agreed, answer) = respond(&prologue, &credentials, message)?;
+                let own = credentials.fresh.datagrams(false, &agreed.binding);
+                Ok((agreed, own, Some(answer)))
+            }
+        }
+    }
 }
 
 /// A link whose ends have agreed on keys.
 struct Sealing {
     channel: Channel,
+    /// Of the last handshake; the next one covers it.
+    binding: [u8; 32],
     sealer: Sealer,
     /// Once the peer has told its key.
     opener: Option<Opener>,
+    renewing: Renewing,
+}
+
+/// A handshake that makes the keys anew.
+#[allow(clippy::large_enum_variant)]
+enum Renewing {
+    No,
+    Proving(Proving),
+    Turning(Turning),
+}
+
+/// New keys, while the two directions go over to them.
+struct Turning {
+    /// The new keys, and those of a direction that has turned.
+    channel: Channel,
+    /// The new key of this end's datagrams.
+    own: DatagramKey,
+    sent: bool,
+    received: bool,
+    /// The peer has told the new key of its datagrams.
+    confirmed: bool,
 }
 
 impl Sealing {
-    fn new(agreed: Agreed, dialed: bool, credentials: &Credentials) -> Self {
-        let own = credentials.datagrams(dialed, &agreed.binding);
-        Self { channel: agreed.channel, sealer: Sealer::new(own, 0), opener: None }
+    fn new(agreed: Agreed, own: DatagramKey) -> Self {
+        Self {
+            channel: agreed.channel,
+            binding: agreed.binding,
+            sealer: Sealer::new(own, 0),
+            opener: None,
+            renewing: Renewing::No,
+        }
+    }
+
+    /// Begins to make the keys anew.
+    fn prove(&mut self, dialed: bool, credentials: Credentials) -> Result<Message, CloseReason> {
+        if !matches!(self.renewing, Renewing::No) {
+            return Err(CloseReason::Protocol);
+        }
+        let (proving, message) = Proving::begin(dialed, handshake::renewal(&self.binding), credentials)?;
+        self.renewing = Renewing::Proving(proving);
+        Ok(message)
+    }
+
+    fn answer(&mut self, message: &[u8]) -> Result<Message, CloseReason> {
+        let Renewing::Proving(proving) = core::mem::replace(&mut self.renewing, Renewing::No) else {
+            return Err(CloseReason::Protocol);
+        };
+        let (Agreed { channel, binding }, own, answer) = proving.finish(message)?;
+        self.binding = binding;
+        self.renewing = Renewing::Turning(Turning { channel, own, sent: false, received: false, confirmed: false });
+        Ok(answer)
+    }
+
+    /// The generation and the key of this end's datagrams that the peer is told.
+    const fn told(&self) -> (u8, &DatagramKey) {
+        match &self.renewing {
+            Renewing::Turning(turning) => (self.next_generation(), &turning.own),
+            Renewing::No | Renewing::Proving(_) => (self.sealer.generation(), self.sealer.key()),
+        }
+    }
+
+    const fn next_generation(&self) -> u8 {
+        self.sealer.generation().wrapping_add(1)
+    }
+
+    fn confirmed(&mut self, generation: u8, key: DatagramKey) -> Result<(), CloseReason> {
+        match (&mut self.opener, &mut self.renewing) {
+            (opener @ None, Renewing::No) if generation == 0 => *opener = Some(Opener::new(key, generation)),
+            (Some(opener), Renewing::Turning(turning))
+                if turning.received && !turning.confirmed && generation == opener.generation().wrapping_add(1) =>
+            {
+                opener.replace(key, generation);
+                turning.confirmed = true;
+            }
+            _ => return Err(CloseReason::Protocol),
+        }
+        Ok(())
+    }
+
+    fn turn(&mut self) -> Result<(), CloseReason> {
+        match &mut self.renewing {
+            Renewing::Turning(turning) if !turning.sent => {
+                self.channel.swap_sending(&mut turning.channel);
+                turning.sent = true;
+                Ok(())
+            }
+            _ => Err(CloseReason::Protocol),
+        }
+    }
+
+    fn turned(&mut self) -> Result<(), CloseReason> {
+        match &mut self.renewing {
+            Renewing::Turning(turning) if !turning.received => {
+                self.channel.swap_receiving(&mut turning.channel);
+                turning.received = true;
+                Ok(())
+            }
+            _ => Err(CloseReason::Protocol),
+        }
+    }
+
+    /// The renewal is over: the old keys are gone, but for what may still come of the peer's datagrams.
+    fn acknowledged(&mut self) -> Result<(), CloseReason> {
+        match &self.renewing {
+            Renewing::Turning(turning) if turning.sent && turning.confirmed => {
+                self.sealer = Sealer::new(turning.own.clone(), self.next_generation());
+                self.renewing = Renewing::No;
+                Ok(())
+            }
+            _ => Err(CloseReason::Protocol),
+        }
+    }
+
+    fn is_worn(&self) -> bool {
+        self.channel.is_worn() || self.sealer.is_worn() || self.opener.as_ref().is_some_and(Opener::is_worn)
     }
 }
 
@@ -87,8 +242,12 @@ impl Noise {
         Self(State::Introducing(Transcript::new()))
     }
 
-    fn sealing(&mut self) -> Option<&mut Sealing> {
+    const fn sealing(&mut self) -> Option<&mut Sealing> {
         if let State::Sealing(sealing) = &mut self.0 { Some(sealing) } else { None }
+    }
+
+    const fn sealed(&self) -> Option<&Sealing> {
+        if let State::Sealing(sealing) = &self.0 { Some(sealing) } else { None }
     }
 }
 
@@ -107,11 +266,15 @@ impl Seal for Noise {
         self.sealing().ok_or(CloseReason::Protocol)?.channel.seal(frame)
     }
 
+    fn turn(&mut self) -> Result<(), CloseReason> {
+        self.sealing().ok_or(CloseReason::Protocol)?.turn()
+    }
+
     fn open<'f>(&mut self, frame: &'f mut [u8]) -> Result<&'f mut [u8], CloseReason> {
         match &mut self.0 {
             State::Sealing(sealing) => sealing.channel.open(frame),
             State::Ended => Err(CloseReason::Protocol),
-            State::Introducing(_) | State::Initiating(..) | State::Responding(..) => Ok(frame),
+            State::Introducing(_) | State::Proving(_) => Ok(frame),
         }
     }
 }
@@ -124,7 +287,7 @@ impl Secure for Noise {
     }
 
     fn is_sealing(&self) -> bool {
-        matches!(self.0, State::Sealing(_))
+        self.sealed().is_some()
     }
 
     fn introduce(&mut self, hello: &[u8]) {
@@ -133,41 +296,34 @@ impl Secure for Noise {
         }
     }
 
-    fn prove(&mut self, dialed: bool, credentials: Credentials) -> Result<Option<[u8; PROOF_BYTES]>, CloseReason> {
+    fn prove(&mut self, dialed: bool, credentials: Credentials) -> Result<Message, CloseReason> {
+        if let Some(sealing) = self.sealing() {
+            return sealing.prove(dialed, credentials);
+        }
         let State::Introducing(transcript) = core::mem::replace(&mut self.0, State::Ended) else {
             return Err(CloseReason::Protocol);
         };
-        let prologue = transcript.prologue();
-        if !dialed {
-            self.0 = State::Responding(prologue, credentials);
-            return Ok(None);
-        }
-        let begun = Initiator::begin(&credentials.key, &prologue, &credentials.ephemeral(&prologue));
-        let (initiator, message) = begun.map_err(|_| CloseReason::BadProof)?;
-        self.0 = State::Initiating(initiator, credentials);
-        Ok(Some(message))
+        let (proving, message) = Proving::begin(dialed, transcript.prologue(), credentials)?;
+        self.0 = State::Proving(proving);
+        Ok(message)
     }
 
-    fn answer(&mut self, message: &[u8]) -> Result<Option<[u8; PROOF_BYTES]>, CloseReason> {
-        let (sealing, answer) = match core::mem::replace(&mut self.0, State::Ended) {
-            State::Initiating(initiator, credentials) => {
-                let agreed = initiator.finish(message).map_err(|_| CloseReason::BadProof)?;
-                (Sealing::new(agreed, true, &credentials), None)
-            }
-            State::Responding(prologue, credentials) => {
-                let (agreed, answer) = respond(&prologue, &credentials, message)?;
-                (Sealing::new(agreed, false, &credentials), Some(answer))
-            }
-            _ => return Err(CloseReason::Protocol),
+    fn answer(&mut self, message: &[u8]) -> Result<Message, CloseReason> {
+        if let Some(sealing) = self.sealing() {
+            return sealing.answer(message);
+        }
+        let State::Proving(proving) = core::mem::replace(&mut self.0, State::Ended) else {
+            return Err(CloseReason::Protocol);
         };
-        self.0 = State::Sealing(sealing);
+        let (agreed, own, answer) = proving.finish(message)?;
+        self.0 = State::Sealing(Sealing::new(agreed, own));
         Ok(answer)
     }
 
     fn confirmation(&self) -> [u8; CONFIRMATION_BYTES] {
         let mut confirmation = [0; CONFIRMATION_BYTES];
-        if let State::Sealing(sealing) = &self.0 {
-            let told = core::iter::once(&0).chain(sealing.sealer.key().expose());
+        if let Some((generation, key)) = self.sealed().map(Sealing::told) {
+            let told = core::iter::once(&generation).chain(key.expose());
             confirmation.iter_mut().zip(told).for_each(|(to, from)| *to = *from);
         }
         confirmation
@@ -176,8 +332,29 @@ impl Secure for Noise {
     fn confirmed(&mut self, confirmation: &[u8]) -> Result<(), CloseReason> {
         let (&generation, key) = confirmation.split_first().ok_or(CloseReason::Protocol)?;
         let key = DatagramKey::new(key.try_into().map_err(|_| CloseReason::Protocol)?);
-        self.sealing().ok_or(CloseReason::Protocol)?.opener = Some(Opener::new(key, generation));
-        Ok(())
+        self.sealing().ok_or(CloseReason::Protocol)?.confirmed(generation, key)
+    }
+
+    fn turned(&mut self) -> Result<(), CloseReason> {
+        self.sealing().ok_or(CloseReason::Protocol)?.turned()
+    }
+
+    fn acknowledged(&mut self) -> Result<(), CloseReason> {
+        self.sealing().ok_or(CloseReason::Protocol)?.acknowledged()
+    }
+
+    fn forget_previous(&mut self) {
+        if let Some(opener) = self.sealing().and_then(|sealing| sealing.opener.as_mut()) {
+            opener.forget_previous();
+        }
+    }
+
+    fn hears_newest(&self) -> bool {
+        self.sealed().and_then(|sealing| sealing.opener.as_ref()).is_some_and(Opener::hears_newest)
+    }
+
+    fn is_worn(&self) -> bool {
+        self.sealed().is_some_and(Sealing::is_worn)
     }
 
     fn datagram_room(&self) -> (usize, usize) {
@@ -203,7 +380,7 @@ fn respond(
     credentials: &Credentials,
     message: &[u8],
 ) -> Result<(Agreed, [u8; PROOF_BYTES]), CloseReason> {
-    let ephemeral = credentials.ephemeral(prologue);
+    let ephemeral = credentials.fresh.ephemeral(prologue);
     let keys = core::iter::once(&credentials.key).chain(&credentials.other);
     let mut answers = keys.filter_map(|key| handshake::answer(key, prologue, &ephemeral, message).ok());
     answers.next().ok_or(CloseReason::BadProof)
@@ -226,6 +403,22 @@ impl Cipher {
             Mode::Secured => Self::Noise(Noise::new()),
         }
     }
+
+    /// What the next frame and the next datagram would be sealed with: a hash of the key, and the number. So a test can tell
+    /// that nothing is ever sealed twice with the same.
+    #[doc(hidden)]
+    pub fn next_seals(&self) -> Option<[([u8; 16], u64); 2]> {
+        let Self::Noise(noise) = self else { return None };
+        let sealing = noise.sealed()?;
+        let (key, number) = sealing.channel.next_seal();
+        let datagrams = (*sealing.sealer.key().expose(), sealing.sealer.next_number());
+        Some([(key, number), datagrams].map(|(key, number)| (hash(&key), number)))
+    }
+}
+
+fn hash(key: &[u8; KEY_BYTES]) -> [u8; 16] {
+    let hash: [u8; KEY_BYTES] = keyed(key).chain_update(b"seal").finalize().into_bytes().into();
+    hash.first_chunk().copied().unwrap_or_default()
 }
 
 macro_rules! either {
@@ -244,6 +437,10 @@ impl Seal for Cipher {
 
     fn seal(&mut self, frame: &mut [u8]) -> Result<(), CloseReason> {
         either!(self, cipher => cipher.seal(frame))
+    }
+
+    fn turn(&mut self) -> Result<(), CloseReason> {
+        either!(self, cipher => cipher.turn())
     }
 
     fn open<'f>(&mut self, frame: &'f mut [u8]) -> Result<&'f mut [u8], CloseReason> {
@@ -285,6 +482,26 @@ impl Secure for Cipher {
         either!(self, cipher => cipher.confirmed(confirmation))
     }
 
+    fn turned(&mut self) -> Result<(), CloseReason> {
+        either!(self, cipher => cipher.turned())
+    }
+
+    fn acknowledged(&mut self) -> Result<(), CloseReason> {
+        either!(self, cipher => cipher.acknowledged())
+    }
+
+    fn forget_previous(&mut self) {
+        either!(self, cipher => cipher.forget_previous());
+    }
+
+    fn hears_newest(&self) -> bool {
+        either!(self, cipher => cipher.hears_newest())
+    }
+
+    fn is_worn(&self) -> bool {
+        either!(self, cipher => cipher.is_worn())
+    }
+
     fn datagram_room(&self) -> (usize, usize) {
         either!(self, cipher => cipher.datagram_room())
     }
@@ -304,7 +521,7 @@ mod tests {
 
     /// Each link of a board has one.
     #[test]
-    fn a_cipher_takes_no_more_than_640_bytes() {
-        assert!(size_of::<Cipher>() <= 640, "{}", size_of::<Cipher>());
+    fn a_cipher_takes_no_more_than_440_bytes() {
+        assert!(size_of::<Cipher>() <= 440, "{}", size_of::<Cipher>());
     }
 }

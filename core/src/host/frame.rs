@@ -42,9 +42,9 @@ pub enum Frame<'b> {
     Pong,
     /// A session body (keep-alive, renewal), as it otherwise travels in a datagram.
     Session(&'b [u8]),
-    /// A message of the proof that opens a secured link.
+    /// A message of the proof that opens a secured link, or makes its keys anew.
     Proof(&'b [u8]),
-    /// The first sealed frame of an end: it has proven itself, and tells what is needed for its datagrams.
+    /// The first frame of an end under its keys: it has proven itself, and tells what is needed for its datagrams.
     Confirm(&'b [u8]),
     /// A piece of a message.
     Chunk(Chunk<'b>),
@@ -64,6 +64,11 @@ pub struct Chunk<'b> {
 }
 
 impl<'b> Frame<'b> {
+    /// A proof that says nothing more: the last frame of its direction under the keys so far.
+    pub const TURN: Self = Self::Proof(&[]);
+    /// A confirmation that tells nothing: the other end's has come.
+    pub const ACKNOWLEDGEMENT: Self = Self::Confirm(&[]);
+
     /// Reads a frame's body. Any deviation from the format is a protocol error.
     pub fn parse(body: &'b [u8]) -> Result<Self, CloseReason> {
         let (&kind, rest) = body.split_first().ok_or(CloseReason::Protocol)?;
@@ -113,17 +118,7 @@ impl<'b> Chunk<'b> {
 
 /// The frames that are not chunks, encoded into `out`; returns how many bytes were written, 0 where they do not fit.
 pub fn encode(frame: &Frame<'_>, overhead: usize, out: &mut [u8]) -> usize {
-    let (kind, payload): (u8, &[u8]) = match frame {
-        Frame::Hello(bytes) => (HELLO, bytes),
-        Frame::Refuse(code) => (REFUSE, core::slice::from_ref(code)),
-        Frame::Close(code) => (CLOSE, core::slice::from_ref(code)),
-        Frame::Ping => (PING, &[]),
-        Frame::Pong => (PONG, &[]),
-        Frame::Session(bytes) => (SESSION, bytes),
-        Frame::Proof(bytes) => (PROOF, bytes),
-        Frame::Confirm(bytes) => (CONFIRM, bytes),
-        Frame::Chunk(_) => return 0,
-    };
+    let Some((kind, payload)) = kind_and_payload(frame) else { return 0 };
     let body_length = payload.len().saturating_add(1).saturating_add(overhead);
     let Some(frame_length) = frame_length(body_length) else { return 0 };
     let Some(out) = out.get_mut(..frame_length) else { return 0 };
@@ -132,6 +127,32 @@ pub fn encode(frame: &Frame<'_>, overhead: usize, out: &mut [u8]) -> usize {
     writer.put(&[kind]);
     writer.put(payload);
     frame_length
+}
+
+/// Bytes on the wire of a frame that is no chunk.
+pub fn encoded_length(frame: &Frame<'_>, overhead: usize) -> usize {
+    let payload = kind_and_payload(frame).map_or(0, |(_, payload)| payload.len());
+    payload.saturating_add(HEADER_BYTES).saturating_add(1).saturating_add(overhead)
+}
+
+/// `None` for a chunk.
+fn kind_and_payload<'b>(frame: &'b Frame<'_>) -> Option<(u8, &'b [u8])> {
+    Some(match frame {
+        Frame::Hello(bytes) => (HELLO, bytes),
+        Frame::Refuse(code) => (REFUSE, core::slice::from_ref(code)),
+        Frame::Close(code) => (CLOSE, core::slice::from_ref(code)),
+        Frame::Ping => (PING, &[]),
+        Frame::Pong => (PONG, &[]),
+        Frame::Session(bytes) => (SESSION, bytes),
+        Frame::Proof(bytes) => (PROOF, bytes),
+        Frame::Confirm(bytes) => (CONFIRM, bytes),
+        Frame::Chunk(_) => return None,
+    })
+}
+
+/// Whether the frame at the start of `bytes` (not sealed yet) is a [`Frame::TURN`].
+pub fn is_turn(bytes: &[u8], overhead: usize) -> bool {
+    bytes.get(HEADER_BYTES) == Some(&PROOF) && first_frame_length(bytes) == Some(encoded_length(&Frame::TURN, overhead))
 }
 
 fn frame_length(body_length: usize) -> Option<usize> {

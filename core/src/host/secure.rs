@@ -7,6 +7,11 @@
 //! ([`Secure::prove`], [`Secure::answer`]). From then on all frames are sealed. The first sealed frame of each end
 //! confirms that it has the keys, and tells the key of its datagrams ([`Secure::confirmation`]). Nothing that the peer
 //! has said counts before that frame has opened.
+//!
+//! # How its keys are made anew
+//! On a link that lives long the same proof is made again, in sealed frames, and covers what the one before has agreed on.
+//! Each end marks the last frame under its old keys ([`Seal::turn`], [`Secure::turned`]) and confirms behind it, under the
+//! new ones. Datagrams go on under the old key until the other end has the new one ([`Secure::acknowledged`]).
 
 use crate::config::Mode;
 use crate::error::CloseReason;
@@ -27,6 +32,11 @@ pub trait Seal {
     /// Seals `frame`, whose last [`overhead`](Self::overhead) bytes are room for the tag.
     fn seal(&mut self, frame: &mut [u8]) -> Result<(), CloseReason>;
 
+    /// The frame that was sealed last was the last one under the keys so far.
+    fn turn(&mut self) -> Result<(), CloseReason> {
+        Err(CloseReason::Protocol)
+    }
+
     /// Opens `frame` and returns its body. Until both ends have proven themselves that is the frame as it is.
     fn open<'f>(&mut self, frame: &'f mut [u8]) -> Result<&'f mut [u8], CloseReason>;
 }
@@ -45,19 +55,43 @@ pub trait Secure: Seal {
     /// A hello as it travels: first the dialler's, then the other one's. The proof covers both.
     fn introduce(&mut self, hello: &[u8]);
 
-    /// Begins the proof. The end that dialled gets the message to send.
+    /// Begins the proof, or, where frames are sealed, begins it anew. The end that dialled gets the message to send.
     fn prove(&mut self, dialed: bool, credentials: Self::Credentials)
     -> Result<Option<[u8; PROOF_BYTES]>, CloseReason>;
 
-    /// Takes the other end's message. The end that was dialled gets the answer to send, which is not sealed; everything
-    /// behind it is.
+    /// Takes the other end's message. The end that was dialled gets the answer to send. In the proof with which a link
+    /// begins it is not sealed, and everything behind it is.
     fn answer(&mut self, message: &[u8]) -> Result<Option<[u8; PROOF_BYTES]>, CloseReason>;
 
-    /// What this end tells in its first sealed frame.
+    /// What this end tells in its first sealed frame, or in the first one under new keys.
     fn confirmation(&self) -> [u8; CONFIRMATION_BYTES];
 
-    /// What the other end told in its first sealed frame.
+    /// What the other end told in its first sealed frame, or in the first one under new keys. Datagrams under the key
+    /// before are taken until [`forget_previous`](Self::forget_previous).
     fn confirmed(&mut self, confirmation: &[u8]) -> Result<(), CloseReason>;
+
+    /// The frame that was opened last was the other end's last one under the keys so far.
+    fn turned(&mut self) -> Result<(), CloseReason> {
+        Err(CloseReason::Protocol)
+    }
+
+    /// The other end has what this one told under the new keys, which it seals its datagrams with from here on.
+    fn acknowledged(&mut self) -> Result<(), CloseReason> {
+        Err(CloseReason::Protocol)
+    }
+
+    /// Datagrams under the key before are taken no longer.
+    fn forget_previous(&mut self) {}
+
+    /// A datagram under the newest key that the other end told has been opened.
+    fn hears_newest(&self) -> bool {
+        true
+    }
+
+    /// So much has been sealed with the keys that new ones are due.
+    fn is_worn(&self) -> bool {
+        false
+    }
 
     /// Room that a datagram needs in front of its body and behind it, at most [`DATAGRAM_OVERHEAD`] in all.
     fn datagram_room(&self) -> (usize, usize);

@@ -356,6 +356,7 @@ impl<T: Send + 'static> Engine<T> {
                 Some(Event::Reply(id, outcome)) => {
                     state.finish(id, outcome.map(|_| Default::default()));
                 }
+                Some(Event::Introduced) => self.prove(link, state),
                 Some(event) => {
                     if let Event::Closed(_) = event {
                         link.stream.shutdown();

@@ -37,6 +37,8 @@ entry!(frames, {
     keep(Frame::parse(unknown_slice()));
     keep(frame::encode(unknown(), *unknown(), unknown_slice()));
     keep((frame::first_frame_length(unknown_slice()), frame::ends_message(unknown_slice())));
+    keep(frame::is_turn(unknown_slice(), *unknown()));
+    keep(frame::encoded_length(&Frame::Proof(unknown_slice()), *unknown()));
 });
 
 entry!(chunks, {

@@ -21,6 +21,10 @@ impl Seal for AnyCipher {
         *unknown()
     }
 
+    fn turn(&mut self) -> Result<(), CloseReason> {
+        *unknown()
+    }
+
     fn open<'f>(&mut self, frame: &'f mut [u8]) -> Result<&'f mut [u8], CloseReason> {
         keep(frame);
         if *unknown() { Ok(unknown_slice()) } else { Err(*unknown()) }
@@ -58,6 +62,26 @@ impl Secure for AnyCipher {
 
     fn confirmed(&mut self, confirmation: &[u8]) -> Result<(), CloseReason> {
         keep(confirmation);
+        *unknown()
+    }
+
+    fn turned(&mut self) -> Result<(), CloseReason> {
+        *unknown()
+    }
+
+    fn acknowledged(&mut self) -> Result<(), CloseReason> {
+        *unknown()
+    }
+
+    fn forget_previous(&mut self) {
+        keep(self);
+    }
+
+    fn hears_newest(&self) -> bool {
+        *unknown()
+    }
+
+    fn is_worn(&self) -> bool {
         *unknown()
     }
 
@@ -111,6 +135,8 @@ entry!(plain, {
     Plain.introduce(unknown_slice());
     keep((Plain.prove(*unknown(), ()), Plain.answer(unknown_slice()), Plain.confirmed(unknown_slice())));
     keep(Plain.seal_datagram(unknown_slice(), unknown_slice()));
+    keep((Plain.turn(), Plain.turned(), Plain.acknowledged(), Plain.hears_newest(), Plain.is_worn()));
+    Plain.forget_previous();
     keep(Plain.open_datagram(unknown_slice(), unknown_slice()));
 });
 

@@ -101,6 +101,7 @@ entry!(session_connected, {
 });
 
 entry!(session_ended, {
+    session().renew_every(*unknown());
     session().prove(context(), *unknown());
     session().refuse(context(), *unknown());
     session().close(context(), *unknown());

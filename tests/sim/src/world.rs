@@ -20,6 +20,7 @@ use crate::network::Network;
 use crate::plan::{Crash, FaultPlan};
 use crate::queue::Queue;
 
+mod audited;
 mod builder;
 mod driving;
 mod events;
@@ -39,6 +40,7 @@ pub use events::UnitEvent;
 pub use handle::{Peer, UnitHandle};
 pub use service::{BoxedParameters, Call, Outcome, Service, boxed_parameters};
 
+use audited::Seals;
 use replies::Promise;
 use state::UnitState;
 use tasks::{Job, Owner, Tasks};
@@ -77,6 +79,8 @@ struct Inner {
     sleepers: Queue<(HostId, Promise<()>)>,
     /// Of the units to come.
     mode: Mode,
+    /// What all units have sealed with.
+    seals: Seals,
     /// Hooks that run before anything else.
     urgent: VecDeque<Box<dyn FnOnce()>>,
     spawned: Vec<(Owner, Job)>,
@@ -139,6 +143,7 @@ impl World {
             units: Vec::new(),
             sleepers: Queue::new(),
             mode,
+            seals: Seals::default(),
             urgent: VecDeque::new(),
             spawned: Vec::new(),
         };
@@ -169,6 +174,11 @@ impl World {
     /// Lends the network, to change paths and to inject faults.
     pub fn network<R>(&self, act: impl FnOnce(&mut Network) -> R) -> R {
         act(&mut self.shared.inner.borrow_mut().network)
+    }
+
+    /// Frames and datagrams that were sealed, each with a key and number of its own: the run ends when two have the same.
+    pub fn sealed(&self) -> usize {
+        self.shared.with(|inner| inner.seals.count())
     }
 
     /// What was injected so far.

@@ -31,6 +31,8 @@ crate::counters::counters! {
         DatagramsRepeated,
         /// Links whose peers did not prove that they have the key of the pair.
         ProofsFailed,
+        /// Handshakes that were made anew on live links.
+        KeysRenewed,
         /// Links that were ended in clear by somebody who had not proven who it is.
         FarewellsInClear,
         /// Links refused because there is no key for the pair.

@@ -39,7 +39,7 @@ pub enum Incoming {
     Session(Place),
     /// A message of the proof.
     Proof(Place),
-    /// What the peer tells in its first sealed frame.
+    /// What the peer tells in its first frame under its keys.
     Confirm(Place),
     /// A whole message.
     Message(Priority, Place),
@@ -215,6 +215,12 @@ impl<S: Storage, C: Seal> Link<S, C> {
             self.counters.add(LinkCounter::FramesWithheld, 1);
         }
         accepted
+    }
+
+    /// Accepts all of these frames that are no chunks, one behind the other, or none: `false` when the room reserved for
+    /// such frames is too full.
+    pub(crate) fn send_frames(&mut self, frames: &[Frame<'_>]) -> bool {
+        self.sender.has_room_for_frames(frames) && frames.iter().all(|frame| self.send_frame(frame))
     }
 
     /// Accepts a frame that is no chunk and is not sealed: before the proof. `false` as above.

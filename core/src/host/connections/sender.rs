@@ -159,6 +159,13 @@ impl<S: Storage> Sender<S> {
         self.urgent.extend_from_slice(scratch.get(..length).unwrap_or(&[])).is_ok()
     }
 
+    /// Whether all of these frames that are no chunks would be accepted now.
+    pub(super) fn has_room_for_frames(&self, frames: &[Frame<'_>]) -> bool {
+        let length = |frame| frame::encoded_length(frame, self.cut.overhead);
+        let end = frames.iter().map(length).fold(self.urgent.len(), usize::saturating_add);
+        end <= URGENT_BYTES.saturating_sub(EMERGENCY_RESERVE)
+    }
+
     /// Writes what the network takes now; returns how many bytes that were.
     pub(super) fn flush<C: Seal>(
         &mut self,
@@ -218,8 +225,12 @@ impl<S: Storage> Sender<S> {
     fn seal_next<C: Seal>(&mut self, cipher: &mut C) -> Result<bool, CloseReason> {
         while self.urgent_sealed < self.urgent.len() {
             let rest = self.urgent.get_mut(self.urgent_sealed..).unwrap_or(&mut []);
+            let turns = frame::is_turn(rest, self.cut.overhead);
             let length = seal_first(cipher, rest)?;
             self.urgent_sealed = self.urgent_sealed.saturating_add(length);
+            if turns {
+                cipher.turn()?;
+            }
         }
         if self.urgent_sealed > 0 {
             return Ok(true);

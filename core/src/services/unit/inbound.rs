@@ -132,6 +132,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         };
         self.link.counters.add(LinkCounter::DatagramsReceived, 1);
         self.liveness.heard_datagram(cx.now);
+        self.datagram_opened(cx.now);
         match self.session_body(cx, Place::lent(body.len()), body) {
             Outcome::Event(event) => Some(event),
             _ => None,
@@ -176,6 +177,8 @@ impl<S: Storage, C: Secure> Session<S, C> {
             (Incoming::Confirm(place), Phase::Proving { .. }) if self.link.cipher().is_sealing() => {
                 self.confirmation_arrived(cx, place, lent)
             }
+            (Incoming::Proof(place), Phase::Live) => self.proof_on_live(cx, place, lent),
+            (Incoming::Confirm(place), Phase::Live) => self.confirmation_on_live(cx, place, lent),
             (Incoming::Ping, Phase::Live) => {
                 self.link.send_frame(&Frame::Pong);
                 self.flush(cx);

@@ -6,8 +6,9 @@
 //! returned events: after [`Event::Hello`] the port asks the node and calls [`Session::accept`] or [`Session::refuse`].
 //!
 //! # What a port does
-//! - [`Event::Introduced`], which only secured links have: look the key of the pair up, then [`Session::prove`], or
-//!   [`Session::refuse`] with [`Refusal::NoKey`];
+//! - [`Event::Introduced`], which only secured links have, at their beginning and whenever their keys are made anew: look
+//!   the key of the pair up, then [`Session::prove`] with bytes that are freshly drawn, or [`Session::refuse`] with
+//!   [`Refusal::NoKey`]. On a live link it comes from [`Session::poll`] or [`Session::receive`], and nothing else changes;
 //! - bytes arrive: [`Session::receive`] until they are consumed and nothing more comes out, then [`Session::next_call`]
 //!   until it returns `None`, running what it returns;
 //! - the stream is writable: [`Session::writable`];
@@ -24,6 +25,7 @@ mod permitting;
 mod pinging;
 mod proving;
 mod publishing;
+mod renewing;
 mod timing;
 
 pub use inbound::{Receipt, ReplyBlock};
@@ -100,7 +102,8 @@ pub struct SessionStorage<S: Storage> {
 #[derive(Debug)]
 pub enum Event<'b> {
     /// The peer says who it is ([`Session::identity`]) and is to prove it: [`Session::prove`] with the key of the pair, or
-    /// [`Session::refuse`] with [`Refusal::NoKey`]. Nothing else that it says counts yet. Never in plain mode.
+    /// [`Session::refuse`] with [`Refusal::NoKey`]. On a link that is not live nothing else that it says counts yet. Never
+    /// in plain mode.
     Introduced,
     /// The peer introduced itself, and has proven who it is where links are secured: ask the node, then
     /// [`Session::accept`] or [`Session::refuse`].
@@ -193,6 +196,7 @@ pub struct Session<S: Storage, C: Secure> {
     pings: pinging::Pings,
     clock: PeerClock,
     timers: Timers,
+    renewal: renewing::Renewal,
     requests: Requests<S>,
     calls: Calls<S>,
     publishing: publishing::Publishing<S>,
@@ -226,6 +230,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
             pings: pinging::Pings::new(),
             clock: PeerClock::default(),
             timers: Timers::new(now),
+            renewal: renewing::Renewal::new(),
             requests: Requests::new(storage.pending),
             calls: Calls::new(storage.running),
             publishing: publishing::Publishing::new(storage.publications),
@@ -359,6 +364,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         }
         self.phase = Phase::Live;
         self.timers.keep_alive = cx.now;
+        self.rest_until_renewal(cx.now);
         debug!("link {} is live", self.link.id().0);
     }
 
@@ -409,6 +415,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     /// The stream takes bytes again.
     pub fn writable<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
         self.flush(cx);
+        self.pump_renewal(cx);
         self.pump(cx);
     }
 

@@ -22,13 +22,18 @@ use crate::time::{Duration, Instant};
 impl<S: Storage, C: Secure> Session<S, C> {
     /// Proves to the peer of [`Event::Introduced`] that this unit has the pair's key, and waits for the same from it. It
     /// comes as [`Event::Hello`]; if it does not, the link ends with [`CloseReason::BadProof`],
-    /// [`CloseReason::Unproven`] or [`CloseReason::HelloTimeout`].
+    /// [`CloseReason::Unproven`] or [`CloseReason::HelloTimeout`]. On a live link the keys are made anew, and no event tells
+    /// that they are; failing that, the link ends with one of those reasons.
     pub fn prove<M: Mailman, B: Buffers<S>, H: Service>(
         &mut self,
         cx: &mut Context<'_, S, M, B, H>,
         credentials: C::Credentials,
     ) {
-        let Phase::Introduced { until } = self.phase else { return };
+        let until = match self.phase {
+            Phase::Introduced { until } => until,
+            Phase::Live => return self.prove_anew(cx, credentials),
+            _ => return,
+        };
         match self.link.cipher().prove(self.dialed, credentials) {
             Ok(message) => {
                 self.phase = Phase::Proving { until };

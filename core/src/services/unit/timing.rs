@@ -102,6 +102,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
             Phase::Live => {
                 let timers = &self.timers;
                 let own = timers.keep_alive.min(timers.gathered).min(timers.lease).min(timers.renewal);
+                let own = own.min(self.renewal.deadline(self.dialed));
                 own.min(self.requests.deadline()).min(self.liveness.deadline())
             }
         }
@@ -151,6 +152,9 @@ impl<S: Storage, C: Secure> Session<S, C> {
         }
         if cx.now >= self.timers.keep_alive {
             self.send_keep_alive(cx);
+        }
+        if let Some(event) = self.poll_renewal(cx) {
+            return Some(event);
         }
         self.look_for_peer(cx);
         match self.phase {

@@ -47,6 +47,8 @@ pub(super) struct SimWorld {
     mode: Mode,
     units: Vec<Rc<SimNode>>,
     weather: Weather,
+    /// How often secured links make their keys anew, instead of every 12 h: in every other run.
+    renews_every: Option<Duration>,
     random: Random,
     report: Report,
 }
@@ -75,7 +77,9 @@ impl SimWorld {
                 network.split_reads(Chance::percent(random.below(40) as f64));
             });
         }
-        Self { world, mode, units: Vec::new(), weather, random, report: Report::default() }
+        let renews = mode == Mode::Secured && !seed.is_multiple_of(2);
+        let renews_every = renews.then(|| secs(1) + random.jitter(secs(2)));
+        Self { world, mode, units: Vec::new(), weather, renews_every, random, report: Report::default() }
     }
 
     fn host(&self, unit: &Unit) -> HostId {
@@ -142,6 +146,10 @@ impl World for SimWorld {
         };
         let new = if spec.same_seed { new.boot_seed(4) } else { new };
         let new = new.fleet(fleet).constraints(constraints).functions(their_functions).message_buffers(message_buffers);
+        let new = match self.renews_every {
+            Some(span) => new.renews_every(span),
+            None => new,
+        };
         let program = move |unit: &UnitHandle| {
             for service in &services {
                 unit.add_function(&service.signature, simulated(service)).expect("a unit has room for its services");

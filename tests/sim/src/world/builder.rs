@@ -7,6 +7,7 @@ use cara_core::config::{Constraints, Mode};
 use cara_core::distribution::connection_handler::Target;
 use cara_core::distribution::hello::Manager;
 use cara_core::distribution::identity::{Fleet, Identity};
+use cara_core::time::Duration;
 
 use super::Shared;
 use super::handle::UnitHandle;
@@ -34,7 +35,7 @@ impl NewUnit {
     }
 
     fn new(shared: &Rc<Shared>, identity: Identity, constraints: Constraints) -> Self {
-        let mode = shared.with(|inner| inner.mode);
+        let (mode, seals) = shared.with(|inner| (inner.mode, inner.seals.clone()));
         let settings = Settings {
             identity,
             fleet: Fleet(0),
@@ -44,7 +45,7 @@ impl NewUnit {
             links: usize::from(constraints.maximum_nodes) + 4,
             functions: 64,
             boot_seed: None,
-            given: Given::new(mode),
+            given: Given::new(mode, seals),
             program: None,
         };
         Self { shared: Rc::downgrade(shared), settings, segment: 0 }
@@ -108,6 +109,12 @@ impl NewUnit {
     /// It has no key for units of this name.
     pub fn without_key_for(mut self, name: &str) -> Self {
         self.settings.given.missing.insert(name.to_owned());
+        self
+    }
+
+    /// The keys of links that it opens are made anew this often, instead of every 12 h.
+    pub fn renews_every(mut self, span: Duration) -> Self {
+        self.settings.given.renews_every = Some(span);
         self
     }
 

@@ -104,6 +104,18 @@ impl UnitHandle {
         self.with(|inner| inner.units[self.host.index()].machine.is_some())
     }
 
+    // --- its keys
+
+    /// It has no key for units of this name any more, in this life.
+    pub fn forget_key_of(&self, name: &str) -> Result<(), Error> {
+        self.machine(|machine, _| machine.keys.forget(name))
+    }
+
+    /// It has the keys of this generation in this life, and those of the other one beside them. The first is 1.
+    pub fn change_keys(&self, generation: u32, other: Option<u32>) -> Result<(), Error> {
+        self.machine(|machine, _| machine.keys.change(generation, other))
+    }
+
     // --- its own functions
 
     /// Adds a service, which nobody sees before it is published. The signature is in the text form, as in

@@ -6,11 +6,14 @@ use cara_core::config::Mode;
 use cara_core::distribution::authenticator::Authenticator;
 use cara_core::distribution::identity::{Fleet, Identity};
 use cara_core::random::Random;
+use cara_core::time::Duration;
 use cara_secure::keyring::{Codes, Keyring};
 use cara_secure::keys::{DiscoveryKey, PairKey, RootKey};
-use cara_secure::link::{Cipher, Credentials};
+use cara_secure::link::Credentials;
 
-/// The generation of all keys.
+use super::audited::{Audited, Seals};
+
+/// The generation of all keys at first.
 const GENERATION: u32 = 1;
 
 /// What a unit is given in every life.
@@ -21,17 +24,23 @@ pub(super) struct Given {
     pub(super) root: u8,
     /// Names of units for which it has no key.
     pub(super) missing: BTreeSet<String>,
+    /// How old the keys of a link become, instead of 12 h.
+    pub(super) renews_every: Option<Duration>,
+    seals: Seals,
 }
 
 impl Given {
-    pub(super) fn new(mode: Mode) -> Self {
-        Self { mode, root: 0, missing: BTreeSet::new() }
+    pub(super) fn new(mode: Mode, seals: Seals) -> Self {
+        Self { mode, root: 0, missing: BTreeSet::new(), renews_every: None, seals }
     }
 }
 
 /// The keys of one life.
 pub(super) struct Keys {
     pub(super) codes: Codes<Ring>,
+    /// How old the keys of a link become, if not 12 h.
+    pub(super) renews_every: Option<Duration>,
+    seals: Seals,
     random: Random,
 }
 
@@ -39,6 +48,10 @@ pub(super) struct Keys {
 pub(super) struct Ring {
     root: RootKey,
     discovery: DiscoveryKey,
+    other_discovery: Option<DiscoveryKey>,
+    generation: u32,
+    /// The one beside it while the keys are changed.
+    other: Option<u32>,
     missing: BTreeSet<String>,
     own: Identity,
     fleet: Fleet,
@@ -46,28 +59,55 @@ pub(super) struct Ring {
 
 impl Keyring for Ring {
     fn discovery(&self) -> (&DiscoveryKey, Option<&DiscoveryKey>) {
-        (&self.discovery, None)
+        (&self.discovery, self.other_discovery.as_ref())
     }
 
     fn pair(&self, peer: &Identity) -> Option<(PairKey, Option<PairKey>)> {
         let known = !self.missing.contains(peer.name());
-        known.then(|| (self.root.pair(self.fleet, GENERATION, &self.own, peer), None))
+        let of = |generation| self.root.pair(self.fleet, generation, &self.own, peer);
+        known.then(|| (of(self.generation), self.other.map(of)))
     }
 }
 
 impl Keys {
     pub(super) fn new(given: Given, own: Identity, fleet: Fleet, random: Random) -> Self {
+        let Given { renews_every, seals, .. } = given.clone();
         let root = RootKey::new([given.root; 32]);
-        let discovery = root.discovery(fleet, GENERATION);
+        let ring = Ring {
+            discovery: root.discovery(fleet, GENERATION),
+            root,
+            other_discovery: None,
+            generation: GENERATION,
+            other: None,
+            missing: given.missing,
+            own,
+            fleet,
+        };
         let codes = match given.mode {
             Mode::Plain => Codes::Plain,
-            Mode::Secured => Codes::Keyed(Ring { root, discovery, missing: given.missing, own, fleet }),
+            Mode::Secured => Codes::Keyed(ring),
         };
-        Self { codes, random }
+        Self { codes, renews_every, seals, random }
     }
 
-    pub(super) fn cipher(&self) -> Cipher {
-        Cipher::new(self.codes.mode())
+    pub(super) fn cipher(&self) -> Audited {
+        Audited::new(self.codes.mode(), &self.seals)
+    }
+
+    /// It has no key for units of this name any more.
+    pub(super) fn forget(&mut self, name: &str) {
+        if let Codes::Keyed(ring) = &mut self.codes {
+            ring.missing.insert(name.to_owned());
+        }
+    }
+
+    /// It has the keys of this generation now, and those of the other one beside them.
+    pub(super) fn change(&mut self, generation: u32, other: Option<u32>) {
+        if let Codes::Keyed(ring) = &mut self.codes {
+            (ring.generation, ring.other) = (generation, other);
+            ring.discovery = ring.root.discovery(ring.fleet, generation);
+            ring.other_discovery = other.map(|other| ring.root.discovery(ring.fleet, other));
+        }
     }
 
     /// What proves this unit to a peer. `None` without a key for it.

@@ -11,8 +11,8 @@ use cara_core::services::requests::CallId;
 use cara_core::services::unit::{Event, Session};
 use cara_core::services::{Context, Ticket};
 use cara_core::time::Instant;
-use cara_secure::link::Cipher;
 
+use super::audited::Audited;
 use super::mail::{LazyPool, SimMailman};
 use super::replies::{Promise, Waiting};
 use super::service::{BoxedParameters, Handler};
@@ -20,7 +20,7 @@ use crate::event::{HostId, StreamId};
 use crate::network::Network;
 use crate::storage::Boxed;
 
-pub(super) type SimSession = Session<Boxed, Cipher>;
+pub(super) type SimSession = Session<Boxed, Audited>;
 pub(super) type SimContext<'c, 'n> = Context<'c, Boxed, SimMailman<'n>, LazyPool, Handler>;
 
 /// What a link led to that concerns more than the link.

@@ -158,7 +158,11 @@ impl Machine {
         };
         let link = LinkId(index);
         let config = SessionConfig { link, dialed, address: peer, local: hello, constraints: self.constraints };
-        self.links.insert(index, Session::new(now, config, self.keys.cipher(), storage), stream);
+        let mut session = Session::new(now, config, self.keys.cipher(), storage);
+        if let Some(span) = self.keys.renews_every {
+            session.renew_every(span);
+        }
+        self.links.insert(index, session, stream);
         Some(index)
     }
 

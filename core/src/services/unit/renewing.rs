@@ -1,0 +1,259 @@
+//! New keys for a link that lives long: the proof of its beginning is made anew in its sealed frames, while calls, leases
+//! and emergencies go on.
+//!
+//! ```text
+//! dialler                                        the other one
+//!   Introduced: the port brings the key
+//!   proof 1  ------------------------------------>  Introduced: the port brings the key
+//!            <------------------------------------  proof 2, turn | confirm
+//!   turn | confirm  ----------------------------->  its datagrams go under the new key
+//!            <------------------------------------  acknowledgement
+//!   its datagrams go under the new key
+//! ```
+//!
+//! A turn is the last frame of its direction under the old keys, so each frame is opened with the keys that it was sealed
+//! with, however many are on their way. Only the end that dialled begins, so two renewals never meet.
+
+use super::inbound::Outcome;
+use super::{Event, Session};
+use crate::config::{HANDSHAKE_LIFE, Mode, PREVIOUS_KEY_LIFE, RENEWAL_TIMEOUT, SHORTEST_HANDSHAKE_LIFE};
+use crate::error::CloseReason;
+use crate::host::connections::{LinkCounter, Place};
+use crate::host::frame::Frame;
+use crate::host::mailman::Mailman;
+use crate::host::secure::{PROOF_BYTES, Secure};
+use crate::services::Context;
+use crate::services::lease::Service;
+use crate::storage::{Buffers, Storage};
+use crate::time::{Duration, Instant};
+
+/// The renewal of a link's keys.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Renewal {
+    every: Duration,
+    step: Step,
+    /// When datagrams under the key before are taken no longer.
+    forget: Instant,
+}
+
+/// Where it stands.
+#[derive(Clone, Copy, Debug)]
+enum Step {
+    /// Nothing goes on. The end that dialled begins at this time; the other one lets it begin from then on.
+    Resting { due: Instant },
+    /// The port looks for the key of the pair; the end that was dialled keeps the message that is to be answered.
+    Asked { until: Instant, message: [u8; PROOF_BYTES] },
+    /// This end's message waits for room in the stream.
+    Telling { until: Instant, message: [u8; PROOF_BYTES] },
+    /// The peer is to go on.
+    Awaiting { until: Instant },
+    /// The confirmation of the end that dialled waits for room in the stream.
+    Confirming { until: Instant },
+    /// The acknowledgement of the end that was dialled waits for room in the stream.
+    Acknowledging,
+}
+
+impl Renewal {
+    pub(super) const fn new() -> Self {
+        Self { every: HANDSHAKE_LIFE, step: Step::Resting { due: Instant::FAR_FUTURE }, forget: Instant::FAR_FUTURE }
+    }
+
+    pub(super) fn deadline(&self, dialed: bool) -> Instant {
+        let step = match self.step {
+            Step::Resting { due } if dialed => due,
+            Step::Resting { .. } | Step::Acknowledging => Instant::FAR_FUTURE,
+            Step::Asked { until, .. }
+            | Step::Telling { until, .. }
+            | Step::Awaiting { until }
+            | Step::Confirming { until } => until,
+        };
+        step.min(self.forget)
+    }
+}
+
+impl<S: Storage, C: Secure> Session<S, C> {
+    /// Makes the keys of a secured link anew each time they are as old as `span`, or up to an eighth younger, instead of
+    /// [`HANDSHAKE_LIFE`]; at least [`SHORTEST_HANDSHAKE_LIFE`]. Holds from the next handshake on, for the end that dialled:
+    /// the other one follows.
+    pub fn renew_every(&mut self, span: Duration) {
+        self.renewal.every = span.max(SHORTEST_HANDSHAKE_LIFE);
+    }
+
+    /// The link is live, or has new keys.
+    pub(super) fn rest_until_renewal(&mut self, now: Instant) {
+        if self.mode() == Mode::Plain {
+            return;
+        }
+        let pause = if self.dialed { self.life_of_keys() } else { SHORTEST_HANDSHAKE_LIFE.divided_by(2) };
+        self.renewal.step = Step::Resting { due: now + pause };
+    }
+
+    /// Links that began together have nonces of their own.
+    fn life_of_keys(&self) -> Duration {
+        let eighth = self.renewal.every.divided_by(8).as_micros();
+        let less = (eighth >> 8).saturating_mul(self.local.nonce & 0xff);
+        Duration::from_micros(self.renewal.every.as_micros().saturating_sub(less))
+    }
+
+    /// Does what is due of the renewal; tells whether the port is to bring the key of the pair.
+    pub(super) fn poll_renewal<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+    ) -> Option<Event<'static>> {
+        if cx.now >= self.renewal.forget {
+            self.link.cipher().forget_previous();
+            self.renewal.forget = Instant::FAR_FUTURE;
+        }
+        if let Step::Resting { due } = self.renewal.step {
+            let begins = self.dialed && (cx.now >= due || self.link.cipher().is_worn());
+            return begins.then(|| self.ask_for_key(cx.now, [0; PROOF_BYTES]));
+        }
+        match cx.now >= self.renewal.deadline(self.dialed) {
+            true => self.close(cx, CloseReason::HelloTimeout),
+            false => self.pump_renewal(cx),
+        }
+        None
+    }
+
+    fn ask_for_key(&mut self, now: Instant, message: [u8; PROOF_BYTES]) -> Event<'static> {
+        self.renewal.step = Step::Asked { until: now + RENEWAL_TIMEOUT, message };
+        Event::Introduced
+    }
+
+    /// The port has brought the key of the pair of a live link.
+    pub(super) fn prove_anew<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        credentials: C::Credentials,
+    ) {
+        let Step::Asked { until, message } = self.renewal.step else { return };
+        let told = match self.link.cipher().prove(self.dialed, credentials) {
+            Ok(None) => self.link.cipher().answer(&message),
+            told => told,
+        };
+        match told {
+            Ok(Some(message)) => {
+                self.renewal.step = Step::Telling { until, message };
+                self.pump_renewal(cx);
+            }
+            Ok(None) | Err(_) => self.fail(cx),
+        }
+    }
+
+    /// Sends what waits for room.
+    pub(super) fn pump_renewal<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+        let sent = match self.renewal.step {
+            Step::Resting { .. } | Step::Asked { .. } | Step::Awaiting { .. } => return,
+            Step::Telling { message, .. } if self.dialed => self.link.send_frames(&[Frame::Proof(&message)]),
+            Step::Telling { message, .. } => self.send_turn(Some(&message)),
+            Step::Confirming { .. } => self.send_turn(None),
+            Step::Acknowledging => self.link.send_frames(&[Frame::ACKNOWLEDGEMENT]),
+        };
+        if !sent {
+            return;
+        }
+        match self.renewal.step {
+            Step::Telling { until, .. } | Step::Confirming { until } => self.renewal.step = Step::Awaiting { until },
+            _ => self.rest_until_renewal(cx.now),
+        }
+        self.flush(cx);
+    }
+
+    /// The last frame under the old keys, behind the message of the end that was dialled, and the first one under the new.
+    fn send_turn(&mut self, message: Option<&[u8]>) -> bool {
+        let confirmation = self.link.cipher().confirmation();
+        let confirm = Frame::Confirm(&confirmation);
+        match message {
+            Some(message) => self.link.send_frames(&[Frame::Proof(message), Frame::TURN, confirm]),
+            None => self.link.send_frames(&[Frame::TURN, confirm]),
+        }
+    }
+
+    /// A proof frame on a live link: the peer's message, or its turn.
+    pub(super) fn proof_on_live<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        place: Place,
+        lent: &[u8],
+    ) -> Outcome {
+        let message = self.link.view(place, lent);
+        let understood = match (message.first_chunk(), self.renewal.step) {
+            (None, _) if message.is_empty() => self.link.cipher().turned(),
+            (Some(_), Step::Awaiting { .. }) if self.dialed => return self.answered_anew(cx, place, lent),
+            (Some(first), Step::Resting { due }) if cx.now >= due && !self.dialed && message.len() == PROOF_BYTES => {
+                return self.ask_for_key(cx.now, *first).into();
+            }
+            _ => Err(CloseReason::Protocol),
+        };
+        if let Err(reason) = understood {
+            self.close(cx, reason);
+        }
+        Outcome::Nothing
+    }
+
+    fn answered_anew<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        place: Place,
+        lent: &[u8],
+    ) -> Outcome {
+        if self.link.answer(place, lent) != Ok(None) {
+            self.fail(cx);
+        }
+        Outcome::Nothing
+    }
+
+    /// A confirm frame on a live link: the first one under the peer's new keys, or what acknowledges this end's.
+    pub(super) fn confirmation_on_live<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        place: Place,
+        lent: &[u8],
+    ) -> Outcome {
+        let Step::Awaiting { until } = self.renewal.step else {
+            self.close(cx, CloseReason::Protocol);
+            return Outcome::Nothing;
+        };
+        let understood = match self.link.view(place, lent).is_empty() {
+            true if self.dialed => self.adopt_keys().map(|()| self.rest_until_renewal(cx.now)),
+            true => Err(CloseReason::Protocol),
+            false => self.link.confirmed(place, lent).and_then(|()| self.confirmed_anew(cx, until)),
+        };
+        if let Err(reason) = understood {
+            self.close(cx, reason);
+        }
+        Outcome::Nothing
+    }
+
+    /// The peer has turned and confirmed. Its confirmation also says that it has that of an end that was dialled.
+    fn confirmed_anew<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        until: Instant,
+    ) -> Result<(), CloseReason> {
+        self.renewal.forget = cx.now + RENEWAL_TIMEOUT;
+        if self.dialed {
+            self.renewal.step = Step::Confirming { until };
+        } else {
+            self.adopt_keys()?;
+            self.renewal.step = Step::Acknowledging;
+        }
+        self.pump_renewal(cx);
+        Ok(())
+    }
+
+    /// The peer has the key of this end's datagrams.
+    fn adopt_keys(&mut self) -> Result<(), CloseReason> {
+        self.link.cipher().acknowledged()?;
+        self.link.counters.add(LinkCounter::KeysRenewed, 1);
+        debug!("link {} has new keys", self.link.id().0);
+        Ok(())
+    }
+
+    /// A datagram has been opened; the first one under a new key lets the one before go.
+    pub(super) fn datagram_opened(&mut self, now: Instant) {
+        if self.renewal.forget != Instant::FAR_FUTURE && self.link.cipher().hears_newest() {
+            self.renewal.forget = self.renewal.forget.min(now + PREVIOUS_KEY_LIFE);
+        }
+    }
+}
