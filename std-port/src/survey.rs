@@ -1,43 +1,50 @@
-//! Looking at a network without being one of its units: what can be heard, from whom, of which fleet and version.
+//! Looking at a network without being one of its units: what can be heard, from whom, of which fleet, mode and version.
 //!
 //! A [`Survey`] listens on the discovery port beside the units of the host, reads every datagram as far as it can be
 //! read, and, when it is told to, asks all m_units of a fleet to show themselves ([`Survey::ask`]). It takes no link,
 //! answers nobody, and sends nothing that it was not told to send. S_units that are connected say nothing to
 //! strangers, so they are not heard; their manager knows them.
 //!
+//! What secured units say in discovery is signed and not sealed, so that it is heard without any key. With the fleet's
+//! discovery key ([`SurveyKeys`]) its m_units answer, and [`Standing`] tells whose datagrams the fleet's are. That key
+//! belongs to every unit of a fleet: it shows that a datagram comes from one of them, and not from which.
+//!
 //! ```no_run
-//! use cara_std::survey::Survey;
+//! use cara_std::survey::{Ports, Survey, SurveyKeys};
 //! use cara_std::{Fleet, Interfaces};
 //! use std::time::Duration;
 //!
-//! let mut survey = Survey::open(Interfaces::All, 21_970)?;
+//! let mut survey = Survey::open(Interfaces::All, Ports::Usual)?.with_keys(SurveyKeys::gather());
 //! survey.ask(Fleet(0));
 //! survey.listen(Duration::from_secs(2));
 //! for heard in survey.heard() {
-//!     println!("{:?} at {}", heard.identity, heard.source);
+//!     println!("{:?} at {}: {:?}", heard.identity, heard.source, heard.standing);
 //! }
 //! # Ok::<(), cara_std::Error>(())
 //! ```
 
 mod heard;
+mod keys;
 
 use std::collections::HashSet;
 use std::hash::{BuildHasher, Hasher, RandomState};
 use std::io;
 use std::net::{SocketAddr, SocketAddrV4, UdpSocket};
-use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use cara_core::config::{Mode, PLAIN_PORT, SECURED_PORT};
+use cara_core::distribution::authenticator::Authenticator;
 use cara_core::distribution::datagram::{Announce, Datagram, Header, SEARCH_BYTES, WhoHas};
 use cara_core::distribution::identity::{Epoch, Fleet, Identity};
 use cara_core::error::Error;
 use cara_core::host::secure::Plain;
 
 use self::heard::News;
-pub use self::heard::{Foreign, Heard, Reach};
+pub use self::heard::{Foreign, Heard, Reach, Standing};
+pub use self::keys::SurveyKeys;
 use crate::sys::datagram::{Datagrams, Socket};
 use crate::sys::epoll::{Epoll, Events, Interest};
-use crate::sys::interfaces::{Interface, Interfaces};
+use crate::sys::interfaces::Interfaces;
 pub use cara_core::config::VERSION;
 
 /// Most lives of units that are kept; beyond them only those that are kept already are counted on.
@@ -51,15 +58,51 @@ pub const NAME: &str = "cara-survey";
 const READ: usize = SEARCH_BYTES + 1;
 /// Datagrams that are read before the time is looked at, so that a flood does not hold up the end.
 const BATCH: usize = 256;
-const SHARED: u64 = 0;
-const VOICE: u64 = 1;
+/// The token of the voice; each ear has its index.
+const VOICE: u64 = u64::MAX;
+
+/// Where a survey listens, and where its questions go.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Ports {
+    /// The port of plain mode and that of secured mode.
+    Usual,
+    /// One port for both modes.
+    One(u16),
+}
+
+impl Ports {
+    /// The ports.
+    pub fn numbers(self) -> Vec<u16> {
+        match self {
+            Self::Usual => vec![PLAIN_PORT, SECURED_PORT],
+            Self::One(port) => vec![port],
+        }
+    }
+
+    /// The one of a mode.
+    pub const fn of(self, mode: Mode) -> u16 {
+        match self {
+            Self::Usual => mode.port(),
+            Self::One(port) => port,
+        }
+    }
+}
+
+impl From<u16> for Ports {
+    fn from(port: u16) -> Self {
+        Self::One(port)
+    }
+}
 
 /// One who looks at a network. See the [module](self).
 #[derive(Debug)]
 pub struct Survey {
-    ear: Datagrams,
+    ports: Ports,
+    ears: Vec<Datagrams>,
     voice: UdpSocket,
     set: Epoll,
+    keys: SurveyKeys,
+    asks_in_plain: bool,
     opened: Instant,
     identity: Identity,
     epoch: Epoch,
@@ -71,21 +114,29 @@ pub struct Survey {
 }
 
 impl Survey {
-    /// Opens the discovery port beside the units of this host; nothing is sent.
+    /// Opens discovery ports beside the units of this host; nothing is sent.
     ///
-    /// [`Error::PortInUse`] when a program that does not share it has the port.
-    pub fn open(interfaces: Interfaces, discovery_port: u16) -> Result<Self, Error> {
-        let ear = Datagrams::open(interfaces, discovery_port)?;
+    /// [`Error::PortInUse`] when a program that does not share it has one of them.
+    pub fn open(interfaces: Interfaces, ports: impl Into<Ports>) -> Result<Self, Error> {
+        let ports = ports.into();
+        let set = Epoll::new().map_err(network)?;
+        let mut ears = Vec::new();
+        for (port, token) in ports.numbers().into_iter().zip(0..) {
+            let ear = Datagrams::open(interfaces, port)?;
+            set.add(ear.fd(Socket::Shared), token, Interest::READ_LEVEL).map_err(network)?;
+            ears.push(ear);
+        }
         let voice = UdpSocket::bind((interfaces.bind_address(), 0)).map_err(network)?;
         voice.set_broadcast(true).map_err(network)?;
         voice.set_nonblocking(true).map_err(network)?;
-        let set = Epoll::new().map_err(network)?;
-        set.add(ear.fd(Socket::Shared), SHARED, Interest::READ_LEVEL).map_err(network)?;
         set.add(&voice, VOICE, Interest::READ_LEVEL).map_err(network)?;
         let mut survey = Self {
-            ear,
+            ports,
+            ears,
             voice,
             set,
+            keys: SurveyKeys::default(),
+            asks_in_plain: true,
             opened: Instant::now(),
             identity: Identity::s_unit(NAME, std::process::id())?,
             epoch: Epoch(random()),
@@ -99,19 +150,36 @@ impl Survey {
         Ok(survey)
     }
 
-    /// Asks every m_unit of `fleet` to answer, by a broadcast on each interface. What became of it is in
-    /// [`reach`](Self::reach); `false` when no interface took it.
+    /// Asks secured fleets as well, those of which there are keys.
+    pub fn with_keys(mut self, keys: SurveyKeys) -> Self {
+        self.keys = keys;
+        self
+    }
+
+    /// Asks secured fleets alone.
+    pub fn without_plain(mut self) -> Self {
+        self.asks_in_plain = false;
+        self
+    }
+
+    /// The keys that it has.
+    pub fn keys(&self) -> &SurveyKeys {
+        &self.keys
+    }
+
+    /// Asks every m_unit of `fleet` to answer, by broadcasts on each interface: one in plain mode, and one for each key
+    /// that the fleet may speak with. What became of them is in [`reach`](Self::reach); `false` when no interface took one.
     pub fn ask(&mut self, fleet: Fleet) -> bool {
         self.look_at_interfaces();
-        let (bytes, length) = self.question(fleet);
-        let Some(question) = bytes.get(..length) else { return false };
-        let port = self.ear.discovery_port();
         let mut sent = false;
-        for reach in &mut self.reach {
-            let Some(broadcast) = reach.interface.broadcast.filter(|_| reach.interface.up) else { continue };
-            match send(&self.voice, SocketAddrV4::new(broadcast, port).into(), question) {
-                Ok(()) => (reach.sent, sent) = (reach.sent.saturating_add(1), true),
-                Err(error) => reach.refused = Some(error.kind()),
+        for (mode, question) in self.questions(fleet) {
+            let port = self.ports.of(mode);
+            for reach in self.reach.iter_mut().filter(|reach| reach.port == port) {
+                let Some(broadcast) = reach.interface.broadcast.filter(|_| reach.interface.up) else { continue };
+                match send(&self.voice, SocketAddrV4::new(broadcast, port).into(), &question) {
+                    Ok(()) => (reach.sent, sent) = (reach.sent.saturating_add(1), true),
+                    Err(error) => reach.refused = Some(error.kind()),
+                }
             }
         }
         sent
@@ -119,8 +187,7 @@ impl Survey {
 
     /// Asks who is at one address, without a broadcast. Of several units of one host, one alone is asked.
     pub fn ask_at(&mut self, fleet: Fleet, address: SocketAddr) -> io::Result<()> {
-        let (bytes, length) = self.question(fleet);
-        send(&self.voice, address, bytes.get(..length).unwrap_or_default())
+        self.questions(fleet).iter().try_for_each(|(_, question)| send(&self.voice, address, question))
     }
 
     /// Listens for `span`.
@@ -131,7 +198,7 @@ impl Survey {
     /// Listens until `enough` says so, which is asked after all that came at once, or until `end`; for ever without
     /// one.
     pub fn listen_until(&mut self, end: Option<Instant>, mut enough: impl FnMut(&Self) -> bool) {
-        let mut events = Events::new(2);
+        let mut events = Events::new(3);
         loop {
             let left = end.map(|end| end.saturating_duration_since(Instant::now()));
             if self.set.wait(&mut events, left.map(Into::into)).is_err() {
@@ -139,7 +206,7 @@ impl Survey {
             }
             let news = events.iter().next().is_some();
             for ready in events.iter() {
-                self.read(ready.token == SHARED);
+                self.read(ready.token);
             }
             if (news && enough(self)) || end.is_some_and(|end| Instant::now() >= end) {
                 return;
@@ -177,51 +244,59 @@ impl Survey {
         self.opened.elapsed()
     }
 
-    fn question(&mut self, fleet: Fleet) -> ([u8; SEARCH_BYTES], usize) {
-        self.sequence = self.sequence.wrapping_add(1);
-        let question = WhoHas {
+    fn questions(&mut self, fleet: Fleet) -> Vec<(Mode, Vec<u8>)> {
+        let first = self.sequence;
+        let question = |sequence| WhoHas {
             identity: self.identity.clone(),
             epoch: self.epoch,
-            sequence: self.sequence,
+            sequence,
             nonce: random() | 1,
             wanted: None,
             tcp_port: 0,
             expected: 0,
             known: Default::default(),
         };
-        let mut bytes = [0; SEARCH_BYTES];
-        let length = question.encode(fleet, &Plain, &mut bytes).map_or(0, <[u8]>::len);
-        (bytes, length)
+        let plain = self.asks_in_plain.then(|| encoded(&question(first.wrapping_add(1)), fleet, &Plain));
+        let secured = self.keys.signers(fleet).zip(2..);
+        let secured = secured.map(|(signer, place)| encoded(&question(first.wrapping_add(place)), fleet, &signer));
+        let questions: Vec<_> = plain.into_iter().chain(secured).collect();
+        self.sequence = first.wrapping_add(1).wrapping_add(questions.len() as u32);
+        questions
     }
 
     /// Interfaces come and go; what is known of one stays with its address.
     fn look_at_interfaces(&mut self) {
-        let found: Arc<[Interface]> = self.ear.targets();
-        self.reach.retain(|reach| found.iter().any(|interface| interface.address == reach.interface.address));
-        for interface in found.iter() {
-            match self.reach.iter_mut().find(|reach| reach.interface.address == interface.address) {
-                Some(known) => known.interface = interface.clone(),
-                None => self.reach.push(Reach { interface: interface.clone(), sent: 0, refused: None, heard: 0 }),
+        let before = std::mem::take(&mut self.reach);
+        for ear in &self.ears {
+            let port = ear.discovery_port();
+            for interface in ear.targets().iter() {
+                let same = |reach: &&Reach| reach.port == port && reach.interface.address == interface.address;
+                let unknown = Reach { interface: interface.clone(), port, sent: 0, refused: None, heard: 0 };
+                let known = before.iter().find(same).cloned().unwrap_or(unknown);
+                self.reach.push(Reach { interface: interface.clone(), ..known });
             }
         }
     }
 
     /// Reads all that waits on one of the sockets.
-    fn read(&mut self, shared: bool) {
+    fn read(&mut self, token: u64) {
         let mut buffer = [0; READ];
         for _ in 0..BATCH {
-            let received = match shared {
-                true => self.ear.receive(Socket::Shared, &mut buffer),
-                false => receive(&self.voice, &mut buffer),
+            let ear = usize::try_from(token).ok().and_then(|ear| self.ears.get(ear));
+            let (received, port) = match ear {
+                Some(ear) => (ear.receive(Socket::Shared, &mut buffer), Some(ear.discovery_port())),
+                None => (receive(&self.voice, &mut buffer), None),
             };
             let Some((length, source)) = received else { return };
-            self.note(source, buffer.get(..length).unwrap_or_default(), shared);
+            self.note(source, buffer.get(..length).unwrap_or_default(), port);
         }
     }
 
-    fn note(&mut self, source: SocketAddr, bytes: &[u8], by_broadcast: bool) {
+    /// Notes a datagram that came to a discovery port, or to the survey alone.
+    fn note(&mut self, source: SocketAddr, bytes: &[u8], port: Option<u16>) {
         if self.is_own(source) {
-            if let Some(reach) = self.reach.iter_mut().find(|reach| source.ip() == reach.interface.address) {
+            let mut reaches = self.reach.iter_mut().filter(|reach| Some(reach.port) == port);
+            if let Some(reach) = reaches.find(|reach| source.ip() == reach.interface.address) {
                 reach.heard = reach.heard.saturating_add(1);
             }
             return;
@@ -234,7 +309,19 @@ impl Survey {
             ) => (Some(identity), Some(*epoch)),
             Some(Datagram::Session { .. }) | None => (None, None),
         };
-        self.note_unit(&News { source, header, identity, epoch, datagram: datagram.as_ref(), by_broadcast });
+        let standing = self.standing(&header, datagram.as_ref(), bytes);
+        let (datagram, by_broadcast) = (datagram.as_ref(), port.is_some());
+        self.note_unit(&News { source, header, standing, identity, epoch, datagram, by_broadcast });
+    }
+
+    fn standing(&self, header: &Header, datagram: Option<&Datagram>, bytes: &[u8]) -> Standing {
+        match (header.mode, datagram) {
+            (Mode::Plain, _) => Standing::Plain,
+            (Mode::Secured, Some(Datagram::Session { .. })) => Standing::Unchecked,
+            // How another version signs is not known here.
+            (Mode::Secured, _) if header.version != VERSION => Standing::Unchecked,
+            (Mode::Secured, _) => self.keys.standing(header.fleet, bytes),
+        }
     }
 
     fn is_own(&self, source: SocketAddr) -> bool {
@@ -267,6 +354,11 @@ impl Survey {
             None => self.foreign.push(Foreign { source, datagrams: 1 }),
         }
     }
+}
+
+fn encoded(question: &WhoHas, fleet: Fleet, signer: &impl Authenticator) -> (Mode, Vec<u8>) {
+    let mut bytes = [0; SEARCH_BYTES];
+    (signer.mode(), question.encode(fleet, signer, &mut bytes).unwrap_or_default().to_vec())
 }
 
 fn receive(voice: &UdpSocket, buffer: &mut [u8]) -> Option<(usize, SocketAddr)> {

@@ -1,7 +1,7 @@
 //! A fleet's root and its nodes, and the ring of each.
 
 use cara_core::distribution::identity::{Fleet, Identity};
-use cara_secure::keys::{FINGERPRINT_BYTES, RootKey};
+use cara_secure::keys::{DiscoveryKey, FINGERPRINT_BYTES, RootKey};
 
 use super::members::{Member, Members};
 use super::ring::Generation;
@@ -67,6 +67,11 @@ impl FleetKeys {
         self.members.finish()
     }
 
+    /// The key for discovery of a generation, of one that is over as well.
+    pub fn discovery(&self, generation: u32) -> DiscoveryKey {
+        self.root.discovery(self.members.fleet(), generation)
+    }
+
     /// The ring of a node.
     pub fn ring(&self, identity: &Identity) -> Result<KeyRing, FleetError> {
         let node = self.members.node(identity)?;
@@ -82,7 +87,7 @@ impl FleetKeys {
         pairs.extend(peers().map(|Member { identity, .. }| {
             (identity.clone(), self.root.pair(fleet, number, &node.identity, identity))
         }));
-        Generation { number, discovery: self.root.discovery(fleet, number), pairs }
+        Generation { number, discovery: self.discovery(number), pairs }
     }
 }
 

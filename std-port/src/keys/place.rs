@@ -49,6 +49,25 @@ pub fn own_folder() -> Option<PathBuf> {
     named.or_else(|| environment.of_user())
 }
 
+/// The folders in which keys are looked for.
+pub fn folders() -> Vec<PathBuf> {
+    let mut folders = Environment::of_process().folders();
+    folders.retain(|folder| folder.is_dir());
+    folders
+}
+
+/// The files with keys of units that are in those folders, whoever's they are, by name; or the one that `CARA_KEYS` names.
+pub fn rings() -> Vec<PathBuf> {
+    if let Some(file) = Environment::of_process().file() {
+        return vec![file.to_owned()];
+    }
+    let entries = folders().into_iter().filter_map(|folder| folder.read_dir().ok()).flatten().flatten();
+    let mut files: Vec<_> = entries.map(|entry| entry.path()).collect();
+    files.retain(|path| path.extension().is_some_and(|extension| extension == "keys"));
+    files.sort();
+    files
+}
+
 /// What the environment says about places.
 struct Environment {
     named: Option<PathBuf>,
@@ -81,9 +100,14 @@ impl Environment {
         }
     }
 
+    /// The file that is named, and stands for all places.
+    fn file(&self) -> Option<&Path> {
+        self.named.as_deref().filter(|named| named.exists() && !named.is_dir())
+    }
+
     fn find(&self, identity: &Identity, fleet: Fleet) -> Result<PathBuf, KeyError> {
-        if let Some(file) = self.named.as_ref().filter(|named| named.exists() && !named.is_dir()) {
-            return Ok(file.clone());
+        if let Some(file) = self.file() {
+            return Ok(file.to_owned());
         }
         let folders = self.folders();
         let searched: Vec<_> = folders.iter().map(|folder| folder.join(file_name(identity, fleet))).collect();

@@ -79,13 +79,19 @@ impl Store {
             return Err(KeyError::NoRoot { folder: folder.to_owned(), fleet });
         }
         let lock = lock(folder)?;
+        Ok(Self { folder: folder.to_owned(), keys: Self::peek(folder, fleet)?, _lock: lock })
+    }
+
+    /// The keys of a fleet in a folder, as they are while others may change them: to look at.
+    pub fn peek(folder: &Path, fleet: Fleet) -> Result<FleetKeys, KeyError> {
+        let path = root_file(folder, fleet);
         let (text, _) = file::read(&path)?;
         let root = parse_root(&text, fleet).map_err(|error| file::form(&path, error))?;
         let path = nodes_file(folder, fleet);
         let (text, _) = file::read(&path)?;
         let members = Members::parse(&text).and_then(|members| is_of(members, fleet));
         let members = members.map_err(|error| file::form(&path, error))?;
-        Ok(Self { folder: folder.to_owned(), keys: FleetKeys::new(root, members), _lock: lock })
+        Ok(FleetKeys::new(root, members))
     }
 
     /// The fleets whose roots are in a folder; none if the folder is not there.

@@ -4,7 +4,7 @@ use std::io;
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use cara_core::config::VERSION;
+use cara_core::config::{Mode, VERSION};
 use cara_core::distribution::datagram::{Datagram, Header};
 use cara_core::distribution::hello::Manager;
 use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
@@ -12,11 +12,36 @@ use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
 use super::NAME;
 use crate::sys::interfaces::Interface;
 
+/// What shows that a datagram comes from its fleet.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Standing {
+    /// Nothing: plain mode, in which anybody can speak as anybody.
+    Plain,
+    /// The fleet's code is right, made with the key of this generation. A unit's name is no more than what another one of
+    /// the fleet may have said.
+    Proven(u32),
+    /// Secured, and made with none of the keys that the survey has of that fleet.
+    OtherKeys,
+    /// Secured, and the survey has no keys of that fleet, or the datagram carries no code for the fleet.
+    Unchecked,
+}
+
+impl Standing {
+    /// Whether both say the same, of whatever generation.
+    fn is_like(self, other: Self) -> bool {
+        std::mem::discriminant(&self) == std::mem::discriminant(&other)
+    }
+}
+
 /// One life of a unit, as it was heard from one address.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Heard {
     /// Where its datagrams came from.
     pub source: SocketAddr,
+    /// Its mode.
+    pub mode: Mode,
+    /// What shows that it belongs to its fleet, as heard last.
+    pub standing: Standing,
     /// Its protocol version. What is said below of another version than this one's is read as if it were of this one.
     pub version: u8,
     /// Its fleet.
@@ -65,6 +90,8 @@ impl Heard {
 
     pub(super) fn is(&self, news: &News) -> bool {
         self.source == news.source
+            && self.mode == news.header.mode
+            && self.standing.is_like(news.standing)
             && self.version == news.header.version
             && self.fleet == news.header.fleet
             && self.identity.as_ref() == news.identity
@@ -74,6 +101,8 @@ impl Heard {
     pub(super) fn new(news: &News, now: Duration) -> Self {
         Self {
             source: news.source,
+            mode: news.header.mode,
+            standing: news.standing,
             version: news.header.version,
             fleet: news.header.fleet,
             identity: news.identity.cloned(),
@@ -92,7 +121,7 @@ impl Heard {
     }
 
     pub(super) fn take(&mut self, news: &News, now: Duration) {
-        self.last = now;
+        (self.last, self.standing) = (now, news.standing);
         self.by_broadcast |= news.by_broadcast;
         self.to_us = self.to_us.saturating_add(u32::from(!news.by_broadcast));
         match news.datagram {
@@ -125,6 +154,8 @@ pub struct Foreign {
 pub struct Reach {
     /// The interface.
     pub interface: Interface,
+    /// The UDP port of the broadcasts.
+    pub port: u16,
     /// Broadcasts that the system took.
     pub sent: u32,
     /// Why the system did not take a broadcast, the last time.
@@ -137,6 +168,7 @@ pub struct Reach {
 pub(super) struct News<'n> {
     pub(super) source: SocketAddr,
     pub(super) header: Header,
+    pub(super) standing: Standing,
     pub(super) identity: Option<&'n Identity>,
     pub(super) epoch: Option<Epoch>,
     pub(super) datagram: Option<&'n Datagram<'n>>,

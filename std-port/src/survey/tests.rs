@@ -4,6 +4,7 @@ use cara_core::distribution::hello::Manager;
 use cara_core::host::secure::Plain;
 
 use super::*;
+use crate::keys::FleetKeys;
 
 /// Longest wait for a datagram on loopback.
 const PATIENCE: Duration = Duration::from_secs(10);
@@ -21,7 +22,7 @@ fn free_port() -> u16 {
 
 /// A sender on loopback, and where the survey listens.
 fn sender(survey: &Survey) -> (UdpSocket, SocketAddr) {
-    let port = survey.ear.discovery_port();
+    let port = survey.reach()[0].port;
     (UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap(), (Ipv4Addr::LOCALHOST, port).into())
 }
 
@@ -90,32 +91,32 @@ fn tables_are_bounded_and_what_is_dropped_is_counted() {
     let mut survey = survey();
     let source = SocketAddr::from((Ipv4Addr::new(127, 1, 2, 3), 9));
     for epoch in 0..HEARD as u64 + 10 {
-        survey.note(source, &bytes(7, &search("agv", epoch)), true);
+        survey.note(source, &bytes(7, &search("agv", epoch)), Some(1));
     }
     for port in 0..FOREIGN as u16 + 5 {
-        survey.note((Ipv4Addr::LOCALHOST, port).into(), b"junk", true);
+        survey.note((Ipv4Addr::LOCALHOST, port).into(), b"junk", Some(1));
     }
     assert_eq!((survey.heard().len(), survey.foreign().len()), (HEARD, FOREIGN));
     // The survey's own port may be among the made-up ones only above 1023.
     assert_eq!(survey.dropped(), 15);
-    survey.note(source, &bytes(7, &search("agv", 3)), true);
+    survey.note(source, &bytes(7, &search("agv", 3)), Some(1));
     assert_eq!((survey.heard()[3].searches, survey.dropped()), (2, 15));
 }
 
 #[test]
 fn a_manager_answers_and_own_broadcasts_come_back() {
     let mut survey = survey();
-    let port = survey.ear.discovery_port();
+    let port = survey.reach()[0].port;
     let fleet = random() as u32;
     let manager = crate::CommunicationSystem::builder("boss", 1).unwrap().fleet(fleet).discovery_port(port);
-    let manager = manager.interfaces(Interfaces::Loopback).build_system().unwrap();
+    let manager = manager.insecure().interfaces(Interfaces::Loopback).build_system().unwrap();
     manager.start().unwrap();
     assert!(survey.ask(Fleet(fleet)));
     listen_until(&mut survey, |survey| survey.heard().iter().any(|heard| heard.answers > 0));
     let boss = survey.heard().iter().find(|heard| heard.answers > 0).unwrap();
     assert_eq!(boss.identity.as_ref(), Some(&manager.identity()));
     assert_eq!(boss.listens_at().map(|at| at.port()), Some(manager.tcp_port()));
-    assert_eq!((boss.room, boss.to_us), (Some(64), 1));
+    assert_eq!((boss.room, boss.to_us, boss.standing), (Some(64), 1, Standing::Plain));
     assert!(survey.reach().iter().any(|reach| reach.sent == 1 && reach.heard == 1), "{:?}", survey.reach());
     assert!(survey.heard().iter().all(|heard| heard.identity.as_ref() == Some(&manager.identity())));
 }
@@ -124,7 +125,7 @@ fn a_manager_answers_and_own_broadcasts_come_back() {
 fn one_that_only_listens_sends_nothing() {
     let (mut asked, mut silent) = {
         let silent = survey();
-        let asked = Survey::open(Interfaces::Loopback, silent.ear.discovery_port()).unwrap();
+        let asked = Survey::open(Interfaces::Loopback, silent.reach()[0].port).unwrap();
         (asked, silent)
     };
     silent.listen(Duration::from_millis(50));
@@ -135,4 +136,68 @@ fn one_that_only_listens_sends_nothing() {
     asked.ask_at(Fleet(1), silent.voice.local_addr().unwrap()).unwrap();
     listen_until(&mut silent, |silent| !silent.heard().is_empty());
     assert!(!silent.heard()[0].by_broadcast);
+}
+
+/// Keys of `boss/1` and `agv/7` in a fleet.
+fn fleet_keys(fleet: u32) -> FleetKeys {
+    let mut keys = FleetKeys::draw(Fleet(fleet)).unwrap();
+    keys.add(&Identity::m_unit("boss", 1).unwrap(), &[]).unwrap();
+    keys.add(&Identity::s_unit("agv", 7).unwrap(), &[]).unwrap();
+    keys
+}
+
+#[test]
+fn a_secured_manager_answers_with_the_fleets_key_and_to_nobody_else() {
+    let fleet = random() as u32;
+    let root = fleet_keys(fleet);
+    let ring = |identity: &Identity| root.ring(identity).unwrap();
+    let boss = Identity::m_unit("boss", 1).unwrap();
+    let mut keys = SurveyKeys::default();
+    keys.add_ring(&ring(&Identity::s_unit("agv", 7).unwrap()));
+    let mut survey = survey().with_keys(keys);
+    let (port, mut stranger_keys) = (survey.reach()[0].port, SurveyKeys::default());
+    stranger_keys.add_ring(&fleet_keys(fleet).ring(&boss).unwrap());
+    let mut stranger = Survey::open(Interfaces::Loopback, port).unwrap().with_keys(stranger_keys);
+    let manager = crate::CommunicationSystem::builder("boss", 1).unwrap().fleet(fleet).discovery_port(port);
+    let manager = manager.interfaces(Interfaces::Loopback).keys(ring(&boss)).build_system().unwrap();
+    manager.start().unwrap();
+    stranger.ask(Fleet(fleet));
+    survey.ask(Fleet(fleet));
+    listen_until(&mut survey, |survey| survey.heard().iter().any(|heard| heard.to_us > 0));
+    let answer = survey.heard().iter().find(|heard| heard.to_us > 0).unwrap();
+    assert_eq!((answer.identity.as_ref(), answer.mode), (Some(&boss), Mode::Secured));
+    assert_eq!((answer.standing, answer.room), (Standing::Proven(1), Some(64)));
+    assert_eq!(answer.listens_at().map(|at| at.port()), Some(manager.tcp_port()));
+    // The manager keeps no refusal of who only looks.
+    assert!(manager.findings().is_empty(), "{:?}", manager.findings());
+    // What it asks of its own accord is heard by all, and trusted by none with other keys.
+    listen_until(&mut stranger, |stranger| stranger.heard().iter().any(|heard| heard.identity.as_ref() == Some(&boss)));
+    let of_boss = stranger.heard().iter().filter(|heard| heard.identity.as_ref() == Some(&boss));
+    assert!(of_boss.clone().all(|heard| heard.standing == Standing::OtherKeys && heard.to_us == 0));
+    assert!(of_boss.count() > 0);
+}
+
+#[test]
+fn what_is_signed_otherwise_is_another_ones() {
+    let fleet = random() as u32;
+    let root = fleet_keys(fleet);
+    let mut keys = SurveyKeys::default();
+    keys.add_root(&root);
+    let mut survey = survey().with_keys(keys);
+    let (sender, to) = sender(&survey);
+    let ring = |root: &FleetKeys| root.ring(&Identity::s_unit("agv", 7).unwrap()).unwrap();
+    let (ours, theirs) = (ring(&root), ring(&fleet_keys(fleet)));
+    let mut sealed = [0; SEARCH_BYTES];
+    for (ring, fleet) in [(&ours, fleet), (&theirs, fleet), (&theirs, fleet.wrapping_add(1))] {
+        let mut signers = SurveyKeys::default();
+        signers.add_ring(ring);
+        let signer = signers.signers(ring.fleet()).next().unwrap();
+        let length = search("agv", 3).encode(Fleet(fleet), &signer, &mut sealed).unwrap().len();
+        sender.send_to(&sealed[..length], to).unwrap();
+    }
+    sender.send_to(&bytes(fleet, &search("agv", 3)), to).unwrap();
+    listen_until(&mut survey, |survey| survey.heard().len() == 4);
+    let standings: Vec<_> = survey.heard().iter().map(|heard| heard.standing).collect();
+    assert_eq!(standings, [Standing::Proven(1), Standing::OtherKeys, Standing::Unchecked, Standing::Plain]);
+    assert!(survey.heard().iter().all(|heard| heard.identity.is_some()), "names travel in clear");
 }

@@ -1,0 +1,221 @@
+//! The keys with which a survey asks secured fleets, and tells whose datagrams are.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use cara_core::distribution::authenticator::CODE_BYTES;
+use cara_core::distribution::identity::{Fleet, Identity};
+use cara_secure::keyring::{Codes, Keyring};
+use cara_secure::mac::Authenticates;
+
+use super::Standing;
+use crate::keys::{DiscoveryKey, FleetKeys, KeyError, KeyRing, PairKey, Store, place};
+
+/// Most files that are read.
+const FILES: usize = 1024;
+/// Most keys that are kept: each datagram may be checked with all of one fleet.
+const KEYS: usize = 64;
+/// Generations before the newest one that a root is asked for.
+const OLD: u32 = 16;
+/// Most files that are told as refused.
+const REFUSED: usize = 8;
+
+/// Discovery keys of fleets. Each shows that whoever has it belongs to the fleet; none of them opens a link.
+#[derive(Debug, Default)]
+pub struct SurveyKeys {
+    keys: Vec<Known>,
+    refused: Vec<KeyError>,
+}
+
+#[derive(Debug)]
+struct Known {
+    fleet: Fleet,
+    generation: u32,
+    key: DiscoveryKey,
+    /// Units of the fleet speak with it, as far as is known here.
+    in_use: bool,
+}
+
+impl SurveyKeys {
+    /// All that this user has in the places where keys are looked for ([`place`]): rings of units, and roots.
+    pub fn gather() -> Self {
+        let mut keys = Self::default();
+        place::rings().into_iter().take(FILES).for_each(|path| keys.add_found(&path));
+        for folder in place::folders() {
+            for fleet in Store::fleets(&folder) {
+                match Store::peek(&folder, fleet) {
+                    Ok(root) => keys.add_root(&root),
+                    Err(error) => keys.refuse(error),
+                }
+            }
+        }
+        keys
+    }
+
+    /// Those of one unit's file.
+    pub fn of_file(path: &Path) -> Result<Self, KeyError> {
+        let mut keys = Self::default();
+        keys.add_ring(&KeyRing::load(path)?);
+        Ok(keys)
+    }
+
+    /// Adds those of a unit's ring.
+    pub fn add_ring(&mut self, ring: &KeyRing) {
+        for (generation, key) in ring.discoveries() {
+            self.add(ring.fleet(), generation, key.clone(), generation == ring.generation());
+        }
+    }
+
+    /// Adds those of a fleet's root: of generations that are over as well, so that a unit that was left behind is known.
+    pub fn add_root(&mut self, root: &FleetKeys) {
+        let (fleet, used) = (root.members().fleet(), root.members().generation());
+        let newest = root.members().generations().max().unwrap_or(used);
+        for generation in newest.saturating_sub(OLD).max(1)..=newest {
+            self.add(fleet, generation, root.discovery(generation), generation == used);
+        }
+    }
+
+    /// Whether there are any of a fleet.
+    pub fn has(&self, fleet: Fleet) -> bool {
+        self.of(fleet).next().is_some()
+    }
+
+    /// The fleets of which there are any.
+    pub fn fleets(&self) -> BTreeSet<Fleet> {
+        self.keys.iter().map(|known| known.fleet).collect()
+    }
+
+    /// Files with keys that were found and not taken, those of other users left out.
+    pub fn refused(&self) -> &[KeyError] {
+        &self.refused
+    }
+
+    /// What can be said of the sender of a who-has or announce of a fleet, from all its bytes.
+    pub(super) fn standing(&self, fleet: Fleet, datagram: &[u8]) -> Standing {
+        let Some((signed, code)) = datagram.split_last_chunk::<CODE_BYTES>().filter(|_| self.has(fleet)) else {
+            return Standing::Unchecked;
+        };
+        let made = self.of(fleet).find(|known| known.key.is_code(&[signed], code));
+        made.map_or(Standing::OtherKeys, |known| Standing::Proven(known.generation))
+    }
+
+    /// What signs a question to a fleet, for each key that its units may speak with.
+    pub(super) fn signers(&self, fleet: Fleet) -> impl Iterator<Item = Codes<Signer<'_>>> {
+        self.of(fleet).filter(|known| known.in_use).map(|known| Codes::Keyed(Signer(&known.key)))
+    }
+
+    fn of(&self, fleet: Fleet) -> impl Iterator<Item = &Known> {
+        self.keys.iter().filter(move |known| known.fleet == fleet)
+    }
+
+    fn add(&mut self, fleet: Fleet, generation: u32, key: DiscoveryKey, in_use: bool) {
+        let same = |known: &&mut Known| known.fleet == fleet && known.key.expose() == key.expose();
+        let full = self.keys.len() >= KEYS;
+        match self.keys.iter_mut().find(same) {
+            Some(known) => known.in_use |= in_use,
+            None if full => {}
+            None => self.keys.push(Known { fleet, generation, key, in_use }),
+        }
+    }
+
+    fn add_found(&mut self, path: &PathBuf) {
+        match KeyRing::load(path) {
+            Ok(ring) => self.add_ring(&ring),
+            Err(error) => self.refuse(error),
+        }
+    }
+
+    /// What belongs to another user, or cannot be opened, is no mistake: a host's units have users of their own.
+    fn refuse(&mut self, error: KeyError) {
+        let is_mistake = !matches!(error, KeyError::Foreign { .. } | KeyError::System { .. });
+        if is_mistake && self.refused.len() < REFUSED {
+            self.refused.push(error);
+        }
+    }
+}
+
+/// Signs for a fleet with one key, as nobody who has a key of a pair.
+#[derive(Debug)]
+pub(super) struct Signer<'k>(&'k DiscoveryKey);
+
+impl Keyring for Signer<'_> {
+    fn discovery(&self) -> (&DiscoveryKey, Option<&DiscoveryKey>) {
+        (self.0, None)
+    }
+
+    fn pair(&self, _peer: &Identity) -> Option<(PairKey, Option<PairKey>)> {
+        None
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::fs;
+    use std::os::unix::fs::PermissionsExt;
+
+    fn depot() -> Identity {
+        Identity::m_unit("depot", 1).unwrap()
+    }
+
+    fn fleet(number: u32) -> FleetKeys {
+        let mut keys = FleetKeys::draw(Fleet(number)).unwrap();
+        keys.add(&depot(), &[]).unwrap();
+        keys
+    }
+
+    fn signed(key: &DiscoveryKey) -> Vec<u8> {
+        let mut datagram = b"a datagram".to_vec();
+        let code: [u8; CODE_BYTES] = key.code(&[&datagram]);
+        datagram.extend(code);
+        datagram
+    }
+
+    #[test]
+    fn a_code_shows_the_fleet_its_generation_or_nothing() {
+        let mut root = fleet(7);
+        let old = root.ring(&depot()).unwrap();
+        root.rotate().unwrap();
+        let ring = root.ring(&depot()).unwrap();
+        let mut keys = SurveyKeys::default();
+        assert_eq!(keys.standing(Fleet(7), &signed(ring.discovery())), Standing::Unchecked);
+        keys.add_ring(&ring);
+        assert_eq!(keys.standing(Fleet(7), &signed(ring.discovery())), Standing::Proven(1));
+        assert_eq!(keys.standing(Fleet(7), &signed(ring.discovery_in(2).unwrap())), Standing::Proven(2));
+        let other = fleet(7).ring(&depot()).unwrap();
+        assert_eq!(keys.standing(Fleet(7), &signed(other.discovery())), Standing::OtherKeys);
+        assert_eq!(keys.standing(Fleet(8), &signed(ring.discovery())), Standing::Unchecked);
+        assert_eq!(keys.standing(Fleet(7), b"short"), Standing::Unchecked);
+        // One that was left behind is known by the root alone.
+        root.switch().unwrap();
+        root.finish().unwrap();
+        let mut ours = SurveyKeys::default();
+        ours.add_ring(&root.ring(&depot()).unwrap());
+        assert_eq!(ours.standing(Fleet(7), &signed(old.discovery())), Standing::OtherKeys);
+        ours.add_root(&root);
+        assert_eq!(ours.standing(Fleet(7), &signed(old.discovery())), Standing::Proven(1));
+        assert_eq!(ours.signers(Fleet(7)).count(), 1, "nobody is asked with a key that is over");
+    }
+
+    #[test]
+    fn a_file_that_others_can_read_is_told_and_not_taken() {
+        let folder = tempfile::tempdir().unwrap();
+        let store = Store::create(folder.path(), fleet(7)).unwrap();
+        store.save().unwrap();
+        let path = store.file_of(&depot());
+        assert!(SurveyKeys::of_file(&path).unwrap().has(Fleet(7)));
+        fs::set_permissions(&path, fs::Permissions::from_mode(0o640)).unwrap();
+        let mut keys = SurveyKeys::default();
+        keys.add_found(&path);
+        assert!(matches!(keys.refused(), [KeyError::Open { .. }]) && keys.fleets().is_empty());
+        keys.add_found(&folder.path().join("absent"));
+        assert_eq!(keys.refused().len(), 1);
+    }
+
+    #[test]
+    fn the_keys_that_are_kept_are_bounded() {
+        let mut keys = SurveyKeys::default();
+        (0..KEYS as u32 + 9).for_each(|number| keys.add_ring(&fleet(number).ring(&depot()).unwrap()));
+        assert_eq!(keys.keys.len(), KEYS);
+    }
+}
