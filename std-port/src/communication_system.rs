@@ -149,6 +149,11 @@ impl<T: Send + 'static> CommunicationSystem<T> {
         &self.owner.engine
     }
 
+    #[cfg(feature = "control")]
+    pub(crate) fn keys(&self) -> &crate::engine::Keys {
+        &self.engine().keys
+    }
+
     /// Searches for nodes and keeps connections, in threads of its own (paper, listing line 2).
     #[doc(alias = "start_thread")]
     pub fn start(&self) -> Result<(), Error> {

@@ -8,6 +8,7 @@ mod exit;
 mod global;
 mod interrupt;
 mod keys;
+mod listening;
 mod name_and_id;
 mod node;
 mod nodes;

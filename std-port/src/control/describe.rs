@@ -1,14 +1,15 @@
 //! Units, nodes, refusals and events in the control socket's form.
 
-use cara_core::config::{Constraints, Priority, VERSION};
+use cara_core::config::{Constraints, Mode, Priority, VERSION};
 use cara_core::distribution::connection_handler::Finding;
 use cara_core::distribution::identity::{Epoch, Identity, Role};
 use cara_core::time::Duration;
 
 use super::failure::name_of;
 use super::protocol::{
-    Answer, ConstraintsInfo, FunctionInfo, InterfaceInfo, LimitsInfo, NodeInfo, RefusedInfo, UnitInfo,
+    Answer, ConstraintsInfo, FunctionInfo, InterfaceInfo, KeysInfo, LimitsInfo, NodeInfo, RefusedInfo, UnitInfo,
 };
+use crate::keys::LiveRing;
 use crate::{CommunicationSystem, Interface, Limits, Peer, TheirFunction, UnitEvent};
 
 pub(super) fn unit<T: Send + 'static>(system: &CommunicationSystem<T>) -> UnitInfo {
@@ -18,6 +19,8 @@ pub(super) fn unit<T: Send + 'static>(system: &CommunicationSystem<T>) -> UnitIn
         id: identity.id(),
         role: role(identity.role()).to_owned(),
         fleet: system.fleet().0,
+        mode: Some(mode(system.keys().mode()).to_owned()),
+        keys: system.keys().ring().map(keys),
         version: VERSION,
         discovery_port: system.discovery_port(),
         tcp_port: system.tcp_port(),
@@ -26,6 +29,20 @@ pub(super) fn unit<T: Send + 'static>(system: &CommunicationSystem<T>) -> UnitIn
         interfaces: system.interfaces().iter().map(interface).collect(),
         constraints: constraints(&system.constraints()),
         connected: system.number_of_s_units() + system.number_of_m_units(),
+    }
+}
+
+const fn mode(mode: Mode) -> &'static str {
+    match mode {
+        Mode::Plain => "plain",
+        Mode::Secured => "secured",
+    }
+}
+
+fn keys(live: &LiveRing) -> KeysInfo {
+    KeysInfo {
+        file: live.path().map(|path| path.display().to_string()),
+        generations: live.ring().generations().collect(),
     }
 }
 

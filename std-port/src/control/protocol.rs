@@ -267,6 +267,12 @@ pub struct UnitInfo {
     pub role: String,
     /// Its fleet.
     pub fleet: u32,
+    /// `plain` or `secured`; absent where the unit is older than this.
+    #[serde(default)]
+    pub mode: Option<String>,
+    /// The keys of a secured unit.
+    #[serde(default)]
+    pub keys: Option<KeysInfo>,
     /// Protocol version.
     pub version: u8,
     /// The UDP port of broadcasts.
@@ -283,6 +289,15 @@ pub struct UnitInfo {
     pub constraints: ConstraintsInfo,
     /// Connected nodes.
     pub connected: usize,
+}
+
+/// What may be told of a unit's keys.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct KeysInfo {
+    /// Their file, which the unit follows; none where they were made in its process.
+    pub file: Option<String>,
+    /// The generations that it takes, the one that it speaks with first.
+    pub generations: Vec<u32>,
 }
 
 /// An address of an interface.

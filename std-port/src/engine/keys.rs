@@ -46,6 +46,14 @@ impl Keys {
         }
     }
 
+    #[cfg(feature = "control")]
+    pub(crate) const fn ring(&self) -> Option<&LiveRing> {
+        match self {
+            Self::Insecure => None,
+            Self::Ring(live) => Some(live),
+        }
+    }
+
     /// The cipher of a link that begins.
     pub(crate) fn cipher(&self) -> Cipher {
         Cipher::new(self.mode())

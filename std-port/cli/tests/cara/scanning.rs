@@ -1,9 +1,13 @@
 //! `cara scan`, `cara publish` and `cara counters`.
 
 use std::io::Read;
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
 use std::process::Stdio;
 
-use cara_std::{Interfaces, Unit};
+use cara_std::control::Control;
+use cara_std::keys::{FleetKeys, Store, place};
+use cara_std::{Fleet, Identity, Interfaces, Unit};
 
 use crate::support::{Ran, Stage};
 
@@ -117,4 +121,100 @@ fn a_pipe_gets_no_colours_and_nobody_with_no_color() {
         assert!(coloured.out.contains('\x1b') || coloured.err.contains('\x1b'), "{}", coloured.everything());
         assert!(!plain.out.contains('\x1b') && !plain.err.contains('\x1b'), "{}", plain.everything());
     }
+}
+
+/// A manager with keys, a vehicle without, and one with keys of another root, all of one fleet.
+struct Modes {
+    stage: Stage,
+    keys: tempfile::TempDir,
+    _units: (cara_std::CommunicationSystem, [Unit; 2]),
+}
+
+impl Modes {
+    fn new() -> Self {
+        let (stage, keys) = (Stage::empty(), crate::support::private_folder());
+        let (boss, stranger) = (Identity::m_unit("boss", 1).unwrap(), Identity::s_unit("stranger", 6).unwrap());
+        let draw = || FleetKeys::draw(Fleet(stage.fleet)).unwrap();
+        let (mut ours, mut theirs) = (draw(), draw());
+        [&mut ours, &mut theirs].into_iter().for_each(|keys| keys.add(&boss, &[]).unwrap());
+        theirs.add(&stranger, &[]).unwrap();
+        let manager = cara_std::CommunicationSystem::builder("boss", 1).unwrap().keys(ours.ring(&boss).unwrap());
+        let manager = manager.fleet(stage.fleet).interfaces(Interfaces::Loopback).control(Control::Off);
+        let manager = manager.build_system().unwrap();
+        manager.start().unwrap();
+        let vehicle = |name, id| {
+            let unit = Unit::builder(name, id, "boss", 1).unwrap();
+            unit.fleet(stage.fleet).interfaces(Interfaces::Loopback)
+        };
+        let stranger = vehicle("stranger", 6).keys(theirs.ring(&stranger).unwrap());
+        let units = [vehicle("open", 5).insecure(), stranger].map(|unit| unit.build_unit().unwrap());
+        units.iter().for_each(|unit| unit.start().unwrap());
+        // As on a host where the fleet's keys are made.
+        Store::create(keys.path(), ours).unwrap().save().unwrap();
+        Self { stage, keys, _units: (manager, units) }
+    }
+
+    fn scan(&self, keys: &Path, more: &[&str]) -> Ran {
+        let mut command = self.stage.command(&[&["scan", "--survey", "--listen", "8s"], more].concat());
+        Ran::of(command.env("CARA_KEYS", keys).output().unwrap())
+    }
+}
+
+/// Name, mode and proof of those of the fleet: other tests are on the same ports.
+fn proofs(fleet: u32, told: &serde_json::Value) -> Vec<(String, String, String)> {
+    let text = |value: &serde_json::Value| value.as_str().unwrap_or("-").to_owned();
+    let heard = told["heard"].as_array().unwrap().iter().filter(|heard| heard["fleet"] == fleet);
+    let mut heard: Vec<_> =
+        heard.map(|heard| (text(&heard["name"]), text(&heard["mode"]), text(&heard["proof"]))).collect();
+    heard.sort();
+    heard.dedup();
+    heard
+}
+
+fn three(heard: [[&str; 3]; 3]) -> Vec<(String, String, String)> {
+    heard.map(|[name, mode, proof]| (name.into(), mode.into(), proof.into())).into()
+}
+
+#[test]
+fn a_survey_tells_whose_datagrams_are_proven() {
+    let modes = Modes::new();
+    let told = modes.scan(modes.keys.path(), &["--json"]).json();
+    let expected =
+        three([["boss", "secured", "fleet"], ["open", "plain", "none"], ["stranger", "secured", "other_keys"]]);
+    assert_eq!(proofs(modes.stage.fleet, &told), expected, "{told}");
+    let boss = told["heard"].as_array().unwrap().iter().find(|heard| heard["name"] == "boss").unwrap();
+    // It answers the survey, and nobody who only listens.
+    assert!(boss["answers"].as_u64() > Some(0) && boss["generation"] == 1, "{told}");
+    assert_eq!(told["keys_of"], serde_json::json!([modes.stage.fleet]));
+    modes.scan(modes.keys.path(), &[]).says("secured, proven").says("secured, other keys").says("do not meet");
+}
+
+#[test]
+fn without_keys_a_survey_hears_secured_units_and_tells_how_to_get_keys() {
+    let modes = Modes::new();
+    let empty = crate::support::private_folder();
+    let told = modes.scan(empty.path(), &["--json"]).json();
+    let expected =
+        three([["boss", "secured", "unchecked"], ["open", "plain", "none"], ["stranger", "secured", "unchecked"]]);
+    assert_eq!(proofs(modes.stage.fleet, &told), expected, "{told}");
+    let command = format!("`cara keys new-fleet --fleet {} ", modes.stage.fleet);
+    modes.scan(empty.path(), &[]).says("secured, not checked").says(&command).says("--key-file");
+    // Whoever wants plain mode alone hears nothing else.
+    let told = modes.scan(modes.keys.path(), &["--json", "--insecure"]).json();
+    assert!(
+        proofs(modes.stage.fleet, &told).iter().all(|(_, mode, _)| mode == "plain")
+            && told["keys_of"] == serde_json::json!([])
+    );
+    // A file of the fleet's is enough.
+    let file = place::file_name(&Identity::m_unit("boss", 1).unwrap(), Fleet(modes.stage.fleet));
+    let file = modes.keys.path().join(file);
+    let told = modes.scan(empty.path(), &["--json", "--key-file", file.to_str().unwrap()]).json();
+    assert!(
+        proofs(modes.stage.fleet, &told).iter().any(|(name, _, proof)| name == "boss" && proof == "fleet"),
+        "{told}"
+    );
+    std::fs::set_permissions(&file, std::fs::Permissions::from_mode(0o644)).unwrap();
+    let ran = modes.scan(empty.path(), &["--key-file", file.to_str().unwrap()]);
+    assert_eq!(ran.says("chmod 600").code, 1);
+    modes.scan(&file, &[]).says("keys were not taken").says("chmod 600");
 }

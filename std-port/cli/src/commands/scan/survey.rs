@@ -3,35 +3,41 @@
 use std::collections::BTreeSet;
 use std::time::Duration;
 
-use cara_std::survey::{Heard, Survey};
+use cara_std::survey::{Heard, Standing, Survey};
 use cara_std::{Fleet, Role};
 use serde_json::{Value, json};
 
 use crate::global::Global;
-use crate::output::{self, PLAIN, Rows};
+use crate::listening::{self, shown_mode, shown_standing};
+use crate::output::{self, BAD, FAINT, PLAIN, Rows};
 
 /// How often a survey asks while it listens: one broadcast may be lost.
 const QUESTIONS: u32 = 2;
 
 pub(crate) fn show(listen: Duration, global: &Global) -> anyhow::Result<()> {
-    let mut survey = Survey::open(global.interfaces(), global.port())?;
+    let keys = listening::keys(global)?;
+    let fleets = listening::fleets(global, &keys);
+    let mut survey = listening::open(global, keys)?;
     for _ in 0..QUESTIONS {
-        survey.ask(Fleet(global.fleet.unwrap_or(0)));
+        for fleet in &fleets {
+            survey.ask(*fleet);
+        }
         survey.listen(listen / QUESTIONS);
     }
     let heard: Vec<_> = survey.heard().iter().filter(|heard| !heard.is_survey()).collect();
     if global.json {
         let heard: Vec<_> = heard.iter().map(|heard| as_json(heard)).collect();
-        return Ok(output::object(&json!({ "unit": null, "heard": heard }))?);
+        let keys_of: Vec<u32> = survey.keys().fleets().iter().map(|fleet| fleet.0).collect();
+        let refused: Vec<String> = survey.keys().refused().iter().map(ToString::to_string).collect();
+        let whole = json!({ "unit": null, "keys_of": keys_of, "key_files_refused": refused, "heard": heard });
+        return Ok(output::object(&whole)?);
     }
     if heard.is_empty() {
         output::line("nobody was heard; `cara doctor` looks for reasons")?;
     }
     table(&heard).print()?;
-    let fleets: BTreeSet<u32> = heard.iter().map(|heard| heard.fleet.0).collect();
-    if fleets.len() > 1 {
-        output::line(format_args!("\nseveral fleets are here: {fleets:?}; units of different fleets do not meet"))?;
-    }
+    about_fleets(&heard)?;
+    about_keys(&survey, &heard, &fleets, global)?;
     output::line(
         "\nA survey hears m_units, and s_units that look for their manager. S_units that have joined are silent: their \
          manager shows them (`cara scan` on its host).",
@@ -39,18 +45,67 @@ pub(crate) fn show(listen: Duration, global: &Global) -> anyhow::Result<()> {
     Ok(())
 }
 
+fn about_fleets(heard: &[&Heard]) -> std::io::Result<()> {
+    let fleets: BTreeSet<u32> = heard.iter().map(|heard| heard.fleet.0).collect();
+    if fleets.len() > 1 {
+        output::line(format_args!("\nseveral fleets are here: {fleets:?}; units of different fleets do not meet"))?;
+    }
+    let modes: BTreeSet<&str> = heard.iter().map(|heard| shown_mode(heard.mode)).collect();
+    if modes.len() > 1 {
+        output::line("\nunits in plain mode and secured ones are here; they do not meet")?;
+    }
+    Ok(())
+}
+
+/// What could not be asked or checked, and how it can be.
+fn about_keys(survey: &Survey, heard: &[&Heard], asked: &[Fleet], global: &Global) -> std::io::Result<()> {
+    for refused in survey.keys().refused() {
+        output::line(format_args!("\n{BAD}keys were not taken{BAD:#}: {refused}"))?;
+    }
+    if heard.iter().any(|heard| heard.standing == Standing::OtherKeys) {
+        output::line(
+            "\n\"other keys\": their codes were made with none of the keys that are here: they have keys of another root, or of \
+             a generation that is over, or somebody speaks in their name",
+        )?;
+    }
+    // Whoever wants plain mode needs none.
+    if global.insecure {
+        return Ok(());
+    }
+    let unchecked = heard.iter().filter(|heard| heard.standing == Standing::Unchecked).map(|heard| heard.fleet);
+    let of_asked = asked.iter().copied().filter(|_| global.fleet.is_some() || survey.keys().fleets().is_empty());
+    let without: BTreeSet<Fleet> = unchecked.chain(of_asked).filter(|fleet| !survey.keys().has(*fleet)).collect();
+    for fleet in without {
+        output::line(format_args!(
+            "\nthere are no keys of fleet {} here, so its secured units were not asked, and nothing shows that those which \
+             were heard belong to it: {}",
+            fleet.0,
+            listening::how_to_get_keys(fleet)
+        ))?;
+    }
+    Ok(())
+}
+
 fn table(heard: &[&Heard]) -> Rows {
-    let mut rows = Rows::new(["NODE", "ID", "ROLE", "FLEET", "VERSION", "HEARD FROM", "LISTENS AT", "LOOKS FOR"]);
+    let mut rows =
+        Rows::new(["NODE", "ID", "ROLE", "FLEET", "MODE", "VERSION", "HEARD FROM", "LISTENS AT", "LOOKS FOR"]);
     for heard in heard {
         let or_dash = |text: Option<String>| text.unwrap_or_else(|| "-".into());
         let identity = heard.identity.as_ref();
+        let (style, mode) = match heard.standing {
+            Standing::Plain => (PLAIN, "plain"),
+            Standing::Proven(_) => (PLAIN, "secured, proven"),
+            Standing::OtherKeys => (BAD, "secured, other keys"),
+            Standing::Unchecked => (FAINT, "secured, not checked"),
+        };
         rows.add(
-            PLAIN,
+            style,
             [
                 or_dash(identity.map(|identity| identity.name().to_owned())),
                 or_dash(identity.map(|identity| identity.id().to_string())),
                 or_dash(identity.map(|identity| role(identity.role()).to_owned())),
                 heard.fleet.0.to_string(),
+                mode.to_owned(),
                 heard.version.to_string(),
                 heard.source.to_string(),
                 or_dash(heard.listens_at().map(|at| at.to_string())),
@@ -63,11 +118,15 @@ fn table(heard: &[&Heard]) -> Rows {
 
 fn as_json(heard: &Heard) -> Value {
     let identity = heard.identity.as_ref();
+    let (proof, generation) = shown_standing(heard.standing);
     json!({
         "name": identity.map(|identity| identity.name()),
         "id": identity.map(|identity| identity.id()),
         "role": identity.map(|identity| role(identity.role())),
         "fleet": heard.fleet.0,
+        "mode": shown_mode(heard.mode),
+        "proof": proof,
+        "generation": generation,
         "version": heard.version,
         "same_version": heard.same_version(),
         "source": heard.source.to_string(),

@@ -3,10 +3,10 @@
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use cara_std::control::protocol::{ConstraintsInfo, NodeInfo, UnitInfo};
-use cara_std::survey::{Heard, Reach};
+use cara_std::control::protocol::{ConstraintsInfo, KeysInfo, NodeInfo, UnitInfo};
+use cara_std::survey::{Heard, Reach, Standing};
 use cara_std::sys::interfaces::Interface;
-use cara_std::{Epoch, Fleet, Identity, Interfaces, Manager};
+use cara_std::{Epoch, Fleet, Identity, Interfaces, Manager, Mode};
 
 use super::{Evidence, Life};
 use crate::doctor::VERSION;
@@ -22,7 +22,7 @@ pub(crate) fn evidence() -> Evidence {
         fleet_known: true,
         interfaces: Interfaces::All,
         loopback_by_environment: false,
-        port: 21_970,
+        port: 21_971,
         listened: Duration::from_secs(16),
         heard: Vec::new(),
         foreign: Vec::new(),
@@ -41,7 +41,7 @@ pub(crate) fn evidence() -> Evidence {
 pub(crate) fn reach(name: &str, address: &str) -> Reach {
     let broadcast = Some("10.0.0.255".parse().unwrap());
     let interface = Interface { name: name.into(), address: address.parse().unwrap(), broadcast, up: true };
-    Reach { interface, sent: 3, refused: None, heard: 3 }
+    Reach { interface, port: 21_971, sent: 3, refused: None, heard: 3 }
 }
 
 pub(crate) fn life(node: &str, epoch: u64, first: u64, last: u64) -> Life {
@@ -63,6 +63,8 @@ pub(crate) fn answering(name: &str, room: u16) -> Heard {
 fn heard(identity: Identity, wanted: Option<Manager>) -> Heard {
     Heard {
         source: SocketAddr::new("10.0.0.9".parse().unwrap(), 5000),
+        mode: Mode::Secured,
+        standing: Standing::Proven(1),
         version: VERSION,
         fleet: FLEET,
         identity: Some(identity),
@@ -96,8 +98,10 @@ pub(crate) fn running(name: &str, id: u32) -> Running {
         id,
         role: "m_unit".into(),
         fleet: FLEET.0,
+        mode: Some("secured".into()),
+        keys: Some(KeysInfo { file: None, generations: vec![1] }),
         version: VERSION,
-        discovery_port: 21_970,
+        discovery_port: 21_971,
         tcp_port: 4000,
         epoch: "1".into(),
         uptime_ms: 100_000,
