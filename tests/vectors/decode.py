@@ -3,8 +3,9 @@
 core.
 
 For each vector: its bytes decode to its value, the value encodes to its bytes, and every change of a single byte is
-accepted or refused, and read, exactly as the core does it. The examples in docs/wire.md must be vectors. Exits with 1
-and a line for each difference.
+accepted or refused, and read, exactly as the core does it. The examples in docs/wire.md must be vectors. Of the secured
+conversation each message of the handshakes is made again, and everything sealed is opened. Exits with 1 and a line for
+each difference.
 """
 
 import json
@@ -17,6 +18,7 @@ from pathlib import Path
 
 sys.dont_write_bytecode = True
 
+import cara_secure as secure  # noqa: E402
 import cara_wire as wire  # noqa: E402
 
 HERE = Path(__file__).resolve().parent
@@ -174,6 +176,46 @@ def check_document(vectors):
     return wrong, len(blocks)
 
 
+# What the ends drew for the first handshake and for the second one: 32 times the same byte.
+DRAWN = {"vehicle": (0x81, 0xC1), "manager": (0x01, 0x41)}
+HANDSHAKE = ["proof 1", "proof 2", "turn", "turn", "acknowledgement"]
+
+
+def conversation():
+    """(the pair's key, [(who, how, bytes)]) of secured.txt."""
+    lines = (HERE / "secured.txt").read_text(encoding="utf-8").splitlines()
+    words = [line.split() for line in lines if not line.startswith("#")]
+    (_, key), carried = words[0], words[1:]
+    return bytes.fromhex(key), [(end, how, bytes.fromhex(data)) for end, how, data in carried]
+
+
+def opened(key, carried):
+    """What was said, and the link behind it."""
+    link = secure.Conversation(key, {end: [bytes([byte]) * 32 for byte in bytes_] for end, bytes_ in DRAWN.items()})
+    return [getattr(link, how)(end, data) for end, how, data in carried], link
+
+
+def check_secured():
+    """The differences of the secured conversation, and how many frames and datagrams it has."""
+    key, carried = conversation()
+    try:
+        said, link = opened(key, carried)
+    except (secure.Refused, wire.Malformed) as error:
+        return ["secured.txt: %s" % (error or "it cannot be read")], len(carried)
+    wrong = [] if link.renewals == 1 else ["secured.txt: the keys are made anew %d times" % link.renewals]
+    if [what for what in said if what in HANDSHAKE] != HANDSHAKE[:2] + HANDSHAKE:
+        wrong.append("secured.txt: the keys are made anew in another order")
+    for at in range(2, len(carried)):
+        end, how, data = carried[at]
+        changed = data[:-1] + bytes([data[-1] ^ 1])
+        try:
+            opened(key, carried[:at] + [(end, how, changed)])
+            wrong.append("secured.txt: number %d opens although it was changed" % at)
+        except secure.Refused:
+            pass
+    return wrong, len(carried)
+
+
 def main():
     begin = time.monotonic()
     document = json.loads((HERE / "vectors.json").read_text(encoding="utf-8"))
@@ -188,12 +230,15 @@ def main():
         wrong += ["%s %s" % (answer["name"], difference) for difference in check_answer(answer)]
     differences, examples = check_document(vectors)
     wrong += differences
+    differences, secured = check_secured()
+    wrong += differences
     for line in wrong:
         print(line, file=sys.stderr)
     seconds = time.monotonic() - begin
-    counts = (len(vectors), total, len(document["answers"]), examples, len(wrong), seconds)
-    print("%d vectors, %d mutations, %d answers, %d examples, %d differences, %.1f s" % counts)
-    return 1 if wrong or 0 in counts[:4] else 0
+    counts = (len(vectors), total, len(document["answers"]), examples, secured, len(wrong), seconds)
+    form = "%d vectors, %d mutations, %d answers, %d examples, %d secured, %d differences, %.1f s"
+    print(form % counts)
+    return 1 if wrong or 0 in counts[:5] else 0
 
 
 if __name__ == "__main__":

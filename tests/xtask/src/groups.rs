@@ -126,8 +126,8 @@ pub(crate) const GROUPS: [Group; 22] = [
     Group {
         name: "vectors",
         what: "a decoder in a second language reads the golden vectors",
-        budget: 5,
-        quick: Some(5),
+        budget: 20,
+        quick: Some(20),
         by_default: true,
         run: |_| needing(install::program("python3", "python3"), vectors),
     },

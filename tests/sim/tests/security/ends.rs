@@ -9,7 +9,7 @@ use cara_core::distribution::function_list::{Entry, FunctionList, Slot};
 use cara_core::distribution::hello::{Hello, Limits};
 use cara_core::distribution::identity::{Epoch, Fleet, Identity};
 use cara_core::distribution::parameters::Parameters;
-use cara_core::error::CloseReason;
+use cara_core::error::{CloseReason, Refusal};
 use cara_core::host::connections::LinkCounter;
 use cara_core::host::mailman::{LinkId, Mailman};
 use cara_core::services::Context;
@@ -22,6 +22,10 @@ use cara_sim::Boxed;
 
 const FLEET: Fleet = Fleet(7);
 const BUFFERS: usize = 6;
+/// What is drawn for later proofs differs by this from what was drawn for the first one.
+const LATER: u8 = 0x40;
+/// How old keys become in a conversation in which they are made anew.
+const RENEWAL: Duration = Duration::from_secs(2);
 
 /// What an end has sent.
 #[derive(Default)]
@@ -54,7 +58,12 @@ pub(crate) struct End {
     pool: Pool<Boxed>,
     sent: Sent,
     now: Instant,
-    credentials: Option<Credentials>,
+    /// The key that it proves, and one that it takes as well. Without one it refuses.
+    pub(crate) keys: Option<(PairKey, Option<PairKey>)>,
+    /// What it draws for the first proof of its link, and for each later one.
+    draws: [u8; 2],
+    /// Whether it answers when the port is asked for a key.
+    pub(crate) answers: bool,
     /// The node was asked about the peer.
     pub(crate) greeted: bool,
     /// Services that ran.
@@ -132,7 +141,9 @@ impl End {
             pool: Pool::new((0..BUFFERS).map(|_| Some(Boxed::slice(size))).collect()),
             sent: Sent::default(),
             now,
-            credentials: Some(Credentials::new(key, [fresh; 32])),
+            keys: Some((key, None)),
+            draws: [fresh, fresh ^ LATER],
+            answers: true,
             greeted: false,
             ran: 0,
             closed: None,
@@ -148,11 +159,7 @@ impl End {
             let quiet = receipt.consumed == 0 && receipt.event.is_none();
             let consumed = receipt.consumed;
             match receipt.event {
-                Some(Event::Introduced) => {
-                    if let Some(credentials) = self.credentials.take() {
-                        self.session.prove(context!(self), credentials);
-                    }
-                }
+                Some(Event::Introduced) => self.prove(),
                 Some(Event::Hello) => self.greet(),
                 Some(Event::Call(call)) => {
                     self.ran += 1;
@@ -177,6 +184,19 @@ impl End {
         self.work();
     }
 
+    fn prove(&mut self) {
+        let [drawn, later] = self.draws;
+        self.draws = [later, later];
+        match self.keys.clone() {
+            _ if !self.answers => {}
+            Some((key, other)) => {
+                let credentials = Credentials::new(key, [drawn; 32]).or(other);
+                self.session.prove(context!(self), credentials);
+            }
+            None => self.session.refuse(context!(self), Refusal::NoKey),
+        }
+    }
+
     fn greet(&mut self) {
         self.greeted = true;
         self.session.accept(context!(self));
@@ -190,8 +210,10 @@ impl End {
             let _ = self.session.answer(context!(self), call.ticket, Ok(&arguments));
         }
         while let Some(event) = self.session.poll(context!(self)) {
-            if let Event::Closed(reason) = event {
-                self.closed = Some(reason);
+            match event {
+                Event::Closed(reason) => self.closed = Some(reason),
+                Event::Introduced => self.prove(),
+                _ => {}
             }
         }
     }
@@ -237,6 +259,7 @@ pub(crate) struct Carried {
 pub(crate) struct Ends {
     pub(crate) manager: End,
     pub(crate) agv: End,
+    steps: usize,
 }
 
 impl Ends {
@@ -249,13 +272,28 @@ impl Ends {
         Self::made(End::new(false, run, manager, run), End::new(true, run, agv, run | 0x80))
     }
 
-    /// Two ends that draw the same numbers, the same in each run; only the nonces of their hellos differ.
+    /// Two ends that draw the same numbers, the same in each run and for each proof; only the nonces of their hellos differ.
     pub(crate) fn repeating(run: u8) -> Self {
-        Self::made(End::new(false, run, key(), 9), End::new(true, run, key(), 9))
+        let mut ends = Self::made(End::new(false, run, key(), 9), End::new(true, run, key(), 9));
+        for end in [&mut ends.manager, &mut ends.agv] {
+            end.draws = [9; 2];
+        }
+        ends.with_renewal()
+    }
+
+    /// As [`Self::new`], in whose conversation the keys are made anew, and the manager calls twice more.
+    pub(crate) fn renewing(run: u8) -> Self {
+        Self::new(run).with_renewal()
+    }
+
+    fn with_renewal(mut self) -> Self {
+        self.agv.session.renew_every(RENEWAL);
+        self.steps = 8;
+        self
     }
 
     fn made(manager: End, agv: End) -> Self {
-        let mut ends = Self { manager, agv };
+        let mut ends = Self { manager, agv, steps: 4 };
         ends.manager.session.connected(context!(ends.manager));
         ends.agv.session.connected(context!(ends.agv));
         ends
@@ -289,11 +327,11 @@ impl Ends {
     /// everything on its way, with its number, and delivers what it likes.
     pub(crate) fn converse(&mut self, mut carry: impl FnMut(&mut Self, usize, Carried)) {
         let mut number = 0;
-        for step in 0..4 {
+        for step in 0..self.steps {
             match step {
-                1 => self.manager.call(Priority::Normal),
-                2 => self.manager.call(Priority::Emergency),
-                3 => [true, false].into_iter().for_each(|end| self.end(end).wait(Duration::from_secs(1))),
+                1 | 5 => self.manager.call(Priority::Normal),
+                2 | 6 => self.manager.call(Priority::Emergency),
+                3 | 4 | 7 => [true, false].into_iter().for_each(|end| self.end(end).wait(Duration::from_secs(1))),
                 _ => {}
             }
             while let Some(carried) = self.next() {
@@ -303,15 +341,27 @@ impl Ends {
         }
     }
 
+    /// Carries everything that is on its way.
+    pub(crate) fn carry(&mut self) {
+        while let Some(carried) = self.next() {
+            self.deliver(&carried);
+        }
+    }
+
     /// The same, undisturbed; all that was carried.
     pub(crate) fn recorded(run: u8) -> Vec<Carried> {
-        let (mut ends, mut record) = (Self::new(run), Vec::new());
-        ends.converse(|ends, _, carried| {
+        Self::new(run).record()
+    }
+
+    /// All that is carried in an undisturbed conversation.
+    pub(crate) fn record(mut self) -> Vec<Carried> {
+        let mut record = Vec::new();
+        self.converse(|ends, _, carried| {
             ends.deliver(&carried);
             record.push(carried);
         });
-        assert!(ends.manager.session.is_live() && ends.agv.session.is_live());
-        assert_eq!(ends.agv.ran, 2, "each call ran once");
+        assert!(self.manager.session.is_live() && self.agv.session.is_live());
+        assert_eq!(self.agv.ran as usize, self.steps / 2, "each call ran once");
         record
     }
 }

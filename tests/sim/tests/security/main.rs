@@ -3,6 +3,7 @@
 //! - [`ends`]: two secured sessions, with every frame and datagram between them in the attacker's hands;
 //! - [`frames`]: changed, cut, moved, left out and repeated frames;
 //! - [`discovery`]: changed, spoofed and repeated datagrams of discovery;
+//! - [`renewals`]: what was recorded before the keys of a link were made anew, and keys that are gone or others;
 //! - [`vectors`]: the bytes of a conversation, as committed;
 //! - [`fleet`]: wrong keys, no keys, plain against secured, floods, on the virtual network.
 
@@ -10,6 +11,7 @@ mod discovery;
 mod ends;
 mod fleet;
 mod frames;
+mod renewals;
 mod vectors;
 
 /// Attempts of one kind, and how many of them came to something.

@@ -23,7 +23,12 @@ fn text() -> String {
          # Who sent it, how, and the bytes. Each end\'s 32 fresh bytes are 01… (manager) and 81… (vehicle).\n",
     );
     let _ = writeln!(text, "key {}", hex(key().expose()));
-    for carried in Ends::recorded(RUN) {
+    let record = Ends::renewing(RUN).record();
+    let plain = Ends::recorded(RUN).len();
+    for (number, carried) in record.into_iter().enumerate() {
+        if number == plain {
+            text += "# The vehicle makes the keys anew, with c1… of its own and 41… of the manager, who then calls twice more.\n";
+        }
         let from = if carried.to_manager { "vehicle" } else { "manager" };
         let how = if carried.datagram { "datagram" } else { "stream" };
         let _ = writeln!(text, "{from} {how} {}", hex(&carried.bytes));

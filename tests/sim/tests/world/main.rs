@@ -3,6 +3,7 @@
 mod calls;
 mod faults;
 mod leases;
+mod renewals;
 mod runs;
 
 use cara_core::distribution::parameters::Parameters;
