@@ -196,6 +196,13 @@ impl<T: Send + 'static> Unit<T> {
         receiver
     }
 
+    /// The keys of links that this unit opens from here on are made anew this often, instead of every 12 h; once. So a test
+    /// need not wait for so long.
+    #[doc(hidden)]
+    pub fn renew_keys_every(&self, span: cara_core::time::Duration) {
+        let _ = self.engine().renews_every.set(span);
+    }
+
     /// Everything that is counted for the unit as a whole: (name, number), zeros included. What happened in discovery and
     /// membership; on all links together, those that have ended included; in the port. The last six (`BuffersInUse`,
     /// `BuffersPeak`, `LinksOpen`, `NodesConnected`, `CallsHeld`, `CallsInFlight`) tell how it is now; no other ever goes

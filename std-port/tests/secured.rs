@@ -2,6 +2,7 @@
 
 use std::hash::{BuildHasher, Hasher, RandomState};
 use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use cara_std::keys::{FleetKeys, Store, place};
@@ -58,7 +59,10 @@ fn started_manager(builder: Builder<()>) -> CommunicationSystem {
 
 /// A vehicle that doubles a number and sends a text back.
 fn started_vehicle(builder: Builder<()>) -> Unit {
-    let agv = builder.build_unit().unwrap();
+    serving(builder.build_unit().unwrap())
+}
+
+fn serving(agv: Unit) -> Unit {
     let double = |_: &Call, view: &mut ParametersView| -> Result<(), ServiceError> {
         let number: i64 = view.variable("number").map_err(|_| ServiceError::BadResults)?;
         view.set_value("number", 2 * number).map_err(|_| ServiceError::BadResults)
@@ -116,6 +120,45 @@ fn units_with_the_pair_s_key_meet_and_call_each_other() {
     assert_eq!(parameters.variable::<&str>("text"), Ok(&*long));
     // Keep-alives are sealed as well: the link outlives the time in which silence would end it.
     std::thread::sleep(Duration::from_secs(4));
+    assert!(peer.is_connected() && agv.is_connected());
+}
+
+/// The keys of the link are made anew about once a second, while several threads call and a text of many frames is on its
+/// way.
+#[test]
+fn calls_go_on_while_the_keys_of_their_link_are_made_anew() {
+    let fleet = fleet();
+    let keys = keys(fleet, &[7]);
+    let manager = started_manager(manager(fleet).keys(keys.ring(&depot()).unwrap()));
+    let agv = vehicle(fleet, 7).keys(keys.ring(&agv(7)).unwrap()).build_unit().unwrap();
+    agv.renew_keys_every(cara_std::Duration::from_secs(1));
+    let agv = serving(agv);
+    joined(&manager, 1);
+    let peer = manager.s_units().remove(0);
+    let renewed = || peer.counters().iter().find(|(name, _)| *name == "KeysRenewed").map_or(0, |(_, count)| *count);
+    let over = AtomicBool::new(false);
+    let long = "x".repeat(20_000);
+    std::thread::scope(|scope| {
+        for first in [0, 1_000_000] {
+            let (peer, over) = (&peer, &over);
+            scope.spawn(move || {
+                let calls = (first..).take_while(|_| !over.load(Ordering::Relaxed));
+                for value in calls {
+                    let mut parameters = number(value);
+                    peer.block_request("double", &mut parameters).unwrap();
+                    assert_eq!(parameters.variable::<i64>("number"), Ok(2 * value));
+                }
+            });
+        }
+        let end = Instant::now() + PATIENCE;
+        while renewed() < 4 && Instant::now() < end {
+            let mut parameters = text(&long);
+            peer.block_request("echo", &mut parameters).unwrap();
+            assert_eq!(parameters.variable::<&str>("text"), Ok(&*long));
+        }
+        over.store(true, Ordering::Relaxed);
+    });
+    assert!(renewed() >= 4, "{} renewals", renewed());
     assert!(peer.is_connected() && agv.is_connected());
 }
 

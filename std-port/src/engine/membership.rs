@@ -72,7 +72,10 @@ impl<T: Send + 'static> Engine<T> {
         };
         let dialed = dialed.is_some();
         let config = SessionConfig { link: id, dialed, address, local, constraints };
-        let session = Session::new(now, config, self.keys.cipher(), storage);
+        let mut session = Session::new(now, config, self.keys.cipher(), storage);
+        if let Some(span) = self.renews_every.get() {
+            session.renew_every(*span);
+        }
         let link = Arc::new(LinkCell::new(self.seat()?, id, serial, stream, session, dialed));
         *links.get_mut(index)? = Some(link.clone());
         drop(links);

@@ -107,6 +107,8 @@ pub(crate) struct Engine<T: 'static> {
     pub(crate) keys: Keys,
     /// When the file with the keys is looked at.
     keys_due: Mutex<Instant>,
+    /// How old the keys of a link become, instead of 12 h.
+    pub(crate) renews_every: OnceLock<Duration>,
     stopping: AtomicBool,
     /// When the unit was made.
     born: Instant,
@@ -186,6 +188,7 @@ impl<T: Send + 'static> Engine<T> {
             interfaces: Mutex::default(),
             keys: parts.keys,
             keys_due: Mutex::new(born),
+            renews_every: OnceLock::new(),
             stopping: AtomicBool::new(false),
             born,
             accounts: accounts::Accounts::default(),
