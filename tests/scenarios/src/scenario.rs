@@ -25,6 +25,8 @@ pub enum Need {
     Suspend,
     /// Somebody who connects and is no unit, or none of this version or fleet.
     Strangers,
+    /// One of them who has no key, and is taken, or told why it is not.
+    UnprovenStrangers,
     /// Connections that wait to be accepted, as many as come.
     Backlog,
     /// An interface that goes and comes.
@@ -45,7 +47,7 @@ pub enum Need {
 
 impl Need {
     /// All of them.
-    pub const ALL: [Self; 18] = [
+    pub const ALL: [Self; 19] = [
         Self::Crash,
         Self::Partition,
         Self::Freeze,
@@ -56,6 +58,7 @@ impl Need {
         Self::AddressChange,
         Self::Suspend,
         Self::Strangers,
+        Self::UnprovenStrangers,
         Self::Backlog,
         Self::Interface,
         Self::ManyUnits,
@@ -79,7 +82,9 @@ impl Need {
     /// Of the simulator with secured units.
     const fn missing_on_secured(self) -> Option<&'static str> {
         match self {
-            Self::Strangers => Some("strangers speak plain; `tests/sim/tests/security` has its own for secured units"),
+            Self::UnprovenStrangers => {
+                Some("who proves nothing is neither taken nor told why; `tests/sim/tests/security` has what it tries")
+            }
             _ => None,
         }
     }
@@ -103,6 +108,7 @@ impl Need {
             | Self::Reset
             | Self::SlowReader
             | Self::Strangers
+            | Self::UnprovenStrangers
             | Self::Backlog => {
                 return None;
             }

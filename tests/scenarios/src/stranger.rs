@@ -62,6 +62,17 @@ impl Stranger {
         }
     }
 
+    /// What it says on a network of another mode than plain: the same behind the magic of that mode, in a datagram or in a
+    /// hello's frame.
+    pub(crate) fn in_mode(mode: Mode, mut said: Vec<u8>) -> Vec<u8> {
+        for at in [0, frame::HEADER_BYTES + 1] {
+            if let Some(magic) = said.get_mut(at..at + PLAIN_MAGIC.len()).filter(|magic| *magic == PLAIN_MAGIC) {
+                magic.copy_from_slice(&mode.magic());
+            }
+        }
+        said
+    }
+
     /// What it must be told before the end.
     pub(crate) fn is_told(self) -> Option<Vec<u8>> {
         let refusal = match self {

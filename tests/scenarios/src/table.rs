@@ -19,13 +19,16 @@ the simulator. A rule's numbers are those of [paper.md](paper.md). Weather is wh
 runs: rough is loss, delay, jitter, reordering, duplication, short partitions and split reads; light is the same without
 loss and partitions; own is only what the scenario injects. A letter instead of a port's ✓ leads to the reason below.
 
-| scenario | rule | weather | simulator | Linux | embassy |
-|---|---|---|---|---|---|
+| scenario | rule | weather | simulator | with keys | Linux | embassy |
+|---|---|---|---|---|---|---|
 ";
 
 /// The ports that lack something, with what they are.
-const PORTS: [(Port, &str); 2] =
-    [(Port::Linux, "Linux over loopback"), (Port::Embassy, "boards with embassy on a switch in memory")];
+const PORTS: [(Port, &str); 3] = [
+    (Port::Secured, "the simulator with keys"),
+    (Port::Linux, "Linux over loopback"),
+    (Port::Embassy, "boards with embassy on a switch in memory"),
+];
 
 /// The whole file.
 pub fn text() -> String {

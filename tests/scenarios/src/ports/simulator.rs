@@ -235,13 +235,14 @@ impl SimWorld {
         let (manager, mut to) = (unit.identity(), self.node(unit).handle.address());
         let host = self.world.network(|network| network.add_host());
         for datagram in stranger.datagrams(0) {
+            let datagram = Stranger::in_mode(self.mode, datagram);
             self.world.network(|network| network.send_to(host, to, &datagram));
         }
         to.set_port(M_UNIT_PORT);
         let mut heard = Vec::new();
         for visit in stranger.visits(&manager, 0) {
             let stream = self.world.network(|network| network.connect(host, to));
-            self.say(stream, &visit.says);
+            self.say(stream, &Stranger::in_mode(self.mode, visit.says));
             if visit.closes {
                 self.world.run_for(millis(200));
                 self.world.network(|network| network.close(stream));

@@ -18,10 +18,10 @@ scenarios![
     full_tables_of_calls_name_their_limit: "full tables", Rough, [], ["RequestsBusy", "CallsTimedOut"];
     two_units_with_few_buffers_do_not_stop_each_other: "full tables", Light, [], ["answered"];
     a_second_manager_of_a_name_is_told_on_its_own_side: "known identity, new epoch", Rough, [], ["OwnIdentity"];
-    another_fleet_that_dials_is_refused_by_name: "fleet", Rough, [Strangers],
+    another_fleet_that_dials_is_refused_by_name: "fleet", Rough, [Strangers, UnprovenStrangers],
         ["DatagramFleet", "RefusedFleet", "stranger was told"];
     garbage_on_every_port_harms_nobody: "garbage", Rough, [Strangers], ["DatagramMagic", "DatagramFleet"];
-    a_peer_that_closes_in_mid_chunk_harms_nobody_else: "half a message", Rough, [Strangers], ["left"];
+    a_peer_that_closes_in_mid_chunk_harms_nobody_else: "half a message", Rough, [Strangers, UnprovenStrangers], ["left"];
     a_thousand_silent_connections_keep_nobody_out: "half-open connections", Light, [Strangers, Backlog], ["GaveWay"];
     a_reader_of_one_byte_a_second_harms_nobody_else: "slow reader", Own, [SlowReader], ["SendRefused"];
     a_unit_without_an_interface_finds_its_manager_when_it_has_one: "no interface", Light, [Interface],
