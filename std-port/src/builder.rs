@@ -72,7 +72,7 @@ impl Builder<()> {
             constraints,
             capacities: Capacities::default(),
             interfaces: Interfaces::from_environment(),
-            keys: KeySource::Insecure,
+            keys: KeySource::Found,
             discovery_port: None,
             tcp_port: 0,
             threads: None,
@@ -111,7 +111,8 @@ impl<T: Send + 'static> Builder<T> {
         self
     }
 
-    /// The file with the unit's keys, instead of where [`place`](crate::keys::place) looks.
+    /// The file with the unit's keys, instead of where [`place`](crate::keys::place) looks, which is what a unit without
+    /// words about keys does.
     pub fn key_file(mut self, path: impl Into<PathBuf>) -> Self {
         self.keys = KeySource::File(path.into());
         self
@@ -124,7 +125,7 @@ impl<T: Send + 'static> Builder<T> {
     }
 
     /// Plain mode: whoever is on the network can read what the unit says, and speak as anybody. It has a port of its own,
-    /// and does not meet units with keys.
+    /// does not meet units with keys, and warns in the log when it starts.
     pub fn insecure(mut self) -> Self {
         self.keys = KeySource::Insecure;
         self
@@ -227,7 +228,7 @@ impl<T: Send + 'static> Builder<T> {
 
     fn engine(self) -> Result<Arc<Engine<T>>, BuildError> {
         check(&self.constraints)?;
-        let keys = self.keys.open(&self.identity, self.fleet)?;
+        let keys = self.keys.open(&self.identity, &self.target, self.fleet)?;
         let discovery_port = self.discovery_port.unwrap_or(keys.mode().port());
         let own_threads = self.threads.is_none();
         let threads = self.threads.map_or_else(Threads::of_one, Ok)?;
@@ -301,18 +302,29 @@ pub enum BuildError {
 
 /// Where the keys of a unit are to come from.
 enum KeySource {
-    Insecure,
+    /// Where files with keys are looked for.
+    Found,
     File(PathBuf),
     Ring(Box<KeyRing>),
+    Insecure,
 }
 
 impl KeySource {
-    fn open(self, identity: &Identity, fleet: Fleet) -> Result<Keys, KeyError> {
+    fn open(self, identity: &Identity, target: &Target, fleet: Fleet) -> Result<Keys, BuildError> {
         Ok(Keys::Ring(match self {
-            Self::Insecure => return Ok(Keys::Insecure),
+            Self::Found => LiveRing::find(identity, manager_of(target)?.as_ref(), fleet)?,
             Self::File(path) => LiveRing::open(&path, identity, fleet)?,
             Self::Ring(ring) => LiveRing::fixed(*ring),
+            Self::Insecure => return Ok(Keys::Insecure),
         }))
+    }
+}
+
+/// The manager that an s_unit joins.
+fn manager_of(target: &Target) -> Result<Option<Identity>, Error> {
+    match target {
+        Target::Everybody => Ok(None),
+        Target::Manager(manager) | Target::Fixed(manager, _) => Identity::m_unit(&manager.name, manager.id).map(Some),
     }
 }
 

@@ -10,7 +10,7 @@ use std::sync::mpsc::{Receiver, sync_channel};
 use std::sync::{Arc, Weak};
 use std::task::{Poll, Wake, Waker};
 
-use cara_core::config::Constraints;
+use cara_core::config::{Constraints, Mode};
 use cara_core::distribution::connection_handler::{Finding, Target};
 use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
 use cara_core::distribution::parameters::{Parameters, ParametersView};
@@ -218,6 +218,11 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     /// Time since it was made.
     pub fn uptime(&self) -> Duration {
         self.engine().uptime()
+    }
+
+    /// Whether its links are secured, with keys, or plain.
+    pub fn mode(&self) -> Mode {
+        self.engine().mode()
     }
 
     /// The UDP port of broadcasts.

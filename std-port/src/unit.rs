@@ -3,7 +3,7 @@
 use std::sync::mpsc::{Receiver, sync_channel};
 use std::sync::{Arc, Weak};
 
-use cara_core::config::Constraints;
+use cara_core::config::{Constraints, Mode};
 use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
@@ -106,6 +106,11 @@ impl<T: Send + 'static> Unit<T> {
     /// Time since it was made.
     pub fn uptime(&self) -> Duration {
         self.engine().uptime()
+    }
+
+    /// Whether its links are secured, with keys, or plain.
+    pub fn mode(&self) -> Mode {
+        self.engine().mode()
     }
 
     /// The UDP port of broadcasts.

@@ -1,9 +1,11 @@
 //! What a stopped unit leaves behind: nothing. In a process of its own, since it counts the whole process.
 
+mod keyed;
+
 use std::hash::{BuildHasher, Hasher, RandomState};
 use std::time::{Duration, Instant};
 
-use cara_std::{Call, CommunicationSystem, Interfaces, Parameters, ParametersView, ServiceError, Unit};
+use cara_std::{Call, Interfaces, Parameters, ParametersView, ServiceError};
 
 fn count(folder: &str) -> usize {
     std::fs::read_dir(folder).unwrap().count()
@@ -20,10 +22,9 @@ fn until(what: impl Fn() -> String, condition: impl Fn() -> bool) {
 /// Two units that meet, call each other in both ways, and stop; their handles are dropped, or only that.
 fn live_once(stops: bool) {
     let fleet = RandomState::new().build_hasher().finish() as u32;
-    let manager = CommunicationSystem::builder("manager", 1).unwrap().fleet(fleet).interfaces(Interfaces::Loopback);
-    let manager = manager.build_system().unwrap();
-    let agv = Unit::builder("agv", 7, "manager", 1).unwrap().fleet(fleet).interfaces(Interfaces::Loopback);
-    let agv = agv.build_unit().unwrap();
+    let (manager, agv) = keyed::pair(fleet);
+    let manager = manager.interfaces(Interfaces::Loopback).build_system().unwrap();
+    let agv = agv.interfaces(Interfaces::Loopback).build_unit().unwrap();
     let mut number = Parameters::new();
     number.add_int("number", 1).unwrap();
     let echo = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };

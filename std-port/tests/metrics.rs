@@ -2,11 +2,18 @@
 
 #![cfg(feature = "metrics")]
 
+mod keyed;
+
 use std::collections::HashMap;
 use std::hash::{BuildHasher, Hasher, RandomState};
+use std::slice;
 use std::time::{Duration, Instant};
 
-use cara_std::{Call, CommunicationSystem, Error, Interfaces, Parameters, ParametersView, ServiceError, Unit};
+use cara_std::{
+    Call, CommunicationSystem, Error, Identity, Interfaces, Parameters, ParametersView, ServiceError, Unit,
+};
+
+use keyed::keyed;
 
 /// A number by name and labels.
 type Samples = HashMap<(String, Vec<(String, String)>), f64>;
@@ -120,13 +127,16 @@ fn until(what: &str, condition: impl Fn() -> bool) {
 fn every_counter_of_the_api_is_in_the_text_with_its_value() {
     let fleet = RandomState::new().build_hasher().finish() as u32;
     let name = r#"the "manager" \ 1"#;
-    let manager = CommunicationSystem::builder(name, 1).unwrap().fleet(fleet).interfaces(Interfaces::Loopback);
-    let manager = manager.build_system().unwrap();
+    let own = Identity::m_unit(name, 1).unwrap();
+    let others = [1, 2, 3].map(|id| Identity::s_unit("agv", id).unwrap());
+    let manager = CommunicationSystem::builder(name, 1).unwrap().interfaces(Interfaces::Loopback);
+    let manager = keyed(manager, fleet, &own, &others).build_system().unwrap();
     manager.start().unwrap();
-    let agvs: Vec<_> = (1..4)
-        .map(|id| {
-            let agv = Unit::builder("agv", id, name, 1).unwrap().fleet(fleet).interfaces(Interfaces::Loopback);
-            let agv = agv.build_unit().unwrap();
+    let agvs: Vec<_> = others
+        .iter()
+        .map(|other| {
+            let agv = Unit::builder("agv", other.id(), name, 1).unwrap().interfaces(Interfaces::Loopback);
+            let agv = keyed(agv, fleet, other, slice::from_ref(&own)).build_unit().unwrap();
             let fail = |_: &Call, _: &mut ParametersView| Err(ServiceError::NotReady);
             agv.my_function_list().add_function("fail", &Parameters::new(), fail).unwrap();
             agv.publish_my_function_list().unwrap();

@@ -3,6 +3,8 @@
 //! A test runs this binary again under `unshare`, as `ip` would need root otherwise. Where that is not possible it says
 //! that it was skipped, and with `CI` set it fails.
 
+mod keyed;
+
 use std::sync::mpsc::Receiver;
 use std::time::{Duration, Instant};
 
@@ -24,15 +26,14 @@ fn plug_in() {
 }
 
 fn manager() -> (CommunicationSystem, Receiver<UnitEvent>) {
-    let manager = CommunicationSystem::builder("manager", 1).unwrap().interfaces(Interfaces::All);
-    let manager = manager.build_system().unwrap();
+    let manager = keyed::pair(0).0.interfaces(Interfaces::All).build_system().unwrap();
     let events = manager.events();
     manager.start().unwrap();
     (manager, events)
 }
 
 fn agv() -> (Unit, Receiver<UnitEvent>) {
-    let agv = Unit::builder("agv", 7, "manager", 1).unwrap().interfaces(Interfaces::All).build_unit().unwrap();
+    let agv = keyed::pair(0).1.interfaces(Interfaces::All).build_unit().unwrap();
     agv.my_function_list().add_function("ping", &Parameters::new(), |parameters: Parameters| parameters).unwrap();
     agv.publish_my_function_list().unwrap();
     let events = agv.events();
@@ -122,8 +123,8 @@ fn a_fixed_address_without_a_route_is_told() {
         return;
     }
     ip("link set lo up");
-    let agv = Unit::builder("agv", 7, "manager", 1).unwrap().manager_address(([10, 77, 0, 1], 7_000).into());
-    let agv = agv.build_unit().unwrap();
+    let (manager, agv) = keyed::pair(0);
+    let agv = agv.manager_address(([10, 77, 0, 1], 7_000).into()).build_unit().unwrap();
     let events = agv.events();
     agv.start().unwrap();
     let end = Instant::now() + PATIENCE;
@@ -136,7 +137,7 @@ fn a_fixed_address_without_a_route_is_told() {
     }
     // The manager comes to be there, with the cable.
     plug_in();
-    let manager = CommunicationSystem::builder("manager", 1).unwrap().tcp_port(7_000).build_system().unwrap();
+    let manager = manager.tcp_port(7_000).build_system().unwrap();
     manager.start().unwrap();
     until("it has joined", || manager.number_of_s_units() == 1);
 }

@@ -1,5 +1,7 @@
 //! The shortest way through: two units on loopback, over real sockets.
 
+mod keyed;
+
 use std::time::{Duration, Instant};
 
 use cara_std::{Call, CommunicationSystem, Error, Interfaces, Parameters, ParametersView, ServiceError, Unit};
@@ -20,10 +22,9 @@ fn until(what: &str, condition: impl Fn() -> bool) {
 
 fn pair() -> (CommunicationSystem, Unit<[i64; 2]>) {
     let fleet = fleet();
-    let manager = CommunicationSystem::builder("manager", 1).unwrap().fleet(fleet).interfaces(Interfaces::Loopback);
-    let manager = manager.build_system().unwrap();
-    let agv = Unit::builder("agv", 7, "manager", 1).unwrap().fleet(fleet).interfaces(Interfaces::Loopback);
-    let agv = agv.state([3_i64, 4]).build_unit().unwrap();
+    let (manager, agv) = keyed::pair(fleet);
+    let manager = manager.interfaces(Interfaces::Loopback).build_system().unwrap();
+    let agv = agv.interfaces(Interfaces::Loopback).state([3_i64, 4]).build_unit().unwrap();
     let mut position = Parameters::new();
     position.add_int("position", 2).unwrap();
     let pos_info = |state: &mut [i64; 2], _: &Call, view: &mut ParametersView| -> Result<(), ServiceError> {

@@ -2,10 +2,11 @@
 
 use std::sync::Arc;
 
+use cara_core::config::Mode;
 use cara_core::error::Error;
 use cara_core::time::Instant;
 
-use super::{Engine, system_refused, workers};
+use super::{Engine, lock, system_refused, workers};
 use crate::sys::datagram::Socket;
 use crate::sys::epoll::Ready;
 use crate::threads::{Crew, Driven, Source};
@@ -32,8 +33,18 @@ impl<T: Send + 'static> Engine<T> {
         let seat = self.crew().seat(self.clone())?;
         let _ = self.seat.set(seat);
         self.watch(seat).map_err(system_refused)?;
+        self.warn_of_plain_mode();
         self.wake_clock();
         Ok(())
+    }
+
+    fn warn_of_plain_mode(&self) {
+        if self.mode() == Mode::Plain {
+            tracing::warn!(
+                unit = %lock(&self.node).node.identity(), discovery_port = self.discovery_port(),
+                "plain mode, without keys: whoever is on the network can read what this unit says, and speak as any unit"
+            );
+        }
     }
 
     fn watch(&self, seat: u16) -> std::io::Result<()> {

@@ -478,6 +478,11 @@ impl<T: Send + 'static> Engine<T> {
         self.clock.now().since(self.born)
     }
 
+    /// Whether it has keys.
+    pub(crate) fn mode(&self) -> Mode {
+        self.keys.mode()
+    }
+
     /// The port of broadcasts.
     pub(crate) fn discovery_port(&self) -> u16 {
         self.datagrams.discovery_port()

@@ -15,7 +15,7 @@ pub enum KeyError {
     /// No ring in any of the places.
     #[error(
         "{} of fleet {} has no keys here. Looked for {}. Make them with `{}`, or copy its file from where the fleet's \
-         keys are made", full_name(identity), fleet.0, list(searched), make(identity, *fleet, *has_root)
+         keys are made", full_name(identity), fleet.0, list(searched), command
     )]
     Missing {
         /// Whose keys.
@@ -24,8 +24,8 @@ pub enum KeyError {
         fleet: Fleet,
         /// The files that were looked for.
         searched: Vec<PathBuf>,
-        /// Whether the fleet's root is here, so that only the node is missing.
-        has_root: bool,
+        /// The one command that makes them, as it is typed on this host.
+        command: String,
     },
     /// Others than the owner can read or write the file.
     #[error(
@@ -87,7 +87,10 @@ pub enum KeyError {
         fleet: Fleet,
     },
     /// No root of this fleet in the folder.
-    #[error("{} has no root of fleet {}: `{}`", folder.display(), fleet.0, new_fleet(*fleet, &[]))]
+    #[error(
+        "{} has no root of fleet {}: `{}`", folder.display(), fleet.0,
+        command(&["cara", "keys", "new-fleet", "--fleet", &fleet.0.to_string()])
+    )]
     NoRoot {
         /// Where it was looked for.
         folder: PathBuf,
@@ -181,19 +184,4 @@ fn list(paths: &[PathBuf]) -> String {
 fn either(identities: &[Identity]) -> String {
     let words = identities.iter().map(|identity| format!("`{}`", command(&["--manager", &identity.to_string()])));
     words.collect::<Vec<_>>().join(" or ")
-}
-
-/// The one command that makes a node's keys.
-fn make(identity: &Identity, fleet: Fleet, has_root: bool) -> String {
-    use cara_core::distribution::identity::Role;
-    let name = full_name(identity);
-    match (has_root, identity.role()) {
-        (true, _) => command(&["cara", "keys", "derive", "--fleet", &fleet.0.to_string(), &name]),
-        (false, Role::MUnit) => new_fleet(fleet, &[&name]),
-        (false, Role::SUnit) => new_fleet(fleet, &["depot/1@m_unit", &name]),
-    }
-}
-
-fn new_fleet(fleet: Fleet, nodes: &[&str]) -> String {
-    command(&[&["cara", "keys", "new-fleet", "--fleet", &fleet.0.to_string()], nodes].concat())
 }

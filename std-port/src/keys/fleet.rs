@@ -17,7 +17,12 @@ pub struct FleetKeys {
 impl FleetKeys {
     /// Draws the root of a fleet without nodes.
     pub fn draw(fleet: Fleet) -> Result<Self, KeyError> {
-        Ok(Self::new(RootKey::new(*draw()?), Members::new(fleet)))
+        Ok(Self::of_root(fleet, RootKey::new(*draw()?)))
+    }
+
+    /// A fleet without nodes whose root is kept, and was drawn, elsewhere.
+    pub fn of_root(fleet: Fleet, root: RootKey) -> Self {
+        Self::new(root, Members::new(fleet))
     }
 
     pub(super) fn new(root: RootKey, members: Members) -> Self {

@@ -25,9 +25,13 @@ struct Held {
 }
 
 impl LiveRing {
-    /// The ring of a node, from where [`place`] says.
-    pub fn find(identity: &Identity, fleet: Fleet) -> Result<Self, KeyError> {
-        Self::open(&place::find(identity, fleet)?, identity, fleet)
+    /// The ring of a node, from where [`place`] says; of an s_unit with the manager that it joins.
+    pub fn find(identity: &Identity, manager: Option<&Identity>, fleet: Fleet) -> Result<Self, KeyError> {
+        let path = match manager {
+            None => place::find(identity, fleet)?,
+            Some(manager) => place::find_joining(identity, manager, fleet)?,
+        };
+        Self::open(&path, identity, fleet)
     }
 
     /// The ring of a node, from this file.

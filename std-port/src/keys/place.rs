@@ -11,6 +11,7 @@ use std::path::{Path, PathBuf};
 
 use cara_core::distribution::identity::{Fleet, Identity, Role};
 
+use super::named::{command, full_name};
 use super::{KeyError, store};
 use crate::file_name::escape;
 
@@ -38,15 +39,18 @@ pub fn file_name(identity: &Identity, fleet: Fleet) -> String {
 
 /// Where a node's keys are, by the rules of this module. The file may still be refused when it is read.
 pub fn find(identity: &Identity, fleet: Fleet) -> Result<PathBuf, KeyError> {
-    Environment::of_process().find(identity, fleet)
+    Environment::of_process().find(identity, None, fleet)
+}
+
+/// As [`find`], for an s_unit that joins `manager`: where there are no keys, the error's command makes those of both.
+pub fn find_joining(identity: &Identity, manager: &Identity, fleet: Fleet) -> Result<PathBuf, KeyError> {
+    Environment::of_process().find(identity, Some(manager), fleet)
 }
 
 /// The user's own folder of keys, in which `cara keys` works unless told: what `CARA_KEYS` names if that is no file, or
 /// `cara/keys` in `$XDG_CONFIG_HOME` or `~/.config`. `None` where none of these is set.
 pub fn own_folder() -> Option<PathBuf> {
-    let environment = Environment::of_process();
-    let named = environment.named.clone().filter(|named| !named.is_file());
-    named.or_else(|| environment.of_user())
+    Environment::of_process().own_folder()
 }
 
 /// The folders in which keys are looked for.
@@ -105,18 +109,56 @@ impl Environment {
         self.named.as_deref().filter(|named| named.exists() && !named.is_dir())
     }
 
-    fn find(&self, identity: &Identity, fleet: Fleet) -> Result<PathBuf, KeyError> {
+    fn own_folder(&self) -> Option<PathBuf> {
+        self.named.clone().filter(|named| !named.is_file()).or_else(|| self.of_user())
+    }
+
+    fn find(&self, identity: &Identity, manager: Option<&Identity>, fleet: Fleet) -> Result<PathBuf, KeyError> {
         if let Some(file) = self.file() {
             return Ok(file.to_owned());
         }
-        let folders = self.folders();
-        let searched: Vec<_> = folders.iter().map(|folder| folder.join(file_name(identity, fleet))).collect();
+        let searched: Vec<_> = self.folders().iter().map(|folder| folder.join(file_name(identity, fleet))).collect();
         // A folder that this user may not enter has nothing for it.
         if let Some(found) = searched.iter().find(|file| file.exists()) {
             return Ok(found.clone());
         }
-        let has_root = folders.iter().any(|folder: &PathBuf| store::root_file(Path::new(folder), fleet).exists());
-        Err(KeyError::Missing { identity: identity.clone(), fleet, searched, has_root })
+        let command = self.command(identity, manager, fleet);
+        Err(KeyError::Missing { identity: identity.clone(), fleet, searched, command })
+    }
+
+    /// The one command that makes a node's keys, typed where the node was started.
+    fn command(&self, identity: &Identity, manager: Option<&Identity>, fleet: Fleet) -> String {
+        let own = self.own_folder();
+        let has_root = |folder: &&PathBuf| store::root_file(folder, fleet).exists();
+        let folders = self.folders();
+        let root = folders.iter().find(has_root);
+        let folder = root.or(own.as_ref()).unwrap_or(&self.host);
+        let mut words = vec!["cara".to_owned(), "keys".into()];
+        words.push(if root.is_some() { "derive" } else { "new-fleet" }.into());
+        words.extend(["--fleet".into(), fleet.0.to_string()]);
+        if Some(folder) != own.as_ref() {
+            words.extend(["--dir".into(), folder.to_string_lossy().into_owned()]);
+        }
+        words.extend(self.nodes(identity, manager, fleet, root));
+        command(&words.iter().map(String::as_str).collect::<Vec<_>>())
+    }
+
+    /// The nodes of that command: an s_unit needs a manager that is in the fleet.
+    fn nodes(
+        &self,
+        identity: &Identity,
+        manager: Option<&Identity>,
+        fleet: Fleet,
+        root: Option<&PathBuf>,
+    ) -> Vec<String> {
+        let own = full_name(identity);
+        let Some(root) = root else {
+            let example = (identity.role() == Role::SUnit).then(|| "depot/1@m_unit".to_owned());
+            return manager.map(full_name).or(example).into_iter().chain([own]).collect();
+        };
+        let Some(manager) = manager else { return vec![own] };
+        let unknown = (!root.join(file_name(manager, fleet)).exists()).then(|| full_name(manager));
+        ["--manager".into(), manager.to_string()].into_iter().chain(unknown).chain([own]).collect()
     }
 }
 
@@ -152,7 +194,7 @@ mod tests {
         }
 
         fn find(&self) -> Result<PathBuf, KeyError> {
-            self.environment.find(&depot(), Fleet(7))
+            self.environment.find(&depot(), None, Fleet(7))
         }
 
         fn missing(&self) -> String {
@@ -190,10 +232,29 @@ mod tests {
         fs::create_dir_all(&root).unwrap();
         fs::write(store::root_file(&root, Fleet(7)), "").unwrap();
         assert!(host.missing().contains("`cara keys derive --fleet 7 depot/1@m_unit`"), "{}", host.missing());
+        let agv = Identity::s_unit("agv 1", 1).unwrap();
+        let of_agv = |host: &Host, manager: Option<&Identity>| {
+            host.environment
+                .find(&agv, manager, Fleet(7))
+                .unwrap_err()
+                .to_string()
+                .split('`')
+                .nth(1)
+                .unwrap()
+                .to_owned()
+        };
+        assert_eq!(of_agv(&host, None), "cara keys derive --fleet 7 'agv 1/1'");
+        let derive = "cara keys derive --fleet 7 --manager depot/1";
+        assert_eq!(of_agv(&host, Some(&depot())), format!("{derive} depot/1@m_unit 'agv 1/1'"));
+        host.write("home/.config/cara/keys");
+        assert_eq!(of_agv(&host, Some(&depot())), format!("{derive} 'agv 1/1'"));
         host.environment.home = None;
-        host.environment.host = PathBuf::new();
-        let agv = host.environment.find(&Identity::s_unit("agv 1", 1).unwrap(), Fleet(7)).unwrap_err().to_string();
-        assert!(agv.contains("`cara keys new-fleet --fleet 7 depot/1@m_unit 'agv 1/1'`"), "{agv}");
+        let folder = host.environment.host.display().to_string();
+        let made = format!("cara keys new-fleet --fleet 7 --dir {folder} depot/1@m_unit 'agv 1/1'");
+        assert_eq!(of_agv(&host, None), made, "where no folder is the user's own");
+        host.environment.named = Some(host.folder.path().join("named"));
+        let yard = Identity::m_unit("yard", 2).unwrap();
+        assert_eq!(of_agv(&host, Some(&yard)), "cara keys new-fleet --fleet 7 yard/2@m_unit 'agv 1/1'");
     }
 
     #[test]

@@ -6,7 +6,7 @@ use cara_std::control::execute;
 use cara_std::control::protocol::{Answer, NodeInfo, Question};
 use cara_std::{Constraints, Duration, Error};
 
-use crate::support::{Depot, ask, call, manager, refused, until, vehicle};
+use crate::support::{Depot, ask, call, manager, refused, until, vehicle, vehicle_of};
 
 fn set(node: Option<&str>, constraint: &str, value: u64) -> Question {
     Question::Set { node: node.map(str::to_owned), constraint: constraint.to_owned(), value }
@@ -263,8 +263,7 @@ fn a_connection_without_room_is_counted() {
     let small = small.control(cara_std::control::Control::Off).build_system().unwrap();
     small.start().unwrap();
     assert_eq!(small.control_path(), None);
-    let agv = cara_std::Unit::builder("agv", 9, "small", 2).unwrap().fleet(fleet);
-    let agv = agv.interfaces(cara_std::Interfaces::Loopback).build_unit().unwrap();
+    let agv = vehicle_of(("small", 2), "agv", 9, fleet).build_unit().unwrap();
     agv.start().unwrap();
     until("the only link is taken", || small.number_of_s_units() == 1);
     let refused = || small.counters().iter().find(|(name, _)| *name == "ConnectionsRefused").unwrap().1;

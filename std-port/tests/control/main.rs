@@ -4,6 +4,8 @@ mod asking;
 mod calling;
 mod clients;
 mod frozen;
+#[path = "../keyed/mod.rs"]
+mod keyed;
 mod operator;
 mod places;
 mod support;

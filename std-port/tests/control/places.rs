@@ -6,7 +6,7 @@ use std::os::unix::net::UnixListener;
 
 use cara_std::control::{Client, Control, ControlError};
 
-use crate::support::{Depot, directory, manager, until, vehicle};
+use crate::support::{Depot, directory, manager, until, vehicle, vehicle_of};
 
 #[test]
 fn the_socket_is_its_owners_alone_and_goes_with_the_unit() {
@@ -33,8 +33,7 @@ fn a_directory_that_others_enter_is_refused_and_the_unit_runs() {
     let lone = manager("lone", 2, depot.fleet).control(Control::Path(open.join("x.sock"))).build_system().unwrap();
     lone.start().unwrap();
     assert_eq!((lone.control_path(), open.join("x.sock").exists()), (None, false));
-    let agv = cara_std::Unit::builder("agv", 9, "lone", 2).unwrap().fleet(depot.fleet);
-    let agv = agv.interfaces(cara_std::Interfaces::Loopback).build_unit().unwrap();
+    let agv = vehicle_of(("lone", 2), "agv", 9, depot.fleet).build_unit().unwrap();
     agv.start().unwrap();
     until("it is a manager as any other", || lone.number_of_s_units() == 1);
     match Client::find_in(&open, None) {

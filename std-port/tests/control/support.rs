@@ -9,9 +9,12 @@ use std::time::{Duration, Instant};
 use cara_std::control::protocol::{Answer, Argument, ArgumentValue, CallQuestion, Failure, Question};
 use cara_std::control::{Client, Control, ControlError};
 use cara_std::{
-    Builder, Call, CommunicationSystem, Interfaces, ParametersView, Priority, ServiceError, ServiceOptions, Unit,
+    Builder, Call, CommunicationSystem, Identity, Interfaces, ParametersView, Priority, ServiceError, ServiceOptions,
+    Unit,
 };
 use tempfile::TempDir;
+
+use crate::keyed::keyed;
 
 /// Longest wait for anything that is to happen.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(30);
@@ -116,11 +119,27 @@ impl Depot {
 }
 
 pub(crate) fn manager(name: &str, id: u32, fleet: u32) -> Builder<()> {
-    CommunicationSystem::builder(name, id).unwrap().fleet(fleet).interfaces(Interfaces::Loopback)
+    let builder = CommunicationSystem::builder(name, id).unwrap().interfaces(Interfaces::Loopback);
+    keyed(builder, fleet, &Identity::m_unit(name, id).unwrap(), &vehicles())
 }
 
 pub(crate) fn vehicle(name: &str, id: u32, fleet: u32) -> Builder<()> {
-    Unit::builder(name, id, "manager", 1).unwrap().fleet(fleet).interfaces(Interfaces::Loopback)
+    vehicle_of(("manager", 1), name, id, fleet)
+}
+
+/// A vehicle that joins another manager than `manager/1`.
+pub(crate) fn vehicle_of(manager: (&str, u32), name: &str, id: u32, fleet: u32) -> Builder<()> {
+    let own = Identity::s_unit(name, id).unwrap();
+    assert!(vehicles().contains(&own), "the managers have no key for {own}: name it in vehicles");
+    let builder = Unit::builder(name, id, manager.0, manager.1).unwrap().interfaces(Interfaces::Loopback);
+    keyed(builder, fleet, &own, &[Identity::m_unit(manager.0, manager.1).unwrap()])
+}
+
+/// All vehicles of these tests.
+fn vehicles() -> Vec<Identity> {
+    let numbered = (0..4).map(|id| (format!("agv{id}"), id));
+    let all = [7, 8, 9].map(|id| ("agv".to_owned(), id)).into_iter().chain(numbered);
+    all.map(|(name, id)| Identity::s_unit(&name, id).unwrap()).collect()
 }
 
 /// All answers to a question, or why there are none.

@@ -4,7 +4,7 @@ use std::io::{Read, Write};
 use std::net::{Ipv4Addr, SocketAddr, TcpStream, UdpSocket};
 use std::time::Duration;
 
-use cara_std::Builder;
+use cara_std::{Builder, Mode};
 
 use crate::support::{PATIENCE, ask, counter, fleet, meet, number, service, system, unit, until};
 
@@ -24,7 +24,7 @@ impl Noise {
         let mut bytes: Vec<u8> = (0..length).map(|_| self.next() as u8).collect();
         // Some of it looks like a datagram or a hello at first.
         if self.next().is_multiple_of(2) {
-            let magic = b"CARp\x01";
+            let magic = [&Mode::Secured.magic()[..], &[1]].concat();
             let length = magic.len().min(bytes.len());
             bytes[..length].copy_from_slice(&magic[..length]);
         }

@@ -12,6 +12,8 @@ mod constraints;
 mod handlers;
 mod in_use;
 mod junk;
+#[path = "../keyed/mod.rs"]
+mod keyed;
 mod leases;
 mod many;
 mod members;

@@ -5,7 +5,9 @@ use std::time::Duration;
 
 use cara_std::{BuildError, CloseReason, Constraints, Error, Refusal, UnitEvent};
 
-use crate::support::{PATIENCE, ask, counter, fleet, meet, number, service, system, system_named, unit, until};
+use crate::support::{
+    PATIENCE, ask, counter, fleet, meet, number, service, system, system_named, unit, unit_of, until,
+};
 
 /// Waits for an attempt to join that ends, and returns why.
 fn refusal(events: &Receiver<UnitEvent>) -> CloseReason {
@@ -23,8 +25,7 @@ fn units_of_other_fleets_and_other_managers_do_not_meet() {
     let (mine, other) = (fleet(), fleet());
     let manager = system(mine).build_system().unwrap();
     let wrong_fleet = unit("stranger", 1, other).build_unit().unwrap();
-    let wrong_manager = cara_std::Unit::builder("astray", 2, "another", 1).unwrap().fleet(mine);
-    let wrong_manager = wrong_manager.interfaces(cara_std::Interfaces::Loopback).build_unit().unwrap();
+    let wrong_manager = unit_of(("another", 1), "astray", 2, mine).build_unit().unwrap();
     manager.start().unwrap();
     wrong_fleet.start().unwrap();
     wrong_manager.start().unwrap();

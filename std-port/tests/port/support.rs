@@ -4,8 +4,11 @@ use std::hash::{BuildHasher, Hasher, RandomState};
 use std::time::{Duration, Instant};
 
 use cara_std::{
-    Builder, Call, CommunicationSystem, Error, Interfaces, Parameters, ParametersView, Peer, ServiceError, Unit,
+    Builder, Call, CommunicationSystem, Error, Identity, Interfaces, Parameters, ParametersView, Peer, ServiceError,
+    Unit,
 };
+
+use crate::keyed::keyed;
 
 /// Longest wait for anything that is to happen.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
@@ -38,12 +41,49 @@ pub(crate) fn system(fleet: u32) -> Builder<()> {
 }
 
 pub(crate) fn system_named(name: &str, id: u32, fleet: u32) -> Builder<()> {
-    CommunicationSystem::builder(name, id).unwrap().fleet(fleet).interfaces(Interfaces::Loopback)
+    let builder = CommunicationSystem::builder(name, id).unwrap().interfaces(Interfaces::Loopback);
+    let others = [m_units(), s_units()].concat();
+    keyed(builder, fleet, &Identity::m_unit(name, id).unwrap(), &others)
 }
 
 /// An s_unit of that manager.
 pub(crate) fn unit(name: &str, id: u32, fleet: u32) -> Builder<()> {
-    Unit::builder(name, id, "manager", 1).unwrap().fleet(fleet).interfaces(Interfaces::Loopback)
+    unit_of(("manager", 1), name, id, fleet)
+}
+
+/// An s_unit of another manager. It has a key for `manager/1` as well, and so has that for it.
+pub(crate) fn unit_of(manager: (&str, u32), name: &str, id: u32, fleet: u32) -> Builder<()> {
+    let own = Identity::s_unit(name, id).unwrap();
+    assert!(s_units().contains(&own), "the managers have no key for {own}: name it in s_units");
+    let builder = Unit::builder(name, id, manager.0, manager.1).unwrap().interfaces(Interfaces::Loopback);
+    let manager = Identity::m_unit(manager.0, manager.1).unwrap();
+    keyed(builder, fleet, &own, &[m_units(), vec![manager]].concat())
+}
+
+/// All m_units of these tests.
+fn m_units() -> Vec<Identity> {
+    [("manager", 1), ("one", 1), ("two", 2)].map(|(name, id)| Identity::m_unit(name, id).unwrap()).to_vec()
+}
+
+/// All s_units of these tests.
+fn s_units() -> Vec<Identity> {
+    let single = [
+        ("agv", 7),
+        ("first", 1),
+        ("second", 2),
+        ("stranger", 1),
+        ("right", 3),
+        ("never", 1),
+        ("astray", 2),
+        ("quick", 1),
+        ("frozen", 2),
+        ("bystander", 2),
+        ("stranger", 9),
+    ];
+    let single = single.into_iter().map(|(name, id)| (name.to_owned(), id));
+    let many =
+        (0..64).flat_map(|id| [(format!("agv{id}"), id), (format!("agv-{id}"), id), (format!("agv-{id}"), 10 + id)]);
+    single.chain(many).map(|(name, id)| Identity::s_unit(&name, id).unwrap()).collect()
 }
 
 /// A manager and an s_unit `agv`, not started.

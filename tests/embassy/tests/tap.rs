@@ -113,7 +113,7 @@ fn meet() {
     let fleet = cara_processes::random_fleet();
     std::thread::spawn(move || board(fleet));
     let builder = CommunicationSystem::builder("manager", 1).unwrap();
-    let manager = builder.fleet(fleet).interfaces(Interfaces::All).build_system().unwrap();
+    let manager = builder.fleet(fleet).interfaces(Interfaces::All).insecure().build_system().unwrap();
     let mut minutes = Parameters::new();
     minutes.add_int("minutes", 1).unwrap();
     let list = manager.my_function_list();

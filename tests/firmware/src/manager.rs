@@ -19,7 +19,7 @@ pub(crate) struct Manager {
 
 impl Manager {
     pub(crate) fn start() -> Result<Self> {
-        let builder = CommunicationSystem::builder("depot", 1)?.fleet(FLEET).control(Control::Off);
+        let builder = CommunicationSystem::builder("depot", 1)?.fleet(FLEET).control(Control::Off).insecure();
         let system = builder.build_system()?;
         let events = Mutex::new(system.events());
         system.start()?;

@@ -78,7 +78,8 @@ fn a_node_written_from_the_document_joins_a_manager() {
         return;
     };
     let manager = CommunicationSystem::builder("python_manager", 1).unwrap().fleet(fleet);
-    let manager = manager.interfaces(Interfaces::Loopback).build_system().unwrap();
+    // The node in Python has no cipher.
+    let manager = manager.interfaces(Interfaces::Loopback).insecure().build_system().unwrap();
     manager.start().unwrap();
 
     wait_until("joining", || manager.number_of_s_units() == 1);

@@ -1,0 +1,33 @@
+//! Keys for units of tests. Their root is made of the fleet's number alone, so that all processes of a test have the same one.
+
+use cara_std::keys::{FleetKeys, KeyRing, RootKey};
+use cara_std::{Builder, CommunicationSystem, Fleet, Identity, Role, Unit};
+
+/// The ring of a unit of a test's fleet, which meets these others.
+pub(crate) fn ring(fleet: u32, own: &Identity, others: &[Identity]) -> KeyRing {
+    let mut root = [0; 32];
+    root[..4].copy_from_slice(&fleet.to_le_bytes());
+    let mut keys = FleetKeys::of_root(Fleet(fleet), RootKey::new(root));
+    let mut all = [others, std::slice::from_ref(own)].concat();
+    // M_units first: the others belong to all of them.
+    all.sort_by_key(Identity::role);
+    let m_units = all.iter().filter(|node| node.role() == Role::MUnit).cloned().collect::<Vec<_>>();
+    for node in &all {
+        keys.add(node, if node.role() == Role::MUnit { &[] } else { &m_units }).unwrap();
+    }
+    keys.ring(own).unwrap()
+}
+
+/// Gives a unit its fleet and its keys.
+pub(crate) fn keyed(builder: Builder<()>, fleet: u32, own: &Identity, others: &[Identity]) -> Builder<()> {
+    builder.fleet(fleet).keys(ring(fleet, own, others))
+}
+
+/// `manager/1` and its `agv/7`.
+#[allow(dead_code, reason = "some tests have more units, and name them themselves")]
+pub(crate) fn pair(fleet: u32) -> (Builder<()>, Builder<()>) {
+    let nodes = [Identity::m_unit("manager", 1).unwrap(), Identity::s_unit("agv", 7).unwrap()];
+    let manager = CommunicationSystem::builder("manager", 1).unwrap();
+    let agv = Unit::builder("agv", 7, "manager", 1).unwrap();
+    (keyed(manager, fleet, &nodes[0], &nodes), keyed(agv, fleet, &nodes[1], &nodes))
+}
