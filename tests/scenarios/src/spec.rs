@@ -1,6 +1,7 @@
 //! A unit as a scenario describes it, before a port makes it.
 
 use cara_core::config::Constraints;
+use cara_core::distribution::identity::Identity;
 
 use crate::Service;
 
@@ -79,6 +80,15 @@ impl Spec {
     pub fn limits(mut self, change: impl FnOnce(&mut Constraints)) -> Self {
         change(&mut self.constraints);
         self
+    }
+
+    /// Who it is.
+    pub(crate) fn identity(&self) -> Identity {
+        let identity = match self.role {
+            SpecRole::Manager => Identity::m_unit(&self.name, self.id),
+            SpecRole::Agv(..) => Identity::s_unit(&self.name, self.id),
+        };
+        identity.expect("a short name")
     }
 
     /// Functions that it keeps of each peer's list.

@@ -9,7 +9,7 @@ use std::sync::mpsc::Receiver;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::thread;
 
-use cara_core::config::{Constraints, PLAIN_PORT};
+use cara_core::config::{Constraints, Mode, PLAIN_PORT};
 use cara_core::counters::Counter;
 use cara_core::distribution::connection_handler::NodeCounter;
 use cara_core::distribution::function::Definition;
@@ -22,11 +22,13 @@ use cara_core::services::requests::CallId;
 use cara_core::services::unit::RequestOptions;
 use cara_core::time::{Duration, Instant};
 use cara_std::access::AccessTable;
+use cara_std::keys::KeyRing;
 use cara_std::{
     BuildError, Call, Capacities, CommunicationSystem, Interfaces, LeaseWatch, MyFunctionList, Peer, ServiceOptions,
     Unit as SUnit, UnitEvent,
 };
 
+use super::keys::Keys;
 use super::relay::{Relay, Way};
 use crate::run::Report;
 use crate::{
@@ -44,6 +46,8 @@ pub(super) struct LinuxWorld {
     start: std::time::Instant,
     fleet: u32,
     units: Vec<Arc<LinuxNode>>,
+    /// None where strangers come, who speak plain.
+    keys: Option<Keys>,
     /// AGVs dial through relays.
     relayed: bool,
     /// The relay of a unit, by its number.
@@ -65,6 +69,8 @@ struct LinuxNode {
     /// The manager's address, for one that is to dial a relay.
     dials: Option<SocketAddr>,
     spec: Spec,
+    /// For its one life; plain mode without.
+    ring: Mutex<Option<KeyRing>>,
     machine: Mutex<Option<Arc<Machine>>>,
     receiver: Mutex<Option<Receiver<UnitEvent>>>,
     events: Mutex<Vec<(Instant, Seen)>>,
@@ -86,11 +92,12 @@ fn since(start: std::time::Instant) -> Instant {
 }
 
 impl LinuxWorld {
-    pub(super) fn new(relayed: bool) -> Self {
+    pub(super) fn new(relayed: bool, mode: Mode) -> Self {
         Self {
             start: std::time::Instant::now(),
             fleet: RandomState::new().build_hasher().finish() as u32,
             units: Vec::new(),
+            keys: (mode == Mode::Secured).then(Keys::default),
             relayed,
             relays: BTreeMap::new(),
             silent: Vec::new(),
@@ -166,11 +173,14 @@ impl World for LinuxWorld {
     }
 
     fn add(&mut self, spec: Spec) -> Unit {
+        let fleet = self.fleet.wrapping_add(spec.fleet);
+        let ring = self.keys.as_mut().map(|keys| keys.ring(fleet, &spec.identity()));
         let node = Arc::new(LinuxNode {
             start: self.start,
             dials: self.relay(&spec),
-            fleet: self.fleet.wrapping_add(spec.fleet),
+            fleet,
             spec,
+            ring: Mutex::new(ring),
             machine: Mutex::new(None),
             receiver: Mutex::new(None),
             events: Mutex::default(),
@@ -292,6 +302,10 @@ impl LinuxNode {
         };
         let builder = builder.fleet(self.fleet).constraints(*constraints).capacities(capacities);
         let builder = builder.interfaces(Interfaces::Loopback);
+        let builder = match lock(&self.ring).take() {
+            Some(ring) => builder.keys(ring),
+            None => builder.insecure(),
+        };
         if *role == SpecRole::Manager {
             return Ok(Machine::Manager(builder.build_system()?));
         }

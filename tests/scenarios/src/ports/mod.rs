@@ -1,6 +1,7 @@
 //! The ports as scenarios see them.
 
 mod embassy;
+mod keys;
 mod linux;
 mod relay;
 mod simulator;
@@ -16,10 +17,12 @@ pub fn simulator(seed: u64, weather: Weather, mode: Mode) -> Box<dyn World> {
 }
 
 /// A fleet of its own over loopback, with a random number. Where a scenario needs streams that can be disturbed, AGVs
-/// dial their managers through a relay.
+/// dial their managers through a relay. Units have keys, as is the default; but where strangers come they are plain.
 pub fn linux(needs: &[Need]) -> Box<dyn World> {
     let disturbed = [Need::Freeze, Need::Reset, Need::SlowReader];
-    Box::new(linux::LinuxWorld::new(needs.iter().any(|need| disturbed.contains(need))))
+    // Strangers speak plain.
+    let mode = if needs.contains(&Need::Strangers) { Mode::Plain } else { Mode::Secured };
+    Box::new(linux::LinuxWorld::new(needs.iter().any(|need| disturbed.contains(need)), mode))
 }
 
 /// A fleet of boards on a switch in memory; the seed decides everything.
