@@ -6,7 +6,7 @@ mod output;
 mod stop;
 
 pub use events::show_events;
-pub use options::{NameAndId, Network};
+pub use options::{NameAndId, Network, shown_mode};
 pub use stop::{Stop, Stopper};
 
 /// Logs to standard error, as the environment's `RUST_LOG` asks; warnings unless it is set.

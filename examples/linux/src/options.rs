@@ -2,7 +2,9 @@
 
 use std::str::FromStr;
 
-use cara_std::Interfaces;
+use anyhow::Result;
+use cara_std::keys::{FleetKeys, KeyRing, parse_node};
+use cara_std::{Builder, Fleet, Interfaces, Mode};
 use clap::Args;
 
 /// Where a unit looks for others.
@@ -14,15 +16,44 @@ pub struct Network {
     /// Use loopback only.
     #[arg(long)]
     pub loopback: bool,
+    /// Plain mode, without keys: whoever is on the network can read what the unit says, and speak as any unit.
+    #[arg(long)]
+    pub insecure: bool,
     /// End when standard input is closed, so that nothing outlives who started it.
     #[arg(long)]
     pub attended: bool,
 }
 
 impl Network {
-    /// What the options say; without them, what the environment says.
-    pub fn interfaces(&self) -> Interfaces {
-        if self.loopback { Interfaces::Loopback } else { Interfaces::from_environment() }
+    /// A unit where the options say; without them, where the environment says. Unless told, it has the keys that are found
+    /// for it.
+    pub fn place(&self, builder: Builder<()>) -> Builder<()> {
+        let interfaces = if self.loopback { Interfaces::Loopback } else { Interfaces::from_environment() };
+        let builder = builder.fleet(self.fleet).interfaces(interfaces);
+        if self.insecure { builder.insecure() } else { builder }
+    }
+
+    /// The same for a unit whose keys were drawn in this process.
+    pub fn place_with(&self, builder: Builder<()>, ring: KeyRing) -> Builder<()> {
+        let builder = self.place(builder);
+        if self.insecure { builder } else { builder.keys(ring) }
+    }
+
+    /// Draws keys for nodes that are all in this process, so that nobody has to make files for them.
+    pub fn draw_keys(&self, nodes: &[&str]) -> Result<FleetKeys> {
+        let mut keys = FleetKeys::draw(Fleet(self.fleet))?;
+        for node in nodes {
+            keys.add(&parse_node(node).map_err(anyhow::Error::msg)?, &[])?;
+        }
+        Ok(keys)
+    }
+}
+
+/// A mode as the examples print it.
+pub fn shown_mode(mode: Mode) -> &'static str {
+    match mode {
+        Mode::Plain => "plain",
+        Mode::Secured => "secured",
     }
 }
 

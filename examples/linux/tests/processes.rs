@@ -4,21 +4,29 @@ use std::path::Path;
 use std::time::Duration;
 
 use cara_processes::{Process, random_fleet};
+use cara_test_keys::KeyFolder;
 
 /// How long a step may take on a machine that does other things as well.
 const STEP: Duration = Duration::from_secs(15);
 
-/// Starts examples of one fleet.
-struct Fleet(String);
+/// Starts examples of one fleet, which have keys.
+struct Fleet {
+    number: String,
+    keys: KeyFolder,
+}
 
 impl Fleet {
     fn new() -> Self {
-        Self(random_fleet().to_string())
+        let number = random_fleet();
+        let nodes = ["AGV_manager/1@m_unit", "zone-1/1@m_unit", "zone-2/2@m_unit", "agv-1/11", "seven/7"];
+        Self { number: number.to_string(), keys: KeyFolder::draw(number, &nodes).unwrap() }
     }
 
     fn start(&self, name: &str, program: &str, arguments: &[&str]) -> Process {
-        let network = ["--loopback", "--fleet", &self.0];
-        Process::start(name, Path::new(program), network.iter().chain(arguments)).unwrap()
+        let keys = format!("CARA_KEYS={}", self.keys.path().display());
+        let network = ["--loopback", "--fleet", &self.number];
+        Process::start(name, Path::new("env"), [keys.as_str(), program].iter().chain(&network).chain(arguments))
+            .unwrap()
     }
 }
 

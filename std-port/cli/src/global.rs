@@ -3,10 +3,10 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use cara_std::keys::place;
-use cara_std::{Fleet, Identity, Interfaces, PLAIN_PORT, SECURED_PORT};
+use cara_std::Interfaces;
 use clap::Args;
 
+use crate::keys::Keys;
 use crate::name_and_id::NameAndId;
 
 /// How long a command as a manager waits for nodes, unless told.
@@ -37,11 +37,10 @@ pub(crate) struct Global {
     /// The fleet to be in; 0 unless told.
     #[arg(long, global = true, value_name = "NUMBER")]
     pub(crate) fleet: Option<u32>,
-    /// The UDP port of broadcasts; 21970 unless told, 21971 with keys.
+    /// The UDP port of broadcasts; 21971 unless told, 21970 in plain mode.
     #[arg(long, global = true, value_name = "PORT")]
     pub(crate) discovery_port: Option<u16>,
-    /// With --as, and for `node`: the file with the unit's keys, instead of where they are looked for. A unit without
-    /// keys is in plain mode, where anybody on the network can speak as anybody.
+    /// With --as, and for `node`: the file with the unit's keys, instead of where they are looked for.
     #[arg(long, global = true, value_name = "FILE")]
     pub(crate) key_file: Option<PathBuf>,
     /// With --as, and for `node`, `scan` and `doctor`: plain mode, without keys, where anybody on the network can read what
@@ -61,15 +60,12 @@ impl Global {
 
     /// The UDP port of broadcasts.
     pub(crate) fn port(&self) -> u16 {
-        self.discovery_port.unwrap_or(if self.key_file.is_some() { SECURED_PORT } else { PLAIN_PORT })
+        self.discovery_port.unwrap_or(self.keys().unwrap_or_default().mode().port())
     }
 
-    /// The file with a unit's keys: the one that is told, or one where such files are looked for. `None` for plain mode.
-    pub(crate) fn keys_of(&self, identity: &Identity, fleet: u32) -> Option<PathBuf> {
-        if self.insecure {
-            return None;
-        }
-        self.key_file.clone().or_else(|| place::find(identity, Fleet(fleet)).ok())
+    /// The keys of the command's unit, where the options say something about them.
+    pub(crate) fn keys(&self) -> Option<Keys> {
+        if self.insecure { Some(Keys::Insecure) } else { self.key_file.clone().map(Keys::File) }
     }
 
     /// How long a command as a manager waits for nodes.

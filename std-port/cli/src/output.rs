@@ -24,6 +24,12 @@ pub(crate) fn line(text: impl std::fmt::Display) -> io::Result<()> {
     out.flush()
 }
 
+/// Prints what people should know and a command does not end with, on standard error.
+pub(crate) fn warning(text: impl std::fmt::Display) {
+    // Where nobody reads it, the command goes on.
+    let _ = writeln!(anstream::stderr().lock(), "{BAD}warning{BAD:#}: {text}");
+}
+
 /// Prints an object for programs, in one line.
 pub(crate) fn object(value: &impl Serialize) -> io::Result<()> {
     let mut text = serde_json::to_string(value)?;

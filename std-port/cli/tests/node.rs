@@ -4,12 +4,14 @@ use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream, UdpSocket};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use cara_processes::{Process, random_fleet};
 use cara_std::control::Client;
 use cara_std::control::protocol::{Answer, Question};
-use cara_std::{Error, Interfaces, Parameters, Peer, ServiceError, Unit};
+use cara_std::{Error, Identity, Interfaces, Parameters, Peer, ServiceError, Unit};
+use cara_test_keys::KeyFolder;
 use rustix::process::{Pid, Signal, kill_process};
 use tempfile::TempDir;
 
@@ -23,7 +25,7 @@ fn cara() -> &'static Path {
 /// Runs `cara node` to its end.
 fn outcome(folder: &Path, arguments: &[&str]) -> Output {
     let mut command = Command::new(cara());
-    command.arg("node").args(arguments).current_dir(folder).env("CARA_CONTROL_DIR", folder);
+    command.arg("node").args(arguments).current_dir(folder).env("CARA_CONTROL_DIR", folder).env("CARA_KEYS", folder);
     command.output().unwrap()
 }
 
@@ -43,7 +45,7 @@ fn until(what: &str, mut condition: impl FnMut() -> bool) {
 // --- mistakes
 
 /// A file, where its mistake is, and a part of what is said about it.
-const MISTAKES: [(&str, &str, &str); 44] = [
+const MISTAKES: [(&str, &str, &str); 46] = [
     ("name = \"a", "1:10", "expected `\"`"),
     ("name = \"a\"\nid = \n", "2:6", "value"),
     ("name = \"a\"\nid = 1\nid = 2", "3:1", "duplicate key"),
@@ -70,6 +72,8 @@ const MISTAKES: [(&str, &str, &str); 44] = [
     ("name = \"a\"\nid = 1\nrole = \"s_unit\"\ntcp_port = 1\n[manager]\nname = \"m\"\nid = 1", "4:12", "takes no"),
     ("name = \"a\"\nid = 1\ninterfaces = \"eth0\"", "3:14", "`lo`"),
     ("name = \"a\"\nid = 1\ndiscovery_port = 0", "3:18", "port 0"),
+    ("name = \"a\"\nid = 1\nkeys = \"a.keys\"\ninsecure = true", "4:12", "contradicts `keys`"),
+    ("name = \"a\"\nid = 1\ninsecure = \"yes\"", "3:12", "expected a boolean"),
     ("name = \"a\"\nid = 1\ntcp_port = 65536", "3:12", "65536"),
     ("name = \"a\"\nid = 1\n[constraints]\nchunk_size = 100", "4:14", "from 320 to 4096"),
     ("name = \"a\"\nid = 1\n[constraints]\n\n\tmessage_size = \"1MiB\"", "5:17", "from 16 to 262144"),
@@ -174,7 +178,7 @@ fn a_port_in_use_of_the_command_line_is_told_with_what_to_do() {
     let folder = TempDir::new().unwrap();
     let taken = TcpListener::bind("127.0.0.1:0").unwrap();
     let (address, fleet) = (taken.local_addr().unwrap().to_string(), random_fleet().to_string());
-    let arguments = ["--name", "a", "--id", "1", "--loopback", "--fleet", &fleet, "--metrics", &address];
+    let arguments = ["--name", "a", "--id", "1", "--loopback", "--fleet", &fleet, "--metrics", &address, "--insecure"];
     let refused = outcome(folder.path(), &arguments);
     let told = text(&refused.stderr);
     assert_eq!(refused.status.code(), Some(1), "{told}");
@@ -188,11 +192,11 @@ fn a_port_in_use_is_told_where_the_file_says_it() {
     let port = taken.local_addr().unwrap().port();
     let taken_by_broadcasts = UdpSocket::bind("0.0.0.0:0").unwrap();
     let udp_port = taken_by_broadcasts.local_addr().unwrap().port();
-    let start = format!("name = \"a\"\nid = 1\nfleet = {}\ninterfaces = \"lo\"\n", random_fleet());
+    let start = format!("name = \"a\"\nid = 1\nfleet = {}\ninterfaces = \"lo\"\ninsecure = true\n", random_fleet());
     for (line, place) in [
-        (format!("tcp_port = {port}"), "5:12"),
-        (format!("metrics.listen = \"127.0.0.1:{port}\""), "5:18"),
-        (format!("discovery_port = {udp_port}"), "5:18"),
+        (format!("tcp_port = {port}"), "6:12"),
+        (format!("metrics.listen = \"127.0.0.1:{port}\""), "6:18"),
+        (format!("discovery_port = {udp_port}"), "6:18"),
     ] {
         std::fs::write(folder.path().join("bad.toml"), format!("{start}{line}\n")).unwrap();
         let refused = outcome(folder.path(), &["bad.toml"]);
@@ -208,6 +212,7 @@ fn a_port_in_use_is_told_where_the_file_says_it() {
 /// A node as a process, with a folder of its own.
 struct Node {
     folder: TempDir,
+    keys: Arc<KeyFolder>,
     process: Process,
     fleet: u32,
     /// How many its file offers.
@@ -227,14 +232,15 @@ impl Node {
         let fleet = random_fleet();
         let file = format!("name = \"plant\"\nid = 1\nfleet = {fleet}\ninterfaces = \"lo\"\n{rest}\n");
         std::fs::write(folder.path().join("plant.toml"), file).unwrap();
-        Self::run(folder, fleet, options)
+        let keys = KeyFolder::draw(fleet, &["plant/1@m_unit", "agv/7", "agv/8"]).unwrap();
+        Self::run(folder, fleet, keys.into(), options)
     }
 
-    fn run(folder: TempDir, fleet: u32, options: &[&str]) -> Self {
-        let script = r#"cd "$1"; cara=$2; export CARA_CONTROL_DIR="$1/control"; shift 2; echo $$ > pid
+    fn run(folder: TempDir, fleet: u32, keys: Arc<KeyFolder>, options: &[&str]) -> Self {
+        let script = r#"cd "$1"; cara=$2; export CARA_CONTROL_DIR="$1/control" CARA_KEYS="$3"; shift 3; echo $$ > pid
             exec "$cara" node plant.toml "$@" 2>>log"#;
         let arguments = ["-c", script, "sh"].map(PathBuf::from).into_iter();
-        let arguments = arguments.chain([folder.path().to_owned(), cara().to_owned()]);
+        let arguments = arguments.chain([folder.path(), cara(), keys.path()].map(Path::to_owned));
         let arguments = arguments.chain(options.iter().map(PathBuf::from));
         let mut process = Process::start("node", Path::new("sh"), arguments).unwrap();
         let up = process.expect(" is up: ", PATIENCE).unwrap_or_else(|error| {
@@ -242,7 +248,7 @@ impl Node {
             panic!("{error}\n{log}");
         });
         let file = std::fs::read_to_string(folder.path().join("plant.toml")).unwrap();
-        Self { folder, process, fleet, functions: file.matches("[[functions]]").count(), up: up.text }
+        Self { folder, keys, process, fleet, functions: file.matches("[[functions]]").count(), up: up.text }
     }
 
     fn control_socket(&self) -> PathBuf {
@@ -261,7 +267,8 @@ impl Node {
     /// An s_unit of this node that has joined and read its list.
     fn vehicle(&self, name: &str, id: u32) -> (Unit, Peer) {
         let unit = Unit::builder(name, id, "plant", 1).unwrap().fleet(self.fleet).interfaces(Interfaces::Loopback);
-        let unit = unit.build_unit().unwrap();
+        let file = self.keys.file(&Identity::s_unit(name, id).unwrap()).unwrap();
+        let unit = unit.key_file(file).build_unit().unwrap();
         unit.start().unwrap();
         until("the vehicle has joined", || {
             unit.manager().is_some_and(|manager| manager.their_function_list().len() == self.functions)
@@ -493,7 +500,7 @@ fn without_a_file_sighup_ends_it() {
     std::fs::write(folder.path().join("plant.toml"), "").unwrap();
     let fleet = random_fleet().to_string();
     let script = r#"cd "$1"; export CARA_CONTROL_DIR="$1/control"; echo $$ > pid
-        exec "$2" node --name a --id 1 --loopback --fleet "$3""#;
+        exec "$2" node --name a --id 1 --loopback --fleet "$3" --insecure"#;
     let arguments = ["-c", script, "sh", folder.path().to_str().unwrap(), cara().to_str().unwrap(), &fleet];
     let mut process = Process::start("node", Path::new("sh"), arguments).unwrap();
     process.expect("a/1 is up: ", PATIENCE).unwrap();
@@ -600,7 +607,7 @@ fn an_s_unit_is_a_node_too() {
         manager.fleet
     );
     std::fs::write(vehicle.path().join("plant.toml"), file).unwrap();
-    let vehicle = Node::run(vehicle, manager.fleet, &["--metrics", "127.0.0.1:0"]);
+    let vehicle = Node::run(vehicle, manager.fleet, manager.keys.clone(), &["--metrics", "127.0.0.1:0"]);
     assert!(vehicle.up.starts_with("agv/7 is up: ") && vehicle.up.contains("control socket none"), "{}", vehicle.up);
     let ask = |arguments: &[&str]| {
         let mut command = Command::new(cara());

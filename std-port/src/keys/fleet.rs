@@ -1,6 +1,6 @@
 //! A fleet's root and its nodes, and the ring of each.
 
-use cara_core::distribution::identity::{Fleet, Identity};
+use cara_core::distribution::identity::{Fleet, Identity, Role};
 use cara_secure::keys::{DiscoveryKey, FINGERPRINT_BYTES, RootKey};
 
 use super::members::{Member, Members};
@@ -48,6 +48,16 @@ impl FleetKeys {
     /// it never had.
     pub fn add(&mut self, identity: &Identity, managers: &[Identity]) -> Result<(), FleetError> {
         self.members.add(identity, managers)
+    }
+
+    /// As [`add`](Self::add) for several nodes: m_units first, so that others can belong to them. `managers` are those of the
+    /// s_units.
+    pub fn add_all(&mut self, nodes: &[Identity], managers: &[Identity]) -> Result<(), FleetError> {
+        let (m_units, s_units): (Vec<_>, Vec<_>) = nodes.iter().partition(|node| node.role() == Role::MUnit);
+        // Where nobody else could be meant, it is a mistake to be told.
+        let of_m_units = if s_units.is_empty() { managers } else { &[] };
+        m_units.into_iter().try_for_each(|node| self.add(node, of_m_units))?;
+        s_units.into_iter().try_for_each(|node| self.add(node, managers))
     }
 
     /// Takes nodes out of all rings, and [begins](Self::rotate) a generation that they have nothing of. Until the change is

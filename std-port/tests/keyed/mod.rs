@@ -8,13 +8,9 @@ pub(crate) fn ring(fleet: u32, own: &Identity, others: &[Identity]) -> KeyRing {
     let mut root = [0; 32];
     root[..4].copy_from_slice(&fleet.to_le_bytes());
     let mut keys = FleetKeys::of_root(Fleet(fleet), RootKey::new(root));
-    let mut all = [others, std::slice::from_ref(own)].concat();
-    // M_units first: the others belong to all of them.
-    all.sort_by_key(Identity::role);
+    let all = [others, std::slice::from_ref(own)].concat();
     let m_units = all.iter().filter(|node| node.role() == Role::MUnit).cloned().collect::<Vec<_>>();
-    for node in &all {
-        keys.add(node, if node.role() == Role::MUnit { &[] } else { &m_units }).unwrap();
-    }
+    keys.add_all(&all, if m_units.len() < all.len() { &m_units } else { &[] }).unwrap();
     keys.ring(own).unwrap()
 }
 

@@ -1,12 +1,16 @@
 //! The child processes as the one that measures sees them.
 
+use std::iter::once;
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, anyhow};
 use cara_processes::Process;
+use cara_test_keys::KeyFolder;
 use serde::de::DeserializeOwned;
 
 use crate::child::{Counters, Question, Ready};
+use crate::units::{MANAGER, name};
 
 /// Longest wait for an answer; the longest question waits a minute itself.
 const PATIENCE: Duration = Duration::from_secs(180);
@@ -19,42 +23,47 @@ pub(crate) struct Child {
     pub(crate) started: Instant,
 }
 
-/// Which fleet, and on which port its units look for each other.
-#[derive(Clone, Copy)]
+/// Which fleet, with which keys, and on which port its units look for each other.
 pub(crate) struct Place {
-    pub(crate) fleet: u32,
-    pub(crate) port: u16,
+    fleet: u32,
+    port: u16,
+    keys: KeyFolder,
 }
 
 impl Place {
-    /// One of its own, so that several runs on one machine do not meet.
-    pub(crate) fn new() -> Self {
+    /// One of its own, so that several runs on one machine do not meet, for a manager and so many s_units.
+    pub(crate) fn new(count: u32) -> Result<Self> {
         let fleet = cara_processes::random_fleet();
+        let s_units = (1..=count).map(|id| format!("{}/{id}", name(id)));
+        let nodes: Vec<_> = once(format!("{}/{}@m_unit", MANAGER.0, MANAGER.1)).chain(s_units).collect();
+        let keys = KeyFolder::draw(fleet, &nodes.iter().map(String::as_str).collect::<Vec<_>>())?;
         // Below the ports that the kernel gives out.
-        Self { fleet, port: 20_000 + (fleet % 10_000) as u16 }
+        Ok(Self { fleet, port: 20_000 + (fleet % 10_000) as u16, keys })
     }
 }
 
 impl Child {
-    pub(crate) fn manager(place: Place, nodes: u16) -> Result<Self> {
+    pub(crate) fn manager(place: &Place, nodes: u16) -> Result<Self> {
         Self::start("manager", place, &["--nodes", &nodes.to_string()])
     }
 
     /// S_units with ID numbers from `first` on.
-    pub(crate) fn units(place: Place, first: u32, count: u32) -> Result<Self> {
+    pub(crate) fn units(place: &Place, first: u32, count: u32) -> Result<Self> {
         Self::start("units", place, &["--first", &first.to_string(), "--count", &count.to_string()])
     }
 
     /// One end of so many raw connections: `floor-server` first, then `floor-client`.
-    pub(crate) fn floor(role: &str, place: Place, count: u16) -> Result<Self> {
+    pub(crate) fn floor(role: &str, place: &Place, count: u16) -> Result<Self> {
         Self::start(role, place, &["--count", &count.to_string()])
     }
 
-    fn start(role: &str, place: Place, more: &[&str]) -> Result<Self> {
+    fn start(role: &str, place: &Place, more: &[&str]) -> Result<Self> {
         let (fleet, port) = (place.fleet.to_string(), place.port.to_string());
-        let arguments = [role, "--fleet", &fleet, "--port", &port];
+        let (keys, program) = (format!("CARA_KEYS={}", place.keys.path().display()), std::env::current_exe()?);
+        let program = program.to_str().context("this program's path is no text")?;
+        let arguments = [keys.as_str(), program, role, "--fleet", &fleet, "--port", &port];
         let started = Instant::now();
-        let mut process = Process::start(role, &std::env::current_exe()?, arguments.iter().chain(more))?;
+        let mut process = Process::start(role, Path::new("env"), arguments.iter().chain(more))?;
         let ready = process.expect("pid", PATIENCE)?;
         let Ready { pid } = serde_json::from_str(&ready.text)?;
         Ok(Self { process, pid, started })

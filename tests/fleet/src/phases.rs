@@ -42,7 +42,7 @@ impl Fleet {
 /// Measures everything.
 pub(crate) fn run(plan: &Plan) -> Result<Figures> {
     let nodes = usize::from(plan.nodes);
-    let place = Place::new();
+    let place = &Place::new(u32::from(plan.nodes))?;
     say("starting");
     let [empty, one] = small_manager()?;
     let mut manager = Child::manager(place, plan.nodes)?;
@@ -110,7 +110,7 @@ fn connected(manager: &mut Child, count: usize, began: Instant) -> Result<f64> {
 /// The memory of a manager's process that has no node, and tables for one only; and when one has come and has been
 /// sent what each of the others is sent.
 fn small_manager() -> Result<[Memory; 2]> {
-    let place = Place::new();
+    let place = &Place::new(1)?;
     let mut manager = Child::manager(place, 1)?;
     std::thread::sleep(REST);
     let empty = proc::memory(manager.pid)?;
@@ -132,7 +132,7 @@ fn per_node(nodes: usize, empty: Memory, full: Memory) -> [f64; 2] {
 fn compare(plan: &Plan, fleet: &mut Fleet) -> Result<[Comparison; 2]> {
     let mut alone = Pair::start()?;
     let mut again = Pair::start()?;
-    let place = Place::new();
+    let place = &Place::new(0)?;
     let raw_server = Child::floor("floor-server", place, plan.nodes)?;
     let mut raw = Child::floor("floor-client", place, plan.nodes)?;
     let [first, second] = proc::two_cpus()?;
@@ -176,7 +176,7 @@ struct Pair {
 
 impl Pair {
     fn start() -> Result<Self> {
-        let place = Place::new();
+        let place = &Place::new(1)?;
         let mut manager = Child::manager(place, 1)?;
         let unit = Child::units(place, SINGLE, 1)?;
         connected(&mut manager, 1, Instant::now())?;
@@ -185,7 +185,7 @@ impl Pair {
 }
 
 /// Kills the manager's process and starts a new one.
-fn restart(plan: &Plan, place: Place, fleet: Fleet) -> Result<(Joining, usize)> {
+fn restart(plan: &Plan, place: &Place, fleet: Fleet) -> Result<(Joining, usize)> {
     let Fleet { manager, mut many, mut single } = fleet;
     let before = broadcasts([&mut many, &mut single])?;
     let killed = manager.kill()?;

@@ -17,7 +17,9 @@ Each rule is a function in `tests/scenarios/src/rules`, run on every port that c
 cara-scenarios` runs each once; `cargo run --release --package cara-scenarios --bin seeds` runs each for 1,000 seeds on
 the simulator. A rule's numbers are those of [paper.md](paper.md). Weather is what the network does by itself in those
 runs: rough is loss, delay, jitter, reordering, duplication, short partitions and split reads; light is the same without
-loss and partitions; own is only what the scenario injects. A letter instead of a port's ✓ leads to the reason below.
+loss and partitions; own is only what the scenario injects. On Linux units have keys, as is the default, but where
+strangers come, who speak plain; on the simulator and on boards they are plain, and `--test secured` runs the rules once
+more on the simulator with keys. A letter instead of a port's ✓ leads to the reason below.
 
 | scenario | rule | weather | simulator | with keys | Linux | embassy |
 |---|---|---|---|---|---|---|

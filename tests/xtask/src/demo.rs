@@ -25,7 +25,9 @@ const REPORTS: usize = 4;
 
 /// Runs the demonstration; success only if everything in it happened.
 pub(crate) fn run() -> Result<ExitCode> {
-    Run::cargo().args(["build", "--quiet", "--package", "cara-examples", "--bins"]).stream()?;
+    Run::cargo()
+        .args(["build", "--quiet", "--package", "cara-examples", "--package", "cara-cli", "--bins"])
+        .stream()?;
     let stage = Stage::new()?;
     play(&stage).context("the demonstration failed")?;
     println!("\neverything happened, in {:.1} s", stage.seconds());
@@ -33,6 +35,8 @@ pub(crate) fn run() -> Result<ExitCode> {
 }
 
 fn play(stage: &Stage) -> Result<()> {
+    stage.title("Keys for the fleet");
+    stage.make_keys()?;
     stage.title("The listing: a manager, and AGVs that come while it searches");
     let mut manager = stage.manager()?;
     let began = Instant::now();

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use anyhow::Result;
 use cara_apps::agv::{Agv, BATTERY, GO_TO, GO_TO_LEASE, POS_INFO, Progress, STOP, TICK};
 use cara_apps::mechanic;
-use cara_examples::{NameAndId, Network, Stop, log_to_stderr, say};
+use cara_examples::{NameAndId, Network, Stop, log_to_stderr, say, shown_mode};
 use cara_std::{Call, Definition, LeaseWatch, ParametersView, Priority, ServiceOptions, Unit, UnitEvent};
 use clap::Parser;
 
@@ -30,14 +30,13 @@ fn main() -> Result<()> {
     let Options { name, id, manager, network } = Options::parse();
     log_to_stderr();
     let stop = Stop::new(network.attended)?;
-    let builder = Unit::builder(&name, id, &manager.name, manager.id)?;
-    let builder = builder.fleet(network.fleet).interfaces(network.interfaces());
+    let builder = network.place(Unit::builder(&name, id, &manager.name, manager.id)?);
     let unit = builder.state(Agv::new([0, 0])).build_unit()?;
     let lease = offer(&unit)?;
     unit.on_manager_lost(|_| say!("manager lost"));
     follow(&unit);
     unit.start()?;
-    say!("started {name}/{id} at {}", unit.with_state(|agv| agv.place())?);
+    say!("started {name}/{id}, {}, at {}", shown_mode(unit.mode()), unit.with_state(|agv| agv.place())?);
     drive(&unit, &lease, &stop)?;
     unit.stop();
     say!("ended at {}", unit.with_state(|agv| agv.place())?);

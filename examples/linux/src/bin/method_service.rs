@@ -6,7 +6,7 @@ use std::time::Duration;
 use anyhow::{Result, bail};
 use cara_apps::depot::{Depot, STORE, TAKE};
 use cara_examples::{Network, Stop, log_to_stderr, say};
-use cara_std::{Call, CommunicationSystem, Definition, Parameters, ParametersView, ServiceOptions, Unit};
+use cara_std::{Call, CommunicationSystem, Definition, Identity, Parameters, ParametersView, ServiceOptions, Unit};
 use clap::Parser;
 
 /// How long the two may take to meet.
@@ -29,7 +29,9 @@ fn main() -> Result<()> {
 }
 
 fn run(network: Network) -> Result<()> {
-    let depot = Unit::builder("depot", 11, "manager", 1)?.fleet(network.fleet).interfaces(network.interfaces());
+    let keys = network.draw_keys(&["manager/1@m_unit", "depot/11"])?;
+    let ring = keys.ring(&Identity::s_unit("depot", 11)?)?;
+    let depot = network.place_with(Unit::builder("depot", 11, "manager", 1)?, ring);
     let depot = depot.state(Depot::default()).build_unit()?;
     let functions = depot.my_function_list();
     let take = |depot: &mut Depot, _: &Call, parcels: &mut ParametersView| depot.take(parcels);
@@ -38,8 +40,8 @@ fn run(network: Network) -> Result<()> {
     depot.publish_my_function_list()?;
     depot.start()?;
 
-    let manager = CommunicationSystem::builder("manager", 1)?.fleet(network.fleet);
-    let manager = manager.interfaces(network.interfaces()).build_system()?;
+    let ring = keys.ring(&Identity::m_unit("manager", 1)?)?;
+    let manager = network.place_with(CommunicationSystem::builder("manager", 1)?, ring).build_system()?;
     let joined = manager.events();
     manager.start()?;
     manager.broadcast();

@@ -37,8 +37,7 @@ fn main() -> Result<()> {
     let Options { name, id, calls, network } = Options::parse();
     log_to_stderr();
     let stop = Stop::new(network.attended)?;
-    let builder = CommunicationSystem::builder(&name, id)?.fleet(network.fleet);
-    let zone = builder.interfaces(network.interfaces()).build_system()?;
+    let zone = network.place(CommunicationSystem::builder(&name, id)?).build_system()?;
     let served = offer(&zone)?;
     zone.start()?;
     zone.broadcast();

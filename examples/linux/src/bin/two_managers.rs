@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use anyhow::Result;
 use cara_examples::{Network, Stop, log_to_stderr, say};
-use cara_std::{CommunicationSystem, Unit};
+use cara_std::{CommunicationSystem, Identity, Unit};
 use clap::Parser;
 
 /// How often the managers search.
@@ -23,13 +23,16 @@ fn main() -> Result<()> {
     let Options { network } = Options::parse();
     log_to_stderr();
     let stop = Stop::new(network.attended)?;
+    // Keys for three units that are in one process. The AGV has one for its own manager, and the managers for each other.
+    let mut keys = network.draw_keys(&["north/1@m_unit", "south/2@m_unit"])?;
+    keys.add(&Identity::s_unit("agv-1", 11)?, &[Identity::m_unit("south", 2)?])?;
     let manager = |name, id| -> Result<CommunicationSystem> {
-        let builder = CommunicationSystem::builder(name, id)?.fleet(network.fleet);
-        Ok(builder.interfaces(network.interfaces()).build_system()?)
+        let ring = keys.ring(&Identity::m_unit(name, id)?)?;
+        Ok(network.place_with(CommunicationSystem::builder(name, id)?, ring).build_system()?)
     };
     let (north, south) = (manager("north", 1)?, manager("south", 2)?);
-    let agv = Unit::builder("agv-1", 11, "south", 2)?.fleet(network.fleet);
-    let agv = agv.interfaces(network.interfaces()).build_unit()?;
+    let ring = keys.ring(&Identity::s_unit("agv-1", 11)?)?;
+    let agv = network.place_with(Unit::builder("agv-1", 11, "south", 2)?, ring).build_unit()?;
     north.start()?;
     south.start()?;
     agv.start()?;

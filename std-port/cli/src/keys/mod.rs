@@ -1,13 +1,16 @@
 //! `cara keys`: makes the keys of a fleet and of its nodes. All of the work is in `cara_std::keys`; [`told`] says what was
 //! changed and what to do next, and [`show`] what there is, never a key.
 
+mod choice;
 mod show;
 mod told;
+
+pub(crate) use choice::{Keys, shown_mode};
 
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use cara_core::distribution::identity::{Fleet, Identity, Role};
+use cara_core::distribution::identity::{Fleet, Identity};
 use cara_std::keys::place::own_folder;
 use cara_std::keys::{FleetError, FleetKeys, KeyError, Store, parse_node};
 
@@ -101,15 +104,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
 impl Nodes {
     fn add_to(&self, keys: &mut FleetKeys) -> anyhow::Result<()> {
         let managers: Result<Vec<_>, _> = self.manager.iter().map(m_unit).collect();
-        let managers = managers?;
-        let mut nodes: Vec<_> = self.nodes.iter().collect();
-        // M_units first, so that others can belong to them.
-        nodes.sort_by_key(|identity| identity.role());
-        let has_s_units = nodes.iter().any(|identity| identity.role() == Role::SUnit);
-        nodes.into_iter().try_for_each(|identity| {
-            let is_meant = identity.role() == Role::SUnit || !has_s_units;
-            keys.add(identity, if is_meant { &managers } else { &[] }).map_err(wrong)
-        })
+        keys.add_all(&self.nodes, &managers?).map_err(wrong)
     }
 }
 

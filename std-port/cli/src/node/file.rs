@@ -21,6 +21,7 @@ pub(super) struct File {
     pub(super) fleet: Option<u32>,
     pub(super) interfaces: Option<Interfaces>,
     pub(super) keys: Option<String>,
+    pub(super) insecure: Maybe<bool>,
     pub(super) discovery_port: Maybe<u16>,
     pub(super) tcp_port: Maybe<u16>,
     pub(super) manager: Maybe<Manager>,

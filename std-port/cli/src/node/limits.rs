@@ -95,7 +95,7 @@ mod tests {
     /// Whether the file's checks and the library's are the same ones.
     #[test]
     fn the_library_takes_what_a_file_may_say_and_nothing_else() {
-        let system = CommunicationSystem::builder("limits", 1).unwrap().interfaces(Interfaces::Loopback);
+        let system = CommunicationSystem::builder("limits", 1).unwrap().interfaces(Interfaces::Loopback).insecure();
         let system = system.fleet(std::process::id()).build_system().unwrap();
         let base = Constraints::M_UNIT;
         let cases = [
@@ -139,9 +139,9 @@ mod tests {
 
     #[test]
     fn the_defaults_are_those_of_the_library() {
-        let system = CommunicationSystem::builder("limits", 1).unwrap().interfaces(Interfaces::Loopback);
+        let system = CommunicationSystem::builder("limits", 1).unwrap().interfaces(Interfaces::Loopback).insecure();
         assert_eq!(system.build_system().unwrap().constraints(), defaults(Role::MUnit));
-        let unit = Unit::builder("limits", 1, "manager", 1).unwrap().interfaces(Interfaces::Loopback);
+        let unit = Unit::builder("limits", 1, "manager", 1).unwrap().interfaces(Interfaces::Loopback).insecure();
         assert_eq!(unit.build_unit().unwrap().constraints(), defaults(Role::SUnit));
         assert_eq!(capacities(&file::Capacities::default(), &mut Vec::new()), Capacities::default());
     }

@@ -126,7 +126,7 @@ fn overrides(arguments: &Arguments, global: &Global) -> anyhow::Result<Overrides
         id: arguments.id.or(named.map(|named| named.id)),
         fleet: global.fleet,
         interfaces: global.loopback.then_some(Interfaces::Loopback),
-        key_file: global.key_file.clone(),
+        keys: global.keys(),
         discovery_port: global.discovery_port,
         tcp_port: arguments.tcp_port,
         metrics: arguments.metrics,

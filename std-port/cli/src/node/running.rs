@@ -4,7 +4,7 @@ use std::net::{SocketAddr, TcpListener};
 use std::sync::Arc;
 
 use anyhow::Context;
-use cara_std::{BuildError, Error, PLAIN_PORT, SECURED_PORT};
+use cara_std::{BuildError, Error};
 use serde_json::json;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::iterator::Signals;
@@ -18,6 +18,7 @@ use super::unit::{Node, NotBuilt};
 use super::{events, http, wrong};
 use crate::exit::Ended;
 use crate::global::Global;
+use crate::keys::shown_mode;
 use crate::output;
 
 /// Runs a node until it is asked to end.
@@ -110,15 +111,14 @@ fn listen(place: &Placed<SocketAddr>, settings: &Settings) -> anyhow::Result<Tcp
 /// One line for whoever waits for the node.
 fn tell_up(settings: &Settings, node: &Node, metrics: Option<SocketAddr>, global: &Global) -> anyhow::Result<()> {
     let Settings { name, id, fleet, .. } = settings;
-    let usual = if settings.key_file.is_some() { SECURED_PORT } else { PLAIN_PORT };
-    let discovery = settings.discovery_port.as_ref().map_or(usual, |port| port.value);
+    let (mode, discovery) = (shown_mode(node.mode()), node.discovery_port());
     let metrics = metrics.map(|address| format!("http://{address}/metrics"));
     let (tcp, control) = (node.tcp_port(), node.control_path());
     if global.json {
         let control = control.map(|path| path.display().to_string());
         output::object(&json!({
-            "up": true, "name": name, "id": id, "fleet": fleet, "discovery_port": discovery, "tcp_port": tcp,
-            "control": control, "metrics": metrics,
+            "up": true, "name": name, "id": id, "fleet": fleet, "mode": mode, "discovery_port": discovery,
+            "tcp_port": tcp, "control": control, "metrics": metrics,
         }))?;
         return Ok(());
     }
@@ -126,7 +126,7 @@ fn tell_up(settings: &Settings, node: &Node, metrics: Option<SocketAddr>, global
     let control = control.map_or("none".into(), |path| path.display().to_string());
     let metrics = metrics.map_or(String::new(), |url| format!(", metrics {url}"));
     output::line(format_args!(
-        "{name}/{id} is up: fleet {fleet}, discovery port {discovery}{tcp}, control socket {control}{metrics}"
+        "{name}/{id} is up: fleet {fleet}, {mode}, discovery port {discovery}{tcp}, control socket {control}{metrics}"
     ))?;
     Ok(())
 }

@@ -6,13 +6,13 @@ use std::path::PathBuf;
 
 use cara_std::access::AccessTable;
 use cara_std::control::Control;
-use cara_std::keys::place;
-use cara_std::{Capacities, Constraints, Fleet, Identity, Interfaces};
+use cara_std::{Capacities, Constraints, Identity, Interfaces};
 
 use super::file::{self, File, Maybe, Role};
 use super::functions::{self, Service};
 use super::limits;
 use super::mistake::{Mistake, Mistakes, Source};
+use crate::keys::Keys;
 
 /// A value, and its place if it comes from the file.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -31,8 +31,7 @@ pub(super) struct Settings {
     pub(super) manager: Option<Manager>,
     pub(super) fleet: u32,
     pub(super) interfaces: Interfaces,
-    /// The file with its keys; none for plain mode.
-    pub(super) key_file: Option<PathBuf>,
+    pub(super) keys: Keys,
     pub(super) discovery_port: Option<Placed<u16>>,
     pub(super) tcp_port: Option<Placed<u16>>,
     pub(super) constraints: Constraints,
@@ -61,7 +60,7 @@ pub(super) struct Overrides {
     pub(super) id: Option<u32>,
     pub(super) fleet: Option<u32>,
     pub(super) interfaces: Option<Interfaces>,
-    pub(super) key_file: Option<PathBuf>,
+    pub(super) keys: Option<Keys>,
     pub(super) discovery_port: Option<u16>,
     pub(super) tcp_port: Option<u16>,
     pub(super) metrics: Option<SocketAddr>,
@@ -100,18 +99,8 @@ impl Settings {
     pub(super) fn of(source: Source, over: &Overrides) -> Result<Self, Mistakes> {
         let file = file::read(&source).map_err(|mistake| Mistakes::new(&source, vec![mistake]))?;
         let mut mistakes = Vec::new();
-        let mut settings = checked(source, &file, over, &mut mistakes);
-        settings.key_file = settings.key_file.take().or_else(|| settings.found_keys());
+        let settings = checked(source, &file, over, &mut mistakes);
         if mistakes.is_empty() { Ok(settings) } else { Err(Mistakes::new(&settings.source, mistakes)) }
-    }
-
-    /// The node's keys where such files are looked for.
-    fn found_keys(&self) -> Option<PathBuf> {
-        let identity = match self.manager {
-            None => Identity::m_unit(&self.name, self.id),
-            Some(_) => Identity::s_unit(&self.name, self.id),
-        };
-        place::find(&identity.ok()?, Fleet(self.fleet)).ok()
     }
 
     /// A mistake that shows only when the node starts, such as a port in use.
@@ -132,7 +121,7 @@ fn checked(source: Source, file: &File, over: &Overrides, mistakes: &mut Vec<Mis
             .interfaces
             .or_else(|| file.interfaces.map(Interfaces::from))
             .unwrap_or_else(Interfaces::from_environment),
-        key_file: over.key_file.clone().or_else(|| file.keys.as_ref().map(PathBuf::from)),
+        keys: keys(file, over, mistakes),
         discovery_port: discovery_port(file, over, mistakes),
         tcp_port: tcp_port(file, role, over, mistakes),
         constraints: limits::constraints(&file.constraints, role, mistakes),
@@ -221,9 +210,19 @@ fn address_of(text: &Maybe<String>, mistakes: &mut Vec<Mistake>) -> Option<Socke
     address
 }
 
+fn keys(file: &File, over: &Overrides, mistakes: &mut Vec<Mistake>) -> Keys {
+    let insecure = file.insecure.as_ref().filter(|insecure| *insecure.get_ref());
+    if let (Some(insecure), Some(_)) = (insecure, &file.keys) {
+        let help = "take one of the two lines out: a node has keys, or is in plain mode";
+        mistakes.push(Mistake::new(insecure.span(), "this contradicts `keys`", help));
+    }
+    let written = file.keys.as_ref().map(|path| Keys::File(path.into()));
+    over.keys.clone().or(written).or(insecure.map(|_| Keys::Insecure)).unwrap_or_default()
+}
+
 fn discovery_port(file: &File, over: &Overrides, mistakes: &mut Vec<Mistake>) -> Option<Placed<u16>> {
     if let Some(port) = file.discovery_port.as_ref().filter(|port| *port.get_ref() == 0) {
-        let help = "write the port that all units use, 21970 for instance";
+        let help = "write the port that all units use, 21971 for instance";
         mistakes.push(Mistake::new(port.span(), "units cannot meet on port 0", help));
     }
     placed(over.discovery_port, &file.discovery_port)

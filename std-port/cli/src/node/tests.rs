@@ -7,6 +7,7 @@ use super::json::{self, BadOutput};
 use super::mistake::Source;
 use super::settings::{Overrides, Settings};
 use super::{EXAMPLE, limits};
+use crate::keys::Keys;
 
 fn settings(text: &str) -> Result<Settings, String> {
     let source = Source { name: "test.toml".into(), text: text.into() };
@@ -20,7 +21,7 @@ fn the_example_shows_the_defaults() {
     assert_eq!(example.constraints, limits::defaults(Role::MUnit));
     assert_eq!(example.capacities, Capacities::default());
     assert_eq!((example.fleet, &example.control), (least.fleet, &Control::Default));
-    assert_eq!(example.discovery_port.unwrap().value, cara_std::PLAIN_PORT);
+    assert_eq!((&example.keys, &example.discovery_port), (&Keys::Found, &None));
     assert_eq!(
         (least.constraints, least.capacities, least.control),
         (example.constraints, example.capacities, example.control)
@@ -38,9 +39,15 @@ fn what_the_example_leaves_out_is_right_too() {
         .replace("# address = ", "address = ");
     let manager = settings(&vehicle).unwrap().manager.unwrap();
     assert_eq!((manager.name.as_str(), manager.id, manager.address.is_some()), ("AGV_manager", 1, true));
-    let manager = EXAMPLE.replace("# tcp_port", "tcp_port").replace("# path = ", "path = ");
+    let manager = EXAMPLE
+        .replace("# tcp_port", "tcp_port")
+        .replace("# discovery_port", "discovery_port")
+        .replace("# keys", "keys");
+    let manager = manager.replace("# path = ", "path = ");
     let manager = settings(&manager).unwrap();
     assert!(manager.tcp_port.is_some() && matches!(manager.control, Control::Path(_)));
+    assert_eq!(manager.discovery_port.unwrap().value, cara_std::SECURED_PORT);
+    assert!(matches!(manager.keys, Keys::File(_)));
 }
 
 #[test]

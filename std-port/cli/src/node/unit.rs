@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::sync::mpsc::Receiver;
 
 use cara_std::access::AccessError;
-use cara_std::{BuildError, Builder, CommunicationSystem, Constraints, Error, MyFunctionList, Unit, UnitEvent};
+use cara_std::{BuildError, Builder, CommunicationSystem, Constraints, Error, Mode, MyFunctionList, Unit, UnitEvent};
 
 use super::http::Metrics;
 use super::settings::Settings;
@@ -87,6 +87,21 @@ impl Node {
         }
     }
 
+    pub(super) fn mode(&self) -> Mode {
+        match self {
+            Self::Manager(system) => system.mode(),
+            Self::Vehicle(unit) => unit.mode(),
+        }
+    }
+
+    /// The UDP port of broadcasts.
+    pub(super) fn discovery_port(&self) -> u16 {
+        match self {
+            Self::Manager(system) => system.discovery_port(),
+            Self::Vehicle(unit) => unit.discovery_port(),
+        }
+    }
+
     /// Where it takes connections; an s_unit takes none.
     pub(super) fn tcp_port(&self) -> Option<u16> {
         match self {
@@ -124,7 +139,7 @@ fn with(builder: Builder<()>, settings: &Settings) -> Result<Builder<()>, Access
     let builder = builder.fleet(settings.fleet).interfaces(settings.interfaces);
     let builder = builder.constraints(settings.constraints).capacities(settings.capacities);
     let builder = builder.control(settings.control.clone());
-    let builder = settings.key_file.iter().fold(builder, Builder::key_file);
+    let builder = settings.keys.given_to(builder);
     let builder = match &settings.discovery_port {
         Some(port) => builder.discovery_port(port.value),
         None => builder,

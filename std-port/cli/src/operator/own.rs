@@ -5,13 +5,14 @@ use std::time::{Duration, Instant};
 use cara_std::control::Control;
 use cara_std::control::protocol::FunctionInfo;
 use cara_std::survey::Survey;
-use cara_std::{BuildError, Builder, CommunicationSystem, Constraints, Fleet, Identity};
+use cara_std::{BuildError, Builder, CommunicationSystem, Constraints, Fleet, Mode};
 
 use super::{Need, Operator, running};
 use crate::exit::Ended;
 use crate::global::Global;
 use crate::name_and_id::NameAndId;
 use crate::nodes::{self, Chosen};
+use crate::output;
 use crate::units::show_micros;
 
 /// Most nodes of such a unit: it should see everybody.
@@ -33,15 +34,20 @@ pub(super) fn start(identity: &NameAndId, global: &Global) -> anyhow::Result<Com
         .map_err(|error| Ended::usage(format!("{identity}: {error}")))?;
     let constraints = Constraints { maximum_nodes: MAXIMUM_NODES, ..Constraints::M_UNIT };
     let builder = builder.fleet(global.fleet.unwrap_or(0)).interfaces(global.interfaces());
-    let keys = Identity::m_unit(&identity.name, identity.id).map(|own| global.keys_of(&own, global.fleet.unwrap_or(0)));
     let builder = global.discovery_port.into_iter().fold(builder, Builder::discovery_port);
     let builder = builder.constraints(constraints).control(Control::Off).tcp_port(global.as_port.unwrap_or(0));
-    let builder = keys.ok().flatten().into_iter().fold(builder, Builder::key_file);
-    let system = builder.build_system().map_err(|error| match error {
+    let keys = global.keys().unwrap_or_default();
+    let system = keys.given_to(builder).build_system().map_err(|error| match error {
         BuildError::Keys(error) => crate::keys::failed(error),
         BuildError::Unit(error) => network(error),
         other => Ended::failed("Failed", other.to_string()),
     })?;
+    if system.mode() == Mode::Plain {
+        output::warning(format_args!(
+            "{identity} is in plain mode, on port {}: whoever is on the network can read what it says, and speak as any unit",
+            system.discovery_port()
+        ));
+    }
     system.start().map_err(network)?;
     Ok(system)
 }

@@ -3,8 +3,6 @@
 use std::io::Write;
 use std::process::Stdio;
 
-use cara_std::{Interfaces, Unit};
-
 use crate::support::{Ran, Stage, private_folder};
 
 const VERBS: [&[&str]; 8] = [
@@ -92,8 +90,8 @@ fn a_node_that_is_told_an_address_is_met_there() {
         let free = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
         free.local_addr().unwrap()
     };
-    let builder = Unit::builder("fixed", 5, "manager", 1).unwrap().fleet(stage.fleet);
-    let agv = builder.interfaces(Interfaces::Loopback).manager_address(address).build_unit().unwrap();
+    stage.know("fixed", 5);
+    let agv = stage.vehicle("fixed", 5).manager_address(address).build_unit().unwrap();
     agv.start().unwrap();
     let port = address.port().to_string();
     let verb =

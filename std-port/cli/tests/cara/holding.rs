@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
-use cara_std::{Call, Definition, Interfaces, LeaseWatch, ParametersView, ServiceError, ServiceOptions, Unit};
+use cara_std::{Call, Definition, LeaseWatch, ParametersView, ServiceError, ServiceOptions, Unit};
 
 use crate::support::{PATIENCE, Running, Stage};
 
@@ -19,8 +19,8 @@ struct Driver {
 
 impl Driver {
     fn join(stage: &Stage) -> Self {
-        let builder = Unit::builder("driver", 99, "manager", 1).unwrap().fleet(stage.fleet);
-        let unit = builder.interfaces(Interfaces::Loopback).build_unit().unwrap();
+        stage.know("driver", 99);
+        let unit = stage.vehicle("driver", 99).build_unit().unwrap();
         let drive = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
         let made_safe = Arc::new(AtomicU32::new(0));
         let counted = made_safe.clone();

@@ -29,8 +29,7 @@ fn a_scan_shows_who_is_there() {
 fn a_scan_shows_who_was_refused_and_why() {
     let stage = Stage::with(&["agv-1"]);
     // The same name and ID as the one that is there.
-    let twin = Unit::builder("agv-1", 11, "manager", 1).unwrap().fleet(stage.fleet).interfaces(Interfaces::Loopback);
-    let twin = twin.build_unit().unwrap();
+    let twin = stage.vehicle("agv-1", 11).build_unit().unwrap();
     twin.start().unwrap();
     let start = std::time::Instant::now();
     loop {
@@ -49,9 +48,9 @@ fn a_scan_shows_who_was_refused_and_why() {
 fn without_a_manager_a_scan_surveys_the_network() {
     let stage = Stage::empty();
     let agv = Unit::builder("lost-agv", 5, "nobody", 9).unwrap().fleet(stage.fleet).interfaces(Interfaces::Loopback);
-    let agv = agv.build_unit().unwrap();
+    let agv = agv.insecure().build_unit().unwrap();
     agv.start().unwrap();
-    let told = stage.ends(0, &["scan", "--listen", "10s", "--json"]).json();
+    let told = stage.ends(0, &["scan", "--listen", "10s", "--json", "--insecure"]).json();
     agv.stop();
     let heard = told["heard"].as_array().unwrap();
     let found = heard.iter().find(|heard| heard["name"] == "lost-agv").unwrap_or_else(|| panic!("{told}"));
@@ -64,8 +63,9 @@ fn without_a_manager_a_scan_surveys_the_network() {
 
 #[test]
 fn a_survey_can_be_had_beside_a_manager() {
-    let stage = Stage::with(&[]);
-    let told = stage.ends(0, &["scan", "--survey", "--listen", "5s", "--json"]).json();
+    let mut stage = Stage::empty();
+    stage.start_manager_with(&["--insecure"]);
+    let told = stage.ends(0, &["scan", "--survey", "--listen", "5s", "--json", "--insecure"]).json();
     assert!(told["heard"].as_array().unwrap().iter().any(|heard| heard["name"] == "manager"), "{told}");
 }
 

@@ -7,7 +7,8 @@ use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
-use cara_std::{Call, Interfaces, ParametersView, ServiceError, ServiceOptions, Unit};
+use cara_std::{Builder, Call, Identity, Interfaces, ParametersView, ServiceError, ServiceOptions, Unit};
+use cara_test_keys::KeyFolder;
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -28,6 +29,7 @@ pub(crate) const FUNCTIONS: [&str; 6] = [
 pub(crate) struct Stage {
     pub(crate) fleet: u32,
     control: TempDir,
+    keys: KeyFolder,
     manager: Option<Child>,
     agvs: Vec<Unit>,
 }
@@ -37,12 +39,14 @@ impl Stage {
     pub(crate) fn empty() -> Self {
         let fleet = RandomState::new().build_hasher().finish() as u32;
         let control = private_folder();
-        Self { fleet, control, manager: None, agvs: Vec::new() }
+        let keys = KeyFolder::draw(fleet, &["manager/1@m_unit", "other/2@m_unit"]).unwrap();
+        Self { fleet, control, keys, manager: None, agvs: Vec::new() }
     }
 
     /// `manager/1` and these AGVs, connected, with IDs from 11 on.
     pub(crate) fn with(agvs: &[&str]) -> Self {
         let mut stage = Self::empty();
+        agvs.iter().zip(11..).for_each(|(name, id)| stage.know(name, id));
         stage.start_manager();
         agvs.iter().zip(11..).for_each(|(name, id)| stage.start_agv(name, id));
         let start = Instant::now();
@@ -80,7 +84,20 @@ impl Stage {
     }
 
     pub(crate) fn start_agv(&mut self, name: &str, id: u32) {
-        self.agvs.push(agv(name, id, self.fleet));
+        self.know(name, id);
+        self.agvs.push(agv(self.vehicle(name, id)));
+    }
+
+    /// Makes the keys of an s_unit, before the manager starts or while it runs.
+    pub(crate) fn know(&self, name: &str, id: u32) {
+        self.keys.add(&[&format!("{name}/{id}")]).unwrap();
+    }
+
+    /// The builder of an s_unit that is [known](Self::know).
+    pub(crate) fn vehicle(&self, name: &str, id: u32) -> Builder<()> {
+        let builder = Unit::builder(name, id, "manager", 1).unwrap().fleet(self.fleet);
+        let file = self.keys.file(&Identity::s_unit(name, id).unwrap()).unwrap();
+        builder.interfaces(Interfaces::Loopback).key_file(file)
     }
 
     pub(crate) fn stop_agvs(&mut self) {
@@ -91,7 +108,8 @@ impl Stage {
     pub(crate) fn command(&self, arguments: &[&str]) -> Command {
         let mut command = Command::new(env!("CARGO_BIN_EXE_cara"));
         command.args(arguments).args(["--loopback", "--fleet", &self.fleet.to_string()]);
-        command.env("CARA_CONTROL_DIR", self.control.path()).env_remove("CARA_INTERFACES").stdin(Stdio::null());
+        command.env("CARA_CONTROL_DIR", self.control.path()).env("CARA_KEYS", self.keys.path());
+        command.env_remove("CARA_INTERFACES").stdin(Stdio::null());
         command
     }
 
@@ -223,9 +241,8 @@ impl Drop for Running {
     }
 }
 
-fn agv(name: &str, id: u32, fleet: u32) -> Unit {
-    let builder = Unit::builder(name, id, "manager", 1).unwrap();
-    let unit = builder.fleet(fleet).interfaces(Interfaces::Loopback).build_unit().unwrap();
+fn agv(builder: Builder<()>) -> Unit {
+    let unit = builder.build_unit().unwrap();
     for signature in FUNCTIONS {
         let definition = signature.parse::<cara_std::Definition>().unwrap();
         let options = ServiceOptions::new();

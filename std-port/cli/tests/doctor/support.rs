@@ -39,7 +39,7 @@ impl Clinic {
     pub(crate) fn system(&self, name: &str) -> Builder<()> {
         let system = CommunicationSystem::builder(name, 1).unwrap().fleet(self.fleet).discovery_port(self.port);
         let socket = self.sockets.path().join(format!("{name}.sock"));
-        system.interfaces(Interfaces::Loopback).control(Control::Path(socket))
+        system.interfaces(Interfaces::Loopback).insecure().control(Control::Path(socket))
     }
 
     /// A running manager `name/1`.
@@ -61,7 +61,9 @@ impl Clinic {
             env!("CARGO_BIN_EXE_cara"),
         ]);
         command.args(["node", "--name", "boss", "--id", "1", "--loopback", "--fleet", &self.fleet.to_string()]);
-        command.args(["--discovery-port", &self.port.to_string()]).env("CARA_CONTROL_DIR", self.sockets.path());
+        command
+            .args(["--insecure", "--discovery-port", &self.port.to_string()])
+            .env("CARA_CONTROL_DIR", self.sockets.path());
         command.stdout(Stdio::null()).stderr(Stdio::null());
         Killed(command.spawn().unwrap())
     }
@@ -69,7 +71,7 @@ impl Clinic {
     /// An s_unit of the manager `manager/1`.
     pub(crate) fn unit(&self, name: &str, id: u32, manager: &str) -> Builder<()> {
         let unit = Unit::builder(name, id, manager, 1).unwrap().fleet(self.fleet).discovery_port(self.port);
-        unit.interfaces(Interfaces::Loopback)
+        unit.interfaces(Interfaces::Loopback).insecure()
     }
 
     pub(crate) fn started(&self, unit: Builder<()>) -> Unit {
@@ -120,6 +122,7 @@ impl Clinic {
         command.args([
             "doctor",
             "--json",
+            "--insecure",
             "--fleet",
             &self.fleet.to_string(),
             "--discovery-port",

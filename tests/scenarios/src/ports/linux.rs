@@ -22,7 +22,6 @@ use cara_core::services::requests::CallId;
 use cara_core::services::unit::RequestOptions;
 use cara_core::time::{Duration, Instant};
 use cara_std::access::AccessTable;
-use cara_std::keys::KeyRing;
 use cara_std::{
     BuildError, Call, Capacities, CommunicationSystem, Interfaces, LeaseWatch, MyFunctionList, Peer, ServiceOptions,
     Unit as SUnit, UnitEvent,
@@ -47,7 +46,7 @@ pub(super) struct LinuxWorld {
     fleet: u32,
     units: Vec<Arc<LinuxNode>>,
     /// None where strangers come, who speak plain.
-    keys: Option<Keys>,
+    keys: Option<Arc<Mutex<Keys>>>,
     /// AGVs dial through relays.
     relayed: bool,
     /// The relay of a unit, by its number.
@@ -69,8 +68,8 @@ struct LinuxNode {
     /// The manager's address, for one that is to dial a relay.
     dials: Option<SocketAddr>,
     spec: Spec,
-    /// For its one life; plain mode without.
-    ring: Mutex<Option<KeyRing>>,
+    /// Of the scenario's fleets; plain mode without.
+    keys: Option<Arc<Mutex<Keys>>>,
     machine: Mutex<Option<Arc<Machine>>>,
     receiver: Mutex<Option<Receiver<UnitEvent>>>,
     events: Mutex<Vec<(Instant, Seen)>>,
@@ -97,7 +96,7 @@ impl LinuxWorld {
             start: std::time::Instant::now(),
             fleet: RandomState::new().build_hasher().finish() as u32,
             units: Vec::new(),
-            keys: (mode == Mode::Secured).then(Keys::default),
+            keys: (mode == Mode::Secured).then(Arc::default),
             relayed,
             relays: BTreeMap::new(),
             silent: Vec::new(),
@@ -173,14 +172,12 @@ impl World for LinuxWorld {
     }
 
     fn add(&mut self, spec: Spec) -> Unit {
-        let fleet = self.fleet.wrapping_add(spec.fleet);
-        let ring = self.keys.as_mut().map(|keys| keys.ring(fleet, &spec.identity()));
         let node = Arc::new(LinuxNode {
             start: self.start,
             dials: self.relay(&spec),
-            fleet,
+            fleet: self.fleet.wrapping_add(spec.fleet),
             spec,
-            ring: Mutex::new(ring),
+            keys: self.keys.clone(),
             machine: Mutex::new(None),
             receiver: Mutex::new(None),
             events: Mutex::default(),
@@ -302,8 +299,8 @@ impl LinuxNode {
         };
         let builder = builder.fleet(self.fleet).constraints(*constraints).capacities(capacities);
         let builder = builder.interfaces(Interfaces::Loopback);
-        let builder = match lock(&self.ring).take() {
-            Some(ring) => builder.keys(ring),
+        let builder = match &self.keys {
+            Some(keys) => builder.keys(lock(keys).ring(self.fleet, &self.spec.identity())),
             None => builder.insecure(),
         };
         if *role == SpecRole::Manager {

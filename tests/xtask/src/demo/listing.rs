@@ -20,7 +20,7 @@ const FUNCTIONS: [&str; 4] =
 pub(super) fn run(stage: &Stage, manager: &mut Process) -> Result<[Process; 2]> {
     let text = workspace::read(Path::new(SOURCE))?;
     let mut listing = Listing { stage, manager, code: code(&text)?, shown: 0 };
-    listing.through(1, "AGV_manager/1")?;
+    listing.through(1, "AGV_manager/1, secured")?;
     listing.through(2, "started")?;
     listing.through(3, "0 s_units")?;
     listing.manager.expect("line 6: searching", STEP)?;

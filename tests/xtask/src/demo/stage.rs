@@ -1,18 +1,24 @@
 //! Where the demonstration's processes come from, and what is shown of them.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::process::Command;
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, ensure};
 use cara_processes::{Line, Process, random_fleet};
+use tempfile::TempDir;
 
 /// How long anything may take that takes a second at most when the machine has nothing else to do.
 pub(super) const STEP: Duration = Duration::from_secs(10);
 
-/// One fleet on loopback.
+/// The fleet's nodes, as `cara keys` takes them.
+const NODES: [&str; 4] = ["AGV_manager/1@m_unit", "agv-1/11", "agv-2/12", "agv-3/13"];
+
+/// One fleet on loopback, with keys of its own.
 pub(super) struct Stage {
     programs: PathBuf,
     fleet: String,
+    keys: TempDir,
     began: Instant,
 }
 
@@ -21,7 +27,18 @@ impl Stage {
     pub(super) fn new() -> Result<Self> {
         let own = std::env::current_exe().context("cannot tell where the examples are")?;
         let programs = own.parent().context("this program is in no folder")?.to_owned();
-        Ok(Self { programs, fleet: random_fleet().to_string(), began: Instant::now() })
+        let keys = tempfile::tempdir().context("there is no room for keys")?;
+        Ok(Self { programs, fleet: random_fleet().to_string(), keys, began: Instant::now() })
+    }
+
+    /// Makes the fleet's keys, with the command that a newcomer types.
+    pub(super) fn make_keys(&self) -> Result<()> {
+        let mut command = Command::new(self.programs.join("cara"));
+        command.args(["keys", "new-fleet", "--fleet", &self.fleet]).args(NODES).env("CARA_KEYS", self.keys.path());
+        let made = command.output().context("cannot start cara")?;
+        ensure!(made.status.success(), "no keys were made: {}", String::from_utf8_lossy(&made.stderr));
+        self.tell(&format!("cara keys new-fleet --fleet {} {}", self.fleet, NODES.join(" ")));
+        Ok(())
     }
 
     /// The manager, which waits behind each line of the listing and takes commands then.
@@ -32,12 +49,18 @@ impl Stage {
     /// AGV number `number`, as `agv-1/11`.
     pub(super) fn agv(&self, number: u32) -> Result<Process> {
         let (name, id) = (format!("agv-{number}"), (10 + number).to_string());
-        self.start(&name, "agv", &["--attended", "--name", &name, "--id", &id])
+        let agv = self.start(&name, "agv", &["--attended", "--name", &name, "--id", &id])?;
+        // Units in plain mode do not meet secured ones, so that whoever joins it has proven its key.
+        agv.seen(&format!("started {name}/{id}, secured"), STEP)?;
+        Ok(agv)
     }
 
     fn start(&self, name: &str, program: &str, arguments: &[&str]) -> Result<Process> {
         let network = ["--loopback", "--fleet", &self.fleet];
-        Process::start(name, &self.programs.join(program), arguments.iter().chain(&network))
+        let keys = format!("CARA_KEYS={}", self.keys.path().display());
+        let program = self.programs.join(program).display().to_string();
+        let words = [keys.as_str(), program.as_str()];
+        Process::start(name, Path::new("env"), words.iter().chain(arguments).chain(&network))
     }
 
     /// Sends a command to the manager's console; its answer, which must contain `wanted`.

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use anyhow::Result;
 use cara_apps::mechanic;
-use cara_examples::{Network, Stop, log_to_stderr, say};
+use cara_examples::{Network, Stop, log_to_stderr, say, shown_mode};
 use cara_std::{CommunicationSystem, Parameters};
 use clap::Parser;
 
@@ -51,12 +51,10 @@ fn main() -> Result<()> {
 /// Comments are line numbers of the paper's listing. Behind each line, `transcript` says what came of it.
 fn listing(options: &Options, transcript: &Transcript) -> Result<CommunicationSystem> {
     let Options { name, id, network, .. } = options;
-    let Network { fleet, .. } = *network;
     // README begins.
-    let agv_manager =
-        CommunicationSystem::builder(name, *id)?.fleet(fleet).interfaces(network.interfaces()).build_system()?; // 1
+    let agv_manager = network.place(CommunicationSystem::builder(name, *id)?).build_system()?; // 1
     transcript.begin(&agv_manager);
-    transcript.after(1, format_args!("{}", agv_manager.identity()))?;
+    transcript.after(1, format_args!("{}, {}", agv_manager.identity(), shown_mode(agv_manager.mode())))?;
     agv_manager.start()?; // 2
     transcript.after(2, "started")?;
     let mut s_unit_number = agv_manager.number_of_s_units(); // 3

@@ -1,0 +1,44 @@
+//! Whether a unit of this program has keys, and where they are: options, files and the default mean the same everywhere.
+
+use std::path::PathBuf;
+
+use cara_std::{Builder, Mode};
+
+/// The keys of a unit.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(crate) enum Keys {
+    /// Those of the file that is found where such files are looked for.
+    #[default]
+    Found,
+    /// Those of this file.
+    File(PathBuf),
+    /// None: plain mode, which is asked for in words.
+    Insecure,
+}
+
+impl Keys {
+    /// The mode of a unit with these keys.
+    pub(crate) fn mode(&self) -> Mode {
+        match self {
+            Self::Found | Self::File(_) => Mode::Secured,
+            Self::Insecure => Mode::Plain,
+        }
+    }
+
+    /// The builder of a unit that has them.
+    pub(crate) fn given_to<T: Send + 'static>(&self, builder: Builder<T>) -> Builder<T> {
+        match self {
+            Self::Found => builder,
+            Self::File(path) => builder.key_file(path),
+            Self::Insecure => builder.insecure(),
+        }
+    }
+}
+
+/// A mode as it is shown.
+pub(crate) fn shown_mode(mode: Mode) -> &'static str {
+    match mode {
+        Mode::Plain => "plain",
+        Mode::Secured => "secured",
+    }
+}

@@ -1,0 +1,49 @@
+//! Keys for the units of a test, drawn into a folder that goes with it: the units of its own process take their files from
+//! there, and those of others are told the folder in `CARA_KEYS`. No test looks at the keys of whoever runs it.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result};
+use cara_std::keys::{FleetKeys, Store, parse_node, place};
+use cara_std::{Fleet, Identity, Role};
+use tempfile::TempDir;
+
+/// A folder with a fleet's root and the file of each node.
+pub struct KeyFolder {
+    folder: TempDir,
+    fleet: Fleet,
+}
+
+impl KeyFolder {
+    /// Draws the keys of a fleet's nodes, which are written as `cara keys` takes them. Each s_unit belongs to all m_units.
+    pub fn draw(fleet: u32, nodes: &[&str]) -> Result<Self> {
+        let drawn = Self { folder: tempfile::tempdir()?, fleet: Fleet(fleet) };
+        Store::create(drawn.path(), FleetKeys::draw(drawn.fleet)?)?;
+        drawn.add(nodes)?;
+        Ok(drawn)
+    }
+
+    /// Makes the keys of further nodes, and with them anew those of whom they talk to.
+    pub fn add(&self, nodes: &[&str]) -> Result<()> {
+        let nodes: Result<Vec<_>, _> = nodes.iter().map(|node| parse_node(node)).collect();
+        let nodes = nodes.map_err(anyhow::Error::msg)?;
+        let mut store = Store::open(self.path(), self.fleet)?;
+        let known = store.keys().members().nodes().iter().map(|member| member.identity.clone());
+        let m_units = known.chain(nodes.clone()).filter(|node| node.role() == Role::MUnit).collect::<Vec<_>>();
+        let has_s_units = nodes.iter().any(|node| node.role() == Role::SUnit);
+        store.keys_mut().add_all(&nodes, if has_s_units { &m_units } else { &[] })?;
+        store.save()?;
+        Ok(())
+    }
+
+    /// What `CARA_KEYS` is to be for processes of the test.
+    pub fn path(&self) -> &Path {
+        self.folder.path()
+    }
+
+    /// The file of a node.
+    pub fn file(&self, identity: &Identity) -> Result<PathBuf> {
+        let file = self.path().join(place::file_name(identity, self.fleet));
+        file.exists().then_some(file).with_context(|| format!("{identity} has no keys in this test"))
+    }
+}
