@@ -34,11 +34,3 @@ impl Keys {
         }
     }
 }
-
-/// A mode as it is shown.
-pub(crate) fn shown_mode(mode: Mode) -> &'static str {
-    match mode {
-        Mode::Plain => "plain",
-        Mode::Secured => "secured",
-    }
-}

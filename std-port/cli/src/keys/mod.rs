@@ -5,7 +5,7 @@ mod choice;
 mod show;
 mod told;
 
-pub(crate) use choice::{Keys, shown_mode};
+pub(crate) use choice::Keys;
 
 use std::path::PathBuf;
 use std::process::ExitCode;

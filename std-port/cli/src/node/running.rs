@@ -18,7 +18,7 @@ use super::unit::{Node, NotBuilt};
 use super::{events, http, wrong};
 use crate::exit::Ended;
 use crate::global::Global;
-use crate::keys::shown_mode;
+use crate::listening::shown_mode;
 use crate::output;
 
 /// Runs a node until it is asked to end.

@@ -10,6 +10,7 @@ use cara_std::{BuildError, Builder, CommunicationSystem, Constraints, Fleet, Mod
 use super::{Need, Operator, running};
 use crate::exit::Ended;
 use crate::global::Global;
+use crate::listening;
 use crate::name_and_id::NameAndId;
 use crate::nodes::{self, Chosen};
 use crate::output;
@@ -70,8 +71,9 @@ fn refuse_if_it_runs(identity: &NameAndId, global: &Global) -> anyhow::Result<()
 
 /// A unit of another host, or one without a control socket.
 fn refuse_if_it_answers(identity: &NameAndId, global: &Global) -> anyhow::Result<()> {
-    // Where nothing can be heard, the start will say so.
-    let Ok(mut survey) = Survey::open(global.interfaces(), global.port()) else { return Ok(()) };
+    // Where nothing can be heard, or keys cannot be read, the start will say so.
+    let survey = listening::keys(global).and_then(|keys| listening::open(global, keys));
+    let Ok(mut survey) = survey else { return Ok(()) };
     let fleet = Fleet(global.fleet.unwrap_or(0));
     let is_it = |survey: &Survey| {
         let twin = survey.heard().iter().find(|heard| {

@@ -50,7 +50,7 @@ fn without_a_manager_a_scan_surveys_the_network() {
     let agv = Unit::builder("lost-agv", 5, "nobody", 9).unwrap().fleet(stage.fleet).interfaces(Interfaces::Loopback);
     let agv = agv.insecure().build_unit().unwrap();
     agv.start().unwrap();
-    let told = stage.ends(0, &["scan", "--listen", "10s", "--json", "--insecure"]).json();
+    let told = stage.ends(0, &["scan", "--listen", "10s", "--json"]).json();
     agv.stop();
     let heard = told["heard"].as_array().unwrap();
     let found = heard.iter().find(|heard| heard["name"] == "lost-agv").unwrap_or_else(|| panic!("{told}"));
@@ -63,9 +63,8 @@ fn without_a_manager_a_scan_surveys_the_network() {
 
 #[test]
 fn a_survey_can_be_had_beside_a_manager() {
-    let mut stage = Stage::empty();
-    stage.start_manager_with(&["--insecure"]);
-    let told = stage.ends(0, &["scan", "--survey", "--listen", "5s", "--json", "--insecure"]).json();
+    let stage = Stage::with(&[]);
+    let told = stage.ends(0, &["scan", "--survey", "--listen", "5s", "--json"]).json();
     assert!(told["heard"].as_array().unwrap().iter().any(|heard| heard["name"] == "manager"), "{told}");
 }
 
