@@ -96,7 +96,7 @@ impl Cara {
         let (name, id) = who.split_once('/').with_context(|| format!("a manager is NAME/ID, not `{who}`"))?;
         let fleet = fleet.to_string();
         let mut command = self.command();
-        command.args(["node", "--name", name, "--id", id, "--fleet", &fleet]);
+        command.args(["node", "--name", name, "--id", id, "--fleet", &fleet, "--insecure"]);
         Ok(Manager(command.spawn().context("cannot start cara")?))
     }
 

@@ -16,6 +16,9 @@ use crate::expectation::{line_matches, matches};
 /// How long a command that stays may take until it has printed what the guide shows.
 const PATIENCE: Duration = Duration::from_secs(60);
 
+/// What would lead to somebody's own keys.
+const NOT_INHERITED: [&str; 2] = ["CARA_KEYS", "XDG_CONFIG_HOME"];
+
 /// What all terminals share: the checkout, and a home of their own that is empty.
 pub(crate) struct Surroundings {
     root: PathBuf,
@@ -101,8 +104,8 @@ impl<'s> Terminal<'s> {
         let environment = self.surroundings.environment();
         let variables = environment.iter().map(|(name, value)| format!("{name}={}", value.display()));
         let directory = self.surroundings.root.display().to_string();
-        let arguments =
-            ["-C".into(), directory].into_iter().chain(variables).chain(["bash".into(), "-c".into(), script]);
+        let arguments = ["-C".into(), directory].into_iter().chain(NOT_INHERITED.map(|name| format!("--unset={name}")));
+        let arguments = arguments.chain(variables).chain(["bash".into(), "-c".into(), script]);
         let process = Process::start(text, Path::new("env"), arguments)?;
         shown.iter().filter(|line| line.trim() != "…").try_for_each(|line| await_line(&process, line))?;
         self.running = Some(process);
@@ -127,6 +130,9 @@ impl<'s> Terminal<'s> {
     fn shell(&self, text: &str) -> Command {
         let mut command = Command::new("bash");
         command.args(["-c", &format!("{}{text}", self.before)]).current_dir(&self.surroundings.root);
+        for name in NOT_INHERITED {
+            command.env_remove(name);
+        }
         command.envs(self.surroundings.environment());
         command
     }
