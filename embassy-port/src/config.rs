@@ -1,30 +1,35 @@
 //! Who a unit is, before it starts.
 
-use cara_core::config::{CHUNK_BYTES, Constraints, MINIMUM_CHUNK_BYTES, PLAIN_PORT};
+use cara_core::config::{CHUNK_BYTES, Constraints, MINIMUM_CHUNK_BYTES};
 use cara_core::distribution::connection_handler::Target;
 use cara_core::distribution::hello::Manager;
 use cara_core::distribution::identity::{Fleet, Identity};
 use cara_core::error::Error;
+use cara_core::host::secure::DATAGRAM_OVERHEAD;
 use cara_core::services::access::Access;
 use cara_core::services::unit::buffer_bytes;
 use core::fmt;
 use core::net::SocketAddr;
 
-/// Most that a session datagram adds to what a message in chunks takes.
-const DATAGRAM_SLACK: usize = 8;
+use crate::security::{OVERHEAD, Security};
 
-/// Bytes that `MESSAGE` of [`Resources`](crate::Resources) needs for messages of `message_size`.
+/// Most that a session datagram adds to what a message in chunks takes, sealed or not.
+const DATAGRAM_SLACK: usize = 8 + if cfg!(feature = "secure") { DATAGRAM_OVERHEAD } else { 0 };
+
+/// Bytes that `MESSAGE` of [`Resources`](crate::Resources) needs for messages of `message_size`, sealed if the crate has its
+/// feature `secure`.
 pub const fn message_buffer(message_size: u32) -> usize {
-    buffer_bytes(message_size, 0) + DATAGRAM_SLACK
+    buffer_bytes(message_size, OVERHEAD) + DATAGRAM_SLACK
 }
 
 /// Who a unit is and what limits it has.
-#[derive(Clone, Debug)]
+#[derive(Debug)]
 pub struct Config {
     pub(crate) identity: Identity,
     pub(crate) target: Target,
     pub(crate) fleet: Fleet,
     pub(crate) constraints: Constraints,
+    pub(crate) security: Security,
     pub(crate) seed: u64,
     pub(crate) epoch: u64,
     pub(crate) tcp_port: u16,
@@ -42,20 +47,20 @@ impl fmt::Debug for Table {
 }
 
 impl Config {
-    /// An s_unit, which joins the manager of the given name and id and no other. `seed` should differ from boot to
-    /// boot: the controller's source of noise, or a count of its starts.
-    pub fn s_unit(name: &str, id: u32, manager_name: &str, manager_id: u32, seed: u64) -> Result<Self, Error> {
+    /// An s_unit, which joins the manager of the given name and id and no other.
+    pub fn s_unit(name: &str, id: u32, manager_name: &str, manager_id: u32, security: Security) -> Result<Self, Error> {
         let manager = Manager::new(manager_name, manager_id)?;
-        Ok(Self::new(Identity::s_unit(name, id)?, Target::Manager(manager), Constraints::S_UNIT, seed))
+        Ok(Self::new(Identity::s_unit(name, id)?, Target::Manager(manager), Constraints::S_UNIT, security))
     }
 
     /// An m_unit.
-    pub fn m_unit(name: &str, id: u32, seed: u64) -> Result<Self, Error> {
+    pub fn m_unit(name: &str, id: u32, security: Security) -> Result<Self, Error> {
         let constraints = Constraints { maximum_nodes: 4, ..Constraints::S_UNIT };
-        Ok(Self::new(Identity::m_unit(name, id)?, Target::Everybody, constraints, seed))
+        Ok(Self::new(Identity::m_unit(name, id)?, Target::Everybody, constraints, security))
     }
 
-    fn new(identity: Identity, target: Target, constraints: Constraints, seed: u64) -> Self {
+    fn new(identity: Identity, target: Target, constraints: Constraints, mut security: Security) -> Self {
+        let seed = security.0.seed();
         Self {
             identity,
             target,
@@ -63,7 +68,8 @@ impl Config {
             constraints,
             seed,
             epoch: seed,
-            tcp_port: PLAIN_PORT,
+            tcp_port: security.0.mode().port(),
+            security,
             access: Table(None),
         }
     }
@@ -80,7 +86,8 @@ impl Config {
         self
     }
 
-    /// This life of the unit, if it is not to be the seed: a count of starts, on a board without a source of noise.
+    /// This life of the unit, if it is not to be drawn, or the seed of an insecure one: a count of starts, on a board
+    /// without a source of noise.
     pub fn epoch(mut self, epoch: u64) -> Self {
         self.epoch = epoch;
         self
@@ -97,13 +104,13 @@ impl Config {
     ///
     /// ```
     /// use cara_core::services::access::{Functions, Rule, Verbs, Who};
-    /// use cara_embassy::Config;
+    /// use cara_embassy::{Config, Security};
     ///
     /// const RULES: [Rule; 2] = [
     ///     Rule::new(Who::node("AGV_manager", 1), Functions::All, Verbs::CALL),
     ///     Rule::new(Who::M_UNITS, Functions::Named(&["pos_info"]), Verbs::CALL),
     /// ];
-    /// let config = Config::s_unit("agv-07", 7, "AGV_manager", 1, 0x5EED)?.access(&RULES);
+    /// let config = Config::s_unit("agv-07", 7, "AGV_manager", 1, Security::insecure(0x5EED))?.access(&RULES);
     /// # Ok::<(), cara_core::error::Error>(())
     /// ```
     pub fn access(mut self, table: &'static dyn Access) -> Self {
@@ -134,13 +141,14 @@ pub(crate) fn check(constraints: &Constraints, links: usize, buffer: usize) -> R
 
 #[cfg(test)]
 mod tests {
-    use super::message_buffer;
+    use super::{DATAGRAM_OVERHEAD, message_buffer};
     use cara_core::distribution::datagram::SESSION_HEADER_BYTES;
     use cara_core::distribution::message::{REQUEST_BYTES, SessionBody};
 
     #[test]
     fn a_message_in_one_datagram_fits_the_buffers_of_datagrams() {
-        let around = SESSION_HEADER_BYTES + SessionBody::message_prefix(0).len() + REQUEST_BYTES;
+        let sealed = if cfg!(feature = "secure") { DATAGRAM_OVERHEAD } else { 0 };
+        let around = SESSION_HEADER_BYTES + SessionBody::message_prefix(0).len() + REQUEST_BYTES + sealed;
         for size in 0..2_000 {
             assert!(message_buffer(size) >= around + size as usize, "{size}");
         }

@@ -10,7 +10,6 @@ use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error, Refusal};
 use cara_core::host::mailman::LinkId;
-use cara_core::host::secure::Plain;
 use cara_core::services::Context;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::{Call, Event};
@@ -25,11 +24,15 @@ use crate::replies::ended;
 use crate::taken::Running;
 use crate::time::now;
 
-/// How long somebody who has dialled may say nothing while nobody else could dial.
-const PATIENCE: Duration = Duration::from_millis(100);
+/// How long somebody who has dialled may take to say, and to prove, who is there while nobody else could dial, or while
+/// another one has dialled. A slow controller takes most of it for the proof.
+const PATIENCE: Duration = Duration::from_millis(300);
+/// That somebody could not join is logged this often at most, whatever is tried.
+const LOGGED: Duration = Duration::from_secs(1);
 
 /// What happened on a link, without what it borrowed.
 pub(crate) enum News {
+    Introduced,
     Hello,
     Call(Call),
     Failed(CallId, Error),
@@ -57,8 +60,8 @@ impl News {
     /// Of all events but replies.
     fn of(event: Event<'_>) -> Self {
         match event {
-            // Plain links prove nothing.
-            Event::Introduced | Event::Hello => Self::Hello,
+            Event::Introduced => Self::Introduced,
+            Event::Hello => Self::Hello,
             Event::Call(call) => Self::Call(call),
             Event::Reply(..) => Self::Reply,
             Event::Failed(id, error) => Self::Failed(id, error),
@@ -136,7 +139,7 @@ impl<T> Machine<T> {
         };
         let from = SocketAddr::new(from.addr.into(), from.port);
         let bytes = scratch.get_mut(..length).unwrap_or_default();
-        match self.node.datagram(now(), from, bytes, &Plain) {
+        match self.node.datagram(now(), from, bytes, self.proof.codes()) {
             Sorted::Done => {
                 if let Some(address) = self.node.take_twin() {
                     let peer = Some(self.node.identity().clone());
@@ -179,14 +182,17 @@ impl<T> Machine<T> {
         self.listen();
     }
 
-    /// The stack refuses who dials while no socket listens, so whoever says nothing gives way.
+    /// The stack refuses who dials while no socket listens, so the oldest of those who have proven nothing gives way; and
+    /// also where more than one has proven nothing, since a board looks at one proof at a time.
     fn show_one_out(&mut self, now: Instant) {
-        if self.mail.lines.iter().any(crate::line::Line::takes_connections) {
+        let mut pending = self.pending();
+        let Some(first) = pending.next() else { return };
+        let second = pending.next();
+        if second.is_none() && self.mail.lines.iter().any(crate::line::Line::takes_connections) {
             return;
         }
-        let since = |machine: &Self, index: u16| machine.link(index).map_or(now, |link| link.since);
-        let silent = self.oldest_silent().filter(|index| now >= since(self, *index) + PATIENCE);
-        if let Some(index) = silent {
+        let (since, index) = pending.chain(second).fold(first, core::cmp::min);
+        if now >= since + PATIENCE {
             self.node.counters.add(NodeCounter::GaveWay, 1);
             self.with(index, |session, cx, _| session.close(cx, CloseReason::HelloTimeout));
         }
@@ -246,6 +252,7 @@ impl<T> Machine<T> {
     pub(crate) fn noted(&mut self, index: u16, news: News) -> Option<Job> {
         match news {
             News::Reply => {}
+            News::Introduced => self.prove(index),
             News::Hello => self.greet(index),
             News::Answered => {
                 let action = self.node.challenge_answered(now(), LinkId(index));
@@ -282,6 +289,27 @@ impl<T> Machine<T> {
             self.tell(event(peer));
         }
     }
+
+    /// The peer of a link says who it is: each proves to the other that it has the pair's key.
+    #[cfg(feature = "secure")]
+    #[inline(never)]
+    fn prove(&mut self, index: u16) {
+        let Some(session) = self.link(index).and_then(|link| link.session.as_ref()) else { return };
+        let (Some(hello), address) = (session.hello().cloned(), session.address()) else { return };
+        match self.proof.credentials(&hello) {
+            Some(credentials) => {
+                self.with(index, |session, cx, _| session.prove(cx, credentials));
+            }
+            None => {
+                self.node.refuse_without_key(now(), address, &hello.identity);
+                self.refuse(index, Refusal::NoKey);
+            }
+        }
+    }
+
+    /// Plain links prove nothing.
+    #[cfg(not(feature = "secure"))]
+    fn prove(&mut self, _index: u16) {}
 
     /// The peer of a link has introduced itself.
     #[inline(never)]
@@ -366,9 +394,19 @@ impl<T> Machine<T> {
                 Some(Job::Lost)
             }
             None => {
+                self.log_refused(told.as_ref(), reason);
                 self.tell(UnitEvent::NotJoined { address, peer: told, reason });
                 None
             }
+        }
+    }
+
+    /// Links end in this way as fast as somebody dials, so the log has one line for many of them.
+    fn log_refused(&mut self, told: Option<&Identity>, reason: CloseReason) {
+        let now = now();
+        if now >= self.logged {
+            self.logged = now + LOGGED;
+            log!("{} could not join, or be joined: {:?}", told.map_or("somebody", Identity::name), reason);
         }
     }
 

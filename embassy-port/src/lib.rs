@@ -7,7 +7,7 @@
 //! ```no_run
 //! use cara_core::services::lease::Lease;
 //! use cara_core::time::Duration;
-//! use cara_embassy::{Config, Handle, Handler, Resources, Runner, ServiceOptions};
+//! use cara_embassy::{Config, Handle, Handler, Resources, Runner, Security, ServiceOptions};
 //!
 //! /// The application's state, which services get.
 //! #[derive(Default)]
@@ -19,9 +19,9 @@
 //! fn start(
 //!     stack: embassy_net::Stack<'static>,
 //!     resources: &'static mut Resources<Agv>,
-//!     seed: u64,
+//!     security: Security,
 //! ) -> Result<(Handle<Agv>, Runner<Agv>), cara_core::error::Error> {
-//!     let config = Config::s_unit("agv-07", 7, "manager", 1, seed)?;
+//!     let config = Config::s_unit("agv-07", 7, "manager", 1, security)?;
 //!     let (unit, runner) = cara_embassy::new(stack, resources, config, Agv::default())?;
 //!     let pos_info = Handler::method(&|agv: &mut Agv, _, p| {
 //!         p.set_value("position", agv.position).map_err(|_| cara_core::error::ServiceError::BadResults)
@@ -63,6 +63,16 @@ macro_rules! log {
     }};
 }
 
+/// A warning, likewise.
+macro_rules! warning {
+    ($($arg:tt)*) => {{
+        #[cfg(feature = "defmt")]
+        ::defmt::warn!($($arg)*);
+        #[cfg(not(feature = "defmt"))]
+        { let _ = ::core::format_args!($($arg)*); }
+    }};
+}
+
 mod calls;
 mod config;
 mod driving;
@@ -79,6 +89,7 @@ mod publishing;
 mod replies;
 mod resources;
 mod runner;
+mod security;
 mod taken;
 mod time;
 
@@ -91,5 +102,6 @@ pub use lease::LeaseWatch;
 pub use peer::{Peer, TheirFunctionList};
 pub use resources::{Resources, new};
 pub use runner::Runner;
+pub use security::Security;
 pub use taken::TakenCall;
 pub use time::now;

@@ -6,7 +6,6 @@ use cara_core::distribution::function_list::FunctionList;
 use cara_core::distribution::identity::{Identity, Role};
 use cara_core::host::connections::LinkCounter;
 use cara_core::host::mailman::LinkId;
-use cara_core::host::secure::Plain;
 use cara_core::services::Context;
 use cara_core::services::publications::Publications;
 use cara_core::services::unit::{Session, SessionConfig, SessionStorage};
@@ -23,13 +22,14 @@ use crate::handler::{Hook, Listed};
 use crate::line::Line;
 use crate::mail::EmbassyMailman;
 use crate::replies::{ReplyBox, Waiter};
+use crate::security::{LinkCipher, Proof};
 use crate::taken::TaskSlot;
 use crate::time::now;
 
 /// Tasks that can wait for the same thing without waking each other.
 const TASKS_WAITING: usize = 4;
 
-pub(crate) type LinkSession = Session<Lent, Plain>;
+pub(crate) type LinkSession = Session<Lent, LinkCipher>;
 pub(crate) type LinkContext<'c, T> = Context<'c, Lent, EmbassyMailman, Pool<Lent>, Listed<T>>;
 pub(crate) type LinkCounters = Counters<LinkCounter, { LinkCounter::COUNT }>;
 
@@ -78,6 +78,8 @@ impl Link {
 pub(crate) struct Machine<T: 'static> {
     pub(crate) node: Node<Lent>,
     pub(crate) publications: Publications<Lent>,
+    /// What proves to peers who this unit is.
+    pub(crate) proof: Proof,
     /// Who may do what.
     pub(crate) access: Table,
     pub(crate) functions: FunctionList<Lent, Listed<T>>,
@@ -100,6 +102,8 @@ pub(crate) struct Machine<T: 'static> {
     pub(crate) has_begun: bool,
     /// It has been stopped, and does nothing any more but end its connections.
     pub(crate) stopped: bool,
+    /// When it was last logged that somebody could not join.
+    pub(crate) logged: Instant,
     /// Of the links that have ended.
     pub(crate) counters: LinkCounters,
     /// Longest message, and bytes of arguments and results, that the memory allows.
@@ -180,7 +184,7 @@ impl<T> Machine<T> {
     /// Lets the node do what is due.
     #[inline(never)]
     pub(crate) fn poll_node(&mut self) -> Option<Action> {
-        self.node.poll(now(), &mut self.mail, &Plain)
+        self.node.poll(now(), &mut self.mail, self.proof.codes())
     }
 
     /// Makes the session of a link. `None` when the link is in use.
@@ -190,8 +194,9 @@ impl<T> Machine<T> {
         let local = self.node.hello(now(), LinkId(index));
         let constraints = *self.node.constraints();
         let config = SessionConfig { link: LinkId(index), dialed, address, local, constraints };
+        let cipher = self.proof.cipher();
         let link = self.link_mut(index)?;
-        link.session = Some(Session::new(now(), config, Plain, storage));
+        link.session = Some(Session::new(now(), config, cipher, storage));
         link.since = now();
         Some(())
     }
@@ -208,15 +213,14 @@ impl<T> Machine<T> {
         if closing(&first) { candidates.find(|index| !closing(index)).or(Some(first)) } else { Some(first) }
     }
 
-    /// The link, of those that others have opened, that has waited longest for its peer's hello.
-    pub(crate) fn oldest_silent(&self) -> Option<u16> {
-        let since = |index: &u16| {
-            let link = self.link(*index)?;
+    /// The links that others have opened and on which nobody has proven, or in plain mode said, who is there: when each was
+    /// opened, and its index.
+    pub(crate) fn pending(&self) -> impl Iterator<Item = (Instant, u16)> {
+        self.indices().filter_map(|index| {
+            let link = self.link(index)?;
             let session = link.session.as_ref()?;
-            (!session.dialed() && !session.is_proven()).then_some(link.since)
-        };
-        let silent = self.indices().filter_map(|index| Some((since(&index)?, index)));
-        silent.min().map(|(_, index)| index)
+            (!session.dialed() && !session.is_proven()).then_some((link.since, index))
+        })
     }
 
     /// Takes connections with every socket that has nothing else to do, if the unit is one that is dialled.

@@ -3,7 +3,6 @@
 use core::net::{IpAddr, Ipv4Addr, SocketAddr};
 use core::task::{Context, Poll, Waker};
 
-use cara_core::config::PLAIN_PORT;
 use cara_core::error::CloseReason;
 use cara_core::host::mailman::{LinkId, Mailman};
 use embassy_net::udp::UdpSocket;
@@ -16,6 +15,8 @@ pub(crate) struct EmbassyMailman {
     /// The socket of each link.
     pub(crate) lines: &'static mut [Line],
     pub(crate) udp: UdpSocket<'static>,
+    /// Where units of this mode listen for broadcasts.
+    pub(crate) port: u16,
     pub(crate) stack: Stack<'static>,
 }
 
@@ -32,7 +33,7 @@ impl Mailman for EmbassyMailman {
     fn broadcast(&mut self, datagram: &[u8]) -> bool {
         let Some(config) = self.stack.config_v4().filter(|_| self.stack.is_link_up()) else { return false };
         let all = config.address.broadcast().unwrap_or(Ipv4Addr::BROADCAST);
-        send(&self.udp, all, PLAIN_PORT, datagram)
+        send(&self.udp, all, self.port, datagram)
     }
 }
 

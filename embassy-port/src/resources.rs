@@ -3,7 +3,7 @@
 use core::cell::RefCell;
 use core::mem::MaybeUninit;
 
-use cara_core::config::{LINK_BUFFER_BYTES, PLAIN_PORT};
+use cara_core::config::{LINK_BUFFER_BYTES, Mode};
 use cara_core::counters::Counters;
 use cara_core::distribution::connection_handler::{Finding, Known, Node, NodeConfig, NodeStorage, Order};
 use cara_core::distribution::datagram::SEARCH_BYTES;
@@ -16,6 +16,7 @@ use cara_core::services::publications::{Publications, PublishedToOne};
 use cara_core::services::requests::Pending;
 use cara_core::services::unit::{Publication, SessionStorage};
 use cara_core::storage::Pool;
+use cara_core::time::Instant;
 use embassy_net::Stack;
 use embassy_net::udp::{PacketMetadata, UdpSocket};
 
@@ -28,6 +29,7 @@ use crate::machine::{Link, Machine, Room, Shared, Wakers};
 use crate::mail::EmbassyMailman;
 use crate::replies::{ReplyBox, Waiter};
 use crate::runner::Runner;
+use crate::security::{Proof, Security};
 use crate::taken::TaskSlot;
 use crate::time::now;
 
@@ -65,7 +67,7 @@ const DATAGRAMS: usize = 8;
 /// struct Agv;
 /// // An s_unit with messages of 1 KiB: the default.
 /// type AgvResources = Resources<Agv>;
-/// const { assert!(AgvResources::BYTES <= 24 * 1024) };
+/// const { assert!(AgvResources::BYTES <= 26 * 1024) };
 /// // An m_unit of three nodes with shorter messages.
 /// type DepotResources = Resources<Agv, 4, { message_buffer(256) }, 4, 768>;
 /// const { assert!(DepotResources::SOCKETS == 5) };
@@ -256,7 +258,7 @@ impl<const FUNCTIONS: usize, const THEIR: usize, const CALLS: usize> SessionMemo
 }
 
 impl<const DATAGRAM: usize> UdpMemory<DATAGRAM> {
-    fn socket(&'static mut self, stack: Stack<'static>) -> Result<UdpSocket<'static>, Error> {
+    fn socket(&'static mut self, stack: Stack<'static>, port: u16) -> Result<UdpSocket<'static>, Error> {
         let mut socket = UdpSocket::new(
             stack,
             self.received.write([PacketMetadata::EMPTY; DATAGRAMS]),
@@ -264,7 +266,7 @@ impl<const DATAGRAM: usize> UdpMemory<DATAGRAM> {
             self.sent.write([PacketMetadata::EMPTY; DATAGRAMS]),
             self.send.write([0; DATAGRAM]),
         );
-        socket.bind(PLAIN_PORT).map_err(|_| Error::PortInUse)?;
+        socket.bind(port).map_err(|_| Error::PortInUse)?;
         Ok(socket)
     }
 }
@@ -314,7 +316,11 @@ pub fn new<
     state: T,
 ) -> Result<(Handle<T>, Runner<T>), Error> {
     check(&config.constraints, LINKS, MESSAGE)?;
-    let udp = resources.udp.socket(stack)?;
+    let mode = config.security.0.mode();
+    if mode == Mode::Plain {
+        warning!("this unit is INSECURE: anybody on the network can read what it says, and can speak as its peers");
+    }
+    let udp = resources.udp.socket(stack, mode.port())?;
     let storage = NodeStorage {
         nodes: resources.nodes.write([const { [const { None }; KNOWN] }; LINKS]).as_flattened_mut(),
         order: resources.order.write(core::array::from_fn(|_| Default::default())).as_flattened_mut(),
@@ -322,7 +328,8 @@ pub fn new<
         findings: resources.findings.write([const { None }; FINDINGS]).as_mut_slice(),
     };
     let (tcp_port, access) = (config.tcp_port, config.access);
-    let node = Node::new(now(), node_config(config), storage);
+    let (node_config, proof) = parts(config);
+    let node = Node::new(now(), node_config, storage);
     let buffers = resources.buffers.each_mut().map(|buffer| Some(buffer.write([0; MESSAGE]).as_mut_slice()));
     let machine = Machine {
         node,
@@ -330,6 +337,7 @@ pub fn new<
             resources.to_all.write([false; FUNCTIONS]).as_mut_slice(),
             resources.to_one.write([const { [const { None }; FUNCTIONS] }; LINKS]).as_flattened_mut(),
         ),
+        proof,
         access,
         functions: FunctionList::new(
             resources.functions.write([const { Entry::empty() }; FUNCTIONS]).as_mut_slice(),
@@ -340,6 +348,7 @@ pub fn new<
         mail: EmbassyMailman {
             lines: resources.lines.write(resources.streams.each_mut().map(|memory| memory.line(stack))),
             udp,
+            port: mode.port(),
             stack,
         },
         reply: ReplyBox::new(resources.reply.write([0; REPLY])),
@@ -354,6 +363,7 @@ pub fn new<
         address: None,
         has_begun: false,
         stopped: false,
+        logged: Instant::START,
         counters: Counters::new(),
         room: Room { buffer: MESSAGE, parameters: ARGUMENTS },
         wakers: Wakers::new(),
@@ -368,17 +378,19 @@ pub fn new<
     Ok((Handle { shared }, runner))
 }
 
-fn node_config(config: Config) -> NodeConfig {
-    let Config { identity, target, fleet, constraints, seed, epoch, tcp_port, .. } = config;
+/// What its node is told, and what proves who it is.
+fn parts(config: Config) -> (NodeConfig, Proof) {
+    let Config { identity, target, fleet, constraints, security: Security(proof), seed, epoch, tcp_port, .. } = config;
     let listens = identity.role() == Role::MUnit;
-    NodeConfig {
+    let node = NodeConfig {
         identity,
         fleet,
         epoch: Epoch(epoch),
         target,
         tcp_port: if listens { tcp_port } else { 0 },
-        udp_port: PLAIN_PORT,
+        udp_port: proof.mode().port(),
         constraints,
         seed,
-    }
+    };
+    (node, proof)
 }

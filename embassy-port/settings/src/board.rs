@@ -1,7 +1,7 @@
 //! The boards that keep settings in flash, and where: the one table that linker scripts, firmware and tools agree on.
 //!
-//! Each board has two pages, which are erased separately and which no code lies in. A linker script calls them
-//! `SETTINGS`; a test compares it with this table.
+//! Each board has two pages of settings and two that count its lives, which are erased separately and which no code lies in.
+//! A linker script calls them `SETTINGS` and `BOOTS`; a test compares it with this table.
 
 /// A board with settings in flash.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -14,6 +14,8 @@ pub struct Board {
     pub chip: &'static str,
     /// Addresses of the two pages.
     pub pages: [u32; 2],
+    /// Addresses of the two pages that count the board's lives.
+    pub boots: [u32; 2],
     /// Bytes that are erased at once, at each of those addresses.
     pub erase_bytes: u32,
     /// Family numbers of UF2 files; none where the chip's boot loader takes no such files.
@@ -41,6 +43,7 @@ pub const NUCLEO_F767ZI: Board = Board {
     description: "ST NUCLEO-F767ZI, Ethernet on board",
     chip: "STM32F767ZITx",
     pages: [0x0818_0000, 0x081C_0000],
+    boots: [0x0810_0000, 0x0814_0000],
     erase_bytes: 256 * 1024,
     uf2: None,
     wireless: false,
@@ -51,6 +54,7 @@ pub const NUCLEO_H743ZI: Board = Board {
     description: "ST NUCLEO-H743ZI or -H743ZI2, Ethernet on board",
     chip: "STM32H743ZITx",
     pages: [0x081C_0000, 0x081E_0000],
+    boots: [0x0818_0000, 0x081A_0000],
     erase_bytes: 128 * 1024,
     uf2: None,
     wireless: false,
@@ -61,6 +65,7 @@ pub const RP2040_W5500: Board = Board {
     description: "RP2040 with a W5500 on SPI, as on a W5500-EVB-Pico",
     chip: "RP2040",
     pages: [0x101F_E000, 0x101F_F000],
+    boots: [0x101F_C000, 0x101F_D000],
     erase_bytes: 4096,
     uf2: Some(RP2040),
     wireless: false,
@@ -71,6 +76,7 @@ pub const RP2350_W5500: Board = Board {
     description: "RP2350 with a W5500 on SPI, as on a W5500-EVB-Pico2",
     chip: "RP235x",
     pages: [0x101F_E000, 0x101F_F000],
+    boots: [0x101F_C000, 0x101F_D000],
     erase_bytes: 4096,
     uf2: Some(RP2350),
     wireless: false,
@@ -81,6 +87,7 @@ pub const PICO2W: Board = Board {
     description: "Raspberry Pi Pico 2 W, Wi-Fi on board",
     chip: "RP235x",
     pages: [0x103F_E000, 0x103F_F000],
+    boots: [0x103F_C000, 0x103F_D000],
     erase_bytes: 4096,
     uf2: Some(RP2350),
     wireless: true,
@@ -105,9 +112,11 @@ mod tests {
 
     #[test]
     fn pages_are_erased_separately() {
-        for Board { name, pages: [first, second], erase_bytes, .. } in BOARDS {
-            assert!(second - first >= erase_bytes, "{name}");
-            assert!(first % erase_bytes == 0 && second % erase_bytes == 0, "{name}");
+        for Board { name, pages: [first, second], boots, erase_bytes, .. } in BOARDS {
+            for (one, other) in [(boots[0], boots[1]), (boots[1], first), (first, second)] {
+                assert!(other - one >= erase_bytes, "{name}");
+                assert!(one % erase_bytes == 0 && other % erase_bytes == 0, "{name}");
+            }
             assert!(erase_bytes as usize >= page::BYTES, "{name}");
         }
     }

@@ -240,11 +240,11 @@ pub fn newest<const PEERS: usize>(first: &[u8], second: &[u8]) -> Result<(Settin
 }
 
 /// The keys of the newest sound copy as they stand there, for the copy that comes after it; none if they are those of
-/// another unit than `settings` tell.
+/// another unit than `settings` tell, or if that is to be in plain mode.
 pub fn kept<'p>(settings: &Settings, first: &'p [u8], second: &'p [u8]) -> Option<&'p [u8]> {
     let found = newest_found(first, second).ok()?;
-    let is_same = found.settings.identity == settings.identity && found.settings.fleet == settings.fleet;
-    (is_same && !found.keys.0.is_empty()).then_some(found.keys.0)
+    let same = found.settings.identity == settings.identity && found.settings.fleet == settings.fleet;
+    (same && !settings.insecure && !found.keys.0.is_empty()).then_some(found.keys.0)
 }
 
 /// The keys in a text of settings, `keys=` and digits; none where it has no such word.
@@ -382,6 +382,9 @@ mod tests {
         let mut other = settings(1);
         other.fleet.0 += 1;
         assert_eq!(kept(&other, &first, &second), None);
+        let mut plain = settings(1);
+        plain.insecure = true;
+        assert_eq!(kept(&plain, &first, &second), None);
         assert_eq!(kept(&settings(1), &page(1, &[], 1), &[]), None);
         assert_eq!(kept(&settings(1), &[], &[]), None);
     }

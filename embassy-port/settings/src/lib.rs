@@ -5,11 +5,12 @@
 //! checksum, so that a cut of power while one is written leaves the other. Its text (`FromStr` and `Display`) is how a person,
 //! a command line or an emulator's arguments say it.
 //!
-//! With the feature `keys`, [`keys`] stand behind the settings in the same copy.
+//! With the feature `keys`, [`keys`] stand behind the settings in the same copy, and [`boots`] counts the lives of the board
+//! in two pages of its own.
 //!
 //! [`board`] is the table of boards and of where their pages are; [`uf2`] is the file form that some boot loaders take.
 //!
-//! It knows no flash controller and reads nothing by itself: a board lends the bytes of its pages.
+//! It knows no flash controller: a board lends the bytes of its pages, and for the count of its lives a driver.
 
 #![no_std]
 
@@ -17,6 +18,8 @@
 extern crate std;
 
 pub mod board;
+#[cfg(feature = "keys")]
+pub mod boots;
 #[cfg(feature = "keys")]
 pub mod keys;
 pub mod page;
@@ -48,6 +51,10 @@ pub struct Settings {
     pub network: Network,
     /// The access point, for a board on Wi-Fi. Text never holds it, because its password is secret.
     pub wifi: Option<Wifi>,
+    /// Somebody has asked for plain mode in words: the board needs no keys, and proves nothing to anybody. In flash the layout
+    /// tells it.
+    #[serde(skip)]
+    pub insecure: bool,
 }
 
 /// How a board gets its address.

@@ -3,7 +3,7 @@
 //! | offset | size | field |
 //! |---|---|---|
 //! | 0 | 4 | `CARs` |
-//! | 4 | 1 | version of this layout: 1, or 2 if keys stand behind the settings |
+//! | 4 | 1 | version of this layout: 1, 2 if keys stand behind the settings, or 3 for plain mode without keys |
 //! | 5 | 1 | zero |
 //! | 6 | 2 | n, bytes of settings and keys, little-endian |
 //! | 8 | 4 | generation, little-endian |
@@ -27,10 +27,11 @@ pub const KEYS_BYTES: usize = BYTES - HEADER - SETTINGS_BYTES - CHECKSUM;
 const MAGIC: [u8; 4] = *b"CARs";
 const SETTINGS_ONLY: u8 = 1;
 const WITH_KEYS: u8 = 2;
+const INSECURE: u8 = 3;
 const HEADER: usize = 12;
 const CHECKSUM: usize = 4;
 /// Without a table: a few hundred bytes are summed once per boot, and a table takes 1 KiB of flash.
-const SUM: Crc<u32, NoTable> = Crc::<u32, NoTable>::new(&CRC_32_ISO_HDLC);
+pub(crate) const SUM: Crc<u32, NoTable> = Crc::<u32, NoTable>::new(&CRC_32_ISO_HDLC);
 
 /// Why a page has no settings.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
@@ -40,7 +41,7 @@ pub enum PageError {
     Absent,
     /// Another version of the layout.
     #[error(
-        "the page holds settings of layout {0}, and this image knows 1 and 2: write them again, or update the image"
+        "the page holds settings of layout {0}, and this image knows 1 to 3: write them again, or update the image"
     )]
     Layout(u8),
     /// The checksum does not fit: a bit has changed, or power was cut while it was written.
@@ -66,9 +67,14 @@ pub fn encode(settings: &Settings, generation: u32, page: &mut [u8; BYTES]) -> O
 }
 
 /// Writes a copy with keys in the form in which they stand in flash, or with none where `keys` is empty; how many bytes of
-/// `page` it takes. `None` for more than [`KEYS_BYTES`] of them.
+/// `page` it takes. `None` for more than [`KEYS_BYTES`] of them, and for keys of a board in plain mode.
 pub fn encode_with(settings: &Settings, keys: &[u8], generation: u32, page: &mut [u8; BYTES]) -> Option<usize> {
-    let layout = if keys.is_empty() { SETTINGS_ONLY } else { WITH_KEYS };
+    let layout = match (settings.insecure, keys) {
+        (false, []) => SETTINGS_ONLY,
+        (false, _) => WITH_KEYS,
+        (true, []) => INSECURE,
+        (true, _) => return None,
+    };
     let length = {
         let body = page.get_mut(HEADER..BYTES - CHECKSUM)?;
         let settings = postcard::to_slice(settings, body.get_mut(..SETTINGS_BYTES)?).ok()?.len();
@@ -124,12 +130,13 @@ fn found(page: &[u8]) -> Result<Found<'_>, PageError> {
     if SUM.checksum(summed) != u32::from_le_bytes(*checksum) {
         return Err(PageError::Damaged);
     }
-    if !matches!(*layout, SETTINGS_ONLY | WITH_KEYS) {
+    if !matches!(*layout, SETTINGS_ONLY | WITH_KEYS | INSECURE) {
         return Err(PageError::Layout(*layout));
     }
-    let (settings, keys) = postcard::take_from_bytes::<Settings>(body).map_err(|_| PageError::Unsound)?;
+    let (mut settings, keys) = postcard::take_from_bytes::<Settings>(body).map_err(|_| PageError::Unsound)?;
+    settings.insecure = *layout == INSECURE;
     let generation = u32::from_le_bytes([*first, *second, *third, *fourth]);
-    if settings.is_sound() && keys.is_empty() == (*layout == SETTINGS_ONLY) {
+    if settings.is_sound() && keys.is_empty() == (*layout != WITH_KEYS) {
         Ok(Found { settings, generation, keys: KeyBytes(keys) })
     } else {
         Err(PageError::Unsound)
@@ -185,6 +192,7 @@ mod tests {
             fleet: Fleet(u32::MAX),
             network,
             wifi: None,
+            insecure: false,
         }
     }
 
@@ -210,6 +218,16 @@ mod tests {
         let found = found(&page).unwrap();
         assert_eq!(found.keys.0, [0xC7; 100]);
         assert!(!std::format!("{found:?}").contains("199"), "{found:?}");
+    }
+
+    #[test]
+    fn plain_mode_is_asked_for_in_words_and_has_no_keys() {
+        let mut written = settings("agv-07", 7);
+        written.insecure = true;
+        assert_eq!(decode(&page(&written, 5)), Ok((written.clone(), 5)));
+        assert!(encode_with(&written, &[0xC7; 100], 5, &mut [0; BYTES]).is_none());
+        written.insecure = false;
+        assert_eq!(decode(&page(&written, 5)), Ok((written, 5)));
     }
 
     #[test]
@@ -284,7 +302,7 @@ mod tests {
 
         /// A checksum that fits does not make settings sound.
         #[test]
-        fn nothing_summed_panics(body in prop::collection::vec(any::<u8>(), 0..200), layout in 0_u8..4) {
+        fn nothing_summed_panics(body in prop::collection::vec(any::<u8>(), 0..200), layout in 0_u8..5) {
             let mut page = [0; BYTES];
             page[..4].copy_from_slice(&MAGIC);
             page[4] = layout;

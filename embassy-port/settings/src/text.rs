@@ -9,7 +9,7 @@
 //! # Ok::<(), cara_settings::TextError>(())
 //! ```
 //!
-//! `address=dhcp` is the default, as are fleet 0 and no gateway; a unit without `manager` is an m_unit;
+//! `address=dhcp` is the default, as are fleet 0, no gateway, and links that are secured (`insecure=yes` makes them plain); a unit without `manager` is an m_unit;
 //! `manager_address=10.0.0.1:4000` replaces broadcasts. Names with spaces cannot be written so; an access point is no
 //! part of it, because its password is secret.
 
@@ -39,12 +39,14 @@ pub enum Field {
     Address,
     /// `gateway=10.0.0.1`
     Gateway,
+    /// `insecure=yes`: plain mode, without keys.
+    Insecure,
     /// `keys=` and digits: the keys, which are no part of the settings and are never shown.
     Keys,
 }
 
 impl Field {
-    const ALL: [Self; 8] = [
+    const ALL: [Self; 9] = [
         Self::Name,
         Self::Id,
         Self::Manager,
@@ -52,6 +54,7 @@ impl Field {
         Self::Fleet,
         Self::Address,
         Self::Gateway,
+        Self::Insecure,
         Self::Keys,
     ];
 
@@ -64,6 +67,7 @@ impl Field {
             Self::Fleet => "fleet",
             Self::Address => "address",
             Self::Gateway => "gateway",
+            Self::Insecure => "insecure",
             Self::Keys => "keys",
         }
     }
@@ -76,6 +80,7 @@ impl Field {
             Self::ManagerAddress => "ADDRESS:PORT",
             Self::Address => "dhcp, or ADDRESS/BITS as in 10.0.0.17/24",
             Self::Gateway => "an IPv4 address; with address=ADDRESS/BITS only",
+            Self::Insecure => "yes; leave it away for a board with keys",
             Self::Keys => "hexadecimal digits, as `cara provision` writes them",
         }
     }
@@ -92,7 +97,7 @@ impl fmt::Display for Field {
 pub enum TextError {
     /// A word that is no `field=value`, or of a field that does not exist.
     #[error(
-        "word {0} is no field=value: fields are name, id, manager, manager_address, fleet, address, gateway and keys"
+        "word {0} is no field=value: fields are name, id, manager, manager_address, fleet, address, gateway, insecure and keys"
     )]
     Word(usize),
     /// The same field twice.
@@ -118,7 +123,13 @@ impl FromStr for Settings {
         let identity = Identity::new(name, id, role).map_err(|_| TextError::Value(Field::Name))?;
         let fleet = words.of_field(Field::Fleet).map_or(Ok(0), |word| number(Field::Fleet, word))?;
         let manager_address = words.parsed(Field::ManagerAddress)?;
-        Ok(Self { identity, manager, manager_address, fleet: Fleet(fleet), network: network(&words)?, wifi: None })
+        let insecure = match words.of_field(Field::Insecure) {
+            None => false,
+            Some("yes") => true,
+            Some(_) => return Err(TextError::Value(Field::Insecure)),
+        };
+        let network = network(&words)?;
+        Ok(Self { identity, manager, manager_address, fleet: Fleet(fleet), network, wifi: None, insecure })
     }
 }
 
@@ -195,12 +206,13 @@ impl fmt::Display for Settings {
         }
         write!(f, " fleet={}", self.fleet.0)?;
         match self.network {
-            Network::Dhcp => f.write_str(" address=dhcp"),
-            Network::Static { address, prefix, gateway: None } => write!(f, " address={address}/{prefix}"),
+            Network::Dhcp => f.write_str(" address=dhcp")?,
+            Network::Static { address, prefix, gateway: None } => write!(f, " address={address}/{prefix}")?,
             Network::Static { address, prefix, gateway: Some(gateway) } => {
-                write!(f, " address={address}/{prefix} gateway={gateway}")
+                write!(f, " address={address}/{prefix} gateway={gateway}")?;
             }
         }
+        if self.insecure { f.write_str(" insecure=yes") } else { Ok(()) }
     }
 }
 
@@ -219,7 +231,7 @@ mod tests {
         let settings: Settings = "name=a id=1".parse().unwrap();
         assert_eq!(settings.identity, Identity::m_unit("a", 1).unwrap());
         assert_eq!((settings.fleet, settings.network), (Fleet(0), Network::Dhcp));
-        assert!(settings.is_sound());
+        assert!(settings.is_sound() && !settings.insecure);
     }
 
     #[test]
@@ -238,6 +250,7 @@ mod tests {
         for address in ["10.0.0.1", "10.0.0/24", "10.0.0.1/33", "DHCP"] {
             assert_eq!(error(&std::format!("name=a id=1 address={address}")), TextError::Value(Field::Address));
         }
+        assert_eq!(error("name=a id=1 insecure=no"), TextError::Value(Field::Insecure));
         assert_eq!(error("name=a id=1 gateway=10.0.0.1"), TextError::Value(Field::Gateway));
         assert_eq!(error("name=a id=1 manager_address=depot:1"), TextError::Value(Field::ManagerAddress));
         let text = error("name=a id=1 fleet=x").to_string();
@@ -254,7 +267,7 @@ mod tests {
         fn what_is_shown_is_read(
             id: u32, fleet: u32, manager in prop::option::of(("[a-z0-9./_-]{1,32}", any::<u32>())),
             name in "[a-zA-Z0-9_/-]{1,32}", network in prop::option::of((any::<u32>(), 0_u8..=32, any::<Option<u32>>())),
-            at in prop::option::of((any::<u32>(), any::<u16>())),
+            at in prop::option::of((any::<u32>(), any::<u16>())), insecure: bool,
         ) {
             let role = if manager.is_some() { Role::SUnit } else { Role::MUnit };
             let settings = Settings {
@@ -266,6 +279,7 @@ mod tests {
                     address: Ipv4Addr::from_bits(address), prefix, gateway: gateway.map(Ipv4Addr::from_bits),
                 }),
                 wifi: None,
+                insecure,
             };
             prop_assert_eq!(settings.to_string().parse(), Ok(settings));
         }

@@ -1,4 +1,4 @@
-//! The table of boards and the linker scripts of their firmware say the same about the pages of the settings.
+//! The table of boards and the linker scripts of their firmware say the same about the pages of the settings and of the count of its lives.
 
 use std::fs;
 use std::path::Path;
@@ -44,10 +44,11 @@ fn linker_scripts_keep_the_pages_free() {
     for (board, file) in MAPS {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/firmware").join(file);
         let map = fs::read_to_string(&path).unwrap_or_else(|error| panic!("{file}: {error}"));
-        let [first, second] = board.pages;
-        assert_eq!(region(&map, "SETTINGS"), (first, second + board.erase_bytes), "{file}");
+        for (name, [first, second]) in [("SETTINGS", board.pages), ("BOOTS", board.boots)] {
+            assert_eq!(region(&map, name), (first, second + board.erase_bytes), "{file}");
+        }
         let (_, end_of_code) = region(&map, "FLASH");
-        assert!(end_of_code <= first, "{file}");
-        assert!(map.contains("ASSERT(ORIGIN(FLASH) + LENGTH(FLASH) <= ORIGIN(SETTINGS)"), "{file}");
+        assert!(end_of_code <= board.boots[0], "{file}");
+        assert!(map.contains("ASSERT(ORIGIN(FLASH) + LENGTH(FLASH) <= ORIGIN(BOOTS)"), "{file}");
     }
 }

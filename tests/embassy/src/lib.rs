@@ -21,8 +21,10 @@ mod bench;
 mod clock;
 mod driver;
 mod gate;
+mod security;
 mod tasks;
 
 pub use bench::{Bench, Board};
 pub use cara_ethernet::{Fault, FaultCounts, Faults};
 pub use clock::now;
+pub use security::{keys, security};

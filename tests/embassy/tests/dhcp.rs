@@ -4,9 +4,10 @@ use std::cell::Cell;
 use std::net::Ipv4Addr;
 use std::rc::Rc;
 
+use cara_core::distribution::identity::Identity;
 use cara_core::time::Duration;
-use cara_embassy::{Config, Handle, Resources, UnitEvent, message_buffer};
-use cara_embassy_host::{Bench, Board};
+use cara_embassy::{Config, Handle, Resources, Security, UnitEvent, message_buffer};
+use cara_embassy_host::{Bench, Board, keys};
 use embassy_net::udp::{PacketMetadata, UdpSocket};
 use smoltcp::wire::{DhcpMessageType, DhcpPacket, DhcpRepr};
 
@@ -60,9 +61,11 @@ fn start(board: &Board, config: Config) -> Handle {
 fn a_unit_joins_with_the_address_that_it_is_given_and_again_with_another() {
     let bench = Bench::new(21);
     let depot = bench.board();
-    let manager = start(&depot, Config::m_unit("manager", 1, 1).unwrap().constraints(short()));
+    let manager = Identity::m_unit("manager", 1).unwrap();
+    let manager = start(&depot, Config::m_unit("manager", 1, proof(&manager)).unwrap().constraints(short()));
     let board = bench.board_on_dhcp();
-    let agv = start(&board, Config::s_unit("agv", 7, "manager", 1, 7).unwrap().constraints(short()));
+    let agv = Identity::s_unit("agv", 7).unwrap();
+    let agv = start(&board, Config::s_unit("agv", 7, "manager", 1, proof(&agv)).unwrap().constraints(short()));
     bench.run_for(Duration::from_secs(5));
     assert!(!agv.is_connected(), "nobody has given it an address");
     let given = Rc::new(Cell::new(Ipv4Addr::new(10, 77, 5, 5)));
@@ -87,6 +90,10 @@ fn a_unit_joins_with_the_address_that_it_is_given_and_again_with_another() {
     });
     bench.run_for(Duration::from_millis(10));
     assert!(told.get() >= 2, "it was gone, and there was another one");
+}
+
+fn proof(own: &Identity) -> Security {
+    keys(0, own, 0, own.id().into())
 }
 
 fn short() -> cara_core::config::Constraints {

@@ -8,9 +8,11 @@ use std::time::{Duration, Instant};
 
 use cara_apps::agv::{Agv, BATTERY, GO_TO, GO_TO_LEASE, POS_INFO, Progress, TICK};
 use cara_core::services::lease::Lease;
-use cara_embassy::{Config, Handle, Handler, Resources, ServiceOptions};
+use cara_embassy::{Config, Handle, Handler, Resources, Security, ServiceOptions};
 use cara_processes::network;
-use cara_std::{CommunicationSystem, Error, Interfaces, Parameters};
+use cara_secure::random::Random;
+use cara_std::keys::{FleetKeys, KeyRing};
+use cara_std::{CommunicationSystem, Error, Fleet, Identity, Interfaces, Parameters};
 use embassy_net::{Ipv4Address, Ipv4Cidr, StackResources, StaticConfigV4};
 use embassy_net_driver::{Capabilities, Driver, HardwareAddress, LinkState, RxToken, TxToken};
 use smoltcp::phy::{Device, Medium, RxToken as _, TunTapInterface, TxToken as _};
@@ -111,9 +113,15 @@ fn meet() {
     network::run("ip addr add 10.77.0.1/24 broadcast + dev tap0").unwrap();
     network::run("ip link set tap0 up").unwrap();
     let fleet = cara_processes::random_fleet();
-    std::thread::spawn(move || board(fleet));
+    let (own, vehicle) = (Identity::m_unit("manager", 1).unwrap(), Identity::s_unit("agv", 7).unwrap());
+    let mut keys = FleetKeys::draw(Fleet(fleet)).unwrap();
+    keys.add(&own, &[]).unwrap();
+    keys.add(&vehicle, &[own.clone()]).unwrap();
+    let vehicle = keys.ring(&vehicle).unwrap();
+    std::thread::spawn(move || board(fleet, vehicle));
     let builder = CommunicationSystem::builder("manager", 1).unwrap();
-    let manager = builder.fleet(fleet).interfaces(Interfaces::All).insecure().build_system().unwrap();
+    let manager =
+        builder.keys(keys.ring(&own).unwrap()).fleet(fleet).interfaces(Interfaces::All).build_system().unwrap();
     let mut minutes = Parameters::new();
     minutes.add_int("minutes", 1).unwrap();
     let list = manager.my_function_list();
@@ -176,7 +184,7 @@ fn talk(manager: &CommunicationSystem, to: [i64; 2]) {
 }
 
 /// The vehicle's controller.
-fn board(fleet: u32) {
+fn board(fleet: u32, keys: KeyRing) {
     let tap = TunTapInterface::new("tap0", Medium::Ethernet).expect("the device is there");
     let address = Ipv4Cidr::new(Ipv4Address::new(10, 77, 0, 2), 24);
     let config = StaticConfigV4 { address, gateway: None, dns_servers: Default::default() };
@@ -184,7 +192,10 @@ fn board(fleet: u32) {
     let config = embassy_net::Config::ipv4_static(config);
     let (stack, mut network) = embassy_net::new(Tap(tap), config, resources, u64::from(fleet));
     let memory: &'static mut Resources<Agv> = Box::leak(Box::new(Resources::new()));
-    let config = Config::s_unit("agv", 7, "manager", 1, u64::from(fleet)).unwrap().fleet(fleet);
+    let mut random = Random::constant();
+    random.stir(&fleet.to_le_bytes());
+    let security = Security::keys(Box::leak(Box::new(keys)), random);
+    let config = Config::s_unit("agv", 7, "manager", 1, security).unwrap().fleet(fleet);
     let (unit, mut runner) = cara_embassy::new(stack, memory, config, Agv::new([0, 0])).unwrap();
     services(unit);
     let (network, runner) = (pin!(async { network.run().await }), pin!(async { runner.run().await }));

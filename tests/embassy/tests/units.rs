@@ -7,8 +7,9 @@ use std::pin::Pin;
 use std::rc::Rc;
 use std::task::{Context, Poll};
 
-use cara_core::config::{Constraints, PLAIN_PORT};
+use cara_core::config::{Constraints, SECURED_PORT};
 use cara_core::distribution::connection_handler::NodeCounter;
+use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::Parameters;
 use cara_core::error::{CloseReason, Error, ServiceError};
 use cara_core::host::connections::LinkCounter;
@@ -16,8 +17,8 @@ use cara_core::services::access::{Functions, Rule, Verbs, Who};
 use cara_core::services::lease::Lease;
 use cara_core::services::unit::RequestOptions;
 use cara_core::time::Duration;
-use cara_embassy::{Config, Handle, Handler, Hook, Resources, ServiceOptions, UnitEvent, message_buffer};
-use cara_embassy_host::{Bench, Board};
+use cara_embassy::{Config, Handle, Handler, Hook, Resources, Security, ServiceOptions, UnitEvent, message_buffer};
+use cara_embassy_host::{Bench, Board, keys};
 use embassy_net::tcp::TcpSocket;
 use embassy_time::{Timer, with_timeout};
 
@@ -43,15 +44,31 @@ fn start(board: &Board, config: Config) -> Unit {
     unit
 }
 
+fn proof(bench: &Bench, own: &Identity) -> Security {
+    keys(0, own, 0, bench.random(u64::MAX))
+}
+
+fn manager_identity() -> Identity {
+    Identity::m_unit("manager", 1).unwrap()
+}
+
+fn agv_identity() -> Identity {
+    Identity::s_unit("agv", 7).unwrap()
+}
+
+fn agv_config(bench: &Bench) -> Config {
+    Config::s_unit("agv", 7, "manager", 1, proof(bench, &agv_identity())).unwrap()
+}
+
 fn manager(bench: &Bench) -> (Board, Unit) {
     let board = bench.board();
-    let unit = start(&board, Config::m_unit("manager", 1, bench.random(u64::MAX)).unwrap());
+    let unit = start(&board, Config::m_unit("manager", 1, proof(bench, &manager_identity())).unwrap());
     (board, unit)
 }
 
 fn agv(bench: &Bench) -> (Board, Unit) {
     let board = bench.board();
-    let unit = start(&board, Config::s_unit("agv", 7, "manager", 1, bench.random(u64::MAX)).unwrap());
+    let unit = start(&board, agv_config(bench));
     unit.on_manager_lost(&|state| state.losses += 1);
     (board, unit)
 }
@@ -121,7 +138,7 @@ fn a_board_has_a_table_from_the_start_and_gets_another_while_it_runs() {
     let bench = Bench::new(8);
     let (manager_board, manager) = manager(&bench);
     let board = bench.board();
-    let config = Config::s_unit("agv", 7, "manager", 1, bench.random(u64::MAX)).unwrap().access(&DOUBLERS);
+    let config = agv_config(&bench).access(&DOUBLERS);
     let agv = start(&board, config);
     doubling(agv);
     agv.add_service("secret(n: int) -> (n: int)", ServiceOptions::new(), Handler::method(&|_, _, _| Ok(()))).unwrap();
@@ -302,7 +319,7 @@ fn events_tell_who_came_and_why_it_left() {
 #[test]
 fn memory_that_cannot_hold_the_constraints_is_refused() {
     let bench = Bench::new(8);
-    let config = Config::m_unit("manager", 1, 1).unwrap();
+    let config = Config::m_unit("manager", 1, Security::insecure(1)).unwrap();
     let constraints = Constraints { maximum_nodes: 4, ..Constraints::M_UNIT };
     let memory = Box::leak(Box::new(Manager::new()));
     let refused = cara_embassy::new(bench.board().stack(), memory, config.constraints(constraints), State::default());
@@ -326,7 +343,7 @@ fn silent_connections_give_way_to_nodes() {
         stranger.spawn(async move {
             let (receive, send) = (Box::leak(Box::new([0; 64])), Box::leak(Box::new([0; 64])));
             let mut socket = TcpSocket::new(stack, receive, send);
-            let _ = socket.connect((Ipv4Addr::new(10, 77, 0, 1), PLAIN_PORT)).await;
+            let _ = socket.connect((Ipv4Addr::new(10, 77, 0, 1), SECURED_PORT)).await;
             std::future::pending::<()>().await;
         });
     }
@@ -356,7 +373,7 @@ fn an_idle_unit_lets_its_controller_sleep() {
     let bench = Bench::new(10);
     let (_, manager) = manager(&bench);
     let board = bench.board();
-    let config = Config::s_unit("agv", 7, "manager", 1, 7).unwrap();
+    let config = agv_config(&bench);
     let memory = Box::leak(Box::new(Manager::new()));
     let (agv, mut runner) = cara_embassy::new(board.stack(), memory, config, State::default()).unwrap();
     let polls = Rc::new(Cell::new(0));
@@ -400,4 +417,41 @@ fn a_starved_vehicle_stops_by_its_lease_and_is_made_safe_first() {
     assert_eq!(agv.with_state(|state| state.done.len()), Ok(0), "nothing runs yet");
     assert!(bench.run_until(|| agv.with_state(|state| state.done.len()) == Ok(2), SHORT));
     assert_eq!(agv.with_state(|state| state.done.clone()), Ok(vec!["made safe", "served"]));
+}
+
+/// Units that were told so in words, and those with keys of another fleet: each meets its like and nobody else.
+#[test]
+fn an_insecure_unit_meets_insecure_units_only() {
+    let bench = Bench::new(12);
+    let (_, manager) = manager(&bench);
+    let board = bench.board();
+    let agv = start(&board, Config::s_unit("agv", 7, "manager", 1, Security::insecure(7)).unwrap());
+    bench.run_for(LONG);
+    assert!(!agv.is_connected() && !manager.is_connected());
+    let depot = bench.board();
+    let other = start(&depot, Config::m_unit("manager", 1, Security::insecure(1)).unwrap());
+    assert!(bench.run_until(|| agv.is_connected() && other.is_connected(), LONG));
+    assert!(!manager.is_connected());
+}
+
+#[test]
+fn a_unit_with_keys_of_another_root_is_not_heard() {
+    let bench = Bench::new(13);
+    let (_, manager) = manager(&bench);
+    let board = bench.board();
+    let stranger = keys(1, &agv_identity(), 0, 7);
+    let agv = start(&board, Config::s_unit("agv", 7, "manager", 1, stranger).unwrap());
+    bench.run_for(LONG);
+    assert!(!agv.is_connected() && !manager.is_connected());
+    // Also where it need not search: the link ends before the node has heard of it.
+    let address = (Ipv4Addr::new(10, 77, 0, 1), SECURED_PORT).into();
+    let stranger = keys(1, &agv_identity(), 0, 8);
+    let board = bench.board();
+    let config = Config::s_unit("agv", 7, "manager", 1, stranger).unwrap().manager_address(address);
+    let agv = start(&board, config);
+    bench.run_for(LONG);
+    assert!(!agv.is_connected() && !manager.is_connected());
+    assert!(manager.counted(LinkCounter::ProofsFailed) > 0, "it dials, and proves nothing");
+    let (_, agv) = self::agv(&bench);
+    assert!(bench.run_until(|| agv.is_connected() && manager.is_connected(), LONG));
 }

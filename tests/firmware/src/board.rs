@@ -5,6 +5,7 @@ use std::io::Read;
 use std::net::Ipv4Addr;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
+use std::rc::Rc;
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -13,6 +14,7 @@ use cara_processes::network;
 use defmt_decoder::{DecodeError, Table};
 use rustix::process::{Pid, Signal, kill_process};
 
+use crate::keys::{Keys, MANAGER as DEPOT};
 use crate::trace::Trace;
 
 /// Long enough for the slowest machine.
@@ -27,9 +29,14 @@ pub(crate) struct Bench {
     image: PathBuf,
     table: Arc<Table>,
     shows_logs: bool,
+    /// Another image, which draws the same random numbers in each life.
+    constant: Option<PathBuf>,
     /// The board's clock counts instructions.
     counts: bool,
-    cables: Cell<u8>,
+    /// How many there are, also of other desks on this bridge.
+    cables: Rc<Cell<u8>>,
+    /// Of the boards, and of their manager.
+    pub(crate) keys: Rc<Keys>,
 }
 
 /// Where a board's clock counts instructions, each takes 2 to this power of nanoseconds: 1.6 cycles of its 12.5 MHz.
@@ -37,19 +44,37 @@ pub(crate) const INSTRUCTION: u32 = 7;
 
 impl Bench {
     /// Makes the network.
-    pub(crate) fn new(image: &Path, shows_logs: bool) -> Result<Self> {
-        let elf = std::fs::read(image).with_context(|| format!("cannot read {}", image.display()))?;
-        let table = Table::parse(&elf)?.with_context(|| format!("{} has no defmt table", image.display()))?;
+    pub(crate) fn new(image: &Path, shows_logs: bool, keys: Rc<Keys>) -> Result<Self> {
         network::run("ip link set lo up")?;
         network::run("ip link add bridge0 type bridge")?;
         network::run(&format!("ip address add {MANAGER} brd + dev bridge0"))?;
         network::run("ip link set bridge0 up")?;
-        Ok(Self { image: image.to_owned(), table: Arc::new(table), shows_logs, counts: false, cables: Cell::new(0) })
+        let (table, image, cables) = (table_of(image)?, image.to_owned(), Rc::default());
+        Ok(Self { image, table, shows_logs, constant: None, counts: false, cables, keys })
     }
 
     /// Times on its boards are counted in instructions, and do not depend on how busy this machine is.
     pub(crate) fn counting(self) -> Self {
         Self { counts: true, ..self }
+    }
+
+    /// The same desk for boards that are told other things.
+    pub(crate) fn with(&self, keys: Rc<Keys>) -> Self {
+        let (image, table, cables) = (self.image.clone(), Arc::clone(&self.table), Rc::clone(&self.cables));
+        let Self { shows_logs, counts, .. } = *self;
+        Self { image, table, shows_logs, constant: self.constant.clone(), counts, cables, keys }
+    }
+
+    /// Has an image beside whose random numbers are constant.
+    pub(crate) fn with_constant(self, constant: Option<PathBuf>) -> Self {
+        Self { constant, ..self }
+    }
+
+    /// The same desk for that image, if there is one.
+    pub(crate) fn constant(&self) -> Result<Option<Self>> {
+        let Some(image) = self.constant.clone() else { return Ok(None) };
+        let table = table_of(&image)?;
+        Ok(Some(Self { image, table, ..self.with(Rc::clone(&self.keys)) }))
     }
 
     /// A cable with nothing at its end yet.
@@ -66,23 +91,22 @@ impl Bench {
 
     /// Puts power on a board.
     pub(crate) fn board(&self, cable: &Cable, who: &Who) -> Result<Board> {
-        self.start(self.emulator(cable, who).stderr(Stdio::null()), who)
+        self.start(self.emulator(cable, who)?.stderr(Stdio::null()), who)
     }
 
     /// The same with everything that it executes, instruction by instruction.
     pub(crate) fn traced_board(&self, cable: &Cable, who: &Who) -> Result<(Board, Trace)> {
-        let mut emulator = self.emulator(cable, who);
+        let mut emulator = self.emulator(cable, who)?;
         let mut board = self.start(emulator.args(Trace::ARGUMENTS).stderr(Stdio::piped()), who)?;
         let output = board.child.stderr.take().context("the emulator has no standard error")?;
         Ok((board, Trace::read(output)))
     }
 
-    fn emulator(&self, cable: &Cable, who: &Who) -> Command {
-        let Who { name, id, manager, fleet, seed, more } = who;
+    fn emulator(&self, cable: &Cable, who: &Who) -> Result<Command> {
         let number = cable.number;
-        let address = address(cable);
-        let seed = seed.map_or_else(String::new, |seed| format!(" seed={seed}"));
-        let told = format!("name={name} id={id} manager={manager} fleet={fleet} address={address}/24{seed} {more}");
+        let (told, boots) = self.keys.told(who, &format!("{}/24", address(cable)))?;
+        let seed = who.seed.map_or_else(String::new, |seed| format!(" seed={seed}"));
+        let told = format!("file={} boots={}{seed}", told.display(), boots.display());
         let mut command = Command::new("qemu-system-arm");
         command
             .args(["-M", "lm3s6965evb", "-display", "none", "-monitor", "none", "-serial", "none"])
@@ -96,7 +120,7 @@ impl Bench {
                 "tap,ifname={},script=no,downscript=no,model=stellaris,mac=52:54:00:00:00:{number:02x}",
                 cable.name
             ));
-        command
+        Ok(command)
     }
 
     fn start(&self, emulator: &mut Command, who: &Who) -> Result<Board> {
@@ -110,6 +134,12 @@ impl Bench {
         }
         Ok(Board { child, log, name: who.name.clone() })
     }
+}
+
+/// How the lines of an image's log are read.
+fn table_of(image: &Path) -> Result<Arc<Table>> {
+    let elf = std::fs::read(image).with_context(|| format!("cannot read {}", image.display()))?;
+    Ok(Arc::new(Table::parse(&elf)?.with_context(|| format!("{} has no defmt table", image.display()))?))
 }
 
 /// The address of the board at the end of a cable.
@@ -167,13 +197,14 @@ pub(crate) struct Who {
     pub(crate) fleet: u32,
     /// The same numbers in each life.
     pub(crate) seed: Option<u64>,
-    /// Further words that only the emulated board understands.
-    pub(crate) more: &'static str,
+    /// Where its manager is, if it is not to search.
+    pub(crate) manager_address: Option<&'static str>,
 }
 
 impl Who {
     pub(crate) fn agv(id: u32) -> Self {
-        Self { name: format!("agv-{id}"), id, manager: "depot/1".into(), fleet: FLEET, seed: None, more: "" }
+        let (name, manager) = (format!("agv-{id}"), DEPOT.into());
+        Self { name, id, manager, fleet: FLEET, seed: None, manager_address: None }
     }
 }
 

@@ -4,6 +4,7 @@ mod calls;
 mod limits;
 mod losses;
 mod restarts;
+mod security;
 
 use anyhow::Result;
 
@@ -16,7 +17,7 @@ pub(crate) struct Check {
 }
 
 /// All of them.
-pub(crate) const CHECKS: [Check; 14] = [
+pub(crate) const CHECKS: [Check; 18] = [
     Check { name: "it is found by broadcast and shows its functions", run: calls::found },
     Check { name: "it drives where it is sent, and arrives", run: calls::driven },
     Check { name: "it stops when nobody renews its lease", run: calls::not_renewed },
@@ -30,5 +31,9 @@ pub(crate) const CHECKS: [Check; 14] = [
     Check { name: "an idle cable is pulled and plugged in again", run: losses::idle_cable },
     Check { name: "a pulled cable stops it, and it returns", run: losses::cable },
     Check { name: "a killed manager stops it, and a new one finds it", run: losses::manager },
+    Check { name: "without keys it joins nobody", run: security::no_keys },
+    Check { name: "with keys of others it joins nobody", run: security::other_keys },
+    Check { name: "a board that is told to be insecure is", run: security::insecure },
+    Check { name: "no two lives have one key", run: security::lives },
     Check { name: "it comes back from every loss of power", run: restarts::run },
 ];

@@ -48,7 +48,7 @@ pub(crate) fn run(bench: &Bench, image: &Path, of: Image, profile: bool) -> Resu
     let places = Places::of(image)?;
     match of {
         Image::Served => {
-            let manager = Manager::start()?;
+            let manager = Manager::start(&bench.keys)?;
             let peer = meet(&manager, &who)?;
             let (mut ints, mut text) = parameters()?;
             let asked = exchanges(&trace, || Ok(peer.block_request("pos_info", &mut ints)?))?;

@@ -1,18 +1,17 @@
 //! A board on the desk: the firmware, its manager and a prompt for `cara` beside it, in a network of their own.
 
-use std::fs::Permissions;
 use std::io::{BufRead, IsTerminal, Write};
-use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
+use std::rc::Rc;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail, ensure};
 use cara_processes::Process;
 use clap::Args;
-use tempfile::TempDir;
 
 use crate::board::{Bench, LONG, Who};
+use crate::keys::Keys;
 
 /// What is on the desk.
 #[derive(Args, Clone, Debug)]
@@ -39,11 +38,12 @@ const PROMPT: &str = "cara> ";
 
 /// Starts everything, then runs what is typed until the input ends.
 pub(crate) fn run(image: &Path, desk: &Desk) -> Result<()> {
-    let bench = Bench::new(image, true)?;
+    let Desk { name, id, manager, fleet, cara } = desk.clone();
+    let keys = Keys::draw(cara.as_deref(), fleet, &manager, &[&format!("{name}/{id}")])?;
+    let bench = Bench::new(image, true, Rc::clone(&keys))?;
     let cable = bench.cable()?;
-    let cara = Cara::new(desk)?;
-    let _manager = cara.manager(&desk.manager, desk.fleet)?;
-    let Desk { name, id, manager, fleet, .. } = desk.clone();
+    let cara = Cara(keys);
+    let _manager = cara.manager(&manager, fleet)?;
     let board = bench.board(&cable, &Who { name, id, manager, fleet, ..Who::agv(id) })?;
     board.logs("has joined")?;
     cara.wait_for(&desk.name)?;
@@ -68,35 +68,19 @@ fn prompt() -> Result<()> {
     Ok(std::io::stdout().flush()?)
 }
 
-/// The command, with a folder of control sockets for this desk only.
-struct Cara {
-    program: PathBuf,
-    sockets: TempDir,
-}
+/// The command, with keys and control sockets of this desk only.
+struct Cara(Rc<Keys>);
 
 impl Cara {
-    fn new(desk: &Desk) -> Result<Self> {
-        let beside = || Ok::<_, anyhow::Error>(std::env::current_exe()?.with_file_name("cara"));
-        let program = desk.cara.clone().map_or_else(beside, Ok)?;
-        ensure!(program.is_file(), "{} is not there: cargo build --package cara-cli", program.display());
-        // Control sockets are not made where others could enter.
-        let owner_only = Permissions::from_mode(0o700);
-        let sockets = tempfile::Builder::new().permissions(owner_only).tempdir();
-        let sockets = sockets.context("cannot make a folder for sockets")?;
-        Ok(Self { program, sockets })
-    }
-
     fn command(&self) -> Command {
-        let mut command = Command::new(&self.program);
-        command.env("CARA_CONTROL_DIR", self.sockets.path()).stdin(Stdio::null());
-        command
+        self.0.command()
     }
 
     fn manager(&self, who: &str, fleet: u32) -> Result<Manager> {
         let (name, id) = who.split_once('/').with_context(|| format!("a manager is NAME/ID, not `{who}`"))?;
         let fleet = fleet.to_string();
         let mut command = self.command();
-        command.args(["node", "--name", name, "--id", id, "--fleet", &fleet, "--insecure"]);
+        command.args(["node", "--name", name, "--id", id, "--fleet", &fleet]);
         Ok(Manager(command.spawn().context("cannot start cara")?))
     }
 

@@ -37,8 +37,8 @@ pub(crate) fn run(bench: &Bench, image: Image) -> Result<()> {
     let board = bench.board(&cable, &Who::agv(17))?;
     for round in 0..ROUNDS {
         match image {
-            Image::Agv => vehicle(&board, &cable, round)?,
-            Image::Unit => least(&board, &cable)?,
+            Image::Agv => vehicle(bench, &board, &cable, round)?,
+            Image::Unit => least(bench, &board, &cable)?,
             Image::Echo => echo(&cable)?,
         }
     }
@@ -48,10 +48,10 @@ pub(crate) fn run(bench: &Bench, image: Image) -> Result<()> {
 }
 
 /// Joining, lists in both directions, calls in both directions, refusals, a lost manager and a pulled cable.
-fn vehicle(board: &Board, cable: &Cable, round: u32) -> Result<()> {
+fn vehicle(bench: &Bench, board: &Board, cable: &Cable, round: u32) -> Result<()> {
     let who = Who::agv(17);
     let line = board.line();
-    let manager = Manager::start()?;
+    let manager = Manager::start(&bench.keys)?;
     let functions = manager.system.my_function_list();
     for number in 0..40 {
         let name = format!("a_function_with_a_long_name_{number}");
@@ -73,7 +73,7 @@ fn vehicle(board: &Board, cable: &Cable, round: u32) -> Result<()> {
     drop(manager);
     board.logs_behind(line, "depot has left")?;
     // A list that is full with other functions has no room for the mechanic.
-    let manager = Manager::start()?;
+    let manager = Manager::start(&bench.keys)?;
     manager.offer_mechanic()?;
     manager.meet(&who)?;
     board.logs_behind(line, "a mechanic comes in 5 minutes")?;
@@ -84,11 +84,11 @@ fn vehicle(board: &Board, cable: &Cable, round: u32) -> Result<()> {
 }
 
 /// Joining, a list, calls, refusals, a lost manager and a pulled cable.
-fn least(board: &Board, cable: &Cable) -> Result<()> {
+fn least(bench: &Bench, board: &Board, cable: &Cable) -> Result<()> {
     let who = Who::agv(17);
     let mut line = board.line();
     for loss in [Loss::OfManager, Loss::OfCable] {
-        let manager = Manager::start()?;
+        let manager = Manager::start(&bench.keys)?;
         manager.offer_mechanic()?;
         let unit = manager.meet_offering(&who, "add")?;
         for number in 0..10 {

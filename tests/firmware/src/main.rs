@@ -9,6 +9,7 @@ mod checks;
 mod count;
 mod desk;
 mod faults;
+mod keys;
 mod load;
 mod manager;
 mod places;
@@ -23,6 +24,7 @@ use cara_processes::network::{self, Own};
 use clap::{Parser, Subcommand};
 
 use board::Bench;
+use keys::Keys;
 
 /// Runs an image of the board lm3s6965evb in QEMU and checks what it does.
 #[derive(Parser)]
@@ -30,6 +32,9 @@ struct Arguments {
     /// The AGV's image.
     #[arg(long)]
     image: PathBuf,
+    /// The same with random numbers that are the same in each life.
+    #[arg(long)]
+    constant: Option<PathBuf>,
     /// How often the board loses power and comes back.
     #[arg(long, default_value_t = 24)]
     restarts: u32,
@@ -42,6 +47,9 @@ struct Arguments {
     /// The `cara` command; the one beside this program if not given.
     #[arg(long)]
     cara: Option<PathBuf>,
+    /// Boards and managers are told to be insecure, in place of being given keys; for images without a cipher.
+    #[arg(long)]
+    insecure: bool,
     #[command(subcommand)]
     part: Option<Part>,
 }
@@ -50,7 +58,11 @@ struct Arguments {
 #[derive(Subcommand)]
 enum Part {
     /// A manager that can be killed.
-    Manager,
+    Manager {
+        /// Its keys; without them it is insecure.
+        #[arg(long)]
+        key_file: Option<PathBuf>,
+    },
     /// Puts a board under load and prints how deep its stack was.
     Stack {
         /// What the image is.
@@ -72,8 +84,8 @@ enum Part {
 
 fn main() -> ExitCode {
     let arguments = Arguments::parse();
-    let outcome = match arguments.part {
-        Some(Part::Manager) => manager::stand_alone().map(|()| ExitCode::SUCCESS),
+    let outcome = match &arguments.part {
+        Some(Part::Manager { key_file }) => manager::stand_alone(key_file.as_deref()).map(|()| ExitCode::SUCCESS),
         _ => in_own_network(&arguments),
     };
     outcome.unwrap_or_else(|error| {
@@ -103,13 +115,18 @@ fn in_own_network(arguments: &Arguments) -> Result<ExitCode> {
 fn inside(arguments: &Arguments) -> Result<()> {
     match &arguments.part {
         Some(Part::Desk(desk)) => desk::run(&arguments.image, desk),
-        Some(Part::Instructions { of, profile }) => {
-            count::run(&Bench::new(&arguments.image, arguments.logs)?, &arguments.image, *of, *profile)
-        }
-        Some(Part::Faults(faults)) => faults::run(Bench::new(&arguments.image, arguments.logs)?.counting(), faults),
-        Some(Part::Stack { of }) => load::run(&Bench::new(&arguments.image, arguments.logs)?, *of),
+        Some(Part::Instructions { of, profile }) => count::run(&bench(arguments)?, &arguments.image, *of, *profile),
+        Some(Part::Faults(faults)) => faults::run(bench(arguments)?.counting(), faults),
+        Some(Part::Stack { of }) => load::run(&bench(arguments)?, *of),
         _ => run(arguments),
     }
+}
+
+/// A desk for boards, which get keys that are drawn now.
+fn bench(arguments: &Arguments) -> Result<Bench> {
+    let cara = arguments.cara.as_deref();
+    let keys = if arguments.insecure { Keys::insecure(cara)? } else { Keys::of_boards(cara)? };
+    Bench::new(&arguments.image, arguments.logs, keys)
 }
 
 /// What is tested from outside, because it makes a network of its own.
@@ -127,7 +144,7 @@ fn after(arguments: &Arguments) -> Result<()> {
 const DESK: &str = "a board on the desk answers what is typed";
 
 fn run(arguments: &Arguments) -> Result<()> {
-    let bench = Bench::new(&arguments.image, arguments.logs)?;
+    let bench = bench(arguments)?.with_constant(arguments.constant.clone());
     let mut passed = 0;
     for check in checks::CHECKS.iter().filter(|check| check.name.contains(&arguments.only)) {
         let start = Instant::now();

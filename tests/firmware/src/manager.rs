@@ -1,5 +1,7 @@
 //! The manager: the Linux port, within this process and, where it is to be killed, in one of its own.
 
+use std::ffi::OsString;
+use std::path::Path;
 use std::sync::Mutex;
 use std::sync::mpsc::Receiver;
 use std::time::{Duration, Instant};
@@ -7,9 +9,10 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, bail, ensure};
 use cara_apps::mechanic;
 use cara_std::control::Control;
-use cara_std::{CloseReason, CommunicationSystem, Parameters, Peer, UnitEvent};
+use cara_std::{Builder, CloseReason, CommunicationSystem, Parameters, Peer, UnitEvent};
 
 use crate::board::{FLEET, LONG, Who};
+use crate::keys::Keys;
 
 /// A manager with its events.
 pub(crate) struct Manager {
@@ -18,8 +21,17 @@ pub(crate) struct Manager {
 }
 
 impl Manager {
-    pub(crate) fn start() -> Result<Self> {
-        let builder = CommunicationSystem::builder("depot", 1)?.fleet(FLEET).control(Control::Off).insecure();
+    pub(crate) fn start(keys: &Keys) -> Result<Self> {
+        keys.give(Self::builder()?).and_then(Self::of)
+    }
+
+    /// As it is, but for its keys.
+    pub(crate) fn builder() -> Result<Builder<()>> {
+        Ok(CommunicationSystem::builder("depot", 1)?.fleet(FLEET).control(Control::Off))
+    }
+
+    /// Starts a manager that was given keys.
+    pub(crate) fn of(builder: Builder<()>) -> Result<Self> {
         let system = builder.build_system()?;
         let events = Mutex::new(system.events());
         system.start()?;
@@ -124,10 +136,23 @@ pub(crate) fn fault(kind: i64) -> Result<Parameters> {
     Ok(parameters)
 }
 
+/// The arguments with which this program is a manager for itself.
+pub(crate) fn command(keys: &Keys) -> Vec<OsString> {
+    let words = ["--image", "none", "manager"].map(OsString::from);
+    words
+        .into_iter()
+        .chain(keys.manager_file().into_iter().flat_map(|file| ["--key-file".into(), file.into()]))
+        .collect()
+}
+
 /// A manager for itself, until it is killed or its standard input ends: it sends the vehicle of its fleet on a long way,
 /// and announces its end when it is told to.
-pub(crate) fn stand_alone() -> Result<()> {
-    let manager = Manager::start()?;
+pub(crate) fn stand_alone(key_file: Option<&Path>) -> Result<()> {
+    let builder = Manager::builder()?;
+    let manager = Manager::of(match key_file {
+        Some(file) => builder.key_file(file),
+        None => builder.insecure(),
+    })?;
     let agv = manager.meet(&Who::agv(17))?;
     agv.block_request("go_to", &mut at([1_000, 0])?)?;
     println!("driving");

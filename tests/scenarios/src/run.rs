@@ -54,7 +54,7 @@ pub fn once(scenario: &Scenario, port: Port, seed: u64, weather: Weather) -> Res
             Port::Simulator => ports::simulator(seed, weather, Mode::Plain),
             Port::Secured => ports::simulator(seed, weather, Mode::Secured),
             Port::Linux => ports::linux(scenario.needs),
-            Port::Embassy => ports::embassy(seed, weather),
+            Port::Embassy => ports::embassy(seed, weather, scenario.needs),
         };
         (scenario.run)(&mut *world);
         world.report()

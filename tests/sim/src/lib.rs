@@ -97,6 +97,6 @@ pub use path::{Chance, Path};
 pub use plan::{Action, Crash, FaultPlan};
 pub use storage::Boxed;
 pub use world::{
-    BoxedParameters, Call, NewUnit, Outcome, Peer, Service, UnitEvent, UnitHandle, World, boxed_parameters,
+    BoxedParameters, Call, NewUnit, Outcome, Peer, Ring, Service, UnitEvent, UnitHandle, World, boxed_parameters,
     for_each_seed, seeds,
 };

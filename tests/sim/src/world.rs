@@ -38,6 +38,7 @@ mod tasks;
 pub use builder::NewUnit;
 pub use events::UnitEvent;
 pub use handle::{Peer, UnitHandle};
+pub use keys::Ring;
 pub use service::{BoxedParameters, Call, Outcome, Service, boxed_parameters};
 
 use audited::Seals;

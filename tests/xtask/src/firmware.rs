@@ -74,8 +74,9 @@ fn emulated(test: impl FnOnce() -> Result<Option<i32>>) -> Outcome {
 
 fn tested() -> Result<Option<i32>> {
     let image = tested_image()?;
+    let constant = boards::find(TESTED)?.build(&boards::CONSTANT)?;
     build_command()?;
-    tests(&image).code()
+    tests(&image).args(["--constant".as_ref(), constant.as_os_str()]).code()
 }
 
 /// The AGV's image of the emulated board.
@@ -92,7 +93,7 @@ pub(crate) fn tests(image: &Path) -> Run {
 }
 
 /// The `cara` command, which is used beside boards.
-fn build_command() -> Result<()> {
+pub(crate) fn build_command() -> Result<()> {
     Run::cargo().args(["build", "--quiet", "--package", "cara-cli"]).stream()
 }
 

@@ -7,7 +7,7 @@ use crate::{DRIVING, Vehicle, now};
 /// What it tells.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Sign {
-    /// The board does not know who it is: it flickers, five times a second.
+    /// The board does not know who it is, or has no keys to prove it: it flickers, five times a second.
     Unprovisioned,
     /// It looks for its manager: it blinks once a second, on for half of it.
     Looking,
@@ -45,7 +45,7 @@ pub async fn show(vehicle: Vehicle, set: impl AsyncFnMut(bool)) -> ! {
     shine(|| Sign::of(&vehicle), set).await
 }
 
-/// Shows that the board does not know who it is, for ever.
+/// Shows that the board does not know who it is or cannot prove it, for ever.
 pub async fn unprovisioned(set: impl AsyncFnMut(bool)) -> ! {
     shine(|| Sign::Unprovisioned, set).await
 }

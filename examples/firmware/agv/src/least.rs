@@ -2,7 +2,7 @@
 //! takes of a board when nothing else is there.
 
 use cara_core::error::{Error, ServiceError};
-use cara_embassy::{Handler, Resources, Runner, ServiceOptions, message_buffer};
+use cara_embassy::{Handler, Resources, Runner, Security, ServiceOptions, message_buffer};
 use cara_settings::Settings;
 use embassy_net::Stack;
 
@@ -35,9 +35,9 @@ pub fn unit(
     stack: Stack<'static>,
     resources: &'static mut LeastResources,
     settings: &Settings,
-    seed: u64,
+    security: Security,
 ) -> Result<Runner<()>, VehicleError> {
-    let (unit, runner) = cara_embassy::new(stack, resources, unit_config(settings, seed)?, ())?;
+    let (unit, runner) = cara_embassy::new(stack, resources, unit_config(settings, security)?, ())?;
     let add = Handler::method(&|(), _, numbers| {
         let mut sum = || {
             let (a, b): (i64, i64) = (numbers.variable("a")?, numbers.variable("b")?);

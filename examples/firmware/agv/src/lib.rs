@@ -1,7 +1,7 @@
 //! The AGV of the examples as firmware, whatever the board. What it does is `cara_apps::agv`, the same as on Linux; a
 //! board adds its network, its clock, its settings and its button.
 //!
-//! [`vehicle`] makes the unit and its services. A board then runs three tasks beside that of its network: the unit's
+//! [`provision`] is what a board has been told, and the keys with which it proves who it is. [`vehicle`] makes the unit and its services. A board then runs three tasks beside that of its network: the unit's
 //! [`Runner`], [`drive`] and [`call_mechanic`]. [`lamp`] and [`reset`] say how a board tells what goes on; [`echo`] is a
 //! program without CARA to compare with.
 
@@ -14,6 +14,7 @@ pub mod echo;
 pub mod lamp;
 pub mod least;
 mod log;
+pub mod provision;
 pub mod reset;
 #[cfg(feature = "tasks")]
 pub mod tasks;
@@ -25,9 +26,9 @@ use cara_apps::agv::{Agv, BATTERY, GO_TO, GO_TO_LEASE, POS_INFO, Place, Progress
 use cara_apps::mechanic;
 use cara_core::config::Priority;
 use cara_core::error::{Cause, Error};
+use cara_core::services::access::{Functions, Rule, Verbs, Who};
 use cara_core::services::lease::Lease;
-use cara_embassy::{Config, Handle, Handler, Hook, Resources, Runner, ServiceOptions, now};
-use cara_settings::page::PageError;
+use cara_embassy::{Config, Handle, Handler, Hook, Resources, Runner, Security, ServiceOptions, now};
 use cara_settings::{Network, Settings};
 use embassy_net::{Ipv4Cidr, Stack, StaticConfigV4};
 use embassy_time::{Duration, Ticker};
@@ -39,6 +40,10 @@ pub type VehicleResources = Resources<Agv>;
 
 /// Returns a text, for whoever measures the way to the vehicle and back.
 const ECHO: &str = "echo(text: string[400]) -> (text: string[400])";
+
+/// Who may do what: m_units see and call all of its functions, and may offer it theirs. The only one that can join is the
+/// manager of the settings, whose name no table in an image knows. An s_unit, which has no business here, may do nothing.
+const RULES: [Rule; 1] = [Rule::new(Who::M_UNITS, Functions::All, Verbs::ALL)];
 
 /// Sockets of the network stack that the vehicle needs, with one for DHCP.
 pub const SOCKETS: usize = VehicleResources::SOCKETS + 1;
@@ -87,43 +92,24 @@ pub fn hardware_address(chip: &[u8]) -> [u8; 6] {
     [0x02, first, second, third, fourth, fifth]
 }
 
-/// The settings of a vehicle; where there are none the log tells why.
-pub fn provisioned(read: Result<Settings, PageError>) -> Option<Settings> {
-    match read {
-        Ok(settings) if settings.manager.is_some() => return Some(settings),
-        Ok(_) => info!("a vehicle belongs to a manager, and the settings name none: give cara provision a --manager"),
-        Err(PageError::Absent) => info!("who am I? There are no settings: write them with cara provision"),
-        Err(PageError::Layout(_layout)) => {
-            info!("settings of layout {}: write them again, or update the image", _layout)
-        }
-        Err(PageError::Damaged) => {
-            info!("who am I? The settings are damaged: write them again with cara provision")
-        }
-        Err(PageError::Unsound) => {
-            info!("who am I? The settings are of no unit: write them again with cara provision")
-        }
-    }
-    None
-}
-
-/// Makes the AGV that the settings describe. `seed` should differ from boot to boot.
+/// Makes the AGV that the settings describe, which proves with `security` who it is.
 pub fn vehicle(
     stack: Stack<'static>,
     resources: &'static mut VehicleResources,
     settings: &Settings,
-    seed: u64,
+    security: Security,
 ) -> Result<(Vehicle, Runner<Agv>), VehicleError> {
-    let config = unit_config(settings, seed)?;
+    let config = unit_config(settings, security)?.access(&RULES);
     let (vehicle, runner) = cara_embassy::new(stack, resources, config, Agv::new([0, 0]))?;
     offer(vehicle)?;
     Ok((vehicle, runner))
 }
 
 /// Who the unit of the settings is.
-fn unit_config(settings: &Settings, seed: u64) -> Result<Config, VehicleError> {
+fn unit_config(settings: &Settings, security: Security) -> Result<Config, VehicleError> {
     let manager = settings.manager.as_ref().ok_or(VehicleError::NoManager)?;
     let identity = &settings.identity;
-    let config = Config::s_unit(identity.name(), identity.id(), &manager.name, manager.id, seed)?;
+    let config = Config::s_unit(identity.name(), identity.id(), &manager.name, manager.id, security)?;
     let config = config.fleet(settings.fleet.0);
     Ok(match settings.manager_address {
         Some(address) => config.manager_address(SocketAddr::V4(address)),
@@ -223,16 +209,8 @@ async fn ask_mechanic(vehicle: Vehicle) -> Result<i64, Error> {
 
 #[cfg(test)]
 mod tests {
-    use super::{PageError, Settings, hardware_address, provisioned};
+    use super::hardware_address;
     use std::collections::HashSet;
-
-    #[test]
-    fn a_vehicle_without_a_manager_is_not_provisioned() {
-        let told = |text: &str| -> Settings { text.parse().unwrap() };
-        assert!(provisioned(Ok(told("name=agv id=1 manager=depot/1"))).is_some());
-        assert!(provisioned(Ok(told("name=agv id=1"))).is_none());
-        assert!(provisioned(Err(PageError::Damaged)).is_none());
-    }
 
     #[test]
     fn chips_have_addresses_of_their_own() {

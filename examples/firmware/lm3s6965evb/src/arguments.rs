@@ -2,20 +2,33 @@
 //! command line (QEMU: `-semihosting-config …,arg=agv,arg="name=agv-17 id=17 manager=depot/1 address=dhcp"`), in the
 //! text form of [`Settings`].
 //!
-//! `seed=N` among them replaces the random seed, for tests in which each life draws the same numbers.
+//! Words that only this board knows:
+//!
+//! - `file=PATH`: more words stand in a file of the host, as `cara provision lm3s6965evb --output PATH` writes it. Keys do,
+//!   because whoever lists the processes of the host sees arguments;
+//! - `boots=PATH`: the file of the host that stands for the two pages of flash in which the board counts its lives;
+//! - `seed=N` replaces the hardware's noise, for tests in which each life has the same.
 
 use cara_settings::{Settings, TextError};
-use heapless::String;
+#[cfg(not(feature = "secure"))]
+use cara_vehicle::provision::{Provision, halves};
+use heapless::{String, Vec};
+use semihosting::fs::File;
+use semihosting::io::Read;
 
 /// Most bytes of all arguments.
 const BYTES: usize = 256;
+/// Most bytes of all words: the keys of a vehicle in two generations with the longest names, and its settings.
+const WORDS: usize = 1024;
 
 /// What the command line told.
 pub struct Told {
     /// The settings.
     pub settings: Settings,
-    /// The random seed, if it is to be a certain one.
-    pub seed: Option<u64>,
+    /// What makes random numbers differ.
+    pub noise: u64,
+    #[cfg(feature = "secure")]
+    secrets: secured::Secrets,
 }
 
 /// Why the board does not know who it is.
@@ -23,32 +36,146 @@ pub struct Told {
 pub enum ArgumentError {
     /// The emulator gives none, or more than fit.
     None,
+    /// The file that they name cannot be read.
+    File,
     /// They are not settings.
     Settings(TextError),
 }
 
-/// Reads the arguments.
-pub fn read() -> Result<Told, ArgumentError> {
-    let arguments = semihosting::experimental::env::args::<BYTES>().map_err(|_| ArgumentError::None)?;
-    let mut text: String<BYTES> = String::new();
-    let mut seed = None;
-    // The first one is the program's name.
-    for argument in (&arguments).into_iter().skip(1) {
-        for word in argument.unwrap_or_default().split_whitespace() {
-            match word.strip_prefix("seed=").map(str::parse) {
-                Some(Ok(number)) => seed = Some(number),
-                Some(Err(_)) => return Err(ArgumentError::None),
-                None => text.push_str(word).and_then(|()| text.push(' ')).map_err(|_| ArgumentError::None)?,
-            }
+impl ArgumentError {
+    /// What the log says of it.
+    pub const fn text(self) -> &'static str {
+        match self {
+            Self::None => "who am I? There are no arguments, or more than this board has room for",
+            Self::File => "who am I? The file that the arguments name cannot be read",
+            Self::Settings(_) => "who am I? The arguments are no settings",
         }
     }
-    let settings = text.parse().map_err(ArgumentError::Settings)?;
-    Ok(Told { settings, seed })
 }
 
-/// A seed from the host's clock: an emulated board has no source of noise.
-pub fn seed() -> u64 {
+/// The words of the arguments, and those that are not of the settings.
+#[derive(Default)]
+struct Words {
+    text: Vec<u8, WORDS>,
+    seed: Option<u64>,
+    file: Path,
+    boots: Path,
+}
+
+/// A file of the host.
+pub(crate) type Path = String<128>;
+
+impl Words {
+    fn add(&mut self, word: &str) -> Result<(), ()> {
+        match word.split_once('=') {
+            Some(("seed", number)) => self.seed = Some(number.parse().map_err(drop)?),
+            Some(("file", path)) => self.file = String::try_from(path).map_err(drop)?,
+            Some(("boots", path)) => self.boots = String::try_from(path).map_err(drop)?,
+            _ => [word.as_bytes(), b" "].iter().try_for_each(|part| self.text.extend_from_slice(part)).map_err(drop)?,
+        }
+        Ok(())
+    }
+
+    /// The words of the settings.
+    fn text(&self) -> &str {
+        core::str::from_utf8(&self.text).unwrap_or_default()
+    }
+}
+
+/// Reads the arguments, and the file that they name.
+pub fn read() -> Result<Told, ArgumentError> {
+    let mut words = Words::default();
+    add_arguments(&mut words).map_err(|()| ArgumentError::None)?;
+    if !words.file.is_empty() {
+        add_file(&mut words).map_err(|()| ArgumentError::File)?;
+    }
+    let settings = words.text().parse().map_err(ArgumentError::Settings)?;
+    let noise = words.seed.unwrap_or_else(clock);
+    Ok(Told {
+        settings,
+        noise,
+        #[cfg(feature = "secure")]
+        secrets: secured::Secrets::of(&words),
+    })
+}
+
+#[inline(never)]
+fn add_arguments(words: &mut Words) -> Result<(), ()> {
+    let arguments = semihosting::experimental::env::args::<BYTES>().map_err(drop)?;
+    // The first one is the program's name.
+    let arguments = (&arguments).into_iter().skip(1).map(Result::unwrap_or_default);
+    arguments.flat_map(str::split_whitespace).try_for_each(|word| words.add(word))
+}
+
+fn add_file(words: &mut Words) -> Result<(), ()> {
+    words.file.push('\0').map_err(drop)?;
+    let path = core::ffi::CStr::from_bytes_with_nul(words.file.as_bytes()).map_err(drop)?;
+    let mut file = File::open(path).map_err(drop)?;
+    let mut length = words.text.len();
+    words.text.resize_default(WORDS).map_err(drop)?;
+    loop {
+        match file.read(words.text.get_mut(length..).unwrap_or_default()).map_err(drop)? {
+            0 => break,
+            more => length += more,
+        }
+    }
+    words.text.truncate(length);
+    Ok(())
+}
+
+/// From the host's clock: an emulated board has no source of noise.
+fn clock() -> u64 {
     let centiseconds = semihosting::sys::arm_compat::sys_clock().unwrap_or(0) as u64;
     let seconds = semihosting::sys::arm_compat::sys_time().unwrap_or(0) as u64;
     seconds << 32 | centiseconds << 16 | embassy_time::Instant::now().as_micros() & 0xFFFF
+}
+
+#[cfg(feature = "secure")]
+mod secured {
+    use cara_embassy::Security;
+    use cara_settings::Settings;
+    use cara_settings::keys::{Keys, KeysError, of_text};
+    use cara_vehicle::provision::{Provision, halves};
+
+    use super::{Path, Told, Words};
+    use crate::boots;
+
+    /// The keys, and the file of the host for the count of starts.
+    pub(super) struct Secrets {
+        keys: Result<Keys, KeysError>,
+        boots: Path,
+    }
+
+    impl Secrets {
+        #[inline(never)]
+        pub(super) fn of(words: &Words) -> Self {
+            let keys = of_text(words.text()).and_then(|keys| keys.ok_or(KeysError::Absent));
+            Self { keys, boots: words.boots.clone() }
+        }
+    }
+
+    impl Told {
+        /// Who the board is, what proves that to peers, and the noise; moves the count of its lives. `None` without keys, which
+        /// the log tells.
+        #[inline(never)]
+        pub fn security(self) -> Option<(Settings, Security, u64)> {
+            let Self { settings, noise, secrets: Secrets { keys, boots } } = self;
+            let Provision { settings, proof } = Provision::of(settings, || keys)?;
+            let security = if cfg!(feature = "constant-random") {
+                proof.begin_constant()
+            } else {
+                proof.begin(&mut boots::File(&boots), halves(noise))?
+            };
+            Some((settings, security, noise))
+        }
+    }
+}
+
+#[cfg(not(feature = "secure"))]
+impl Told {
+    /// Who the board is, that nothing proves it if the settings say so in words, and the noise.
+    pub fn security(self) -> Option<(Settings, cara_embassy::Security, u64)> {
+        let Provision { settings, proof } = Provision::of(self.settings)?;
+        Some((settings, proof.begin(halves(self.noise)), self.noise))
+    }
 }

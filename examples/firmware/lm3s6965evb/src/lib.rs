@@ -6,6 +6,8 @@
 #![no_std]
 
 pub mod arguments;
+#[cfg(feature = "secure")]
+mod boots;
 pub mod clock;
 pub mod ethernet;
 pub mod executor;

@@ -1,7 +1,5 @@
 //! The board's devices, taken and started. Pins are those of a Nucleo-144 (ST, UM1974 and UM2407).
 
-use cara_settings::Settings;
-use cara_settings::page::PageError;
 use cara_vehicle::reset::Reason;
 use embassy_stm32::eth::{self, Ethernet, GenericPhy, PacketQueue, Sma};
 use embassy_stm32::exti::{self, ExtiInput};
@@ -19,6 +17,7 @@ use embassy_stm32::{bind_interrupts, uid};
 use embassy_time::{Duration, Timer};
 use static_cell::StaticCell;
 
+use crate::settings::{Flash, Lives};
 use crate::{clocks, reset, settings};
 
 bind_interrupts!(struct Interrupts {
@@ -39,8 +38,10 @@ const BOUNCES: Duration = Duration::from_millis(50);
 pub struct Board {
     /// Why it started.
     pub reason: Reason,
-    /// What it is told.
-    pub settings: Result<Settings, PageError>,
+    /// The pages of flash that tell who it is.
+    pub pages: [&'static [u8]; 2],
+    /// Counts its lives.
+    pub lives: Lives,
     /// A number that differs from boot to boot, from the chip's random number generator.
     pub seed: u64,
     /// The network.
@@ -82,7 +83,8 @@ impl Board {
         );
         Self {
             reason,
-            settings: settings::read(),
+            pages: settings::pages(),
+            lives: settings::lives(Flash::new_blocking(chip.FLASH)),
             seed: u64::from_le_bytes(seed),
             device,
             lamp: Lamp(Output::new(chip.PB0, Level::Low, Speed::Low)),

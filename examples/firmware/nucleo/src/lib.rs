@@ -10,7 +10,7 @@ pub mod board;
 mod clocks;
 mod fault;
 mod reset;
-mod settings;
+pub mod settings;
 
 pub use board::Board;
 

@@ -1,19 +1,33 @@
-//! The settings in flash.
+//! What flash keeps: the settings with the keys, and the count of the board's lives.
 #![allow(unsafe_code)]
 
-use cara_settings::Settings;
 use cara_settings::board;
-use cara_settings::page::{self, PageError};
+use cara_settings::boots::Boots;
+use cara_settings::page;
+use embassy_stm32::flash::{self, Blocking};
 
 #[cfg(feature = "f767zi")]
 const BOARD: board::Board = board::NUCLEO_F767ZI;
 #[cfg(feature = "h743zi")]
 const BOARD: board::Board = board::NUCLEO_H743ZI;
 
-/// The newest sound copy.
-pub(crate) fn read() -> Result<Settings, PageError> {
-    let [first, second] = BOARD.pages.map(page);
-    page::newest(first, second)
+/// The driver.
+pub type Flash = flash::Flash<'static, Blocking>;
+
+/// Where flash begins; drivers count from there.
+const START: u32 = 0x0800_0000;
+
+/// The count of the board's lives.
+pub type Lives = Boots<Flash>;
+
+/// The two pages with settings and keys.
+pub(crate) fn pages() -> [&'static [u8]; 2] {
+    BOARD.pages.map(page)
+}
+
+/// The count of the board's lives, in pages of its own.
+pub(crate) fn lives(flash: Flash) -> Lives {
+    Boots::new(flash, BOARD.boots.map(|address| address - START), BOARD.erase_bytes)
 }
 
 fn page(address: u32) -> &'static [u8] {

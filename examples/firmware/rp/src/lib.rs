@@ -14,7 +14,7 @@ pub mod board;
 mod fault;
 pub mod parts;
 mod reset;
-mod settings;
+pub mod settings;
 
 pub use board::Board;
 

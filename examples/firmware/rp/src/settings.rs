@@ -1,9 +1,11 @@
-//! The settings in flash.
+//! What flash keeps: the settings with the keys, and the count of the board's lives.
 #![allow(unsafe_code)]
 
-use cara_settings::Settings;
 use cara_settings::board;
-use cara_settings::page::{self, PageError};
+use cara_settings::boots::Boots;
+use cara_settings::page;
+use embassy_rp::flash::{self, Blocking};
+use embassy_rp::peripherals::FLASH;
 
 #[cfg(feature = "rp2040")]
 const BOARD: board::Board = board::RP2040_W5500;
@@ -12,10 +14,28 @@ const BOARD: board::Board = board::RP2350_W5500;
 #[cfg(feature = "pico2w")]
 const BOARD: board::Board = board::PICO2W;
 
-/// The newest sound copy.
-pub(crate) fn read() -> Result<Settings, PageError> {
-    let [first, second] = BOARD.pages.map(page);
-    page::newest(first, second)
+#[cfg(not(feature = "pico2w"))]
+const BYTES: usize = 2 * 1024 * 1024;
+#[cfg(feature = "pico2w")]
+const BYTES: usize = 4 * 1024 * 1024;
+
+/// The driver.
+pub type Flash = flash::Flash<'static, FLASH, Blocking, BYTES>;
+
+/// Where flash begins; drivers count from there.
+const START: u32 = 0x1000_0000;
+
+/// The count of the board's lives.
+pub type Lives = Boots<Flash>;
+
+/// The two pages with settings and keys.
+pub(crate) fn pages() -> [&'static [u8]; 2] {
+    BOARD.pages.map(page)
+}
+
+/// The count of the board's lives, in pages of its own.
+pub(crate) fn lives(flash: Flash) -> Lives {
+    Boots::new(flash, BOARD.boots.map(|address| address - START), BOARD.erase_bytes)
 }
 
 fn page(address: u32) -> &'static [u8] {

@@ -84,13 +84,13 @@ fn write(arguments: &Arguments, global: &Global) -> anyhow::Result<()> {
         return Err(Ended::usage(text));
     }
     let ring = arguments.keys.as_deref().map(secrets::load).transpose()?;
-    let settings = arguments.told.settings(board, global.fleet, ring.as_ref())?;
+    let settings = arguments.told.settings(board, global, ring.as_ref())?;
     let secrets = ring.as_ref().map(|ring| Secrets::draw(ring, &settings)).transpose()?;
     let content = Content { settings, secrets };
     match &arguments.output {
         _ if *board == text::EMULATED => text::write(&content, arguments.output.as_deref(), global),
         Some(file) => write_file(arguments, board, &content, file, global),
-        None => report(board, &probe::provision(board, &content)?, None, global),
+        None => report(board, &probe::provision(board, &content)?, None, &content, global),
     }
 }
 
@@ -122,7 +122,7 @@ fn write_file(
     let has_keys = written.iter().any(|copy| copy.has_keys);
     let is_secret = has_keys || content.settings.wifi.is_some();
     store(file, &bytes, is_secret).with_context(|| format!("cannot write {}", file.display()))?;
-    report(board, &written, Some(file), global)?;
+    report(board, &written, Some(file), content, global)?;
     if previous.is_none() && arguments.uf2 && !has_keys && !global.json {
         output::line("keys that the board has are gone with it: give --keys if it is to keep any")?;
     }
@@ -171,7 +171,13 @@ fn pages(files: &[PathBuf]) -> anyhow::Result<[Zeroizing<Vec<u8>>; 2]> {
     }
 }
 
-fn report(board: &Board, written: &[Written], file: Option<&Path>, global: &Global) -> anyhow::Result<()> {
+fn report(
+    board: &Board,
+    written: &[Written],
+    file: Option<&Path>,
+    content: &Content,
+    global: &Global,
+) -> anyhow::Result<()> {
     for copy in written {
         let Written { address, generation, has_keys, .. } = copy;
         let place = file.map_or_else(|| "the board".to_owned(), |file| file.display().to_string());
@@ -181,7 +187,11 @@ fn report(board: &Board, written: &[Written], file: Option<&Path>, global: &Glob
                 "board": board.name, "file": file, "address": address, "generation": generation, "keys": keys,
             }))?,
             false => {
-                let what = if *has_keys { "settings and keys" } else { "settings without keys" };
+                let what = match (has_keys, content.settings.insecure) {
+                    (true, _) => "settings and keys",
+                    (false, true) => "settings for plain mode, INSECURE,",
+                    (false, false) => "settings without keys, with which it joins nobody,",
+                };
                 let name = board.name;
                 output::line(format_args!("{place}: {what} for {name} at {address:#x}, generation {generation}"))?;
             }

@@ -1,4 +1,4 @@
-//! The emulated board, which is told by an argument of QEMU: the text of its settings, and its keys behind it.
+//! The emulated board, which is told by a file of the host: the text of its settings, and its keys behind it.
 
 use std::path::Path;
 
@@ -19,6 +19,7 @@ pub(super) const EMULATED: Board = Board {
     description: "emulated Cortex-M3",
     chip: "LM3S6965",
     pages: [0; 2],
+    boots: [0; 2],
     erase_bytes: 0,
     uf2: None,
     wireless: false,
@@ -27,18 +28,21 @@ pub(super) const EMULATED: Board = Board {
 /// Begins the word with the keys.
 const WORD: &str = " keys=";
 
-/// Writes the argument to a file.
+/// Writes the file.
 pub(super) fn write(content: &Content, file: Option<&Path>, global: &Global) -> anyhow::Result<()> {
     let name = EMULATED.name;
     let file = file.ok_or_else(|| {
-        Ended::usage(format!("{name} is emulated: it is told as an argument of QEMU, which --output FILE writes"))
+        Ended::usage(format!("{name} is emulated: it is told by a file of this computer, which --output FILE writes"))
     })?;
     let text = text(content);
     store(file, text.as_bytes(), content.secrets.is_some())
         .with_context(|| format!("cannot write {}", file.display()))?;
     match global.json {
         true => output::object(&json!({ "board": name, "file": file }))?,
-        false => output::line(format_args!("{0}: for QEMU's -semihosting-config, arg=\"$(cat {0})\"", file.display()))?,
+        false => output::line(format_args!(
+            "{0}: for QEMU's -semihosting-config, arg=agv,arg=\"file={0} boots={0}.boots\"",
+            file.display()
+        ))?,
     }
     Ok(())
 }

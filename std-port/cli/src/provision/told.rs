@@ -13,6 +13,7 @@ use cara_settings::{Network, Settings, Wifi};
 use cara_std::keys::{KeyRing, full_name};
 
 use crate::exit::Ended;
+use crate::global::Global;
 use crate::name_and_id::NameAndId;
 
 /// What the board is told.
@@ -67,15 +68,13 @@ impl FromStr for Address {
 
 impl Told {
     /// Makes settings, or tells what is wrong with them. What is not said comes from the board's keys.
-    pub(super) fn settings(
-        &self,
-        board: &Board,
-        fleet: Option<u32>,
-        ring: Option<&KeyRing>,
-    ) -> anyhow::Result<Settings> {
+    pub(super) fn settings(&self, board: &Board, global: &Global, ring: Option<&KeyRing>) -> anyhow::Result<Settings> {
+        if global.insecure && ring.is_some() {
+            return Err(Ended::usage("a board in plain mode has no keys: say either --keys or --insecure"));
+        }
         let manager = self.manager(ring)?;
         let identity = self.identity(manager.is_some(), ring)?;
-        let fleet = fleet.map(Fleet).or(ring.map(KeyRing::fleet)).unwrap_or(Fleet(0));
+        let fleet = global.fleet.map(Fleet).or(ring.map(KeyRing::fleet)).unwrap_or(Fleet(0));
         ring.map_or(Ok(()), |ring| agree(ring, &identity, fleet, manager.as_ref()))?;
         let settings = Settings {
             identity,
@@ -84,6 +83,7 @@ impl Told {
             fleet,
             network: self.network()?,
             wifi: self.wifi(board)?,
+            insecure: global.insecure,
         };
         if settings.is_sound() { Ok(settings) } else { Err(Ended::usage("no unit can be made of these settings")) }
     }

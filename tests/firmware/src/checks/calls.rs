@@ -18,7 +18,7 @@ go_to(position: int[2])
 /// Two boards run the same image, and are told apart by what they are told.
 pub(super) fn found(bench: &Bench, _: u32) -> Result<String> {
     let (cable, other_cable) = (bench.cable()?, bench.cable()?);
-    let manager = Manager::start()?;
+    let manager = Manager::start(&bench.keys)?;
     let _boards = (bench.board(&cable, &Who::agv(17))?, bench.board(&other_cable, &Who::agv(18))?);
     for id in [17, 18] {
         let peer = manager.meet(&Who::agv(id))?;
@@ -31,7 +31,7 @@ pub(super) fn found(bench: &Bench, _: u32) -> Result<String> {
 
 pub(super) fn driven(bench: &Bench, _: u32) -> Result<String> {
     let cable = bench.cable()?;
-    let manager = Manager::start()?;
+    let manager = Manager::start(&bench.keys)?;
     let board = bench.board(&cable, &Who::agv(17))?;
     let agv = manager.meet(&Who::agv(17))?;
     ensure!(position(&agv)? == [0, 0], "it begins elsewhere");
@@ -58,7 +58,7 @@ pub(super) fn driven(bench: &Bench, _: u32) -> Result<String> {
 
 pub(super) fn not_renewed(bench: &Bench, _: u32) -> Result<String> {
     let cable = bench.cable()?;
-    let manager = Manager::start()?;
+    let manager = Manager::start(&bench.keys)?;
     let board = bench.board(&cable, &Who::agv(17))?;
     let agv = manager.meet(&Who::agv(17))?;
     let once = RequestOptions { renew_lease: false, ..RequestOptions::default() };
@@ -79,7 +79,7 @@ pub(super) fn not_renewed(bench: &Bench, _: u32) -> Result<String> {
 
 pub(super) fn wrong(bench: &Bench, _: u32) -> Result<String> {
     let cable = bench.cable()?;
-    let manager = Manager::start()?;
+    let manager = Manager::start(&bench.keys)?;
     let _board = bench.board(&cable, &Who::agv(17))?;
     let agv = manager.meet(&Who::agv(17))?;
     let mut empty = Parameters::<512>::new();
@@ -107,7 +107,7 @@ pub(super) fn wrong(bench: &Bench, _: u32) -> Result<String> {
 
 pub(super) fn best_effort(bench: &Bench, _: u32) -> Result<String> {
     let cable = bench.cable()?;
-    let manager = Manager::start()?;
+    let manager = Manager::start(&bench.keys)?;
     let board = bench.board(&cable, &Who::agv(17))?;
     let agv = manager.meet(&Who::agv(17))?;
     let one_datagram = RequestOptions { delivery: Delivery::BestEffort, ..RequestOptions::default() };
@@ -118,7 +118,7 @@ pub(super) fn best_effort(bench: &Bench, _: u32) -> Result<String> {
 
 pub(super) fn mechanic(bench: &Bench, _: u32) -> Result<String> {
     let cable = bench.cable()?;
-    let manager = Manager::start()?;
+    let manager = Manager::start(&bench.keys)?;
     let board = bench.board(&cable, &Who::agv(17))?;
     manager.meet(&Who::agv(17))?;
     manager.offer_mechanic()?;
@@ -129,7 +129,7 @@ pub(super) fn mechanic(bench: &Bench, _: u32) -> Result<String> {
 /// The manager offers far more than a board keeps: it keeps some, and says how many it has skipped.
 pub(super) fn many_functions(bench: &Bench, _: u32) -> Result<String> {
     let cable = bench.cable()?;
-    let manager = Manager::start()?;
+    let manager = Manager::start(&bench.keys)?;
     let board = bench.board(&cable, &Who::agv(17))?;
     let functions = manager.system.my_function_list();
     let nothing = Parameters::<512>::new();

@@ -12,7 +12,7 @@ use crate::manager::{Manager, position};
 /// The manager knows the board's limit, and the board its manager's: neither sends what the other cannot take.
 pub(super) fn oversize(bench: &Bench, _: u32) -> Result<String> {
     let cable = bench.cable()?;
-    let manager = Manager::start()?;
+    let manager = Manager::start(&bench.keys)?;
     let small = Constraints { message_size: 16, ..manager.system.constraints() };
     manager.system.set_constraints(small)?;
     manager.offer_mechanic()?;
@@ -44,7 +44,7 @@ const TOLD: usize = 3;
 pub(super) fn breaks_its_limit(bench: &Bench, _: u32) -> Result<String> {
     let cable = bench.cable()?;
     let listener = TcpListener::bind(STRANGER)?;
-    let _board = bench.board(&cable, &Who { more: "manager_address=10.77.0.1:4000", ..Who::agv(17) })?;
+    let _board = bench.board(&cable, &Who { manager_address: Some(STRANGER), ..Who::agv(17) })?;
     let (mut told, mut cut) = (0, 0);
     while told < TOLD {
         ensure!(told + cut < LINKS, "{told} of {LINKS} links ended with the code");

@@ -12,7 +12,7 @@ use crate::manager::{Manager, at, position};
 
 pub(super) fn hung(bench: &Bench, _: u32) -> Result<String> {
     let cable = bench.cable()?;
-    let manager = Manager::start()?;
+    let manager = Manager::start(&bench.keys)?;
     let board = bench.board(&cable, &Who::agv(17))?;
     let agv = manager.meet(&Who::agv(17))?;
     board.freeze()?;
@@ -27,7 +27,7 @@ pub(super) fn hung(bench: &Bench, _: u32) -> Result<String> {
 
 pub(super) fn idle_cable(bench: &Bench, _: u32) -> Result<String> {
     let cable = bench.cable()?;
-    let manager = Manager::start()?;
+    let manager = Manager::start(&bench.keys)?;
     let who = Who::agv(17);
     let board = bench.board(&cable, &who)?;
     manager.meet(&who)?;
@@ -45,7 +45,7 @@ pub(super) fn idle_cable(bench: &Bench, _: u32) -> Result<String> {
 
 pub(super) fn cable(bench: &Bench, _: u32) -> Result<String> {
     let cable = bench.cable()?;
-    let manager = Manager::start()?;
+    let manager = Manager::start(&bench.keys)?;
     let who = Who::agv(17);
     let board = bench.board(&cable, &who)?;
     let agv = manager.meet(&who)?;
@@ -67,14 +67,14 @@ pub(super) fn manager(bench: &Bench, _: u32) -> Result<String> {
     let who = Who::agv(17);
     let board = bench.board(&cable, &who)?;
     let program = std::env::current_exe()?;
-    let arguments = ["--image", "none", "manager"];
+    let arguments = crate::manager::command(&bench.keys);
     let mut process = Process::start("manager", Path::new(&program), arguments)?;
     process.expect("driving", LONG)?;
     board.logs("driving")?;
     process.kill()?;
     let line = board.logs_behind(0, "stopped at")?;
     board.logs_behind(line, "depot has left")?;
-    let manager = Manager::start()?;
+    let manager = Manager::start(&bench.keys)?;
     let agv = manager.meet(&who)?;
     let [x, _] = position(&agv)?;
     std::thread::sleep(Duration::from_secs(1));

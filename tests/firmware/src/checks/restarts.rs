@@ -63,7 +63,7 @@ impl Loss {
 
 pub(super) fn run(bench: &Bench, restarts: u32) -> Result<String> {
     let cable = bench.cable()?;
-    let manager = Manager::start()?;
+    let manager = Manager::start(&bench.keys)?;
     let mut counted: BTreeMap<(Absence, State), u32> = BTreeMap::new();
     let mut seeded = 0;
     for number in 0..restarts {

@@ -2,6 +2,7 @@
 //! and first, no old command moves the vehicle, and a new one does.
 
 use std::path::Path;
+use std::rc::Rc;
 use std::time::Duration;
 
 use anyhow::{Context, Result, ensure};
@@ -12,7 +13,8 @@ use cara_std::{CloseReason, Error, Peer, UnitEvent};
 use super::Stop;
 use super::kind::{Bound, Failing, Kind};
 use crate::board::{Bench, Board, Cable, LONG, Way, Who};
-use crate::manager::{ANNOUNCE, Manager, at, fault, position};
+use crate::keys::Keys;
+use crate::manager::{self, ANNOUNCE, Manager, at, fault, position};
 
 /// Longer than the pause between two renewals: faults come in every phase of it.
 const PHASES: u64 = 250;
@@ -30,6 +32,7 @@ const HOOK: &str = "hook for the lost manager";
 pub(super) struct Desk {
     board: Board,
     cable: Cable,
+    keys: Rc<Keys>,
     who: Who,
     /// The constants that the image has logged.
     constants: String,
@@ -48,7 +51,7 @@ impl Desk {
         let who = Who::agv(17);
         let board = bench.board(&cable, &who)?;
         let (_, constants) = board.finds(0, "bound:")?;
-        Ok(Self { board, cable, who, constants })
+        Ok(Self { board, cable, keys: Rc::clone(&bench.keys), who, constants })
     }
 
     pub(super) fn bound(&self, kind: &Kind) -> Result<Bound> {
@@ -71,7 +74,7 @@ impl Desk {
     fn manager_fails(&self, frozen: bool, dice: &mut fastrand::Rng) -> Result<Stop> {
         let line = self.board.line();
         let program = std::env::current_exe()?;
-        let mut process = Process::start("manager", Path::new(&program), ["--image", "none", "manager"])?;
+        let mut process = Process::start("manager", Path::new(&program), manager::command(&self.keys))?;
         process.expect("driving", LONG)?;
         let line = self.board.logs_behind(line, ON)?;
         pause(dice);
@@ -92,14 +95,14 @@ impl Desk {
         }
         drop(process);
         self.lost_once(line)?;
-        let manager = Manager::start()?;
+        let manager = Manager::start(&self.keys)?;
         let agv = manager.meet(&self.who)?;
         self.stands(&agv, behind)?;
         Ok(stop)
     }
 
     fn link_cut(&self, failing: Failing, number: u32, dice: &mut fastrand::Rng) -> Result<Stop> {
-        let manager = Manager::start()?;
+        let manager = Manager::start(&self.keys)?;
         let Drive { agv, line } = self.drive(&manager, dice)?;
         self.cut(failing)?;
         agv.request("go_to", &at([-9_000, 0])?)?;
@@ -126,7 +129,7 @@ impl Desk {
     /// The manager hears nothing any more, and wants the vehicle to drive until it notices.
     fn manager_hears_nothing(&self, dice: &mut fastrand::Rng) -> Result<Stop> {
         let failing = Failing::Wire(Way::FromBoard);
-        let manager = Manager::start()?;
+        let manager = Manager::start(&self.keys)?;
         let Drive { line, .. } = self.drive(&manager, dice)?;
         self.cut(failing)?;
         manager.left(&self.who)?;
@@ -139,7 +142,7 @@ impl Desk {
     }
 
     fn board_fails(&self, asked: i64, reason: &str, dice: &mut fastrand::Rng) -> Result<Stop> {
-        let manager = Manager::start()?;
+        let manager = Manager::start(&self.keys)?;
         let Drive { agv, line } = self.drive(&manager, dice)?;
         manager.forget_events();
         agv.request("fault", &fault(asked)?)?;

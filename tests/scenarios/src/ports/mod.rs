@@ -25,9 +25,11 @@ pub fn linux(needs: &[Need]) -> Box<dyn World> {
     Box::new(linux::LinuxWorld::new(needs.iter().any(|need| disturbed.contains(need)), mode))
 }
 
-/// A fleet of boards on a switch in memory; the seed decides everything.
-pub fn embassy(seed: u64, weather: Weather) -> Box<dyn World> {
-    Box::new(embassy::EmbassyWorld::new(seed, weather))
+/// A fleet of boards on a switch in memory; the seed decides everything. Strangers speak plain, so where a scenario has
+/// some its units are insecure, and secured in all others.
+pub fn embassy(seed: u64, weather: Weather, needs: &[Need]) -> Box<dyn World> {
+    let mode = if needs.contains(&Need::Strangers) { Mode::Plain } else { Mode::Secured };
+    Box::new(embassy::EmbassyWorld::new(seed, weather, mode))
 }
 
 /// A table as a board has it: there for good.

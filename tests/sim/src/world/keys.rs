@@ -44,8 +44,8 @@ pub(super) struct Keys {
     random: Random,
 }
 
-/// Derives what it is asked for.
-pub(super) struct Ring {
+/// A unit's keys, derived when they are asked for: units with rings of one root can talk to each other.
+pub struct Ring {
     root: RootKey,
     discovery: DiscoveryKey,
     other_discovery: Option<DiscoveryKey>,
@@ -55,6 +55,23 @@ pub(super) struct Ring {
     missing: BTreeSet<String>,
     own: Identity,
     fleet: Fleet,
+}
+
+impl Ring {
+    /// Tells roots apart by a number: units of different roots have no key in common.
+    pub fn new(root: u8, own: Identity, fleet: Fleet) -> Self {
+        let root = RootKey::new([root; 32]);
+        Self {
+            discovery: root.discovery(fleet, GENERATION),
+            root,
+            other_discovery: None,
+            generation: GENERATION,
+            other: None,
+            missing: BTreeSet::new(),
+            own,
+            fleet,
+        }
+    }
 }
 
 impl Keyring for Ring {
@@ -72,20 +89,9 @@ impl Keyring for Ring {
 impl Keys {
     pub(super) fn new(given: Given, own: Identity, fleet: Fleet, random: Random) -> Self {
         let Given { renews_every, seals, .. } = given.clone();
-        let root = RootKey::new([given.root; 32]);
-        let ring = Ring {
-            discovery: root.discovery(fleet, GENERATION),
-            root,
-            other_discovery: None,
-            generation: GENERATION,
-            other: None,
-            missing: given.missing,
-            own,
-            fleet,
-        };
         let codes = match given.mode {
             Mode::Plain => Codes::Plain,
-            Mode::Secured => Codes::Keyed(ring),
+            Mode::Secured => Codes::Keyed(Ring { missing: given.missing, ..Ring::new(given.root, own, fleet) }),
         };
         Self { codes, renews_every, seals, random }
     }

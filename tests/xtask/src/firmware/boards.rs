@@ -26,19 +26,26 @@ pub(crate) struct Image {
     pub(crate) name: &'static str,
     /// The binary of the board's crate.
     pub(crate) program: &'static str,
-    /// Whether it tells what it does. An image without logs is built with none of the default features.
+    /// Whether it tells what it does.
     pub(crate) has_logs: bool,
+    /// Whether it has a cipher, and proves with keys who it is.
+    pub(crate) is_secured: bool,
     /// What only tests want of it, on the emulated board.
     pub(crate) feature: Option<&'static str>,
 }
 
 impl Image {
-    const fn with_logs(program: &'static str) -> Self {
-        Self { name: program, program, has_logs: true, feature: None }
+    /// With logs and without a cipher.
+    const fn plain(name: &'static str, program: &'static str) -> Self {
+        Self { name, program, has_logs: true, is_secured: false, feature: None }
     }
 
-    const fn quiet(name: &'static str, program: &'static str) -> Self {
-        Self { name, program, has_logs: false, feature: None }
+    const fn secured(self) -> Self {
+        Self { is_secured: true, ..self }
+    }
+
+    const fn quiet(self) -> Self {
+        Self { has_logs: false, ..self }
     }
 
     /// Whether the other images of its kind are compared with it.
@@ -53,20 +60,27 @@ pub(crate) const RADIO: &str = "CARA_CYW43_FIRMWARE";
 const NO_RADIO: &str = "none";
 
 /// Of every board.
-const IMAGES: &[Image] = &[Image::with_logs("agv"), Image::with_logs("echo")];
-/// Of the emulated board, on which also the least unit and images without logs are measured.
+const IMAGES: &[Image] = &[AGV, ECHO];
+const AGV: Image = Image::plain("agv", "agv").secured();
+const ECHO: Image = Image::plain("echo", "echo");
+/// Of the emulated board, on which also the least unit, images without logs and images without a cipher are measured.
 const EMULATED: &[Image] = &[
-    Image::with_logs("agv"),
-    Image::with_logs("unit"),
-    Image::with_logs("echo"),
-    Image::quiet("agv-quiet", "agv"),
-    Image::quiet("unit-quiet", "unit"),
-    Image::quiet("echo-quiet", "echo"),
+    AGV,
+    Image::plain("agv-plain", "agv"),
+    Image::plain("unit-secured", "unit").secured(),
+    Image::plain("unit", "unit"),
+    ECHO,
+    Image::plain("agv-quiet", "agv").secured().quiet(),
+    Image::plain("unit-secured-quiet", "unit").secured().quiet(),
+    Image::plain("unit-quiet", "unit").quiet(),
+    Image::plain("echo-quiet", "echo").quiet(),
 ];
 /// The AGV of the emulated board with a service that makes it fail.
-pub(crate) const FAULTS: Image = Image { name: "agv-faults", feature: Some("faults"), ..Image::with_logs("agv") };
+pub(crate) const FAULTS: Image = Image { name: "agv-faults", feature: Some("faults"), ..AGV };
+/// The AGV of the emulated board with random numbers that are the same in each life.
+pub(crate) const CONSTANT: Image = Image { name: "agv-constant-random", feature: Some("constant-random"), ..AGV };
 /// Says what each capacity of a unit costs.
-pub(crate) const RESOURCES: Image = Image::with_logs("resources");
+pub(crate) const RESOURCES: Image = Image::plain("resources", "resources").secured();
 
 /// All of them.
 pub(crate) const BOARDS: [Board; 6] = [
@@ -143,10 +157,16 @@ impl Board {
             (true, Err(_)) => build.env(RADIO, NO_RADIO),
             _ => build,
         };
-        let build =
-            if self.feature.is_some() || !image.has_logs { build.args(["--no-default-features"]) } else { build };
-        let features = self.feature.iter().chain(&image.feature);
-        features.fold(build, |build, feature| build.args(["--features", feature])).stream()?;
+        let chosen = |feature, is_chosen: bool| is_chosen.then_some(feature);
+        let features: Vec<&str> = match self.feature {
+            Some(feature) => vec![feature],
+            None => [chosen("defmt", image.has_logs), chosen("secure", image.is_secured), image.feature]
+                .into_iter()
+                .flatten()
+                .collect(),
+        };
+        let build = build.args(["--no-default-features"]);
+        features.iter().fold(build, |build, feature| build.args(["--features", feature])).stream()?;
         self.kept(image)
     }
 

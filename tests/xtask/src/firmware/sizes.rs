@@ -60,7 +60,7 @@ fn of_board(board: &'static Board) -> Result<Vec<Row>> {
     for image in board.images {
         let path = board.build(image)?;
         // A board tells by its logs how deep its stack has been.
-        let stack = if board.name == TESTED && image.has_logs { stack(&path, image.program)? } else { None };
+        let stack = if board.name == TESTED && image.has_logs { stack(&path, image)? } else { None };
         found.push((image, footprint(&path)?, stack));
     }
     let row = |(image, footprint, stack): &(&Image, Footprint, Option<u64>)| {
@@ -80,12 +80,14 @@ fn of_board(board: &'static Board) -> Result<Vec<Row>> {
 }
 
 /// The deepest stack under load; none, with the reason printed, where nothing can be run.
-fn stack(path: &Path, image: &str) -> Result<Option<u64>> {
+fn stack(path: &Path, image: &Image) -> Result<Option<u64>> {
     if let Err(reason) = install::program("qemu-system-arm", "qemu-system-arm") {
         println!("warning: no stack is measured: {reason}");
         return Ok(None);
     }
-    let (code, output) = tests(path).args(["stack", image]).output()?;
+    super::build_command()?;
+    let insecure = (!image.is_secured).then_some("--insecure");
+    let (code, output) = tests(path).args(insecure).args(["stack", image.program]).output()?;
     match code {
         Some(0) => {}
         Some(NOT_ALLOWED) => {

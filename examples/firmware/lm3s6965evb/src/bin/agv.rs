@@ -5,7 +5,7 @@
 
 use cara_apps::agv::Agv;
 use cara_embassy::Runner as UnitRunner;
-use cara_lm3s6965evb::arguments::{self, Told};
+use cara_lm3s6965evb::arguments::{self, ArgumentError};
 use cara_lm3s6965evb::ethernet::Ethernet;
 use cara_lm3s6965evb::watchdog::Watchdog;
 use cara_lm3s6965evb::{executor, fault, motor, reset, stack, start};
@@ -40,14 +40,14 @@ fn spawn(spawner: Spawner) -> Result<(), &'static str> {
     static SOCKETS_MEMORY: ConstStaticCell<StackResources<SOCKETS>> = ConstStaticCell::new(StackResources::new());
     static RESOURCES: StaticCell<VehicleResources> = StaticCell::new();
     const NO_ROOM: &str = "no room for a task";
-    let Told { settings, seed } = arguments::read().map_err(|_| "who am I? The arguments are no settings")?;
-    let seed = seed.unwrap_or_else(arguments::seed);
+    let told = arguments::read().map_err(ArgumentError::text)?;
+    let (settings, security, noise) = told.security().ok_or("it joins nobody")?;
     let ethernet = ETHERNET.take();
     ethernet.start();
     let sockets = SOCKETS_MEMORY.take();
-    let (stack, network_runner) = embassy_net::new(ethernet, cara_vehicle::network(&settings), sockets, seed);
+    let (stack, network_runner) = embassy_net::new(ethernet, cara_vehicle::network(&settings), sockets, noise);
     let resources = RESOURCES.init_with(VehicleResources::new);
-    let made = cara_vehicle::vehicle(stack, resources, &settings, seed);
+    let made = cara_vehicle::vehicle(stack, resources, &settings, security);
     let (vehicle, unit_runner) = made.map_err(|_| "the settings are of no vehicle")?;
     #[cfg(feature = "faults")]
     cara_lm3s6965evb::faults::offer(vehicle).map_err(|_| "no room for the test's functions")?;

@@ -3,6 +3,7 @@
 #![no_std]
 #![no_main]
 
+use cara_lm3s6965evb::arguments::ArgumentError;
 use cara_lm3s6965evb::ethernet::Ethernet;
 use cara_lm3s6965evb::{arguments, executor, fault, stack, start};
 use cara_vehicle::echo;
@@ -26,12 +27,11 @@ fn main() -> ! {
 fn spawn(spawner: Spawner) -> Result<(), &'static str> {
     static ETHERNET: ConstStaticCell<Ethernet> = ConstStaticCell::new(Ethernet::new());
     static RESOURCES: ConstStaticCell<StackResources<4>> = ConstStaticCell::new(StackResources::new());
-    let told = arguments::read().map_err(|_| "the arguments are no settings")?;
+    let told = arguments::read().map_err(ArgumentError::text)?;
     let ethernet = ETHERNET.take();
-    let [.., last] = ethernet.start();
-    let seed = told.seed.unwrap_or(u64::from(last));
+    ethernet.start();
     let config = cara_vehicle::network(&told.settings);
-    let (stack, runner) = embassy_net::new(ethernet, config, RESOURCES.take(), seed);
+    let (stack, runner) = embassy_net::new(ethernet, config, RESOURCES.take(), told.noise);
     spawner.spawn(network(runner).map_err(|_| "no room for a task")?);
     spawner.spawn(answer(stack).map_err(|_| "no room for a task")?);
     spawner.spawn(stack::report().map_err(|_| "no room for a task")?);

@@ -5,7 +5,7 @@
 #![no_main]
 
 use cara_embassy::Runner as UnitRunner;
-use cara_lm3s6965evb::arguments::{self, Told};
+use cara_lm3s6965evb::arguments::{self, ArgumentError};
 use cara_lm3s6965evb::ethernet::Ethernet;
 use cara_lm3s6965evb::{executor, fault, stack, start};
 use cara_vehicle::least::{self, LeastResources, SOCKETS};
@@ -31,13 +31,13 @@ fn spawn(spawner: Spawner) -> Result<(), &'static str> {
     static SOCKETS_MEMORY: ConstStaticCell<StackResources<SOCKETS>> = ConstStaticCell::new(StackResources::new());
     static RESOURCES: StaticCell<LeastResources> = StaticCell::new();
     const NO_ROOM: &str = "no room for a task";
-    let Told { settings, seed, .. } = arguments::read().map_err(|_| "the arguments are no settings")?;
+    let told = arguments::read().map_err(ArgumentError::text)?;
+    let (settings, security, noise) = told.security().ok_or("it joins nobody")?;
     let ethernet = ETHERNET.take();
-    let [.., last] = ethernet.start();
-    let seed = seed.unwrap_or(u64::from(last));
+    ethernet.start();
     let sockets = SOCKETS_MEMORY.take();
-    let (stack, network_runner) = embassy_net::new(ethernet, cara_vehicle::network(&settings), sockets, seed);
-    let made = least::unit(stack, RESOURCES.init_with(LeastResources::new), &settings, seed);
+    let (stack, network_runner) = embassy_net::new(ethernet, cara_vehicle::network(&settings), sockets, noise);
+    let made = least::unit(stack, RESOURCES.init_with(LeastResources::new), &settings, security);
     let unit_runner = made.map_err(|_| "the settings are of no s_unit")?;
     spawner.spawn(network(network_runner).map_err(|_| NO_ROOM)?);
     spawner.spawn(unit(unit_runner).map_err(|_| NO_ROOM)?);

@@ -3,9 +3,11 @@
 #![no_std]
 #![no_main]
 
+use cara_embassy::Security;
 use cara_nucleo::Board;
 use cara_nucleo::board::{Button, Device, Lamp, Watchdog};
 use cara_settings::Settings;
+use cara_vehicle::provision::{Provision, halves};
 use cara_vehicle::{SOCKETS, Vehicle, VehicleResources, lamp, tasks};
 use defmt_rtt as _;
 use embassy_executor::{SpawnError, Spawner};
@@ -16,15 +18,27 @@ use static_cell::StaticCell;
 async fn main(spawner: Spawner) {
     let mut board = Board::start();
     defmt::info!("started because of {}", board.reason);
-    let Some(settings) = cara_vehicle::provisioned(board.settings) else {
-        lamp::unprovisioned(async |on| board.lamp.set(on)).await
-    };
-    defmt::unwrap!(spawn(spawner, settings, board.seed, board.device, board.lamp, board.button, board.watchdog));
+    let [first, second] = board.pages;
+    let known = Provision::read(first, second).and_then(|Provision { settings, proof }| {
+        proof.begin(&mut board.lives, halves(board.seed)).map(|security| (settings, security))
+    });
+    let Some((settings, security)) = known else { lamp::unprovisioned(async |on| board.lamp.set(on)).await };
+    defmt::unwrap!(spawn(
+        spawner,
+        settings,
+        security,
+        board.seed,
+        board.device,
+        board.lamp,
+        board.button,
+        board.watchdog
+    ));
 }
 
 fn spawn(
     spawner: Spawner,
     settings: Settings,
+    security: Security,
     seed: u64,
     device: Device,
     lamp: Lamp,
@@ -36,7 +50,7 @@ fn spawn(
     let sockets = SOCKETS_MEMORY.init_with(StackResources::new);
     let (stack, network_runner) = embassy_net::new(device, cara_vehicle::network(&settings), sockets, seed);
     let resources = RESOURCES.init_with(VehicleResources::new);
-    let made = cara_vehicle::vehicle(stack, resources, &settings, seed);
+    let made = cara_vehicle::vehicle(stack, resources, &settings, security);
     let Ok((vehicle, unit)) = made else { defmt::panic!("no vehicle can be made of the settings") };
     defmt::info!("{=str}/{=u32}", settings.identity.name(), settings.identity.id());
     spawner.spawn(network(network_runner)?);

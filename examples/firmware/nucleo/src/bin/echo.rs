@@ -5,6 +5,7 @@
 
 use cara_nucleo::Board;
 use cara_nucleo::board::Device;
+use cara_settings::page;
 use cara_vehicle::echo;
 use defmt_rtt as _;
 use embassy_executor::Spawner;
@@ -16,7 +17,8 @@ async fn main(spawner: Spawner) {
     static RESOURCES: StaticCell<StackResources<4>> = StaticCell::new();
     let board = Board::start();
     defmt::info!("started because of {}", board.reason);
-    let config = board.settings.map_or_else(|_| echo::dhcp(), |settings| cara_vehicle::network(&settings));
+    let [first, second] = board.pages;
+    let config = page::newest(first, second).map_or_else(|_| echo::dhcp(), |settings| cara_vehicle::network(&settings));
     let resources = RESOURCES.init_with(StackResources::new);
     let (stack, runner) = embassy_net::new(board.device, config, resources, board.seed);
     spawner.spawn(defmt::unwrap!(network(runner)));

@@ -6,6 +6,7 @@
 use cara_rp::Board;
 use cara_rp::board::{Device, Lamp};
 use cara_rp::parts::{Button, Watchdog};
+use cara_vehicle::provision::{Provision, halves};
 use cara_vehicle::{SOCKETS, Vehicle, VehicleResources, lamp, tasks};
 use defmt_rtt as _;
 use embassy_executor::{SpawnError, Spawner};
@@ -20,9 +21,13 @@ async fn main(spawner: Spawner) {
 async fn run(spawner: Spawner) -> Result<(), SpawnError> {
     static SOCKETS_MEMORY: StaticCell<StackResources<SOCKETS>> = StaticCell::new();
     static RESOURCES: StaticCell<VehicleResources> = StaticCell::new();
-    let Board { reason, settings, seed, lamp, button, watchdog, network } = Board::start(spawner).await;
+    let Board { reason, pages: [first, second], mut lives, seed, lamp, button, watchdog, network } =
+        Board::start(spawner).await;
     defmt::info!("started because of {}", reason);
-    let Some(settings) = cara_vehicle::provisioned(settings) else {
+    let known = Provision::read(first, second).and_then(|Provision { settings, proof }| {
+        proof.begin(&mut lives, halves(seed)).map(|security| (settings, security))
+    });
+    let Some((settings, security)) = known else {
         spawner.spawn(flicker(lamp)?);
         let (_, uplink) = network.start(spawner).await?;
         uplink.only_lamp().await
@@ -32,7 +37,7 @@ async fn run(spawner: Spawner) -> Result<(), SpawnError> {
     let (stack, runner) = embassy_net::new(device, cara_vehicle::network(&settings), sockets, seed);
     uplink.keep(spawner, stack, Some(&settings))?;
     let resources = RESOURCES.init_with(VehicleResources::new);
-    let made = cara_vehicle::vehicle(stack, resources, &settings, seed);
+    let made = cara_vehicle::vehicle(stack, resources, &settings, security);
     let Ok((vehicle, unit)) = made else { defmt::panic!("no vehicle can be made of the settings") };
     defmt::info!("{=str}/{=u32}", settings.identity.name(), settings.identity.id());
     spawner.spawn(talk(runner)?);

@@ -5,6 +5,7 @@
 
 use cara_rp::Board;
 use cara_rp::board::Device;
+use cara_settings::page;
 use cara_vehicle::echo;
 use defmt_rtt as _;
 use embassy_executor::{SpawnError, Spawner};
@@ -18,9 +19,10 @@ async fn main(spawner: Spawner) {
 
 async fn run(spawner: Spawner) -> Result<(), SpawnError> {
     static RESOURCES: StaticCell<StackResources<4>> = StaticCell::new();
-    let Board { reason, settings, seed, network, .. } = Board::start(spawner).await;
+    let Board { reason, pages: [first, second], seed, network, .. } = Board::start(spawner).await;
     defmt::info!("started because of {}", reason);
     let (device, uplink) = network.start(spawner).await?;
+    let settings = page::newest(first, second);
     let config = settings.as_ref().map_or_else(|_| echo::dhcp(), cara_vehicle::network);
     let resources = RESOURCES.init_with(StackResources::new);
     let (stack, runner) = embassy_net::new(device, config, resources, seed);

@@ -1,7 +1,6 @@
 //! The devices of a Raspberry Pi Pico 2 W, taken and started. The radio has the board's LED on one of its own pins, so
 //! that the lamp goes on only once the radio runs.
 
-use cara_settings::page::PageError;
 use cara_settings::{Settings, Wifi};
 use cara_vehicle::reset::Reason;
 use cyw43::{A4, Aligned, Control, JoinOptions, NetDriver, PowerManagementMode, Runner, SpiBus, State};
@@ -19,6 +18,7 @@ use embassy_time::{Duration, Timer, with_timeout};
 use static_cell::StaticCell;
 
 use crate::parts::{Button, Watchdog};
+use crate::settings::{Flash, Lives};
 use crate::{reset, settings};
 
 bind_interrupts!(struct Interrupts {
@@ -48,8 +48,10 @@ static LIGHT: Signal<CriticalSectionRawMutex, bool> = Signal::new();
 pub struct Board {
     /// Why it started.
     pub reason: Reason,
-    /// What it is told.
-    pub settings: Result<Settings, PageError>,
+    /// The pages of flash that tell who it is.
+    pub pages: [&'static [u8]; 2],
+    /// Counts its lives.
+    pub lives: Lives,
     /// A number that differs from boot to boot, from the jitter of the ring oscillator.
     pub seed: u64,
     /// The LED on the board, which the radio switches.
@@ -82,7 +84,8 @@ impl Board {
         let (device, control) = defmt::unwrap!(start_radio(spawner, power, bus).await);
         Self {
             reason,
-            settings: settings::read(),
+            pages: settings::pages(),
+            lives: settings::lives(Flash::new_blocking(chip.FLASH)),
             seed: RoscRng.next_u64(),
             lamp: Lamp(()),
             button: Button(Input::new(chip.PIN_14, Pull::Up)),

@@ -2,7 +2,6 @@
 //! Pico, wire a W5500 module the same way.
 
 use cara_settings::Settings;
-use cara_settings::page::PageError;
 use cara_vehicle::reset::Reason;
 use embassy_executor::{SpawnError, Spawner};
 use embassy_net::Stack;
@@ -18,6 +17,7 @@ use embedded_hal_bus::spi::ExclusiveDevice;
 use static_cell::StaticCell;
 
 use crate::parts::{Button, Watchdog};
+use crate::settings::{Flash, Lives};
 use crate::{reset, settings};
 
 bind_interrupts!(struct Interrupts {
@@ -37,8 +37,10 @@ const ABSENT: Duration = Duration::from_secs(2);
 pub struct Board {
     /// Why it started.
     pub reason: Reason,
-    /// What it is told.
-    pub settings: Result<Settings, PageError>,
+    /// The pages of flash that tell who it is.
+    pub pages: [&'static [u8]; 2],
+    /// Counts its lives.
+    pub lives: Lives,
     /// A number that differs from boot to boot, from the jitter of the ring oscillator.
     pub seed: u64,
     /// GP25, the LED on the board.
@@ -75,13 +77,18 @@ impl Board {
             Err(never) => match never {},
         };
         #[cfg(feature = "rp2040")]
-        let address = hardware_address(chip.FLASH);
+        let mut flash = Flash::new_blocking(chip.FLASH);
+        #[cfg(feature = "rp2350")]
+        let flash = Flash::new_blocking(chip.FLASH);
+        #[cfg(feature = "rp2040")]
+        let address = hardware_address(&mut flash);
         #[cfg(feature = "rp2350")]
         let address = hardware_address();
         let (interrupt, reset) = (Input::new(chip.PIN_21, Pull::Up), Output::new(chip.PIN_20, Level::High));
         Self {
             reason,
-            settings: settings::read(),
+            pages: settings::pages(),
+            lives: settings::lives(flash),
             seed: RoscRng.next_u64(),
             lamp: Lamp(Output::new(chip.PIN_25, Level::Low)),
             button: Button(Input::new(chip.PIN_14, Pull::Up)),
@@ -132,12 +139,8 @@ async fn serve(runner: Runner<'static, W5500, Bus, Input<'static>, Output<'stati
 
 /// From the number of the flash chip: an RP2040 has none of its own.
 #[cfg(feature = "rp2040")]
-fn hardware_address(flash: embassy_rp::Peri<'static, embassy_rp::peripherals::FLASH>) -> [u8; 6] {
-    use embassy_rp::flash::{Blocking, Flash};
-
-    const BYTES: usize = 2 * 1024 * 1024;
+fn hardware_address(flash: &mut Flash) -> [u8; 6] {
     let mut number = [0; 8];
-    let mut flash = Flash::<_, Blocking, BYTES>::new_blocking(flash);
     if flash.blocking_unique_id(&mut number).is_err() {
         defmt::warn!("the flash has no number: two boards of this kind would share a hardware address");
     }

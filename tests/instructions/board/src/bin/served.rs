@@ -3,7 +3,7 @@
 #![no_std]
 #![no_main]
 
-use cara_embassy::{Config, Handler, Resources, Runner as UnitRunner, ServiceOptions, message_buffer};
+use cara_embassy::{Config, Handler, Resources, Runner as UnitRunner, Security, ServiceOptions, message_buffer};
 use cara_lm3s6965evb::arguments;
 use cara_lm3s6965evb::ethernet::Ethernet;
 use cara_lm3s6965evb::{executor, fault, start};
@@ -45,7 +45,7 @@ fn spawn(spawner: Spawner) -> Result<(), &'static str> {
     let (stack, network_runner) = embassy_net::new(ethernet, cara_vehicle::network(&settings), SOCKETS.take(), seed);
     let (name, id) = (settings.identity.name(), settings.identity.id());
     let config =
-        Config::s_unit(name, id, &manager.name, manager.id, seed).map_err(|_| "the settings are of no unit")?;
+        Config::s_unit(name, id, &manager.name, manager.id, Security::insecure(seed)).map_err(|_| "the settings are of no unit")?;
     let config = config.fleet(settings.fleet.0);
     let (unit, unit_runner) =
         cara_embassy::new(stack, MEMORY.init_with(Memory::new), config, ()).map_err(|_| "no such unit")?;

@@ -7,6 +7,7 @@ mod visitor;
 
 use std::rc::Rc;
 
+use cara_core::config::Mode;
 use cara_core::random::Random;
 use cara_core::time::{Duration, Instant};
 use cara_embassy_host::{Bench, Faults};
@@ -18,17 +19,18 @@ use crate::{Fault, Need, Port, Spec, Stranger, Unit, Unsupported, Weather, World
 
 pub(super) struct EmbassyWorld {
     bench: Bench,
+    mode: Mode,
     units: Vec<Rc<BoardNode>>,
     random: Random,
     report: Report,
 }
 
 impl EmbassyWorld {
-    pub(super) fn new(seed: u64, weather: Weather) -> Self {
+    pub(super) fn new(seed: u64, weather: Weather, mode: Mode) -> Self {
         let bench = Bench::new(seed);
         let mut random = Random::new(seed ^ 0x00E3_BA55);
         bench.set_faults(faults(&mut random, weather));
-        Self { bench, units: Vec::new(), random, report: Report::default() }
+        Self { bench, mode, units: Vec::new(), random, report: Report::default() }
     }
 
     fn node(&self, unit: &Unit) -> &Rc<BoardNode> {
@@ -79,7 +81,7 @@ impl World for EmbassyWorld {
     }
 
     fn add(&mut self, spec: Spec) -> Unit {
-        let node = BoardNode::new(self.units.len(), &self.bench, spec);
+        let node = BoardNode::new(self.units.len(), &self.bench, self.mode, spec);
         self.units.push(Rc::clone(&node));
         Rc::new(node)
     }

@@ -4,7 +4,7 @@ use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::rc::Rc;
 
-use cara_core::config::Constraints;
+use cara_core::config::{Constraints, Mode};
 use cara_core::distribution::connection_handler::NodeCounter;
 use cara_core::distribution::identity::{Identity, Role};
 use cara_core::distribution::parameters::ParametersView;
@@ -16,7 +16,7 @@ use cara_core::services::requests::CallId;
 use cara_core::services::unit::RequestOptions;
 use cara_core::time::Instant;
 use cara_embassy::{Config, Handle, Peer, UnitEvent};
-use cara_embassy_host::{Bench, Board, now};
+use cara_embassy_host::{Bench, Board, now, security};
 use embassy_time::with_timeout;
 
 use super::super::lent;
@@ -27,6 +27,7 @@ use crate::{Node, Pending, PendingAll, Seen, Service, Spec, SpecRole, boxed};
 pub(super) struct BoardNode {
     number: usize,
     bench: Bench,
+    mode: Mode,
     spec: Spec,
     board: RefCell<Board>,
     unit: RefCell<Option<Handle>>,
@@ -37,10 +38,11 @@ pub(super) struct BoardNode {
 }
 
 impl BoardNode {
-    pub(super) fn new(number: usize, bench: &Bench, spec: Spec) -> Rc<Self> {
+    pub(super) fn new(number: usize, bench: &Bench, mode: Mode, spec: Spec) -> Rc<Self> {
         let node = Rc::new(Self {
             number,
             bench: bench.clone(),
+            mode,
             spec,
             board: RefCell::new(bench.board()),
             unit: RefCell::new(None),
@@ -109,9 +111,10 @@ impl BoardNode {
         let Spec { role, name, id, fleet, mut constraints, same_seed, .. } = self.spec.clone();
         let seed = if same_seed { 4 } else { self.bench.random(u64::MAX) };
         constraints.maximum_nodes = constraints.maximum_nodes.min(memory::links(&self.spec));
+        let security = security(self.mode, &self.spec.identity(), fleet, seed);
         let config = match role {
-            SpecRole::Manager => Config::m_unit(&name, id, seed)?,
-            SpecRole::Agv(manager, manager_id) => Config::s_unit(&name, id, &manager, manager_id, seed)?,
+            SpecRole::Manager => Config::m_unit(&name, id, security)?,
+            SpecRole::Agv(manager, manager_id) => Config::s_unit(&name, id, &manager, manager_id, security)?,
         };
         let epoch = self.bench.random(u64::MAX);
         Ok(config.fleet(fleet).constraints(constraints).epoch(epoch))
@@ -132,12 +135,7 @@ impl BoardNode {
 
 impl Node for Rc<BoardNode> {
     fn identity(&self) -> Identity {
-        let Spec { role, name, id, .. } = &self.spec;
-        let identity = match role {
-            SpecRole::Manager => Identity::m_unit(name, *id),
-            SpecRole::Agv(..) => Identity::s_unit(name, *id),
-        };
-        identity.expect("a unit was made of it")
+        self.spec.identity()
     }
 
     fn broadcast(&self) {

@@ -1,0 +1,320 @@
+//! How many lives a board has had, kept in two pages of flash of its own: what makes its random numbers differ from life to
+//! life where its noise does not.
+//!
+//! Each life adds a record behind those of the lives before; where a page is full the other one is erased, so that the
+//! record with the highest count is never in a page that is being erased. A record has 32 bytes:
+//!
+//! | offset | size | field |
+//! |---|---|---|
+//! | 0 | 4 | `CARb` |
+//! | 4 | 8 | the count, little-endian, from 1 |
+//! | 12 | 16 | zero |
+//! | 28 | 4 | CRC-32 (ISO-HDLC) of all before, little-endian |
+//!
+//! A count is returned once its record has been read back, and counts only rise: wherever power is cut, no count is
+//! returned twice. The pages are erased by nothing else; when somebody erases all of a chip the keys are gone with them.
+
+use cara_secure::random::BootCounter;
+use embedded_storage::nor_flash::NorFlash;
+
+use crate::page::SUM;
+
+/// Bytes of a record, which are written at once: a multiple of what any of these chips writes at once.
+pub const RECORD_BYTES: usize = 32;
+/// Most bytes of a page that are used: the pages of some chips are far longer than need be.
+const USED_BYTES: u32 = 16 * 1024;
+
+const MAGIC: [u8; 4] = *b"CARb";
+const COUNT: core::ops::Range<usize> = 4..12;
+const SUMMED: usize = RECORD_BYTES - 4;
+const ERASED: [u8; RECORD_BYTES] = [0xFF; RECORD_BYTES];
+
+/// Why a board does not know which of its lives this is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum BootError<E> {
+    /// The driver says so.
+    #[error("the flash with the count of starts cannot be read or written")]
+    Flash(E),
+    /// No record can be written to either page any more, or the count has come to its end.
+    #[error("the pages with the count of starts are worn out: this board needs other flash")]
+    Worn,
+}
+
+impl<E> From<E> for BootError<E> {
+    fn from(error: E) -> Self {
+        Self::Flash(error)
+    }
+}
+
+/// The count in two pages of flash.
+pub struct Boots<F> {
+    flash: F,
+    pages: [u32; 2],
+    erase_bytes: u32,
+}
+
+/// What stands in a page.
+#[derive(Clone, Copy)]
+struct Seen {
+    /// The highest count, or 0.
+    newest: u64,
+    /// Where the page is erased from.
+    free: u32,
+}
+
+impl<F: NorFlash> Boots<F> {
+    /// The count in the pages at these offsets, as the driver counts them, of so many bytes each.
+    pub const fn new(flash: F, pages: [u32; 2], erase_bytes: u32) -> Self {
+        const { assert!(RECORD_BYTES.is_multiple_of(F::WRITE_SIZE), "a record is written at once") }
+        Self { flash, pages, erase_bytes }
+    }
+
+    /// Ends with the driver.
+    pub fn free(self) -> F {
+        self.flash
+    }
+
+    fn used_bytes(&self) -> u32 {
+        self.erase_bytes.min(USED_BYTES)
+    }
+
+    fn offsets(&self) -> impl DoubleEndedIterator<Item = u32> + use<F> {
+        (0..self.used_bytes() / RECORD_BYTES as u32).map(|index| index * RECORD_BYTES as u32)
+    }
+
+    fn look(&mut self, page: u32) -> Result<Seen, F::Error> {
+        let mut seen = Seen { newest: 0, free: 0 };
+        for offset in self.offsets() {
+            let record = self.read(page + offset)?;
+            if record != ERASED {
+                seen.free = offset + RECORD_BYTES as u32;
+            }
+            seen.newest = seen.newest.max(count(&record).unwrap_or(0));
+        }
+        Ok(seen)
+    }
+
+    fn read(&mut self, at: u32) -> Result<[u8; RECORD_BYTES], F::Error> {
+        let mut record = ERASED;
+        self.flash.read(at, &mut record).map(|()| record)
+    }
+
+    /// Writes a record to the first place from `free` on that takes it; whether there was one.
+    fn put(&mut self, page: u32, free: u32, record: &[u8; RECORD_BYTES]) -> Result<bool, F::Error> {
+        for offset in self.offsets().filter(|offset| *offset >= free) {
+            self.flash.write(page + offset, record)?;
+            if self.read(page + offset)? == *record {
+                return Ok(true);
+            }
+        }
+        Ok(false)
+    }
+}
+
+impl<F: NorFlash> BootCounter for Boots<F> {
+    type Error = BootError<F::Error>;
+
+    fn advance(&mut self) -> Result<u64, Self::Error> {
+        let [one, two] = self.pages;
+        let (first, second) = (self.look(one)?, self.look(two)?);
+        let is_second = second.newest > first.newest;
+        let (page, seen, other) = if is_second { (two, second, one) } else { (one, first, two) };
+        let next = seen.newest.checked_add(1).ok_or(BootError::Worn)?;
+        let record = record(next);
+        if self.put(page, seen.free, &record)? {
+            return Ok(next);
+        }
+        self.flash.erase(other, other + self.erase_bytes)?;
+        if self.put(other, 0, &record)? { Ok(next) } else { Err(BootError::Worn) }
+    }
+}
+
+fn record(count: u64) -> [u8; RECORD_BYTES] {
+    let mut record = [0; RECORD_BYTES];
+    let (summed, sum) = record.split_at_mut(SUMMED);
+    let (magic, rest) = summed.split_at_mut(MAGIC.len());
+    magic.copy_from_slice(&MAGIC);
+    let (number, _) = rest.split_at_mut(COUNT.len());
+    number.copy_from_slice(&count.to_le_bytes());
+    sum.copy_from_slice(&SUM.checksum(summed).to_le_bytes());
+    record
+}
+
+/// The count of a sound record.
+fn count(record: &[u8; RECORD_BYTES]) -> Option<u64> {
+    let number = record.get(COUNT)?.first_chunk()?;
+    let count = u64::from_le_bytes(*number);
+    (*record == self::record(count)).then_some(count)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use embedded_storage::nor_flash::{ErrorType, NorFlashError, NorFlashErrorKind, ReadNorFlash};
+    use proptest::prelude::*;
+    use std::vec::Vec;
+
+    const PAGE: usize = 4 * RECORD_BYTES;
+    const WORD: usize = 4;
+
+    #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+    struct PowerCut;
+
+    impl NorFlashError for PowerCut {
+        fn kind(&self) -> NorFlashErrorKind {
+            NorFlashErrorKind::Other
+        }
+    }
+
+    /// Two pages, and power for so many words that are written or erased.
+    struct Chip {
+        bytes: Vec<u8>,
+        power: usize,
+        /// Places that take nothing any more.
+        worn: Vec<usize>,
+    }
+
+    impl Chip {
+        fn new() -> Self {
+            Self { bytes: std::vec![0xFF; 2 * PAGE], power: usize::MAX, worn: Vec::new() }
+        }
+
+        fn spend(&mut self) -> Result<(), PowerCut> {
+            self.power = self.power.checked_sub(1).ok_or(PowerCut)?;
+            Ok(())
+        }
+
+        fn boot(&mut self) -> Result<u64, BootError<PowerCut>> {
+            Boots::new(self, [0, PAGE as u32], PAGE as u32).advance()
+        }
+    }
+
+    impl ErrorType for Chip {
+        type Error = PowerCut;
+    }
+
+    impl ReadNorFlash for Chip {
+        const READ_SIZE: usize = 1;
+
+        fn read(&mut self, offset: u32, bytes: &mut [u8]) -> Result<(), PowerCut> {
+            bytes.copy_from_slice(&self.bytes[offset as usize..][..bytes.len()]);
+            Ok(())
+        }
+
+        fn capacity(&self) -> usize {
+            self.bytes.len()
+        }
+    }
+
+    impl NorFlash for Chip {
+        const WRITE_SIZE: usize = WORD;
+        const ERASE_SIZE: usize = PAGE;
+
+        /// What power leaves of a page that is being erased is anything: here every other word is erased already.
+        fn erase(&mut self, from: u32, to: u32) -> Result<(), PowerCut> {
+            assert_eq!(to as usize - from as usize, PAGE);
+            let words = (from as usize..to as usize).step_by(WORD);
+            for at in words.clone().step_by(2).chain(words.skip(1).step_by(2)) {
+                self.spend()?;
+                self.bytes[at..][..WORD].fill(0xFF);
+            }
+            Ok(())
+        }
+
+        /// Programming clears bits and sets none; of the word that power is cut in, half has been written.
+        fn write(&mut self, offset: u32, bytes: &[u8]) -> Result<(), PowerCut> {
+            for (at, word) in (offset as usize..).step_by(WORD).zip(bytes.chunks(WORD)) {
+                let powered = self.spend();
+                let written = if powered.is_ok() { WORD } else { WORD / 2 };
+                let worn = self.worn.contains(&(at / RECORD_BYTES));
+                for (to, from) in self.bytes[at..].iter_mut().zip(&word[..written]).filter(|_| !worn) {
+                    *to &= from;
+                }
+                powered?;
+            }
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn counts_rise_by_one_through_page_after_page() {
+        let mut chip = Chip::new();
+        for life in 1..50 {
+            assert_eq!(chip.boot(), Ok(life));
+        }
+    }
+
+    /// Power is cut in each word that is written or erased, in each life around two changes of page, and also in the life
+    /// that comes after that: no count is returned twice, and none is lost.
+    #[test]
+    fn wherever_power_is_cut_counts_rise() {
+        let (mut cuts, mut second_cuts) = (0, 0);
+        for lives in 0..12 {
+            let before = || {
+                let mut chip = Chip::new();
+                (0..lives).for_each(|life| assert_eq!(chip.boot(), Ok(life + 1)));
+                chip
+            };
+            for power in 0.. {
+                let mut chip = before();
+                chip.power = power;
+                if chip.boot().is_ok() {
+                    break;
+                }
+                cuts += 1;
+                for second in 0.. {
+                    let mut chip = Chip { bytes: chip.bytes.clone(), power: second, worn: Vec::new() };
+                    let interrupted = chip.boot();
+                    chip.power = usize::MAX;
+                    let counts = [interrupted.unwrap_or(lives), chip.boot().unwrap(), chip.boot().unwrap()];
+                    assert!(counts[0] >= lives && counts[1] > counts[0] && counts[2] > counts[1], "{counts:?}");
+                    if interrupted.is_ok() {
+                        break;
+                    }
+                    second_cuts += 1;
+                }
+            }
+        }
+        assert!(cuts > 100 && second_cuts > 1_000, "{cuts} {second_cuts}");
+    }
+
+    #[test]
+    fn places_that_are_worn_are_passed_over_until_none_is_left() {
+        let mut chip = Chip::new();
+        chip.worn = std::vec![1, 2, 4];
+        for life in 1..40 {
+            assert_eq!(chip.boot(), Ok(life));
+        }
+        chip.worn = (0..8).collect();
+        let mut last = Ok(0);
+        for _ in 0..8 {
+            last = chip.boot();
+        }
+        assert_eq!(last, Err(BootError::Worn));
+    }
+
+    /// Before its first life a board's pages hold anything, old code for example.
+    #[test]
+    fn what_stood_there_before_is_erased() {
+        let mut chip = Chip::new();
+        chip.bytes.fill(0x5A);
+        assert_eq!([chip.boot(), chip.boot(), chip.boot()], [Ok(1), Ok(2), Ok(3)]);
+    }
+
+    proptest! {
+        /// Whatever stands in the pages: there is a count, and the next life has a greater one.
+        #[test]
+        fn nothing_in_flash_panics(bytes in prop::collection::vec(any::<u8>(), 2 * PAGE), sound in 0_usize..8, high: u64) {
+            let mut chip = Chip::new();
+            chip.bytes = bytes;
+            chip.bytes[sound * RECORD_BYTES..][..RECORD_BYTES].copy_from_slice(&record(high));
+            match chip.boot() {
+                Ok(count) => {
+                    prop_assert!(count > high);
+                    prop_assert_eq!(chip.boot(), count.checked_add(1).ok_or(BootError::Worn));
+                }
+                Err(error) => prop_assert_eq!((error, high), (BootError::Worn, u64::MAX)),
+            }
+        }
+    }
+}

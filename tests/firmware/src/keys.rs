@@ -1,0 +1,145 @@
+//! The keys of a fleet of boards, drawn anew for each run, and what boards are told with them: made with the commands that a
+//! user types.
+
+use std::ffi::OsStr;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::rc::Rc;
+
+use anyhow::{Context, Result, ensure};
+use cara_std::keys::place;
+use cara_std::{Builder, Fleet, Identity};
+use tempfile::TempDir;
+
+use crate::board::{FLEET, Who};
+
+/// The manager of all boards, unless somebody says another.
+pub(crate) const MANAGER: &str = "depot/1";
+
+/// What a manager and its boards prove who they are with.
+pub(crate) struct Keys {
+    cara: PathBuf,
+    /// The keys, and what boards have been told. It goes when this does.
+    folder: TempDir,
+    kind: Kind,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Kind {
+    Drawn,
+    /// Everybody has been told in words to be insecure.
+    Insecure,
+    /// Boards are told who they are, and get no keys.
+    Missing,
+}
+
+impl Keys {
+    /// Draws keys for a manager and its vehicles, each as NAME/ID. Nobody else's keys fit them.
+    pub(crate) fn draw(cara: Option<&Path>, fleet: u32, manager: &str, vehicles: &[&str]) -> Result<Rc<Self>> {
+        let keys = Self::new(cara, Kind::Drawn)?;
+        let (fleet, manager) = (fleet.to_string(), format!("{manager}@m_unit"));
+        let arguments = ["keys", "new-fleet", "--fleet", &fleet, &manager];
+        keys.run(arguments.into_iter().chain(vehicles.iter().copied()))?;
+        Ok(Rc::new(keys))
+    }
+
+    /// Keys of the boards that are tested.
+    pub(crate) fn of_boards(cara: Option<&Path>) -> Result<Rc<Self>> {
+        Self::draw(cara, FLEET, MANAGER, &["agv-17/17", "agv-18/18"])
+    }
+
+    /// No keys, but plain mode, asked for in words.
+    pub(crate) fn insecure(cara: Option<&Path>) -> Result<Rc<Self>> {
+        Self::new(cara, Kind::Insecure).map(Rc::new)
+    }
+
+    /// Other keys of the same boards.
+    pub(crate) fn others(&self) -> Result<Rc<Self>> {
+        Self::of_boards(Some(&self.cara))
+    }
+
+    /// Boards with settings and without keys.
+    pub(crate) fn none(&self) -> Result<Rc<Self>> {
+        Self::new(Some(&self.cara), Kind::Missing).map(Rc::new)
+    }
+
+    /// Boards in plain mode beside these.
+    pub(crate) fn plain(&self) -> Result<Rc<Self>> {
+        Self::insecure(Some(&self.cara))
+    }
+
+    fn new(cara: Option<&Path>, kind: Kind) -> Result<Self> {
+        let beside = || Ok::<_, anyhow::Error>(std::env::current_exe()?.with_file_name("cara"));
+        let cara = cara.map_or_else(beside, |cara| Ok(cara.to_owned()))?;
+        ensure!(cara.is_file(), "{} is not there: cargo build --package cara-cli", cara.display());
+        // Control sockets, and keys, are not made where others could enter; a temporary folder is its owner's alone.
+        let folder = tempfile::Builder::new().prefix("boards").tempdir().context("cannot make a folder for keys")?;
+        Ok(Self { cara, folder, kind })
+    }
+
+    /// The command, which finds these keys, and control sockets of this run only.
+    pub(crate) fn command(&self) -> Command {
+        let mut command = Command::new(&self.cara);
+        command.env("CARA_KEYS", self.folder.path()).env("CARA_CONTROL_DIR", self.folder.path());
+        command.stdin(Stdio::null());
+        command
+    }
+
+    /// Words without which the command would look for keys.
+    pub(crate) fn words(&self) -> &'static [&'static str] {
+        if self.kind == Kind::Insecure { &["--insecure"] } else { &[] }
+    }
+
+    /// The manager's keys; none in plain mode.
+    pub(crate) fn manager_file(&self) -> Option<PathBuf> {
+        let (name, id) = MANAGER.split_once('/')?;
+        let manager = Identity::m_unit(name, id.parse().ok()?).ok()?;
+        (self.kind == Kind::Drawn).then(|| self.file_of(&manager, FLEET))
+    }
+
+    /// Gives a manager its keys.
+    pub(crate) fn give(&self, builder: Builder<()>) -> Result<Builder<()>> {
+        match (self.kind, self.manager_file()) {
+            (Kind::Insecure, _) => Ok(builder.insecure()),
+            (_, file) => Ok(builder.key_file(file.context("there are no keys for a manager")?)),
+        }
+    }
+
+    fn file_of(&self, identity: &Identity, fleet: u32) -> PathBuf {
+        self.folder.path().join(place::file_name(identity, Fleet(fleet)))
+    }
+
+    /// The file with what a board is told, and the one in which it counts its lives. A board that has been told before is
+    /// not told again.
+    pub(crate) fn told(&self, who: &Who, address: &str) -> Result<(PathBuf, PathBuf)> {
+        let Who { name, id, manager, fleet, manager_address, .. } = who;
+        let mut stem = format!("{name}-{id}-{}", address.replace(['.', '/'], "-"));
+        stem.extend(manager_address.iter().map(|_| "-directly"));
+        let [told, boots] = ["told", "boots"].map(|end| self.folder.path().join(format!("{stem}.{end}")));
+        if told.exists() {
+            return Ok((told, boots));
+        }
+        let keys = self.file_of(&Identity::s_unit(name, *id)?, *fleet);
+        let (id, fleet) = (id.to_string(), fleet.to_string());
+        let mut words: Vec<&OsStr> = ["provision", "lm3s6965evb", "--name", name, "--id", &id, "--manager", manager]
+            .into_iter()
+            .chain(["--fleet", &fleet, "--address", address])
+            .chain(manager_address.iter().flat_map(|address| ["--manager-address", address]))
+            .chain(self.words().iter().copied())
+            .map(OsStr::new)
+            .collect();
+        words.extend(["--output".as_ref(), told.as_os_str()]);
+        if self.kind == Kind::Drawn {
+            words.extend(["--keys".as_ref(), keys.as_os_str()]);
+        }
+        self.run(words)?;
+        Ok((told, boots))
+    }
+
+    fn run<A: AsRef<OsStr>>(&self, words: impl IntoIterator<Item = A>) -> Result<()> {
+        let output = self.command().args(words).output().context("cannot start cara")?;
+        let said = String::from_utf8_lossy(&output.stderr);
+        ensure!(output.status.success(), "cara: {said}");
+        Ok(())
+    }
+}
