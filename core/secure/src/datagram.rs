@@ -86,6 +86,11 @@ impl Sealer {
         self.next >= DATAGRAMS_PER_KEY
     }
 
+    #[cfg(test)]
+    pub(crate) const fn at(next: u64) -> Self {
+        Self { key: DatagramKey([0; KEY_BYTES]), generation: 0, next }
+    }
+
     /// The number of the next datagram.
     pub(crate) const fn next_number(&self) -> u64 {
         self.next

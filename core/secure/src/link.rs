@@ -517,7 +517,150 @@ impl Secure for Cipher {
 
 #[cfg(test)]
 mod tests {
+    #![allow(clippy::indexing_slicing, clippy::unwrap_used)]
     use super::*;
+    use crate::channel::FRAMES_PER_HANDSHAKE;
+    use crate::datagram::{DATAGRAMS_PER_KEY, OVERHEAD};
+    use std::vec::Vec;
+
+    fn credentials(fresh: u8) -> Credentials {
+        Credentials::new(PairKey::new([5; KEY_BYTES]), [fresh; KEY_BYTES])
+    }
+
+    /// The two ends of a proof; whatever they were before.
+    fn proven(dialler: &mut Noise, other: &mut Noise, fresh: u8) {
+        let first = dialler.prove(true, credentials(fresh)).unwrap().unwrap();
+        assert_eq!(other.prove(false, credentials(fresh + 1)), Ok(None));
+        let second = other.answer(&first).unwrap().unwrap();
+        assert_eq!(dialler.answer(&second), Ok(None));
+    }
+
+    /// Two ends of a live link.
+    fn live() -> (Noise, Noise) {
+        let (mut dialler, mut other) = (Noise::new(), Noise::new());
+        for end in [&mut dialler, &mut other] {
+            end.introduce(b"hello of one");
+            end.introduce(b"hello of the other");
+        }
+        proven(&mut dialler, &mut other, 1);
+        confirm(&mut dialler, &mut other).unwrap();
+        confirm(&mut other, &mut dialler).unwrap();
+        (dialler, other)
+    }
+
+    fn confirm(from: &mut Noise, to: &mut Noise) -> Result<(), CloseReason> {
+        to.confirmed(&from.confirmation())
+    }
+
+    fn turn(from: &mut Noise, to: &mut Noise) {
+        from.turn().unwrap();
+        to.turned().unwrap();
+    }
+
+    fn sealed(from: &mut Noise, text: &[u8]) -> Vec<u8> {
+        let mut frame = [text, &[0; TAG_BYTES]].concat();
+        from.seal(&mut frame).unwrap();
+        frame
+    }
+
+    fn datagram(from: &mut Noise, text: &[u8]) -> Vec<u8> {
+        let mut datagram = std::vec![0; text.len() + OVERHEAD];
+        datagram[datagram::HEADER_BYTES..][..text.len()].copy_from_slice(text);
+        assert!(from.seal_datagram(b"plain", &mut datagram));
+        datagram
+    }
+
+    #[test]
+    fn a_renewal_changes_each_direction_at_its_own_frame() {
+        let (mut dialler, mut other) = live();
+        let before = [dialler.confirmation(), other.confirmation()];
+        proven(&mut dialler, &mut other, 11);
+        let late = sealed(&mut dialler, b"under the old key");
+        turn(&mut other, &mut dialler);
+        let answer = sealed(&mut other, b"under the new one");
+        assert_eq!(other.open(&mut late.clone()).unwrap(), b"under the old key");
+        assert_eq!(dialler.open(&mut answer.clone()).unwrap(), b"under the new one");
+        confirm(&mut other, &mut dialler).unwrap();
+        turn(&mut dialler, &mut other);
+        assert_eq!(other.open(&mut sealed(&mut dialler, b"new too")).unwrap(), b"new too");
+        confirm(&mut dialler, &mut other).unwrap();
+        for (end, before) in [&dialler, &other].into_iter().zip(before) {
+            assert_eq!((end.confirmation()[0], before[0]), (1, 0), "the generation");
+            assert_ne!(end.confirmation()[1..], before[1..], "the key of datagrams");
+        }
+        assert!(other.open(&mut late.clone()).is_err(), "what was recorded ends the link");
+    }
+
+    #[test]
+    fn datagrams_keep_their_key_until_the_other_end_has_the_new_one() {
+        let (mut dialler, mut other) = live();
+        proven(&mut dialler, &mut other, 11);
+        turn(&mut other, &mut dialler);
+        confirm(&mut other, &mut dialler).unwrap();
+        turn(&mut dialler, &mut other);
+        confirm(&mut dialler, &mut other).unwrap();
+        let old = datagram(&mut other, b"old");
+        assert_eq!(old[0], 0);
+        other.acknowledged().unwrap();
+        assert!(!dialler.hears_newest());
+        let new = datagram(&mut other, b"new");
+        assert_eq!(new[0], 1);
+        assert_eq!(dialler.open_datagram(b"plain", &mut new.clone()).unwrap(), b"new");
+        assert!(dialler.hears_newest());
+        assert_eq!(dialler.open_datagram(b"plain", &mut old.clone()).unwrap(), b"old");
+        let later = datagram(&mut dialler, b"late");
+        dialler.acknowledged().unwrap();
+        other.forget_previous();
+        assert_eq!(other.open_datagram(b"plain", &mut later.clone()), Err(Unopened::Forged));
+    }
+
+    #[test]
+    fn what_comes_out_of_its_turn_is_an_error() {
+        let (mut dialler, mut other) = live();
+        let wrong = Err(CloseReason::Protocol);
+        assert_eq!((dialler.turn(), dialler.turned(), dialler.acknowledged()), (wrong, wrong, wrong));
+        assert!(confirm(&mut other, &mut dialler).is_err(), "it is confirmed already");
+        assert!(dialler.answer(&[0; PROOF_BYTES]).is_err());
+        let (mut dialler, mut other) = live();
+        proven(&mut dialler, &mut other, 11);
+        assert!(dialler.prove(true, credentials(21)).is_err(), "one at a time");
+        assert!(confirm(&mut other, &mut dialler).is_err(), "not before its turn");
+        turn(&mut other, &mut dialler);
+        assert_eq!((other.turn(), dialler.turned()), (wrong, wrong), "once each");
+        let told = other.confirmation();
+        assert!(dialler.confirmed(&[&[2], &told[1..]].concat()).is_err(), "the next generation only");
+        assert_eq!(dialler.confirmed(&told), Ok(()));
+        assert!(dialler.confirmed(&told).is_err(), "once");
+        assert_eq!(dialler.acknowledged(), wrong, "not before it has turned itself");
+    }
+
+    #[test]
+    fn the_generation_goes_round() {
+        let (mut dialler, mut other) = live();
+        for round in 1..=300_u32 {
+            proven(&mut dialler, &mut other, 11);
+            turn(&mut other, &mut dialler);
+            confirm(&mut other, &mut dialler).unwrap();
+            turn(&mut dialler, &mut other);
+            confirm(&mut dialler, &mut other).unwrap();
+            other.acknowledged().unwrap();
+            dialler.acknowledged().unwrap();
+            let mut datagram = datagram(&mut dialler, b"x");
+            assert_eq!(u32::from(datagram[0]), round % 256);
+            assert!(other.open_datagram(b"plain", &mut datagram).is_ok());
+        }
+    }
+
+    #[test]
+    fn what_has_sealed_too_much_is_worn() {
+        let (mut dialler, mut other) = live();
+        assert!(!dialler.is_worn());
+        dialler.sealing().unwrap().sealer = Sealer::at(DATAGRAMS_PER_KEY);
+        assert!(dialler.is_worn());
+        assert!(!other.is_worn());
+        other.sealing().unwrap().channel.jump(FRAMES_PER_HANDSHAKE);
+        assert!(other.is_worn());
+    }
 
     /// Each link of a board has one.
     #[test]

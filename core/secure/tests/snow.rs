@@ -3,7 +3,7 @@
 
 use cara_core::host::secure::Seal;
 use cara_secure::channel::{Channel, FRAMES_PER_KEY, TAG_BYTES};
-use cara_secure::handshake::{Initiator, MESSAGE_BYTES, answer, prologue};
+use cara_secure::handshake::{Initiator, MESSAGE_BYTES, answer, prologue, renewal};
 use cara_secure::keys::PairKey;
 
 const SUITE: &str = "Noise_NNpsk0_25519_ChaChaPoly_BLAKE2s";
@@ -52,6 +52,37 @@ fn snow_begins() {
     assert_eq!(theirs.write_message(&[], &mut message).unwrap(), MESSAGE_BYTES);
     let (agreed, reply) = answer(&PairKey::new(KEY), &prologue, &[4; 32], &message).unwrap();
     assert_eq!(theirs.read_message(&reply, &mut []).unwrap(), 0);
+    talk(agreed.channel, theirs);
+}
+
+/// The handshake with which a live link makes its keys anew covers the hash of the one before, which is Noise's.
+#[test]
+fn snow_takes_part_in_a_renewal_in_both_roles() {
+    let first = prologue(b"hello of one", b"hello of the other");
+    let mut theirs = snow(&first, true);
+    let mut message = [0; MESSAGE_BYTES];
+    theirs.write_message(&[], &mut message).unwrap();
+    let (agreed, reply) = answer(&PairKey::new(KEY), &first, &[4; 32], &message).unwrap();
+    theirs.read_message(&reply, &mut []).unwrap();
+    assert_eq!(theirs.get_handshake_hash(), agreed.binding);
+
+    let again = renewal(&agreed.binding);
+    let (initiator, message) = Initiator::begin(&PairKey::new(KEY), &again, &[5; 32]).unwrap();
+    let mut theirs = snow(&again, false);
+    theirs.read_message(&message, &mut []).unwrap();
+    let mut reply = [0; MESSAGE_BYTES];
+    theirs.write_message(&[], &mut reply).unwrap();
+    let agreed = initiator.finish(&reply).unwrap();
+    assert_eq!(theirs.get_handshake_hash(), agreed.binding);
+    talk(agreed.channel, theirs);
+
+    let third = renewal(&agreed.binding);
+    let mut theirs = snow(&third, true);
+    let mut message = [0; MESSAGE_BYTES];
+    theirs.write_message(&[], &mut message).unwrap();
+    assert!(answer(&PairKey::new(KEY), &again, &[6; 32], &message).is_err(), "of another handshake");
+    let (agreed, reply) = answer(&PairKey::new(KEY), &third, &[6; 32], &message).unwrap();
+    theirs.read_message(&reply, &mut []).unwrap();
     talk(agreed.channel, theirs);
 }
 

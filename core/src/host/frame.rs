@@ -326,4 +326,24 @@ mod tests {
         let mut out = [0; 100];
         assert!(ChunkWriter::new(&mut out, cut, Priority::Normal, 100).is_none());
     }
+
+    #[test]
+    fn a_turn_is_told_from_every_other_frame() {
+        for overhead in [0, 16] {
+            let mut out = [0; 128];
+            for (frame, turns) in [
+                (Frame::TURN, true),
+                (Frame::Proof(&[0; 48]), false),
+                (Frame::ACKNOWLEDGEMENT, false),
+                (Frame::Confirm(&[7; 33]), false),
+                (Frame::Session(&[7]), false),
+                (Frame::Ping, false),
+            ] {
+                let length = encode(&frame, overhead, &mut out);
+                assert_eq!(length, encoded_length(&frame, overhead));
+                assert_eq!(is_turn(&out[..length], overhead), turns, "{frame:?}");
+            }
+        }
+        assert!(!is_turn(&[], 0) && !is_turn(&[1, 0], 0));
+    }
 }

@@ -32,11 +32,13 @@ const RENEWAL: Duration = Duration::from_secs(2);
 struct Sent {
     stream: Vec<u8>,
     datagrams: VecDeque<Vec<u8>>,
+    /// The network takes nothing more into the stream.
+    full: bool,
 }
 
 impl Mailman for Sent {
     fn write(&mut self, _: LinkId, slices: &[&[u8]]) -> Result<usize, CloseReason> {
-        let bytes = slices.concat();
+        let bytes = if self.full { Vec::new() } else { slices.concat() };
         self.stream.extend(&bytes);
         Ok(bytes.len())
     }
@@ -225,6 +227,18 @@ impl End {
         let options = RequestOptions { priority: Some(priority), ..RequestOptions::default() };
         let _ = self.session.request(context!(self), "stop", &parameters, &options, false);
         self.session.flush_gathered(context!(self));
+    }
+
+    /// The network takes nothing more into the stream, and all room for frames of the protocol itself is in use.
+    pub(crate) fn clog(&mut self) {
+        self.sent.full = true;
+        while self.session.ping(context!(self)).is_ok() {}
+    }
+
+    /// The network goes on.
+    pub(crate) fn unclog(&mut self) {
+        self.sent.full = false;
+        self.session.writable(context!(self));
     }
 
     pub(crate) fn wait(&mut self, span: Duration) {

@@ -209,6 +209,29 @@ fn a_peer_that_does_not_go_on_loses_its_link() {
     assert_eq!(renewed(&ends.agv), 0);
 }
 
+/// Whoever has something to say and finds no room says it later.
+#[test]
+fn a_renewal_waits_for_room_in_the_stream() {
+    for clogged in [true, false] {
+        let mut ends = before();
+        for step in 0..12 {
+            // Before, between and behind each of its frames.
+            if let Some(carried) = ends.next() {
+                ends.deliver(&carried);
+            }
+            ends.end(clogged).clog();
+            if step == 0 {
+                ends.agv.wait(STEP);
+            }
+            ends.carry();
+            ends.end(clogged).unclog();
+        }
+        ends.carry();
+        assert_eq!((renewed(&ends.manager), renewed(&ends.agv)), (1, 1), "manager: {clogged}");
+        assert!(ends.manager.session.is_live() && ends.agv.session.is_live());
+    }
+}
+
 /// Calls that are asked while each single frame of the renewal is on its way, in either direction, run once.
 #[test]
 fn calls_go_on_at_every_step_of_a_renewal() {

@@ -8,8 +8,8 @@ use proptest::prelude::*;
 use super::super::harness::{self, Item, Numbered, Wire, link, pattern, read};
 use super::super::{Link, LinkCounter};
 use crate::config::{EMERGENCY_BYTES, Priority};
-use crate::error::{Error, Limit};
-use crate::host::frame::Frame;
+use crate::error::{CloseReason, Error, Limit};
+use crate::host::frame::{self, Frame};
 use crate::host::secure::{Plain, Seal};
 use crate::storage::{Boxed, LEFT_BY_SENDING, Pool};
 
@@ -224,4 +224,74 @@ fn framing_is_the_same_however_little_the_network_takes() {
         })
         .collect();
     assert!(streams.iter().all(|stream| *stream == streams[0]));
+}
+
+/// A cipher whose tags tell the key, which a turn changes.
+#[derive(Default)]
+struct Turning {
+    key: u8,
+}
+
+impl Seal for Turning {
+    fn overhead(&self) -> usize {
+        16
+    }
+
+    fn seal(&mut self, frame: &mut [u8]) -> Result<(), CloseReason> {
+        let tag = frame.len() - 16;
+        frame[tag..].fill(self.key);
+        Ok(())
+    }
+
+    fn turn(&mut self) -> Result<(), CloseReason> {
+        self.key += 1;
+        Ok(())
+    }
+
+    fn open<'f>(&mut self, frame: &'f mut [u8]) -> Result<&'f mut [u8], CloseReason> {
+        Ok(frame)
+    }
+}
+
+/// (kind, key) of each frame.
+fn kinds_and_keys(mut bytes: &[u8]) -> Vec<(u8, u8)> {
+    let mut seen = Vec::new();
+    while let Some(length) = frame::first_frame_length(bytes) {
+        seen.push((bytes[frame::HEADER_BYTES], bytes[length - 1]));
+        bytes = &bytes[length..];
+    }
+    seen
+}
+
+#[test]
+fn keys_change_right_behind_the_turn_whatever_waits() {
+    for step in [1, 7, 100, 1_100, 20_000] {
+        let (mut link, mut wire, mut pool) = (link(Turning::default()), Wire::default(), pool(1, 9000));
+        send(&mut link, &mut wire, &mut pool, Priority::Normal, &pattern(1, 5000)).unwrap();
+        wire.budget = 1_500;
+        link.flush(&mut wire, &mut pool).unwrap();
+        assert!(link.send_frames(&[Frame::Proof(&[1; 48]), Frame::TURN, Frame::Confirm(&[2; 33])]));
+        while link.queued() > 0 {
+            wire.budget = step;
+            link.flush(&mut wire, &mut pool).unwrap();
+        }
+        let seen = kinds_and_keys(&wire.bytes);
+        let turn = seen.windows(2).position(|pair| pair == [(7, 0), (7, 0)]).unwrap() + 1;
+        assert!(turn > 1 && turn + 2 < seen.len(), "in the middle of the message: {seen:?}");
+        assert!(seen[..=turn].iter().all(|(_, key)| *key == 0) && seen[turn + 1..].iter().all(|(_, key)| *key == 1));
+        assert_eq!(seen[turn + 1].0, 8, "{seen:?}");
+    }
+}
+
+#[test]
+fn frames_that_belong_together_are_accepted_together_or_not_at_all() {
+    let (mut link, mut wire, mut pool) = (link(Turning::default()), Wire::default(), pool(1, 9000));
+    let together = [Frame::Proof(&[1; 48]), Frame::TURN, Frame::Confirm(&[2; 33])];
+    while link.send_frames(&together) {}
+    let queued = link.queued();
+    assert!(link.send_frame(&Frame::Ping), "there is room for less");
+    assert!(!link.send_frames(&together));
+    assert_eq!(link.queued(), queued + 19);
+    drain(&mut link, &mut wire, &mut pool);
+    assert!(link.send_frames(&together));
 }
