@@ -5,6 +5,8 @@
 mod datagrams;
 #[path = "doctor/namespace.rs"]
 mod namespace;
+#[path = "doctor/secured.rs"]
+mod secured;
 #[path = "doctor/support.rs"]
 mod support;
 
@@ -356,7 +358,12 @@ fn a_link_on_which_signs_of_life_get_lost_is_told() {
 fn broadcasts_that_do_not_reach_the_other_host_are_told() {
     namespace::inside("broadcasts_that_do_not_reach_the_other_host_are_told", &["nft", "nsenter"], || {
         let clinic = Clinic::on_all_interfaces();
-        let far = Peer::start(&[MANAGER, &clinic.fleet.to_string(), &clinic.port.to_string()]);
+        let far = Peer::start(&[
+            MANAGER,
+            &clinic.fleet.to_string(),
+            &clinic.port.to_string(),
+            clinic.key_file("boss").to_str().unwrap(),
+        ]);
         for command in [
             "link set lo up",
             "link add v0 type veth peer name v1",

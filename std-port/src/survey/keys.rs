@@ -1,7 +1,7 @@
 //! The keys with which a survey asks secured fleets, and tells whose datagrams are.
 
 use std::collections::BTreeSet;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use cara_core::distribution::authenticator::CODE_BYTES;
 use cara_core::distribution::identity::{Fleet, Identity};
@@ -40,7 +40,7 @@ impl SurveyKeys {
     /// All that this user has in the places where keys are looked for ([`place`]): rings of units, and roots.
     pub fn gather() -> Self {
         let mut keys = Self::default();
-        place::rings().into_iter().take(FILES).for_each(|path| keys.add_found(&path));
+        place::rings().into_iter().take(FILES).for_each(|path| keys.add_file(&path));
         for folder in place::folders() {
             for fleet in Store::fleets(&folder) {
                 match Store::peek(&folder, fleet) {
@@ -57,6 +57,14 @@ impl SurveyKeys {
         let mut keys = Self::default();
         keys.add_ring(&KeyRing::load(path)?);
         Ok(keys)
+    }
+
+    /// Adds those of one unit's file, or what is wrong with it to the [refused](Self::refused).
+    pub fn add_file(&mut self, path: &Path) {
+        match KeyRing::load(path) {
+            Ok(ring) => self.add_ring(&ring),
+            Err(error) => self.refuse(error),
+        }
     }
 
     /// Adds those of a unit's ring.
@@ -118,17 +126,11 @@ impl SurveyKeys {
         }
     }
 
-    fn add_found(&mut self, path: &PathBuf) {
-        match KeyRing::load(path) {
-            Ok(ring) => self.add_ring(&ring),
-            Err(error) => self.refuse(error),
-        }
-    }
-
     /// What belongs to another user, or cannot be opened, is no mistake: a host's units have users of their own.
     fn refuse(&mut self, error: KeyError) {
         let is_mistake = !matches!(error, KeyError::Foreign { .. } | KeyError::System { .. });
-        if is_mistake && self.refused.len() < REFUSED {
+        let is_told = self.refused.iter().any(|known| known.to_string() == error.to_string());
+        if is_mistake && !is_told && self.refused.len() < REFUSED {
             self.refused.push(error);
         }
     }
@@ -206,9 +208,9 @@ mod tests {
         assert!(SurveyKeys::of_file(&path).unwrap().has(Fleet(7)));
         fs::set_permissions(&path, fs::Permissions::from_mode(0o640)).unwrap();
         let mut keys = SurveyKeys::default();
-        keys.add_found(&path);
+        keys.add_file(&path);
         assert!(matches!(keys.refused(), [KeyError::Open { .. }]) && keys.fleets().is_empty());
-        keys.add_found(&folder.path().join("absent"));
+        keys.add_file(&folder.path().join("absent"));
         assert_eq!(keys.refused().len(), 1);
     }
 

@@ -92,8 +92,13 @@ impl<S: Storage> Node<S> {
     /// gets the answer of a broadcast, which the fleet's code alone is for.
     pub(super) fn answer_survey(&mut self, now: Instant, from: SocketAddr, who_has: &WhoHas, mode: Mode) {
         let delay = self.spread(who_has.expected);
+        self.answer_unpaired(now + delay, from, who_has, mode);
+    }
+
+    /// Plans an answer to one of whom and this unit there is no pair, and so no key.
+    pub(super) fn answer_unpaired(&mut self, at: Instant, to: SocketAddr, who_has: &WhoHas, mode: Mode) {
         let nonce = if mode == Mode::Secured { 0 } else { who_has.nonce };
-        self.answer_later(now + delay, from, &who_has.identity, nonce);
+        self.answer_later(at, to, &who_has.identity, nonce);
     }
 
     /// Plans an answer to one node. One that finds no room is left to the broadcast, or to the next question.

@@ -238,7 +238,7 @@ impl<S: Storage> Node<S> {
     }
 
     pub(super) fn heard_who_has(&mut self, now: Instant, from: SocketAddr, who_has: &WhoHas, mode: Mode) {
-        if self.is_own(now, from, &who_has.identity, who_has.epoch, Some(who_has)) {
+        if self.is_own(now, from, &who_has.identity, who_has.epoch, Some((who_has, mode))) {
             return;
         }
         self.counters.add(NodeCounter::WhoHasHeard, 1);

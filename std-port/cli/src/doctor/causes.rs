@@ -144,6 +144,7 @@ pub(crate) fn refusal(manager: &str, refused: &RefusedInfo) -> Option<Finding> {
         "WrongManager" => Id::WrongManager,
         "Fleet" => Id::OtherFleet,
         "Version" => Id::OtherVersion,
+        "NoKey" => Id::NoPairKey,
         // Each end has dialled the other: one link is refused, and the other one is in use.
         "AlreadyConnected" => return None,
         _ => Id::Refused,

@@ -5,8 +5,8 @@ use std::net::SocketAddr;
 use std::time::Duration;
 
 use cara_std::control::RunningUnit;
-use cara_std::survey::{Foreign, Heard, Reach};
-use cara_std::{Fleet, Identity, Interfaces, Manager, Role};
+use cara_std::survey::{Foreign, Heard, Ports, Reach, Standing};
+use cara_std::{Fleet, Identity, Interfaces, Manager, Mode, Role};
 
 use super::dial::Dial;
 use super::running::Running;
@@ -26,6 +26,12 @@ pub(crate) struct Evidence {
     pub(crate) interfaces: Interfaces,
     /// Loopback alone is used because the environment says so, not the command line.
     pub(crate) loopback_by_environment: bool,
+    /// The mode of the fleet, where it is known: as asked for, or that of its units on this host.
+    pub(crate) mode: Option<Mode>,
+    pub(crate) keys: KeysSeen,
+    /// Where is listened.
+    pub(crate) ports: Ports,
+    /// The one of them that is meant where one is named.
     pub(crate) port: u16,
     /// How long was listened.
     pub(crate) listened: Duration,
@@ -47,6 +53,15 @@ pub(crate) struct Evidence {
     pub(crate) answered_alone: Vec<SocketAddr>,
 }
 
+/// What keys of the fleet there are.
+#[derive(Clone, Debug)]
+pub(crate) struct KeysSeen {
+    /// There are some.
+    pub(crate) has: bool,
+    /// Files that were not taken, and why.
+    pub(crate) refused: Vec<String>,
+}
+
 /// One life of a node, between two times at which it was seen.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Life {
@@ -60,9 +75,25 @@ pub(crate) struct Life {
 }
 
 impl Evidence {
-    /// Units of our fleet and version.
+    /// Units of our fleet and version, and, as far as that is known, of our mode and keys.
     pub(crate) fn ours(&self) -> impl Iterator<Item = (&Heard, &Identity)> {
-        self.units().filter(|(heard, _)| heard.same_version() && heard.fleet == self.fleet)
+        self.units().filter(|(heard, _)| self.is_ours(heard))
+    }
+
+    pub(crate) fn is_ours(&self, heard: &Heard) -> bool {
+        let same_mode = self.mode.is_none_or(|mode| mode == heard.mode);
+        heard.same_version() && heard.fleet == self.fleet && same_mode && heard.standing != Standing::OtherKeys
+    }
+
+    /// The interfaces that are used and up, each once.
+    pub(crate) fn interfaces_up(&self) -> Vec<&str> {
+        let mut names: Vec<&str> = Vec::new();
+        for reach in self.reach.iter().filter(|reach| reach.interface.up) {
+            if !names.contains(&reach.interface.name.as_str()) {
+                names.push(&reach.interface.name);
+            }
+        }
+        names
     }
 
     /// Everybody who has a name, other surveys left out.

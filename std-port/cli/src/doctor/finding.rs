@@ -44,6 +44,18 @@ pub(crate) enum Id {
     OtherVersion,
     /// Another fleet.
     OtherFleet,
+    /// Plain mode at one end, keys at the other.
+    ModeMismatch,
+    /// No keys of the fleet on this host.
+    KeysMissing,
+    /// A file with keys that is not taken.
+    KeyFileRefused,
+    /// Keys of another root, or of a generation that is over.
+    WrongKeys,
+    /// Generations of keys of which neither end takes the other's.
+    KeyGenerations,
+    /// The manager has no key for the node.
+    NoPairKey,
     /// Two live nodes with one identity.
     Duplicate,
     /// A node that starts again and again.
@@ -85,7 +97,7 @@ pub(crate) enum Id {
 impl Id {
     /// All of them, in the order of the documentation.
     #[cfg(test)]
-    pub(crate) const ALL: [Self; 31] = [
+    pub(crate) const ALL: [Self; 37] = [
         Self::PortInUse,
         Self::NoInterface,
         Self::InterfaceDown,
@@ -99,6 +111,12 @@ impl Id {
         Self::ControlFull,
         Self::OtherVersion,
         Self::OtherFleet,
+        Self::ModeMismatch,
+        Self::KeysMissing,
+        Self::KeyFileRefused,
+        Self::WrongKeys,
+        Self::KeyGenerations,
+        Self::NoPairKey,
         Self::Duplicate,
         Self::Restarting,
         Self::Full,
@@ -135,6 +153,12 @@ impl Id {
             Self::ControlFull => "control-full",
             Self::OtherVersion => "other-version",
             Self::OtherFleet => "other-fleet",
+            Self::ModeMismatch => "mode-mismatch",
+            Self::KeysMissing => "keys-missing",
+            Self::KeyFileRefused => "key-file-refused",
+            Self::WrongKeys => "wrong-keys",
+            Self::KeyGenerations => "key-generations",
+            Self::NoPairKey => "no-pair-key",
             Self::Duplicate => "duplicate",
             Self::Restarting => "restarting",
             Self::Full => "full",

@@ -1,5 +1,6 @@
 //! What on this host keeps every node away: interfaces, broadcasts, firewall, descriptors.
 
+use std::collections::BTreeSet;
 use std::io::ErrorKind;
 
 use cara_std::Interfaces;
@@ -32,8 +33,8 @@ pub(crate) fn check(seen: &Evidence) -> Vec<Finding> {
     let no_way = if seen.interfaces == Interfaces::All { no_interface(seen) } else { loopback_only(seen) };
     let mut found: Vec<Finding> = no_way.into_iter().collect();
     let own_way: Vec<&Reach> = seen.reach.iter().filter(|reach| reach.interface.up).collect();
-    found.extend(own_way.iter().filter_map(|reach| send_refused(seen, reach)));
-    found.extend(own_way.iter().filter_map(|reach| broadcast_lost(seen, reach)));
+    found.extend(own_way.iter().filter_map(|reach| send_refused(reach)));
+    found.extend(own_way.iter().filter_map(|reach| broadcast_lost(reach)));
     found.extend(seen.running.iter().filter_map(exhausted));
     found
 }
@@ -52,9 +53,9 @@ fn loopback_only(seen: &Evidence) -> Option<Finding> {
 fn no_interface(seen: &Evidence) -> Option<Finding> {
     let real: Vec<&Reach> = seen.reach.iter().filter(|reach| !reach.interface.address.is_loopback()).collect();
     let names = |reaches: &[&Reach]| {
-        let named: Vec<_> =
-            reaches.iter().map(|reach| format!("{} ({})", reach.interface.name, reach.interface.address)).collect();
-        named.join(", ")
+        let named = reaches.iter().map(|reach| format!("{} ({})", reach.interface.name, reach.interface.address));
+        // Each is there once for each port.
+        named.collect::<BTreeSet<_>>().into_iter().collect::<Vec<_>>().join(", ")
     };
     if real.is_empty() {
         let devices = match seen.devices.is_empty() {
@@ -88,15 +89,15 @@ fn no_interface(seen: &Evidence) -> Option<Finding> {
     })
 }
 
-fn send_refused(seen: &Evidence, reach: &Reach) -> Option<Finding> {
+fn send_refused(reach: &Reach) -> Option<Finding> {
     let kind = reach.refused.filter(|_| reach.sent == 0)?;
     let name = &reach.interface.name;
     let (found, advice) = match kind {
         ErrorKind::PermissionDenied => (
-            format!("the system does not let broadcasts to UDP port {} out of {name}", seen.port),
+            format!("the system does not let broadcasts to UDP port {} out of {name}", reach.port),
             format!(
                 "let UDP port {} out in this host's firewall (`nft list ruleset`, `iptables -S OUTPUT`)",
-                seen.port
+                reach.port
             ),
         ),
         kind => (
@@ -107,14 +108,14 @@ fn send_refused(seen: &Evidence, reach: &Reach) -> Option<Finding> {
     Some(Finding::error(Id::SendRefused, found, advice).about(name).certain(kind == ErrorKind::PermissionDenied))
 }
 
-fn broadcast_lost(seen: &Evidence, reach: &Reach) -> Option<Finding> {
+fn broadcast_lost(reach: &Reach) -> Option<Finding> {
     (reach.sent >= ENOUGH && reach.heard == 0).then(|| {
         let name = &reach.interface.name;
         let found =
             format!("{} broadcasts left through {name}, and none came back to another socket of this host", reach.sent);
         let advice = format!(
             "let UDP port {} in in this host's firewall, broadcasts included (`nft list ruleset`, `iptables -S INPUT`)",
-            seen.port
+            reach.port
         );
         Finding::error(Id::BroadcastLost, found, advice).about(name)
     })

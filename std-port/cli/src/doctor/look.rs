@@ -3,18 +3,20 @@
 use std::collections::HashSet;
 use std::fs;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::path::Path;
 use std::time::{Duration, Instant};
 
-use cara_std::survey::Survey;
-use cara_std::{Error, Fleet, Identity, Interfaces};
+use cara_std::survey::{Ports, Survey, SurveyKeys};
+use cara_std::{Error, Fleet, Identity, Interfaces, Mode};
 
 use super::dial::Dials;
-use super::evidence::{Evidence, Life};
+use super::evidence::{Evidence, KeysSeen, Life};
 use super::finding::Finding;
-use super::running::Sources;
+use super::running::{Running, Sources};
 use super::which::Which;
 use super::{holder, host, network, node, unasked};
 use crate::global::Global;
+use crate::listening;
 
 /// Between two looks at what has come.
 const SLICE: Duration = Duration::from_millis(250);
@@ -42,16 +44,24 @@ pub(crate) fn look(which: Option<Which>, listen: Duration, global: &Global) -> a
     let running = sources.look();
     let silent = sources.unasked.iter().map(|unit| unit.fleet);
     let fleets: HashSet<u32> = running.iter().map(|running| running.unit.fleet).chain(silent).collect();
-    let ports: HashSet<u16> = running.iter().map(|running| running.unit.discovery_port).collect();
-    let fleet = global.fleet.or_else(|| only(&fleets)).unwrap_or(0);
-    let port = global.discovery_port.or_else(|| only(&ports)).unwrap_or_else(|| global.port());
+    let keys = keys(global, &running)?;
+    let keyed: HashSet<u32> = keys.fleets().iter().map(|fleet| fleet.0).collect();
+    let known = global.fleet.or_else(|| only(&fleets));
+    let fleet = known.or_else(|| only(&keyed).filter(|_| fleets.is_empty())).unwrap_or(0);
+    let (ports, mode) = (ports(global, &running), mode(global, &running, fleet));
     let evidence = Evidence {
         which,
         fleet: Fleet(fleet),
         fleet_known: global.fleet.is_some() || !fleets.is_empty(),
         interfaces: global.interfaces(),
         loopback_by_environment: !global.loopback && global.interfaces() == Interfaces::Loopback,
-        port,
+        mode,
+        keys: KeysSeen {
+            has: keys.has(Fleet(fleet)),
+            refused: keys.refused().iter().map(ToString::to_string).collect(),
+        },
+        ports,
+        port: ports.of(mode.unwrap_or(Mode::Secured)),
         listened: Duration::ZERO,
         heard: Vec::new(),
         foreign: Vec::new(),
@@ -64,14 +74,44 @@ pub(crate) fn look(which: Option<Which>, listen: Duration, global: &Global) -> a
         connected_lives: Vec::new(),
         answered_alone: Vec::new(),
     };
-    match Survey::open(evidence.interfaces, port) {
-        Ok(survey) => Ok(Looking::new(survey, sources, evidence).until(listen)),
+    match Survey::open(evidence.interfaces, ports) {
+        Ok(survey) => Ok(Looking::new(survey.with_keys(keys), sources, evidence).until(listen)),
         Err(Error::PortInUse) => {
+            let in_use = |port: &u16| matches!(Survey::open(evidence.interfaces, *port), Err(Error::PortInUse));
+            let port = ports.numbers().into_iter().find(in_use).unwrap_or(evidence.port);
             let findings = vec![host::port_in_use(port, &holder::holders(port))];
             Ok(Looked { evidence, findings })
         }
         Err(error) => Err(error.into()),
     }
+}
+
+/// Those of the command, and those of the units that can be asked, as far as their files can be read.
+fn keys(global: &Global, running: &[Running]) -> anyhow::Result<SurveyKeys> {
+    let mut keys = listening::keys(global)?;
+    if !global.insecure && global.key_file.is_none() {
+        let files = running.iter().filter_map(|unit| unit.unit.keys.as_ref()?.file.as_ref());
+        files.for_each(|file| keys.add_file(Path::new(file)));
+    }
+    Ok(keys)
+}
+
+/// Those of both modes, unless another one is told, or is that of the units of this host.
+fn ports(global: &Global, running: &[Running]) -> Ports {
+    let used: HashSet<u16> = running.iter().map(|unit| unit.unit.discovery_port).collect();
+    let usual = Ports::Usual.numbers();
+    let other = only(&used).filter(|port| !usual.contains(port));
+    global.discovery_port.or(other).map_or(Ports::Usual, Ports::One)
+}
+
+/// What was asked for, or what all units of the fleet on this host have.
+fn mode(global: &Global, running: &[Running], fleet: u32) -> Option<Mode> {
+    if global.insecure {
+        return Some(Mode::Plain);
+    }
+    let mut modes = running.iter().filter(|unit| unit.unit.fleet == fleet).map(Running::mode);
+    let first = modes.next()??;
+    modes.all(|mode| mode == Some(first)).then_some(first)
 }
 
 fn only<T: Copy>(set: &HashSet<T>) -> Option<T> {
@@ -156,7 +196,9 @@ impl Looking {
             m_units.iter().filter(|(_, identity)| silent(identity)).map(|(heard, _)| heard.source).collect();
         if m_units.len() == targets.len() && self.evidence.interfaces == Interfaces::All {
             let known = neighbours(&fs::read_to_string("/proc/net/arp").unwrap_or_default());
-            let strangers = known.into_iter().map(|ip| SocketAddr::new(IpAddr::V4(ip), self.evidence.port));
+            let ports = self.evidence.ports.numbers();
+            let at = |ip| ports.iter().map(move |port| SocketAddr::new(IpAddr::V4(ip), *port));
+            let strangers = known.into_iter().flat_map(at);
             targets.extend(strangers.take(MOST_ALONE));
         }
         for target in targets.iter().take(MOST_ALONE) {

@@ -1,7 +1,7 @@
 //! `cara doctor`: why is a node not there, and what is strange on this host and its network?
 //!
 //! [`look`] gathers evidence: a survey of the network, connections that are tried, the units of this host through their
-//! control sockets. [`node`], [`connected`], [`network`] and [`host`] judge it; they are pure.
+//! control sockets. [`node`], [`connected`], [`network`], [`secured`] and [`host`] judge it; they are pure.
 
 mod causes;
 mod connected;
@@ -16,6 +16,7 @@ mod network;
 mod node;
 mod report;
 mod running;
+mod secured;
 mod unasked;
 mod which;
 

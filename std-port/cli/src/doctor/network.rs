@@ -15,6 +15,7 @@ use super::finding::{Finding, Id, Severity};
 use super::host;
 use super::left;
 use super::running::Running;
+use super::secured;
 
 /// Findings of one kind that are listed.
 const MOST: usize = 8;
@@ -30,9 +31,11 @@ pub(crate) fn check(seen: &Evidence) -> Vec<Finding> {
         .iter_mut()
         .filter(|finding| finding.id == Id::NoInterface)
         .for_each(|finding| finding.severity = Severity::Warning);
+    found.extend(secured::of_host(seen));
     found.extend(lives(seen));
     found.extend(managers(seen));
     found.extend(searching(seen));
+    found.extend(secured::all(seen));
     found.extend(versions(seen));
     found.extend(seen.running.iter().flat_map(|unit| running(seen, unit)));
     found.extend(fleets(seen));
@@ -119,6 +122,7 @@ fn versions(seen: &Evidence) -> Vec<Finding> {
 /// What a unit of this host has met.
 fn running(seen: &Evidence, unit: &Running) -> Vec<Finding> {
     let mut found: Vec<Finding> = host::few_descriptors(unit).into_iter().chain(host::access_table(unit)).collect();
+    found.extend(secured::failed_proofs(unit));
     if unit.is_full() {
         found.push(no_room(unit));
     }
@@ -183,8 +187,10 @@ fn foreign(seen: &Evidence) -> Vec<Finding> {
     for foreign in &seen.foreign {
         *hosts.entry(foreign.source.ip()).or_default() += u64::from(foreign.datagrams);
     }
+    let ports: Vec<String> = seen.ports.numbers().iter().map(u16::to_string).collect();
+    let ports = ports.join(" or ");
     let told = hosts.iter().take(MOST).map(|(host, datagrams)| {
-        let found = format!("{host} sent {datagrams} datagrams to UDP port {} that are not CARA's", seen.port);
+        let found = format!("{host} sent {datagrams} datagrams to UDP port {ports} that are not CARA's");
         let advice = "they are dropped; if they are many, find the program there and give it another port";
         Finding::warning(Id::ForeignDatagrams, found, advice).about(host)
     });

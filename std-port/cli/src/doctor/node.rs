@@ -16,6 +16,7 @@ use super::finding::{Finding, Id};
 use super::host;
 use super::left;
 use super::running::Running;
+use super::secured;
 use super::which::{Which, quoted};
 use crate::close_names::close;
 
@@ -37,21 +38,24 @@ pub(crate) fn check(seen: &Evidence, which: &Which) -> Vec<Finding> {
     {
         return connected::check(seen, unit, node);
     }
-    let mut ours: Vec<_> = seen.of(which).filter(|(heard, _)| is_ours(seen, heard)).collect();
+    let mut ours: Vec<_> = seen.of(which).filter(|(heard, _)| seen.is_ours(heard)).collect();
     ours.sort_by_key(|(heard, _)| heard.last);
     if let Some((heard, identity)) = ours.last().filter(|(_, identity)| identity.role() == Role::MUnit) {
         return heard_m_unit(seen, heard, identity);
     }
     let mut found = twin_managers(seen);
-    found.extend(match ours.last() {
-        Some((heard, identity)) => heard_s_unit(seen, which, heard, identity),
-        None => strange(seen, which).unwrap_or_else(|| silent(seen, which)),
-    });
+    let heard = match ours.last() {
+        Some((heard, identity)) => Some(heard_s_unit(seen, which, heard, identity)),
+        None => strange(seen, which),
+    };
+    match heard {
+        Some(heard) => found.extend(heard.into_iter().chain(secured::of_host(seen))),
+        None => {
+            found.extend(secured::of_silence(seen));
+            found.extend(silent(seen, which));
+        }
+    }
     found
-}
-
-fn is_ours(seen: &Evidence, heard: &Heard) -> bool {
-    heard.same_version() && heard.fleet == seen.fleet
 }
 
 fn runs_here(seen: &Evidence, unit: &Running) -> Vec<Finding> {
@@ -66,17 +70,32 @@ fn runs_here(seen: &Evidence, unit: &Running) -> Vec<Finding> {
     vec![Finding::info(Id::Answers, found, "nothing needs to be done").about(unit.name()).certain(certain)]
 }
 
-/// In another fleet or of another version, and in ours not at all.
+/// In another fleet, mode or version, or with other keys, and in ours not at all.
 fn strange(seen: &Evidence, which: &Which) -> Option<Vec<Finding>> {
     let (heard, identity) = seen.of(which).last()?;
     let about = identity.to_string();
-    let finding = match heard.same_version() {
-        true => and_its_manager(seen, heard, other_fleet(seen, &about, heard)),
-        false => other_version(&about, heard),
+    let finding = match apart(seen, &about, heard) {
+        finding if finding.id == Id::OtherFleet => and_its_manager(seen, heard, finding),
+        finding => finding,
     };
     // It could be of ours as well until that has had time to show itself.
     let certain = seen.listened >= ANSWERED;
     Some(vec![finding.certain(certain)])
+}
+
+/// Why a unit that was heard is none of ours.
+fn apart(seen: &Evidence, about: &str, heard: &Heard) -> Finding {
+    if !heard.same_version() {
+        return other_version(about, heard);
+    }
+    if heard.fleet != seen.fleet {
+        return other_fleet(seen, about, heard);
+    }
+    if seen.mode.is_some_and(|mode| mode != heard.mode) {
+        let wanted = heard.wanted.as_ref().map_or_else(|| format!("fleet {} here", seen.fleet.0), text_of);
+        return secured::mode_mismatch(seen, about, heard, &wanted);
+    }
+    secured::wrong_keys(seen, about, heard)
 }
 
 /// A node of another fleet may look for another manager as well.
@@ -130,14 +149,11 @@ fn silent(seen: &Evidence, which: &Which) -> Vec<Finding> {
 }
 
 fn not_heard(seen: &Evidence, which: &Which) -> Finding {
-    let used = seen.reach.iter().filter(|reach| reach.interface.up).map(|reach| reach.interface.name.clone());
-    let mut used: Vec<String> = used.collect();
-    used.dedup();
     let mut found = format!(
         "nothing was heard from {} in {:.0} s on {}, fleet {}",
         which.0,
         seen.listened.as_secs_f32(),
-        used.join(", "),
+        seen.interfaces_up().join(", "),
         seen.fleet.0
     );
     if let Some(name) = nearest(seen, which) {
@@ -222,7 +238,10 @@ fn heard_s_unit(seen: &Evidence, which: &Which, heard: &Heard, identity: &Identi
     let restarts = restarting(&name, &lives);
     let Some(wanted) = &heard.wanted else { return restarts.into_iter().collect() };
     let mut found: Vec<Finding> = restarts.into_iter().collect();
-    found.extend(of_its_manager(seen, &name, wanted));
+    found.extend(of_its_manager(seen, &name, heard, wanted));
+    if found.is_empty() {
+        found.extend(secured::generations(seen, &name, heard));
+    }
     if found.is_empty() {
         found.push(not_joining(seen, &name, wanted));
     }
@@ -230,8 +249,12 @@ fn heard_s_unit(seen: &Evidence, which: &Which, heard: &Heard, identity: &Identi
 }
 
 /// What is wrong with the manager that a node looks for, as seen from here.
-fn of_its_manager(seen: &Evidence, name: &str, wanted: &Manager) -> Option<Finding> {
+fn of_its_manager(seen: &Evidence, name: &str, node: &Heard, wanted: &Manager) -> Option<Finding> {
     let manager = text_of(wanted);
+    let keys = secured::two_modes(seen, name, node);
+    if let Some(found) = keys.or_else(|| secured::generations(seen, name, node).filter(|found| found.certain)) {
+        return Some(found.certain(seen.listened >= ANSWERED));
+    }
     let here =
         seen.running.iter().find(|unit| unit.name() == manager && unit.is_m_unit() && unit.unit.fleet == seen.fleet.0);
     let Some(heard) = seen.manager(wanted) else {
@@ -241,8 +264,7 @@ fn of_its_manager(seen: &Evidence, name: &str, wanted: &Manager) -> Option<Findi
         }
         let abroad = seen.units().find(|(_, identity)| wanted.is(identity));
         let found = match abroad {
-            Some((heard, _)) if !heard.same_version() => other_version(&manager, heard),
-            Some((heard, _)) => other_fleet(seen, &manager, heard),
+            Some((heard, _)) => apart(seen, &manager, heard),
             None => missing_manager(seen, name, wanted),
         };
         return Some(found.certain(seen.listened >= ANSWERED));

@@ -6,6 +6,7 @@ use serde_json::{Value, json};
 
 use super::finding::{Finding, Severity};
 use super::look::Looked;
+use crate::listening;
 use crate::output::{self, BAD, FAINT, GOOD, HEADING, PLAIN};
 
 /// As one object.
@@ -20,6 +21,9 @@ pub(crate) fn object(looked: &Looked) -> Value {
                 "address": heard.source.to_string(),
                 "version": heard.version,
                 "fleet": heard.fleet.0,
+                "mode": listening::shown_mode(heard.mode),
+                "proof": listening::shown_standing(heard.standing).0,
+                "generation": listening::shown_standing(heard.standing).1,
                 "node": heard.identity.as_ref().map(ToString::to_string),
                 "role": heard.identity.as_ref().map(|identity| super::role(identity.role())),
                 "epoch": heard.epoch.map(|epoch| format!("{:016x}", epoch.0)),
@@ -36,9 +40,11 @@ pub(crate) fn object(looked: &Looked) -> Value {
     json!({
         "node": seen.which.as_ref().map(|which| &which.0),
         "fleet": seen.fleet.0,
-        "discovery_port": seen.port,
+        "mode": seen.mode.map(listening::shown_mode),
+        "keys": seen.keys.has,
+        "discovery_ports": seen.ports.numbers(),
         "listened_ms": seen.listened.as_millis() as u64,
-        "interfaces": seen.reach.iter().filter(|reach| reach.interface.up).map(|reach| &reach.interface.name).collect::<Vec<_>>(),
+        "interfaces": seen.interfaces_up(),
         "units_asked": seen.running.iter().map(|running| running.name()).collect::<Vec<_>>(),
         "findings": looked.findings,
         "heard": heard,
@@ -61,10 +67,12 @@ pub(crate) fn text(looked: &Looked) -> std::io::Result<()> {
     } else {
         format!("asked {}", asked.join(", "))
     };
+    let ports: Vec<String> = seen.ports.numbers().iter().map(u16::to_string).collect();
+    let ports = ports.join(" and ");
+    let without = if seen.keys.has { "" } else { ", without its keys" };
     output::line(format_args!(
-        "{FAINT}listened {:.1} s on UDP port {}, fleet {}; nodes heard: {heard}; {asked}{FAINT:#}",
+        "{FAINT}listened {:.1} s on UDP port {ports}, fleet {}{without}; nodes heard: {heard}; {asked}{FAINT:#}",
         seen.listened.as_secs_f32(),
-        seen.port,
         seen.fleet.0
     ))
 }

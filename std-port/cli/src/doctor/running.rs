@@ -5,6 +5,7 @@ use std::sync::mpsc::{Receiver, channel};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use cara_std::Mode;
 use cara_std::control::protocol::{Answer, NodeInfo, Question, RefusedInfo, UnitInfo};
 use cara_std::control::{self, Client, ControlError, RunningUnit, UnitState};
 
@@ -42,6 +43,15 @@ impl Running {
     /// `NAME/ID`.
     pub(crate) fn name(&self) -> String {
         format!("{}/{}", self.unit.name, self.unit.id)
+    }
+
+    /// Its mode, where it tells.
+    pub(crate) fn mode(&self) -> Option<Mode> {
+        match self.unit.mode.as_deref()? {
+            "plain" => Some(Mode::Plain),
+            "secured" => Some(Mode::Secured),
+            _ => None,
+        }
     }
 
     pub(crate) fn is_m_unit(&self) -> bool {

@@ -99,11 +99,12 @@ impl Drop for Peer {
 fn as_peer() {
     let part = std::env::var(PART).expect("the part to play");
     let words: Vec<&str> = part.split(' ').collect();
-    let [MANAGER, fleet, port] = words[..] else { panic!("{part}") };
+    let [MANAGER, fleet, port, keys] = words[..] else { panic!("{part}") };
     let mut input = std::io::stdin();
     input.read_exact(&mut [0; 3]).unwrap();
     let system = CommunicationSystem::builder("boss", 1).unwrap().fleet(fleet.parse().unwrap());
-    let system = system.discovery_port(port.parse().unwrap()).control(Control::Off).insecure().build_system().unwrap();
+    let system =
+        system.discovery_port(port.parse().unwrap()).control(Control::Off).key_file(keys).build_system().unwrap();
     system.start().unwrap();
     // Until the other end goes.
     let _ = input.read_to_end(&mut Vec::new());

@@ -3,12 +3,14 @@
 use std::fs::Permissions;
 use std::net::{Ipv4Addr, UdpSocket};
 use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use cara_std::control::Control;
-use cara_std::{Builder, CommunicationSystem, Constraints, Interfaces, Unit};
+use cara_std::keys::{FleetKeys, KeyRing, Store, place};
+use cara_std::{Builder, CommunicationSystem, Constraints, Fleet, Identity, Interfaces, Unit};
 use serde_json::Value;
 
 use crate::datagrams::Search;
@@ -21,6 +23,8 @@ pub(crate) struct Clinic {
     pub(crate) fleet: u32,
     pub(crate) port: u16,
     sockets: tempfile::TempDir,
+    /// Where the fleet's root is, and the files of all nodes.
+    keys: tempfile::TempDir,
     loopback: bool,
 }
 
@@ -31,15 +35,17 @@ impl Clinic {
 
     /// For inside a namespace alone.
     pub(crate) fn on_all_interfaces() -> Self {
-        let sockets = private_directory();
-        Self { fleet: random() as u32, port: free_port(), sockets, loopback: false }
+        let (sockets, keys, fleet) = (private_directory(), private_directory(), random() as u32);
+        Store::create(keys.path(), draw(fleet)).unwrap().save().unwrap();
+        Self { fleet, port: free_port(), sockets, keys, loopback: false }
     }
 
     /// A builder of an m_unit `name/1`.
     pub(crate) fn system(&self, name: &str) -> Builder<()> {
         let system = CommunicationSystem::builder(name, 1).unwrap().fleet(self.fleet).discovery_port(self.port);
         let socket = self.sockets.path().join(format!("{name}.sock"));
-        system.interfaces(Interfaces::Loopback).insecure().control(Control::Path(socket))
+        let system = system.keys(self.ring(&Identity::m_unit(name, 1).unwrap()));
+        system.interfaces(Interfaces::Loopback).control(Control::Path(socket))
     }
 
     /// A running manager `name/1`.
@@ -61,9 +67,8 @@ impl Clinic {
             env!("CARGO_BIN_EXE_cara"),
         ]);
         command.args(["node", "--name", "boss", "--id", "1", "--loopback", "--fleet", &self.fleet.to_string()]);
-        command
-            .args(["--insecure", "--discovery-port", &self.port.to_string()])
-            .env("CARA_CONTROL_DIR", self.sockets.path());
+        command.arg("--key-file").arg(self.key_file("boss"));
+        command.args(["--discovery-port", &self.port.to_string()]).env("CARA_CONTROL_DIR", self.sockets.path());
         command.stdout(Stdio::null()).stderr(Stdio::null());
         Killed(command.spawn().unwrap())
     }
@@ -71,7 +76,27 @@ impl Clinic {
     /// An s_unit of the manager `manager/1`.
     pub(crate) fn unit(&self, name: &str, id: u32, manager: &str) -> Builder<()> {
         let unit = Unit::builder(name, id, manager, 1).unwrap().fleet(self.fleet).discovery_port(self.port);
-        unit.interfaces(Interfaces::Loopback).insecure()
+        unit.keys(self.ring(&Identity::s_unit(name, id).unwrap())).interfaces(Interfaces::Loopback)
+    }
+
+    /// The keys of a node of [`draw`], as they are in the folder now.
+    pub(crate) fn ring(&self, identity: &Identity) -> KeyRing {
+        self.root().ring(identity).unwrap()
+    }
+
+    /// The fleet's root.
+    pub(crate) fn root(&self) -> FleetKeys {
+        Store::peek(self.keys.path(), Fleet(self.fleet)).unwrap()
+    }
+
+    /// The same, to be changed.
+    pub(crate) fn store(&self) -> Store {
+        Store::open(self.keys.path(), Fleet(self.fleet)).unwrap()
+    }
+
+    /// The file with the keys of the m_unit `name/1`.
+    pub(crate) fn key_file(&self, name: &str) -> PathBuf {
+        self.keys.path().join(place::file_name(&Identity::m_unit(name, 1).unwrap(), Fleet(self.fleet)))
     }
 
     pub(crate) fn started(&self, unit: Builder<()>) -> Unit {
@@ -82,7 +107,7 @@ impl Clinic {
 
     /// A search of an s_unit that is not there, for `boss/1`.
     pub(crate) fn search(&self, name: &'static str, id: u8, epoch: u8) -> Search {
-        Search::new(self.fleet, self.port, name, id, epoch)
+        Search::new(self.fleet, self.port, self.root().discovery(1), name, id, epoch)
     }
 
     /// Any datagram.
@@ -93,16 +118,21 @@ impl Clinic {
 
     /// What the doctor says on this host.
     pub(crate) fn doctor(&self, arguments: &[&str]) -> Told {
-        self.told(arguments, self.sockets.path())
+        self.told(arguments, self.sockets.path(), self.keys.path())
+    }
+
+    /// What it says where only these keys are.
+    pub(crate) fn doctor_with_keys(&self, keys: &Path, arguments: &[&str]) -> Told {
+        self.told(arguments, self.sockets.path(), keys)
     }
 
     /// What it says where no unit can be asked.
     pub(crate) fn stranger(&self, arguments: &[&str]) -> Told {
-        self.told(arguments, private_directory().path())
+        self.told(arguments, private_directory().path(), self.keys.path())
     }
 
-    fn told(&self, arguments: &[&str], sockets: &std::path::Path) -> Told {
-        let (code, output, errors) = self.run(arguments, sockets);
+    fn told(&self, arguments: &[&str], sockets: &Path, keys: &Path) -> Told {
+        let (code, output, errors) = self.run(arguments, sockets, keys);
         let told = serde_json::from_str(&output).unwrap_or_else(|_| panic!("{output}{errors}"));
         Told { told, code }
     }
@@ -114,22 +144,21 @@ impl Clinic {
 
     /// Exit code, standard output and standard error.
     pub(crate) fn output(&self, arguments: &[&str]) -> (i32, String, String) {
-        self.run(arguments, self.sockets.path())
+        self.run(arguments, self.sockets.path(), self.keys.path())
     }
 
-    fn run(&self, arguments: &[&str], sockets: &std::path::Path) -> (i32, String, String) {
+    fn run(&self, arguments: &[&str], sockets: &Path, keys: &Path) -> (i32, String, String) {
         let mut command = Command::new(env!("CARGO_BIN_EXE_cara"));
         command.args([
             "doctor",
             "--json",
-            "--insecure",
             "--fleet",
             &self.fleet.to_string(),
             "--discovery-port",
             &self.port.to_string(),
         ]);
         command.args(self.loopback.then_some("--loopback")).args(arguments);
-        command.env("CARA_CONTROL_DIR", sockets).env_remove("CARA_INTERFACES");
+        command.env("CARA_CONTROL_DIR", sockets).env("CARA_KEYS", keys).env_remove("CARA_INTERFACES");
         let output = command.output().unwrap();
         let text = |bytes| String::from_utf8(bytes).unwrap();
         (output.status.code().unwrap(), text(output.stdout), text(output.stderr))
@@ -179,6 +208,11 @@ impl Told {
         self.findings()[index]["found"].as_str().unwrap()
     }
 
+    /// What to do.
+    pub(crate) fn advice(&self, index: usize) -> &str {
+        self.findings()[index]["advice"].as_str().unwrap()
+    }
+
     fn findings(&self) -> &Vec<Value> {
         self.told["findings"].as_array().unwrap()
     }
@@ -222,7 +256,18 @@ fn free_port() -> u16 {
     free.next().unwrap()
 }
 
-fn private_directory() -> tempfile::TempDir {
+/// A root for all nodes of these tests, each of which belongs to every m_unit.
+pub(crate) fn draw(fleet: u32) -> FleetKeys {
+    let mut keys = FleetKeys::draw(Fleet(fleet)).unwrap();
+    let managers = ["boss", "chief", "bos"].map(|name| Identity::m_unit(name, 1).unwrap());
+    managers.iter().for_each(|manager| keys.add(manager, &[]).unwrap());
+    for (name, id) in [("agv", 7), ("agv-8", 8), ("first", 1), ("second", 2), ("lost", 3), ("far", 4)] {
+        keys.add(&Identity::s_unit(name, id).unwrap(), &managers).unwrap();
+    }
+    keys
+}
+
+pub(crate) fn private_directory() -> tempfile::TempDir {
     tempfile::Builder::new().permissions(Permissions::from_mode(0o700)).tempdir().unwrap()
 }
 

@@ -470,6 +470,10 @@ fn whoever_looks_at_a_secured_network_needs_the_fleets_key_alone() {
     let read = Datagram::decode(&sent[0].1, FLEET, &FleetOnly);
     let Ok(Datagram::Announce(answer)) = read else { panic!("{read:?}") };
     assert_eq!((answer.nonce, answer.identity.name()), (0, MANAGER));
+    // A second manager of one name hears of the first.
+    let twin = NodeConfig { epoch: Epoch(77), ..m_unit(MANAGER, MANAGER_ID) };
+    let (sent, withheld) = answers_of_secured(&WhoHas { wanted: None, ..search_of(&twin, 1) });
+    assert_eq!((sent.len(), withheld), (1, 0));
     // A vehicle without a key of the pair gets none, and the operator is told.
     let (sent, withheld) = answers_of_secured(&search_of(&s_unit("agv", 9), 1));
     assert_eq!((sent.len(), withheld), (0, 1));

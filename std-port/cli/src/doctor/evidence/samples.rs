@@ -4,11 +4,11 @@ use std::net::SocketAddr;
 use std::time::Duration;
 
 use cara_std::control::protocol::{ConstraintsInfo, KeysInfo, NodeInfo, UnitInfo};
-use cara_std::survey::{Heard, Reach, Standing};
+use cara_std::survey::{Heard, Ports, Reach, Standing};
 use cara_std::sys::interfaces::Interface;
 use cara_std::{Epoch, Fleet, Identity, Interfaces, Manager, Mode};
 
-use super::{Evidence, Life};
+use super::{Evidence, KeysSeen, Life};
 use crate::doctor::VERSION;
 use crate::doctor::running::{Counted, Running};
 
@@ -22,6 +22,9 @@ pub(crate) fn evidence() -> Evidence {
         fleet_known: true,
         interfaces: Interfaces::All,
         loopback_by_environment: false,
+        mode: None,
+        keys: KeysSeen { has: true, refused: Vec::new() },
+        ports: Ports::Usual,
         port: 21_971,
         listened: Duration::from_secs(16),
         heard: Vec::new(),

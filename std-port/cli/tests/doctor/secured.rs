@@ -1,0 +1,141 @@
+//! Modes and keys that keep a node and its manager apart.
+
+use std::fs::{Permissions, set_permissions};
+use std::os::unix::fs::PermissionsExt;
+
+use cara_std::control::Control;
+use cara_std::{Builder, CommunicationSystem, Identity};
+
+use crate::support::{Clinic, draw, private_directory, until};
+
+fn boss() -> Identity {
+    Identity::m_unit("boss", 1).unwrap()
+}
+
+fn agv() -> Identity {
+    Identity::s_unit("agv", 7).unwrap()
+}
+
+/// The manager `boss/1` with what else is said of it, running.
+fn manager(clinic: &Clinic, with: impl FnOnce(Builder<()>) -> Builder<()>) -> CommunicationSystem {
+    let manager = with(clinic.system("boss")).build_system().unwrap();
+    manager.start().unwrap();
+    manager
+}
+
+#[test]
+fn a_plain_node_of_a_secured_manager_and_the_other_way_round_is_told() {
+    let clinic = Clinic::new();
+    let secured = manager(&clinic, |boss| boss);
+    let _agv = clinic.started(clinic.unit("agv", 7, "boss").insecure());
+    for told in [clinic.doctor(&["agv"]), clinic.stranger(&["agv"]), clinic.doctor(&["--listen", "3s"])] {
+        told.is(&["mode-mismatch"], 4);
+        assert!(told.found(0).contains("agv/7 at ") && told.found(0).contains("boss/1 is secured"), "{told:?}");
+    }
+    secured.stop();
+    let clinic = Clinic::new();
+    let _plain = manager(&clinic, |boss| boss.insecure());
+    let _agv = clinic.started(clinic.unit("agv", 7, "boss"));
+    for told in [clinic.doctor(&["agv"]), clinic.stranger(&["agv"]), clinic.doctor(&["--listen", "3s"])] {
+        told.is(&["mode-mismatch"], 4);
+        assert!(told.found(0).contains("boss/1 is in plain mode"), "{told:?}");
+    }
+}
+
+#[test]
+fn without_keys_of_the_fleet_the_doctor_says_so_with_the_command() {
+    let clinic = Clinic::new();
+    let nothing = private_directory();
+    let told = clinic.doctor_with_keys(nothing.path(), &["agv", "--listen", "3s"]);
+    told.is(&["keys-missing", "not-heard"], 4);
+    assert!(told.advice(0).contains(&format!("`cara keys new-fleet --fleet {} ", clinic.fleet)), "{told:?}");
+    clinic.doctor_with_keys(nothing.path(), &["--listen", "3s"]).is(&["keys-missing", "no-manager"], 4);
+    // Whoever wants plain mode misses none.
+    clinic.doctor_with_keys(nothing.path(), &["agv", "--listen", "3s", "--insecure"]).is(&["not-heard"], 4);
+    clinic.doctor(&["agv", "--listen", "3s"]).is(&["not-heard"], 4);
+}
+
+#[test]
+fn keys_of_another_root_are_told_of_the_node_and_of_its_manager() {
+    let clinic = Clinic::new();
+    let others = draw(clinic.fleet);
+    let ours = manager(&clinic, |boss| boss);
+    let _agv = clinic.started(clinic.unit("agv", 7, "boss").keys(others.ring(&agv()).unwrap()));
+    for told in [clinic.doctor(&["agv"]), clinic.doctor(&["--listen", "10s"])] {
+        told.is(&["wrong-keys"], 4);
+        assert!(told.found(0).starts_with("agv/7 at "), "{told:?}");
+        assert!(told.advice(0).contains(&format!("`cara keys derive --fleet {} ", clinic.fleet)), "{told:?}");
+    }
+    ours.stop();
+    let clinic = Clinic::new();
+    // Its socket is another one's, as of a manager of another host.
+    let others = draw(clinic.fleet).ring(&boss()).unwrap();
+    let _far = manager(&clinic, |boss| boss.keys(others).control(Control::Off));
+    let _agv = clinic.started(clinic.unit("agv", 7, "boss"));
+    let told = clinic.doctor(&["agv"]);
+    told.is(&["wrong-keys"], 4);
+    assert!(told.found(0).starts_with("boss/1 at "), "{told:?}");
+}
+
+#[test]
+fn a_node_that_the_managers_file_does_not_have_is_told() {
+    let clinic = Clinic::new();
+    let mut without = clinic.root();
+    without.revoke(&[agv()]).unwrap();
+    let manager = manager(&clinic, |system| system.keys(without.ring(&boss()).unwrap()));
+    let _agv = clinic.started(clinic.unit("agv", 7, "boss"));
+    until("it was refused", || !manager.findings().is_empty());
+    for told in [clinic.doctor(&["agv"]), clinic.doctor(&["--listen", "3s"])] {
+        told.is(&["no-pair-key"], 4);
+        assert!(told.found(0).contains("agv/7"), "{told:?}");
+    }
+}
+
+#[test]
+fn a_change_of_keys_that_left_a_node_behind_is_told() {
+    let clinic = Clinic::new();
+    let old = clinic.ring(&agv());
+    let mut store = clinic.store();
+    store.keys_mut().rotate().unwrap();
+    store.keys_mut().switch().unwrap();
+    store.keys_mut().finish().unwrap();
+    store.save().unwrap();
+    drop(store);
+    let _manager = manager(&clinic, |boss| boss);
+    let _agv = clinic.started(clinic.unit("agv", 7, "boss").keys(old));
+    for told in [clinic.doctor(&["agv"]), clinic.doctor(&["--listen", "10s"])] {
+        told.is(&["key-generations"], 4);
+        assert!(told.found(0).contains("with generation 1 ") && told.found(0).contains("generation 2:"), "{told:?}");
+    }
+    // As on another host: both were heard, and neither takes the other.
+    clinic.stranger(&["agv"]).is(&["key-generations"], 4);
+}
+
+#[test]
+fn a_key_file_that_others_can_read_is_told_with_the_command() {
+    let clinic = Clinic::new();
+    let _manager = clinic.manager_of_few_files(1024);
+    until("it is up", || clinic.doctor(&["boss", "--listen", "0s"]).ids() == ["answers"]);
+    let file = clinic.key_file("boss");
+    set_permissions(&file, Permissions::from_mode(0o644)).unwrap();
+    let told = clinic.doctor(&["--listen", "3s"]);
+    told.is(&["key-file-refused"], 4);
+    assert!(told.found(0).contains("chmod 600"), "{told:?}");
+    // Nothing but this file, and nobody there: that is why nothing is heard.
+    let clinic = Clinic::new();
+    set_permissions(clinic.key_file("boss"), Permissions::from_mode(0o644)).unwrap();
+    let told = clinic.doctor_with_keys(&clinic.key_file("boss"), &["agv", "--listen", "3s"]);
+    told.is(&["key-file-refused", "not-heard"], 4);
+}
+
+#[test]
+fn a_fleet_in_plain_mode_is_looked_at_in_plain_mode() {
+    let clinic = Clinic::new();
+    let nothing = private_directory();
+    let plain = manager(&clinic, |boss| boss.insecure());
+    let _agv = clinic.started(clinic.unit("agv", 7, "boss").insecure());
+    until("it has come", || plain.number_of_s_units() == 1);
+    clinic.doctor_with_keys(nothing.path(), &["agv"]).is(&["connected"], 0);
+    clinic.doctor_with_keys(nothing.path(), &["--listen", "3s", "--insecure"]).is(&[], 0);
+    clinic.stranger(&["boss", "--insecure"]).is(&["answers"], 0);
+}
