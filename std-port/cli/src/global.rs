@@ -58,11 +58,6 @@ impl Global {
         if self.loopback { Interfaces::Loopback } else { Interfaces::from_environment() }
     }
 
-    /// The UDP port of broadcasts.
-    pub(crate) fn port(&self) -> u16 {
-        self.discovery_port.unwrap_or(self.keys().unwrap_or_default().mode().port())
-    }
-
     /// The keys of the command's unit, where the options say something about them.
     pub(crate) fn keys(&self) -> Option<Keys> {
         if self.insecure { Some(Keys::Insecure) } else { self.key_file.clone().map(Keys::File) }

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use cara_std::{Builder, Mode};
+use cara_std::Builder;
 
 /// The keys of a unit.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -17,14 +17,6 @@ pub(crate) enum Keys {
 }
 
 impl Keys {
-    /// The mode of a unit with these keys.
-    pub(crate) fn mode(&self) -> Mode {
-        match self {
-            Self::Found | Self::File(_) => Mode::Secured,
-            Self::Insecure => Mode::Plain,
-        }
-    }
-
     /// The builder of a unit that has them.
     pub(crate) fn given_to<T: Send + 'static>(&self, builder: Builder<T>) -> Builder<T> {
         match self {
