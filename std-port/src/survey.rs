@@ -25,6 +25,7 @@
 
 mod heard;
 mod keys;
+mod ports;
 
 use std::collections::HashSet;
 use std::hash::{BuildHasher, Hasher, RandomState};
@@ -32,7 +33,7 @@ use std::io;
 use std::net::{SocketAddr, SocketAddrV4, UdpSocket};
 use std::time::{Duration, Instant};
 
-use cara_core::config::{Mode, PLAIN_PORT, SECURED_PORT};
+use cara_core::config::Mode;
 use cara_core::distribution::authenticator::Authenticator;
 use cara_core::distribution::datagram::{Announce, Datagram, Header, SEARCH_BYTES, WhoHas};
 use cara_core::distribution::identity::{Epoch, Fleet, Identity};
@@ -42,6 +43,7 @@ use cara_core::host::secure::Plain;
 use self::heard::News;
 pub use self::heard::{Foreign, Heard, Reach, Standing};
 pub use self::keys::SurveyKeys;
+pub use self::ports::Ports;
 use crate::sys::datagram::{Datagrams, Socket};
 use crate::sys::epoll::{Epoll, Events, Interest};
 use crate::sys::interfaces::Interfaces;
@@ -60,39 +62,6 @@ const READ: usize = SEARCH_BYTES + 1;
 const BATCH: usize = 256;
 /// The token of the voice; each ear has its index.
 const VOICE: u64 = u64::MAX;
-
-/// Where a survey listens, and where its questions go.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Ports {
-    /// The port of plain mode and that of secured mode.
-    Usual,
-    /// One port for both modes.
-    One(u16),
-}
-
-impl Ports {
-    /// The ports.
-    pub fn numbers(self) -> Vec<u16> {
-        match self {
-            Self::Usual => vec![PLAIN_PORT, SECURED_PORT],
-            Self::One(port) => vec![port],
-        }
-    }
-
-    /// The one of a mode.
-    pub const fn of(self, mode: Mode) -> u16 {
-        match self {
-            Self::Usual => mode.port(),
-            Self::One(port) => port,
-        }
-    }
-}
-
-impl From<u16> for Ports {
-    fn from(port: u16) -> Self {
-        Self::One(port)
-    }
-}
 
 /// One who looks at a network. See the [module](self).
 #[derive(Debug)]
