@@ -9,6 +9,8 @@ crate::counters::counters! {
         BytesReceived,
         /// Messages received whole.
         MessagesReceived,
+        /// Links ended because what came could not be read, did not open, or was longer than it may be.
+        FramesRefused,
         /// Messages accepted for sending.
         MessagesSent,
         /// Bytes that the network took.

@@ -391,6 +391,9 @@ impl<S: Storage, C: Secure> Session<S, C> {
         cx: &mut Context<'_, S, M, B, H>,
         reason: CloseReason,
     ) {
+        if matches!(reason, CloseReason::Protocol | CloseReason::Oversize) {
+            self.link.counters.add(LinkCounter::FramesRefused, 1);
+        }
         self.farewell(cx, &Frame::Close(close_code(reason)));
         self.end(reason);
     }

@@ -54,6 +54,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         let hello = match Hello::decode(self.link.view(place, lent), mode) {
             Ok(hello) => hello,
             Err(error) => {
+                self.link.counters.add(LinkCounter::FramesRefused, 1);
                 self.refuse(cx, refusal_of(error));
                 return Outcome::Nothing;
             }

@@ -1,0 +1,323 @@
+//! Attacks on the links of a unit, whoever opens them.
+
+use std::io;
+
+use anyhow::Result;
+use cara_core::config::Mode;
+use cara_core::distribution::identity::Fleet;
+use cara_core::host::frame::Frame;
+use cara_secure::keys::PairKey;
+
+use crate::ground::Keys;
+use crate::speaker::{Claim, HANDSHAKE, STEPS, Said, Speaker, framed, request_in_clear};
+use crate::tally::Report;
+use crate::target::{Target, Visit};
+use crate::trial::{attack, control};
+
+/// Lengths of frames that no unit takes before the proof.
+const TOO_LONG: [usize; 6] = [318, 319, 320, 1_024, 4_096, 65_535];
+
+/// How much is tried.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Extent {
+    /// Everything.
+    Full,
+    /// Some of everything.
+    Quick,
+}
+
+impl Extent {
+    /// Some of many cases: all of them, or one in `of`.
+    pub fn some<C>(self, cases: Vec<C>, of: usize) -> Vec<C> {
+        match self {
+            Self::Full => cases,
+            Self::Quick => cases.into_iter().step_by(of).collect(),
+        }
+    }
+}
+
+/// All attacks on links.
+pub fn run(report: &mut Report, target: &dyn Target, extent: Extent) -> Result<()> {
+    with_the_key(report, target)?;
+    keys(report, target, extent)?;
+    without_a_key(report, target, extent)?;
+    plain(report, target, extent)?;
+    lengths(report, target, extent)?;
+    let record = record(target)?;
+    recorded_elsewhere(report, target, extent, &record)?;
+    recorded_here(report, target, extent)?;
+    whole_records(report, target, &record)
+}
+
+/// As many cases as the target has time for, evenly from all of them.
+fn share<C>(target: &dyn Target, cases: Vec<C>) -> Vec<C> {
+    let wanted = target.share(cases.len()).clamp(1, cases.len().max(1));
+    let of = cases.len().div_ceil(wanted).max(1);
+    cases.into_iter().step_by(of).collect()
+}
+
+/// The attacker with the key gets in: what counts successes can count them.
+fn with_the_key(report: &mut Report, target: &dyn Target) -> Result<()> {
+    control(report, target, "the same attacker with the key", &share(target, vec![(); 8]), |(), visit| {
+        let mut speaker = visit.speaker(&visit.keys.genuine)?;
+        speaker.converse(5)?;
+        speaker.hear_answer(speaker.last_id())?;
+        let asked = speaker.asked.clone();
+        speaker.finish();
+        // Its calls have priorities of their own, and run side by side.
+        let in_time = || {
+            let seen = (visit.seen)()?;
+            anyhow::Ok(seen.joins == 1 && asked.iter().all(|mark| seen.marks.contains(mark)))
+        };
+        Ok(in_time()? || in_time()? || in_time()?)
+    })
+}
+
+/// Which key somebody tries.
+type Which = fn(&Keys) -> &PairKey;
+
+fn keys(report: &mut Report, target: &dyn Target, extent: Extent) -> Result<()> {
+    let tried: [(&str, Which); 4] = [
+        ("wrong key", |keys| &keys.wrong),
+        ("key of another fleet", |keys| &keys.of_another_fleet),
+        ("key of before the change of keys", |keys| &keys.revoked),
+        ("key of another unit of the fleet", |keys| &keys.of_another_unit),
+    ];
+    for (name, which) in tried {
+        let cases = share(target, extent.some((0..120_u32).collect(), 4));
+        attack(report, target, name, &cases, |number, visit| {
+            let mut claim = visit.claim.clone();
+            // Every other one of another fleet says so, too.
+            if name.ends_with("another fleet") && number % 2 == 1 {
+                claim.fleet = Fleet(claim.fleet.0.wrapping_add(1));
+            }
+            let mut speaker = visit.speaker_as(Mode::Secured, claim, which(&visit.keys))?;
+            let _ = speaker.converse(STEPS);
+            visit.was_seen(speaker)
+        })?;
+    }
+    Ok(())
+}
+
+/// What somebody without any key says.
+#[derive(Clone, Copy, Debug)]
+enum Ruse {
+    RandomProof,
+    ZeroKey,
+    ConfirmInClear,
+    RequestInClear,
+    RequestAtOnce,
+    HelloTwice,
+    Reflect,
+    AnyFrame,
+    Noise,
+}
+
+const RUSES: [Ruse; 9] = [
+    Ruse::RandomProof,
+    Ruse::ZeroKey,
+    Ruse::ConfirmInClear,
+    Ruse::RequestInClear,
+    Ruse::RequestAtOnce,
+    Ruse::HelloTwice,
+    Ruse::Reflect,
+    Ruse::AnyFrame,
+    Ruse::Noise,
+];
+
+fn without_a_key(report: &mut Report, target: &dyn Target, extent: Extent) -> Result<()> {
+    let cases: Vec<Ruse> = RUSES.iter().copied().cycle().take(RUSES.len() * 24).collect();
+    // All of them are tried in any case.
+    let some = share(target, extent.some((0..cases.len()).collect(), 3)).len().max(RUSES.len());
+    let cases: Vec<Ruse> = cases.into_iter().take(some).collect();
+    attack(report, target, "no key", &cases, |ruse, visit| {
+        let key = if matches!(ruse, Ruse::ZeroKey) { PairKey::new([0; 32]) } else { visit.keys.wrong.clone() };
+        let mut speaker = visit.speaker(&key)?;
+        let _ = pretend(*ruse, &visit, &mut speaker);
+        visit.was_seen(speaker)
+    })
+}
+
+fn noise(length: usize) -> Vec<u8> {
+    std::iter::repeat_with(|| fastrand::u8(..)).take(length).collect()
+}
+
+/// Bytes as the body of a frame.
+pub(crate) fn in_frame(body: &[u8]) -> Vec<u8> {
+    [&(body.len() as u16).to_le_bytes()[..], body].concat()
+}
+
+fn pretend(ruse: Ruse, visit: &Visit<'_>, speaker: &mut Speaker) -> io::Result<()> {
+    match ruse {
+        Ruse::RequestAtOnce => return speaker.say_bytes(&request_in_clear()),
+        Ruse::Noise => return speaker.say_bytes(&noise(600)),
+        Ruse::ZeroKey => return speaker.converse(STEPS).map(drop),
+        _ => drop(speaker.converse(1)?),
+    }
+    let proof = || [&[7][..], &noise(48)].concat();
+    match ruse {
+        Ruse::RandomProof => {
+            speaker.say_bytes(&in_frame(&proof()))?;
+            (0..3).try_for_each(|_| speaker.say_bytes(&in_frame(&noise(50))))
+        }
+        Ruse::ConfirmInClear => {
+            speaker.say_bytes(&framed(&Frame::Confirm(&noise(33))))?;
+            speaker.say_bytes(&request_in_clear())
+        }
+        Ruse::RequestInClear => speaker.say_bytes(&request_in_clear()),
+        Ruse::HelloTwice => {
+            let claim = Claim { fleet: visit.claim.fleet, ..visit.claim.clone() };
+            let again = crate::speaker::hello(&claim, Mode::Secured, 9);
+            speaker.say_bytes(&framed(&Frame::Hello(&again)))?;
+            speaker.say_bytes(&request_in_clear())
+        }
+        Ruse::Reflect => {
+            // Whoever dialled hears the other one's hello only now.
+            let _ = speaker.step();
+            let heard = speaker.heard.clone();
+            heard.iter().try_for_each(|frame| speaker.say_bytes(frame))
+        }
+        _ => speaker.say_bytes(&in_frame(&[&[fastrand::u8(..)][..], &noise(fastrand::usize(..60))].concat())),
+    }
+}
+
+/// Somebody in plain mode, or who goes on in plain text after a secured hello.
+fn plain(report: &mut Report, target: &dyn Target, extent: Extent) -> Result<()> {
+    let cases = share(target, extent.some((0..60_u32).collect(), 3));
+    attack(report, target, "downgrade to plain", &cases, |_, visit| {
+        let mut speaker = visit.speaker_as(Mode::Plain, visit.claim.clone(), &visit.keys.wrong)?;
+        let _ = speaker.converse(STEPS);
+        visit.was_seen(speaker)
+    })
+}
+
+/// A step of the handshake and what is said instead of it.
+fn cut_and_long(steps: &[Said]) -> Vec<(usize, Vec<u8>)> {
+    let mut cases = Vec::new();
+    for (at, said) in steps.iter().enumerate() {
+        let body = said.bytes.get(2..).unwrap_or_default();
+        cases.extend((0..body.len()).map(|length| (at, in_frame(body.get(..length).unwrap_or_default()))));
+        cases.extend((0..said.bytes.len()).map(|length| (at, said.bytes.get(..length).unwrap_or_default().to_vec())));
+        cases.extend(TOO_LONG.map(|length| (at, in_frame(&vec![0x13; length]))));
+        cases.extend(TOO_LONG.map(|length| (at, in_frame(&[body, &vec![0; length - body.len()]].concat()))));
+    }
+    cases
+}
+
+fn lengths(report: &mut Report, target: &dyn Target, extent: Extent) -> Result<()> {
+    let record = record(target)?;
+    let cases = cut_and_long(record.said.get(..HANDSHAKE).unwrap_or_default());
+    let cases = share(target, extent.some(cases, 9));
+    attack(report, target, "truncated and oversize frames before the proof", &cases, |(at, instead), visit| {
+        let mut speaker = visit.speaker(&visit.keys.genuine)?;
+        // The genuine hello and proof up to there: the frame alone is at fault.
+        let _ = speaker.converse(*at).and_then(|_| speaker.step()).and_then(|_| speaker.say_bytes(instead));
+        visit.was_seen(speaker)
+    })?;
+    let lengths = [0, 1, 15, 16, 17, 40, 57, 1_025, 1_200, 4_200, 65_535];
+    let cases: Vec<_> = (4..STEPS).flat_map(|at| lengths.map(|length| (at, length))).collect();
+    let cases = share(target, extent.some(cases, 3));
+    attack(report, target, "truncated and oversize sealed frames", &cases, |(at, length), visit| {
+        let mut speaker = visit.speaker(&visit.keys.genuine)?;
+        let _ = speaker.converse(*at);
+        let asked = speaker.asked.clone();
+        let next = speaker.request(0, cara_core::config::Priority::Normal, false);
+        let mut body = next.get(2..).unwrap_or_default().to_vec();
+        // One of the genuine length is another one all the same.
+        body.resize(if *length == body.len() { length + 1 } else { *length }, 0);
+        let _ = speaker.say_bytes(&in_frame(&body)).and_then(|()| speaker.converse(STEPS));
+        visit.saw_more(speaker, 1, &asked)
+    })
+}
+
+/// A genuine conversation as somebody on the network has it.
+pub struct Record {
+    /// What the genuine peer said.
+    pub said: Vec<Said>,
+    /// What the target said.
+    pub heard: Vec<Vec<u8>>,
+}
+
+/// A genuine peer talks with the target, and all of it is written down.
+pub fn record(target: &dyn Target) -> Result<Record> {
+    let visit = target.visit()?;
+    let mut speaker = visit.speaker(&visit.keys.genuine)?;
+    let mut said = Vec::new();
+    while let Some(next) = speaker.step()? {
+        speaker.say(&next)?;
+        said.push(next);
+    }
+    speaker.finish();
+    Ok(Record { said, heard: speaker.heard })
+}
+
+impl Record {
+    /// All of it as something to be said.
+    fn all(&self) -> impl Iterator<Item = Said> + '_ {
+        let heard = self.heard.iter().map(|bytes| Said { datagram: false, bytes: bytes.clone() });
+        self.said.iter().cloned().chain(heard)
+    }
+}
+
+/// A genuine conversation in which `again` is said once more after `state` steps; whether it came to anything.
+fn interrupted(visit: &Visit<'_>, state: usize, again: impl Fn(&[Said]) -> Option<Said>) -> Result<bool> {
+    let mut speaker = visit.speaker(&visit.keys.genuine)?;
+    let mut said = Vec::new();
+    let mut joins = 1;
+    for at in 0..=STEPS {
+        if at == state {
+            if let Some(again) = again(&said) {
+                if !again.datagram && state < HANDSHAKE {
+                    joins = 0;
+                }
+                let _ = speaker.say(&again);
+            }
+        }
+        let Ok(Some(next)) = speaker.step() else { break };
+        if speaker.say(&next).is_err() {
+            break;
+        }
+        said.push(next);
+    }
+    let asked = speaker.asked.clone();
+    visit.saw_more(speaker, joins, &asked)
+}
+
+fn recorded_elsewhere(report: &mut Report, target: &dyn Target, extent: Extent, record: &Record) -> Result<()> {
+    let cases: Vec<_> = (0..=STEPS).flat_map(|state| record.all().map(move |old| (state, old))).collect();
+    let cases = share(target, extent.some(cases, 7));
+    attack(report, target, "frames of another link, at every state", &cases, |(state, old), visit| {
+        interrupted(&visit, *state, |said| Some(moved(old, said)))
+    })
+}
+
+/// A recorded datagram with the link and the nonce of this link, as far as it has shown them.
+fn moved(old: &Said, said: &[Said]) -> Said {
+    let mut moved = old.clone();
+    let here = said.iter().rev().find(|said| said.datagram);
+    if let (true, Some(here)) = (old.datagram, here) {
+        moved.bytes.iter_mut().zip(&here.bytes).take(24).for_each(|(to, from)| *to = *from);
+    }
+    moved
+}
+
+fn recorded_here(report: &mut Report, target: &dyn Target, extent: Extent) -> Result<()> {
+    let cases: Vec<_> = (1..=STEPS).flat_map(|state| (0..state).map(move |old| (state, old))).collect();
+    let cases = share(target, extent.some(cases, 3));
+    attack(report, target, "frames of the same link, at every later state", &cases, |(state, old), visit| {
+        interrupted(&visit, *state, |said| said.get(*old).cloned())
+    })
+}
+
+fn whole_records(report: &mut Report, target: &dyn Target, record: &Record) -> Result<()> {
+    let cases = share(target, (1..=record.said.len()).collect());
+    attack(report, target, "whole recorded conversations", &cases, |length, visit| {
+        let mut speaker = visit.speaker(&visit.keys.wrong)?;
+        for said in record.said.iter().take(*length) {
+            if speaker.say(said).is_err() {
+                break;
+            }
+        }
+        visit.was_seen(speaker)
+    })
+}

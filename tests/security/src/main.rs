@@ -1,0 +1,43 @@
+//! Runs all attacks on Linux units and prints one table.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use anyhow::Result;
+use cara_security::linux::{Linux, LinuxVehicles, Weakness};
+use cara_security::links::{self, Extent};
+use cara_security::tally::Report;
+use clap::Parser;
+
+/// Attacks units of the Linux port on loopback.
+#[derive(Parser)]
+struct Arguments {
+    /// Some of everything.
+    #[arg(long)]
+    quick: bool,
+    /// Also writes the figures here.
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+}
+
+fn main() -> ExitCode {
+    run(&Arguments::parse()).unwrap_or_else(|error| {
+        eprintln!("security: {error:#}");
+        ExitCode::FAILURE
+    })
+}
+
+fn run(arguments: &Arguments) -> Result<ExitCode> {
+    let extent = if arguments.quick { Extent::Quick } else { Extent::Full };
+    let linux = Linux::new(256, Weakness::None)?;
+    let mut report = Report::default();
+    links::run(&mut report, &linux.manager()?, extent)?;
+    links::run(&mut report, &LinuxVehicles::new(&linux), extent)?;
+    println!("{report}");
+    if let Some(path) = &arguments.json {
+        report.write(path)?;
+    }
+    let faults = report.faults();
+    faults.iter().for_each(|fault| eprintln!("{fault}"));
+    Ok(if faults.is_empty() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}

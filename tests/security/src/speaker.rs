@@ -1,0 +1,374 @@
+//! Somebody who speaks the wire through raw sockets, step by step, with whatever key it has: the end that opened the
+//! connection or the other one. What it says next is handed out before it is said, so that it can be changed, repeated,
+//! or replaced.
+
+use std::io::{self, Read, Write};
+use std::net::{Shutdown, SocketAddr, TcpStream, UdpSocket};
+use std::sync::atomic::{AtomicI64, Ordering};
+use std::time::Duration;
+
+use cara_core::config::{Mode, Priority};
+use cara_core::distribution::datagram::session_header;
+use cara_core::distribution::function_list::{Generation, Slot};
+use cara_core::distribution::hello::{Hello, Limits, Manager};
+use cara_core::distribution::identity::{Epoch, Fleet, Identity};
+use cara_core::distribution::message::{Message, RequestHeader, SessionBody};
+use cara_core::host::frame::{self, Frame};
+use cara_core::host::secure::{Seal, Secure};
+use cara_secure::keys::PairKey;
+use cara_secure::link::{Cipher, Credentials};
+
+/// Longest wait for something that the other end says or does.
+pub const PATIENCE: Duration = Duration::from_secs(10);
+/// The first steps, which prove the link.
+pub const HANDSHAKE: usize = 3;
+/// All steps.
+pub const STEPS: usize = 8;
+/// The kind of a chunk that is a whole message.
+const WHOLE: u8 = 0x13;
+
+/// Whom somebody says it is.
+#[derive(Clone, Debug)]
+pub struct Claim {
+    /// The fleet.
+    pub fleet: Fleet,
+    /// The name.
+    pub identity: Identity,
+    /// The manager that it wants, of a vehicle.
+    pub wanted: Option<Manager>,
+}
+
+/// Something to be said.
+#[derive(Clone, Debug)]
+pub struct Said {
+    /// It goes as a datagram.
+    pub datagram: bool,
+    /// All of it.
+    pub bytes: Vec<u8>,
+}
+
+/// One end of a link.
+pub struct Speaker {
+    stream: TcpStream,
+    datagrams: UdpSocket,
+    claim: Claim,
+    dials: bool,
+    key: PairKey,
+    cipher: Cipher,
+    own: Vec<u8>,
+    theirs: Option<Hello>,
+    came: Vec<u8>,
+    at: usize,
+    next_id: u32,
+    /// Numbers with which it has asked for a service.
+    pub asked: Vec<i64>,
+    /// Frames that came, whole.
+    pub heard: Vec<Vec<u8>>,
+    /// The other end said something that is for those only who have proven who they are.
+    pub told: bool,
+}
+
+fn random<const BYTES: usize>() -> [u8; BYTES] {
+    let mut bytes = [0; BYTES];
+    fastrand::fill(&mut bytes);
+    bytes
+}
+
+/// A number that no other request of this program has.
+fn fresh_mark() -> i64 {
+    static NEXT: AtomicI64 = AtomicI64::new(1);
+    NEXT.fetch_add(1, Ordering::Relaxed)
+}
+
+impl Speaker {
+    /// At one end of a connection, with a key.
+    pub fn new(stream: TcpStream, dials: bool, mode: Mode, claim: Claim, key: PairKey) -> io::Result<Self> {
+        stream.set_nodelay(true)?;
+        stream.set_read_timeout(Some(PATIENCE))?;
+        stream.set_write_timeout(Some(PATIENCE))?;
+        let datagrams = UdpSocket::bind((stream.local_addr()?.ip(), 0))?;
+        let own = hello(&claim, mode, datagrams.local_addr()?.port());
+        Ok(Self {
+            stream,
+            datagrams,
+            claim,
+            dials,
+            key,
+            cipher: Cipher::new(mode),
+            own,
+            theirs: None,
+            came: Vec::new(),
+            at: 0,
+            next_id: 1,
+            asked: Vec::new(),
+            heard: Vec::new(),
+            told: false,
+        })
+    }
+
+    /// What is to be said next, after what must be heard before it; `None` at the end. An error when the other end has
+    /// ended the link.
+    pub fn step(&mut self) -> io::Result<Option<Said>> {
+        let at = self.at;
+        self.at += 1;
+        let stream = |bytes| Ok(Some(Said { datagram: false, bytes }));
+        match (self.cipher.mode(), at) {
+            (Mode::Plain, 0) => stream(self.introduce()?),
+            (Mode::Plain, 1) => {
+                if self.dials {
+                    self.hear_hello()?;
+                }
+                self.step()
+            }
+            (Mode::Plain, 2) => self.step(),
+            (Mode::Secured, 0..HANDSHAKE) => stream(self.proof_step(at)?),
+            (_, 3) => {
+                if self.dials && self.cipher.mode() == Mode::Secured {
+                    self.hear_confirmation()?;
+                }
+                stream(self.request(0, Priority::Normal, false))
+            }
+            (_, 4) => stream(self.request(0, Priority::High, true)),
+            (_, 5) => stream(self.sealed(&[4])),
+            (_, 6) => Ok(Some(self.request_in_datagram(0))),
+            (_, 7) => stream(self.sealed(&[&[6][..], &SessionBody::keep_alive(7)].concat())),
+            _ => Ok(None),
+        }
+    }
+
+    /// Says all of a conversation up to step `end`; how many steps there were.
+    pub fn converse(&mut self, end: usize) -> io::Result<usize> {
+        while self.at < end {
+            match self.step()? {
+                Some(said) => self.say(&said)?,
+                None => break,
+            }
+        }
+        Ok(self.at)
+    }
+
+    /// Says something.
+    pub fn say(&mut self, said: &Said) -> io::Result<()> {
+        if said.datagram {
+            let to = SocketAddr::new(self.stream.peer_addr()?.ip(), self.theirs.as_ref().map_or(9, |them| them.udp_port));
+            return self.datagrams.send_to(&said.bytes, to).map(drop);
+        }
+        self.stream.write_all(&said.bytes)
+    }
+
+    /// Says bytes in the stream.
+    pub fn say_bytes(&mut self, bytes: &[u8]) -> io::Result<()> {
+        self.stream.write_all(bytes)
+    }
+
+    /// Says no more, and hears what still comes until the other end is gone as well.
+    pub fn finish(&mut self) {
+        let _ = self.stream.shutdown(Shutdown::Write);
+        while self.hear().is_ok() {}
+    }
+
+    /// Breaks off without a word.
+    pub fn abandon(self) {}
+
+    fn proof_step(&mut self, at: usize) -> io::Result<Vec<u8>> {
+        match (self.dials, at) {
+            (true, 0) | (false, 0) => self.introduce(),
+            (true, 1) => {
+                self.hear_hello()?;
+                self.prove().map(|proof| framed(&Frame::Proof(&proof.unwrap_or([0; 48]))))
+            }
+            (false, 1) => {
+                self.prove()?;
+                // Who has another key answers with something all the same.
+                let answer = self.hear_proof().ok().flatten();
+                Ok(framed(&Frame::Proof(&answer.unwrap_or_else(random))))
+            }
+            (dials, _) => {
+                if dials {
+                    self.hear_proof()?;
+                } else {
+                    self.hear_confirmation()?;
+                }
+                let confirmation = self.cipher.confirmation();
+                Ok(self.sealed(&[&[8][..], &confirmation].concat()))
+            }
+        }
+    }
+
+    /// The own hello, after the other one's where that comes first.
+    fn introduce(&mut self) -> io::Result<Vec<u8>> {
+        if !self.dials {
+            self.hear_hello()?;
+        }
+        self.cipher.introduce(&self.own);
+        Ok(framed(&Frame::Hello(&self.own)))
+    }
+
+    fn prove(&mut self) -> io::Result<Option<[u8; 48]>> {
+        self.cipher.prove(self.dials, Credentials::new(self.key.clone(), random())).map_err(|_| over("no proof"))
+    }
+
+    fn hear_hello(&mut self) -> io::Result<()> {
+        let body = self.hear()?;
+        let Ok(Frame::Hello(bytes)) = Frame::parse(&body) else { return Err(over("no hello")) };
+        self.theirs = Hello::decode(bytes, self.cipher.mode()).ok();
+        self.cipher.introduce(bytes);
+        Ok(())
+    }
+
+    fn hear_proof(&mut self) -> io::Result<Option<[u8; 48]>> {
+        let body = self.hear()?;
+        let Ok(Frame::Proof(bytes)) = Frame::parse(&body) else { return Err(over("no proof")) };
+        self.cipher.answer(bytes).map_err(|_| over("another key"))
+    }
+
+    fn hear_confirmation(&mut self) -> io::Result<()> {
+        let body = self.hear()?;
+        let Ok(Frame::Confirm(bytes)) = Frame::parse(&body) else { return Err(over("no confirmation")) };
+        self.cipher.confirmed(bytes).map_err(|_| over("another key"))
+    }
+
+    /// Waits for the answer to a request: whether it was run.
+    pub fn hear_answer(&mut self, id: u32) -> io::Result<bool> {
+        loop {
+            let body = self.hear()?;
+            if body.first().is_some_and(|kind| kind & 0x10 == 0) {
+                continue;
+            }
+            match Message::decode(body.get(6..).unwrap_or_default()) {
+                Some(Message::Reply(found, outcome)) if found == id => return Ok(outcome.is_ok()),
+                _ => {}
+            }
+        }
+    }
+
+    /// The next frame, opened where frames are sealed.
+    fn hear(&mut self) -> io::Result<Vec<u8>> {
+        loop {
+            if let Some(length) = frame::first_frame_length(&self.came).filter(|length| *length <= self.came.len()) {
+                let whole: Vec<u8> = self.came.drain(..length).collect();
+                let mut body = whole.get(2..).unwrap_or_default().to_vec();
+                self.heard.push(whole);
+                return self.open(&mut body);
+            }
+            let mut buffer = [0; 4096];
+            match self.stream.read(&mut buffer)? {
+                0 => return Err(over("the other end is gone")),
+                count => self.came.extend(buffer.iter().take(count)),
+            }
+        }
+    }
+
+    fn open(&mut self, body: &mut [u8]) -> io::Result<Vec<u8>> {
+        let secured = self.cipher.mode() == Mode::Secured;
+        if secured && !self.cipher.is_sealing() {
+            let hello_or_end = matches!(
+                Frame::parse(body),
+                Ok(Frame::Hello(_) | Frame::Proof(_) | Frame::Close(_) | Frame::Refuse(_))
+            );
+            self.told |= !hello_or_end;
+            return Ok(body.to_vec());
+        }
+        let opened = self.cipher.open(body).map_err(|_| over("it does not open"))?;
+        self.told |= !secured && opened.first().is_some_and(|kind| kind & 0x10 != 0);
+        Ok(opened.to_vec())
+    }
+
+    /// A frame of this body.
+    pub fn sealed(&mut self, body: &[u8]) -> Vec<u8> {
+        let overhead = if self.cipher.is_sealing() { self.cipher.overhead() } else { 0 };
+        let length = u16::try_from(body.len() + overhead).expect("a short body").to_le_bytes();
+        let mut bytes = [&length[..], body, &vec![0; overhead]].concat();
+        if let (true, Some(frame)) = (overhead > 0, bytes.get_mut(2..)) {
+            self.cipher.seal(frame).expect("the keys are agreed");
+        }
+        bytes
+    }
+
+    /// A request of the function in a slot, with a number of its own.
+    pub fn request(&mut self, slot: u16, priority: Priority, wants_reply: bool) -> Vec<u8> {
+        let message = self.message(slot, wants_reply);
+        let total = u32::try_from(message.len()).expect("a short message").to_le_bytes();
+        self.sealed(&[&[WHOLE, priority as u8][..], &total, &message].concat())
+    }
+
+    /// The number of the last request.
+    pub fn last_id(&self) -> u32 {
+        self.next_id - 1
+    }
+
+    fn message(&mut self, slot: u16, wants_reply: bool) -> Vec<u8> {
+        let mark = fresh_mark();
+        self.asked.push(mark);
+        let header = RequestHeader {
+            id: self.next_id,
+            slot: Slot(slot),
+            generation: Generation(0),
+            wants_reply,
+            remaining: cara_core::time::Duration::from_secs(600),
+            stamp: self.theirs.as_ref().map_or(0, |them| them.stamp),
+            since: cara_core::time::Duration::ZERO,
+        };
+        self.next_id += 1;
+        [&header.encode()[..], &mark.to_le_bytes()].concat()
+    }
+
+    /// A best-effort request in a datagram.
+    pub fn request_in_datagram(&mut self, slot: u16) -> Said {
+        let body = [&[3, 2][..], &self.message(slot, false)].concat();
+        let (link, nonce) = self.theirs.as_ref().map_or((0, 0), |them| (them.link, them.nonce));
+        let header = session_header(self.cipher.mode(), self.claim.fleet, link, nonce);
+        let (front, behind) = self.cipher.datagram_room();
+        let mut sealed = [&vec![0; front][..], &body, &vec![0; behind]].concat();
+        self.cipher.seal_datagram(&header, &mut sealed);
+        Said { datagram: true, bytes: [&header[..], &sealed].concat() }
+    }
+}
+
+fn over(why: &str) -> io::Error {
+    io::Error::new(io::ErrorKind::UnexpectedEof, why)
+}
+
+/// A frame in clear.
+pub fn framed(frame: &Frame<'_>) -> Vec<u8> {
+    let mut bytes = [0; 512];
+    let length = frame::encode(frame, 0, &mut bytes);
+    bytes.get(..length).unwrap_or_default().to_vec()
+}
+
+/// A frame in clear around a request.
+pub fn request_in_clear() -> Vec<u8> {
+    let header = RequestHeader {
+        id: 1,
+        slot: Slot(0),
+        generation: Generation(0),
+        wants_reply: true,
+        remaining: cara_core::time::Duration::from_secs(600),
+        stamp: 0,
+        since: cara_core::time::Duration::ZERO,
+    };
+    let message = [&header.encode()[..], &fresh_mark().to_le_bytes()].concat();
+    let body = [&[WHOLE, 2][..], &(message.len() as u32).to_le_bytes(), &message].concat();
+    [&(body.len() as u16).to_le_bytes()[..], &body].concat()
+}
+
+/// The hello of somebody.
+pub fn hello(claim: &Claim, mode: Mode, udp_port: u16) -> Vec<u8> {
+    let hello = Hello {
+        fleet: claim.fleet,
+        identity: claim.identity.clone(),
+        wanted: claim.wanted.clone(),
+        epoch: Epoch(u64::from_le_bytes(random())),
+        nonce: u64::from_le_bytes(random()),
+        term: 0,
+        capabilities: 0,
+        limits: Limits { message_size: 1_024, chunk_size: 1_024, calls: 8, minimum_interval: 0 },
+        link: 0,
+        udp_port,
+        stamp: 0,
+        keep_alive: 1_000,
+    };
+    let mut bytes = [0; 320];
+    let length = hello.encode(mode, &mut bytes).expect("a hello fits");
+    bytes.get(..length).unwrap_or_default().to_vec()
+}

@@ -1,0 +1,112 @@
+//! Carries out the attempts of an attack, several at a time, and makes its row.
+
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+
+use anyhow::{Context, Result};
+
+use crate::tally::{Counters, Report, Row};
+use crate::target::{Target, Visit};
+
+/// Counters that tell an operator of an attack.
+const TELLING: [&str; 23] = [
+    "FramesRefused",
+    "ProofsFailed",
+    "FarewellsInClear",
+    "KeysMissing",
+    "RefusedKey",
+    "RefusedMode",
+    "RefusedDuplicate",
+    "RefusedFleet",
+    "GaveWay",
+    "ConnectionsRefused",
+    "DatagramMagic",
+    "DatagramFleet",
+    "DatagramMalformed",
+    "DatagramForged",
+    "DatagramNotForUs",
+    "DatagramUnknownLink",
+    "DatagramsForged",
+    "DatagramsRepeated",
+    "DatagramsDropped",
+    "Outdated",
+    "Unasked",
+    "RequestsForbidden",
+    "RequestsTooSoon",
+];
+
+/// Names of the telling counters that have risen.
+pub fn risen(before: &Counters, after: &Counters) -> Vec<String> {
+    let value = |counters: &Counters, name: &str| counters.get(name).copied().unwrap_or(0);
+    TELLING.iter().filter(|name| value(after, name) > value(before, name)).map(|&name| name.to_owned()).collect()
+}
+
+/// Makes an attempt for each of `cases`, on visits of their own; `act` tells whether it came to anything.
+pub fn attack<C: Sync>(
+    report: &mut Report,
+    target: &dyn Target,
+    attack: &str,
+    cases: &[C],
+    act: impl Fn(&C, Visit<'_>) -> Result<bool> + Sync,
+) -> Result<()> {
+    let visit_and_act = |case: &C| target.visit().and_then(|visit| act(case, visit));
+    row(report, target, attack, cases, false, visit_and_act)
+}
+
+/// As [`attack`], by somebody who has the key.
+pub fn control<C: Sync>(
+    report: &mut Report,
+    target: &dyn Target,
+    name: &str,
+    cases: &[C],
+    act: impl Fn(&C, Visit<'_>) -> Result<bool> + Sync,
+) -> Result<()> {
+    let visit_and_act = |case: &C| target.visit().and_then(|visit| act(case, visit));
+    row(report, target, name, cases, true, visit_and_act)
+}
+
+/// A row of attempts that make their connections themselves.
+pub fn row<C: Sync>(
+    report: &mut Report,
+    target: &dyn Target,
+    attack: &str,
+    cases: &[C],
+    control: bool,
+    act: impl Fn(&C) -> Result<bool> + Sync,
+) -> Result<()> {
+    let before = target.counters()?;
+    let successes = each(target.workers(), cases, act).with_context(|| format!("{attack}, {}", target.name()))?;
+    report.add(Row {
+        attack: attack.to_owned(),
+        target: target.name().to_owned(),
+        attempts: cases.len() as u64,
+        successes,
+        noticed: risen(&before, &target.counters()?),
+        control,
+    });
+    Ok(())
+}
+
+/// Tries each case, `workers` at a time; how many came to something.
+pub fn each<C: Sync>(workers: usize, cases: &[C], act: impl Fn(&C) -> Result<bool> + Sync) -> Result<u64> {
+    let (next, successes, failed) = (AtomicUsize::new(0), AtomicU64::new(0), Mutex::new(None));
+    std::thread::scope(|scope| {
+        for _ in 0..workers.min(cases.len()) {
+            scope.spawn(|| {
+                while let Some(case) = cases.get(next.fetch_add(1, Ordering::Relaxed)) {
+                    match act(case) {
+                        Ok(success) => drop(successes.fetch_add(u64::from(success), Ordering::Relaxed)),
+                        Err(error) => {
+                            next.store(cases.len(), Ordering::Relaxed);
+                            failed.lock().unwrap_or_else(std::sync::PoisonError::into_inner).get_or_insert(error);
+                        }
+                    }
+                }
+            });
+        }
+    });
+    match failed.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner) {
+        Some(error) => Err(error),
+        None => Ok(successes.into_inner()),
+    }
+}
