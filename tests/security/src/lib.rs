@@ -5,12 +5,17 @@
 //! - [`ground`]: the keys of a fleet, and those that an attacker may have instead;
 //! - [`target`]: what is attacked; [`linux`] has units of the Linux port;
 //! - [`links`]: the attacks on links; they know of a target only what [`target::Target`] tells;
+//! - [`between`]: somebody between two genuine ends; [`discovery`], [`floods`] and [`permission`]: the other attacks;
 //! - [`tally`]: attempts, successes, and the counters that tell of them.
 
+pub mod between;
 pub mod diary;
+pub mod discovery;
+pub mod floods;
 pub mod ground;
-pub mod linux;
 pub mod links;
+pub mod linux;
+pub mod permission;
 pub mod speaker;
 pub mod tally;
 pub mod target;

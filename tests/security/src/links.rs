@@ -57,7 +57,7 @@ fn share<C>(target: &dyn Target, cases: Vec<C>) -> Vec<C> {
 }
 
 /// The attacker with the key gets in: what counts successes can count them.
-fn with_the_key(report: &mut Report, target: &dyn Target) -> Result<()> {
+pub fn with_the_key(report: &mut Report, target: &dyn Target) -> Result<()> {
     control(report, target, "the same attacker with the key", &share(target, vec![(); 8]), |(), visit| {
         let mut speaker = visit.speaker(&visit.keys.genuine)?;
         speaker.converse(5)?;
@@ -182,7 +182,7 @@ fn pretend(ruse: Ruse, visit: &Visit<'_>, speaker: &mut Speaker) -> io::Result<(
 }
 
 /// Somebody in plain mode, or who goes on in plain text after a secured hello.
-fn plain(report: &mut Report, target: &dyn Target, extent: Extent) -> Result<()> {
+pub fn plain(report: &mut Report, target: &dyn Target, extent: Extent) -> Result<()> {
     let cases = share(target, extent.some((0..60_u32).collect(), 3));
     attack(report, target, "downgrade to plain", &cases, |_, visit| {
         let mut speaker = visit.speaker_as(Mode::Plain, visit.claim.clone(), &visit.keys.wrong)?;
@@ -225,7 +225,13 @@ fn lengths(report: &mut Report, target: &dyn Target, extent: Extent) -> Result<(
         let mut body = next.get(2..).unwrap_or_default().to_vec();
         // One of the genuine length is another one all the same.
         body.resize(if *length == body.len() { length + 1 } else { *length }, 0);
-        let _ = speaker.say_bytes(&in_frame(&body)).and_then(|()| speaker.converse(STEPS));
+        let _ = speaker.say_bytes(&in_frame(&body));
+        // A datagram overtakes it. What comes behind it in the stream must not run.
+        while let Ok(Some(next)) = speaker.step() {
+            if !next.datagram && speaker.say(&next).is_err() {
+                break;
+            }
+        }
         visit.saw_more(speaker, 1, &asked)
     })
 }
@@ -271,6 +277,10 @@ fn interrupted(visit: &Visit<'_>, state: usize, again: impl Fn(&[Said]) -> Optio
                     joins = 0;
                 }
                 let _ = speaker.say(&again);
+                if again.datagram {
+                    // Read before what follows it in the stream.
+                    std::thread::sleep(std::time::Duration::from_millis(3));
+                }
             }
         }
         let Ok(Some(next)) = speaker.step() else { break };

@@ -221,7 +221,7 @@ impl Target for LinuxVehicles<'_> {
     }
 
     fn workers(&self) -> usize {
-        24
+        40
     }
 
     fn visit(&self) -> Result<Visit<'_>> {
@@ -252,7 +252,8 @@ impl Target for LinuxVehicles<'_> {
 /// The next connection, within a generous time.
 pub fn accept(listener: &TcpListener) -> Result<TcpStream> {
     listener.set_nonblocking(true)?;
-    let end = Instant::now() + PATIENCE;
+    // A vehicle whose link was refused looks again after a pause of up to 16 s.
+    let end = Instant::now() + 4 * PATIENCE;
     loop {
         match listener.accept() {
             Ok((stream, _)) => {

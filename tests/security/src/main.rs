@@ -4,9 +4,11 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::Result;
-use cara_security::linux::{Linux, LinuxVehicles, Weakness};
+use cara_security::between::Middle;
 use cara_security::links::{self, Extent};
+use cara_security::linux::{Linux, LinuxVehicles, Weakness};
 use cara_security::tally::Report;
+use cara_security::{discovery, floods, permission};
 use clap::Parser;
 
 /// Attacks units of the Linux port on loopback.
@@ -15,6 +17,9 @@ struct Arguments {
     /// Some of everything.
     #[arg(long)]
     quick: bool,
+    /// Only the parts whose names contain this: links, between, permission, discovery, floods.
+    #[arg(long, default_value = "")]
+    only: String,
     /// Also writes the figures here.
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
@@ -31,8 +36,24 @@ fn run(arguments: &Arguments) -> Result<ExitCode> {
     let extent = if arguments.quick { Extent::Quick } else { Extent::Full };
     let linux = Linux::new(256, Weakness::None)?;
     let mut report = Report::default();
-    links::run(&mut report, &linux.manager()?, extent)?;
-    links::run(&mut report, &LinuxVehicles::new(&linux), extent)?;
+    let (manager, vehicles) = (linux.manager()?, LinuxVehicles::new(&linux));
+    let wanted = |part: &str| part.contains(&arguments.only);
+    if wanted("links") {
+        links::run(&mut report, &manager, extent)?;
+        links::run(&mut report, &vehicles, extent)?;
+    }
+    if wanted("between") {
+        Middle::new(&linux, &manager, &vehicles).run(&mut report, extent)?;
+    }
+    if wanted("permission") {
+        permission::run(&mut report, &linux, &manager, extent)?;
+    }
+    if wanted("discovery") {
+        discovery::run(&mut report, &linux, &manager, extent)?;
+    }
+    if wanted("floods") {
+        floods::run(&mut report, &linux, &manager, extent)?;
+    }
     println!("{report}");
     if let Some(path) = &arguments.json {
         report.write(path)?;

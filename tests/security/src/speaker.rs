@@ -75,7 +75,7 @@ fn random<const BYTES: usize>() -> [u8; BYTES] {
 }
 
 /// A number that no other request of this program has.
-fn fresh_mark() -> i64 {
+pub fn fresh_mark() -> i64 {
     static NEXT: AtomicI64 = AtomicI64::new(1);
     NEXT.fetch_add(1, Ordering::Relaxed)
 }
@@ -150,7 +150,8 @@ impl Speaker {
     /// Says something.
     pub fn say(&mut self, said: &Said) -> io::Result<()> {
         if said.datagram {
-            let to = SocketAddr::new(self.stream.peer_addr()?.ip(), self.theirs.as_ref().map_or(9, |them| them.udp_port));
+            let to =
+                SocketAddr::new(self.stream.peer_addr()?.ip(), self.theirs.as_ref().map_or(9, |them| them.udp_port));
             return self.datagrams.send_to(&said.bytes, to).map(drop);
         }
         self.stream.write_all(&said.bytes)
@@ -166,9 +167,6 @@ impl Speaker {
         let _ = self.stream.shutdown(Shutdown::Write);
         while self.hear().is_ok() {}
     }
-
-    /// Breaks off without a word.
-    pub fn abandon(self) {}
 
     fn proof_step(&mut self, at: usize) -> io::Result<Vec<u8>> {
         match (self.dials, at) {

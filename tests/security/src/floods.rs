@@ -1,0 +1,149 @@
+//! Floods: of datagrams, and of links that never prove anything. Meanwhile those who belong go on as before.
+
+use std::net::TcpStream;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::Duration;
+
+use anyhow::{Result, ensure};
+use cara_core::config::Mode;
+use cara_core::distribution::datagram::{SEARCH_BYTES, WhoHas};
+use cara_core::distribution::identity::Epoch;
+use cara_core::host::frame::Frame;
+use cara_secure::keyring::Codes;
+use cara_std::sys::datagram::Datagrams;
+use cara_std::{Error, Interfaces, Parameters, Peer, RequestOptions};
+
+use crate::ground::agv;
+use crate::links::Extent;
+use crate::linux::{Linux, LinuxManager, wait_for};
+use crate::speaker::{framed, fresh_mark, hello};
+use crate::tally::{Report, Row};
+use crate::target::Target;
+use crate::trial::risen;
+
+/// The deadline that calls keep during a flood. Generous: the machine is shared.
+const DEADLINE: Duration = Duration::from_secs(2);
+/// Calls during each flood, at least.
+const CALLS: usize = 60;
+/// Connections that a flood holds open at a time, per thread: together more than a manager has room for.
+const HELD: usize = 100;
+/// Numbers of the vehicles that belong, and that others do not use.
+const THERE: u32 = 201;
+
+/// Both floods against a manager.
+pub fn run(report: &mut Report, linux: &Linux, manager: &LinuxManager<'_>, extent: Extent) -> Result<()> {
+    let (there, _) = linux.vehicle(THERE, None)?;
+    ensure!(wait_for(|| connected(manager, THERE).is_some()), "nobody joins in calm");
+    let count = if extent == Extent::Full { 6_000 } else { 600 };
+    let handshakes = |over: &AtomicBool, made: &AtomicU64| open_links(linux, manager, over, made);
+    flood(report, linux, manager, ("flood of half-open links", count, THERE + 1), handshakes)?;
+    let count = if extent == Extent::Full { 60_000 } else { 6_000 };
+    let datagrams = |over: &AtomicBool, made: &AtomicU64| say_anything(linux, over, made);
+    flood(report, linux, manager, ("flood of discovery", count, THERE + 2), datagrams)?;
+    there.stop();
+    Ok(())
+}
+
+fn connected(manager: &LinuxManager<'_>, id: u32) -> Option<Peer> {
+    let mut peers = manager.system.s_units().into_iter().filter(Peer::is_connected);
+    peers.find(|peer| peer.id() == id && peer.their_function_list().contains("mark"))
+}
+
+fn call(peer: &Peer) -> Result<(), Error> {
+    let mut number = Parameters::<64>::sized();
+    number.add_int("n", 1)?;
+    number.set_value("n", fresh_mark())?;
+    let options = RequestOptions { timeout: Some(DEADLINE.into()), ..RequestOptions::default() };
+    peer.block_request_with("mark", &mut number, &options)
+}
+
+/// Lets `attacker` go on until it has done enough, and those who belong have done what they want: calls in time, and a
+/// new vehicle that is found and joins. Each attempt that keeps one from that is a success, as is who joins without a key.
+fn flood(
+    report: &mut Report,
+    linux: &Linux,
+    manager: &LinuxManager<'_>,
+    (name, count, newcomer): (&str, u64, u32),
+    attacker: impl Fn(&AtomicBool, &AtomicU64) -> Result<()> + Sync,
+) -> Result<()> {
+    let (over, made) = (AtomicBool::new(false), AtomicU64::new(0));
+    let before = manager.counters()?;
+    let joins = manager.diary.all().joins;
+    let (mut late, mut calls, mut new) = (0, 0, None);
+    std::thread::scope(|scope| -> Result<()> {
+        let attackers = [(); 2].map(|()| scope.spawn(|| attacker(&over, &made)));
+        let peer = connected(manager, THERE);
+        while calls < CALLS || made.load(Ordering::Relaxed) < count {
+            if attackers.iter().any(|attacker| attacker.is_finished()) {
+                break;
+            }
+            late += u64::from(peer.as_ref().is_none_or(|peer| call(peer).is_err()));
+            calls += 1;
+            if calls == 10 {
+                new = Some(linux.vehicle(newcomer, None)?);
+            }
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        late += u64::from(!wait_for(|| connected(manager, newcomer).is_some()));
+        over.store(true, Ordering::Relaxed);
+        attackers.into_iter().try_for_each(|attacker| attacker.join().unwrap_or(Ok(())))
+    })?;
+    let strangers = manager.diary.all().joins - joins - usize::from(connected(manager, newcomer).is_some());
+    if let Some((unit, _)) = new {
+        unit.stop();
+    }
+    report.add(Row {
+        attack: name.to_owned(),
+        target: manager.name().to_owned(),
+        attempts: made.load(Ordering::Relaxed),
+        successes: late + strangers as u64,
+        noticed: risen(&before, &manager.counters()?),
+        control: false,
+    });
+    Ok(())
+}
+
+/// Opens link after link and says hello on each, every other time in the name of a vehicle that is connected.
+fn open_links(linux: &Linux, manager: &LinuxManager<'_>, over: &AtomicBool, made: &AtomicU64) -> Result<()> {
+    use std::io::Write;
+    let mut held = std::collections::VecDeque::new();
+    while !over.load(Ordering::Relaxed) {
+        let number = made.fetch_add(1, Ordering::Relaxed);
+        let claim = linux.claim_of(if number.is_multiple_of(2) { THERE } else { 100 });
+        let mut stream = TcpStream::connect(manager.address())?;
+        let says = framed(&Frame::Hello(&hello(&claim, Mode::Secured, 9)));
+        // Who gave way to a newer one hears it here.
+        let _ = stream.write_all(&says);
+        held.push_back(stream);
+        if held.len() > HELD {
+            held.pop_front();
+        }
+        std::thread::sleep(Duration::from_micros(500));
+    }
+    Ok(())
+}
+
+/// Sends datagrams as fast as it can: who-has with the codes of another fleet, and noise behind a right beginning.
+fn say_anything(linux: &Linux, over: &AtomicBool, made: &AtomicU64) -> Result<()> {
+    let socket = Datagrams::open(Interfaces::Loopback, linux.port)?;
+    let mut out = [0; SEARCH_BYTES];
+    while !over.load(Ordering::Relaxed) {
+        let search = WhoHas {
+            identity: agv(fastrand::u32(1..200)),
+            epoch: Epoch(fastrand::u64(..)),
+            sequence: fastrand::u32(..),
+            nonce: fastrand::u64(1..),
+            wanted: cara_std::Manager::new("depot", 1).ok(),
+            tcp_port: 0,
+            expected: 1,
+            known: Default::default(),
+        };
+        let codes = Codes::Keyed(crate::discovery::Lent(linux.ground.elsewhere()));
+        let bytes = search.encode(linux.ground.fleet, &codes, &mut out).unwrap_or_default();
+        socket.broadcast(bytes);
+        made.fetch_add(1, Ordering::Relaxed);
+        // A hundred thousand a second would be a test of the kernel.
+        std::thread::sleep(Duration::from_micros(50));
+    }
+    Ok(())
+}

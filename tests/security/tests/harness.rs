@@ -1,0 +1,49 @@
+//! The attackers must be able to succeed, or their zeros show nothing: against units with a weakness that was put there
+//! on purpose, and with the key.
+
+use cara_security::links::{self, Extent};
+use cara_security::linux::{Linux, LinuxVehicles, Weakness};
+use cara_security::permission;
+use cara_security::tally::{Report, Row};
+use cara_security::target::Target;
+
+fn row<'r>(report: &'r Report, attack: &str, target: &dyn Target) -> &'r Row {
+    let found = report.rows.iter().find(|row| row.attack.contains(attack) && row.target == target.name());
+    found.unwrap_or_else(|| panic!("no row for {attack}, {}", target.name()))
+}
+
+/// A unit in plain mode on the port of secured ones believes whoever speaks plain, which the attackers see.
+#[test]
+fn a_unit_in_plain_mode_is_found_out() {
+    let linux = Linux::new(64, Weakness::Plain).unwrap();
+    let (manager, vehicles) = (linux.manager().unwrap(), LinuxVehicles::new(&linux));
+    for target in [&manager as &dyn Target, &vehicles] {
+        let mut report = Report::default();
+        links::plain(&mut report, target, Extent::Quick).unwrap();
+        let row = row(&report, "downgrade", target);
+        assert_eq!(row.successes, row.attempts, "{row:?}");
+        assert!(!report.faults().is_empty());
+    }
+}
+
+/// A unit whose table allows everything runs what a random table would not have allowed.
+#[test]
+fn a_table_that_allows_everything_is_found_out() {
+    let linux = Linux::new(64, Weakness::Open).unwrap();
+    let mut report = Report::default();
+    permission::run(&mut report, &linux, &linux.manager().unwrap(), Extent::Quick).unwrap();
+    assert!(report.rows.len() == 2 && report.rows.iter().all(|row| row.successes > 0), "{report}");
+}
+
+/// The same attacker with the key joins and is served: what counts successes can count them.
+#[test]
+fn who_has_the_key_gets_in() {
+    let linux = Linux::new(64, Weakness::None).unwrap();
+    let (manager, vehicles) = (linux.manager().unwrap(), LinuxVehicles::new(&linux));
+    for target in [&manager as &dyn Target, &vehicles] {
+        let mut report = Report::default();
+        links::with_the_key(&mut report, target).unwrap();
+        assert_eq!(report.faults(), [""; 0]);
+        assert!(report.rows.iter().all(|row| row.control && row.successes > 0));
+    }
+}
