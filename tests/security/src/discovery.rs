@@ -142,10 +142,10 @@ impl Forger {
                 continue;
             };
             let Ok((header, body)) = Header::decode(buffer.get(..count).unwrap_or_default()) else { continue };
-            if let Ok(Datagram::WhoHas(search)) = header.read(body) {
-                if search.identity.role() == Role::SUnit {
-                    return Ok((search.nonce, from));
-                }
+            if let Ok(Datagram::WhoHas(search)) = header.read(body)
+                && search.identity.role() == Role::SUnit
+            {
+                return Ok((search.nonce, from));
             }
         }
         bail!("no vehicle asks for its manager")

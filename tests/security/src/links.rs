@@ -271,16 +271,16 @@ fn interrupted(visit: &Visit<'_>, state: usize, again: impl Fn(&[Said]) -> Optio
     let mut said = Vec::new();
     let mut joins = 1;
     for at in 0..=STEPS {
-        if at == state {
-            if let Some(again) = again(&said) {
-                if !again.datagram && state < HANDSHAKE {
-                    joins = 0;
-                }
-                let _ = speaker.say(&again);
-                if again.datagram {
-                    // Read before what follows it in the stream.
-                    std::thread::sleep(std::time::Duration::from_millis(3));
-                }
+        if at == state
+            && let Some(again) = again(&said)
+        {
+            if !again.datagram && state < HANDSHAKE {
+                joins = 0;
+            }
+            let _ = speaker.say(&again);
+            if again.datagram {
+                // Read before what follows it in the stream.
+                std::thread::sleep(std::time::Duration::from_millis(3));
             }
         }
         let Ok(Some(next)) = speaker.step() else { break };

@@ -3,12 +3,12 @@
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use anyhow::Result;
+use anyhow::{Context, Result, ensure};
 use cara_security::between::Middle;
 use cara_security::links::{self, Extent};
 use cara_security::linux::{Linux, LinuxVehicles, Weakness};
 use cara_security::tally::Report;
-use cara_security::{discovery, floods, permission};
+use cara_security::{discovery, floods, permission, tally};
 use clap::Parser;
 
 /// Attacks units of the Linux port on loopback.
@@ -20,6 +20,12 @@ struct Arguments {
     /// Only the parts whose names contain this: links, between, permission, discovery, floods.
     #[arg(long, default_value = "")]
     only: String,
+    /// What the simulator's attackers have printed: their figures stand first in the table.
+    #[arg(long, value_name = "FILE")]
+    simulator: Option<PathBuf>,
+    /// Figures that another program has written, for the table.
+    #[arg(long, value_name = "FILE")]
+    with: Vec<PathBuf>,
     /// Also writes the figures here.
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
@@ -36,6 +42,11 @@ fn run(arguments: &Arguments) -> Result<ExitCode> {
     let extent = if arguments.quick { Extent::Quick } else { Extent::Full };
     let linux = Linux::new(256, Weakness::None)?;
     let mut report = Report::default();
+    if let Some(path) = &arguments.simulator {
+        let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
+        report.rows.extend(tally::simulated(&text));
+        ensure!(!report.rows.is_empty(), "{} has no figures of the simulator's attackers", path.display());
+    }
     let (manager, vehicles) = (linux.manager()?, LinuxVehicles::new(&linux));
     let wanted = |part: &str| part.contains(&arguments.only);
     if wanted("links") {
@@ -53,6 +64,9 @@ fn run(arguments: &Arguments) -> Result<ExitCode> {
     }
     if wanted("floods") {
         floods::run(&mut report, &linux, &manager, extent)?;
+    }
+    for path in &arguments.with {
+        report.rows.extend(Report::read(path)?.rows);
     }
     println!("{report}");
     if let Some(path) = &arguments.json {

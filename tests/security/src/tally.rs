@@ -48,6 +48,20 @@ impl Row {
 /// The target whose tests count by themselves, and check counters where they belong.
 pub const SIMULATOR: &str = "simulator";
 
+/// The figures in what the simulator's attackers print: `WHAT: N attempts, N successes`.
+pub fn simulated(text: &str) -> Vec<Row> {
+    text.lines().filter_map(simulated_row).collect()
+}
+
+fn simulated_row(line: &str) -> Option<Row> {
+    let (attack, figures) = line.rsplit_once(": ")?;
+    let (attempts, successes) = figures.strip_suffix(" successes")?.split_once(" attempts, ")?;
+    let (attempts, successes) = (attempts.parse().ok()?, successes.parse().ok()?);
+    // The first test's line stands behind a dot of the harness.
+    let attack = attack.trim_start_matches('.').to_owned();
+    Some(Row { attack, target: SIMULATOR.to_owned(), attempts, successes, noticed: Vec::new(), control: false })
+}
+
 /// All rows.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Report {
@@ -122,6 +136,14 @@ mod tests {
             assert!(wrong.fault().is_some(), "{wrong:?}");
         }
         assert!(Row { noticed: Vec::new(), ..row(5, 0, false) }.fault().is_some());
+    }
+
+    #[test]
+    fn the_simulator_s_lines_are_read() {
+        let rows = simulated("running 2 tests\n.bits: all of them: 12 attempts, 0 successes\n..\nok: nothing\n");
+        let [row] = &rows[..] else { panic!("{rows:?}") };
+        assert_eq!((row.attack.as_str(), row.attempts, row.successes), ("bits: all of them", 12, 0));
+        assert!(row.fault().is_none());
     }
 
     #[test]

@@ -113,7 +113,7 @@ fn objections(row: &Row<'_>, exists: impl Fn(&str) -> bool, read: impl Fn(&str) 
 }
 
 /// What stands in backquotes.
-fn references(cell: &str) -> Vec<&str> {
+pub(crate) fn references(cell: &str) -> Vec<&str> {
     cell.split('`').skip(1).step_by(2).collect()
 }
 

@@ -6,8 +6,8 @@ use anyhow::{Result, bail};
 
 use crate::command::Run;
 use crate::{
-    bad_input, dependencies, firmware, fleet, hygiene, install, instructions, layers, licences, links, manifests,
-    names, panic_free, paper, workspace,
+    bad_input, claims, dependencies, firmware, fleet, hygiene, install, instructions, layers, licences, links,
+    manifests, names, panic_free, paper, security, workspace,
 };
 
 /// A group of checks that is run and reported as one.
@@ -42,7 +42,7 @@ pub(crate) enum Outcome {
 }
 
 /// All groups, in the order in which they run: cheap ones first.
-pub(crate) const GROUPS: [Group; 22] = [
+pub(crate) const GROUPS: [Group; 23] = [
     Group {
         name: "format",
         what: "every crate is formatted",
@@ -77,11 +77,11 @@ pub(crate) const GROUPS: [Group; 22] = [
     },
     Group {
         name: "paper",
-        what: "every promise of the paper and every item of bad input has its test, and the test exists",
+        what: "every promise of the paper, item of bad input and claim about security has its test, and the test exists",
         budget: 2,
         quick: Some(2),
         by_default: true,
-        run: |_| all(&[paper::check, bad_input::check]),
+        run: |_| all(&[paper::check, bad_input::check, claims::check]),
     },
     Group {
         name: "names",
@@ -156,6 +156,14 @@ pub(crate) const GROUPS: [Group; 22] = [
         run: |_| {
             Run::cargo().args(["run", "--quiet", "--package", "cara-scenarios", "--bin", "planted"]).stream().into()
         },
+    },
+    Group {
+        name: "security",
+        what: "attackers on the simulator and on Linux units: none of them comes to anything",
+        budget: 240,
+        quick: Some(90),
+        by_default: true,
+        run: |extent| security::check(extent).into(),
     },
     Group {
         name: "fleet",

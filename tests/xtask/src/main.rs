@@ -7,6 +7,7 @@ use clap::{Parser, Subcommand};
 
 mod bad_input;
 mod bench;
+mod claims;
 mod command;
 mod demo;
 mod dependencies;
@@ -26,6 +27,7 @@ mod panic_free;
 mod paper;
 mod peers;
 mod runner;
+mod security;
 mod source;
 mod workspace;
 
@@ -87,6 +89,8 @@ enum Task {
         #[arg(long, value_name = "FILE")]
         json: Option<PathBuf>,
     },
+    /// Attacks units on the simulator and on Linux, and prints what was tried and what came of it.
+    Security(security::Security),
     /// Makes things fail while an emulated vehicle drives, and prints how long its motors went on, beside the bound.
     Faults(firmware::Faults),
     /// Builds the firmware of a board, or of all boards; or runs the emulated one.
@@ -111,6 +115,7 @@ fn main() -> ExitCode {
         Task::Instructions { json, write } => instructions::run(json.as_deref(), write),
         Task::Fleet { nodes, json } => fleet::run(nodes, json.as_deref()),
         Task::Peers { names } => peers::run(&names),
+        Task::Security(options) => security::run(&options),
         Task::Faults(faults) => firmware::faults(&faults),
         Task::Bench(options) => bench::run(&options),
         Task::Firmware { board: Some(board), flash: true, .. } => firmware::flash(&board),
