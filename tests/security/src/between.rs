@@ -134,6 +134,10 @@ impl<'l> Middle<'l> {
         // The last frame is the manager's: it has the vehicle's proof then, and takes it.
         let last = !at.to_manager && at.number == HANDSHAKE - 1;
         let fooled = !ended || way.diary.all().joins > 0 || (!last && way.manager_joins() > 0);
+        if fooled {
+            let (vehicle, manager) = (way.diary.all().joins, way.manager_joins());
+            eprintln!("bit {bit} of {at:?}: ended {ended}, joins at the vehicle {vehicle}, at the manager {manager}");
+        }
         if bit.is_multiple_of(8) {
             way.carry(|_, bytes| vec![bytes], |_| wait_for(|| way.has_joined()))?;
             ensure!(way.has_joined(), "bit {bit} of {at:?}: nor did the next link come up");

@@ -27,6 +27,9 @@ const DEADLINE: Duration = Duration::from_secs(2);
 const CALLS: usize = 60;
 /// Connections that a flood holds open at a time, per thread: together more than a manager has room for.
 const HELD: usize = 100;
+/// Pause of each of the two attackers between two links, so that they open a thousand a second at most: a link has as long
+/// to prove itself as it takes to open as many as there is room for.
+const BETWEEN_LINKS: Duration = Duration::from_millis(2);
 /// Numbers of the vehicles that belong, and that others do not use.
 const THERE: u32 = 201;
 
@@ -34,7 +37,7 @@ const THERE: u32 = 201;
 pub fn run(report: &mut Report, linux: &Linux, manager: &LinuxManager<'_>, extent: Extent) -> Result<()> {
     let (there, _) = linux.vehicle(THERE, None)?;
     ensure!(wait_for(|| connected(manager, THERE).is_some()), "nobody joins in calm");
-    let count = if extent == Extent::Full { 6_000 } else { 600 };
+    let count = if extent == Extent::Full { 6_000 } else { 800 };
     let handshakes = |over: &AtomicBool, made: &AtomicU64| open_links(linux, manager, over, made);
     flood(report, linux, manager, ("flood of half-open links", count, THERE + 1), handshakes)?;
     let count = if extent == Extent::Full { 60_000 } else { 6_000 };
@@ -84,7 +87,11 @@ fn flood(
             }
             std::thread::sleep(Duration::from_millis(5));
         }
-        late += u64::from(!wait_for(|| connected(manager, newcomer).is_some()));
+        let out = !wait_for(|| connected(manager, newcomer).is_some());
+        if late > 0 || out {
+            eprintln!("{name}: {late} of {calls} calls came too late; the newcomer stayed out: {out}");
+        }
+        late += u64::from(out);
         over.store(true, Ordering::Relaxed);
         attackers.into_iter().try_for_each(|attacker| attacker.join().unwrap_or(Ok(())))
     })?;
@@ -118,7 +125,7 @@ fn open_links(linux: &Linux, manager: &LinuxManager<'_>, over: &AtomicBool, made
         if held.len() > HELD {
             held.pop_front();
         }
-        std::thread::sleep(Duration::from_micros(500));
+        std::thread::sleep(BETWEEN_LINKS);
     }
     Ok(())
 }

@@ -11,6 +11,9 @@ use cara_security::tally::Report;
 use cara_security::{discovery, floods, permission, tally};
 use clap::Parser;
 
+/// More than attempts of any attack: two vehicles of one name at the same time would be told apart by their manager.
+const VEHICLES: u32 = 4_096;
+
 /// Attacks units of the Linux port on loopback.
 #[derive(Parser)]
 struct Arguments {
@@ -40,7 +43,7 @@ fn main() -> ExitCode {
 
 fn run(arguments: &Arguments) -> Result<ExitCode> {
     let extent = if arguments.quick { Extent::Quick } else { Extent::Full };
-    let linux = Linux::new(256, Weakness::None)?;
+    let linux = Linux::new(VEHICLES, Weakness::None)?;
     let mut report = Report::default();
     if let Some(path) = &arguments.simulator {
         let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
