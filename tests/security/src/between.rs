@@ -139,7 +139,12 @@ impl<'l> Middle<'l> {
             eprintln!("bit {bit} of {at:?}: ended {ended}, joins at the vehicle {vehicle}, at the manager {manager}");
         }
         if bit.is_multiple_of(8) {
-            way.carry(|_, bytes| vec![bytes], |_| wait_for(|| way.has_joined()))?;
+            let next = way.carry(|_, bytes| vec![bytes], |_| wait_for(|| way.has_joined()));
+            next.with_context(|| {
+                let (events, counters) = (way.manager_joins(), way.unit.counters());
+                let told: Vec<_> = counters.into_iter().filter(|(_, count)| *count > 0).collect();
+                format!("behind bit {bit} of {at:?}, after which the manager had {events} joins: {told:?}")
+            })?;
             ensure!(way.has_joined(), "bit {bit} of {at:?}: nor did the next link come up");
         }
         Ok(fooled)

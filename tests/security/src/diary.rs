@@ -42,6 +42,13 @@ impl Diary {
         })
     }
 
+    /// How often others than these joined.
+    pub fn joins_but_of(&self, these: &[Identity]) -> usize {
+        let pages = self.pages();
+        let others = pages.of.iter().filter(|(who, _)| !these.contains(who));
+        others.map(|(_, seen)| seen.joins).sum()
+    }
+
     /// Names of the functions that ran since this was asked last.
     pub fn take_ran(&self) -> Vec<&'static str> {
         std::mem::take(&mut self.pages().ran)

@@ -71,7 +71,7 @@ fn flood(
 ) -> Result<()> {
     let (over, made) = (AtomicBool::new(false), AtomicU64::new(0));
     let before = manager.counters()?;
-    let joins = manager.diary.all().joins;
+    let joins = manager.diary.joins_but_of(&[agv(THERE), agv(newcomer)]);
     let (mut late, mut calls, mut new) = (0, 0, None);
     std::thread::scope(|scope| -> Result<()> {
         let attackers = [(); 2].map(|()| scope.spawn(|| attacker(&over, &made)));
@@ -95,7 +95,7 @@ fn flood(
         over.store(true, Ordering::Relaxed);
         attackers.into_iter().try_for_each(|attacker| attacker.join().unwrap_or(Ok(())))
     })?;
-    let strangers = manager.diary.all().joins - joins - usize::from(connected(manager, newcomer).is_some());
+    let strangers = manager.diary.joins_but_of(&[agv(THERE), agv(newcomer)]) - joins;
     if let Some((unit, _)) = new {
         unit.stop();
     }

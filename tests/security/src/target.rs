@@ -25,6 +25,11 @@ pub trait Target: Sync {
     /// All that it has counted since the beginning.
     fn counters(&self) -> Result<Counters>;
 
+    /// Whether it tells which calls it has run. Otherwise only who joined is seen.
+    fn tells_calls(&self) -> bool {
+        true
+    }
+
     /// How many of so many attempts it has time for.
     fn share(&self, attempts: usize) -> usize {
         attempts
