@@ -1,15 +1,16 @@
 //! Attacks on the links of a unit, whoever opens them.
 
 use std::io;
+use std::time::Instant;
 
 use anyhow::Result;
-use cara_core::config::Mode;
+use cara_core::config::{Mode, Priority};
 use cara_core::distribution::identity::Fleet;
 use cara_core::host::frame::Frame;
 use cara_secure::keys::PairKey;
 
 use crate::ground::Keys;
-use crate::speaker::{Claim, HANDSHAKE, STEPS, Said, Speaker, framed, request_in_clear};
+use crate::speaker::{Claim, HANDSHAKE, PATIENCE, STEPS, Said, Speaker, framed, request_in_clear};
 use crate::tally::Report;
 use crate::target::{Target, Visit};
 use crate::trial::{attack, control};
@@ -60,17 +61,21 @@ fn share<C>(target: &dyn Target, cases: Vec<C>) -> Vec<C> {
 pub fn with_the_key(report: &mut Report, target: &dyn Target) -> Result<()> {
     control(report, target, "the same attacker with the key", &share(target, vec![(); 8]), |(), visit| {
         let mut speaker = visit.speaker(&visit.keys.genuine)?;
-        speaker.converse(5)?;
+        speaker.converse(HANDSHAKE + 1)?;
+        // Those of one class run in their order: when this one is answered, the one before has run as well.
+        let request = speaker.request(0, Priority::Normal, true);
+        speaker.say_bytes(&request)?;
         speaker.hear_answer(speaker.last_id())?;
         let asked = speaker.asked.clone();
         speaker.finish();
-        // Its calls have priorities of their own, and run side by side.
-        let in_time = || {
+        let end = Instant::now() + PATIENCE;
+        loop {
             let seen = (visit.seen)()?;
             let served = !target.tells_calls() || asked.iter().all(|mark| seen.marks.contains(mark));
-            anyhow::Ok(seen.joins == 1 && served)
-        };
-        Ok(in_time()? || in_time()? || in_time()?)
+            if (seen.joins == 1 && served) || Instant::now() > end {
+                return Ok(seen.joins == 1 && served);
+            }
+        }
     })
 }
 
@@ -222,7 +227,7 @@ fn lengths(report: &mut Report, target: &dyn Target, extent: Extent) -> Result<(
         let mut speaker = visit.speaker(&visit.keys.genuine)?;
         let _ = speaker.converse(*at);
         let asked = speaker.asked.clone();
-        let next = speaker.request(0, cara_core::config::Priority::Normal, false);
+        let next = speaker.request(0, Priority::Normal, false);
         let mut body = next.get(2..).unwrap_or_default().to_vec();
         // One of the genuine length is another one all the same.
         body.resize(if *length == body.len() { length + 1 } else { *length }, 0);
