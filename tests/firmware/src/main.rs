@@ -13,6 +13,7 @@ mod keys;
 mod load;
 mod manager;
 mod places;
+mod security;
 mod trace;
 
 use std::path::PathBuf;
@@ -78,6 +79,8 @@ enum Part {
     },
     /// Makes things fail while a vehicle drives, and measures how long its motors go on.
     Faults(faults::Faults),
+    /// Attacks a board that dials the attacker.
+    Security(security::Security),
     /// Puts a board on the desk, with its manager and a prompt for `cara`.
     Desk(desk::Desk),
 }
@@ -117,6 +120,7 @@ fn inside(arguments: &Arguments) -> Result<()> {
         Some(Part::Desk(desk)) => desk::run(&arguments.image, desk),
         Some(Part::Instructions { of, profile }) => count::run(&bench(arguments)?, &arguments.image, *of, *profile),
         Some(Part::Faults(faults)) => faults::run(bench(arguments)?.counting(), faults),
+        Some(Part::Security(options)) => security::run(&bench(arguments)?, options),
         Some(Part::Stack { of }) => load::run(&bench(arguments)?, *of),
         _ => run(arguments),
     }

@@ -8,8 +8,8 @@ use anyhow::{Context, Result};
 use crate::tally::{Counters, Report, Row};
 use crate::target::{Target, Visit};
 
-/// Counters that tell an operator of an attack.
-const TELLING: [&str; 23] = [
+/// Counters that tell an operator of an attack, and what a board logs.
+const TELLING: [&str; 25] = [
     "FramesRefused",
     "ProofsFailed",
     "FarewellsInClear",
@@ -33,6 +33,9 @@ const TELLING: [&str; 23] = [
     "Unasked",
     "RequestsForbidden",
     "RequestsTooSoon",
+    // Lines of a board's log, which has no counters for others to read.
+    "could not join",
+    "has left",
 ];
 
 /// Names of the telling counters that have risen.

@@ -79,6 +79,20 @@ fn tested() -> Result<Option<i32>> {
     tests(&image).args(["--constant".as_ref(), constant.as_os_str()]).code()
 }
 
+/// Attacks the emulated board and writes the figures to a file; why not, where it cannot be.
+pub(crate) fn attack(figures: &Path) -> Result<Option<String>> {
+    let attacked = || {
+        let image = tested_image()?;
+        build_command()?;
+        tests(&image).args(["security", "--json"]).args([figures]).code()
+    };
+    match emulated(attacked) {
+        Outcome::Passed => Ok(None),
+        Outcome::Skipped(reason) => Ok(Some(reason)),
+        Outcome::Failed(why) => bail!("attacks on a board: {why}"),
+    }
+}
+
 /// The AGV's image of the emulated board.
 fn tested_image() -> Result<PathBuf> {
     let board = boards::find(TESTED)?;

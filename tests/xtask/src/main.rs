@@ -89,7 +89,7 @@ enum Task {
         #[arg(long, value_name = "FILE")]
         json: Option<PathBuf>,
     },
-    /// Attacks units on the simulator and on Linux, and prints what was tried and what came of it.
+    /// Attacks units on the simulator, a board in QEMU and Linux units, and prints what was tried and what came of it.
     Security(security::Security),
     /// Makes things fail while an emulated vehicle drives, and prints how long its motors went on, beside the bound.
     Faults(firmware::Faults),

@@ -1,4 +1,5 @@
-//! `cargo xtask security`: everything that attackers try, on the simulator and on units of the Linux port, in one table.
+//! `cargo xtask security`: everything that attackers try, on the simulator, on boards in QEMU and on units of the Linux
+//! port, in one table.
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -7,13 +8,14 @@ use anyhow::{Context, Result, ensure};
 use clap::Args;
 
 use crate::command::Run;
-use crate::groups::Extent;
+use crate::firmware;
+use crate::groups::{Extent, Outcome};
 use crate::workspace;
 
 /// How much is tried, and where the figures go.
 #[derive(Args)]
 pub(crate) struct Security {
-    /// Tries some of everything.
+    /// Tries some of everything, and leaves the boards out.
     #[arg(long)]
     quick: bool,
     /// Also writes the figures here.
@@ -24,28 +26,42 @@ pub(crate) struct Security {
 /// The command: the table, and success only if no attack came to anything.
 pub(crate) fn run(options: &Security) -> Result<ExitCode> {
     let extent = if options.quick { Extent::Quick } else { Extent::Full };
-    attack(extent, options.json.as_deref()).map(|()| ExitCode::SUCCESS)
+    if let Some(reason) = attack(extent, options.json.as_deref())? {
+        println!("without boards: {reason}");
+    }
+    Ok(ExitCode::SUCCESS)
 }
 
-/// The group.
-pub(crate) fn check(extent: Extent) -> Result<()> {
-    attack(extent, None)
+/// The group. What could not be attacked makes it skipped.
+pub(crate) fn check(extent: Extent) -> Outcome {
+    match attack(extent, None) {
+        Ok(Some(reason)) if extent == Extent::Full => Outcome::Skipped(reason),
+        Ok(_) => Outcome::Passed,
+        Err(error) => Outcome::Failed(format!("{error:#}")),
+    }
 }
 
-fn attack(extent: Extent, json: Option<&Path>) -> Result<()> {
+/// Attacks everything; why boards were left out, if they were.
+fn attack(extent: Extent, json: Option<&Path>) -> Result<Option<String>> {
     let folder = workspace::root().join("target/security");
     std::fs::create_dir_all(&folder).context("cannot make a folder for figures")?;
-    let simulator = folder.join("simulator.txt");
+    let [simulator, boards] = ["simulator.txt", "boards.json"].map(|name| folder.join(name));
     std::fs::write(&simulator, simulated()?)?;
+    let left_out = match extent {
+        Extent::Full => firmware::attack(&boards)?,
+        Extent::Quick => Some("the quick run has none".to_owned()),
+    };
     let run =
         Run::cargo().args(["run", "--quiet", "--package", "cara-security", "--", "--simulator"]).args([&simulator]);
     let run = if extent == Extent::Quick { run.args(["--quick"]) } else { run };
+    let run = if left_out.is_none() { run.args(["--with".as_ref(), boards.as_os_str()]) } else { run };
     let run = match json {
         // The child runs in the project's root, wherever this command was started.
         Some(path) => run.args(["--json".as_ref(), std::path::absolute(path)?.as_os_str()]),
         None => run,
     };
-    run.stream()
+    run.stream()?;
+    Ok(left_out)
 }
 
 /// What the simulator's attackers print.
