@@ -255,8 +255,9 @@ impl Crew {
 
     /// Takes a unit out. Unless a thread of the crew does it itself, nobody is inside the unit any more when it returns.
     pub(crate) fn leave(&self, seat: u16) {
-        let place = write(&self.seats).get_mut(usize::from(seat)).and_then(Option::take);
+        // Before the seat is free: the next one on it may set its time at once.
         lock(&self.due).cancel(u32::from(seat));
+        let place = write(&self.seats).get_mut(usize::from(seat)).and_then(Option::take);
         if let Some(seat) = place.filter(|_| !self.is_own_thread()) {
             drop(write(&seat.gate));
         }
