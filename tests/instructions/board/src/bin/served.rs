@@ -44,8 +44,8 @@ fn spawn(spawner: Spawner) -> Result<(), &'static str> {
     let seed = 1;
     let (stack, network_runner) = embassy_net::new(ethernet, cara_vehicle::network(&settings), SOCKETS.take(), seed);
     let (name, id) = (settings.identity.name(), settings.identity.id());
-    let config =
-        Config::s_unit(name, id, &manager.name, manager.id, Security::insecure(seed)).map_err(|_| "the settings are of no unit")?;
+    let config = Config::s_unit(name, id, &manager.name, manager.id, Security::insecure(seed))
+        .map_err(|_| "the settings are of no unit")?;
     let config = config.fleet(settings.fleet.0);
     let (unit, unit_runner) =
         cara_embassy::new(stack, MEMORY.init_with(Memory::new), config, ()).map_err(|_| "no such unit")?;
