@@ -116,7 +116,7 @@ fn meet() {
     let (own, vehicle) = (Identity::m_unit("manager", 1).unwrap(), Identity::s_unit("agv", 7).unwrap());
     let mut keys = FleetKeys::draw(Fleet(fleet)).unwrap();
     keys.add(&own, &[]).unwrap();
-    keys.add(&vehicle, &[own.clone()]).unwrap();
+    keys.add(&vehicle, std::slice::from_ref(&own)).unwrap();
     let vehicle = keys.ring(&vehicle).unwrap();
     std::thread::spawn(move || board(fleet, vehicle));
     let builder = CommunicationSystem::builder("manager", 1).unwrap();

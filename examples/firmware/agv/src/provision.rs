@@ -20,6 +20,8 @@ pub struct Provision {
 }
 
 /// How a board proves who it is.
+// One of them lives while a board starts; boxing its keys would need an allocator.
+#[allow(clippy::large_enum_variant)]
 pub enum Proof {
     /// Not at all: its settings say so in words.
     Insecure,
