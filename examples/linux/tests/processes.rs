@@ -62,7 +62,8 @@ fn the_listing_runs_and_both_end_when_asked_to() {
 
 #[test]
 fn a_manager_that_finds_nobody_ends_when_asked_to() {
-    let mut manager = Fleet::new().start("manager", env!("CARGO_BIN_EXE_agv_manager"), &[]);
+    let fleet = Fleet::new();
+    let mut manager = fleet.start("manager", env!("CARGO_BIN_EXE_agv_manager"), &[]);
     manager.expect("line 6: searching", STEP).unwrap();
     assert!(manager.terminate(STEP).unwrap().success());
 }
