@@ -296,6 +296,8 @@ impl<T> Machine<T> {
     fn prove(&mut self, index: u16) {
         let Some(session) = self.link(index).and_then(|link| link.session.as_ref()) else { return };
         let (Some(hello), address) = (session.hello().cloned(), session.address()) else { return };
+        // A proof is two long computations: other tasks have their turn between them.
+        self.yields = true;
         match self.proof.credentials(&hello) {
             Some(credentials) => {
                 self.with(index, |session, cx, _| session.prove(cx, credentials));

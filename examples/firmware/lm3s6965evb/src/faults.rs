@@ -45,7 +45,7 @@ struct Record {
     sleeps: bool,
     /// How late the emulator was to wake the processor for the last tick, because its host was busy: no chip is.
     late: CoreDuration,
-    /// Longest turn of the executor that has ended.
+    /// Longest turn of the executor that has ended, while somebody wanted the vehicle to drive.
     turn: CoreDuration,
     /// Losses of the manager for which the hook has run.
     losses: u32,
@@ -121,10 +121,13 @@ pub async fn starve() -> ! {
     hang()
 }
 
-/// A turn of the executor has ended.
+/// A turn of the executor has ended. Those in which nobody wants the vehicle to drive hold nothing up: the longest of all are
+/// those of a proof, on a link that is not live yet.
 pub(crate) fn turned(began: Instant) {
-    let turn = now().since(began);
-    Record::change(|record| record.turn = record.turn.max(turn));
+    if DRIVING.is_live(began) {
+        let turn = now().since(began);
+        Record::change(|record| record.turn = record.turn.max(turn));
+    }
 }
 
 /// The processor is going to sleep, or has run the interrupts that woke it.
