@@ -2,6 +2,8 @@
 //! user types.
 
 use std::ffi::OsStr;
+use std::fs::Permissions;
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::rc::Rc;
@@ -72,8 +74,10 @@ impl Keys {
         let beside = || Ok::<_, anyhow::Error>(std::env::current_exe()?.with_file_name("cara"));
         let cara = cara.map_or_else(beside, |cara| Ok(cara.to_owned()))?;
         ensure!(cara.is_file(), "{} is not there: cargo build --package cara-cli", cara.display());
-        // Control sockets, and keys, are not made where others could enter; a temporary folder is its owner's alone.
-        let folder = tempfile::Builder::new().prefix("boards").tempdir().context("cannot make a folder for keys")?;
+        // Control sockets are not made where others could enter, and keys should not be.
+        let owner_only = Permissions::from_mode(0o700);
+        let folder = tempfile::Builder::new().prefix("boards").permissions(owner_only).tempdir();
+        let folder = folder.context("cannot make a folder for keys")?;
         Ok(Self { cara, folder, kind })
     }
 
