@@ -1,5 +1,7 @@
 //! The node and its links: opening, accepting, admitting, leaving, and what is published to whom.
 
+use std::cmp::Reverse;
+use std::collections::HashMap;
 use std::sync::Arc;
 
 use cara_core::config::Constraints;
@@ -11,7 +13,7 @@ use cara_core::host::mailman::LinkId;
 use cara_core::services::publications::Publications;
 use cara_core::services::unit::{Session, SessionConfig};
 use cara_core::time::{Duration, Instant};
-use core::net::SocketAddr;
+use core::net::{IpAddr, SocketAddr};
 
 use super::link::{LinkCell, LinkState, Notice, StdMailman};
 use super::{Engine, lock, read, write};
@@ -96,15 +98,16 @@ impl<T: Send + 'static> Engine<T> {
         }
     }
 
-    /// Ends the link that has waited longest for its peer's first word, so that nobody who connects and says nothing
-    /// keeps others out. One whose hello waits to be read has spoken.
+    /// Ends a link whose peer has proven nothing, so that nobody who connects and says nothing keeps others out: of the
+    /// host that has most of them, the one that has waited longest. One whose hello waits to be read has spoken.
     fn make_room(&self) {
-        let mut unproven = self.each_link();
-        unproven.retain(|link| link.peer.get().is_none());
-        unproven.sort_unstable_by_key(|link| link.serial);
-        for link in unproven {
+        let mut unproven = self.unproven();
+        let mut of_host: HashMap<IpAddr, usize> = HashMap::new();
+        unproven.iter().for_each(|(host, _)| *of_host.entry(*host).or_default() += 1);
+        unproven.sort_unstable_by_key(|(host, link)| (Reverse(of_host.get(host).copied()), link.serial));
+        for (_, link) in unproven {
             let Some(mut state) = link.try_lock() else { continue };
-            if state.session.dialed() || state.session.is_proven() || link.stream.has_unread() {
+            if state.session.is_proven() || link.stream.has_unread() {
                 continue;
             }
             self.with(&link, &mut state, |session, cx| session.close(cx, CloseReason::HelloTimeout));
@@ -112,6 +115,18 @@ impl<T: Send + 'static> Engine<T> {
             lock(&self.node).node.counters.add(NodeCounter::GaveWay, 1);
             return;
         }
+    }
+
+    /// Links that others have opened and that have proven nothing, with the hosts they come from. One in use is left out.
+    fn unproven(&self) -> Vec<(IpAddr, Arc<LinkCell>)> {
+        let host = |link: &Arc<LinkCell>| {
+            let state = link.try_lock()?;
+            let is_unproven = !state.session.dialed() && !state.session.is_proven();
+            is_unproven.then(|| state.session.address().ip())
+        };
+        let mut links = self.each_link();
+        links.retain(|link| link.peer.get().is_none());
+        links.into_iter().filter_map(|link| Some((host(&link)?, link))).collect()
     }
 
     fn dial(&self, to: SocketAddr, identity: Option<&Identity>) {

@@ -2,9 +2,10 @@
 
 use std::io::{Read, Write};
 use std::net::{Ipv4Addr, SocketAddr, TcpStream, UdpSocket};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use cara_std::{Builder, Mode};
+use cara_std::{Builder, Constraints, Mode};
+use socket2::{Domain, Socket, Type};
 
 use crate::support::{PATIENCE, ask, counter, fleet, meet, number, service, system, unit, until};
 
@@ -105,4 +106,39 @@ fn half_open_connections_do_not_keep_units_out_for_ever() {
     second.start().unwrap();
     until("the second comes", || manager.number_of_s_units() == 2);
     drop(silent);
+}
+
+/// A host that opens one connection after the other shuts out its own, and not that of another host that is slow.
+#[test]
+fn half_open_connections_of_one_host_give_way_to_each_other_first() {
+    let fleet = fleet();
+    let constraints = Constraints { maximum_nodes: 4, ..Constraints::M_UNIT };
+    let manager = system(fleet).constraints(constraints).build_system().unwrap();
+    let first = unit("first", 1, fleet).build_unit().unwrap();
+    meet(&manager, &first);
+    let port = stream_port(&first);
+    // Nobody may say nothing for longer than 2 s, so a machine that is slower than that tries again.
+    let was_in_time = (0..20).any(|_| {
+        let began = Instant::now();
+        let slow = connection_from(Ipv4Addr::LOCALHOST, port);
+        let gave_way = counter(&manager.counters(), "GaveWay");
+        let greedy: Vec<_> = (0..100).map(|_| connection_from(Ipv4Addr::new(127, 0, 0, 2), port)).collect();
+        until("some gave way", || counter(&manager.counters(), "GaveWay") > gave_way);
+        slow.set_nonblocking(true).unwrap();
+        let is_open = (&slow).read(&mut [0; 1]).is_err_and(|error| error.kind() == std::io::ErrorKind::WouldBlock);
+        drop(greedy);
+        let in_time = began.elapsed() < Duration::from_millis(1_500);
+        assert!(is_open || !in_time, "another host's connection was ended");
+        in_time
+    });
+    assert!(was_in_time, "this machine opens no 100 connections in 1.5 s");
+    assert!(first.manager().is_some_and(|manager| manager.is_connected()));
+}
+
+/// A connection that says nothing.
+fn connection_from(host: Ipv4Addr, to: SocketAddr) -> TcpStream {
+    let socket = Socket::new(Domain::IPV4, Type::STREAM, None).unwrap();
+    socket.bind(&SocketAddr::from((host, 0)).into()).unwrap();
+    socket.connect(&to.into()).unwrap();
+    socket.into()
 }
