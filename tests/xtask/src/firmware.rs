@@ -75,16 +75,14 @@ fn emulated(test: impl FnOnce() -> Result<Option<i32>>) -> Outcome {
 fn tested() -> Result<Option<i32>> {
     let image = tested_image()?;
     let constant = boards::find(TESTED)?.build(&boards::CONSTANT)?;
-    build_command()?;
-    tests(&image).args(["--constant".as_ref(), constant.as_os_str()]).code()
+    tests(&image)?.args(["--constant".as_ref(), constant.as_os_str()]).code()
 }
 
 /// Attacks the emulated board and writes the figures to a file; why not, where it cannot be.
 pub(crate) fn attack(figures: &Path) -> Result<Option<String>> {
     let attacked = || {
         let image = tested_image()?;
-        build_command()?;
-        tests(&image).args(["security", "--json"]).args([figures]).code()
+        tests(&image)?.args(["security", "--json"]).args([figures]).code()
     };
     match emulated(attacked) {
         Outcome::Passed => Ok(None),
@@ -101,14 +99,10 @@ fn tested_image() -> Result<PathBuf> {
     board.build(image)
 }
 
-/// The program that runs images, about to be run with one.
-pub(crate) fn tests(image: &Path) -> Run {
-    Run::cargo().args(["run", "--quiet", "--package", "cara-firmware-tests", "--", "--image"]).args([image])
-}
-
-/// The `cara` command, which is used beside boards.
-pub(crate) fn build_command() -> Result<()> {
-    Run::cargo().args(["build", "--quiet", "--package", "cara-cli"]).stream()
+/// The program that runs images, about to be run with one. It uses the `cara` command beside it.
+pub(crate) fn tests(image: &Path) -> Result<Run> {
+    Run::cargo().args(["build", "--quiet", "--package", "cara-cli"]).stream()?;
+    Ok(Run::cargo().args(["run", "--quiet", "--package", "cara-firmware-tests", "--", "--image"]).args([image]))
 }
 
 fn chosen(name: Option<&str>) -> Result<Vec<&'static Board>> {

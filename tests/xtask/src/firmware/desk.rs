@@ -5,7 +5,7 @@ use std::process::ExitCode;
 use anyhow::{Result, bail};
 use clap::Args;
 
-use super::{NOT_ALLOWED, TESTED, build_command, tested_image, tests};
+use super::{NOT_ALLOWED, TESTED, tested_image, tests};
 use crate::install;
 
 /// Who is put on the desk.
@@ -35,10 +35,9 @@ pub(crate) fn desk(board: Option<&str>, who: &Who) -> Result<ExitCode> {
     }
     install::program("qemu-system-arm", "qemu-system-arm").map_err(anyhow::Error::msg)?;
     let image = tested_image()?;
-    build_command()?;
     let (id, fleet) = (who.id.to_string(), who.fleet.to_string());
     let told = ["desk", "--name", &who.name, "--id", &id, "--manager", &who.manager, "--fleet", &fleet];
-    match tests(&image).args(told).interactive().code()? {
+    match tests(&image)?.args(told).interactive().code()? {
         Some(0) => Ok(ExitCode::SUCCESS),
         Some(NOT_ALLOWED) => bail!("the board needs a network of its own, see above"),
         code => bail!("the desk ended with code {code:?}"),

@@ -50,8 +50,7 @@ fn injected(faults: &Faults) -> Result<Option<i32>> {
     let board = boards::find(TESTED)?;
     install::rust_target(board.target).map_err(anyhow::Error::msg)?;
     let image = board.build(&FAULTS)?;
-    super::build_command()?;
     let seed = faults.seed.map(|seed| ["--seed".to_owned(), seed.to_string()]);
     let each = faults.each.to_string();
-    tests(&image).args(["faults", "--each", &each, "--kind", &faults.kind]).args(seed.iter().flatten()).code()
+    tests(&image)?.args(["faults", "--each", &each, "--kind", &faults.kind]).args(seed.iter().flatten()).code()
 }

@@ -85,9 +85,8 @@ fn stack(path: &Path, image: &Image) -> Result<Option<u64>> {
         println!("warning: no stack is measured: {reason}");
         return Ok(None);
     }
-    super::build_command()?;
     let insecure = (!image.is_secured).then_some("--insecure");
-    let (code, output) = tests(path).args(insecure).args(["stack", image.program]).output()?;
+    let (code, output) = tests(path)?.args(insecure).args(["stack", image.program]).output()?;
     match code {
         Some(0) => {}
         Some(NOT_ALLOWED) => {
