@@ -157,22 +157,27 @@ fn two_units_with_few_buffers_do_not_stop_each_other(world: &mut dyn World) {
     met(world, &one, "two", "store");
     met(world, &two, "one", "store");
     for _ in 0..3 {
-        let mut calls = Vec::new();
-        for priority in [Priority::High, Priority::Normal, Priority::Low] {
-            let options =
-                RequestOptions { timeout: Some(secs(8)), priority: Some(priority), ..RequestOptions::default() };
-            calls.push(one.begin("two", "store", &text(length), options));
-            calls.push(two.begin("one", "store", &text(length), options));
-        }
-        let outcomes: Vec<_> = calls.iter().map(|call| world.finish(call).map(drop)).collect();
-        let answered = |outcome: &Result<(), Error>| matches!(outcome, Ok(()) | Err(Error::Busy | Error::Full(_)));
-        assert!(outcomes.iter().all(answered), "{outcomes:?}{}", world.story());
-        assert!(outcomes.contains(&Ok(())), "{outcomes:?}");
+        // While each of them sends all it can, each may have no room for any of a round's calls, and say so: not every time.
+        assert!((0..20).any(|_| some_at_once_run(world, &one, &two, length)), "none ran{}", world.story());
     }
     for (unit, other) in [(&one, "two"), (&two, "one")] {
         assert_eq!(world.ask(unit, other, "store", &mut text(length)), Ok(()));
     }
     world.reached("answered");
+}
+
+/// Three calls in each direction at once; all are answered, and whether any ran.
+fn some_at_once_run(world: &mut dyn World, one: &Unit, two: &Unit, length: usize) -> bool {
+    let mut calls = Vec::new();
+    for priority in [Priority::High, Priority::Normal, Priority::Low] {
+        let options = RequestOptions { timeout: Some(secs(8)), priority: Some(priority), ..RequestOptions::default() };
+        calls.push(one.begin("two", "store", &text(length), options));
+        calls.push(two.begin("one", "store", &text(length), options));
+    }
+    let outcomes: Vec<_> = calls.iter().map(|call| world.finish(call).map(drop)).collect();
+    let answered = |outcome: &Result<(), Error>| matches!(outcome, Ok(()) | Err(Error::Busy | Error::Full(_)));
+    assert!(outcomes.iter().all(answered), "{outcomes:?}{}", world.story());
+    outcomes.contains(&Ok(()))
 }
 
 fn a_second_manager_of_a_name_is_told_on_its_own_side(world: &mut dyn World) {
