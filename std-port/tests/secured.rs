@@ -214,6 +214,28 @@ fn a_running_manager_follows_its_key_file() {
     assert!(events.try_iter().any(|event| event == left));
 }
 
+/// A stranger's dial makes the manager look at its file between two looks: what was revoked is found then as well.
+#[test]
+fn a_stranger_who_dials_saves_no_revoked_vehicle() {
+    let fleet = fleet();
+    let folder = tempfile::tempdir().unwrap();
+    let mut store = Store::create(folder.path(), keys(fleet, &[7, 8])).unwrap();
+    store.save().unwrap();
+    let manager = started_manager(manager(fleet).key_file(store.file_of(&depot())));
+    let start = |id| started_vehicle(vehicle(fleet, id).key_file(store.file_of(&agv(id))));
+    let (first, _second) = (start(7), start(8));
+    joined(&manager, 2);
+    let address = first.manager().unwrap().address().unwrap();
+    let of_others = keys(fleet, &[99]).ring(&agv(99)).unwrap();
+    let stranger = vehicle(fleet, 99).keys(of_others).manager_address(address).build_unit().unwrap();
+
+    store.keys_mut().revoke(&[agv(7)]).unwrap();
+    store.save().unwrap();
+    stranger.start().unwrap();
+    until("the revoked one is gone", || manager.number_of_s_units() == 1);
+    assert!(manager.s_units().iter().all(|peer| peer.is_connected() == (peer.identity() == &agv(8))));
+}
+
 #[test]
 fn without_keys_the_error_says_which_command_makes_them() {
     let missing = Path::new("/nonexistent/depot.keys");

@@ -13,6 +13,8 @@ pub(crate) struct FileWatch {
     read: Option<Mark>,
     /// As it was at the last look.
     seen: Option<Mark>,
+    /// The state in which it could not be read, about which whoever asked has been told.
+    refused: Option<Option<Mark>>,
 }
 
 impl FileWatch {
@@ -21,11 +23,12 @@ impl FileWatch {
         // Before it is read: what is written meanwhile is a change.
         let mark = Mark::of(&path).ok();
         let table = AccessTable::read(&path)?;
-        Ok((Self { path, read: mark, seen: mark }, table))
+        Ok((Self { path, read: mark, seen: mark, refused: None }, table))
     }
 
     /// The file's contents if they have changed, and have not since the last look: whoever writes it in place is given
-    /// the time to finish.
+    /// the time to finish. What cannot be read is told once and tried again at each look, as it need not be the file's
+    /// fault.
     pub(crate) fn look(&mut self) -> Option<Result<AccessTable, AccessError>> {
         let now = Mark::of(&self.path).ok();
         let settled = now == self.seen;
@@ -33,8 +36,13 @@ impl FileWatch {
         if now == self.read || !settled {
             return None;
         }
-        self.read = now;
-        Some(AccessTable::read(&self.path))
+        let table = AccessTable::read(&self.path);
+        match &table {
+            Ok(_) => (self.read, self.refused) = (now, None),
+            Err(_) if self.refused == Some(now) => return None,
+            Err(_) => self.refused = Some(now),
+        }
+        Some(table)
     }
 }
 

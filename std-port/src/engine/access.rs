@@ -102,19 +102,19 @@ impl<T: Send + 'static> Engine<T> {
     /// Whether the operator may do something; a refusal is counted, and told in the log once a second at most.
     pub(crate) fn operator_may(&self, function: &str, verb: Verb) -> Result<(), Error> {
         let Some(table) = self.guard.table() else { return Ok(()) };
-        match table.decide(Principal::Operator, function, verb) {
+        let decision = match table.decide(Principal::Operator, function, verb) {
             Decision::Allowed { rate: Some(rate), .. } if verb == Verb::Call => {
                 self.guard.take(self.now(), function, rate)
             }
             Decision::Allowed { .. } => Ok(()),
-            Decision::Denied => {
-                self.guard.operator_refused.fetch_add(1, Ordering::Relaxed);
-                if self.guard.may_log(self.now()) {
-                    tracing::warn!(function, ?verb, "the access table does not let the operator do this");
-                }
-                Err(Error::NotAllowed)
+            Decision::Denied => Err(Error::NotAllowed),
+        };
+        decision.inspect_err(|error| {
+            self.guard.operator_refused.fetch_add(1, Ordering::Relaxed);
+            if self.guard.may_log(self.now()) {
+                tracing::warn!(function, ?verb, %error, "the access table does not let the operator do this");
             }
-        }
+        })
     }
 
     /// Whether the operator may call a function, whatever its rate.

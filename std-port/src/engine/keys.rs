@@ -79,6 +79,27 @@ impl Keys {
     }
 }
 
+/// When the keys are looked at next, and which links have been held against them.
+#[derive(Debug)]
+pub(super) struct Watched {
+    due: Instant,
+    /// The ring in which every live link had its key. Another one may have been taken since, for somebody who came.
+    checked: Option<Arc<KeyRing>>,
+}
+
+impl Watched {
+    pub(super) const fn new(born: Instant) -> Self {
+        Self { due: born, checked: None }
+    }
+
+    /// Whether links have not been held against this ring yet; from here on they have.
+    fn is_news(&mut self, ring: &Arc<KeyRing>) -> bool {
+        let is_news = self.checked.as_ref().is_none_or(|checked| !Arc::ptr_eq(checked, ring));
+        self.checked = Some(ring.clone());
+        is_news
+    }
+}
+
 /// Whether there is another ring now. A file that is refused is told once, and the ring stays as it was.
 fn refresh(live: &LiveRing) -> bool {
     match live.refresh() {
@@ -100,7 +121,9 @@ impl<T: Send + 'static> Engine<T> {
     /// The peer of a secured link says who it is: each proves to the other that it has the pair's key.
     pub(super) fn prove(&self, link: &Arc<LinkCell>, state: &mut LinkState) {
         let Some(peer) = state.session.identity().cloned() else { return };
-        match self.keys.credentials(&peer) {
+        let credentials = self.keys.credentials(&peer);
+        self.watch_new_keys();
+        match credentials {
             Some(credentials) => self.with(link, state, |session, cx| session.prove(cx, credentials)),
             None => {
                 lock(&self.node).node.refuse_without_key(self.now(), state.session.address(), &peer);
@@ -109,19 +132,34 @@ impl<T: Send + 'static> Engine<T> {
         }
     }
 
-    /// Looks at the file with the keys if it is time; returns when it will be.
+    /// Keys that were taken for somebody who came are held against all links at once.
+    fn watch_new_keys(&self) {
+        let Keys::Ring(live) = &self.keys else { return };
+        let mut watched = lock(&self.watched_keys);
+        if watched.checked.as_ref().is_some_and(|checked| !Arc::ptr_eq(checked, &live.ring())) {
+            watched.due = self.now();
+            drop(watched);
+            self.wake_clock();
+        }
+    }
+
+    /// Looks at the file with the keys if it is time; returns when it will be. Whoever is not in the ring any more loses its
+    /// link, also where the ring was taken between two looks.
     pub(super) fn watch_keys(&self) -> Instant {
         let Keys::Ring(live) = &self.keys else { return Instant::FAR_FUTURE };
         let now = self.now();
-        {
-            let mut due = lock(&self.keys_due);
-            if now < *due {
-                return *due;
+        let ring = {
+            let mut watched = lock(&self.watched_keys);
+            if now < watched.due {
+                return watched.due;
             }
-            *due = now + REFRESH;
-        }
-        if refresh(live) {
-            self.end_links_without_keys(&live.ring());
+            watched.due = now + REFRESH;
+            refresh(live);
+            let ring = live.ring();
+            watched.is_news(&ring).then_some(ring)
+        };
+        if let Some(ring) = ring {
+            self.end_links_without_keys(&ring);
         }
         now + REFRESH
     }

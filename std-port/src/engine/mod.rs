@@ -106,7 +106,7 @@ pub(crate) struct Engine<T: 'static> {
     interfaces: Mutex<interfaces::InterfaceWatch>,
     pub(crate) keys: Keys,
     /// When the file with the keys is looked at.
-    keys_due: Mutex<Instant>,
+    watched_keys: Mutex<keys::Watched>,
     /// How old the keys of a link become, instead of 12 h.
     pub(crate) renews_every: OnceLock<Duration>,
     stopping: AtomicBool,
@@ -187,7 +187,7 @@ impl<T: Send + 'static> Engine<T> {
             watch: staying::Watch::default(),
             interfaces: Mutex::default(),
             keys: parts.keys,
-            keys_due: Mutex::new(born),
+            watched_keys: Mutex::new(keys::Watched::new(born)),
             renews_every: OnceLock::new(),
             stopping: AtomicBool::new(false),
             born,

@@ -20,8 +20,10 @@ pub struct LiveRing {
 #[derive(Debug)]
 struct Held {
     ring: Arc<KeyRing>,
-    /// The file that was read last, taken or not. None when it could not even be found.
+    /// The file that it was read from. None where there is none.
     mark: Option<Mark>,
+    /// The file that could not be taken, about which whoever asked has been told; none in it where it is gone.
+    refused: Option<Option<Mark>>,
 }
 
 impl LiveRing {
@@ -38,13 +40,13 @@ impl LiveRing {
     pub fn open(path: &Path, identity: &Identity, fleet: Fleet) -> Result<Self, KeyError> {
         let (ring, mark) = KeyRing::load_marked(path)?;
         let ring = ring.belonging_to(path, identity, fleet)?;
-        let held = Mutex::new(Held { ring: Arc::new(ring), mark: Some(mark) });
+        let held = Mutex::new(Held { ring: Arc::new(ring), mark: Some(mark), refused: None });
         Ok(Self { path: Some(path.to_owned()), held })
     }
 
     /// A ring that was made in this process, and that follows no file.
     pub fn fixed(ring: KeyRing) -> Self {
-        Self { path: None, held: Mutex::new(Held { ring: Arc::new(ring), mark: None }) }
+        Self { path: None, held: Mutex::new(Held { ring: Arc::new(ring), mark: None, refused: None }) }
     }
 
     /// Its file.
@@ -58,20 +60,41 @@ impl LiveRing {
     }
 
     /// Looks at the file, which costs one system call, and reads it if it has changed. Whether there is another ring now.
-    /// A file that is refused, or gone, leaves the ring as it was; it is an error once, and tried again when it changes.
+    /// A file that is refused, or gone, leaves the ring as it was; it is an error once. It is tried again at each look:
+    /// what was in the way may have been a full table of files, and a revocation must not be lost by that.
     pub fn refresh(&self) -> Result<bool, KeyError> {
+        self.refresh_by(read)
+    }
+
+    fn refresh_by(
+        &self,
+        read: impl FnOnce(&Path, &KeyRing) -> Result<(KeyRing, Mark), KeyError>,
+    ) -> Result<bool, KeyError> {
         let Some(path) = &self.path else { return Ok(false) };
         let mut held = self.held.lock().unwrap_or_else(PoisonError::into_inner);
         let mark = Mark::of(path).ok();
         if mark == held.mark {
+            held.refused = None;
             return Ok(false);
         }
-        held.mark = mark;
-        let (ring, mark) = KeyRing::load_marked(path)?;
-        let ring = ring.belonging_to(path, held.ring.identity(), held.ring.fleet())?;
-        *held = Held { ring: Arc::new(ring), mark: Some(mark) };
-        Ok(true)
+        match read(path, &held.ring) {
+            Ok((ring, mark)) => {
+                *held = Held { ring: Arc::new(ring), mark: Some(mark), refused: None };
+                Ok(true)
+            }
+            Err(_) if held.refused == Some(mark) => Ok(false),
+            Err(error) => {
+                held.refused = Some(mark);
+                Err(error)
+            }
+        }
     }
+}
+
+/// The ring of the same node that is in its file now.
+fn read(path: &Path, held: &KeyRing) -> Result<(KeyRing, Mark), KeyError> {
+    let (ring, mark) = KeyRing::load_marked(path)?;
+    Ok((ring.belonging_to(path, held.identity(), held.fleet())?, mark))
 }
 
 #[cfg(test)]
@@ -117,6 +140,25 @@ mod tests {
         fs::rename(folder.path().join(place::file_name(&agv(1), Fleet(7))), &path).unwrap();
         assert!(matches!(live.refresh(), Err(KeyError::OtherNode { .. })));
         assert!(live.ring().pair(&agv(1)).is_some());
+    }
+
+    #[test]
+    fn what_could_not_be_read_for_another_reason_is_tried_again() {
+        let folder = tempfile::tempdir().unwrap();
+        let agv = Identity::s_unit("agv", 1).unwrap();
+        let mut store = Store::create(folder.path(), FleetKeys::draw(Fleet(7)).unwrap()).unwrap();
+        [depot(), agv.clone()].iter().for_each(|node| store.keys_mut().add(node, &[]).unwrap());
+        store.save().unwrap();
+        let live = LiveRing::open(&store.file_of(&depot()), &depot(), Fleet(7)).unwrap();
+        store.keys_mut().revoke(std::slice::from_ref(&agv)).unwrap();
+        store.save().unwrap();
+        let full = |path: &Path, _: &KeyRing| {
+            let (path, error) = (path.to_owned(), std::io::Error::other("too many open files"));
+            Err(KeyError::System { path, error })
+        };
+        assert!(live.refresh_by(full).is_err() && !live.refresh_by(full).unwrap(), "told once");
+        assert!(live.ring().pair(&agv).is_some());
+        assert!(live.refresh().unwrap() && live.ring().pair(&agv).is_none(), "the file is the same as before");
     }
 
     #[test]
