@@ -62,6 +62,8 @@ fn the_operator_does_what_its_rule_allows_as_often_as_it_does() {
     }
     assert_eq!(refused(&mut client, ask_fail()), "TooSoon");
     assert_eq!(refused(&mut client, Question::Call(call(Some("agv"), "slow", vec![]))), "NotAllowed");
+    let counted = depot.system.counters();
+    assert!(counted.contains(&("OperatorForbidden", 2)), "each refusal is counted: {counted:?}");
 }
 
 #[test]
