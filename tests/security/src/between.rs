@@ -150,7 +150,8 @@ impl<'l> Middle<'l> {
         Ok(fooled)
     }
 
-    fn meddle(&self, report: &mut Report, extent: Extent) -> Result<()> {
+    /// Something is done to each sealed frame.
+    pub fn meddle(&self, report: &mut Report, extent: Extent) -> Result<()> {
         for to_manager in [true, false] {
             let numbers = HANDSHAKE..HANDSHAKE + 8;
             let places = numbers.map(|number| Place { to_manager, number });

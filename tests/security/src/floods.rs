@@ -4,9 +4,9 @@ use std::net::TcpStream;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
-use anyhow::{Result, ensure};
+use anyhow::{Context, Result, anyhow, ensure};
 use cara_core::config::Mode;
-use cara_core::distribution::datagram::{SEARCH_BYTES, WhoHas};
+use cara_core::distribution::datagram::{HEADER_BYTES, SEARCH_BYTES, WhoHas};
 use cara_core::distribution::identity::Epoch;
 use cara_core::host::frame::Frame;
 use cara_secure::keyring::Codes;
@@ -15,9 +15,9 @@ use cara_std::{Error, Interfaces, Parameters, Peer, RequestOptions};
 
 use crate::ground::agv;
 use crate::links::Extent;
-use crate::linux::{Linux, LinuxManager, wait_for};
+use crate::linux::{Linux, LinuxManager, named, wait_for};
 use crate::speaker::{framed, fresh_mark, hello};
-use crate::tally::{Report, Row};
+use crate::tally::{Counters, Report, Row};
 use crate::target::Target;
 use crate::trial::risen;
 
@@ -30,8 +30,23 @@ const HELD: usize = 100;
 /// Pause of each of the two attackers between two links, so that they open a thousand a second at most: a link has as long
 /// to prove itself as it takes to open as many as there is room for.
 const BETWEEN_LINKS: Duration = Duration::from_millis(2);
+/// Pause of each of the two attackers between two datagrams.
+const BETWEEN_DATAGRAMS: Duration = Duration::from_micros(50);
+/// Counters of a manager that rise where it believes what comes to its discovery port.
+const BELIEVED: [&str; 3] = ["WhoHasHeard", "AnnounceHeard", "Dialled"];
 /// Numbers of the vehicles that belong, and that others do not use.
 const THERE: u32 = 201;
+
+/// A flood.
+struct Flood {
+    name: &'static str,
+    /// Attempts, at least.
+    count: u64,
+    /// The vehicle that comes meanwhile.
+    newcomer: u32,
+    /// The counter that rises with each attempt that the manager looked at; without one all that were made count.
+    looked_at: Option<&'static str>,
+}
 
 /// Both floods against a manager.
 pub fn run(report: &mut Report, linux: &Linux, manager: &LinuxManager<'_>, extent: Extent) -> Result<()> {
@@ -39,10 +54,13 @@ pub fn run(report: &mut Report, linux: &Linux, manager: &LinuxManager<'_>, exten
     ensure!(wait_for(|| connected(manager, THERE).is_some()), "nobody joins in calm");
     let count = if extent == Extent::Full { 6_000 } else { 800 };
     let handshakes = |over: &AtomicBool, made: &AtomicU64| open_links(linux, manager, over, made);
-    flood(report, linux, manager, ("flood of half-open links", count, THERE + 1), handshakes)?;
+    let links = Flood { name: "flood of half-open links", count, newcomer: THERE + 1, looked_at: None };
+    flood(report, linux, manager, &links, handshakes)?;
     let count = if extent == Extent::Full { 60_000 } else { 6_000 };
     let datagrams = |over: &AtomicBool, made: &AtomicU64| say_anything(linux, over, made);
-    flood(report, linux, manager, ("flood of discovery", count, THERE + 2), datagrams)?;
+    let forged = Some("DatagramForged");
+    let discovery = Flood { name: "flood of discovery", count, newcomer: THERE + 2, looked_at: forged };
+    flood(report, linux, manager, &discovery, datagrams)?;
     there.stop();
     Ok(())
 }
@@ -61,12 +79,13 @@ fn call(peer: &Peer) -> Result<(), Error> {
 }
 
 /// Lets `attacker` go on until it has done enough, and those who belong have done what they want: calls in time, and a
-/// new vehicle that is found and joins. Each attempt that keeps one from that is a success, as is who joins without a key.
+/// new vehicle that is found and joins. Each attempt that keeps one from that is a success, as is who joins without a key,
+/// and each datagram that is believed.
 fn flood(
     report: &mut Report,
     linux: &Linux,
     manager: &LinuxManager<'_>,
-    (name, count, newcomer): (&str, u64, u32),
+    &Flood { name, count, newcomer, looked_at }: &Flood,
     attacker: impl Fn(&AtomicBool, &AtomicU64) -> Result<()> + Sync,
 ) -> Result<()> {
     let (over, made) = (AtomicBool::new(false), AtomicU64::new(0));
@@ -93,21 +112,33 @@ fn flood(
         }
         late += u64::from(out);
         over.store(true, Ordering::Relaxed);
-        attackers.into_iter().try_for_each(|attacker| attacker.join().unwrap_or(Ok(())))
+        attackers.into_iter().try_for_each(|attacker| attacker.join().map_err(|_| anyhow!("an attacker panicked"))?)
     })?;
     let strangers = manager.diary.joins_but_of(&[agv(THERE), agv(newcomer)]) - joins;
-    if let Some((unit, _)) = new {
-        unit.stop();
-    }
+    let after = manager.counters()?;
+    let (unit, _) = new.ok_or_else(|| anyhow!("the flood was over before a newcomer came"))?;
+    // The manager's counters were read first: what it heard of the newcomer was sent before.
+    let believed = believed(&before, &after, unit.counters());
+    unit.stop();
     report.add(Row {
         attack: name.to_owned(),
         target: manager.name().to_owned(),
-        attempts: made.load(Ordering::Relaxed),
-        successes: late + strangers as u64,
-        noticed: risen(&before, &manager.counters()?),
+        attempts: looked_at.map_or(made.into_inner(), |name| value(&after, name) - value(&before, name)),
+        successes: late + strangers as u64 + believed,
+        noticed: risen(&before, &after),
         control: false,
     });
     Ok(())
+}
+
+fn value(counters: &Counters, name: &str) -> u64 {
+    counters.get(name).copied().unwrap_or(0)
+}
+
+/// What the manager believed beyond the newcomer's own questions.
+fn believed(before: &Counters, after: &Counters, newcomer: Vec<(&'static str, u64)>) -> u64 {
+    let heard: u64 = BELIEVED.iter().map(|name| value(after, name) - value(before, name)).sum();
+    heard.saturating_sub(value(&named(newcomer), "WhoHasSent"))
 }
 
 /// Opens link after link and says hello on each, every other time in the name of a vehicle that is connected.
@@ -130,7 +161,7 @@ fn open_links(linux: &Linux, manager: &LinuxManager<'_>, over: &AtomicBool, made
     Ok(())
 }
 
-/// Sends datagrams as fast as it can: who-has with the codes of another fleet, and noise behind a right beginning.
+/// Sends datagram after datagram: who-has with the codes of another fleet, and noise behind a right beginning in turn.
 fn say_anything(linux: &Linux, over: &AtomicBool, made: &AtomicU64) -> Result<()> {
     let socket = Datagrams::open(Interfaces::Loopback, linux.port)?;
     let mut out = [0; SEARCH_BYTES];
@@ -146,11 +177,13 @@ fn say_anything(linux: &Linux, over: &AtomicBool, made: &AtomicU64) -> Result<()
             known: Default::default(),
         };
         let codes = Codes::Keyed(crate::discovery::Lent(linux.ground.elsewhere()));
-        let bytes = search.encode(linux.ground.fleet, &codes, &mut out).unwrap_or_default();
-        socket.broadcast(bytes);
-        made.fetch_add(1, Ordering::Relaxed);
-        // A hundred thousand a second would be a test of the kernel.
-        std::thread::sleep(Duration::from_micros(50));
+        let mut bytes = search.encode(linux.ground.fleet, &codes, &mut out).context("it fits")?.to_vec();
+        if made.fetch_add(1, Ordering::Relaxed).is_multiple_of(2) {
+            bytes.iter_mut().skip(HEADER_BYTES).for_each(|byte| *byte = fastrand::u8(..));
+        }
+        socket.broadcast(&bytes);
+        // Without a pause the kernel drops nearly all of them, and the unit is not what is tested.
+        std::thread::sleep(BETWEEN_DATAGRAMS);
     }
     Ok(())
 }

@@ -6,17 +6,19 @@ use std::time::Instant;
 use anyhow::Result;
 use cara_core::config::{Mode, Priority};
 use cara_core::distribution::identity::Fleet;
-use cara_core::host::frame::Frame;
+use cara_core::host::frame::{self, Frame};
 use cara_secure::keys::PairKey;
 
 use crate::ground::Keys;
-use crate::speaker::{Claim, HANDSHAKE, PATIENCE, STEPS, Said, Speaker, framed, request_in_clear};
+use crate::speaker::{Claim, End, HANDSHAKE, PATIENCE, STEPS, Said, Speaker, framed, request_in_clear};
 use crate::tally::Report;
 use crate::target::{Target, Visit};
-use crate::trial::{attack, control};
+use crate::trial::{attack, control, row};
 
 /// Lengths of frames that no unit takes before the proof.
 const TOO_LONG: [usize; 6] = [318, 319, 320, 1_024, 4_096, 65_535];
+/// Tries of a frame that ends its link: on a busy machine the unit's wait may be over before the frame is there.
+const TRIES: usize = 3;
 
 /// How much is tried.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -44,10 +46,15 @@ pub fn run(report: &mut Report, target: &dyn Target, extent: Extent) -> Result<(
     without_a_key(report, target, extent)?;
     plain(report, target, extent)?;
     lengths(report, target, extent)?;
-    let record = record(target)?;
-    recorded_elsewhere(report, target, extent, &record)?;
-    recorded_here(report, target, extent)?;
-    whole_records(report, target, &record)
+    replays(report, target, extent, Mode::Secured)
+}
+
+/// All that is said once more, in the mode of the target.
+pub fn replays(report: &mut Report, target: &dyn Target, extent: Extent, mode: Mode) -> Result<()> {
+    let record = record(target, mode)?;
+    recorded_elsewhere(report, target, extent, mode, &record)?;
+    recorded_here(report, target, extent, mode)?;
+    whole_records(report, target, mode, &record)
 }
 
 /// As many cases as the target has time for, evenly from all of them.
@@ -197,6 +204,23 @@ pub fn plain(report: &mut Report, target: &dyn Target, extent: Extent) -> Result
     })
 }
 
+/// Whether a target let a frame pass that has to end its link: `once` says it, and tells whether anything was seen of it,
+/// and how the link ended while the attacker's own end was open.
+fn passes(once: impl Fn() -> Result<(bool, End)>) -> Result<bool> {
+    for _ in 0..TRIES {
+        let (seen, end) = once()?;
+        if seen || end.blames_what_came() {
+            return Ok(seen);
+        }
+    }
+    Ok(true)
+}
+
+/// Whether there are as many bytes as the length in front says: of others the rest may still come.
+fn is_whole(bytes: &[u8]) -> bool {
+    frame::first_frame_length(bytes).is_some_and(|length| length <= bytes.len())
+}
+
 /// A step of the handshake and what is said instead of it.
 fn cut_and_long(steps: &[Said]) -> Vec<(usize, Vec<u8>)> {
     let mut cases = Vec::new();
@@ -211,35 +235,59 @@ fn cut_and_long(steps: &[Said]) -> Vec<(usize, Vec<u8>)> {
 }
 
 fn lengths(report: &mut Report, target: &dyn Target, extent: Extent) -> Result<()> {
-    let record = record(target)?;
+    let record = record(target, Mode::Secured)?;
     let cases = cut_and_long(record.said.get(..HANDSHAKE).unwrap_or_default());
     let cases = share(target, extent.some(cases, 9));
-    attack(report, target, "truncated and oversize frames before the proof", &cases, |(at, instead), visit| {
-        let mut speaker = visit.speaker(&visit.keys.genuine)?;
-        // The genuine hello and proof up to there: the frame alone is at fault.
-        let _ = speaker.converse(*at).and_then(|_| speaker.step()).and_then(|_| speaker.say_bytes(instead));
+    row(report, target, "truncated and oversize frames before the proof", &cases, false, |(at, instead)| {
+        if is_whole(instead) {
+            return passes(|| {
+                let (visit, mut speaker) = instead_of(target, *at, instead)?;
+                let end = speaker.hear_end();
+                Ok((visit.was_seen(speaker)?, end))
+            });
+        }
+        // It ends with the attacker's end of the connection.
+        let (visit, speaker) = instead_of(target, *at, instead)?;
         visit.was_seen(speaker)
     })?;
+    sealed_lengths(report, target, extent)
+}
+
+/// The genuine hello and proof up to a step, and bytes instead of that: they alone are at fault.
+fn instead_of<'t>(target: &'t dyn Target, at: usize, instead: &[u8]) -> Result<(Visit<'t>, Speaker)> {
+    let visit = target.visit()?;
+    let mut speaker = visit.speaker(&visit.keys.genuine)?;
+    let _ = speaker.converse(at).and_then(|_| speaker.step()).and_then(|_| speaker.say_bytes(instead));
+    Ok((visit, speaker))
+}
+
+fn sealed_lengths(report: &mut Report, target: &dyn Target, extent: Extent) -> Result<()> {
     let lengths = [0, 1, 15, 16, 17, 40, 57, 1_025, 1_200, 4_200, 65_535];
     let cases: Vec<_> = (4..STEPS).flat_map(|at| lengths.map(|length| (at, length))).collect();
     let cases = share(target, extent.some(cases, 3));
-    attack(report, target, "truncated and oversize sealed frames", &cases, |(at, length), visit| {
-        let mut speaker = visit.speaker(&visit.keys.genuine)?;
-        let _ = speaker.converse(*at);
-        let asked = speaker.asked.clone();
-        let next = speaker.request(0, Priority::Normal, false);
-        let mut body = next.get(2..).unwrap_or_default().to_vec();
-        // One of the genuine length is another one all the same.
-        body.resize(if *length == body.len() { length + 1 } else { *length }, 0);
-        let _ = speaker.say_bytes(&in_frame(&body));
-        // A datagram overtakes it. What comes behind it in the stream must not run.
-        while let Ok(Some(next)) = speaker.step() {
-            if !next.datagram && speaker.say(&next).is_err() {
-                break;
-            }
-        }
-        visit.saw_more(speaker, 1, &asked)
+    row(report, target, "truncated and oversize sealed frames", &cases, false, |(at, length)| {
+        passes(|| sealed_of_length(&target.visit()?, *at, *length))
     })
+}
+
+/// A sealed frame of a wrong length after so many steps, and the others behind it.
+fn sealed_of_length(visit: &Visit<'_>, at: usize, length: usize) -> Result<(bool, End)> {
+    let mut speaker = visit.speaker(&visit.keys.genuine)?;
+    let _ = speaker.converse(at);
+    let asked = speaker.asked.clone();
+    let next = speaker.request(0, Priority::Normal, false);
+    let mut body = next.get(2..).unwrap_or_default().to_vec();
+    // One of the genuine length is another one all the same.
+    body.resize(if length == body.len() { length + 1 } else { length }, 0);
+    let _ = speaker.say_bytes(&in_frame(&body));
+    // A datagram overtakes it. What comes behind it in the stream must not run.
+    while let Ok(Some(next)) = speaker.step() {
+        if !next.datagram && speaker.say(&next).is_err() {
+            break;
+        }
+    }
+    let end = speaker.hear_end();
+    Ok((visit.saw_more(speaker, 1, &asked)?, end))
 }
 
 /// A genuine conversation as somebody on the network has it.
@@ -251,9 +299,9 @@ pub struct Record {
 }
 
 /// A genuine peer talks with the target, and all of it is written down.
-pub fn record(target: &dyn Target) -> Result<Record> {
+pub fn record(target: &dyn Target, mode: Mode) -> Result<Record> {
     let visit = target.visit()?;
-    let mut speaker = visit.speaker(&visit.keys.genuine)?;
+    let mut speaker = visit.speaker_as(mode, visit.claim.clone(), &visit.keys.genuine)?;
     let mut said = Vec::new();
     while let Some(next) = speaker.step()? {
         speaker.say(&next)?;
@@ -272,8 +320,8 @@ impl Record {
 }
 
 /// A genuine conversation in which `again` is said once more after `state` steps; whether it came to anything.
-fn interrupted(visit: &Visit<'_>, state: usize, again: impl Fn(&[Said]) -> Option<Said>) -> Result<bool> {
-    let mut speaker = visit.speaker(&visit.keys.genuine)?;
+fn interrupted(visit: &Visit<'_>, mode: Mode, state: usize, again: impl Fn(&[Said]) -> Option<Said>) -> Result<bool> {
+    let mut speaker = visit.speaker_as(mode, visit.claim.clone(), &visit.keys.genuine)?;
     let mut said = Vec::new();
     let mut joins = 1;
     for at in 0..=STEPS {
@@ -299,11 +347,17 @@ fn interrupted(visit: &Visit<'_>, state: usize, again: impl Fn(&[Said]) -> Optio
     visit.saw_more(speaker, joins, &asked)
 }
 
-fn recorded_elsewhere(report: &mut Report, target: &dyn Target, extent: Extent, record: &Record) -> Result<()> {
+fn recorded_elsewhere(
+    report: &mut Report,
+    target: &dyn Target,
+    extent: Extent,
+    mode: Mode,
+    record: &Record,
+) -> Result<()> {
     let cases: Vec<_> = (0..=STEPS).flat_map(|state| record.all().map(move |old| (state, old))).collect();
     let cases = share(target, extent.some(cases, 7));
     attack(report, target, "frames of another link, at every state", &cases, |(state, old), visit| {
-        interrupted(&visit, *state, |said| Some(moved(old, said)))
+        interrupted(&visit, mode, *state, |said| Some(moved(old, said)))
     })
 }
 
@@ -317,18 +371,18 @@ fn moved(old: &Said, said: &[Said]) -> Said {
     moved
 }
 
-fn recorded_here(report: &mut Report, target: &dyn Target, extent: Extent) -> Result<()> {
+fn recorded_here(report: &mut Report, target: &dyn Target, extent: Extent, mode: Mode) -> Result<()> {
     let cases: Vec<_> = (1..=STEPS).flat_map(|state| (0..state).map(move |old| (state, old))).collect();
     let cases = share(target, extent.some(cases, 3));
     attack(report, target, "frames of the same link, at every later state", &cases, |(state, old), visit| {
-        interrupted(&visit, *state, |said| said.get(*old).cloned())
+        interrupted(&visit, mode, *state, |said| said.get(*old).cloned())
     })
 }
 
-fn whole_records(report: &mut Report, target: &dyn Target, record: &Record) -> Result<()> {
+fn whole_records(report: &mut Report, target: &dyn Target, mode: Mode, record: &Record) -> Result<()> {
     let cases = share(target, (1..=record.said.len()).collect());
     attack(report, target, "whole recorded conversations", &cases, |length, visit| {
-        let mut speaker = visit.speaker(&visit.keys.wrong)?;
+        let mut speaker = visit.speaker_as(mode, visit.claim.clone(), &visit.keys.wrong)?;
         for said in record.said.iter().take(*length) {
             if speaker.say(said).is_err() {
                 break;

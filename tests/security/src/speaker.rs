@@ -47,6 +47,33 @@ pub struct Said {
     pub bytes: Vec<u8>,
 }
 
+/// How the other end has ended a link.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum End {
+    /// With a close frame of this code.
+    Closed(u8),
+    /// With a refusal.
+    Refused,
+    /// Without a word that arrived: what it left unread resets the connection, which can overtake the word.
+    Cut,
+    /// Not at all, however long somebody waits.
+    Never,
+}
+
+/// Close codes of the wire that blame what came: a frame that is wrong, one that is too long, a proof that is wrong.
+const BLAMES: [u8; 3] = [5, 6, 12];
+
+impl End {
+    /// The link has ended because of what came, and not because nothing came for too long.
+    pub fn blames_what_came(self) -> bool {
+        match self {
+            Self::Closed(code) => BLAMES.contains(&code),
+            Self::Refused | Self::Cut => true,
+            Self::Never => false,
+        }
+    }
+}
+
 /// One end of a link.
 pub struct Speaker {
     stream: TcpStream,
@@ -168,6 +195,22 @@ impl Speaker {
         while self.hear().is_ok() {}
     }
 
+    /// Keeps its end open and hears what still comes until the other end has ended the link: how it has.
+    pub fn hear_end(&mut self) -> End {
+        let mut end = End::Cut;
+        loop {
+            let mut body = match self.hear_frame() {
+                Ok(body) => body,
+                Err(error) if [io::ErrorKind::WouldBlock, io::ErrorKind::TimedOut].contains(&error.kind()) => {
+                    return End::Never;
+                }
+                Err(_) => return end,
+            };
+            // A farewell is in clear until both have proven themselves.
+            end = farewell(&body).or_else(|| farewell(&self.open(&mut body).ok()?)).unwrap_or(end);
+        }
+    }
+
     fn proof_step(&mut self, at: usize) -> io::Result<Vec<u8>> {
         match (self.dials, at) {
             (true, 0) | (false, 0) => self.introduce(),
@@ -242,12 +285,18 @@ impl Speaker {
 
     /// The next frame, opened where frames are sealed.
     fn hear(&mut self) -> io::Result<Vec<u8>> {
+        let mut body = self.hear_frame()?;
+        self.open(&mut body)
+    }
+
+    /// The body of the next frame as it came.
+    fn hear_frame(&mut self) -> io::Result<Vec<u8>> {
         loop {
             if let Some(length) = frame::first_frame_length(&self.came).filter(|length| *length <= self.came.len()) {
                 let whole: Vec<u8> = self.came.drain(..length).collect();
-                let mut body = whole.get(2..).unwrap_or_default().to_vec();
+                let body = whole.get(2..).unwrap_or_default().to_vec();
                 self.heard.push(whole);
-                return self.open(&mut body);
+                return Ok(body);
             }
             let mut buffer = [0; 4096];
             match self.stream.read(&mut buffer)? {
@@ -320,6 +369,14 @@ impl Speaker {
         let mut sealed = [&vec![0; front][..], &body, &vec![0; behind]].concat();
         self.cipher.seal_datagram(&header, &mut sealed);
         Said { datagram: true, bytes: [&header[..], &sealed].concat() }
+    }
+}
+
+fn farewell(body: &[u8]) -> Option<End> {
+    match Frame::parse(body) {
+        Ok(Frame::Close(code)) => Some(End::Closed(code)),
+        Ok(Frame::Refuse(_)) => Some(End::Refused),
+        _ => None,
     }
 }
 

@@ -1,9 +1,12 @@
 //! The attackers must be able to succeed, or their zeros show nothing: against units with a weakness that was put there
 //! on purpose, and with the key.
 
+use cara_core::config::Mode;
+use cara_security::between::Middle;
 use cara_security::links::{self, Extent};
 use cara_security::linux::{Linux, LinuxVehicles, Weakness};
 use cara_security::permission;
+use cara_security::speaker::End;
 use cara_security::tally::{Report, Row};
 use cara_security::target::Target;
 
@@ -23,6 +26,46 @@ fn a_unit_in_plain_mode_is_found_out() {
         let row = row(&report, "downgrade", target);
         assert_eq!(row.successes, row.attempts, "{row:?}");
         assert!(!report.faults().is_empty());
+    }
+}
+
+/// A unit that seals nothing believes what others have recorded, on its own link and later.
+#[test]
+fn a_unit_that_believes_recorded_words_is_found_out() {
+    let linux = Linux::new(64, Weakness::Plain).unwrap();
+    let (manager, vehicles) = (linux.manager().unwrap(), LinuxVehicles::new(&linux));
+    for target in [&manager as &dyn Target, &vehicles] {
+        let mut report = Report::default();
+        links::replays(&mut report, target, Extent::Quick, Mode::Plain).unwrap();
+        for attack in ["frames of another link", "frames of the same link", "whole recorded conversations"] {
+            let row = row(&report, attack, target);
+            assert!(row.successes > 0, "{row:?}");
+        }
+    }
+}
+
+/// Nor does it notice what somebody in the middle does to its frames.
+#[test]
+fn a_unit_that_believes_whoever_is_in_the_middle_is_found_out() {
+    let linux = Linux::new(64, Weakness::Plain).unwrap();
+    let (manager, vehicles) = (linux.manager().unwrap(), LinuxVehicles::new(&linux));
+    let mut report = Report::default();
+    Middle::new(&linux, &manager, &vehicles).meddle(&mut report, Extent::Quick).unwrap();
+    assert!(report.rows.len() == 2 && report.rows.iter().all(|row| row.successes > 0), "{report}");
+}
+
+/// A link that ends because nothing more comes is told from one that a frame ends: a unit that only waits, whatever came,
+/// is found out.
+#[test]
+fn a_unit_that_only_waits_is_found_out() {
+    let linux = Linux::new(64, Weakness::None).unwrap();
+    let (manager, vehicles) = (linux.manager().unwrap(), LinuxVehicles::new(&linux));
+    for target in [&manager as &dyn Target, &vehicles] {
+        let visit = target.visit().unwrap();
+        let mut speaker = visit.speaker(&visit.keys.genuine).unwrap();
+        speaker.converse(1).unwrap();
+        let end = speaker.hear_end();
+        assert!(end == End::Closed(7) && !end.blames_what_came(), "{end:?}");
     }
 }
 
