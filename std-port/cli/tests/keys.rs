@@ -1,5 +1,6 @@
 //! `cara keys` as a process: what it makes, what it shows, what it refuses, and that docs/keys.md says what it prints.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::io::{BufRead, BufReader};
 use std::os::unix::fs::PermissionsExt;
@@ -31,6 +32,14 @@ impl Home {
     fn cara(&self, arguments: &[&str]) -> Output {
         let mut command = Command::new(env!("CARGO_BIN_EXE_cara"));
         command.arg("keys").args(arguments).current_dir(self.0.path()).env("HOME", self.0.path());
+        command.env_remove("XDG_CONFIG_HOME").env_remove("CARA_KEYS").output().unwrap()
+    }
+
+    /// As [`cara`](Self::cara), where no file gets longer than 2 or 4 KiB: shells differ in what they count.
+    fn cut_short(&self, arguments: &[&str]) -> Output {
+        let mut command = Command::new("sh");
+        command.args(["-c", "trap '' XFSZ; ulimit -f 4; exec \"$@\"", "sh", env!("CARGO_BIN_EXE_cara"), "keys"]);
+        command.args(arguments).current_dir(self.0.path()).env("HOME", self.0.path());
         command.env_remove("XDG_CONFIG_HOME").env_remove("CARA_KEYS").output().unwrap()
     }
 
@@ -148,15 +157,15 @@ fn without_its_manager_a_vehicle_is_told() {
 fn a_change_of_keys_begins_and_is_finished() {
     let home = Home::with_fleet();
     let held = || generations(&home.ring("agv/1"), "depot/1@m_unit");
-    home.refused(&["rotate", "--finish"], 2, "`cara keys rotate` begins another");
-    home.refused(&["rotate", "--switch"], 2, "`cara keys rotate` begins another");
+    home.refused(&["rotate", "--finish"], 2, "`cara keys rotate --fleet 7` begins another");
+    home.refused(&["rotate", "--switch"], 2, "`cara keys rotate --fleet 7` begins another");
     home.done(&["rotate"]);
     assert_eq!(held(), [1, 2]);
     home.refused(&["rotate"], 2, "a change to generation 2 is under way");
-    home.refused(&["rotate", "--finish"], 2, "`cara keys rotate --switch`");
+    home.refused(&["rotate", "--finish"], 2, "`cara keys rotate --fleet 7 --switch`");
     home.done(&["rotate", "--switch"]);
     assert_eq!(held(), [2, 1]);
-    home.refused(&["rotate", "--switch"], 2, "`cara keys rotate --finish`");
+    home.refused(&["rotate", "--switch"], 2, "`cara keys rotate --fleet 7 --finish`");
     home.refused(&["rotate", "--switch", "--finish"], 2, "cannot be used with");
     home.done(&["revoke", "agv/2"]);
     assert_eq!(held(), [2, 3]);
@@ -181,7 +190,23 @@ fn what_is_missing_is_written_again() {
 fn no_key_is_printed() {
     let home = Home::with_fleet();
     let (depot, root) = (home.file("depot/1@m_unit"), home.folder().join("fleet-7.root"));
-    let mut said = vec![home.done(&["rotate"])];
+    let all = |ran: Output| String::from_utf8(ran.stdout).unwrap() + &String::from_utf8(ran.stderr).unwrap();
+    let mut held = Vec::new();
+    let mut said = Vec::new();
+    let changes: [&[&str]; 6] = [
+        &["rotate"],
+        &["revoke", "agv/2"],
+        &["revoke", "agv/2", "--json"],
+        &["rotate", "--switch"],
+        &["rotate", "--finish", "--json"],
+        &["rotate"],
+    ];
+    for arguments in changes {
+        held.extend(fs::read_dir(home.folder()).unwrap().map(|file| fs::read_to_string(file.unwrap().path()).unwrap()));
+        let ran = home.cara(arguments);
+        assert!(ran.status.success(), "{arguments:?}");
+        said.push(all(ran));
+    }
     let shown: [&[&str]; 4] =
         [&["show"], &["show", "--json"], &["show", depot.to_str().unwrap()], &["derive", "agv/3", "--json"]];
     said.extend(shown.map(|arguments| home.done(arguments)));
@@ -196,9 +221,10 @@ fn no_key_is_printed() {
         }
         fs::write(file, text).unwrap();
     }
-    let files = [depot, root, home.file("agv/1")].map(|file| fs::read_to_string(file).unwrap());
-    let keys: Vec<_> = files.iter().flat_map(|text| text.split_whitespace()).filter(|word| word.len() == 64).collect();
-    assert!(keys.len() >= 8);
+    held.extend([depot, root, home.file("agv/1")].map(|file| fs::read_to_string(file).unwrap()));
+    let keys = held.iter().flat_map(|text| text.split_whitespace()).filter(|word| word.len() == 64);
+    let keys: BTreeSet<_> = keys.collect();
+    assert!(keys.len() >= 13, "{}", keys.len());
     for key in keys {
         // Eight digits of a key in a row are no accident.
         let pieces = (0..=56).step_by(8).map(|at| &key[at..at + 8]);
@@ -228,8 +254,120 @@ fn every_mistake_is_told() {
     let text = format!("chmod 600 {}", home.file("agv/1").display());
     home.refused(&["show", home.file("agv/1").to_str().unwrap()], 1, &text);
     home.refused(&["rotate", "--fleet", "7"], 1, &text);
+    home.refused(&["rotate", "--fleet", "7"], 1, "`cara keys revoke --fleet 7 NODE`");
+    home.refused(&["revoke", "--fleet", "7", "agv/9"], 2, "`cara keys derive --fleet 7 agv/9`");
+    fs::set_permissions(home.file("agv/1"), fs::Permissions::from_mode(0o600)).unwrap();
+    fs::write(home.file("agv/1"), [0xFF; 9]).unwrap();
+    home.refused(&["show", home.file("agv/1").to_str().unwrap()], 1, "`cara keys derive --fleet 7`");
+    home.done(&["derive", "--fleet", "7"]);
     let error: Value = serde_json::from_slice(&home.cara(&["show", "--fleet", "8", "--json"]).stderr).unwrap();
     assert_eq!((&error["error"]["name"], &error["error"]["exit"]), (&"Keys".into(), &1.into()));
+}
+
+#[test]
+fn a_root_that_leaked_needs_another_fleet_and_a_list_that_is_missing_a_copy() {
+    let home = Home::with_fleet();
+    let (root, nodes) = (home.folder().join("fleet-7.root"), home.folder().join("fleet-7.nodes"));
+    fs::set_permissions(&root, fs::Permissions::from_mode(0o644)).unwrap();
+    home.refused(&["show"], 1, "`cara keys new-fleet --fleet 7 NODE...`");
+    let said = String::from_utf8(home.cara(&["show"]).stderr).unwrap();
+    assert!(said.contains(&format!("chmod 600 {}", root.display())) && !said.contains("revoke the node"), "{said}");
+    fs::set_permissions(&root, fs::Permissions::from_mode(0o600)).unwrap();
+    fs::rename(&nodes, home.0.path().join("away")).unwrap();
+    home.refused(&["show"], 1, "fleet-7.nodes is missing, the list of fleet 7's nodes");
+    home.refused(&["derive", "agv/3"], 1, "`cara keys new-fleet --fleet 7 NODE...`");
+}
+
+/// What is in the folder, by name.
+fn contents(home: &Home) -> BTreeMap<PathBuf, Vec<u8>> {
+    let files = fs::read_dir(home.folder()).unwrap().map(|file| file.unwrap().path());
+    files.map(|path| (path.clone(), fs::read(path).unwrap())).collect()
+}
+
+#[test]
+fn a_file_that_is_refused_is_told_before_anything_is_written() {
+    let home = Home::with_fleet();
+    let file = home.file("agv/2");
+    let text = format!("chmod 600 {}", file.display());
+    let mode = |mode| fs::set_permissions(&file, fs::Permissions::from_mode(mode)).unwrap();
+    let steps: [&[&str]; 5] =
+        [&["derive", "agv/3"], &["revoke", "agv/1"], &["rotate", "--switch"], &["rotate", "--finish"], &["rotate"]];
+    for step in steps {
+        mode(0o640);
+        let before = contents(&home);
+        home.refused(step, 1, &text);
+        assert!(contents(&home) == before, "{step:?} has changed something");
+        mode(0o600);
+        home.done(step);
+    }
+    fs::remove_file(&file).unwrap();
+    fs::create_dir(&file).unwrap();
+    home.refused(&["revoke", "agv/2"], 1, "is no file");
+    home.refused(&["revoke", "agv/3"], 1, "move it away");
+    assert!(home.file("agv/3").exists());
+}
+
+/// One that nobody reads any more is no reason to keep a node that is lost.
+#[test]
+fn a_file_of_garbage_is_written_again_and_holds_up_no_revocation() {
+    let home = Home::with_fleet();
+    let long = vec![b'#'; 9 << 20];
+    for garbage in [&[0xFF, 0x00, 0xFE][..], b"", b"cara-keys", &long] {
+        let before = fs::read(home.file("agv/2")).unwrap();
+        fs::write(home.file("agv/2"), garbage).unwrap();
+        assert!(home.done(&["derive", "--fleet", "7"]).contains("changed  agv/2"));
+        assert!(fs::read(home.file("agv/2")).unwrap() == before);
+    }
+    fs::write(home.file("agv/1"), [0xFF; 9]).unwrap();
+    fs::write(home.file("agv/2"), [0xFF; 9]).unwrap();
+    fs::set_permissions(home.file("agv/1"), fs::Permissions::from_mode(0o640)).unwrap();
+    home.done(&["revoke", "agv/1"]);
+    assert_eq!(generations(&home.ring("agv/2"), "depot/1@m_unit"), [1, 2]);
+    assert!(!home.file("agv/1").exists());
+}
+
+/// The file of a manager is longer than what the system lets be written, and the list of nodes is not.
+#[test]
+fn what_stops_half_way_is_completed_by_the_same_command() {
+    let home = Home::new();
+    let vehicles: Vec<_> = (1..=40).map(|id| format!("agv/{id}")).collect();
+    let vehicles = vehicles.iter().map(String::as_str);
+    home.done(&["new-fleet", "--fleet", "7", "depot/1@m_unit"].into_iter().chain(vehicles).collect::<Vec<_>>());
+    home.done(&["new-fleet", "--fleet", "9"]);
+    let held = || home.ring("depot/1@m_unit").generations().collect::<Vec<_>>();
+    let complete = |step: &[&str], other: Option<&[&str]>| {
+        let ran = home.cut_short(step);
+        let said = String::from_utf8_lossy(&ran.stderr).into_owned();
+        assert!(
+            ran.status.code() == Some(1) && said.contains("`cara keys derive --fleet 7` writes the rest"),
+            "{said}"
+        );
+        if let Some(other) = other {
+            home.refused(other, 2, "`cara keys derive --fleet 7` writes the rest");
+        }
+        let said = home.done(step);
+        assert!(said.contains("already") && said.contains("changed  depot/1@m_unit"), "{said}");
+        let said = home.done(&["derive", "--fleet", "7"]);
+        assert!(said.contains("every file is as it should be"), "{said}");
+    };
+    complete(&["revoke", "--fleet", "7", "agv/1"], Some(&["rotate", "--fleet", "7", "--switch"]));
+    assert_eq!(held(), [1, 2]);
+    assert!(generations(&home.ring("depot/1@m_unit"), "agv/1").is_empty());
+    let said = home.done(&["revoke", "--fleet", "7", "agv/1"]);
+    assert!(said.contains("agv/1 is revoked already") && said.contains("every file is as it should be"), "{said}");
+    assert!(said.contains("rotate --fleet 7 --switch"), "{said}");
+    assert_eq!(held(), [1, 2]);
+    complete(&["rotate", "--fleet", "7", "--switch"], Some(&["rotate", "--fleet", "7", "--finish"]));
+    assert_eq!(held(), [2, 1]);
+    complete(&["rotate", "--fleet", "7", "--finish"], Some(&["rotate", "--fleet", "7"]));
+    assert_eq!(held(), [2]);
+    complete(&["rotate", "--fleet", "7"], Some(&["rotate", "--fleet", "7", "--switch"]));
+    assert_eq!(held(), [2, 3]);
+    home.refused(&["rotate", "--fleet", "7"], 2, "a change to generation 3 is under way");
+    // Nor does it hold up a revocation.
+    home.cut_short(&["rotate", "--fleet", "7", "--switch"]);
+    home.done(&["revoke", "--fleet", "7", "agv/2"]);
+    assert_eq!(held(), [3, 4]);
 }
 
 #[test]

@@ -2,7 +2,7 @@
 
 use std::fmt;
 use std::io;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use cara_core::distribution::identity::{Fleet, Identity};
 
@@ -29,8 +29,8 @@ pub enum KeyError {
     },
     /// Others than the owner can read or write the file.
     #[error(
-        "others can read {} (mode {mode:o}), so its keys may be known to them: `{}`, and if they may have been read, \
-         revoke the node", path.display(), command(&["chmod", "600", &path.to_string_lossy()])
+        "others can read or write {} (mode {mode:o}): `{}`. {}", path.display(),
+        command(&["chmod", "600", &path.to_string_lossy()]), Kind::of(path).if_read()
     )]
     Open {
         /// The file.
@@ -52,13 +52,13 @@ pub enum KeyError {
         own: u32,
     },
     /// A folder, a pipe or a device.
-    #[error("{} is no file: name the file with the keys, or the folder that it is in", .0.display())]
+    #[error(
+        "{} is no file: name the file with the keys, or the folder that it is in; where this is in the place of one, move \
+         it away", .0.display()
+    )]
     NoFile(PathBuf),
     /// Not what `cara keys` writes.
-    #[error(
-        "{}:{line}: {what}. `cara keys derive` writes a node's file again; take a root or a list of nodes from your copy",
-        path.display()
-    )]
+    #[error("{}:{line}: {what}. {}", path.display(), Kind::of(path).if_damaged())]
     Form {
         /// The file.
         path: PathBuf,
@@ -77,8 +77,8 @@ pub enum KeyError {
     },
     /// There are keys of this fleet already.
     #[error(
-        "{} is there already: fleet {} has its keys. Add nodes with `cara keys derive`; if its root is lost to others, \
-         move the file away and make all keys anew", path.display(), fleet.0
+        "{} is there already: fleet {} has its keys. Add nodes with `{} NODE...`; if its root is lost to others, move the \
+         file away and make all keys anew", path.display(), fleet.0, keys(*fleet, &["derive"])
     )]
     Exists {
         /// The root's file.
@@ -88,14 +88,35 @@ pub enum KeyError {
     },
     /// No root of this fleet in the folder.
     #[error(
-        "{} has no root of fleet {}: `{}`", folder.display(), fleet.0,
-        command(&["cara", "keys", "new-fleet", "--fleet", &fleet.0.to_string()])
+        "{} has no root of fleet {}: `{}`", folder.display(), fleet.0, keys(*fleet, &["new-fleet"])
     )]
     NoRoot {
         /// Where it was looked for.
         folder: PathBuf,
         /// The fleet.
         fleet: Fleet,
+    },
+    /// The root is there, and the list of nodes is not.
+    #[error(
+        "{} is missing, the list of fleet {}'s nodes that belongs beside its root: take it from your copy. {}",
+        path.display(), fleet.0, anew("Without one", *fleet)
+    )]
+    NoNodes {
+        /// The list's file.
+        path: PathBuf,
+        /// The fleet.
+        fleet: Fleet,
+    },
+    /// The list of nodes is written, and a node's file could not be.
+    #[error(
+        "{error}. The change itself is kept, and not all files are written: when that is mended, `{}` writes the rest",
+        keys(*fleet, &["derive"])
+    )]
+    HalfWay {
+        /// The fleet.
+        fleet: Fleet,
+        /// Why.
+        error: Box<KeyError>,
     },
     /// Another command changes the same folder.
     #[error("another `cara keys` works in {}: wait until it has ended", .0.display())]
@@ -133,14 +154,17 @@ impl fmt::Display for Owner {
 #[non_exhaustive]
 pub enum FleetError {
     /// A node that the fleet does not have.
-    #[error("{} is not in the fleet: `{}` adds it", full_name(.0), command(&["cara", "keys", "derive", &full_name(.0)]))]
-    Unknown(Identity),
+    #[error(
+        "{} is not in the fleet: `{}` tells who is, and `{}` adds it", full_name(.1), keys(*.0, &["show"]),
+        keys(*.0, &["derive", &full_name(.1)])
+    )]
+    Unknown(Fleet, Identity),
     /// An s_unit, and no m_unit that it could belong to.
     #[error(
-        "{} has no m_unit to belong to: name one with it, as in `{}`", full_name(.0),
-        command(&["cara", "keys", "derive", "depot/1@m_unit", &full_name(.0)])
+        "{} has no m_unit to belong to: name one with it, as in `{}`", full_name(.1),
+        keys(*.0, &["derive", "depot/1@m_unit", &full_name(.1)])
     )]
-    NoManager(Identity),
+    NoManager(Fleet, Identity),
     /// An s_unit, and several m_units that it could belong to.
     #[error("which m_unit does {node} belong to? Say {}", either(managers))]
     WhichManager {
@@ -157,21 +181,98 @@ pub enum FleetError {
     MUnit(Identity),
     /// A change of keys has begun and is not finished.
     #[error(
-        "a change to generation {0} is under way: `cara keys rotate --switch` and `cara keys rotate --finish` complete it"
+        "a change to generation {} is under way: `{}` and `{}` complete it", .1, keys(*.0, &["rotate", "--switch"]),
+        keys(*.0, &["rotate", "--finish"])
     )]
-    UnderWay(u32),
+    UnderWay(Fleet, u32),
     /// No change of keys has begun.
-    #[error("only generation {0} is there: `cara keys rotate` begins another")]
-    NotBegun(u32),
+    #[error("only generation {} is there: `{}` begins another", .1, keys(*.0, &["rotate"]))]
+    NotBegun(Fleet, u32),
     /// The new generation is not used yet.
-    #[error("generation {0} is not used yet: when all nodes have their files, `cara keys rotate --switch`")]
-    NotSwitched(u32),
+    #[error("generation {} is not used yet: when all nodes have their files, `{}`", .1, keys(*.0, &["rotate", "--switch"]))]
+    NotSwitched(Fleet, u32),
     /// The new generation is used already.
-    #[error("generation {0} is used already: when all nodes have their files, `cara keys rotate --finish`")]
-    Switched(u32),
+    #[error("generation {} is used already: when all nodes have their files, `{}`", .1, keys(*.0, &["rotate", "--finish"]))]
+    Switched(Fleet, u32),
+    /// A step was interrupted, and another one is asked for.
+    #[error(
+        "not all files are of the step that was made last, and two steps at once lock nodes out: `{}` writes the rest. Bring \
+         them to their nodes before the next step", keys(*.0, &["derive"])
+    )]
+    Behind(Fleet),
     /// Generations have an end.
-    #[error("there are no more generations: make the fleet's keys anew with `cara keys new-fleet`")]
-    Exhausted,
+    #[error("there are no more generations: make the fleet's keys anew with `{} NODE...`", keys(*.0, &["new-fleet"]))]
+    Exhausted(Fleet),
+}
+
+/// What a file is for, as its name tells.
+enum Kind {
+    Root(Fleet),
+    Nodes(Fleet),
+    /// Of a node, and perhaps renamed.
+    Ring(Option<Fleet>),
+}
+
+impl Kind {
+    fn of(path: &Path) -> Self {
+        let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+        let fleet = |number: &str| number.parse().ok().map(Fleet);
+        let numbered = |end| name.strip_prefix("fleet-")?.strip_suffix(end).and_then(fleet);
+        match (numbered(".root"), numbered(".nodes")) {
+            (Some(fleet), _) => Self::Root(fleet),
+            (_, Some(fleet)) => Self::Nodes(fleet),
+            _ => Self::Ring(name.strip_suffix(".keys").and_then(|name| fleet(name.rsplit_once('-')?.1))),
+        }
+    }
+
+    /// What to do where others may have read it.
+    fn if_read(&self) -> String {
+        match self {
+            Self::Root(fleet) => {
+                let anew = anew("If it may have been read", *fleet);
+                format!("Whoever has read this root can speak as every node, and no revocation ends that. {anew}")
+            }
+            Self::Nodes(_) => "There is no key in it; if somebody may have changed it, take it from your copy".into(),
+            Self::Ring(fleet) => {
+                format!("If its keys may have been read, revoke the node: `{} NODE`", keys_of(*fleet, &["revoke"]))
+            }
+        }
+    }
+
+    /// What to do where it is not what `cara keys` wrote.
+    fn if_damaged(&self) -> String {
+        match self {
+            Self::Root(fleet) | Self::Nodes(fleet) => {
+                format!("Take this file from your copy. {}", anew("Without one", *fleet))
+            }
+            Self::Ring(fleet) => format!(
+                "If this is a node's file, `{}` where the fleet's root is writes it again",
+                keys_of(*fleet, &["derive"])
+            ),
+        }
+    }
+}
+
+/// When and how a fleet gets another root.
+fn anew(when: &str, fleet: Fleet) -> String {
+    format!(
+        "{when}, the fleet needs a new root: move fleet-{}.root away, run `{} NODE...` with all nodes, and bring each its file",
+        fleet.0,
+        keys(fleet, &["new-fleet"])
+    )
+}
+
+/// A command for a fleet's keys.
+fn keys(fleet: Fleet, words: &[&str]) -> String {
+    keys_of(Some(fleet), words)
+}
+
+fn keys_of(fleet: Option<Fleet>, words: &[&str]) -> String {
+    let number = fleet.map(|fleet| fleet.0.to_string());
+    let (action, values) = words.split_at(words.len().min(1));
+    let option = number.iter().flat_map(|number| ["--fleet", number]);
+    let all: Vec<_> = ["cara", "keys"].into_iter().chain(action.iter().copied()).chain(option).collect();
+    command(&[&all, values].concat())
 }
 
 fn list(paths: &[PathBuf]) -> String {
@@ -184,4 +285,51 @@ fn list(paths: &[PathBuf]) -> String {
 fn either(identities: &[Identity]) -> String {
     let words = identities.iter().map(|identity| format!("`{}`", command(&["--manager", &identity.to_string()])));
     words.collect::<Vec<_>>().join(" or ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn open(path: &str) -> String {
+        KeyError::Open { path: path.into(), mode: 0o644 }.to_string()
+    }
+
+    fn form(path: &str) -> String {
+        KeyError::Form { path: path.into(), line: 1, what: "this is no text" }.to_string()
+    }
+
+    #[test]
+    fn advice_is_for_the_file_that_it_is_about() {
+        let all = [open, form]
+            .map(|error| ["k/fleet-7.root", "k/fleet-7.nodes", "k/agv-1-s_unit-8.keys", "k/renamed"].map(error));
+        let [[root, nodes, ring, renamed], [no_root, no_nodes, no_ring, no_renamed]] = all;
+        for text in [&root, &no_root, &no_nodes] {
+            assert!(text.contains("`cara keys new-fleet --fleet 7 NODE...`") && !text.contains("revoke the"), "{text}");
+        }
+        assert!(nodes.contains("no key in it"), "{nodes}");
+        assert!(ring.contains("`cara keys revoke --fleet 8 NODE`"), "{ring}");
+        assert!(renamed.contains("`cara keys revoke NODE`"), "{renamed}");
+        assert!(no_ring.contains("`cara keys derive --fleet 8`"), "{no_ring}");
+        assert!(no_renamed.contains("`cara keys derive`"), "{no_renamed}");
+    }
+
+    #[test]
+    fn every_command_names_the_fleet() {
+        let (fleet, node) = (Fleet(7), Identity::s_unit("agv 1", 1).unwrap());
+        let errors = [
+            FleetError::Unknown(fleet, node.clone()),
+            FleetError::NoManager(fleet, node),
+            FleetError::UnderWay(fleet, 2),
+            FleetError::NotBegun(fleet, 1),
+            FleetError::NotSwitched(fleet, 2),
+            FleetError::Switched(fleet, 2),
+            FleetError::Behind(fleet),
+            FleetError::Exhausted(fleet),
+        ];
+        for text in errors.map(|error| error.to_string()) {
+            let commands: Vec<_> = text.split("`cara keys ").skip(1).collect();
+            assert!(!commands.is_empty() && commands.iter().all(|one| one.contains("--fleet 7")), "{text}");
+        }
+    }
 }

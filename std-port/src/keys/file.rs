@@ -111,6 +111,16 @@ pub(super) fn create(path: &Path, text: &str) -> Result<(), KeyError> {
     kept.and_then(|_| keep_folder(path))
 }
 
+/// Whether there is a file, or a link, that can be taken away.
+pub(super) fn is_there(path: &Path) -> Result<bool, KeyError> {
+    match path.symlink_metadata() {
+        Ok(found) if found.is_dir() => Err(KeyError::NoFile(path.to_owned())),
+        Ok(_) => Ok(true),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
+        Err(error) => Err(system(path, error)),
+    }
+}
+
 /// Takes a file away, if there is one.
 pub(super) fn remove(path: &Path) -> Result<bool, KeyError> {
     match std::fs::remove_file(path) {
@@ -161,7 +171,9 @@ mod tests {
         assert_eq!((path.metadata().unwrap().mode() & 0o777, &**read(&path).unwrap().0), (0o600, "two"));
         assert_ne!(Mark::of(&path).unwrap(), before);
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "nothing is left beside it");
-        assert!(remove(&path).unwrap() && !remove(&path).unwrap());
+        assert!(is_there(&path).unwrap() && remove(&path).unwrap());
+        assert!(!is_there(&path).unwrap() && !remove(&path).unwrap());
+        assert!(matches!(is_there(folder.path()), Err(KeyError::NoFile(_))));
     }
 
     #[test]

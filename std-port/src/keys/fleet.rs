@@ -62,7 +62,7 @@ impl FleetKeys {
 
     /// Takes nodes out of all rings, and [begins](Self::rotate) a generation that they have nothing of. Until the change is
     /// [finished](Self::finish) they can still make discovery messages that others take for the fleet's; nobody opens a
-    /// link to them. Where one of them is no node of the fleet, nothing changes.
+    /// link to them. Where one of them is no node of the fleet, nothing changes; those that were revoked already stay so.
     pub fn revoke(&mut self, identities: &[Identity]) -> Result<(), FleetError> {
         self.members.revoke(identities)
     }
@@ -183,7 +183,7 @@ mod tests {
         let mut keys = fleet();
         let stolen = keys.ring(&agv(1)).unwrap();
         keys.revoke(&[agv(1)]).unwrap();
-        assert_eq!(keys.ring(&agv(1)).map(drop), Err(FleetError::Unknown(agv(1))));
+        assert_eq!(keys.ring(&agv(1)).map(drop), Err(FleetError::Unknown(Fleet(7), agv(1))));
         let manager = keys.ring(&depot()).unwrap();
         assert!(manager.pair(&agv(1)).is_none());
         assert_eq!(generations(&manager, &agv(2)), [1, 2]);

@@ -100,9 +100,17 @@ impl Members {
         &self.revoked
     }
 
+    /// Whether a node was taken out, and has not come back.
+    pub fn is_revoked(&self, identity: &Identity) -> bool {
+        self.revoked.iter().any(|revoked| revoked.identity == *identity)
+    }
+
     /// A node.
     pub fn node(&self, identity: &Identity) -> Result<&Member, FleetError> {
-        self.nodes.iter().find(|node| node.identity == *identity).ok_or_else(|| FleetError::Unknown(identity.clone()))
+        self.nodes
+            .iter()
+            .find(|node| node.identity == *identity)
+            .ok_or_else(|| FleetError::Unknown(self.fleet, identity.clone()))
     }
 
     /// Those that a node talks to: m_units to each other, and an s_unit to those that it belongs to.
@@ -152,7 +160,7 @@ impl Members {
             return Ok(());
         }
         match m_units.as_slice() {
-            [] => Err(FleetError::NoManager(identity.clone())),
+            [] => Err(FleetError::NoManager(self.fleet, identity.clone())),
             [only] => {
                 node.managers = vec![only.clone()];
                 Ok(())
@@ -167,15 +175,19 @@ impl Members {
     }
 
     /// Takes nodes out, and begins a generation that they have nothing of. It stands beside the one in use in the place of
-    /// any other: a node must never stay in because a change of keys is under way.
+    /// any other: a node must never stay in because a change of keys is under way. Those that were revoked already stay so,
+    /// and where there are no others nothing changes.
     pub(super) fn revoke(&mut self, identities: &[Identity]) -> Result<(), FleetError> {
-        identities.iter().try_for_each(|identity| self.node(identity).map(drop))?;
-        let newest = self.newest().checked_add(1).ok_or(FleetError::Exhausted)?;
-        self.nodes.retain(|node| !identities.contains(&node.identity));
-        self.nodes.iter_mut().for_each(|node| node.managers.retain(|manager| !identities.contains(manager)));
-        let mut revoked = identities.to_vec();
+        let mut revoked: Vec<_> = identities.iter().filter(|identity| !self.is_revoked(identity)).cloned().collect();
         revoked.sort();
         revoked.dedup();
+        revoked.iter().try_for_each(|identity| self.node(identity).map(drop))?;
+        if revoked.is_empty() {
+            return Ok(());
+        }
+        let newest = self.newest().checked_add(1).ok_or(FleetError::Exhausted(self.fleet))?;
+        self.nodes.retain(|node| !revoked.contains(&node.identity));
+        self.nodes.iter_mut().for_each(|node| node.managers.retain(|manager| !revoked.contains(manager)));
         self.revoked.extend(revoked.into_iter().map(|identity| Revoked { identity, from: newest }));
         self.beside = Some(newest);
         Ok(())
@@ -184,17 +196,17 @@ impl Members {
     /// Begins a generation beside the one in use.
     pub(super) fn rotate(&mut self) -> Result<(), FleetError> {
         if self.beside.is_some() {
-            return Err(FleetError::UnderWay(self.newest()));
+            return Err(FleetError::UnderWay(self.fleet, self.newest()));
         }
-        self.beside = Some(self.used.checked_add(1).ok_or(FleetError::Exhausted)?);
+        self.beside = Some(self.used.checked_add(1).ok_or(FleetError::Exhausted(self.fleet))?);
         Ok(())
     }
 
     /// Uses the generation that has begun, and keeps the one before beside it.
     pub(super) fn switch(&mut self) -> Result<(), FleetError> {
         match self.beside {
-            None => Err(FleetError::NotBegun(self.used)),
-            Some(beside) if beside < self.used => Err(FleetError::Switched(self.used)),
+            None => Err(FleetError::NotBegun(self.fleet, self.used)),
+            Some(beside) if beside < self.used => Err(FleetError::Switched(self.fleet, self.used)),
             Some(beside) => {
                 self.beside = Some(std::mem::replace(&mut self.used, beside));
                 Ok(())
@@ -205,8 +217,8 @@ impl Members {
     /// Ends the generation before the one in use.
     pub(super) fn finish(&mut self) -> Result<(), FleetError> {
         match self.beside {
-            None => Err(FleetError::NotBegun(self.used)),
-            Some(beside) if beside > self.used => Err(FleetError::NotSwitched(beside)),
+            None => Err(FleetError::NotBegun(self.fleet, self.used)),
+            Some(beside) if beside > self.used => Err(FleetError::NotSwitched(self.fleet, beside)),
             Some(_) => {
                 self.beside = None;
                 Ok(())
@@ -326,7 +338,7 @@ mod tests {
     #[test]
     fn what_cannot_be_added_is_told_and_changes_nothing() {
         let mut members = Members::new(Fleet(7));
-        assert_eq!(members.add(&agv(1), &[]), Err(FleetError::NoManager(agv(1))));
+        assert_eq!(members.add(&agv(1), &[]), Err(FleetError::NoManager(Fleet(7), agv(1))));
         assert_eq!(members, Members::new(Fleet(7)));
         let mut members = fleet();
         let before = members.clone();
@@ -350,13 +362,26 @@ mod tests {
         members.revoke(&[agv(1)]).unwrap();
         assert_eq!(members.generations().collect::<Vec<_>>(), [1, 2]);
         assert_eq!(members.revoked(), [Revoked { identity: agv(1), from: 2 }]);
-        assert_eq!(members.revoke(&[agv(2), agv(1)]), Err(FleetError::Unknown(agv(1))));
+        let before = members.clone();
+        members.revoke(&[agv(1), agv(1)]).unwrap();
+        assert_eq!(members, before, "once is enough");
+        assert_eq!(members.revoke(&[agv(2), agv(9)]), Err(FleetError::Unknown(Fleet(7), agv(9))));
         assert!(members.node(&agv(2)).is_ok(), "all of them or none");
         assert!(members.add(&agv(1), &[]).is_err(), "there are two m_units");
         members.add(&agv(1), &[m_unit("depot")]).unwrap();
         assert_eq!((members.node(&agv(1)).unwrap().since, members.revoked().len()), (2, 0));
         members.add(&agv(3), &[m_unit("depot")]).unwrap();
         assert_eq!(members.node(&agv(3)).unwrap().since, 1, "a new node speaks as all do");
+    }
+
+    #[test]
+    fn who_is_revoked_already_is_taken_out_once() {
+        let mut members = fleet();
+        members.revoke(&[agv(1)]).unwrap();
+        members.revoke(&[agv(2), agv(1), agv(2)]).unwrap();
+        let expected = [Revoked { identity: agv(1), from: 2 }, Revoked { identity: agv(2), from: 3 }];
+        assert_eq!((members.revoked(), members.beside()), (&expected[..], Some(3)));
+        assert!(members.is_revoked(&agv(2)) && !members.is_revoked(&agv(3)));
     }
 
     #[test]
@@ -372,18 +397,24 @@ mod tests {
     fn a_change_of_keys_has_three_steps_and_revoking_is_never_held_up() {
         let mut members = fleet();
         let generations = |members: &Members| members.generations().collect::<Vec<_>>();
-        assert_eq!((members.switch(), members.finish()), (Err(FleetError::NotBegun(1)), Err(FleetError::NotBegun(1))));
+        assert_eq!(
+            (members.switch(), members.finish()),
+            (Err(FleetError::NotBegun(Fleet(7), 1)), Err(FleetError::NotBegun(Fleet(7), 1)))
+        );
         members.rotate().unwrap();
         assert_eq!(generations(&members), [1, 2]);
         assert_eq!(
             (members.rotate(), members.finish()),
-            (Err(FleetError::UnderWay(2)), Err(FleetError::NotSwitched(2)))
+            (Err(FleetError::UnderWay(Fleet(7), 2)), Err(FleetError::NotSwitched(Fleet(7), 2)))
         );
         members.revoke(&[agv(1)]).unwrap();
         assert_eq!(generations(&members), [1, 3], "nobody speaks with 2 yet");
         members.switch().unwrap();
         assert_eq!(generations(&members), [3, 1]);
-        assert_eq!((members.rotate(), members.switch()), (Err(FleetError::UnderWay(3)), Err(FleetError::Switched(3))));
+        assert_eq!(
+            (members.rotate(), members.switch()),
+            (Err(FleetError::UnderWay(Fleet(7), 3)), Err(FleetError::Switched(Fleet(7), 3)))
+        );
         members.revoke(&[agv(2)]).unwrap();
         assert_eq!(generations(&members), [3, 4]);
         members.switch().unwrap();
@@ -393,7 +424,7 @@ mod tests {
         let depot = [m_unit("depot")];
         assert_eq!(
             (members.rotate(), members.revoke(&depot)),
-            (Err(FleetError::Exhausted), Err(FleetError::Exhausted))
+            (Err(FleetError::Exhausted(Fleet(7))), Err(FleetError::Exhausted(Fleet(7))))
         );
         assert!(members.node(&depot[0]).is_ok());
     }

@@ -2,6 +2,7 @@
 //! of each node, to be brought to where it runs.
 
 use std::fs::File;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use cara_core::distribution::identity::{Fleet, Identity};
@@ -11,7 +12,7 @@ use zeroize::Zeroizing;
 
 use super::members::Members;
 use super::text::{FormError, Lines, push_key};
-use super::{FleetKeys, KeyError, file, place};
+use super::{FleetKeys, KeyError, KeyRing, file, place};
 
 /// Which form this is.
 const FORM: u32 = 1;
@@ -48,6 +49,13 @@ pub enum Change {
     Removed,
 }
 
+/// A node's file that is to be written or removed.
+struct Planned {
+    to_be: Written,
+    /// Nothing where it is to be removed.
+    text: Option<Zeroizing<String>>,
+}
+
 pub(super) fn root_file(folder: &Path, fleet: Fleet) -> PathBuf {
     folder.join(format!("fleet-{}.root", fleet.0))
 }
@@ -66,10 +74,13 @@ impl Store {
         if path.exists() {
             return Err(KeyError::Exists { path, fleet });
         }
+        let store = Self { folder: folder.to_owned(), keys, _lock: lock };
+        // What could not be saved is told while there is no root that would be in the way of the next try.
+        store.planned()?;
         // A list of nodes without its root is of keys that nobody has any more.
-        file::replace(&nodes_file(folder, fleet), &keys.members().text())?;
-        file::create(&path, &root_text(fleet, keys.root()))?;
-        Ok(Self { folder: folder.to_owned(), keys, _lock: lock })
+        file::replace(&nodes_file(folder, fleet), &store.keys.members().text())?;
+        file::create(&path, &root_text(fleet, store.keys.root()))?;
+        Ok(store)
     }
 
     /// The keys of a fleet in a folder.
@@ -88,7 +99,7 @@ impl Store {
         let (text, _) = file::read(&path)?;
         let root = parse_root(&text, fleet).map_err(|error| file::form(&path, error))?;
         let path = nodes_file(folder, fleet);
-        let (text, _) = file::read(&path)?;
+        let (text, _) = file::read(&path).map_err(|error| without_nodes(error, fleet))?;
         let members = Members::parse(&text).and_then(|members| is_of(members, fleet));
         let members = members.map_err(|error| file::form(&path, error))?;
         Ok(FleetKeys::new(root, members))
@@ -128,36 +139,84 @@ impl Store {
         &mut self.keys
     }
 
-    /// Writes the list of nodes and every node's file that is not as it should be; those are told. Where it is
-    /// interrupted, the next one completes it.
+    /// Writes the list of nodes and every node's file that is not as it should be; those are told. Where one of them is
+    /// refused, nothing is written. Where writing fails or is interrupted, the next one completes it.
     pub fn save(&self) -> Result<Vec<Written>, KeyError> {
-        let members = self.keys.members();
+        let (members, planned) = (self.keys.members(), self.planned()?);
         file::replace(&nodes_file(&self.folder, members.fleet()), &members.text())?;
-        let mut all = Vec::new();
-        for revoked in members.revoked() {
-            let (identity, path) = (revoked.identity.clone(), self.file_of(&revoked.identity));
-            if file::remove(&path)? {
-                all.push(Written { identity, path, change: Change::Removed });
-            }
-        }
-        for node in members.nodes() {
-            all.extend(self.save_ring(&node.identity)?);
-        }
-        Ok(all)
+        let written = planned.into_iter().map(Planned::carry_out).collect::<Result<_, _>>();
+        written.map_err(|error| KeyError::HalfWay { fleet: members.fleet(), error: Box::new(error) })
     }
 
-    fn save_ring(&self, identity: &Identity) -> Result<Option<Written>, KeyError> {
+    /// Whether a node's file is of other generations than the list of nodes: a change of keys was interrupted, and
+    /// [`save`](Self::save) completes it. A step on top of it would be two for some nodes, which locks them out.
+    pub fn is_behind(&self) -> Result<bool, KeyError> {
+        for node in self.keys.members().nodes() {
+            let text = own_text(&self.file_of(&node.identity))?;
+            let ring = text.and_then(|text| KeyRing::parse(&text).ok());
+            if ring.is_some_and(|ring| !ring.generations().eq(self.keys.members().generations())) {
+                return Ok(true);
+            }
+        }
+        Ok(false)
+    }
+
+    /// What is to be done for every node's file to be as it should be, after a look at all of them.
+    fn planned(&self) -> Result<Vec<Planned>, KeyError> {
+        let members = self.keys.members();
+        let removals = members.revoked().iter().map(|revoked| self.planned_removal(&revoked.identity));
+        let rings = members.nodes().iter().map(|node| self.planned_ring(&node.identity));
+        removals.chain(rings).filter_map(Result::transpose).collect()
+    }
+
+    fn planned_removal(&self, identity: &Identity) -> Result<Option<Planned>, KeyError> {
+        let to_be = self.to_be(identity, Change::Removed);
+        // Who can read it does not matter any more.
+        Ok(file::is_there(&to_be.path)?.then_some(Planned { to_be, text: None }))
+    }
+
+    fn planned_ring(&self, identity: &Identity) -> Result<Option<Planned>, KeyError> {
         // Whoever is a member has a ring.
         let Ok(ring) = self.keys.ring(identity) else { return Ok(None) };
-        let (text, path) = (ring.text(), self.file_of(identity));
-        let change = match path.exists() {
-            // One that others can read is told, and not silently mended.
-            true if *file::read(&path)?.0 == *text => return Ok(None),
-            true => Change::Replaced,
-            false => Change::New,
+        let text = ring.text();
+        // One that others can read is told, and not silently mended.
+        let change = match own_text(&self.file_of(identity))? {
+            Some(found) if *found == *text => return Ok(None),
+            Some(_) => Change::Replaced,
+            None => Change::New,
         };
-        file::replace(&path, &text)?;
-        Ok(Some(Written { identity: identity.clone(), path, change }))
+        Ok(Some(Planned { to_be: self.to_be(identity, change), text: Some(text) }))
+    }
+
+    fn to_be(&self, identity: &Identity, change: Change) -> Written {
+        Written { identity: identity.clone(), path: self.file_of(identity), change }
+    }
+}
+
+impl Planned {
+    fn carry_out(self) -> Result<Written, KeyError> {
+        match &self.text {
+            Some(text) => file::replace(&self.to_be.path, text)?,
+            None => drop(file::remove(&self.to_be.path)?),
+        }
+        Ok(self.to_be)
+    }
+}
+
+/// The text of a node's file, if there is one; an empty one where it is not even text, and only to be written again.
+fn own_text(path: &Path) -> Result<Option<Zeroizing<String>>, KeyError> {
+    match file::read(path) {
+        Ok((text, _)) => Ok(Some(text)),
+        Err(KeyError::Form { .. }) => Ok(Some(Zeroizing::default())),
+        Err(KeyError::System { error, .. }) if error.kind() == ErrorKind::NotFound => Ok(None),
+        Err(error) => Err(error),
+    }
+}
+
+fn without_nodes(error: KeyError, fleet: Fleet) -> KeyError {
+    match error {
+        KeyError::System { path, error } if error.kind() == ErrorKind::NotFound => KeyError::NoNodes { path, fleet },
+        other => other,
     }
 }
 
@@ -207,8 +266,6 @@ mod tests {
     use super::*;
     use std::fs;
     use std::os::unix::fs::PermissionsExt;
-
-    use super::super::KeyRing;
 
     fn depot() -> Identity {
         Identity::m_unit("depot", 1).unwrap()
@@ -274,10 +331,86 @@ mod tests {
         let (path, ring) = (store.folder().to_owned(), store.file_of(&agv(1)));
         fs::set_permissions(&ring, fs::Permissions::from_mode(0o644)).unwrap();
         assert!(matches!(store.save(), Err(KeyError::Open { .. })));
+        assert!(matches!(store.is_behind(), Err(KeyError::Open { .. })));
         let root = store.root_file();
         drop(store);
         fs::set_permissions(&root, fs::Permissions::from_mode(0o604)).unwrap();
         assert!(matches!(Store::open(&path, Fleet(7)), Err(KeyError::Open { .. })));
+    }
+
+    #[test]
+    fn where_one_file_is_refused_nothing_is_written() {
+        let (_folder, mut store) = store();
+        let (list, ring) = (nodes_file(store.folder(), Fleet(7)), store.file_of(&agv(2)));
+        let (manager, taken) = (store.file_of(&depot()), store.file_of(&agv(1)));
+        let read = || [&list, &manager].map(|path| fs::read(path).unwrap());
+        let before = read();
+        fs::set_permissions(&ring, fs::Permissions::from_mode(0o640)).unwrap();
+        store.keys_mut().revoke(&[agv(1)]).unwrap();
+        assert!(matches!(store.save(), Err(KeyError::Open { path, .. }) if path == ring));
+        assert!(read() == before && taken.exists());
+        fs::set_permissions(&ring, fs::Permissions::from_mode(0o600)).unwrap();
+        assert_eq!(store.save().unwrap().len(), 3);
+    }
+
+    #[test]
+    fn a_root_is_not_made_where_a_file_is_refused() {
+        let (_folder, store) = store();
+        let (path, root, ring) = (store.folder().to_owned(), store.root_file(), store.file_of(&depot()));
+        drop(store);
+        fs::remove_file(&root).unwrap();
+        fs::set_permissions(&ring, fs::Permissions::from_mode(0o640)).unwrap();
+        let anew = || {
+            let mut keys = FleetKeys::draw(Fleet(7)).unwrap();
+            keys.add(&depot(), &[]).unwrap();
+            Store::create(&path, keys)
+        };
+        assert!(matches!(anew(), Err(KeyError::Open { .. })) && !root.exists());
+        fs::set_permissions(&ring, fs::Permissions::from_mode(0o600)).unwrap();
+        assert_eq!(changes(&anew().unwrap().save().unwrap()), [("depot/1".into(), Change::Replaced)]);
+    }
+
+    #[test]
+    fn a_file_that_is_no_text_is_written_again() {
+        let (_folder, store) = store();
+        let ring = store.file_of(&agv(1));
+        for garbage in [&[0xFF, 0xFE][..], b"", b"cara-keys 1", &vec![b'#'; 9 << 20]] {
+            fs::write(&ring, garbage).unwrap();
+            assert!(!store.is_behind().unwrap());
+            assert_eq!(changes(&store.save().unwrap()), [("agv/1".into(), Change::Replaced)]);
+        }
+        assert_eq!(store.save().unwrap(), []);
+    }
+
+    #[test]
+    fn files_of_the_step_before_are_behind() {
+        let (_folder, mut store) = store();
+        let before = fs::read(store.file_of(&agv(2))).unwrap();
+        assert!(!store.is_behind().unwrap());
+        store.keys_mut().rotate().unwrap();
+        assert!(store.is_behind().unwrap());
+        store.save().unwrap();
+        assert!(!store.is_behind().unwrap());
+        fs::write(store.file_of(&agv(2)), before).unwrap();
+        assert!(store.is_behind().unwrap());
+        store.save().unwrap();
+        store.keys_mut().switch().unwrap();
+        assert!(store.is_behind().unwrap(), "the order of generations counts");
+        fs::remove_file(store.file_of(&depot())).unwrap();
+        store.save().unwrap();
+        fs::remove_file(store.file_of(&depot())).unwrap();
+        assert!(!store.is_behind().unwrap(), "what was brought away may be gone here");
+    }
+
+    #[test]
+    fn a_list_of_nodes_that_is_missing_is_told() {
+        let (_folder, store) = store();
+        let path = store.folder().to_owned();
+        drop(store);
+        fs::remove_file(nodes_file(&path, Fleet(7))).unwrap();
+        let error = Store::open(&path, Fleet(7)).unwrap_err();
+        assert!(matches!(error, KeyError::NoNodes { .. }), "{error}");
+        assert!(error.to_string().contains("fleet-7.nodes is missing"), "{error}");
     }
 
     #[test]

@@ -6,13 +6,14 @@ mod show;
 mod told;
 
 pub(crate) use choice::Keys;
+use told::Done;
 
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 use cara_core::distribution::identity::{Fleet, Identity};
 use cara_std::keys::place::own_folder;
-use cara_std::keys::{FleetError, FleetKeys, KeyError, Store, parse_node};
+use cara_std::keys::{FleetError, FleetKeys, KeyError, Members, Store, parse_node};
 
 use crate::exit::{Ended, Exit};
 use crate::global::Global;
@@ -82,21 +83,13 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
     let folder = || arguments.dir.clone().or_else(own_folder).ok_or_else(|| Ended::usage("say where: --dir FOLDER"));
     match &arguments.action {
         Action::NewFleet(nodes) => new_fleet(nodes, folder()?, global)?,
-        Action::Derive(nodes) => change(folder()?, global, told::Done::Derived, |keys| nodes.add_to(keys))?,
+        Action::Derive(nodes) => derive(nodes, folder()?, global)?,
         Action::Show { file: Some(file) } => show::ring(file, global)?,
         Action::Show { file: None } => show::fleet(&open(folder()?, global)?, global)?,
-        Action::Revoke { nodes } => {
-            change(folder()?, global, told::Done::Revoked, |keys| keys.revoke(nodes).map_err(wrong))?;
-        }
-        Action::Rotate { switch: true, .. } => {
-            change(folder()?, global, told::Done::Switched, |keys| keys.switch().map_err(wrong))?;
-        }
-        Action::Rotate { finish: true, .. } => {
-            change(folder()?, global, told::Done::Finished, |keys| keys.finish().map_err(wrong))?;
-        }
-        Action::Rotate { .. } => {
-            change(folder()?, global, told::Done::Rotated, |keys| keys.rotate().map_err(wrong))?;
-        }
+        Action::Revoke { nodes } => revoke(nodes, folder()?, global)?,
+        Action::Rotate { switch: true, .. } => Step::Switch.make(folder()?, global)?,
+        Action::Rotate { finish: true, .. } => Step::Finish.make(folder()?, global)?,
+        Action::Rotate { .. } => Step::Begin.make(folder()?, global)?,
     }
     Ok(Exit::Done.into())
 }
@@ -116,18 +109,69 @@ fn new_fleet(nodes: &Nodes, folder: PathBuf, global: &Global) -> anyhow::Result<
     let mut keys = FleetKeys::draw(Fleet(global.fleet.unwrap_or(0))).map_err(failed)?;
     nodes.add_to(&mut keys)?;
     let store = Store::create(&folder, keys).map_err(failed)?;
-    told::tell(told::Done::Made, &store, &store.save().map_err(failed)?, global)
+    save(Done::Made, &store, global)
 }
 
-fn change(
-    folder: PathBuf,
-    global: &Global,
-    done: told::Done,
-    change: impl FnOnce(&mut FleetKeys) -> anyhow::Result<()>,
-) -> anyhow::Result<()> {
+fn derive(nodes: &Nodes, folder: PathBuf, global: &Global) -> anyhow::Result<()> {
     let mut store = open(folder, global)?;
-    change(store.keys_mut())?;
-    told::tell(done, &store, &store.save().map_err(failed)?, global)
+    nodes.add_to(store.keys_mut())?;
+    save(Done::Derived, &store, global)
+}
+
+/// Of nodes that were revoked already what was not written is, so that a command that stopped half-way can be repeated.
+fn revoke(nodes: &[Identity], folder: PathBuf, global: &Global) -> anyhow::Result<()> {
+    let mut store = open(folder, global)?;
+    let members = store.keys().members();
+    let already = nodes.iter().all(|node| members.is_revoked(node));
+    let done = if already { Done::RevokedAlready(nodes) } else { Done::Revoked };
+    store.keys_mut().revoke(nodes).map_err(wrong)?;
+    save(done, &store, global)
+}
+
+/// A step of a change of keys.
+#[derive(Clone, Copy)]
+enum Step {
+    Begin,
+    Switch,
+    Finish,
+}
+
+impl Step {
+    /// Makes the step, or completes it where it stopped half-way. Where another one did, that comes first.
+    fn make(self, folder: PathBuf, global: &Global) -> anyhow::Result<()> {
+        let mut store = open(folder, global)?;
+        if !store.is_behind().map_err(failed)? {
+            self.change(store.keys_mut()).map_err(wrong)?;
+            return save(Done::Stepped, &store, global);
+        }
+        let members = store.keys().members();
+        if !self.is_last(members) {
+            return Err(wrong(FleetError::Behind(members.fleet())));
+        }
+        save(Done::SteppedAlready, &store, global)
+    }
+
+    fn change(self, keys: &mut FleetKeys) -> Result<(), FleetError> {
+        match self {
+            Self::Begin => keys.rotate(),
+            Self::Switch => keys.switch(),
+            Self::Finish => keys.finish(),
+        }
+    }
+
+    /// Whether it is the one that was made last.
+    fn is_last(self, members: &Members) -> bool {
+        let begun = members.beside().map(|beside| beside > members.generation());
+        match self {
+            Self::Begin => begun == Some(true),
+            Self::Switch => begun == Some(false),
+            Self::Finish => begun.is_none(),
+        }
+    }
+}
+
+fn save(done: Done<'_>, store: &Store, global: &Global) -> anyhow::Result<()> {
+    told::tell(done, store, &store.save().map_err(failed)?, global)
 }
 
 /// The keys of the fleet that is meant: of the only one in the folder, unless one is named.

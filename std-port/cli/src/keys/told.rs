@@ -1,6 +1,6 @@
 //! What was changed, and what to do next.
 
-use cara_core::distribution::identity::Role;
+use cara_core::distribution::identity::{Identity, Role};
 use cara_std::keys::{Change, Members, Store, Written, full_name, shown};
 use serde_json::json;
 
@@ -9,24 +9,24 @@ use crate::output;
 
 /// What a command has done.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Done {
+pub(super) enum Done<'n> {
     /// A root was drawn.
     Made,
     /// Nodes have got keys.
     Derived,
     /// Nodes were taken out.
     Revoked,
-    /// A generation has begun.
-    Rotated,
-    /// The generation that had begun is used.
-    Switched,
-    /// The generation before has ended.
-    Finished,
+    /// These had been taken out before.
+    RevokedAlready(&'n [Identity]),
+    /// A step of a change of keys was made.
+    Stepped,
+    /// It had been made before, and not all of it was written.
+    SteppedAlready,
 }
 
 /// Prints what a command has done.
-pub(super) fn tell(done: Done, store: &Store, written: &[Written], global: &Global) -> anyhow::Result<()> {
-    let next = next(done, store, written);
+pub(super) fn tell(done: Done<'_>, store: &Store, written: &[Written], global: &Global) -> anyhow::Result<()> {
+    let next = next(store, written);
     if global.json {
         return Ok(output::object(&object(store, written, &next))?);
     }
@@ -45,7 +45,7 @@ pub(super) fn tell(done: Done, store: &Store, written: &[Written], global: &Glob
     Ok(next.iter().try_for_each(|line| output::line(format_args!("next: {line}")))?)
 }
 
-fn headline(done: Done, store: &Store) -> String {
+fn headline(done: Done<'_>, store: &Store) -> String {
     let members = store.keys().members();
     let (fleet, generations) = (members.fleet().0, generations(members));
     match done {
@@ -60,7 +60,13 @@ fn headline(done: Done, store: &Store) -> String {
             let names: Vec<_> = revoked.map(|revoked| full_name(&revoked.identity)).collect();
             format!("fleet {fleet}, {generations}: without {}", names.join(", "))
         }
-        Done::Derived | Done::Rotated | Done::Switched | Done::Finished => format!("fleet {fleet}, {generations}"),
+        Done::RevokedAlready(nodes) => {
+            let names: Vec<_> = nodes.iter().map(full_name).collect();
+            let are = if names.len() == 1 { "is" } else { "are" };
+            format!("fleet {fleet}, {generations}: {} {are} revoked already", names.join(", "))
+        }
+        Done::SteppedAlready => format!("fleet {fleet}, {generations}, already; what was not written yet is now"),
+        Done::Derived | Done::Stepped => format!("fleet {fleet}, {generations}"),
     }
 }
 
@@ -70,7 +76,7 @@ pub(super) fn generations(members: &Members) -> String {
     format!("generation {} is in use{}", members.generation(), beside.unwrap_or_default())
 }
 
-fn next(done: Done, store: &Store, written: &[Written]) -> Vec<String> {
+fn next(store: &Store, written: &[Written]) -> Vec<String> {
     let members = store.keys().members();
     let fleet = members.fleet().0;
     let mut next = Vec::new();
@@ -90,11 +96,7 @@ fn next(done: Done, store: &Store, written: &[Written]) -> Vec<String> {
                 .into(),
         );
     }
-    let step = match done {
-        Done::Revoked | Done::Rotated => Some("--switch"),
-        Done::Switched => Some("--finish"),
-        Done::Made | Done::Derived | Done::Finished => None,
-    };
+    let step = members.beside().map(|beside| if beside > members.generation() { "--switch" } else { "--finish" });
     next.extend(step.map(|step| format!("when all nodes have theirs: `cara keys rotate --fleet {fleet} {step}`")));
     next
 }
