@@ -134,7 +134,7 @@ fn every_mistake_is_told() {
     let long = "n".repeat(33);
     refused(folder.path(), &[], 2, "BOARD");
     refused(folder.path(), &told("toaster", &output), 2, "there are: nucleo-f767zi, nucleo-h743zi, rp2040");
-    refused(folder.path(), &told("lm3s6965evb", &[]), 2, "argument of QEMU");
+    refused(folder.path(), &told("lm3s6965evb", &[]), 2, "a file of this computer");
     refused(folder.path(), &["rp2040", "--output", "page.bin"], 2, "--name and an --id");
     refused(folder.path(), &["rp2040", "--name", "a"], 2, "--id");
     refused(folder.path(), &["rp2040", "--name", &long, "--id", "1", "--output", "x"], 2, "--name");
