@@ -167,12 +167,20 @@ impl Forger {
 
 /// All attacks on discovery.
 pub fn run(report: &mut Report, linux: &Linux, manager: &LinuxManager<'_>, extent: Extent) -> Result<()> {
+    spoof(report, linux, manager, extent)?;
+    relayed(report, &alone(linux)?, extent)
+}
+
+/// A fleet whose manager is not there, so that its vehicles ask.
+fn alone(linux: &Linux) -> Result<Linux> {
+    Linux::new(64, linux.weakness)
+}
+
+/// Datagrams in everybody's name, to a manager and to a vehicle that asks.
+pub fn spoof(report: &mut Report, linux: &Linux, manager: &LinuxManager<'_>, extent: Extent) -> Result<()> {
     let identities = extent.some(identities(128), 8);
     spoof_manager(report, linux, manager, &identities)?;
-    // Their manager is not there, so that they ask.
-    let alone = Linux::new(64, linux.weakness)?;
-    spoof_vehicle(report, &alone, &identities)?;
-    relayed(report, &alone, extent)
+    spoof_vehicle(report, &alone(linux)?, &identities)
 }
 
 /// Datagrams that tell a manager of everybody: nobody is dialled or answered.

@@ -5,10 +5,10 @@ use cara_core::config::Mode;
 use cara_security::between::Middle;
 use cara_security::links::{self, Extent};
 use cara_security::linux::{Linux, LinuxVehicles, Weakness};
-use cara_security::permission;
 use cara_security::speaker::End;
 use cara_security::tally::{Report, Row};
 use cara_security::target::Target;
+use cara_security::{discovery, permission};
 
 fn row<'r>(report: &'r Report, attack: &str, target: &dyn Target) -> &'r Row {
     let found = report.rows.iter().find(|row| row.attack.contains(attack) && row.target == target.name());
@@ -51,6 +51,15 @@ fn a_unit_that_believes_whoever_is_in_the_middle_is_found_out() {
     let (manager, vehicles) = (linux.manager().unwrap(), LinuxVehicles::new(&linux));
     let mut report = Report::default();
     Middle::new(&linux, &manager, &vehicles).meddle(&mut report, Extent::Quick).unwrap();
+    assert!(report.rows.len() == 2 && report.rows.iter().all(|row| row.successes > 0), "{report}");
+}
+
+/// Nor does it tell its fleet's datagrams from others.
+#[test]
+fn a_unit_that_believes_every_datagram_is_found_out() {
+    let linux = Linux::new(64, Weakness::Plain).unwrap();
+    let mut report = Report::default();
+    discovery::spoof(&mut report, &linux, &linux.manager().unwrap(), Extent::Quick).unwrap();
     assert!(report.rows.len() == 2 && report.rows.iter().all(|row| row.successes > 0), "{report}");
 }
 
