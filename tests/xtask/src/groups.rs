@@ -160,7 +160,7 @@ pub(crate) const GROUPS: [Group; 23] = [
     Group {
         name: "security",
         what: "attackers on the simulator, a board in QEMU (not quick) and Linux units: none of them comes to anything",
-        budget: 240,
+        budget: 300,
         quick: Some(90),
         by_default: true,
         run: security::check,
