@@ -52,8 +52,7 @@ pub fn attack<C: Sync>(
     cases: &[C],
     act: impl Fn(&C, Visit<'_>) -> Result<bool> + Sync,
 ) -> Result<()> {
-    let visit_and_act = |case: &C| target.visit().and_then(|visit| act(case, visit));
-    row(report, target, attack, cases, false, visit_and_act)
+    row(report, target, attack, cases, false, visiting(target, act))
 }
 
 /// As [`attack`], by somebody who has the key.
@@ -64,8 +63,15 @@ pub fn control<C: Sync>(
     cases: &[C],
     act: impl Fn(&C, Visit<'_>) -> Result<bool> + Sync,
 ) -> Result<()> {
-    let visit_and_act = |case: &C| target.visit().and_then(|visit| act(case, visit));
-    row(report, target, name, cases, true, visit_and_act)
+    row(report, target, name, cases, true, visiting(target, act))
+}
+
+/// `act` with a visit of its own.
+fn visiting<C>(
+    target: &dyn Target,
+    act: impl Fn(&C, Visit<'_>) -> Result<bool> + Sync,
+) -> impl Fn(&C) -> Result<bool> + Sync {
+    move |case| target.visit().and_then(|visit| act(case, visit))
 }
 
 /// A row of attempts that make their connections themselves.

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use anyhow::{Result, bail};
+use anyhow::Result;
 
 use crate::{paper, workspace};
 
@@ -54,12 +54,7 @@ pub(crate) fn check() -> Result<()> {
     let read = |path: &str| workspace::read(Path::new(path)).unwrap_or_default();
     let exists = |path: &str| workspace::root().join(path).exists();
     let wrong = problems(&read(TABLE), exists, read);
-    if wrong.is_empty() {
-        println!("{} items of bad input, each with its tests", ITEMS.len());
-        return Ok(());
-    }
-    wrong.iter().for_each(|line| eprintln!("{TABLE}: {line}"));
-    bail!("{} faults in {TABLE}", wrong.len())
+    paper::verdict(TABLE, &wrong, &format!("{} items of bad input, each with its tests", ITEMS.len()))
 }
 
 fn problems(table: &str, exists: impl Fn(&str) -> bool, read: impl Fn(&str) -> String) -> Vec<String> {

@@ -18,12 +18,17 @@ pub(crate) fn check() -> Result<()> {
     let exists = |path: &str| workspace::root().join(path).exists();
     let read = |path: &str| workspace::read(Path::new(path)).unwrap_or_default();
     let wrong = problems(&text, exists, read);
+    verdict(TABLE, &wrong, &format!("{} promises, each with its place", numbers().count()))
+}
+
+/// Prints what is `wrong` in a table and fails, or says that all is `well`.
+pub(crate) fn verdict(table: &str, wrong: &[String], well: &str) -> Result<()> {
     if wrong.is_empty() {
-        println!("{} promises, each with its place", numbers().count());
+        println!("{well}");
         return Ok(());
     }
-    wrong.iter().for_each(|line| eprintln!("{TABLE}: {line}"));
-    bail!("{} promises of {TABLE} are not shown", wrong.len())
+    wrong.iter().for_each(|line| eprintln!("{table}: {line}"));
+    bail!("{} faults in {table}", wrong.len())
 }
 
 /// 1 to 77 with 13b and 13c.
