@@ -42,7 +42,7 @@ pub(crate) enum Outcome {
 }
 
 /// All groups, in the order in which they run: cheap ones first.
-pub(crate) const GROUPS: [Group; 23] = [
+pub(crate) const GROUPS: [Group; 24] = [
     Group {
         name: "format",
         what: "every crate is formatted",
@@ -106,6 +106,14 @@ pub(crate) const GROUPS: [Group; 23] = [
         quick: None,
         by_default: true,
         run: |_| doc().into(),
+    },
+    Group {
+        name: "build",
+        what: "every test of the workspace builds; apart, so that the time of `unit` is that of its tests",
+        budget: 300,
+        quick: Some(300),
+        by_default: true,
+        run: |_| workspace_tests(&["--no-run"]).into(),
     },
     Group {
         name: "unit",
@@ -248,7 +256,11 @@ fn unit() -> Result<()> {
             println!("some tests will be skipped: {reason}");
         }
     }
-    Run::cargo().args(["test", "--workspace", "--no-fail-fast", "--features", FEATURES]).stream()
+    workspace_tests(&["--no-fail-fast"])
+}
+
+fn workspace_tests(how: &[&str]) -> Result<()> {
+    Run::cargo().args(["test", "--workspace", "--features", FEATURES]).args(how).stream()
 }
 
 /// Runs a check once what it needs is there; what cannot be had is a reason to skip it.
