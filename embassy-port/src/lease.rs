@@ -6,7 +6,7 @@ use cara_core::services::lease::Lease;
 
 use crate::time::now;
 
-/// A service's lease, to be read from any task and any interrupt: one atomic load and the clock.
+/// A service's lease, to be read from any task and any interrupt: two atomic loads and the clock.
 ///
 /// An interrupt that has no `LeaseWatch` at hand reads the static itself:
 ///

@@ -7,7 +7,7 @@ use cara_core::services::lease::Lease;
 
 use crate::clock::Clock;
 
-/// A service's lease, to be read from any thread at any time: one atomic load and the clock.
+/// A service's lease, to be read from any thread at any time: two atomic loads and the clock.
 #[derive(Clone)]
 pub struct LeaseWatch {
     lease: Arc<Lease>,

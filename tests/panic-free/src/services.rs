@@ -159,7 +159,8 @@ entry!(replies, {
 
 entry!(leases, {
     let lease = Lease::new();
-    lease.renew(*unknown());
+    lease.begin(*unknown());
+    keep((lease.renew(*unknown()), lease.lasts_beyond(*unknown())));
     keep((lease.is_live(*unknown()), Lease::seen_end(*unknown())));
     lease.end();
     keep(unknown::<Lease>().is_live(*unknown()));

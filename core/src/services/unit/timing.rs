@@ -262,21 +262,29 @@ impl<S: Storage, C: Secure> Session<S, C> {
         cx: &mut Context<'_, S, M, B, H>,
         granted: Granted,
     ) -> Result<(), Error> {
-        let known = self.granted.iter_mut().find(|known| known.slot == granted.slot);
+        let granted = Granted { end: Lease::seen_end(granted.end), ..granted };
+        let Some(known) = self.granted.iter_mut().find(|known| known.slot == granted.slot) else {
+            self.granted.push(granted).map_err(|_| Error::Full(crate::error::Limit::Leases))?;
+            self.timers.lease = self.timers.lease.min(granted.end);
+            begin_service_lease(cx, granted.slot, granted.end);
+            return Ok(());
+        };
         // What has been seen dead is reported before anything begins in its place.
-        if known.as_ref().is_some_and(|known| known.end <= cx.now) {
+        if known.end <= cx.now {
             return Err(Error::Busy);
         }
-        let granted = Granted { end: Lease::seen_end(granted.end), ..granted };
         // What came late on its way takes nothing away from what came before it.
-        let end = known.as_ref().map_or(granted.end, |known| known.end.max(granted.end));
-        let granted = Granted { end, ..granted };
-        match known {
-            Some(known) => *known = granted,
-            None => self.granted.push(granted).map_err(|_| Error::Full(crate::error::Limit::Leases))?,
+        let granted = Granted { end: known.end.max(granted.end), ..granted };
+        let is_same = known.generation == granted.generation;
+        *known = granted;
+        self.timers.lease = self.timers.lease.min(granted.end);
+        if !is_same {
+            begin_service_lease(cx, granted.slot, granted.end);
+        } else if !renew_service_lease(cx, granted.slot, granted.end) {
+            // Whoever moves something has looked later than at `cx.now`, and has stopped it.
+            self.cut_lease(cx, granted.slot);
+            return Err(Error::Busy);
         }
-        self.timers.lease = self.timers.lease.min(end);
-        renew_service_lease(cx, granted.slot, end);
         Ok(())
     }
 
@@ -387,14 +395,24 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 }
 
-fn renew_service_lease<S: Storage, M: Mailman, B: Buffers<S>, H: Service>(
+fn begin_service_lease<S: Storage, M: Mailman, B: Buffers<S>, H: Service>(
     cx: &mut Context<'_, S, M, B, H>,
     slot: Slot,
     end: Instant,
 ) {
     if let Some(lease) = cx.functions.function(slot).and_then(|function| function.handler.lease()) {
-        lease.renew(end);
+        lease.begin(end);
     }
+}
+
+/// `false` when it has been seen dead.
+fn renew_service_lease<S: Storage, M: Mailman, B: Buffers<S>, H: Service>(
+    cx: &mut Context<'_, S, M, B, H>,
+    slot: Slot,
+    end: Instant,
+) -> bool {
+    let lease = cx.functions.function(slot).and_then(|function| function.handler.lease());
+    lease.is_none_or(|lease| lease.renew(end))
 }
 
 fn end_service_lease<S: Storage, M: Mailman, B: Buffers<S>, H: Service>(cx: &mut Context<'_, S, M, B, H>, slot: Slot) {

@@ -124,7 +124,7 @@ pub async fn starve() -> ! {
 /// A turn of the executor has ended. Those in which nobody wants the vehicle to drive hold nothing up: the longest of all are
 /// those of a proof, on a link that is not live yet.
 pub(crate) fn turned(began: Instant) {
-    if DRIVING.is_live(began) {
+    if DRIVING.lasts_beyond(began) {
         let turn = now().since(began);
         Record::change(|record| record.turn = record.turn.max(turn));
     }
@@ -139,9 +139,9 @@ pub(crate) fn sleeps(it_does: bool) {
 pub(crate) fn tick() {
     Record::change(|record| {
         let now = now();
-        if record.reaches <= now || DRIVING.is_live(record.reaches) {
+        if record.reaches <= now || DRIVING.lasts_beyond(record.reaches) {
             record.reaches = record.reaches.max(now);
-            while DRIVING.is_live(record.reaches) {
+            while DRIVING.lasts_beyond(record.reaches) {
                 record.reaches = record.reaches + STEP;
                 record.renewed = record.ticked;
             }

@@ -61,7 +61,12 @@ impl Side {
     }
 
     pub(super) fn is_live(&self, slot: Slot) -> bool {
-        self.functions.function(slot).unwrap().handler.lease.is_live(self.now)
+        self.is_live_behind(slot, Duration::ZERO)
+    }
+
+    /// What an interrupt is told that falls so long behind the moment at which the session began to look at something.
+    pub(super) fn is_live_behind(&self, slot: Slot, later: Duration) -> bool {
+        self.functions.function(slot).unwrap().handler.lease.is_live(self.now + later)
     }
 
     pub(super) fn request_with(

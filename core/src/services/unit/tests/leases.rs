@@ -1,5 +1,7 @@
 //! What moves goes on only while somebody wants it to.
 
+use proptest::prelude::*;
+
 use super::net::Datagrams;
 use super::pair::{Happened, Pair};
 use super::{none, x};
@@ -76,6 +78,96 @@ fn a_lease_ends_in_time_when_nothing_comes_through() {
     assert!(!pair.agv.is_live(slot), "renewals that were held back revive nothing");
     assert!(pair.manager.has(&Happened::LeaseEnded { slot, expired: true }));
     assert_eq!(expirations(&pair), 1);
+}
+
+#[test]
+fn what_an_interrupt_has_seen_dead_is_not_renewed() {
+    let (mut pair, slot) = moving(true);
+    (pair.manager.net.frozen, pair.manager.net.datagrams) = (true, Datagrams::Lost);
+    pair.run(LEASE - Duration::from_millis(50));
+    assert!(pair.agv.is_live(slot));
+    // The session looks at a renewal while the lease lasts, and is not through with it when the lease ends.
+    assert!(!pair.agv.is_live_behind(slot, Duration::from_millis(50)));
+    pair.manager.net.frozen = false;
+    pair.settle();
+    assert!(!pair.agv.is_live(slot), "the motors have been switched off, and come on again");
+    assert_eq!((expirations(&pair), pair.agv.counter(LinkCounter::LeasesExpired)), (1, 1), "the hook is told");
+    assert!(pair.manager.has(&Happened::LeaseEnded { slot, expired: true }));
+    pair.run(Duration::from_secs(1));
+    assert_eq!((expirations(&pair), pair.agv.is_live(slot)), (1, false));
+    pair.manager.tell("go", &none()).unwrap();
+    pair.run(Duration::from_millis(1));
+    assert!(pair.agv.is_live(slot), "a new order moves it");
+}
+
+#[test]
+fn an_order_does_not_take_the_place_of_a_motion_that_an_interrupt_has_seen_dead() {
+    let (mut pair, slot) = moving(false);
+    assert!(!pair.agv.is_live_behind(slot, LEASE));
+    let early = pair.manager.tell("go", &none()).unwrap();
+    pair.run(Duration::from_millis(1));
+    assert!(pair.manager.has(&Happened::Failed(early, Error::Busy)), "the hook comes first");
+    assert_eq!((expirations(&pair), pair.agv.is_live(slot)), (1, false));
+    pair.manager.tell("go", &none()).unwrap();
+    pair.run(Duration::from_millis(1));
+    assert_eq!((expirations(&pair), pair.agv.is_live(slot)), (1, true));
+}
+
+/// What befalls a motion.
+#[derive(Clone, Copy, Debug)]
+enum Befalls {
+    /// Milliseconds go by.
+    Time(u64),
+    /// An interrupt looks, so many milliseconds behind the session's clock.
+    Look(u64),
+    Stream(bool),
+    Datagrams(bool),
+    Order,
+}
+
+fn befalls() -> impl Strategy<Value = Befalls> {
+    prop_oneof![
+        4 => (0..200_u64).prop_map(Befalls::Time),
+        4 => (0..300_u64).prop_map(Befalls::Look),
+        2 => any::<bool>().prop_map(Befalls::Stream),
+        2 => any::<bool>().prop_map(Befalls::Datagrams),
+        1 => Just(Befalls::Order),
+    ]
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(128))]
+
+    #[test]
+    fn motors_that_were_switched_off_come_on_by_an_order_only(story in prop::collection::vec(befalls(), 1..60)) {
+        let (mut pair, slot) = moving(true);
+        // The orders that were running when it was last seen dead.
+        let mut dead_at = None;
+        for step in story {
+            let mut later = Duration::ZERO;
+            match step {
+                Befalls::Time(millis) => pair.run(Duration::from_millis(millis)),
+                Befalls::Look(millis) => later = Duration::from_millis(millis),
+                Befalls::Stream(frozen) => pair.manager.net.frozen = frozen,
+                Befalls::Datagrams(pass) => {
+                    pair.manager.net.datagrams = if pass { Datagrams::Pass } else { Datagrams::Lost };
+                }
+                Befalls::Order => {
+                    let _ = pair.manager.tell("go", &none());
+                }
+            }
+            pair.settle();
+            let orders = pair.agv.ran().len();
+            if pair.agv.is_live_behind(slot, later) {
+                prop_assert!(dead_at.is_none_or(|dead_at| orders > dead_at), "it goes on by itself: {step:?}");
+                dead_at = None;
+            } else {
+                dead_at = Some(orders);
+            }
+        }
+        pair.manager.net.frozen = false;
+        pair.settle();
+    }
 }
 
 #[test]
