@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, bail, ensure};
 use cara_apps::mechanic;
 use cara_std::control::Control;
-use cara_std::{Builder, CloseReason, CommunicationSystem, Parameters, Peer, UnitEvent};
+use cara_std::{Builder, CloseReason, CommunicationSystem, Error, Parameters, Peer, UnitEvent};
 
 use crate::board::{FLEET, LONG, Who};
 use crate::keys::Keys;
@@ -104,8 +104,36 @@ impl Manager {
 /// Where a vehicle says it is.
 pub(crate) fn position(peer: &Peer) -> Result<[i64; 2]> {
     let mut parameters = at([0, 0])?;
-    peer.block_request("pos_info", &mut parameters)?;
+    patiently(|| peer.block_request("pos_info", &mut parameters))?;
     Ok(parameters.variable("position")?)
+}
+
+/// Announces a fault to a board's test image.
+pub(crate) fn announce(peer: &Peer) -> Result<()> {
+    patiently(|| peer.block_request("fault", &mut fault(0)?))
+}
+
+/// Asks for what may run twice, again where this machine was too busy for an answer in time.
+fn patiently(mut ask: impl FnMut() -> Result<(), Error>) -> Result<()> {
+    let deadline = Instant::now() + LONG;
+    loop {
+        match ask() {
+            Err(Error::TimedOut | Error::Expired) if Instant::now() < deadline => {}
+            ended => return Ok(ended?),
+        }
+    }
+}
+
+/// Sends a vehicle to a place; `false` where this machine was too busy for that, and nobody wants it there any more.
+pub(crate) fn sends(peer: &Peer, position: [i64; 2]) -> Result<bool> {
+    match peer.block_request("go_to", &mut at(position)?) {
+        Err(Error::TimedOut | Error::Expired | Error::Busy) => {
+            // The call may have run all the same, and its lease is not renewed then.
+            peer.release("go_to")?;
+            Ok(false)
+        }
+        ended => ended.map(|()| true).map_err(Into::into),
+    }
 }
 
 /// Parameters with a position.
@@ -129,7 +157,7 @@ pub(crate) fn arrives(peer: &Peer, target: [i64; 2]) -> Result<()> {
 }
 
 /// A call that announces a fault to a board's test image, or makes it fail.
-pub(crate) fn fault(kind: i64) -> Result<Parameters> {
+pub(crate) fn fault(kind: i64) -> Result<Parameters, Error> {
     let mut parameters = Parameters::new();
     parameters.add_int("kind", 1)?;
     parameters.set_value("kind", kind)?;
@@ -158,7 +186,7 @@ pub(crate) fn stand_alone(key_file: Option<&Path>) -> Result<()> {
     println!("driving");
     for line in std::io::stdin().lines() {
         if line? == ANNOUNCE {
-            agv.block_request("fault", &mut fault(0)?)?;
+            announce(&agv)?;
             println!("announced");
         }
     }

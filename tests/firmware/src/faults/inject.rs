@@ -14,12 +14,14 @@ use super::Stop;
 use super::kind::{Bound, Failing, Kind};
 use crate::board::{Bench, Board, Cable, LONG, Way, Who};
 use crate::keys::Keys;
-use crate::manager::{self, ANNOUNCE, Manager, at, fault, position};
+use crate::manager::{self, ANNOUNCE, Manager, announce, at, fault, position, sends};
 
 /// Longer than the pause between two renewals: faults come in every phase of it.
 const PHASES: u64 = 250;
 /// In which a vehicle that drives would be seen to.
 const STANDS: Duration = Duration::from_millis(300);
+/// How often a manager renews that has its turns.
+const RENEWED: Duration = Duration::from_millis(100);
 /// Times that a drive is begun anew because this machine was too busy to renew a lease in time.
 const TRIES: u32 = 5;
 /// What the board logs.
@@ -62,6 +64,7 @@ impl Desk {
     pub(super) fn fail(&self, kind: &Kind, number: u32, dice: &mut fastrand::Rng) -> Result<Stop> {
         let stop = match kind.failing {
             Failing::Manager { frozen } => self.manager_fails(frozen, dice),
+            Failing::Turns => self.manager_is_held_up(dice),
             Failing::Wire(Way::FromBoard) => self.manager_hears_nothing(dice),
             Failing::Wire(Way::ToBoard) | Failing::Cable => self.link_cut(kind.failing, number, dice),
             Failing::Board { asked, reason } => self.board_fails(asked, reason, dice),
@@ -73,9 +76,7 @@ impl Desk {
 
     fn manager_fails(&self, frozen: bool, dice: &mut fastrand::Rng) -> Result<Stop> {
         let line = self.board.line();
-        let program = std::env::current_exe()?;
-        let mut process = Process::start("manager", Path::new(&program), manager::command(&self.keys))?;
-        process.expect("driving", LONG)?;
+        let mut process = self.manager_process()?;
         let line = self.board.logs_behind(line, ON)?;
         pause(dice);
         process.send(ANNOUNCE)?;
@@ -91,14 +92,50 @@ impl Desk {
             process.thaw()?;
             process.send(ANNOUNCE)?;
             process.expect("announced", LONG)?;
-            ensure!(!self.has_logged(behind, ON), "a manager that was frozen moves it");
+            let moves = self.has_logged(behind, ON);
+            ensure!(!moves, "a manager that was frozen moves it; the board logged{}", self.log(line));
         }
+        self.another_finds_it_standing(process, line, behind)?;
+        Ok(stop)
+    }
+
+    /// A manager that renews at the last moment, on a busy machine: either in time, or in vain.
+    fn manager_is_held_up(&self, dice: &mut fastrand::Rng) -> Result<Stop> {
+        let line = self.board.line();
+        let mut process = self.manager_process()?;
+        let line = self.board.logs_behind(line, ON)?;
+        while !self.has_logged(line, OFF) {
+            process.send(ANNOUNCE)?;
+            process.expect("announced", LONG)?;
+            process.freeze()?;
+            std::thread::sleep(Duration::from(GO_TO_LEASE) - RENEWED.mul_f64(dice.f64()));
+            process.thaw()?;
+        }
+        let (behind, stop) = self.stopped(line)?;
+        // It wants to go on, and says so.
+        process.send(ANNOUNCE)?;
+        process.expect("announced", LONG)?;
+        std::thread::sleep(STANDS);
+        let moves = self.has_logged(behind, ON);
+        ensure!(!moves, "a renewal that came too late moves it; the board logged{}", self.log(line));
+        self.another_finds_it_standing(process, line, behind)?;
+        Ok(stop)
+    }
+
+    fn manager_process(&self) -> Result<Process> {
+        let program = std::env::current_exe()?;
+        let mut process = Process::start("manager", Path::new(&program), manager::command(&self.keys))?;
+        process.expect("driving", LONG)?;
+        Ok(process)
+    }
+
+    /// Ends a manager; the next one finds the vehicle where it was.
+    fn another_finds_it_standing(&self, process: Process, line: usize, behind: usize) -> Result<()> {
         drop(process);
         self.lost_once(line)?;
         let manager = Manager::start(&self.keys)?;
         let agv = manager.meet(&self.who)?;
-        self.stands(&agv, behind)?;
-        Ok(stop)
+        self.stands(&agv, line, behind)
     }
 
     fn link_cut(&self, failing: Failing, number: u32, dice: &mut fastrand::Rng) -> Result<Stop> {
@@ -114,14 +151,15 @@ impl Desk {
             let ends = |event: &UnitEvent| matches!(event, UnitEvent::RequestFailed { .. } | UnitEvent::Left { .. });
             let ended = manager.event("end of the old command", ends)?;
             let refused = matches!(ended, UnitEvent::RequestFailed { error: Error::Expired, .. });
-            ensure!(refused || matches!(ended, UnitEvent::Left { .. }), "the old command came to {ended:?}");
+            let left = matches!(ended, UnitEvent::Left { .. });
+            ensure!(refused || left, "the old command came to {ended:?}; the board logged{}", self.log(line));
         } else {
             manager.left(&self.who)?;
             self.lost_once(line)?;
             self.mend(failing)?;
         }
         let agv = manager.meet(&self.who)?;
-        self.stands(&agv, behind)?;
+        self.stands(&agv, line, behind)?;
         self.hooks_follow_losses(line)?;
         Ok(stop)
     }
@@ -137,7 +175,7 @@ impl Desk {
         self.lost_once(line)?;
         self.mend(failing)?;
         let agv = manager.meet(&self.who)?;
-        self.stands(&agv, behind)?;
+        self.stands(&agv, line, behind)?;
         Ok(stop)
     }
 
@@ -153,11 +191,12 @@ impl Desk {
         let started = self.board.logs_behind(behind, &told)?;
         let left = manager.event("loss", |event| matches!(event, UnitEvent::Left { .. }))?;
         let restarted = matches!(left, UnitEvent::Left { reason: CloseReason::PeerRestarted | CloseReason::Reset, .. });
-        ensure!(restarted || reason == "Watchdog", "the manager was told {left:?}");
+        ensure!(restarted || reason == "Watchdog", "the manager was told {left:?}; the board logged{}", self.log(line));
         self.board.logs_behind(started, "has joined")?;
         let agv = manager.meet(&self.who)?;
-        ensure!(position(&agv)? == [0, 0], "a fresh board has moved");
-        self.stands(&agv, behind)?;
+        let place = position(&agv)?;
+        ensure!(place == [0, 0], "a fresh board has moved to {place:?}; it logged{}", self.log(line));
+        self.stands(&agv, line, behind)?;
         Ok(stop)
     }
 
@@ -166,10 +205,12 @@ impl Desk {
         for _ in 0..TRIES {
             let agv = manager.meet(&self.who)?;
             let line = self.board.line();
-            agv.block_request("go_to", &mut at([9_000, 0])?)?;
+            if !sends(&agv, [9_000, 0])? {
+                continue;
+            }
             let line = self.board.logs_behind(line, ON)?;
             pause(dice);
-            agv.block_request("fault", &mut fault(0)?)?;
+            announce(&agv)?;
             if !self.has_logged(line, OFF) {
                 return Ok(Drive { agv, line });
             }
@@ -201,7 +242,7 @@ impl Desk {
     fn lost_once(&self, line: usize) -> Result<()> {
         self.board.logs_behind(line, HOOK)?;
         let losses = self.hooks_follow_losses(line)?;
-        ensure!(losses == 1, "{losses} losses of one manager");
+        ensure!(losses == 1, "{losses} losses of one manager; the board logged{}", self.log(line));
         Ok(())
     }
 
@@ -214,19 +255,30 @@ impl Desk {
         let in_order = lines.windows(2).filter(|pair| pair[0].contains(LEFT) && pair[1].contains(HOOK)).count();
         ensure!(
             losses == hooks && hooks == in_order,
-            "losses and their hooks do not match:\n    {}",
-            lines.join("\n    ")
+            "losses and their hooks do not match; the board logged{}",
+            self.log(line)
         );
         Ok(losses)
     }
 
     /// Nothing has moved the vehicle since, and nothing does while it is looked at.
-    fn stands(&self, agv: &Peer, behind: usize) -> Result<()> {
-        let place = position(agv)?;
+    fn stands(&self, agv: &Peer, line: usize, behind: usize) -> Result<()> {
+        let before = position(agv)?;
         std::thread::sleep(STANDS);
-        let still = position(agv)? == place && !self.has_logged(behind, ON);
-        ensure!(still, "it drives again, and nobody told it to");
+        let after = position(agv)?;
+        ensure!(
+            before == after && !self.has_logged(behind, ON),
+            "it drives again, and nobody told it to: from {before:?} to {after:?}; behind the motors' end in line {behind} \
+             the board logged{}",
+            self.log(line)
+        );
         Ok(())
+    }
+
+    /// What the board has logged since, for whoever reads that something is wrong.
+    fn log(&self, line: usize) -> String {
+        let number = |(at, said): (usize, String)| format!("\n    {:4} {said}", line + at + 1);
+        self.board.lines(line).into_iter().enumerate().map(number).collect()
     }
 
     fn has_logged(&self, line: usize, text: &str) -> bool {

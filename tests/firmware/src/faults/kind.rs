@@ -14,6 +14,8 @@ pub(super) enum Failing {
         /// It gets no turn any more, and its connections stay open; otherwise it is killed.
         frozen: bool,
     },
+    /// The manager's process gets no turn for about as long as its lease lasts, again and again.
+    Turns,
     /// One wire of the cable is cut.
     Wire(Way),
     /// The cable is pulled.
@@ -34,9 +36,10 @@ pub(super) struct Kind {
 }
 
 /// All of them.
-pub(super) const KINDS: [Kind; 8] = [
+pub(super) const KINDS: [Kind; 9] = [
     Kind { name: "manager killed", failing: Failing::Manager { frozen: false } },
     Kind { name: "manager frozen", failing: Failing::Manager { frozen: true } },
+    Kind { name: "manager held up", failing: Failing::Turns },
     Kind { name: "link cut towards the board", failing: Failing::Wire(Way::ToBoard) },
     Kind { name: "link cut towards the manager", failing: Failing::Wire(Way::FromBoard) },
     Kind { name: "link cut in both directions", failing: Failing::Cable },

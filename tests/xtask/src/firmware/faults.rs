@@ -13,7 +13,7 @@ use crate::install;
 /// How many faults are injected.
 #[derive(Args)]
 pub(crate) struct Faults {
-    /// Faults of each of the eight kinds.
+    /// Faults of each of the nine kinds.
     #[arg(long, default_value_t = 26)]
     each: u32,
     /// Only kinds whose names contain this.
