@@ -14,6 +14,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::json;
 use std::io::Write;
 
+use crate::counted::under_callgrind;
 use crate::peers::{self, Contender};
 use crate::share;
 
@@ -59,7 +60,12 @@ pub(crate) struct Handle {
     last_words: Arc<Mutex<String>>,
     /// How long it may take to answer; our own may take what they need.
     patience: Option<Duration>,
+    /// How long it may take to end when there are no more questions.
+    farewell: Duration,
 }
+
+/// What a process needs to end, and what it needs to write a profile before.
+const FAREWELLS: [Duration; 2] = [Duration::from_secs(2), Duration::from_secs(60)];
 
 impl Handle {
     /// Starts this program again with `arguments`.
@@ -74,9 +80,16 @@ impl Handle {
         let mut command = contender.command()?;
         command.args([role, "--peer", &end.peer, "--run", &end.place.run.to_string(), "--address", &end.address]);
         command.args(end.place.print.then_some("--print"));
+        if end.place.client > 0 {
+            command.args(["--client", &end.place.client.to_string()]);
+        }
         let patience = match contender {
-            Contender::Own(_) => None,
             Contender::Outside(outside) => Some(outside.patience()),
+            Contender::Counted(_, folder) => {
+                command = under_callgrind(&command, folder);
+                None
+            }
+            Contender::Own(_) => None,
         };
         if patience.is_some() || (end.place.print && role == "serve") {
             command.stderr(Stdio::piped());
@@ -87,7 +100,10 @@ impl Handle {
                 pin::stay_on(end.cpu)?;
                 Self::spawn(command, patience)
             });
-            starter.join().expect("starting does not panic")
+            let mut started = starter.join().expect("starting does not panic")?;
+            let is_counted = matches!(contender, Contender::Counted(..));
+            started.farewell = FAREWELLS[usize::from(is_counted)];
+            Ok(started)
         })
     }
 
@@ -103,7 +119,7 @@ impl Handle {
         let lines = BufReader::new(process.stdout.take().context("the child has no output")?).lines();
         let (sender, answers) = mpsc::channel();
         thread::spawn(move || lines.map_while(Result::ok).try_for_each(|line| sender.send(line)));
-        Ok(Self { process, questions, answers, last_words, patience })
+        Ok(Self { process, questions, answers, last_words, patience, farewell: FAREWELLS[0] })
     }
 
     /// Sends one line.
@@ -140,6 +156,11 @@ impl Handle {
         self.answer()
     }
 
+    /// There will be no more questions, so it ends.
+    pub(crate) fn dismiss(&mut self) {
+        drop(self.questions.take());
+    }
+
     /// What happened, with what the child said last.
     fn end(&self, what: &str) -> String {
         // What it said before it ended may still be on its way.
@@ -165,9 +186,9 @@ fn listen(mut said: impl Read, kept: &Mutex<String>) {
 
 impl Drop for Handle {
     fn drop(&mut self) {
-        drop(self.questions.take());
+        self.dismiss();
         // It ends by itself now; one that does not must not hold up the report.
-        for _ in 0..200 {
+        for _ in 0..self.farewell.as_millis() / 10 {
             if !matches!(self.process.try_wait(), Ok(None)) {
                 return;
             }

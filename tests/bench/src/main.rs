@@ -8,7 +8,9 @@
 //! Only a release build measures anything: `cargo xtask bench --help`.
 
 mod child;
+mod counted;
 mod experiments;
+mod lanes;
 mod nodes;
 mod pair;
 mod peers;

@@ -1,12 +1,14 @@
 //! The processes of a manager and of many s_units, to see what a node costs.
 
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
 use cara_bench_ends::{Place, answer_all, clock, pin, text};
+use cara_std::keys::{FleetKeys, Store, place::file_name};
 use cara_std::{
-    Builder, Call, CommunicationSystem, Constraints, Interfaces, Parameters, ParametersView, Peer, RequestOptions,
-    ServiceError, Threads, Unit,
+    Builder, Call, CommunicationSystem, Constraints, Fleet, Identity, Interfaces, Parameters, ParametersView, Peer,
+    RequestOptions, ServiceError, Threads, Unit,
 };
 use clap::Args;
 use serde::{Deserialize, Serialize};
@@ -30,6 +32,9 @@ pub(crate) struct Nodes {
     /// The CPU to stay on.
     #[arg(long)]
     pub(crate) cpu: Option<usize>,
+    /// The folder of their keys; none for plain mode.
+    #[arg(long)]
+    pub(crate) keys: Option<PathBuf>,
 }
 
 /// What a manager's process is asked.
@@ -45,15 +50,39 @@ pub(crate) enum Question {
     Block { calls: u32, each: bool },
 }
 
-fn placed(builder: Builder<()>, place: &Place) -> Builder<()> {
-    builder.insecure().fleet(place.run).discovery_port(place.discovery_port()).interfaces(Interfaces::Loopback)
+/// Draws keys for the manager of run `run` and so many nodes, into a folder of their own.
+pub(crate) fn draw_keys(run: u32, count: u32) -> Result<tempfile::TempDir> {
+    let folder = tempfile::tempdir()?;
+    let mut keys = FleetKeys::draw(Fleet(run))?;
+    let manager = Identity::m_unit(MANAGER.0, MANAGER.1)?;
+    keys.add(&manager, &[])?;
+    let nodes = (0..count).map(|index| Identity::s_unit(&name(FIRST_ID + index), FIRST_ID + index));
+    keys.add_all(&nodes.collect::<Result<Vec<_>, _>>()?, std::slice::from_ref(&manager))?;
+    Store::create(folder.path(), keys)?.save()?;
+    Ok(folder)
+}
+
+fn name(id: u32) -> String {
+    format!("agv-{id}")
+}
+
+impl Nodes {
+    fn placed(&self, builder: Builder<()>, identity: &Identity) -> Builder<()> {
+        let fleet = self.place.run;
+        let builder = builder.fleet(fleet).discovery_port(self.place.discovery_port()).interfaces(Interfaces::Loopback);
+        match &self.keys {
+            Some(folder) => builder.key_file(folder.join(file_name(identity, Fleet(fleet)))),
+            None => builder.insecure(),
+        }
+    }
 }
 
 /// The manager's process, with defaults but for the number of nodes.
 pub(crate) fn manager(nodes: &Nodes) -> Result<()> {
     pin::stay_on(nodes.cpu)?;
     let constraints = Constraints { maximum_nodes: u16::try_from(nodes.count)?, ..Constraints::M_UNIT };
-    let builder = placed(CommunicationSystem::builder(MANAGER.0, MANAGER.1)?, &nodes.place);
+    let builder = CommunicationSystem::builder(MANAGER.0, MANAGER.1)?;
+    let builder = nodes.placed(builder, &Identity::m_unit(MANAGER.0, MANAGER.1)?);
     let manager = builder.constraints(constraints).build_system()?;
     manager.start()?;
     answer_all(|question| {
@@ -119,16 +148,16 @@ const FIRST_ID: u32 = 1;
 pub(crate) fn units(nodes: &Nodes) -> Result<()> {
     pin::stay_on(nodes.cpu)?;
     let threads = Threads::new()?;
-    let units = (0..nodes.count).map(|index| unit(&nodes.place, FIRST_ID + index, &threads));
+    let units = (0..nodes.count).map(|index| unit(nodes, FIRST_ID + index, &threads));
     let units = units.collect::<Result<Vec<_>>>()?;
     let _ = std::io::stdin().lines().next();
     drop(units);
     Ok(())
 }
 
-fn unit(place: &Place, id: u32, threads: &Threads) -> Result<Unit> {
-    let builder = placed(Unit::builder(&format!("agv-{id}"), id, MANAGER.0, MANAGER.1)?, place);
-    let unit = builder.threads(threads).build_unit()?;
+fn unit(nodes: &Nodes, id: u32, threads: &Threads) -> Result<Unit> {
+    let builder = Unit::builder(&name(id), id, MANAGER.0, MANAGER.1)?;
+    let unit = nodes.placed(builder, &Identity::s_unit(&name(id), id)?).threads(threads).build_unit()?;
     unit.my_function_list().add_function("echo", &*text_parameters()?, same)?;
     unit.my_function_list().add_function("touch", &number()?, same)?;
     unit.publish_my_function_list()?;

@@ -32,7 +32,7 @@ pub(crate) struct Setting {
 pub(crate) struct Pair {
     peer: String,
     server: Handle,
-    client: Handle,
+    clients: Vec<Handle>,
     further: Option<Handle>,
 }
 
@@ -58,44 +58,58 @@ impl Delivered {
 impl Pair {
     /// Starts the processes of `peer`; they share no network with any other pair.
     pub(crate) fn start(contender: &Contender, setting: Setting) -> Result<Self> {
+        Self::with_clients(1, contender, setting)
+    }
+
+    /// As [`start`](Self::start), with so many processes that call.
+    pub(crate) fn with_clients(count: usize, contender: &Contender, setting: Setting) -> Result<Self> {
         let peer = contender.name();
         let [client_cpu, server_cpu] = pin::cpus(setting.pin)?;
-        let place = Place { run: fastrand::u32(1..), print: setting.print };
+        let place = Place { run: fastrand::u32(1..), print: setting.print, client: 0 };
         let mut end = End { peer: peer.to_owned(), cpu: server_cpu, place, address: String::new() };
         let mut server = Handle::of_pair("serve", contender, &end)?;
         end.address = server.line().with_context(|| format!("starting the server of {peer}"))?;
         end.cpu = client_cpu;
-        let client = Handle::of_pair("call", contender, &end)?;
+        let mut clients = Vec::new();
+        for client in 0..count {
+            end.place.client = u32::try_from(client)?;
+            clients.push(Handle::of_pair("call", contender, &end)?);
+        }
         let further = (setting.distribution == 2).then(|| Handle::of_pair("further", contender, &end)).transpose()?;
-        Ok(Self { peer: peer.to_owned(), server, client, further })
+        Ok(Self { peer: peer.to_owned(), server, clients, further })
     }
 
     /// One block of echo calls.
     pub(crate) fn block(&mut self, order: &Order) -> Result<Turn> {
-        let used = self.begin_block(order)?;
-        self.end_block(used)
+        let used = self.begin_blocks(std::slice::from_ref(order))?;
+        self.end_blocks(used)?.pop().context("a pair has a client")
     }
 
-    /// As [`block`](Self::block) in two parts, so that several pairs can be under way; returns what the end needs.
-    pub(crate) fn begin_block(&mut self, order: &Order) -> Result<u64> {
+    /// As [`block`](Self::block) in two parts, so that several pairs can be under way, with an order for each client;
+    /// returns what the end needs.
+    pub(crate) fn begin_blocks(&mut self, orders: &[Order]) -> Result<u64> {
         self.begin_further()?;
         let used = self.ask_server(&ServerQuestion::CpuTime)?;
-        self.client.ask(&ClientQuestion::Echo(order.clone()))?;
+        let ask = |(client, order): (&mut Handle, &Order)| client.ask(&ClientQuestion::Echo(order.clone()));
+        self.clients.iter_mut().zip(orders).try_for_each(ask)?;
         Ok(used)
     }
 
-    pub(crate) fn end_block(&mut self, used: u64) -> Result<Turn> {
-        let outcome: Result<Outcome> = self.client.answer().with_context(|| format!("calls of {}", self.peer));
+    /// The turn of each client; they share the time of the server evenly.
+    pub(crate) fn end_blocks(&mut self, used: u64) -> Result<Vec<Turn>> {
+        let outcomes: Vec<Result<Outcome>> = self.clients.iter_mut().map(Handle::answer).collect();
         let server_cpu = self.ask_server::<u64>(&ServerQuestion::CpuTime)?.saturating_sub(used);
         self.end_further()?;
-        Ok(Turn::new(outcome?, server_cpu))
+        let share = server_cpu / outcomes.len().max(1) as u64;
+        let turn = |outcome: Result<Outcome>| outcome.map(|outcome| Turn::new(outcome, share));
+        outcomes.into_iter().map(turn).collect::<Result<_>>().with_context(|| format!("calls of {}", self.peer))
     }
 
     /// One burst of one-way messages, and what became of each.
     pub(crate) fn burst(&mut self, burst: &Burst) -> Result<Delivered> {
         self.begin_further()?;
         let (before, _): (u64, u64) = self.ask_server(&ServerQuestion::Executed)?;
-        let offered: Offered = self.client.order(&ClientQuestion::Burst(burst.clone()))?;
+        let offered: Offered = self.client()?.order(&ClientQuestion::Burst(burst.clone()))?;
         let mut delivered = Delivered { offered, ..Delivered::default() };
         self.settle(before, &mut delivered)?;
         self.end_further()?;
@@ -111,7 +125,7 @@ impl Pair {
         let mut changed = Instant::now();
         loop {
             let known = (delivered.executed, delivered.failed);
-            delivered.failed += self.client.order::<u64>(&ClientQuestion::Failed)?;
+            delivered.failed += self.client()?.order::<u64>(&ClientQuestion::Failed)?;
             let (count, last): (u64, u64) = self.ask_server(&ServerQuestion::Executed)?;
             delivered.executed = count - before;
             delivered.elapsed = last.saturating_sub(delivered.offered.start);
@@ -144,7 +158,11 @@ impl Pair {
 
     /// Asks the client anything else.
     pub(crate) fn ask_client<T: DeserializeOwned>(&mut self, question: &impl Serialize) -> Result<T> {
-        self.client.order(question)
+        self.client()?.order(question)
+    }
+
+    fn client(&mut self) -> Result<&mut Handle> {
+        self.clients.first_mut().context("a pair has a client")
     }
 
     fn ask_server<T: DeserializeOwned>(&mut self, question: &ServerQuestion) -> Result<T> {
@@ -161,5 +179,12 @@ impl Pair {
     fn end_further(&mut self) -> Result<()> {
         let Some(further) = &mut self.further else { return Ok(()) };
         further.order(&false).map(|_: u64| ())
+    }
+}
+
+impl Drop for Pair {
+    /// All of them end at the same time.
+    fn drop(&mut self) {
+        self.clients.iter_mut().chain(&mut self.further).chain([&mut self.server]).for_each(Handle::dismiss);
     }
 }

@@ -97,7 +97,7 @@ fn availability(results: &Results, distribution: u8) -> Chart {
 }
 
 fn is_reliable(row: &&Availability) -> bool {
-    row.delivery == Delivery::Reliable
+    (row.delivery, row.mode) == (Delivery::Reliable, Mode::Plain)
 }
 
 /// Availability at the paper's longest size in both distributions.

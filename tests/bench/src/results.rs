@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use anyhow::{Context, Result};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use crate::peers::OutsideReport;
 
@@ -12,15 +12,25 @@ use cara_bench_ends::Delivery;
 use cara_bench_ends::Pin;
 
 /// How messages are protected.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum Mode {
     Plain,
     Secured,
 }
 
+impl Mode {
+    /// As rows say it.
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            Self::Plain => "plain",
+            Self::Secured => "secured",
+        }
+    }
+}
+
 /// A whole run, complete or not.
-#[derive(Debug, Clone, Default, Serialize)]
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub(crate) struct Results {
     pub(crate) run: About,
     pub(crate) response: Vec<Response>,
@@ -30,10 +40,12 @@ pub(crate) struct Results {
     pub(crate) scale: Vec<Scale>,
     pub(crate) throughput: Vec<Throughput>,
     pub(crate) constraints: Vec<Constrained>,
+    /// From the rows above, when the run ends.
+    pub(crate) goals: Vec<Goal>,
 }
 
 /// What was run, where and when.
-#[derive(Debug, Clone, Default, Serialize)]
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub(crate) struct About {
     pub(crate) version: String,
     pub(crate) commit: String,
@@ -43,14 +55,26 @@ pub(crate) struct About {
     pub(crate) started_unix_s: u64,
     pub(crate) seconds: f64,
     pub(crate) cpus: usize,
+    pub(crate) processor: String,
     pub(crate) load_before: f64,
     pub(crate) load_after: f64,
+    pub(crate) experiments: Vec<Done>,
     pub(crate) notes: Vec<String>,
     pub(crate) peers: Vec<OutsideReport>,
 }
 
+/// One experiment.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+pub(crate) struct Done {
+    pub(crate) experiment: String,
+    pub(crate) is_complete: bool,
+    pub(crate) seconds: f64,
+    /// Of all CPUs, how much was in use.
+    pub(crate) busy: f64,
+}
+
 /// Round trips of one peer in one cell.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub(crate) struct Response {
     pub(crate) peer: String,
     pub(crate) distribution: u8,
@@ -74,7 +98,7 @@ pub(crate) struct Response {
 }
 
 /// One-way requests at one period.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub(crate) struct Availability {
     pub(crate) distribution: u8,
     pub(crate) chars: u32,
@@ -91,7 +115,7 @@ pub(crate) struct Availability {
 }
 
 /// What became of one-way requests.
-#[derive(Debug, Clone, Default, Serialize)]
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub(crate) struct Counts {
     pub(crate) offered: u64,
     pub(crate) sent: u64,
@@ -104,7 +128,7 @@ pub(crate) struct Counts {
 }
 
 /// Where the time of a round trip goes.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub(crate) struct Share {
     pub(crate) chars: u32,
     pub(crate) pin: Pin,
@@ -115,10 +139,46 @@ pub(crate) struct Share {
     pub(crate) process_us: f64,
     pub(crate) generate: f64,
     pub(crate) process: f64,
+    pub(crate) instructions_per_call: Option<f64>,
+    pub(crate) generate_instructions: Option<f64>,
+    pub(crate) process_instructions: Option<f64>,
+    /// `null` without callgrind.
+    pub(crate) instructions: Option<Instructions>,
+    /// The same with keys; within that, `null`.
+    pub(crate) secured: Option<Box<Share>>,
+}
+
+/// What callgrind counts of a round trip outside of the kernel; parts are of the process that they are named after.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub(crate) struct Instructions {
+    pub(crate) calls: u32,
+    #[serde(skip)]
+    pub(crate) per_call: f64,
+    #[serde(skip)]
+    pub(crate) generate: f64,
+    #[serde(skip)]
+    pub(crate) process: f64,
+    pub(crate) client_per_call: f64,
+    pub(crate) client_generate: f64,
+    pub(crate) client_process: f64,
+    pub(crate) server_per_call: f64,
+    pub(crate) server_generate: f64,
+    pub(crate) server_process: f64,
+}
+
+/// One of the project's goals.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub(crate) struct Goal {
+    pub(crate) quantity: String,
+    pub(crate) cell: String,
+    pub(crate) goal: String,
+    /// `null` where this run did not measure it.
+    pub(crate) figure: Option<f64>,
+    pub(crate) is_reached: Option<bool>,
 }
 
 /// A manager with so many nodes.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub(crate) struct Scale {
     pub(crate) nodes: u32,
     pub(crate) pin: Pin,
@@ -133,7 +193,7 @@ pub(crate) struct Scale {
 }
 
 /// Requests or one-way messages per second.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub(crate) struct Throughput {
     pub(crate) kind: Kind,
     pub(crate) peer: String,
@@ -149,7 +209,7 @@ pub(crate) struct Throughput {
 }
 
 /// What is counted per second.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum Kind {
     Request,
@@ -157,7 +217,7 @@ pub(crate) enum Kind {
 }
 
 /// One-way requests under constraints of the paper.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub(crate) struct Constrained {
     pub(crate) minimum_interval_ms: u64,
     pub(crate) message_size: u32,
@@ -171,6 +231,12 @@ pub(crate) struct Constrained {
 }
 
 impl Results {
+    /// What an earlier run wrote.
+    pub(crate) fn read(path: &Path) -> Result<Self> {
+        let text = std::fs::read_to_string(path).with_context(|| format!("reading {}", path.display()))?;
+        serde_json::from_str(&text).with_context(|| format!("{} is no complete file of a run", path.display()))
+    }
+
     /// Writes all of it; a reader finds the old file or the new one, never a part.
     pub(crate) fn write(&self, path: &Path) -> Result<()> {
         let text = serde_json::to_string_pretty(self)? + "\n";

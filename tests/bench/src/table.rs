@@ -18,6 +18,7 @@ pub(crate) fn show(results: &Results) {
     scale(results);
     constraints(results);
     availability(results);
+    goals(results);
     let run = &results.run;
     let state = if run.is_complete { "complete" } else { "not complete" };
     println!("{} run, {state}, {} s, load {} to {}", run.extent, run.seconds, run.load_before, run.load_after);
@@ -27,7 +28,7 @@ pub(crate) fn show(results: &Results) {
             "{}: {} {}",
             outside.peer,
             outside.system,
-            [&[outside.state.to_owned()][..], &outside.notes].concat().join("; ")
+            [std::slice::from_ref(&outside.state), &outside.notes].concat().join("; ")
         );
     }
 }
@@ -113,6 +114,7 @@ fn scale(results: &Results) {
     let rows = results.scale.iter().map(|row| {
         vec![
             row.nodes.to_string(),
+            row.mode.name().to_owned(),
             format!("{:.1}", row.request_us),
             format!("{:.3}", row.request_ratio),
             format!("{:.1}", row.each_us),
@@ -121,13 +123,14 @@ fn scale(results: &Results) {
             row.discovery_s.to_string(),
         ]
     });
-    let header = ["nodes", "one: µs", "ratio", "each in turn: µs", "ratio", "bytes per node", "discovery s"];
+    let header = ["nodes", "mode", "one: µs", "ratio", "each in turn: µs", "ratio", "bytes per node", "discovery s"];
     print(&header, rows);
 }
 
 fn constraints(results: &Results) {
     let rows = results.constraints.iter().map(|row| {
         let mut cells = vec![
+            row.mode.name().to_owned(),
             row.minimum_interval_ms.to_string(),
             row.message_size.to_string(),
             row.chars.to_string(),
@@ -137,7 +140,7 @@ fn constraints(results: &Results) {
         cells.push(row.executed_per_s.to_string());
         cells
     });
-    let first = ["interval ms", "message size", "chars", "period ms"];
+    let first = ["mode", "interval ms", "message size", "chars", "period ms"];
     print(&[&first[..], &COUNTS, &["per second"]].concat(), rows);
 }
 
@@ -145,6 +148,7 @@ fn availability(results: &Results) {
     let rows = results.availability.iter().map(|row| {
         let mut cells = vec![
             row.distribution.to_string(),
+            row.mode.name().to_owned(),
             format!("{:?}", row.delivery),
             row.chars.to_string(),
             row.period_ms.to_string(),
@@ -154,8 +158,21 @@ fn availability(results: &Results) {
         cells.push(row.ratio.map(|ratio| format!("{ratio:.3}")).unwrap_or_default());
         cells
     });
-    let first = ["distr.", "delivery", "chars", "period ms"];
+    let first = ["distr.", "mode", "delivery", "chars", "period ms"];
     print(&[&first[..], &COUNTS, &["per second", "to the floor's"]].concat(), rows);
+}
+
+fn goals(results: &Results) {
+    let rows = results.goals.iter().map(|goal| {
+        let verdict = match goal.is_reached {
+            Some(true) => "reached",
+            Some(false) => "NOT reached",
+            None => "not measured",
+        };
+        let figure = goal.figure.map(|figure| figure.to_string()).unwrap_or_default();
+        vec![goal.quantity.clone(), goal.cell.clone(), goal.goal.clone(), figure, verdict.to_owned()]
+    });
+    print(&["goal", "where", "must be", "is", ""], rows);
 }
 
 const COUNTS: [&str; 6] = ["offered", "refused", "sent", "executed", "lost", "executed/offered"];

@@ -24,6 +24,13 @@ pub(crate) struct Options {
     /// Also writes all rows here, after each experiment anew.
     #[arg(long, value_name = "FILE")]
     json: Option<std::path::PathBuf>,
+    /// Keeps the complete experiments of this file, which an earlier run of the same commit and form wrote on this
+    /// machine, and makes the others.
+    #[arg(long, value_name = "FILE")]
+    resume: Option<std::path::PathBuf>,
+    /// So many turns of each cell of the response time instead of the usual.
+    #[arg(long)]
+    rounds: Option<u32>,
     /// Draws the paper's figures 6, 7 and 8 and the ratios here, as SVG and PNG.
     #[arg(long, value_name = "DIR")]
     plots: Option<std::path::PathBuf>,
@@ -42,7 +49,8 @@ pub(crate) fn run(options: &Options) -> Result<ExitCode> {
     if !options.peers.is_empty() {
         command.arg("--peers").arg(options.peers.join(","));
     }
-    for (name, path) in [("--json", &options.json), ("--plots", &options.plots)] {
+    command.args(options.rounds.iter().flat_map(|rounds| ["--rounds".to_owned(), rounds.to_string()]));
+    for (name, path) in [("--json", &options.json), ("--resume", &options.resume), ("--plots", &options.plots)] {
         if let Some(path) = path {
             // The program runs in the project's root, wherever this command was started.
             command.arg(name).arg(absolute(path)?);

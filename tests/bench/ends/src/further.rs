@@ -1,7 +1,7 @@
 //! The five further nodes of the paper's distribution 2: each calls at random, while it is told to.
 
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Condvar, Mutex, OnceLock, PoisonError};
 use std::thread;
 use std::time::Duration;
 
@@ -16,6 +16,8 @@ const NODES: u32 = 5;
 const CHARS: u32 = 1_000;
 /// Milliseconds between two calls of one node, drawn at random.
 const INTERVAL_MS: std::ops::RangeInclusive<u64> = 1..=20;
+/// One call of so many may fail: on a machine with other load an answer may come too late, and the others go on.
+const TOLERATED: u64 = 100;
 
 /// The nodes, each with a thread of its own.
 pub(crate) struct Further {
@@ -26,8 +28,10 @@ pub(crate) struct Further {
 struct State {
     is_calling: Mutex<bool>,
     changed: Condvar,
-    has_failed: AtomicBool,
     calls: AtomicU64,
+    failures: AtomicU64,
+    /// Of the first failure.
+    reason: OnceLock<String>,
 }
 
 impl Further {
@@ -52,11 +56,13 @@ impl Further {
         self.state.set(true);
     }
 
-    /// They stop; how many calls were answered since the process began, or an error where one was not.
+    /// They stop; how many calls were answered since the process began, or an error where more than a few were not.
     pub(crate) fn end(&self) -> Result<u64> {
         self.state.set(false);
-        ensure!(!self.state.has_failed.load(Ordering::Relaxed), "a call of a further node failed");
-        Ok(self.state.calls.load(Ordering::Relaxed))
+        let [calls, failures] = [&self.state.calls, &self.state.failures].map(|count| count.load(Ordering::Relaxed));
+        let reason = self.state.reason.get().map_or("", String::as_str);
+        ensure!(failures <= calls / TOLERATED, "{failures} calls of further nodes failed, {calls} did not: {reason}");
+        Ok(calls)
     }
 }
 
@@ -82,7 +88,10 @@ impl State {
             }
             match caller.echo(&text) {
                 Ok(_) => self.calls.fetch_add(1, Ordering::Relaxed),
-                Err(_) => return self.has_failed.store(true, Ordering::Relaxed),
+                Err(error) => {
+                    self.reason.get_or_init(|| format!("{error:#}"));
+                    self.failures.fetch_add(1, Ordering::Relaxed)
+                }
             };
         }
     }

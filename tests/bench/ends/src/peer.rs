@@ -37,6 +37,9 @@ pub struct Place {
     /// The service prints what it gets.
     #[arg(long)]
     pub print: bool,
+    /// Which of the pair's client processes this is.
+    #[arg(long, default_value_t = 0)]
+    pub client: u32,
 }
 
 impl Place {

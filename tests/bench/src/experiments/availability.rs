@@ -5,71 +5,128 @@ use std::collections::BTreeMap;
 use anyhow::{Context, Result};
 
 use super::plan::{Bursts, Plan};
+use crate::lanes::side_by_side;
 use crate::pair::{Delivered, Pair, Setting};
-use crate::peers::Contender;
-use crate::progress::{bar, is_stopped};
+use crate::peers::{Contender, SECURED};
+use crate::progress::{Progress, is_stopped};
 use crate::results::{Availability, Counts, Mode, ratio};
 use crate::statistics::quartile;
 use cara_bench_ends::Burst;
 use cara_bench_ends::Delivery;
 
+/// Pairs that start at the same time.
+const AT_A_TIME: usize = 8;
+/// Ours, in both modes.
+const OWN: [Contender; 2] = [Contender::Own("cara"), Contender::Own(SECURED)];
+
+/// First what keeps a CPU busy, on its own; then whatever waits between its requests, side by side.
 pub(super) fn measure(plan: &Plan, rows: &mut Vec<Availability>) -> Result<()> {
-    for distribution in [1, 2] {
-        let setting = Setting { pin: plan.pin, distribution, print: false };
-        let start = |peer| Pair::start(&Contender::Own(peer), setting);
-        let mut pairs = [start("floor")?, start("cara")?];
-        for bursts in plan.availability.iter().filter(|bursts| bursts.distribution == distribution) {
-            of(setting, &mut pairs, bursts, rows)?;
+    let alone = [1, 2].map(|distribution| at_once(plan, distribution, rows));
+    let outcome = alone.into_iter().chain([spaced(plan, rows)]).collect();
+    rows.sort_by_key(|row| {
+        (row.distribution, row.mode == Mode::Secured, row.delivery == Delivery::BestEffort, row.chars, row.period_ms)
+    });
+    outcome
+}
+
+/// Period 0, in turns with the floor.
+fn at_once(plan: &Plan, distribution: u8, rows: &mut Vec<Availability>) -> Result<()> {
+    let setting = Setting { pin: plan.pin, distribution, print: false };
+    let bursts: Vec<_> = plan.availability.iter().filter(|bursts| bursts.distribution == distribution).collect();
+    let mut floor = Pair::start(&Contender::Own("floor"), setting)?;
+    let started = side_by_side(OWN.iter().collect(), OWN.len(), |own| Pair::start(own, setting));
+    let mut pairs = started.into_iter().collect::<Result<Vec<_>>>()?;
+    let steps = bursts.iter().filter(|bursts| bursts.periods_ms.contains(&0)).map(|bursts| bursts.chars.len()).sum();
+    let bar = Progress::new(&format!("availability at period 0, distribution {distribution}"), steps);
+    for bursts in bursts.into_iter().filter(|bursts| bursts.periods_ms.contains(&0)) {
+        for &chars in &bursts.chars {
+            let burst = bursts.burst(chars, 0);
+            let mut cells = [Groups::default(), Groups::default()];
+            for _ in (0..bursts.groups).take_while(|_| !is_stopped()) {
+                let compared = burst.delivery == Delivery::Reliable;
+                let floor_per_s = compared.then(|| floor.burst(&burst)).transpose()?.as_ref().map(per_second);
+                for (cell, pair) in cells.iter_mut().zip(&mut pairs) {
+                    cell.floor_per_s.extend(floor_per_s);
+                    cell.own.push(pair.burst(&burst).with_context(|| format!("{chars} characters at once"))?);
+                }
+            }
+            rows.extend(cells.iter().zip(&OWN).filter_map(|(cell, own)| cell.row(own, setting, &burst)));
+            bar.step();
         }
     }
     Ok(())
 }
 
-fn of(setting: Setting, pairs: &mut [Pair; 2], bursts: &Bursts, rows: &mut Vec<Availability>) -> Result<()> {
-    let delivery = if bursts.delivery == Delivery::Reliable { "reliable" } else { "best effort" };
-    let what = format!("availability: {delivery}, distribution {}", bursts.distribution);
-    let bar = bar(&what, bursts.chars.len() * bursts.periods_ms.len() * bursts.groups as usize);
-    for &chars in &bursts.chars {
-        for &period_ms in &bursts.periods_ms {
-            let burst = Burst { chars, count: bursts.group, period_ms, delivery: bursts.delivery, insist: false };
-            let mut cell = Groups::default();
-            for _ in 0..bursts.groups {
-                if is_stopped() {
-                    break;
-                }
-                let outcome = cell.take_turns(pairs, &burst);
-                outcome.with_context(|| format!("{chars} characters every {period_ms} ms"))?;
-                bar.inc(1);
-            }
-            rows.extend(cell.row(setting, &burst));
+/// A pair that goes from period to period.
+struct Lane<'p> {
+    contender: &'static Contender,
+    setting: Setting,
+    bursts: &'p Bursts,
+    chars: u32,
+    periods_ms: Vec<u64>,
+}
+
+/// All periods that leave the CPUs idle most of the time: each size, delivery, distribution and mode has a pair of its
+/// own, and begins with another period than its neighbours.
+fn spaced(plan: &Plan, rows: &mut Vec<Availability>) -> Result<()> {
+    let mut lanes = Vec::new();
+    for bursts in &plan.availability {
+        let setting = Setting { pin: plan.pin, distribution: bursts.distribution, print: false };
+        let spaced: Vec<u64> = bursts.periods_ms.iter().copied().filter(|period| *period > 0).collect();
+        for (&chars, contender) in bursts.chars.iter().flat_map(|chars| OWN.iter().map(move |own| (chars, own))) {
+            let mut periods_ms = spaced.clone();
+            periods_ms.rotate_left(lanes.len() % spaced.len().max(1));
+            lanes.push(Lane { contender, setting, bursts, chars, periods_ms });
         }
     }
-    bar.finish_and_clear();
-    Ok(())
+    lanes.retain(|lane| !lane.periods_ms.is_empty());
+    let groups = lanes.iter().map(|lane| lane.periods_ms.len() * lane.bursts.groups as usize).sum();
+    let bar = Progress::new(&format!("availability, {} pairs side by side", lanes.len()), groups);
+    let started = side_by_side(lanes, AT_A_TIME, |lane| (Pair::start(lane.contender, lane.setting), lane));
+    let count = started.len();
+    let mut outcome = Ok(());
+    for (found, ended) in side_by_side(started, count, |(pair, lane)| lane.run(pair, &bar)) {
+        rows.extend(found);
+        outcome = outcome.and(ended);
+    }
+    outcome
+}
+
+impl Lane<'_> {
+    /// The rows of all periods that are complete, and why there are no more.
+    fn run(self, pair: Result<Pair>, bar: &Progress) -> (Vec<Availability>, Result<()>) {
+        let mut rows = Vec::new();
+        let outcome = pair.and_then(|mut pair| {
+            for &period_ms in &self.periods_ms {
+                let burst = self.bursts.burst(self.chars, period_ms);
+                let mut cell = Groups::default();
+                for _ in (0..self.bursts.groups).take_while(|_| !is_stopped()) {
+                    let told = || format!("{} characters every {period_ms} ms", self.chars);
+                    cell.own.push(pair.burst(&burst).with_context(told)?);
+                    bar.step();
+                }
+                rows.extend(cell.row(self.contender, self.setting, &burst));
+            }
+            Ok(())
+        });
+        (rows, outcome)
+    }
 }
 
 /// The groups of one cell.
 #[derive(Default)]
 struct Groups {
-    cara: Vec<Delivered>,
+    own: Vec<Delivered>,
     /// The floor's speed in the same turns, at period 0.
     floor_per_s: Vec<f64>,
 }
 
 impl Groups {
-    fn take_turns(&mut self, [floor, cara]: &mut [Pair; 2], burst: &Burst) -> Result<()> {
-        if burst.period_ms == 0 && burst.delivery == Delivery::Reliable {
-            self.floor_per_s.push(per_second(&floor.burst(burst)?));
-        }
-        self.cara.push(cara.burst(burst)?);
-        Ok(())
-    }
-
-    fn row(&self, setting: Setting, burst: &Burst) -> Option<Availability> {
-        let speeds: Vec<f64> = self.cara.iter().map(per_second).collect();
+    fn row(&self, contender: &Contender, setting: Setting, burst: &Burst) -> Option<Availability> {
+        let speeds: Vec<f64> = self.own.iter().map(per_second).collect();
         let ratios: Vec<f64> = speeds.iter().zip(&self.floor_per_s).map(|(own, floor)| own / floor.max(1e-9)).collect();
         let group = f64::from(burst.count.max(1));
-        let worst = self.cara.iter().map(|group| group.executed).min()?;
+        let worst = self.own.iter().map(|group| group.executed).min()?;
         let has_floor = !self.floor_per_s.is_empty();
         Some(Availability {
             distribution: setting.distribution,
@@ -77,8 +134,8 @@ impl Groups {
             period_ms: burst.period_ms,
             delivery: burst.delivery,
             pin: setting.pin,
-            mode: Mode::Plain,
-            counts: counts(&self.cara),
+            mode: contender.name_and_mode().1,
+            counts: counts(&self.own),
             worst_group: ratio(worst as f64 / group),
             executed_per_s: quartile(speeds, 2).round(),
             floor_per_s: has_floor.then(|| quartile(self.floor_per_s.clone(), 2).round()),

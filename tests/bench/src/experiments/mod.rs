@@ -2,8 +2,11 @@
 
 mod availability;
 mod constraints;
+mod far;
+mod goals;
 mod plan;
 mod response;
+mod resume;
 mod scale;
 mod share;
 mod throughput;
@@ -18,7 +21,7 @@ use clap::{Args, ValueEnum};
 use crate::peers::{Outside, Selection};
 use crate::plots;
 use crate::progress::{is_stopped, stop_at_interrupt, was_stopped};
-use crate::results::{About, Results};
+use crate::results::{About, Done, Results, ratio};
 use crate::table;
 use cara_bench_ends::Pin;
 use plan::{Extent, Plan};
@@ -52,6 +55,10 @@ pub(crate) struct Options {
     /// Writes all rows there as one JSON object, after each experiment anew.
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
+    /// Keeps the complete experiments of this file, which an earlier run of the same commit and form wrote on this
+    /// machine, and makes the others.
+    #[arg(long, value_name = "FILE")]
+    resume: Option<PathBuf>,
     /// Draws the paper's figures 6, 7 and 8 and the ratios there, as SVG and PNG.
     #[arg(long, value_name = "DIR")]
     plots: Option<PathBuf>,
@@ -69,11 +76,23 @@ enum Experiment {
 }
 
 impl Experiment {
+    /// As rows and options say it.
+    fn name(self) -> &'static str {
+        match self {
+            Self::Response => "response",
+            Self::Throughput => "throughput",
+            Self::Share => "share",
+            Self::Scale => "scale",
+            Self::Constraints => "constraints",
+            Self::Availability => "availability",
+        }
+    }
+
     fn measure(self, plan: &Plan, results: &mut Results) -> Result<()> {
         match self {
             Self::Response => response::measure(plan, &mut results.response),
             Self::Throughput => throughput::measure(plan, &mut results.throughput),
-            Self::Share => share::measure(plan, &mut results.share),
+            Self::Share => share::measure(plan, &mut results.share, &mut results.run.notes),
             Self::Scale => scale::measure(plan, &mut results.scale),
             Self::Constraints => constraints::measure(plan, &mut results.constraints),
             Self::Availability => availability::measure(plan, &mut results.availability),
@@ -86,24 +105,39 @@ pub(crate) fn run(options: &Options) -> Result<()> {
     stop_at_interrupt()?;
     let (outside, absent) = options.outside.find()?;
     let plan = plan(options, &outside)?;
-    let began = Instant::now();
     let mut results = Results { run: about(&plan), ..Results::default() };
+    let earlier = options.resume.as_deref().map(|path| resume::read(path, &results.run)).transpose()?;
+    results.run.peers = earlier.iter().flat_map(|earlier| earlier.run.peers.iter().cloned()).collect();
     let mut failures = Vec::new();
     for experiment in Experiment::value_variants() {
         if is_stopped() || !(options.only.is_empty() || options.only.contains(experiment)) {
             continue;
         }
-        match experiment.measure(&plan, &mut results) {
-            Err(error) if !was_stopped() => failures.push(format!("{experiment:?}: {error:#}")),
+        if let Some(earlier) = earlier.as_ref().filter(|earlier| resume::has(earlier, experiment.name())) {
+            eprintln!("{}: kept from the earlier run", experiment.name());
+            resume::keep(earlier, experiment.name(), &mut results);
+            continue;
+        }
+        let (since, busy) = (Instant::now(), Busy::begin());
+        let outcome = experiment.measure(&plan, &mut results);
+        let is_complete = outcome.is_ok() && !is_stopped();
+        let seconds = since.elapsed().as_secs_f64().round();
+        let (experiment, busy) = (experiment.name().to_owned(), ratio(busy.end()));
+        eprintln!("{experiment}: {seconds} s, {:.0} % of the CPUs in use", busy * 100.0);
+        match outcome {
+            Err(error) if !was_stopped() => failures.push(format!("{experiment}: {error:#}")),
             _ => {}
         }
+        results.run.experiments.push(Done { experiment, is_complete, seconds, busy });
         results.run.peers = outside.iter().map(|outside| outside.report()).chain(absent.iter().cloned()).collect();
-        results.run.seconds = began.elapsed().as_secs_f64().round();
+        earlier.iter().for_each(|earlier| resume::add_notes(&earlier.run.peers, &mut results.run.peers));
+        results.run.seconds = results.run.experiments.iter().map(|done| done.seconds).sum();
         results.run.load_after = load();
         write(&results, options.json.as_deref())?;
     }
     results.run.is_complete = !is_stopped() && failures.is_empty() && options.only.is_empty();
     results.run.notes.extend(failures.iter().cloned());
+    results.goals = goals::of(&results);
     write(&results, options.json.as_deref())?;
     table::show(&results);
     if let Some(folder) = &options.plots {
@@ -138,10 +172,43 @@ fn about(plan: &Plan) -> About {
         extent: plan.extent.name().into(),
         is_release_build: !cfg!(debug_assertions),
         started_unix_s: started.as_secs(),
+        processor: processor(),
         cpus: std::thread::available_parallelism().map_or(1, usize::from),
         load_before: load(),
         notes: plan.notes.clone(),
         ..About::default()
+    }
+}
+
+/// What the machine says that it has.
+fn processor() -> String {
+    let text = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let model = text.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'));
+    model.map(|(_, model)| model.trim().to_owned()).unwrap_or_default()
+}
+
+/// How much of all CPUs is in use.
+struct Busy([u64; 2]);
+
+impl Busy {
+    fn begin() -> Self {
+        Self(Self::so_far())
+    }
+
+    /// Since the beginning, from 0 to 1.
+    fn end(&self) -> f64 {
+        let [busy, all] = Self::so_far();
+        busy.saturating_sub(self.0[0]) as f64 / all.saturating_sub(self.0[1]).max(1) as f64
+    }
+
+    /// Ticks of all CPUs: in use, and all.
+    fn so_far() -> [u64; 2] {
+        let text = std::fs::read_to_string("/proc/stat").unwrap_or_default();
+        let first = text.lines().next().unwrap_or_default();
+        // User, nice, system, idle, waiting for a disk, two kinds of interrupts, taken by the host.
+        let ticks: Vec<u64> = first.split_whitespace().skip(1).take(8).map_while(|word| word.parse().ok()).collect();
+        let (all, idle) = (ticks.iter().sum(), ticks.iter().skip(3).take(2).sum::<u64>());
+        [u64::saturating_sub(all, idle), all]
     }
 }
 

@@ -4,10 +4,10 @@ use std::sync::Arc;
 
 use anyhow::Result;
 
+use crate::counted;
 use crate::pair::Setting;
 use crate::peers::{Contender, Outside, SECURED};
-use cara_bench_ends::Order;
-use cara_bench_ends::{Pin, pin};
+use cara_bench_ends::{Burst, Order, Pin, pin};
 
 /// How much is run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -41,6 +41,8 @@ impl Extent {
 pub(crate) struct Plan {
     pub(crate) extent: Extent,
     pub(crate) response: Vec<Group>,
+    /// Round trips that are seconds apart.
+    pub(crate) far: Vec<Group>,
     pub(crate) throughput: Group,
     pub(crate) throughput_pins: Vec<Pin>,
     pub(crate) one_way_peers: Vec<Contender>,
@@ -49,6 +51,8 @@ pub(crate) struct Plan {
     /// Calls of each turn whose time is taken apart.
     pub(crate) share_calls: u32,
     pub(crate) share_rounds: u32,
+    /// Calls whose instructions are counted.
+    pub(crate) counted_calls: u32,
     pub(crate) nodes: Vec<u32>,
     pub(crate) scale_rounds: u32,
     pub(crate) scale_calls: u32,
@@ -80,6 +84,12 @@ pub(crate) struct Bursts {
     pub(crate) group: u32,
 }
 
+impl Bursts {
+    pub(crate) fn burst(&self, chars: u32, period_ms: u64) -> Burst {
+        Burst { chars, count: self.group, period_ms, delivery: self.delivery, insist: false }
+    }
+}
+
 /// The sweep over constraints: every interval with every message size.
 #[derive(Debug, Clone)]
 pub(crate) struct Constrained {
@@ -102,11 +112,16 @@ impl Plan {
     pub(crate) fn new(extent: Extent, print: bool, outside: &[Arc<Outside>]) -> Result<Self> {
         let has_two = pin::cpus(Pin::Split).is_ok();
         let pins: &[Pin] = if has_two { &[Pin::Same, Pin::Split, Pin::None] } else { &[Pin::Same, Pin::None] };
-        let notes = if has_two { Vec::new() } else { vec!["one CPU only: no rows with pin split".into()] };
+        let lacks = [
+            (!has_two, "one CPU only: no rows with pin split"),
+            (!counted::is_installed(), "valgrind is absent: no instructions in share"),
+        ];
+        let notes = lacks.into_iter().filter(|(is_lacking, _)| *is_lacking).map(|(_, note)| note.into()).collect();
         let pin = if has_two { Pin::Split } else { Pin::Same };
+        let places = if extent == Extent::Full { pins } else { &pins[pins.len() - 2..pins.len() - 1] };
         let response = match extent {
             Extent::Tiny => tiny(outside),
-            _ => response(extent, pins, pin, print, outside),
+            _ => response(extent, pins, places, print, outside),
         };
         let callers = extent.of(vec![1, 8, 64], vec![1, 8, 64], vec![1, 2]);
         let orders = callers.into_iter().map(|callers| busy_order(callers, extent.of(3_200, 1_600, 8))).collect();
@@ -114,14 +129,16 @@ impl Plan {
         Ok(Self {
             extent,
             response,
-            throughput: Group { setting, peers: with(&SHARED, outside.iter()), orders, rounds: extent.of(15, 3, 1) },
-            throughput_pins: if extent == Extent::Full { pins[..pins.len() - 1].to_vec() } else { vec![pin] },
+            far: far(extent, places, print),
+            throughput: Group { setting, peers: with(&SHARED, outside.iter()), orders, rounds: extent.of(9, 3, 1) },
+            throughput_pins: places.to_vec(),
             one_way_peers: with(&COMPARED, outside.iter().filter(|outside| outside.is_one_way())),
             one_way: extent.of(40_000, 40_000, 50),
             share_calls: extent.of(400, 200, 5),
             share_rounds: extent.of(20, 5, 1),
+            counted_calls: extent.of(400, 400, 20),
             nodes: extent.of(vec![1, 10, 100, 1_000, 5_000], vec![1, 10, 100, 1_000], vec![1, 3]),
-            scale_rounds: extent.of(20, 4, 1),
+            scale_rounds: extent.of(15, 4, 1),
             scale_calls: extent.of(400, 200, 5),
             availability: availability(extent),
             constrained: constrained(extent),
@@ -133,14 +150,16 @@ impl Plan {
     /// Leaves out what is not among `pins` and `chars`, where these are given, and changes the number of turns.
     pub(crate) fn narrow(&mut self, pins: &[Pin], chars: &[u32], rounds: Option<u32>) {
         if !pins.is_empty() {
-            self.response.retain(|group| pins.contains(&group.setting.pin));
             self.throughput_pins.retain(|pin| pins.contains(pin));
         }
-        for group in &mut self.response {
-            group.orders.retain(|order| chars.is_empty() || chars.contains(&order.chars));
-            group.rounds = rounds.unwrap_or(group.rounds);
+        for groups in [&mut self.response, &mut self.far] {
+            groups.retain(|group| pins.is_empty() || pins.contains(&group.setting.pin));
+            for group in &mut *groups {
+                group.orders.retain(|order| chars.is_empty() || chars.contains(&order.chars));
+                group.rounds = rounds.unwrap_or(group.rounds);
+            }
+            groups.retain(|group| !group.orders.is_empty());
         }
-        self.response.retain(|group| !group.orders.is_empty());
     }
 }
 
@@ -176,35 +195,61 @@ fn tiny(outside: &[Arc<Outside>]) -> Vec<Group> {
     groups
 }
 
-/// Back to back at every size, everywhere, also among idle links and beside other systems; then spaced; then with the
-/// service printing.
-fn response(extent: Extent, pins: &[Pin], pin: Pin, print: bool, outside: &[Arc<Outside>]) -> Vec<Group> {
+fn orders(chars: &[u32], calls: u32, pause_ms: u64) -> Vec<Order> {
+    chars.iter().map(|&chars| order(chars, calls, pause_ms)).collect()
+}
+
+/// Back to back at every size, everywhere, also among idle links and beside other systems; then 10 ms apart; then with
+/// the service printing. In `places` only, what is not back to back and silent.
+fn response(extent: Extent, pins: &[Pin], places: &[Pin], print: bool, outside: &[Arc<Outside>]) -> Vec<Group> {
     let mut groups = Vec::new();
     let mut add = |setting, peers: Vec<Contender>, rounds, orders| {
         groups.push(Group { setting, peers, orders, rounds });
     };
     let own = || with(&COMPARED, [].iter());
-    let orders = |chars: &[u32], calls, pause_ms| chars.iter().map(|&chars| order(chars, calls, pause_ms)).collect();
     let calls = extent.of(200, 100, 5);
     for distribution in [1, 2] {
         for &pin in pins {
             let setting = Setting { pin, distribution, print };
-            let peers = if distribution == 1 && pin != Pin::None { &AMONG[..] } else { &COMPARED[..] };
             let is_shortened = extent == Extent::Quick && (pin == Pin::None || distribution == 2);
+            let peers = if is_shortened { &COMPARED[..] } else { &AMONG[..] };
             let outside = if is_shortened || print { &[] } else { outside };
-            add(setting, with(peers, outside.iter()), extent.of(30, 4, 1), orders(&CHARS, calls, 0));
+            add(setting, with(peers, outside.iter()), extent.of(24, 4, 1), orders(&CHARS, calls, 0));
         }
-        let setting = Setting { pin, distribution, print };
-        let (spaced, rounds) = extent.of((&CHARS[..], 10), (&SOME_CHARS[..], 1), (&SOME_CHARS[..], 1));
-        add(setting, own(), rounds, orders(spaced, 10, 10));
-        let (far, calls, rounds) = extent.of((&CHARS[..], 5, 20), (&[1_000, 20_000][..], 2, 1), (&[100][..], 1, 1));
-        add(setting, own(), rounds, orders(far, calls, 2_000));
-    }
-    if !print {
-        let setting = Setting { pin, distribution: 1, print: true };
-        add(setting, own(), extent.of(30, 4, 1), orders(&CHARS, calls, 0));
+        for &pin in places {
+            let setting = Setting { pin, distribution, print };
+            let (chars, rounds) = extent.of((&CHARS[..], 12), (&SOME_CHARS[..], 1), (&SOME_CHARS[..], 1));
+            // In distribution 2 the peers do not wait side by side.
+            let calls = if extent == Extent::Full && distribution == 1 { 20 } else { 10 };
+            add(setting, own(), rounds, orders(chars, calls, 10));
+        }
+        for &pin in places.iter().filter(|_| !print && (extent == Extent::Full || distribution == 1)) {
+            let setting = Setting { pin, distribution, print: true };
+            add(setting, own(), extent.of(12, 4, 1), orders(&CHARS, calls, 0));
+        }
     }
     groups
+}
+
+/// The paper's pause between a reply and the next request.
+const PAUSE_MS: u64 = 2_000;
+
+/// Few calls, as each of them waits.
+fn far(extent: Extent, places: &[Pin], print: bool) -> Vec<Group> {
+    let group = |(distribution, pin)| {
+        let chars = extent.of(&CHARS[..], &SOME_CHARS, &[100]);
+        let (rounds, calls) = match (extent, distribution) {
+            (Extent::Full, 1) => (3, 10),
+            (Extent::Full, _) => (3, 3),
+            (Extent::Quick, 1) => (1, 3),
+            _ => (1, 1),
+        };
+        let pause_ms = extent.of(PAUSE_MS, PAUSE_MS, 50);
+        let setting = Setting { pin, distribution, print };
+        Group { setting, peers: with(&COMPARED, [].iter()), orders: orders(chars, calls, pause_ms), rounds }
+    };
+    let cells = [1, 2].into_iter().flat_map(|distribution| places.iter().map(move |&pin| (distribution, pin)));
+    cells.map(group).collect()
 }
 
 fn availability(extent: Extent) -> Vec<Bursts> {
@@ -222,15 +267,16 @@ fn availability(extent: Extent) -> Vec<Bursts> {
     let periods: &[u64] = extent.of(&all[..], &[0, 1, 10, 20, 70], &[0, 1]);
     let chars: &[u32] = extent.of(&[100, 1_000, 5_000, 10_000, 20_000], &[100, 20_000], &[100, 20_000]);
     // A datagram holds at most 1,400 bytes: a longer text is refused at once, whatever the period.
-    let short: &[u32] = extent.of(&[100, 1_000], &[1_000], &[100]);
-    let short_periods: &[u64] = extent.of(&all[..], &[0, 1, 10], &[0]);
+    let short: &[u32] = extent.of(chars, &[1_000], &[100]);
+    let short_periods: &[u64] = extent.of(&all[..], &[0, 1, 10], &[0, 1]);
+    let refused: &[u32] = extent.of(&[], &[5_000], &[5_000]);
     [1, 2]
         .into_iter()
         .flat_map(|distribution| {
             [
                 bursts(distribution, Reliable, chars, periods),
                 bursts(distribution, BestEffort, short, short_periods),
-                bursts(distribution, BestEffort, &[5_000], &[0]),
+                bursts(distribution, BestEffort, refused, &[0]),
             ]
         })
         .collect()

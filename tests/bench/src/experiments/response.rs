@@ -2,10 +2,12 @@
 
 use anyhow::{Context, Result};
 
+use super::far;
 use super::plan::{Group, Plan};
+use crate::lanes::side_by_side;
 use crate::pair::{Pair, Setting};
 use crate::peers::Contender;
-use crate::progress::{bar, is_stopped};
+use crate::progress::{Progress, is_stopped, was_stopped};
 use crate::results::{Mode, Response, micros, ratio};
 use crate::statistics::Cell;
 use cara_bench_ends::Order;
@@ -13,8 +15,9 @@ use cara_bench_ends::Order;
 /// Cells by order, then by peer; the first peer is the floor.
 pub(super) type Cells = Vec<Vec<Cell>>;
 
-/// All groups; the rows of those that are complete, and of what there is of the one that is not.
+/// All groups, also after one that fails; the rows of what there is.
 pub(super) fn measure(plan: &Plan, rows: &mut Vec<Response>) -> Result<()> {
+    let mut outcome = Ok(());
     for (index, group) in plan.response.iter().enumerate() {
         if is_stopped() {
             break;
@@ -22,16 +25,25 @@ pub(super) fn measure(plan: &Plan, rows: &mut Vec<Response>) -> Result<()> {
         let Setting { pin, distribution, .. } = group.setting;
         let of = format!("{} of {}", index + 1, plan.response.len());
         let mut cells = Cells::new();
-        let outcome = turns(group, &mut cells, &format!("response {of}: {pin}, distribution {distribution}"));
+        let ended = turns(group, &mut cells, &format!("response {of}: {pin}, distribution {distribution}"));
         rows.extend(self::rows(group, &cells));
-        outcome?;
+        outcome = outcome.and(unless_stopped(ended));
     }
-    Ok(())
+    let ended = far::measure(&plan.far, rows);
+    outcome.and(ended)
+}
+
+/// A failure that a run need not end with; one that comes from its being stopped is noticed before anything else begins.
+fn unless_stopped(outcome: Result<()>) -> Result<()> {
+    if outcome.is_err() {
+        was_stopped();
+    }
+    outcome
 }
 
 /// Every peer in every cell, once per turn.
 pub(super) fn turns(group: &Group, cells: &mut Cells, what: &str) -> Result<()> {
-    let bar = bar(what, group.rounds as usize * group.orders.len());
+    let bar = Progress::new(what, group.rounds as usize * group.orders.len());
     let mut pairs = start(&group.peers, group.setting)?;
     *cells = group.orders.iter().map(|_| pairs.iter().map(|_| Cell::default()).collect()).collect();
     for round in 0..group.rounds as usize {
@@ -45,20 +57,19 @@ pub(super) fn turns(group: &Group, cells: &mut Cells, what: &str) -> Result<()> 
                 false => turn(&group.peers, &mut pairs, order, round, cells),
             };
             turn.with_context(|| format!("{} characters, {} callers", order.chars, order.callers))?;
-            bar.inc(1);
+            bar.step();
         }
     }
-    bar.finish_and_clear();
     Ok(())
 }
 
-/// The processes of all contenders; none for another system that does not start.
+/// The processes of all contenders, started at the same time; none for another system that does not start.
 pub(super) fn start(contenders: &[Contender], setting: Setting) -> Result<Vec<Option<Pair>>> {
     let start = |contender: &Contender| match contender.works() {
         true => contender.tolerate(Pair::start(contender, setting)),
         false => Ok(None),
     };
-    contenders.iter().map(start).collect()
+    side_by_side(contenders.iter().collect(), contenders.len(), start).into_iter().collect()
 }
 
 /// Who missed a turn of this cell gets no further one, so that the turns of a cell are the first ones of the floor's.
@@ -84,17 +95,17 @@ fn spaced_turn(pairs: &mut [Option<Pair>], order: &Order, cells: &mut [Cell]) ->
     let offset = order.pause_ms * 1_000 / pairs.len().max(1) as u64;
     let begun = pairs.iter_mut().zip(0..).map(|(pair, place): (_, u64)| {
         let delayed = Order { delay_us: offset * place, ..order.clone() };
-        pair.begin_block(&delayed)
+        pair.begin_blocks(&[delayed])
     });
     let begun = begun.collect::<Result<Vec<_>>>()?;
-    let turns = pairs.iter_mut().zip(begun).map(|(pair, used)| pair.end_block(used));
+    let turns = pairs.iter_mut().zip(begun).map(|(pair, used)| pair.end_blocks(used));
     let turns = turns.collect::<Result<Vec<_>>>()?;
-    cells.iter_mut().zip(turns).for_each(|(cell, turn)| cell.turns.push(turn));
+    cells.iter_mut().zip(turns.into_iter().flatten()).for_each(|(cell, turn)| cell.turns.push(turn));
     Ok(())
 }
 
 /// Cells without any complete turn have no row.
-fn rows(group: &Group, cells: &Cells) -> Vec<Response> {
+pub(super) fn rows(group: &Group, cells: &Cells) -> Vec<Response> {
     let mut rows = Vec::new();
     for (order, cells) in group.orders.iter().zip(cells) {
         let Some(floor) = cells.first() else { continue };

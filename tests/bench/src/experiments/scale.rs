@@ -6,8 +6,8 @@ use anyhow::{Context, Result};
 
 use super::plan::Plan;
 use crate::child::Handle;
-use crate::nodes::Question;
-use crate::progress::{bar, is_stopped};
+use crate::nodes::{Question, draw_keys};
+use crate::progress::{Progress, is_stopped};
 use crate::results::{Mode, Scale, micros, ratio};
 use crate::statistics::{percentile, quartile};
 use cara_bench_ends::clock;
@@ -21,8 +21,10 @@ const REST: Duration = Duration::from_millis(500);
 /// A manager with its nodes.
 struct Fleet {
     nodes: u32,
+    mode: Mode,
     manager: Handle,
     _units: Handle,
+    _keys: Option<tempfile::TempDir>,
     rss_per_node: i64,
     discovery: f64,
     /// Medians of each turn, in nanoseconds: of calls of one node, and of each in turn.
@@ -30,13 +32,19 @@ struct Fleet {
     each: Vec<u64>,
 }
 
-/// All fleets stand side by side, and make their calls in turns.
+/// Fleets of all numbers of nodes, in plain mode and then with keys.
 pub(super) fn measure(plan: &Plan, rows: &mut Vec<Scale>) -> Result<()> {
-    let bar = bar("nodes on one manager", plan.nodes.len() + plan.scale_rounds as usize);
+    [Mode::Plain, Mode::Secured].into_iter().try_for_each(|mode| in_mode(mode, plan, rows))
+}
+
+/// All fleets of a mode stand side by side, and make their calls in turns.
+fn in_mode(mode: Mode, plan: &Plan, rows: &mut Vec<Scale>) -> Result<()> {
+    let bar =
+        Progress::new(&format!("nodes on one manager, {}", mode.name()), plan.nodes.len() + plan.scale_rounds as usize);
     let mut fleets = Vec::new();
     let mut failure = Ok(());
     for &nodes in plan.nodes.iter().take_while(|_| !is_stopped()) {
-        match Fleet::start(nodes, plan.pin).with_context(|| format!("a manager with {nodes} nodes")) {
+        match Fleet::start(nodes, mode, plan.pin).with_context(|| format!("a manager with {nodes} nodes")) {
             Ok(fleet) => fleets.push(fleet),
             // The smaller ones are measured all the same.
             Err(error) => {
@@ -44,25 +52,28 @@ pub(super) fn measure(plan: &Plan, rows: &mut Vec<Scale>) -> Result<()> {
                 break;
             }
         }
-        bar.inc(1);
+        bar.step();
     }
     for _ in (0..plan.scale_rounds).take_while(|_| !is_stopped()) {
         fleets.iter_mut().try_for_each(|fleet| fleet.turn(plan.scale_calls))?;
-        bar.inc(1);
+        bar.step();
     }
-    bar.finish_and_clear();
     let first = fleets.first();
     rows.extend(fleets.iter().filter_map(|fleet| Some(fleet.row(first?, plan))));
     failure
 }
 
 impl Fleet {
-    fn start(nodes: u32, pin: Pin) -> Result<Self> {
+    fn start(nodes: u32, mode: Mode, pin: Pin) -> Result<Self> {
         let [manager_cpu, units_cpu] = pin::cpus(pin)?;
-        let run = fastrand::u32(1..).to_string();
+        let run = fastrand::u32(1..);
+        let keys = (mode == Mode::Secured).then(|| draw_keys(run, nodes)).transpose()?;
+        let folder = keys.as_ref().and_then(|keys| keys.path().to_str());
+        let run = run.to_string();
         let start = |role: &str, cpu: Option<usize>| {
             let mut arguments = [role, "--run", &run, "--count", &nodes.to_string()].map(String::from).to_vec();
             arguments.extend(cpu.into_iter().flat_map(|cpu| ["--cpu".into(), cpu.to_string()]));
+            arguments.extend(folder.into_iter().flat_map(|folder| ["--keys".into(), folder.into()]));
             Handle::start(&arguments)
         };
         let mut manager = start("manager", manager_cpu)?;
@@ -76,7 +87,8 @@ impl Fleet {
         let full: u64 = manager.order(&Question::Resident)?;
         let rss_per_node = (full as i64 - empty as i64) / i64::from(nodes.max(1));
         let discovery = joined.saturating_sub(began) as f64 / 1e9;
-        Ok(Self { nodes, manager, _units: units, rss_per_node, discovery, one: Vec::new(), each: Vec::new() })
+        let (one, each) = (Vec::new(), Vec::new());
+        Ok(Self { nodes, mode, manager, _units: units, _keys: keys, rss_per_node, discovery, one, each })
     }
 
     fn turn(&mut self, calls: u32) -> Result<()> {
@@ -99,7 +111,7 @@ impl Fleet {
         Scale {
             nodes: self.nodes,
             pin: plan.pin,
-            mode: Mode::Plain,
+            mode: self.mode,
             n: self.one.len() * plan.scale_calls as usize,
             request_us: middle(&self.one),
             request_ratio: compared(&self.one),

@@ -5,7 +5,7 @@ use anyhow::{Context, Result};
 use super::plan::{Group, Plan};
 use super::response::{Cells, start, turns};
 use crate::pair::Setting;
-use crate::progress::{bar, is_stopped};
+use crate::progress::{Progress, is_stopped};
 use crate::results::{Kind, Mode, Throughput, ratio};
 use crate::statistics::quartile;
 use cara_bench_ends::Burst;
@@ -87,7 +87,7 @@ fn one_way(plan: &Plan, setting: Setting, rows: &mut Vec<Throughput>) -> Result<
     let mut pairs = start(contenders, setting)?;
     let count = plan.one_way;
     let burst = Burst { chars: CHARS, count, period_ms: 0, delivery: Delivery::Reliable, insist: true };
-    let bar = bar(&format!("one-way messages: {}", setting.pin), plan.throughput.rounds as usize);
+    let bar = Progress::new(&format!("one-way messages: {}", setting.pin), plan.throughput.rounds as usize);
     let mut speeds: Vec<Vec<f64>> = vec![Vec::new(); pairs.len()];
     let mut missing = vec![(0, 0); pairs.len()];
     for _ in 0..plan.throughput.rounds {
@@ -106,9 +106,8 @@ fn one_way(plan: &Plan, setting: Setting, rows: &mut Vec<Throughput>) -> Result<
             *refused += delivered.offered.refused + delivered.failed;
             *lost += delivered.lost();
         }
-        bar.inc(1);
+        bar.step();
     }
-    bar.finish_and_clear();
     let floor = speeds.first().cloned().unwrap_or_default();
     for ((peer, own), (refused, lost)) in
         contenders.iter().zip(speeds).zip(missing).filter(|((_, own), _)| !own.is_empty())

@@ -170,7 +170,8 @@ impl Peer for Cara {
     fn connect(&self, place: &Place, address: &str) -> Result<Box<dyn Caller>> {
         static NEXT: AtomicU32 = AtomicU32::new(FIRST_CALLER);
         let new = || {
-            let id = NEXT.fetch_add(1, Ordering::Relaxed);
+            // Where a pair has several client processes, each has one caller.
+            let id = NEXT.fetch_add(1, Ordering::Relaxed) + place.client;
             self.system(place, address, &main_name(id), id)
         };
         let main = match self {

@@ -4,6 +4,7 @@ pub(crate) mod cara;
 mod floor;
 mod outside;
 
+use std::path::PathBuf;
 use std::process::Command;
 use std::sync::{Arc, Mutex};
 
@@ -42,6 +43,8 @@ pub(crate) fn named(name: &str) -> Result<Box<dyn Peer>> {
 pub(crate) enum Contender {
     /// Played by this program.
     Own(&'static str),
+    /// Played by this program under callgrind, which writes into this folder.
+    Counted(&'static str, PathBuf),
     /// Another system.
     Outside(Arc<Outside>),
 }
@@ -50,7 +53,7 @@ impl Contender {
     /// What its processes are told to play.
     pub(crate) fn name(&self) -> &str {
         match self {
-            Self::Own(name) => name,
+            Self::Own(name) | Self::Counted(name, _) => name,
             Self::Outside(outside) => outside.name(),
         }
     }
@@ -66,7 +69,7 @@ impl Contender {
     /// The program that plays it.
     pub(crate) fn command(&self) -> Result<Command> {
         Ok(match self {
-            Self::Own(_) => Command::new(std::env::current_exe()?),
+            Self::Own(_) | Self::Counted(..) => Command::new(std::env::current_exe()?),
             Self::Outside(outside) => outside.command(),
         })
     }
@@ -75,19 +78,19 @@ impl Contender {
     pub(crate) fn tolerate<T>(&self, outcome: Result<T>) -> Result<Option<T>> {
         match (self, outcome) {
             (_, Ok(value)) => Ok(Some(value)),
-            (Self::Own(_), Err(error)) => Err(error),
             (Self::Outside(outside), Err(error)) => {
                 outside.failed(&error);
                 Ok(None)
             }
+            (_, Err(error)) => Err(error),
         }
     }
 
     /// Whether it can still be asked.
     pub(crate) fn works(&self) -> bool {
         match self {
-            Self::Own(_) => true,
             Self::Outside(outside) => outside.works(),
+            _ => true,
         }
     }
 }

@@ -63,12 +63,12 @@ struct State {
 }
 
 /// What the run says of one of them.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub(crate) struct OutsideReport {
     pub(crate) peer: String,
     pub(crate) system: String,
     pub(crate) version: String,
-    pub(crate) state: &'static str,
+    pub(crate) state: String,
     pub(crate) notes: Vec<String>,
 }
 
@@ -98,7 +98,7 @@ impl Entry {
     fn absent(&self, file: &Path) -> OutsideReport {
         let note = format!("{} is not there: `cargo xtask peers` builds it, or says what is missing", file.display());
         let (peer, system) = (self.name.clone(), self.system.clone());
-        OutsideReport { peer, system, version: String::new(), state: "absent", notes: vec![note] }
+        OutsideReport { peer, system, version: String::new(), state: "absent".into(), notes: vec![note] }
     }
 }
 
@@ -153,7 +153,7 @@ impl Outside {
             peer: self.entry.name.clone(),
             system: self.entry.system.clone(),
             version,
-            state: if state.broke { "broken" } else { "measured" },
+            state: if state.broke { "broken" } else { "measured" }.into(),
             notes: state.notes.clone(),
         }
     }

@@ -1,14 +1,22 @@
 //! Charts of lines, beside each other, with a font that is part of the program.
 
+use std::ops::Range;
 use std::path::Path;
 
 use anyhow::{Result, anyhow};
 use plotters::coord::Shift;
+use plotters::coord::ranged1d::{DefaultFormatting, KeyPointHint, Ranged};
 use plotters::prelude::*;
 use plotters::style::{FontStyle, register_font};
 
 /// Width of one chart and height of all, in pixels.
-const SIZE: (u32, u32) = (760, 540);
+const SIZE: (u32, u32) = (1_010, 540);
+/// Width of what tells the lines apart, beside them.
+const LEGEND: u32 = 300;
+/// From one line of that to the next.
+const SPACING: i32 = 22;
+/// How many marks an axis has at most.
+const MARKS: usize = 9;
 /// Under this name the font is known to the drawing library.
 const FONT: &str = "sans-serif";
 
@@ -61,17 +69,58 @@ impl Axis {
     /// The text of a place.
     fn text(&self, place: f64) -> String {
         let value = if self.scale == Scale::Log { 10_f64.powf(place) } else { place };
-        if value.fract().abs() < 1e-9 || value >= 100.0 { format!("{value:.0}") } else { format!("{value:.2}") }
+        ((value * 1e3).round() / 1e3).to_string()
+    }
+
+    /// Places of round values.
+    fn marks(&self, range: &Range<f64>) -> Vec<f64> {
+        if self.scale == Scale::Log {
+            let decades = range.start.floor() as i32..=range.end.ceil() as i32;
+            let marks = |steps: &[f64]| {
+                let values =
+                    decades.clone().flat_map(|decade| steps.iter().map(move |step| step * 10_f64.powi(decade)));
+                values.map(f64::log10).filter(|place| range.contains(place)).collect::<Vec<_>>()
+            };
+            let [fine, middle, coarse] = [&[1.0, 1.5, 2.0, 3.0, 5.0, 7.0][..], &[1.0, 2.0, 5.0], &[1.0]].map(marks);
+            return [fine, middle].into_iter().find(|marks| marks.len() <= MARKS).unwrap_or(coarse);
+        }
+        let steps = (-3..6).flat_map(|decade| [1.0, 2.0, 5.0].map(|step| step * 10_f64.powi(decade)));
+        let step = steps.into_iter().find(|step| (range.end - range.start) / step <= MARKS as f64).unwrap_or(1e6);
+        (0..=MARKS).map(|mark| mark as f64 * step).filter(|place| range.contains(place)).collect()
     }
 
     /// From where to where, so that all places and a margin fit.
-    fn range(&self, places: impl Iterator<Item = f64>) -> std::ops::Range<f64> {
+    fn range(&self, places: impl Iterator<Item = f64>) -> Range<f64> {
         let (low, high) = places.fold((f64::MAX, f64::MIN), |(low, high), place| (low.min(place), high.max(place)));
         match self.scale {
             Scale::Share => 0.0..1.05,
             Scale::Linear => 0.0..(high * 1.1).max(1e-9),
             Scale::Log => (low - 0.1)..(high + 0.1),
         }
+    }
+}
+
+/// An axis with lines and labels at these places only.
+struct Marked {
+    range: Range<f64>,
+    marks: Vec<f64>,
+}
+
+impl Ranged for Marked {
+    type FormatOption = DefaultFormatting;
+    type ValueType = f64;
+
+    fn map(&self, place: &f64, (first, last): (i32, i32)) -> i32 {
+        let part = (place - self.range.start) / (self.range.end - self.range.start);
+        first + (part * f64::from(last - first)).round() as i32
+    }
+
+    fn key_points<Hint: KeyPointHint>(&self, hint: Hint) -> Vec<f64> {
+        if hint.weight().allow_light_points() { Vec::new() } else { self.marks.clone() }
+    }
+
+    fn range(&self) -> Range<f64> {
+        self.range.clone()
     }
 }
 
@@ -84,9 +133,10 @@ impl Chart {
         let points = || self.lines.iter().flat_map(|line| &line.points);
         let x = self.x.range(points().map(|point| self.x.place(point.0)));
         let y = self.y.range(points().map(|point| self.y.place(point.1)));
-        // The legend stands below the lines.
-        let y = if self.y.scale == Scale::Log { (y.start - (y.end - y.start) * 0.4)..y.end } else { y };
-        let mut builder = ChartBuilder::on(area);
+        let (area, legend) = area.split_horizontally(SIZE.0 - LEGEND);
+        let (x_marks, y_marks) = (self.x.marks(&x), self.y.marks(&y));
+        let (x, y) = (Marked { range: x, marks: x_marks }, Marked { range: y, marks: y_marks });
+        let mut builder = ChartBuilder::on(&area);
         builder.caption(&self.title, (FONT, 20)).margin(12).x_label_area_size(44).y_label_area_size(64);
         let mut chart = builder.build_cartesian_2d(x, y).map_err(told)?;
         let mut mesh = chart.configure_mesh();
@@ -97,12 +147,12 @@ impl Chart {
             let color = Palette99::pick(index).to_rgba();
             let places = line.points.iter().map(|point| (self.x.place(point.0), self.y.place(point.1)));
             let series = LineSeries::new(places, color.stroke_width(2)).point_size(3);
-            let series = chart.draw_series(series).map_err(told)?;
-            series.label(&line.name).legend(move |(x, y)| PathElement::new([(x, y), (x + 18, y)], color));
+            chart.draw_series(series).map_err(told)?;
+            let middle = 50 + index as i32 * SPACING;
+            legend.draw(&PathElement::new([(0, middle), (18, middle)], color.stroke_width(2))).map_err(told)?;
+            legend.draw(&Text::new(line.name.as_str(), (26, middle - 7), (FONT, 13))).map_err(told)?;
         }
-        let mut legend = chart.configure_series_labels();
-        legend.position(SeriesLabelPosition::LowerRight).background_style(WHITE.mix(0.8)).border_style(BLACK.mix(0.3));
-        legend.label_font((FONT, 13)).draw().map_err(told)
+        Ok(())
     }
 }
 
