@@ -10,6 +10,15 @@ pub(crate) fn copy(from: &[u8], to: &mut [u8]) {
     }
 }
 
+/// Whether two names are the same, word by word: what boards compare with does so byte by byte.
+pub(crate) fn are_same(one: &[u8], other: &[u8]) -> bool {
+    let ((words, rest), (other_words, other_rest)) = (one.as_chunks::<4>(), other.as_chunks::<4>());
+    let same = |(one, other): (&[u8; 4], &[u8; 4])| u32::from_ne_bytes(*one) == u32::from_ne_bytes(*other);
+    one.len() == other.len()
+        && words.iter().zip(other_words).all(same)
+        && rest.iter().zip(other_rest).all(|(one, other)| one == other)
+}
+
 /// Moves the bytes of `range` to the front; does nothing for a range that is not inside.
 pub(crate) fn move_down(bytes: &mut [u8], range: Range<usize>) {
     if range.start <= range.end && range.end <= bytes.len() {

@@ -162,6 +162,8 @@ pub enum ServiceError {
 
 /// An error of any operation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, thiserror::Error)]
+// A wide tag: the rest is then moved in words, and not byte by byte.
+#[repr(u32)]
 pub enum Error {
     // --- configuration
     /// The peer has published no function of this name to this unit.

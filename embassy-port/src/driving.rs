@@ -21,7 +21,6 @@ use crate::event::{Name, UnitEvent};
 use crate::line::Progress;
 use crate::machine::{LinkSession, Machine};
 use crate::replies::ended;
-use crate::taken::Running;
 use crate::time::now;
 
 /// How long somebody who has dialled may take to say, and to prove, who is there while nobody else could dial, or while
@@ -29,12 +28,16 @@ use crate::time::now;
 const PATIENCE: Duration = Duration::from_millis(300);
 /// That somebody could not join is logged this often at most, whatever is tried.
 const LOGGED: Duration = Duration::from_secs(1);
+/// How often the cable and the address are looked at, since the stack wakes one task only for them: it is left to the
+/// application's `wait_config_up`.
+const LOOK: Duration = Duration::from_millis(50);
 
 /// What happened on a link, without what it borrowed.
+// A wide tag: the rest is then moved in words, and not byte by byte.
+#[repr(u32)]
 pub(crate) enum News {
     Introduced,
     Hello,
-    Call(Call),
     Failed(CallId, Error),
     ListChanged,
     Skipped(u16),
@@ -48,21 +51,30 @@ pub(crate) enum News {
 
 /// What the runner has to do outside of the machine.
 pub(crate) enum Job {
-    /// Run a call, whose arguments are in the runner's parameters.
-    Serve(Running, Call),
     /// Run the safe hook of a service.
     Safe(Slot),
     /// Run the hook for a lost peer.
     Lost,
 }
 
+/// The call that the runner is to run next, if there is one; its arguments are in the runner's parameters.
+// A wide tag, as above, and nothing narrow beside the call.
+#[repr(u32)]
+pub(crate) enum Begun {
+    Nothing,
+    Call(Call),
+}
+
 impl News {
-    /// Of all events but replies.
-    fn of(event: Event<'_>) -> Self {
-        match event {
+    /// Of all events but replies. A call is no news: it is left where the runner finds it.
+    fn of(event: &Event<'_>, begun: &mut Begun) -> Option<Self> {
+        Some(match *event {
             Event::Introduced => Self::Introduced,
             Event::Hello => Self::Hello,
-            Event::Call(call) => Self::Call(call),
+            Event::Call(call) => {
+                *begun = Begun::Call(call);
+                return None;
+            }
             Event::Reply(..) => Self::Reply,
             Event::Failed(id, error) => Self::Failed(id, error),
             Event::ListChanged => Self::ListChanged,
@@ -72,7 +84,7 @@ impl News {
             Event::LeaseEnded { slot, expired } => Self::LeaseEnded(slot, expired),
             Event::Answered => Self::Answered,
             Event::Closed(reason) => Self::Closed(reason),
-        }
+        })
     }
 }
 
@@ -80,7 +92,7 @@ impl<T> Machine<T> {
     /// Lets the session of a link do what is due: `None` when nothing is.
     #[inline(never)]
     pub(crate) fn poll_link(&mut self, index: u16) -> Option<News> {
-        let Self { links, mail, pool, functions, reply, access, .. } = self;
+        let Self { links, mail, pool, functions, reply, access, begun, begun_on, .. } = self;
         let link = links.get_mut(usize::from(index))?;
         let session = link.session.as_mut()?;
         let mut cx = Context { now: now(), mailman: mail, buffers: pool, functions, access: access.0 };
@@ -92,7 +104,10 @@ impl<T> Machine<T> {
                 ended(link.waiters, reply, link.serial, id, result);
                 Some(News::Reply)
             }
-            event => Some(News::of(event)),
+            event => {
+                *begun_on = index;
+                News::of(&event, begun)
+            }
         }
     }
 
@@ -103,7 +118,7 @@ impl<T> Machine<T> {
         scratch: &mut [u8],
         arguments: Option<&mut ParametersView>,
     ) -> Option<Option<News>> {
-        let Self { links, mail, pool, functions, reply, access, .. } = self;
+        let Self { links, mail, pool, functions, reply, access, begun, begun_on, .. } = self;
         let link = links.get_mut(usize::from(index))?;
         if link.session.is_none() || (reply.is_taken() && link.awaits_reply()) {
             return None;
@@ -114,15 +129,27 @@ impl<T> Machine<T> {
         let mut cx = Context { now: now(), mailman: mail, buffers: pool, functions, access: access.0 };
         let receipt = session.receive(&mut cx, lent, arguments);
         let consumed = receipt.consumed;
-        let news = match receipt.event {
+        let news = match &receipt.event {
             Some(Event::Reply(id, result)) => {
-                ended(link.waiters, reply, link.serial, id, result);
+                ended(link.waiters, reply, link.serial, *id, *result);
                 Some(News::Reply)
             }
-            event => event.map(News::of),
+            Some(event) => {
+                *begun_on = index;
+                News::of(event, begun)
+            }
+            None => None,
         };
         mail.lines.get_mut(usize::from(index))?.take(consumed);
         if consumed == 0 && news.is_none() { None } else { Some(news) }
+    }
+
+    /// Whether no link has anything left to read, or a call to begin.
+    pub(crate) fn has_read_all(&self) -> bool {
+        self.links.iter().zip(self.mail.lines.iter()).all(|(link, line)| {
+            let session = link.session.as_ref();
+            line.has_been_read() && session.is_none_or(|session| !session.holds_received() && !session.has_next_call())
+        })
     }
 
     /// Takes a datagram that has arrived: `None` when there is none.
@@ -150,7 +177,8 @@ impl<T> Machine<T> {
             }
             Sorted::Session { link, nonce, body } => {
                 let event = self.with(link.0, |session, cx, _| session.datagram(cx, from, nonce, body)).flatten();
-                Some(event.map(|event| (link.0, News::of(event))))
+                self.begun_on = link.0;
+                Some(event.and_then(|event| Some((link.0, News::of(&event, &mut self.begun)?))))
             }
         }
     }
@@ -225,6 +253,12 @@ impl<T> Machine<T> {
     /// The cable was pulled or plugged in, or the address changed: every connection is dead, whatever TCP still hopes.
     #[inline(never)]
     pub(crate) fn look_at_network(&mut self) {
+        let now = now();
+        // Until there is an address each step looks: a connection must not be there before it.
+        if now < self.look && self.address.is_some() {
+            return;
+        }
+        self.look = now + LOOK;
         let config = if self.mail.stack.is_link_up() { self.mail.stack.config_v4() } else { None };
         let address = config.map(|config| config.address);
         if address == self.address {
@@ -234,7 +268,7 @@ impl<T> Machine<T> {
         let address = address.map(|address| address.address());
         log!("the address is now {:?}", address.map(|address| address.octets()));
         if address.is_some() {
-            self.node.network_changed(now());
+            self.node.network_changed(now);
         }
         // That there is one at last is no news at the start.
         if core::mem::replace(&mut self.has_begun, true) {
@@ -259,11 +293,6 @@ impl<T> Machine<T> {
                 self.act(action);
             }
             News::Closed(reason) => return self.closed(index, reason),
-            News::Call(call) => {
-                let serial = self.link(index)?.serial;
-                let running = Running { link: index, serial, ticket: call.ticket, deadline: call.deadline };
-                return Some(Job::Serve(running, call));
-            }
             News::LeaseExpired(slot) => {
                 let function = self.functions.function(slot).map_or("", |function| function.name());
                 let function = Name::try_from(function).unwrap_or_default();

@@ -204,6 +204,11 @@ impl Line {
         self.doing == Doing::Open && !self.socket.may_recv()
     }
 
+    /// Whether nothing has arrived that nobody has looked at, not even the end.
+    pub(crate) fn has_been_read(&self) -> bool {
+        !self.socket.can_recv() && !self.has_ended()
+    }
+
     /// Whether it would take bytes.
     pub(crate) fn can_write(&self) -> bool {
         self.socket.can_send()

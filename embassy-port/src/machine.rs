@@ -17,6 +17,7 @@ use embassy_net::Ipv4Cidr;
 use embassy_sync::waitqueue::{MultiWakerRegistration, WakerRegistration};
 
 use crate::config::Table;
+use crate::driving::Begun;
 use crate::event::{Events, UnitEvent};
 use crate::handler::{Hook, Listed};
 use crate::line::Line;
@@ -91,6 +92,9 @@ pub(crate) struct Machine<T: 'static> {
     pub(crate) events: Events,
     /// What the node wants done next.
     pub(crate) due: Option<Action>,
+    pub(crate) begun: Begun,
+    /// The link that it came on.
+    pub(crate) begun_on: u16,
     /// The runner is to let other tasks run.
     pub(crate) yields: bool,
     pub(crate) lost_hook: Option<&'static Hook<T>>,
@@ -98,6 +102,8 @@ pub(crate) struct Machine<T: 'static> {
     pub(crate) tcp_port: u16,
     /// The unit's own address; none while the cable is out or no address is known.
     pub(crate) address: Option<Ipv4Cidr>,
+    /// When the cable and the address are looked at again.
+    pub(crate) look: Instant,
     /// It has had an address.
     pub(crate) has_begun: bool,
     /// It has been stopped, and does nothing any more but end its connections.

@@ -21,6 +21,7 @@ use embassy_net::Stack;
 use embassy_net::udp::{PacketMetadata, UdpSocket};
 
 use crate::config::{Config, check, message_buffer};
+use crate::driving::Begun;
 use crate::event::{Events, UnitEvent};
 use crate::handle::Handle;
 use crate::handler::Listed;
@@ -361,6 +362,9 @@ pub fn new<
         lost_hook: None,
         tcp_port,
         address: None,
+        look: Instant::START,
+        begun: Begun::Nothing,
+        begun_on: 0,
         has_begun: false,
         stopped: false,
         logged: Instant::START,
@@ -373,6 +377,7 @@ pub fn new<
         shared,
         scratch: resources.scratch.write([0; DATAGRAM]),
         arguments: resources.arguments.write(Parameters::sized()),
+        rested_until: Instant::START,
         unanswered: None,
     };
     Ok((Handle { shared }, runner))

@@ -8,9 +8,9 @@ use core::task::{Context, Poll};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 use cara_core::services::unit::Call as CoreCall;
-use cara_core::time::{Duration, Instant};
+use cara_core::time::Instant;
 
-use crate::driving::Job;
+use crate::driving::{Begun, Job};
 use crate::handle::Handle;
 use crate::handler::{Call, Hook, Listed};
 use crate::lease::LeaseWatch;
@@ -20,10 +20,6 @@ use crate::time::{now, timer};
 
 /// Steps in a row before other tasks get their turn.
 const BUDGET: usize = 64;
-/// How often the cable and the address are looked at, since the stack wakes one task only for them: it is left to the
-/// application's `wait_config_up`.
-const LOOK: Duration = Duration::from_millis(50);
-
 /// Drives a unit; the one that [`new`](crate::new) returns. It needs a task of its own.
 pub struct Runner<T: 'static> {
     pub(crate) shared: &'static Shared<T>,
@@ -31,6 +27,8 @@ pub struct Runner<T: 'static> {
     pub(crate) scratch: &'static mut [u8],
     /// The arguments and results of the call that runs.
     pub(crate) arguments: &'static mut ParametersView,
+    /// Nothing is due before, by what the last rest has seen.
+    pub(crate) rested_until: Instant,
     /// A call whose results are still in there, because they could be kept nowhere else.
     pub(crate) unanswered: Option<(Running, Result<(), Error>)>,
 }
@@ -51,12 +49,19 @@ impl<T> Runner<T> {
     }
 
     fn poll(&mut self, context: &mut Context<'_>) -> Poll<Infallible> {
+        // First, so that what a service asks of the unit is seen by the next poll.
+        self.shared.machine.borrow_mut().wakers.runner.register(context.waker());
         for _ in 0..BUDGET {
-            match self.step(context) {
-                Step::Job(job) => self.run_job(job),
-                Step::Again => {}
-                Step::Idle if self.rest(context) => return Poll::Pending,
-                Step::Idle => {}
+            let is_through = match self.step(context) {
+                Step::Job(job) => {
+                    self.run_job(job);
+                    false
+                }
+                Step::Again => self.serve_begun(),
+                Step::Idle => true,
+            };
+            if is_through && self.rest(context) {
+                return Poll::Pending;
             }
             if core::mem::take(&mut self.shared.machine.borrow_mut().yields) {
                 break;
@@ -71,18 +76,26 @@ impl<T> Runner<T> {
     fn step(&mut self, context: &mut Context<'_>) -> Step {
         let shared = self.shared;
         let machine = &mut *shared.machine.borrow_mut();
-        let due = machine.due.take();
-        machine.act(due);
-        machine.look_at_network();
-        for index in machine.indices() {
-            if let Some(news) = machine.poll_link(index) {
-                return machine.noted(index, news).map_or(Step::Again, Step::Job);
-            }
+        if machine.due.is_some() {
+            let due = machine.due.take();
+            machine.act(due);
         }
-        machine.expire_reply(now());
+        // Anything may be due behind whatever is done, but nothing before the time to which the last rest has looked.
+        let is_due = now() >= core::mem::replace(&mut self.rested_until, Instant::START);
+        if is_due || machine.address.is_none() {
+            machine.look_at_network();
+        }
+        if is_due {
+            for index in machine.indices() {
+                if let Some(news) = machine.poll_link(index) {
+                    return machine.noted(index, news).map_or(Step::Again, Step::Job);
+                }
+            }
+            machine.expire_reply(now());
+        }
         self.answer_again(machine);
         machine.look_at_lines();
-        if !machine.stopped {
+        if is_due && !machine.stopped {
             let action = machine.poll_node();
             if action.is_some() {
                 machine.act(action);
@@ -108,8 +121,8 @@ impl<T> Runner<T> {
             if !busy
                 && let Some(Some(call)) = machine.with(index, |session, cx, _| session.next_call(cx, self.arguments))
             {
-                let job = machine.noted(index, crate::driving::News::Call(call));
-                return job.map_or(Step::Again, Step::Job);
+                (machine.begun, machine.begun_on) = (Begun::Call(call), index);
+                return Step::Again;
             }
         }
         Step::Idle
@@ -119,17 +132,15 @@ impl<T> Runner<T> {
     #[inline(never)]
     fn rest(&mut self, context: &mut Context<'_>) -> bool {
         let machine = &mut *self.shared.machine.borrow_mut();
-        machine.wakers.runner.register(context.waker());
         for (link, line) in machine.links.iter().zip(machine.mail.lines.iter()) {
             line.wake_on_news(context, link.session.as_ref().is_some_and(LinkSession::wants_to_write));
         }
-        let deadline = machine.deadline(now());
-        pin!(timer(deadline)).poll(context).is_pending()
+        self.rested_until = machine.deadline();
+        pin!(timer(self.rested_until)).poll(context).is_pending()
     }
 
     fn run_job(&mut self, job: Job) {
         match job {
-            Job::Serve(running, call) => self.serve(running, &call),
             Job::Safe(slot) => {
                 let machine = self.shared.machine.borrow();
                 let hook = machine.functions.function(slot).and_then(|function| function.handler.safe);
@@ -143,6 +154,18 @@ impl<T> Runner<T> {
         }
     }
 
+    /// Runs the call that has begun, if one has. Whether nothing can have become due by it, so that another step would
+    /// find nothing.
+    fn serve_begun(&mut self) -> bool {
+        let (begun, link) = {
+            let machine = &mut *self.shared.machine.borrow_mut();
+            (core::mem::replace(&mut machine.begun, Begun::Nothing), machine.begun_on)
+        };
+        let Begun::Call(call) = begun else { return false };
+        self.serve(link, &call);
+        self.unanswered.is_none() && self.shared.machine.borrow().has_read_all()
+    }
+
     fn run_hook(&self, hook: Option<&'static Hook<T>>) {
         // The state is lent for the length of one call only, and never across an await.
         if let (Some(hook), Ok(mut state)) = (hook, self.shared.state.try_borrow_mut()) {
@@ -151,7 +174,9 @@ impl<T> Runner<T> {
     }
 
     #[inline(never)]
-    fn serve(&mut self, running: Running, call: &CoreCall) {
+    fn serve(&mut self, link: u16, call: &CoreCall) {
+        let serial = self.shared.machine.borrow().link(link).map_or(0, |link| link.serial);
+        let running = Running { link, serial, ticket: call.ticket, deadline: call.deadline };
         let result = self.begin(running, call);
         let Some(result) = result else { return };
         let machine = &mut *self.shared.machine.borrow_mut();
@@ -205,12 +230,12 @@ impl<T> Runner<T> {
 
 impl<T> Machine<T> {
     /// When something is due.
-    fn deadline(&self, now: Instant) -> Instant {
+    fn deadline(&self) -> Instant {
         let sessions = self.links.iter().filter_map(|link| link.session.as_ref());
         let sessions = sessions.map(LinkSession::deadline).min().unwrap_or(Instant::FAR_FUTURE);
         let lines = self.mail.lines.iter().map(crate::line::Line::deadline).min().unwrap_or(Instant::FAR_FUTURE);
         let node = if self.stopped { Instant::FAR_FUTURE } else { self.node.next_deadline() };
         let kept = self.reply_deadline().min(self.parked_deadline());
-        sessions.min(lines).min(node).min(kept).min(now + LOOK)
+        sessions.min(lines).min(node).min(kept).min(self.look)
     }
 }

@@ -93,7 +93,10 @@ pub fn write(specs: VariableSpecs<'_>, parameters: &ParametersView, to: &mut imp
             to.put(&u64::from(saturate(bytes.len())).to_le_bytes());
         }
         to.put(bytes);
-        to.put(ZEROS.get(..padding_after(bytes.len())).unwrap_or_default());
+        match padding_after(bytes.len()) {
+            0 => {}
+            padding => to.put(ZEROS.get(..padding).unwrap_or_default()),
+        }
     }
 }
 
@@ -140,11 +143,7 @@ pub fn check_results_fit(specs: VariableSpecs<'_>, parameters: &ParametersView) 
 /// [`Error::Malformed`], or [`Error::Full`] if the parameters are too small; they may be empty after an error.
 pub fn read_arguments(specs: VariableSpecs<'_>, block: &[u8], parameters: &mut ParametersView) -> Result<(), Error> {
     parameters.clear();
-    let read = each(specs, block, |index, spec, value| {
-        parameters.add_checked(spec.name, spec.kind, spec.size)?;
-        parameters.set_checked(usize::from(index), value);
-        Ok(())
-    });
+    let read = each(specs, block, |_, spec, value| parameters.add_with(spec.name, spec.kind, spec.size, value));
     if read.is_err() {
         parameters.clear();
     }

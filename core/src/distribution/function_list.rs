@@ -99,7 +99,7 @@ impl<S: Storage, H: 'static> FunctionList<S, H> {
         if entry.generation != generation {
             return Err(Error::StaleFunction);
         }
-        self.function(slot).ok_or(Error::UnknownFunction)
+        self.table.of(entry).ok_or(Error::UnknownFunction)
     }
 
     /// The generation of a place, of an empty one as well.

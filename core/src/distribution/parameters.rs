@@ -13,7 +13,7 @@ use crate::error::{Error, Limit};
 use super::name::check_name;
 pub use super::value::{Element, FromValue, IntoValue, Target, Type, Value};
 use super::value::{read_elements, saturate};
-use crate::bytes::copy;
+use crate::bytes::{are_same, copy};
 
 /// Variables in `BYTES` bytes of names and values (paper, listing line 11).
 ///
@@ -261,6 +261,23 @@ impl ParametersView {
 
     /// Adds a variable whose name may be one, and is not there.
     pub(super) fn add_checked(&mut self, name: &[u8], kind: Type, size: u32) -> Result<(), Error> {
+        let target = self.reserve(name, kind, size)?;
+        if kind.is_fixed() {
+            target.bytes.fill(0);
+            *target.length = saturate(target.bytes.len());
+        }
+        Ok(())
+    }
+
+    /// The same with a value that was checked against its type and size.
+    pub(super) fn add_with(&mut self, name: &[u8], kind: Type, size: u32, value: &[u8]) -> Result<(), Error> {
+        self.reserve(name, kind, size)?.set_checked(value);
+        Ok(())
+    }
+
+    /// The place of a new variable, whose value is not set.
+    fn reserve(&mut self, name: &[u8], kind: Type, size: u32) -> Result<Target<'_>, Error> {
+        let index = self.count;
         let place = self.table.get_mut(self.count as usize).ok_or(Error::Full(Limit::Variables))?;
         let full = Error::Full(Limit::ParametersBytes);
         let length = kind.bytes_of(size).ok_or(full)?;
@@ -268,20 +285,11 @@ impl ParametersView {
         let (name_place, free) = free.split_at_mut_checked(name.len()).ok_or(full)?;
         let value = free.get_mut(..length).ok_or(full)?;
         copy(name, name_place);
-        if kind.is_fixed() {
-            value.fill(0);
-        }
         let value_at = self.used.saturating_add(saturate(name.len()));
-        *place = Entry {
-            value_at,
-            size,
-            length: if kind.is_fixed() { saturate(length) } else { 0 },
-            name_length: name.len() as u8,
-            kind,
-        };
+        *place = Entry { value_at, size, length: 0, name_length: name.len() as u8, kind };
         self.used = value_at.saturating_add(saturate(length));
-        self.count = self.count.saturating_add(1);
-        Ok(())
+        self.count = index.saturating_add(1);
+        Ok(Target { index: index as u8, kind, size, length: &mut place.length, bytes: value })
     }
 
     fn replace_by(&mut self, other: &Self) -> Result<(), Error> {
@@ -296,7 +304,7 @@ impl ParametersView {
     }
 
     pub(super) fn find(&self, name: &[u8]) -> Option<usize> {
-        self.table.iter().take(self.len()).position(|entry| self.name_of(entry) == name)
+        self.table.iter().take(self.len()).position(|entry| are_same(self.name_of(entry), name))
     }
 
     pub(super) fn named(&self, name: &[u8]) -> Option<Value<'_>> {
@@ -312,10 +320,8 @@ impl ParametersView {
 
     /// Sets the value of the variable at `index` from bytes that were checked against its type and size.
     pub(crate) fn set_checked(&mut self, index: usize, bytes: &[u8]) {
-        let Some(target) = self.target(index) else { return };
-        if let Some(place) = target.bytes.get_mut(..bytes.len()) {
-            copy(bytes, place);
-            *target.length = saturate(bytes.len());
+        if let Some(target) = self.target(index) {
+            target.set_checked(bytes);
         }
     }
 

@@ -191,7 +191,11 @@ impl<S: Storage, H: 'static> Table<S, H> {
     }
 
     pub(super) fn function(&self, index: usize) -> Option<Function<'_, H>> {
-        let entry = self.entries.get(index)?;
+        self.of(self.entries.get(index)?)
+    }
+
+    /// The function in one of the entries.
+    pub(super) fn of<'a>(&'a self, entry: &'a Entry<H>) -> Option<Function<'a, H>> {
         let stored = entry.function.as_ref()?;
         Some(Function {
             slot: stored.slot,

@@ -168,6 +168,14 @@ impl Target<'_> {
         self.size
     }
 
+    /// Sets the value from bytes that were checked against the type and size.
+    pub(crate) fn set_checked(self, bytes: &[u8]) {
+        if let Some(place) = self.bytes.get_mut(..bytes.len()) {
+            copy(bytes, place);
+            *self.length = saturate(bytes.len());
+        }
+    }
+
     fn set_raw(self, bytes: &[u8]) -> Result<(), Error> {
         let index = self.index;
         let wrong = Error::WrongSize { index, expected: self.size, found: saturate(bytes.len()) };

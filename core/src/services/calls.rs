@@ -139,7 +139,10 @@ impl<S: Storage> Calls<S> {
     /// that came before and may begin.
     pub(crate) fn is_idle(&self, priority: Priority) -> bool {
         let active = self.active.get(usize::from(priority.to_wire())).is_some_and(Option::is_some);
-        !active && !self.class_waits(priority) && (priority == Priority::Emergency || !self.can_begin())
+        if active || !self.any_waiting() {
+            return !active;
+        }
+        !self.class_waits(priority) && (priority == Priority::Emergency || !self.can_begin())
     }
 
     fn class_waits(&self, priority: Priority) -> bool {
@@ -183,20 +186,28 @@ impl<S: Storage> Calls<S> {
 
     /// Lets the next call of the class begin while this one goes on.
     pub(crate) fn detach(&mut self, ticket: Ticket) {
-        for active in &mut self.active {
+        let place = self.running.get(usize::from(ticket.index));
+        if let Some(&Some(CallHead { priority, .. })) = place {
+            self.free_class(priority, ticket);
+        }
+    }
+
+    fn free_class(&mut self, priority: Priority, ticket: Ticket) {
+        if let Some(active) = self.active.get_mut(usize::from(priority.to_wire())) {
             active.take_if(|active| *active == ticket);
         }
     }
 
-    /// Ends a call. `None` when it was ended already.
-    pub(crate) fn end(&mut self, ticket: Ticket) -> Option<CallHead> {
-        let head = self.call(ticket)?;
-        if let Some(place) = self.running.get_mut(usize::from(ticket.index)) {
-            *place = None;
+    /// Ends a call; `false` when it was ended already.
+    pub(crate) fn end(&mut self, ticket: Ticket) -> bool {
+        let Some(place) = self.running.get_mut(usize::from(ticket.index)) else { return false };
+        let Some(CallHead { priority, .. }) = *place else { return false };
+        if place.take_if(|head| head.id == ticket.id).is_none() {
+            return false;
         }
-        self.detach(ticket);
+        self.free_class(priority, ticket);
         self.held = self.held.saturating_sub(1);
-        Some(head)
+        true
     }
 
     /// Keeps a call until its class is idle.
@@ -447,10 +458,10 @@ mod tests {
     fn a_ticket_is_good_once_and_for_its_call_only() {
         let mut calls = calls(2);
         let first = calls.begin(head(1, Priority::Normal)).unwrap();
-        assert!(calls.end(first).is_some() && calls.end(first).is_none());
+        assert!(calls.end(first) && !calls.end(first));
         let second = calls.begin(head(2, Priority::Normal)).unwrap();
         assert_eq!((calls.call(first), calls.held()), (None, 1));
-        assert!(calls.end(first).is_none());
+        assert!(!calls.end(first));
         assert_eq!(calls.call(second).unwrap().id, 2);
     }
 
@@ -507,7 +518,7 @@ mod tests {
         assert_eq!((calls.held(), pool.free()), (4, LEFT_BY_WAITING));
         calls.release(&mut pool);
         assert_eq!((calls.held(), pool.free()), (1, 4));
-        assert!(calls.end(running).is_some());
+        assert!(calls.end(running));
         assert_eq!(calls.held(), 0);
     }
 

@@ -24,6 +24,8 @@ use sender::Sender;
 
 /// A whole frame or message that arrived; [`Link::view`] shows the bytes.
 #[derive(Clone, Copy, Debug)]
+// A wide tag: the rest is then moved in words, and not byte by byte.
+#[repr(u32)]
 pub enum Incoming {
     /// The peer's hello.
     Hello(Place),
@@ -146,7 +148,8 @@ impl<S: Storage, C: Seal> Link<S, C> {
     /// that call gives the buffer of the last message back.
     pub fn receive(&mut self, buffers: &mut impl Buffers<S>, bytes: &mut [u8]) -> Result<Received, CloseReason> {
         let available = bytes.len();
-        let received = self.receiver.receive(&mut self.cipher, buffers, bytes)?;
+        let mut received = Received { consumed: 0, incoming: None, paused: false };
+        self.receiver.receive(&mut self.cipher, buffers, bytes, &mut received)?;
         self.counters.add(LinkCounter::BytesReceived, received.consumed as u64);
         if received.paused && available > 0 {
             self.counters.add(LinkCounter::ReadPaused, 1);

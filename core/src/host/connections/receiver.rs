@@ -47,6 +47,8 @@ struct Piece {
 }
 
 /// A frame without its bytes, which are the tail of its body.
+// A wide tag: the rest is then moved in words, and not byte by byte.
+#[repr(u32)]
 enum Content {
     Hello,
     Refuse(u8),
@@ -85,18 +87,22 @@ impl<S: Storage> Receiver<S> {
         }
     }
 
+    /// Takes bytes that have come, and says in `received` what became of them: it is lent, because moving it through
+    /// each layer would cost a board more than reading the frame.
     pub(super) fn receive<C: Seal>(
         &mut self,
         cipher: &mut C,
         buffers: &mut impl Buffers<S>,
         lent: &mut [u8],
-    ) -> Result<Received, CloseReason> {
-        let received = self.step(cipher, buffers, lent)?;
-        if self.partial.done && received.consumed == 0 && received.incoming.is_none() {
-            // A chunk that had waited for a buffer: it would look as if nothing were left to do.
-            return self.step(cipher, buffers, lent);
+        received: &mut Received,
+    ) -> Result<(), CloseReason> {
+        loop {
+            self.step(cipher, buffers, lent, received)?;
+            // A chunk that had waited for a buffer would look as if nothing were left to do.
+            if !self.partial.done || received.consumed > 0 || received.incoming.is_some() {
+                return Ok(());
+            }
         }
-        Ok(received)
     }
 
     fn step<C: Seal>(
@@ -104,64 +110,67 @@ impl<S: Storage> Receiver<S> {
         cipher: &mut C,
         buffers: &mut impl Buffers<S>,
         lent: &mut [u8],
-    ) -> Result<Received, CloseReason> {
+        received: &mut Received,
+    ) -> Result<(), CloseReason> {
         self.clear_finished(buffers);
-        if self.partial.length == 0 {
-            match frame::first_frame_length(lent) {
-                Some(length) if length <= lent.len() => return self.take_whole(cipher, buffers, lent, length),
-                _ => {}
+        let frame = match frame::first_frame_length(lent) {
+            Some(length) if length <= lent.len() && self.partial.length == 0 => {
+                self.take_whole(buffers, length, received)?
             }
+            _ => self.take_partial(buffers, lent, received)?,
+        };
+        if let Some((store, start, length)) = frame {
+            self.open(cipher, store, lent, start, length, received)?;
+            self.give_unused(buffers);
         }
-        self.take_partial(cipher, buffers, lent)
+        Ok(())
     }
 
     /// The frame lies whole in the lent bytes: it is opened there.
-    fn take_whole<C: Seal>(
+    fn take_whole(
         &mut self,
-        cipher: &mut C,
         buffers: &mut impl Buffers<S>,
-        lent: &mut [u8],
         length: usize,
-    ) -> Result<Received, CloseReason> {
+        received: &mut Received,
+    ) -> Result<Option<(Store, usize, usize)>, CloseReason> {
         self.check_length(length)?;
         if !self.reserve(buffers, length) {
-            return Ok(Received { consumed: 0, incoming: None, paused: true });
+            received.paused = true;
+            return Ok(None);
         }
-        let incoming = self.open(cipher, Store::Lent, lent, 0, length)?;
-        self.give_unused(buffers);
-        Ok(Received { consumed: length, incoming, paused: false })
+        received.consumed = length;
+        Ok(Some((Store::Lent, 0, length)))
     }
 
     /// The frame came in pieces: it is collected, and opened when it is whole.
-    fn take_partial<C: Seal>(
+    fn take_partial(
         &mut self,
-        cipher: &mut C,
         buffers: &mut impl Buffers<S>,
-        lent: &mut [u8],
-    ) -> Result<Received, CloseReason> {
-        let mut consumed = self.collect(lent, frame::HEADER_BYTES);
-        let Some(length) = self.partial_frame_length() else {
-            return Ok(Received { consumed, incoming: None, paused: false });
-        };
+        lent: &[u8],
+        received: &mut Received,
+    ) -> Result<Option<(Store, usize, usize)>, CloseReason> {
+        received.consumed = self.collect(lent, frame::HEADER_BYTES);
+        let Some(length) = self.partial_frame_length() else { return Ok(None) };
         self.check_length(length)?;
         if length > self.small.len() && !self.partial.in_buffer {
             if !self.borrow(buffers) {
-                return Ok(Received { consumed, incoming: None, paused: true });
+                received.paused = true;
+                return Ok(None);
             }
             self.move_to_buffer(length)?;
         }
-        consumed = consumed.saturating_add(self.collect(lent.get(consumed..).unwrap_or(&[]), length));
+        let rest = lent.get(received.consumed..).unwrap_or(&[]);
+        received.consumed = received.consumed.saturating_add(self.collect(rest, length));
         if self.partial.length < length {
-            return Ok(Received { consumed, incoming: None, paused: false });
+            return Ok(None);
         }
         if !self.partial.in_buffer && !self.reserve(buffers, length) {
-            return Ok(Received { consumed, incoming: None, paused: true });
+            received.paused = true;
+            return Ok(None);
         }
         self.partial.done = true;
         let (store, start) = self.partial_place();
-        let incoming = self.open(cipher, store, lent, start, length)?;
-        self.give_unused(buffers);
-        Ok(Received { consumed, incoming, paused: false })
+        Ok(Some((store, start, length)))
     }
 
     fn check_length(&self, length: usize) -> Result<(), CloseReason> {
@@ -234,7 +243,8 @@ impl<S: Storage> Receiver<S> {
         lent: &mut [u8],
         start: usize,
         length: usize,
-    ) -> Result<Option<Incoming>, CloseReason> {
+        received: &mut Received,
+    ) -> Result<(), CloseReason> {
         let bytes: &mut [u8] = match (store, &mut self.buffer) {
             (Store::Lent, _) => lent,
             (Store::Buffer, Some(buffer)) => buffer,
@@ -245,11 +255,17 @@ impl<S: Storage> Receiver<S> {
         let body = cipher.open(sealed)?;
         let end = body_at.saturating_add(body.len());
         let (content, tail) = Content::of(Frame::parse(body)?);
-        self.deliver(content, Place { store, start: end.saturating_sub(tail), end }, lent)
+        self.deliver(content, Place { store, start: end.saturating_sub(tail), end }, lent, received)
     }
 
-    fn deliver(&mut self, content: Content, place: Place, lent: &[u8]) -> Result<Option<Incoming>, CloseReason> {
-        Ok(Some(match content {
+    fn deliver(
+        &mut self,
+        content: Content,
+        place: Place,
+        lent: &[u8],
+        received: &mut Received,
+    ) -> Result<(), CloseReason> {
+        received.incoming = Some(match content {
             Content::Hello => Incoming::Hello(place),
             Content::Refuse(code) => Incoming::Refuse(code),
             Content::Close(code) => Incoming::Close(code),
@@ -263,11 +279,14 @@ impl<S: Storage> Receiver<S> {
                 Incoming::Message(priority, place)
             }
             Content::Piece(Piece { priority, total: Some(total), last: false }) => {
-                self.begin(priority, total as usize, place, lent)?;
-                return Ok(None);
+                return self.begin(priority, total as usize, place, lent);
             }
-            Content::Piece(piece) => return self.go_on(&piece, place, lent),
-        }))
+            Content::Piece(piece) => match self.go_on(&piece, place, lent)? {
+                Some(whole) => Incoming::Message(piece.priority, whole),
+                None => return Ok(()),
+            },
+        });
+        Ok(())
     }
 
     fn check_whole(&self, place: Place, total: usize) -> Result<(), CloseReason> {
@@ -291,8 +310,8 @@ impl<S: Storage> Receiver<S> {
         Ok(())
     }
 
-    /// A chunk behind the first one.
-    fn go_on(&mut self, piece: &Piece, place: Place, lent: &[u8]) -> Result<Option<Incoming>, CloseReason> {
+    /// A chunk behind the first one; the whole message with the last one.
+    fn go_on(&mut self, piece: &Piece, place: Place, lent: &[u8]) -> Result<Option<Place>, CloseReason> {
         let Some(Assembly { length, total, priority, .. }) = self.assembly else { return Err(CloseReason::Protocol) };
         let end = length.saturating_add(place.length());
         if piece.priority != priority || end > total || piece.last != (end == total) {
@@ -301,7 +320,7 @@ impl<S: Storage> Receiver<S> {
         self.keep(place, lent, length)?;
         self.assembly = Some(Assembly { length: end, total, priority, done: piece.last });
         let whole = Place { store: Store::Buffer, start: 0, end };
-        Ok(piece.last.then_some(Incoming::Message(priority, whole)))
+        Ok(piece.last.then_some(whole))
     }
 
     /// Puts the bytes at `place` into the buffer at `at`, which is not behind them where they are in it already.

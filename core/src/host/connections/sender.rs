@@ -94,13 +94,13 @@ impl<S: Storage> Sender<S> {
             Some(lane) => lane,
             None => slot.insert(Lane::new(buffers.take_leaving(LEFT_BY_SENDING).ok_or(Error::Full(Limit::Buffers))?)),
         };
-        let result = lane.append(self.cut, priority, total, write);
+        let Err(error) = lane.append(self.cut, priority, total, write) else { return Ok(()) };
         if lane.waiting() == 0
             && let Some(lane) = slot.take()
         {
             buffers.give(lane.buffer);
         }
-        result
+        Err(error)
     }
 
     fn accept_emergency(&mut self, total: usize, write: impl FnOnce(&mut ChunkWriter<'_>)) -> Result<(), Error> {
@@ -176,7 +176,9 @@ impl<S: Storage> Sender<S> {
     ) -> Result<u64, CloseReason> {
         let mut written = 0;
         while self.write_sealed(id, mailman, &mut written)? == Progress::Through {
-            self.give_drained(buffers);
+            if written > 0 {
+                self.give_drained(buffers);
+            }
             if !self.seal_next(cipher)? {
                 self.blocked = false;
                 return Ok(written);

@@ -18,6 +18,7 @@ use crate::services::access::Verb;
 use crate::services::calls::{CallHead, Ticket};
 use crate::services::lease::{Granted, Service};
 use crate::storage::{Buffers, Storage};
+use crate::time::{Duration, Instant};
 
 impl<S: Storage, C: Secure> Session<S, C> {
     /// The next call that waited and may begin now, its arguments in `arguments`. Call it after
@@ -38,9 +39,9 @@ impl<S: Storage, C: Secure> Session<S, C> {
                 if !decide(access, remote, function.name(), Verb::Call).is_allowed() {
                     return Err(Error::NotAllowed);
                 }
-                read_arguments(function.signature, block, arguments)
+                read_arguments(function.signature, block, arguments).map(|()| function.attributes.lease)
             })?;
-            match read.and_then(|()| self.begin(cx, head)) {
+            match read.and_then(|lease| self.begin(cx, head, lease)) {
                 Ok(call) => return Some(call),
                 Err(error) => self.refuse_request(cx, head.id, head.slot, head.priority, head.wants_reply, error),
             }
@@ -59,12 +60,13 @@ impl<S: Storage, C: Secure> Session<S, C> {
         self.calls.has_room(self.constraints.calls_per_peer, self.constraints.message_size as usize)
     }
 
+    /// Begins a call of a function that has this lease.
     pub(super) fn begin<M: Mailman, B: Buffers<S>, H: Service>(
         &mut self,
         cx: &mut Context<'_, S, M, B, H>,
         head: CallHead,
+        lease: Option<Duration>,
     ) -> Result<Call, Error> {
-        let lease = cx.functions.function(head.slot).and_then(|function| function.attributes.lease);
         // A command that waited for its turn is no longer wanted once its lease has been given up.
         if lease.is_some() && self.publishing.is_released(head.slot, head.id) {
             return Err(Error::Expired);
@@ -119,7 +121,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
 
     /// Gives up on answering a call whose answer could not be kept.
     pub fn drop_answer(&mut self, ticket: Ticket) {
-        if self.calls.end(ticket).is_some() {
+        if self.calls.end(ticket) {
             self.link.counters.add(LinkCounter::RepliesDropped, 1);
         }
     }
@@ -182,7 +184,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         total: usize,
         write: &mut dyn FnMut(&mut ChunkWriter<'_>),
     ) -> Result<(), Error> {
-        self.timers.gathered = crate::time::Instant::FAR_FUTURE;
+        self.timers.gathered = Instant::FAR_FUTURE;
         self.timers.last_write = cx.now;
         let sent = self.link.send_message(cx.mailman, cx.buffers, priority, total, false, write);
         if let Err(Error::Closed(reason)) = sent {

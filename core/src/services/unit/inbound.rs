@@ -9,7 +9,7 @@ use super::timing::made_at;
 use super::{Event, Phase, Session, close_reason};
 use crate::config::Priority;
 use crate::distribution::function::{Attributes, Signature};
-use crate::distribution::function_list::{Generation, Slot};
+use crate::distribution::function_list::{Function, Generation, Slot};
 use crate::distribution::message::{Control, Message, REPLY_BYTES, REQUEST_BYTES, RequestHeader, SessionBody};
 use crate::distribution::parameters::ParametersView;
 use crate::distribution::{block, datagram};
@@ -60,6 +60,8 @@ impl<'b> ReplyBlock<'b> {
 }
 
 /// What a frame led to, before anything is borrowed for the port.
+// A wide tag: the rest is then moved in words, and not byte by byte.
+#[repr(u32)]
 pub(super) enum Outcome {
     Nothing,
     Event(Event<'static>),
@@ -349,14 +351,15 @@ impl<S: Storage, C: Secure> Session<S, C> {
             self.link.counters.add(LinkCounter::RequestsRepeated, 1);
             return Outcome::Nothing;
         }
+        // Once for all that a request needs of it.
+        let function = cx.functions.lookup(header.slot, header.generation);
         let length = self.link.view(block, lent).len();
-        let result = self.check_request(cx, priority, header, seen, length).and_then(|head| {
+        let result = self.check_request(cx, priority, header, seen, length, function).and_then(|(head, function)| {
             let block = self.link.view(block, lent);
             match arguments.filter(|_| self.calls.is_idle(priority)) {
                 Some(arguments) => {
-                    let function = cx.functions.lookup(head.slot, head.generation)?;
                     read_arguments(function.signature, block, arguments)?;
-                    self.begin(cx, head).map(Some)
+                    self.begin(cx, head, function.attributes.lease).map(Some)
                 }
                 None => self.calls.wait(cx.buffers, head, block).map(|()| None),
             }
@@ -372,14 +375,15 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// Everything that can be said of a request without looking at its arguments.
-    fn check_request<M: Mailman, B: Buffers<S>, H: Service>(
+    fn check_request<'f, M: Mailman, B: Buffers<S>, H: Service>(
         &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
+        cx: &Context<'_, S, M, B, H>,
         priority: Priority,
         header: &RequestHeader,
         seen: Seen,
         length: usize,
-    ) -> Result<CallHead, Error> {
+        function: Result<Function<'f, H>, Error>,
+    ) -> Result<(CallHead, Function<'f, H>), Error> {
         if seen == Seen::TooOld {
             return Err(Error::Stale);
         }
@@ -393,16 +397,17 @@ impl<S: Storage, C: Secure> Session<S, C> {
         if deadline <= cx.now {
             return Err(Error::Expired);
         }
-        match self.publishing.told(header.slot, header.generation) {
+        let function = match self.publishing.told(header.slot, header.generation) {
             Told::Never => return Err(Error::UnknownFunction),
             Told::Earlier => return Err(Error::StaleFunction),
-            Told::Now => self.permit_call(cx, header.slot, header.generation)?,
+            Told::Now => function?,
         };
+        self.permit_call(cx, &function)?;
         if priority != Priority::Emergency {
             self.calls.interval(cx.now, self.constraints.minimum_interval)?;
         }
         self.calls.admit(priority, self.constraints.calls_per_peer)?;
-        Ok(CallHead {
+        let head = CallHead {
             id: header.id,
             slot: header.slot,
             generation: header.generation,
@@ -410,7 +415,8 @@ impl<S: Storage, C: Secure> Session<S, C> {
             wants_reply: header.wants_reply,
             deadline,
             made,
-        })
+        };
+        Ok((head, function))
     }
 }
 

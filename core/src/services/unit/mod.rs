@@ -100,6 +100,8 @@ pub struct SessionStorage<S: Storage> {
 
 /// What happened on a link.
 #[derive(Debug)]
+// A wide tag: the rest is then moved in words, and not byte by byte.
+#[repr(u32)]
 pub enum Event<'b> {
     /// The peer says who it is ([`Session::identity`]) and is to prove it: [`Session::prove`] with the key of the pair, or
     /// [`Session::refuse`] with [`Refusal::NoKey`]. On a link that is not live nothing else that it says counts yet. Never
