@@ -12,6 +12,7 @@ use cara_core::error::{CloseReason, Error};
 use cara_core::host::connections::LinkCounter;
 use cara_core::services::access::Access;
 use cara_core::services::requests::CallId;
+use cara_core::time::Duration;
 
 use crate::config::{Table, check};
 use crate::event::UnitEvent;
@@ -232,6 +233,13 @@ impl<T> Handle<T> {
                 session.access_changed(cx);
             });
         });
+    }
+
+    /// The keys of links that this unit opens from here on are made anew this often, instead of every 12 h, so that a test
+    /// need not wait for so long.
+    #[doc(hidden)]
+    pub fn renew_keys_every(&self, span: Duration) {
+        self.act(|machine| machine.renews_every = span);
     }
 
     /// What happened on all links, also on those that have ended.

@@ -10,7 +10,7 @@ use cara_core::services::Context;
 use cara_core::services::publications::Publications;
 use cara_core::services::unit::{Session, SessionConfig, SessionStorage};
 use cara_core::storage::{Lent, Pool};
-use cara_core::time::Instant;
+use cara_core::time::{Duration, Instant};
 use core::cell::RefCell;
 use core::net::SocketAddr;
 use embassy_net::Ipv4Cidr;
@@ -110,6 +110,8 @@ pub(crate) struct Machine<T: 'static> {
     pub(crate) stopped: bool,
     /// When it was last logged that somebody could not join.
     pub(crate) logged: Instant,
+    /// How old the keys of a link become.
+    pub(crate) renews_every: Duration,
     /// Of the links that have ended.
     pub(crate) counters: LinkCounters,
     /// Longest message, and bytes of arguments and results, that the memory allows.
@@ -201,8 +203,10 @@ impl<T> Machine<T> {
         let constraints = *self.node.constraints();
         let config = SessionConfig { link: LinkId(index), dialed, address, local, constraints };
         let cipher = self.proof.cipher();
+        let mut session = Session::new(now(), config, cipher, storage);
+        session.renew_every(self.renews_every);
         let link = self.link_mut(index)?;
-        link.session = Some(Session::new(now(), config, cipher, storage));
+        link.session = Some(session);
         link.since = now();
         Some(())
     }

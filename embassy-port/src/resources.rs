@@ -3,7 +3,7 @@
 use core::cell::RefCell;
 use core::mem::MaybeUninit;
 
-use cara_core::config::{LINK_BUFFER_BYTES, Mode};
+use cara_core::config::{HANDSHAKE_LIFE, LINK_BUFFER_BYTES, Mode};
 use cara_core::counters::Counters;
 use cara_core::distribution::connection_handler::{Finding, Known, Node, NodeConfig, NodeStorage, Order};
 use cara_core::distribution::datagram::SEARCH_BYTES;
@@ -368,6 +368,7 @@ pub fn new<
         has_begun: false,
         stopped: false,
         logged: Instant::START,
+        renews_every: HANDSHAKE_LIFE,
         counters: Counters::new(),
         room: Room { buffer: MESSAGE, parameters: ARGUMENTS },
         wakers: Wakers::new(),

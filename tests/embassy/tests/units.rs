@@ -419,6 +419,70 @@ fn a_starved_vehicle_stops_by_its_lease_and_is_made_safe_first() {
     assert_eq!(agv.with_state(|state| state.done.clone()), Ok(vec!["made safe", "served"]));
 }
 
+/// The motor's interrupt falls while the runner is at work on a renewal that it has begun to look at in time.
+#[test]
+fn what_a_motors_interrupt_has_seen_dead_no_renewal_revives() {
+    let bench = Bench::new(14);
+    let ((manager_board, manager), (_, agv)) = (manager(&bench), agv(&bench));
+    static MOVING: Lease = Lease::new();
+    let length = Duration::from_millis(400);
+    let options = ServiceOptions::new().lease(length, &MOVING, &|state: &mut State| state.stops += 1);
+    agv.add_service("go(n: int) -> (n: int)", options, Handler::method(&|_, _, _| Ok(()))).unwrap();
+    agv.publish_my_function_list().unwrap();
+    assert!(bench.run_until(|| knows(manager, "agv", "go"), SHORT));
+    for round in 1..4 {
+        assert_eq!(ask(&bench, &manager_board, manager, "agv", "go", 1), Ok(1), "a new order moves it");
+        bench.run_for(Duration::from_secs(1));
+        assert!(MOVING.is_live(bench.now()), "the manager renews it");
+        assert!(!MOVING.is_live(bench.now() + length));
+        assert!(!bench.run_until(|| MOVING.is_live(bench.now()), SHORT), "renewals go on, and move nothing");
+        assert_eq!(agv.with_state(|state| state.stops), Ok(round), "the hook is not left out");
+    }
+}
+
+/// The keys of a live link are made anew every second, while both ends ask each other and one drives.
+#[test]
+fn keys_are_made_anew_while_calls_go_on() {
+    let bench = Bench::new(15);
+    let ((manager_board, manager), (agv_board, agv)) = (manager(&bench), agv(&bench));
+    static MOVING: Lease = Lease::new();
+    let stop: &'static Hook<State> = &|state| state.stops += 1;
+    let options = ServiceOptions::new().lease(Duration::from_millis(400), &MOVING, stop);
+    agv.add_service("go(n: int) -> (n: int)", options, Handler::method(&|_, _, _| Ok(()))).unwrap();
+    for unit in [manager, agv] {
+        unit.renew_keys_every(Duration::from_secs(1));
+        doubling(unit);
+        unit.publish_my_function_list().unwrap();
+    }
+    assert!(bench.run_until(|| knows(manager, "agv", "double") && knows(agv, "manager", "double"), SHORT));
+    assert_eq!(ask(&bench, &manager_board, manager, "agv", "go", 1), Ok(1));
+    let answered = Rc::new(Cell::new([0; 2]));
+    for (at, board, unit, peer) in [(0, &manager_board, manager, "agv"), (1, &agv_board, agv, "manager")] {
+        let (answered, peer) = (Rc::clone(&answered), unit.peer(peer).unwrap());
+        board.spawn(async move {
+            for n in 0.. {
+                let mut parameters = number(n);
+                assert_eq!(peer.block_request("double", &mut parameters).await, Ok(()));
+                assert_eq!(parameters.variable::<i64>("n"), Ok(2 * n));
+                let mut counts = answered.get();
+                counts[at] += 1;
+                answered.set(counts);
+            }
+        });
+    }
+    let renewed = |unit: Unit| unit.counted(LinkCounter::KeysRenewed);
+    for age in 1..20 {
+        let before = answered.get();
+        assert!(bench.run_until(|| renewed(manager) >= age && renewed(agv) >= age, SHORT), "keys number {age}");
+        assert!(MOVING.is_live(bench.now()), "the lease is renewed across keys");
+        let after = answered.get();
+        assert!(before[0] < after[0] && before[1] < after[1], "{before:?} {after:?}");
+    }
+    assert_eq!(agv.with_state(|state| (state.stops, state.losses)), Ok((0, 0)), "the link is the same");
+    let refused = |unit: Unit| unit.counted(LinkCounter::ProofsFailed);
+    assert_eq!([refused(manager), refused(agv)], [0, 0]);
+}
+
 /// Units that were told so in words, and those with keys of another fleet: each meets its like and nobody else.
 #[test]
 fn an_insecure_unit_meets_insecure_units_only() {
