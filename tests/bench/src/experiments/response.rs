@@ -46,6 +46,7 @@ pub(super) fn turns(group: &Group, cells: &mut Cells, what: &str) -> Result<()> 
     let bar = Progress::new(what, group.rounds as usize * group.orders.len());
     let mut pairs = start(&group.peers, group.setting)?;
     *cells = group.orders.iter().map(|_| pairs.iter().map(|_| Cell::default()).collect()).collect();
+    let mut outcome = Ok(());
     for round in 0..group.rounds as usize {
         for (order, cells) in group.orders.iter().zip(cells.iter_mut()) {
             if is_stopped() {
@@ -53,14 +54,14 @@ pub(super) fn turns(group: &Group, cells: &mut Cells, what: &str) -> Result<()> 
             }
             let shared = order.pause_ms > 0 && group.setting.distribution == 1;
             let turn = match shared {
-                true => spaced_turn(&mut pairs, order, cells),
+                true => spaced_turn(&mut pairs, order, round, cells),
                 false => turn(&group.peers, &mut pairs, order, round, cells),
             };
-            turn.with_context(|| format!("{} characters, {} callers", order.chars, order.callers))?;
+            outcome = outcome.and(unless_stopped(turn));
             bar.step();
         }
     }
-    Ok(())
+    outcome
 }
 
 /// The processes of all contenders, started at the same time; none for another system that does not start.
@@ -80,17 +81,26 @@ fn turn(
     round: usize,
     cells: &mut [Cell],
 ) -> Result<()> {
+    let mut failure = Ok(());
     for ((contender, pair), cell) in contenders.iter().zip(pairs).zip(cells) {
         let Some(running) = pair.as_mut().filter(|_| cell.turns.len() == round) else { continue };
-        let outcome = running.block(order).with_context(|| format!("{} characters", order.chars));
-        cell.turns.extend(contender.tolerate(outcome)?);
+        let outcome = running.block(order).with_context(|| told(order));
+        match contender.tolerate(outcome) {
+            Ok(turn) => cell.turns.extend(turn),
+            // The others go on, and the experiment fails when all is done.
+            Err(error) => failure = failure.and(Err(error)),
+        }
         pair.take_if(|_| !contender.works());
     }
-    Ok(())
+    failure
+}
+
+fn told(order: &Order) -> String {
+    format!("{} characters, {} callers, {} ms apart", order.chars, order.callers, order.pause_ms)
 }
 
 /// Peers that pause are under way together: each calls while the others pause. All of them are our own.
-fn spaced_turn(pairs: &mut [Option<Pair>], order: &Order, cells: &mut [Cell]) -> Result<()> {
+fn spaced_turn(pairs: &mut [Option<Pair>], order: &Order, round: usize, cells: &mut [Cell]) -> Result<()> {
     let mut pairs: Vec<&mut Pair> = pairs.iter_mut().flatten().collect();
     let offset = order.pause_ms * 1_000 / pairs.len().max(1) as u64;
     let begun = pairs.iter_mut().zip(0..).map(|(pair, place): (_, u64)| {
@@ -98,10 +108,16 @@ fn spaced_turn(pairs: &mut [Option<Pair>], order: &Order, cells: &mut [Cell]) ->
         pair.begin_blocks(&[delayed])
     });
     let begun = begun.collect::<Result<Vec<_>>>()?;
-    let turns = pairs.iter_mut().zip(begun).map(|(pair, used)| pair.end_blocks(used));
-    let turns = turns.collect::<Result<Vec<_>>>()?;
-    cells.iter_mut().zip(turns.into_iter().flatten()).for_each(|(cell, turn)| cell.turns.push(turn));
-    Ok(())
+    let turns: Vec<_> = pairs.iter_mut().zip(begun).map(|(pair, used)| pair.end_blocks(used)).collect();
+    let mut failure = Ok(());
+    for (cell, turn) in cells.iter_mut().zip(turns) {
+        match turn.with_context(|| told(order)) {
+            Ok(turn) if cell.turns.len() == round => cell.turns.extend(turn),
+            Ok(_) => {}
+            Err(error) => failure = failure.and(Err(error)),
+        }
+    }
+    failure
 }
 
 /// Cells without any complete turn have no row.

@@ -14,7 +14,7 @@ use cara_bench_ends::clock;
 use cara_bench_ends::{Pin, pin};
 
 /// How long all nodes may take to join.
-const WITHIN_S: u64 = 90;
+const WITHIN_S: u64 = 240;
 /// How long nothing happens before memory is looked at.
 const REST: Duration = Duration::from_millis(500);
 
