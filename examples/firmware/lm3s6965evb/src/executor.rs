@@ -23,11 +23,11 @@ pub fn run(first: impl FnOnce(Spawner)) -> ! {
     first(executor.spawner());
     loop {
         #[cfg(feature = "faults")]
-        let began = cara_embassy::now();
+        let turn = crate::faults::turn();
         // SAFETY: called here only, and not from within itself: `run` does not return, and `EXECUTOR` is taken once.
         unsafe { executor.poll() };
         #[cfg(feature = "faults")]
-        crate::faults::turned(began);
+        crate::faults::turned(turn);
         cortex_m::interrupt::disable();
         // An interrupt that comes after this look still ends the wait, and runs when interrupts are on again.
         if !WOKEN.load(Ordering::Acquire) {

@@ -121,10 +121,16 @@ pub async fn starve() -> ! {
     hang()
 }
 
-/// A turn of the executor has ended. Those in which nobody wants the vehicle to drive hold nothing up: the longest of all are
-/// those of a proof, on a link that is not live yet.
-pub(crate) fn turned(began: Instant) {
-    if DRIVING.lasts_beyond(began) {
+/// A turn of the executor begins; when, if somebody wants the vehicle to drive. Other turns hold nothing up: the longest of
+/// all are those of a proof, on a link that is not live yet, and the one that reads all that comes with a new link.
+pub(crate) fn turn() -> Option<Instant> {
+    let now = now();
+    DRIVING.lasts_beyond(now).then_some(now)
+}
+
+/// That turn has ended.
+pub(crate) fn turned(began: Option<Instant>) {
+    if let Some(began) = began {
         let turn = now().since(began);
         Record::change(|record| record.turn = record.turn.max(turn));
     }

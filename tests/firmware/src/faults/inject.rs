@@ -69,8 +69,9 @@ impl Desk {
             Failing::Wire(Way::ToBoard) | Failing::Cable => self.link_cut(kind.failing, number, dice),
             Failing::Board { asked, reason } => self.board_fails(asked, reason, dice),
         };
-        let stop = stop.with_context(|| format!("{}, number {number}", kind.name))?;
-        stop.check(&self.constants)?;
+        let which = || format!("{}, number {number}", kind.name);
+        let stop = stop.with_context(which)?;
+        stop.check(&self.constants).with_context(which)?;
         Ok(stop)
     }
 
