@@ -125,7 +125,12 @@ pub(crate) fn run(options: &Options) -> Result<()> {
         let (experiment, busy) = (experiment.name().to_owned(), ratio(busy.end()));
         eprintln!("{experiment}: {seconds} s, {:.0} % of the CPUs in use", busy * 100.0);
         match outcome {
-            Err(error) if !was_stopped() => failures.push(format!("{experiment}: {error:#}")),
+            Err(error) if !was_stopped() => {
+                let failure = format!("{experiment}: {error:#}");
+                eprintln!("{failure}");
+                results.run.notes.push(failure.clone());
+                failures.push(failure);
+            }
             _ => {}
         }
         results.run.experiments.push(Done { experiment, is_complete, seconds, busy });
@@ -136,7 +141,6 @@ pub(crate) fn run(options: &Options) -> Result<()> {
         write(&results, options.json.as_deref())?;
     }
     results.run.is_complete = !is_stopped() && failures.is_empty() && options.only.is_empty();
-    results.run.notes.extend(failures.iter().cloned());
     results.goals = goals::of(&results);
     write(&results, options.json.as_deref())?;
     table::show(&results);

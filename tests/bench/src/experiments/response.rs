@@ -45,6 +45,7 @@ fn unless_stopped(outcome: Result<()>) -> Result<()> {
 pub(super) fn turns(group: &Group, cells: &mut Cells, what: &str) -> Result<()> {
     let bar = Progress::new(what, group.rounds as usize * group.orders.len());
     let mut pairs = start(&group.peers, group.setting)?;
+    connect(group, &mut pairs)?;
     *cells = group.orders.iter().map(|_| pairs.iter().map(|_| Cell::default()).collect()).collect();
     let mut outcome = Ok(());
     for round in 0..group.rounds as usize {
@@ -71,6 +72,20 @@ pub(super) fn start(contenders: &[Contender], setting: Setting) -> Result<Vec<Op
         false => Ok(None),
     };
     side_by_side(contenders.iter().collect(), contenders.len(), start).into_iter().collect()
+}
+
+/// All pairs connect and warm up at the same time, before anything counts: none does while another is measured.
+fn connect(group: &Group, pairs: &mut [Option<Pair>]) -> Result<()> {
+    let callers = group.orders.iter().map(|order| order.callers).max().unwrap_or(1);
+    let chars = group.orders.iter().map(|order| order.chars).min().unwrap_or(1);
+    let order = Order { chars, callers, calls_per_caller: 1, pause_ms: 0, delay_us: 0 };
+    let connect = |(contender, pair): (&Contender, &mut Option<Pair>)| {
+        let Some(running) = pair else { return Ok(()) };
+        contender.tolerate(running.block(&order).with_context(|| told(&order)))?;
+        pair.take_if(|_| !contender.works());
+        Ok(())
+    };
+    side_by_side(group.peers.iter().zip(pairs).collect(), group.peers.len(), connect).into_iter().collect()
 }
 
 /// Who missed a turn of this cell gets no further one, so that the turns of a cell are the first ones of the floor's.
