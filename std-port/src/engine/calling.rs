@@ -114,7 +114,8 @@ impl<T: Send + 'static> Engine<T> {
         begun: Begun<'_>,
         parameters: &mut ParametersView,
     ) -> Result<(), Error> {
-        let Begun { mut state, mut turn, id, mut now, deadline } = begun;
+        let Begun { mut state, mut turn, id, now: asked, deadline } = begun;
+        let mut now = asked;
         loop {
             // The reply may have come through another thread before this one took the lead.
             if let Some(outcome) = state.take_outcome(id) {
@@ -133,7 +134,7 @@ impl<T: Send + 'static> Engine<T> {
                 (state, now) = self.lead(link, state, &mut own, now, deadline);
                 if let Some(result) = own.result {
                     state.forget(id);
-                    self.leave_with_reply(now, link, state, turn);
+                    self.leave_with_reply(asked, now, link, state, turn);
                     return result;
                 }
             } else {
@@ -216,9 +217,17 @@ impl<T: Send + 'static> Engine<T> {
         self.settle(link, guard);
     }
 
-    /// The same for a leader who has had its reply: if its calls follow each other at once, it keeps the link.
-    fn leave_with_reply(&self, now: Instant, link: &Arc<LinkCell>, mut guard: MutexGuard<'_, LinkState>, turn: Turn) {
-        let keeps = self.may_keep(now, &mut guard);
+    /// The same for a leader who has had its reply to what it asked: if its calls follow each other at once, it keeps the
+    /// link.
+    fn leave_with_reply(
+        &self,
+        asked: Instant,
+        now: Instant,
+        link: &Arc<LinkCell>,
+        mut guard: MutexGuard<'_, LinkState>,
+        turn: Turn,
+    ) {
+        let keeps = self.may_keep(asked, now, &mut guard);
         let LinkState { reader, waiters, .. } = &mut *guard;
         match keeps {
             true => reader.keep(turn, || pass_lead(waiters)),

@@ -1,10 +1,10 @@
 //! A link that its caller keeps from one call to the next.
 //!
 //! Taking a link out of the epoll set before a call and putting it back afterwards costs more than all of the protocol's
-//! own work. A caller whose calls follow each other at once leaves it out, and the clock puts it back when no further call
-//! has come within [`LOOK`], so after twice that time at most. Meanwhile nobody reads what the peer sends of its own
-//! accord: keep-alives and emergencies come as datagrams as well, and a peer that calls here is not kept waiting, since
-//! its link is not kept.
+//! own work. A caller whose calls follow each other at once, however long a reply takes, leaves it out, and the clock puts
+//! it back when no further call has come within [`LOOK`], so after twice that time at most. Meanwhile nobody reads what
+//! the peer sends of its own accord: keep-alives and emergencies come as datagrams as well, and a peer that calls here is
+//! not kept waiting, since its link is not kept.
 
 use std::sync::Arc;
 
@@ -15,10 +15,10 @@ use super::staying::LOOK;
 use super::{Engine, lock};
 
 impl<T: Send + 'static> Engine<T> {
-    /// Whether a caller who has just had its reply keeps the link.
-    pub(super) fn may_keep(&self, now: Instant, state: &mut LinkState) -> bool {
+    /// Whether a caller who has just had its reply to what it asked keeps the link.
+    pub(super) fn may_keep(&self, asked: Instant, now: Instant, state: &mut LinkState) -> bool {
         let before = state.replied_at.replace(now);
-        let at_once = before.is_some_and(|before| now < before + LOOK);
+        let at_once = before.is_some_and(|before| asked < before + LOOK);
         at_once
             && !state.is_called
             && !state.is_paused()

@@ -66,6 +66,12 @@ impl Watch {
     }
 }
 
+/// The same moment for all units that share a clock, so that it wakes once for all of them.
+fn next_look(now: Instant) -> Instant {
+    let every = LOOK.as_micros();
+    Instant::from_micros((now.as_micros() / every + 1) * every)
+}
+
 impl<T: Send + 'static> Engine<T> {
     /// Waits on `link` for more calls, as long as they come and are quick, and another thread looks after the rest.
     pub(super) fn stay(&self, link: &Arc<LinkCell>, worker: &mut Worker) {
@@ -199,7 +205,7 @@ impl<T: Send + 'static> Engine<T> {
             return Instant::FAR_FUTURE;
         }
         self.watch.go_on();
-        now + LOOK
+        next_look(now)
     }
 
     /// Takes the lead from threads whose handlers take long; whether others may soon take as long.

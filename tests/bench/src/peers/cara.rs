@@ -1,5 +1,8 @@
-//! CARA through its public API, discovery on: a passive m_unit that echoes and takes, main m_units that call it, and
-//! the s_units of distribution 2. Both ends read the string as `&str`.
+//! CARA through its public API, discovery on: a passive m_unit that echoes and takes, a main m_unit that calls it,
+//! s_units that call beside it, and those of distribution 2. Both ends read the string as `&str`.
+//!
+//! Further callers are s_units, which have a link to the passive m_unit and to nobody else, and share threads. Each
+//! m_unit of a fleet connects with each other one: 64 would have 2,016 links among themselves.
 
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
@@ -29,7 +32,7 @@ pub(crate) type Text = Parameters<PARAMETERS_BYTES>;
 
 /// How callers share links. All but [`Secured`](Self::Secured) are in plain mode.
 pub(crate) enum Cara {
-    /// Each caller is an m_unit of its own.
+    /// Each caller is a unit of its own: the first one the main m_unit, the others s_units.
     LinkEach,
     /// As `LinkEach`, with keys.
     Secured,
@@ -46,6 +49,8 @@ const FIRST_CALLER: u32 = 2;
 /// The ID number of the first of the further nodes of distribution 2.
 const FIRST_FURTHER: u32 = 100;
 const FURTHER: u32 = 5;
+/// What the ID numbers of callers that are s_units have more than the callers' own.
+const FIRST_UNIT: u32 = 200;
 
 /// Links that do nothing but keep alive, for [`Cara::AmongIdle`].
 const IDLE_LINKS: usize = 1_000;
@@ -86,6 +91,10 @@ fn main_name(id: u32) -> String {
     format!("main-{id}")
 }
 
+fn caller_name(id: u32) -> String {
+    format!("caller-{id}")
+}
+
 fn further_name(number: u32) -> String {
     format!("further-{number}")
 }
@@ -96,12 +105,14 @@ fn draw_keys(place: &Place) -> Result<tempfile::TempDir> {
     let mut keys = FleetKeys::draw(Fleet(place.run))?;
     let passive = Identity::m_unit("passive", 1)?;
     keys.add(&passive, &[])?;
-    for id in FIRST_CALLER..FIRST_CALLER + CALLERS {
+    let ids = FIRST_CALLER..FIRST_CALLER + CALLERS;
+    for id in ids.clone() {
         keys.add(&Identity::m_unit(&main_name(id), id)?, &[])?;
     }
-    for number in 0..FURTHER {
-        let further = Identity::s_unit(&further_name(number), FIRST_FURTHER + number)?;
-        keys.add(&further, std::slice::from_ref(&passive))?;
+    let callers = ids.map(|id| (caller_name(id), FIRST_UNIT + id));
+    let further = (0..FURTHER).map(|number| (further_name(number), FIRST_FURTHER + number));
+    for (name, id) in callers.chain(further) {
+        keys.add(&Identity::s_unit(&name, id)?, std::slice::from_ref(&passive))?;
     }
     Store::create(folder.path(), keys)?.save()?;
     Ok(folder)
@@ -124,6 +135,14 @@ impl Cara {
         let system = builder.constraints(constraints).build_system()?;
         system.start()?;
         Ok(system)
+    }
+
+    fn unit(&self, place: &Place, address: &str, name: &str, id: u32, threads: Option<Threads>) -> Result<Unit> {
+        let builder = Unit::builder(name, id, "passive", 1)?;
+        let builder = self.keyed(builder, place, address, &Identity::s_unit(name, id)?);
+        let builder = threads.iter().fold(builder, Builder::threads);
+        let constraints = Constraints { message_size: MESSAGE_BYTES, maximum_nodes: 1, ..Constraints::M_UNIT };
+        Ok(builder.constraints(constraints).build_unit()?)
     }
 }
 
@@ -169,38 +188,40 @@ impl Peer for Cara {
 
     fn connect(&self, place: &Place, address: &str) -> Result<Box<dyn Caller>> {
         static NEXT: AtomicU32 = AtomicU32::new(FIRST_CALLER);
-        let new = || {
-            // Where a pair has several client processes, each has one caller.
-            let id = NEXT.fetch_add(1, Ordering::Relaxed) + place.client;
-            self.system(place, address, &main_name(id), id)
-        };
-        let main = match self {
-            Self::LinkEach | Self::Secured | Self::AmongIdle => new()?,
+        let number = NEXT.fetch_add(1, Ordering::Relaxed);
+        // Where a pair has several client processes, each has one caller.
+        let id = number + place.client;
+        match self {
             Self::OneLink(shared) => {
                 let mut shared = shared.lock().unwrap_or_else(PoisonError::into_inner);
                 let main = match shared.take() {
                     Some(main) => main,
-                    None => new()?,
+                    None => self.system(place, address, &main_name(id), id)?,
                 };
-                shared.insert(main).clone()
+                Echo::of_system(shared.insert(main).clone())
             }
-        };
-        let failures = Failures::watch(main.events());
-        let passive = found(|| main.m_unit("passive"))?;
-        Ok(Box::new(Echo { _kept: Kept::Main(main), passive, parameters: parameters()?, failures }))
+            _ if number == FIRST_CALLER => Echo::of_system(self.system(place, address, &main_name(id), id)?),
+            _ => {
+                let threads = Some(shared_threads()?);
+                Echo::of_unit(self.unit(place, address, &caller_name(id), FIRST_UNIT + id, threads)?)
+            }
+        }
     }
 
     fn connect_further(&self, place: &Place, address: &str, number: u32) -> Result<Box<dyn Caller>> {
-        let (name, id) = (further_name(number), FIRST_FURTHER + number);
-        let builder = Unit::builder(&name, id, "passive", 1)?;
-        let builder = self.keyed(builder, place, address, &Identity::s_unit(&name, id)?);
-        let constraints = Constraints { message_size: MESSAGE_BYTES, maximum_nodes: 1, ..Constraints::M_UNIT };
-        let unit = builder.constraints(constraints).build_unit()?;
-        let failures = Failures::watch(unit.events());
-        unit.start()?;
-        let passive = found(|| unit.manager())?;
-        Ok(Box::new(Echo { _kept: Kept::Further(unit), passive, parameters: parameters()?, failures }))
+        Echo::of_unit(self.unit(place, address, &further_name(number), FIRST_FURTHER + number, None)?)
     }
+}
+
+/// The threads of all callers that are s_units.
+fn shared_threads() -> Result<Threads> {
+    static SHARED: Mutex<Option<Threads>> = Mutex::new(None);
+    let mut shared = SHARED.lock().unwrap_or_else(PoisonError::into_inner);
+    let threads = match shared.take() {
+        Some(threads) => threads,
+        None => Threads::new()?,
+    };
+    Ok(shared.insert(threads).clone())
 }
 
 /// An argument and result with one text.
@@ -243,7 +264,7 @@ impl Failures {
 /// Keeps the unit of a caller.
 enum Kept {
     Main(#[expect(dead_code, reason = "kept, not read")] CommunicationSystem),
-    Further(#[expect(dead_code, reason = "kept, not read")] Unit),
+    Unit(#[expect(dead_code, reason = "kept, not read")] Unit),
 }
 
 struct Echo {
@@ -251,6 +272,21 @@ struct Echo {
     passive: Node,
     parameters: Box<Text>,
     failures: Failures,
+}
+
+impl Echo {
+    fn of_system(main: CommunicationSystem) -> Result<Box<dyn Caller>> {
+        let failures = Failures::watch(main.events());
+        let passive = found(|| main.m_unit("passive"))?;
+        Ok(Box::new(Self { _kept: Kept::Main(main), passive, parameters: parameters()?, failures }))
+    }
+
+    fn of_unit(unit: Unit) -> Result<Box<dyn Caller>> {
+        let failures = Failures::watch(unit.events());
+        unit.start()?;
+        let passive = found(|| unit.manager())?;
+        Ok(Box::new(Self { _kept: Kept::Unit(unit), passive, parameters: parameters()?, failures }))
+    }
 }
 
 impl Caller for Echo {
