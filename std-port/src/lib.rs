@@ -37,6 +37,7 @@ mod lease;
 #[cfg(feature = "metrics")]
 pub mod metrics;
 mod my_function_list;
+mod occupancy;
 mod peer;
 pub mod pool;
 pub mod storage;

@@ -10,18 +10,19 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError, RwLock};
 use std::thread::JoinHandle;
 
 use cara_core::error::Error;
-use cara_core::time::Instant;
+use cara_core::time::{Duration, Instant};
 
 use crate::clock::Clock;
 use crate::engine::workers::Worker;
 use crate::engine::{lock, read, system_refused, write};
+use crate::occupancy::Occupancy;
 use crate::sys::datagram::Socket;
 use crate::sys::epoll::{Epoll, Events, Interest, Ready, Waker};
 use crate::timers::Timers;
 
 /// Threads of the pool to begin with.
 const FIRST_WORKERS: usize = 2;
-/// Most threads of a pool.
+/// Most threads of a pool, but for the one that the clock starts when all of these are stuck in handlers.
 const MOST_WORKERS: usize = 14;
 /// Longest datagram that counts, and one byte more.
 const DATAGRAM: usize = 2048;
@@ -32,7 +33,7 @@ const CLOCK_EVENTS: usize = 64;
 /// Bits of a token below the unit's number: what the event is about.
 const UNIT_SHIFT: u32 = 48;
 
-/// Threads that several units of one process share: at most 15, however many units there are.
+/// Threads that several units of one process share: at most 16, however many units there are.
 ///
 /// For processes with many s_units, such as simulations of a fleet and gateways. They share fate as well: a handler
 /// runs on a thread of all, and where 14 handlers wait, calls of all units wait. Units whose handlers call each other
@@ -158,6 +159,7 @@ pub(crate) struct Crew {
     /// Threads of the pool that wait for something to do.
     idle: AtomicUsize,
     workers: AtomicUsize,
+    pub(crate) occupancy: Occupancy,
     /// Calls that the pool has read and served, to tell a few busy links from many.
     pub(crate) served: AtomicUsize,
     started: OnceLock<Result<(), Error>>,
@@ -191,6 +193,7 @@ impl Crew {
             ready: Mutex::new(VecDeque::new()),
             idle: AtomicUsize::new(0),
             workers: AtomicUsize::new(0),
+            occupancy: Occupancy::new(),
             served: AtomicUsize::new(0),
             started: OnceLock::new(),
             threads: Mutex::new(Vec::new()),
@@ -250,7 +253,20 @@ impl Crew {
 
     /// Whether a call may be run: another thread goes on reading.
     pub(crate) fn may_run(self: &Arc<Self>) -> bool {
-        self.has_idle() || self.start_worker()
+        self.has_idle() || self.start_worker(MOST_WORKERS)
+    }
+
+    /// Whether a quick handler may be run while nobody waits: the clock can help if it takes long.
+    pub(crate) fn may_run_quickly(&self) -> bool {
+        self.occupancy.leaves_one(MOST_WORKERS)
+    }
+
+    /// Starts a thread if all have been inside handlers for `limit`; whether that may come to be.
+    pub(crate) fn relieve(self: &Arc<Self>, now: Instant, limit: Duration) -> bool {
+        if self.has_idle() {
+            return false;
+        }
+        !self.occupancy.is_stuck(now, limit) || self.start_worker(MOST_WORKERS + 1)
     }
 
     /// Takes a unit out. Unless a thread of the crew does it itself, nobody is inside the unit any more when it returns.
@@ -270,12 +286,12 @@ impl Crew {
             let clock = std::thread::Builder::new().name("cara-clock".into());
             let clock = clock.spawn(move || crew.keep_time()).map_err(system_refused)?;
             lock(&self.threads).push(clock);
-            if (0..FIRST_WORKERS).all(|_| self.start_worker()) { Ok(()) } else { Err(Error::Network) }
+            if (0..FIRST_WORKERS).all(|_| self.start_worker(MOST_WORKERS)) { Ok(()) } else { Err(Error::Network) }
         })
     }
 
-    fn start_worker(self: &Arc<Self>) -> bool {
-        let started = self.workers.fetch_add(1, Ordering::AcqRel) < MOST_WORKERS;
+    fn start_worker(self: &Arc<Self>, most: usize) -> bool {
+        let started = self.workers.fetch_add(1, Ordering::AcqRel) < most;
         let crew = self.clone();
         let thread = std::thread::Builder::new().name("cara-pool".into());
         match started.then(|| thread.spawn(move || crew.work())) {
@@ -332,6 +348,7 @@ impl Crew {
             self.idle.fetch_add(1, Ordering::AcqRel);
             let waited = self.epoll.wait(&mut events, None);
             self.idle.fetch_sub(1, Ordering::AcqRel);
+            self.occupancy.turn();
             if let Err(error) = waited {
                 tracing::error!(%error, "waiting for links failed");
                 return;

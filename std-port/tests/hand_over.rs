@@ -1,7 +1,7 @@
 //! The hand-over of a link's lead, in every order in which threads can run it.
 //!
-//! `Reader` is the port's own; around it stand the few steps of `calling.rs`, `keeping.rs`, `workers.rs` and `staying.rs`
-//! that it is used in, with a queue in the place of the socket and no time-outs: a wake-up that is lost blocks for ever, and the
+//! `Reader` and `Watch` are the port's own; around them stand the few steps of `calling.rs`, `keeping.rs`, `workers.rs`,
+//! `staying.rs` and `threads.rs` that they are used in, with a queue in the place of the socket and no time-outs: a wake-up that is lost blocks for ever, and the
 //! model reports that. With `--cfg cara_planted="lost_wakeup"` it must fail.
 //!
 //! ```text
@@ -12,14 +12,19 @@
 #[allow(dead_code, reason = "the file is included for the type it defines; not every function is modelled")]
 #[path = "../src/engine/reader.rs"]
 mod reader;
+#[allow(dead_code, reason = "as above")]
+#[path = "../src/engine/watch.rs"]
+mod watch;
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use cara_core::time::{Duration, Instant};
+use loom::sync::atomic::{self, AtomicUsize};
 use loom::sync::{Arc, Condvar, Mutex, MutexGuard};
 use loom::thread;
 use reader::{Reader, Turn};
+use watch::Watch;
 
 /// What the stream brings: the reply to a call of this unit, or a call of the peer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -533,5 +538,94 @@ fn a_caller_and_a_thread_that_stays_share_a_link() {
         link.close();
         staying.join().unwrap();
         clock.join().unwrap();
+    });
+}
+
+/// The pool, without links: threads that run handlers though nobody waits, and the clock that stands in for them.
+#[derive(Default)]
+struct Pool {
+    calls: Mutex<VecDeque<Handler>>,
+    idle: AtomicUsize,
+    watch: Watch,
+    flags: Mutex<Flags>,
+    changed: Condvar,
+}
+
+#[derive(Default)]
+struct Flags {
+    /// The clock is to look.
+    told: bool,
+    /// Handlers need not wait any more.
+    released: bool,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Handler {
+    /// Has been quick, and waits for the other one now.
+    Waits,
+    Releases,
+}
+
+impl Pool {
+    /// `Crew::work`, for the calls that there are.
+    fn work(&self) {
+        loop {
+            self.idle.fetch_add(1, Ordering::SeqCst);
+            let call = self.calls.lock().unwrap().pop_front();
+            self.idle.fetch_sub(1, Ordering::SeqCst);
+            let Some(call) = call else { return };
+            // `Engine::may_run_at_once`.
+            if self.idle.load(Ordering::SeqCst) == 0 && self.watch.begins() {
+                self.flags.lock().unwrap().told = true;
+                self.changed.notify_all();
+            }
+            self.run(call);
+        }
+    }
+
+    fn run(&self, call: Handler) {
+        let mut flags = self.flags.lock().unwrap();
+        flags.released |= call == Handler::Releases;
+        self.changed.notify_all();
+        while !flags.released {
+            flags = self.changed.wait(flags).unwrap();
+        }
+    }
+
+    /// `Engine::watch_links`: looks when it is told to, and until it finds that nothing has happened.
+    fn clock(&self) {
+        let mut flags = self.flags.lock().unwrap();
+        while !flags.released {
+            if !std::mem::take(&mut flags.told) {
+                flags = self.changed.wait(flags).unwrap();
+                continue;
+            }
+            drop(flags);
+            let mut used = true;
+            while used {
+                used = self.watch.look();
+                let waiting = !self.calls.lock().unwrap().is_empty();
+                if waiting && self.idle.load(Ordering::SeqCst) == 0 {
+                    // `Crew::relieve`: what it starts is this thread here.
+                    self.work();
+                }
+            }
+            flags = self.flags.lock().unwrap();
+        }
+    }
+}
+
+/// All threads are inside handlers that wait for a call which nobody has read: the clock starts one that reads it.
+#[test]
+fn the_clock_helps_when_all_threads_are_inside_handlers() {
+    check(2, || {
+        let pool = Arc::new(Pool::default());
+        pool.calls.lock().unwrap().extend([Handler::Waits, Handler::Waits, Handler::Releases]);
+        let workers = [(); 2].map(|()| {
+            let pool = pool.clone();
+            thread::spawn(move || pool.work())
+        });
+        pool.clock();
+        workers.into_iter().for_each(|worker| worker.join().unwrap());
     });
 }

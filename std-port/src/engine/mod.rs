@@ -22,6 +22,7 @@ mod state_gate;
 mod staying;
 mod tables;
 mod telling;
+mod watch;
 pub(crate) mod workers;
 
 pub(crate) use accounts::pairs;
@@ -34,7 +35,7 @@ pub(crate) use keys::Keys;
 pub(crate) use membership::NodeCell;
 pub(crate) use workers::arena_bytes;
 
-use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
+use std::sync::atomic::{self, AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{SyncSender, TrySendError};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 
@@ -102,7 +103,7 @@ pub(crate) struct Engine<T: 'static> {
     /// Links that are left to a caller who calls back to back.
     kept: Mutex<Vec<LinkId>>,
     /// Whether the clock looks at these.
-    watch: staying::Watch,
+    watch: watch::Watch,
     interfaces: Mutex<interfaces::InterfaceWatch>,
     pub(crate) keys: Keys,
     /// When the file with the keys is looked at.
@@ -184,7 +185,7 @@ impl<T: Send + 'static> Engine<T> {
             largest_function: AtomicUsize::new(0),
             stays: Mutex::new(Vec::new()),
             kept: Mutex::new(Vec::new()),
-            watch: staying::Watch::default(),
+            watch: watch::Watch::default(),
             interfaces: Mutex::default(),
             keys: parts.keys,
             watched_keys: Mutex::new(keys::Watched::new(born)),

@@ -38,7 +38,9 @@ impl<T: Send + 'static> Engine<T> {
         call: &Call,
         arguments: &mut ParametersView,
     ) -> (MutexGuard<'l, LinkState>, Instant) {
+        let occupied = self.crew().occupancy.enter();
         let result = self.run(link, call, arguments);
+        drop(occupied);
         let now = self.now();
         let mut state = link.lock();
         state.quick = now.since(began) < QUICK;
@@ -58,7 +60,7 @@ impl<T: Send + 'static> Engine<T> {
         if state.is_paused() && !state.session.has_next_call() {
             self.feed(self.now(), link, &mut state, &mut [], None, None);
         }
-        if state.session.has_next_call() && self.may_run() {
+        if state.session.has_next_call() && self.may_run(state.quick) {
             next = self.with(link, &mut state, |session, cx| session.next_call(cx, arguments));
         }
         if state.session.has_next_call() {

@@ -6,7 +6,7 @@
 //! lead away ([`Engine::watch_links`]), so that other threads read on; until then that link's stream waits, but not its
 //! datagrams, which carry emergencies and keep-alives as well, and no other link.
 
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::Ordering;
 use std::sync::{Arc, MutexGuard};
 
 use cara_core::error::CloseReason;
@@ -32,40 +32,6 @@ const RELIEF: Duration = Duration::from_millis(1);
 /// How often the clock looks at links that are led or kept, as long as anything happens there.
 pub(super) const LOOK: Duration = Duration::from_millis(2);
 
-/// Whether the clock looks at links that are read, or kept, without its being told of each call.
-#[derive(Debug, Default)]
-pub(super) struct Watch {
-    /// Something has happened since it last looked.
-    used: AtomicBool,
-    looking: AtomicBool,
-}
-
-impl Watch {
-    /// Something happens on a link. `true` where the clock must be told to look again.
-    pub(super) fn begins(&self) -> bool {
-        self.used.store(true, Ordering::SeqCst);
-        !self.looking.load(Ordering::SeqCst) && !self.looking.swap(true, Ordering::SeqCst)
-    }
-
-    /// Whether anything has happened since the last look. If not, whatever happens next tells the clock anew.
-    fn look(&self) -> bool {
-        self.looking.store(false, Ordering::SeqCst);
-        let used = self.used.swap(false, Ordering::SeqCst);
-        if used {
-            self.go_on();
-        }
-        used
-    }
-
-    fn go_on(&self) {
-        self.looking.store(true, Ordering::SeqCst);
-    }
-
-    fn is_on(&self) -> bool {
-        self.looking.load(Ordering::SeqCst)
-    }
-}
-
 /// The same moment for all units that share a clock, so that it wakes once for all of them.
 fn next_look(now: Instant) -> Instant {
     let every = LOOK.as_micros();
@@ -76,6 +42,7 @@ impl<T: Send + 'static> Engine<T> {
     /// Waits on `link` for more calls, as long as they come and are quick, and another thread looks after the rest.
     pub(super) fn stay(&self, link: &Arc<LinkCell>, worker: &mut Worker) {
         let Some(turn) = self.begin_stay(link) else { return };
+        let _occupied = self.crew().occupancy.enter();
         while let Some((call, began)) = self.await_call(link, turn, worker) {
             let (state, now) = self.serve_one(began, link, &call, &mut worker.arguments);
             if state.session.has_next_call() || state.is_paused() {
@@ -200,7 +167,7 @@ impl<T: Send + 'static> Engine<T> {
         }
         let now = self.now();
         let used = self.watch.look();
-        let busy = self.relieve_stays(now);
+        let busy = self.relieve_stays(now) | self.crew().relieve(now, RELIEF);
         if !self.look_at_kept(now) && !busy && !used {
             return Instant::FAR_FUTURE;
         }

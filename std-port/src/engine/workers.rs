@@ -1,7 +1,8 @@
 //! What a thread of the pool does for a unit: it reads the link that is ready, and runs the calls that it read.
 //!
-//! There is always a thread that reads: one that is about to run a handler starts another if none is idle, up to a
-//! limit; beyond it calls wait in their sessions until a handler returns.
+//! There is always a thread that reads, or comes back to: one that is about to run a handler starts another if none is
+//! idle, up to a limit; beyond it calls wait in their sessions until a handler returns. Before a handler that has been
+//! quick it starts none: the clock does, should it take long after all.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -42,8 +43,21 @@ impl Worker {
 
 impl<T: Send + 'static> Engine<T> {
     /// Whether a call may be run: another thread goes on reading.
-    pub(super) fn may_run(&self) -> bool {
-        self.crew().may_run()
+    pub(super) fn may_run(&self, quick: bool) -> bool {
+        self.may_run_at_once(quick) || self.crew().may_run()
+    }
+
+    /// Whether a call may be run without another thread being started: one waits, or the handler has been quick, and the
+    /// clock looks whether it still is.
+    fn may_run_at_once(&self, quick: bool) -> bool {
+        if self.crew().has_idle() {
+            return true;
+        }
+        let may = quick && self.crew().may_run_quickly();
+        if may {
+            self.begin_watch();
+        }
+        may
     }
 
     /// Bytes that the parameters of a served call may need: of a message, or of the largest function.
@@ -93,8 +107,9 @@ impl<T: Send + 'static> Engine<T> {
                     return call;
                 }
             };
-            // Where nobody else waits to read on, the call waits in the session: most of what is read is none.
-            let arguments = if call.is_none() && self.crew().has_idle() { Some(&mut *worker.arguments) } else { None };
+            // Where nobody else goes on reading, the call waits in the session: most of what is read is none.
+            let at_once = call.is_none() && self.may_run_at_once(state.quick);
+            let arguments = if at_once { Some(&mut *worker.arguments) } else { None };
             let bytes = worker.buffer.get_mut(..count).unwrap_or_default();
             call = call.or(self.feed(self.now(), link, state, bytes, arguments, None));
             // A short read has emptied the stream; a hang-up shows in one more.

@@ -127,6 +127,44 @@ fn a_slow_handler_delays_nobody_else() {
     });
 }
 
+/// Handlers that have been quick are run by threads that nobody stands in for; the clock starts one when all are inside.
+#[test]
+fn quick_handlers_that_all_get_slow_leave_a_thread_that_reads() {
+    const CALLERS: u32 = 5;
+    let fleet = fleet();
+    let manager = system(fleet).build_system().unwrap();
+    let gate = Arc::new(Gate::default());
+    let at_gate = gate.clone();
+    let work = service(move |number| {
+        if number == 1 {
+            at_gate.pass();
+        }
+        number
+    });
+    manager.my_function_list().add_function("work", &number(0), work).unwrap();
+    let units: Vec<_> =
+        (0..=CALLERS).map(|index| unit(&format!("agv{index}"), index, fleet).build_unit().unwrap()).collect();
+    let met: Vec<_> = units.iter().map(|unit| meet(&manager, unit)).collect();
+    let (last, callers) = met.split_last().unwrap();
+    let options = RequestOptions { timeout: Some(cara_std::Duration::from_secs(20)), ..Default::default() };
+    let call = |peer: &cara_std::Peer, argument| peer.block_request_with("work", &mut number(argument), &options);
+    std::thread::scope(|scope| {
+        let calls: Vec<_> = callers
+            .iter()
+            .map(|(_, peer)| {
+                scope.spawn(move || {
+                    (0..50).for_each(|_| assert_eq!(call(peer, 0), Ok(())));
+                    call(peer, 1)
+                })
+            })
+            .collect();
+        until("all slow handlers run", || gate.came() == CALLERS as usize);
+        assert_eq!(call(&last.1, 0), Ok(()), "another link");
+        gate.open();
+        calls.into_iter().for_each(|call| assert_eq!(call.join().unwrap(), Ok(())));
+    });
+}
+
 /// An emergency is served while a handler of each other class is busy.
 #[test]
 fn an_emergency_does_not_wait_for_other_handlers() {
