@@ -4,6 +4,7 @@
 use core::ops::Range;
 
 /// Copies slices of equal length; does nothing for others.
+#[inline]
 pub(crate) fn copy(from: &[u8], to: &mut [u8]) {
     if from.len() == to.len() {
         to.copy_from_slice(from);
@@ -17,6 +18,20 @@ pub(crate) fn are_same(one: &[u8], other: &[u8]) -> bool {
     one.len() == other.len()
         && words.iter().zip(other_words).all(same)
         && rest.iter().zip(other_rest).all(|(one, other)| one == other)
+}
+
+/// The bytes as text, if they are UTF-8.
+pub(crate) fn as_text(bytes: &[u8]) -> Option<&str> {
+    #[cfg(feature = "simd")]
+    let text = simdutf8::basic::from_utf8(bytes);
+    #[cfg(not(feature = "simd"))]
+    let text = core::str::from_utf8(bytes);
+    text.ok()
+}
+
+/// Whether the bytes are UTF-8. Most text is ASCII, which is found out in less time.
+pub(crate) fn is_text(bytes: &[u8]) -> bool {
+    (cfg!(not(feature = "simd")) && bytes.is_ascii()) || as_text(bytes).is_some()
 }
 
 /// Moves the bytes of `range` to the front; does nothing for a range that is not inside.

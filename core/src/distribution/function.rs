@@ -141,16 +141,19 @@ impl<'a> Signature<'a> {
     }
 
     /// What a caller must pass.
+    #[inline]
     pub fn arguments(&self) -> VariableSpecs<'a> {
         VariableSpecs::of_checked(self.behind_length().and_then(|(length, rest)| rest.get(length..)))
     }
 
     /// What a caller gets back.
+    #[inline]
     pub fn results(&self) -> VariableSpecs<'a> {
         VariableSpecs::of_checked(self.arguments().behind())
     }
 
     /// The length of the name, and what follows it.
+    #[inline]
     fn behind_length(&self) -> Option<(usize, &'a [u8])> {
         self.bytes.split_first().map(|(length, rest)| (usize::from(*length), rest))
     }
@@ -203,6 +206,7 @@ impl<'a> VariableSpecs<'a> {
         })
     }
 
+    #[inline]
     fn of_checked(bytes: Option<&'a [u8]>) -> Self {
         match bytes.and_then(<[u8]>::split_first) {
             Some((&left, rest)) => Self { left, rest },
@@ -211,6 +215,7 @@ impl<'a> VariableSpecs<'a> {
     }
 
     /// What follows the variables, none of which is read.
+    #[inline]
     fn behind(&self) -> Option<&'a [u8]> {
         (0..self.left).try_fold(self.rest, |rest, _| {
             let (&[_, length, _, _, _, _], rest) = rest.split_first_chunk()?;
@@ -244,6 +249,7 @@ impl<'a> Iterator for VariableSpecs<'a> {
 }
 
 impl<'a> RawSpec<'a> {
+    #[inline]
     fn split(bytes: &'a [u8]) -> Option<(Self, &'a [u8])> {
         let (&[kind, length], rest) = bytes.split_first_chunk::<2>()?;
         let (&size, rest) = rest.split_first_chunk::<4>()?;

@@ -43,6 +43,7 @@ pub enum Message<'b> {
 
 impl<'b> Message<'b> {
     /// Reads a message; `None` for anything that the format does not know.
+    #[inline]
     pub fn decode(bytes: &'b [u8]) -> Option<Self> {
         match *bytes.first()? {
             REQUEST => {
@@ -72,6 +73,7 @@ impl<'b> Message<'b> {
 }
 
 impl Put for ChunkWriter<'_> {
+    #[inline]
     fn put(&mut self, bytes: &[u8]) {
         ChunkWriter::put(self, bytes);
     }
@@ -98,6 +100,7 @@ pub struct RequestHeader {
 
 impl RequestHeader {
     /// The header's bytes.
+    #[inline]
     pub fn encode(&self) -> [u8; REQUEST_BYTES] {
         let flags = if self.wants_reply { WANTS_REPLY } else { 0 };
         let [s0, s1] = self.slot.0.to_le_bytes();
@@ -112,6 +115,7 @@ impl RequestHeader {
         ]
     }
 
+    #[inline]
     fn decode(bytes: &[u8; REQUEST_BYTES]) -> Option<Self> {
         let [_, flags, s0, s1, g0, g1, 0, 0, i0, i1, i2, i3, r0, r1, r2, r3, rest @ ..] = bytes else { return None };
         let [t0, t1, t2, t3, t4, t5, t6, t7, e0, e1, e2, e3, 0, 0, 0, 0] = rest else { return None };
@@ -155,6 +159,7 @@ fn answer(kind: u8, id: u32, status: Result<(), Error>) -> [u8; REPLY_BYTES] {
     [kind, code, index, 0, i0, i1, i2, i3, a0, a1, a2, a3, b0, b1, b2, b3]
 }
 
+#[inline]
 fn decode_reply(bytes: &[u8; REPLY_BYTES]) -> Option<(u32, Result<(), Error>)> {
     let &[_, code, index, 0, i0, i1, i2, i3, a0, a1, a2, a3, b0, b1, b2, b3] = bytes else { return None };
     let id = u32::from_le_bytes([i0, i1, i2, i3]);

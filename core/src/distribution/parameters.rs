@@ -303,14 +303,17 @@ impl ParametersView {
         Ok(())
     }
 
+    #[inline]
     pub(super) fn find(&self, name: &[u8]) -> Option<usize> {
         self.table.iter().take(self.len()).position(|entry| are_same(self.name_of(entry), name))
     }
 
+    #[inline]
     pub(super) fn named(&self, name: &[u8]) -> Option<Value<'_>> {
         self.find(name).and_then(|index| self.value_at(index))
     }
 
+    #[inline]
     pub(crate) fn value_at(&self, index: usize) -> Option<Value<'_>> {
         let entry = self.table.get(index)?;
         let start = entry.value_at as usize;
@@ -319,6 +322,7 @@ impl ParametersView {
     }
 
     /// Sets the value of the variable at `index` from bytes that were checked against its type and size.
+    #[inline]
     pub(crate) fn set_checked(&mut self, index: usize, bytes: &[u8]) {
         if let Some(target) = self.target(index) {
             target.set_checked(bytes);
@@ -333,6 +337,7 @@ impl ParametersView {
         Some(Target { index: index as u8, kind: entry.kind, size: entry.size, length: &mut entry.length, bytes })
     }
 
+    #[inline]
     fn name_of(&self, entry: &Entry) -> &[u8] {
         let end = entry.value_at as usize;
         self.bytes.get(end.saturating_sub(usize::from(entry.name_length))..end).unwrap_or_default()

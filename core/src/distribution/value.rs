@@ -5,7 +5,7 @@
 
 use core::fmt;
 
-use crate::bytes::copy;
+use crate::bytes::{as_text, copy};
 use crate::error::Error;
 
 pub use super::element::Element;
@@ -124,7 +124,7 @@ impl<'a> Value<'a> {
         if self.kind != Type::String {
             return None;
         }
-        core::str::from_utf8(self.bytes).ok()
+        as_text(self.bytes)
     }
 
     fn words(&self, kind: Type) -> impl Iterator<Item = [u8; 8]> + Clone + use<'a> {

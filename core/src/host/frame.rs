@@ -70,6 +70,7 @@ impl<'b> Frame<'b> {
     pub const ACKNOWLEDGEMENT: Self = Self::Confirm(&[]);
 
     /// Reads a frame's body. Any deviation from the format is a protocol error.
+    #[inline]
     pub fn parse(body: &'b [u8]) -> Result<Self, CloseReason> {
         let (&kind, rest) = body.split_first().ok_or(CloseReason::Protocol)?;
         match kind {
@@ -95,6 +96,7 @@ fn only_byte(rest: &[u8]) -> Result<u8, CloseReason> {
 }
 
 impl<'b> Chunk<'b> {
+    #[inline]
     fn parse(kind: u8, body_length: usize, rest: &'b [u8]) -> Result<Self, CloseReason> {
         let (&priority, rest) = rest.split_first().ok_or(CloseReason::Protocol)?;
         let priority = Priority::from_wire(priority).ok_or(CloseReason::Protocol)?;
@@ -174,6 +176,7 @@ pub struct Cut {
 }
 
 impl Cut {
+    #[inline]
     fn first_payload(self) -> usize {
         self.chunk.saturating_sub(FIRST_CHUNK_BYTES).saturating_sub(self.overhead)
     }
@@ -183,8 +186,12 @@ impl Cut {
     }
 
     /// Bytes on the wire of a message of `total` bytes.
+    #[inline]
     pub fn framed_length(self, total: usize) -> usize {
         let first = HEADER_BYTES.saturating_add(FIRST_CHUNK_BYTES).saturating_add(self.overhead);
+        if total <= self.first_payload() {
+            return total.saturating_add(first);
+        }
         let next = HEADER_BYTES.saturating_add(CHUNK_BYTES).saturating_add(self.overhead);
         let more = total.saturating_sub(self.first_payload()).div_ceil(self.next_payload());
         total.saturating_add(first).saturating_add(more.saturating_mul(next))
@@ -204,6 +211,7 @@ pub struct ChunkWriter<'b> {
 
 impl<'b> ChunkWriter<'b> {
     /// A writer of a message of `total` bytes into `out`, which must hold [`Cut::framed_length`] of them.
+    #[inline]
     pub fn new(out: &'b mut [u8], cut: Cut, priority: Priority, total: usize) -> Option<Self> {
         let out = out.get_mut(..cut.framed_length(total))?;
         let mut writer = Self { writer: Writer { out, position: 0 }, cut, priority, uncovered: total, room: 0 };
@@ -214,7 +222,19 @@ impl<'b> ChunkWriter<'b> {
     }
 
     /// Appends bytes of the message. What goes beyond the announced length is ignored.
-    pub fn put(&mut self, mut bytes: &[u8]) {
+    #[inline]
+    pub fn put(&mut self, bytes: &[u8]) {
+        match self.room.checked_sub(bytes.len()) {
+            Some(room) => {
+                self.writer.put(bytes);
+                self.room = room;
+            }
+            None => self.put_across(bytes),
+        }
+    }
+
+    /// The same for bytes that need another frame.
+    fn put_across(&mut self, mut bytes: &[u8]) {
         while !bytes.is_empty() {
             if self.room == 0 {
                 if self.uncovered == 0 {
@@ -230,6 +250,7 @@ impl<'b> ChunkWriter<'b> {
         }
     }
 
+    #[inline]
     fn open_frame(&mut self, first: u8, head: usize, payload: usize) {
         self.uncovered = self.uncovered.saturating_sub(payload);
         self.room = payload;
@@ -246,6 +267,7 @@ struct Writer<'b> {
 }
 
 impl Writer<'_> {
+    #[inline]
     fn put(&mut self, bytes: &[u8]) {
         let end = self.position.saturating_add(bytes.len());
         if let Some(place) = self.out.get_mut(self.position..end) {
@@ -260,6 +282,7 @@ impl Writer<'_> {
 }
 
 /// The first frame in `bytes`: its whole length, header included. `None` while the header is incomplete.
+#[inline]
 pub fn first_frame_length(bytes: &[u8]) -> Option<usize> {
     let header = bytes.first_chunk::<HEADER_BYTES>()?;
     Some(usize::from(u16::from_le_bytes(*header)).saturating_add(HEADER_BYTES))

@@ -234,6 +234,7 @@ impl<T: Send + 'static> Engine<T> {
             false => reader.leave(Some(turn), || pass_lead(waiters)),
         }
         if guard.reader.is_kept() {
+            self.take_out(link, &mut guard);
             self.watch_kept(link, &mut guard);
         }
         self.settle_at(now, link, guard);

@@ -60,6 +60,8 @@ pub(crate) struct LinkState {
     pub(crate) kept: bool,
     /// What the epoll set watches the stream for.
     pub(crate) registration: Registration,
+    /// It is not in the epoll set, for as long as it is watched for nothing.
+    pub(crate) is_out: bool,
     /// The connection is still being opened.
     pub(crate) connecting: bool,
     /// Bytes that were read and cannot be looked at yet, behind those that were.
@@ -144,6 +146,7 @@ impl LinkCell {
             replied_at: None,
             kept: false,
             registration: Registration { readable: true, writable: connecting },
+            is_out: false,
             connecting,
             leftover: Vec::new(),
             leftover_at: 0,

@@ -250,7 +250,12 @@ impl<T: Send + 'static> Engine<T> {
 
     /// The link's id is free for another link only when nothing here means the old one by it any more.
     fn link_ended(&self, link: &Arc<LinkCell>, reason: CloseReason) {
-        let _ = self.crew().epoll.remove(&link.stream);
+        {
+            let mut state = link.lock();
+            // Nobody puts it back.
+            state.is_out = false;
+            let _ = self.crew().epoll.remove(&link.stream);
+        }
         self.retire(link);
         if let Some(peer) = link.peer.get() {
             peer.leave(link, reason);

@@ -83,6 +83,7 @@ impl<T: Send + 'static> Engine<T> {
         let turn = state.reader.take_lead()?;
         stays.push(link.id);
         drop(stays);
+        self.take_out(link, &mut state);
         self.settle_at(now, link, state);
         Some(turn)
     }

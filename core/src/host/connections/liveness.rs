@@ -64,6 +64,7 @@ impl Liveness {
     }
 
     /// When to look again.
+    #[inline]
     pub fn deadline(&self) -> Instant {
         self.next_check.min(self.next_question)
     }

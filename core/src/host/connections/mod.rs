@@ -8,6 +8,7 @@ mod counters;
 mod liveness;
 mod receiver;
 mod sender;
+mod urgent;
 
 pub use counters::LinkCounter;
 pub use liveness::{Liveness, Look};
@@ -62,6 +63,7 @@ impl Place {
     }
 
     /// The same without its first `count` bytes.
+    #[inline]
     pub fn after(self, count: usize) -> Self {
         Self { start: self.start.saturating_add(count).min(self.end), ..self }
     }
@@ -186,6 +188,9 @@ impl<S: Storage, C: Seal> Link<S, C> {
         hold: bool,
         write: impl FnOnce(&mut ChunkWriter<'_>),
     ) -> Result<(), Error> {
+        if !hold && self.sender.takes_at_once(priority, total) {
+            return self.send_at_once(mailman, buffers, priority, total, write);
+        }
         if !self.sender.has_room(priority, total) {
             // What was held back may be in the way.
             self.flush(mailman, buffers).map_err(Error::Closed)?;
@@ -196,6 +201,23 @@ impl<S: Storage, C: Seal> Link<S, C> {
         }
         self.counters.add(LinkCounter::MessagesSent, 1);
         if hold { Ok(()) } else { self.flush(mailman, buffers).map_err(Error::Closed) }
+    }
+
+    /// The same for a short message while nothing waits.
+    fn send_at_once(
+        &mut self,
+        mailman: &mut impl Mailman,
+        buffers: &mut impl Buffers<S>,
+        priority: Priority,
+        total: usize,
+        write: impl FnOnce(&mut ChunkWriter<'_>),
+    ) -> Result<(), Error> {
+        self.sender.append_urgent(priority, total, write);
+        self.flush(mailman, buffers).map_err(Error::Closed)?;
+        let kept = self.sender.put_back(buffers, priority, total);
+        let counter = if kept.is_ok() { LinkCounter::MessagesSent } else { LinkCounter::SendRefused };
+        self.counters.add(counter, 1);
+        kept
     }
 
     /// Accepts a message of one short chunk into the link's own bytes, for an answer that finds no buffer. It may overtake

@@ -97,9 +97,13 @@ impl<S: Storage> Receiver<S> {
         received: &mut Received,
     ) -> Result<(), CloseReason> {
         loop {
+            let before = received.consumed;
             self.step(cipher, buffers, lent, received)?;
-            // A chunk that had waited for a buffer would look as if nothing were left to do.
-            if !self.partial.done || received.consumed > 0 || received.incoming.is_some() {
+            // The chunks of a message are taken in a row: the layers above have nothing to do with them. And one that had
+            // waited for a buffer would look as if nothing were left to do.
+            let progress = received.consumed > before;
+            let goes_on = if progress { received.consumed < lent.len() } else { self.partial.done };
+            if !goes_on || received.paused || received.incoming.is_some() {
                 return Ok(());
             }
         }
@@ -113,8 +117,9 @@ impl<S: Storage> Receiver<S> {
         received: &mut Received,
     ) -> Result<(), CloseReason> {
         self.clear_finished(buffers);
-        let frame = match frame::first_frame_length(lent) {
-            Some(length) if length <= lent.len() && self.partial.length == 0 => {
+        let rest = lent.get(received.consumed..).unwrap_or_default();
+        let frame = match frame::first_frame_length(rest) {
+            Some(length) if length <= rest.len() && self.partial.length == 0 => {
                 self.take_whole(buffers, length, received)?
             }
             _ => self.take_partial(buffers, lent, received)?,
@@ -138,8 +143,9 @@ impl<S: Storage> Receiver<S> {
             received.paused = true;
             return Ok(None);
         }
-        received.consumed = length;
-        Ok(Some((Store::Lent, 0, length)))
+        let start = received.consumed;
+        received.consumed = start.saturating_add(length);
+        Ok(Some((Store::Lent, start, length)))
     }
 
     /// The frame came in pieces: it is collected, and opened when it is whole.
@@ -149,7 +155,8 @@ impl<S: Storage> Receiver<S> {
         lent: &[u8],
         received: &mut Received,
     ) -> Result<Option<(Store, usize, usize)>, CloseReason> {
-        received.consumed = self.collect(lent, frame::HEADER_BYTES);
+        let rest = lent.get(received.consumed..).unwrap_or_default();
+        received.consumed = received.consumed.saturating_add(self.collect(rest, frame::HEADER_BYTES));
         let Some(length) = self.partial_frame_length() else { return Ok(None) };
         self.check_length(length)?;
         if length > self.small.len() && !self.partial.in_buffer {

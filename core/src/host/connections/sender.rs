@@ -5,6 +5,7 @@
 //! plain mode, where sealing changes nothing, all that waits is written in one go, and whatever frame the network has
 //! not begun to take may still be overtaken. Either way an emergency waits for one chunk at most.
 
+use super::urgent::Urgent;
 use crate::bytes;
 use crate::config::{EMERGENCY_BYTES, MINIMUM_CHUNK_BYTES, Priority};
 use crate::error::{CloseReason, Error, Limit};
@@ -20,8 +21,7 @@ const EMERGENCY_RESERVE: usize = EMERGENCY_BYTES + 64;
 
 pub(super) struct Sender<S: Storage> {
     cut: Cut,
-    urgent: heapless::Vec<u8, URGENT_BYTES>,
-    urgent_sealed: usize,
+    urgent: Urgent<URGENT_BYTES>,
     lanes: [Option<Lane<S>>; 3],
     /// The lane whose frames were sealed last and are not all written, or whose message is not complete.
     current: Option<usize>,
@@ -52,8 +52,7 @@ impl<S: Storage> Sender<S> {
     pub(super) fn new(overhead: usize) -> Self {
         Self {
             cut: Cut { chunk: MINIMUM_CHUNK_BYTES, overhead },
-            urgent: heapless::Vec::new(),
-            urgent_sealed: 0,
+            urgent: Urgent::new(),
             lanes: [const { None }; 3],
             current: None,
             blocked: false,
@@ -103,6 +102,37 @@ impl<S: Storage> Sender<S> {
         Err(error)
     }
 
+    /// Whether a message is short and finds nothing that waits: it is written out of the link's own bytes, and needs no
+    /// buffer if the network takes it.
+    pub(super) fn takes_at_once(&self, priority: Priority, total: usize) -> bool {
+        self.urgent.is_empty()
+            && !self.blocked
+            && self.lanes.iter().all(Option::is_none)
+            && priority != Priority::Emergency
+            && self.cut.framed_length(total) <= MINIMUM_CHUNK_BYTES
+    }
+
+    /// After an attempt to write the only message, which went with the urgent frames: if the network has not begun to
+    /// take it, it waits in its lane, where those of higher classes overtake it. A seal is not taken back.
+    pub(super) fn put_back(
+        &mut self,
+        buffers: &mut impl Buffers<S>,
+        priority: Priority,
+        total: usize,
+    ) -> Result<(), Error> {
+        let framed = self.cut.framed_length(total);
+        let Some(index) = lane_index(priority) else { return Ok(()) };
+        if !self.blocked || self.cut.overhead > 0 || self.urgent.len() != framed {
+            return Ok(());
+        }
+        let lane = buffers.take_leaving(LEFT_BY_SENDING).map(|buffer| Lane::of(buffer, self.urgent.sealed()));
+        self.urgent.clear();
+        self.blocked = lane.is_some();
+        let slot = self.lanes.get_mut(index).ok_or(Error::Full(Limit::SendQueue))?;
+        *slot = lane;
+        if slot.is_some() { Ok(()) } else { Err(Error::Full(Limit::Buffers)) }
+    }
+
     fn accept_emergency(&mut self, total: usize, write: impl FnOnce(&mut ChunkWriter<'_>)) -> Result<(), Error> {
         if total > EMERGENCY_BYTES {
             return Err(Error::TooLarge { limit: EMERGENCY_BYTES as u32 });
@@ -124,18 +154,15 @@ impl<S: Storage> Sender<S> {
             && self.append_urgent(priority, total, write)
     }
 
-    fn append_urgent(&mut self, priority: Priority, total: usize, write: impl FnOnce(&mut ChunkWriter<'_>)) -> bool {
-        let start = self.urgent.len();
-        let end = start.saturating_add(self.cut.framed_length(total));
-        if self.urgent.resize(end, 0).is_err() {
-            return false;
-        }
-        let place = self.urgent.get_mut(start..end).unwrap_or(&mut []);
-        match ChunkWriter::new(place, self.cut, priority, total) {
-            Some(mut writer) => write(&mut writer),
-            None => self.urgent.truncate(start),
-        }
-        self.urgent.len() == end
+    pub(super) fn append_urgent(
+        &mut self,
+        priority: Priority,
+        total: usize,
+        write: impl FnOnce(&mut ChunkWriter<'_>),
+    ) -> bool {
+        let place = self.urgent.append(self.cut.framed_length(total));
+        let writer = place.and_then(|place| ChunkWriter::new(place, self.cut, priority, total));
+        writer.map(|mut writer| write(&mut writer)).is_some()
     }
 
     pub(super) fn accept_frame(&mut self, frame: &Frame<'_>) -> bool {
@@ -144,8 +171,10 @@ impl<S: Storage> Sender<S> {
 
     /// A frame that is not to be sealed, while there is none yet that is.
     pub(super) fn accept_clear(&mut self, frame: &Frame<'_>) -> bool {
-        let accepted = self.urgent_sealed == self.urgent.len() && self.append_frame(frame, 0);
-        self.urgent_sealed = if accepted { self.urgent.len() } else { self.urgent_sealed };
+        let accepted = !self.urgent.has_unsealed() && self.append_frame(frame, 0);
+        if accepted {
+            self.urgent.note_sealed(usize::MAX);
+        }
         accepted
     }
 
@@ -156,7 +185,8 @@ impl<S: Storage> Sender<S> {
         if length == 0 || end > URGENT_BYTES.saturating_sub(EMERGENCY_RESERVE) {
             return false;
         }
-        self.urgent.extend_from_slice(scratch.get(..length).unwrap_or(&[])).is_ok()
+        let place = self.urgent.append(length);
+        place.map(|place| bytes::copy(scratch.get(..length).unwrap_or(&[]), place)).is_some()
     }
 
     /// Whether all of these frames that are no chunks would be accepted now.
@@ -204,37 +234,29 @@ impl<S: Storage> Sender<S> {
                 return Ok(progress);
             }
         }
-        while self.urgent_sealed > 0 {
-            let piece = self.urgent.get(..self.urgent_sealed).unwrap_or(&[]);
-            let count = mailman.write(id, &[piece])?;
+        while self.urgent.has_sealed() {
+            let count = mailman.write(id, &[self.urgent.sealed()])?;
             if count == 0 {
                 return Ok(Progress::Blocked);
             }
-            self.drop_urgent(count);
+            self.urgent.drop_front(count);
             *written = written.saturating_add(count as u64);
         }
         Ok(Progress::Through)
     }
 
-    fn drop_urgent(&mut self, count: usize) {
-        let end = self.urgent.len();
-        bytes::move_down(&mut self.urgent, count..end);
-        self.urgent.truncate(end.saturating_sub(count));
-        self.urgent_sealed = self.urgent_sealed.saturating_sub(count);
-    }
-
     /// Seals what is to be written next: urgent frames before all others. `false` when nothing waits.
     fn seal_next<C: Seal>(&mut self, cipher: &mut C) -> Result<bool, CloseReason> {
-        while self.urgent_sealed < self.urgent.len() {
-            let rest = self.urgent.get_mut(self.urgent_sealed..).unwrap_or(&mut []);
+        while self.urgent.has_unsealed() {
+            let rest = self.urgent.unsealed();
             let turns = frame::is_turn(rest, self.cut.overhead);
             let length = seal_first(cipher, rest)?;
-            self.urgent_sealed = self.urgent_sealed.saturating_add(length);
+            self.urgent.note_sealed(length);
             if turns {
                 cipher.turn()?;
             }
         }
-        if self.urgent_sealed > 0 {
+        if self.urgent.has_sealed() {
             return Ok(true);
         }
         self.current = self.next_lane();
@@ -272,7 +294,6 @@ impl<S: Storage> Sender<S> {
             buffers.give(lane.buffer);
         }
         self.urgent.clear();
-        self.urgent_sealed = 0;
         self.blocked = false;
     }
 }
@@ -280,6 +301,16 @@ impl<S: Storage> Sender<S> {
 impl<S: Storage> Lane<S> {
     fn new(buffer: Buffer<S>) -> Self {
         Self { buffer, start: 0, sealed: 0, end: 0, at_boundary: true, before: (0, true) }
+    }
+
+    /// One with the frames of a short message in it, for which there is room in any buffer.
+    fn of(buffer: Buffer<S>, frames: &[u8]) -> Self {
+        let mut lane = Self::new(buffer);
+        if let Some(place) = lane.buffer.get_mut(..frames.len()) {
+            bytes::copy(frames, place);
+            lane.end = frames.len();
+        }
+        lane
     }
 
     /// Bytes that are not written.

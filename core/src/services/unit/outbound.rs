@@ -15,7 +15,7 @@ use crate::services::Context;
 use crate::services::lease::{Held, Service};
 use crate::services::requests::CallId;
 use crate::storage::{Buffers, Storage};
-use crate::time::Duration;
+use crate::time::{Duration, Instant};
 
 /// Gathered one-way messages go out when there are this many bytes of them.
 const GATHERED_BYTES: usize = 8 * 1024;
@@ -211,7 +211,11 @@ impl<S: Storage, C: Secure> Session<S, C> {
             }
             Ok(()) => {
                 self.timers.last_write = cx.now;
-                self.flush(cx);
+                if hold {
+                    self.flush(cx);
+                }
+                // What is not held has taken with it what was.
+                self.timers.gathered = Instant::FAR_FUTURE;
                 Ok(())
             }
             Err(Error::Closed(reason)) => {

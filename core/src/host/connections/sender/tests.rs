@@ -7,7 +7,7 @@ use proptest::prelude::*;
 
 use super::super::harness::{self, Item, Numbered, Wire, link, pattern, read};
 use super::super::{Link, LinkCounter};
-use crate::config::{EMERGENCY_BYTES, Priority};
+use crate::config::{EMERGENCY_BYTES, MINIMUM_CHUNK_BYTES, Priority};
 use crate::error::{CloseReason, Error, Limit};
 use crate::host::frame::{self, Frame};
 use crate::host::secure::{Plain, Seal};
@@ -50,6 +50,40 @@ fn a_link_that_keeps_up_keeps_nothing() {
     send(&mut link, &mut wire, &mut pool, Priority::Normal, &bytes).unwrap();
     assert_eq!((spare(&pool), link.queued(), link.wants_to_write()), (1, 0, false));
     assert_eq!(read(Plain, &wire.bytes), [Item::Message(Priority::Normal, bytes)]);
+}
+
+#[test]
+fn a_short_message_needs_no_buffer_while_the_network_takes_it() {
+    let (mut link, mut wire, mut pool) = (link(Plain), Wire::open(), pool(0, 9000));
+    let (short, long) = (pattern(1, MINIMUM_CHUNK_BYTES - 8), pattern(2, MINIMUM_CHUNK_BYTES - 7));
+    send(&mut link, &mut wire, &mut pool, Priority::Normal, &short).unwrap();
+    assert_eq!(send(&mut link, &mut wire, &mut pool, Priority::Normal, &long), Err(Error::Full(Limit::Buffers)));
+    assert_eq!((link.queued(), link.wants_to_write()), (0, false));
+    assert_eq!(read(Plain, &wire.bytes), [Item::Message(Priority::Normal, short)]);
+}
+
+#[test]
+fn a_short_message_that_the_network_does_not_take_is_refused_without_a_buffer() {
+    let (mut link, mut wire, mut pool) = (link(Plain), Wire::default(), pool(0, 9000));
+    assert_eq!(send(&mut link, &mut wire, &mut pool, Priority::Low, b"x"), Err(Error::Full(Limit::Buffers)));
+    assert_eq!((link.queued(), link.wants_to_write()), (0, false));
+    assert_eq!(link.counters.value(LinkCounter::SendRefused), 1);
+    drain(&mut link, &mut wire, &mut pool);
+    assert_eq!(read(Plain, &wire.bytes), []);
+}
+
+#[test]
+fn a_short_message_that_was_begun_is_finished_from_the_links_own_bytes() {
+    for budget in 1..16 {
+        let (mut link, mut wire, mut pool) = (link(Plain), Wire { budget, ..Wire::default() }, pool(1, 9000));
+        send(&mut link, &mut wire, &mut pool, Priority::Low, b"12345678").unwrap();
+        assert_eq!((spare(&pool), link.queued()), (1, 16 - budget));
+        send(&mut link, &mut wire, &mut pool, Priority::Emergency, b"stop").unwrap();
+        send(&mut link, &mut wire, &mut pool, Priority::High, b"high").unwrap();
+        drain(&mut link, &mut wire, &mut pool);
+        let order = [Priority::Low, Priority::Emergency, Priority::High];
+        assert_eq!(priorities(&read(Plain, &wire.bytes)), order, "{budget} bytes at first");
+    }
 }
 
 #[test]
