@@ -541,6 +541,20 @@ fn a_caller_and_a_thread_that_stays_share_a_link() {
     });
 }
 
+/// What happens while the clock looks is seen by it, or tells it to look again.
+#[test]
+fn nothing_happens_behind_the_back_of_the_clock() {
+    loom::model(|| {
+        let watch = Arc::new(Watch::default());
+        assert!(watch.begins(), "nobody has told the clock yet");
+        let other = watch.clone();
+        let happens = thread::spawn(move || other.begins());
+        while watch.look() {}
+        let is_told = happens.join().unwrap();
+        assert!(is_told || !watch.look(), "the clock sleeps, and has not seen it");
+    });
+}
+
 /// The pool, without links: threads that run handlers though nobody waits, and the clock that stands in for them.
 #[derive(Default)]
 struct Pool {
@@ -618,7 +632,7 @@ impl Pool {
 /// All threads are inside handlers that wait for a call which nobody has read: the clock starts one that reads it.
 #[test]
 fn the_clock_helps_when_all_threads_are_inside_handlers() {
-    check(2, || {
+    check(3, || {
         let pool = Arc::new(Pool::default());
         pool.calls.lock().unwrap().extend([Handler::Waits, Handler::Waits, Handler::Releases]);
         let workers = [(); 2].map(|()| {

@@ -13,8 +13,8 @@ pub(super) struct Watch {
 impl Watch {
     /// Something happens. `true` where the clock must be told to look again.
     pub(super) fn begins(&self) -> bool {
-        self.used.store(true, Ordering::SeqCst);
-        !self.looking.load(Ordering::SeqCst) && !self.looking.swap(true, Ordering::SeqCst)
+        // Where it has been noted already, whoever noted it has told the clock or found it looking.
+        !self.used.swap(true, Ordering::SeqCst) && !self.looking.swap(true, Ordering::SeqCst)
     }
 
     /// Whether anything has happened since the last look. If not, whatever happens next tells the clock anew.
