@@ -7,7 +7,7 @@ use crate::bytes;
 use crate::config::{EMERGENCY_BYTES, Priority, WINDOW};
 use crate::distribution::function_list::{Generation, Slot};
 use crate::error::{Error, Limit};
-use crate::storage::{Buffer, Buffers, LEFT_BY_WAITING, Storage};
+use crate::storage::{Buffer, Buffers, Storage};
 use crate::time::{Duration, Instant};
 
 /// Which ids of one class have been seen. Serves the stream and datagrams alike.
@@ -210,14 +210,20 @@ impl<S: Storage> Calls<S> {
         true
     }
 
-    /// Keeps a call until its class is idle.
-    pub(crate) fn wait(&mut self, buffers: &mut impl Buffers<S>, head: CallHead, block: &[u8]) -> Result<(), Error> {
+    /// Keeps a call until its class is idle. If it needs a buffer, it leaves so many others in the pool.
+    pub(crate) fn wait(
+        &mut self,
+        buffers: &mut impl Buffers<S>,
+        left: usize,
+        head: CallHead,
+        block: &[u8],
+    ) -> Result<(), Error> {
         let Some(index) = queue_index(head.priority) else { return self.wait_emergency(head, block) };
         let slot = self.queues.get_mut(index).ok_or(Error::Busy)?;
         let queue = match slot {
             Some(queue) => queue,
             None => slot.insert(Queue {
-                buffer: buffers.take_leaving(LEFT_BY_WAITING).ok_or(Error::Busy)?,
+                buffer: buffers.take_leaving(left).ok_or(Error::Busy)?,
                 start: 0,
                 end: 0,
             }),
@@ -381,7 +387,7 @@ const fn queue_index(priority: Priority) -> Option<usize> {
 mod tests {
     #![allow(clippy::indexing_slicing, clippy::unwrap_used, clippy::panic, clippy::arithmetic_side_effects)]
     use super::*;
-    use crate::storage::{Boxed, Pool};
+    use crate::storage::{Boxed, LEFT_BY_WAITING, Pool};
     use proptest::prelude::*;
     use std::collections::BTreeSet;
     use std::collections::VecDeque;
@@ -432,7 +438,7 @@ mod tests {
                     let (head, block) = (head(id, Priority::Low), vec![id as u8; length]);
                     let used: usize = model.iter().map(|(_, block)| block.len() + HEAD_BYTES).sum();
                     let fits = used + block.len() + HEAD_BYTES <= 600;
-                    prop_assert_eq!(calls.wait(&mut pool, head, &block).is_ok(), fits);
+                    prop_assert_eq!(calls.wait(&mut pool, LEFT_BY_WAITING, head, &block).is_ok(), fits);
                     if fits {
                         model.push_back((head, block));
                     }
@@ -482,18 +488,18 @@ mod tests {
     fn room_ends_with_the_calls_that_may_wait_or_with_the_bytes() {
         let (mut calls, mut pool) = (calls(3), pool(4, 100));
         assert!(calls.has_room(1, 68) && !calls.has_room(0, 0));
-        calls.wait(&mut pool, head(1, Priority::Normal), b"12345678").unwrap();
+        calls.wait(&mut pool, LEFT_BY_WAITING, head(1, Priority::Normal), b"12345678").unwrap();
         assert_eq!([(1, 0), (2, 28), (2, 29)].map(|(limit, bytes)| calls.has_room(limit, bytes)), [false, true, false]);
-        assert!(calls.wait(&mut pool, head(2, Priority::Normal), &[0; 28]).is_ok());
+        assert!(calls.wait(&mut pool, LEFT_BY_WAITING, head(2, Priority::Normal), &[0; 28]).is_ok());
     }
 
     #[test]
     fn one_emergency_waits_without_a_buffer() {
         let (mut calls, mut pool) = (calls(3), pool(0, 0));
         calls.begin(head(1, Priority::Emergency)).unwrap();
-        calls.wait(&mut pool, head(2, Priority::Emergency), b"stop").unwrap();
-        assert_eq!(calls.wait(&mut pool, head(3, Priority::Emergency), b"stop"), Err(Error::Busy));
-        assert_eq!(calls.wait(&mut pool, head(4, Priority::Normal), b"go"), Err(Error::Busy));
+        calls.wait(&mut pool, LEFT_BY_WAITING, head(2, Priority::Emergency), b"stop").unwrap();
+        assert_eq!(calls.wait(&mut pool, LEFT_BY_WAITING, head(3, Priority::Emergency), b"stop"), Err(Error::Busy));
+        assert_eq!(calls.wait(&mut pool, LEFT_BY_WAITING, head(4, Priority::Normal), b"go"), Err(Error::Busy));
         assert!(!calls.can_begin());
     }
 
@@ -512,9 +518,9 @@ mod tests {
     fn the_end_of_a_link_forgets_what_waits_and_keeps_what_runs() {
         let (mut calls, mut pool) = (calls(3), pool(4, 100));
         let running = calls.begin(head(1, Priority::Normal)).unwrap();
-        calls.wait(&mut pool, head(2, Priority::Normal), b"").unwrap();
-        calls.wait(&mut pool, head(3, Priority::High), b"").unwrap();
-        calls.wait(&mut pool, head(4, Priority::Emergency), b"").unwrap();
+        calls.wait(&mut pool, LEFT_BY_WAITING, head(2, Priority::Normal), b"").unwrap();
+        calls.wait(&mut pool, LEFT_BY_WAITING, head(3, Priority::High), b"").unwrap();
+        calls.wait(&mut pool, LEFT_BY_WAITING, head(4, Priority::Emergency), b"").unwrap();
         assert_eq!((calls.held(), pool.free()), (4, LEFT_BY_WAITING));
         calls.release(&mut pool);
         assert_eq!((calls.held(), pool.free()), (1, 4));
@@ -525,7 +531,7 @@ mod tests {
     #[test]
     fn the_last_buffers_are_left_to_answers_and_to_what_is_received() {
         let (mut calls, mut pool) = (calls(3), pool(LEFT_BY_WAITING, 100));
-        assert_eq!(calls.wait(&mut pool, head(1, Priority::Normal), b""), Err(Error::Busy));
+        assert_eq!(calls.wait(&mut pool, LEFT_BY_WAITING, head(1, Priority::Normal), b""), Err(Error::Busy));
         assert_eq!((calls.held(), pool.free()), (0, LEFT_BY_WAITING));
     }
 }

@@ -62,6 +62,11 @@ impl Place {
         Self { store: Store::Lent, start: 0, end: length }
     }
 
+    /// Whether it lies in a buffer of the pool, which the link gives back before it looks at anything else.
+    pub fn is_in_buffer(self) -> bool {
+        matches!(self.store, Store::Buffer)
+    }
+
     /// The same without its first `count` bytes.
     #[inline]
     pub fn after(self, count: usize) -> Self {

@@ -22,7 +22,7 @@ use crate::services::Context;
 use crate::services::calls::{CallHead, Seen};
 use crate::services::lease::Service;
 use crate::services::requests::CallId;
-use crate::storage::{Buffers, Storage};
+use crate::storage::{Buffers, LEFT_BY_WAITING, Storage};
 
 /// Result of [`Session::receive`].
 #[derive(Debug)]
@@ -354,6 +354,8 @@ impl<S: Storage, C: Secure> Session<S, C> {
         // Once for all that a request needs of it.
         let function = cx.functions.lookup(header.slot, header.generation);
         let length = self.link.view(block, lent).len();
+        // A buffer that the request lies in is back in the pool at once.
+        let left = LEFT_BY_WAITING.saturating_sub(usize::from(block.is_in_buffer()));
         let result = self.check_request(cx, priority, header, seen, length, function).and_then(|(head, function)| {
             let block = self.link.view(block, lent);
             match arguments.filter(|_| self.calls.is_idle(priority)) {
@@ -361,7 +363,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
                     read_arguments(function.signature, block, arguments)?;
                     self.begin(cx, head, function.attributes.lease).map(Some)
                 }
-                None => self.calls.wait(cx.buffers, head, block).map(|()| None),
+                None => self.calls.wait(cx.buffers, left, head, block).map(|()| None),
             }
         });
         match result {

@@ -161,7 +161,8 @@ fn two_units_with_few_buffers_do_not_stop_each_other(world: &mut dyn World) {
         assert!((0..20).any(|_| some_at_once_run(world, &one, &two, length)), "none ran{}", world.story());
     }
     for (unit, other) in [(&one, "two"), (&two, "one")] {
-        assert_eq!(world.ask(unit, other, "store", &mut text(length)), Ok(()));
+        let asked = world.ask(unit, other, "store", &mut text(length));
+        assert_eq!(asked, Ok(()), "{}", world.story());
     }
     world.reached("answered");
 }

@@ -7,6 +7,7 @@ use crate::config::{Constraints, Priority};
 use crate::error::Error;
 use crate::host::connections::LinkCounter;
 use crate::services::unit::RequestOptions;
+use crate::storage::LEFT_BY_WAITING;
 use crate::time::Duration;
 
 const ECHO: &str = "echo(text: string[20000]) -> (text: string[20000])";
@@ -138,6 +139,25 @@ fn a_call_that_finds_no_buffer_to_wait_in_is_refused_without_one() {
     assert_eq!(pair.manager.outcome(second).unwrap().unwrap_err(), Error::Busy);
     assert!(pair.manager.has(&Happened::Failed(told, Error::Busy)));
     assert_eq!(pair.agv.counter(LinkCounter::RepliesDropped), 0);
+}
+
+/// The buffer that it came in is given back, so that as many are left as without it.
+#[test]
+fn a_long_call_finds_one_buffer_more_to_wait_in() {
+    for (more, outcome) in [(0, Err(Error::Busy)), (1, Ok(()))] {
+        let mut pair = Pair::with(&Setup { buffers: LEFT_BY_WAITING + more, ..Setup::default() });
+        pair.agv.offer_held("work(text: string[20000])");
+        pair.publish();
+        pair.manager.tell("work", &text(20_000)).unwrap();
+        pair.settle();
+        let second = pair.manager.call("work", &text(20_000)).unwrap();
+        pair.settle();
+        while !pair.agv.held.is_empty() {
+            pair.agv.answer_held(Ok(&*none()));
+            pair.settle();
+        }
+        assert_eq!(pair.manager.outcome(second).unwrap().map(drop), outcome);
+    }
 }
 
 /// The bytes that refusals may use are few, and none of them are those of an emergency.
