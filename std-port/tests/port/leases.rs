@@ -8,7 +8,7 @@ use cara_std::{CommunicationSystem, Error, LeaseWatch, Peer, RequestOptions, Ser
 
 use crate::support::{PATIENCE, fleet, meet, number, service, system, unit, until};
 
-const LEASE: Duration = Duration::from_millis(200);
+const LEASE: Duration = Duration::from_millis(800);
 
 struct Vehicle {
     manager: CommunicationSystem,
@@ -72,7 +72,7 @@ fn motion_goes_on_while_it_is_renewed_and_ends_when_it_is_released() {
     let vehicle = vehicle();
     vehicle.go(true);
     let began = Instant::now();
-    while began.elapsed() < 4 * LEASE {
+    while began.elapsed() < 3 * LEASE {
         assert!(vehicle.lease.is_live());
         std::thread::sleep(Duration::from_millis(5));
     }

@@ -228,15 +228,21 @@ impl Board {
 
     /// As [`logs_behind`](Self::logs_behind), with what the line says.
     pub(crate) fn finds(&self, from: usize, text: &str) -> Result<(usize, String)> {
+        self.finds_any(from, &[text])
+    }
+
+    /// As [`finds`](Self::finds), with the first line that has one of several texts.
+    pub(crate) fn finds_any(&self, from: usize, texts: &[&str]) -> Result<(usize, String)> {
         let deadline = Instant::now() + LONG;
+        let has = |line: &str| texts.iter().any(|text| line.contains(text));
         let mut lines = self.log.lock();
         loop {
-            if let Some((at, line)) = lines.iter().enumerate().skip(from).find(|(_, line)| line.contains(text)) {
+            if let Some((at, line)) = lines.iter().enumerate().skip(from).find(|(_, line)| has(line)) {
                 return Ok((at + 1, line.clone()));
             }
             let left = deadline.saturating_duration_since(Instant::now());
             if left.is_zero() {
-                bail!("{} did not log `{text}`; it logged:\n    {}", self.name, lines.join("\n    "));
+                bail!("{} did not log `{}`; it logged:\n    {}", self.name, texts.join("` or `"), lines.join("\n    "));
             }
             lines = self.log.news.wait_timeout(lines, left).unwrap_or_else(PoisonError::into_inner).0;
         }

@@ -10,7 +10,7 @@ use cara_std::Parameters;
 use clap::ValueEnum;
 
 use crate::board::{self, Bench, Board, Cable, LONG, Who};
-use crate::manager::{Manager, at, position};
+use crate::manager::{Manager, at, patiently, position, sets_out};
 
 /// An image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -60,16 +60,16 @@ fn vehicle(bench: &Bench, board: &Board, cable: &Cable, round: u32) -> Result<()
     manager.system.publish_my_function_list()?;
     let agv = manager.meet(&who)?;
     for x in 1..=2 {
-        agv.block_request("go_to", &mut at([x + 2 * i64::from(round), 0])?)?;
+        sets_out(&agv, [x + 2 * i64::from(round), 0])?;
         agv.request("pos_info", &at([0, 0])?)?;
         position(&agv)?;
         let mut text = Parameters::<1024>::sized();
         text.add_string("text", 400)?;
         text.set_value("text", "a".repeat(400).as_str())?;
-        agv.block_request("echo", &mut text)?;
+        patiently(|| agv.block_request("echo", &mut text))?;
     }
     ensure!(agv.block_request("fly_to", &mut at([0, 0])?).is_err(), "it flies");
-    agv.block_request("stop", &mut Parameters::<512>::new())?;
+    patiently(|| agv.block_request("stop", &mut Parameters::<512>::new()))?;
     drop(manager);
     board.logs_behind(line, "depot has left")?;
     // A list that is full with other functions has no room for the mechanic.
@@ -98,7 +98,7 @@ fn least(bench: &Bench, board: &Board, cable: &Cable) -> Result<()> {
                 sum.set_value(name, number)?;
             }
             unit.request("add", &sum)?;
-            unit.block_request("add", &mut sum)?;
+            patiently(|| unit.block_request("add", &mut sum))?;
             ensure!(sum.variable::<i64>("sum")? == 2 * number, "it cannot add");
         }
         ensure!(unit.block_request("add", &mut at([0, 0])?).is_err(), "it adds a position");

@@ -11,7 +11,7 @@ use cara_apps::mechanic;
 use cara_std::control::Control;
 use cara_std::{Builder, CloseReason, CommunicationSystem, Error, Parameters, Peer, UnitEvent};
 
-use crate::board::{FLEET, LONG, Who};
+use crate::board::{Board, FLEET, LONG, Who};
 use crate::keys::Keys;
 
 /// A manager with its events.
@@ -114,7 +114,7 @@ pub(crate) fn announce(peer: &Peer) -> Result<()> {
 }
 
 /// Asks for what may run twice, again where this machine was too busy for an answer in time.
-fn patiently(mut ask: impl FnMut() -> Result<(), Error>) -> Result<()> {
+pub(crate) fn patiently(mut ask: impl FnMut() -> Result<(), Error>) -> Result<()> {
     let deadline = Instant::now() + LONG;
     loop {
         match ask() {
@@ -134,6 +134,30 @@ pub(crate) fn sends(peer: &Peer, position: [i64; 2]) -> Result<bool> {
         }
         ended => ended.map(|()| true).map_err(Into::into),
     }
+}
+
+/// Sends a vehicle on its way, again where this machine was too busy for that.
+pub(crate) fn sets_out(peer: &Peer, position: [i64; 2]) -> Result<()> {
+    let deadline = Instant::now() + LONG;
+    while !sends(peer, position)? {
+        ensure!(Instant::now() < deadline, "it does not set out");
+    }
+    Ok(())
+}
+
+/// Sends a vehicle to a place with `ask`, until it is there: on a busy machine it may lose its lease on the way.
+pub(crate) fn drives(board: &Board, position: [i64; 2], mut ask: impl FnMut() -> Result<()>) -> Result<()> {
+    let [x, y] = position;
+    let deadline = Instant::now() + LONG;
+    while Instant::now() < deadline {
+        let line = board.line();
+        ask()?;
+        let (_, said) = board.finds_any(line, &["arrived at", "stopped at"])?;
+        if said.contains(&format!("arrived at {x} {y}")) {
+            return Ok(());
+        }
+    }
+    bail!("it does not come to {position:?}")
 }
 
 /// Parameters with a position.
@@ -182,7 +206,7 @@ pub(crate) fn stand_alone(key_file: Option<&Path>) -> Result<()> {
         None => builder.insecure(),
     })?;
     let agv = manager.meet(&Who::agv(17))?;
-    agv.block_request("go_to", &mut at([1_000, 0])?)?;
+    sets_out(&agv, [1_000, 0])?;
     println!("driving");
     for line in std::io::stdin().lines() {
         if line? == ANNOUNCE {

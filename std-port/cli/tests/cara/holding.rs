@@ -8,7 +8,7 @@ use cara_std::{Call, Definition, LeaseWatch, ParametersView, ServiceError, Servi
 
 use crate::support::{PATIENCE, Running, Stage};
 
-const LEASE: Duration = Duration::from_millis(300);
+const LEASE: Duration = Duration::from_millis(1_200);
 
 /// A vehicle that drives until it is told that it has arrived, or until nobody wants it to.
 struct Driver {
@@ -42,7 +42,7 @@ impl Driver {
         let mut running = Running::start(stage.command(&["call", "driver", "--hold", "drive"]));
         running.expect("drive()");
         let start = Instant::now();
-        while start.elapsed() < 4 * LEASE {
+        while start.elapsed() < 2 * LEASE {
             assert!(self.lease.is_live() || start.elapsed() > PATIENCE, "the lease was not renewed");
             std::thread::sleep(Duration::from_millis(10));
         }

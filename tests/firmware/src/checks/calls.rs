@@ -4,7 +4,7 @@ use anyhow::{Context, Result, ensure};
 use cara_std::{Delivery, Error, Parameters, RequestOptions, UnitEvent};
 
 use crate::board::{Bench, Who};
-use crate::manager::{Manager, arrives, at, position};
+use crate::manager::{Manager, arrives, at, drives, patiently, position, sets_out};
 
 /// What the board offers, in the order in which it was added.
 const FUNCTIONS: &str = "\
@@ -35,14 +35,13 @@ pub(super) fn driven(bench: &Bench, _: u32) -> Result<String> {
     let board = bench.board(&cable, &Who::agv(17))?;
     let agv = manager.meet(&Who::agv(17))?;
     ensure!(position(&agv)? == [0, 0], "it begins elsewhere");
-    agv.request("go_to", &at([1, 2])?)?;
-    board.logs("arrived at 1 2")?;
+    drives(&board, [1, 2], || Ok(agv.request("go_to", &at([1, 2])?).map(drop)?))?;
     arrives(&agv, [1, 2])?;
-    agv.block_request("go_to", &mut at([0, 2])?)?;
+    drives(&board, [0, 2], || sets_out(&agv, [0, 2]))?;
     arrives(&agv, [0, 2])?;
     let mut charge = Parameters::new();
     charge.add_float("charge", 1)?;
-    agv.block_request("battery", &mut charge)?;
+    patiently(|| agv.block_request("battery", &mut charge))?;
     let left: f64 = charge.variable("charge")?;
     ensure!(left < 100.0, "driving costs nothing: {left} % are left");
     for length in [0, 1, 100, 400] {
@@ -50,7 +49,7 @@ pub(super) fn driven(bench: &Bench, _: u32) -> Result<String> {
         text.add_string("text", 400)?;
         let sent = "a".repeat(length);
         text.set_value("text", sent.as_str())?;
-        agv.block_request("echo", &mut text)?;
+        patiently(|| agv.block_request("echo", &mut text))?;
         ensure!(text.variable::<&str>("text")? == sent, "an echo of {length} characters came back changed");
     }
     Ok("asynchronously and blocking; float and string results".into())
@@ -62,17 +61,18 @@ pub(super) fn not_renewed(bench: &Bench, _: u32) -> Result<String> {
     let board = bench.board(&cable, &Who::agv(17))?;
     let agv = manager.meet(&Who::agv(17))?;
     let once = RequestOptions { renew_lease: false, ..RequestOptions::default() };
-    agv.block_request_with("go_to", &mut at([1_000, 0])?, &once)?;
+    let mut far = at([1_000, 0])?;
+    patiently(|| agv.block_request_with("go_to", &mut far, &once))?;
     board.logs("stopped at")?;
     let [x, _] = position(&agv)?;
     ensure!((0..10).contains(&x), "it stands at {x}");
-    agv.block_request("go_to", &mut at([1_000, 0])?)?;
+    sets_out(&agv, [1_000, 0])?;
     let line = board.line();
     agv.release("go_to")?;
     board.logs_behind(line, "stopped at")?;
     let line = board.line();
-    agv.block_request("go_to", &mut at([1_000, 0])?)?;
-    agv.block_request("stop", &mut Parameters::<512>::new())?;
+    sets_out(&agv, [1_000, 0])?;
+    patiently(|| agv.block_request("stop", &mut Parameters::<512>::new()))?;
     board.logs_behind(line, "stopped at")?;
     Ok(format!("without renewal after {x} units; on release; by an emergency"))
 }
@@ -111,8 +111,7 @@ pub(super) fn best_effort(bench: &Bench, _: u32) -> Result<String> {
     let board = bench.board(&cable, &Who::agv(17))?;
     let agv = manager.meet(&Who::agv(17))?;
     let one_datagram = RequestOptions { delivery: Delivery::BestEffort, ..RequestOptions::default() };
-    agv.request_with("go_to", &at([1, 1])?, &one_datagram)?;
-    board.logs("arrived at 1 1")?;
+    drives(&board, [1, 1], || Ok(agv.request_with("go_to", &at([1, 1])?, &one_datagram).map(drop)?))?;
     Ok("in one datagram".into())
 }
 
@@ -142,7 +141,6 @@ pub(super) fn many_functions(bench: &Bench, _: u32) -> Result<String> {
     let event = manager.event("skipped functions", |event| matches!(event, UnitEvent::FunctionsSkipped { .. }))?;
     let UnitEvent::FunctionsSkipped { skipped, .. } = event else { return Err(Error::NotConnected.into()) };
     ensure!((1..40).contains(&skipped), "{skipped} skipped");
-    agv.block_request("go_to", &mut at([1, 0])?).context("it no longer serves")?;
-    board.logs("arrived at 1 0")?;
+    drives(&board, [1, 0], || sets_out(&agv, [1, 0])).context("it no longer serves")?;
     Ok(format!("{} kept, {skipped} skipped", 40 - skipped))
 }

@@ -8,7 +8,7 @@ use cara_processes::Process;
 use cara_std::{Error, RequestOptions};
 
 use crate::board::{Bench, LONG, Who};
-use crate::manager::{Manager, at, position};
+use crate::manager::{Manager, at, position, sets_out};
 
 pub(super) fn hung(bench: &Bench, _: u32) -> Result<String> {
     let cable = bench.cable()?;
@@ -49,7 +49,7 @@ pub(super) fn cable(bench: &Bench, _: u32) -> Result<String> {
     let who = Who::agv(17);
     let board = bench.board(&cable, &who)?;
     let agv = manager.meet(&who)?;
-    agv.block_request("go_to", &mut at([1_000, 0])?)?;
+    sets_out(&agv, [1_000, 0])?;
     cable.pull()?;
     let line = board.logs_behind(0, "stopped at")?;
     manager.left(&who)?;

@@ -7,7 +7,7 @@ use anyhow::{Context, Result, ensure};
 use cara_std::{Peer, UnitEvent};
 
 use crate::board::{Bench, Board, Who};
-use crate::manager::{Manager, at, position};
+use crate::manager::{Manager, at, drives, position, sets_out};
 
 /// Where the protocol stands when power goes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -108,7 +108,7 @@ fn reach(state: State, manager: &Manager, board: &Board, who: &Who) -> Result<()
     match state {
         State::Calling => drop(agv.request("pos_info", &at([0, 0])?)?),
         State::Driving => {
-            agv.block_request("go_to", &mut at([1_000, 0])?)?;
+            sets_out(&agv, [1_000, 0])?;
             board.logs("driving")?;
         }
         _ => {}
@@ -122,8 +122,7 @@ fn works(manager: &Manager, board: &Board, who: &Who) -> Result<()> {
     let agv: Peer = manager.meet(who)?;
     let found = retried(|| position(&agv))?;
     ensure!(found == [0, 0], "a fresh board is at {found:?}");
-    agv.block_request("go_to", &mut at([1, 0])?)?;
-    board.logs("arrived at 1 0")
+    drives(board, [1, 0], || sets_out(&agv, [1, 0]))
 }
 
 /// A call may meet the old link's end: it says so, and the next one is for the new link.

@@ -5,7 +5,7 @@ use cara_core::services::unit::RequestOptions;
 
 use super::{met, pair};
 use crate::scenario::scenarios;
-use crate::{Seen, Service, Spec, World, millis, number, secs};
+use crate::{Seen, Service, Spec, World, number, secs};
 
 scenarios![
     a_slow_handler_delays_no_other_peer: "handlers run outside", Light, [], ["RequestsRun"];
@@ -26,7 +26,7 @@ const PATIENT: RequestOptions = RequestOptions {
 };
 
 fn a_slow_handler_delays_no_other_peer(world: &mut dyn World) {
-    let slow = Service::numbered("slow").takes(secs(1));
+    let slow = Service::numbered("slow").takes(secs(3));
     let quick = Service::numbered("quick");
     let manager = world.add(Spec::manager("manager", 1));
     world.add(Spec::agv("one", 1).service(&slow));
@@ -35,9 +35,8 @@ fn a_slow_handler_delays_no_other_peer(world: &mut dyn World) {
     met(world, &manager, "two", "quick");
     let long = manager.begin("one", "slow", &number("n", 1), PATIENT);
     world.wait("it runs", || slow.diary().runs() == 1, secs(10));
-    let start = world.now();
     assert_eq!(world.ask(&manager, "two", "quick", &mut number("n", 1)), Ok(()));
-    assert!(world.now().since(start) < millis(900) && !long.is_over());
+    assert!(!long.is_over());
     assert!(world.finish(&long).is_ok());
 }
 
@@ -64,12 +63,12 @@ fn overtakes(world: &mut dyn World, slow: Service) -> bool {
 }
 
 fn a_detached_service_does_not_block_the_next_call(world: &mut dyn World) {
-    assert!(overtakes(world, Service::numbered("slow").takes(millis(500)).detached()));
+    assert!(overtakes(world, Service::numbered("slow").takes(secs(2)).detached()));
     world.reached("detached");
 }
 
 fn without_detaching_the_next_call_waits(world: &mut dyn World) {
-    assert!(!overtakes(world, Service::numbered("slow").takes(millis(500))));
+    assert!(!overtakes(world, Service::numbered("slow").takes(secs(2))));
     world.reached("waited");
 }
 
