@@ -48,7 +48,8 @@ pub(crate) fn show(listen: Duration, global: &Global) -> anyhow::Result<()> {
 fn about_fleets(heard: &[&Heard]) -> std::io::Result<()> {
     let fleets: BTreeSet<u32> = heard.iter().map(|heard| heard.fleet.0).collect();
     if fleets.len() > 1 {
-        output::line(format_args!("\nseveral fleets are here: {fleets:?}; units of different fleets do not meet"))?;
+        let fleets: Vec<String> = fleets.iter().map(u32::to_string).collect();
+        output::line(format_args!("\nfleets {} are here; units of different fleets do not meet", fleets.join(", ")))?;
     }
     let modes: BTreeSet<&str> = heard.iter().map(|heard| shown_mode(heard.mode)).collect();
     if modes.len() > 1 {
