@@ -5,6 +5,7 @@ mod command_line;
 mod commands;
 mod doctor;
 mod exit;
+mod files;
 mod global;
 mod interrupt;
 mod keys;

@@ -237,7 +237,9 @@ fn every_mistake_is_told() {
     let home = Home::new();
     home.refused(&[], 2, "cara keys");
     home.refused(&["derive", "agv/1"], 1, "`cara keys new-fleet --fleet 0`");
-    home.refused(&["new-fleet", "agv/1"], 2, "name one with it");
+    home.refused(&["new-fleet", "--fleet", "9", "agv/1"], 2, "`cara keys new-fleet --fleet 9 depot/1@m_unit agv/1`");
+    fs::write(home.0.path().join("file"), "").unwrap();
+    home.refused(&["new-fleet", "--dir", "file"], 1, "the folder file cannot be made");
     home.refused(&["new-fleet", "agv"], 2, "NAME/ID@m_unit for an m_unit");
     home.refused(&["new-fleet", "agv/1@manager"], 2, "0 to 4294967295");
     home.refused(&["new-fleet", "depot/1@m_unit", "--manager", "depot/1"], 2, "leave --manager away");

@@ -45,7 +45,7 @@ fn until(what: &str, mut condition: impl FnMut() -> bool) {
 // --- mistakes
 
 /// A file, where its mistake is, and a part of what is said about it.
-const MISTAKES: [(&str, &str, &str); 46] = [
+const MISTAKES: [(&str, &str, &str); 47] = [
     ("name = \"a", "1:10", "expected `\"`"),
     ("name = \"a\"\nid = \n", "2:6", "value"),
     ("name = \"a\"\nid = 1\nid = 2", "3:1", "duplicate key"),
@@ -92,6 +92,7 @@ const MISTAKES: [(&str, &str, &str); 46] = [
     ("name = \"a\"\nid = 1\n[metrics]\nlisten = \"9464\"", "4:10", "no address"),
     ("name = \"a\"\nid = 1\n[metrics]\nlisten = \"0.0.0.0:9464\"", "4:10", "--metrics-anywhere"),
     ("name = \"a\"\nid = 1\n[log]\nlevel = \"a=b=c\"", "4:9", "no level"),
+    ("name = \"a\"\nid = 1\n[log]\nlevel = \"bogus\"", "4:9", "`bogus`"),
     ("name = \"a\"\nid = 1\n[[functions]]\nanswer = \"echo\"", "3:1", "no signature"),
     ("name = \"a\"\nid = 1\n[[functions]]\nsignature = \"f(n: integer)\"\nanswer = \"echo\"", "4:19", "a type"),
     ("name = \"a\"\nid = 1\n[[functions]]\nsignature = '''f(ä: int)'''\nanswer = \"echo\"", "4:18", "a name"),
@@ -153,8 +154,11 @@ fn the_example_is_correct() {
 #[test]
 fn wrong_options_are_told_with_what_to_do() {
     let folder = TempDir::new().unwrap();
-    let cases: [(&[&str], &str); 11] = [
-        (&["/dev/zero"], "more than 1048576 bytes"),
+    std::fs::write(folder.path().join("long.toml"), vec![b'\n'; 1048577]).unwrap();
+    let cases: [(&[&str], &str); 14] = [
+        (&["long.toml"], "more than 1048576 bytes"),
+        (&["/dev/zero"], "it is no file"),
+        (&["--check", "."], "it is no file"),
         (&["--socket", "x", "--name", "a", "--id", "1"], "a node is a unit itself"),
         (&[], "--name and --id"),
         (&["--id", "1"], "--name and --id"),
@@ -162,6 +166,7 @@ fn wrong_options_are_told_with_what_to_do() {
         (&["--name", "", "--id", "1"], "1 to 32 bytes"),
         (&["--name", "a", "--id", "1", "--metrics", "0.0.0.0:0"], "--metrics-anywhere"),
         (&["--name", "a", "--id", "1", "--log", "a=b=c"], "debug"),
+        (&["--name", "a", "--id", "1", "--log", "warn,bogus"], "`bogus` is none of the levels"),
         (&["--name", "a", "--id", "1", "--as", "b/1"], "contradict"),
         (&["--name", "a", "--id", "1", "--as", "a/2"], "contradict"),
         (&["--name", "a", "--id", "1", "--metrics", "localhost:9464"], "write an IP address and a port"),

@@ -125,6 +125,11 @@ fn a_board_on_wifi_is_told_its_access_point() {
     refused(folder.path(), &told("rp2040", &["--wifi", "hall"]), 2, "has no Wi-Fi");
     fs::write(folder.path().join("password"), "short").unwrap();
     refused(folder.path(), &told("pico2w", &access), 2, "8 to 63 bytes");
+    for empty in ["", "\nopen sesame\n"] {
+        fs::write(folder.path().join("password"), empty).unwrap();
+        refused(folder.path(), &told("pico2w", &access), 2, "leave --wifi-password-file away");
+    }
+    done(folder.path(), &told("pico2w", &["--wifi", "hall 3", "--output", "page.bin"]));
 }
 
 #[test]
@@ -140,6 +145,9 @@ fn every_mistake_is_told() {
     refused(folder.path(), &["rp2040", "--name", &long, "--id", "1", "--output", "x"], 2, "--name");
     refused(folder.path(), &told("rp2040", &["--address", "10.0.0.1"]), 2, "10.0.0.17/24");
     refused(folder.path(), &told("rp2040", &["--gateway", "10.0.0.1", "--output", "x"]), 2, "the server tells");
+    let address = ["--address", "10.0.0.1/24", "--gateway", "255.255.255.255", "--output", "page.bin"];
+    refused(folder.path(), &told("rp2040", &address), 2, "no host's address");
+    refused(folder.path(), &told("rp2040", &["--address", "255.255.255.255/24"]), 2, "no address of a host");
     refused(folder.path(), &told("rp2040", &["--uf2"]), 2, "--output");
     refused(folder.path(), &told("rp2040", &["--output", "absent/page.bin"]), 1, "cannot write absent/page.bin");
     refused(folder.path(), &["--read", "absent.bin"], 1, "cannot read absent.bin");
@@ -155,7 +163,12 @@ fn boards_are_listed() {
     for board in board::BOARDS {
         assert!(shown.contains(board.name) && shown.contains(&format!("{:#x}", board.pages[1])), "{shown}");
     }
-    assert_eq!(done(folder.path(), &["--list", "--json"]).lines().count(), board::BOARDS.len());
+    for word in ["0x8100000, 0x8140000", "256 KiB", "lm3s6965evb"] {
+        assert!(shown.contains(word), "{word}: {shown}");
+    }
+    let json = done(folder.path(), &["--list", "--json"]);
+    assert_eq!(json.lines().count(), board::BOARDS.len() + 1);
+    assert!(json.contains(r#""starts":[270516224,270520320]"#) && json.contains(r#""pages":null"#), "{json}");
 }
 
 #[test]
@@ -335,6 +348,60 @@ fn the_emulated_board_is_told_by_text() {
     let plain = fs::read_to_string(folder.path().join("plain")).unwrap();
     assert_eq!(plain, "name=agv-17 id=17 manager=depot/1 fleet=0 address=dhcp");
     refused(folder.path(), &told("lm3s6965evb", &["--uf2", "--output", "x"]), 2, "no boot loader that takes UF2");
+    let shown = done(folder.path(), &["--read", "argument"]);
+    let expected =
+        "lm3s6965evb: name=agv-17 id=17 manager=depot/1 fleet=7 address=dhcp, keys of generation 1 with depot/1";
+    assert_eq!(shown, format!("{expected}@m_unit\n"));
+    let json = done(folder.path(), &["--read", "plain", "--json"]);
+    assert!(json.contains(r#""generation":null"#) && json.contains(r#""keys":null"#), "{json}");
+    fs::write(folder.path().join("cut"), "name=agv-17").unwrap();
+    refused(folder.path(), &["--read", "cut"], 1, "id is missing");
+}
+
+#[test]
+fn words_that_the_emulated_board_would_split_are_refused() {
+    let folder = folder();
+    let board = |name, manager, file| {
+        ["lm3s6965evb", "--name", name, "--id", "17", "--manager", manager, "--output", file].map(str::to_owned)
+    };
+    for (name, manager, file) in [("agv 17", "depot/1", "x"), ("agv-17", "the depot/1", "x")] {
+        let arguments = board(name, manager, file);
+        refused(folder.path(), &arguments.each_ref().map(String::as_str), 2, "no name may have a blank");
+    }
+    for file in ["a file", "a,file", "a\"file"] {
+        let arguments = board("agv-17", "depot/1", file);
+        refused(folder.path(), &arguments.each_ref().map(String::as_str), 2, "name a path without them");
+    }
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
+}
+
+#[test]
+fn what_is_no_file_is_neither_replaced_nor_waited_for() {
+    let folder = folder();
+    let (_store, keys) = with_keys(folder.path());
+    let pipe = folder.path().join("pipe");
+    assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+    for board in ["rp2040", "lm3s6965evb"] {
+        for output in ["pipe", "keys"] {
+            refused(folder.path(), &told(board, &["--output", output]), 2, "is no file");
+            refused(folder.path(), &[board, "--keys", &keys, "--output", output], 2, "is no file");
+        }
+    }
+    refused(folder.path(), &["--read", "pipe"], 1, "it is no file");
+    assert!(!fs::metadata(&pipe).unwrap().is_file());
+}
+
+#[test]
+fn keys_that_are_left_behind_are_told() {
+    let folder = folder();
+    let (_store, keys) = with_keys(folder.path());
+    done(folder.path(), &["rp2040", "--keys", &keys, "--output", "1.bin"]);
+    fs::write(folder.path().join("0.bin"), [0xFF; BYTES]).unwrap();
+    let previous = ["--output", "2.bin", "--previous", "1.bin", "0.bin"];
+    let said = done(folder.path(), &told("rp2040", &previous));
+    assert!(said.contains("the keys of agv-17/17 in fleet 7 that the board had are not kept"), "{said}");
+    let said = done(folder.path(), &told("rp2040", &[&["--fleet", "7"], &previous[..]].concat()));
+    assert!(said.contains("settings and keys") && !said.contains("not kept"), "{said}");
 }
 
 #[test]

@@ -57,6 +57,17 @@ pub enum KeyError {
          it away", .0.display()
     )]
     NoFile(PathBuf),
+    /// A folder, a pipe or a device is where a file is to be written.
+    #[error("{} is no file, and nothing is written in its place: name a file, or a path where nothing is yet", .0.display())]
+    InTheWay(PathBuf),
+    /// The folder for the keys cannot be made.
+    #[error("the folder {} cannot be made: {error}. Name another one, or make it first", path.display())]
+    NoFolder {
+        /// The folder.
+        path: PathBuf,
+        /// Why.
+        error: io::Error,
+    },
     /// Not what `cara keys` writes.
     #[error("{}:{line}: {what}. {}", path.display(), Kind::of(path).if_damaged())]
     Form {
@@ -165,6 +176,12 @@ pub enum FleetError {
         keys(*.0, &["derive", "depot/1@m_unit", &full_name(.1)])
     )]
     NoManager(Fleet, Identity),
+    /// As [`NoManager`](Self::NoManager), of a fleet that is not kept anywhere yet.
+    #[error(
+        "{} has no m_unit to belong to: name one with it, as in `{}`", full_name(.1),
+        keys(*.0, &["new-fleet", "depot/1@m_unit", &full_name(.1)])
+    )]
+    NoFirstManager(Fleet, Identity),
     /// An s_unit, and several m_units that it could belong to.
     #[error("which m_unit does {node} belong to? Say {}", either(managers))]
     WhichManager {
@@ -203,6 +220,17 @@ pub enum FleetError {
     /// Generations have an end.
     #[error("there are no more generations: make the fleet's keys anew with `{} NODE...`", keys(*.0, &["new-fleet"]))]
     Exhausted(Fleet),
+}
+
+impl FleetError {
+    /// The same of a fleet that is only being made, to which no command can add yet.
+    #[must_use]
+    pub fn of_new_fleet(self) -> Self {
+        match self {
+            Self::NoManager(fleet, node) => Self::NoFirstManager(fleet, node),
+            other => other,
+        }
+    }
 }
 
 /// What a file is for, as its name tells.
@@ -319,7 +347,8 @@ mod tests {
         let (fleet, node) = (Fleet(7), Identity::s_unit("agv 1", 1).unwrap());
         let errors = [
             FleetError::Unknown(fleet, node.clone()),
-            FleetError::NoManager(fleet, node),
+            FleetError::NoManager(fleet, node.clone()),
+            FleetError::NoManager(fleet, node).of_new_fleet(),
             FleetError::UnderWay(fleet, 2),
             FleetError::NotBegun(fleet, 1),
             FleetError::NotSwitched(fleet, 2),

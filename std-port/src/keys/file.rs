@@ -96,25 +96,36 @@ fn foreign(path: &Path, owner: u32) -> KeyError {
 
 /// Makes a folder that only this user enters, unless there is one.
 pub(super) fn make_folder(path: &Path) -> Result<(), KeyError> {
-    DirBuilder::new().recursive(true).mode(0o700).create(path).map_err(|error| system(path, error))
+    let made = DirBuilder::new().recursive(true).mode(0o700).create(path);
+    made.map_err(|error| KeyError::NoFolder { path: path.to_owned(), error })
 }
 
-/// Puts a file in the place of the one at `path`, if there is one.
-pub(super) fn replace(path: &Path, text: &str) -> Result<(), KeyError> {
-    let kept = written(path, text)?.persist(path).map_err(|error| system(path, error.error));
+/// Writes a file for this user alone in the place of the one at `path`, if there is one: whole, or not at all.
+pub fn write_private(path: &Path, bytes: &[u8]) -> Result<(), KeyError> {
+    check_replaceable(path)?;
+    let kept = written(path, bytes)?.persist(path).map_err(|error| system(path, error.error));
     kept.and_then(|_| keep_folder(path))
+}
+
+/// Refuses a path where a folder, a pipe or a device is: a rename would put a file in the place of those last two.
+pub fn check_replaceable(path: &Path) -> Result<(), KeyError> {
+    match path.metadata() {
+        Ok(found) if !found.is_file() => Err(KeyError::InTheWay(path.to_owned())),
+        // What else is wrong shows when it is written.
+        _ => Ok(()),
+    }
 }
 
 /// Puts a file at `path`, where there must be none.
 pub(super) fn create(path: &Path, text: &str) -> Result<(), KeyError> {
-    let kept = written(path, text)?.persist_noclobber(path).map_err(|error| system(path, error.error));
+    let kept = written(path, text.as_bytes())?.persist_noclobber(path).map_err(|error| system(path, error.error));
     kept.and_then(|_| keep_folder(path))
 }
 
 /// Whether there is a file, or a link, that can be taken away.
 pub(super) fn is_there(path: &Path) -> Result<bool, KeyError> {
     match path.symlink_metadata() {
-        Ok(found) if found.is_dir() => Err(KeyError::NoFile(path.to_owned())),
+        Ok(found) if !found.is_file() && !found.is_symlink() => Err(KeyError::NoFile(path.to_owned())),
         Ok(_) => Ok(true),
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
         Err(error) => Err(system(path, error)),
@@ -131,10 +142,10 @@ pub(super) fn remove(path: &Path) -> Result<bool, KeyError> {
 }
 
 /// A file beside `path`, opened with `O_EXCL` for this user alone, and on the disk.
-fn written(path: &Path, text: &str) -> Result<NamedTempFile, KeyError> {
+fn written(path: &Path, bytes: &[u8]) -> Result<NamedTempFile, KeyError> {
     let file = tempfile::Builder::new().prefix(".keys-").tempfile_in(folder_of(path));
     let mut file = file.map_err(|error| system(path, error))?;
-    let result = file.write_all(text.as_bytes()).and_then(|()| file.as_file().sync_all());
+    let result = file.write_all(bytes).and_then(|()| file.as_file().sync_all());
     result.map_err(|error| system(path, error))?;
     Ok(file)
 }
@@ -158,6 +169,12 @@ mod tests {
     use std::fs::{Permissions, set_permissions};
     use std::os::unix::fs::PermissionsExt;
 
+    fn pipe(folder: &Path) -> PathBuf {
+        let pipe = folder.join("pipe");
+        rustix::fs::mknodat(rustix::fs::CWD, &pipe, rustix::fs::FileType::Fifo, rustix::fs::Mode::RWXU, 0).unwrap();
+        pipe
+    }
+
     #[test]
     fn what_is_written_is_for_its_owner_alone() {
         let folder = tempfile::tempdir().unwrap();
@@ -167,13 +184,29 @@ mod tests {
         assert!(matches!(create(&path, "two"), Err(KeyError::System { .. })));
         assert_eq!(*read(&path).unwrap().0, "one");
         let before = Mark::of(&path).unwrap();
-        replace(&path, "two").unwrap();
+        write_private(&path, b"two").unwrap();
         assert_eq!((path.metadata().unwrap().mode() & 0o777, &**read(&path).unwrap().0), (0o600, "two"));
         assert_ne!(Mark::of(&path).unwrap(), before);
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "nothing is left beside it");
         assert!(is_there(&path).unwrap() && remove(&path).unwrap());
         assert!(!is_there(&path).unwrap() && !remove(&path).unwrap());
         assert!(matches!(is_there(folder.path()), Err(KeyError::NoFile(_))));
+        assert!(matches!(make_folder(&folder.path().join("b")), Ok(())));
+        create(&path, "one").unwrap();
+        assert!(matches!(make_folder(&path), Err(KeyError::NoFolder { .. })));
+    }
+
+    #[test]
+    fn what_is_no_file_is_neither_replaced_nor_removed() {
+        let folder = tempfile::tempdir().unwrap();
+        let pipe = pipe(folder.path());
+        let link = folder.path().join("link");
+        std::os::unix::fs::symlink(&pipe, &link).unwrap();
+        for path in [pipe.as_path(), &link, folder.path()] {
+            assert!(matches!(write_private(path, b"one"), Err(KeyError::InTheWay(_))), "{}", path.display());
+        }
+        assert!(matches!(is_there(&pipe), Err(KeyError::NoFile(_))));
+        assert!(!pipe.metadata().unwrap().is_file() && link.symlink_metadata().unwrap().is_symlink());
     }
 
     #[test]
@@ -200,8 +233,7 @@ mod tests {
         assert!(matches!(read(folder.path()), Err(KeyError::NoFile(_))));
         assert!(matches!(read(Path::new("/dev/zero")), Err(KeyError::NoFile(_))));
         assert!(matches!(read(&folder.path().join("absent")), Err(KeyError::System { .. })));
-        let pipe = folder.path().join("pipe");
-        rustix::fs::mknodat(rustix::fs::CWD, &pipe, rustix::fs::FileType::Fifo, rustix::fs::Mode::RWXU, 0).unwrap();
+        let pipe = pipe(folder.path());
         assert!(matches!(read(&pipe), Err(KeyError::NoFile(_))));
         let bytes = folder.path().join("bytes");
         create(&bytes, "").unwrap();

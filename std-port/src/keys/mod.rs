@@ -36,6 +36,7 @@ pub use cara_secure::keys::{DeviceSecret, DiscoveryKey, KEY_BYTES, PairKey, Root
 pub use error::{FleetError, KeyError, Owner};
 #[cfg(feature = "access")]
 pub(crate) use file::Mark;
+pub use file::{check_replaceable, write_private};
 pub use fleet::FleetKeys;
 pub use live::LiveRing;
 pub use members::{Member, Members, Revoked};

@@ -78,7 +78,7 @@ impl Store {
         // What could not be saved is told while there is no root that would be in the way of the next try.
         store.planned()?;
         // A list of nodes without its root is of keys that nobody has any more.
-        file::replace(&nodes_file(folder, fleet), &store.keys.members().text())?;
+        file::write_private(&nodes_file(folder, fleet), store.keys.members().text().as_bytes())?;
         file::create(&path, &root_text(fleet, store.keys.root()))?;
         Ok(store)
     }
@@ -143,7 +143,7 @@ impl Store {
     /// refused, nothing is written. Where writing fails or is interrupted, the next one completes it.
     pub fn save(&self) -> Result<Vec<Written>, KeyError> {
         let (members, planned) = (self.keys.members(), self.planned()?);
-        file::replace(&nodes_file(&self.folder, members.fleet()), &members.text())?;
+        file::write_private(&nodes_file(&self.folder, members.fleet()), members.text().as_bytes())?;
         let written = planned.into_iter().map(Planned::carry_out).collect::<Result<_, _>>();
         written.map_err(|error| KeyError::HalfWay { fleet: members.fleet(), error: Box::new(error) })
     }
@@ -196,7 +196,7 @@ impl Store {
 impl Planned {
     fn carry_out(self) -> Result<Written, KeyError> {
         match &self.text {
-            Some(text) => file::replace(&self.to_be.path, text)?,
+            Some(text) => file::write_private(&self.to_be.path, text.as_bytes())?,
             None => drop(file::remove(&self.to_be.path)?),
         }
         Ok(self.to_be)

@@ -19,16 +19,13 @@ pub(crate) struct Arguments {
     #[arg(long = "for", value_name = "TIME", value_parser = parse_time)]
     span: Option<Duration>,
     /// End after so many events.
-    #[arg(long, value_name = "NUMBER")]
+    #[arg(long, value_name = "NUMBER", value_parser = clap::value_parser!(u64).range(1..))]
     count: Option<u64>,
 }
 
 pub(crate) fn run(Arguments { span, count }: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
     let mut operator = Operator::open(global, &Need::Nothing)?;
     let mut left = count.unwrap_or(u64::MAX);
-    if left == 0 {
-        return Ok(Exit::Done.into());
-    }
     operator.watch(&Question::Watch, span, |answer| {
         let Answer::Event { at_ms, event, node, text } = answer else { return Ok(true) };
         match global.json {

@@ -95,9 +95,8 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
 }
 
 impl Nodes {
-    fn add_to(&self, keys: &mut FleetKeys) -> anyhow::Result<()> {
-        let managers: Result<Vec<_>, _> = self.manager.iter().map(m_unit).collect();
-        keys.add_all(&self.nodes, &managers?).map_err(wrong)
+    fn managers(&self) -> anyhow::Result<Vec<Identity>> {
+        self.manager.iter().map(m_unit).collect()
     }
 }
 
@@ -107,14 +106,15 @@ fn m_unit(NameAndId { name, id }: &NameAndId) -> anyhow::Result<Identity> {
 
 fn new_fleet(nodes: &Nodes, folder: PathBuf, global: &Global) -> anyhow::Result<()> {
     let mut keys = FleetKeys::draw(Fleet(global.fleet.unwrap_or(0))).map_err(failed)?;
-    nodes.add_to(&mut keys)?;
+    let added = keys.add_all(&nodes.nodes, &nodes.managers()?);
+    added.map_err(|error| wrong(error.of_new_fleet()))?;
     let store = Store::create(&folder, keys).map_err(failed)?;
     save(Done::Made, &store, global)
 }
 
 fn derive(nodes: &Nodes, folder: PathBuf, global: &Global) -> anyhow::Result<()> {
     let mut store = open(folder, global)?;
-    nodes.add_to(store.keys_mut())?;
+    store.keys_mut().add_all(&nodes.nodes, &nodes.managers()?).map_err(wrong)?;
     save(Done::Derived, &store, global)
 }
 

@@ -90,11 +90,12 @@ fn next(store: &Store, written: &[Written]) -> Vec<String> {
         next.push(format!("`cara keys derive --fleet {fleet} depot/1@m_unit agv-17/17` makes the keys of nodes"));
     }
     if written.iter().any(|written| written.change != Change::Removed) {
-        next.push(
-            "bring each of these files to where its node runs, into ~/.config/cara/keys or /etc/cara/keys, for that \
+        let is_set = std::env::var_os("XDG_CONFIG_HOME").is_some_and(|folder| !folder.is_empty());
+        let configuration = if is_set { "$XDG_CONFIG_HOME" } else { "~/.config" };
+        next.push(format!(
+            "bring each of these files to where its node runs, into {configuration}/cara/keys or /etc/cara/keys, for that \
              user alone; a board takes its own with `cara provision BOARD --keys FILE`"
-                .into(),
-        );
+        ));
     }
     let step = members.beside().map(|beside| if beside > members.generation() { "--switch" } else { "--finish" });
     next.extend(step.map(|step| format!("when all nodes have theirs: `cara keys rotate --fleet {fleet} {step}`")));

@@ -3,7 +3,7 @@
 use std::io::IsTerminal;
 
 use tracing_subscriber::EnvFilter;
-use tracing_subscriber::filter::ParseError;
+use tracing_subscriber::filter::{LevelFilter, ParseError};
 
 /// What is logged unless somebody says something else.
 const LEVEL: &str = "info";
@@ -15,17 +15,37 @@ pub(super) struct Logging {
     fixed: bool,
 }
 
+/// Why a text is no level.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum LevelError {
+    /// A word alone that is none of the levels. `RUST_LOG` would take it for a part of the program of which all is logged.
+    #[error("`{0}` is none of the levels")]
+    Word(String),
+    #[error(transparent)]
+    Form(#[from] ParseError),
+}
+
 /// What a level's text asks for, as `info` or `warn,cara_std=debug`.
-pub(super) fn filter(text: &str) -> Result<EnvFilter, ParseError> {
-    EnvFilter::try_new(text)
+pub(super) fn filter(text: &str) -> Result<EnvFilter, LevelError> {
+    // Brackets hold the fields of a span, and commas between those.
+    let words = text.split(',').filter(|_| !text.contains('['));
+    let mut alone = words.map(str::trim).filter(|word| !word.contains('='));
+    match alone.find(|word| word.parse::<LevelFilter>().is_err()) {
+        Some(word) => Err(LevelError::Word(word.to_owned())),
+        None => Ok(EnvFilter::try_new(text)?),
+    }
 }
 
 impl Logging {
     /// Begins to log. The command line's level stands above `RUST_LOG`, and that above the file's.
     pub(super) fn start(command_line: Option<&str>, file: Option<&str>) -> anyhow::Result<Self> {
         let environment = std::env::var(EnvFilter::DEFAULT_ENV).ok().filter(|text| !text.is_empty());
-        let above = command_line.or(environment.as_deref());
-        let filter = filter(above.or(file).unwrap_or(LEVEL))?;
+        let fixed = command_line.is_some() || environment.is_some();
+        let filter = match (command_line, environment) {
+            // It is every program's, and may name parts alone.
+            (None, Some(text)) => EnvFilter::try_new(text)?,
+            (level, _) => filter(level.or(file).unwrap_or(LEVEL))?,
+        };
         let builder = tracing_subscriber::fmt()
             .with_writer(std::io::stderr)
             .with_ansi(std::io::stderr().is_terminal())
@@ -38,7 +58,7 @@ impl Logging {
             // Fails only once nobody logs any more.
             let _ = handle.reload(filter);
         });
-        Ok(Self { change, fixed: above.is_some() })
+        Ok(Self { change, fixed })
     }
 
     /// Takes the level of a file that has changed.

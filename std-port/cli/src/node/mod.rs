@@ -16,8 +16,7 @@ mod settings;
 mod unit;
 mod values;
 
-use std::fs::File;
-use std::io::Read;
+use std::fmt::Display;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -26,6 +25,7 @@ use cara_std::Interfaces;
 use serde_json::json;
 
 use crate::exit::{Ended, Exit};
+use crate::files;
 use crate::global::Global;
 use crate::output;
 use mistake::{Mistakes, Source};
@@ -97,14 +97,14 @@ fn wrong(mistakes: Mistakes) -> anyhow::Error {
 fn read(path: Option<&Path>) -> anyhow::Result<Source> {
     let Some(path) = path else { return Ok(Source::default()) };
     let shown = path.display();
-    let mut text = String::new();
-    let read = File::open(path).and_then(|file| file.take(LONGEST_FILE + 1).read_to_string(&mut text));
-    read.map_err(|error| {
+    let wrong = |error: &dyn Display| {
         Ended::usage(format!("{shown} cannot be read: {error}; `cara node --example` prints a configuration"))
-    })?;
-    if text.len() as u64 > LONGEST_FILE {
+    };
+    let (bytes, is_longer) = files::read(path, LONGEST_FILE).map_err(|error| wrong(&error))?;
+    if is_longer {
         return Err(Ended::usage(format!("{shown} has more than {LONGEST_FILE} bytes: is it a configuration?")));
     }
+    let text = String::from_utf8(bytes.to_vec()).map_err(|error| wrong(&error.utf8_error()))?;
     Ok(Source { name: shown.to_string(), text })
 }
 

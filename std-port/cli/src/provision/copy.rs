@@ -5,9 +5,10 @@ use cara_settings::board::Board;
 use cara_settings::keys::kept;
 use cara_settings::page::{BYTES, Copy, encode_with, replaced};
 use cara_settings::uf2::{PAYLOAD, Place, block};
+use cara_std::keys::Owner;
 use zeroize::Zeroizing;
 
-use super::secrets::Secrets;
+use super::secrets::{Secrets, owner};
 use crate::exit::Ended;
 
 /// What a copy says.
@@ -27,6 +28,8 @@ pub(super) struct Written {
     /// How many of them say something.
     used: usize,
     pub(super) has_keys: bool,
+    /// Whose keys the board has and this copy leaves behind.
+    pub(super) left: Option<Owner>,
 }
 
 /// The copy that comes after those on the board; it replaces the older one.
@@ -39,7 +42,8 @@ pub(super) fn next(board: &Board, content: &Content, first: &[u8], second: &[u8]
     };
     let held = || kept(&content.settings, first, second).map(Secrets::kept);
     let secrets = content.secrets.clone().or_else(held);
-    written(&content.settings, secrets.as_ref(), address, generation)
+    let left = if secrets.is_none() { owner(first, second) } else { None };
+    Ok(Written { left, ..written(&content.settings, secrets.as_ref(), address, generation)? })
 }
 
 /// Both copies, for a board of which nobody knows what it holds.
@@ -54,7 +58,7 @@ fn written(settings: &Settings, secrets: Option<&Secrets>, address: u32, generat
     match encode_with(settings, keys, generation, &mut page) {
         Some(used) => {
             let bytes = Zeroizing::new(page.to_vec());
-            Ok(Written { address, generation, bytes, used, has_keys: !keys.is_empty() })
+            Ok(Written { address, generation, bytes, used, has_keys: !keys.is_empty(), left: None })
         }
         None => Err(Ended::usage("the settings are longer than a page")),
     }

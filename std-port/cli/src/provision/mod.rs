@@ -11,16 +11,16 @@ mod show;
 mod text;
 mod told;
 
-use std::fs::File;
-use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use anyhow::Context;
 use cara_settings::board::{BOARDS, Board, find};
+use cara_std::keys::{Owner, check_replaceable, full_name, write_private};
 use serde_json::json;
 
 use crate::exit::{Ended, Exit};
+use crate::files;
 use crate::global::Global;
 use crate::output;
 
@@ -96,7 +96,8 @@ fn write(arguments: &Arguments, global: &Global) -> anyhow::Result<()> {
 
 fn known(name: &str) -> anyhow::Result<&'static Board> {
     find(name).ok_or_else(|| {
-        let names = BOARDS.map(|board| board.name).join(", ");
+        let names = BOARDS.iter().chain([&text::EMULATED]).map(|board| board.name);
+        let names = names.collect::<Vec<_>>().join(", ");
         Ended::usage(format!("there is no board {name}; there are: {names}"))
     })
 }
@@ -121,7 +122,7 @@ fn write_file(
     };
     let has_keys = written.iter().any(|copy| copy.has_keys);
     let is_secret = has_keys || content.settings.wifi.is_some();
-    store(file, &bytes, is_secret).with_context(|| format!("cannot write {}", file.display()))?;
+    store(file, &bytes, is_secret)?;
     report(board, &written, Some(file), content, global)?;
     if previous.is_none() && arguments.uf2 && !has_keys && !global.json {
         output::line("keys that the board has are gone with it: give --keys if it is to keep any")?;
@@ -136,15 +137,12 @@ fn write_file(
 }
 
 /// Writes a file; one with keys or a password for its owner alone, whatever stood there before.
-fn store(file: &Path, bytes: &[u8], is_secret: bool) -> std::io::Result<()> {
-    if !is_secret {
-        return std::fs::write(file, bytes);
+fn store(file: &Path, bytes: &[u8], is_secret: bool) -> anyhow::Result<()> {
+    check_replaceable(file).map_err(|error| Ended::usage(format!("--output: {error}")))?;
+    if is_secret {
+        return write_private(file, bytes).map_err(|error| Ended::failed("Failed", format!("cannot write {error}")));
     }
-    let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let mut private = tempfile::NamedTempFile::new_in(folder)?;
-    private.write_all(bytes)?;
-    private.persist(file)?;
-    Ok(())
+    std::fs::write(file, bytes).with_context(|| format!("cannot write {}", file.display()))
 }
 
 /// Longest file that is read: the pages of any board as UF2 are far shorter.
@@ -152,10 +150,9 @@ const LONGEST_FILE: u64 = 1 << 20;
 
 /// A file with pages of a board.
 fn read_whole(file: &Path) -> anyhow::Result<Zeroizing<Vec<u8>>> {
-    let mut bytes = Zeroizing::new(Vec::new());
-    let read = File::open(file).and_then(|opened| opened.take(LONGEST_FILE + 1).read_to_end(&mut bytes));
-    read.with_context(|| format!("cannot read {}", file.display()))?;
-    if bytes.len() as u64 > LONGEST_FILE {
+    let read = files::read(file, LONGEST_FILE);
+    let (bytes, is_longer) = read.with_context(|| format!("cannot read {}", file.display()))?;
+    if is_longer {
         let text = format!("{} has more than {LONGEST_FILE} bytes: it holds no pages of a board", file.display());
         return Err(Ended::usage(text));
     }
@@ -179,7 +176,7 @@ fn report(
     global: &Global,
 ) -> anyhow::Result<()> {
     for copy in written {
-        let Written { address, generation, has_keys, .. } = copy;
+        let Written { address, generation, has_keys, left, .. } = copy;
         let place = file.map_or_else(|| "the board".to_owned(), |file| file.display().to_string());
         let keys = secrets::told(&copy.bytes).ok().flatten().map(|keys| keys.generations);
         match global.json {
@@ -194,8 +191,22 @@ fn report(
                 };
                 let name = board.name;
                 output::line(format_args!("{place}: {what} for {name} at {address:#x}, generation {generation}"))?;
+                left.as_ref().map_or(Ok(()), |owner| keys_are_left(owner, content))?;
             }
         }
     }
     Ok(())
+}
+
+/// Why a copy does not have the keys that the board had.
+fn keys_are_left(owner: &Owner, Content { settings, .. }: &Content) -> std::io::Result<()> {
+    let why = match settings.insecure {
+        true => "a board in plain mode has no keys".to_owned(),
+        false => format!(
+            "this is {} in fleet {}: tell it the same name, id, manager and --fleet, or give --keys",
+            full_name(&settings.identity),
+            settings.fleet.0,
+        ),
+    };
+    output::line(format_args!("the keys of {owner} that the board had are not kept: {why}"))
 }

@@ -5,7 +5,7 @@ use std::path::Path;
 use cara_core::distribution::identity::Identity;
 use cara_settings::Settings;
 use cara_settings::keys::{KEYS_BYTES, Keys, KeysError};
-use cara_std::keys::{DeviceSecret, KeyRing, draw, full_name};
+use cara_std::keys::{DeviceSecret, KeyRing, Owner, draw, full_name};
 use zeroize::Zeroizing;
 
 use crate::exit::Ended;
@@ -65,16 +65,31 @@ pub(super) struct Shown {
     pub(super) peers: Vec<String>,
 }
 
+impl Shown {
+    fn of(keys: &Keys<PEERS>) -> Self {
+        let generations = keys.discoveries().map(|(number, _)| number).collect();
+        Self { generations, peers: keys.peers().map(full_name).collect() }
+    }
+}
+
+/// What may be shown of the keys in the text of an emulated board.
+pub(super) fn told_by(text: &str) -> Result<Option<Shown>, KeysError> {
+    Ok(cara_settings::keys::of_text(text)?.as_ref().map(Shown::of))
+}
+
 /// What may be shown of the keys in a page.
 pub(super) fn told(page: &[u8]) -> Result<Option<Shown>, KeysError> {
-    match cara_settings::keys::newest::<PEERS>(page, &[]) {
-        Ok((_, keys)) => {
-            let generations = keys.discoveries().map(|(number, _)| number).collect();
-            Ok(Some(Shown { generations, peers: keys.peers().map(full_name).collect() }))
-        }
+    match cara_settings::keys::newest(page, &[]) {
+        Ok((_, keys)) => Ok(Some(Shown::of(&keys))),
         Err(KeysError::Absent) => Ok(None),
         Err(error) => Err(error),
     }
+}
+
+/// Whose keys the newest copy of a board has.
+pub(super) fn owner(first: &[u8], second: &[u8]) -> Option<Owner> {
+    let (settings, _) = cara_settings::keys::newest::<PEERS>(first, second).ok()?;
+    Some(Owner { identity: settings.identity, fleet: settings.fleet })
 }
 
 /// The file with a board's keys.

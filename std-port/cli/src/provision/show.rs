@@ -2,14 +2,16 @@
 
 use std::path::Path;
 
-use cara_settings::board::BOARDS;
+use cara_settings::Settings;
+use cara_settings::board::{BOARDS, Board};
 use cara_settings::keys::KeysError;
 use cara_settings::page::{BYTES, decode};
 use cara_settings::uf2::{BLOCK, PAYLOAD};
 use serde_json::json;
 use zeroize::Zeroizing;
 
-use super::secrets::{Shown, told};
+use super::secrets::{Shown, told, told_by};
+use super::text::{self, EMULATED};
 use crate::exit::Ended;
 use crate::global::Global;
 use crate::output::{self, PLAIN, Rows};
@@ -19,27 +21,54 @@ const HEADER: usize = 32;
 
 /// Prints the table of boards.
 pub(super) fn boards(global: &Global) -> anyhow::Result<()> {
-    let mut rows = Rows::new(["board", "chip", "first page", "second page", "file", "what it is"]);
-    for board in BOARDS {
-        let [first, second] = board.pages;
-        let file = if board.uf2.is_some() { "uf2" } else { "bin" };
+    let heads =
+        ["board", "chip", "first page", "second page", "count of starts", "erased at once", "file", "what it is"];
+    let mut rows = Rows::new(heads);
+    for board in BOARDS.iter().chain([&EMULATED]) {
         if global.json {
+            // The emulated board has no flash.
+            let flash = (*board != EMULATED).then_some((board.pages, board.boots, board.erase_bytes));
             output::object(&json!({
-                "board": board.name, "chip": board.chip, "pages": board.pages, "erase_bytes": board.erase_bytes,
-                "file": file, "wireless": board.wireless, "description": board.description,
+                "board": board.name, "chip": board.chip, "pages": flash.map(|(pages, ..)| pages),
+                "starts": flash.map(|(_, starts, _)| starts), "erase_bytes": flash.map(|(.., bytes)| bytes),
+                "file": form(board), "wireless": board.wireless, "description": board.description,
             }))?;
         }
-        let cells = [board.name, board.chip, &format!("{first:#x}"), &format!("{second:#x}"), file, board.description];
-        rows.add(PLAIN, cells.map(str::to_owned));
+        let [first, second, starts, erased] = flash(board);
+        let [name, chip, description] = [board.name, board.chip, board.description].map(str::to_owned);
+        rows.add(PLAIN, [name, chip, first, second, starts, erased, form(board).to_owned(), description]);
     }
     if global.json { Ok(()) } else { Ok(rows.print()?) }
+}
+
+/// The form of the file that is written for a board.
+fn form(board: &Board) -> &'static str {
+    match board.uf2 {
+        _ if *board == EMULATED => "text",
+        Some(_) => "uf2",
+        None => "bin",
+    }
+}
+
+/// Where settings and the count of starts are, and how much is erased at once.
+fn flash(board: &Board) -> [String; 4] {
+    if *board == EMULATED {
+        return ["-"; 4].map(str::to_owned);
+    }
+    let ([first, second], [one, other]) = (board.pages, board.boots);
+    let starts = format!("{one:#x}, {other:#x}");
+    [format!("{first:#x}"), format!("{second:#x}"), starts, format!("{} KiB", board.erase_bytes / 1024)]
 }
 
 /// Prints what the pages in a file say. Passwords and keys are not shown.
 pub(super) fn file(file: &Path, global: &Global) -> anyhow::Result<()> {
     let bytes = super::read_whole(file)?;
+    let wrong = |error: KeysError| Ended::failed("Page", format!("{}: {error}", file.display()));
+    if let Some(text) = text::of_emulated(&bytes) {
+        return Ok(told_by_text(text).map_err(wrong)?.print(global)?);
+    }
     for page in pages(&bytes) {
-        page_of(&page, global).map_err(|error| Ended::failed("Page", format!("{}: {error}", file.display())))??;
+        page_of(&page).map_err(wrong)?.print(global)?;
     }
     Ok(())
 }
@@ -65,24 +94,39 @@ fn pages(bytes: &[u8]) -> Vec<Zeroizing<Vec<u8>>> {
     pages.into_iter().map(|(_, page)| page).collect()
 }
 
-fn page_of(page: &[u8], global: &Global) -> Result<std::io::Result<()>, KeysError> {
+/// What a board is told.
+struct Told {
+    settings: Settings,
+    /// None of the emulated board, which has one text and no copies.
+    generation: Option<u32>,
+    keys: Option<Shown>,
+}
+
+fn page_of(page: &[u8]) -> Result<Told, KeysError> {
     let (settings, generation) = decode(page)?;
-    let wifi = settings.wifi.as_ref().map(|wifi| wifi.name());
-    let keys = told(page)?;
-    Ok(match global.json {
-        true => {
+    Ok(Told { settings, generation: Some(generation), keys: told(page)? })
+}
+
+fn told_by_text(text: &str) -> Result<Told, KeysError> {
+    Ok(Told { settings: text.parse()?, generation: None, keys: told_by(text)? })
+}
+
+impl Told {
+    fn print(self, global: &Global) -> std::io::Result<()> {
+        let Self { settings, generation, keys } = self;
+        let wifi = settings.wifi.as_ref().map(|wifi| wifi.name());
+        if global.json {
             let keys = keys.map(|Shown { generations, peers }| json!({ "generations": generations, "peers": peers }));
             let settings = settings.to_string();
-            output::object(&json!({ "generation": generation, "settings": settings, "wifi": wifi, "keys": keys }))
+            return output::object(
+                &json!({ "generation": generation, "settings": settings, "wifi": wifi, "keys": keys }),
+            );
         }
-        false => {
-            let wifi = wifi.map(|name| format!(", Wi-Fi {name}")).unwrap_or_default();
-            output::line(format_args!(
-                "generation {generation}: {settings}{wifi}{}",
-                keys.map(in_words).unwrap_or_default()
-            ))
-        }
-    })
+        let wifi = wifi.map(|name| format!(", Wi-Fi {name}")).unwrap_or_default();
+        let keys = keys.map(in_words).unwrap_or_default();
+        let head = generation.map_or_else(|| EMULATED.name.to_owned(), |number| format!("generation {number}"));
+        output::line(format_args!("{head}: {settings}{wifi}{keys}"))
+    }
 }
 
 fn in_words(Shown { generations, peers }: Shown) -> String {

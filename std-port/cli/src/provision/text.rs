@@ -2,7 +2,6 @@
 
 use std::path::Path;
 
-use anyhow::Context;
 use cara_settings::board::Board;
 use serde_json::json;
 use zeroize::Zeroizing;
@@ -12,6 +11,7 @@ use super::store;
 use crate::exit::Ended;
 use crate::global::Global;
 use crate::output;
+use cara_settings::Settings;
 
 /// The emulated board. It has no pages.
 pub(super) const EMULATED: Board = Board {
@@ -34,15 +34,36 @@ pub(super) fn write(content: &Content, file: Option<&Path>, global: &Global) -> 
     let file = file.ok_or_else(|| {
         Ended::usage(format!("{name} is emulated: it is told by a file of this computer, which --output FILE writes"))
     })?;
+    check_words(&content.settings, file)?;
     let text = text(content);
-    store(file, text.as_bytes(), content.secrets.is_some())
-        .with_context(|| format!("cannot write {}", file.display()))?;
+    store(file, text.as_bytes(), content.secrets.is_some())?;
     match global.json {
         true => output::object(&json!({ "board": name, "file": file }))?,
         false => output::line(format_args!(
             "{0}: for QEMU's -semihosting-config, arg=agv,arg=\"file={0} boots={0}.boots\"",
             file.display()
         ))?,
+    }
+    Ok(())
+}
+
+/// The text of a file that was written here.
+pub(super) fn of_emulated(bytes: &[u8]) -> Option<&str> {
+    std::str::from_utf8(bytes).ok().filter(|text| text.starts_with("name="))
+}
+
+/// The image splits its arguments at blanks, and QEMU its options at commas.
+fn check_words(settings: &Settings, file: &Path) -> anyhow::Result<()> {
+    let names = [Some(settings.identity.name()), settings.manager.as_ref().map(|manager| &*manager.name)];
+    if let Some(name) = names.into_iter().flatten().find(|name| name.contains(char::is_whitespace)) {
+        let text = format!("{} is told by words, so no name may have a blank in it: rename {name:?}", EMULATED.name);
+        return Err(Ended::usage(text));
+    }
+    let path = file.to_string_lossy();
+    if path.contains(|character: char| character.is_whitespace() || matches!(character, ',' | '"')) {
+        let text =
+            format!("--output {path:?}: QEMU's options end at blanks, commas and quotes: name a path without them");
+        return Err(Ended::usage(text));
     }
     Ok(())
 }

@@ -35,7 +35,7 @@ pub(super) struct Told {
     #[arg(long, value_name = "ADDRESS", default_value = "dhcp")]
     address: Address,
     /// Where other networks are reached; only with an address of the board's own.
-    #[arg(long, value_name = "ADDRESS")]
+    #[arg(long, value_name = "ADDRESS", value_parser = host)]
     gateway: Option<Ipv4Addr>,
     /// The access point, for a board on Wi-Fi.
     #[arg(long, value_name = "NAME")]
@@ -57,13 +57,38 @@ impl FromStr for Address {
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         const FORM: &str = "write dhcp, or ADDRESS/BITS as in 10.0.0.17/24";
+        const HOST: &str = "this is no address of a host in its network: write one as in 10.0.0.17/24";
         if text == "dhcp" {
             return Ok(Self::Dhcp);
         }
         let (address, prefix) = text.split_once('/').ok_or(FORM)?;
         let prefix = prefix.parse().ok().filter(|bits| *bits <= 32).ok_or(FORM)?;
-        Ok(Self::Static(address.parse().map_err(|_| FORM)?, prefix))
+        let address = address.parse().map_err(|_| FORM)?;
+        if is_of_host(address) && !names_network(address, prefix) {
+            Ok(Self::Static(address, prefix))
+        } else {
+            Err(HOST)
+        }
     }
+}
+
+/// Whether one host can have it.
+fn is_of_host(address: Ipv4Addr) -> bool {
+    let [first, ..] = address.octets();
+    // From 224 on they are of groups, or reserved.
+    (1..224).contains(&first) && !address.is_loopback()
+}
+
+/// Whether it means the network itself, or all hosts in it. Networks of two addresses and of one have no such ones.
+fn names_network(address: Ipv4Addr, prefix: u8) -> bool {
+    let hosts = u32::MAX.checked_shr(prefix.into()).unwrap_or(0);
+    let host = address.to_bits() & hosts;
+    prefix < 31 && (host == 0 || host == hosts)
+}
+
+fn host(text: &str) -> Result<Ipv4Addr, &'static str> {
+    let address = text.parse().map_err(|_| "write an IPv4 address as in 10.0.0.1")?;
+    if is_of_host(address) { Ok(address) } else { Err("this is no host's address: write one as in 10.0.0.1") }
 }
 
 impl Told {
@@ -177,7 +202,16 @@ fn password(file: &Path) -> anyhow::Result<String> {
     } else {
         text = std::fs::read_to_string(file).with_context(|| format!("cannot read {}", file.display()))?;
     }
-    Ok(text.lines().next().unwrap_or_default().to_owned())
+    match text.lines().next().unwrap_or_default() {
+        "" => {
+            let text = format!(
+                "{} has no password in its first line: for an open access point leave --wifi-password-file away",
+                file.display()
+            );
+            Err(Ended::usage(text))
+        }
+        password => Ok(password.to_owned()),
+    }
 }
 
 #[cfg(test)]
@@ -189,6 +223,17 @@ mod tests {
         assert_eq!("dhcp".parse(), Ok(Address::Dhcp));
         assert_eq!("10.0.0.17/24".parse(), Ok(Address::Static([10, 0, 0, 17].into(), 24)));
         for wrong in ["", "DHCP", "10.0.0.17", "10.0.0.17/33", "10.0.0/24", "10.0.0.17/-1", "::1/64"] {
+            assert!(wrong.parse::<Address>().is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn an_address_is_one_of_a_host() {
+        for right in ["10.0.0.1/24", "10.0.0.254/24", "10.0.1.0/16", "192.168.0.0/31", "10.0.0.255/32", "10.0.0.17/0"] {
+            assert!(right.parse::<Address>().is_ok(), "{right}");
+        }
+        let wrong = ["255.255.255.255/24", "0.0.0.0/24", "224.0.0.1/4", "127.0.0.1/8", "10.0.0.0/24", "10.0.0.255/24"];
+        for wrong in wrong {
             assert!(wrong.parse::<Address>().is_err(), "{wrong}");
         }
     }

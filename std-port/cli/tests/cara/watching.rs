@@ -32,5 +32,5 @@ fn a_failed_asynchronous_call_is_an_event() {
 fn a_watch_ends_when_it_is_told_to() {
     let stage = Stage::with(&[]);
     stage.ends(0, &["watch", "--for", "50ms"]);
-    stage.ends(0, &["watch", "--count", "0"]);
+    stage.ends(2, &["watch", "--count", "0"]);
 }
