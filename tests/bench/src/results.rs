@@ -1,7 +1,7 @@
 //! Everything that a run finds, as the one JSON object that `docs/performance.md` describes key by key.
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
 use serde::{Deserialize, Serialize};
@@ -10,6 +10,7 @@ use crate::peers::OutsideReport;
 
 use cara_bench_ends::Delivery;
 use cara_bench_ends::Pin;
+use cara_processes::files::can_write;
 
 /// How messages are protected.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -237,13 +238,24 @@ impl Results {
         serde_json::from_str(&text).with_context(|| format!("{} is no complete file of a run", path.display()))
     }
 
+    /// Fails unless [`write`](Self::write) can write there.
+    pub(crate) fn can_write(path: &Path) -> Result<()> {
+        can_write(path)?;
+        can_write(&part(path)).with_context(|| format!("{} is first written beside it", path.display()))
+    }
+
     /// Writes all of it; a reader finds the old file or the new one, never a part.
     pub(crate) fn write(&self, path: &Path) -> Result<()> {
         let text = serde_json::to_string_pretty(self)? + "\n";
-        let fresh = path.with_extension("part");
+        let fresh = part(path);
         std::fs::write(&fresh, text).with_context(|| format!("writing {}", fresh.display()))?;
         std::fs::rename(&fresh, path).with_context(|| format!("writing {}", path.display()))
     }
+}
+
+/// Where a file is written before it has its name.
+fn part(path: &Path) -> PathBuf {
+    path.with_extension("part")
 }
 
 /// Microseconds with two digits behind the point.

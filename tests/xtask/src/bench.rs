@@ -5,6 +5,7 @@ use std::path::Path;
 use std::process::{Command, ExitCode};
 
 use anyhow::{Context, Result};
+use cara_processes::files;
 
 use crate::command::Run;
 use crate::workspace;
@@ -29,7 +30,7 @@ pub(crate) struct Options {
     #[arg(long, value_name = "FILE")]
     resume: Option<std::path::PathBuf>,
     /// So many turns of each cell of the response time instead of the usual.
-    #[arg(long)]
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     rounds: Option<u32>,
     /// Draws the paper's figures 6, 7 and 8 and the ratios here, as SVG and PNG.
     #[arg(long, value_name = "DIR")]
@@ -41,6 +42,8 @@ pub(crate) struct Options {
 
 /// Builds the program and becomes it, so that Ctrl-C reaches it alone and it can write what it has.
 pub(crate) fn run(options: &Options) -> Result<ExitCode> {
+    options.json.as_deref().map_or(Ok(()), files::can_write)?;
+    options.plots.as_deref().map_or(Ok(()), files::can_write_in)?;
     Run::cargo().args(["build", "--release", "--quiet", "--package", "cara-bench"]).stream()?;
     let folder = std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| workspace::root().join("target"), Into::into);
     let program = folder.join("release").join("cara-bench");

@@ -4,6 +4,7 @@ use std::path::Path;
 use std::process::ExitCode;
 
 use anyhow::Result;
+use cara_processes::files;
 
 use crate::command::Run;
 use crate::groups::Extent;
@@ -13,6 +14,7 @@ const CHECKED_ROUNDS: &str = "5";
 
 /// All figures, for as many nodes as are asked for.
 pub(crate) fn run(nodes: Option<u16>, json: Option<&Path>) -> Result<ExitCode> {
+    json.map_or(Ok(()), files::can_write)?;
     let nodes = nodes.map(|nodes| nodes.to_string());
     let mut run = measured();
     if let Some(nodes) = &nodes {

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use anyhow::{Context, Result, bail};
+use cara_processes::files;
 use serde_json::{Value, json};
 
 use crate::command::Run;
@@ -40,6 +41,7 @@ const TUNABLES: &str = "glibc.cpu.hwcaps=-AVX512F,-AVX512VL,-AVX512BW,-AVX2,-AVX
 
 /// Counts, prints, and writes the same as JSON or into the document.
 pub(crate) fn run(json: Option<&Path>, write: bool) -> Result<ExitCode> {
+    json.map_or(Ok(()), files::can_write)?;
     installed().map_err(anyhow::Error::msg)?;
     let mut rows = counted()?;
     match network()? {
@@ -50,7 +52,8 @@ pub(crate) fn run(json: Option<&Path>, write: bool) -> Result<ExitCode> {
     println!("{}", table(&rows));
     if let Some(path) = json {
         let rows: Vec<Value> = rows.iter().map(Row::to_json).collect();
-        std::fs::write(path, serde_json::to_string_pretty(&rows)? + "\n")?;
+        let written = std::fs::write(path, serde_json::to_string_pretty(&rows)? + "\n");
+        written.with_context(|| format!("cannot write {}", path.display()))?;
     }
     if write {
         DOCUMENT.write(&rows)?;

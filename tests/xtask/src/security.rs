@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use anyhow::{Context, Result, ensure};
+use cara_processes::files;
 use clap::Args;
 
 use crate::command::Run;
@@ -25,6 +26,7 @@ pub(crate) struct Security {
 
 /// The command: the table, and success only if no attack came to anything.
 pub(crate) fn run(options: &Security) -> Result<ExitCode> {
+    options.json.as_deref().map_or(Ok(()), files::can_write)?;
     let extent = if options.quick { Extent::Quick } else { Extent::Full };
     if let Some(reason) = attack(extent, options.json.as_deref())? {
         println!("without boards: {reason}");

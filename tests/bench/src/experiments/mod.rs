@@ -24,6 +24,7 @@ use crate::progress::{is_stopped, stop_at_interrupt, was_stopped};
 use crate::results::{About, Done, Results, ratio};
 use crate::table;
 use cara_bench_ends::Pin;
+use cara_processes::files;
 use plan::{Extent, Plan};
 
 /// What to run.
@@ -102,6 +103,7 @@ impl Experiment {
 
 /// Runs them; what was measured is written and shown even where the run is stopped or an experiment fails.
 pub(crate) fn run(options: &Options) -> Result<()> {
+    can_write(options)?;
     stop_at_interrupt()?;
     let (outside, absent) = options.outside.find()?;
     let plan = plan(options, &outside)?;
@@ -138,17 +140,24 @@ pub(crate) fn run(options: &Options) -> Result<()> {
         earlier.iter().for_each(|earlier| resume::add_notes(&earlier.run.peers, &mut results.run.peers));
         results.run.seconds = results.run.experiments.iter().map(|done| done.seconds).sum();
         results.run.load_after = load();
-        write(&results, options.json.as_deref())?;
+        if let Err(error) = write(&results, options.json.as_deref()) {
+            eprintln!("{error:#}");
+        }
     }
     results.run.is_complete = !is_stopped() && failures.is_empty() && options.only.is_empty();
     results.goals = goals::of(&results);
-    write(&results, options.json.as_deref())?;
+    let written = write(&results, options.json.as_deref());
     table::show(&results);
-    if let Some(folder) = &options.plots {
-        plots::draw(&results, folder)?;
-    }
+    let drawn = options.plots.as_deref().map_or(Ok(()), |folder| plots::draw(&results, folder));
+    failures.extend([written, drawn].into_iter().filter_map(Result::err).map(|error| format!("{error:#}")));
     failures.extend(silent_losses(&results));
     if failures.is_empty() { Ok(()) } else { bail!("{}", failures.join("\n")) }
+}
+
+/// Fails unless what comes of the run can be written where it is wanted.
+fn can_write(options: &Options) -> Result<()> {
+    options.json.as_deref().map_or(Ok(()), Results::can_write)?;
+    options.plots.as_deref().map_or(Ok(()), files::can_write_in)
 }
 
 fn plan(options: &Options, outside: &[Arc<Outside>]) -> Result<Plan> {

@@ -4,6 +4,7 @@ use std::path::Path;
 use std::process::ExitCode;
 
 use anyhow::{Context, Result, bail};
+use cara_processes::files;
 use serde_json::{Value, json};
 
 use super::bill::Row;
@@ -20,13 +21,15 @@ const DOCUMENT: Document = Document { file: "docs/sizes.md", command: "cargo xta
 
 /// Builds every firmware, prints what it takes, and writes the same as JSON or into the document.
 pub(crate) fn sizes(json: Option<&Path>, write: bool) -> Result<ExitCode> {
+    json.map_or(Ok(()), files::can_write)?;
     let rows = measured()?;
     println!("{}", table(&rows));
     println!("The stack is measured on the emulated board only; the others were linked, and not run.");
     print_resources()?;
     if let Some(path) = json {
         let rows: Vec<Value> = rows.iter().map(to_json).collect();
-        std::fs::write(path, serde_json::to_string_pretty(&rows)? + "\n")?;
+        let written = std::fs::write(path, serde_json::to_string_pretty(&rows)? + "\n");
+        written.with_context(|| format!("cannot write {}", path.display()))?;
     }
     if write {
         DOCUMENT.write(&rows)?;
