@@ -16,7 +16,8 @@ Exit codes:
   1  a node or the network failed it
   2  wrong usage, a mistake in a call's arguments included
   3  no unit to talk to: no m_unit runs on this host, and --as is not given
-  4  the doctor found something";
+  4  the doctor found something
+  130  Ctrl-C ended it (143: SIGTERM)";
 
 /// The exit codes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

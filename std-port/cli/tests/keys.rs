@@ -104,6 +104,17 @@ fn nodes_of_a_new_fleet_have_each_others_keys() {
 }
 
 #[test]
+fn the_next_step_names_the_folder_that_the_environment_does() {
+    let home = Home::new();
+    assert!(home.done(&["new-fleet", "--fleet", "7", "depot/1@m_unit"]).contains("into ~/.config/cara/keys or"));
+    let mut command = Command::new(env!("CARGO_BIN_EXE_cara"));
+    command.args(["keys", "new-fleet", "--fleet", "7", "depot/1@m_unit"]).env_remove("CARA_KEYS");
+    let ran = command.env("XDG_CONFIG_HOME", home.0.path().join("other")).output().unwrap();
+    let said = String::from_utf8_lossy(&ran.stdout).into_owned();
+    assert!(said.contains("into $XDG_CONFIG_HOME/cara/keys or"), "{said}");
+}
+
+#[test]
 fn managers_know_each_other_and_their_own_vehicles() {
     let home = Home::with_fleet();
     home.refused(&["derive", "hall/2@m_unit", "agv/3"], 2, "Say `--manager depot/1` or `--manager hall/2`");

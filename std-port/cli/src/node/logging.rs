@@ -5,6 +5,8 @@ use std::io::IsTerminal;
 use tracing_subscriber::EnvFilter;
 use tracing_subscriber::filter::{LevelFilter, ParseError};
 
+use crate::exit::Ended;
+
 /// What is logged unless somebody says something else.
 const LEVEL: &str = "info";
 
@@ -43,7 +45,9 @@ impl Logging {
         let fixed = command_line.is_some() || environment.is_some();
         let filter = match (command_line, environment) {
             // It is every program's, and may name parts alone.
-            (None, Some(text)) => EnvFilter::try_new(text)?,
+            (None, Some(text)) => {
+                EnvFilter::try_new(text).map_err(|error| Ended::usage(format!("RUST_LOG: {error}")))?
+            }
             (level, _) => filter(level.or(file).unwrap_or(LEVEL))?,
         };
         let builder = tracing_subscriber::fmt()
