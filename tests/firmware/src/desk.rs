@@ -1,5 +1,6 @@
 //! A board on the desk: the firmware, its manager and a prompt for `cara` beside it, in a network of their own.
 
+use std::ffi::OsString;
 use std::io::{BufRead, IsTerminal, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -8,6 +9,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail, ensure};
 use cara_processes::Process;
+use cara_std::Identity;
 use clap::Args;
 
 use crate::board::{Bench, LONG, Who};
@@ -17,13 +19,13 @@ use crate::keys::Keys;
 #[derive(Args, Clone, Debug)]
 pub(crate) struct Desk {
     /// The vehicle's name.
-    #[arg(long, default_value = "agv-17")]
+    #[arg(long, default_value = "agv-17", value_parser = word)]
     name: String,
     /// The vehicle's ID number.
     #[arg(long, default_value_t = 17)]
     id: u32,
     /// Its manager, as NAME/ID.
-    #[arg(long, default_value = "depot/1")]
+    #[arg(long, value_name = "NAME/ID", default_value = "depot/1", value_parser = manager)]
     manager: String,
     /// Their fleet.
     #[arg(long, default_value_t = 0)]
@@ -31,6 +33,21 @@ pub(crate) struct Desk {
     /// The `cara` command; the one beside this program if not given.
     #[arg(long)]
     cara: Option<PathBuf>,
+}
+
+/// A name that can be told to a board.
+fn word(text: &str) -> Result<String, String> {
+    if text.contains(char::is_whitespace) {
+        return Err("a board is told its settings as words, so that names on the desk have no blanks".into());
+    }
+    Identity::s_unit(text, 1).map_err(|error| error.to_string())?;
+    Ok(text.to_owned())
+}
+
+fn manager(text: &str) -> Result<String, String> {
+    let (name, id) = text.split_once('/').ok_or("write NAME/ID, as in depot/1")?;
+    id.parse::<u32>().map_err(|_| "the ID behind the slash is a number from 0 to 4294967295")?;
+    word(name).map(|_| text.to_owned())
 }
 
 /// What a line is prompted with.
@@ -47,7 +64,7 @@ pub(crate) fn run(image: &Path, desk: &Desk) -> Result<()> {
     let board = bench.board(&cable, &Who { name, id, manager, fleet, ..Who::agv(id) })?;
     board.logs("has joined")?;
     cara.wait_for(&desk.name)?;
-    println!("verbs of cara can be typed, as scan, or: call {0} stop; Ctrl-D ends it", desk.name);
+    println!("verbs of cara can be typed, as scan, or: call {0} stop; Ctrl-D or `exit` ends it", desk.name);
     let input = std::io::stdin();
     let typed = input.is_terminal();
     prompt()?;
@@ -55,6 +72,9 @@ pub(crate) fn run(image: &Path, desk: &Desk) -> Result<()> {
         let line = line?;
         if !typed {
             println!("{line}");
+        }
+        if matches!(line.trim(), "exit" | "quit") {
+            return Ok(());
         }
         cara.run(&line)?;
         prompt()?;
@@ -102,9 +122,13 @@ impl Cara {
                 println!("a quote is open");
                 return Ok(());
             }
-            Some(words) if words.is_empty() => return Ok(()),
             Some(words) => words,
         };
+        // Somebody types it as in any shell.
+        let words = words.strip_prefix(["cara".to_owned()].as_slice()).unwrap_or(&words);
+        if words.is_empty() {
+            return Ok(());
+        }
         let output = self.command().args(words).output().context("cannot start cara")?;
         let mut shown = std::io::stdout().lock();
         shown.write_all(&output.stdout)?;
@@ -124,8 +148,9 @@ impl Drop for Manager {
 }
 
 /// What is typed in the test, and what must come of it, in this order.
-const TYPED: [(&str, &str); 6] = [
+const TYPED: [(&str, &str); 7] = [
     ("scan", "agv-17"),
+    ("cara scan", "agv-17"),
     ("functions agv-17", "go_to(position: int[2])"),
     ("call agv-17 'pos_info(position: [7, 7])'", "position: [0, 0]"),
     ("call agv-17 'go_to(position: [1, 0])' --hold", "agv-17: "),
@@ -136,9 +161,7 @@ const TYPED: [(&str, &str); 6] = [
 /// The desk, with what somebody might type piped into it.
 pub(crate) fn test(image: &Path, cara: Option<&Path>) -> Result<String> {
     let program = std::env::current_exe()?;
-    let mut arguments = vec!["--image".into(), image.as_os_str().to_owned(), "desk".into()];
-    arguments.extend(cara.into_iter().flat_map(|cara| ["--cara".into(), cara.as_os_str().to_owned()]));
-    let mut desk = Process::start("the desk", &program, arguments)?;
+    let mut desk = Process::start("the desk", &program, arguments(image, cara))?;
     desk.seen("INFO started because of", LONG)?;
     for (line, answer) in TYPED {
         desk.send(line)?;
@@ -146,10 +169,37 @@ pub(crate) fn test(image: &Path, cara: Option<&Path>) -> Result<String> {
         desk.expect(answer, LONG)?;
     }
     desk.seen("INFO arrived at 1 0", LONG)?;
-    desk.end_input();
+    desk.send("exit")?;
     let ended = desk.wait(LONG)?;
     if !ended.success() {
         bail!("it ended with {ended}");
     }
-    Ok("what is typed is run, what the board logs is shown".into())
+    leaves_no_keys(&program, image, cara)?;
+    Ok("what is typed is run, what the board logs is shown, and no keys stay behind".into())
+}
+
+fn arguments(image: &Path, cara: Option<&Path>) -> Vec<OsString> {
+    let mut arguments = vec!["--image".into(), image.as_os_str().to_owned(), "desk".into()];
+    arguments.extend(cara.into_iter().flat_map(|cara| ["--cara".into(), cara.as_os_str().to_owned()]));
+    arguments
+}
+
+/// A desk that a signal ends takes its keys along.
+fn leaves_no_keys(program: &Path, image: &Path, cara: Option<&Path>) -> Result<()> {
+    let folder = tempfile::tempdir()?;
+    let is_empty = || Ok::<_, std::io::Error>(std::fs::read_dir(folder.path())?.next().is_none());
+    let mut place = OsString::from("TMPDIR=");
+    place.push(folder.path());
+    let words = [place, program.as_os_str().to_owned()].into_iter().chain(arguments(image, cara));
+    let mut desk = Process::start("the desk", Path::new("env"), words)?;
+    desk.seen("Ctrl-D", LONG)?;
+    ensure!(!is_empty()?, "the desk has its keys elsewhere");
+    desk.terminate(LONG)?;
+    let deadline = Instant::now() + LONG;
+    // What runs in the desk's network ends a moment later.
+    while !is_empty()? {
+        ensure!(Instant::now() < deadline, "the desk has left keys in {}", folder.path().display());
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    Ok(())
 }

@@ -18,7 +18,7 @@ use kind::{Bound, KINDS, Kind};
 #[derive(Args, Clone, Debug)]
 pub(crate) struct Faults {
     /// Faults of each kind.
-    #[arg(long, default_value_t = 6)]
+    #[arg(long, default_value_t = 6, value_parser = clap::value_parser!(u32).range(1..))]
     each: u32,
     /// Only kinds whose names contain this.
     #[arg(long, default_value = "")]

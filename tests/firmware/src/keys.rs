@@ -14,6 +14,7 @@ use cara_std::{Builder, Fleet, Identity};
 use tempfile::TempDir;
 
 use crate::board::{FLEET, Who};
+use crate::signals::remove_at_end;
 
 /// The manager of all boards, unless somebody says another.
 pub(crate) const MANAGER: &str = "depot/1";
@@ -25,6 +26,9 @@ pub(crate) struct Keys {
     folder: TempDir,
     kind: Kind,
 }
+
+/// Bytes of a vehicle's name by which files are told apart: the image has room for 128 bytes of a path.
+const SHOWN: usize = 16;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Kind {
@@ -78,6 +82,7 @@ impl Keys {
         let owner_only = Permissions::from_mode(0o700);
         let folder = tempfile::Builder::new().prefix("boards").permissions(owner_only).tempdir();
         let folder = folder.context("cannot make a folder for keys")?;
+        remove_at_end(folder.path());
         Ok(Self { cara, folder, kind })
     }
 
@@ -117,7 +122,9 @@ impl Keys {
     /// not told again.
     pub(crate) fn told(&self, who: &Who, address: &str) -> Result<(PathBuf, PathBuf)> {
         let Who { name, id, manager, fleet, manager_address, .. } = who;
-        let mut stem = format!("{name}-{id}-{}", address.replace(['.', '/'], "-"));
+        // The image and QEMU split what they are told at blanks and commas, which a name may have.
+        let plain: String = name.bytes().map(|byte| format!("{byte:02x}")).take(SHOWN).collect();
+        let mut stem = format!("{plain}-{id}-{}", address.replace(['.', '/'], "-"));
         stem.extend(manager_address.iter().map(|_| "-directly"));
         let [told, boots] = ["told", "boots"].map(|end| self.folder.path().join(format!("{stem}.{end}")));
         if told.exists() {

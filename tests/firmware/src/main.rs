@@ -14,6 +14,7 @@ mod load;
 mod manager;
 mod places;
 mod security;
+mod signals;
 mod trace;
 
 use std::path::PathBuf;
@@ -37,7 +38,7 @@ struct Arguments {
     #[arg(long)]
     constant: Option<PathBuf>,
     /// How often the board loses power and comes back.
-    #[arg(long, default_value_t = 24)]
+    #[arg(long, default_value_t = 24, value_parser = clap::value_parser!(u32).range(1..))]
     restarts: u32,
     /// Only the checks whose names contain this.
     #[arg(long, default_value = "")]
@@ -116,6 +117,7 @@ fn in_own_network(arguments: &Arguments) -> Result<ExitCode> {
 }
 
 fn inside(arguments: &Arguments) -> Result<()> {
+    signals::clean_up_at_signals()?;
     match &arguments.part {
         Some(Part::Desk(desk)) => desk::run(&arguments.image, desk),
         Some(Part::Instructions { of, profile }) => count::run(&bench(arguments)?, &arguments.image, *of, *profile),

@@ -59,7 +59,7 @@ pub fn test(name: &str, needs: &[&str], tap: bool) -> bool {
 
 /// This program in a network of its own, or why there can be none.
 fn again(needs: &[&str], tap: bool) -> Result<std::result::Result<Command, String>> {
-    if let Some(absent) = ["unshare", "ip"].iter().chain(needs).find(|program| !is_there(program)) {
+    if let Some(absent) = ["setpriv", "unshare", "ip"].iter().chain(needs).find(|program| !is_there(program)) {
         return Ok(Err(format!("the program `{absent}` is not installed")));
     }
     let devices = "ip tuntap add name trial mode tap && ip link add trial0 type bridge";
@@ -76,8 +76,10 @@ fn again(needs: &[&str], tap: bool) -> Result<std::result::Result<Command, Strin
 const KINDS: [&[&str]; 2] = [&["--net"], &["--user", "--map-root-user", "--net"]];
 
 fn unshare(kind: &[&str]) -> Command {
-    let mut command = Command::new("unshare");
-    command.env("PATH", paths()).args(["--fork", "--kill-child"]).args(kind);
+    // Whichever of them ends, what runs inside is asked to end, and cleans up; `unshare` ignores the other signals.
+    let mut command = Command::new("setpriv");
+    let words = ["--pdeathsig", "HUP", "unshare", "--fork", "--kill-child=TERM"];
+    command.env("PATH", paths()).args(words).args(kind);
     command
 }
 

@@ -40,6 +40,7 @@ pub(crate) fn desk(board: Option<&str>, who: &Who) -> Result<ExitCode> {
     match tests(&image)?.args(told).interactive().code()? {
         Some(0) => Ok(ExitCode::SUCCESS),
         Some(NOT_ALLOWED) => bail!("the board needs a network of its own, see above"),
-        code => bail!("the desk ended with code {code:?}"),
+        Some(_) => bail!("the desk ended, for the reason above"),
+        None => bail!("a signal ended the desk"),
     }
 }

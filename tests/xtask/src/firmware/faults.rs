@@ -14,7 +14,7 @@ use crate::install;
 #[derive(Args)]
 pub(crate) struct Faults {
     /// Faults of each of the nine kinds.
-    #[arg(long, default_value_t = 26)]
+    #[arg(long, default_value_t = 26, value_parser = clap::value_parser!(u32).range(1..))]
     each: u32,
     /// Only kinds whose names contain this.
     #[arg(long, value_name = "TEXT", default_value = "")]
