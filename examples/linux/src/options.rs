@@ -11,16 +11,16 @@ use clap::Args;
 #[derive(Args, Clone, Copy, Debug)]
 pub struct Network {
     /// Units of different fleets do not meet.
-    #[arg(long, default_value_t = 0)]
+    #[arg(long, global = true, default_value_t = 0)]
     pub fleet: u32,
     /// Use loopback only.
-    #[arg(long)]
+    #[arg(long, global = true)]
     pub loopback: bool,
     /// Plain mode, without keys: whoever is on the network can read what the unit says, and speak as any unit.
-    #[arg(long)]
+    #[arg(long, global = true)]
     pub insecure: bool,
     /// End when standard input is closed, so that nothing outlives who started it.
-    #[arg(long)]
+    #[arg(long, global = true)]
     pub attended: bool,
 }
 

@@ -80,8 +80,9 @@ fn receive(name: &str, id: u32, network: Network, stop: &Stop) -> Result<()> {
     };
     show(&manager)?;
     manager.stop();
+    outcome?;
     say!("ended");
-    outcome
+    Ok(())
 }
 
 fn show(manager: &CommunicationSystem<Received>) -> Result<()> {
@@ -110,4 +111,17 @@ fn send((name, id): (&str, u32), manager: &NameAndId, count: i64, network: Netwo
     say!("sent {number}, refused here {refused}");
     unit.stop();
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Options;
+    use clap::Parser;
+
+    #[test]
+    fn options_of_the_network_stand_on_either_side_of_the_role() {
+        for words in [["telemetry", "send", "--loopback"], ["telemetry", "--loopback", "send"]] {
+            assert!(Options::try_parse_from(words).unwrap().network.loopback);
+        }
+    }
 }

@@ -44,8 +44,9 @@ fn main() -> Result<()> {
     });
     let outcome = stop.wait();
     transcript.stop_unit();
+    outcome?;
     say!("ended");
-    outcome
+    Ok(())
 }
 
 /// Comments are line numbers of the paper's listing. Behind each line, `transcript` says what came of it.
