@@ -222,11 +222,7 @@ impl<S: Storage> Calls<S> {
         let slot = self.queues.get_mut(index).ok_or(Error::Busy)?;
         let queue = match slot {
             Some(queue) => queue,
-            None => slot.insert(Queue {
-                buffer: buffers.take_leaving(left).ok_or(Error::Busy)?,
-                start: 0,
-                end: 0,
-            }),
+            None => slot.insert(Queue { buffer: buffers.take_leaving(left).ok_or(Error::Busy)?, start: 0, end: 0 }),
         };
         let result = queue.push(head, block);
         if result.is_ok() {
