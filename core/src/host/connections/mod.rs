@@ -63,7 +63,7 @@ impl Place {
     }
 
     /// Whether it lies in a buffer of the pool, which the link gives back before it looks at anything else.
-    pub fn is_in_buffer(self) -> bool {
+    pub(crate) fn is_in_buffer(self) -> bool {
         matches!(self.store, Store::Buffer)
     }
 
