@@ -94,7 +94,7 @@ pub(crate) const GROUPS: [Group; 24] = [
     Group {
         name: "clippy",
         what: "clippy on all crates and targets, warnings are errors",
-        budget: 120,
+        budget: 90,
         quick: Some(120),
         by_default: true,
         run: |_| needing(install::rust_component("clippy", "cargo-clippy"), clippy),
@@ -110,18 +110,18 @@ pub(crate) const GROUPS: [Group; 24] = [
     Group {
         name: "build",
         what: "every test of the workspace builds; apart, so that the time of `unit` is that of its tests",
-        budget: 300,
+        budget: 400,
         quick: Some(300),
         by_default: true,
-        run: |_| workspace_tests(&["--no-run"]).into(),
+        run: |_| workspace_tests().args(["--no-run"]).stream().into(),
     },
     Group {
         name: "unit",
         what: "cargo test of the whole workspace, and of the Linux port with its asynchronous face",
-        budget: 300,
+        budget: 540,
         quick: Some(300),
         by_default: true,
-        run: |_| unit().into(),
+        run: |extent| unit(extent).into(),
     },
     Group {
         name: "thumb",
@@ -142,7 +142,7 @@ pub(crate) const GROUPS: [Group; 24] = [
     Group {
         name: "loom",
         what: "the hand-over of a link's reader, in every order of its threads; and a lost wake-up is found",
-        budget: 180,
+        budget: 130,
         quick: None,
         by_default: true,
         run: |_| loom().into(),
@@ -150,7 +150,7 @@ pub(crate) const GROUPS: [Group; 24] = [
     Group {
         name: "scenarios",
         what: "every scenario on the simulator, with faults, for 1,000 seeds (quick: 50)",
-        budget: 600,
+        budget: 200,
         quick: Some(90),
         by_default: true,
         run: |extent| scenarios(extent).into(),
@@ -158,7 +158,7 @@ pub(crate) const GROUPS: [Group; 24] = [
     Group {
         name: "planted",
         what: "two bugs, planted on purpose, are found by the scenarios (the third one by loom)",
-        budget: 300,
+        budget: 180,
         quick: None,
         by_default: true,
         run: |_| {
@@ -168,7 +168,7 @@ pub(crate) const GROUPS: [Group; 24] = [
     Group {
         name: "security",
         what: "attackers on the simulator, a board in QEMU (not quick) and Linux units: none of them comes to anything",
-        budget: 300,
+        budget: 280,
         quick: Some(90),
         by_default: true,
         run: security::check,
@@ -176,7 +176,7 @@ pub(crate) const GROUPS: [Group; 24] = [
     Group {
         name: "fleet",
         what: "1,000 s_units on one manager (quick: 200): broadcasts, threads, memory; times far beyond their goals",
-        budget: 60,
+        budget: 90,
         quick: Some(60),
         by_default: true,
         run: |extent| fleet::check(extent).into(),
@@ -184,7 +184,7 @@ pub(crate) const GROUPS: [Group; 24] = [
     Group {
         name: "demo",
         what: "cargo xtask demo: the listing between real processes",
-        budget: 90,
+        budget: 110,
         quick: None,
         by_default: true,
         run: |_| Run::cargo().args(["xtask", "demo"]).stream().into(),
@@ -192,7 +192,7 @@ pub(crate) const GROUPS: [Group; 24] = [
     Group {
         name: "guide",
         what: "every command of the guide does what it says",
-        budget: 240,
+        budget: 200,
         quick: None,
         by_default: true,
         run: |_| guide().into(),
@@ -200,7 +200,7 @@ pub(crate) const GROUPS: [Group; 24] = [
     Group {
         name: "boards",
         what: "firmware of every board links, and leaves the pages of its settings free",
-        budget: 420,
+        budget: 240,
         quick: None,
         by_default: true,
         run: |_| firmware::link(),
@@ -208,7 +208,7 @@ pub(crate) const GROUPS: [Group; 24] = [
     Group {
         name: "firmware",
         what: "firmware in QEMU against the Linux manager: calls, cables, losses of power",
-        budget: 300,
+        budget: 380,
         quick: None,
         by_default: true,
         run: |_| firmware::test(),
@@ -216,7 +216,7 @@ pub(crate) const GROUPS: [Group; 24] = [
     Group {
         name: "faults",
         what: "an emulated vehicle's motors stand within the bound, whatever fails; cargo xtask faults does it 234 times",
-        budget: 300,
+        budget: 220,
         quick: None,
         by_default: true,
         run: |_| firmware::check_faults(),
@@ -224,7 +224,7 @@ pub(crate) const GROUPS: [Group; 24] = [
     Group {
         name: "sizes",
         what: "no firmware takes 2 % more flash, RAM or stack than docs/sizes.md says",
-        budget: 600,
+        budget: 240,
         quick: None,
         by_default: true,
         run: |_| firmware::check_sizes(),
@@ -232,7 +232,7 @@ pub(crate) const GROUPS: [Group; 24] = [
     Group {
         name: "instructions",
         what: "no operation takes 3 % more instructions than docs/instructions.md says, on this host and a Cortex-M3",
-        budget: 120,
+        budget: 90,
         quick: None,
         by_default: true,
         run: |_| instructions::check(),
@@ -248,7 +248,11 @@ impl From<Result<()>> for Outcome {
     }
 }
 
-fn unit() -> Result<()> {
+/// Most of the slow tests wait, so that more of them than there are CPUs end sooner; in full they have the CPUs for
+/// themselves, as with `cargo test`.
+const QUICK_THREADS: &str = "8";
+
+fn unit(extent: Extent) -> Result<()> {
     // A few tests of the doctor make networks and firewalls of their own; without these programs they say so, and fail
     // where `CI` is set.
     for (program, package) in [("ip", "iproute2"), ("nft", "nftables")] {
@@ -256,11 +260,15 @@ fn unit() -> Result<()> {
             println!("some tests will be skipped: {reason}");
         }
     }
-    workspace_tests(&["--no-fail-fast"])
+    let tests = workspace_tests().args(["--no-fail-fast"]);
+    match extent {
+        Extent::Quick => tests.env("RUST_TEST_THREADS", QUICK_THREADS).stream(),
+        Extent::Full => tests.stream(),
+    }
 }
 
-fn workspace_tests(how: &[&str]) -> Result<()> {
-    Run::cargo().args(["test", "--workspace", "--features", FEATURES]).args(how).stream()
+fn workspace_tests() -> Run {
+    Run::cargo().args(["test", "--workspace", "--features", FEATURES])
 }
 
 /// Runs a check once what it needs is there; what cannot be had is a reason to skip it.
@@ -353,6 +361,12 @@ mod tests {
     fn names_are_unique() {
         let names: HashSet<&str> = GROUPS.iter().map(|group| group.name).collect();
         assert_eq!(names.len(), GROUPS.len());
+    }
+
+    #[test]
+    fn the_budgets_of_all_groups_fit_into_an_hour() {
+        let seconds: u64 = GROUPS.iter().filter(|group| group.by_default).map(|group| group.budget).sum();
+        assert!(seconds <= 3_600, "{seconds} s");
     }
 
     #[test]
