@@ -31,7 +31,7 @@ pub(crate) fn run(nodes: Option<u16>, json: Option<&Path>) -> Result<ExitCode> {
 
 /// The group: whether a bound is broken.
 pub(crate) fn check(extent: Extent) -> Result<()> {
-    let nodes = if extent == Extent::Full { "1000" } else { "200" };
+    let nodes = if extent == Extent::Full { "1000" } else { "500" };
     measured().args(["--nodes", nodes, "--rounds", CHECKED_ROUNDS]).stream()
 }
 

@@ -175,7 +175,7 @@ pub(crate) const GROUPS: [Group; 24] = [
     },
     Group {
         name: "fleet",
-        what: "1,000 s_units on one manager (quick: 200): broadcasts, threads, memory; times far beyond their goals",
+        what: "1,000 s_units on one manager (quick: 500): broadcasts, threads, memory; times far beyond their goals",
         budget: 90,
         quick: Some(60),
         by_default: true,
