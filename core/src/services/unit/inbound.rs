@@ -354,16 +354,18 @@ impl<S: Storage, C: Secure> Session<S, C> {
         // Once for all that a request needs of it.
         let function = cx.functions.lookup(header.slot, header.generation);
         let length = self.link.view(block, lent).len();
-        // A buffer that the request lies in is back in the pool at once.
-        let left = LEFT_BY_WAITING.saturating_sub(usize::from(block.is_in_buffer()));
         let result = self.check_request(cx, priority, header, seen, length, function).and_then(|(head, function)| {
-            let block = self.link.view(block, lent);
+            let bytes = self.link.view(block, lent);
             match arguments.filter(|_| self.calls.is_idle(priority)) {
                 Some(arguments) => {
-                    read_arguments(function.signature, block, arguments)?;
+                    read_arguments(function.signature, bytes, arguments)?;
                     self.begin(cx, head, function.attributes.lease).map(Some)
                 }
-                None => self.calls.wait(cx.buffers, left, head, block).map(|()| None),
+                None => {
+                    // A buffer that the request lies in is back in the pool at once.
+                    let left = LEFT_BY_WAITING.saturating_sub(usize::from(block.is_in_buffer()));
+                    self.calls.wait(cx.buffers, left, head, bytes).map(|()| None)
+                }
             }
         });
         match result {
