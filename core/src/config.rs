@@ -54,6 +54,11 @@ pub const RENEWAL_TIMEOUT: Duration = Duration::from_secs(60);
 pub const PREVIOUS_KEY_LIFE: Duration = Duration::from_secs(5);
 /// How long an old link may take to answer the challenge that tells a restarted peer from a duplicate one.
 pub const CHALLENGE_TIMEOUT: Duration = Duration::from_millis(300);
+/// Shortest pause between two keep-alives.
+pub const SHORTEST_KEEP_ALIVE: Duration = Duration::from_millis(1);
+/// Longest pause between two keep-alives. A unit refuses a longer one of its own; a peer that tells one counts as telling
+/// this, so that whatever it tells, it is lost 210 s after it vanishes.
+pub const LONGEST_KEEP_ALIVE: Duration = Duration::from_secs(60);
 /// Keep-alives that may be missed in a row.
 pub const MISSED_KEEP_ALIVES: u8 = 3;
 /// Loss is declared this late where only TCP passes, since one retransmission alone can take seconds.
@@ -84,7 +89,7 @@ pub struct Constraints {
     pub message_size: u32,
     /// Longest chunk received, in bytes; told to peers.
     pub chunk_size: u16,
-    /// Pause between two keep-alives.
+    /// Pause between two keep-alives: [`SHORTEST_KEEP_ALIVE`] to [`LONGEST_KEEP_ALIVE`].
     pub keep_alive: Duration,
     /// Calls that one peer may have waiting or running here; the next one is answered with `Busy`.
     pub calls_per_peer: u16,

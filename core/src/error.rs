@@ -96,7 +96,9 @@ pub enum Refusal {
     #[error("one of the two units is plain and the other one secured: give both keys, or start both in plain mode")]
     Mode = 9,
     /// There is no key for these two units.
-    #[error("there is no key for this pair of units: derive one, and give it to both")]
+    #[error(
+        "there is no key for this pair of units: one was revoked, or never added; if that is on purpose, do nothing"
+    )]
     NoKey = 10,
 }
 
@@ -139,7 +141,9 @@ pub enum CloseReason {
     #[error("the other end went before it proved who it is: has it the key of this pair, and the same version?")]
     Unproven = 11,
     /// The other end has another key for this pair, or somebody changed what was sent.
-    #[error("the two have different keys for this pair, or somebody changed what they sent: derive and give keys anew")]
+    #[error(
+        "the two have different keys for this pair, or what they sent was changed: compare their fingerprints; if one was revoked on purpose, do nothing"
+    )]
     BadProof = 12,
 }
 
@@ -206,6 +210,14 @@ pub enum Error {
     /// name of a node is empty, longer than 32 bytes, or holds control characters.
     #[error("a name has letters, digits, '_', '-', '.' or '/'; a node's has 1 to 32 bytes and no control characters")]
     BadName,
+    /// Several nodes have this name; `ids` are those of two of them.
+    #[error(
+        "several nodes are meant, with the ids {} and {}: ask for one of them by name and id", ids[0], ids[1]
+    )]
+    Ambiguous {
+        /// The ID numbers of two of the nodes.
+        ids: [u32; 2],
+    },
     /// A number does not fit the Rust type that it was asked as, or the variable that it is put into.
     #[error("the number does not fit the type it was asked as: use a wider one")]
     OutOfRange,
@@ -231,6 +243,11 @@ pub enum Error {
     /// A constraint outside what its type or the lent storage allows.
     #[error("a constraint or option is outside what this unit can do: compare it with the bounds in its documentation")]
     BadConstraint,
+    /// A service of the emergency class was given a handler that needs the application's state, or a task.
+    #[error(
+        "an emergency service waits for nothing, and this handler may wait for the application's state or a task: give it the form without the state"
+    )]
+    EmergencyWaits,
 
     // --- peer
     /// No node of this name, id or index is connected.
@@ -250,8 +267,9 @@ pub enum Error {
     /// The callee saw this id, or a much newer one, before and did not run it again.
     #[error("the request is older than 64 others and was not run: ask again")]
     Stale,
-    /// The function was replaced or removed while the call ran: its results cannot be read any more.
-    #[error("the service ran, but was replaced meanwhile and its results are lost: look at the new list")]
+    /// The service ran, and its results cannot be read: the function was replaced or removed meanwhile, or the reply does
+    /// not fit the published signature.
+    #[error("the service ran, and its results are lost: it was replaced meanwhile, or answers other than it publishes")]
     ResultLost,
     /// The callee holds as many calls of this unit as it may; it did not run it.
     #[error("the peer is busy and did not run the request: try again later")]
@@ -292,6 +310,11 @@ pub enum Error {
     /// Another process owns the port.
     #[error("the port is in use by a program that does not share it: choose another port, or end that program")]
     PortInUse,
+    /// The system does not let this user have the port.
+    #[error(
+        "the system does not permit this port: below 1024 it takes root or CAP_NET_BIND_SERVICE; choose another one"
+    )]
+    PortNotPermitted,
     /// The unit has been stopped, or cannot be started (again).
     #[error("the unit does not run: it was stopped or runs already; make a new one")]
     NotRunning,
@@ -309,11 +332,13 @@ impl Error {
             | Self::UnknownVariable
             | Self::NameTaken
             | Self::BadName
+            | Self::Ambiguous { .. }
             | Self::OutOfRange
             | Self::ResultWouldNotFit { .. }
             | Self::TooLarge { .. }
             | Self::WouldDeadlock
-            | Self::BadConstraint => Cause::Configuration,
+            | Self::BadConstraint
+            | Self::EmergencyWaits => Cause::Configuration,
             Self::NotConnected
             | Self::TimedOut
             | Self::Interrupted
@@ -326,7 +351,9 @@ impl Error {
             | Self::Service(_)
             | Self::Refused(_) => Cause::Peer,
             Self::Full(_) | Self::TooSoon { .. } => Cause::Resource,
-            Self::Closed(_) | Self::Network | Self::PortInUse | Self::NotRunning => Cause::Transport,
+            Self::Closed(_) | Self::Network | Self::PortInUse | Self::PortNotPermitted | Self::NotRunning => {
+                Cause::Transport
+            }
         }
     }
 }

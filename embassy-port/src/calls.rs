@@ -21,8 +21,9 @@ impl<T> Peer<T> {
     /// Calls a function and waits for its results, which update `parameters` (paper, listing line 13). On an error they
     /// are unchanged.
     ///
-    /// Cancelled before the request was sent, nothing has happened. Cancelled later, the reply is lost, and the service
-    /// may still run, once; a lease that the request began is renewed until [`release`](Self::release).
+    /// Cancelled before the request was sent, nothing has happened. Cancelled later, the reply is lost; what the call
+    /// started, or would start, stops if its service has a lease, as it does on an error. Without one the service may
+    /// still run, once.
     #[doc(alias = "block_request_their_function")]
     pub async fn block_request(&self, function: &str, parameters: &mut ParametersView) -> Result<(), Error> {
         self.block_request_with(function, parameters, &RequestOptions::default()).await
@@ -37,12 +38,14 @@ impl<T> Peer<T> {
     ) -> Result<(), Error> {
         let timeout = options.timeout.unwrap_or(self.unit.constraints().request_timeout);
         let deadline = now() + timeout;
-        let call = self.begin(function, parameters, options, deadline).await?;
-        poll_fn(|cx| {
+        let mut call = self.begin(function, parameters, options, deadline).await?;
+        let result = poll_fn(|cx| {
             let mut machine = self.unit.shared.machine.borrow_mut();
             machine.outcome(&call.call, parameters, cx.waker()).map_or(Poll::Pending, Poll::Ready)
         })
-        .await
+        .await;
+        call.has_succeeded = result.is_ok();
+        result
     }
 
     /// Sends the request as soon as the interval and the room allow, within the deadline.
@@ -58,7 +61,7 @@ impl<T> Peer<T> {
             let link = self.link()?;
             let sent = self.unit.act(|machine| machine.call(link, function, parameters, &options, deadline));
             let (error, wait) = match sent {
-                Ok(call) => return Ok(CallGuard { unit: self.unit, call }),
+                Ok(call) => return Ok(CallGuard { unit: self.unit, call, has_succeeded: false }),
                 Err(error @ Error::TooSoon { wait }) => (error, wait),
                 Err(error @ Error::Full(Limit::SendQueue | Limit::Buffers | Limit::Calls)) => (error, PAUSE),
                 Err(error) => return Err(error),
@@ -71,14 +74,18 @@ impl<T> Peer<T> {
     }
 }
 
-/// A call in flight, which is given up when this is dropped.
+/// A call in flight, which is given up when this is dropped before it has ended well.
 struct CallGuard<T: 'static> {
     unit: Handle<T>,
     call: InFlight,
+    has_succeeded: bool,
 }
 
 impl<T> Drop for CallGuard<T> {
     fn drop(&mut self) {
+        if self.has_succeeded {
+            return;
+        }
         if let Ok(mut machine) = self.unit.shared.machine.try_borrow_mut() {
             machine.give_up(&self.call);
         }

@@ -134,7 +134,8 @@ pub(crate) fn check(constraints: &Constraints, links: usize, buffer: usize) -> R
         && usize::from(constraints.maximum_nodes) <= links
         && message_buffer(constraints.message_size) <= buffer
         && (MINIMUM_CHUNK_BYTES..=CHUNK_BYTES).contains(&chunk)
-        && constraints.keep_alive.as_millis() > 0
+        && (cara_core::config::SHORTEST_KEEP_ALIVE..=cara_core::config::LONGEST_KEEP_ALIVE)
+            .contains(&constraints.keep_alive)
         && constraints.calls_per_peer > 0;
     if sound { Ok(()) } else { Err(Error::BadConstraint) }
 }

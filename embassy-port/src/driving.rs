@@ -11,6 +11,7 @@ use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error, Refusal};
 use cara_core::host::mailman::LinkId;
 use cara_core::services::Context;
+use cara_core::services::lease::LeaseEnd;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::{Call, Event};
 use cara_core::time::{Duration, Instant};
@@ -43,7 +44,7 @@ pub(crate) enum News {
     Skipped(u16),
     Acknowledged,
     LeaseExpired(Slot),
-    LeaseEnded(Slot, bool),
+    LeaseEnded { call: CallId, slot: Slot, why: LeaseEnd },
     Answered,
     Closed(CloseReason),
     Reply,
@@ -81,7 +82,7 @@ impl News {
             Event::Acknowledged { skipped: 0, .. } => Self::Acknowledged,
             Event::Acknowledged { skipped, .. } => Self::Skipped(skipped),
             Event::LeaseExpired(slot) => Self::LeaseExpired(slot),
-            Event::LeaseEnded { slot, expired } => Self::LeaseEnded(slot, expired),
+            Event::LeaseEnded { call, slot, why } => Self::LeaseEnded { call, slot, why },
             Event::Answered => Self::Answered,
             Event::Closed(reason) => Self::Closed(reason),
         })
@@ -297,17 +298,18 @@ impl<T> Machine<T> {
                 let function = self.functions.function(slot).map_or("", |function| function.name());
                 let function = Name::try_from(function).unwrap_or_default();
                 self.tell_of(index, |peer| UnitEvent::LeaseExpired { peer, function });
+                self.wakers.leases.wake();
                 return Some(Job::Safe(slot));
             }
             News::ListChanged => self.tell_of(index, |peer| UnitEvent::ListChanged { peer }),
             News::Acknowledged => self.wakers.news.wake(),
             News::Skipped(skipped) => self.tell_of(index, |peer| UnitEvent::FunctionsSkipped { peer, skipped }),
             News::Failed(call, error) => self.tell_of(index, |peer| UnitEvent::RequestFailed { peer, call, error }),
-            News::LeaseEnded(slot, expired) => {
+            News::LeaseEnded { call, slot, why } => {
                 let session = self.link(index).and_then(|link| link.session.as_ref());
                 let function = session.and_then(|session| session.their_function_list().function(slot));
                 let function = Name::try_from(function.map_or("", |function| function.name())).unwrap_or_default();
-                self.tell_of(index, |peer| UnitEvent::LeaseEnded { peer, function, expired });
+                self.tell_of(index, |peer| UnitEvent::LeaseEnded { peer, function, call, why });
             }
         }
         None

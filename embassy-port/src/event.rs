@@ -3,6 +3,7 @@
 use cara_core::config::NAME_BYTES;
 use cara_core::distribution::identity::Identity;
 use cara_core::error::{CloseReason, Error};
+use cara_core::services::lease::LeaseEnd;
 use cara_core::services::requests::CallId;
 use core::net::{Ipv4Addr, SocketAddr};
 
@@ -75,8 +76,10 @@ pub enum UnitEvent {
         peer: Identity,
         /// The service.
         function: Name,
-        /// It was not renewed in time, as opposed to: it is finished.
-        expired: bool,
+        /// The call that held the lease.
+        call: CallId,
+        /// Why.
+        why: LeaseEnd,
     },
 }
 

@@ -4,9 +4,11 @@ use core::fmt;
 use core::future::poll_fn;
 use core::task::Poll;
 
+use cara_core::config::Priority;
 use cara_core::distribution::function::Definition;
 use cara_core::distribution::function_list::{FunctionList, Slot};
 use cara_core::error::Error;
+use cara_core::services::lease::Lease;
 use cara_core::storage::Lent;
 
 use crate::handle::Handle;
@@ -25,7 +27,8 @@ impl<T> Handle<T> {
     /// `go_to(position: int[2])`.
     ///
     /// [`Error::BadName`] for a signature that cannot be read, [`Error::TooLarge`] when arguments and results are
-    /// declared larger than what services have room for, [`Error::Full`] when the list is full.
+    /// declared larger than what services have room for, [`Error::Full`] when the list is full,
+    /// [`Error::EmergencyWaits`] for a handler of an emergency service that takes the application's state, or is a task.
     #[doc(alias = "add_function")]
     pub fn add_service(&self, signature: &str, options: ServiceOptions<T>, handler: Handler<T>) -> Result<(), Error> {
         self.put(signature, options, handler, FunctionList::add_function)
@@ -43,21 +46,36 @@ impl<T> Handle<T> {
 
     fn put(&self, signature: &str, options: ServiceOptions<T>, handler: Handler<T>, put: Put<T>) -> Result<(), Error> {
         let definition = Definition::parse(signature).map_err(|_| Error::BadName)?;
-        let ServiceOptions { attributes, lease, safe, detached } = options;
+        let ServiceOptions { attributes, lease, safe, then } = options;
+        if attributes.priority == Priority::Emergency && handler.waits() {
+            return Err(Error::EmergencyWaits);
+        }
         self.act(|machine| {
             let limit = machine.room.parameters;
             if definition.signature().parameters_bytes() as usize > limit {
                 return Err(Error::TooLarge { limit: u32::try_from(limit).unwrap_or(u32::MAX) });
             }
-            let listed = Listed { handler, lease, safe, detached };
-            put(&mut machine.functions, &definition, attributes, listed).map(drop)
+            let listed = Listed { handler, lease, safe, then };
+            let replaced = machine.functions.find(definition.name()).and_then(|slot| machine.functions.function(slot));
+            let replaced = replaced.and_then(|function| function.handler.lease);
+            put(&mut machine.functions, &definition, attributes, listed)?;
+            // A service that had this lease before may have left it dead, and no call would begin; and what a call of the
+            // service before started would go on to the end of its lease.
+            [lease, replaced].into_iter().flatten().for_each(Lease::clear);
+            machine.wakers.leases.wake();
+            Ok(())
         })
     }
 
     /// Removes a service; peers that saw it are told.
     pub fn remove_service(&self, name: &str) -> Result<(), Error> {
         self.act(|machine| {
-            let (slot, _) = machine.functions.remove(name)?;
+            let (slot, removed) = machine.functions.remove(name)?;
+            if let Some(lease) = removed.lease {
+                // What a call of it started would go on to the lease's end.
+                lease.clear();
+                machine.wakers.leases.wake();
+            }
             machine.publications.withdraw(slot);
             machine.each_live(|session, cx, _| {
                 session.withdraw(cx, slot);
@@ -71,6 +89,7 @@ impl<T> Handle<T> {
         self.act(|machine| {
             let Some(slot) = machine.functions.find(name) else { return };
             machine.each_live(|session, cx, _| session.end_lease(cx, slot));
+            machine.wakers.leases.wake();
         });
     }
 

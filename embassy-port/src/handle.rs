@@ -81,8 +81,9 @@ impl<T> Handle<T> {
         manager.map(|identity| Peer { unit: *self, identity })
     }
 
-    /// A node of this name: a connected one if there is one.
-    pub fn peer(&self, name: &str) -> Option<Peer<T>> {
+    /// The node of this name among those that have joined, connected or not. [`Error::NotConnected`] where there is none,
+    /// [`Error::Ambiguous`] where there are several: take [`Self::peer_of`] then.
+    pub fn peer(&self, name: &str) -> Result<Peer<T>, Error> {
         let identity = self.look(|machine| machine.node.find(name).map(|known| known.identity.clone()));
         identity.map(|identity| Peer { unit: *self, identity })
     }
@@ -102,6 +103,12 @@ impl<T> Handle<T> {
     pub fn m_unit(&self, index: u16) -> Option<Peer<T>> {
         let identity = self.look(|machine| machine.node.m_unit(index).map(|known| known.identity.clone()));
         identity.map(|identity| Peer { unit: *self, identity })
+    }
+
+    /// The s_units that have joined since the board's start, connected or not, in the order of joining.
+    pub fn roster(&self) -> impl Iterator<Item = Peer<T>> + use<T> {
+        let unit = *self;
+        (0..).map_while(move |index| unit.s_unit(index))
     }
 
     /// The connected node at a place of the unit's table of links, of which there are [`Self::links`].

@@ -1,10 +1,12 @@
 //! What runs a service: the runner itself, or a task that takes the calls.
 
+use core::cell::RefCell;
+
 use cara_core::config::Priority;
 use cara_core::distribution::function::Attributes;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::{Parameters, ParametersView};
-use cara_core::error::ServiceError;
+use cara_core::error::{Error, ServiceError};
 use cara_core::services::lease::{Lease, Service};
 use cara_core::time::{Duration, Instant};
 
@@ -21,15 +23,27 @@ pub struct Call<T: 'static> {
     pub deadline: Instant,
     /// Whether the caller waits.
     pub wants_reply: bool,
-    /// The service's lease, if it has one: what the call starts may go on while it is live.
+    /// The call's hold of the service's lease, if there is one: what the call starts may go on while it is live.
     pub lease: Option<LeaseWatch>,
     /// The unit that serves, which can request from any other, the caller among them.
     pub unit: Handle<T>,
 }
 
+impl<T> Call<T> {
+    /// Ends when what the call starts may go on no longer, for whatever reason; never for a service without a lease.
+    /// Cancelling loses nothing.
+    pub async fn lease_ended(&self) {
+        self.unit.lease_ended(self.lease).await;
+    }
+}
+
 /// A service that the runner runs, with the application's state.
 pub type Method<T> = dyn Fn(&mut T, &Call<T>, &mut ParametersView) -> Result<(), ServiceError>;
-/// Runs when something was lost.
+/// A service that the runner runs, without it.
+pub type Free<T> = dyn Fn(&Call<T>, &mut ParametersView) -> Result<(), ServiceError>;
+/// Makes safe what a service has started.
+pub type Safe = dyn Fn();
+/// Runs after something has ended.
 pub type Hook<T> = dyn Fn(&mut T);
 
 /// What runs a service.
@@ -37,6 +51,7 @@ pub type Hook<T> = dyn Fn(&mut T);
 /// | form | example |
 /// |---|---|
 /// | in place | `Handler::method(&\|agv: &mut Agv, call, parameters\| agv.pos_info(parameters))` |
+/// | in place, without the state, as an emergency service is | `Handler::free(&\|call, parameters\| brake())` |
 /// | the paper's, free | `Handler::paper(echo)` with `fn echo(parameters: Parameters) -> Parameters` |
 /// | the paper's, method | `Handler::paper_method(Agv::pos_info)` |
 /// | by a task that awaits | `Handler::task()`, and there `unit.next_call("go_to", &mut parameters).await` |
@@ -53,6 +68,7 @@ impl<T> Clone for Handler<T> {
 impl<T> Copy for Handler<T> {}
 
 enum Run<T: 'static> {
+    Free(&'static Free<T>),
     Method(&'static Method<T>),
     Paper(fn(Parameters) -> Parameters),
     PaperMethod(fn(&mut T, Parameters) -> Parameters),
@@ -74,6 +90,11 @@ impl<T> Handler<T> {
         Self { run: Run::Method(run) }
     }
 
+    /// A service in place that does not get the application's state.
+    pub const fn free(run: &'static Free<T>) -> Self {
+        Self { run: Run::Free(run) }
+    }
+
     /// A function of the paper's form.
     pub const fn paper(run: fn(Parameters) -> Parameters) -> Self {
         Self { run: Run::Paper(run) }
@@ -93,18 +114,25 @@ impl<T> Handler<T> {
         matches!(self.run, Run::Task)
     }
 
-    pub(crate) fn run(
-        &self,
-        state: &mut T,
-        call: &Call<T>,
-        parameters: &mut ParametersView,
-    ) -> Result<(), ServiceError> {
-        match self.run {
-            Run::Method(run) => run(state, call, parameters),
+    /// It may wait for something of the application.
+    pub(crate) fn waits(&self) -> bool {
+        !matches!(self.run, Run::Free(_) | Run::Paper(_))
+    }
+
+    /// [`Error::WouldDeadlock`] when the state is lent already.
+    pub(crate) fn run(&self, state: &RefCell<T>, call: &Call<T>, parameters: &mut ParametersView) -> Result<(), Error> {
+        let state = || state.try_borrow_mut().map_err(|_| Error::WouldDeadlock);
+        let result = match self.run {
+            Run::Free(run) => run(call, parameters),
+            Run::Method(run) => run(&mut *state()?, call, parameters),
             Run::Paper(run) => by_value(parameters, run),
-            Run::PaperMethod(run) => by_value(parameters, |arguments| run(state, arguments)),
+            Run::PaperMethod(run) => {
+                let mut state = state()?;
+                by_value(parameters, |arguments| run(&mut state, arguments))
+            }
             Run::Task => Err(ServiceError::NotReady),
-        }
+        };
+        result.map_err(Error::Service)
     }
 }
 
@@ -120,8 +148,8 @@ fn by_value(view: &mut ParametersView, service: impl FnOnce(Parameters) -> Param
 pub struct ServiceOptions<T: 'static> {
     pub(crate) attributes: Attributes,
     pub(crate) lease: Option<&'static Lease>,
-    pub(crate) safe: Option<&'static Hook<T>>,
-    pub(crate) detached: bool,
+    pub(crate) safe: Option<&'static Safe>,
+    pub(crate) then: Option<&'static Hook<T>>,
 }
 
 impl<T> Default for ServiceOptions<T> {
@@ -134,7 +162,7 @@ impl<T> ServiceOptions<T> {
     /// Normal priority, no lease.
     pub const fn new() -> Self {
         let attributes = Attributes { priority: Priority::Normal, lease: None, idempotent: false };
-        Self { attributes, lease: None, safe: None, detached: false }
+        Self { attributes, lease: None, safe: None, then: None }
     }
 
     /// The class of calls that name none.
@@ -144,18 +172,19 @@ impl<T> ServiceOptions<T> {
     }
 
     /// What the service starts goes on for this long after the caller's last sign that it wants it; then `safe` runs,
-    /// once, before any other work. It must be short. `lease` is a static of this service alone, which a motor's
-    /// interrupt can read: it is dead in time also when no task runs any more.
-    pub fn lease(mut self, length: impl Into<Duration>, lease: &'static Lease, safe: &'static Hook<T>) -> Self {
+    /// once, before any other work. It must be short, and does not get the application's state: what it switches off is
+    /// a pin, or a static that the motors read; what needs the state belongs in [`then`](Self::then). `lease` is a static
+    /// of this service alone, which a motor's interrupt can read: it is dead in time also when no task runs any more.
+    pub fn lease(mut self, length: impl Into<Duration>, lease: &'static Lease, safe: &'static Safe) -> Self {
         self.attributes.lease = Some(length.into());
         self.lease = Some(lease);
         self.safe = Some(safe);
         self
     }
 
-    /// It takes long: the caller's next call of the same class begins while it runs.
-    pub const fn detached(mut self) -> Self {
-        self.detached = true;
+    /// Runs each time after the safe hook, with the application's state.
+    pub const fn then(mut self, hook: &'static Hook<T>) -> Self {
+        self.then = Some(hook);
         self
     }
 
@@ -170,8 +199,8 @@ impl<T> ServiceOptions<T> {
 pub(crate) struct Listed<T: 'static> {
     pub(crate) handler: Handler<T>,
     pub(crate) lease: Option<&'static Lease>,
-    pub(crate) safe: Option<&'static Hook<T>>,
-    pub(crate) detached: bool,
+    pub(crate) safe: Option<&'static Safe>,
+    pub(crate) then: Option<&'static Hook<T>>,
 }
 
 impl<T> Clone for Listed<T> {

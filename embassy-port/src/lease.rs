@@ -1,14 +1,19 @@
 //! What a motor's interrupt looks at: may this motion go on?
 
 use core::fmt;
+use core::future::poll_fn;
+use core::task::Poll;
 
-use cara_core::services::lease::Lease;
+use cara_core::services::lease::{Lease, Order};
+use cara_core::services::unit::Call;
 
+use crate::handle::Handle;
 use crate::time::now;
 
-/// A service's lease, to be read from any task and any interrupt: two atomic loads and the clock.
+/// The lease of one call, to be read from any task and any interrupt: a few atomic loads and the clock. Once dead it is
+/// dead for ever, whatever call comes next.
 ///
-/// An interrupt that has no `LeaseWatch` at hand reads the static itself:
+/// An interrupt reads the static of the service, for whichever call holds it now:
 ///
 /// ```
 /// use cara_core::services::lease::Lease;
@@ -20,13 +25,34 @@ use crate::time::now;
 /// ```
 #[derive(Clone, Copy)]
 pub struct LeaseWatch {
-    pub(crate) lease: &'static Lease,
+    lease: &'static Lease,
+    order: Order,
 }
 
 impl LeaseWatch {
-    /// Whether the caller still wants what it started.
+    /// A call's hold of the lease of its service.
+    pub(crate) fn new(lease: Option<&'static Lease>, call: &Call) -> Option<Self> {
+        lease.zip(call.order).map(|(lease, order)| Self { lease, order })
+    }
+
+    /// Whether the caller still wants what this call started. Once it has said no, it says so for ever.
     pub fn is_live(&self) -> bool {
-        self.lease.is_live(now())
+        self.lease.is_live_for(self.order, now())
+    }
+}
+
+impl<T> Handle<T> {
+    /// Ends when a lease of one of this unit's calls is dead; never without one. Cancelling loses nothing.
+    pub(crate) async fn lease_ended(&self, lease: Option<LeaseWatch>) {
+        poll_fn(|cx| {
+            let Some(lease) = lease else { return Poll::Pending };
+            if !lease.is_live() {
+                return Poll::Ready(());
+            }
+            self.shared.machine.borrow_mut().wakers.leases.register(cx.waker());
+            Poll::Pending
+        })
+        .await;
     }
 }
 

@@ -27,12 +27,17 @@
 //!         p.set_value("position", agv.position).map_err(|_| cara_core::error::ServiceError::BadResults)
 //!     });
 //!     unit.add_service("pos_info() -> (position: int[2])", ServiceOptions::new(), pos_info)?;
-//!     let stop: &'static cara_embassy::Hook<Agv> = &|agv| agv.target = None;
-//!     let leased = ServiceOptions::new().lease(Duration::from_millis(400), &GO_TO, stop);
+//!     let forget: &'static cara_embassy::Hook<Agv> = &|agv| agv.target = None;
+//!     // The hook makes safe, and waits for nothing; what needs the state comes after it.
+//!     let leased = ServiceOptions::new().lease(Duration::from_millis(400), &GO_TO, &cut_power).then(forget);
 //!     unit.add_service("go_to(position: int[2])", leased, Handler::task())?;
-//!     unit.on_manager_lost(stop);
+//!     unit.on_manager_lost(forget);
 //!     unit.publish_my_function_list()?;
 //!     Ok((unit, runner))
+//! }
+//!
+//! fn cut_power() {
+//!     // A pin, or a static that the motors' interrupt reads.
 //! }
 //!
 //! /// A task that drives, and answers when the vehicle has arrived.
@@ -41,8 +46,8 @@
 //!     loop {
 //!         let call = unit.next_call("go_to", &mut parameters).await?;
 //!         let target = parameters.variable::<[i64; 2]>("position")?;
-//!         unit.with_state(|agv| agv.target = Some(target))?;
-//!         // … await the motors, as long as `call.lease` is live …
+//!         // … await the motors on their way to the target, as long as the lease is live …
+//!         unit.with_state(|agv| agv.position = target)?;
 //!         call.reply(Ok(&parameters)).await;
 //!     }
 //! }
@@ -97,7 +102,7 @@ pub use config::{Config, message_buffer};
 pub use event::{Name, UnitEvent};
 pub use functions::MyFunctionList;
 pub use handle::Handle;
-pub use handler::{Call, Handler, Hook, Method, ServiceOptions};
+pub use handler::{Call, Free, Handler, Hook, Method, Safe, ServiceOptions};
 pub use lease::LeaseWatch;
 pub use peer::{Peer, TheirFunctionList};
 pub use resources::{Resources, new};

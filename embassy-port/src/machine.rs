@@ -138,6 +138,8 @@ pub(crate) struct Wakers {
     pub(crate) news: MultiWakerRegistration<TASKS_WAITING>,
     /// A call waits for a task.
     pub(crate) calls: MultiWakerRegistration<TASKS_WAITING>,
+    /// A lease of one of this unit's services has ended, or gone over to a newer call.
+    pub(crate) leases: MultiWakerRegistration<TASKS_WAITING>,
 }
 
 impl Wakers {
@@ -147,6 +149,7 @@ impl Wakers {
             events: WakerRegistration::new(),
             news: MultiWakerRegistration::new(),
             calls: MultiWakerRegistration::new(),
+            leases: MultiWakerRegistration::new(),
         }
     }
 }

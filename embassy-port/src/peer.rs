@@ -94,14 +94,14 @@ impl<T> Peer<T> {
         requested.unwrap_or(Err(Error::NotConnected))
     }
 
-    /// Gives up the lease that a call of `function` began: what it started stops.
+    /// Gives up the leases that calls of `function` have begun or will begin: what they started stops, and what has not
+    /// begun does not begin.
     pub fn release(&self, function: &str) -> Result<(), Error> {
         let link = self.link()?;
         let released = self.unit.act(|machine| {
             machine.with(link, |session, cx, _| {
                 let slot = session.their_function_list().find(function).ok_or(Error::UnknownFunction)?;
-                session.release(cx, slot);
-                Ok(())
+                session.release(cx, slot)
             })
         });
         released.unwrap_or(Err(Error::NotConnected))

@@ -152,16 +152,14 @@ impl<T> Machine<T> {
         block::read(function.signature.results(), bytes, parameters)
     }
 
-    /// Nobody waits for a call any more.
+    /// Nothing waits for a call any more, and what it started is not wanted.
     pub(crate) fn give_up(&mut self, call: &InFlight) {
         let Some(link) = self.links.get_mut(usize::from(call.link)) else { return };
         for place in link.waiters.iter_mut() {
             place.take_if(|waiter| waiter.call == *call);
         }
-        if link.serial == call.serial
-            && let Some(session) = &mut link.session
-        {
-            session.cancel(call.id);
+        if link.serial == call.serial {
+            self.with(call.link, |session, cx, _| session.cancel(cx, call.id));
         }
         let _ = self.reply.take(call);
         self.wakers.runner.wake();

@@ -143,9 +143,16 @@ impl<T> Runner<T> {
         match job {
             Job::Safe(slot) => {
                 let machine = self.shared.machine.borrow();
-                let hook = machine.functions.function(slot).and_then(|function| function.handler.safe);
+                let Some(Listed { safe, then, .. }) =
+                    machine.functions.function(slot).map(|function| *function.handler)
+                else {
+                    return;
+                };
                 drop(machine);
-                self.run_hook(hook);
+                if let Some(safe) = safe {
+                    safe();
+                }
+                self.run_hook(then);
             }
             Job::Lost => {
                 let hook = self.shared.machine.borrow().lost_hook;
@@ -193,12 +200,13 @@ impl<T> Runner<T> {
             let Some(function) = machine.functions.function(call.slot) else {
                 return Some(Err(Error::StaleFunction));
             };
-            let Listed { handler, lease, detached, .. } = *function.handler;
+            let Listed { handler, lease, .. } = *function.handler;
             let Some(caller) = machine.link(running.link).and_then(|link| link.peer.clone()) else {
                 return Some(Err(Error::NotConnected));
             };
-            if detached {
-                machine.with(running.link, |session, _, _| session.detach(running.ticket));
+            if call.order.is_some() {
+                // An earlier call of the service has given way.
+                machine.wakers.leases.wake();
             }
             if handler.is_task() {
                 return machine.leave_to_task(running, *call, caller, self.arguments).err().map(Err);
@@ -208,13 +216,12 @@ impl<T> Runner<T> {
                 priority: call.priority,
                 deadline: call.deadline,
                 wants_reply: call.wants_reply,
-                lease: lease.map(|lease| LeaseWatch { lease }),
+                lease: LeaseWatch::new(lease, call),
                 unit: Handle { shared: self.shared },
             };
             (told, handler)
         };
-        let Ok(mut state) = self.shared.state.try_borrow_mut() else { return Some(Err(Error::WouldDeadlock)) };
-        Some(handler.run(&mut state, &told, self.arguments).map_err(Error::Service))
+        Some(handler.run(&self.shared.state, &told, self.arguments))
     }
 
     fn answer_again(&mut self, machine: &mut Machine<T>) {

@@ -178,7 +178,7 @@ impl<T> Machine<T> {
             // Room for another call.
             self.wakers.runner.wake();
             let listed = self.functions.function(call.slot)?;
-            let ended = listed.handler.lease.is_some_and(|lease| !lease.is_live(now()));
+            let ended = LeaseWatch::new(listed.handler.lease, &call).is_some_and(|lease| !lease.is_live());
             if ended || now() >= running.deadline {
                 self.answer(&running, Err(Error::Expired));
                 continue;
@@ -206,7 +206,7 @@ pub struct TakenCall<T: 'static> {
     pub deadline: Instant,
     /// Whether the caller waits.
     pub wants_reply: bool,
-    /// The service's lease, if it has one: what the call starts may go on while it is live.
+    /// The call's hold of the service's lease, if there is one: what the call starts may go on while it is live.
     pub lease: Option<LeaseWatch>,
 }
 
@@ -239,12 +239,18 @@ impl<T> Handle<T> {
             priority: call.priority,
             deadline: call.deadline,
             wants_reply: call.wants_reply,
-            lease: lease.map(|lease| LeaseWatch { lease }),
+            lease: LeaseWatch::new(lease, &call),
         })
     }
 }
 
 impl<T> TakenCall<T> {
+    /// Ends when what the call starts may go on no longer, for whatever reason; never for a service without a lease.
+    /// Cancelling loses nothing.
+    pub async fn lease_ended(&self) {
+        self.unit.lease_ended(self.lease).await;
+    }
+
     /// Answers with results, or with why there are none; waits for room on the link while the caller waits for the
     /// answer. Cancelled, the caller gets [`ServiceError::NotReady`] instead.
     pub async fn reply(mut self, result: Result<&ParametersView, ServiceError>) {

@@ -19,6 +19,7 @@ use crate::access::{AccessError, watch::FileWatch};
 use crate::communication_system::{CommunicationSystem, Owner};
 use crate::config::Capacities;
 use crate::engine::{Engine, EngineParts, Keys, NodeCell, message_buffer_bytes, system_refused};
+use crate::error::StartError;
 use crate::keys::{KeyError, KeyRing, LiveRing};
 use crate::pool::MessagePool;
 use crate::storage::{filled, filled_with};
@@ -52,6 +53,7 @@ pub struct Builder<T> {
     access: Option<AccessTable>,
     #[cfg(feature = "access")]
     access_file: Option<FileWatch>,
+    asks_for_itself: bool,
     state: T,
 }
 
@@ -81,6 +83,7 @@ impl Builder<()> {
             access: None,
             #[cfg(feature = "access")]
             access_file: None,
+            asks_for_itself: true,
             state: (),
         }
     }
@@ -144,6 +147,13 @@ impl<T: Send + 'static> Builder<T> {
         self
     }
 
+    /// An m_unit starts without asking whether a live one has its name and id. Two of one identity take each other's
+    /// s_units away: for tests of just that.
+    pub fn beside_another(mut self) -> Self {
+        self.asks_for_itself = false;
+        self
+    }
+
     /// The unit shares these threads with others of its process; unless set, it has threads of its own.
     pub fn threads(mut self, threads: &Threads) -> Self {
         self.threads = Some(threads.clone());
@@ -177,6 +187,7 @@ impl<T: Send + 'static> Builder<T> {
             access: self.access,
             #[cfg(feature = "access")]
             access_file: self.access_file,
+            asks_for_itself: self.asks_for_itself,
             state,
         }
     }
@@ -275,6 +286,7 @@ impl<T: Send + 'static> Builder<T> {
             datagrams,
             listener,
             maximum_links,
+            asks_for_itself: self.asks_for_itself,
         };
         let engine = Engine::new(parts);
         if self.access.is_some() {
@@ -288,8 +300,8 @@ impl<T: Send + 'static> Builder<T> {
     }
 }
 
-/// Why a unit is not made.
-#[derive(Debug, thiserror::Error)]
+/// Why a unit is not made, or not started. `Debug` is the sentence too, which is what a `main` that returns it prints.
+#[derive(thiserror::Error)]
 #[non_exhaustive]
 pub enum BuildError {
     /// Something about the unit itself, or what the system refuses.
@@ -298,6 +310,9 @@ pub enum BuildError {
     /// It has no keys, or none that can be used.
     #[error(transparent)]
     Keys(#[from] KeyError),
+    /// It does not start.
+    #[error(transparent)]
+    Start(#[from] StartError),
 }
 
 /// Where the keys of a unit are to come from.
@@ -331,6 +346,7 @@ fn manager_of(target: &Target) -> Result<Option<Identity>, Error> {
 fn listen_error(error: std::io::Error) -> Error {
     match error.kind() {
         std::io::ErrorKind::AddrInUse => Error::PortInUse,
+        std::io::ErrorKind::PermissionDenied => Error::PortNotPermitted,
         _ => system_refused(error),
     }
 }
@@ -348,13 +364,14 @@ pub(crate) fn check(constraints: &Constraints) -> Result<(), Error> {
         && (SHORTEST_MESSAGE..=LONGEST_MESSAGE).contains(&constraints.message_size)
         && constraints.request_timeout.as_millis() > 0
         && (cara_core::config::MINIMUM_CHUNK_BYTES..=cara_core::config::CHUNK_BYTES).contains(&chunk)
-        && constraints.keep_alive.as_millis() > 0
+        && (cara_core::config::SHORTEST_KEEP_ALIVE..=cara_core::config::LONGEST_KEEP_ALIVE)
+            .contains(&constraints.keep_alive)
         && constraints.calls_per_peer > 0;
     if sound { Ok(()) } else { Err(Error::BadConstraint) }
 }
 
 /// Bits that differ from process to process and from call to call, without a dependency for them.
-fn random() -> u64 {
+pub(crate) fn random() -> u64 {
     RandomState::new().build_hasher().finish()
 }
 

@@ -1,5 +1,6 @@
 //! The paper's `Communication_System`: an m_unit, which connects to many nodes.
 
+use std::collections::HashSet;
 #[cfg(feature = "control")]
 use std::path::PathBuf;
 #[cfg(feature = "control")]
@@ -27,6 +28,7 @@ use crate::builder::{self, BuildError, Builder};
 #[cfg(feature = "control")]
 use crate::control::{self, Control, Server};
 use crate::engine::{Engine, lock, pairs, read};
+use crate::error::StartError;
 use crate::event::UnitEvent;
 use crate::my_function_list::MyFunctionList;
 use crate::peer::Peer;
@@ -89,10 +91,14 @@ impl<T: Send + 'static> Owner<T> {
         guest
     }
 
-    /// Opens the socket for the unit's operator.
+    /// Opens the socket for the unit's operator, unless it is open or the unit is being stopped.
     fn open_control(&self) {
-        let guest = Self::guest(self.engine.clone());
-        *lock(&self.server) = control::open(&self.control, CommunicationSystem::of(guest));
+        let mut server = lock(&self.server);
+        // A server that is dropped in place of stopped leaves its threads.
+        if server.is_none() && !self.engine.is_stopping() {
+            let guest = Self::guest(self.engine.clone());
+            *server = control::open(&self.control, CommunicationSystem::of(guest));
+        }
     }
 }
 
@@ -145,7 +151,7 @@ impl<T: Send + 'static> CommunicationSystem<T> {
         Self { owner: Arc::new(owner) }
     }
 
-    fn engine(&self) -> &Arc<Engine<T>> {
+    pub(crate) fn engine(&self) -> &Arc<Engine<T>> {
         &self.owner.engine
     }
 
@@ -155,8 +161,12 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     }
 
     /// Searches for nodes and keeps connections, in threads of its own (paper, listing line 2).
+    ///
+    /// First it asks for its own identity and waits 300 ms: [`StartError::AlreadyRunning`] where a live m_unit answers.
+    /// One that is stopped (`SIGSTOP`) or hangs does not answer, and its links go to this one. See
+    /// [`Builder::beside_another`].
     #[doc(alias = "start_thread")]
-    pub fn start(&self) -> Result<(), Error> {
+    pub fn start(&self) -> Result<(), StartError> {
         self.engine().start()?;
         #[cfg(feature = "control")]
         self.owner.open_control();
@@ -280,19 +290,40 @@ impl<T: Send + 'static> CommunicationSystem<T> {
         Peer { engine: self.engine().clone(), cell: cell.clone() }
     }
 
-    /// The s_unit of a name.
-    pub fn s_unit(&self, name: &str) -> Option<Peer<T>> {
-        self.find(|identity| identity.role() == Role::SUnit && identity.name() == name)
+    /// The s_unit of a name, connected or not. [`Error::NotConnected`] before it has joined; [`Error::Ambiguous`] where
+    /// several s_units have that name, those included that the [roster](Self::roster) misses: the one that is here may not
+    /// be the one that is meant. Ask by [identity](Self::node) then.
+    pub fn s_unit(&self, name: &str) -> Result<Peer<T>, Error> {
+        self.only(|identity| identity.role() == Role::SUnit && identity.name() == name)
     }
 
-    /// The m_unit of a name.
-    pub fn m_unit(&self, name: &str) -> Option<Peer<T>> {
-        self.find(|identity| identity.role() == Role::MUnit && identity.name() == name)
+    /// The m_unit of a name, likewise.
+    pub fn m_unit(&self, name: &str) -> Result<Peer<T>, Error> {
+        self.only(|identity| identity.role() == Role::MUnit && identity.name() == name)
     }
 
-    /// The node of an ID number.
-    pub fn node_with_id(&self, id: u32) -> Option<Peer<T>> {
-        self.find(|identity| identity.id() == id)
+    /// The node of an ID number, likewise.
+    pub fn node_with_id(&self, id: u32) -> Result<Peer<T>, Error> {
+        self.only(|identity| identity.id() == id)
+    }
+
+    /// The node of a name, an ID number and a role: `None` if it has neither joined nor stands on the [roster](Self::roster).
+    pub fn node(&self, identity: &Identity) -> Option<Peer<T>> {
+        self.engine().node_of(identity).map(|cell| self.peer(&cell))
+    }
+
+    /// The s_units that this manager is to have, connected or not: with keys those that its key file lists, in plain mode
+    /// those that have joined since its start. [`Peer::retire`] takes one off.
+    ///
+    /// ```no_run
+    /// # let depot = cara_std::CommunicationSystem::new("depot", 1)?;
+    /// for missing in depot.roster().iter().filter(|agv| !agv.is_connected()) {
+    ///     eprintln!("{missing:?} is missing");
+    /// }
+    /// # Ok::<(), cara_std::BuildError>(())
+    /// ```
+    pub fn roster(&self) -> Vec<Peer<T>> {
+        self.engine().roster().iter().map(|cell| self.peer(cell)).collect()
     }
 
     /// The connected nodes at an IP address.
@@ -305,8 +336,17 @@ impl<T: Send + 'static> CommunicationSystem<T> {
         self.connected().filter(|peer| peer.their_function_list().contains(function)).collect()
     }
 
-    fn find(&self, wanted: impl Fn(&Identity) -> bool) -> Option<Peer<T>> {
-        read(&self.engine().peers).find(wanted).map(|cell| self.peer(&cell))
+    fn only(&self, wanted: impl Fn(&Identity) -> bool) -> Result<Peer<T>, Error> {
+        self.engine().only_node(wanted).map(|cell| self.peer(&cell))
+    }
+
+    /// Those of which a call to all has an outcome: the whole roster, and any other node that offers the function.
+    pub(crate) fn asked_with_all(&self, function: &str) -> Vec<Peer<T>> {
+        let mut asked = self.roster();
+        let known: HashSet<_> = asked.iter().map(|peer| Arc::as_ptr(&peer.cell)).collect();
+        let others = self.nodes_offering(function).into_iter();
+        asked.extend(others.filter(|other| !known.contains(&Arc::as_ptr(&other.cell))));
+        asked
     }
 
     fn connected(&self) -> impl Iterator<Item = Peer<T>> {
@@ -332,20 +372,23 @@ impl<T: Send + 'static> CommunicationSystem<T> {
         Ok(missing.iter().filter_map(|link| link.peer.get()).map(|peer| peer.identity.clone()).collect())
     }
 
-    /// Requests without waiting from every connected node that offers `function`, with an outcome for each.
+    /// Requests without waiting from every node, with an outcome for each: for each s_unit of the [roster](Self::roster),
+    /// [`Error::NotConnected`] of one that is absent and [`Error::UnknownFunction`] of one that does not offer `function`;
+    /// and for each m_unit that offers it.
     pub fn request_all(&self, function: &str, parameters: &ParametersView) -> Vec<(Peer<T>, Result<CallId, Error>)> {
-        let peers = self.nodes_offering(function).into_iter();
+        let peers = self.asked_with_all(function).into_iter();
         peers.map(|peer| (peer.clone(), peer.request(function, parameters))).collect()
     }
 
-    /// Calls `function` of every connected node that offers it, all at the same time, and waits for all of them.
+    /// Calls `function` of every node, all at the same time, and waits for all of them. There is an outcome for each, as of
+    /// [`request_all`](Self::request_all).
     pub fn block_request_all<const BYTES: usize>(
         &self,
         function: &str,
         parameters: &Parameters<BYTES>,
         options: &RequestOptions,
     ) -> Vec<(Peer<T>, Result<Parameters<BYTES>, Error>)> {
-        let peers = self.nodes_offering(function);
+        let peers = self.asked_with_all(function);
         let links = peers.iter().map(Peer::link).collect();
         let calls = self.engine().call_each(links, function, parameters, options);
         let each = peers.into_iter().zip(calls);
@@ -395,7 +438,7 @@ impl<T: Send + 'static> CommunicationSystem<T> {
 
     /// Runs `act` with the application's state.
     pub fn with_state<R>(&self, act: impl FnOnce(&mut T) -> R) -> Result<R, Error> {
-        self.engine().state.enter(None).map(|mut state| act(&mut state))
+        self.engine().with_state(act)
     }
 
     /// Gives back the memory of message buffers that nobody uses; a few are kept otherwise, for the next long messages.

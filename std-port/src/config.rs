@@ -16,7 +16,7 @@ pub struct Capacities {
     pub their_signature_bytes: usize,
     /// Blocking calls in flight to one peer.
     pub calls_in_flight: usize,
-    /// Calls of one peer that run here at the same time.
+    /// Calls of one peer that run here at the same time; more of them wait in their order, up to `calls_per_peer`.
     pub calls_running: usize,
     /// Links that are open beyond the maximum number of nodes: those that have not joined yet.
     pub pending_links: usize,
@@ -33,7 +33,7 @@ impl Default for Capacities {
             their_functions: 48,
             their_signature_bytes: 2 * 1024,
             calls_in_flight: 64,
-            calls_running: 8,
+            calls_running: 16,
             pending_links: 64,
             message_buffers: 256,
         }

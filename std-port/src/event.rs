@@ -2,6 +2,7 @@
 
 use cara_core::distribution::identity::Identity;
 use cara_core::error::{CloseReason, Error};
+use cara_core::services::lease::LeaseEnd;
 use cara_core::services::requests::CallId;
 use core::net::SocketAddr;
 
@@ -57,7 +58,7 @@ pub enum UnitEvent {
         /// Why.
         error: Error,
     },
-    /// A service of this unit stopped because its caller no longer wanted it. Its lease is dead, and its safe hook has run,
+    /// A service of this unit stopped because its caller no longer wanted it. Its lease is dead, and its safe hook runs,
     /// or runs as soon as the method that holds the state leaves it.
     LeaseExpired {
         /// Whose call it was.
@@ -71,7 +72,9 @@ pub enum UnitEvent {
         peer: Identity,
         /// The service.
         function: String,
-        /// It was not renewed in time, as opposed to: it is finished.
-        expired: bool,
+        /// The call that held the lease.
+        call: CallId,
+        /// Why.
+        why: LeaseEnd,
     },
 }

@@ -9,7 +9,8 @@ use cara_core::error::Error;
 
 use crate::engine::CallFuture;
 
-/// A call in flight. Dropping it gives up the reply, and frees the call's slot; the service may still run, once.
+/// A call in flight. Dropped before it has ended, it is given up: its slot is free, and what it started, or would start,
+/// stops if its service has a lease. Without one the service may still run, once.
 #[must_use = "a call is waited for by awaiting it"]
 pub struct PendingReply<'p, T: Send + 'static> {
     call: CallFuture<T>,

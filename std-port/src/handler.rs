@@ -9,7 +9,9 @@ use cara_core::error::ServiceError;
 use cara_core::services::lease::{Lease, Service};
 use cara_core::time::{Duration, Instant};
 
-use crate::lease::LeaseWatch;
+use crate::lane::Lane;
+use crate::lease::{LeaseEnded, LeaseWatch, ServiceLease};
+use crate::safe_hook::SafeHook;
 
 /// What a handler is told about the call that it serves.
 #[derive(Clone, Debug)]
@@ -22,20 +24,30 @@ pub struct Call {
     pub deadline: Instant,
     /// Whether the caller waits.
     pub wants_reply: bool,
-    /// The service's lease, if it has one: what the call starts may go on while it is live.
+    /// The call's hold of the service's lease, if there is one: what the call starts may go on while it is live.
     pub lease: Option<LeaseWatch>,
+}
+
+impl Call {
+    /// Ends when what the call starts may go on no longer, for whatever reason; never for a service without a lease.
+    /// [`LeaseWatch::wait_until_ended`] is the form that blocks.
+    pub fn lease_ended(&self) -> LeaseEnded {
+        LeaseEnded { watch: self.lease.clone() }
+    }
 }
 
 type Free = dyn Fn(&Call, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync;
 type Method<T> = dyn Fn(&mut T, &Call, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync;
-/// Runs when something was lost.
+/// Makes safe what a service has started.
+pub(crate) type Safe = dyn Fn() + Send + Sync;
+/// Runs after something has ended.
 pub(crate) type Hook<T> = dyn Fn(&mut T) + Send + Sync;
 
 /// How a handler is run.
 pub(crate) enum Run<T> {
     /// Without the application's state; calls run side by side.
     Free(Arc<Free>),
-    /// With it, under its lock.
+    /// With it, one at a time, in the order in which they began.
     Method(Arc<Method<T>>),
 }
 
@@ -48,17 +60,33 @@ impl<T> Clone for Run<T> {
     }
 }
 
+impl<T> Run<T> {
+    /// It waits for the application's state.
+    pub(crate) const fn takes_state(&self) -> bool {
+        matches!(self, Self::Method(_))
+    }
+}
+
 /// A service as the list of functions holds it.
 pub(crate) struct Handler<T> {
     pub(crate) run: Run<T>,
-    pub(crate) lease: Option<Arc<Lease>>,
-    pub(crate) safe: Option<Arc<Hook<T>>>,
-    pub(crate) detached: bool,
+    pub(crate) lease: Option<Arc<ServiceLease>>,
+    pub(crate) safe: Option<Arc<SafeHook>>,
+    /// Where its emergencies run, if it is a service for those.
+    pub(crate) lane: Option<Arc<Lane>>,
 }
 
 impl<T: 'static> Service for Handler<T> {
     fn lease(&self) -> Option<&Lease> {
-        self.lease.as_deref()
+        self.lease.as_ref().map(|service| &service.lease)
+    }
+}
+
+impl<T> Drop for Handler<T> {
+    fn drop(&mut self) {
+        if let Some(lease) = &self.lease {
+            lease.clear();
+        }
     }
 }
 
@@ -67,13 +95,13 @@ pub struct ServiceOptions<T> {
     pub(crate) priority: Priority,
     pub(crate) lease: Option<Duration>,
     pub(crate) idempotent: bool,
-    pub(crate) detached: bool,
-    pub(crate) safe: Option<Arc<Hook<T>>>,
+    pub(crate) safe: Option<Arc<Safe>>,
+    pub(crate) then: Option<Arc<Hook<T>>>,
 }
 
 impl<T> Default for ServiceOptions<T> {
     fn default() -> Self {
-        Self { priority: Priority::Normal, lease: None, idempotent: false, detached: false, safe: None }
+        Self { priority: Priority::Normal, lease: None, idempotent: false, safe: None, then: None }
     }
 }
 
@@ -83,23 +111,47 @@ impl<T> ServiceOptions<T> {
         Self::default()
     }
 
-    /// The class of calls that name none.
+    /// The class of calls that name none. A service of the class [`Priority::Emergency`] has a thread of its own, and
+    /// takes a handler without the application's state: see [`Error::EmergencyWaits`](cara_core::error::Error).
     pub fn priority(mut self, priority: Priority) -> Self {
         self.priority = priority;
         self
     }
 
     /// What the service starts goes on for this long after the caller's last sign that it wants it; then `safe` runs,
-    /// once, before any other work. It must be short: other leases wait for it.
-    pub fn lease(mut self, length: impl Into<Duration>, safe: impl Fn(&mut T) + Send + Sync + 'static) -> Self {
+    /// once, and the next order of the service comes after it.
+    ///
+    /// The hook has a thread of its own and waits for nothing: not for the application's state, which it does not get, nor
+    /// for other hooks, nor for any handler. It owns what it switches off (a pin, a descriptor, an atomic that the motor's
+    /// loop reads). It must be short: while it runs for more than 100 ms, its service answers
+    /// [`ServiceError::NotReady`], and it is counted (`HooksLate`). What needs the state belongs in [`then`](Self::then).
+    ///
+    /// ```
+    /// # use std::{sync::{Arc, atomic::{AtomicBool, Ordering}}, time::Duration};
+    /// # use cara_std::ServiceOptions;
+    /// let power = Arc::new(AtomicBool::new(false));
+    /// let off = power.clone();
+    /// let options = ServiceOptions::<()>::new().lease(Duration::from_millis(400), move || off.store(false, Ordering::SeqCst));
+    /// ```
+    ///
+    /// A hook that takes the state does not compile:
+    ///
+    /// ```compile_fail
+    /// # use std::time::Duration;
+    /// # use cara_std::ServiceOptions;
+    /// struct Agv { speed: i64 }
+    /// let options = ServiceOptions::<Agv>::new().lease(Duration::from_millis(400), |agv: &mut Agv| agv.speed = 0);
+    /// ```
+    pub fn lease(mut self, length: impl Into<Duration>, safe: impl Fn() + Send + Sync + 'static) -> Self {
         self.lease = Some(length.into());
         self.safe = Some(Arc::new(safe));
         self
     }
 
-    /// It takes long: the caller's next call of the same class begins while it runs, in a thread of its own.
-    pub fn detached(mut self) -> Self {
-        self.detached = true;
+    /// Runs each time after the safe hook, with the application's state, for which it may have to wait: nothing that makes
+    /// safe belongs here.
+    pub fn then(mut self, hook: impl Fn(&mut T) + Send + Sync + 'static) -> Self {
+        self.then = Some(Arc::new(hook));
         self
     }
 

@@ -1,32 +1,118 @@
 //! What a motor's loop looks at: may this motion go on?
 
 use std::fmt;
-use std::sync::Arc;
+use std::future::Future;
+use std::pin::Pin;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::task::{Context, Poll, Waker};
+use std::time::Duration;
 
-use cara_core::services::lease::Lease;
+use cara_core::services::lease::{Lease, Order};
 
 use crate::clock::Clock;
 
-/// A service's lease, to be read from any thread at any time: two atomic loads and the clock.
+/// A service's lease, and the threads and tasks that await its end.
+#[derive(Debug, Default)]
+pub(crate) struct ServiceLease {
+    pub(crate) lease: Lease,
+    tasks: Mutex<Vec<Waker>>,
+    threads: Condvar,
+}
+
+impl ServiceLease {
+    fn tasks(&self) -> MutexGuard<'_, Vec<Waker>> {
+        self.tasks.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// An order has ended, or a newer one has begun: the threads and tasks that wait look again.
+    pub(crate) fn wake(&self) {
+        // Under the lock, which a thread holds from its look to its rest.
+        let tasks = std::mem::take(&mut *self.tasks());
+        self.threads.notify_all();
+        tasks.into_iter().for_each(Waker::wake);
+    }
+
+    /// The service is gone: nothing renews its lease any more.
+    pub(crate) fn clear(&self) {
+        self.lease.clear();
+        self.wake();
+    }
+}
+
+/// A lease, to be read from any thread at any time: a few atomic loads and the clock.
+///
+/// [`Call::lease`](crate::Call::lease) is that of one call: once dead it is dead for ever, whatever call comes next. What
+/// [`add_function`](crate::MyFunctionList::add_function) returns is the service's, for whichever call holds it now: for a
+/// motor's loop, which has to stand still whenever no call moves it.
 #[derive(Clone)]
 pub struct LeaseWatch {
-    lease: Arc<Lease>,
+    service: Arc<ServiceLease>,
+    order: Option<Order>,
     clock: Clock,
 }
 
 impl LeaseWatch {
-    pub(crate) fn new(lease: Arc<Lease>, clock: Clock) -> Self {
-        Self { lease, clock }
+    /// Of the service, or of one order.
+    pub(crate) fn new(service: Arc<ServiceLease>, order: Option<Order>, clock: Clock) -> Self {
+        Self { service, order, clock }
     }
 
     /// Whether the caller still wants what it started.
     pub fn is_live(&self) -> bool {
-        self.lease.is_live(self.clock.now())
+        let now = self.clock.now();
+        match self.order {
+            Some(order) => self.service.lease.is_live_for(order, now),
+            None => self.service.lease.is_live(now),
+        }
+    }
+
+    /// Waits until it is dead, in this thread. It returns at once when it is dead already.
+    pub fn wait_until_ended(&self) {
+        let mut tasks = self.service.tasks();
+        while self.is_live() {
+            // It may end by time alone, where the unit's own threads are held up.
+            let left = self
+                .service
+                .lease
+                .left(self.clock.now())
+                .map_or(Duration::ZERO, Duration::from)
+                .max(Duration::from_millis(1));
+            tasks = self.service.threads.wait_timeout(tasks, left).unwrap_or_else(PoisonError::into_inner).0;
+        }
+    }
+
+    /// Ends when it is dead. Dropping the future loses nothing.
+    pub fn ended(&self) -> LeaseEnded {
+        LeaseEnded { watch: Some(self.clone()) }
     }
 }
 
 impl fmt::Debug for LeaseWatch {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "LeaseWatch(live: {})", self.is_live())
+    }
+}
+
+/// The end of a lease; see [`LeaseWatch::ended`] and [`Call::lease_ended`](crate::Call::lease_ended).
+#[derive(Clone, Debug)]
+#[must_use = "it is awaited"]
+pub struct LeaseEnded {
+    /// `None` where there is no lease: nothing ends.
+    pub(crate) watch: Option<LeaseWatch>,
+}
+
+impl Future for LeaseEnded {
+    type Output = ();
+
+    fn poll(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<()> {
+        let Some(watch) = &self.watch else { return Poll::Pending };
+        let mut tasks = watch.service.tasks();
+        if !watch.is_live() {
+            return Poll::Ready(());
+        }
+        if !tasks.iter().any(|task| task.will_wake(cx.waker())) {
+            tasks.push(cx.waker().clone());
+        }
+        Poll::Pending
     }
 }

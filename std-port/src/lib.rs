@@ -27,12 +27,14 @@ mod config;
 #[cfg(feature = "control")]
 pub mod control;
 mod engine;
+mod error;
 mod event;
 mod file_name;
 #[cfg(feature = "async")]
 mod future;
 mod handler;
 pub mod keys;
+mod lane;
 mod lease;
 #[cfg(feature = "metrics")]
 pub mod metrics;
@@ -40,6 +42,8 @@ mod my_function_list;
 mod occupancy;
 mod peer;
 pub mod pool;
+mod safe_hook;
+mod seldom;
 pub mod storage;
 pub mod survey;
 pub mod sys;
@@ -53,19 +57,22 @@ pub use cara_core::distribution::connection_handler::Finding;
 pub use cara_core::distribution::function::{Attributes, Definition, Signature, VariableSpec};
 pub use cara_core::distribution::hello::{Limits, Manager};
 pub use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
+pub use cara_core::distribution::name::{Shown, is_hidden};
 pub use cara_core::distribution::parameters::{Parameters, ParametersView, Type, Value};
 pub use cara_core::error::{Cause, CloseReason, Error, Limit, Refusal, ServiceError};
 pub use cara_core::host::connections::LinkCounter;
+pub use cara_core::services::lease::LeaseEnd;
 pub use cara_core::services::requests::CallId;
 pub use cara_core::services::unit::{Delivery, RequestOptions};
 pub use cara_core::time::Duration;
 pub use communication_system::{CommunicationSystem, WeakSystem};
 pub use config::Capacities;
+pub use error::StartError;
 pub use event::UnitEvent;
 #[cfg(feature = "async")]
 pub use future::PendingReply;
 pub use handler::{Call, IntoHandler, ServiceOptions};
-pub use lease::LeaseWatch;
+pub use lease::{LeaseEnded, LeaseWatch};
 pub use my_function_list::MyFunctionList;
 pub use peer::{FunctionNames, Peer, TheirFunction};
 pub use sys::interfaces::{Interface, Interfaces};

@@ -2,15 +2,17 @@
 
 use std::sync::Arc;
 
+use cara_core::config::Priority;
 use cara_core::distribution::function::{Attributes, Definition};
 use cara_core::distribution::function_list::{FunctionList, Slot};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
-use cara_core::services::lease::Lease;
 
 use crate::engine::{Engine, arena_bytes, read, write};
 use crate::handler::{Handler, IntoHandler, ServiceOptions};
-use crate::lease::LeaseWatch;
+use crate::lane::Lane;
+use crate::lease::{LeaseWatch, ServiceLease};
+use crate::safe_hook::{Parts, SafeHook};
 use crate::storage::Boxed;
 
 /// The functions that a unit offers. Adding one makes nothing visible: that is what publishing is for.
@@ -33,7 +35,9 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
     /// Adds a function by its definition, as made by `"go_to(position: int[2])".parse()`, with attributes. Returns its
     /// lease, which is dead unless the options ask for one.
     ///
-    /// [`Error::TooLarge`] when arguments and results are declared larger than any call can be served with.
+    /// [`Error::TooLarge`] when arguments and results are declared larger than any call can be served with,
+    /// [`Error::EmergencyWaits`] for a handler of an emergency service that takes the application's state,
+    /// [`Error::Network`] when the system refuses the threads of a safe hook or of an emergency service.
     pub fn add_service<Form>(
         &self,
         definition: &Definition,
@@ -72,14 +76,32 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
         put: impl FnOnce(&mut FunctionList<Boxed, Handler<T>>, &Definition, Attributes, Handler<T>) -> Result<Slot, Error>,
     ) -> Result<LeaseWatch, Error> {
         self.check_size(definition)?;
-        let lease = Arc::new(Lease::new());
+        let lease = Arc::new(ServiceLease::default());
         let attributes =
             Attributes { priority: options.priority, lease: options.lease, idempotent: options.idempotent };
+        let run = handler.into_run().0;
+        let is_emergency = options.priority == Priority::Emergency;
+        if is_emergency && run.takes_state() {
+            return Err(Error::EmergencyWaits);
+        }
+        let lane = if is_emergency { Some(Arc::new(Lane::start("cara-emergency")?)) } else { None };
+        let safe = self.safe_hook(&options, &lease)?;
         let kept = options.lease.map(|_| lease.clone());
-        let handler =
-            Handler { run: handler.into_run().0, lease: kept, safe: options.safe, detached: options.detached };
+        let handler = Handler { run, lease: kept, safe, lane };
         put(&mut write(&self.engine.functions), definition, attributes, handler)?;
-        Ok(LeaseWatch::new(lease, self.engine.clock))
+        Ok(LeaseWatch::new(lease, None, self.engine.clock))
+    }
+
+    fn safe_hook(
+        &self,
+        options: &ServiceOptions<T>,
+        lease: &Arc<ServiceLease>,
+    ) -> Result<Option<Arc<SafeHook>>, Error> {
+        let Some(hook) = options.safe.clone() else { return Ok(None) };
+        let then = options.then.clone().map(|then| self.engine.afterwards(then)).transpose()?;
+        let late = self.engine.hooks_late();
+        let parts = Parts { lease: lease.clone(), clock: self.engine.clock, hook, then, late };
+        SafeHook::start(parts).map(|hook| Some(Arc::new(hook)))
     }
 
     /// Removes a function; peers are told.
@@ -89,12 +111,21 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
 
     /// The service has finished what its caller started: the lease ends, and no hook runs.
     pub fn end_lease(&self, name: &str) {
-        let Some(slot) = read(&self.engine.functions).find(name) else { return };
+        let Some((slot, lease)) = self.leased(name) else { return };
         for link in self.engine.each_link() {
             let mut state = link.lock();
             self.engine.with(&link, &mut state, |session, cx| session.end_lease(cx, slot));
             self.engine.settle(&link, state);
         }
+        if let Some(lease) = lease {
+            lease.wake();
+        }
+    }
+
+    fn leased(&self, name: &str) -> Option<(Slot, Option<Arc<ServiceLease>>)> {
+        let functions = read(&self.engine.functions);
+        let slot = functions.find(name)?;
+        Some((slot, functions.function(slot)?.handler.lease.clone()))
     }
 
     /// How many functions there are.

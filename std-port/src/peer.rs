@@ -117,6 +117,17 @@ impl<T: Send + 'static> Peer<T> {
         self.cell.is_connected()
     }
 
+    /// Takes it off the [roster](crate::CommunicationSystem::roster) until it joins again, or this unit is started anew; `false`
+    /// while it is connected.
+    pub fn retire(&self) -> bool {
+        self.cell.retire()
+    }
+
+    /// Whether it has been taken off the roster, and has not joined since.
+    pub fn is_retired(&self) -> bool {
+        self.cell.is_retired()
+    }
+
     /// The other end of its link, while it is connected.
     pub fn address(&self) -> Option<SocketAddr> {
         self.cell.link().map(|link| link.lock().session.address())
@@ -202,7 +213,7 @@ impl<T: Send + 'static> Peer<T> {
     }
 
     /// Calls a function and waits for its results, which update `parameters` (paper, listing line 13). On an error they
-    /// are unchanged.
+    /// are unchanged, and what the call started, or would start, stops if its service has a lease.
     #[doc(alias = "block_request_their_function")]
     pub fn block_request(&self, function: &str, parameters: &mut ParametersView) -> Result<(), Error> {
         self.block_request_with(function, parameters, &RequestOptions::default())
@@ -258,14 +269,15 @@ impl<T: Send + 'static> Peer<T> {
         self.engine.call_future(self.link()?, function, parameters, options)
     }
 
-    /// Gives up the lease that a call of `function` began: what it started stops.
+    /// Gives up the leases that calls of `function` have begun or will begin: what they started stops, and what has not
+    /// begun does not begin.
     pub fn release(&self, function: &str) -> Result<(), Error> {
         let link = self.link()?;
         let mut state = link.lock();
         let slot = state.session.their_function_list().find(function).ok_or(Error::UnknownFunction)?;
-        self.engine.with(&link, &mut state, |session, cx| session.release(cx, slot));
+        let released = self.engine.with(&link, &mut state, |session, cx| session.release(cx, slot));
         self.engine.settle(&link, state);
-        Ok(())
+        released
     }
 
     /// Sends one-way messages that gather now.

@@ -6,7 +6,7 @@
 use std::cell::Cell;
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, OnceLock, PoisonError, RwLock};
+use std::sync::{Arc, Condvar, Mutex, OnceLock, PoisonError, RwLock};
 use std::thread::JoinHandle;
 
 use cara_core::error::Error;
@@ -15,6 +15,7 @@ use cara_core::time::{Duration, Instant};
 use crate::clock::Clock;
 use crate::engine::workers::Worker;
 use crate::engine::{lock, read, system_refused, write};
+use crate::lane::Lane;
 use crate::occupancy::Occupancy;
 use crate::sys::datagram::Socket;
 use crate::sys::epoll::{Epoll, Events, Interest, Ready, Waker};
@@ -28,12 +29,15 @@ const MOST_WORKERS: usize = 14;
 const DATAGRAM: usize = 2048;
 /// The token of both wakers; no unit has this number.
 const WAKER: u64 = u64::MAX;
+/// The clock looks at the time this often at least.
+const LONGEST_WAIT: Duration = Duration::from_millis(250);
 /// Events of sockets that are taken in one look.
 const CLOCK_EVENTS: usize = 64;
 /// Bits of a token below the unit's number: what the event is about.
 const UNIT_SHIFT: u32 = 48;
 
-/// Threads that several units of one process share: at most 16, however many units there are.
+/// Threads that several units of one process share: at most 18, however many units there are. Each safe hook and each
+/// emergency service has one of its own besides.
 ///
 /// For processes with many s_units, such as simulations of a fleet and gateways. They share fate as well: a handler
 /// runs on a thread of all, and where 14 handlers wait, calls of all units wait. Units whose handlers call each other
@@ -98,8 +102,10 @@ pub(crate) trait Driven: Send + Sync {
     fn ready(&self, ready: Ready, worker: &mut Worker);
     /// A call may begin on the link of a token.
     fn serve_waiting(&self, token: u64, worker: &mut Worker);
-    /// Does what is due; returns when it is to be called again.
+    /// Does what is due; returns when it is to be called again. It waits for nothing outside of the process.
     fn keep_time(&self) -> Instant;
+    /// Looks at files and interfaces, which may take long; returns when to look again.
+    fn look_around(&self) -> Instant;
     /// Datagrams have come.
     fn read_datagrams(&self, socket: Socket, buffer: &mut [u8]);
     /// Connections have come.
@@ -164,6 +170,10 @@ pub(crate) struct Crew {
     pub(crate) served: AtomicUsize,
     started: OnceLock<Result<(), Error>>,
     threads: Mutex<Vec<JoinHandle<()>>>,
+    /// Whether the thread that looks at files and interfaces is to look now.
+    looks: (Mutex<bool>, Condvar),
+    /// Where emergencies run that are for no emergency service.
+    lane: OnceLock<Arc<Lane>>,
     stopping: AtomicBool,
 }
 
@@ -197,6 +207,8 @@ impl Crew {
             served: AtomicUsize::new(0),
             started: OnceLock::new(),
             threads: Mutex::new(Vec::new()),
+            looks: (Mutex::new(true), Condvar::new()),
+            lane: OnceLock::new(),
             stopping: AtomicBool::new(false),
         })
     }
@@ -286,6 +298,11 @@ impl Crew {
             let clock = std::thread::Builder::new().name("cara-clock".into());
             let clock = clock.spawn(move || crew.keep_time()).map_err(system_refused)?;
             lock(&self.threads).push(clock);
+            let crew = self.clone();
+            let looker = std::thread::Builder::new().name("cara-files".into());
+            let looker = looker.spawn(move || crew.look_around()).map_err(system_refused)?;
+            lock(&self.threads).push(looker);
+            let _ = self.lane.set(Arc::new(Lane::start("cara-emergency")?));
             if (0..FIRST_WORKERS).all(|_| self.start_worker(MOST_WORKERS)) { Ok(()) } else { Err(Error::Network) }
         })
     }
@@ -315,6 +332,10 @@ impl Crew {
         lock(&self.threads).iter().any(|thread| thread.thread().id() == own)
     }
 
+    pub(crate) fn lane(&self) -> Option<Arc<Lane>> {
+        self.lane.get().cloned()
+    }
+
     /// Ends all threads, and waits for it unless one of them calls.
     pub(crate) fn stop(&self) {
         if self.stopping.swap(true, Ordering::AcqRel) {
@@ -322,10 +343,14 @@ impl Crew {
         }
         self.clock_waker.wake();
         self.pool_waker.wake();
+        self.wake_looker();
         let own = self.is_own_thread();
         let threads = std::mem::take(&mut *lock(&self.threads));
         // A handler that stops its unit does not wait for the others: one of them may wait for it.
         if !own {
+            if let Some(lane) = self.lane.get() {
+                lane.end();
+            }
             threads.into_iter().for_each(|thread| drop(thread.join()));
         }
     }
@@ -381,14 +406,33 @@ impl Crew {
         ready.pop_front()
     }
 
+    /// The thread that looks at files and interfaces looks now.
+    pub(crate) fn wake_looker(&self) {
+        *lock(&self.looks.0) = true;
+        self.looks.1.notify_all();
+    }
+
+    fn look_around(&self) {
+        while !self.is_stopping() {
+            *lock(&self.looks.0) = false;
+            let seats = u16::try_from(read(&self.seats).len()).unwrap_or(u16::MAX);
+            let looks = (0..seats).filter_map(|seat| self.enter(token(seat, 0), |driven| driven.look_around()));
+            let next = looks.min().unwrap_or(Instant::FAR_FUTURE);
+            let wait = next.since(self.clock.now()).clamp(Duration::from_millis(1), Duration::from_secs(1));
+            let asked = lock(&self.looks.0);
+            drop(self.looks.1.wait_timeout_while(asked, wait.into(), |asked| !*asked));
+        }
+    }
+
     fn keep_time(&self) {
         CLOCK_OF.set(std::ptr::from_ref(self).addr());
         let mut events = Events::new(CLOCK_EVENTS);
         let mut buffer = vec![0; DATAGRAM];
         while !self.is_stopping() {
             let next = self.poll_due();
-            let wait = (next != Instant::FAR_FUTURE).then(|| next.since(self.clock.now()));
-            if let Err(error) = self.clock_epoll.wait(&mut events, wait) {
+            // The wait stands still while the system is suspended, and the clock goes on.
+            let wait = next.since(self.clock.now()).min(LONGEST_WAIT);
+            if let Err(error) = self.clock_epoll.wait(&mut events, Some(wait)) {
                 tracing::error!(%error, "waiting for time failed");
                 return;
             }
@@ -441,6 +485,9 @@ mod tests {
         fn keep_time(&self) -> Instant {
             self.polls.fetch_add(1, Ordering::SeqCst);
             drop(lock(&self.closed));
+            Instant::FAR_FUTURE
+        }
+        fn look_around(&self) -> Instant {
             Instant::FAR_FUTURE
         }
         fn read_datagrams(&self, _: Socket, _: &mut [u8]) {}

@@ -14,6 +14,7 @@ use crate::access::AccessTable;
 use crate::builder::{self, BuildError, Builder, manager};
 use crate::communication_system::Owner;
 use crate::engine::{Engine, lock, pairs, read};
+use crate::error::StartError;
 use crate::event::UnitEvent;
 use crate::my_function_list::MyFunctionList;
 use crate::peer::Peer;
@@ -74,7 +75,7 @@ impl<T: Send + 'static> Unit<T> {
 
     /// Looks for the manager and keeps the connection, in threads of its own.
     #[doc(alias = "start_thread")]
-    pub fn start(&self) -> Result<(), Error> {
+    pub fn start(&self) -> Result<(), StartError> {
         self.engine().start()
     }
 
@@ -162,14 +163,16 @@ impl<T: Send + 'static> Unit<T> {
         self.engine().broadcast();
     }
 
-    /// Runs `hook` each time the manager is lost, once, before anything else is done about it. It must be short.
-    pub fn on_manager_lost(&self, hook: impl Fn(&mut T) + Send + Sync + 'static) {
-        *lock(&self.engine().lost_hook) = Some(Arc::new(hook));
+    /// Runs `hook` each time the manager is lost, once, with the application's state, for which it may have to wait: what
+    /// makes safe belongs into the hook of a [lease](crate::ServiceOptions::lease). [`Error::Network`] when the system
+    /// refuses the thread that it runs on.
+    pub fn on_manager_lost(&self, hook: impl Fn(&mut T) + Send + Sync + 'static) -> Result<(), Error> {
+        self.engine().on_lost(Arc::new(hook))
     }
 
     /// Runs `act` with the application's state.
     pub fn with_state<R>(&self, act: impl FnOnce(&mut T) -> R) -> Result<R, Error> {
-        self.engine().state.enter(None).map(|mut state| act(&mut state))
+        self.engine().with_state(act)
     }
 
     /// The constraints in force.

@@ -31,6 +31,7 @@ fn live_once(stops: bool) {
     agv.my_function_list().add_function("echo", &number, echo).unwrap();
     agv.publish_my_function_list().unwrap();
     manager.start().unwrap();
+    manager.start().expect("one that runs goes on");
     agv.start().unwrap();
     until(|| "they meet".into(), || manager.nodes_offering("echo").len() == 1);
     let peer = manager.s_units().remove(0);

@@ -61,7 +61,7 @@ fn until(what: &str, condition: impl Fn() -> bool) {
 }
 
 fn ping(manager: &CommunicationSystem) -> Result<(), Error> {
-    manager.s_unit("agv").ok_or(Error::NotConnected)?.block_request("ping", &mut Parameters::new())
+    manager.s_unit("agv")?.block_request("ping", &mut Parameters::new())
 }
 
 #[test]

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use cara_std::keys::{FleetKeys, Store, place};
 use cara_std::{
     BuildError, Builder, Call, CloseReason, CommunicationSystem, Fleet, Identity, Interfaces, Parameters,
-    ParametersView, Refusal, ServiceError, Unit, UnitEvent,
+    ParametersView, Refusal, ServiceError, StartError, Unit, UnitEvent,
 };
 
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -160,6 +160,45 @@ fn calls_go_on_while_the_keys_of_their_link_are_made_anew() {
     });
     assert!(renewed() >= 4, "{} renewals", renewed());
     assert!(peer.is_connected() && agv.is_connected());
+}
+
+/// A live manager shows that it is one with the key that its identity alone has, or with the fleet's where its file has
+/// none; keys of another fleet show nothing.
+#[test]
+fn a_manager_starts_once_and_again_when_the_first_has_stopped() {
+    let (fleet, other) = (fleet(), fleet());
+    let root = keys(fleet, &[7]);
+    let first = started_manager(manager(fleet).keys(root.ring(&depot()).unwrap()));
+    let second = manager(fleet).keys(root.ring(&depot()).unwrap()).build_system().unwrap();
+    let running = second.start();
+    assert!(matches!(running, Err(StartError::AlreadyRunning { at }) if at.port() == first.tcp_port()), "{running:?}");
+    started_manager(manager(fleet).keys(keys(fleet, &[7]).ring(&depot()).unwrap())).stop();
+    started_manager(manager(other).keys(keys(other, &[]).ring(&depot()).unwrap())).stop();
+    started_manager(manager(fleet).keys(root.ring(&depot()).unwrap()).beside_another()).stop();
+    first.stop();
+    second.start().unwrap();
+}
+
+#[test]
+fn of_two_managers_that_start_at_once_one_stays() {
+    let fleet = fleet();
+    let root = keys(fleet, &[7]);
+    let managers: Vec<_> =
+        (0..2).map(|_| manager(fleet).keys(root.ring(&depot()).unwrap()).build_system().unwrap()).collect();
+    let begin = std::sync::Barrier::new(2);
+    let started: Vec<_> = std::thread::scope(|scope| {
+        let threads: Vec<_> = managers
+            .iter()
+            .map(|manager| {
+                scope.spawn(|| {
+                    begin.wait();
+                    manager.start().is_ok()
+                })
+            })
+            .collect();
+        threads.into_iter().map(|thread| thread.join().unwrap()).collect()
+    });
+    assert_eq!(started.iter().filter(|started| **started).count(), 1);
 }
 
 #[test]

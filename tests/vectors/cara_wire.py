@@ -248,9 +248,9 @@ CONTROLS = [
     ("list_end", [("serial", 32)]),
     ("list_ack", [("serial", 32), ("skipped", 16)]),
     ("limits", [("message_size", 32), ("minimum_interval", 32), ("calls", 16)]),
-    ("release", [("slot", 16), ("id", 32)]),
-    ("lease_ended", [("slot", 16), ("expired", "bool")]),
+    ("lease_ended", [("call", 32), ("why", "lease_end")]),
 ]
+LEASE_ENDS = ["finished", "expired", "replaced"]
 
 
 def decode_message(data):
@@ -326,8 +326,10 @@ def read_control(reader):
             value[field] = reader.take(8).hex()
         elif encoding == "bytes":
             value[field] = reader.sized().hex()
-        elif encoding == "bool":
-            value[field] = reader.boolean()
+        elif encoding == "lease_end":
+            number = reader.varint(32)
+            require(number < len(LEASE_ENDS))
+            value[field] = LEASE_ENDS[number]
         else:
             value[field] = reader.varint(encoding)
     reader.end()
@@ -342,6 +344,8 @@ def write_control(name, value):
             out += bytes.fromhex(value[field])
         elif encoding == "bytes":
             out += sized(bytes.fromhex(value[field]))
+        elif encoding == "lease_end":
+            out += varint(LEASE_ENDS.index(value[field]))
         else:
             out += varint(int(value[field]))
     return out
@@ -465,8 +469,16 @@ def decode_session_body(data):
         stamp, = reader.fixed("Q")
         body = {"keep_alive": {"stamp": stamp}}
     elif kind == 2:
-        slot, generation, stamp, since = reader.fixed("HHQI")
-        body = {"renew": {"slot": slot, "generation": generation, "stamp": stamp, "since": since}}
+        priority, call, stamp, since = reader.fixed("BIQI")
+        require(priority < len(PRIORITIES))
+        body = {"renew": {"class": PRIORITIES[priority], "call": call, "stamp": stamp, "since": since}}
+    elif kind == 6:
+        priority, call = reader.fixed("BI")
+        require(priority < len(PRIORITIES))
+        body = {"release": {"class": PRIORITIES[priority], "call": call}}
+    elif kind == 7:
+        slot, call = reader.fixed("HI")
+        body = {"release_all": {"slot": slot, "call": call}}
     elif kind in (4, 5):
         body = {"ping" if kind == 4 else "pong": {}}
     else:
@@ -485,7 +497,11 @@ def encode_session_body(body):
     if name in ("ping", "pong"):
         return bytes([4 if name == "ping" else 5])
     if name == "renew":
-        return struct.pack("<BHHQI", 2, value["slot"], value["generation"], value["stamp"], value["since"])
+        return struct.pack("<BBIQI", 2, PRIORITIES.index(value["class"]), value["call"], value["stamp"], value["since"])
+    if name == "release":
+        return struct.pack("<BBI", 6, PRIORITIES.index(value["class"]), value["call"])
+    if name == "release_all":
+        return struct.pack("<BHI", 7, value["slot"], value["call"])
     return bytes([3, PRIORITIES.index(value["priority"])]) + encode_message(value["message"])
 
 

@@ -53,6 +53,7 @@ class SUnit:
         self.udp.bind((options.address, 0))
         self.position = [3, -4]
         self.lease_end = None
+        self.leased_call = 0
         self.renewals = 0
         self.theirs = {}
         self.windows = {priority: (0, set()) for priority in wire.PRIORITIES}
@@ -240,12 +241,25 @@ class SUnit:
             self.hear_stamp(value["stamp"])
         elif kind == "renew":
             self.renew(value)
-        elif "request" in value["message"]:
+        elif kind == "release":
+            self.note(value["class"], value["call"])
+            if self.lease_end is not None and value["call"] == self.leased_call:
+                self.released()
+        elif kind == "release_all":
+            if self.lease_end is not None and value["slot"] == 1 and self.leased_call <= value["call"]:
+                self.released()
+        elif kind == "message" and "request" in value["message"]:
             self.request(value["priority"], value["message"]["request"])
 
+    def released(self):
+        say("released")
+        self.lease_end = None
+
     def renew(self, value):
-        if self.lease_end is None or (value["slot"], value["generation"]) != (1, 0):
-            self.send("high", {"lease_ended": {"slot": value["slot"], "expired": False}})
+        if self.lease_end is None or value["call"] != self.leased_call:
+            newest, seen = self.windows[value["class"]]
+            if value["call"] in seen or value["call"] + 64 <= newest:
+                self.send("high", {"lease_ended": {"call": value["call"], "why": "expired"}})
         elif value["stamp"] <= clock():
             self.renewals += 1
             made = min(value["stamp"] + value["since"], clock())
@@ -254,7 +268,7 @@ class SUnit:
     def end_lease(self, expired):
         say("stopped after", self.renewals, "renewals")
         self.lease_end = None
-        self.send("high", {"lease_ended": {"slot": 1, "expired": expired}})
+        self.send("high", {"lease_ended": {"call": self.leased_call, "why": "expired" if expired else "finished"}})
 
     # --- messages (sections 9, 11 and 12)
 
@@ -278,9 +292,6 @@ class SUnit:
             say("published")
         elif kind == "limits":
             self.peer.update(value)
-        elif kind == "release" and self.lease_end is not None and value["slot"] == 1:
-            say("released")
-            self.lease_end = None
 
     def call_mechanic(self):
         """Calls the manager's function, once; every argument at its smallest."""
@@ -312,8 +323,7 @@ class SUnit:
         if number in seen:
             return
         error = "stale" if number + 64 <= newest else self.refusal(request)
-        newest = max(newest, number)
-        self.windows[priority] = (newest, {each for each in seen | {number} if each + 64 > newest})
+        self.note(priority, number)
         if error is None:
             try:
                 results = self.serve(request)
@@ -322,6 +332,11 @@ class SUnit:
             except wire.Malformed:
                 error = "malformed"
         self.answer(priority, request, {"error": error})
+
+    def note(self, priority, number):
+        newest, seen = self.windows[priority]
+        newest = max(newest, number)
+        self.windows[priority] = (newest, {each for each in seen | {number} if each + 64 > newest})
 
     def refusal(self, request):
         """Why a request is not run, by its header alone."""
@@ -340,6 +355,9 @@ class SUnit:
         say("run", signature["name"], arguments)
         if signature is GO_TO:
             self.position = arguments["position"]
+            if self.lease_end is not None:
+                self.send("high", {"lease_ended": {"call": self.leased_call, "why": "replaced"}})
+            self.leased_call = request["id"]
             self.lease_end = clock() + LEASE_MILLIS * 1000
             return b""
         return wire.encode_block({"position": self.position}, signature["results"])

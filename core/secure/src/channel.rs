@@ -95,3 +95,45 @@ impl Seal for Channel {
         frame.get_mut(..opened?).ok_or(CloseReason::Protocol)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::indexing_slicing, clippy::unwrap_used)]
+    use super::*;
+    use noise_protocol::Cipher as _;
+
+    const KEY: [u8; 32] = [9; 32];
+
+    fn at(number: u64) -> CipherState<ChaCha20Poly1305> {
+        CipherState::new(&KEY, number)
+    }
+
+    fn frame() -> [u8; 4 + TAG_BYTES] {
+        let mut frame = [0; 4 + TAG_BYTES];
+        frame[..4].copy_from_slice(b"stop");
+        frame
+    }
+
+    /// Before frame 2^20 and each multiple of it, as docs/wire.md says: both ends, or what comes next does not open.
+    #[test]
+    fn a_key_seals_no_more_frames_than_it_may() {
+        for times in [1, 2, 4095] {
+            let last = times * FRAMES_PER_KEY - 1;
+            let (mut one, mut other) = (Channel::new(at(last), at(0)), Channel::new(at(0), at(last)));
+            let rekeyed = {
+                let mut key = [0; 32];
+                key.copy_from_slice(ChaCha20Poly1305::rekey(&noise_protocol::U8Array::from_slice(&KEY)).as_slice());
+                key
+            };
+            for expected in [(KEY, last), (rekeyed, last + 1), (rekeyed, last + 2)] {
+                assert_eq!(one.next_seal(), expected);
+                let mut sealed = frame();
+                one.seal(&mut sealed).unwrap();
+                let mut without = at(expected.1);
+                let opens = without.decrypt_in_place(&mut sealed.clone(), sealed.len()).is_ok();
+                assert_eq!(opens, expected.0 == KEY, "frame {}", expected.1);
+                assert_eq!(other.open(&mut sealed).unwrap(), b"stop");
+            }
+        }
+    }
+}

@@ -211,7 +211,11 @@ struct Window {
 impl Window {
     const NEW: Self = Self { end: 0, seen: 0 };
 
+    /// The last number is nobody's: behind it there is no end.
     fn is_new(&self, number: u64) -> bool {
+        if number == u64::MAX {
+            return false;
+        }
         match self.end.checked_sub(number) {
             None | Some(0) => true,
             Some(behind) => behind <= WINDOW && self.seen & bit(behind) == 0,
@@ -295,6 +299,24 @@ mod tests {
     fn the_last_number_is_not_used_twice() {
         let mut sealer = Sealer { key: key(1), generation: 0, next: u64::MAX };
         assert_eq!(sealer.seal(PLAIN, &mut [0; OVERHEAD]), None);
+    }
+
+    #[test]
+    fn the_last_number_is_not_taken_and_the_one_before_it_once() {
+        let mut opener = Opener::new(key(1), 0);
+        let mut sealer = Sealer { key: key(1), generation: 0, next: u64::MAX - 1 };
+        let last = sealed(&mut sealer, b"stop");
+        assert_eq!(opener.open(PLAIN, &mut last.clone()).unwrap(), b"stop");
+        assert_eq!(opener.open(PLAIN, &mut last.clone()), Err(DatagramError::Repeated));
+        // Sealed by a peer that counts on, with the right key.
+        let mut beyond = std::vec![0; OVERHEAD];
+        let header = header_of(0, u64::MAX);
+        beyond[..HEADER_BYTES].copy_from_slice(&header);
+        let bound = Bound::of(PLAIN, &header).unwrap();
+        ChaCha20Poly1305::encrypt_in_place(&key(1).cipher_key(), u64::MAX, &bound.0, &mut beyond[HEADER_BYTES..], 0);
+        for _ in 0..3 {
+            assert_eq!(opener.open(PLAIN, &mut beyond.clone()), Err(DatagramError::Repeated));
+        }
     }
 
     proptest! {

@@ -160,10 +160,13 @@ mod tests {
     #[test]
     fn the_derivation_stays() {
         let manager = Identity::m_unit("depot", 1).unwrap();
-        let key = root().pair(Fleet(3), 1, &manager, &agv(17));
-        let shown = key.expose().iter().fold(std::string::String::new(), |text, byte| text + &format!("{byte:02x}"));
-        // Computed with another implementation, Python's `hashlib.blake2s(…, key=bytes([7] * 32))`.
-        assert_eq!(shown, "2be3d533d8d6234ec6a1992b8b145520cc16b1587ea980a8d609282c2b18f4f2");
+        let shown =
+            |bytes: &[u8]| bytes.iter().fold(std::string::String::new(), |text, byte| text + &format!("{byte:02x}"));
+        let (pair, discovery) = (root().pair(Fleet(3), 1, &manager, &agv(17)), root().discovery(Fleet(3), 1));
+        // Computed with another implementation, Python's `hashlib.blake2s(…, key=bytes([7] * 32))`; docs/keys.md has them.
+        assert_eq!(shown(pair.expose()), "2be3d533d8d6234ec6a1992b8b145520cc16b1587ea980a8d609282c2b18f4f2");
+        assert_eq!(shown(discovery.expose()), "80bac0f6c5a1a40734539c79423d7a50d5d04a6e55837ea100ac549404afabfd");
+        assert_eq!(shown(&root().fingerprint()), "6b627df40843");
     }
 
     #[test]

@@ -570,6 +570,25 @@ mod tests {
         datagram
     }
 
+    /// Boards that draw the same at each start: the two directions must not seal with one key and the same numbers.
+    #[test]
+    fn each_direction_s_datagrams_have_their_own_key_whatever_is_drawn() {
+        let (mut dialler, mut other) = live();
+        for fresh in [1, 11] {
+            let first = dialler.prove(true, credentials(fresh)).unwrap().unwrap();
+            other.prove(false, credentials(fresh)).unwrap();
+            let second = other.answer(&first).unwrap().unwrap();
+            dialler.answer(&second).unwrap();
+            assert_ne!(dialler.confirmation()[1..], other.confirmation()[1..]);
+            turn(&mut other, &mut dialler);
+            confirm(&mut other, &mut dialler).unwrap();
+            turn(&mut dialler, &mut other);
+            confirm(&mut dialler, &mut other).unwrap();
+            dialler.acknowledged().unwrap();
+            other.acknowledged().unwrap();
+        }
+    }
+
     #[test]
     fn a_renewal_changes_each_direction_at_its_own_frame() {
         let (mut dialler, mut other) = live();

@@ -116,14 +116,16 @@ pub fn check(specs: VariableSpecs<'_>, block: &[u8]) -> Result<(), Error> {
 /// Updates `parameters` with a block of results (paper, section 2: "the request will update the `pos` object").
 ///
 /// Variables of the same name take the new value; missing ones are added with their declared size. Everything is
-/// validated first, UTF-8 once: [`Error::Malformed`], or [`Error::ResultWouldNotFit`], [`Error::WrongType`],
+/// validated first, UTF-8 once: [`Error::ResultLost`] for a malformed block, since the service has run, or
+/// [`Error::ResultWouldNotFit`], [`Error::WrongType`],
 /// [`Error::WrongSize`] and [`Error::Full`] if the parameters can't hold the results. On any error they are unchanged.
 pub fn read(specs: VariableSpecs<'_>, block: &[u8], parameters: &mut ParametersView) -> Result<(), Error> {
     let mut room = Room::of(parameters);
-    each(specs, block, |index, spec, value| {
+    let read = each(specs, block, |index, spec, value| {
         let needed = if spec.kind.is_fixed() { spec.size } else { saturate(value.len()) };
         room.take(parameters, index, spec, needed)
-    })?;
+    });
+    read.map_err(|error| if error == Error::Malformed { Error::ResultLost } else { error })?;
     room.check()?;
     commit(specs, block, parameters)
 }

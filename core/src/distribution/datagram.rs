@@ -10,8 +10,9 @@
 //! | 12– | who-has, announce: postcard; session: link u16, zero u16, nonce u64, body |
 //!
 //! In secured mode codes follow who-has and announce: at the end the fleet's, over all before it; before it, in an answer
-//! to one unit, that of the pair. A who-has is filled with zeros to the length of the longest answer, so that nobody is
-//! sent more because somebody asked in its name.
+//! to one unit, that of the pair. A who-has and an announce to all are filled with zeros to the length of the longest answer:
+//! what follows from one, an answer or a question, is no longer than it, so that nobody is sent more because somebody spoke
+//! in its name.
 
 use serde::{Deserialize, Serialize};
 
@@ -50,7 +51,7 @@ pub struct WhoHas {
     pub wanted: Option<Manager>,
     /// Where who asks can be dialled; 0 for nowhere.
     pub tcp_port: u16,
-    /// How many nodes who asks expects to answer.
+    /// How many nodes who asks expects to answer; 0 in a question to one node alone, which answers at once.
     pub expected: u16,
     /// [`short_hash`] of nodes that are connected already and stay silent.
     pub known: heapless::Vec<u32, KNOWN_NODES>,
@@ -154,19 +155,19 @@ impl Header {
         let (who_has, rest): (WhoHas, _) = postcard::take_from_bytes(body).ok()?;
         let filled = match self.mode {
             Mode::Plain => rest.is_empty(),
-            Mode::Secured => rest.split_last_chunk::<CODE_BYTES>()?.0.iter().all(|byte| *byte == 0),
+            Mode::Secured => is_filled(rest),
         };
         (filled && who_has.identity.is_sound()).then_some(who_has)
     }
 
     fn announce(&self, body: &[u8]) -> Option<Announce> {
         let (announce, rest): (Announce, _) = postcard::take_from_bytes(body).ok()?;
-        let codes = match self.mode {
-            Mode::Plain => 0,
-            Mode::Secured if announce.nonce == 0 => CODE_BYTES,
-            Mode::Secured => 2 * CODE_BYTES,
+        let complete = match self.mode {
+            Mode::Plain => rest.is_empty(),
+            Mode::Secured if announce.nonce == 0 => is_filled(rest),
+            Mode::Secured => rest.len() == 2 * CODE_BYTES,
         };
-        (rest.len() == codes && announce.identity.is_sound()).then_some(announce)
+        (complete && announce.identity.is_sound()).then_some(announce)
     }
 }
 
@@ -196,6 +197,19 @@ impl<'b> Datagram<'b> {
             _ => Ok(datagram),
         }
     }
+}
+
+/// Zeros, and a code behind them.
+fn is_filled(rest: &[u8]) -> bool {
+    rest.split_last_chunk::<CODE_BYTES>().is_some_and(|(zeros, _)| zeros.iter().all(|byte| *byte == 0))
+}
+
+/// Zeros behind the first `length` bytes of `out`, so that the whole with the fleet's code is as long as the longest
+/// answer; the length with them.
+fn fill(length: usize, out: &mut [u8]) -> Option<usize> {
+    let filled = length.max(ANSWER_BYTES.saturating_sub(CODE_BYTES));
+    out.get_mut(length..filled)?.fill(0);
+    Some(filled)
 }
 
 /// All but the fleet's code, if that is right.
@@ -246,9 +260,7 @@ impl WhoHas {
         let mode = authenticator.mode();
         let mut length = encode(WHO_HAS, mode, fleet, self, out)?;
         if mode == Mode::Secured {
-            let filled = length.max(ANSWER_BYTES.saturating_sub(CODE_BYTES));
-            out.get_mut(length..filled)?.fill(0);
-            length = sign_for_fleet(filled, authenticator, out)?;
+            length = sign_for_fleet(fill(length, out)?, authenticator, out)?;
         }
         out.get(..length)
     }
@@ -269,6 +281,8 @@ impl Announce {
         if mode == Mode::Secured {
             if let Some(to) = to.filter(|_| self.nonce != 0) {
                 length = append(authenticator.sign_for(to, out.get(..length)?)?, length, out)?;
+            } else {
+                length = fill(length, out)?;
             }
             length = sign_for_fleet(length, authenticator, out)?;
         }

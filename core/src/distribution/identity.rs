@@ -5,6 +5,7 @@ use core::fmt;
 use serde::{Deserialize, Serialize};
 
 use super::compact::{Reader, Writer};
+use super::name::is_hidden;
 use crate::config::NODE_NAME_BYTES;
 use crate::error::Error;
 
@@ -46,8 +47,8 @@ impl Identity {
         Self::new(name, id, Role::SUnit)
     }
 
-    /// An identity; [`Error::BadName`] for a name that is empty, longer than [`NODE_NAME_BYTES`], or has control
-    /// characters.
+    /// An identity; [`Error::BadName`] for a name that is empty, longer than [`NODE_NAME_BYTES`], or has control, bidi or
+    /// zero-width characters.
     pub fn new(name: &str, id: u32, role: Role) -> Result<Self, Error> {
         let name = heapless::String::try_from(name).map_err(|_| Error::BadName)?;
         let identity = Self { id, name, role };
@@ -65,9 +66,10 @@ impl Identity {
         Self { id, name, role: if reader.choice(2) == 0 { Role::MUnit } else { Role::SUnit } }
     }
 
-    /// Whether the name is one: not empty, and without control characters, which could forge lines of a log.
+    /// Whether the name is one: not empty, and without [hidden](is_hidden) characters, which could forge lines of a log or
+    /// make two names look alike.
     pub(crate) fn is_sound(&self) -> bool {
-        !self.name.is_empty() && !self.name.chars().any(char::is_control)
+        !self.name.is_empty() && !self.name.chars().any(is_hidden)
     }
 
     /// The name.

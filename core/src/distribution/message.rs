@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::block::Put;
 use super::compact::{Reader, Writer};
 use super::function_list::{Generation, Slot};
+use crate::config::Priority;
 use crate::error::{Error, ServiceError};
 use crate::host::frame::ChunkWriter;
 use crate::time::Duration;
@@ -262,20 +263,12 @@ pub enum Control<'b> {
         /// Calls of one peer that the sender holds.
         calls: u16,
     },
-    /// The caller no longer wants what the leased function started.
-    Release {
-        /// The function.
-        slot: u16,
-        /// The newest request that the caller has made: this one and all before it are no longer wanted, wherever they
-        /// are.
-        id: u32,
-    },
-    /// The callee ended what the leased function started; renewing it is no use.
+    /// The callee ended what a leased call started; renewing it is no use.
     LeaseEnded {
-        /// The function.
-        slot: u16,
-        /// The caller let it expire, as opposed to: it is finished.
-        expired: bool,
+        /// The caller's id of the call.
+        call: u32,
+        /// Why.
+        why: LeaseEnd,
     },
 }
 
@@ -302,13 +295,12 @@ impl<'b> Control<'b> {
             Self::Limits { message_size, minimum_interval, calls } => {
                 writer.numbers(&[4, message_size, minimum_interval, calls.into()]);
             }
-            Self::Release { slot, id } => writer.numbers(&[5, slot.into(), id]),
-            Self::LeaseEnded { slot, expired } => writer.numbers(&[6, slot.into(), expired.into()]),
+            Self::LeaseEnded { call, why } => writer.numbers(&[5, call, why as u32]),
         }
     }
 
     fn take(reader: &mut Reader<'b>) -> Self {
-        match reader.choice(7) {
+        match reader.choice(6) {
             0 => Self::Publish {
                 slot: reader.u16(),
                 generation: reader.u16(),
@@ -319,8 +311,37 @@ impl<'b> Control<'b> {
             2 => Self::ListEnd { serial: reader.u32() },
             3 => Self::ListAck { serial: reader.u32(), skipped: reader.u16() },
             4 => Self::Limits { message_size: reader.u32(), minimum_interval: reader.u32(), calls: reader.u16() },
-            5 => Self::Release { slot: reader.u16(), id: reader.u32() },
-            _ => Self::LeaseEnded { slot: reader.u16(), expired: reader.flag() },
+            _ => {
+                let call = reader.u32();
+                let why = reader.choice(LeaseEnd::ALL.len() as u32);
+                Self::LeaseEnded { call, why: LeaseEnd::ALL.get(why as usize).copied().unwrap_or(LeaseEnd::Expired) }
+            }
+        }
+    }
+}
+
+/// Why the callee ended what a leased call started.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[repr(u8)]
+#[cfg_attr(test, derive(Serialize, Deserialize))]
+pub enum LeaseEnd {
+    /// The service has done what was asked for.
+    Finished,
+    /// It was not renewed in time, or the callee stopped it: the safe hook runs there.
+    Expired,
+    /// A newer call of the same function goes on in its place.
+    Replaced,
+}
+
+impl LeaseEnd {
+    pub(crate) const ALL: [Self; 3] = [Self::Finished, Self::Expired, Self::Replaced];
+
+    /// `finished`, `expired`, `replaced`.
+    pub const fn word(self) -> &'static str {
+        match self {
+            Self::Finished => "finished",
+            Self::Expired => "expired",
+            Self::Replaced => "replaced",
         }
     }
 }
@@ -333,8 +354,13 @@ pub enum SessionBody<'b> {
         /// The sender's clock.
         stamp: u64,
     },
-    /// The caller still wants what a leased function started.
+    /// The caller still wants what a leased call started.
     Renew(Renewal),
+    /// The caller no longer wants a leased call, wherever it is.
+    Release(Release),
+    /// The caller no longer wants any call of a leased function that it has made up to the one with this id, wherever
+    /// they are.
+    ReleaseAll(Slot, u32),
     /// One whole message: a best-effort request, or an emergency's second copy. The priority's byte, the message.
     Message(u8, &'b [u8]),
     /// To be answered at once, in a datagram.
@@ -343,17 +369,26 @@ pub enum SessionBody<'b> {
     Pong,
 }
 
-/// The caller still wants what a leased function started; aged like a request.
+/// The caller still wants what a leased call started; aged like a request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Renewal {
-    /// The function.
-    pub slot: Slot,
-    /// Its life.
-    pub generation: Generation,
+    /// The caller's id of the call.
+    pub call: u32,
+    /// The class that the call was made in.
+    pub class: Priority,
     /// The callee's clock as the caller last heard it.
     pub stamp: u64,
     /// Time since then.
     pub since: Duration,
+}
+
+/// The caller no longer wants a leased call: it ends, leaves the queue, or does not begin when it arrives later.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Release {
+    /// The caller's id of the call.
+    pub call: u32,
+    /// The class that the call was made in.
+    pub class: Priority,
 }
 
 /// Longest session body that is not a message.
@@ -364,6 +399,8 @@ const RENEW: u8 = 2;
 const MESSAGE: u8 = 3;
 const PING: u8 = 4;
 const PONG: u8 = 5;
+const RELEASE: u8 = 6;
+const RELEASE_ALL: u8 = 7;
 
 impl<'b> SessionBody<'b> {
     /// Reads a session body.
@@ -372,15 +409,25 @@ impl<'b> SessionBody<'b> {
         match kind {
             KEEP_ALIVE => Some(Self::KeepAlive { stamp: u64::from_le_bytes(rest.try_into().ok()?) }),
             RENEW => {
-                let (slot, rest) = rest.split_first_chunk()?;
-                let (generation, rest) = rest.split_first_chunk()?;
+                let (&class, rest) = rest.split_first()?;
+                let (call, rest) = rest.split_first_chunk()?;
                 let (stamp, rest) = rest.split_first_chunk()?;
                 Some(Self::Renew(Renewal {
-                    slot: Slot(u16::from_le_bytes(*slot)),
-                    generation: Generation(u16::from_le_bytes(*generation)),
+                    call: u32::from_le_bytes(*call),
+                    class: Priority::from_wire(class)?,
                     stamp: u64::from_le_bytes(*stamp),
                     since: micros(rest.try_into().ok()?),
                 }))
+            }
+            RELEASE => {
+                let (&class, call) = rest.split_first()?;
+                let (call, class) = (u32::from_le_bytes(call.try_into().ok()?), Priority::from_wire(class)?);
+                Some(Self::Release(Release { call, class }))
+            }
+            RELEASE_ALL => {
+                let (slot, id) = rest.split_first_chunk()?;
+                let id = u32::from_le_bytes(id.try_into().ok()?);
+                Some(Self::ReleaseAll(Slot(u16::from_le_bytes(*slot)), id))
             }
             MESSAGE => {
                 let (&priority, message) = rest.split_first()?;
@@ -399,12 +446,23 @@ impl<'b> SessionBody<'b> {
     }
 
     /// A renewal's bytes.
-    pub fn renewal(renewal: &Renewal) -> [u8; 17] {
-        let [s0, s1] = renewal.slot.0.to_le_bytes();
-        let [g0, g1] = renewal.generation.0.to_le_bytes();
+    pub fn renewal(renewal: &Renewal) -> [u8; 18] {
+        let [c0, c1, c2, c3] = renewal.call.to_le_bytes();
         let [a, b, c, d, e, f, g, h] = renewal.stamp.to_le_bytes();
         let [w, x, y, z] = renewal.since.as_wire().to_le_bytes();
-        [RENEW, s0, s1, g0, g1, a, b, c, d, e, f, g, h, w, x, y, z]
+        [RENEW, renewal.class.to_wire(), c0, c1, c2, c3, a, b, c, d, e, f, g, h, w, x, y, z]
+    }
+
+    /// The bytes that release one call.
+    pub fn release(release: &Release) -> [u8; 6] {
+        let [c0, c1, c2, c3] = release.call.to_le_bytes();
+        [RELEASE, release.class.to_wire(), c0, c1, c2, c3]
+    }
+
+    /// The bytes that release all calls of a function up to `id`.
+    pub fn release_all(slot: Slot, id: u32) -> [u8; 7] {
+        let ([s0, s1], [i0, i1, i2, i3]) = (slot.0.to_le_bytes(), id.to_le_bytes());
+        [RELEASE_ALL, s0, s1, i0, i1, i2, i3]
     }
 
     /// A ping's byte.
@@ -500,7 +558,11 @@ mod tests {
         assert_eq!(SessionBody::decode(&SessionBody::PING), Some(SessionBody::Ping));
         assert_eq!(SessionBody::decode(&SessionBody::PONG), Some(SessionBody::Pong));
         assert_eq!(SessionBody::decode(&SessionBody::keep_alive(9)), Some(SessionBody::KeepAlive { stamp: 9 }));
-        let renewal = Renewal { slot: Slot(1), generation: Generation(2), stamp: 3, since: Duration::from_micros(4) };
+        let renewal = Renewal { call: 1, class: Priority::Low, stamp: 3, since: Duration::from_micros(4) };
         assert_eq!(SessionBody::decode(&SessionBody::renewal(&renewal)), Some(SessionBody::Renew(renewal)));
+        let release = Release { call: 5, class: Priority::Emergency };
+        assert_eq!(SessionBody::decode(&SessionBody::release(&release)), Some(SessionBody::Release(release)));
+        let all = SessionBody::ReleaseAll(Slot(6), 7);
+        assert_eq!(SessionBody::decode(&SessionBody::release_all(Slot(6), 7)), Some(all));
     }
 }

@@ -1,4 +1,6 @@
-//! Which names functions and variables may have.
+//! Which names functions, variables and nodes may have, and how what a peer says is shown.
+
+use core::fmt::{self, Write};
 
 use crate::config::NAME_BYTES;
 use crate::error::{Error, Limit};
@@ -14,6 +16,65 @@ pub(crate) fn check_name(name: &str) -> Result<(), Error> {
     Ok(())
 }
 
+/// Whether a character acts on a terminal or on the reading of a line instead of being seen: control characters (C0, DEL and
+/// C1), marks of direction (bidi) and characters without width.
+pub const fn is_hidden(character: char) -> bool {
+    matches!(character,
+        '\0'..='\u{1F}' | '\u{7F}'..='\u{9F}' | '\u{061C}' | '\u{200B}'..='\u{200F}'
+        | '\u{202A}'..='\u{202E}' | '\u{2060}' | '\u{2066}'..='\u{2069}' | '\u{FEFF}')
+}
+
+/// A text of a peer, with each [hidden](is_hidden) character as `\u{…}`: for terminals and logs.
+#[derive(Clone, Copy, Debug)]
+pub struct Shown<'t>(pub &'t str);
+
+impl fmt::Display for Shown<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for character in self.0.chars() {
+            if is_hidden(character) {
+                write!(f, "{}", character.escape_unicode())?;
+            } else {
+                f.write_char(character)?;
+            }
+        }
+        Ok(())
+    }
+}
+
 pub(crate) const fn is_name_byte(byte: u8) -> bool {
     byte.is_ascii_alphanumeric() || matches!(byte, b'_' | b'-' | b'.' | b'/')
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::distribution::hello::Manager;
+    use crate::distribution::identity::Identity;
+    use std::string::ToString;
+
+    #[test]
+    fn no_name_holds_what_is_not_seen_and_no_text_shows_it() {
+        let ranges = [
+            0..=0x1F,
+            0x7F..=0x9F,
+            0x061C..=0x061C,
+            0x200B..=0x200F,
+            0x202A..=0x202E,
+            0x2060..=0x2060,
+            0x2066..=0x2069,
+            0xFEFF..=0xFEFF,
+        ];
+        for code in ranges.into_iter().flatten() {
+            let hidden = char::from_u32(code).unwrap();
+            let name = std::format!("a{hidden}b");
+            assert_eq!(Identity::s_unit(&name, 1), Err(Error::BadName), "U+{code:04X}");
+            assert!(Manager::new(&name, 1).is_err() && check_name(&name).is_err(), "U+{code:04X}");
+            assert_eq!(Shown(&name).to_string(), std::format!("a\\u{{{code:x}}}b"));
+        }
+        for seen in ["agv-1", "Gabelstapler ä", "叉车", "مركبة"] {
+            assert!(Identity::s_unit(seen, 1).is_ok());
+            assert_eq!(Shown(seen).to_string(), seen);
+        }
+    }
 }

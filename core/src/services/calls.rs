@@ -1,7 +1,8 @@
-//! Calls of a peer: at most once, in order within a class, bounded.
+//! Calls of a peer: at most once, begun in order within a class, side by side, bounded.
 //!
-//! A call that may run now becomes a ticket; one whose class is busy waits in the class's queue. An emergency has a
-//! place of its own in both, so that nothing else can keep it out.
+//! A call that may begin now becomes a ticket, whatever else runs; one for which no slot is free waits in its class's
+//! queue, and those behind it wait as well. Some slots are kept for emergencies, and one place to wait, so that other
+//! calls cannot keep them out, nor two calls of one emergency service those of another one.
 
 use crate::bytes;
 use crate::config::{EMERGENCY_BYTES, Priority, WINDOW};
@@ -47,6 +48,13 @@ impl Window {
         self.seen |= bit;
         Seen::Never
     }
+
+    /// Whether an id was noted, or is so old that it may have been.
+    fn knows(&self, id: u32) -> bool {
+        let behind = self.newest.saturating_sub(id);
+        let bit = 1_u64.checked_shl(behind).unwrap_or(0);
+        id <= self.newest && (behind >= WINDOW || self.seen & bit != 0)
+    }
 }
 
 /// Names a call that runs: to be answered exactly once.
@@ -75,15 +83,20 @@ pub struct CallHead {
     pub made: Instant,
 }
 
+/// So many requests that were given up before they arrived are remembered beside the windows.
+const UNWANTED: usize = 8;
+
 /// Bytes of a call's head in a queue.
 const HEAD_BYTES: usize = 32;
+/// Where its deadline is.
+const DEADLINE: usize = 16;
 
 /// Calls of one peer that run or wait.
 pub(crate) struct Calls<S: Storage> {
     windows: [Window; 4],
+    /// Requests that the caller gave up before they arrived here.
+    unwanted: heapless::Vec<(u32, Priority), UNWANTED>,
     running: S::Slice<Option<CallHead>>,
-    /// The call that keeps its class busy.
-    active: [Option<Ticket>; 4],
     queues: [Option<Queue<S>>; 3],
     emergency: Option<(CallHead, heapless::Vec<u8, EMERGENCY_BYTES>)>,
     held: u16,
@@ -97,13 +110,27 @@ struct Queue<S: Storage> {
     end: usize,
 }
 
+/// Calls of one emergency service that one peer may have running; the next one is told `Busy`.
+const EMERGENCIES_OF_ONE: usize = 2;
+
+/// Of so many slots, those that are kept for emergencies.
+const fn kept(slots: usize) -> usize {
+    if slots < 8 { 1 } else { slots / 4 }
+}
+
+/// Slots that a link needs for so many calls to run at the same time, those that are kept for emergencies included.
+pub const fn slots_for(running: usize) -> usize {
+    let kept = if running < 6 { 1 } else { running / 3 };
+    running.saturating_add(kept)
+}
+
 impl<S: Storage> Calls<S> {
-    /// `running` bounds the calls that run at the same time; one slot is kept for an emergency.
+    /// `running` bounds the calls that run at the same time; one slot in four, at least one, is kept for emergencies.
     pub(crate) fn new(running: S::Slice<Option<CallHead>>) -> Self {
         Self {
             windows: [Window::default(); 4],
+            unwanted: heapless::Vec::new(),
             running,
-            active: [None; 4],
             queues: [const { None }; 3],
             emergency: None,
             held: 0,
@@ -113,7 +140,59 @@ impl<S: Storage> Calls<S> {
 
     /// Notes a request's id in the window of its class.
     pub(crate) fn note(&mut self, priority: Priority, id: u32) -> Seen {
-        self.windows.get_mut(usize::from(priority.to_wire())).map_or(Seen::TooOld, |window| window.note(id))
+        let seen = self.windows.get_mut(usize::from(priority.to_wire())).map_or(Seen::TooOld, |window| window.note(id));
+        if self.unwanted.is_empty() || seen != Seen::Never {
+            return seen;
+        }
+        let unwanted = self.unwanted.len();
+        self.unwanted.retain(|unwanted| *unwanted != (id, priority));
+        if self.unwanted.len() < unwanted { Seen::Before } else { Seen::Never }
+    }
+
+    /// Whether a request has arrived, as far back as the window of its class reaches.
+    pub(crate) fn has_arrived(&self, class: Priority, id: u32) -> bool {
+        self.windows.get(usize::from(class.to_wire())).is_some_and(|window| window.knows(id))
+    }
+
+    /// Whether a call has arrived and not begun yet.
+    pub(crate) fn is_waiting(&self, class: Priority, id: u32) -> bool {
+        match queue_index(class) {
+            None => self.emergency.as_ref().is_some_and(|(head, _)| head.id == id),
+            Some(index) => {
+                self.queues.get(index).and_then(Option::as_ref).is_some_and(|queue| queue.find(id).is_some())
+            }
+        }
+    }
+
+    /// The caller no longer wants a call. One that waits runs out at once, and is refused when its turn comes; one that has
+    /// not arrived is passed over when it does.
+    pub(crate) fn give_up(&mut self, class: Priority, id: u32) {
+        if !self.has_arrived(class, id) {
+            return self.keep_out(class, id);
+        }
+        match queue_index(class) {
+            None => {
+                if let Some((head, _)) = self.emergency.as_mut().filter(|(head, _)| head.id == id) {
+                    head.deadline = Instant::START;
+                }
+            }
+            Some(index) => {
+                if let Some(queue) = self.queues.get_mut(index).and_then(Option::as_mut) {
+                    queue.run_out(id);
+                }
+            }
+        }
+    }
+
+    /// A window that went ahead to this id would take earlier requests that are still on their way for too old.
+    fn keep_out(&mut self, class: Priority, id: u32) {
+        let known = self.unwanted.contains(&(id, class));
+        if !known && self.unwanted.push((id, class)).is_err() {
+            let oldest = self.unwanted.iter().enumerate().min_by_key(|(_, (id, _))| *id).map_or(0, |(index, _)| index);
+            let (oldest, its_class) = self.unwanted.swap_remove(oldest);
+            self.note(its_class, oldest);
+            let _ = self.unwanted.push((id, class));
+        }
     }
 
     /// Whether any call has not begun yet.
@@ -135,14 +214,22 @@ impl<S: Storage> Calls<S> {
         Ok(())
     }
 
-    /// Whether a call of this class may begin at once: nothing of the class runs or waits, and no other class has a call
-    /// that came before and may begin.
+    /// Whether a call of this class may begin at once: a slot is free, nothing of the class waits, and no other class has
+    /// a call that came before and may begin.
     pub(crate) fn is_idle(&self, priority: Priority) -> bool {
-        let active = self.active.get(usize::from(priority.to_wire())).is_some_and(Option::is_some);
-        if active || !self.any_waiting() {
-            return !active;
+        if self.free_slot(priority == Priority::Emergency).is_none() {
+            return false;
         }
-        !self.class_waits(priority) && (priority == Priority::Emergency || !self.can_begin())
+        !self.any_waiting() || !self.class_waits(priority) && (priority == Priority::Emergency || !self.can_begin())
+    }
+
+    /// An empty slot; the last ones are for emergencies, which take those first.
+    fn free_slot(&self, emergency: bool) -> Option<usize> {
+        if emergency {
+            return self.running.iter().rposition(Option::is_none);
+        }
+        let free = self.running.len().saturating_sub(kept(self.running.len()));
+        self.running.iter().take(free).position(Option::is_none)
     }
 
     fn class_waits(&self, priority: Priority) -> bool {
@@ -152,10 +239,16 @@ impl<S: Storage> Calls<S> {
         }
     }
 
-    /// [`Error::Busy`] when the peer has as many calls here as it may.
-    pub(crate) fn admit(&self, priority: Priority, limit: u16) -> Result<(), Error> {
-        let free = priority == Priority::Emergency || self.held < limit;
+    /// [`Error::Busy`] when the peer has as many calls here as it may; of an emergency service it may have two running,
+    /// whatever else there is.
+    pub(crate) fn admit(&self, slot: Slot, is_emergency: bool, limit: u16) -> Result<(), Error> {
+        let free = if is_emergency { self.emergencies_of(slot) < EMERGENCIES_OF_ONE } else { self.held < limit };
         if free { Ok(()) } else { Err(Error::Busy) }
+    }
+
+    fn emergencies_of(&self, slot: Slot) -> usize {
+        let same = |head: &&CallHead| head.slot == slot && head.priority == Priority::Emergency;
+        self.running.iter().flatten().filter(same).count()
     }
 
     /// Whether one more call of any class with a block of `bytes` could wait, as far as this peer's own calls go.
@@ -164,19 +257,13 @@ impl<S: Storage> Calls<S> {
         self.held < limit && self.queues.iter().flatten().all(|queue| queue.room() >= needed)
     }
 
-    /// Begins a call.
-    pub(crate) fn begin(&mut self, head: CallHead) -> Result<Ticket, Error> {
-        let reserve = if head.priority == Priority::Emergency { 0 } else { 1 };
-        let free = self.running.len().saturating_sub(reserve);
-        let index = self.running.iter().take(free).position(Option::is_none).ok_or(Error::Busy)?;
+    /// Begins a call; one of an emergency service may take a slot that is kept for those.
+    pub(crate) fn begin(&mut self, head: CallHead, is_emergency: bool) -> Result<Ticket, Error> {
+        let index = self.free_slot(is_emergency).ok_or(Error::Busy)?;
         let place = self.running.get_mut(index).ok_or(Error::Full(Limit::IncomingCalls))?;
         *place = Some(head);
-        let ticket = Ticket { index: index as u16, id: head.id };
-        if let Some(active) = self.active.get_mut(usize::from(head.priority.to_wire())) {
-            *active = Some(ticket);
-        }
         self.held = self.held.saturating_add(1);
-        Ok(ticket)
+        Ok(Ticket { index: index as u16, id: head.id })
     }
 
     /// The call of a ticket, unless it was answered already.
@@ -184,33 +271,17 @@ impl<S: Storage> Calls<S> {
         self.running.get(usize::from(ticket.index)).copied().flatten().filter(|head| head.id == ticket.id)
     }
 
-    /// Lets the next call of the class begin while this one goes on.
-    pub(crate) fn detach(&mut self, ticket: Ticket) {
-        let place = self.running.get(usize::from(ticket.index));
-        if let Some(&Some(CallHead { priority, .. })) = place {
-            self.free_class(priority, ticket);
-        }
-    }
-
-    fn free_class(&mut self, priority: Priority, ticket: Ticket) {
-        if let Some(active) = self.active.get_mut(usize::from(priority.to_wire())) {
-            active.take_if(|active| *active == ticket);
-        }
-    }
-
     /// Ends a call; `false` when it was ended already.
     pub(crate) fn end(&mut self, ticket: Ticket) -> bool {
         let Some(place) = self.running.get_mut(usize::from(ticket.index)) else { return false };
-        let Some(CallHead { priority, .. }) = *place else { return false };
         if place.take_if(|head| head.id == ticket.id).is_none() {
             return false;
         }
-        self.free_class(priority, ticket);
         self.held = self.held.saturating_sub(1);
         true
     }
 
-    /// Keeps a call until its class is idle. If it needs a buffer, it leaves so many others in the pool.
+    /// Keeps a call until it may begin. If it needs a buffer, it leaves so many others in the pool.
     pub(crate) fn wait(
         &mut self,
         buffers: &mut impl Buffers<S>,
@@ -245,9 +316,14 @@ impl<S: Storage> Calls<S> {
         Ok(())
     }
 
-    /// Whether a call waits whose class is idle.
+    /// Whether a call waits for which a slot is free.
     pub(crate) fn can_begin(&self) -> bool {
         self.next_class().is_some()
+    }
+
+    /// Whether an emergency waits for which a slot is free.
+    pub(crate) fn has_next_emergency(&self) -> bool {
+        self.emergency.is_some() && self.free_slot(true).is_some()
     }
 
     /// Takes the next call that may begin and shows its block to `look`.
@@ -278,10 +354,9 @@ impl<S: Storage> Calls<S> {
         if !self.any_waiting() {
             return None;
         }
-        Priority::ALL.into_iter().find(|&class| {
-            let idle = self.active.get(usize::from(class.to_wire())).is_some_and(Option::is_none);
-            idle && self.class_waits(class)
-        })
+        let may_begin =
+            |class: &Priority| self.class_waits(*class) && self.free_slot(*class == Priority::Emergency).is_some();
+        Priority::ALL.into_iter().find(may_begin)
     }
 
     /// Forgets what waits and gives the buffers back. Running calls may still be ended.
@@ -330,6 +405,26 @@ impl<S: Storage> Queue<S> {
         bytes::copy(block, block_place);
         self.end = end;
         Ok(())
+    }
+
+    /// Where the head of a call is.
+    fn find(&self, id: u32) -> Option<usize> {
+        let mut at = self.start;
+        while at < self.end {
+            let head = self.buffer.get(at..self.end)?.first_chunk()?;
+            let (head, length) = decode_head(head, Priority::Normal);
+            if head.id == id {
+                return Some(at);
+            }
+            at = at.saturating_add(HEAD_BYTES).saturating_add(length);
+        }
+        None
+    }
+
+    fn run_out(&mut self, id: u32) {
+        let Some(at) = self.find(id) else { return };
+        let deadline = at.saturating_add(DEADLINE)..at.saturating_add(DEADLINE).saturating_add(8);
+        self.buffer.get_mut(deadline).unwrap_or_default().fill(0);
     }
 
     fn pop<R>(&mut self, priority: Priority, look: impl FnOnce(CallHead, &[u8]) -> R) -> Option<(CallHead, R)> {
@@ -449,6 +544,54 @@ mod tests {
     }
 
     #[test]
+    fn a_window_knows_what_it_has_noted_and_what_is_too_old() {
+        let mut window = Window::default();
+        window.note(70);
+        window.note(72);
+        assert_eq!([70, 71, 72, 73].map(|id| window.knows(id)), [true, false, true, false]);
+        assert!(window.knows(72 - WINDOW), "it may have been noted");
+    }
+
+    #[test]
+    fn a_call_that_is_released_while_it_waits_has_run_out_and_no_other() {
+        let (mut calls, mut pool) = (calls(3), pool(4, 200));
+        for id in 1..=3 {
+            calls.wait(&mut pool, LEFT_BY_WAITING, head(id, Priority::Low), &[0; 8]).unwrap();
+        }
+        calls.wait(&mut pool, LEFT_BY_WAITING, head(4, Priority::Emergency), b"").unwrap();
+        assert!(calls.is_waiting(Priority::Low, 2) && !calls.is_waiting(Priority::High, 2));
+        for id in 1..=3 {
+            calls.note(Priority::Low, id);
+        }
+        calls.note(Priority::Emergency, 4);
+        calls.give_up(Priority::Low, 2);
+        calls.give_up(Priority::Emergency, 4);
+        let mut left = || calls.take_next(&mut pool, |head, _| head).unwrap().0;
+        assert_eq!(
+            [left(), left(), left(), left()].map(|head| (head.id, head.deadline == Instant::START)),
+            [(4, true), (1, false), (2, true), (3, false),]
+        );
+    }
+
+    #[test]
+    fn a_request_that_is_given_up_before_it_arrives_is_passed_over_and_those_before_it_are_not() {
+        let mut calls = calls(1);
+        calls.give_up(Priority::Low, 500);
+        calls.give_up(Priority::Low, 500);
+        let mut note = |id| calls.note(Priority::Low, id);
+        assert_eq!(
+            [note(3), note(499), note(500), note(500), note(501)],
+            [Seen::Never, Seen::Never, Seen::Before, Seen::Before, Seen::Never,]
+        );
+        // Those that never come give way to others, which are kept out all the same.
+        (600..620).for_each(|id| calls.give_up(Priority::Low, id));
+        for id in 600..620 {
+            assert_eq!(calls.note(Priority::Low, id), Seen::Before, "{id}");
+        }
+        assert_eq!(calls.note(Priority::Low, 620), Seen::Never);
+    }
+
+    #[test]
     fn ids_far_ahead_forget_what_was_before() {
         let mut window = Window::default();
         assert_eq!([window.note(1), window.note(u32::MAX), window.note(1)], [Seen::Never, Seen::Never, Seen::TooOld]);
@@ -459,9 +602,9 @@ mod tests {
     #[test]
     fn a_ticket_is_good_once_and_for_its_call_only() {
         let mut calls = calls(2);
-        let first = calls.begin(head(1, Priority::Normal)).unwrap();
+        let first = calls.begin(head(1, Priority::Normal), false).unwrap();
         assert!(calls.end(first) && !calls.end(first));
-        let second = calls.begin(head(2, Priority::Normal)).unwrap();
+        let second = calls.begin(head(2, Priority::Normal), false).unwrap();
         assert_eq!((calls.call(first), calls.held()), (None, 1));
         assert!(!calls.end(first));
         assert_eq!(calls.call(second).unwrap().id, 2);
@@ -471,13 +614,54 @@ mod tests {
     fn an_emergency_finds_a_slot_when_all_others_are_taken() {
         let mut calls = calls(3);
         for id in 1..=2 {
-            let ticket = calls.begin(head(id, Priority::Normal)).unwrap();
-            calls.detach(ticket);
+            calls.begin(head(id, Priority::Normal), false).unwrap();
         }
-        assert_eq!(calls.begin(head(3, Priority::High)), Err(Error::Busy));
-        assert!(calls.begin(head(4, Priority::Emergency)).is_ok());
-        assert_eq!(calls.admit(Priority::High, 3), Err(Error::Busy));
-        assert_eq!(calls.admit(Priority::Emergency, 3), Ok(()));
+        assert_eq!(calls.begin(head(3, Priority::High), false), Err(Error::Busy));
+        assert_eq!(calls.begin(head(4, Priority::Emergency), false), Err(Error::Busy), "its class alone is not enough");
+        assert!(calls.begin(head(4, Priority::Emergency), true).is_ok());
+        assert_eq!(calls.admit(Slot(9), false, 3), Err(Error::Busy));
+        assert_eq!(calls.admit(Slot(9), true, 3), Ok(()));
+    }
+
+    #[test]
+    fn of_one_emergency_service_two_calls_run_and_leave_slots_for_those_of_others() {
+        let mut calls = calls(slots_for(16));
+        let same = |id| CallHead { slot: Slot(7), ..head(id, Priority::Emergency) };
+        for id in 1..=16 {
+            calls.begin(head(id, Priority::Normal), false).unwrap();
+        }
+        for id in 17..=18 {
+            assert_eq!(calls.admit(Slot(7), true, 1), Ok(()));
+            calls.begin(same(id), true).unwrap();
+        }
+        assert_eq!(calls.admit(Slot(7), true, 1), Err(Error::Busy));
+        assert_eq!(calls.admit(Slot(8), true, 1), Ok(()));
+        assert!(calls.is_idle(Priority::Emergency) && !calls.is_idle(Priority::High));
+    }
+
+    #[test]
+    fn the_slots_that_are_asked_for_are_those_that_other_calls_may_have() {
+        for running in 1..100 {
+            let slots = slots_for(running);
+            assert_eq!(slots - kept(slots), running, "{running} of {slots}");
+        }
+    }
+
+    #[test]
+    fn a_call_begins_while_others_of_its_class_run_and_never_before_one_that_waits() {
+        let (mut calls, mut pool) = (calls(slots_for(2)), pool(3, 100));
+        assert!(calls.is_idle(Priority::Normal));
+        let first = calls.begin(head(1, Priority::Normal), false).unwrap();
+        assert!(calls.is_idle(Priority::Normal), "one runs, and there is room for another");
+        calls.begin(head(2, Priority::Normal), false).unwrap();
+        assert!(!calls.is_idle(Priority::Normal));
+        calls.wait(&mut pool, LEFT_BY_WAITING, head(3, Priority::Normal), b"").unwrap();
+        assert!(!calls.can_begin());
+        calls.end(first);
+        assert!(calls.can_begin() && !calls.is_idle(Priority::Normal), "the third comes before a fourth");
+        assert!(!calls.is_idle(Priority::High), "and before one of another class that came later");
+        assert_eq!(calls.take_next(&mut pool, |head, _| head.id).map(|(_, id)| id), Some(3));
+        assert!(calls.is_idle(Priority::Normal));
     }
 
     #[test]
@@ -492,7 +676,9 @@ mod tests {
     #[test]
     fn one_emergency_waits_without_a_buffer() {
         let (mut calls, mut pool) = (calls(3), pool(0, 0));
-        calls.begin(head(1, Priority::Emergency)).unwrap();
+        for id in 11..=13 {
+            calls.begin(head(id, Priority::Emergency), true).unwrap();
+        }
         calls.wait(&mut pool, LEFT_BY_WAITING, head(2, Priority::Emergency), b"stop").unwrap();
         assert_eq!(calls.wait(&mut pool, LEFT_BY_WAITING, head(3, Priority::Emergency), b"stop"), Err(Error::Busy));
         assert_eq!(calls.wait(&mut pool, LEFT_BY_WAITING, head(4, Priority::Normal), b"go"), Err(Error::Busy));
@@ -513,7 +699,7 @@ mod tests {
     #[test]
     fn the_end_of_a_link_forgets_what_waits_and_keeps_what_runs() {
         let (mut calls, mut pool) = (calls(3), pool(4, 100));
-        let running = calls.begin(head(1, Priority::Normal)).unwrap();
+        let running = calls.begin(head(1, Priority::Normal), false).unwrap();
         calls.wait(&mut pool, LEFT_BY_WAITING, head(2, Priority::Normal), b"").unwrap();
         calls.wait(&mut pool, LEFT_BY_WAITING, head(3, Priority::High), b"").unwrap();
         calls.wait(&mut pool, LEFT_BY_WAITING, head(4, Priority::Emergency), b"").unwrap();

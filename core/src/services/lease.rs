@@ -1,35 +1,56 @@
 //! Leases: a motion goes on only while the caller renews it.
 //!
-//! [`Lease`] is what the application reads, from a motor's interrupt if it likes: two atomic loads say whether the
-//! motion may go on. It is dead again when nobody polls, so a busy or hung executor cannot keep a vehicle moving.
+//! [`Lease`] is what the application reads, from a motor's interrupt if it likes: a few atomic loads say whether the
+//! motion may go on. It is dead again when nothing polls, so a busy or hung executor cannot keep a vehicle moving.
+//!
+//! A service has one lease, and each call that begins is an [`Order`] of it. The newest order holds the lease; an earlier
+//! one stays dead for ever, whatever comes after it.
 
+use core::num::NonZeroU32;
 use core::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 
-use crate::config::LEASES;
+use crate::config::{LEASES, Priority};
 use crate::distribution::function_list::{Generation, Slot};
+pub use crate::distribution::message::LeaseEnd;
+use crate::services::requests::CallId;
 use crate::time::{Duration, Instant};
+
+/// One call's hold of a service's [`Lease`]. Numbers rise, and repeat after 2^32 calls of one service.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct Order(NonZeroU32);
+
+impl Order {
+    const fn number(self) -> u32 {
+        self.0.get()
+    }
+}
 
 /// Says until when a leased service may act. Written by the unit, read anywhere.
 ///
-/// Whoever reads it may be later than the unit, which renews it as of the time at which it began to look at a renewal: an
-/// interrupt can fall between, and a thread can be held up there. So one that has been seen dead remembers it, and no
+/// A reader may be later than the unit, which renews the lease as of the time at which it began to look at a renewal: an
+/// interrupt can fall between, and a thread can be held up there. So a lease that has been seen dead remembers it, and no
 /// renewal revives it: only a new order does.
+///
+/// There is no compare-and-swap on the smallest boards. Each write is one store, and the stores come in an order in which
+/// a reader that falls between two of them sees less than there is: dead where it might be live, never the reverse.
 #[derive(Debug, Default)]
 pub struct Lease {
     /// The end in milliseconds of the port's clock, wrapping, with the lowest bit set; 0 when there is none.
     end: AtomicU32,
-    /// Somebody has been told that it has passed its end.
+    /// A reader has been told that it has passed its end, or the unit has cut it: its safe hook is due.
     seen_dead: AtomicBool,
+    /// The order that holds it, or held it last; 0 before the first.
+    order: AtomicU32,
 }
 
 impl Lease {
-    /// A lease that nobody holds.
+    /// A lease without an order.
     pub const fn new() -> Self {
-        Self { end: AtomicU32::new(0), seen_dead: AtomicBool::new(false) }
+        Self { end: AtomicU32::new(0), seen_dead: AtomicBool::new(false), order: AtomicU32::new(0) }
     }
 
-    /// Whether the service may act at `now`, which is no time to come. Never later than what was granted: the end is
-    /// rounded down. Once it has said no, it says so until the next order.
+    /// Whether the service may act at `now`, which is no time to come, for whichever order holds the lease. Never later
+    /// than what was granted: the end is rounded down. Once it has said no, it says so until the next order.
     pub fn is_live(&self, now: Instant) -> bool {
         if self.seen_dead.load(Ordering::Acquire) {
             return false;
@@ -42,22 +63,61 @@ impl Lease {
         live
     }
 
-    /// Whether it lasts beyond `at` as things are, for whoever measures: it is only looked at, so `at` may be to come.
+    /// The same for one order: once it is dead it stays so, also when another order holds the lease.
+    pub fn is_live_for(&self, order: Order, now: Instant) -> bool {
+        // A new order stores its number first and its end last. So the end read in between is this order's own if the
+        // number is still the same behind it.
+        self.is_held_by(order) && self.is_live(now) && self.is_held_by(order)
+    }
+
+    /// Whether `order` is the newest one, live or dead.
+    pub(crate) fn is_held_by(&self, order: Order) -> bool {
+        self.order.load(Ordering::Acquire) == order.number()
+    }
+
+    /// Whether it lasts beyond `at` as things are, for measurements: nothing is remembered, so `at` may be to come.
     pub fn lasts_beyond(&self, at: Instant) -> bool {
         !self.seen_dead.load(Ordering::Acquire) && is_before(at, self.end.load(Ordering::Acquire))
     }
 
-    /// Lets the service act for a new order, until [`Lease::seen_end`] of `end`.
-    pub fn begin(&self, end: Instant) {
-        self.end.store(odd_millis(end) as u32, Ordering::Release);
-        // Last, so that nobody sees the old end as that of the new order.
-        self.seen_dead.store(false, Ordering::Release);
+    /// How long it still lasts as things are: zero once it has passed its end, `None` when nothing is granted. It is only
+    /// looked at, as by [`Lease::lasts_beyond`].
+    pub fn left(&self, now: Instant) -> Option<Duration> {
+        let end = self.end.load(Ordering::Acquire);
+        let (millis, rest) = (now.as_micros() / 1_000, now.as_micros() % 1_000);
+        let left = i64::from(end.wrapping_sub(millis as u32) as i32).saturating_mul(1_000);
+        let left = u64::try_from(left).unwrap_or(0).saturating_sub(rest);
+        (end != 0).then(|| Duration::from_micros(left))
     }
 
-    /// Lets the service go on until [`Lease::seen_end`] of `end`: `false` when it has ended or been seen dead, and stays so.
+    /// Lets the service act for a new order, until [`Lease::seen_end`] of `end`. `None` where an earlier order is dead and
+    /// has not been ended: its safe hook comes first.
+    pub fn begin(&self, now: Instant, end: Instant) -> Option<Order> {
+        let runs = self.end.load(Ordering::Acquire) != 0;
+        if runs && !self.is_live(now) {
+            return None;
+        }
+        let before = self.order.load(Ordering::Acquire);
+        let order = NonZeroU32::new(before.wrapping_add(1)).unwrap_or(NonZeroU32::MIN);
+        self.order.store(order.get(), Ordering::Release);
+        if !runs {
+            self.seen_dead.store(false, Ordering::Release);
+        }
+        self.end.store(odd_millis(end) as u32, Ordering::Release);
+        // The earlier order may have been seen dead in between.
+        if self.seen_dead.load(Ordering::Acquire) {
+            self.order.store(before, Ordering::Release);
+            return None;
+        }
+        Some(Order(order))
+    }
+
+    /// Lets the service go on until [`Lease::seen_end`] of `end`: `false` when the order has ended or been seen dead, and
+    /// stays so.
     #[must_use]
-    pub fn renew(&self, end: Instant) -> bool {
-        if self.seen_dead.load(Ordering::Acquire) || self.end.load(Ordering::Acquire) == 0 {
+    pub fn renew(&self, order: Order, end: Instant) -> bool {
+        let ended = self.seen_dead.load(Ordering::Acquire) || self.end.load(Ordering::Acquire) == 0;
+        if ended || !self.is_held_by(order) {
             return false;
         }
         self.end.store(odd_millis(end) as u32, Ordering::Release);
@@ -71,8 +131,24 @@ impl Lease {
         Instant::from_micros(odd_millis(end).saturating_mul(1_000))
     }
 
-    /// Ends it now.
-    pub fn end(&self) {
+    /// Stops an order whose safe hook is due: no other one begins before [`Lease::end`].
+    pub fn cut(&self, order: Order) {
+        if self.is_held_by(order) {
+            self.seen_dead.store(true, Ordering::Release);
+        }
+    }
+
+    /// Ends an order; `false` when a newer one holds the lease.
+    pub fn end(&self, order: Order) -> bool {
+        let held = self.is_held_by(order);
+        if held {
+            self.end.store(0, Ordering::Release);
+        }
+        held
+    }
+
+    /// Ends whichever order holds it, as when the service is removed.
+    pub fn clear(&self) {
         self.end.store(0, Ordering::Release);
     }
 }
@@ -100,29 +176,36 @@ pub trait Service {
 
 impl Service for () {}
 
-/// A lease that the peer holds on a function of this unit.
+/// The lease that a call of the peer holds on a function of this unit: one for each function.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Granted {
+    /// The peer's id of the call.
+    pub(crate) call: u32,
     pub(crate) slot: Slot,
     pub(crate) generation: Generation,
+    /// `None` where the port has no [`Lease`] for the service.
+    pub(crate) order: Option<Order>,
     pub(crate) length: Duration,
     pub(crate) end: Instant,
 }
 
-/// A lease that this unit holds on a function of the peer, and renews until it is released.
+/// The lease that a call of this unit holds on a function of the peer, renewed until it is released.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Held {
+    pub(crate) call: CallId,
     pub(crate) slot: Slot,
-    pub(crate) generation: Generation,
+    pub(crate) class: Priority,
     pub(crate) every: Duration,
     pub(crate) next: Instant,
+    /// It is renewed no more, and the release is still to be sent in the stream.
+    pub(crate) is_released: bool,
 }
 
 pub(crate) type GrantedLeases = heapless::Vec<Granted, LEASES>;
 pub(crate) type HeldLeases = heapless::Vec<Held, LEASES>;
 
 #[cfg(test)]
-#[allow(clippy::arithmetic_side_effects)]
+#[allow(clippy::arithmetic_side_effects, clippy::indexing_slicing, clippy::unwrap_used)]
 mod tests {
     use super::*;
     use proptest::prelude::*;
@@ -131,27 +214,30 @@ mod tests {
         Instant::from_micros(micros)
     }
 
+    const START: Instant = Instant::START;
+
     #[test]
     fn a_lease_lives_until_its_end_and_not_longer() {
         let lease = Lease::new();
-        assert!(!lease.is_live(Instant::START));
-        lease.begin(at(500_000));
+        assert!(!lease.is_live(START));
+        let order = lease.begin(START, at(500_000)).unwrap();
         assert!(lease.is_live(at(498_000)));
-        assert!(lease.renew(at(501_000)));
+        assert!(lease.renew(order, at(501_000)));
         assert!(lease.is_live(at(500_000)));
         assert!(!lease.is_live(at(501_000)));
-        lease.begin(at(500_000));
+        assert!(lease.end(order));
+        let order = lease.begin(START, at(500_000)).unwrap();
         assert!(!lease.is_live(at(500_000)));
-        lease.begin(at(500_000));
-        lease.end();
-        assert!(!lease.is_live(Instant::START));
+        assert!(lease.end(order) && lease.begin(START, at(500_000)).is_some());
+        lease.clear();
+        assert!(!lease.is_live(START));
     }
 
     #[test]
     fn a_lease_survives_the_wrap_of_its_clock() {
         let wrap = u64::from(u32::MAX) * 1_000;
         let lease = Lease::new();
-        lease.begin(at(wrap + 300_000));
+        assert!(lease.begin(at(wrap - 200_000), at(wrap + 300_000)).is_some());
         assert!(lease.is_live(at(wrap - 100_000)));
         assert!(lease.is_live(at(wrap + 200_000)));
         assert!(!lease.is_live(at(wrap + 300_000)));
@@ -160,10 +246,51 @@ mod tests {
     #[test]
     fn looking_ahead_ends_nothing() {
         let lease = Lease::new();
-        lease.begin(at(500_000));
+        let order = lease.begin(START, at(500_000)).unwrap();
         assert!(lease.lasts_beyond(at(498_000)) && !lease.lasts_beyond(at(500_000)));
-        assert!(lease.is_live(at(498_000)) && lease.renew(at(600_000)));
+        assert!(lease.is_live(at(498_000)) && lease.renew(order, at(600_000)));
         assert!(!lease.is_live(at(600_000)) && !lease.lasts_beyond(at(0)));
+    }
+
+    #[test]
+    fn an_order_does_not_take_the_place_of_a_dead_one_before_that_has_been_ended() {
+        let lease = Lease::new();
+        let first = lease.begin(START, at(500_000)).unwrap();
+        assert!(lease.begin(at(500_000), at(900_000)).is_none(), "its time is over");
+        assert!(lease.end(first) && lease.begin(at(500_000), at(900_000)).is_some());
+        let lease = Lease::new();
+        let first = lease.begin(START, at(500_000)).unwrap();
+        lease.cut(first);
+        assert!(!lease.is_live(START) && !lease.renew(first, at(600_000)));
+        assert!(lease.begin(START, at(900_000)).is_none(), "it was cut");
+        assert!(lease.end(first) && lease.begin(START, at(900_000)).is_some());
+    }
+
+    #[test]
+    fn what_belongs_to_an_earlier_order_does_nothing_to_a_newer_one() {
+        let lease = Lease::new();
+        let first = lease.begin(START, at(500_000)).unwrap();
+        let second = lease.begin(at(100_000), at(600_000)).unwrap();
+        assert!(!lease.is_live_for(first, at(100_000)) && lease.is_live_for(second, at(100_000)));
+        lease.cut(first);
+        assert!(!lease.end(first) && !lease.renew(first, at(900_000)));
+        assert!(lease.is_live_for(second, at(598_000)));
+        assert!(!lease.is_live_for(second, at(600_000)) && !lease.is_live_for(second, START));
+    }
+
+    #[test]
+    fn what_is_left_of_a_lease_is_told_until_its_end() {
+        let lease = Lease::new();
+        assert_eq!(lease.left(at(7)), None);
+        let order = lease.begin(START, at(501_000)).unwrap();
+        let left = [0, 500_999, 501_000, 900_000].map(|now| lease.left(at(now)).map(Duration::as_micros));
+        assert_eq!(left, [Some(501_000), Some(1), Some(0), Some(0)]);
+        let wrap = (1_u64 << 32) * 1_000;
+        assert!(lease.end(order));
+        let order = lease.begin(at(wrap - 1_000), at(wrap + 301_000)).unwrap();
+        assert_eq!(lease.left(at(wrap - 1_000)), Some(Duration::from_millis(302)));
+        assert!(lease.end(order));
+        assert_eq!(lease.left(at(0)), None);
     }
 
     /// What befalls a lease whose reader's clock goes on by so much in between.
@@ -190,6 +317,7 @@ mod tests {
         fn what_was_seen_dead_lives_only_by_a_new_order(steps in prop::collection::vec(step(), 0..60)) {
             let lease = Lease::new();
             let (mut now, mut dead) = (0, true);
+            let mut orders: std::vec::Vec<(Order, bool)> = std::vec::Vec::new();
             for step in steps {
                 match step {
                     Step::Look(later) => {
@@ -198,20 +326,29 @@ mod tests {
                         prop_assert!(!(live && dead), "it was seen dead, and lives at {now}");
                         dead = !live;
                     }
-                    Step::Renew(length) if !dead => {
-                        prop_assert!(lease.renew(at(now + length)));
-                    }
                     Step::Renew(length) => {
-                        let _ = lease.renew(at(now + length));
+                        let renewed = orders.last().is_some_and(|(order, _)| lease.renew(*order, at(now + length)));
+                        prop_assert_eq!(renewed, !dead);
                     }
                     Step::Begin(length) => {
-                        lease.begin(at(now + length));
-                        dead = false;
+                        if let Some(order) = lease.begin(at(now), at(now + length)) {
+                            orders.push((order, false));
+                            dead = false;
+                        }
                     }
                     Step::End => {
-                        lease.end();
+                        if let Some((order, _)) = orders.last() {
+                            prop_assert!(lease.end(*order));
+                        }
                         dead = true;
                     }
+                }
+                for index in 0..orders.len() {
+                    let live = lease.is_live_for(orders[index].0, at(now));
+                    prop_assert!(!(live && orders[index].1), "an order was dead, and lives");
+                    prop_assert!(!live || index + 1 == orders.len(), "an earlier order lives");
+                    orders[index].1 = !live;
+                    dead |= index + 1 == orders.len() && !live;
                 }
             }
         }

@@ -7,7 +7,7 @@ pub mod publications;
 pub mod requests;
 pub mod unit;
 
-pub use calls::{CallHead, Ticket};
+pub use calls::{CallHead, Ticket, slots_for};
 
 use crate::distribution::function_list::FunctionList;
 use crate::host::mailman::Mailman;

@@ -1,5 +1,6 @@
 //! Calls of this unit that wait for a reply, and the gate that keeps the minimum interval.
 
+use crate::config::Priority;
 use crate::distribution::function_list::{Generation, Slot};
 use crate::error::{Error, Limit};
 use crate::storage::Storage;
@@ -16,6 +17,10 @@ pub struct Pending {
     pub(crate) slot: Slot,
     pub(crate) generation: Generation,
     pub(crate) deadline: Instant,
+    /// The class of a call whose function has a lease, which is released when the call fails.
+    pub(crate) leased: Option<Priority>,
+    /// The call has ended, and the release of its lease is still to be sent in the stream.
+    pub(crate) is_released: bool,
 }
 
 /// The table of calls in flight to one peer: lent slots, found by id without a search.
@@ -64,6 +69,7 @@ impl<S: Storage> Requests<S> {
         slot: Slot,
         generation: Generation,
         deadline: Instant,
+        leased: Option<Priority>,
     ) -> Result<Option<CallId>, Error> {
         if self.in_flight >= self.pending.len() {
             return Err(Error::Full(Limit::Calls));
@@ -73,7 +79,7 @@ impl<S: Storage> Requests<S> {
             let Some(id) = self.next_id() else { return Ok(None) };
             let Some(place) = self.place(id) else { continue };
             if place.is_none() {
-                *place = Some(Pending { id, slot, generation, deadline });
+                *place = Some(Pending { id, slot, generation, deadline, leased, is_released: false });
                 self.in_flight = self.in_flight.saturating_add(1);
                 self.earliest = self.earliest.min(deadline);
                 return Ok(Some(id));
@@ -85,31 +91,53 @@ impl<S: Storage> Requests<S> {
     /// Ends a call and frees its slot. `None` when it had ended already.
     pub(crate) fn close(&mut self, id: CallId) -> Option<Pending> {
         let place = self.place(id)?;
-        let pending = place.take_if(|pending| pending.id == id)?;
+        let pending = place.take_if(|pending| pending.id == id && !pending.is_released)?;
         self.in_flight = self.in_flight.saturating_sub(1);
         Some(pending)
     }
 
     /// Ends one call whose deadline has passed.
-    pub(crate) fn expire(&mut self, now: Instant) -> Option<CallId> {
+    pub(crate) fn expire(&mut self, now: Instant) -> Option<Pending> {
         if now < self.earliest {
             return None;
         }
-        let due = self.pending.iter().flatten().find(|pending| pending.deadline <= now).map(|pending| pending.id);
-        match due {
-            Some(id) => self.close(id).map(|pending| pending.id),
-            None => {
-                let deadlines = self.pending.iter().flatten().map(|pending| pending.deadline);
-                self.earliest = deadlines.min().unwrap_or(Instant::FAR_FUTURE);
-                None
-            }
+        let due = self.waiting().find(|pending| pending.deadline <= now).map(|pending| pending.id);
+        if due.is_none() {
+            let earliest = self.waiting().map(|pending| pending.deadline).min();
+            self.earliest = earliest.unwrap_or(Instant::FAR_FUTURE);
         }
+        due.and_then(|id| self.close(id))
     }
 
     /// Ends any one call, as when the link is gone.
     pub(crate) fn interrupt(&mut self) -> Option<CallId> {
-        let id = self.pending.iter().flatten().map(|pending| pending.id).min()?;
+        let id = self.waiting().map(|pending| pending.id).min()?;
         self.close(id).map(|pending| pending.id)
+    }
+
+    fn waiting(&self) -> impl Iterator<Item = &Pending> {
+        self.pending.iter().flatten().filter(|pending| !pending.is_released)
+    }
+
+    /// Keeps a call that was closed just now in its slot until its release has been sent.
+    pub(crate) fn keep_release(&mut self, pending: Pending) {
+        if let Some(place) = self.place(pending.id) {
+            *place = Some(Pending { is_released: true, ..pending });
+            self.in_flight = self.in_flight.saturating_add(1);
+        }
+    }
+
+    /// A call whose release is still to be sent, and its class.
+    pub(crate) fn release_due(&self) -> Option<(CallId, Priority)> {
+        let due = self.pending.iter().flatten().find(|pending| pending.is_released)?;
+        due.leased.map(|class| (due.id, class))
+    }
+
+    /// The release has been sent.
+    pub(crate) fn released(&mut self, id: CallId) {
+        if self.place(id).and_then(|place| place.take_if(|pending| pending.id == id)).is_some() {
+            self.in_flight = self.in_flight.saturating_sub(1);
+        }
     }
 
     /// Moves to more slots: a multiple of those before, since the slot of an id follows from their number. Returns the
@@ -169,7 +197,7 @@ mod tests {
     }
 
     fn open(requests: &mut Requests<Boxed>, deadline: u64) -> Result<Option<CallId>, Error> {
-        requests.open(Slot(0), Generation(0), Instant::from_micros(deadline))
+        requests.open(Slot(0), Generation(0), Instant::from_micros(deadline), None)
     }
 
     #[test]
@@ -181,6 +209,31 @@ mod tests {
         assert!(requests.close(first).is_some());
         assert!(requests.close(first).is_none());
         assert!(open(&mut requests, 10).unwrap().is_some());
+    }
+
+    #[test]
+    fn a_reply_is_matched_by_its_id_and_not_by_its_slot() {
+        let mut requests = table(2);
+        let first = open(&mut requests, 10).unwrap().unwrap();
+        assert!(requests.close(first).is_some());
+        open(&mut requests, 10).unwrap();
+        let third = open(&mut requests, 10).unwrap().unwrap();
+        assert_eq!(third.0 % 2, first.0 % 2, "the two share a slot");
+        assert!(requests.close(first).is_none(), "the late reply to the first is taken for that to the third");
+        assert!(requests.close(third).is_some());
+    }
+
+    #[test]
+    fn a_release_that_waits_for_room_keeps_its_slot_and_no_reply() {
+        let mut requests = table(2);
+        let leased = requests.open(Slot(0), Generation(0), Instant::from_micros(10), Some(Priority::Low)).unwrap();
+        let pending = requests.expire(Instant::from_micros(10)).unwrap();
+        requests.keep_release(pending);
+        assert_eq!(requests.release_due(), Some((leased.unwrap(), Priority::Low)));
+        assert!(requests.close(pending.id).is_none() && requests.expire(Instant::FAR_FUTURE).is_none());
+        assert_eq!((requests.interrupt(), requests.in_flight()), (None, 1));
+        requests.released(pending.id);
+        assert_eq!((requests.release_due(), requests.in_flight()), (None, 0));
     }
 
     #[test]
@@ -205,7 +258,7 @@ mod tests {
         assert_eq!((requests.slots(), requests.in_flight()), (6, 2));
         (0..4).for_each(|_| assert!(open(&mut requests, 50).is_ok()));
         assert_eq!(open(&mut requests, 50), Err(Error::Full(Limit::Calls)));
-        assert_eq!(requests.expire(Instant::from_micros(20)), Some(ids[1]));
+        assert_eq!(requests.expire(Instant::from_micros(20)).map(|pending| pending.id), Some(ids[1]));
         assert_eq!(requests.close(ids[0]).unwrap().deadline, Instant::from_micros(30));
         assert_eq!(requests.in_flight(), 4);
     }
@@ -231,8 +284,8 @@ mod tests {
                     }
                     _ => {
                         now += value;
-                        while let Some(id) = requests.expire(Instant::from_micros(now)) {
-                            prop_assert!(model.remove(&id).unwrap() <= now);
+                        while let Some(ended) = requests.expire(Instant::from_micros(now)) {
+                            prop_assert!(model.remove(&ended.id).unwrap() <= now);
                         }
                         prop_assert!(model.values().all(|deadline| *deadline > now));
                         let earliest = model.values().min().map_or(Instant::FAR_FUTURE, |d| Instant::from_micros(*d));

@@ -49,6 +49,9 @@ fn linker_scripts_keep_the_pages_free() {
         }
         let (_, end_of_code) = region(&map, "FLASH");
         assert!(end_of_code <= board.boots[0], "{file}");
+        let (stack, variables) = (region(&map, "STACK"), region(&map, "RAM"));
+        assert!(stack.1 <= variables.0 && map.contains("INCLUDE stack.x"), "{file}: an overflow would not fault");
+        assert_eq!(stack.0, 0x2000_0000, "{file}: there is memory in front of the stack");
         assert!(map.contains("ASSERT(ORIGIN(FLASH) + LENGTH(FLASH) <= ORIGIN(BOOTS)"), "{file}");
     }
 }

@@ -2,7 +2,7 @@
 
 use std::sync::mpsc::Receiver;
 
-use cara_std::UnitEvent;
+use cara_std::{LeaseEnd, UnitEvent};
 
 use crate::say;
 
@@ -18,8 +18,11 @@ fn show(event: &UnitEvent) {
         UnitEvent::ListChanged { peer } => say!("new function list of {peer}"),
         UnitEvent::RequestFailed { peer, error, .. } => say!("request to {peer} failed: {error}"),
         UnitEvent::LeaseExpired { peer, function } => say!("lease of {function} expired, held by {peer}"),
-        UnitEvent::LeaseEnded { peer, function, expired: true } => say!("lease of {function} at {peer} expired"),
-        UnitEvent::LeaseEnded { peer, function, expired: false } => say!("{function} at {peer} is finished"),
+        UnitEvent::LeaseEnded { peer, function, why, .. } => match why {
+            LeaseEnd::Finished => say!("{function} at {peer} is finished"),
+            LeaseEnd::Expired => say!("lease of {function} at {peer} expired"),
+            LeaseEnd::Replaced => say!("{function} at {peer} goes on for a newer call"),
+        },
         UnitEvent::NotJoined { address, reason, .. } => say!("{address} did not join: {reason}"),
         UnitEvent::InterfacesChanged { up } => say!("interfaces that are up: {}", up.join(" ")),
         UnitEvent::FunctionsSkipped { peer, skipped } => say!("{peer} has no room for {skipped} functions"),

@@ -102,7 +102,7 @@ impl SUnit {
     fn take_bytes<P: Program>(&mut self, now: Instant, lent: &mut [u8], program: &mut P) -> bool {
         let Some(session) = &mut self.session else { return false };
         let length = self.stack.peek(lent);
-        let arguments = Some(self.arguments.as_mut_view());
+        let arguments = self.unanswered.is_none().then_some(self.arguments.as_mut_view());
         let receipt = session.receive(context!(self, now), &mut lent[..length], arguments);
         let (consumed, moved) = (receipt.consumed, receipt.consumed > 0 || receipt.event.is_some());
         let rest = receipt.event.map_or(Rest::Nothing, |event| tell(event, program));
@@ -114,10 +114,18 @@ impl SUnit {
     /// Serves the calls that waited for their turn.
     fn serve_waiting<P: Program>(&mut self, now: Instant, program: &mut P) {
         self.answer_again(now);
-        while let Some(session) = &mut self.session
-            && let Some(call) = session.next_call(context!(self, now), self.arguments.as_mut_view())
-        {
+        while let Some(call) = self.next_call(now) {
             self.serve(now, &call, program);
+        }
+    }
+
+    /// While results wait for room there is no place for those of a further call: only emergencies are served.
+    fn next_call(&mut self, now: Instant) -> Option<Call> {
+        let session = self.session.as_mut()?;
+        let arguments = self.arguments.as_mut_view();
+        match self.unanswered {
+            None => session.next_call(context!(self, now), arguments),
+            Some(_) => session.next_emergency(context!(self, now), arguments),
         }
     }
 
@@ -170,10 +178,10 @@ impl SUnit {
             return;
         }
         if self.unanswered.is_some() {
-            // A second class whose answer finds no room: its caller waits in vain, and a counter says so.
+            // An emergency whose answer finds no room either: its caller waits in vain, and a counter says so.
             return session.drop_answer(ticket);
         }
-        // The results step aside, so that an emergency is served meanwhile. Calls of the same class wait for this one.
+        // The results step aside, so that an emergency is served meanwhile. All other calls wait for this one.
         core::mem::swap(&mut self.arguments, &mut self.results);
         self.unanswered = Some((ticket, outcome));
     }
@@ -215,7 +223,7 @@ fn tell<P: Program>(event: Event<'_>, program: &mut P) -> Rest {
         Event::Reply(id, outcome) => program.replied(id, outcome),
         Event::Failed(id, error) => program.hear(News::Failed(id, error)),
         Event::ListChanged => program.hear(News::ListChanged),
-        Event::LeaseEnded { slot, expired } => program.hear(News::LeaseEnded { function: slot, expired }),
+        Event::LeaseEnded { slot, why, .. } => program.hear(News::LeaseEnded { function: slot, why }),
         // Plain links prove nothing.
         Event::Acknowledged { .. } | Event::Answered | Event::Introduced => {}
         Event::Hello => return Rest::Greet,

@@ -3,6 +3,7 @@
 use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error, ServiceError};
+use cara_core::services::lease::LeaseEnd;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::{Call, ReplyBlock};
 
@@ -50,7 +51,7 @@ pub enum News {
     LeaseEnded {
         /// The manager's function.
         function: Slot,
-        /// It was not renewed in time.
-        expired: bool,
+        /// Why.
+        why: LeaseEnd,
     },
 }

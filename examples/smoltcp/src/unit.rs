@@ -160,11 +160,10 @@ impl SUnit {
         }
     }
 
-    /// Gives up the lease that this unit holds on a function of the manager.
-    pub fn release(&mut self, now: Instant, function: Slot) {
-        if let Some(session) = &mut self.session {
-            session.release(context!(self, now), function);
-        }
+    /// Gives up the leases that calls of a function of the manager have begun or will begin.
+    pub fn release(&mut self, now: Instant, function: Slot) -> Result<(), Error> {
+        let Some(session) = &mut self.session else { return Err(Error::NotConnected) };
+        session.release(context!(self, now), function)
     }
 
     /// The manager has taken the unit.

@@ -24,6 +24,7 @@ pub(crate) enum Verb {
     Functions(commands::functions::Arguments),
     Call(commands::call::Arguments),
     Publish(commands::publish::Arguments),
+    Retire(commands::retire::Arguments),
     Set(commands::set::Arguments),
     Watch(commands::watch::Arguments),
     Counters(commands::counters::Arguments),

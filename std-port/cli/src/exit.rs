@@ -4,10 +4,11 @@ use std::fmt;
 use std::io::Write;
 use std::process::ExitCode;
 
+use cara_std::{StartError, is_hidden};
 use serde_json::json;
 
 use crate::global::Global;
-use crate::output::BAD;
+use crate::output::{BAD, json as escaped};
 
 /// What `cara --help` says about exit codes.
 pub(crate) const EXIT_CODES: &str = "\
@@ -17,6 +18,7 @@ Exit codes:
   2  wrong usage, a mistake in a call's arguments included
   3  no unit to talk to: no m_unit runs on this host, and --as is not given
   4  the doctor found something
+  5  a live m_unit has this one's name and ID: `cara node` does not start
   130  Ctrl-C ended it (143: SIGTERM)";
 
 /// The exit codes.
@@ -32,6 +34,12 @@ pub(crate) enum Exit {
     NoUnit = 3,
     /// The doctor found something.
     Findings = 4,
+    /// Ctrl-C ended it.
+    Interrupted = 130,
+    /// SIGTERM ended it.
+    Terminated = 143,
+    /// A live m_unit has the identity of the one that was to start.
+    AlreadyRunning = StartError::ALREADY_RUNNING_EXIT as isize,
 }
 
 impl From<Exit> for ExitCode {
@@ -59,6 +67,12 @@ impl Ended {
     /// A node or the network failed it.
     pub(crate) fn failed(name: impl Into<String>, text: impl Into<String>) -> anyhow::Error {
         Self { exit: Exit::Failed, text: text.into(), name: name.into() }.into()
+    }
+
+    /// A unit does not start.
+    pub(crate) fn not_started(error: StartError) -> anyhow::Error {
+        let exit = if let StartError::AlreadyRunning { .. } = error { Exit::AlreadyRunning } else { Exit::Failed };
+        Self { exit, text: error.to_string(), name: error.code() }.into()
     }
 
     /// No unit to talk to.
@@ -95,18 +109,18 @@ pub(crate) fn tell(error: &anyhow::Error, json: bool) -> ExitCode {
         let text = format!("{error:#}");
         let text = text.strip_prefix("error: ").unwrap_or(&text);
         let told = json!({ "error": { "name": name, "exit": exit as u8, "text": text } });
-        writeln!(std::io::stderr(), "{told}")
+        writeln!(std::io::stderr(), "{}", escaped(&told).unwrap_or_default())
     } else {
         writeln!(anstream::stderr(), "{BAD}error:{BAD:#} {}", harmless(&format!("{error:#}")))
     };
     exit.into()
 }
 
-/// A terminal would obey control characters, which a name or an argument may hold.
+/// A terminal would obey hidden characters, which an argument or a text of another node may hold.
 fn harmless(text: &str) -> String {
-    let is_harmful = |character: char| character.is_control() && !matches!(character, '\n' | '\t');
+    let is_harmful = |character: char| is_hidden(character) && !matches!(character, '\n' | '\t');
     let pieces = text.chars().map(|character| match is_harmful(character) {
-        true => character.escape_default().to_string(),
+        true => character.escape_unicode().to_string(),
         false => character.to_string(),
     });
     pieces.collect()
@@ -124,6 +138,6 @@ mod tests {
 
     #[test]
     fn control_characters_are_written_out() {
-        assert_eq!(harmless("a\u{1b}[2Jb\n  c\u{9b}"), "a\\u{1b}[2Jb\n  c\\u{9b}");
+        assert_eq!(harmless("a\u{1b}[2Jb\n  c\u{9b}\u{202e}"), "a\\u{1b}[2Jb\n  c\\u{9b}\\u{202e}");
     }
 }

@@ -2,12 +2,14 @@
 
 use std::io;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-use signal_hook::consts::{SIGINT, SIGTERM};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::flag;
 use signal_hook::iterator::Signals;
+
+use crate::exit::Exit;
 
 /// How often is looked whether it came.
 const LOOK: Duration = Duration::from_millis(20);
@@ -51,5 +53,28 @@ impl Interrupt {
         while !self.came() && start.elapsed() < span {
             std::thread::sleep(LOOK.min(span.saturating_sub(start.elapsed())));
         }
+    }
+}
+
+/// Which signal came that asks the process to end, for commands that end by themselves at the next place where nothing is
+/// half done.
+pub(crate) struct Asked(Arc<AtomicUsize>);
+
+impl Asked {
+    pub(crate) fn catch() -> io::Result<Self> {
+        let came = Arc::new(AtomicUsize::new(0));
+        for signal in [SIGINT, SIGTERM, SIGHUP] {
+            flag::register_usize(signal, came.clone(), signal as usize)?;
+        }
+        Ok(Self(came))
+    }
+
+    pub(crate) fn came(&self) -> bool {
+        self.0.load(Ordering::SeqCst) != 0
+    }
+
+    /// How the command ends because of it.
+    pub(crate) fn exit(&self) -> Exit {
+        if self.0.load(Ordering::SeqCst) == SIGINT as usize { Exit::Interrupted } else { Exit::Terminated }
     }
 }

@@ -40,6 +40,7 @@ fn run(verb: Verb, global: &Global) -> anyhow::Result<ExitCode> {
         Verb::Functions(arguments) => commands::functions::run(arguments, global),
         Verb::Call(arguments) => commands::call::run(arguments, global),
         Verb::Publish(arguments) => commands::publish::run(arguments, global),
+        Verb::Retire(arguments) => commands::retire::run(arguments, global),
         Verb::Set(arguments) => commands::set::run(arguments, global),
         Verb::Watch(arguments) => commands::watch::run(arguments, global),
         Verb::Counters(arguments) => commands::counters::run(arguments, global),

@@ -3,6 +3,7 @@
 use cara_std::control::protocol::{Answer, FunctionInfo, NodeInfo, Question};
 
 use crate::close_names::close;
+use crate::doctor::quoted;
 use crate::exit::Ended;
 use crate::operator::Operator;
 
@@ -46,8 +47,9 @@ pub(crate) fn connected(operator: &mut Operator, meant: &str) -> anyhow::Result<
     if known.node.connected {
         return Ok(known);
     }
-    let (name, plain) = (&known.selector, &known.node.name);
-    let text = format!("{name} was here and is not connected now; `cara doctor {plain}` looks for the reason");
+    let (name, full) = (&known.selector, quoted(&full_name(&known.node)));
+    let was = if known.node.left_ms.is_some() { "was here and" } else { "has not joined: it" };
+    let text = format!("{name} {was} is not connected now; `cara doctor {full}` looks for the reason");
     Err(Ended::failed("NotConnected", text))
 }
 
@@ -77,9 +79,9 @@ fn choose<'n>(nodes: &'n [NodeInfo], meant: &str) -> Choice<'n> {
         found = self::found(nodes, meant);
         found.retain(|node| node.role == role);
     }
-    // One that is here goes before one of the same name that has left.
-    if found.len() > 1 && found.iter().any(|node| node.connected) {
-        found.retain(|node| node.connected);
+    // One of the roster that is absent may be the one that is meant; one that was taken off it is not.
+    if found.len() > 1 && found.iter().any(|node| counts(node)) {
+        found.retain(|node| counts(node));
     }
     match found.as_slice() {
         [] => Choice::None,
@@ -93,6 +95,11 @@ fn choose<'n>(nodes: &'n [NodeInfo], meant: &str) -> Choice<'n> {
             Choice::Several(several.iter().map(|node| name(node)).collect())
         }
     }
+}
+
+/// Connected, or missed.
+fn counts(node: &NodeInfo) -> bool {
+    node.connected || node.expected
 }
 
 /// By both, else by name, else by ID.
@@ -170,6 +177,7 @@ mod tests {
             id,
             role,
             connected,
+            expected: connected,
             address,
             version,
             epoch,
@@ -198,7 +206,13 @@ mod tests {
         assert_eq!(chosen(&nodes, "#3"), "a/1/3");
         assert_eq!(chosen(&nodes, "a/1/3"), "a/1/3");
         assert_eq!(chosen(&nodes, "a/1"), "a/1");
-        assert_eq!(chosen(&nodes, "#1"), "agv/1", "the other one of this id has left");
+        assert_eq!(chosen(&nodes, "#1"), "agv/1", "the other one of this id was retired");
+        let missed = NodeInfo { expected: true, ..node("agv", 2, false) };
+        assert_eq!(
+            chosen(&[node("agv", 1, true), missed], "agv"),
+            "agv/1|agv/2",
+            "the one that is missed may be meant"
+        );
         assert_eq!(chosen(&nodes, "#x"), "none");
     }
 

@@ -3,6 +3,7 @@
 use std::io::{self, Write};
 
 use anstyle::{AnsiColor, Style};
+use cara_std::{Shown, is_hidden};
 use comfy_table::{ContentArrangement, Table, presets};
 use serde::Serialize;
 
@@ -20,19 +21,48 @@ pub(crate) const PLAIN: Style = Style::new();
 /// Prints a line for people. Colours reach terminals only, and not with `NO_COLOR`.
 pub(crate) fn line(text: impl std::fmt::Display) -> io::Result<()> {
     let mut out = anstream::stdout().lock();
-    writeln!(out, "{text}")?;
+    writeln!(out, "{}", visible(&text.to_string()))?;
     out.flush()
 }
 
 /// Prints what people should know and a command does not end with, on standard error.
 pub(crate) fn warning(text: impl std::fmt::Display) {
     // Where nobody reads it, the command goes on.
-    let _ = writeln!(anstream::stderr().lock(), "{BAD}warning{BAD:#}: {text}");
+    let _ = writeln!(anstream::stderr().lock(), "{BAD}warning{BAD:#}: {}", visible(&text.to_string()));
+}
+
+/// A line with each hidden character written out, but for line breaks, tabs and ESC, with which this program's colours begin:
+/// what comes from elsewhere is [`Shown`](cara_std::Shown) before it is put into one.
+fn visible(text: &str) -> String {
+    let mut shown = String::with_capacity(text.len());
+    for character in text.chars() {
+        if is_hidden(character) && !matches!(character, '\n' | '\t' | '\u{1b}') {
+            shown.extend(character.escape_unicode());
+        } else {
+            shown.push(character);
+        }
+    }
+    shown
+}
+
+/// JSON with an escape for each hidden character, which JSON would leave alone but for C0.
+pub(crate) fn json(value: &impl Serialize) -> serde_json::Result<String> {
+    let text = serde_json::to_string(value)?;
+    let mut shown = String::with_capacity(text.len());
+    for character in text.chars() {
+        if is_hidden(character) {
+            // All of them are in the basic plane.
+            shown.push_str(&format!("\\u{:04x}", u32::from(character)));
+        } else {
+            shown.push(character);
+        }
+    }
+    Ok(shown)
 }
 
 /// Prints an object for programs, in one line.
 pub(crate) fn object(value: &impl Serialize) -> io::Result<()> {
-    let mut text = serde_json::to_string(value)?;
+    let mut text = json(value)?;
     text.push('\n');
     let mut out = io::stdout().lock();
     out.write_all(text.as_bytes())?;
@@ -55,7 +85,7 @@ impl Rows {
 
     pub(crate) fn add<const COLUMNS: usize>(&mut self, style: Style, cells: [String; COLUMNS]) {
         // A line break in a cell would part the row from its style.
-        self.table.add_row(cells.map(|cell| cell.replace(['\n', '\r'], " ")));
+        self.table.add_row(cells.map(|cell| Shown(&cell.replace(['\n', '\r'], " ")).to_string()));
         self.styles.push(style);
     }
 

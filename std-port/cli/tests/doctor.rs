@@ -129,7 +129,8 @@ fn of_two_managers_with_one_name_is_told_first() {
     let clinic = Clinic::new();
     let _first = clinic.manager("boss", 64);
     // Its socket is another one's, as of a manager in a container.
-    let second = clinic.system("boss").control(cara_std::control::Control::Off).build_system().unwrap();
+    let second = clinic.system("boss").control(cara_std::control::Control::Off).beside_another();
+    let second = second.build_system().unwrap();
     second.start().unwrap();
     clinic.doctor(&["boss"]).is(&["duplicate"], 4);
     assert_eq!(clinic.doctor(&["agv", "--listen", "4s"]).ids()[0], "duplicate");

@@ -7,8 +7,8 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 
-use cara_std::keys::{KeyRing, parse_node, place};
-use cara_std::{Fleet, Identity};
+use cara_std::keys::{KeyRing, RootKey, parse_node, place};
+use cara_std::{Fleet, Identity, Role};
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -339,48 +339,143 @@ fn a_file_of_garbage_is_written_again_and_holds_up_no_revocation() {
     assert!(!home.file("agv/1").exists());
 }
 
-/// The file of a manager is longer than what the system lets be written, and the list of nodes is not.
+/// Of forty vehicles and their manager, whose file is longer than what the system lets be written.
+fn forty() -> Vec<String> {
+    let vehicles = (1..=40).map(|id| format!("agv/{id}"));
+    std::iter::once("depot/1@m_unit".to_owned()).chain(vehicles).collect()
+}
+
+fn new_fleet(nodes: &[String]) -> Vec<&str> {
+    ["new-fleet", "--fleet", "7"].into_iter().chain(nodes.iter().map(String::as_str)).collect()
+}
+
+/// Writing fails in the middle.
+#[test]
+fn a_command_that_cannot_write_all_changes_nothing() {
+    let home = Home::new();
+    let nodes = forty();
+    let ran = home.cut_short(&new_fleet(&nodes));
+    assert_eq!(ran.status.code(), Some(1), "{}", String::from_utf8_lossy(&ran.stderr));
+    assert!(contents(&home).is_empty(), "{:?}", contents(&home).keys());
+    home.done(&new_fleet(&nodes));
+    let steps: [&[&str]; 4] = [&["revoke", "agv/1"], &["rotate", "--switch"], &["rotate", "--finish"], &["rotate"]];
+    for step in steps {
+        let before = contents(&home);
+        let ran = home.cut_short(step);
+        assert_eq!(ran.status.code(), Some(1), "{step:?}: {}", String::from_utf8_lossy(&ran.stderr));
+        assert!(contents(&home) == before, "{step:?} has changed something");
+        home.done(step);
+    }
+}
+
+/// The host went down after the list of nodes, and before a node's file was in its place.
 #[test]
 fn what_stops_half_way_is_completed_by_the_same_command() {
-    let home = Home::new();
-    let vehicles: Vec<_> = (1..=40).map(|id| format!("agv/{id}")).collect();
-    let vehicles = vehicles.iter().map(String::as_str);
-    home.done(&["new-fleet", "--fleet", "7", "depot/1@m_unit"].into_iter().chain(vehicles).collect::<Vec<_>>());
+    let home = Home::with_fleet();
     home.done(&["new-fleet", "--fleet", "9"]);
     let held = || home.ring("depot/1@m_unit").generations().collect::<Vec<_>>();
-    let complete = |step: &[&str], other: Option<&[&str]>| {
-        let ran = home.cut_short(step);
-        let said = String::from_utf8_lossy(&ran.stderr).into_owned();
-        assert!(
-            ran.status.code() == Some(1) && said.contains("`cara keys derive --fleet 7` writes the rest"),
-            "{said}"
-        );
-        if let Some(other) = other {
-            home.refused(other, 2, "`cara keys derive --fleet 7` writes the rest");
-        }
+    let complete = |step: &[&str], other: &[&str]| {
+        let before = fs::read(home.file("depot/1@m_unit")).unwrap();
+        home.done(step);
+        fs::write(home.file("depot/1@m_unit"), before).unwrap();
+        home.refused(other, 2, "`cara keys derive --fleet 7` writes the rest");
         let said = home.done(step);
         assert!(said.contains("already") && said.contains("changed  depot/1@m_unit"), "{said}");
         let said = home.done(&["derive", "--fleet", "7"]);
         assert!(said.contains("every file is as it should be"), "{said}");
     };
-    complete(&["revoke", "--fleet", "7", "agv/1"], Some(&["rotate", "--fleet", "7", "--switch"]));
+    complete(&["revoke", "--fleet", "7", "agv/1"], &["rotate", "--fleet", "7", "--switch"]);
     assert_eq!(held(), [1, 2]);
     assert!(generations(&home.ring("depot/1@m_unit"), "agv/1").is_empty());
     let said = home.done(&["revoke", "--fleet", "7", "agv/1"]);
     assert!(said.contains("agv/1 is revoked already") && said.contains("every file is as it should be"), "{said}");
     assert!(said.contains("rotate --fleet 7 --switch"), "{said}");
     assert_eq!(held(), [1, 2]);
-    complete(&["rotate", "--fleet", "7", "--switch"], Some(&["rotate", "--fleet", "7", "--finish"]));
+    complete(&["rotate", "--fleet", "7", "--switch"], &["rotate", "--fleet", "7", "--finish"]);
     assert_eq!(held(), [2, 1]);
-    complete(&["rotate", "--fleet", "7", "--finish"], Some(&["rotate", "--fleet", "7"]));
+    complete(&["rotate", "--fleet", "7", "--finish"], &["rotate", "--fleet", "7"]);
     assert_eq!(held(), [2]);
-    complete(&["rotate", "--fleet", "7"], Some(&["rotate", "--fleet", "7", "--switch"]));
+    complete(&["rotate", "--fleet", "7"], &["rotate", "--fleet", "7", "--switch"]);
     assert_eq!(held(), [2, 3]);
     home.refused(&["rotate", "--fleet", "7"], 2, "a change to generation 3 is under way");
     // Nor does it hold up a revocation.
-    home.cut_short(&["rotate", "--fleet", "7", "--switch"]);
+    let before = fs::read(home.file("depot/1@m_unit")).unwrap();
+    home.done(&["rotate", "--fleet", "7", "--switch"]);
+    fs::write(home.file("depot/1@m_unit"), before).unwrap();
     home.done(&["revoke", "--fleet", "7", "agv/2"]);
     assert_eq!(held(), [3, 4]);
+}
+
+/// A file system of its own with as many pages, or as many files, as are said; prints the exit code and what is left.
+const SMALL_DISK: &str = r#"
+mount -t tmpfs -o "$1" none "$2" || exit 9
+HOME=$2 "$3" keys --dir "$2" new-fleet --fleet 7 depot/1@m_unit agv/1 agv/2 >/dev/null 2>"$4"
+echo "$?"
+ls -A "$2"
+"#;
+
+#[test]
+fn a_new_fleet_on_a_full_disk_is_all_there_or_nothing_is() {
+    let folder = TempDir::new().unwrap();
+    let (disk, errors) = (folder.path().join("disk"), folder.path().join("errors"));
+    fs::create_dir(&disk).unwrap();
+    let kinds: [&[&str]; 2] = [&["--mount"], &["--user", "--map-root-user", "--mount"]];
+    let run = |kind: &[&str], options: &str| {
+        let mut command = Command::new("unshare");
+        command.args(kind).args(["sh", "-c", SMALL_DISK, "sh", options]).arg(&disk).arg(env!("CARGO_BIN_EXE_cara"));
+        command.arg(&errors).env_remove("XDG_CONFIG_HOME").env_remove("CARA_KEYS").output()
+    };
+    let works = |kind: &&[&str]| run(kind, "size=1m").is_ok_and(|ran| ran.status.success());
+    let Some(kind) = kinds.into_iter().find(works) else {
+        eprintln!("skipped: this user cannot mount a file system in a namespace");
+        assert!(std::env::var_os("CI").is_none(), "skipped, which counts as failed where CI is set");
+        return;
+    };
+    let mut ends = BTreeSet::new();
+    let pages = (1..=8).map(|pages| format!("size={}k", 4 * pages));
+    // The folder is one of them.
+    let files = (1..=8).map(|files| format!("nr_inodes={files}"));
+    for options in pages.chain(files) {
+        let ran = run(kind, &options).unwrap();
+        let said = String::from_utf8(ran.stdout).unwrap();
+        let (code, left) = said.split_once('\n').unwrap();
+        let (left, error) = (left.lines().count(), fs::read_to_string(&errors).unwrap());
+        match code {
+            "0" => assert_eq!(left, 5, "{options}: {said}"),
+            "1" => assert!(left == 0 && error.contains("No space left"), "{options}: {said}{error}"),
+            _ => panic!("{options}: {said}{error}"),
+        }
+        ends.insert(code.to_owned());
+    }
+    assert_eq!(ends.len(), 2, "some disks are too small, and some are not");
+}
+
+/// Ctrl-C and SIGTERM while files are being written.
+#[test]
+fn a_new_fleet_that_is_interrupted_is_all_there_or_nothing_is() {
+    let nodes: Vec<_> =
+        std::iter::once("depot/1@m_unit".to_owned()).chain((1..=300).map(|id| format!("agv/{id}"))).collect();
+    let mut codes = BTreeSet::new();
+    for (round, signal) in ["INT", "TERM"].into_iter().cycle().take(12).enumerate() {
+        let home = Home::new();
+        fs::create_dir_all(home.folder()).unwrap();
+        let mut command = Command::new(env!("CARGO_BIN_EXE_cara"));
+        command.arg("keys").args(new_fleet(&nodes)).env("HOME", home.0.path()).stdout(Stdio::null());
+        command.env_remove("XDG_CONFIG_HOME").env_remove("CARA_KEYS").stderr(Stdio::null());
+        let mut child = command.spawn().unwrap();
+        let written = || fs::read_dir(home.folder()).unwrap().count();
+        while written() <= round * 30 && child.try_wait().unwrap().is_none() {}
+        let _ = Command::new("sh").args(["-c", &format!("kill -{signal} {} 2>&1", child.id())]).output();
+        let code = child.wait().unwrap().code();
+        let left = contents(&home);
+        match code {
+            Some(0) => assert_eq!(left.len(), nodes.len() + 2),
+            Some(130 | 143) => assert!(left.is_empty(), "{:?}", left.keys()),
+            code => panic!("{code:?}"),
+        }
+        codes.insert(code);
+    }
+    assert!(codes.len() > 1 || !codes.contains(&Some(0)), "it was never interrupted: {codes:?}");
 }
 
 #[test]
@@ -410,6 +505,45 @@ fn the_guide_shows_what_is_printed() {
         let printed = home.done(&line.split(' ').collect::<Vec<_>>());
         let printed = printed.replace(home.0.path().to_str().unwrap(), "/home/me");
         assert_eq!(without_fingerprints(&printed), without_fingerprints(expected), "cara keys {line}");
+    }
+}
+
+/// A program in Python, written from the guide, makes the same files out of the root and the list.
+#[test]
+fn what_the_guide_says_about_files_is_enough_to_make_them() {
+    let home = Home::with_fleet();
+    home.done(&["derive", "hall/2@m_unit", "it's long/3", "--manager", "hall/2", "--manager", "depot/1"]);
+    home.done(&["revoke", "agv/2"]);
+    home.done(&["derive", "agv/2", "--manager", "depot/1"]);
+    home.done(&["rotate", "--switch"]);
+    let program = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/vectors/cara_keys.py");
+    for node in ["depot/1@m_unit", "hall/2@m_unit", "agv/1", "agv/2", "it's long/3"] {
+        let node = named(node);
+        let role = if node.role() == Role::MUnit { "m_unit" } else { "s_unit" };
+        let made = Command::new("python3")
+            .arg(&program)
+            .arg(home.folder())
+            .args(["7", role, &node.id().to_string(), node.name()])
+            .output();
+        let Ok(made) = made else {
+            eprintln!("skipped: python3 is not installed");
+            assert!(std::env::var_os("CI").is_none(), "skipped, which counts as failed where CI is set");
+            return;
+        };
+        assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+        let file = fs::read_to_string(home.folder().join(place::file_name(&node, Fleet(7)))).unwrap();
+        assert_eq!(String::from_utf8(made.stdout).unwrap(), file);
+    }
+}
+
+#[test]
+fn the_guide_s_keys_come_from_its_root() {
+    let text = fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(GUIDE)).unwrap();
+    let (root, hex) =
+        (RootKey::new([7; 32]), |bytes: &[u8]| bytes.iter().map(|byte| format!("{byte:02x}")).collect::<String>());
+    let pair = root.pair(Fleet(3), 1, &named("agv/17"), &named("depot/1@m_unit"));
+    for shown in [hex(pair.expose()), hex(root.discovery(Fleet(3), 1).expose()), hex(&root.fingerprint())] {
+        assert!(text.contains(&format!("| `{shown}` |")), "{shown}");
     }
 }
 

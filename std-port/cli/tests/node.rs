@@ -141,6 +141,23 @@ fn all_mistakes_of_meaning_are_told_at_once() {
 }
 
 #[test]
+fn all_mistakes_of_form_are_told_at_once() {
+    let folder = TempDir::new().unwrap();
+    let file = "nam = \"ä\"\nid = \"1\"\ntcp_port = 65536\n[constraint]\nkeep_alive = 5\n[log]\nlevl = \"info\"\n\
+                [[functions]]\nanswer = \"ehco\"\nsignature = \"f()\"\n";
+    std::fs::write(folder.path().join("bad.toml"), file).unwrap();
+    let told = text(&outcome(folder.path(), &["--check", "bad.toml"]).stderr);
+    for place in ["1:1: ", "2:6: ", "3:12: ", "4:2: ", "7:1: ", "9:10: "] {
+        assert!(told.contains(&format!("bad.toml:{place}")), "{place}\n{told}");
+    }
+    assert_eq!(told.matches("bad.toml:").count(), 6, "{told}");
+    // What is no TOML hides the rest.
+    std::fs::write(folder.path().join("bad.toml"), format!("{file}id = \n")).unwrap();
+    let told = text(&outcome(folder.path(), &["--check", "bad.toml"]).stderr);
+    assert_eq!(told.matches("bad.toml:").count(), 1, "{told}");
+}
+
+#[test]
 fn the_example_is_correct() {
     let folder = TempDir::new().unwrap();
     let example = outcome(folder.path(), &["--example"]).stdout;
@@ -619,11 +636,27 @@ fn an_s_unit_is_a_node_too() {
         let asked = command.args(arguments).arg("--socket").arg(manager.control_socket()).output().unwrap();
         (asked.status.success(), text(&asked.stdout))
     };
-    until("its function is there", || ask(&["functions", "agv"]).1.contains("echo"));
-    let (called, results) = ask(&["call", "agv", "echo(text: \"there and back\")"]);
+    until("its function is there", || ask(&["functions", "agv/7"]).1.contains("echo"));
+    let (called, results) = ask(&["call", "agv/7", "echo(text: \"there and back\")"]);
     assert!(called && results.contains("there and back"), "{results}");
-    let (measured, times) = ask(&["bench", "agv", "--count", "2", "--groups", "0", "--pause", "0", "--json"]);
+    let (measured, times) = ask(&["bench", "agv/7", "--count", "2", "--groups", "0", "--pause", "0", "--json"]);
     assert!(measured && times.contains("\"characters\":20000"), "{times}");
     let address = vehicle.up.split("metrics http://").nth(1).unwrap().strip_suffix("/metrics").unwrap();
     assert!(scrape(address.parse().unwrap()).contains("unit=\"agv/7\",peer=\"plant/1\",role=\"m_unit\"} 1\n"));
+}
+
+/// What a peer says in a call is in the log, and nothing of it acts on the terminal that shows the log.
+#[test]
+fn hidden_characters_of_a_caller_are_written_out_in_the_log() {
+    let node = Node::start(SERVED);
+    let (_unit, manager) = node.vehicle("agv", 7);
+    let hidden = ['\u{9b}', '\u{202e}', '\u{200b}', '\u{1b}'];
+    let mut report = Parameters::new();
+    report.add_string("text", 64).unwrap();
+    report.set_value("text", "a\u{9b}31mb\u{202e}c\u{200b}d\u{1b}[2J").unwrap();
+    manager.block_request("report", &mut report).unwrap();
+    until("the call is in the log", || node.log().contains("called"));
+    let log = node.log();
+    assert!(!log.contains(hidden), "{log:?}");
+    assert!(log.contains(r"a\u{9b}31mb\u{202e}c\u{200b}d\u001b[2J"), "{log}");
 }

@@ -4,7 +4,7 @@ use std::fmt;
 use std::ops::Range;
 
 /// Why a file is no access table. `Display` has a line for each mistake: `FILE:LINE:COLUMN: what is wrong: what to do`.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, PartialEq, Eq)]
 pub enum AccessError {
     /// It cannot be read.
     Unreadable {

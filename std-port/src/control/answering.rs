@@ -1,5 +1,6 @@
 //! One question, answered against a system of this process.
 
+use std::collections::HashSet;
 use std::ops::ControlFlow;
 use std::sync::mpsc::RecvTimeoutError;
 
@@ -9,8 +10,8 @@ use cara_core::services::access::Verb;
 use cara_core::time::Duration;
 
 use super::protocol::{Answer, Failure, Question};
-use super::{call, constraint, describe, hold, select};
-use crate::CommunicationSystem;
+use super::{call, constraint, describe, everybody, hold, select};
+use crate::{CommunicationSystem, Identity, Peer};
 
 /// Where answers go; `Break` when nobody reads them any more.
 pub(super) type Sink<'s> = &'s mut dyn FnMut(Answer) -> ControlFlow<()>;
@@ -20,8 +21,9 @@ const EVENTS: usize = 1024;
 /// Bytes of metrics in one answer.
 #[cfg(feature = "metrics")]
 const PIECE_BYTES: usize = 256 * 1024;
-/// How often a watch without events looks whether it is still wanted, and a pause whether the unit still runs.
-pub(super) const LOOK: std::time::Duration = std::time::Duration::from_millis(100);
+/// How often a call and a watch look whether they are still wanted, and a pause whether the unit still runs: so long after
+/// its client has gone away, what a call started goes on.
+pub(super) const LOOK: std::time::Duration = std::time::Duration::from_millis(20);
 
 /// Why an answer ends early.
 pub(super) enum End {
@@ -54,7 +56,7 @@ pub fn execute<T: Send + 'static>(
     execute_while(system, question, answer, &|| true);
 }
 
-/// As [`execute`]; a watch ends as well when `wanted` says no.
+/// As [`execute`]; a call or a watch ends as well when `wanted` says no.
 pub(super) fn execute_while<T: Send + 'static>(
     system: &CommunicationSystem<T>,
     question: &Question,
@@ -82,10 +84,16 @@ fn attempt<T: Send + 'static>(
             system.broadcast();
             Ok(())
         }
+        Question::Retire { node } => retire(system, node),
         Question::Functions { node } => functions(system, node, sink),
         Question::Call(question) => {
             permit(system, &question.function, Verb::Call)?;
-            call::call(system, question, sink)
+            match question.node {
+                Some(_) => call::call(system, question, sink, wanted),
+                None => {
+                    everybody::call(system, &question.function, sink, |sink| call::call(system, question, sink, wanted))
+                }
+            }
         }
         Question::Hold(question) => {
             permit(system, &question.function, Verb::Call)?;
@@ -158,13 +166,24 @@ fn nodes<T: Send + 'static>(
         Some(function) => system.nodes_offering(function),
         None => select::nodes(system),
     };
+    let roster = system.roster();
+    let roster: HashSet<&Identity> = roster.iter().map(Peer::identity).collect();
     for peer in &all {
-        send(sink, Answer::Node(describe::node(peer)))?;
+        send(sink, Answer::Node(describe::node(peer, roster.contains(peer.identity()))))?;
     }
     for finding in system.findings() {
         send(sink, Answer::Refused(describe::refused(&finding, system.age(&finding))))?;
     }
     Ok(())
+}
+
+fn retire<T: Send + 'static>(system: &CommunicationSystem<T>, node: &str) -> Result<(), End> {
+    let peer = select::node(system, node)?;
+    if peer.retire() {
+        return Ok(());
+    }
+    let text = format!("{} is connected: only one that is absent is taken off the roster", peer.identity());
+    Err(Failure::configuration("Connected", text).into())
 }
 
 fn functions<T: Send + 'static>(system: &CommunicationSystem<T>, node: &str, sink: Sink<'_>) -> Result<(), End> {

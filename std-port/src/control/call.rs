@@ -1,5 +1,6 @@
 //! Calls that an operator makes: to one node or to all, once or again and again.
 
+use std::task::Poll;
 use std::time::Instant;
 
 use cara_core::distribution::parameters::ParametersView;
@@ -7,31 +8,50 @@ use cara_core::error::{Cause, Error};
 use cara_core::services::access::Verb;
 use cara_core::time::Duration;
 
-use super::answering::{End, Sink, pause, permit, send};
+use super::answering::{End, LOOK, Sink, pause, permit, send};
 use super::protocol::{Answer, Argument, CallQuestion, Failure};
 use super::{describe, select, values};
 use crate::communication_system::thread_waker;
+use crate::engine::{CallFuture, worth_waiting};
 use crate::{CommunicationSystem, Delivery, Peer, RequestOptions, TheirFunction};
 
 /// Most bytes of parameters that are under way at a time when all nodes are called.
 const BYTES_AT_A_TIME: usize = 64 * 1024 * 1024;
 
-/// Calls one node, or all that offer the function.
+/// How long a call waits for room at a time.
+const PAUSE: Duration = Duration::from_millis(20);
+
+/// Calls one node, or all that offer the function. When `wanted` says no, calls that have not ended are given up.
 pub(super) fn call<T: Send + 'static>(
     system: &CommunicationSystem<T>,
     question: &CallQuestion,
     sink: Sink<'_>,
+    wanted: &dyn Fn() -> bool,
 ) -> Result<(), End> {
     let options = options(question)?;
-    match &question.node {
-        Some(node) => {
-            let peer = select::node(system, node)?;
-            let started = Instant::now();
-            let outcome = call_one(&peer, question, &options);
-            send(sink, called(&peer, outcome, started))
-        }
-        None => call_all(system, question, &options, sink),
+    let Some(node) = &question.node else { return call_all(system, question, &options, sink, wanted) };
+    let peer = select::node(system, node)?;
+    if question.asynchronous {
+        return tell(&peer, question, &options, sink);
     }
+    let started = Instant::now();
+    let outcome = await_one(&peer, question, &options, wanted)?.map(|(outcome, _)| outcome);
+    send(sink, called(&peer, outcome, started))
+}
+
+/// Makes a call of one node that is not waited for.
+fn tell<T: Send + 'static>(
+    peer: &Peer<T>,
+    question: &CallQuestion,
+    options: &RequestOptions,
+    sink: Sink<'_>,
+) -> Result<(), End> {
+    let started = Instant::now();
+    let outcome = prepare(peer, question).and_then(|prepared| {
+        let id = peer.request_with(&question.function, &prepared.parameters, options);
+        id.map(|id| Outcome { call: Some(id.0), ..Outcome::default() }).map_err(|error| prepared.explain(error))
+    });
+    send(sink, called(peer, outcome, started))
 }
 
 /// What a call has led to.
@@ -67,20 +87,58 @@ pub(super) fn options(question: &CallQuestion) -> Result<RequestOptions, Failure
     })
 }
 
-pub(super) fn call_one<T: Send + 'static>(
+/// Calls one node and waits for its results; the call is returned as well, whose lease may go on. It is given up when
+/// `wanted` says no.
+pub(super) fn await_one<T: Send + 'static>(
     peer: &Peer<T>,
     question: &CallQuestion,
     options: &RequestOptions,
-) -> Result<Outcome, Failure> {
-    let mut prepared = prepare(peer, question)?;
-    if question.asynchronous {
-        let id = peer.request_with(&question.function, &prepared.parameters, options);
-        return id
-            .map(|id| Outcome { call: Some(id.0), ..Outcome::default() })
-            .map_err(|error| prepared.explain(error));
+    wanted: &dyn Fn() -> bool,
+) -> Result<Result<(Outcome, CallFuture<T>), Failure>, End> {
+    let mut prepared = match prepare(peer, question) {
+        Ok(prepared) => prepared,
+        Err(failure) => return Ok(Err(failure)),
+    };
+    let mut call = match begin(peer, &question.function, &prepared, options, wanted)? {
+        Ok(call) => call,
+        Err(error) => return Ok(Err(prepared.explain(error))),
+    };
+    let waker = thread_waker();
+    let mut cx = std::task::Context::from_waker(&waker);
+    loop {
+        if let Poll::Ready(outcome) = call.poll(&mut cx, &mut prepared.parameters) {
+            return Ok(prepared.outcome(outcome).map(|outcome| (outcome, call)));
+        }
+        if !wanted() {
+            return Err(End::Gone);
+        }
+        std::thread::park_timeout(LOOK);
     }
-    let outcome = peer.block_request_with(&question.function, &mut prepared.parameters, options);
-    prepared.outcome(outcome)
+}
+
+/// Sends the request as soon as the interval and the room allow, within the deadline.
+fn begin<T: Send + 'static>(
+    peer: &Peer<T>,
+    function: &str,
+    prepared: &Prepared,
+    options: &RequestOptions,
+    wanted: &dyn Fn() -> bool,
+) -> Result<Result<CallFuture<T>, Error>, End> {
+    let timeout = options.timeout.unwrap_or_else(|| peer.constraints().request_timeout);
+    let started = Instant::now();
+    loop {
+        let left = timeout - started.elapsed().into();
+        let options = RequestOptions { timeout: Some(left), ..*options };
+        let error = match peer.call_future(function, &prepared.parameters, &options) {
+            Ok(call) => return Ok(Ok(call)),
+            Err(error) => error,
+        };
+        let Some(wait) = worth_waiting(&error, PAUSE).filter(|wait| *wait < left) else { return Ok(Err(error)) };
+        if !wanted() {
+            return Err(End::Gone);
+        }
+        std::thread::sleep(LOOK.min(wait.into()));
+    }
 }
 
 fn prepare<T: Send + 'static>(peer: &Peer<T>, question: &CallQuestion) -> Result<Prepared, Failure> {
@@ -137,6 +195,7 @@ fn call_all<T: Send + 'static>(
     question: &CallQuestion,
     options: &RequestOptions,
     sink: Sink<'_>,
+    wanted: &dyn Fn() -> bool,
 ) -> Result<(), End> {
     let peers = system.nodes_offering(&question.function);
     if peers.is_empty() {
@@ -144,13 +203,9 @@ fn call_all<T: Send + 'static>(
         return Err(Failure::configuration("UnknownFunction", text).into());
     }
     if !question.asynchronous {
-        return block_all(&peers, question, options, sink);
+        return block_all(&peers, question, options, sink, wanted);
     }
-    peers.iter().try_for_each(|peer| {
-        let started = Instant::now();
-        let outcome = call_one(peer, question, options);
-        send(sink, called(peer, outcome, started))
-    })
+    peers.iter().try_for_each(|peer| tell(peer, question, options, sink))
 }
 
 /// All at the same time, as far as the memory for their parameters reaches; answers come in the order of the replies.
@@ -159,6 +214,7 @@ fn block_all<T: Send + 'static>(
     question: &CallQuestion,
     options: &RequestOptions,
     sink: Sink<'_>,
+    wanted: &dyn Fn() -> bool,
 ) -> Result<(), End> {
     let mut peers = peers.iter();
     let mut under_way = Vec::new();
@@ -188,7 +244,7 @@ fn block_all<T: Send + 'static>(
         let before = under_way.len();
         let mut index = 0;
         while let Some((peer, started, prepared, call)) = under_way.get_mut(index) {
-            if let std::task::Poll::Ready(outcome) = call.poll(&mut cx, &mut prepared.parameters) {
+            if let Poll::Ready(outcome) = call.poll(&mut cx, &mut prepared.parameters) {
                 bytes -= size_of_val(&*prepared.parameters);
                 let answer = called(peer, prepared.outcome(outcome), *started);
                 drop(under_way.swap_remove(index));
@@ -197,8 +253,11 @@ fn block_all<T: Send + 'static>(
                 index += 1;
             }
         }
+        if !wanted() {
+            return Err(End::Gone);
+        }
         if under_way.len() == before {
-            std::thread::park();
+            std::thread::park_timeout(LOOK);
         }
     }
 }

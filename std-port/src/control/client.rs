@@ -63,13 +63,13 @@ impl RunningUnit {
     }
 
     /// Whether `wanted` is its `NAME/ID` or its `NAME`.
-    fn is(&self, wanted: &str) -> bool {
+    pub fn is(&self, wanted: &str) -> bool {
         self.unit == wanted || self.unit.rsplit_once('/').is_some_and(|(name, _)| name == wanted)
     }
 }
 
 /// Why a question has no answer.
-#[derive(Debug, thiserror::Error)]
+#[derive(thiserror::Error)]
 #[non_exhaustive]
 pub enum ControlError {
     /// No unit answers in the directory.
@@ -154,8 +154,23 @@ pub fn running() -> Result<Vec<RunningUnit>, ControlError> {
 
 /// The units with a socket in a directory: those that answer, and those that run and cannot be asked now.
 pub fn running_in(directory: &Path) -> Result<Vec<RunningUnit>, ControlError> {
+    Ok(look_at(&place::sockets(directory)?))
+}
+
+/// As [`running_in`], of the units of this `NAME/ID` or `NAME` alone: one that hangs holds up nothing that asks another one.
+pub fn running_called(directory: &Path, wanted: &str) -> Result<Vec<RunningUnit>, ControlError> {
     let sockets = place::sockets(directory)?;
-    Ok(sockets.iter().filter_map(|path| look(path)).collect())
+    let may_be = |path: &&PathBuf| !place::tells_name(path) || RunningUnit::unasked(path, UnitState::Silent).is(wanted);
+    let found = look_at(&sockets.iter().filter(may_be).cloned().collect::<Vec<_>>());
+    Ok(found.into_iter().filter(|unit| unit.is(wanted)).collect())
+}
+
+/// All at the same time: each one that hangs takes the whole time-out.
+fn look_at(sockets: &[PathBuf]) -> Vec<RunningUnit> {
+    std::thread::scope(|scope| {
+        let looking: Vec<_> = sockets.iter().map(|path| scope.spawn(|| look(path))).collect();
+        looking.into_iter().filter_map(|looked| looked.join().ok().flatten()).collect()
+    })
 }
 
 /// The unit behind a socket. One that is just being stopped, or that speaks otherwise, is none.
@@ -213,18 +228,12 @@ impl Client {
 
     /// As [`find`](Self::find), with the sockets of a directory.
     pub fn find_in(directory: &Path, unit: Option<&str>) -> Result<Self, ControlError> {
-        let mut running = running_in(directory)?;
-        if running.is_empty() {
-            return Err(ControlError::NoneRunning(directory.to_owned()));
-        }
-        if let Some(wanted) = unit {
-            let (meant, others): (Vec<_>, Vec<_>) = running.into_iter().partition(|unit| unit.is(wanted));
-            if meant.is_empty() {
-                return Err(ControlError::NotRunning { wanted: wanted.to_owned(), running: others });
-            }
-            running = meant;
-        }
+        let running = match unit {
+            Some(wanted) => running_called(directory, wanted)?,
+            None => running_in(directory)?,
+        };
         match &running[..] {
+            [] => Err(none(running_in(directory)?, directory, unit)),
             [only] => only.refusal().map_or_else(|| Self::connect(&only.path), Err),
             _ => Err(ControlError::Several(running)),
         }
@@ -259,6 +268,14 @@ impl Client {
             Answer::Failed(failure) => Err(ControlError::Failed(failure)),
             answer => Ok(Some(answer)),
         }
+    }
+}
+
+/// None of the units that run is meant.
+fn none(running: Vec<RunningUnit>, directory: &Path, wanted: Option<&str>) -> ControlError {
+    match wanted.filter(|_| !running.is_empty()) {
+        Some(wanted) => ControlError::NotRunning { wanted: wanted.to_owned(), running },
+        None => ControlError::NoneRunning(directory.to_owned()),
     }
 }
 

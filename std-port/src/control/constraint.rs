@@ -62,7 +62,12 @@ fn bad(name: &str, value: u64) -> Failure {
         "maximum_nodes" => "it is at least 1, and at most what the unit was made with and 16 more".to_owned(),
         "message_size" => format!("it is {SHORTEST_MESSAGE} to {LONGEST_MESSAGE} bytes"),
         "chunk_size" => format!("it is {MINIMUM_CHUNK_BYTES} to {CHUNK_BYTES} bytes"),
-        "keep_alive" | "request_timeout" => "it is at least 1000 microseconds".to_owned(),
+        "request_timeout" => "it is at least 1000 microseconds".to_owned(),
+        "keep_alive" => format!(
+            "it is {} to {} microseconds",
+            cara_core::config::SHORTEST_KEEP_ALIVE.as_micros(),
+            cara_core::config::LONGEST_KEEP_ALIVE.as_micros()
+        ),
         "calls_per_peer" => format!("it is 1 to {}", u16::MAX),
         _ => "this unit cannot hold it".to_owned(),
     };

@@ -3,6 +3,7 @@
 use cara_core::config::{Constraints, Mode, Priority, VERSION};
 use cara_core::distribution::connection_handler::Finding;
 use cara_core::distribution::identity::{Epoch, Identity, Role};
+use cara_core::services::lease::LeaseEnd;
 use cara_core::time::Duration;
 
 use super::failure::name_of;
@@ -55,13 +56,14 @@ fn interface(interface: &Interface) -> InterfaceInfo {
     }
 }
 
-pub(super) fn node<T: Send + 'static>(peer: &Peer<T>) -> NodeInfo {
+pub(super) fn node<T: Send + 'static>(peer: &Peer<T>, expected: bool) -> NodeInfo {
     let (limits, left) = (peer.limits(), peer.left());
     NodeInfo {
         name: peer.name().to_owned(),
         id: peer.id(),
         role: role(peer.identity().role()).to_owned(),
         connected: peer.is_connected(),
+        expected,
         address: peer.address().map(|address| address.to_string()),
         // Nodes of another version are refused.
         version: limits.map(|_| VERSION),
@@ -135,11 +137,13 @@ pub(super) fn event(event: &UnitEvent, at: Duration) -> Answer {
         UnitEvent::LeaseExpired { peer, function } => {
             ("lease_expired", Some(peer), format!("'{function}' of this unit stopped: its caller no longer wants it"))
         }
-        UnitEvent::LeaseEnded { peer, function, expired: true } => {
-            ("lease_ended", Some(peer), format!("'{function}' stopped there: it was not renewed in time"))
-        }
-        UnitEvent::LeaseEnded { peer, function, expired: false } => {
-            ("lease_ended", Some(peer), format!("'{function}' is finished there"))
+        UnitEvent::LeaseEnded { peer, function, why, .. } => {
+            let text = match why {
+                LeaseEnd::Finished => format!("'{function}' is finished there"),
+                LeaseEnd::Expired => format!("'{function}' stopped there: it was not renewed in time"),
+                LeaseEnd::Replaced => format!("'{function}' goes on there for a newer call"),
+            };
+            ("lease_ended", Some(peer), text)
         }
     };
     Answer::Event { at_ms: at.as_millis(), event: name.to_owned(), node: node.map(Identity::to_string), text }

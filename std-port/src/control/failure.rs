@@ -2,7 +2,7 @@
 
 use std::fmt::Display;
 
-use cara_core::error::{Cause, Error};
+use cara_core::error::{Cause, CloseReason, Error, ServiceError};
 use cara_core::services::access::Verb;
 
 use super::protocol::Failure;
@@ -33,7 +33,8 @@ impl Failure {
     }
 
     fn new(cause: Cause, error: &str, text: impl Display) -> Self {
-        Self { cause: cause_word(cause).to_owned(), error: error.to_owned(), text: text.to_string() }
+        let (cause, error) = (cause_word(cause).to_owned(), error.to_owned());
+        Self { cause, error, kind: None, code: None, text: text.to_string() }
     }
 
     /// The same with more to its text.
@@ -51,7 +52,19 @@ impl Display for Failure {
 
 impl From<Error> for Failure {
     fn from(error: Error) -> Self {
-        Self::new(error.cause(), &name_of(&error), error)
+        let code = if let Error::Service(ServiceError::Failed(code)) = error { Some(code) } else { None };
+        Self { kind: kind_of(&error), code, ..Self::new(error.cause(), &name_of(&error), error) }
+    }
+}
+
+/// What an error says beyond its own name.
+fn kind_of(error: &Error) -> Option<String> {
+    match error {
+        Error::Service(error) => Some(name_of(error)),
+        Error::Refused(refusal) | Error::Closed(CloseReason::Refused(refusal)) => Some(name_of(refusal)),
+        Error::Closed(reason) => Some(name_of(reason)),
+        Error::Full(limit) => Some(name_of(limit)),
+        _ => None,
     }
 }
 
@@ -81,6 +94,8 @@ mod tests {
         assert_eq!((failure.cause.as_str(), failure.error.as_str()), ("configuration", "WrongSize"));
         assert!(failure.text.contains('2') && failure.text.contains('3'), "{failure}");
         assert_eq!(Failure::from(Error::TimedOut).error, "TimedOut");
+        let failed = Failure::from(Error::Service(ServiceError::Failed(7)));
+        assert_eq!((failed.error.as_str(), failed.kind.as_deref(), failed.code), ("Service", Some("Failed"), Some(7)));
         assert_eq!(Failure::from(Error::TimedOut).cause, "peer");
     }
 }

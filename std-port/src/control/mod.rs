@@ -13,6 +13,8 @@ mod call;
 mod client;
 mod constraint;
 mod describe;
+mod elsewhere;
+mod everybody;
 mod failure;
 mod hold;
 mod lines;
@@ -25,7 +27,8 @@ mod values;
 use std::path::PathBuf;
 
 pub use answering::execute;
-pub use client::{Answers, Client, ControlError, RunningUnit, UnitState, running, running_in};
+pub use client::{Answers, Client, ControlError, RunningUnit, UnitState, running, running_called, running_in};
+pub use elsewhere::{Elsewhere, elsewhere};
 pub use place::directory;
 pub(crate) use server::Server;
 

@@ -83,6 +83,11 @@ pub(super) fn told_by_name(path: &Path) -> (String, u32) {
     told(&name).unwrap_or_else(|| (path.display().to_string(), 0))
 }
 
+/// Whether the name of a socket tells the whole name of its unit.
+pub(super) fn tells_name(path: &Path) -> bool {
+    told(&path.file_name().unwrap_or_default().to_string_lossy()).is_some_and(|(unit, _)| !unit.contains('~'))
+}
+
 fn told(file: &str) -> Option<(String, u32)> {
     let (rest, fleet) = file.strip_suffix(SUFFIX)?.rsplit_once('-')?;
     let (name, id) = rest.rsplit_once('-')?;

@@ -24,12 +24,17 @@ pub enum Question {
     },
     /// Search now.
     Search,
+    /// Take a node that is not connected off the roster, until it joins again or the unit is started anew.
+    Retire {
+        /// `NAME`, `NAME/ID` or `#ID`.
+        node: String,
+    },
     /// An [`Answer::Function`] for each function that a node has published to this unit.
     Functions {
         /// `NAME`, `NAME/ID` or `#ID`.
         node: String,
     },
-    /// Call a function. An [`Answer::Called`] for each node. No lease is renewed: what the call starts goes on for the
+    /// Call a function. An [`Answer::Called`] for each node; of all, also for each s_unit of the roster that was not called. No lease is renewed: what the call starts goes on for the
     /// length of its lease.
     Call(CallQuestion),
     /// Call a function of one node and keep its lease, until what it started has ended there, or the connection is closed:
@@ -173,7 +178,7 @@ pub enum Answer {
     },
     /// This unit.
     Unit(UnitInfo),
-    /// A node that has joined, connected or not.
+    /// A node that has joined, connected or not, or that is on the roster.
     Node(NodeInfo),
     /// A node that was refused, here or there.
     Refused(RefusedInfo),
@@ -252,6 +257,12 @@ pub struct Failure {
     pub cause: String,
     /// The error's name, as `TimedOut`.
     pub error: String,
+    /// What kind of it, as `Failed` or `Panicked` of `Service`, `NoKey` of `Refused`.
+    #[serde(default)]
+    pub kind: Option<String>,
+    /// The code with which a service failed.
+    #[serde(default)]
+    pub code: Option<u16>,
     /// What happened and what to do.
     pub text: String,
 }
@@ -343,6 +354,9 @@ pub struct NodeInfo {
     pub role: String,
     /// Whether it is connected now.
     pub connected: bool,
+    /// Whether it is on the roster: an s_unit that this unit is to have, and that was not retired.
+    #[serde(default)]
+    pub expected: bool,
     /// The other end of its link while it is connected.
     pub address: Option<String>,
     /// Protocol version that it speaks, while it is connected.

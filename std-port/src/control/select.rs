@@ -1,6 +1,8 @@
 //! Which node a question means: `NAME`, `NAME/ID` or `#ID`, where needed with `@m_unit` or `@s_unit` behind it.
 
-use crate::{CommunicationSystem, Peer};
+use std::collections::HashSet;
+
+use crate::{CommunicationSystem, Identity, Peer};
 
 use super::describe::role;
 use super::protocol::Failure;
@@ -13,9 +15,9 @@ pub(super) fn node<T: Send + 'static>(system: &CommunicationSystem<T>, selector:
     let all = nodes(system);
     let is_meant = |peer: &&Peer<T>| means(selector, peer.name(), peer.id(), role(peer.identity().role()));
     let mut meant: Vec<Peer<T>> = all.iter().filter(is_meant).cloned().collect();
-    // One that is here goes before one that has left.
-    if meant.len() > 1 && meant.iter().any(Peer::is_connected) {
-        meant.retain(Peer::is_connected);
+    // One that is absent may be the one that is meant, unless it was taken off the roster.
+    if meant.len() > 1 {
+        meant.retain(|peer| !peer.is_retired());
     }
     match (meant.pop(), meant.is_empty()) {
         (Some(peer), true) => Ok(peer),
@@ -34,9 +36,11 @@ pub(super) fn node<T: Send + 'static>(system: &CommunicationSystem<T>, selector:
     }
 }
 
-/// All nodes that have joined, connected or not.
+/// All nodes that have joined, connected or not, and those of the roster that have not.
 pub(super) fn nodes<T: Send + 'static>(system: &CommunicationSystem<T>) -> Vec<Peer<T>> {
     let mut nodes = system.s_units();
+    let joined: HashSet<Identity> = nodes.iter().map(|peer| peer.identity().clone()).collect();
+    nodes.extend(system.roster().into_iter().filter(|peer| !joined.contains(peer.identity())));
     nodes.extend(system.m_units());
     nodes
 }

@@ -8,7 +8,6 @@ use std::os::unix::net::{UnixListener, UnixStream};
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
-use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -19,6 +18,8 @@ use super::place::{Place, PlaceError, own_uid, peer_uid};
 use super::protocol::{Answer, CONTROL_VERSION, Failure, LONGEST_LINE, Question};
 use crate::CommunicationSystem;
 use crate::engine::lock;
+use crate::lane::OwnThread;
+use crate::seldom::warn_seldom;
 use crate::sys::epoll::{Epoll, Events, Interest, Waker};
 
 /// Connections at a time.
@@ -27,8 +28,14 @@ pub(super) const MOST_CONNECTIONS: usize = 8;
 pub(super) const FULL: &str = "Full";
 /// A client that takes nothing for so long is cut off.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(2);
+/// A client that asks nothing for so long is ended. One that waits for an answer, as of a watch or a hold, is not idle.
+const IDLE_TIMEOUT: Duration = Duration::from_secs(600);
+/// Where all connections are taken, one that has asked nothing for so long gives way to the next client.
+const GIVES_WAY: Duration = Duration::from_secs(1);
 /// Samples gather for at most so long, so that writing them disturbs what they measure less.
 const GATHER: Duration = Duration::from_millis(50);
+/// How long a stop waits for all threads together.
+const PATIENCE: Duration = Duration::from_secs(1);
 const WAKER: u64 = 0;
 const LISTENER: u64 = 1;
 
@@ -47,8 +54,24 @@ struct Shared {
 #[derive(Default)]
 struct Connections {
     next: u64,
-    open: HashMap<u64, UnixStream>,
-    threads: Vec<JoinHandle<()>>,
+    open: HashMap<u64, Open>,
+    threads: Vec<OwnThread>,
+}
+
+/// A connection.
+struct Open {
+    stream: UnixStream,
+    /// Since when it has asked nothing; none while a question is answered.
+    idle: Arc<Mutex<Option<Instant>>>,
+}
+
+impl Connections {
+    /// Ends the connection that has asked nothing for the longest time; `false` if all are in use.
+    fn make_room(&mut self) -> bool {
+        let idle = self.open.iter().filter_map(|(number, open)| Some((lock(&open.idle).as_ref()?.elapsed(), *number)));
+        let Some((_, number)) = idle.filter(|(idle, _)| *idle >= GIVES_WAY).max() else { return false };
+        self.open.remove(&number).is_some_and(|open| open.stream.shutdown(Shutdown::Both).is_ok())
+    }
 }
 
 impl Server {
@@ -69,18 +92,18 @@ impl Server {
         self.place.path()
     }
 
-    /// Ends all connections and threads, except the one that calls.
+    /// Ends all connections and threads, except the one that calls; for one that is stuck it waits only so long.
     pub(crate) fn stop(&self) {
         self.place.remove();
         self.shared.stopping.store(true, Ordering::Release);
         self.shared.waker.wake();
         let threads = {
             let mut connections = lock(&self.shared.connections);
-            connections.open.values().for_each(|stream| drop(stream.shutdown(Shutdown::Both)));
+            connections.open.values().for_each(|open| drop(open.stream.shutdown(Shutdown::Both)));
             std::mem::take(&mut connections.threads)
         };
-        let own = std::thread::current().id();
-        threads.into_iter().filter(|thread| thread.thread().id() != own).for_each(|thread| drop(thread.join()));
+        let end = Instant::now() + PATIENCE;
+        threads.iter().for_each(|thread| thread.join(end.saturating_duration_since(Instant::now())));
     }
 }
 
@@ -93,7 +116,7 @@ fn accept_with<T: Send + 'static>(listener: UnixListener, system: CommunicationS
     let own = shared.clone();
     let thread = std::thread::Builder::new().name("cara-control".into());
     let thread = thread.spawn(move || own.accept(&listener, &epoll, &system))?;
-    lock(&shared.connections).threads.push(thread);
+    lock(&shared.connections).threads.push(thread.into());
     Ok(shared)
 }
 
@@ -121,7 +144,7 @@ impl Shared {
                 Ok((stream, _)) => self.accepted(stream, system),
                 Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
                 Err(error) => {
-                    tracing::warn!(%error, "a control connection could not be taken");
+                    warn_seldom!(%error, "a control connection could not be taken");
                     std::thread::sleep(Duration::from_millis(100));
                 }
             }
@@ -136,29 +159,42 @@ impl Shared {
             return refuse(Failure::configuration("NotAllowed", "only the user who runs the unit may ask it"));
         }
         let mut connections = lock(&self.connections);
+        // A stop ends those that it finds.
+        if self.is_stopping() {
+            return;
+        }
         connections.threads.retain(|thread| !thread.is_finished());
-        if connections.open.len() >= MOST_CONNECTIONS {
+        if connections.open.len() >= MOST_CONNECTIONS && !connections.make_room() {
             let text = format!("{MOST_CONNECTIONS} connections are open already: close one");
             return refuse(Failure::resource(FULL, text));
         }
         let Ok(kept) = stream.try_clone() else { return };
         let number = connections.next;
         let (own, system) = (self.clone(), system.clone());
+        let idle = Arc::new(Mutex::new(Some(Instant::now())));
+        let open = Open { stream: kept, idle: idle.clone() };
         let thread = std::thread::Builder::new().name("cara-control".into());
         let thread = thread.spawn(move || {
             // An end of the connection is not worth a word: the client knows.
-            let _ = own.serve(stream, &system);
+            let _ = own.serve(stream, &idle, &system);
             lock(&own.connections).open.remove(&number);
         });
         if let Ok(thread) = thread {
             connections.next += 1;
-            connections.open.insert(number, kept);
-            connections.threads.push(thread);
+            connections.open.insert(number, open);
+            connections.threads.push(thread.into());
         }
     }
 
-    fn serve<T: Send + 'static>(&self, stream: UnixStream, system: &CommunicationSystem<T>) -> io::Result<()> {
+    fn serve<T: Send + 'static>(
+        &self,
+        stream: UnixStream,
+        idle: &Mutex<Option<Instant>>,
+        system: &CommunicationSystem<T>,
+    ) -> io::Result<()> {
         stream.set_nonblocking(false)?;
+        // Between questions alone is anything read.
+        stream.set_read_timeout(Some(IDLE_TIMEOUT))?;
         stream.set_write_timeout(Some(WRITE_TIMEOUT))?;
         let mut writer = Answers::new(&stream);
         let mut lines = Lines::new(&stream);
@@ -171,6 +207,7 @@ impl Shared {
         while !self.is_stopping()
             && let Some(line) = lines.next()?
         {
+            *lock(idle) = None;
             match question(line) {
                 Ok(question) => {
                     let wanted = || !self.is_stopping() && !has_hung_up(&stream);
@@ -179,6 +216,7 @@ impl Shared {
                 Err(failure) => drop(writer.sink(&Answer::Failed(failure))),
             }
             writer.outcome()?;
+            *lock(idle) = Some(Instant::now());
         }
         Ok(())
     }

@@ -3,8 +3,8 @@
 //! A link's counters are added to those of the links before it when it ends, so that a sum never goes back. The lock of
 //! the sums is taken before any other.
 
-use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
 
 use cara_core::counters::{Counter, Counters};
 use cara_core::host::connections::LinkCounter;
@@ -23,6 +23,7 @@ pub(crate) struct Accounts {
     ended: Mutex<LinkCounters>,
     events_lost: AtomicU64,
     connections_refused: AtomicU64,
+    hooks_late: Arc<AtomicU64>,
 }
 
 impl Accounts {
@@ -32,8 +33,8 @@ impl Accounts {
     }
 
     /// A connection found no room. Returns how many did so before.
-    pub(super) fn connection_refused(&self) -> u64 {
-        self.connections_refused.fetch_add(1, Ordering::Relaxed)
+    pub(super) fn connection_refused(&self) {
+        self.connections_refused.fetch_add(1, Ordering::Relaxed);
     }
 }
 
@@ -120,7 +121,14 @@ impl<T: Send + 'static> Engine<T> {
         (sum, held)
     }
 
-    fn port_readings(&self, held: &Held) -> [Reading; 13] {
+    /// Where safe hooks count that they took long.
+    pub(crate) fn hooks_late(&self) -> Arc<AtomicU64> {
+        self.accounts.hooks_late.clone()
+    }
+
+    fn port_readings(&self, held: &Held) -> [Reading; 14] {
+        // One that is stuck has not counted itself.
+        read(&self.functions).iter().filter_map(|function| function.handler.safe.as_ref()).for_each(|safe| safe.look());
         let pool = self.pool.counters();
         let connected = read(&self.peers).connected().count() as u64;
         let file = &self.guard.file;
@@ -136,6 +144,7 @@ impl<T: Send + 'static> Engine<T> {
                 "Connections dropped because as many links were open as may be.",
                 load(&self.accounts.connections_refused),
             ),
+            count("HooksLate", "Safe hooks that took longer than 100 ms.", load(&self.accounts.hooks_late)),
             count(
                 "BuffersRefused",
                 "Times that all message buffers were in use when one was asked for.",

@@ -62,6 +62,7 @@ impl<T: Send + 'static> Engine<T> {
         options: &RequestOptions,
     ) -> Result<(), Error> {
         self.state.waiting_for(link.id, || {
+            self.go_on_with_parked();
             let begun = self.begin_call(link, function, parameters, options)?;
             self.await_reply(link, begun, parameters)
         })
@@ -120,11 +121,10 @@ impl<T: Send + 'static> Engine<T> {
             // The reply may have come through another thread before this one took the lead.
             if let Some(outcome) = state.take_outcome(id) {
                 self.leave(link, state, turn);
-                return read_outcome(outcome, parameters);
+                return self.read_outcome(link, id, outcome, parameters);
             }
             if now >= deadline {
-                state.session.cancel(id);
-                state.forget(id);
+                self.cancel(now, link, &mut state, id);
                 self.leave(link, state, turn);
                 return Err(Error::TimedOut);
             }
@@ -133,6 +133,10 @@ impl<T: Send + 'static> Engine<T> {
                 let mut own = OwnCall { id, parameters, result: None };
                 (state, now) = self.lead(link, state, &mut own, now, deadline);
                 if let Some(result) = own.result {
+                    if result.is_err() {
+                        // The results may not fit: what the call started is not wanted then.
+                        self.cancel(now, link, &mut state, id);
+                    }
                     state.forget(id);
                     self.leave_with_reply(asked, now, link, state, turn);
                     return result;
@@ -256,7 +260,35 @@ impl<T: Send + 'static> Engine<T> {
             state.waiters.push(Waiter { id, wake: Wake::Task(None), outcome: None });
         }
         self.settle(&link, state);
-        sent.map(|id| CallFuture { engine: self.clone(), link, id })
+        sent.map(|id| CallFuture { engine: self.clone(), link, id, has_succeeded: false })
+    }
+
+    /// Nothing waits for a call any more, and what it started is not wanted.
+    pub(crate) fn give_up_call(&self, link: &Arc<LinkCell>, id: CallId) {
+        let mut state = link.lock();
+        self.cancel(self.now(), link, &mut state, id);
+        self.settle(link, state);
+    }
+
+    fn cancel(&self, now: Instant, link: &LinkCell, state: &mut LinkState, id: CallId) {
+        self.with_at(now, link, state, |session, cx| session.cancel(cx, id));
+        state.forget(id);
+    }
+
+    /// Decodes what another thread read. What a call started whose results do not fit is not wanted.
+    fn read_outcome(
+        &self,
+        link: &Arc<LinkCell>,
+        id: CallId,
+        outcome: Outcome,
+        parameters: &mut ParametersView,
+    ) -> Result<(), Error> {
+        let result = outcome
+            .and_then(|(signature, bytes)| block::read(Signature::decode(&signature)?.results(), &bytes, parameters));
+        if result.is_err() {
+            self.give_up_call(link, id);
+        }
+        result
     }
 }
 
@@ -294,7 +326,7 @@ impl<T: Send + 'static> Engine<T> {
 }
 
 /// After what time a request that failed so may succeed; after `pause` where only somebody else's end makes room.
-fn worth_waiting(error: &Error, pause: Duration) -> Option<Duration> {
+pub(crate) fn worth_waiting(error: &Error, pause: Duration) -> Option<Duration> {
     match *error {
         Error::TooSoon { wait } => Some(wait),
         Error::Full(Limit::SendQueue | Limit::Buffers | Limit::Calls) => Some(pause),
@@ -320,20 +352,34 @@ pub(super) fn pass_lead(waiters: &mut [Waiter]) -> bool {
     }
 }
 
-/// Decodes what another thread read.
-fn read_outcome(outcome: Outcome, parameters: &mut ParametersView) -> Result<(), Error> {
-    let (signature, bytes) = outcome?;
-    block::read(Signature::decode(&signature)?.results(), &bytes, parameters)
-}
-
-/// A call in flight. Dropping it gives up the reply; the service may still run.
+/// A call in flight. Dropped before it has ended well, it is given up: nothing waits for its reply, and the lease that it
+/// began, or would begin, is released. A service without a lease may still run.
 pub(crate) struct CallFuture<T: Send + 'static> {
     engine: Arc<Engine<T>>,
     link: Arc<LinkCell>,
     id: CallId,
+    has_succeeded: bool,
 }
 
 impl<T: Send + 'static> CallFuture<T> {
+    /// The call's id.
+    #[cfg(feature = "control")]
+    pub(crate) fn id(&self) -> CallId {
+        self.id
+    }
+
+    /// Whether the lease that it has begun is renewed.
+    #[cfg(feature = "control")]
+    pub(crate) fn is_held(&self) -> bool {
+        self.link.lock().session.holds(self.id)
+    }
+
+    /// What a call has started that ended well is not wanted any more.
+    #[cfg(feature = "control")]
+    pub(crate) fn release(&mut self) {
+        self.has_succeeded = false;
+    }
+
     /// Polls for the reply, which updates `parameters`.
     pub(crate) fn poll(
         &mut self,
@@ -343,7 +389,9 @@ impl<T: Send + 'static> CallFuture<T> {
         let mut state = self.link.lock();
         if let Some(outcome) = state.take_outcome(self.id) {
             drop(state);
-            return Poll::Ready(read_outcome(outcome, parameters));
+            let result = self.engine.read_outcome(&self.link, self.id, outcome, parameters);
+            self.has_succeeded = result.is_ok();
+            return Poll::Ready(result);
         }
         match state.waiters.iter_mut().find(|waiter| waiter.id == self.id) {
             Some(waiter) => {
@@ -357,10 +405,8 @@ impl<T: Send + 'static> CallFuture<T> {
 
 impl<T: Send + 'static> Drop for CallFuture<T> {
     fn drop(&mut self) {
-        let mut state = self.link.lock();
-        let id = self.id;
-        state.session.cancel(id);
-        state.forget(id);
-        self.engine.settle(&self.link, state);
+        if !self.has_succeeded {
+            self.engine.give_up_call(&self.link, self.id);
+        }
     }
 }

@@ -1,14 +1,17 @@
-//! The thread that keeps time: timers of links and of the node, datagrams, and new connections. It runs no handlers.
+//! The thread that keeps time: timers of links and of the node, datagrams, and new connections. It runs no handlers and no
+//! hooks, never sleeps, and looks at no file: [`look_around`](crate::threads::Driven::look_around) has a thread of its own.
 
 use cara_core::distribution::connection_handler::Sorted;
 use cara_core::error::Error;
 use cara_core::host::mailman::LinkId;
-use cara_core::time::Instant;
+use cara_core::time::{Duration, Instant};
 use core::net::SocketAddr;
 
-use super::{Engine, lock, notice};
+use super::{Engine, lock};
+use crate::seldom::warn_seldom;
 use crate::sys::datagram::Socket;
 use crate::sys::stream::Accepted;
+use crate::threads::Source;
 
 /// Datagrams and connections that are taken in a row before timers are looked at again.
 const BATCH: usize = 256;
@@ -57,7 +60,10 @@ impl<T: Send + 'static> Engine<T> {
         let Some(link) = self.link(link) else { return };
         let mut state = link.lock();
         let event = self.with(&link, &mut state, |session, cx| session.datagram(cx, from, nonce, body));
-        state.notices.extend(event.as_ref().and_then(notice));
+        if let Some(event) = &event {
+            self.note(&mut state, event);
+        }
+        self.dispatch_emergencies(&link, &mut state);
         if state.session.has_next_call() {
             self.hand_over(&link);
         }
@@ -71,11 +77,45 @@ impl<T: Send + 'static> Engine<T> {
                 Accepted::Stream(stream, address) => self.accepted(stream, address),
                 Accepted::WouldBlock => return,
                 Accepted::Exhausted => {
-                    tracing::error!("no file descriptors are left for a new connection: raise the limit (ulimit -n)");
-                    std::thread::sleep(std::time::Duration::from_millis(10));
+                    warn_seldom!("no file descriptors are left for a new connection: raise the limit (ulimit -n)");
+                    if self.make_room() {
+                        continue;
+                    }
+                    self.pause_listening();
                     return;
                 }
             }
+        }
+    }
+}
+
+/// A unit for which there are no descriptors takes no connections for so long. Its clock goes on.
+const PAUSE: Duration = Duration::from_millis(100);
+
+impl<T: Send + 'static> Engine<T> {
+    fn pause_listening(&self) {
+        let Some(listener) = &self.listener else { return };
+        self.crew().unwatch(listener);
+        *lock(&self.listens_at) = Some(self.now() + PAUSE);
+    }
+
+    /// Takes connections again when the pause is over; returns when that is.
+    pub(super) fn go_on_listening(&self) -> Instant {
+        let mut at = lock(&self.listens_at);
+        match *at {
+            Some(due) if due <= self.now() => {
+                let seat = self.seat();
+                if let Some((listener, seat)) = self.listener.as_ref().zip(seat)
+                    && self.crew().watch(seat, Source::Listener, listener).is_err()
+                {
+                    *at = Some(self.now() + PAUSE);
+                    return self.now() + PAUSE;
+                }
+                *at = None;
+                Instant::FAR_FUTURE
+            }
+            Some(due) => due,
+            None => Instant::FAR_FUTURE,
         }
     }
 }

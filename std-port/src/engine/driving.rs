@@ -7,6 +7,7 @@ use cara_core::error::Error;
 use cara_core::time::Instant;
 
 use super::{Engine, lock, system_refused, workers};
+use crate::error::StartError;
 use crate::sys::datagram::Socket;
 use crate::sys::epoll::Ready;
 use crate::threads::{Crew, Driven, Source};
@@ -22,18 +23,22 @@ impl<T: Send + 'static> Engine<T> {
 
     /// Begins to search and to serve, driven by the unit's threads. One that runs already goes on; one that was stopped
     /// does not start again.
-    pub(crate) fn start(self: &Arc<Self>) -> Result<(), Error> {
+    pub(crate) fn start(self: &Arc<Self>) -> Result<(), StartError> {
         if self.is_stopping() {
-            return Err(Error::NotRunning);
+            return Err(Error::NotRunning.into());
         }
         if self.seat().is_some() {
             return Ok(());
+        }
+        if let Some(at) = self.running_elsewhere().map_err(system_refused)? {
+            return Err(StartError::AlreadyRunning { at });
         }
         self.crew().start()?;
         let seat = self.crew().seat(self.clone())?;
         let _ = self.seat.set(seat);
         self.watch(seat).map_err(system_refused)?;
         self.warn_of_plain_mode();
+        self.crew().wake_looker();
         self.wake_clock();
         Ok(())
     }
@@ -92,11 +97,11 @@ impl<T: Send + 'static> Driven for Engine<T> {
     }
 
     fn keep_time(&self) -> Instant {
-        self.poll_links()
-            .min(self.poll_node())
-            .min(self.watch_links())
-            .min(self.watch_interfaces())
-            .min(self.watch_keys())
+        self.poll_links().min(self.poll_node()).min(self.watch_links()).min(self.go_on_listening())
+    }
+
+    fn look_around(&self) -> Instant {
+        self.watch_interfaces().min(self.watch_keys())
     }
 
     fn read_datagrams(&self, socket: Socket, buffer: &mut [u8]) {

@@ -47,6 +47,7 @@ impl<T: Send + 'static> Engine<T> {
         }
         if !first {
             lock(&self.node).node.network_changed(now);
+            self.wake_clock();
         }
         if !first || !reaches {
             self.tell(UnitEvent::InterfacesChanged { up });

@@ -36,6 +36,10 @@ impl Keyring for View {
     fn pair(&self, peer: &Identity) -> Option<(PairKey, Option<PairKey>)> {
         Keyring::pair(&*self.0, peer)
     }
+
+    fn is_own(&self, identity: &Identity) -> bool {
+        self.0.is_own(identity)
+    }
 }
 
 impl Keys {
@@ -46,7 +50,6 @@ impl Keys {
         }
     }
 
-    #[cfg(feature = "control")]
     pub(crate) const fn ring(&self) -> Option<&LiveRing> {
         match self {
             Self::Insecure => None,
@@ -139,7 +142,7 @@ impl<T: Send + 'static> Engine<T> {
         if watched.checked.as_ref().is_some_and(|checked| !Arc::ptr_eq(checked, &live.ring())) {
             watched.due = self.now();
             drop(watched);
-            self.wake_clock();
+            self.crew().wake_looker();
         }
     }
 

@@ -8,6 +8,7 @@ use std::thread::Thread;
 use cara_core::distribution::function_list::Slot;
 use cara_core::error::{CloseReason, Error};
 use cara_core::host::mailman::{LinkId, Mailman};
+use cara_core::services::lease::LeaseEnd;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::Session;
 use cara_core::time::{Duration, Instant};
@@ -107,12 +108,12 @@ pub(crate) type Outcome = Result<(Box<[u8]>, Box<[u8]>), Error>;
 /// What happened under a link's lock and is acted upon without it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Notice {
+    /// Its safe hook has been told.
     LeaseExpired(Slot),
-    /// Its safe hook has run.
-    MadeSafe(Slot),
     LeaseEnded {
+        call: CallId,
         slot: Slot,
-        expired: bool,
+        why: LeaseEnd,
     },
     Failed(CallId, Error),
     ListChanged,

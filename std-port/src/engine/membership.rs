@@ -18,8 +18,10 @@ use core::net::{IpAddr, SocketAddr};
 use super::link::{LinkCell, LinkState, Notice, StdMailman};
 use super::{Engine, lock, read, write};
 use crate::event::UnitEvent;
+use crate::seldom::warn_seldom;
 use crate::storage::Boxed;
 use crate::sys::epoll::Interest;
+use crate::sys::limits;
 use crate::sys::stream::Stream;
 
 /// What the node's lock protects.
@@ -29,17 +31,44 @@ pub(crate) struct NodeCell {
     /// Nodes that the tables have room for.
     room: usize,
     serial: u32,
+    /// The serial of the link that last had an index: what the node says of an index is meant for that one.
+    serials: HashMap<LinkId, u32>,
+}
+
+/// What the node wants done, with the serials of the links that it speaks of. Another link may have the index of one of
+/// them by the time that it is done.
+pub(super) struct Directive {
+    action: Action,
+    old: Option<u32>,
+    new: Option<u32>,
 }
 
 /// A node that has not told its list by then counts as one that has none.
 const INTRODUCTION: Duration = Duration::from_secs(1);
+
+/// Descriptors that links which have proven nothing leave to those that do, and to the control socket.
+const KEPT_FOR_PROVEN: u64 = 24;
+/// And of these what stays for the control socket, key files and dialling: two for each operator's connection, and some more.
+const KEPT_FOR_OPERATOR: u64 = 20;
 
 /// Whom a link is dialled for, as far as it is known.
 struct Dialed<'i>(Option<&'i Identity>);
 
 impl NodeCell {
     pub(crate) fn new(node: Node<Boxed>, publications: Publications<Boxed>, room: usize) -> Self {
-        Self { node, publications, room, serial: 0 }
+        Self { node, publications, room, serial: 0, serials: HashMap::new() }
+    }
+
+    /// To be asked under the lock under which the node wanted it.
+    pub(super) fn directive(&self, action: Option<Action>) -> Option<Directive> {
+        let action = action?;
+        let serial = |link: LinkId| self.serials.get(&link).copied();
+        let (old, new) = match &action {
+            Action::Dial { .. } => (None, None),
+            Action::Supersede { old, new, .. } => (serial(*old), serial(*new)),
+            Action::Admit { new } | Action::Refuse { new, .. } => (None, serial(*new)),
+        };
+        Some(Directive { action, old, new })
     }
 
     pub(crate) fn set_constraints(&mut self, constraints: Constraints) -> Result<(), Error> {
@@ -67,6 +96,8 @@ impl<T: Send + 'static> Engine<T> {
         let (serial, local, constraints) = {
             let mut cell = lock(&self.node);
             cell.serial = cell.serial.wrapping_add(1);
+            let serial = cell.serial;
+            cell.serials.insert(id, serial);
             if let Some(Dialed(identity)) = dialed {
                 cell.node.dialing(identity, id);
             }
@@ -90,17 +121,29 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     pub(super) fn accepted(&self, stream: Stream, address: SocketAddr) {
+        let mut stream = stream;
+        if limits::left_above(&stream) < KEPT_FOR_PROVEN && self.make_room() {
+            // Into the place that is free now: the next connection would get it, and not be seen to be one too many.
+            stream = stream.with_lowest_number();
+        }
+        if limits::left_above(&stream) < KEPT_FOR_OPERATOR {
+            self.accounts.connection_refused();
+            warn_seldom!(%address, "a connection was dropped: too few descriptors are left; raise the limit (ulimit -n)");
+            return;
+        }
         if read(&self.links).iter().all(Option::is_some) {
             self.make_room();
         }
-        if self.open_link(stream, address, None).is_none() && self.accounts.connection_refused() == 0 {
-            tracing::warn!(%address, "a connection was dropped, as others may be from now on: {}", Limit::Links);
+        if self.open_link(stream, address, None).is_none() {
+            self.accounts.connection_refused();
+            warn_seldom!(%address, "a connection was dropped: {}", Limit::Links);
         }
     }
 
     /// Ends a link whose peer has proven nothing, so that nobody who connects and says nothing keeps others out: of the
     /// host that has most of them, the one that has waited longest. One whose hello waits to be read has spoken.
-    fn make_room(&self) {
+    /// Whether there was one.
+    pub(super) fn make_room(&self) -> bool {
         let mut unproven = self.unproven();
         let mut of_host: HashMap<IpAddr, usize> = HashMap::new();
         unproven.iter().for_each(|(host, _)| *of_host.entry(*host).or_default() += 1);
@@ -113,8 +156,9 @@ impl<T: Send + 'static> Engine<T> {
             self.with(&link, &mut state, |session, cx| session.close(cx, CloseReason::HelloTimeout));
             self.settle(&link, state);
             lock(&self.node).node.counters.add(NodeCounter::GaveWay, 1);
-            return;
+            return true;
         }
+        false
     }
 
     /// Links that others have opened and that have proven nothing, with the hosts they come from. One in use is left out.
@@ -143,7 +187,7 @@ impl<T: Send + 'static> Engine<T> {
     pub(super) fn twin_heard(&self, address: SocketAddr) {
         let refusal = Refusal::DuplicateIdentity;
         let own = lock(&self.node).node.identity().clone();
-        tracing::warn!(%address, name = own.name(), id = own.id(), "{refusal}");
+        warn_seldom!(%address, name = own.name(), id = own.id(), "{refusal}");
         self.tell(UnitEvent::NotJoined { address, peer: Some(own), reason: CloseReason::Refused(refusal) });
     }
 
@@ -177,6 +221,10 @@ impl<T: Send + 'static> Engine<T> {
     fn join(&self, link: &Arc<LinkCell>, state: &mut LinkState) {
         let Some(identity) = state.session.identity().cloned() else { return };
         self.with(link, state, |session, cx| session.accept(cx));
+        if !state.session.is_live() {
+            // It has ended meanwhile, and that is told by itself.
+            return;
+        }
         let limit = usize::from(lock(&self.node).node.constraints().maximum_nodes);
         link.introduced(self.clock.now() + INTRODUCTION);
         let peer = write(&self.peers).join(&identity, limit, link);
@@ -200,8 +248,12 @@ impl<T: Send + 'static> Engine<T> {
             Notice::Challenge(old) => self.challenge(old),
             Notice::Answered => {
                 link.room.notify_all();
-                let action = lock(&self.node).node.challenge_answered(self.clock.now(), link.id);
-                self.carry_out(action);
+                let directive = {
+                    let mut cell = lock(&self.node);
+                    let action = cell.node.challenge_answered(self.clock.now(), link.id);
+                    cell.directive(action)
+                };
+                self.carry_out(directive);
             }
             Notice::Left(reason) => self.link_ended(link, reason),
             notice => {
@@ -228,18 +280,20 @@ impl<T: Send + 'static> Engine<T> {
             Notice::Joined => UnitEvent::Joined { peer },
             Notice::ListChanged => UnitEvent::ListChanged { peer },
             Notice::Failed(call, error) => UnitEvent::RequestFailed { peer, call, error },
-            Notice::MadeSafe(slot) => UnitEvent::LeaseExpired { peer, function: own_name(slot) },
-            Notice::LeaseEnded { slot, expired } => UnitEvent::LeaseEnded { peer, function: their_name(slot), expired },
+            Notice::LeaseExpired(slot) => UnitEvent::LeaseExpired { peer, function: own_name(slot) },
+            Notice::LeaseEnded { call, slot, why } => {
+                UnitEvent::LeaseEnded { peer, function: their_name(slot), call, why }
+            }
             Notice::Acknowledged { skipped, .. } if skipped > 0 => UnitEvent::FunctionsSkipped { peer, skipped },
-            Notice::LeaseExpired(_) | Notice::Acknowledged { .. } => return None,
+            Notice::Acknowledged { .. } => return None,
             Notice::Challenge(_) | Notice::Answered | Notice::Left(_) => return None,
         })
     }
 
     fn challenge(&self, old: LinkId) {
         let Some(link) = self.link(old) else {
-            let action = lock(&self.node).node.left(self.clock.now(), old, CloseReason::Reset);
-            self.carry_out(action);
+            let directive = self.left(old, CloseReason::Reset);
+            self.carry_out(directive);
             return;
         };
         let mut state = link.lock();
@@ -269,43 +323,50 @@ impl<T: Send + 'static> Engine<T> {
             self.tell(UnitEvent::NotJoined { address, peer, reason });
         }
         lock(&self.timers).cancel(u32::from(link.id.0));
-        let action = lock(&self.node).node.left(self.clock.now(), link.id, reason);
+        let directive = self.left(link.id, reason);
         if let Some(place) = write(&self.links).get_mut(usize::from(link.id.0)) {
             place.take_if(|current| current.serial == link.serial);
         }
-        self.carry_out(action);
+        self.carry_out(directive);
         // The node may have something to do earlier than before.
         self.wake_clock();
     }
 
-    /// Does what the node wants done.
-    pub(super) fn carry_out(&self, action: Option<Action>) {
+    fn left(&self, link: LinkId, reason: CloseReason) -> Option<Directive> {
+        let mut cell = lock(&self.node);
+        let action = cell.node.left(self.clock.now(), link, reason);
+        cell.directive(action)
+    }
+
+    /// Does what the node wants done, to the links that it meant and to no others.
+    pub(super) fn carry_out(&self, directive: Option<Directive>) {
+        let Some(Directive { action, old: old_serial, new: new_serial }) = directive else { return };
+        let meant = |id: LinkId, serial: Option<u32>| self.link(id).filter(|link| Some(link.serial) == serial);
         match action {
-            None => {}
-            Some(Action::Dial { to, identity }) => self.dial(to, identity.as_ref()),
-            Some(Action::Supersede { old, new, reason }) => {
-                if let Some(old) = self.link(old) {
+            Action::Dial { to, identity } => self.dial(to, identity.as_ref()),
+            Action::Supersede { old, new, reason } => {
+                if let Some(old) = meant(old, old_serial) {
                     let mut state = old.lock();
                     self.with(&old, &mut state, |session, cx| session.close(cx, reason));
                     self.settle(&old, state);
                 }
-                self.admit_waiting(new);
+                self.admit_waiting(meant(new, new_serial));
             }
-            Some(Action::Admit { new }) => self.admit_waiting(new),
-            Some(Action::Refuse { new, refusal }) => self.refuse_waiting(new, refusal),
+            Action::Admit { new } => self.admit_waiting(meant(new, new_serial)),
+            Action::Refuse { new, refusal } => self.refuse_waiting(meant(new, new_serial), refusal),
         }
     }
 
-    fn admit_waiting(&self, new: LinkId) {
-        let Some(link) = self.link(new) else { return };
+    fn admit_waiting(&self, new: Option<Arc<LinkCell>>) {
+        let Some(link) = new else { return };
         let mut state = link.lock();
         self.join(&link, &mut state);
         self.feed(self.now(), &link, &mut state, &mut [], None, None);
         self.settle(&link, state);
     }
 
-    fn refuse_waiting(&self, new: LinkId, refusal: Refusal) {
-        let Some(link) = self.link(new) else { return };
+    fn refuse_waiting(&self, new: Option<Arc<LinkCell>>, refusal: Refusal) {
+        let Some(link) = new else { return };
         let mut state = link.lock();
         self.with(&link, &mut state, |session, cx| session.refuse(cx, refusal));
         self.settle(&link, state);
@@ -386,16 +447,72 @@ impl<T: Send + 'static> Engine<T> {
         // Before the node's lock: whoever reads a new key file keeps the ring to itself meanwhile.
         let codes = self.keys.codes();
         loop {
-            let (action, next) = {
+            let (directive, next) = {
                 let mut cell = lock(&self.node);
                 let mut mailman = StdMailman { stream: None, datagrams: &self.datagrams };
                 let action = cell.node.poll(self.clock.now(), &mut mailman, &codes);
-                (action, cell.node.next_deadline())
+                (cell.directive(action), cell.node.next_deadline())
             };
-            if action.is_none() {
+            if directive.is_none() {
                 return next;
             }
-            self.carry_out(action);
+            self.carry_out(directive);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{CommunicationSystem, Interfaces, Unit};
+
+    fn until(condition: impl Fn() -> bool) {
+        let end = std::time::Instant::now() + std::time::Duration::from_secs(20);
+        while !condition() {
+            assert!(std::time::Instant::now() < end, "not in time");
+            std::thread::sleep(std::time::Duration::from_millis(1));
+        }
+    }
+
+    fn vehicle(fleet: u32, id: u32) -> Unit {
+        let unit = Unit::builder("agv", id, "manager", 1).unwrap().interfaces(Interfaces::Loopback);
+        let unit = unit.fleet(fleet).insecure().build_unit().unwrap();
+        unit.start().unwrap();
+        unit
+    }
+
+    /// A link ends after the node has said what is to become of it: it is not joined, and a link that has got its index
+    /// is neither joined for it nor ended.
+    #[test]
+    fn what_the_node_wanted_of_a_link_that_has_ended_befalls_no_other_link() {
+        let fleet = std::process::id() ^ 0xC6C6_0000;
+        let manager = CommunicationSystem::builder("manager", 1).unwrap().interfaces(Interfaces::Loopback);
+        let manager = manager.fleet(fleet).insecure().build_system().unwrap();
+        manager.start().unwrap();
+        let engine = manager.engine();
+        let first = vehicle(fleet, 1);
+        until(|| manager.number_of_s_units() == 1);
+        let ended = engine.each_link().remove(0);
+        let (admit, supersede) = {
+            let cell = lock(&engine.node);
+            let (id, reason) = (ended.id, CloseReason::PeerRestarted);
+            let supersede = Action::Supersede { old: id, new: id, reason };
+            (cell.directive(Some(Action::Admit { new: id })), cell.directive(Some(supersede)))
+        };
+        first.stop();
+        until(|| manager.number_of_s_units() == 0);
+        until(|| engine.link(ended.id).is_none());
+        let events = manager.events();
+        engine.join(&ended, &mut ended.lock());
+        assert_eq!(ended.lock().notices, [], "a link that has ended joins nobody");
+        let _second = vehicle(fleet, 2);
+        until(|| manager.number_of_s_units() == 1);
+        let newcomer = engine.each_link().remove(0);
+        assert_eq!((newcomer.id, newcomer.serial != ended.serial), (ended.id, true), "it has the same index");
+        engine.carry_out(admit);
+        engine.carry_out(supersede);
+        assert!(newcomer.lock().session.is_live());
+        let joined = events.try_iter().filter(|event| matches!(event, UnitEvent::Joined { .. })).count();
+        assert_eq!((joined, manager.number_of_s_units()), (1, 1));
     }
 }

@@ -6,6 +6,7 @@
 
 mod access;
 mod accounts;
+mod afterwards;
 mod calling;
 mod clock_thread;
 mod driving;
@@ -16,7 +17,9 @@ pub(crate) mod link;
 mod membership;
 pub(crate) mod peers;
 mod pinging;
+mod presence;
 pub(crate) mod reader;
+mod roster;
 mod serving;
 mod state_gate;
 mod staying;
@@ -29,7 +32,7 @@ pub(crate) use accounts::pairs;
 #[cfg(feature = "metrics")]
 pub(crate) use accounts::{Group, Reading};
 #[cfg(any(feature = "async", feature = "control"))]
-pub(crate) use calling::CallFuture;
+pub(crate) use calling::{CallFuture, worth_waiting};
 pub(crate) use clock_thread::system_refused;
 pub(crate) use keys::Keys;
 pub(crate) use membership::NodeCell;
@@ -37,7 +40,7 @@ pub(crate) use workers::arena_bytes;
 
 use std::sync::atomic::{self, AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{SyncSender, TrySendError};
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard, Weak};
 
 use cara_core::config::{Constraints, Mode};
 use cara_core::distribution::function_list::FunctionList;
@@ -46,7 +49,7 @@ use cara_core::error::{CloseReason, Error};
 use cara_core::host::mailman::LinkId;
 use cara_core::host::secure::Seal;
 use cara_core::services::access::Access;
-use cara_core::services::unit::{Call, Event, Session, buffer_bytes};
+use cara_core::services::unit::{Event, Session, buffer_bytes};
 use cara_core::services::{Context, requests::CallId};
 use cara_core::time::{Duration, Instant};
 use cara_secure::link::Cipher;
@@ -65,6 +68,7 @@ use crate::threads::Threads;
 use crate::timers::Timers;
 use link::{LinkCell, LinkState, Notice, StdMailman};
 use peers::{PeerCell, Peers};
+use serving::Begun;
 use state_gate::StateGate;
 
 /// Bytes that one read takes from a stream.
@@ -77,6 +81,8 @@ pub(crate) type Lent<'c, T> = Context<'c, Boxed, StdMailman<'c>, &'c MessagePool
 
 /// Everything that a unit's threads and handles share.
 pub(crate) struct Engine<T: 'static> {
+    /// For work that is left to another thread.
+    me: Weak<Self>,
     pub(crate) clock: Clock,
     capacities: Capacities,
     pub(crate) node: Mutex<NodeCell>,
@@ -84,9 +90,11 @@ pub(crate) struct Engine<T: 'static> {
     pub(crate) peers: RwLock<Peers>,
     links: RwLock<Vec<Option<Arc<LinkCell>>>>,
     pub(crate) pool: MessagePool,
-    pub(crate) state: StateGate<T>,
+    pub(crate) state: StateGate<T, serving::Parked>,
     datagrams: Datagrams,
     listener: Option<Listener>,
+    /// A manager looks for a live one of its identity before it starts.
+    asks_for_itself: bool,
     /// Whoever drives the unit: threads of its own, or of several units.
     threads: Threads,
     /// No other unit has them.
@@ -105,6 +113,8 @@ pub(crate) struct Engine<T: 'static> {
     /// Whether the clock looks at these.
     watch: watch::Watch,
     interfaces: Mutex<interfaces::InterfaceWatch>,
+    /// When connections are taken again, where there were no descriptors for them.
+    listens_at: Mutex<Option<Instant>>,
     pub(crate) keys: Keys,
     /// When the file with the keys is looked at.
     watched_keys: Mutex<keys::Watched>,
@@ -116,8 +126,7 @@ pub(crate) struct Engine<T: 'static> {
     accounts: accounts::Accounts,
     guard: access::Guard,
     subscribers: Mutex<Vec<Subscriber>>,
-    /// Runs when a peer is lost, before its loss is told.
-    pub(crate) lost_hook: Mutex<Option<Arc<crate::handler::Hook<T>>>>,
+    afterwards: afterwards::Afterwards<T>,
 }
 
 /// Somebody who is told what happens.
@@ -160,13 +169,15 @@ pub(crate) struct EngineParts<T: 'static> {
     pub(crate) datagrams: Datagrams,
     pub(crate) listener: Option<Listener>,
     pub(crate) maximum_links: usize,
+    pub(crate) asks_for_itself: bool,
 }
 
 impl<T: Send + 'static> Engine<T> {
     pub(crate) fn new(parts: EngineParts<T>) -> Arc<Self> {
         let longest_message = AtomicUsize::new(parts.node.longest_message());
         let born = parts.threads.crew().clock.now();
-        Arc::new(Self {
+        Arc::new_cyclic(|me| Self {
+            me: me.clone(),
             clock: parts.threads.crew().clock,
             capacities: parts.capacities,
             node: Mutex::new(parts.node),
@@ -177,6 +188,7 @@ impl<T: Send + 'static> Engine<T> {
             state: StateGate::new(parts.state),
             datagrams: parts.datagrams,
             listener: parts.listener,
+            asks_for_itself: parts.asks_for_itself,
             threads: parts.threads,
             own_threads: parts.own_threads,
             seat: OnceLock::new(),
@@ -187,6 +199,7 @@ impl<T: Send + 'static> Engine<T> {
             kept: Mutex::new(Vec::new()),
             watch: watch::Watch::default(),
             interfaces: Mutex::default(),
+            listens_at: Mutex::new(None),
             keys: parts.keys,
             watched_keys: Mutex::new(keys::Watched::new(born)),
             renews_every: OnceLock::new(),
@@ -195,7 +208,7 @@ impl<T: Send + 'static> Engine<T> {
             accounts: accounts::Accounts::default(),
             guard: access::Guard::default(),
             subscribers: Mutex::new(Vec::new()),
-            lost_hook: Mutex::new(None),
+            afterwards: afterwards::Afterwards::default(),
         })
     }
 
@@ -239,7 +252,7 @@ impl<T: Send + 'static> Engine<T> {
         bytes: &mut [u8],
         mut arguments: Option<&mut ParametersView>,
         mut own: Option<&mut OwnCall<'_>>,
-    ) -> Option<Call> {
+    ) -> Option<Begun> {
         let (was_paused, stalled) = (state.is_paused(), state.is_stalled(now));
         let mut earlier = std::mem::take(&mut state.leftover);
         let mut position = std::mem::take(&mut state.leftover_at);
@@ -260,6 +273,8 @@ impl<T: Send + 'static> Engine<T> {
             };
             position += step.consumed;
             call = call.or(step.call);
+            // One emergency alone has a place to wait, and the next one may be among these bytes.
+            self.dispatch_emergencies(link, state);
             if step.introduced {
                 self.prove(link, state);
             }
@@ -282,14 +297,14 @@ impl<T: Send + 'static> Engine<T> {
         }
     }
 
-    /// One call of `Session::receive`, with its event taken apart.
+    /// One call of `Session::receive`, with its event taken apart; an emergency goes to the thread of its service.
     fn step(
         &self,
         now: Instant,
         link: &Arc<LinkCell>,
         state: &mut LinkState,
         bytes: &mut [u8],
-        arguments: Option<&mut ParametersView>,
+        mut arguments: Option<&mut ParametersView>,
         own: Option<&mut OwnCall<'_>>,
     ) -> Step {
         self.make_list_room(state);
@@ -300,7 +315,7 @@ impl<T: Send + 'static> Engine<T> {
         let access = asked.as_ref().map(|asked| asked as &dyn Access);
         let mut cx = Context { now, mailman: &mut mailman, buffers: &mut buffers, functions: &functions, access };
         let LinkState { session, waiters, notices, .. } = state;
-        let receipt = session.receive(&mut cx, bytes, arguments);
+        let receipt = session.receive(&mut cx, bytes, arguments.as_deref_mut());
         let mut step = Step {
             consumed: receipt.consumed,
             paused: receipt.paused,
@@ -313,7 +328,13 @@ impl<T: Send + 'static> Engine<T> {
             None => {}
             Some(Event::Introduced) => step.introduced = true,
             Some(Event::Hello) => step.hello = true,
-            Some(Event::Call(call)) => step.call = Some(call),
+            Some(Event::Call(call)) => {
+                let begun = self.begun(&functions, link, call);
+                match arguments.filter(|_| serving::is_emergency(&call)) {
+                    None => step.call = Some(begun),
+                    Some(arguments) => self.copy_emergency(&functions, link, begun, arguments),
+                }
+            }
             Some(Event::Reply(id, outcome)) => match own.filter(|own| own.id == id) {
                 Some(own) => own.result = Some(outcome.and_then(|block| block.read_into(own.parameters))),
                 None => {
@@ -328,6 +349,9 @@ impl<T: Send + 'static> Engine<T> {
                 if let Event::ListChanged = event {
                     link.introduced(Instant::START);
                 }
+                if let Event::LeaseExpired(slot) = event {
+                    self.make_safe(&functions, slot);
+                }
                 notices.extend(notice(&event));
             }
         }
@@ -335,13 +359,14 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     /// Polls the session as far as something is due, sets its timer and epoll interest, gives the lock up, and acts on
-    /// what happened: safe hooks first.
+    /// what happened.
     pub(crate) fn settle<'l>(&self, link: &'l Arc<LinkCell>, guard: MutexGuard<'l, LinkState>) {
         self.settle_at(self.now(), link, guard);
     }
 
     fn settle_at<'l>(&self, now: Instant, link: &'l Arc<LinkCell>, mut guard: MutexGuard<'l, LinkState>) {
         let state = &mut *guard;
+        self.dispatch_emergencies(link, state);
         let mut deadline = state.session.deadline();
         if deadline <= now {
             self.poll_session(link, state);
@@ -368,9 +393,31 @@ impl<T: Send + 'static> Engine<T> {
                         link.stream.shutdown();
                         link.room.notify_all();
                     }
-                    state.notices.extend(notice(&event));
+                    self.note(state, &event);
                 }
             }
+        }
+    }
+
+    /// An event that is acted upon when the lock is given up; only safe hooks do not wait for that.
+    fn note(&self, state: &mut LinkState, event: &Event<'_>) {
+        if let Event::LeaseExpired(slot) = *event {
+            self.make_safe(&read(&self.functions), slot);
+        }
+        state.notices.extend(notice(event));
+    }
+
+    /// The thread that has read an emergency goes on reading.
+    fn copy_emergency(
+        &self,
+        functions: &FunctionList<Boxed, Handler<T>>,
+        link: &Arc<LinkCell>,
+        begun: Begun,
+        arguments: &ParametersView,
+    ) {
+        let mut copy = workers::arena(self.call_bytes());
+        if copy.copy_from(arguments).is_ok() {
+            self.run_emergency(functions, link, begun, copy);
         }
     }
 
@@ -519,10 +566,21 @@ impl<T: Send + 'static> Engine<T> {
             self.settle(&link, state);
         }
         self.state.stop();
-        self.release_threads();
+        self.go_on_with_parked();
         // A handler may own a handle to a peer of this unit, and so the unit itself: without handlers nothing is left.
         let handlers = self.take_handlers();
-        drop(handlers);
+        // What moved stops, and is heard of, before the unit is gone.
+        handlers.iter().filter_map(|handler| handler.safe.as_ref()).for_each(|safe| safe.end());
+        self.afterwards.end();
+        handlers.iter().filter_map(|handler| handler.lane.as_ref()).for_each(|lane| lane.end());
+        self.release_threads();
+    }
+
+    /// Runs `act` with the application's state, when its turn comes.
+    pub(crate) fn with_state<R>(&self, act: impl FnOnce(&mut T) -> R) -> Result<R, Error> {
+        let result = self.state.enter().map(|mut state| act(&mut state));
+        self.go_on_with_parked();
+        result
     }
 
     fn take_handlers(&self) -> Vec<Handler<T>> {
@@ -549,7 +607,7 @@ struct Step {
     progress: bool,
     introduced: bool,
     hello: bool,
-    call: Option<Call>,
+    call: Option<Begun>,
 }
 
 impl Step {
@@ -574,7 +632,7 @@ impl Registration {
 fn notice(event: &Event<'_>) -> Option<Notice> {
     Some(match *event {
         Event::LeaseExpired(slot) => Notice::LeaseExpired(slot),
-        Event::LeaseEnded { slot, expired } => Notice::LeaseEnded { slot, expired },
+        Event::LeaseEnded { call, slot, why } => Notice::LeaseEnded { call, slot, why },
         Event::Failed(id, error) => Notice::Failed(id, error),
         Event::ListChanged => Notice::ListChanged,
         Event::Acknowledged { serial, skipped } => Notice::Acknowledged { serial, skipped },

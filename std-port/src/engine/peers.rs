@@ -2,6 +2,7 @@
 //! and finds it again when it comes back.
 
 use std::collections::HashMap;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use cara_core::config::Constraints;
@@ -12,6 +13,7 @@ use cara_core::time::{Duration, Instant};
 use super::accounts::Earlier;
 use super::link::LinkCell;
 use super::lock;
+use super::roster::Roster;
 
 /// A node, connected or not.
 pub(crate) struct PeerCell {
@@ -24,6 +26,8 @@ pub(crate) struct PeerCell {
     /// What differs for this node from the unit's constraints, whether it is connected or not.
     own: Mutex<Option<OwnConstraints>>,
     pub(super) earlier: Earlier,
+    /// The operator has taken it off the roster.
+    retired: AtomicBool,
 }
 
 /// The constraints that a node may have of its own.
@@ -82,9 +86,42 @@ impl PeerCell {
         Ok(())
     }
 
+    pub(super) fn new(identity: &Identity) -> Arc<Self> {
+        Arc::new(Self {
+            identity: identity.clone(),
+            link: Mutex::new(None),
+            joined: Mutex::new(None),
+            left: Mutex::new(None),
+            own: Mutex::new(None),
+            earlier: Mutex::new(None),
+            retired: AtomicBool::new(false),
+        })
+    }
+
+    /// Whether it has ever joined.
+    pub(super) fn has_joined(&self) -> bool {
+        lock(&self.joined).is_some()
+    }
+
+    /// Whether it has been taken off the roster, and has not joined since.
+    pub(crate) fn is_retired(&self) -> bool {
+        self.retired.load(Ordering::Relaxed)
+    }
+
+    /// Takes it off the roster until it joins again; `false` while it is connected.
+    pub(crate) fn retire(&self) -> bool {
+        let link = self.link.lock().unwrap_or_else(PoisonError::into_inner);
+        if link.is_none() {
+            self.retired.store(true, Ordering::Relaxed);
+        }
+        link.is_none()
+    }
+
     fn join(&self, link: Arc<LinkCell>) {
         *lock(&self.joined) = Some(std::time::Instant::now());
-        *self.link.lock().unwrap_or_else(PoisonError::into_inner) = Some(link);
+        let mut current = self.link.lock().unwrap_or_else(PoisonError::into_inner);
+        self.retired.store(false, Ordering::Relaxed);
+        *current = Some(link);
     }
 
     /// The link has ended; a newer one stays.
@@ -102,6 +139,7 @@ impl PeerCell {
 pub(crate) struct Peers {
     list: Vec<Arc<PeerCell>>,
     by_identity: HashMap<Identity, usize>,
+    pub(super) roster: Roster,
 }
 
 impl Peers {
@@ -114,22 +152,15 @@ impl Peers {
     }
 
     fn of(&mut self, identity: &Identity, limit: usize) -> Arc<PeerCell> {
-        if let Some(peer) = self.by_identity.get(identity).and_then(|&index| self.list.get(index)) {
+        if let Some(peer) = self.placed(identity) {
             return peer.clone();
         }
-        let peer = Arc::new(PeerCell {
-            identity: identity.clone(),
-            link: Mutex::new(None),
-            joined: Mutex::new(None),
-            left: Mutex::new(None),
-            own: Mutex::new(None),
-            earlier: Mutex::new(None),
-        });
+        let peer = self.roster.take(identity).unwrap_or_else(|| PeerCell::new(identity));
         let away = if self.list.len() < limit { None } else { self.list.iter().position(|peer| !peer.is_connected()) };
         let index = match away.and_then(|index| self.list.get_mut(index).map(|place| (index, place))) {
             Some((index, place)) => {
                 self.by_identity.remove(&place.identity);
-                *place = peer.clone();
+                self.roster.keep(std::mem::replace(place, peer.clone()));
                 index
             }
             None => {
@@ -141,8 +172,13 @@ impl Peers {
         peer
     }
 
-    pub(crate) fn find(&self, wanted: impl Fn(&Identity) -> bool) -> Option<Arc<PeerCell>> {
-        self.list.iter().find(|peer| wanted(&peer.identity)).cloned()
+    /// The node of an identity that has a place here.
+    pub(super) fn placed(&self, identity: &Identity) -> Option<&Arc<PeerCell>> {
+        self.list.get(*self.by_identity.get(identity)?)
+    }
+
+    pub(super) fn all(&self) -> impl Iterator<Item = &Arc<PeerCell>> {
+        self.list.iter()
     }
 
     /// All nodes of a role, in the order of their places.
@@ -156,7 +192,7 @@ impl Peers {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use cara_core::distribution::hello::{Hello, Limits};
     use cara_core::distribution::identity::{Epoch, Fleet};
     use cara_core::host::mailman::LinkId;
@@ -168,12 +204,12 @@ mod tests {
     use crate::storage::{filled, filled_with};
     use crate::sys::stream::Stream;
 
-    fn agv(id: u32) -> Identity {
+    pub(crate) fn agv(id: u32) -> Identity {
         Identity::s_unit("agv", id).unwrap()
     }
 
     /// A link that leads nowhere.
-    fn link(serial: u32) -> Arc<LinkCell> {
+    pub(crate) fn link(serial: u32) -> Arc<LinkCell> {
         let listener = crate::sys::stream::Listener::open(std::net::Ipv4Addr::LOCALHOST, 0).unwrap();
         let address = std::net::SocketAddr::from((std::net::Ipv4Addr::LOCALHOST, listener.port()));
         let storage = SessionStorage {
@@ -242,7 +278,7 @@ mod tests {
         second.leave(&links[1], CloseReason::Reset);
         peers.join(&agv(3), 2, &links[2]);
         assert_eq!(ids(&peers), [1, 3]);
-        assert!(peers.find(|identity| identity.id() == 2).is_none());
+        assert!(peers.placed(&agv(2)).is_none());
         assert_eq!(peers.connected().count(), 2);
     }
 

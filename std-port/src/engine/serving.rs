@@ -1,18 +1,22 @@
-//! Running the peers' calls, on the thread that read them.
+//! Running the peers' calls: on the thread of the pool that read them; emergencies on the thread of their service.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, MutexGuard, PoisonError};
 
-use cara_core::distribution::function_list::Slot;
+use cara_core::config::Priority;
+use cara_core::distribution::function_list::{FunctionList, Slot};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, ServiceError};
 use cara_core::services::unit::Call;
 use cara_core::time::{Duration, Instant};
 
 use super::link::{LinkCell, LinkState};
-use super::{Engine, lock, read};
-use crate::handler::{self, Run};
+use super::state_gate::{Entered, Turn};
+use super::workers::{Worker, arena};
+use super::{Engine, read};
+use crate::handler::{self, Handler, Run};
 use crate::lease::LeaseWatch;
+use crate::storage::Boxed;
 
 /// How long an answer waits for room at a time.
 const PAUSE: std::time::Duration = std::time::Duration::from_millis(20);
@@ -20,33 +24,75 @@ const PAUSE: std::time::Duration = std::time::Duration::from_millis(20);
 /// A handler that takes less than this is quick: the thread that ran it may stay on the link.
 const QUICK: Duration = Duration::from_micros(50);
 
+/// A call that has begun.
+#[derive(Clone, Copy)]
+pub(super) struct Begun {
+    pub(super) call: Call,
+    /// Its turn, where it takes the application's state.
+    turn: Option<Turn>,
+}
+
+/// A call whose turn has not come yet, with its arguments.
+pub(crate) struct Parked {
+    link: Arc<LinkCell>,
+    call: Call,
+    arguments: Box<ParametersView>,
+}
+
+/// What running a call led to.
+enum Ran {
+    Over(Result<(), Error>),
+    NotYet(Turn),
+}
+
 impl<T: Send + 'static> Engine<T> {
+    /// A call has begun, under its link's lock: it takes its turn, and the thread of its safe hook looks at its lease.
+    pub(super) fn begun(&self, functions: &FunctionList<Boxed, Handler<T>>, link: &LinkCell, call: Call) -> Begun {
+        let handler = functions.function(call.slot).map(|function| function.handler);
+        if let Some(safe) = handler.and_then(|handler| handler.safe.as_ref()) {
+            safe.watch();
+        }
+        let takes_state = handler.is_some_and(|handler| handler.run.takes_state());
+        Begun { call, turn: takes_state.then(|| self.state.take_turn(Some(link.id))) }
+    }
+
     /// Runs a call and those that waited behind it.
-    pub(super) fn serve(&self, link: &Arc<LinkCell>, call: Call, arguments: &mut ParametersView) {
-        let mut next = Some(call);
-        while let Some(call) = next {
-            let (state, _) = self.serve_one(self.now(), link, &call, arguments);
-            next = self.next_call(link, state, arguments);
+    pub(super) fn serve(&self, link: &Arc<LinkCell>, begun: Begun, worker: &mut Worker) {
+        let mut next = Some(begun);
+        while let Some(begun) = next {
+            let served = self.serve_one(self.now(), link, begun, worker);
+            next = self.next_call(link, served.map_or_else(|| link.lock(), |(state, _)| state), worker);
         }
     }
 
-    /// Runs one call and answers it. Returns the time of its last look at the clock as well.
+    /// Runs one call and answers it. Returns the time of its last look at the clock as well; `None` when the call has to
+    /// wait for the application's state, and goes on elsewhere.
     pub(super) fn serve_one<'l>(
         &self,
         began: Instant,
         link: &'l Arc<LinkCell>,
-        call: &Call,
-        arguments: &mut ParametersView,
-    ) -> (MutexGuard<'l, LinkState>, Instant) {
+        begun: Begun,
+        worker: &mut Worker,
+    ) -> Option<(MutexGuard<'l, LinkState>, Instant)> {
         let occupied = self.crew().occupancy.enter();
-        let result = self.run(link, call, arguments);
+        let ran = self.run(link, begun, &mut worker.arguments);
         drop(occupied);
+        let result = match ran {
+            Ran::Over(result) => result,
+            Ran::NotYet(turn) => {
+                link.lock().quick = false;
+                let spare = arena(worker.longest());
+                let arguments = std::mem::replace(&mut worker.arguments, spare);
+                self.park(turn, Parked { link: link.clone(), call: begun.call, arguments });
+                return None;
+            }
+        };
         let now = self.now();
         let mut state = link.lock();
         state.quick = now.since(began) < QUICK;
         state.is_called = true;
         state.moved_at = now;
-        (self.answer(now, link, state, call, result, arguments), now)
+        Some((self.answer(now, link, state, &begun.call, result, &worker.arguments), now))
     }
 
     /// Takes the next call that may begin on a link; another thread is told if there is one more.
@@ -54,14 +100,15 @@ impl<T: Send + 'static> Engine<T> {
         &self,
         link: &Arc<LinkCell>,
         mut state: MutexGuard<'_, LinkState>,
-        arguments: &mut ParametersView,
-    ) -> Option<Call> {
+        worker: &mut Worker,
+    ) -> Option<Begun> {
         let mut next = None;
+        self.dispatch_emergencies(link, &mut state);
         if state.is_paused() && !state.session.has_next_call() {
             self.feed(self.now(), link, &mut state, &mut [], None, None);
         }
         if state.session.has_next_call() && self.may_run(state.quick) {
-            next = self.with(link, &mut state, |session, cx| session.next_call(cx, arguments));
+            next = self.take_call(link, &mut state, worker);
         }
         if state.session.has_next_call() {
             self.hand_over(link);
@@ -70,50 +117,154 @@ impl<T: Send + 'static> Engine<T> {
         next
     }
 
+    /// Begins the next call of a link.
+    pub(super) fn take_call(&self, link: &LinkCell, state: &mut LinkState, worker: &mut Worker) -> Option<Begun> {
+        let call = self.with(link, state, |session, cx| session.next_call(cx, &mut worker.arguments))?;
+        Some(self.begun(&read(&self.functions), link, call))
+    }
+
+    /// Gives emergencies that have come to the threads of their services. No thread that reads runs them.
+    pub(super) fn dispatch_emergencies(&self, link: &Arc<LinkCell>, state: &mut LinkState) {
+        while state.session.has_next_emergency() {
+            let mut arguments = arena(self.call_bytes());
+            let call = self.with(link, state, |session, cx| session.next_emergency(cx, &mut arguments));
+            let Some(call) = call else { return };
+            let begun = self.begun(&read(&self.functions), link, call);
+            self.run_emergency(&read(&self.functions), link, begun, arguments);
+        }
+    }
+
+    /// Leaves an emergency to the thread of its service. One of a service that is none for emergencies has a thread with
+    /// all others of that kind.
+    pub(super) fn run_emergency(
+        &self,
+        functions: &FunctionList<Boxed, Handler<T>>,
+        link: &Arc<LinkCell>,
+        begun: Begun,
+        mut arguments: Box<ParametersView>,
+    ) {
+        let Some(engine) = self.me.upgrade() else { return };
+        let lane = functions.function(begun.call.slot).and_then(|function| function.handler.lane.clone());
+        let Some(lane) = lane.or_else(|| self.crew().lane()) else { return };
+        let link = link.clone();
+        lane.run(move || match engine.run(&link, begun, &mut arguments) {
+            Ran::Over(result) => {
+                let state = engine.answer(engine.now(), &link, link.lock(), &begun.call, result, &arguments);
+                if state.session.has_next_call() {
+                    engine.hand_over(&link);
+                }
+                engine.settle(&link, state);
+            }
+            Ran::NotYet(turn) => engine.park(turn, Parked { link, call: begun.call, arguments }),
+        });
+    }
+
     /// Leaves a link's calls to another thread of the pool.
     pub(super) fn hand_over(&self, link: &LinkCell) {
         self.crew().hand_over(link.token());
     }
 
-    fn run(&self, link: &LinkCell, call: &Call, arguments: &mut ParametersView) -> Result<(), Error> {
-        let Some(peer) = link.peer.get() else { return Err(Error::NotConnected) };
-        let (run, lease, detached) = {
-            let functions = read(&self.functions);
-            let function = functions.function(call.slot).ok_or(Error::StaleFunction)?;
-            (function.handler.run.clone(), function.handler.lease.clone(), function.handler.detached)
+    fn park(&self, turn: Turn, parked: Parked) {
+        self.state.park(turn, parked);
+        self.go_on_with_parked();
+    }
+
+    /// Calls that were parked and have their turn now are left to the pool.
+    pub(super) fn go_on_with_parked(&self) {
+        if self.state.has_ready()
+            && let Some(seat) = self.seat()
+        {
+            self.crew().hand_over(crate::threads::token(seat, u64::MAX));
+        }
+    }
+
+    /// Runs a call that was parked, and those that wait behind it on its link.
+    pub(super) fn serve_parked(&self, worker: &mut Worker) {
+        let Some((Parked { link, call, arguments }, turn)) = self.state.take_ready() else { return };
+        self.go_on_with_parked();
+        let now = self.now();
+        // A command that waited for its turn may no longer be wanted.
+        let is_over = now >= call.deadline || !self.is_wanted(now, &call);
+        let result = if is_over { Err(Error::Expired) } else { turn.map(drop) };
+        let own = std::mem::replace(&mut worker.arguments, arguments);
+        let state = match result {
+            Ok(()) => self.serve_one(now, &link, Begun { call, turn: turn.ok() }, worker).map(|(state, _)| state),
+            Err(error) => {
+                self.give_up(turn.ok());
+                Some(self.answer(now, &link, link.lock(), &call, Err(error), &worker.arguments))
+            }
         };
-        if detached {
-            self.detach(link, call);
+        worker.arguments = own;
+        let next = self.next_call(&link, state.unwrap_or_else(|| link.lock()), worker);
+        if let Some(next) = next {
+            self.serve(&link, next, worker);
+        }
+    }
+
+    /// Whether the lease of a call that has waited here still lasts, if it has one.
+    fn is_wanted(&self, now: Instant, call: &Call) -> bool {
+        let functions = read(&self.functions);
+        let lease = functions.function(call.slot).and_then(|function| function.handler.lease.as_ref()).zip(call.order);
+        lease.is_none_or(|(service, order)| service.lease.is_live_for(order, now))
+    }
+
+    fn give_up(&self, turn: Option<Turn>) {
+        if let Some(turn) = turn {
+            self.state.give_up(turn);
+            self.go_on_with_parked();
+        }
+    }
+
+    fn run(&self, link: &LinkCell, begun: Begun, arguments: &mut ParametersView) -> Ran {
+        let Begun { call, turn } = begun;
+        let (run, told) = match self.prepare(link, &call) {
+            Ok(prepared) => prepared,
+            Err(error) => {
+                self.give_up(turn);
+                return Ran::Over(Err(error));
+            }
+        };
+        match run {
+            Run::Free(run) => {
+                self.give_up(turn);
+                Ran::Over(guarded(&told, || run(&told, arguments)))
+            }
+            Run::Method(run) => {
+                let turn = turn.unwrap_or_else(|| self.state.take_turn(Some(link.id)));
+                let result = match self.state.enter_by(turn) {
+                    Entered::Held(mut state) => guarded(&told, || run(&mut state, &told, arguments)),
+                    Entered::NotYet => return Ran::NotYet(turn),
+                    Entered::Refused(error) => Err(error),
+                };
+                self.go_on_with_parked();
+                Ran::Over(result)
+            }
+        }
+    }
+
+    /// How a call is run, and what its handler is told.
+    fn prepare(&self, link: &LinkCell, call: &Call) -> Result<(Run<T>, handler::Call), Error> {
+        let peer = link.peer.get().ok_or(Error::NotConnected)?;
+        let (run, lease, safe) = {
+            let functions = read(&self.functions);
+            let Handler { run, lease, safe, .. } = functions.function(call.slot).ok_or(Error::StaleFunction)?.handler;
+            (run.clone(), lease.clone(), safe.clone())
+        };
+        if safe.is_some_and(|safe| !safe.has_run()) {
+            return Err(Error::Service(ServiceError::NotReady));
+        }
+        if let Some(lease) = lease.as_ref().filter(|_| call.order.is_some()) {
+            // An earlier call of the service has given way.
+            lease.wake();
         }
         let told = handler::Call {
             caller: peer.identity.clone(),
             priority: call.priority,
             deadline: call.deadline,
             wants_reply: call.wants_reply,
-            lease: lease.map(|lease| LeaseWatch::new(lease, self.clock)),
+            lease: lease.zip(call.order).map(|(lease, order)| LeaseWatch::new(lease, Some(order), self.clock)),
         };
-        let run = AssertUnwindSafe(|| match run {
-            Run::Free(run) => run(&told, arguments).map_err(Error::Service),
-            Run::Method(run) => {
-                let mut state = self.state.enter(Some(link.id))?;
-                run(&mut state, &told, arguments).map_err(Error::Service)
-            }
-        });
-        catch_unwind(run).unwrap_or_else(|_| {
-            tracing::error!(slot = call.slot.0, caller = %peer.identity, "a handler panicked");
-            Err(Error::Service(ServiceError::Panicked))
-        })
-    }
-
-    /// Lets the caller's next call of the class begin while this one runs.
-    fn detach(&self, link: &LinkCell, call: &Call) {
-        let mut state = link.lock();
-        state.session.detach(call.ticket);
-        let next = state.session.has_next_call();
-        drop(state);
-        if next {
-            self.hand_over(link);
-        }
+        Ok((run, told))
     }
 
     /// Answers, waiting for room while somebody waits for the answer.
@@ -146,26 +297,30 @@ impl<T: Send + 'static> Engine<T> {
         }
     }
 
-    /// Runs the safe hook of a service whose lease ended.
-    pub(super) fn make_safe(&self, slot: Slot) {
-        let hook = read(&self.functions).function(slot).and_then(|function| function.handler.safe.clone());
-        self.run_hook(hook);
+    /// Runs the safe hook of a service whose lease has ended. Returns at once.
+    pub(super) fn make_safe(&self, functions: &FunctionList<Boxed, Handler<T>>, slot: Slot) {
+        let Some(function) = functions.function(slot) else { return };
+        if let Some(safe) = &function.handler.safe {
+            safe.run();
+        }
+        if let Some(lease) = &function.handler.lease {
+            lease.wake();
+        }
     }
+}
 
-    /// Runs the hook for the loss of a peer.
-    pub(super) fn run_lost_hook(&self) {
-        let hook = lock(&self.lost_hook).clone();
-        self.run_hook(hook);
-    }
+/// Runs a handler, which may panic.
+fn guarded(told: &handler::Call, run: impl FnOnce() -> Result<(), ServiceError>) -> Result<(), Error> {
+    catch_unwind(AssertUnwindSafe(run)).map_or_else(
+        |_| {
+            tracing::error!(caller = %told.caller, "a handler panicked");
+            Err(Error::Service(ServiceError::Panicked))
+        },
+        |result| result.map_err(Error::Service),
+    )
+}
 
-    /// While a method holds the state, the hook is left to it: the thread that comes here may be the clock's, or that
-    /// method's own, which reads for its reply.
-    fn run_hook(&self, hook: Option<Arc<handler::Hook<T>>>) {
-        let Some(hook) = hook else { return };
-        self.state.run_or_leave(Box::new(move |state| {
-            if catch_unwind(AssertUnwindSafe(|| hook(state))).is_err() {
-                tracing::error!("a hook panicked");
-            }
-        }));
-    }
+/// Whether an emergency is to be given to another thread than the one that read it.
+pub(super) fn is_emergency(call: &Call) -> bool {
+    call.priority == Priority::Emergency
 }

@@ -1,92 +1,214 @@
-//! The application's state under its own lock, which knows when waiting for it cannot end.
+//! The application's state, which calls take in turns, in the order in which they began.
 //!
-//! A method holds the state while it runs. If it then makes a blocking request to a peer, and that peer needs the state
-//! for its answer, both would wait until the deadline; the second one is told at once instead. A hook waits for nobody:
-//! what it would wait for may be the very thread that is to run it. The holder runs it before it gives the state up.
+//! A call takes its turn when it begins, under the lock of its link, and the state when its turn comes. One that would
+//! wait for long gives its thread back and is parked here: it is given to the pool again when its turn has come. So
+//! however many calls wait for the state, none of them keeps a thread from the calls that do not need it.
+//!
+//! The gate also knows when waiting cannot end. A method holds the state while it runs. If it then makes a blocking
+//! request to a peer, and that peer needs the state for its answer, both would wait until the deadline; the second one is
+//! told at once instead.
 
 use std::cell::Cell;
-use std::sync::{Condvar, Mutex, MutexGuard};
+use std::collections::VecDeque;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::ThreadId;
+use std::time::{Duration, Instant};
 
 use cara_core::error::Error;
 use cara_core::host::mailman::LinkId;
 
 use super::lock;
 
+/// How long a thread of the pool waits for a turn before it parks the call: methods are short as a rule.
+const PATIENCE: Duration = Duration::from_millis(1);
+
 thread_local! {
     /// How many methods of any unit this thread is inside of.
     static HOLDING: Cell<usize> = const { Cell::new(0) };
 }
 
-pub(crate) struct StateGate<T> {
-    gate: Mutex<Gate<T>>,
-    changed: Condvar,
-    state: Mutex<T>,
+/// A place in the order of those that take the state.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Turn {
+    number: u64,
+    /// The peer whose call it is.
+    caller: Option<LinkId>,
 }
 
-struct Gate<T> {
-    holder: Option<ThreadId>,
+/// The state, and what is parked for it: `W`.
+pub(crate) struct StateGate<T, W> {
+    gate: Mutex<Gate<W>>,
+    changed: Condvar,
+    state: Mutex<T>,
+    /// Calls that were parked and are to go on; read without a lock.
+    ready: AtomicUsize,
+}
+
+struct Gate<W> {
+    holder: Option<Holder>,
     /// The holder waits for a reply of this peer.
     waits_for: Option<LinkId>,
-    /// What the holder runs before it goes.
-    left: Vec<Work<T>>,
+    /// Those that wait, in their order.
+    queue: VecDeque<Waiting<W>>,
+    /// What was parked and is to go on.
+    ready: VecDeque<(W, Result<Turn, Error>)>,
+    turns: u64,
     /// Peers' calls are no longer let in.
     stopped: bool,
 }
 
-/// Something short that needs the state.
-type Work<T> = Box<dyn FnOnce(&mut T) + Send>;
+/// Whose turn it is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Holder {
+    /// It has yet to come.
+    Expected(Turn),
+    Here(ThreadId),
+}
+
+struct Waiting<W> {
+    turn: Turn,
+    parked: Option<W>,
+}
+
+/// What waiting for a turn led to.
+pub(crate) enum Entered<'g, T, W> {
+    Held(Held<'g, T, W>),
+    /// It takes long: the call is to be parked.
+    NotYet,
+    Refused(Error),
+}
 
 /// The state, until it is dropped.
-pub(crate) struct Held<'g, T> {
-    gate: &'g StateGate<T>,
+pub(crate) struct Held<'g, T, W> {
+    gate: &'g StateGate<T, W>,
     state: MutexGuard<'g, T>,
 }
 
-impl<T> StateGate<T> {
+impl<T, W> StateGate<T, W> {
     pub(crate) fn new(state: T) -> Self {
-        let gate = Gate { holder: None, waits_for: None, left: Vec::new(), stopped: false };
-        Self { gate: Mutex::new(gate), changed: Condvar::new(), state: Mutex::new(state) }
+        let (queue, ready) = (VecDeque::new(), VecDeque::new());
+        let gate = Gate { holder: None, waits_for: None, queue, ready, turns: 0, stopped: false };
+        Self { gate: Mutex::new(gate), changed: Condvar::new(), state: Mutex::new(state), ready: AtomicUsize::new(0) }
     }
 
-    /// The state, for a call of `caller`; [`Error::WouldDeadlock`] when its holder waits for that caller, or is this
-    /// thread. [`Error::NotRunning`] for a call of a peer when the unit has stopped.
-    pub(crate) fn enter(&self, caller: Option<LinkId>) -> Result<Held<'_, T>, Error> {
+    /// The next turn, for a call of `caller`, or for the application itself.
+    pub(crate) fn take_turn(&self, caller: Option<LinkId>) -> Turn {
+        let mut gate = lock(&self.gate);
+        gate.turns += 1;
+        let turn = Turn { number: gate.turns, caller };
+        match gate.holder {
+            None => gate.holder = Some(Holder::Expected(turn)),
+            Some(_) => gate.queue.push_back(Waiting { turn, parked: None }),
+        }
+        turn
+    }
+
+    /// The state for the application itself, however long that takes; [`Error::WouldDeadlock`] when this thread has it.
+    pub(crate) fn enter(&self) -> Result<Held<'_, T, W>, Error> {
+        let turn = self.take_turn(None);
+        match self.await_turn(turn, None) {
+            Entered::Held(held) => Ok(held),
+            Entered::NotYet => Err(Error::WouldDeadlock),
+            Entered::Refused(error) => Err(error),
+        }
+    }
+
+    /// The state for a call that has its turn. [`Error::WouldDeadlock`] when its holder waits for that call's peer, or is
+    /// this thread. [`Error::NotRunning`] when the unit has stopped. Refused, the turn is given up.
+    pub(crate) fn enter_by(&self, turn: Turn) -> Entered<'_, T, W> {
+        self.await_turn(turn, Some(PATIENCE))
+    }
+
+    fn await_turn(&self, turn: Turn, patience: Option<Duration>) -> Entered<'_, T, W> {
         let this = std::thread::current().id();
+        let mut end = None;
         let mut gate = lock(&self.gate);
         loop {
-            if caller.is_some() && gate.stopped {
-                return Err(Error::NotRunning);
+            if gate.holder == Some(Holder::Expected(turn)) {
+                if gate.stopped && turn.caller.is_some() {
+                    gate.pass_on();
+                    self.count_ready(&gate);
+                    return Entered::Refused(Error::NotRunning);
+                }
+                gate.holder = Some(Holder::Here(this));
+                drop(gate);
+                HOLDING.with(|holding| holding.set(holding.get() + 1));
+                return Entered::Held(Held { gate: self, state: lock(&self.state) });
             }
-            let Some(holder) = gate.holder else { break };
-            if holder == this || (caller.is_some() && gate.waits_for == caller) {
-                return Err(Error::WouldDeadlock);
+            let refusal = match gate.holder == Some(Holder::Here(this)) {
+                true => Some(Error::WouldDeadlock),
+                false => gate.refusal(turn),
+            };
+            if let Some(error) = refusal {
+                gate.queue.retain(|waiting| waiting.turn != turn);
+                return Entered::Refused(error);
             }
-            gate = self.changed.wait(gate).unwrap_or_else(std::sync::PoisonError::into_inner);
+            let Some(patience) = patience else {
+                gate = self.changed.wait(gate).unwrap_or_else(PoisonError::into_inner);
+                continue;
+            };
+            let now = Instant::now();
+            let left = end.get_or_insert(now + patience).saturating_duration_since(now);
+            if left.is_zero() {
+                return Entered::NotYet;
+            }
+            gate = self.changed.wait_timeout(gate, left).unwrap_or_else(PoisonError::into_inner).0;
         }
-        gate.holder = Some(this);
-        drop(gate);
-        HOLDING.with(|holding| holding.set(holding.get() + 1));
-        Ok(Held { gate: self, state: lock(&self.state) })
     }
 
-    /// Runs `work` now, or leaves it to whoever holds the state. `work` must not panic.
-    pub(crate) fn run_or_leave(&self, work: Work<T>) {
+    /// Leaves a call here until its turn comes; whether that is now, so that it is to be asked for at once.
+    pub(crate) fn park(&self, turn: Turn, work: W) -> bool {
         let mut gate = lock(&self.gate);
-        if gate.holder.is_some() {
-            gate.left.push(work);
-            return;
+        let refusal = gate.refusal(turn);
+        if gate.holder == Some(Holder::Expected(turn)) || refusal.is_some() {
+            gate.queue.retain(|waiting| waiting.turn != turn);
+            gate.ready.push_back((work, refusal.map_or(Ok(turn), Err)));
+            self.count_ready(&gate);
+            return true;
         }
-        gate.holder = Some(std::thread::current().id());
+        if let Some(waiting) = gate.queue.iter_mut().find(|waiting| waiting.turn == turn) {
+            waiting.parked = Some(work);
+        }
+        false
+    }
+
+    /// A call that was parked, with its turn, or with why it gets none.
+    pub(crate) fn take_ready(&self) -> Option<(W, Result<Turn, Error>)> {
+        let mut gate = lock(&self.gate);
+        let ready = gate.ready.pop_front();
+        self.count_ready(&gate);
+        ready
+    }
+
+    /// Whether a call that was parked is to go on. Whoever gives up the state, or a turn, or begins to wait, asks.
+    pub(crate) fn has_ready(&self) -> bool {
+        self.ready.load(Ordering::Acquire) > 0
+    }
+
+    fn count_ready(&self, gate: &Gate<W>) {
+        self.ready.store(gate.ready.len(), Ordering::Release);
+    }
+
+    /// A call that has begun is not run after all.
+    pub(crate) fn give_up(&self, turn: Turn) {
+        let mut gate = lock(&self.gate);
+        match gate.holder == Some(Holder::Expected(turn)) {
+            true => gate.pass_on(),
+            false => gate.queue.retain(|waiting| waiting.turn != turn),
+        }
+        self.count_ready(&gate);
         drop(gate);
-        HOLDING.with(|holding| holding.set(holding.get() + 1));
-        let mut held = Held { gate: self, state: lock(&self.state) };
-        work(&mut held);
+        self.changed.notify_all();
     }
 
     /// Lets no more calls of peers in; those that wait return.
     pub(crate) fn stop(&self) {
-        lock(&self.gate).stopped = true;
+        let mut gate = lock(&self.gate);
+        gate.stopped = true;
+        gate.refuse_parked();
+        self.count_ready(&gate);
+        drop(gate);
         self.changed.notify_all();
     }
 
@@ -95,49 +217,84 @@ impl<T> StateGate<T> {
         if HOLDING.with(Cell::get) == 0 {
             return wait();
         }
+        // However the wait ends: a mark that stays would refuse that peer's later calls.
+        struct Mark<'g, T, W>(&'g StateGate<T, W>);
+        impl<T, W> Drop for Mark<'_, T, W> {
+            fn drop(&mut self) {
+                self.0.set_waits_for(None);
+            }
+        }
         self.set_waits_for(Some(peer));
-        let result = wait();
-        self.set_waits_for(None);
-        result
+        let _mark = Mark(self);
+        wait()
     }
 
     fn set_waits_for(&self, peer: Option<LinkId>) {
         let mut gate = lock(&self.gate);
-        if gate.holder == Some(std::thread::current().id()) {
+        if gate.holder == Some(Holder::Here(std::thread::current().id())) {
             gate.waits_for = peer;
+            gate.refuse_parked();
+            self.count_ready(&gate);
         }
         drop(gate);
         self.changed.notify_all();
     }
 }
 
-impl<T> std::ops::Deref for Held<'_, T> {
+impl<W> Gate<W> {
+    /// Why a turn that waits never comes, or comes too late for its caller.
+    fn refusal(&self, turn: Turn) -> Option<Error> {
+        match turn.caller {
+            None => None,
+            Some(_) if self.stopped => Some(Error::NotRunning),
+            caller => (self.waits_for == caller).then_some(Error::WouldDeadlock),
+        }
+    }
+
+    /// The next one has its turn.
+    fn pass_on(&mut self) {
+        self.waits_for = None;
+        let next = self.queue.pop_front();
+        self.holder = next.as_ref().map(|waiting| Holder::Expected(waiting.turn));
+        if let Some(Waiting { turn, parked: Some(work), .. }) = next {
+            self.ready.push_back((work, Ok(turn)));
+        }
+    }
+
+    fn refuse_parked(&mut self) {
+        let mut index = 0;
+        while let Some(waiting) = self.queue.get(index) {
+            let error = waiting.parked.as_ref().and_then(|_| self.refusal(waiting.turn));
+            let Some(error) = error else {
+                index += 1;
+                continue;
+            };
+            let refused = self.queue.remove(index).and_then(|waiting| waiting.parked);
+            self.ready.extend(refused.map(|work| (work, Err(error))));
+        }
+    }
+}
+
+impl<T, W> std::ops::Deref for Held<'_, T, W> {
     type Target = T;
     fn deref(&self) -> &T {
         &self.state
     }
 }
 
-impl<T> std::ops::DerefMut for Held<'_, T> {
+impl<T, W> std::ops::DerefMut for Held<'_, T, W> {
     fn deref_mut(&mut self) -> &mut T {
         &mut self.state
     }
 }
 
-impl<T> Drop for Held<'_, T> {
-    /// Runs what was left to the holder, then opens the gate; the lock itself is given up right after.
+impl<T, W> Drop for Held<'_, T, W> {
+    /// Passes the turn on; the lock itself is given up right after.
     fn drop(&mut self) {
-        loop {
-            let mut gate = lock(&self.gate.gate);
-            if gate.left.is_empty() {
-                gate.holder = None;
-                gate.waits_for = None;
-                break;
-            }
-            let left = std::mem::take(&mut gate.left);
-            drop(gate);
-            left.into_iter().for_each(|work| work(&mut self.state));
-        }
+        let mut gate = lock(&self.gate.gate);
+        gate.pass_on();
+        self.gate.count_ready(&gate);
+        drop(gate);
         HOLDING.with(|holding| holding.set(holding.get().saturating_sub(1)));
         self.gate.changed.notify_all();
     }
@@ -154,13 +311,35 @@ mod tests {
     const HERE: Option<LinkId> = Some(LinkId(1));
     const ELSEWHERE: Option<LinkId> = Some(LinkId(2));
 
-    fn assert_refused(gate: &StateGate<u32>, caller: Option<LinkId>, error: Error) {
-        assert_eq!(gate.enter(caller).map(|held| *held).unwrap_err(), error);
+    fn entered<'g>(entered: Entered<'g, u32, &'static str>) -> Result<Held<'g, u32, &'static str>, Error> {
+        match entered {
+            Entered::Held(held) => Ok(held),
+            Entered::NotYet => panic!("it is not its turn"),
+            Entered::Refused(error) => Err(error),
+        }
+    }
+
+    /// A call of `caller`, which waits for its turn as long as that takes.
+    fn call<'g>(
+        gate: &'g StateGate<u32, &'static str>,
+        caller: Option<LinkId>,
+    ) -> Result<Held<'g, u32, &'static str>, Error> {
+        let turn = gate.take_turn(caller);
+        loop {
+            match gate.enter_by(turn) {
+                Entered::NotYet => {}
+                other => return entered(other),
+            }
+        }
+    }
+
+    fn assert_refused(gate: &StateGate<u32, &'static str>, caller: Option<LinkId>, error: Error) {
+        assert_eq!(call(gate, caller).map(|held| *held).unwrap_err(), error);
     }
 
     /// Runs `act` on another thread while this one holds the state and waits for the peer of `HERE`.
-    fn while_waiting(gate: &StateGate<u32>, act: impl FnOnce() + Send) {
-        let held = gate.enter(None).unwrap();
+    fn while_waiting(gate: &StateGate<u32, &'static str>, act: impl FnOnce() + Send) {
+        let held = gate.enter().unwrap();
         gate.waiting_for(LinkId(1), || std::thread::scope(|scope| scope.spawn(act).join().unwrap()));
         drop(held);
     }
@@ -171,25 +350,25 @@ mod tests {
         let threads: Vec<_> = (0..4)
             .map(|_| {
                 let gate = gate.clone();
-                std::thread::spawn(move || (0..500).for_each(|_| *gate.enter(HERE).unwrap() += 1))
+                std::thread::spawn(move || (0..500).for_each(|_| *call(&gate, HERE).unwrap() += 1))
             })
             .collect();
         threads.into_iter().for_each(|thread| thread.join().unwrap());
-        assert_eq!(*gate.enter(None).unwrap(), 2_000);
+        assert_eq!(*gate.enter().unwrap(), 2_000);
     }
 
     #[test]
     fn who_is_waited_for_is_told_at_once() {
         let gate = StateGate::new(0);
         while_waiting(&gate, || assert_refused(&gate, HERE, Error::WouldDeadlock));
-        assert!(gate.enter(HERE).is_ok(), "nobody holds it any more");
+        assert!(call(&gate, HERE).is_ok(), "nobody holds it any more");
     }
 
     /// The peer's call came first and waits; then the holder begins to wait for that peer.
     #[test]
     fn who_waits_already_is_told_when_the_holder_begins_to_wait() {
         let gate = StateGate::new(0);
-        let held = gate.enter(None).unwrap();
+        let held = gate.enter().unwrap();
         std::thread::scope(|scope| {
             let waiting = scope.spawn(|| assert_refused(&gate, HERE, Error::WouldDeadlock));
             gate.waiting_for(LinkId(1), || waiting.join().unwrap());
@@ -201,10 +380,10 @@ mod tests {
     fn others_wait_until_the_holder_goes() {
         let gate = Arc::new(StateGate::new(1));
         let (sender, receiver) = channel();
-        let held = gate.enter(None).unwrap();
+        let held = gate.enter().unwrap();
         let other = {
             let gate = gate.clone();
-            std::thread::spawn(move || sender.send(*gate.enter(ELSEWHERE).unwrap()).unwrap())
+            std::thread::spawn(move || sender.send(*call(&gate, ELSEWHERE).unwrap()).unwrap())
         };
         gate.waiting_for(LinkId(1), || assert!(receiver.recv_timeout(Duration::from_millis(20)).is_err()));
         drop(held);
@@ -215,48 +394,116 @@ mod tests {
     #[test]
     fn a_thread_does_not_wait_for_itself() {
         let gate = StateGate::new(0);
-        let _held = gate.enter(HERE).unwrap();
+        let _held = call(&gate, HERE).unwrap();
         assert_refused(&gate, None, Error::WouldDeadlock);
     }
 
     /// A thread that holds one unit's state and asks on behalf of another unit changes nothing there.
     #[test]
     fn only_the_holder_can_wait_for_a_peer() {
-        let (mine, other) = (StateGate::new(0), Arc::new(StateGate::new(0)));
+        let (mine, other): (StateGate<u32, &'static str>, Arc<StateGate<u32, &'static str>>) =
+            (StateGate::new(0), Arc::new(StateGate::new(0)));
         let barrier = Arc::new(Barrier::new(2));
         let holder = {
             let (other, barrier) = (other.clone(), barrier.clone());
             std::thread::spawn(move || {
-                let _held = other.enter(None).unwrap();
+                let _held = other.enter().unwrap();
                 barrier.wait();
                 barrier.wait();
             })
         };
         barrier.wait();
-        let _held = mine.enter(None).unwrap();
+        let _held = mine.enter().unwrap();
         other.waiting_for(LinkId(1), || assert_eq!(lock(&other.gate).waits_for, None));
         barrier.wait();
         holder.join().unwrap();
     }
 
+    /// Calls of three peers begin while the application has the state: two are parked, one thread waits.
     #[test]
-    fn work_is_run_at_once_or_by_the_holder_in_order() {
+    fn the_state_is_taken_in_the_order_in_which_calls_began() {
         let gate = StateGate::new(0);
-        gate.run_or_leave(Box::new(|state| *state = 1));
-        let mut held = gate.enter(None).unwrap();
-        assert_eq!(*held, 1);
-        gate.run_or_leave(Box::new(|state| *state *= 10));
-        gate.run_or_leave(Box::new(|state| *state += 2));
-        *held = 4;
+        let held = gate.take_turn(None);
+        let [first, second, third] = [HERE, ELSEWHERE, HERE].map(|caller| gate.take_turn(caller));
+        assert!(matches!(gate.enter_by(third), Entered::NotYet) && !gate.park(third, "third"));
+        assert!(matches!(gate.enter_by(first), Entered::NotYet) && !gate.park(first, "first"));
+        assert!(!gate.has_ready());
+        gate.give_up(held);
+        assert_eq!(gate.take_ready(), Some(("first", Ok(first))), "it came first, and was parked later");
+        assert!(matches!(gate.enter_by(second), Entered::NotYet), "the first one has its turn");
+        drop(entered(gate.enter_by(first)).unwrap());
+        assert!(!gate.has_ready(), "the second is not parked, and has its turn");
+        drop(entered(gate.enter_by(second)).unwrap());
+        assert_eq!(gate.take_ready(), Some(("third", Ok(third))));
+        drop(entered(gate.enter_by(third)).unwrap());
+        assert!(gate.enter().is_ok());
+    }
+
+    #[test]
+    fn a_turn_that_comes_while_its_call_is_being_parked_is_not_lost() {
+        let gate = StateGate::new(0);
+        let held = gate.take_turn(None);
+        let turn = gate.take_turn(HERE);
+        assert!(matches!(gate.enter_by(turn), Entered::NotYet));
+        gate.give_up(held);
+        assert!(gate.park(turn, "late"));
+        assert_eq!(gate.take_ready(), Some(("late", Ok(turn))));
+    }
+
+    #[test]
+    fn a_turn_that_is_given_up_passes_to_the_next_one() {
+        let gate = StateGate::new(0);
+        let [first, second, third] = [HERE; 3].map(|caller| gate.take_turn(caller));
+        gate.give_up(second);
+        gate.give_up(first);
+        drop(entered(gate.enter_by(third)).unwrap());
+        assert!(gate.enter().is_ok());
+    }
+
+    /// Two are parked when the holder begins to wait for the peer of one of them.
+    #[test]
+    fn what_is_parked_is_refused_when_the_holder_begins_to_wait_for_its_caller() {
+        let gate = StateGate::new(0);
+        let held = gate.enter().unwrap();
+        let [here, there] = [(HERE, "here"), (ELSEWHERE, "there")].map(|(caller, name)| {
+            let turn = gate.take_turn(caller);
+            assert!(!gate.park(turn, name));
+            turn
+        });
+        gate.waiting_for(LinkId(1), || {
+            assert_eq!(gate.take_ready(), Some(("here", Err(Error::WouldDeadlock))));
+            assert!(!gate.has_ready());
+        });
+        gate.stop();
+        assert_eq!(gate.take_ready(), Some(("there", Err(Error::NotRunning))));
         drop(held);
-        assert_eq!(*gate.enter(None).unwrap(), 42);
+        assert!(gate.enter().is_ok(), "{here:?} and {there:?} have no turns any more");
+    }
+
+    /// A mark that stayed would refuse the calls of a peer for whom nobody waits any more.
+    #[test]
+    fn the_mark_of_whom_the_holder_waits_for_goes_with_the_wait() {
+        let gate = StateGate::new(0);
+        let held = gate.enter().unwrap();
+        gate.waiting_for(LinkId(1), || {});
+        let turn = gate.take_turn(HERE);
+        assert!(!gate.park(turn, "here") && !gate.has_ready(), "it waits for its turn, and is not refused");
+        let panicked = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
+            gate.waiting_for(LinkId(1), || panic!("a request"));
+        }));
+        assert!(panicked.is_err());
+        assert_eq!(gate.take_ready(), Some(("here", Err(Error::WouldDeadlock))), "while that one waited");
+        let turn = gate.take_turn(HERE);
+        assert!(!gate.park(turn, "here") && !gate.has_ready(), "and none after it");
+        drop(held);
+        assert_eq!(gate.take_ready(), Some(("here", Ok(turn))));
     }
 
     #[test]
     fn a_stopped_unit_lets_no_peer_in() {
         let gate = StateGate::new(0);
         let began = Instant::now();
-        let held = gate.enter(None).unwrap();
+        let held = gate.enter().unwrap();
         std::thread::scope(|scope| {
             let waiting = scope.spawn(|| assert_refused(&gate, HERE, Error::NotRunning));
             gate.stop();
@@ -264,7 +511,7 @@ mod tests {
         });
         drop(held);
         assert_refused(&gate, HERE, Error::NotRunning);
-        assert!(gate.enter(None).is_ok(), "the application still reads its state");
+        assert!(gate.enter().is_ok(), "the application still reads its state");
         assert!(began.elapsed() < Duration::from_secs(5));
     }
 
@@ -272,9 +519,9 @@ mod tests {
     fn a_panic_opens_the_gate() {
         let gate = StateGate::new(0);
         let panicked = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
-            let _held = gate.enter(HERE).unwrap();
+            let _held = call(&gate, HERE).unwrap();
             panic!("a handler");
         }));
-        assert!(panicked.is_err() && gate.enter(HERE).is_ok());
+        assert!(panicked.is_err() && call(&gate, HERE).is_ok());
     }
 }

@@ -10,12 +10,12 @@ use std::sync::atomic::Ordering;
 use std::sync::{Arc, MutexGuard};
 
 use cara_core::error::CloseReason;
-use cara_core::services::unit::Call;
 use cara_core::time::{Duration, Instant};
 
 use super::calling::pass_lead;
 use super::link::{LinkCell, LinkState};
 use super::reader::Turn;
+use super::serving::Begun;
 use super::workers::Worker;
 use super::{Engine, lock};
 use crate::sys::stream::{Received, Wait};
@@ -44,11 +44,11 @@ impl<T: Send + 'static> Engine<T> {
         let Some(turn) = self.begin_stay(link) else { return };
         let _occupied = self.crew().occupancy.enter();
         while let Some((call, began)) = self.await_call(link, turn, worker) {
-            let (state, now) = self.serve_one(began, link, &call, &mut worker.arguments);
+            let Some((state, now)) = self.serve_one(began, link, call, worker) else { break };
             if state.session.has_next_call() || state.is_paused() {
                 // It is busy until the last of those that waited behind this call is done.
-                if let Some(call) = self.next_call(link, state, &mut worker.arguments) {
-                    self.serve(link, call, &mut worker.arguments);
+                if let Some(call) = self.next_call(link, state, worker) {
+                    self.serve(link, call, worker);
                 }
                 if !self.goes_on(self.now(), link, link.lock(), turn) {
                     break;
@@ -103,7 +103,7 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     /// Reads until a call is to be run; `None` when nothing comes any more or the lead is lost.
-    fn await_call(&self, link: &Arc<LinkCell>, turn: Turn, worker: &mut Worker) -> Option<(Call, Instant)> {
+    fn await_call(&self, link: &Arc<LinkCell>, turn: Turn, worker: &mut Worker) -> Option<(Begun, Instant)> {
         loop {
             let received = link.stream.receive(&mut worker.buffer, Wait::Slice);
             let now = self.now();
@@ -138,9 +138,10 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     /// A call that came together with others and may begin.
-    fn waiting_call(&self, link: &LinkCell, state: &mut LinkState, worker: &mut Worker) -> Option<Call> {
+    fn waiting_call(&self, link: &Arc<LinkCell>, state: &mut LinkState, worker: &mut Worker) -> Option<Begun> {
+        self.dispatch_emergencies(link, state);
         let has = state.session.has_next_call();
-        has.then(|| self.with(link, state, |session, cx| session.next_call(cx, &mut worker.arguments))).flatten()
+        has.then(|| self.take_call(link, state, worker)).flatten()
     }
 
     fn end_stay(&self, link: &Arc<LinkCell>, turn: Turn) {

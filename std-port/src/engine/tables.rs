@@ -6,6 +6,7 @@ use cara_core::distribution::function_list::Entry;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, Limit};
 use cara_core::services::requests::CallId;
+use cara_core::services::slots_for;
 use cara_core::services::unit::{RequestOptions, SessionStorage};
 use cara_core::time::Instant;
 
@@ -38,7 +39,7 @@ impl<T: Send + 'static> Engine<T> {
         SessionStorage {
             small: filled(LINK_BUFFER_BYTES, 0),
             pending: filled(first_calls(calls_in_flight), None),
-            running: filled(calls_running + 1, None),
+            running: filled(slots_for(calls_running), None),
             publications: filled_with(self.own_functions(), Default::default),
             their_functions: filled_with(their_functions.min(FIRST_FUNCTIONS), Entry::empty),
             their_signatures: filled(their_signature_bytes.min(FIRST_SIGNATURES), 0),

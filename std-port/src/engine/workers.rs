@@ -9,9 +9,9 @@ use std::sync::atomic::Ordering;
 
 use cara_core::distribution::parameters::{Parameters, ParametersView};
 use cara_core::error::CloseReason;
-use cara_core::services::unit::Call;
 
 use super::link::{LinkCell, LinkState};
+use super::serving::Begun;
 use super::{Engine, READ_BYTES};
 use crate::sys::epoll::{Interest, Ready};
 use crate::sys::stream::{Received, Wait};
@@ -30,6 +30,10 @@ pub(crate) struct Worker {
 impl Worker {
     pub(crate) fn new() -> Self {
         Self { buffer: vec![0; READ_BYTES], arguments: arena(0), longest: 0 }
+    }
+
+    pub(super) const fn longest(&self) -> usize {
+        self.longest
     }
 
     /// The limit may have been raised since the last call.
@@ -86,17 +90,17 @@ impl<T: Send + 'static> Engine<T> {
             call = self.drain(&link, &mut state, ready.hung_up, worker);
         }
         match call {
-            None => call = self.next_call(&link, state, &mut worker.arguments),
+            None => call = self.next_call(&link, state, worker),
             Some(_) => self.settle(&link, state),
         }
         if let Some(call) = call {
-            self.serve(&link, call, &mut worker.arguments);
+            self.serve(&link, call, worker);
             self.stay(&link, worker);
         }
     }
 
     /// Reads until nothing is left or the budget is used up, in which case the epoll set reports the link again.
-    fn drain(&self, link: &Arc<LinkCell>, state: &mut LinkState, hung_up: bool, worker: &mut Worker) -> Option<Call> {
+    fn drain(&self, link: &Arc<LinkCell>, state: &mut LinkState, hung_up: bool, worker: &mut Worker) -> Option<Begun> {
         let mut call = None;
         for _ in 0..READS {
             let count = match link.stream.receive(&mut worker.buffer, Wait::Not) {
@@ -122,13 +126,14 @@ impl<T: Send + 'static> Engine<T> {
         call
     }
 
-    /// Runs the calls of a link that nobody has run yet.
+    /// Runs a call that was parked and has its turn, and the calls of a link that nobody has run yet.
     pub(super) fn serve_link(&self, token: u64, worker: &mut Worker) {
-        let Some(link) = self.link_of_token(token) else { return };
         worker.fit(self.call_bytes());
+        self.serve_parked(worker);
+        let Some(link) = self.link_of_token(token) else { return };
         let state = link.lock();
-        if let Some(call) = self.next_call(&link, state, &mut worker.arguments) {
-            self.serve(&link, call, &mut worker.arguments);
+        if let Some(call) = self.next_call(&link, state, worker) {
+            self.serve(&link, call, worker);
         }
     }
 }
@@ -143,7 +148,7 @@ pub(crate) const fn arena_bytes(message: usize) -> usize {
     }
 }
 
-fn arena(message: usize) -> Box<ParametersView> {
+pub(super) fn arena(message: usize) -> Box<ParametersView> {
     match message {
         0..=2048 => Box::new(Parameters::<{ arena_bytes(0) }>::sized()),
         2049..=20_000 => Box::new(Parameters::<{ arena_bytes(20_000) }>::sized()),

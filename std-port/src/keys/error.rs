@@ -9,7 +9,7 @@ use cara_core::distribution::identity::{Fleet, Identity};
 use super::named::{command, full_name};
 
 /// Why there are no keys.
-#[derive(Debug, thiserror::Error)]
+#[derive(thiserror::Error)]
 #[non_exhaustive]
 pub enum KeyError {
     /// No ring in any of the places.
@@ -78,6 +78,12 @@ pub enum KeyError {
         /// What is expected there.
         what: &'static str,
     },
+    /// Not as it was written: its checksum does not fit.
+    #[error("{} is damaged: its checksum does not fit. {}", .0.display(), Kind::of(.0).if_damaged())]
+    Damaged(PathBuf),
+    /// Stopped before anything was changed.
+    #[error("stopped: no file was changed")]
+    Stopped,
     /// The keys of another node, or of another fleet.
     #[error("{} has the keys of {}, and this is {}: give it its own file", path.display(), owners.0, owners.1)]
     OtherNode {
@@ -161,7 +167,7 @@ impl fmt::Display for Owner {
 }
 
 /// Why a fleet's keys do not change as asked.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[derive(Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum FleetError {
     /// A node that the fleet does not have.
@@ -281,6 +287,15 @@ impl Kind {
     }
 }
 
+/// How a file without a checksum gets one.
+pub(super) fn renewal(path: &Path) -> String {
+    let (fleet, behind) = match Kind::of(path) {
+        Kind::Root(fleet) | Kind::Nodes(fleet) => (Some(fleet), ""),
+        Kind::Ring(fleet) => (fleet, " where the fleet's root is; bring it to its node then"),
+    };
+    format!("no damage to it would be found: `{}` writes it with a checksum{behind}", keys_of(fleet, &["derive"]))
+}
+
 /// When and how a fleet gets another root.
 fn anew(when: &str, fleet: Fleet) -> String {
     format!(
@@ -360,5 +375,14 @@ mod tests {
             let commands: Vec<_> = text.split("`cara keys ").skip(1).collect();
             assert!(!commands.is_empty() && commands.iter().all(|one| one.contains("--fleet 7")), "{text}");
         }
+    }
+
+    #[test]
+    fn a_file_without_a_checksum_is_told_how_to_get_one() {
+        let of = |path: &str| renewal(Path::new(path));
+        assert!(
+            of("k/agv-1-s_unit-8.keys").contains("`cara keys derive --fleet 8` writes it with a checksum where the")
+        );
+        assert!(of("k/fleet-7.root").ends_with("`cara keys derive --fleet 7` writes it with a checksum"));
     }
 }

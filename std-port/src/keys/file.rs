@@ -7,14 +7,17 @@ use std::path::{Path, PathBuf};
 
 use rustix::fs::OFlags;
 use rustix::process::geteuid;
-use tempfile::NamedTempFile;
+use tempfile::TempPath;
 use zeroize::{Zeroize, Zeroizing};
 
 use super::KeyError;
-use super::text::FormError;
+use super::error::renewal;
+use super::text::{Checksum, FormError, checksum};
 
 /// Longest file that is read: the ring of ten thousand nodes in all its generations.
 const BYTES: u64 = 8 << 20;
+/// Files that are not in their places yet begin so.
+const TEMPORARY: &str = ".keys-";
 /// Permissions of others than the owner.
 const OTHERS: u32 = 0o077;
 
@@ -43,7 +46,7 @@ pub(super) fn form(path: &Path, FormError { line, what }: FormError) -> KeyError
     KeyError::Form { path: path.to_owned(), line, what }
 }
 
-/// The text of a file that belongs to this user and that nobody else can read.
+/// The text of a file that belongs to this user, that nobody else can read, and that is as it was written.
 pub(super) fn read(path: &Path) -> Result<(Zeroizing<String>, Mark), KeyError> {
     let mut file = open(path)?;
     let found = file.metadata().map_err(|error| system(path, error))?;
@@ -51,12 +54,25 @@ pub(super) fn read(path: &Path) -> Result<(Zeroizing<String>, Mark), KeyError> {
     // All of it at once: a buffer that grows leaves pieces behind.
     let mut bytes = Zeroizing::new(vec![0; found.len() as usize]);
     file.read_exact(&mut bytes).map_err(|error| system(path, error))?;
-    match String::from_utf8(std::mem::take(&mut *bytes)) {
-        Ok(text) => Ok((Zeroizing::new(text), Mark::from(&found))),
+    Ok((text_of(path, std::mem::take(&mut *bytes))?, Mark::from(&found)))
+}
+
+/// What is in a file, if it is as it was written.
+pub(super) fn text_of(path: &Path, bytes: Vec<u8>) -> Result<Zeroizing<String>, KeyError> {
+    match String::from_utf8(bytes).map(Zeroizing::new) {
+        Ok(text) if checksum(&text) == Checksum::Wrong => Err(KeyError::Damaged(path.to_owned())),
+        Ok(text) => Ok(text),
         Err(error) => {
             error.into_bytes().zeroize();
             Err(form(path, FormError { line: 1, what: "this is no text" }))
         }
+    }
+}
+
+/// Tells in the log how a file without a checksum gets one.
+pub(super) fn advise(path: &Path, text: &str) {
+    if checksum(text) == Checksum::Absent {
+        tracing::warn!(path = %path.display(), "a key file without a checksum: {}", renewal(path));
     }
 }
 
@@ -102,9 +118,55 @@ pub(super) fn make_folder(path: &Path) -> Result<(), KeyError> {
 
 /// Writes a file for this user alone in the place of the one at `path`, if there is one: whole, or not at all.
 pub fn write_private(path: &Path, bytes: &[u8]) -> Result<(), KeyError> {
-    check_replaceable(path)?;
-    let kept = written(path, bytes)?.persist(path).map_err(|error| system(path, error.error));
-    kept.and_then(|_| keep_folder(path))
+    Staged::write(path, bytes)?.put()?;
+    keep_names(&folder_of(path))
+}
+
+/// A file for this user alone that is on the disk and not in its place yet. It is gone when this is dropped.
+#[derive(Debug)]
+pub(super) struct Staged {
+    temporary: TempPath,
+    path: PathBuf,
+}
+
+impl Staged {
+    /// Writes it beside its place, opened with `O_EXCL`.
+    pub(super) fn write(path: &Path, bytes: &[u8]) -> Result<Self, KeyError> {
+        check_replaceable(path)?;
+        let file = tempfile::Builder::new().prefix(TEMPORARY).tempfile_in(folder_of(path));
+        let mut file = file.map_err(|error| system(path, error))?;
+        let result = file.write_all(bytes).and_then(|()| file.as_file().sync_all());
+        result.map_err(|error| system(path, error))?;
+        // Without its descriptor: there are as many of these as a fleet has nodes.
+        Ok(Self { temporary: file.into_temp_path(), path: path.to_owned() })
+    }
+
+    /// Where it will be.
+    pub(super) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Puts it in its place, where there may be another one.
+    pub(super) fn put(self) -> Result<(), KeyError> {
+        let Self { temporary, path } = self;
+        temporary.persist(&path).map_err(|error| system(&path, error.error))
+    }
+
+    /// Puts it in its place, where there must be none.
+    pub(super) fn put_new(self) -> Result<(), KeyError> {
+        let Self { temporary, path } = self;
+        temporary.persist_noclobber(&path).map_err(|error| system(&path, error.error))
+    }
+}
+
+/// Takes away what a command left that was killed before its files were in their places.
+pub(super) fn remove_staged(folder: &Path) -> Result<(), KeyError> {
+    for entry in std::fs::read_dir(folder).map_err(|error| system(folder, error))?.flatten() {
+        if entry.file_name().to_string_lossy().starts_with(TEMPORARY) {
+            remove(&entry.path())?;
+        }
+    }
+    Ok(())
 }
 
 /// Refuses a path where a folder, a pipe or a device is: a rename would put a file in the place of those last two.
@@ -114,12 +176,6 @@ pub fn check_replaceable(path: &Path) -> Result<(), KeyError> {
         // What else is wrong shows when it is written.
         _ => Ok(()),
     }
-}
-
-/// Puts a file at `path`, where there must be none.
-pub(super) fn create(path: &Path, text: &str) -> Result<(), KeyError> {
-    let kept = written(path, text.as_bytes())?.persist_noclobber(path).map_err(|error| system(path, error.error));
-    kept.and_then(|_| keep_folder(path))
 }
 
 /// Whether there is a file, or a link, that can be taken away.
@@ -141,19 +197,9 @@ pub(super) fn remove(path: &Path) -> Result<bool, KeyError> {
     }
 }
 
-/// A file beside `path`, opened with `O_EXCL` for this user alone, and on the disk.
-fn written(path: &Path, bytes: &[u8]) -> Result<NamedTempFile, KeyError> {
-    let file = tempfile::Builder::new().prefix(".keys-").tempfile_in(folder_of(path));
-    let mut file = file.map_err(|error| system(path, error))?;
-    let result = file.write_all(bytes).and_then(|()| file.as_file().sync_all());
-    result.map_err(|error| system(path, error))?;
-    Ok(file)
-}
-
-/// A name is on the disk when its folder is.
-fn keep_folder(path: &Path) -> Result<(), KeyError> {
-    let folder = folder_of(path);
-    File::open(&folder).and_then(|folder| folder.sync_all()).map_err(|error| system(&folder, error))
+/// The names of files are on the disk when their folder is.
+pub(super) fn keep_names(folder: &Path) -> Result<(), KeyError> {
+    File::open(folder).and_then(|folder| folder.sync_all()).map_err(|error| system(folder, error))
 }
 
 fn folder_of(path: &Path) -> PathBuf {
@@ -168,6 +214,10 @@ mod tests {
     use super::*;
     use std::fs::{Permissions, set_permissions};
     use std::os::unix::fs::PermissionsExt;
+
+    fn create(path: &Path, text: &str) -> Result<(), KeyError> {
+        Staged::write(path, text.as_bytes())?.put_new()
+    }
 
     fn pipe(folder: &Path) -> PathBuf {
         let pipe = folder.join("pipe");
@@ -194,6 +244,21 @@ mod tests {
         assert!(matches!(make_folder(&folder.path().join("b")), Ok(())));
         create(&path, "one").unwrap();
         assert!(matches!(make_folder(&path), Err(KeyError::NoFolder { .. })));
+    }
+
+    #[test]
+    fn what_is_not_put_in_its_place_leaves_nothing() {
+        let folder = tempfile::tempdir().unwrap();
+        let names = || std::fs::read_dir(folder.path()).unwrap().count();
+        let staged = Staged::write(&folder.path().join("a"), b"one").unwrap();
+        assert_eq!(names(), 1);
+        drop(staged);
+        assert_eq!(names(), 0);
+        // As a command leaves it that is killed.
+        std::mem::forget(Staged::write(&folder.path().join("a"), b"one").unwrap());
+        write_private(&folder.path().join("b"), b"two").unwrap();
+        remove_staged(folder.path()).unwrap();
+        assert_eq!((names(), folder.path().join("b").exists()), (1, true));
     }
 
     #[test]

@@ -97,11 +97,13 @@ impl FleetKeys {
 
     fn generation(&self, node: &Member, number: u32) -> Generation {
         let fleet = self.members.fleet();
-        let peers = || self.members.peers(node).filter(|peer| peer.since.max(node.since) <= number);
+        let itself = (node.identity.role() == Role::MUnit && node.since <= number).then_some(node);
+        let peers = || self.members.peers(node).chain(itself).filter(|peer| peer.since.max(node.since) <= number);
         let mut pairs = Vec::with_capacity(peers().count());
         pairs.extend(peers().map(|Member { identity, .. }| {
             (identity.clone(), self.root.pair(fleet, number, &node.identity, identity))
         }));
+        pairs.sort_unstable_by(|(one, _), (other, _)| one.cmp(other));
         Generation { number, discovery: self.discovery(number), pairs }
     }
 }

@@ -15,6 +15,8 @@ pub struct LiveRing {
     /// None where the ring was made in this process.
     path: Option<PathBuf>,
     held: Mutex<Held>,
+    /// Held by whoever looks at the file: the ring itself is there meanwhile.
+    looking: Mutex<()>,
 }
 
 #[derive(Debug)]
@@ -41,12 +43,13 @@ impl LiveRing {
         let (ring, mark) = KeyRing::load_marked(path)?;
         let ring = ring.belonging_to(path, identity, fleet)?;
         let held = Mutex::new(Held { ring: Arc::new(ring), mark: Some(mark), refused: None });
-        Ok(Self { path: Some(path.to_owned()), held })
+        Ok(Self { path: Some(path.to_owned()), held, looking: Mutex::new(()) })
     }
 
     /// A ring that was made in this process, and that follows no file.
     pub fn fixed(ring: KeyRing) -> Self {
-        Self { path: None, held: Mutex::new(Held { ring: Arc::new(ring), mark: None, refused: None }) }
+        let held = Mutex::new(Held { ring: Arc::new(ring), mark: None, refused: None });
+        Self { path: None, held, looking: Mutex::new(()) }
     }
 
     /// Its file.
@@ -57,6 +60,10 @@ impl LiveRing {
     /// The ring as it is now.
     pub fn ring(&self) -> Arc<KeyRing> {
         self.held.lock().unwrap_or_else(PoisonError::into_inner).ring.clone()
+    }
+
+    fn mark(&self) -> Option<Mark> {
+        self.held.lock().unwrap_or_else(PoisonError::into_inner).mark
     }
 
     /// Looks at the file, which costs one system call, and reads it if it has changed. Whether there is another ring now.
@@ -71,13 +78,17 @@ impl LiveRing {
         read: impl FnOnce(&Path, &KeyRing) -> Result<(KeyRing, Mark), KeyError>,
     ) -> Result<bool, KeyError> {
         let Some(path) = &self.path else { return Ok(false) };
-        let mut held = self.held.lock().unwrap_or_else(PoisonError::into_inner);
+        let _looking = self.looking.lock().unwrap_or_else(PoisonError::into_inner);
         let mark = Mark::of(path).ok();
-        if mark == held.mark {
+        let ring = self.ring();
+        // Whoever needs the ring does not wait for the file.
+        let found = (mark != self.mark()).then(|| read(path, &ring));
+        let mut held = self.held.lock().unwrap_or_else(PoisonError::into_inner);
+        let Some(found) = found else {
             held.refused = None;
             return Ok(false);
-        }
-        match read(path, &held.ring) {
+        };
+        match found {
             Ok((ring, mark)) => {
                 *held = Held { ring: Arc::new(ring), mark: Some(mark), refused: None };
                 Ok(true)

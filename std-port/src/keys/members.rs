@@ -1,13 +1,14 @@
 //! Who belongs to a fleet, and which generations of keys are in use. Nothing of it is secret.
 //!
 //! ```text
-//! cara-fleet 1
+//! cara-fleet 2
 //! fleet 7
 //! generations 1 2
 //! node 1 m_unit 1 depot
 //! node 2 s_unit 17 agv-17
 //! manager m_unit 1 depot
 //! revoked 2 s_unit 18 agv-18
+//! sum 8 hexadecimal digits
 //! ```
 //!
 //! `generations` tells the one in use, and behind it the one beside it if keys are being changed. `node` tells the first
@@ -18,10 +19,7 @@ use std::fmt::Write;
 use cara_core::distribution::identity::{Fleet, Identity, Role};
 
 use super::FleetError;
-use super::text::{FormError, Line, Lines, push_identity};
-
-/// Which form this is.
-const FORM: u32 = 1;
+use super::text::{FORM, FormError, Line, Lines, push_identity, push_sum};
 
 /// A node of the fleet.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -240,15 +238,13 @@ impl Members {
             node.managers.iter().for_each(|manager| push(&mut text, format_args!("manager "), manager));
         }
         self.revoked.iter().for_each(|one| push(&mut text, format_args!("revoked {} ", one.from), &one.identity));
+        push_sum(&mut text);
         text
     }
 
     pub(super) fn parse(text: &str) -> Result<Self, FormError> {
         let mut lines = Lines::of(text);
-        let head = lines.expect("cara-fleet", "here `cara-fleet 1` is expected: this is no list of a fleet's nodes")?;
-        if head.number()? != FORM {
-            return Err(head.wrong("this list is written in a form that this version does not know"));
-        }
+        lines.head("cara-fleet", "here `cara-fleet 2` is expected: this is no list of a fleet's nodes")?;
         let fleet = Fleet(lines.expect("fleet", "here `fleet` is expected")?.number()?);
         let line = lines.expect("generations", "here `generations` is expected")?;
         let (used, behind) = line.numbered()?;
@@ -445,7 +441,8 @@ mod tests {
         let mut members = fleet();
         members.revoke(&[agv(1)]).unwrap();
         let text = members.text();
-        let parse = |text: &str| Members::parse(text).map(drop).map_err(|error| error.line);
+        let (text, sum) = text.split_at(text.find("sum ").unwrap());
+        let parse = |text: &str| Members::parse(&format!("{text}{sum}")).map(drop).map_err(|error| error.line);
         for (index, line) in text.lines().enumerate().skip(1) {
             for wrong in ["strange 1", line.split(' ').next().unwrap()] {
                 assert_eq!(parse(&text.replace(line, wrong)), Err(index + 1), "{line}");
@@ -455,7 +452,7 @@ mod tests {
             assert_eq!(parse(&text.replace("generations 1 2", &format!("generations {generations}"))), Err(4));
         }
         assert_eq!(parse(""), Err(1));
-        assert_eq!(parse("cara-fleet 1\nfleet 7\ngenerations 1\nmanager m_unit 1 depot\n"), Err(4));
+        assert_eq!(parse("cara-fleet 2\nfleet 7\ngenerations 1\nmanager m_unit 1 depot\n"), Err(4));
         assert_eq!(parse(&format!("{text}node 1 m_unit 1 depot\n")), Err(text.lines().count() + 1));
     }
 }

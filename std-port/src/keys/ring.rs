@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! # The keys of agv-17/17 in fleet 7. Whoever reads them can speak as it.
-//! cara-ring 1
+//! cara-ring 2
 //! fleet 7
 //! node s_unit 17 agv-17
 //! generation 1
@@ -10,6 +10,7 @@
 //! pair 64 hexadecimal digits m_unit 1 depot
 //! generation 2
 //! …
+//! sum 8 hexadecimal digits
 //! ```
 //!
 //! The generation in use stands first, and behind it the one beside it, if keys are being changed; pairs in the order of
@@ -23,14 +24,11 @@ use cara_secure::keyring::Keyring;
 use cara_secure::keys::{DiscoveryKey, PairKey};
 use zeroize::Zeroizing;
 
-use super::text::{FormError, Line, Lines, push_identity, push_key};
+use super::text::{FORM, FormError, Line, Lines, push_identity, push_key, push_sum};
 use super::{KeyError, Owner, file, full_name};
 
 /// Bytes that a line with a key takes at most, and those of a generation or the head of a file.
 const LINE_BYTES: usize = 160;
-/// Which form this is.
-const FORM: u32 = 1;
-
 /// The keys of one node: of the generation in use, with which it speaks, and while the fleet changes its keys of the one
 /// beside it, which it takes as well.
 #[derive(Debug)]
@@ -73,6 +71,7 @@ impl KeyRing {
 
     pub(super) fn load_marked(path: &Path) -> Result<(Self, file::Mark), KeyError> {
         let (text, mark) = file::read(path)?;
+        file::advise(path, &text);
         Ok((Self::parse(&text).map_err(|error| file::form(path, error))?, mark))
     }
 
@@ -140,10 +139,11 @@ impl KeyRing {
         self.all().map(|generation| (generation.number, &generation.discovery))
     }
 
-    /// Whom it may talk to, in order.
+    /// Whom it may talk to, in order. An m_unit's key for itself, with which it finds another one of its identity, is no
+    /// peer's.
     pub fn peers(&self) -> Vec<&Identity> {
         let pairs = self.all().flat_map(|generation| &generation.pairs);
-        let mut peers: Vec<_> = pairs.map(|(identity, _)| identity).collect();
+        let mut peers: Vec<_> = pairs.map(|(identity, _)| identity).filter(|peer| **peer != self.identity).collect();
         peers.sort_unstable();
         peers.dedup();
         peers
@@ -151,7 +151,7 @@ impl KeyRing {
 
     /// The text of its file.
     pub(super) fn text(&self) -> Zeroizing<String> {
-        let lines = 4 + self.all().map(|generation| 2 + generation.pairs.len()).sum::<usize>();
+        let lines = 5 + self.all().map(|generation| 2 + generation.pairs.len()).sum::<usize>();
         let mut text = Zeroizing::new(String::with_capacity(lines * LINE_BYTES));
         self.push_to(&mut text);
         debug_assert!(text.len() <= lines * LINE_BYTES, "a text that grows leaves keys behind");
@@ -177,14 +177,12 @@ impl KeyRing {
                 text.push('\n');
             }
         }
+        push_sum(text);
     }
 
     pub(super) fn parse(text: &str) -> Result<Self, FormError> {
         let mut lines = Lines::of(text);
-        let head = lines.expect("cara-ring", "here `cara-ring 1` is expected: this is no file with a node's keys")?;
-        if head.number()? != FORM {
-            return Err(head.wrong("these keys are written in a form that this version does not know"));
-        }
+        lines.head("cara-ring", "here `cara-ring 2` is expected: this is no file with a node's keys")?;
         let fleet = Fleet(lines.expect("fleet", "here `fleet` is expected")?.number()?);
         let identity = lines.expect("node", "here `node` is expected")?.identity()?;
         let first = lines.expect("generation", "here `generation` is expected")?;
@@ -206,6 +204,10 @@ impl Keyring for KeyRing {
     fn pair(&self, peer: &Identity) -> Option<(PairKey, Option<PairKey>)> {
         let mut keys = self.pairs(peer).map(|(_, key)| key.clone());
         keys.next().map(|key| (key, keys.next()))
+    }
+
+    fn is_own(&self, identity: &Identity) -> bool {
+        self.identity == *identity
     }
 }
 
@@ -279,8 +281,10 @@ mod tests {
     #[test]
     fn every_line_that_is_wrong_is_told_by_its_number() {
         let text = ring().text();
+        let (text, sum) = text.split_at(text.find("sum ").unwrap());
         let lines: Vec<_> = text.lines().collect();
-        let parse = |lines: Vec<&str>| KeyRing::parse(&lines.join("\n")).map(drop).map_err(|error| error.line);
+        let with_sum = |lines: Vec<&str>| lines.join("\n") + "\n" + sum;
+        let parse = |lines: Vec<&str>| KeyRing::parse(&with_sum(lines)).map(drop).map_err(|error| error.line);
         assert_eq!(parse(lines.clone()), Ok(()));
         for (index, line) in lines.iter().enumerate().skip(1) {
             let with = |new: &str| {
@@ -292,8 +296,10 @@ mod tests {
             assert_eq!(with(line.split(' ').next().unwrap()), Err(index + 1), "{line}");
         }
         assert_eq!(parse(lines[..4].to_vec()), Err(5));
-        assert_eq!(parse(vec![]), Err(1));
-        assert_eq!(parse(vec!["cara-ring 2"]), Err(1));
+        assert_eq!(KeyRing::parse("").map_err(|error| error.line).err(), Some(1));
+        let unknown = format!("{}{sum}", text.replace("cara-ring 2", "cara-ring 3"));
+        assert_eq!(KeyRing::parse(&unknown).map_err(|error| error.line).err(), Some(2));
+        assert_eq!(KeyRing::parse(text).map_err(|error| error.line).err(), Some(2), "without its checksum");
         let swapped = |one: usize, other: usize| {
             let mut lines = lines.clone();
             lines.swap(one, other);
@@ -310,7 +316,7 @@ mod tests {
     fn another_node_s_ring_is_refused() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("ring");
-        file::create(&path, &ring().text()).unwrap();
+        file::write_private(&path, ring().text().as_bytes()).unwrap();
         let depot = Identity::m_unit("depot", 1).unwrap();
         assert!(KeyRing::load_of(&path, &depot, Fleet(7)).is_ok());
         assert!(matches!(KeyRing::load_of(&path, &agv(1), Fleet(7)), Err(KeyError::OtherNode { .. })));

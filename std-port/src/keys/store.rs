@@ -10,12 +10,12 @@ use cara_secure::keys::RootKey;
 use rustix::fs::{FlockOperation, flock};
 use zeroize::Zeroizing;
 
+use super::file::Staged;
 use super::members::Members;
-use super::text::{FormError, Lines, push_key};
+use super::text::{Checksum, FORM, FormError, Lines, checksum, push_key, push_sum};
 use super::{FleetKeys, KeyError, KeyRing, file, place};
 
-/// Which form this is.
-const FORM: u32 = 1;
+/// Bytes of the root's file at most.
 const ROOT_BYTES: usize = 512;
 
 /// A fleet's keys in a folder, which nobody else changes while this is there.
@@ -56,6 +56,12 @@ struct Planned {
     text: Option<Zeroizing<String>>,
 }
 
+/// The same, on the disk beside its place.
+struct Ready {
+    to_be: Written,
+    staged: Option<Staged>,
+}
+
 pub(super) fn root_file(folder: &Path, fleet: Fleet) -> PathBuf {
     folder.join(format!("fleet-{}.root", fleet.0))
 }
@@ -65,8 +71,18 @@ fn nodes_file(folder: &Path, fleet: Fleet) -> PathBuf {
 }
 
 impl Store {
-    /// Keeps new keys in a folder, which is made for this user alone if it is not there.
+    /// Keeps new keys, and the file of each node, in a folder, which is made for this user alone if it is not there.
     pub fn create(folder: &Path, keys: FleetKeys) -> Result<Self, KeyError> {
+        Self::create_unless(folder, keys, &|| false).map(|(store, _)| store)
+    }
+
+    /// As [`create`](Self::create), with the files of nodes that were written: all of it, or nothing where a file cannot be
+    /// written or `stop` says so before the first one is in its place ([`KeyError::Stopped`]).
+    pub fn create_unless(
+        folder: &Path,
+        keys: FleetKeys,
+        stop: &dyn Fn() -> bool,
+    ) -> Result<(Self, Vec<Written>), KeyError> {
         file::make_folder(folder)?;
         let lock = lock(folder)?;
         let fleet = keys.members().fleet();
@@ -75,12 +91,20 @@ impl Store {
             return Err(KeyError::Exists { path, fleet });
         }
         let store = Self { folder: folder.to_owned(), keys, _lock: lock };
-        // What could not be saved is told while there is no root that would be in the way of the next try.
-        store.planned()?;
-        // A list of nodes without its root is of keys that nobody has any more.
-        file::write_private(&nodes_file(folder, fleet), store.keys.members().text().as_bytes())?;
-        file::create(&path, &root_text(fleet, store.keys.root()))?;
-        Ok(store)
+        let (ready, list) = store.ready(stop)?;
+        let root = Staged::write(&path, root_text(fleet, store.keys.root()).as_bytes())?;
+        if stop() {
+            return Err(KeyError::Stopped);
+        }
+        // The root comes last: while there is none, nothing else is a fleet, or in the way of the next try.
+        let mut made = Vec::new();
+        let written = put_all(ready, &mut made).and_then(|written| {
+            made.push(list.path().to_owned());
+            list.put().and_then(|()| root.put_new()).map(|()| written)
+        });
+        let written = written.inspect_err(|_| made.iter().for_each(|path| drop(file::remove(path))))?;
+        file::keep_names(folder)?;
+        Ok((store, written))
     }
 
     /// The keys of a fleet in a folder.
@@ -97,9 +121,11 @@ impl Store {
     pub fn peek(folder: &Path, fleet: Fleet) -> Result<FleetKeys, KeyError> {
         let path = root_file(folder, fleet);
         let (text, _) = file::read(&path)?;
+        file::advise(&path, &text);
         let root = parse_root(&text, fleet).map_err(|error| file::form(&path, error))?;
         let path = nodes_file(folder, fleet);
         let (text, _) = file::read(&path).map_err(|error| without_nodes(error, fleet))?;
+        file::advise(&path, &text);
         let members = Members::parse(&text).and_then(|members| is_of(members, fleet));
         let members = members.map_err(|error| file::form(&path, error))?;
         Ok(FleetKeys::new(root, members))
@@ -140,12 +166,53 @@ impl Store {
     }
 
     /// Writes the list of nodes and every node's file that is not as it should be; those are told. Where one of them is
-    /// refused, nothing is written. Where writing fails or is interrupted, the next one completes it.
+    /// refused, or cannot be written, nothing is changed. Where the host goes down between the first file that is put in
+    /// its place and the last, the next call completes it.
     pub fn save(&self) -> Result<Vec<Written>, KeyError> {
+        self.save_unless(&|| false)
+    }
+
+    /// As [`save`](Self::save); nothing is changed where `stop` says so before the first file is in its place
+    /// ([`KeyError::Stopped`]).
+    pub fn save_unless(&self, stop: &dyn Fn() -> bool) -> Result<Vec<Written>, KeyError> {
+        let fleet = self.keys.members().fleet();
+        let ((ready, list), root) = (self.ready(stop)?, self.root_with_checksum()?);
+        if stop() {
+            return Err(KeyError::Stopped);
+        }
+        root.map_or(Ok(()), Staged::put)?;
+        list.put()?;
+        let written = put_all(ready, &mut Vec::new()).and_then(|written| {
+            file::keep_names(&self.folder)?;
+            Ok(written)
+        });
+        written.map_err(|error| KeyError::HalfWay { fleet, error: Box::new(error) })
+    }
+
+    /// All that is to be put in its place, on the disk: of nodes, and their list.
+    fn ready(&self, stop: &dyn Fn() -> bool) -> Result<(Vec<Ready>, Staged), KeyError> {
         let (members, planned) = (self.keys.members(), self.planned()?);
-        file::write_private(&nodes_file(&self.folder, members.fleet()), members.text().as_bytes())?;
-        let written = planned.into_iter().map(Planned::carry_out).collect::<Result<_, _>>();
-        written.map_err(|error| KeyError::HalfWay { fleet: members.fleet(), error: Box::new(error) })
+        file::remove_staged(&self.folder)?;
+        let mut ready = Vec::with_capacity(planned.len());
+        for Planned { to_be, text } in planned {
+            if stop() {
+                return Err(KeyError::Stopped);
+            }
+            let staged = text.map(|text| Staged::write(&to_be.path, text.as_bytes())).transpose()?;
+            ready.push(Ready { to_be, staged });
+        }
+        let list = Staged::write(&nodes_file(&self.folder, members.fleet()), members.text().as_bytes())?;
+        Ok((ready, list))
+    }
+
+    /// The root's file as it is written today, where the one that is there has no checksum.
+    fn root_with_checksum(&self) -> Result<Option<Staged>, KeyError> {
+        let path = self.root_file();
+        let (text, _) = file::read(&path)?;
+        if checksum(&text) != Checksum::Absent {
+            return Ok(None);
+        }
+        Staged::write(&path, root_text(self.keys.members().fleet(), self.keys.root()).as_bytes()).map(Some)
     }
 
     /// Whether a node's file is of other generations than the list of nodes: a change of keys was interrupted, and
@@ -193,21 +260,26 @@ impl Store {
     }
 }
 
-impl Planned {
-    fn carry_out(self) -> Result<Written, KeyError> {
-        match &self.text {
-            Some(text) => file::write_private(&self.to_be.path, text.as_bytes())?,
-            None => drop(file::remove(&self.to_be.path)?),
+/// Puts files in their places; `made` gets those of places that were empty.
+fn put_all(ready: Vec<Ready>, made: &mut Vec<PathBuf>) -> Result<Vec<Written>, KeyError> {
+    let put = |Ready { to_be, staged }| {
+        match staged {
+            Some(staged) => staged.put()?,
+            None => drop(file::remove(&to_be.path)?),
         }
-        Ok(self.to_be)
-    }
+        if to_be.change == Change::New {
+            made.push(to_be.path.clone());
+        }
+        Ok(to_be)
+    };
+    ready.into_iter().map(put).collect()
 }
 
-/// The text of a node's file, if there is one; an empty one where it is not even text, and only to be written again.
+/// The text of a node's file, if there is one; an empty one where it is damaged, and only to be written again.
 fn own_text(path: &Path) -> Result<Option<Zeroizing<String>>, KeyError> {
     match file::read(path) {
         Ok((text, _)) => Ok(Some(text)),
-        Err(KeyError::Form { .. }) => Ok(Some(Zeroizing::default())),
+        Err(KeyError::Form { .. } | KeyError::Damaged(_)) => Ok(Some(Zeroizing::default())),
         Err(KeyError::System { error, .. }) if error.kind() == ErrorKind::NotFound => Ok(None),
         Err(error) => Err(error),
     }
@@ -238,22 +310,23 @@ fn root_text(fleet: Fleet, root: &RootKey) -> Zeroizing<String> {
     ));
     push_key(&mut text, root.expose());
     text.push('\n');
+    push_sum(&mut text);
     debug_assert!(text.len() <= ROOT_BYTES, "a text that grows leaves keys behind");
     text
 }
 
 fn parse_root(text: &str, fleet: Fleet) -> Result<RootKey, FormError> {
     let mut lines = Lines::of(text);
-    let head = lines.expect("cara-root", "here `cara-root 1` is expected: this is no fleet's root")?;
-    if head.number()? != FORM {
-        return Err(head.wrong("this root is written in a form that this version does not know"));
-    }
+    lines.head("cara-root", "here `cara-root 2` is expected: this is no fleet's root")?;
     let line = lines.expect("fleet", "here `fleet` is expected")?;
     if line.number()? != fleet.0 {
         return Err(line.wrong("this is the root of another fleet than its file's name says"));
     }
     let (key, _) = lines.expect("root", "here `root` is expected")?.key()?;
-    Ok(RootKey::new(*key))
+    match lines.next() {
+        Some(line) => Err(line.wrong("here the file should end")),
+        None => Ok(RootKey::new(*key)),
+    }
 }
 
 fn is_of(members: Members, fleet: Fleet) -> Result<Members, FormError> {
@@ -363,11 +436,134 @@ mod tests {
         let anew = || {
             let mut keys = FleetKeys::draw(Fleet(7)).unwrap();
             keys.add(&depot(), &[]).unwrap();
-            Store::create(&path, keys)
+            Store::create_unless(&path, keys, &|| false)
         };
         assert!(matches!(anew(), Err(KeyError::Open { .. })) && !root.exists());
         fs::set_permissions(&ring, fs::Permissions::from_mode(0o600)).unwrap();
-        assert_eq!(changes(&anew().unwrap().save().unwrap()), [("depot/1".into(), Change::Replaced)]);
+        let (store, written) = anew().unwrap();
+        assert_eq!(changes(&written), [("depot/1".into(), Change::Replaced)]);
+        assert_eq!(store.save().unwrap(), []);
+    }
+
+    fn names(folder: &Path) -> Vec<String> {
+        let entries = fs::read_dir(folder).into_iter().flatten();
+        let mut names: Vec<_> = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+        names.sort();
+        names
+    }
+
+    /// Stopped before its first file, and before each further one.
+    #[test]
+    fn a_new_fleet_that_is_stopped_leaves_nothing() {
+        let folder = tempfile::tempdir().unwrap();
+        for looks in 0.. {
+            let mut keys = FleetKeys::draw(Fleet(7)).unwrap();
+            keys.add_all(&[depot(), agv(1), agv(2)], &[]).unwrap();
+            let left = std::cell::Cell::new(looks);
+            let stop = || left.replace(left.get() - 1) == 0;
+            match Store::create_unless(folder.path(), keys, &stop) {
+                Err(KeyError::Stopped) => assert_eq!(names(folder.path()), [""; 0], "stopped at look {looks}"),
+                made => {
+                    assert_eq!((made.unwrap().1.len(), looks), (3, 4));
+                    break;
+                }
+            }
+        }
+        assert_eq!(names(folder.path()).len(), 5, "root, list and three nodes");
+    }
+
+    #[test]
+    fn a_change_that_is_stopped_changes_nothing() {
+        let (_folder, mut store) = store();
+        let all = |store: &Store| {
+            names(store.folder()).iter().map(|name| fs::read(store.folder().join(name)).unwrap()).collect::<Vec<_>>()
+        };
+        let before = all(&store);
+        store.keys_mut().rotate().unwrap();
+        for looks in 0..4 {
+            let left = std::cell::Cell::new(looks);
+            assert!(matches!(store.save_unless(&|| left.replace(left.get() - 1) == 0), Err(KeyError::Stopped)));
+            assert!(all(&store) == before, "stopped at look {looks}");
+        }
+        assert_eq!(store.save().unwrap().len(), 3);
+    }
+
+    /// Where a file cannot be put in its place, what was made before it goes again.
+    #[test]
+    fn a_new_fleet_whose_root_cannot_be_put_there_leaves_nothing() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut keys = FleetKeys::draw(Fleet(7)).unwrap();
+        keys.add_all(&[depot(), agv(1)], &[]).unwrap();
+        let root = root_file(folder.path(), Fleet(7));
+        // Another one comes in between, past the lock.
+        let come = || {
+            fs::write(&root, "").unwrap();
+            false
+        };
+        assert!(matches!(Store::create_unless(folder.path(), keys, &come), Err(KeyError::System { .. })));
+        assert_eq!(names(folder.path()), ["fleet-7.root"]);
+    }
+
+    /// The root, the list and a ring: each bit, each digit that becomes another one, each length that is too short.
+    #[test]
+    fn every_flipped_bit_or_digit_is_refused_with_advice() {
+        type Parse = fn(&str) -> Result<(), FormError>;
+        let (_folder, store) = store();
+        let (folder, copy) = (store.folder().to_owned(), "Take this file from your copy");
+        let kinds: [(PathBuf, Parse, &str); 3] = [
+            (root_file(&folder, Fleet(7)), |text| parse_root(text, Fleet(7)).map(drop), copy),
+            (nodes_file(&folder, Fleet(7)), |text| Members::parse(text).map(drop), copy),
+            (store.file_of(&depot()), |text| KeyRing::parse(text).map(drop), "`cara keys derive --fleet 7` where the"),
+        ];
+        let digits = b"0123456789abcdef";
+        for (path, parse, advice) in kinds {
+            let right = fs::read(&path).unwrap();
+            let read = |bytes: &[u8]| {
+                let text = file::text_of(&path, bytes.to_vec())?;
+                parse(&text).map_err(|error| file::form(&path, error))
+            };
+            assert!(read(&right).is_ok());
+            let refused = |bytes: &[u8]| {
+                let Err(error) = read(bytes) else { panic!("taken: {:?}", String::from_utf8_lossy(bytes)) };
+                assert!(matches!(error, KeyError::Damaged(_) | KeyError::Form { .. }), "{error:?}");
+                assert!(error.to_string().contains(advice), "{error}");
+            };
+            for (at, &byte) in right.iter().enumerate() {
+                let bits = (0..8).map(|bit| byte ^ 1 << bit);
+                let others = digits.iter().copied().filter(|digit| digits.contains(&byte) && *digit != byte);
+                for other in bits.chain(others) {
+                    let mut wrong = right.clone();
+                    wrong[at] = other;
+                    refused(&wrong);
+                }
+                refused(&right[..at]);
+            }
+            // The file itself, once.
+            fs::write(&path, right.to_ascii_uppercase()).unwrap();
+        }
+        assert!(matches!(Store::peek(&folder, Fleet(7)), Err(KeyError::Damaged(_) | KeyError::Form { .. })));
+        assert!(matches!(KeyRing::load(&store.file_of(&depot())), Err(KeyError::Form { .. })));
+    }
+
+    #[test]
+    fn files_without_a_checksum_are_read_and_get_one() {
+        let (_folder, store) = store();
+        let (folder, ring) = (store.folder().to_owned(), store.file_of(&agv(1)));
+        let paths = [root_file(&folder, Fleet(7)), nodes_file(&folder, Fleet(7)), ring.clone()];
+        let right = paths.each_ref().map(|path| fs::read(path).unwrap());
+        for path in &paths {
+            let text = fs::read_to_string(path).unwrap();
+            let (before, _) = text.split_at(text.find("sum ").unwrap());
+            let old = ["cara-root", "cara-fleet", "cara-ring"]
+                .iter()
+                .fold(before.to_owned(), |text, word| text.replace(&format!("{word} 2"), &format!("{word} 1")));
+            fs::write(path, old).unwrap();
+        }
+        assert!(KeyRing::load(&ring).is_ok());
+        drop(store);
+        let store = Store::open(&folder, Fleet(7)).unwrap();
+        assert_eq!(changes(&store.save().unwrap()), [("agv/1".into(), Change::Replaced)]);
+        assert!(paths.each_ref().map(|path| fs::read(path).unwrap()) == right);
     }
 
     #[test]
@@ -422,6 +618,8 @@ mod tests {
         for (wrong, line) in
             [(text.replace("fleet 7\n", "fleet 8\n"), 3), (text.replace("root ", "root x"), 2), (String::new(), 1)]
         {
+            let mut wrong = wrong.split("sum ").next().unwrap().to_owned();
+            push_sum(&mut wrong);
             fs::write(&root, wrong).unwrap();
             match Store::open(&path, Fleet(7)) {
                 Err(KeyError::Form { line: found, .. }) => assert_eq!(found, line),

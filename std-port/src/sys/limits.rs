@@ -1,5 +1,7 @@
 //! How many descriptors the process may have: each link takes one.
 
+use std::os::fd::{AsFd, AsRawFd};
+
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 
 /// Descriptors that a process has besides the links: its own files, and the sockets and wakers of a few units.
@@ -29,6 +31,13 @@ pub fn make_room_for(links: usize) {
     if !is_enough(getrlimit(Resource::Nofile).current, needed) && !is_enough(Some(raise()), needed) {
         tracing::warn!(needed, limit = raise(), "fewer files may be open than links are allowed: raise ulimit -Hn");
     }
+}
+
+/// How many descriptors the process may open beyond this one. It is the newest, and the system gives the lowest number that is
+/// free: so all below are taken.
+pub fn left_above(newest: impl AsFd) -> u64 {
+    let number = u64::try_from(newest.as_fd().as_raw_fd()).unwrap_or(0);
+    getrlimit(Resource::Nofile).current.map_or(u64::MAX, |limit| limit.saturating_sub(number + 1))
 }
 
 fn is_enough(limit: Option<u64>, needed: u64) -> bool {

@@ -5,11 +5,11 @@
 
 use std::io::{self, IoSlice};
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
-use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd};
 
 use cara_core::error::CloseReason;
 use cara_core::time::Duration;
-use rustix::io::{Errno, ioctl_fionbio, ioctl_fionread};
+use rustix::io::{Errno, fcntl_dupfd_cloexec, ioctl_fionbio, ioctl_fionread};
 use rustix::net::{
     AddressFamily, RecvFlags, SendAncillaryBuffer, SendFlags, Shutdown, SocketFlags, SocketType, accept_with, bind,
     connect, getpeername, getsockname, listen, recv, send, sendmsg, shutdown, socket_with, sockopt,
@@ -86,6 +86,14 @@ impl Stream {
         }
         ioctl_fionbio(&self.socket, false).map_err(dial_failed)?;
         Ok(true)
+    }
+
+    /// The same stream behind the lowest descriptor that is free, if that is lower than its own.
+    pub fn with_lowest_number(self) -> Self {
+        match fcntl_dupfd_cloexec(&self.socket, 0) {
+            Ok(socket) if socket.as_raw_fd() < self.socket.as_raw_fd() => Self { socket },
+            _ => self,
+        }
     }
 
     /// The peer's address; `None` when the stream is not connected.
@@ -236,10 +244,7 @@ impl Listener {
                     return Accepted::Stream(stream, peer);
                 }
                 Err(Errno::AGAIN) => return Accepted::WouldBlock,
-                Err(errno @ (Errno::MFILE | Errno::NFILE | Errno::NOBUFS | Errno::NOMEM)) => {
-                    tracing::warn!(%errno, "a connection cannot be taken: raise the limit of open files");
-                    return Accepted::Exhausted;
-                }
+                Err(Errno::MFILE | Errno::NFILE | Errno::NOBUFS | Errno::NOMEM) => return Accepted::Exhausted,
                 // The socket itself is of no use any more; nothing will come from it.
                 Err(Errno::BADF | Errno::INVAL | Errno::NOTSOCK | Errno::OPNOTSUPP) => return Accepted::WouldBlock,
                 // The rest are errors of the connection that was being taken.

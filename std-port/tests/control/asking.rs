@@ -102,15 +102,15 @@ fn a_node_that_is_not_meant_alone_is_a_failure_that_lists_what_there_is() {
     let depot = Depot::new();
     let mut client = depot.client();
     let functions = |node: &str| Question::Functions { node: node.to_owned() };
-    assert!(ask(&mut client, functions("agv")).unwrap_err().text.contains("none has joined"));
-    let _agvs = [depot.agv("agv", 7), depot.agv("agv", 8)];
-    let failure = ask(&mut client, functions("agv")).unwrap_err();
+    assert!(ask(&mut client, functions("twin")).unwrap_err().text.contains("none has joined"));
+    let _agvs = [depot.agv("twin", 7), depot.agv("twin", 8)];
+    let failure = ask(&mut client, functions("twin")).unwrap_err();
     assert_eq!((failure.error.as_str(), failure.cause.as_str()), ("AmbiguousNode", "configuration"));
-    assert!(failure.text.contains("agv/7") && failure.text.contains("agv/8"), "{failure}");
-    let failure = ask(&mut client, functions("agv/9")).unwrap_err();
+    assert!(failure.text.contains("twin/7") && failure.text.contains("twin/8"), "{failure}");
+    let failure = ask(&mut client, functions("twin/9")).unwrap_err();
     assert_eq!(failure.error, "UnknownNode");
-    assert!(failure.text.contains("agv/7, agv/8"), "{failure}");
-    assert!(ask(&mut client, functions("agv/8")).is_ok());
+    assert!(failure.text.contains("twin/7, twin/8"), "{failure}");
+    assert!(ask(&mut client, functions("twin/8")).is_ok());
 }
 
 #[test]
@@ -131,7 +131,9 @@ fn every_question_about_a_node_fails_for_one_that_is_away() {
     );
     let answers = ask(&mut client, Question::Call(call(Some("agv"), "echo", vec![]))).unwrap();
     assert!(matches!(&answers[..], [Answer::Called { error: Some(failure), .. }] if failure.error == "NotConnected"));
-    assert_eq!(refused(&mut client, Question::Call(call(None, "echo", vec![]))), "UnknownFunction");
+    let all = ask(&mut client, Question::Call(call(None, "echo", vec![]))).unwrap();
+    let [Answer::Called { error: Some(failure), .. }] = &all[..] else { panic!("{all:?}") };
+    assert_eq!(failure.error, "NotConnected");
 }
 
 #[test]
@@ -263,7 +265,7 @@ fn a_connection_without_room_is_counted() {
     let small = small.control(cara_std::control::Control::Off).build_system().unwrap();
     small.start().unwrap();
     assert_eq!(small.control_path(), None);
-    let agv = vehicle_of(("small", 2), "agv", 9, fleet).build_unit().unwrap();
+    let agv = vehicle_of(("small", 2), "lone-agv", 9, fleet).build_unit().unwrap();
     agv.start().unwrap();
     until("the only link is taken", || small.number_of_s_units() == 1);
     let refused = || small.counters().iter().find(|(name, _)| *name == "ConnectionsRefused").unwrap().1;

@@ -84,7 +84,9 @@ fn options_that_cannot_be_are_refused() {
     let datagram = CallQuestion { best_effort: true, ..plain() };
     assert_eq!(refused(&mut client, Question::Call(datagram)), "BadQuestion");
     assert_eq!(refused(&mut client, Question::Call(call(Some("x"), "fail", vec![]))), "UnknownNode");
-    assert_eq!(refused(&mut client, Question::Call(call(None, "fly", vec![]))), "UnknownFunction");
+    let all = ask(&mut client, Question::Call(call(None, "fly", vec![]))).unwrap();
+    let [Answer::Called { error: Some(failure), .. }] = &all[..] else { panic!("{all:?}") };
+    assert_eq!((failure.error.as_str(), failure.cause.as_str()), ("UnknownFunction", "peer"));
     let nobody = Question::Bench { call: call(None, "fail", vec![]), count: 1, pause_us: 0 };
     assert_eq!(refused(&mut client, nobody), "BadQuestion");
 }
@@ -129,6 +131,37 @@ fn all_are_called_at_the_same_time() {
         answers.len() == 4
             && answers.iter().all(|answer| matches!(answer, Answer::Called { call: Some(_), error: None, .. }))
     );
+}
+
+/// Nobody is passed over in silence.
+#[test]
+fn a_call_of_all_tells_who_was_not_called() {
+    let depot = Depot::new();
+    let agvs: Vec<_> = (0..3).map(|id| depot.agv(&format!("agv{id}"), id)).collect();
+    agvs[0].stop();
+    agvs[1].my_function_list().remove("fail").unwrap();
+    let peer = |id: u32| depot.system.roster().into_iter().find(|peer| peer.id() == id).unwrap();
+    until("one has left", || !peer(0).is_connected());
+    until("one has withdrawn it", || !peer(1).their_function_list().contains("fail"));
+    let mut client = depot.client();
+    for asynchronous in [false, true] {
+        let question = CallQuestion { asynchronous, ..call(None, "fail", vec![]) };
+        let answers = ask(&mut client, Question::Call(question)).unwrap();
+        let mut told: Vec<_> = answers
+            .iter()
+            .map(|answer| match answer {
+                Answer::Called { id, error, .. } => (*id, error.as_ref().map(|failure| failure.error.clone())),
+                other => panic!("{other:?}"),
+            })
+            .collect();
+        told.sort();
+        let ran = (!asynchronous).then(|| "Service".to_owned());
+        assert_eq!(told, [(0, Some("NotConnected".into())), (1, Some("UnknownFunction".into())), (2, ran)]);
+    }
+    // Also where nobody offers it; what is retired is not missed.
+    assert!(peer(0).retire());
+    let answers = ask(&mut client, Question::Call(call(None, "fly", vec![]))).unwrap();
+    assert_eq!(answers.len(), 2, "{answers:?}");
 }
 
 #[test]

@@ -25,6 +25,14 @@ impl Raw {
         raw
     }
 
+    /// One that is not idle.
+    fn watching(depot: &Depot) -> Self {
+        let mut raw = Self::new(depot);
+        raw.write(b"{\"ask\":\"watch\"}\n");
+        assert!(matches!(raw.read(), Answer::Event { event, .. } if event == "watching"));
+        raw
+    }
+
     fn write(&mut self, bytes: &[u8]) {
         self.stream.write_all(bytes).unwrap();
     }
@@ -149,7 +157,7 @@ fn crate_arguments() -> Vec<cara_std::control::protocol::Argument> {
 #[test]
 fn the_ninth_client_is_told_why_it_is_not_taken() {
     let depot = Depot::new();
-    let mut clients: Vec<_> = (0..8).map(|_| depot.client()).collect();
+    let mut clients: Vec<_> = (0..8).map(|_| Raw::watching(&depot)).collect();
     match Client::connect(&depot.path()) {
         Err(error @ ControlError::Full { .. }) => assert!(error.to_string().contains("close one"), "{error}"),
         other => panic!("{:?}", other.map(|client| client.unit().clone())),
@@ -157,11 +165,50 @@ fn the_ninth_client_is_told_why_it_is_not_taken() {
     let units = running_in(depot.directory.path()).unwrap();
     assert!(matches!(&units[..], [RunningUnit { state: UnitState::Full(_), .. }]), "{units:?}");
     assert!(matches!(Client::find_in(depot.directory.path(), None), Err(ControlError::Full { .. })));
-    for client in &mut clients {
-        assert_eq!(ask(client, Question::Search).unwrap(), []);
-    }
     clients.pop();
     until("there is room again", || Client::connect(&depot.path()).is_ok());
+}
+
+/// Clients that ask nothing give way, and one that waits for events does not.
+#[test]
+fn idle_clients_do_not_lock_the_operator_out() {
+    let depot = Depot::new();
+    let mut watching = Raw::watching(&depot);
+    let mut idle: Vec<_> = (0..7).map(|_| depot.client()).collect();
+    let mut more = Vec::new();
+    for _ in 0..8 {
+        until("the next one is taken", || Client::connect(&depot.path()).map(|client| more.push(client)).is_ok());
+    }
+    let serves = |client: &mut Client| {
+        client.ask(&Question::Unit).is_ok_and(|mut answers| matches!(answers.next(), Some(Ok(_))))
+    };
+    assert!(!idle.iter_mut().all(serves), "some had to go");
+    let _agv = depot.agv("agv", 7);
+    assert!(matches!(watching.read(), Answer::Event { event, .. } if event == "joined" || event == "not_joined"));
+}
+
+/// A unit that hangs takes the time of a question to it, not of one to another unit.
+#[test]
+fn a_unit_that_hangs_holds_up_no_question_to_another() {
+    let depot = Depot::new();
+    let directory = depot.directory.path();
+    let _hung: Vec<_> =
+        (1..4).map(|id| UnixListener::bind(directory.join(format!("hung-{id}-3.sock"))).unwrap()).collect();
+    let other = manager("other", 9, depot.fleet).control(Control::Path(directory.join("other-9-3.sock")));
+    let other = other.build_system().unwrap();
+    other.start().unwrap();
+    let took = |unit: Option<&str>| {
+        let start = std::time::Instant::now();
+        let found = Client::find_in(directory, unit).map(|client| client.unit().unit.clone());
+        (found.ok(), start.elapsed())
+    };
+    let (found, of_another) = took(Some("other/9"));
+    let (_, of_all) = took(None);
+    assert_eq!(found.as_deref(), Some("other/9"));
+    // One time-out for all that hang, and none for who does not ask them: on any machine the longer one waits for it.
+    assert!(of_all >= Duration::from_secs(2) && of_another < of_all, "{of_another:?}, {of_all:?}");
+    let units = running_in(directory).unwrap();
+    assert_eq!(units.iter().filter(|unit| unit.state == UnitState::Silent).count(), 3);
 }
 
 #[test]

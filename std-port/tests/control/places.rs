@@ -24,6 +24,18 @@ fn the_socket_is_its_owners_alone_and_goes_with_the_unit() {
 }
 
 #[test]
+fn a_unit_that_is_started_twice_keeps_its_socket() {
+    let depot = Depot::new();
+    depot.system.start().unwrap();
+    assert_eq!(depot.system.control_path(), Some(depot.path()));
+    assert_eq!(depot.client().unit().fleet, depot.fleet);
+    depot.system.stop();
+    assert!(!depot.path().exists());
+    depot.system.start().unwrap_err();
+    assert_eq!((depot.system.control_path(), depot.path().exists()), (None, false));
+}
+
+#[test]
 fn a_directory_that_others_enter_is_refused_and_the_unit_runs() {
     let above = directory();
     let open = above.path().join("open");
@@ -33,7 +45,7 @@ fn a_directory_that_others_enter_is_refused_and_the_unit_runs() {
     let lone = manager("lone", 2, depot.fleet).control(Control::Path(open.join("x.sock"))).build_system().unwrap();
     lone.start().unwrap();
     assert_eq!((lone.control_path(), open.join("x.sock").exists()), (None, false));
-    let agv = vehicle_of(("lone", 2), "agv", 9, depot.fleet).build_unit().unwrap();
+    let agv = vehicle_of(("lone", 2), "lone-agv", 9, depot.fleet).build_unit().unwrap();
     agv.start().unwrap();
     until("it is a manager as any other", || lone.number_of_s_units() == 1);
     match Client::find_in(&open, None) {

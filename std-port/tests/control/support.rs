@@ -73,6 +73,8 @@ impl Depot {
         let system = manager("manager", 1, fleet).control(Control::Path(directory.path().join("manager.sock")));
         let system = system.build_system().unwrap();
         system.start().unwrap();
+        // All have keys, and each test starts those that it is about.
+        system.roster().iter().for_each(|absent| assert!(absent.retire()));
         Self { fleet, directory, system, gate: Default::default() }
     }
 
@@ -102,7 +104,7 @@ impl Depot {
             gate.pass();
             Ok(())
         };
-        let leased = ServiceOptions::new().priority(Priority::High).idempotent().lease(Duration::from_secs(2), |_| {});
+        let leased = ServiceOptions::new().priority(Priority::High).idempotent().lease(Duration::from_secs(2), || {});
         list.add_service(&format!("echo{EVERY_TYPE} -> {EVERY_TYPE}").parse().unwrap(), ServiceOptions::new(), echo)
             .unwrap();
         list.add_service(&"fail()".parse().unwrap(), ServiceOptions::new(), fail).unwrap();
@@ -138,7 +140,8 @@ pub(crate) fn vehicle_of(manager: (&str, u32), name: &str, id: u32, fleet: u32) 
 /// All vehicles of these tests.
 fn vehicles() -> Vec<Identity> {
     let numbered = (0..4).map(|id| (format!("agv{id}"), id));
-    let all = [7, 8, 9].map(|id| ("agv".to_owned(), id)).into_iter().chain(numbered);
+    let named = [("agv", 7), ("twin", 7), ("twin", 8), ("lone-agv", 9)].map(|(name, id)| (name.to_owned(), id));
+    let all = named.into_iter().chain(numbered);
     all.map(|(name, id)| Identity::s_unit(&name, id).unwrap()).collect()
 }
 

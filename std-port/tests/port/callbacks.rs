@@ -96,7 +96,7 @@ fn a_hook_does_not_wait_for_the_method_whose_thread_runs_it() {
             Ok(())
         };
     agv.my_function_list().add_function("asks_back", &number(0), asks_back).unwrap();
-    agv.on_manager_lost(|state| state.push("lost"));
+    agv.on_manager_lost(|state| state.push("lost")).unwrap();
     let gate = Arc::new(crate::support::Gate::default());
     let at_gate = gate.clone();
     let never = service(move |number| {

@@ -18,6 +18,25 @@ fn an_interval_set_while_running_holds_at_both_ends() {
     until("it is told again", || peer.request("f", &number(1)).is_ok());
 }
 
+/// By hand, for one of two nodes.
+#[test]
+fn an_interval_set_for_one_node_holds_for_that_node_alone() {
+    let fleet = fleet();
+    let manager = system(fleet).build_system().unwrap();
+    let units = [("first", 1), ("second", 2)].map(|(name, id)| unit(name, id, fleet).build_unit().unwrap());
+    let [first, second] = units.each_ref().map(|agv| {
+        agv.my_function_list().add_function("f", &number(0), service(|number| number)).unwrap();
+        meet(&manager, agv).0
+    });
+    let interval = cara_std::Duration::from_secs(30);
+    first.set_constraints(Constraints { minimum_interval: interval, ..first.constraints() }).unwrap();
+    assert!(first.request("f", &number(1)).is_ok());
+    assert!(matches!(first.request("f", &number(2)), Err(Error::TooSoon { wait }) if wait <= interval));
+    assert_eq!((ask(&second, "f", 1), ask(&second, "f", 2)), (Ok(1), Ok(2)), "the other one is as it was");
+    first.set_constraints(Constraints { minimum_interval: cara_std::Duration::ZERO, ..first.constraints() }).unwrap();
+    assert_eq!((ask(&first, "f", 1), ask(&first, "f", 2)), (Ok(1), Ok(2)));
+}
+
 /// Larger messages than either unit began with.
 #[test]
 fn longer_messages_are_allowed_while_running() {

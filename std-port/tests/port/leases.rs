@@ -4,7 +4,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-use cara_std::{CommunicationSystem, Error, LeaseWatch, Peer, RequestOptions, ServiceOptions, Unit, UnitEvent};
+use cara_std::{
+    CommunicationSystem, Error, LeaseEnd, LeaseWatch, Peer, RequestOptions, ServiceOptions, Unit, UnitEvent,
+};
 
 use crate::support::{PATIENCE, fleet, meet, number, service, system, unit, until};
 
@@ -25,8 +27,7 @@ fn vehicle() -> Vehicle {
     let agv = unit("agv", 7, fleet).state(0_i64).build_unit().unwrap();
     let stops = Arc::new(AtomicUsize::new(0));
     let stopped = stops.clone();
-    let safe = move |speed: &mut i64| {
-        *speed = 0;
+    let safe = move || {
         stopped.fetch_add(1, Ordering::SeqCst);
     };
     let go_to = |speed: &mut i64, mut parameters: cara_std::Parameters| {
@@ -35,8 +36,8 @@ fn vehicle() -> Vehicle {
         parameters
     };
     let definition = "go_to(number: int[1]) -> (number: int[1])".parse().unwrap();
-    let lease =
-        agv.my_function_list().add_service(&definition, ServiceOptions::new().lease(LEASE, safe), go_to).unwrap();
+    let options = ServiceOptions::new().lease(LEASE, safe).then(|speed: &mut i64| *speed = 0);
+    let lease = agv.my_function_list().add_service(&definition, options, go_to).unwrap();
     agv.my_function_list().add_function("echo", &number(0), service(|number| number)).unwrap();
     let (peer, _) = meet(&manager, &agv);
     Vehicle { manager, agv, peer, lease, stops }
@@ -63,7 +64,7 @@ impl Vehicle {
     fn assert_stopped(&self) {
         until("the safe hook has run", || self.stops() == 1);
         assert!(!self.lease.is_live());
-        assert_eq!(self.speed(), 0);
+        until("what needs the state has run behind it", || self.speed() == 0);
     }
 }
 
@@ -124,8 +125,8 @@ fn what_has_finished_ends_without_the_hook() {
     vehicle.agv.my_function_list().end_lease("go_to");
     assert!(!vehicle.lease.is_live());
     loop {
-        if let UnitEvent::LeaseEnded { function, expired, .. } = events.recv_timeout(PATIENCE).unwrap() {
-            assert_eq!((function.as_str(), expired), ("go_to", false));
+        if let UnitEvent::LeaseEnded { function, why, .. } = events.recv_timeout(PATIENCE).unwrap() {
+            assert_eq!((function.as_str(), why), ("go_to", LeaseEnd::Finished));
             break;
         }
     }
@@ -140,31 +141,32 @@ fn the_loss_of_the_manager_is_told_to_the_hook_once() {
     let vehicle = vehicle();
     let lost = Arc::new(AtomicUsize::new(0));
     let told = lost.clone();
-    vehicle.agv.on_manager_lost(move |_| {
-        told.fetch_add(1, Ordering::SeqCst);
-    });
+    vehicle
+        .agv
+        .on_manager_lost(move |_| {
+            told.fetch_add(1, Ordering::SeqCst);
+        })
+        .unwrap();
     vehicle.manager.stop();
     until("the hook has run", || lost.load(Ordering::SeqCst) == 1);
     vehicle.agv.stop();
     assert_eq!(lost.load(Ordering::SeqCst), 1);
 }
 
-/// The manager's process is gone without a goodbye: see `processes.rs` for the same with a kill. Here the method that
-/// moves is still running when the lease ends, and the hook comes right after it.
+/// The manager's process is gone without a goodbye: see `processes.rs` for the same with a kill. Here somebody holds the
+/// state when the lease ends: the hook waits for nobody, and what needs the state comes when it is free.
 #[test]
-fn a_hook_comes_right_after_a_method_that_holds_the_state() {
+fn a_hook_waits_for_nobody_who_holds_the_state() {
     let vehicle = vehicle();
     vehicle.go(false);
     let agv = vehicle.agv.clone();
-    let stopped_inside = agv
-        .with_state(|speed| {
-            until("the lease has ended", || !vehicle.lease.is_live());
-            // The clock goes on meanwhile: the link is kept alive, and calls without the state are served.
-            assert_eq!(crate::support::ask(&vehicle.peer, "echo", 3), Ok(3));
-            *speed = 5;
-            vehicle.stops()
-        })
-        .unwrap();
-    assert_eq!(stopped_inside, 0);
+    agv.with_state(|speed| {
+        until("the hook has run", || vehicle.stops() == 1);
+        assert!(!vehicle.lease.is_live());
+        // The rest goes on meanwhile: the link is kept alive, and calls without the state are served.
+        assert_eq!(crate::support::ask(&vehicle.peer, "echo", 3), Ok(3));
+        *speed = 5;
+    })
+    .unwrap();
     vehicle.assert_stopped();
 }

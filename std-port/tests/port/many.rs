@@ -6,7 +6,8 @@ use std::time::Duration;
 use cara_std::{Capacities, Constraints, Error, RequestOptions, Threads, Unit, UnitEvent};
 
 use crate::support::{
-    Gate, PATIENCE, ask, counter, fleet, meet, number, pair, publish, service, system, unit, until, value,
+    Gate, PATIENCE, ask, counter, fleet, meet, number, pair, publish, retire_absent, service, system, unit, until,
+    value,
 };
 
 const NODES: u32 = 40;
@@ -42,7 +43,7 @@ fn units_that_share_threads_serve_and_stop_each_by_itself() {
     }
     let rest = agvs.split_off(NODES as usize / 2);
     agvs.iter().for_each(Unit::stop);
-    assert_eq!(agvs.first().unwrap().start(), Err(Error::NotRunning), "it does not start again");
+    assert_eq!(agvs.first().unwrap().start(), Err(Error::NotRunning.into()), "it does not start again");
     drop(threads);
     until("half of them have left", || manager.number_of_s_units() == rest.len());
     for peer in manager.s_units().iter().filter(|peer| peer.is_connected()) {
@@ -80,6 +81,7 @@ fn all_are_called_although_the_interval_has_not_passed() {
     manager.start().unwrap();
     agvs.iter().for_each(|agv| agv.start().unwrap());
     until("all have joined", || all_joined(&manager));
+    retire_absent(&manager);
     let options = RequestOptions { timeout: Some(PATIENCE.into()), ..RequestOptions::default() };
     let began = std::time::Instant::now();
     for _ in 0..2 {

@@ -55,7 +55,7 @@ fn a_full_manager_says_so() {
     assert_eq!(refusal(&events), CloseReason::Refused(Refusal::Full));
     assert_eq!(manager.number_of_s_units(), 1);
     first.stop();
-    until("the second has the first one's place", || manager.s_unit("second").is_some_and(|peer| peer.is_connected()));
+    until("the second has the first one's place", || manager.s_unit("second").is_ok_and(|peer| peer.is_connected()));
     assert_eq!(manager.s_units().len(), 1);
 }
 

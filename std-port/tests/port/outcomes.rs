@@ -7,7 +7,9 @@ use cara_std::{
     CommunicationSystem, Constraints, Delivery, Error, Parameters, Peer, RequestOptions, ServiceError, Unit, UnitEvent,
 };
 
-use crate::support::{Gate, PATIENCE, ask, counter, fleet, meet, number, pair, service, system, unit, until, value};
+use crate::support::{
+    Gate, PATIENCE, ask, counter, fleet, meet, number, pair, retire_absent, service, system, unit, until, value,
+};
 
 /// A manager and `count` s_units with a function `f`, which the last one fails.
 fn fleet_with_one_that_fails(count: u32) -> (CommunicationSystem, Vec<Unit>) {
@@ -30,6 +32,7 @@ fn fleet_with_one_that_fails(count: u32) -> (CommunicationSystem, Vec<Unit>) {
         agv.start().unwrap();
     }
     until("all have come", || manager.nodes_offering("f").len() == count as usize);
+    retire_absent(&manager);
     (manager, units)
 }
 
@@ -43,7 +46,51 @@ fn a_request_to_all_has_an_outcome_for_each() {
             if peer.id() == 2 { Err(Error::Service(ServiceError::Failed(4))) } else { Ok(100 + i64::from(peer.id())) };
         assert_eq!(outcome.map(|parameters| value(&parameters)), expected, "{peer:?}");
     }
-    assert!(manager.block_request_all("g", &number(1), &RequestOptions::default()).is_empty());
+}
+
+/// Nobody is passed over in silence: who is away or has no such function has an outcome too, until it is retired.
+#[test]
+fn a_request_to_all_tells_who_is_missing() {
+    let (manager, units) = fleet_with_one_that_fails(4);
+    units[0].stop();
+    units[1].my_function_list().remove("f").unwrap();
+    let by_id = |id: u32| manager.roster().into_iter().find(|peer| peer.id() == id).unwrap();
+    until("one has left", || !by_id(0).is_connected());
+    until("one has withdrawn it", || by_id(1).their_function_list().is_empty());
+    let outcomes = || {
+        let told = manager.block_request_all("f", &number(100), &RequestOptions::default()).into_iter();
+        let mut told: Vec<_> =
+            told.map(|(peer, outcome)| (peer.id(), outcome.map(|results| value(&results)))).collect();
+        told.sort_unstable_by_key(|(id, _)| *id);
+        told
+    };
+    let fails = (3, Err(Error::Service(ServiceError::Failed(4))));
+    assert_eq!(outcomes(), [(0, Err(Error::NotConnected)), (1, Err(Error::UnknownFunction)), (2, Ok(102)), fails]);
+    let asked = manager.request_all("f", &number(100));
+    let refused = |id: u32| asked.iter().find(|(peer, _)| peer.id() == id).unwrap().1.err();
+    assert_eq!([0, 1, 2, 3].map(refused), [Some(Error::NotConnected), Some(Error::UnknownFunction), None, None]);
+    assert!(by_id(0).retire() && !by_id(1).retire(), "one that is connected stays");
+    assert_eq!(outcomes(), [(1, Err(Error::UnknownFunction)), (2, Ok(102)), fails]);
+}
+
+/// Three vehicles have one name: none of them is meant by it.
+#[test]
+fn a_name_that_several_have_is_refused() {
+    let fleet = fleet();
+    let manager = system(fleet).build_system().unwrap();
+    let units = [1, 11].map(|id| unit("agv-1", id, fleet).build_unit().unwrap());
+    let named = || manager.s_unit("agv-1").map(|peer| peer.id());
+    let (first, _) = meet(&manager, &units[0]);
+    assert_eq!(named(), Err(Error::Ambiguous { ids: [1, 11] }), "the one that is absent may be meant");
+    let (second, _) = meet(&manager, &units[1]);
+    assert_eq!(named(), Err(Error::Ambiguous { ids: [1, 11] }));
+    assert_eq!((first.id(), second.id()), (1, 11), "by identity each is found");
+    units[0].stop();
+    until("it has left", || !first.is_connected());
+    assert_eq!(named(), Err(Error::Ambiguous { ids: [1, 11] }));
+    assert!(first.retire());
+    assert_eq!(named(), Ok(11));
+    assert_eq!(manager.s_unit("nobody").err(), Some(Error::NotConnected));
 }
 
 /// One that wants no replies: it comes back as an event what failed.

@@ -9,7 +9,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-use cara_std::{CloseReason, Error, Refusal, ServiceOptions, UnitEvent};
+use cara_std::{CloseReason, Error, Refusal, ServiceOptions, StartError, UnitEvent};
 use rustix::process::{Pid, Signal, kill_process};
 
 use crate::support::{PATIENCE, ask, fleet, number, service, system, unit, until};
@@ -193,7 +193,7 @@ fn a_restart_and_a_twin_are_told_apart() {
     manager.start().unwrap();
     let _bystander = Process::agv(fleet, "bystander", 2, 20);
     let first = Process::agv(fleet, "agv", 7, 1);
-    let life = |name: &str| manager.s_unit(name).and_then(|peer| ask(&peer, "life", 0).ok());
+    let life = |name: &str| manager.s_unit(name).and_then(|peer| ask(&peer, "life", 0)).ok();
     until("both have come", || (life("agv"), life("bystander")) == (Some(1), Some(20)));
 
     first.freeze();
@@ -222,6 +222,25 @@ fn a_restart_and_a_twin_are_told_apart() {
     assert_eq!((life("agv"), life("bystander"), manager.number_of_s_units()), (Some(2), Some(20), 2));
 }
 
+/// A manager that runs keeps its place; one that hangs does not answer, and its vehicles go to the one that starts.
+#[test]
+fn a_second_manager_starts_only_where_the_first_does_not_answer() {
+    let fleet = fleet();
+    let first = Process::manager(fleet);
+    let agv = unit("agv", 7, fleet).build_unit().unwrap();
+    agv.start().unwrap();
+    until("it has joined the first", || agv.is_connected());
+    let second = system(fleet).build_system().unwrap();
+    let port = agv.manager().and_then(|peer| peer.address()).map(|address| address.port());
+    match second.start() {
+        Err(StartError::AlreadyRunning { at }) => assert_eq!(Some(at.port()), port),
+        other => panic!("one runs already: {other:?}"),
+    }
+    first.freeze();
+    second.start().unwrap();
+    until("the vehicle joins the second", || second.number_of_s_units() == 1);
+}
+
 #[test]
 fn a_vehicle_stops_once_when_its_manager_is_killed() {
     let fleet = fleet();
@@ -230,7 +249,7 @@ fn a_vehicle_stops_once_when_its_manager_is_killed() {
     let agv = unit("agv", 7, fleet).build_unit().unwrap();
     let definition = "go_to(number: int[1]) -> (number: int[1])".parse().unwrap();
     let length = Duration::from_millis(1_500);
-    let options = ServiceOptions::new().lease(length, move |_| {
+    let options = ServiceOptions::new().lease(length, move || {
         stopped.fetch_add(1, Ordering::SeqCst);
     });
     let lease = agv.my_function_list().add_service(&definition, options, service(|number| number)).unwrap();

@@ -32,7 +32,7 @@ fn a_waiting_caller_returns_at_once_when_its_unit_stops() {
                 })
             })
             .collect();
-        until("the first one runs", || gate.came() == 1);
+        until("they run side by side", || gate.came() == 4);
         until("all have asked", || crate::support::counter(&peer.counters(), "RequestsSent") == 4);
         manager.stop();
         for caller in callers {

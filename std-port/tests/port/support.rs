@@ -100,14 +100,19 @@ pub(crate) fn meet<T: Send + 'static, U: Send + 'static>(
     publish(manager, agv);
     manager.start().unwrap();
     agv.start().unwrap();
-    let name = agv.identity().name().to_owned();
-    until("the two have met", || manager.s_unit(&name).is_some_and(|peer| peer.is_connected()) && agv.is_connected());
-    let (peer, back) = (manager.s_unit(&name).unwrap(), agv.manager().unwrap());
+    let peer = manager.node(&agv.identity()).expect("the manager has a key for it");
+    until("the two have met", || peer.is_connected() && agv.is_connected());
+    let back = agv.manager().unwrap();
     until("lists have come", || {
         peer.their_function_list().len() == agv.my_function_list().len()
             && back.their_function_list().len() == manager.my_function_list().len()
     });
     (peer, back)
+}
+
+/// Takes those off the manager's roster that a test has not started: all of them have keys.
+pub(crate) fn retire_absent<T: Send + 'static>(manager: &CommunicationSystem<T>) {
+    manager.roster().iter().filter(|peer| !peer.is_connected()).for_each(|absent| assert!(absent.retire()));
 }
 
 pub(crate) fn publish<T: Send + 'static, U: Send + 'static>(manager: &CommunicationSystem<T>, agv: &Unit<U>) {

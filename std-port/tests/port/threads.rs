@@ -72,18 +72,17 @@ fn sixty_four_callers_have_a_link_each() {
     });
 }
 
-/// Calls of one thread in one class arrive in the order in which they were made, whoever reads and runs them.
+/// Calls of one thread in one class take the state in the order in which they were made, whoever reads and runs them.
 #[test]
-fn calls_of_a_class_run_in_order() {
-    let (manager, agv) = pair();
-    let last = std::sync::Arc::new(std::sync::Mutex::new(-1));
-    let seen = last.clone();
-    let in_order = service(move |number| {
-        let mut last = seen.lock().unwrap();
-        assert_eq!(number, *last + 1);
-        *last = number;
-        number
-    });
+fn calls_of_a_class_take_the_state_in_order() {
+    let fleet = fleet();
+    let manager = system(fleet).build_system().unwrap();
+    let agv = crate::support::unit("agv", 7, fleet).state(-1_i64).build_unit().unwrap();
+    let in_order = |last: &mut i64, parameters: cara_std::Parameters| {
+        assert_eq!(crate::support::value(&parameters), *last + 1);
+        *last += 1;
+        parameters
+    };
     agv.my_function_list().add_function("in_order", &number(0), in_order).unwrap();
     agv.my_function_list().add_function("echo", &number(0), service(|number| number)).unwrap();
     let (peer, _) = meet(&manager, &agv);
@@ -107,5 +106,5 @@ fn calls_of_a_class_run_in_order() {
         }
         done.store(true, Ordering::Relaxed);
     });
-    until("all have run", || *last.lock().unwrap() == 1_999);
+    until("all have run", || agv.with_state(|last| *last) == Ok(1_999));
 }

@@ -229,10 +229,10 @@ fn services(unit: Handle<Agv>) {
     let pos_info = Handler::method(&|agv: &mut Agv, _, parameters| agv.pos_info(parameters));
     unit.add_service(POS_INFO, plain(), pos_info).unwrap();
     unit.add_service(BATTERY, plain(), Handler::method(&|agv: &mut Agv, _, p| agv.battery(p))).unwrap();
-    let stop: &'static cara_embassy::Hook<Agv> = &|agv| {
+    let forget: &'static cara_embassy::Hook<Agv> = &|agv| {
         agv.stop();
     };
-    unit.add_service(GO_TO, plain().lease(GO_TO_LEASE, &DRIVING, stop).detached(), Handler::task()).unwrap();
+    unit.add_service(GO_TO, plain().lease(GO_TO_LEASE, &DRIVING, &|| {}).then(forget), Handler::task()).unwrap();
     unit.on_manager_lost(&|agv| {
         agv.stop();
         LOSSES.fetch_add(1, Ordering::Relaxed);

@@ -16,7 +16,7 @@ use cara_core::host::connections::LinkCounter;
 use cara_core::services::access::{Functions, Rule, Verbs, Who};
 use cara_core::services::lease::Lease;
 use cara_core::services::unit::RequestOptions;
-use cara_core::time::Duration;
+use cara_core::time::{Duration, Instant};
 use cara_embassy::{Config, Handle, Handler, Hook, Resources, Security, ServiceOptions, UnitEvent, message_buffer};
 use cara_embassy_host::{Bench, Board, keys};
 use embassy_net::tcp::TcpSocket;
@@ -175,9 +175,10 @@ async fn drive(unit: Unit) {
 }
 
 fn driving(board: &Board, unit: Unit) {
-    let options =
-        ServiceOptions::new().lease(Duration::from_millis(400), &GO_TO, &|state: &mut State| state.stops += 1);
-    unit.add_service("go_to(n: int) -> (n: int)", options.detached(), Handler::task()).unwrap();
+    let options = ServiceOptions::new()
+        .lease(Duration::from_millis(400), &GO_TO, &|| {})
+        .then(&|state: &mut State| state.stops += 1);
+    unit.add_service("go_to(n: int) -> (n: int)", options, Handler::task()).unwrap();
     board.spawn(drive(unit));
 }
 
@@ -205,13 +206,76 @@ fn a_task_takes_calls_and_awaits_before_it_replies() {
     assert_eq!(agv.with_state(|state| state.stops), Ok(0), "what is finished needs no safe hook");
 }
 
+/// Calls of `haul` in tasks of their own, each of which does no more than await the end of what was started.
+fn hauling(board: &Board, unit: Unit, length: Duration) -> Rc<RefCell<Vec<(i64, Instant)>>> {
+    let lease = Box::leak(Box::new(Lease::new()));
+    let options = ServiceOptions::new().lease(length, lease, &|| {}).then(&|state: &mut State| state.stops += 1);
+    unit.add_service("haul(n: int)", options, Handler::task()).unwrap();
+    let ended = Rc::new(RefCell::new(Vec::new()));
+    let (told, own) = (Rc::clone(&ended), board.clone());
+    board.spawn(async move {
+        let mut parameters = Parameters::new();
+        while let Ok(call) = unit.next_call("haul", &mut parameters).await {
+            let (told, number) = (Rc::clone(&told), parameters.variable("n").unwrap());
+            own.spawn(async move {
+                call.lease_ended().await;
+                told.borrow_mut().push((number, cara_embassy::now()));
+                call.reply(Ok(&Parameters::new())).await;
+            });
+        }
+    });
+    ended
+}
+
+/// As much as a message needs from board to board, and the 2 ms by which the end of a lease is rounded down.
+const AT_ONCE: Duration = Duration::from_millis(20);
+
+#[test]
+fn a_task_awaits_the_end_of_its_own_call() {
+    let bench = Bench::new(15);
+    let ((_manager_board, manager), (board, agv)) = (manager(&bench), agv(&bench));
+    let length = Duration::from_secs(60);
+    let ended = hauling(&board, agv, length);
+    agv.publish_my_function_list().unwrap();
+    assert!(bench.run_until(|| knows(manager, "agv", "haul"), SHORT));
+    let peer = manager.peer("agv").unwrap();
+    let numbers = || ended.borrow().iter().map(|(number, _)| *number).collect::<Vec<_>>();
+    let call = |number_of: i64, renew_lease| {
+        let options = RequestOptions { renew_lease, ..RequestOptions::default() };
+        peer.request_with("haul", &number(number_of), &options).unwrap();
+        bench.run_for(Duration::from_secs(1));
+    };
+    let stops = || agv.with_state(|state| state.stops).unwrap();
+    call(1, true);
+    assert_eq!(numbers(), [0; 0]);
+    call(2, true);
+    assert_eq!((numbers(), stops()), (vec![1], 0), "the first was replaced, without the hook");
+    peer.release("haul").unwrap();
+    bench.run_for(AT_ONCE);
+    assert_eq!((numbers(), stops()), (vec![1, 2], 1), "the second was released");
+    call(3, true);
+    agv.end_lease("haul");
+    bench.run_for(AT_ONCE);
+    assert_eq!((numbers(), stops()), (vec![1, 2, 3], 1), "the third has finished");
+    let asked = bench.now();
+    call(4, false);
+    assert!(bench.run_until(|| ended.borrow().len() == 4, Duration::from_secs(90)));
+    let took = ended.borrow()[3].1.since(asked);
+    assert!(took <= length + AT_ONCE && took + AT_ONCE >= length, "{} ms", took.as_millis());
+    call(5, true);
+    agv.remove_service("haul").unwrap();
+    bench.run_for(AT_ONCE);
+    assert_eq!((numbers(), stops()), (vec![1, 2, 3, 4, 5], 2), "the service of the fifth is gone");
+}
+
 #[test]
 fn a_pulled_cable_runs_each_hook_once_and_the_board_comes_back() {
     let bench = Bench::new(3);
     let ((_, manager), (agv_board, agv)) = (manager(&bench), agv(&bench));
     static STANDING: Lease = Lease::new();
-    let options =
-        ServiceOptions::new().lease(Duration::from_millis(400), &STANDING, &|state: &mut State| state.stops += 1);
+    let options = ServiceOptions::new()
+        .lease(Duration::from_millis(400), &STANDING, &|| {})
+        .then(&|state: &mut State| state.stops += 1);
     agv.add_service("go(n: int) -> (n: int)", options, Handler::method(&|_, _, _| Ok(()))).unwrap();
     agv.publish_my_function_list().unwrap();
     for round in 1..4 {
@@ -396,7 +460,7 @@ fn a_starved_vehicle_stops_by_its_lease_and_is_made_safe_first() {
     static MOVING: Lease = Lease::new();
     let length = Duration::from_millis(400);
     let safe: &'static Hook<State> = &|state| state.done.push("made safe");
-    let options = ServiceOptions::new().lease(length, &MOVING, safe);
+    let options = ServiceOptions::new().lease(length, &MOVING, &|| {}).then(safe);
     agv.add_service("go(n: int) -> (n: int)", options, Handler::method(&|_, _, _| Ok(()))).unwrap();
     let noted = Handler::method(&|state: &mut State, _, _| {
         state.done.push("served");
@@ -426,7 +490,7 @@ fn what_a_motors_interrupt_has_seen_dead_no_renewal_revives() {
     let ((manager_board, manager), (_, agv)) = (manager(&bench), agv(&bench));
     static MOVING: Lease = Lease::new();
     let length = Duration::from_millis(400);
-    let options = ServiceOptions::new().lease(length, &MOVING, &|state: &mut State| state.stops += 1);
+    let options = ServiceOptions::new().lease(length, &MOVING, &|| {}).then(&|state: &mut State| state.stops += 1);
     agv.add_service("go(n: int) -> (n: int)", options, Handler::method(&|_, _, _| Ok(()))).unwrap();
     agv.publish_my_function_list().unwrap();
     assert!(bench.run_until(|| knows(manager, "agv", "go"), SHORT));
@@ -447,7 +511,7 @@ fn keys_are_made_anew_while_calls_go_on() {
     let ((manager_board, manager), (agv_board, agv)) = (manager(&bench), agv(&bench));
     static MOVING: Lease = Lease::new();
     let stop: &'static Hook<State> = &|state| state.stops += 1;
-    let options = ServiceOptions::new().lease(Duration::from_millis(400), &MOVING, stop);
+    let options = ServiceOptions::new().lease(Duration::from_millis(400), &MOVING, &|| {}).then(stop);
     agv.add_service("go(n: int) -> (n: int)", options, Handler::method(&|_, _, _| Ok(()))).unwrap();
     for unit in [manager, agv] {
         unit.renew_keys_every(Duration::from_secs(1));

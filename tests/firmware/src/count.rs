@@ -76,7 +76,7 @@ pub(crate) fn run(bench: &Bench, image: &Path, of: Image, profile: bool) -> Resu
 fn meet(manager: &Manager, who: &Who) -> Result<Peer> {
     let deadline = Instant::now() + LONG;
     while Instant::now() < deadline {
-        let peer = manager.system.s_unit(&who.name).filter(Peer::is_connected);
+        let peer = manager.system.s_unit(&who.name).ok().filter(Peer::is_connected);
         if let Some(peer) = peer.filter(|peer| peer.their_function_list().contains("echo")) {
             return Ok(peer);
         }

@@ -11,6 +11,8 @@ use anyhow::{Context, Result, bail, ensure};
 use cara_processes::Process;
 use cara_std::Identity;
 use clap::Args;
+use rustix::process::Signal;
+use tempfile::TempDir;
 
 use crate::board::{Bench, LONG, Who};
 use crate::keys::Keys;
@@ -174,7 +176,9 @@ pub(crate) fn test(image: &Path, cara: Option<&Path>) -> Result<String> {
     if !ended.success() {
         bail!("it ended with {ended}");
     }
-    leaves_no_keys(&program, image, cara)?;
+    for wrapper in ["env", "nohup"] {
+        leaves_no_keys(wrapper, &program, image, cara).with_context(|| format!("started by {wrapper}"))?;
+    }
     Ok("what is typed is run, what the board logs is shown, and no keys stay behind".into())
 }
 
@@ -184,20 +188,53 @@ fn arguments(image: &Path, cara: Option<&Path>) -> Vec<OsString> {
     arguments
 }
 
-/// A desk that a signal ends takes its keys along.
-fn leaves_no_keys(program: &Path, image: &Path, cara: Option<&Path>) -> Result<()> {
+/// A desk that a signal ends takes its keys along, whatever signals it was started to ignore.
+fn leaves_no_keys(wrapper: &str, program: &Path, image: &Path, cara: Option<&Path>) -> Result<()> {
     let folder = tempfile::tempdir()?;
-    let is_empty = || Ok::<_, std::io::Error>(std::fs::read_dir(folder.path())?.next().is_none());
+    let mut desk = process_in(&folder, wrapper, program, image, cara)?;
+    desk.seen("Ctrl-D", LONG)?;
+    ensure!(std::fs::read_dir(folder.path())?.next().is_some(), "the desk has its keys elsewhere");
+    desk.terminate(LONG)?;
+    becomes_empty(&folder)
+}
+
+/// How long a desk takes until it can be typed at, on a machine that does nothing else.
+const STARTS: Duration = Duration::from_millis(1_500);
+/// Signals that end a desk; the last one does not below `nohup`.
+const ENDS: [Signal; 3] = [Signal::TERM, Signal::INT, Signal::HUP];
+
+/// Ends desks by signals at random moments of their start, every second one below `nohup`; none leaves keys behind.
+pub(crate) fn ends(image: &Path, cara: Option<&Path>, times: u32) -> Result<()> {
+    let program = std::env::current_exe()?;
+    let mut dice = fastrand::Rng::new();
+    let mut with_keys = 0;
+    for number in 0..times {
+        let folder = tempfile::tempdir()?;
+        let (wrapper, signals) = if number.is_multiple_of(2) { ("env", 3) } else { ("nohup", 2) };
+        let mut desk = process_in(&folder, wrapper, &program, image, cara)?;
+        std::thread::sleep(STARTS.mul_f64(dice.f64()));
+        with_keys += u32::from(std::fs::read_dir(folder.path())?.next().is_some());
+        let signal = dice.choice(ENDS.iter().take(signals)).copied().unwrap_or(Signal::TERM);
+        desk.signal(signal)?;
+        desk.wait(LONG)?;
+        becomes_empty(&folder).with_context(|| format!("end {number}, below {wrapper}, by {signal:?}"))?;
+    }
+    println!("{times} desks ended by a signal, {with_keys} of them with keys; none left any");
+    Ok(())
+}
+
+/// A desk whose keys are in a folder.
+fn process_in(folder: &TempDir, wrapper: &str, program: &Path, image: &Path, cara: Option<&Path>) -> Result<Process> {
     let mut place = OsString::from("TMPDIR=");
     place.push(folder.path());
-    let words = [place, program.as_os_str().to_owned()].into_iter().chain(arguments(image, cara));
-    let mut desk = Process::start("the desk", Path::new("env"), words)?;
-    desk.seen("Ctrl-D", LONG)?;
-    ensure!(!is_empty()?, "the desk has its keys elsewhere");
-    desk.terminate(LONG)?;
+    let words = ["env".into(), place, program.as_os_str().to_owned()].into_iter().chain(arguments(image, cara));
+    Process::start("the desk", Path::new(wrapper), words)
+}
+
+/// What runs in a desk's network ends a moment later than the desk.
+fn becomes_empty(folder: &TempDir) -> Result<()> {
     let deadline = Instant::now() + LONG;
-    // What runs in the desk's network ends a moment later.
-    while !is_empty()? {
+    while std::fs::read_dir(folder.path())?.next().is_some() {
         ensure!(Instant::now() < deadline, "the desk has left keys in {}", folder.path().display());
         std::thread::sleep(Duration::from_millis(20));
     }

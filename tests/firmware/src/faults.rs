@@ -6,13 +6,15 @@
 
 mod inject;
 mod kind;
+mod orders;
+mod processes;
 
 use anyhow::{Result, ensure};
 use clap::Args;
 
 use crate::board::{Bench, INSTRUCTION};
-use inject::Desk;
 use kind::{Bound, KINDS, Kind};
+pub(crate) use processes::stand_alone;
 
 /// How often what fails.
 #[derive(Args, Clone, Debug)]
@@ -39,6 +41,19 @@ pub(crate) struct Stop {
     turn: u64,
 }
 
+/// Where things fail: the emulated board with its manager. A kind that fails elsewhere, as in processes of Linux, has another
+/// one; [`Kind::target`] says which.
+trait Target {
+    /// In the table.
+    fn name(&self) -> &'static str;
+
+    /// Within which time the motors must stand.
+    fn bound(&self, kind: &Kind) -> Result<Bound>;
+
+    /// Makes something fail, and checks what must be so behind it.
+    fn fail(&self, kind: &Kind, number: u32, dice: &mut fastrand::Rng) -> Result<Stop>;
+}
+
 /// Makes everything fail, prints the table, and fails if any stop took longer than its bound.
 pub(crate) fn run(bench: Bench, faults: &Faults) -> Result<()> {
     let seed = faults.seed.unwrap_or_else(|| fastrand::u64(..));
@@ -48,10 +63,11 @@ pub(crate) fn run(bench: Bench, faults: &Faults) -> Result<()> {
     ensure!(!kinds.is_empty(), "no kind of fault has `{}` in its name", faults.kind);
     let mut rows = Vec::new();
     for kind in kinds {
-        let desk = Desk::new(&bench)?;
-        let bound = desk.bound(kind)?;
-        let stops = (0..faults.each).map(|number| desk.fail(kind, number, &mut dice)).collect::<Result<Vec<Stop>>>()?;
-        rows.push(Row::of(kind, bound, &stops));
+        let target = kind.target(&bench)?;
+        let bound = target.bound(kind)?;
+        let stops =
+            (0..faults.each).map(|number| target.fail(kind, number, &mut dice)).collect::<Result<Vec<Stop>>>()?;
+        rows.push(Row::of(kind, target.name(), bound, &stops));
         println!("{}", rows.last().map_or_else(String::new, Row::to_string));
     }
     println!("\n{HEAD}");
@@ -64,31 +80,36 @@ pub(crate) fn run(bench: Bench, faults: &Faults) -> Result<()> {
 }
 
 const HEAD: &str = "\
-| fault | times | longest, ms | longest, instructions | bound, ms | of | left, ms |
-|---|---|---|---|---|---|---|";
+| fault | on | times | longest, ms | longest, instructions | bound, ms | of | left, ms |
+|---|---|---|---|---|---|---|---|";
 
 /// A row of the table.
 struct Row {
     kind: &'static Kind,
+    on: &'static str,
     bound: Bound,
     faults: usize,
     longest: u64,
 }
 
 impl Row {
-    fn of(kind: &'static Kind, bound: Bound, stops: &[Stop]) -> Self {
+    fn of(kind: &'static Kind, on: &'static str, bound: Bound, stops: &[Stop]) -> Self {
         let longest = stops.iter().map(|stop| kind.took(stop)).max().unwrap_or(0);
-        Self { kind, bound, faults: stops.len(), longest }
+        Self { kind, on, bound, faults: stops.len(), longest }
     }
 }
 
 impl std::fmt::Display for Row {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { kind, bound, faults, longest } = self;
+        let Self { kind, on, bound, faults, longest } = self;
         let millis = |micros: i64| micros as f64 / 1_000.0;
         let instructions = (longest * 1_000) >> INSTRUCTION;
         let left = bound.micros as i64 - *longest as i64;
         let (took, allowed, left) = (millis(*longest as i64), millis(bound.micros as i64), millis(left));
-        write!(f, "| {} | {faults} | {took:.1} | {instructions} | {allowed:.1} | {} | {left:.1} |", kind.name, bound.of)
+        write!(
+            f,
+            "| {} | {on} | {faults} | {took:.1} | {instructions} | {allowed:.1} | {} | {left:.1} |",
+            kind.name, bound.of
+        )
     }
 }

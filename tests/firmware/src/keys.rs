@@ -9,6 +9,7 @@ use std::process::{Command, Stdio};
 use std::rc::Rc;
 
 use anyhow::{Context, Result, ensure};
+use cara_processes::Process;
 use cara_std::keys::place;
 use cara_std::{Builder, Fleet, Identity};
 use tempfile::TempDir;
@@ -92,6 +93,14 @@ impl Keys {
         command.env("CARA_KEYS", self.folder.path()).env("CARA_CONTROL_DIR", self.folder.path());
         command.stdin(Stdio::null());
         command
+    }
+
+    /// The command as a process that goes on.
+    pub(crate) fn process(&self, name: &str, words: &[&str]) -> Result<Process> {
+        let folder = self.folder.path().display();
+        let settings = ["CARA_KEYS", "CARA_CONTROL_DIR"].map(|variable| format!("{variable}={folder}"));
+        let command = settings.into_iter().chain([self.cara.display().to_string()]);
+        Process::start(name, Path::new("env"), command.chain(words.iter().map(|word| (*word).to_owned())))
     }
 
     /// Words without which the command would look for keys.

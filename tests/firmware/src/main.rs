@@ -65,6 +65,8 @@ enum Part {
         #[arg(long)]
         key_file: Option<PathBuf>,
     },
+    /// A vehicle that can hold its own state for ever.
+    Vehicle,
     /// Puts a board under load and prints how deep its stack was.
     Stack {
         /// What the image is.
@@ -82,6 +84,12 @@ enum Part {
     Faults(faults::Faults),
     /// Attacks a board that dials the attacker.
     Security(security::Security),
+    /// Ends desks by signals at random moments, and fails if one leaves keys behind.
+    Ends {
+        /// How many.
+        #[arg(long, default_value_t = 300)]
+        times: u32,
+    },
     /// Puts a board on the desk, with its manager and a prompt for `cara`.
     Desk(desk::Desk),
 }
@@ -90,6 +98,10 @@ fn main() -> ExitCode {
     let arguments = Arguments::parse();
     let outcome = match &arguments.part {
         Some(Part::Manager { key_file }) => manager::stand_alone(key_file.as_deref()).map(|()| ExitCode::SUCCESS),
+        Some(Part::Vehicle) => faults::stand_alone().map(|()| ExitCode::SUCCESS),
+        Some(Part::Ends { times }) => {
+            desk::ends(&arguments.image, arguments.cara.as_deref(), *times).map(|()| ExitCode::SUCCESS)
+        }
         _ => in_own_network(&arguments),
     };
     outcome.unwrap_or_else(|error| {

@@ -55,7 +55,7 @@ impl Manager {
     pub(crate) fn meet_offering(&self, who: &Who, function: &str) -> Result<Peer> {
         let deadline = Instant::now() + LONG;
         while Instant::now() < deadline {
-            let peer = self.system.s_unit(&who.name).filter(Peer::is_connected);
+            let peer = self.system.s_unit(&who.name).ok().filter(Peer::is_connected);
             if let Some(peer) = peer.filter(|peer| peer.their_function_list().contains(function)) {
                 return Ok(peer);
             }

@@ -1,4 +1,4 @@
-//! Link arguments. The memory map comes with the `lm3s6965` crate.
+//! Link arguments. The memory map comes with the board's crate.
 
 fn main() {
     for argument in ["--nmagic", "-Tlink.x", "-Tdefmt.x"] {

@@ -129,12 +129,13 @@ entry!(session_set, {
 
 entry!(session_requests, {
     keep(session().request(context(), unknown_text(), parameters(), unknown(), *unknown()));
-    session().cancel(*unknown());
+    session().cancel(context(), *unknown());
+    keep(session().holds(*unknown()));
 });
 
 entry!(session_serves, {
     keep(session().next_call(context(), parameters()));
-    session().detach(*unknown::<Ticket>());
+    keep(session().has_next_emergency());
     keep(session().answer(context(), *unknown(), Ok(parameters())));
     keep(session().answer(context(), *unknown(), Err(*unknown())));
     session().drop_answer(*unknown());
@@ -147,7 +148,7 @@ entry!(session_publishes, {
 
 entry!(session_leases, {
     session().end_lease(context(), *unknown());
-    session().release(context(), *unknown());
+    keep(session().release(context(), *unknown()));
 });
 
 entry!(replies, {
@@ -159,10 +160,12 @@ entry!(replies, {
 
 entry!(leases, {
     let lease = Lease::new();
-    lease.begin(*unknown());
-    keep((lease.renew(*unknown()), lease.lasts_beyond(*unknown())));
-    keep((lease.is_live(*unknown()), Lease::seen_end(*unknown())));
-    lease.end();
+    keep(lease.begin(*unknown(), *unknown()));
+    keep((lease.renew(*unknown(), *unknown()), lease.lasts_beyond(*unknown())));
+    keep((lease.is_live(*unknown()), lease.is_live_for(*unknown(), *unknown()), Lease::seen_end(*unknown())));
+    keep((lease.left(*unknown()), lease.end(*unknown())));
+    lease.cut(*unknown());
+    lease.clear();
     keep(unknown::<Lease>().is_live(*unknown()));
 });
 

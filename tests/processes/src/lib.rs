@@ -129,7 +129,8 @@ impl Process {
         self.wait(within)
     }
 
-    fn signal(&self, signal: Signal) -> Result<()> {
+    /// Sends it a signal.
+    pub fn signal(&self, signal: Signal) -> Result<()> {
         let sent = kill_process(Pid::from_child(&self.child), signal);
         sent.with_context(|| format!("{} takes no signal", self.name))
     }

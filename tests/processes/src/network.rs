@@ -76,9 +76,10 @@ fn again(needs: &[&str], tap: bool) -> Result<std::result::Result<Command, Strin
 const KINDS: [&[&str]; 2] = [&["--net"], &["--user", "--map-root-user", "--net"]];
 
 fn unshare(kind: &[&str]) -> Command {
-    // Whichever of them ends, what runs inside is asked to end, and cleans up; `unshare` ignores the other signals.
+    // Whichever of them ends, what runs inside is asked to end, and cleans up. `unshare` ignores SIGINT and SIGTERM, and below
+    // `nohup` SIGHUP as well: a signal that it can ignore would leave it, and all that runs inside, behind.
     let mut command = Command::new("setpriv");
-    let words = ["--pdeathsig", "HUP", "unshare", "--fork", "--kill-child=TERM"];
+    let words = ["--pdeathsig", "KILL", "unshare", "--fork", "--kill-child=TERM"];
     command.env("PATH", paths()).args(words).args(kind);
     command
 }

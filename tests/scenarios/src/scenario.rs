@@ -37,8 +37,6 @@ pub enum Need {
     LongTime,
     /// Instants that do not depend on how busy the machine is.
     ExactTime,
-    /// Services that let the next call begin.
-    Detached,
     /// The same random numbers in each life.
     SameSeed,
     /// A unit that goes on when a handler panics.
@@ -47,7 +45,7 @@ pub enum Need {
 
 impl Need {
     /// All of them.
-    pub const ALL: [Self; 19] = [
+    pub const ALL: [Self; 18] = [
         Self::Crash,
         Self::Partition,
         Self::Freeze,
@@ -64,7 +62,6 @@ impl Need {
         Self::ManyUnits,
         Self::LongTime,
         Self::ExactTime,
-        Self::Detached,
         Self::SameSeed,
         Self::Panics,
     ];
@@ -102,8 +99,7 @@ impl Need {
             Self::ManyUnits => "too many threads and sockets for a test",
             Self::LongTime => "minutes of real time",
             Self::ExactTime => "instants depend on the machine's load",
-            Self::Detached
-            | Self::Panics
+            Self::Panics
             | Self::Freeze
             | Self::Reset
             | Self::SlowReader

@@ -24,10 +24,10 @@ pub struct Service {
     pub(crate) signature: String,
     pub(crate) body: Arc<Body>,
     pub(crate) takes: Duration,
+    pub(crate) moves_every: Option<Duration>,
     pub(crate) calls_back: Option<String>,
     pub(crate) priority: Priority,
     pub(crate) lease: Option<Duration>,
-    pub(crate) detached: bool,
     diary: Arc<Diary>,
 }
 
@@ -38,10 +38,10 @@ impl Service {
             signature: signature.to_owned(),
             body: Arc::new(|_, _| Ok(())),
             takes: Duration::ZERO,
+            moves_every: None,
             calls_back: None,
             priority: Priority::Normal,
             lease: None,
-            detached: false,
             diary: Arc::new(Diary::default()),
         }
     }
@@ -59,6 +59,12 @@ impl Service {
         Self { takes: span, ..self }
     }
 
+    /// Its handler moves once in each `span` for as long as its call is wanted, and answers then. The diary notes the call's
+    /// int `n` at each move.
+    pub fn moves_every(self, span: Duration) -> Self {
+        Self { moves_every: Some(span), ..self }
+    }
+
     /// Before it does anything, it calls this function of its caller with the same parameters.
     pub fn calls_back(self, function: &str) -> Self {
         Self { calls_back: Some(function.to_owned()), ..self }
@@ -74,9 +80,16 @@ impl Service {
         Self { lease: Some(length), ..self }
     }
 
-    /// The next call begins while this one still runs.
-    pub fn detached(self) -> Self {
-        Self { detached: true, ..self }
+    /// Whether its handler waits for anything, so that one that must not wait cannot serve it.
+    pub(crate) fn awaits(&self) -> bool {
+        self.takes > Duration::ZERO || self.calls_back.is_some() || self.moves_every.is_some()
+    }
+
+    /// Moves once, if the call of these parameters is wanted; the pause until the next move.
+    pub(crate) fn moves_on(&self, is_wanted: bool, parameters: &ParametersView) -> Option<Duration> {
+        let pause = self.moves_every.filter(|_| is_wanted)?;
+        self.diary.note(parameters.variable("n").ok()?);
+        Some(pause)
     }
 
     /// What it did so far, in all copies.

@@ -27,6 +27,7 @@ pub struct Spec {
     pub(crate) their_functions: usize,
     pub(crate) message_buffers: usize,
     pub(crate) same_seed: bool,
+    pub(crate) beside_another: bool,
 }
 
 impl Spec {
@@ -52,7 +53,13 @@ impl Spec {
             their_functions: 48,
             message_buffers: 32,
             same_seed: false,
+            beside_another: false,
         }
+    }
+
+    /// A manager that starts although one of its identity is there.
+    pub fn beside_another(self) -> Self {
+        Self { beside_another: true, ..self }
     }
 
     /// The manager that an s_unit joins instead.

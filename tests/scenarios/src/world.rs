@@ -11,6 +11,7 @@ use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error};
 use cara_core::host::connections::LinkCounter;
 use cara_core::services::access::Rule;
+use cara_core::services::lease::LeaseEnd;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::RequestOptions;
 use cara_core::time::{Duration, Instant};
@@ -94,8 +95,8 @@ pub enum Seen {
     Failed(CallId, Error),
     /// A service of the unit stopped because nobody renewed its lease.
     LeaseExpired(String),
-    /// A lease that the unit held ended at the peer: not renewed in time, as opposed to finished.
-    LeaseEnded(String, bool),
+    /// A lease that the unit held ended at the peer.
+    LeaseEnded(String, LeaseEnd),
 }
 
 /// How a call ended, and when.
@@ -184,11 +185,11 @@ pub trait Node {
         parameters: &ParametersView,
         options: RequestOptions,
     ) -> Result<CallId, Error>;
-    /// The asynchronous request to every node that offers the function.
+    /// The asynchronous request to all: each s_unit that has joined, connected or not, and each m_unit that offers it.
     fn request_all(&self, function: &str, parameters: &ParametersView) -> Vec<(Identity, Result<CallId, Error>)>;
     /// The synchronous request, made in a task of its own.
     fn begin(&self, peer: &str, function: &str, parameters: &ParametersView, options: RequestOptions) -> Pending;
-    /// The synchronous request to every node that offers the function, in a task of its own.
+    /// The synchronous request to all, likewise, in a task of its own.
     fn begin_all(&self, function: &str, parameters: &ParametersView) -> PendingAll;
     /// Gives up the lease on a function of a peer.
     fn release(&self, peer: &str, function: &str) -> Result<(), Error>;

@@ -15,6 +15,7 @@ use cara_std::keys::KeyRing;
 use cara_std::sys::datagram::{Datagrams, Socket};
 
 use crate::ground::{Ground, agv, depot};
+use crate::kept_away;
 use crate::links::Extent;
 use crate::linux::{Linux, LinuxManager, accept, named};
 use crate::speaker::{HANDSHAKE, PATIENCE, Speaker};
@@ -168,7 +169,8 @@ impl Forger {
 /// All attacks on discovery.
 pub fn run(report: &mut Report, linux: &Linux, manager: &LinuxManager<'_>, extent: Extent) -> Result<()> {
     spoof(report, linux, manager, extent)?;
-    relayed(report, &alone(linux)?, extent)
+    relayed(report, &alone(linux)?, extent)?;
+    kept_away::run(report, linux.weakness, extent)
 }
 
 /// A fleet whose manager is not there, so that its vehicles ask.

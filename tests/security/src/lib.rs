@@ -5,7 +5,8 @@
 //! - [`ground`]: the keys of a fleet, and those that an attacker may have instead;
 //! - [`target`]: what is attacked; [`linux`] has units of the Linux port;
 //! - [`links`]: the attacks on links; they know of a target only what [`target::Target`] tells;
-//! - [`between`]: somebody between two genuine ends; [`discovery`], [`floods`] and [`permission`]: the other attacks;
+//! - [`between`]: somebody between two genuine ends; [`discovery`], [`kept_away`], [`floods`] and [`permission`]: the other
+//!   attacks;
 //! - [`tally`]: attempts, successes, and the counters that tell of them.
 
 pub mod between;
@@ -13,6 +14,7 @@ pub mod diary;
 pub mod discovery;
 pub mod floods;
 pub mod ground;
+pub mod kept_away;
 pub mod links;
 pub mod linux;
 pub mod permission;

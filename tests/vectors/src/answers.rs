@@ -5,7 +5,7 @@ use cara_core::config::Priority;
 use cara_core::distribution::function_list::{Generation, Slot};
 use cara_core::distribution::hello::Hello;
 use cara_core::distribution::identity::{Fleet, Identity};
-use cara_core::distribution::message::{Control, Renewal, RequestHeader, SessionBody, encode_reply};
+use cara_core::distribution::message::{Control, Release, Renewal, RequestHeader, SessionBody, encode_reply};
 use cara_core::error::Error;
 use cara_core::host::frame::Frame;
 use cara_core::time::Duration;
@@ -295,20 +295,32 @@ fn leases() -> Vec<Answer> {
     let position = [[3, 0, 0, 0, 0, 0, 0, 0], [4, 0, 0, 0, 0, 0, 0, 0]].concat();
     let go_to = RequestHeader { wants_reply: false, ..header(1, 1) };
     let old = RequestHeader { stamp: 501_000, remaining: Duration::from_secs(9), ..go_to };
-    let renewal = Renewal { slot: Slot(1), generation: Generation(0), stamp: 1_001_000, since: Duration::ZERO };
-    let renew = frame(&Frame::Session(&SessionBody::renewal(&renewal)));
+    let body = |body: &[u8]| frame(&Frame::Session(body));
+    let renewal = Renewal { call: 1, class: Priority::Normal, stamp: 1_001_000, since: Duration::ZERO };
+    let renew = body(&SessionBody::renewal(&renewal));
     let started = request(go_to, &position);
-    let released = vec![started.clone(), control(&Control::Release { slot: 1, id: 9 })];
-    let ended = |expired: bool| json!([{ "priority": "high", "message": { "lease_ended": { "slot": 1, "expired": expired } } }]);
+    let release = body(&SessionBody::release(&Release { call: 1, class: Priority::Normal }));
+    let renewed_after = vec![started.clone(), release.clone(), renew.clone()];
+    let released = vec![started.clone(), release.clone()];
+    let all = vec![started.clone(), body(&SessionBody::release_all(Slot(1), 9))];
+    let overtaken = vec![release, request(RequestHeader { wants_reply: true, ..go_to }, &position)];
+    let ended = |why: &str| json!([{ "priority": "high", "message": { "lease_ended": { "call": 1, "why": why } } }]);
     let failure = json!([{ "priority": "normal", "message": { "failure": { "id": 1, "error": "expired" } } }]);
     let lease_released = answer(("lease_released", "it ends without an answer", "live", released, 600, json!([])));
     let mut leases = answers([
-        ("lease_expires", "500 ms after the request was made", "live", started.clone(), 500, ended(true)),
+        ("lease_expires", "500 ms after the request was made", "live", started.clone(), 500, ended("expired")),
         ("lease_lives", "1 ms less", "live", started, 499, json!([])),
-        ("renewal_of_nothing", "no lease runs", "live", renew, 0, ended(false)),
+        ("renewal_too_early", "the call has not arrived", "live", renew, 0, json!([])),
         ("lease_over", "made 500 ms ago, though its deadline is later", "live", request(old, &position), 0, failure),
     ]);
     leases.push(lease_released);
+    for (name, about, given, after, expected) in [
+        ("leases_released", "all of a function", all, 600, json!([])),
+        ("release_overtakes", "the call is dropped when it arrives", overtaken, 0, json!([])),
+        ("renewal_of_nothing", "the call has ended", renewed_after, 0, ended("expired")),
+    ] {
+        leases.push(answer((name, about, "live", given, after, expected)));
+    }
     leases
 }
 

@@ -137,8 +137,7 @@ fn control(control: &Control<'_>) -> Value {
         Control::Limits { message_size, minimum_interval, calls } => json!({ "limits": {
             "message_size": message_size, "minimum_interval": minimum_interval, "calls": calls,
         }}),
-        Control::Release { slot, id } => json!({ "release": { "slot": slot, "id": id } }),
-        Control::LeaseEnded { slot, expired } => json!({ "lease_ended": { "slot": slot, "expired": expired } }),
+        Control::LeaseEnded { call, why } => json!({ "lease_ended": { "call": call, "why": why.word() } }),
     }
 }
 
@@ -188,11 +187,15 @@ pub(crate) fn session_body(bytes: &[u8]) -> Option<Value> {
         SessionBody::Ping => json!({ "ping": {} }),
         SessionBody::Pong => json!({ "pong": {} }),
         SessionBody::Renew(renewal) => json!({ "renew": {
-            "slot": renewal.slot.0,
-            "generation": renewal.generation.0,
+            "class": priority(renewal.class),
+            "call": renewal.call,
             "stamp": renewal.stamp,
             "since": renewal.since.as_micros(),
         }}),
+        SessionBody::Release(release) => {
+            json!({ "release": { "class": priority(release.class), "call": release.call } })
+        }
+        SessionBody::ReleaseAll(slot, call) => json!({ "release_all": { "slot": slot.0, "call": call } }),
         SessionBody::Message(byte, message) => json!({ "message": {
             "priority": priority(Priority::from_wire(byte)?), "message": self::message(message)?,
         }}),

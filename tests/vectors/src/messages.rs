@@ -3,7 +3,9 @@
 use cara_core::config::Priority;
 use cara_core::distribution::function::Attributes;
 use cara_core::distribution::function_list::{Generation, Slot};
-use cara_core::distribution::message::{Control, Renewal, RequestHeader, SessionBody, encode_failure, encode_reply};
+use cara_core::distribution::message::{
+    Control, LeaseEnd, Release, Renewal, RequestHeader, SessionBody, encode_failure, encode_reply,
+};
 use cara_core::error::{Error, ServiceError};
 use cara_core::time::Duration;
 use serde_json::{Value, json};
@@ -156,16 +158,16 @@ fn controls() -> Vec<Vector> {
             json!({ "limits": { "message_size": 65_536, "minimum_interval": 10_000, "calls": 4 } }),
         ),
         (
-            "release",
-            "a lease is given up",
-            Control::Release { slot: 4, id: 9 },
-            json!({ "release": { "slot": 4, "id": 9 } }),
-        ),
-        (
             "lease_ended",
             "a lease has expired at the callee",
-            Control::LeaseEnded { slot: 4, expired: true },
-            json!({ "lease_ended": { "slot": 4, "expired": true } }),
+            Control::LeaseEnded { call: 70_000, why: LeaseEnd::Expired },
+            json!({ "lease_ended": { "call": 70_000, "why": "expired" } }),
+        ),
+        (
+            "lease_replaced",
+            "a newer call of the same function goes on",
+            Control::LeaseEnded { call: 4, why: LeaseEnd::Replaced },
+            json!({ "lease_ended": { "call": 4, "why": "replaced" } }),
         ),
     ];
     let encoded = |(name, about, control, value): (_, _, Control<'_>, _)| {
@@ -176,23 +178,25 @@ fn controls() -> Vec<Vector> {
     vectors.push(
         message(
             ("long_varint", "a number in more bytes than needed is read all the same"),
-            &[3, 5, 0x84, 0x00, 9],
-            &json!({ "release": { "slot": 4, "id": 9 } }),
+            &[3, 5, 0x84, 0x00, 0],
+            &json!({ "lease_ended": { "call": 4, "why": "finished" } }),
         )
         .lossy(),
     );
-    vectors.push(message(("varint_too_big", "refused: beyond 16 bits"), &[3, 5, 0x84, 0x80, 0x04, 9], &Value::Null));
-    vectors.push(message(("control_behind", "refused: a byte follows"), &[3, 5, 4, 9, 0], &Value::Null));
+    vectors.push(message(("varint_too_big", "refused: beyond 16 bits"), &[3, 1, 0x84, 0x80, 0x04], &Value::Null));
+    vectors.push(message(("control_behind", "refused: a byte follows"), &[3, 5, 4, 1, 0], &Value::Null));
+    vectors.push(message(("lease_end_unknown", "refused: no such reason"), &[3, 5, 4, 3], &Value::Null));
     vectors
 }
 
 fn session_bodies() -> Vec<Vector> {
     let renewal = Renewal {
-        slot: Slot(5),
-        generation: Generation(1),
+        call: 0x0102_0304,
+        class: Priority::Normal,
         stamp: 0x0001_0203_0405_0607,
         since: Duration::from_micros(80_000),
     };
+    let release = Release { call: 0x0102_0304, class: Priority::Low };
     let emergency = [&SessionBody::message_prefix(0)[..], &request(false, &[])].concat();
     let body =
         |names, bytes: &[u8], value: &Value| Vector::new(names, Kind::SessionBody, Context::default(), bytes, value);
@@ -205,12 +209,23 @@ fn session_bodies() -> Vec<Vector> {
         body(("ping", "to be answered at once, in a datagram"), &SessionBody::PING, &json!({ "ping": {} })),
         body(("pong", "the answer"), &SessionBody::PONG, &json!({ "pong": {} })),
         body(
-            ("renew", "the caller still wants what a leased function started"),
+            ("renew", "the caller still wants what a leased call started"),
             &SessionBody::renewal(&renewal),
             &json!({ "renew": {
-                "slot": 5, "generation": 1, "stamp": 0x0001_0203_0405_0607_u64, "since": 80_000,
+                "class": "normal", "call": 0x0102_0304, "stamp": 0x0001_0203_0405_0607_u64, "since": 80_000,
             }}),
         ),
+        body(
+            ("release", "the caller no longer wants a leased call"),
+            &SessionBody::release(&release),
+            &json!({ "release": { "class": "low", "call": 0x0102_0304 } }),
+        ),
+        body(
+            ("release_all", "nor any call of a function up to this one"),
+            &SessionBody::release_all(Slot(5), 0x0102_0304),
+            &json!({ "release_all": { "slot": 5, "call": 0x0102_0304 } }),
+        ),
+        body(("release_class", "refused: no such class"), &[6, 4, 1, 0, 0, 0], &Value::Null),
         body(
             ("session_message", "an emergency's second copy"),
             &emergency,

@@ -142,7 +142,14 @@ impl Talk {
         self.agv.answer(call.ticket, Err(cara_core::error::ServiceError::Failed(7).into()))?;
         self.agv.end_lease(1);
         self.pass(From::Agv, &[("talk_failure", "the service has failed with code 7, and its lease is ended")]);
-        assert_eq!(self.manager.events.last().map(String::as_str), Some("LeaseEnded"));
+        assert_eq!(self.manager.events.last().map(String::as_str), Some("Failed"));
+        self.pass(
+            From::Manager,
+            &[
+                ("talk_release", "what has failed is not wanted: released, as a datagram"),
+                ("talk_release_stream", "and in the stream"),
+            ],
+        );
         Ok(())
     }
 

@@ -10,7 +10,7 @@ use crate::{paper, workspace};
 const TABLE: &str = "docs/security.md";
 
 /// What the table must make a claim about, once each.
-const SUBJECTS: [&str; 28] = [
+const SUBJECTS: [&str; 29] = [
     "wrong key",
     "no key",
     "key of another fleet",
@@ -27,6 +27,7 @@ const SUBJECTS: [&str; 28] = [
     "boards' random numbers",
     "rekeying",
     "discovery",
+    "recorded and forged discovery",
     "relayed answers",
     "amplification",
     "flood of links",

@@ -1,7 +1,7 @@
 //! Child processes: started in the project's root, output streamed through or captured as text.
 
 use std::ffi::OsStr;
-use std::io::ErrorKind;
+use std::io::{ErrorKind, Read};
 use std::path::Path;
 use std::process::{Command, Stdio};
 
@@ -78,6 +78,20 @@ impl Run {
             bail!("`{shown}` failed: {}", errors.trim());
         }
         Ok(output)
+    }
+
+    /// Standard output and standard error as one text, in the order in which they were written.
+    pub(crate) fn merged(mut self) -> Result<String> {
+        let shown = self.shown();
+        let (mut reader, writer) = std::io::pipe()?;
+        self.command.stdout(writer.try_clone()?).stderr(writer);
+        let mut child = self.command.spawn().with_context(|| format!("cannot start `{shown}`"))?;
+        // The ends that this process would write to, without which the text has no end.
+        drop(self);
+        let mut output = Vec::new();
+        reader.read_to_end(&mut output)?;
+        child.wait()?;
+        Ok(String::from_utf8_lossy(&output).into_owned())
     }
 
     /// Whether it succeeded, its standard output and its standard error.

@@ -33,8 +33,9 @@ pub(crate) fn program(program: &str, package: &str) -> Result<(), String> {
 
 /// Tries the package lists as they are first: fetching them anew is slow.
 fn apt_install(package: &str) -> anyhow::Result<()> {
-    let install =
-        || Run::new("apt-get").args(["install", "-y", package]).env("DEBIAN_FRONTEND", "noninteractive").stream();
+    // Another group may be installing something at the same time.
+    let install = ["install", "-y", "-o", "DPkg::Lock::Timeout=300", package];
+    let install = || Run::new("apt-get").args(install).env("DEBIAN_FRONTEND", "noninteractive").stream();
     if install().is_ok() {
         return Ok(());
     }

@@ -21,9 +21,24 @@ enum Layer {
 /// Modules at the root of the core that belong to no layer and that every layer may use.
 const FOUNDATION: [&str; 8] = ["bytes", "config", "counters", "error", "fmt", "random", "storage", "time"];
 
-/// A layer talks to its neighbour. These modules of the host layer are the exceptions that services use directly: a
-/// session owns one link and lends the port's trait down to it.
-const HOST_FOR_SERVICES: [&str; 4] = ["connections", "frame", "mailman", "secure"];
+/// A layer talks to its neighbour. These items of the host layer are the exceptions that services use directly, each with
+/// what for; everything else goes through distribution.
+const HOST_FOR_SERVICES: [(&str, &str, &str); 14] = [
+    ("connections", "Link", "a session owns one link"),
+    ("connections", "Incoming", "what the link has received whole"),
+    ("connections", "Place", "where that lies, without a copy"),
+    ("connections", "Liveness", "whether the peer is still there decides how long the session lasts"),
+    ("connections", "LinkCounter", "a session counts in its link's counters"),
+    ("frame", "Frame", "frames that are no messages: hello, proof, ping, session bodies, close"),
+    ("frame", "ChunkWriter", "where a message is encoded in place"),
+    ("frame", "HEADER_BYTES", "how large a buffer is that a framed message fits"),
+    ("mailman", "Mailman", "the port's trait, lent down to the link"),
+    ("mailman", "LinkId", "how ports name a link"),
+    ("secure", "Secure", "the cipher's trait: a session proves, renews and opens"),
+    ("secure", "Unopened", "why a session datagram is dropped"),
+    ("secure", "PROOF_BYTES", "size of a message of the proof"),
+    ("secure", "DATAGRAM_OVERHEAD", "size of the longest session datagram"),
+];
 
 /// One wrong arrow.
 #[derive(Debug)]
@@ -52,12 +67,14 @@ pub(crate) fn check() -> Result<()> {
     if !sources.iter().any(|(file, text)| file == Path::new("lib.rs") && text.contains("#![no_std]")) {
         bail!("core/src/lib.rs does not say #![no_std]");
     }
-    if wrong.is_empty() {
+    let unused = unused_exceptions(&sources, &tests);
+    unused.iter().for_each(|line| eprintln!("HOST_FOR_SERVICES: {line}"));
+    if wrong.is_empty() && unused.is_empty() {
         println!("{} files of the core, every arrow points down", sources.len() - tests.len());
         return Ok(());
     }
     wrong.iter().for_each(|arrow| eprintln!("core/src/{arrow}"));
-    bail!("{} wrong arrows in the core", wrong.len())
+    bail!("{} wrong arrows in the core, {} exceptions without use", wrong.len(), unused.len())
 }
 
 /// The files below `core/src`, named from there, with their texts.
@@ -160,12 +177,28 @@ fn objection(from: Layer, own: &str, target: &[String]) -> Option<String> {
         return Some(format!("{from:?} must not use {to:?}, which lies above it"));
     }
     if to == Layer::Host && from == Layer::Services {
-        let module = target.get(1).map_or("", String::as_str);
-        if !HOST_FOR_SERVICES.contains(&module) {
-            return Some(format!("Services may use {HOST_FOR_SERVICES:?} of Host, the rest through Distribution"));
+        let [module, item] = [1, 2].map(|at| target.get(at).map_or("", String::as_str));
+        if !HOST_FOR_SERVICES.iter().any(|allowed| (allowed.0, allowed.1) == (module, item)) {
+            return Some("Services may use of Host what HOST_FOR_SERVICES lists, the rest through Distribution".into());
         }
     }
     None
+}
+
+/// Items that are listed as exceptions and that no file of the services names.
+fn unused_exceptions(sources: &[(PathBuf, String)], tests: &HashSet<PathBuf>) -> Vec<String> {
+    let of_services = sources.iter().filter(|(file, _)| file.starts_with("services") && !tests.contains(file));
+    let mut used = HashSet::new();
+    for (file, text) in of_services {
+        let all = source::tokens(text);
+        let kept = source::without_tests(&all);
+        used.extend(source::paths(&kept).iter().filter_map(|path| resolve(&module_of(file), &path.segments)));
+    }
+    let is_used = |module: &str, item: &str| {
+        used.iter().any(|target| target.iter().take(3).map(String::as_str).eq(["host", module, item]))
+    };
+    let unused = HOST_FOR_SERVICES.iter().filter(|(module, item, _)| !is_used(module, item));
+    unused.map(|(module, item, what)| format!("host::{module}::{item} ({what}): no service uses it")).collect()
 }
 
 fn layer(module: &str) -> Option<Layer> {
@@ -205,7 +238,8 @@ fn forbidden_words(file: &Path, text: &str) -> Vec<Wrong> {
 
 #[cfg(test)]
 mod tests {
-    use super::{forbidden_words, module_of, test_files, wrong_arrows};
+    use super::{HOST_FOR_SERVICES, forbidden_words, module_of, test_files, unused_exceptions, wrong_arrows};
+    use std::collections::HashSet;
     use std::path::{Path, PathBuf};
 
     fn arrows(file: &str, text: &str) -> usize {
@@ -236,6 +270,26 @@ mod tests {
     fn services_reach_past_their_neighbour_only_where_it_is_written() {
         assert_eq!(arrows("services/unit.rs", "use crate::host::something_else::Thing;"), 1);
         assert_eq!(arrows("services/unit.rs", "use crate::host;"), 1);
+        // Of each module of the host layer: what is not listed, the module as a whole, everything in it.
+        for module in ["connections", "frame", "mailman", "secure"] {
+            for item in ["Unlisted", "*", "{self}", "{*}", "{Unlisted as Link}"] {
+                let text = format!("use crate::host::{module}::{item};");
+                assert_eq!(arrows("services/unit/mod.rs", &text), 1, "{text}");
+            }
+            assert_eq!(arrows("services/unit.rs", &format!("use crate::host::{module};")), 1);
+        }
+        assert_eq!(arrows("services/unit.rs", "use crate::host::connections::{Link, Received};"), 1);
+        assert_eq!(arrows("services/unit.rs", "fn f() { crate::host::frame::encode() }"), 1);
+        assert_eq!(arrows("distribution/message.rs", "use crate::host::frame::Cut;"), 0, "a neighbour");
+    }
+
+    #[test]
+    fn an_exception_that_is_not_used_is_told() {
+        let source = |text: &str| vec![(PathBuf::from("services/unit/mod.rs"), text.to_owned())];
+        let unused = |text: &str| unused_exceptions(&source(text), &HashSet::new()).len();
+        assert_eq!(unused(""), HOST_FOR_SERVICES.len());
+        assert_eq!(unused("use crate::host::frame::{Frame, HEADER_BYTES};"), HOST_FOR_SERVICES.len() - 2);
+        assert_eq!(unused("#[cfg(test)] mod tests { use crate::host::frame::Frame; }"), HOST_FOR_SERVICES.len());
     }
 
     #[test]

@@ -1,9 +1,16 @@
-//! Runs groups of checks one after the other, and reports what each showed and what it cost.
+//! Runs groups of checks, and reports what each showed and what it cost.
+//!
+//! Groups that fill the processors run one after the other. Groups that mostly wait (for an emulator, for a time-out, for a
+//! linker with one thread) run two at a time behind them, each as a process of its own whose output is printed at its end.
 
+use std::collections::VecDeque;
 use std::process::ExitCode;
+use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
 use anyhow::{Result, bail};
+
+use crate::command::Run;
 
 use crate::groups::{Extent, GROUPS, Group, Outcome};
 
@@ -29,8 +36,13 @@ pub(crate) fn list() -> Result<ExitCode> {
 /// Runs the groups named, or those of the default run.
 pub(crate) fn run(names: &[String], quick: bool) -> Result<ExitCode> {
     let chosen = chosen(names, quick)?;
-    let reports: Vec<Report> = chosen.into_iter().map(|group| run_group(group, quick)).collect();
+    let start = Instant::now();
+    let (waiting, busy): (Vec<&Group>, Vec<&Group>) =
+        chosen.into_iter().partition(|group| group.waits && names.is_empty());
+    let mut reports: Vec<Report> = busy.into_iter().map(|group| run_group(group, quick)).collect();
+    reports.extend(run_side_by_side(waiting, quick));
     summarise(&reports);
+    println!("{:<14}{:>10.1}", "all of it", start.elapsed().as_secs_f64());
     let strict = is_strict(std::env::var("CI").ok().as_deref());
     let (line, success) = verdict(&reports, strict);
     if strict && !success && !reports.iter().any(|report| matches!(report.outcome, Outcome::Failed(_))) {
@@ -56,18 +68,78 @@ fn chosen(names: &[String], quick: bool) -> Result<Vec<&'static Group>> {
 
 fn run_group(group: &'static Group, quick: bool) -> Report {
     println!("== {}: {}", group.name, group.what);
-    let (extent, budget) = match group.quick {
-        Some(seconds) if quick => (Extent::Quick, seconds),
-        _ => (Extent::Full, group.budget),
-    };
+    let (extent, budget) = extent_of(group, quick);
     let start = Instant::now();
     let outcome = (group.run)(extent);
     let report = Report { group, outcome, seconds: start.elapsed().as_secs_f64(), budget };
-    println!("-- {}", report.line());
-    if report.seconds > budget as f64 {
-        println!("warning: {} took {:.0} s, its budget is {budget} s", group.name, report.seconds);
-    }
+    println!("{REPORT}{}", report.line());
+    report.warn();
     report
+}
+
+fn extent_of(group: &Group, quick: bool) -> (Extent, u64) {
+    match group.quick {
+        Some(seconds) if quick => (Extent::Quick, seconds),
+        _ => (Extent::Full, group.budget),
+    }
+}
+
+/// Begins the line with which a group ends.
+const REPORT: &str = "-- ";
+
+/// How many groups that mostly wait run at a time.
+const SIDE_BY_SIDE: usize = 2;
+
+fn run_side_by_side(groups: Vec<&'static Group>, quick: bool) -> Vec<Report> {
+    let names: Vec<&str> = groups.iter().map(|group| group.name).collect();
+    if !names.is_empty() {
+        println!("== {SIDE_BY_SIDE} at a time, each printed when it has ended: {}", names.join(", "));
+    }
+    let (queue, reports) = (Mutex::new(VecDeque::from(groups)), Mutex::new(Vec::new()));
+    let work = || {
+        loop {
+            let next = queue.lock().unwrap_or_else(PoisonError::into_inner).pop_front();
+            let Some(group) = next else { return };
+            let report = run_apart(group, quick);
+            reports.lock().unwrap_or_else(PoisonError::into_inner).push(report);
+        }
+    };
+    std::thread::scope(|scope| (0..SIDE_BY_SIDE).for_each(|_| drop(scope.spawn(work))));
+    reports.into_inner().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Runs a group as a process of its own, and prints at once what it printed.
+fn run_apart(group: &'static Group, quick: bool) -> Report {
+    let (_, budget) = extent_of(group, quick);
+    let start = Instant::now();
+    let outcome = apart(group.name, quick).unwrap_or_else(|error| Outcome::Failed(format!("{error:#}")));
+    let report = Report { group, outcome, seconds: start.elapsed().as_secs_f64(), budget };
+    report.warn();
+    report
+}
+
+fn apart(name: &str, quick: bool) -> Result<Outcome> {
+    let this = std::env::current_exe()?;
+    let run = Run::new(&this.to_string_lossy()).args(["test", name]);
+    let run = if quick { run.args(["--quick"]) } else { run };
+    let output = run.merged()?;
+    println!("{output}");
+    Ok(outcome_in(name, &output))
+}
+
+/// What the output of a group's own process says of it; nothing said is a failure.
+fn outcome_in(name: &str, output: &str) -> Outcome {
+    let mut lines = output.lines().rev().filter_map(|line| line.strip_prefix(REPORT));
+    let ended = lines.find(|line| line.split_whitespace().next() == Some(name)).unwrap_or_default();
+    if ended.ends_with(PASSED) {
+        return Outcome::Passed;
+    }
+    let reason = |mark: &str| ended.split_once(mark).map(|(_, why)| why.to_owned());
+    match (reason(SKIPPED), reason(FAILED)) {
+        (Some(why), None) => Outcome::Skipped(why),
+        (_, Some(why)) => Outcome::Failed(why),
+        (None, None) => Outcome::Failed("its process ended without a result".to_owned()),
+    }
 }
 
 fn summarise(reports: &[Report]) {
@@ -77,14 +149,26 @@ fn summarise(reports: &[Report]) {
     }
 }
 
+const PASSED: &str = "  passed";
+const FAILED: &str = "  FAILED: ";
+const SKIPPED: &str = "  skipped: ";
+
 impl Report {
+    fn warn(&self) {
+        let Self { group, seconds, budget, .. } = self;
+        if *seconds > *budget as f64 {
+            println!("warning: {} took {seconds:.0} s, its budget is {budget} s", group.name);
+        }
+    }
+
     fn line(&self) -> String {
         let result = match &self.outcome {
-            Outcome::Passed => "passed".to_owned(),
-            Outcome::Failed(why) => format!("FAILED: {why}"),
-            Outcome::Skipped(why) => format!("skipped: {why}"),
+            Outcome::Passed => PASSED.to_owned(),
+            // A result is one line, also where a reason is several.
+            Outcome::Failed(why) => format!("{FAILED}{}", why.replace('\n', " ")),
+            Outcome::Skipped(why) => format!("{SKIPPED}{}", why.replace('\n', " ")),
         };
-        format!("{:<14}{:>10.1}{:>10}  {result}", self.group.name, self.seconds, self.budget)
+        format!("{:<14}{:>10.1}{:>10}{result}", self.group.name, self.seconds, self.budget)
     }
 }
 
@@ -104,7 +188,7 @@ fn is_strict(ci: Option<&str>) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use super::{Report, chosen, is_strict, verdict};
+    use super::{REPORT, Report, chosen, is_strict, outcome_in, verdict};
     use crate::groups::{GROUPS, Outcome};
 
     fn reports(outcomes: Vec<Outcome>) -> Vec<Report> {
@@ -124,6 +208,19 @@ mod tests {
         assert!(!verdict(&reports, true).1);
         assert!(is_strict(Some("true")) && is_strict(Some("1")));
         assert!(!is_strict(None) && !is_strict(Some("false")) && !is_strict(Some("")));
+    }
+
+    #[test]
+    fn what_a_process_says_of_its_group_is_read_as_it_was_meant() {
+        let name = GROUPS[0].name;
+        let ends =
+            reports(vec![Outcome::Passed, Outcome::Failed("a\nb: c".into()), Outcome::Skipped("no root".into())]);
+        let read = ends.iter().map(|report| outcome_in(name, &format!("x\n{REPORT}{}\ny", report.line())));
+        let said = [Outcome::Passed, Outcome::Failed("a b: c".into()), Outcome::Skipped("no root".into())];
+        assert_eq!(read.collect::<Vec<_>>(), said);
+        for nothing in ["", "-- other   1.0   1  passed"] {
+            assert!(matches!(outcome_in(name, nothing), Outcome::Failed(_)), "{nothing}");
+        }
     }
 
     #[test]

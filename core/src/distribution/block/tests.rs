@@ -256,7 +256,7 @@ fn a_malformed_block_is_the_peers_fault_even_if_it_would_not_fit() {
     let mut block = [0; 16];
     assert_eq!(read(results, &block, &mut mine), Err(Error::WrongType { index: 0 }));
     block[8] = 2;
-    assert_eq!(read(results, &block, &mut mine), Err(Error::Malformed));
+    assert_eq!(read(results, &block, &mut mine), Err(Error::ResultLost));
 }
 
 #[test]

@@ -86,7 +86,7 @@ impl<S: Storage> Node<S> {
             known.listens = Some(address);
         }
         if known.newest.is_none_or(|(newest, _)| newest != epoch) {
-            known.hear(now, epoch, 0);
+            known.newest = Some((epoch, 0));
         }
         (known.epoch, known.limits, known.address, known.since) = (epoch, Some(limits), address, now);
         self.table.cancel(place);
@@ -95,6 +95,7 @@ impl<S: Storage> Node<S> {
         self.table.keep_index(place);
         self.counters.add(NodeCounter::Restarted, u64::from(restarted));
         self.counters.add(NodeCounter::Joined, 1);
+        self.hints.forget(identity);
         debug!("link {} joins", link.0);
         Admission::Accept
     }

@@ -24,12 +24,16 @@ const ANSWER_PAUSE: Duration = FIRST_SEARCH.times(2);
 const ANSWER_GATHER: Duration = Duration::from_millis(20);
 /// Answers to single nodes that may wait for their random delay.
 const WAITING_ANSWERS: usize = 8;
+/// Of them to one host: units that share one are told by the broadcast.
+const ANSWERS_TO_A_HOST: usize = 4;
 /// Dials are spread over as many nodes at least: those that hold back are more than those that are expected.
 const LEAST_SPREAD: u16 = 50;
 /// Dials are spread over as many nodes at most, whatever is expected: the last one dials two seconds later.
 const MOST_SPREAD: u16 = 2_000;
 /// An m_unit that has dialled a peer in vain this often asks where it is.
 const MOVED_AFTER: u8 = 2;
+/// A dial that has been silent for so long no longer keeps another address of the same node waiting.
+const DIAL_ALONE: Duration = Duration::from_millis(300);
 /// A link that is being opened is given up after this, however the network below thinks about it.
 pub(super) const DIAL_TIMEOUT: Duration = Duration::from_secs(6);
 
@@ -64,19 +68,28 @@ impl Answers {
     }
 }
 
-/// What a datagram says of a node that can be dialled.
+/// What an answer says of a node that can be dialled.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Found {
-    pub(super) epoch: Epoch,
-    pub(super) sequence: u32,
-    pub(super) tcp_port: u16,
-    /// In secured mode whoever cannot make a datagram may still send one again.
-    pub(super) mode: Mode,
+    epoch: Epoch,
+    sequence: u32,
+    tcp_port: u16,
+}
+
+impl Found {
+    pub(super) const fn of(announce: &Announce) -> Self {
+        Self { epoch: announce.epoch, sequence: announce.sequence, tcp_port: announce.tcp_port }
+    }
 }
 
 impl<S: Storage> Node<S> {
     /// A unit looks for this manager: the first is answered alone, and with the second all the others as well.
     pub(super) fn answer_seeker(&mut self, now: Instant, from: SocketAddr, who_has: &WhoHas) {
+        if who_has.expected == 0 {
+            // It asks this unit alone, and has waited already.
+            self.answer_later(now, from, &who_has.identity, who_has.nonce);
+            return;
+        }
         let who = short_hash(&who_has.identity);
         let another = self.answers.asked.is_some_and(|(at, asked)| asked != who && now < at + SAME_QUESTION);
         self.answers.asked = Some((now, who));
@@ -101,11 +114,16 @@ impl<S: Storage> Node<S> {
         self.answer_later(at, to, &who_has.identity, nonce);
     }
 
-    /// Plans an answer to one node. One that finds no room is left to the broadcast, or to the next question.
+    /// Plans an answer to one node. One that finds no room is left to the broadcast, or to the next question; one host
+    /// does not take all the room.
     pub(super) fn answer_later(&mut self, at: Instant, to: SocketAddr, who: &Identity, nonce: u64) {
-        let who = who.clone();
-        let waiting = self.answers.single.iter().any(|answer| answer.to == to && answer.nonce == nonce);
-        if !waiting && self.answers.single.push(Answer { at, to, who, nonce }).is_err() {
+        let single = &mut self.answers.single;
+        if single.iter().any(|answer| answer.to == to && answer.nonce == nonce) {
+            return;
+        }
+        let of_host = single.iter().filter(|answer| answer.to.ip() == to.ip()).count();
+        let is_crowded = of_host >= ANSWERS_TO_A_HOST && !to.ip().is_loopback();
+        if is_crowded || single.push(Answer { at, to, who: who.clone(), nonce }).is_err() {
             self.counters.add(NodeCounter::AnnounceDropped, 1);
         }
     }
@@ -180,16 +198,10 @@ impl<S: Storage> Node<S> {
         peer.role() == Role::MUnit && (self.config.identity.role() == Role::SUnit || self.config.identity < *peer)
     }
 
-    /// A node that this unit dials has been heard; it is dialled at `dial_at`, unless it is connected.
-    pub(super) fn found(
-        &mut self,
-        now: Instant,
-        identity: &Identity,
-        from: SocketAddr,
-        found: Found,
-        dial_at: Option<Instant>,
-    ) {
-        let Found { epoch, sequence, tcp_port, mode } = found;
+    /// A node that this unit dials has answered it: it is dialled at once, unless it is connected. While a dial to another
+    /// address of it is silent, this one is tried beside it.
+    pub(super) fn found(&mut self, now: Instant, identity: &Identity, from: SocketAddr, found: Found) {
+        let Found { epoch, sequence, tcp_port } = found;
         if tcp_port == 0 || matches!(self.config.target, Target::Fixed(..)) {
             return;
         }
@@ -200,26 +212,27 @@ impl<S: Storage> Node<S> {
         };
         self.count_forgotten(forgotten);
         let Some(known) = self.table.node_mut(place) else { return };
-        if !known.is_news(now, epoch, sequence, mode) {
+        if !known.is_news(epoch, sequence) {
             self.counters.add(NodeCounter::Outdated, 1);
             return;
         }
-        known.hear(now, epoch, sequence);
-        known.listens = Some(address);
-        if !known.is_joined() {
-            if known.epoch != epoch {
-                known.not_before = Instant::START;
-                known.attempts = 0;
-            }
-            (known.address, known.epoch) = (address, epoch);
+        known.newest = Some((epoch, sequence));
+        let moved = known.listens.replace(address) != Some(address);
+        if known.is_joined() {
+            return;
         }
-        let not_before = known.not_before;
-        if known.state == NodeState::Away
-            && let Some(dial_at) = dial_at
-        {
-            let planned = if known.task.is_some() { known.due } else { Instant::FAR_FUTURE };
-            self.table.schedule(place, planned.min(dial_at.max(not_before)), Task::Dial);
+        if known.epoch != epoch {
+            known.not_before = Instant::START;
+            known.attempts = 0;
         }
+        (known.address, known.epoch) = (address, epoch);
+        let at = match known.state {
+            NodeState::Dialing if moved => now.max(known.since + DIAL_ALONE),
+            NodeState::Dialing => return,
+            _ if known.task.is_some() => known.due.min(now.max(known.not_before)),
+            _ => now.max(known.not_before),
+        };
+        self.table.schedule(place, at, Task::Dial);
     }
 
     /// The time to dial a node has come.
@@ -228,10 +241,10 @@ impl<S: Storage> Node<S> {
             self.retry(now, place);
             return None;
         }
-        let known = self.table.node_mut(place).filter(|known| known.state == NodeState::Away)?;
+        let known = self.table.node_mut(place).filter(|known| !known.is_joined())?;
         let to = known.listens?;
         let identity = Some(known.identity.clone());
-        known.dialing = None;
+        known.since = now;
         self.table.set_state(place, NodeState::Dialing);
         self.table.schedule(place, now + DIAL_TIMEOUT, Task::GiveUp);
         self.counters.add(NodeCounter::Dialled, 1);

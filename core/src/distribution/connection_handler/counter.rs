@@ -35,6 +35,12 @@ crate::counters::counters! {
         AnnounceWithheld,
         /// Answers to another question than this unit's last one.
         Unasked,
+        /// Nodes that a broadcast told of and that were asked whether they are there.
+        HintsAsked,
+        /// Broadcasts of a wanted node whose address was asked a short while ago, or for which there was no room.
+        HintsIgnored,
+        /// Searches of others that put nothing off, because one of their host did a short while ago.
+        WhoHasUnheeded,
         /// Searches and answers that the network did not take.
         SendFailed,
         /// Datagrams older than what is known of their sender.

@@ -4,15 +4,10 @@ use core::net::SocketAddr;
 
 use super::table::NONE;
 use super::timetable::Task;
-use crate::config::Mode;
 use crate::distribution::hello::Limits;
 use crate::distribution::identity::{Epoch, Identity};
 use crate::host::mailman::LinkId;
-use crate::time::{Duration, Instant};
-
-/// Datagrams overtake each other by less than this. Within it the greater (epoch, sequence) is the newer one, whichever
-/// comes first; after it whatever comes is news, since epochs of a board need not rise from boot to boot.
-const REORDERING: Duration = Duration::from_secs(1);
+use crate::time::Instant;
 
 /// What is known of a node.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -27,9 +22,8 @@ pub struct Known {
     pub limits: Option<Limits>,
     /// Where it can be dialled, if that is known.
     pub(super) listens: Option<SocketAddr>,
-    /// The newest datagram of it.
+    /// The newest answer of it.
     pub(super) newest: Option<(Epoch, u32)>,
-    heard: Instant,
     pub(super) state: NodeState,
     /// Its link was opened from here.
     pub(super) dialed: bool,
@@ -37,7 +31,7 @@ pub struct Known {
     pub(super) dialing: Option<LinkId>,
     /// A link with its identity that waits for the present one to show whether it lives.
     pub(super) newcomer: Option<Newcomer>,
-    /// When it joined.
+    /// When it joined, or was dialled last.
     pub(super) since: Instant,
     /// Dials that have failed in a row.
     pub(super) attempts: u8,
@@ -98,19 +92,10 @@ impl Known {
         if self.index == NONE { None } else { Some(self.index) }
     }
 
-    /// Whether a datagram is newer than what is known.
-    pub(super) fn is_news(&self, now: Instant, epoch: Epoch, sequence: u32, mode: Mode) -> bool {
-        let Some(newest) = self.newest else { return true };
-        let late = now >= self.heard + REORDERING;
-        // Within a life numbers rise: the same datagram once more is somebody else's who has recorded it.
-        let again = mode == Mode::Secured && epoch == newest.0;
-        (epoch, sequence) > newest || (late && !again)
-    }
-
-    /// Notes the newest datagram.
-    pub(super) fn hear(&mut self, now: Instant, epoch: Epoch, sequence: u32) {
-        self.newest = Some((epoch, sequence));
-        self.heard = now;
+    /// Whether an answer is newer than what is known. Earlier lives cannot answer this unit's question; within a life
+    /// numbers rise, and the same answer once more is another's who has recorded it.
+    pub(super) fn is_news(&self, epoch: Epoch, sequence: u32) -> bool {
+        self.newest.is_none_or(|(newest, last)| newest != epoch || sequence > last)
     }
 
     pub(super) fn new(identity: Identity, address: SocketAddr, epoch: Epoch) -> Self {
@@ -121,7 +106,6 @@ impl Known {
             limits: None,
             listens: None,
             newest: None,
-            heard: Instant::START,
             state: NodeState::Away,
             dialed: false,
             dialing: None,

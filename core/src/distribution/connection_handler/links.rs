@@ -33,7 +33,10 @@ impl<S: Storage> Node<S> {
     /// The link that [`Action::Dial`] asked for could not be opened at all.
     pub fn dial_failed(&mut self, now: Instant, identity: Option<&Identity>) {
         let place = identity.and_then(|identity| self.table.find(identity));
-        let dialing = |place: &usize| self.table.node(*place).is_some_and(|known| known.state == NodeState::Dialing);
+        // An earlier dial to another address of it may still come through.
+        let dialing = |place: &usize| {
+            self.table.node(*place).is_some_and(|known| known.state == NodeState::Dialing && known.dialing.is_none())
+        };
         if let Some(place) = place.filter(dialing) {
             self.dial_ended(now, place);
         }

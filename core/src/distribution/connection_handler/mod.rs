@@ -8,12 +8,15 @@
 //! - An s_unit broadcasts a who-has for its manager, waits longer and longer between two, and dials the one that answers.
 //!   When it hears another unit ask for the same manager it holds its own question back: the manager answers two with
 //!   one broadcast.
-//! - An m_unit broadcasts a who-has for everybody. Its own s_units dial it, after a random delay; of two m_units the
-//!   smaller identity dials.
+//! - An m_unit broadcasts a who-has for everybody. Its own s_units ask it, after a random delay, and dial it when it
+//!   answers; of two m_units the smaller identity dials.
+//! - What is dialled has answered a question of this unit, in secured mode with the code of the pair. All else that is
+//!   heard is a hint of an address.
 
 mod admission;
 mod answers;
 mod counter;
+mod hints;
 mod known;
 mod links;
 mod search;
@@ -29,7 +32,7 @@ pub use table::Order;
 
 use core::net::SocketAddr;
 
-use crate::config::{Constraints, NODE_NAME_BYTES};
+use crate::config::Constraints;
 use crate::counters::Counters;
 use crate::distribution::authenticator::Authenticator;
 use crate::distribution::datagram::{Datagram, DatagramError, SESSION_HEADER_BYTES};
@@ -41,6 +44,7 @@ use crate::random::Random;
 use crate::storage::Storage;
 use crate::time::Instant;
 use answers::Answers;
+use hints::{Hints, Hosts};
 use search::{Budget, Search};
 use table::Table;
 use timetable::Task;
@@ -58,11 +62,9 @@ pub enum Target {
 }
 
 impl Manager {
-    /// A manager's name and id; [`Error::BadName`] for a name that is empty or longer than [`NODE_NAME_BYTES`].
+    /// A manager's name and id; [`Error::BadName`] for what is [no name](Identity::new).
     pub fn new(name: &str, id: u32) -> Result<Self, Error> {
-        if name.is_empty() || name.len() > NODE_NAME_BYTES {
-            return Err(Error::BadName);
-        }
+        Identity::m_unit(name, id)?;
         Ok(Self { name: heapless::String::try_from(name).map_err(|_| Error::BadName)?, id })
     }
 
@@ -184,6 +186,8 @@ pub struct Node<S: Storage> {
     random: Random,
     search: Search,
     budget: Budget,
+    hints: Hints,
+    hosts: Hosts,
     answers: Answers,
     twins: Twins,
     /// Of the last search or answer.
@@ -206,6 +210,8 @@ impl<S: Storage> Node<S> {
             findings: storage.findings,
             search: Search::new(now, config.identity.role(), &mut random),
             budget: Budget::new(),
+            hints: Hints::new(),
+            hosts: Hosts::new((config.seed >> 32) as u32 ^ config.seed as u32),
             answers: Answers::new(),
             twins: Twins::default(),
             sequence: 0,
@@ -295,7 +301,7 @@ impl<S: Storage> Node<S> {
 
     /// When [`poll`](Self::poll) has something to do next.
     pub fn next_deadline(&self) -> Instant {
-        self.search.next().min(self.answers.next()).min(self.table.next_due())
+        self.search.next().min(self.answers.next()).min(self.hints.next()).min(self.table.next_due())
     }
 
     /// Does what is due. Returns one action at a time; call it until it returns `None`.
@@ -319,6 +325,7 @@ impl<S: Storage> Node<S> {
             }
         }
         self.poll_answers(now, mailman, authenticator);
+        self.poll_hints(now, mailman, authenticator);
         self.poll_search(now, mailman, authenticator);
         None
     }
@@ -334,7 +341,7 @@ impl<S: Storage> Node<S> {
         match Datagram::decode(bytes, self.config.fleet, authenticator) {
             Ok(Datagram::Session { link, nonce, .. }) => return self.sort(LinkId(link), nonce, bytes),
             Ok(Datagram::WhoHas(who_has)) => self.heard_who_has(now, from, &who_has, authenticator.mode()),
-            Ok(Datagram::Announce(announce)) => self.heard_announce(now, from, &announce, authenticator.mode()),
+            Ok(Datagram::Announce(announce)) => self.heard_announce(now, from, &announce),
             Err(error) => self.unreadable(now, from, error),
         }
         Sorted::Done

@@ -9,6 +9,7 @@ use super::{Node, NodeCounter, Target};
 use crate::config::{FIRST_SEARCH, LONGEST_SEARCH, Mode, SEARCH_BUDGET, SEARCH_WINDOW};
 use crate::distribution::authenticator::Authenticator;
 use crate::distribution::datagram::{Announce, KNOWN_NODES, SEARCH_BYTES, WhoHas, short_hash};
+use crate::distribution::hello::Manager;
 use crate::distribution::identity::{Epoch, Identity, Role};
 use crate::error::Refusal;
 use crate::host::mailman::Mailman;
@@ -33,7 +34,7 @@ const LONGEST_PAUSE_AFTER: u8 = 5;
 /// it hears. Nobody who asks all the time silences a fleet for good, and a fleet that waits stays quiet.
 const STUBBORN: u64 = 1_024;
 /// Times in a row that a search is put off because of the budget.
-const DEFERRALS: u8 = 30;
+const DEFERRALS: u8 = 4;
 /// Steps of [`alone`]: among a thousand units about one falls into the earliest that is taken.
 const STEPS: u32 = 12;
 
@@ -53,12 +54,23 @@ pub(super) struct Search {
     stubborn: bool,
     /// Times in a row that the budget was used up.
     deferred: u8,
+    /// It has waited for the answer to a hint, and does so no more before it has gone out.
+    pub(super) waited: bool,
 }
 
 impl Search {
     pub(super) fn new(now: Instant, role: Role, random: &mut Random) -> Self {
         let next = now + first_delay(role, FIRST_LISTENING, random);
-        Self { next, explicit: None, attempt: 0, round: now, nonce: fresh(random), stubborn: false, deferred: 0 }
+        Self {
+            next,
+            explicit: None,
+            attempt: 0,
+            round: now,
+            nonce: fresh(random),
+            stubborn: false,
+            deferred: 0,
+            waited: false,
+        }
     }
 
     pub(super) fn next(&self) -> Instant {
@@ -160,6 +172,7 @@ impl<S: Storage> Node<S> {
             return;
         }
         self.search.nonce = fresh(&mut self.random);
+        self.search.waited = false;
         if let Some(listening) = listening {
             self.search.attempt = 0;
             self.search.next = now + first_delay(self.config.identity.role(), listening, &mut self.random);
@@ -204,6 +217,9 @@ impl<S: Storage> Node<S> {
             self.search.next = Instant::FAR_FUTURE;
             return;
         }
+        if self.config.identity.role() == Role::SUnit && self.waits_for_hints(now) {
+            return;
+        }
         let allowed = self.budget.allowed_at(now);
         if allowed > now && !self.search.stubborn {
             self.search.deferred = self.search.deferred.saturating_add(1);
@@ -217,40 +233,67 @@ impl<S: Storage> Node<S> {
 
     fn send_who_has(&mut self, now: Instant, mailman: &mut impl Mailman, authenticator: &impl Authenticator) {
         self.plan_next(now);
-        (self.search.stubborn, self.search.deferred) = (false, 0);
+        (self.search.stubborn, self.search.deferred, self.search.waited) = (false, 0, false);
         self.budget.note(now);
-        let known = self.table.iter().filter(|known| known.is_joined()).map(|known| short_hash(&known.identity));
+        let (wanted, expected) = (self.manager().cloned(), self.expected().max(1));
+        let sent = self.say_who_has(wanted, expected, authenticator, |datagram| mailman.broadcast(datagram));
+        self.counters.add(if sent { NodeCounter::WhoHasSent } else { NodeCounter::SendFailed }, 1);
+    }
+
+    /// Makes a who-has and sends it; `expected` is 0 in one that asks a single node.
+    pub(super) fn say_who_has(
+        &mut self,
+        wanted: Option<Manager>,
+        expected: u16,
+        authenticator: &impl Authenticator,
+        send: impl FnOnce(&[u8]) -> bool,
+    ) -> bool {
+        let known = self.table.iter().filter(|known| expected > 0 && known.is_joined());
+        let known = known.map(|known| short_hash(&known.identity));
         let who_has = WhoHas {
             identity: self.config.identity.clone(),
             epoch: self.config.epoch,
             sequence: self.sequence.wrapping_add(1),
             nonce: self.search.nonce,
-            wanted: self.manager().cloned(),
+            wanted,
             tcp_port: self.config.tcp_port,
-            expected: self.expected(),
+            expected,
             known: known.take(KNOWN_NODES).collect(),
         };
         self.sequence = who_has.sequence;
         let mut bytes = [0; SEARCH_BYTES];
-        let datagram = who_has.encode(self.config.fleet, authenticator, &mut bytes);
-        let sent = datagram.is_some_and(|datagram| mailman.broadcast(datagram));
-        self.counters.add(if sent { NodeCounter::WhoHasSent } else { NodeCounter::SendFailed }, 1);
+        who_has.encode(self.config.fleet, authenticator, &mut bytes).is_some_and(send)
     }
 
     pub(super) fn heard_who_has(&mut self, now: Instant, from: SocketAddr, who_has: &WhoHas, mode: Mode) {
-        if self.is_own(now, from, &who_has.identity, who_has.epoch, Some((who_has, mode))) {
+        if self.is_own(now, from, &who_has.identity, who_has.epoch, Some(who_has)) {
             return;
         }
         self.counters.add(NodeCounter::WhoHasHeard, 1);
-        self.budget.note(now);
         let here = self.config.identity.role() == Role::MUnit;
+        let heeded = self.heeds(now, from, who_has);
         match &who_has.wanted {
             Some(manager) if manager.is(&self.config.identity) => self.answer_seeker(now, from, who_has),
-            Some(manager) if self.manager() == Some(manager) => self.hold_back(now),
-            None if who_has.identity.role() == Role::MUnit => self.heard_m_unit(now, from, who_has, mode),
+            Some(manager) if self.manager() == Some(manager) => {
+                if heeded {
+                    self.hold_back(now);
+                }
+            }
+            None if who_has.identity.role() == Role::MUnit => self.heard_m_unit(now, from, who_has),
             None if here => self.answer_survey(now, from, who_has, mode),
             _ => self.counters.add(NodeCounter::WrongManager, 1),
         }
+    }
+
+    /// Whether somebody's question may put this unit's own off. One that asks a single node says nothing to others.
+    fn heeds(&mut self, now: Instant, from: SocketAddr, who_has: &WhoHas) -> bool {
+        let heeded = who_has.expected > 0 && self.hosts.heeds(now, from);
+        if heeded {
+            self.budget.note(now);
+        } else {
+            self.counters.add(NodeCounter::WhoHasUnheeded, 1);
+        }
+        heeded
     }
 
     /// Another unit asks this unit's question: the answer will reach both.
@@ -272,8 +315,8 @@ impl<S: Storage> Node<S> {
         self.search.next = self.search.next.max(later);
     }
 
-    /// An m_unit asks for everybody: its own s_units dial it, and of two m_units the smaller one dials.
-    fn heard_m_unit(&mut self, now: Instant, from: SocketAddr, who_has: &WhoHas, mode: Mode) {
+    /// An m_unit asks for everybody: its own s_units ask it whether it is there, and so does the smaller one of two m_units.
+    fn heard_m_unit(&mut self, now: Instant, from: SocketAddr, who_has: &WhoHas) {
         if !self.is_wanted(&who_has.identity) {
             self.counters.add(NodeCounter::WrongManager, 1);
             return;
@@ -288,11 +331,10 @@ impl<S: Storage> Node<S> {
             }
             return;
         }
-        let found = Found { epoch: who_has.epoch, sequence: who_has.sequence, tcp_port: who_has.tcp_port, mode };
-        self.found(now, &who_has.identity, from, found, Some(now + delay));
+        self.hinted(now, from, &who_has.identity, delay);
     }
 
-    pub(super) fn heard_announce(&mut self, now: Instant, from: SocketAddr, announce: &Announce, mode: Mode) {
+    pub(super) fn heard_announce(&mut self, now: Instant, from: SocketAddr, announce: &Announce) {
         if self.is_own(now, from, &announce.identity, announce.epoch, None) {
             return;
         }
@@ -310,14 +352,15 @@ impl<S: Storage> Node<S> {
         if !self.dials(&announce.identity) {
             return;
         }
-        // A full manager's broadcast is no invitation; who asked it itself may be the one whose place is being kept.
-        let invited = !broadcast || announce.room > 0;
-        if !invited {
+        if !broadcast {
+            self.found(now, &announce.identity, from, Found::of(announce));
+        } else if announce.room > 0 {
+            let delay = self.spread(announce.expected);
+            self.hinted(now, from, &announce.identity, delay);
+        } else {
+            // A full manager's broadcast is no invitation; one that asked it may be the one whose place is being kept.
             self.note_of(now, from, &announce.identity, Refusal::Full);
         }
-        let delay = if broadcast { self.spread(announce.expected) } else { Duration::ZERO };
-        let found = Found { epoch: announce.epoch, sequence: announce.sequence, tcp_port: announce.tcp_port, mode };
-        self.found(now, &announce.identity, from, found, invited.then_some(now + delay));
     }
 
     /// An s_unit wants its manager, an m_unit everybody.

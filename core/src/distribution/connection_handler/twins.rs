@@ -3,7 +3,7 @@
 use core::net::SocketAddr;
 
 use super::{Node, NodeCounter};
-use crate::config::{LONGEST_SEARCH, Mode};
+use crate::config::LONGEST_SEARCH;
 use crate::distribution::datagram::WhoHas;
 use crate::distribution::identity::{Epoch, Identity, Role};
 use crate::error::Refusal;
@@ -43,7 +43,7 @@ impl<S: Storage> Node<S> {
         from: SocketAddr,
         identity: &Identity,
         epoch: Epoch,
-        question: Option<(&WhoHas, Mode)>,
+        question: Option<&WhoHas>,
     ) -> bool {
         if *identity != self.config.identity {
             return false;
@@ -52,8 +52,8 @@ impl<S: Storage> Node<S> {
             self.counters.add(NodeCounter::OwnIdentity, 1);
             self.note_of(now, from, identity, Refusal::DuplicateIdentity);
             self.twins.hear(now, from, epoch);
-            if let Some((who_has, mode)) = question.filter(|_| identity.role() == Role::MUnit) {
-                self.answer_unpaired(now, from, who_has, mode);
+            if let Some(who_has) = question.filter(|_| identity.role() == Role::MUnit) {
+                self.answer_later(now, from, identity, who_has.nonce);
             }
         }
         true

@@ -4,6 +4,7 @@ use core::net::IpAddr;
 
 use super::{Known, Node};
 use crate::distribution::identity::{Identity, Role};
+use crate::error::Error;
 use crate::host::mailman::LinkId;
 use crate::storage::Storage;
 
@@ -39,11 +40,15 @@ impl<S: Storage> Node<S> {
         self.table.find(identity).and_then(|place| self.table.node(place))
     }
 
-    /// The first node with this name, connected ones before others. Looks at all nodes.
-    pub fn find(&self, name: &str) -> Option<&Known> {
-        let mut same = self.nodes().filter(|known| known.identity.name() == name);
-        let first = same.next()?;
-        if first.is_joined() { Some(first) } else { same.find(|known| known.is_joined()).or(Some(first)) }
+    /// The node with this name among those that have joined, connected or not. [`Error::NotConnected`] where there is none,
+    /// [`Error::Ambiguous`] where there are several: the one that is connected may not be the one that is meant.
+    pub fn find(&self, name: &str) -> Result<&Known, Error> {
+        let mut same = self.s_units().chain(self.m_units()).filter(|known| known.identity.name() == name);
+        let first = same.next().ok_or(Error::NotConnected)?;
+        match same.next() {
+            None => Ok(first),
+            Some(second) => Err(Error::Ambiguous { ids: [first.identity.id(), second.identity.id()] }),
+        }
     }
 
     /// The first node with this id, connected ones before others.

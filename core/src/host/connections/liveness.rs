@@ -1,10 +1,8 @@
 //! Whether the peer is still there.
 
-use crate::config::{MISSED_KEEP_ALIVES, TCP_ONLY_LOSS};
+use crate::config::{LONGEST_KEEP_ALIVE, MISSED_KEEP_ALIVES, SHORTEST_KEEP_ALIVE, TCP_ONLY_LOSS};
 use crate::time::{Duration, Instant};
 
-/// No period, and no pause between two questions, is shorter.
-const SHORTEST: Duration = Duration::from_millis(1);
 /// While a keep-alive is missed, the peer is asked so often within each period. A live peer whose datagrams are lost at
 /// 10 % answers none of the eight questions until the link is given up once in 600,000 times.
 const QUESTIONS_PER_PERIOD: u64 = 4;
@@ -38,9 +36,10 @@ pub struct Look {
 }
 
 impl Liveness {
-    /// A peer that was heard just now and sends a keep-alive every `period`.
+    /// A peer that was heard just now and sends a keep-alive every `period`. One outside the bounds is taken as the nearer of
+    /// them: a peer that tells 2^32-1 ms is lost 210 s after it vanished, and not never.
     pub fn new(now: Instant, period: Duration) -> Self {
-        let period = period.max(SHORTEST);
+        let period = period.clamp(SHORTEST_KEEP_ALIVE, LONGEST_KEEP_ALIVE);
         let next_check = now + period + period.divided_by(2);
         Self { period, next_check, next_question: Instant::FAR_FUTURE, missed: 0, datagrams_pass: false }
     }
@@ -80,7 +79,7 @@ impl Liveness {
         // Where no datagram has passed, each keep-alive asks in the stream already.
         let ask = self.datagrams_pass && !lost && (missed || now >= self.next_question);
         if ask {
-            self.next_question = now + self.period.divided_by(QUESTIONS_PER_PERIOD).max(SHORTEST);
+            self.next_question = now + self.period.divided_by(QUESTIONS_PER_PERIOD).max(SHORTEST_KEEP_ALIVE);
         }
         Look { missed, ask, lost }
     }
@@ -121,6 +120,23 @@ mod tests {
             }
         }
         unreachable!()
+    }
+
+    #[test]
+    fn a_peer_that_tells_no_end_of_a_pause_is_lost_all_the_same() {
+        let told = Duration::from_millis(u64::from(u32::MAX));
+        let start = Instant::from_micros(1_000_000);
+        for datagrams_pass in [true, false] {
+            let mut liveness = Liveness::new(start, told);
+            if datagrams_pass {
+                liveness.heard_datagram(start);
+            }
+            let lost = (0..1_000).find_map(|_| {
+                let now = liveness.deadline();
+                liveness.poll(now).lost.then(|| now.since(start))
+            });
+            assert!(lost.is_some_and(|lost| lost <= Duration::from_secs(210)), "{lost:?}");
+        }
     }
 
     #[test]

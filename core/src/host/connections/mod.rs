@@ -196,8 +196,8 @@ impl<S: Storage, C: Seal> Link<S, C> {
         if !hold && self.sender.takes_at_once(priority, total) {
             return self.send_at_once(mailman, buffers, priority, total, write);
         }
-        if !self.sender.has_room(priority, total) {
-            // What was held back may be in the way.
+        if self.sender.is_in_the_way(buffers, priority, total) {
+            // What was held back goes out and makes room.
             self.flush(mailman, buffers).map_err(Error::Closed)?;
         }
         if let Err(error) = self.sender.accept(buffers, priority, total, write) {

@@ -72,11 +72,19 @@ impl<S: Storage> Sender<S> {
         self.lanes.iter().flatten().map(Lane::waiting).fold(self.urgent.len(), usize::saturating_add)
     }
 
-    /// Whether the lane of a class holds one more message of `total` bytes, if it holds any.
-    pub(super) fn has_room(&self, priority: Priority, total: usize) -> bool {
+    /// Whether what waits in the lanes is in the way of one more message of `total` bytes: its class's lane is too full,
+    /// or the other lanes hold the buffer that it needs.
+    pub(super) fn is_in_the_way(&self, buffers: &mut impl Buffers<S>, priority: Priority, total: usize) -> bool {
         match lane_index(priority).and_then(|index| self.lanes.get(index)) {
-            Some(Some(lane)) => self.cut.framed_length(total) <= lane.room(),
-            _ => true,
+            Some(Some(lane)) => self.cut.framed_length(total) > lane.room(),
+            Some(None) if self.lanes.iter().any(Option::is_some) => match buffers.take_leaving(LEFT_BY_SENDING) {
+                Some(buffer) => {
+                    buffers.give(buffer);
+                    false
+                }
+                None => true,
+            },
+            _ => false,
         }
     }
 

@@ -4,7 +4,7 @@ use super::permitting::{decide, log_refusal};
 use super::{Call, Phase, Session};
 use crate::config::Priority;
 use crate::distribution::block;
-use crate::distribution::function::Signature;
+use crate::distribution::function::{Attributes, Signature};
 use crate::distribution::function_list::Slot;
 use crate::distribution::message::{REPLY_BYTES, encode_failure, encode_reply};
 use crate::distribution::parameters::ParametersView;
@@ -16,9 +16,8 @@ use crate::host::secure::Secure;
 use crate::services::Context;
 use crate::services::access::Verb;
 use crate::services::calls::{CallHead, Ticket};
-use crate::services::lease::{Granted, Service};
+use crate::services::lease::Service;
 use crate::storage::{Buffers, Storage};
-use crate::time::{Duration, Instant};
 
 impl<S: Storage, C: Secure> Session<S, C> {
     /// The next call that waited and may begin now, its arguments in `arguments`. Call it after
@@ -29,29 +28,60 @@ impl<S: Storage, C: Secure> Session<S, C> {
         arguments: &mut ParametersView,
     ) -> Option<Call> {
         while self.phase == Phase::Live {
-            let (functions, now, access, remote) = (cx.functions, cx.now, cx.access, self.remote.as_ref());
-            let (head, read) = self.calls.take_next(cx.buffers, |head, block| {
-                if head.deadline <= now {
-                    return Err(Error::Expired);
-                }
-                let function = functions.lookup(head.slot, head.generation)?;
-                // The table may have changed while the call waited.
-                if !decide(access, remote, function.name(), Verb::Call).is_allowed() {
-                    return Err(Error::NotAllowed);
-                }
-                read_arguments(function.signature, block, arguments).map(|()| function.attributes.lease)
-            })?;
-            match read.and_then(|lease| self.begin(cx, head, lease)) {
-                Ok(call) => return Some(call),
-                Err(error) => self.refuse_request(cx, head.id, head.slot, head.priority, head.wants_reply, error),
+            if let Ok(call) = self.begin_next(cx, arguments)? {
+                return Some(call);
             }
         }
         None
     }
 
+    /// The same for emergencies alone, for ports that run those apart from all other calls.
+    pub fn next_emergency<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        arguments: &mut ParametersView,
+    ) -> Option<Call> {
+        while self.has_next_emergency() {
+            if let Ok(call) = self.begin_next(cx, arguments)? {
+                return Some(call);
+            }
+        }
+        None
+    }
+
+    /// Begins the next call that may begin, or refuses it; `None` when there is none.
+    fn begin_next<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        arguments: &mut ParametersView,
+    ) -> Option<Result<Call, Error>> {
+        let (functions, now, access, remote) = (cx.functions, cx.now, cx.access, self.remote.as_ref());
+        let (head, read) = self.calls.take_next(cx.buffers, |head, block| {
+            if head.deadline <= now {
+                return Err(Error::Expired);
+            }
+            let function = functions.lookup(head.slot, head.generation)?;
+            // The table may have changed while the call waited.
+            if !decide(access, remote, function.name(), Verb::Call).is_allowed() {
+                return Err(Error::NotAllowed);
+            }
+            read_arguments(function.signature, block, arguments).map(|()| function.attributes)
+        })?;
+        let begun = read.and_then(|attributes| self.begin(cx, head, &attributes));
+        if let Err(error) = begun {
+            self.refuse_request(cx, head.id, head.slot, head.priority, head.wants_reply, error);
+        }
+        Some(begun)
+    }
+
     /// Whether [`next_call`](Self::next_call) would look at a call.
     pub fn has_next_call(&self) -> bool {
         self.phase == Phase::Live && self.calls.can_begin()
+    }
+
+    /// Whether [`next_emergency`](Self::next_emergency) would look at a call.
+    pub fn has_next_emergency(&self) -> bool {
+        self.phase == Phase::Live && self.calls.has_next_emergency()
     }
 
     /// Whether a request that comes now would be kept if it cannot run at once. A port that stops looking at what it has
@@ -60,35 +90,29 @@ impl<S: Storage, C: Secure> Session<S, C> {
         self.calls.has_room(self.constraints.calls_per_peer, self.constraints.message_size as usize)
     }
 
-    /// Begins a call of a function that has this lease.
+    /// Begins a call of a function that has these attributes.
     pub(super) fn begin<M: Mailman, B: Buffers<S>, H: Service>(
         &mut self,
         cx: &mut Context<'_, S, M, B, H>,
         head: CallHead,
-        lease: Option<Duration>,
+        attributes: &Attributes,
     ) -> Result<Call, Error> {
+        let lease = attributes.lease;
         // A command that waited for its turn is no longer wanted once its lease has been given up.
         if lease.is_some() && self.publishing.is_released(head.slot, head.id) {
             return Err(Error::Expired);
         }
-        let ticket = self.calls.begin(head)?;
-        if let Some(length) = lease {
-            let end = head.made + length;
-            let granted = Granted { slot: head.slot, generation: head.generation, length, end };
-            let result = if end > cx.now { self.grant(cx, granted) } else { Err(Error::Expired) };
-            if let Err(error) = result {
+        let ticket = self.calls.begin(head, is_emergency(attributes, head.priority))?;
+        let order = match lease.map_or(Ok(None), |length| self.grant(cx, &head, length)) {
+            Ok(order) => order,
+            Err(error) => {
                 self.calls.end(ticket);
                 return Err(error);
             }
-        }
+        };
         self.link.counters.add(LinkCounter::RequestsRun, 1);
         let CallHead { slot, priority, wants_reply, deadline, .. } = head;
-        Ok(Call { ticket, slot, priority, wants_reply, deadline })
-    }
-
-    /// Lets the next call of the class begin while this one goes on, as for a service that takes long.
-    pub fn detach(&mut self, ticket: Ticket) {
-        self.calls.detach(ticket);
+        Ok(Call { ticket, slot, priority, wants_reply, deadline, order })
     }
 
     /// Answers a call. [`Error::Full`] when the answer cannot be kept now: the call stays open, to be answered again
@@ -111,7 +135,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
             }
         }
         if result.is_err() {
-            self.cut_lease(cx, head.slot);
+            self.cut_call(cx, head.id);
         }
         if !cfg!(cara_planted = "leaked_slot") {
             self.calls.end(ticket);
@@ -184,13 +208,8 @@ impl<S: Storage, C: Secure> Session<S, C> {
         total: usize,
         write: &mut dyn FnMut(&mut ChunkWriter<'_>),
     ) -> Result<(), Error> {
-        self.timers.gathered = Instant::FAR_FUTURE;
-        self.timers.last_write = cx.now;
         let sent = self.link.send_message(cx.mailman, cx.buffers, priority, total, false, write);
-        if let Err(Error::Closed(reason)) = sent {
-            self.end(reason);
-        }
-        sent
+        self.after_sending(cx, false, sent)
     }
 
     pub(super) fn refuse_request<M: Mailman, B: Buffers<S>, H: Service>(
@@ -231,6 +250,11 @@ impl<S: Storage, C: Secure> Session<S, C> {
             self.pump(cx);
         }
     }
+}
+
+/// Whether a call has its slots of emergencies: its class alone does not make it one.
+pub(super) fn is_emergency(attributes: &Attributes, priority: Priority) -> bool {
+    priority == Priority::Emergency && attributes.priority == Priority::Emergency
 }
 
 /// Puts a call's arguments, and room for its results, into the lent parameters.

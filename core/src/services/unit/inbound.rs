@@ -2,12 +2,12 @@
 
 use core::net::SocketAddr;
 
-use super::answering::read_arguments;
+use super::answering::{is_emergency, read_arguments};
 use super::permitting::may_publish;
 use super::publishing::Told;
 use super::timing::made_at;
 use super::{Event, Phase, Session, close_reason};
-use crate::config::Priority;
+use crate::config::{EMERGENCY_BYTES, Priority};
 use crate::distribution::function::{Attributes, Signature};
 use crate::distribution::function_list::{Function, Generation, Slot};
 use crate::distribution::message::{Control, Message, REPLY_BYTES, REQUEST_BYTES, RequestHeader, SessionBody};
@@ -59,6 +59,9 @@ impl<'b> ReplyBlock<'b> {
     }
 }
 
+/// Longest block of an emergency, whose message has its header as well.
+const EMERGENCY_BLOCK_BYTES: u32 = (EMERGENCY_BYTES - REQUEST_BYTES) as u32;
+
 /// What a frame led to, before anything is borrowed for the port.
 // A wide tag: the rest is then moved in words, and not byte by byte.
 #[repr(u32)]
@@ -79,7 +82,8 @@ impl<S: Storage, C: Secure> Session<S, C> {
     /// it consumes nothing and returns no event.
     ///
     /// The arguments of a call that may run at once are put into `arguments`; without them, or when more bytes follow
-    /// that must be looked at first, the call waits for [`next_call`](Self::next_call).
+    /// that must be looked at first, the call waits for [`next_call`](Self::next_call). Nothing that follows comes before
+    /// an emergency, and one alone has a place to wait: it begins at once.
     pub fn receive<'b, M: Mailman, B: Buffers<S>, H: Service>(
         &'b mut self,
         cx: &mut Context<'_, S, M, B, H>,
@@ -107,8 +111,9 @@ impl<S: Storage, C: Secure> Session<S, C> {
             return Receipt { consumed: received.consumed, event: None, paused: received.paused };
         };
         self.liveness.heard(cx.now);
-        let last = received.consumed == lent.len();
-        let outcome = self.digest(cx, incoming, lent, arguments.filter(|_| last));
+        let is_emergency = matches!(incoming, Incoming::Message(Priority::Emergency, _));
+        let at_once = is_emergency || received.consumed == lent.len();
+        let outcome = self.digest(cx, incoming, lent, arguments.filter(|_| at_once));
         Receipt { consumed: received.consumed, event: self.event(outcome, lent), paused: received.paused }
     }
 
@@ -213,6 +218,8 @@ impl<S: Storage, C: Secure> Session<S, C> {
                 self.renewed(cx, &renewal);
                 Outcome::Nothing
             }
+            Some(SessionBody::Release(release)) => self.released(cx, release),
+            Some(SessionBody::ReleaseAll(slot, id)) => self.released_all(cx, slot, id),
             Some(SessionBody::Message(priority, message)) => {
                 let prefix = self.link.view(place, lent).len().saturating_sub(message.len());
                 match (Priority::from_wire(priority), Message::decode(message)) {
@@ -256,9 +263,12 @@ impl<S: Storage, C: Secure> Session<S, C> {
             }
             Some(Message::Reply(id, result)) => {
                 let error = result.err();
-                self.reply_arrived(CallId(id), error, place.after(REPLY_BYTES))
+                self.reply_arrived(cx, CallId(id), error, place.after(REPLY_BYTES))
             }
-            Some(Message::Failure(id, error)) => Event::Failed(CallId(id), error).into(),
+            Some(Message::Failure(id, error)) => {
+                self.let_go(cx, CallId(id), None);
+                Event::Failed(CallId(id), error).into()
+            }
             Some(Message::Control(_)) => self.control_arrived(cx, place, lent),
             None => {
                 self.close(cx, CloseReason::Protocol);
@@ -267,13 +277,22 @@ impl<S: Storage, C: Secure> Session<S, C> {
         }
     }
 
-    fn reply_arrived(&mut self, id: CallId, error: Option<Error>, block: Place) -> Outcome {
+    fn reply_arrived<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        id: CallId,
+        error: Option<Error>,
+        block: Place,
+    ) -> Outcome {
         let Some(pending) = self.requests.close(id) else {
             self.link.counters.add(LinkCounter::RepliesLate, 1);
             return Outcome::Nothing;
         };
         match error {
-            Some(error) => Event::Reply(id, Err(error)).into(),
+            Some(error) => {
+                self.let_go(cx, id, Some(pending));
+                Event::Reply(id, Err(error)).into()
+            }
             None => Outcome::Reply { id, slot: pending.slot, generation: pending.generation, block },
         }
     }
@@ -325,13 +344,9 @@ impl<S: Storage, C: Secure> Session<S, C> {
                 }
                 Outcome::Nothing
             }
-            Control::Release { slot, id } => match self.released(cx, Slot(slot), id) {
-                true => Event::LeaseExpired(Slot(slot)).into(),
-                false => Outcome::Nothing,
-            },
-            Control::LeaseEnded { slot, expired } => match self.forget_held(Slot(slot)) {
-                true => Event::LeaseEnded { slot: Slot(slot), expired }.into(),
-                false => Outcome::Nothing,
+            Control::LeaseEnded { call, why } => match self.forget_held(CallId(call)) {
+                Some(held) => Event::LeaseEnded { call: held.call, slot: held.slot, why }.into(),
+                None => Outcome::Nothing,
             },
         }
     }
@@ -359,7 +374,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
             match arguments.filter(|_| self.calls.is_idle(priority)) {
                 Some(arguments) => {
                     read_arguments(function.signature, bytes, arguments)?;
-                    self.begin(cx, head, function.attributes.lease).map(Some)
+                    self.begin(cx, head, &function.attributes).map(Some)
                 }
                 None => {
                     // A buffer that the request lies in is back in the pool at once.
@@ -392,7 +407,10 @@ impl<S: Storage, C: Secure> Session<S, C> {
             return Err(Error::Stale);
         }
         // The limit may have become lower while the request was on its way.
-        let limit = self.constraints.message_size;
+        let limit = match priority {
+            Priority::Emergency => self.constraints.message_size.min(EMERGENCY_BLOCK_BYTES),
+            _ => self.constraints.message_size,
+        };
         if length > limit as usize {
             return Err(Error::TooLarge { limit });
         }
@@ -410,7 +428,8 @@ impl<S: Storage, C: Secure> Session<S, C> {
         if priority != Priority::Emergency {
             self.calls.interval(cx.now, self.constraints.minimum_interval)?;
         }
-        self.calls.admit(priority, self.constraints.calls_per_peer)?;
+        let is_emergency = is_emergency(&function.attributes, priority);
+        self.calls.admit(header.slot, is_emergency, self.constraints.calls_per_peer)?;
         let head = CallHead {
             id: header.id,
             slot: header.slot,

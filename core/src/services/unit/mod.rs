@@ -18,6 +18,8 @@
 //! - [`Event::Closed`] is the last event: the port forgets the link and tells the node that it left.
 
 mod answering;
+mod granting;
+mod holding;
 mod inbound;
 mod lending;
 mod outbound;
@@ -44,12 +46,12 @@ use crate::distribution::message::REQUEST_BYTES;
 use crate::distribution::message::SessionBody;
 use crate::error::{CloseReason, Error, Refusal};
 use crate::host::connections::{Link, LinkCounter, Liveness};
-use crate::host::frame::{self, Frame};
+use crate::host::frame::{Frame, HEADER_BYTES};
 use crate::host::mailman::{LinkId, Mailman};
 use crate::host::secure::Secure;
 use crate::services::Context;
 use crate::services::calls::{CallHead, Calls, Ticket};
-use crate::services::lease::{GrantedLeases, HeldLeases, Service};
+use crate::services::lease::{GrantedLeases, HeldLeases, LeaseEnd, Order, Service};
 use crate::services::requests::{CallId, Pending, Requests};
 use crate::storage::{Buffers, Storage};
 use crate::time::{Duration, Instant};
@@ -58,12 +60,12 @@ use timing::{PeerClock, Timers};
 /// Longest hello frame.
 const HELLO_BYTES: usize = 320;
 /// Longest frame body of a peer that has proven nothing: with its header too short to need a buffer of the pool.
-const UNPROVEN_BYTES: usize = crate::config::MINIMUM_CHUNK_BYTES - frame::HEADER_BYTES - 1;
+const UNPROVEN_BYTES: usize = crate::config::MINIMUM_CHUNK_BYTES - HEADER_BYTES - 1;
 /// A challenge goes in the stream and in so many datagrams: one lost segment or datagram must not make a live peer look
 /// dead, and its place go to a twin.
 const CHALLENGE_DATAGRAMS: usize = 3;
 /// Most that a chunk adds to its piece of a message, without sealing.
-const FRAME_BYTES: usize = frame::HEADER_BYTES + 6;
+const FRAME_BYTES: usize = HEADER_BYTES + 6;
 /// Messages of the protocol itself fit this, however small `message_size` is.
 const LEAST_MESSAGE_BYTES: usize = 512;
 
@@ -127,12 +129,14 @@ pub enum Event<'b> {
     },
     /// A lease on a function of this unit ended without being renewed: run its safe hook before anything else.
     LeaseExpired(Slot),
-    /// The peer ended the lease that this unit held on its function: finished, or expired there.
+    /// The peer ended the lease that a call of this unit held on its function.
     LeaseEnded {
+        /// The call that held it.
+        call: CallId,
         /// The peer's function.
         slot: Slot,
-        /// It was not renewed in time.
-        expired: bool,
+        /// Why.
+        why: LeaseEnd,
     },
     /// The peer answered a [`Session::challenge`] or a [`Session::ping`].
     Answered,
@@ -153,6 +157,8 @@ pub struct Call {
     pub wants_reply: bool,
     /// After this nobody waits for the answer.
     pub deadline: Instant,
+    /// Its hold of the service's lease, if there is one.
+    pub order: Option<Order>,
 }
 
 /// Where the link stands.
@@ -204,7 +210,9 @@ pub struct Session<S: Storage, C: Secure> {
     publishing: publishing::Publishing<S>,
     theirs: TheirFunctionList<S>,
     granted: GrantedLeases,
+    ends: granting::Ends,
     held: HeldLeases,
+    releases: holding::Releases,
 }
 
 impl<S: Storage, C: Secure> Session<S, C> {
@@ -238,7 +246,9 @@ impl<S: Storage, C: Secure> Session<S, C> {
             publishing: publishing::Publishing::new(storage.publications),
             theirs: TheirFunctionList::new(storage.their_functions, storage.their_signatures),
             granted: GrantedLeases::new(),
+            ends: granting::Ends::new(),
             held: HeldLeases::new(),
+            releases: holding::Releases::new(),
         }
     }
 
@@ -421,6 +431,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     pub fn writable<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
         self.flush(cx);
         self.pump_renewal(cx);
+        self.send_releases(cx);
         self.pump(cx);
     }
 

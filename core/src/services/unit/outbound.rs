@@ -4,23 +4,20 @@ use super::{Phase, Session};
 use crate::config::{DATAGRAM_BYTES, EMERGENCY_BYTES, Priority};
 use crate::distribution::block::{self, Put, SliceWriter};
 use crate::distribution::function::Signature;
-use crate::distribution::function_list::Slot;
 use crate::distribution::message::{REQUEST_BYTES, RequestHeader, SessionBody};
 use crate::distribution::parameters::ParametersView;
-use crate::error::{CloseReason, Error, Limit};
+use crate::error::{CloseReason, Error};
 use crate::host::connections::LinkCounter;
 use crate::host::mailman::Mailman;
 use crate::host::secure::Secure;
 use crate::services::Context;
-use crate::services::lease::{Held, Service};
+use crate::services::lease::Service;
 use crate::services::requests::CallId;
 use crate::storage::{Buffers, Storage};
 use crate::time::{Duration, Instant};
 
 /// Gathered one-way messages go out when there are this many bytes of them.
 const GATHERED_BYTES: usize = 8 * 1024;
-/// A held lease is renewed this often within its length, so that lost renewals do not end it.
-const RENEWALS_PER_LEASE: u64 = 4;
 
 /// How a request travels.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -41,7 +38,8 @@ pub struct RequestOptions {
     pub priority: Option<Priority>,
     /// Stream or datagram.
     pub delivery: Delivery,
-    /// Renew the function's lease until it is released. Without it, only further requests renew it.
+    /// Renew the lease that the call begins until it is released, or the call fails. Without it, what the call starts goes
+    /// on for the length of the lease.
     pub renew_lease: bool,
 }
 
@@ -105,7 +103,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         }
         self.requests.sent(cx.now);
         if let Some(lease) = checked.lease.filter(|_| options.renew_lease) {
-            self.hold_lease(cx, &checked.header, lease);
+            self.hold_lease(cx, &checked.header, checked.priority, lease);
         }
         Ok(id)
     }
@@ -162,11 +160,6 @@ impl<S: Storage, C: Secure> Session<S, C> {
         if length > limit { Err(Error::TooLarge { limit: limit as u32 }) } else { Ok(()) }
     }
 
-    fn check_held(&self, wanted: bool, slot: Slot) -> Result<(), Error> {
-        let known = self.held.iter().any(|held| held.slot == slot);
-        if wanted && !known && self.held.is_full() { Err(Error::Full(Limit::Leases)) } else { Ok(()) }
-    }
-
     fn take_id<M: Mailman, B: Buffers<S>, H: Service>(
         &mut self,
         cx: &mut Context<'_, S, M, B, H>,
@@ -175,7 +168,8 @@ impl<S: Storage, C: Secure> Session<S, C> {
     ) -> Result<CallId, Error> {
         let header = &checked.header;
         let id = if wants_reply {
-            self.requests.open(header.slot, header.generation, cx.now + header.remaining)?
+            let leased = checked.lease.map(|_| checked.priority);
+            self.requests.open(header.slot, header.generation, cx.now + header.remaining, leased)?
         } else {
             self.requests.next_id()
         };
@@ -204,30 +198,33 @@ impl<S: Storage, C: Secure> Session<S, C> {
             block::write(signature.arguments(), parameters, writer);
         };
         let sent = link.send_message(cx.mailman, cx.buffers, *priority, total, hold, write);
+        self.after_sending(cx, hold, sent)
+    }
+
+    /// What an attempt to send means for the messages that gather. A message that is refused leaves them where they
+    /// were: they go out now, because nothing else may come to take them along, and they hold the buffer that the next
+    /// attempt needs.
+    pub(super) fn after_sending<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        hold: bool,
+        sent: Result<(), Error>,
+    ) -> Result<(), Error> {
         match sent {
             Ok(()) if hold && self.link.queued() < GATHERED_BYTES => {
                 self.timers.gathered = self.timers.gathered.min(cx.now + crate::config::GATHER);
-                Ok(())
+                return sent;
             }
-            Ok(()) => {
-                self.timers.last_write = cx.now;
-                if hold {
-                    self.flush(cx);
-                }
-                // What is not held has taken with it what was.
-                self.timers.gathered = Instant::FAR_FUTURE;
-                Ok(())
-            }
-            Err(Error::Closed(reason)) => {
-                self.end(reason);
-                Err(Error::Closed(reason))
-            }
-            Err(error) => {
-                // What gathered may be in the way of this one: it goes out, and the caller may try again.
-                self.flush(cx);
-                Err(error)
-            }
+            // What is not held has taken with it what was.
+            Ok(()) if !hold => self.timers.gathered = Instant::FAR_FUTURE,
+            Ok(()) => self.flush(cx),
+            Err(Error::Closed(reason)) => self.end(reason),
+            Err(_) => self.flush(cx),
         }
+        if sent.is_ok() {
+            self.timers.last_write = cx.now;
+        }
+        sent
     }
 
     /// The second copy of an emergency; at-most-once removes the double.
@@ -256,26 +253,6 @@ impl<S: Storage, C: Secure> Session<S, C> {
         let prefix = SessionBody::message_prefix(checked.priority.to_wire());
         let sent = self.send_datagram(cx, &prefix, message.get(..length).unwrap_or(&[]));
         if sent { Ok(()) } else { Err(Error::Network) }
-    }
-
-    fn hold_lease<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        header: &RequestHeader,
-        lease: Duration,
-    ) {
-        let every = lease.divided_by(RENEWALS_PER_LEASE);
-        let held = Held { slot: header.slot, generation: header.generation, every, next: cx.now + every };
-        self.forget_held(header.slot);
-        let _ = self.held.push(held);
-        self.timers.renewal = self.timers.renewal.min(held.next);
-    }
-
-    /// The caller no longer waits for a call. Its reply, should it still come, counts as late.
-    pub fn cancel(&mut self, id: CallId) {
-        if self.requests.close(id).is_some() {
-            self.link.counters.add(LinkCounter::CallsTimedOut, 1);
-        }
     }
 
     /// Writes what has gathered now.

@@ -37,7 +37,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         for index in 0..self.granted.len() {
             let Some(slot) = self.granted.get(index).map(|granted| granted.slot) else { return };
             if !self.may(cx, slot, Verb::Call) {
-                self.cut_lease(cx, slot);
+                self.cut_lease(cx, index);
             }
         }
     }

@@ -205,6 +205,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         if self.phase != Phase::Live {
             return;
         }
+        self.send_ends(cx);
         if self.publishing.limits_due && self.send_limits(cx) {
             self.publishing.limits_due = false;
         }
@@ -226,7 +227,8 @@ impl<S: Storage, C: Secure> Session<S, C> {
     /// Whether something waits for room.
     pub(super) fn has_news(&self) -> bool {
         let publishing = &self.publishing;
-        publishing.dirty || publishing.end_due || publishing.limits_due || publishing.acknowledgement_due.is_some()
+        let told = publishing.acknowledgement_due.is_none() && self.ends.is_empty();
+        publishing.dirty || publishing.end_due || publishing.limits_due || !told
     }
 
     fn send_limits<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) -> bool {

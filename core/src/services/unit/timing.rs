@@ -2,18 +2,18 @@
 
 use core::net::SocketAddr;
 
+use super::granting::end_service_lease;
 use super::{Event, Phase, Session};
 use crate::config::{DATAGRAM_BYTES, GATHER};
 use crate::distribution::datagram;
-use crate::distribution::function_list::Slot;
-use crate::distribution::message::{Control, Renewal, SESSION_BODY_BYTES, SessionBody};
+use crate::distribution::message::{SESSION_BODY_BYTES, SessionBody};
 use crate::error::{CloseReason, Error};
 use crate::host::connections::LinkCounter;
 use crate::host::frame::Frame;
 use crate::host::mailman::Mailman;
 use crate::host::secure::{DATAGRAM_OVERHEAD, Secure};
 use crate::services::Context;
-use crate::services::lease::{Granted, Lease, Service};
+use crate::services::lease::Service;
 use crate::storage::{Buffers, Storage};
 use crate::time::{Duration, Instant};
 
@@ -72,6 +72,8 @@ pub(super) struct Timers {
     pub(super) lease: Instant,
     /// The earliest renewal of a held lease.
     pub(super) renewal: Instant,
+    /// The next try to send a release that the stream had no room for.
+    pub(super) release: Instant,
 }
 
 impl Timers {
@@ -82,6 +84,7 @@ impl Timers {
             gathered: Instant::FAR_FUTURE,
             lease: Instant::FAR_FUTURE,
             renewal: Instant::FAR_FUTURE,
+            release: Instant::FAR_FUTURE,
         }
     }
 
@@ -101,7 +104,8 @@ impl<S: Storage, C: Secure> Session<S, C> {
             Phase::Ended => Instant::FAR_FUTURE,
             Phase::Live => {
                 let timers = &self.timers;
-                let own = timers.keep_alive.min(timers.gathered).min(timers.lease).min(timers.renewal);
+                let own =
+                    timers.keep_alive.min(timers.gathered).min(timers.lease).min(timers.renewal).min(timers.release);
                 let own = own.min(self.renewal.deadline(self.dialed));
                 own.min(self.requests.deadline()).min(self.liveness.deadline())
             }
@@ -137,12 +141,17 @@ impl<S: Storage, C: Secure> Session<S, C> {
         {
             return Some(Event::LeaseExpired(slot));
         }
-        if let Some(id) = self.requests.expire(cx.now) {
+        if let Some(pending) = self.requests.expire(cx.now) {
+            let id = pending.id;
+            self.let_go(cx, id, Some(pending));
             self.link.counters.add(LinkCounter::CallsTimedOut, 1);
             return Some(Event::Reply(id, Err(Error::TimedOut)));
         }
         if self.has_news() {
             self.pump(cx);
+        }
+        if cx.now >= self.timers.release {
+            self.send_releases(cx);
         }
         if cx.now >= self.timers.gathered {
             self.flush(cx);
@@ -188,9 +197,10 @@ impl<S: Storage, C: Secure> Session<S, C> {
         cx: &mut Context<'_, S, M, B, H>,
         reason: CloseReason,
     ) -> Option<Event<'static>> {
-        if let Some(granted) = self.granted.pop() {
-            end_service_lease(cx, granted.slot);
-            return Some(Event::LeaseExpired(granted.slot));
+        while let Some(granted) = self.granted.pop() {
+            if end_service_lease(cx, &granted) {
+                return Some(Event::LeaseExpired(granted.slot));
+            }
         }
         if let Some(id) = self.requests.interrupt() {
             return Some(Event::Reply(id, Err(Error::Interrupted)));
@@ -252,171 +262,5 @@ impl<S: Storage, C: Secure> Session<S, C> {
         }
         let header = datagram::session_header(mode, self.local.fleet, remote.hello.link, remote.hello.nonce);
         Some((remote.datagrams, header))
-    }
-
-    // --- leases that the peer holds here
-
-    /// The caller's request, made at `made`, starts or renews its lease on a function.
-    pub(super) fn grant<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        granted: Granted,
-    ) -> Result<(), Error> {
-        let granted = Granted { end: Lease::seen_end(granted.end), ..granted };
-        let Some(known) = self.granted.iter_mut().find(|known| known.slot == granted.slot) else {
-            self.granted.push(granted).map_err(|_| Error::Full(crate::error::Limit::Leases))?;
-            self.timers.lease = self.timers.lease.min(granted.end);
-            begin_service_lease(cx, granted.slot, granted.end);
-            return Ok(());
-        };
-        // What has been seen dead is reported before anything begins in its place.
-        if known.end <= cx.now {
-            return Err(Error::Busy);
-        }
-        // What came late on its way takes nothing away from what came before it.
-        let granted = Granted { end: known.end.max(granted.end), ..granted };
-        let is_same = known.generation == granted.generation;
-        *known = granted;
-        self.timers.lease = self.timers.lease.min(granted.end);
-        if !is_same {
-            begin_service_lease(cx, granted.slot, granted.end);
-        } else if !renew_service_lease(cx, granted.slot, granted.end) {
-            // Whoever moves something has looked later than at `cx.now`, and has stopped it.
-            self.cut_lease(cx, granted.slot);
-            return Err(Error::Busy);
-        }
-        Ok(())
-    }
-
-    pub(super) fn renewed<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        renewal: &Renewal,
-    ) {
-        let current = cx.functions.lookup(renewal.slot, renewal.generation).is_ok();
-        let known =
-            self.granted.iter().find(|g| current && (g.slot, g.generation) == (renewal.slot, renewal.generation));
-        let Some(granted) = known.copied() else {
-            self.link.counters.add(LinkCounter::RenewalsIgnored, 1);
-            // The call that the renewal is for may be one of those that wait for their turn.
-            if !self.calls.any_waiting() {
-                self.send_control(cx, &Control::LeaseEnded { slot: renewal.slot.0, expired: false });
-            }
-            return;
-        };
-        let Some(made) = made_at(cx.now, renewal.stamp, renewal.since) else { return };
-        let end = made + granted.length;
-        if end > cx.now {
-            let _ = self.grant(cx, Granted { end, ..granted });
-        }
-    }
-
-    /// The application has finished what the leased function started: no renewal keeps it alive, no hook runs.
-    pub fn end_lease<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>, slot: Slot) {
-        if let Some(index) = self.granted.iter().position(|granted| granted.slot == slot) {
-            self.granted.swap_remove(index);
-            end_service_lease(cx, slot);
-            self.send_control(cx, &Control::LeaseEnded { slot: slot.0, expired: false });
-        }
-    }
-
-    /// The caller's newest order has failed, so nothing that it wants is going on: the lease expires at once.
-    pub(super) fn cut_lease<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        slot: Slot,
-    ) {
-        if let Some(granted) = self.granted.iter_mut().find(|granted| granted.slot == slot) {
-            granted.end = cx.now;
-            self.timers.lease = cx.now;
-            end_service_lease(cx, slot);
-        }
-    }
-
-    /// The caller gave up its lease: it ends now, as if it had expired, and its
-    /// requests up to `id` that wait for their turn, or are still on their way, do not begin.
-    pub(super) fn released<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        slot: Slot,
-        id: u32,
-    ) -> bool {
-        self.publishing.release(slot, id);
-        let Some(index) = self.granted.iter().position(|granted| granted.slot == slot) else { return false };
-        self.granted.swap_remove(index);
-        end_service_lease(cx, slot);
-        true
-    }
-
-    fn expire_lease<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-    ) -> Option<Slot> {
-        let due = self.granted.iter().position(|granted| granted.end <= cx.now);
-        let Some(index) = due else {
-            self.timers.lease = self.granted.iter().map(|granted| granted.end).min().unwrap_or(Instant::FAR_FUTURE);
-            return None;
-        };
-        let granted = self.granted.swap_remove(index);
-        end_service_lease(cx, granted.slot);
-        self.link.counters.add(LinkCounter::LeasesExpired, 1);
-        self.send_control(cx, &Control::LeaseEnded { slot: granted.slot.0, expired: true });
-        Some(granted.slot)
-    }
-
-    // --- leases that this unit holds at the peer
-
-    fn renew_leases<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
-        let (stamp, since) = self.clock.tell(cx.now);
-        let now = cx.now;
-        for index in 0..self.held.len() {
-            let Some(held) = self.held.get_mut(index).filter(|held| held.next <= now) else { continue };
-            held.next = now + held.every;
-            let renewal = Renewal { slot: held.slot, generation: held.generation, stamp, since };
-            let body = SessionBody::renewal(&renewal);
-            // Both ways: one lost datagram must not stop a vehicle, nor must a retransmission in the stream.
-            self.send_datagram(cx, &body, &[]);
-            self.link.send_frame(&Frame::Session(&body));
-        }
-        self.timers.renewal = self.held.iter().map(|held| held.next).min().unwrap_or(Instant::FAR_FUTURE);
-        self.flush(cx);
-    }
-
-    /// Gives up the lease on a function of the peer, which stops what it started.
-    pub fn release<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>, slot: Slot) {
-        self.forget_held(slot);
-        self.send_control(cx, &Control::Release { slot: slot.0, id: self.requests.newest().0 });
-    }
-
-    pub(super) fn forget_held(&mut self, slot: Slot) -> bool {
-        let Some(index) = self.held.iter().position(|held| held.slot == slot) else { return false };
-        self.held.swap_remove(index);
-        true
-    }
-}
-
-fn begin_service_lease<S: Storage, M: Mailman, B: Buffers<S>, H: Service>(
-    cx: &mut Context<'_, S, M, B, H>,
-    slot: Slot,
-    end: Instant,
-) {
-    if let Some(lease) = cx.functions.function(slot).and_then(|function| function.handler.lease()) {
-        lease.begin(end);
-    }
-}
-
-/// `false` when it has been seen dead.
-fn renew_service_lease<S: Storage, M: Mailman, B: Buffers<S>, H: Service>(
-    cx: &mut Context<'_, S, M, B, H>,
-    slot: Slot,
-    end: Instant,
-) -> bool {
-    let lease = cx.functions.function(slot).and_then(|function| function.handler.lease());
-    lease.is_none_or(|lease| lease.renew(end))
-}
-
-fn end_service_lease<S: Storage, M: Mailman, B: Buffers<S>, H: Service>(cx: &mut Context<'_, S, M, B, H>, slot: Slot) {
-    if let Some(lease) = cx.functions.function(slot).and_then(|function| function.handler.lease()) {
-        lease.end();
     }
 }

@@ -2,7 +2,7 @@
 //! board adds its network, its clock, its settings and its button.
 //!
 //! [`provision`] is what a board has been told, and the keys with which it proves who it is. [`vehicle`] makes the unit and its services. A board then runs three tasks beside that of its network: the unit's
-//! [`Runner`], [`drive`] and [`call_mechanic`]. [`lamp`] and [`reset`] say how a board tells what goes on; [`echo`] is a
+//! [`Runner`], [`drive`] and [`call_mechanic`]. [`lamp`] says how a board tells what goes on; [`echo`] is a
 //! program without CARA to compare with.
 
 #![no_std]
@@ -15,7 +15,6 @@ pub mod lamp;
 pub mod least;
 mod log;
 pub mod provision;
-pub mod reset;
 #[cfg(feature = "tasks")]
 pub mod tasks;
 
@@ -123,8 +122,10 @@ fn offer(vehicle: Vehicle) -> Result<(), Error> {
     let stand: &'static Hook<Agv> = &stand_still;
     let pos_info = Handler::method(&|agv: &mut Agv, _, pos| agv.pos_info(pos));
     let battery = Handler::method(&|agv: &mut Agv, _, charge| agv.battery(charge));
-    let stop = Handler::method(&|agv: &mut Agv, _, _| {
-        stand_still(agv);
+    // The motors' interrupt sees it at once; the motors' loop sees it as well, and forgets the target.
+    let stop = Handler::free(&|_, _| {
+        DRIVING.clear();
+        cut();
         Ok(())
     });
     let go_to = Handler::method(&|agv: &mut Agv, _, pos| {
@@ -137,12 +138,17 @@ fn offer(vehicle: Vehicle) -> Result<(), Error> {
     vehicle.add_service(BATTERY, plain().idempotent(), battery)?;
     vehicle.add_service(STOP, plain().idempotent().priority(Priority::Emergency), stop)?;
     vehicle.add_service(ECHO, plain().idempotent(), Handler::method(&|_, _, _| Ok(())))?;
-    vehicle.add_service(GO_TO, plain().lease(GO_TO_LEASE, &DRIVING, stand), go_to)?;
+    vehicle.add_service(GO_TO, plain().lease(GO_TO_LEASE, &DRIVING, &cut).then(stand), go_to)?;
     vehicle.on_manager_lost(stand);
     vehicle.publish_my_function_list()
 }
 
-/// Stops the motors.
+/// Stops the motors, whatever else runs.
+fn cut() {
+    HAS_TARGET.store(false, Ordering::Release);
+}
+
+/// Stops the motors, and forgets the target.
 pub fn stand_still(agv: &mut Agv) {
     HAS_TARGET.store(false, Ordering::Release);
     if let Some(place) = agv.stop() {

@@ -6,10 +6,10 @@ use cara_embassy::Runner;
 
 use crate::Vehicle;
 
-/// The unit's task.
+/// The unit's task, which the watchdog looks at.
 #[embassy_executor::task]
 pub async fn unit(mut runner: Runner<Agv>) -> ! {
-    runner.run().await
+    cara_board::watched(runner.run()).await
 }
 
 /// The motors' task.

@@ -1,35 +1,38 @@
-//! Where a panic or a fault ends: the motors are cut off, the log says where it was, and the board starts again.
-//! [`crate::reset`] then tells "program".
-#![allow(unsafe_code)]
+//! How this board does what [`cara_board`] decides, and where its panics and faults end.
 
+use cara_board::{Place, Reason};
 use cortex_m::peripheral::SCB;
 
-use crate::motor;
-use crate::note::{self, Note};
+use crate::{motor, watchdog};
 
 /// Exit code of a program that cannot start: starting again would not help.
 pub const NOT_STARTED: i32 = 101;
 
-#[panic_handler]
-fn panic(information: &core::panic::PanicInfo<'_>) -> ! {
-    cortex_m::interrupt::disable();
-    motor::cut_off();
-    match information.location() {
-        Some(place) => cara_vehicle::error!("panic at {=str}:{=u32}", place.file(), place.line()),
-        None => cara_vehicle::error!("panic"),
+/// This board.
+pub(crate) struct Board;
+
+cara_board::guard!(Board);
+
+impl cara_board::Board for Board {
+    fn motors(on: bool) {
+        motor::switch(on);
     }
-    start_again()
-}
 
-#[cortex_m_rt::exception]
-unsafe fn HardFault(frame: &cortex_m_rt::ExceptionFrame) -> ! {
-    cortex_m::interrupt::disable();
-    motor::cut_off();
-    cara_vehicle::error!("fault at {=u32:#x}, called from {=u32:#x}", frame.pc(), frame.lr());
-    start_again()
-}
+    fn feed() {
+        watchdog::feed();
+    }
 
-fn start_again() -> ! {
-    note::leave(Note::Program);
-    SCB::sys_reset()
+    fn ended(reason: Reason, place: Place<'_>) {
+        #[cfg(feature = "faults")]
+        crate::faults::ended(reason);
+        match reason {
+            Reason::Panic => cara_vehicle::error!("panic at {=str}:{=u32}", place.file, place.at),
+            Reason::Fault => cara_vehicle::error!("fault at {=u32:#x}", place.at),
+            _ => cara_vehicle::error!("the stack has overflown"),
+        }
+    }
+
+    fn reset() -> ! {
+        SCB::sys_reset()
+    }
 }

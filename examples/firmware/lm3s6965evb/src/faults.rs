@@ -8,9 +8,12 @@
 //! Log lines are read by `tests/firmware`.
 
 use core::cell::Cell;
+use core::mem::{MaybeUninit, size_of};
 
 use cara_apps::agv::{Agv, GO_TO_LEASE};
+use cara_board::Reason;
 use cara_core::error::{Error, ServiceError};
+use cara_core::services::lease::Lease;
 use cara_core::time::{Duration as CoreDuration, Instant};
 use cara_embassy::{Handler, Hook, ServiceOptions, now};
 use cara_vehicle::{DRIVING, Vehicle};
@@ -18,15 +21,19 @@ use critical_section::Mutex;
 use embassy_sync::blocking_mutex::raw::CriticalSectionRawMutex;
 use embassy_sync::signal::Signal;
 
+use crate::creep::{self, CREEPING};
 use crate::motor;
 
 /// Makes the board fail: 0 notes that something outside is about to fail, 1 hangs in the handler, 2 starves all tasks,
-/// 3 panics.
+/// 3 panics, 4 calls itself until the stack is full, 5 has a frame larger than the stack.
 const FAULT: &str = "fault(kind: int)";
 /// Longest turn of the executor while nothing is broken: until it ends, a frame that has arrived may wait.
 const POLL: CoreDuration = CoreDuration::from_millis(20);
 /// A millisecond, to which a lease is exact.
 const STEP: CoreDuration = CoreDuration::from_millis(1);
+
+/// Words of a lease in memory.
+const LEASE_WORDS: usize = size_of::<Lease>() / size_of::<u32>();
 
 static STARVING: Signal<CriticalSectionRawMutex, ()> = Signal::new();
 static RECORD: Mutex<Cell<Record>> = Mutex::new(Cell::new(Record::NEW));
@@ -49,6 +56,10 @@ struct Record {
     turn: CoreDuration,
     /// Losses of the manager for which the hook has run.
     losses: u32,
+    /// Calls that tasks have taken.
+    orders: u32,
+    /// The lease's words before the stack overflows.
+    lease: [u32; LEASE_WORDS],
 }
 
 impl Record {
@@ -61,6 +72,8 @@ impl Record {
         late: CoreDuration::ZERO,
         turn: CoreDuration::ZERO,
         losses: 0,
+        orders: 0,
+        lease: [0; LEASE_WORDS],
     };
 
     fn change<R>(act: impl FnOnce(&mut Self) -> R) -> R {
@@ -91,6 +104,7 @@ pub fn offer(vehicle: Vehicle) -> Result<(), Error> {
         });
         defmt::info!("hook for the lost manager: {=u32}", losses);
     };
+    creep::offer(vehicle)?;
     vehicle.publish_my_function_list()?;
     vehicle.on_manager_lost(lost);
     let [lease, poll, tick] = [GO_TO_LEASE.as_micros(), POLL.as_micros(), motor::TICK.as_micros()];
@@ -103,6 +117,7 @@ fn fail(kind: i64) {
         1 => hang(),
         2 => STARVING.signal(()),
         3 => panic!("asked for"),
+        4 | 5 => overflow(kind),
         _ => {}
     }
 }
@@ -110,6 +125,49 @@ fn fail(kind: i64) {
 fn hang() -> ! {
     loop {
         cortex_m::asm::nop();
+    }
+}
+
+/// Fills the stack beyond its end.
+fn overflow(kind: i64) {
+    let lease = lease_words();
+    Record::change(|record| record.lease = lease);
+    if kind == 4 {
+        recurse(0);
+    } else {
+        too_large();
+    }
+}
+
+/// Small frames: whatever lies below the stack is reached by one of them.
+#[inline(never)]
+#[allow(unconditional_recursion)]
+fn recurse(depth: u32) -> u32 {
+    let frame = MaybeUninit::<[u8; 512]>::uninit();
+    core::hint::black_box(&frame);
+    recurse(core::hint::black_box(depth + 1)) + 1
+}
+
+/// One frame that leaves the stack by far, and would lie among the variables if those were below it.
+#[inline(never)]
+fn too_large() {
+    let frame = core::hint::black_box([0xFF_u8; 43 * 1024]);
+    core::hint::black_box(&frame);
+}
+
+/// The lease as it lies in memory.
+#[allow(unsafe_code)]
+fn lease_words() -> [u32; LEASE_WORDS] {
+    let place = (&raw const DRIVING).cast::<u32>();
+    // SAFETY: the words of a variable, which is aligned to them at least and has as many.
+    core::array::from_fn(|index| unsafe { place.add(index).read_volatile() })
+}
+
+/// The program has ended, and why: has an overflow written over the lease?
+pub(crate) fn ended(reason: Reason) {
+    if reason == Reason::StackOverflow {
+        let kept = lease_words() == Record::change(|record| record.lease);
+        defmt::info!("the lease's words are {=str}", if kept { "as they were" } else { "overwritten" });
     }
 }
 
@@ -121,11 +179,27 @@ pub async fn starve() -> ! {
     hang()
 }
 
+/// Whether a lease lasts beyond a time.
+fn lasts_beyond(at: Instant) -> bool {
+    DRIVING.lasts_beyond(at) || CREEPING.lasts_beyond(at)
+}
+
+/// A task has taken a call that moves, or is to end the motion of another one; its number. A fault counts from here.
+pub(crate) fn order_begins() -> u32 {
+    let number = Record::change(|record| {
+        record.marked = now();
+        record.orders += 1;
+        record.orders
+    });
+    defmt::info!("order {=u32} begins", number);
+    number
+}
+
 /// A turn of the executor begins; when, if somebody wants the vehicle to drive. Other turns hold nothing up: the longest of
 /// all are those of a proof, on a link that is not live yet, and the one that reads all that comes with a new link.
 pub(crate) fn turn() -> Option<Instant> {
     let now = now();
-    DRIVING.lasts_beyond(now).then_some(now)
+    lasts_beyond(now).then_some(now)
 }
 
 /// That turn has ended.
@@ -145,9 +219,9 @@ pub(crate) fn sleeps(it_does: bool) {
 pub(crate) fn tick() {
     Record::change(|record| {
         let now = now();
-        if record.reaches <= now || DRIVING.lasts_beyond(record.reaches) {
+        if record.reaches <= now || lasts_beyond(record.reaches) {
             record.reaches = record.reaches.max(now);
-            while DRIVING.lasts_beyond(record.reaches) {
+            while lasts_beyond(record.reaches) {
                 record.reaches = record.reaches + STEP;
                 record.renewed = record.ticked;
             }

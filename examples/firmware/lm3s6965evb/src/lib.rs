@@ -9,13 +9,14 @@ pub mod arguments;
 #[cfg(feature = "secure")]
 mod boots;
 pub mod clock;
+#[cfg(feature = "faults")]
+pub mod creep;
 pub mod ethernet;
 pub mod executor;
 pub mod fault;
 #[cfg(feature = "faults")]
 pub mod faults;
 pub mod motor;
-mod note;
 mod register;
 pub mod reset;
 pub mod stack;

@@ -1,13 +1,10 @@
-//! The motors' enable: a pin, and the interrupt that decides about it each millisecond.
-//!
-//! Nothing but the interrupt switches it on, and only while [`cara_vehicle::may_move`]. So the motors stand in time when
-//! a handler hangs, when the unit's task gets no turn, and when the manager is gone; a panic switches them off at once.
-//! At a reset the pin becomes an input: the motors' driver has to pull it down (data sheet, General-Purpose
-//! Input/Outputs; General-Purpose Timers).
+//! The motors' enable, a pin, and the interrupt that decides about it each millisecond, as [`cara_board`] says (data sheet,
+//! General-Purpose Input/Outputs; General-Purpose Timers).
 
 use embassy_time::Duration;
 use lm3s6965::{Interrupt, interrupt};
 
+use crate::fault::Board;
 use crate::register::{PORT_F, Register, SYSTEM, TIMER_1, unmask};
 
 /// How often the interrupt looks.
@@ -62,19 +59,26 @@ pub fn is_on() -> bool {
     PIN_DATA.read() & PIN != 0
 }
 
-/// Cuts them off: for whoever has stopped the interrupts for good.
-pub(crate) fn cut_off() {
-    if RCGC2.read() & RCGC2_PORT_F != 0 {
-        switch(false);
+/// Switches them, once the pin is an output.
+pub(crate) fn switch(on: bool) {
+    // Without a clock its registers fault.
+    if RCGC2.read() & RCGC2_PORT_F == 0 {
+        return;
     }
-}
-
-fn switch(on: bool) {
     #[cfg(feature = "faults")]
     let before = is_on();
     PIN_DATA.write(if on { PIN } else { 0 });
     #[cfg(feature = "faults")]
     crate::faults::switched(before, on);
+}
+
+/// Whether the motors may run now.
+fn may_move() -> bool {
+    #[cfg(feature = "faults")]
+    if crate::creep::may_move() {
+        return true;
+    }
+    cara_vehicle::may_move()
 }
 
 #[allow(unsafe_code)]
@@ -86,6 +90,6 @@ mod handlers {
         GPTMICR.write(TIMEOUT);
         #[cfg(feature = "faults")]
         crate::faults::tick();
-        switch(cara_vehicle::may_move());
+        cara_board::tick::<Board>(may_move());
     }
 }

@@ -10,7 +10,7 @@ const PAINT: u32 = 0xC0FF_EE11;
 const MARGIN: usize = 64;
 
 unsafe extern "C" {
-    static mut __sheap: u32;
+    static mut _stack_end: u32;
     static mut _stack_start: u32;
 }
 
@@ -28,9 +28,9 @@ pub struct Stack {
 #[inline(never)]
 pub(crate) fn paint() {
     let end = cortex_m::register::msp::read() as usize - MARGIN;
-    let mut place = &raw mut __sheap;
+    let mut place = &raw mut _stack_end;
     while (place as usize) < end {
-        // SAFETY: between the end of static memory and the stack pointer nobody has anything.
+        // SAFETY: between the end of the stack and the stack pointer nothing lies.
         unsafe {
             place.write_volatile(PAINT);
             place = place.add(1);
@@ -40,9 +40,9 @@ pub(crate) fn paint() {
 
 /// Looks how far the paint reaches.
 pub fn used() -> Stack {
-    let (bottom, top) = (&raw const __sheap, &raw const _stack_start as usize);
+    let (bottom, top) = (&raw const _stack_end, &raw const _stack_start as usize);
     let mut place = bottom;
-    // SAFETY: reads words between the end of static memory and the start of the stack, which are RAM.
+    // SAFETY: reads words between the two ends of the stack, which are RAM.
     while (place as usize) < top && unsafe { place.read_volatile() } == PAINT {
         place = unsafe { place.add(1) };
     }

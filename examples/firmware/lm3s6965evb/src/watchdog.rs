@@ -1,11 +1,12 @@
-//! Starts the board again when nobody feeds it (data sheet, Watchdog Timer). A handler that hangs ends so.
+//! Starts the board again when it is not fed (data sheet, Watchdog Timer). A handler that hangs ends so.
 //!
-//! When it runs out for the first time its interrupt leaves a note for the next life (`note.rs`); when it runs out
-//! for the second time, it resets.
+//! When it runs out for the first time its interrupt leaves a note for the next life, because the emulated chip's register
+//! does not tell; when it runs out for the second time, it resets.
 
+use cara_board::Reason;
+use embassy_time::Duration;
 use lm3s6965::{Interrupt, interrupt};
 
-use crate::note::{self, Note};
 use crate::register::{Register, SYSTEM, WATCHDOG, unmask};
 
 const RCGC0: Register = SYSTEM.at(0x100);
@@ -19,35 +20,34 @@ const LOCK: u32 = 0;
 /// Count, and reset when it has run out twice.
 const COUNT_AND_RESET: u32 = 0b11;
 
+/// A board that has not been fed for so long starts again.
+const HANGS: Duration = Duration::from_secs(4);
 /// Cycles of the system clock in a millisecond.
 const CYCLES: u32 = 12_500;
 
-/// A watchdog that runs. It cannot be stopped.
-pub struct Watchdog {
-    load: u32,
+/// Cycles from feeding until it runs out for the first time: it resets when it runs out for the second time.
+const LOAD: u32 = HANGS.as_millis() as u32 * CYCLES / 2;
+
+/// Starts it, once. It cannot be stopped; [`cara_board::tick`] feeds it.
+pub fn start() {
+    RCGC0.set(RCGC0_WATCHDOG);
+    WDTLOCK.write(UNLOCK);
+    WDTLOAD.write(LOAD);
+    WDTCTL.write(COUNT_AND_RESET);
+    WDTLOCK.write(LOCK);
+    unmask(Interrupt::WATCHDOG_TIMER_0);
 }
 
-impl Watchdog {
-    /// Starts it: the board starts again when it has not been fed for `milliseconds`, at most 340,000.
-    pub fn start(milliseconds: u32) -> Self {
-        RCGC0.set(RCGC0_WATCHDOG);
-        // It resets when it runs out for the second time.
-        let load = milliseconds.saturating_mul(CYCLES) / 2;
-        WDTLOCK.write(UNLOCK);
-        WDTLOAD.write(load);
-        WDTCTL.write(COUNT_AND_RESET);
-        WDTLOCK.write(LOCK);
-        unmask(Interrupt::WATCHDOG_TIMER_0);
-        Self { load }
+/// The board lives.
+pub(crate) fn feed() {
+    // Without a clock its registers fault.
+    if RCGC0.read() & RCGC0_WATCHDOG == 0 {
+        return;
     }
-
-    /// The program lives.
-    pub fn feed(&mut self) {
-        WDTLOCK.write(UNLOCK);
-        WDTICR.write(1);
-        WDTLOAD.write(self.load);
-        WDTLOCK.write(LOCK);
-    }
+    WDTLOCK.write(UNLOCK);
+    WDTICR.write(1);
+    WDTLOAD.write(LOAD);
+    WDTLOCK.write(LOCK);
 }
 
 #[allow(unsafe_code)]
@@ -57,6 +57,6 @@ mod handlers {
     /// The interrupt stays pending: nothing but the reset is to come.
     #[interrupt]
     fn WATCHDOG_TIMER_0() {
-        note::leave(Note::Watchdog);
+        cara_board::leave(Reason::Watchdog, 0);
     }
 }

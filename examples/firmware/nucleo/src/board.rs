@@ -1,6 +1,5 @@
 //! The board's devices, taken and started. Pins are those of a Nucleo-144 (ST, UM1974 and UM2407).
 
-use cara_vehicle::reset::Reason;
 use embassy_stm32::eth::{self, Ethernet, GenericPhy, PacketQueue, Sma};
 use embassy_stm32::exti::{self, ExtiInput};
 use embassy_stm32::gpio::{Level, Output, Pull, Speed};
@@ -18,7 +17,7 @@ use embassy_time::{Duration, Timer};
 use static_cell::StaticCell;
 
 use crate::settings::{Flash, Lives};
-use crate::{clocks, reset, settings};
+use crate::{clocks, motor, reset, settings};
 
 bind_interrupts!(struct Interrupts {
     ETH => eth::InterruptHandler;
@@ -36,8 +35,6 @@ const BOUNCES: Duration = Duration::from_millis(50);
 
 /// The board.
 pub struct Board {
-    /// Why it started.
-    pub reason: Reason,
     /// The pages of flash that tell who it is.
     pub pages: [&'static [u8]; 2],
     /// Counts its lives.
@@ -58,8 +55,10 @@ impl Board {
     /// Takes the devices; call it first, once.
     pub fn start() -> Self {
         static PACKETS: StaticCell<PacketQueue<4, 4>> = StaticCell::new();
-        let reason = reset::reason();
+        let (reason, place) = cara_board::reason(reset::reason());
         let chip = embassy_stm32::init(clocks::config());
+        motor::start(chip.PF13);
+        defmt::info!("started because of {}; the program before ended at {=u32:#x}", reason, place);
         let mut random = Rng::new(chip.RNG, Interrupts);
         let mut seed = [0; 8];
         random.fill_bytes(&mut seed);
@@ -82,7 +81,6 @@ impl Board {
             chip.PC1,
         );
         Self {
-            reason,
             pages: settings::pages(),
             lives: settings::lives(Flash::new_blocking(chip.FLASH)),
             seed: u64::from_le_bytes(seed),
@@ -119,16 +117,12 @@ impl Button {
     }
 }
 
-/// Starts the board again when tasks do not get their turn. It cannot be stopped.
+/// Starts the board again when the unit's task or the motors' interrupt does not run. It cannot be stopped.
 pub struct Watchdog(IndependentWatchdog<'static, IWDG>);
 
 impl Watchdog {
-    /// Feeds it for as long as tasks get their turn.
-    pub async fn run(mut self) -> ! {
+    /// Starts it; the motors' interrupt feeds it.
+    pub fn start(mut self) {
         self.0.unleash();
-        loop {
-            self.0.pet();
-            Timer::after(HANGS / 4).await;
-        }
     }
 }

@@ -3,6 +3,13 @@
 use embassy_stm32::Config;
 use embassy_stm32::rcc::*;
 
+/// Cycles of the processor in a millisecond.
+#[cfg(feature = "f767zi")]
+pub(crate) const CYCLES: u32 = 216_000;
+/// Cycles of the processor in a millisecond.
+#[cfg(feature = "h743zi")]
+pub(crate) const CYCLES: u32 = 400_000;
+
 /// Clocks from the 8 MHz that the board's debug probe gives.
 #[cfg(feature = "f767zi")]
 pub(crate) fn config() -> Config {

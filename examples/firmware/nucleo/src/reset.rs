@@ -1,9 +1,9 @@
 //! Why the board started (reference manuals RM0410 and RM0433: RCC_CSR and RCC_RSR).
 
-use cara_vehicle::reset::Reason;
+use cara_board::Reason;
 use embassy_stm32::pac::RCC;
 
-/// The reason of this start. The register keeps reasons until they are cleared, which this does: ask once.
+/// What the register tells of this start. It keeps reasons until they are cleared, which this does: ask once.
 #[cfg(feature = "f767zi")]
 pub(crate) fn reason() -> Reason {
     let cause = RCC.csr().read();
@@ -18,7 +18,7 @@ pub(crate) fn reason() -> Reason {
     }
 }
 
-/// The reason of this start. The register keeps reasons until they are cleared, which this does: ask once.
+/// What the register tells of this start. It keeps reasons until they are cleared, which this does: ask once.
 #[cfg(feature = "h743zi")]
 pub(crate) fn reason() -> Reason {
     let cause = RCC.rsr().read();

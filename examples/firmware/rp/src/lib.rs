@@ -1,4 +1,4 @@
-//! What boards with Raspberry Pi's RP2040 or RP2350 need below embassy: network, button, lamp, watchdog, and the settings
+//! What boards with Raspberry Pi's RP2040 or RP2350 need below embassy: network, button, lamp, motors, watchdog, and the settings
 //! in their flash. What the vehicle does is in `cara_vehicle`.
 //!
 //! [`Board`] is the same whatever the network: a W5500 on SPI, or the radio of a Pico 2 W.
@@ -11,7 +11,7 @@ pub mod board;
 #[cfg(not(feature = "pico2w"))]
 #[path = "board/w5500.rs"]
 pub mod board;
-mod fault;
+mod motor;
 pub mod parts;
 mod reset;
 pub mod settings;

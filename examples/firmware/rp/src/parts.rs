@@ -4,7 +4,7 @@ use embassy_rp::gpio::Input;
 use embassy_time::{Duration, Timer};
 
 /// A board that has not been fed for so long starts again.
-const HANGS: Duration = Duration::from_secs(4);
+pub(crate) const HANGS: Duration = Duration::from_secs(4);
 /// A button that bounces is pressed once.
 const BOUNCES: Duration = Duration::from_millis(50);
 
@@ -20,17 +20,13 @@ impl Button {
     }
 }
 
-/// Starts the board again when tasks do not get their turn.
+/// Starts the board again when the unit's task or the motors' interrupt does not run.
 pub struct Watchdog(pub(crate) embassy_rp::watchdog::Watchdog);
 
 impl Watchdog {
-    /// Feeds it for as long as tasks get their turn.
-    pub async fn run(mut self) -> ! {
+    /// Starts it; the motors' interrupt feeds it.
+    pub fn start(mut self) {
         self.0.pause_on_debug(true);
         self.0.start(HANGS);
-        loop {
-            self.0.feed(HANGS);
-            Timer::after(HANGS / 4).await;
-        }
     }
 }

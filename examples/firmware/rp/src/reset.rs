@@ -1,10 +1,10 @@
 //! Why the board started (data sheets: RP2040, CHIP_RESET; RP2350, POWMAN CHIP_RESET; both, WATCHDOG REASON).
 
-use cara_vehicle::reset::Reason;
+use cara_board::Reason;
 use embassy_rp::pac;
 use embassy_rp::watchdog::{ResetReason, Watchdog};
 
-/// The reason of this start.
+/// What the registers tell of this start.
 pub(crate) fn reason(watchdog: &Watchdog) -> Reason {
     match watchdog.reset_reason() {
         Some(ResetReason::TimedOut) => Reason::Watchdog,

@@ -1,5 +1,6 @@
 //! An AGV: an s_unit that keeps a position, drives while its manager wants it to, and calls a mechanic.
 
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
@@ -31,32 +32,40 @@ fn main() -> Result<()> {
     log_to_stderr();
     let stop = Stop::new(network.attended)?;
     let builder = network.place(Unit::builder(&name, id, &manager.name, manager.id)?);
-    let unit = builder.state(Agv::new([0, 0])).build_unit()?;
-    let lease = offer(&unit)?;
-    unit.on_manager_lost(|_| say!("manager lost"));
+    let unit = builder.build_unit()?;
+    let agv = Arc::new(Mutex::new(Agv::new([0, 0])));
+    let lease = offer(&unit, &agv)?;
+    unit.on_manager_lost(|()| say!("manager lost"))?;
     follow(&unit);
     unit.start()?;
-    say!("started {name}/{id}, {}, at {}", shown_mode(unit.mode()), unit.with_state(|agv| agv.place())?);
-    drive(&unit, &lease, &stop)?;
+    say!("started {name}/{id}, {}, at {}", shown_mode(unit.mode()), lock(&agv).place());
+    drive(&unit, &agv, &lease, &stop)?;
     unit.stop();
-    say!("ended at {}", unit.with_state(|agv| agv.place())?);
+    say!("ended at {}", lock(&agv).place());
     Ok(())
 }
 
 /// Publishes the AGV's services. Returns the lease of driving.
-fn offer(unit: &Unit<Agv>) -> Result<LeaseWatch> {
-    let pos_info = |agv: &mut Agv, _: &Call, pos: &mut ParametersView| agv.pos_info(pos);
-    let go_to = |agv: &mut Agv, _: &Call, pos: &mut ParametersView| {
+fn offer(unit: &Unit, agv: &Arc<Mutex<Agv>>) -> Result<LeaseWatch> {
+    let own = || agv.clone();
+    let agv = own();
+    let pos_info = move |_: &Call, pos: &mut ParametersView| lock(&agv).pos_info(pos);
+    let agv = own();
+    let go_to = move |_: &Call, pos: &mut ParametersView| {
+        let mut agv = lock(&agv);
         agv.go_to(pos)?;
         agv.target().into_iter().for_each(|target| say!("driving to {target}"));
         Ok(())
     };
-    let battery = |agv: &mut Agv, _: &Call, charge: &mut ParametersView| agv.battery(charge);
-    let stop = |agv: &mut Agv, call: &Call, _: &mut ParametersView| {
-        agv.stop().into_iter().for_each(|place| say!("stopped at {place}: {} said so", call.caller));
+    let agv = own();
+    let battery = move |_: &Call, charge: &mut ParametersView| lock(&agv).battery(charge);
+    let agv = own();
+    let stop = move |call: &Call, _: &mut ParametersView| {
+        lock(&agv).stop().into_iter().for_each(|place| say!("stopped at {place}: {} said so", call.caller));
         Ok(())
     };
-    let safe = |agv: &mut Agv| agv.stop().into_iter().for_each(not_wanted);
+    let agv = own();
+    let safe = move || lock(&agv).stop().into_iter().for_each(not_wanted);
     let functions = unit.my_function_list();
     let plain = ServiceOptions::new;
     functions.add_service(&Definition::parse(POS_INFO)?, plain().idempotent(), pos_info)?;
@@ -68,7 +77,7 @@ fn offer(unit: &Unit<Agv>) -> Result<LeaseWatch> {
 }
 
 /// The motors' loop: drives while the lease is live.
-fn drive(unit: &Unit<Agv>, lease: &LeaseWatch, stop: &Stop) -> Result<()> {
+fn drive(unit: &Unit, agv: &Mutex<Agv>, lease: &LeaseWatch, stop: &Stop) -> Result<()> {
     let (mut last, mut said) = (Instant::now(), Instant::now());
     loop {
         if let Some(outcome) = stop.wait_for(TICK.into()) {
@@ -76,7 +85,10 @@ fn drive(unit: &Unit<Agv>, lease: &LeaseWatch, stop: &Stop) -> Result<()> {
         }
         let elapsed = last.elapsed();
         last += elapsed;
-        let (progress, place) = unit.with_state(|agv| (agv.step(elapsed.into(), lease.is_live()), agv.place()))?;
+        let (progress, place) = {
+            let mut agv = lock(agv);
+            (agv.step(elapsed.into(), lease.is_live()), agv.place())
+        };
         match progress {
             Some(Progress::Passed(place)) => say!("passed {place}"),
             Some(Progress::Arrived(place)) => {
@@ -93,12 +105,17 @@ fn drive(unit: &Unit<Agv>, lease: &LeaseWatch, stop: &Stop) -> Result<()> {
     }
 }
 
+/// The vehicle has a lock of its own, held for some assignments at a time: no service can keep the motors' loop from it.
+fn lock(agv: &Mutex<Agv>) -> MutexGuard<'_, Agv> {
+    agv.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
 fn not_wanted(place: cara_apps::agv::Place) {
     say!("stopped at {place}: nobody wants go_to any more");
 }
 
 /// Says what happens, and calls a mechanic, once, when the manager offers to send one.
-fn follow(unit: &Unit<Agv>) {
+fn follow(unit: &Unit) {
     let events = unit.events();
     let unit = unit.clone();
     std::thread::spawn(move || {
@@ -115,11 +132,11 @@ fn follow(unit: &Unit<Agv>) {
     });
 }
 
-fn offered(unit: &Unit<Agv>) -> bool {
+fn offered(unit: &Unit) -> bool {
     unit.manager().is_some_and(|manager| manager.their_function_list().contains("call_mechanic"))
 }
 
-fn call_mechanic(unit: &Unit<Agv>) -> bool {
+fn call_mechanic(unit: &Unit) -> bool {
     let answer = || -> Result<i64> {
         let mut arguments = mechanic::arguments()?;
         arguments.set_value("fault", "a wheel squeaks")?;

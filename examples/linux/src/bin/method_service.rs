@@ -46,9 +46,10 @@ fn run(network: Network) -> Result<()> {
     manager.start()?;
     manager.broadcast();
     joined.recv_timeout(PATIENCE)?;
-    let Some(peer) = manager.s_unit("depot").filter(|peer| peer.wait_for_function("take", PATIENCE)) else {
-        bail!("the depot did not come");
-    };
+    let peer = manager.s_unit("depot")?;
+    if !peer.wait_for_function("take", PATIENCE) {
+        bail!("the depot has not published its functions");
+    }
     print!("{}", peer.their_function_list().show_functions());
     let mut parcels = Parameters::new();
     parcels.add_int("parcels", 1)?;

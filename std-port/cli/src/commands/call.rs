@@ -3,10 +3,10 @@
 use std::process::ExitCode;
 use std::time::Duration;
 
-use cara_std::Definition;
 use cara_std::control::protocol::{Answer, Argument, CallQuestion, Failure, FunctionInfo, Question};
+use cara_std::{Definition, Shown};
 use clap::ValueEnum;
-use serde_json::json;
+use serde_json::{Value, json};
 
 use crate::exit::{Ended, Exit};
 use crate::global::Global;
@@ -28,7 +28,7 @@ pub(crate) struct Arguments {
     /// alone where there are no arguments.
     #[arg(required = true, num_args = 1..=2, value_names = ["NODE", "CALL"])]
     words: Vec<String>,
-    /// Call every node that offers the function.
+    /// Call every node, with an outcome for each s_unit of the roster; it fails where one is missing.
     #[arg(long)]
     all: bool,
     /// Do not wait for results: return when the request is accepted.
@@ -127,7 +127,7 @@ fn call(operator: &mut Operator, question: CallQuestion, hold: bool, global: &Gl
         if global.json {
             let text = (error.is_none() && !asynchronous).then(|| show_call(&function, &results));
             output::object(&json!({
-                "node": node, "text": text, "results": results, "call": call, "error": error, "took_us": took_us,
+                "node": node, "text": text, "results": values(&results), "call": call, "error": error, "took_us": took_us,
             }))?;
         } else {
             show(&node, &function, &results, call, error.as_ref(), took_us, one)?;
@@ -138,6 +138,24 @@ fn call(operator: &mut Operator, question: CallQuestion, hold: bool, global: &Gl
         operator.deliver();
     }
     Ok(worst)
+}
+
+/// The results, of which those of size 1 are a value and no list of one.
+fn values(results: &[Argument]) -> Vec<Value> {
+    let one = |value: Value| match value {
+        Value::Array(list) if list.len() == 1 => list.into_iter().next().unwrap_or_default(),
+        value => value,
+    };
+    let as_value = |result: &Argument| {
+        let mut value = json!(result);
+        if result.size == 1
+            && let Some(inner) = value.get_mut("value")
+        {
+            *inner = one(inner.take());
+        }
+        value
+    };
+    results.iter().map(as_value).collect()
 }
 
 /// What came of the call of one node; its name goes before where there are several.
@@ -152,7 +170,9 @@ fn show(
 ) -> std::io::Result<()> {
     let before = if one { String::new() } else { format!("{node}  ") };
     match (error, call) {
-        (Some(Failure { error, text, .. }), _) => output::line(format_args!("{BAD}{node}: {error}:{BAD:#} {text}")),
+        (Some(Failure { error, text, .. }), _) => {
+            output::line(format_args!("{BAD}{node}: {error}:{BAD:#} {}", Shown(text)))
+        }
         (None, Some(call)) => {
             output::line(format_args!("{before}accepted as call {call}; `cara watch` tells if it fails"))
         }

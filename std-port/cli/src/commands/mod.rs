@@ -9,6 +9,7 @@ pub(crate) mod functions;
 pub(crate) mod man;
 pub(crate) mod ping;
 pub(crate) mod publish;
+pub(crate) mod retire;
 pub(crate) mod scan;
 pub(crate) mod set;
 pub(crate) mod watch;

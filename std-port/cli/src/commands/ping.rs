@@ -3,6 +3,7 @@
 use std::process::ExitCode;
 use std::time::Duration;
 
+use cara_std::Shown;
 use cara_std::control::protocol::{Answer, Question};
 use serde_json::json;
 
@@ -78,7 +79,9 @@ fn round_trip(
             (None, Some(failure)) if failure.error == "TimedOut" => {
                 output::line(format_args!("{BAD}{node} {number}:{BAD:#} no answer within --timeout"))?
             }
-            (None, Some(failure)) => output::line(format_args!("{BAD}{node} {number}:{BAD:#} {}", failure.text))?,
+            (None, Some(failure)) => {
+                output::line(format_args!("{BAD}{node} {number}:{BAD:#} {}", Shown(&failure.text)))?
+            }
             (None, None) => output::line(format_args!("{BAD}{node} {number}:{BAD:#} no answer"))?,
         }
         Ok(())

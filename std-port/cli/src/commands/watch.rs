@@ -3,6 +3,7 @@
 use std::process::ExitCode;
 use std::time::Duration;
 
+use cara_std::Shown;
 use cara_std::control::protocol::{Answer, Question};
 use serde_json::json;
 
@@ -47,6 +48,7 @@ fn show(at_ms: u64, event: &str, node: Option<&str>, text: &str) -> std::io::Res
     let (seconds, millis) = (at_ms / 1000, at_ms % 1000);
     let node = node.unwrap_or("-");
     output::line(format_args!(
-        "{FAINT}{seconds:>7}.{millis:03} s{FAINT:#}  {style}{event:<17}{style:#} {node:<20} {text}"
+        "{FAINT}{seconds:>7}.{millis:03} s{FAINT:#}  {style}{event:<17}{style:#} {node:<20} {}",
+        Shown(text)
     ))
 }

@@ -47,6 +47,11 @@ pub(crate) fn duplicate(node: &str, lives: &[Life]) -> Option<Finding> {
 
 const DUPLICATE_ADVICE: &str = "give each node a name and id of its own; the one that was connected first stays";
 
+/// Who comes without a key may be who was shut out: what is read at the first alarm must not let it in again.
+const NO_PAIR_KEY_ADVICE: &str = "if it was revoked, or is not known to you, do nothing: it stays out. `cara keys show`, where \
+                                  the fleet's root is, tells who was revoked; one that was never added and belongs here is \
+                                  added there";
+
 /// Managers of which there are two.
 pub(crate) fn twin_managers(seen: &Evidence) -> Vec<Finding> {
     let twins = seen.managers().into_iter().filter_map(|name| duplicate(&name, &seen.lives(&name)));
@@ -154,6 +159,7 @@ pub(crate) fn refusal(manager: &str, refused: &RefusedInfo) -> Option<Finding> {
     let found = format!("{manager} refused {who} at {} {ago} s ago: {}", refused.address, refused.reason);
     let advice = match id {
         Id::Duplicate => DUPLICATE_ADVICE.to_owned(),
+        Id::NoPairKey => NO_PAIR_KEY_ADVICE.to_owned(),
         _ => refused.text.clone(),
     };
     Some(Finding::error(id, found, advice).about(who))
@@ -189,5 +195,7 @@ mod tests {
         assert_eq!(refusal("m/1", &refused("AlreadyConnected")), None);
         assert_eq!(refusal("m/1", &refused("Role")).unwrap().id, Id::Refused);
         assert_eq!(refusal("m/1", &refused("Full")).unwrap().id, Id::Full);
+        let keyless = refusal("m/1", &refused("NoKey")).unwrap();
+        assert!(keyless.advice.contains("do nothing") && !keyless.advice.contains("derive"), "{}", keyless.advice);
     }
 }

@@ -2,6 +2,8 @@
 
 use std::fs;
 
+use cara_std::is_hidden;
+
 /// Sockets in the system's tables that are looked at.
 const MOST_SOCKETS: usize = 65_536;
 
@@ -85,7 +87,7 @@ fn has(pid: u32, inodes: &[u64]) -> bool {
 /// The program's name, without what could forge a line of the output.
 fn name(pid: u32) -> String {
     let name = fs::read_to_string(format!("/proc/{pid}/comm")).unwrap_or_default();
-    name.trim().chars().filter(|c| !c.is_control()).collect()
+    name.trim().chars().filter(|c| !is_hidden(*c)).collect()
 }
 
 #[cfg(test)]

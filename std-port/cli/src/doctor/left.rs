@@ -15,6 +15,16 @@ pub(crate) fn of(seen: &Evidence, which: &Which) -> Option<Finding> {
     left.first().and_then(|(unit, node)| finding(unit, node))
 }
 
+/// A node that looks for its manager says something within this time, so that it would be back.
+pub(crate) const RETURNS_MILLIS: u64 = 17_000;
+
+/// Whether a node that is asked about left so long ago that it would be back if it could.
+pub(crate) fn for_long(seen: &Evidence, which: &Which) -> bool {
+    let nodes = seen.running.iter().flat_map(|unit| &unit.nodes).filter(|node| which.is(&node.name, node.id));
+    let mut ago = nodes.filter_map(|node| node.left_ms);
+    ago.any(|ago| ago >= RETURNS_MILLIS)
+}
+
 /// All that have left a unit, and are neither heard nor connected to another one; the latest first.
 pub(crate) fn all(seen: &Evidence, unit: &Running) -> Vec<Finding> {
     let is_there = |node: &NodeInfo| {

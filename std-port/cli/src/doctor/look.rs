@@ -20,6 +20,8 @@ use crate::listening;
 
 /// Between two looks at what has come.
 const SLICE: Duration = Duration::from_millis(250);
+/// After listening for so long in vain, units of this host are dialled as well.
+const TRIES_OWN: Duration = Duration::from_secs(5);
 /// Between two questions to the units of this host.
 const REFRESH: Duration = Duration::from_secs(1);
 /// When all are asked, in seconds since the start: one broadcast alone may get lost.
@@ -221,10 +223,17 @@ impl Looking {
         evidence.heard = self.survey.heard().to_vec();
         evidence.foreign = self.survey.foreign().to_vec();
         evidence.reach = self.survey.reach().to_vec();
-        for (heard, _) in evidence.m_units() {
-            if let Some(at) = heard.listens_at() {
-                self.dials.try_once(at);
-            }
+        // A unit of this host that answers its operator logs a try as a link that did not come about: it gets one only
+        // where nothing else has told why nodes are missing.
+        let own: HashSet<u16> = evidence.running.iter().map(|unit| unit.unit.tcp_port).collect();
+        let is_own = |identity: &Identity, port: u16| {
+            own.contains(&port) && evidence.running.iter().any(|unit| unit.name() == identity.to_string())
+        };
+        let others =
+            evidence.m_units().into_iter().filter_map(|(heard, identity)| Some((heard.listens_at()?, identity)));
+        let tries_own = evidence.listened >= TRIES_OWN;
+        for (at, _) in others.filter(|(at, identity)| tries_own || !is_own(identity, at.port())) {
+            self.dials.try_once(at);
         }
         evidence.dials = self.dials.all();
         if let Some(alone) = &self.alone {

@@ -20,6 +20,8 @@ mod secured;
 mod unasked;
 mod which;
 
+pub(crate) use which::quoted;
+
 use std::process::ExitCode;
 use std::time::Duration;
 

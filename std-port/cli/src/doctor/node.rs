@@ -126,10 +126,17 @@ fn silent(seen: &Evidence, which: &Which) -> Vec<Finding> {
     let blocked = dials.filter_map(|(dial, identity)| tcp_blocked(&identity.to_string(), dial));
     // It may still turn out to look for somebody else.
     found.extend(blocked.map(|finding| finding.certain(false)));
-    let lost = left::of(seen, which);
+    // Its manager hears whatever it says, so that once it has had time to come back there is nothing to wait for.
+    let lost = left::of(seen, which).map(|lost| lost.certain(seen.listened >= ANSWERED && left::for_long(seen, which)));
     if !found.is_empty() {
         found.extend(lost);
         return found;
+    }
+    if let Some(lost) = lost {
+        return vec![lost];
+    }
+    if let Some(missing) = no_manager_for_any(seen, which) {
+        return vec![missing];
     }
     // Who cannot be read may be the one that is missed.
     let unreadable = seen.heard.iter().filter(|heard| heard.identity.is_none() && !heard.same_version());
@@ -139,11 +146,10 @@ fn silent(seen: &Evidence, which: &Which) -> Vec<Finding> {
     let no_room =
         m_units.iter().filter(|(heard, identity)| heard.room == Some(0) && elsewhere.contains(&identity.to_string()));
     found.extend(no_room.map(|(_, identity)| full(&identity.to_string(), None)));
-    match lost {
-        Some(lost) => found.push(lost),
-        None if elsewhere.is_empty() => found.push(not_heard(seen, which)),
-        None => found.push(ask_its_manager(seen, which, &elsewhere)),
-    }
+    found.push(match elsewhere.is_empty() {
+        true => not_heard(seen, which).certain(seen.listened >= ANSWERED && missed_for_long(seen, which)),
+        false => ask_its_manager(seen, which, &elsewhere),
+    });
     found.extend(waiting_for_another(seen));
     found
 }
@@ -192,6 +198,28 @@ fn ask_its_manager(seen: &Evidence, which: &Which, managers: &[String]) -> Findi
     );
     let advice = format!("run `cara doctor {}` on the host of {}", quoted(&which.0), managers.join(" or "));
     Finding::warning(Id::AskItsManager, found, advice).about(&which.0)
+}
+
+/// A manager of this host misses it, and has run for longer than a node that looks for it is silent.
+fn missed_for_long(seen: &Evidence, which: &Which) -> bool {
+    let mut misses = seen.running.iter().filter(|unit| unit.unit.uptime_ms >= left::RETURNS_MILLIS);
+    misses.any(|unit| unit.nodes.iter().any(|node| node.expected && !node.connected && which.is(&node.name, node.id)))
+}
+
+/// Nodes that look for one manager hold back for each other: where none runs, that is why this one is not heard.
+fn no_manager_for_any(seen: &Evidence, which: &Which) -> Option<Finding> {
+    if !seen.managers().is_empty() || !seen.unasked.is_empty() {
+        return None;
+    }
+    let (wanted, other) = seen.ours().find_map(|(heard, identity)| Some((heard.wanted.as_ref()?, identity)))?;
+    let wanted = text_of(wanted);
+    let found = format!(
+        "no manager of fleet {} runs: {other} looks for {wanted} in vain. {} was not heard; of nodes that look for one manager \
+         in vain they hold back for each other, so that it may be among them",
+        seen.fleet.0, which.0
+    );
+    let advice = format!("start {wanted}; if {} does not join it then, run the doctor again", which.0);
+    Some(Finding::error(Id::NoManager, found, advice).about(&which.0).certain(seen.listened >= ANSWERED))
 }
 
 /// Nodes that look for the same manager hold back for each other, so one may speak for those that are not heard.

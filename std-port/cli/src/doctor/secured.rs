@@ -61,9 +61,9 @@ pub(crate) fn wrong_keys(seen: &Evidence, about: &str, heard: &Heard) -> Finding
         heard.source
     );
     let advice = format!(
-        "on the host that has the fleet's root: `cara keys derive --fleet {fleet} {}`, and bring the file that it writes to that \
-         unit; if there are two roots, one of them has to go",
-        quoted(&named(heard, about))
+        "if it was revoked, or does not belong here, do nothing: it stays out. `cara keys show --fleet {fleet}`, where the fleet's \
+         root is, tells who belongs to it. Only one that does gets the file that lies beside the root; if there are two roots, one \
+         of them has to go"
     );
     Finding::error(Id::WrongKeys, found, advice).about(about)
 }
@@ -99,7 +99,10 @@ pub(crate) fn mode_mismatch(seen: &Evidence, about: &str, heard: &Heard, other: 
         Mode::Plain => (
             "in plain mode",
             "secured",
-            format!("give {about} its keys ({}) and start it without `insecure`", derive(&node)),
+            format!(
+                "if {about} belongs here and was not revoked, give it its keys ({}) and start it without `insecure`",
+                derive(&node)
+            ),
         ),
         Mode::Secured => (
             "secured",
@@ -261,7 +264,7 @@ mod tests {
         seen.heard = vec![of(Standing::Unchecked)];
         assert_eq!(ids(&seen), [Id::NoManager, Id::KeysMissing], "names travel in clear");
         seen.heard = vec![plain(searching("other", 8, "boss"))];
-        assert_eq!(ids(&seen), [Id::NotHeard, Id::NoManager]);
+        assert_eq!(ids(&seen), [Id::NoManager]);
         seen.heard.clear();
         seen.mode = Some(Mode::Plain);
         assert_eq!(ids(&seen), [Id::NotHeard]);

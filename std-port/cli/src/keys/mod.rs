@@ -17,6 +17,7 @@ use cara_std::keys::{FleetError, FleetKeys, KeyError, Members, Store, parse_node
 
 use crate::exit::{Ended, Exit};
 use crate::global::Global;
+use crate::interrupt::Asked;
 use crate::name_and_id::NameAndId;
 
 /// Makes the keys of a fleet and of its nodes, shows whose there are, takes nodes out, and changes keys.
@@ -108,8 +109,10 @@ fn new_fleet(nodes: &Nodes, folder: PathBuf, global: &Global) -> anyhow::Result<
     let mut keys = FleetKeys::draw(Fleet(global.fleet.unwrap_or(0))).map_err(failed)?;
     let added = keys.add_all(&nodes.nodes, &nodes.managers()?);
     added.map_err(|error| wrong(error.of_new_fleet()))?;
-    let store = Store::create(&folder, keys).map_err(failed)?;
-    save(Done::Made, &store, global)
+    let asked = Asked::catch()?;
+    let made = Store::create_unless(&folder, keys, &|| asked.came());
+    let (store, written) = made.map_err(|error| not_changed(error, &asked))?;
+    told::tell(Done::Made, &store, &written, global)
 }
 
 fn derive(nodes: &Nodes, folder: PathBuf, global: &Global) -> anyhow::Result<()> {
@@ -171,7 +174,9 @@ impl Step {
 }
 
 fn save(done: Done<'_>, store: &Store, global: &Global) -> anyhow::Result<()> {
-    told::tell(done, store, &store.save().map_err(failed)?, global)
+    let asked = Asked::catch()?;
+    let written = store.save_unless(&|| asked.came()).map_err(|error| not_changed(error, &asked))?;
+    told::tell(done, store, &written, global)
 }
 
 /// The keys of the fleet that is meant: of the only one in the folder, unless one is named.
@@ -187,6 +192,13 @@ fn open(folder: PathBuf, global: &Global) -> anyhow::Result<Store> {
         }
     };
     Store::open(&folder, fleet).map_err(failed)
+}
+
+fn not_changed(error: KeyError, asked: &Asked) -> anyhow::Error {
+    match error {
+        KeyError::Stopped => Ended { exit: asked.exit(), text: error.to_string(), name: "Stopped".into() }.into(),
+        error => failed(error),
+    }
 }
 
 /// What is wrong with keys, as the end of a command.

@@ -1,6 +1,8 @@
 //! A configuration file as it is written: every table and key that there is, each value with its place. What the values
 //! mean together is checked by [`settings`](super::settings).
 
+use std::ops::Range;
+
 use serde::Deserialize;
 use toml::Spanned;
 
@@ -160,12 +162,56 @@ impl From<Priority> for cara_std::Priority {
     }
 }
 
-/// Reads a file's text; the first mistake in its form ends that.
-pub(super) fn read(source: &Source) -> Result<File, Mistake> {
-    toml::from_str(&source.text).map_err(|error| {
-        let help = nearest_of(error.message()).unwrap_or_else(|| "`cara node --example` shows every key".into());
-        Mistake::new(error.span().unwrap_or(0..0), error.message().trim_end(), help)
-    })
+/// Most mistakes of form that are told at once.
+const MOST: usize = 20;
+
+/// Reads a file's text. What is no TOML is told alone, since nothing can be read behind it; of keys and values each mistake.
+pub(super) fn read(source: &Source) -> Result<File, Vec<Mistake>> {
+    let mut text = source.text.clone();
+    let mut mistakes = Vec::new();
+    loop {
+        let error = match toml::from_str(&text) {
+            Ok(file) if mistakes.is_empty() => return Ok(file),
+            Ok(_) => return Err(mistakes),
+            Err(error) => error,
+        };
+        let is_toml = toml::from_str::<toml::Table>(&text).is_ok();
+        if is_toml || mistakes.is_empty() {
+            mistakes.push(mistake(&error));
+        }
+        // Without the statement that is wrong, the next one is found; its bytes keep their places.
+        let span = error.span().filter(|_| is_toml && mistakes.len() < MOST);
+        if !span.is_some_and(|span| blank_statement(&mut text, span)) {
+            return Err(mistakes);
+        }
+    }
+}
+
+fn mistake(error: &toml::de::Error) -> Mistake {
+    let help = nearest_of(error.message()).unwrap_or_else(|| "`cara node --example` shows every key".into());
+    Mistake::new(error.span().unwrap_or(0..0), error.message().trim_end(), help)
+}
+
+/// Makes blanks of the lines of a statement, and of a table's header with all of the table; `false` where nothing changes.
+fn blank_statement(text: &mut String, span: Range<usize>) -> bool {
+    let start = text.get(..span.start).and_then(|before| before.rfind('\n')).map_or(0, |end| end + 1);
+    let Some(rest) = text.get(start..) else { return false };
+    let is_table = rest.trim_start().starts_with('[');
+    let from = span.end.max(span.start + 1) - start;
+    let end = match is_table {
+        true => rest.get(1..).and_then(|rest| rest.find("\n[")).map(|end| end + 1),
+        false => rest.get(from.min(rest.len())..).and_then(|rest| rest.find('\n')).map(|end| end + from),
+    };
+    let end = start + end.unwrap_or(rest.len());
+    let blanks: String = text.get(start..end).unwrap_or_default().chars().map(blank).collect();
+    let changed = text.get(start..end) != Some(&blanks);
+    text.replace_range(start..end, &blanks);
+    changed
+}
+
+/// As long as it was, in bytes.
+fn blank(character: char) -> String {
+    if character == '\n' { "\n".to_owned() } else { " ".repeat(character.len_utf8()) }
 }
 
 /// The word that was meant, where a word is none of those expected.

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use cara_std::{Call, Definition, Error, MyFunctionList, ParametersView, ServiceError, ServiceOptions};
+use cara_std::{Call, Definition, Error, MyFunctionList, ParametersView, ServiceError, ServiceOptions, Shown};
 
 use super::functions::{Lease, Service, Work};
 use super::json;
@@ -41,8 +41,7 @@ pub(super) fn offer(
                 let task = Serving { number, definition: &definition, command: &command, timeout };
                 task.run(&programs, call, view)
             };
-            // Programs take long, and must not keep the caller's next call waiting.
-            list.add_service(&service.definition, options.detached(), run)?
+            list.add_service(&service.definition, options, run)?
         }
     };
     Ok(())
@@ -55,7 +54,7 @@ fn echo(_: &Call, _: &mut ParametersView) -> Result<(), ServiceError> {
 fn log(definition: &Definition, call: &Call, view: &ParametersView) -> Result<(), ServiceError> {
     let mut arguments = json::arguments(definition.signature(), view).to_string();
     arguments.truncate(arguments.floor_char_boundary(LOGGED_BYTES));
-    tracing::info!(function = definition.name(), caller = %call.caller, %arguments, "called");
+    tracing::info!(function = definition.name(), caller = %call.caller, arguments = %Shown(&arguments), "called");
     Ok(())
 }
 
@@ -65,9 +64,9 @@ fn make_safe(
     definition: &Definition,
     lease: &Lease,
     programs: &Arc<Programs>,
-) -> impl Fn(&mut ()) + Send + Sync + 'static {
+) -> impl Fn() + Send + Sync + 'static {
     let (name, command, programs) = (definition.name().to_owned(), lease.at_end.clone(), programs.clone());
-    move |()| {
+    move || {
         let Some(command) = &command else { return };
         let environment = [("CARA_FUNCTION", name.clone()), ("CARA_CALLER", String::new())];
         programs.make_safe(number, &Task { command, environment, input: b"{}" }, SAFE_TIMEOUT);
@@ -90,11 +89,11 @@ impl Serving<'_> {
         let environment = [("CARA_FUNCTION", function.to_owned()), ("CARA_CALLER", call.caller.to_string())];
         let task = Task { command: self.command, environment, input: input.as_bytes() };
         let output = programs.serve(self.number, &task, self.timeout, call.lease.as_ref()).map_err(|failure| {
-            tracing::warn!(function, caller = %call.caller, program = self.command.join(" "), "{failure}");
+            tracing::warn!(function, caller = %call.caller, program = self.command.join(" "), "{}", Shown(&failure.to_string()));
             failure.to_service_error()
         })?;
         json::set_results(signature, &output, view).map_err(|bad| {
-            tracing::warn!(function, caller = %call.caller, program = self.command.join(" "), "{bad}");
+            tracing::warn!(function, caller = %call.caller, program = self.command.join(" "), "{}", Shown(&bad.to_string()));
             ServiceError::BadResults
         })
     }

@@ -289,7 +289,7 @@ mod tests {
         let system = CommunicationSystem::builder("program", 1).unwrap().interfaces(Interfaces::Loopback).insecure();
         let system = system.build_system().unwrap();
         let nothing = |_: &Call, _: &mut ParametersView| Ok(());
-        let options = ServiceOptions::new().lease(LONG, |_: &mut ()| {});
+        let options = ServiceOptions::new().lease(LONG, || {});
         let dead = system.my_function_list().add_service(&Definition::parse("f()").unwrap(), options, nothing).unwrap();
         let programs = Arc::default();
         assert!(matches!(serve(&programs, ":", Some(&dead)), Err(Failure::NotWanted)));

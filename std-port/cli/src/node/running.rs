@@ -33,7 +33,7 @@ pub(super) fn run(settings: Settings, over: &Overrides, logging: &Logging, globa
     offer_all(&node, &settings, &programs)?;
     let metrics = settings.metrics.as_ref().map(|place| listen(place, &settings)).transpose()?;
     events::log(node.events())?;
-    node.start().map_err(|error| Ended::failed(format!("{error:?}"), error.to_string()))?;
+    node.start().map_err(Ended::not_started)?;
     let served = metrics.as_ref().map(TcpListener::local_addr).transpose()?;
     if let Some(listener) = metrics {
         http::serve(listener, node.metrics()).context("metrics cannot be served")?;
@@ -88,7 +88,13 @@ fn not_made(error: Error, settings: &Settings) -> anyhow::Error {
         let help = format!("choose another one; `ss -lntup | grep :{value}` shows who has it");
         return Ended::failed("PortInUse", settings.mistake(span.clone(), &what, &help).to_string());
     }
-    let which = port.map_or(String::new(), |port| format!("port {}: ", port.value));
+    let refused = settings.tcp_port.as_ref().filter(|_| error == Error::PortNotPermitted);
+    if let Some(Placed { value, span: Some(span) }) = refused {
+        let what = format!("the system does not permit port {value}");
+        let help = "a port below 1024 takes root or CAP_NET_BIND_SERVICE: choose another one";
+        return Ended::failed("PortNotPermitted", settings.mistake(span.clone(), &what, help).to_string());
+    }
+    let which = port.or(refused).map_or(String::new(), |port| format!("port {}: ", port.value));
     Ended::failed(format!("{error:?}"), format!("{which}{error}"))
 }
 

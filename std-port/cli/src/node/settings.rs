@@ -97,7 +97,7 @@ impl Overrides {
 impl Settings {
     /// Reads and checks a file; all mistakes of meaning are told at once.
     pub(super) fn of(source: Source, over: &Overrides) -> Result<Self, Mistakes> {
-        let file = file::read(&source).map_err(|mistake| Mistakes::new(&source, vec![mistake]))?;
+        let file = file::read(&source).map_err(|mistakes| Mistakes::new(&source, mistakes))?;
         let mut mistakes = Vec::new();
         let settings = checked(source, &file, over, &mut mistakes);
         if mistakes.is_empty() { Ok(settings) } else { Err(Mistakes::new(&settings.source, mistakes)) }

@@ -5,7 +5,9 @@ use std::sync::Arc;
 use std::sync::mpsc::Receiver;
 
 use cara_std::access::AccessError;
-use cara_std::{BuildError, Builder, CommunicationSystem, Constraints, Error, Mode, MyFunctionList, Unit, UnitEvent};
+use cara_std::{
+    BuildError, Builder, CommunicationSystem, Constraints, Error, Mode, MyFunctionList, StartError, Unit, UnitEvent,
+};
 
 use super::http::Metrics;
 use super::settings::Settings;
@@ -45,7 +47,7 @@ impl Node {
         Ok(Self::Vehicle(with(builder, settings).map_err(NotBuilt::Access)?.build_unit()?))
     }
 
-    pub(super) fn start(&self) -> Result<(), Error> {
+    pub(super) fn start(&self) -> Result<(), StartError> {
         match self {
             Self::Manager(system) => system.start(),
             Self::Vehicle(unit) => unit.start(),

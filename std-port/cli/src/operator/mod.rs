@@ -54,6 +54,10 @@ impl Operator {
         let found = Self::open_if_any(global, need)?;
         found.ok_or_else(|| {
             let others = running::not_meant();
+            let of_others = running::of_others(None);
+            if others.is_empty() && !of_others.is_empty() {
+                return Ended::no_unit(of_others);
+            }
             let text = format!(
                 "no such m_unit runs on this host{others}. Start a manager (`cara node --name NAME --id ID`), or be one \
                  for the time of this command: --as NAME/ID with the fleet's --fleet NUMBER"

@@ -49,7 +49,7 @@ pub(super) fn start(identity: &NameAndId, global: &Global) -> anyhow::Result<Com
             system.discovery_port()
         ));
     }
-    system.start().map_err(network)?;
+    system.start().map_err(Ended::not_started)?;
     Ok(system)
 }
 
@@ -136,7 +136,8 @@ fn is_there(operator: &mut Operator, meant: &str) -> anyhow::Result<Option<Chose
 /// Whether somebody is there and nothing has changed for a while.
 fn settled(operator: &mut Operator, offering: Option<&str>, (seen, since): &mut Seen) -> anyhow::Result<bool> {
     let all = nodes::all(operator, offering)?;
-    let now: Vec<_> = all.iter().map(|node| (nodes::full_name(node), node.functions)).collect();
+    let now: Vec<_> =
+        all.iter().filter(|node| node.connected).map(|node| (nodes::full_name(node), node.functions)).collect();
     if now != *seen {
         (*seen, *since) = (now, Instant::now());
     }

@@ -4,7 +4,7 @@ use std::ops::ControlFlow;
 use std::path::Path;
 
 use cara_std::control::protocol::{Answer, Question};
-use cara_std::control::{Client, ControlError, RunningUnit, running};
+use cara_std::control::{Client, ControlError, Elsewhere, RunningUnit, directory, elsewhere, running, running_called};
 
 use super::error_of;
 use crate::exit::{Ended, Exit};
@@ -16,8 +16,12 @@ pub(super) fn choose(global: &Global) -> anyhow::Result<Option<Client>> {
     if let Some(path) = &global.socket {
         return Client::connect(path).map(Some).map_err(error);
     }
-    let all = running().map_err(error)?;
     let wanted = global.unit.as_ref().map(NameAndId::to_string);
+    let all = match &wanted {
+        Some(wanted) => running_called(&directory(), wanted),
+        None => running(),
+    };
+    let all = all.map_err(error)?;
     let is_meant = |unit: &&RunningUnit| {
         global.fleet.is_none_or(|fleet| fleet == unit.fleet)
             && wanted.as_ref().is_none_or(|wanted| *wanted == unit.unit)
@@ -25,7 +29,10 @@ pub(super) fn choose(global: &Global) -> anyhow::Result<Option<Client>> {
     let meant: Vec<_> = all.iter().filter(is_meant).collect();
     match (meant.as_slice(), wanted) {
         ([], None) => Ok(None),
-        ([], Some(wanted)) => Err(Ended::no_unit(format!("{wanted} does not run on this host{}", others(&all)))),
+        ([], Some(wanted)) => Err(Ended::no_unit(match of_others(Some(&wanted)).as_str() {
+            "" => format!("{wanted} does not run on this host{}", not_meant()),
+            others => others.to_owned(),
+        })),
         ([only], _) => only.refusal().map_or_else(|| Client::connect(&only.path), Err).map(Some).map_err(error),
         (several, _) => Err(Ended::usage(format!(
             "several units run on this host: {}; choose one with --unit, --fleet or --socket",
@@ -33,6 +40,26 @@ pub(super) fn choose(global: &Global) -> anyhow::Result<Option<Client>> {
         ))),
     }
 }
+
+/// Units of this host, or the one that is wanted, that another user runs, and how they are asked; empty if there are none.
+pub(super) fn of_others(wanted: Option<&str>) -> String {
+    let all = elsewhere().into_iter().filter(|unit| wanted.is_none_or(|wanted| wanted == unit.unit));
+    let told = all.take(SHOWN).map(|Elsewhere { unit, fleet, path, owner }| {
+        let folder = path.parent().unwrap_or(&path).display().to_string();
+        let (user, sudo) = match owner {
+            Some(owner) => (format!("user {owner}"), format!("sudo -u '#{owner}' ")),
+            None => ("another user".to_owned(), String::new()),
+        };
+        format!(
+            "{unit} (fleet {fleet}) runs on this host as {user}, and its control socket is in {folder}: \
+             `{sudo}env CARA_CONTROL_DIR={folder} cara …` asks it"
+        )
+    });
+    told.collect::<Vec<_>>().join("; ")
+}
+
+/// Units of others that an error lists.
+const SHOWN: usize = 4;
 
 /// Which units run although none of them is meant.
 pub(super) fn not_meant() -> String {

@@ -3,6 +3,8 @@
 use std::fmt::Write;
 use std::ops::Range;
 
+use cara_std::is_hidden;
+
 /// Characters of a long text that are shown on each side of the mistake.
 const AROUND: usize = 60;
 
@@ -58,7 +60,7 @@ impl Mistake {
 
 /// What a control character would do to the terminal is not wanted here.
 fn visible(c: char) -> char {
-    if c.is_control() { '·' } else { c }
+    if is_hidden(c) { '·' } else { c }
 }
 
 /// The nearest boundary of a character at or before `at`.

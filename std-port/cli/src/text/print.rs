@@ -2,6 +2,8 @@
 
 use cara_std::control::protocol::{Argument, ArgumentValue, Number};
 
+use crate::output::json;
+
 /// A call, or results in the form of one: `go_to(position: [1, 2])`.
 pub(crate) fn show_call(function: &str, arguments: &[Argument]) -> String {
     format!("{function}({})", show_arguments(arguments))
@@ -32,11 +34,9 @@ fn elements(elements: impl Iterator<Item = String>) -> String {
     }
 }
 
-/// With the escapes of JSON, and with one for each control character that JSON leaves alone.
+/// With the escapes of JSON, and with one for each hidden character that JSON leaves alone.
 fn quoted(text: &str) -> String {
-    let json = serde_json::Value::from(text).to_string();
-    let escape = |c: char| if c.is_control() { format!("\\u{:04x}", u32::from(c)) } else { c.to_string() };
-    json.chars().map(escape).collect()
+    json(&text).unwrap_or_default()
 }
 
 /// A float with a point or exponent, so that it is told from a whole number.

@@ -124,3 +124,37 @@ fn wrong_usage_ends_with_2() {
         assert!(!error["text"].as_str().unwrap().starts_with("error"), "{error}");
     }
 }
+
+/// What a terminal obeys or does not show, in a result and in a call's error: C1's CSI, a turn of direction, no width, ESC.
+#[test]
+fn hidden_characters_are_written_out() {
+    let stage = Stage::with(&["agv-1"]);
+    let hidden = ['\u{9b}', '\u{202e}', '\u{200b}', '\u{1b}'];
+    let shows_none = |ran: &crate::support::Ran| {
+        assert!(!ran.everything().contains(hidden), "{:?}", ran.everything());
+    };
+    let raw = "a\u{9b}31mb\u{202e}c\u{200b}d";
+    let escaped = r"a\u009b31mb\u202ec\u200bd\u001b[2J";
+    let call = format!("echo(text: \"{raw}\\u001b[2J\")");
+    let text = stage.ends(0, &["call", "agv-1", &call]);
+    shows_none(&text);
+    assert_eq!(text.out, format!("echo(text: \"{escaped}\")\n"));
+    assert_eq!(stage.ends(0, &["call", "agv-1", text.out.trim()]).out, text.out, "it can be pasted back");
+    let json = stage.ends(0, &["call", "agv-1", &call, "--json"]);
+    shows_none(&json);
+    assert!(json.out.contains(&format!("\"value\":\"{escaped}\"")), "{}", json.out);
+    assert_eq!(json.json()["results"][0]["value"], format!("{raw}\u{1b}[2J"), "JSON reads it back");
+    for wrong in [format!("swallow(text: \"{raw}\", more: 1)"), format!("fail(\"{raw}\u{1b}[2J\")")] {
+        let text = stage.ends(2, &["call", "agv-1", &wrong]);
+        shows_none(&text);
+        text.says("a·31mb·c·d");
+        shows_none(&stage.ends(2, &["call", "agv-1", &wrong, "--json"]));
+    }
+    let nobody = stage.ends(1, &["call", &format!("agv{raw}\u{1b}"), "fail"]);
+    shows_none(&nobody);
+    nobody.says(r"agva\u{9b}31mb\u{202e}c\u{200b}d\u{1b}");
+    let json = stage.ends(1, &["call", &format!("agv{raw}\u{1b}"), "fail", "--json"]);
+    shows_none(&json);
+    assert!(json.err.contains(r"agva\u009b31mb\u202ec\u200bd\u001b"), "{}", json.err);
+    assert!(json.error()["text"].as_str().unwrap().contains(raw), "JSON reads it back");
+}

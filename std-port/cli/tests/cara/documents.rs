@@ -8,10 +8,11 @@ use serde_json::Value;
 use crate::support::Stage;
 
 const REFERENCE: &str = "../../docs/cara.md";
-const VERBS: [&str; 16] = [
+const VERBS: [&str; 17] = [
     "scan",
     "functions",
     "call",
+    "retire",
     "publish",
     "set",
     "watch",

@@ -24,7 +24,7 @@ impl Driver {
         let drive = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
         let made_safe = Arc::new(AtomicU32::new(0));
         let counted = made_safe.clone();
-        let safe = move |_: &mut ()| {
+        let safe = move || {
             counted.fetch_add(1, Ordering::SeqCst);
         };
         let options = ServiceOptions::new().lease(LEASE, safe);

@@ -104,6 +104,13 @@ impl Stage {
         self.agvs.drain(..).for_each(|agv| agv.stop());
     }
 
+    /// Ends the manager by SIGKILL.
+    pub(crate) fn kill_manager(&mut self) {
+        let mut manager = self.manager.take().expect("it runs");
+        manager.kill().unwrap();
+        manager.wait().unwrap();
+    }
+
     /// The command with the stage's fleet, on loopback, to be run.
     pub(crate) fn command(&self, arguments: &[&str]) -> Command {
         let mut command = Command::new(env!("CARGO_BIN_EXE_cara"));
@@ -227,6 +234,12 @@ impl Running {
         rustix::process::kill_process(pid, rustix::process::Signal::INT).unwrap();
     }
 
+    /// SIGKILL, from which it learns nothing.
+    pub(crate) fn kill(&mut self) {
+        self.child.kill().unwrap();
+        self.child.wait().unwrap();
+    }
+
     /// Waits for its end.
     pub(crate) fn end(mut self) -> i32 {
         self.child.wait().unwrap().code().unwrap_or(-1)
@@ -241,7 +254,7 @@ impl Drop for Running {
     }
 }
 
-fn agv(builder: Builder<()>) -> Unit {
+pub(crate) fn agv(builder: Builder<()>) -> Unit {
     let unit = builder.build_unit().unwrap();
     for signature in FUNCTIONS {
         let definition = signature.parse::<cara_std::Definition>().unwrap();

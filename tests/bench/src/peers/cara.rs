@@ -277,7 +277,7 @@ struct Echo {
 impl Echo {
     fn of_system(main: CommunicationSystem) -> Result<Box<dyn Caller>> {
         let failures = Failures::watch(main.events());
-        let passive = found(|| main.m_unit("passive"))?;
+        let passive = found(|| main.m_unit("passive").ok())?;
         Ok(Box::new(Self { _kept: Kept::Main(main), passive, parameters: parameters()?, failures }))
     }
 

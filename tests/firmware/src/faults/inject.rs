@@ -5,13 +5,13 @@ use std::path::Path;
 use std::rc::Rc;
 use std::time::Duration;
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result, bail, ensure};
 use cara_apps::agv::GO_TO_LEASE;
 use cara_processes::Process;
 use cara_std::{CloseReason, Error, Peer, UnitEvent};
 
-use super::Stop;
-use super::kind::{Bound, Failing, Kind};
+use super::kind::{Bound, Failing, Kind, OVERFLOW};
+use super::{Stop, Target};
 use crate::board::{Bench, Board, Cable, LONG, Way, Who};
 use crate::keys::Keys;
 use crate::manager::{self, ANNOUNCE, Manager, announce, at, fault, position, sends};
@@ -19,23 +19,23 @@ use crate::manager::{self, ANNOUNCE, Manager, announce, at, fault, position, sen
 /// Longer than the pause between two renewals: faults come in every phase of it.
 const PHASES: u64 = 250;
 /// In which a vehicle that drives would be seen to.
-const STANDS: Duration = Duration::from_millis(300);
+pub(super) const STANDS: Duration = Duration::from_millis(300);
 /// How often a manager renews that has its turns.
 const RENEWED: Duration = Duration::from_millis(100);
 /// Times that a drive is begun anew because this machine was too busy to renew a lease in time.
 const TRIES: u32 = 5;
 /// What the board logs.
-const ON: &str = "motors on";
+pub(super) const ON: &str = "motors on";
 const OFF: &str = "motors off:";
 const LEFT: &str = "depot has left";
 const HOOK: &str = "hook for the lost manager";
 
 /// A board with its cable.
 pub(super) struct Desk {
-    board: Board,
-    cable: Cable,
-    keys: Rc<Keys>,
-    who: Who,
+    pub(super) board: Board,
+    pub(super) cable: Cable,
+    pub(super) keys: Rc<Keys>,
+    pub(super) who: Who,
     /// The constants that the image has logged.
     constants: String,
 }
@@ -47,6 +47,35 @@ struct Drive {
     line: usize,
 }
 
+impl Target for Desk {
+    fn name(&self) -> &'static str {
+        "emulated board"
+    }
+
+    fn bound(&self, kind: &Kind) -> Result<Bound> {
+        Bound::of(kind, &self.constants)
+    }
+
+    fn fail(&self, kind: &Kind, number: u32, dice: &mut fastrand::Rng) -> Result<Stop> {
+        let stop = match kind.failing {
+            Failing::Manager { frozen } => self.manager_fails(frozen, dice),
+            Failing::Turns => self.manager_is_held_up(dice),
+            Failing::Wire(Way::FromBoard) => self.manager_hears_nothing(dice),
+            Failing::Wire(Way::ToBoard) | Failing::Cable => self.link_cut(kind.failing, number, dice),
+            Failing::Looks => self.task_looks_rarely(dice),
+            Failing::Replaced => self.order_replaced(dice),
+            Failing::Caller { killed: true } => self.caller_is_killed(dice),
+            Failing::Caller { killed: false } => self.caller_times_out(number, dice),
+            Failing::Board { asked, reason } => self.board_fails(in_turn(asked, number), reason, dice),
+            Failing::StateHeld | Failing::SecondManager => bail!("only processes of Linux fail so"),
+        };
+        let which = || format!("{}, number {number}", kind.name);
+        let stop = stop.with_context(which)?;
+        stop.check(&self.constants).with_context(which)?;
+        Ok(stop)
+    }
+}
+
 impl Desk {
     pub(super) fn new(bench: &Bench) -> Result<Self> {
         let cable = bench.cable()?;
@@ -54,25 +83,6 @@ impl Desk {
         let board = bench.board(&cable, &who)?;
         let (_, constants) = board.finds(0, "bound:")?;
         Ok(Self { board, cable, keys: Rc::clone(&bench.keys), who, constants })
-    }
-
-    pub(super) fn bound(&self, kind: &Kind) -> Result<Bound> {
-        Bound::of(kind, &self.constants)
-    }
-
-    /// Makes something fail.
-    pub(super) fn fail(&self, kind: &Kind, number: u32, dice: &mut fastrand::Rng) -> Result<Stop> {
-        let stop = match kind.failing {
-            Failing::Manager { frozen } => self.manager_fails(frozen, dice),
-            Failing::Turns => self.manager_is_held_up(dice),
-            Failing::Wire(Way::FromBoard) => self.manager_hears_nothing(dice),
-            Failing::Wire(Way::ToBoard) | Failing::Cable => self.link_cut(kind.failing, number, dice),
-            Failing::Board { asked, reason } => self.board_fails(asked, reason, dice),
-        };
-        let which = || format!("{}, number {number}", kind.name);
-        let stop = stop.with_context(which)?;
-        stop.check(&self.constants).with_context(which)?;
-        Ok(stop)
     }
 
     fn manager_fails(&self, frozen: bool, dice: &mut fastrand::Rng) -> Result<Stop> {
@@ -188,6 +198,9 @@ impl Desk {
         // Whatever becomes of it, the next life of the board does not run it.
         let _ = agv.request("go_to", &at([-9_000, 0])?);
         let (behind, stop) = self.stopped(line)?;
+        if reason == OVERFLOW {
+            self.board.logs_behind(behind, "the lease's words are as they were")?;
+        }
         let told = format!("started because of {reason}, with the motors off");
         let started = self.board.logs_behind(behind, &told)?;
         let left = manager.event("loss", |event| matches!(event, UnitEvent::Left { .. }))?;
@@ -234,7 +247,7 @@ impl Desk {
     }
 
     /// Waits until the motors stand; the line behind that, and how long it took.
-    fn stopped(&self, line: usize) -> Result<(usize, Stop)> {
+    pub(super) fn stopped(&self, line: usize) -> Result<(usize, Stop)> {
         let (behind, said) = self.board.finds(line, OFF)?;
         Ok((behind, Stop::read(&said)?))
     }
@@ -263,7 +276,7 @@ impl Desk {
     }
 
     /// Nothing has moved the vehicle since, and nothing does while it is looked at.
-    fn stands(&self, agv: &Peer, line: usize, behind: usize) -> Result<()> {
+    pub(super) fn stands(&self, agv: &Peer, line: usize, behind: usize) -> Result<()> {
         let before = position(agv)?;
         std::thread::sleep(STANDS);
         let after = position(agv)?;
@@ -277,16 +290,20 @@ impl Desk {
     }
 
     /// What the board has logged since, for whoever reads that something is wrong.
-    fn log(&self, line: usize) -> String {
+    pub(super) fn log(&self, line: usize) -> String {
         let number = |(at, said): (usize, String)| format!("\n    {:4} {said}", line + at + 1);
         self.board.lines(line).into_iter().enumerate().map(number).collect()
     }
 
-    fn has_logged(&self, line: usize, text: &str) -> bool {
+    pub(super) fn has_logged(&self, line: usize, text: &str) -> bool {
         self.board.lines(line).iter().any(|line| line.contains(text))
     }
 }
 
-fn pause(dice: &mut fastrand::Rng) {
+fn in_turn(asked: &[i64], number: u32) -> i64 {
+    asked.get(number as usize % asked.len().max(1)).copied().unwrap_or_default()
+}
+
+pub(super) fn pause(dice: &mut fastrand::Rng) {
     std::thread::sleep(Duration::from_millis(dice.u64(..PHASES)));
 }

@@ -3,8 +3,10 @@
 use anyhow::{Context, Result, ensure};
 use cara_std::{Constraints, Duration};
 
-use super::Stop;
-use crate::board::Way;
+use super::inject::Desk;
+use super::processes::Processes;
+use super::{Stop, Target};
+use crate::board::{Bench, Way};
 
 /// What fails.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -20,10 +22,23 @@ pub(super) enum Failing {
     Wire(Way),
     /// The cable is pulled.
     Cable,
+    /// A task looks at its call's lease once a second, and the next call comes in between.
+    Looks,
+    /// A call that wants no motion takes the place of one that does.
+    Replaced,
+    /// A caller that waits for its answer.
+    Caller {
+        /// Its process is killed; otherwise it has waited for as long as it wants to.
+        killed: bool,
+    },
+    /// Nothing gives the application's state back, on Linux.
+    StateHeld,
+    /// A second manager of the first one's name starts, on Linux.
+    SecondManager,
     /// The board itself, by what its service does.
     Board {
-        /// What the service is asked for.
-        asked: i64,
+        /// What the service is asked for, in turns.
+        asked: &'static [i64],
         /// Why the board says that it started again.
         reason: &'static str,
     },
@@ -36,28 +51,61 @@ pub(super) struct Kind {
 }
 
 /// All of them.
-pub(super) const KINDS: [Kind; 9] = [
+pub(super) const KINDS: [Kind; 16] = [
     Kind { name: "manager killed", failing: Failing::Manager { frozen: false } },
     Kind { name: "manager frozen", failing: Failing::Manager { frozen: true } },
     Kind { name: "manager held up", failing: Failing::Turns },
     Kind { name: "link cut towards the board", failing: Failing::Wire(Way::ToBoard) },
     Kind { name: "link cut towards the manager", failing: Failing::Wire(Way::FromBoard) },
     Kind { name: "link cut in both directions", failing: Failing::Cable },
-    Kind { name: "handler in an endless loop", failing: Failing::Board { asked: 1, reason: "Watchdog" } },
-    Kind { name: "runner starved", failing: Failing::Board { asked: 2, reason: "Watchdog" } },
-    Kind { name: "handler panics", failing: Failing::Board { asked: 3, reason: "Program" } },
+    Kind { name: "handler in an endless loop", failing: Failing::Board { asked: &[1], reason: "Watchdog" } },
+    Kind { name: "runner starved", failing: Failing::Board { asked: &[2], reason: "Watchdog" } },
+    Kind { name: "handler panics", failing: Failing::Board { asked: &[3], reason: "Panic" } },
+    // By many small frames, and by a single large one.
+    Kind { name: "stack overflow", failing: Failing::Board { asked: &[4, 5], reason: OVERFLOW } },
+    Kind { name: "task that looks once a second", failing: Failing::Looks },
+    Kind { name: "order replaced", failing: Failing::Replaced },
+    Kind { name: "caller timed out", failing: Failing::Caller { killed: false } },
+    Kind { name: "caller killed", failing: Failing::Caller { killed: true } },
+    Kind { name: "state held for ever", failing: Failing::StateHeld },
+    Kind { name: "second manager", failing: Failing::SecondManager },
 ];
 
+/// What a board says behind a stack overflow.
+pub(super) const OVERFLOW: &str = "StackOverflow";
+
 impl Kind {
+    /// Where it happens.
+    pub(super) fn target(&self, bench: &Bench) -> Result<Box<dyn Target>> {
+        Ok(match self.failing {
+            Failing::StateHeld | Failing::SecondManager => Box::new(Processes),
+            _ => Box::new(Desk::new(bench)?),
+        })
+    }
+
     /// From the last sign before the fault until the motors stood.
     pub(super) fn took(&self, stop: &Stop) -> u64 {
         match self.failing {
             // The manager goes on renewing until it notices, by its own clock: where that took longer, or seems to, its
             // machine was busy.
             Failing::Wire(Way::FromBoard) => stop.announced.min(SILENCE.as_micros() + stop.renewed),
+            // Likewise, for as long as the caller waits, or until the manager asks for it: by the manager's clock.
+            Failing::Caller { killed } => stop.announced.min(waits(killed) + stop.renewed),
+            // From when the new call's task had its turn, by the board's clock.
+            Failing::Replaced => stop.announced,
             _ => stop.announced.min(stop.renewed),
         }
     }
+}
+
+/// How long a caller waits for its answer.
+pub(super) const TIMEOUT: Duration = Duration::from_millis(1_500);
+/// How often a manager asks whether the process of a caller is there: `cara_std`'s control socket.
+const ASKED: Duration = Duration::from_millis(100);
+
+/// How long a manager goes on for a caller that fails, in microseconds.
+fn waits(killed: bool) -> u64 {
+    if killed { ASKED.as_micros() } else { TIMEOUT.as_micros() }
 }
 
 /// Within which time the motors must stand.
@@ -78,7 +126,14 @@ impl Bound {
         let [poll, tick] = [value(said, "poll=")?, value(said, "tick=")?];
         let silence = SILENCE.as_micros();
         Ok(match kind.failing {
-            Failing::Board { reason: "Program", .. } => Self { micros: tick, of: "tick" },
+            Failing::Board { reason: "Panic", .. } => Self { micros: tick, of: "tick" },
+            // The image takes up to a tick to fill its stack.
+            Failing::Board { reason: OVERFLOW, .. } => Self { micros: 2 * tick, of: "filling + tick" },
+            Failing::Replaced => Self { micros: tick, of: "tick" },
+            Failing::Caller { killed } => {
+                let of = if killed { "question + lease + poll + tick" } else { "time-out + lease + poll + tick" };
+                Self { micros: waits(killed) + lease + poll + tick, of }
+            }
             Failing::Wire(Way::FromBoard) => {
                 Self { micros: silence + lease + poll + tick, of: "silence + lease + poll + tick" }
             }

@@ -1,8 +1,12 @@
 //! Builds with each bug that is planted behind a test-only cfg, and requires that the scenarios find it.
 //!
-//! `planted [BUG…]`; all of them without a name. Each is built in `target/planted`, so that no other build sees it.
+//! `planted [BUG…]`; all of them without a name. The cfg reaches the crates of the workspace alone, through a wrapper of
+//! the compiler: what they depend on is that of every other build.
 
-use std::path::Path;
+use std::fs::{self, Permissions};
+use std::io;
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode, Output};
 use std::time::Instant;
 
@@ -29,12 +33,13 @@ fn main() -> ExitCode {
 /// Whether the run fails because of the bug, rather than the build.
 fn finds(bug: &str) -> bool {
     let start = Instant::now();
-    let built = cargo(bug, BUILD);
+    let wrapper = wrapper(bug).expect("the target folder can be written");
+    let built = cargo(&wrapper, BUILD);
     if !built.status.success() {
         println!("{bug}: does not build\n{}", String::from_utf8_lossy(&built.stderr));
         return false;
     }
-    let output = cargo(bug, RUN);
+    let output = cargo(&wrapper, RUN);
     let text = String::from_utf8_lossy(&output.stdout);
     let finders = finders(&text);
     let found = !output.status.success() && !finders.is_empty();
@@ -62,16 +67,29 @@ fn finders(text: &str) -> Vec<String> {
     finders
 }
 
-fn cargo(bug: &str, arguments: &[&str]) -> Output {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
+/// Writes a wrapper of the compiler that plants the bug. Cargo tells builds apart by its path, so that no other build sees
+/// what it compiles.
+fn wrapper(bug: &str) -> io::Result<PathBuf> {
+    let folder = root().join("target/planted").join(bug);
+    fs::create_dir_all(&folder)?;
+    let file = folder.join("rustc-with-bug");
+    fs::write(&file, format!("#!/bin/sh\nexec \"$@\" --cfg 'cara_planted=\"{bug}\"'\n"))?;
+    fs::set_permissions(&file, Permissions::from_mode(0o755))?;
+    Ok(file)
+}
+
+fn cargo(wrapper: &Path, arguments: &[&str]) -> Output {
     let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
     Command::new(cargo)
         .args(arguments)
-        .current_dir(&root)
-        .env("RUSTFLAGS", format!("--cfg cara_planted=\"{bug}\""))
-        .env("CARGO_TARGET_DIR", root.join("target/planted"))
+        .current_dir(root())
+        .env("RUSTC_WORKSPACE_WRAPPER", wrapper)
         .output()
         .expect("cargo can be started")
+}
+
+fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../..")
 }
 
 #[cfg(test)]

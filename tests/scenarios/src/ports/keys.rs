@@ -18,7 +18,8 @@ const M_UNITS: [(&str, u32); 10] = [
     ("b", 2),
     ("twin", 1),
 ];
-const S_UNITS: [&str; 10] = ["agv", "one", "two", "three", "other", "quick", "newcomer", "late", "bystander", "bad"];
+const S_UNITS: [&str; 11] =
+    ["agv", "one", "two", "three", "other", "quick", "newcomer", "late", "bystander", "bad", "gone"];
 const IDS: [u32; 13] = [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 20, 30, 99];
 /// Units that scenarios number.
 const NUMBERED: u32 = 8;

@@ -298,6 +298,7 @@ impl LinuxNode {
             ..Capacities::default()
         };
         let builder = builder.fleet(self.fleet).constraints(*constraints).capacities(capacities);
+        let builder = if self.spec.beside_another { builder.beside_another() } else { builder };
         let builder = builder.interfaces(Interfaces::Loopback);
         let builder = match &self.keys {
             Some(keys) => builder.keys(lock(keys).ring(self.fleet, &self.spec.identity())),
@@ -312,7 +313,7 @@ impl LinuxNode {
         };
         let unit = builder.build_unit()?;
         let (losses, start) = (Arc::clone(&self.losses), self.start);
-        unit.on_manager_lost(move |()| lock(&losses).push(since(start)));
+        unit.on_manager_lost(move |()| lock(&losses).push(since(start)))?;
         Ok(Machine::Agv(unit))
     }
 
@@ -344,11 +345,8 @@ impl LinuxNode {
         let diary = service.diary();
         let start = self.start;
         let mut options = ServiceOptions::new().priority(service.priority);
-        if service.detached {
-            options = options.detached();
-        }
         if let Some(length) = service.lease {
-            options = options.lease(length, move |()| diary.stop(since(start)));
+            options = options.lease(length, move || diary.stop(since(start)));
         }
         let (kept, node) = (service.clone(), Arc::downgrade(self));
         let handler = move |call: &Call, parameters: &mut ParametersView| serve(&kept, &node, call, parameters);
@@ -378,6 +376,9 @@ fn serve(
     (service.body)(&Asked { caller: call.caller.clone(), at: node.now() }, parameters)?;
     if service.takes > Duration::ZERO {
         thread::sleep(service.takes.into());
+    }
+    while let Some(pause) = service.moves_on(call.lease.as_ref().is_some_and(LeaseWatch::is_live), parameters) {
+        thread::sleep(pause.into());
     }
     service.diary().end(node.now());
     Ok(())
@@ -527,7 +528,8 @@ impl Node for Handle {
     }
 
     fn request_all(&self, function: &str, parameters: &ParametersView) -> Vec<(Identity, Result<CallId, Error>)> {
-        let requested = self.system().map(|system| system.request_all(function, parameters)).unwrap_or_default();
+        let system = self.system().inspect(retire_strangers);
+        let requested = system.map(|system| system.request_all(function, parameters)).unwrap_or_default();
         requested.into_iter().map(|(peer, result)| (peer.identity().clone(), result)).collect()
     }
 
@@ -550,6 +552,7 @@ impl Node for Handle {
         copy.copy_from(parameters).expect("what is asked of all is short");
         let system = self.system();
         thread::spawn(move || {
+            let system = system.inspect(retire_strangers);
             let outcomes = system.map(|system| system.block_request_all(&function, &copy, &RequestOptions::default()));
             let short = |(peer, outcome): (Peer, Result<_, Error>)| (peer.identity().clone(), outcome.map(drop));
             told.end(outcomes.map(|outcomes| outcomes.into_iter().map(short).collect()), node.now());
@@ -624,8 +627,14 @@ fn seen(event: UnitEvent) -> Option<Seen> {
         UnitEvent::ListChanged { peer } => Seen::ListChanged(peer),
         UnitEvent::RequestFailed { call, error, .. } => Seen::Failed(call, error),
         UnitEvent::LeaseExpired { function, .. } => Seen::LeaseExpired(function),
-        UnitEvent::LeaseEnded { function, expired, .. } => Seen::LeaseEnded(function, expired),
+        UnitEvent::LeaseEnded { function, why, .. } => Seen::LeaseEnded(function, why),
         UnitEvent::InterfacesChanged { up } => Seen::InterfaceChanged(!up.is_empty()),
         UnitEvent::FunctionsSkipped { .. } => return None,
     })
+}
+
+/// All units of all scenarios have keys: those that this one has not started are not missed.
+fn retire_strangers(system: &CommunicationSystem) {
+    let never_joined = |peer: &&Peer| !peer.is_connected() && peer.left().is_none();
+    system.roster().iter().filter(never_joined).for_each(|stranger| assert!(stranger.retire()));
 }

@@ -338,7 +338,7 @@ impl SimWorld {
 fn simulated(service: &Service) -> cara_sim::Service {
     let diary = service.diary();
     let kept = service.clone();
-    let plain = service.takes == Duration::ZERO && service.calls_back.is_none();
+    let plain = !service.awaits();
     let made = if plain {
         cara_sim::Service::new(move |call, parameters| {
             kept.diary().begin(call.unit.now());
@@ -359,13 +359,15 @@ fn simulated(service: &Service) -> cara_sim::Service {
                 }
                 (kept.body)(&Asked { caller: call.caller.clone(), at: call.unit.now() }, &mut parameters)?;
                 call.unit.sleep(kept.takes).await;
+                while let Some(pause) = kept.moves_on(call.may_act(), &parameters) {
+                    call.unit.sleep(pause).await;
+                }
                 kept.diary().end(call.unit.now());
                 Ok(parameters)
             }
         })
     };
     let made = made.priority(service.priority);
-    let made = if service.detached { made.detached() } else { made };
     match service.lease {
         Some(length) => made.lease(length).on_lease_end(move |unit| diary.stop(unit.now())),
         None => made,
@@ -526,7 +528,7 @@ fn seen(event: UnitEvent) -> Option<Seen> {
         UnitEvent::ListChanged { peer } => Seen::ListChanged(peer),
         UnitEvent::Failed { id, error, .. } => Seen::Failed(id, error),
         UnitEvent::LeaseExpired { function } => Seen::LeaseExpired(function),
-        UnitEvent::LeaseEnded { function, expired, .. } => Seen::LeaseEnded(function, expired),
+        UnitEvent::LeaseEnded { function, why, .. } => Seen::LeaseEnded(function, why),
         UnitEvent::InterfaceChanged { up } => Seen::InterfaceChanged(up),
         UnitEvent::Started | UnitEvent::Stopped | UnitEvent::Called { .. } => return None,
     })

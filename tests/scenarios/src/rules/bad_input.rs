@@ -184,7 +184,7 @@ fn some_at_once_run(world: &mut dyn World, one: &Unit, two: &Unit, length: usize
 fn a_second_manager_of_a_name_is_told_on_its_own_side(world: &mut dyn World) {
     let (manager, agv, mut bystander) = three(world, &Service::numbered("note"));
     world.run_for(secs(1));
-    let second = world.add(Spec::manager("manager", 1));
+    let second = world.add(Spec::manager("manager", 1).beside_another());
     let told = |unit: &Unit| unit.count(|event| *event == Seen::NotJoined(DUPLICATE));
     world.wait("the second is told", || told(&second) > 0, secs(40));
     world.wait("so is the first", || told(&manager) > 0, secs(40));

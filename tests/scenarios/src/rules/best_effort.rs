@@ -1,6 +1,7 @@
 //! Telemetry: now or never.
 
 use cara_core::error::Error;
+use cara_core::host::connections::LinkCounter;
 use cara_core::services::unit::{Delivery, RequestOptions};
 use cara_sim::Path;
 
@@ -35,10 +36,16 @@ fn best_effort_loses_without_blocking(world: &mut dyn World) {
 fn best_effort_arrives_in_one_datagram(world: &mut dyn World) {
     let service = Service::numbered("telemetry");
     let (manager, _agv) = pair(world, &service);
+    let sent = || [LinkCounter::MessagesSent, LinkCounter::DatagramsSent].map(|counter| manager.counted(counter));
+    let before = sent();
     for n in 0..20 {
         manager.request_with("agv", "telemetry", &number("n", n), BEST_EFFORT).expect("it is accepted");
         world.run_for(millis(5));
     }
+    let [in_the_stream, in_datagrams] = [0, 1].map(|at| sent()[at] - before[at]);
+    // The acknowledgement of a list may be among them.
+    assert!(in_the_stream < 10, "{in_the_stream} messages over TCP for 20 requests");
+    assert!(in_datagrams >= 20, "{in_datagrams} datagrams for 20 requests");
     world.wait("most of it arrives", || service.diary().runs() >= 5, secs(10));
 }
 

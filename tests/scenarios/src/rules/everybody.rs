@@ -10,7 +10,8 @@ scenarios![
     an_asynchronous_request_to_all_has_an_id_for_each: "asynchronous request", Rough, [], ["failure came back"];
 ];
 
-/// A manager with three AGVs, of which one fails; with the service of the others.
+/// A manager with three AGVs that offer `note`, of which one fails, one that does not offer it, and one that has left; with the
+/// service of the first two.
 fn fleet(world: &mut dyn World) -> (crate::Unit, Service) {
     let service = Service::numbered("note");
     let failing = Service::numbered("note").does(|_, _| Err(ServiceError::Failed(7)));
@@ -18,7 +19,18 @@ fn fleet(world: &mut dyn World) -> (crate::Unit, Service) {
     world.add(Spec::agv("one", 1).service(&service));
     world.add(Spec::agv("two", 2).service(&service));
     world.add(Spec::agv("bad", 3).service(&failing));
-    world.wait("all have joined", || manager.nodes_offering("note").len() == 3, secs(60));
+    world.add(Spec::agv("other", 4).service(&Service::numbered("wave")));
+    let gone = world.add(Spec::agv("gone", 5).service(&service));
+    let offering = |function: &str| {
+        let mut names: Vec<String> =
+            manager.nodes_offering(function).iter().map(|node| node.name().to_owned()).collect();
+        names.sort();
+        names
+    };
+    let all = || offering("note").len() == 4 && offering("wave") == ["other"];
+    world.wait("all have joined", all, secs(60));
+    gone.stop();
+    world.wait("one has left", || offering("note") == ["bad", "one", "two"], secs(20));
     (manager, service)
 }
 
@@ -27,9 +39,14 @@ fn a_blocking_request_to_all_has_an_outcome_for_each(world: &mut dyn World) {
     manager.change(|limits| limits.request_timeout = secs(20));
     let outcomes = manager.begin_all("note", &number("n", 5));
     let outcomes = world.finish(&outcomes).expect("the manager runs");
-    assert_eq!(outcomes.len(), 3);
+    assert_eq!(outcomes.len(), 5);
     for (peer, outcome) in outcomes {
-        let expected = if peer.name() == "bad" { Err(Error::Service(ServiceError::Failed(7))) } else { Ok(()) };
+        let expected = match peer.name() {
+            "bad" => Err(Error::Service(ServiceError::Failed(7))),
+            "other" => Err(Error::UnknownFunction),
+            "gone" => Err(Error::NotConnected),
+            _ => Ok(()),
+        };
         assert_eq!(outcome, expected, "{peer}");
     }
     assert_eq!(service.diary().values(), [5, 5]);
@@ -38,11 +55,15 @@ fn a_blocking_request_to_all_has_an_outcome_for_each(world: &mut dyn World) {
 fn an_asynchronous_request_to_all_has_an_id_for_each(world: &mut dyn World) {
     let (manager, service) = fleet(world);
     let requested = manager.request_all("note", &number("n", 5));
-    assert_eq!(requested.len(), 3);
-    assert!(requested.iter().all(|(_, result)| result.is_ok()), "{requested:?}");
-    let bad = requested.iter().find(|(peer, _)| peer.name() == "bad").expect("it was asked").1;
+    let outcome = |name: &str| requested.iter().find(|(peer, _)| peer.name() == name).expect("it has an outcome").1;
+    assert_eq!((outcome("other"), outcome("gone")), (Err(Error::UnknownFunction), Err(Error::NotConnected)));
+    assert_eq!(
+        (requested.len(), requested.iter().filter(|(_, result)| result.is_ok()).count()),
+        (5, 3),
+        "{requested:?}"
+    );
     world.wait("two ran", || service.diary().runs() == 2, secs(20));
-    let failed = Seen::Failed(bad.expect("it was accepted"), Error::Service(ServiceError::Failed(7)));
+    let failed = Seen::Failed(outcome("bad").expect("it was accepted"), Error::Service(ServiceError::Failed(7)));
     world.wait("the failure comes back", || manager.count(|event| *event == failed) == 1, secs(20));
     world.reached("failure came back");
 }

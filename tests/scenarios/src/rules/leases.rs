@@ -1,6 +1,7 @@
 //! A vehicle does only what its manager still wants.
 
 use cara_core::error::Error;
+use cara_core::services::lease::LeaseEnd;
 use cara_core::services::unit::RequestOptions;
 use cara_core::time::Duration;
 
@@ -129,7 +130,7 @@ fn a_lease_that_is_not_renewed_ends(world: &mut dyn World) {
     assert!(!agv.lease_is_live("drive"));
     let took = service.diary().stops()[0].since(service.diary().began()[0]);
     assert!(!world.is_virtual() || took <= lease(world) + SLACK, "{} ms", took.as_millis());
-    let expired = || manager.count(|event| *event == Seen::LeaseEnded("drive".to_owned(), true));
+    let expired = || manager.count(|event| *event == Seen::LeaseEnded("drive".to_owned(), LeaseEnd::Expired));
     // The caller holds no lease, so the news of its end is not its matter.
     world.run_for(millis(200));
     assert_eq!(expired(), 0);
@@ -151,7 +152,7 @@ fn what_is_finished_needs_no_safe_hook(world: &mut dyn World) {
     drive(world, &manager);
     agv.end_lease("drive");
     assert!(!agv.lease_is_live("drive"));
-    let finished = |event: &Seen| *event == Seen::LeaseEnded("drive".to_owned(), false);
+    let finished = |event: &Seen| *event == Seen::LeaseEnded("drive".to_owned(), LeaseEnd::Finished);
     world.wait("the caller is told", || manager.count(finished) == 1, secs(10));
     let long = lease(world).times(3);
     world.run_for(long);

@@ -21,6 +21,8 @@ fn the_listing_runs_line_by_line(world: &mut dyn World) {
     let manager = world.add(Spec::manager("manager", 1));
     assert_eq!(manager.number_of_s_units(), 0);
     let (pos_info, go_to) = paper_services();
+    // So long that a request which waited for its end would not have returned before.
+    let go_to = go_to.takes(secs(2));
     let agv = world.add(Spec::agv("agv", 7).service(&pos_info).service(&go_to));
     while manager.number_of_s_units() < 1 {
         manager.broadcast();
@@ -36,8 +38,9 @@ fn the_listing_runs_line_by_line(world: &mut dyn World) {
     assert_eq!(variable(&pos, "position"), [3, 4]);
     pos.set_value("position", [1, 2]).expect("it is there");
     manager.request("agv", "go_to", &pos).expect("it is accepted");
+    assert!(go_to.diary().ended().is_empty(), "it returns at once");
     assert_eq!(variable(&pos, "position"), [1, 2]);
-    world.wait("go_to has run", || go_to.diary().runs() == 1, secs(10));
+    world.wait("go_to has run", || go_to.diary().ended().len() == 1, secs(10));
     let mut told = position();
     assert_eq!(world.ask(&manager, "agv", "pos_info", &mut told), Ok(()));
     assert_eq!(variable(&told, "position"), [1, 2]);

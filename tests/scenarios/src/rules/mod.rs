@@ -18,6 +18,7 @@ mod links;
 mod listing;
 mod membership;
 mod message_size;
+mod orders;
 mod priorities;
 mod publishing;
 mod slow;
@@ -45,6 +46,7 @@ pub fn all() -> Vec<Scenario> {
         at_most_once::SCENARIOS,
         age::SCENARIOS,
         leases::SCENARIOS,
+        orders::SCENARIOS,
         links::SCENARIOS,
         priorities::SCENARIOS,
         emergency::SCENARIOS,

@@ -10,8 +10,7 @@ use crate::{Seen, Service, Spec, World, number, secs};
 scenarios![
     a_slow_handler_delays_no_other_peer: "handlers run outside", Light, [], ["RequestsRun"];
     a_slow_handler_delays_no_keep_alive: "handlers run outside", Light, [LongTime], ["DatagramsReceived"];
-    a_detached_service_does_not_block_the_next_call: "ticket", Light, [Detached], ["detached"];
-    without_detaching_the_next_call_waits: "ticket (ticket removed)", Light, [], ["waited"];
+    a_quick_call_overtakes_slow_ones_that_began_before_it: "handlers run outside", Light, [], ["overtook"];
     a_service_calls_its_caller_back: "handlers run outside", Rough, [], ["RequestsRun"];
     two_peers_call_each_other_at_the_same_time: "handlers run outside, 6", Rough, [], ["RequestsRun"];
     many_callers_share_one_link: "6", Rough, [], ["RequestsRun"];
@@ -47,29 +46,19 @@ fn a_slow_handler_delays_no_keep_alive(world: &mut dyn World) {
     assert_eq!((manager.count(left), agv.count(left)), (0, 0));
 }
 
-/// A quick call of the same class behind one that takes long; whether it was answered before.
-fn overtakes(world: &mut dyn World, slow: Service) -> bool {
+/// Three slow calls and a quick one of the same class: they begin in their order, and the quick one waits for none.
+fn a_quick_call_overtakes_slow_ones_that_began_before_it(world: &mut dyn World) {
+    let (slow, quick) = (Service::numbered("slow").takes(secs(2)), Service::numbered("quick"));
     let manager = world.add(Spec::manager("manager", 1));
-    let quick = Service::numbered("quick");
     world.add(Spec::agv("agv", 7).service(&slow).service(&quick));
     met(world, &manager, "agv", "slow");
     met(world, &manager, "agv", "quick");
-    let long = manager.begin("agv", "slow", &number("n", 1), PATIENT);
-    world.wait("it runs", || slow.diary().runs() == 1, secs(10));
+    let long: Vec<_> = (0..3).map(|n| manager.begin("agv", "slow", &number("n", n), PATIENT)).collect();
+    world.wait("they run side by side", || slow.diary().runs() == 3, secs(10));
     assert_eq!(world.ask(&manager, "agv", "quick", &mut number("n", 1)), Ok(()));
-    let overtook = quick.diary().began()[0] < *slow.diary().ended().first().unwrap_or(&world.now());
-    assert!(world.finish(&long).is_ok());
-    overtook
-}
-
-fn a_detached_service_does_not_block_the_next_call(world: &mut dyn World) {
-    assert!(overtakes(world, Service::numbered("slow").takes(secs(2)).detached()));
-    world.reached("detached");
-}
-
-fn without_detaching_the_next_call_waits(world: &mut dyn World) {
-    assert!(!overtakes(world, Service::numbered("slow").takes(secs(2))));
-    world.reached("waited");
+    assert!(slow.diary().ended().is_empty() && long.iter().all(|call| !call.is_over()), "it waited for none of them");
+    assert!(long.iter().all(|call| world.finish(call).is_ok()));
+    world.reached("overtook");
 }
 
 fn a_service_calls_its_caller_back(world: &mut dyn World) {

@@ -198,11 +198,11 @@ impl Inner {
             Happened::Failed(id, error) => {
                 self.log_of(shared, host, peer, |peer| UnitEvent::Failed { peer, id, error });
             }
-            Happened::LeaseEnded(slot, expired) => {
+            Happened::LeaseEnded { call, slot, why } => {
                 let theirs = machine.links.link(index).map(|link| link.session.their_function_list());
                 let function = theirs.and_then(|list| list.function(slot));
                 let function = function.map(|function| function.name().to_owned()).unwrap_or_default();
-                self.log_of(shared, host, peer, |peer| UnitEvent::LeaseEnded { peer, function, expired });
+                self.log_of(shared, host, peer, |peer| UnitEvent::LeaseEnded { peer, function, call, why });
             }
         }
     }
@@ -344,9 +344,6 @@ impl Inner {
         let Some(link) = machine.links.link_mut(index) else { return };
         let Some(caller) = link.peer.clone() else { return };
         let (ticket, stream) = (call.ticket, link.stream);
-        if service.detached {
-            link.session.detach(ticket);
-        }
         let handle = UnitHandle::new(Rc::downgrade(shared), host);
         let told = Call {
             unit: handle.clone(),
@@ -356,6 +353,7 @@ impl Inner {
             wants_reply: call.wants_reply,
             deadline: call.deadline,
             service: Rc::clone(&service),
+            order: call.order,
         };
         let owner = Owner { host, life: unit.life };
         let job = async move {

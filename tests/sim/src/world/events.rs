@@ -2,6 +2,7 @@
 
 use cara_core::distribution::identity::Identity;
 use cara_core::error::{CloseReason, Error};
+use cara_core::services::lease::LeaseEnd;
 use cara_core::services::requests::CallId;
 
 /// Something that happened to a unit.
@@ -65,7 +66,9 @@ pub enum UnitEvent {
         peer: Identity,
         /// The function; empty where the peer has withdrawn it meanwhile.
         function: String,
-        /// It was not renewed in time, rather than finished.
-        expired: bool,
+        /// The call that held it.
+        call: CallId,
+        /// Why.
+        why: LeaseEnd,
     },
 }

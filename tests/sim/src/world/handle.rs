@@ -215,6 +215,12 @@ impl UnitHandle {
         self.peers().into_iter().filter(|peer| peer.role() == Role::SUnit).collect()
     }
 
+    /// The s_units that have joined this life of the unit, connected or not.
+    pub fn roster(&self) -> Vec<Identity> {
+        let joined = self.machine(|machine, _| machine.node.s_units().map(|known| known.identity.clone()).collect());
+        joined.unwrap_or_default()
+    }
+
     /// The s_units that this life of the unit has known, in the order in which they became known, and whether each is
     /// connected. One that has left keeps its place.
     pub fn s_units_ever(&self) -> Vec<(Identity, bool)> {

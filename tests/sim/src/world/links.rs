@@ -7,6 +7,7 @@ use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error};
 use cara_core::services::access::Access;
+use cara_core::services::lease::LeaseEnd;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::{Event, Session};
 use cara_core::services::{Context, Ticket};
@@ -31,7 +32,7 @@ pub(super) enum Happened {
     Failed(CallId, Error),
     ListChanged,
     LeaseExpired(Slot),
-    LeaseEnded(Slot, bool),
+    LeaseEnded { call: CallId, slot: Slot, why: LeaseEnd },
     Answered,
     Closed(CloseReason),
 }
@@ -177,13 +178,12 @@ impl Links {
         Ok(id)
     }
 
-    /// The caller no longer waits.
-    pub(super) fn cancel(&mut self, index: u16, id: CallId) {
-        if let Some(link) = self.link_mut(index)
-            && link.waiting.remove(&id).is_some()
-        {
-            link.session.cancel(id);
+    /// The caller has not taken an outcome, and does not want the call any more.
+    pub(super) fn cancel(&mut self, network: &mut Network, index: u16, id: CallId) {
+        if let Some(link) = self.link_mut(index) {
+            link.waiting.remove(&id);
         }
+        self.with(network, index, |session, cx| session.cancel(cx, id));
     }
 
     /// The promise is kept with `true` when the peer has read the list up to `serial`, with `false` if the link ends.
@@ -409,7 +409,7 @@ fn note(
         Some(Event::Failed(id, error)) => Happened::Failed(id, error),
         Some(Event::ListChanged) => Happened::ListChanged,
         Some(Event::LeaseExpired(slot)) => Happened::LeaseExpired(slot),
-        Some(Event::LeaseEnded { slot, expired }) => Happened::LeaseEnded(slot, expired),
+        Some(Event::LeaseEnded { call, slot, why }) => Happened::LeaseEnded { call, slot, why },
         Some(Event::Answered) => Happened::Answered,
         Some(Event::Closed(reason)) => Happened::Closed(reason),
     });

@@ -1,6 +1,6 @@
 //! Requests of a unit: the paper's two forms, to one node and to all, and the leases that they hold.
 
-use cara_core::distribution::identity::Identity;
+use cara_core::distribution::identity::{Identity, Role};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 use cara_core::services::requests::CallId;
@@ -32,9 +32,13 @@ impl UnitHandle {
         requested
     }
 
-    /// The asynchronous request to every connected node, with an outcome for each.
+    /// The asynchronous request to all, with an outcome for each: each s_unit that has joined, connected or not, and each
+    /// m_unit that offers the function.
     pub fn request_all(&self, function: &str, parameters: &ParametersView) -> Vec<(Identity, Result<CallId, Error>)> {
-        self.peers().into_iter().map(|peer| (peer.clone(), self.request(&peer, function, parameters))).collect()
+        self.asked_with_all(function)
+            .into_iter()
+            .map(|peer| (peer.clone(), self.request(&peer, function, parameters)))
+            .collect()
     }
 
     /// The paper's synchronous request: waits for the reply, which updates the parameters; on an error they are
@@ -63,7 +67,7 @@ impl UnitHandle {
             let options = RequestOptions { timeout: Some(deadline.since(self.now())), ..options };
             match self.call(&peer, function, parameters, &options) {
                 Ok(call) => {
-                    let results = call.promise.clone().await?;
+                    let results = call.results().await?;
                     return parameters.copy_from(&results);
                 }
                 Err(Error::TooSoon { wait }) if self.now() + wait < deadline => self.sleep(wait).await,
@@ -72,7 +76,13 @@ impl UnitHandle {
         }
     }
 
-    /// The synchronous request to every connected node at the same time, with an outcome for each.
+    fn asked_with_all(&self, function: &str) -> Vec<Identity> {
+        let mut asked = self.roster();
+        asked.extend(self.nodes_offering(function).into_iter().filter(|node| node.role() == Role::MUnit));
+        asked
+    }
+
+    /// The synchronous request to all at the same time, with an outcome for each, as of [`request_all`](Self::request_all).
     pub async fn block_request_all(
         &self,
         function: &str,
@@ -80,7 +90,7 @@ impl UnitHandle {
     ) -> Vec<(Identity, Result<BoxedParameters, Error>)> {
         let options = RequestOptions::default();
         let calls: Vec<_> = self
-            .peers()
+            .asked_with_all(function)
             .into_iter()
             .map(|peer| (peer.clone(), self.call(&Peer::Is(peer), function, parameters, &options)))
             .collect();
@@ -89,7 +99,7 @@ impl UnitHandle {
             outcomes.push((
                 peer,
                 match call {
-                    Ok(call) => call.promise.clone().await,
+                    Ok(call) => call.results().await,
                     Err(error) => Err(error),
                 },
             ));
@@ -103,8 +113,7 @@ impl UnitHandle {
         self.machine(|machine, network| {
             let released = machine.links.with(network, index, |session, cx| {
                 let slot = session.their_function_list().find(function).ok_or(Error::UnknownFunction)?;
-                session.release(cx, slot);
-                Ok(())
+                session.release(cx, slot)
             });
             released.unwrap_or(Err(Error::NotConnected))
         })??;
@@ -150,26 +159,35 @@ impl UnitHandle {
             Ok((stream, id))
         })?;
         self.work(index);
-        requested.map(|(stream, id)| InFlight { unit: self.clone(), stream, id, promise })
+        requested.map(|(stream, id)| InFlight { unit: self.clone(), stream, id, promise, has_succeeded: false })
     }
 }
 
-/// A call in flight, which is given up when this is dropped.
+/// A call in flight, which is given up when this is dropped before it has ended well.
 struct InFlight {
     unit: UnitHandle,
     stream: StreamId,
     id: CallId,
     promise: Promise<Result<BoxedParameters, Error>>,
+    has_succeeded: bool,
+}
+
+impl InFlight {
+    async fn results(mut self) -> Result<BoxedParameters, Error> {
+        let results = self.promise.clone().await;
+        self.has_succeeded = results.is_ok();
+        results
+    }
 }
 
 impl Drop for InFlight {
     fn drop(&mut self) {
-        if self.unit.shared.strong_count() == 0 {
+        if self.has_succeeded || self.unit.shared.strong_count() == 0 {
             return;
         }
-        let _ = self.unit.machine(|machine, _| {
+        let _ = self.unit.machine(|machine, network| {
             if let Some(index) = machine.links.of_stream(self.stream) {
-                machine.links.cancel(index, self.id);
+                machine.links.cancel(network, index, self.id);
             }
         });
     }

@@ -11,7 +11,7 @@ use cara_core::distribution::function::Attributes;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::{Parameters, ParametersView};
 use cara_core::error::ServiceError;
-use cara_core::services::lease::Lease;
+use cara_core::services::lease::{Lease, Order};
 use cara_core::time::{Duration, Instant};
 
 use super::UnitHandle;
@@ -48,12 +48,15 @@ pub struct Call {
     /// After this nobody waits.
     pub deadline: Instant,
     pub(super) service: Rc<Service>,
+    pub(super) order: Option<Order>,
 }
 
 impl Call {
-    /// Whether the lease of a leased service is live now; true for a service without one.
+    /// Whether this call's hold of its service's lease is live now; true for a service without one. Once it has said no,
+    /// it says so for ever, whatever call comes next.
     pub fn may_act(&self) -> bool {
-        self.service.lease.as_ref().is_none_or(|lease| lease.is_live(self.unit.now()))
+        let hold = self.service.lease.as_ref().zip(self.order);
+        hold.is_none_or(|(lease, order)| lease.is_live_for(order, self.unit.now()))
     }
 }
 
@@ -76,7 +79,6 @@ pub struct Service {
     takes: Duration,
     survives_panics: bool,
     pub(super) attributes: Attributes,
-    pub(super) detached: bool,
     lease: Option<Lease>,
     pub(super) safe_hook: Option<Box<SafeHook>>,
 }
@@ -112,7 +114,6 @@ impl Service {
             takes: Duration::ZERO,
             survives_panics: false,
             attributes: Attributes::default(),
-            detached: false,
             lease: None,
             safe_hook: None,
         }
@@ -142,11 +143,6 @@ impl Service {
     /// It may be called twice without harm.
     pub fn idempotent(self) -> Self {
         Self { attributes: Attributes { idempotent: true, ..self.attributes }, ..self }
-    }
-
-    /// The next call of the same peer and class begins while this one still runs.
-    pub fn detached(self) -> Self {
-        Self { detached: true, ..self }
     }
 
     /// A panic is answered to the caller as [`ServiceError::Panicked`], as on Linux. Otherwise it ends the test.

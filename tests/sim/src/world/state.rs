@@ -13,6 +13,7 @@ use cara_core::host::mailman::LinkId;
 use cara_core::host::secure::Seal;
 use cara_core::random::Random;
 use cara_core::services::publications::Publications;
+use cara_core::services::slots_for;
 use cara_core::services::unit::{Session, SessionConfig, SessionStorage, buffer_bytes};
 use cara_core::time::Instant;
 
@@ -151,7 +152,7 @@ impl Machine {
         let storage = SessionStorage {
             small: Boxed::slice(cara_core::config::LINK_BUFFER_BYTES),
             pending: Boxed::slice(calls),
-            running: Boxed::slice(calls + 1),
+            running: Boxed::slice(slots_for(calls)),
             publications: Boxed::slice(functions),
             their_functions: Boxed::slice(functions),
             their_signatures: Boxed::slice(functions * SIGNATURE_BYTES),

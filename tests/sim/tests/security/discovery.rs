@@ -8,6 +8,7 @@ use cara_core::distribution::connection_handler::{Action, Node, NodeConfig, Node
 use cara_core::distribution::datagram::{ANSWER_BYTES, Announce, SEARCH_BYTES};
 use cara_core::distribution::hello::Manager;
 use cara_core::distribution::identity::{Epoch, Fleet, Identity};
+use cara_core::distribution::presence::{Heard, Presence};
 use cara_core::error::CloseReason;
 use cara_core::host::mailman::{LinkId, Mailman};
 use cara_core::time::{Duration, Instant};
@@ -17,9 +18,9 @@ use cara_sim::Boxed;
 
 use super::Tally;
 
-const FLEET: Fleet = Fleet(7);
+pub(super) const FLEET: Fleet = Fleet(7);
 
-struct Ring {
+pub(super) struct Ring {
     root: RootKey,
     discovery: DiscoveryKey,
     own: Identity,
@@ -35,15 +36,15 @@ impl Keyring for Ring {
     }
 }
 
-fn codes(root: u8, own: &Identity) -> Codes<Ring> {
+pub(super) fn codes(root: u8, own: &Identity) -> Codes<Ring> {
     let root = RootKey::new([root; 32]);
     Codes::Keyed(Ring { discovery: root.discovery(FLEET, 1), root, own: own.clone() })
 }
 
 #[derive(Default)]
-struct Outbox {
-    broadcasts: Vec<Vec<u8>>,
-    sent: Vec<Vec<u8>>,
+pub(super) struct Outbox {
+    pub(super) broadcasts: Vec<Vec<u8>>,
+    pub(super) sent: Vec<(SocketAddr, Vec<u8>)>,
 }
 
 impl Mailman for Outbox {
@@ -51,8 +52,8 @@ impl Mailman for Outbox {
         Ok(0)
     }
 
-    fn send_to(&mut self, _: SocketAddr, datagram: &[u8]) -> bool {
-        self.sent.push(datagram.to_vec());
+    fn send_to(&mut self, to: SocketAddr, datagram: &[u8]) -> bool {
+        self.sent.push((to, datagram.to_vec()));
         true
     }
 
@@ -63,40 +64,45 @@ impl Mailman for Outbox {
 }
 
 /// A node with its keys, and what it did.
-struct Unit {
-    node: Node<Boxed>,
-    codes: Codes<Ring>,
-    outbox: Outbox,
-    dials: Vec<SocketAddr>,
+pub(super) struct Unit {
+    pub(super) node: Node<Boxed>,
+    pub(super) codes: Codes<Ring>,
+    pub(super) outbox: Outbox,
+    pub(super) dials: Vec<SocketAddr>,
 }
 
-fn depot() -> Identity {
+pub(super) fn depot() -> Identity {
     Identity::m_unit("depot", 1).expect("a name")
 }
 
-fn agv(id: u32) -> Identity {
+pub(super) fn agv(id: u32) -> Identity {
     Identity::s_unit("agv", id).expect("a name")
 }
 
-fn at(millis: u64) -> Instant {
+pub(super) fn at(millis: u64) -> Instant {
     Instant::START + Duration::from_secs(100) + Duration::from_millis(millis)
 }
 
-fn host(number: u8) -> SocketAddr {
+pub(super) fn host(number: u8) -> SocketAddr {
     SocketAddr::from(([10, 0, 0, number], 7_001))
 }
 
 impl Unit {
     fn new(identity: &Identity, target: Target) -> Self {
+        Self::of_life(identity, target, at(0), u64::from(identity.id()) + 40)
+    }
+
+    /// A life of a unit that begins at `now`, with delays of its own.
+    pub(super) fn of_life(identity: &Identity, target: Target, now: Instant, life: u64) -> Self {
         let config = NodeConfig {
             identity: identity.clone(),
             fleet: FLEET,
-            epoch: Epoch(u64::from(identity.id()) + 40),
+            epoch: Epoch(life),
             target,
             tcp_port: 7_000,
             udp_port: 7_001,
             constraints: Constraints::M_UNIT,
-            seed: u64::from(identity.id()),
+            seed: life.wrapping_mul(0x9E37_79B9_7F4A_7C15) ^ u64::from(identity.id()),
         };
         let storage = NodeStorage {
             nodes: Boxed::slice(8),
@@ -104,7 +110,7 @@ impl Unit {
             links: Boxed::slice(8),
             findings: Boxed::slice(4),
         };
-        let node = Node::new(at(0), config, storage);
+        let node = Node::new(now, config, storage);
         Self { node, codes: codes(1, identity), outbox: Outbox::default(), dials: Vec::new() }
     }
 
@@ -116,11 +122,11 @@ impl Unit {
         Self::new(&agv(id), Target::Manager(Manager::new("depot", 1).expect("a name")))
     }
 
-    fn hear(&mut self, now: Instant, from: SocketAddr, bytes: &[u8]) {
+    pub(super) fn hear(&mut self, now: Instant, from: SocketAddr, bytes: &[u8]) {
         assert_eq!(self.node.datagram(now, from, &mut bytes.to_vec(), &self.codes), Sorted::Done);
     }
 
-    fn run(&mut self, until: Instant) {
+    pub(super) fn run(&mut self, until: Instant) {
         while self.node.next_deadline() <= until {
             let now = self.node.next_deadline();
             while let Some(action) = self.node.poll(now, &mut self.outbox, &self.codes) {
@@ -143,7 +149,7 @@ fn asked() -> (Unit, Vec<u8>, Vec<u8>, Unit) {
     let question = vehicle.outbox.broadcasts.last().expect("it has asked").clone();
     manager.hear(at(2_000), host(17), &question);
     manager.run(at(2_100));
-    let answer = manager.outbox.sent.last().expect("it has answered").clone();
+    let answer = manager.outbox.sent.last().expect("it has answered").1.clone();
     (vehicle, question, answer, manager)
 }
 
@@ -231,6 +237,62 @@ fn another_unit_of_the_fleet_cannot_answer_for_the_manager() {
     vehicle.run(at(2_101));
     assert!(vehicle.dials.is_empty());
     assert_eq!(vehicle.counted(NodeCounter::DatagramNotForUs), 1);
+}
+
+/// A manager asks for its own identity: only holders of its keys answer, and only to this very question. What was said
+/// before, by it or by another life of it, and what a stolen vehicle's keys can make, keeps it from starting no more than
+/// its own words do.
+#[test]
+fn nobody_without_a_manager_s_own_key_keeps_it_from_starting() {
+    let mut tally = Tally::new("answers that a manager runs already");
+    let mut out = [0; SEARCH_BYTES];
+    let own = codes(1, &depot());
+    let mut asking = Presence::new(depot(), FLEET, Epoch(500), 77);
+    let question = asking.question(&own, &mut out).expect("it fits").to_vec();
+    // A live one answers, with what it has.
+    let mut running = Unit::manager();
+    running.hear(at(2_000), host(1), &question);
+    running.run(at(2_001));
+    let answer = running.outbox.sent.last().expect("it answers").1.clone();
+    let told = asking.hear(host(1), &answer, &own, &mut out);
+    assert_eq!(told, Heard::Running(SocketAddr::from(([10, 0, 0, 1], 7_000))));
+    assert!(answer.len() <= question.len());
+    // The next start has another nonce, and that answer is an old one.
+    let next = Presence::new(depot(), FLEET, Epoch(600), 78);
+    for bytes in [&answer, &question] {
+        for codes in [&own, &codes(9, &depot())] {
+            tally.note(matches!(next.hear(host(66), bytes, codes, &mut out), Heard::Running(_)));
+        }
+    }
+    // With the fleet's key and another pair's.
+    let thief = codes(1, &agv(18));
+    for epoch in [1, 599, 600, 601, u64::MAX] {
+        for nonce in [0, 1, 78 | 1] {
+            let announce = Announce {
+                identity: depot(),
+                epoch: Epoch(epoch),
+                sequence: 9,
+                nonce,
+                tcp_port: 666,
+                room: 1,
+                expected: 1,
+            };
+            let mut bytes = [0; SEARCH_BYTES];
+            for to in [None, Some(depot()), Some(agv(18))] {
+                let Some(bytes) = announce.encode(FLEET, &thief, to.as_ref(), &mut bytes) else { continue };
+                tally.note(matches!(next.hear(host(66), bytes, &own, &mut out), Heard::Running(_)));
+            }
+        }
+    }
+    // Its own answer to a made-up question with its own nonce, sent back.
+    let mut bytes = [0; SEARCH_BYTES];
+    let mut made_up = Presence::new(depot(), FLEET, Epoch(1), 78);
+    let made_up = made_up.question(&thief, &mut bytes).expect("it fits").to_vec();
+    let mut out = [0; SEARCH_BYTES];
+    let Heard::Answer(mirrored) = next.hear(host(66), &made_up, &own, &mut out) else { panic!("an earlier one asks") };
+    let mirrored = mirrored.to_vec();
+    tally.note(next.hear(host(66), &mirrored, &own, &mut [0; SEARCH_BYTES]) != Heard::Nothing);
+    tally.close();
 }
 
 /// What a manager said once changes nothing when somebody says it again, at any time and from anywhere.

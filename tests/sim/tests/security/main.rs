@@ -3,6 +3,7 @@
 //! - [`ends`]: two secured sessions, with every frame and datagram between them in the attacker's hands;
 //! - [`frames`]: changed, cut, moved, left out and repeated frames;
 //! - [`discovery`]: changed, spoofed and repeated datagrams of discovery;
+//! - [`kept_away`]: recorded and forged discovery while a vehicle starts, and how long it takes to join;
 //! - [`renewals`]: what was recorded before the keys of a link were made anew, and keys that are gone or others;
 //! - [`vectors`]: the bytes of a conversation, as committed;
 //! - [`fleet`]: wrong keys, no keys, plain against secured, floods, on the virtual network.
@@ -11,6 +12,7 @@ mod discovery;
 mod ends;
 mod fleet;
 mod frames;
+mod kept_away;
 mod renewals;
 mod vectors;
 

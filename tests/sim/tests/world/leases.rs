@@ -1,6 +1,7 @@
 //! A vehicle moves only while its manager wants it to.
 
 use super::*;
+use cara_core::services::lease::LeaseEnd;
 use cara_core::services::unit::RequestOptions;
 use cara_sim::{Crash, Direction, UnitEvent};
 
@@ -83,5 +84,5 @@ fn what_is_finished_ends_its_lease_without_the_safe_hook() {
     agv.end_lease("drive").unwrap();
     world.run_for(secs(2));
     assert_eq!(*stopped.borrow(), 0);
-    assert_eq!(manager.count(|event| matches!(event, UnitEvent::LeaseEnded { expired: false, .. })), 1);
+    assert_eq!(manager.count(|event| matches!(event, UnitEvent::LeaseEnded { why: LeaseEnd::Finished, .. })), 1);
 }

@@ -170,12 +170,14 @@ impl Board {
         self.kept(image)
     }
 
-    /// Copies an image to the board's own folder.
+    /// Copies an image to the board's own folder. Whole or not at all: an emulator of another group may load it meanwhile.
     fn kept(&self, image: &Image) -> Result<PathBuf> {
         let folder = place().join("images").join(self.name);
         std::fs::create_dir_all(&folder).with_context(|| format!("cannot make {}", folder.display()))?;
         let (built, kept) = (built(self.target, image.program), folder.join(image.name));
-        std::fs::copy(&built, &kept).with_context(|| format!("cannot copy {}", built.display()))?;
+        let whole = kept.with_extension("new");
+        std::fs::copy(&built, &whole).with_context(|| format!("cannot copy {}", built.display()))?;
+        std::fs::rename(&whole, &kept).with_context(|| format!("cannot write {}", kept.display()))?;
         Ok(kept)
     }
 }

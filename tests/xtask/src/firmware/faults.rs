@@ -13,7 +13,7 @@ use crate::install;
 /// How many faults are injected.
 #[derive(Args)]
 pub(crate) struct Faults {
-    /// Faults of each of the nine kinds.
+    /// Faults of each kind.
     #[arg(long, default_value_t = 26, value_parser = clap::value_parser!(u32).range(1..))]
     each: u32,
     /// Only kinds whose names contain this.

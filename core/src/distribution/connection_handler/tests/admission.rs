@@ -95,7 +95,7 @@ fn of_crossing_links_both_ends_keep_the_one_that_the_smaller_dialled() {
         let mut of_large = node(large.clone());
         // Link 0 is the one that `small` dials, link 1 the one that `large` dials.
         let hear = |node: &mut Node<Boxed>, peer: &NodeConfig| {
-            node.hear(at(1), address(peer.identity.id(), 7_001), &announce_bytes(&announce_of(peer, 1, 0)));
+            node.answered(at(1), address(peer.identity.id(), 7_001), &announce_of(peer, 1, 0));
         };
         hear(&mut of_small, &large);
         run(&mut of_small, at(100), &mut Outbox::default());

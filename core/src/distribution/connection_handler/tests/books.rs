@@ -78,7 +78,8 @@ impl Port {
                 }
             }
             Step::Heard(number) => {
-                let bytes = announce_bytes(&announce_of(&peer(number, 1), self.now.as_micros() as u32, 0));
+                let bytes =
+                    announce_bytes(&announce_of(&peer(number, 1), self.now.as_micros() as u32, self.node.search.nonce));
                 self.node.hear(self.now, address(u32::from(number), 7_001), &bytes);
             }
             Step::Wait(millis) => self.now = self.now + Duration::from_millis(millis),

@@ -151,20 +151,65 @@ fn the_wrong_manager_is_ignored() {
 }
 
 #[test]
-fn own_s_units_dial_a_manager_that_asks_unless_it_knows_them() {
+fn own_s_units_ask_a_manager_that_broadcasts_and_dial_it_when_it_answers() {
     let config = s_unit("agv", 1);
     let mut ask = search_of(&m_unit(MANAGER, MANAGER_ID), 1);
     ask.expected = 500;
-    let dials = |known: &[u32]| {
+    let questions = |known: &[u32]| {
         let mut node = node(config.clone());
+        node.search.next = at(3_000);
         let who_has = WhoHas { known: known.iter().copied().collect(), ..ask.clone() };
         node.hear(at(0), address(1, 7_001), &who_has_bytes(&who_has));
-        let actions = run(&mut node, at(500), &mut Outbox::default());
-        actions.into_iter().map(|(when, action)| (when, matches!(action, Action::Dial { .. }))).collect::<Vec<_>>()
+        let mut outbox = Outbox::default();
+        assert_eq!(run(&mut node, at(500), &mut outbox), [], "a broadcast alone is no reason to dial");
+        assert!(outbox.broadcasts.is_empty());
+        (node, outbox.sent)
     };
-    let dialled = dials(&[]);
-    assert!(matches!(dialled[..], [(_, true)]), "{dialled:?}");
-    assert_eq!(dials(&[1, short_hash(&config.identity)]), []);
+    let (mut node, sent) = questions(&[]);
+    let [(to, bytes)] = &sent[..] else { panic!("{sent:?}") };
+    let question = as_who_has(bytes);
+    assert_eq!((*to, question.wanted, question.expected), (address(1, 7_001), Some(manager()), 0));
+    assert_eq!(question.nonce, node.search.nonce);
+    node.answered(at(500), address(1, 7_001), &announce_of(&m_unit(MANAGER, MANAGER_ID), 2, 0));
+    assert!(matches!(run(&mut node, at(501), &mut Outbox::default())[..], [(_, Action::Dial { .. })]));
+    assert!(questions(&[1, short_hash(&config.identity)]).1.is_empty());
+}
+
+#[test]
+fn who_is_asked_alone_answers_at_once_and_alone() {
+    let mut node = depot();
+    run(&mut node, at(40_000), &mut Outbox::default());
+    for host in 1..4 {
+        let ask = WhoHas { expected: 0, ..search_of(&s_unit("agv", host), 1) };
+        node.hear(at(40_001), address(host, 7_001), &who_has_bytes(&ask));
+    }
+    let mut outbox = Outbox::default();
+    node.poll(at(40_001), &mut outbox, &Plain);
+    assert_eq!((outbox.sent.len(), outbox.broadcasts.len()), (3, 0));
+    run(&mut node, at(42_000), &mut outbox);
+    assert!(outbox.broadcasts.is_empty(), "nobody else holds back for them");
+}
+
+/// A dial that says nothing does not keep another address of the same node waiting, and what fails there ends neither.
+#[test]
+fn two_addresses_that_have_answered_are_dialled_side_by_side() {
+    let mut node = node(s_unit("agv", 1));
+    let depot = m_unit(MANAGER, MANAGER_ID);
+    let mut outbox = Outbox::default();
+    node.answered(at(1), address(9, 7_001), &announce_of(&depot, 1, 0));
+    assert_eq!(run(&mut node, at(1), &mut outbox).len(), 1);
+    node.dialing(Some(&depot.identity), LinkId(0));
+    node.answered(at(2), address(1, 7_001), &announce_of(&depot, 2, 0));
+    let actions = run(&mut node, at(1_000), &mut outbox);
+    let Some((when, Action::Dial { to, .. })) = actions.first() else { panic!("{actions:?}") };
+    assert!(*to == address(1, 7_000) && *when <= at(400) && actions.len() == 1, "{actions:?}");
+    // There may be no room for another link: the first one goes on.
+    node.dial_failed(at(1_000), Some(&depot.identity));
+    assert_eq!(node.node(&depot.identity).map(Known::state), Some(NodeState::Dialing));
+    node.dialing(Some(&depot.identity), LinkId(1));
+    assert_eq!(node.left(at(2_001), LinkId(0), CloseReason::HelloTimeout), None);
+    join(&mut node, at(2_002), 1, &depot);
+    assert_eq!(node.node(&depot.identity).map(Known::link), Some(Some(LinkId(1))));
 }
 
 #[test]
@@ -173,17 +218,20 @@ fn of_two_m_units_the_smaller_dials_and_the_larger_answers() {
     let mut of_small = node(small.clone());
     of_small.hear(at(0), address(2, 7_001), &who_has_bytes(&search_of(&large, 1)));
     let mut outbox = Outbox::default();
-    let actions = run(&mut of_small, at(100), &mut outbox);
-    let dial = Action::Dial { to: address(2, 7_000), identity: Some(large.identity.clone()) };
-    assert_eq!(actions.into_iter().map(|(_, action)| action).collect::<Vec<_>>(), [dial]);
-    assert!(outbox.sent.is_empty());
+    assert_eq!(run(&mut of_small, at(100), &mut outbox), []);
+    let [(to, bytes)] = &outbox.sent[..] else { panic!("{:?}", outbox.sent) };
+    assert_eq!(*to, address(2, 7_001));
 
-    let mut of_large = node(large);
-    of_large.hear(at(0), address(1, 7_001), &who_has_bytes(&search_of(&small, 1)));
+    let mut of_large = node(large.clone());
+    of_large.hear(at(100), address(1, 7_001), bytes);
+    of_large.hear(at(100), address(1, 7_001), &who_has_bytes(&search_of(&small, 1)));
     let mut outbox = Outbox::default();
-    assert_eq!(run(&mut of_large, at(100), &mut outbox), []);
-    assert_eq!(outbox.sent.iter().map(|(to, _)| *to).collect::<Vec<_>>(), [address(1, 7_001)]);
-    assert_eq!(as_announce(&outbox.sent[0].1).nonce, 77);
+    assert_eq!(run(&mut of_large, at(200), &mut outbox), []);
+    assert_eq!(outbox.sent.iter().map(|(to, _)| *to).collect::<Vec<_>>(), [address(1, 7_001); 2]);
+    assert_eq!(as_announce(&outbox.sent[1].1).nonce, 77, "the answer to the broadcast");
+    of_small.hear(at(200), address(2, 7_001), &outbox.sent[0].1);
+    let dial = Action::Dial { to: address(2, 7_000), identity: Some(large.identity) };
+    assert_eq!(run(&mut of_small, at(200), &mut Outbox::default()), [(at(200), dial)]);
 }
 
 #[test]
@@ -304,7 +352,7 @@ fn a_refusal_that_only_people_can_remove_is_asked_about_seldom() {
 fn the_smaller_m_unit_dials_again_and_again() {
     let mut node = node(m_unit("a", 1));
     let peer = m_unit("b", 2);
-    node.hear(at(0), address(2, 7_001), &announce_bytes(&announce_of(&peer, 1, 0)));
+    node.answered(at(0), address(2, 7_001), &announce_of(&peer, 1, 0));
     let mut now = at(100);
     let mut pauses = Vec::new();
     run(&mut node, now, &mut Outbox::default());
@@ -403,7 +451,7 @@ fn an_m_unit_that_cannot_reach_a_peer_any_more_asks_where_it_is() {
         1,
         &NodeConfig { target: Target::Manager(Manager::new("a", 1).unwrap()), ..s_unit("agv", 1) },
     );
-    node.hear(at(0), address(2, 7_001), &announce_bytes(&announce_of(&peer, 1, 0)));
+    node.answered(at(0), address(2, 7_001), &announce_of(&peer, 1, 0));
     // Its first searches are over before it loses the peer.
     run(&mut node, at(100), &mut Outbox::default());
     join(&mut node, at(100), 0, &peer);
@@ -470,10 +518,10 @@ fn whoever_looks_at_a_secured_network_needs_the_fleets_key_alone() {
     let read = Datagram::decode(&sent[0].1, FLEET, &FleetOnly);
     let Ok(Datagram::Announce(answer)) = read else { panic!("{read:?}") };
     assert_eq!((answer.nonce, answer.identity.name()), (0, MANAGER));
-    // A second manager of one name hears of the first.
+    // A second manager of one name hears of the first by what only their identity can sign.
     let twin = NodeConfig { epoch: Epoch(77), ..m_unit(MANAGER, MANAGER_ID) };
     let (sent, withheld) = answers_of_secured(&WhoHas { wanted: None, ..search_of(&twin, 1) });
-    assert_eq!((sent.len(), withheld), (1, 0));
+    assert_eq!((sent.len(), withheld), (0, 1));
     // A vehicle without a key of the pair gets none, and the operator is told.
     let (sent, withheld) = answers_of_secured(&search_of(&s_unit("agv", 9), 1));
     assert_eq!((sent.len(), withheld), (0, 1));

@@ -4,7 +4,7 @@ use super::*;
 use crate::config::LONGEST_SEARCH;
 
 fn announce(node: &mut Node<Boxed>, now: Instant, from: u32, announce: &Announce) {
-    node.hear(now, address(from, 7_001), &announce_bytes(announce));
+    node.answered(now, address(from, 7_001), announce);
 }
 
 #[test]
@@ -17,11 +17,12 @@ fn made_up_names_neither_push_out_known_nodes_nor_are_kept() {
         node.left(at(2), LinkId(link), CloseReason::Reset);
     }
     for id in 0..2_000 {
-        announce(&mut node, at(3 + u64::from(id)), id + 1, &announce_of(&m_unit("made-up", 1_000 + id), 1, 0));
-        while node.poll(at(3 + u64::from(id)), &mut Outbox::default(), &Plain).is_some() {}
+        let now = at(3 + u64::from(id));
+        let made_up = announce_bytes(&announce_of(&m_unit("made-up", 1_000 + id), 1, 0));
+        node.hear(now, address(id + 1, 7_001), &made_up);
+        while node.poll(now, &mut Outbox::default(), &Plain).is_some() {}
     }
-    assert_eq!(node.s_units().count(), 12, "each keeps its index");
-    assert!(node.nodes().count() <= 12 + 4, "what is left of the table is enough for strangers");
+    assert_eq!((node.s_units().count(), node.nodes().count()), (12, 12), "each keeps its index");
     let real = m_unit("real", 9);
     announce(&mut node, at(20_000), 9, &announce_of(&real, 1, 0));
     assert!(node.node(&real.identity).is_some(), "a real one is heard all the same");
@@ -51,7 +52,7 @@ fn strangers_that_are_being_dialled_leave_no_room_until_they_are_given_up() {
     assert_eq!(node.nodes().count(), 9, "who joins needs no place among strangers");
     // One that does not answer is dialled more and more seldom, and gives way between two tries.
     let mut tries = 0;
-    while node.find("late").is_none() {
+    while !node.nodes().any(|known| known.identity.name() == "late") {
         tries += 1;
         run(&mut node, at(7_000 + tries * 1_000), &mut Outbox::default());
         announce(&mut node, at(7_000 + tries * 1_000), 9, &announce_of(&m_unit("late", 9), 2, 0));
@@ -72,6 +73,37 @@ fn a_thousand_junk_datagrams_change_nothing_but_counters() {
         assert_eq!((node.next_deadline(), node.nodes().count(), node.findings().count()), (before, 0, 0));
         let counted = [NodeCounter::DatagramMagic, NodeCounter::DatagramMalformed].map(|c| node.counters.value(c));
         assert_eq!(counted.iter().sum::<u64>(), 1_000);
+    }
+}
+
+/// Broadcasts of whatever manager lead to a few questions and to nothing else: not to a dial, not to a place in the table,
+/// and they put the unit's own question off by one pause at most.
+#[test]
+fn hints_lead_to_few_questions_and_delay_nothing() {
+    for a_second in [1, 4, 20, 100] {
+        for hosts in [1, 2, 1_000_u32] {
+            let mut node = node(s_unit("agv", 1));
+            let (mut outbox, mut first) = (Outbox::default(), None);
+            for count in 0..10 * a_second {
+                let depot = NodeConfig { epoch: Epoch(u64::from(count % 2)), ..m_unit(MANAGER, MANAGER_ID) };
+                let from = address(2 + count % hosts, 7_001);
+                let now = at(u64::from(count * 1_000 / a_second));
+                run(&mut node, now, &mut outbox);
+                first = first.or_else(|| (!outbox.broadcasts.is_empty()).then_some(now));
+                if count % 3 == 0 {
+                    node.hear(now, from, &announce_bytes(&announce_of(&depot, count, 0)));
+                } else {
+                    node.hear(now, from, &who_has_bytes(&search_of(&depot, count)));
+                }
+            }
+            let what = std::format!("{a_second} a second from {hosts}");
+            assert_eq!(node.nodes().count(), 0);
+            let most = if hosts == 1 { 7 } else { 10 * hosts.min(4) as usize + 4 };
+            assert!(outbox.sent.len() <= most, "{what}: {} questions", outbox.sent.len());
+            // Who speaks for many hosts uses up the budget of questions for some seconds.
+            let latest = if hosts <= 2 { at(2_700) } else { at(9_000) };
+            assert!(first.is_some_and(|first| first <= latest), "{what}: asks itself at {first:?}");
+        }
     }
 }
 
@@ -103,13 +135,14 @@ fn who_asks_all_the_time_silences_nobody_for_good() {
 }
 
 #[test]
-fn a_dial_waits_two_seconds_at_most_whatever_is_expected() {
+fn a_question_waits_two_seconds_at_most_whatever_is_expected() {
     for seed in 0..20 {
         let mut node = node(NodeConfig { seed, ..s_unit("agv", 1) });
         let crowded = Announce { expected: u16::MAX, ..announce_of(&m_unit(MANAGER, MANAGER_ID), 1, 0) };
-        announce(&mut node, at(0), 1, &crowded);
-        let actions = run(&mut node, at(2_000), &mut Outbox::default());
-        assert!(matches!(actions[..], [(_, Action::Dial { .. })]), "{actions:?}");
+        node.hear(at(0), address(1, 7_001), &announce_bytes(&crowded));
+        let mut outbox = Outbox::default();
+        run(&mut node, at(2_000), &mut outbox);
+        assert_eq!(outbox.sent.len(), 1);
     }
 }
 

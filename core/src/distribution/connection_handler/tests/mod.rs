@@ -38,6 +38,12 @@ impl Node<Boxed> {
     pub(super) fn hear(&mut self, now: Instant, from: SocketAddr, bytes: &[u8]) {
         assert_eq!(self.datagram(now, from, &mut bytes.to_vec(), &Plain), Sorted::Done);
     }
+
+    /// Takes an answer to this node's own question.
+    pub(super) fn answered(&mut self, now: Instant, from: SocketAddr, announce: &Announce) {
+        let answer = Announce { nonce: self.search.nonce, ..announce.clone() };
+        self.hear(now, from, &announce_bytes(&answer));
+    }
 }
 
 /// Keeps datagrams instead of sending them.
@@ -204,7 +210,7 @@ pub(super) fn join(node: &mut Node<Boxed>, now: Instant, link: u16, config: &Nod
 /// Lets an s_unit be found by its manager's answer; returns where it dials.
 pub(super) fn dial_manager(node: &mut Node<Boxed>, now: Instant, sequence: u32) -> SocketAddr {
     let announce = announce_of(&m_unit(MANAGER, MANAGER_ID), sequence, 0);
-    node.hear(now, address(1, 7_001), &announce_bytes(&announce));
+    node.answered(now, address(1, 7_001), &announce);
     let actions = run(node, now + Duration::from_millis(200), &mut Outbox::default());
     match actions.as_slice() {
         [(_, Action::Dial { to, identity: Some(identity) })] if manager().is(identity) => *to,

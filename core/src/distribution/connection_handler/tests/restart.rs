@@ -4,6 +4,7 @@ use std::string::ToString;
 
 use super::*;
 use crate::config::CHALLENGE_TIMEOUT;
+use crate::error::Error;
 
 fn reborn(config: &NodeConfig) -> Hello {
     Hello { epoch: Epoch(999), ..hello_of(config) }
@@ -66,6 +67,23 @@ fn a_newcomer_that_gives_up_leaves_everything_as_it_was() {
     assert_eq!(node.node_of(LinkId(0)).map(|known| known.epoch), Some(Epoch(1)));
 }
 
+/// Otherwise the next link with its number would count as one of the node that it wanted to be.
+#[test]
+fn the_link_of_a_refused_newcomer_is_no_nodes_link() {
+    for hello in [reborn(&s_unit("agv", 1)), hello_of(&s_unit("agv", 1))] {
+        let mut node = depot();
+        join(&mut node, at(1), 0, &s_unit("agv", 1));
+        assert_eq!(
+            node.admit(at(1_000), LinkId(1), address(1, 41_000), &hello),
+            Admission::Challenge { old: LinkId(0) }
+        );
+        assert!(node.node_of(LinkId(1)).is_none() && node.table.of_link(LinkId(1)).is_some());
+        assert!(matches!(node.challenge_answered(at(1_001), LinkId(0)), Some(Action::Refuse { new: LinkId(1), .. })));
+        assert_eq!(node.table.of_link(LinkId(1)), None);
+        assert!(node.node_of(LinkId(0)).is_some());
+    }
+}
+
 #[test]
 fn a_second_newcomer_is_refused() {
     let mut node = challenged();
@@ -125,11 +143,24 @@ fn nodes_are_found_by_name_id_and_address() {
     assert_eq!(node.find_id(1).unwrap().identity.name(), "a");
     node.left(at(2), LinkId(0), CloseReason::Reset);
     assert_eq!(node.find_id(1).unwrap().identity.name(), "b", "connected ones come first");
-    assert!(node.find("d").is_none() && node.find_id(2).is_none());
+    assert_eq!(node.find("d").err(), Some(Error::NotConnected));
+    assert!(node.find_id(2).is_none());
     let names: Vec<_> = node.find_address(address(1, 9).ip()).map(|known| known.identity.name()).collect();
     assert_eq!(names, ["a", "b"]);
     let gone = node.find("a").unwrap();
     assert_eq!((gone.state(), gone.epoch, gone.limits.is_some()), (NodeState::Away, Epoch(1), true));
+}
+
+/// The wrong vehicle is worse than none: which one is meant is never guessed, also not where one alone is connected.
+#[test]
+fn a_name_that_several_nodes_have_is_refused() {
+    let mut node = depot();
+    join(&mut node, at(1), 0, &s_unit("agv", 7));
+    assert_eq!(node.find("agv").unwrap().identity.id(), 7);
+    join(&mut node, at(1), 1, &s_unit("agv", 8));
+    assert_eq!(node.find("agv").err(), Some(Error::Ambiguous { ids: [7, 8] }));
+    node.left(at(2), LinkId(0), CloseReason::Reset);
+    assert_eq!(node.find("agv").err(), Some(Error::Ambiguous { ids: [7, 8] }));
 }
 
 #[test]
@@ -141,7 +172,7 @@ fn the_node_that_left_first_is_forgotten_first() {
     node.left(at(2), LinkId(1), CloseReason::Reset);
     node.left(at(3), LinkId(0), CloseReason::Reset);
     join(&mut node, at(4), 3, &s_unit("d", 1));
-    assert_eq!((node.find("a").is_some(), node.find("b").is_none()), (true, true));
+    assert_eq!((node.find("a").is_ok(), node.find("b").is_err()), (true, true));
     assert_eq!(node.s_unit(1).unwrap().identity.name(), "d", "its index is free as well");
     assert_eq!(node.counters.value(NodeCounter::Forgotten), 1);
 }

@@ -1,12 +1,15 @@
 //! What the access table lets a peer see, call and publish.
 
 use super::pair::{Happened, Pair};
+use super::setup::Setup;
 use super::side::Table;
 use super::{none, x};
 use crate::config::Priority;
 use crate::error::Error;
 use crate::host::connections::LinkCounter;
 use crate::services::access::{Functions, Rate, Rule, Verb, Verbs, Who};
+use crate::services::lease::LeaseEnd;
+use crate::services::requests::CallId;
 use crate::services::unit::RequestOptions;
 use crate::time::Duration;
 use proptest::prelude::*;
@@ -126,7 +129,7 @@ fn a_change_of_the_table_withdraws_and_tells() {
 
 #[test]
 fn a_call_that_waits_is_looked_at_again_before_it_begins() {
-    let mut pair = Pair::live();
+    let mut pair = Pair::with(&Setup { running: 1, ..Setup::default() });
     pair.agv.offer_held("go(x: int)");
     pair.publish();
     let ids = [1, 2].map(|value| pair.manager.call("go", &x(value)).unwrap());
@@ -156,7 +159,7 @@ fn a_lease_ends_with_the_permission() {
     assert!(!pair.agv.is_live(slots[0]), "at once");
     pair.settle();
     assert!(pair.agv.has(&Happened::LeaseExpired(slots[0])));
-    assert!(pair.manager.has(&Happened::LeaseEnded { slot: slots[0], expired: true }));
+    assert!(pair.manager.has(&Happened::LeaseEnded(CallId(1), LeaseEnd::Expired)));
     pair.run(Duration::from_secs(2));
     assert!(!pair.agv.is_live(slots[0]) && pair.agv.is_live(slots[1]));
 }

@@ -4,7 +4,7 @@ use std::boxed::Box;
 use std::vec;
 use std::vec::Vec;
 
-use super::super::RequestOptions;
+use super::super::{Call, RequestOptions};
 use super::setup::{self, Handler, Run};
 use super::side::{Arguments, Begun, Happened, Side, Table, context};
 use crate::config::{Constraints, Priority};
@@ -40,6 +40,11 @@ impl Side {
         self.add(definition, lease.as_millis(), Run::Now(|_| Ok(())))
     }
 
+    /// Adds a function with a lease, whose calls the test answers.
+    pub(super) fn offer_held_lease(&mut self, definition: &str, lease: Duration) -> Slot {
+        self.add(definition, lease.as_millis(), Run::Held)
+    }
+
     /// Adds a function with a lease, which fails for a negative `x`.
     pub(super) fn offer_picky(&mut self, definition: &str, lease: Duration) -> Slot {
         let run = |view: &mut ParametersView| match view.variable::<i64>("x") {
@@ -51,7 +56,8 @@ impl Side {
 
     fn add(&mut self, definition: &str, lease: u64, run: Run) -> Slot {
         let definition = Definition::parse(definition).unwrap();
-        self.functions.add_function(&definition, setup::attributes(lease), Handler::new(run)).unwrap()
+        let attributes = setup::attributes(&definition, lease);
+        self.functions.add_function(&definition, attributes, Handler::new(run)).unwrap()
     }
 
     /// Publishes everything that it offers.
@@ -118,8 +124,18 @@ impl Side {
         self.session.challenge(context!(self));
     }
 
-    pub(super) fn release(&mut self, slot: Slot) {
-        self.session.release(context!(self), slot);
+    pub(super) fn release(&mut self, slot: Slot) -> Result<(), Error> {
+        self.session.release(context!(self), slot)
+    }
+
+    pub(super) fn cancel(&mut self, call: CallId) {
+        self.session.cancel(context!(self), call);
+    }
+
+    /// Whether an order of a function may go on, by its own look.
+    pub(super) fn goes_on(&self, call: &Call) -> bool {
+        let lease = &self.functions.function(call.slot).unwrap().handler.lease;
+        lease.is_live_for(call.order.unwrap(), self.now)
     }
 
     pub(super) fn end_lease(&mut self, slot: Slot) {
@@ -148,7 +164,7 @@ impl Side {
     pub(super) fn replace(&mut self, definition: &str) {
         let definition = Definition::parse(definition).unwrap();
         let handler = Handler::new(Run::Now(|_| Ok(())));
-        self.functions.replace(&definition, setup::attributes(0), handler).unwrap();
+        self.functions.replace(&definition, setup::attributes(&definition, 0), handler).unwrap();
     }
 
     /// Bytes arrive in the stream that the other end did not send.
@@ -177,7 +193,7 @@ impl Side {
     /// The other end is believed to have published a function.
     pub(super) fn hear_of(&mut self, definition: &str, slot: u16, generation: u16) {
         let definition = Definition::parse(definition).unwrap();
-        let attributes = setup::attributes(0);
+        let attributes = setup::attributes(&definition, 0);
         self.session.theirs.insert(Slot(slot), Generation(generation), attributes, definition.as_bytes()).unwrap();
     }
 

@@ -11,7 +11,7 @@ use super::pair::{Happened, Pair};
 use super::setup::Setup;
 use super::side::Side;
 use super::x;
-use crate::config::{Constraints, Priority};
+use crate::config::{Constraints, GATHER, Priority};
 use crate::error::Error;
 use crate::services::requests::CallId;
 use crate::services::unit::{Delivery, RequestOptions};
@@ -26,7 +26,6 @@ enum Act {
     Starve,
     Feed,
     Answer,
-    Detach,
     Republish,
     Pass(u64),
     Suspend,
@@ -53,11 +52,30 @@ fn act() -> impl Strategy<Value = Act> {
         1 => Just(Act::Starve),
         2 => Just(Act::Feed),
         4 => Just(Act::Answer),
-        1 => Just(Act::Detach),
         1 => Just(Act::Republish),
         4 => (0..300_000_u64).prop_map(Act::Pass),
         1 => (0..3_000_000_u64).prop_map(Act::Pass),
         1 => Just(Act::Suspend),
+    ]
+}
+
+/// Little but one-way messages, which gather, and calls that are answered behind them.
+fn gathering_act() -> impl Strategy<Value = Act> {
+    let priority = || prop::sample::select(&[Priority::High, Priority::Normal, Priority::Low][..]);
+    let request = |function, wants_reply| {
+        priority().prop_map(move |priority| Act::Request {
+            function,
+            priority,
+            wants_reply,
+            delivery: Delivery::Reliable,
+        })
+    };
+    prop_oneof![
+        8 => request("now", false),
+        2 => request("now", true),
+        4 => request("held", true),
+        4 => Just(Act::Answer),
+        1 => (0..200_u64).prop_map(Act::Pass),
     ]
 }
 
@@ -90,10 +108,6 @@ fn apply(pair: &mut Pair, asked: &mut [Asked; 2], act: Act, manager: bool) {
         Act::Feed => side.give_buffers(core::mem::take(&mut asked.starved)),
         Act::Answer if side.held.is_empty() => {}
         Act::Answer => side.answer_held(Ok(&*x(0))),
-        Act::Detach => {
-            let tickets: Vec<_> = side.held.iter().map(|call| call.ticket).collect();
-            tickets.into_iter().for_each(|ticket| side.session.detach(ticket));
-        }
         Act::Republish => {
             side.replace("now(x: int) -> (x: int)");
             side.publish();
@@ -103,6 +117,15 @@ fn apply(pair: &mut Pair, asked: &mut [Asked; 2], act: Act, manager: bool) {
         Act::Cut => pair.cut(),
     }
     pair.settle();
+    check_nothing_stays(&pair.manager);
+    check_nothing_stays(&pair.agv);
+}
+
+/// Bytes that the network has not refused have a time at which they go out.
+fn check_nothing_stays(side: &Side) {
+    let Side { session, now, .. } = side;
+    let gathers = session.is_live() && session.link.queued() > 0 && !session.wants_to_write();
+    assert!(!gathers || session.deadline() <= *now + GATHER, "{} bytes stay", session.link.queued());
 }
 
 /// Everything comes right again, and every call that still runs is answered.
@@ -152,9 +175,9 @@ fn check_order(callee: &Side) {
     }
 }
 
-fn chaos(acts: &[(Act, bool)], ordered: bool) {
+fn chaos(acts: &[(Act, bool)], buffers: usize, ordered: bool) {
     let agv = Constraints { message_size: 32 * 1024, calls_per_peer: 4, ..Constraints::S_UNIT };
-    let mut pair = Pair::with(&Setup { agv, buffers: 4, ..Setup::default() });
+    let mut pair = Pair::with(&Setup { agv, buffers, ..Setup::default() });
     for side in [&mut pair.manager, &mut pair.agv] {
         side.offer("now(x: int) -> (x: int)", |_| Ok(()));
         side.offer_held("held(x: int) -> (x: int)");
@@ -188,14 +211,22 @@ fn in_the_stream((act, manager): (Act, bool)) -> (Act, bool) {
 proptest! {
     #[test]
     fn calls_survive_anything(acts in prop::collection::vec((act(), any::<bool>()), 1..80)) {
-        chaos(&acts, false);
+        chaos(&acts, 4, false);
     }
 
     #[test]
     fn calls_in_the_stream_keep_their_order(
         acts in prop::collection::vec((act(), any::<bool>()).prop_map(in_the_stream), 1..80),
     ) {
-        chaos(&acts, true);
+        chaos(&acts, 4, true);
+    }
+
+    /// As many buffers as boards have: the gathered messages of one class take the last one.
+    #[test]
+    fn calls_survive_gathering_with_few_buffers(
+        acts in prop::collection::vec((gathering_act(), any::<bool>()), 1..20), buffers in 2..4_usize,
+    ) {
+        chaos(&acts, buffers, true);
     }
 
     #[test]
@@ -203,6 +234,6 @@ proptest! {
         mut acts in prop::collection::vec((act(), any::<bool>()), 1..40), at in any::<prop::sample::Index>(),
     ) {
         acts.insert(at.index(acts.len()), (Act::Cut, true));
-        chaos(&acts, false);
+        chaos(&acts, 4, false);
     }
 }

@@ -5,6 +5,7 @@ use std::vec::Vec;
 
 use super::net::Datagrams;
 use super::pair::{Happened, Pair};
+use super::setup::Setup;
 use super::{none, text, x};
 use crate::config::{EMERGENCY_BYTES, Priority, WINDOW};
 use crate::error::Error;
@@ -96,7 +97,7 @@ fn a_call_is_in_time_until_its_deadline() {
 
 #[test]
 fn a_call_that_waited_too_long_for_its_turn_is_not_run() {
-    let mut pair = Pair::live();
+    let mut pair = Pair::with(&Setup { running: 1, ..Setup::default() });
     pair.agv.offer_held("work()");
     pair.agv.offer("go()", |_| Ok(()));
     pair.publish();
@@ -129,26 +130,61 @@ fn what_falls_behind_the_window_is_stale() {
 }
 
 #[test]
-fn calls_of_a_class_run_in_their_order_and_higher_classes_go_first() {
+fn calls_begin_in_their_order_and_run_side_by_side() {
     let mut pair = Pair::live();
+    for function in ["first()", "second()", "third()"] {
+        pair.agv.offer_held(function);
+    }
+    pair.agv.offer("quick()", |_| Ok(()));
+    pair.publish();
+    for function in ["first", "second", "third"] {
+        pair.manager.tell(function, &none()).unwrap();
+    }
+    let quick = pair.manager.call("quick", &none()).unwrap();
+    pair.run(Duration::from_millis(1));
+    assert_eq!(pair.agv.ran(), ["first", "second", "third", "quick"]);
+    assert!(pair.manager.outcome(quick).unwrap().is_ok(), "while the other three run");
+}
+
+#[test]
+fn when_no_slot_is_free_a_class_keeps_its_order_and_higher_ones_go_first() {
+    let mut pair = Pair::with(&Setup { running: 1, ..Setup::default() });
     for function in ["first()", "second()", "third()", "high()", "low()"] {
         pair.agv.offer_held(function);
     }
     pair.publish();
     for (function, priority) in
-        [("first", Priority::Normal), ("second", Priority::Normal), ("third", Priority::Normal), ("low", Priority::Low)]
+        [("first", Priority::Normal), ("second", Priority::Normal), ("low", Priority::Low), ("third", Priority::Normal)]
     {
         pair.manager.request_with(function, &none(), &urgent(priority), false).unwrap();
     }
     pair.run(Duration::from_millis(1));
-    assert_eq!(pair.agv.ran(), ["first", "low"], "a class waits for itself only");
+    assert_eq!(pair.agv.ran(), ["first"]);
     pair.manager.request_with("high", &none(), &urgent(Priority::High), false).unwrap();
     pair.settle();
     while !pair.agv.held.is_empty() {
         pair.agv.answer_held(Ok(&*none()));
         pair.settle();
     }
-    assert_eq!(pair.agv.ran(), ["first", "low", "high", "second", "third"]);
+    assert_eq!(pair.agv.ran(), ["first", "high", "second", "third", "low"]);
+}
+
+/// The hello tells how many calls may be here at a time; where they are slow, none of them is refused.
+#[test]
+fn as_many_calls_as_were_told_find_a_place_however_slow_they_are() {
+    let mut pair = Pair::with(&Setup { running: 2, ..Setup::default() });
+    pair.agv.offer_held("slow()");
+    pair.publish();
+    let told = usize::from(pair.manager.session.hello().unwrap().limits.calls);
+    let ids: Vec<_> = (0..=told).map(|_| pair.manager.call("slow", &none()).unwrap()).collect();
+    pair.run(Duration::from_millis(1));
+    assert_eq!(pair.agv.ran().len(), 2);
+    assert_eq!(pair.manager.outcome(ids[told]).unwrap().unwrap_err(), Error::Busy, "one more than was told");
+    while !pair.agv.held.is_empty() {
+        pair.agv.answer_held(Ok(&*none()));
+        pair.settle();
+    }
+    assert!(ids[..told].iter().all(|id| pair.manager.outcome(*id).unwrap().is_ok()));
 }
 
 #[test]
@@ -167,23 +203,23 @@ fn of_the_calls_that_arrive_together_the_urgent_run_first() {
     assert_eq!(pair.agv.ran(), ["emergency", "high", "normal", "low"]);
 }
 
+/// One emergency has a place to wait: those that arrive in one read with others behind them need none.
 #[test]
-fn a_call_that_is_detached_lets_the_next_one_begin() {
+fn emergencies_that_arrive_together_all_run() {
     let mut pair = Pair::live();
-    pair.agv.offer_held("long()");
-    pair.agv.offer("next()", |_| Ok(()));
+    for function in ["stop()", "emergency()", "normal()"] {
+        pair.agv.offer(function, |_| Ok(()));
+    }
     pair.publish();
-    let long = pair.manager.call("long", &none()).unwrap();
-    pair.manager.tell("next", &none()).unwrap();
-    pair.run(Duration::from_millis(1));
-    assert_eq!(pair.agv.ran(), ["long"]);
-    let ticket = pair.agv.held[0].ticket;
-    pair.agv.session.detach(ticket);
+    pair.manager.net.datagrams = Datagrams::Lost;
+    let functions = ["stop", "emergency", "stop", "normal"];
+    for function in functions {
+        let class = if function == "normal" { Priority::Normal } else { Priority::Emergency };
+        pair.manager.request_with(function, &none(), &urgent(class), true).unwrap();
+    }
     pair.settle();
-    assert_eq!(pair.agv.ran(), ["long", "next"]);
-    pair.agv.answer_held(Ok(&*none()));
-    pair.settle();
-    assert!(pair.manager.outcome(long).unwrap().is_ok());
+    assert_eq!(pair.agv.ran(), functions);
+    assert_eq!(pair.agv.counter(LinkCounter::RequestsBusy), 0);
 }
 
 #[test]
@@ -219,4 +255,24 @@ fn a_best_effort_request_goes_in_one_datagram_or_not_at_all() {
     pair.manager.request_with("log", &x(2), &best_effort(), false).unwrap();
     pair.settle();
     assert_eq!((pair.agv.ran(), pair.manager.net.writes.len()), (vec!["log"], writes));
+}
+
+/// In plain mode nothing but the address tells a datagram of the peer from one of a host that knows the link's nonce.
+#[test]
+fn a_session_datagram_from_another_address_than_the_peers_is_dropped() {
+    let mut pair = Pair::live();
+    pair.agv.offer("log(x: int)", |_| Ok(()));
+    pair.publish();
+    pair.manager.request_with("log", &x(1), &best_effort(), false).unwrap();
+    let (_, mut datagrams) = pair.manager.net.deliver();
+    let (nonce, body) = datagrams.pop().unwrap();
+    let peer = pair.agv.session.address();
+    let dropped = |pair: &Pair| pair.agv.counter(LinkCounter::DatagramsDropped);
+    for other in ["10.0.0.77:7001", "[::1]:7001"] {
+        let before = dropped(&pair);
+        pair.agv.hear_datagram_from(other.parse().unwrap(), nonce, body.clone());
+        assert_eq!((pair.agv.ran().len(), dropped(&pair)), (0, before + 1), "{other}");
+    }
+    pair.agv.hear_datagram_from(peer, nonce, body);
+    assert_eq!(pair.agv.ran(), ["log"], "it was a good one");
 }

@@ -118,7 +118,7 @@ fn a_link_that_has_ended_does_and_keeps_nothing() {
     pair.cut();
     assert_eq!(pair.manager.call("pos_info", &none()), Err(Error::NotConnected));
     for side in [&mut pair.manager, &mut pair.agv] {
-        side.release(slot);
+        assert_eq!(side.release(slot), Err(Error::NotConnected));
         side.end_lease(slot);
         side.challenge();
         side.publish();

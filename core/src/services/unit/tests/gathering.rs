@@ -3,7 +3,10 @@
 use super::pair::Pair;
 use super::setup::Setup;
 use super::{none, text, x};
-use crate::config::GATHER;
+use crate::config::{GATHER, Priority};
+use crate::host::connections::LinkCounter;
+use crate::services::unit::RequestOptions;
+use crate::storage::LEFT_BY_SENDING;
 use crate::time::Duration;
 
 /// A pair that has been quiet, and whose writes are counted from here.
@@ -103,5 +106,44 @@ fn what_has_gathered_when_the_link_closes_still_arrives() {
     pair.manager.tell("log", &x(2)).unwrap();
     pair.manager.close(crate::error::CloseReason::Stopped);
     pair.settle();
-    assert_eq!(pair.agv.counter(crate::host::connections::LinkCounter::RequestsReceived), 2);
+    assert_eq!(pair.agv.counter(LinkCounter::RequestsReceived), 2);
+}
+
+/// An AGV with one buffer to send from has begun a call, and gathers a message in it.
+fn answering_behind_gathered() -> Pair {
+    let mut pair = Pair::with(&Setup { buffers: 1 + LEFT_BY_SENDING, ..Setup::default() });
+    pair.agv.offer_held("ask()");
+    pair.manager.offer("log(x: int)", |_| Ok(()));
+    pair.publish();
+    pair.manager.publish();
+    pair.run(Duration::from_millis(10));
+    pair.manager.call("ask", &none()).unwrap();
+    pair.settle();
+    let high = RequestOptions { priority: Some(Priority::High), ..RequestOptions::default() };
+    pair.agv.tell("log", &x(1)).unwrap();
+    pair.agv.request_with("log", &x(2), &high, false).unwrap();
+    pair
+}
+
+#[test]
+fn an_answer_sends_the_gathered_messages_that_hold_the_buffer_it_needs() {
+    let mut pair = answering_behind_gathered();
+    pair.agv.answer_held(Ok(&*none()));
+    pair.settle();
+    assert_eq!((pair.agv.session.calls_held(), pair.manager.session.calls_in_flight()), (0, 0));
+    assert_eq!(pair.manager.counter(LinkCounter::RequestsReceived), 2);
+}
+
+#[test]
+fn a_refused_message_leaves_no_gathered_one_behind() {
+    let mut pair = answering_behind_gathered();
+    // Another link holds what the pool has, so that the answer is refused whatever this link gives back.
+    let taken = pair.agv.take_buffers();
+    pair.agv.net.capacity = 0;
+    pair.agv.answer_held(Ok(&*none()));
+    assert_eq!(pair.agv.session.calls_held(), 1, "the answer waits");
+    pair.agv.net.capacity = 1 << 20;
+    pair.agv.give_buffers(taken);
+    pair.run(GATHER);
+    assert_eq!((pair.manager.counter(LinkCounter::RequestsReceived), pair.agv.session.calls_held()), (2, 0));
 }

@@ -3,14 +3,15 @@
 use super::pair::{Happened, Pair};
 use super::setup::Setup;
 use crate::config::HELLO_TIMEOUT;
+use crate::distribution::identity::Identity;
 use crate::error::{CloseReason, Refusal};
 use crate::time::Duration;
 
 #[test]
 fn both_ends_learn_who_the_other_is() {
     let pair = Pair::live();
-    assert_eq!(pair.manager.session.identity().unwrap().name(), "agv-01");
-    assert_eq!(pair.agv.session.identity().unwrap().name(), "manager");
+    assert_eq!(pair.manager.session.identity(), Some(&Identity::s_unit("agv-01", 1).unwrap()));
+    assert_eq!(pair.agv.session.identity(), Some(&Identity::m_unit("manager", 1).unwrap()));
     assert_eq!(pair.manager.happened, [Happened::Hello]);
     assert_eq!(pair.agv.happened, [Happened::Hello]);
 }

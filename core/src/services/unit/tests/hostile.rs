@@ -10,7 +10,9 @@ use super::{none, parameters, x};
 use crate::config::Priority;
 use crate::distribution::function::Definition;
 use crate::distribution::function_list::{Generation, Slot};
-use crate::distribution::message::{Control, Renewal, RequestHeader, SessionBody, encode_failure, encode_reply};
+use crate::distribution::message::{
+    Control, LeaseEnd, Release, Renewal, RequestHeader, SessionBody, encode_failure, encode_reply,
+};
 use crate::error::{CloseReason, Error};
 use crate::host::frame::{self, ChunkWriter, Cut, Frame};
 use crate::time::Duration;
@@ -48,8 +50,7 @@ fn message() -> impl Strategy<Value = Vec<u8>> {
             9 => control(&Control::ListEnd { serial: one }),
             10 if flag => control(&Control::Limits { message_size: one, minimum_interval: two, calls: three as u16 }),
             10 => control(&Control::ListAck { serial: one, skipped: two as u16 }),
-            _ if flag => control(&Control::Release { slot: two as u16, id: one }),
-            _ => control(&Control::LeaseEnded { slot: two as u16, expired: one > 2 }),
+            _ => control(&Control::LeaseEnded { call: one, why: LeaseEnd::ALL[two as usize % 3] }),
         },
     )
 }
@@ -88,7 +89,9 @@ fn frames() -> impl Strategy<Value = Vec<u8>> {
     let body = prop_oneof![
         prop::collection::vec(any::<u8>(), 0..20),
         any::<u64>().prop_map(|stamp| SessionBody::keep_alive(stamp).to_vec()),
-        (0..4_u16, any::<u64>()).prop_map(|(slot, stamp)| renewal(slot, stamp)),
+        (0..6_u32, 0..4_u8, any::<u64>()).prop_map(|(call, class, stamp)| renewal(call, class, stamp)),
+        (0..6_u32, 0..4_u8).prop_map(|(call, class)| release(call, class)),
+        (0..4_u16, 0..6_u32).prop_map(|(slot, id)| SessionBody::release_all(Slot(slot), id).to_vec()),
         message()
             .prop_map(|message| [&SessionBody::message_prefix(2)[..], &message[..message.len().min(400)]].concat()),
     ];
@@ -107,9 +110,13 @@ fn frames() -> impl Strategy<Value = Vec<u8>> {
     prop_oneof![4 => chunked, 1 => other]
 }
 
-fn renewal(slot: u16, stamp: u64) -> Vec<u8> {
+fn renewal(call: u32, class: u8, stamp: u64) -> Vec<u8> {
     let since = Duration::from_micros(stamp & 0xFFFF);
-    SessionBody::renewal(&Renewal { slot: Slot(slot), generation: Generation(0), stamp, since }).to_vec()
+    SessionBody::renewal(&Renewal { call, class: Priority::from_wire(class).unwrap(), stamp, since }).to_vec()
+}
+
+fn release(call: u32, class: u8) -> Vec<u8> {
+    SessionBody::release(&Release { call, class: Priority::from_wire(class).unwrap() }).to_vec()
 }
 
 /// A pair where each end has published something of each kind and calls the other.
@@ -174,7 +181,7 @@ fn a_reply_that_does_not_fit_its_signature_is_an_error_of_the_call_only() {
     let reply = [&encode_reply(id.0, Ok(()))[..], &[1, 2, 3]].concat();
     pair.manager.hear_message(&reply, Priority::Normal);
     pair.settle();
-    assert_eq!(pair.manager.outcome(id).unwrap().unwrap_err(), Error::Malformed);
+    assert_eq!(pair.manager.outcome(id).unwrap().unwrap_err(), Error::ResultLost);
     assert!(pair.manager.session.is_live());
 }
 

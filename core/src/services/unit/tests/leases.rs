@@ -4,10 +4,13 @@ use proptest::prelude::*;
 
 use super::net::Datagrams;
 use super::pair::{Happened, Pair};
+use super::setup::Setup;
 use super::{none, x};
 use crate::distribution::function_list::Slot;
 use crate::error::{Error, Limit};
 use crate::host::connections::LinkCounter;
+use crate::services::lease::LeaseEnd;
+use crate::services::requests::CallId;
 use crate::services::unit::RequestOptions;
 use crate::time::Duration;
 
@@ -27,6 +30,11 @@ fn moving(renew: bool) -> (Pair, Slot) {
 
 fn expirations(pair: &Pair) -> usize {
     pair.agv.count(|happened| matches!(happened, Happened::LeaseExpired(_)))
+}
+
+/// The manager has been told so of its first call.
+fn is_told(pair: &Pair, why: LeaseEnd) -> bool {
+    pair.manager.has(&Happened::LeaseEnded(CallId(1), why))
 }
 
 #[test]
@@ -76,7 +84,7 @@ fn a_lease_ends_in_time_when_nothing_comes_through() {
     pair.manager.net.frozen = false;
     pair.run(Duration::from_secs(1));
     assert!(!pair.agv.is_live(slot), "renewals that were held back revive nothing");
-    assert!(pair.manager.has(&Happened::LeaseEnded { slot, expired: true }));
+    assert!(is_told(&pair, LeaseEnd::Expired));
     assert_eq!(expirations(&pair), 1);
 }
 
@@ -92,7 +100,7 @@ fn what_an_interrupt_has_seen_dead_is_not_renewed() {
     pair.settle();
     assert!(!pair.agv.is_live(slot), "the motors have been switched off, and come on again");
     assert_eq!((expirations(&pair), pair.agv.counter(LinkCounter::LeasesExpired)), (1, 1), "the hook is told");
-    assert!(pair.manager.has(&Happened::LeaseEnded { slot, expired: true }));
+    assert!(is_told(&pair, LeaseEnd::Expired));
     pair.run(Duration::from_secs(1));
     assert_eq!((expirations(&pair), pair.agv.is_live(slot)), (1, false));
     pair.manager.tell("go", &none()).unwrap();
@@ -186,7 +194,7 @@ fn either_way_of_a_renewal_is_enough() {
 fn renewals_that_come_late_take_nothing_away() {
     let (mut pair, slot) = moving(true);
     // The stream lags behind the datagrams, and room for one renewal is in the pipe.
-    (pair.manager.net.frozen, pair.manager.net.capacity) = (true, 20);
+    (pair.manager.net.frozen, pair.manager.net.capacity) = (true, 21);
     pair.run(Duration::from_millis(400));
     pair.manager.net.datagrams = Datagrams::Lost;
     pair.manager.net.frozen = false;
@@ -234,7 +242,7 @@ fn a_request_older_than_its_lease_is_not_run() {
 #[test]
 fn a_lease_that_is_released_ends_at_once() {
     let (mut pair, slot) = moving(true);
-    pair.manager.release(slot);
+    pair.manager.release(slot).unwrap();
     pair.settle();
     assert!(!pair.agv.is_live(slot));
     pair.run(Duration::from_secs(2));
@@ -243,7 +251,7 @@ fn a_lease_that_is_released_ends_at_once() {
 
 #[test]
 fn a_motion_that_is_given_up_before_it_began_does_not_begin() {
-    let mut pair = Pair::live();
+    let mut pair = Pair::with(&Setup { running: 1, ..Setup::default() });
     pair.agv.offer_held("work()");
     let slot = pair.agv.offer_leased("go()", LEASE);
     pair.publish();
@@ -252,7 +260,7 @@ fn a_motion_that_is_given_up_before_it_began_does_not_begin() {
     let told = pair.manager.tell("go", &none()).unwrap();
     pair.run(Duration::from_millis(1));
     let late = pair.manager.tell("go", &none()).unwrap();
-    pair.manager.release(slot);
+    pair.manager.release(slot).unwrap();
     pair.run(Duration::from_millis(1));
     pair.agv.answer_held(Ok(&*none()));
     pair.settle();
@@ -272,12 +280,12 @@ fn an_order_that_fails_leaves_nothing_going_on() {
     pair.manager.call("go_to", &x(1)).unwrap();
     pair.settle();
     assert!(pair.agv.is_live(slot));
-    // The newest order replaces the one before it, so when it fails, nobody wants the old motion either.
-    pair.manager.call("go_to", &x(-1)).unwrap();
+    // The newest order replaces the one before it, so when it fails, the old motion is not wanted either.
+    let failed = pair.manager.call("go_to", &x(-1)).unwrap();
     pair.settle();
-    assert!(!pair.agv.is_live(slot));
+    assert!(!pair.agv.is_live(slot) && !pair.manager.session.holds(failed));
     assert_eq!(expirations(&pair), 1);
-    assert!(pair.manager.has(&Happened::LeaseEnded { slot, expired: true }));
+    assert!(is_told(&pair, LeaseEnd::Replaced));
     pair.run(Duration::from_secs(2));
     assert_eq!((expirations(&pair), pair.agv.is_live(slot)), (1, false));
 }
@@ -288,7 +296,7 @@ fn a_motion_that_is_finished_ends_its_lease_without_the_hook() {
     pair.agv.end_lease(slot);
     pair.settle();
     assert!(!pair.agv.is_live(slot));
-    assert!(pair.manager.has(&Happened::LeaseEnded { slot, expired: false }));
+    assert!(is_told(&pair, LeaseEnd::Finished));
     pair.run(Duration::from_secs(2));
     assert_eq!((expirations(&pair), pair.agv.counter(LinkCounter::RenewalsIgnored)), (0, 0));
 }
@@ -306,7 +314,7 @@ fn no_more_leases_are_held_than_there_is_room_for() {
     assert_eq!(pair.manager.call("go_4", &x(4)), Err(Error::Full(Limit::Leases)));
     pair.settle();
     assert_eq!(pair.agv.ran().len(), 4);
-    pair.manager.release(Slot(0));
+    pair.manager.release(Slot(0)).unwrap();
     pair.settle();
     assert!(pair.manager.call("go_4", &x(4)).is_ok());
 }

@@ -1,11 +1,16 @@
 //! The limits that each end tells the other, and keeps.
 
+use std::vec;
+
 use super::pair::{Happened, Pair};
 use super::setup::Setup;
 use super::{none, text, x};
 use crate::config::{Constraints, Priority};
+use crate::distribution::function_list::Generation;
+use crate::distribution::message::RequestHeader;
 use crate::error::Error;
 use crate::host::connections::LinkCounter;
+use crate::services::requests::CallId;
 use crate::services::unit::RequestOptions;
 use crate::storage::LEFT_BY_WAITING;
 use crate::time::Duration;
@@ -23,6 +28,33 @@ fn a_request_above_the_peers_limit_is_not_sent() {
     pair.publish();
     assert_eq!(pair.manager.call("echo", &text(1_100)), Err(Error::TooLarge { limit: 1_024 }));
     assert!(pair.manager.call("echo", &text(1_000)).is_ok());
+}
+
+/// Of a peer that keeps no limit: the place of an emergency would hold a little more.
+#[test]
+fn an_emergency_above_its_limit_is_refused() {
+    let mut pair = Pair::live();
+    let slot = pair.agv.offer("stop(text: string[300])", |_| Ok(()));
+    pair.publish();
+    for (id, length, outcome) in [(1, 216, None), (2, 217, Some(Error::TooLarge { limit: 224 }))] {
+        let header = RequestHeader {
+            id,
+            slot,
+            generation: Generation(0),
+            wants_reply: false,
+            remaining: Duration::from_secs(1),
+            stamp: pair.agv.now.as_micros(),
+            since: Duration::ZERO,
+        };
+        let mut block = vec![b'x'; 8 + length];
+        block[..8].copy_from_slice(&(length as u64).to_le_bytes());
+        block.resize(block.len().next_multiple_of(8), 0);
+        pair.agv.hear_request(&header, Priority::Emergency, &block);
+        pair.settle();
+        let failed = outcome.map(|error| Happened::Failed(CallId(id), error));
+        assert!(failed.is_none_or(|failed| pair.manager.has(&failed)), "{:?}", pair.manager.happened);
+        assert_eq!(pair.agv.ran().len(), 1, "the first one only");
+    }
 }
 
 #[test]
@@ -108,7 +140,7 @@ fn the_minimum_interval_is_kept_by_the_callee() {
 #[test]
 fn a_callee_with_its_hands_full_is_busy_except_for_an_emergency() {
     let agv = Constraints { calls_per_peer: 3, ..Constraints::S_UNIT };
-    let mut pair = Pair::with(&Setup { agv, ..Setup::default() });
+    let mut pair = Pair::with(&Setup { agv, running: 1, ..Setup::default() });
     pair.agv.offer_held("work()");
     pair.agv.offer("stop()", |_| Ok(()));
     pair.publish();
@@ -145,7 +177,7 @@ fn a_call_that_finds_no_buffer_to_wait_in_is_refused_without_one() {
 #[test]
 fn a_long_call_finds_one_buffer_more_to_wait_in() {
     for (more, outcome) in [(0, Err(Error::Busy)), (1, Ok(()))] {
-        let mut pair = Pair::with(&Setup { buffers: LEFT_BY_WAITING + more, ..Setup::default() });
+        let mut pair = Pair::with(&Setup { buffers: LEFT_BY_WAITING + more, running: 1, ..Setup::default() });
         pair.agv.offer_held("work(text: string[20000])");
         pair.publish();
         pair.manager.tell("work", &text(20_000)).unwrap();

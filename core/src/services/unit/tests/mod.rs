@@ -20,6 +20,7 @@ mod limits;
 mod lists;
 mod liveness;
 mod net;
+mod orders;
 mod pair;
 mod requests;
 mod setup;

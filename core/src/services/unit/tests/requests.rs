@@ -138,7 +138,7 @@ fn a_call_that_is_given_up_ends_without_an_event() {
     pair.agv.offer_held("wait()");
     pair.publish();
     let id = pair.manager.call("wait", &none()).unwrap();
-    pair.manager.session.cancel(id);
+    pair.manager.cancel(id);
     pair.settle();
     pair.agv.answer_held(Ok(&*none()));
     pair.run(Duration::from_secs(3));

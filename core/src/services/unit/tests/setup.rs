@@ -4,14 +4,15 @@ use std::vec;
 
 use super::super::{Publication, SessionStorage, buffer_bytes};
 use super::net::DATAGRAM_PORT;
-use crate::config::{Constraints, LINK_BUFFER_BYTES};
-use crate::distribution::function::Attributes;
+use crate::config::{Constraints, LINK_BUFFER_BYTES, Priority};
+use crate::distribution::function::{Attributes, Definition};
 use crate::distribution::function_list::{Entry, FunctionList};
 use crate::distribution::hello::{Hello, Limits};
 use crate::distribution::identity::{Epoch, Fleet, Identity};
 use crate::distribution::parameters::ParametersView;
 use crate::error::Error;
 use crate::services::lease::{Lease, Service};
+use crate::services::slots_for;
 use crate::storage::{Boxed, Pool};
 use crate::time::Duration;
 
@@ -26,6 +27,8 @@ pub(super) struct Setup {
     pub(super) buffer_size: usize,
     /// Functions of the other end that are kept.
     pub(super) their_functions: usize,
+    /// Calls of the other end that run at the same time.
+    pub(super) running: usize,
 }
 
 impl Default for Setup {
@@ -37,6 +40,7 @@ impl Default for Setup {
             buffers: 6,
             buffer_size: buffer_bytes(32 * 1024, 0),
             their_functions: 8,
+            running: 64,
         }
     }
 }
@@ -68,9 +72,12 @@ impl Service for Handler {
     }
 }
 
-pub(super) fn attributes(lease_millis: u64) -> Attributes {
+/// Of a function with this definition: `stop` and `emergency` are emergency services.
+pub(super) fn attributes(definition: &Definition, lease_millis: u64) -> Attributes {
     let lease = (lease_millis > 0).then(|| Duration::from_millis(lease_millis));
-    Attributes { lease, ..Attributes::default() }
+    let is_emergency = ["stop", "emergency"].contains(&definition.signature().name());
+    let priority = if is_emergency { Priority::Emergency } else { Priority::Normal };
+    Attributes { lease, priority, ..Attributes::default() }
 }
 
 pub(super) fn hello(constraints: &Constraints, agv: bool, datagrams: bool) -> Hello {
@@ -95,11 +102,11 @@ pub(super) fn hello(constraints: &Constraints, agv: bool, datagrams: bool) -> He
     }
 }
 
-pub(super) fn storage(constraints: &Constraints, their_functions: usize) -> SessionStorage<Boxed> {
+pub(super) fn storage(running: usize, their_functions: usize) -> SessionStorage<Boxed> {
     SessionStorage {
         small: vec![0; LINK_BUFFER_BYTES].into_boxed_slice(),
         pending: vec![None; 128].into_boxed_slice(),
-        running: vec![None; usize::from(constraints.calls_per_peer) + 1].into_boxed_slice(),
+        running: vec![None; slots_for(running)].into_boxed_slice(),
         publications: vec![Publication::default(); 16].into_boxed_slice(),
         their_functions: (0..their_functions).map(|_| Entry::empty()).collect(),
         their_signatures: vec![0; 2048].into_boxed_slice(),

@@ -17,6 +17,7 @@ use crate::host::mailman::LinkId;
 use crate::host::secure::Plain;
 use crate::services::Context;
 use crate::services::access::{Access, Decision, Principal, Rule, Verb, decide};
+use crate::services::lease::LeaseEnd;
 use crate::services::requests::CallId;
 use crate::storage::{Boxed, Pool};
 use crate::time::{Duration, Instant};
@@ -37,10 +38,7 @@ pub(super) enum Happened {
         skipped: u16,
     },
     LeaseExpired(Slot),
-    LeaseEnded {
-        slot: Slot,
-        expired: bool,
-    },
+    LeaseEnded(CallId, LeaseEnd),
     Answered,
     Closed(CloseReason),
     /// A handler was begun.
@@ -121,7 +119,7 @@ impl Side {
         };
         Self {
             now,
-            session: Session::new(now, config, Plain, setup::storage(&constraints, setup.their_functions)),
+            session: Session::new(now, config, Plain, setup::storage(setup.running, setup.their_functions)),
             functions: setup::functions(),
             table: None,
             pool: setup::pool(setup.buffers, setup.buffer_size),
@@ -142,10 +140,8 @@ impl Side {
     pub(super) fn work(&mut self, datagrams: Vec<(u64, Vec<u8>)>) -> bool {
         let mut worked = !datagrams.is_empty();
         let from = SocketAddr::new(self.session.address().ip(), DATAGRAM_PORT);
-        for (nonce, mut body) in datagrams {
-            let event = self.session.datagram(context!(self), from, nonce, &mut body).map(own);
-            self.note(event);
-            self.run_calls();
+        for (nonce, body) in datagrams {
+            self.hear_datagram_from(from, nonce, body);
         }
         worked |= self.read();
         worked |= self.run_calls();
@@ -159,6 +155,13 @@ impl Side {
             worked |= self.unanswered.len() == unanswered;
         }
         worked
+    }
+
+    /// A datagram arrives from an address, which may be another one than the peer's.
+    pub(super) fn hear_datagram_from(&mut self, from: SocketAddr, nonce: u64, mut body: Vec<u8>) {
+        let event = self.session.datagram(context!(self), from, nonce, &mut body).map(own);
+        self.note(event);
+        self.run_calls();
     }
 
     fn read(&mut self) -> bool {
@@ -259,7 +262,7 @@ fn own(event: Event<'_>) -> Happened {
         Event::ListChanged => Happened::ListChanged,
         Event::Acknowledged { serial, skipped } => Happened::Acknowledged { serial, skipped },
         Event::LeaseExpired(slot) => Happened::LeaseExpired(slot),
-        Event::LeaseEnded { slot, expired } => Happened::LeaseEnded { slot, expired },
+        Event::LeaseEnded { call, why, .. } => Happened::LeaseEnded(call, why),
         Event::Answered => Happened::Answered,
         Event::Closed(reason) => Happened::Closed(reason),
         Event::Call(_) | Event::Reply(_, Ok(_)) => panic!("only `read` gets what borrows"),

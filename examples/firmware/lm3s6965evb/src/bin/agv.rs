@@ -7,16 +7,13 @@ use cara_apps::agv::Agv;
 use cara_embassy::Runner as UnitRunner;
 use cara_lm3s6965evb::arguments::{self, ArgumentError};
 use cara_lm3s6965evb::ethernet::Ethernet;
-use cara_lm3s6965evb::watchdog::Watchdog;
-use cara_lm3s6965evb::{executor, fault, motor, reset, stack, start};
+use cara_lm3s6965evb::{executor, fault, motor, reset, stack, start, watchdog};
 use cara_vehicle::{SOCKETS, Vehicle, VehicleResources};
 use embassy_executor::Spawner;
 use embassy_net::{Runner, StackResources};
 use embassy_time::{Duration, Timer};
 use static_cell::{ConstStaticCell, StaticCell};
 
-/// A board that hangs for so long starts again.
-const HANGS: Duration = Duration::from_secs(4);
 /// How often the timer presses the button.
 const PRESSED_EVERY: Duration = Duration::from_secs(10);
 
@@ -24,7 +21,11 @@ const PRESSED_EVERY: Duration = Duration::from_secs(10);
 fn main() -> ! {
     let _core = start();
     let motors = if motor::start() { "on" } else { "off" };
-    cara_vehicle::info!("started because of {}, with the motors {=str}", reset::reason(), motors);
+    let (reason, place) = reset::reason();
+    cara_vehicle::info!("started because of {}, with the motors {=str}", reason, motors);
+    if place != 0 {
+        cara_vehicle::info!("it ended at line or address {=u32:#x}", place);
+    }
     executor::run(|spawner| {
         if let Err(text) = spawn(spawner) {
             cara_vehicle::error!("{=str}", text);
@@ -56,10 +57,14 @@ fn spawn(spawner: Spawner) -> Result<(), &'static str> {
     spawner.spawn(unit(unit_runner).map_err(|_| NO_ROOM)?);
     spawner.spawn(drive(vehicle).map_err(|_| NO_ROOM)?);
     spawner.spawn(button(vehicle).map_err(|_| NO_ROOM)?);
-    spawner.spawn(watch().map_err(|_| NO_ROOM)?);
     spawner.spawn(stack::report().map_err(|_| NO_ROOM)?);
     #[cfg(feature = "faults")]
     spawner.spawn(cara_lm3s6965evb::faults::starve().map_err(|_| NO_ROOM)?);
+    #[cfg(feature = "faults")]
+    for _ in 0..2 {
+        spawner.spawn(cara_lm3s6965evb::creep::take(vehicle).map_err(|_| NO_ROOM)?);
+    }
+    watchdog::start();
     Ok(())
 }
 
@@ -70,7 +75,7 @@ async fn network(mut runner: Runner<'static, &'static mut Ethernet>) -> ! {
 
 #[embassy_executor::task]
 async fn unit(mut runner: UnitRunner<Agv>) -> ! {
-    runner.run().await
+    cara_board::watched(runner.run()).await
 }
 
 #[embassy_executor::task]
@@ -81,14 +86,4 @@ async fn drive(vehicle: Vehicle) -> ! {
 #[embassy_executor::task]
 async fn button(vehicle: Vehicle) -> ! {
     cara_vehicle::call_mechanic(vehicle, async || Timer::after(PRESSED_EVERY).await).await
-}
-
-/// Feeds the watchdog for as long as tasks get their turn.
-#[embassy_executor::task]
-async fn watch() -> ! {
-    let mut watchdog = Watchdog::start(HANGS.as_millis() as u32);
-    loop {
-        watchdog.feed();
-        Timer::after(HANGS / 4).await;
-    }
 }

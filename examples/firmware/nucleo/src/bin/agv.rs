@@ -17,7 +17,6 @@ use static_cell::StaticCell;
 #[embassy_executor::main]
 async fn main(spawner: Spawner) {
     let mut board = Board::start();
-    defmt::info!("started because of {}", board.reason);
     let [first, second] = board.pages;
     let known = Provision::read(first, second).and_then(|Provision { settings, proof }| {
         proof.begin(&mut board.lives, halves(board.seed)).map(|security| (settings, security))
@@ -58,7 +57,7 @@ fn spawn(
     spawner.spawn(tasks::drive(vehicle)?);
     spawner.spawn(call_mechanic(vehicle, button)?);
     spawner.spawn(shine(vehicle, lamp)?);
-    spawner.spawn(watch(watchdog)?);
+    watchdog.start();
     Ok(())
 }
 
@@ -75,9 +74,4 @@ async fn call_mechanic(vehicle: Vehicle, mut button: Button) -> ! {
 #[embassy_executor::task]
 async fn shine(vehicle: Vehicle, mut lamp: Lamp) -> ! {
     lamp::show(vehicle, async |on| lamp.set(on)).await
-}
-
-#[embassy_executor::task]
-async fn watch(watchdog: Watchdog) -> ! {
-    watchdog.run().await
 }

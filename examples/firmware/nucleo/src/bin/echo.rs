@@ -16,7 +16,6 @@ use static_cell::StaticCell;
 async fn main(spawner: Spawner) {
     static RESOURCES: StaticCell<StackResources<4>> = StaticCell::new();
     let board = Board::start();
-    defmt::info!("started because of {}", board.reason);
     let [first, second] = board.pages;
     let config = page::newest(first, second).map_or_else(|_| echo::dhcp(), |settings| cara_vehicle::network(&settings));
     let resources = RESOURCES.init_with(StackResources::new);

@@ -5,7 +5,7 @@
 
 use cara_rp::Board;
 use cara_rp::board::{Device, Lamp};
-use cara_rp::parts::{Button, Watchdog};
+use cara_rp::parts::Button;
 use cara_vehicle::provision::{Provision, halves};
 use cara_vehicle::{SOCKETS, Vehicle, VehicleResources, lamp, tasks};
 use defmt_rtt as _;
@@ -21,9 +21,8 @@ async fn main(spawner: Spawner) {
 async fn run(spawner: Spawner) -> Result<(), SpawnError> {
     static SOCKETS_MEMORY: StaticCell<StackResources<SOCKETS>> = StaticCell::new();
     static RESOURCES: StaticCell<VehicleResources> = StaticCell::new();
-    let Board { reason, pages: [first, second], mut lives, seed, lamp, button, watchdog, network } =
+    let Board { pages: [first, second], mut lives, seed, lamp, button, watchdog, network } =
         Board::start(spawner).await;
-    defmt::info!("started because of {}", reason);
     let known = Provision::read(first, second).and_then(|Provision { settings, proof }| {
         proof.begin(&mut lives, halves(seed)).map(|security| (settings, security))
     });
@@ -45,7 +44,7 @@ async fn run(spawner: Spawner) -> Result<(), SpawnError> {
     spawner.spawn(tasks::drive(vehicle)?);
     spawner.spawn(call_mechanic(vehicle, button)?);
     spawner.spawn(shine(vehicle, lamp)?);
-    spawner.spawn(watch(watchdog)?);
+    watchdog.start();
     Ok(())
 }
 
@@ -67,9 +66,4 @@ async fn shine(vehicle: Vehicle, mut lamp: Lamp) -> ! {
 #[embassy_executor::task]
 async fn flicker(mut lamp: Lamp) -> ! {
     lamp::unprovisioned(async |on| lamp.set(on).await).await
-}
-
-#[embassy_executor::task]
-async fn watch(watchdog: Watchdog) -> ! {
-    watchdog.run().await
 }

@@ -19,8 +19,7 @@ async fn main(spawner: Spawner) {
 
 async fn run(spawner: Spawner) -> Result<(), SpawnError> {
     static RESOURCES: StaticCell<StackResources<4>> = StaticCell::new();
-    let Board { reason, pages: [first, second], seed, network, .. } = Board::start(spawner).await;
-    defmt::info!("started because of {}", reason);
+    let Board { pages: [first, second], seed, network, .. } = Board::start(spawner).await;
     let (device, uplink) = network.start(spawner).await?;
     let settings = page::newest(first, second);
     let config = settings.as_ref().map_or_else(|_| echo::dhcp(), cara_vehicle::network);

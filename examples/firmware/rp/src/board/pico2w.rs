@@ -2,7 +2,6 @@
 //! that the lamp goes on only once the radio runs.
 
 use cara_settings::{Settings, Wifi};
-use cara_vehicle::reset::Reason;
 use cyw43::{A4, Aligned, Control, JoinOptions, NetDriver, PowerManagementMode, Runner, SpiBus, State};
 use cyw43_pio::{PioSpi, RM2_CLOCK_DIVIDER};
 use embassy_executor::{SpawnError, Spawner};
@@ -19,7 +18,7 @@ use static_cell::StaticCell;
 
 use crate::parts::{Button, Watchdog};
 use crate::settings::{Flash, Lives};
-use crate::{reset, settings};
+use crate::{motor, reset, settings};
 
 bind_interrupts!(struct Interrupts {
     DMA_IRQ_0 => dma::InterruptHandler<DMA_CH0>;
@@ -46,8 +45,6 @@ static LIGHT: Signal<CriticalSectionRawMutex, bool> = Signal::new();
 
 /// The board.
 pub struct Board {
-    /// Why it started.
-    pub reason: Reason,
     /// The pages of flash that tell who it is.
     pub pages: [&'static [u8]; 2],
     /// Counts its lives.
@@ -75,7 +72,9 @@ impl Board {
     pub async fn start(spawner: Spawner) -> Self {
         let chip = embassy_rp::init(Default::default());
         let watchdog = watchdog::Watchdog::new(chip.WATCHDOG);
-        let reason = reset::reason(&watchdog);
+        let (reason, place) = cara_board::reason(reset::reason(&watchdog));
+        motor::start(chip.PIN_15);
+        defmt::info!("started because of {}; the program before ended at {=u32:#x}", reason, place);
         let (power, select) = (Output::new(chip.PIN_23, Level::Low), Output::new(chip.PIN_25, Level::High));
         let Pio { mut common, irq0, sm0, .. } = Pio::new(chip.PIO0, Interrupts);
         let channel = dma::Channel::new(chip.DMA_CH0, Interrupts);
@@ -83,7 +82,6 @@ impl Board {
         let bus = PioSpi::new(&mut common, sm0, RM2_CLOCK_DIVIDER, irq0, select, data, clock, channel);
         let (device, control) = defmt::unwrap!(start_radio(spawner, power, bus).await);
         Self {
-            reason,
             pages: settings::pages(),
             lives: settings::lives(Flash::new_blocking(chip.FLASH)),
             seed: RoscRng.next_u64(),

@@ -2,7 +2,6 @@
 //! Pico, wire a W5500 module the same way.
 
 use cara_settings::Settings;
-use cara_vehicle::reset::Reason;
 use embassy_executor::{SpawnError, Spawner};
 use embassy_net::Stack;
 use embassy_net_wiznet::chip::W5500;
@@ -18,7 +17,7 @@ use static_cell::StaticCell;
 
 use crate::parts::{Button, Watchdog};
 use crate::settings::{Flash, Lives};
-use crate::{reset, settings};
+use crate::{motor, reset, settings};
 
 bind_interrupts!(struct Interrupts {
     DMA_IRQ_0 => dma::InterruptHandler<DMA_CH0>, dma::InterruptHandler<DMA_CH1>;
@@ -35,8 +34,6 @@ const ABSENT: Duration = Duration::from_secs(2);
 
 /// The board.
 pub struct Board {
-    /// Why it started.
-    pub reason: Reason,
     /// The pages of flash that tell who it is.
     pub pages: [&'static [u8]; 2],
     /// Counts its lives.
@@ -66,7 +63,9 @@ impl Board {
     pub async fn start(_: Spawner) -> Self {
         let chip = embassy_rp::init(Default::default());
         let watchdog = watchdog::Watchdog::new(chip.WATCHDOG);
-        let reason = reset::reason(&watchdog);
+        let (reason, place) = cara_board::reason(reset::reason(&watchdog));
+        motor::start(chip.PIN_15);
+        defmt::info!("started because of {}; the program before ended at {=u32:#x}", reason, place);
         let mut config = Config::default();
         config.frequency = SPI_HERTZ;
         let (clock, send, receive) = (chip.PIN_18, chip.PIN_19, chip.PIN_16);
@@ -86,7 +85,6 @@ impl Board {
         let address = hardware_address();
         let (interrupt, reset) = (Input::new(chip.PIN_21, Pull::Up), Output::new(chip.PIN_20, Level::High));
         Self {
-            reason,
             pages: settings::pages(),
             lives: settings::lives(flash),
             seed: RoscRng.next_u64(),

@@ -1,12 +1,13 @@
 //! The paper's listing (section 2): a manager finds an AGV, asks where it is, sends it somewhere, and offers it a
 //! mechanic. Then it serves until Ctrl-C.
 
+use std::process::ExitCode;
 use std::thread::sleep;
 use std::time::Duration;
 
 use anyhow::Result;
 use cara_apps::mechanic;
-use cara_examples::{Network, Stop, log_to_stderr, say, shown_mode};
+use cara_examples::{Network, Stop, ended, log_to_stderr, say, shown_mode};
 use cara_std::{CommunicationSystem, Parameters};
 use clap::Parser;
 
@@ -30,7 +31,11 @@ struct Options {
     network: Network,
 }
 
-fn main() -> Result<()> {
+fn main() -> Result<ExitCode> {
+    ended(run())
+}
+
+fn run() -> Result<()> {
     let options = Options::parse();
     log_to_stderr();
     let stop = Stop::new(options.network.attended)?;

@@ -2,6 +2,8 @@
 
 use std::io;
 
+use cara_std::Shown;
+
 use super::Arguments;
 use super::subject::Subject;
 use super::{availability, response};
@@ -53,5 +55,5 @@ pub(crate) fn availability(row: &availability::Row) -> io::Result<()> {
         "{characters:>10}  {period:>8}  {real:>10}  {sent:>8}  {refused:>7}  {failed:>7}  {least:>6.3}  {availability:>12.4}"
     ))?;
     let error = row.groups.iter().find_map(|group| group.error.as_deref());
-    error.map_or(Ok(()), |error| line(format_args!("{:>10}  {error}", "")))
+    error.map_or(Ok(()), |error| line(format_args!("{:>10}  {}", "", Shown(error))))
 }

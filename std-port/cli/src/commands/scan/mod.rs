@@ -5,14 +5,19 @@ mod survey;
 use std::process::ExitCode;
 use std::time::Duration;
 
+use anstyle::Style;
 use cara_std::control::protocol::{Answer, LimitsInfo, NodeInfo, Question, RefusedInfo};
 use serde_json::json;
 
 use crate::exit::{Ended, Exit};
 use crate::global::Global;
+use crate::nodes;
 use crate::operator::{Need, Operator};
 use crate::output::{self, BAD, FAINT, PLAIN, Rows};
 use crate::units::{parse_time, show_bytes, show_micros};
+
+/// Nodes that a line lists.
+const LISTED: usize = 8;
 
 /// Shows who is there: name, ID, role, address, version and limits; and who was refused, with the reason.
 ///
@@ -77,6 +82,7 @@ fn of_unit(mut operator: Operator, offering: Option<String>, global: &Global) ->
         output::line(format_args!("{who}; `cara doctor` looks for reasons"))?;
     }
     joined(&nodes).print()?;
+    missing(&nodes)?;
     if !refused.is_empty() {
         output::line("")?;
     }
@@ -87,7 +93,7 @@ fn of_unit(mut operator: Operator, offering: Option<String>, global: &Global) ->
 fn joined(nodes: &[NodeInfo]) -> Rows {
     let mut rows = Rows::new(["NODE", "ID", "ROLE", "STATE", "ADDRESS", "VERSION", "FUNCTIONS", "LIMITS"]);
     for node in nodes {
-        let (style, state) = if node.connected { (PLAIN, "connected") } else { (FAINT, "left") };
+        let (style, state) = state(node);
         let or_dash = |text: Option<String>| text.unwrap_or_else(|| "-".into());
         rows.add(
             style,
@@ -104,6 +110,32 @@ fn joined(nodes: &[NodeInfo]) -> Rows {
         );
     }
     rows
+}
+
+fn state(node: &NodeInfo) -> (Style, &'static str) {
+    match (node.connected, node.expected, node.left_ms) {
+        (true, ..) => (PLAIN, "connected"),
+        (false, true, None) => (BAD, "absent"),
+        (false, true, Some(_)) => (BAD, "left"),
+        (false, false, _) => (FAINT, "left"),
+    }
+}
+
+/// Those of the roster that are not there: what a call to all would miss.
+fn missing(nodes: &[NodeInfo]) -> std::io::Result<()> {
+    let expected = nodes.iter().filter(|node| node.expected);
+    let missing: Vec<String> = expected.clone().filter(|node| !node.connected).map(nodes::full_name).collect();
+    if missing.is_empty() {
+        return Ok(());
+    }
+    let more = missing.len().saturating_sub(LISTED);
+    let more = if more == 0 { String::new() } else { format!(" and {more} more") };
+    let (count, all) = (missing.len(), expected.count());
+    let names = missing.iter().take(LISTED).cloned().collect::<Vec<_>>().join(", ");
+    output::line(format_args!(
+        "\n{BAD}missing{BAD:#}: {count} of {all} s_units of the roster: {names}{more}; `cara doctor NODE` looks for the reason, \
+         `cara retire NODE` takes one off the roster"
+    ))
 }
 
 fn limits(limits: &LimitsInfo) -> String {

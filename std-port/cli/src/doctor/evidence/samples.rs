@@ -121,6 +121,7 @@ pub(crate) fn node_info(name: &str, id: u32, connected: bool) -> NodeInfo {
         id,
         role: "s_unit".into(),
         connected,
+        expected: true,
         address: connected.then(|| "10.0.0.7:5000".into()),
         version: None,
         epoch: None,

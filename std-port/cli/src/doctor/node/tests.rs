@@ -60,10 +60,30 @@ fn a_manager_elsewhere_may_have_it() {
 }
 
 #[test]
-fn who_holds_back_behind_another_is_named_after_the_silence() {
+fn where_no_manager_runs_that_is_the_cause_and_it_is_about_the_node_that_was_asked_for() {
     let mut seen = evidence();
     seen.heard = vec![searching("other", 8, "boss")];
-    assert_eq!(ids(&seen), [Id::NotHeard, Id::NoManager]);
+    let told = check(&seen, &Which("agv".into()));
+    assert_eq!((told.len(), told[0].id, told[0].about.as_deref()), (1, Id::NoManager, Some("agv")));
+    assert!(told[0].certain, "it need not listen for longer");
+    seen.running = vec![running("bos", 1)];
+    assert_eq!(ids(&seen), [Id::NotHeard, Id::WrongManager], "another one runs");
+}
+
+#[test]
+fn what_the_manager_knows_is_not_listened_for() {
+    let mut seen = evidence();
+    seen.running = vec![running("boss", 1)];
+    seen.running[0].nodes = vec![node_info("agv", 7, false)];
+    let first = |seen: &Evidence| check(seen, &Which("agv".into())).remove(0);
+    assert_eq!((first(&seen).id, first(&seen).certain), (Id::Lost, false), "it may come back within the next seconds");
+    seen.running[0].nodes[0].left_ms = Some(20_000);
+    assert!(first(&seen).certain);
+    // It has never joined, and this manager has run for long.
+    seen.running[0].nodes[0].left_ms = None;
+    assert_eq!((first(&seen).id, first(&seen).certain), (Id::NotHeard, true));
+    seen.running[0].unit.uptime_ms = 5_000;
+    assert!(!first(&seen).certain);
 }
 
 #[test]

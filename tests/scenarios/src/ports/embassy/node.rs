@@ -121,11 +121,17 @@ impl BoardNode {
     }
 
     fn peer(&self, name: &str) -> Result<Peer, Error> {
-        self.unit()?.peer(name).ok_or(Error::NotConnected)
+        self.unit()?.peer(name)
     }
 
     fn connected(&self) -> Vec<Peer> {
         self.unit().map(|unit| unit.peers().collect()).unwrap_or_default()
+    }
+
+    fn asked_with_all(&self, function: &str) -> Vec<Peer> {
+        let mut asked: Vec<Peer> = self.unit().map(|unit| unit.roster().collect()).unwrap_or_default();
+        asked.extend(self.offering(function).into_iter().filter(|peer| peer.identity().role() == Role::MUnit));
+        asked
     }
 
     fn offering(&self, function: &str) -> Vec<Peer> {
@@ -195,8 +201,7 @@ impl Node for Rc<BoardNode> {
 
     fn s_units(&self) -> Vec<(Identity, bool)> {
         let Ok(unit) = self.unit() else { return Vec::new() };
-        let s_units = (0..).map_while(|index| unit.s_unit(index));
-        s_units.map(|peer| (peer.identity().clone(), peer.is_connected())).collect()
+        unit.roster().map(|peer| (peer.identity().clone(), peer.is_connected())).collect()
     }
 
     fn peers(&self) -> Vec<Identity> {
@@ -222,8 +227,8 @@ impl Node for Rc<BoardNode> {
     }
 
     fn request_all(&self, function: &str, parameters: &ParametersView) -> Vec<(Identity, Result<CallId, Error>)> {
-        let offering = self.offering(function).into_iter();
-        offering.map(|peer| (peer.identity().clone(), peer.request(function, parameters))).collect()
+        let asked = self.asked_with_all(function).into_iter();
+        asked.map(|peer| (peer.identity().clone(), peer.request(function, parameters))).collect()
     }
 
     fn begin(&self, peer: &str, function: &str, parameters: &ParametersView, options: RequestOptions) -> Pending {
@@ -242,7 +247,7 @@ impl Node for Rc<BoardNode> {
 
     fn begin_all(&self, function: &str, parameters: &ParametersView) -> PendingAll {
         let pending = Pending::new();
-        let peers = self.offering(function);
+        let peers = self.asked_with_all(function);
         let (count, outcomes) = (peers.len(), Rc::new(RefCell::new(Vec::new())));
         for peer in peers {
             let (told, outcomes) = (pending.share(), Rc::clone(&outcomes));
@@ -320,7 +325,7 @@ fn seen(event: UnitEvent) -> Option<Seen> {
         UnitEvent::ListChanged { peer } => Seen::ListChanged(peer),
         UnitEvent::RequestFailed { call, error, .. } => Seen::Failed(call, error),
         UnitEvent::LeaseExpired { function, .. } => Seen::LeaseExpired(function.to_string()),
-        UnitEvent::LeaseEnded { function, expired, .. } => Seen::LeaseEnded(function.to_string(), expired),
+        UnitEvent::LeaseEnded { function, why, .. } => Seen::LeaseEnded(function.to_string(), why),
         UnitEvent::AddressChanged { address } => Seen::InterfaceChanged(address.is_some()),
         UnitEvent::FunctionsSkipped { .. } => return None,
     })

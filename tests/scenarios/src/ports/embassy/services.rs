@@ -2,7 +2,6 @@
 
 use std::rc::Rc;
 
-use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, ServiceError};
 use cara_core::services::lease::Lease;
@@ -18,37 +17,29 @@ use crate::{Asked, Service};
 /// Bytes of the parameters that a task takes calls in.
 const PARAMETERS: usize = 48 * 1024;
 
-/// Whether a task serves it.
-fn awaits(service: &Service) -> bool {
-    service.takes > Duration::ZERO || service.calls_back.is_some()
-}
-
 /// Puts a service into a unit's list.
 pub(super) fn put(node: &Rc<BoardNode>, service: &Service, replace: bool) -> Result<(), Error> {
     let (unit, board) = (node.unit()?, node.board());
     let lease: &'static Lease = Box::leak(Box::new(Lease::new()));
     let mut options = ServiceOptions::new().priority(service.priority);
-    if service.detached {
-        options = options.detached();
-    }
     if let Some(length) = service.lease {
         let diary = service.diary();
-        options = options.lease(length, lease, Box::leak(Box::new(move |_: &mut ()| diary.stop(now()))));
+        options = options.lease(length, lease, Box::leak(Box::new(move || diary.stop(now()))));
     }
-    let handler = if awaits(service) { Handler::task() } else { at_once(service.clone()) };
+    let handler = if service.awaits() { Handler::task() } else { at_once(service.clone()) };
     match replace {
         true => unit.replace_service(&service.signature, options, handler),
         false => unit.add_service(&service.signature, options, handler),
     }?;
     let known = node.keep(service, lease);
-    if awaits(service) && !known {
+    if service.awaits() && !known {
         board.spawn(take_calls(Rc::clone(node), board.clone(), unit, service.name().to_owned()));
     }
     Ok(())
 }
 
 fn at_once(service: Service) -> Handler<()> {
-    Handler::method(Box::leak(Box::new(move |(): &mut (), call: &cara_embassy::Call<()>, parameters: &mut _| {
+    Handler::free(Box::leak(Box::new(move |call: &cara_embassy::Call<()>, parameters: &mut _| {
         service.diary().begin(now());
         let result = (service.body)(&Asked { caller: call.caller.clone(), at: now() }, parameters);
         service.diary().end(now());
@@ -74,7 +65,7 @@ async fn take_calls(node: Rc<BoardNode>, board: Board, unit: Handle, function: S
 
 async fn serve(unit: Handle, service: &Service, call: TakenCall<()>, parameters: &mut ParametersView) {
     service.diary().begin(now());
-    let result = run(unit, service, &call.caller, parameters).await;
+    let result = run(unit, service, &call, parameters).await;
     if result.is_ok() {
         service.diary().end(now());
     }
@@ -84,15 +75,18 @@ async fn serve(unit: Handle, service: &Service, call: TakenCall<()>, parameters:
 async fn run(
     unit: Handle,
     service: &Service,
-    caller: &Identity,
+    call: &TakenCall<()>,
     parameters: &mut ParametersView,
 ) -> Result<(), ServiceError> {
     if let Some(function) = &service.calls_back {
         let patient = RequestOptions { timeout: Some(Duration::from_secs(8)), ..RequestOptions::default() };
-        let called = unit.peer_of(caller).block_request_with(function, parameters, &patient).await;
+        let called = unit.peer_of(&call.caller).block_request_with(function, parameters, &patient).await;
         called.map_err(|_| ServiceError::NotReady)?;
     }
-    (service.body)(&Asked { caller: caller.clone(), at: now() }, parameters)?;
+    (service.body)(&Asked { caller: call.caller.clone(), at: now() }, parameters)?;
     embassy_time::Timer::after_micros(service.takes.as_micros()).await;
+    while let Some(pause) = service.moves_on(call.lease.is_some_and(|lease| lease.is_live()), parameters) {
+        embassy_time::Timer::after_micros(pause.as_micros()).await;
+    }
     Ok(())
 }

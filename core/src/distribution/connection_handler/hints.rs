@@ -1,0 +1,186 @@
+//! What broadcasts say of where a node may be: hints, which anybody who has recorded one can give.
+//!
+//! A hint leads to one question with a fresh nonce, to the address that it came from, and to nothing else; what is dialled
+//! has answered it. An address that has not answered is asked later and later, however often it is heard, and takes no
+//! place from another one. The unit's own search goes on beside: a hint delays it once, by a second at most.
+
+use core::net::{IpAddr, SocketAddr};
+
+use super::known::NodeState;
+use super::search::{alone, pause};
+use super::{Node, NodeCounter, Target};
+use crate::config::{FIRST_SEARCH, LONGEST_SEARCH};
+use crate::distribution::authenticator::Authenticator;
+use crate::distribution::hello::Manager;
+use crate::distribution::identity::Identity;
+use crate::host::mailman::Mailman;
+use crate::storage::Storage;
+use crate::time::{Duration, Instant};
+
+/// Addresses that are asked side by side.
+const HINTS: usize = 4;
+/// An address that was asked keeps its place for so long: no more than four a second are asked, however many are told.
+const STAY: Duration = Duration::from_secs(1);
+/// The unit's own search waits for such a question so long at most.
+const LONGEST_WAIT: Duration = Duration::from_secs(1);
+/// One that has asked so and hears nothing broadcasts after this and a random part of it, if it would not do so earlier.
+const UNANSWERED: Duration = Duration::from_millis(500);
+/// A host's question counts once in this time, the longest for which units hold back.
+const HOST_PAUSE: Duration = LONGEST_SEARCH.times(2);
+/// Hosts that are remembered for that.
+const HOSTS: usize = 16;
+
+/// One address that a broadcast came from.
+#[derive(Clone, Debug)]
+struct Hint {
+    from: SocketAddr,
+    /// Who is said to be there.
+    who: Identity,
+    /// When it is asked; `None` once it was.
+    due: Option<Instant>,
+    /// How often it was asked.
+    asked: u8,
+    /// It is not asked again earlier.
+    not_before: Instant,
+    /// When it was asked last.
+    since: Instant,
+}
+
+/// The addresses that are asked, or were a short while ago.
+#[derive(Clone, Debug)]
+pub(super) struct Hints {
+    list: heapless::Vec<Hint, HINTS>,
+}
+
+impl Hints {
+    pub(super) const fn new() -> Self {
+        Self { list: heapless::Vec::new() }
+    }
+
+    pub(super) fn next(&self) -> Instant {
+        self.list.iter().filter_map(|hint| hint.due).min().unwrap_or(Instant::FAR_FUTURE)
+    }
+
+    /// Plans a question. `false` where one is planned, or as many addresses as may be are asked.
+    fn plan(&mut self, now: Instant, from: SocketAddr, who: &Identity, due: Instant) -> bool {
+        if let Some(known) = self.list.iter_mut().find(|hint| is_same_host(hint.from, from) && hint.who == *who) {
+            let is_free = known.due.is_none();
+            if is_free {
+                (known.from, known.due) = (from, Some(due.max(known.not_before)));
+            }
+            return is_free;
+        }
+        if self.list.is_full() {
+            let rests = |hint: &Hint| hint.due.is_none() && hint.since + STAY <= now;
+            let Some(old) = self.list.iter().position(rests) else { return false };
+            self.list.swap_remove(old);
+        }
+        let who = who.clone();
+        self.list.push(Hint { from, who, due: Some(due), asked: 0, not_before: now, since: now }).is_ok()
+    }
+
+    /// A question that is due.
+    fn take(&mut self, now: Instant) -> Option<(SocketAddr, Identity)> {
+        let hint = self.list.iter_mut().find(|hint| hint.due.is_some_and(|due| due <= now))?;
+        hint.due = None;
+        (hint.since, hint.not_before) = (now, now + pause(hint.asked));
+        hint.asked = hint.asked.saturating_add(1);
+        Some((hint.from, hint.who.clone()))
+    }
+
+    /// Somebody is there: what leads to it later begins anew.
+    pub(super) fn forget(&mut self, who: &Identity) {
+        self.list.retain(|hint| hint.who != *who);
+    }
+}
+
+/// Units of one host have ports of their own. On loopback all are of this host, and told apart by them.
+fn is_same_host(one: SocketAddr, other: SocketAddr) -> bool {
+    one.ip() == other.ip() && (!one.ip().is_loopback() || one.port() == other.port())
+}
+
+/// Which hosts' questions have counted a short while ago: what anybody can send again puts this unit's own question off
+/// once, and not for as long as somebody likes.
+#[derive(Clone, Debug)]
+pub(super) struct Hosts {
+    seed: u32,
+    /// Marks of hosts, the one that counted first in front.
+    list: heapless::Deque<(u32, Instant), HOSTS>,
+}
+
+impl Hosts {
+    pub(super) const fn new(seed: u32) -> Self {
+        Self { seed, list: heapless::Deque::new() }
+    }
+
+    /// Whether a question from there counts now; from here on it does not for a while.
+    pub(super) fn heeds(&mut self, now: Instant, from: SocketAddr) -> bool {
+        while self.list.front().is_some_and(|(_, at)| *at + HOST_PAUSE <= now) {
+            self.list.pop_front();
+        }
+        let host = self.mark(from);
+        if self.list.iter().any(|(known, _)| *known == host) {
+            return false;
+        }
+        if self.list.is_full() {
+            self.list.pop_front();
+        }
+        self.list.push_back((host, now)).is_ok()
+    }
+
+    /// 32 bits for a host. Two with one mark cost a search more, no more.
+    fn mark(&self, from: SocketAddr) -> u32 {
+        let port = if from.ip().is_loopback() { from.port() } else { 0 };
+        let host = match from.ip() {
+            IpAddr::V4(host) => u32::from_le_bytes(host.octets()),
+            IpAddr::V6(host) => host.segments().iter().fold(0, |sum, part| mix(sum ^ u32::from(*part))),
+        };
+        mix(mix(self.seed ^ host) ^ u32::from(port))
+    }
+}
+
+const fn mix(bits: u32) -> u32 {
+    (bits ^ (bits >> 15)).wrapping_mul(0x9E37_79B1)
+}
+
+impl<S: Storage> Node<S> {
+    /// A broadcast says that a node which this unit dials is there: it is asked after `delay`, unless it is connected.
+    pub(super) fn hinted(&mut self, now: Instant, from: SocketAddr, who: &Identity, delay: Duration) {
+        let away = self.node(who).is_none_or(|known| known.state == NodeState::Away && known.not_before <= now);
+        if !away || matches!(self.config.target, Target::Fixed(..)) {
+            return;
+        }
+        if !self.hints.plan(now, from, who, now + delay) {
+            self.counters.add(NodeCounter::HintsIgnored, 1);
+        }
+    }
+
+    pub(super) fn poll_hints(&mut self, now: Instant, mailman: &mut impl Mailman, authenticator: &impl Authenticator) {
+        while let Some((to, who)) = self.hints.take(now) {
+            self.ask(to, &who, mailman, authenticator);
+            if self.search.next != Instant::FAR_FUTURE {
+                let soon = now + UNANSWERED + alone(&mut self.random, UNANSWERED);
+                self.search.next = self.search.next.min(soon);
+            }
+        }
+    }
+
+    /// A question to one node is about to go out, and its answer makes a broadcast needless: the search waits for it, once
+    /// and not for long. `false` where none is.
+    pub(super) fn waits_for_hints(&mut self, now: Instant) -> bool {
+        let due = self.hints.next();
+        if self.search.waited || due == Instant::FAR_FUTURE {
+            return false;
+        }
+        self.search.waited = true;
+        self.search.next = due.min(now + LONGEST_WAIT) + alone(&mut self.random, FIRST_SEARCH);
+        true
+    }
+
+    /// Asks one node alone. It answers whoever asks so, and at once.
+    fn ask(&mut self, to: SocketAddr, who: &Identity, mailman: &mut impl Mailman, authenticator: &impl Authenticator) {
+        let Ok(wanted) = Manager::new(who.name(), who.id()) else { return };
+        let sent = self.say_who_has(Some(wanted), 0, authenticator, |datagram| mailman.send_to(to, datagram));
+        self.counters.add(if sent { NodeCounter::HintsAsked } else { NodeCounter::SendFailed }, 1);
+    }
+}

@@ -1,0 +1,113 @@
+//! Whether a live unit has this unit's own identity already: asked before a manager starts.
+//!
+//! The question is a who-has for the unit itself, with a nonce of its own, and only holders of this identity's keys can
+//! answer it. Of two units that ask at once the one with the greater epoch answers, so that one of them starts.
+
+use core::net::SocketAddr;
+
+use super::authenticator::Authenticator;
+use super::datagram::{Announce, Datagram, SEARCH_BYTES, WhoHas};
+use super::hello::Manager;
+use super::identity::{Epoch, Fleet, Identity};
+use crate::time::Duration;
+
+/// How long a manager waits for an answer before it starts. A unit that is alive answers at once.
+pub const PRESENCE_WAIT: Duration = Duration::from_millis(300);
+/// Pause between two questions: one that is lost must not start a second manager.
+pub const PRESENCE_PAUSE: Duration = Duration::from_millis(90);
+
+/// A question after the unit's own identity. See the [module](self).
+#[derive(Clone, Debug)]
+pub struct Presence {
+    identity: Identity,
+    fleet: Fleet,
+    epoch: Epoch,
+    nonce: u64,
+    sequence: u32,
+}
+
+/// What a datagram means to a unit that asks.
+#[derive(Debug, PartialEq, Eq)]
+pub enum Heard<'o> {
+    /// Nothing.
+    Nothing,
+    /// Another one asks the same and is to give way: the answer, for where the datagram came from.
+    Answer(&'o [u8]),
+    /// A live unit has this identity; where it can be dialled.
+    Running(SocketAddr),
+}
+
+impl Presence {
+    /// A question of a unit that has not started. The nonce is fresh.
+    pub const fn new(identity: Identity, fleet: Fleet, epoch: Epoch, nonce: u64) -> Self {
+        // 0 stands for an answer to nobody.
+        Self { identity, fleet, epoch, nonce: nonce | 1, sequence: 0 }
+    }
+
+    /// The datagram to broadcast, in `out`.
+    pub fn question<'o>(
+        &mut self,
+        authenticator: &impl Authenticator,
+        out: &'o mut [u8; SEARCH_BYTES],
+    ) -> Option<&'o [u8]> {
+        self.sequence = self.sequence.wrapping_add(1);
+        let who_has = WhoHas {
+            identity: self.identity.clone(),
+            epoch: self.epoch,
+            sequence: self.sequence,
+            nonce: self.nonce,
+            wanted: Some(Manager::new(self.identity.name(), self.identity.id()).ok()?),
+            tcp_port: 0,
+            expected: 1,
+            known: heapless::Vec::new(),
+        };
+        who_has.encode(self.fleet, authenticator, out)
+    }
+
+    /// Looks at a datagram that came while the unit waits. Only an answer to this very question tells of a live unit.
+    pub fn hear<'o>(
+        &self,
+        from: SocketAddr,
+        bytes: &[u8],
+        authenticator: &impl Authenticator,
+        out: &'o mut [u8; SEARCH_BYTES],
+    ) -> Heard<'o> {
+        match Datagram::decode(bytes, self.fleet, authenticator) {
+            Ok(Datagram::Announce(announce)) if self.is_answer(&announce) => {
+                Heard::Running(SocketAddr::new(from.ip(), announce.tcp_port))
+            }
+            Ok(Datagram::WhoHas(who_has)) if self.gives_way(&who_has) => {
+                self.answer(who_has.nonce, authenticator, out).map_or(Heard::Nothing, Heard::Answer)
+            }
+            _ => Heard::Nothing,
+        }
+    }
+
+    /// What this unit has said itself tells of nobody else, whoever says it again.
+    fn is_answer(&self, announce: &Announce) -> bool {
+        announce.identity == self.identity && announce.nonce == self.nonce && announce.epoch != self.epoch
+    }
+
+    fn gives_way(&self, who_has: &WhoHas) -> bool {
+        let asks_the_same = who_has.wanted.as_ref().is_some_and(|wanted| wanted.is(&self.identity));
+        who_has.identity == self.identity && asks_the_same && who_has.epoch < self.epoch
+    }
+
+    fn answer<'o>(
+        &self,
+        nonce: u64,
+        authenticator: &impl Authenticator,
+        out: &'o mut [u8; SEARCH_BYTES],
+    ) -> Option<&'o [u8]> {
+        let announce = Announce {
+            identity: self.identity.clone(),
+            epoch: self.epoch,
+            sequence: self.sequence,
+            nonce,
+            tcp_port: 0,
+            room: 0,
+            expected: 1,
+        };
+        announce.encode(self.fleet, authenticator, Some(&self.identity), out)
+    }
+}

@@ -1,0 +1,233 @@
+//! Leases that the peer's calls hold on functions of this unit.
+
+use super::inbound::Outcome;
+use super::timing::made_at;
+use super::{Event, Session};
+use crate::config::LEASES;
+use crate::distribution::function_list::{Generation, Slot};
+use crate::distribution::message::{Control, Release, Renewal};
+use crate::error::{Error, Limit};
+use crate::host::connections::LinkCounter;
+use crate::host::mailman::Mailman;
+use crate::host::secure::Secure;
+use crate::services::Context;
+use crate::services::calls::CallHead;
+use crate::services::lease::{Granted, Lease, LeaseEnd, Order, Service};
+use crate::storage::{Buffers, Storage};
+use crate::time::{Duration, Instant};
+
+/// Ends of leases that the peer is still to be told. One that finds no place is told when the peer renews it.
+pub(super) type Ends = heapless::Vec<(u32, LeaseEnd), LEASES>;
+
+impl<S: Storage, C: Secure> Session<S, C> {
+    /// A call begins the lease of its function, as of when it was made. It takes the place of an earlier call's at once,
+    /// but not that of a lease that is dead: its hook comes first.
+    pub(super) fn grant<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        head: &CallHead,
+        length: Duration,
+    ) -> Result<Option<Order>, Error> {
+        let end = Lease::seen_end(head.made + length);
+        if end <= cx.now {
+            return Err(Error::Expired);
+        }
+        let known = self.granted.iter().position(|known| known.slot == head.slot);
+        let earlier = known.and_then(|index| self.granted.get(index)).copied();
+        if earlier.is_some_and(|earlier| earlier.end <= cx.now) {
+            return Err(Error::Busy);
+        }
+        if earlier.is_none() && self.granted.is_full() {
+            return Err(Error::Full(Limit::Leases));
+        }
+        let order = match service_lease(cx, head.slot, head.generation).map(|lease| lease.begin(cx.now, end)) {
+            None => None,
+            Some(Some(order)) => Some(order),
+            Some(None) => {
+                // A reader has looked later than at `cx.now`, and has stopped the motion.
+                if let Some(index) = known {
+                    self.cut_lease(cx, index);
+                }
+                return Err(Error::Busy);
+            }
+        };
+        let (slot, generation) = (head.slot, head.generation);
+        let granted = Granted { call: head.id, slot, generation, order, length, end };
+        self.timers.lease = self.timers.lease.min(end);
+        match self.granted.iter_mut().find(|known| known.slot == slot) {
+            Some(known) => {
+                let replaced = core::mem::replace(known, granted).call;
+                self.tell_end(cx, replaced, LeaseEnd::Replaced);
+            }
+            None => self.granted.push(granted).map_err(|_| Error::Full(Limit::Leases))?,
+        }
+        Ok(order)
+    }
+
+    /// The caller still wants a call: its lease goes on, as of when the renewal was made.
+    pub(super) fn renewed<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        renewal: &Renewal,
+    ) {
+        let Some(index) = self.granted.iter().position(|granted| granted.call == renewal.call) else {
+            self.link.counters.add(LinkCounter::RenewalsIgnored, 1);
+            // A call that is on its way or waits for its turn has no lease yet.
+            let Renewal { call, class, .. } = *renewal;
+            if self.calls.has_arrived(class, call) && !self.calls.is_waiting(class, call) {
+                self.tell_end(cx, call, LeaseEnd::Expired);
+            }
+            return;
+        };
+        let Some(granted) = self.granted.get(index).copied() else { return };
+        // A function that has been replaced since started it, and nothing of it is prolonged.
+        if cx.functions.lookup(granted.slot, granted.generation).is_err() {
+            self.link.counters.add(LinkCounter::RenewalsIgnored, 1);
+            return;
+        }
+        let Some(made) = made_at(cx.now, renewal.stamp, renewal.since) else { return };
+        let end = Lease::seen_end(made + granted.length);
+        // What was late on its way takes nothing away from what came before it, and revives nothing.
+        if end > granted.end && granted.end > cx.now {
+            self.prolong(cx, index, end);
+        }
+    }
+
+    fn prolong<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        index: usize,
+        end: Instant,
+    ) {
+        let Some(granted) = self.granted.get_mut(index) else { return };
+        let lease = service_lease(cx, granted.slot, granted.generation).zip(granted.order);
+        if lease.is_none_or(|(lease, order)| lease.renew(order, end)) {
+            granted.end = end;
+        } else {
+            // A reader has looked later than at `cx.now`, or a call of another peer has taken the lease over.
+            self.cut_lease(cx, index);
+        }
+    }
+
+    /// The application has finished what calls of the leased function started: no renewal keeps it alive, no hook runs.
+    pub fn end_lease<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>, slot: Slot) {
+        if let Some(index) = self.granted.iter().position(|granted| granted.slot == slot) {
+            let granted = self.granted.swap_remove(index);
+            end_service_lease(cx, &granted);
+            self.tell_end(cx, granted.call, LeaseEnd::Finished);
+        }
+    }
+
+    /// A call has failed here: the lease that it holds, if it does, expires at once.
+    pub(super) fn cut_call<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        call: u32,
+    ) {
+        if let Some(index) = self.granted.iter().position(|granted| granted.call == call) {
+            self.cut_lease(cx, index);
+        }
+    }
+
+    /// Lets a lease expire at once.
+    pub(super) fn cut_lease<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        index: usize,
+    ) {
+        let Some(granted) = self.granted.get_mut(index) else { return };
+        granted.end = cx.now;
+        self.timers.lease = cx.now;
+        if let Some((lease, order)) = service_lease(cx, granted.slot, granted.generation).zip(granted.order) {
+            lease.cut(order);
+        }
+    }
+
+    /// The caller gave up a call: its lease ends now, as if it had expired. If it waits for its turn, or is still on its
+    /// way, it does not begin.
+    pub(super) fn released<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        release: Release,
+    ) -> Outcome {
+        let Release { call, class } = release;
+        self.calls.give_up(class, call);
+        self.end_released(cx, |granted| granted.call == call)
+    }
+
+    /// The same for all calls of a function up to `id`.
+    pub(super) fn released_all<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        slot: Slot,
+        id: u32,
+    ) -> Outcome {
+        self.publishing.release(slot, id);
+        self.end_released(cx, |granted| granted.slot == slot && granted.call <= id)
+    }
+
+    fn end_released<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        is_released: impl Fn(&Granted) -> bool,
+    ) -> Outcome {
+        let Some(index) = self.granted.iter().position(is_released) else { return Outcome::Nothing };
+        let granted = self.granted.swap_remove(index);
+        if end_service_lease(cx, &granted) { Event::LeaseExpired(granted.slot).into() } else { Outcome::Nothing }
+    }
+
+    /// Ends a lease that is due; its function, whose hook is to run.
+    pub(super) fn expire_lease<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+    ) -> Option<Slot> {
+        while let Some(index) = self.granted.iter().position(|granted| granted.end <= cx.now) {
+            let granted = self.granted.swap_remove(index);
+            if end_service_lease(cx, &granted) {
+                self.link.counters.add(LinkCounter::LeasesExpired, 1);
+                self.tell_end(cx, granted.call, LeaseEnd::Expired);
+                return Some(granted.slot);
+            }
+            self.tell_end(cx, granted.call, LeaseEnd::Replaced);
+        }
+        self.timers.lease = self.granted.iter().map(|granted| granted.end).min().unwrap_or(Instant::FAR_FUTURE);
+        None
+    }
+
+    fn tell_end<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        call: u32,
+        why: LeaseEnd,
+    ) {
+        if !self.send_control(cx, &Control::LeaseEnded { call, why }) {
+            let _ = self.ends.push((call, why));
+        }
+    }
+
+    /// Tells the peer of ends that there was no room for.
+    pub(super) fn send_ends<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+        while let Some(&(call, why)) = self.ends.first()
+            && self.send_control(cx, &Control::LeaseEnded { call, why })
+        {
+            self.ends.remove(0);
+        }
+    }
+}
+
+fn service_lease<'c, S: Storage, M: Mailman, B: Buffers<S>, H: Service>(
+    cx: &Context<'c, S, M, B, H>,
+    slot: Slot,
+    generation: Generation,
+) -> Option<&'c Lease> {
+    cx.functions.lookup(slot, generation).ok().and_then(|function| function.handler.lease())
+}
+
+/// `false` when a call of another peer holds the lease now: what goes on is that one's.
+pub(super) fn end_service_lease<S: Storage, M: Mailman, B: Buffers<S>, H: Service>(
+    cx: &Context<'_, S, M, B, H>,
+    granted: &Granted,
+) -> bool {
+    let lease = service_lease(cx, granted.slot, granted.generation).zip(granted.order);
+    lease.is_none_or(|(lease, order)| lease.end(order))
+}

@@ -1,0 +1,199 @@
+//! Leases that calls of this unit hold at the peer: renewed until they are released, and released when the call fails.
+
+use super::{Phase, Session};
+use crate::config::{LEASES, Priority};
+use crate::distribution::function_list::Slot;
+use crate::distribution::message::{Release, Renewal, RequestHeader, SessionBody};
+use crate::error::{Error, Limit};
+use crate::host::connections::LinkCounter;
+use crate::host::frame::Frame;
+use crate::host::mailman::Mailman;
+use crate::host::secure::Secure;
+use crate::services::Context;
+use crate::services::lease::{Held, Service};
+use crate::services::requests::{CallId, Pending};
+use crate::storage::{Buffers, Storage};
+use crate::time::{Duration, Instant};
+
+/// A held lease is renewed this often within its length, so that lost renewals do not end it.
+const RENEWALS_PER_LEASE: u64 = 4;
+/// After this a release that the stream had no room for is tried again, if the stream has not become writable before.
+const RETRY: Duration = Duration::from_millis(20);
+
+/// Releases of whole functions that are still to be sent in the stream: the function, and the newest call.
+pub(super) type Releases = heapless::Vec<(Slot, CallId), LEASES>;
+
+impl<S: Storage, C: Secure> Session<S, C> {
+    /// Whether this unit renews the lease of a call.
+    pub fn holds(&self, call: CallId) -> bool {
+        self.held.iter().any(|held| held.call == call && !held.is_released)
+    }
+
+    /// [`Error::Full`] when a call of a leased function could not be renewed: there is no room, and no earlier call of the
+    /// same function that would give way.
+    pub(super) fn check_held(&self, wanted: bool, slot: Slot) -> Result<(), Error> {
+        let fits = !wanted || !self.held.is_full() || self.oldest_held(slot).is_some();
+        if fits { Ok(()) } else { Err(Error::Full(Limit::Leases)) }
+    }
+
+    fn oldest_held(&self, slot: Slot) -> Option<usize> {
+        let of_slot = self.held.iter().enumerate().filter(|(_, held)| held.slot == slot && !held.is_released);
+        of_slot.min_by_key(|(_, held)| held.call).map(|(index, _)| index)
+    }
+
+    /// Renews the lease that a call has begun, or will begin, from here on.
+    pub(super) fn hold_lease<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        header: &RequestHeader,
+        class: Priority,
+        lease: Duration,
+    ) {
+        if self.held.is_full()
+            && let Some(oldest) = self.oldest_held(header.slot)
+        {
+            self.held.swap_remove(oldest);
+        }
+        let every = lease.divided_by(RENEWALS_PER_LEASE);
+        let (call, slot, next) = (CallId(header.id), header.slot, cx.now + every);
+        let _ = self.held.push(Held { call, slot, class, every, next, is_released: false });
+        self.timers.renewal = self.timers.renewal.min(next);
+    }
+
+    pub(super) fn renew_leases<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+        let (stamp, since) = self.clock.tell(cx.now);
+        let now = cx.now;
+        for index in 0..self.held.len() {
+            let due = self.held.get_mut(index).filter(|held| held.next <= now && !held.is_released);
+            let Some(held) = due else { continue };
+            held.next = now + held.every;
+            let renewal = Renewal { call: held.call.0, class: held.class, stamp, since };
+            let body = SessionBody::renewal(&renewal);
+            // Both ways: one lost datagram must not stop a vehicle, nor must a retransmission in the stream.
+            self.send_datagram(cx, &body, &[]);
+            self.link.send_frame(&Frame::Session(&body));
+        }
+        let renewed = self.held.iter().filter(|held| !held.is_released);
+        self.timers.renewal = renewed.map(|held| held.next).min().unwrap_or(Instant::FAR_FUTURE);
+        self.flush(cx);
+    }
+
+    /// The peer has ended the lease of a call.
+    pub(super) fn forget_held(&mut self, call: CallId) -> Option<Held> {
+        let index = self.held.iter().position(|held| held.call == call && !held.is_released)?;
+        Some(self.held.swap_remove(index))
+    }
+
+    /// The caller gives a call up: its reply, should it still come, counts as late, and the lease that it holds, or would
+    /// begin, is released. Other calls are untouched. Also for a call that has been answered, whose lease goes on.
+    pub fn cancel<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>, id: CallId) {
+        let pending = self.requests.close(id);
+        if pending.is_some() {
+            self.link.counters.add(LinkCounter::CallsTimedOut, 1);
+        }
+        self.let_go(cx, id, pending);
+    }
+
+    /// A call has failed, or its caller does not want it any more: its lease is renewed no longer, and the peer is told,
+    /// wherever the call is. `pending` is what was known of it while it waited for its reply.
+    pub(super) fn let_go<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        id: CallId,
+        pending: Option<Pending>,
+    ) {
+        let held = self.forget_held(id);
+        let waited = pending.and_then(|pending| pending.leased);
+        let Some(class) = held.map(|held| held.class).or(waited) else { return };
+        if self.phase != Phase::Live || self.send_release(cx, id, class) {
+            return;
+        }
+        match (pending, held) {
+            (Some(pending), _) => self.requests.keep_release(pending),
+            (None, Some(held)) => drop(self.held.push(Held { is_released: true, ..held })),
+            (None, None) => {}
+        }
+        self.timers.release = cx.now + RETRY;
+    }
+
+    /// Gives up the leases that calls of a function of the peer have begun or will begin: what they started stops.
+    ///
+    /// [`Error::Full`] where the peer can be told in no way now: nothing is renewed any more, and it may be tried again.
+    pub fn release<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        slot: Slot,
+    ) -> Result<(), Error> {
+        if self.phase != Phase::Live {
+            return Err(Error::NotConnected);
+        }
+        self.held.retain(|held| held.slot != slot || held.is_released);
+        let newest = self.requests.newest();
+        if self.send_release_all(cx, slot, newest) {
+            return Ok(());
+        }
+        self.timers.release = cx.now + RETRY;
+        match self.releases.iter_mut().find(|(known, _)| *known == slot) {
+            Some((_, id)) => *id = newest,
+            None => self.releases.push((slot, newest)).map_err(|_| Error::Full(Limit::SendQueue))?,
+        }
+        Ok(())
+    }
+
+    /// Sends the releases that there was no room for, as far as there is now.
+    pub(super) fn send_releases<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+        if self.timers.release == Instant::FAR_FUTURE {
+            return;
+        }
+        self.timers.release = cx.now + RETRY;
+        while let Some(&(slot, id)) = self.releases.last() {
+            if !self.send_release_all(cx, slot, id) {
+                return;
+            }
+            self.releases.pop();
+        }
+        while let Some(Held { call, class, .. }) = self.held.iter().find(|held| held.is_released).copied() {
+            if !self.send_release(cx, call, class) {
+                return;
+            }
+            self.held.retain(|held| held.call != call);
+        }
+        while let Some((id, class)) = self.requests.release_due() {
+            if !self.send_release(cx, id, class) {
+                return;
+            }
+            self.requests.released(id);
+        }
+        self.timers.release = Instant::FAR_FUTURE;
+    }
+
+    fn send_release<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        id: CallId,
+        class: Priority,
+    ) -> bool {
+        self.send_both_ways(cx, &SessionBody::release(&Release { call: id.0, class }))
+    }
+
+    fn send_release_all<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        slot: Slot,
+        id: CallId,
+    ) -> bool {
+        self.send_both_ways(cx, &SessionBody::release_all(slot, id.0))
+    }
+
+    /// As a datagram and in the stream; `false` when the stream has no room.
+    fn send_both_ways<M: Mailman, B: Buffers<S>, H: Service>(
+        &mut self,
+        cx: &mut Context<'_, S, M, B, H>,
+        body: &[u8],
+    ) -> bool {
+        self.send_datagram(cx, body, &[]);
+        let kept = self.link.send_frame(&Frame::Session(body));
+        self.flush(cx);
+        kept
+    }
+}

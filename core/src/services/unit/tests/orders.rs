@@ -1,0 +1,323 @@
+//! A lease belongs to one call: the failure of a call ends what it started, and nothing else.
+
+use super::super::{Call, RequestOptions};
+use super::net::Datagrams;
+use super::pair::{Happened, Pair};
+use super::{none, x};
+use crate::config::Priority;
+use crate::distribution::function_list::Slot;
+use crate::distribution::message::{Renewal, SessionBody};
+use crate::error::Error;
+use crate::host::connections::LinkCounter;
+use crate::services::lease::LeaseEnd;
+use crate::services::requests::CallId;
+use crate::time::Duration;
+
+const LEASE: Duration = Duration::from_millis(500);
+const TIMEOUT: Duration = Duration::from_millis(300);
+
+fn millis(millis: u64) -> Duration {
+    Duration::from_millis(millis)
+}
+
+/// A pair whose vehicle offers `go()`, answered by the test.
+fn vehicle() -> (Pair, Slot) {
+    let mut pair = Pair::live();
+    let slot = pair.agv.offer_held_lease("go()", LEASE);
+    pair.publish();
+    (pair, slot)
+}
+
+/// Calls `go()`; in classes of their own, two calls run side by side.
+fn go(pair: &mut Pair, class: Priority, renew_lease: bool) -> CallId {
+    let options =
+        RequestOptions { renew_lease, priority: Some(class), timeout: Some(TIMEOUT), ..RequestOptions::default() };
+    pair.manager.request_with("go", &none(), &options, true).unwrap()
+}
+
+/// The same, begun; what its handler was given.
+fn begun(pair: &mut Pair, class: Priority) -> (CallId, Call) {
+    let id = go(pair, class, true);
+    pair.settle();
+    (id, *pair.agv.held.last().unwrap())
+}
+
+fn expirations(pair: &Pair) -> usize {
+    pair.agv.count(|happened| matches!(happened, Happened::LeaseExpired(_)))
+}
+
+fn is_told(pair: &Pair, call: CallId, why: LeaseEnd) -> bool {
+    pair.manager.has(&Happened::LeaseEnded(call, why))
+}
+
+#[test]
+fn a_call_that_times_out_is_released_at_once_renewed_or_not() {
+    for renewed in [true, false] {
+        let (mut pair, slot) = vehicle();
+        let id = go(&mut pair, Priority::Normal, renewed);
+        pair.run(TIMEOUT - millis(1));
+        assert!(pair.agv.is_live(slot));
+        pair.run(millis(1));
+        assert_eq!(pair.manager.outcome(id), Some(Err(Error::TimedOut)));
+        assert_eq!((pair.agv.is_live(slot), expirations(&pair)), (false, 1), "renewed: {renewed}");
+        pair.agv.answer_held(Ok(&*none()));
+        pair.run(LEASE.times(2));
+        assert_eq!((pair.agv.is_live(slot), expirations(&pair)), (false, 1));
+        assert_eq!(pair.agv.counter(LinkCounter::RenewalsIgnored), 0, "it is renewed no more");
+    }
+}
+
+#[test]
+fn a_call_whose_answer_does_not_come_through_is_released_at_once() {
+    let (mut pair, slot) = vehicle();
+    let id = go(&mut pair, Priority::Normal, true);
+    pair.settle();
+    (pair.agv.net.frozen, pair.agv.net.datagrams) = (true, Datagrams::Lost);
+    pair.agv.answer_held(Ok(&*none()));
+    pair.run(TIMEOUT);
+    assert_eq!(pair.manager.outcome(id), Some(Err(Error::TimedOut)));
+    assert_eq!((pair.agv.is_live(slot), expirations(&pair)), (false, 1));
+    pair.agv.net.frozen = false;
+    pair.run(LEASE.times(2));
+    assert_eq!((pair.agv.is_live(slot), expirations(&pair)), (false, 1));
+}
+
+#[test]
+fn a_cancelled_call_is_released_at_once_waited_for_or_answered() {
+    for answered in [false, true] {
+        let (mut pair, slot) = vehicle();
+        let (id, _) = begun(&mut pair, Priority::Normal);
+        if answered {
+            pair.agv.answer_held(Ok(&*none()));
+            pair.settle();
+        }
+        pair.run(millis(100));
+        assert!(pair.agv.is_live(slot) && pair.manager.session.holds(id));
+        pair.manager.cancel(id);
+        pair.settle();
+        assert_eq!((pair.agv.is_live(slot), expirations(&pair)), (false, 1), "answered: {answered}");
+        assert!(!pair.manager.session.holds(id));
+        pair.manager.cancel(id);
+        pair.run(LEASE);
+        assert_eq!(expirations(&pair), 1);
+    }
+}
+
+#[test]
+fn a_newer_call_replaces_an_older_one_for_ever_and_without_the_hook() {
+    let (mut pair, slot) = vehicle();
+    let (first, old) = begun(&mut pair, Priority::Normal);
+    let (second, new) = begun(&mut pair, Priority::High);
+    assert!(is_told(&pair, first, LeaseEnd::Replaced));
+    assert!(!pair.manager.session.holds(first) && pair.manager.session.holds(second));
+    assert!(!pair.agv.goes_on(&old) && pair.agv.goes_on(&new));
+    // The end of the first is no matter of the second.
+    pair.manager.cancel(first);
+    pair.settle();
+    assert!(pair.agv.goes_on(&new) && pair.agv.is_live(slot));
+    pair.agv.answer_held(Err(Error::Busy));
+    pair.settle();
+    assert!(pair.agv.goes_on(&new));
+    assert_eq!(expirations(&pair), 0);
+    pair.manager.cancel(second);
+    pair.settle();
+    assert_eq!((pair.agv.goes_on(&new), expirations(&pair)), (false, 1));
+    let (_, third) = begun(&mut pair, Priority::Low);
+    pair.agv.answer_held(Ok(&*none()));
+    pair.run(LEASE.divided_by(2));
+    assert!(pair.agv.goes_on(&third) && !pair.agv.goes_on(&old) && !pair.agv.goes_on(&new));
+}
+
+#[test]
+fn a_call_that_is_released_on_its_way_does_not_begin_and_those_beside_it_do() {
+    let (mut pair, slot) = vehicle();
+    pair.manager.net.frozen = true;
+    let options = RequestOptions { renew_lease: false, ..RequestOptions::default() };
+    let calls = [0; 3].map(|_| pair.manager.request_with("go", &none(), &options, true).unwrap());
+    pair.manager.cancel(calls[1]);
+    pair.settle();
+    assert!(pair.agv.counter(LinkCounter::DatagramsReceived) > 0, "the release overtakes the requests");
+    pair.manager.net.frozen = false;
+    for _ in 0..2 {
+        pair.settle();
+        assert!(pair.agv.is_live(slot));
+        pair.agv.answer_held(Ok(&*none()));
+    }
+    pair.settle();
+    assert_eq!((pair.agv.ran().len(), pair.agv.held.len()), (2, 0));
+    assert!(pair.manager.outcome(calls[0]).unwrap().is_ok() && pair.manager.outcome(calls[2]).unwrap().is_ok());
+    assert_eq!(pair.manager.outcome(calls[1]), None);
+    pair.run(LEASE);
+}
+
+#[test]
+fn a_best_effort_call_that_arrives_behind_its_release_does_not_begin() {
+    let mut pair = Pair::live();
+    let slot = pair.agv.offer_leased("go()", LEASE);
+    pair.publish();
+    let id = pair.manager.session.requests.newest().0 + 1;
+    let nonce = pair.agv.session.nonce();
+    let release = crate::distribution::message::Release { call: id, class: Priority::Normal };
+    pair.agv.hear_datagram(nonce, &SessionBody::release(&release));
+    let delivery = super::super::Delivery::BestEffort;
+    let options = RequestOptions { delivery, ..RequestOptions::default() };
+    pair.manager.request_with("go", &none(), &options, false).unwrap();
+    pair.settle();
+    assert!(pair.agv.ran().is_empty() && !pair.agv.is_live(slot));
+    pair.manager.request_with("go", &none(), &options, false).unwrap();
+    pair.settle();
+    assert_eq!(pair.agv.ran().len(), 1);
+}
+
+#[test]
+fn a_release_that_finds_no_room_is_sent_when_there_is_some() {
+    let (mut pair, slot) = vehicle();
+    let (first, _) = begun(&mut pair, Priority::Normal);
+    pair.agv.answer_held(Ok(&*none()));
+    pair.settle();
+    // The stream is stuck and full to the brim; no datagram passes.
+    (pair.manager.net.frozen, pair.manager.net.capacity, pair.manager.net.datagrams) = (true, 0, Datagrams::Lost);
+    for _ in 0..1_000 {
+        pair.manager.challenge();
+    }
+    let withheld = pair.manager.counter(LinkCounter::FramesWithheld);
+    let second = go(&mut pair, Priority::High, true);
+    pair.manager.cancel(first);
+    pair.manager.cancel(second);
+    assert!(pair.manager.counter(LinkCounter::FramesWithheld) > withheld);
+    assert!(!pair.manager.session.holds(first) && !pair.manager.session.holds(second));
+    (pair.manager.net.frozen, pair.manager.net.capacity) = (false, 1 << 20);
+    pair.settle();
+    pair.run(millis(20));
+    assert_eq!((pair.agv.ran().len(), pair.agv.is_live(slot)), (1, false));
+    assert_eq!(pair.manager.session.calls_in_flight(), 0);
+}
+
+#[test]
+fn a_call_that_fails_ends_its_own_lease_only() {
+    let mut pair = Pair::live();
+    let slot = pair.agv.offer_picky("go_to(x: int)", LEASE);
+    let other = pair.agv.offer_picky("turn_to(x: int)", LEASE);
+    pair.publish();
+    pair.manager.call("turn_to", &x(1)).unwrap();
+    let failed = pair.manager.call("go_to", &x(-1)).unwrap();
+    pair.settle();
+    assert!(!pair.agv.is_live(slot) && pair.agv.is_live(other));
+    assert!(!pair.manager.session.holds(failed));
+    pair.run(LEASE.times(2));
+    assert!(pair.agv.is_live(other));
+    assert_eq!(pair.agv.counter(LinkCounter::RenewalsIgnored), 0);
+}
+
+#[test]
+fn a_lost_link_ends_every_order() {
+    let (mut pair, slot) = vehicle();
+    let (_, old) = begun(&mut pair, Priority::Normal);
+    let (_, new) = begun(&mut pair, Priority::High);
+    pair.cut();
+    assert!(!pair.agv.is_live(slot) && !pair.agv.goes_on(&old) && !pair.agv.goes_on(&new));
+    assert_eq!(expirations(&pair), 1);
+}
+
+#[test]
+fn in_a_full_table_the_oldest_call_of_the_function_gives_way() {
+    let (mut pair, _) = vehicle();
+    pair.manager.net.frozen = true;
+    let calls = [0; 5].map(|_| go(&mut pair, Priority::Normal, true));
+    assert_eq!(calls.map(|call| pair.manager.session.holds(call)), [false, true, true, true, true]);
+    calls.into_iter().for_each(|call| pair.manager.cancel(call));
+    pair.manager.net.frozen = false;
+    pair.settle();
+    assert_eq!(pair.agv.ran().len(), 0);
+}
+
+/// A renewal that the manager made so long ago, as it arrives at the vehicle.
+fn renewal_arrives(pair: &mut Pair, call: CallId, class: Priority, age: Duration) {
+    let stamp = (pair.agv.now - age).as_micros();
+    let renewal = Renewal { call: call.0, class, stamp, since: Duration::ZERO };
+    let nonce = pair.agv.session.nonce();
+    pair.agv.hear_datagram(nonce, &SessionBody::renewal(&renewal));
+}
+
+#[test]
+fn a_renewal_of_an_older_call_does_not_prolong_the_newer() {
+    let (mut pair, slot) = vehicle();
+    let old = go(&mut pair, Priority::Normal, false);
+    pair.settle();
+    let new = go(&mut pair, Priority::High, false);
+    pair.settle();
+    (0..2).for_each(|_| pair.agv.answer_held(Ok(&*none())));
+    pair.run(millis(400));
+    renewal_arrives(&mut pair, old, Priority::Normal, Duration::ZERO);
+    pair.run(millis(99));
+    assert!(!pair.agv.is_live(slot), "the renewal of the older call has prolonged the newer");
+    assert!(pair.agv.counter(LinkCounter::RenewalsIgnored) == 1 && expirations(&pair) == 1);
+    renewal_arrives(&mut pair, new, Priority::High, Duration::ZERO);
+    assert!(!pair.agv.is_live(slot), "and nothing revives it");
+}
+
+#[test]
+fn a_renewal_counts_from_when_it_was_made_and_not_from_its_arrival() {
+    let (mut pair, slot) = vehicle();
+    let call = go(&mut pair, Priority::Normal, false);
+    pair.settle();
+    pair.agv.answer_held(Ok(&*none()));
+    pair.run(millis(400));
+    renewal_arrives(&mut pair, call, Priority::Normal, millis(300));
+    // Made 100 ms after the call, it lasts until 600 ms after that.
+    pair.run(millis(190));
+    assert!(pair.agv.is_live(slot));
+    pair.run(millis(10));
+    assert_eq!((pair.agv.is_live(slot), expirations(&pair)), (false, 1));
+}
+
+#[test]
+fn a_renewal_does_nothing_for_a_function_that_was_replaced_since() {
+    let (mut pair, _) = vehicle();
+    let call = go(&mut pair, Priority::Normal, false);
+    pair.settle();
+    pair.agv.answer_held(Ok(&*none()));
+    pair.agv.replace("go()");
+    pair.run(millis(400));
+    renewal_arrives(&mut pair, call, Priority::Normal, Duration::ZERO);
+    assert_eq!(pair.agv.counter(LinkCounter::RenewalsIgnored), 1);
+    pair.run(millis(100));
+    assert_eq!(expirations(&pair), 1, "the lease of the function before was prolonged");
+}
+
+#[test]
+fn a_new_call_never_takes_the_place_of_a_dead_lease_before_its_hook_has_run() {
+    let mut pair = Pair::live();
+    let slot = pair.agv.offer_leased("go()", LEASE);
+    pair.publish();
+    let options = RequestOptions { renew_lease: false, ..RequestOptions::default() };
+    pair.manager.request_with("go", &none(), &options, false).unwrap();
+    pair.run(LEASE - millis(10));
+    let early = pair.manager.request_with("go", &none(), &options, false).unwrap();
+    // The request arrives at a vehicle that has not been polled since the lease ended.
+    let (stream, _) = pair.manager.net.deliver();
+    pair.manager.flush_gathered();
+    let (more, _) = pair.manager.net.deliver();
+    pair.agv.now = pair.agv.now + millis(10);
+    pair.agv.hear(&[stream, more].concat());
+    pair.agv.work(std::vec::Vec::new());
+    assert_eq!((pair.agv.ran().len(), pair.agv.is_live(slot), expirations(&pair)), (1, false, 1));
+    pair.settle();
+    assert!(pair.manager.has(&Happened::Failed(early, Error::Busy)));
+}
+
+#[test]
+fn the_unit_ends_a_lease_not_later_than_the_motor_sees_it_dead() {
+    for late in 0..4 {
+        let (mut pair, slot) = vehicle();
+        pair.run(millis(late));
+        go(&mut pair, Priority::Normal, false);
+        pair.settle();
+        pair.agv.answer_held(Ok(&*none()));
+        while pair.agv.is_live_behind(slot, Duration::ZERO) {
+            assert_eq!(expirations(&pair), 0);
+            pair.run(Duration::from_micros(250));
+        }
+        assert_eq!(expirations(&pair), 1, "the motor has stopped, and the unit does not know");
+    }
+}

@@ -1,0 +1,38 @@
+//! `cara retire`: a node is not missed any more.
+
+use std::process::ExitCode;
+
+use cara_std::control::protocol::Question;
+use serde_json::json;
+
+use crate::exit::{Ended, Exit};
+use crate::global::Global;
+use crate::nodes;
+use crate::operator::{Need, Operator};
+use crate::output;
+
+/// Takes an absent node off the roster of the manager that runs on this host, until it joins again or the manager is started
+/// anew.
+///
+/// A manager misses each s_unit that its key file lists, or, in plain mode, that has joined since its start: `cara call --all`
+/// fails while one is missing. One that has left for good is taken out of the key file with `cara keys revoke`.
+#[derive(clap::Args)]
+pub(crate) struct Arguments {
+    /// The node: NAME, NAME/ID or #ID.
+    node: String,
+}
+
+pub(crate) fn run(Arguments { node }: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
+    if global.act_as.is_some() {
+        return Err(Ended::usage("a manager for the time of a command has no roster to keep: leave --as away"));
+    }
+    let mut operator = Operator::open(global, &Need::Nothing)?;
+    let node = nodes::known(&mut operator, &node)?.selector;
+    operator.ask(&Question::Retire { node: node.clone() }, |_| Ok(()))?;
+    if global.json {
+        output::object(&json!({ "retired": node }))?;
+    } else {
+        output::line(format_args!("{node} is off the roster until it joins again, or the manager is started anew"))?;
+    }
+    Ok(Exit::Done.into())
+}

@@ -1,0 +1,82 @@
+//! A call whose answer is not waited for any more stops what it started, while the manager goes on.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::Duration;
+
+use cara_std::{Call, Definition, ParametersView, ServiceError, ServiceOptions, Unit};
+
+use crate::support::{PATIENCE, Running, Stage, until};
+
+/// What only its lease's own end would stop goes on beyond all patience.
+const LEASE: Duration = PATIENCE.saturating_mul(4);
+const WAYS: [&[&str]; 2] = [&["call", "lifter", "lift"], &["call", "lifter", "--hold", "lift"]];
+
+/// What a vehicle has done so far.
+#[derive(Default)]
+struct Diary {
+    began: AtomicU32,
+    ended: AtomicU32,
+    made_safe: AtomicU32,
+}
+
+/// A vehicle whose service moves for as long as it is wanted, and answers then.
+struct Lifter {
+    unit: Unit,
+    diary: Arc<Diary>,
+}
+
+impl Lifter {
+    fn join(stage: &Stage) -> Self {
+        stage.know("lifter", 98);
+        let unit = stage.vehicle("lifter", 98).build_unit().unwrap();
+        let diary = Arc::new(Diary::default());
+        let (moved, stopped) = (diary.clone(), diary.clone());
+        let lift = move |call: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+            moved.began.fetch_add(1, Ordering::SeqCst);
+            call.lease.as_ref().unwrap().wait_until_ended();
+            moved.ended.fetch_add(1, Ordering::SeqCst);
+            Ok(())
+        };
+        let safe = move || {
+            stopped.made_safe.fetch_add(1, Ordering::SeqCst);
+        };
+        let options = ServiceOptions::new().lease(LEASE, safe);
+        unit.my_function_list().add_service(&Definition::parse("lift()").unwrap(), options, lift).unwrap();
+        unit.publish_my_function_list().unwrap();
+        unit.start().unwrap();
+        until("the lift is offered", || stage.cara(&["functions", "lifter"]).out.contains("lift()"));
+        Self { unit, diary }
+    }
+
+    /// Its motion has ended, and its safe hook has run, as often as this; it is still its manager's.
+    fn has_stopped(&self, times: u32) {
+        let count = |counter: &AtomicU32| counter.load(Ordering::SeqCst);
+        until("the safe hook runs", || count(&self.diary.made_safe) == times);
+        until("the motion ends", || count(&self.diary.ended) == times);
+        assert_eq!(count(&self.diary.began), times);
+        assert!(self.unit.is_connected(), "the manager has gone, and that is what stopped it");
+    }
+}
+
+#[test]
+fn what_times_out_stops_though_the_manager_goes_on() {
+    let stage = Stage::with(&[]);
+    let lifter = Lifter::join(&stage);
+    for (way, times) in WAYS.into_iter().zip(1..) {
+        stage.ends(1, &[way, &["--timeout", "3s"]].concat()).says("TimedOut");
+        lifter.has_stopped(times);
+    }
+}
+
+#[test]
+fn what_is_killed_while_it_waits_stops_though_the_manager_goes_on() {
+    let stage = Stage::with(&[]);
+    let lifter = Lifter::join(&stage);
+    for (way, times) in WAYS.into_iter().zip(1..) {
+        let mut waiting = Running::start(stage.command(way));
+        until("the lift begins", || lifter.diary.began.load(Ordering::SeqCst) == times);
+        waiting.kill();
+        lifter.has_stopped(times);
+    }
+}

@@ -1,0 +1,121 @@
+//! `cara node` as the manager of a fleet: a second one of its identity, few descriptors, and who is missing.
+
+use std::io::{BufRead, BufReader};
+use std::net::TcpStream;
+use std::process::{Command, Stdio};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::time::{Duration, Instant};
+
+use serde_json::Value;
+
+use crate::support::{PATIENCE, Stage, agv, until};
+
+const NODE: [&str; 5] = ["node", "--name", "manager", "--id", "1"];
+
+#[test]
+fn a_second_manager_of_one_identity_does_not_start_and_the_first_goes_on() {
+    let mut stage = Stage::with(&["agv-1"]);
+    let connected = |stage: &Stage| stage.ends(0, &["scan", "--json"]).json()["nodes"][0].clone();
+    let before = connected(&stage);
+    for json in [false, true] {
+        let arguments: Vec<&str> = NODE.into_iter().chain(json.then_some("--json")).collect();
+        let refused = stage.ends(5, &arguments);
+        refused.says("is running already, at 127.0.0.1:").says("stop it first");
+        assert!(!json || refused.says("\"AlreadyRunning\"").err.contains("\"exit\":5"), "{}", refused.everything());
+    }
+    let after = connected(&stage);
+    assert_eq!((&after["epoch"], &after["connected"]), (&before["epoch"], &Value::Bool(true)));
+    assert!(after["connected_ms"].as_u64() >= before["connected_ms"].as_u64(), "it has not left: {before} {after}");
+    // One that was killed stands in nobody's way.
+    stage.kill_manager();
+    stage.start_manager();
+    until("the vehicle is back", || stage.ready() == 1);
+}
+
+#[test]
+fn who_is_missing_is_shown_until_it_is_retired() {
+    let mut stage = Stage::with(&["agv-1", "agv-2"]);
+    stage.know("agv-9", 19);
+    let state = |stage: &Stage, name: &str| {
+        let told = stage.ends(0, &["scan", "--json"]).json();
+        let nodes = told["nodes"].as_array().unwrap().clone();
+        nodes.into_iter().find(|node| node["name"] == name)
+    };
+    let expected = |node: &Value| (node["connected"].as_bool().unwrap(), node["expected"].as_bool().unwrap());
+    until("the new keys are taken", || state(&stage, "agv-9").is_some());
+    assert_eq!(expected(&state(&stage, "agv-9").unwrap()), (false, true));
+    assert_eq!(expected(&state(&stage, "agv-1").unwrap()), (true, true));
+    stage.ends(0, &["scan"]).says("absent").says("1 of 3 s_units of the roster: agv-9/19").says("cara retire");
+    let to_all = ["call", "--all", "go_to(position: [1, 2])"];
+    stage.ends(1, &to_all).says("agv-9/19: NotConnected").says("agv-1/11  go_to(").says("agv-2/12  go_to(");
+    stage.ends(1, &["functions", "agv-9"]).says("has not joined");
+    stage.ends(2, &["retire", "agv-1"]).says("is connected");
+    stage.ends(1, &["retire", "agv-70"]).says("no node `agv-70`");
+    assert_eq!(stage.ends(0, &["retire", "agv-9", "--json"]).json()["retired"], "agv-9/19");
+    stage.ends(0, &to_all);
+    assert!(!stage.ends(0, &["scan"]).out.contains("missing") && state(&stage, "agv-9").is_none());
+    // It counts again once it has joined.
+    let back = agv(stage.vehicle("agv-9", 19));
+    until("it is expected again", || state(&stage, "agv-9").is_some_and(|node| expected(&node) == (true, true)));
+    back.stop();
+    until("it is missed", || state(&stage, "agv-9").is_some_and(|node| expected(&node) == (false, true)));
+    stage.stop_agvs();
+    until("all are missed", || stage.ends(0, &["scan"]).out.contains("3 of 3 s_units"));
+}
+
+/// 64 descriptors, and a client without keys that keeps 300 connections open: the operator is answered, and a vehicle joins.
+#[test]
+fn idle_connections_take_no_descriptor_from_the_operator_and_from_vehicles() {
+    let stage = Stage::empty();
+    stage.know("agv-1", 11);
+    let node = stage.command(&[&NODE[..], &["--json"]].concat());
+    // A shell sets the limit, for that process alone.
+    let mut limited = Command::new("sh");
+    limited.args(["-c", "ulimit -n 64; exec \"$@\"", "sh"]).arg(node.get_program()).args(node.get_args());
+    limited.envs(node.get_envs().filter_map(|(name, value)| Some((name, value?)))).env_remove("CARA_INTERFACES");
+    let mut manager = limited.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let mut first = String::new();
+    BufReader::new(manager.stdout.take().unwrap()).read_line(&mut first).unwrap();
+    let up: Value = serde_json::from_str(&first).unwrap_or_else(|error| panic!("{first}: {error}"));
+    let port = up["tcp_port"].as_u64().unwrap() as u16;
+    let log = BufReader::new(manager.stderr.take().unwrap());
+    let (over, lines, opened) = (AtomicBool::new(false), AtomicUsize::new(0), AtomicUsize::new(0));
+    std::thread::scope(|scope| {
+        scope.spawn(|| log.lines().map_while(Result::ok).for_each(|_| _ = lines.fetch_add(1, Ordering::Relaxed)));
+        scope.spawn(|| {
+            let mut held = std::collections::VecDeque::new();
+            while !over.load(Ordering::Relaxed) {
+                if let Ok(stream) = TcpStream::connect(("127.0.0.1", port)) {
+                    held.push_back(stream);
+                    opened.fetch_add(1, Ordering::Relaxed);
+                }
+                if held.len() > 300 {
+                    held.pop_front();
+                    std::thread::sleep(Duration::from_millis(20));
+                }
+            }
+        });
+        let ended = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
+            until("300 are open", || opened.load(Ordering::Relaxed) > 300);
+            let (start, lines_before) = (Instant::now(), lines.load(Ordering::Relaxed));
+            // Again and again: one lucky moment is not enough.
+            for _ in 0..20 {
+                stage.ends(0, &["scan", "--unit", "manager/1"]);
+            }
+            let vehicle = agv(stage.vehicle("agv-1", 11));
+            until("the vehicle has joined", || vehicle.is_connected());
+            until("the manager has its list", || stage.ready() == 1);
+            std::thread::sleep(Duration::from_secs(2));
+            assert!(vehicle.is_connected() && start.elapsed() < PATIENCE * 3);
+            let (told, seconds) = (lines.load(Ordering::Relaxed) - lines_before, start.elapsed().as_secs() + 1);
+            assert!(told <= 6 * seconds as usize, "{told} lines in {seconds} s");
+            vehicle.stop();
+        }));
+        over.store(true, Ordering::Relaxed);
+        manager.kill().unwrap();
+        manager.wait().unwrap();
+        if let Err(panic) = ended {
+            std::panic::resume_unwind(panic);
+        }
+    });
+}

@@ -1,0 +1,48 @@
+//! A call of all: it has an outcome for each node that is to be asked, also for those that could not be.
+
+use std::collections::HashSet;
+use std::ops::ControlFlow;
+
+use cara_core::error::Error;
+
+use super::answering::{End, Sink, send};
+use super::protocol::{Answer, Failure};
+use crate::{CommunicationSystem, Peer};
+
+/// Makes the call, and then tells of each node that it has not reached.
+pub(super) fn call<T: Send + 'static>(
+    system: &CommunicationSystem<T>,
+    function: &str,
+    sink: Sink<'_>,
+    call: impl FnOnce(Sink<'_>) -> Result<(), End>,
+) -> Result<(), End> {
+    let mut told = HashSet::new();
+    let outcome = call(&mut |answer: Answer| -> ControlFlow<()> {
+        if let Answer::Called { node, id, .. } = &answer {
+            told.insert((node.clone(), *id));
+        }
+        sink(answer)
+    });
+    let asked = system.asked_with_all(function);
+    let missed = asked.iter().filter(|peer| !told.contains(&(peer.name().to_owned(), peer.id())));
+    match outcome {
+        Ok(()) => {}
+        // Nobody offers it: each of the roster is told of instead.
+        Err(End::Failed(failure)) if failure.error == "UnknownFunction" && !asked.is_empty() => {}
+        Err(end) => return Err(end),
+    }
+    missed.clone().try_for_each(|peer| send(sink, missing(peer, function)))
+}
+
+fn missing<T: Send + 'static>(peer: &Peer<T>, function: &str) -> Answer {
+    let (error, text) = match peer.is_connected() && !peer.their_function_list().contains(function) {
+        true => ("UnknownFunction", format!("it does not offer '{function}' to this unit, and was not called")),
+        false => (
+            "NotConnected",
+            "it was not connected, and was not called; `cara retire` takes it off the roster".to_owned(),
+        ),
+    };
+    let failure = Failure { error: error.to_owned(), text, ..Failure::from(Error::NotConnected) };
+    let (node, id) = (peer.name().to_owned(), peer.id());
+    Answer::Called { node, id, results: Vec::new(), call: None, error: Some(failure), took_us: 0 }
+}

@@ -1,0 +1,98 @@
+//! Hooks that take the application's state: behind the safe hook of a service, and when a peer is lost. They may have to
+//! wait for the state, so they have a thread of their own, in the order in which they became due.
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+
+use cara_core::error::Error;
+
+use super::{Engine, lock};
+use crate::handler::Hook;
+use crate::lane::Lane;
+
+/// The thread, once there is a hook, and the hook for the loss of a peer.
+pub(super) struct Afterwards<T> {
+    lane: Mutex<Option<Arc<Lane>>>,
+    lost: Mutex<Option<Arc<Pending<T>>>>,
+}
+
+impl<T> Default for Afterwards<T> {
+    fn default() -> Self {
+        Self { lane: Mutex::new(None), lost: Mutex::new(None) }
+    }
+}
+
+/// A hook that waits once at most, however often it became due meanwhile.
+struct Pending<T> {
+    hook: Arc<Hook<T>>,
+    waits: AtomicBool,
+}
+
+impl<T> Pending<T> {
+    fn new(hook: Arc<Hook<T>>) -> Arc<Self> {
+        Arc::new(Self { hook, waits: AtomicBool::new(false) })
+    }
+}
+
+impl<T> Afterwards<T> {
+    /// The thread is there from here on. [`Error::Network`] when the system refuses it.
+    fn start(&self) -> Result<(), Error> {
+        let mut lane = lock(&self.lane);
+        if lane.is_none() {
+            *lane = Some(Arc::new(Lane::start("cara-after")?));
+        }
+        Ok(())
+    }
+
+    /// Waits for the hooks that are due, and ends the thread.
+    pub(super) fn end(&self) {
+        let lane = lock(&self.lane).take();
+        if let Some(lane) = lane {
+            lane.end();
+        }
+    }
+}
+
+impl<T: Send + 'static> Engine<T> {
+    /// What makes a hook run with the state; it returns at once.
+    pub(crate) fn afterwards(&self, hook: Arc<Hook<T>>) -> Result<Box<dyn Fn() + Send + Sync>, Error> {
+        self.afterwards.start()?;
+        let (me, pending) = (self.me.clone(), Pending::new(hook));
+        Ok(Box::new(move || {
+            if let Some(engine) = me.upgrade() {
+                engine.run_afterwards(&pending);
+            }
+        }))
+    }
+
+    /// Runs `hook` whenever a peer is lost.
+    pub(crate) fn on_lost(&self, hook: Arc<Hook<T>>) -> Result<(), Error> {
+        self.afterwards.start()?;
+        *lock(&self.afterwards.lost) = Some(Pending::new(hook));
+        Ok(())
+    }
+
+    pub(super) fn run_lost_hook(&self) {
+        let pending = lock(&self.afterwards.lost).clone();
+        if let Some(pending) = pending {
+            self.run_afterwards(&pending);
+        }
+    }
+
+    fn run_afterwards(&self, pending: &Arc<Pending<T>>) {
+        let lane = lock(&self.afterwards.lane).clone();
+        let Some(lane) = lane.filter(|_| !pending.waits.swap(true, Ordering::AcqRel)) else { return };
+        let (me, pending) = (self.me.clone(), pending.clone());
+        lane.run(move || {
+            let Some(engine) = me.upgrade() else { return };
+            let ran = engine.with_state(|state| {
+                pending.waits.store(false, Ordering::Release);
+                catch_unwind(AssertUnwindSafe(|| (pending.hook)(state)))
+            });
+            if !matches!(ran, Ok(Ok(()))) {
+                tracing::error!("a hook panicked");
+            }
+        });
+    }
+}

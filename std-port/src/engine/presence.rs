@@ -1,0 +1,73 @@
+//! A manager asks for its own identity before it starts.
+
+use std::net::SocketAddr;
+
+use cara_core::distribution::authenticator::Authenticator;
+use cara_core::distribution::datagram::SEARCH_BYTES;
+use cara_core::distribution::identity::Role;
+use cara_core::distribution::presence::{Heard, PRESENCE_PAUSE, PRESENCE_WAIT, Presence};
+use cara_core::time::Duration;
+
+use super::{Engine, lock};
+use crate::builder::random;
+use crate::sys::datagram::Socket;
+use crate::sys::epoll::{Epoll, Events, Interest};
+
+/// Datagrams that are read before the time is looked at: a flood does not hold up the start.
+const BATCH: usize = 64;
+
+impl<T: Send + 'static> Engine<T> {
+    /// Where a live manager of this unit's identity answers; `None` after a wait in which none did.
+    pub(super) fn running_elsewhere(&self) -> std::io::Result<Option<SocketAddr>> {
+        let presence = {
+            let node = &lock(&self.node).node;
+            if node.identity().role() != Role::MUnit || !self.asks_for_itself {
+                return Ok(None);
+            }
+            Presence::new(node.identity().clone(), node.fleet(), node.epoch(), random())
+        };
+        let set = Epoll::new()?;
+        for socket in [Socket::Shared, Socket::Own] {
+            set.add(self.datagrams.fd(socket), 0, Interest::READ_LEVEL)?;
+        }
+        self.wait_for_itself(presence, &set)
+    }
+
+    fn wait_for_itself(&self, mut presence: Presence, set: &Epoll) -> std::io::Result<Option<SocketAddr>> {
+        let (codes, mut events) = (self.keys.codes(), Events::new(2));
+        let mut next = self.clock.now();
+        let end = next + PRESENCE_WAIT;
+        loop {
+            let now = self.clock.now();
+            if now >= end {
+                return Ok(None);
+            }
+            if now >= next {
+                let mut out = [0; SEARCH_BYTES];
+                let sent = presence.question(&codes, &mut out).map(|question| self.datagrams.broadcast(question));
+                tracing::debug!(?sent, "asked whether this unit runs already");
+                next = now + PRESENCE_PAUSE;
+            }
+            set.wait(&mut events, Some(next.min(end).since(now).max(Duration::from_millis(1))))?;
+            if let Some(at) = self.hear_of_itself(&presence, &codes) {
+                return Ok(Some(at));
+            }
+        }
+    }
+
+    fn hear_of_itself(&self, presence: &Presence, codes: &impl Authenticator) -> Option<SocketAddr> {
+        for socket in [Socket::Shared, Socket::Own] {
+            let mut buffer = [0; SEARCH_BYTES + 1];
+            for _ in 0..BATCH {
+                let Some((length, from)) = self.datagrams.receive(socket, &mut buffer) else { break };
+                let mut out = [0; SEARCH_BYTES];
+                match presence.hear(from, buffer.get(..length).unwrap_or_default(), codes, &mut out) {
+                    Heard::Nothing => {}
+                    Heard::Answer(answer) => drop(self.datagrams.send_to(from, answer)),
+                    Heard::Running(at) => return Some(at),
+                }
+            }
+        }
+        None
+    }
+}

@@ -1,0 +1,253 @@
+//! The safe hook of a leased service, on a thread of its own that watches the lease itself.
+//!
+//! At the end of the lease the hook runs whatever else the process is about: the thread waits for no lock of a link, no
+//! other thread, no other hook, and not for the application's state. The unit reports each end as well, and also ends
+//! that come before their time; whichever of the two is first makes the hook run, once for each order.
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+
+use cara_core::error::Error;
+use cara_core::time::{Duration, Instant};
+
+use crate::clock::Clock;
+use crate::engine::lock;
+use crate::lane::OwnThread;
+use crate::lease::ServiceLease;
+
+/// A thread that waits for the end of a lease looks at the clock this often: its wait stands still while the system is
+/// suspended, and the clock goes on.
+const LOOK: Duration = Duration::from_millis(20);
+/// A hook that runs for longer is counted, and its service refused until it returns.
+const LATE: Duration = Duration::from_millis(100);
+
+/// How long the end of a service waits for its hook.
+const PATIENCE: std::time::Duration = std::time::Duration::from_secs(10);
+
+/// The hook and its thread.
+pub(crate) struct SafeHook {
+    shared: Arc<Shared>,
+    thread: OwnThread,
+}
+
+/// What a hook is made of.
+pub(crate) struct Parts {
+    pub(crate) lease: Arc<ServiceLease>,
+    pub(crate) clock: Clock,
+    pub(crate) hook: Arc<dyn Fn() + Send + Sync>,
+    /// Runs after it, and waits for nothing either.
+    pub(crate) then: Option<Box<dyn Fn() + Send + Sync>>,
+    /// Counts hooks that took long.
+    pub(crate) late: Arc<AtomicU64>,
+}
+
+struct Shared {
+    parts: Parts,
+    state: Mutex<State>,
+    changed: Condvar,
+}
+
+#[derive(Default)]
+struct State {
+    /// The hook is to run.
+    due: bool,
+    /// It has run, or is about to, because the thread saw the end of the lease, which the unit has yet to report.
+    is_ahead: bool,
+    running_since: Option<Instant>,
+    /// This run has been counted as a long one.
+    counted: bool,
+    /// The service is gone.
+    is_over: bool,
+}
+
+impl SafeHook {
+    /// Starts the thread. [`Error::Network`] when the system refuses it.
+    pub(crate) fn start(parts: Parts) -> Result<Self, Error> {
+        let shared = Arc::new(Shared { parts, state: Mutex::default(), changed: Condvar::new() });
+        let own = shared.clone();
+        let thread = OwnThread::start("cara-safe", move || own.work())?;
+        Ok(Self { shared, thread })
+    }
+
+    /// An order has begun: the thread looks when its lease ends.
+    pub(crate) fn watch(&self) {
+        // The end of an earlier order has been reported by now.
+        lock(&self.shared.state).is_ahead = false;
+        self.shared.changed.notify_all();
+    }
+
+    /// The unit has seen the end of the lease. Returns at once.
+    pub(crate) fn run(&self) {
+        let mut state = lock(&self.shared.state);
+        if !std::mem::take(&mut state.is_ahead) {
+            state.due = true;
+        }
+        self.shared.changed.notify_all();
+    }
+
+    /// Waits until the hook has run as often as it was to: the next order of the service comes after it. `false` when
+    /// that takes long.
+    pub(crate) fn has_run(&self) -> bool {
+        let mut state = lock(&self.shared.state);
+        let until = self.shared.parts.clock.now() + LATE;
+        while state.due || state.running_since.is_some() {
+            let now = self.shared.parts.clock.now();
+            if self.shared.count_if_late(&mut state, now) || now >= until {
+                return false;
+            }
+            state = self.shared.wait(state, Some(LATE));
+        }
+        true
+    }
+
+    /// Counts a hook that is stuck.
+    pub(crate) fn look(&self) {
+        let now = self.shared.parts.clock.now();
+        self.shared.count_if_late(&mut lock(&self.shared.state), now);
+    }
+
+    /// Ends the thread, and waits for it, when the hook has run as often as it was to.
+    pub(crate) fn end(&self) {
+        self.shared.end();
+        self.thread.join(PATIENCE);
+    }
+}
+
+impl Drop for SafeHook {
+    /// Without waiting: a service is replaced under a lock that everything needs.
+    fn drop(&mut self) {
+        self.shared.end();
+    }
+}
+
+impl Shared {
+    fn end(&self) {
+        lock(&self.state).is_over = true;
+        self.changed.notify_all();
+    }
+
+    fn work(&self) {
+        while self.await_end() {
+            if catch_unwind(AssertUnwindSafe(|| (self.parts.hook)())).is_err() {
+                tracing::error!("a safe hook panicked");
+            }
+            let mut state = lock(&self.state);
+            self.count_if_late(&mut state, self.parts.clock.now());
+            state.running_since = None;
+            drop(state);
+            self.changed.notify_all();
+            if let Some(then) = &self.parts.then {
+                then();
+            }
+        }
+    }
+
+    /// Waits until the hook is to run; `false` when it never is any more.
+    fn await_end(&self) -> bool {
+        let mut state = lock(&self.state);
+        loop {
+            let now = self.parts.clock.now();
+            let left = self.parts.lease.lease.left(now);
+            if left == Some(Duration::ZERO) && !state.is_ahead && !state.due && !self.parts.lease.lease.is_live(now) {
+                (state.due, state.is_ahead) = (true, true);
+            }
+            if std::mem::take(&mut state.due) {
+                (state.running_since, state.counted) = (Some(now), false);
+                return true;
+            }
+            if state.is_over {
+                return false;
+            }
+            state = self.wait(state, left.map(|left| left.clamp(Duration::from_micros(1), LOOK)));
+        }
+    }
+
+    fn wait<'s>(&self, state: MutexGuard<'s, State>, at_most: Option<Duration>) -> MutexGuard<'s, State> {
+        match at_most {
+            None => self.changed.wait(state).unwrap_or_else(PoisonError::into_inner),
+            Some(span) => self.changed.wait_timeout(state, span.into()).unwrap_or_else(PoisonError::into_inner).0,
+        }
+    }
+
+    /// Whether the hook runs for longer than it may; counted once.
+    fn count_if_late(&self, state: &mut State, now: Instant) -> bool {
+        let is_late = state.running_since.is_some_and(|since| now >= since + LATE);
+        if is_late && !std::mem::replace(&mut state.counted, true) {
+            self.parts.late.fetch_add(1, Ordering::Relaxed);
+            tracing::error!("a safe hook takes longer than {} ms: it must be short", LATE.as_millis());
+        }
+        is_late
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::AtomicUsize;
+
+    use super::*;
+    use cara_core::services::lease::Order;
+
+    static AHEAD: AtomicU64 = AtomicU64::new(0);
+
+    fn begin(lease: &ServiceLease, clock: Clock, length: Duration) -> Order {
+        lease.lease.begin(clock.now(), clock.now() + length).expect("the order before has ended")
+    }
+
+    fn until(condition: impl Fn() -> bool) {
+        let end = std::time::Instant::now() + std::time::Duration::from_secs(20);
+        while !condition() {
+            assert!(std::time::Instant::now() < end, "not in time");
+            std::thread::sleep(std::time::Duration::from_millis(1));
+        }
+    }
+
+    /// The unit does nothing here: the thread sees the end of a lease that a suspension has outlasted, and what the unit
+    /// reports of it later makes the hook run no second time.
+    #[test]
+    fn a_lease_that_a_suspension_has_outlasted_is_made_safe_at_once_and_once() {
+        let (lease, runs) = (Arc::new(ServiceLease::default()), Arc::new(AtomicUsize::new(0)));
+        let (clock, counted) = (Clock::moved_by(&AHEAD), runs.clone());
+        let hook = Arc::new(move || {
+            counted.fetch_add(1, Ordering::SeqCst);
+        });
+        let parts = Parts { lease: lease.clone(), clock, hook, then: None, late: Arc::default() };
+        let safe = SafeHook::start(parts).unwrap();
+        for round in 1..4 {
+            let order = begin(&lease, clock, Duration::from_secs(3_600));
+            safe.watch();
+            std::thread::sleep(std::time::Duration::from_millis(30));
+            assert_eq!(runs.load(Ordering::SeqCst), round - 1, "it is live");
+            AHEAD.fetch_add(7_200_000_000, Ordering::SeqCst);
+            assert!(!lease.lease.is_live(clock.now()));
+            until(|| runs.load(Ordering::SeqCst) == round);
+            assert!(lease.lease.end(order));
+            safe.run();
+            assert!(safe.has_run());
+        }
+        safe.end();
+        assert_eq!(runs.load(Ordering::SeqCst), 3);
+    }
+
+    #[test]
+    fn what_ends_before_its_time_is_made_safe_and_what_is_finished_is_not() {
+        let (lease, runs) = (Arc::new(ServiceLease::default()), Arc::new(AtomicUsize::new(0)));
+        let (clock, counted) = (Clock::new(), runs.clone());
+        let hook = Arc::new(move || {
+            counted.fetch_add(1, Ordering::SeqCst);
+        });
+        let parts = Parts { lease: lease.clone(), clock, hook, then: None, late: Arc::default() };
+        let safe = SafeHook::start(parts).unwrap();
+        let order = begin(&lease, clock, Duration::from_secs(3_600));
+        safe.watch();
+        assert!(lease.lease.end(order));
+        safe.run();
+        until(|| runs.load(Ordering::SeqCst) == 1);
+        let order = begin(&lease, clock, Duration::from_millis(30));
+        safe.watch();
+        assert!(lease.lease.end(order));
+        std::thread::sleep(std::time::Duration::from_millis(60));
+        safe.end();
+        assert_eq!(runs.load(Ordering::SeqCst), 1);
+    }
+}

@@ -1,0 +1,172 @@
+//! Faults of a vehicle that is a process of Linux: what holds its application's state for ever, and a second manager of its
+//! manager's name.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+use anyhow::{Context, Result, ensure};
+use cara_apps::agv::{GO_TO, GO_TO_LEASE};
+use cara_processes::Process;
+use cara_std::control::Control;
+use cara_std::{Call, Definition, LeaseWatch, ParametersView, ServiceOptions, Unit};
+use rustix::time::{ClockId, clock_gettime};
+
+use super::inject::{STANDS, pause};
+use super::kind::{Bound, Failing, Kind};
+use super::{Stop, Target};
+use crate::board::{FLEET, LONG, Who};
+
+/// What the vehicle prints, each with the time of the system's clock in microseconds.
+const ON: &str = "motors on";
+const OFF: &str = "motors off";
+const SAFE: &str = "safe hook";
+/// What it is told.
+const HOLD: &str = "hold";
+/// Between two looks of the motors' loop at the lease.
+const TICK: Duration = Duration::from_millis(1);
+/// In which hook and motors' loop have their turn on a Linux host, beyond what the vehicle's canary was late.
+const TURN: Duration = Duration::from_millis(50);
+
+/// A vehicle and its managers, each a process.
+pub(super) struct Processes;
+
+impl Target for Processes {
+    fn name(&self) -> &'static str {
+        "Linux processes"
+    }
+
+    fn bound(&self, _: &Kind) -> Result<Bound> {
+        let micros = GO_TO_LEASE.as_micros() + micros(TURN);
+        Ok(Bound { micros, of: "lease + turn" })
+    }
+
+    fn fail(&self, kind: &Kind, number: u32, dice: &mut fastrand::Rng) -> Result<Stop> {
+        let stopped = match kind.failing {
+            Failing::StateHeld => state_is_held(dice),
+            _ => second_manager(dice),
+        };
+        let announced = stopped.with_context(|| format!("{}, number {number}", kind.name))?;
+        Ok(Stop { announced, renewed: announced, turn: 0 })
+    }
+}
+
+/// A method of the application never gives the state back, and the manager hangs.
+fn state_is_held(dice: &mut fastrand::Rng) -> Result<u64> {
+    let (mut vehicle, mut manager) = (vehicle()?, manager()?);
+    vehicle.expect(ON, LONG)?;
+    vehicle.send(HOLD)?;
+    vehicle.expect(HOLD, LONG)?;
+    pause(dice);
+    let fault = now();
+    manager.freeze()?;
+    stopped(&vehicle, fault)
+}
+
+/// A second manager does not start beside the first one, starts when the first one hangs, and the first one moves nothing
+/// when it goes on.
+fn second_manager(dice: &mut fastrand::Rng) -> Result<u64> {
+    let (mut vehicle, mut first) = (vehicle()?, manager()?);
+    vehicle.expect(ON, LONG)?;
+    let ended = manager()?.wait(LONG)?;
+    ensure!(!ended.success(), "a second manager ran beside the first one");
+    ensure!(!vehicle.has(OFF), "the vehicle stopped though its manager was there");
+    pause(dice);
+    let fault = now();
+    first.freeze()?;
+    let took = stopped(&vehicle, fault)?;
+    let second = manager()?;
+    vehicle.expect(ON, LONG)?;
+    first.thaw()?;
+    std::thread::sleep(STANDS);
+    let offs = vehicle.lines().iter().filter(|line| line.text.starts_with(OFF)).count();
+    // A busy host may let the second one's lease end; the first one must not be what moves the vehicle then.
+    let running = second.has("driving");
+    ensure!(running && offs <= 2, "the first manager came back: {:?}", vehicle.lines());
+    Ok(took)
+}
+
+/// From the fault until both the motors' loop and the safe hook have stopped the vehicle, in microseconds, less what the
+/// vehicle's canary was late meanwhile.
+fn stopped(vehicle: &Process, fault: u64) -> Result<u64> {
+    let at = |what: &str| -> Result<(u64, u64)> {
+        let line = vehicle.seen(what, LONG)?;
+        let mut numbers = line.text.split_whitespace().filter_map(|word| word.parse().ok());
+        let missing = || format!("no times in `{}`", line.text);
+        Ok((numbers.next().with_context(missing)?, numbers.next().with_context(missing)?))
+    };
+    let ((motors, motors_late), (hook, hook_late)) = (at(OFF)?, at(SAFE)?);
+    let took = |at: u64, late: u64| at.saturating_sub(fault).saturating_sub(late);
+    Ok(took(motors, motors_late).max(took(hook, hook_late)))
+}
+
+fn vehicle() -> Result<Process> {
+    start("vehicle", &["--image", "none", "vehicle"])
+}
+
+fn manager() -> Result<Process> {
+    start("manager", &["--image", "none", "manager"])
+}
+
+fn start(name: &str, arguments: &[&str]) -> Result<Process> {
+    Process::start(name, &std::env::current_exe()?, arguments)
+}
+
+/// The vehicle's process: drives while its lease is live, and says when its motors go on and off.
+pub(crate) fn stand_alone() -> Result<()> {
+    let Who { name, id, .. } = Who::agv(17);
+    let unit = Unit::builder(&name, id, "depot", 1)?.fleet(FLEET).control(Control::Off).insecure().build_unit()?;
+    let late = Arc::new(AtomicU64::new(0));
+    let canary = late.clone();
+    let safe = move || println!("{SAFE} {} {}", now(), canary.load(Ordering::Relaxed));
+    let go_to = |_: &Call, _: &mut ParametersView| Ok(());
+    let functions = unit.my_function_list();
+    let lease =
+        functions.add_service(&Definition::parse(GO_TO)?, ServiceOptions::new().lease(GO_TO_LEASE, safe), go_to)?;
+    unit.publish_my_function_list()?;
+    unit.start()?;
+    std::thread::spawn(move || motors(&lease, &late));
+    for line in std::io::stdin().lines() {
+        if line? == HOLD {
+            let unit = unit.clone();
+            std::thread::spawn(move || unit.with_state(|()| hold()));
+        }
+    }
+    Ok(())
+}
+
+fn hold() {
+    println!("{HOLD}");
+    loop {
+        std::thread::park();
+    }
+}
+
+/// The motors' loop. It is the canary as well: how late its turns came within the last lease, at the worst.
+fn motors(lease: &LeaseWatch, late: &AtomicU64) {
+    let mut on = false;
+    let mut worst = (now(), 0);
+    loop {
+        let before = now();
+        std::thread::sleep(TICK);
+        let held_up = (now() - before).saturating_sub(micros(TICK));
+        if held_up >= worst.1 || now() - worst.0 > GO_TO_LEASE.as_micros() {
+            worst = (now(), held_up);
+        }
+        late.store(worst.1, Ordering::Relaxed);
+        if lease.is_live() != on {
+            on = !on;
+            println!("{} {} {}", if on { ON } else { OFF }, now(), worst.1);
+        }
+    }
+}
+
+/// The system's clock, which is the same in all processes.
+fn now() -> u64 {
+    let time = clock_gettime(ClockId::Boottime);
+    time.tv_sec as u64 * 1_000_000 + time.tv_nsec as u64 / 1_000
+}
+
+const fn micros(span: Duration) -> u64 {
+    span.as_micros() as u64
+}

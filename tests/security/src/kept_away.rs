@@ -1,0 +1,158 @@
+//! Recorded and forged discovery while a vehicle starts beside its running manager: it joins nevertheless.
+
+use std::net::{Ipv4Addr, TcpListener};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, bail};
+use cara_core::distribution::datagram::{Announce, Datagram, Header, SEARCH_BYTES, WhoHas};
+use cara_core::distribution::identity::{Epoch, Role};
+use cara_secure::keyring::Codes;
+use cara_std::Interfaces;
+use cara_std::sys::datagram::{Datagrams, Socket};
+
+use crate::discovery::Lent;
+use crate::ground::{agv, depot};
+use crate::links::Extent;
+use crate::linux::{Linux, named, wait_for};
+use crate::speaker::PATIENCE;
+use crate::tally::{Report, Row};
+
+/// The vehicle whose question is recorded, and whose keys are stolen.
+const OTHER: u32 = 1;
+/// Before a vehicle starts, the attack has gone on for so long.
+const BEFORE: Duration = Duration::from_millis(200);
+/// Counters of a vehicle that rise with each broadcast that leads to nothing.
+const TELLING: [&str; 2] = ["HintsIgnored", "WhoHasUnheeded"];
+
+struct Attack {
+    name: &'static str,
+    said: Vec<Vec<u8>>,
+    /// Where what is said leads to: connections are taken, and nothing is said on them.
+    _silent: Vec<TcpListener>,
+}
+
+/// Each attack at each rate, against vehicles that start one after the other.
+pub fn run(report: &mut Report, weakness: crate::linux::Weakness, extent: Extent) -> Result<()> {
+    let linux = Linux::new(64, weakness)?;
+    let socket = Datagrams::open(Interfaces::Loopback, linux.port)?;
+    let attacks = [earlier_lives(&linux, &socket)?, another_vehicle(&linux, &socket)?, forged(&linux)?];
+    let _manager = linux.manager()?;
+    let starts = if extent == Extent::Full { 6 } else { 1 };
+    let mut vehicle = OTHER;
+    for attack in &attacks {
+        for a_second in [20, 100] {
+            let (mut worst, mut noticed) = (Duration::ZERO, Vec::new());
+            let (sent, mut out) = (AtomicU64::new(0), 0);
+            for _ in 0..starts {
+                vehicle += 1;
+                let (joined, counted) = start(&linux, &socket, attack, a_second, vehicle, &sent)?;
+                worst = worst.max(joined.unwrap_or(PATIENCE));
+                out += u64::from(joined.is_none());
+                noticed.extend(counted);
+            }
+            noticed.sort();
+            noticed.dedup();
+            let worst = worst.as_millis();
+            println!("{}, {a_second} a second: of {starts} vehicles the last joined after {worst} ms", attack.name);
+            let (attack, target) = (format!("{}, {a_second} a second", attack.name), "Linux s_unit".to_owned());
+            let attempts = sent.into_inner();
+            report.add(Row { attack, target, attempts, successes: out, noticed, control: false });
+        }
+    }
+    Ok(())
+}
+
+/// How long a vehicle takes to join while the attack goes on, and the telling counters that have risen.
+fn start(
+    linux: &Linux,
+    socket: &Datagrams,
+    attack: &Attack,
+    a_second: u64,
+    vehicle: u32,
+    sent: &AtomicU64,
+) -> Result<(Option<Duration>, Vec<String>)> {
+    let over = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        scope.spawn(|| say(socket, &attack.said, a_second, &over, sent));
+        std::thread::sleep(BEFORE);
+        let outcome = linux.vehicle(vehicle, None).map(|(unit, diary)| {
+            let since = Instant::now();
+            let joined = wait_for(|| diary.all().joins > 0).then(|| since.elapsed());
+            let counted = named(unit.counters());
+            unit.stop();
+            let risen = TELLING.iter().filter(|name| counted.get(**name).is_some_and(|count| *count > 0));
+            (joined, risen.map(|name| (*name).to_owned()).collect())
+        });
+        over.store(true, Ordering::Relaxed);
+        outcome
+    })
+}
+
+fn say(socket: &Datagrams, said: &[Vec<u8>], a_second: u64, over: &AtomicBool, sent: &AtomicU64) {
+    let pause = Duration::from_micros(1_000_000 / a_second);
+    for bytes in said.iter().cycle().take_while(|_| !over.load(Ordering::Relaxed)) {
+        socket.broadcast(bytes);
+        sent.fetch_add(1, Ordering::Relaxed);
+        std::thread::sleep(pause);
+    }
+}
+
+/// A who-has of each of two lives of the manager that are over.
+fn earlier_lives(linux: &Linux, socket: &Datagrams) -> Result<Attack> {
+    let (mut said, mut silent) = (Vec::new(), Vec::new());
+    for _ in 0..2 {
+        let manager = linux.manager()?;
+        let (bytes, who_has) = recorded(socket, Role::MUnit)?;
+        manager.system.stop();
+        drop(manager);
+        silent.extend(TcpListener::bind((Ipv4Addr::LOCALHOST, who_has.tcp_port)));
+        said.push(bytes);
+    }
+    Ok(Attack { name: "recorded who-has of two earlier lives of the manager", said, _silent: silent })
+}
+
+/// A who-has of another vehicle.
+fn another_vehicle(linux: &Linux, socket: &Datagrams) -> Result<Attack> {
+    let (unit, _) = linux.vehicle(OTHER, None)?;
+    let (bytes, _) = recorded(socket, Role::SUnit)?;
+    unit.stop();
+    Ok(Attack { name: "recorded who-has of another vehicle", said: vec![bytes], _silent: Vec::new() })
+}
+
+/// Announces of the manager, each of another life, with the discovery key of a stolen vehicle.
+fn forged(linux: &Linux) -> Result<Attack> {
+    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?;
+    let ring = linux.ground.ring(&agv(OTHER));
+    let codes = Codes::Keyed(Lent(&ring));
+    let tcp_port = listener.local_addr()?.port();
+    let announce = |_| {
+        let epoch = Epoch(fastrand::u64(..));
+        let (sequence, room, expected) = (u32::MAX, 100, u16::MAX);
+        let announce = Announce { identity: depot(), epoch, sequence, nonce: 0, tcp_port, room, expected };
+        let mut out = [0; SEARCH_BYTES];
+        announce.encode(linux.ground.fleet, &codes, None, &mut out).map(<[u8]>::to_vec).context("it fits")
+    };
+    let said = (0..200).map(announce).collect::<Result<_>>()?;
+    Ok(Attack { name: "announces forged with a stolen discovery key", said, _silent: vec![listener] })
+}
+
+/// The next who-has of a unit of this role that goes to all.
+fn recorded(socket: &Datagrams, role: Role) -> Result<(Vec<u8>, WhoHas)> {
+    let end = Instant::now() + PATIENCE;
+    let mut buffer = [0; 2_048];
+    while Instant::now() < end {
+        let Some((count, _)) = socket.receive(Socket::Shared, &mut buffer) else {
+            std::thread::sleep(Duration::from_millis(1));
+            continue;
+        };
+        let bytes = buffer.get(..count).unwrap_or_default();
+        let Ok((header, body)) = Header::decode(bytes) else { continue };
+        if let Ok(Datagram::WhoHas(who_has)) = header.read(body)
+            && who_has.identity.role() == role
+        {
+            return Ok((bytes.to_vec(), who_has));
+        }
+    }
+    bail!("no unit of this role asks")
+}
