@@ -32,7 +32,7 @@ pub(crate) fn warning(text: impl std::fmt::Display) {
 }
 
 /// A line with each hidden character written out, but for line breaks, tabs and ESC, with which this program's colours begin:
-/// what comes from elsewhere is [`Shown`](cara_std::Shown) before it is put into one.
+/// what comes from elsewhere is [`Shown`] before it is put into one.
 fn visible(text: &str) -> String {
     let mut shown = String::with_capacity(text.len());
     for character in text.chars() {
