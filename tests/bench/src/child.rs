@@ -8,7 +8,8 @@ use std::thread;
 use std::time::Duration;
 
 use anyhow::{Context, Result, bail};
-use cara_bench_ends::{Callers, ClientQuestion, End, answer_all, answer_client, pin};
+use cara_bench_ends::{CABLE_END, Callers, ClientQuestion, End, answer_all, answer_client, pin};
+use cara_processes::cable::Host;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
@@ -75,11 +76,14 @@ impl Handle {
         Self::spawn(command, None)
     }
 
-    /// Starts `role` of a pair. What it prints as a service is read and thrown away.
-    pub(crate) fn of_pair(role: &str, contender: &Contender, end: &End) -> Result<Self> {
+    /// Starts `role` of a pair, on `host` where there is a cable. What it prints as a service is read and thrown away.
+    pub(crate) fn of_pair(role: &str, contender: &Contender, end: &End, host: Option<&Host>) -> Result<Self> {
         let mut command = contender.command()?;
         command.args([role, "--peer", &end.peer, "--run", &end.place.run.to_string(), "--address", &end.address]);
         command.args(end.place.print.then_some("--print"));
+        if let Some(host) = host {
+            command.env(CABLE_END, host.server().to_string());
+        }
         if end.place.client > 0 {
             command.args(["--client", &end.place.client.to_string()]);
         }
@@ -94,10 +98,11 @@ impl Handle {
         if patience.is_some() || (end.place.print && role == "serve") {
             command.stderr(Stdio::piped());
         }
-        // Children inherit the CPU of the thread that starts them, so a program need not know how to stay on one.
+        // Children inherit the CPU and the host of the thread that starts them, so a program need not know of either.
         thread::scope(|scope| {
             let starter = scope.spawn(|| {
                 pin::stay_on(end.cpu)?;
+                host.map_or(Ok(()), Host::enter)?;
                 Self::spawn(command, patience)
             });
             let mut started = starter.join().expect("starting does not panic")?;

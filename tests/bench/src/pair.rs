@@ -6,6 +6,7 @@ use anyhow::{Context, Result};
 use cara_bench_ends::{
     Burst, ClientQuestion, Counters, End, Limits, Offered, Order, Outcome, Pin, Place, ServerQuestion, pin,
 };
+use cara_processes::cable::Cable;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
@@ -26,6 +27,8 @@ pub(crate) struct Setting {
     pub(crate) distribution: u8,
     /// The service prints what it gets.
     pub(crate) print: bool,
+    /// The pair has a cable of so many million bits a second to itself; `None` for loopback.
+    pub(crate) mbit: Option<u32>,
 }
 
 /// One peer's processes.
@@ -34,6 +37,8 @@ pub(crate) struct Pair {
     server: Handle,
     clients: Vec<Handle>,
     further: Option<Handle>,
+    /// Laid for as long as the processes run.
+    _cable: Option<Cable>,
 }
 
 /// A burst, as both ends saw it.
@@ -44,6 +49,8 @@ pub(crate) struct Delivered {
     pub(crate) executed: u64,
     /// Taken, and reported as not executed later.
     pub(crate) failed: u64,
+    /// Executed when the burst had to be over, where that was looked at.
+    pub(crate) in_time: u64,
     /// From the first offer to the last execution, in nanoseconds.
     pub(crate) elapsed: u64,
 }
@@ -65,18 +72,21 @@ impl Pair {
     pub(crate) fn with_clients(count: usize, contender: &Contender, setting: Setting) -> Result<Self> {
         let peer = contender.name();
         let [client_cpu, server_cpu] = pin::cpus(setting.pin)?;
+        let cable = setting.mbit.map(Cable::lay).transpose()?;
+        let [far, near] = [0, 1].map(|end| cable.as_ref().map(|cable| &cable.hosts[end]));
         let place = Place { run: fastrand::u32(1..), print: setting.print, client: 0 };
         let mut end = End { peer: peer.to_owned(), cpu: server_cpu, place, address: String::new() };
-        let mut server = Handle::of_pair("serve", contender, &end)?;
+        let mut server = Handle::of_pair("serve", contender, &end, far)?;
         end.address = server.line().with_context(|| format!("starting the server of {peer}"))?;
         end.cpu = client_cpu;
         let mut clients = Vec::new();
         for client in 0..count {
             end.place.client = u32::try_from(client)?;
-            clients.push(Handle::of_pair("call", contender, &end)?);
+            clients.push(Handle::of_pair("call", contender, &end, near)?);
         }
-        let further = (setting.distribution == 2).then(|| Handle::of_pair("further", contender, &end)).transpose()?;
-        Ok(Self { peer: peer.to_owned(), server, clients, further })
+        let further = (setting.distribution == 2).then(|| Handle::of_pair("further", contender, &end, near));
+        let further = further.transpose()?;
+        Ok(Self { peer: peer.to_owned(), server, clients, further, _cable: cable })
     }
 
     /// One block of echo calls.
@@ -107,10 +117,20 @@ impl Pair {
 
     /// One burst of one-way messages, and what became of each.
     pub(crate) fn burst(&mut self, burst: &Burst) -> Result<Delivered> {
+        self.burst_within(burst, None)
+    }
+
+    /// As [`burst`](Self::burst), and counts those that were executed when so much time had passed since it began.
+    pub(crate) fn burst_within(&mut self, burst: &Burst, within: Option<Duration>) -> Result<Delivered> {
         self.begin_further()?;
         let (before, _): (u64, u64) = self.ask_server(&ServerQuestion::Executed)?;
-        let offered: Offered = self.client()?.order(&ClientQuestion::Burst(burst.clone()))?;
-        let mut delivered = Delivered { offered, ..Delivered::default() };
+        let mut delivered = Delivered::default();
+        self.client()?.ask(&ClientQuestion::Burst(burst.clone()))?;
+        if let Some(within) = within {
+            std::thread::sleep(within);
+            delivered.in_time = self.ask_server::<(u64, u64)>(&ServerQuestion::Executed)?.0 - before;
+        }
+        delivered.offered = self.client()?.answer()?;
         self.settle(before, &mut delivered)?;
         self.end_further()?;
         if delivered.lost() > 0 {

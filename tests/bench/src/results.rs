@@ -35,12 +35,16 @@ impl Mode {
 pub(crate) struct Results {
     pub(crate) run: About,
     pub(crate) response: Vec<Response>,
+    pub(crate) echoes: Vec<Response>,
     pub(crate) availability: Vec<Availability>,
     /// `null` until it is measured.
     pub(crate) share: Option<Share>,
     pub(crate) scale: Vec<Scale>,
     pub(crate) throughput: Vec<Throughput>,
     pub(crate) constraints: Vec<Constrained>,
+    pub(crate) link_response: Vec<OnLink<Response>>,
+    pub(crate) link_availability: Vec<OnLink<LinkAvailability>>,
+    pub(crate) link_constraints: Vec<OnLink<LinkConstrained>>,
     /// From the rows above, when the run ends.
     pub(crate) goals: Vec<Goal>,
 }
@@ -85,7 +89,10 @@ pub(crate) struct Response {
     pub(crate) print: bool,
     pub(crate) pause_ms: u64,
     pub(crate) n: usize,
+    pub(crate) mean_us: f64,
+    pub(crate) lower_quartile_us: f64,
     pub(crate) p50_us: f64,
+    pub(crate) upper_quartile_us: f64,
     pub(crate) p99_us: f64,
     pub(crate) p999_us: f64,
     pub(crate) max_us: f64,
@@ -107,6 +114,7 @@ pub(crate) struct Availability {
     pub(crate) delivery: Delivery,
     pub(crate) pin: Pin,
     pub(crate) mode: Mode,
+    pub(crate) print: bool,
     #[serde(flatten)]
     pub(crate) counts: Counts,
     pub(crate) worst_group: f64,
@@ -229,6 +237,69 @@ pub(crate) struct Constrained {
     #[serde(flatten)]
     pub(crate) counts: Counts,
     pub(crate) executed_per_s: f64,
+}
+
+/// A row of a link of so many million bits a second in each direction, or why there is none.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub(crate) struct OnLink<T> {
+    pub(crate) mbit: u32,
+    pub(crate) skipped: Option<String>,
+    #[serde(flatten)]
+    pub(crate) row: Option<T>,
+}
+
+impl<T> OnLink<T> {
+    pub(crate) fn measured(mbit: u32, row: T) -> Self {
+        Self { mbit, skipped: None, row: Some(row) }
+    }
+
+    pub(crate) fn skipped(mbit: u32, reason: &str) -> Self {
+        Self { mbit, skipped: Some(reason.to_owned()), row: None }
+    }
+}
+
+/// The rows of a list that were measured, each with the rate of its link.
+pub(crate) fn measured<T>(rows: &[OnLink<T>]) -> impl Iterator<Item = (u32, &T)> {
+    rows.iter().filter_map(|on| Some((on.mbit, on.row.as_ref()?)))
+}
+
+/// One-way requests at one period on a link.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub(crate) struct LinkAvailability {
+    pub(crate) peer: String,
+    pub(crate) distribution: u8,
+    pub(crate) chars: u32,
+    pub(crate) period_ms: u64,
+    pub(crate) delivery: Delivery,
+    pub(crate) mode: Mode,
+    pub(crate) print: bool,
+    pub(crate) load: f64,
+    #[serde(flatten)]
+    pub(crate) counts: Counts,
+    pub(crate) in_time_of_offered: f64,
+    pub(crate) worst_group: f64,
+    pub(crate) best_group: f64,
+    pub(crate) executed_per_s: f64,
+}
+
+/// Constraints of the paper on a link.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub(crate) struct LinkConstrained {
+    pub(crate) minimum_interval_ms: u64,
+    pub(crate) message_size: u32,
+    pub(crate) chars: u32,
+    pub(crate) period_ms: u64,
+    pub(crate) delivery: Delivery,
+    pub(crate) mode: Mode,
+    #[serde(flatten)]
+    pub(crate) counts: Counts,
+    pub(crate) in_time_of_offered: f64,
+    pub(crate) executed_per_s: f64,
+    pub(crate) calls: usize,
+    /// `null` where calls are refused.
+    pub(crate) p50_us: Option<f64>,
+    pub(crate) p99_us: Option<f64>,
+    pub(crate) call_refused: Option<String>,
 }
 
 impl Results {

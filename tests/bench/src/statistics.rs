@@ -9,7 +9,7 @@ pub(crate) struct Cell {
 }
 
 /// One block.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(crate) struct Turn {
     round_trips: Vec<u64>,
     median: u64,
@@ -37,7 +37,11 @@ impl Turn {
 pub(crate) struct Figures {
     pub(crate) calls: usize,
     /// Nanoseconds.
+    pub(crate) mean: u64,
+    /// Nanoseconds: a quarter, a half and three quarters took no longer.
+    pub(crate) lower_quartile: u64,
     pub(crate) median: u64,
+    pub(crate) upper_quartile: u64,
     /// Nanoseconds.
     pub(crate) p99: u64,
     /// Nanoseconds.
@@ -56,7 +60,10 @@ impl Cell {
         all.sort_unstable();
         Figures {
             calls: all.len(),
+            mean: all.iter().sum::<u64>() / all.len().max(1) as u64,
+            lower_quartile: percentile(&all, 25.0),
             median: percentile(&all, 50.0),
+            upper_quartile: percentile(&all, 75.0),
             p99: percentile(&all, 99.0),
             p999: percentile(&all, 99.9),
             longest: all.last().copied().unwrap_or(0),

@@ -1,6 +1,7 @@
 //! Processes under test: what they print as lines with the time at which they came, waits with deadlines, and no
 //! process that outlives its owner. Nothing here knows CARA.
 
+pub mod cable;
 pub mod files;
 pub mod network;
 

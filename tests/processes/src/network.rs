@@ -59,7 +59,7 @@ pub fn test(name: &str, needs: &[&str], tap: bool) -> bool {
 
 /// This program in a network of its own, or why there can be none.
 fn again(needs: &[&str], tap: bool) -> Result<std::result::Result<Command, String>> {
-    if let Some(absent) = ["setpriv", "unshare", "ip"].iter().chain(needs).find(|program| !is_there(program)) {
+    if let Some(absent) = ["setpriv", "unshare", "ip"].iter().chain(needs).find(|program| !find(program)) {
         return Ok(Err(format!("the program `{absent}` is not installed")));
     }
     let devices = "ip tuntap add name trial mode tap && ip link add trial0 type bridge";
@@ -84,7 +84,7 @@ fn unshare(kind: &[&str]) -> Command {
     command
 }
 
-fn paths() -> String {
+pub(crate) fn paths() -> String {
     std::env::var("PATH").map_or_else(|_| PATHS.to_owned(), |path| format!("{path}:{PATHS}"))
 }
 
@@ -92,7 +92,7 @@ fn works(command: &mut Command) -> bool {
     command.stdout(Stdio::null()).stderr(Stdio::null()).status().is_ok_and(|status| status.success())
 }
 
-fn is_there(program: &str) -> bool {
+pub(crate) fn find(program: &str) -> bool {
     paths().split(':').any(|path| std::path::Path::new(path).join(program).is_file())
 }
 

@@ -10,8 +10,9 @@ use serde::{Deserialize, Serialize};
 use crate::clock::cpu_time;
 use crate::peer::{Caller, Peer, Place};
 
-/// Calls of each caller before those that count.
+/// Calls of each caller before those that count, as far apart as those up to [`WARM_UP_PAUSE`].
 const WARM_UP: u32 = 3;
+const WARM_UP_PAUSE: Duration = Duration::from_millis(100);
 
 /// Callers that connect together: units that look for each other wait, and many that look at once hold each other up.
 const AT_A_TIME: usize = 8;
@@ -118,6 +119,7 @@ fn make_calls(caller: &mut dyn Caller, order: &Order, text: &str, barrier: &Barr
     let pause = Duration::from_millis(order.pause_ms);
     let mut failed = None;
     for _ in 0..WARM_UP {
+        thread::sleep(pause.min(WARM_UP_PAUSE));
         failed = failed.or(call(caller, text).err());
     }
     let mut round_trips = Vec::with_capacity(order.calls_per_caller as usize);

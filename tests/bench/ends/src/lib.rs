@@ -15,7 +15,7 @@ mod questions;
 
 pub use block::{Callers, Order, Outcome, text};
 pub use burst::{Burst, Offered};
-pub use peer::{Caller, Constrain, Counters, Delivery, Executed, Limits, Peer, Place, Server};
+pub use peer::{CABLE_END, Caller, Constrain, Counters, Delivery, Executed, Limits, Peer, Place, Server, cable_end};
 pub use pin::Pin;
 pub use print::Printer;
 pub use questions::{ClientQuestion, End, ServerQuestion, answer_all, answer_client, further, main, main_with, serve};

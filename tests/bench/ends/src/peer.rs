@@ -2,6 +2,7 @@
 
 use std::any::Any;
 use std::collections::BTreeMap;
+use std::net::{IpAddr, Ipv4Addr};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -43,6 +44,11 @@ pub struct Place {
 }
 
 impl Place {
+    /// The address to listen on: that of the server's end of a cable, else loopback.
+    pub fn host(&self) -> IpAddr {
+        cable_end().unwrap_or(IpAddr::V4(Ipv4Addr::LOCALHOST))
+    }
+
     /// Prints as this place wants it.
     pub fn printer(&self) -> Printer {
         Printer(self.print)
@@ -53,6 +59,15 @@ impl Place {
     pub fn discovery_port(&self) -> u16 {
         20_000 + (self.run % 10_000) as u16
     }
+}
+
+/// This environment variable holds the address of the server's end of a cable, for all processes of the pair; other systems
+/// read it as well.
+pub const CABLE_END: &str = "CARA_BENCH_CABLE";
+
+/// The address of the server's end where the pair has a cable.
+pub fn cable_end() -> Option<IpAddr> {
+    std::env::var(CABLE_END).ok()?.parse().ok()
 }
 
 /// A server that runs until its process ends.

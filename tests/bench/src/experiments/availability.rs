@@ -31,7 +31,7 @@ pub(super) fn measure(plan: &Plan, rows: &mut Vec<Availability>) -> Result<()> {
 
 /// Period 0, in turns with the floor.
 fn at_once(plan: &Plan, distribution: u8, rows: &mut Vec<Availability>) -> Result<()> {
-    let setting = Setting { pin: plan.pin, distribution, print: false };
+    let setting = Setting { pin: plan.pin, distribution, print: false, mbit: None };
     let bursts: Vec<_> = plan.availability.iter().filter(|bursts| bursts.distribution == distribution).collect();
     let mut floor = Pair::start(&Contender::Own("floor"), setting)?;
     let started = side_by_side(OWN.iter().collect(), OWN.len(), |own| Pair::start(own, setting));
@@ -71,7 +71,7 @@ struct Lane<'p> {
 fn spaced(plan: &Plan, rows: &mut Vec<Availability>) -> Result<()> {
     let mut lanes = Vec::new();
     for bursts in &plan.availability {
-        let setting = Setting { pin: plan.pin, distribution: bursts.distribution, print: false };
+        let setting = Setting { pin: plan.pin, distribution: bursts.distribution, print: true, mbit: None };
         let spaced: Vec<u64> = bursts.periods_ms.iter().copied().filter(|period| *period > 0).collect();
         for (&chars, contender) in bursts.chars.iter().flat_map(|chars| OWN.iter().map(move |own| (chars, own))) {
             let mut periods_ms = spaced.clone();
@@ -135,6 +135,7 @@ impl Groups {
             delivery: burst.delivery,
             pin: setting.pin,
             mode: contender.name_and_mode().1,
+            print: setting.print,
             counts: counts(&self.own),
             worst_group: ratio(worst as f64 / group),
             executed_per_s: quartile(speeds, 2).round(),
@@ -184,7 +185,7 @@ mod tests {
     fn refused_and_lost_are_told_apart() {
         let reasons = BTreeMap::from([("full".to_owned(), 2)]);
         let offered = Offered { taken: 8, refused: 2, reasons, start: 0 };
-        let group = Delivered { offered, executed: 6, failed: 1, elapsed: 1_000 };
+        let group = Delivered { offered, executed: 6, failed: 1, elapsed: 1_000, in_time: 0 };
         let counts = counts(&[group.clone(), group]);
         assert_eq!((counts.offered, counts.sent, counts.refused), (20, 14, 6));
         assert_eq!((counts.executed, counts.lost), (12, 2));

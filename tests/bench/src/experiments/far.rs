@@ -34,21 +34,21 @@ struct Place {
     peer: usize,
 }
 
-/// In distribution 1 every cell of every place has a pair of its own, and all of them wait together. In distribution 2
-/// that would multiply the five further nodes: there the pair of one peer has a client per size, and pairs take turns.
+/// All cells of a distribution wait together. In distribution 1 every cell of every place has a pair of its own; in
+/// distribution 2 the pair of one peer has a client per size, so that there are five further nodes for each peer only.
 pub(super) fn measure(groups: &[Group], results: &mut Vec<Response>) -> Result<()> {
     let (alone, among): (Vec<_>, Vec<_>) = groups.iter().partition(|group| group.setting.distribution == 1);
     let outcome = if alone.is_empty() { Ok(()) } else { together(&alone, false, results) };
     among.into_iter().fold(outcome, |outcome, group| outcome.and(together(&[group], true, results)))
 }
 
-/// The groups' cells, all at once or one pair after the other; what there is has rows even where something fails.
-fn together(groups: &[&Group], one_by_one: bool, results: &mut Vec<Response>) -> Result<()> {
+/// The groups' cells, all at once; what there is has rows even where something fails.
+fn together(groups: &[&Group], shares_pair: bool, results: &mut Vec<Response>) -> Result<()> {
     if is_stopped() {
         return Ok(());
     }
     let mut cells: Vec<Cells> = groups.iter().map(|group| empty(group)).collect();
-    let outcome = turns(groups, one_by_one, &mut cells);
+    let outcome = turns(groups, shares_pair, &mut cells);
     groups.iter().zip(&cells).for_each(|(group, cells)| results.extend(rows(group, cells)));
     outcome
 }
@@ -57,30 +57,27 @@ fn empty(group: &Group) -> Cells {
     group.orders.iter().map(|_| group.peers.iter().map(|_| Cell::default()).collect()).collect()
 }
 
-fn turns(groups: &[&Group], one_by_one: bool, cells: &mut [Cells]) -> Result<()> {
-    let mut seats = seats(groups, one_by_one)?;
+fn turns(groups: &[&Group], shares_pair: bool, cells: &mut [Cells]) -> Result<()> {
+    let mut seats = seats(groups, shares_pair)?;
     let rounds = groups.iter().map(|group| group.rounds).max().unwrap_or(0);
-    let at_once = if one_by_one { 1 } else { seats.len().max(1) };
-    let what = format!("response: seconds apart, distribution {}", if one_by_one { 2 } else { 1 });
-    let bar = Progress::new(&what, rounds as usize * seats.len().div_ceil(at_once));
+    let what = format!("echoes: seconds apart, distribution {}", if shares_pair { 2 } else { 1 });
+    let bar = Progress::new(&what, rounds as usize);
     for _ in 0..rounds {
-        for seats in seats.chunks_mut(at_once) {
-            if is_stopped() {
-                return Ok(());
-            }
-            turn(seats, cells).context("calls that are seconds apart")?;
-            bar.step();
+        if is_stopped() {
+            return Ok(());
         }
+        turn(&mut seats, cells).context("calls that are seconds apart")?;
+        bar.step();
     }
     Ok(())
 }
 
-fn seats(groups: &[&Group], one_by_one: bool) -> Result<Vec<Seat>> {
+fn seats(groups: &[&Group], shares_pair: bool) -> Result<Vec<Seat>> {
     let mut wanted: Vec<(&Contender, Setting, Vec<Place>)> = Vec::new();
     for (number, group) in groups.iter().enumerate() {
         for (peer, contender) in group.peers.iter().enumerate() {
             let places = (0..group.orders.len()).map(|order| Place { group: number, order, peer });
-            match one_by_one {
+            match shares_pair {
                 true => wanted.push((contender, group.setting, places.collect())),
                 false => wanted.extend(places.map(|place| (contender, group.setting, vec![place]))),
             }

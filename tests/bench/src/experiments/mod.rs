@@ -4,6 +4,7 @@ mod availability;
 mod constraints;
 mod far;
 mod goals;
+mod link;
 mod plan;
 mod response;
 mod resume;
@@ -69,11 +70,13 @@ pub(crate) struct Options {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum Experiment {
     Response,
+    Echoes,
     Throughput,
     Share,
     Scale,
     Constraints,
     Availability,
+    Link,
 }
 
 impl Experiment {
@@ -81,22 +84,26 @@ impl Experiment {
     fn name(self) -> &'static str {
         match self {
             Self::Response => "response",
+            Self::Echoes => "echoes",
             Self::Throughput => "throughput",
             Self::Share => "share",
             Self::Scale => "scale",
             Self::Constraints => "constraints",
             Self::Availability => "availability",
+            Self::Link => "link",
         }
     }
 
     fn measure(self, plan: &Plan, results: &mut Results) -> Result<()> {
         match self {
             Self::Response => response::measure(plan, &mut results.response),
+            Self::Echoes => far::measure(&plan.far, &mut results.echoes),
             Self::Throughput => throughput::measure(plan, &mut results.throughput),
             Self::Share => share::measure(plan, &mut results.share, &mut results.run.notes),
             Self::Scale => scale::measure(plan, &mut results.scale),
             Self::Constraints => constraints::measure(plan, &mut results.constraints),
             Self::Availability => availability::measure(plan, &mut results.availability),
+            Self::Link => link::measure(plan, results),
         }
     }
 }
@@ -266,6 +273,7 @@ mod tests {
             delivery,
             pin: Pin::Same,
             mode: Mode::Plain,
+            print: false,
             counts,
             worst_group: 1.0,
             executed_per_s: 1.0,

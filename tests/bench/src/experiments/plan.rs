@@ -58,6 +58,7 @@ pub(crate) struct Plan {
     pub(crate) scale_calls: u32,
     pub(crate) availability: Vec<Bursts>,
     pub(crate) constrained: Constrained,
+    pub(crate) link: Link,
     /// Where the experiments run that have one place only.
     pub(crate) pin: Pin,
     /// What could not be planned.
@@ -100,6 +101,33 @@ pub(crate) struct Constrained {
     pub(crate) count: u32,
 }
 
+/// The paper's experiments on links that fill, each cell at each rate.
+#[derive(Debug, Clone)]
+pub(crate) struct Link {
+    pub(crate) mbit: Vec<u32>,
+    /// Of one rate each.
+    pub(crate) response: Vec<Group>,
+    pub(crate) availability: LinkBursts,
+    pub(crate) constrained: Constrained,
+    /// Calls under each pair of constraints.
+    pub(crate) constrained_calls: u32,
+}
+
+/// A message that takes longer is left out: a group of them would take minutes.
+pub(crate) const LONGEST_MS: u32 = 20;
+
+/// One-way requests on a link, in both distributions; none that takes a link longer than [`LONGEST_MS`].
+#[derive(Debug, Clone)]
+pub(crate) struct LinkBursts {
+    pub(crate) mbit: Vec<u32>,
+    pub(crate) chars: Vec<u32>,
+    pub(crate) periods_ms: Vec<u64>,
+    pub(crate) groups: u32,
+    pub(crate) group: u32,
+    /// Other systems with messages without an answer.
+    pub(crate) outside: Vec<Contender>,
+}
+
 const COMPARED: [&str; 4] = ["floor", "floor_again", "cara", SECURED];
 const AMONG: [&str; 5] = ["floor", "floor_again", "cara", SECURED, "cara_among_1000_idle"];
 const SHARED: [&str; 5] = ["floor", "floor_again", "cara", SECURED, "cara_one_link"];
@@ -125,11 +153,11 @@ impl Plan {
         };
         let callers = extent.of(vec![1, 8, 64], vec![1, 8, 64], vec![1, 2]);
         let orders = callers.into_iter().map(|callers| busy_order(callers, extent.of(3_200, 1_600, 8))).collect();
-        let setting = Setting { pin, distribution: 1, print: false };
+        let setting = Setting { pin, distribution: 1, print: false, mbit: None };
         Ok(Self {
             extent,
             response,
-            far: far(extent, places, print),
+            far: far(extent, pin, places),
             throughput: Group { setting, peers: with(&SHARED, outside.iter()), orders, rounds: extent.of(9, 3, 1) },
             throughput_pins: places.to_vec(),
             one_way_peers: with(&COMPARED, outside.iter().filter(|outside| outside.is_one_way())),
@@ -142,6 +170,7 @@ impl Plan {
             scale_calls: extent.of(400, 200, 5),
             availability: availability(extent),
             constrained: constrained(extent),
+            link: link(extent, pin, outside),
             pin,
             notes,
         })
@@ -182,7 +211,7 @@ fn with<'o>(own: &[&'static str], outside: impl Iterator<Item = &'o Arc<Outside>
 fn tiny(outside: &[Arc<Outside>]) -> Vec<Group> {
     let own = || with(&COMPARED, [].iter());
     let group = |distribution, print, peers, orders| {
-        let setting = Setting { pin: Pin::None, distribution, print };
+        let setting = Setting { pin: Pin::None, distribution, print, mbit: None };
         Group { setting, peers, orders, rounds: 1 }
     };
     let orders = || vec![order(1, 5, 0), order(20_000, 5, 0), order(100, 2, 10)];
@@ -210,21 +239,21 @@ fn response(extent: Extent, pins: &[Pin], places: &[Pin], print: bool, outside: 
     let calls = extent.of(200, 100, 5);
     for distribution in [1, 2] {
         for &pin in pins {
-            let setting = Setting { pin, distribution, print };
+            let setting = Setting { pin, distribution, print, mbit: None };
             let is_shortened = extent == Extent::Quick && (pin == Pin::None || distribution == 2);
             let peers = if is_shortened { &COMPARED[..] } else { &AMONG[..] };
             let outside = if is_shortened || print { &[] } else { outside };
             add(setting, with(peers, outside.iter()), extent.of(24, 4, 1), orders(&CHARS, calls, 0));
         }
         for &pin in places {
-            let setting = Setting { pin, distribution, print };
+            let setting = Setting { pin, distribution, print, mbit: None };
             let (chars, rounds) = extent.of((&CHARS[..], 12), (&SOME_CHARS[..], 1), (&SOME_CHARS[..], 1));
             // In distribution 2 the peers do not wait side by side.
             let calls = if extent == Extent::Full && distribution == 1 { 20 } else { 10 };
             add(setting, own(), rounds, orders(chars, calls, 10));
         }
         for &pin in places.iter().filter(|_| !print && (extent == Extent::Full || distribution == 1)) {
-            let setting = Setting { pin, distribution, print: true };
+            let setting = Setting { pin, distribution, print: true, mbit: None };
             add(setting, own(), extent.of(12, 4, 1), orders(&CHARS, calls, 0));
         }
     }
@@ -234,22 +263,20 @@ fn response(extent: Extent, pins: &[Pin], places: &[Pin], print: bool, outside: 
 /// The paper's pause between a reply and the next request.
 const PAUSE_MS: u64 = 2_000;
 
-/// Few calls, as each of them waits.
-fn far(extent: Extent, places: &[Pin], print: bool) -> Vec<Group> {
+/// As the paper's: with printing, a hundred calls of each size in full. Distribution 2 at one place only.
+fn far(extent: Extent, pin: Pin, places: &[Pin]) -> Vec<Group> {
     let group = |(distribution, pin)| {
         let chars = extent.of(&CHARS[..], &SOME_CHARS, &[100]);
         let (rounds, calls) = match (extent, distribution) {
-            (Extent::Full, 1) => (3, 10),
-            (Extent::Full, _) => (3, 3),
+            (Extent::Full, _) => (10, 10),
             (Extent::Quick, 1) => (1, 3),
-            _ => (1, 1),
+            _ => (1, 2),
         };
         let pause_ms = extent.of(PAUSE_MS, PAUSE_MS, 50);
-        let setting = Setting { pin, distribution, print };
+        let setting = Setting { pin, distribution, print: true, mbit: None };
         Group { setting, peers: with(&COMPARED, [].iter()), orders: orders(chars, calls, pause_ms), rounds }
     };
-    let cells = [1, 2].into_iter().flat_map(|distribution| places.iter().map(move |&pin| (distribution, pin)));
-    cells.map(group).collect()
+    places.iter().map(|&pin| (1, pin)).chain([(2, pin)]).map(group).collect()
 }
 
 fn availability(extent: Extent) -> Vec<Bursts> {
@@ -280,6 +307,40 @@ fn availability(extent: Extent) -> Vec<Bursts> {
             ]
         })
         .collect()
+}
+
+fn link(extent: Extent, pin: Pin, outside: &[Arc<Outside>]) -> Link {
+    let known =
+        || outside.iter().filter(|outside| ["omniorb", "zenoh"].contains(&outside.name()) && extent != Extent::Quick);
+    let mbit = extent.of(vec![10, 20, 100], vec![20], vec![100]);
+    let chars: &[u32] = extent.of(&CHARS, &SOME_CHARS, &[100]);
+    let (rounds, calls) = extent.of((5, 20), (2, 5), (1, 3));
+    let group = |(distribution, mbit)| {
+        let setting = Setting { pin, distribution, print: true, mbit: Some(mbit) };
+        Group { setting, peers: with(&COMPARED, known()), orders: orders(chars, calls, 20), rounds }
+    };
+    let cells = [1, 2].into_iter().flat_map(|distribution| mbit.iter().map(move |&mbit| (distribution, mbit)));
+    Link {
+        response: cells.map(group).collect(),
+        availability: LinkBursts {
+            // The slowest one fills with what a datagram holds.
+            mbit: [extent.of(&[2][..], &[2], &[]), &mbit].concat(),
+            chars: extent.of(vec![1_000, 10_000, 20_000], vec![1_000, 20_000], vec![1_000]),
+            periods_ms: extent.of(vec![1, 2, 5, 8, 10, 15, 20, 30, 50, 80], vec![5, 10, 20], vec![1]),
+            groups: extent.of(5, 1, 1),
+            group: extent.of(200, 100, 5),
+            outside: with(&[], known()),
+        },
+        constrained: Constrained {
+            intervals_ms: extent.of(vec![0, 2, 5, 10, 20, 50], vec![0, 10], vec![0]),
+            message_sizes: extent.of(vec![1_024, 8_192, 32_768], vec![1_024, 32_768], vec![32_768]),
+            chars: extent.of(vec![100, 1_000, 5_000, 20_000], vec![1_000, 20_000], vec![1_000]),
+            period_ms: 5,
+            count: extent.of(400, 100, 5),
+        },
+        constrained_calls: extent.of(50, 10, 2),
+        mbit,
+    }
 }
 
 fn constrained(extent: Extent) -> Constrained {

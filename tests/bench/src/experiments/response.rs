@@ -2,7 +2,6 @@
 
 use anyhow::{Context, Result};
 
-use super::far;
 use super::plan::{Group, Plan};
 use crate::lanes::side_by_side;
 use crate::pair::{Pair, Setting};
@@ -29,8 +28,7 @@ pub(super) fn measure(plan: &Plan, rows: &mut Vec<Response>) -> Result<()> {
         rows.extend(self::rows(group, &cells));
         outcome = outcome.and(unless_stopped(ended));
     }
-    let ended = far::measure(&plan.far, rows);
-    outcome.and(ended)
+    outcome
 }
 
 /// A failure that a run need not end with; one that comes from its being stopped is noticed before anything else begins.
@@ -55,7 +53,7 @@ pub(super) fn turns(group: &Group, cells: &mut Cells, what: &str) -> Result<()> 
             }
             let shared = order.pause_ms > 0 && group.setting.distribution == 1;
             let turn = match shared {
-                true => spaced_turn(&mut pairs, order, round, cells),
+                true => spaced_turn(&group.peers, &mut pairs, order, round, cells),
                 false => turn(&group.peers, &mut pairs, order, round, cells),
             };
             outcome = outcome.and(unless_stopped(turn));
@@ -114,23 +112,30 @@ fn told(order: &Order) -> String {
     format!("{} characters, {} callers, {} ms apart", order.chars, order.callers, order.pause_ms)
 }
 
-/// Peers that pause are under way together: each calls while the others pause. All of them are our own.
-fn spaced_turn(pairs: &mut [Option<Pair>], order: &Order, round: usize, cells: &mut [Cell]) -> Result<()> {
-    let mut pairs: Vec<&mut Pair> = pairs.iter_mut().flatten().collect();
-    let offset = order.pause_ms * 1_000 / pairs.len().max(1) as u64;
-    let begun = pairs.iter_mut().zip(0..).map(|(pair, place): (_, u64)| {
+/// Peers that pause are under way together: each calls while the others pause.
+fn spaced_turn(
+    contenders: &[Contender],
+    pairs: &mut [Option<Pair>],
+    order: &Order,
+    round: usize,
+    cells: &mut [Cell],
+) -> Result<()> {
+    let offset = order.pause_ms * 1_000 / pairs.iter().flatten().count().max(1) as u64;
+    let begin = |(pair, place): (&mut Option<Pair>, u64)| {
         let delayed = Order { delay_us: offset * place, ..order.clone() };
-        pair.begin_blocks(&[delayed])
-    });
-    let begun = begun.collect::<Result<Vec<_>>>()?;
-    let turns: Vec<_> = pairs.iter_mut().zip(begun).map(|(pair, used)| pair.end_blocks(used)).collect();
+        Some(pair.as_mut()?.begin_blocks(&[delayed]))
+    };
+    let begun: Vec<Option<Result<u64>>> = pairs.iter_mut().zip(0..).map(begin).collect();
     let mut failure = Ok(());
-    for (cell, turn) in cells.iter_mut().zip(turns) {
-        match turn.with_context(|| told(order)) {
-            Ok(turn) if cell.turns.len() == round => cell.turns.extend(turn),
+    for (((contender, pair), begun), cell) in contenders.iter().zip(pairs).zip(begun).zip(cells) {
+        let (Some(running), Some(begun)) = (pair.as_mut(), begun) else { continue };
+        let turns = begun.and_then(|used| running.end_blocks(used)).with_context(|| told(order));
+        match contender.tolerate(turns) {
+            Ok(turns) if cell.turns.len() == round => cell.turns.extend(turns.into_iter().flatten()),
             Ok(_) => {}
             Err(error) => failure = failure.and(Err(error)),
         }
+        pair.take_if(|_| !contender.works());
     }
     failure
 }
@@ -165,7 +170,10 @@ fn row(peer: &str, setting: Setting, order: &Order, cell: &Cell, floor: &Cell) -
         print: setting.print,
         pause_ms: order.pause_ms,
         n: figures.calls,
+        mean_us: micros(figures.mean),
+        lower_quartile_us: micros(figures.lower_quartile),
         p50_us: micros(figures.median),
+        upper_quartile_us: micros(figures.upper_quartile),
         p99_us: micros(figures.p99),
         p999_us: micros(figures.p999),
         max_us: micros(figures.longest),

@@ -36,11 +36,17 @@ pub(super) fn keep(earlier: &Results, experiment: &str, into: &mut Results) {
     let earlier = earlier.clone();
     match experiment {
         "response" => into.response = earlier.response,
+        "echoes" => into.echoes = earlier.echoes,
         "throughput" => into.throughput = earlier.throughput,
         "share" => into.share = earlier.share,
         "scale" => into.scale = earlier.scale,
         "constraints" => into.constraints = earlier.constraints,
         "availability" => into.availability = earlier.availability,
+        "link" => {
+            into.link_response = earlier.link_response;
+            into.link_availability = earlier.link_availability;
+            into.link_constraints = earlier.link_constraints;
+        }
         _ => return,
     }
     into.run.experiments.extend(earlier.run.experiments.into_iter().filter(|done| done.experiment == experiment));

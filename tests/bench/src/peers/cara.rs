@@ -11,7 +11,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
-use cara_bench_ends::{Caller, Delivery, Executed, Limits, Peer, Place, Printer, Server};
+use cara_bench_ends::{Caller, Delivery, Executed, Limits, Peer, Place, Printer, Server, cable_end};
 use cara_std::keys::{FleetKeys, Store, place::file_name};
 use cara_std::{
     Builder, Call, CommunicationSystem, Constraints, Delivery as CaraDelivery, Fleet, Identity, Interfaces, Parameters,
@@ -84,7 +84,8 @@ fn start_idle(place: &Place, passive: &CommunicationSystem) -> Result<Child> {
 }
 
 fn placed(builder: Builder<()>, place: &Place) -> Builder<()> {
-    builder.fleet(place.run).discovery_port(place.discovery_port()).interfaces(Interfaces::Loopback)
+    let interfaces = if cable_end().is_some() { Interfaces::All } else { Interfaces::Loopback };
+    builder.fleet(place.run).discovery_port(place.discovery_port()).interfaces(interfaces)
 }
 
 fn main_name(id: u32) -> String {

@@ -22,7 +22,7 @@ pub(crate) struct Floor;
 
 impl Peer for Floor {
     fn start_server(&self, place: &Place) -> Result<Server> {
-        let listener = TcpListener::bind("127.0.0.1:0")?;
+        let listener = TcpListener::bind((place.host(), 0))?;
         let address = listener.local_addr()?.to_string();
         let executed = Arc::new(Executed::default());
         let (counted, printer) = (executed.clone(), place.printer());
