@@ -21,6 +21,8 @@ mod share;
 mod statistics;
 mod table;
 
+use std::path::PathBuf;
+
 use anyhow::Result;
 use cara_bench_ends::{End, Place, further, serve};
 use clap::{Parser, Subcommand};
@@ -37,6 +39,13 @@ struct Arguments {
 enum Command {
     /// Response time, throughput, the share of messages, scale, constraints and availability.
     Experiments(experiments::Options),
+    /// Draws the figures of an earlier run again.
+    Plots {
+        /// What it wrote.
+        json: PathBuf,
+        /// Where they go.
+        folder: PathBuf,
+    },
     /// The process that answers; started by the others.
     #[command(hide = true)]
     Serve(End),
@@ -65,6 +74,7 @@ fn main() -> Result<()> {
             }
             experiments::run(&options)
         }
+        Command::Plots { json, folder } => plots::draw(&results::Results::read(&json)?, &folder),
         Command::Serve(end) => serve(&*peers::named(&end.peer)?, &end),
         Command::Call(end) => child::call(&end),
         Command::Further(end) => further(&*peers::named(&end.peer)?, &end),

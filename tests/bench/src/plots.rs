@@ -1,39 +1,67 @@
 //! The paper's figures from a run: 6 and 7 (response time and availability in each distribution), 8 (availability at
-//! 20,000 characters in both), the ratios to the floor, and those of other systems.
+//! 20,000 characters in both), on loopback and on links that fill; the ratios to the floor, and those of other systems.
 
+mod axis;
 mod chart;
+mod link;
 
 use std::path::Path;
 
 use anyhow::{Context, Result};
 
 use crate::results::{Availability, Mode, Response, Results};
+use axis::Axis;
 use cara_bench_ends::Delivery;
 use cara_bench_ends::Pin;
-use chart::{Axis, Chart, Line};
+use chart::{Chart, Kind, Line, Point};
 
 /// The size of figure 8.
 const LONG: u32 = 20_000;
 
+/// A figure: rows of charts, and what is said below its legend.
+struct Figure {
+    name: &'static str,
+    rows: Vec<Vec<Chart>>,
+    about: Vec<String>,
+}
+
 /// Draws every figure for which there are rows, each as SVG and PNG.
 pub(crate) fn draw(results: &Results, folder: &Path) -> Result<()> {
     std::fs::create_dir_all(folder).with_context(|| format!("making {}", folder.display()))?;
-    for (name, charts) in figures(results) {
-        let charts: Vec<Chart> = charts.into_iter().filter(|chart| !chart.is_empty()).collect();
-        if !charts.is_empty() {
-            chart::draw(&charts, &folder.join(name)).with_context(|| format!("drawing {name}"))?;
+    for mut figure in figures(results).into_iter().chain(link::figures(results)) {
+        figure.rows.retain(|row| !row.iter().all(Chart::is_empty));
+        if !figure.rows.is_empty() {
+            let drawn = chart::draw(&figure.rows, &figure.about, &folder.join(figure.name));
+            drawn.with_context(|| format!("drawing {}", figure.name))?;
         }
     }
     Ok(())
 }
 
-fn figures(results: &Results) -> Vec<(&'static str, Vec<Chart>)> {
+fn figures(results: &Results) -> Vec<Figure> {
+    let figure = |name, charts, about: &[&str]| Figure {
+        name,
+        rows: vec![charts],
+        about: about.iter().map(|line| (*line).to_owned()).collect(),
+    };
+    let apart = results.echoes.iter().map(|row| row.n).min().unwrap_or(0);
+    let spread = format!("2 s apart: n = {apart} a point, printing");
+    let loopback =
+        [&spread, "bars: quartiles (response time),", "worst group to 1 (availability)", "loopback cannot fill"];
     vec![
-        ("figure-6", vec![response(results, 1), availability(results, 1)]),
-        ("figure-7", vec![response(results, 2), availability(results, 2)]),
-        ("figure-8", vec![both(results)]),
-        ("ratios", vec![ratios(results, Pin::Same), ratios(results, Pin::Split)]),
-        ("other-systems", vec![others(results, Pin::Same), others(results, Pin::Split)]),
+        figure("figure-6", vec![response(results, 1), availability(results, 1)], &loopback),
+        figure("figure-7", vec![response(results, 2), availability(results, 2)], &loopback),
+        figure("figure-8", vec![both(results)], &loopback[2..]),
+        figure(
+            "ratios",
+            vec![ratios(results, Pin::Same), ratios(results, Pin::Split)],
+            &["bars: quartiles of the turns"],
+        ),
+        figure(
+            "other-systems",
+            vec![others(results, Pin::Same), others(results, Pin::Split)],
+            &["bars: quartiles of the turns"],
+        ),
     ]
 }
 
@@ -57,29 +85,72 @@ fn calls_in<'r>(
     results.response.iter().filter(is_wanted).collect()
 }
 
-/// Response time over size: as far apart as the paper's, and back to back.
-fn response(results: &Results, distribution: u8) -> Chart {
-    let mut lines = Vec::new();
-    for (pause_ms, spacing) in [(2_000, "2 s apart"), (10, "10 ms apart"), (0, "back to back")] {
-        for pin in [Pin::Split, Pin::Same, Pin::None] {
-            for peer in ["cara", "floor"] {
-                let rows = calls(results, peer, distribution, pin, pause_ms);
-                let points = rows.iter().map(|row| (f64::from(row.chars), row.p50_us)).collect();
-                lines.push(Line { name: format!("{peer}, {spacing}, {pin}"), points });
-            }
-        }
-    }
-    lines.retain(|line| line.points.len() > 1);
-    // One place is enough to look at.
-    if let Some(place) = lines.first().and_then(|line| line.name.rsplit(", ").next().map(str::to_owned)) {
-        lines.retain(|line| line.name.ends_with(&place));
-    }
-    let title = format!("Response time, distribution {distribution}, median");
-    Chart { title, x: Axis::log("characters"), y: Axis::log("µs"), lines }
+/// Medians and quartiles of round trips by size.
+fn round_trips<'r>(rows: impl Iterator<Item = &'r Response>) -> Vec<Point> {
+    let point = |row: &Response| {
+        Point::new(f64::from(row.chars), row.p50_us).with_spread(row.lower_quartile_us, row.upper_quartile_us)
+    };
+    rows.map(point).collect()
 }
 
-fn periods(row: &Availability) -> (f64, f64) {
-    (row.period_ms as f64, row.counts.executed_of_offered)
+/// In proportion to the floor's, by size.
+fn proportions(rows: &[&Response]) -> Vec<Point> {
+    let point = |row: &&Response| {
+        Point::new(f64::from(row.chars), row.ratio).with_spread(row.ratio_lower_quartile, row.ratio_upper_quartile)
+    };
+    rows.iter().map(point).collect()
+}
+
+/// Response time over size: as far apart as the paper's, and back to back.
+fn response(results: &Results, distribution: u8) -> Chart {
+    let places = [Pin::Split, Pin::Same, Pin::None];
+    let of = |row: &&Response, pin| row.distribution == distribution && row.pin == pin;
+    let pin = places.into_iter().find(|pin| results.echoes.iter().any(|row| of(&row, *pin))).unwrap_or(Pin::None);
+    let echoes = results.echoes.iter().filter(|row| of(row, pin));
+    let mut lines = Vec::new();
+    for (peer, mode, name) in PEERS {
+        let rows = echoes.clone().filter(|row| row.peer == peer && row.mode == mode);
+        lines.push(Line::measured(format!("{name}, 2 s apart"), round_trips(rows)));
+    }
+    for peer in ["floor", "cara"] {
+        let rows = calls(results, peer, distribution, pin, 0);
+        lines.push(Line::measured(format!("{peer}, back to back, silent"), round_trips(rows.into_iter())));
+    }
+    let title = format!("Response time, distribution {distribution}, loopback");
+    Chart::new(title, Axis::log("characters"), Axis::log("µs, median"), lines)
+}
+
+/// Whose curves are drawn, and their names there.
+const PEERS: [(&str, Mode, &str); 3] =
+    [("floor", Mode::Plain, "plain sockets"), ("cara", Mode::Plain, "CARA"), ("cara", Mode::Secured, "CARA, secured")];
+
+fn periods<'r>(rows: impl Iterator<Item = &'r Availability>) -> Vec<Point> {
+    let point = |row: &Availability| {
+        let share = row.counts.executed_of_offered;
+        // Period 0 stands a little left of 1 ms.
+        Point::new((row.period_ms as f64).max(0.5), share).with_spread(row.worst_group, share)
+    };
+    rows.map(point).collect()
+}
+
+/// What the paper's text says of availability: lowest value, periods, sizes.
+fn paper(distribution: u8, longest: u32) -> Option<Line> {
+    let (low, from, sizes) = match (distribution, longest) {
+        (1, ..=10_000) => (0.81, 20.0, "up to 10,000 characters"),
+        (1, _) => (0.97, 70.0, "20,000 characters"),
+        _ => return None,
+    };
+    let name = format!("the paper's lowest, distribution 1, {sizes}");
+    Some(Line::of(Kind::Paper, name, &[(from, low), (100.0, low)]))
+}
+
+/// Where the paper's text sees availability fall, in distribution 2.
+fn paper_falls(distribution: u8, longest: u32) -> Vec<(f64, String)> {
+    match (distribution, longest) {
+        (2, ..=10_000) => vec![(20.0, "paper: falls below 20 ms".into())],
+        (2, _) => vec![(80.0, "paper: falls below 80 ms".into())],
+        _ => Vec::new(),
+    }
 }
 
 /// Availability over period, one line per size.
@@ -88,12 +159,14 @@ fn availability(results: &Results, distribution: u8) -> Chart {
     let mut sizes: Vec<u32> = rows().map(|row| row.chars).collect();
     sizes.sort_unstable();
     sizes.dedup();
-    let lines = sizes.into_iter().map(|chars| {
-        let points = rows().filter(|row| row.chars == chars).map(periods).collect();
-        Line { name: format!("{chars} characters"), points }
-    });
-    let title = format!("Availability, distribution {distribution}, reliable");
-    Chart { title, x: Axis::linear("period, ms"), y: Axis::share("executed / offered"), lines: lines.collect() }
+    let line =
+        |chars: u32| Line::measured(format!("{chars} characters"), periods(rows().filter(|row| row.chars == chars)));
+    let mut lines: Vec<Line> = sizes.into_iter().map(line).collect();
+    lines.extend([10_000, LONG].into_iter().filter_map(|longest| paper(distribution, longest)));
+    let title = format!("Availability, distribution {distribution}, loopback");
+    let mut chart = Chart::new(title, Axis::log("period, ms (leftmost: 0)"), Axis::share("executed / offered"), lines);
+    chart.knees = [10_000, LONG].into_iter().flat_map(|longest| paper_falls(distribution, longest)).collect();
+    chart
 }
 
 fn is_reliable(row: &&Availability) -> bool {
@@ -104,28 +177,25 @@ fn is_reliable(row: &&Availability) -> bool {
 fn both(results: &Results) -> Chart {
     let line = |distribution: u8| {
         let rows = results.availability.iter().filter(is_reliable).filter(|row| row.chars == LONG);
-        let points = rows.filter(|row| row.distribution == distribution).map(periods).collect();
-        Line { name: format!("distribution {distribution}"), points }
+        let rows = rows.filter(|row| row.distribution == distribution);
+        Line::measured(format!("distribution {distribution}"), periods(rows))
     };
-    let title = format!("Availability, {LONG} characters");
-    let lines = vec![line(1), line(2)];
-    Chart { title, x: Axis::linear("period, ms"), y: Axis::share("executed / offered"), lines }
+    let title = format!("Availability, {LONG} characters, loopback");
+    let lines = [line(1), line(2)].into_iter().chain(paper(1, LONG)).collect();
+    let mut chart = Chart::new(title, Axis::log("period, ms (leftmost: 0)"), Axis::share("executed / offered"), lines);
+    chart.knees = paper_falls(2, LONG);
+    chart
 }
 
 /// Median round trips of CARA and other systems in proportion to the floor's; none where no other system was measured.
 fn others(results: &Results, pin: Pin) -> Chart {
-    let line = |peer: &str| {
-        let rows = calls(results, peer, 1, pin, 0);
-        let points = rows.iter().map(|row| (f64::from(row.chars), row.ratio)).collect();
-        Line { name: peer.to_owned(), points }
-    };
+    let line = |peer: &str| Line::measured(peer, proportions(&calls(results, peer, 1, pin, 0)));
     let mut lines: Vec<Line> = results.run.peers.iter().map(|outside| line(&outside.peer)).collect();
     lines.retain(|line| !line.points.is_empty());
     if !lines.is_empty() {
         lines.insert(0, line("cara"));
     }
-    let title = format!("Round trip / floor, back to back, {pin}, distribution 1");
-    Chart { title, x: Axis::log("characters"), y: Axis::log("ratio"), lines }
+    Chart::new(format!("Round trip / floor, {pin}, distribution 1"), Axis::log("characters"), Axis::log("ratio"), lines)
 }
 
 /// Median round trips in proportion to the floor's, with the control.
@@ -140,15 +210,9 @@ fn ratios(results: &Results, pin: Pin) -> Chart {
     for distribution in [1, 2] {
         for (mode, peer, label) in peers {
             let rows = calls_in(mode, results, peer, distribution, pin, 0);
-            let points = rows.iter().map(|row| (f64::from(row.chars), row.ratio)).collect();
-            lines.push(Line { name: format!("{peer}{label}, distribution {distribution}"), points });
+            lines.push(Line::measured(format!("{peer}{label}, distribution {distribution}"), proportions(&rows)));
         }
     }
     lines.retain(|line| !line.points.is_empty());
-    Chart {
-        title: format!("Round trip / floor, back to back, {pin}"),
-        x: Axis::log("characters"),
-        y: Axis::linear("ratio"),
-        lines,
-    }
+    Chart::new(format!("Round trip / floor, back to back, {pin}"), Axis::log("characters"), Axis::log("ratio"), lines)
 }

@@ -259,7 +259,7 @@ impl<T> OnLink<T> {
 }
 
 /// The rows of a list that were measured, each with the rate of its link.
-pub(crate) fn measured<T>(rows: &[OnLink<T>]) -> impl Iterator<Item = (u32, &T)> {
+pub(crate) fn measured<T>(rows: &[OnLink<T>]) -> impl Iterator<Item = (u32, &T)> + Clone {
     rows.iter().filter_map(|on| Some((on.mbit, on.row.as_ref()?)))
 }
 

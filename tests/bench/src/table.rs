@@ -2,11 +2,12 @@
 
 use comfy_table::{Table, presets};
 
-use crate::results::{Counts, Mode, Results};
+use crate::results::{Counts, Mode, OnLink, Response, Results, measured};
 
 /// Prints a table for each kind of row that there is.
 pub(crate) fn show(results: &Results) {
-    response(results);
+    response(&results.response);
+    response(&results.echoes);
     throughput(results);
     if let Some(share) = &results.share {
         let [generate, process] = [share.generate, share.process].map(|part| part * 100.0);
@@ -18,6 +19,9 @@ pub(crate) fn show(results: &Results) {
     scale(results);
     constraints(results);
     availability(results);
+    link_response(results);
+    link_availability(results);
+    link_constraints(results);
     goals(results);
     let run = &results.run;
     let state = if run.is_complete { "complete" } else { "not complete" };
@@ -52,7 +56,7 @@ fn of_mode(peer: &str, mode: Mode) -> String {
     }
 }
 
-fn response(results: &Results) {
+fn response(rows: &[Response]) {
     let header = [
         "pin",
         "distr.",
@@ -61,7 +65,9 @@ fn response(results: &Results) {
         "chars",
         "peer",
         "n",
+        "mean µs",
         "p50 µs",
+        "quartiles µs",
         "p99 µs",
         "p99.9 µs",
         "max µs",
@@ -72,7 +78,7 @@ fn response(results: &Results) {
         "CPU µs",
         "CPU ratio",
     ];
-    let rows = results.response.iter().map(|row| {
+    let rows = rows.iter().map(|row| {
         vec![
             row.pin.to_string(),
             row.distribution.to_string(),
@@ -81,7 +87,9 @@ fn response(results: &Results) {
             row.chars.to_string(),
             of_mode(&row.peer, row.mode),
             row.n.to_string(),
+            format!("{:.1}", row.mean_us),
             format!("{:.1}", row.p50_us),
+            format!("{:.1}-{:.1}", row.lower_quartile_us, row.upper_quartile_us),
             format!("{:.1}", row.p99_us),
             format!("{:.1}", row.p999_us),
             format!("{:.1}", row.max_us),
@@ -160,6 +168,72 @@ fn availability(results: &Results) {
     });
     let first = ["distr.", "mode", "delivery", "chars", "period ms"];
     print(&[&first[..], &COUNTS, &["per second", "to the floor's"]].concat(), rows);
+}
+
+/// Says why a list has no rows, where it has none.
+fn skipped<T>(what: &str, rows: &[OnLink<T>]) {
+    if let Some(reason) = rows.iter().find_map(|row| row.skipped.as_ref()) {
+        println!("{what}: skipped: {reason}\n");
+    }
+}
+
+fn link_response(results: &Results) {
+    skipped("response on a link", &results.link_response);
+    let rows = measured(&results.link_response).map(|(mbit, row)| {
+        vec![
+            mbit.to_string(),
+            row.distribution.to_string(),
+            row.chars.to_string(),
+            of_mode(&row.peer, row.mode),
+            row.n.to_string(),
+            format!("{:.2}", row.mean_us / 1e3),
+            format!("{:.2}", row.p50_us / 1e3),
+            format!("{:.2}-{:.2}", row.lower_quartile_us / 1e3, row.upper_quartile_us / 1e3),
+            format!("{:.2}", row.p99_us / 1e3),
+            format!("{:.3}", row.ratio),
+        ]
+    });
+    let header = ["Mbit/s", "distr.", "chars", "peer", "n", "mean ms", "p50 ms", "quartiles ms", "p99 ms", "ratio"];
+    print(&header, rows);
+}
+
+fn link_availability(results: &Results) {
+    let rows = measured(&results.link_availability).map(|(mbit, row)| {
+        let mut cells = vec![
+            mbit.to_string(),
+            row.distribution.to_string(),
+            of_mode(&row.peer, row.mode),
+            format!("{:?}", row.delivery),
+            row.chars.to_string(),
+            row.period_ms.to_string(),
+            format!("{:.2}", row.load),
+        ];
+        cells.extend(counts(&row.counts));
+        cells.push(format!("{:.3}", row.in_time_of_offered));
+        cells.push(format!("{:.2}-{:.2}", row.worst_group, row.best_group));
+        cells
+    });
+    let first = ["Mbit/s", "distr.", "peer", "delivery", "chars", "period ms", "load"];
+    print(&[&first[..], &COUNTS, &["in time/offered", "groups"]].concat(), rows);
+}
+
+fn link_constraints(results: &Results) {
+    let rows = measured(&results.link_constraints).map(|(mbit, row)| {
+        let mut cells = vec![
+            mbit.to_string(),
+            row.mode.name().to_owned(),
+            format!("{:?}", row.delivery),
+            row.minimum_interval_ms.to_string(),
+            row.message_size.to_string(),
+            row.chars.to_string(),
+        ];
+        cells.extend(counts(&row.counts));
+        cells.push(format!("{:.3}", row.in_time_of_offered));
+        cells.push(row.p50_us.map_or_else(|| "refused".to_owned(), |micros| format!("{:.2}", micros / 1e3)));
+        cells
+    });
+    let first = ["Mbit/s", "mode", "delivery", "interval ms", "message size", "chars"];
+    print(&[&first[..], &COUNTS, &["in time/offered", "call p50 ms"]].concat(), rows);
 }
 
 fn goals(results: &Results) {

@@ -22,7 +22,7 @@ use clap::{Args, ValueEnum};
 use crate::peers::{Outside, Selection};
 use crate::plots;
 use crate::progress::{is_stopped, stop_at_interrupt, was_stopped};
-use crate::results::{About, Done, Results, ratio};
+use crate::results::{About, Done, Results, measured, ratio};
 use crate::table;
 use cara_bench_ends::Pin;
 use cara_processes::files;
@@ -246,7 +246,10 @@ fn silent_losses(results: &Results) -> Vec<String> {
     let is_outside = |peer: &str| results.run.peers.iter().any(|outside| outside.peer == peer);
     let one_way = results.throughput.iter().filter(|row| row.lost > 0 && !is_outside(&row.peer));
     let one_way = one_way.map(|row| format!("{}, one-way messages on {}: {} vanished", row.peer, row.pin, row.lost));
-    let counted = lost.chain(constrained);
+    let on_link = measured(&results.link_availability).map(|(_, row)| row);
+    let on_link = on_link.filter(|row| row.peer == "cara" && row.delivery == cara_bench_ends::Delivery::Reliable);
+    let on_link = on_link.map(|row| (&row.counts, row.chars, row.period_ms));
+    let counted = lost.chain(constrained).chain(on_link);
     counted
         .filter(|(counts, ..)| counts.lost > 0 || counts.executed > counts.sent)
         .map(|(counts, chars, period_ms)| {

@@ -325,7 +325,7 @@ fn link(extent: Extent, pin: Pin, outside: &[Arc<Outside>]) -> Link {
         availability: LinkBursts {
             // The slowest one fills with what a datagram holds.
             mbit: [extent.of(&[2][..], &[2], &[]), &mbit].concat(),
-            chars: extent.of(vec![1_000, 10_000, 20_000], vec![1_000, 20_000], vec![1_000]),
+            chars: extent.of(vec![1_000, 10_000, 20_000], vec![1_000, 20_000], vec![1_000, 20_000]),
             periods_ms: extent.of(vec![1, 2, 5, 8, 10, 15, 20, 30, 50, 80], vec![5, 10, 20], vec![1]),
             groups: extent.of(5, 1, 1),
             group: extent.of(200, 100, 5),

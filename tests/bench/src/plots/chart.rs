@@ -1,174 +1,244 @@
-//! Charts of lines, beside each other, with a font that is part of the program.
+//! Charts of lines in rows and columns, with one legend and a font that is part of the program.
+//!
+//! A line is told from the others by colour, marker and dashes, so that print in grey will do; lines that share an axis are
+//! a few pixels apart, so that none hides another.
 
-use std::ops::Range;
 use std::path::Path;
 
-use anyhow::{Result, anyhow};
+use anyhow::{Context, Result, anyhow};
 use plotters::coord::Shift;
-use plotters::coord::ranged1d::{DefaultFormatting, KeyPointHint, Ranged};
+use plotters::element::DashedPathElement;
 use plotters::prelude::*;
 use plotters::style::{FontStyle, register_font};
 
-/// Width of one chart and height of all, in pixels.
-const SIZE: (u32, u32) = (1_010, 540);
-/// Width of what tells the lines apart, beside them.
-const LEGEND: u32 = 300;
-/// From one line of that to the next.
-const SPACING: i32 = 22;
-/// How many marks an axis has at most.
-const MARKS: usize = 9;
+use super::axis::{Axis, Marked};
+
+/// Width and height of one chart, in pixels.
+const SIZE: (u32, u32) = (520, 400);
+/// Width of the legend, on the right of all charts.
+const LEGEND: u32 = 400;
+/// From one line of the legend to the next.
+const SPACING: i32 = 24;
+/// From one line to the next along the axis.
+const OFFSET: i32 = 2;
 /// Under this name the font is known to the drawing library.
 const FONT: &str = "sans-serif";
 
 /// A chart of lines with points.
+#[derive(Clone)]
 pub(super) struct Chart {
     pub(super) title: String,
     pub(super) x: Axis,
     pub(super) y: Axis,
     pub(super) lines: Vec<Line>,
+    /// Vertical lines with a text: where something is expected.
+    pub(super) knees: Vec<(f64, String)>,
 }
 
-/// One line of a chart.
+/// One line of a chart; lines of one name look alike in all charts of a figure.
+#[derive(Clone)]
 pub(super) struct Line {
     pub(super) name: String,
-    pub(super) points: Vec<(f64, f64)>,
-}
-
-/// What an axis shows.
-pub(super) struct Axis {
-    label: &'static str,
-    scale: Scale,
+    pub(super) kind: Kind,
+    pub(super) points: Vec<Point>,
 }
 
 #[derive(Clone, Copy, PartialEq, Eq)]
-enum Scale {
-    Linear,
-    /// From 0 to a little above 1.
-    Share,
-    Log,
+pub(super) enum Kind {
+    Measured,
+    /// Reckoned, not measured: thin and without markers.
+    Reckoned,
+    /// What the paper's text tells: a broad grey line.
+    Paper,
 }
 
-impl Axis {
-    pub(super) fn linear(label: &'static str) -> Self {
-        Self { label, scale: Scale::Linear }
+#[derive(Clone, Copy)]
+pub(super) struct Point {
+    pub(super) x: f64,
+    pub(super) y: f64,
+    /// Drawn as a bar.
+    pub(super) spread: Option<(f64, f64)>,
+    /// With a ring around it.
+    pub(super) is_knee: bool,
+}
+
+impl Point {
+    pub(super) fn new(x: f64, y: f64) -> Self {
+        Self { x, y, spread: None, is_knee: false }
     }
 
-    pub(super) fn share(label: &'static str) -> Self {
-        Self { label, scale: Scale::Share }
-    }
-
-    pub(super) fn log(label: &'static str) -> Self {
-        Self { label, scale: Scale::Log }
-    }
-
-    /// A value's place on the axis.
-    fn place(&self, value: f64) -> f64 {
-        if self.scale == Scale::Log { value.max(1e-3).log10() } else { value }
-    }
-
-    /// The text of a place.
-    fn text(&self, place: f64) -> String {
-        let value = if self.scale == Scale::Log { 10_f64.powf(place) } else { place };
-        ((value * 1e3).round() / 1e3).to_string()
-    }
-
-    /// Places of round values.
-    fn marks(&self, range: &Range<f64>) -> Vec<f64> {
-        if self.scale == Scale::Log {
-            let decades = range.start.floor() as i32..=range.end.ceil() as i32;
-            let marks = |steps: &[f64]| {
-                let values =
-                    decades.clone().flat_map(|decade| steps.iter().map(move |step| step * 10_f64.powi(decade)));
-                values.map(f64::log10).filter(|place| range.contains(place)).collect::<Vec<_>>()
-            };
-            let [fine, middle, coarse] = [&[1.0, 1.5, 2.0, 3.0, 5.0, 7.0][..], &[1.0, 2.0, 5.0], &[1.0]].map(marks);
-            return [fine, middle].into_iter().find(|marks| marks.len() <= MARKS).unwrap_or(coarse);
-        }
-        let steps = (-3..6).flat_map(|decade| [1.0, 2.0, 5.0].map(|step| step * 10_f64.powi(decade)));
-        let step = steps.into_iter().find(|step| (range.end - range.start) / step <= MARKS as f64).unwrap_or(1e6);
-        (0..=MARKS).map(|mark| mark as f64 * step).filter(|place| range.contains(place)).collect()
-    }
-
-    /// From where to where, so that all places and a margin fit.
-    fn range(&self, places: impl Iterator<Item = f64>) -> Range<f64> {
-        let (low, high) = places.fold((f64::MAX, f64::MIN), |(low, high), place| (low.min(place), high.max(place)));
-        match self.scale {
-            Scale::Share => 0.0..1.05,
-            Scale::Linear => 0.0..(high * 1.1).max(1e-9),
-            Scale::Log => (low - 0.1)..(high + 0.1),
-        }
+    pub(super) fn with_spread(self, low: f64, high: f64) -> Self {
+        Self { spread: Some((low, high)), ..self }
     }
 }
 
-/// An axis with lines and labels at these places only.
-struct Marked {
-    range: Range<f64>,
-    marks: Vec<f64>,
-}
-
-impl Ranged for Marked {
-    type FormatOption = DefaultFormatting;
-    type ValueType = f64;
-
-    fn map(&self, place: &f64, (first, last): (i32, i32)) -> i32 {
-        let part = (place - self.range.start) / (self.range.end - self.range.start);
-        first + (part * f64::from(last - first)).round() as i32
+impl Line {
+    pub(super) fn measured(name: impl Into<String>, points: Vec<Point>) -> Self {
+        Self { name: name.into(), kind: Kind::Measured, points }
     }
 
-    fn key_points<Hint: KeyPointHint>(&self, hint: Hint) -> Vec<f64> {
-        if hint.weight().allow_light_points() { Vec::new() } else { self.marks.clone() }
-    }
-
-    fn range(&self) -> Range<f64> {
-        self.range.clone()
+    pub(super) fn of(kind: Kind, name: impl Into<String>, points: &[(f64, f64)]) -> Self {
+        Self { name: name.into(), kind, points: points.iter().map(|&(x, y)| Point::new(x, y)).collect() }
     }
 }
 
 impl Chart {
-    pub(super) fn is_empty(&self) -> bool {
-        self.lines.iter().all(|line| line.points.is_empty())
+    pub(super) fn new(title: impl Into<String>, x: Axis, y: Axis, lines: Vec<Line>) -> Self {
+        Self { title: title.into(), x, y, lines, knees: Vec::new() }
     }
 
-    fn draw<D: DrawingBackend>(&self, area: &DrawingArea<D, Shift>) -> Result<()> {
+    /// Whether nothing in it was measured.
+    pub(super) fn is_empty(&self) -> bool {
+        !self.lines.iter().any(|line| line.kind == Kind::Measured && !line.points.is_empty())
+    }
+
+    fn draw<D: DrawingBackend>(&self, root: &Area<D>, area: &Area<D>, names: &[(String, Kind)]) -> Result<()> {
         let points = || self.lines.iter().flat_map(|line| &line.points);
-        let x = self.x.range(points().map(|point| self.x.place(point.0)));
-        let y = self.y.range(points().map(|point| self.y.place(point.1)));
-        let (area, legend) = area.split_horizontally(SIZE.0 - LEGEND);
-        let (x_marks, y_marks) = (self.x.marks(&x), self.y.marks(&y));
-        let (x, y) = (Marked { range: x, marks: x_marks }, Marked { range: y, marks: y_marks });
-        let mut builder = ChartBuilder::on(&area);
-        builder.caption(&self.title, (FONT, 20)).margin(12).x_label_area_size(44).y_label_area_size(64);
+        let spreads = || points().filter_map(|point| point.spread).flat_map(|(low, high)| [low, high]);
+        let x = Marked::new(&self.x, points().map(|point| point.x).chain(self.knees.iter().map(|(x, _)| *x)));
+        let y = Marked::new(&self.y, points().map(|point| point.y).chain(spreads()));
+        let mut builder = ChartBuilder::on(area);
+        builder.caption(&self.title, (FONT, 16)).margin(10).x_label_area_size(42).y_label_area_size(62);
         let mut chart = builder.build_cartesian_2d(x, y).map_err(told)?;
         let mut mesh = chart.configure_mesh();
         let (x_text, y_text) = (|place: &f64| self.x.text(*place), |place: &f64| self.y.text(*place));
         mesh.x_desc(self.x.label).y_desc(self.y.label).x_label_formatter(&x_text).y_label_formatter(&y_text);
-        mesh.label_style((FONT, 14)).x_labels(7).y_labels(8).draw().map_err(told)?;
-        for (index, line) in self.lines.iter().enumerate() {
-            let color = Palette99::pick(index).to_rgba();
-            let places = line.points.iter().map(|point| (self.x.place(point.0), self.y.place(point.1)));
-            let series = LineSeries::new(places, color.stroke_width(2)).point_size(3);
-            chart.draw_series(series).map_err(told)?;
-            let middle = 50 + index as i32 * SPACING;
-            legend.draw(&PathElement::new([(0, middle), (18, middle)], color.stroke_width(2))).map_err(told)?;
-            legend.draw(&Text::new(line.name.as_str(), (26, middle - 7), (FONT, 13))).map_err(told)?;
+        mesh.label_style((FONT, 13)).bold_line_style(BLACK.mix(0.12)).draw().map_err(told)?;
+        let place = |x: f64, y: f64| chart.backend_coord(&(self.x.place(x), self.y.place(y)));
+        let (_, tops) = chart.plotting_area().get_pixel_range();
+        for (index, (x, text)) in self.knees.iter().enumerate() {
+            let at = chart.backend_coord(&(self.x.place(*x), 0.0)).0;
+            let ends = [(at, tops.start), (at, tops.end)];
+            root.draw(&DashedPathElement::new(ends, 2, 3, BLACK.mix(0.6))).map_err(told)?;
+            let height = tops.end - 16 - 14 * (index as i32 % 4);
+            root.draw(&Text::new(text.as_str(), (at + 3, height), (FONT, 11))).map_err(told)?;
+        }
+        let style = |line: &Line| names.iter().position(|(name, _)| *name == line.name).map(Style::of);
+        for line in &self.lines {
+            let style = style(line).context("every line has a name in the legend")?;
+            let shift = if line.kind == Kind::Measured { style.shift() } else { 0 };
+            let shifted = |(x, y): (i32, i32)| (x + shift, y);
+            let path: Vec<_> = line.points.iter().map(|point| shifted(place(point.x, point.y))).collect();
+            style.path(root, line.kind, &path)?;
+            for (point, &at) in line.points.iter().zip(&path).filter(|_| line.kind == Kind::Measured) {
+                if let Some((low, high)) = point.spread {
+                    let ends = [low, high].map(|y| shifted(place(point.x, y)));
+                    root.draw(&PathElement::new(ends, style.color.stroke_width(1))).map_err(told)?;
+                }
+                style.marker(root, at)?;
+                if point.is_knee {
+                    root.draw(&Circle::new(at, 9, style.color.stroke_width(2))).map_err(told)?;
+                }
+            }
         }
         Ok(())
     }
 }
 
-/// Draws charts side by side, as `path` with `.svg` and with `.png`.
-pub(super) fn draw(charts: &[Chart], path: &Path) -> Result<()> {
-    register_font(FONT, FontStyle::Normal, dejavu::sans::regular()).map_err(|_| anyhow!("the font cannot be read"))?;
-    let size = (SIZE.0 * charts.len() as u32, SIZE.1);
-    all(charts, SVGBackend::new(&path.with_extension("svg"), size).into_drawing_area())?;
-    all(charts, BitMapBackend::new(&path.with_extension("png"), size).into_drawing_area())
+type Area<D> = DrawingArea<D, Shift>;
+
+/// How a line looks.
+struct Style {
+    index: usize,
+    color: RGBColor,
 }
 
-fn all<D: DrawingBackend>(charts: &[Chart], area: DrawingArea<D, Shift>) -> Result<()> {
-    area.fill(&WHITE).map_err(told)?;
-    let parts = area.split_evenly((1, charts.len()));
-    charts.iter().zip(&parts).try_for_each(|(chart, part)| chart.draw(part))?;
-    area.present().map_err(told)
+/// From dark to light, so that they differ in grey as well.
+const COLORS: [RGBColor; 6] = [
+    RGBColor(0, 0, 0),
+    RGBColor(0, 80, 160),
+    RGBColor(200, 60, 0),
+    RGBColor(0, 150, 110),
+    RGBColor(150, 110, 200),
+    RGBColor(205, 160, 0),
+];
+const PAPER: RGBColor = RGBColor(170, 170, 170);
+
+impl Style {
+    fn of(index: usize) -> Self {
+        Self { index, color: COLORS[index % COLORS.len()] }
+    }
+
+    /// Along the axis, in pixels.
+    fn shift(&self) -> i32 {
+        (self.index as i32 % 5 - 2) * OFFSET
+    }
+
+    fn path<D: DrawingBackend>(&self, root: &Area<D>, kind: Kind, path: &[(i32, i32)]) -> Result<()> {
+        let color = self.color.stroke_width(2);
+        let dashes = [(1, 0), (8, 4), (3, 3)][self.index % 3];
+        match (kind, dashes) {
+            (Kind::Paper, _) => root.draw(&PathElement::new(path.to_vec(), PAPER.stroke_width(7))),
+            (Kind::Reckoned, _) => root.draw(&DashedPathElement::new(path.to_vec(), 2, 4, BLACK.stroke_width(1))),
+            (Kind::Measured, (_, 0)) => root.draw(&PathElement::new(path.to_vec(), color)),
+            (Kind::Measured, (dash, gap)) => root.draw(&DashedPathElement::new(path.to_vec(), dash, gap, color)),
+        }
+        .map_err(told)
+    }
+
+    fn marker<D: DrawingBackend>(&self, root: &Area<D>, (x, y): (i32, i32)) -> Result<()> {
+        let color = self.color;
+        let shape = |corners: &[(i32, i32)]| corners.iter().map(|(dx, dy)| (x + dx, y + dy)).collect::<Vec<_>>();
+        match self.index % 5 {
+            0 => root
+                .draw(&Circle::new((x, y), 4, WHITE.filled()))
+                .and_then(|()| root.draw(&Circle::new((x, y), 4, color.stroke_width(2)))),
+            1 => root.draw(&Circle::new((x, y), 4, color.filled())),
+            2 => root.draw(&Polygon::new(shape(&[(-4, 4), (4, 4), (0, -5)]), color.filled())),
+            3 => root.draw(&Rectangle::new([(x - 4, y - 4), (x + 4, y + 4)], color.filled())),
+            _ => root.draw(&Cross::new((x, y), 4, color.stroke_width(2))),
+        }
+        .map_err(told)
+    }
+}
+
+/// Draws charts in rows, as `path` with `.svg` and with `.png`, with `about` below the legend.
+pub(super) fn draw(rows: &[Vec<Chart>], about: &[String], path: &Path) -> Result<()> {
+    register_font(FONT, FontStyle::Normal, dejavu::sans::regular()).map_err(|_| anyhow!("the font cannot be read"))?;
+    let columns = rows.iter().map(Vec::len).max().unwrap_or(0) as u32;
+    let size = (SIZE.0 * columns + LEGEND, SIZE.1 * rows.len() as u32);
+    all(rows, about, &SVGBackend::new(&path.with_extension("svg"), size).into_drawing_area())?;
+    all(rows, about, &BitMapBackend::new(&path.with_extension("png"), size).into_drawing_area())
+}
+
+fn all<D: DrawingBackend>(rows: &[Vec<Chart>], about: &[String], root: &Area<D>) -> Result<()> {
+    root.fill(&WHITE).map_err(told)?;
+    let (charts, _) = root.split_horizontally(root.dim_in_pixel().0 - LEGEND);
+    let mut names: Vec<(String, Kind)> = Vec::new();
+    for line in rows.iter().flatten().flat_map(|chart| &chart.lines).filter(|line| !line.points.is_empty()) {
+        if !names.iter().any(|(name, _)| *name == line.name) {
+            names.push((line.name.clone(), line.kind));
+        }
+    }
+    // Markers and colours go to what was measured first.
+    names.sort_by_key(|(_, kind)| *kind != Kind::Measured);
+    for (row, area) in rows.iter().zip(charts.split_evenly((rows.len(), 1))) {
+        let areas = area.split_evenly((1, row.len()));
+        row.iter().zip(&areas).filter(|(chart, _)| !chart.is_empty()).try_for_each(|(chart, area)| {
+            let mut chart = chart.clone();
+            chart.lines.retain(|line| !line.points.is_empty());
+            chart.draw(root, area, &names)
+        })?;
+    }
+    legend(root, &names, about)?;
+    root.present().map_err(told)
+}
+
+fn legend<D: DrawingBackend>(root: &Area<D>, names: &[(String, Kind)], about: &[String]) -> Result<()> {
+    let left = (root.dim_in_pixel().0 - LEGEND) as i32 + 8;
+    for (index, (name, kind)) in names.iter().enumerate() {
+        let (middle, style) = (30 + index as i32 * SPACING, Style::of(index));
+        style.path(root, *kind, &[(left, middle), (left + 34, middle)])?;
+        if *kind == Kind::Measured {
+            style.marker(root, (left + 17, middle))?;
+        }
+        root.draw(&Text::new(name.as_str(), (left + 42, middle - 7), (FONT, 13))).map_err(told)?;
+    }
+    for (index, text) in about.iter().enumerate() {
+        let top = 30 + (names.len() as i32 + 1) * SPACING + index as i32 * 18;
+        root.draw(&Text::new(text.as_str(), (left, top), (FONT, 12))).map_err(told)?;
+    }
+    Ok(())
 }
 
 /// The drawing library's errors borrow from what they are about.
