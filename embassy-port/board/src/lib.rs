@@ -44,7 +44,7 @@ pub trait Board {
 }
 
 /// Why this life of the board began: what the last one has noted, or else what the chip's registers tell. With it comes the
-/// line of a panic, or the address of a fault, else 0. Asking clears the note.
+/// line of a panic, in images with log lines, or the address of a fault, else 0. Asking clears the note.
 pub fn reason(of_chip: Reason) -> (Reason, u32) {
     note::take().unwrap_or((of_chip, 0))
 }
@@ -57,8 +57,7 @@ macro_rules! guard {
         const _: () = {
             #[panic_handler]
             fn panic(information: &::core::panic::PanicInfo<'_>) -> ! {
-                let place = information.location().map_or($crate::Place::NOWHERE, $crate::Place::of);
-                $crate::end::<$board>($crate::Reason::Panic, place)
+                $crate::end::<$board>($crate::Reason::Panic, $crate::Place::of(information))
             }
 
             /// Called by the fault handler, on a stack that it has emptied.

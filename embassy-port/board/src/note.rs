@@ -2,7 +2,7 @@
 //! where.
 #![cfg_attr(target_os = "none", allow(unsafe_code))]
 
-use core::panic::Location;
+use core::panic::PanicInfo;
 use core::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 
 use crate::Board;
@@ -60,9 +60,11 @@ impl<'f> Place<'f> {
         Self { file: "", at: address }
     }
 
-    /// Of a panic.
-    pub const fn of(location: &'f Location<'_>) -> Self {
-        Self { file: location.file(), at: location.line() }
+    /// Of a panic, in images with log lines. Those without do not tell it: files and lines of all panics that could come took
+    /// a tenth of such an image.
+    pub fn of(panic: &'f PanicInfo<'_>) -> Self {
+        let told = if cfg!(feature = "defmt") { panic.location() } else { None };
+        told.map_or(Self::NOWHERE, |location| Self { file: location.file(), at: location.line() })
     }
 }
 

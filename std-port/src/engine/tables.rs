@@ -16,20 +16,20 @@ use crate::config::Capacities;
 use crate::storage::{Boxed, filled, filled_with};
 
 /// Calls in flight to a peer that a link begins with room for.
-const FIRST_CALLS: usize = 8;
+const FIRST_CALLS: usize = 4;
 /// Functions of a peer that a link begins with room for.
-const FIRST_FUNCTIONS: usize = 8;
-/// Bytes of their signatures.
-const FIRST_SIGNATURES: usize = 512;
+const FIRST_FUNCTIONS: usize = 4;
+/// Bytes of their signatures: those of the longest.
+const FIRST_SIGNATURES: usize = SIGNATURE_BYTES;
 
 /// Slots for calls to begin with: at most [`FIRST_CALLS`], and so many that `most` is a multiple of them.
 fn first_calls(most: usize) -> usize {
     (1..=FIRST_CALLS).rev().find(|slots| most.checked_rem(*slots) == Some(0)).unwrap_or(most).min(most)
 }
 
-/// Twice as much, and not more than `most`.
-fn doubled(length: usize, most: usize) -> usize {
-    length.saturating_mul(2).max(1).min(most)
+/// Half as much again, at least what is `needed`, and not more than `most`; as it is where that much is there.
+fn longer(length: usize, needed: usize, most: usize) -> usize {
+    if length >= needed { length } else { length.saturating_add(length / 2).max(needed).min(most) }
 }
 
 impl<T: Send + 'static> Engine<T> {
@@ -86,9 +86,9 @@ impl<T: Send + 'static> Engine<T> {
         }
         let Capacities { their_functions, their_signature_bytes, .. } = self.capacities;
         let (all_entries, all_bytes) = state.session.their_function_list().capacity();
-        let longer = |length, short, most| if short { doubled(length, most) } else { length };
-        let entries = longer(all_entries, entries == 0, their_functions);
-        let bytes = longer(all_bytes, bytes < SIGNATURE_BYTES, their_signature_bytes);
+        let (used_entries, used_bytes) = (all_entries.saturating_sub(entries), all_bytes.saturating_sub(bytes));
+        let entries = longer(all_entries, used_entries.saturating_add(1), their_functions);
+        let bytes = longer(all_bytes, used_bytes.saturating_add(SIGNATURE_BYTES), their_signature_bytes);
         if (entries, bytes) != (all_entries, all_bytes) {
             drop(state.session.lend_functions((filled_with(entries, Entry::empty), filled(bytes, 0))));
         }
@@ -109,10 +109,9 @@ mod tests {
 
     #[test]
     fn tables_begin_short_and_reach_their_capacity() {
-        assert_eq!([64, 20, 7, 1, 0, 11].map(first_calls), [8, 5, 7, 1, 0, 1]);
-        assert_eq!(
-            [doubled(8, 48), doubled(32, 48), doubled(0, 48), doubled(48, 48), doubled(0, 0)],
-            [16, 48, 1, 48, 0]
-        );
+        assert_eq!([64, 20, 7, 1, 0, 11].map(first_calls), [4, 4, 1, 1, 0, 1]);
+        let lengths = [(8, 9, 48), (40, 41, 48), (8, 100, 200), (0, 1, 48), (8, 8, 48), (48, 49, 48), (0, 1, 0)];
+        let longer = lengths.map(|(length, needed, most)| longer(length, needed, most));
+        assert_eq!(longer, [12, 48, 100, 1, 8, 48, 0]);
     }
 }
