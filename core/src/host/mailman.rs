@@ -26,6 +26,13 @@ pub trait Mailman {
     /// Writes to the stream of `link`; returns how many bytes were taken in all, 0 when the stream would block.
     fn write(&mut self, link: LinkId, slices: &[&[u8]]) -> Result<usize, CloseReason>;
 
+    /// Most bytes of sealed frames that wait for the stream at a time; one frame may be longer, and 0 means the peer's
+    /// longest chunk. More of them cost fewer writes per message. What is sealed is not overtaken, not even by an
+    /// emergency, of which then only the datagram is in time.
+    fn seals_ahead(&self) -> usize {
+        0
+    }
+
     /// Sends one datagram from the unit's own UDP port. `false` when the network refused it.
     fn send_to(&mut self, to: SocketAddr, datagram: &[u8]) -> bool;
 

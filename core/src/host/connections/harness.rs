@@ -23,23 +23,32 @@ pub(super) fn pool(count: usize, size: usize) -> Pool<Boxed> {
 pub(super) struct Wire {
     pub(super) budget: usize,
     pub(super) bytes: Vec<u8>,
+    /// What the port lets be sealed ahead.
+    pub(super) ahead: usize,
+    /// The most that was offered at a time.
+    pub(super) offered: usize,
 }
 
 impl Wire {
     pub(super) fn open() -> Self {
-        Self { budget: usize::MAX, bytes: Vec::new() }
+        Self { budget: usize::MAX, ..Self::default() }
     }
 }
 
 impl Mailman for Wire {
     fn write(&mut self, _: LinkId, slices: &[&[u8]]) -> Result<usize, CloseReason> {
         let before = self.bytes.len();
+        self.offered = self.offered.max(slices.iter().map(|slice| slice.len()).sum());
         for slice in slices {
             let count = slice.len().min(self.budget);
             self.bytes.extend_from_slice(&slice[..count]);
             self.budget -= count;
         }
         Ok(self.bytes.len() - before)
+    }
+
+    fn seals_ahead(&self) -> usize {
+        self.ahead
     }
 
     fn send_to(&mut self, _: SocketAddr, _: &[u8]) -> bool {

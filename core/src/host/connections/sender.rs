@@ -1,9 +1,10 @@
 //! What waits to be written: one lane per class and the urgent frames that go between chunks.
 //!
 //! Frames are sealed just before they are written, in the order in which they go out. What is sealed cannot be
-//! overtaken, so no more than a chunk is sealed at a time, and one frame at a time on a link that does not keep up. In
-//! plain mode, where sealing changes nothing, all that waits is written in one go, and whatever frame the network has
-//! not begun to take may still be overtaken. Either way an emergency waits for one chunk at most.
+//! overtaken, so no more is sealed at a time than a chunk, or than the port asks for ([`Mailman::seals_ahead`]), and one
+//! frame at a time on a link that does not keep up. In plain mode, where sealing changes nothing, all that waits is written
+//! in one go, and a frame that the network has not begun to take may still be overtaken. So in the stream an emergency
+//! waits for one chunk at most, or for what the port lets be sealed ahead.
 
 use super::urgent::Urgent;
 use crate::bytes;
@@ -217,7 +218,7 @@ impl<S: Storage> Sender<S> {
             if written > 0 {
                 self.give_drained(buffers);
             }
-            if !self.seal_next(cipher)? {
+            if !self.seal_next(cipher, mailman.seals_ahead())? {
                 self.blocked = false;
                 return Ok(written);
             }
@@ -254,7 +255,7 @@ impl<S: Storage> Sender<S> {
     }
 
     /// Seals what is to be written next: urgent frames before all others. `false` when nothing waits.
-    fn seal_next<C: Seal>(&mut self, cipher: &mut C) -> Result<bool, CloseReason> {
+    fn seal_next<C: Seal>(&mut self, cipher: &mut C, ahead: usize) -> Result<bool, CloseReason> {
         while self.urgent.has_unsealed() {
             let rest = self.urgent.unsealed();
             let turns = frame::is_turn(rest, self.cut.overhead);
@@ -269,12 +270,12 @@ impl<S: Storage> Sender<S> {
         }
         self.current = self.next_lane();
         let Some(Some(lane)) = self.current.and_then(|index| self.lanes.get_mut(index)) else { return Ok(false) };
-        let enough = match self.cut.overhead {
+        let most = match self.cut.overhead {
             0 => usize::MAX,
-            _ if self.blocked => 1,
-            _ => self.cut.chunk,
+            _ if self.blocked => 0,
+            _ => ahead.max(self.cut.chunk),
         };
-        lane.seal(cipher, enough)?;
+        lane.seal(cipher, most)?;
         Ok(true)
     }
 
@@ -366,14 +367,19 @@ impl<S: Storage> Lane<S> {
         self.start = 0;
     }
 
-    /// Seals frames until `enough` bytes of them are ready.
-    fn seal<C: Seal>(&mut self, cipher: &mut C, enough: usize) -> Result<(), CloseReason> {
+    /// Seals the next frame, and those behind it as long as no more than `most` bytes are ready to be written.
+    fn seal<C: Seal>(&mut self, cipher: &mut C, most: usize) -> Result<(), CloseReason> {
         self.before = (self.sealed, self.at_boundary);
-        while self.sealed < self.end && self.sealed.saturating_sub(self.start) < enough {
+        while self.sealed < self.end {
             let rest = self.buffer.get_mut(self.sealed..self.end).unwrap_or(&mut []);
             self.at_boundary = frame::ends_message(rest);
             let length = seal_first(cipher, rest)?;
             self.sealed = self.sealed.saturating_add(length);
+            let next = self.buffer.get(self.sealed..self.end).and_then(frame::first_frame_length);
+            let ready = self.sealed.saturating_sub(self.start);
+            if next.is_none_or(|next| ready.saturating_add(next) > most) {
+                break;
+            }
         }
         Ok(())
     }

@@ -141,6 +141,66 @@ fn sealed_frames_are_opened_in_whatever_pieces_they_come() {
     }
 }
 
+/// What a sender that seals ahead writes for a message of `length` bytes, with an emergency behind it.
+fn sealed_stream(length: usize) -> (Vec<u8>, Vec<Item>) {
+    let (mut sender, mut buffers) = (link(Numbered::default()), pool(2, 9000));
+    let mut wire = Wire { ahead: 64 * 1024, ..Wire::open() };
+    let (bulk, stop) = (pattern(1, length), pattern(2, 100));
+    for (priority, payload) in [(Priority::Normal, &bulk), (Priority::Emergency, &stop), (Priority::Normal, &bulk)] {
+        let write = |writer: &mut ChunkWriter<'_>| writer.put(payload);
+        sender.send_message(&mut wire, &mut buffers, priority, payload.len(), false, write).unwrap();
+    }
+    let items = [(Priority::Normal, &bulk), (Priority::Emergency, &stop), (Priority::Normal, &bulk)];
+    (wire.bytes, items.map(|(priority, payload)| Item::Message(priority, payload.clone())).to_vec())
+}
+
+proptest! {
+    /// One read brings several frames, the end of one and the beginning of another.
+    #[test]
+    fn all_frames_of_a_read_are_opened_wherever_it_ends(
+        length in 0..8000_usize, cuts in prop::collection::vec(any::<prop::sample::Index>(), 0..8),
+    ) {
+        let (bytes, expected) = sealed_stream(length);
+        let mut cuts: Vec<usize> = cuts.iter().map(|at| at.index(bytes.len())).chain([0, bytes.len()]).collect();
+        cuts.sort_unstable();
+        let (mut link, mut pool, mut items) = (link(Numbered::default()), pool(1, 9000), Vec::new());
+        for piece in cuts.windows(2) {
+            let mut read = bytes[piece[0]..piece[1]].to_vec();
+            prop_assert!(offer(&mut link, &mut pool, &mut read, &mut items).unwrap());
+            prop_assert!(read.is_empty());
+        }
+        prop_assert_eq!(items, expected);
+        prop_assert_eq!(pool.free(), 1);
+    }
+
+    /// What came before the changed frame counts, nothing behind it does, and the link ends.
+    #[test]
+    fn a_changed_frame_in_the_middle_of_a_read_ends_the_link(
+        length in 1..8000_usize, at in any::<prop::sample::Index>(), change in 1..=255_u8,
+    ) {
+        let (mut bytes, expected) = sealed_stream(length);
+        let frames = frame_ends(&bytes);
+        let at = at.index(frames.len());
+        // The last byte of the frame, which is its tag's.
+        bytes[frames[at] - 1] ^= change;
+        let (mut link, mut pool, mut items) = (link(Numbered::default()), pool(1, 9000), Vec::new());
+        prop_assert_eq!(offer(&mut link, &mut pool, &mut bytes, &mut items), Err(CloseReason::Protocol));
+        prop_assert!(items.len() < expected.len());
+        prop_assert_eq!(&items[..], &expected[..items.len()]);
+        link.release(&mut pool);
+        prop_assert_eq!(pool.free(), 1);
+    }
+}
+
+fn frame_ends(bytes: &[u8]) -> Vec<usize> {
+    let (mut ends, mut end) = (Vec::new(), 0);
+    while let Some(length) = crate::host::frame::first_frame_length(&bytes[end..]) {
+        end += length;
+        ends.push(end);
+    }
+    ends
+}
+
 fn hostile(bytes: &[u8], piece: usize) {
     let (mut link, mut pool, mut items) = (link(Plain), pool(1, 8300), Vec::new());
     for piece in bytes.chunks(piece) {

@@ -1,12 +1,12 @@
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, clippy::arithmetic_side_effects)]
 
-use std::vec;
 use std::vec::Vec;
 
 use proptest::prelude::*;
 
 use super::super::harness::{self, Item, Numbered, Wire, link, pattern, read};
 use super::super::{Link, LinkCounter};
+use super::URGENT_BYTES;
 use crate::config::{EMERGENCY_BYTES, MINIMUM_CHUNK_BYTES, Priority};
 use crate::error::{CloseReason, Error, Limit};
 use crate::host::frame::{self, Frame};
@@ -120,9 +120,11 @@ fn a_message_that_was_not_begun_is_overtaken() {
     assert_eq!(priorities(&read(Plain, &wire.bytes)), order);
 }
 
-/// Bytes between an emergency's acceptance and its last byte on a network that takes `step` bytes at a time.
-fn emergency_behind_a_long_message<C: Seal + Default>(step: usize) -> usize {
-    let (mut link, mut wire, mut pool) = (link(C::default()), Wire { budget: step, ..Wire::default() }, pool(1, 9000));
+/// Bytes between an emergency's acceptance and its last byte on a network that takes `step` bytes at a time, where so much
+/// may be sealed `ahead`.
+fn emergency_behind_a_long_message<C: Seal + Default>(step: usize, ahead: usize) -> usize {
+    let wire = Wire { budget: step, ahead, ..Wire::default() };
+    let (mut link, mut wire, mut pool) = (link(C::default()), wire, pool(1, 9000));
     let (long, stop) = (pattern(1, 8000), pattern(2, EMERGENCY_BYTES));
     send(&mut link, &mut wire, &mut pool, Priority::Normal, &long).unwrap();
     let before = wire.bytes.len();
@@ -131,20 +133,50 @@ fn emergency_behind_a_long_message<C: Seal + Default>(step: usize) -> usize {
         wire.budget += step;
         link.flush(&mut wire, &mut pool).unwrap();
     }
-    let items = read(C::default(), &wire.bytes);
-    assert_eq!(items, [Item::Message(Priority::Emergency, stop), Item::Message(Priority::Normal, long)]);
+    let stop = Item::Message(Priority::Emergency, stop);
+    let mut items = [stop.clone(), Item::Message(Priority::Normal, long)];
+    if link.cipher.overhead() > 0 && ahead > 9_000 {
+        // All of the message was sealed before the emergency came.
+        items.reverse();
+    }
+    assert!(read(C::default(), &wire.bytes) == items, "{step} bytes a step, {ahead} ahead");
     assert_eq!(spare(&pool), 1);
-    let ends = (before..=wire.bytes.len()).find(|&end| !read(C::default(), &wire.bytes[..end]).is_empty());
+    let ends = (before..=wire.bytes.len()).find(|&end| read(C::default(), &wire.bytes[..end]).contains(&stop));
     ends.unwrap() - before
 }
 
 #[test]
 fn an_emergency_waits_for_one_chunk_at_most() {
     for step in [1, 7, 100, 1026, 3000] {
-        let bytes = emergency_behind_a_long_message::<Plain>(step);
+        let bytes = emergency_behind_a_long_message::<Plain>(step, 0);
         assert!(bytes <= 1026 + EMERGENCY_BYTES + 8, "{bytes} bytes at {step} a step");
-        let bytes = emergency_behind_a_long_message::<Numbered>(step);
+        let bytes = emergency_behind_a_long_message::<Numbered>(step, 0);
         assert!(bytes <= 1026 + EMERGENCY_BYTES + 8 + 16, "{bytes} sealed bytes at {step} a step");
+    }
+}
+
+#[test]
+fn an_emergency_waits_for_what_the_port_lets_be_sealed_ahead_and_in_plain_mode_for_one_chunk() {
+    for step in [1, 7, 100, 1026, 3000] {
+        for ahead in [1, 2_000, 4_000, 64_000] {
+            let bytes = emergency_behind_a_long_message::<Plain>(step, ahead);
+            assert!(bytes <= 1026 + EMERGENCY_BYTES + 8, "{bytes} bytes at {step} a step");
+            let bytes = emergency_behind_a_long_message::<Numbered>(step, ahead);
+            assert!(
+                bytes <= ahead.max(1026) + EMERGENCY_BYTES + 8 + 16,
+                "{bytes} bytes at {step} a step, {ahead} ahead"
+            );
+        }
+    }
+}
+
+#[test]
+fn a_message_that_may_be_sealed_ahead_is_one_write() {
+    for (ahead, largest) in [(0, 1026), (3000, 2 * 1026), (8000, 5104)] {
+        let (mut link, mut wire, mut pool) = (link(Numbered::default()), Wire::open(), pool(1, 9000));
+        wire.ahead = ahead;
+        send(&mut link, &mut wire, &mut pool, Priority::Normal, &pattern(1, 5000)).unwrap();
+        assert_eq!(wire.offered, largest, "{ahead} bytes ahead");
     }
 }
 
@@ -195,6 +227,11 @@ fn a_link_that_ends_gives_every_buffer_back() {
     assert_eq!((spare(&pool), link.queued()), (3, 0));
 }
 
+/// Bytes of the lanes that are sealed and not written.
+fn sealed_ahead<C: Seal>(link: &Link<Boxed, C>) -> usize {
+    link.sender.lanes.iter().flatten().map(|lane| lane.sealed - lane.start).sum()
+}
+
 /// Sends, flushes and stalls in any order; returns what was accepted.
 fn exercise<C: Seal>(link: &mut Link<Boxed, C>, wire: &mut Wire, steps: &[(u8, usize)]) -> Vec<Item> {
     let (mut pool, mut accepted) = (pool(2, 4000), Vec::new());
@@ -212,6 +249,9 @@ fn exercise<C: Seal>(link: &mut Link<Boxed, C>, wire: &mut Wire, steps: &[(u8, u
                 link.flush(wire, &mut pool).unwrap();
             }
         }
+        let most = if link.sender.cut.overhead == 0 { 0 } else { wire.ahead.max(1026) };
+        let ahead = sealed_ahead(link);
+        assert!(ahead <= most.max(1026), "{ahead} bytes are sealed ahead of {most}");
     }
     drain(link, wire, &mut pool);
     assert_eq!(spare(&pool), 2);
@@ -226,11 +266,12 @@ proptest! {
     #[test]
     fn what_is_accepted_arrives_whole_and_in_order_of_its_class(
         steps in prop::collection::vec((0..7_u8, prop_oneof![0..300_usize, 0..3000_usize]), 1..40),
+        ahead in prop_oneof![Just(0), 0..6000_usize, Just(64 * 1024)],
     ) {
         let (mut plain, mut wire) = (link(Plain), Wire::default());
         let accepted = exercise(&mut plain, &mut wire, &steps);
         let arrived = read(Plain, &wire.bytes);
-        let (mut sealed, mut wire) = (link(Numbered::default()), Wire::default());
+        let (mut sealed, mut wire) = (link(Numbered::default()), Wire { ahead, ..Wire::default() });
         let accepted_sealed = exercise(&mut sealed, &mut wire, &steps);
         let arrived_sealed = read(Numbered::default(), &wire.bytes);
         for class in Priority::ALL {
@@ -239,6 +280,7 @@ proptest! {
         }
         prop_assert_eq!(arrived.len(), accepted.len());
         prop_assert_eq!(arrived_sealed.len(), accepted_sealed.len());
+        prop_assert!(wire.offered <= ahead.max(URGENT_BYTES).max(1026));
     }
 }
 
@@ -248,7 +290,7 @@ fn framing_is_the_same_however_little_the_network_takes() {
     let streams: Vec<Vec<u8>> = [1, 3, 1026, usize::MAX]
         .into_iter()
         .map(|step| {
-            let (mut link, mut wire, mut pool) = (link(Plain), Wire { budget: step, bytes: vec![] }, pool(1, 9000));
+            let (mut link, mut wire, mut pool) = (link(Plain), Wire { budget: step, ..Wire::default() }, pool(1, 9000));
             send(&mut link, &mut wire, &mut pool, Priority::Normal, &bytes).unwrap();
             while link.wants_to_write() {
                 wire.budget = step;
@@ -299,8 +341,9 @@ fn kinds_and_keys(mut bytes: &[u8]) -> Vec<(u8, u8)> {
 
 #[test]
 fn keys_change_right_behind_the_turn_whatever_waits() {
-    for step in [1, 7, 100, 1_100, 20_000] {
-        let (mut link, mut wire, mut pool) = (link(Turning::default()), Wire::default(), pool(1, 9000));
+    for (step, ahead) in [1, 7, 100, 1_100, 20_000].into_iter().flat_map(|step| [(step, 0), (step, 2_500)]) {
+        let wire = Wire { ahead, ..Wire::default() };
+        let (mut link, mut wire, mut pool) = (link(Turning::default()), wire, pool(1, 9000));
         send(&mut link, &mut wire, &mut pool, Priority::Normal, &pattern(1, 5000)).unwrap();
         wire.budget = 1_500;
         link.flush(&mut wire, &mut pool).unwrap();
