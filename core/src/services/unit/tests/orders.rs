@@ -285,25 +285,30 @@ fn a_renewal_does_nothing_for_a_function_that_was_replaced_since() {
     assert_eq!(expirations(&pair), 1, "the lease of the function before was prolonged");
 }
 
+/// The motors' word refuses the new call; where there is none, the unit's own look at the lease does.
 #[test]
 fn a_new_call_never_takes_the_place_of_a_dead_lease_before_its_hook_has_run() {
-    let mut pair = Pair::live();
-    let slot = pair.agv.offer_leased("go()", LEASE);
-    pair.publish();
-    let options = RequestOptions { renew_lease: false, ..RequestOptions::default() };
-    pair.manager.request_with("go", &none(), &options, false).unwrap();
-    pair.run(LEASE - millis(10));
-    let early = pair.manager.request_with("go", &none(), &options, false).unwrap();
-    // The request arrives at a vehicle that has not been polled since the lease ended.
-    let (stream, _) = pair.manager.net.deliver();
-    pair.manager.flush_gathered();
-    let (more, _) = pair.manager.net.deliver();
-    pair.agv.now = pair.agv.now + millis(10);
-    pair.agv.hear(&[stream, more].concat());
-    pair.agv.work(std::vec::Vec::new());
-    assert_eq!((pair.agv.ran().len(), pair.agv.is_live(slot), expirations(&pair)), (1, false, 1));
-    pair.settle();
-    assert!(pair.manager.has(&Happened::Failed(early, Error::Busy)));
+    for has_word in [true, false] {
+        let mut pair = Pair::live();
+        let slot = pair.agv.offer_leased("go()", LEASE);
+        pair.agv.functions.function(slot).unwrap().handler.has_word.set(has_word);
+        pair.publish();
+        let options = RequestOptions { renew_lease: false, ..RequestOptions::default() };
+        pair.manager.request_with("go", &none(), &options, false).unwrap();
+        pair.run(LEASE - millis(10));
+        let early = pair.manager.request_with("go", &none(), &options, false).unwrap();
+        // The request arrives at a vehicle that has not been polled since the lease ended.
+        let (stream, _) = pair.manager.net.deliver();
+        pair.manager.flush_gathered();
+        let (more, _) = pair.manager.net.deliver();
+        pair.agv.now = pair.agv.now + millis(10);
+        pair.agv.hear(&[stream, more].concat());
+        pair.agv.work(std::vec::Vec::new());
+        assert_eq!((pair.agv.ran().len(), expirations(&pair)), (1, 1), "with a word: {has_word}");
+        assert!(!has_word || !pair.agv.is_live(slot));
+        pair.settle();
+        assert!(pair.manager.has(&Happened::Failed(early, Error::Busy)));
+    }
 }
 
 #[test]

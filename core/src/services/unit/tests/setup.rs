@@ -1,5 +1,6 @@
 //! What a pair is made of: constraints, storage, hellos, handlers.
 
+use core::cell::Cell;
 use std::vec;
 
 use super::super::{Publication, SessionStorage, buffer_bytes};
@@ -49,6 +50,8 @@ impl Default for Setup {
 pub(super) struct Handler {
     pub(super) run: Run,
     pub(super) lease: Lease,
+    /// It has a word that motors read. Without one, the unit alone knows of the lease.
+    pub(super) has_word: Cell<bool>,
 }
 
 /// When a service answers.
@@ -62,13 +65,13 @@ pub(super) enum Run {
 
 impl Handler {
     pub(super) fn new(run: Run) -> Self {
-        Self { run, lease: Lease::new() }
+        Self { run, lease: Lease::new(), has_word: Cell::new(true) }
     }
 }
 
 impl Service for Handler {
     fn lease(&self) -> Option<&Lease> {
-        Some(&self.lease)
+        self.has_word.get().then_some(&self.lease)
     }
 }
 
