@@ -47,6 +47,8 @@ mod seldom;
 pub mod storage;
 pub mod survey;
 pub mod sys;
+#[cfg(test)]
+mod testing;
 mod threads;
 pub mod timers;
 mod unit;

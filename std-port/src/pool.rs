@@ -161,6 +161,19 @@ mod tests {
         assert_eq!(pool.take().unwrap().len(), 32);
     }
 
+    /// Those of the earlier size that come back make room as any other.
+    #[test]
+    fn a_resize_costs_no_room() {
+        let pool = MessagePool::new(16, 2, 2);
+        for size in [32, 16, 64] {
+            let out = [pool.take().unwrap(), pool.take().unwrap()];
+            pool.resize(size);
+            assert!(pool.take().is_none());
+            out.into_iter().for_each(|buffer| pool.give(buffer));
+            assert_eq!((pool.counters().in_use, pool.counters().idle), (0, 0));
+        }
+    }
+
     #[test]
     fn an_idle_pool_can_be_emptied() {
         let pool = MessagePool::new(16, 4, 4);

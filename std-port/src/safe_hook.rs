@@ -186,20 +186,13 @@ mod tests {
     use std::sync::atomic::AtomicUsize;
 
     use super::*;
+    use crate::testing::until;
     use cara_core::services::lease::Order;
 
     static AHEAD: AtomicU64 = AtomicU64::new(0);
 
     fn begin(lease: &ServiceLease, clock: Clock, length: Duration) -> Order {
         lease.lease.begin(clock.now(), clock.now() + length).expect("the order before has ended")
-    }
-
-    fn until(condition: impl Fn() -> bool) {
-        let end = std::time::Instant::now() + std::time::Duration::from_secs(20);
-        while !condition() {
-            assert!(std::time::Instant::now() < end, "not in time");
-            std::thread::sleep(std::time::Duration::from_millis(1));
-        }
     }
 
     /// The unit does nothing here: the thread sees the end of a lease that a suspension has outlasted, and what the unit

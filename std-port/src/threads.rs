@@ -471,6 +471,7 @@ impl Crew {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::until;
 
     /// Counts what it is asked to do, and waits in it as long as the gate is closed.
     #[derive(Default)]
@@ -492,14 +493,6 @@ mod tests {
         }
         fn read_datagrams(&self, _: Socket, _: &mut [u8]) {}
         fn accept(&self) {}
-    }
-
-    fn until(condition: impl Fn() -> bool) {
-        let end = std::time::Instant::now() + std::time::Duration::from_secs(20);
-        while !condition() {
-            assert!(std::time::Instant::now() < end, "not in time");
-            std::thread::sleep(std::time::Duration::from_millis(1));
-        }
     }
 
     #[test]

@@ -69,7 +69,7 @@ impl<T: Send + 'static> Unit<T> {
         Self { owner: Arc::new(owner) }
     }
 
-    fn engine(&self) -> &Arc<Engine<T>> {
+    pub(crate) fn engine(&self) -> &Arc<Engine<T>> {
         &self.owner.engine
     }
 

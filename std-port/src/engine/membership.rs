@@ -464,33 +464,17 @@ impl<T: Send + 'static> Engine<T> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{CommunicationSystem, Interfaces, Unit};
-
-    fn until(condition: impl Fn() -> bool) {
-        let end = std::time::Instant::now() + std::time::Duration::from_secs(20);
-        while !condition() {
-            assert!(std::time::Instant::now() < end, "not in time");
-            std::thread::sleep(std::time::Duration::from_millis(1));
-        }
-    }
-
-    fn vehicle(fleet: u32, id: u32) -> Unit {
-        let unit = Unit::builder("agv", id, "manager", 1).unwrap().interfaces(Interfaces::Loopback);
-        let unit = unit.fleet(fleet).insecure().build_unit().unwrap();
-        unit.start().unwrap();
-        unit
-    }
+    use crate::testing::{fleet, manager, until, vehicle};
 
     /// A link ends after the node has said what is to become of it: it is not joined, and a link that has got its index
     /// is neither joined for it nor ended.
     #[test]
     fn what_the_node_wanted_of_a_link_that_has_ended_befalls_no_other_link() {
-        let fleet = std::process::id() ^ 0xC6C6_0000;
-        let manager = CommunicationSystem::builder("manager", 1).unwrap().interfaces(Interfaces::Loopback);
-        let manager = manager.fleet(fleet).insecure().build_system().unwrap();
-        manager.start().unwrap();
+        let fleet = fleet();
+        let manager = manager(fleet, Constraints::M_UNIT);
         let engine = manager.engine();
-        let first = vehicle(fleet, 1);
+        let first = vehicle(fleet, 1, Constraints::S_UNIT);
+        first.start().unwrap();
         until(|| manager.number_of_s_units() == 1);
         let ended = engine.each_link().remove(0);
         let (admit, supersede) = {
@@ -504,8 +488,9 @@ mod tests {
         until(|| engine.link(ended.id).is_none());
         let events = manager.events();
         engine.join(&ended, &mut ended.lock());
-        assert_eq!(ended.lock().notices, [], "a link that has ended joins nobody");
-        let _second = vehicle(fleet, 2);
+        assert_eq!(ended.lock().notices, [], "a link that has ended does not join");
+        let second = vehicle(fleet, 2, Constraints::S_UNIT);
+        second.start().unwrap();
         until(|| manager.number_of_s_units() == 1);
         let newcomer = engine.each_link().remove(0);
         assert_eq!((newcomer.id, newcomer.serial != ended.serial), (ended.id, true), "it has the same index");

@@ -25,6 +25,8 @@ mod state_gate;
 mod staying;
 mod tables;
 mod telling;
+#[cfg(test)]
+mod tests;
 mod watch;
 pub(crate) mod workers;
 

@@ -1,0 +1,238 @@
+//! What a full socket, an empty pool, a time-out and an end leave behind: rules of links and calls that are seen from
+//! inside a unit alone.
+
+use std::io::Write;
+use std::net::{Ipv4Addr, TcpStream};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::mpsc::{channel, sync_channel};
+use std::sync::{Arc, Mutex};
+
+use cara_core::config::{Constraints, LONGEST_KEEP_ALIVE, Mode};
+use cara_core::distribution::hello::Hello;
+use cara_core::distribution::identity::Epoch;
+use cara_core::error::Error;
+use cara_core::host::connections::LinkCounter;
+use cara_core::host::frame::{self, Frame};
+use cara_core::services::unit::RequestOptions;
+use cara_core::time::{Duration, Instant};
+use rustix::net::sockopt;
+
+use super::accounts::{Group, Reading};
+use super::*;
+use crate::testing::{Pair, until};
+use crate::{Call, Parameters, ServiceError, ServiceOptions, UnitEvent};
+
+/// Too long for the buffer that a link has of its own.
+const LONG: usize = 16_000;
+/// Nothing that a test waits for comes by a time-out.
+const PATIENT: Duration = Duration::from_secs(60);
+
+/// A text under the name `text`.
+fn text(length: usize) -> Box<Parameters<{ 48 * 1024 }>> {
+    let mut text = Box::new(Parameters::sized());
+    text.add_string("text", length as u32).unwrap();
+    text.set_value("text", "x".repeat(length).as_str()).unwrap();
+    text
+}
+
+fn options(timeout: Duration) -> RequestOptions {
+    RequestOptions { timeout: Some(timeout), ..RequestOptions::default() }
+}
+
+fn value(readings: &[Reading], group: Group, name: &str) -> u64 {
+    readings.iter().find(|reading| (reading.group, reading.name) == (group, name)).unwrap().value
+}
+
+/// All buffers of a unit's pool.
+fn drain(pool: &MessagePool) -> Vec<Box<[u8]>> {
+    std::iter::from_fn(|| pool.take()).collect()
+}
+
+/// What the socket did not take goes out when it has room: no other event or timer moves it on.
+#[test]
+fn a_full_socket_is_watched_for_room_each_time() {
+    let constraints = Constraints { keep_alive: LONGEST_KEEP_ALIVE, request_timeout: PATIENT, ..Constraints::M_UNIT };
+    let taken = Arc::new(AtomicUsize::new(0));
+    let counted = taken.clone();
+    let take = move |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+        counted.fetch_add(1, Ordering::SeqCst);
+        Ok(())
+    };
+    let pair = Pair::new(constraints, |agv| {
+        agv.my_function_list().add_function("take", &text(LONG), take).unwrap();
+    });
+    let (near, far) = (pair.near(), pair.far());
+    sockopt::set_socket_send_buffer_size(&near.stream, 8 * 1024).unwrap();
+    let mut sent = 0;
+    for _ in 0..3 {
+        let frozen = far.lock();
+        loop {
+            let state = near.lock();
+            if state.session.wants_to_write() {
+                assert!(state.registration.writable, "bytes wait, and the link is not watched for room");
+                break;
+            }
+            drop(state);
+            pair.peer.request("take", &text(LONG)).unwrap();
+            sent += 1;
+        }
+        drop(frozen);
+        until(|| taken.load(Ordering::SeqCst) == sent);
+        until(|| !near.lock().registration.writable);
+    }
+}
+
+/// A link that has ended is among the sums of the ended ones while the table still has it.
+#[test]
+fn what_a_link_has_counted_counts_once_when_it_ends() {
+    let pair = Pair::new(Constraints::M_UNIT, |agv| {
+        let echo = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+        agv.my_function_list().add_function("take", &text(1), echo).unwrap();
+    });
+    for _ in 0..3 {
+        pair.peer.block_request("take", &mut text(1)).unwrap();
+    }
+    let (engine, near) = (pair.manager.engine(), pair.near());
+    let cell = near.peer.get().unwrap();
+    let sent = || {
+        let of_peer = value(&engine.peer_readings(cell), Group::Link, "RequestsSent");
+        (value(&engine.readings(), Group::Links, "RequestsSent"), of_peer)
+    };
+    assert_eq!(sent(), (3, 3));
+    for _ in 0..2 {
+        engine.retire(&near);
+        assert_eq!((sent(), value(&engine.readings(), Group::Unit, "LinksOpen")), ((3, 3), 0));
+    }
+    pair.agv.stop();
+    until(|| engine.link(near.id).is_none());
+    assert_eq!(sent(), (3, 3));
+}
+
+/// Of links whose peers have not joined, one that has proven who it is never makes room for another one.
+#[test]
+fn a_proven_link_gives_way_to_none() {
+    let pair = Pair::new(Constraints::M_UNIT, |_| {});
+    let (engine, near, far) = (pair.manager.engine(), pair.near(), pair.far());
+    let dial = || TcpStream::connect((Ipv4Addr::LOCALHOST, engine.tcp_port())).unwrap();
+    // Another life of the vehicle waits until the first one has been asked, and that one does not answer.
+    let frozen = far.lock();
+    let earlier = near.lock().session.hello().unwrap().clone();
+    let hello = Hello { epoch: Epoch(earlier.epoch.0 + 1), nonce: earlier.nonce + 1, ..earlier };
+    let (mut bytes, mut framed) = ([0; 256], [0; 512]);
+    let length = hello.encode(Mode::Plain, &mut bytes).unwrap();
+    let length = frame::encode(&Frame::Hello(&bytes[..length]), 0, &mut framed);
+    let mut proven = dial();
+    proven.write_all(&framed[..length]).unwrap();
+    let newest = || engine.each_link().into_iter().max_by_key(|link| link.serial).unwrap();
+    until(|| newest().serial != near.serial && newest().lock().session.is_proven());
+    let newcomer = newest();
+    assert!(!engine.make_room(), "all have proven themselves");
+    let _silent = dial();
+    until(|| newest().serial != newcomer.serial);
+    let unproven = newest();
+    assert!(engine.make_room() && !engine.make_room());
+    until(|| engine.link(unproven.id).is_none());
+    assert!(engine.link(newcomer.id).is_some_and(|link| Arc::ptr_eq(&link, &newcomer)));
+    drop(frozen);
+}
+
+/// The caller has given up, and no buffer comes free for the answer: the call ends, and its thread with it.
+#[test]
+fn an_answer_that_cannot_be_kept_is_dropped_with_its_deadline() {
+    let fill = |_: &Call, results: &mut ParametersView| -> Result<(), ServiceError> {
+        results.set_value("text", "x".repeat(LONG).as_str()).map_err(|_| ServiceError::BadResults)
+    };
+    let pair = Pair::new(Constraints::M_UNIT, |agv| {
+        let definition = "fill() -> (text: string[16000])".parse().unwrap();
+        agv.my_function_list().add_service(&definition, ServiceOptions::new(), fill).unwrap();
+    });
+    let (pool, far) = (&pair.agv.engine().pool, pair.far());
+    let buffers = drain(pool);
+    let outcome = pair.peer.block_request_with("fill", &mut text(LONG), &options(Duration::from_millis(300)));
+    assert_eq!(outcome, Err(Error::TimedOut));
+    until(|| far.lock().session.calls_held() == 0);
+    assert_eq!(far.lock().session.counters().value(LinkCounter::RepliesDropped), 1);
+    buffers.into_iter().for_each(|buffer| pool.give(buffer));
+    pair.peer.block_request_with("fill", &mut text(LONG), &options(PATIENT)).unwrap();
+}
+
+#[test]
+fn an_event_that_finds_no_room_is_counted_for_its_subscriber_and_the_unit() {
+    let pair = Pair::new(Constraints::M_UNIT, |_| {});
+    let engine = pair.manager.engine();
+    let lost = || value(&engine.readings(), Group::Unit, "EventsLost");
+    let (slow, slow_events) = sync_channel(1);
+    let (quick, quick_events) = sync_channel(8);
+    let (lost_by_slow, lost_by_quick) = (engine.subscribe(slow), engine.subscribe(quick));
+    let event = UnitEvent::InterfacesChanged { up: Vec::new() };
+    (0..4).for_each(|_| engine.tell(event.clone()));
+    let counted = [&lost_by_slow, &lost_by_quick].map(|lost| lost.load(Ordering::Relaxed));
+    assert_eq!((counted, lost()), ([3, 0], 3));
+    assert_eq!((slow_events.try_iter().count(), quick_events.try_iter().count()), (1, 4));
+    drop(slow_events);
+    engine.tell(event);
+    assert_eq!((lost_by_slow.load(Ordering::Relaxed), lost()), (3, 3), "one that is gone loses nothing");
+}
+
+/// A call that finds no buffer is tried again and again, to one node and to all: what is left of its time goes with it.
+#[test]
+fn the_deadline_of_a_call_is_that_of_its_first_try() {
+    const TIMEOUT: Duration = Duration::from_secs(30);
+    let (tell, told) = channel();
+    let tell = Mutex::new(tell);
+    let take = move |call: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+        lock(&tell).send(call.deadline).unwrap();
+        Ok(())
+    };
+    let pair = Pair::new(Constraints::M_UNIT, |agv| {
+        agv.my_function_list().add_function("take", &text(LONG), take).unwrap();
+    });
+    let (pool, near) = (&pair.manager.engine().pool, pair.near());
+    let tries = || near.lock().session.counters().value(LinkCounter::RequestsWithheld);
+    let one = || pair.peer.block_request_with("take", &mut text(LONG), &options(TIMEOUT)).unwrap();
+    let all = || {
+        let outcomes = pair.manager.block_request_all("take", &*text(LONG), &options(TIMEOUT));
+        assert!(outcomes.len() == 1 && outcomes.iter().all(|(_, outcome)| outcome.is_ok()));
+    };
+    for call in [&one as &(dyn Fn() + Sync), &all] {
+        let (buffers, before) = (drain(pool), tries());
+        let latest: Instant = std::thread::scope(|scope| {
+            scope.spawn(call);
+            until(|| tries() > before);
+            // It has begun, so that its time is over by then at the latest.
+            let latest = pair.agv.engine().clock.now() + TIMEOUT;
+            until(|| tries() > before + 20);
+            buffers.into_iter().for_each(|buffer| pool.give(buffer));
+            latest
+        });
+        let deadline = told.recv().unwrap();
+        assert!(deadline <= latest, "{} us later", deadline.since(latest).as_micros());
+    }
+}
+
+#[test]
+fn nothing_is_left_of_a_call_that_has_timed_out() {
+    let (open, gate) = channel::<()>();
+    let gate = Mutex::new(gate);
+    let wait = move |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+        let _ = lock(&gate).recv();
+        Ok(())
+    };
+    let pair = Pair::new(Constraints::M_UNIT, |agv| {
+        agv.my_function_list().add_function("wait", &text(1), wait).unwrap();
+    });
+    let (engine, near) = (pair.manager.engine(), pair.near());
+    // It goes before the pair, whose end waits for the handlers.
+    let open = open;
+    for clock_is_held_up in [true, true, false] {
+        // The clock ends the call, or the caller does where the clock waits for the node.
+        let held_up = clock_is_held_up.then(|| lock(&engine.node));
+        engine.wake_clock();
+        let outcome = pair.peer.block_request_with("wait", &mut text(1), &options(Duration::from_millis(50)));
+        assert_eq!(outcome, Err(Error::TimedOut));
+        drop(held_up);
+        let state = near.lock();
+        assert_eq!((state.waiters.len(), state.session.calls_in_flight()), (0, 0));
+    }
+    drop(open);
+}
