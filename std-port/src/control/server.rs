@@ -48,6 +48,7 @@ pub(crate) struct Server {
 struct Shared {
     waker: Waker,
     stopping: AtomicBool,
+    idle_limit: Duration,
     connections: Mutex<Connections>,
 }
 
@@ -78,7 +79,7 @@ impl Server {
     /// Answers questions about `system` at `path`. The handle must not be one that keeps the unit running.
     pub(super) fn open<T: Send + 'static>(path: &Path, system: CommunicationSystem<T>) -> Result<Self, PlaceError> {
         let (place, listener) = Place::open(path)?;
-        let started = accept_with(listener, system);
+        let started = Shared::new(IDLE_TIMEOUT).and_then(|shared| shared.accept_with(listener, system));
         match started {
             Ok(shared) => Ok(Self { place, shared }),
             Err(error) => {
@@ -107,20 +108,27 @@ impl Server {
     }
 }
 
-fn accept_with<T: Send + 'static>(listener: UnixListener, system: CommunicationSystem<T>) -> io::Result<Arc<Shared>> {
-    let (waker, epoll) = (Waker::new()?, Epoll::new()?);
-    epoll.add(&waker, WAKER, Interest::READ_LEVEL)?;
-    epoll.add(&listener, LISTENER, Interest::READ_LEVEL)?;
-    let shared =
-        Arc::new(Shared { waker, stopping: AtomicBool::new(false), connections: Mutex::new(Connections::default()) });
-    let own = shared.clone();
-    let thread = std::thread::Builder::new().name("cara-control".into());
-    let thread = thread.spawn(move || own.accept(&listener, &epoll, &system))?;
-    lock(&shared.connections).threads.push(thread.into());
-    Ok(shared)
-}
-
 impl Shared {
+    fn new(idle_limit: Duration) -> io::Result<Arc<Self>> {
+        let (waker, stopping, connections) = (Waker::new()?, AtomicBool::new(false), Mutex::default());
+        Ok(Arc::new(Self { waker, stopping, idle_limit, connections }))
+    }
+
+    fn accept_with<T: Send + 'static>(
+        self: Arc<Self>,
+        listener: UnixListener,
+        system: CommunicationSystem<T>,
+    ) -> io::Result<Arc<Self>> {
+        let epoll = Epoll::new()?;
+        epoll.add(&self.waker, WAKER, Interest::READ_LEVEL)?;
+        epoll.add(&listener, LISTENER, Interest::READ_LEVEL)?;
+        let own = self.clone();
+        let thread = std::thread::Builder::new().name("cara-control".into());
+        let thread = thread.spawn(move || own.accept(&listener, &epoll, &system))?;
+        lock(&self.connections).threads.push(thread.into());
+        Ok(self)
+    }
+
     fn is_stopping(&self) -> bool {
         self.stopping.load(Ordering::Acquire)
     }
@@ -194,7 +202,7 @@ impl Shared {
     ) -> io::Result<()> {
         stream.set_nonblocking(false)?;
         // Between questions alone is anything read.
-        stream.set_read_timeout(Some(IDLE_TIMEOUT))?;
+        stream.set_read_timeout(Some(self.idle_limit))?;
         stream.set_write_timeout(Some(WRITE_TIMEOUT))?;
         let mut writer = Answers::new(&stream);
         let mut lines = Lines::new(&stream);
@@ -280,5 +288,48 @@ impl<'s> Answers<'s> {
 
     fn outcome(&mut self) -> io::Result<()> {
         self.error.take().map_or(Ok(()), Err)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::{BufRead, BufReader, Read};
+
+    use cara_core::config::Constraints;
+
+    use super::*;
+    use crate::UnitEvent;
+    use crate::testing::{fleet, manager};
+
+    /// Each client has asked before it is served, so that its time to ask is no race.
+    #[test]
+    fn a_client_that_asks_nothing_is_ended_and_one_that_waits_for_an_answer_is_not() {
+        let system = manager(fleet(), Constraints::M_UNIT);
+        let shared = Shared::new(Duration::from_millis(20)).unwrap();
+        std::thread::scope(|scope| {
+            let client = |asks: &[u8]| {
+                let (client, served) = UnixStream::pair().unwrap();
+                client.set_read_timeout(Some(Duration::from_secs(20))).unwrap();
+                (&client).write_all(asks).unwrap();
+                let (shared, system) = (&shared, &system);
+                scope.spawn(move || drop(shared.serve(served, &Mutex::default(), system)));
+                BufReader::new(client)
+            };
+            let next = |client: &mut BufReader<UnixStream>| {
+                let mut line = String::new();
+                client.read_line(&mut line).unwrap();
+                serde_json::from_str::<Answer>(&line).unwrap()
+            };
+            let mut watching = client(b"{\"ask\":\"watch\"}\n");
+            assert!(matches!(next(&mut watching), Answer::Hello { .. }));
+            assert!(matches!(next(&mut watching), Answer::Event { .. }));
+            for (asks, answers) in [(&b""[..], 1), (b"{\"ask\":\"search\"}\n", 2)] {
+                let mut told = String::new();
+                client(asks).read_to_string(&mut told).unwrap();
+                assert_eq!(told.lines().count(), answers, "{told}");
+            }
+            system.engine().tell(UnitEvent::InterfacesChanged { up: Vec::new() });
+            assert!(matches!(next(&mut watching), Answer::Event { .. }));
+        });
     }
 }
