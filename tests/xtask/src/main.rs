@@ -27,6 +27,7 @@ mod panic_free;
 mod paper;
 mod peers;
 mod runner;
+mod sanitize;
 mod security;
 mod source;
 mod workspace;
@@ -89,6 +90,8 @@ enum Task {
         #[arg(long, value_name = "FILE")]
         json: Option<PathBuf>,
     },
+    /// Runs the Linux port's unit and port tests under the thread sanitizer; needs a nightly compiler.
+    Sanitize,
     /// Attacks units on the simulator, a board in QEMU and Linux units, and prints what was tried and what came of it.
     Security(security::Security),
     /// Makes things fail while an emulated vehicle drives, and prints how long its motors went on, beside the bound.
@@ -115,6 +118,7 @@ fn main() -> ExitCode {
         Task::Instructions { json, write } => instructions::run(json.as_deref(), write),
         Task::Fleet { nodes, json } => fleet::run(nodes, json.as_deref()),
         Task::Peers { names } => peers::run(&names),
+        Task::Sanitize => sanitize::run(),
         Task::Security(options) => security::run(&options),
         Task::Faults(faults) => firmware::faults(&faults),
         Task::Bench(options) => bench::run(&options),

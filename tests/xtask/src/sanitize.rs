@@ -1,0 +1,61 @@
+//! `cargo xtask sanitize`: the thread sanitizer over the Linux port. It needs a nightly compiler, which the project uses for
+//! nothing else, so it is a command of its own and no group of checks.
+
+use std::process::ExitCode;
+
+use anyhow::{Result, bail};
+
+use crate::command::{Run, exists};
+
+const TARGET: &str = "x86_64-unknown-linux-gnu";
+
+/// Runs the unit and port tests of the Linux port. A data race, or a thread that is never joined, fails them.
+pub(crate) fn run() -> Result<ExitCode> {
+    if !exists("rustup") {
+        bail!("rustup is missing: see https://rustup.rs");
+    }
+    let toolchains = Run::new("rustup").args(["toolchain", "list"]).text()?;
+    let components = match has_nightly(&toolchains) {
+        true => Run::new("rustup").args(["component", "list", "--installed", "--toolchain", "nightly"]).text()?,
+        false => String::new(),
+    };
+    if let Some(command) = missing(&toolchains, &components) {
+        bail!("the thread sanitizer needs a nightly compiler and the sources of the standard library: {command}");
+    }
+    let cargo =
+        ["run", "nightly", "cargo", "test", "-Zbuild-std", "--target", TARGET, "--target-dir", "target/sanitize"];
+    let tests = ["-p", "cara-std", "--features", "async", "--lib", "--test", "port"];
+    Run::new("rustup").args(cargo).args(tests).env("RUSTFLAGS", "-Zsanitizer=thread").stream()?;
+    println!("no data race and no leaked thread; target/sanitize can be removed");
+    Ok(ExitCode::SUCCESS)
+}
+
+fn has_nightly(toolchains: &str) -> bool {
+    toolchains.lines().any(|line| line.starts_with("nightly-x86_64") || line.trim() == "nightly")
+}
+
+/// The command that brings what is not installed.
+fn missing(toolchains: &str, components: &str) -> Option<&'static str> {
+    match (has_nightly(toolchains), components.lines().any(|line| line.trim() == "rust-src")) {
+        (false, _) => Some("rustup toolchain install nightly --component rust-src"),
+        (true, false) => Some("rustup component add rust-src --toolchain nightly"),
+        (true, true) => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::missing;
+
+    #[test]
+    fn what_is_missing_is_told_with_the_command_that_brings_it() {
+        let stable = "stable-x86_64-unknown-linux-gnu (active, default)\n";
+        let both = format!("{stable}nightly-x86_64-unknown-linux-gnu\n");
+        assert!(missing(stable, "").unwrap().contains("toolchain install nightly"));
+        assert!(
+            missing("nightly-2026-01-01-x86_64-unknown-linux-gnu\n", "").is_some_and(|told| told.contains("install"))
+        );
+        assert!(missing(&both, "cargo\nrustc\n").unwrap().contains("component add rust-src"));
+        assert_eq!(missing(&both, "cargo\nrust-src\n"), None);
+    }
+}
