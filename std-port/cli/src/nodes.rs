@@ -140,15 +140,16 @@ pub(crate) fn functions(operator: &mut Operator, node: &str) -> anyhow::Result<V
 
 /// A function that a node does not offer: close names, and all that it does.
 pub(crate) fn no_such_function(node: &str, name: &str, functions: &[FunctionInfo]) -> anyhow::Error {
-    not_offered(format!("{node} has not published `{name}`"), "it has", name, functions)
+    Ended::usage(not_offered(format!("{node} has not published `{name}`"), "it has", name, functions))
 }
 
-/// A function that no connected node offers.
-pub(crate) fn offered_nowhere(name: &str, functions: &[FunctionInfo]) -> anyhow::Error {
-    not_offered(format!("no connected node has published `{name}`"), "they have", name, functions)
+/// A function that no connected node offers: a mistake, unless one that `is_missing` may offer it.
+pub(crate) fn offered_nowhere(name: &str, functions: &[FunctionInfo], is_missing: bool) -> anyhow::Error {
+    let text = not_offered(format!("no connected node has published `{name}`"), "they have", name, functions);
+    if is_missing { Ended::failed("UnknownFunction", text) } else { Ended::usage(text) }
 }
 
-fn not_offered(mut text: String, they_have: &str, name: &str, functions: &[FunctionInfo]) -> anyhow::Error {
+fn not_offered(mut text: String, they_have: &str, name: &str, functions: &[FunctionInfo]) -> String {
     let close = close(name, functions.iter().map(|function| function.name.as_str()));
     if let Some(nearest) = close.first() {
         text += &format!("; did you mean `{nearest}`?");
@@ -160,7 +161,7 @@ fn not_offered(mut text: String, they_have: &str, name: &str, functions: &[Funct
             functions.iter().for_each(|function| text += &format!("\n    {}", function.signature));
         }
     }
-    Ended::usage(text)
+    text
 }
 
 #[cfg(test)]

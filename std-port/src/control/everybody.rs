@@ -3,8 +3,6 @@
 use std::collections::HashSet;
 use std::ops::ControlFlow;
 
-use cara_core::error::Error;
-
 use super::answering::{End, Sink, send};
 use super::protocol::{Answer, Failure};
 use crate::{CommunicationSystem, Peer};
@@ -27,7 +25,7 @@ pub(super) fn call<T: Send + 'static>(
     let missed = asked.iter().filter(|peer| !told.contains(&(peer.name().to_owned(), peer.id())));
     match outcome {
         Ok(()) => {}
-        // Nobody offers it: each of the roster is told of instead.
+        // No node offers it: each of the roster is told of instead.
         Err(End::Failed(failure)) if failure.error == "UnknownFunction" && !asked.is_empty() => {}
         Err(end) => return Err(end),
     }
@@ -35,14 +33,8 @@ pub(super) fn call<T: Send + 'static>(
 }
 
 fn missing<T: Send + 'static>(peer: &Peer<T>, function: &str) -> Answer {
-    let (error, text) = match peer.is_connected() && !peer.their_function_list().contains(function) {
-        true => ("UnknownFunction", format!("it does not offer '{function}' to this unit, and was not called")),
-        false => (
-            "NotConnected",
-            "it was not connected, and was not called; `cara retire` takes it off the roster".to_owned(),
-        ),
-    };
-    let failure = Failure { error: error.to_owned(), text, ..Failure::from(Error::NotConnected) };
+    let lacks_it = peer.is_connected() && !peer.their_function_list().contains(function);
+    let failure = Failure::not_called(lacks_it.then_some(function));
     let (node, id) = (peer.name().to_owned(), peer.id());
     Answer::Called { node, id, results: Vec::new(), call: None, error: Some(failure), took_us: 0 }
 }

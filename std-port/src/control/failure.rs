@@ -8,7 +8,7 @@ use cara_core::services::access::Verb;
 use super::protocol::Failure;
 
 impl Failure {
-    /// A failure of the question itself: whoever asks must ask otherwise.
+    /// A failure of the question itself: it must be asked otherwise.
     pub fn configuration(error: &str, text: impl Display) -> Self {
         Self::new(Cause::Configuration, error, text)
     }
@@ -16,6 +16,20 @@ impl Failure {
     /// A failure for which the unit lacks something.
     pub fn resource(error: &str, text: impl Display) -> Self {
         Self::new(Cause::Resource, error, text)
+    }
+
+    /// A call of all has passed a node over, which is connected and `lacks` the function, or is not connected.
+    pub fn not_called(lacks: Option<&str>) -> Self {
+        let (error, text) = match lacks {
+            Some(function) => {
+                ("UnknownFunction", format!("it does not offer '{function}' to this unit, and was not called"))
+            }
+            None => {
+                let text = "it was not connected, and was not called; `cara retire` takes it off the roster";
+                ("NotConnected", text.to_owned())
+            }
+        };
+        Self::new(Error::NotConnected.cause(), error, text)
     }
 
     /// The unit's access table does not let the operator do this.

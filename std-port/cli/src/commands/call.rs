@@ -92,7 +92,10 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
     };
     let published = match &node {
         Some(node) => of_node(&mut operator, node, function)?,
-        None => of_any(&mut operator, function)?,
+        None => match of_any(&mut operator, function)? {
+            Some(published) => published,
+            None => return Err(offered_by_none(&mut operator, function, global)?),
+        },
     };
     let question = CallQuestion {
         node,
@@ -124,15 +127,7 @@ fn call(operator: &mut Operator, question: CallQuestion, hold: bool, global: &Gl
         if let Some(failure) = &error {
             worst = if worst == Exit::Failed { worst } else { exit_of(failure) };
         }
-        if global.json {
-            let text = (error.is_none() && !asynchronous).then(|| show_call(&function, &results));
-            output::object(&json!({
-                "node": node, "text": text, "results": values(&results), "call": call, "error": error, "took_us": took_us,
-            }))?;
-        } else {
-            show(&node, &function, &results, call, error.as_ref(), took_us, one)?;
-        }
-        Ok(())
+        Ok(show_outcome(&node, &function, &results, call, error.as_ref(), (took_us, one), global)?)
     })?;
     if asynchronous {
         operator.deliver();
@@ -156,6 +151,25 @@ fn values(results: &[Argument]) -> Vec<Value> {
         value
     };
     results.iter().map(as_value).collect()
+}
+
+/// What came of the call of one node, in the form that is asked for.
+fn show_outcome(
+    node: &str,
+    function: &str,
+    results: &[Argument],
+    call: Option<u32>,
+    error: Option<&Failure>,
+    (took_us, one): (u64, bool),
+    global: &Global,
+) -> std::io::Result<()> {
+    if !global.json {
+        return show(node, function, results, call, error, took_us, one);
+    }
+    let text = (error.is_none() && call.is_none()).then(|| show_call(function, results));
+    output::object(&json!({
+        "node": node, "text": text, "results": values(results), "call": call, "error": error, "took_us": took_us,
+    }))
 }
 
 /// What came of the call of one node; its name goes before where there are several.
@@ -201,21 +215,29 @@ fn of_node(operator: &mut Operator, node: &str, function: &str) -> anyhow::Resul
 }
 
 /// The function as the first of the nodes that offer it has published it.
-fn of_any(operator: &mut Operator, function: &str) -> anyhow::Result<FunctionInfo> {
+fn of_any(operator: &mut Operator, function: &str) -> anyhow::Result<Option<FunctionInfo>> {
     let offering = nodes::all(operator, Some(function))?;
-    if let Some(node) = offering.iter().find(|node| node.connected) {
-        let all = nodes::all(operator, None)?;
-        return of_node(operator, &Chosen::among(&all, node).selector, function);
+    let Some(node) = offering.iter().find(|node| node.connected) else { return Ok(None) };
+    let all = nodes::all(operator, None)?;
+    of_node(operator, &Chosen::among(&all, node).selector, function).map(Some)
+}
+
+/// Shows an outcome for each node of the roster, none of which was called; the error that tells what there is.
+fn offered_by_none(operator: &mut Operator, function: &str, global: &Global) -> anyhow::Result<anyhow::Error> {
+    let all = nodes::all(operator, None)?;
+    for node in all.iter().filter(|node| node.expected) {
+        let failure = Failure::not_called(node.connected.then_some(function));
+        show_outcome(&nodes::full_name(node), function, &[], None, Some(&failure), (0, false), global)?;
     }
     let mut functions: Vec<FunctionInfo> = Vec::new();
-    let all = nodes::all(operator, None)?;
     for node in all.iter().filter(|node| node.connected) {
         let more = nodes::functions(operator, &Chosen::among(&all, node).selector)?.into_iter();
         functions.extend(more);
     }
     functions.sort_by(|a, b| a.signature.cmp(&b.signature));
     functions.dedup_by(|a, b| a.signature == b.signature);
-    Err(nodes::offered_nowhere(function, &functions))
+    let is_missing = all.iter().any(|node| node.expected && !node.connected);
+    Ok(nodes::offered_nowhere(function, &functions, is_missing))
 }
 
 /// The arguments as the signature asks for them.

@@ -54,7 +54,8 @@ fn all_nodes_are_called_at_once() {
     assert_eq!(told.len(), 2);
     stage.ends(1, &["call", "--all", "fail"]).says("agv-1/11: Service").says("agv-2/12: Service");
     stage.ends(2, &["call", "--all", "goto"]).says("did you mean `go_to`?");
-    stage.ends(2, &["call", "--all", "goto"]).says("no connected node has published `goto`");
+    let none = stage.ends(2, &["call", "--all", "goto"]);
+    none.says("agv-1/11: UnknownFunction").says("no connected node has published `goto`");
 }
 
 #[test]

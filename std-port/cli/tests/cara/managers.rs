@@ -48,6 +48,17 @@ fn who_is_missing_is_shown_until_it_is_retired() {
     stage.ends(0, &["scan"]).says("absent").says("1 of 3 s_units of the roster: agv-9/19").says("cara retire");
     let to_all = ["call", "--all", "go_to(position: [1, 2])"];
     stage.ends(1, &to_all).says("agv-9/19: NotConnected").says("agv-1/11  go_to(").says("agv-2/12  go_to(");
+    // A function that no node offers: each is told of all the same.
+    let none = stage.ends(1, &["call", "--all", "fly"]);
+    none.says("agv-1/11: UnknownFunction").says("agv-2/12: UnknownFunction").says("agv-9/19: NotConnected");
+    none.says("no connected node has published `fly`");
+    let told = stage.ends(1, &["call", "--all", "fly", "--json"]).lines();
+    let mut told: Vec<_> =
+        told.iter().map(|line| (line["node"].to_string(), line["error"]["error"].to_string())).collect();
+    told.sort();
+    let of = |node: &str, error: &str| (format!("\"{node}\""), format!("\"{error}\""));
+    let unknown = ["agv-1/11", "agv-2/12"].map(|node| of(node, "UnknownFunction"));
+    assert_eq!(told, [&unknown[..], &[of("agv-9/19", "NotConnected")]].concat());
     stage.ends(1, &["functions", "agv-9"]).says("has not joined");
     stage.ends(2, &["retire", "agv-1"]).says("is connected");
     stage.ends(1, &["retire", "agv-70"]).says("no node `agv-70`");
