@@ -1,7 +1,7 @@
 //! The threads that drive units: a pool that reads links and runs calls, and one that keeps time.
 //!
 //! A unit has threads of its own unless it is given [`Threads`] that several units of a process share. A token says
-//! which unit an event is for, so that the units of a process wait in one epoll set, whoever has the threads.
+//! which unit an event is for, so that the units of a process wait in one epoll set.
 
 use std::cell::Cell;
 use std::collections::VecDeque;
@@ -160,7 +160,7 @@ pub(crate) struct Crew {
     seats: RwLock<Vec<Option<Arc<Seat>>>>,
     /// When each unit's time has come.
     due: Mutex<Timers>,
-    /// Links on which a call may begin that nobody runs yet.
+    /// Links with a call that may begin and that no thread runs yet.
     ready: Mutex<VecDeque<u64>>,
     /// Threads of the pool that wait for something to do.
     idle: AtomicUsize,
@@ -268,7 +268,7 @@ impl Crew {
         self.has_idle() || self.start_worker(MOST_WORKERS)
     }
 
-    /// Whether a quick handler may be run while nobody waits: the clock can help if it takes long.
+    /// Whether a quick handler may be run while no thread waits: the clock can help if it takes long.
     pub(crate) fn may_run_quickly(&self) -> bool {
         self.occupancy.leaves_one(MOST_WORKERS)
     }
@@ -281,7 +281,7 @@ impl Crew {
         !self.occupancy.is_stuck(now, limit) || self.start_worker(MOST_WORKERS + 1)
     }
 
-    /// Takes a unit out. Unless a thread of the crew does it itself, nobody is inside the unit any more when it returns.
+    /// Takes a unit out. When it returns no thread is inside the unit any more, except one of the crew that does it itself.
     pub(crate) fn leave(&self, seat: u16) {
         // Before the seat is free: the next one on it may set its time at once.
         lock(&self.due).cancel(u32::from(seat));
@@ -391,7 +391,7 @@ impl Crew {
         }
     }
 
-    /// Runs the calls of links that nobody has run yet.
+    /// Runs the calls of links that no thread has run yet.
     fn serve_waiting(self: &Arc<Self>, worker: &mut Worker) {
         while let Some(link) = self.take_ready() {
             self.enter(link, |driven| driven.serve_waiting(link, worker));
@@ -520,7 +520,7 @@ mod tests {
         crew.wake_at(0, Instant::START);
         until(|| first.polls.load(Ordering::SeqCst) == 1);
         assert_eq!(second.polls.load(Ordering::SeqCst), 1);
-        assert_eq!(Arc::strong_count(&second), 1, "who left is held by nobody");
+        assert_eq!(Arc::strong_count(&second), 1, "a unit that has left is held no more");
         assert_eq!(crew.seat(second).unwrap(), 1, "its number is free again");
     }
 

@@ -192,7 +192,7 @@ impl<T: Send + 'static> Unit<T> {
         self.engine().set_access(table);
     }
 
-    /// The access table in force; without one whoever has joined may do everything.
+    /// The access table in force; without one each node that has joined may do everything.
     pub fn access(&self) -> Option<Arc<AccessTable>> {
         self.engine().access()
     }
@@ -204,7 +204,7 @@ impl<T: Send + 'static> Unit<T> {
         receiver
     }
 
-    /// The keys of links that this unit opens from here on are made anew this often, instead of every 12 h; once. So a test
+    /// The keys of links that this unit opens from here on are renewed this often, instead of every 12 h; once. So a test
     /// need not wait for so long.
     #[doc(hidden)]
     pub fn renew_keys_every(&self, span: cara_core::time::Duration) {

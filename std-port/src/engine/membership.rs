@@ -1,4 +1,4 @@
-//! The node and its links: opening, accepting, admitting, leaving, and what is published to whom.
+//! The node and its links: opening, accepting, admitting, leaving, and what is published to which node.
 
 use std::cmp::Reverse;
 use std::collections::HashMap;
@@ -51,7 +51,7 @@ const KEPT_FOR_PROVEN: u64 = 24;
 /// And of these what stays for the control socket, key files and dialling: two for each operator's connection, and some more.
 const KEPT_FOR_OPERATOR: u64 = 20;
 
-/// Whom a link is dialled for, as far as it is known.
+/// The node that a link is dialled for, as far as it is known.
 struct Dialed<'i>(Option<&'i Identity>);
 
 impl NodeCell {
@@ -140,7 +140,7 @@ impl<T: Send + 'static> Engine<T> {
         }
     }
 
-    /// Ends a link whose peer has proven nothing, so that nobody who connects and says nothing keeps others out: of the
+    /// Ends a link whose peer has proven nothing, so that connections that say nothing keep no others out: of the
     /// host that has most of them, the one that has waited longest. One whose hello waits to be read has spoken.
     /// Whether there was one.
     pub(super) fn make_room(&self) -> bool {
@@ -306,7 +306,7 @@ impl<T: Send + 'static> Engine<T> {
     fn link_ended(&self, link: &Arc<LinkCell>, reason: CloseReason) {
         {
             let mut state = link.lock();
-            // Nobody puts it back.
+            // It is not put back.
             state.is_out = false;
             let _ = self.crew().epoll.remove(&link.stream);
         }
@@ -444,7 +444,7 @@ impl<T: Send + 'static> Engine<T> {
 
     /// Lends the node the mailman of the unit's datagrams.
     pub(super) fn poll_node(&self) -> Instant {
-        // Before the node's lock: whoever reads a new key file keeps the ring to itself meanwhile.
+        // Before the node's lock: a thread that reads a new key file keeps the ring to itself meanwhile.
         let codes = self.keys.codes();
         loop {
             let (directive, next) = {

@@ -97,7 +97,7 @@ pub(crate) struct Engine<T: 'static> {
     listener: Option<Listener>,
     /// A manager looks for a live one of its identity before it starts.
     asks_for_itself: bool,
-    /// Whoever drives the unit: threads of its own, or of several units.
+    /// The threads that drive the unit: its own, or those of several units.
     threads: Threads,
     /// No other unit has them.
     own_threads: bool,
@@ -131,7 +131,7 @@ pub(crate) struct Engine<T: 'static> {
     afterwards: afterwards::Afterwards<T>,
 }
 
-/// Somebody who is told what happens.
+/// A channel that is told what happens.
 struct Subscriber {
     sender: SyncSender<UnitEvent>,
     /// Events that found no room.
@@ -427,7 +427,7 @@ impl<T: Send + 'static> Engine<T> {
         if state.is_paused() {
             deadline = deadline.min(now + RETRY);
         }
-        // A timer that is early does no harm: it is set anew when it comes.
+        // A timer that is early does no harm: it is set again when it comes.
         if deadline < state.timer {
             state.timer = deadline;
             if lock(&self.timers).set(u32::from(link.id.0), deadline) {
@@ -455,7 +455,7 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     /// Takes a link that the pool does not read out of the epoll set, for a row of calls: in the set, each arrival costs
-    /// a percent of a small round trip, although nobody is told of it. Taking it out and putting it back cost more than
+    /// a percent of a small round trip, although no thread is told of it. Taking it out and putting it back cost more than
     /// disarming and arming it, so this is for those who stay.
     fn take_out(&self, link: &LinkCell, state: &mut LinkState) {
         self.set_interest(link, state);

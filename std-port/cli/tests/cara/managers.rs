@@ -26,7 +26,7 @@ fn a_second_manager_of_one_identity_does_not_start_and_the_first_goes_on() {
     let after = connected(&stage);
     assert_eq!((&after["epoch"], &after["connected"]), (&before["epoch"], &Value::Bool(true)));
     assert!(after["connected_ms"].as_u64() >= before["connected_ms"].as_u64(), "it has not left: {before} {after}");
-    // One that was killed stands in nobody's way.
+    // One that was killed does not keep the next one from starting.
     stage.kill_manager();
     stage.start_manager();
     until("the vehicle is back", || stage.ready() == 1);
