@@ -9,6 +9,7 @@ use std::path::Path;
 
 use anyhow::{Context, Result};
 
+use crate::experiments::SIMULATED;
 use crate::results::{Availability, Mode, Response, Results};
 use axis::Axis;
 use cara_bench_ends::Delivery;
@@ -121,8 +122,12 @@ fn response(results: &Results, distribution: u8) -> Chart {
 }
 
 /// Whose curves are drawn, and their names there.
-const PEERS: [(&str, Mode, &str); 3] =
-    [("floor", Mode::Plain, "plain sockets"), ("cara", Mode::Plain, "CARA"), ("cara", Mode::Secured, "CARA, secured")];
+const PEERS: [(&str, Mode, &str); 4] = [
+    ("floor", Mode::Plain, "plain sockets"),
+    ("cara", Mode::Plain, "CARA"),
+    ("cara", Mode::Secured, "CARA, secured"),
+    (SIMULATED, Mode::Plain, "CARA, simulated"),
+];
 
 fn periods<'r>(rows: impl Iterator<Item = &'r Availability>) -> Vec<Point> {
     let point = |row: &Availability| {

@@ -109,11 +109,13 @@ fn share(plain: &Value, notes: &[Value]) {
 
 fn covers_links(all: &Map<String, Value>) {
     let set = |values: &[&str]| values.iter().map(|value| (*value).to_owned()).collect::<BTreeSet<_>>();
-    assert_eq!(values(all, "link_response", "peer"), set(&["floor", "floor_again", "cara"]));
-    assert_eq!(values(all, "link_availability", "peer"), set(&["floor", "cara"]));
+    assert_eq!(values(all, "link_response", "peer"), set(&["floor", "floor_again", "cara", "simulated"]));
+    assert_eq!(values(all, "link_availability", "peer"), set(&["floor", "cara", "simulated"]));
     for kind in ["link_response", "link_availability"] {
         assert_eq!(values(all, kind, "distribution"), set(&["1", "2"]), "{kind}");
-        assert_eq!(values(all, kind, "print"), set(&["true"]), "{kind}");
+        for row in rows(all, kind) {
+            assert_eq!(row["print"] == true, row["peer"] != "simulated", "{kind}");
+        }
     }
     for kind in ["link_availability", "link_constraints"] {
         assert_eq!(values(all, kind, "delivery"), set(&["reliable", "best_effort"]), "{kind}");
@@ -143,7 +145,7 @@ fn covers(all: &Map<String, Value>) {
     }
     share(&all["share"], all["run"]["notes"].as_array().unwrap());
     let experiments = all["run"]["experiments"].as_array().unwrap();
-    assert_eq!(experiments.len(), 8);
+    assert_eq!(experiments.len(), 9);
     assert!(experiments.iter().all(|done| done["is_complete"] == true), "{experiments:?}");
     for goal in rows(all, "goals") {
         assert_eq!(goal["figure"].is_number(), goal["is_reached"].is_boolean(), "{goal:?}");

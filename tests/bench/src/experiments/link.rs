@@ -7,20 +7,20 @@ use cara_bench_ends::{Burst, Delivery, Limits, Order};
 use cara_processes::cable::Cable;
 
 use super::availability::{counts, per_second};
-use super::plan::{LONGEST_MS, Plan};
+use super::plan::Plan;
 use super::response::{Cells, rows, turns};
 use crate::lanes::side_by_side;
 use crate::pair::{Delivered, Pair, Setting};
 use crate::peers::{Contender, SECURED};
 use crate::progress::{Progress, is_stopped};
-use crate::results::{LinkAvailability, LinkConstrained, OnLink, Results, micros, ratio};
+use crate::results::{LinkAvailability, LinkConstrained, Mode, OnLink, Results, micros, ratio};
 use crate::statistics::{Cell, quartile};
 
 /// Pairs that start at the same time.
 const AT_A_TIME: usize = 8;
 /// A request that is executed later than this behind the time at which the last one of its group was due has come too late.
 /// As long as what waits in the link's own queue.
-const GRACE: Duration = Duration::from_millis(50);
+pub(super) const GRACE: Duration = Duration::from_millis(50);
 /// Longest text of a datagram.
 const DATAGRAM_CHARS: u32 = 1_000;
 
@@ -77,7 +77,7 @@ fn availability(plan: &Plan, results: &mut Results) -> Result<()> {
     let mut outcome = Ok(());
     for &mbit in bursts.mbit.iter().take_while(|_| !is_stopped()) {
         let mut lanes = Vec::new();
-        let sizes = bursts.chars.iter().filter(|chars| *chars * 8 / mbit / 1_000 <= LONGEST_MS);
+        let sizes = bursts.sizes(mbit);
         for (distribution, &chars) in
             [1, 2].into_iter().flat_map(|number| sizes.clone().map(move |chars| (number, chars)))
         {
@@ -148,7 +148,10 @@ impl Lane<'_> {
                 format!("{}, {:?}: {chars} characters every {period_ms} ms", self.contender.name(), self.setting)
             });
             match self.contender.tolerate(groups) {
-                Ok(groups) => rows.extend(groups.and_then(|groups| self.row(&burst, &groups))),
+                Ok(groups) => rows.extend(groups.filter(|groups| !groups.is_empty()).map(|groups| {
+                    let Setting { distribution, print, mbit, .. } = self.setting;
+                    row(self.contender.name_and_mode(), distribution, print, mbit.unwrap_or_default(), &burst, &groups)
+                })),
                 Err(error) => return (rows, Err(error)),
             }
             if !self.contender.works() {
@@ -158,26 +161,33 @@ impl Lane<'_> {
         }
         (rows, Ok(()))
     }
+}
 
-    fn row(&self, burst: &Burst, groups: &[Delivered]) -> Option<LinkAvailability> {
-        let (peer, mode) = self.contender.name_and_mode();
-        let shares = || groups.iter().map(|group| ratio(group.in_time as f64 / f64::from(burst.count.max(1))));
-        let bits_per_s = f64::from(burst.chars) * 8e3 / burst.period_ms.max(1) as f64;
-        Some(LinkAvailability {
-            peer: peer.to_owned(),
-            distribution: self.setting.distribution,
-            chars: burst.chars,
-            period_ms: burst.period_ms,
-            delivery: burst.delivery,
-            mode,
-            print: self.setting.print,
-            load: ratio(bits_per_s / (f64::from(self.setting.mbit?) * 1e6)),
-            counts: counts(groups),
-            in_time_of_offered: ratio(shares().sum::<f64>() / groups.len().max(1) as f64),
-            worst_group: shares().min_by(f64::total_cmp)?,
-            best_group: shares().max_by(f64::total_cmp)?,
-            executed_per_s: quartile(groups.iter().map(per_second).collect(), 2).round(),
-        })
+/// What became of these groups of requests.
+pub(super) fn row(
+    (peer, mode): (&str, Mode),
+    distribution: u8,
+    print: bool,
+    mbit: u32,
+    burst: &Burst,
+    groups: &[Delivered],
+) -> LinkAvailability {
+    let shares = || groups.iter().map(|group| ratio(group.in_time as f64 / f64::from(burst.count.max(1))));
+    let bits_per_s = f64::from(burst.chars) * 8e3 / burst.period_ms.max(1) as f64;
+    LinkAvailability {
+        peer: peer.to_owned(),
+        distribution,
+        chars: burst.chars,
+        period_ms: burst.period_ms,
+        delivery: burst.delivery,
+        mode,
+        print,
+        load: ratio(bits_per_s / (f64::from(mbit) * 1e6)),
+        counts: counts(groups),
+        in_time_of_offered: ratio(shares().sum::<f64>() / groups.len().max(1) as f64),
+        worst_group: shares().fold(1.0, f64::min),
+        best_group: shares().fold(0.0, f64::max),
+        executed_per_s: quartile(groups.iter().map(per_second).collect(), 2).round(),
     }
 }
 

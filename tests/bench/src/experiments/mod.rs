@@ -10,6 +10,7 @@ mod response;
 mod resume;
 mod scale;
 mod share;
+mod simulated;
 mod throughput;
 
 use std::path::{Path, PathBuf};
@@ -27,6 +28,7 @@ use crate::table;
 use cara_bench_ends::Pin;
 use cara_processes::files;
 use plan::{Extent, Plan};
+pub(crate) use simulated::SIMULATED;
 
 /// What to run.
 #[derive(Args)]
@@ -52,6 +54,9 @@ pub(crate) struct Options {
     /// So many turns of each cell of the response time instead of the usual.
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     rounds: Option<u32>,
+    /// Only links of these rates, in Mbit/s.
+    #[arg(long, value_delimiter = ',')]
+    mbit: Vec<u32>,
     #[command(flatten)]
     outside: Selection,
     /// Writes all rows there as one JSON object, after each experiment anew.
@@ -77,6 +82,7 @@ enum Experiment {
     Constraints,
     Availability,
     Link,
+    Simulated,
 }
 
 impl Experiment {
@@ -91,6 +97,7 @@ impl Experiment {
             Self::Constraints => "constraints",
             Self::Availability => "availability",
             Self::Link => "link",
+            Self::Simulated => "simulated",
         }
     }
 
@@ -104,6 +111,7 @@ impl Experiment {
             Self::Constraints => constraints::measure(plan, &mut results.constraints),
             Self::Availability => availability::measure(plan, &mut results.availability),
             Self::Link => link::measure(plan, results),
+            Self::Simulated => simulated::measure(plan, results),
         }
     }
 }
@@ -175,6 +183,7 @@ fn plan(options: &Options, outside: &[Arc<Outside>]) -> Result<Plan> {
     };
     let mut plan = Plan::new(extent, options.print, outside)?;
     plan.narrow(&options.pins, &options.chars, options.rounds);
+    plan.link.narrow(&options.mbit);
     Ok(plan)
 }
 

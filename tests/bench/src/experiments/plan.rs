@@ -91,6 +91,23 @@ impl Bursts {
     }
 }
 
+impl Link {
+    /// Leaves out the rates that are not among these, where there are any.
+    pub(crate) fn narrow(&mut self, mbit: &[u32]) {
+        let is_wanted = |rate: &u32| mbit.is_empty() || mbit.contains(rate);
+        self.mbit.retain(is_wanted);
+        self.availability.mbit.retain(is_wanted);
+        self.response.retain(|group| group.setting.mbit.as_ref().is_some_and(is_wanted));
+    }
+}
+
+impl LinkBursts {
+    /// Those that a link of this rate carries soon enough.
+    pub(crate) fn sizes(&self, mbit: u32) -> impl Iterator<Item = &u32> + Clone {
+        self.chars.iter().filter(move |chars| *chars * 8 / mbit / 1_000 <= LONGEST_MS)
+    }
+}
+
 /// The sweep over constraints: every interval with every message size.
 #[derive(Debug, Clone)]
 pub(crate) struct Constrained {
@@ -114,7 +131,7 @@ pub(crate) struct Link {
 }
 
 /// A message that takes longer is left out: a group of them would take minutes.
-pub(crate) const LONGEST_MS: u32 = 20;
+const LONGEST_MS: u32 = 20;
 
 /// One-way requests on a link, in both distributions; none that takes a link longer than [`LONGEST_MS`].
 #[derive(Debug, Clone)]

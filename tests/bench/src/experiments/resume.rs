@@ -4,6 +4,7 @@ use std::path::Path;
 
 use anyhow::{Result, ensure};
 
+use super::simulated::SIMULATED;
 use crate::peers::OutsideReport;
 use crate::results::{About, Results};
 
@@ -46,6 +47,17 @@ pub(super) fn keep(earlier: &Results, experiment: &str, into: &mut Results) {
             into.link_response = earlier.link_response;
             into.link_availability = earlier.link_availability;
             into.link_constraints = earlier.link_constraints;
+            into.link_response.retain(|on| on.row.as_ref().is_none_or(|row| row.peer != SIMULATED));
+            into.link_availability.retain(|on| on.row.as_ref().is_none_or(|row| row.peer != SIMULATED));
+        }
+        // Its rows stand among those of the link.
+        "simulated" => {
+            let (responses, availabilities) = (earlier.link_response, earlier.link_availability);
+            let is_ours = |peer: &str| peer == SIMULATED;
+            let responses = responses.into_iter().filter(|on| on.row.as_ref().is_some_and(|row| is_ours(&row.peer)));
+            into.link_response.extend(responses);
+            let rows = availabilities.into_iter().filter(|on| on.row.as_ref().is_some_and(|row| is_ours(&row.peer)));
+            into.link_availability.extend(rows);
         }
         _ => return,
     }
