@@ -61,8 +61,7 @@ impl Place {
     }
 }
 
-/// This environment variable holds the address of the server's end of a cable, for all processes of the pair; other systems
-/// read it as well.
+/// This environment variable holds the address of the server's end of a cable, for all processes of the pair.
 pub const CABLE_END: &str = "CARA_BENCH_CABLE";
 
 /// The address of the server's end where the pair has a cable.

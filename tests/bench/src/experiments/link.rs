@@ -82,8 +82,7 @@ fn availability(plan: &Plan, results: &mut Results) -> Result<()> {
             [1, 2].into_iter().flat_map(|number| sizes.clone().map(move |chars| (number, chars)))
         {
             let setting = Setting { pin: plan.pin, distribution, print: true, mbit: Some(mbit) };
-            let outside = bursts.outside.iter().filter(|_| distribution == 1);
-            for contender in own.iter().chain(outside) {
+            for contender in &own {
                 let is_ours = contender.name_and_mode().0 == "cara";
                 let datagrams = is_ours && chars <= DATAGRAM_CHARS;
                 let deliveries =

@@ -141,8 +141,6 @@ pub(crate) struct LinkBursts {
     pub(crate) periods_ms: Vec<u64>,
     pub(crate) groups: u32,
     pub(crate) group: u32,
-    /// Other systems with messages without an answer.
-    pub(crate) outside: Vec<Contender>,
 }
 
 const COMPARED: [&str; 4] = ["floor", "floor_again", "cara", SECURED];
@@ -187,7 +185,7 @@ impl Plan {
             scale_calls: extent.of(400, 200, 5),
             availability: availability(extent),
             constrained: constrained(extent),
-            link: link(extent, pin, outside),
+            link: link(extent, pin),
             pin,
             notes,
         })
@@ -326,15 +324,13 @@ fn availability(extent: Extent) -> Vec<Bursts> {
         .collect()
 }
 
-fn link(extent: Extent, pin: Pin, outside: &[Arc<Outside>]) -> Link {
-    let known =
-        || outside.iter().filter(|outside| ["omniorb", "zenoh"].contains(&outside.name()) && extent != Extent::Quick);
+fn link(extent: Extent, pin: Pin) -> Link {
     let mbit = extent.of(vec![10, 20, 100], vec![20], vec![100]);
     let chars: &[u32] = extent.of(&CHARS, &SOME_CHARS, &[100]);
     let (rounds, calls) = extent.of((5, 20), (2, 5), (1, 3));
     let group = |(distribution, mbit)| {
         let setting = Setting { pin, distribution, print: true, mbit: Some(mbit) };
-        Group { setting, peers: with(&COMPARED, known()), orders: orders(chars, calls, 20), rounds }
+        Group { setting, peers: with(&COMPARED, [].iter()), orders: orders(chars, calls, 20), rounds }
     };
     let cells = [1, 2].into_iter().flat_map(|distribution| mbit.iter().map(move |&mbit| (distribution, mbit)));
     Link {
@@ -346,7 +342,6 @@ fn link(extent: Extent, pin: Pin, outside: &[Arc<Outside>]) -> Link {
             periods_ms: extent.of(vec![1, 2, 5, 8, 10, 15, 20, 30, 50, 80], vec![5, 10, 20], vec![1]),
             groups: extent.of(5, 1, 1),
             group: extent.of(200, 100, 5),
-            outside: with(&[], known()),
         },
         constrained: Constrained {
             intervals_ms: extent.of(vec![0, 2, 5, 10, 20, 50], vec![0, 10], vec![0]),

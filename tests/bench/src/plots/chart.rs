@@ -111,7 +111,11 @@ impl Chart {
             let ends = [(at, tops.start), (at, tops.end)];
             root.draw(&DashedPathElement::new(ends, 2, 3, BLACK.mix(0.6))).map_err(told)?;
             let height = tops.end - 16 - 14 * (index as i32 % 4);
-            root.draw(&Text::new(text.as_str(), (at + 3, height), (FONT, 11))).map_err(told)?;
+            // On the side where there is room.
+            let (columns, _) = chart.plotting_area().get_pixel_range();
+            let is_right = at > (columns.start + columns.end) / 2;
+            let left = if is_right { at - 6 * text.chars().count() as i32 - 4 } else { at + 3 };
+            root.draw(&Text::new(text.as_str(), (left, height), (FONT, 11))).map_err(told)?;
         }
         let style = |line: &Line| names.iter().position(|(name, _)| *name == line.name).map(Style::of);
         for line in &self.lines {

@@ -5,6 +5,7 @@ use cara_bench_ends::Delivery;
 use super::axis::Axis;
 use super::chart::{Chart, Kind, Line, Point};
 use super::{Figure, LONG, PEERS, paper, paper_falls, round_trips};
+use crate::experiments::SIMULATED;
 use crate::results::{LinkAvailability, LinkConstrained, Mode, Response, Results, measured};
 
 /// From this share on, and at every longer period, requests count as available.
@@ -16,8 +17,10 @@ pub(super) fn figures(results: &Results) -> Vec<Figure> {
     let mut rates: Vec<u32> = measured(&results.link_response).map(|(mbit, _)| mbit).collect();
     rates.sort_unstable();
     rates.dedup();
-    let n = measured(&results.link_availability).map(|(_, row)| row.counts.offered).min().unwrap_or(0);
-    let calls = measured(&results.link_response).map(|(_, row)| row.n).min().unwrap_or(0);
+    let offered = measured(&results.link_availability).filter(|(_, row)| row.peer != SIMULATED);
+    let n = offered.map(|(_, row)| row.counts.offered).min().unwrap_or(0);
+    let called = measured(&results.link_response).filter(|(_, row)| row.peer != SIMULATED);
+    let calls = called.map(|(_, row)| row.n).min().unwrap_or(0);
     let of_calls = format!("response time: n = {calls} a point, bars: quartiles");
     let of_requests = format!("availability: n = {n} a point, bars: worst and best group");
     let ring = format!("ring: from here on {} % and more in time", AVAILABLE * 100.0);
@@ -74,7 +77,6 @@ fn response(results: &Results, mbit: u32, distribution: u8) -> Chart {
         round_trips(rows.clone().map(|(_, row)| row).filter(is_wanted)).into_iter().map(in_ms).collect::<Vec<_>>()
     };
     let mut lines: Vec<Line> = PEERS.iter().map(|(peer, mode, name)| Line::measured(*name, of(peer, *mode))).collect();
-    lines.extend(results.run.peers.iter().map(|outside| Line::measured(&outside.peer, of(&outside.peer, Mode::Plain))));
     let wire = [1_000.0, 100_000.0].map(|chars| (chars, 2.0 * chars * 8.0 / f64::from(mbit) / 1e3));
     lines.push(Line::of(Kind::Reckoned, "the bits of both texts alone", &wire));
     let title = format!("Response time, {mbit} Mbit/s, distribution {distribution}");
@@ -141,7 +143,6 @@ fn long(results: &Results, mbit: u32, distribution: u8) -> Chart {
         })
     };
     let mut lines: Vec<Line> = PEERS.iter().map(|(peer, mode, name)| Line::measured(*name, of(peer, *mode))).collect();
-    lines.extend(results.run.peers.iter().map(|outside| Line::measured(&outside.peer, of(&outside.peer, Mode::Plain))));
     lines.extend(paper(distribution, LONG));
     let (x, y) = axes();
     let title = format!("{LONG} characters, {mbit} Mbit/s, distribution {distribution}");
