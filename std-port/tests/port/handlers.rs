@@ -1,12 +1,14 @@
 //! What runs a service: its forms, in both roles, and what happens when it panics or takes long.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use cara_std::{Call, Error, Parameters, ParametersView, Priority, RequestOptions, Role, ServiceError, ServiceOptions};
 
-use crate::support::{Gate, ask, fleet, meet, number, pair, publish, service, system, unit, until, value};
+use crate::support::{
+    Gate, PATIENCE, ask, fleet, meet, number, pair, publish, service, system, unit, until, value, within,
+};
 
 fn free(mut parameters: Parameters) -> Parameters {
     let doubled = 2 * value(&parameters);
@@ -248,4 +250,48 @@ fn a_changed_function_is_stale_until_it_is_published_again() {
     until("the new one is known", || ask(&peer, "f", 1) == Ok(-1));
     agv.my_function_list().remove("f").unwrap();
     until("it is gone", || ask(&peer, "f", 1) == Err(Error::UnknownFunction));
+}
+
+/// Long messages are sealed ahead of the stream, on a link that is full of them: an emergency runs before those that were
+/// accepted before it, and once, though it comes as a datagram and in the stream.
+#[test]
+fn an_emergency_overtakes_long_messages_that_are_sealed_ahead() {
+    let (manager, agv) = pair();
+    let (stored, stops) = (Arc::new(AtomicUsize::new(0)), Arc::new(AtomicUsize::new(0)));
+    let mut long = Parameters::<48_000>::sized();
+    long.add_string("text", 20_000).unwrap();
+    long.set_value("text", &*"x".repeat(20_000)).unwrap();
+    let list = agv.my_function_list();
+    let runs = stored.clone();
+    let store = move |_: &Call, _: &mut ParametersView| {
+        runs.fetch_add(1, Ordering::SeqCst);
+        Ok(())
+    };
+    list.add_function("store", &long, store).unwrap();
+    let definition = "stop(number: int[1]) -> (number: int[1])".parse().unwrap();
+    let (runs, stopped) = (stored.clone(), stops.clone());
+    let stop = service(move |_| {
+        stopped.fetch_add(1, Ordering::SeqCst);
+        runs.load(Ordering::SeqCst) as i64
+    });
+    list.add_service(&definition, ServiceOptions::new().priority(Priority::Emergency), stop).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    let (accepted, over) = (AtomicUsize::new(0), AtomicBool::new(false));
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            while !over.load(Ordering::SeqCst) {
+                accepted.fetch_add(usize::from(peer.request("store", &long).is_ok()), Ordering::SeqCst);
+            }
+        });
+        let mut asked = 0;
+        let overtakes = within(PATIENCE, || {
+            let before = accepted.load(Ordering::SeqCst) as i64;
+            asked += 1;
+            ask(&peer, "stop", 0).is_ok_and(|stored| stored < before)
+        });
+        over.store(true, Ordering::SeqCst);
+        assert!(overtakes, "an emergency runs before what was accepted before it");
+        assert_eq!(stops.load(Ordering::SeqCst), asked, "each once");
+    });
+    until("the long messages run as well", || stored.load(Ordering::SeqCst) > 0);
 }
