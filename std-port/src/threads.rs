@@ -17,6 +17,7 @@ use crate::engine::workers::Worker;
 use crate::engine::{lock, read, system_refused, write};
 use crate::lane::Lane;
 use crate::occupancy::Occupancy;
+use crate::sys::alarm::Alarm;
 use crate::sys::datagram::Socket;
 use crate::sys::epoll::{Epoll, Events, Interest, Ready, Waker};
 use crate::timers::Timers;
@@ -27,10 +28,12 @@ const FIRST_WORKERS: usize = 2;
 const MOST_WORKERS: usize = 14;
 /// Longest datagram that counts, and one byte more.
 const DATAGRAM: usize = 2048;
-/// The token of both wakers; no unit has this number.
+/// The token of both wakers and of the alarm; no unit has this number.
 const WAKER: u64 = u64::MAX;
 /// The clock looks at the time this often at least.
 const LONGEST_WAIT: Duration = Duration::from_millis(250);
+/// The clock waits for less than this by itself, and for more by its alarm, which can be put off meanwhile.
+const ALARMED: Duration = Duration::from_millis(1);
 /// Events of sockets that are taken in one look.
 const CLOCK_EVENTS: usize = 64;
 /// Bits of a token below the unit's number: what the event is about.
@@ -160,6 +163,10 @@ pub(crate) struct Crew {
     seats: RwLock<Vec<Option<Arc<Seat>>>>,
     /// When each unit's time has come.
     due: Mutex<Timers>,
+    /// Wakes the clock for the first of them; set under the lock of `due`.
+    alarm: Alarm,
+    /// Links that a clock looks at: those that threads stay on, and those that are kept for callers.
+    pub(crate) watched: AtomicUsize,
     /// Links with a call that may begin and that no thread runs yet.
     ready: Mutex<VecDeque<u64>>,
     /// Threads of the pool that wait for something to do.
@@ -192,6 +199,8 @@ impl Crew {
             (Epoll::new()?, Epoll::new()?, Waker::new()?, Waker::new()?);
         epoll.add(&pool_waker, WAKER, Interest::READ_LEVEL)?;
         clock_epoll.add(&clock_waker, WAKER, Interest::READ_LEVEL)?;
+        let alarm = Alarm::new()?;
+        clock_epoll.add(&alarm, WAKER, Interest::READ_EDGE)?;
         Ok(Self {
             clock: Clock::new(),
             epoll,
@@ -200,6 +209,8 @@ impl Crew {
             pool_waker,
             seats: RwLock::new(Vec::new()),
             due: Mutex::new(Timers::new()),
+            alarm,
+            watched: AtomicUsize::new(0),
             ready: Mutex::new(VecDeque::new()),
             idle: AtomicUsize::new(0),
             workers: AtomicUsize::new(0),
@@ -241,6 +252,23 @@ impl Crew {
         if lock(&self.due).bring_forward(u32::from(seat), at) && !self.keeps_time_here() {
             self.clock_waker.wake();
         }
+    }
+
+    /// What the unit was to do at `from` is put off until the time that `to` gives, without waking the clock. `None` where
+    /// the unit has something else to do before, or the clock has begun.
+    pub(crate) fn put_off(&self, seat: u16, from: Instant, to: impl FnOnce() -> Instant) -> Option<Instant> {
+        let mut due = self.due.try_lock().ok()?;
+        if due.deadline(u32::from(seat)) != Some(from) {
+            return None;
+        }
+        // Under the lock: what comes to be due from here on brings the new time forward again.
+        let to = to();
+        let first = due.next();
+        due.set(u32::from(seat), to);
+        if let Some(next) = due.next().filter(|_| first == Some(from)) {
+            self.alarm.set(next.since(self.clock.now()));
+        }
+        Some(to)
     }
 
     /// This thread is the crew's clock, which looks at what is due before it next waits.
@@ -429,9 +457,7 @@ impl Crew {
         let mut events = Events::new(CLOCK_EVENTS);
         let mut buffer = vec![0; DATAGRAM];
         while !self.is_stopping() {
-            let next = self.poll_due();
-            // The wait stands still while the system is suspended, and the clock goes on.
-            let wait = next.since(self.clock.now()).min(LONGEST_WAIT);
+            let wait = self.poll_due();
             if let Err(error) = self.clock_epoll.wait(&mut events, Some(wait)) {
                 tracing::error!(%error, "waiting for time failed");
                 return;
@@ -451,20 +477,33 @@ impl Crew {
         }
     }
 
-    /// Lets every unit whose time has come do what is due; returns when the next one's comes.
-    fn poll_due(&self) -> Instant {
+    /// Lets every unit whose time has come do what is due; returns how long to wait at most for the next one's.
+    fn poll_due(&self) -> Duration {
         loop {
             let seat = {
                 let mut due = lock(&self.due);
-                match due.pop_due(self.clock.now()) {
+                let now = self.clock.now();
+                match due.pop_due(now) {
                     Some(seat) => seat as u16,
-                    None => return due.next().unwrap_or(Instant::FAR_FUTURE),
+                    None => return self.wait_for(due.next().unwrap_or(Instant::FAR_FUTURE).since(now)),
                 }
             };
             if let Some(next) = self.enter(token(seat, 0), |driven| driven.keep_time()) {
                 lock(&self.due).bring_forward(u32::from(seat), next);
             }
         }
+    }
+
+    /// How long to wait for something that is due after `span`. The wait itself stands still while the system is suspended,
+    /// and the clock goes on.
+    fn wait_for(&self, span: Duration) -> Duration {
+        if span < ALARMED {
+            return span;
+        }
+        if span < LONGEST_WAIT {
+            self.alarm.set(span);
+        }
+        LONGEST_WAIT
     }
 }
 
@@ -522,6 +561,21 @@ mod tests {
         assert_eq!(second.polls.load(Ordering::SeqCst), 1);
         assert_eq!(Arc::strong_count(&second), 1, "a unit that has left is held no more");
         assert_eq!(crew.seat(second).unwrap(), 1, "its number is free again");
+    }
+
+    #[test]
+    fn only_what_a_unit_waits_for_is_put_off() {
+        let threads = Threads::new().unwrap();
+        let crew = threads.crew();
+        let at = |seconds| crew.clock.now() + Duration::from_secs(seconds);
+        let (look, later, between) = (at(100), at(300), at(200));
+        crew.wake_at(4, look);
+        assert_eq!(crew.put_off(4, between, || later), None, "it waits for something else");
+        assert_eq!(crew.put_off(4, look, || later), Some(later));
+        assert_eq!(crew.put_off(4, look, || later), None, "it was put off already");
+        crew.wake_at(4, between);
+        assert_eq!(crew.put_off(4, later, || later), None, "something is due before");
+        assert_eq!(lock(&crew.due).next(), Some(between));
     }
 
     #[test]

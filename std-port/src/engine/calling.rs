@@ -239,7 +239,7 @@ impl<T: Send + 'static> Engine<T> {
         }
         if guard.reader.is_kept() {
             self.take_out(link, &mut guard);
-            self.watch_kept(link, &mut guard);
+            self.watch_kept(now, link, &mut guard);
         }
         self.settle_at(now, link, guard);
     }

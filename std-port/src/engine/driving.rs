@@ -1,6 +1,7 @@
 //! The unit among those that its threads drive: how it begins, what wakes it, and how the threads let go of it.
 
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 
 use cara_core::config::Mode;
 use cara_core::error::Error;
@@ -72,6 +73,8 @@ impl<T: Send + 'static> Engine<T> {
 
     /// From here on no thread works for the unit any more, except the one that calls.
     pub(super) fn release_threads(&self) {
+        let kept = std::mem::take(&mut *lock(&self.kept));
+        self.crew().watched.fetch_sub(kept.len(), Ordering::Relaxed);
         for socket in [Socket::Shared, Socket::Own] {
             self.crew().unwatch(self.datagrams.fd(socket));
         }
@@ -97,7 +100,9 @@ impl<T: Send + 'static> Driven for Engine<T> {
     }
 
     fn keep_time(&self) -> Instant {
-        self.poll_links().min(self.poll_node()).min(self.watch_links()).min(self.go_on_listening())
+        let others = self.poll_node().min(self.go_on_listening());
+        let look = self.watch_links(others);
+        self.poll_links().min(others).min(look)
     }
 
     fn look_around(&self) -> Instant {

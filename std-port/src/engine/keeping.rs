@@ -7,6 +7,7 @@
 //! not kept waiting, since its link is not kept.
 
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 
 use cara_core::time::Instant;
 
@@ -28,9 +29,12 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     /// The clock is to look at a link that is kept from here on.
-    pub(super) fn watch_kept(&self, link: &LinkCell, state: &mut LinkState) {
-        if !std::mem::replace(&mut state.kept, true) {
+    pub(super) fn watch_kept(&self, now: Instant, link: &LinkCell, state: &mut LinkState) {
+        if std::mem::replace(&mut state.kept, true) {
+            self.put_off_look(now);
+        } else {
             lock(&self.kept).push(link.id);
+            self.crew().watched.fetch_add(1, Ordering::Relaxed);
             self.begin_watch();
         }
     }
@@ -39,8 +43,10 @@ impl<T: Send + 'static> Engine<T> {
     /// is next kept.
     pub(super) fn look_at_kept(&self, now: Instant) -> bool {
         let kept = std::mem::take(&mut *lock(&self.kept));
+        let before = kept.len();
         let left: Vec<_> =
             kept.into_iter().filter(|id| self.link(*id).is_some_and(|link| self.stays_kept(now, &link))).collect();
+        self.crew().watched.fetch_sub(before - left.len(), Ordering::Relaxed);
         let mut kept = lock(&self.kept);
         kept.extend(left);
         !kept.is_empty()

@@ -114,6 +114,7 @@ pub(crate) struct Engine<T: 'static> {
     kept: Mutex<Vec<LinkId>>,
     /// Whether the clock looks at these.
     watch: watch::Watch,
+    next_look: staying::NextLook,
     interfaces: Mutex<interfaces::InterfaceWatch>,
     /// When connections are taken again, where there were no descriptors for them.
     listens_at: Mutex<Option<Instant>>,
@@ -200,6 +201,7 @@ impl<T: Send + 'static> Engine<T> {
             stays: Mutex::new(Vec::new()),
             kept: Mutex::new(Vec::new()),
             watch: watch::Watch::default(),
+            next_look: staying::NextLook::new(),
             interfaces: Mutex::default(),
             listens_at: Mutex::new(None),
             keys: parts.keys,

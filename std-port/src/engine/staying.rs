@@ -6,7 +6,7 @@
 //! lead away ([`Engine::watch_links`]), so that other threads read on; until then that link's stream waits, but not its
 //! datagrams, which carry emergencies and keep-alives as well, and no other link.
 
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, MutexGuard};
 
 use cara_core::error::CloseReason;
@@ -29,13 +29,47 @@ const FEW: usize = 4;
 const AT_ONCE: Duration = Duration::from_millis(1);
 /// A handler that runs longer than this while its thread has the lead loses it.
 const RELIEF: Duration = Duration::from_millis(1);
-/// How often the clock looks at links that are led or kept, as long as anything happens there.
+/// How often the clock looks at links that are led or kept, as long as anything happens there. Calls on a single link put
+/// the look off ([`Engine::put_off_look`]).
 pub(super) const LOOK: Duration = Duration::from_millis(2);
 
 /// The same moment for all units that share a clock, so that it wakes once for all of them.
 fn next_look(now: Instant) -> Instant {
     let every = LOOK.as_micros();
     Instant::from_micros((now.as_micros() / every + 1) * every)
+}
+
+/// When the clock looks next, for those who put that off.
+#[derive(Debug)]
+pub(super) struct NextLook {
+    at: AtomicU64,
+    /// What is due beside links.
+    others: AtomicU64,
+}
+
+impl NextLook {
+    pub(super) const fn new() -> Self {
+        Self { at: AtomicU64::new(u64::MAX), others: AtomicU64::new(u64::MAX) }
+    }
+
+    fn at(&self) -> Instant {
+        Instant::from_micros(self.at.load(Ordering::Acquire))
+    }
+
+    fn others(&self) -> Instant {
+        Instant::from_micros(self.others.load(Ordering::Relaxed))
+    }
+
+    /// The clock is about to wait.
+    fn set(&self, at: Instant, others: Instant) {
+        self.others.store(others.as_micros(), Ordering::Relaxed);
+        self.at.store(at.as_micros(), Ordering::Release);
+    }
+
+    /// Unless the clock has looked meanwhile.
+    fn put_off(&self, from: Instant, to: Instant) {
+        let _ = self.at.compare_exchange(from.as_micros(), to.as_micros(), Ordering::AcqRel, Ordering::Relaxed);
+    }
 }
 
 impl<T: Send + 'static> Engine<T> {
@@ -82,6 +116,7 @@ impl<T: Send + 'static> Engine<T> {
         }
         let turn = state.reader.take_lead()?;
         stays.push(link.id);
+        self.crew().watched.fetch_add(1, Ordering::Relaxed);
         drop(stays);
         self.take_out(link, &mut state);
         self.settle_at(now, link, state);
@@ -129,6 +164,7 @@ impl<T: Send + 'static> Engine<T> {
             self.settle_at(now, link, state);
             if let Some(call) = call {
                 self.begin_watch();
+                self.put_off_look(now);
                 return Some((call, now));
             }
             if !alive || !self.crew().has_idle() || self.is_stopping() {
@@ -149,6 +185,7 @@ impl<T: Send + 'static> Engine<T> {
         // Another thread may stay on the same link since this one lost the lead.
         if let Some(index) = stays.iter().position(|id| *id == link.id) {
             stays.swap_remove(index);
+            self.crew().watched.fetch_sub(1, Ordering::Relaxed);
         }
         drop(stays);
         self.leave(link, link.lock(), Some(turn));
@@ -162,8 +199,9 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     /// Gives to the pool what is led by a thread whose handler takes long, and what is kept for a caller who does not come
-    /// back; returns when to look again.
-    pub(super) fn watch_links(&self) -> Instant {
+    /// back; returns when to look again. The unit's `others` are due then.
+    pub(super) fn watch_links(&self, others: Instant) -> Instant {
+        self.next_look.set(Instant::FAR_FUTURE, others);
         if !self.watch.is_on() {
             return Instant::FAR_FUTURE;
         }
@@ -174,7 +212,26 @@ impl<T: Send + 'static> Engine<T> {
             return Instant::FAR_FUTURE;
         }
         self.watch.go_on();
-        next_look(now)
+        let next = next_look(now);
+        self.next_look.set(next, others);
+        next
+    }
+
+    /// A call comes or ends at `now`. Where the clock looks at no other link, it need not look before the next one is
+    /// overdue: a wake-up every 2 ms would be in the way of each hundredth call.
+    pub(super) fn put_off_look(&self, now: Instant) {
+        let look = self.next_look.at();
+        if look >= now + LOOK.divided_by(2)
+            || self.crew().watched.load(Ordering::Relaxed) != 1
+            || !self.crew().has_idle()
+        {
+            return;
+        }
+        let Some(seat) = self.seat() else { return };
+        let due = || lock(&self.timers).next().unwrap_or(Instant::FAR_FUTURE).min(self.next_look.others());
+        if let Some(at) = self.crew().put_off(seat, look, || due().min(now + LOOK)) {
+            self.next_look.put_off(look, at);
+        }
     }
 
     /// Takes the lead from threads whose handlers take long; whether others may soon take as long.

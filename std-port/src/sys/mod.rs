@@ -2,6 +2,7 @@
 //!
 //! Nothing here knows the protocol, starts a thread or holds a lock across a call that may block.
 
+pub mod alarm;
 pub mod datagram;
 pub mod epoll;
 pub mod interfaces;
