@@ -29,7 +29,7 @@ impl Lane {
         Ok(Self { jobs: Mutex::new(Some(sender)), thread })
     }
 
-    /// Leaves `job` to the thread; whoever calls bounds how many wait. It must not panic.
+    /// Leaves `job` to the thread; the caller bounds how many wait. It must not panic.
     pub(crate) fn run(&self, job: impl FnOnce() + Send + 'static) {
         if let Some(jobs) = lock(&self.jobs).as_ref() {
             // The thread ends only when there is no sender any more.

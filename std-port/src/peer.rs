@@ -117,7 +117,7 @@ impl<T: Send + 'static> Peer<T> {
         self.cell.is_connected()
     }
 
-    /// Takes it off the [roster](crate::CommunicationSystem::roster) until it joins again, or this unit is started anew; `false`
+    /// Takes it off the [roster](crate::CommunicationSystem::roster) until it joins again, or this unit is started again; `false`
     /// while it is connected.
     pub fn retire(&self) -> bool {
         self.cell.retire()

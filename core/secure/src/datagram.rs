@@ -211,7 +211,7 @@ struct Window {
 impl Window {
     const NEW: Self = Self { end: 0, seen: 0 };
 
-    /// The last number is nobody's: behind it there is no end.
+    /// The last number is never used: behind it there is no end.
     fn is_new(&self, number: u64) -> bool {
         if number == u64::MAX {
             return false;

@@ -40,7 +40,7 @@ pub enum Heard<'o> {
 impl Presence {
     /// A question of a unit that has not started. The nonce is fresh.
     pub const fn new(identity: Identity, fleet: Fleet, epoch: Epoch, nonce: u64) -> Self {
-        // 0 stands for an answer to nobody.
+        // 0 stands for an announcement that answers no question.
         Self { identity, fleet, epoch, nonce: nonce | 1, sequence: 0 }
     }
 
@@ -83,7 +83,7 @@ impl Presence {
         }
     }
 
-    /// What this unit has said itself tells of nobody else, whoever says it again.
+    /// What this unit has said itself, repeated by another host, tells of no other unit.
     fn is_answer(&self, announce: &Announce) -> bool {
         announce.identity == self.identity && announce.nonce == self.nonce && announce.epoch != self.epoch
     }

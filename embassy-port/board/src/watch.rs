@@ -11,7 +11,7 @@ static HAD_TURN: AtomicBool = AtomicBool::new(false);
 
 /// Switches the motors on or off, and feeds the watchdog if the unit's task has had a turn since the last feeding.
 ///
-/// For a board's interrupt, each millisecond. `may_move` says whether somebody wants motion *now*: it reads a lease, and not
+/// For a board's interrupt, each millisecond. `may_move` says whether motion is wanted *now*: it reads a lease, and not
 /// the application's state.
 pub fn tick<B: Board>(may_move: bool) {
     B::motors(may_move);

@@ -24,7 +24,7 @@ pub enum Question {
     },
     /// Search now.
     Search,
-    /// Take a node that is not connected off the roster, until it joins again or the unit is started anew.
+    /// Take a node that is not connected off the roster, until it joins again or the unit is started again.
     Retire {
         /// `NAME`, `NAME/ID` or `#ID`.
         node: String,

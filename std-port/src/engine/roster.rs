@@ -12,7 +12,7 @@ use super::{Engine, write};
 use crate::keys::KeyRing;
 
 /// Most nodes of a plain manager that are expected beyond those that have a place: names cost nothing there, so that
-/// whoever joins with many would take up memory without end.
+/// a host that joins under many would take up memory without end.
 const MOST_ABSENT: usize = 4096;
 
 /// The nodes that are expected and have no place among those that have joined.

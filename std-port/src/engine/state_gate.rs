@@ -181,7 +181,7 @@ impl<T, W> StateGate<T, W> {
         ready
     }
 
-    /// Whether a call that was parked is to go on. Whoever gives up the state, or a turn, or begins to wait, asks.
+    /// Whether a call that was parked is to go on. Asked by a thread that gives up the state, or a turn, or begins to wait.
     pub(crate) fn has_ready(&self) -> bool {
         self.ready.load(Ordering::Acquire) > 0
     }
@@ -480,7 +480,7 @@ mod tests {
         assert!(gate.enter().is_ok(), "{here:?} and {there:?} have no turns any more");
     }
 
-    /// A mark that stayed would refuse the calls of a peer for whom nobody waits any more.
+    /// A mark that stayed would refuse the calls of a peer that no caller waits for any more.
     #[test]
     fn the_mark_of_whom_the_holder_waits_for_goes_with_the_wait() {
         let gate = StateGate::new(0);

@@ -126,7 +126,7 @@ impl<T: Send + 'static> Engine<T> {
         call
     }
 
-    /// Runs a call that was parked and has its turn, and the calls of a link that nobody has run yet.
+    /// Runs a call that was parked and has its turn, and the calls of a link that no thread has run yet.
     pub(super) fn serve_link(&self, token: u64, worker: &mut Worker) {
         worker.fit(self.call_bytes());
         self.serve_parked(worker);

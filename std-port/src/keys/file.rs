@@ -46,7 +46,7 @@ pub(super) fn form(path: &Path, FormError { line, what }: FormError) -> KeyError
     KeyError::Form { path: path.to_owned(), line, what }
 }
 
-/// The text of a file that belongs to this user, that nobody else can read, and that is as it was written.
+/// The text of a file that belongs to this user, that no other user can read, and that is as it was written.
 pub(super) fn read(path: &Path) -> Result<(Zeroizing<String>, Mark), KeyError> {
     let mut file = open(path)?;
     let found = file.metadata().map_err(|error| system(path, error))?;

@@ -15,7 +15,7 @@ pub struct LiveRing {
     /// None where the ring was made in this process.
     path: Option<PathBuf>,
     held: Mutex<Held>,
-    /// Held by whoever looks at the file: the ring itself is there meanwhile.
+    /// Held by the thread that looks at the file: the ring itself is there meanwhile.
     looking: Mutex<()>,
 }
 
@@ -81,7 +81,7 @@ impl LiveRing {
         let _looking = self.looking.lock().unwrap_or_else(PoisonError::into_inner);
         let mark = Mark::of(path).ok();
         let ring = self.ring();
-        // Whoever needs the ring does not wait for the file.
+        // A thread that needs the ring does not wait for the file.
         let found = (mark != self.mark()).then(|| read(path, &ring));
         let mut held = self.held.lock().unwrap_or_else(PoisonError::into_inner);
         let Some(found) = found else {

@@ -139,7 +139,7 @@ impl KeyRing {
         self.all().map(|generation| (generation.number, &generation.discovery))
     }
 
-    /// Whom it may talk to, in order. An m_unit's key for itself, with which it finds another one of its identity, is no
+    /// The nodes that it may talk to, in order. An m_unit's key for itself, with which it finds another one of its identity, is no
     /// peer's.
     pub fn peers(&self) -> Vec<&Identity> {
         let pairs = self.all().flat_map(|generation| &generation.pairs);

@@ -133,7 +133,7 @@ fn all_are_called_at_the_same_time() {
     );
 }
 
-/// Nobody is passed over in silence.
+/// No node is passed over in silence.
 #[test]
 fn a_call_of_all_tells_who_was_not_called() {
     let depot = Depot::new();
@@ -158,7 +158,7 @@ fn a_call_of_all_tells_who_was_not_called() {
         let ran = (!asynchronous).then(|| "Service".to_owned());
         assert_eq!(told, [(0, Some("NotConnected".into())), (1, Some("UnknownFunction".into())), (2, ran)]);
     }
-    // Also where nobody offers it; what is retired is not missed.
+    // Also where no node offers it; what is retired is not missed.
     assert!(peer(0).retire());
     let answers = ask(&mut client, Question::Call(call(None, "fly", vec![]))).unwrap();
     assert_eq!(answers.len(), 2, "{answers:?}");

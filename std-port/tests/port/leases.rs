@@ -153,8 +153,8 @@ fn the_loss_of_the_manager_is_told_to_the_hook_once() {
     assert_eq!(lost.load(Ordering::SeqCst), 1);
 }
 
-/// The manager's process is gone without a goodbye: see `processes.rs` for the same with a kill. Here somebody holds the
-/// state when the lease ends: the hook waits for nobody, and what needs the state comes when it is free.
+/// The manager's process is gone without a goodbye: see `processes.rs` for the same with a kill. Here a handler holds the
+/// state when the lease ends: the hook does not wait, and what needs the state comes when it is free.
 #[test]
 fn a_hook_waits_for_nobody_who_holds_the_state() {
     let vehicle = vehicle();

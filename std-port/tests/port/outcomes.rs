@@ -48,7 +48,7 @@ fn a_request_to_all_has_an_outcome_for_each() {
     }
 }
 
-/// Nobody is passed over in silence: who is away or has no such function has an outcome too, until it is retired.
+/// No node is passed over in silence: one that is away or has no such function has an outcome too, until it is retired.
 #[test]
 fn a_request_to_all_tells_who_is_missing() {
     let (manager, units) = fleet_with_one_that_fails(4);

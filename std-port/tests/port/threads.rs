@@ -72,7 +72,7 @@ fn sixty_four_callers_have_a_link_each() {
     });
 }
 
-/// Calls of one thread in one class take the state in the order in which they were made, whoever reads and runs them.
+/// Calls of one thread in one class take the state in the order in which they were made, whichever threads read and run them.
 #[test]
 fn calls_of_a_class_take_the_state_in_order() {
     let fleet = fleet();

@@ -5,7 +5,7 @@
 //! - [`ground`]: the keys of a fleet, and those that an attacker may have instead;
 //! - [`target`]: what is attacked; [`linux`] has units of the Linux port;
 //! - [`links`]: the attacks on links; they know of a target only what [`target::Target`] tells;
-//! - [`between`]: somebody between two genuine ends; [`discovery`], [`kept_away`], [`floods`] and [`permission`]: the other
+//! - [`between`]: an attacker between two genuine ends; [`discovery`], [`kept_away`], [`floods`] and [`permission`]: the other
 //!   attacks;
 //! - [`tally`]: attempts, successes, and the counters that tell of them.
 

@@ -88,7 +88,7 @@ impl Hints {
         Some((hint.from, hint.who.clone()))
     }
 
-    /// Somebody is there: what leads to it later begins anew.
+    /// The node is there: later hints at it begin from the start.
     pub(super) fn forget(&mut self, who: &Identity) {
         self.list.retain(|hint| hint.who != *who);
     }
@@ -100,7 +100,7 @@ fn is_same_host(one: SocketAddr, other: SocketAddr) -> bool {
 }
 
 /// Which hosts' questions have counted a short while ago: what anybody can send again puts this unit's own question off
-/// once, and not for as long as somebody likes.
+/// once, and not for as long as the sender likes.
 #[derive(Clone, Debug)]
 pub(super) struct Hosts {
     seed: u32,
@@ -177,7 +177,7 @@ impl<S: Storage> Node<S> {
         true
     }
 
-    /// Asks one node alone. It answers whoever asks so, and at once.
+    /// Asks one node alone, which answers at once.
     fn ask(&mut self, to: SocketAddr, who: &Identity, mailman: &mut impl Mailman, authenticator: &impl Authenticator) {
         let Ok(wanted) = Manager::new(who.name(), who.id()) else { return };
         let sent = self.say_who_has(Some(wanted), 0, authenticator, |datagram| mailman.send_to(to, datagram));

@@ -285,7 +285,7 @@ impl<S: Storage> Node<S> {
         }
     }
 
-    /// Whether somebody's question may put this unit's own off. One that asks a single node says nothing to others.
+    /// Whether another unit's question may put this unit's own off. One that asks a single node says nothing to others.
     fn heeds(&mut self, now: Instant, from: SocketAddr, who_has: &WhoHas) -> bool {
         let heeded = who_has.expected > 0 && self.hosts.heeds(now, from);
         if heeded {

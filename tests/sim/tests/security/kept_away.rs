@@ -165,7 +165,7 @@ fn join(said: &[Vec<u8>], a_second: u64, quietly: bool, life: u64) -> Option<Dur
     ground.joined.map(|joined| joined.since(start))
 }
 
-/// Nothing of what somebody without the pair's key repeats or makes up keeps a vehicle from its manager.
+/// Nothing of what an attacker without the pair's key repeats or makes up keeps a vehicle from its manager.
 #[test]
 fn a_starting_vehicle_joins_whatever_is_recorded_or_forged() {
     println!("| attack | a second | median | worst of {STARTS} |\n|---|---|---|---|");
