@@ -170,7 +170,8 @@ impl Forger {
 pub fn run(report: &mut Report, linux: &Linux, manager: &LinuxManager<'_>, extent: Extent) -> Result<()> {
     spoof(report, linux, manager, extent)?;
     relayed(report, &alone(linux)?, extent)?;
-    kept_away::run(report, linux.weakness, extent)
+    let starts = if extent == Extent::Full { 6 } else { 1 };
+    kept_away::run(report, linux.weakness, starts, &[20, 100])
 }
 
 /// A fleet whose manager is not there, so that its vehicles ask.

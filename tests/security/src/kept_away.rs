@@ -13,8 +13,7 @@ use cara_std::sys::datagram::{Datagrams, Socket};
 
 use crate::discovery::Lent;
 use crate::ground::{agv, depot};
-use crate::links::Extent;
-use crate::linux::{Linux, named, wait_for};
+use crate::linux::{Linux, Weakness, named, wait_for};
 use crate::speaker::PATIENCE;
 use crate::tally::{Report, Row};
 
@@ -32,29 +31,31 @@ struct Attack {
     _silent: Vec<TcpListener>,
 }
 
-/// Each attack at each rate, against vehicles that start one after the other.
-pub fn run(report: &mut Report, weakness: crate::linux::Weakness, extent: Extent) -> Result<()> {
-    let linux = Linux::new(64, weakness)?;
+/// Each attack at each rate, so many times a second, against vehicles that start one after the other.
+pub fn run(report: &mut Report, weakness: Weakness, starts: u32, rates: &[u64]) -> Result<()> {
+    // The vehicles of all attacks, and the one that is recorded.
+    let vehicles = OTHER + starts * 3 * rates.len() as u32;
+    let linux = Linux::new(vehicles, weakness)?;
     let socket = Datagrams::open(Interfaces::Loopback, linux.port)?;
     let attacks = [earlier_lives(&linux, &socket)?, another_vehicle(&linux, &socket)?, forged(&linux)?];
     let _manager = linux.manager()?;
-    let starts = if extent == Extent::Full { 6 } else { 1 };
     let mut vehicle = OTHER;
     for attack in &attacks {
-        for a_second in [20, 100] {
-            let (mut worst, mut noticed) = (Duration::ZERO, Vec::new());
+        for a_second in rates {
+            let (mut took, mut noticed) = (Vec::new(), Vec::new());
             let (sent, mut out) = (AtomicU64::new(0), 0);
             for _ in 0..starts {
                 vehicle += 1;
-                let (joined, counted) = start(&linux, &socket, attack, a_second, vehicle, &sent)?;
-                worst = worst.max(joined.unwrap_or(PATIENCE));
+                let (joined, counted) = start(&linux, &socket, attack, *a_second, vehicle, &sent)?;
+                took.push(joined.unwrap_or(PATIENCE).as_millis());
                 out += u64::from(joined.is_none());
                 noticed.extend(counted);
             }
             noticed.sort();
             noticed.dedup();
-            let worst = worst.as_millis();
-            println!("{}, {a_second} a second: of {starts} vehicles the last joined after {worst} ms", attack.name);
+            took.sort_unstable();
+            let (median, worst) = (took.get(took.len() / 2).unwrap_or(&0), took.last().unwrap_or(&0));
+            println!("{}, {a_second} a second: {starts} vehicles joined, ms: {median} / {worst}", attack.name);
             let (attack, target) = (format!("{}, {a_second} a second", attack.name), "Linux s_unit".to_owned());
             let attempts = sent.into_inner();
             report.add(Row { attack, target, attempts, successes: out, noticed, control: false });

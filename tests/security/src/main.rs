@@ -8,7 +8,7 @@ use cara_security::between::Middle;
 use cara_security::links::{self, Extent};
 use cara_security::linux::{Linux, LinuxVehicles, Weakness};
 use cara_security::tally::Report;
-use cara_security::{discovery, floods, permission, tally};
+use cara_security::{discovery, floods, kept_away, permission, tally};
 use clap::Parser;
 
 /// More than attempts of any attack: two vehicles of one name at the same time would be told apart by their manager.
@@ -23,6 +23,9 @@ struct Arguments {
     /// Only the parts whose names contain this: links, between, permission, discovery, floods.
     #[arg(long, default_value = "")]
     only: String,
+    /// Only vehicles that start beside recorded and forged discovery: so many for each attack and rate.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000))]
+    starts: Option<u32>,
     /// What the simulator's attackers have printed: their figures stand first in the table.
     #[arg(long, value_name = "FILE")]
     simulator: Option<PathBuf>,
@@ -42,6 +45,11 @@ fn main() -> ExitCode {
 }
 
 fn run(arguments: &Arguments) -> Result<ExitCode> {
+    if let Some(starts) = arguments.starts {
+        let mut report = Report::default();
+        kept_away::run(&mut report, Weakness::None, starts, &[1, 4, 20, 100])?;
+        return told(&report, arguments);
+    }
     let extent = if arguments.quick { Extent::Quick } else { Extent::Full };
     let linux = Linux::new(VEHICLES, Weakness::None)?;
     let mut report = Report::default();
@@ -71,6 +79,11 @@ fn run(arguments: &Arguments) -> Result<ExitCode> {
     for path in &arguments.with {
         report.rows.extend(Report::read(path)?.rows);
     }
+    told(&report, arguments)
+}
+
+/// The table, the figures for a file, and what came to something.
+fn told(report: &Report, arguments: &Arguments) -> Result<ExitCode> {
     println!("{report}");
     if let Some(path) = &arguments.json {
         report.write(path)?;
