@@ -29,6 +29,12 @@ impl Storage for Boxed {
     type Slice<T: 'static> = std::boxed::Box<[T]>;
 }
 
+/// Takes an element out of a list, the last one into its place. The list's own method panics for an index that is not inside.
+#[inline]
+pub(crate) fn take_at<T, const N: usize>(list: &mut heapless::Vec<T, N>, index: usize) -> Option<T> {
+    (index < list.len()).then(|| list.swap_remove(index))
+}
+
 /// A buffer for one whole message, taken from a [`Buffers`] pool and given back to it.
 pub type Buffer<S> = <S as Storage>::Slice<u8>;
 

@@ -8,7 +8,7 @@ use crate::bytes;
 use crate::config::{EMERGENCY_BYTES, Priority, WINDOW};
 use crate::distribution::function_list::{Generation, Slot};
 use crate::error::{Error, Limit};
-use crate::storage::{Buffer, Buffers, Storage};
+use crate::storage::{Buffer, Buffers, Storage, take_at};
 use crate::time::{Duration, Instant};
 
 /// Which ids of one class have been seen. Serves the stream and datagrams alike.
@@ -188,9 +188,10 @@ impl<S: Storage> Calls<S> {
     fn keep_out(&mut self, class: Priority, id: u32) {
         let known = self.unwanted.contains(&(id, class));
         if !known && self.unwanted.push((id, class)).is_err() {
-            let oldest = self.unwanted.iter().enumerate().min_by_key(|(_, (id, _))| *id).map_or(0, |(index, _)| index);
-            let (oldest, its_class) = self.unwanted.swap_remove(oldest);
-            self.note(its_class, oldest);
+            let oldest = self.unwanted.iter().enumerate().min_by_key(|(_, (id, _))| *id).map(|(index, _)| index);
+            if let Some((oldest, its_class)) = oldest.and_then(|index| take_at(&mut self.unwanted, index)) {
+                self.note(its_class, oldest);
+            }
             let _ = self.unwanted.push((id, class));
         }
     }

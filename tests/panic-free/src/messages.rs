@@ -25,6 +25,7 @@ entry!(messages_written, {
     keep((message::encode_reply(*unknown(), *unknown()), message::encode_failure(*unknown(), *unknown())));
     keep(unknown::<Control<'static>>().encode(unknown_slice()));
     keep((SessionBody::keep_alive(*unknown()), SessionBody::renewal(unknown())));
+    keep((SessionBody::release(unknown()), SessionBody::release_all(*unknown(), *unknown())));
     keep(SessionBody::message_prefix(*unknown()));
 });
 

@@ -5,6 +5,7 @@ use cara_core::distribution::connection_handler::{Known, Node, NodeConfig, NodeC
 use cara_core::distribution::datagram::{self, Announce, Datagram, WhoHas};
 use cara_core::distribution::hello::Manager;
 use cara_core::distribution::identity::Identity;
+use cara_core::distribution::presence::Presence;
 use cara_core::storage::Lent;
 use core::mem::MaybeUninit;
 
@@ -96,4 +97,10 @@ entry!(datagrams, {
     keep(unknown::<WhoHas>().encode(*unknown(), &AnyCodes, unknown_slice()));
     keep(unknown::<Announce>().encode(*unknown(), &AnyCodes, unknown::<Option<Identity>>().as_ref(), unknown_slice()));
     keep(datagram::short_hash(identity()));
+});
+
+entry!(presence, {
+    let presence = unknown::<Presence>();
+    keep(presence.question(&AnyCodes, unknown()));
+    keep(presence.hear(*unknown(), unknown_slice(), &AnyCodes, unknown()));
 });

@@ -11,7 +11,7 @@ use cara_core::services::lease::{Lease, Service};
 use cara_core::services::publications::Publications;
 use cara_core::services::requests::Requests;
 use cara_core::services::unit::{self, Event, ReplyBlock, Session, SessionConfig, SessionStorage};
-use cara_core::services::{Context, Ticket};
+use cara_core::services::{Context, slots_for};
 use cara_core::storage::{Lent, Pool};
 
 use crate::host::AnyMailman;
@@ -135,7 +135,7 @@ entry!(session_requests, {
 
 entry!(session_serves, {
     keep(session().next_call(context(), parameters()));
-    keep(session().has_next_emergency());
+    keep((session().has_next_emergency(), session().next_emergency(context(), parameters())));
     keep(session().answer(context(), *unknown(), Ok(parameters())));
     keep(session().answer(context(), *unknown(), Err(*unknown())));
     session().drop_answer(*unknown());
@@ -144,6 +144,10 @@ entry!(session_serves, {
 entry!(session_publishes, {
     keep(session().publish(context(), unknown_slice().iter().copied()));
     keep(session().withdraw(context(), *unknown()));
+});
+
+entry!(call_slots, {
+    keep(slots_for(*unknown()));
 });
 
 entry!(session_leases, {

@@ -3,10 +3,11 @@
 use cara_core::distribution::function::Definition;
 use cara_core::distribution::function_list::{FunctionList, TheirFunctionList};
 use cara_core::distribution::identity::Identity;
+use cara_core::distribution::name::{Shown, is_hidden};
 use cara_core::error::Error;
 use cara_core::storage::Lent;
 
-use crate::linkage::{show, unknown};
+use crate::linkage::{keep, show, unknown, unknown_text};
 
 entry!(shown_errors, {
     show(unknown::<Error>());
@@ -19,6 +20,11 @@ entry!(shown_definitions, {
 entry!(shown_lists, {
     show(unknown::<FunctionList<Lent, u32>>().show_functions());
     show(unknown::<TheirFunctionList<Lent>>().show_functions());
+});
+
+entry!(shown_names, {
+    show(Shown(unknown_text()));
+    keep(is_hidden(*unknown()));
 });
 
 entry!(shown_identities, {

@@ -13,7 +13,7 @@ use crate::host::secure::Secure;
 use crate::services::Context;
 use crate::services::calls::CallHead;
 use crate::services::lease::{Granted, Lease, LeaseEnd, Order, Service};
-use crate::storage::{Buffers, Storage};
+use crate::storage::{Buffers, Storage, take_at};
 use crate::time::{Duration, Instant};
 
 /// Ends of leases that the peer is still to be told. One that finds no place is told when the peer renews it.
@@ -111,8 +111,8 @@ impl<S: Storage, C: Secure> Session<S, C> {
 
     /// The application has finished what calls of the leased function started: no renewal keeps it alive, no hook runs.
     pub fn end_lease<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>, slot: Slot) {
-        if let Some(index) = self.granted.iter().position(|granted| granted.slot == slot) {
-            let granted = self.granted.swap_remove(index);
+        let index = self.granted.iter().position(|granted| granted.slot == slot);
+        if let Some(granted) = index.and_then(|index| take_at(&mut self.granted, index)) {
             end_service_lease(cx, &granted);
             self.tell_end(cx, granted.call, LeaseEnd::Finished);
         }
@@ -171,8 +171,8 @@ impl<S: Storage, C: Secure> Session<S, C> {
         cx: &mut Context<'_, S, M, B, H>,
         is_released: impl Fn(&Granted) -> bool,
     ) -> Outcome {
-        let Some(index) = self.granted.iter().position(is_released) else { return Outcome::Nothing };
-        let granted = self.granted.swap_remove(index);
+        let index = self.granted.iter().position(is_released);
+        let Some(granted) = index.and_then(|index| take_at(&mut self.granted, index)) else { return Outcome::Nothing };
         if end_service_lease(cx, &granted) { Event::LeaseExpired(granted.slot).into() } else { Outcome::Nothing }
     }
 
@@ -181,8 +181,10 @@ impl<S: Storage, C: Secure> Session<S, C> {
         &mut self,
         cx: &mut Context<'_, S, M, B, H>,
     ) -> Option<Slot> {
-        while let Some(index) = self.granted.iter().position(|granted| granted.end <= cx.now) {
-            let granted = self.granted.swap_remove(index);
+        let now = cx.now;
+        let due = |granted: &Granted| granted.end <= now;
+        while let Some(granted) = self.granted.iter().position(due).and_then(|index| take_at(&mut self.granted, index))
+        {
             if end_service_lease(cx, &granted) {
                 self.link.counters.add(LinkCounter::LeasesExpired, 1);
                 self.tell_end(cx, granted.call, LeaseEnd::Expired);
@@ -207,10 +209,10 @@ impl<S: Storage, C: Secure> Session<S, C> {
 
     /// Tells the peer of ends that there was no room for.
     pub(super) fn send_ends<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
-        while let Some(&(call, why)) = self.ends.first()
+        while let Some(&(call, why)) = self.ends.last()
             && self.send_control(cx, &Control::LeaseEnded { call, why })
         {
-            self.ends.remove(0);
+            self.ends.pop();
         }
     }
 }

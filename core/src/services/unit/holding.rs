@@ -12,7 +12,7 @@ use crate::host::secure::Secure;
 use crate::services::Context;
 use crate::services::lease::{Held, Service};
 use crate::services::requests::{CallId, Pending};
-use crate::storage::{Buffers, Storage};
+use crate::storage::{Buffers, Storage, take_at};
 use crate::time::{Duration, Instant};
 
 /// A held lease is renewed this often within its length, so that lost renewals do not end it.
@@ -52,7 +52,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         if self.held.is_full()
             && let Some(oldest) = self.oldest_held(header.slot)
         {
-            self.held.swap_remove(oldest);
+            take_at(&mut self.held, oldest);
         }
         let every = lease.divided_by(RENEWALS_PER_LEASE);
         let (call, slot, next) = (CallId(header.id), header.slot, cx.now + every);
@@ -81,7 +81,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     /// The peer has ended the lease of a call.
     pub(super) fn forget_held(&mut self, call: CallId) -> Option<Held> {
         let index = self.held.iter().position(|held| held.call == call && !held.is_released)?;
-        Some(self.held.swap_remove(index))
+        take_at(&mut self.held, index)
     }
 
     /// The caller gives a call up: its reply, should it still come, counts as late, and the lease that it holds, or would
