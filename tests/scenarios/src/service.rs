@@ -28,6 +28,7 @@ pub struct Service {
     pub(crate) calls_back: Option<String>,
     pub(crate) priority: Priority,
     pub(crate) lease: Option<Duration>,
+    pub(crate) in_turns: bool,
     diary: Arc<Diary>,
 }
 
@@ -42,6 +43,7 @@ impl Service {
             calls_back: None,
             priority: Priority::Normal,
             lease: None,
+            in_turns: false,
             diary: Arc::new(Diary::default()),
         }
     }
@@ -78,6 +80,12 @@ impl Service {
     /// What it starts may go on only this long after the last renewal; then its safe hook notes the stop.
     pub fn lease(self, length: Duration) -> Self {
         Self { lease: Some(length), ..self }
+    }
+
+    /// Its calls take the application's state, and so run one after the other, in the order in which they began. The handlers of
+    /// other services run side by side where a unit has threads.
+    pub fn in_turns(self) -> Self {
+        Self { in_turns: true, ..self }
     }
 
     /// Whether its handler waits for anything, so that one that must not wait cannot serve it.

@@ -349,16 +349,26 @@ impl LinuxNode {
             options = options.lease(length, move || diary.stop(since(start)));
         }
         let (kept, node) = (service.clone(), Arc::downgrade(self));
-        let handler = move |call: &Call, parameters: &mut ParametersView| serve(&kept, &node, call, parameters);
+        let in_turns = service.in_turns;
+        let free = move |call: &Call, parameters: &mut ParametersView| serve(&kept, &node, call, parameters);
         let machine = self.machine()?;
         let list = machine.functions();
-        let watch = match (list, replace) {
-            (list, true) => list.replace(&definition, options, handler),
-            (list, false) => list.add_service(&definition, options, handler),
+        let watch = match (in_turns, replace) {
+            (true, true) => list.replace(&definition, options, with_state(free)),
+            (true, false) => list.add_service(&definition, options, with_state(free)),
+            (false, true) => list.replace(&definition, options, free),
+            (false, false) => list.add_service(&definition, options, free),
         }?;
         lock(&self.leases).insert(service.name().to_owned(), watch);
         Ok(())
     }
+}
+
+/// The form of a handler that takes the application's state.
+fn with_state(
+    free: impl Fn(&Call, &mut ParametersView) -> Result<(), ServiceError>,
+) -> impl Fn(&mut (), &Call, &mut ParametersView) -> Result<(), ServiceError> {
+    move |(), call, parameters| free(call, parameters)
 }
 
 fn serve(

@@ -58,7 +58,7 @@ fn an_emergency_travels_twice_and_runs_once(world: &mut dyn World) {
 }
 
 fn calls_run_in_the_order_of_asking(world: &mut dyn World) {
-    let service = Service::numbered("note");
+    let service = Service::numbered("note").in_turns();
     let (manager, _agv) = pair(world, &service);
     let options = RequestOptions { timeout: Some(secs(30)), ..RequestOptions::default() };
     let mut accepted = Vec::new();

@@ -25,6 +25,7 @@ fn ran(world: &mut dyn World, classes: [Option<Priority>; 3]) -> Vec<i64> {
         diary.note(parameters.variable::<i64>("n").map_err(|_| ServiceError::BadResults)?);
         Ok(())
     });
+    let service = service.in_turns();
     let manager = world.add(Spec::manager("manager", 1));
     let agv = Spec::agv("agv", 7).service(&service).limits(|limits| {
         limits.calls_per_peer = 60;
