@@ -55,7 +55,8 @@ pub fn run(report: &mut Report, weakness: Weakness, starts: u32, rates: &[u64]) 
             noticed.dedup();
             took.sort_unstable();
             let (median, worst) = (took.get(took.len() / 2).unwrap_or(&0), took.last().unwrap_or(&0));
-            println!("{}, {a_second} a second: {starts} vehicles joined, ms: {median} / {worst}", attack.name);
+            let joined = u64::from(starts) - out;
+            println!("{}, {a_second} a second: {joined} of {starts} joined, ms: {median} / {worst}", attack.name);
             let (attack, target) = (format!("{}, {a_second} a second", attack.name), "Linux s_unit".to_owned());
             let attempts = sent.into_inner();
             report.add(Row { attack, target, attempts, successes: out, noticed, control: false });
