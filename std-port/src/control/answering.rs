@@ -16,6 +16,10 @@ use crate::{CommunicationSystem, Identity, Peer};
 /// Where answers go; `Break` when nobody reads them any more.
 pub(super) type Sink<'s> = &'s mut dyn FnMut(Answer) -> ControlFlow<()>;
 
+/// Whether the client is still there; where a span is given, also whether it has sent a [`BEAT`](super::protocol::BEAT)
+/// within that span.
+pub(super) type Lives<'l> = &'l dyn Fn(Option<std::time::Duration>) -> bool;
+
 /// Events that wait to be written before some are lost.
 const EVENTS: usize = 1024;
 /// Bytes of metrics in one answer.
@@ -53,18 +57,18 @@ pub fn execute<T: Send + 'static>(
     question: &Question,
     answer: &mut dyn FnMut(Answer) -> ControlFlow<()>,
 ) {
-    execute_while(system, question, answer, &|| true);
+    execute_for(system, question, answer, &|_| true);
 }
 
-/// As [`execute`]; a call or a watch ends as well when `wanted` says no.
-pub(super) fn execute_while<T: Send + 'static>(
+/// As [`execute`]; a call or a watch ends as well when the client has gone.
+pub(super) fn execute_for<T: Send + 'static>(
     system: &CommunicationSystem<T>,
     question: &Question,
     sink: Sink<'_>,
-    wanted: &dyn Fn() -> bool,
+    lives: Lives<'_>,
 ) {
     // Whoever is gone does not hear it.
-    let _ = match attempt(system, question, sink, wanted) {
+    let _ = match attempt(system, question, sink, lives) {
         Ok(()) => sink(Answer::Done),
         Err(End::Failed(failure)) => sink(Answer::Failed(failure)),
         Err(End::Gone) => ControlFlow::Break(()),
@@ -75,8 +79,9 @@ fn attempt<T: Send + 'static>(
     system: &CommunicationSystem<T>,
     question: &Question,
     sink: Sink<'_>,
-    wanted: &dyn Fn() -> bool,
+    lives: Lives<'_>,
 ) -> Result<(), End> {
+    let wanted = &|| lives(None);
     match question {
         Question::Unit => send(sink, Answer::Unit(describe::unit(system))),
         Question::Nodes { offering } => nodes(system, offering.as_deref(), sink),
@@ -97,7 +102,7 @@ fn attempt<T: Send + 'static>(
         }
         Question::Hold(question) => {
             permit(system, &question.function, Verb::Call)?;
-            hold::hold(system, question, sink, wanted)
+            hold::hold(system, question, sink, lives)
         }
         Question::Publish { node, timeout_ms } => {
             let own = system.my_function_list().names();
@@ -116,7 +121,7 @@ fn attempt<T: Send + 'static>(
             call::ping(system, node, times, sink)
         }
         Question::Bench { call, count, pause_us } => {
-            call::bench(system, call, (*count, Duration::from_micros(*pause_us)), sink)
+            call::bench(system, call, (*count, Duration::from_micros(*pause_us)), sink, lives)
         }
     }
 }

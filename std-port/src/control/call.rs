@@ -8,7 +8,8 @@ use cara_core::error::{Cause, Error};
 use cara_core::services::access::Verb;
 use cara_core::time::Duration;
 
-use super::answering::{End, LOOK, Sink, pause, permit, send};
+use super::answering::{End, LOOK, Lives, Sink, pause, permit, send};
+use super::hold::{lease_of, unattended};
 use super::protocol::{Answer, Argument, CallQuestion, Failure};
 use super::{describe, select, values};
 use crate::communication_system::thread_waker;
@@ -262,12 +263,13 @@ fn block_all<T: Send + 'static>(
     }
 }
 
-/// Calls again and again, and tells how long each took.
+/// Calls again and again, and tells how long each took. Each call begins a lease again, so that it takes a client that lives.
 pub(super) fn bench<T: Send + 'static>(
     system: &CommunicationSystem<T>,
     question: &CallQuestion,
     (count, between): (u32, Duration),
     sink: Sink<'_>,
+    lives: Lives<'_>,
 ) -> Result<(), End> {
     let Some(node) = &question.node else {
         return Err(Failure::configuration("BadQuestion", "name the node whose round trips are measured").into());
@@ -275,6 +277,7 @@ pub(super) fn bench<T: Send + 'static>(
     let options = RequestOptions { delivery: Delivery::Reliable, ..options(question)? };
     let peer = select::node(system, node)?;
     let prepared = prepare(&peer, question)?;
+    let lease = lease_of(&peer, &question.function);
     let mut parameters =
         values::parameters(&question.arguments, values::bytes_of(prepared.function.definition.signature().results())?)?;
     for number in 0..count {
@@ -282,6 +285,12 @@ pub(super) fn bench<T: Send + 'static>(
             pause(system, between)?;
         }
         permit(system, &question.function, Verb::Call)?;
+        if !lives(None) {
+            return Err(End::Gone);
+        }
+        if !lives(lease) {
+            return Err(unattended(&question.function).into());
+        }
         parameters.copy_from(&prepared.parameters)?;
         let started = Instant::now();
         let outcome = peer.block_request_with(&question.function, &mut parameters, &options);

@@ -1,14 +1,16 @@
 //! The other end: finds the socket of a running unit, asks, and reads the answers.
 
 use std::io::{self, Write};
+use std::os::fd::AsFd;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use super::lines::{Line, Lines};
 use super::place::{self, PlaceError, directory, own_uid, peer_uid};
-use super::protocol::{Answer, CONTROL_VERSION, Failure, Question};
+use super::protocol::{Answer, BEAT, CONTROL_VERSION, Failure, Question};
 use super::server::FULL;
+use crate::sys::epoll::wait_readable;
 
 /// How long a unit may take to introduce itself.
 const HELLO_TIMEOUT: Duration = Duration::from_secs(2);
@@ -202,6 +204,8 @@ pub struct Client {
     unit: RunningUnit,
     /// Answers to the last question may still come.
     open: bool,
+    /// When the last sign of life was sent, for a question that needs them.
+    beaten: Option<Instant>,
 }
 
 impl Client {
@@ -218,7 +222,7 @@ impl Client {
         let (unit, fleet) = hello(&mut lines).map_err(|error| refused(path, error))?;
         lines.source().set_read_timeout(None)?;
         let unit = RunningUnit { unit, fleet, path: path.to_owned(), state: UnitState::Answers };
-        Ok(Self { lines, unit, open: false })
+        Ok(Self { lines, unit, open: false, beaten: None })
     }
 
     /// Connects to the only unit that runs, or to the one that is meant by `NAME/ID` or `NAME`.
@@ -246,6 +250,9 @@ impl Client {
 
     /// Asks. What has not been read of the answers to the question before is passed over, which for
     /// [`Question::Watch`] never ends: drop the client instead.
+    ///
+    /// [`Question::Hold`] and [`Question::Bench`] need signs of life, which the iterator sends while it waits for the next
+    /// answer: a program that does not go on reading loses what it holds.
     pub fn ask(&mut self, question: &Question) -> Result<Answers<'_>, ControlError> {
         while self.open {
             match self.next_answer() {
@@ -257,10 +264,28 @@ impl Client {
         line.push(b'\n');
         self.lines.source().write_all(&line)?;
         self.open = true;
+        self.beaten = question.needs_beats().then(Instant::now);
         Ok(Answers { client: self })
     }
 
+    /// Sends a sign of life as often as one is due until something has come.
+    fn beat_until_answered(&mut self) {
+        while let Some(beaten) = self.beaten
+            && !self.lines.has_more()
+        {
+            let left = BEAT.saturating_sub(beaten.elapsed());
+            if left.is_zero() {
+                // What is wrong with the connection is told when it is read.
+                let _ = self.lines.source().write_all(b"\n");
+                self.beaten = Some(Instant::now());
+            } else if wait_readable(self.lines.source().as_fd(), left.into()).unwrap_or(true) {
+                return;
+            }
+        }
+    }
+
     fn next_answer(&mut self) -> Result<Option<Answer>, ControlError> {
+        self.beat_until_answered();
         let answer = read(&mut self.lines);
         self.open = matches!(answer, Ok(ref answer) if !matches!(answer, Answer::Done | Answer::Failed(_)));
         match answer? {

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use cara_core::services::access::Verb;
 use cara_core::services::lease::LeaseEnd;
 
-use super::answering::{End, LOOK, Sink, send};
+use super::answering::{End, LOOK, Lives, Sink, send};
 use super::call::{await_one, called, options};
 use super::protocol::{Answer, CallQuestion, Failure};
 use super::select;
@@ -18,26 +18,31 @@ const EVENTS: usize = 1024;
 /// So long the event of a lease's end may be on its way.
 const PATIENCE: Duration = Duration::from_secs(1);
 
-/// Calls one node, keeps the lease until what was started has ended there, and gives it up when `wanted` says no.
+/// Calls one node, keeps the lease until what was started has ended there, and gives it up when the client has gone, or has
+/// given no sign of life for the length of the lease.
 pub(super) fn hold<T: Send + 'static>(
     system: &CommunicationSystem<T>,
     question: &CallQuestion,
     sink: Sink<'_>,
-    wanted: &dyn Fn() -> bool,
+    lives: Lives<'_>,
 ) -> Result<(), End> {
     let peer = held_node(system, question)?;
+    let lease = lease_of(&peer, &question.function);
     let options = RequestOptions { renew_lease: true, ..options(question)? };
     // Before the call: it may be finished before it is answered.
     let events = system.events_with_losses(EVENTS).0;
-    let is_wanted = || wanted() && !system.is_stopped();
+    let is_wanted = || lives(lease) && !system.is_stopped();
+    let gone = || if lives(None) && !system.is_stopped() { unattended(&question.function).into() } else { End::Gone };
     let started = Instant::now();
-    let mut held = match await_one(&peer, question, &options, &is_wanted)? {
-        Ok((outcome, call)) => {
+    let mut held = match await_one(&peer, question, &options, &is_wanted) {
+        Err(End::Gone) => return Err(gone()),
+        Err(end) => return Err(end),
+        Ok(Ok((outcome, call))) => {
             let held = Held { peer: &peer, call, lost: None };
             send(sink, called(&peer, Ok(outcome), started))?;
             held
         }
-        Err(failure) => return send(sink, called(&peer, Err(failure), started)),
+        Ok(Err(failure)) => return send(sink, called(&peer, Err(failure), started)),
     };
     loop {
         // The table may have changed since.
@@ -46,7 +51,7 @@ pub(super) fn hold<T: Send + 'static>(
         }
         // Before each event: however many there are, a client that has gone away holds nothing any more.
         if !is_wanted() {
-            return Err(End::Gone);
+            return Err(gone());
         }
         let end = match events.recv_timeout(LOOK) {
             Ok(event) => held.end(&event),
@@ -76,12 +81,22 @@ fn held_node<T: Send + 'static>(system: &CommunicationSystem<T>, question: &Call
         ));
     }
     let peer = select::node(system, node)?;
-    let leased = peer.function(&question.function).is_none_or(|function| function.attributes.lease.is_some());
-    if !leased {
+    if peer.function(&question.function).is_some() && lease_of(&peer, &question.function).is_none() {
         let text = format!("'{}' has no lease that could be kept: call it without", question.function);
         return Err(Failure::configuration("NoLease", text));
     }
     Ok(peer)
+}
+
+/// The length of a function's lease.
+pub(super) fn lease_of<T: Send + 'static>(peer: &Peer<T>, function: &str) -> Option<Duration> {
+    Some(peer.function(function)?.attributes.lease?.into())
+}
+
+pub(super) fn unattended(function: &str) -> Failure {
+    let text =
+        format!("the client gave no sign of life for the length of the lease of '{function}', which was given up");
+    Failure::resource("Unattended", text)
 }
 
 /// A lease that is kept; given up when it goes, however that comes.

@@ -31,6 +31,18 @@ impl<R: Read> Lines<R> {
         self.reader.get_ref()
     }
 
+    /// Whether something has been read that is in no line yet.
+    pub(super) fn has_more(&self) -> bool {
+        !self.reader.buffer().is_empty()
+    }
+
+    /// Passes over the empty lines that come next; whether there were any. It waits where nothing has come.
+    pub(super) fn skip_empty(&mut self) -> Result<bool> {
+        let empty = self.reader.fill_buf()?.iter().take_while(|&&byte| byte == b'\n').count();
+        self.reader.consume(empty);
+        Ok(empty > 0)
+    }
+
     /// The next line; `None` at the end. What stands behind the last end of a line is no line.
     pub(super) fn next(&mut self) -> Result<Option<Line<'_>>> {
         self.line.clear();
@@ -71,6 +83,15 @@ mod tests {
             assert_eq!(lines.next().unwrap(), Some(Line::Text(expected.as_bytes())));
         }
         assert_eq!(lines.next().unwrap(), None);
+    }
+
+    #[test]
+    fn empty_lines_are_passed_over_up_to_the_next_line() {
+        let mut lines = Lines::new(&b"\n\n\none\n\n"[..]);
+        assert!(!lines.has_more() && lines.skip_empty().unwrap() && !lines.skip_empty().unwrap());
+        assert!(lines.has_more());
+        assert_eq!(lines.next().unwrap(), Some(Line::Text(b"one")));
+        assert!(lines.skip_empty().unwrap() && !lines.has_more() && !lines.skip_empty().unwrap());
     }
 
     #[test]

@@ -1,12 +1,16 @@
 //! What travels over the control socket: one JSON object a line. Each [`Question`] is answered by any number of
 //! [`Answer`]s, of which the last one is [`Answer::Done`] or [`Answer::Failed`]. A line that is no question is answered
-//! with `Failed`, and the next line is read.
+//! with `Failed`, and the next line is read. An empty line is a [`BEAT`] and not answered.
 
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize};
 
 /// First line from the manager's side, so that an older command and a newer manager tell each other apart.
-pub const CONTROL_VERSION: u32 = 1;
+pub const CONTROL_VERSION: u32 = 2;
+
+/// How often a client sends an empty line, its sign of life, while a [`Question::Hold`] or a [`Question::Bench`] is
+/// answered. A process that is stopped sends none, and what it keeps moving stops.
+pub const BEAT: std::time::Duration = std::time::Duration::from_millis(50);
 
 /// Longest line in bytes, in either direction: a call with 256 KiB of parameters, written as text.
 pub const LONGEST_LINE: usize = 4 * 1024 * 1024;
@@ -38,7 +42,8 @@ pub enum Question {
     /// length of its lease.
     Call(CallQuestion),
     /// Call a function of one node and keep its lease, until what it started has ended there, or the connection is closed:
-    /// then it stops. An [`Answer::Called`], then an [`Answer::Ended`].
+    /// then it stops; likewise after the length of the lease without a [`BEAT`] of the client. An [`Answer::Called`], then
+    /// an [`Answer::Ended`].
     Hold(CallQuestion),
     /// Publish this unit's functions. An [`Answer::Unread`] for each node that has not read the list in time.
     Publish {
@@ -77,7 +82,8 @@ pub enum Question {
         /// How long to wait for each.
         timeout_ms: u64,
     },
-    /// Measures round trips of blocking calls within this unit. An [`Answer::Sample`] for each.
+    /// Measures round trips of blocking calls within this unit. An [`Answer::Sample`] for each. Calls of a function with a
+    /// lease end after its length without a [`BEAT`] of the client.
     Bench {
         /// What is called, again and again; its `asynchronous` is not looked at.
         call: CallQuestion,
@@ -86,6 +92,13 @@ pub enum Question {
         /// Between two of them.
         pause_us: u64,
     },
+}
+
+impl Question {
+    /// Whether what it keeps moving needs a [`BEAT`] of the client.
+    pub(super) fn needs_beats(&self) -> bool {
+        matches!(self, Self::Hold(_) | Self::Bench { .. })
+    }
 }
 
 /// A call as an operator makes it.

@@ -1,5 +1,6 @@
 //! The socket of a running unit: one thread that accepts, and one for each open connection.
 
+use std::cell::RefCell;
 use std::collections::HashMap;
 use std::io::{self, BufWriter, Write};
 use std::net::Shutdown;
@@ -12,7 +13,7 @@ use std::time::{Duration, Instant};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
-use super::answering::execute_while;
+use super::answering::execute_for;
 use super::lines::{Line, Lines};
 use super::place::{Place, PlaceError, own_uid, peer_uid};
 use super::protocol::{Answer, CONTROL_VERSION, Failure, LONGEST_LINE, Question};
@@ -215,11 +216,16 @@ impl Shared {
         while !self.is_stopping()
             && let Some(line) = lines.next()?
         {
+            // A sign of life that came when what it was for had ended.
+            if matches!(line, Line::Text([])) {
+                continue;
+            }
             *lock(idle) = None;
             match question(line) {
                 Ok(question) => {
-                    let wanted = || !self.is_stopping() && !has_hung_up(&stream);
-                    execute_while(system, &question, &mut |answer| writer.sink(&answer), &wanted);
+                    let client = RefCell::new(Beats { stream: &stream, lines: &mut lines, last: Instant::now() });
+                    let lives = |within| !self.is_stopping() && client.borrow_mut().lives(within);
+                    execute_for(system, &question, &mut |answer| writer.sink(&answer), &lives);
                 }
                 Err(failure) => drop(writer.sink(&Answer::Failed(failure))),
             }
@@ -243,11 +249,30 @@ fn question(line: Line<'_>) -> Result<Question, Failure> {
     }
 }
 
-/// Whether the client has closed its end altogether, as opposed to: asks nothing more.
-fn has_hung_up(stream: &UnixStream) -> bool {
-    let mut fds = [PollFd::new(stream, PollFlags::empty())];
-    let now = Timespec { tv_sec: 0, tv_nsec: 0 };
-    poll(&mut fds, Some(&now)).is_ok() && fds[0].revents().intersects(PollFlags::HUP | PollFlags::ERR)
+/// The signs of life of a client whose question is being answered.
+struct Beats<'b, 's> {
+    stream: &'s UnixStream,
+    lines: &'b mut Lines<&'s UnixStream>,
+    last: Instant,
+}
+
+impl Beats<'_, '_> {
+    /// Whether the client has not closed its end altogether, as opposed to: asks nothing more; and, if that is asked, has
+    /// sent an empty line within a span. Behind its next question none is seen.
+    fn lives(&mut self, within: Option<Duration>) -> bool {
+        let mut fds = [PollFd::new(self.stream, PollFlags::IN)];
+        let now = Timespec { tv_sec: 0, tv_nsec: 0 };
+        let came = if poll(&mut fds, Some(&now)).is_ok() { fds[0].revents() } else { PollFlags::empty() };
+        if came.intersects(PollFlags::HUP | PollFlags::ERR) {
+            return false;
+        }
+        let Some(within) = within else { return true };
+        // Reading waits for nothing where something has come.
+        if (self.lines.has_more() || came.contains(PollFlags::IN)) && self.lines.skip_empty().unwrap_or(false) {
+            self.last = Instant::now();
+        }
+        self.last.elapsed() < within
+    }
 }
 
 fn write(writer: &mut impl Write, answer: &Answer) -> io::Result<()> {

@@ -184,7 +184,7 @@ impl Epoll {
 }
 
 /// Waits until `fd` can be read, with a resolution of microseconds; `false` after `timeout` or a signal.
-pub(super) fn wait_readable(fd: BorrowedFd<'_>, timeout: Duration) -> io::Result<bool> {
+pub(crate) fn wait_readable(fd: BorrowedFd<'_>, timeout: Duration) -> io::Result<bool> {
     let mut fds = [PollFd::from_borrowed_fd(fd, PollFlags::IN | PollFlags::RDHUP)];
     match poll(&mut fds, Some(&timespec(timeout))) {
         Ok(count) => Ok(count > 0),

@@ -4,7 +4,7 @@ use std::io::{BufRead, BufReader, Read, Write};
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::time::Duration;
 
-use cara_std::control::protocol::{Answer, LONGEST_LINE, Question};
+use cara_std::control::protocol::{Answer, ArgumentValue, LONGEST_LINE, Question};
 use cara_std::control::{Client, Control, ControlError, RunningUnit, UnitState, running_in};
 
 use crate::support::{Depot, PATIENCE, ask, call, manager, until};
@@ -60,8 +60,7 @@ fn what_is_no_question_is_told_so_and_the_next_line_is_read() {
     let mut raw = Raw::new(&depot);
     let deep = format!("{}\n", "[".repeat(100_000));
     for garbage in [
-        &b"\n"[..],
-        b"hello\n",
+        &b"hello\n"[..],
         b"{}\n",
         b"{\"ask\":\"fly\"}\n",
         b"{\"ask\":\"functions\"}\n",
@@ -74,6 +73,30 @@ fn what_is_no_question_is_told_so_and_the_next_line_is_read() {
         raw.write(garbage);
         raw.is_refused_with("BadQuestion");
         raw.goes_on();
+    }
+    // An empty line is a sign of life, and not answered.
+    raw.write(b"\n\n");
+    raw.goes_on();
+}
+
+/// What a client keeps moving takes its signs of life: `go_to` has a lease of 2 s.
+#[test]
+fn what_a_client_holds_ends_without_its_signs_of_life() {
+    let (depot, _agv) = Depot::with_agv();
+    let position = crate::support::argument("position", 2, ArgumentValue::Int(vec![1, 2]));
+    let go_to = call(Some("agv"), "go_to", vec![position]);
+    let bench = Question::Bench { call: go_to.clone(), count: 100, pause_us: 100_000 };
+    for question in [Question::Hold(go_to), bench] {
+        let mut silent = Raw::new(&depot);
+        silent.write(&[serde_json::to_vec(&question).unwrap(), b"\n".to_vec()].concat());
+        let ended = loop {
+            match silent.read() {
+                Answer::Failed(failure) => break failure,
+                answer => assert!(matches!(answer, Answer::Called { .. } | Answer::Sample { .. }), "{answer:?}"),
+            }
+        };
+        assert_eq!(ended.error, "Unattended", "{ended}");
+        silent.goes_on();
     }
 }
 
@@ -144,7 +167,7 @@ fn a_client_that_does_not_read_is_cut_off_and_disturbs_nobody() {
 
 fn crate_arguments() -> Vec<cara_std::control::protocol::Argument> {
     use crate::support::argument;
-    use cara_std::control::protocol::{ArgumentValue, Number};
+    use cara_std::control::protocol::Number;
     vec![
         argument("i", 2, ArgumentValue::Int(vec![1, 2])),
         argument("f", 4, ArgumentValue::Float(vec![Number::Finite(1.0); 4])),
@@ -341,8 +364,8 @@ fn impostor(line: &'static [u8]) -> (tempfile::TempDir, Result<Client, ControlEr
 
 #[test]
 fn a_client_says_what_is_wrong_with_the_other_end() {
-    let newer = impostor(b"{\"answer\":\"hello\",\"control_version\":2,\"unit\":\"x/1\",\"fleet\":0}\n").1;
-    assert!(matches!(newer, Err(ControlError::Version { theirs: 2 })));
+    let newer = impostor(b"{\"answer\":\"hello\",\"control_version\":3,\"unit\":\"x/1\",\"fleet\":0}\n").1;
+    assert!(matches!(newer, Err(ControlError::Version { theirs: 3 })));
     for line in [&b"SSH-2.0\n"[..], b"{\"answer\":\"done\"}\n"] {
         assert!(matches!(impostor(line).1, Err(ControlError::Broken(_))), "{line:?}");
     }

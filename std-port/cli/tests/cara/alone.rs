@@ -155,7 +155,7 @@ fn what_else_may_answer_on_a_socket_does_not_panic() {
     let stage = Stage::empty();
     let path = stage.control().join("other.sock");
     let listener = std::os::unix::net::UnixListener::bind(&path).unwrap();
-    let hello = r#"{"answer":"hello","control_version":1,"unit":"manager/1","fleet":0}"#;
+    let hello = r#"{"answer":"hello","control_version":2,"unit":"manager/1","fleet":0}"#;
     let says: [(String, i32); 6] = [
         (String::new(), 1),
         ("\0\u{ff} garbage\n".into(), 1),

@@ -84,6 +84,20 @@ fn who_goes_away_stops_what_is_held() {
     held.end();
 }
 
+/// A stopped process keeps its connection open, and nothing but the missing signs of life tells the manager.
+#[test]
+fn what_is_held_stops_when_its_command_is_stopped_by_a_signal() {
+    let stage = Stage::with(&[]);
+    let driver = Driver::join(&stage);
+    let held = driver.held(&stage);
+    held.freeze();
+    until(|| driver.made_safe() == 1);
+    assert!(!driver.lease.is_live());
+    held.thaw();
+    assert_eq!(held.end(), 1, "it goes on as one that has lost what it held");
+    assert_eq!(driver.made_safe(), 1);
+}
+
 /// The manager has events all the time, and still sees at once that nobody holds any more.
 #[test]
 fn who_goes_away_is_noticed_among_many_events() {
