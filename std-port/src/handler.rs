@@ -5,8 +5,8 @@ use std::sync::Arc;
 use cara_core::config::Priority;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::{Parameters, ParametersView};
-use cara_core::error::ServiceError;
-use cara_core::services::lease::{Lease, Service};
+use cara_core::error::{Error, ServiceError};
+use cara_core::services::lease::{Lease, Order, Service};
 use cara_core::time::{Duration, Instant};
 
 use crate::lane::Lane;
@@ -70,6 +70,7 @@ impl<T> Run<T> {
 /// A service as the list of functions holds it.
 pub(crate) struct Handler<T> {
     pub(crate) run: Run<T>,
+    /// To be read; a service has it together with the hook, which writes it.
     pub(crate) lease: Option<Arc<ServiceLease>>,
     pub(crate) safe: Option<Arc<SafeHook>>,
     /// Where its emergencies run, if it is a service for those.
@@ -80,12 +81,38 @@ impl<T: 'static> Service for Handler<T> {
     fn lease(&self) -> Option<&Lease> {
         self.lease.as_ref().map(|service| &service.lease)
     }
+
+    fn begin_lease(&self, now: Instant, end: Instant) -> Result<Option<Order>, Error> {
+        let Some(safe) = &self.safe else { return Ok(None) };
+        safe.begin(now, end).map(Some).ok_or(Error::Busy)
+    }
+
+    fn renew_lease(&self, order: Order, end: Instant) -> bool {
+        self.safe.as_ref().is_none_or(|safe| safe.renew(order, end))
+    }
+
+    fn cut_lease(&self, order: Order) {
+        if let Some(safe) = &self.safe {
+            safe.cut(order);
+        }
+    }
+
+    fn finish_lease(&self, order: Order) -> bool {
+        self.safe.as_ref().is_none_or(|safe| safe.finish(order))
+    }
+
+    fn expire_lease(&self, order: Order) -> bool {
+        self.safe.as_ref().is_none_or(|safe| safe.expire(order))
+    }
 }
 
 impl<T> Drop for Handler<T> {
     fn drop(&mut self) {
+        if let Some(safe) = &self.safe {
+            safe.clear();
+        }
         if let Some(lease) = &self.lease {
-            lease.clear();
+            lease.wake();
         }
     }
 }

@@ -31,12 +31,6 @@ impl ServiceLease {
         self.threads.notify_all();
         tasks.into_iter().for_each(Waker::wake);
     }
-
-    /// The service is gone: nothing renews its lease any more.
-    pub(crate) fn clear(&self) {
-        self.lease.clear();
-        self.wake();
-    }
 }
 
 /// A lease, to be read from any thread at any time: a few atomic loads and the clock.

@@ -3,12 +3,17 @@
 //! At the end of the lease the hook runs whatever else the process is about: the thread waits for no lock of a link, no
 //! other thread, no other hook, and not for the application's state. The unit reports each end as well, and also ends
 //! that come before their time; whichever of the two is first makes the hook run, once for each order.
+//!
+//! Links of several peers write one lease, each from a thread of its own. They write it here, under the lock of the hook:
+//! so one write never comes between the look and the store of another, and no order begins between the end of the one
+//! before it and its hook.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 
 use cara_core::error::Error;
+use cara_core::services::lease::{Lease, Order};
 use cara_core::time::{Duration, Instant};
 
 use crate::clock::Clock;
@@ -25,7 +30,7 @@ const LATE: Duration = Duration::from_millis(100);
 /// How long the end of a service waits for its hook.
 const PATIENCE: std::time::Duration = std::time::Duration::from_secs(10);
 
-/// The hook and its thread.
+/// The hook and its thread, and all writes to the lease.
 pub(crate) struct SafeHook {
     shared: Arc<Shared>,
     thread: OwnThread,
@@ -52,8 +57,8 @@ struct Shared {
 struct State {
     /// The hook is to run.
     due: bool,
-    /// It has run, or is about to, because the thread saw the end of the lease, which the unit has yet to report.
-    is_ahead: bool,
+    /// The thread has seen the end of the lease and started the hook; the unit has yet to report that end.
+    started_early: bool,
     running_since: Option<Instant>,
     /// This run has been counted as a long one.
     counted: bool,
@@ -70,20 +75,49 @@ impl SafeHook {
         Ok(Self { shared, thread })
     }
 
-    /// An order has begun: the thread looks when its lease ends.
-    pub(crate) fn watch(&self) {
-        // The end of an earlier order has been reported by now.
-        lock(&self.shared.state).is_ahead = false;
+    /// Begins an order: the thread looks when its lease ends.
+    pub(crate) fn begin(&self, now: Instant, end: Instant) -> Option<Order> {
+        let _writing = lock(&self.shared.state);
+        let order = self.shared.lease().begin(now, end)?;
         self.shared.changed.notify_all();
+        Some(order)
     }
 
-    /// The unit has seen the end of the lease. Returns at once.
-    pub(crate) fn run(&self) {
+    pub(crate) fn renew(&self, order: Order, end: Instant) -> bool {
+        let _writing = lock(&self.shared.state);
+        self.shared.lease().renew(order, end)
+    }
+
+    pub(crate) fn cut(&self, order: Order) {
+        let _writing = lock(&self.shared.state);
+        self.shared.lease().cut(order);
+    }
+
+    /// Ends an order whose work is done: the hook does not run.
+    pub(crate) fn finish(&self, order: Order) -> bool {
         let mut state = lock(&self.shared.state);
-        if !std::mem::take(&mut state.is_ahead) {
-            state.due = true;
+        let is_over = self.shared.lease().end(order);
+        state.started_early &= !is_over;
+        is_over
+    }
+
+    /// Ends an order and starts the hook, unless it was started early. Returns at once.
+    pub(crate) fn expire(&self, order: Order) -> bool {
+        let mut state = lock(&self.shared.state);
+        let is_over = self.shared.lease().end(order);
+        if is_over {
+            self.shared.start(&mut state);
         }
-        self.shared.changed.notify_all();
+        is_over
+    }
+
+    /// The service is removed: an order that has not ended does so, and the hook starts.
+    pub(crate) fn clear(&self) {
+        let mut state = lock(&self.shared.state);
+        if self.shared.lease().left(self.shared.parts.clock.now()).is_some() {
+            self.shared.lease().clear();
+            self.shared.start(&mut state);
+        }
     }
 
     /// Waits until the hook has run as often as it was to: the next order of the service comes after it. `false` when
@@ -122,6 +156,16 @@ impl Drop for SafeHook {
 }
 
 impl Shared {
+    fn lease(&self) -> &Lease {
+        &self.parts.lease.lease
+    }
+
+    /// An order has ended, and the hook is to run, once.
+    fn start(&self, state: &mut State) {
+        state.due |= !std::mem::take(&mut state.started_early);
+        self.changed.notify_all();
+    }
+
     fn end(&self) {
         lock(&self.state).is_over = true;
         self.changed.notify_all();
@@ -148,9 +192,9 @@ impl Shared {
         let mut state = lock(&self.state);
         loop {
             let now = self.parts.clock.now();
-            let left = self.parts.lease.lease.left(now);
-            if left == Some(Duration::ZERO) && !state.is_ahead && !state.due && !self.parts.lease.lease.is_live(now) {
-                (state.due, state.is_ahead) = (true, true);
+            let left = self.lease().left(now);
+            if left == Some(Duration::ZERO) && !state.started_early && !state.due && !self.lease().is_live(now) {
+                (state.due, state.started_early) = (true, true);
             }
             if std::mem::take(&mut state.due) {
                 (state.running_since, state.counted) = (Some(now), false);
@@ -184,15 +228,15 @@ impl Shared {
 #[cfg(test)]
 mod tests {
     use std::sync::atomic::AtomicUsize;
+    use std::sync::mpsc::channel;
 
     use super::*;
     use crate::testing::until;
-    use cara_core::services::lease::Order;
 
     static AHEAD: AtomicU64 = AtomicU64::new(0);
 
-    fn begin(lease: &ServiceLease, clock: Clock, length: Duration) -> Order {
-        lease.lease.begin(clock.now(), clock.now() + length).expect("the order before has ended")
+    fn begin(safe: &SafeHook, clock: Clock, length: Duration) -> Order {
+        safe.begin(clock.now(), clock.now() + length).expect("the order before has ended")
     }
 
     /// The unit does nothing here: the thread sees the end of a lease that a suspension has outlasted, and what the unit
@@ -207,16 +251,13 @@ mod tests {
         let parts = Parts { lease: lease.clone(), clock, hook, then: None, late: Arc::default() };
         let safe = SafeHook::start(parts).unwrap();
         for round in 1..4 {
-            let order = begin(&lease, clock, Duration::from_secs(3_600));
-            safe.watch();
+            let order = begin(&safe, clock, Duration::from_secs(3_600));
             std::thread::sleep(std::time::Duration::from_millis(30));
             assert_eq!(runs.load(Ordering::SeqCst), round - 1, "it is live");
             AHEAD.fetch_add(7_200_000_000, Ordering::SeqCst);
             assert!(!lease.lease.is_live(clock.now()));
             until(|| runs.load(Ordering::SeqCst) == round);
-            assert!(lease.lease.end(order));
-            safe.run();
-            assert!(safe.has_run());
+            assert!(safe.expire(order) && safe.has_run());
         }
         safe.end();
         assert_eq!(runs.load(Ordering::SeqCst), 3);
@@ -231,16 +272,93 @@ mod tests {
         });
         let parts = Parts { lease: lease.clone(), clock, hook, then: None, late: Arc::default() };
         let safe = SafeHook::start(parts).unwrap();
-        let order = begin(&lease, clock, Duration::from_secs(3_600));
-        safe.watch();
-        assert!(lease.lease.end(order));
-        safe.run();
+        let order = begin(&safe, clock, Duration::from_secs(3_600));
+        assert!(safe.expire(order));
         until(|| runs.load(Ordering::SeqCst) == 1);
-        let order = begin(&lease, clock, Duration::from_millis(30));
-        safe.watch();
-        assert!(lease.lease.end(order));
+        let order = begin(&safe, clock, Duration::from_millis(30));
+        assert!(safe.finish(order));
         std::thread::sleep(std::time::Duration::from_millis(60));
         safe.end();
         assert_eq!(runs.load(Ordering::SeqCst), 1);
+    }
+
+    /// What one link writes waits for what another one is writing.
+    #[test]
+    fn no_write_begins_during_another() {
+        const LONG: Duration = Duration::from_secs(3_600);
+        type Write = fn(&SafeHook, Order, Instant) -> bool;
+        let writes: [Write; 6] = [
+            |safe, _, now| safe.begin(now, now + LONG).is_some(),
+            |safe, order, now| safe.renew(order, now + LONG + LONG),
+            |safe, order, now| {
+                safe.cut(order);
+                !safe.shared.lease().is_live(now)
+            },
+            |safe, order, _| safe.finish(order),
+            |safe, order, _| safe.expire(order),
+            |safe, order, now| {
+                safe.clear();
+                !safe.shared.lease().is_live_for(order, now)
+            },
+        ];
+        let clock = Clock::new();
+        for write in writes {
+            let parts = Parts { lease: Arc::default(), clock, hook: Arc::new(|| {}), then: None, late: Arc::default() };
+            let safe = SafeHook::start(parts).unwrap();
+            let order = begin(&safe, clock, LONG);
+            let (now, lease) = (clock.now(), safe.shared.lease());
+            let seen = || (lease.is_live_for(order, now), lease.left(now));
+            let before = seen();
+            std::thread::scope(|scope| {
+                let writing = lock(&safe.shared.state);
+                let (begins, begun) = channel();
+                let safe = &safe;
+                let other = scope.spawn(move || {
+                    begins.send(()).unwrap();
+                    write(safe, order, now)
+                });
+                begun.recv().unwrap();
+                std::thread::sleep(std::time::Duration::from_millis(20));
+                assert!(!other.is_finished() && seen() == before, "it has been written during another write");
+                drop(writing);
+                assert!(other.join().unwrap());
+                assert_ne!(seen(), before);
+            });
+            safe.end();
+        }
+    }
+
+    /// Two links serve calls of one service at once. What each of them does to the lease is done as a whole: no lease
+    /// outlives its orders, and no hook of an earlier order runs while a later one is live.
+    #[test]
+    fn calls_of_two_peers_change_one_lease_one_after_the_other() {
+        const CALLS: usize = 20_000;
+        const LONG: Duration = Duration::from_secs(3_600);
+        let (lease, runs) = (Arc::new(ServiceLease::default()), Arc::new(AtomicUsize::new(0)));
+        let (clock, counted) = (Clock::new(), runs.clone());
+        let hook = Arc::new(move || {
+            counted.fetch_add(1, Ordering::SeqCst);
+        });
+        let parts = Parts { lease: lease.clone(), clock, hook, then: None, late: Arc::default() };
+        let safe = SafeHook::start(parts).unwrap();
+        let serve = || {
+            for call in 0..CALLS {
+                let now = clock.now();
+                let Some(order) = safe.begin(now, now + LONG) else { panic!("call {call}: busy for ever") };
+                if safe.has_run() {
+                    let before = runs.load(Ordering::SeqCst);
+                    let renewed = safe.renew(order, now + LONG);
+                    std::thread::yield_now();
+                    let after = runs.load(Ordering::SeqCst);
+                    let live = lease.lease.is_live_for(order, now);
+                    assert!(!live || after == before, "call {call}: the hook of an earlier order ran");
+                    assert!(!live || renewed, "call {call}: a live order was not renewed");
+                }
+                safe.expire(order);
+            }
+        };
+        std::thread::scope(|scope| (0..2).for_each(|_| drop(scope.spawn(serve))));
+        assert_eq!(lease.lease.left(clock.now()), None, "every order has ended, and the lease lives");
+        safe.end();
     }
 }

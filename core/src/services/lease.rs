@@ -12,6 +12,7 @@ use core::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use crate::config::{LEASES, Priority};
 use crate::distribution::function_list::{Generation, Slot};
 pub use crate::distribution::message::LeaseEnd;
+use crate::error::Error;
 use crate::services::requests::CallId;
 use crate::time::{Duration, Instant};
 
@@ -32,7 +33,9 @@ impl Order {
 /// renewal revives it: only a new order does.
 ///
 /// There is no compare-and-swap on the smallest boards. Each write is one store, and the stores come in an order in which
-/// a reader that falls between two of them sees less than there is: dead where it might be live, never the reverse.
+/// a reader that falls between two of them sees less than there is: dead where it might be live, never the reverse. Two
+/// writers side by side would undo that: a renewal could revive what the other one has just ended. The unit writes by the
+/// methods of [`Service`], which take turns.
 #[derive(Debug, Default)]
 pub struct Lease {
     /// The end in milliseconds of the port's clock, wrapping, with the lowest bit set; 0 when there is none.
@@ -166,11 +169,44 @@ const fn odd_millis(end: Instant) -> u64 {
     if millis & 1 == 0 { millis.saturating_sub(1) | 1 } else { millis }
 }
 
-/// What the core asks of a port's service: where its lease is, if it has one.
+/// What the core asks of a port's service: where its lease is, if it has one, and all writes to it.
+///
+/// The writes do for a port that drives all links of a unit in one thread. A port that drives them in several does each
+/// write under a lock of the service, and starts the safe hook of [`expire_lease`](Self::expire_lease) under the same
+/// lock: a call of another peer that begins in between would be stopped by the hook of the one before it.
 pub trait Service {
     /// The lease that the application reads.
     fn lease(&self) -> Option<&Lease> {
         None
+    }
+
+    /// [`Lease::begin`]; `Ok(None)` for a service without a lease, [`Error::Busy`] where a dead order has not been ended.
+    fn begin_lease(&self, now: Instant, end: Instant) -> Result<Option<Order>, Error> {
+        let Some(lease) = self.lease() else { return Ok(None) };
+        lease.begin(now, end).map(Some).ok_or(Error::Busy)
+    }
+
+    /// [`Lease::renew`]
+    fn renew_lease(&self, order: Order, end: Instant) -> bool {
+        self.lease().is_none_or(|lease| lease.renew(order, end))
+    }
+
+    /// [`Lease::cut`]
+    fn cut_lease(&self, order: Order) {
+        if let Some(lease) = self.lease() {
+            lease.cut(order);
+        }
+    }
+
+    /// [`Lease::end`], because what the order has started is finished: no hook runs.
+    fn finish_lease(&self, order: Order) -> bool {
+        self.lease().is_none_or(|lease| lease.end(order))
+    }
+
+    /// [`Lease::end`], because its caller no longer wants it. Where this is `true`, the safe hook is due: the event
+    /// [`LeaseExpired`](crate::services::unit::Event::LeaseExpired) says so to a port that has not started it here.
+    fn expire_lease(&self, order: Order) -> bool {
+        self.finish_lease(order)
     }
 }
 

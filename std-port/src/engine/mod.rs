@@ -354,7 +354,7 @@ impl<T: Send + 'static> Engine<T> {
                     link.introduced(Instant::START);
                 }
                 if let Event::LeaseExpired(slot) = event {
-                    self.make_safe(&functions, slot);
+                    self.wake_leased(&functions, slot);
                 }
                 notices.extend(notice(&event));
             }
@@ -403,10 +403,10 @@ impl<T: Send + 'static> Engine<T> {
         }
     }
 
-    /// An event that is acted upon when the lock is given up; only safe hooks do not wait for that.
+    /// An event that is acted upon when the lock is given up; only what waits for the end of a lease is woken before.
     fn note(&self, state: &mut LinkState, event: &Event<'_>) {
         if let Event::LeaseExpired(slot) = *event {
-            self.make_safe(&read(&self.functions), slot);
+            self.wake_leased(&read(&self.functions), slot);
         }
         state.notices.extend(notice(event));
     }

@@ -46,13 +46,9 @@ enum Ran {
 }
 
 impl<T: Send + 'static> Engine<T> {
-    /// A call has begun, under its link's lock: it takes its turn, and the thread of its safe hook looks at its lease.
+    /// A call has begun, under its link's lock: it takes its turn.
     pub(super) fn begun(&self, functions: &FunctionList<Boxed, Handler<T>>, link: &LinkCell, call: Call) -> Begun {
-        let handler = functions.function(call.slot).map(|function| function.handler);
-        if let Some(safe) = handler.and_then(|handler| handler.safe.as_ref()) {
-            safe.watch();
-        }
-        let takes_state = handler.is_some_and(|handler| handler.run.takes_state());
+        let takes_state = functions.function(call.slot).is_some_and(|function| function.handler.run.takes_state());
         Begun { call, turn: takes_state.then(|| self.state.take_turn(Some(link.id))) }
     }
 
@@ -297,13 +293,9 @@ impl<T: Send + 'static> Engine<T> {
         }
     }
 
-    /// Runs the safe hook of a service whose lease has ended. Returns at once.
-    pub(super) fn make_safe(&self, functions: &FunctionList<Boxed, Handler<T>>, slot: Slot) {
-        let Some(function) = functions.function(slot) else { return };
-        if let Some(safe) = &function.handler.safe {
-            safe.run();
-        }
-        if let Some(lease) = &function.handler.lease {
+    /// The lease of a service has ended, and its safe hook is running: whatever waits for the end of the lease looks again.
+    pub(super) fn wake_leased(&self, functions: &FunctionList<Boxed, Handler<T>>, slot: Slot) {
+        if let Some(lease) = functions.function(slot).and_then(|function| function.handler.lease.as_ref()) {
             lease.wake();
         }
     }

@@ -137,6 +137,25 @@ fn what_has_finished_ends_without_the_hook() {
 }
 
 #[test]
+fn what_a_service_has_started_stops_when_it_is_removed_or_replaced() {
+    for is_replaced in [false, true] {
+        let vehicle = vehicle();
+        vehicle.go(true);
+        let functions = vehicle.agv.my_function_list();
+        if is_replaced {
+            let definition = "go_to(number: int[1]) -> (number: int[1])".parse().unwrap();
+            let options = ServiceOptions::new().lease(LEASE, || panic!("it has started nothing"));
+            functions.replace(&definition, options, |_: &mut i64, number: cara_std::Parameters| number).unwrap();
+        } else {
+            functions.remove("go_to").unwrap();
+        }
+        vehicle.assert_stopped();
+        vehicle.agv.stop();
+        assert_eq!(vehicle.stops(), 1);
+    }
+}
+
+#[test]
 fn the_loss_of_the_manager_is_told_to_the_hook_once() {
     let vehicle = vehicle();
     let lost = Arc::new(AtomicUsize::new(0));

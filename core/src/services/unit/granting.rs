@@ -40,15 +40,15 @@ impl<S: Storage, C: Secure> Session<S, C> {
         if earlier.is_none() && self.granted.is_full() {
             return Err(Error::Full(Limit::Leases));
         }
-        let order = match service_lease(cx, head.slot, head.generation).map(|lease| lease.begin(cx.now, end)) {
-            None => None,
-            Some(Some(order)) => Some(order),
-            Some(None) => {
+        let service = service_of(cx, head.slot, head.generation);
+        let order = match service.map_or(Ok(None), |service| service.begin_lease(cx.now, end)) {
+            Ok(order) => order,
+            Err(error) => {
                 // A reader has looked later than at `cx.now`, and has stopped the motion.
                 if let Some(index) = known {
                     self.cut_lease(cx, index);
                 }
-                return Err(Error::Busy);
+                return Err(error);
             }
         };
         let (slot, generation) = (head.slot, head.generation);
@@ -100,8 +100,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         end: Instant,
     ) {
         let Some(granted) = self.granted.get_mut(index) else { return };
-        let lease = service_lease(cx, granted.slot, granted.generation).zip(granted.order);
-        if lease.is_none_or(|(lease, order)| lease.renew(order, end)) {
+        if held_lease(cx, granted).is_none_or(|(service, order)| service.renew_lease(order, end)) {
             granted.end = end;
         } else {
             // A reader has looked later than at `cx.now`, or a call of another peer has taken the lease over.
@@ -113,7 +112,9 @@ impl<S: Storage, C: Secure> Session<S, C> {
     pub fn end_lease<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>, slot: Slot) {
         let index = self.granted.iter().position(|granted| granted.slot == slot);
         if let Some(granted) = index.and_then(|index| take_at(&mut self.granted, index)) {
-            end_service_lease(cx, &granted);
+            if let Some((service, order)) = held_lease(cx, &granted) {
+                service.finish_lease(order);
+            }
             self.tell_end(cx, granted.call, LeaseEnd::Finished);
         }
     }
@@ -138,8 +139,8 @@ impl<S: Storage, C: Secure> Session<S, C> {
         let Some(granted) = self.granted.get_mut(index) else { return };
         granted.end = cx.now;
         self.timers.lease = cx.now;
-        if let Some((lease, order)) = service_lease(cx, granted.slot, granted.generation).zip(granted.order) {
-            lease.cut(order);
+        if let Some((service, order)) = held_lease(cx, granted) {
+            service.cut_lease(order);
         }
     }
 
@@ -173,7 +174,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     ) -> Outcome {
         let index = self.granted.iter().position(is_released);
         let Some(granted) = index.and_then(|index| take_at(&mut self.granted, index)) else { return Outcome::Nothing };
-        if end_service_lease(cx, &granted) { Event::LeaseExpired(granted.slot).into() } else { Outcome::Nothing }
+        if expire_granted(cx, &granted) { Event::LeaseExpired(granted.slot).into() } else { Outcome::Nothing }
     }
 
     /// Ends a lease that is due; its function, whose hook is to run.
@@ -185,7 +186,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         let due = |granted: &Granted| granted.end <= now;
         while let Some(granted) = self.granted.iter().position(due).and_then(|index| take_at(&mut self.granted, index))
         {
-            if end_service_lease(cx, &granted) {
+            if expire_granted(cx, &granted) {
                 self.link.counters.add(LinkCounter::LeasesExpired, 1);
                 self.tell_end(cx, granted.call, LeaseEnd::Expired);
                 return Some(granted.slot);
@@ -217,19 +218,26 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 }
 
-fn service_lease<'c, S: Storage, M: Mailman, B: Buffers<S>, H: Service>(
+fn service_of<'c, S: Storage, M: Mailman, B: Buffers<S>, H: Service>(
     cx: &Context<'c, S, M, B, H>,
     slot: Slot,
     generation: Generation,
-) -> Option<&'c Lease> {
-    cx.functions.lookup(slot, generation).ok().and_then(|function| function.handler.lease())
+) -> Option<&'c H> {
+    cx.functions.lookup(slot, generation).ok().map(|function| function.handler)
+}
+
+/// The service and the order of a lease, where the port has one for it.
+fn held_lease<'c, S: Storage, M: Mailman, B: Buffers<S>, H: Service>(
+    cx: &Context<'c, S, M, B, H>,
+    granted: &Granted,
+) -> Option<(&'c H, Order)> {
+    service_of(cx, granted.slot, granted.generation).zip(granted.order)
 }
 
 /// `false` when a call of another peer holds the lease now: what goes on is that one's.
-pub(super) fn end_service_lease<S: Storage, M: Mailman, B: Buffers<S>, H: Service>(
+pub(super) fn expire_granted<S: Storage, M: Mailman, B: Buffers<S>, H: Service>(
     cx: &Context<'_, S, M, B, H>,
     granted: &Granted,
 ) -> bool {
-    let lease = service_lease(cx, granted.slot, granted.generation).zip(granted.order);
-    lease.is_none_or(|(lease, order)| lease.end(order))
+    held_lease(cx, granted).is_none_or(|(service, order)| service.expire_lease(order))
 }

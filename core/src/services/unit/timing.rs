@@ -2,7 +2,7 @@
 
 use core::net::SocketAddr;
 
-use super::granting::end_service_lease;
+use super::granting::expire_granted;
 use super::{Event, Phase, Session};
 use crate::config::{DATAGRAM_BYTES, GATHER};
 use crate::distribution::datagram;
@@ -198,7 +198,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         reason: CloseReason,
     ) -> Option<Event<'static>> {
         while let Some(granted) = self.granted.pop() {
-            if end_service_lease(cx, &granted) {
+            if expire_granted(cx, &granted) {
                 return Some(Event::LeaseExpired(granted.slot));
             }
         }
