@@ -9,6 +9,7 @@ mod checks;
 mod count;
 mod desk;
 mod faults;
+mod kept_away;
 mod keys;
 mod load;
 mod manager;
@@ -84,6 +85,8 @@ enum Part {
     Faults(faults::Faults),
     /// Attacks a board that dials the attacker.
     Security(security::Security),
+    /// Measures how long boards take to join beside recorded and forged discovery.
+    KeptAway(kept_away::KeptAway),
     /// Ends desks by signals at random moments, and fails if one leaves keys behind.
     Ends {
         /// How many.
@@ -135,6 +138,7 @@ fn inside(arguments: &Arguments) -> Result<()> {
         Some(Part::Instructions { of, profile }) => count::run(&bench(arguments)?, &arguments.image, *of, *profile),
         Some(Part::Faults(faults)) => faults::run(bench(arguments)?.counting(), faults),
         Some(Part::Security(options)) => security::run(&bench(arguments)?, options),
+        Some(Part::KeptAway(options)) => kept_away::run(&bench(arguments)?, options),
         Some(Part::Stack { of }) => load::run(&bench(arguments)?, *of),
         _ => run(arguments),
     }

@@ -8,8 +8,9 @@ use anyhow::{Context, Result, bail};
 use cara_core::distribution::datagram::{Announce, Datagram, Header, SEARCH_BYTES, WhoHas};
 use cara_core::distribution::identity::{Epoch, Role};
 use cara_secure::keyring::Codes;
-use cara_std::Interfaces;
+use cara_std::keys::KeyRing;
 use cara_std::sys::datagram::{Datagrams, Socket};
+use cara_std::{Fleet, Interfaces};
 
 use crate::discovery::Lent;
 use crate::ground::{agv, depot};
@@ -24,8 +25,10 @@ const BEFORE: Duration = Duration::from_millis(200);
 /// Counters of a vehicle that rise with each broadcast that leads to nothing.
 const TELLING: [&str; 2] = ["HintsIgnored", "WhoHasUnheeded"];
 
-struct Attack {
-    name: &'static str,
+/// What an attacker broadcasts, again and again.
+pub struct Attack {
+    /// What it is.
+    pub name: &'static str,
     said: Vec<Vec<u8>>,
     /// Where what is said leads to: connections are taken, and nothing is said on them.
     _silent: Vec<TcpListener>,
@@ -37,7 +40,12 @@ pub fn run(report: &mut Report, weakness: Weakness, starts: u32, rates: &[u64]) 
     let vehicles = OTHER + starts * 3 * rates.len() as u32;
     let linux = Linux::new(vehicles, weakness)?;
     let socket = Datagrams::open(Interfaces::Loopback, linux.port)?;
-    let attacks = [earlier_lives(&linux, &socket)?, another_vehicle(&linux, &socket)?, forged(&linux)?];
+    let at = Ipv4Addr::LOCALHOST;
+    let attacks = [
+        Attack::earlier_lives(&socket, at, || live(&linux))?,
+        another_vehicle(&linux, &socket)?,
+        Attack::forged(&linux.ground.ring(&agv(OTHER)), linux.ground.fleet, at)?,
+    ];
     let _manager = linux.manager()?;
     let mut vehicle = OTHER;
     for attack in &attacks {
@@ -53,8 +61,7 @@ pub fn run(report: &mut Report, weakness: Weakness, starts: u32, rates: &[u64]) 
             }
             noticed.sort();
             noticed.dedup();
-            took.sort_unstable();
-            let (median, worst) = (took.get(took.len() / 2).unwrap_or(&0), took.last().unwrap_or(&0));
+            let (median, worst) = median_and_worst(&mut took);
             let joined = u64::from(starts) - out;
             println!("{}, {a_second} a second: {joined} of {starts} joined, ms: {median} / {worst}", attack.name);
             let (attack, target) = (format!("{}, {a_second} a second", attack.name), "Linux s_unit".to_owned());
@@ -74,69 +81,96 @@ fn start(
     vehicle: u32,
     sent: &AtomicU64,
 ) -> Result<(Option<Duration>, Vec<String>)> {
-    let over = AtomicBool::new(false);
-    std::thread::scope(|scope| {
-        scope.spawn(|| say(socket, &attack.said, a_second, &over, sent));
-        std::thread::sleep(BEFORE);
-        let outcome = linux.vehicle(vehicle, None).map(|(unit, diary)| {
-            let since = Instant::now();
-            let joined = wait_for(|| diary.all().joins > 0).then(|| since.elapsed());
-            let counted = named(unit.counters());
-            unit.stop();
-            let risen = TELLING.iter().filter(|name| counted.get(**name).is_some_and(|count| *count > 0));
-            (joined, risen.map(|name| (*name).to_owned()).collect())
-        });
-        over.store(true, Ordering::Relaxed);
-        outcome
+    attack.beside(socket, a_second, sent, || {
+        let (unit, diary) = linux.vehicle(vehicle, None)?;
+        let since = Instant::now();
+        let joined = wait_for(|| diary.all().joins > 0).then(|| since.elapsed());
+        let counted = named(unit.counters());
+        unit.stop();
+        let risen = TELLING.iter().filter(|name| counted.get(**name).is_some_and(|count| *count > 0));
+        Ok((joined, risen.map(|name| (*name).to_owned()).collect()))
     })
 }
 
-fn say(socket: &Datagrams, said: &[Vec<u8>], a_second: u64, over: &AtomicBool, sent: &AtomicU64) {
-    let pause = Duration::from_micros(1_000_000 / a_second);
-    for bytes in said.iter().cycle().take_while(|_| !over.load(Ordering::Relaxed)) {
-        socket.broadcast(bytes);
-        sent.fetch_add(1, Ordering::Relaxed);
-        std::thread::sleep(pause);
+impl Attack {
+    /// A who-has of each of two lives of the manager that are over. `live` begins one, and returns what ends it.
+    pub fn earlier_lives<'l>(
+        socket: &Datagrams,
+        at: Ipv4Addr,
+        live: impl Fn() -> Result<Box<dyn FnOnce() + 'l>>,
+    ) -> Result<Self> {
+        let (mut said, mut silent) = (Vec::new(), Vec::new());
+        for _ in 0..2 {
+            let end = live()?;
+            let (bytes, who_has) = recorded(socket, Role::MUnit)?;
+            end();
+            silent.extend(TcpListener::bind((at, who_has.tcp_port)));
+            said.push(bytes);
+        }
+        Ok(Self { name: "recorded who-has of two earlier lives of the manager", said, _silent: silent })
+    }
+
+    /// The who-has of another vehicle, which asks now.
+    pub fn another_vehicle(socket: &Datagrams) -> Result<Self> {
+        let (bytes, _) = recorded(socket, Role::SUnit)?;
+        Ok(Self { name: "recorded who-has of another vehicle", said: vec![bytes], _silent: Vec::new() })
+    }
+
+    /// Announces of the manager, each of another life, with the discovery key of a stolen vehicle.
+    pub fn forged(ring: &KeyRing, fleet: Fleet, at: Ipv4Addr) -> Result<Self> {
+        let listener = TcpListener::bind((at, 0))?;
+        let codes = Codes::Keyed(Lent(ring));
+        let tcp_port = listener.local_addr()?.port();
+        let announce = |_| {
+            let epoch = Epoch(fastrand::u64(..));
+            let (sequence, room, expected) = (u32::MAX, 100, u16::MAX);
+            let announce = Announce { identity: depot(), epoch, sequence, nonce: 0, tcp_port, room, expected };
+            let mut out = [0; SEARCH_BYTES];
+            announce.encode(fleet, &codes, None, &mut out).map(<[u8]>::to_vec).context("it fits")
+        };
+        let said = (0..200).map(announce).collect::<Result<_>>()?;
+        Ok(Self { name: "announces forged with a stolen discovery key", said, _silent: vec![listener] })
+    }
+
+    /// Does something while this is broadcast so many times a second, and has been for a while; counts what is `sent`.
+    pub fn beside<T>(&self, socket: &Datagrams, a_second: u64, sent: &AtomicU64, what: impl FnOnce() -> T) -> T {
+        let over = AtomicBool::new(false);
+        let pause = Duration::from_micros(1_000_000 / a_second);
+        std::thread::scope(|scope| {
+            scope.spawn(|| {
+                for bytes in self.said.iter().cycle().take_while(|_| !over.load(Ordering::Relaxed)) {
+                    socket.broadcast(bytes);
+                    sent.fetch_add(1, Ordering::Relaxed);
+                    std::thread::sleep(pause);
+                }
+            });
+            std::thread::sleep(BEFORE);
+            let outcome = what();
+            over.store(true, Ordering::Relaxed);
+            outcome
+        })
     }
 }
 
-/// A who-has of each of two lives of the manager that are over.
-fn earlier_lives(linux: &Linux, socket: &Datagrams) -> Result<Attack> {
-    let (mut said, mut silent) = (Vec::new(), Vec::new());
-    for _ in 0..2 {
-        let manager = linux.manager()?;
-        let (bytes, who_has) = recorded(socket, Role::MUnit)?;
-        manager.system.stop();
-        drop(manager);
-        silent.extend(TcpListener::bind((Ipv4Addr::LOCALHOST, who_has.tcp_port)));
-        said.push(bytes);
-    }
-    Ok(Attack { name: "recorded who-has of two earlier lives of the manager", said, _silent: silent })
+/// The median and the longest of what several took, in milliseconds.
+pub fn median_and_worst(took: &mut [u128]) -> (u128, u128) {
+    took.sort_unstable();
+    let at = |index: usize| took.get(index).copied().unwrap_or_default();
+    (at(took.len() / 2), at(took.len().saturating_sub(1)))
+}
+
+/// A manager that runs until it is ended.
+fn live(linux: &Linux) -> Result<Box<dyn FnOnce() + '_>> {
+    let manager = linux.manager()?;
+    Ok(Box::new(move || manager.system.stop()))
 }
 
 /// A who-has of another vehicle.
 fn another_vehicle(linux: &Linux, socket: &Datagrams) -> Result<Attack> {
     let (unit, _) = linux.vehicle(OTHER, None)?;
-    let (bytes, _) = recorded(socket, Role::SUnit)?;
+    let attack = Attack::another_vehicle(socket);
     unit.stop();
-    Ok(Attack { name: "recorded who-has of another vehicle", said: vec![bytes], _silent: Vec::new() })
-}
-
-/// Announces of the manager, each of another life, with the discovery key of a stolen vehicle.
-fn forged(linux: &Linux) -> Result<Attack> {
-    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?;
-    let ring = linux.ground.ring(&agv(OTHER));
-    let codes = Codes::Keyed(Lent(&ring));
-    let tcp_port = listener.local_addr()?.port();
-    let announce = |_| {
-        let epoch = Epoch(fastrand::u64(..));
-        let (sequence, room, expected) = (u32::MAX, 100, u16::MAX);
-        let announce = Announce { identity: depot(), epoch, sequence, nonce: 0, tcp_port, room, expected };
-        let mut out = [0; SEARCH_BYTES];
-        announce.encode(linux.ground.fleet, &codes, None, &mut out).map(<[u8]>::to_vec).context("it fits")
-    };
-    let said = (0..200).map(announce).collect::<Result<_>>()?;
-    Ok(Attack { name: "announces forged with a stolen discovery key", said, _silent: vec![listener] })
+    attack
 }
 
 /// The next who-has of a unit of this role that goes to all.

@@ -9,6 +9,7 @@ mod image;
 mod sizes;
 mod uf2;
 
+use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -80,9 +81,18 @@ fn tested() -> Result<Option<i32>> {
 
 /// Attacks the emulated board and writes the figures to a file; why not, where it cannot be.
 pub(crate) fn attack(figures: &Path) -> Result<Option<String>> {
+    attacked(&["security".as_ref(), "--json".as_ref(), figures.as_os_str()])
+}
+
+/// Starts emulated boards beside recorded and forged discovery; why not, where it cannot be.
+pub(crate) fn kept_away(starts: &str) -> Result<Option<String>> {
+    attacked(&["kept-away".as_ref(), "--starts".as_ref(), starts.as_ref()])
+}
+
+fn attacked(arguments: &[&OsStr]) -> Result<Option<String>> {
     let attacked = || {
         let image = tested_image()?;
-        tests(&image)?.args(["security", "--json"]).args([figures]).code()
+        tests(&image)?.args(arguments).code()
     };
     match emulated(attacked) {
         Outcome::Passed => Ok(None),

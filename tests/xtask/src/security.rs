@@ -19,6 +19,9 @@ pub(crate) struct Security {
     /// Tries some of everything, and leaves the boards out.
     #[arg(long)]
     quick: bool,
+    /// Only measures how long vehicles and boards take to join beside recorded and forged discovery: so many for each attack.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000), conflicts_with_all = ["quick", "json"])]
+    starts: Option<u32>,
     /// Also writes the figures here.
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
@@ -26,9 +29,23 @@ pub(crate) struct Security {
 
 /// The command: the table, and success only if no attack came to anything.
 pub(crate) fn run(options: &Security) -> Result<ExitCode> {
+    if let Some(starts) = options.starts {
+        return kept_away(starts);
+    }
     options.json.as_deref().map_or(Ok(()), files::can_write)?;
     let extent = if options.quick { Extent::Quick } else { Extent::Full };
     if let Some(reason) = attack(extent, options.json.as_deref())? {
+        println!("without boards: {reason}");
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Starts Linux vehicles and boards beside each attack.
+fn kept_away(starts: u32) -> Result<ExitCode> {
+    let starts = starts.to_string();
+    let run = ["run", "--quiet", "--release", "--package", "cara-security", "--", "--starts", &starts];
+    Run::cargo().args(run).stream()?;
+    if let Some(reason) = firmware::kept_away(&starts)? {
         println!("without boards: {reason}");
     }
     Ok(ExitCode::SUCCESS)
