@@ -203,7 +203,7 @@ impl Shared {
             if state.is_over {
                 return false;
             }
-            state = self.wait(state, left.map(|left| left.clamp(Duration::from_micros(1), LOOK)));
+            state = self.wait(state, left.map(until_next_look));
         }
     }
 
@@ -223,6 +223,12 @@ impl Shared {
         }
         is_late
     }
+}
+
+/// How long the thread waits where so much of the lease is left. Nothing is left of a lease whose hook was started early:
+/// until the unit reports its end there is nothing to hurry for.
+fn until_next_look(left: Duration) -> Duration {
+    if left == Duration::ZERO { LOOK } else { left.min(LOOK) }
 }
 
 #[cfg(test)]
@@ -280,6 +286,12 @@ mod tests {
         std::thread::sleep(std::time::Duration::from_millis(60));
         safe.end();
         assert_eq!(runs.load(Ordering::SeqCst), 1);
+    }
+
+    #[test]
+    fn the_thread_rests_between_two_looks() {
+        let waits = [0, 1, 5_000, 3_600_000_000].map(|left| until_next_look(Duration::from_micros(left)).as_micros());
+        assert_eq!(waits, [20_000, 1, 5_000, 20_000]);
     }
 
     /// What one link writes waits for what another one is writing.
