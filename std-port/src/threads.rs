@@ -263,9 +263,10 @@ impl Crew {
         }
         // Under the lock: what comes to be due from here on brings the new time forward again.
         let to = to();
-        let first = due.next();
+        let before = due.next();
         due.set(u32::from(seat), to);
-        if let Some(next) = due.next().filter(|_| first == Some(from)) {
+        // Also where another unit comes first: `to` may be before its time.
+        if let Some(next) = due.next().filter(|next| before != Some(*next)) {
             self.alarm.set(next.since(self.clock.now()));
         }
         Some(to)
@@ -576,6 +577,31 @@ mod tests {
         crew.wake_at(4, between);
         assert_eq!(crew.put_off(4, later, || later), None, "something is due before");
         assert_eq!(lock(&crew.due).next(), Some(between));
+    }
+
+    /// The clock waits with the alarm set to what is due first, and is not woken.
+    #[test]
+    fn the_alarm_is_set_to_what_is_due_first_whichever_unit_it_is_for() {
+        let threads = Threads::new().unwrap();
+        let crew = threads.crew();
+        let (hour, now) = (Duration::from_secs(3_600), crew.clock.now());
+        let (first, later) = (now + hour, now + hour + hour);
+        for (seat, at) in [(1, first), (4, later)] {
+            crew.wake_at(seat, at);
+        }
+        crew.clock_waker.reset();
+        let goes_off = |within: Duration| {
+            let mut events = Events::new(1);
+            crew.clock_epoll.wait(&mut events, Some(within)).unwrap();
+            events.iter().next().is_some()
+        };
+        assert!(!goes_off(Duration::ZERO));
+        let soon = crew.clock.now() + Duration::from_millis(20);
+        assert_eq!(crew.put_off(4, later, || soon), Some(soon));
+        assert!(goes_off(Duration::from_secs(20)), "unit 4 is due before unit 1, and the alarm is not set");
+        assert_eq!(crew.put_off(4, soon, || later), Some(later));
+        assert_eq!(crew.put_off(1, first, || later + hour), Some(later + hour));
+        assert!(!goes_off(Duration::from_millis(40)), "both are put off");
     }
 
     #[test]
