@@ -1,8 +1,11 @@
 //! The port's clock: monotonic, microseconds since the unit was made, those included during which the system was suspended.
 //! Leases, ages and deadlines go by it, so that none of them survives a suspension that was longer.
 
-use cara_core::time::Instant;
+use cara_core::time::{Duration, Instant};
 use rustix::time::{ClockId, clock_gettime};
+
+/// What a new clock shows.
+const FIRST: u64 = 1_000_000;
 
 /// Tells the time to the core. Copies agree.
 #[derive(Clone, Copy, Debug)]
@@ -35,7 +38,12 @@ impl Clock {
         let elapsed = boot_time().saturating_sub(self.start);
         #[cfg(test)]
         let elapsed = elapsed + self.ahead.map_or(0, |ahead| ahead.load(std::sync::atomic::Ordering::SeqCst));
-        Instant::from_micros(elapsed.saturating_add(1_000_000))
+        Instant::from_micros(elapsed.saturating_add(FIRST))
+    }
+
+    /// A time of this clock on the system's boot clock.
+    pub(crate) fn boot_time_of(&self, time: Instant) -> Duration {
+        Duration::from_micros(time.as_micros().saturating_sub(FIRST).saturating_add(self.start))
     }
 }
 
@@ -58,5 +66,8 @@ mod tests {
         // /proc/uptime tells it in hundredths of a second.
         assert!(uptime * 1e6 >= before as f64 - 20_000.0);
         assert!(clock.now() >= Instant::from_micros(1_000_000));
+        let earlier = boot_time();
+        let now = clock.boot_time_of(clock.now()).as_micros();
+        assert!((earlier..=boot_time()).contains(&now));
     }
 }

@@ -32,8 +32,8 @@ const DATAGRAM: usize = 2048;
 const WAKER: u64 = u64::MAX;
 /// The clock looks at the time this often at least.
 const LONGEST_WAIT: Duration = Duration::from_millis(250);
-/// The clock waits for less than this by itself, and for more by its alarm, which can be put off meanwhile.
-const ALARMED: Duration = Duration::from_millis(1);
+/// The clock sleeps through less than this, and sets its alarm for more, which can be put off meanwhile.
+const SHORTEST_ALARM: Duration = Duration::from_millis(1);
 /// Events of sockets that are taken in one look.
 const CLOCK_EVENTS: usize = 64;
 /// Bits of a token below the unit's number: what the event is about.
@@ -267,7 +267,7 @@ impl Crew {
         due.set(u32::from(seat), to);
         // Also where another unit comes first: `to` may be before its time.
         if let Some(next) = due.next().filter(|next| before != Some(*next)) {
-            self.alarm.set(next.since(self.clock.now()));
+            self.alarm.set(self.clock.boot_time_of(next));
         }
         Some(to)
     }
@@ -486,7 +486,7 @@ impl Crew {
                 let now = self.clock.now();
                 match due.pop_due(now) {
                     Some(seat) => seat as u16,
-                    None => return self.wait_for(due.next().unwrap_or(Instant::FAR_FUTURE).since(now)),
+                    None => return self.set_alarm(now, due.next().unwrap_or(Instant::FAR_FUTURE)),
                 }
             };
             if let Some(next) = self.enter(token(seat, 0), |driven| driven.keep_time()) {
@@ -495,14 +495,15 @@ impl Crew {
         }
     }
 
-    /// How long to wait for something that is due after `span`. The wait itself stands still while the system is suspended,
-    /// and the clock goes on.
-    fn wait_for(&self, span: Duration) -> Duration {
-        if span < ALARMED {
-            return span;
+    /// Sets the alarm for what is due first; returns how long to wait at most. The wait itself stands still while the system
+    /// is suspended, and the alarm goes on.
+    fn set_alarm(&self, now: Instant, first: Instant) -> Duration {
+        let left = first.since(now);
+        if left < SHORTEST_ALARM {
+            return left;
         }
-        if span < LONGEST_WAIT {
-            self.alarm.set(span);
+        if left < LONGEST_WAIT {
+            self.alarm.set(self.clock.boot_time_of(first));
         }
         LONGEST_WAIT
     }

@@ -22,12 +22,14 @@ impl Alarm {
         Ok(Self { timer: timerfd_create(TimerfdClockId::Boottime, flags)? })
     }
 
-    /// Sets it to go off once after `span`, at least a microsecond, instead of when it was set to before.
-    pub fn set(&self, span: Duration) {
-        let it_value = timespec(span.max(Duration::from_micros(1)));
+    /// Sets it to go off once at a time on the boot clock, instead of when it was set to before; at once if that has
+    /// passed. A thread that is held up on its way here does not make it late.
+    pub fn set(&self, boot_time: Duration) {
+        // Zero would unset it.
+        let it_value = timespec(boot_time.max(Duration::from_micros(1)));
         let once = Itimerspec { it_interval: timespec(Duration::ZERO), it_value };
         // The arguments are valid, and nothing else can fail here.
-        let _ = timerfd_settime(&self.timer, TimerfdTimerFlags::empty(), &once);
+        let _ = timerfd_settime(&self.timer, TimerfdTimerFlags::ABSTIME, &once);
     }
 }
 
@@ -41,21 +43,40 @@ impl AsFd for Alarm {
 mod tests {
     use super::super::epoll::{Epoll, Events, Interest};
     use super::*;
+    use rustix::time::{ClockId, clock_gettime};
+
+    /// So long from now, on the boot clock.
+    fn after(span: Duration) -> Duration {
+        let now = clock_gettime(ClockId::Boottime);
+        Duration::from_micros(now.tv_sec as u64 * 1_000_000 + now.tv_nsec as u64 / 1_000) + span
+    }
 
     #[test]
     fn it_goes_off_once_each_time_it_is_set_and_not_while_it_is_put_off() {
         let (set, alarm, mut events) = (Epoll::new().unwrap(), Alarm::new().unwrap(), Events::new(1));
         set.add(&alarm, 7, Interest::READ_EDGE).unwrap();
         for _ in 0..2 {
-            alarm.set(Duration::from_millis(1));
+            alarm.set(after(Duration::from_millis(1)));
             set.wait(&mut events, Some(Duration::from_secs(20))).unwrap();
             assert_eq!(events.iter().map(|ready| ready.token).collect::<Vec<_>>(), [7]);
             set.wait(&mut events, Some(Duration::from_millis(10))).unwrap();
             assert!(events.is_empty(), "once");
         }
-        alarm.set(Duration::from_secs(60));
-        alarm.set(Duration::from_secs(600));
+        alarm.set(after(Duration::from_secs(60)));
+        alarm.set(after(Duration::from_secs(600)));
         set.wait(&mut events, Some(Duration::ZERO)).unwrap();
         assert!(events.is_empty());
+    }
+
+    /// The time was read before it passed, and the thread was held up before it set the alarm.
+    #[test]
+    fn a_time_that_has_passed_meanwhile_is_not_waited_for_again() {
+        let (set, alarm, mut events) = (Epoll::new().unwrap(), Alarm::new().unwrap(), Events::new(1));
+        set.add(&alarm, 7, Interest::READ_EDGE).unwrap();
+        for passed in [after(Duration::ZERO), Duration::ZERO] {
+            alarm.set(passed);
+            set.wait(&mut events, Some(Duration::from_secs(20))).unwrap();
+            assert!(!events.is_empty(), "{passed:?}");
+        }
     }
 }

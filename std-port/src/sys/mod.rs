@@ -12,7 +12,7 @@ pub mod stream;
 use cara_core::time::Duration;
 use rustix::time::Timespec;
 
-/// A span as the kernel takes it; [`Duration::MAX`] and the like become the longest span that it can hold.
+/// A span, or a time since the start of a clock, as the kernel takes it; [`Duration::MAX`] and the like become the longest span that it can hold.
 fn timespec(span: Duration) -> Timespec {
     let micros = span.as_micros();
     Timespec {
