@@ -1,8 +1,9 @@
 //! What broadcasts say of where a node may be: hints, which anybody who has recorded one can give.
 //!
 //! A hint leads to one question with a fresh nonce, to the address that it came from, and to nothing else; what is dialled
-//! has answered it. An address that has not answered is asked later and later, however often it is heard, and takes no
-//! place from another one. The unit's own search goes on beside: a hint delays it once, by a second at most.
+//! has answered it. An address that has not answered is asked later and later, however often it is heard, and gives way
+//! to another one a second after it was asked. The unit's own search goes on beside: a hint delays it once, by a second
+//! at most.
 
 use core::net::{IpAddr, SocketAddr};
 
@@ -14,7 +15,7 @@ use crate::distribution::authenticator::Authenticator;
 use crate::distribution::hello::Manager;
 use crate::distribution::identity::Identity;
 use crate::host::mailman::Mailman;
-use crate::storage::Storage;
+use crate::storage::{Storage, take_at};
 use crate::time::{Duration, Instant};
 
 /// Addresses that are asked side by side.
@@ -71,9 +72,10 @@ impl Hints {
             return is_free;
         }
         if self.list.is_full() {
-            let rests = |hint: &Hint| hint.due.is_none() && hint.since + STAY <= now;
-            let Some(old) = self.list.iter().position(rests) else { return false };
-            self.list.swap_remove(old);
+            // The one that was asked longest ago, even if it is to be asked again: it has had its time to answer.
+            let asked = self.list.iter().enumerate().filter(|(_, hint)| hint.asked > 0 && hint.since + STAY <= now);
+            let Some((oldest, _)) = asked.min_by_key(|(_, hint)| hint.since) else { return false };
+            take_at(&mut self.list, oldest);
         }
         let who = who.clone();
         self.list.push(Hint { from, who, due: Some(due), asked: 0, not_before: now, since: now }).is_ok()

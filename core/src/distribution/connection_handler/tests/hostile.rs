@@ -107,6 +107,22 @@ fn hints_lead_to_few_questions_and_delay_nothing() {
     }
 }
 
+/// As many addresses as are asked side by side are told of again and again, and no node answers there.
+#[test]
+fn addresses_that_do_not_answer_give_way_to_a_new_one() {
+    let mut node = node(s_unit("agv", 1));
+    let (mut outbox, depot) = (Outbox::default(), m_unit(MANAGER, MANAGER_ID));
+    for count in 0..400 {
+        let now = at(u64::from(count) * 25);
+        run(&mut node, now, &mut outbox);
+        node.hear(now, address(2 + count % 4, 7_001), &announce_bytes(&announce_of(&depot, count, 0)));
+        if count >= 200 {
+            node.hear(now, address(9, 7_001), &announce_bytes(&announce_of(&depot, count, 0)));
+        }
+    }
+    assert!(outbox.sent.iter().any(|(to, _)| *to == address(9, 7_001)), "the new one is never asked");
+}
+
 /// How many searches a unit sends within ten minutes in which `others` ask every `pause`.
 fn searches_among(others: &NodeConfig, pause: Duration, seed: u64) -> usize {
     let mut node = node(NodeConfig { seed, ..s_unit("agv", 1) });
