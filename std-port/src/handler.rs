@@ -145,8 +145,8 @@ impl<T> ServiceOptions<T> {
         self
     }
 
-    /// What the service starts goes on for this long after the caller's last sign that it wants it; then `safe` runs,
-    /// once, and the next order of the service comes after it.
+    /// What the service starts goes on for this long after the caller's last sign that it wants it, 20 ms at least; then
+    /// `safe` runs, once, and the next order of the service comes after it.
     ///
     /// The hook has a thread of its own and waits for nothing: not for the application's state, which it does not get, nor
     /// for other hooks, nor for any handler. It owns what it switches off (a pin, a descriptor, an atomic that the motor's

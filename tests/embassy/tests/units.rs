@@ -320,7 +320,7 @@ fn what_is_cancelled_makes_room_for_the_next() {
         }
     });
     assert_eq!(manager.counted(LinkCounter::RequestsSent), 20);
-    assert_eq!(manager.counted(LinkCounter::CallsTimedOut), 20, "none waits for its reply any more");
+    assert_eq!(manager.counted(LinkCounter::CallsCancelled), 20, "none waits for its reply any more");
     assert_eq!(ask(&bench, &manager_board, manager, "agv", "go_to", 3), Ok(3));
 }
 

@@ -63,6 +63,8 @@ crate::counters::counters! {
         RequestsWithheld,
         /// Calls that ended without an answer in time.
         CallsTimedOut,
+        /// Calls that their callers gave up before the answer, and in time.
+        CallsCancelled,
         /// Answers to calls that had ended already.
         RepliesLate,
         /// Answers that could not be sent.
@@ -75,5 +77,7 @@ crate::counters::counters! {
         LeasesExpired,
         /// Renewals that came for no running lease.
         RenewalsIgnored,
+        /// Leases of calls of this unit that it renews no longer because newer calls of the same function took their places.
+        RenewalsStopped,
     }
 }

@@ -17,6 +17,9 @@ use crate::time::{Duration, Instant};
 
 /// A held lease is renewed this often within its length, so that lost renewals do not end it.
 const RENEWALS_PER_LEASE: u64 = 4;
+/// But no more often, which is how often a lease of 20 ms is: a peer may publish a shorter one, which is over before it is
+/// renewed, and the renewals are not to fill the network.
+const SHORTEST_RENEWAL: Duration = Duration::from_millis(5);
 /// After this a release that the stream had no room for is tried again, if the stream has not become writable before.
 const RETRY: Duration = Duration::from_millis(20);
 
@@ -49,12 +52,14 @@ impl<S: Storage, C: Secure> Session<S, C> {
         class: Priority,
         lease: Duration,
     ) {
+        // Not refused: the new call may be the one that stops what the earlier ones started, whose leases it takes over.
         if self.held.is_full()
             && let Some(oldest) = self.oldest_held(header.slot)
         {
             take_at(&mut self.held, oldest);
+            self.link.counters.add(LinkCounter::RenewalsStopped, 1);
         }
-        let every = lease.divided_by(RENEWALS_PER_LEASE);
+        let every = lease.divided_by(RENEWALS_PER_LEASE).max(SHORTEST_RENEWAL);
         let (call, slot, next) = (CallId(header.id), header.slot, cx.now + every);
         let _ = self.held.push(Held { call, slot, class, every, next, is_released: false });
         self.timers.renewal = self.timers.renewal.min(next);
@@ -88,8 +93,11 @@ impl<S: Storage, C: Secure> Session<S, C> {
     /// begin, is released. Other calls are untouched. Also for a call that has been answered, whose lease goes on.
     pub fn cancel<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>, id: CallId) {
         let pending = self.requests.close(id);
-        if pending.is_some() {
-            self.link.counters.add(LinkCounter::CallsTimedOut, 1);
+        if let Some(pending) = &pending {
+            // Its caller may have noticed the time-out before this session was polled.
+            let is_late = pending.deadline <= cx.now;
+            let counter = if is_late { LinkCounter::CallsTimedOut } else { LinkCounter::CallsCancelled };
+            self.link.counters.add(counter, 1);
         }
         self.let_go(cx, id, pending);
     }

@@ -47,6 +47,24 @@ fn a_lease_that_is_renewed_goes_on() {
     assert_eq!(expirations(&pair), 0);
 }
 
+/// A lease of 20 ms is renewed as often as it has to be; one that a peer makes shorter, no more often.
+#[test]
+fn renewals_of_a_short_lease_do_not_fill_the_network() {
+    for (millis, lives) in [(5, false), (20, true)] {
+        let mut pair = Pair::live();
+        let slot = pair.agv.offer_leased("go()", Duration::from_millis(millis));
+        pair.publish();
+        let before = pair.manager.counter(LinkCounter::DatagramsSent);
+        for _ in 0..10 {
+            let _ = pair.manager.call("go", &none());
+            pair.run(Duration::from_millis(10));
+            assert_eq!(pair.agv.is_live(slot), lives);
+        }
+        let sent = pair.manager.counter(LinkCounter::DatagramsSent) - before;
+        assert!(sent <= 40, "{sent} datagrams in 100 ms");
+    }
+}
+
 #[test]
 fn a_lease_that_is_not_renewed_expires_once_in_time() {
     let (mut pair, slot) = moving(false);

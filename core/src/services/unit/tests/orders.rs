@@ -225,6 +225,7 @@ fn in_a_full_table_the_oldest_call_of_the_function_gives_way() {
     pair.manager.net.frozen = true;
     let calls = [0; 5].map(|_| go(&mut pair, Priority::Normal, true));
     assert_eq!(calls.map(|call| pair.manager.session.holds(call)), [false, true, true, true, true]);
+    assert_eq!(pair.manager.counter(LinkCounter::RenewalsStopped), 1);
     calls.into_iter().for_each(|call| pair.manager.cancel(call));
     pair.manager.net.frozen = false;
     pair.settle();

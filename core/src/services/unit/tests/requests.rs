@@ -143,6 +143,20 @@ fn a_call_that_is_given_up_ends_without_an_event() {
     pair.agv.answer_held(Ok(&*none()));
     pair.run(Duration::from_secs(3));
     assert_eq!((pair.manager.outcome(id), pair.manager.counter(LinkCounter::RepliesLate)), (None, 1));
+    let counted = [LinkCounter::CallsCancelled, LinkCounter::CallsTimedOut].map(|which| pair.manager.counter(which));
+    assert_eq!(counted, [1, 0]);
+}
+
+#[test]
+fn a_time_out_that_the_caller_notices_first_is_one() {
+    let mut pair = Pair::live();
+    pair.agv.offer_held("wait()");
+    pair.publish();
+    let id = pair.manager.call("wait", &none()).unwrap();
+    pair.manager.now = pair.manager.now + Duration::from_secs(2);
+    pair.manager.cancel(id);
+    let counted = [LinkCounter::CallsCancelled, LinkCounter::CallsTimedOut].map(|which| pair.manager.counter(which));
+    assert_eq!(counted, [0, 1]);
 }
 
 #[test]
