@@ -5,9 +5,8 @@
 //! model reports that. With `--cfg cara_planted="lost_wakeup"` it must fail.
 //!
 //! ```text
-//! RUSTFLAGS='--cfg loom' cargo test -p cara-std --release --target-dir target/loom --test hand_over
+//! cargo test -p cara-std --test hand_over
 //! ```
-#![cfg(loom)]
 
 #[allow(dead_code, reason = "the file is included for the type it defines; not every function is modelled")]
 #[path = "../src/engine/reader.rs"]

@@ -1,14 +1,12 @@
 //! Builds with each bug that is planted behind a test-only cfg, and requires that the scenarios find it.
 //!
-//! `planted [BUG…]`; all of them without a name. The cfg reaches the crates of the workspace alone, through a wrapper of
-//! the compiler: what they depend on is that of every other build.
+//! `planted [BUG…]`; all of them without a name.
 
-use std::fs::{self, Permissions};
-use std::io;
-use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode, Output};
 use std::time::Instant;
+
+use cara_processes::planted;
 
 const RUN: &[&str] = &["run", "--package", "cara-scenarios", "--bin", "seeds", "--", "--seeds", "10"];
 const BUILD: &[&str] = &["build", "--package", "cara-scenarios", "--bin", "seeds"];
@@ -33,7 +31,7 @@ fn main() -> ExitCode {
 /// Whether the run fails because of the bug, rather than the build.
 fn finds(bug: &str) -> bool {
     let start = Instant::now();
-    let wrapper = wrapper(bug).expect("the target folder can be written");
+    let wrapper = planted::wrapper(&root(), bug).expect("the target folder can be written");
     let built = cargo(&wrapper, BUILD);
     if !built.status.success() {
         println!("{bug}: does not build\n{}", String::from_utf8_lossy(&built.stderr));
@@ -65,17 +63,6 @@ fn finders(text: &str) -> Vec<String> {
         }
     }
     finders
-}
-
-/// Writes a wrapper of the compiler that plants the bug. Cargo tells builds apart by its path, so that no other build sees
-/// what it compiles.
-fn wrapper(bug: &str) -> io::Result<PathBuf> {
-    let folder = root().join("target/planted").join(bug);
-    fs::create_dir_all(&folder)?;
-    let file = folder.join("rustc-with-bug");
-    fs::write(&file, format!("#!/bin/sh\nexec \"$@\" --cfg 'cara_planted=\"{bug}\"'\n"))?;
-    fs::set_permissions(&file, Permissions::from_mode(0o755))?;
-    Ok(file)
 }
 
 fn cargo(wrapper: &Path, arguments: &[&str]) -> Output {
