@@ -9,7 +9,7 @@
 use core::num::NonZeroU32;
 use core::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 
-use crate::config::{LEASES, Priority};
+use crate::config::Priority;
 use crate::distribution::function_list::{Generation, Slot};
 pub use crate::distribution::message::LeaseEnd;
 use crate::error::Error;
@@ -236,9 +236,6 @@ pub(crate) struct Held {
     /// It is renewed no more, and the release is still to be sent in the stream.
     pub(crate) is_released: bool,
 }
-
-pub(crate) type GrantedLeases = heapless::Vec<Granted, LEASES>;
-pub(crate) type HeldLeases = heapless::Vec<Held, LEASES>;
 
 #[cfg(test)]
 #[allow(clippy::arithmetic_side_effects, clippy::indexing_slicing, clippy::unwrap_used)]

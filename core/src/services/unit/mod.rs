@@ -37,7 +37,7 @@ pub use publishing::Publication;
 
 use core::net::SocketAddr;
 
-use crate::config::{Constraints, HELLO_TIMEOUT, LINK_BUFFER_BYTES, Mode, Priority};
+use crate::config::{Constraints, HELLO_TIMEOUT, LEASES, LINK_BUFFER_BYTES, Mode, Priority};
 use crate::counters::Counters;
 use crate::distribution::function_list::{Entry, Slot, TheirFunctionList};
 use crate::distribution::hello::Hello;
@@ -51,7 +51,7 @@ use crate::host::mailman::{LinkId, Mailman};
 use crate::host::secure::Secure;
 use crate::services::Context;
 use crate::services::calls::{CallHead, Calls, Ticket};
-use crate::services::lease::{GrantedLeases, HeldLeases, LeaseEnd, Order, Service};
+use crate::services::lease::{Granted, Held, LeaseEnd, Order, Service};
 use crate::services::requests::{CallId, Pending, Requests};
 use crate::storage::{Buffers, Storage};
 use crate::time::{Duration, Instant};
@@ -209,9 +209,9 @@ pub struct Session<S: Storage, C: Secure> {
     calls: Calls<S>,
     publishing: publishing::Publishing<S>,
     theirs: TheirFunctionList<S>,
-    granted: GrantedLeases,
+    granted: heapless::Vec<Granted, LEASES>,
     ends: granting::Ends,
-    held: HeldLeases,
+    held: heapless::Vec<Held, LEASES>,
     releases: holding::Releases,
 }
 
@@ -245,9 +245,9 @@ impl<S: Storage, C: Secure> Session<S, C> {
             calls: Calls::new(storage.running),
             publishing: publishing::Publishing::new(storage.publications),
             theirs: TheirFunctionList::new(storage.their_functions, storage.their_signatures),
-            granted: GrantedLeases::new(),
+            granted: heapless::Vec::new(),
             ends: granting::Ends::new(),
-            held: HeldLeases::new(),
+            held: heapless::Vec::new(),
             releases: holding::Releases::new(),
         }
     }
