@@ -163,13 +163,18 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     /// Searches for nodes and keeps connections, in threads of its own (paper, listing line 2).
     ///
     /// First it asks for its own identity and waits 300 ms: [`StartError::AlreadyRunning`] where a live m_unit answers.
-    /// One that is stopped (`SIGSTOP`) or hangs does not answer, and its links go to this one. See
+    /// One that is stopped (`SIGSTOP`) or hangs does not answer; on this host it holds its control socket, which is
+    /// [`StartError::SocketHeld`]. From one on another host, or without a socket, the links go to this one. See
     /// [`Builder::beside_another`].
     #[doc(alias = "start_thread")]
     pub fn start(&self) -> Result<(), StartError> {
+        #[cfg(not(feature = "control"))]
         self.engine().start()?;
         #[cfg(feature = "control")]
-        self.owner.open_control();
+        {
+            self.engine().start_unless(|| control::held(&self.owner.control, &self.identity(), self.fleet()))?;
+            self.owner.open_control();
+        }
         Ok(())
     }
 

@@ -2,20 +2,43 @@
 
 use std::fmt;
 use std::net::SocketAddr;
+use std::path::PathBuf;
 
+use cara_core::distribution::identity::{Fleet, Identity};
 use cara_core::error::Error;
 
 /// Why a unit does not start.
-#[derive(Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[derive(Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum StartError {
     /// A live m_unit has this name, id and fleet. With keys the answer was proven by a key that only this identity has.
     #[error(
-        "an m_unit with this name and id is running already, at {at}: stop it first, or give this one its own name or id"
+        "the m_unit {identity} of fleet {} is running already, {}: stop it first, or give this one its own name or id",
+        fleet.0, place(at)
     )]
     AlreadyRunning {
+        /// The identity of both.
+        identity: Identity,
+        /// Their fleet.
+        fleet: Fleet,
         /// The address at which it takes links; port 0 of one that is about to start.
         at: SocketAddr,
+    },
+    /// A process of this host has the control socket of an m_unit of this name, id and fleet, and does not answer on the
+    /// network: it hangs, is stopped, or is of another mode.
+    #[error(
+        "the m_unit {identity} of fleet {} is running already: a process of this host holds its control socket {}, and does \
+         not answer as this one would. It hangs or is stopped (state T in `ps`; `kill -CONT` lets it go on), or it has other \
+         keys or none: end it first, or give this one its own name or id",
+        fleet.0, path.display()
+    )]
+    SocketHeld {
+        /// The identity of both.
+        identity: Identity,
+        /// Their fleet.
+        fleet: Fleet,
+        /// The socket.
+        path: PathBuf,
     },
     /// Something about the unit itself, or what the system refuses.
     #[error(transparent)]
@@ -23,16 +46,28 @@ pub enum StartError {
 }
 
 impl StartError {
-    /// The exit code with which `cara node` and the examples end where another one [runs already](Self::AlreadyRunning): a
-    /// supervisor should not start them again.
+    /// The exit code with which `cara node` and the examples end where another one [runs already](Self::is_running_already):
+    /// a supervisor should not start them again.
     pub const ALREADY_RUNNING_EXIT: u8 = 5;
+
+    /// Whether another one of this identity is why it does not start.
+    pub fn is_running_already(&self) -> bool {
+        matches!(self, Self::AlreadyRunning { .. } | Self::SocketHeld { .. })
+    }
 
     /// The error's name, for programs.
     pub fn code(&self) -> String {
         match self {
-            Self::AlreadyRunning { .. } => "AlreadyRunning".to_owned(),
+            Self::AlreadyRunning { .. } | Self::SocketHeld { .. } => "AlreadyRunning".to_owned(),
             Self::Unit(error) => format!("{error:?}"),
         }
+    }
+}
+
+fn place(at: &SocketAddr) -> String {
+    match at.port() {
+        0 => format!("on {}, and about to take links", at.ip()),
+        _ => format!("at {at}"),
     }
 }
 
@@ -61,9 +96,15 @@ mod tests {
     #[test]
     fn what_main_prints_is_the_sentence() {
         let at = SocketAddr::from(([127, 0, 0, 1], 4000));
-        let error = BuildError::from(StartError::AlreadyRunning { at });
+        let (identity, fleet) = (Identity::m_unit("depot", 1).unwrap(), Fleet(7));
+        let running = |at| BuildError::from(StartError::AlreadyRunning { identity: identity.clone(), fleet, at });
+        let error = running(at);
         assert_eq!(format!("{error:?}"), error.to_string());
-        assert!(format!("{error:?}").contains("127.0.0.1:4000"), "{error:?}");
+        for part in ["depot/1 of fleet 7", "at 127.0.0.1:4000"] {
+            assert!(format!("{error:?}").contains(part), "{error:?}");
+        }
+        let about_to_start = running(SocketAddr::from(([127, 0, 0, 1], 0))).to_string();
+        assert!(!about_to_start.contains(":0") && about_to_start.contains("on 127.0.0.1,"), "{about_to_start}");
         let error = BuildError::from(Error::PortInUse);
         assert!(format!("{error:?}").contains("choose another port"), "{error:?}");
     }

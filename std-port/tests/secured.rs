@@ -43,8 +43,10 @@ fn keys(fleet: Fleet, vehicles: &[u32]) -> FleetKeys {
     keys
 }
 
+/// Without a control socket, which would tell of it beside the network.
 fn manager(fleet: Fleet) -> Builder<()> {
-    CommunicationSystem::builder("depot", 1).unwrap().fleet(fleet.0).interfaces(Interfaces::Loopback)
+    let builder = CommunicationSystem::builder("depot", 1).unwrap().fleet(fleet.0);
+    builder.interfaces(Interfaces::Loopback).control(cara_std::control::Control::Off)
 }
 
 fn vehicle(fleet: Fleet, id: u32) -> Builder<()> {
@@ -171,7 +173,10 @@ fn a_manager_starts_once_and_again_when_the_first_has_stopped() {
     let first = started_manager(manager(fleet).keys(root.ring(&depot()).unwrap()));
     let second = manager(fleet).keys(root.ring(&depot()).unwrap()).build_system().unwrap();
     let running = second.start();
-    assert!(matches!(running, Err(StartError::AlreadyRunning { at }) if at.port() == first.tcp_port()), "{running:?}");
+    assert!(
+        matches!(running, Err(StartError::AlreadyRunning { at, .. }) if at.port() == first.tcp_port()),
+        "{running:?}"
+    );
     started_manager(manager(fleet).keys(keys(fleet, &[7]).ring(&depot()).unwrap())).stop();
     started_manager(manager(other).keys(keys(other, &[]).ring(&depot()).unwrap())).stop();
     started_manager(manager(fleet).keys(root.ring(&depot()).unwrap()).beside_another()).stop();

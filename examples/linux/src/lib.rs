@@ -24,7 +24,7 @@ pub fn log_to_stderr() {
 /// again.
 pub fn ended(outcome: anyhow::Result<()>) -> anyhow::Result<ExitCode> {
     match outcome {
-        Err(error) if matches!(error.downcast_ref(), Some(StartError::AlreadyRunning { .. })) => {
+        Err(error) if error.downcast_ref().is_some_and(StartError::is_running_already) => {
             eprintln!("error: {error}");
             Ok(ExitCode::from(StartError::ALREADY_RUNNING_EXIT))
         }

@@ -71,7 +71,7 @@ impl Ended {
 
     /// A unit does not start.
     pub(crate) fn not_started(error: StartError) -> anyhow::Error {
-        let exit = if let StartError::AlreadyRunning { .. } = error { Exit::AlreadyRunning } else { Exit::Failed };
+        let exit = if error.is_running_already() { Exit::AlreadyRunning } else { Exit::Failed };
         Self { exit, text: error.to_string(), name: error.code() }.into()
     }
 

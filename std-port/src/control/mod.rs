@@ -32,6 +32,8 @@ pub use elsewhere::{Elsewhere, elsewhere};
 pub use place::directory;
 pub(crate) use server::Server;
 
+use cara_core::distribution::identity::{Fleet, Identity};
+
 use crate::CommunicationSystem;
 
 /// Where a running m_unit answers its operator.
@@ -44,6 +46,28 @@ pub enum Control {
     Path(PathBuf),
     /// Nowhere.
     Off,
+}
+
+/// The socket of a unit that is to start, where a process has it that may be one of its identity, whether it answers or not.
+pub(crate) fn held(control: &Control, identity: &Identity, fleet: Fleet) -> Option<PathBuf> {
+    let (path, is_its_own) = match control {
+        Control::Off => return None,
+        Control::Default => {
+            let path = directory().join(place::file_name(identity, fleet));
+            let is_held = place::is_held(&path);
+            (path, is_held)
+        }
+        // Any unit may have been told this path.
+        Control::Path(path) => (
+            path.clone(),
+            match Client::connect(path) {
+                Ok(client) => client.unit().unit == identity.to_string() && client.unit().fleet == fleet.0,
+                Err(ControlError::Silent { .. } | ControlError::Full { .. } | ControlError::Version { .. }) => true,
+                Err(_) => false,
+            },
+        ),
+    };
+    is_its_own.then_some(path)
 }
 
 /// Opens the socket of a unit that has been started. A unit that cannot have one runs without: it is warned of.

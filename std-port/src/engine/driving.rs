@@ -1,9 +1,11 @@
 //! The unit among those that its threads drive: how it begins, what wakes it, and how the threads let go of it.
 
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 use cara_core::config::Mode;
+use cara_core::distribution::identity::{Fleet, Identity};
 use cara_core::error::Error;
 use cara_core::time::Instant;
 
@@ -25,6 +27,12 @@ impl<T: Send + 'static> Engine<T> {
     /// Begins to search and to serve, driven by the unit's threads. One that runs already goes on; one that was stopped
     /// does not start again.
     pub(crate) fn start(self: &Arc<Self>) -> Result<(), StartError> {
+        self.start_unless(|| None)
+    }
+
+    /// As [`start`](Self::start), unless a process of this host `holds` what is this unit's, as one does that hangs and
+    /// does not say that it runs.
+    pub(crate) fn start_unless(self: &Arc<Self>, holds: impl FnOnce() -> Option<PathBuf>) -> Result<(), StartError> {
         if self.is_stopping() {
             return Err(Error::NotRunning.into());
         }
@@ -32,7 +40,12 @@ impl<T: Send + 'static> Engine<T> {
             return Ok(());
         }
         if let Some(at) = self.running_elsewhere().map_err(system_refused)? {
-            return Err(StartError::AlreadyRunning { at });
+            let (identity, fleet) = self.identity();
+            return Err(StartError::AlreadyRunning { identity, fleet, at });
+        }
+        if let Some(path) = self.asks_for_itself.then(holds).flatten() {
+            let (identity, fleet) = self.identity();
+            return Err(StartError::SocketHeld { identity, fleet, path });
         }
         self.crew().start()?;
         let seat = self.crew().seat(self.clone())?;
@@ -42,6 +55,11 @@ impl<T: Send + 'static> Engine<T> {
         self.crew().wake_looker();
         self.wake_clock();
         Ok(())
+    }
+
+    fn identity(&self) -> (Identity, Fleet) {
+        let node = &lock(&self.node).node;
+        (node.identity().clone(), node.fleet())
     }
 
     fn warn_of_plain_mode(&self) {

@@ -9,6 +9,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
+use cara_std::control::Control;
 use cara_std::{CloseReason, Error, Refusal, ServiceOptions, StartError, UnitEvent};
 use rustix::process::{Pid, Signal, kill_process};
 
@@ -95,7 +96,7 @@ fn as_child() {
             std::process::exit(0);
         }
         _ => {
-            let manager = system(fleet).build_system().unwrap();
+            let manager = system(fleet).control(Control::Off).build_system().unwrap();
             manager.start().unwrap();
             until("a vehicle has come", || manager.nodes_offering("go_to").len() == 1);
             manager.nodes_offering("go_to")[0].block_request("go_to", &mut number(1)).unwrap();
@@ -222,7 +223,8 @@ fn a_restart_and_a_twin_are_told_apart() {
     assert_eq!((life("agv"), life("bystander"), manager.number_of_s_units()), (Some(2), Some(20), 2));
 }
 
-/// A manager that runs keeps its place; one that hangs does not answer, and its vehicles go to the one that starts.
+/// A manager that runs keeps its place; one that hangs does not answer, and where no control socket tells of it, its vehicles
+/// go to the one that starts.
 #[test]
 fn a_second_manager_starts_only_where_the_first_does_not_answer() {
     let fleet = fleet();
@@ -230,10 +232,10 @@ fn a_second_manager_starts_only_where_the_first_does_not_answer() {
     let agv = unit("agv", 7, fleet).build_unit().unwrap();
     agv.start().unwrap();
     until("it has joined the first", || agv.is_connected());
-    let second = system(fleet).build_system().unwrap();
+    let second = system(fleet).control(Control::Off).build_system().unwrap();
     let port = agv.manager().and_then(|peer| peer.address()).map(|address| address.port());
     match second.start() {
-        Err(StartError::AlreadyRunning { at }) => assert_eq!(Some(at.port()), port),
+        Err(StartError::AlreadyRunning { at, .. }) => assert_eq!(Some(at.port()), port),
         other => panic!("one runs already: {other:?}"),
     }
     first.freeze();

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
-use crate::support::{PATIENCE, Stage, agv, until};
+use crate::support::{PATIENCE, Ran, Stage, agv, until};
 
 const NODE: [&str; 5] = ["node", "--name", "manager", "--id", "1"];
 
@@ -20,7 +20,7 @@ fn a_second_manager_of_one_identity_does_not_start_and_the_first_goes_on() {
     for json in [false, true] {
         let arguments: Vec<&str> = NODE.into_iter().chain(json.then_some("--json")).collect();
         let refused = stage.ends(5, &arguments);
-        refused.says("is running already, at 127.0.0.1:").says("stop it first");
+        refused.says("manager/1 of fleet").says(" is running already, at 127.0.0.1:").says("stop it first");
         assert!(!json || refused.says("\"AlreadyRunning\"").err.contains("\"exit\":5"), "{}", refused.everything());
     }
     let after = connected(&stage);
@@ -30,6 +30,32 @@ fn a_second_manager_of_one_identity_does_not_start_and_the_first_goes_on() {
     stage.kill_manager();
     stage.start_manager();
     until("the vehicle is back", || stage.ready() == 1);
+}
+
+#[test]
+fn no_manager_starts_beside_one_that_hangs_or_has_other_keys() {
+    let mut stage = Stage::with(&[]);
+    // A node that starts would run on.
+    let refused = |stage: &Stage, arguments: &[&str]| {
+        let node = stage.command(arguments);
+        let mut limited = Command::new("timeout");
+        limited.arg("30").arg(node.get_program()).args(node.get_args());
+        limited.envs(node.get_envs().filter_map(|(name, value)| Some((name, value?)))).env_remove("CARA_INTERFACES");
+        let ran = Ran::of(limited.output().unwrap());
+        assert_eq!(ran.code, 5, "{}", ran.everything());
+        ran
+    };
+    let plain = [&NODE[..], &["--insecure"]].concat();
+    refused(&stage, &plain).says("manager/1 of fleet").says("control socket").says("manager-1-");
+    stage.freeze_manager();
+    for arguments in [&NODE[..], &plain, &[&NODE[..], &["--json"]].concat()] {
+        let refused = refused(&stage, arguments);
+        refused.says("manager/1 of fleet").says("stopped (state T").says("end it first");
+        assert!(!arguments.contains(&"--json") || refused.error()["name"] == "AlreadyRunning");
+    }
+    // A socket without a process holds nothing up.
+    stage.kill_manager();
+    stage.start_manager();
 }
 
 #[test]

@@ -111,6 +111,13 @@ impl Stage {
         manager.wait().unwrap();
     }
 
+    /// The manager stands still, as after Ctrl-Z: the system still takes connections for it.
+    pub(crate) fn freeze_manager(&self) {
+        let manager = self.manager.as_ref().expect("it runs");
+        rustix::process::kill_process(rustix::process::Pid::from_child(manager), rustix::process::Signal::STOP)
+            .unwrap();
+    }
+
     /// The command with the stage's fleet, on loopback, to be run.
     pub(crate) fn command(&self, arguments: &[&str]) -> Command {
         let mut command = Command::new(env!("CARGO_BIN_EXE_cara"));
