@@ -152,6 +152,8 @@ fn who_is_revoked_is_in_nobody_s_file() {
     assert_eq!(generations(&home.ring("depot/1@m_unit"), "agv/1"), [2]);
     assert_eq!(home.json(&["show"])["revoked"], serde_json::json!([]));
     home.refused(&["revoke", "agv/9"], 2, "agv/9 is not in the fleet");
+    let unknown = String::from_utf8(home.cara(&["revoke", "agv/9"]).stderr).unwrap();
+    assert!(!unknown.contains("derive"), "what is to be shut out is not to be added: {unknown}");
     home.refused(&["revoke"], 2, "NODE");
 }
 
@@ -268,7 +270,7 @@ fn every_mistake_is_told() {
     home.refused(&["show", home.file("agv/1").to_str().unwrap()], 1, &text);
     home.refused(&["rotate", "--fleet", "7"], 1, &text);
     home.refused(&["rotate", "--fleet", "7"], 1, "`cara keys revoke --fleet 7 NODE`");
-    home.refused(&["revoke", "--fleet", "7", "agv/9"], 2, "`cara keys derive --fleet 7 agv/9`");
+    home.refused(&["revoke", "--fleet", "7", "agv/9"], 2, "`cara keys show --fleet 7`");
     fs::set_permissions(home.file("agv/1"), fs::Permissions::from_mode(0o600)).unwrap();
     fs::write(home.file("agv/1"), [0xFF; 9]).unwrap();
     home.refused(&["show", home.file("agv/1").to_str().unwrap()], 1, "`cara keys derive --fleet 7`");
@@ -476,6 +478,36 @@ fn a_new_fleet_that_is_interrupted_is_all_there_or_nothing_is() {
         codes.insert(code);
     }
     assert!(codes.len() > 1 || !codes.contains(&Some(0)), "it was never interrupted: {codes:?}");
+}
+
+/// Killed, or without power: what is there is of a root that is there, and one command writes the rest.
+#[test]
+fn a_new_fleet_that_is_killed_leaves_no_keys_without_a_root() {
+    let nodes: Vec<_> =
+        std::iter::once("depot/1@m_unit".to_owned()).chain((1..=300).map(|id| format!("agv/{id}"))).collect();
+    let mut half = 0;
+    for _ in 0..12 {
+        let home = Home::new();
+        fs::create_dir_all(home.folder()).unwrap();
+        let mut command = Command::new(env!("CARGO_BIN_EXE_cara"));
+        command.arg("keys").args(new_fleet(&nodes)).env("HOME", home.0.path()).stdout(Stdio::null());
+        let mut child = command.env_remove("XDG_CONFIG_HOME").env_remove("CARA_KEYS").spawn().unwrap();
+        let rings = || {
+            let files = fs::read_dir(home.folder()).unwrap().flatten();
+            files.filter(|file| file.file_name().to_string_lossy().ends_with("-7.keys")).count()
+        };
+        while rings() == 0 && child.try_wait().unwrap().is_none() {}
+        child.kill().unwrap();
+        child.wait().unwrap();
+        half += usize::from(rings() < nodes.len());
+        home.done(&["derive", "--fleet", "7"]);
+        assert_eq!(rings(), nodes.len());
+        home.ring("depot/1@m_unit");
+    }
+    println!("{half} of 12 were half done");
+    let home = Home::with_fleet();
+    fs::remove_file(home.folder().join("fleet-7.root")).unwrap();
+    home.refused(&["show", "--fleet", "7"], 1, "`cara keys new-fleet --fleet 7 depot/1@m_unit agv/1 agv/2`");
 }
 
 #[test]

@@ -107,6 +107,20 @@ fn the_command_that_a_vehicle_says_is_enough_for_both() {
     meet(&user);
 }
 
+/// What is read at the first alarm lets a stolen vehicle in again only where that is said to be on purpose.
+#[test]
+fn a_vehicle_that_was_revoked_is_told_so() {
+    let user = User::new();
+    user.succeeds(&format!("cara keys new-fleet --fleet {} yard/3@m_unit 'agv 7/7'", user.fleet));
+    user.succeeds(&format!("cara keys revoke --fleet {} 'agv 7/7'", user.fleet));
+    let refused = user.types(&user.node(VEHICLE));
+    let text = String::from_utf8(refused.stderr).unwrap();
+    assert_eq!(refused.status.code(), Some(1), "{text}");
+    assert!(text.contains("was revoked") && text.contains("Leave it so") && !text.contains("Make them"), "{text}");
+    let way = format!("`cara keys derive --fleet {} --manager yard/3 'agv 7/7'` admits it on purpose", user.fleet);
+    assert!(text.contains(&way), "{text}");
+}
+
 /// A fleet that has keys, of another manager than the one that a vehicle joins.
 #[test]
 fn a_vehicle_of_a_manager_without_keys_says_a_command_that_makes_both() {

@@ -4,7 +4,7 @@ use std::fmt;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use cara_core::distribution::identity::{Fleet, Identity};
+use cara_core::distribution::identity::{Fleet, Identity, Role};
 
 use super::named::{command, full_name};
 
@@ -25,6 +25,20 @@ pub enum KeyError {
         /// The files that were looked for.
         searched: Vec<PathBuf>,
         /// The one command that makes them, as it is typed on this host.
+        command: String,
+    },
+    /// The list of nodes on this host says that it was revoked.
+    #[error(
+        "{} of fleet {} was revoked, so that it has no keys, and what still has its old ones stays out. Leave it so, unless \
+         you know what runs here: `{}` admits it on purpose, with keys that it never had", full_name(identity), fleet.0,
+        command
+    )]
+    Revoked {
+        /// Whose keys.
+        identity: Identity,
+        /// Its fleet.
+        fleet: Fleet,
+        /// The one command that admits it, as it is typed on this host.
         command: String,
     },
     /// Others than the owner can read or write the file.
@@ -105,13 +119,15 @@ pub enum KeyError {
     },
     /// No root of this fleet in the folder.
     #[error(
-        "{} has no root of fleet {}: `{}`", folder.display(), fleet.0, keys(*fleet, &["new-fleet"])
+        "{} has no root of fleet {}: `{}`", folder.display(), fleet.0, new_fleet(*fleet, nodes)
     )]
     NoRoot {
         /// Where it was looked for.
         folder: PathBuf,
         /// The fleet.
         fleet: Fleet,
+        /// Those of the list that is there without it, as where the root was moved away.
+        nodes: Vec<Identity>,
     },
     /// The root is there, and the list of nodes is not.
     #[error(
@@ -171,11 +187,14 @@ impl fmt::Display for Owner {
 #[non_exhaustive]
 pub enum FleetError {
     /// A node that the fleet does not have.
-    #[error(
-        "{} is not in the fleet: `{}` tells who is, and `{}` adds it", full_name(.1), keys(*.0, &["show"]),
-        keys(*.0, &["derive", &full_name(.1)])
-    )]
+    #[error("{} is not in the fleet: `{}` tells which nodes are, and which were revoked", full_name(.1), keys(*.0, &["show"]))]
     Unknown(Fleet, Identity),
+    /// A node that was taken out.
+    #[error(
+        "{} was revoked: leave it so, unless you know what it is now; `{}` admits it on purpose, with keys that it never had",
+        full_name(.1), keys(*.0, &["derive", &full_name(.1)])
+    )]
+    Revoked(Fleet, Identity),
     /// An s_unit, and no m_unit that it could belong to.
     #[error(
         "{} has no m_unit to belong to: name one with it, as in `{}`", full_name(.1),
@@ -305,6 +324,14 @@ fn anew(when: &str, fleet: Fleet) -> String {
     )
 }
 
+/// The command that makes a fleet of these nodes, m_units first.
+fn new_fleet(fleet: Fleet, nodes: &[Identity]) -> String {
+    let mut names: Vec<_> = nodes.iter().map(|node| (node.role() != Role::MUnit, full_name(node))).collect();
+    names.sort();
+    let names = names.iter().map(|(_, name)| name.as_str());
+    keys(fleet, &["new-fleet"].into_iter().chain(names).collect::<Vec<_>>())
+}
+
 /// A command for a fleet's keys.
 fn keys(fleet: Fleet, words: &[&str]) -> String {
     keys_of(Some(fleet), words)
@@ -362,6 +389,7 @@ mod tests {
         let (fleet, node) = (Fleet(7), Identity::s_unit("agv 1", 1).unwrap());
         let errors = [
             FleetError::Unknown(fleet, node.clone()),
+            FleetError::Revoked(fleet, node.clone()),
             FleetError::NoManager(fleet, node.clone()),
             FleetError::NoManager(fleet, node).of_new_fleet(),
             FleetError::UnderWay(fleet, 2),

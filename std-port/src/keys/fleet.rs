@@ -185,7 +185,7 @@ mod tests {
         let mut keys = fleet();
         let stolen = keys.ring(&agv(1)).unwrap();
         keys.revoke(&[agv(1)]).unwrap();
-        assert_eq!(keys.ring(&agv(1)).map(drop), Err(FleetError::Unknown(Fleet(7), agv(1))));
+        assert_eq!(keys.ring(&agv(1)).map(drop), Err(FleetError::Revoked(Fleet(7), agv(1))));
         let manager = keys.ring(&depot()).unwrap();
         assert!(manager.pair(&agv(1)).is_none());
         assert_eq!(generations(&manager, &agv(2)), [1, 2]);

@@ -105,10 +105,10 @@ impl Members {
 
     /// A node.
     pub fn node(&self, identity: &Identity) -> Result<&Member, FleetError> {
-        self.nodes
-            .iter()
-            .find(|node| node.identity == *identity)
-            .ok_or_else(|| FleetError::Unknown(self.fleet, identity.clone()))
+        self.nodes.iter().find(|node| node.identity == *identity).ok_or_else(|| match self.is_revoked(identity) {
+            true => FleetError::Revoked(self.fleet, identity.clone()),
+            false => FleetError::Unknown(self.fleet, identity.clone()),
+        })
     }
 
     /// Those that a node talks to: m_units to each other, and an s_unit to those that it belongs to.

@@ -122,8 +122,11 @@ impl Environment {
         if let Some(found) = searched.iter().find(|file| file.exists()) {
             return Ok(found.clone());
         }
-        let command = self.command(identity, manager, fleet);
-        Err(KeyError::Missing { identity: identity.clone(), fleet, searched, command })
+        let (identity, command) = (identity.clone(), self.command(identity, manager, fleet));
+        if self.folders().iter().any(|folder| store::is_revoked(folder, &identity, fleet)) {
+            return Err(KeyError::Revoked { identity, fleet, command });
+        }
+        Err(KeyError::Missing { identity, fleet, searched, command })
     }
 
     /// The one command that makes a node's keys, typed where the node was started.

@@ -70,6 +70,17 @@ fn nodes_file(folder: &Path, fleet: Fleet) -> PathBuf {
     folder.join(format!("fleet-{}.nodes", fleet.0))
 }
 
+/// Whether the list of a fleet's nodes in a folder says that one was revoked. A list that cannot be read says nothing.
+pub(super) fn is_revoked(folder: &Path, identity: &Identity, fleet: Fleet) -> bool {
+    listed(folder, fleet).is_some_and(|members| members.is_revoked(identity))
+}
+
+/// The list of a fleet's nodes in a folder, if it is there and can be read.
+fn listed(folder: &Path, fleet: Fleet) -> Option<Members> {
+    let (text, _) = file::read(&nodes_file(folder, fleet)).ok()?;
+    Members::parse(&text).ok().filter(|members| members.fleet() == fleet)
+}
+
 impl Store {
     /// Keeps new keys, and the file of each node, in a folder, which is made for this user alone if it is not there.
     pub fn create(folder: &Path, keys: FleetKeys) -> Result<Self, KeyError> {
@@ -96,11 +107,12 @@ impl Store {
         if stop() {
             return Err(KeyError::Stopped);
         }
-        // The root comes last: while there is none, nothing else is a fleet, or in the way of the next try.
-        let mut made = Vec::new();
-        let written = put_all(ready, &mut made).and_then(|written| {
-            made.push(list.path().to_owned());
-            list.put().and_then(|()| root.put_new()).map(|()| written)
+        // The root comes before the keys that are of it: what is killed here leaves no key of a root that nobody has, and
+        // `cara keys derive` writes the rest. A list alone is no fleet, nor in the way of the next try.
+        let mut made = vec![list.path().to_owned()];
+        let written = list.put().and_then(|()| root.put_new()).and_then(|()| {
+            made.push(path);
+            put_all(ready, &mut made)
         });
         let written = written.inspect_err(|_| made.iter().for_each(|path| drop(file::remove(path))))?;
         file::keep_names(folder)?;
@@ -111,7 +123,9 @@ impl Store {
     pub fn open(folder: &Path, fleet: Fleet) -> Result<Self, KeyError> {
         let path = root_file(folder, fleet);
         if !path.exists() {
-            return Err(KeyError::NoRoot { folder: folder.to_owned(), fleet });
+            let list = listed(folder, fleet).map(|members| members.nodes().to_vec()).unwrap_or_default();
+            let nodes = list.into_iter().map(|node| node.identity).collect();
+            return Err(KeyError::NoRoot { folder: folder.to_owned(), fleet, nodes });
         }
         let lock = lock(folder)?;
         Ok(Self { folder: folder.to_owned(), keys: Self::peek(folder, fleet)?, _lock: lock })
