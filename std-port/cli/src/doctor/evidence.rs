@@ -1,6 +1,6 @@
 //! What the doctor knows when it judges: plain values, so that each judgement can be tested by itself.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
 use std::time::Duration;
 
@@ -11,6 +11,7 @@ use cara_std::{Fleet, Identity, Interfaces, Manager, Mode, Role};
 use super::dial::Dial;
 use super::running::Running;
 use super::which::Which;
+use crate::nodes::full_name;
 
 /// Two lives that overlap by less than this may be one after the other: datagrams overtake each other.
 const OVERTAKING: Duration = Duration::from_millis(200);
@@ -109,6 +110,21 @@ impl Evidence {
         self.units().filter(|(_, identity)| which.is_identity(identity))
     }
 
+    /// `NAME/ID` of all that a name or an ID may mean: units of this host, what they have or wait for, and what was heard. One
+    /// that was taken off the roster is meant where there is no other.
+    pub(crate) fn called(&self, which: &Which) -> BTreeSet<String> {
+        let nodes = || self.running.iter().flat_map(|unit| &unit.nodes).filter(|node| which.is(&node.name, node.id));
+        let counts = nodes().filter(|node| node.connected || node.expected);
+        let here = self.running.iter().filter(|unit| which.is(&unit.unit.name, unit.unit.id)).map(Running::name);
+        let heard = self.ours().filter(|(_, identity)| which.is_identity(identity));
+        let mut called: BTreeSet<_> = here.chain(counts.map(full_name)).collect();
+        called.extend(heard.map(|(_, identity)| identity.to_string()));
+        if called.is_empty() {
+            called.extend(nodes().map(full_name));
+        }
+        if called.contains(&which.0) { BTreeSet::from([which.0.clone()]) } else { called }
+    }
+
     /// M_units of our fleet that were heard, each once, as it was heard last.
     pub(crate) fn m_units(&self) -> Vec<(&Heard, &Identity)> {
         let mut found: Vec<(&Heard, &Identity)> = Vec::new();
@@ -178,7 +194,9 @@ pub(crate) mod samples;
 
 #[cfg(test)]
 mod tests {
-    use super::samples::{evidence, life};
+    use cara_std::control::protocol::NodeInfo;
+
+    use super::samples::{evidence, life, node_info, running, searching};
     use super::*;
 
     #[test]
@@ -187,6 +205,23 @@ mod tests {
         assert_eq!(overlapping(&[first.clone(), second.clone()]), None);
         let again = Life { last: Duration::from_millis(3000), ..first };
         assert_eq!(overlapping(&[again.clone(), second.clone()]), Some((&again, &second)));
+    }
+
+    #[test]
+    fn a_name_that_several_have_means_all_of_them_unless_the_id_is_told() {
+        let mut seen = evidence();
+        let mut unit = running("boss", 1);
+        let absent = |id, expected| NodeInfo { expected, ..node_info("agv", id, false) };
+        unit.nodes = vec![node_info("agv", 7, true), absent(8, true), absent(9, false), node_info("x", 7, true)];
+        seen.running = vec![unit];
+        seen.heard = vec![searching("agv", 8, "boss"), searching("agv", 10, "boss")];
+        let called = |text: &str| seen.called(&Which(text.into())).into_iter().collect::<Vec<_>>().join(" ");
+        assert_eq!(called("agv"), "agv/10 agv/7 agv/8", "agv/9 was taken off the roster");
+        assert_eq!(
+            (called("agv/8"), called("agv/9"), called("#7")),
+            ("agv/8".into(), "agv/9".into(), "agv/7 x/7".into())
+        );
+        assert_eq!((called("boss"), called("none")), ("boss/1".into(), String::new()));
     }
 
     #[test]

@@ -13,8 +13,9 @@ use super::dial::Dials;
 use super::evidence::{Evidence, KeysSeen, Life};
 use super::finding::Finding;
 use super::running::{Running, Sources};
-use super::which::Which;
+use super::which::{Which, quoted};
 use super::{holder, host, network, node, unasked};
+use crate::exit::Ended;
 use crate::global::Global;
 use crate::listening;
 
@@ -76,8 +77,9 @@ pub(crate) fn look(which: Option<Which>, listen: Duration, global: &Global) -> a
         connected_lives: Vec::new(),
         answered_alone: Vec::new(),
     };
+    only_one(&evidence)?;
     match Survey::open(evidence.interfaces, ports) {
-        Ok(survey) => Ok(Looking::new(survey.with_keys(keys), sources, evidence).until(listen)),
+        Ok(survey) => Looking::new(survey.with_keys(keys), sources, evidence).until(listen),
         Err(Error::PortInUse) => {
             let in_use = |port: &u16| matches!(Survey::open(evidence.interfaces, *port), Err(Error::PortInUse));
             let port = ports.numbers().into_iter().find(in_use).unwrap_or(evidence.port);
@@ -120,6 +122,17 @@ fn only<T: Copy>(set: &HashSet<T>) -> Option<T> {
     set.iter().next().copied().filter(|_| set.len() == 1)
 }
 
+/// One node may be meant and no more: what is told of one is not told of another of its name.
+fn only_one(seen: &Evidence) -> anyhow::Result<()> {
+    let Some(which) = &seen.which else { return Ok(()) };
+    let several = seen.called(which);
+    if several.len() < 2 {
+        return Ok(());
+    }
+    let names: Vec<_> = several.iter().map(|name| quoted(name)).collect();
+    Err(Ended::usage(format!("several nodes are called `{}`: write {}", which.0, names.join(" or "))))
+}
+
 /// What it means.
 fn judge(evidence: &Evidence) -> Vec<Finding> {
     let which = evidence.which.as_ref();
@@ -157,16 +170,17 @@ impl Looking {
         }
     }
 
-    fn until(mut self, listen: Duration) -> Looked {
+    fn until(mut self, listen: Duration) -> anyhow::Result<Looked> {
         loop {
             self.ask();
             let left = listen.saturating_sub(self.survey.age());
             self.survey.listen(SLICE.min(left));
             self.gather();
+            only_one(&self.evidence)?;
             let findings = judge(&self.evidence);
             let certain = findings.first().is_some_and(|finding| finding.certain);
             if certain || self.survey.age() >= listen {
-                return Looked { evidence: self.evidence, findings };
+                return Ok(Looked { evidence: self.evidence, findings });
             }
         }
     }

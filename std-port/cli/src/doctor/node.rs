@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use cara_std::control::protocol::RefusedInfo;
+use cara_std::control::protocol::{NodeInfo, RefusedInfo};
 use cara_std::survey::Heard;
 use cara_std::{Identity, Manager, Role};
 
@@ -118,7 +118,11 @@ fn silent(seen: &Evidence, which: &Which) -> Vec<Finding> {
     if !refused.is_empty() {
         return refused;
     }
-    let mut found = host::check(seen);
+    let (no_way, mut found): (Vec<_>, Vec<_>) =
+        host::check(seen).into_iter().partition(|finding| keeps_here(finding.id));
+    // A manager of this host knows more of the node than its interfaces tell: units of one host meet without any.
+    let (first, behind) = if seen.running.is_empty() { (no_way, Vec::new()) } else { (Vec::new(), no_way) };
+    found.splice(0..0, first);
     found.extend(seen.answered_alone.first().map(|alone| one_way(seen, *alone)));
     // A node that knows where its manager is dials it, again and again, and asks nobody meanwhile.
     let m_units = seen.m_units();
@@ -129,14 +133,10 @@ fn silent(seen: &Evidence, which: &Which) -> Vec<Finding> {
     // Its manager hears whatever it says, so that once it has had time to come back there is nothing to wait for.
     let lost = left::of(seen, which).map(|lost| lost.certain(seen.listened >= ANSWERED && left::for_long(seen, which)));
     if !found.is_empty() {
-        found.extend(lost);
-        return found;
+        return found.into_iter().chain(lost).chain(behind).collect();
     }
-    if let Some(lost) = lost {
-        return vec![lost];
-    }
-    if let Some(missing) = no_manager_for_any(seen, which) {
-        return vec![missing];
+    if let Some(cause) = lost.or_else(|| no_manager_for_any(seen, which)) {
+        return [cause].into_iter().chain(behind).collect();
     }
     // Who cannot be read may be the one that is missed.
     let unreadable = seen.heard.iter().filter(|heard| heard.identity.is_none() && !heard.same_version());
@@ -150,8 +150,13 @@ fn silent(seen: &Evidence, which: &Which) -> Vec<Finding> {
         true => not_heard(seen, which).certain(seen.listened >= ANSWERED && missed_for_long(seen, which)),
         false => ask_its_manager(seen, which, &elsewhere),
     });
-    found.extend(waiting_for_another(seen));
+    found.extend(waiting_for_another(seen).into_iter().chain(behind));
     found
+}
+
+/// What keeps nodes of other hosts away, and none of this one.
+fn keeps_here(id: Id) -> bool {
+    matches!(id, Id::NoInterface | Id::LoopbackOnly)
 }
 
 fn not_heard(seen: &Evidence, which: &Which) -> Finding {
@@ -162,11 +167,20 @@ fn not_heard(seen: &Evidence, which: &Which) -> Finding {
         seen.interfaces_up().join(", "),
         seen.fleet.0
     );
+    let managers: Vec<_> = seen.running.iter().filter(|unit| unit.is_m_unit()).map(Running::name).collect();
+    match left(seen, which) {
+        Some((unit, node)) if node.left_ms.is_some() && !node.expected => {
+            found.push_str(&format!("; it has been connected to {}, and was taken off its roster", unit.name()));
+        }
+        Some((unit, node)) if node.left_ms.is_some() => {
+            found.push_str(&format!("; it has been connected to {}", unit.name()));
+        }
+        Some((unit, _)) => found.push_str(&format!("; {} waits for it, and it has not joined", unit.name())),
+        None if managers.is_empty() => {}
+        None => found.push_str(&format!("; {} neither has it nor waits for it", managers.join(", "))),
+    }
     if let Some(name) = nearest(seen, which) {
         found.push_str(&format!("; there is {name}"));
-    }
-    if let Some((unit, _)) = left(seen, which) {
-        found.push_str(&format!("; it has been connected to {}", unit.name()));
     }
     let advice = "check that it is switched on, cabled to this network and started; that its fleet is this one; a node that \
                   was told its manager's address is silent here, and another cable or network carries no broadcast to here";
@@ -184,10 +198,10 @@ fn nearest(seen: &Evidence, which: &Which) -> Option<String> {
     known.iter().find(|full| full.get(..name_of(full)) == Some(closest)).cloned()
 }
 
-/// A unit of this host that has had the node connected.
-fn left<'e>(seen: &'e Evidence, which: &Which) -> Option<(&'e Running, &'e str)> {
+/// A unit of this host that has had the node connected, or waits for it.
+fn left<'e>(seen: &'e Evidence, which: &Which) -> Option<(&'e Running, &'e NodeInfo)> {
     let mut nodes = seen.running.iter().flat_map(|unit| unit.nodes.iter().map(move |node| (unit, node)));
-    nodes.find(|(_, node)| which.is(&node.name, node.id)).map(|(unit, node)| (unit, node.name.as_str()))
+    nodes.find(|(_, node)| which.is(&node.name, node.id))
 }
 
 fn ask_its_manager(seen: &Evidence, which: &Which, managers: &[String]) -> Finding {

@@ -86,6 +86,22 @@ fn what_the_manager_knows_is_not_listened_for() {
     assert!(!first(&seen).certain);
 }
 
+/// What the manager knows of a node comes before what keeps other hosts away: both may be on this one.
+#[test]
+fn a_host_without_an_interface_is_told_behind_what_its_manager_knows() {
+    let mut seen = evidence();
+    seen.reach.clear();
+    assert_eq!(ids(&seen), [Id::NoInterface], "nobody knows more");
+    seen.running = vec![running("boss", 1)];
+    let told = |seen: &Evidence| check(seen, &Which("agv".into())).remove(0).found;
+    assert_eq!(ids(&seen), [Id::NotHeard, Id::NoInterface]);
+    assert!(told(&seen).contains("boss/1 neither has it nor waits for it"), "{}", told(&seen));
+    seen.running[0].nodes = vec![node_info("agv", 7, false)];
+    assert_eq!(ids(&seen), [Id::Lost, Id::NoInterface]);
+    seen.running[0].nodes[0].left_ms = Some(20_000);
+    assert!(check(&seen, &Which("agv".into()))[0].certain, "it need not listen for longer");
+}
+
 #[test]
 fn another_fleet_or_version_counts_only_where_ours_is_silent() {
     let mut seen = evidence();
