@@ -109,11 +109,18 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
     if arguments.hold {
         interrupt::end_at_signals()?;
     }
-    let exit = call(&mut operator, question, arguments.hold, global)?;
+    let lease = published.lease_us.filter(|_| !arguments.hold);
+    let exit = call(&mut operator, question, arguments.hold, lease, global)?;
     Ok(exit.into())
 }
 
-fn call(operator: &mut Operator, question: CallQuestion, hold: bool, global: &Global) -> anyhow::Result<Exit> {
+fn call(
+    operator: &mut Operator,
+    question: CallQuestion,
+    hold: bool,
+    not_kept_us: Option<u64>,
+    global: &Global,
+) -> anyhow::Result<Exit> {
     let (function, asynchronous, one) = (question.function.clone(), question.asynchronous, question.node.is_some());
     let mut worst = Exit::Done;
     let question = if hold { Question::Hold(question) } else { Question::Call(question) };
@@ -123,6 +130,9 @@ fn call(operator: &mut Operator, question: CallQuestion, hold: bool, global: &Gl
             return Ok(show_end(expired, global)?);
         }
         let Answer::Called { node, id, results, call, error, took_us } = answer else { return Ok(()) };
+        // The lease counts from when the call was made, and its end is on its way like any answer.
+        let ended = not_kept_us.filter(|lease| took_us >= lease / 4 * 3);
+        let error = error.map(|failure| of_its_lease(failure, &function, ended));
         let node = format!("{node}/{id}");
         if let Some(failure) = &error {
             worst = if worst == Exit::Failed { worst } else { exit_of(failure) };
@@ -133,6 +143,17 @@ fn call(operator: &mut Operator, question: CallQuestion, hold: bool, global: &Gl
         operator.deliver();
     }
     Ok(worst)
+}
+
+/// Why a service failed that went on for longer than a lease which nothing has kept.
+fn of_its_lease(failure: Failure, function: &str, ended_us: Option<u64>) -> Failure {
+    let Some(lease) = ended_us.filter(|_| failure.error == "Service") else { return failure };
+    let text = format!(
+        "the lease of `{function}` ({}) ended before it had finished, which stops it: a call keeps it with --hold. It said: {}",
+        show_micros(lease as f64),
+        failure.text
+    );
+    Failure { text, ..failure }
 }
 
 /// The results, of which those of size 1 are a value and no list of one.

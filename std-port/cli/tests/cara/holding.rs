@@ -30,6 +30,13 @@ impl Driver {
         let options = ServiceOptions::new().lease(LEASE, safe);
         let functions = unit.my_function_list();
         let lease = functions.add_service(&Definition::parse("drive()").unwrap(), options, drive).unwrap();
+        let carry = |call: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+            call.lease.as_ref().unwrap().wait_until_ended();
+            // As a program that was killed.
+            Err(ServiceError::Failed(137))
+        };
+        let short = ServiceOptions::new().lease(LEASE, || {});
+        functions.add_service(&Definition::parse("carry()").unwrap(), short, carry).unwrap();
         functions.add_service(&Definition::parse("look()").unwrap(), ServiceOptions::new(), drive).unwrap();
         unit.publish_my_function_list().unwrap();
         unit.start().unwrap();
@@ -139,6 +146,14 @@ fn without_a_lease_there_is_nothing_to_hold() {
     let _driver = Driver::join(&stage);
     stage.ends(2, &["call", "driver", "--hold", "look"]).says("has no lease");
     stage.ends(2, &["call", "driver", "--hold", "--async", "drive"]);
+}
+
+#[test]
+fn a_call_that_its_own_lease_has_ended_says_so() {
+    let stage = Stage::with(&[]);
+    let _driver = Driver::join(&stage);
+    let ended = stage.ends(1, &["call", "driver", "carry"]);
+    ended.says("the lease of `carry` (1.2").says("ended before it had finished").says("--hold").says("code 137");
 }
 
 #[test]
