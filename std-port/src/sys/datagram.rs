@@ -54,14 +54,12 @@ pub enum Socket {
 impl Datagrams {
     /// Opens both sockets on `interfaces`; other units of the host may share `discovery_port`.
     ///
-    /// [`Error::PortInUse`] when a program that does not share it has that port, [`Error::Network`] otherwise.
+    /// [`Error::PortInUse`] when a program that does not share it has that port, [`Error::PortNotPermitted`] when this user
+    /// may not have it, [`Error::Network`] otherwise.
     pub fn open(interfaces: Interfaces, discovery_port: u16) -> Result<Self, Error> {
         // Bound to all addresses even for loopback alone, where `receive` drops what comes from elsewhere: a socket
         // bound to one address hears no broadcasts.
-        let shared = open_socket(Ipv4Addr::UNSPECIFIED, discovery_port, true).map_err(|errno| match errno {
-            Errno::ADDRINUSE => Error::PortInUse,
-            errno => network(errno),
-        })?;
+        let shared = open_socket(Ipv4Addr::UNSPECIFIED, discovery_port, true).map_err(refused)?;
         let own = open_socket(interfaces.bind_address(), 0, false).map_err(network)?;
         sockopt::set_socket_broadcast(&own, true).map_err(network)?;
         let own_port = local_port(&own).map_err(|_| Error::Network)?;
@@ -199,6 +197,15 @@ fn send_datagram(socket: &OwnedFd, to: SocketAddr, datagram: &[u8]) -> rustix::i
     Err(Errno::CONNREFUSED)
 }
 
+/// Why the port of broadcasts is not to be had.
+fn refused(errno: Errno) -> Error {
+    match errno {
+        Errno::ADDRINUSE => Error::PortInUse,
+        Errno::ACCESS | Errno::PERM => Error::PortNotPermitted,
+        errno => network(errno),
+    }
+}
+
 fn network(errno: Errno) -> Error {
     tracing::warn!(%errno, "a socket for datagrams could not be opened");
     Error::Network
@@ -232,6 +239,12 @@ mod tests {
             port = unit.discovery_port();
             unit
         })
+    }
+
+    #[test]
+    fn a_port_that_is_not_permitted_is_told_apart_from_a_network_that_is_down() {
+        assert_eq!(refused(Errno::ACCESS), Error::PortNotPermitted);
+        assert_eq!((refused(Errno::ADDRINUSE), refused(Errno::MFILE)), (Error::PortInUse, Error::Network));
     }
 
     #[test]

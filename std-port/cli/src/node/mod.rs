@@ -145,6 +145,11 @@ fn overrides(arguments: &Arguments, global: &Global) -> anyhow::Result<Overrides
 
 /// An address is not looked up by a name: the host could have several of it.
 fn address(text: &str) -> Result<SocketAddr, String> {
+    if text.strip_prefix(':').is_some_and(|port| port.parse::<u16>().is_ok()) {
+        return Err(format!(
+            "say at which address: 127.0.0.1{text} for this host alone, 0.0.0.0{text} for others as well"
+        ));
+    }
     text.parse().map_err(|_| "write an IP address and a port, as 127.0.0.1:9464; names are not looked up".to_owned())
 }
 

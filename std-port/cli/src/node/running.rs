@@ -1,5 +1,6 @@
 //! A node's life: built, started, told of signals, ended.
 
+use std::io::ErrorKind;
 use std::net::{SocketAddr, TcpListener};
 use std::sync::Arc;
 
@@ -88,28 +89,36 @@ fn not_made(error: Error, settings: &Settings) -> anyhow::Error {
         let help = format!("choose another one; `ss -lntup | grep :{value}` shows who has it");
         return Ended::failed("PortInUse", settings.mistake(span.clone(), &what, &help).to_string());
     }
-    let refused = settings.tcp_port.as_ref().filter(|_| error == Error::PortNotPermitted);
+    let is_reserved = |port: &&Placed<u16>| error == Error::PortNotPermitted && (1..1024).contains(&port.value);
+    let refused = settings.tcp_port.as_ref().filter(is_reserved);
+    let refused = refused.or(settings.discovery_port.as_ref().filter(is_reserved));
     if let Some(Placed { value, span: Some(span) }) = refused {
         let what = format!("the system does not permit port {value}");
-        let help = "a port below 1024 takes root or CAP_NET_BIND_SERVICE: choose another one";
-        return Ended::failed("PortNotPermitted", settings.mistake(span.clone(), &what, help).to_string());
+        return Ended::failed("PortNotPermitted", settings.mistake(span.clone(), &what, NOT_PERMITTED).to_string());
     }
     let which = port.or(refused).map_or(String::new(), |port| format!("port {}: ", port.value));
     Ended::failed(format!("{error:?}"), format!("{which}{error}"))
 }
 
+const NOT_PERMITTED: &str = "a port below 1024 takes root or CAP_NET_BIND_SERVICE: choose another one";
+
+/// What to do where metrics have no port.
+fn not_served(kind: ErrorKind) -> &'static str {
+    match kind {
+        ErrorKind::PermissionDenied => NOT_PERMITTED,
+        ErrorKind::AddrInUse => "choose an address with a free port; `ss -lntp` shows who has this one",
+        ErrorKind::AddrNotAvailable => "choose an address of this host: `ip address` shows them",
+        _ => "choose an address of this host with a free port",
+    }
+}
+
 fn listen(place: &Placed<SocketAddr>, settings: &Settings) -> anyhow::Result<TcpListener> {
     http::listen(place.value).map_err(|error| {
         let what = format!("metrics cannot be served at {}: {error}", place.value);
+        let help = not_served(error.kind());
         match &place.span {
-            Some(span) => {
-                let help = "choose an address of this host with a free port; `ss -lntp` shows who has which";
-                Ended::failed("Network", settings.mistake(span.clone(), &what, help).to_string())
-            }
-            None => {
-                let help = "choose an address of this host with a free port; `ss -lntp` shows who has which";
-                Ended::failed("Network", format!("{what}; {help}"))
-            }
+            Some(span) => Ended::failed("Network", settings.mistake(span.clone(), &what, help).to_string()),
+            None => Ended::failed("Network", format!("{what}; {help}")),
         }
     })
 }
@@ -155,4 +164,16 @@ fn read_again(settings: &Settings, over: &Overrides) -> Result<Settings, String>
     let path = std::path::Path::new(&settings.source.name);
     let source = super::read(Some(path)).map_err(|error| format!("{error:#}"))?;
     Settings::of(source, over).map_err(|mistakes: Mistakes| mistakes.to_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_keeps_metrics_from_being_served_is_what_the_advice_is_about() {
+        assert!(not_served(ErrorKind::PermissionDenied).contains("below 1024"));
+        assert!(not_served(ErrorKind::AddrInUse).contains("a free port"));
+        assert!(not_served(ErrorKind::AddrNotAvailable).contains("ip address"));
+    }
 }

@@ -15,6 +15,14 @@ fn settings(text: &str) -> Result<Settings, String> {
 }
 
 #[test]
+fn a_port_of_metrics_without_an_address_is_told_with_both() {
+    let told = super::address(":80").unwrap_err();
+    assert!(told.contains("127.0.0.1:80") && told.contains("0.0.0.0:80") && !told.contains("names"), "{told}");
+    assert!(super::address("localhost:80").unwrap_err().contains("names are not looked up"));
+    assert!(super::address("127.0.0.1:80").is_ok());
+}
+
+#[test]
 fn the_example_shows_the_defaults() {
     let example = settings(EXAMPLE).unwrap();
     let least = settings("name = \"AGV_manager\"\nid = 1\n").unwrap();
