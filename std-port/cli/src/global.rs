@@ -6,6 +6,7 @@ use std::time::Duration;
 use cara_std::Interfaces;
 use clap::Args;
 
+use crate::exit::Ended;
 use crate::keys::Keys;
 use crate::name_and_id::NameAndId;
 
@@ -20,19 +21,19 @@ pub(crate) struct Global {
     #[arg(long, global = true)]
     pub(crate) json: bool,
     /// Ask this one of the units that run on this host.
-    #[arg(long, global = true, value_name = "NAME/ID", conflicts_with_all = ["socket", "act_as"])]
+    #[arg(long, global = true, value_name = "NAME/ID")]
     pub(crate) unit: Option<NameAndId>,
     /// Ask the unit with this control socket.
-    #[arg(long, global = true, value_name = "PATH", conflicts_with = "act_as")]
+    #[arg(long, global = true, value_name = "PATH")]
     pub(crate) socket: Option<PathBuf>,
     /// Be this m_unit for the time of the command. Refused while a unit of that identity runs on this host.
     #[arg(id = "act_as", long = "as", global = true, value_name = "NAME/ID")]
     pub(crate) act_as: Option<NameAndId>,
     /// With --as: how long to wait for the nodes that the command is about [default: 5s].
-    #[arg(long, global = true, value_name = "TIME", value_parser = crate::units::parse_time, requires = "act_as")]
+    #[arg(long, global = true, value_name = "TIME", value_parser = crate::units::parse_time)]
     wait: Option<Duration>,
     /// With --as: the TCP port for nodes that are told their manager's address; a free one unless told.
-    #[arg(long, global = true, value_name = "PORT", requires = "act_as")]
+    #[arg(long, global = true, value_name = "PORT")]
     pub(crate) as_port: Option<u16>,
     /// The fleet to be in; 0 unless told.
     #[arg(long, global = true, value_name = "NUMBER")]
@@ -45,7 +46,7 @@ pub(crate) struct Global {
     pub(crate) key_file: Option<PathBuf>,
     /// With --as, and for `node`, `scan` and `doctor`: plain mode, without keys, where anybody on the network can read what
     /// units say and speak as any of them. It meets units in plain mode alone.
-    #[arg(long, global = true, conflicts_with = "key_file")]
+    #[arg(long, global = true)]
     pub(crate) insecure: bool,
     /// Use loopback only.
     #[arg(long, global = true)]
@@ -53,6 +54,22 @@ pub(crate) struct Global {
 }
 
 impl Global {
+    /// Which options go together is looked at here: clap does it for those before the verb, and those behind it, apart.
+    pub(crate) fn check(&self) -> anyhow::Result<()> {
+        let (unit, socket, own) = (self.unit.is_some(), self.socket.is_some(), self.act_as.is_some());
+        let wrong = [
+            (unit && socket, "--unit and --socket both say which unit is asked: leave one away"),
+            (
+                (unit || socket) && own,
+                "--as is for a unit of this command, and --unit and --socket for one that runs: leave one away",
+            ),
+            (self.wait.is_some() && !own, "--wait is for a unit of this command: say which with --as NAME/ID"),
+            (self.as_port.is_some() && !own, "--as-port is for a unit of this command: say which with --as NAME/ID"),
+            (self.insecure && self.key_file.is_some(), "--insecure is for a unit without keys: leave --key-file away"),
+        ];
+        wrong.into_iter().find(|(is_wrong, _)| *is_wrong).map_or(Ok(()), |(_, text)| Err(Ended::usage(text)))
+    }
+
     /// Where to look for nodes: what the options say, or else the environment.
     pub(crate) fn interfaces(&self) -> Interfaces {
         if self.loopback { Interfaces::Loopback } else { Interfaces::from_environment() }

@@ -30,7 +30,7 @@ fn main() -> ExitCode {
         Ok(line) => line,
         Err(code) => return code,
     };
-    let outcome = run(verb, &global);
+    let outcome = global.check().and_then(|()| run(verb, &global));
     exit::code_of(outcome, &global)
 }
 

@@ -39,6 +39,21 @@ fn a_unit_that_is_named_and_not_there_is_an_error() {
     stage.ends(3, &["counters", "--socket", not_a_socket.to_str().unwrap()]);
 }
 
+/// Options that belong together may stand before the verb and behind it.
+#[test]
+fn options_before_and_behind_the_verb_are_looked_at_together() {
+    let stage = Stage::empty();
+    stage.ends(0, &["--as", "x/9", "--insecure", "scan", "--wait", "100ms"]);
+    stage.ends(0, &["--insecure", "scan", "--wait", "100ms", "--as", "x/9"]);
+    stage.ends(2, &["scan", "--wait", "1s"]).says("--wait").says("--as NAME/ID");
+    stage.ends(2, &["scan", "--as-port", "9"]).says("--as-port").says("--as NAME/ID");
+    for [before, value] in [["--unit", "a/1"], ["--socket", "here"]] {
+        stage.ends(2, &[before, value, "scan", "--as", "x/9"]).says("leave one away");
+    }
+    stage.ends(2, &["--unit", "a/1", "scan", "--socket", "here"]).says("leave one away");
+    stage.ends(2, &["--insecure", "scan", "--key-file", "k"]).says("--key-file");
+}
+
 #[test]
 fn a_unit_is_chosen_where_several_run() {
     let stage = Stage::with(&[]);
