@@ -121,12 +121,16 @@ fn not_there(nodes: &[NodeInfo], meant: &str, waited: &str) -> String {
         [] => "no node is".to_owned(),
         nodes => {
             let close = close(name, nodes.iter().map(|node| node.name.as_str()));
-            let is_close = |node: &&NodeInfo| close.is_empty() || close.contains(&node.name.as_str());
-            let names: Vec<_> = nodes.iter().filter(is_close).map(full_name).take(SHOWN).collect();
-            format!("there {} {}", if names.len() == 1 { "is" } else { "are" }, names.join(", "))
+            let (mut names, others): (Vec<_>, Vec<_>) =
+                nodes.iter().partition(|node| close.contains(&node.name.as_str()));
+            names.extend(others);
+            let more = names.len().saturating_sub(SHOWN);
+            let shown: Vec<_> = names.into_iter().take(SHOWN).map(full_name).collect();
+            let more = if more == 0 { String::new() } else { format!(" and {more} more") };
+            format!("there {} {}{more}", if nodes.len() == 1 { "is" } else { "are" }, shown.join(", "))
         }
     };
-    format!("no node `{meant}` is connected{waited}; {hint}. `cara doctor {name}` looks for the reason")
+    format!("no node `{meant}` is connected{waited}; {hint}. `cara doctor {}` looks for the reason", quoted(meant))
 }
 
 /// Nodes that an error lists.
@@ -232,7 +236,13 @@ mod tests {
     #[test]
     fn who_is_not_there_is_told_with_who_is() {
         let nodes = [node("agv-1", 11, true), node("lift", 2, true)];
-        assert!(not_there(&nodes, "agv1/11", "").contains("there is agv-1/11."));
+        let told = not_there(&nodes, "agv1/11", "");
+        assert!(told.contains("there are agv-1/11, lift/2.") && told.contains("`cara doctor agv1/11`"), "{told}");
+        assert!(
+            not_there(&nodes[1..], "#19", "").ends_with("there is lift/2. `cara doctor '#19'` looks for the reason")
+        );
+        let many: Vec<_> = (0..11).map(|id| node("agv", id, true)).collect();
+        assert!(not_there(&many, "zz", "").contains(", agv/7 and 3 more."), "{}", not_there(&many, "zz", ""));
         assert!(not_there(&nodes, "zz", "").contains("there are agv-1/11, lift/2."));
         assert!(not_there(&[], "zz", "").contains("no node is."));
     }

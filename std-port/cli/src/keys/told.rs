@@ -4,6 +4,7 @@ use cara_core::distribution::identity::{Identity, Role};
 use cara_std::keys::{Change, Members, Store, Written, full_name, shown};
 use serde_json::json;
 
+use crate::doctor::quoted;
 use crate::global::Global;
 use crate::output;
 
@@ -83,7 +84,8 @@ fn next(store: &Store, written: &[Written]) -> Vec<String> {
     for lost in members.nodes().iter().filter(|node| node.identity.role() == Role::SUnit && node.managers.is_empty()) {
         let name = full_name(&lost.identity);
         next.push(format!(
-            "{name} belongs to no m_unit now: `cara keys derive --fleet {fleet} {name} --manager NAME/ID`"
+            "{name} belongs to no m_unit now: `cara keys derive --fleet {fleet} {} --manager NAME/ID`",
+            quoted(&name)
         ));
     }
     if members.nodes().is_empty() {
