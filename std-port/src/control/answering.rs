@@ -11,7 +11,7 @@ use cara_core::time::Duration;
 
 use super::protocol::{Answer, Failure, Question};
 use super::{call, constraint, describe, everybody, hold, select};
-use crate::{CommunicationSystem, Identity, Peer};
+use crate::{CommunicationSystem, Finding, Identity, Peer};
 
 /// Where answers go; `Break` when nobody reads them any more.
 pub(super) type Sink<'s> = &'s mut dyn FnMut(Answer) -> ControlFlow<()>;
@@ -176,7 +176,12 @@ fn nodes<T: Send + 'static>(
     for peer in &all {
         send(sink, Answer::Node(describe::node(peer, roster.contains(peer.identity()))))?;
     }
-    for finding in system.findings() {
+    // One that was refused and is connected now is no news any more; a twin of it that was refused since is.
+    let has_joined_since = |finding: &Finding| {
+        let peer = finding.identity.as_ref().and_then(|identity| system.node(identity));
+        peer.and_then(|peer| peer.connected_for()).is_some_and(|connected| connected < system.age(finding))
+    };
+    for finding in system.findings().into_iter().filter(|finding| !has_joined_since(finding)) {
         send(sink, Answer::Refused(describe::refused(&finding, system.age(&finding))))?;
     }
     Ok(())

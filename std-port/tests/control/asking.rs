@@ -57,7 +57,7 @@ fn nodes_are_told_with_what_is_known_of_them() {
 
 #[test]
 fn who_was_refused_is_told_by_name_with_the_reason() {
-    let (depot, _agv) = Depot::with_agv();
+    let (depot, agv) = Depot::with_agv();
     let twin = vehicle("agv", 7, depot.fleet).build_unit().unwrap();
     twin.start().unwrap();
     let mut client = depot.client();
@@ -73,6 +73,13 @@ fn who_was_refused_is_told_by_name_with_the_reason() {
     });
     let finding = depot.system.findings().remove(0);
     assert_eq!(finding.identity.as_ref().map(|identity| identity.id()), Some(7));
+    // Once it has joined, that it was refused before is no news.
+    agv.stop();
+    until("the twin has joined", || twin.is_connected());
+    until("it is not told as refused", || {
+        let answers = ask(&mut client, Question::Nodes { offering: None }).unwrap();
+        !answers.iter().any(|answer| matches!(answer, Answer::Refused(_)))
+    });
 }
 
 #[test]
