@@ -17,11 +17,12 @@ pub(crate) fn check_name(name: &str) -> Result<(), Error> {
 }
 
 /// Whether a character acts on a terminal or on the reading of a line instead of being seen: control characters (C0, DEL and
-/// C1), marks of direction (bidi) and characters without width.
+/// C1), marks of direction (bidi), ends of lines and paragraphs, and characters without width, tags included.
 pub const fn is_hidden(character: char) -> bool {
     matches!(character,
-        '\0'..='\u{1F}' | '\u{7F}'..='\u{9F}' | '\u{061C}' | '\u{200B}'..='\u{200F}'
-        | '\u{202A}'..='\u{202E}' | '\u{2060}' | '\u{2066}'..='\u{2069}' | '\u{FEFF}')
+        '\0'..='\u{1F}' | '\u{7F}'..='\u{9F}' | '\u{AD}' | '\u{061C}' | '\u{200B}'..='\u{200F}'
+        | '\u{2028}'..='\u{202E}' | '\u{2060}'..='\u{2064}' | '\u{2066}'..='\u{206F}' | '\u{FEFF}'
+        | '\u{E0000}'..='\u{E007F}')
 }
 
 /// A text of a peer, with each [hidden](is_hidden) character as `\u{…}`: for terminals and logs.
@@ -58,12 +59,14 @@ mod tests {
         let ranges = [
             0..=0x1F,
             0x7F..=0x9F,
+            0xAD..=0xAD,
             0x061C..=0x061C,
             0x200B..=0x200F,
-            0x202A..=0x202E,
-            0x2060..=0x2060,
-            0x2066..=0x2069,
+            0x2028..=0x202E,
+            0x2060..=0x2064,
+            0x2066..=0x206F,
             0xFEFF..=0xFEFF,
+            0xE0000..=0xE007F,
         ];
         for code in ranges.into_iter().flatten() {
             let hidden = char::from_u32(code).unwrap();
