@@ -50,38 +50,41 @@ impl<T> Handle<T> {
         if attributes.priority == Priority::Emergency && handler.waits() {
             return Err(Error::EmergencyWaits);
         }
-        self.act(|machine| {
+        let stop = self.act(|machine| {
             let limit = machine.room.parameters;
             if definition.signature().parameters_bytes() as usize > limit {
                 return Err(Error::TooLarge { limit: u32::try_from(limit).unwrap_or(u32::MAX) });
             }
             let listed = Listed { handler, lease, safe, then };
             let replaced = machine.functions.find(definition.name()).and_then(|slot| machine.functions.function(slot));
-            let replaced = replaced.and_then(|function| function.handler.lease);
+            let replaced = replaced.map(|function| *function.handler);
             put(&mut machine.functions, &definition, attributes, listed)?;
-            // A service that had this lease before may have left it dead, and no call would begin; and what a call of the
-            // service before started would go on to the end of its lease.
-            [lease, replaced].into_iter().flatten().for_each(Lease::clear);
+            // What a call of the service before started would go on to the end of its lease.
+            let stop = replaced.and_then(Listed::clear);
+            // Another service that had this lease may have left it dead, and no call would begin.
+            lease.map(Lease::clear);
             machine.wakers.leases.wake();
-            Ok(())
-        })
+            Ok(stop)
+        })?;
+        stop.into_iter().for_each(|safe| safe());
+        Ok(())
     }
 
     /// Removes a service; peers that saw it are told.
     pub fn remove_service(&self, name: &str) -> Result<(), Error> {
-        self.act(|machine| {
+        let stop = self.act(|machine| {
             let (slot, removed) = machine.functions.remove(name)?;
-            if let Some(lease) = removed.lease {
-                // What a call of it started would go on to the lease's end.
-                lease.clear();
-                machine.wakers.leases.wake();
-            }
+            // What a call of it started would go on to the lease's end.
+            let stop = removed.clear();
+            machine.wakers.leases.wake();
             machine.publications.withdraw(slot);
             machine.each_live(|session, cx, _| {
                 session.withdraw(cx, slot);
             });
-            Ok(())
-        })
+            Ok::<_, Error>(stop)
+        })?;
+        stop.into_iter().for_each(|safe| safe());
+        Ok(())
     }
 
     /// The service has finished what its caller started: the lease ends, and no hook runs.

@@ -211,6 +211,14 @@ impl<T> Clone for Listed<T> {
 
 impl<T> Copy for Listed<T> {}
 
+impl<T> Listed<T> {
+    /// The service goes: an order that has not ended does so. Its safe hook is to run then; the one behind it, which takes the
+    /// application's state, does not.
+    pub(crate) fn clear(self) -> Option<&'static Safe> {
+        self.lease?.clear().then_some(self.safe).flatten()
+    }
+}
+
 impl<T> Service for Listed<T> {
     fn lease(&self) -> Option<&Lease> {
         self.lease

@@ -114,8 +114,7 @@ impl SafeHook {
     /// The service is removed: an order that has not ended does so, and the hook starts.
     pub(crate) fn clear(&self) {
         let mut state = lock(&self.shared.state);
-        if self.shared.lease().left(self.shared.parts.clock.now()).is_some() {
-            self.shared.lease().clear();
+        if self.shared.lease().clear() {
             self.shared.start(&mut state);
         }
     }

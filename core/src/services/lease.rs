@@ -150,9 +150,11 @@ impl Lease {
         held
     }
 
-    /// Ends whichever order holds it, as when the service is removed.
-    pub fn clear(&self) {
+    /// Ends whichever order holds it, as when the service is removed: whether there is one, whose safe hook is to run.
+    pub fn clear(&self) -> bool {
+        let has_order = self.end.load(Ordering::Acquire) != 0;
         self.end.store(0, Ordering::Release);
+        has_order
     }
 }
 
@@ -262,7 +264,7 @@ mod tests {
         let order = lease.begin(START, at(500_000)).unwrap();
         assert!(!lease.is_live(at(500_000)));
         assert!(lease.end(order) && lease.begin(START, at(500_000)).is_some());
-        lease.clear();
+        assert!(lease.clear() && !lease.clear());
         assert!(!lease.is_live(START));
     }
 

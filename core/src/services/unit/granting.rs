@@ -100,10 +100,12 @@ impl<S: Storage, C: Secure> Session<S, C> {
         end: Instant,
     ) {
         let Some(granted) = self.granted.get_mut(index) else { return };
-        if held_lease(cx, granted).is_none_or(|(service, order)| service.renew_lease(order, end)) {
+        let service = service_of(cx, granted.slot, granted.generation);
+        if service.is_some_and(|service| granted.order.is_none_or(|order| service.renew_lease(order, end))) {
             granted.end = end;
         } else {
-            // A reader has looked later than at `cx.now`, or a call of another peer has taken the lease over.
+            // A reader has looked later than at `cx.now`, a call of another peer has taken the lease over, or the service is
+            // gone.
             self.cut_lease(cx, index);
         }
     }
@@ -112,7 +114,8 @@ impl<S: Storage, C: Secure> Session<S, C> {
     pub fn end_lease<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>, slot: Slot) {
         let index = self.granted.iter().position(|granted| granted.slot == slot);
         if let Some(granted) = index.and_then(|index| take_at(&mut self.granted, index)) {
-            if let Some((service, order)) = held_lease(cx, &granted) {
+            let service = service_of(cx, granted.slot, granted.generation);
+            if let Some((service, order)) = service.zip(granted.order) {
                 service.finish_lease(order);
             }
             self.tell_end(cx, granted.call, LeaseEnd::Finished);
@@ -130,6 +133,16 @@ impl<S: Storage, C: Secure> Session<S, C> {
         }
     }
 
+    /// Ends the leases of services that are gone: their callers are told.
+    pub(super) fn cut_gone<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+        for index in 0..self.granted.len() {
+            let granted = self.granted.get(index);
+            if granted.is_some_and(|granted| service_of(cx, granted.slot, granted.generation).is_none()) {
+                self.cut_lease(cx, index);
+            }
+        }
+    }
+
     /// Lets a lease expire at once.
     pub(super) fn cut_lease<M: Mailman, B: Buffers<S>, H: Service>(
         &mut self,
@@ -139,7 +152,8 @@ impl<S: Storage, C: Secure> Session<S, C> {
         let Some(granted) = self.granted.get_mut(index) else { return };
         granted.end = cx.now;
         self.timers.lease = cx.now;
-        if let Some((service, order)) = held_lease(cx, granted) {
+        let service = service_of(cx, granted.slot, granted.generation);
+        if let Some((service, order)) = service.zip(granted.order) {
             service.cut_lease(order);
         }
     }
@@ -191,7 +205,8 @@ impl<S: Storage, C: Secure> Session<S, C> {
                 self.tell_end(cx, granted.call, LeaseEnd::Expired);
                 return Some(granted.slot);
             }
-            self.tell_end(cx, granted.call, LeaseEnd::Replaced);
+            let is_gone = service_of(cx, granted.slot, granted.generation).is_none();
+            self.tell_end(cx, granted.call, if is_gone { LeaseEnd::Expired } else { LeaseEnd::Replaced });
         }
         self.timers.lease = self.granted.iter().map(|granted| granted.end).min().unwrap_or(Instant::FAR_FUTURE);
         None
@@ -226,18 +241,12 @@ fn service_of<'c, S: Storage, M: Mailman, B: Buffers<S>, H: Service>(
     cx.functions.lookup(slot, generation).ok().map(|function| function.handler)
 }
 
-/// The service and the order of a lease, where the port has one for it.
-fn held_lease<'c, S: Storage, M: Mailman, B: Buffers<S>, H: Service>(
-    cx: &Context<'c, S, M, B, H>,
-    granted: &Granted,
-) -> Option<(&'c H, Order)> {
-    service_of(cx, granted.slot, granted.generation).zip(granted.order)
-}
-
-/// `false` when a call of another peer holds the lease now: what goes on is that one's.
+/// Whether the safe hook is to run: not when a call of another peer holds the lease now, whose motion goes on, and not when
+/// the service is gone, with which its hook has run.
 pub(super) fn expire_granted<S: Storage, M: Mailman, B: Buffers<S>, H: Service>(
     cx: &Context<'_, S, M, B, H>,
     granted: &Granted,
 ) -> bool {
-    held_lease(cx, granted).is_none_or(|(service, order)| service.expire_lease(order))
+    let service = service_of(cx, granted.slot, granted.generation);
+    service.is_some_and(|service| granted.order.is_none_or(|order| service.expire_lease(order)))
 }

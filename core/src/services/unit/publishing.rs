@@ -196,6 +196,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         self.publishing.serial = self.publishing.serial.wrapping_add(1);
         self.publishing.dirty = true;
         self.publishing.end_due = true;
+        self.cut_gone(cx);
         self.pump(cx);
         self.publishing.serial
     }

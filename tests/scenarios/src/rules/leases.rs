@@ -20,6 +20,7 @@ scenarios![
     without_a_lease_motion_goes_on: "lease of a service (lease removed)", Rough, [], ["went on"];
     a_lease_that_is_not_renewed_ends: "lease of a service", Light, [], ["LeasesExpired"];
     a_released_lease_stops_at_once: "lease of a service", Light, [], ["stopped"];
+    what_a_service_that_goes_has_started_stops_at_once: "lease of a service", Light, [], ["gone"];
     what_is_finished_needs_no_safe_hook: "lease of a service", Light, [], ["finished"];
 ];
 
@@ -31,14 +32,16 @@ fn lease(world: &dyn World) -> Duration {
 /// What may come on top of the lease: one poll, in virtual time nothing.
 const SLACK: Duration = Duration::from_millis(1);
 
-/// Asks to drive, again where the network was so slow that the lease would have been over before it began.
+/// Asks to drive, again where the network was so slow that the lease would have been over before it began, or that the
+/// manager has not heard of the function yet.
 fn drive(world: &mut dyn World, manager: &Unit) {
     let mut asked = Err(Error::Expired);
-    for _ in 0..10 {
+    for _ in 0..200 {
         asked = world.ask(manager, "agv", "drive", &mut number("n", 1));
-        if asked != Err(Error::Expired) {
+        if !matches!(asked, Err(Error::Expired | Error::StaleFunction)) {
             break;
         }
+        world.run_for(millis(20));
     }
     assert_eq!(asked, Ok(()));
 }
@@ -142,6 +145,22 @@ fn a_released_lease_stops_at_once(world: &mut dyn World) {
     world.wait("the safe hook runs", || service.diary().stops().len() == 1, secs(10));
     assert!(!agv.lease_is_live("drive"));
     world.reached("stopped");
+}
+
+fn what_a_service_that_goes_has_started_stops_at_once(world: &mut dyn World) {
+    let (first, manager, agv) = driving(world);
+    let second = Service::new("drive(n: int[1])").lease(lease(world));
+    agv.replace_service(&second).expect("it is there");
+    world.wait("what the first one started is safe", || first.diary().stops().len() == 1, secs(10));
+    agv.publish().expect("it runs");
+    drive(world, &manager);
+    assert!(agv.lease_is_live("drive"));
+    agv.remove_service("drive").expect("it is there");
+    world.wait("what the second one started is safe", || second.diary().stops().len() == 1, secs(10));
+    world.run_for(lease(world).times(2));
+    let stops = [&first, &second].map(|service| service.diary().stops().len());
+    assert_eq!(stops, [1, 1], "each hook runs once");
+    world.reached("gone");
 }
 
 fn what_is_finished_needs_no_safe_hook(world: &mut dyn World) {

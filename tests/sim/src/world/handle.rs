@@ -139,14 +139,20 @@ impl UnitHandle {
     pub fn replace_function(&self, signature: &str, service: Service) -> Result<(), Error> {
         let definition = definition(signature);
         let attributes = service.attributes;
-        self.machine(|machine, _| {
-            machine.links.functions.replace(&definition, attributes, Handler(Rc::new(service))).map(|_| ())
-        })?
+        let replaced = self.machine(|machine, _| {
+            let functions = &mut machine.links.functions;
+            let before = functions.find(definition.name()).and_then(|slot| functions.function(slot));
+            let before = before.map(|function| Rc::clone(&function.handler.0));
+            functions.replace(&definition, attributes, Handler(Rc::new(service))).map(|_| before)
+        })??;
+        replaced.into_iter().for_each(|service| service.goes(self));
+        Ok(())
     }
 
     /// Removes a service; peers that saw it are told.
     pub fn remove_function(&self, name: &str) -> Result<(), Error> {
-        let slot = self.machine(|machine, _| machine.links.functions.remove(name).map(|(slot, _)| slot))??;
+        let (slot, Handler(service)) = self.machine(|machine, _| machine.links.functions.remove(name))??;
+        service.goes(self);
         self.machine(|machine, _| machine.publications.withdraw(slot))?;
         self.each_live_link(|links, network, index| {
             links.with(network, index, |session, cx| session.withdraw(cx, slot));

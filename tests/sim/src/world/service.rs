@@ -108,6 +108,15 @@ impl Service {
         Self::with(Body::Future(Box::new(move |call, parameters| Box::pin(body(call, parameters)))))
     }
 
+    /// What a call of it started is made safe when the service goes.
+    pub(super) fn goes(&self, unit: &UnitHandle) {
+        if self.lease.as_ref().is_some_and(Lease::clear)
+            && let Some(hook) = &self.safe_hook
+        {
+            hook(unit);
+        }
+    }
+
     fn with(body: Body) -> Self {
         Self {
             body,

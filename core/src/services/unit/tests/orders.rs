@@ -283,7 +283,24 @@ fn a_renewal_does_nothing_for_a_function_that_was_replaced_since() {
     renewal_arrives(&mut pair, call, Priority::Normal, Duration::ZERO);
     assert_eq!(pair.agv.counter(LinkCounter::RenewalsIgnored), 1);
     pair.run(millis(100));
-    assert_eq!(expirations(&pair), 1, "the lease of the function before was prolonged");
+    assert!(pair.agv.session.granted.is_empty(), "the lease of the function before was prolonged");
+    assert_eq!(expirations(&pair), 0, "the hook of the function that is there now runs");
+}
+
+/// Its hook has run with its removal, which is the port's affair.
+#[test]
+fn who_holds_a_lease_of_a_function_that_is_removed_is_told_at_once() {
+    let (mut pair, slot) = vehicle();
+    let call = go(&mut pair, Priority::Normal, true);
+    pair.settle();
+    pair.agv.answer_held(Ok(&*none()));
+    pair.settle();
+    assert!(pair.manager.session.holds(call));
+    pair.agv.functions.remove("go").unwrap();
+    pair.agv.withdraw(slot);
+    pair.settle();
+    assert_eq!((is_told(&pair, call, LeaseEnd::Expired), expirations(&pair)), (true, 0));
+    assert!(!pair.manager.session.holds(call), "it is renewed no more");
 }
 
 /// The motors' word refuses the new call; where there is none, the unit's own look at the lease does.
