@@ -80,7 +80,7 @@ pub struct CallHead {
     /// After this the caller no longer waits, and the call is not begun.
     pub deadline: Instant,
     /// The earliest time at which the caller can have made the request: its age is counted from here.
-    pub made: Instant,
+    pub sent_at: Instant,
 }
 
 /// So many requests that were given up before they arrived are remembered beside the windows.
@@ -448,7 +448,7 @@ fn encode_head(head: &CallHead, block: usize) -> impl Iterator<Item = u8> {
         .chain(head.generation.0.to_le_bytes())
         .chain(wants_reply)
         .chain(head.deadline.as_micros().to_le_bytes())
-        .chain(head.made.as_micros().to_le_bytes())
+        .chain(head.sent_at.as_micros().to_le_bytes())
 }
 
 fn decode_head(bytes: &[u8; HEAD_BYTES], priority: Priority) -> (CallHead, usize) {
@@ -461,7 +461,7 @@ fn decode_head(bytes: &[u8; HEAD_BYTES], priority: Priority) -> (CallHead, usize
         priority,
         wants_reply: wants_reply != 0,
         deadline: Instant::from_micros(u64::from_le_bytes([d0, d1, d2, d3, d4, d5, d6, d7])),
-        made: Instant::from_micros(u64::from_le_bytes([m0, m1, m2, m3, m4, m5, m6, m7])),
+        sent_at: Instant::from_micros(u64::from_le_bytes([m0, m1, m2, m3, m4, m5, m6, m7])),
     };
     (head, u32::from_le_bytes([l0, l1, l2, l3]) as usize)
 }
@@ -502,7 +502,7 @@ mod tests {
             priority,
             wants_reply: id.is_multiple_of(2),
             deadline: Instant::from_micros(u64::from(id) << 20),
-            made: Instant::from_micros(u64::from(id) << 10),
+            sent_at: Instant::from_micros(u64::from(id) << 10),
         }
     }
 

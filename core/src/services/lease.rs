@@ -235,8 +235,8 @@ pub(crate) struct Held {
     pub(crate) class: Priority,
     pub(crate) every: Duration,
     pub(crate) next: Instant,
-    /// It is renewed no more, and the release is still to be sent in the stream.
-    pub(crate) is_released: bool,
+    /// It is renewed no more, and its release has yet to be sent in the stream.
+    pub(crate) release_unsent: bool,
 }
 
 #[cfg(test)]

@@ -19,8 +19,8 @@ pub struct Pending {
     pub(crate) deadline: Instant,
     /// The class of a call whose function has a lease, which is released when the call fails.
     pub(crate) leased: Option<Priority>,
-    /// The call has ended, and the release of its lease is still to be sent in the stream.
-    pub(crate) is_released: bool,
+    /// The call has ended, and its release has yet to be sent in the stream.
+    pub(crate) release_unsent: bool,
 }
 
 /// The table of calls in flight to one peer: lent slots, found by id without a search.
@@ -79,7 +79,7 @@ impl<S: Storage> Requests<S> {
             let Some(id) = self.next_id() else { return Ok(None) };
             let Some(place) = self.place(id) else { continue };
             if place.is_none() {
-                *place = Some(Pending { id, slot, generation, deadline, leased, is_released: false });
+                *place = Some(Pending { id, slot, generation, deadline, leased, release_unsent: false });
                 self.in_flight = self.in_flight.saturating_add(1);
                 self.earliest = self.earliest.min(deadline);
                 return Ok(Some(id));
@@ -91,7 +91,7 @@ impl<S: Storage> Requests<S> {
     /// Ends a call and frees its slot. `None` when it had ended already.
     pub(crate) fn close(&mut self, id: CallId) -> Option<Pending> {
         let place = self.place(id)?;
-        let pending = place.take_if(|pending| pending.id == id && !pending.is_released)?;
+        let pending = place.take_if(|pending| pending.id == id && !pending.release_unsent)?;
         self.in_flight = self.in_flight.saturating_sub(1);
         Some(pending)
     }
@@ -116,25 +116,25 @@ impl<S: Storage> Requests<S> {
     }
 
     fn waiting(&self) -> impl Iterator<Item = &Pending> {
-        self.pending.iter().flatten().filter(|pending| !pending.is_released)
+        self.pending.iter().flatten().filter(|pending| !pending.release_unsent)
     }
 
     /// Keeps a call that was closed just now in its slot until its release has been sent.
-    pub(crate) fn keep_release(&mut self, pending: Pending) {
+    pub(crate) fn keep_unsent_release(&mut self, pending: Pending) {
         if let Some(place) = self.place(pending.id) {
-            *place = Some(Pending { is_released: true, ..pending });
+            *place = Some(Pending { release_unsent: true, ..pending });
             self.in_flight = self.in_flight.saturating_add(1);
         }
     }
 
     /// A call whose release is still to be sent, and its class.
-    pub(crate) fn release_due(&self) -> Option<(CallId, Priority)> {
-        let due = self.pending.iter().flatten().find(|pending| pending.is_released)?;
+    pub(crate) fn unsent_release(&self) -> Option<(CallId, Priority)> {
+        let due = self.pending.iter().flatten().find(|pending| pending.release_unsent)?;
         due.leased.map(|class| (due.id, class))
     }
 
     /// The release has been sent.
-    pub(crate) fn released(&mut self, id: CallId) {
+    pub(crate) fn release_sent(&mut self, id: CallId) {
         if self.place(id).and_then(|place| place.take_if(|pending| pending.id == id)).is_some() {
             self.in_flight = self.in_flight.saturating_sub(1);
         }
@@ -228,12 +228,12 @@ mod tests {
         let mut requests = table(2);
         let leased = requests.open(Slot(0), Generation(0), Instant::from_micros(10), Some(Priority::Low)).unwrap();
         let pending = requests.expire(Instant::from_micros(10)).unwrap();
-        requests.keep_release(pending);
-        assert_eq!(requests.release_due(), Some((leased.unwrap(), Priority::Low)));
+        requests.keep_unsent_release(pending);
+        assert_eq!(requests.unsent_release(), Some((leased.unwrap(), Priority::Low)));
         assert!(requests.close(pending.id).is_none() && requests.expire(Instant::FAR_FUTURE).is_none());
         assert_eq!((requests.interrupt(), requests.in_flight()), (None, 1));
-        requests.released(pending.id);
-        assert_eq!((requests.release_due(), requests.in_flight()), (None, 0));
+        requests.release_sent(pending.id);
+        assert_eq!((requests.unsent_release(), requests.in_flight()), (None, 0));
     }
 
     #[test]

@@ -8,7 +8,7 @@
 use core::net::{IpAddr, SocketAddr};
 
 use super::known::NodeState;
-use super::search::{alone, pause};
+use super::search::{mostly_late, pause};
 use super::{Node, NodeCounter, Target};
 use crate::config::{FIRST_SEARCH, LONGEST_SEARCH};
 use crate::distribution::authenticator::Authenticator;
@@ -116,7 +116,7 @@ impl Hosts {
     }
 
     /// Whether a question from there counts now; from here on it does not for a while.
-    pub(super) fn heeds(&mut self, now: Instant, from: SocketAddr) -> bool {
+    pub(super) fn counts(&mut self, now: Instant, from: SocketAddr) -> bool {
         while self.list.front().is_some_and(|(_, at)| *at + HOST_PAUSE <= now) {
             self.list.pop_front();
         }
@@ -161,7 +161,7 @@ impl<S: Storage> Node<S> {
         while let Some((to, who)) = self.hints.take(now) {
             self.ask(to, &who, mailman, authenticator);
             if self.search.next != Instant::FAR_FUTURE {
-                let soon = now + UNANSWERED + alone(&mut self.random, UNANSWERED);
+                let soon = now + UNANSWERED + mostly_late(&mut self.random, UNANSWERED);
                 self.search.next = self.search.next.min(soon);
             }
         }
@@ -175,7 +175,7 @@ impl<S: Storage> Node<S> {
             return false;
         }
         self.search.waited = true;
-        self.search.next = due.min(now + LONGEST_WAIT) + alone(&mut self.random, FIRST_SEARCH);
+        self.search.next = due.min(now + LONGEST_WAIT) + mostly_late(&mut self.random, FIRST_SEARCH);
         true
     }
 

@@ -35,7 +35,7 @@ const LONGEST_PAUSE_AFTER: u8 = 5;
 const STUBBORN: u64 = 1_024;
 /// Times in a row that a search is put off because of the budget.
 const DEFERRALS: u8 = 4;
-/// Steps of [`alone`]: among a thousand units about one falls into the earliest that is taken.
+/// Steps of [`mostly_late`]: among a thousand units about one falls into the earliest that is taken.
 const STEPS: u32 = 12;
 
 /// When this unit asks next.
@@ -81,7 +81,7 @@ impl Search {
 fn first_delay(role: Role, listening: Duration, random: &mut Random) -> Duration {
     match role {
         Role::MUnit => random.jitter(FIRST_DELAY),
-        Role::SUnit => alone(random, listening),
+        Role::SUnit => mostly_late(random, listening),
     }
 }
 
@@ -93,7 +93,7 @@ fn fresh(random: &mut Random) -> u64 {
 /// A delay in `[0, limit)` for something that one of many units should do for all, as far as they hear each other: half
 /// of them fall into the last step, a quarter into the one before, and so on, so that few are early, however many there
 /// are.
-pub(super) fn alone(random: &mut Random, limit: Duration) -> Duration {
+pub(super) fn mostly_late(random: &mut Random, limit: Duration) -> Duration {
     let step = limit.divided_by(u64::from(STEPS));
     let last = STEPS.saturating_sub(1);
     let early = random.bits().trailing_ones().min(last);
@@ -202,7 +202,7 @@ impl<S: Storage> Node<S> {
     pub(super) fn plan_next(&mut self, now: Instant) {
         let pause = pause(self.search.attempt);
         self.search.attempt = self.search.attempt.saturating_add(1);
-        self.search.next = now + pause + alone(&mut self.random, pause);
+        self.search.next = now + pause + mostly_late(&mut self.random, pause);
     }
 
     pub(super) fn poll_search(&mut self, now: Instant, mailman: &mut impl Mailman, authenticator: &impl Authenticator) {
@@ -225,7 +225,7 @@ impl<S: Storage> Node<S> {
             self.search.deferred = self.search.deferred.saturating_add(1);
             self.search.stubborn = self.search.deferred >= DEFERRALS;
             self.counters.add(NodeCounter::WhoHasDeferred, 1);
-            self.search.next = allowed + alone(&mut self.random, FIRST_SEARCH);
+            self.search.next = allowed + mostly_late(&mut self.random, FIRST_SEARCH);
             return;
         }
         self.send_who_has(now, mailman, authenticator);
@@ -271,11 +271,11 @@ impl<S: Storage> Node<S> {
         }
         self.counters.add(NodeCounter::WhoHasHeard, 1);
         let here = self.config.identity.role() == Role::MUnit;
-        let heeded = self.heeds(now, from, who_has);
+        let counts = self.counts(now, from, who_has);
         match &who_has.wanted {
             Some(manager) if manager.is(&self.config.identity) => self.answer_seeker(now, from, who_has),
             Some(manager) if self.manager() == Some(manager) => {
-                if heeded {
+                if counts {
                     self.hold_back(now);
                 }
             }
@@ -286,14 +286,14 @@ impl<S: Storage> Node<S> {
     }
 
     /// Whether another unit's question may put this unit's own off. One that asks a single node says nothing to others.
-    fn heeds(&mut self, now: Instant, from: SocketAddr, who_has: &WhoHas) -> bool {
-        let heeded = who_has.expected > 0 && self.hosts.heeds(now, from);
-        if heeded {
+    fn counts(&mut self, now: Instant, from: SocketAddr, who_has: &WhoHas) -> bool {
+        let counts = who_has.expected > 0 && self.hosts.counts(now, from);
+        if counts {
             self.budget.note(now);
         } else {
             self.counters.add(NodeCounter::WhoHasUnheeded, 1);
         }
-        heeded
+        counts
     }
 
     /// Another unit asks this unit's question: the answer will reach both.
@@ -311,7 +311,7 @@ impl<S: Storage> Node<S> {
             self.search.round = now;
         }
         let pause = pause(self.search.attempt.saturating_sub(1));
-        let later = now + pause + alone(&mut self.random, pause);
+        let later = now + pause + mostly_late(&mut self.random, pause);
         self.search.next = self.search.next.max(later);
     }
 

@@ -1,7 +1,7 @@
 //! Leases that the peer's calls hold on functions of this unit.
 
 use super::inbound::Outcome;
-use super::timing::made_at;
+use super::timing::sent_at_earliest;
 use super::{Event, Session};
 use crate::config::LEASES;
 use crate::distribution::function_list::{Generation, Slot};
@@ -28,7 +28,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         head: &CallHead,
         length: Duration,
     ) -> Result<Option<Order>, Error> {
-        let end = Lease::seen_end(head.made + length);
+        let end = Lease::seen_end(head.sent_at + length);
         if end <= cx.now {
             return Err(Error::Expired);
         }
@@ -85,8 +85,8 @@ impl<S: Storage, C: Secure> Session<S, C> {
             self.link.counters.add(LinkCounter::RenewalsIgnored, 1);
             return;
         }
-        let Some(made) = made_at(cx.now, renewal.stamp, renewal.since) else { return };
-        let end = Lease::seen_end(made + granted.length);
+        let Some(sent_at) = sent_at_earliest(cx.now, renewal.stamp, renewal.since) else { return };
+        let end = Lease::seen_end(sent_at + granted.length);
         // What was late on its way takes nothing away from what came before it, and revives nothing.
         if end > granted.end && granted.end > cx.now {
             self.prolong(cx, index, end);

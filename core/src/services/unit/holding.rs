@@ -1,4 +1,7 @@
-//! Leases that calls of this unit hold at the peer: renewed until they are released, and released when the call fails.
+//! Leases that calls of this unit hold at the peer.
+//!
+//! A call *holds* a lease as long as this unit renews it. It is *released* when the peer is told that the call is not
+//! wanted, wherever it is: when it has failed, and when its caller *cancels* it.
 
 use super::{Phase, Session};
 use crate::config::{LEASES, Priority};
@@ -17,9 +20,9 @@ use crate::time::{Duration, Instant};
 
 /// A held lease is renewed this often within its length, so that lost renewals do not end it.
 const RENEWALS_PER_LEASE: u64 = 4;
-/// But no more often, which is how often a lease of 20 ms is: a peer may publish a shorter one, which is over before it is
-/// renewed, and the renewals are not to fill the network.
-const SHORTEST_RENEWAL: Duration = Duration::from_millis(5);
+/// Renewals of a lease are so far apart at least, as those of one of 20 ms. A shorter one, which a peer may publish, ends
+/// before it is renewed: its renewals would fill the network.
+const SHORTEST_INTERVAL: Duration = Duration::from_millis(5);
 /// After this a release that the stream had no room for is tried again, if the stream has not become writable before.
 const RETRY: Duration = Duration::from_millis(20);
 
@@ -29,18 +32,18 @@ pub(super) type Releases = heapless::Vec<(Slot, CallId), LEASES>;
 impl<S: Storage, C: Secure> Session<S, C> {
     /// Whether this unit renews the lease of a call.
     pub fn holds(&self, call: CallId) -> bool {
-        self.held.iter().any(|held| held.call == call && !held.is_released)
+        self.held.iter().any(|held| held.call == call && !held.release_unsent)
     }
 
     /// [`Error::Full`] when a call of a leased function could not be renewed: there is no room, and no earlier call of the
     /// same function that would give way.
-    pub(super) fn check_held(&self, wanted: bool, slot: Slot) -> Result<(), Error> {
+    pub(super) fn check_room_to_hold(&self, wanted: bool, slot: Slot) -> Result<(), Error> {
         let fits = !wanted || !self.held.is_full() || self.oldest_held(slot).is_some();
         if fits { Ok(()) } else { Err(Error::Full(Limit::Leases)) }
     }
 
     fn oldest_held(&self, slot: Slot) -> Option<usize> {
-        let of_slot = self.held.iter().enumerate().filter(|(_, held)| held.slot == slot && !held.is_released);
+        let of_slot = self.held.iter().enumerate().filter(|(_, held)| held.slot == slot && !held.release_unsent);
         of_slot.min_by_key(|(_, held)| held.call).map(|(index, _)| index)
     }
 
@@ -59,9 +62,9 @@ impl<S: Storage, C: Secure> Session<S, C> {
             take_at(&mut self.held, oldest);
             self.link.counters.add(LinkCounter::RenewalsStopped, 1);
         }
-        let every = lease.divided_by(RENEWALS_PER_LEASE).max(SHORTEST_RENEWAL);
+        let every = lease.divided_by(RENEWALS_PER_LEASE).max(SHORTEST_INTERVAL);
         let (call, slot, next) = (CallId(header.id), header.slot, cx.now + every);
-        let _ = self.held.push(Held { call, slot, class, every, next, is_released: false });
+        let _ = self.held.push(Held { call, slot, class, every, next, release_unsent: false });
         self.timers.renewal = self.timers.renewal.min(next);
     }
 
@@ -69,7 +72,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         let (stamp, since) = self.clock.tell(cx.now);
         let now = cx.now;
         for index in 0..self.held.len() {
-            let due = self.held.get_mut(index).filter(|held| held.next <= now && !held.is_released);
+            let due = self.held.get_mut(index).filter(|held| held.next <= now && !held.release_unsent);
             let Some(held) = due else { continue };
             held.next = now + held.every;
             let renewal = Renewal { call: held.call.0, class: held.class, stamp, since };
@@ -78,19 +81,20 @@ impl<S: Storage, C: Secure> Session<S, C> {
             self.send_datagram(cx, &body, &[]);
             self.link.send_frame(&Frame::Session(&body));
         }
-        let renewed = self.held.iter().filter(|held| !held.is_released);
+        let renewed = self.held.iter().filter(|held| !held.release_unsent);
         self.timers.renewal = renewed.map(|held| held.next).min().unwrap_or(Instant::FAR_FUTURE);
         self.flush(cx);
     }
 
     /// The peer has ended the lease of a call.
-    pub(super) fn forget_held(&mut self, call: CallId) -> Option<Held> {
-        let index = self.held.iter().position(|held| held.call == call && !held.is_released)?;
+    pub(super) fn stop_renewing(&mut self, call: CallId) -> Option<Held> {
+        let index = self.held.iter().position(|held| held.call == call && !held.release_unsent)?;
         take_at(&mut self.held, index)
     }
 
-    /// The caller gives a call up: its reply, should it still come, counts as late, and the lease that it holds, or would
-    /// begin, is released. Other calls are untouched. Also for a call that has been answered, whose lease goes on.
+    /// The caller does not want a call any more: its reply, should it still come, counts as late, and the lease that it
+    /// holds, or would begin, is released. Other calls are untouched. Also for a call that has been answered and holds a
+    /// lease.
     pub fn cancel<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>, id: CallId) {
         let pending = self.requests.close(id);
         if let Some(pending) = &pending {
@@ -99,32 +103,31 @@ impl<S: Storage, C: Secure> Session<S, C> {
             let counter = if is_late { LinkCounter::CallsTimedOut } else { LinkCounter::CallsCancelled };
             self.link.counters.add(counter, 1);
         }
-        self.let_go(cx, id, pending);
+        self.release_call(cx, id, pending);
     }
 
-    /// A call has failed, or its caller does not want it any more: its lease is renewed no longer, and the peer is told,
-    /// wherever the call is. `pending` is what was known of it while it waited for its reply.
-    pub(super) fn let_go<M: Mailman, B: Buffers<S>, H: Service>(
+    /// Releases a call that has failed or was cancelled. `pending` is what was known of it while it waited for its reply.
+    pub(super) fn release_call<M: Mailman, B: Buffers<S>, H: Service>(
         &mut self,
         cx: &mut Context<'_, S, M, B, H>,
         id: CallId,
         pending: Option<Pending>,
     ) {
-        let held = self.forget_held(id);
+        let held = self.stop_renewing(id);
         let waited = pending.and_then(|pending| pending.leased);
         let Some(class) = held.map(|held| held.class).or(waited) else { return };
         if self.phase != Phase::Live || self.send_release(cx, id, class) {
             return;
         }
         match (pending, held) {
-            (Some(pending), _) => self.requests.keep_release(pending),
-            (None, Some(held)) => drop(self.held.push(Held { is_released: true, ..held })),
+            (Some(pending), _) => self.requests.keep_unsent_release(pending),
+            (None, Some(held)) => drop(self.held.push(Held { release_unsent: true, ..held })),
             (None, None) => {}
         }
         self.timers.release = cx.now + RETRY;
     }
 
-    /// Gives up the leases that calls of a function of the peer have begun or will begin: what they started stops.
+    /// Releases all calls of a function of the peer, those that are on their way as well: what they started stops.
     ///
     /// [`Error::Full`] where the peer can be told in no way now: nothing is renewed any more, and it may be tried again.
     pub fn release<M: Mailman, B: Buffers<S>, H: Service>(
@@ -135,7 +138,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         if self.phase != Phase::Live {
             return Err(Error::NotConnected);
         }
-        self.held.retain(|held| held.slot != slot || held.is_released);
+        self.held.retain(|held| held.slot != slot || held.release_unsent);
         let newest = self.requests.newest();
         if self.send_release_all(cx, slot, newest) {
             return Ok(());
@@ -160,17 +163,17 @@ impl<S: Storage, C: Secure> Session<S, C> {
             }
             self.releases.pop();
         }
-        while let Some(Held { call, class, .. }) = self.held.iter().find(|held| held.is_released).copied() {
+        while let Some(Held { call, class, .. }) = self.held.iter().find(|held| held.release_unsent).copied() {
             if !self.send_release(cx, call, class) {
                 return;
             }
             self.held.retain(|held| held.call != call);
         }
-        while let Some((id, class)) = self.requests.release_due() {
+        while let Some((id, class)) = self.requests.unsent_release() {
             if !self.send_release(cx, id, class) {
                 return;
             }
-            self.requests.released(id);
+            self.requests.release_sent(id);
         }
         self.timers.release = Instant::FAR_FUTURE;
     }

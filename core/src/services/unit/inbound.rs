@@ -5,7 +5,7 @@ use core::net::SocketAddr;
 use super::answering::{is_emergency, read_arguments};
 use super::permitting::may_publish;
 use super::publishing::Told;
-use super::timing::made_at;
+use super::timing::sent_at_earliest;
 use super::{Event, Phase, Session, close_reason};
 use crate::config::{EMERGENCY_BYTES, Priority};
 use crate::distribution::function::{Attributes, Signature};
@@ -266,7 +266,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
                 self.reply_arrived(cx, CallId(id), error, place.after(REPLY_BYTES))
             }
             Some(Message::Failure(id, error)) => {
-                self.let_go(cx, CallId(id), None);
+                self.release_call(cx, CallId(id), None);
                 Event::Failed(CallId(id), error).into()
             }
             Some(Message::Control(_)) => self.control_arrived(cx, place, lent),
@@ -290,7 +290,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         };
         match error {
             Some(error) => {
-                self.let_go(cx, id, Some(pending));
+                self.release_call(cx, id, Some(pending));
                 Event::Reply(id, Err(error)).into()
             }
             None => Outcome::Reply { id, slot: pending.slot, generation: pending.generation, block },
@@ -344,7 +344,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
                 }
                 Outcome::Nothing
             }
-            Control::LeaseEnded { call, why } => match self.forget_held(CallId(call)) {
+            Control::LeaseEnded { call, why } => match self.stop_renewing(CallId(call)) {
                 Some(held) => Event::LeaseEnded { call: held.call, slot: held.slot, why }.into(),
                 None => Outcome::Nothing,
             },
@@ -414,8 +414,8 @@ impl<S: Storage, C: Secure> Session<S, C> {
         if length > limit as usize {
             return Err(Error::TooLarge { limit });
         }
-        let made = made_at(cx.now, header.stamp, header.since).ok_or(Error::Malformed)?;
-        let deadline = made + header.remaining;
+        let sent_at = sent_at_earliest(cx.now, header.stamp, header.since).ok_or(Error::Malformed)?;
+        let deadline = sent_at + header.remaining;
         if deadline <= cx.now {
             return Err(Error::Expired);
         }
@@ -437,7 +437,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
             priority,
             wants_reply: header.wants_reply,
             deadline,
-            made,
+            sent_at,
         };
         Ok((head, function))
     }

@@ -90,7 +90,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     ) -> Result<CallId, Error> {
         let mut checked = self.check(cx, function, parameters, options, wants_reply)?;
         let slot = checked.header.slot;
-        self.check_held(checked.lease.is_some() && options.renew_lease, slot)?;
+        self.check_room_to_hold(checked.lease.is_some() && options.renew_lease, slot)?;
         let id = self.take_id(cx, &checked, wants_reply)?;
         checked.header.id = id.0;
         let sent = match options.delivery {

@@ -19,7 +19,7 @@ pub struct Publication {
     told: Option<Generation>,
     /// It has been visible at some time, so a call of it is stale rather than unknown.
     ever: bool,
-    /// The peer gave up what its requests up to this one started, or would have started.
+    /// The peer has released its requests up to this one.
     released: u32,
     /// What the peer has left of the rate that it may call at.
     bucket: Bucket,
@@ -109,14 +109,14 @@ impl<S: Storage> Publishing<S> {
         }
     }
 
-    /// The peer gives up what its requests up to `id` started or would start.
+    /// The peer releases its requests up to `id`.
     pub(super) fn release(&mut self, slot: Slot, id: u32) {
         if let Some(publication) = self.table.get_mut(usize::from(slot.0)) {
             publication.released = publication.released.max(id);
         }
     }
 
-    /// Whether the peer has given up what request `id` would start.
+    /// Whether the peer has released request `id`, so that it does not begin.
     pub(super) fn is_released(&self, slot: Slot, id: u32) -> bool {
         self.table.get(usize::from(slot.0)).is_some_and(|publication| id <= publication.released)
     }

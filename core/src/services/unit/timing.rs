@@ -54,10 +54,10 @@ impl PeerClock {
 }
 
 /// The earliest time at which the peer can have made what it stamped so; `None` for a stamp from the future.
-pub(super) fn made_at(now: Instant, stamp: u64, since: Duration) -> Option<Instant> {
-    let made = Instant::from_micros(stamp) + since;
+pub(super) fn sent_at_earliest(now: Instant, stamp: u64, since: Duration) -> Option<Instant> {
+    let sent_at = Instant::from_micros(stamp) + since;
     // The peer's clock runs a little faster or slower than ours; what seems to come from the future is new.
-    if Instant::from_micros(stamp) > now { None } else { Some(made.min(now)) }
+    if Instant::from_micros(stamp) > now { None } else { Some(sent_at.min(now)) }
 }
 
 /// When each thing is due.
@@ -143,7 +143,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         }
         if let Some(pending) = self.requests.expire(cx.now) {
             let id = pending.id;
-            self.let_go(cx, id, Some(pending));
+            self.release_call(cx, id, Some(pending));
             self.link.counters.add(LinkCounter::CallsTimedOut, 1);
             return Some(Event::Reply(id, Err(Error::TimedOut)));
         }
