@@ -15,7 +15,7 @@ use crate::distribution::authenticator::Authenticator;
 use crate::distribution::hello::Manager;
 use crate::distribution::identity::Identity;
 use crate::host::mailman::Mailman;
-use crate::storage::{Storage, take_at};
+use crate::storage::Storage;
 use crate::time::{Duration, Instant};
 
 /// Addresses that are asked side by side.
@@ -71,14 +71,12 @@ impl Hints {
             }
             return is_free;
         }
-        if self.list.is_full() {
-            // The one that was asked longest ago, even if it is to be asked again: it has had its time to answer.
-            let asked = self.list.iter().enumerate().filter(|(_, hint)| hint.asked > 0 && hint.since + STAY <= now);
-            let Some((oldest, _)) = asked.min_by_key(|(_, hint)| hint.since) else { return false };
-            take_at(&mut self.list, oldest);
-        }
         let who = who.clone();
-        self.list.push(Hint { from, who, due: Some(due), asked: 0, not_before: now, since: now }).is_ok()
+        let hint = Hint { from, who, due: Some(due), asked: 0, not_before: now, since: now };
+        let Err(hint) = self.list.push(hint) else { return true };
+        // The one that was asked longest ago gives way, even if it is to be asked again: it has had its time to answer.
+        let asked = self.list.iter_mut().filter(|known| known.asked > 0 && known.since + STAY <= now);
+        asked.min_by_key(|known| known.since).map(|oldest| *oldest = hint).is_some()
     }
 
     /// A question that is due.
