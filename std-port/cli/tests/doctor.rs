@@ -124,6 +124,24 @@ fn a_full_manager_is_told_by_itself_and_by_what_it_says_on_the_network() {
     assert!(told.found(0).contains("boss/1") && told.found(0).contains("second/2"), "{told:?}");
 }
 
+/// `agv/9` has no link, and looks for its manager where all hear it.
+#[test]
+fn a_name_of_several_nodes_is_refused() {
+    let clinic = Clinic::new();
+    let _manager = clinic.manager("boss", 64);
+    let _agv = clinic.started(clinic.unit("agv", 7, "boss"));
+    let search = clinic.search("agv", 9, 1);
+    while_running(
+        || search.send(),
+        || {
+            let (code, _, errors) = clinic.output(&["agv"]);
+            assert_eq!(code, 2, "{errors}");
+            assert!(errors.contains("several nodes are called `agv`: write agv/7 or agv/9"), "{errors}");
+        },
+    );
+    clinic.doctor(&["agv/7"]).is(&["connected"], 0);
+}
+
 #[test]
 fn of_two_managers_with_one_name_is_told_first() {
     let clinic = Clinic::new();
