@@ -9,6 +9,7 @@ use std::sync::mpsc::Receiver;
 use std::time::{Duration, Instant};
 
 use cara_processes::network;
+use cara_std::control::Control;
 use cara_std::{CloseReason, CommunicationSystem, Error, Interfaces, Parameters, Unit, UnitEvent};
 
 const PATIENCE: Duration = Duration::from_secs(30);
@@ -25,8 +26,9 @@ fn plug_in() {
     ip("link set eth7 up");
 }
 
+/// Without a control socket: its place is the same in all of these networks.
 fn manager() -> (CommunicationSystem, Receiver<UnitEvent>) {
-    let manager = keyed::pair(0).0.interfaces(Interfaces::All).build_system().unwrap();
+    let manager = keyed::pair(0).0.interfaces(Interfaces::All).control(Control::Off).build_system().unwrap();
     let events = manager.events();
     manager.start().unwrap();
     (manager, events)
@@ -137,7 +139,7 @@ fn a_fixed_address_without_a_route_is_told() {
     }
     // The manager comes to be there, with the cable.
     plug_in();
-    let manager = manager.tcp_port(7_000).build_system().unwrap();
+    let manager = manager.tcp_port(7_000).control(Control::Off).build_system().unwrap();
     manager.start().unwrap();
     until("it has joined", || manager.number_of_s_units() == 1);
 }
