@@ -245,7 +245,8 @@ mod tests {
         let later = Instant::from_micros(4_000);
         assert_eq!(requests.gate(later, interval), Err(Error::TooSoon { wait: Duration::from_millis(6) }));
         assert_eq!(requests.gate(Instant::from_micros(10_000), interval), Ok(()));
-        assert_eq!(requests.gate(later, Duration::ZERO), Ok(()));
+        let default = crate::config::Constraints::M_UNIT.minimum_interval;
+        assert_eq!((default, requests.gate(Instant::START, default)), (Duration::ZERO, Ok(())), "one behind the other");
     }
 
     #[test]

@@ -110,6 +110,26 @@ fn a_request_to_all_without_waiting_reports_the_failure() {
     }
 }
 
+/// Its parameters stay as they are, whatever the service makes of them.
+#[test]
+fn a_request_without_waiting_returns_while_its_service_runs() {
+    let (manager, agv) = pair();
+    let gate = Arc::new(Gate::default());
+    let at_gate = gate.clone();
+    let slow = service(move |number| {
+        at_gate.pass();
+        number + 1
+    });
+    agv.my_function_list().add_function("f", &number(0), slow).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    let parameters = number(1);
+    peer.request("f", &parameters).unwrap();
+    until("it runs", || gate.came() == 1);
+    gate.open();
+    until("it has run", || ask(&peer, "f", 5) == Ok(6));
+    assert_eq!(value(&parameters), 1);
+}
+
 #[test]
 fn publishing_waits_until_all_have_acknowledged() {
     let fleet = fleet();

@@ -15,11 +15,14 @@ const LIMIT: Duration = Duration::from_secs(90);
 /// The seed of plain `cargo test`.
 const SEED: u64 = 1;
 
-/// Runs what the port can and the command line asks for: names that contain one of its words, all without one.
+/// Runs what the port can and the command line asks for: names that contain one of its words, or with `--exact` are one of
+/// them; all without a word.
 pub fn main(port: Port, threads: usize) -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let words: Vec<&String> = arguments.iter().filter(|word| !word.starts_with('-')).collect();
-    let wanted = |scenario: &Scenario| words.is_empty() || words.iter().any(|word| scenario.name.contains(*word));
+    let exact = arguments.iter().any(|word| word == "--exact");
+    let named = |scenario: &Scenario, word: &str| scenario.name == word || (!exact && scenario.name.contains(word));
+    let wanted = |scenario: &Scenario| words.is_empty() || words.iter().any(|word| named(scenario, word));
     let can = |scenario: &Scenario| scenario.missing_on(port).is_none();
     let scenarios: Vec<Scenario> = all().into_iter().filter(|scenario| can(scenario) && wanted(scenario)).collect();
     if arguments.iter().any(|word| word == "--list") {

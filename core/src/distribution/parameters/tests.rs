@@ -19,9 +19,11 @@ use super::*;
 #[test]
 fn the_listing_of_the_paper() {
     let mut pos = Parameters::new();
+    assert!(pos.is_empty() && pos.iter().next().is_none());
     pos.add_int("position", 2).unwrap();
-    let mut coordinates = [0; 2];
+    let mut coordinates = [9; 2];
     pos.variable_into("position", &mut coordinates).unwrap();
+    assert_eq!(coordinates, [0, 0]);
     coordinates[0] = 1;
     coordinates[1] = 2;
     pos.set_value("position", coordinates).unwrap();

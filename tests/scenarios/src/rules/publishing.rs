@@ -6,13 +6,14 @@ use cara_core::host::connections::LinkCounter;
 
 use super::{met, pair};
 use crate::scenario::scenarios;
-use crate::{Seen, Service, Spec, World, millis, number, secs};
+use crate::{Fault, Seen, Service, Spec, World, millis, number, secs};
 
 scenarios![
     published_to_one_is_hidden_from_others: "43–44", Rough, [], ["RequestsRun"];
     published_to_all_reaches_those_that_come_later: "45–46", Rough, [], ["RequestsRun"];
     published_to_one_survives_its_reconnection: "44", Rough, [], ["RequestsRun", "agv came back"];
     publishing_waits_until_everybody_has_read: "45", Rough, [], ["MessagesSent"];
+    publishing_returns_at_once_or_waits_as_asked: "45b", Light, [Freeze], ["freeze"];
     a_changed_function_is_stale_until_it_is_published_again: "12", Rough, [], ["RequestsRejected"];
     a_removed_function_is_gone_and_the_others_stay: "12", Rough, [], ["RequestsRun"];
     what_a_peer_has_no_room_for_is_counted: "12", Rough, [], ["FunctionsSkipped"];
@@ -29,8 +30,10 @@ fn published_to_one_is_hidden_from_others(world: &mut dyn World) {
     manager.publish_to("one").expect("it can be published");
     met(world, &one, "manager", "call_mechanic");
     assert_eq!(world.ask(&one, "manager", "call_mechanic", &mut number("n", 0)), Ok(()));
+    let late = world.add(Spec::agv("late", 3));
+    world.wait("a third has joined", || late.is_connected("manager"), secs(40));
     world.run_for(millis(200));
-    assert!(!other.knows("manager", "call_mechanic"));
+    assert!(!other.knows("manager", "call_mechanic") && !late.knows("manager", "call_mechanic"));
     assert_eq!(other.request("manager", "call_mechanic", &number("n", 0)), Err(Error::UnknownFunction));
 }
 
@@ -81,6 +84,24 @@ fn publishing_waits_until_everybody_has_read(world: &mut dyn World) {
     let has_left = |node: &Identity| events.iter().any(|(_, seen)| matches!(seen, Seen::Left(left, _) if left == node));
     assert!(missing.iter().all(has_left), "{missing:?} had not read");
     world.wait("all have read in the end", || agvs.iter().all(|agv| agv.knows("manager", "late")), secs(40));
+}
+
+/// While the stream to the AGV holds everything, nobody can have read what is published.
+fn publishing_returns_at_once_or_waits_as_asked(world: &mut dyn World) {
+    let manager = world.add(Spec::manager("manager", 1));
+    let agv = world.add(Spec::agv("agv", 7));
+    world.wait("it has joined", || manager.is_connected("agv") && agv.is_connected("manager"), secs(40));
+    // Keep-alives pass, so that the link outlives the pause of its stream.
+    world.run_for(secs(2));
+    manager.add_service(&Service::new("late()")).expect("there is room");
+    world.fault(Fault::FreezeStreams(&manager, &agv, secs(6)));
+    manager.publish().expect("it can be published");
+    assert!(!agv.knows("manager", "late"), "it has returned before the AGV has read");
+    let told = manager.begin_publish();
+    world.run_for(secs(1));
+    assert!(!told.is_over() && !agv.knows("manager", "late"), "it waits for the AGV");
+    assert_eq!(world.finish(&told), Ok(vec![]));
+    assert!(agv.knows("manager", "late"));
 }
 
 fn a_changed_function_is_stale_until_it_is_published_again(world: &mut dyn World) {

@@ -21,6 +21,30 @@ fn a_request_updates_the_callers_parameters() {
     assert_eq!((pair.manager.session.calls_in_flight(), pair.agv.session.calls_held()), (0, 0));
 }
 
+/// Those sent, received, refused and dropped.
+#[test]
+fn a_link_counts_what_becomes_of_its_messages() {
+    let mut pair = Pair::with_position();
+    pair.agv.offer_held("wait()");
+    pair.publish();
+    let count = |pair: &Pair, counter| [pair.manager.counter(counter), pair.agv.counter(counter)];
+    let messages = |pair: &Pair| {
+        let [sent, received] = [LinkCounter::MessagesSent, LinkCounter::MessagesReceived].map(|of| count(pair, of));
+        [sent[0], received[1], sent[1], received[0]]
+    };
+    let before = messages(&pair);
+    pair.block_request("pos_info", &mut *parameters(|pos| pos.add_int("position", 2).unwrap())).unwrap();
+    assert_eq!(messages(&pair), before.map(|count| count + 1));
+    assert_eq!(pair.manager.call("come", &none()), Err(Error::UnknownFunction));
+    let late = pair.manager.call("wait", &none()).unwrap();
+    pair.run(Duration::from_secs(2));
+    assert_eq!(pair.manager.outcome(late).unwrap().unwrap_err(), Error::TimedOut);
+    pair.agv.answer_held(Ok(&*none()));
+    pair.settle();
+    let counted = [LinkCounter::RequestsWithheld, LinkCounter::CallsTimedOut, LinkCounter::RepliesLate];
+    assert_eq!(counted.map(|counter| count(&pair, counter)), [[1, 0]; 3]);
+}
+
 #[test]
 fn twenty_thousand_characters_travel_in_chunks() {
     let mut pair = Pair::live();
