@@ -36,6 +36,12 @@ impl Run {
         self
     }
 
+    /// In another folder than the project's root.
+    pub(crate) fn within(mut self, folder: &Path) -> Self {
+        self.command.current_dir(folder);
+        self
+    }
+
     /// With the standard input of this program.
     pub(crate) fn interactive(mut self) -> Self {
         self.command.stdin(Stdio::inherit());

@@ -55,6 +55,15 @@ enum Task {
         #[arg(long)]
         list: bool,
     },
+    /// Breaks what rows of docs/paper.md say, one committed patch at a time, and requires that the row's test fails.
+    Paper {
+        /// Rows; all that have a patch if not given.
+        #[arg(value_name = "NUMBER")]
+        numbers: Vec<String>,
+        /// Breaks nothing, and writes on which ports each row's tests run.
+        #[arg(long, conflicts_with = "numbers")]
+        write: bool,
+    },
     /// Prints the sizes of the firmware images and the memory that each capacity costs.
     Sizes {
         /// Also writes the figures here.
@@ -116,6 +125,8 @@ fn main() -> ExitCode {
         Task::Test { groups, quick, list: false } => runner::run(&groups, quick),
         Task::Sizes { json, write } => firmware::sizes(json.as_deref(), write),
         Task::Instructions { json, write } => instructions::run(json.as_deref(), write),
+        Task::Paper { write: true, .. } => paper::write_ports().map(|()| ExitCode::SUCCESS),
+        Task::Paper { numbers, write: false } => paper::broken::run(&numbers),
         Task::Fleet { nodes, json } => fleet::run(nodes, json.as_deref()),
         Task::Peers { names } => peers::run(&names),
         Task::Sanitize => sanitize::run(),
