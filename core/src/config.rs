@@ -100,7 +100,7 @@ impl Constraints {
     pub const M_UNIT: Self = Self {
         request_timeout: Duration::from_secs(2),
         minimum_interval: Duration::ZERO,
-        maximum_nodes: 64,
+        maximum_nodes: 1_000,
         message_size: 32 * 1024,
         chunk_size: CHUNK_BYTES as u16,
         keep_alive: Duration::from_secs(1),

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use cara_core::config::Constraints;
-use cara_core::distribution::connection_handler::{Node, NodeConfig, NodeStorage, Target};
+use cara_core::distribution::connection_handler::{Node, NodeConfig, Target};
 use cara_core::distribution::function_list::{Entry, FunctionList};
 use cara_core::distribution::hello::Manager;
 use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
@@ -18,7 +18,7 @@ use crate::access::AccessTable;
 use crate::access::{AccessError, watch::FileWatch};
 use crate::communication_system::{CommunicationSystem, Owner};
 use crate::config::Capacities;
-use crate::engine::{Engine, EngineParts, Keys, NodeCell, message_buffer_bytes, system_refused};
+use crate::engine::{Engine, EngineParts, Keys, NodeCell, message_buffer_bytes, node_storage, system_refused};
 use crate::error::StartError;
 use crate::keys::{KeyError, KeyRing, LiveRing};
 use crate::pool::MessagePool;
@@ -31,10 +31,6 @@ use crate::unit::Unit;
 
 /// Message buffers that a unit keeps while it is idle.
 const KEPT_BUFFERS: usize = 8;
-/// Nodes that are remembered beyond the maximum number of connected ones.
-const REMEMBERED_NODES: usize = 16;
-/// Refusals that are remembered for the operator.
-const FINDINGS: usize = 32;
 
 /// Makes a [`CommunicationSystem`] or a [`Unit`].
 pub struct Builder<T> {
@@ -262,13 +258,7 @@ impl<T: Send + 'static> Builder<T> {
             constraints: self.constraints,
             seed: random(),
         };
-        let storage = NodeStorage {
-            nodes: filled(nodes + REMEMBERED_NODES, None),
-            order: filled_with(nodes + REMEMBERED_NODES, Default::default),
-            links: filled(maximum_links, None),
-            findings: filled(FINDINGS, None),
-        };
-        let node = Node::new(threads.crew().clock.now(), config, storage);
+        let node = Node::new(threads.crew().clock.now(), config, node_storage(nodes, maximum_links));
         let publications =
             Publications::new(filled(capacities.functions, false), filled(capacities.published_to_one, None));
         let functions =
@@ -279,7 +269,7 @@ impl<T: Send + 'static> Builder<T> {
             own_threads,
             capacities,
             keys,
-            node: NodeCell::new(node, publications, nodes + REMEMBERED_NODES),
+            node: NodeCell::new(node, publications),
             functions,
             pool: MessagePool::new(size, capacities.message_buffers, KEPT_BUFFERS),
             state: self.state,

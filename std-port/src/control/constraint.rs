@@ -59,7 +59,11 @@ fn narrow<N: TryFrom<u64>>(name: &str, value: u64) -> Result<N, Failure> {
 
 fn bad(name: &str, value: u64) -> Failure {
     let bounds = match plain(name) {
-        "maximum_nodes" => "it is at least 1, and at most what the unit was made with and 16 more".to_owned(),
+        "maximum_nodes" => format!(
+            "it is 1 to {}, and its process may have {} links open at most (ulimit -Hn)",
+            u16::MAX,
+            crate::sys::limits::most_links()
+        ),
         "message_size" => format!("it is {SHORTEST_MESSAGE} to {LONGEST_MESSAGE} bytes"),
         "chunk_size" => format!("it is {MINIMUM_CHUNK_BYTES} to {CHUNK_BYTES} bytes"),
         "request_timeout" => "it is at least 1000 microseconds".to_owned(),

@@ -4,7 +4,6 @@ use std::cmp::Reverse;
 use std::collections::HashMap;
 use std::sync::Arc;
 
-use cara_core::config::Constraints;
 use cara_core::distribution::connection_handler::{Action, Admission, Node, NodeCounter};
 use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::identity::Identity;
@@ -28,8 +27,6 @@ use crate::sys::stream::Stream;
 pub(crate) struct NodeCell {
     pub(crate) node: Node<Boxed>,
     pub(crate) publications: Publications<Boxed>,
-    /// Nodes that the tables have room for.
-    room: usize,
     serial: u32,
     /// The serial of the link that last had an index: what the node says of an index is meant for that one.
     serials: HashMap<LinkId, u32>,
@@ -55,8 +52,8 @@ const KEPT_FOR_OPERATOR: u64 = 20;
 struct Dialed<'i>(Option<&'i Identity>);
 
 impl NodeCell {
-    pub(crate) fn new(node: Node<Boxed>, publications: Publications<Boxed>, room: usize) -> Self {
-        Self { node, publications, room, serial: 0, serials: HashMap::new() }
+    pub(crate) fn new(node: Node<Boxed>, publications: Publications<Boxed>) -> Self {
+        Self { node, publications, serial: 0, serials: HashMap::new() }
     }
 
     /// To be asked under the lock under which the node wanted it.
@@ -69,14 +66,6 @@ impl NodeCell {
             Action::Admit { new } | Action::Refuse { new, .. } => (None, serial(*new)),
         };
         Some(Directive { action, old, new })
-    }
-
-    pub(crate) fn set_constraints(&mut self, constraints: Constraints) -> Result<(), Error> {
-        if usize::from(constraints.maximum_nodes) > self.room {
-            return Err(Error::BadConstraint);
-        }
-        self.node.set_constraints(constraints);
-        Ok(())
     }
 
     /// Longest block of parameters that this unit takes.

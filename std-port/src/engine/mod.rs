@@ -38,6 +38,7 @@ pub(crate) use calling::{CallFuture, worth_waiting};
 pub(crate) use clock_thread::system_refused;
 pub(crate) use keys::Keys;
 pub(crate) use membership::NodeCell;
+pub(crate) use tables::node_storage;
 pub(crate) use workers::arena_bytes;
 
 use std::sync::atomic::{self, AtomicBool, AtomicU64, AtomicUsize, Ordering};
@@ -507,12 +508,13 @@ impl<T: Send + 'static> Engine<T> {
         lost
     }
 
-    /// Changes the constraints of the unit and tells every peer. [`Error::BadConstraint`] for more nodes than the tables
-    /// have room for.
+    /// Changes the constraints of the unit and tells every peer. [`Error::BadConstraint`] for more nodes than the process may
+    /// have files open for.
     pub(crate) fn set_constraints(&self, constraints: Constraints) -> Result<(), Error> {
+        self.make_node_room(constraints.maximum_nodes)?;
         let longest = {
             let mut cell = lock(&self.node);
-            cell.set_constraints(constraints)?;
+            cell.node.set_constraints(constraints);
             cell.longest_message()
         };
         // Buffers first: peers send longer messages as soon as they are told.

@@ -2,6 +2,7 @@
 //! unit's capacities. A manager of a thousand nodes pays for what its nodes offer, not for the most that they could.
 
 use cara_core::config::{LINK_BUFFER_BYTES, SIGNATURE_BYTES};
+use cara_core::distribution::connection_handler::NodeStorage;
 use cara_core::distribution::function_list::Entry;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, Limit};
@@ -11,9 +12,15 @@ use cara_core::services::unit::{RequestOptions, SessionStorage};
 use cara_core::time::Instant;
 
 use super::link::{LinkCell, LinkState};
-use super::{Engine, read};
+use super::{Engine, lock, read, write};
 use crate::config::Capacities;
 use crate::storage::{Boxed, filled, filled_with};
+use crate::sys::limits;
+
+/// Nodes that left and are remembered, beyond the most that may be connected.
+const REMEMBERED_NODES: usize = 16;
+/// Refusals that are remembered for the operator.
+const FINDINGS: usize = 32;
 
 /// Calls in flight to a peer that a link begins with room for.
 const FIRST_CALLS: usize = 4;
@@ -32,7 +39,37 @@ fn longer(length: usize, needed: usize, most: usize) -> usize {
     if length >= needed { length } else { length.saturating_add(length / 2).max(needed).min(most) }
 }
 
+/// The slices of a unit that may be connected to so many nodes, over so many links.
+pub(crate) fn node_storage(nodes: usize, links: usize) -> NodeStorage<Boxed> {
+    NodeStorage {
+        nodes: filled(nodes + REMEMBERED_NODES, None),
+        order: filled_with(nodes + REMEMBERED_NODES, Default::default),
+        links: filled(links, None),
+        findings: filled(FINDINGS, None),
+    }
+}
+
 impl<T: Send + 'static> Engine<T> {
+    /// Longer tables where those of the node are too short for so many. [`Error::BadConstraint`] where the process may not have
+    /// as many files open.
+    pub(super) fn make_node_room(&self, nodes: u16) -> Result<(), Error> {
+        let nodes = usize::from(nodes);
+        let links = nodes + self.capacities.pending_links;
+        if read(&self.links).len() >= links {
+            return Ok(());
+        }
+        if !limits::make_room_for(links) {
+            return Err(Error::BadConstraint);
+        }
+        // The node first: it is to know every link that there can be.
+        let longer = node_storage(nodes, links);
+        lock(&self.node).node.grow(longer.nodes, longer.order, longer.links);
+        let mut cells = write(&self.links);
+        let length = cells.len().max(links);
+        cells.resize_with(length, || None);
+        Ok(())
+    }
+
     /// The slices that a session begins with.
     pub(super) fn session_storage(&self) -> SessionStorage<Boxed> {
         let Capacities { calls_in_flight, calls_running, their_functions, their_signature_bytes, .. } = self.capacities;

@@ -25,12 +25,19 @@ pub fn raise() -> u64 {
     }
 }
 
-/// Makes room for so many links where the soft limit is too low, and tells where the hard one is.
-pub fn make_room_for(links: usize) {
+/// Makes room for so many links where the soft limit is too low; `false`, and a warning, where the hard one is.
+pub fn make_room_for(links: usize) -> bool {
     let needed = (links as u64).saturating_add(BESIDES);
-    if !is_enough(getrlimit(Resource::Nofile).current, needed) && !is_enough(Some(raise()), needed) {
+    let is_enough = is_enough(getrlimit(Resource::Nofile).current, needed) || is_enough(Some(raise()), needed);
+    if !is_enough {
         tracing::warn!(needed, limit = raise(), "fewer files may be open than links are allowed: raise ulimit -Hn");
     }
+    is_enough
+}
+
+/// For how many links there is room at most.
+pub fn most_links() -> u64 {
+    getrlimit(Resource::Nofile).maximum.map_or(u64::MAX, |limit| limit.saturating_sub(BESIDES))
 }
 
 /// How many descriptors the process may open beyond this one. It is the newest, and the system gives the lowest number that is
@@ -54,7 +61,7 @@ mod tests {
         let Rlimit { current, maximum } = getrlimit(Resource::Nofile);
         assert_eq!((current, current), (maximum, Some(limit)));
         // Too many for any system: it warns, and goes on with what there is.
-        make_room_for(usize::MAX);
+        assert!(!make_room_for(usize::MAX) && make_room_for(1));
         assert_eq!(getrlimit(Resource::Nofile).current, current);
     }
 

@@ -3,7 +3,7 @@
 use std::sync::mpsc::Receiver;
 use std::time::Duration;
 
-use cara_std::{BuildError, CloseReason, Constraints, Error, Refusal, UnitEvent};
+use cara_std::{BuildError, CloseReason, Constraints, Error, Refusal, Threads, Unit, UnitEvent};
 
 use crate::support::{
     PATIENCE, ask, counter, fleet, meet, number, service, system, system_named, unit, unit_of, until,
@@ -57,6 +57,25 @@ fn a_full_manager_says_so() {
     first.stop();
     until("the second has the first one's place", || manager.s_unit("second").is_ok_and(|peer| peer.is_connected()));
     assert_eq!(manager.s_units().len(), 1);
+}
+
+/// The tables grow: nothing was made for so many at the start.
+#[test]
+fn a_full_manager_takes_more_when_its_maximum_is_raised() {
+    const NODES: u16 = 40;
+    let fleet = fleet();
+    let few = Constraints { maximum_nodes: 1, ..Constraints::M_UNIT };
+    let manager = system(fleet).constraints(few).build_system().unwrap();
+    let first = unit("first", 1, fleet).build_unit().unwrap();
+    let (peer, _) = meet(&manager, &first);
+    let threads = Threads::new().unwrap();
+    let others: Vec<Unit> =
+        (2..=NODES.into()).map(|id| unit("other", id, fleet).threads(&threads).build_unit().unwrap()).collect();
+    others.iter().for_each(|unit| unit.start().unwrap());
+    manager.set_constraints(Constraints { maximum_nodes: NODES, ..few }).unwrap();
+    until("all have joined", || manager.number_of_s_units() == usize::from(NODES));
+    assert!(peer.is_connected(), "the first is where it was");
+    assert_eq!(manager.s_unit("first").unwrap().identity(), peer.identity());
 }
 
 #[test]

@@ -258,6 +258,11 @@ impl<S: Storage> Node<S> {
         self.config.constraints = constraints;
     }
 
+    /// Moves to longer tables, for a higher maximum of nodes; does nothing where one is shorter. Findings stay where they are.
+    pub fn grow(&mut self, nodes: S::Slice<Option<Known>>, order: S::Slice<Order>, links: S::Slice<Option<u16>>) {
+        self.table.grow(nodes, order, links);
+    }
+
     /// Changes the most nodes that may be connected at a time.
     pub fn set_maximum_nodes(&mut self, maximum_nodes: u16) {
         self.config.constraints.maximum_nodes = maximum_nodes;

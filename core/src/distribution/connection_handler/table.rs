@@ -83,6 +83,22 @@ impl<S: Storage> Table<S> {
         }
     }
 
+    /// Moves to longer slices; does nothing where one is shorter. Places, indices and orders stay.
+    pub(super) fn grow(
+        &mut self,
+        mut nodes: S::Slice<Option<Known>>,
+        mut order: S::Slice<Order>,
+        mut links: S::Slice<Option<u16>>,
+    ) {
+        if nodes.len() < self.nodes.len() || order.len() < self.order.len() || links.len() < self.links.len() {
+            return;
+        }
+        nodes.iter_mut().zip(self.nodes.iter_mut()).for_each(|(new, old)| *new = old.take());
+        order.iter_mut().zip(self.order.iter()).for_each(|(new, old)| *new = *old);
+        links.iter_mut().zip(self.links.iter()).for_each(|(new, old)| *new = *old);
+        (self.nodes, self.order, self.links) = (nodes, order, links);
+    }
+
     pub(super) fn iter(&self) -> impl Iterator<Item = &Known> {
         self.nodes.iter().flatten()
     }

@@ -9,7 +9,9 @@ use super::super::table::Table;
 use super::super::timetable::Task;
 use super::*;
 
-const CAPACITY: usize = 6;
+/// Nodes that there is room for at first, and when the table has grown: no more than it knows strangers.
+const CAPACITY: usize = 5;
+const GROWN: usize = 8;
 
 fn identity(which: u8) -> Identity {
     let role = if which.is_multiple_of(3) { Role::MUnit } else { Role::SUnit };
@@ -24,6 +26,7 @@ enum Step {
     Schedule(u8, u64),
     Cancel(u8),
     Pop(u64),
+    Grow,
 }
 
 fn step() -> impl Strategy<Value = Step> {
@@ -34,6 +37,7 @@ fn step() -> impl Strategy<Value = Step> {
         (0u8..16, 0u64..100).prop_map(|(who, at)| Step::Schedule(who, at)),
         (0u8..16).prop_map(Step::Cancel),
         (0u64..100).prop_map(Step::Pop),
+        Just(Step::Grow),
     ]
 }
 
@@ -50,11 +54,11 @@ struct Entry {
 
 type Model = BTreeMap<u8, Entry>;
 
-fn meet(model: &mut Model, clock: usize, who: u8, joins: bool) -> bool {
+fn meet(model: &mut Model, capacity: usize, clock: usize, who: u8, joins: bool) -> bool {
     if model.contains_key(&who) {
         return true;
     }
-    if model.len() == CAPACITY {
+    if model.len() == capacity {
         let away = model.iter().filter(|(_, entry)| !entry.joined);
         let key = |entry: &Entry| (entry.stranger.is_none(), entry.stranger.unwrap_or(entry.rested));
         let Some(oldest) = away.min_by_key(|(_, entry)| key(entry)).map(|(who, _)| *who) else { return false };
@@ -96,16 +100,16 @@ proptest! {
     #[test]
     fn the_table_is_what_its_model_is(steps in prop::collection::vec(step(), 1..120)) {
         let mut table: Table<Boxed> = Table::new(slice(CAPACITY), slice(CAPACITY), slice(4));
-        let mut model = Model::new();
+        let (mut model, mut capacity) = (Model::new(), CAPACITY);
         for (clock, step) in steps.into_iter().enumerate() {
             match step {
                 Step::Meet(who) => {
                     let place = table.hear_of(&identity(who), address(1, 1), Epoch(1));
-                    prop_assert_eq!(place.is_some(), meet(&mut model, clock, who, false));
+                    prop_assert_eq!(place.is_some(), meet(&mut model, capacity, clock, who, false));
                 }
                 Step::Join(who) => {
                     let place = table.place_of(&identity(who), address(1, 1), Epoch(1));
-                    prop_assert_eq!(place.is_some(), meet(&mut model, clock, who, true));
+                    prop_assert_eq!(place.is_some(), meet(&mut model, capacity, clock, who, true));
                     let Some((place, _)) = place else { continue };
                     table.set_state(place, NodeState::Joined(LinkId(u16::from(who))));
                     table.keep_index(place);
@@ -132,6 +136,12 @@ proptest! {
                     let Some(place) = table.find(&identity(who)) else { continue };
                     table.cancel(place);
                     model.get_mut(&who).unwrap().due = None;
+                }
+                Step::Grow => {
+                    // Shorter ones change nothing.
+                    table.grow(slice(CAPACITY - 1), slice(GROWN), slice(4));
+                    table.grow(slice(GROWN), slice(GROWN), slice(4));
+                    capacity = GROWN;
                 }
                 Step::Pop(now) => {
                     let earliest = model.values().filter_map(|entry| entry.due).min().filter(|at| *at <= now);
