@@ -1,5 +1,6 @@
 use std::net::Ipv4Addr;
 
+use cara_core::config::Constraints;
 use cara_core::distribution::hello::Manager;
 use cara_core::host::secure::Plain;
 
@@ -116,7 +117,7 @@ fn a_manager_answers_and_own_broadcasts_come_back() {
     let boss = survey.heard().iter().find(|heard| heard.answers > 0).unwrap();
     assert_eq!(boss.identity.as_ref(), Some(&manager.identity()));
     assert_eq!(boss.listens_at().map(|at| at.port()), Some(manager.tcp_port()));
-    assert_eq!((boss.room, boss.to_us, boss.standing), (Some(64), 1, Standing::Plain));
+    assert_eq!((boss.room, boss.to_us, boss.standing), (Some(Constraints::M_UNIT.maximum_nodes), 1, Standing::Plain));
     assert!(survey.reach().iter().any(|reach| reach.sent == 1 && reach.heard == 1), "{:?}", survey.reach());
     assert!(survey.heard().iter().all(|heard| heard.identity.as_ref() == Some(&manager.identity())));
 }
@@ -166,7 +167,7 @@ fn a_secured_manager_answers_with_the_fleets_key_and_to_nobody_else() {
     listen_until(&mut survey, |survey| survey.heard().iter().any(|heard| heard.to_us > 0));
     let answer = survey.heard().iter().find(|heard| heard.to_us > 0).unwrap();
     assert_eq!((answer.identity.as_ref(), answer.mode), (Some(&boss), Mode::Secured));
-    assert_eq!((answer.standing, answer.room), (Standing::Proven(1), Some(64)));
+    assert_eq!((answer.standing, answer.room), (Standing::Proven(1), Some(Constraints::M_UNIT.maximum_nodes)));
     assert_eq!(answer.listens_at().map(|at| at.port()), Some(manager.tcp_port()));
     // The manager keeps no refusal of who only looks.
     assert!(manager.findings().is_empty(), "{:?}", manager.findings());

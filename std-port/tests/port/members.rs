@@ -69,8 +69,8 @@ fn a_full_manager_takes_more_when_its_maximum_is_raised() {
     let first = unit("first", 1, fleet).build_unit().unwrap();
     let (peer, _) = meet(&manager, &first);
     let threads = Threads::new().unwrap();
-    let others: Vec<Unit> =
-        (2..=NODES.into()).map(|id| unit("other", id, fleet).threads(&threads).build_unit().unwrap()).collect();
+    let other = |id: u32| unit(&format!("agv-{id}"), 10 + id, fleet).threads(&threads).build_unit().unwrap();
+    let others: Vec<Unit> = (1..NODES.into()).map(other).collect();
     others.iter().for_each(|unit| unit.start().unwrap());
     manager.set_constraints(Constraints { maximum_nodes: NODES, ..few }).unwrap();
     until("all have joined", || manager.number_of_s_units() == usize::from(NODES));

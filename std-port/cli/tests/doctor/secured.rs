@@ -116,7 +116,7 @@ fn a_change_of_keys_that_left_a_node_behind_is_told() {
 #[test]
 fn a_key_file_that_others_can_read_is_told_with_the_command() {
     let clinic = Clinic::new();
-    let _manager = clinic.manager_of_few_files(1024);
+    let _manager = clinic.manager_of_few_files(2048);
     until("it is up", || clinic.doctor(&["boss", "--listen", "0s"]).ids() == ["answers"]);
     let file = clinic.key_file("boss");
     set_permissions(&file, Permissions::from_mode(0o644)).unwrap();
