@@ -27,13 +27,15 @@ const FIRST_WORKERS: usize = 2;
 /// Most threads of a pool, but for the one that the clock starts when all of these are stuck in handlers.
 const MOST_WORKERS: usize = 14;
 /// Longest datagram that counts, and one byte more.
-const DATAGRAM: usize = 2048;
+pub(crate) const DATAGRAM: usize = 2048;
 /// The token of both wakers and of the alarm; no unit has this number.
 const WAKER: u64 = u64::MAX;
 /// The clock looks at the time this often at least.
 const LONGEST_WAIT: Duration = Duration::from_millis(250);
 /// The clock sleeps through less than this, and sets its alarm for more, which can be put off meanwhile.
 const SHORTEST_ALARM: Duration = Duration::from_millis(1);
+/// The thread that looks at files and interfaces looks at the time this often at least.
+const LONGEST_LOOK: Duration = Duration::from_secs(1);
 /// Events of sockets that are taken in one look.
 const CLOCK_EVENTS: usize = 64;
 /// Bits of a token below the unit's number: what the event is about.
@@ -177,8 +179,8 @@ pub(crate) struct Crew {
     pub(crate) served: AtomicUsize,
     started: OnceLock<Result<(), Error>>,
     threads: Mutex<Vec<JoinHandle<()>>>,
-    /// Whether the thread that looks at files and interfaces is to look now.
-    looks: (Mutex<bool>, Condvar),
+    /// When files and interfaces are looked at next, for each unit.
+    looks: (Mutex<Timers>, Condvar),
     /// Where emergencies run that are for no emergency service.
     lane: OnceLock<Arc<Lane>>,
     stopping: AtomicBool,
@@ -218,7 +220,7 @@ impl Crew {
             served: AtomicUsize::new(0),
             started: OnceLock::new(),
             threads: Mutex::new(Vec::new()),
-            looks: (Mutex::new(true), Condvar::new()),
+            looks: (Mutex::new(Timers::new()), Condvar::new()),
             lane: OnceLock::new(),
             stopping: AtomicBool::new(false),
         })
@@ -314,6 +316,7 @@ impl Crew {
     pub(crate) fn leave(&self, seat: u16) {
         // Before the seat is free: the next one on it may set its time at once.
         lock(&self.due).cancel(u32::from(seat));
+        lock(&self.looks.0).cancel(u32::from(seat));
         let place = write(&self.seats).get_mut(usize::from(seat)).and_then(Option::take);
         if let Some(seat) = place.filter(|_| !self.is_own_thread()) {
             drop(write(&seat.gate));
@@ -372,7 +375,9 @@ impl Crew {
         }
         self.clock_waker.wake();
         self.pool_waker.wake();
-        self.wake_looker();
+        // Under the lock: the looker has seen that the crew stops, or waits.
+        drop(lock(&self.looks.0));
+        self.looks.1.notify_all();
         let own = self.is_own_thread();
         let threads = std::mem::take(&mut *lock(&self.threads));
         // A handler that stops its unit does not wait for the others: one of them may wait for it.
@@ -435,22 +440,33 @@ impl Crew {
         ready.pop_front()
     }
 
-    /// The thread that looks at files and interfaces looks now.
-    pub(crate) fn wake_looker(&self) {
-        *lock(&self.looks.0) = true;
+    /// The thread that looks at files and interfaces looks at those of this unit now.
+    pub(crate) fn wake_looker(&self, seat: u16) {
+        lock(&self.looks.0).bring_forward(u32::from(seat), Instant::START);
         self.looks.1.notify_all();
     }
 
+    /// One unit at a time, each when it is due: where a thousand units start, a look at all for each would be a million.
     fn look_around(&self) {
-        while !self.is_stopping() {
-            *lock(&self.looks.0) = false;
-            let seats = u16::try_from(read(&self.seats).len()).unwrap_or(u16::MAX);
-            let looks = (0..seats).filter_map(|seat| self.enter(token(seat, 0), |driven| driven.look_around()));
-            let next = looks.min().unwrap_or(Instant::FAR_FUTURE);
-            let wait = next.since(self.clock.now()).clamp(Duration::from_millis(1), Duration::from_secs(1));
-            let asked = lock(&self.looks.0);
-            drop(self.looks.1.wait_timeout_while(asked, wait.into(), |asked| !*asked));
+        while let Some(seat) = self.wait_for_look() {
+            if let Some(next) = self.enter(token(seat, 0), |driven| driven.look_around()) {
+                lock(&self.looks.0).bring_forward(u32::from(seat), next);
+            }
         }
+    }
+
+    /// The unit whose files and interfaces are to be looked at; `None` when the crew stops.
+    fn wait_for_look(&self) -> Option<u16> {
+        let mut looks = lock(&self.looks.0);
+        while !self.is_stopping() {
+            let now = self.clock.now();
+            if let Some(seat) = looks.pop_due(now) {
+                return Some(seat as u16);
+            }
+            let wait = looks.next().unwrap_or(Instant::FAR_FUTURE).since(now).min(LONGEST_LOOK);
+            looks = self.looks.1.wait_timeout(looks, wait.into()).unwrap_or_else(PoisonError::into_inner).0;
+        }
+        None
     }
 
     fn keep_time(&self) {
@@ -518,6 +534,7 @@ mod tests {
     #[derive(Default)]
     struct Counting {
         polls: AtomicUsize,
+        looks: AtomicUsize,
         closed: Mutex<()>,
     }
 
@@ -530,6 +547,7 @@ mod tests {
             Instant::FAR_FUTURE
         }
         fn look_around(&self) -> Instant {
+            self.looks.fetch_add(1, Ordering::SeqCst);
             Instant::FAR_FUTURE
         }
         fn read_datagrams(&self, _: Socket, _: &mut [u8]) {}
@@ -603,6 +621,20 @@ mod tests {
         assert_eq!(crew.put_off(4, soon, || later), Some(later));
         assert_eq!(crew.put_off(1, first, || later + hour), Some(later + hour));
         assert!(!goes_off(Duration::from_millis(40)), "both are put off");
+    }
+
+    /// The work of a thousand starts is that of a thousand looks, and not of a million.
+    #[test]
+    fn a_unit_that_starts_is_looked_at_alone() {
+        let threads = Threads::new().unwrap();
+        let crew = threads.crew();
+        crew.start().unwrap();
+        let units: [Arc<Counting>; 20] = Default::default();
+        for unit in &units {
+            crew.wake_looker(crew.seat(unit.clone()).unwrap());
+            until(|| unit.looks.load(Ordering::SeqCst) > 0);
+        }
+        assert_eq!(units.map(|unit| unit.looks.load(Ordering::SeqCst)), [1; 20]);
     }
 
     #[test]

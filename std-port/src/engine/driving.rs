@@ -52,7 +52,7 @@ impl<T: Send + 'static> Engine<T> {
         let _ = self.seat.set(seat);
         self.watch(seat).map_err(system_refused)?;
         self.warn_of_plain_mode();
-        self.crew().wake_looker();
+        self.wake_looker();
         self.wake_clock();
         Ok(())
     }
@@ -86,6 +86,13 @@ impl<T: Send + 'static> Engine<T> {
     pub(super) fn wake_clock_at(&self, at: Instant) {
         if let Some(seat) = self.seat() {
             self.crew().wake_at(seat, at);
+        }
+    }
+
+    /// Files and interfaces are looked at now.
+    pub(super) fn wake_looker(&self) {
+        if let Some(seat) = self.seat() {
+            self.crew().wake_looker(seat);
         }
     }
 

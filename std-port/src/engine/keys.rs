@@ -142,7 +142,7 @@ impl<T: Send + 'static> Engine<T> {
         if watched.checked.as_ref().is_some_and(|checked| !Arc::ptr_eq(checked, &live.ring())) {
             watched.due = self.now();
             drop(watched);
-            self.crew().wake_looker();
+            self.wake_looker();
         }
     }
 

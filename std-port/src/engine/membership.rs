@@ -19,9 +19,11 @@ use super::{Engine, lock, read, write};
 use crate::event::UnitEvent;
 use crate::seldom::warn_seldom;
 use crate::storage::Boxed;
+use crate::sys::datagram::Socket;
 use crate::sys::epoll::Interest;
 use crate::sys::limits;
 use crate::sys::stream::Stream;
+use crate::threads::DATAGRAM;
 
 /// What the node's lock protects.
 pub(crate) struct NodeCell {
@@ -435,6 +437,13 @@ impl<T: Send + 'static> Engine<T> {
     pub(super) fn poll_node(&self) -> Instant {
         // Before the node's lock: a thread that reads a new key file keeps the ring to itself meanwhile.
         let codes = self.keys.codes();
+        if lock(&self.node).node.searches_at() <= self.now() {
+            // What others have asked and answered may lie unread for as long as this thread was busy with other units.
+            let mut buffer = [0; DATAGRAM];
+            for socket in [Socket::Shared, Socket::Own] {
+                self.datagrams_ready(socket, &mut buffer);
+            }
+        }
         loop {
             let (directive, next) = {
                 let mut cell = lock(&self.node);
@@ -452,6 +461,8 @@ impl<T: Send + 'static> Engine<T> {
 
 #[cfg(test)]
 mod tests {
+    use cara_core::config::Constraints;
+
     use super::*;
     use crate::testing::{fleet, manager, until, vehicle};
 

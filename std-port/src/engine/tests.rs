@@ -19,8 +19,11 @@ use rustix::net::sockopt;
 
 use super::accounts::{Group, Reading};
 use super::*;
-use crate::testing::{Pair, until};
-use crate::{Call, Parameters, ServiceError, ServiceOptions, UnitEvent};
+use crate::sys::datagram::Socket;
+use crate::sys::epoll::wait_readable;
+use crate::testing::{Pair, fleet, until};
+use crate::threads::Driven;
+use crate::{Call, Interfaces, Parameters, ServiceError, ServiceOptions, Unit, UnitEvent};
 
 /// Too long for the buffer that a link has of its own.
 const LONG: usize = 16_000;
@@ -235,4 +238,29 @@ fn nothing_is_left_of_a_call_that_has_timed_out() {
         assert_eq!((state.waiters.len(), state.session.calls_in_flight()), (0, 0));
     }
     drop(open);
+}
+
+/// Units that one busy thread drives are due long before it comes to them. One of them asks for all.
+#[test]
+fn what_lies_unread_is_read_before_a_question_goes_out() {
+    const UNITS: u32 = 20;
+    let (fleet, mut port) = (fleet(), 0);
+    let mut vehicle = |id| -> Unit {
+        let unit = Unit::builder("agv", id, "manager", 1).unwrap().interfaces(Interfaces::Loopback);
+        let unit = unit.fleet(fleet).discovery_port(port).insecure().build_unit().unwrap();
+        port = unit.engine().discovery_port();
+        unit
+    };
+    // None is started: this thread is their clock.
+    let units: Vec<Unit> = (1..=UNITS).map(&mut vehicle).collect();
+    let is_due = |unit: &Unit| lock(&unit.engine().node).node.searches_at() <= unit.engine().now();
+    until(|| units.iter().all(is_due));
+    for (index, unit) in units.iter().enumerate() {
+        if index > 0 {
+            wait_readable(unit.engine().datagrams.fd(Socket::Shared), PATIENT.into()).unwrap();
+        }
+        unit.engine().keep_time();
+    }
+    let asked = |unit: &Unit| value(&unit.engine().readings(), Group::Node, "WhoHasSent");
+    assert_eq!(units.iter().map(asked).sum::<u64>(), 1);
 }

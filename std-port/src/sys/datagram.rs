@@ -140,7 +140,8 @@ impl Datagrams {
         targets.list.clone()
     }
 
-    /// Names of the interfaces on which broadcasts can go out now, asked of the system.
+    /// Names of the interfaces on which broadcasts can go out, as any unit of the process has seen them half a second ago at
+    /// most.
     pub fn usable(&self) -> Vec<String> {
         let list: Arc<[Interface]> = look(self.interfaces).into();
         *self.targets.lock().unwrap_or_else(PoisonError::into_inner) =
@@ -166,12 +167,30 @@ impl Datagrams {
     }
 }
 
+/// A list of interfaces serves all units of the process for so long: a thousand that start together ask the system once.
+const SHARED: Duration = Duration::from_millis(500);
+
+/// When the system was asked for its interfaces, and what it said.
+static SEEN: Mutex<Option<(Instant, Arc<[Interface]>)>> = Mutex::new(None);
+
 fn look(wanted: Interfaces) -> Vec<Interface> {
-    match interfaces() {
-        Ok(all) => all.into_iter().filter(|interface| wanted.accept(interface.address)).collect(),
+    match all_interfaces() {
+        Ok(all) => all.iter().filter(|interface| wanted.accept(interface.address)).cloned().collect(),
         Err(error) => {
             tracing::warn!(%error, "the interfaces could not be listed");
             Vec::new()
+        }
+    }
+}
+
+fn all_interfaces() -> std::io::Result<Arc<[Interface]>> {
+    let mut seen = SEEN.lock().unwrap_or_else(PoisonError::into_inner);
+    match &*seen {
+        Some((at, all)) if at.elapsed() < SHARED => Ok(all.clone()),
+        _ => {
+            let all: Arc<[Interface]> = interfaces()?.into();
+            *seen = Some((Instant::now(), all.clone()));
+            Ok(all)
         }
     }
 }
@@ -309,6 +328,14 @@ mod tests {
         assert!(unit.send_to(to, &[1; 100]));
         assert!(!unit.send_to(to, &[1; 70_000]));
         assert_eq!(receive(&other, Socket::Own, &[1; 64]).port(), unit.own_port());
+    }
+
+    #[test]
+    fn units_that_look_at_once_ask_the_system_once() {
+        let ask = || -> Vec<_> { (0..100).map(|_| all_interfaces().unwrap()).collect() };
+        // The machine may be so slow that the first list is too old before the last look.
+        let once = |lists: Vec<Arc<[Interface]>>| lists.iter().all(|list| Arc::ptr_eq(list, &lists[0]));
+        assert!((0..20).any(|_| once(ask())));
     }
 
     #[test]

@@ -145,6 +145,12 @@ impl<S: Storage> Node<S> {
         }
     }
 
+    /// When the next search goes out. Another unit's question that is read before may put it off, so a port that lets
+    /// datagrams wait reads them first: of many units that one busy thread drives, each would ask otherwise.
+    pub fn searches_at(&self) -> Instant {
+        self.search.next()
+    }
+
     fn dial_target(&mut self, now: Instant) {
         let place = self.target.as_ref().and_then(|target| self.table.find(target));
         let away = |place: &usize| self.table.node(*place).is_some_and(|known| known.state == NodeState::Away);
