@@ -36,8 +36,11 @@ struct Arguments {
 #[derive(Args)]
 pub(crate) struct Plan {
     /// S_units that join the manager.
-    #[arg(long, default_value_t = 1_000, value_parser = clap::value_parser!(u16).range(2..=5_000))]
+    #[arg(long, default_value_t = 1_000, value_parser = clap::value_parser!(u16).range(2..=10_000))]
     nodes: u16,
+    /// Processes that share all s_units but one, which has a process of its own. Each s_unit takes three descriptors.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=64))]
+    processes: u16,
     /// Turns of the comparison of the cost per request.
     #[arg(long, default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..))]
     rounds: u32,

@@ -92,14 +92,23 @@ impl Child {
     }
 }
 
-/// Broadcasts that the units of these processes have sent: questions of all, and the managers' answers to all.
-pub(crate) fn broadcasts<'c>(children: impl IntoIterator<Item = &'c mut Child>) -> Result<u64> {
-    let mut sum = 0;
+/// What the units of these processes have counted, in all.
+pub(crate) fn counters<'c>(children: impl IntoIterator<Item = &'c mut Child>) -> Result<Counters> {
+    let mut sum = Counters::new();
     for child in children {
-        let counters = child.counters()?;
-        for name in ["WhoHasSent", "AnnounceBroadcast"] {
-            sum += counters.get(name).with_context(|| format!("no counter {name}"))?;
+        for (name, count) in child.counters()? {
+            *sum.entry(name).or_default() += count;
         }
     }
     Ok(sum)
+}
+
+/// The sum of some of them.
+pub(crate) fn sum(counters: &Counters, names: &[&str]) -> Result<u64> {
+    names.iter().map(|name| counters.get(*name).copied().with_context(|| format!("no counter {name}"))).sum()
+}
+
+/// Broadcasts that the units of these processes have sent: questions of all, and the managers' answers to all.
+pub(crate) fn broadcasts<'c>(children: impl IntoIterator<Item = &'c mut Child>) -> Result<u64> {
+    sum(&counters(children)?, &["WhoHasSent", "AnnounceBroadcast"])
 }

@@ -6,7 +6,7 @@ use anyhow::{Result, ensure};
 
 use crate::Plan;
 use crate::child::{Block, Called, Question};
-use crate::parent::{Child, Place, broadcasts};
+use crate::parent::{Child, Place, broadcasts, counters, sum};
 use crate::proc::{self, Memory, ThreadWatch};
 use crate::report::{Comparison, Figures, Joining};
 use crate::units::TEXT_BYTES;
@@ -24,7 +24,7 @@ const REST: Duration = Duration::from_secs(1);
 struct Fleet {
     manager: Child,
     /// All s_units but the first.
-    many: Child,
+    many: Vec<Child>,
     /// The first one, in a process of its own, as those that it is compared with.
     single: Child,
 }
@@ -34,8 +34,8 @@ const SINGLE: u32 = 1;
 const AMONG: u32 = 2;
 
 impl Fleet {
-    fn broadcasts(&mut self) -> Result<u64> {
-        broadcasts([&mut self.manager, &mut self.many, &mut self.single])
+    fn all(&mut self) -> impl Iterator<Item = &mut Child> {
+        [&mut self.manager, &mut self.single].into_iter().chain(&mut self.many)
     }
 }
 
@@ -49,10 +49,12 @@ pub(crate) fn run(plan: &Plan) -> Result<Figures> {
     let threads = ThreadWatch::new(manager.pid);
     let single = Child::units(place, SINGLE, 1)?;
     let began = single.started;
-    let many = Child::units(place, AMONG, u32::from(plan.nodes) - 1)?;
-    let unit_threads = ThreadWatch::new(many.pid);
+    let many = many(plan, place)?;
+    let unit_threads: Vec<_> = many.iter().map(|child| ThreadWatch::new(child.pid)).collect();
     let connected_ms = connected(&mut manager, nodes, began)?;
     let mut fleet = Fleet { manager, many, single };
+    let cpu_us = [cpu_us(nodes, [&fleet.manager])?, cpu_us(nodes, fleet.many.iter().chain([&fleet.single]))?];
+    let dials = sum(&counters(fleet.all())?, &["Dialled"])? as f64 / nodes as f64;
     say("calling each, and all");
     let exchanged: Called = fleet.manager.ask(&Question::Exchange { chars: TEXT_BYTES as usize })?;
     std::thread::sleep(REST);
@@ -62,7 +64,7 @@ pub(crate) fn run(plan: &Plan) -> Result<Figures> {
     let called: Called = fleet.manager.ask(&Question::CallAll)?;
     let runs = fleet.runs()?;
     std::thread::sleep(COUNTED.saturating_sub(began.elapsed()));
-    let joining = Joining { all_ms: connected_ms, broadcasts: fleet.broadcasts()?, most_in_a_second: None };
+    let joining = Joining { all_ms: connected_ms, broadcasts: broadcasts(fleet.all())?, most_in_a_second: None };
     say("comparing the cost of a request");
     let costs = compare(plan, &mut fleet)?;
     let threads_before = threads.most();
@@ -72,6 +74,8 @@ pub(crate) fn run(plan: &Plan) -> Result<Figures> {
     Ok(Figures {
         nodes,
         joining,
+        dials,
+        cpu_us,
         exchanged,
         called,
         runs,
@@ -79,10 +83,23 @@ pub(crate) fn run(plan: &Plan) -> Result<Figures> {
         memory_of_others: per_node(nodes - 1, one, after),
         memory_trimmed: per_node(nodes, empty, trimmed),
         manager_threads: threads_before.max(threads_after),
-        unit_threads: unit_threads.most(),
+        unit_threads: unit_threads.iter().map(ThreadWatch::most).max().unwrap_or(0),
         costs,
         restart,
     })
+}
+
+/// The processes that share all s_units but the first.
+fn many(plan: &Plan, place: &Place) -> Result<Vec<Child>> {
+    let (count, processes) = (u32::from(plan.nodes) - 1, u32::from(plan.processes.min(plan.nodes - 1)));
+    let first = |index| AMONG + count * index / processes;
+    (0..processes).map(|index| Child::units(place, first(index), first(index + 1) - first(index))).collect()
+}
+
+/// CPU time of these processes for each node.
+fn cpu_us<'c>(nodes: usize, children: impl IntoIterator<Item = &'c Child>) -> Result<f64> {
+    let times = children.into_iter().map(|child| proc::cpu_time(child.pid)).sum::<Result<Duration>>()?;
+    Ok(times.as_secs_f64() * 1e6 / nodes as f64)
 }
 
 fn say(what: &str) {
@@ -92,9 +109,12 @@ fn say(what: &str) {
 impl Fleet {
     /// Fewest and most runs of `touch` on a node.
     fn runs(&mut self) -> Result<(u32, u32)> {
-        let (many, single): ((u32, u32), (u32, u32)) =
-            (self.many.ask(&Question::Runs)?, self.single.ask(&Question::Runs)?);
-        Ok((many.0.min(single.0), many.1.max(single.1)))
+        let mut runs: (u32, u32) = self.single.ask(&Question::Runs)?;
+        for child in &mut self.many {
+            let (fewest, most): (u32, u32) = child.ask(&Question::Runs)?;
+            runs = (runs.0.min(fewest), runs.1.max(most));
+        }
+        Ok(runs)
     }
 }
 
@@ -139,12 +159,13 @@ fn compare(plan: &Plan, fleet: &mut Fleet) -> Result<[Comparison; 2]> {
     let mut both = [Comparison::default(), Comparison::default()];
     for (comparison, other) in both.iter_mut().zip([first, second]) {
         let managers = [&alone.manager, &again.manager, &fleet.manager, &raw].map(|child| (child.pid, first));
-        let units = [&alone.unit, &again.unit, &fleet.many, &fleet.single, &raw_server].map(|child| (child.pid, other));
+        let units = [&alone.unit, &again.unit, &fleet.single, &raw_server].into_iter().chain(&fleet.many);
+        let units = units.map(|child| (child.pid, other));
         managers.into_iter().chain(units).try_for_each(|(pid, cpu)| proc::pin(pid, Some(cpu)))?;
         let managers = [&mut alone.manager, &mut again.manager, &mut fleet.manager, &mut raw];
         turns(plan.rounds, comparison, managers)?;
     }
-    [&fleet.many, &fleet.single].iter().try_for_each(|child| proc::pin(child.pid, None))?;
+    fleet.many.iter().chain([&fleet.single]).try_for_each(|child| proc::pin(child.pid, None))?;
     Ok(both)
 }
 
@@ -187,14 +208,14 @@ impl Pair {
 /// Kills the manager's process and starts a new one.
 fn restart(plan: &Plan, place: &Place, fleet: Fleet) -> Result<(Joining, usize)> {
     let Fleet { manager, mut many, mut single } = fleet;
-    let before = broadcasts([&mut many, &mut single])?;
+    let before = broadcasts(many.iter_mut().chain([&mut single]))?;
     let killed = manager.kill()?;
     let mut manager = Child::manager(place, plan.nodes)?;
     let threads = ThreadWatch::new(manager.pid);
     let all_ms = connected(&mut manager, usize::from(plan.nodes), killed)?;
     let (mut last, mut most) = (before, 0);
     loop {
-        let total = broadcasts([&mut manager, &mut many, &mut single])?;
+        let total = broadcasts(many.iter_mut().chain([&mut single, &mut manager]))?;
         most = most.max(total.saturating_sub(last));
         last = total;
         if killed.elapsed() >= COUNTED {

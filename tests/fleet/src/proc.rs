@@ -59,15 +59,20 @@ pub(crate) fn two_cpus() -> Result<[usize; 2]> {
     Ok([first, allowed.next().unwrap_or(first)])
 }
 
-/// CPU time of this process, all threads, from `/proc/self/schedstat` of each of them.
-pub(crate) fn own_cpu_time() -> Result<Duration> {
+/// CPU time of a process, all threads that it has now, from `/proc/PID/schedstat` of each of them.
+pub(crate) fn cpu_time(pid: u32) -> Result<Duration> {
     let mut nanos = 0;
-    for task in std::fs::read_dir("/proc/self/task")? {
+    for task in std::fs::read_dir(format!("/proc/{pid}/task"))? {
         // A thread that has ended meanwhile has no file any more.
         let Ok(text) = std::fs::read_to_string(task?.path().join("schedstat")) else { continue };
         nanos += text.split_whitespace().next().and_then(|nanos| nanos.parse().ok()).unwrap_or(0);
     }
     Ok(Duration::from_nanos(nanos))
+}
+
+/// CPU time of this process.
+pub(crate) fn own_cpu_time() -> Result<Duration> {
+    cpu_time(std::process::id())
 }
 
 /// The most threads that a process has had while it was watched.

@@ -88,6 +88,10 @@ fn median<T: Copy + PartialOrd + Default>(values: &[T]) -> T {
 pub(crate) struct Figures {
     pub(crate) nodes: usize,
     pub(crate) joining: Joining,
+    /// How often a node dialled until all were connected, on average.
+    pub(crate) dials: f64,
+    /// Microseconds of CPU time for each node until then, starts included: of the manager, and of the s_units.
+    pub(crate) cpu_us: [f64; 2],
     /// One long message with each, one after the other.
     pub(crate) exchanged: Called,
     /// All at the same time.
@@ -151,6 +155,7 @@ fn lines(figures: &Figures) -> Vec<Line> {
     vec![
         Line::far("all connected", figures.joining.all_ms, "ms", 5_000.0, FAR),
         Line::bound("broadcasts until then and 12 s on", figures.joining.broadcasts as f64, "", 20.0),
+        Line::bound("dials of a node until then, on average", figures.dials, "", 1.5),
         Line::bound("nodes that did not echo 20,000 characters", failed(&figures.exchanged), "", 0.0),
         Line::bound("nodes that failed when all were called", failed(&figures.called), "", 0.0),
         Line::bound("nodes called not exactly once then", twice, "", 0.0),
@@ -204,6 +209,8 @@ fn costs(costs: &Comparison, cpus: &str) -> Table {
 fn details(figures: &Figures) {
     let [anonymous, trimmed] = [figures.memory[1], figures.memory_trimmed[1]].map(rounded);
     println!("anonymous memory per node: {anonymous} KiB, {trimmed} KiB with the buffers trimmed");
+    let [manager, s_units] = figures.cpu_us.map(rounded);
+    println!("CPU time per node until all were connected: {manager} µs of the manager, {s_units} µs of the s_units");
     let exchanged = figures.exchanged.micros as f64 / 1e3;
     println!("20,000 characters to each node and back, one after the other: {} ms", rounded(exchanged));
     println!("all called at the same time: {} ms", rounded(figures.called.micros as f64 / 1e3));
@@ -238,6 +245,8 @@ mod tests {
         Figures {
             nodes: MANY,
             joining: joining(),
+            dials: 1.0,
+            cpu_us: [100.0, 200.0],
             exchanged: called(MANY),
             called: called(MANY),
             runs: (1, 1),
@@ -260,9 +269,10 @@ mod tests {
     #[test]
     fn each_bound_can_be_broken() {
         assert!(broken(|_| {}).is_empty());
-        let changes: [fn(&mut Figures); 14] = [
+        let changes: [fn(&mut Figures); 15] = [
             |figures| figures.joining.all_ms = 40_000.0,
             |figures| figures.joining.broadcasts = 21,
+            |figures| figures.dials = 1.6,
             |figures| figures.exchanged = called(MANY - 1),
             |figures| figures.called = called(MANY - 1),
             |figures| figures.runs.1 = 2,
