@@ -267,6 +267,11 @@ mod tests {
     }
 
     #[test]
+    fn the_core_keeps_to_its_layers() {
+        super::check().unwrap();
+    }
+
+    #[test]
     fn services_reach_past_their_neighbour_only_where_it_is_written() {
         assert_eq!(arrows("services/unit.rs", "use crate::host::something_else::Thing;"), 1);
         assert_eq!(arrows("services/unit.rs", "use crate::host;"), 1);
