@@ -44,6 +44,9 @@ impl Patch {
     }
 }
 
+/// Lines around a change that must be there: of the two in a patch the further ones may have changed.
+const CONTEXT: &str = "-C1";
+
 /// Fewest rows that have a patch.
 const LEAST: usize = 40;
 
@@ -56,7 +59,7 @@ pub(super) fn problems(table: &str, wrong: &mut Vec<String>) -> Result<usize> {
         if !tests.contains_key(patch.number.as_str()) {
             wrong.push(format!("{file}: its row names no test"));
         }
-        if let Err(why) = Run::new("git").args(["apply", "--check"]).args([&patch.file]).text() {
+        if let Err(why) = Run::new("git").args(["apply", "--check", CONTEXT]).args([&patch.file]).text() {
             wrong.push(format!("{file} does not apply: {why:#}"));
         }
     }
@@ -140,7 +143,7 @@ impl Tree {
     /// The name of the test, if it fails with the patch.
     fn finds(&self, patch: &Patch, test: &str) -> Result<String> {
         let file = workspace::root().join(&patch.file);
-        self.git(&["apply", &file.to_string_lossy()])?;
+        self.git(&["apply", CONTEXT, &file.to_string_lossy()])?;
         let ended = self.passes(test);
         self.git(&["reset", "--quiet", "--hard"])?;
         match ended? {
