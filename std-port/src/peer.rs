@@ -112,9 +112,9 @@ impl<T: Send + 'static> Peer<T> {
         self.cell.identity.id()
     }
 
-    /// Whether it is connected now.
+    /// Whether it is connected now, and has told what it offers.
     pub fn is_connected(&self) -> bool {
-        self.cell.is_connected()
+        self.cell.is_introduced()
     }
 
     /// Takes it off the [roster](crate::CommunicationSystem::roster) until it joins again, or this unit is started again; `false`
