@@ -44,6 +44,8 @@ pub struct Builder<T> {
     discovery_port: Option<u16>,
     tcp_port: u16,
     threads: Option<Threads>,
+    /// The m_units that an m_unit connects to, if not all.
+    m_units: Option<Box<[Identity]>>,
     #[cfg(feature = "control")]
     control: crate::control::Control,
     access: Option<AccessTable>,
@@ -74,6 +76,7 @@ impl Builder<()> {
             discovery_port: None,
             tcp_port: 0,
             threads: None,
+            m_units: None,
             #[cfg(feature = "control")]
             control: crate::control::Control::Default,
             access: None,
@@ -164,6 +167,21 @@ impl<T: Send + 'static> Builder<T> {
         self
     }
 
+    /// Of all m_units an m_unit connects to these alone, by name and ID number; to every one of its fleet unless set, and to
+    /// none with none named. A link takes the choice of both ends. An s_unit connects to its manager, whatever is set here.
+    ///
+    /// ```no_run
+    /// use cara_std::CommunicationSystem;
+    ///
+    /// let hall = CommunicationSystem::builder("hall", 2)?.m_units([("depot", 1), ("gate", 3)])?.build_system()?;
+    /// # Ok::<(), cara_std::BuildError>(())
+    /// ```
+    pub fn m_units<N: AsRef<str>>(mut self, m_units: impl IntoIterator<Item = (N, u32)>) -> Result<Self, Error> {
+        let identities = m_units.into_iter().map(|(name, id)| Identity::m_unit(name.as_ref(), id));
+        self.m_units = Some(identities.collect::<Result<_, _>>()?);
+        Ok(self)
+    }
+
     /// The application's state, which methods get (paper, section 2: "the object class to be passed as a template
     /// parameter").
     pub fn state<U: Send + 'static>(self, state: U) -> Builder<U> {
@@ -178,6 +196,7 @@ impl<T: Send + 'static> Builder<T> {
             discovery_port: self.discovery_port,
             tcp_port: self.tcp_port,
             threads: self.threads,
+            m_units: self.m_units,
             #[cfg(feature = "control")]
             control: self.control,
             access: self.access,
@@ -258,7 +277,10 @@ impl<T: Send + 'static> Builder<T> {
             constraints: self.constraints,
             seed: random(),
         };
-        let node = Node::new(threads.crew().clock.now(), config, node_storage(nodes, maximum_links));
+        let mut node = Node::new(threads.crew().clock.now(), config, node_storage(nodes, maximum_links));
+        if let Some(m_units) = self.m_units {
+            node.choose(m_units);
+        }
         let publications =
             Publications::new(filled(capacities.functions, false), filled(capacities.published_to_one, None));
         let functions =

@@ -45,7 +45,7 @@ fn until(what: &str, mut condition: impl FnMut() -> bool) {
 // --- mistakes
 
 /// A file, where its mistake is, and a part of what is said about it.
-const MISTAKES: [(&str, &str, &str); 47] = [
+const MISTAKES: [(&str, &str, &str); 49] = [
     ("name = \"a", "1:10", "expected `\"`"),
     ("name = \"a\"\nid = \n", "2:6", "value"),
     ("name = \"a\"\nid = 1\nid = 2", "3:1", "duplicate key"),
@@ -89,6 +89,8 @@ const MISTAKES: [(&str, &str, &str); 47] = [
         "6:8",
         "an s_unit has no control socket",
     ),
+    ("name = \"a\"\nid = 1\nm_units = [\"b/2\", \"b\"]", "3:19", "no m_unit"),
+    ("name = \"a\"\nid = 1\nrole = \"s_unit\"\nm_units = []\n[manager]\nname = \"b\"\nid = 1", "4:11", "alone"),
     ("name = \"a\"\nid = 1\n[metrics]\nlisten = \"9464\"", "4:10", "no address"),
     ("name = \"a\"\nid = 1\n[metrics]\nlisten = \"0.0.0.0:9464\"", "4:10", "--metrics-anywhere"),
     ("name = \"a\"\nid = 1\n[log]\nlevel = \"a=b=c\"", "4:9", "no level"),

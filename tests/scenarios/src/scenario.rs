@@ -41,11 +41,13 @@ pub enum Need {
     SameSeed,
     /// A unit that goes on when a handler panics.
     Panics,
+    /// An m_unit that is told to which m_units it connects.
+    Choice,
 }
 
 impl Need {
     /// All of them.
-    pub const ALL: [Self; 18] = [
+    pub const ALL: [Self; 19] = [
         Self::Crash,
         Self::Partition,
         Self::Freeze,
@@ -64,6 +66,7 @@ impl Need {
         Self::ExactTime,
         Self::SameSeed,
         Self::Panics,
+        Self::Choice,
     ];
 
     /// Why a port lacks it; `None` where it does not.
@@ -100,6 +103,7 @@ impl Need {
             Self::LongTime => "minutes of real time",
             Self::ExactTime => "instants depend on the machine's load",
             Self::Panics
+            | Self::Choice
             | Self::Freeze
             | Self::Reset
             | Self::SlowReader
@@ -119,6 +123,7 @@ impl Need {
             Self::Backlog => "a board refuses connections while its few sockets are busy",
             Self::ManyUnits => "more nodes than a board has links for",
             Self::Panics => "a panic restarts a board",
+            Self::Choice => "a board that is an m_unit has few links, and meets every m_unit",
             _ => return None,
         })
     }

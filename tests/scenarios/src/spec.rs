@@ -28,6 +28,7 @@ pub struct Spec {
     pub(crate) message_buffers: usize,
     pub(crate) same_seed: bool,
     pub(crate) beside_another: bool,
+    pub(crate) m_units: Option<Vec<(&'static str, u32)>>,
 }
 
 impl Spec {
@@ -54,12 +55,18 @@ impl Spec {
             message_buffers: 32,
             same_seed: false,
             beside_another: false,
+            m_units: None,
         }
     }
 
     /// A manager that starts although one of its identity is there.
     pub fn beside_another(self) -> Self {
         Self { beside_another: true, ..self }
+    }
+
+    /// The m_units that an m_unit connects to, instead of all.
+    pub fn m_units(self, m_units: &[(&'static str, u32)]) -> Self {
+        Self { m_units: Some(m_units.to_vec()), ..self }
     }
 
     /// The manager that an s_unit joins instead.

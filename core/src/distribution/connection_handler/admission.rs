@@ -61,6 +61,7 @@ impl<S: Storage> Node<S> {
             (Role::SUnit, Role::MUnit) if self.is_wanted(&hello.identity) => Ok(()),
             (Role::SUnit, Role::MUnit) => Err(Refusal::WrongManager),
             (Role::MUnit, role) => match &hello.wanted {
+                _ if !self.is_wanted(&hello.identity) => Err(Refusal::WrongManager),
                 Some(manager) if manager.is(&self.config.identity) => Ok(()),
                 None if role == Role::MUnit => Ok(()),
                 _ => Err(Refusal::WrongManager),

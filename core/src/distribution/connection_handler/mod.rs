@@ -53,7 +53,7 @@ use twins::Twins;
 /// Whom a unit wants to reach.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Target {
-    /// Every m_unit, and the s_units that belong to this one.
+    /// Every m_unit, or those that [`Node::choose`] names, and the s_units that belong to this one.
     Everybody,
     /// The one manager of an s_unit, wherever it is.
     Manager(Manager),
@@ -181,6 +181,8 @@ pub struct Node<S: Storage> {
     config: NodeConfig,
     /// The manager of an s_unit.
     target: Option<Identity>,
+    /// The m_units that an m_unit connects to, if not all.
+    chosen: Option<S::Slice<Identity>>,
     table: Table<S>,
     findings: S::Slice<Option<Finding>>,
     random: Random,
@@ -206,6 +208,7 @@ impl<S: Storage> Node<S> {
         };
         let mut node = Self {
             target,
+            chosen: None,
             table: Table::new(storage.nodes, storage.order, storage.links),
             findings: storage.findings,
             search: Search::new(now, config.identity.role(), &mut random),
@@ -266,6 +269,12 @@ impl<S: Storage> Node<S> {
     /// Changes the most nodes that may be connected at a time.
     pub fn set_maximum_nodes(&mut self, maximum_nodes: u16) {
         self.config.constraints.maximum_nodes = maximum_nodes;
+    }
+
+    /// Of all m_units this one connects to these alone, from here on; links that there are stay. A link of two m_units takes
+    /// both: one that is not chosen is not answered, and refused where it dials.
+    pub fn choose(&mut self, m_units: S::Slice<Identity>) {
+        self.chosen = Some(m_units);
     }
 
     /// The hello for a new link, with a fresh nonce.

@@ -279,7 +279,9 @@ impl<S: Storage> Node<S> {
         let here = self.config.identity.role() == Role::MUnit;
         let counts = self.counts(now, from, who_has);
         match &who_has.wanted {
-            Some(manager) if manager.is(&self.config.identity) => self.answer_seeker(now, from, who_has),
+            Some(manager) if manager.is(&self.config.identity) && self.is_wanted(&who_has.identity) => {
+                self.answer_seeker(now, from, who_has);
+            }
             Some(manager) if self.manager() == Some(manager) => {
                 if counts {
                     self.hold_back(now);
@@ -347,7 +349,9 @@ impl<S: Storage> Node<S> {
         self.counters.add(NodeCounter::AnnounceHeard, 1);
         if announce.identity.role() != Role::MUnit || !self.is_wanted(&announce.identity) {
             self.counters.add(NodeCounter::WrongManager, 1);
-            self.note_of(now, from, &announce.identity, Refusal::WrongManager);
+            if self.chosen.is_none() {
+                self.note_of(now, from, &announce.identity, Refusal::WrongManager);
+            }
             return;
         }
         let broadcast = announce.nonce == 0;
@@ -369,9 +373,10 @@ impl<S: Storage> Node<S> {
         }
     }
 
-    /// An s_unit wants its manager, an m_unit everybody.
+    /// An s_unit wants its manager, an m_unit its s_units and the m_units that it has chosen.
     pub(super) fn is_wanted(&self, identity: &Identity) -> bool {
-        self.manager().is_none_or(|manager| manager.is(identity))
+        let is_chosen = || self.chosen.as_ref().is_none_or(|chosen| chosen.contains(identity));
+        self.manager().map_or_else(|| identity.role() == Role::SUnit || is_chosen(), |manager| manager.is(identity))
     }
 
     fn is_connected(&self, identity: &Identity, epoch: Epoch) -> bool {

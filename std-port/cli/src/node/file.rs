@@ -27,6 +27,7 @@ pub(super) struct File {
     pub(super) discovery_port: Maybe<u16>,
     pub(super) tcp_port: Maybe<u16>,
     pub(super) manager: Maybe<Manager>,
+    pub(super) m_units: Maybe<Vec<Spanned<String>>>,
     pub(super) access: Maybe<String>,
     #[serde(default)]
     pub(super) constraints: Constraints,

@@ -27,6 +27,7 @@ use serde_json::json;
 use crate::exit::{Ended, Exit};
 use crate::files;
 use crate::global::Global;
+use crate::name_and_id::NameAndId;
 use crate::output;
 use mistake::{Mistakes, Source};
 use settings::{Overrides, Settings};
@@ -56,6 +57,9 @@ pub(crate) struct Arguments {
     /// The node's ID number.
     #[arg(long)]
     id: Option<u32>,
+    /// An m_unit that an m_unit connects to, instead of all; as often as there are such.
+    #[arg(long = "m-unit", value_name = "NAME/ID")]
+    m_units: Vec<NameAndId>,
     /// The TCP port for connections of others; a free one unless told.
     #[arg(long, value_name = "PORT")]
     tcp_port: Option<u16>,
@@ -128,6 +132,7 @@ fn overrides(arguments: &Arguments, global: &Global) -> anyhow::Result<Overrides
         interfaces: global.loopback.then_some(Interfaces::Loopback),
         keys: global.keys(),
         discovery_port: global.discovery_port,
+        m_units: arguments.m_units.clone(),
         tcp_port: arguments.tcp_port,
         metrics: arguments.metrics,
         metrics_anywhere: arguments.metrics_anywhere,

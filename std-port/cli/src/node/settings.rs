@@ -13,6 +13,7 @@ use super::functions::{self, Service};
 use super::limits;
 use super::mistake::{Mistake, Mistakes, Source};
 use crate::keys::Keys;
+use crate::name_and_id::NameAndId;
 
 /// A value, and its place if it comes from the file.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -29,6 +30,8 @@ pub(super) struct Settings {
     pub(super) id: u32,
     /// An s_unit's manager; none for an m_unit.
     pub(super) manager: Option<Manager>,
+    /// The m_units that an m_unit connects to, if not all.
+    pub(super) m_units: Option<Vec<NameAndId>>,
     pub(super) fleet: u32,
     pub(super) interfaces: Interfaces,
     pub(super) keys: Keys,
@@ -62,6 +65,7 @@ pub(super) struct Overrides {
     pub(super) interfaces: Option<Interfaces>,
     pub(super) keys: Option<Keys>,
     pub(super) discovery_port: Option<u16>,
+    pub(super) m_units: Vec<NameAndId>,
     pub(super) tcp_port: Option<u16>,
     pub(super) metrics: Option<SocketAddr>,
     pub(super) metrics_anywhere: bool,
@@ -74,6 +78,9 @@ impl Overrides {
     pub(super) fn check(&self) -> Result<(), String> {
         if self.name.as_ref().is_some_and(|name| Identity::m_unit(name, 0).is_err()) {
             return Err("--name: a node's name has 1 to 32 bytes and no control characters".into());
+        }
+        if self.m_units.iter().any(|m_unit| Identity::m_unit(&m_unit.name, m_unit.id).is_err()) {
+            return Err("--m-unit: a node's name has 1 to 32 bytes and no control characters".into());
         }
         if self.discovery_port == Some(0) {
             return Err("--discovery-port: units cannot meet on port 0: write the port that all use".into());
@@ -116,6 +123,7 @@ fn checked(source: Source, file: &File, over: &Overrides, mistakes: &mut Vec<Mis
         name: own_name(file, over, mistakes),
         id: own_id(file, over, mistakes),
         manager: manager(file, role, mistakes),
+        m_units: m_units(file, role, over, mistakes),
         fleet: over.fleet.or(file.fleet).unwrap_or(0),
         interfaces: over
             .interfaces
@@ -198,6 +206,28 @@ fn named_manager(table: &toml::Spanned<file::Manager>, mistakes: &mut Vec<Mistak
         id: id.as_ref().map_or(0, |id| *id.get_ref()),
         address: address_of(address, mistakes),
     }
+}
+
+fn m_units(file: &File, role: Role, over: &Overrides, mistakes: &mut Vec<Mistake>) -> Option<Vec<NameAndId>> {
+    if let Some(written) = file.m_units.as_ref().filter(|_| role == Role::SUnit) {
+        let help = "take the line out; [manager] says which one it is";
+        mistakes.push(Mistake::new(written.span(), "an s_unit connects to its manager alone", help));
+    }
+    let written = file
+        .m_units
+        .as_ref()
+        .map(|m_units| m_units.get_ref().iter().filter_map(|text| named_m_unit(text, mistakes)).collect());
+    if over.m_units.is_empty() { written } else { Some(over.m_units.clone()) }
+}
+
+fn named_m_unit(text: &toml::Spanned<String>, mistakes: &mut Vec<Mistake>) -> Option<NameAndId> {
+    let named = text.get_ref().parse().ok();
+    let named = named.filter(|named: &NameAndId| Identity::m_unit(&named.name, named.id).is_ok());
+    if named.is_none() {
+        let help = "write NAME/ID, as in \"AGV_manager/1\"";
+        mistakes.push(Mistake::new(text.span(), "this is no m_unit", help));
+    }
+    named
 }
 
 fn address_of(text: &Maybe<String>, mistakes: &mut Vec<Mistake>) -> Option<SocketAddr> {

@@ -50,17 +50,20 @@ fn what_the_example_leaves_out_is_right_too() {
     let manager = EXAMPLE
         .replace("# tcp_port", "tcp_port")
         .replace("# discovery_port", "discovery_port")
+        .replace("# m_units", "m_units")
         .replace("# keys", "keys");
     let manager = manager.replace("# path = ", "path = ");
     let manager = settings(&manager).unwrap();
     assert!(manager.tcp_port.is_some() && matches!(manager.control, Control::Path(_)));
     assert_eq!(manager.discovery_port.unwrap().value, cara_std::SECURED_PORT);
     assert!(matches!(manager.keys, Keys::File(_)));
+    let m_units: Vec<_> = manager.m_units.unwrap().iter().map(ToString::to_string).collect();
+    assert_eq!(m_units, ["station/2", "hall/3"]);
 }
 
 #[test]
 fn the_command_line_stands_above_the_file() {
-    let text = "name = \"a\"\nid = 1\nfleet = 1\ntcp_port = 1\nmetrics.listen = \"127.0.0.1:1\"\n";
+    let text = "name = \"a\"\nid = 1\nfleet = 1\nm_units = []\ntcp_port = 1\nmetrics.listen = \"127.0.0.1:1\"\n";
     let source = Source { name: "test.toml".into(), text: text.into() };
     let over = Overrides {
         name: Some("b".into()),
@@ -68,11 +71,13 @@ fn the_command_line_stands_above_the_file() {
         fleet: Some(3),
         tcp_port: Some(4),
         discovery_port: Some(5),
+        m_units: vec!["hall/3".parse().unwrap()],
         metrics: Some(([127, 0, 0, 1], 6).into()),
         ..Overrides::default()
     };
     let settings = Settings::of(source, &over).unwrap();
     assert_eq!((settings.name.as_str(), settings.id, settings.fleet), ("b", 2, 3));
+    assert_eq!(settings.m_units, Some(vec!["hall/3".parse().unwrap()]));
     let port = |port: Option<super::settings::Placed<u16>>| port.map(|port| port.value);
     assert_eq!((port(settings.tcp_port), port(settings.discovery_port)), (Some(4), Some(5)));
     assert_eq!(settings.metrics.map(|metrics| metrics.value.port()), Some(6));

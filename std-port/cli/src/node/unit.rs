@@ -37,6 +37,10 @@ impl Node {
         let Settings { name, id, .. } = settings;
         let Some(manager) = &settings.manager else {
             let builder = CommunicationSystem::builder(name, *id)?;
+            let builder = match &settings.m_units {
+                Some(m_units) => builder.m_units(m_units.iter().map(|m_unit| (&m_unit.name, m_unit.id)))?,
+                None => builder,
+            };
             return Ok(Self::Manager(with(builder, settings).map_err(NotBuilt::Access)?.build_system()?));
         };
         let builder = Unit::builder(name, *id, &manager.name, manager.id)?;

@@ -299,6 +299,10 @@ impl LinuxNode {
         };
         let builder = builder.fleet(self.fleet).constraints(*constraints).capacities(capacities);
         let builder = if self.spec.beside_another { builder.beside_another() } else { builder };
+        let builder = match &self.spec.m_units {
+            Some(m_units) => builder.m_units(m_units.iter().copied())?,
+            None => builder,
+        };
         let builder = builder.interfaces(Interfaces::Loopback);
         let builder = match &self.keys {
             Some(keys) => builder.keys(lock(keys).ring(self.fleet, &self.spec.identity())),

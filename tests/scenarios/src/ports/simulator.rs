@@ -145,6 +145,7 @@ impl World for SimWorld {
             SpecRole::Agv(manager, manager_id) => self.world.s_unit(&name, id).joins(&manager, manager_id),
         };
         let new = if spec.same_seed { new.boot_seed(4) } else { new };
+        let new = spec.m_units.iter().fold(new, |new, m_units| new.m_units(m_units));
         let new = new.fleet(fleet).constraints(constraints).functions(their_functions).message_buffers(message_buffers);
         let new = match self.renews_every {
             Some(span) => new.renews_every(span),

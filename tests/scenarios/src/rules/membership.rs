@@ -15,6 +15,7 @@ scenarios![
         ["DatagramVersion", "datagram was counted", "stranger was told"];
     the_maximum_of_nodes_refuses_the_next: "51", Rough, [], ["RefusedFull"];
     two_m_units_meet_and_call_both_ways: "18, 20", Rough, [], ["Dialled"];
+    an_m_unit_meets_the_m_units_that_it_has_chosen: "a choice of m_units", Rough, [Choice], ["WrongManager"];
     an_m_unit_has_m_units_and_s_units: "16–17, 19", Rough, [], ["Joined"];
     an_agv_finds_its_manager_at_a_new_address: "address change", Rough, [AddressChange], ["address-change"];
 ];
@@ -98,6 +99,33 @@ fn two_m_units_meet_and_call_both_ways(world: &mut dyn World) {
     assert_eq!(service.diary().values(), [1, 2]);
     assert!(smaller.node_counted(NodeCounter::Dialled) > 0);
     assert_eq!(larger.node_counted(NodeCounter::Dialled), 0, "the smaller identity dials");
+}
+
+fn an_m_unit_meets_the_m_units_that_it_has_chosen(world: &mut dyn World) {
+    let service = Service::numbered("note");
+    // `a` wants `b` alone, and `manager` wants neither; `station` wants all.
+    let [a, b, manager, station] = [
+        Spec::manager("a", 1).m_units(&[("b", 2)]),
+        Spec::manager("b", 2).m_units(&[("station", 2), ("a", 1)]),
+        Spec::manager("manager", 1).m_units(&[("station", 2)]),
+        Spec::manager("station", 2),
+    ]
+    .map(|spec| world.add(spec.service(&service)));
+    let agv = world.add(Spec::agv("agv", 7).service(&service));
+    met(world, &a, "b", "note");
+    met(world, &station, "b", "note");
+    met(world, &station, "manager", "note");
+    met(world, &manager, "agv", "note");
+    world.wait("it is known", || !agv.peers().is_empty(), secs(10));
+    world.run_for(secs(4));
+    let peers = |unit: &Unit| {
+        let mut names: Vec<_> = unit.peers().iter().map(|identity| identity.name().to_owned()).collect();
+        names.sort();
+        names
+    };
+    assert_eq!([peers(&a), peers(&b)], [vec!["b"], vec!["a", "station"]]);
+    assert_eq!([peers(&manager), peers(&station)], [vec!["agv", "station"], vec!["b", "manager"]]);
+    assert_eq!(world.ask(&a, "b", "note", &mut number("n", 1)), Ok(()));
 }
 
 fn an_m_unit_has_m_units_and_s_units(world: &mut dyn World) {

@@ -40,6 +40,7 @@ impl NewUnit {
             identity,
             fleet: Fleet(0),
             target: Target::Everybody,
+            m_units: None,
             constraints,
             message_buffers: 16,
             links: usize::from(constraints.maximum_nodes) + 4,
@@ -60,6 +61,13 @@ impl NewUnit {
     /// The manager that an s_unit belongs to, dialled at a fixed address without broadcasts.
     pub fn joins_at(mut self, name: &str, id: u32, address: SocketAddr) -> Self {
         self.settings.target = Target::Fixed(manager(name, id), address);
+        self
+    }
+
+    /// Of all m_units an m_unit connects to these alone, by name and id.
+    pub fn m_units(mut self, m_units: &[(&str, u32)]) -> Self {
+        let identity = |&(name, id): &(&str, u32)| Identity::m_unit(name, id).expect("a name has 1 to 32 bytes");
+        self.settings.m_units = Some(m_units.iter().map(identity).collect());
         self
     }
 

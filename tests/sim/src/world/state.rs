@@ -46,6 +46,8 @@ pub(super) struct Settings {
     pub(super) identity: Identity,
     pub(super) fleet: Fleet,
     pub(super) target: Target,
+    /// The m_units that an m_unit connects to, if not all.
+    pub(super) m_units: Option<Box<[Identity]>>,
     pub(super) constraints: Constraints,
     pub(super) message_buffers: usize,
     pub(super) links: usize,
@@ -124,8 +126,12 @@ impl UnitState {
         let buffers = LazyPool::new(buffer_bytes(message_size, keys.cipher().overhead()), settings.message_buffers);
         // A block reserves what its signature declares, which may be more than what it holds.
         let arguments = boxed_parameters(2 * message_size as usize + 1_024);
+        let mut node = Node::new(network.now(), config, storage);
+        if let Some(m_units) = &settings.m_units {
+            node.choose(m_units.clone());
+        }
         self.machine = Some(Machine {
-            node: Node::new(network.now(), config, storage),
+            node,
             links: Links::new(self.host, settings.links, functions, buffers, arguments),
             publications: Publications::new(Boxed::slice(settings.functions), Boxed::slice(4 * settings.functions)),
             constraints: settings.constraints,

@@ -234,6 +234,43 @@ fn of_two_m_units_the_smaller_dials_and_the_larger_answers() {
     assert_eq!(run(&mut of_small, at(200), &mut Outbox::default()), [(at(200), dial)]);
 }
 
+/// `m` has chosen `z`, and hears of `z` and of two others, of which it would dial one and be dialled by the other.
+#[test]
+fn an_m_unit_that_has_chosen_others_meets_those_alone() {
+    let own = m_unit("m", 1);
+    let [chosen, larger, smaller] = ["z", "x", "b"].map(|name| m_unit(name, 1));
+    let mut node = node(own.clone());
+    node.choose(Box::new([chosen.identity.clone()]));
+    let question = |config: &NodeConfig| who_has_bytes(&search_of(config, 1));
+    let asks = |config: &NodeConfig| {
+        let wanted = Some(Manager::new("m", 1).unwrap());
+        who_has_bytes(&WhoHas { wanted, expected: 0, ..search_of(config, 2) })
+    };
+    for other in [&larger, &smaller] {
+        node.hear(at(0), address(2, 7_001), &question(other));
+        node.hear(at(0), address(2, 7_001), &asks(other));
+        node.hear(at(0), address(2, 7_001), &announce_bytes(&announce_of(other, 3, 0)));
+    }
+    let mut outbox = Outbox::default();
+    assert_eq!(run(&mut node, at(200), &mut outbox), []);
+    assert_eq!((&outbox.sent[..], node.counters.value(NodeCounter::WrongManager)), (&[][..], 6));
+    node.hear(at(200), address(3, 7_001), &question(&chosen));
+    node.hear(at(200), address(3, 7_001), &asks(&s_unit("agv", 1)));
+    assert_eq!(run(&mut node, at(2_000), &mut outbox), []);
+    assert_eq!(outbox.sent.len(), 2, "one question to the chosen one, and the answer to its own s_unit");
+    let admitted = |node: &mut Node<Boxed>, config: &NodeConfig, link| {
+        let hello = Hello {
+            wanted: config.identity.name().eq("agv").then(|| Manager::new("m", 1).unwrap()),
+            ..hello_of(config)
+        };
+        node.admit(at(2_000), LinkId(link), address(9, 40_000), &hello)
+    };
+    assert_eq!(admitted(&mut node, &larger, 1), Admission::Refuse(Refusal::WrongManager));
+    assert_eq!(admitted(&mut node, &chosen, 2), Admission::Accept);
+    assert_eq!(admitted(&mut node, &s_unit("agv", 1), 3), Admission::Accept);
+    assert_eq!(node.findings().count(), 1, "others that are about are no finding");
+}
+
 #[test]
 fn own_datagrams_are_ignored_and_a_double_is_told() {
     let mut node = depot();
