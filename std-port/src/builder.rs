@@ -281,6 +281,9 @@ impl<T: Send + 'static> Builder<T> {
         if let Some(m_units) = self.m_units {
             node.choose(m_units);
         }
+        if let Keys::Ring(live) = &keys {
+            node.expect(live.ring().nodes());
+        }
         let publications =
             Publications::new(filled(capacities.functions, false), filled(capacities.published_to_one, None));
         let functions =

@@ -162,6 +162,7 @@ impl<T: Send + 'static> Engine<T> {
             watched.is_news(&ring).then_some(ring)
         };
         if let Some(ring) = ring {
+            lock(&self.node).node.expect(ring.nodes());
             self.end_links_without_keys(&ring);
         }
         now + REFRESH

@@ -149,6 +149,11 @@ impl KeyRing {
         peers
     }
 
+    /// How many those are.
+    pub(crate) fn nodes(&self) -> u16 {
+        u16::try_from(self.peers().len()).unwrap_or(u16::MAX)
+    }
+
     /// The text of its file.
     pub(super) fn text(&self) -> Zeroizing<String> {
         let lines = 5 + self.all().map(|generation| 2 + generation.pairs.len()).sum::<usize>();

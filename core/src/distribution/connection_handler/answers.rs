@@ -180,10 +180,10 @@ impl<S: Storage> Node<S> {
         self.config.constraints.maximum_nodes.saturating_sub(self.table.joined())
     }
 
-    /// How many nodes may answer or dial at once: those that still fit.
+    /// How many nodes may answer or dial at once: those that still fit, of those that there are.
     pub(super) fn expected(&self) -> u16 {
         match self.config.identity.role() {
-            Role::MUnit => self.room(),
+            Role::MUnit => self.room().min(self.known_nodes),
             Role::SUnit => 1,
         }
     }

@@ -183,6 +183,8 @@ pub struct Node<S: Storage> {
     target: Option<Identity>,
     /// The m_units that an m_unit connects to, if not all.
     chosen: Option<S::Slice<Identity>>,
+    /// Nodes that there are to be met at most.
+    known_nodes: u16,
     table: Table<S>,
     findings: S::Slice<Option<Finding>>,
     random: Random,
@@ -209,6 +211,7 @@ impl<S: Storage> Node<S> {
         let mut node = Self {
             target,
             chosen: None,
+            known_nodes: u16::MAX,
             table: Table::new(storage.nodes, storage.order, storage.links),
             findings: storage.findings,
             search: Search::new(now, config.identity.role(), &mut random),
@@ -275,6 +278,11 @@ impl<S: Storage> Node<S> {
     /// both: one that is not chosen is not answered, and refused where it dials.
     pub fn choose(&mut self, m_units: S::Slice<Identity>) {
         self.chosen = Some(m_units);
+    }
+
+    /// An m_unit has no more than so many nodes to meet, as far as the port knows: they answer it the sooner the fewer they are.
+    pub fn expect(&mut self, nodes: u16) {
+        self.known_nodes = nodes;
     }
 
     /// The hello for a new link, with a fresh nonce.

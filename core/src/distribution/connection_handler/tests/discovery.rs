@@ -234,6 +234,22 @@ fn of_two_m_units_the_smaller_dials_and_the_larger_answers() {
     assert_eq!(run(&mut of_small, at(200), &mut Outbox::default()), [(at(200), dial)]);
 }
 
+/// Each node that is expected costs the others a millisecond.
+#[test]
+fn a_manager_expects_no_more_nodes_than_it_knows_of() {
+    let expected = |node: &mut Node<Boxed>| {
+        let mut outbox = Outbox::default();
+        run(node, at(100), &mut outbox);
+        as_who_has(&outbox.broadcasts[0]).expected
+    };
+    assert_eq!(expected(&mut depot()), Constraints::M_UNIT.maximum_nodes);
+    for (known, told) in [(0, 1), (3, 3), (u16::MAX, Constraints::M_UNIT.maximum_nodes)] {
+        let mut node = depot();
+        node.expect(known);
+        assert_eq!(expected(&mut node), told);
+    }
+}
+
 /// `m` has chosen `z`, and hears of `z` and of two others, of which it would dial one and be dialled by the other.
 #[test]
 fn an_m_unit_that_has_chosen_others_meets_those_alone() {
