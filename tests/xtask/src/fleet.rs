@@ -13,12 +13,13 @@ use crate::groups::Extent;
 const CHECKED_ROUNDS: &str = "5";
 
 /// All figures, for as many nodes as are asked for.
-pub(crate) fn run(nodes: Option<u16>, json: Option<&Path>) -> Result<ExitCode> {
+pub(crate) fn run(nodes: Option<u16>, processes: Option<u16>, json: Option<&Path>) -> Result<ExitCode> {
     json.map_or(Ok(()), files::can_write)?;
-    let nodes = nodes.map(|nodes| nodes.to_string());
     let mut run = measured();
-    if let Some(nodes) = &nodes {
-        run = run.args(["--nodes", nodes]);
+    for (option, number) in [("--nodes", nodes), ("--processes", processes)] {
+        if let Some(number) = number {
+            run = run.args([option, &number.to_string()]);
+        }
     }
     let run = match json {
         // The child runs in the project's root, wherever this command was started.

@@ -93,8 +93,11 @@ enum Task {
     /// Puts many s_units on one manager and measures how they join, what they cost, and how they come back.
     Fleet {
         /// How many s_units; 1,000 if not given.
-        #[arg(long, value_parser = clap::value_parser!(u16).range(2..=5_000))]
+        #[arg(long, value_parser = clap::value_parser!(u16).range(2..=10_000))]
         nodes: Option<u16>,
+        /// Processes that share them; 1 if not given.
+        #[arg(long, value_parser = clap::value_parser!(u16).range(1..=64))]
+        processes: Option<u16>,
         /// Also writes the figures here.
         #[arg(long, value_name = "FILE")]
         json: Option<PathBuf>,
@@ -127,7 +130,7 @@ fn main() -> ExitCode {
         Task::Instructions { json, write } => instructions::run(json.as_deref(), write),
         Task::Paper { write: true, .. } => paper::write_ports().map(|()| ExitCode::SUCCESS),
         Task::Paper { numbers, write: false } => paper::broken::run(&numbers),
-        Task::Fleet { nodes, json } => fleet::run(nodes, json.as_deref()),
+        Task::Fleet { nodes, processes, json } => fleet::run(nodes, processes, json.as_deref()),
         Task::Peers { names } => peers::run(&names),
         Task::Sanitize => sanitize::run(),
         Task::Security(options) => security::run(&options),
