@@ -257,7 +257,7 @@ fn what_lies_unread_is_read_before_a_question_goes_out() {
     until(|| units.iter().all(is_due));
     for (index, unit) in units.iter().enumerate() {
         if index > 0 {
-            wait_readable(unit.engine().datagrams.fd(Socket::Shared), PATIENT.into()).unwrap();
+            wait_readable(unit.engine().datagrams.fd(Socket::Shared), PATIENT).unwrap();
         }
         unit.engine().keep_time();
     }
