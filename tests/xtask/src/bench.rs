@@ -45,8 +45,7 @@ pub(crate) fn run(options: &Options) -> Result<ExitCode> {
     options.json.as_deref().map_or(Ok(()), files::can_write)?;
     options.plots.as_deref().map_or(Ok(()), files::can_write_in)?;
     Run::cargo().args(["build", "--release", "--quiet", "--package", "cara-bench"]).stream()?;
-    let folder = std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| workspace::root().join("target"), Into::into);
-    let program = folder.join("release").join("cara-bench");
+    let program = workspace::target().join("release").join("cara-bench");
     let mut command = Command::new(&program);
     command.arg("experiments").args(options.quick.then_some("--quick")).args(options.print.then_some("--print"));
     if !options.peers.is_empty() {

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, bail, ensure};
 use cara_processes::Process;
 
-use crate::command::Run;
+use crate::binaries;
 
 mod listing;
 mod stage;
@@ -25,9 +25,7 @@ const REPORTS: usize = 4;
 
 /// Runs the demonstration; success only if everything in it happened.
 pub(crate) fn run() -> Result<ExitCode> {
-    Run::cargo()
-        .args(["build", "--quiet", "--package", "cara-examples", "--package", "cara-cli", "--bins"])
-        .stream()?;
+    binaries::build(&["agv", "agv_manager", "cara"])?;
     let stage = Stage::new()?;
     play(&stage).context("the demonstration failed")?;
     println!("\neverything happened, in {:.1} s", stage.seconds());

@@ -15,6 +15,7 @@ use std::process::ExitCode;
 
 use anyhow::{Result, bail};
 
+use crate::binaries;
 use crate::command::Run;
 use crate::groups::Outcome;
 use crate::install;
@@ -111,8 +112,8 @@ fn tested_image() -> Result<PathBuf> {
 
 /// The program that runs images, about to be run with one. It uses the `cara` command beside it.
 pub(crate) fn tests(image: &Path) -> Result<Run> {
-    Run::cargo().args(["build", "--quiet", "--package", "cara-cli"]).stream()?;
-    Ok(Run::cargo().args(["run", "--quiet", "--package", "cara-firmware-tests", "--", "--image"]).args([image]))
+    binaries::build(&["cara"])?;
+    Ok(binaries::debug("cara-firmware-tests")?.args(["--image".as_ref(), image.as_os_str()]))
 }
 
 fn chosen(name: Option<&str>) -> Result<Vec<&'static Board>> {

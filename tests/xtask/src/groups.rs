@@ -7,8 +7,8 @@ use cara_processes::planted;
 
 use crate::command::Run;
 use crate::{
-    bad_input, claims, dependencies, firmware, fleet, hygiene, install, instructions, layers, licences, links,
-    manifests, names, panic_free, paper, security, workspace,
+    bad_input, binaries, claims, demo, dependencies, firmware, fleet, hygiene, install, instructions, layers, licences,
+    links, manifests, names, panic_free, paper, security, workspace,
 };
 
 /// A group of checks that is run and reported as one.
@@ -26,9 +26,6 @@ pub(crate) struct Group {
     pub(crate) waits: bool,
     pub(crate) run: fn(Extent) -> Outcome,
 }
-
-/// Features that nothing in the workspace asks for, and whose code is checked and tested all the same.
-const FEATURES: &str = "cara-std/async";
 
 /// How much of a group is run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -126,7 +123,7 @@ pub(crate) const GROUPS: [Group; 24] = [
         quick: Some(300),
         by_default: true,
         waits: false,
-        run: |_| workspace_tests().args(["--no-run"]).stream().into(),
+        run: |_| binaries::tests().args(["--no-run"]).stream().into(),
     },
     Group {
         name: "unit",
@@ -180,9 +177,7 @@ pub(crate) const GROUPS: [Group; 24] = [
         quick: None,
         by_default: true,
         waits: true,
-        run: |_| {
-            Run::cargo().args(["run", "--quiet", "--package", "cara-scenarios", "--bin", "planted"]).stream().into()
-        },
+        run: |_| planted_bugs().into(),
     },
     Group {
         name: "security",
@@ -209,7 +204,7 @@ pub(crate) const GROUPS: [Group; 24] = [
         quick: None,
         by_default: true,
         waits: true,
-        run: |_| Run::cargo().args(["xtask", "demo"]).stream().into(),
+        run: |_| demo::run().map(drop).into(),
     },
     Group {
         name: "guide",
@@ -287,12 +282,8 @@ fn unit() -> Result<()> {
             println!("some tests will be skipped: {reason}");
         }
     }
-    workspace_tests().args(["--no-fail-fast"]).env("RUST_TEST_THREADS", THREADS).stream()?;
-    paper::check_ran(&["--workspace", "--features", FEATURES])
-}
-
-fn workspace_tests() -> Run {
-    Run::cargo().args(["test", "--workspace", "--features", FEATURES])
+    binaries::tests().args(["--no-fail-fast"]).env("RUST_TEST_THREADS", THREADS).stream()?;
+    paper::check_ran(&["--workspace", "--features", binaries::FEATURES])
 }
 
 /// Runs a check once what it needs is there; what cannot be had is a reason to skip it.
@@ -320,7 +311,7 @@ fn format() -> Result<()> {
 }
 
 fn clippy() -> Result<()> {
-    let all = ["clippy", "--workspace", "--all-targets", "--features", FEATURES, "--", "-D", "warnings"];
+    let all = ["clippy", "--workspace", "--all-targets", "--features", binaries::FEATURES, "--", "-D", "warnings"];
     Run::cargo().args(all).stream()
 }
 
@@ -356,18 +347,21 @@ fn loom() -> Result<()> {
 
 /// The model has to be named: it takes too long beside the other tests.
 fn hand_over() -> Run {
-    workspace_tests().args(["--test", "hand_over"])
+    binaries::tests().args(["--test", "hand_over"])
 }
 
 fn scenarios(extent: Extent) -> Result<()> {
     present("tests/scenarios/Cargo.toml")?;
     let seeds = if extent == Extent::Full { "1000" } else { "50" };
-    let run = ["run", "--release", "--package", "cara-scenarios", "--bin", "seeds", "--", "--seeds", seeds];
-    Run::cargo().args(run).stream()
+    binaries::release("seeds")?.args(["--seeds", seeds]).stream()
+}
+
+fn planted_bugs() -> Result<()> {
+    binaries::debug("planted")?.stream()
 }
 
 fn guide() -> Result<()> {
-    Run::cargo().args(["run", "--quiet", "--package", "cara-guide", "--", "docs/guide.md"]).stream()
+    binaries::debug("cara-guide")?.args(["docs/guide.md"]).stream()
 }
 
 fn present(file: &str) -> Result<()> {

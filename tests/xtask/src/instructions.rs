@@ -3,7 +3,7 @@
 //! On the host callgrind counts what happens within one function of `tests/instructions`. On the board an emulator gives
 //! every instruction the same time, and the image measures time. Both are the same in every run of one compiler.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::ExitCode;
 
 use anyhow::{Context, Result, bail};
@@ -99,14 +99,14 @@ fn host() -> Result<Vec<Row>> {
         return Ok(Vec::new());
     }
     Run::cargo().args(["build", "--quiet", "--profile", "counted", "--package", "cara-instructions"]).stream()?;
-    let program = target().join("counted/cara-instructions");
+    let program = workspace::target().join("counted/cara-instructions");
     let listed = Run::new(&program.to_string_lossy()).text()?;
     listed.lines().enumerate().map(|(number, line)| of_host(&program, number, line)).collect()
 }
 
 fn of_host(program: &Path, number: usize, line: &str) -> Result<Row> {
     let (operation, of) = line.split_once('\t').context("an operation has a name and a size")?;
-    let folder = target().join("instructions");
+    let folder = workspace::target().join("instructions");
     std::fs::create_dir_all(&folder)?;
     let profile = folder.join(format!("callgrind.{number}"));
     let counted = ["--tool=callgrind", "--quiet", "--toggle-collect=*counted_by_callgrind*"];
@@ -164,10 +164,6 @@ fn of_board(line: &str) -> Result<Row> {
         of: of.into(),
         instructions: instructions.trim().parse()?,
     })
-}
-
-fn target() -> PathBuf {
-    std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| workspace::root().join("target"), Into::into)
 }
 
 /// How many instructions an operation takes.

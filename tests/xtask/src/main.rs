@@ -7,6 +7,7 @@ use clap::{Parser, Subcommand};
 
 mod bad_input;
 mod bench;
+mod binaries;
 mod claims;
 mod command;
 mod demo;

@@ -8,7 +8,7 @@ use anyhow::{Context, Result, ensure};
 use cara_processes::files;
 use clap::Args;
 
-use crate::command::Run;
+use crate::binaries;
 use crate::firmware;
 use crate::groups::{Extent, Outcome};
 use crate::workspace;
@@ -43,8 +43,7 @@ pub(crate) fn run(options: &Security) -> Result<ExitCode> {
 /// Starts Linux vehicles and boards beside each attack.
 fn kept_away(starts: u32) -> Result<ExitCode> {
     let starts = starts.to_string();
-    let run = ["run", "--quiet", "--release", "--package", "cara-security", "--", "--starts", &starts];
-    Run::cargo().args(run).stream()?;
+    binaries::release("cara-security")?.args(["--starts", &starts]).stream()?;
     if let Some(reason) = firmware::kept_away(&starts)? {
         println!("without boards: {reason}");
     }
@@ -70,8 +69,7 @@ fn attack(extent: Extent, json: Option<&Path>) -> Result<Option<String>> {
         Extent::Full => firmware::attack(&boards)?,
         Extent::Quick => Some("the quick run has none".to_owned()),
     };
-    let run =
-        Run::cargo().args(["run", "--quiet", "--package", "cara-security", "--", "--simulator"]).args([&simulator]);
+    let run = binaries::debug("cara-security")?.args(["--simulator".as_ref(), simulator.as_os_str()]);
     let run = if extent == Extent::Quick { run.args(["--quick"]) } else { run };
     let run = if left_out.is_none() { run.args(["--with".as_ref(), boards.as_os_str()]) } else { run };
     let run = match json {
@@ -85,8 +83,7 @@ fn attack(extent: Extent, json: Option<&Path>) -> Result<Option<String>> {
 
 /// What the simulator's attackers print.
 fn simulated() -> Result<String> {
-    let test = ["test", "--quiet", "--package", "cara-sim", "--test", "security", "--", "--nocapture"];
-    let (code, output) = Run::cargo().args(test).output()?;
+    let (code, output) = binaries::tests().args(["--quiet", "--test", "security", "--", "--nocapture"]).output()?;
     ensure!(code == Some(0), "attacks on the simulator: {output}");
     Ok(output)
 }

@@ -13,6 +13,11 @@ pub(crate) fn root() -> &'static Path {
     here.parent().and_then(Path::parent).unwrap_or(here)
 }
 
+/// Where cargo puts what it builds.
+pub(crate) fn target() -> PathBuf {
+    std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| root().join("target"), Into::into)
+}
+
 /// The whole text of a file below the root.
 pub(crate) fn read(path: &Path) -> Result<String> {
     let path = root().join(path);

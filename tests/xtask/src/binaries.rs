@@ -1,0 +1,42 @@
+//! Binaries of the workspace that the checks run.
+//!
+//! Cargo builds a crate once for each set of features that is asked of it, and which features a dependency has follows from
+//! everything that is built with it. So binaries are built as members of the whole workspace, and those that are not
+//! optimised as if its tests were built too, as they are in CI: otherwise the same crates are compiled again for each of them.
+
+use anyhow::Result;
+
+use crate::command::Run;
+use crate::workspace;
+
+/// Features that nothing in the workspace asks for, and whose code is checked and tested all the same.
+pub(crate) const FEATURES: &str = "cara-std/async";
+/// A small test. With one in the build, dependencies have the features that tests want of them.
+const TEST: [&str; 2] = ["--test", "smoke"];
+
+/// Builds one and says how to run it.
+pub(crate) fn debug(name: &str) -> Result<Run> {
+    build(&[name])?;
+    Ok(Run::new(&workspace::target().join("debug").join(name).to_string_lossy()))
+}
+
+/// As [`debug`], optimised.
+pub(crate) fn release(name: &str) -> Result<Run> {
+    workspace_build(&[name]).args(["--release"]).stream()?;
+    Ok(Run::new(&workspace::target().join("release").join(name).to_string_lossy()))
+}
+
+/// Builds several.
+pub(crate) fn build(names: &[&str]) -> Result<()> {
+    workspace_build(names).args(TEST).stream()
+}
+
+fn workspace_build(names: &[&str]) -> Run {
+    let build = Run::cargo().args(["build", "--quiet", "--workspace", "--features", FEATURES]);
+    names.iter().fold(build, |build, name| build.args(["--bin", name]))
+}
+
+/// `cargo test` of the whole workspace.
+pub(crate) fn tests() -> Run {
+    Run::cargo().args(["test", "--workspace", "--features", FEATURES])
+}
