@@ -129,6 +129,10 @@ const PEERS: [(&str, Mode, &str); 4] = [
     (SIMULATED, Mode::Plain, "CARA, simulated"),
 ];
 
+/// Whose curves are drawn where every pair has a cable.
+const ON_LINKS: [(&str, Mode, &str); 6] =
+    [PEERS[0], PEERS[1], PEERS[2], PEERS[3], ("zenoh", Mode::Plain, "zenoh"), ("omniorb", Mode::Plain, "omniORB")];
+
 fn periods<'r>(rows: impl Iterator<Item = &'r Availability>) -> Vec<Point> {
     let point = |row: &Availability| {
         let share = row.counts.executed_of_offered;

@@ -1,5 +1,6 @@
-// omniORB: CORBA over TCP on loopback, a connection and a server thread for each caller.
+// omniORB: CORBA over TCP, a connection and a server thread for each caller.
 
+#include <cstdlib>
 #include <mutex>
 #include <stdexcept>
 
@@ -16,12 +17,15 @@ public:
     void take(const char *) override { note(); }
 };
 
-// Both ends keep texts as UTF-8, and up to 128 callers have a connection each.
-CORBA::ORB_var make_orb() {
+// Both ends keep texts as UTF-8, and up to 128 callers have a connection each. The server listens on its end of the cable
+// where there is one, else on loopback; the caller's end has no other address than those two to listen on.
+CORBA::ORB_var make_orb(bool serves) {
+    const char *cable = serves ? std::getenv("CARA_BENCH_CABLE") : nullptr;
+    const std::string end_point = std::string("giop:tcp:") + (cable ? cable : "127.0.0.1") + ":";
     const char *options[][2] = {
         {"nativeCharCodeSet", "UTF-8"},
         {"defaultCharCodeSet", "UTF-8"},
-        {"endPoint", "giop:tcp:127.0.0.1:"},
+        {"endPoint", end_point.c_str()},
         {"maxGIOPConnectionPerServer", "128"},
         {"threadPerConnectionPolicy", "1"},
         {nullptr, nullptr},
@@ -46,7 +50,7 @@ Result guard(Result failed, Work work) {
 extern "C" const char *peer_serve(uint32_t, void (*executed)()) {
     return guard<const char *>(nullptr, [&] {
         note = executed;
-        static CORBA::ORB_var orb = make_orb();
+        static CORBA::ORB_var orb = make_orb(true);
         CORBA::Object_var object = orb->resolve_initial_references("RootPOA");
         PortableServer::POA_var poa = PortableServer::POA::_narrow(object);
         Service *service = new Service;
@@ -62,7 +66,7 @@ extern "C" void *peer_connect(uint32_t, const char *address) {
     return guard<void *>(nullptr, [&]() -> void * {
         static std::mutex mutex;
         std::lock_guard<std::mutex> lock(mutex);
-        static CORBA::ORB_var orb = make_orb();
+        static CORBA::ORB_var orb = make_orb(false);
         CORBA::Object_var object = orb->string_to_object(address);
         Mirror_ptr echo = Mirror::_narrow(object);
         if (CORBA::is_nil(echo)) throw std::runtime_error("the address is not one of a Mirror");

@@ -73,7 +73,6 @@ struct Lane<'p> {
 /// One rate after the other; at each, all sizes and peers in both distributions side by side, on a cable each.
 fn availability(plan: &Plan, results: &mut Results) -> Result<()> {
     let bursts = &plan.link.availability;
-    let own = ["floor", "cara", SECURED].map(Contender::Own);
     let mut outcome = Ok(());
     for &mbit in bursts.mbit.iter().take_while(|_| !is_stopped()) {
         let mut lanes = Vec::new();
@@ -82,7 +81,7 @@ fn availability(plan: &Plan, results: &mut Results) -> Result<()> {
             [1, 2].into_iter().flat_map(|number| sizes.clone().map(move |chars| (number, chars)))
         {
             let setting = Setting { pin: plan.pin, distribution, print: true, mbit: Some(mbit) };
-            for contender in &own {
+            for contender in &bursts.peers {
                 let is_ours = contender.name_and_mode().0 == "cara";
                 let datagrams = is_ours && chars <= DATAGRAM_CHARS;
                 let deliveries =

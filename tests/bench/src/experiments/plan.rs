@@ -136,6 +136,7 @@ const LONGEST_MS: u32 = 20;
 /// One-way requests on a link, in both distributions; none that takes a link longer than [`LONGEST_MS`].
 #[derive(Debug, Clone)]
 pub(crate) struct LinkBursts {
+    pub(crate) peers: Vec<Contender>,
     pub(crate) mbit: Vec<u32>,
     pub(crate) chars: Vec<u32>,
     pub(crate) periods_ms: Vec<u64>,
@@ -185,7 +186,7 @@ impl Plan {
             scale_calls: extent.of(400, 200, 5),
             availability: availability(extent),
             constrained: constrained(extent),
-            link: link(extent, pin),
+            link: link(extent, pin, outside),
             pin,
             notes,
         })
@@ -324,18 +325,20 @@ fn availability(extent: Extent) -> Vec<Bursts> {
         .collect()
 }
 
-fn link(extent: Extent, pin: Pin) -> Link {
+fn link(extent: Extent, pin: Pin, outside: &[Arc<Outside>]) -> Link {
+    let outside = || outside.iter().filter(|outside| outside.has_cable());
     let mbit = extent.of(vec![10, 20, 100], vec![20], vec![100]);
     let chars: &[u32] = extent.of(&CHARS, &SOME_CHARS, &[100]);
     let (rounds, calls) = extent.of((5, 20), (2, 5), (1, 3));
     let group = |(distribution, mbit)| {
         let setting = Setting { pin, distribution, print: true, mbit: Some(mbit) };
-        Group { setting, peers: with(&COMPARED, [].iter()), orders: orders(chars, calls, 20), rounds }
+        Group { setting, peers: with(&COMPARED, outside()), orders: orders(chars, calls, 20), rounds }
     };
     let cells = [1, 2].into_iter().flat_map(|distribution| mbit.iter().map(move |&mbit| (distribution, mbit)));
     Link {
         response: cells.map(group).collect(),
         availability: LinkBursts {
+            peers: with(&["floor", "cara", SECURED], outside().filter(|outside| outside.is_one_way())),
             // The slowest one fills with what a datagram holds.
             mbit: [extent.of(&[2][..], &[2], &[]), &mbit].concat(),
             chars: extent.of(vec![1_000, 10_000, 20_000], vec![1_000, 20_000], vec![1_000, 20_000]),

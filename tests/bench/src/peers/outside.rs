@@ -45,6 +45,9 @@ struct Entry {
     files: Vec<PathBuf>,
     /// Whether it has messages without an answer.
     one_way: bool,
+    /// Whether its server listens on the end of a cable.
+    #[serde(default)]
+    cable: bool,
 }
 
 /// Another system.
@@ -114,6 +117,11 @@ impl Outside {
     /// Whether it has messages without an answer.
     pub(crate) fn is_one_way(&self) -> bool {
         self.entry.one_way
+    }
+
+    /// Whether it takes part on links of a given rate.
+    pub(crate) fn has_cable(&self) -> bool {
+        self.entry.cable
     }
 
     /// How long it may take to start, or to answer.

@@ -4,7 +4,7 @@ use cara_bench_ends::Delivery;
 
 use super::axis::Axis;
 use super::chart::{Chart, Kind, Line, Point};
-use super::{Figure, LONG, PEERS, paper, paper_falls, round_trips};
+use super::{Figure, LONG, ON_LINKS, paper, paper_falls, round_trips};
 use crate::experiments::SIMULATED;
 use crate::results::{LinkAvailability, LinkConstrained, Mode, Response, Results, measured};
 
@@ -76,7 +76,8 @@ fn response(results: &Results, mbit: u32, distribution: u8) -> Chart {
         let is_wanted = move |row: &&Response| row.peer == peer && row.mode == mode;
         round_trips(rows.clone().map(|(_, row)| row).filter(is_wanted)).into_iter().map(in_ms).collect::<Vec<_>>()
     };
-    let mut lines: Vec<Line> = PEERS.iter().map(|(peer, mode, name)| Line::measured(*name, of(peer, *mode))).collect();
+    let mut lines: Vec<Line> =
+        ON_LINKS.iter().map(|(peer, mode, name)| Line::measured(*name, of(peer, *mode))).collect();
     let wire = [1_000.0, 100_000.0].map(|chars| (chars, 2.0 * chars * 8.0 / f64::from(mbit) / 1e3));
     lines.push(Line::of(Kind::Reckoned, "the bits of both texts alone", &wire));
     let title = format!("Response time, {mbit} Mbit/s, distribution {distribution}");
@@ -142,7 +143,8 @@ fn long(results: &Results, mbit: u32, distribution: u8) -> Chart {
             cell == (peer, mode, Delivery::Reliable, LONG, distribution)
         })
     };
-    let mut lines: Vec<Line> = PEERS.iter().map(|(peer, mode, name)| Line::measured(*name, of(peer, *mode))).collect();
+    let mut lines: Vec<Line> =
+        ON_LINKS.iter().map(|(peer, mode, name)| Line::measured(*name, of(peer, *mode))).collect();
     lines.extend(paper(distribution, LONG));
     let (x, y) = axes();
     let title = format!("{LONG} characters, {mbit} Mbit/s, distribution {distribution}");
@@ -161,7 +163,7 @@ fn slowest(results: &Results, distribution: u8) -> Chart {
         })
     };
     let mut lines = Vec::new();
-    for (peer, mode, name) in PEERS {
+    for (peer, mode, name) in ON_LINKS {
         lines.push(Line::measured(name, of(peer, mode, Delivery::Reliable)));
         lines.push(Line::measured(format!("{name}, best effort"), of(peer, mode, Delivery::BestEffort)));
     }

@@ -1,6 +1,6 @@
 //! zenoh: a get that a queryable answers, and puts that zenoh batches. Peers with fixed endpoints, no scouting.
 
-use std::net::TcpListener;
+use std::net::{SocketAddr, TcpListener};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
@@ -39,14 +39,14 @@ fn open(listens: Option<&str>, connects: Option<&str>) -> Result<Session> {
 }
 
 impl Peer for Zenoh {
-    fn start_server(&self, _: &Place) -> Result<Server> {
-        let port = TcpListener::bind("127.0.0.1:0")?.local_addr()?.port();
-        let address = format!("tcp/127.0.0.1:{port}");
+    fn start_server(&self, place: &Place) -> Result<Server> {
+        let free: SocketAddr = TcpListener::bind((place.host(), 0))?.local_addr()?;
+        let address = format!("tcp/{free}");
         let session = open(Some(&address), None)?;
         let echo = session.declare_queryable("echo").callback(|query| {
             let text = query.payload().and_then(|payload| payload.try_to_string().ok());
             let text = text.unwrap_or_default().into_owned();
-            // Whoever asked may have gone.
+            // The one who asked may have gone.
             let _ = query.reply(query.key_expr().clone(), text).wait();
         });
         let executed = Arc::new(Executed::default());
