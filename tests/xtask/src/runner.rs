@@ -1,7 +1,7 @@
 //! Runs groups of checks, and reports what each showed and what it cost.
 //!
 //! Groups that fill the processors run one after the other. Groups that mostly wait (for an emulator, for a time-out, for a
-//! linker with one thread) run two at a time behind them, each as a process of its own whose output is printed at its end.
+//! linker with one thread) run three at a time behind them, each as a process of its own whose output is printed at its end.
 
 use std::collections::VecDeque;
 use std::process::ExitCode;
@@ -19,6 +19,8 @@ struct Report {
     group: &'static Group,
     outcome: Outcome,
     seconds: f64,
+    /// Of the processors, by all processes that it waited for. None outside Linux.
+    cpu: f64,
     budget: u64,
 }
 
@@ -36,13 +38,14 @@ pub(crate) fn list() -> Result<ExitCode> {
 /// Runs the groups named, or those of the default run.
 pub(crate) fn run(names: &[String], quick: bool) -> Result<ExitCode> {
     let chosen = chosen(names, quick)?;
-    let start = Instant::now();
+    let (start, before) = (Instant::now(), cpu_of_children());
     let (waiting, busy): (Vec<&Group>, Vec<&Group>) =
         chosen.into_iter().partition(|group| group.waits && names.is_empty());
     let mut reports: Vec<Report> = busy.into_iter().map(|group| run_group(group, quick)).collect();
     reports.extend(run_side_by_side(waiting, quick));
     summarise(&reports);
-    println!("{:<14}{:>10.1}", "all of it", start.elapsed().as_secs_f64());
+    let (seconds, cpu) = (start.elapsed().as_secs_f64(), cpu_of_children() - before);
+    println!("{:<14}{seconds:>10.1}{cpu:>10.1}", "all of it");
     let strict = is_strict(std::env::var("CI").ok().as_deref());
     let (line, success) = verdict(&reports, strict);
     if strict && !success && !reports.iter().any(|report| matches!(report.outcome, Outcome::Failed(_))) {
@@ -69,9 +72,10 @@ fn chosen(names: &[String], quick: bool) -> Result<Vec<&'static Group>> {
 fn run_group(group: &'static Group, quick: bool) -> Report {
     println!("== {}: {}", group.name, group.what);
     let (extent, budget) = extent_of(group, quick);
-    let start = Instant::now();
+    let (start, before) = (Instant::now(), cpu_of_children());
     let outcome = (group.run)(extent);
-    let report = Report { group, outcome, seconds: start.elapsed().as_secs_f64(), budget };
+    let (seconds, cpu) = (start.elapsed().as_secs_f64(), cpu_of_children() - before);
+    let report = Report { group, outcome, seconds, cpu, budget };
     println!("{REPORT}{}", report.line());
     report.warn();
     report
@@ -88,7 +92,7 @@ fn extent_of(group: &Group, quick: bool) -> (Extent, u64) {
 const REPORT: &str = "-- ";
 
 /// How many groups that mostly wait run at a time.
-const SIDE_BY_SIDE: usize = 2;
+const SIDE_BY_SIDE: usize = 3;
 
 fn run_side_by_side(groups: Vec<&'static Group>, quick: bool) -> Vec<Report> {
     let names: Vec<&str> = groups.iter().map(|group| group.name).collect();
@@ -112,25 +116,48 @@ fn run_side_by_side(groups: Vec<&'static Group>, quick: bool) -> Vec<Report> {
 fn run_apart(group: &'static Group, quick: bool) -> Report {
     let (_, budget) = extent_of(group, quick);
     let start = Instant::now();
-    let outcome = apart(group.name, quick).unwrap_or_else(|error| Outcome::Failed(format!("{error:#}")));
-    let report = Report { group, outcome, seconds: start.elapsed().as_secs_f64(), budget };
+    let ended = apart(group.name, quick);
+    let (outcome, cpu) = ended.unwrap_or_else(|error| (Outcome::Failed(format!("{error:#}")), 0.0));
+    let report = Report { group, outcome, seconds: start.elapsed().as_secs_f64(), cpu, budget };
     report.warn();
     report
 }
 
-fn apart(name: &str, quick: bool) -> Result<Outcome> {
+/// How a group ended in a process of its own, and what it took of the processors.
+fn apart(name: &str, quick: bool) -> Result<(Outcome, f64)> {
     let this = std::env::current_exe()?;
     let run = Run::new(&this.to_string_lossy()).args(["test", name]);
     let run = if quick { run.args(["--quick"]) } else { run };
     let output = run.merged()?;
     println!("{output}");
-    Ok(outcome_in(name, &output))
+    Ok((outcome_in(name, &output), cpu_in(name, &output)))
+}
+
+/// The line with which a group's own process reports it, or an empty one.
+fn report_in<'a>(name: &str, output: &'a str) -> &'a str {
+    let mut lines = output.lines().rev().filter_map(|line| line.strip_prefix(REPORT));
+    lines.find(|line| line.split_whitespace().next() == Some(name)).unwrap_or_default()
+}
+
+/// The third word of a group's report.
+fn cpu_in(name: &str, output: &str) -> f64 {
+    report_in(name, output).split_whitespace().nth(2).and_then(|word| word.parse().ok()).unwrap_or_default()
+}
+
+/// Seconds that processes which this one started and waited for took of the processors; zero where no `/proc` tells it.
+fn cpu_of_children() -> f64 {
+    /// The kernel tells hundredths on every system, whatever it counts in.
+    const PER_SECOND: f64 = 100.0;
+    let stat = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
+    // The second word is the program's name in brackets, which may have blanks.
+    let behind_name = stat.rsplit(')').next().unwrap_or_default();
+    let ticks = behind_name.split_whitespace().skip(13).take(2).filter_map(|word| word.parse::<f64>().ok());
+    ticks.sum::<f64>() / PER_SECOND
 }
 
 /// What the output of a group's own process says of it; nothing said is a failure.
 fn outcome_in(name: &str, output: &str) -> Outcome {
-    let mut lines = output.lines().rev().filter_map(|line| line.strip_prefix(REPORT));
-    let ended = lines.find(|line| line.split_whitespace().next() == Some(name)).unwrap_or_default();
+    let ended = report_in(name, output);
     if ended.ends_with(PASSED) {
         return Outcome::Passed;
     }
@@ -143,7 +170,7 @@ fn outcome_in(name: &str, output: &str) -> Outcome {
 }
 
 fn summarise(reports: &[Report]) {
-    println!("\n{:<14}{:>10}{:>10}  result", "group", "time s", "budget s");
+    println!("\n{:<14}{:>10}{:>10}{:>10}  result", "group", "time s", "CPU s", "budget s");
     for report in reports {
         println!("{}", report.line());
     }
@@ -168,7 +195,8 @@ impl Report {
             Outcome::Failed(why) => format!("{FAILED}{}", why.replace('\n', " ")),
             Outcome::Skipped(why) => format!("{SKIPPED}{}", why.replace('\n', " ")),
         };
-        format!("{:<14}{:>10.1}{:>10}{result}", self.group.name, self.seconds, self.budget)
+        let Self { group, seconds, cpu, budget, .. } = self;
+        format!("{:<14}{seconds:>10.1}{cpu:>10.1}{budget:>10}{result}", group.name)
     }
 }
 
@@ -188,11 +216,14 @@ fn is_strict(ci: Option<&str>) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use super::{REPORT, Report, chosen, is_strict, outcome_in, verdict};
+    use super::{REPORT, Report, chosen, cpu_in, is_strict, outcome_in, verdict};
     use crate::groups::{GROUPS, Outcome};
 
     fn reports(outcomes: Vec<Outcome>) -> Vec<Report> {
-        outcomes.into_iter().map(|outcome| Report { group: &GROUPS[0], outcome, seconds: 0.0, budget: 1 }).collect()
+        outcomes
+            .into_iter()
+            .map(|outcome| Report { group: &GROUPS[0], outcome, seconds: 1.0, cpu: 2.5, budget: 1 })
+            .collect()
     }
 
     #[test]
@@ -215,10 +246,13 @@ mod tests {
         let name = GROUPS[0].name;
         let ends =
             reports(vec![Outcome::Passed, Outcome::Failed("a\nb: c".into()), Outcome::Skipped("no root".into())]);
-        let read = ends.iter().map(|report| outcome_in(name, &format!("x\n{REPORT}{}\ny", report.line())));
+        let read = ends.iter().map(|report| {
+            let output = format!("x\n{REPORT}{}\ny", report.line());
+            (outcome_in(name, &output), cpu_in(name, &output))
+        });
         let said = [Outcome::Passed, Outcome::Failed("a b: c".into()), Outcome::Skipped("no root".into())];
-        assert_eq!(read.collect::<Vec<_>>(), said);
-        for nothing in ["", "-- other   1.0   1  passed"] {
+        assert_eq!(read.collect::<Vec<_>>(), said.map(|outcome| (outcome, 2.5)));
+        for nothing in ["", "-- other   1.0   2.5   1  passed"] {
             assert!(matches!(outcome_in(name, nothing), Outcome::Failed(_)), "{nothing}");
         }
     }
