@@ -33,7 +33,7 @@ entry!(node_made, {
 
 entry!(node_asked, {
     let node = node();
-    keep((node.identity(), node.fleet(), node.epoch(), node.constraints(), node.next_deadline()));
+    keep((node.identity(), node.fleet(), node.epoch(), node.constraints(), node.next_deadline(), node.searches_at()));
     keep((node.connected(), node.number_of_s_units(), node.number_of_m_units()));
     drain(node.findings());
 });
@@ -42,6 +42,12 @@ entry!(node_set, {
     node().set_constraints(*unknown());
     node().set_maximum_nodes(*unknown());
     keep(node().hello(*unknown(), *unknown()));
+    node().choose(unknown_slice());
+    node().expect(*unknown());
+});
+
+entry!(node_grown, {
+    node().grow(unknown_slice(), unknown_slice(), unknown_slice());
 });
 
 entry!(node_polled, {
