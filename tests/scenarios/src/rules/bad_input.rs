@@ -234,8 +234,13 @@ fn a_peer_that_closes_in_mid_chunk_harms_nobody_else(world: &mut dyn World) {
 
 /// Somebody opens connections and says nothing; a node comes meanwhile.
 fn a_thousand_silent_connections_keep_nobody_out(world: &mut dyn World) {
-    let (manager, agv, mut bystander) = three(world, &Service::numbered("note"));
-    let newcomer = world.add(Spec::agv("newcomer", 8).service(&Service::numbered("note")));
+    // With room for fewer links than there are strangers.
+    let manager = world.add(Spec::manager("manager", 1).limits(|limits| limits.maximum_nodes = 64));
+    let service = Service::numbered("note");
+    let agv = world.add(Spec::agv("agv", 7).service(&service));
+    met(world, &manager, "agv", "note");
+    let mut bystander = Bystander::add(world, &manager);
+    let newcomer = world.add(Spec::agv("newcomer", 8).service(&service));
     met(world, &manager, "newcomer", "note");
     newcomer.stop();
     world.wait("it has left", || !manager.is_connected("newcomer"), secs(20));
