@@ -272,11 +272,12 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     }
 
     fn number_of(&self, role: Role) -> usize {
-        read(&self.engine().peers).of_role(role).filter(|peer| peer.is_introduced()).count()
+        let now = self.engine().clock.now();
+        read(&self.engine().peers).of_role(role).filter(|peer| peer.is_introduced(now)).count()
     }
 
-    /// The s_units in the order in which they joined and told what they offer. One that has left keeps its place, so an index
-    /// goes on to mean the same node.
+    /// The s_units in the order in which they joined. One that has left keeps its place, so an index goes on to mean the
+    /// same node.
     pub fn s_units(&self) -> Vec<Peer<T>> {
         self.of_role(Role::SUnit)
     }

@@ -112,9 +112,9 @@ impl<T: Send + 'static> Peer<T> {
         self.cell.identity.id()
     }
 
-    /// Whether it is connected now, and has told what it offers.
+    /// Whether it is connected now.
     pub fn is_connected(&self) -> bool {
-        self.cell.is_introduced()
+        self.cell.is_connected()
     }
 
     /// Takes it off the [roster](crate::CommunicationSystem::roster) until it joins again, or this unit is started again; `false`

@@ -4,7 +4,7 @@ use std::sync::mpsc::{Receiver, sync_channel};
 use std::sync::{Arc, Weak};
 
 use cara_core::config::{Constraints, Mode};
-use cara_core::distribution::identity::{Epoch, Fleet, Identity};
+use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 use cara_core::services::requests::CallId;
@@ -127,7 +127,7 @@ impl<T: Send + 'static> Unit<T> {
     /// The manager, once it has been met.
     pub fn manager(&self) -> Option<Peer<T>> {
         let peers = read(&self.engine().peers);
-        let cell = peers.all().next().cloned();
+        let cell = peers.of_role(Role::MUnit).next().cloned();
         cell.map(|cell| Peer { engine: self.engine().clone(), cell })
     }
 

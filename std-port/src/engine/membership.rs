@@ -42,6 +42,9 @@ pub(super) struct Directive {
     new: Option<u32>,
 }
 
+/// A node that has not told its list by then counts as one that has none.
+const INTRODUCTION: Duration = Duration::from_secs(1);
+
 /// Descriptors that links which have proven nothing leave to those that do, and to the control socket.
 const KEPT_FOR_PROVEN: u64 = 24;
 /// And of these what stays for the control socket, key files and dialling: two for each operator's connection, and some more.
@@ -205,7 +208,7 @@ impl<T: Send + 'static> Engine<T> {
         }
     }
 
-    /// The node has taken the peer: it is told what it may call. It counts from when it has told the same.
+    /// The node has taken the peer: it is told what it may call, and has its place from here on.
     fn join(&self, link: &Arc<LinkCell>, state: &mut LinkState) {
         let Some(identity) = state.session.identity().cloned() else { return };
         self.with(link, state, |session, cx| session.accept(cx));
@@ -213,7 +216,9 @@ impl<T: Send + 'static> Engine<T> {
             // It has ended meanwhile, and that is told by itself.
             return;
         }
-        let peer = write(&self.peers).join(&identity, link);
+        let limit = usize::from(lock(&self.node).node.constraints().maximum_nodes);
+        link.introduced(self.clock.now() + INTRODUCTION);
+        let peer = write(&self.peers).join(&identity, limit, link);
         if let Some(own) = peer.own_constraints(*state.session.constraints()) {
             self.with(link, state, |session, cx| session.set_constraints(cx, own));
         }
@@ -225,15 +230,7 @@ impl<T: Send + 'static> Engine<T> {
         };
         self.make_publication_room(state);
         self.with(link, state, |session, cx| session.publish(cx, visible.into_iter()));
-    }
-
-    /// The peer has told what it offers; whether for the first time. From then on it counts, and has its place.
-    pub(super) fn introduced(&self, link: &LinkCell) -> bool {
-        let Some(peer) = link.peer.get().filter(|_| !link.is_introduced()) else { return false };
-        let limit = usize::from(lock(&self.node).node.constraints().maximum_nodes);
-        write(&self.peers).introduce(peer, limit);
-        link.introduce();
-        true
+        state.notices.push(Notice::Joined);
     }
 
     /// Does what a notice asks for, or tells it.
@@ -307,18 +304,14 @@ impl<T: Send + 'static> Engine<T> {
         self.retire(link);
         if let Some(peer) = link.peer.get() {
             peer.leave(link, reason);
-            write(&self.peers).depart(peer);
             self.run_lost_hook();
-        }
-        match link.peer.get().filter(|_| link.is_introduced()) {
-            Some(peer) => self.tell(UnitEvent::Left { peer: peer.identity.clone(), reason }),
-            None => {
-                let (peer, address) = {
-                    let state = link.lock();
-                    (state.session.identity().cloned(), state.session.address())
-                };
-                self.tell(UnitEvent::NotJoined { address, peer, reason });
-            }
+            self.tell(UnitEvent::Left { peer: peer.identity.clone(), reason });
+        } else {
+            let (peer, address) = {
+                let state = link.lock();
+                (state.session.identity().cloned(), state.session.address())
+            };
+            self.tell(UnitEvent::NotJoined { address, peer, reason });
         }
         lock(&self.timers).cancel(u32::from(link.id.0));
         let directive = self.left(link.id, reason);

@@ -351,8 +351,8 @@ impl<T: Send + 'static> Engine<T> {
                 }
             },
             Some(event) => {
-                if matches!(event, Event::ListChanged) && self.introduced(link) {
-                    notices.push(Notice::Joined);
+                if let Event::ListChanged = event {
+                    link.introduced(Instant::START);
                 }
                 if let Event::LeaseExpired(slot) = event {
                     self.wake_leased(&functions, slot);

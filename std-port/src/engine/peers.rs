@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use cara_core::config::Constraints;
 use cara_core::distribution::identity::{Identity, Role};
 use cara_core::error::{CloseReason, Error};
-use cara_core::time::Duration;
+use cara_core::time::{Duration, Instant};
 
 use super::accounts::Earlier;
 use super::link::LinkCell;
@@ -61,8 +61,8 @@ impl PeerCell {
     }
 
     /// Whether it is connected and what it offers is known.
-    pub(crate) fn is_introduced(&self) -> bool {
-        self.link().is_some_and(|link| link.is_introduced())
+    pub(crate) fn is_introduced(&self, now: Instant) -> bool {
+        self.link().is_some_and(|link| link.is_introduced(now))
     }
 
     /// The unit's constraints with what this node has of its own.
@@ -137,31 +137,25 @@ impl PeerCell {
 /// All nodes that have joined.
 #[derive(Default)]
 pub(crate) struct Peers {
-    /// Those that have told what they offer, in the order in which they first did.
     list: Vec<Arc<PeerCell>>,
     by_identity: HashMap<Identity, usize>,
-    /// Those that are connected, and have no place before they have told what they offer.
-    arriving: HashMap<Identity, Arc<PeerCell>>,
     pub(super) roster: Roster,
 }
 
 impl Peers {
-    /// The node of an identity is connected by `link`.
-    pub(crate) fn join(&mut self, identity: &Identity, link: &Arc<LinkCell>) -> Arc<PeerCell> {
-        let known = self.known(identity).cloned();
-        let peer = known.unwrap_or_else(|| {
-            let peer = self.roster.take(identity).unwrap_or_else(|| PeerCell::new(identity));
-            self.arriving.insert(identity.clone(), peer.clone());
-            peer
-        });
+    /// The node of an identity is connected by `link`. A new one gets the next place, or that of the first node that is
+    /// away when there are `limit` of them.
+    pub(crate) fn join(&mut self, identity: &Identity, limit: usize, link: &Arc<LinkCell>) -> Arc<PeerCell> {
+        let peer = self.of(identity, limit);
         peer.join(link.clone());
         peer
     }
 
-    /// A node has told what it offers. A new one gets the next place, or that of the first node that is away when there
-    /// are `limit` of them.
-    pub(crate) fn introduce(&mut self, peer: &PeerCell, limit: usize) {
-        let Some(peer) = self.arriving.remove(&peer.identity) else { return };
+    fn of(&mut self, identity: &Identity, limit: usize) -> Arc<PeerCell> {
+        if let Some(peer) = self.placed(identity) {
+            return peer.clone();
+        }
+        let peer = self.roster.take(identity).unwrap_or_else(|| PeerCell::new(identity));
         let away = if self.list.len() < limit { None } else { self.list.iter().position(|peer| !peer.is_connected()) };
         let index = match away.and_then(|index| self.list.get_mut(index).map(|place| (index, place))) {
             Some((index, place)) => {
@@ -174,23 +168,8 @@ impl Peers {
                 self.list.len() - 1
             }
         };
-        self.by_identity.insert(peer.identity.clone(), index);
-    }
-
-    /// The link of a node has ended: one that has told nothing gets no place.
-    pub(crate) fn depart(&mut self, peer: &PeerCell) {
-        let gone = (!peer.is_connected()).then(|| self.arriving.remove(&peer.identity)).flatten();
-        gone.into_iter().for_each(|peer| self.roster.keep(peer));
-    }
-
-    /// The node of an identity, with a place or without.
-    pub(super) fn known(&self, identity: &Identity) -> Option<&Arc<PeerCell>> {
-        self.placed(identity).or_else(|| self.arriving.get(identity))
-    }
-
-    /// Those that are connected and have no place yet.
-    pub(super) fn arriving(&self) -> impl Iterator<Item = &Arc<PeerCell>> {
-        self.arriving.values()
+        self.by_identity.insert(identity.clone(), index);
+        peer
     }
 
     /// The node of an identity that has a place here.
@@ -198,9 +177,8 @@ impl Peers {
         self.list.get(*self.by_identity.get(identity)?)
     }
 
-    /// With those that have no place yet.
-    pub(crate) fn all(&self) -> impl Iterator<Item = &Arc<PeerCell>> {
-        self.list.iter().chain(self.arriving.values())
+    pub(super) fn all(&self) -> impl Iterator<Item = &Arc<PeerCell>> {
+        self.list.iter()
     }
 
     /// All nodes of a role, in the order of their places.
@@ -209,7 +187,7 @@ impl Peers {
     }
 
     pub(crate) fn connected(&self) -> impl Iterator<Item = &Arc<PeerCell>> {
-        self.all().filter(|peer| peer.is_connected())
+        self.list.iter().filter(|peer| peer.is_connected())
     }
 }
 
@@ -261,13 +239,6 @@ pub(super) mod tests {
         Arc::new(LinkCell::new(0, LinkId(0), serial, Stream::connect(address).unwrap(), session, true))
     }
 
-    /// Joins and tells what it offers.
-    pub(crate) fn join(peers: &mut Peers, identity: &Identity, limit: usize, link: &Arc<LinkCell>) -> Arc<PeerCell> {
-        let peer = peers.join(identity, link);
-        peers.introduce(&peer, limit);
-        peer
-    }
-
     fn ids(peers: &Peers) -> Vec<u32> {
         peers.of_role(Role::SUnit).map(|peer| peer.identity.id()).collect()
     }
@@ -276,14 +247,14 @@ pub(super) mod tests {
     fn a_node_keeps_its_place_and_its_handle() {
         let mut peers = Peers::default();
         let (old, new) = (link(1), link(2));
-        let first = join(&mut peers, &agv(1), 8, &old);
-        join(&mut peers, &agv(2), 8, &link(3));
+        let first = peers.join(&agv(1), 8, &old);
+        peers.join(&agv(2), 8, &link(3));
         assert_eq!(first.left(), None);
         first.leave(&old, CloseReason::Silent);
         assert!(!first.is_connected());
         assert_eq!(first.left().unwrap().1, CloseReason::Silent);
         assert_eq!(ids(&peers), [1, 2]);
-        let again = join(&mut peers, &agv(1), 8, &new);
+        let again = peers.join(&agv(1), 8, &new);
         assert!(Arc::ptr_eq(&first, &again) && first.is_connected() && first.left().is_none());
         assert_eq!(ids(&peers), [1, 2]);
     }
@@ -292,8 +263,8 @@ pub(super) mod tests {
     fn the_end_of_an_old_link_does_not_touch_a_newer_one() {
         let mut peers = Peers::default();
         let (old, new) = (link(1), link(2));
-        let peer = join(&mut peers, &agv(1), 8, &old);
-        join(&mut peers, &agv(1), 8, &new);
+        let peer = peers.join(&agv(1), 8, &old);
+        peers.join(&agv(1), 8, &new);
         peer.leave(&old, CloseReason::Reset);
         assert!(Arc::ptr_eq(&peer.link().unwrap(), &new));
     }
@@ -302,10 +273,10 @@ pub(super) mod tests {
     fn beyond_the_limit_a_newcomer_gets_the_place_of_one_that_is_away() {
         let mut peers = Peers::default();
         let links = [1, 2, 3].map(link);
-        join(&mut peers, &agv(1), 2, &links[0]);
-        let second = join(&mut peers, &agv(2), 2, &links[1]);
+        peers.join(&agv(1), 2, &links[0]);
+        let second = peers.join(&agv(2), 2, &links[1]);
         second.leave(&links[1], CloseReason::Reset);
-        join(&mut peers, &agv(3), 2, &links[2]);
+        peers.join(&agv(3), 2, &links[2]);
         assert_eq!(ids(&peers), [1, 3]);
         assert!(peers.placed(&agv(2)).is_none());
         assert_eq!(peers.connected().count(), 2);
@@ -315,26 +286,7 @@ pub(super) mod tests {
     #[test]
     fn who_is_connected_keeps_its_place() {
         let mut peers = Peers::default();
-        (1..4).for_each(|id| drop(join(&mut peers, &agv(id), 2, &link(id))));
+        (1..4).for_each(|id| drop(peers.join(&agv(id), 2, &link(id))));
         assert_eq!(ids(&peers), [1, 2, 3]);
-    }
-
-    /// In the order in which they tell what they offer, whoever connected first.
-    #[test]
-    fn a_node_has_no_place_before_it_has_told_what_it_offers() {
-        let mut peers = Peers::default();
-        let links = [link(1), link(2)];
-        let [first, second] = [(1, &links[0]), (2, &links[1])].map(|(id, link)| peers.join(&agv(id), link));
-        assert_eq!((ids(&peers), peers.connected().count()), (vec![], 2));
-        peers.introduce(&second, 8);
-        assert_eq!(ids(&peers), [2]);
-        peers.introduce(&first, 8);
-        assert_eq!(ids(&peers), [2, 1]);
-        let third = peers.join(&agv(3), &links[0]);
-        third.leave(&links[0], CloseReason::Silent);
-        peers.depart(&third);
-        peers.introduce(&third, 8);
-        assert_eq!((ids(&peers), peers.all().count()), (vec![2, 1], 2), "it has gone without a word");
-        assert!(Arc::ptr_eq(&third, &join(&mut peers, &agv(3), 8, &links[1])), "its handle works again");
     }
 }

@@ -60,7 +60,7 @@ impl Peers {
         let peers = ring.peers().into_iter();
         let s_units: HashSet<Identity> = peers.filter(|peer| peer.role() == Role::SUnit).cloned().collect();
         self.roster.absent.retain(|identity, _| s_units.contains(identity));
-        for identity in s_units.iter().filter(|identity| self.known(identity).is_none()).cloned().collect::<Vec<_>>() {
+        for identity in s_units.iter().filter(|identity| self.placed(identity).is_none()).cloned().collect::<Vec<_>>() {
             self.roster.absent.entry(identity).or_insert_with_key(PeerCell::new);
         }
         self.roster.keyed = Some(Keyed { ring: ring.clone(), s_units });
@@ -68,9 +68,7 @@ impl Peers {
 
     /// Those that have joined in the order of their places, then the others by name and id.
     fn expected(&self) -> Vec<Arc<PeerCell>> {
-        let arriving =
-            self.arriving().filter(|peer| peer.identity.role() == Role::SUnit && self.roster.belongs(&peer.identity));
-        let mut absent: Vec<_> = self.roster.absent.values().chain(arriving).cloned().collect();
+        let mut absent: Vec<_> = self.roster.absent.values().cloned().collect();
         absent.sort_unstable_by(|a, b| a.identity.cmp(&b.identity));
         let placed = self.of_role(Role::SUnit).filter(|peer| self.roster.belongs(&peer.identity)).cloned();
         placed.chain(absent).filter(|peer| !peer.is_retired()).collect()
@@ -116,13 +114,13 @@ impl<T: Send + 'static> Engine<T> {
 
     /// The node of an identity, if it has joined or is expected.
     pub(crate) fn node_of(&self, identity: &Identity) -> Option<Arc<PeerCell>> {
-        self.with_roster(|peers| peers.known(identity).or_else(|| peers.roster.absent.get(identity)).cloned())
+        self.with_roster(|peers| peers.placed(identity).or_else(|| peers.roster.absent.get(identity)).cloned())
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::peers::tests::{agv, join, link};
+    use super::super::peers::tests::{agv, link};
     use super::*;
     use crate::keys::{FleetKeys, RootKey};
     use cara_core::distribution::identity::Fleet;
@@ -145,12 +143,12 @@ mod tests {
         let mut peers = Peers::default();
         assert!(expected(&peers).is_empty());
         let old = link(1);
-        let first = join(&mut peers, &agv(1), 1, &old);
+        let first = peers.join(&agv(1), 1, &old);
         first.leave(&old, CloseReason::Silent);
-        join(&mut peers, &agv(2), 1, &link(2));
+        peers.join(&agv(2), 1, &link(2));
         assert!(peers.placed(&agv(1)).is_none(), "its place is taken");
         assert_eq!(expected(&peers), [2, 1]);
-        let again = join(&mut peers, &agv(1), 2, &link(3));
+        let again = peers.join(&agv(1), 2, &link(3));
         assert!(Arc::ptr_eq(&first, &again), "its handle works again");
         assert_eq!(expected(&peers), [2, 1]);
     }
@@ -161,7 +159,7 @@ mod tests {
         peers.expect(&ring(&[agv(1), agv(2)]));
         assert_eq!(expected(&peers), [1, 2]);
         let handle = peers.expected().remove(1);
-        join(&mut peers, &agv(2), 8, &link(1));
+        peers.join(&agv(2), 8, &link(1));
         assert_eq!(expected(&peers), [2, 1]);
         assert!(handle.is_connected(), "a handle from before works once the node has joined");
         // One is revoked, and one is added.
@@ -173,13 +171,13 @@ mod tests {
     fn what_is_retired_is_not_expected_until_it_joins_again() {
         let mut peers = Peers::default();
         peers.expect(&ring(&[agv(1), agv(2)]));
-        let first = join(&mut peers, &agv(1), 8, &link(1));
+        let first = peers.join(&agv(1), 8, &link(1));
         assert!(!first.retire(), "it is connected");
         assert!(peers.expected().last().unwrap().retire());
         assert_eq!(expected(&peers), [1]);
         peers.expect(&ring(&[agv(1), agv(2), agv(3)]));
         assert_eq!(expected(&peers), [1, 3], "other keys do not bring it back");
-        join(&mut peers, &agv(2), 8, &link(2));
+        peers.join(&agv(2), 8, &link(2));
         assert_eq!(expected(&peers), [1, 2, 3]);
     }
 
@@ -190,7 +188,7 @@ mod tests {
         peers.expect(&ring(&[agv(7), agv(8)]));
         let named = |peers: &Peers| peers.only(|identity| identity.name() == "agv").map(|peer| peer.identity.id());
         assert_eq!(named(&peers), Err(Error::Ambiguous { ids: [7, 8] }));
-        join(&mut peers, &agv(7), 8, &link(1));
+        peers.join(&agv(7), 8, &link(1));
         assert_eq!(named(&peers), Err(Error::Ambiguous { ids: [7, 8] }), "the other one may be meant");
         assert!(peers.expected().last().unwrap().retire());
         assert_eq!(named(&peers), Ok(7));

@@ -1,7 +1,5 @@
 //! Who meets whom, who is refused, and who takes whose place.
 
-use std::io::{Read, Write};
-use std::net::{Ipv4Addr, Shutdown, SocketAddr, TcpListener, TcpStream};
 use std::sync::mpsc::Receiver;
 use std::time::Duration;
 
@@ -204,49 +202,4 @@ fn a_fixed_address_needs_no_broadcast() {
     let agv = unit("agv", 7, fleet).manager_address(([127, 0, 0, 1], port).into()).build_unit().unwrap();
     meet(&manager, &agv);
     assert_eq!(counter(&agv.counters(), "WhoHasSent"), 0);
-}
-
-/// Passes on what the vehicle says as a radio of 8 kbit/s would, and what the manager says at once.
-fn slow_link(to: SocketAddr) -> SocketAddr {
-    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
-    let address = listener.local_addr().unwrap();
-    std::thread::spawn(move || -> std::io::Result<()> {
-        let (mut vehicle, _) = listener.accept()?;
-        let mut manager = TcpStream::connect(to)?;
-        manager.set_nodelay(true)?;
-        let (mut back, mut forth) = (manager.try_clone()?, vehicle.try_clone()?);
-        std::thread::spawn(move || std::io::copy(&mut back, &mut forth));
-        let mut few = [0; 16];
-        loop {
-            let count = vehicle.read(&mut few)?;
-            if count == 0 {
-                return manager.shutdown(Shutdown::Both);
-            }
-            manager.write_all(&few[..count])?;
-            std::thread::sleep(Duration::from_millis(15));
-        }
-    });
-    address
-}
-
-/// Lines 4 to 10 of the listing, whatever the link: the list is there when the node is counted, and when it is told of.
-#[test]
-fn a_node_counts_once_its_list_has_come_however_slowly() {
-    const FUNCTIONS: usize = 30;
-    let fleet = fleet();
-    let manager = system(fleet).build_system().unwrap();
-    let events = manager.events();
-    manager.start().unwrap();
-    let relay = slow_link((Ipv4Addr::LOCALHOST, manager.tcp_port()).into());
-    let agv = unit("agv-1", 1, fleet).manager_address(relay).build_unit().unwrap();
-    for index in 0..FUNCTIONS {
-        let name = format!("a_service_with_a_long_name_{index}");
-        agv.my_function_list().add_function(&name, &number(0), service(|number| number)).unwrap();
-    }
-    agv.publish_my_function_list().unwrap();
-    agv.start().unwrap();
-    until("it is counted", || manager.number_of_s_units() == 1);
-    assert_eq!(manager.s_units()[0].their_function_list().len(), FUNCTIONS);
-    let joined = events.recv_timeout(PATIENCE).unwrap();
-    assert!(matches!(&joined, UnitEvent::Joined { peer } if peer == manager.s_units()[0].identity()), "{joined:?}");
 }
