@@ -52,6 +52,10 @@ impl Target for Desk {
         "emulated board"
     }
 
+    fn has_own_clock(&self) -> bool {
+        true
+    }
+
     fn bound(&self, kind: &Kind) -> Result<Bound> {
         Bound::of(kind, &self.constants)
     }

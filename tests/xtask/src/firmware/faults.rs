@@ -31,7 +31,7 @@ const CHECKED: u32 = 6;
 pub(crate) fn faults(faults: &Faults) -> Result<ExitCode> {
     install::program("qemu-system-arm", "qemu-system-arm").map_err(anyhow::Error::msg)?;
     install::program("nft", "nftables").map_err(anyhow::Error::msg)?;
-    match injected(faults)? {
+    match injected(faults, &[])? {
         Some(0) => Ok(ExitCode::SUCCESS),
         Some(NOT_ALLOWED) => bail!("the board needs a network of its own, see above"),
         code => bail!("it ended with code {code:?}"),
@@ -43,14 +43,18 @@ pub(crate) fn check() -> Outcome {
     if let Err(reason) = install::program("nft", "nftables") {
         return Outcome::Skipped(reason);
     }
-    emulated(|| injected(&Faults { each: CHECKED, kind: String::new(), seed: None }))
+    emulated(|| injected(&Faults { each: CHECKED, kind: String::new(), seed: None }, &["--busy-host"]))
 }
 
-fn injected(faults: &Faults) -> Result<Option<i32>> {
+fn injected(faults: &Faults, more: &[&str]) -> Result<Option<i32>> {
     let board = boards::find(TESTED)?;
     install::rust_target(board.target).map_err(anyhow::Error::msg)?;
     let image = board.build(&FAULTS)?;
     let seed = faults.seed.map(|seed| ["--seed".to_owned(), seed.to_string()]);
     let each = faults.each.to_string();
-    tests(&image)?.args(["faults", "--each", &each, "--kind", &faults.kind]).args(seed.iter().flatten()).code()
+    tests(&image)?
+        .args(["faults", "--each", &each, "--kind", &faults.kind])
+        .args(seed.iter().flatten())
+        .args(more)
+        .code()
 }
