@@ -9,7 +9,7 @@ use anyhow::{Context, Result, ensure};
 use cara_core::distribution::identity::Identity;
 use cara_std::access::AccessTable;
 use cara_std::control::Control;
-use cara_std::{Builder, CommunicationSystem, Interfaces, Manager, Threads, Unit};
+use cara_std::{Builder, CommunicationSystem, Constraints, Interfaces, Manager, Threads, Unit};
 
 use crate::diary::Diary;
 use crate::ground::{Ground, agv, depot};
@@ -66,7 +66,9 @@ impl Linux {
 
     /// A manager that runs and offers its functions.
     pub fn manager(&self) -> Result<LinuxManager<'_>> {
-        let builder = CommunicationSystem::builder("depot", 1)?;
+        // With room for fewer links than attackers hold.
+        let constraints = Constraints { maximum_nodes: 64, ..Constraints::M_UNIT };
+        let builder = CommunicationSystem::builder("depot", 1)?.constraints(constraints);
         let system = self.prepared(builder, &depot()).build_system()?;
         let diary = Diary::default();
         diary.offer(&system.my_function_list())?;
