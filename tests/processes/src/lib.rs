@@ -4,7 +4,6 @@
 pub mod cable;
 pub mod files;
 pub mod network;
-pub mod planted;
 
 use std::ffi::OsStr;
 use std::io::{BufRead, BufReader, Write};

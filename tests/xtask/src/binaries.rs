@@ -28,7 +28,12 @@ pub(crate) fn release(name: &str) -> Result<Run> {
 
 /// Builds several.
 pub(crate) fn build(names: &[&str]) -> Result<()> {
-    workspace_build(names).args(TEST).stream()
+    debug_build(names).stream()
+}
+
+/// The command that builds them.
+pub(crate) fn debug_build(names: &[&str]) -> Run {
+    workspace_build(names).args(TEST)
 }
 
 fn workspace_build(names: &[&str]) -> Run {

@@ -3,12 +3,11 @@
 use std::path::Path;
 
 use anyhow::{Result, bail};
-use cara_processes::planted;
 
 use crate::command::Run;
 use crate::{
     bad_input, binaries, claims, demo, dependencies, firmware, fleet, hygiene, install, instructions, layers, licences,
-    links, manifests, names, panic_free, paper, security, workspace,
+    links, manifests, names, panic_free, paper, planted, security, workspace,
 };
 
 /// A group of checks that is run and reported as one.
@@ -159,7 +158,7 @@ pub(crate) const GROUPS: [Group; 24] = [
         quick: None,
         by_default: true,
         waits: true,
-        run: |_| loom().into(),
+        run: |_| planted::loom().into(),
     },
     Group {
         name: "scenarios",
@@ -177,7 +176,7 @@ pub(crate) const GROUPS: [Group; 24] = [
         quick: None,
         by_default: true,
         waits: true,
-        run: |_| planted_bugs().into(),
+        run: |_| planted::scenarios().into(),
     },
     Group {
         name: "security",
@@ -333,31 +332,10 @@ fn vectors() -> Result<()> {
     Run::new("python3").args(["tests/vectors/decode.py"]).stream()
 }
 
-/// The model must pass, and must fail with the bug that is planted for it.
-fn loom() -> Result<()> {
-    hand_over().stream()?;
-    let wrapper = planted::wrapper(workspace::root(), "lost_wakeup")?;
-    let (passed, output, _) = hand_over().env("RUSTC_WORKSPACE_WRAPPER", &wrapper.to_string_lossy()).captured()?;
-    if passed || !output.contains("nobody reads") {
-        bail!("the planted lost wake-up was not found: {output}");
-    }
-    println!("the planted lost wake-up is found");
-    Ok(())
-}
-
-/// The model has to be named: it takes too long beside the other tests.
-fn hand_over() -> Run {
-    binaries::tests().args(["--test", "hand_over"])
-}
-
 fn scenarios(extent: Extent) -> Result<()> {
     present("tests/scenarios/Cargo.toml")?;
     let seeds = if extent == Extent::Full { "1000" } else { "50" };
     binaries::release("seeds")?.args(["--seeds", seeds]).stream()
-}
-
-fn planted_bugs() -> Result<()> {
-    binaries::debug("planted")?.stream()
 }
 
 fn guide() -> Result<()> {

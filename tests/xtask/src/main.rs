@@ -27,6 +27,7 @@ mod names;
 mod panic_free;
 mod paper;
 mod peers;
+mod planted;
 mod runner;
 mod sanitize;
 mod security;
