@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use cara_std::{Error, Peer, RequestOptions};
 
-use crate::support::{Gate, ask, counter, meet, number, pair, service, until, value};
+use crate::support::{Gate, ask, counter, held, meet, number, pair, service, until, value};
 
 fn runtime() -> tokio::runtime::Runtime {
     tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_time().build().unwrap()
@@ -68,12 +68,7 @@ fn a_hundred_requests_are_awaited_side_by_side() {
 fn a_future_times_out_and_a_dropped_one_frees_its_slot() {
     let (manager, agv) = pair();
     let gate = Arc::new(Gate::default());
-    let at_gate = gate.clone();
-    let hang = service(move |number| {
-        at_gate.pass();
-        number
-    });
-    agv.my_function_list().add_function("hang", &number(0), hang).unwrap();
+    agv.my_function_list().add_function("hang", &number(0), held(&gate)).unwrap();
     agv.my_function_list().add_function("echo", &number(0), service(|number| number)).unwrap();
     let (peer, _) = meet(&manager, &agv);
     runtime().block_on(async {
@@ -99,12 +94,7 @@ fn a_future_times_out_and_a_dropped_one_frees_its_slot() {
 fn a_future_ends_when_its_link_does() {
     let (manager, agv) = pair();
     let gate = Arc::new(Gate::default());
-    let at_gate = gate.clone();
-    let hang = service(move |number| {
-        at_gate.pass();
-        number
-    });
-    agv.my_function_list().add_function("hang", &number(0), hang).unwrap();
+    agv.my_function_list().add_function("hang", &number(0), held(&gate)).unwrap();
     let (peer, _) = meet(&manager, &agv);
     let runtime = runtime();
     let waiting = runtime.spawn({

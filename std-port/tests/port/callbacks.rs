@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use cara_std::{Call, Error, Parameters, ParametersView, Peer, ServiceError};
 
-use crate::support::{ask, fleet, meet, number, pair, service, system, unit, value};
+use crate::support::{Gate, ask, fleet, held, meet, number, pair, service, system, unit, value};
 
 /// What a handler needs to call back, known when both have met.
 type Back<T> = Arc<OnceLock<Peer<T>>>;
@@ -97,13 +97,8 @@ fn a_hook_does_not_wait_for_the_method_whose_thread_runs_it() {
         };
     agv.my_function_list().add_function("asks_back", &number(0), asks_back).unwrap();
     agv.on_manager_lost(|state| state.push("lost")).unwrap();
-    let gate = Arc::new(crate::support::Gate::default());
-    let at_gate = gate.clone();
-    let never = service(move |number| {
-        at_gate.pass();
-        number
-    });
-    manager.my_function_list().add_function("never", &number(0), never).unwrap();
+    let gate = Arc::new(Gate::default());
+    manager.my_function_list().add_function("never", &number(0), held(&gate)).unwrap();
     let (peer, to_manager) = meet(&manager, &agv);
     assert!(back.set(to_manager).is_ok());
     peer.request("asks_back", &number(0)).unwrap();

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use cara_std::{Call, Error, Parameters, ParametersView, Priority, RequestOptions, Role, ServiceError, ServiceOptions};
 
 use crate::support::{
-    Gate, PATIENCE, ask, fleet, meet, number, pair, publish, service, system, unit, until, value, within,
+    Gate, PATIENCE, ask, fleet, held, meet, number, pair, publish, service, system, unit, until, value, within,
 };
 
 fn free(mut parameters: Parameters) -> Parameters {
@@ -89,12 +89,7 @@ fn a_slow_handler_delays_nobody_else() {
         cara_std::Constraints { keep_alive: cara_std::Duration::from_millis(400), ..cara_std::Constraints::M_UNIT };
     let manager = system(fleet).constraints(constraints).build_system().unwrap();
     let gate = Arc::new(Gate::default());
-    let at_gate = gate.clone();
-    let blocks = service(move |number| {
-        at_gate.pass();
-        number
-    });
-    manager.my_function_list().add_function("slow", &number(0), blocks).unwrap();
+    manager.my_function_list().add_function("slow", &number(0), held(&gate)).unwrap();
     manager.my_function_list().add_function("quick", &number(0), service(|number| number + 1)).unwrap();
     let units: Vec<_> = (0..2)
         .map(|index| {
@@ -169,17 +164,9 @@ fn an_emergency_does_not_wait_for_other_handlers() {
     let (manager, agv) = pair();
     let gate = Arc::new(Gate::default());
     let stops = Arc::new(AtomicUsize::new(0));
-    let (at_gate, stopped) = (gate.clone(), stops.clone());
+    let stopped = stops.clone();
     let list = agv.my_function_list();
-    list.add_function(
-        "work",
-        &number(0),
-        service(move |number| {
-            at_gate.pass();
-            number
-        }),
-    )
-    .unwrap();
+    list.add_function("work", &number(0), held(&gate)).unwrap();
     let definition = "stop(number: int[1]) -> (number: int[1])".parse().unwrap();
     let stop = service(move |number| {
         stopped.fetch_add(1, Ordering::SeqCst);
@@ -205,18 +192,9 @@ fn an_emergency_does_not_wait_for_other_handlers() {
 fn a_burst_that_ends_slowly_leaves_the_stream_to_others() {
     let (manager, agv) = pair();
     let gate = Arc::new(Gate::default());
-    let at_gate = gate.clone();
     let list = agv.my_function_list();
     list.add_function("quick", &number(0), service(|number| number)).unwrap();
-    list.add_function(
-        "slow",
-        &number(0),
-        service(move |number| {
-            at_gate.pass();
-            number
-        }),
-    )
-    .unwrap();
+    list.add_function("slow", &number(0), held(&gate)).unwrap();
     let (peer, _) = meet(&manager, &agv);
     for round in 0..50 {
         // A thread of the pool comes to stay.

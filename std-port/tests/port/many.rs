@@ -6,8 +6,8 @@ use std::time::Duration;
 use cara_std::{Capacities, Constraints, Error, RequestOptions, Threads, Unit, UnitEvent};
 
 use crate::support::{
-    Gate, PATIENCE, ask, counter, fleet, meet, number, pair, publish, retire_absent, service, system, unit, until,
-    value,
+    Gate, PATIENCE, ask, counter, fleet, held, meet, number, pair, publish, retire_absent, service, system, unit,
+    until, value,
 };
 
 const NODES: u32 = 40;
@@ -145,12 +145,7 @@ fn tables_grow_to_the_capacities_and_no_further() {
     let agv = unit("agv", 7, fleet).build_unit().unwrap();
     agv.set_constraints(Constraints { calls_per_peer: 64, ..agv.constraints() }).unwrap();
     let gate = std::sync::Arc::new(Gate::default());
-    let at_gate = gate.clone();
-    let slow = service(move |number| {
-        at_gate.pass();
-        number
-    });
-    agv.my_function_list().add_function("slow", &number(0), slow).unwrap();
+    agv.my_function_list().add_function("slow", &number(0), held(&gate)).unwrap();
     for index in 1..45 {
         agv.my_function_list()
             .add_function(&format!("function_{index}"), &number(0), service(|number| number))

@@ -5,18 +5,13 @@ use std::time::Instant;
 
 use cara_std::{Error, Unit, UnitEvent};
 
-use crate::support::{Gate, PATIENCE, ask, fleet, meet, number, pair, service, system, unit, until};
+use crate::support::{Gate, PATIENCE, ask, fleet, held, meet, number, pair, service, system, unit, until};
 
 #[test]
 fn a_waiting_caller_returns_at_once_when_its_unit_stops() {
     let (manager, agv) = pair();
     let gate = Arc::new(Gate::default());
-    let at_gate = gate.clone();
-    let slow = service(move |number| {
-        at_gate.pass();
-        number
-    });
-    agv.my_function_list().add_function("slow", &number(0), slow).unwrap();
+    agv.my_function_list().add_function("slow", &number(0), held(&gate)).unwrap();
     let (peer, _) = meet(&manager, &agv);
     std::thread::scope(|scope| {
         // One leads, the others wait for it.

@@ -4,11 +4,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
-use cara_std::{
-    Call, Error, Parameters, ParametersView, Peer, Priority, RequestOptions, ServiceError, ServiceOptions, Unit,
-};
+use cara_std::{Error, Parameters, Peer, Priority, RequestOptions, ServiceError, ServiceOptions, Unit};
 
-use crate::support::{Gate, PATIENCE, ask, counter, fleet, meet, number, service, system, unit, until};
+use crate::support::{Gate, PATIENCE, ask, counter, fleet, held, meet, number, service, system, unit, until};
 
 const LEASE: Duration = Duration::from_millis(300);
 
@@ -24,15 +22,6 @@ struct Stuck {
 
 fn emergency<T>() -> ServiceOptions<T> {
     ServiceOptions::new().priority(Priority::Emergency)
-}
-
-/// A service in place, free, that waits at the gate.
-fn held(gate: &Arc<Gate>) -> impl Fn(&Call, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync + 'static {
-    let gate = gate.clone();
-    service(move |number| {
-        gate.pass();
-        number
-    })
 }
 
 fn counting(hooks: &Arc<AtomicUsize>) -> impl Fn() + Send + Sync + 'static {

@@ -1,6 +1,7 @@
 //! Units on loopback, in a fleet of their own.
 
 use std::hash::{BuildHasher, Hasher, RandomState};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use cara_std::{
@@ -180,4 +181,15 @@ impl Gate {
     pub(crate) fn came(&self) -> usize {
         self.waiting.load(std::sync::atomic::Ordering::SeqCst)
     }
+}
+
+/// A service in place, free, that waits at the gate.
+pub(crate) fn held(
+    gate: &Arc<Gate>,
+) -> impl Fn(&Call, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync + 'static {
+    let gate = gate.clone();
+    service(move |number| {
+        gate.pass();
+        number
+    })
 }
