@@ -3,7 +3,7 @@
 //!
 //! A [`Scenario`] is a function of a [`World`]: it builds a fleet in a few lines, lets time pass, injects faults, and
 //! asserts what the rule says. `cargo test` runs each once on every port that can; the program `seeds` runs each for
-//! many seeds on the simulator with faults on; `table` writes `docs/scenarios.md`; `planted` shows that bugs are found.
+//! many seeds on the simulator with faults on; `table` writes `docs/scenarios.md`.
 //!
 //! ```
 //! use cara_scenarios::{Spec, Service, ports, secs};

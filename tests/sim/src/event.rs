@@ -160,8 +160,8 @@ impl NetEvent {
     }
 }
 
-/// A running hash (FNV-1a) over everything that was sent and happened: equal for equal runs.
-#[derive(Clone, Debug)]
+/// A running hash (FNV-1a).
+#[derive(Clone, Copy, Debug)]
 pub(crate) struct Trace(u64);
 
 impl Trace {
@@ -179,21 +179,25 @@ impl Trace {
         }
     }
 
+    /// Everything but how a unit reads, writes and sets its timers.
     pub(crate) fn note_event(&mut self, now: Instant, event: &NetEvent) {
-        self.note(&now.as_micros().to_le_bytes());
-        self.note(&[event.code()]);
-        self.note(&event.host().0.to_le_bytes());
+        if matches!(event, NetEvent::Readable { .. } | NetEvent::Writable { .. } | NetEvent::Timer { .. }) {
+            return;
+        }
+        self.note_at(now, &[event.code()]);
         match event {
             NetEvent::Connected { stream, .. }
             | NetEvent::Refused { stream, .. }
             | NetEvent::Accepted { stream, .. }
-            | NetEvent::Readable { stream, .. }
-            | NetEvent::Writable { stream, .. }
             | NetEvent::Closed { stream, .. }
             | NetEvent::Reset { stream, .. } => self.note(&stream.0.to_le_bytes()),
             NetEvent::Datagram { bytes, .. } => self.note(bytes),
-            NetEvent::Timer { token, .. } => self.note(&token.to_le_bytes()),
-            NetEvent::Crashed { .. } | NetEvent::Restarted { .. } | NetEvent::AddressChanged { .. } => (),
+            _ => (),
         }
+    }
+
+    pub(crate) fn note_at(&mut self, now: Instant, what: &[u8]) {
+        self.note(&now.as_micros().to_le_bytes());
+        self.note(what);
     }
 }

@@ -51,7 +51,6 @@ pub struct Network {
     hears_itself: bool,
     counts: FaultCounts,
     injected: u32,
-    trace: Trace,
 }
 
 #[derive(Debug)]
@@ -75,6 +74,8 @@ struct Host {
     send_buffer: usize,
     receive_window: usize,
     answers_strays: bool,
+    /// What it received as datagrams, did and saw.
+    trace: Trace,
 }
 
 /// The bandwidth of one direction between two hosts, shared by everything that goes there.
@@ -175,7 +176,6 @@ impl Network {
             hears_itself: false,
             counts: FaultCounts::default(),
             injected: 0,
-            trace: Trace::new(),
         }
     }
 
@@ -194,14 +194,20 @@ impl Network {
         &self.counts
     }
 
-    /// A hash over all bytes sent, all events so far and all notes: equal for equal runs.
+    /// A hash over what each end of a stream wrote, and over the datagrams that each host received, the fate of its streams and
+    /// its notes, in their order and with their times. Equal for equal runs, also where a unit reads and writes in other
+    /// portions or sets other timers.
     pub fn trace_hash(&self) -> u64 {
-        self.trace.hash()
+        let mut all = Trace::new();
+        let parts = self.hosts.iter().map(|host| host.trace).chain(self.ends.iter().map(|end| end.sent));
+        parts.for_each(|part| all.note(&part.hash().to_le_bytes()));
+        all.hash()
     }
 
-    /// Mixes something that the user saw into [`Self::trace_hash`].
-    pub fn note(&mut self, bytes: &[u8]) {
-        self.trace.note(bytes);
+    /// Mixes something that a host did or saw now into [`Self::trace_hash`].
+    pub fn note(&mut self, host: HostId, what: &[u8]) {
+        let now = self.now;
+        self.host_mut(host).trace.note_at(now, what);
     }
 
     // --- time
@@ -227,7 +233,8 @@ impl Network {
         loop {
             if let Some(event) = self.ready.pop_front() {
                 let Some(event) = self.hold_if_suspended(event) else { continue };
-                self.trace.note_event(self.now, &event);
+                let now = self.now;
+                self.host_mut(event.host()).trace.note_event(now, &event);
                 return Some(event);
             }
             let due = self.queue.next_time().filter(|at| *at <= limit);

@@ -1,12 +1,19 @@
 //! Runs every scenario for many seeds on the simulator, with faults on; or on boards, where each run keeps its memory
 //! until the end, so that a scenario at a time suits.
 //!
-//! `seeds [--seeds N] [--quick] [--scenario NAME] [--seed N] [--embassy]`
+//! `seeds [--seeds N] [--quick] [--scenario NAME] [--seed N] [--secured | --embassy] [--traces FILE | --write-traces FILE]`
+//!
+//! A trace stands for all that could be seen of a scenario's runs: what is on the wire, what units see, and when. `--traces`
+//! fails where one differs from the file, which `--write-traces` has made: so a change that is to keep behaviour shows that
+//! it does.
 
+use std::num::NonZero;
 use std::process::ExitCode;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::thread;
 use std::time::{Duration, Instant};
 
-use cara_scenarios::run::{Report, once};
+use cara_scenarios::run::{Failure, Report, once};
 use cara_scenarios::{Port, Scenario, all, measurements};
 
 /// Seeds of a quick run.
@@ -16,19 +23,26 @@ const FEW: u64 = 500;
 /// Failures that are shown of one scenario.
 const SHOWN: usize = 3;
 
+const USAGE: &str = "seeds [--seeds N] [--quick] [--scenario NAME] [--seed N] [--secured | --embassy] \
+                     [--traces FILE | --write-traces FILE]";
+
 /// What the command line says.
 struct Wanted {
     seeds: u64,
     seed: Option<u64>,
     scenario: Option<String>,
     port: Port,
+    /// The traces that there should be, one line each.
+    traces: Option<String>,
+    /// Where to write those that there are.
+    write: Option<String>,
 }
 
 fn main() -> ExitCode {
     let wanted = match arguments() {
         Ok(wanted) => wanted,
         Err(problem) => {
-            eprintln!("{problem}\nseeds [--seeds N] [--quick] [--scenario NAME] [--seed N] [--embassy]");
+            eprintln!("{problem}\n{USAGE}");
             return ExitCode::from(2);
         }
     };
@@ -40,9 +54,24 @@ fn main() -> ExitCode {
         return ExitCode::from(2);
     }
     let start = Instant::now();
-    let results: Vec<(u64, bool)> = scenarios.iter().map(|scenario| run(scenario, &wanted)).collect();
-    let runs: u64 = results.iter().map(|(runs, _)| runs).sum();
-    let failed = results.iter().filter(|(_, passed)| !passed).count();
+    let (mut runs, mut failed, mut traces) = (0, 0, String::new());
+    for scenario in &scenarios {
+        let ended = run(scenario, &wanted);
+        let line = format!("{} {} {:016x}\n", scenario.name, ended.seeds, ended.trace);
+        let differs = wanted.traces.as_ref().is_some_and(|known| !known.contains(&line));
+        if differs {
+            print!("  FAILED: the file has no such trace: {line}");
+        }
+        runs += ended.seeds;
+        failed += u64::from(differs || !ended.passed);
+        traces += &line;
+    }
+    if let Some(file) = &wanted.write
+        && let Err(problem) = std::fs::write(file, traces)
+    {
+        eprintln!("{file} cannot be written: {problem}");
+        return ExitCode::FAILURE;
+    }
     let seconds = start.elapsed().as_secs_f64();
     println!(
         "{} scenarios, {runs} seeds in {seconds:.1} s, {:.0} seeds/s, {failed} scenarios failed",
@@ -53,7 +82,8 @@ fn main() -> ExitCode {
 }
 
 fn arguments() -> Result<Wanted, String> {
-    let mut wanted = Wanted { seeds: 1_000, seed: None, scenario: None, port: Port::Simulator };
+    let mut wanted =
+        Wanted { seeds: 1_000, seed: None, scenario: None, port: Port::Simulator, traces: None, write: None };
     let mut words = std::env::args().skip(1);
     while let Some(word) = words.next() {
         let mut value = || words.next().ok_or_else(|| format!("{word} needs a value"));
@@ -65,26 +95,33 @@ fn arguments() -> Result<Wanted, String> {
             "--secured" => wanted.port = Port::Secured,
             "--embassy" => wanted.port = Port::Embassy,
             "--quick" => wanted.seeds = QUICK,
+            "--traces" => {
+                let file = value()?;
+                let known = std::fs::read_to_string(&file).map_err(|problem| format!("{file}: {problem}"))?;
+                wanted.traces = Some(known);
+            }
+            "--write-traces" => wanted.write = Some(value()?),
             other => return Err(format!("{other} is unknown")),
         }
     }
     Ok(wanted)
 }
 
-/// Runs one scenario; how many seeds, and whether all passed and everything expected was reached.
-fn run(scenario: &Scenario, wanted: &Wanted) -> (u64, bool) {
+/// How the runs of a scenario ended.
+struct Ended {
+    seeds: u64,
+    /// All passed, and everything expected was reached.
+    passed: bool,
+    trace: u64,
+}
+
+fn run(scenario: &Scenario, wanted: &Wanted) -> Ended {
     let seeds: Vec<u64> = match wanted.seed {
         Some(seed) => vec![seed],
         None => (0..wanted.seeds).collect(),
     };
     let start = Instant::now();
-    let (mut report, mut failures) = (Report::default(), Vec::new());
-    for &seed in &seeds {
-        match once(scenario, wanted.port, seed, scenario.weather) {
-            Ok(run) => report.merge(run),
-            Err(failure) => failures.push((seed, failure)),
-        }
-    }
+    let (report, failures) = run_each(scenario, wanted.port, &seeds);
     let all_faults = wanted.seed.is_none() && wanted.port == Port::Simulator;
     let missing = if !all_faults { Vec::new() } else { missing(scenario, &report, wanted.seeds < FEW) };
     show(scenario, seeds.len(), start.elapsed(), &report);
@@ -106,7 +143,35 @@ fn run(scenario: &Scenario, wanted: &Wanted) -> (u64, bool) {
     for name in &missing {
         println!("  FAILED: `{name}` was never reached");
     }
-    (seeds.len() as u64, failures.is_empty() && missing.is_empty())
+    let passed = failures.is_empty() && missing.is_empty();
+    Ended { seeds: seeds.len() as u64, passed, trace: report.trace }
+}
+
+/// Runs the seeds on all processors; what they reached together, and which failed, in their order.
+fn run_each(scenario: &Scenario, port: Port, seeds: &[u64]) -> (Report, Vec<(u64, Failure)>) {
+    let threads = thread::available_parallelism().map_or(1, NonZero::get);
+    let next = AtomicUsize::new(0);
+    let work = || {
+        let (mut report, mut failures) = (Report::default(), Vec::new());
+        while let Some(&seed) = seeds.get(next.fetch_add(1, Ordering::Relaxed)) {
+            match once(scenario, port, seed, scenario.weather) {
+                Ok(run) => report.merge(run),
+                Err(failure) => failures.push((seed, failure)),
+            }
+        }
+        (report, failures)
+    };
+    let (mut report, mut failures) = (Report::default(), Vec::new());
+    thread::scope(|scope| {
+        let threads: Vec<_> = (0..threads).map(|_| scope.spawn(work)).collect();
+        for thread in threads {
+            let (part, failed) = thread.join().expect("what a scenario panics with is caught");
+            report.merge(part);
+            failures.extend(failed);
+        }
+    });
+    failures.sort_by_key(|(seed, _)| *seed);
+    (report, failures)
 }
 
 /// What the runs should have injected or reached, and did not.

@@ -227,6 +227,7 @@ impl World for SimWorld {
         for (name, count) in self.counters().into_iter().filter(|(_, count)| *count > 0) {
             *report.states.entry(name.to_owned()).or_default() += count;
         }
+        report.trace = self.world.trace_hash();
         report
     }
 }

@@ -86,7 +86,7 @@ fn publishing_waits_until_everybody_has_read(world: &mut dyn World) {
     world.wait("all have read in the end", || agvs.iter().all(|agv| agv.knows("manager", "late")), secs(40));
 }
 
-/// While the stream to the AGV holds everything, nobody can have read what is published.
+/// While the stream to the AGV holds everything, the AGV cannot read what is published.
 fn publishing_returns_at_once_or_waits_as_asked(world: &mut dyn World) {
     let manager = world.add(Spec::manager("manager", 1));
     let agv = world.add(Spec::agv("agv", 7));

@@ -5,7 +5,7 @@ use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
 use cara_core::time::Instant;
 
 use super::{Host, Network};
-use crate::event::HostId;
+use crate::event::{HostId, Trace};
 
 /// The UDP port of a host that never asked for another one.
 const OWN_PORT: u16 = 40_000;
@@ -49,6 +49,7 @@ impl Network {
             send_buffer: 8 * 1024,
             receive_window: 64 * 1024,
             answers_strays: true,
+            trace: Trace::new(),
         });
         self.by_address.entry(address).or_default().push(id);
         id

@@ -9,7 +9,7 @@ use std::net::{SocketAddr, SocketAddrV4};
 use cara_core::time::Duration;
 
 use super::{Happening, Network};
-use crate::event::{HostId, NetEvent, StreamId};
+use crate::event::{HostId, NetEvent, StreamId, Trace};
 use crate::faults::Fault;
 use crate::pipe::{End as PipeEnd, Pipe};
 
@@ -36,6 +36,8 @@ pub(super) struct End {
     pub(super) host: HostId,
     pub(super) local: SocketAddrV4,
     pub(super) outgoing: Pipe,
+    /// All that was ever written.
+    pub(super) sent: Trace,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -61,8 +63,8 @@ impl Network {
         dialler.dial_port = dialler.dial_port.checked_add(1).unwrap_or(super::hosts::FIRST_DIAL_PORT);
         dialler.streams.push(stream);
         let local = SocketAddrV4::new(dialler.address, dialler.dial_port);
-        self.ends.push(End { state: State::Dialling, host, local, outgoing: Pipe::new() });
-        self.ends.push(End { state: State::Unborn, host, local: to, outgoing: Pipe::new() });
+        self.ends.push(End { state: State::Dialling, host, local, outgoing: Pipe::new(), sent: Trace::new() });
+        self.ends.push(End { state: State::Unborn, host, local: to, outgoing: Pipe::new(), sent: Trace::new() });
         self.dial(stream, 0);
         stream
     }
@@ -97,10 +99,10 @@ impl Network {
     }
 
     fn trace_written(&mut self, stream: StreamId, slices: &[&[u8]], mut taken: usize) {
-        self.trace.note(&stream.0.to_le_bytes());
+        let sent = &mut self.end_mut(stream).sent;
         for slice in slices {
             let part = taken.min(slice.len());
-            self.trace.note(&slice[..part]);
+            sent.note(&slice[..part]);
             taken -= part;
         }
     }

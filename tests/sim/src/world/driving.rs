@@ -393,6 +393,7 @@ impl Inner {
 
     fn log(&mut self, shared: &Rc<Shared>, host: HostId, event: UnitEvent) {
         let now = self.network.now();
+        self.network.note(host, event.words().as_bytes());
         let unit = &mut self.units[host.index()];
         for hook in &unit.hooks {
             let (hook, event, handle) = (Rc::clone(hook), event.clone(), UnitHandle::new(Rc::downgrade(shared), host));

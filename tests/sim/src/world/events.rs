@@ -72,3 +72,24 @@ pub enum UnitEvent {
         why: LeaseEnd,
     },
 }
+
+impl UnitEvent {
+    /// What the trace of a run has of it: the same text whatever types and variants are called.
+    pub(super) fn words(&self) -> String {
+        match self {
+            Self::Started => "started".to_owned(),
+            Self::Stopped => "stopped".to_owned(),
+            Self::Joined { peer } => format!("{peer} joined"),
+            Self::Left { peer, reason } => format!("{peer} left: {reason:?}"),
+            Self::LinkEnded { reason } => format!("a link ended: {reason:?}"),
+            Self::InterfaceChanged { up } => format!("interface up: {up}"),
+            Self::ListChanged { peer } => format!("{peer} has another list"),
+            Self::Called { function, caller } => format!("{caller} called {function}"),
+            Self::Failed { peer, id, error } => format!("{} failed at {peer}: {error:?}", id.0),
+            Self::LeaseExpired { function } => format!("the lease of {function} expired"),
+            Self::LeaseEnded { peer, function, call, why } => {
+                format!("the lease of {function} at {peer} for {} ended: {why:?}", call.0)
+            }
+        }
+    }
+}
