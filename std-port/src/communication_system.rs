@@ -272,12 +272,11 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     }
 
     fn number_of(&self, role: Role) -> usize {
-        let now = self.engine().clock.now();
-        read(&self.engine().peers).of_role(role).filter(|peer| peer.is_introduced(now)).count()
+        read(&self.engine().peers).of_role(role).filter(|peer| peer.is_introduced()).count()
     }
 
-    /// The s_units in the order in which they joined. One that has left keeps its place, so an index goes on to mean the
-    /// same node.
+    /// The s_units in the order in which they first told what they offer, then those that have not told it yet. One that has
+    /// left keeps its place, so an index goes on to mean the same node once that has told.
     pub fn s_units(&self) -> Vec<Peer<T>> {
         self.of_role(Role::SUnit)
     }

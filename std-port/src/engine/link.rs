@@ -1,6 +1,6 @@
 //! One link as the threads share it: the session under its lock, who waits for what, and who reads.
 
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError, TryLockError};
 use std::task::Waker;
 use std::thread::Thread;
@@ -39,8 +39,8 @@ pub(crate) struct LinkCell {
     pub(crate) serial: u32,
     pub(crate) stream: Stream,
     pub(crate) peer: OnceLock<Arc<PeerCell>>,
-    /// When the peer counts as introduced, in microseconds: at once when its list has come.
-    introduced_at: AtomicU64,
+    /// The peer has told what it offers.
+    introduced: AtomicBool,
     state: Mutex<LinkState>,
     /// The stream took bytes, or the link ended.
     pub(crate) room: Condvar,
@@ -162,27 +162,26 @@ impl LinkCell {
             notices: Vec::new(),
             telling: false,
         };
-        let introduced_at = AtomicU64::new(u64::MAX);
         Self {
             seat,
             id,
             serial,
             stream,
             peer: OnceLock::new(),
-            introduced_at,
+            introduced: AtomicBool::new(false),
             state: Mutex::new(state),
             room: Condvar::new(),
         }
     }
 
-    /// The peer counts from `at` on; an earlier time that was set before stays.
-    pub(crate) fn introduced(&self, at: Instant) {
-        self.introduced_at.fetch_min(at.as_micros(), Ordering::Relaxed);
+    /// The peer has told what it offers.
+    pub(crate) fn introduce(&self) {
+        self.introduced.store(true, Ordering::Release);
     }
 
-    /// Whether the peer's list has come, or it has had its time to tell it.
-    pub(crate) fn is_introduced(&self, now: Instant) -> bool {
-        now.as_micros() >= self.introduced_at.load(Ordering::Relaxed)
+    /// Whether the peer has told what it offers.
+    pub(crate) fn is_introduced(&self) -> bool {
+        self.introduced.load(Ordering::Acquire)
     }
 
     /// The epoll token: unit, id and serial, so that an event of an earlier link with the same id is known.

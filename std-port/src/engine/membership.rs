@@ -42,9 +42,6 @@ pub(super) struct Directive {
     new: Option<u32>,
 }
 
-/// A node that has not told its list by then counts as one that has none.
-const INTRODUCTION: Duration = Duration::from_secs(1);
-
 /// Descriptors that links which have proven nothing leave to those that do, and to the control socket.
 const KEPT_FOR_PROVEN: u64 = 24;
 /// And of these what stays for the control socket, key files and dialling: two for each operator's connection, and some more.
@@ -217,7 +214,6 @@ impl<T: Send + 'static> Engine<T> {
             return;
         }
         let limit = usize::from(lock(&self.node).node.constraints().maximum_nodes);
-        link.introduced(self.clock.now() + INTRODUCTION);
         let peer = write(&self.peers).join(&identity, limit, link);
         if let Some(own) = peer.own_constraints(*state.session.constraints()) {
             self.with(link, state, |session, cx| session.set_constraints(cx, own));

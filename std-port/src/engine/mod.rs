@@ -351,8 +351,10 @@ impl<T: Send + 'static> Engine<T> {
                 }
             },
             Some(event) => {
-                if let Event::ListChanged = event {
-                    link.introduced(Instant::START);
+                if matches!(event, Event::ListChanged) && !link.is_introduced() {
+                    // A node that counts has its place.
+                    link.peer.get().into_iter().for_each(|peer| write(&self.peers).introduce(peer));
+                    link.introduce();
                 }
                 if let Event::LeaseExpired(slot) = event {
                     self.wake_leased(&functions, slot);

@@ -1,5 +1,5 @@
-//! The nodes that this unit knows, in the order in which they joined: a node keeps its place when another one leaves,
-//! and finds it again when it comes back.
+//! The nodes that this unit knows, in the order in which they first told what they offer: a node keeps its place when
+//! another one leaves, and finds it again when it comes back.
 
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use cara_core::config::Constraints;
 use cara_core::distribution::identity::{Identity, Role};
 use cara_core::error::{CloseReason, Error};
-use cara_core::time::{Duration, Instant};
+use cara_core::time::Duration;
 
 use super::accounts::Earlier;
 use super::link::LinkCell;
@@ -26,6 +26,8 @@ pub(crate) struct PeerCell {
     /// What differs for this node from the unit's constraints, whether it is connected or not.
     own: Mutex<Option<OwnConstraints>>,
     pub(super) earlier: Earlier,
+    /// It has told what it offers since it has its place, on this link or an earlier one.
+    introduced: AtomicBool,
     /// The operator has taken it off the roster.
     retired: AtomicBool,
 }
@@ -61,8 +63,8 @@ impl PeerCell {
     }
 
     /// Whether it is connected and what it offers is known.
-    pub(crate) fn is_introduced(&self, now: Instant) -> bool {
-        self.link().is_some_and(|link| link.is_introduced(now))
+    pub(crate) fn is_introduced(&self) -> bool {
+        self.link().is_some_and(|link| link.is_introduced())
     }
 
     /// The unit's constraints with what this node has of its own.
@@ -94,6 +96,7 @@ impl PeerCell {
             left: Mutex::new(None),
             own: Mutex::new(None),
             earlier: Mutex::new(None),
+            introduced: AtomicBool::new(false),
             retired: AtomicBool::new(false),
         })
     }
@@ -160,6 +163,7 @@ impl Peers {
         let index = match away.and_then(|index| self.list.get_mut(index).map(|place| (index, place))) {
             Some((index, place)) => {
                 self.by_identity.remove(&place.identity);
+                place.introduced.store(false, Ordering::Relaxed);
                 self.roster.keep(std::mem::replace(place, peer.clone()));
                 index
             }
@@ -170,6 +174,23 @@ impl Peers {
         };
         self.by_identity.insert(identity.clone(), index);
         peer
+    }
+
+    /// A node has told what it offers. From then on it keeps its place; the first time, it goes before those of its role that
+    /// have never told.
+    pub(crate) fn introduce(&mut self, peer: &PeerCell) {
+        if peer.introduced.swap(true, Ordering::Relaxed) {
+            return;
+        }
+        let Some(&own) = self.by_identity.get(&peer.identity) else { return };
+        let waits = |other: &Arc<PeerCell>| {
+            other.identity.role() == peer.identity.role() && !other.introduced.load(Ordering::Relaxed)
+        };
+        let Some(place) = self.list.iter().take(own).position(waits) else { return };
+        self.list.swap(place, own);
+        for index in [place, own] {
+            self.by_identity.extend(self.list.get(index).map(|peer| (peer.identity.clone(), index)));
+        }
     }
 
     /// The node of an identity that has a place here.
@@ -282,7 +303,27 @@ pub(super) mod tests {
         assert_eq!(peers.connected().count(), 2);
     }
 
-    /// Nobody's place is taken while it is connected, even if there are more than the limit for a moment.
+    /// A node that has told what it offers comes first and stays where it is, whatever those of the other role do.
+    #[test]
+    fn a_node_that_has_told_goes_before_those_that_have_not() {
+        let mut peers = Peers::default();
+        let manager = Identity::m_unit("manager", 4).unwrap();
+        let units = [agv(1), manager.clone(), agv(2), agv(3)];
+        let [first, manager_cell, second, third] = units.map(|unit| peers.join(&unit, 8, &link(unit.id())));
+        peers.introduce(&third);
+        assert_eq!(ids(&peers), [3, 2, 1]);
+        peers.introduce(&manager_cell);
+        peers.introduce(&first);
+        assert_eq!(ids(&peers), [3, 1, 2]);
+        peers.introduce(&second);
+        peers.introduce(&third);
+        assert_eq!(ids(&peers), [3, 1, 2]);
+        for cell in [&first, &manager_cell, &second, &third] {
+            assert!(Arc::ptr_eq(peers.placed(&cell.identity).unwrap(), cell));
+        }
+    }
+
+    /// A node that is connected keeps its place, even if there are more than the limit for a moment.
     #[test]
     fn who_is_connected_keeps_its_place() {
         let mut peers = Peers::default();

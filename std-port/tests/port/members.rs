@@ -1,5 +1,7 @@
 //! Who meets whom, who is refused, and who takes whose place.
 
+use std::io::{Read, Write};
+use std::net::{Ipv4Addr, Shutdown, SocketAddr, TcpListener, TcpStream};
 use std::sync::mpsc::Receiver;
 use std::time::Duration;
 
@@ -202,4 +204,59 @@ fn a_fixed_address_needs_no_broadcast() {
     let agv = unit("agv", 7, fleet).manager_address(([127, 0, 0, 1], port).into()).build_unit().unwrap();
     meet(&manager, &agv);
     assert_eq!(counter(&agv.counters(), "WhoHasSent"), 0);
+}
+
+/// Passes on what the vehicle says as a radio of 8 kbit/s would, and what the manager says at once.
+fn slow_link(to: SocketAddr) -> SocketAddr {
+    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
+    let address = listener.local_addr().unwrap();
+    std::thread::spawn(move || -> std::io::Result<()> {
+        let (mut vehicle, _) = listener.accept()?;
+        let mut manager = TcpStream::connect(to)?;
+        manager.set_nodelay(true)?;
+        let (mut back, mut forth) = (manager.try_clone()?, vehicle.try_clone()?);
+        std::thread::spawn(move || std::io::copy(&mut back, &mut forth));
+        let mut few = [0; 16];
+        loop {
+            let count = vehicle.read(&mut few)?;
+            if count == 0 {
+                return manager.shutdown(Shutdown::Both);
+            }
+            manager.write_all(&few[..count])?;
+            std::thread::sleep(Duration::from_millis(15));
+        }
+    });
+    address
+}
+
+/// Lines 4 to 10 of the listing, whatever the link: the list is there when the node is counted, and one that has not told it
+/// keeps out of the way of one that has.
+#[test]
+fn a_node_counts_once_its_list_has_come_however_slowly() {
+    const FUNCTIONS: usize = 30;
+    let fleet = fleet();
+    let manager = system(fleet).build_system().unwrap();
+    manager.start().unwrap();
+    let relay = slow_link((Ipv4Addr::LOCALHOST, manager.tcp_port()).into());
+    let slow = unit("agv-1", 1, fleet).manager_address(relay).build_unit().unwrap();
+    for index in 0..FUNCTIONS {
+        let name = format!("a_service_with_a_long_name_{index}");
+        slow.my_function_list().add_function(&name, &number(0), service(|number| number)).unwrap();
+    }
+    slow.publish_my_function_list().unwrap();
+    slow.start().unwrap();
+    until("it has joined", || !manager.s_units().is_empty());
+    let quick = unit("agv-2", 2, fleet).build_unit().unwrap();
+    quick.start().unwrap();
+    until("one is counted", || manager.number_of_s_units() > 0);
+    let mut ids = vec![2, 1];
+    if manager.s_units()[0].identity().id() == 1 {
+        // A machine that is busy enough makes the quick one slower.
+        ids.reverse();
+    }
+    until("both are counted", || manager.number_of_s_units() == 2);
+    let units = manager.s_units();
+    assert_eq!(units.iter().map(|unit| unit.identity().id()).collect::<Vec<_>>(), ids);
+    let lengths = units.iter().map(|unit| (unit.identity().id(), unit.their_function_list().len()));
+    assert!(lengths.eq(ids.into_iter().map(|id| (id, if id == 1 { FUNCTIONS } else { 0 }))));
 }

@@ -74,7 +74,6 @@ fn listing(options: &Options, transcript: &Transcript) -> Result<CommunicationSy
         transcript.show(8, format_args!("{s_unit_number} s_units"));
     } // 9
     transcript.after(9, console::units(&agv_manager))?;
-    agv_manager.s_units()[0].wait_for_function("go_to", Duration::from_secs(2)); // It may have joined just now.
     print!("{}", agv_manager.s_units()[0].their_function_list().show_functions()); // 10
     transcript.after(10, "shown")?;
     let mut pos = Parameters::new(); // 11
