@@ -30,7 +30,8 @@ impl Surroundings {
         Ok(Self { root: root.to_owned(), home: tempfile::tempdir()? })
     }
 
-    /// What differs from the environment of this program: nobody else's units are met, and nothing is left behind.
+    /// What differs from the environment of this program: nobody else's units are met, nothing is left behind, and what the
+    /// guide's programs have in common is built once and quickly.
     fn environment(&self) -> Vec<(&'static str, PathBuf)> {
         let before = PathBuf::from(std::env::var_os("HOME").unwrap_or_default());
         let kept = |name: &str, below: &str| std::env::var_os(name).map_or_else(|| before.join(below), PathBuf::from);
@@ -41,6 +42,9 @@ impl Surroundings {
             ("CARA_CONTROL_DIR", self.home.path().join("control")),
             ("CARA_INTERFACES", PathBuf::from("lo")),
             ("NO_COLOR", PathBuf::from("1")),
+            ("CARGO_BUILD_BUILD_DIR", self.home.path().join("build")),
+            ("CARGO_PROFILE_DEV_OPT_LEVEL", PathBuf::from("0")),
+            ("CARGO_PROFILE_DEV_DEBUG", PathBuf::from("0")),
         ]
     }
 }
