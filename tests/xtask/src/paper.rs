@@ -121,10 +121,7 @@ impl<'t> Row<'t> {
 
 fn row(line: &str) -> Option<Row<'_>> {
     let cells: Vec<&str> = line.trim().strip_prefix('|')?.strip_suffix('|')?.split('|').map(str::trim).collect();
-    let (number, promise, place, ports) = match cells[..] {
-        [number, promise, place, ports] => (number, promise, place, ports),
-        _ => return None,
-    };
+    let [number, promise, place, ports] = cells[..] else { return None };
     number.starts_with(|c: char| c.is_ascii_digit()).then_some(Row { number, promise, place, ports })
 }
 
