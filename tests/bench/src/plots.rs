@@ -47,8 +47,7 @@ fn figures(results: &Results) -> Vec<Figure> {
     };
     let apart = results.echoes.iter().map(|row| row.n).min().unwrap_or(0);
     let spread = format!("2 s apart: n = {apart} a point, printing");
-    let loopback =
-        [&spread, "bars: quartiles (response time),", "worst group to 1 (availability)", "loopback cannot fill"];
+    let loopback = [&spread, "bars: quartiles (response time)", "or worst group; loopback cannot fill"];
     vec![
         figure("figure-6", vec![response(results, 1), availability(results, 1)], &loopback),
         figure("figure-7", vec![response(results, 2), availability(results, 2)], &loopback),

@@ -18,6 +18,8 @@ use crate::statistics::{Cell, quartile};
 
 /// Pairs that start at the same time.
 const AT_A_TIME: usize = 8;
+/// What the links of pairs that run side by side carry together at most, in Mbit/s: more would fill two CPUs before it fills the links.
+const TOGETHER: u32 = 400;
 /// A request that is executed later than this behind the time at which the last one of its group was due has come too late.
 /// As long as what waits in the link's own queue.
 pub(super) const GRACE: Duration = Duration::from_millis(50);
@@ -70,13 +72,14 @@ struct Lane<'p> {
     periods_ms: Vec<u64>,
 }
 
-/// One rate after the other; at each, all sizes and peers in both distributions side by side, on a cable each.
+/// One rate after the other; at each, all sizes and peers in both distributions, on a cable each, as many side by side as the CPUs
+/// bear.
 fn availability(plan: &Plan, results: &mut Results) -> Result<()> {
     let bursts = &plan.link.availability;
     let mut outcome = Ok(());
     for &mbit in bursts.mbit.iter().take_while(|_| !is_stopped()) {
         let mut lanes = Vec::new();
-        let sizes = bursts.sizes(mbit);
+        let (sizes, periods) = (bursts.sizes(mbit), bursts.periods_ms(mbit));
         for (distribution, &chars) in
             [1, 2].into_iter().flat_map(|number| sizes.clone().map(move |chars| (number, chars)))
         {
@@ -87,7 +90,7 @@ fn availability(plan: &Plan, results: &mut Results) -> Result<()> {
                 let deliveries =
                     [Delivery::Reliable, Delivery::BestEffort].into_iter().take(1 + usize::from(datagrams));
                 for delivery in deliveries {
-                    let mut periods_ms = bursts.periods_ms.clone();
+                    let mut periods_ms = periods.clone();
                     let first = lanes.len() % periods_ms.len().max(1);
                     periods_ms.rotate_left(first);
                     lanes.push(Lane { contender, setting, delivery, chars, periods_ms });
@@ -96,15 +99,18 @@ fn availability(plan: &Plan, results: &mut Results) -> Result<()> {
         }
         let bar = Progress::new(
             &format!("link: availability, {mbit} Mbit/s, {} pairs", lanes.len()),
-            lanes.len() * bursts.periods_ms.len(),
+            lanes.len() * periods.len(),
         );
-        let started = side_by_side(lanes, AT_A_TIME, |lane| {
-            (lane.contender.tolerate(Pair::start(lane.contender, lane.setting)), lane)
-        });
-        let count = started.len();
-        for (rows, ended) in side_by_side(started, count, |(pair, lane)| lane.run(plan, pair, &bar)) {
-            results.link_availability.extend(rows.into_iter().map(|row| OnLink::measured(mbit, row)));
-            outcome = outcome.and(ended);
+        while !lanes.is_empty() && !is_stopped() {
+            let later = lanes.split_off(lanes.len().min((TOGETHER / mbit.max(1)).max(1) as usize));
+            let started = side_by_side(std::mem::replace(&mut lanes, later), AT_A_TIME, |lane| {
+                (lane.contender.tolerate(Pair::start(lane.contender, lane.setting)), lane)
+            });
+            let count = started.len();
+            for (rows, ended) in side_by_side(started, count, |(pair, lane)| lane.run(plan, pair, &bar)) {
+                results.link_availability.extend(rows.into_iter().map(|row| OnLink::measured(mbit, row)));
+                outcome = outcome.and(ended);
+            }
         }
     }
     results.link_availability.sort_by(|one, other| {

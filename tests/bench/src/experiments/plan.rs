@@ -106,6 +106,12 @@ impl LinkBursts {
     pub(crate) fn sizes(&self, mbit: u32) -> impl Iterator<Item = &u32> + Clone {
         self.chars.iter().filter(move |chars| *chars * 8 / mbit / 1_000 <= LONGEST_MS)
     }
+
+    /// Up to five times what the longest text takes on a link of this rate, beyond which nothing is late any more.
+    pub(crate) fn periods_ms(&self, mbit: u32) -> Vec<u64> {
+        let longest = self.sizes(mbit).max().map_or(0, |chars| u64::from(*chars) * 8 * 5 / u64::from(mbit) / 1_000);
+        self.periods_ms.iter().copied().filter(|period| *period <= longest.max(10)).collect()
+    }
 }
 
 /// The sweep over constraints: every interval with every message size.
@@ -139,7 +145,7 @@ pub(crate) struct LinkBursts {
     pub(crate) peers: Vec<Contender>,
     pub(crate) mbit: Vec<u32>,
     pub(crate) chars: Vec<u32>,
-    pub(crate) periods_ms: Vec<u64>,
+    periods_ms: Vec<u64>,
     pub(crate) groups: u32,
     pub(crate) group: u32,
 }

@@ -34,7 +34,7 @@ pub(super) fn measure(plan: &Plan, results: &mut Results) -> Result<()> {
     let bursts = &plan.link.availability;
     for &mbit in &bursts.mbit {
         for &chars in bursts.sizes(mbit) {
-            for &period_ms in &bursts.periods_ms {
+            for period_ms in bursts.periods_ms(mbit) {
                 let burst =
                     Burst { chars, count: bursts.group, period_ms, delivery: Delivery::Reliable, insist: false };
                 results.link_availability.push(OnLink::measured(mbit, availability(mbit, &burst)?));
