@@ -92,7 +92,7 @@ fn extent_of(group: &Group, quick: bool) -> (Extent, u64) {
 const REPORT: &str = "-- ";
 
 /// How many groups that mostly wait run at a time.
-const SIDE_BY_SIDE: usize = 3;
+pub(crate) const SIDE_BY_SIDE: usize = 3;
 
 fn run_side_by_side(groups: Vec<&'static Group>, quick: bool) -> Vec<Report> {
     let names: Vec<&str> = groups.iter().map(|group| group.name).collect();
