@@ -6,9 +6,9 @@ use cara_core::distribution::function_list::FunctionList;
 use cara_core::distribution::identity::{Identity, Role};
 use cara_core::host::connections::LinkCounter;
 use cara_core::host::mailman::LinkId;
-use cara_core::services::Context;
 use cara_core::services::publications::Publications;
 use cara_core::services::unit::{Session, SessionConfig, SessionStorage};
+use cara_core::services::{Context, Port};
 use cara_core::storage::{Lent, Pool};
 use cara_core::time::{Duration, Instant};
 use core::cell::RefCell;
@@ -30,8 +30,16 @@ use crate::time::now;
 /// Tasks that can wait for the same thing without waking each other.
 const TASKS_WAITING: usize = 4;
 
-pub(crate) type LinkSession = Session<Lent, LinkCipher>;
-pub(crate) type LinkContext<'c, T> = Context<'c, Lent, EmbassyMailman, Pool<Lent>, Listed<T>>;
+/// The port.
+pub(crate) enum Board {}
+
+impl Port for Board {
+    type Storage = Lent;
+    type Cipher = LinkCipher;
+}
+
+pub(crate) type LinkSession = Session<Board>;
+pub(crate) type LinkContext<'c> = Context<'c, Board>;
 pub(crate) type LinkCounters = Counters<LinkCounter, { LinkCounter::COUNT }>;
 
 /// What a handle points to.
@@ -178,7 +186,7 @@ impl<T> Machine<T> {
     pub(crate) fn with<R>(
         &mut self,
         index: u16,
-        act: impl FnOnce(&mut LinkSession, &mut LinkContext<'_, T>, &Publications<Lent>) -> R,
+        act: impl FnOnce(&mut LinkSession, &mut LinkContext<'_>, &Publications<Lent>) -> R,
     ) -> Option<R> {
         let (session, mut context, publications) = self.lend(index)?;
         Some(act(session, &mut context, publications))
@@ -186,7 +194,7 @@ impl<T> Machine<T> {
 
     /// Kept apart from the many that use it.
     #[inline(never)]
-    fn lend(&mut self, index: u16) -> Option<(&mut LinkSession, LinkContext<'_, T>, &Publications<Lent>)> {
+    fn lend(&mut self, index: u16) -> Option<(&mut LinkSession, LinkContext<'_>, &Publications<Lent>)> {
         let Self { links, mail, pool, functions, publications, access, .. } = self;
         let session = links.get_mut(usize::from(index))?.session.as_mut()?;
         Some((session, Context { now: now(), mailman: mail, buffers: pool, functions, access: access.0 }, publications))

@@ -11,7 +11,7 @@ impl<T> Machine<T> {
     /// Does something on each link to a peer.
     pub(crate) fn each_live(
         &mut self,
-        mut act: impl FnMut(&mut LinkSession, &mut LinkContext<'_, T>, &Publications<Lent>),
+        mut act: impl FnMut(&mut LinkSession, &mut LinkContext<'_>, &Publications<Lent>),
     ) {
         for index in self.indices() {
             if self.link(index).is_some_and(crate::machine::Link::is_live) {

@@ -74,9 +74,9 @@ impl TaskSlot {
 
 /// Answers a call, or gives that up once nobody waits any more; `false` when the answer cannot be kept now.
 #[inline(never)]
-fn answer<T>(
+fn answer(
     session: &mut LinkSession,
-    cx: &mut LinkContext<'_, T>,
+    cx: &mut LinkContext<'_>,
     running: &Running,
     result: Result<&ParametersView, Error>,
 ) -> bool {

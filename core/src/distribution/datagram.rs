@@ -174,7 +174,7 @@ impl Header {
 impl<'b> Datagram<'b> {
     /// Reads a datagram of this fleet. In secured mode nothing of a who-has or announce is read before the fleet's code is
     /// found right, and an answer counts only with the code of the pair. Session datagrams are opened by their session.
-    pub fn decode(bytes: &'b [u8], fleet: Fleet, authenticator: &impl Authenticator) -> Result<Self, DatagramError> {
+    pub fn decode(bytes: &'b [u8], fleet: Fleet, authenticator: &dyn Authenticator) -> Result<Self, DatagramError> {
         let (header, body) = Header::decode(bytes)?;
         if header.mode != authenticator.mode() {
             return Err(DatagramError::Magic);
@@ -213,12 +213,12 @@ fn fill(length: usize, out: &mut [u8]) -> Option<usize> {
 }
 
 /// All but the fleet's code, if that is right.
-fn of_fleet<'b>(bytes: &'b [u8], authenticator: &impl Authenticator) -> Option<&'b [u8]> {
+fn of_fleet<'b>(bytes: &'b [u8], authenticator: &dyn Authenticator) -> Option<&'b [u8]> {
     let (signed, code) = bytes.split_last_chunk()?;
     authenticator.is_of_fleet(signed, code).then_some(signed)
 }
 
-fn is_for_us(signed: &[u8], announce: &Announce, authenticator: &impl Authenticator) -> bool {
+fn is_for_us(signed: &[u8], announce: &Announce, authenticator: &dyn Authenticator) -> bool {
     let Some((signed, code)) = signed.split_last_chunk() else { return false };
     authenticator.is_of(&announce.identity, signed, code)
 }
@@ -250,13 +250,13 @@ fn append(code: [u8; CODE_BYTES], length: usize, out: &mut [u8]) -> Option<usize
     length.checked_add(CODE_BYTES)
 }
 
-fn sign_for_fleet(length: usize, authenticator: &impl Authenticator, out: &mut [u8]) -> Option<usize> {
+fn sign_for_fleet(length: usize, authenticator: &dyn Authenticator, out: &mut [u8]) -> Option<usize> {
     append(authenticator.sign_for_fleet(out.get(..length)?), length, out)
 }
 
 impl WhoHas {
     /// The datagram, in `out`; `None` where it does not fit.
-    pub fn encode<'o>(&self, fleet: Fleet, authenticator: &impl Authenticator, out: &'o mut [u8]) -> Option<&'o [u8]> {
+    pub fn encode<'o>(&self, fleet: Fleet, authenticator: &dyn Authenticator, out: &'o mut [u8]) -> Option<&'o [u8]> {
         let mode = authenticator.mode();
         let mut length = encode(WHO_HAS, mode, fleet, self, out)?;
         if mode == Mode::Secured {
@@ -272,7 +272,7 @@ impl Announce {
     pub fn encode<'o>(
         &self,
         fleet: Fleet,
-        authenticator: &impl Authenticator,
+        authenticator: &dyn Authenticator,
         to: Option<&Identity>,
         out: &'o mut [u8],
     ) -> Option<&'o [u8]> {

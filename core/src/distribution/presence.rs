@@ -47,7 +47,7 @@ impl Presence {
     /// The datagram to broadcast, in `out`.
     pub fn question<'o>(
         &mut self,
-        authenticator: &impl Authenticator,
+        authenticator: &dyn Authenticator,
         out: &'o mut [u8; SEARCH_BYTES],
     ) -> Option<&'o [u8]> {
         self.sequence = self.sequence.wrapping_add(1);
@@ -69,7 +69,7 @@ impl Presence {
         &self,
         from: SocketAddr,
         bytes: &[u8],
-        authenticator: &impl Authenticator,
+        authenticator: &dyn Authenticator,
         out: &'o mut [u8; SEARCH_BYTES],
     ) -> Heard<'o> {
         match Datagram::decode(bytes, self.fleet, authenticator) {
@@ -96,7 +96,7 @@ impl Presence {
     fn answer<'o>(
         &self,
         nonce: u64,
-        authenticator: &impl Authenticator,
+        authenticator: &dyn Authenticator,
         out: &'o mut [u8; SEARCH_BYTES],
     ) -> Option<&'o [u8]> {
         let announce = Announce {

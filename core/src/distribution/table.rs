@@ -20,7 +20,7 @@ pub struct Slot(pub u16);
 pub struct Generation(pub u16);
 
 /// A function in a list. `H` is its handler; `()` in a peer's list.
-pub struct Function<'a, H = ()> {
+pub struct Function<'a, H: ?Sized = ()> {
     /// Its place.
     pub slot: Slot,
     /// The generation of its place.
@@ -33,22 +33,22 @@ pub struct Function<'a, H = ()> {
     pub handler: &'a H,
 }
 
-impl<'a, H> Function<'a, H> {
+impl<'a, H: ?Sized> Function<'a, H> {
     /// Its name.
     pub fn name(&self) -> &'a str {
         self.signature.name()
     }
 }
 
-impl<H> Clone for Function<'_, H> {
+impl<H: ?Sized> Clone for Function<'_, H> {
     fn clone(&self) -> Self {
         *self
     }
 }
 
-impl<H> Copy for Function<'_, H> {}
+impl<H: ?Sized> Copy for Function<'_, H> {}
 
-impl<H> fmt::Debug for Function<'_, H> {
+impl<H: ?Sized> fmt::Debug for Function<'_, H> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}.{}: {}", self.slot.0, self.generation.0, self.signature)
     }

@@ -285,7 +285,7 @@ impl<S: Storage> Calls<S> {
     /// Keeps a call until it may begin. If it needs a buffer, it leaves so many others in the pool.
     pub(crate) fn wait(
         &mut self,
-        buffers: &mut impl Buffers<S>,
+        buffers: &mut dyn Buffers<S>,
         left: usize,
         head: CallHead,
         block: &[u8],
@@ -330,7 +330,7 @@ impl<S: Storage> Calls<S> {
     /// Takes the next call that may begin and shows its block to `look`.
     pub(crate) fn take_next<R>(
         &mut self,
-        buffers: &mut impl Buffers<S>,
+        buffers: &mut dyn Buffers<S>,
         look: impl FnOnce(CallHead, &[u8]) -> R,
     ) -> Option<(CallHead, R)> {
         let class = self.next_class()?;
@@ -361,7 +361,7 @@ impl<S: Storage> Calls<S> {
     }
 
     /// Forgets what waits and gives the buffers back. Running calls may still be ended.
-    pub(crate) fn release(&mut self, buffers: &mut impl Buffers<S>) {
+    pub(crate) fn release(&mut self, buffers: &mut dyn Buffers<S>) {
         for queue in self.queues.iter_mut().filter_map(Option::take) {
             buffers.give(queue.buffer);
         }

@@ -9,7 +9,7 @@ use cara_core::host::secure::Plain;
 use cara_core::services::lease::Lease;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::{RequestOptions, Session, SessionStorage};
-use cara_core::services::{Context, Ticket};
+use cara_core::services::{Context, Port, Ticket};
 use cara_core::storage::{Lent, Pool};
 use cara_core::time::Instant;
 use smoltcp::phy::Device;
@@ -23,6 +23,14 @@ use crate::stack::Stack;
 /// Frames that one poll takes from the device at most, so that a flood keeps nothing else waiting.
 const FRAMES_PER_POLL: usize = 16;
 
+/// The port.
+pub enum Smoltcp {}
+
+impl Port for Smoltcp {
+    type Storage = Lent;
+    type Cipher = Plain;
+}
+
 /// An s_unit on smoltcp.
 pub struct SUnit {
     pub(crate) stack: Stack,
@@ -31,7 +39,7 @@ pub struct SUnit {
     pub(crate) buffers: Pool<Lent>,
     pub(crate) arguments: &'static mut Arguments,
     /// The link to the manager, from dialling to its end.
-    pub(crate) session: Option<Session<Lent, Plain>>,
+    pub(crate) session: Option<Session<Smoltcp>>,
     /// What the next link will live in.
     pub(crate) spare: Option<SessionStorage<Lent>>,
     pub(crate) standing: Standing,
@@ -182,7 +190,7 @@ impl SUnit {
     }
 
     /// The link to the manager, for its counters.
-    pub fn session(&self) -> Option<&Session<Lent, Plain>> {
+    pub fn session(&self) -> Option<&Session<Smoltcp>> {
         self.session.as_ref()
     }
 

@@ -8,6 +8,7 @@ use std::thread::Thread;
 use cara_core::distribution::function_list::Slot;
 use cara_core::error::{CloseReason, Error};
 use cara_core::host::mailman::{LinkId, Mailman};
+use cara_core::services::Port;
 use cara_core::services::lease::LeaseEnd;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::Session;
@@ -22,6 +23,14 @@ use crate::storage::Boxed;
 use crate::sys::datagram::Datagrams;
 use crate::sys::stream::Stream;
 use crate::threads;
+
+/// Linux, as the core's port.
+pub(crate) enum Linux {}
+
+impl Port for Linux {
+    type Storage = Boxed;
+    type Cipher = Cipher;
+}
 
 /// Calls that leave no room for more hold up what follows them for so long after the last one has ended.
 const STALLED: Duration = Duration::from_millis(20);
@@ -48,7 +57,7 @@ pub(crate) struct LinkCell {
 
 /// What the lock of a link protects.
 pub(crate) struct LinkState {
-    pub(crate) session: Session<Boxed, Cipher>,
+    pub(crate) session: Session<Linux>,
     pub(crate) waiters: Vec<Waiter>,
     pub(crate) reader: Reader,
     /// The last handler that ran for this link was quick.
@@ -137,7 +146,7 @@ impl LinkCell {
         id: LinkId,
         serial: u32,
         stream: Stream,
-        session: Session<Boxed, Cipher>,
+        session: Session<Linux>,
         connecting: bool,
     ) -> Self {
         let state = LinkState {

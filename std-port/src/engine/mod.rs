@@ -69,7 +69,7 @@ use crate::sys::interfaces::Interface;
 use crate::sys::stream::Listener;
 use crate::threads::Threads;
 use crate::timers::Timers;
-use link::{LinkCell, LinkState, Notice, StdMailman};
+use link::{LinkCell, LinkState, Linux, Notice, StdMailman};
 use peers::{PeerCell, Peers};
 use serving::Begun;
 use state_gate::StateGate;
@@ -78,9 +78,6 @@ use state_gate::StateGate;
 pub(crate) const READ_BYTES: usize = 128 * 1024;
 /// A link on which reading is paused is looked at again after this.
 pub(crate) const RETRY: cara_core::time::Duration = cara_core::time::Duration::from_millis(1);
-
-/// What a session call is lent on Linux.
-pub(crate) type Lent<'c, T> = Context<'c, Boxed, StdMailman<'c>, &'c MessagePool, Handler<T>>;
 
 /// Everything that a unit's threads and handles share.
 pub(crate) struct Engine<T: 'static> {
@@ -226,7 +223,7 @@ impl<T: Send + 'static> Engine<T> {
         &self,
         link: &LinkCell,
         state: &mut LinkState,
-        act: impl FnOnce(&mut Session<Boxed, Cipher>, &mut Lent<'_, T>) -> R,
+        act: impl FnOnce(&mut Session<Linux>, &mut Context<'_, Linux>) -> R,
     ) -> R {
         self.with_at(self.now(), link, state, act)
     }
@@ -237,14 +234,14 @@ impl<T: Send + 'static> Engine<T> {
         now: Instant,
         link: &LinkCell,
         state: &mut LinkState,
-        act: impl FnOnce(&mut Session<Boxed, Cipher>, &mut Lent<'_, T>) -> R,
+        act: impl FnOnce(&mut Session<Linux>, &mut Context<'_, Linux>) -> R,
     ) -> R {
         let functions = read(&self.functions);
         let mut mailman = StdMailman { stream: Some(&link.stream), datagrams: &self.datagrams };
         let mut buffers = &self.pool;
         let asked = self.guard.ask();
         let access = asked.as_ref().map(|asked| asked as &dyn Access);
-        let mut cx = Context { now, mailman: &mut mailman, buffers: &mut buffers, functions: &functions, access };
+        let mut cx = Context { now, mailman: &mut mailman, buffers: &mut buffers, functions: &*functions, access };
         act(&mut state.session, &mut cx)
     }
 
@@ -318,7 +315,7 @@ impl<T: Send + 'static> Engine<T> {
         let mut buffers = &self.pool;
         let asked = self.guard.ask();
         let access = asked.as_ref().map(|asked| asked as &dyn Access);
-        let mut cx = Context { now, mailman: &mut mailman, buffers: &mut buffers, functions: &functions, access };
+        let mut cx = Context { now, mailman: &mut mailman, buffers: &mut buffers, functions: &*functions, access };
         let LinkState { session, waiters, notices, .. } = state;
         let receipt = session.receive(&mut cx, bytes, arguments.as_deref_mut());
         let mut step = Step {

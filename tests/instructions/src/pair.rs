@@ -17,7 +17,7 @@ use cara_core::host::secure::Plain;
 use cara_core::services::lease::{Lease, Service};
 use cara_core::services::requests::{CallId, Pending};
 use cara_core::services::unit::{Call, Event, Publication, RequestOptions, Session, SessionConfig, SessionStorage};
-use cara_core::services::{CallHead, Context};
+use cara_core::services::{CallHead, Context, Port};
 use cara_core::storage::{Buffer, Lent, Pool};
 use cara_core::time::{Duration, Instant};
 
@@ -155,9 +155,16 @@ impl Mailman for Pipe {
     }
 }
 
+enum Bench {}
+
+impl Port for Bench {
+    type Storage = Lent;
+    type Cipher = Plain;
+}
+
 struct Side {
     now: Instant,
-    session: Session<Lent, Plain>,
+    session: Session<Bench>,
     functions: FunctionList<Lent, Nothing>,
     pool: Pool<Lent>,
     pipe: Pipe,

@@ -3,6 +3,7 @@
 use core::mem::MaybeUninit;
 
 use cara_core::distribution::datagram;
+use cara_core::distribution::function_list::FunctionList;
 use cara_core::distribution::hello::Hello;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::{Parameters, ParametersView};
@@ -11,10 +12,9 @@ use cara_core::services::lease::{Lease, Service};
 use cara_core::services::publications::Publications;
 use cara_core::services::requests::Requests;
 use cara_core::services::unit::{self, Event, ReplyBlock, Session, SessionConfig, SessionStorage};
-use cara_core::services::{Context, slots_for};
+use cara_core::services::{Context, OwnFunctions, Port, slots_for};
 use cara_core::storage::{Lent, Pool};
 
-use crate::host::AnyMailman;
 use crate::linkage::{drain, keep, unknown, unknown_slice, unknown_text};
 use crate::secure::AnyCipher;
 
@@ -27,8 +27,15 @@ impl Service for Handler {
     }
 }
 
-type AnySession = Session<Lent, AnyCipher>;
-type AnyContext = Context<'static, Lent, AnyMailman, Pool<Lent>, Handler>;
+enum Any {}
+
+impl Port for Any {
+    type Storage = Lent;
+    type Cipher = AnyCipher;
+}
+
+type AnySession = Session<Any>;
+type AnyContext = Context<'static, Any>;
 
 fn session() -> &'static mut AnySession {
     unknown()
@@ -46,6 +53,18 @@ fn parameters() -> &'static mut ParametersView {
 fn taken<T: 'static>() -> Option<T> {
     unknown::<Option<T>>().take()
 }
+
+// What a session is lent, it calls through a table that is not known here.
+entry!(own_functions, {
+    let functions: &dyn OwnFunctions = unknown::<FunctionList<Lent, Handler>>();
+    keep((functions.function(*unknown()).is_some(), functions.generation(*unknown())));
+    if let Ok(function) = functions.lookup(*unknown(), *unknown()) {
+        let service = function.handler;
+        keep((service.begin_lease(*unknown(), *unknown()), service.renew_lease(*unknown(), *unknown())));
+        keep((service.finish_lease(*unknown()), service.expire_lease(*unknown())));
+        service.cut_lease(*unknown());
+    }
+});
 
 entry!(session_made, {
     if let (Some(config), Some(storage)) = (taken::<SessionConfig>(), taken::<SessionStorage<Lent>>()) {

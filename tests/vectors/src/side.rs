@@ -12,7 +12,7 @@ use cara_core::error::{CloseReason, Error};
 use cara_core::host::mailman::{LinkId, Mailman};
 use cara_core::host::secure::Plain;
 use cara_core::services::unit::{Call, Delivery, Event, RequestOptions, Session, SessionConfig, SessionStorage};
-use cara_core::services::{Context, Ticket};
+use cara_core::services::{Context, Port, Ticket};
 use cara_core::storage::Pool;
 use cara_core::time::{Duration, Instant};
 
@@ -53,11 +53,16 @@ impl Mailman for Kept {
     }
 }
 
-type OwnContext<'c> = Context<'c, Boxed, Kept, Pool<Boxed>, ()>;
+enum Vectors {}
+
+impl Port for Vectors {
+    type Storage = Boxed;
+    type Cipher = Plain;
+}
 
 /// One end of a link, with a clock of its own.
 pub(crate) struct Side {
-    session: Session<Boxed, Plain>,
+    session: Session<Vectors>,
     pool: Pool<Boxed>,
     functions: FunctionList<Boxed, ()>,
     node: Node<Boxed>,
@@ -229,7 +234,7 @@ impl Side {
         self.with(|session, cx| session.close(cx, CloseReason::Stopped));
     }
 
-    fn with<R>(&mut self, act: impl FnOnce(&mut Session<Boxed, Plain>, &mut OwnContext<'_>) -> R) -> R {
+    fn with<R>(&mut self, act: impl FnOnce(&mut Session<Vectors>, &mut Context<'_, Vectors>) -> R) -> R {
         let mut cx = Context {
             now: self.now,
             mailman: &mut self.kept,

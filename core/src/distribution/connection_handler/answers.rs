@@ -128,12 +128,7 @@ impl<S: Storage> Node<S> {
         }
     }
 
-    pub(super) fn poll_answers(
-        &mut self,
-        now: Instant,
-        mailman: &mut impl Mailman,
-        authenticator: &impl Authenticator,
-    ) {
+    pub(super) fn poll_answers(&mut self, now: Instant, mailman: &mut dyn Mailman, authenticator: &dyn Authenticator) {
         while let Some(index) = self.answers.single.iter().position(|answer| answer.at <= now) {
             let Answer { to, who, nonce, .. } = self.answers.single.swap_remove(index);
             let send = |datagram: &[u8]| mailman.send_to(to, datagram);
@@ -153,7 +148,7 @@ impl<S: Storage> Node<S> {
     /// `false` where there is no key to sign the answer with.
     fn send_announce(
         &mut self,
-        authenticator: &impl Authenticator,
+        authenticator: &dyn Authenticator,
         nonce: u64,
         to: Option<&Identity>,
         counter: NodeCounter,

@@ -155,7 +155,7 @@ impl<S: Storage> Node<S> {
         }
     }
 
-    pub(super) fn poll_hints(&mut self, now: Instant, mailman: &mut impl Mailman, authenticator: &impl Authenticator) {
+    pub(super) fn poll_hints(&mut self, now: Instant, mailman: &mut dyn Mailman, authenticator: &dyn Authenticator) {
         while let Some((to, who)) = self.hints.take(now) {
             self.ask(to, &who, mailman, authenticator);
             if self.search.next != Instant::FAR_FUTURE {
@@ -178,7 +178,7 @@ impl<S: Storage> Node<S> {
     }
 
     /// Asks one node alone, which answers at once.
-    fn ask(&mut self, to: SocketAddr, who: &Identity, mailman: &mut impl Mailman, authenticator: &impl Authenticator) {
+    fn ask(&mut self, to: SocketAddr, who: &Identity, mailman: &mut dyn Mailman, authenticator: &dyn Authenticator) {
         let Ok(wanted) = Manager::new(who.name(), who.id()) else { return };
         let sent = self.say_who_has(Some(wanted), 0, authenticator, |datagram| mailman.send_to(to, datagram));
         self.counters.add(if sent { NodeCounter::HintsAsked } else { NodeCounter::SendFailed }, 1);

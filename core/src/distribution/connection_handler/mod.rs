@@ -330,8 +330,8 @@ impl<S: Storage> Node<S> {
     pub fn poll(
         &mut self,
         now: Instant,
-        mailman: &mut impl Mailman,
-        authenticator: &impl Authenticator,
+        mailman: &mut dyn Mailman,
+        authenticator: &dyn Authenticator,
     ) -> Option<Action> {
         while let Some((place, task)) = self.table.pop_due(now) {
             let action = match task {
@@ -358,7 +358,7 @@ impl<S: Storage> Node<S> {
         now: Instant,
         from: SocketAddr,
         bytes: &'b mut [u8],
-        authenticator: &impl Authenticator,
+        authenticator: &dyn Authenticator,
     ) -> Sorted<'b> {
         match Datagram::decode(bytes, self.config.fleet, authenticator) {
             Ok(Datagram::Session { link, nonce, .. }) => return self.sort(LinkId(link), nonce, bytes),

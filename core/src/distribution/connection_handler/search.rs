@@ -211,7 +211,7 @@ impl<S: Storage> Node<S> {
         self.search.next = now + pause + mostly_late(&mut self.random, pause);
     }
 
-    pub(super) fn poll_search(&mut self, now: Instant, mailman: &mut impl Mailman, authenticator: &impl Authenticator) {
+    pub(super) fn poll_search(&mut self, now: Instant, mailman: &mut dyn Mailman, authenticator: &dyn Authenticator) {
         if self.search.explicit.take_if(|at| *at <= now).is_some() {
             self.send_who_has(now, mailman, authenticator);
             return;
@@ -237,7 +237,7 @@ impl<S: Storage> Node<S> {
         self.send_who_has(now, mailman, authenticator);
     }
 
-    fn send_who_has(&mut self, now: Instant, mailman: &mut impl Mailman, authenticator: &impl Authenticator) {
+    fn send_who_has(&mut self, now: Instant, mailman: &mut dyn Mailman, authenticator: &dyn Authenticator) {
         self.plan_next(now);
         (self.search.stubborn, self.search.deferred, self.search.waited) = (false, 0, false);
         self.budget.note(now);
@@ -251,7 +251,7 @@ impl<S: Storage> Node<S> {
         &mut self,
         wanted: Option<Manager>,
         expected: u16,
-        authenticator: &impl Authenticator,
+        authenticator: &dyn Authenticator,
         send: impl FnOnce(&[u8]) -> bool,
     ) -> bool {
         let known = self.table.iter().filter(|known| expected > 0 && known.is_joined());

@@ -153,7 +153,7 @@ impl<S: Storage, C: Seal> Link<S, C> {
 
     /// Takes what the port has read. Call it again with the rest, and once with nothing, until it completes nothing:
     /// that call gives the buffer of the last message back.
-    pub fn receive(&mut self, buffers: &mut impl Buffers<S>, bytes: &mut [u8]) -> Result<Received, CloseReason> {
+    pub fn receive(&mut self, buffers: &mut dyn Buffers<S>, bytes: &mut [u8]) -> Result<Received, CloseReason> {
         let available = bytes.len();
         let mut received = Received { consumed: 0, incoming: None, paused: false };
         self.receiver.receive(&mut self.cipher, buffers, bytes, &mut received)?;
@@ -186,8 +186,8 @@ impl<S: Storage, C: Seal> Link<S, C> {
     #[cfg_attr(target_os = "none", inline(never))]
     pub fn send_message(
         &mut self,
-        mailman: &mut impl Mailman,
-        buffers: &mut impl Buffers<S>,
+        mailman: &mut dyn Mailman,
+        buffers: &mut dyn Buffers<S>,
         priority: Priority,
         total: usize,
         hold: bool,
@@ -211,8 +211,8 @@ impl<S: Storage, C: Seal> Link<S, C> {
     /// The same for a short message while nothing waits.
     fn send_at_once(
         &mut self,
-        mailman: &mut impl Mailman,
-        buffers: &mut impl Buffers<S>,
+        mailman: &mut dyn Mailman,
+        buffers: &mut dyn Buffers<S>,
         priority: Priority,
         total: usize,
         write: impl FnOnce(&mut ChunkWriter<'_>),
@@ -261,7 +261,7 @@ impl<S: Storage, C: Seal> Link<S, C> {
     }
 
     /// Writes what the network takes now.
-    pub fn flush(&mut self, mailman: &mut impl Mailman, buffers: &mut impl Buffers<S>) -> Result<(), CloseReason> {
+    pub fn flush(&mut self, mailman: &mut dyn Mailman, buffers: &mut dyn Buffers<S>) -> Result<(), CloseReason> {
         let written = self.sender.flush(self.id, &mut self.cipher, mailman, buffers)?;
         self.counters.add(LinkCounter::BytesSent, written);
         Ok(())
@@ -278,7 +278,7 @@ impl<S: Storage, C: Seal> Link<S, C> {
     }
 
     /// Gives every borrowed buffer back. The link is of no use afterwards.
-    pub fn release(&mut self, buffers: &mut impl Buffers<S>) {
+    pub fn release(&mut self, buffers: &mut dyn Buffers<S>) {
         self.receiver.release(buffers);
         self.sender.release(buffers);
     }

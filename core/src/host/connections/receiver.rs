@@ -92,7 +92,7 @@ impl<S: Storage> Receiver<S> {
     pub(super) fn receive<C: Seal>(
         &mut self,
         cipher: &mut C,
-        buffers: &mut impl Buffers<S>,
+        buffers: &mut dyn Buffers<S>,
         lent: &mut [u8],
         received: &mut Received,
     ) -> Result<(), CloseReason> {
@@ -112,7 +112,7 @@ impl<S: Storage> Receiver<S> {
     fn step<C: Seal>(
         &mut self,
         cipher: &mut C,
-        buffers: &mut impl Buffers<S>,
+        buffers: &mut dyn Buffers<S>,
         lent: &mut [u8],
         received: &mut Received,
     ) -> Result<(), CloseReason> {
@@ -134,7 +134,7 @@ impl<S: Storage> Receiver<S> {
     /// The frame lies whole in the lent bytes: it is opened there.
     fn take_whole(
         &mut self,
-        buffers: &mut impl Buffers<S>,
+        buffers: &mut dyn Buffers<S>,
         length: usize,
         received: &mut Received,
     ) -> Result<Option<(Store, usize, usize)>, CloseReason> {
@@ -151,7 +151,7 @@ impl<S: Storage> Receiver<S> {
     /// The frame came in pieces: it is collected, and opened when it is whole.
     fn take_partial(
         &mut self,
-        buffers: &mut impl Buffers<S>,
+        buffers: &mut dyn Buffers<S>,
         lent: &[u8],
         received: &mut Received,
     ) -> Result<Option<(Store, usize, usize)>, CloseReason> {
@@ -186,11 +186,11 @@ impl<S: Storage> Receiver<S> {
 
     /// A frame that may begin a chunked message needs a buffer before it is opened, since it cannot be closed again.
     /// `false` when one is needed and the pool is empty.
-    fn reserve(&mut self, buffers: &mut impl Buffers<S>, length: usize) -> bool {
+    fn reserve(&mut self, buffers: &mut dyn Buffers<S>, length: usize) -> bool {
         self.assembly.is_some() || length < MINIMUM_CHUNK_BYTES || self.borrow(buffers)
     }
 
-    fn borrow(&mut self, buffers: &mut impl Buffers<S>) -> bool {
+    fn borrow(&mut self, buffers: &mut dyn Buffers<S>) -> bool {
         if self.buffer.is_none() {
             self.buffer = buffers.take();
         }
@@ -349,7 +349,7 @@ impl<S: Storage> Receiver<S> {
         Ok(())
     }
 
-    fn clear_finished(&mut self, buffers: &mut impl Buffers<S>) {
+    fn clear_finished(&mut self, buffers: &mut dyn Buffers<S>) {
         if self.partial.done {
             self.partial = Partial::default();
         }
@@ -357,7 +357,7 @@ impl<S: Storage> Receiver<S> {
         self.give_unused(buffers);
     }
 
-    fn give_unused(&mut self, buffers: &mut impl Buffers<S>) {
+    fn give_unused(&mut self, buffers: &mut dyn Buffers<S>) {
         if self.assembly.is_none()
             && !self.partial.in_buffer
             && let Some(buffer) = self.buffer.take()
@@ -366,7 +366,7 @@ impl<S: Storage> Receiver<S> {
         }
     }
 
-    pub(super) fn release(&mut self, buffers: &mut impl Buffers<S>) {
+    pub(super) fn release(&mut self, buffers: &mut dyn Buffers<S>) {
         self.assembly = None;
         self.partial = Partial::default();
         self.give_unused(buffers);

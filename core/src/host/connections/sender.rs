@@ -75,7 +75,7 @@ impl<S: Storage> Sender<S> {
 
     /// Whether what waits in the lanes is in the way of one more message of `total` bytes: its class's lane is too full,
     /// or the other lanes hold the buffer that it needs.
-    pub(super) fn is_in_the_way(&self, buffers: &mut impl Buffers<S>, priority: Priority, total: usize) -> bool {
+    pub(super) fn is_in_the_way(&self, buffers: &mut dyn Buffers<S>, priority: Priority, total: usize) -> bool {
         match lane_index(priority).and_then(|index| self.lanes.get(index)) {
             Some(Some(lane)) => self.cut.framed_length(total) > lane.room(),
             Some(None) if self.lanes.iter().any(Option::is_some) => match buffers.take_leaving(LEFT_BY_SENDING) {
@@ -91,7 +91,7 @@ impl<S: Storage> Sender<S> {
 
     pub(super) fn accept(
         &mut self,
-        buffers: &mut impl Buffers<S>,
+        buffers: &mut dyn Buffers<S>,
         priority: Priority,
         total: usize,
         write: impl FnOnce(&mut ChunkWriter<'_>),
@@ -125,7 +125,7 @@ impl<S: Storage> Sender<S> {
     /// take it, it waits in its lane, where those of higher classes overtake it. A seal is not taken back.
     pub(super) fn put_back(
         &mut self,
-        buffers: &mut impl Buffers<S>,
+        buffers: &mut dyn Buffers<S>,
         priority: Priority,
         total: usize,
     ) -> Result<(), Error> {
@@ -210,8 +210,8 @@ impl<S: Storage> Sender<S> {
         &mut self,
         id: LinkId,
         cipher: &mut C,
-        mailman: &mut impl Mailman,
-        buffers: &mut impl Buffers<S>,
+        mailman: &mut dyn Mailman,
+        buffers: &mut dyn Buffers<S>,
     ) -> Result<u64, CloseReason> {
         let mut written = 0;
         while self.write_sealed(id, mailman, &mut written)? == Progress::Through {
@@ -231,7 +231,7 @@ impl<S: Storage> Sender<S> {
     fn write_sealed(
         &mut self,
         id: LinkId,
-        mailman: &mut impl Mailman,
+        mailman: &mut dyn Mailman,
         written: &mut u64,
     ) -> Result<Progress, CloseReason> {
         if let Some(Some(lane)) = self.current.and_then(|index| self.lanes.get_mut(index)) {
@@ -288,7 +288,7 @@ impl<S: Storage> Sender<S> {
         unfinished.or_else(|| self.lanes.iter().position(Option::is_some))
     }
 
-    fn give_drained(&mut self, buffers: &mut impl Buffers<S>) {
+    fn give_drained(&mut self, buffers: &mut dyn Buffers<S>) {
         for slot in &mut self.lanes {
             if slot.as_ref().is_some_and(|lane| lane.waiting() == 0)
                 && let Some(lane) = slot.take()
@@ -298,7 +298,7 @@ impl<S: Storage> Sender<S> {
         }
     }
 
-    pub(super) fn release(&mut self, buffers: &mut impl Buffers<S>) {
+    pub(super) fn release(&mut self, buffers: &mut dyn Buffers<S>) {
         for lane in self.lanes.iter_mut().filter_map(Option::take) {
             buffers.give(lane.buffer);
         }
@@ -398,7 +398,7 @@ impl<S: Storage> Lane<S> {
         self.before = (sealed, at_boundary);
     }
 
-    fn write(&mut self, id: LinkId, mailman: &mut impl Mailman, written: &mut u64) -> Result<Progress, CloseReason> {
+    fn write(&mut self, id: LinkId, mailman: &mut dyn Mailman, written: &mut u64) -> Result<Progress, CloseReason> {
         while self.start < self.sealed {
             let piece = self.buffer.get(self.start..self.sealed).unwrap_or(&[]);
             let count = mailman.write(id, &[piece])?;

@@ -11,22 +11,14 @@ use crate::distribution::parameters::ParametersView;
 use crate::error::{Error, Limit, ServiceError};
 use crate::host::connections::LinkCounter;
 use crate::host::frame::ChunkWriter;
-use crate::host::mailman::Mailman;
-use crate::host::secure::Secure;
-use crate::services::Context;
 use crate::services::access::Verb;
 use crate::services::calls::{CallHead, Ticket};
-use crate::services::lease::Service;
-use crate::storage::{Buffers, Storage};
+use crate::services::{Context, Port};
 
-impl<S: Storage, C: Secure> Session<S, C> {
+impl<P: Port> Session<P> {
     /// The next call that waited and may begin now, its arguments in `arguments`. Call it after
     /// [`receive`](Self::receive) is through and after each [`answer`](Self::answer), until it returns `None`.
-    pub fn next_call<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        arguments: &mut ParametersView,
-    ) -> Option<Call> {
+    pub fn next_call(&mut self, cx: &mut Context<'_, P>, arguments: &mut ParametersView) -> Option<Call> {
         while self.phase == Phase::Live {
             if let Ok(call) = self.begin_next(cx, arguments)? {
                 return Some(call);
@@ -36,11 +28,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// The same for emergencies alone, for ports that run those apart from all other calls.
-    pub fn next_emergency<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        arguments: &mut ParametersView,
-    ) -> Option<Call> {
+    pub fn next_emergency(&mut self, cx: &mut Context<'_, P>, arguments: &mut ParametersView) -> Option<Call> {
         while self.has_next_emergency() {
             if let Ok(call) = self.begin_next(cx, arguments)? {
                 return Some(call);
@@ -50,11 +38,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// Begins the next call that may begin, or refuses it; `None` when there is none.
-    fn begin_next<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        arguments: &mut ParametersView,
-    ) -> Option<Result<Call, Error>> {
+    fn begin_next(&mut self, cx: &mut Context<'_, P>, arguments: &mut ParametersView) -> Option<Result<Call, Error>> {
         let (functions, now, access, remote) = (cx.functions, cx.now, cx.access, self.remote.as_ref());
         let (head, read) = self.calls.take_next(cx.buffers, |head, block| {
             if head.deadline <= now {
@@ -91,9 +75,9 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// Begins a call of a function that has these attributes.
-    pub(super) fn begin<M: Mailman, B: Buffers<S>, H: Service>(
+    pub(super) fn begin(
         &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
+        cx: &mut Context<'_, P>,
         head: CallHead,
         attributes: &Attributes,
     ) -> Result<Call, Error> {
@@ -117,9 +101,9 @@ impl<S: Storage, C: Secure> Session<S, C> {
 
     /// Answers a call. [`Error::Full`] when the answer cannot be kept now: the call stays open, to be answered again
     /// when the stream has taken bytes. A call that was answered, or whose link has ended, is passed over.
-    pub fn answer<M: Mailman, B: Buffers<S>, H: Service>(
+    pub fn answer(
         &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
+        cx: &mut Context<'_, P>,
         ticket: Ticket,
         result: Result<&ParametersView, Error>,
     ) -> Result<(), Error> {
@@ -150,9 +134,9 @@ impl<S: Storage, C: Secure> Session<S, C> {
         }
     }
 
-    fn send_results<M: Mailman, B: Buffers<S>, H: Service>(
+    fn send_results(
         &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
+        cx: &mut Context<'_, P>,
         head: &CallHead,
         results: &ParametersView,
     ) -> Result<(), Error> {
@@ -182,9 +166,9 @@ impl<S: Storage, C: Secure> Session<S, C> {
         }
     }
 
-    fn send_error<M: Mailman, B: Buffers<S>, H: Service>(
+    fn send_error(
         &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
+        cx: &mut Context<'_, P>,
         id: u32,
         priority: Priority,
         wants_reply: bool,
@@ -201,9 +185,9 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// One piece of code whatever is written, which is a third of what it would be for each kind.
-    pub(super) fn send<M: Mailman, B: Buffers<S>, H: Service>(
+    pub(super) fn send(
         &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
+        cx: &mut Context<'_, P>,
         priority: Priority,
         total: usize,
         write: &mut dyn FnMut(&mut ChunkWriter<'_>),
@@ -212,9 +196,9 @@ impl<S: Storage, C: Secure> Session<S, C> {
         self.after_sending(cx, false, sent)
     }
 
-    pub(super) fn refuse_request<M: Mailman, B: Buffers<S>, H: Service>(
+    pub(super) fn refuse_request(
         &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
+        cx: &mut Context<'_, P>,
         id: u32,
         slot: Slot,
         priority: Priority,

@@ -8,23 +8,21 @@ use crate::distribution::function_list::{Generation, Slot};
 use crate::distribution::message::{Control, Release, Renewal};
 use crate::error::{Error, Limit};
 use crate::host::connections::LinkCounter;
-use crate::host::mailman::Mailman;
-use crate::host::secure::Secure;
-use crate::services::Context;
 use crate::services::calls::CallHead;
 use crate::services::lease::{Granted, Lease, LeaseEnd, Order, Service};
-use crate::storage::{Buffers, Storage, take_at};
+use crate::services::{Context, Port};
+use crate::storage::take_at;
 use crate::time::{Duration, Instant};
 
 /// Ends of leases that the peer is still to be told. One that finds no place is told when the peer renews it.
 pub(super) type Ends = heapless::Vec<(u32, LeaseEnd), LEASES>;
 
-impl<S: Storage, C: Secure> Session<S, C> {
+impl<P: Port> Session<P> {
     /// A call begins the lease of its function, as of when it was made. It takes the place of an earlier call's at once,
     /// but not that of a lease that is dead: its hook comes first.
-    pub(super) fn grant<M: Mailman, B: Buffers<S>, H: Service>(
+    pub(super) fn grant(
         &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
+        cx: &mut Context<'_, P>,
         head: &CallHead,
         length: Duration,
     ) -> Result<Option<Order>, Error> {
@@ -65,11 +63,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// The caller still wants a call: its lease goes on, as of when the renewal was made.
-    pub(super) fn renewed<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        renewal: &Renewal,
-    ) {
+    pub(super) fn renewed(&mut self, cx: &mut Context<'_, P>, renewal: &Renewal) {
         let Some(index) = self.granted.iter().position(|granted| granted.call == renewal.call) else {
             self.link.counters.add(LinkCounter::RenewalsIgnored, 1);
             // A call that is on its way or waits for its turn has no lease yet.
@@ -93,12 +87,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         }
     }
 
-    fn prolong<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        index: usize,
-        end: Instant,
-    ) {
+    fn prolong(&mut self, cx: &mut Context<'_, P>, index: usize, end: Instant) {
         let Some(granted) = self.granted.get_mut(index) else { return };
         let service = service_of(cx, granted.slot, granted.generation);
         if service.is_some_and(|service| granted.order.is_none_or(|order| service.renew_lease(order, end))) {
@@ -111,7 +100,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// The application has finished what calls of the leased function started: no renewal keeps it alive, no hook runs.
-    pub fn end_lease<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>, slot: Slot) {
+    pub fn end_lease(&mut self, cx: &mut Context<'_, P>, slot: Slot) {
         let index = self.granted.iter().position(|granted| granted.slot == slot);
         if let Some(granted) = index.and_then(|index| take_at(&mut self.granted, index)) {
             let service = service_of(cx, granted.slot, granted.generation);
@@ -123,18 +112,14 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// A call has failed here: the lease that it holds, if it does, expires at once.
-    pub(super) fn cut_call<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        call: u32,
-    ) {
+    pub(super) fn cut_call(&mut self, cx: &mut Context<'_, P>, call: u32) {
         if let Some(index) = self.granted.iter().position(|granted| granted.call == call) {
             self.cut_lease(cx, index);
         }
     }
 
     /// Ends the leases of services that are gone: their callers are told.
-    pub(super) fn cut_gone<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+    pub(super) fn cut_gone(&mut self, cx: &mut Context<'_, P>) {
         for index in 0..self.granted.len() {
             let granted = self.granted.get(index);
             if granted.is_some_and(|granted| service_of(cx, granted.slot, granted.generation).is_none()) {
@@ -144,11 +129,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// Lets a lease expire at once.
-    pub(super) fn cut_lease<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        index: usize,
-    ) {
+    pub(super) fn cut_lease(&mut self, cx: &mut Context<'_, P>, index: usize) {
         let Some(granted) = self.granted.get_mut(index) else { return };
         granted.end = cx.now;
         self.timers.lease = cx.now;
@@ -160,42 +141,26 @@ impl<S: Storage, C: Secure> Session<S, C> {
 
     /// The caller gave up a call: its lease ends now, as if it had expired. If it waits for its turn, or is still on its
     /// way, it does not begin.
-    pub(super) fn released<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        release: Release,
-    ) -> Outcome {
+    pub(super) fn released(&mut self, cx: &mut Context<'_, P>, release: Release) -> Outcome {
         let Release { call, class } = release;
         self.calls.give_up(class, call);
         self.end_released(cx, |granted| granted.call == call)
     }
 
     /// The same for all calls of a function up to `id`.
-    pub(super) fn released_all<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        slot: Slot,
-        id: u32,
-    ) -> Outcome {
+    pub(super) fn released_all(&mut self, cx: &mut Context<'_, P>, slot: Slot, id: u32) -> Outcome {
         self.publishing.release(slot, id);
         self.end_released(cx, |granted| granted.slot == slot && granted.call <= id)
     }
 
-    fn end_released<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        is_released: impl Fn(&Granted) -> bool,
-    ) -> Outcome {
+    fn end_released(&mut self, cx: &mut Context<'_, P>, is_released: impl Fn(&Granted) -> bool) -> Outcome {
         let index = self.granted.iter().position(is_released);
         let Some(granted) = index.and_then(|index| take_at(&mut self.granted, index)) else { return Outcome::Nothing };
         if expire_granted(cx, &granted) { Event::LeaseExpired(granted.slot).into() } else { Outcome::Nothing }
     }
 
     /// Ends a lease that is due; its function, whose hook is to run.
-    pub(super) fn expire_lease<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-    ) -> Option<Slot> {
+    pub(super) fn expire_lease(&mut self, cx: &mut Context<'_, P>) -> Option<Slot> {
         let now = cx.now;
         let due = |granted: &Granted| granted.end <= now;
         while let Some(granted) = self.granted.iter().position(due).and_then(|index| take_at(&mut self.granted, index))
@@ -212,19 +177,14 @@ impl<S: Storage, C: Secure> Session<S, C> {
         None
     }
 
-    fn tell_end<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        call: u32,
-        why: LeaseEnd,
-    ) {
+    fn tell_end(&mut self, cx: &mut Context<'_, P>, call: u32, why: LeaseEnd) {
         if !self.send_control(cx, &Control::LeaseEnded { call, why }) {
             let _ = self.ends.push((call, why));
         }
     }
 
     /// Tells the peer of ends that there was no room for.
-    pub(super) fn send_ends<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+    pub(super) fn send_ends(&mut self, cx: &mut Context<'_, P>) {
         while let Some(&(call, why)) = self.ends.last()
             && self.send_control(cx, &Control::LeaseEnded { call, why })
         {
@@ -233,20 +193,13 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 }
 
-fn service_of<'c, S: Storage, M: Mailman, B: Buffers<S>, H: Service>(
-    cx: &Context<'c, S, M, B, H>,
-    slot: Slot,
-    generation: Generation,
-) -> Option<&'c H> {
+fn service_of<'c, P: Port>(cx: &Context<'c, P>, slot: Slot, generation: Generation) -> Option<&'c dyn Service> {
     cx.functions.lookup(slot, generation).ok().map(|function| function.handler)
 }
 
 /// Whether the safe hook is to run: not when a call of another peer holds the lease now, whose motion goes on, and not when
 /// the service is gone, with which its hook has run.
-pub(super) fn expire_granted<S: Storage, M: Mailman, B: Buffers<S>, H: Service>(
-    cx: &Context<'_, S, M, B, H>,
-    granted: &Granted,
-) -> bool {
+pub(super) fn expire_granted<P: Port>(cx: &Context<'_, P>, granted: &Granted) -> bool {
     let service = service_of(cx, granted.slot, granted.generation);
     service.is_some_and(|service| granted.order.is_none_or(|order| service.expire_lease(order)))
 }

@@ -10,12 +10,10 @@ use crate::distribution::message::{Release, Renewal, RequestHeader, SessionBody}
 use crate::error::{Error, Limit};
 use crate::host::connections::LinkCounter;
 use crate::host::frame::Frame;
-use crate::host::mailman::Mailman;
-use crate::host::secure::Secure;
-use crate::services::Context;
-use crate::services::lease::{Held, Service};
+use crate::services::lease::Held;
 use crate::services::requests::{CallId, Pending};
-use crate::storage::{Buffers, Storage, take_at};
+use crate::services::{Context, Port};
+use crate::storage::take_at;
 use crate::time::{Duration, Instant};
 
 /// A held lease is renewed this often within its length, so that lost renewals do not end it.
@@ -29,7 +27,7 @@ const RETRY: Duration = Duration::from_millis(20);
 /// Releases of whole functions that are still to be sent in the stream: the function, and the newest call.
 pub(super) type Releases = heapless::Vec<(Slot, CallId), LEASES>;
 
-impl<S: Storage, C: Secure> Session<S, C> {
+impl<P: Port> Session<P> {
     /// Whether this unit renews the lease of a call.
     pub fn holds(&self, call: CallId) -> bool {
         self.held.iter().any(|held| held.call == call && !held.release_unsent)
@@ -48,9 +46,9 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// Renews the lease that a call has begun, or will begin, from here on.
-    pub(super) fn hold_lease<M: Mailman, B: Buffers<S>, H: Service>(
+    pub(super) fn hold_lease(
         &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
+        cx: &mut Context<'_, P>,
         header: &RequestHeader,
         class: Priority,
         lease: Duration,
@@ -68,7 +66,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         self.timers.renewal = self.timers.renewal.min(next);
     }
 
-    pub(super) fn renew_leases<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+    pub(super) fn renew_leases(&mut self, cx: &mut Context<'_, P>) {
         let (stamp, since) = self.clock.tell(cx.now);
         let now = cx.now;
         for index in 0..self.held.len() {
@@ -95,7 +93,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     /// The caller does not want a call any more: its reply, should it still come, counts as late, and the lease that it
     /// holds, or would begin, is released. Other calls are untouched. Also for a call that has been answered and holds a
     /// lease.
-    pub fn cancel<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>, id: CallId) {
+    pub fn cancel(&mut self, cx: &mut Context<'_, P>, id: CallId) {
         let pending = self.requests.close(id);
         if let Some(pending) = &pending {
             // Its caller may have noticed the time-out before this session was polled.
@@ -107,12 +105,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// Releases a call that has failed or was cancelled. `pending` is what was known of it while it waited for its reply.
-    pub(super) fn release_call<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        id: CallId,
-        pending: Option<Pending>,
-    ) {
+    pub(super) fn release_call(&mut self, cx: &mut Context<'_, P>, id: CallId, pending: Option<Pending>) {
         let held = self.stop_renewing(id);
         let waited = pending.and_then(|pending| pending.leased);
         let Some(class) = held.map(|held| held.class).or(waited) else { return };
@@ -130,11 +123,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     /// Releases all calls of a function of the peer, those that are on their way as well: what they started stops.
     ///
     /// [`Error::Full`] where the peer can be told in no way now: nothing is renewed any more, and it may be tried again.
-    pub fn release<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        slot: Slot,
-    ) -> Result<(), Error> {
+    pub fn release(&mut self, cx: &mut Context<'_, P>, slot: Slot) -> Result<(), Error> {
         if self.phase != Phase::Live {
             return Err(Error::NotConnected);
         }
@@ -152,7 +141,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// Sends the releases that there was no room for, as far as there is now.
-    pub(super) fn send_releases<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+    pub(super) fn send_releases(&mut self, cx: &mut Context<'_, P>) {
         if self.timers.release == Instant::FAR_FUTURE {
             return;
         }
@@ -178,30 +167,16 @@ impl<S: Storage, C: Secure> Session<S, C> {
         self.timers.release = Instant::FAR_FUTURE;
     }
 
-    fn send_release<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        id: CallId,
-        class: Priority,
-    ) -> bool {
+    fn send_release(&mut self, cx: &mut Context<'_, P>, id: CallId, class: Priority) -> bool {
         self.send_both_ways(cx, &SessionBody::release(&Release { call: id.0, class }))
     }
 
-    fn send_release_all<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        slot: Slot,
-        id: CallId,
-    ) -> bool {
+    fn send_release_all(&mut self, cx: &mut Context<'_, P>, slot: Slot, id: CallId) -> bool {
         self.send_both_ways(cx, &SessionBody::release_all(slot, id.0))
     }
 
     /// As a datagram and in the stream; `false` when the stream has no room.
-    fn send_both_ways<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        body: &[u8],
-    ) -> bool {
+    fn send_both_ways(&mut self, cx: &mut Context<'_, P>, body: &[u8]) -> bool {
         self.send_datagram(cx, body, &[]);
         let kept = self.link.send_frame(&Frame::Session(body));
         self.flush(cx);

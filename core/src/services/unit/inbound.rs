@@ -16,13 +16,12 @@ use crate::distribution::{block, datagram};
 use crate::error::{CloseReason, Error, Refusal};
 use crate::host::connections::{Incoming, LinkCounter, Place};
 use crate::host::frame::Frame;
-use crate::host::mailman::Mailman;
 use crate::host::secure::{Secure, Unopened};
-use crate::services::Context;
 use crate::services::calls::{CallHead, Seen};
 use crate::services::lease::Service;
 use crate::services::requests::CallId;
-use crate::storage::{Buffers, LEFT_BY_WAITING, Storage};
+use crate::services::{Context, Port};
+use crate::storage::LEFT_BY_WAITING;
 
 /// Result of [`Session::receive`].
 #[derive(Debug)]
@@ -77,16 +76,16 @@ impl From<Event<'static>> for Outcome {
     }
 }
 
-impl<S: Storage, C: Secure> Session<S, C> {
+impl<P: Port> Session<P> {
     /// Takes bytes that the port has read from the stream. Call it again with the rest, and finally with nothing, until
     /// it consumes nothing and returns no event.
     ///
     /// The arguments of a call that may run at once are put into `arguments`; without them, or when more bytes follow
     /// that must be looked at first, the call waits for [`next_call`](Self::next_call). Nothing that follows comes before
     /// an emergency, and one alone has a place to wait: it begins at once.
-    pub fn receive<'b, M: Mailman, B: Buffers<S>, H: Service>(
+    pub fn receive<'b>(
         &'b mut self,
-        cx: &mut Context<'_, S, M, B, H>,
+        cx: &mut Context<'_, P>,
         lent: &'b mut [u8],
         arguments: Option<&mut ParametersView>,
     ) -> Receipt<'b> {
@@ -118,9 +117,9 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// Takes the body of a session datagram, which the node has found to be this link's. It is opened where it is.
-    pub fn datagram<M: Mailman, B: Buffers<S>, H: Service>(
+    pub fn datagram(
         &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
+        cx: &mut Context<'_, P>,
         from: SocketAddr,
         nonce: u64,
         body: &mut [u8],
@@ -159,9 +158,9 @@ impl<S: Storage, C: Secure> Session<S, C> {
         }
     }
 
-    fn digest<M: Mailman, B: Buffers<S>, H: Service>(
+    fn digest(
         &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
+        cx: &mut Context<'_, P>,
         incoming: Incoming,
         lent: &[u8],
         arguments: Option<&mut ParametersView>,
@@ -203,12 +202,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         }
     }
 
-    fn session_body<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        place: Place,
-        lent: &[u8],
-    ) -> Outcome {
+    fn session_body(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8]) -> Outcome {
         match SessionBody::decode(self.link.view(place, lent)) {
             Some(SessionBody::KeepAlive { stamp }) => {
                 self.clock.hear(cx.now, stamp);
@@ -249,9 +243,9 @@ impl<S: Storage, C: Secure> Session<S, C> {
         Outcome::Nothing
     }
 
-    fn message_arrived<M: Mailman, B: Buffers<S>, H: Service>(
+    fn message_arrived(
         &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
+        cx: &mut Context<'_, P>,
         priority: Priority,
         place: Place,
         lent: &[u8],
@@ -277,13 +271,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         }
     }
 
-    fn reply_arrived<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        id: CallId,
-        error: Option<Error>,
-        block: Place,
-    ) -> Outcome {
+    fn reply_arrived(&mut self, cx: &mut Context<'_, P>, id: CallId, error: Option<Error>, block: Place) -> Outcome {
         let Some(pending) = self.requests.close(id) else {
             self.link.counters.add(LinkCounter::RepliesLate, 1);
             return Outcome::Nothing;
@@ -297,12 +285,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         }
     }
 
-    fn control_arrived<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        place: Place,
-        lent: &[u8],
-    ) -> Outcome {
+    fn control_arrived(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8]) -> Outcome {
         let Some(Message::Control(control)) = Message::decode(self.link.view(place, lent)) else {
             return Outcome::Nothing;
         };
@@ -351,9 +334,9 @@ impl<S: Storage, C: Secure> Session<S, C> {
         }
     }
 
-    fn request_arrived<M: Mailman, B: Buffers<S>, H: Service>(
+    fn request_arrived(
         &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
+        cx: &mut Context<'_, P>,
         priority: Priority,
         header: &RequestHeader,
         block: Place,
@@ -394,15 +377,15 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// Everything that can be said of a request without looking at its arguments.
-    fn check_request<'f, M: Mailman, B: Buffers<S>, H: Service>(
+    fn check_request<'f>(
         &mut self,
-        cx: &Context<'_, S, M, B, H>,
+        cx: &Context<'_, P>,
         priority: Priority,
         header: &RequestHeader,
         seen: Seen,
         length: usize,
-        function: Result<Function<'f, H>, Error>,
-    ) -> Result<(CallHead, Function<'f, H>), Error> {
+        function: Result<Function<'f, dyn Service>, Error>,
+    ) -> Result<(CallHead, Function<'f, dyn Service>), Error> {
         if seen == Seen::TooOld {
             return Err(Error::Stale);
         }

@@ -3,13 +3,13 @@
 
 use super::publishing::Publication;
 use super::{Entry, Pending, Session};
-use crate::host::secure::Secure;
+use crate::services::Port;
 use crate::storage::Storage;
 
 /// A peer's list: one entry per function, and the bytes of their signatures.
 pub type ListSlices<S> = (<S as Storage>::Slice<Entry>, <S as Storage>::Slice<u8>);
 
-impl<S: Storage, C: Secure> Session<S, C> {
+impl<P: Port> Session<P> {
     /// How many calls of this unit may be in flight.
     pub fn call_slots(&self) -> usize {
         self.requests.slots()
@@ -17,13 +17,16 @@ impl<S: Storage, C: Secure> Session<S, C> {
 
     /// Lends more slots for calls of this unit, a multiple of those before. Returns the slots that are not needed any
     /// more: the new ones if they are no such multiple.
-    pub fn lend_calls(&mut self, pending: S::Slice<Option<Pending>>) -> S::Slice<Option<Pending>> {
+    pub fn lend_calls(
+        &mut self,
+        pending: <P::Storage as Storage>::Slice<Option<Pending>>,
+    ) -> <P::Storage as Storage>::Slice<Option<Pending>> {
         self.requests.grow(pending)
     }
 
     /// Lends more room for the peer's list; functions that were skipped before stay so until the peer tells them again.
     /// Returns the slices that are not needed any more: the new ones if one of them is shorter than before.
-    pub fn lend_functions(&mut self, (entries, bytes): ListSlices<S>) -> ListSlices<S> {
+    pub fn lend_functions(&mut self, (entries, bytes): ListSlices<P::Storage>) -> ListSlices<P::Storage> {
         self.theirs.grow(entries, bytes)
     }
 
@@ -34,7 +37,10 @@ impl<S: Storage, C: Secure> Session<S, C> {
 
     /// Lends more slots for functions of this unit's own list. Returns the slots that are not needed any more: the new
     /// ones if they are fewer.
-    pub fn lend_publications(&mut self, publications: S::Slice<Publication>) -> S::Slice<Publication> {
+    pub fn lend_publications(
+        &mut self,
+        publications: <P::Storage as Storage>::Slice<Publication>,
+    ) -> <P::Storage as Storage>::Slice<Publication> {
         self.publishing.grow(publications)
     }
 }

@@ -47,12 +47,12 @@ use crate::distribution::message::SessionBody;
 use crate::error::{CloseReason, Error, Refusal};
 use crate::host::connections::{Link, LinkCounter, Liveness};
 use crate::host::frame::{Frame, HEADER_BYTES};
-use crate::host::mailman::{LinkId, Mailman};
+use crate::host::mailman::LinkId;
 use crate::host::secure::Secure;
-use crate::services::Context;
 use crate::services::calls::{CallHead, Calls, Ticket};
-use crate::services::lease::{Granted, Held, LeaseEnd, Order, Service};
+use crate::services::lease::{Granted, Held, LeaseEnd, Order};
 use crate::services::requests::{CallId, Pending, Requests};
+use crate::services::{Context, Port};
 use crate::storage::{Buffers, Storage};
 use crate::time::{Duration, Instant};
 use timing::{PeerClock, Timers};
@@ -190,8 +190,8 @@ struct Remote {
 }
 
 /// One link to one peer.
-pub struct Session<S: Storage, C: Secure> {
-    link: Link<S, C>,
+pub struct Session<P: Port> {
+    link: Link<P::Storage, P::Cipher>,
     phase: Phase,
     dialed: bool,
     local: Hello,
@@ -205,19 +205,19 @@ pub struct Session<S: Storage, C: Secure> {
     clock: PeerClock,
     timers: Timers,
     renewal: renewing::Renewal,
-    requests: Requests<S>,
-    calls: Calls<S>,
-    publishing: publishing::Publishing<S>,
-    theirs: TheirFunctionList<S>,
+    requests: Requests<P::Storage>,
+    calls: Calls<P::Storage>,
+    publishing: publishing::Publishing<P::Storage>,
+    theirs: TheirFunctionList<P::Storage>,
     granted: heapless::Vec<Granted, LEASES>,
     ends: granting::Ends,
     held: heapless::Vec<Held, LEASES>,
     releases: holding::Releases,
 }
 
-impl<S: Storage, C: Secure> Session<S, C> {
+impl<P: Port> Session<P> {
     /// A session on a link that is being opened or was accepted.
-    pub fn new(now: Instant, config: SessionConfig, cipher: C, storage: SessionStorage<S>) -> Self {
+    pub fn new(now: Instant, config: SessionConfig, cipher: P::Cipher, storage: SessionStorage<P::Storage>) -> Self {
         let SessionConfig { link, dialed, address, local, constraints } = config;
         let chunk_limit = usize::from(constraints.chunk_size);
         debug_assert!(storage.small.len() >= LINK_BUFFER_BYTES);
@@ -254,7 +254,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
 
     /// The slices that the session lived in, for the next one: so a port without an allocator opens link after link.
     /// For a session that has ended; of one that has not, what is in flight is forgotten without a word.
-    pub fn into_storage<B: Buffers<S>>(mut self, buffers: &mut B) -> SessionStorage<S> {
+    pub fn into_storage(mut self, buffers: &mut dyn Buffers<P::Storage>) -> SessionStorage<P::Storage> {
         self.link.release(buffers);
         self.calls.release(buffers);
         let (their_functions, their_signatures) = self.theirs.into_slices();
@@ -325,7 +325,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// What the peer has published to this unit.
-    pub const fn their_function_list(&self) -> &TheirFunctionList<S> {
+    pub const fn their_function_list(&self) -> &TheirFunctionList<P::Storage> {
         &self.theirs
     }
 
@@ -356,7 +356,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// The connection is open: the one who dialed introduces itself first.
-    pub fn connected<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+    pub fn connected(&mut self, cx: &mut Context<'_, P>) {
         self.phase = Phase::AwaitingHello { until: cx.now + HELLO_TIMEOUT };
         if self.dialed {
             self.send_hello(cx);
@@ -364,7 +364,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// The node takes the peer. The link is live from here on.
-    pub fn accept<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+    pub fn accept(&mut self, cx: &mut Context<'_, P>) {
         if self.phase != Phase::Deciding {
             return;
         }
@@ -381,11 +381,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// The node does not take the peer, which is told why.
-    pub fn refuse<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        refusal: Refusal,
-    ) {
+    pub fn refuse(&mut self, cx: &mut Context<'_, P>, refusal: Refusal) {
         match refusal {
             Refusal::NoKey => {
                 // Whoever tries identities does not learn for which of them there are keys.
@@ -398,11 +394,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// Ends the link in an orderly way; [`poll`](Self::poll) reports what was in flight.
-    pub fn close<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        reason: CloseReason,
-    ) {
+    pub fn close(&mut self, cx: &mut Context<'_, P>, reason: CloseReason) {
         if matches!(reason, CloseReason::Protocol | CloseReason::Oversize) {
             self.link.counters.add(LinkCounter::FramesRefused, 1);
         }
@@ -416,7 +408,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// Asks the peer of a live link for a sign of life; it comes as [`Event::Answered`].
-    pub fn challenge<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+    pub fn challenge(&mut self, cx: &mut Context<'_, P>) {
         if self.phase == Phase::Live {
             self.challenged = true;
             self.send_ping(cx.now);
@@ -428,7 +420,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// The stream takes bytes again.
-    pub fn writable<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+    pub fn writable(&mut self, cx: &mut Context<'_, P>) {
         self.flush(cx);
         self.pump_renewal(cx);
         self.send_releases(cx);
@@ -436,18 +428,14 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// Changes the limits of this unit; the peer is told.
-    pub fn set_constraints<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        constraints: Constraints,
-    ) {
+    pub fn set_constraints(&mut self, cx: &mut Context<'_, P>, constraints: Constraints) {
         self.constraints = constraints;
         self.link.set_message_limit(message_limit(&constraints));
         self.publishing.tell_limits();
         self.pump(cx);
     }
 
-    fn send_hello<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+    fn send_hello(&mut self, cx: &mut Context<'_, P>) {
         self.local.stamp = cx.now.as_micros();
         let mut bytes = [0; HELLO_BYTES];
         let mode = self.mode();
@@ -468,7 +456,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// A last frame, behind what is being written, as far as the network takes it now.
-    fn farewell<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>, frame: &Frame<'_>) {
+    fn farewell(&mut self, cx: &mut Context<'_, P>, frame: &Frame<'_>) {
         if !matches!(self.phase, Phase::Ending(_) | Phase::Ended) {
             // What was accepted goes first: a frame would overtake it.
             let _ = self.link.flush(cx.mailman, cx.buffers);
@@ -477,7 +465,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         }
     }
 
-    fn flush<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+    fn flush(&mut self, cx: &mut Context<'_, P>) {
         self.timers.gathered = Instant::FAR_FUTURE;
         if let Err(reason) = self.link.flush(cx.mailman, cx.buffers) {
             self.end(reason);

@@ -8,12 +8,8 @@ use crate::distribution::message::{REQUEST_BYTES, RequestHeader, SessionBody};
 use crate::distribution::parameters::ParametersView;
 use crate::error::{CloseReason, Error};
 use crate::host::connections::LinkCounter;
-use crate::host::mailman::Mailman;
-use crate::host::secure::Secure;
-use crate::services::Context;
-use crate::services::lease::Service;
 use crate::services::requests::CallId;
-use crate::storage::{Buffers, Storage};
+use crate::services::{Context, Port};
 use crate::time::{Duration, Instant};
 
 /// Gathered one-way messages go out when there are this many bytes of them.
@@ -57,16 +53,16 @@ struct Checked {
     lease: Option<Duration>,
 }
 
-impl<S: Storage, C: Secure> Session<S, C> {
+impl<P: Port> Session<P> {
     /// Requests `function` of the peer. With `wants_reply`, its end comes as [`Event::Reply`](super::Event::Reply)
     /// under the returned id; without, only a failure comes back.
     ///
     /// Nothing is sent on an error: [`Error::UnknownFunction`], [`Error::MissingArgument`], [`Error::WrongType`],
     /// [`Error::WrongSize`], [`Error::ResultWouldNotFit`], [`Error::TooLarge`], [`Error::TooSoon`], [`Error::Full`],
     /// [`Error::NotConnected`].
-    pub fn request<M: Mailman, B: Buffers<S>, H: Service>(
+    pub fn request(
         &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
+        cx: &mut Context<'_, P>,
         function: &str,
         parameters: &ParametersView,
         options: &RequestOptions,
@@ -80,9 +76,9 @@ impl<S: Storage, C: Secure> Session<S, C> {
         result
     }
 
-    fn try_request<M: Mailman, B: Buffers<S>, H: Service>(
+    fn try_request(
         &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
+        cx: &mut Context<'_, P>,
         function: &str,
         parameters: &ParametersView,
         options: &RequestOptions,
@@ -108,9 +104,9 @@ impl<S: Storage, C: Secure> Session<S, C> {
         Ok(id)
     }
 
-    fn check<M: Mailman, B: Buffers<S>, H: Service>(
+    fn check(
         &self,
-        cx: &Context<'_, S, M, B, H>,
+        cx: &Context<'_, P>,
         function: &str,
         parameters: &ParametersView,
         options: &RequestOptions,
@@ -160,12 +156,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         if length > limit { Err(Error::TooLarge { limit: limit as u32 }) } else { Ok(()) }
     }
 
-    fn take_id<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        checked: &Checked,
-        wants_reply: bool,
-    ) -> Result<CallId, Error> {
+    fn take_id(&mut self, cx: &mut Context<'_, P>, checked: &Checked, wants_reply: bool) -> Result<CallId, Error> {
         let header = &checked.header;
         let id = if wants_reply {
             let leased = checked.lease.map(|_| checked.priority);
@@ -179,9 +170,9 @@ impl<S: Storage, C: Secure> Session<S, C> {
         id.ok_or(Error::Closed(CloseReason::Exhausted))
     }
 
-    fn send_reliable<M: Mailman, B: Buffers<S>, H: Service>(
+    fn send_reliable(
         &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
+        cx: &mut Context<'_, P>,
         checked: &Checked,
         parameters: &ParametersView,
     ) -> Result<(), Error> {
@@ -204,9 +195,9 @@ impl<S: Storage, C: Secure> Session<S, C> {
     /// What an attempt to send means for the messages that gather. A message that is refused leaves them where they
     /// were: they go out now, because nothing else may come to take them along, and they hold the buffer that the next
     /// attempt needs.
-    pub(super) fn after_sending<M: Mailman, B: Buffers<S>, H: Service>(
+    pub(super) fn after_sending(
         &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
+        cx: &mut Context<'_, P>,
         hold: bool,
         sent: Result<(), Error>,
     ) -> Result<(), Error> {
@@ -228,9 +219,9 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// The second copy of an emergency; at-most-once removes the double.
-    fn send_emergency_datagram<M: Mailman, B: Buffers<S>, H: Service>(
+    fn send_emergency_datagram(
         &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
+        cx: &mut Context<'_, P>,
         header: &RequestHeader,
         parameters: &ParametersView,
     ) {
@@ -241,9 +232,9 @@ impl<S: Storage, C: Secure> Session<S, C> {
         self.send_datagram(cx, &prefix, message.get(..length).unwrap_or(&[]));
     }
 
-    fn send_best_effort<M: Mailman, B: Buffers<S>, H: Service>(
+    fn send_best_effort(
         &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
+        cx: &mut Context<'_, P>,
         checked: &Checked,
         parameters: &ParametersView,
     ) -> Result<(), Error> {
@@ -256,7 +247,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// Writes what has gathered now.
-    pub fn flush_gathered<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+    pub fn flush_gathered(&mut self, cx: &mut Context<'_, P>) {
         self.flush(cx);
     }
 }

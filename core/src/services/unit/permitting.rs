@@ -5,12 +5,9 @@ use super::{Remote, Session};
 use crate::distribution::function::Signature;
 use crate::distribution::function_list::{Function, Slot};
 use crate::error::Error;
-use crate::host::mailman::Mailman;
-use crate::host::secure::Secure;
-use crate::services::Context;
 use crate::services::access::{Access, Decision, Principal, Verb};
 use crate::services::lease::Service;
-use crate::storage::{Buffers, Storage};
+use crate::services::{Context, Port};
 
 /// What the table says about the peer; without a table everything is allowed.
 pub(super) fn decide(access: Option<&dyn Access>, remote: Option<&Remote>, function: &str, verb: Verb) -> Decision {
@@ -21,11 +18,11 @@ pub(super) fn decide(access: Option<&dyn Access>, remote: Option<&Remote>, funct
     }
 }
 
-impl<S: Storage, C: Secure> Session<S, C> {
+impl<P: Port> Session<P> {
     /// The access table of the context is another one than before: the peer is told what it may see from here on,
     /// leases end that it may not hold any more, and of what it has published this unit sees what it may. For a live link; before that, what is published is under the new table anyway.
     /// Returns the serial that comes back with [`Event::Acknowledged`](super::Event::Acknowledged).
-    pub fn access_changed<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) -> u32 {
+    pub fn access_changed(&mut self, cx: &mut Context<'_, P>) -> u32 {
         self.publishing.fill_buckets();
         self.cut_forbidden_leases(cx);
         let remote = self.remote.as_ref();
@@ -33,7 +30,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         self.end_of_changes(cx)
     }
 
-    fn cut_forbidden_leases<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+    fn cut_forbidden_leases(&mut self, cx: &mut Context<'_, P>) {
         for index in 0..self.granted.len() {
             let Some(slot) = self.granted.get(index).map(|granted| granted.slot) else { return };
             if !self.may(cx, slot, Verb::Call) {
@@ -43,24 +40,20 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// Whether the peer sees a function: one that it may call, or list.
-    pub(super) fn may_see<M: Mailman, B: Buffers<S>, H: Service>(
-        &self,
-        cx: &Context<'_, S, M, B, H>,
-        slot: Slot,
-    ) -> bool {
+    pub(super) fn may_see(&self, cx: &Context<'_, P>, slot: Slot) -> bool {
         cx.access.is_none() || self.may(cx, slot, Verb::Call) || self.may(cx, slot, Verb::List)
     }
 
-    fn may<M: Mailman, B: Buffers<S>, H: Service>(&self, cx: &Context<'_, S, M, B, H>, slot: Slot, verb: Verb) -> bool {
+    fn may(&self, cx: &Context<'_, P>, slot: Slot, verb: Verb) -> bool {
         let function = cx.functions.function(slot);
         function.is_none_or(|function| decide(cx.access, self.remote.as_ref(), function.name(), verb).is_allowed())
     }
 
     /// A request has arrived for a function that the peer was told of: may it be called, and so soon?
-    pub(super) fn permit_call<M: Mailman, B: Buffers<S>, H: Service>(
+    pub(super) fn permit_call(
         &mut self,
-        cx: &Context<'_, S, M, B, H>,
-        function: &Function<'_, H>,
+        cx: &Context<'_, P>,
+        function: &Function<'_, dyn Service>,
     ) -> Result<(), Error> {
         if cx.access.is_none() {
             return Ok(());
@@ -77,8 +70,8 @@ impl<S: Storage, C: Secure> Session<S, C> {
 }
 
 /// Whether what the peer publishes is shown here.
-pub(super) fn may_publish<S: Storage, M: Mailman, B: Buffers<S>, H: Service>(
-    cx: &Context<'_, S, M, B, H>,
+pub(super) fn may_publish<P: Port>(
+    cx: &Context<'_, P>,
     remote: Option<&Remote>,
     refusals: &mut Refusals,
     signature: &[u8],
@@ -93,8 +86,8 @@ pub(super) fn may_publish<S: Storage, M: Mailman, B: Buffers<S>, H: Service>(
 }
 
 /// Says in the log what was refused, once a second at most.
-pub(super) fn log_refusal<S: Storage, M: Mailman, B: Buffers<S>, H: Service>(
-    cx: &Context<'_, S, M, B, H>,
+pub(super) fn log_refusal<P: Port>(
+    cx: &Context<'_, P>,
     remote: Option<&Remote>,
     refusals: &mut Refusals,
     function: &str,

@@ -4,11 +4,7 @@ use super::inbound::Outcome;
 use super::{Event, Phase, Session};
 use crate::error::{Error, Limit};
 use crate::host::frame::Frame;
-use crate::host::mailman::Mailman;
-use crate::host::secure::Secure;
-use crate::services::Context;
-use crate::services::lease::Service;
-use crate::storage::{Buffers, Storage};
+use crate::services::{Context, Port};
 use crate::time::{Duration, Instant};
 
 /// Answers come in the order of the pings. One that has not come after this was never sent: a link whose peer is silent
@@ -57,15 +53,12 @@ impl Pings {
     }
 }
 
-impl<S: Storage, C: Secure> Session<S, C> {
+impl<P: Port> Session<P> {
     /// Asks the peer for a sign of life and measures how long it takes: [`Event::Answered`] comes with it, and
     /// [`round_trip`](Self::round_trip) tells. A ping before it that has not been answered is given up.
     ///
     /// [`Error::NotConnected`] on a link that is not live, [`Error::Full`] where the stream has no room.
-    pub fn ping<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-    ) -> Result<(), Error> {
+    pub fn ping(&mut self, cx: &mut Context<'_, P>) -> Result<(), Error> {
         if self.phase != Phase::Live {
             return Err(Error::NotConnected);
         }

@@ -12,23 +12,16 @@ use crate::distribution::hello::{Hello, HelloError};
 use crate::error::{CloseReason, Refusal};
 use crate::host::connections::{LinkCounter, Liveness, Place};
 use crate::host::frame::Frame;
-use crate::host::mailman::Mailman;
 use crate::host::secure::Secure;
-use crate::services::Context;
-use crate::services::lease::Service;
-use crate::storage::{Buffers, Storage};
+use crate::services::{Context, Port};
 use crate::time::{Duration, Instant};
 
-impl<S: Storage, C: Secure> Session<S, C> {
+impl<P: Port> Session<P> {
     /// Proves to the peer of [`Event::Introduced`] that this unit has the pair's key, and waits for the same from it. It
     /// comes as [`Event::Hello`]; if it does not, the link ends with [`CloseReason::BadProof`],
     /// [`CloseReason::Unproven`] or [`CloseReason::HelloTimeout`]. On a live link the keys are made anew, and no event tells
     /// that they are; failing that, the link ends with one of those reasons.
-    pub fn prove<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        credentials: C::Credentials,
-    ) {
+    pub fn prove(&mut self, cx: &mut Context<'_, P>, credentials: <P::Cipher as Secure>::Credentials) {
         let until = match self.phase {
             Phase::Introduced { until } => until,
             Phase::Live => return self.prove_anew(cx, credentials),
@@ -43,9 +36,9 @@ impl<S: Storage, C: Secure> Session<S, C> {
         }
     }
 
-    pub(super) fn hello_arrived<M: Mailman, B: Buffers<S>, H: Service>(
+    pub(super) fn hello_arrived(
         &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
+        cx: &mut Context<'_, P>,
         until: Instant,
         place: Place,
         lent: &[u8],
@@ -76,12 +69,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// The peer's message of the proof. The end that dialled confirms at once that it has the keys.
-    pub(super) fn proof_arrived<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        place: Place,
-        lent: &[u8],
-    ) -> Outcome {
+    pub(super) fn proof_arrived(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8]) -> Outcome {
         match self.link.answer(place, lent) {
             Ok(answer) => self.send_proof(cx, answer.as_ref().map(|answer| &answer[..])),
             Err(_) => self.fail(cx),
@@ -93,12 +81,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// The peer's first sealed frame has opened: it is who it says it is.
-    pub(super) fn confirmation_arrived<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        place: Place,
-        lent: &[u8],
-    ) -> Outcome {
+    pub(super) fn confirmation_arrived(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8]) -> Outcome {
         if self.link.confirmed(place, lent).is_err() {
             self.fail(cx);
             return Outcome::Nothing;
@@ -108,7 +91,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// The node has taken the peer: it is told so with this end's hello, or on a secured link with its confirmation.
-    pub(super) fn reply_to_hello<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+    pub(super) fn reply_to_hello(&mut self, cx: &mut Context<'_, P>) {
         match self.mode() {
             Mode::Plain => self.send_hello(cx),
             Mode::Secured => self.send_confirmation(cx),
@@ -116,7 +99,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// Ends a link whose peer has not proven who it is.
-    pub(super) fn fail<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+    pub(super) fn fail(&mut self, cx: &mut Context<'_, P>) {
         self.link.counters.add(LinkCounter::ProofsFailed, 1);
         self.close(cx, CloseReason::BadProof);
     }
@@ -137,11 +120,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         Event::Hello.into()
     }
 
-    fn send_proof<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        message: Option<&[u8]>,
-    ) {
+    fn send_proof(&mut self, cx: &mut Context<'_, P>, message: Option<&[u8]>) {
         let Some(message) = message else { return };
         if self.link.send_clear(&Frame::Proof(message)) {
             self.flush(cx);
@@ -150,7 +129,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         }
     }
 
-    fn send_confirmation<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+    fn send_confirmation(&mut self, cx: &mut Context<'_, P>) {
         let confirmation = self.link.cipher().confirmation();
         if self.link.send_frame(&Frame::Confirm(&confirmation)) {
             self.flush(cx);

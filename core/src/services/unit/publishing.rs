@@ -4,12 +4,9 @@ use super::{Phase, Session};
 use crate::config::{Priority, SIGNATURE_BYTES};
 use crate::distribution::function_list::{Generation, Slot};
 use crate::distribution::message::{CONTROL_BYTES, Control, PUBLISH_BYTES};
-use crate::host::mailman::Mailman;
-use crate::host::secure::Secure;
-use crate::services::Context;
 use crate::services::access::Bucket;
-use crate::services::lease::Service;
-use crate::storage::{Buffers, Storage};
+use crate::services::{Context, Port};
+use crate::storage::Storage;
 use crate::time::{Duration, Instant};
 
 /// One of this unit's functions, as one peer sees it.
@@ -153,15 +150,11 @@ impl<S: Storage> Publishing<S> {
     }
 }
 
-impl<S: Storage, C: Secure> Session<S, C> {
+impl<P: Port> Session<P> {
     /// Makes functions of this unit visible to the peer, as they are now and as far as the access table lets it see them.
     /// Returns the serial that comes back with
     /// [`Event::Acknowledged`](super::Event::Acknowledged).
-    pub fn publish<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        slots: impl Iterator<Item = Slot>,
-    ) -> u32 {
+    pub fn publish(&mut self, cx: &mut Context<'_, P>, slots: impl Iterator<Item = Slot>) -> u32 {
         for slot in slots {
             let generation = cx.functions.generation(slot);
             if let Some(publication) = self.publishing.table.get_mut(usize::from(slot.0)) {
@@ -178,21 +171,14 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// Hides a function from the peer.
-    pub fn withdraw<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        slot: Slot,
-    ) -> u32 {
+    pub fn withdraw(&mut self, cx: &mut Context<'_, P>, slot: Slot) -> u32 {
         if let Some(publication) = self.publishing.table.get_mut(usize::from(slot.0)) {
             publication.wanted = None;
         }
         self.end_of_changes(cx)
     }
 
-    pub(super) fn end_of_changes<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-    ) -> u32 {
+    pub(super) fn end_of_changes(&mut self, cx: &mut Context<'_, P>) -> u32 {
         self.publishing.serial = self.publishing.serial.wrapping_add(1);
         self.publishing.dirty = true;
         self.publishing.end_due = true;
@@ -202,7 +188,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// Tells the peer what it is still to be told, as far as there is room.
-    pub(super) fn pump<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+    pub(super) fn pump(&mut self, cx: &mut Context<'_, P>) {
         if self.phase != Phase::Live {
             return;
         }
@@ -232,7 +218,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         publishing.dirty || publishing.end_due || publishing.limits_due || !told
     }
 
-    fn send_limits<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) -> bool {
+    fn send_limits(&mut self, cx: &mut Context<'_, P>) -> bool {
         let control = Control::Limits {
             message_size: self.constraints.message_size,
             minimum_interval: self.constraints.minimum_interval.as_wire(),
@@ -242,7 +228,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// Sends each function whose news the peer does not have; `false` when there was no more room.
-    fn send_news<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) -> bool {
+    fn send_news(&mut self, cx: &mut Context<'_, P>) -> bool {
         for index in 0..self.publishing.table.len() {
             let Some(&publication) = self.publishing.table.get(index) else { break };
             let slot = Slot(index as u16);
@@ -274,11 +260,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// Sends a control message; `false` when there is no room, or nobody to send it to.
-    pub(super) fn send_control<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        control: &Control<'_>,
-    ) -> bool {
+    pub(super) fn send_control(&mut self, cx: &mut Context<'_, P>, control: &Control<'_>) -> bool {
         if self.phase != Phase::Live {
             return false;
         }

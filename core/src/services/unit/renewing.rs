@@ -20,11 +20,8 @@ use crate::config::{HANDSHAKE_LIFE, Mode, PREVIOUS_KEY_LIFE, RENEWAL_TIMEOUT, SH
 use crate::error::CloseReason;
 use crate::host::connections::{LinkCounter, Place};
 use crate::host::frame::Frame;
-use crate::host::mailman::Mailman;
 use crate::host::secure::{PROOF_BYTES, Secure};
-use crate::services::Context;
-use crate::services::lease::Service;
-use crate::storage::{Buffers, Storage};
+use crate::services::{Context, Port};
 use crate::time::{Duration, Instant};
 
 /// The renewal of a link's keys.
@@ -71,7 +68,7 @@ impl Renewal {
     }
 }
 
-impl<S: Storage, C: Secure> Session<S, C> {
+impl<P: Port> Session<P> {
     /// Makes the keys of a secured link anew each time they are as old as `span`, or up to an eighth younger, instead of
     /// [`HANDSHAKE_LIFE`]; at least [`SHORTEST_HANDSHAKE_LIFE`]. Holds from the next handshake on, for the end that dialled:
     /// the other one follows.
@@ -96,10 +93,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// Does what is due of the renewal; tells whether the port is to bring the key of the pair.
-    pub(super) fn poll_renewal<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-    ) -> Option<Event<'static>> {
+    pub(super) fn poll_renewal(&mut self, cx: &mut Context<'_, P>) -> Option<Event<'static>> {
         if cx.now >= self.renewal.forget {
             self.link.cipher().forget_previous();
             self.renewal.forget = Instant::FAR_FUTURE;
@@ -121,11 +115,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// The port has brought the key of the pair of a live link.
-    pub(super) fn prove_anew<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        credentials: C::Credentials,
-    ) {
+    pub(super) fn prove_anew(&mut self, cx: &mut Context<'_, P>, credentials: <P::Cipher as Secure>::Credentials) {
         let Step::Asked { until, message } = self.renewal.step else { return };
         let told = match self.link.cipher().prove(self.dialed, credentials) {
             Ok(None) => self.link.cipher().answer(&message),
@@ -141,7 +131,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// Sends what waits for room.
-    pub(super) fn pump_renewal<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+    pub(super) fn pump_renewal(&mut self, cx: &mut Context<'_, P>) {
         let sent = match self.renewal.step {
             Step::Resting { .. } | Step::Asked { .. } | Step::Awaiting { .. } => return,
             Step::Telling { message, .. } if self.dialed => self.link.send_frames(&[Frame::Proof(&message)]),
@@ -170,12 +160,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// A proof frame on a live link: the peer's message, or its turn.
-    pub(super) fn proof_on_live<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        place: Place,
-        lent: &[u8],
-    ) -> Outcome {
+    pub(super) fn proof_on_live(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8]) -> Outcome {
         let message = self.link.view(place, lent);
         let understood = match (message.first_chunk(), self.renewal.step) {
             (None, _) if message.is_empty() => self.link.cipher().turned(),
@@ -191,12 +176,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         Outcome::Nothing
     }
 
-    fn answered_anew<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        place: Place,
-        lent: &[u8],
-    ) -> Outcome {
+    fn answered_anew(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8]) -> Outcome {
         if self.link.answer(place, lent) != Ok(None) {
             self.fail(cx);
         }
@@ -204,12 +184,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// A confirm frame on a live link: the first one under the peer's new keys, or what acknowledges this end's.
-    pub(super) fn confirmation_on_live<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        place: Place,
-        lent: &[u8],
-    ) -> Outcome {
+    pub(super) fn confirmation_on_live(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8]) -> Outcome {
         let Step::Awaiting { until } = self.renewal.step else {
             self.close(cx, CloseReason::Protocol);
             return Outcome::Nothing;
@@ -226,11 +201,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// The peer has turned and confirmed. Its confirmation also says that it has that of an end that was dialled.
-    fn confirmed_anew<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        until: Instant,
-    ) -> Result<(), CloseReason> {
+    fn confirmed_anew(&mut self, cx: &mut Context<'_, P>, until: Instant) -> Result<(), CloseReason> {
         self.renewal.forget = cx.now + RENEWAL_TIMEOUT;
         if self.dialed {
             self.renewal.step = Step::Confirming { until };

@@ -10,11 +10,8 @@ use crate::distribution::message::{SESSION_BODY_BYTES, SessionBody};
 use crate::error::{CloseReason, Error};
 use crate::host::connections::LinkCounter;
 use crate::host::frame::Frame;
-use crate::host::mailman::Mailman;
 use crate::host::secure::{DATAGRAM_OVERHEAD, Secure};
-use crate::services::Context;
-use crate::services::lease::Service;
-use crate::storage::{Buffers, Storage};
+use crate::services::{Context, Port};
 use crate::time::{Duration, Instant};
 
 /// A peer's clock as last heard, so that it can bound the age of what we send.
@@ -94,7 +91,7 @@ impl Timers {
     }
 }
 
-impl<S: Storage, C: Secure> Session<S, C> {
+impl<P: Port> Session<P> {
     /// When [`poll`](Self::poll) has something to do next.
     pub fn deadline(&self) -> Instant {
         match self.phase {
@@ -113,10 +110,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// Does what is due. Returns one event at a time; call it until it returns `None`.
-    pub fn poll<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-    ) -> Option<Event<'static>> {
+    pub fn poll(&mut self, cx: &mut Context<'_, P>) -> Option<Event<'static>> {
         match self.phase {
             Phase::AwaitingHello { until } | Phase::Introduced { until } | Phase::Proving { until } => {
                 if cx.now < until {
@@ -131,10 +125,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         }
     }
 
-    fn poll_live<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-    ) -> Option<Event<'static>> {
+    fn poll_live(&mut self, cx: &mut Context<'_, P>) -> Option<Event<'static>> {
         // Leases come first: what moves must stop before anything else is done.
         if cx.now >= self.timers.lease
             && let Some(slot) = self.expire_lease(cx)
@@ -173,7 +164,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// Asks a peer that has missed a keep-alive for a sign of life, and gives it up when none comes.
-    fn look_for_peer<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+    fn look_for_peer(&mut self, cx: &mut Context<'_, P>) {
         let look = self.liveness.poll(cx.now);
         if look.missed {
             self.link.counters.add(LinkCounter::KeepAlivesMissed, 1);
@@ -192,11 +183,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// Reports what ended with the link, one by one: leases first.
-    fn poll_ending<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        reason: CloseReason,
-    ) -> Option<Event<'static>> {
+    fn poll_ending(&mut self, cx: &mut Context<'_, P>, reason: CloseReason) -> Option<Event<'static>> {
         while let Some(granted) = self.granted.pop() {
             if expire_granted(cx, &granted) {
                 return Some(Event::LeaseExpired(granted.slot));
@@ -211,7 +198,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
         Some(Event::Closed(reason))
     }
 
-    fn send_keep_alive<M: Mailman, B: Buffers<S>, H: Service>(&mut self, cx: &mut Context<'_, S, M, B, H>) {
+    fn send_keep_alive(&mut self, cx: &mut Context<'_, P>) {
         // The peer counts by what it was told in the hello.
         let told = Duration::from_millis(u64::from(self.local.keep_alive));
         self.timers.keep_alive = cx.now + self.constraints.keep_alive.min(told).max(Duration::from_millis(1));
@@ -226,12 +213,7 @@ impl<S: Storage, C: Secure> Session<S, C> {
     }
 
     /// Sends a session datagram; `body` and `rest` follow each other in it. `false` when the network refused it.
-    pub(super) fn send_datagram<M: Mailman, B: Buffers<S>, H: Service>(
-        &mut self,
-        cx: &mut Context<'_, S, M, B, H>,
-        body: &[u8],
-        rest: &[u8],
-    ) -> bool {
+    pub(super) fn send_datagram(&mut self, cx: &mut Context<'_, P>, body: &[u8], rest: &[u8]) -> bool {
         let Some((to, header)) = self.datagram_header() else { return false };
         let (front, back) = self.link.cipher().datagram_room();
         let mut bytes = [0; LONGEST_DATAGRAM];

@@ -10,7 +10,7 @@ use cara_core::services::access::Access;
 use cara_core::services::lease::LeaseEnd;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::{Event, Session};
-use cara_core::services::{Context, Ticket};
+use cara_core::services::{Context, Port, Ticket};
 use cara_core::time::Instant;
 
 use super::audited::Audited;
@@ -21,8 +21,15 @@ use crate::event::{HostId, StreamId};
 use crate::network::Network;
 use crate::storage::Boxed;
 
-pub(super) type SimSession = Session<Boxed, Audited>;
-pub(super) type SimContext<'c, 'n> = Context<'c, Boxed, SimMailman<'n>, LazyPool, Handler>;
+/// The port.
+pub(super) enum Simulated {}
+
+impl Port for Simulated {
+    type Storage = Boxed;
+    type Cipher = Audited;
+}
+
+pub(super) type SimSession = Session<Simulated>;
 
 /// What a link led to that concerns more than the link.
 pub(super) enum Happened {
@@ -143,7 +150,7 @@ impl Links {
         &mut self,
         network: &mut Network,
         index: u16,
-        act: impl FnOnce(&mut SimSession, &mut SimContext<'_, '_>) -> R,
+        act: impl FnOnce(&mut SimSession, &mut Context<'_, Simulated>) -> R,
     ) -> Option<R> {
         let link = self.links.get_mut(usize::from(index))?.as_mut()?;
         let now = network.now();

@@ -12,8 +12,8 @@ use cara_core::distribution::parameters::Parameters;
 use cara_core::error::{CloseReason, Refusal};
 use cara_core::host::connections::LinkCounter;
 use cara_core::host::mailman::{LinkId, Mailman};
-use cara_core::services::Context;
 use cara_core::services::unit::{Event, RequestOptions, Session, SessionConfig, SessionStorage, buffer_bytes};
+use cara_core::services::{Context, Port};
 use cara_core::storage::Pool;
 use cara_core::time::{Duration, Instant};
 use cara_secure::keys::{PairKey, RootKey};
@@ -53,9 +53,16 @@ impl Mailman for Sent {
     }
 }
 
+pub(crate) enum Attacked {}
+
+impl Port for Attacked {
+    type Storage = Boxed;
+    type Cipher = Cipher;
+}
+
 /// One end.
 pub(crate) struct End {
-    pub(crate) session: Session<Boxed, Cipher>,
+    pub(crate) session: Session<Attacked>,
     functions: FunctionList<Boxed, ()>,
     pool: Pool<Boxed>,
     sent: Sent,

@@ -15,10 +15,10 @@ use crate::distribution::parameters::Parameters;
 use crate::error::{CloseReason, Error, Refusal};
 use crate::host::mailman::LinkId;
 use crate::host::secure::Plain;
-use crate::services::Context;
 use crate::services::access::{Access, Decision, Principal, Rule, Verb, decide};
 use crate::services::lease::LeaseEnd;
 use crate::services::requests::CallId;
+use crate::services::{Context, Port};
 use crate::storage::{Boxed, Pool};
 use crate::time::{Duration, Instant};
 
@@ -66,10 +66,18 @@ impl Access for Table {
     }
 }
 
+/// The port of these tests.
+pub(super) enum Tested {}
+
+impl Port for Tested {
+    type Storage = Boxed;
+    type Cipher = Plain;
+}
+
 /// One end.
 pub(super) struct Side {
     pub(super) now: Instant,
-    pub(super) session: Session<Boxed, Plain>,
+    pub(super) session: Session<Tested>,
     pub(super) functions: FunctionList<Boxed, Handler>,
     pub(super) pool: Pool<Boxed>,
     /// Who may do what here.

@@ -11,9 +11,9 @@ use cara_core::distribution::parameters::Parameters;
 use cara_core::error::{CloseReason, Error};
 use cara_core::host::mailman::{LinkId, Mailman};
 use cara_core::host::secure::Plain;
-use cara_core::services::Context;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::{Event, RequestOptions, Session, SessionConfig, SessionStorage, buffer_bytes};
+use cara_core::services::{Context, Port};
 use cara_core::storage::Pool;
 use cara_core::time::Instant;
 use cara_sim::Boxed;
@@ -49,11 +49,18 @@ pub(crate) fn number(value: i64) -> Parameters<2048> {
     parameters
 }
 
+enum OnHost {}
+
+impl Port for OnHost {
+    type Storage = Boxed;
+    type Cipher = Plain;
+}
+
 pub(crate) struct Manager {
     pub(crate) cable: Cable,
     net: Net,
     node: Node<Boxed>,
-    sessions: Vec<Option<Session<Boxed, Plain>>>,
+    sessions: Vec<Option<Session<OnHost>>>,
     functions: FunctionList<Boxed, ()>,
     buffers: Pool<Boxed>,
     arguments: Box<Parameters<4096>>,
@@ -193,7 +200,7 @@ impl Manager {
 
     /// Indices of the links that are live.
     pub(crate) fn links(&self) -> Vec<usize> {
-        let live = |session: &Option<Session<Boxed, Plain>>| session.as_ref().is_some_and(Session::is_live);
+        let live = |session: &Option<Session<OnHost>>| session.as_ref().is_some_and(Session::is_live);
         (0..LINKS).filter(|&index| live(&self.sessions[index])).collect()
     }
 
