@@ -65,7 +65,7 @@ pub(crate) fn measure(peer: &'static str, chars: u32, calls: u32) -> Result<Inst
 fn run(peer: &'static str, chars: u32, calls: u32) -> Result<[Counts; 2]> {
     let folder = tempfile::tempdir()?;
     let contender = Contender::Counted(peer, folder.path().to_owned());
-    let mut pair = Pair::start(&contender, Setting { pin: Pin::None, distribution: 1, print: false, mbit: None })?;
+    let mut pair = Pair::start(&contender, Setting { pin: Pin::None, distribution: 1, print: false, wire: None })?;
     pair.block(&Order { chars, callers: 1, calls_per_caller: calls, pause_ms: 0, delay_us: 0 })?;
     // Callgrind writes when the processes end.
     drop(pair);

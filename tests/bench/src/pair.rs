@@ -6,7 +6,7 @@ use anyhow::{Context, Result};
 use cara_bench_ends::{
     Burst, ClientQuestion, Counters, End, Limits, Offered, Order, Outcome, Pin, Place, ServerQuestion, pin,
 };
-use cara_processes::cable::Cable;
+use cara_processes::cable::{Cable, Wire};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
@@ -27,8 +27,15 @@ pub(crate) struct Setting {
     pub(crate) distribution: u8,
     /// The service prints what it gets.
     pub(crate) print: bool,
-    /// The pair has a cable of so many million bits a second to itself; `None` for loopback.
-    pub(crate) mbit: Option<u32>,
+    /// The pair has such a cable to itself; `None` for loopback.
+    pub(crate) wire: Option<Wire>,
+}
+
+impl Setting {
+    /// The rate of the cable; 0 for loopback.
+    pub(crate) fn mbit(&self) -> u32 {
+        self.wire.map_or(0, |wire| wire.mbit)
+    }
 }
 
 /// One peer's processes.
@@ -72,7 +79,7 @@ impl Pair {
     pub(crate) fn with_clients(count: usize, contender: &Contender, setting: Setting) -> Result<Self> {
         let peer = contender.name();
         let [client_cpu, server_cpu] = pin::cpus(setting.pin)?;
-        let cable = setting.mbit.map(Cable::lay).transpose()?;
+        let cable = setting.wire.map(Cable::lay).transpose()?;
         let [far, near] = [0, 1].map(|end| cable.as_ref().map(|cable| &cable.hosts[end]));
         let place = Place { run: fastrand::u32(1..), print: setting.print, client: 0 };
         let mut end = End { peer: peer.to_owned(), cpu: server_cpu, place, address: String::new() };

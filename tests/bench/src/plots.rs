@@ -47,11 +47,11 @@ fn figures(results: &Results) -> Vec<Figure> {
     };
     let apart = results.echoes.iter().map(|row| row.n).min().unwrap_or(0);
     let spread = format!("2 s apart: n = {apart} a point, printing");
-    let loopback = [&spread, "bars: quartiles (response time)", "or worst group; loopback cannot fill"];
+    let loopback = [&spread, "bars: quartiles; availability:", "worst group. Loopback never fills"];
     vec![
         figure("figure-6", vec![response(results, 1), availability(results, 1)], &loopback),
         figure("figure-7", vec![response(results, 2), availability(results, 2)], &loopback),
-        figure("figure-8", vec![both(results)], &loopback[2..]),
+        figure("figure-8", vec![both(results)], &["bars: worst group", "loopback never fills"]),
         figure(
             "ratios",
             vec![ratios(results, Pin::Same), ratios(results, Pin::Split)],

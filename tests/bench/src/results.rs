@@ -63,6 +63,8 @@ pub(crate) struct About {
     pub(crate) processor: String,
     pub(crate) load_before: f64,
     pub(crate) load_after: f64,
+    #[serde(default)]
+    pub(crate) loss_percent: u32,
     pub(crate) experiments: Vec<Done>,
     pub(crate) notes: Vec<String>,
     pub(crate) peers: Vec<OutsideReport>,

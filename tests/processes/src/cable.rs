@@ -1,6 +1,6 @@
 //! Two hosts and a cable of a given rate between them, on one machine: a network namespace for each host, a pair of virtual
 //! Ethernet devices, and a token bucket at each end that lets no more than the rate through. Needs root, `ip`, `tc` and
-//! `unshare`. Nothing has to be removed: a namespace ends with its last user.
+//! `unshare`, and `nft` for a cable that loses frames. Nothing has to be removed: a namespace ends with its last user.
 
 use std::fs::File;
 use std::io::Read;
@@ -19,6 +19,15 @@ pub struct Host {
     address: Ipv4Addr,
 }
 
+/// What a cable carries.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Wire {
+    /// So many million bits a second in each direction; what would wait for more than 50 ms is kept out.
+    pub mbit: u32,
+    /// Of a hundred packets so many are lost, at random, where they arrive.
+    pub loss_percent: u32,
+}
+
 /// Two hosts, joined.
 pub struct Cable {
     /// Both ends are alike.
@@ -26,9 +35,11 @@ pub struct Cable {
 }
 
 impl Cable {
-    /// Lets `mbit` million bits a second through in each direction, and keeps what would wait for more than 50 ms out.
-    pub fn lay(mbit: u32) -> Result<Self> {
-        if let Some(absent) = ["unshare", "ip", "tc"].into_iter().find(|program| !find(program)) {
+    /// Makes two hosts and joins them.
+    pub fn lay(wire: Wire) -> Result<Self> {
+        let Wire { mbit, loss_percent } = wire;
+        let needs = ["unshare", "ip", "tc", "nft"].into_iter().take(3 + usize::from(loss_percent > 0));
+        if let Some(absent) = needs.into_iter().find(|program| !find(program)) {
             anyhow::bail!("the program `{absent}` is not installed");
         }
         let holders = [Holder::start()?, Holder::start()?];
@@ -43,6 +54,12 @@ impl Cable {
             // As small a bucket as a frame and the kernel's clock allow: what it holds passes at once.
             let burst = 1_600.max(mbit * 1_000_000 / 8 / 4_000);
             host.run(&format!("tc qdisc add dev wire root tbf rate {mbit}mbit burst {burst} latency 50ms"))?;
+            if loss_percent > 0 {
+                host.run("nft add table ip cable")?;
+                host.run("nft add chain ip cable arriving { type filter hook input priority 0 ; }")?;
+                let lost = format!("numgen random mod 100 < {loss_percent}");
+                host.run(&format!("nft add rule ip cable arriving iifname wire {lost} drop"))?;
+            }
         }
         Ok(Self { hosts })
     }
@@ -107,17 +124,47 @@ impl Drop for Holder {
 mod tests {
     use super::*;
     use std::io::Write;
-    use std::net::{TcpListener, TcpStream};
+    use std::net::{TcpListener, TcpStream, UdpSocket};
+    use std::time::Duration;
+
+    fn lay(wire: Wire) -> Option<Cable> {
+        let laid = Cable::lay(wire);
+        if let Err(reason) = &laid {
+            assert!(std::env::var_os("CI").is_none(), "{reason:#}");
+            eprintln!("skipped: {reason:#}");
+        }
+        laid.ok()
+    }
+
+    #[test]
+    fn a_cable_that_loses_half_of_all_packets_does_so() {
+        let Some(cable) = lay(Wire { mbit: 100, loss_percent: 50 }) else { return };
+        let [one, other] = &cable.hosts;
+        let bind = |host: &Host| {
+            let bound = std::thread::scope(|scope| {
+                scope.spawn(|| host.enter().and_then(|()| Ok(UdpSocket::bind((host.address(), 7))?))).join()
+            });
+            bound.unwrap().unwrap()
+        };
+        let (from, to) = (bind(one), bind(other));
+        to.set_nonblocking(true).unwrap();
+        let mut arrived = 0;
+        for _ in 0..400 {
+            from.send_to(b"ping", (other.address(), 7)).unwrap();
+            // Behind a veth device a packet is there, or lost, when it has been sent, but for what the bucket keeps.
+            std::thread::sleep(Duration::from_micros(100));
+            arrived += u32::from(to.recv(&mut [0; 8]).is_ok());
+        }
+        std::thread::sleep(Duration::from_millis(50));
+        while to.recv(&mut [0; 8]).is_ok() {
+            arrived += 1;
+        }
+        assert!((100..=300).contains(&arrived), "{arrived} of 400");
+    }
 
     #[test]
     fn what_one_host_sends_arrives_at_the_other() {
-        let cable = match Cable::lay(100) {
-            Ok(cable) => cable,
-            Err(reason) => {
-                assert!(std::env::var_os("CI").is_none(), "{reason:#}");
-                return eprintln!("skipped: {reason:#}");
-            }
-        };
+        let Some(cable) = lay(Wire { mbit: 100, loss_percent: 0 }) else { return };
         let [one, other] = &cable.hosts;
         let listener = std::thread::scope(|scope| {
             scope.spawn(|| one.enter().and_then(|()| Ok(TcpListener::bind((one.address(), 7))?))).join().unwrap()

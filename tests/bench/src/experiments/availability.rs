@@ -31,7 +31,7 @@ pub(super) fn measure(plan: &Plan, rows: &mut Vec<Availability>) -> Result<()> {
 
 /// Period 0, in turns with the floor.
 fn at_once(plan: &Plan, distribution: u8, rows: &mut Vec<Availability>) -> Result<()> {
-    let setting = Setting { pin: plan.pin, distribution, print: false, mbit: None };
+    let setting = Setting { pin: plan.pin, distribution, print: false, wire: None };
     let bursts: Vec<_> = plan.availability.iter().filter(|bursts| bursts.distribution == distribution).collect();
     let mut floor = Pair::start(&Contender::Own("floor"), setting)?;
     let started = side_by_side(OWN.iter().collect(), OWN.len(), |own| Pair::start(own, setting));
@@ -71,7 +71,7 @@ struct Lane<'p> {
 fn spaced(plan: &Plan, rows: &mut Vec<Availability>) -> Result<()> {
     let mut lanes = Vec::new();
     for bursts in &plan.availability {
-        let setting = Setting { pin: plan.pin, distribution: bursts.distribution, print: true, mbit: None };
+        let setting = Setting { pin: plan.pin, distribution: bursts.distribution, print: true, wire: None };
         let spaced: Vec<u64> = bursts.periods_ms.iter().copied().filter(|period| *period > 0).collect();
         for (&chars, contender) in bursts.chars.iter().flat_map(|chars| OWN.iter().map(move |own| (chars, own))) {
             let mut periods_ms = spaced.clone();

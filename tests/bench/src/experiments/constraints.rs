@@ -46,7 +46,7 @@ impl Lane {
     /// The rows of all intervals that are complete, and why there are no more.
     fn run(&self, plan: &Plan, bar: &Progress) -> (Vec<Constrained>, Result<()>) {
         let (sweep, mut rows) = (&plan.constrained, Vec::new());
-        let setting = Setting { pin: plan.pin, distribution: 1, print: false, mbit: None };
+        let setting = Setting { pin: plan.pin, distribution: 1, print: false, wire: None };
         let outcome = Pair::start(&self.contender, setting).and_then(|mut pair| {
             for &minimum_interval_ms in sweep.intervals_ms.iter().take_while(|_| !is_stopped()) {
                 let limits = Limits { minimum_interval_ms, message_size: self.message_size };

@@ -28,7 +28,7 @@ const DATAGRAM_CHARS: u32 = 1_000;
 
 /// Rows that say why there are none, where this machine or user can have no cable.
 pub(super) fn measure(plan: &Plan, results: &mut Results) -> Result<()> {
-    if let Err(reason) = Cable::lay(plan.link.mbit.first().copied().unwrap_or(10)) {
+    if let Err(reason) = Cable::lay(plan.link.wire(plan.link.mbit.first().copied().unwrap_or(10))) {
         let reason = format!("{reason:#}");
         eprintln!("link: skipped: {reason}");
         for &mbit in &plan.link.mbit {
@@ -50,7 +50,7 @@ fn response(plan: &Plan, results: &mut Results) -> Result<()> {
     for distribution in [1, 2] {
         let groups = plan.link.response.iter().filter(|group| group.setting.distribution == distribution);
         let found = side_by_side(groups.collect(), plan.link.mbit.len(), |group| {
-            let (mut cells, mbit) = (Cells::new(), group.setting.mbit.unwrap_or_default());
+            let (mut cells, mbit) = (Cells::new(), group.setting.mbit());
             let ended =
                 turns(group, &mut cells, &format!("link: response, {mbit} Mbit/s, distribution {distribution}"));
             (rows(group, &cells).into_iter().map(move |row| OnLink::measured(mbit, row)), ended)
@@ -83,7 +83,8 @@ fn availability(plan: &Plan, results: &mut Results) -> Result<()> {
         for (distribution, &chars) in
             [1, 2].into_iter().flat_map(|number| sizes.clone().map(move |chars| (number, chars)))
         {
-            let setting = Setting { pin: plan.pin, distribution, print: true, mbit: Some(mbit) };
+            let wire = Some(plan.link.wire(mbit));
+            let setting = Setting { pin: plan.pin, distribution, print: true, wire };
             for contender in &bursts.peers {
                 let is_ours = contender.name_and_mode().0 == "cara";
                 let datagrams = is_ours && chars <= DATAGRAM_CHARS;
@@ -153,8 +154,8 @@ impl Lane<'_> {
             });
             match self.contender.tolerate(groups) {
                 Ok(groups) => rows.extend(groups.filter(|groups| !groups.is_empty()).map(|groups| {
-                    let Setting { distribution, print, mbit, .. } = self.setting;
-                    row(self.contender.name_and_mode(), distribution, print, mbit.unwrap_or_default(), &burst, &groups)
+                    let Setting { distribution, print, .. } = self.setting;
+                    row(self.contender.name_and_mode(), distribution, print, self.setting.mbit(), &burst, &groups)
                 })),
                 Err(error) => return (rows, Err(error)),
             }
@@ -232,7 +233,7 @@ fn constraints(plan: &Plan, results: &mut Results) -> Result<()> {
 
 impl Constraint {
     fn setting(&self, plan: &Plan) -> Setting {
-        Setting { pin: plan.pin, distribution: 1, print: true, mbit: Some(self.mbit) }
+        Setting { pin: plan.pin, distribution: 1, print: true, wire: Some(plan.link.wire(self.mbit)) }
     }
 
     fn run(self, plan: &Plan, pair: Result<Pair>, bar: &Progress) -> (Vec<LinkConstrained>, Result<()>) {

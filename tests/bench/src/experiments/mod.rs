@@ -57,6 +57,9 @@ pub(crate) struct Options {
     /// Only links of these rates, in Mbit/s.
     #[arg(long, value_delimiter = ',')]
     mbit: Vec<u32>,
+    /// Links lose so many of a hundred packets, at random.
+    #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=50))]
+    loss_percent: u32,
     #[command(flatten)]
     outside: Selection,
     /// Writes all rows there as one JSON object, after each experiment anew.
@@ -183,7 +186,8 @@ fn plan(options: &Options, outside: &[Arc<Outside>]) -> Result<Plan> {
     };
     let mut plan = Plan::new(extent, options.print, outside)?;
     plan.narrow(&options.pins, &options.chars, options.rounds);
-    plan.link.narrow(&options.mbit);
+    plan.link.narrow(&options.mbit)?;
+    plan.link.lose(options.loss_percent);
     Ok(plan)
 }
 
@@ -204,6 +208,7 @@ fn about(plan: &Plan) -> About {
         processor: processor(),
         cpus: std::thread::available_parallelism().map_or(1, usize::from),
         load_before: load(),
+        loss_percent: plan.link.loss_percent,
         notes: plan.notes.clone(),
         ..About::default()
     }

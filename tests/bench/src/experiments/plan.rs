@@ -2,7 +2,9 @@
 
 use std::sync::Arc;
 
-use anyhow::Result;
+use anyhow::{Result, bail};
+
+use cara_processes::cable::Wire;
 
 use crate::counted;
 use crate::pair::Setting;
@@ -93,11 +95,27 @@ impl Bursts {
 
 impl Link {
     /// Leaves out the rates that are not among these, where there are any.
-    pub(crate) fn narrow(&mut self, mbit: &[u32]) {
+    pub(crate) fn narrow(&mut self, mbit: &[u32]) -> Result<()> {
+        let known = &self.availability.mbit;
+        if let Some(unknown) = mbit.iter().find(|rate| !known.contains(rate)) {
+            bail!("no link has {unknown} Mbit/s here: choose among {known:?}");
+        }
         let is_wanted = |rate: &u32| mbit.is_empty() || mbit.contains(rate);
         self.mbit.retain(is_wanted);
         self.availability.mbit.retain(is_wanted);
-        self.response.retain(|group| group.setting.mbit.as_ref().is_some_and(is_wanted));
+        self.response.retain(|group| is_wanted(&group.setting.mbit()));
+        Ok(())
+    }
+
+    /// Every link loses so many of a hundred packets.
+    pub(crate) fn lose(&mut self, loss_percent: u32) {
+        self.loss_percent = loss_percent;
+        let wires = self.response.iter_mut().filter_map(|group| group.setting.wire.as_mut());
+        wires.for_each(|wire| wire.loss_percent = loss_percent);
+    }
+
+    pub(crate) fn wire(&self, mbit: u32) -> Wire {
+        Wire { mbit, loss_percent: self.loss_percent }
     }
 }
 
@@ -128,6 +146,7 @@ pub(crate) struct Constrained {
 #[derive(Debug, Clone)]
 pub(crate) struct Link {
     pub(crate) mbit: Vec<u32>,
+    pub(crate) loss_percent: u32,
     /// Of one rate each.
     pub(crate) response: Vec<Group>,
     pub(crate) availability: LinkBursts,
@@ -175,7 +194,7 @@ impl Plan {
         };
         let callers = extent.of(vec![1, 8, 64], vec![1, 8, 64], vec![1, 2]);
         let orders = callers.into_iter().map(|callers| busy_order(callers, extent.of(3_200, 1_600, 8))).collect();
-        let setting = Setting { pin, distribution: 1, print: false, mbit: None };
+        let setting = Setting { pin, distribution: 1, print: false, wire: None };
         Ok(Self {
             extent,
             response,
@@ -233,7 +252,7 @@ fn with<'o>(own: &[&'static str], outside: impl Iterator<Item = &'o Arc<Outside>
 fn tiny(outside: &[Arc<Outside>]) -> Vec<Group> {
     let own = || with(&COMPARED, [].iter());
     let group = |distribution, print, peers, orders| {
-        let setting = Setting { pin: Pin::None, distribution, print, mbit: None };
+        let setting = Setting { pin: Pin::None, distribution, print, wire: None };
         Group { setting, peers, orders, rounds: 1 }
     };
     let orders = || vec![order(1, 5, 0), order(20_000, 5, 0), order(100, 2, 10)];
@@ -261,21 +280,21 @@ fn response(extent: Extent, pins: &[Pin], places: &[Pin], print: bool, outside: 
     let calls = extent.of(200, 100, 5);
     for distribution in [1, 2] {
         for &pin in pins {
-            let setting = Setting { pin, distribution, print, mbit: None };
+            let setting = Setting { pin, distribution, print, wire: None };
             let is_shortened = extent == Extent::Quick && (pin == Pin::None || distribution == 2);
             let peers = if is_shortened { &COMPARED[..] } else { &AMONG[..] };
             let outside = if is_shortened || print { &[] } else { outside };
             add(setting, with(peers, outside.iter()), extent.of(24, 4, 1), orders(&CHARS, calls, 0));
         }
         for &pin in places {
-            let setting = Setting { pin, distribution, print, mbit: None };
+            let setting = Setting { pin, distribution, print, wire: None };
             let (chars, rounds) = extent.of((&CHARS[..], 12), (&SOME_CHARS[..], 1), (&SOME_CHARS[..], 1));
             // In distribution 2 the peers do not wait side by side.
             let calls = if extent == Extent::Full && distribution == 1 { 20 } else { 10 };
             add(setting, own(), rounds, orders(chars, calls, 10));
         }
         for &pin in places.iter().filter(|_| !print && (extent == Extent::Full || distribution == 1)) {
-            let setting = Setting { pin, distribution, print: true, mbit: None };
+            let setting = Setting { pin, distribution, print: true, wire: None };
             add(setting, own(), extent.of(12, 4, 1), orders(&CHARS, calls, 0));
         }
     }
@@ -295,7 +314,7 @@ fn far(extent: Extent, pin: Pin, places: &[Pin]) -> Vec<Group> {
             _ => (1, 2),
         };
         let pause_ms = extent.of(PAUSE_MS, PAUSE_MS, 50);
-        let setting = Setting { pin, distribution, print: true, mbit: None };
+        let setting = Setting { pin, distribution, print: true, wire: None };
         Group { setting, peers: with(&COMPARED, [].iter()), orders: orders(chars, calls, pause_ms), rounds }
     };
     places.iter().map(|&pin| (1, pin)).chain([(2, pin)]).map(group).collect()
@@ -337,7 +356,8 @@ fn link(extent: Extent, pin: Pin, outside: &[Arc<Outside>]) -> Link {
     let chars: &[u32] = extent.of(&CHARS, &SOME_CHARS, &[100]);
     let (rounds, calls) = extent.of((5, 20), (2, 5), (1, 3));
     let group = |(distribution, mbit)| {
-        let setting = Setting { pin, distribution, print: true, mbit: Some(mbit) };
+        let wire = Some(Wire { mbit, loss_percent: 0 });
+        let setting = Setting { pin, distribution, print: true, wire };
         Group { setting, peers: with(&COMPARED, outside()), orders: orders(chars, calls, 20), rounds }
     };
     let cells = [1, 2].into_iter().flat_map(|distribution| mbit.iter().map(move |&mbit| (distribution, mbit)));
@@ -361,6 +381,7 @@ fn link(extent: Extent, pin: Pin, outside: &[Arc<Outside>]) -> Link {
         },
         constrained_calls: extent.of(50, 10, 2),
         mbit,
+        loss_percent: 0,
     }
 }
 
@@ -371,5 +392,41 @@ fn constrained(extent: Extent) -> Constrained {
         chars: extent.of(vec![100, 1_000, 5_000, 20_000], vec![100, 20_000], vec![100, 20_000]),
         period_ms: extent.of(2, 2, 1),
         count: extent.of(1_000, 100, 5),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn in_full_a_hundred_echoes_two_seconds_apart_are_made_of_each_size() {
+        let plan = Plan::new(Extent::Full, false, &[]).unwrap();
+        for distribution in [1, 2] {
+            let group = plan.far.iter().find(|group| group.setting.distribution == distribution).unwrap();
+            assert!(group.setting.print);
+            assert_eq!(group.orders.iter().map(|order| order.chars).collect::<Vec<_>>(), CHARS);
+            for order in &group.orders {
+                assert_eq!((group.rounds * order.calls_per_caller, order.pause_ms), (100, 2_000));
+            }
+        }
+    }
+
+    #[test]
+    fn in_full_a_thousand_requests_are_made_at_each_period_in_groups_of_a_hundred() {
+        let plan = Plan::new(Extent::Full, false, &[]).unwrap();
+        for distribution in [1, 2] {
+            let reliable = |bursts: &&Bursts| {
+                bursts.distribution == distribution && bursts.delivery == cara_bench_ends::Delivery::Reliable
+            };
+            let bursts = plan.availability.iter().find(reliable).unwrap();
+            assert_eq!((bursts.groups * bursts.group, bursts.group), (1_000, 100));
+            assert!([10_000, 20_000].iter().all(|chars| bursts.chars.contains(chars)), "{:?}", bursts.chars);
+            assert!(
+                [10, 20, 70, 80].iter().all(|period| bursts.periods_ms.contains(period)),
+                "{:?}",
+                bursts.periods_ms
+            );
+        }
     }
 }

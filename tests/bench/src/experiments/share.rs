@@ -31,7 +31,7 @@ pub(super) fn measure(plan: &Plan, share: &mut Option<Share>, notes: &mut Vec<St
 }
 
 fn of(&(own, mode): &(&'static str, Mode), plan: &Plan, notes: &mut Vec<String>) -> Result<Option<Share>> {
-    let mut pair = Pair::start(&Contender::Own(own), Setting { pin: PIN, distribution: 1, print: false, mbit: None })?;
+    let mut pair = Pair::start(&Contender::Own(own), Setting { pin: PIN, distribution: 1, print: false, wire: None })?;
     let what = format!("share of making and reading messages, {}", mode.name());
     let bar = Progress::new(&what, plan.share_rounds as usize);
     let mut all = Times::default();

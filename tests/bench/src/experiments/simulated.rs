@@ -25,7 +25,7 @@ const BUFFER: usize = 128 * 1_024;
 /// All rates.
 pub(super) fn measure(plan: &Plan, results: &mut Results) -> Result<()> {
     for group in plan.link.response.iter().filter(|group| group.setting.distribution == 1) {
-        let mbit = group.setting.mbit.unwrap_or_default();
+        let mbit = group.setting.mbit();
         for order in &group.orders {
             let row = response(mbit, order.chars, order.pause_ms, results)?;
             results.link_response.push(OnLink::measured(mbit, row));
@@ -154,4 +154,34 @@ fn availability(mbit: u32, burst: &Burst) -> Result<LinkAvailability> {
     let elapsed = pair.nanoseconds() - start;
     let delivered = Delivered { failed: taken - executed, offered, executed, in_time, elapsed };
     Ok(super::link::row((SIMULATED, Mode::Plain), 1, false, mbit, burst, &[delivered]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn response_times_are_alike_up_to_a_thousand_characters_and_far_longer_beyond() {
+        let [one, thousand, longest] =
+            [1, 1_000, 20_000].map(|chars| response(100, chars, 20, &Results::default()).unwrap().p50_us);
+        assert!(thousand < 10.0 * one && longest > 10.0 * thousand, "{one}, {thousand}, {longest} us");
+    }
+
+    /// Of a hundred requests at this period, how many are executed in time on a link of 10 Mbit/s.
+    fn in_time(chars: u32, period_ms: u64) -> f64 {
+        let burst = Burst { chars, count: 100, period_ms, delivery: Delivery::Reliable, insist: false };
+        availability(10, &burst).unwrap().in_time_of_offered
+    }
+
+    #[test]
+    fn ten_thousand_characters_are_in_time_from_the_period_on_at_which_they_fit_the_link() {
+        assert!(in_time(10_000, 5) < 0.8);
+        assert_eq!([10, 20, 50].map(|period| in_time(10_000, period)), [1.0; 3]);
+    }
+
+    #[test]
+    fn twenty_thousand_characters_are_in_time_from_the_period_on_at_which_they_fit_the_link() {
+        assert!(in_time(20_000, 10) < 0.8);
+        assert_eq!([20, 70].map(|period| in_time(20_000, period)), [1.0; 2]);
+    }
 }
