@@ -30,7 +30,7 @@ use crate::time::now;
 /// Tasks that can wait for the same thing without waking each other.
 const TASKS_WAITING: usize = 4;
 
-/// The port.
+/// Boards with embassy-net, as the core's port.
 pub(crate) enum Board {}
 
 impl Port for Board {

@@ -23,7 +23,7 @@ use crate::stack::Stack;
 /// Frames that one poll takes from the device at most, so that a flood keeps nothing else waiting.
 const FRAMES_PER_POLL: usize = 16;
 
-/// The port.
+/// Programs on bare smoltcp, as the core's port.
 pub enum Smoltcp {}
 
 impl Port for Smoltcp {

@@ -155,6 +155,7 @@ impl Mailman for Pipe {
     }
 }
 
+/// Both sides, as the core's port.
 enum Bench {}
 
 impl Port for Bench {

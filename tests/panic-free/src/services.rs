@@ -27,6 +27,7 @@ impl Service for Handler {
     }
 }
 
+/// A port of which nothing is known.
 enum Any {}
 
 impl Port for Any {

@@ -53,6 +53,7 @@ impl Mailman for Kept {
     }
 }
 
+/// These ends, as the core's port.
 enum Vectors {}
 
 impl Port for Vectors {

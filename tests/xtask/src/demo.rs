@@ -91,9 +91,9 @@ fn epoch(units: &str) -> Result<String> {
 /// The manager hangs while an AGV drives. No connection ends, so it is the lease that stops the AGV; and it stays where
 /// it is when the manager goes on.
 fn hang_manager(stage: &Stage, manager: &mut Process, agv: &mut Process) -> Result<()> {
+    const EXPIRED: &str = "lease of go_to expired";
     stage.title("The manager hangs while agv-1 drives");
     drive(stage, manager, agv, [5, 2])?;
-    const EXPIRED: &str = "lease of go_to expired";
     ensure!(!agv.has(EXPIRED), "the lease of go_to ended while the manager was there");
     let place = stops(stage, agv, || {
         let frozen = manager.freeze()?;

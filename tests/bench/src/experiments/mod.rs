@@ -57,7 +57,7 @@ pub(crate) struct Options {
     /// Only links of these rates, in Mbit/s.
     #[arg(long, value_delimiter = ',')]
     mbit: Vec<u32>,
-    /// Links lose so many of a hundred packets, at random.
+    /// Links lose so many of a hundred packets, at random; the simulator's have no rows then.
     #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=50))]
     loss_percent: u32,
     #[command(flatten)]
@@ -184,10 +184,9 @@ fn plan(options: &Options, outside: &[Arc<Outside>]) -> Result<Plan> {
         (_, true) => Extent::Tiny,
         _ => Extent::Full,
     };
-    let mut plan = Plan::new(extent, options.print, outside)?;
+    let mut plan = Plan::new(extent, options.print, options.loss_percent, outside)?;
     plan.narrow(&options.pins, &options.chars, options.rounds);
     plan.link.narrow(&options.mbit)?;
-    plan.link.lose(options.loss_percent);
     Ok(plan)
 }
 

@@ -3,7 +3,6 @@
 use std::sync::Arc;
 
 use anyhow::{Result, bail};
-
 use cara_processes::cable::Wire;
 
 use crate::counted;
@@ -107,13 +106,6 @@ impl Link {
         Ok(())
     }
 
-    /// Every link loses so many of a hundred packets.
-    pub(crate) fn lose(&mut self, loss_percent: u32) {
-        self.loss_percent = loss_percent;
-        let wires = self.response.iter_mut().filter_map(|group| group.setting.wire.as_mut());
-        wires.for_each(|wire| wire.loss_percent = loss_percent);
-    }
-
     pub(crate) fn wire(&self, mbit: u32) -> Wire {
         Wire { mbit, loss_percent: self.loss_percent }
     }
@@ -146,6 +138,7 @@ pub(crate) struct Constrained {
 #[derive(Debug, Clone)]
 pub(crate) struct Link {
     pub(crate) mbit: Vec<u32>,
+    /// Of a hundred packets every link loses so many.
     pub(crate) loss_percent: u32,
     /// Of one rate each.
     pub(crate) response: Vec<Group>,
@@ -178,7 +171,7 @@ const SOME_CHARS: [u32; 3] = [100, 1_000, 20_000];
 
 impl Plan {
     /// The plan for a machine with these CPUs; `print` in all cells of the response time instead of some.
-    pub(crate) fn new(extent: Extent, print: bool, outside: &[Arc<Outside>]) -> Result<Self> {
+    pub(crate) fn new(extent: Extent, print: bool, loss_percent: u32, outside: &[Arc<Outside>]) -> Result<Self> {
         let has_two = pin::cpus(Pin::Split).is_ok();
         let pins: &[Pin] = if has_two { &[Pin::Same, Pin::Split, Pin::None] } else { &[Pin::Same, Pin::None] };
         let lacks = [
@@ -211,7 +204,7 @@ impl Plan {
             scale_calls: extent.of(400, 200, 5),
             availability: availability(extent),
             constrained: constrained(extent),
-            link: link(extent, pin, outside),
+            link: link(extent, pin, loss_percent, outside),
             pin,
             notes,
         })
@@ -350,13 +343,13 @@ fn availability(extent: Extent) -> Vec<Bursts> {
         .collect()
 }
 
-fn link(extent: Extent, pin: Pin, outside: &[Arc<Outside>]) -> Link {
+fn link(extent: Extent, pin: Pin, loss_percent: u32, outside: &[Arc<Outside>]) -> Link {
     let outside = || outside.iter().filter(|outside| outside.has_cable());
     let mbit = extent.of(vec![10, 20, 100], vec![20], vec![100]);
     let chars: &[u32] = extent.of(&CHARS, &SOME_CHARS, &[100]);
     let (rounds, calls) = extent.of((5, 20), (2, 5), (1, 3));
     let group = |(distribution, mbit)| {
-        let wire = Some(Wire { mbit, loss_percent: 0 });
+        let wire = Some(Wire { mbit, loss_percent });
         let setting = Setting { pin, distribution, print: true, wire };
         Group { setting, peers: with(&COMPARED, outside()), orders: orders(chars, calls, 20), rounds }
     };
@@ -381,7 +374,7 @@ fn link(extent: Extent, pin: Pin, outside: &[Arc<Outside>]) -> Link {
         },
         constrained_calls: extent.of(50, 10, 2),
         mbit,
-        loss_percent: 0,
+        loss_percent,
     }
 }
 
@@ -401,7 +394,7 @@ mod tests {
 
     #[test]
     fn in_full_a_hundred_echoes_two_seconds_apart_are_made_of_each_size() {
-        let plan = Plan::new(Extent::Full, false, &[]).unwrap();
+        let plan = Plan::new(Extent::Full, false, 0, &[]).unwrap();
         for distribution in [1, 2] {
             let group = plan.far.iter().find(|group| group.setting.distribution == distribution).unwrap();
             assert!(group.setting.print);
@@ -414,7 +407,7 @@ mod tests {
 
     #[test]
     fn in_full_a_thousand_requests_are_made_at_each_period_in_groups_of_a_hundred() {
-        let plan = Plan::new(Extent::Full, false, &[]).unwrap();
+        let plan = Plan::new(Extent::Full, false, 0, &[]).unwrap();
         for distribution in [1, 2] {
             let reliable = |bursts: &&Bursts| {
                 bursts.distribution == distribution && bursts.delivery == cara_bench_ends::Delivery::Reliable

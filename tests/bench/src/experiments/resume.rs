@@ -17,6 +17,7 @@ pub(super) fn read(path: &Path, this: &About) -> Result<Results> {
             ("extent", run.extent.clone()),
             ("processor", run.processor.clone()),
             ("number of CPUs", run.cpus.to_string()),
+            ("loss on links", format!("{} %", run.loss_percent)),
             ("build", if run.is_release_build { "release" } else { "debug" }.to_owned()),
         ]
     };
@@ -86,7 +87,7 @@ mod tests {
     }
 
     #[test]
-    fn only_the_same_commit_is_resumed() {
+    fn only_the_same_commit_and_loss_are_resumed() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("rows.json");
         run("abc").write(&path).unwrap();
@@ -94,6 +95,8 @@ mod tests {
         assert!(has(&earlier, "response") && !has(&earlier, "scale") && !has(&earlier, "share"));
         let refused = read(&path, &run("def").run).unwrap_err();
         assert!(refused.to_string().contains("commit"), "{refused}");
+        let refused = read(&path, &About { loss_percent: 1, ..run("abc").run }).unwrap_err();
+        assert!(refused.to_string().contains("loss"), "{refused}");
     }
 
     #[test]

@@ -21,7 +21,7 @@ use crate::event::{HostId, StreamId};
 use crate::network::Network;
 use crate::storage::Boxed;
 
-/// The port.
+/// The simulator, as the core's port.
 pub(super) enum Simulated {}
 
 impl Port for Simulated {

@@ -53,6 +53,7 @@ impl Mailman for Sent {
     }
 }
 
+/// These ends, as the core's port.
 pub(crate) enum Attacked {}
 
 impl Port for Attacked {

@@ -49,6 +49,7 @@ pub(crate) fn number(value: i64) -> Parameters<2048> {
     parameters
 }
 
+/// A host with an allocator, as the core's port.
 enum OnHost {}
 
 impl Port for OnHost {
