@@ -18,7 +18,7 @@ use anyhow::{Result, bail};
 use crate::binaries;
 use crate::command::Run;
 use crate::groups::Outcome;
-use crate::install;
+use crate::{install, msrv};
 use boards::{BOARDS, Board};
 pub(crate) use boards::{built, find, image_build};
 pub(crate) use desk::{Who, desk};
@@ -41,14 +41,14 @@ pub(crate) fn build(name: Option<&str>) -> Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// Builds and links the images of all boards.
+/// Builds and links the images of all boards, with a Rust as old as promised as far as their dependencies say.
 pub(crate) fn link() -> Outcome {
     for board in &BOARDS {
         if let Err(reason) = install::rust_target(board.target) {
             return Outcome::Skipped(reason);
         }
     }
-    build(None).map(drop).into()
+    build(None).and_then(|_| msrv::check_firmware()).into()
 }
 
 /// The emulated board, whose firmware is tested.

@@ -7,7 +7,7 @@ use anyhow::{Result, bail};
 use crate::command::Run;
 use crate::{
     bad_input, binaries, claims, demo, dependencies, firmware, fleet, hygiene, install, instructions, layers, licences,
-    links, manifests, names, panic_free, paper, planted, security, workspace,
+    links, manifests, msrv, names, panic_free, paper, planted, security, workspace,
 };
 
 /// A group of checks that is run and reported as one.
@@ -62,12 +62,12 @@ pub(crate) const GROUPS: [Group; 24] = [
     },
     Group {
         name: "dependencies",
-        what: "each dependency has its reason; licences and sources are allowed",
+        what: "each dependency has its reason; licences, sources and the Rust that they need are allowed",
         budget: 5,
         quick: Some(5),
         by_default: true,
         waits: false,
-        run: |_| all(&[dependencies::check, licences::check]),
+        run: |_| all(&[dependencies::check, licences::check, msrv::check]),
     },
     Group {
         name: "links",
@@ -309,7 +309,18 @@ fn format() -> Result<()> {
 }
 
 fn clippy() -> Result<()> {
-    let all = ["clippy", "--workspace", "--all-targets", "--features", binaries::FEATURES, "--", "-D", "warnings"];
+    let all = [
+        "clippy",
+        "--workspace",
+        "--all-targets",
+        "--features",
+        binaries::FEATURES,
+        "--",
+        "-D",
+        "warnings",
+        "-D",
+        "clippy::incompatible_msrv",
+    ];
     Run::cargo().args(all).stream()
 }
 

@@ -1,11 +1,12 @@
 //! Licences and sources of everything in the lock file: what may be linked, and from the registry only.
 
 use std::collections::{HashMap, HashSet};
+use std::path::Path;
 
 use anyhow::{Result, bail};
 use serde_json::Value;
 
-use crate::command::Run;
+use crate::workspace;
 
 /// Licences that MIT OR Apache-2.0 software may be linked with.
 const ALLOWED: [&str; 12] = [
@@ -30,8 +31,7 @@ const REGISTRY: &str = "registry+https://github.com/rust-lang/crates.io-index";
 
 /// Asks cargo for all packages and fails with those that may not be used.
 pub(crate) fn check() -> Result<()> {
-    let text = Run::cargo().args(["metadata", "--format-version", "1", "--locked"]).text()?;
-    let metadata: Value = serde_json::from_str(&text)?;
+    let metadata = workspace::metadata(Path::new("Cargo.toml"))?;
     let packages = metadata.get("packages").and_then(Value::as_array).map_or(&[][..], Vec::as_slice);
     let shipped = shipped(&metadata);
     let is_shipped = |package: &Value| package.get("id").and_then(Value::as_str).is_none_or(|id| shipped.contains(id));

@@ -23,6 +23,7 @@ mod layers;
 mod licences;
 mod links;
 mod manifests;
+mod msrv;
 mod names;
 mod panic_free;
 mod paper;

@@ -101,6 +101,12 @@ impl Manifest {
         self.table.contains_key("workspace")
     }
 
+    /// The oldest Rust that it names, or `none`; `None` where it inherits that of its workspace.
+    pub(crate) fn rust_version(&self) -> Option<&str> {
+        let named = self.table.get("package").and_then(|package| package.get("rust-version"));
+        named.map_or(Some("none"), Value::as_str)
+    }
+
     fn place(&self) -> Option<Place> {
         let mut folders = self.file.components().map(|component| component.as_os_str().to_str().unwrap_or_default());
         match (folders.next()?, folders.next()?) {

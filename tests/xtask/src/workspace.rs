@@ -4,6 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
+use serde_json::Value;
 
 use crate::command::Run;
 
@@ -39,4 +40,11 @@ pub(crate) fn files_with(extension: &str) -> Result<Vec<PathBuf>> {
     let mut files = files()?;
     files.retain(|path| path.extension().is_some_and(|found| found == extension));
     Ok(files)
+}
+
+/// What cargo tells about all packages that the manifest's lock file names.
+pub(crate) fn metadata(manifest: &Path) -> Result<Value> {
+    let file = manifest.to_string_lossy();
+    let arguments = ["metadata", "--format-version", "1", "--locked", "--manifest-path", &file];
+    Ok(serde_json::from_str(&Run::cargo().args(arguments).text()?)?)
 }
