@@ -21,23 +21,85 @@ enum Layer {
 /// Modules at the root of the core that belong to no layer and that every layer may use.
 const FOUNDATION: [&str; 8] = ["bytes", "config", "counters", "error", "fmt", "random", "storage", "time"];
 
-/// A layer talks to its neighbour. These items of the host layer are the exceptions that services use directly, each with
-/// what for; everything else goes through distribution.
-const HOST_FOR_SERVICES: [(&str, &str, &str); 14] = [
-    ("connections", "Link", "a session owns one link"),
-    ("connections", "Incoming", "what the link has received whole"),
-    ("connections", "Place", "where that lies, without a copy"),
-    ("connections", "Liveness", "whether the peer is still there decides how long the session lasts"),
-    ("connections", "LinkCounter", "a session counts in its link's counters"),
-    ("frame", "Frame", "frames that are no messages: hello, proof, ping, session bodies, close"),
-    ("frame", "ChunkWriter", "where a message is encoded in place"),
-    ("frame", "HEADER_BYTES", "how large a buffer is that a framed message fits"),
-    ("mailman", "Mailman", "the port's trait, lent down to the link"),
-    ("mailman", "LinkId", "how ports name a link"),
-    ("secure", "Secure", "the cipher's trait: a session proves, renews and opens"),
-    ("secure", "Unopened", "why a session datagram is dropped"),
-    ("secure", "PROOF_BYTES", "size of a message of the proof"),
-    ("secure", "DATAGRAM_OVERHEAD", "size of the longest session datagram"),
+/// What services use of host directly, past distribution.
+struct Purpose {
+    /// What for.
+    what: &'static str,
+    /// Which files or folders below `core/src`; each of them uses each of the items.
+    places: &'static [&'static str],
+    /// Which items, as `module::Item` of host.
+    items: &'static [&'static str],
+}
+
+/// A layer talks to its neighbour. These are the exceptions of services; everything else of host goes through distribution.
+const HOST_FOR_SERVICES: [Purpose; 15] = [
+    Purpose {
+        what: "the cipher's trait, over which all of a session is generic",
+        places: &["services"],
+        items: &["secure::Secure"],
+    },
+    Purpose {
+        what: "what happens on a link is counted in the link",
+        places: &["services/unit"],
+        items: &["connections::LinkCounter"],
+    },
+    Purpose {
+        what: "the port's sockets, lent down to the link",
+        places: &["services/mod.rs"],
+        items: &["mailman::Mailman"],
+    },
+    Purpose {
+        what: "the link that a session owns, and the port's name of it",
+        places: &["services/unit/mod.rs"],
+        items: &["connections::Link", "mailman::LinkId"],
+    },
+    Purpose {
+        what: "whether the peer is still there decides how long a session lasts",
+        places: &["services/unit/mod.rs", "services/unit/proving.rs"],
+        items: &["connections::Liveness"],
+    },
+    Purpose { what: "hello and farewell", places: &["services/unit/mod.rs"], items: &["frame::Frame"] },
+    Purpose { what: "a ping", places: &["services/unit/pinging.rs"], items: &["frame::Frame"] },
+    Purpose {
+        what: "session bodies: leases, and what else fits a datagram",
+        places: &["services/unit/holding.rs", "services/unit/timing.rs"],
+        items: &["frame::Frame"],
+    },
+    Purpose {
+        what: "proof and renewal of keys: their frames, and where they lie",
+        places: &["services/unit/proving.rs", "services/unit/renewing.rs"],
+        items: &["connections::Place", "frame::Frame"],
+    },
+    Purpose {
+        what: "the step of a renewal that is kept until it can be sent",
+        places: &["services/unit/renewing.rs"],
+        items: &["secure::PROOF_BYTES"],
+    },
+    Purpose {
+        what: "what a link has received whole, where it lies, and the answer to a ping",
+        places: &["services/unit/inbound.rs"],
+        items: &["connections::Incoming", "connections::Place", "frame::Frame"],
+    },
+    Purpose {
+        what: "why a session datagram is dropped",
+        places: &["services/unit/inbound.rs"],
+        items: &["secure::Unopened"],
+    },
+    Purpose {
+        what: "how large a frame is that needs no buffer, and what a chunk adds",
+        places: &["services/unit/mod.rs"],
+        items: &["frame::HEADER_BYTES"],
+    },
+    Purpose {
+        what: "how large a buffer is that a session datagram fits",
+        places: &["services/unit/timing.rs"],
+        items: &["secure::DATAGRAM_OVERHEAD"],
+    },
+    Purpose {
+        what: "requests and replies are encoded in place",
+        places: &["services/unit/answering.rs", "services/unit/outbound.rs"],
+        items: &["frame::ChunkWriter"],
+    },
 ];
 
 /// One wrong arrow.
@@ -67,7 +129,7 @@ pub(crate) fn check() -> Result<()> {
     if !sources.iter().any(|(file, text)| file == Path::new("lib.rs") && text.contains("#![no_std]")) {
         bail!("core/src/lib.rs does not say #![no_std]");
     }
-    let unused = unused_exceptions(&sources, &tests);
+    let unused = unused_exceptions(&used_of_host(&sources, &tests));
     unused.iter().for_each(|line| eprintln!("HOST_FOR_SERVICES: {line}"));
     if wrong.is_empty() && unused.is_empty() {
         println!("{} files of the core, every arrow points down", sources.len() - tests.len());
@@ -136,7 +198,7 @@ fn wrong_arrows(file: &Path, text: &str) -> Vec<Wrong> {
     let mut wrong = Vec::new();
     for path in source::paths(&kept) {
         let Some(target) = resolve(&module, &path.segments) else { continue };
-        if let Some(why) = objection(from, own, &target) {
+        if let Some(why) = objection(file, from, own, &target) {
             wrong.push(Wrong { file: file.to_owned(), line: path.line, path: path.segments.join("::"), why });
         }
     }
@@ -162,8 +224,8 @@ fn resolve(module: &[String], segments: &[&str]) -> Option<Vec<String>> {
     Some(base)
 }
 
-/// Why a file of layer `from`, in the crate's module `own`, may not use `target`.
-fn objection(from: Layer, own: &str, target: &[String]) -> Option<String> {
+/// Why `file`, of layer `from` and in the crate's module `own`, may not use `target`.
+fn objection(file: &Path, from: Layer, own: &str, target: &[String]) -> Option<String> {
     let name = target.first()?;
     if name == "*" {
         return Some("takes everything from the crate's root: name the module".into());
@@ -177,28 +239,46 @@ fn objection(from: Layer, own: &str, target: &[String]) -> Option<String> {
         return Some(format!("{from:?} must not use {to:?}, which lies above it"));
     }
     if to == Layer::Host && from == Layer::Services {
-        let [module, item] = [1, 2].map(|at| target.get(at).map_or("", String::as_str));
-        if !HOST_FOR_SERVICES.iter().any(|allowed| (allowed.0, allowed.1) == (module, item)) {
-            return Some("Services may use of Host what HOST_FOR_SERVICES lists, the rest through Distribution".into());
+        let item = item_of_host(target);
+        let is_listed = |purpose: &Purpose| {
+            purpose.places.iter().any(|place| file.starts_with(place)) && purpose.items.contains(&item.as_str())
+        };
+        if !HOST_FOR_SERVICES.iter().any(is_listed) {
+            return Some("no purpose in HOST_FOR_SERVICES lets this file use it: go through Distribution".into());
         }
     }
     None
 }
 
-/// Items that are listed as exceptions and that no file of the services names.
-fn unused_exceptions(sources: &[(PathBuf, String)], tests: &HashSet<PathBuf>) -> Vec<String> {
-    let of_services = sources.iter().filter(|(file, _)| file.starts_with("services") && !tests.contains(file));
+/// `host::module::Item::Variant` as `module::Item`.
+fn item_of_host(target: &[String]) -> String {
+    target.iter().skip(1).take(2).map(String::as_str).collect::<Vec<_>>().join("::")
+}
+
+/// Which items of host the files of the services name.
+fn used_of_host(sources: &[(PathBuf, String)], tests: &HashSet<PathBuf>) -> HashSet<(PathBuf, String)> {
     let mut used = HashSet::new();
-    for (file, text) in of_services {
+    for (file, text) in sources.iter().filter(|(file, _)| file.starts_with("services") && !tests.contains(file)) {
         let all = source::tokens(text);
         let kept = source::without_tests(&all);
-        used.extend(source::paths(&kept).iter().filter_map(|path| resolve(&module_of(file), &path.segments)));
+        let targets = source::paths(&kept).into_iter().filter_map(|path| resolve(&module_of(file), &path.segments));
+        let of_host = targets.filter(|target| target.first().is_some_and(|layer| layer == "host"));
+        used.extend(of_host.map(|target| (file.clone(), item_of_host(&target))));
     }
-    let is_used = |module: &str, item: &str| {
-        used.iter().any(|target| target.iter().take(3).map(String::as_str).eq(["host", module, item]))
-    };
-    let unused = HOST_FOR_SERVICES.iter().filter(|(module, item, _)| !is_used(module, item));
-    unused.map(|(module, item, what)| format!("host::{module}::{item} ({what}): no service uses it")).collect()
+    used
+}
+
+/// Places that are listed with an item that they do not name.
+fn unused_exceptions(used: &HashSet<(PathBuf, String)>) -> Vec<String> {
+    let mut unused = Vec::new();
+    for Purpose { what, places, items } in &HOST_FOR_SERVICES {
+        for (place, item) in places.iter().flat_map(|place| items.iter().map(move |item| (place, item))) {
+            if !used.iter().any(|(file, named)| file.starts_with(place) && named == item) {
+                unused.push(format!("{what}: {place} does not use host::{item}"));
+            }
+        }
+    }
+    unused
 }
 
 fn layer(module: &str) -> Option<Layer> {
@@ -238,7 +318,9 @@ fn forbidden_words(file: &Path, text: &str) -> Vec<Wrong> {
 
 #[cfg(test)]
 mod tests {
-    use super::{HOST_FOR_SERVICES, forbidden_words, module_of, test_files, unused_exceptions, wrong_arrows};
+    use super::{
+        HOST_FOR_SERVICES, forbidden_words, module_of, test_files, unused_exceptions, used_of_host, wrong_arrows,
+    };
     use std::collections::HashSet;
     use std::path::{Path, PathBuf};
 
@@ -249,7 +331,7 @@ mod tests {
     #[test]
     fn arrows_down_are_right() {
         assert_eq!(arrows("services/unit.rs", "use crate::distribution::message::Message;"), 0);
-        assert_eq!(arrows("services/unit.rs", "use crate::host::mailman::{LinkId, Mailman};"), 0);
+        assert_eq!(arrows("services/unit/mod.rs", "use crate::host::{connections::Link, mailman::LinkId};"), 0);
         assert_eq!(arrows("distribution/message.rs", "use crate::{host::frame::Frame, error::Error};"), 0);
         assert_eq!(arrows("host/frame.rs", "use super::mailman::LinkId; use crate::config::CHUNK_BYTES;"), 0);
         assert_eq!(arrows("error.rs", "use crate::time::Duration;"), 0);
@@ -283,18 +365,35 @@ mod tests {
             }
             assert_eq!(arrows("services/unit.rs", &format!("use crate::host::{module};")), 1);
         }
-        assert_eq!(arrows("services/unit.rs", "use crate::host::connections::{Link, Received};"), 1);
+        assert_eq!(arrows("services/unit/mod.rs", "use crate::host::connections::{Link, Received};"), 1);
         assert_eq!(arrows("services/unit.rs", "fn f() { crate::host::frame::encode() }"), 1);
         assert_eq!(arrows("distribution/message.rs", "use crate::host::frame::Cut;"), 0, "a neighbour");
     }
 
     #[test]
+    fn a_purpose_holds_for_its_files_only() {
+        let writer = "fn f(writer: &mut crate::host::frame::ChunkWriter<'_>) {}";
+        assert_eq!(arrows("services/unit/outbound.rs", writer), 0);
+        for other in ["services/unit/granting.rs", "services/unit/outbound_too.rs", "services/requests.rs"] {
+            assert_eq!(arrows(other, writer), 1, "{other}");
+        }
+        let counter = "use crate::host::connections::LinkCounter;";
+        assert_eq!((arrows("services/unit/new.rs", counter), arrows("services/lease.rs", counter)), (0, 1));
+        assert_eq!(arrows("services/lease.rs", "use crate::host::secure::Secure;"), 0);
+    }
+
+    #[test]
     fn an_exception_that_is_not_used_is_told() {
-        let source = |text: &str| vec![(PathBuf::from("services/unit/mod.rs"), text.to_owned())];
-        let unused = |text: &str| unused_exceptions(&source(text), &HashSet::new()).len();
-        assert_eq!(unused(""), HOST_FOR_SERVICES.len());
-        assert_eq!(unused("use crate::host::frame::{Frame, HEADER_BYTES};"), HOST_FOR_SERVICES.len() - 2);
-        assert_eq!(unused("#[cfg(test)] mod tests { use crate::host::frame::Frame; }"), HOST_FOR_SERVICES.len());
+        let unused = |file: &str, text: &str| {
+            let source = [(PathBuf::from(file), text.to_owned())];
+            unused_exceptions(&used_of_host(&source, &HashSet::new())).len()
+        };
+        let all: usize = HOST_FOR_SERVICES.iter().map(|purpose| purpose.places.len() * purpose.items.len()).sum();
+        let file = "services/unit/pinging.rs";
+        assert_eq!(unused(file, ""), all);
+        assert_eq!(unused(file, "use crate::host::frame::Frame;"), all - 1);
+        assert_eq!(unused("services/requests.rs", "use crate::host::frame::Frame;"), all);
+        assert_eq!(unused(file, "#[cfg(test)] mod tests { use crate::host::frame::Frame; }"), all);
     }
 
     #[test]
