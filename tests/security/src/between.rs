@@ -1,4 +1,4 @@
-//! Somebody between a genuine manager and a genuine vehicle, through whose hands all frames go.
+//! An attacker in the middle: every frame between a genuine manager and a genuine vehicle passes through it.
 
 use std::io::{self, Read, Write};
 use std::net::{Ipv4Addr, Shutdown, TcpListener, TcpStream};
@@ -9,7 +9,7 @@ use anyhow::{Context, Result, ensure};
 use cara_core::host::frame;
 use cara_std::Unit;
 
-use crate::diary::Diary;
+use crate::event_log::EventLog;
 use crate::ground::agv;
 use crate::links::Extent;
 use crate::linux::{Linux, LinuxManager, LinuxVehicles, accept, wait_for};
@@ -18,7 +18,7 @@ use crate::tally::Report;
 use crate::target::{Seen, Target};
 use crate::trial::row;
 
-/// A link that is still there after that has noticed nothing. It is longer than any wait for a proof.
+/// A link that is still up after this time has not detected the attack. Longer than any wait for a proof.
 const NOTICED: Duration = Duration::from_secs(5);
 /// Requests in each direction.
 const REQUESTS: usize = 12;
@@ -31,19 +31,27 @@ struct Place {
     number: usize,
 }
 
-/// What is done to a frame.
+/// How a frame is tampered with.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Deed {
+enum Tampering {
     Change,
-    Cut,
+    Truncate,
     Drop,
-    Double,
+    Duplicate,
     Swap,
     Insert,
     Reflect,
 }
 
-const DEEDS: [Deed; 7] = [Deed::Change, Deed::Cut, Deed::Drop, Deed::Double, Deed::Swap, Deed::Insert, Deed::Reflect];
+const TAMPERINGS: [Tampering; 7] = [
+    Tampering::Change,
+    Tampering::Truncate,
+    Tampering::Drop,
+    Tampering::Duplicate,
+    Tampering::Swap,
+    Tampering::Insert,
+    Tampering::Reflect,
+];
 
 /// A manager, and vehicles that reach it through the attacker.
 pub struct Middle<'l> {
@@ -55,7 +63,7 @@ pub struct Middle<'l> {
 /// A vehicle and the way to its manager.
 struct Way<'m> {
     unit: Unit,
-    diary: Diary,
+    log: EventLog,
     listener: TcpListener,
     middle: &'m Middle<'m>,
     id: u32,
@@ -74,7 +82,7 @@ impl<'l> Middle<'l> {
         Self { linux, manager, vehicles }
     }
 
-    /// All that somebody in the middle can try.
+    /// Every attack from the middle.
     pub fn run(&self, report: &mut Report, extent: Extent) -> Result<()> {
         self.flip_every_bit(report, extent)?;
         self.meddle(report, extent)
@@ -83,12 +91,12 @@ impl<'l> Middle<'l> {
     fn way(&self) -> Result<Way<'_>> {
         let id = self.vehicles.next_vehicle();
         let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?;
-        let before = self.manager.diary.seen(&agv(id));
-        let (unit, diary) = self.linux.vehicle(id, Some(listener.local_addr()?))?;
-        Ok(Way { unit, diary, listener, middle: self, id, before })
+        let before = self.manager.log.seen(&agv(id));
+        let (unit, log) = self.linux.vehicle(id, Some(listener.local_addr()?))?;
+        Ok(Way { unit, log, listener, middle: self, id, before })
     }
 
-    /// How long the frames of a handshake are: those of one that nobody touches.
+    /// Lengths of the frames of an undisturbed handshake.
     fn lengths(&self) -> Result<Vec<(Place, usize)>> {
         let way = self.way()?;
         let lengths = Mutex::new(Vec::new());
@@ -118,7 +126,8 @@ impl<'l> Middle<'l> {
         Ok(())
     }
 
-    /// One bit of one frame is another one: whether the link came up all the same. The next one, which nobody touches, must.
+    /// Flips one bit of one frame: whether the link came up all the same. The next handshake, undisturbed, must
+    /// succeed.
     fn flip(&self, at: Place, bit: usize) -> Result<bool> {
         let way = self.way()?;
         let changed = |place, mut bytes: Vec<u8>| {
@@ -133,9 +142,9 @@ impl<'l> Middle<'l> {
         let ended = way.carry(changed, |_| false)?;
         // The last frame is the manager's: it has the vehicle's proof then, and takes it.
         let last = !at.to_manager && at.number == HANDSHAKE - 1;
-        let fooled = !ended || way.diary.all().joins > 0 || (!last && way.manager_joins() > 0);
+        let fooled = !ended || way.log.all().joins > 0 || (!last && way.manager_joins() > 0);
         if fooled {
-            let (vehicle, manager) = (way.diary.all().joins, way.manager_joins());
+            let (vehicle, manager) = (way.log.all().joins, way.manager_joins());
             eprintln!("bit {bit} of {at:?}: ended {ended}, joins at the vehicle {vehicle}, at the manager {manager}");
         }
         if bit.is_multiple_of(8) {
@@ -150,35 +159,36 @@ impl<'l> Middle<'l> {
         Ok(fooled)
     }
 
-    /// Something is done to each sealed frame.
+    /// Tampers with each sealed frame.
     pub fn meddle(&self, report: &mut Report, extent: Extent) -> Result<()> {
         for to_manager in [true, false] {
             let numbers = HANDSHAKE..HANDSHAKE + 8;
             let places = numbers.map(|number| Place { to_manager, number });
-            let cases = places.flat_map(|place| DEEDS.map(|deed| (place, deed))).collect();
+            let cases = places.flat_map(|place| TAMPERINGS.map(|tampering| (place, tampering))).collect();
             let cases = extent.some(cases, 3);
             let target: &dyn Target = if to_manager { self.manager } else { self.vehicles };
             let name = "in the middle: change, cut, drop, double, swap, insert, reflect";
-            row(report, target, name, &cases, false, |(place, deed)| self.meddle_once(*place, *deed))?;
+            row(report, target, name, &cases, false, |(place, tampering)| self.meddle_once(*place, *tampering))?;
         }
         Ok(())
     }
 
-    /// Something is done to one sealed frame: whether anything ran that nobody asked for, or twice, or the link went on.
-    fn meddle_once(&self, at: Place, deed: Deed) -> Result<bool> {
+    /// Tampers with one sealed frame: whether a call ran that was not requested, a call ran twice, or the link stayed
+    /// up.
+    fn meddle_once(&self, at: Place, tampering: Tampering) -> Result<bool> {
         let way = self.way()?;
         let mut held = None;
         let mut came = false;
         let meddle = |place: Place, bytes: Vec<u8>| {
             let next = Place { number: at.number + 1, ..at };
-            match deed {
+            match tampering {
                 _ if place == at => {
                     came = true;
-                    done(deed, bytes, &mut held)
+                    done(tampering, bytes, &mut held)
                 }
-                Deed::Swap if place == next => [Some(bytes), held.take()].into_iter().flatten().collect(),
-                // What goes the other way next is the frame that came from there.
-                Deed::Reflect if place.to_manager != at.to_manager && held.is_some() => {
+                Tampering::Swap if place == next => [Some(bytes), held.take()].into_iter().flatten().collect(),
+                // The next frame in the other direction is preceded by the one that came from there.
+                Tampering::Reflect if place.to_manager != at.to_manager && held.is_some() => {
                     [held.take(), Some(bytes)].into_iter().flatten().collect()
                 }
                 _ => vec![bytes],
@@ -198,36 +208,36 @@ impl<'l> Middle<'l> {
             once.dedup();
             once.len() < marks.len() || once.iter().any(|mark| !asked.contains(mark))
         };
-        Ok(!ended || more(way.diary.all().marks) || more(way.manager_marks()))
+        Ok(!ended || more(way.log.all().marks) || more(way.manager_marks()))
     }
 }
 
-/// What is sent in the place of a frame.
-fn done(deed: Deed, mut bytes: Vec<u8>, held: &mut Option<Vec<u8>>) -> Vec<Vec<u8>> {
-    match deed {
-        Deed::Change => {
+/// The frames that are sent in place of one.
+fn done(tampering: Tampering, mut bytes: Vec<u8>, held: &mut Option<Vec<u8>>) -> Vec<Vec<u8>> {
+    match tampering {
+        Tampering::Change => {
             let at = fastrand::usize(2..bytes.len());
             if let Some(byte) = bytes.get_mut(at) {
                 *byte ^= 1 << fastrand::u8(0..8);
             }
             vec![bytes]
         }
-        Deed::Cut => {
+        Tampering::Truncate => {
             let body = bytes.get(2..bytes.len() - 1).unwrap_or_default();
             vec![[&(body.len() as u16).to_le_bytes()[..], body].concat()]
         }
-        Deed::Drop => Vec::new(),
-        Deed::Double => vec![bytes.clone(), bytes],
-        Deed::Swap => {
+        Tampering::Drop => Vec::new(),
+        Tampering::Duplicate => vec![bytes.clone(), bytes],
+        Tampering::Swap => {
             *held = Some(bytes);
             Vec::new()
         }
-        Deed::Insert => {
+        Tampering::Insert => {
             let noise = std::iter::repeat_with(|| fastrand::u8(..)).take(bytes.len() - 2);
             let length = bytes.iter().take(2).copied();
             vec![length.chain(noise).collect(), bytes]
         }
-        Deed::Reflect => {
+        Tampering::Reflect => {
             *held = Some(bytes.clone());
             vec![bytes]
         }
@@ -236,19 +246,19 @@ fn done(deed: Deed, mut bytes: Vec<u8>, held: &mut Option<Vec<u8>>) -> Vec<Vec<u
 
 impl Way<'_> {
     fn manager_joins(&self) -> usize {
-        self.middle.manager.diary.seen(&agv(self.id)).joins - self.before.joins
+        self.middle.manager.log.seen(&agv(self.id)).joins - self.before.joins
     }
 
     fn manager_marks(&self) -> Vec<i64> {
-        let marks = self.middle.manager.diary.seen(&agv(self.id)).marks;
+        let marks = self.middle.manager.log.seen(&agv(self.id)).marks;
         marks.into_iter().skip(self.before.marks.len()).collect()
     }
 
     fn has_joined(&self) -> bool {
-        self.diary.all().joins > 0 && self.manager_joins() > 0
+        self.log.all().joins > 0 && self.manager_joins() > 0
     }
 
-    /// Both ask for services of each other; the numbers of their requests.
+    /// Both ends call functions of each other; the numbers of their requests.
     fn ask(&self, over: &dyn Fn() -> bool) -> Vec<i64> {
         let mut marks = Vec::new();
         let know =

@@ -25,7 +25,7 @@ use crate::trial::risen;
 
 /// Datagrams in a row, before a unit is given time to read them: its kernel drops what it has no room for.
 const BURST: usize = 40;
-/// Counters of what a unit does because of a who-has or an announce that it believes.
+/// Counters that rise when a unit accepts a `WhoHas` or an `Announce`.
 const BELIEVED: [&str; 5] = ["WhoHasHeard", "AnnounceHeard", "AnnounceSent", "AnnounceBroadcast", "Dialled"];
 
 /// Keys that are lent.
@@ -41,7 +41,7 @@ impl Keyring for Lent<'_> {
     }
 }
 
-/// What is in the flash of a stolen vehicle: the fleet's key, and one for a pair, which is used whoever is meant.
+/// The keys in the flash of a stolen vehicle: the fleet's, and one pair key, which is used for every destination.
 struct Thief<'r>(&'r KeyRing);
 
 impl Keyring for Thief<'_> {
@@ -54,7 +54,7 @@ impl Keyring for Thief<'_> {
     }
 }
 
-/// Everybody who could be announced.
+/// All identities that can be announced.
 fn identities(count: u32) -> Vec<Identity> {
     let others = (2..2 + count / 4).map(|id| Identity::m_unit("depot", id).expect("a short name"));
     std::iter::once(depot()).chain(others).chain((1..=count).map(agv)).collect()
@@ -78,7 +78,7 @@ fn announce(who: &Identity, nonce: u64, tcp_port: u16) -> Announce {
     Announce { identity: who.clone(), epoch, sequence: u32::MAX, nonce, tcp_port, room: 100, expected: 1 }
 }
 
-/// A datagram without a right code, from one with the codes of somebody else.
+/// Datagrams without a valid code, made from one with another sender's codes.
 fn forgeries(bytes: &[u8], fleet: Fleet) -> Vec<Vec<u8>> {
     let signed = bytes.get(..bytes.len() - CODE_BYTES).unwrap_or_default();
     let mut flipped = bytes.to_vec();
@@ -94,7 +94,8 @@ fn forgeries(bytes: &[u8], fleet: Fleet) -> Vec<Vec<u8>> {
     vec![bytes.to_vec(), [signed, &[0; CODE_BYTES]].concat(), signed.to_vec(), flipped, plain, elsewhere]
 }
 
-/// What somebody without the fleet's key can say about `who`; `asked` is the nonce of the target's own question.
+/// The datagrams that an attacker without the fleet's key can send about `who`; `asked` is the nonce of the target's
+/// own question.
 fn said_of(ground: &Ground, who: &Identity, asked: u64, port: u16) -> Vec<Vec<u8>> {
     let (fleet, mut out) = (ground.fleet, [0; SEARCH_BYTES]);
     let mut said = Vec::new();
@@ -117,7 +118,7 @@ fn sum(counters: &Counters, names: &[&str]) -> u64 {
     names.iter().filter_map(|name| counters.get(*name)).sum()
 }
 
-/// Who forges, at the discovery port of a fleet.
+/// A forger at the discovery port of a fleet.
 struct Forger {
     socket: Datagrams,
     listener: TcpListener,
@@ -133,7 +134,7 @@ impl Forger {
         Ok(self.listener.local_addr()?.port())
     }
 
-    /// The next who-has of a vehicle: its nonce and where it came from.
+    /// The next `WhoHas` of a vehicle: its nonce and its source address.
     fn question(&self) -> Result<(u64, SocketAddr)> {
         let end = Instant::now() + PATIENCE;
         let mut buffer = [0; 2_048];
@@ -179,14 +180,14 @@ fn alone(linux: &Linux) -> Result<Linux> {
     Linux::new(64, linux.weakness)
 }
 
-/// Datagrams in everybody's name, to a manager and to a vehicle that asks.
+/// Datagrams in the name of every identity, to a manager and to a vehicle that searches.
 pub fn spoof(report: &mut Report, linux: &Linux, manager: &LinuxManager<'_>, extent: Extent) -> Result<()> {
     let identities = extent.some(identities(128), 8);
     spoof_manager(report, linux, manager, &identities)?;
     spoof_vehicle(report, &alone(linux)?, &identities)
 }
 
-/// Datagrams that tell a manager of everybody: nobody is dialled or answered.
+/// Sends a manager datagrams in the name of every identity: it dials none and answers none.
 fn spoof_manager(report: &mut Report, linux: &Linux, manager: &LinuxManager<'_>, who: &[Identity]) -> Result<()> {
     let forger = Forger::new(linux)?;
     let said: Vec<_> =
@@ -214,10 +215,10 @@ fn spoofed(target: &str, said: &[Vec<u8>], before: &Counters, after: &Counters) 
     })
 }
 
-/// A vehicle asks, and everybody but its manager answers: it dials nobody.
+/// A vehicle searches, and every identity except its manager answers: it dials none of them.
 fn spoof_vehicle(report: &mut Report, linux: &Linux, who: &[Identity]) -> Result<()> {
     let forger = Forger::new(linux)?;
-    let (unit, diary) = linux.vehicle(1, None)?;
+    let (unit, log) = linux.vehicle(1, None)?;
     let (nonce, from) = forger.question()?;
     let thief = Codes::Keyed(Thief(&linux.ground.ring(&agv(2))));
     let mut said = Vec::new();
@@ -233,7 +234,7 @@ fn spoof_vehicle(report: &mut Report, linux: &Linux, who: &[Identity]) -> Result
     let after = named(unit.counters());
     let mut row = spoofed("Linux s_unit", &said, &before, &after)?;
     forger.listener.set_nonblocking(true)?;
-    row.successes += u64::from(forger.listener.accept().is_ok()) + diary.all().joins as u64;
+    row.successes += u64::from(forger.listener.accept().is_ok()) + log.all().joins as u64;
     report.add(row);
     unit.stop();
     Ok(())
@@ -246,7 +247,7 @@ fn relayed(report: &mut Report, linux: &Linux, extent: Extent) -> Result<()> {
     let times = if extent == Extent::Full { 24 } else { 4 };
     let (mut successes, mut noticed) = (0, Vec::new());
     for id in 1..=times {
-        let (unit, diary) = linux.vehicle(id, None)?;
+        let (unit, log) = linux.vehicle(id, None)?;
         let (nonce, from) = forger.question()?;
         let mut out = [0; SEARCH_BYTES];
         let answer = announce(&depot(), nonce, forger.port()?);
@@ -255,7 +256,7 @@ fn relayed(report: &mut Report, linux: &Linux, extent: Extent) -> Result<()> {
         for _ in 0..8 {
             forger.socket.send_to(from, answer);
         }
-        let stream = accept(&forger.listener).context("a vehicle dials whoever its manager's answer comes from")?;
+        let stream = accept(&forger.listener).context("a vehicle dials the source address of its manager's answer")?;
         let claim = linux.claim_of_manager();
         let keys = linux.ground.keys(id);
         let mut speaker = Speaker::new(stream, false, cara_core::config::Mode::Secured, claim, keys.wrong)?;
@@ -265,7 +266,7 @@ fn relayed(report: &mut Report, linux: &Linux, extent: Extent) -> Result<()> {
         std::thread::sleep(Duration::from_millis(20));
         noticed.extend(risen(&before, &named(unit.counters())));
         unit.stop();
-        successes += u64::from(diary.all().joins > 0 || speaker.told);
+        successes += u64::from(log.all().joins > 0 || speaker.told);
     }
     noticed.sort();
     noticed.dedup();

@@ -1,4 +1,4 @@
-//! Floods: of datagrams, and of links that never prove anything. Meanwhile those who belong go on as before.
+//! Floods of datagrams, and of links that never send a proof. Genuine units keep working meanwhile.
 
 use std::net::TcpStream;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -25,16 +25,17 @@ use crate::trial::risen;
 const DEADLINE: Duration = Duration::from_secs(2);
 /// Calls during each flood, at least.
 const CALLS: usize = 60;
-/// Connections that a flood holds open at a time, per thread: together more than a manager has room for.
+/// Connections that a flood holds open at a time, per thread: together they exceed a manager's capacity.
 const HELD: usize = 100;
-/// Pause of each of the two attackers between two links, so that they open a thousand a second at most: a link has as long
-/// to prove itself as it takes to open as many as there is room for.
+/// Pause of each of the two attackers between two links, so that they open a thousand a second at most. A link is
+/// displaced
+/// once as many newer ones are open as the manager has capacity for; until then it has time to prove itself.
 const BETWEEN_LINKS: Duration = Duration::from_millis(2);
 /// Pause of each of the two attackers between two datagrams.
 const BETWEEN_DATAGRAMS: Duration = Duration::from_micros(50);
-/// Counters of a manager that rise where it believes what comes to its discovery port.
+/// Counters of a manager that rise when it accepts a datagram at its discovery port.
 const BELIEVED: [&str; 3] = ["WhoHasHeard", "AnnounceHeard", "Dialled"];
-/// Numbers of the vehicles that belong, and that others do not use.
+/// Number of the first genuine vehicle.
 const THERE: u32 = 201;
 
 /// A flood.
@@ -42,16 +43,16 @@ struct Flood {
     name: &'static str,
     /// Attempts, at least.
     count: u64,
-    /// The vehicle that comes meanwhile.
+    /// The vehicle that joins during the flood.
     newcomer: u32,
-    /// The counter that rises with each attempt that the manager looked at; without one all that were made count.
+    /// The counter of attempts that the manager processed; without one, every attempt counts.
     looked_at: Option<&'static str>,
 }
 
 /// Both floods against a manager.
 pub fn run(report: &mut Report, linux: &Linux, manager: &LinuxManager<'_>, extent: Extent) -> Result<()> {
     let (there, _) = linux.vehicle(THERE, None)?;
-    ensure!(wait_for(|| connected(manager, THERE).is_some()), "nobody joins in calm");
+    ensure!(wait_for(|| connected(manager, THERE).is_some()), "no vehicle joins before the flood");
     let count = if extent == Extent::Full { 6_000 } else { 800 };
     let handshakes = |over: &AtomicBool, made: &AtomicU64| open_links(linux, manager, over, made);
     let links = Flood { name: "flood of half-open links", count, newcomer: THERE + 1, looked_at: None };
@@ -78,9 +79,9 @@ fn call(peer: &Peer) -> Result<(), Error> {
     peer.block_request_with("mark", &mut number, &options)
 }
 
-/// Lets `attacker` go on until it has done enough, and those who belong have done what they want: calls in time, and a
-/// new vehicle that is found and joins. Each attempt that keeps one from that is a success, as is who joins without a key,
-/// and each datagram that is believed.
+/// Runs `attacker` until it has made enough attempts and the genuine units have done their part: calls within their
+/// deadline, and a new vehicle that is found and joins. Successes of the attacker are: a late call, a new vehicle that
+/// does not join, a join without a key, and a datagram that is accepted.
 fn flood(
     report: &mut Report,
     linux: &Linux,
@@ -90,7 +91,7 @@ fn flood(
 ) -> Result<()> {
     let (over, made) = (AtomicBool::new(false), AtomicU64::new(0));
     let before = manager.counters()?;
-    let joins = manager.diary.joins_but_of(&[agv(THERE), agv(newcomer)]);
+    let joins = manager.log.joins_but_of(&[agv(THERE), agv(newcomer)]);
     let (mut late, mut calls, mut new) = (0, 0, None);
     std::thread::scope(|scope| -> Result<()> {
         let attackers = [(); 2].map(|()| scope.spawn(|| attacker(&over, &made)));
@@ -114,17 +115,17 @@ fn flood(
         over.store(true, Ordering::Relaxed);
         attackers.into_iter().try_for_each(|attacker| attacker.join().map_err(|_| anyhow!("an attacker panicked"))?)
     })?;
-    let strangers = manager.diary.joins_but_of(&[agv(THERE), agv(newcomer)]) - joins;
+    let unexpected = manager.log.joins_but_of(&[agv(THERE), agv(newcomer)]) - joins;
     let after = manager.counters()?;
     let (unit, _) = new.ok_or_else(|| anyhow!("the flood was over before a newcomer came"))?;
-    // The manager's counters were read first: what it heard of the newcomer was sent before.
+    // The manager's counters are read first, so that they hold no datagram of the newcomer that its own counters lack.
     let believed = believed(&before, &after, unit.counters());
     unit.stop();
     report.add(Row {
         attack: name.to_owned(),
         target: manager.name().to_owned(),
         attempts: looked_at.map_or(made.into_inner(), |name| value(&after, name) - value(&before, name)),
-        successes: late + strangers as u64 + believed,
+        successes: late + unexpected as u64 + believed,
         noticed: risen(&before, &after),
         control: false,
     });
@@ -135,7 +136,7 @@ fn value(counters: &Counters, name: &str) -> u64 {
     counters.get(name).copied().unwrap_or(0)
 }
 
-/// What the manager believed beyond the newcomer's own questions.
+/// Datagrams that the manager accepted beyond the newcomer's own.
 fn believed(before: &Counters, after: &Counters, newcomer: Vec<(&'static str, u64)>) -> u64 {
     let heard: u64 = BELIEVED.iter().map(|name| value(after, name) - value(before, name)).sum();
     heard.saturating_sub(value(&named(newcomer), "WhoHasSent"))
@@ -150,7 +151,7 @@ fn open_links(linux: &Linux, manager: &LinuxManager<'_>, over: &AtomicBool, made
         let claim = linux.claim_of(if number.is_multiple_of(2) { THERE } else { 100 });
         let mut stream = TcpStream::connect(manager.address())?;
         let says = framed(&Frame::Hello(&hello(&claim, Mode::Secured, 9)));
-        // Who gave way to a newer one hears it here.
+        // The write fails on a link that the manager has closed in favour of a newer one.
         let _ = stream.write_all(&says);
         held.push_back(stream);
         if held.len() > HELD {
@@ -161,7 +162,8 @@ fn open_links(linux: &Linux, manager: &LinuxManager<'_>, over: &AtomicBool, made
     Ok(())
 }
 
-/// Sends datagram after datagram: who-has with the codes of another fleet, and noise behind a right beginning in turn.
+/// Sends datagrams without end: each second one a `WhoHas` with another fleet's codes, the others noise behind a valid
+/// header.
 fn say_anything(linux: &Linux, over: &AtomicBool, made: &AtomicU64) -> Result<()> {
     let socket = Datagrams::open(Interfaces::Loopback, linux.port)?;
     let mut out = [0; SEARCH_BYTES];

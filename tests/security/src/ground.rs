@@ -16,7 +16,7 @@ pub struct Ground {
     vehicles: u32,
 }
 
-/// The keys that somebody may try on the link of the manager and one vehicle.
+/// The keys that an attacker can try on the link between the manager and one vehicle.
 #[derive(Clone, Debug)]
 pub struct Keys {
     /// The right one.

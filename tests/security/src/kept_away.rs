@@ -30,7 +30,7 @@ pub struct Attack {
     /// What it is.
     pub name: &'static str,
     said: Vec<Vec<u8>>,
-    /// Where what is said leads to: connections are taken, and nothing is said on them.
+    /// Listeners at the addresses that the datagrams name: they accept connections and stay silent.
     _silent: Vec<TcpListener>,
 }
 
@@ -82,9 +82,9 @@ fn start(
     sent: &AtomicU64,
 ) -> Result<(Option<Duration>, Vec<String>)> {
     attack.beside(socket, a_second, sent, || {
-        let (unit, diary) = linux.vehicle(vehicle, None)?;
+        let (unit, log) = linux.vehicle(vehicle, None)?;
         let since = Instant::now();
-        let joined = wait_for(|| diary.all().joins > 0).then(|| since.elapsed());
+        let joined = wait_for(|| log.all().joins > 0).then(|| since.elapsed());
         let counted = named(unit.counters());
         unit.stop();
         let risen = TELLING.iter().filter(|name| counted.get(**name).is_some_and(|count| *count > 0));
@@ -93,7 +93,7 @@ fn start(
 }
 
 impl Attack {
-    /// A who-has of each of two lives of the manager that are over. `live` begins one, and returns what ends it.
+    /// A recorded `WhoHas` of each of two ended boots of the manager. `live` starts one, and returns what stops it.
     pub fn earlier_lives<'l>(
         socket: &Datagrams,
         at: Ipv4Addr,
@@ -110,13 +110,13 @@ impl Attack {
         Ok(Self { name: "recorded who-has of two earlier lives of the manager", said, _silent: silent })
     }
 
-    /// The who-has of another vehicle, which asks now.
+    /// The `WhoHas` of another vehicle that is searching now.
     pub fn another_vehicle(socket: &Datagrams) -> Result<Self> {
         let (bytes, _) = recorded(socket, Role::SUnit)?;
         Ok(Self { name: "recorded who-has of another vehicle", said: vec![bytes], _silent: Vec::new() })
     }
 
-    /// Announces of the manager, each of another life, with the discovery key of a stolen vehicle.
+    /// Announces of the manager, each of another boot, with the discovery key of a stolen vehicle.
     pub fn forged(ring: &KeyRing, fleet: Fleet, at: Ipv4Addr) -> Result<Self> {
         let listener = TcpListener::bind((at, 0))?;
         let codes = Codes::Keyed(Lent(ring));
@@ -132,7 +132,9 @@ impl Attack {
         Ok(Self { name: "announces forged with a stolen discovery key", said, _silent: vec![listener] })
     }
 
-    /// Does something while this is broadcast so many times a second, and has been for a while; counts what is `sent`.
+    /// Runs `what` while the attack's datagrams are broadcast `a_second` times a second, after they have been for
+    /// [`BEFORE`];
+    /// counts them in `sent`.
     pub fn beside<T>(&self, socket: &Datagrams, a_second: u64, sent: &AtomicU64, what: impl FnOnce() -> T) -> T {
         let over = AtomicBool::new(false);
         let pause = Duration::from_micros(1_000_000 / a_second);
@@ -159,13 +161,13 @@ pub fn median_and_worst(took: &mut [u128]) -> (u128, u128) {
     (at(took.len() / 2), at(took.len().saturating_sub(1)))
 }
 
-/// A manager that runs until it is ended.
+/// A running manager, and what stops it.
 fn live(linux: &Linux) -> Result<Box<dyn FnOnce() + '_>> {
     let manager = linux.manager()?;
     Ok(Box::new(move || manager.system.stop()))
 }
 
-/// A who-has of another vehicle.
+/// A `WhoHas` of another vehicle.
 fn another_vehicle(linux: &Linux, socket: &Datagrams) -> Result<Attack> {
     let (unit, _) = linux.vehicle(OTHER, None)?;
     let attack = Attack::another_vehicle(socket);
@@ -173,7 +175,7 @@ fn another_vehicle(linux: &Linux, socket: &Datagrams) -> Result<Attack> {
     attack
 }
 
-/// The next who-has of a unit of this role that goes to all.
+/// The next broadcast `WhoHas` of a unit of this role.
 fn recorded(socket: &Datagrams, role: Role) -> Result<(Vec<u8>, WhoHas)> {
     let end = Instant::now() + PATIENCE;
     let mut buffer = [0; 2_048];

@@ -1,17 +1,18 @@
-//! Attackers on real sockets. Nothing here is a unit: an attacker speaks the wire through raw sockets, and has of CARA
-//! only what writes valid frames and codes, so that it can write nearly valid ones.
+//! Attackers on real sockets. No attacker is a unit: each speaks the wire protocol through raw sockets, and takes from
+//! CARA
+//! only the encoders of frames and codes, so that what it sends is valid, or nearly.
 //!
-//! - [`speaker`]: one end of a link, step by step, with whatever key;
+//! - [`speaker`]: one end of a link, step by step, with any key;
 //! - [`ground`]: the keys of a fleet, and those that an attacker may have instead;
-//! - [`target`]: what is attacked; [`linux`] has units of the Linux port;
+//! - [`target`]: the unit under attack; [`linux`] has those of the Linux port;
 //! - [`links`]: the attacks on links; they know of a target only what [`target::Target`] tells;
 //! - [`between`]: an attacker between two genuine ends; [`discovery`], [`kept_away`], [`floods`] and [`permission`]: the other
 //!   attacks;
-//! - [`tally`]: attempts, successes, and the counters that tell of them.
+//! - [`tally`]: attempts, successes, and the counters that record them.
 
 pub mod between;
-pub mod diary;
 pub mod discovery;
+pub mod event_log;
 pub mod floods;
 pub mod ground;
 pub mod kept_away;

@@ -1,4 +1,4 @@
-//! Attacks on the links of a unit, whoever opens them.
+//! Attacks on the links of a unit, in both directions of dialling.
 
 use std::io;
 use std::time::Instant;
@@ -49,7 +49,7 @@ pub fn run(report: &mut Report, target: &dyn Target, extent: Extent) -> Result<(
     replays(report, target, extent, Mode::Secured)
 }
 
-/// All that is said once more, in the mode of the target.
+/// All replays, in the mode of the target.
 pub fn replays(report: &mut Report, target: &dyn Target, extent: Extent, mode: Mode) -> Result<()> {
     let record = record(target, mode)?;
     recorded_elsewhere(report, target, extent, mode, &record)?;
@@ -64,12 +64,12 @@ fn share<C>(target: &dyn Target, cases: Vec<C>) -> Vec<C> {
     cases.into_iter().step_by(of).collect()
 }
 
-/// The attacker with the key gets in: what counts successes can count them.
+/// The same attacker with the key gets in, which shows that successes are counted.
 pub fn with_the_key(report: &mut Report, target: &dyn Target) -> Result<()> {
     control(report, target, "the same attacker with the key", &share(target, vec![(); 8]), |(), visit| {
         let mut speaker = visit.speaker(&visit.keys.genuine)?;
         speaker.converse(HANDSHAKE + 1)?;
-        // Those of one class run in their order: when this one is answered, the one before has run as well.
+        // Requests of one class run in order: once this one is answered, the one before it has run as well.
         let request = speaker.request(0, Priority::Normal, true);
         speaker.say_bytes(&request)?;
         speaker.hear_answer(speaker.last_id())?;
@@ -86,7 +86,7 @@ pub fn with_the_key(report: &mut Report, target: &dyn Target) -> Result<()> {
     })
 }
 
-/// Which key somebody tries.
+/// Selects the key that is tried.
 type Which = fn(&Keys) -> &PairKey;
 
 fn keys(report: &mut Report, target: &dyn Target, extent: Extent) -> Result<()> {
@@ -100,7 +100,7 @@ fn keys(report: &mut Report, target: &dyn Target, extent: Extent) -> Result<()> 
         let cases = share(target, extent.some((0..120_u32).collect(), 4));
         attack(report, target, name, &cases, |number, visit| {
             let mut claim = visit.claim.clone();
-            // Every other one of another fleet says so, too.
+            // Every second attempt with another fleet's key also claims that fleet.
             if name.ends_with("another fleet") && number % 2 == 1 {
                 claim.fleet = Fleet(claim.fleet.0.wrapping_add(1));
             }
@@ -112,7 +112,7 @@ fn keys(report: &mut Report, target: &dyn Target, extent: Extent) -> Result<()> 
     Ok(())
 }
 
-/// What somebody without any key says.
+/// What an attacker without a key sends.
 #[derive(Clone, Copy, Debug)]
 enum Ruse {
     RandomProof,
@@ -185,7 +185,7 @@ fn pretend(ruse: Ruse, visit: &Visit<'_>, speaker: &mut Speaker) -> io::Result<(
             speaker.say_bytes(&request_in_clear())
         }
         Ruse::Reflect => {
-            // Whoever dialled hears the other one's hello only now.
+            // As the dialling end, it receives the other hello only now.
             let _ = speaker.step();
             let heard = speaker.heard.clone();
             heard.iter().try_for_each(|frame| speaker.say_bytes(frame))
@@ -194,7 +194,7 @@ fn pretend(ruse: Ruse, visit: &Visit<'_>, speaker: &mut Speaker) -> io::Result<(
     }
 }
 
-/// Somebody in plain mode, or who goes on in plain text after a secured hello.
+/// An attacker in plain mode, or one that continues in plain text after a secured hello.
 pub fn plain(report: &mut Report, target: &dyn Target, extent: Extent) -> Result<()> {
     let cases = share(target, extent.some((0..60_u32).collect(), 3));
     attack(report, target, "downgrade to plain", &cases, |_, visit| {
@@ -204,8 +204,8 @@ pub fn plain(report: &mut Report, target: &dyn Target, extent: Extent) -> Result
     })
 }
 
-/// Whether a target let a frame pass that has to end its link: `once` says it, and tells whether anything was seen of it,
-/// and how the link ended while the attacker's own end was open.
+/// Whether a target accepts a frame that has to end its link. `once` sends it, and returns whether the application saw
+/// anything of it and how the link ended while the attacker kept its own end open.
 fn passes(once: impl Fn() -> Result<(bool, End)>) -> Result<bool> {
     for _ in 0..TRIES {
         let (seen, end) = once()?;
@@ -216,7 +216,7 @@ fn passes(once: impl Fn() -> Result<(bool, End)>) -> Result<bool> {
     Ok(true)
 }
 
-/// Whether there are as many bytes as the length in front says: of others the rest may still come.
+/// Whether `bytes` is a complete frame by its own length prefix. The target waits for the rest of an incomplete one.
 fn is_whole(bytes: &[u8]) -> bool {
     frame::first_frame_length(bytes).is_some_and(|length| length <= bytes.len())
 }
@@ -253,7 +253,7 @@ fn lengths(report: &mut Report, target: &dyn Target, extent: Extent) -> Result<(
     sealed_lengths(report, target, extent)
 }
 
-/// The genuine hello and proof up to a step, and bytes instead of that: they alone are at fault.
+/// The genuine handshake up to a step, and `instead` in place of that step, so that only these bytes are wrong.
 fn instead_of<'t>(target: &'t dyn Target, at: usize, instead: &[u8]) -> Result<(Visit<'t>, Speaker)> {
     let visit = target.visit()?;
     let mut speaker = visit.speaker(&visit.keys.genuine)?;
@@ -277,10 +277,10 @@ fn sealed_of_length(visit: &Visit<'_>, at: usize, length: usize) -> Result<(bool
     let asked = speaker.asked.clone();
     let next = speaker.request(0, Priority::Normal, false);
     let mut body = next.get(2..).unwrap_or_default().to_vec();
-    // One of the genuine length is another one all the same.
+    // At the genuine length the frame would be valid: make it one byte longer.
     body.resize(if length == body.len() { length + 1 } else { length }, 0);
     let _ = speaker.say_bytes(&in_frame(&body));
-    // A datagram overtakes it. What comes behind it in the stream must not run.
+    // A datagram may overtake the wrong frame; a request behind it in the stream must not run.
     while let Ok(Some(next)) = speaker.step() {
         if !next.datagram && speaker.say(&next).is_err() {
             break;
@@ -290,7 +290,7 @@ fn sealed_of_length(visit: &Visit<'_>, at: usize, length: usize) -> Result<(bool
     Ok((visit.saw_more(speaker, 1, &asked)?, end))
 }
 
-/// A genuine conversation as somebody on the network has it.
+/// A genuine conversation as recorded on the network.
 pub struct Record {
     /// What the genuine peer said.
     pub said: Vec<Said>,
@@ -298,7 +298,7 @@ pub struct Record {
     pub heard: Vec<Vec<u8>>,
 }
 
-/// A genuine peer talks with the target, and all of it is written down.
+/// Records a conversation between a genuine peer and the target.
 pub fn record(target: &dyn Target, mode: Mode) -> Result<Record> {
     let visit = target.visit()?;
     let mut speaker = visit.speaker_as(mode, visit.claim.clone(), &visit.keys.genuine)?;
@@ -319,7 +319,7 @@ impl Record {
     }
 }
 
-/// A genuine conversation in which `again` is said once more after `state` steps; whether it came to anything.
+/// A genuine conversation in which `again` is replayed after `state` steps; whether the target acted on it.
 fn interrupted(visit: &Visit<'_>, mode: Mode, state: usize, again: impl Fn(&[Said]) -> Option<Said>) -> Result<bool> {
     let mut speaker = visit.speaker_as(mode, visit.claim.clone(), &visit.keys.genuine)?;
     let mut said = Vec::new();

@@ -1,4 +1,4 @@
-//! Units of the Linux port on loopback: a manager that strangers dial, and vehicles that dial a stranger.
+//! Units of the Linux port on loopback: a manager that attackers dial, and vehicles that dial an attacker.
 
 use std::net::{Ipv4Addr, SocketAddr, TcpListener, TcpStream};
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -11,13 +11,13 @@ use cara_std::access::AccessTable;
 use cara_std::control::Control;
 use cara_std::{Builder, CommunicationSystem, Constraints, Interfaces, Manager, Threads, Unit};
 
-use crate::diary::Diary;
+use crate::event_log::EventLog;
 use crate::ground::{Ground, agv, depot};
 use crate::speaker::{Claim, PATIENCE};
 use crate::tally::Counters;
 use crate::target::{Seen, Target, Visit};
 
-/// Between the end of a connection and the last that the application hears of it.
+/// Between the end of a connection and its last event in the application.
 const SETTLING: Duration = Duration::from_millis(4);
 
 /// What is wrong with a unit, on purpose: the attacks must find it.
@@ -28,7 +28,7 @@ pub enum Weakness {
     None,
     /// It is in plain mode, on the port of secured units.
     Plain,
-    /// Its access table allows whatever it is to be.
+    /// Its access table allows everything.
     Open,
 }
 
@@ -66,29 +66,29 @@ impl Linux {
 
     /// A manager that runs and offers its functions.
     pub fn manager(&self) -> Result<LinuxManager<'_>> {
-        // With room for fewer links than attackers hold.
+        // The capacity is below the number of links that attackers hold.
         let constraints = Constraints { maximum_nodes: 64, ..Constraints::M_UNIT };
         let builder = CommunicationSystem::builder("depot", 1)?.constraints(constraints);
         let system = self.prepared(builder, &depot()).build_system()?;
-        let diary = Diary::default();
-        diary.offer(&system.my_function_list())?;
-        diary.follow(system.events());
+        let log = EventLog::default();
+        log.offer(&system.my_function_list())?;
+        log.follow(system.events());
         system.publish_my_function_list()?;
         system.start()?;
-        Ok(LinuxManager { linux: self, system, diary, next: AtomicU32::new(0) })
+        Ok(LinuxManager { linux: self, system, log, next: AtomicU32::new(0) })
     }
 
     /// A vehicle that runs and offers its functions; its manager is at an address, or found by discovery.
-    pub fn vehicle(&self, id: u32, manager: Option<SocketAddr>) -> Result<(Unit, Diary)> {
+    pub fn vehicle(&self, id: u32, manager: Option<SocketAddr>) -> Result<(Unit, EventLog)> {
         let builder = self.prepared(Unit::builder("agv", id, "depot", 1)?, &agv(id));
         let builder = manager.into_iter().fold(builder, Builder::manager_address);
         let unit = builder.build_unit()?;
-        let diary = Diary::default();
-        diary.offer(&unit.my_function_list())?;
-        diary.follow(unit.events());
+        let log = EventLog::default();
+        log.offer(&unit.my_function_list())?;
+        log.follow(unit.events());
         unit.publish_my_function_list()?;
         unit.start()?;
-        Ok((unit, diary))
+        Ok((unit, log))
     }
 
     /// The vehicle's claim on a link with its manager.
@@ -120,13 +120,13 @@ pub fn wait_for(condition: impl Fn() -> bool) -> bool {
     true
 }
 
-/// A manager: strangers dial it, as vehicles.
+/// A manager: attackers dial it, as vehicles.
 pub struct LinuxManager<'l> {
     linux: &'l Linux,
     /// The unit.
     pub system: CommunicationSystem,
     /// What it has seen.
-    pub diary: Diary,
+    pub log: EventLog,
     next: AtomicU32,
 }
 
@@ -136,7 +136,7 @@ impl LinuxManager<'_> {
         (Ipv4Addr::LOCALHOST, self.system.tcp_port()).into()
     }
 
-    /// A vehicle's number that was not given for long.
+    /// The vehicle number that has been unused for the longest time.
     pub fn next_vehicle(&self) -> u32 {
         self.linux.ground.vehicle(self.next.fetch_add(1, Ordering::Relaxed))
     }
@@ -154,10 +154,10 @@ impl Target for LinuxManager<'_> {
     fn visit(&self) -> Result<Visit<'_>> {
         let vehicle = self.next_vehicle();
         let who = agv(vehicle);
-        let before = self.diary.seen(&who);
+        let before = self.log.seen(&who);
         let seen = move || {
             std::thread::sleep(SETTLING);
-            let Seen { joins, marks } = self.diary.seen(&who);
+            let Seen { joins, marks } = self.log.seen(&who);
             Ok(Seen { joins: joins - before.joins, marks: marks.into_iter().skip(before.marks.len()).collect() })
         };
         Ok(Visit {
@@ -174,7 +174,7 @@ impl Target for LinuxManager<'_> {
     }
 }
 
-/// Vehicles, a new one for each visit: they dial a stranger, as their manager.
+/// Vehicles, a new one for each visit: they dial the attacker, as their manager.
 pub struct LinuxVehicles<'l> {
     linux: &'l Linux,
     next: AtomicU32,
@@ -188,7 +188,7 @@ impl<'l> LinuxVehicles<'l> {
         Self { linux, next: AtomicU32::new(0), counted: Mutex::default() }
     }
 
-    /// A vehicle's number that was not given for long.
+    /// The vehicle number that has been unused for the longest time.
     pub fn next_vehicle(&self) -> u32 {
         self.linux.ground.vehicle(self.next.fetch_add(1, Ordering::Relaxed))
     }
@@ -203,10 +203,10 @@ impl<'l> LinuxVehicles<'l> {
     }
 }
 
-/// A vehicle that is stopped when nobody asks about it any more.
+/// A vehicle that is stopped when the last handle to it is dropped.
 struct Guest<'t> {
     unit: Unit,
-    diary: Diary,
+    log: EventLog,
     vehicles: &'t LinuxVehicles<'t>,
     _listener: TcpListener,
 }
@@ -229,13 +229,13 @@ impl Target for LinuxVehicles<'_> {
     fn visit(&self) -> Result<Visit<'_>> {
         let vehicle = self.next_vehicle();
         let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?;
-        let (unit, diary) = self.linux.vehicle(vehicle, Some(listener.local_addr()?))?;
+        let (unit, log) = self.linux.vehicle(vehicle, Some(listener.local_addr()?))?;
         let stream = accept(&listener).context("a vehicle dials its manager")?;
-        let guest = Guest { unit, diary, vehicles: self, _listener: listener };
+        let guest = Guest { unit, log, vehicles: self, _listener: listener };
         let seen = move || {
             std::thread::sleep(SETTLING);
             guest.unit.stop();
-            Ok(guest.diary.all())
+            Ok(guest.log.all())
         };
         Ok(Visit {
             stream,
@@ -254,7 +254,7 @@ impl Target for LinuxVehicles<'_> {
 /// The next connection, within a generous time.
 pub fn accept(listener: &TcpListener) -> Result<TcpStream> {
     listener.set_nonblocking(true)?;
-    // A vehicle whose link was refused looks again after a pause of up to 16 s.
+    // A vehicle whose link was refused searches again after a back-off of up to 16 s.
     let end = Instant::now() + 4 * PATIENCE;
     loop {
         match listener.accept() {
@@ -265,7 +265,7 @@ pub fn accept(listener: &TcpListener) -> Result<TcpStream> {
             Err(error) if error.kind() == std::io::ErrorKind::WouldBlock => {}
             Err(error) => return Err(error.into()),
         }
-        ensure!(Instant::now() < end, "nobody has dialled");
+        ensure!(Instant::now() < end, "no connection arrived");
         std::thread::sleep(Duration::from_millis(1));
     }
 }

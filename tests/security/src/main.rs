@@ -11,7 +11,7 @@ use cara_security::tally::Report;
 use cara_security::{discovery, floods, kept_away, permission, tally};
 use clap::Parser;
 
-/// More than attempts of any attack: two vehicles of one name at the same time would be told apart by their manager.
+/// More than the attempts of any attack: their manager would refuse two vehicles of one identity at the same time.
 const VEHICLES: u32 = 4_096;
 
 /// Attacks units of the Linux port on loopback.

@@ -1,11 +1,11 @@
-//! A peer that has its key, and asks for more than the access table lets it: only what is allowed may run.
+//! A peer with its genuine key that calls more than the access table allows: only allowed calls may run.
 
 use anyhow::{Context, Result};
 use cara_core::config::Priority;
 use cara_std::access::{AccessTable, Functions, OwnedRule, Rate, Verb, Verbs, Who};
 use cara_std::{Duration, Identity, Role};
 
-use crate::diary::{Diary, FUNCTIONS};
+use crate::event_log::{EventLog, FUNCTIONS};
 use crate::links::Extent;
 use crate::linux::{Linux, LinuxManager, LinuxVehicles, accept, guarded, named};
 use crate::speaker::{HANDSHAKE, Speaker};
@@ -24,7 +24,7 @@ pub fn run(report: &mut Report, linux: &Linux, manager: &LinuxManager<'_>, exten
     let peer = Peer { stream, dials: true, caller: caller.identity.clone(), vehicle };
     let seen = Watched {
         target: "Linux m_unit",
-        diary: &manager.diary,
+        log: &manager.log,
         set: &|table| manager.system.set_access(table),
         counters: &|| named(manager.system.counters()),
     };
@@ -34,12 +34,12 @@ pub fn run(report: &mut Report, linux: &Linux, manager: &LinuxManager<'_>, exten
     let vehicles = LinuxVehicles::new(linux);
     let vehicle = vehicles.next_vehicle();
     let listener = std::net::TcpListener::bind((std::net::Ipv4Addr::LOCALHOST, 0))?;
-    let (unit, diary) = linux.vehicle(vehicle, Some(listener.local_addr()?))?;
+    let (unit, log) = linux.vehicle(vehicle, Some(listener.local_addr()?))?;
     let stream = accept(&listener)?;
     let peer = Peer { stream, dials: false, caller: linux.claim_of_manager().identity, vehicle };
     let seen = Watched {
         target: "Linux s_unit",
-        diary: &diary,
+        log: &log,
         set: &|table| unit.set_access(table),
         counters: &|| named(unit.counters()),
     };
@@ -49,7 +49,7 @@ pub fn run(report: &mut Report, linux: &Linux, manager: &LinuxManager<'_>, exten
     Ok(())
 }
 
-/// The peer that asks for too much.
+/// The peer that exceeds its permissions.
 struct Peer {
     stream: std::net::TcpStream,
     dials: bool,
@@ -60,7 +60,7 @@ struct Peer {
 /// A unit under tables.
 struct Watched<'w> {
     target: &'static str,
-    diary: &'w Diary,
+    log: &'w EventLog,
     set: &'w dyn Fn(Option<AccessTable>),
     counters: &'w dyn Fn() -> Counters,
 }
@@ -73,7 +73,7 @@ fn under_tables(linux: &Linux, peer: Peer, unit: &Watched<'_>, tables: usize) ->
     speaker.converse(HANDSHAKE + 2).context("the genuine peer joins")?;
     speaker.hear_answer(speaker.last_id())?;
     settle();
-    unit.diary.take_ran();
+    unit.log.take_ran();
     let before = (unit.counters)();
     let (mut attempts, mut successes) = (0, 0);
     for _ in 0..tables {
@@ -82,7 +82,7 @@ fn under_tables(linux: &Linux, peer: Peer, unit: &Watched<'_>, tables: usize) ->
         ask_for_everything(&mut speaker)?;
         let forbidden = |function: &&&str| !allows(&rules, &peer.caller, function);
         attempts += 9 * FUNCTIONS.iter().filter(|function| forbidden(function)).count() as u64 + 4;
-        successes += unit.diary.take_ran().iter().filter(|function| forbidden(function)).count() as u64;
+        successes += unit.log.take_ran().iter().filter(|function| forbidden(function)).count() as u64;
     }
     let noticed = risen(&before, &(unit.counters)());
     let attack = "function called without permission, random tables".to_owned();
@@ -93,7 +93,7 @@ fn settle() {
     std::thread::sleep(std::time::Duration::from_millis(5));
 }
 
-/// Each function in each class, with and without waiting, and in a datagram.
+/// Calls each function in each class, with and without a reply, and in a datagram.
 fn ask_for_everything(speaker: &mut Speaker) -> Result<()> {
     for slot in 0..FUNCTIONS.len() as u16 {
         let datagram = speaker.request_in_datagram(slot);
@@ -102,7 +102,7 @@ fn ask_for_everything(speaker: &mut Speaker) -> Result<()> {
     settle();
     for slot in (0..FUNCTIONS.len() as u16).chain([NOWHERE]) {
         for priority in Priority::ALL {
-            // The answer to the second one tells that the first one is done with, since those of a class keep their order.
+            // Requests of a class keep their order, so the answer to the second shows that the first is done.
             for waits in [false, true] {
                 let request = speaker.request(slot, priority, waits);
                 speaker.say_bytes(&request)?;
@@ -140,7 +140,7 @@ fn random_rules(caller: &Identity) -> Vec<OwnedRule> {
     (0..fastrand::usize(..4)).map(rule).collect()
 }
 
-/// Written out once more, from what docs/access.md says: who the caller is does not change.
+/// The rules of docs/access.md, implemented a second time; the caller is fixed.
 fn allows(rules: &[OwnedRule], caller: &Identity, function: &str) -> bool {
     rules.iter().any(|rule| {
         let names = match &rule.functions {

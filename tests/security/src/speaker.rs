@@ -1,6 +1,6 @@
-//! Somebody who speaks the wire through raw sockets, step by step, with whatever key it has: the end that opened the
-//! connection or the other one. What it says next is handed out before it is said, so that it can be changed, repeated,
-//! or replaced.
+//! One end of a link that speaks the wire protocol through raw sockets, step by step, with any key, as the dialling or
+//! the
+//! accepting end. Each message is handed out before it is sent, so that it can be changed, repeated or replaced.
 
 use std::io::{self, Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpStream, UdpSocket};
@@ -18,7 +18,7 @@ use cara_core::host::secure::{Seal, Secure};
 use cara_secure::keys::PairKey;
 use cara_secure::link::{Cipher, Credentials};
 
-/// Longest wait for something that the other end says or does.
+/// Longest wait for the other end.
 pub const PATIENCE: Duration = Duration::from_secs(10);
 /// The first steps, which prove the link.
 pub const HANDSHAKE: usize = 3;
@@ -27,7 +27,7 @@ pub const STEPS: usize = 8;
 /// The kind of a chunk that is a whole message.
 const WHOLE: u8 = 0x13;
 
-/// Whom somebody says it is.
+/// The identity that an end claims.
 #[derive(Clone, Debug)]
 pub struct Claim {
     /// The fleet.
@@ -38,7 +38,7 @@ pub struct Claim {
     pub wanted: Option<Manager>,
 }
 
-/// Something to be said.
+/// A message to be sent.
 #[derive(Clone, Debug)]
 pub struct Said {
     /// It goes as a datagram.
@@ -54,9 +54,9 @@ pub enum End {
     Closed(u8),
     /// With a refusal.
     Refused,
-    /// Without a word that arrived: what it left unread resets the connection, which can overtake the word.
+    /// Without a close frame that arrived: unread bytes reset the connection, and the reset can overtake the frame.
     Cut,
-    /// Not at all, however long somebody waits.
+    /// Not within [`PATIENCE`].
     Never,
 }
 
@@ -91,7 +91,7 @@ pub struct Speaker {
     pub asked: Vec<i64>,
     /// Frames that came, whole.
     pub heard: Vec<Vec<u8>>,
-    /// The other end said something that is for those only who have proven who they are.
+    /// The other end sent a message that only a proven peer may receive.
     pub told: bool,
 }
 
@@ -133,7 +133,8 @@ impl Speaker {
         })
     }
 
-    /// What is to be said next, after what must be heard before it; `None` at the end. An error when the other end has
+    /// The next message, after the messages that must be received before it; `None` at the end. An error if the other
+    /// end has
     /// ended the link.
     pub fn step(&mut self) -> io::Result<Option<Said>> {
         let at = self.at;
@@ -163,7 +164,7 @@ impl Speaker {
         }
     }
 
-    /// Says all of a conversation up to step `end`; how many steps there were.
+    /// Sends a conversation up to step `end`; the number of steps made.
     pub fn converse(&mut self, end: usize) -> io::Result<usize> {
         while self.at < end {
             match self.step()? {
@@ -174,7 +175,7 @@ impl Speaker {
         Ok(self.at)
     }
 
-    /// Says something.
+    /// Sends a message.
     pub fn say(&mut self, said: &Said) -> io::Result<()> {
         if said.datagram {
             let to =
@@ -184,18 +185,18 @@ impl Speaker {
         self.stream.write_all(&said.bytes)
     }
 
-    /// Says bytes in the stream.
+    /// Sends bytes in the stream.
     pub fn say_bytes(&mut self, bytes: &[u8]) -> io::Result<()> {
         self.stream.write_all(bytes)
     }
 
-    /// Says no more, and hears what still comes until the other end is gone as well.
+    /// Closes its sending direction, and receives until the other end is gone as well.
     pub fn finish(&mut self) {
         let _ = self.stream.shutdown(Shutdown::Write);
         while self.hear().is_ok() {}
     }
 
-    /// Keeps its end open and hears what still comes until the other end has ended the link: how it has.
+    /// Keeps its end open and receives until the other end has ended the link; how it ended.
     pub fn hear_end(&mut self) -> End {
         let mut end = End::Cut;
         loop {
@@ -206,7 +207,7 @@ impl Speaker {
                 }
                 Err(_) => return end,
             };
-            // A farewell is in clear until both have proven themselves.
+            // A close frame is in clear until both ends have proven themselves.
             end = farewell(&body).or_else(|| farewell(&self.open(&mut body).ok()?)).unwrap_or(end);
         }
     }
@@ -220,7 +221,7 @@ impl Speaker {
             }
             (false, 1) => {
                 self.prove()?;
-                // Who has another key answers with something all the same.
+                // With another key there is no valid answer; random bytes are sent in its place.
                 let answer = self.hear_proof().ok().flatten();
                 Ok(framed(&Frame::Proof(&answer.unwrap_or_else(random))))
             }
@@ -236,7 +237,7 @@ impl Speaker {
         }
     }
 
-    /// The own hello, after the other one's where that comes first.
+    /// Its own hello; the accepting end receives the other hello first.
     fn introduce(&mut self) -> io::Result<Vec<u8>> {
         if !self.dials {
             self.hear_hello()?;
@@ -283,7 +284,7 @@ impl Speaker {
         }
     }
 
-    /// The next frame, opened where frames are sealed.
+    /// The next frame, opened if frames are sealed by now.
     fn hear(&mut self) -> io::Result<Vec<u8>> {
         let mut body = self.hear_frame()?;
         self.open(&mut body)
@@ -407,7 +408,7 @@ pub fn request_in_clear() -> Vec<u8> {
     [&(body.len() as u16).to_le_bytes()[..], &body].concat()
 }
 
-/// The hello of somebody.
+/// The hello of a claimed identity.
 pub fn hello(claim: &Claim, mode: Mode, udp_port: u16) -> Vec<u8> {
     let hello = Hello {
         fleet: claim.fleet,

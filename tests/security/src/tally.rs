@@ -36,8 +36,8 @@ impl Row {
         let Self { attack, target, attempts, successes, .. } = self;
         let why = match self.control {
             _ if *attempts == 0 => "nothing was tried".to_owned(),
-            true if successes < attempts => format!("{successes} of {attempts}: who has the key must succeed"),
-            false if *successes > 0 => format!("{successes} of {attempts} came to something"),
+            true if successes < attempts => format!("{successes} of {attempts}: an attempt with the key must succeed"),
+            false if *successes > 0 => format!("{successes} of {attempts} succeeded"),
             false if self.noticed.is_empty() && ![SIMULATOR, BOARD].contains(&self.target.as_str()) => {
                 "no counter tells of it".to_owned()
             }
@@ -47,10 +47,10 @@ impl Row {
     }
 }
 
-/// The target whose tests count by themselves, and check counters where they belong.
+/// The target whose attacks are tests of their own, which count their attempts and check the counters themselves.
 pub const SIMULATOR: &str = "simulator";
 
-/// A target that tells nobody what it counts but its own program.
+/// A target whose counters can be read only by its own program.
 pub const BOARD: &str = "board in QEMU";
 
 /// The figures in what the simulator's attackers print: `WHAT: N attempts, N successes`.

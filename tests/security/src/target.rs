@@ -1,4 +1,4 @@
-//! What is attacked: anything that takes a connection or opens one, and of which can be told what its application saw.
+//! The unit under attack: anything that accepts or opens a connection and reports what its application saw.
 
 use std::collections::HashSet;
 use std::net::TcpStream;
@@ -19,13 +19,13 @@ pub trait Target: Sync {
     /// How many connections at a time.
     fn workers(&self) -> usize;
 
-    /// A connection with it, whoever of the two opens it.
+    /// A connection with it, opened by either end.
     fn visit(&self) -> Result<Visit<'_>>;
 
-    /// All that it has counted since the beginning.
+    /// Its counters since it started.
     fn counters(&self) -> Result<Counters>;
 
-    /// Whether it tells which calls it has run. Otherwise only who joined is seen.
+    /// Whether it reports the calls that it ran. Otherwise only joins are seen.
     fn tells_calls(&self) -> bool {
         true
     }
@@ -36,7 +36,7 @@ pub trait Target: Sync {
     }
 }
 
-/// What an application saw of somebody.
+/// What an application saw of one peer.
 #[derive(Clone, Debug, Default)]
 pub struct Seen {
     /// How often it joined.
@@ -51,7 +51,7 @@ pub struct Visit<'t> {
     pub stream: TcpStream,
     /// The attacker has opened it.
     pub dials: bool,
-    /// Whom the attacker can say it is: there is a key for this one.
+    /// The identity that the attacker claims; there is a key for it.
     pub claim: Claim,
     /// What keys there are.
     pub keys: Keys,
@@ -60,25 +60,26 @@ pub struct Visit<'t> {
 }
 
 impl Visit<'_> {
-    /// Somebody at this end of the connection.
+    /// A speaker at the attacker's end of the connection.
     pub fn speaker(&self, key: &PairKey) -> Result<Speaker> {
         self.speaker_as(Mode::Secured, self.claim.clone(), key)
     }
 
-    /// Somebody who says that it is somebody else.
+    /// A speaker with another claim.
     pub fn speaker_as(&self, mode: Mode, claim: Claim, key: &PairKey) -> Result<Speaker> {
         Ok(Speaker::new(self.stream.try_clone()?, self.dials, mode, claim, key.clone())?)
     }
 
-    /// Whether the application saw anything of somebody who has no key.
+    /// Whether the application saw anything of a speaker without a key.
     pub fn was_seen(&self, mut speaker: Speaker) -> Result<bool> {
         speaker.finish();
         let seen = (self.seen)()?;
         Ok(speaker.told || seen.joins > 0 || !seen.marks.is_empty())
     }
 
-    /// Whether the application saw more of a genuine peer than this one has said: `joins` at most, and each of the
-    /// requests `allowed` once at most.
+    /// Whether the application saw more than a genuine peer sent: more than `joins` joins, a request that is not in
+    /// `allowed`,
+    /// or one of them twice.
     pub fn saw_more(&self, mut speaker: Speaker, joins: usize, allowed: &[i64]) -> Result<bool> {
         speaker.finish();
         let seen = (self.seen)()?;

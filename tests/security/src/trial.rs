@@ -8,7 +8,7 @@ use anyhow::{Context, Result};
 use crate::tally::{Counters, Report, Row};
 use crate::target::{Target, Visit};
 
-/// Counters that tell an operator of an attack, and what a board logs.
+/// Counters that show an operator an attack, and a board's log lines that do.
 const TELLING: [&str; 25] = [
     "FramesRefused",
     "ProofsFailed",
@@ -33,7 +33,7 @@ const TELLING: [&str; 25] = [
     "Unasked",
     "RequestsForbidden",
     "RequestsTooSoon",
-    // Lines of a board's log, which has no counters for others to read.
+    // Lines of a board's log: its counters cannot be read from outside.
     "could not join",
     "has left",
 ];
@@ -44,7 +44,7 @@ pub fn risen(before: &Counters, after: &Counters) -> Vec<String> {
     TELLING.iter().filter(|name| value(after, name) > value(before, name)).map(|&name| name.to_owned()).collect()
 }
 
-/// Makes an attempt for each of `cases`, on visits of their own; `act` tells whether it came to anything.
+/// Makes an attempt for each of `cases`, each on its own visit; `act` returns whether it succeeded.
 pub fn attack<C: Sync>(
     report: &mut Report,
     target: &dyn Target,
@@ -55,7 +55,7 @@ pub fn attack<C: Sync>(
     row(report, target, attack, cases, false, visiting(target, act))
 }
 
-/// As [`attack`], by somebody who has the key.
+/// As [`attack`], with the key.
 pub fn control<C: Sync>(
     report: &mut Report,
     target: &dyn Target,
@@ -96,7 +96,7 @@ pub fn row<C: Sync>(
     Ok(())
 }
 
-/// Tries each case, `workers` at a time; how many came to something.
+/// Tries each case, `workers` at a time; the number of successes.
 pub fn each<C: Sync>(workers: usize, cases: &[C], act: impl Fn(&C) -> Result<bool> + Sync) -> Result<u64> {
     let (next, successes, failed) = (AtomicUsize::new(0), AtomicU64::new(0), Mutex::new(None));
     std::thread::scope(|scope| {

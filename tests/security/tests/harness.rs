@@ -1,5 +1,5 @@
-//! The attackers must be able to succeed, or their zeros show nothing: against units with a weakness that was put there
-//! on purpose, and with the key.
+//! The attackers must be able to succeed, or their zeros show nothing: against units with a deliberate weakness, and
+//! with the key.
 
 use cara_core::config::Mode;
 use cara_security::between::Middle;
@@ -15,7 +15,7 @@ fn row<'r>(report: &'r Report, attack: &str, target: &dyn Target) -> &'r Row {
     found.unwrap_or_else(|| panic!("no row for {attack}, {}", target.name()))
 }
 
-/// A unit in plain mode on the port of secured ones believes whoever speaks plain, which the attackers see.
+/// A unit in plain mode on the port of secured ones accepts plain peers; the attack counts it.
 #[test]
 fn a_unit_in_plain_mode_is_found_out() {
     let linux = Linux::new(64, Weakness::Plain).unwrap();
@@ -29,7 +29,7 @@ fn a_unit_in_plain_mode_is_found_out() {
     }
 }
 
-/// A unit that seals nothing believes what others have recorded, on its own link and later.
+/// A unit that seals nothing accepts recorded frames, on the same link and later.
 #[test]
 fn a_unit_that_believes_recorded_words_is_found_out() {
     let linux = Linux::new(64, Weakness::Plain).unwrap();
@@ -44,7 +44,7 @@ fn a_unit_that_believes_recorded_words_is_found_out() {
     }
 }
 
-/// Nor does it notice what somebody in the middle does to its frames.
+/// It does not detect tampering in the middle either.
 #[test]
 fn a_unit_that_believes_whoever_is_in_the_middle_is_found_out() {
     let linux = Linux::new(64, Weakness::Plain).unwrap();
@@ -54,7 +54,7 @@ fn a_unit_that_believes_whoever_is_in_the_middle_is_found_out() {
     assert!(report.rows.len() == 2 && report.rows.iter().all(|row| row.successes > 0), "{report}");
 }
 
-/// Nor does it tell its fleet's datagrams from others.
+/// It accepts datagrams of other fleets as well.
 #[test]
 fn a_unit_that_believes_every_datagram_is_found_out() {
     let linux = Linux::new(64, Weakness::Plain).unwrap();
@@ -63,8 +63,7 @@ fn a_unit_that_believes_every_datagram_is_found_out() {
     assert!(report.rows.len() == 2 && report.rows.iter().all(|row| row.successes > 0), "{report}");
 }
 
-/// A link that ends because nothing more comes is told from one that a frame ends: a unit that only waits, whatever came,
-/// is found out.
+/// An end by timeout is distinguished from an end by a wrong frame: a unit that only waits is found out.
 #[test]
 fn a_unit_that_only_waits_is_found_out() {
     let linux = Linux::new(64, Weakness::None).unwrap();
@@ -87,7 +86,7 @@ fn a_table_that_allows_everything_is_found_out() {
     assert!(report.rows.len() == 2 && report.rows.iter().all(|row| row.successes > 0), "{report}");
 }
 
-/// The same attacker with the key joins and is served: what counts successes can count them.
+/// The same attacker with the key joins and is served, which shows that successes are counted.
 #[test]
 fn who_has_the_key_gets_in() {
     let linux = Linux::new(64, Weakness::None).unwrap();

@@ -15,7 +15,7 @@ use cara_std::control::Control;
 use cara_std::keys::{FleetKeys, Store, place};
 use cara_std::{CommunicationSystem, Fleet, Interfaces, Unit};
 
-/// Lines of the log that came while somebody listened.
+/// Log lines written since the subscriber was installed.
 #[derive(Clone, Default)]
 struct Lines(Arc<Mutex<Vec<u8>>>);
 
@@ -35,8 +35,8 @@ impl Lines {
     }
 }
 
-/// Two peers ask for what they may not, some hundred times: each refusal is counted, and the whole unit writes a line a
-/// second at most, with how many there were.
+/// Two peers make forbidden calls, some hundred times: each refusal is counted, and the unit logs at most one line a
+/// second, with their number.
 #[test]
 fn every_refusal_is_counted_and_one_line_a_second_is_logged() {
     let lines = Lines::default();
@@ -68,12 +68,12 @@ fn every_refusal_is_counted_and_one_line_a_second_is_logged() {
     let seconds = begun.elapsed().as_secs() as usize + 1;
     assert!(manager.counters().unwrap()["RequestsForbidden"] >= asked);
     let written = lines.with("may not call mark");
-    // One before this began, when they joined and asked for the first time.
+    // One more before the loop, from their first call after joining.
     assert!((1..=seconds + 1).contains(&written), "{written} lines for {asked} refusals in {seconds} s");
     assert!(asked > 5 * seconds as u64);
 }
 
-/// From `cara keys revoke`, or rather the new file in its place, to the end of the link.
+/// From the new key file that `cara keys revoke` writes to the end of the link.
 #[test]
 fn a_live_link_ends_soon_after_its_key_is_revoked() {
     let fleet = Fleet(cara_processes::random_fleet());
@@ -98,7 +98,7 @@ fn a_live_link_ends_soon_after_its_key_is_revoked() {
     store.save().unwrap();
     assert!(wait_for(|| manager.number_of_s_units() == 1), "it is still there");
     println!("a live link ended {:.1} s after its key was revoked", revoked.elapsed().as_secs_f64());
-    // Its own end of the link learns of it a little later.
+    // The vehicle detects the end of its link a little later.
     assert!(wait_for(|| !units[0].is_connected() && units[1].is_connected()));
     // It does not come back.
     std::thread::sleep(Duration::from_secs(2));

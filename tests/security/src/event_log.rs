@@ -1,4 +1,4 @@
-//! What an application sees: who joined, and which calls were run for whom.
+//! Event log of an application: joins and calls, by peer.
 
 use std::collections::HashMap;
 use std::sync::mpsc::Receiver;
@@ -12,70 +12,70 @@ use crate::target::Seen;
 /// Functions that each target offers, in the order of their slots.
 pub const FUNCTIONS: [&str; 3] = ["mark", "go", "stop"];
 
-/// Notes of one unit.
+/// The event log of one unit.
 #[derive(Clone, Debug, Default)]
-pub struct Diary(Arc<Mutex<Pages>>);
+pub struct EventLog(Arc<Mutex<Entries>>);
 
 #[derive(Debug, Default)]
-struct Pages {
+struct Entries {
     of: HashMap<Identity, Seen>,
     ran: Vec<&'static str>,
 }
 
-impl Diary {
-    fn pages(&self) -> MutexGuard<'_, Pages> {
+impl EventLog {
+    fn entries(&self) -> MutexGuard<'_, Entries> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// What was seen of somebody.
+    /// What was seen of one peer.
     pub fn seen(&self, who: &Identity) -> Seen {
-        self.pages().of.get(who).cloned().unwrap_or_default()
+        self.entries().of.get(who).cloned().unwrap_or_default()
     }
 
-    /// Everything of everybody.
+    /// The sum over all peers.
     pub fn all(&self) -> Seen {
-        let pages = self.pages();
-        pages.of.values().fold(Seen::default(), |mut all, seen| {
+        let entries = self.entries();
+        entries.of.values().fold(Seen::default(), |mut all, seen| {
             all.joins += seen.joins;
             all.marks.extend(&seen.marks);
             all
         })
     }
 
-    /// How often others than these joined.
+    /// Joins of peers other than these.
     pub fn joins_but_of(&self, these: &[Identity]) -> usize {
-        let pages = self.pages();
-        let others = pages.of.iter().filter(|(who, _)| !these.contains(who));
+        let entries = self.entries();
+        let others = entries.of.iter().filter(|(who, _)| !these.contains(who));
         others.map(|(_, seen)| seen.joins).sum()
     }
 
-    /// Names of the functions that ran since this was asked last.
+    /// Names of the functions that ran since the last call.
     pub fn take_ran(&self) -> Vec<&'static str> {
-        std::mem::take(&mut self.pages().ran)
+        std::mem::take(&mut self.entries().ran)
     }
 
-    /// Notes who joins, until the unit is gone.
+    /// Records joins until the unit is gone.
     pub fn follow(&self, events: Receiver<UnitEvent>) {
-        let diary = self.clone();
+        let log = self.clone();
         std::thread::spawn(move || {
             for event in events {
                 if let UnitEvent::Joined { peer } = event {
-                    diary.pages().of.entry(peer).or_default().joins += 1;
+                    log.entries().of.entry(peer).or_default().joins += 1;
                 }
             }
         });
     }
 
-    /// Adds the functions, which note their calls.
+    /// Adds the functions; each records its calls.
     pub fn offer<T: Send + 'static>(&self, functions: &MyFunctionList<'_, T>) -> Result<(), Error> {
         for name in FUNCTIONS {
             let definition: Definition = format!("{name}(n: int)").parse().expect("a signature");
-            let diary = self.clone();
+            let log = self.clone();
             let note = move |call: &Call, view: &mut ParametersView| -> Result<(), ServiceError> {
                 let mark = view.variable("n").map_err(|_| ServiceError::BadResults)?;
-                let mut pages = diary.pages();
-                pages.of.entry(call.caller.clone()).or_default().marks.push(mark);
-                pages.ran.push(name);
+                let mut entries = log.entries();
+                entries.of.entry(call.caller.clone()).or_default().marks.push(mark);
+                entries.ran.push(name);
                 Ok(())
             };
             functions.add_service(&definition, ServiceOptions::new(), note)?;
