@@ -1,4 +1,4 @@
-//! The place of the codes that show whose datagrams of discovery are: a trait, and the plain mode, which has none.
+//! Interface of the codes that authenticate datagrams of discovery: a trait, and plain mode, which has none.
 
 use super::identity::Identity;
 use crate::config::Mode;
@@ -7,8 +7,9 @@ use crate::host::secure::Plain;
 /// Bytes of a code.
 pub const CODE_BYTES: usize = 16;
 
-/// Makes and checks the codes of who-has and announce; lent to each call of a
-/// [`Node`](super::connection_handler::Node) that may need it. A code covers all of the datagram that is before it.
+/// Makes and checks the codes of [`WhoHas`](super::datagram::WhoHas) and [`Announce`](super::datagram::Announce); lent
+/// to each call of a [`Node`](super::connection_handler::Node) that may need it. A code covers all of the datagram that
+/// is before it.
 pub trait Authenticator {
     /// The unit's mode. In plain mode datagrams carry no codes, and nothing below is asked.
     fn mode(&self) -> Mode;

@@ -9,10 +9,10 @@
 //! | 8–11 | fleet, little-endian |
 //! | 12– | who-has, announce: postcard; session: link u16, zero u16, nonce u64, body |
 //!
-//! In secured mode codes follow who-has and announce: at the end the fleet's, over all before it; before it, in an answer
-//! to one unit, that of the pair. A who-has and an announce to all are filled with zeros to the length of the longest answer:
-//! what follows from one, an answer or a question, is no longer than it, so that nobody is sent more because somebody spoke
-//! in its name.
+//! In secured mode a who-has and an announce end with the fleet's code, over everything before it. An answer to one
+//! unit has the pair's code as well, in front of the fleet's. A [`WhoHas`] and a broadcast [`Announce`] are padded with
+//! zeros to the length of the longest answer, so that a datagram with a forged source address is not amplified: the
+//! answer or question that it causes is no longer than itself.
 
 use serde::{Deserialize, Serialize};
 
@@ -25,46 +25,46 @@ const WHO_HAS: u8 = 1;
 const ANNOUNCE: u8 = 2;
 const SESSION: u8 = 3;
 
-/// Bytes before the body of a who-has or announce.
+/// Bytes before the body of a [`WhoHas`] or [`Announce`].
 pub const HEADER_BYTES: usize = 12;
 /// Bytes before the body of a session datagram.
 pub const SESSION_HEADER_BYTES: usize = 24;
-/// Known nodes that one who-has can name.
+/// Known nodes that one [`WhoHas`] can name.
 pub const KNOWN_NODES: usize = 64;
-/// Longest who-has.
+/// Longest [`WhoHas`].
 pub const SEARCH_BYTES: usize = 512;
-/// Longest announce of secured mode, and the shortest who-has.
+/// Longest [`Announce`] of secured mode, and the shortest [`WhoHas`].
 pub const ANSWER_BYTES: usize = 120;
 
-/// "Who is there?", broadcast (paper: "one node broadcasts a message containing its identifier").
+/// A search, broadcast (paper: "one node broadcasts a message containing its identifier").
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct WhoHas {
-    /// Who asks.
+    /// The sender.
     pub identity: Identity,
-    /// This life of who asks.
+    /// The sender's boot.
     pub epoch: Epoch,
-    /// Rises with each search of this life.
+    /// Rises with each search of this boot.
     pub sequence: u32,
     /// Comes back in the answer.
     pub nonce: u64,
-    /// The manager that is looked for; `None` asks other m_units, and the s_units of who asks.
+    /// The manager that is looked for; `None` asks other m_units, and the sender's own s_units.
     pub wanted: Option<Manager>,
-    /// Where who asks can be dialled; 0 for nowhere.
+    /// The sender's TCP port; 0 if it accepts no links.
     pub tcp_port: u16,
-    /// How many nodes who asks expects to answer; 0 in a question to one node alone, which answers at once.
+    /// How many answers the sender expects; 0 in a question to a single node, which answers at once.
     pub expected: u16,
     /// [`short_hash`] of nodes that are connected already and stay silent.
     pub known: heapless::Vec<u32, KNOWN_NODES>,
 }
 
-/// "Here I am", to who asked, or broadcast when several ask.
+/// An answer, to the node that asked, or broadcast when several ask.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Announce {
-    /// Who is here.
+    /// The sender.
     pub identity: Identity,
-    /// This life of it.
+    /// Its boot.
     pub epoch: Epoch,
-    /// Rises with each announce of this life.
+    /// Rises with each announce of this boot.
     pub sequence: u32,
     /// The nonce of the search that is answered; 0 in a broadcast.
     pub nonce: u64,
@@ -107,14 +107,14 @@ pub enum DatagramError {
     Fleet(Fleet),
     /// The code that shows that it comes from the fleet is wrong, or there is none.
     Forged,
-    /// It is an answer to one unit, and the code that shows that it is for this one is wrong.
+    /// An answer to one unit whose pair code is wrong for this unit.
     NotForUs,
     /// The rest cannot be read.
     Malformed,
 }
 
-/// The fixed part of a datagram, whatever its mode, version and fleet: for who looks at a network without being one of its
-/// units. Units read with [`Datagram::decode`].
+/// The fixed part of a datagram of any mode, version and fleet, for tools that inspect a network without being one of
+/// its units. Units decode with [`Datagram::decode`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Header {
     /// The sender's mode.
@@ -172,8 +172,9 @@ impl Header {
 }
 
 impl<'b> Datagram<'b> {
-    /// Reads a datagram of this fleet. In secured mode nothing of a who-has or announce is read before the fleet's code is
-    /// found right, and an answer counts only with the code of the pair. Session datagrams are opened by their session.
+    /// Decodes a datagram of this fleet. In secured mode the fleet's code is checked before anything else of a
+    /// [`WhoHas`] or [`Announce`] is parsed, and an answer counts only with the code of the pair. Session datagrams are
+    /// opened by their session.
     pub fn decode(bytes: &'b [u8], fleet: Fleet, authenticator: &dyn Authenticator) -> Result<Self, DatagramError> {
         let (header, body) = Header::decode(bytes)?;
         if header.mode != authenticator.mode() {

@@ -32,10 +32,10 @@ pub struct Definition {
     bytes: heapless::Vec<u8, SIGNATURE_BYTES>,
 }
 
-/// A signature in somebody else's bytes; `Display` is its text form.
+/// A signature in borrowed bytes; `Display` is its text form.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub struct Signature<'a> {
-    /// Checked: what is looked at often is not read as a whole first.
+    /// Validated on construction, so that a look-up need not parse all of it.
     bytes: &'a [u8],
 }
 

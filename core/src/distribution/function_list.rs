@@ -15,7 +15,7 @@ use super::attributes::Attributes;
 
 /// One's own functions (paper: `my_function_list`).
 ///
-/// Adding a function makes it visible to nobody; publishing does.
+/// Adding a function does not make it visible to peers; publishing does.
 ///
 /// ```
 /// use cara_core::distribution::function::{Attributes, Definition};

@@ -1,4 +1,4 @@
-//! Who a node is: name, id, role, fleet (paper, Fig. 2) and the boot epoch that tells two lives of it apart.
+//! Identity of a node: name, id, role, fleet (paper, Fig. 2), and the epoch that distinguishes its boots.
 
 use core::fmt;
 

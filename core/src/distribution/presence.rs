@@ -1,7 +1,7 @@
 //! Whether a live unit has this unit's own identity already: asked before a manager starts.
 //!
-//! The question is a who-has for the unit itself, with a nonce of its own, and only holders of this identity's keys can
-//! answer it. Of two units that ask at once the one with the greater epoch answers, so that one of them starts.
+//! The question is a [`WhoHas`] for the unit itself, with a nonce of its own, and only holders of this identity's keys
+//! can answer it. If two units ask at once, the one with the greater epoch answers, so that only one of them starts.
 
 use core::net::SocketAddr;
 

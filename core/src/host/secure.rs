@@ -1,5 +1,5 @@
-//! The place of the cipher: traits for proving who is at the other end and for sealing and opening in place, and the
-//! plain mode, which does nothing of that.
+//! Interface of the cipher: traits that prove the peer's identity and seal and open frames in place, and plain mode,
+//! which does neither.
 //!
 //! # How a secured link begins
 //! Both hellos travel in clear, the dialler's first; each end gives both to [`Secure::introduce`] in that order. When
@@ -8,10 +8,10 @@
 //! confirms that it has the keys, and tells the key of its datagrams ([`Secure::confirmation`]). Nothing that the peer
 //! has said counts before that frame has opened.
 //!
-//! # How its keys are made anew
-//! On a link that lives long the same proof is made again, in sealed frames, and covers what the one before has agreed on.
-//! Each end marks the last frame under its old keys ([`Seal::turn`], [`Secure::turned`]) and confirms behind it, under the
-//! new ones. Datagrams go on under the old key until the other end has the new one ([`Secure::acknowledged`]).
+//! # How a link is rekeyed
+//! On a long-lived link the same proof is made again, in sealed frames, and covers what the one before has agreed on.
+//! Each end marks the last frame under its old keys ([`Seal::turn`], [`Secure::turned`]) and confirms behind it, under
+//! the new ones. Datagrams go on under the old key until the other end has the new one ([`Secure::acknowledged`]).
 
 use crate::config::Mode;
 use crate::error::CloseReason;
@@ -43,7 +43,7 @@ pub trait Seal {
 
 /// All that one link needs of a cipher.
 pub trait Secure: Seal {
-    /// What the port brings once it knows whom the peer claims to be: the pair's key, and random bytes.
+    /// What the port supplies once the peer has claimed an identity: the pair's key, and random bytes.
     type Credentials;
 
     /// The mode of the link.
@@ -55,7 +55,7 @@ pub trait Secure: Seal {
     /// A hello as it travels: first the dialler's, then the other one's. The proof covers both.
     fn introduce(&mut self, hello: &[u8]);
 
-    /// Begins the proof, or, where frames are sealed, begins it anew. The end that dialled gets the message to send.
+    /// Begins the proof, or, where frames are sealed, a rekey. The end that dialled gets the message to send.
     fn prove(&mut self, dialed: bool, credentials: Self::Credentials)
     -> Result<Option<[u8; PROOF_BYTES]>, CloseReason>;
 
@@ -109,7 +109,7 @@ pub trait Secure: Seal {
 pub enum Unopened {
     /// The same, or one much newer, came before.
     Repeated,
-    /// It is not the peer's, or somebody changed it.
+    /// It is not the peer's, or it was changed on its way.
     Forged,
 }
 

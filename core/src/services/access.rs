@@ -1,28 +1,30 @@
-//! Access control: who may see, call and publish which function.
+//! Access control: which peer may see, call and publish which function.
 //!
-//! A table is a list of [`Rule`]s that a port lends with each [`Context`](super::Context), so that it is a `const` on a
-//! board and can be exchanged while the unit runs. What it means:
+//! A table is a list of [`Rule`]s. A port lends it with each [`Context`](super::Context), so that it can be a `const`
+//! on a board, and can be exchanged while the unit runs. Its semantics:
 //!
-//! - **No table**: the unit's mode decides who joins, and whoever has joined may do everything.
-//! - **A table**: nothing is allowed but what a rule allows. Rules are looked at in their order; the first one that names
-//!   the [`Principal`], the function and the verb decides, also about the rate. A table without rules allows nothing.
-//! - **A node** is named by its role, its name, its id, or several of them; what the rule leaves open is not looked at.
-//! - **The operator** on a control socket is named by [`Who::Operator`] and by nothing else: no rule about nodes means it.
-//! - **[`Verb::Call`]**: the peer may call this unit's function. It is asked when the request arrives, before its arguments
-//!   are looked at, and again just before a call begins that had to wait. Whoever may call a function sees it as well.
+//! - **No table**: the mode of the unit decides which nodes join, and a joined node may do everything.
+//! - **A table**: what no rule allows is forbidden. Rules are evaluated in order; the first one that matches the
+//!   [`Principal`], the function and the verb decides, also about the rate. A table without rules allows nothing.
+//! - **A node** is matched by role, name, id, or several of them; a field that the rule leaves open matches any value.
+//! - **The operator** on a control socket is matched by [`Who::Operator`] only: rules about nodes never match it.
+//! - **[`Verb::Call`]**: the peer may call this unit's function. Checked when the request arrives, before its arguments
+//!   are parsed, and, if the call has to wait, again just before it begins. Permission to call includes permission to
+//!   see.
 //! - **[`Verb::List`]**: the peer sees this unit's function in the list that is published to it.
 //! - **[`Verb::Publish`]**: this unit sees the peer's function of that name, so that it can be called from here.
-//! - **A rate** bounds the calls of each peer to each function, whatever their priority: a peer could choose another one
-//!   otherwise. A function that must always be reached, as a stop, is in a rule without a rate.
+//! - **A rate** limits the calls of each peer to each function over all priorities: otherwise a peer could evade it by
+//!   choosing another priority. A function that must always be reachable, such as a stop, belongs in a rule without a
+//!   rate.
 //!
-//! A call that has begun goes on when the table changes; a lease that the caller holds by it ends, which runs the safe
-//! hook. A peer that joins again has its whole rate again.
+//! A call that has begun continues when the table changes; a lease that the caller holds by it ends, which runs the
+//! safe hook. A peer that joins again starts with its full rate.
 
 use crate::distribution::identity::{Identity, Role};
 use crate::error::Error;
 use crate::time::{Duration, Instant};
 
-/// What somebody may do with a function.
+/// What a principal may do with a function.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 #[repr(u8)]
 pub enum Verb {
@@ -67,16 +69,16 @@ impl From<Verb> for Verbs {
     }
 }
 
-/// Whoever wants something of a unit.
+/// The origin of a request to a unit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Principal<'a> {
     /// Another node.
     Node(&'a Identity),
-    /// Whoever has the unit's control socket.
+    /// The operator on the unit's control socket.
     Operator,
 }
 
-/// Whom a rule is about. `N` is text: lent on a board, owned where there is an allocator.
+/// The principals that a rule matches. `N` is text: borrowed on a board, owned where there is an allocator.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Who<N = &'static str> {
     /// The operator on the control socket.
@@ -107,7 +109,7 @@ impl<N> Who<N> {
 }
 
 impl<N: AsRef<str>> Who<N> {
-    /// Whether the rule is about somebody.
+    /// Whether the rule matches `principal`.
     pub fn means(&self, principal: Principal<'_>) -> bool {
         match (self, principal) {
             (Self::Operator, Principal::Operator) => true,
@@ -121,7 +123,7 @@ impl<N: AsRef<str>> Who<N> {
     }
 }
 
-/// Which functions a rule is about.
+/// The functions that a rule matches.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Functions<L = &'static [&'static str]> {
     /// All of them.
@@ -196,13 +198,13 @@ impl Bucket {
         Ok(())
     }
 
-    /// Whether the whole rate may be used.
+    /// Whether the full rate is available.
     pub fn is_full(&self, now: Instant) -> bool {
         self.full_at <= now
     }
 }
 
-/// A row of a table: what it names is allowed.
+/// A row of a table, which allows what it names.
 ///
 /// ```
 /// use cara_core::services::access::{Functions, Rate, Rule, Verbs, Who};
@@ -215,13 +217,13 @@ impl Bucket {
 /// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Rule<N = &'static str, L = &'static [&'static str]> {
-    /// Whom it is about.
+    /// The principals that it matches.
     pub who: Who<N>,
-    /// Which functions it is about.
+    /// The functions that it matches.
     pub functions: Functions<L>,
     /// What is allowed.
     pub verbs: Verbs,
-    /// How often functions may be called; as often as asked for if `None`.
+    /// How often functions may be called; unlimited if `None`.
     pub rate: Option<Rate>,
 }
 
@@ -368,7 +370,7 @@ mod tests {
         assert!(Bucket::default().take(Instant::FAR_FUTURE, Rate::new(u32::MAX, Duration::MAX)).is_ok());
     }
 
-    /// Who, which functions, which verbs: small numbers that the tests make rules of.
+    /// Principals, functions and verbs: small numbers that the tests make rules of.
     fn rows() -> impl Strategy<Value = Vec<Rule<&'static str, Vec<&'static str>>>> {
         const NAMES: [&str; 3] = ["a", "b", "c"];
         let role = prop_oneof![Just(None), Just(Some(Role::MUnit)), Just(Some(Role::SUnit))];

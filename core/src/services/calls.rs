@@ -18,14 +18,14 @@ struct Window {
     seen: u64,
 }
 
-/// What the window knows of an id.
+/// What the window says about an id.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Seen {
-    /// It is new, and noted now.
+    /// New, and recorded now.
     Never,
-    /// It was noted before: a second copy, to be dropped without an answer since the first is answered.
+    /// Recorded before: a duplicate, to be dropped without an answer, since the first copy is answered.
     Before,
-    /// So far below the newest one that nobody knows.
+    /// Below the window, so that it cannot be decided.
     TooOld,
 }
 

@@ -28,8 +28,7 @@ const CALLS: usize = 60;
 /// Connections that a flood holds open at a time, per thread: together they exceed a manager's capacity.
 const HELD: usize = 100;
 /// Pause of each of the two attackers between two links, so that they open a thousand a second at most. A link is
-/// displaced
-/// once as many newer ones are open as the manager has capacity for; until then it has time to prove itself.
+/// displaced once as many newer ones are open as the manager has capacity for; until then it has time to prove itself.
 const BETWEEN_LINKS: Duration = Duration::from_millis(2);
 /// Pause of each of the two attackers between two datagrams.
 const BETWEEN_DATAGRAMS: Duration = Duration::from_micros(50);

@@ -1,6 +1,5 @@
 //! Attackers on real sockets. No attacker is a unit: each speaks the wire protocol through raw sockets, and takes from
-//! CARA
-//! only the encoders of frames and codes, so that what it sends is valid, or nearly.
+//! CARA only the encoders of frames and codes, so that what it sends is valid, or nearly.
 //!
 //! - [`speaker`]: one end of a link, step by step, with any key;
 //! - [`ground`]: the keys of a fleet, and those that an attacker may have instead;

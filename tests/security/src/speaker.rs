@@ -1,6 +1,5 @@
 //! One end of a link that speaks the wire protocol through raw sockets, step by step, with any key, as the dialling or
-//! the
-//! accepting end. Each message is handed out before it is sent, so that it can be changed, repeated or replaced.
+//! the accepting end. Each message is handed out before it is sent, so that it can be changed, repeated or replaced.
 
 use std::io::{self, Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpStream, UdpSocket};
@@ -134,8 +133,7 @@ impl Speaker {
     }
 
     /// The next message, after the messages that must be received before it; `None` at the end. An error if the other
-    /// end has
-    /// ended the link.
+    /// end has ended the link.
     pub fn step(&mut self) -> io::Result<Option<Said>> {
         let at = self.at;
         self.at += 1;

@@ -78,8 +78,7 @@ impl Visit<'_> {
     }
 
     /// Whether the application saw more than a genuine peer sent: more than `joins` joins, a request that is not in
-    /// `allowed`,
-    /// or one of them twice.
+    /// `allowed`, or one of them twice.
     pub fn saw_more(&self, mut speaker: Speaker, joins: usize, allowed: &[i64]) -> Result<bool> {
         speaker.finish();
         let seen = (self.seen)()?;

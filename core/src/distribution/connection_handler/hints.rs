@@ -1,4 +1,4 @@
-//! What broadcasts say of where a node may be: hints, which anybody who has recorded one can give.
+//! Hints: addresses at which broadcasts place a node. A recorded broadcast can be replayed, so a hint proves nothing.
 //!
 //! A hint leads to one question with a fresh nonce, to the address that it came from, and to nothing else; what is dialled
 //! has answered it. An address that has not answered is asked later and later, however often it is heard, and gives way
@@ -35,9 +35,9 @@ const HOSTS: usize = 16;
 #[derive(Clone, Debug)]
 struct Hint {
     from: SocketAddr,
-    /// Who is said to be there.
+    /// The identity that the broadcast claims.
     who: Identity,
-    /// When it is asked; `None` once it was.
+    /// When it is asked; `None` afterwards.
     due: Option<Instant>,
     /// How often it was asked.
     asked: u8,

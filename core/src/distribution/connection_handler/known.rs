@@ -92,8 +92,8 @@ impl Known {
         if self.index == NONE { None } else { Some(self.index) }
     }
 
-    /// Whether an answer is newer than what is known. Earlier lives cannot answer this unit's question; within a life
-    /// numbers rise, and the same answer once more is another's who has recorded it.
+    /// Whether an answer is newer than what is known. An earlier boot cannot answer this unit's question; within a boot
+    /// sequence numbers rise, so an equal or lower one is a replay.
     pub(super) fn is_news(&self, epoch: Epoch, sequence: u32) -> bool {
         self.newest.is_none_or(|(newest, last)| newest != epoch || sequence > last)
     }

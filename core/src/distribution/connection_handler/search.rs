@@ -23,15 +23,15 @@ pub(super) const FIRST_DELAY: Duration = Duration::from_millis(50);
 /// most hear a manager's answer to another one first.
 const FIRST_LISTENING: Duration = Duration::from_millis(400);
 /// The same where a manager has been lost: a whole fleet loses it, each unit when it notices, so that they begin within
-/// seconds of each other; and who has just gone takes a moment to return.
+/// seconds of each other; and a node that has just left takes a moment to return.
 pub(super) const LOST_LISTENING: Duration = Duration::from_millis(800);
-/// Searches that an m_unit makes after its start, or after it lost its last node, whoever has joined meanwhile: a lost
+/// Searches that an m_unit makes after its start, or after it lost its last node, even if nodes join meanwhile: a lost
 /// datagram must not keep two managers apart.
 const M_UNIT_SEARCHES: u8 = 4;
-/// Pauses double until then.
+/// The back-off doubles up to this attempt.
 const LONGEST_PAUSE_AFTER: u8 = 5;
-/// One unit in so many that hold back for others does so no longer, once pauses are at their longest; it asks whatever
-/// it hears. Nobody who asks all the time silences a fleet for good, and a fleet that waits stays quiet.
+/// With back-off at its longest, one in so many units that hold back searches regardless of what it hears. A unit that
+/// searches without end cannot silence a fleet for good, and a waiting fleet stays quiet.
 const STUBBORN: u64 = 1_024;
 /// Times in a row that a search is put off because of the budget.
 const DEFERRALS: u8 = 4;
@@ -196,7 +196,8 @@ impl<S: Storage> Node<S> {
         }
     }
 
-    /// Asks a few times, as after the start, whoever is connected. Only m_units do: one of them may have moved.
+    /// Searches a few times, as after the start, even while nodes are connected. Only m_units do: one of them may have
+    /// moved.
     pub(super) fn look_around(&mut self, now: Instant) {
         if self.config.target == Target::Everybody && !self.is_searching() {
             self.search.attempt = 0;
@@ -246,7 +247,7 @@ impl<S: Storage> Node<S> {
         self.counters.add(if sent { NodeCounter::WhoHasSent } else { NodeCounter::SendFailed }, 1);
     }
 
-    /// Makes a who-has and sends it; `expected` is 0 in one that asks a single node.
+    /// Encodes a [`WhoHas`] and sends it; `expected` is 0 in one that asks a single node.
     pub(super) fn say_who_has(
         &mut self,
         wanted: Option<Manager>,

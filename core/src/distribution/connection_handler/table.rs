@@ -13,8 +13,8 @@ use crate::storage::Storage;
 /// No place, position or index.
 pub(super) const NONE: u16 = u16::MAX;
 
-/// Nodes that were only heard of and have never joined: the one heard of first gives way to the next. However many names
-/// somebody makes up, a full table forgets at most this many nodes for them that have been connected and left.
+/// Capacity for nodes that were heard of and have never joined: the oldest gives way to the next. However many names an
+/// attacker makes up, they displace at most this many disconnected nodes from a full table.
 pub(super) const STRANGERS: usize = 8;
 
 /// One row of the table's orders; ports allocate a slice of default ones. It belongs to no node in particular.

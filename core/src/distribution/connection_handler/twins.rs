@@ -13,9 +13,9 @@ use crate::time::Instant;
 /// What has been heard of others with this unit's identity.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Twins {
-    /// To be told.
+    /// To be reported.
     news: Option<SocketAddr>,
-    /// The life that was told last, and when: whoever claims many lives is told of now and then only.
+    /// The boot that was reported last, and when: reports of a node that claims many boots are rate-limited.
     told: Option<(Epoch, Instant)>,
 }
 
@@ -29,8 +29,8 @@ impl Twins {
 }
 
 impl<S: Storage> Node<S> {
-    /// Where another live node with this unit's own name and id was heard, told once for each life of it. It waits until
-    /// this unit stops, or this one waits for it: give each node its own name or id.
+    /// The address of another live node with this unit's own name and id, reported once for each of its boots. It waits
+    /// until this unit stops, or this one waits for it: give each node its own name or id.
     pub fn take_twin(&mut self) -> Option<SocketAddr> {
         self.twins.news.take()
     }

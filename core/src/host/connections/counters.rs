@@ -31,11 +31,11 @@ crate::counters::counters! {
         DatagramsForged,
         /// Session datagrams that came before, or are far older than others that came.
         DatagramsRepeated,
-        /// Links whose peers did not prove that they have the key of the pair.
+        /// Links whose peers did not prove possession of the pair key.
         ProofsFailed,
-        /// Handshakes that were made anew on live links.
+        /// Rekeys of live links.
         KeysRenewed,
-        /// Links that were ended in clear by somebody who had not proven who it is.
+        /// Links that were ended in clear, by a peer that had not proven its identity.
         FarewellsInClear,
         /// Links refused because there is no key for the pair.
         KeysMissing,

@@ -145,8 +145,8 @@ impl<S: Storage, C: Seal> Link<S, C> {
         self.sender.set_chunk(chunk.max(MINIMUM_CHUNK_BYTES));
     }
 
-    /// Raises the longest message that this unit takes. A lower limit than one that the peer was told changes nothing
-    /// here, since longer messages may be on their way: whoever reads them refuses them.
+    /// Raises the longest message that this unit accepts. A limit below the one advertised to the peer changes nothing
+    /// here, since longer messages may be in flight: the reader of the message refuses them.
     pub fn set_message_limit(&mut self, limit: usize) {
         self.receiver.raise_message_limit(limit);
     }

@@ -54,7 +54,7 @@ impl Worst {
         row
     }
 
-    /// Whoever comes whenever: no ten seconds bring more than this.
+    /// Whatever nodes come and when, no ten seconds bring more broadcasts than this.
     fn assert_calm(&self, what: &str) {
         assert!(self.in_ten <= 50, "{} broadcasts in ten seconds, {what}", self.in_ten);
     }
