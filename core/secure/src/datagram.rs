@@ -175,7 +175,8 @@ impl Opener {
         self.previous = None;
     }
 
-    /// Opens a datagram in place; its body. One that is forged changes nothing, so that nobody can shut the window.
+    /// Opens a datagram in place; its body. A forged one changes nothing, so that forgeries cannot move the replay
+    /// window.
     pub fn open<'d>(&mut self, bound: &[u8], datagram: &'d mut [u8]) -> Result<&'d mut [u8], DatagramError> {
         let (header, body) = datagram.split_first_chunk_mut::<HEADER_BYTES>().ok_or(DatagramError::Short)?;
         let length = body.len();

@@ -1,5 +1,5 @@
-//! Two messages that prove that both ends have the pair's key, and agree on keys that nobody can compute later, the key
-//! of the pair in hand.
+//! Two messages that prove that both ends have the pair's key, and agree on keys with forward secrecy: a pair key that
+//! leaks later does not reveal them.
 //!
 //! The **prologue** is what both ends must have seen alike: a hash over it goes into every key, so that a bit that was
 //! changed on the way fails the handshake. The responder knows the initiator only when the first sealed frame opens:
@@ -17,8 +17,8 @@ use crate::suite::{Blake2s, ChaCha20Poly1305, X25519};
 /// Bytes of each of the two messages: a public key and a tag.
 pub const MESSAGE_BYTES: usize = 48;
 
-/// A handshake that cannot go on: the other end has another key, or has seen another prologue, or the message was
-/// changed. There is one error for all: whoever tries keys learns nothing else.
+/// A handshake that cannot go on: the other end has another key or another prologue, or the message was changed. One
+/// error for all, so that an attacker that tries keys learns nothing else.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("the handshake failed: the other end has another key for this pair, or somebody changed what was sent")]
 pub struct HandshakeError;
@@ -122,7 +122,7 @@ impl Initiator {
         Ok((state, message))
     }
 
-    /// The responder has answered: it is who it says it is.
+    /// Takes the responder's answer, which proves its identity.
     pub fn finish(self, message: &[u8]) -> Result<Agreed, HandshakeError> {
         let (mut state, _) = self.state()?;
         read(&mut state, message)?;

@@ -1,8 +1,8 @@
 //! The keys of a fleet.
 //!
-//! A **root** stays with whoever provisions units. From it comes a **pair key** for each two units that may talk, and a
-//! **discovery key** for all of the fleet. Who has a pair key can speak as either of the two, to the other one only.
-//! Revoking a unit is leaving its pairs out when the generation is raised.
+//! A **root** stays where units are provisioned. From it are derived a **pair key** for each two units that may talk,
+//! and a **discovery key** for the whole fleet. A pair key lets its holder speak as either unit of the pair, to the
+//! other one only. A unit is revoked by leaving its pairs out when the generation is raised.
 
 use core::fmt;
 
@@ -28,7 +28,7 @@ macro_rules! key {
                 Self(bytes)
             }
 
-            /// Its bytes, for whoever writes them to where they belong.
+            /// Its bytes, to be written to a key file or to flash.
             pub const fn expose(&self) -> &[u8; KEY_BYTES] {
                 &self.0
             }
@@ -49,7 +49,7 @@ macro_rules! key {
 }
 
 key! {
-    /// The root of a fleet's keys. It never leaves whoever provisions.
+    /// The root of a fleet's keys. It never leaves the provisioning host.
     RootKey
 }
 key! {
@@ -57,12 +57,12 @@ key! {
     PairKey
 }
 key! {
-    /// The key with which all units of a fleet ask and answer who is there.
+    /// The key that authenticates discovery within a fleet.
     DiscoveryKey
 }
 key! {
-    /// The secret from which a board draws its random numbers. It is drawn anew whenever a board is provisioned and
-    /// does not come from the root: whoever gets the root cannot compute what the board drew.
+    /// The seed of a board's random numbers. It is drawn whenever a board is provisioned and is not derived from the
+    /// root: a leaked root does not reveal what the board drew.
     DeviceSecret
 }
 

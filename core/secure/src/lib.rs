@@ -12,9 +12,9 @@
 //! With the feature `ring`, frames and datagrams are sealed by *ring*, which is several times as fast on a Linux host;
 //! without it, by portable code, which boards use. Both seal alike.
 //!
-//! Another suite would be another version of the protocol; nothing is negotiated. This crate has no source
-//! of noise, reads no file and allocates nothing: whoever calls brings 32 fresh bytes for each handshake. What it does not
-//! do: decide who may speak, which is the business of the tables above.
+//! Another suite would be another version of the protocol; nothing is negotiated. This crate has no source of
+//! randomness, reads no file and allocates nothing: the caller supplies 32 fresh bytes for each handshake. It does not
+//! decide which peer may speak; that is the business of the tables above.
 
 #![no_std]
 

@@ -24,7 +24,7 @@ pub struct Board {
     pub wireless: bool,
 }
 
-/// Who takes a UF2 file.
+/// The family that a UF2 file is for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Families {
     /// Of an image.

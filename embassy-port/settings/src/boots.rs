@@ -1,8 +1,8 @@
-//! How many lives a board has had, kept in two pages of flash of its own: what makes its random numbers differ from life to
-//! life where its noise does not.
+//! The boot counter of a board, kept in two pages of flash of its own. It makes random numbers differ between boots
+//! even where the board's noise does not.
 //!
-//! Each life adds a record behind those of the lives before; where a page is full the other one is erased, so that the
-//! record with the highest count is never in a page that is being erased. A record has 32 bytes:
+//! Each boot appends a record; when a page is full the other one is erased, so that the record with the highest count
+//! is never in a page that is being erased. A record has 32 bytes:
 //!
 //! | offset | size | field |
 //! |---|---|---|
@@ -12,7 +12,7 @@
 //! | 28 | 4 | CRC-32 (ISO-HDLC) of all before, little-endian |
 //!
 //! A count is returned once its record has been read back, and counts only rise: wherever power is cut, no count is
-//! returned twice. The pages are erased by nothing else; when somebody erases all of a chip the keys are gone with them.
+//! returned twice. Nothing else erases the pages; a full chip erase takes the keys with them.
 
 use cara_secure::random::BootCounter;
 use embedded_storage::nor_flash::NorFlash;

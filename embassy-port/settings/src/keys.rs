@@ -1,5 +1,5 @@
-//! What a board needs to speak with its fleet, and how it stands in flash: behind the settings, in the same copy, so that
-//! one checksum and one generation hold for both.
+//! The keys of a board, and their layout in flash: behind the settings, in the same copy, so that one checksum and one
+//! generation cover both.
 //!
 //! | size | field |
 //! |---|---|
@@ -9,8 +9,8 @@
 //! | 1 | p, how many peers |
 //! | … | each peer: role (0 m_unit, 1 s_unit), length of its name, name, id, little-endian; then for each generation 0, or 1 and 32 bytes of the pair's key |
 //!
-//! Keys are wiped when they are dropped and are never shown, neither by `Debug` nor in the text of the settings. Flash holds
-//! them in the clear: who reads it out has them, and only them.
+//! Keys are wiped when they are dropped and are never shown, neither by `Debug` nor in the text of the settings. Flash
+//! holds them in clear: reading out one board's flash reveals that board's keys and no others.
 
 use core::fmt;
 
@@ -51,19 +51,19 @@ impl fmt::Debug for Peer {
 /// Why a board has no keys.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum KeysError {
-    /// The pages do not even tell who the board is.
+    /// The pages do not hold valid settings either.
     #[error("{0}")]
     Page(#[from] PageError),
-    /// Settings stand there without keys.
+    /// The page holds settings without keys.
     #[error("the page holds no keys: write them with `cara provision BOARD --keys FILE`")]
     Absent,
-    /// What stands there is not as `cara provision` writes it.
+    /// The keys are not in the form that `cara provision` writes.
     #[error("the keys are not as `cara provision` writes them: write them again")]
     Unsound,
-    /// More than this board, or a copy, has room for.
+    /// More keys than fit into this board's table or into a copy.
     #[error("a board holds {GENERATIONS} generations of keys, a vehicle with one peer, any other with as many as fit")]
     Full,
-    /// The text of the settings is none.
+    /// The text of the settings cannot be parsed.
     #[error("{0}")]
     Text(#[from] TextError),
 }
@@ -121,12 +121,12 @@ impl<const PEERS: usize> Keys<PEERS> {
         self.discoveries().zip(keys).filter_map(|((number, _), key)| Some((number, key.as_ref()?)))
     }
 
-    /// Whom it may talk to.
+    /// The peers that it has keys for.
     pub fn peers(&self) -> impl Iterator<Item = &Identity> {
         self.peers.iter().map(|peer| &peer.identity)
     }
 
-    /// Writes them as they stand in flash; how many bytes that takes. Whoever lends the bytes wipes them.
+    /// Encodes them as they are laid out in flash; the number of bytes. The caller wipes the buffer.
     pub fn encode(&self, bytes: &mut [u8; KEYS_BYTES]) -> Result<usize, KeysError> {
         let mut left = bytes.as_mut_slice();
         put(&mut left, self.secret.expose())?;

@@ -39,7 +39,7 @@ pub use wifi::{Wifi, WifiError};
 /// What one board is told.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Settings {
-    /// Who it is.
+    /// Its identity.
     pub identity: Identity,
     /// The m_unit that it belongs to; none on a board that is an m_unit itself.
     pub manager: Option<Manager>,
@@ -51,8 +51,7 @@ pub struct Settings {
     pub network: Network,
     /// The access point, for a board on Wi-Fi. Text never holds it, because its password is secret.
     pub wifi: Option<Wifi>,
-    /// Somebody has asked for plain mode in words: the board needs no keys, and proves nothing to anybody. In flash the layout
-    /// tells it.
+    /// Plain mode was an explicit opt-in: the board needs no keys and proves nothing. In flash the layout encodes it.
     #[serde(skip)]
     pub insecure: bool,
 }

@@ -208,7 +208,7 @@ mod tests {
         assert_eq!(decode(&page(&written, 5)), Ok((written, 5)));
     }
 
-    /// An image that knows no keys still reads who it is.
+    /// An image without support for keys still reads the settings.
     #[test]
     fn keys_stand_behind_the_settings() {
         let written = settings("agv-07", 7);

@@ -22,7 +22,7 @@ pub struct Place {
     pub number: u32,
     /// Blocks of the file.
     pub total: u32,
-    /// Who takes it.
+    /// The chip family that accepts it.
     pub family: u32,
 }
 

@@ -1,4 +1,4 @@
-//! A vehicle that keeps its position and drives only while somebody wants it to.
+//! A vehicle that tracks its position and drives only while a lease is live.
 
 use core::fmt;
 
@@ -15,7 +15,7 @@ pub const BATTERY: &str = "battery() -> (charge: float)";
 /// Stops at once.
 pub const STOP: &str = "stop()";
 
-/// How long [`GO_TO`] goes on after the manager's last sign that it wants it.
+/// How long [`GO_TO`] goes on after the manager's last renewal.
 pub const GO_TO_LEASE: Duration = Duration::from_millis(400);
 /// How often [`Agv::step`] is to be called.
 pub const TICK: Duration = Duration::from_millis(20);
@@ -71,7 +71,7 @@ pub enum Progress {
     Passed(Place),
     /// It is where it was to go, and stands.
     Arrived(Place),
-    /// Nobody wanted it to go on; it stands.
+    /// The lease ended; it stands.
     Stopped(Place),
 }
 
@@ -100,7 +100,7 @@ impl Agv {
         self.target
     }
 
-    /// Drives for `elapsed`, unless `lease_live` says that nobody wants it any more: then it stops.
+    /// Drives for `elapsed`; without a live lease it stops.
     pub fn step(&mut self, elapsed: Duration, lease_live: bool) -> Option<Progress> {
         let target = self.target?;
         if !lease_live {

@@ -16,10 +16,10 @@ pub struct Network {
     /// Use loopback only.
     #[arg(long, global = true)]
     pub loopback: bool,
-    /// Plain mode, without keys: whoever is on the network can read what the unit says, and speak as any unit.
+    /// Plain mode, without keys: any host on the network can read what the unit sends, and speak as any unit.
     #[arg(long, global = true)]
     pub insecure: bool,
-    /// End when standard input is closed, so that nothing outlives who started it.
+    /// End when standard input is closed, so that the program does not outlive its parent.
     #[arg(long, global = true)]
     pub attended: bool,
 }
@@ -39,7 +39,7 @@ impl Network {
         if self.insecure { builder } else { builder.keys(ring) }
     }
 
-    /// Draws keys for nodes that are all in this process, so that nobody has to make files for them.
+    /// Draws keys for nodes that are all in this process, so that they need no key files.
     pub fn draw_keys(&self, nodes: &[&str]) -> Result<FleetKeys> {
         let mut keys = FleetKeys::draw(Fleet(self.fleet))?;
         for node in nodes {

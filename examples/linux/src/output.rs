@@ -1,6 +1,6 @@
 //! Standard output, a line at a time.
 
-/// Prints a line. Where nobody reads any more, the example goes on: an AGV must not end because its terminal closed.
+/// Prints a line. A closed standard output is not an error: an AGV must not end because its terminal closed.
 #[macro_export]
 macro_rules! say {
     ($($text:tt)*) => {{

@@ -19,7 +19,7 @@ pub struct Stopper(Sender<Result<()>>);
 impl Stopper {
     /// The example ends with this outcome.
     pub fn stop(&self, outcome: Result<()>) {
-        // Once nobody waits, the end has come already.
+        // Without a receiver the program is ending already.
         let _ = self.0.send(outcome);
     }
 }

@@ -1,4 +1,4 @@
-//! The README's listing is the example's: whoever copies it runs what the tests run.
+//! The README's listing is the example's, so that a copy of it is tested code.
 
 /// The lines behind the one of the paper's line 1, which differs: the example takes the name from its command line.
 fn listing(text: &str, begin: &str, end: &str) -> Vec<String> {

@@ -13,7 +13,7 @@ pub trait Program {
     /// Serves a call: the arguments are in `parameters`, and the results go there.
     fn serve(&mut self, call: &Call, parameters: &mut ParametersView) -> Served;
 
-    /// Nobody wants any more what this function started: stop it. Runs before anything else that is due.
+    /// The lease of this function has ended: stop what it started. Runs before anything else that is due.
     fn make_safe(&mut self, function: Slot);
 
     /// A call of this unit has ended; [`ReplyBlock::read_into`] gives the results.

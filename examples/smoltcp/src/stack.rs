@@ -123,7 +123,7 @@ impl Stack {
         self.sockets.get::<tcp::Socket>(self.stream).can_send()
     }
 
-    /// Closes the stream behind what it still has to send, or without it when nobody takes that for a while.
+    /// Closes the stream once its queue is sent, or without that when the peer accepts nothing for [`FAREWELL`].
     pub(crate) fn close(&mut self) {
         let stream = self.sockets.get_mut::<tcp::Socket>(self.stream);
         stream.set_timeout(Some(FAREWELL));
@@ -146,7 +146,7 @@ impl Stack {
     pub(crate) fn datagram(&mut self, bytes: &mut [u8]) -> Option<(SocketAddr, usize)> {
         let socket = self.sockets.get_mut::<udp::Socket>(self.datagrams);
         while socket.can_recv() {
-            // One that is longer than any of CARA is cut by nobody: it is dropped.
+            // A datagram longer than any of CARA does not fit the buffer: it is dropped, not truncated.
             if let Ok((length, from)) = socket.recv_slice(bytes) {
                 return Some((from.endpoint.into(), length));
             }

@@ -8,7 +8,7 @@ use zeroize::Zeroizing;
 
 /// The bytes of a file, up to one more than the longest that is taken, and whether it is longer than that.
 ///
-/// What is no file is refused: a pipe would keep us waiting for somebody to write.
+/// Anything but a regular file is refused: a pipe would block until its other end writes.
 pub(crate) fn read(path: &Path, longest: u64) -> io::Result<(Zeroizing<Vec<u8>>, bool)> {
     if !path.metadata()?.is_file() {
         return Err(io::Error::other("it is no file"));

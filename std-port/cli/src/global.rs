@@ -1,4 +1,4 @@
-//! Options that every verb has: which unit is asked, as whom, and in which form it is told.
+//! Options of every verb: the unit that is asked, the identity that asks, and the form of the output.
 
 use std::path::PathBuf;
 use std::time::Duration;

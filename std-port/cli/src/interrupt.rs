@@ -18,8 +18,7 @@ const ENDED: i32 = SHELL + SIGINT;
 /// A shell adds the number of the signal to it.
 const SHELL: i32 = 128;
 
-/// Ends the process at Ctrl-C and at SIGTERM, also where whoever started it has them ignored, as a shell does for what it
-/// starts in the background.
+/// Ends the process at Ctrl-C and at SIGTERM, even if its parent has them ignored, as a shell does for background jobs.
 pub(crate) fn end_at_signals() -> io::Result<()> {
     let mut signals = Signals::new([SIGINT, SIGTERM])?;
     std::thread::Builder::new().name("signals".into()).spawn(move || {

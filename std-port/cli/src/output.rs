@@ -11,7 +11,7 @@ use serde::Serialize;
 pub(crate) const HEADING: Style = Style::new().bold();
 /// What is in order.
 pub(crate) const GOOD: Style = AnsiColor::Green.on_default();
-/// What needs somebody to act.
+/// Something that needs action.
 pub(crate) const BAD: Style = AnsiColor::Red.on_default().bold();
 /// What is of less interest.
 pub(crate) const FAINT: Style = Style::new().dimmed();
@@ -27,7 +27,7 @@ pub(crate) fn line(text: impl std::fmt::Display) -> io::Result<()> {
 
 /// Prints what people should know and a command does not end with, on standard error.
 pub(crate) fn warning(text: impl std::fmt::Display) {
-    // Where nobody reads it, the command goes on.
+    // A closed standard error does not end the command.
     let _ = writeln!(anstream::stderr().lock(), "{BAD}warning{BAD:#}: {}", visible(&text.to_string()));
 }
 

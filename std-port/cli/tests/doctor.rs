@@ -179,7 +179,7 @@ fn a_node_that_was_lost_is_told_with_time_and_reason() {
     let told = clinic.doctor(&["agv", "--listen", "3s"]);
     told.is(&["lost"], 4);
     assert!(told.found(0).starts_with("agv/7 left boss/1 "), "{told:?}");
-    // Whoever stopped it knows.
+    // Without a named node it is no error: the operator who stopped it knows.
     clinic.doctor(&["--listen", "3s"]).is(&["lost"], 0);
 }
 
@@ -191,7 +191,7 @@ fn a_node_that_is_not_there_at_all_is_not_heard() {
     let told = clinic.doctor(&["agv-7", "--listen", "3s"]);
     told.is(&["not-heard"], 4);
     assert!(told.found(0).contains("there is agv-8/8"), "{told:?}");
-    // From another host nobody can know.
+    // Another host cannot know.
     clinic.stranger(&["agv-7", "--listen", "3s"]).is(&["ask-its-manager"], 4);
 }
 

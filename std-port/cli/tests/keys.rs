@@ -322,7 +322,7 @@ fn a_file_that_is_refused_is_told_before_anything_is_written() {
     assert!(home.file("agv/3").exists());
 }
 
-/// One that nobody reads any more is no reason to keep a node that is lost.
+/// A key file that cannot be read must not prevent a revocation.
 #[test]
 fn a_file_of_garbage_is_written_again_and_holds_up_no_revocation() {
     let home = Home::with_fleet();
@@ -618,7 +618,7 @@ signature = \"echo(n: int) -> (n: int)\"
 answer = \"echo\"
 ";
 
-/// A node finds its keys where `cara keys` has put them, and from then on nobody reaches it who has none.
+/// A node finds its keys where `cara keys` has put them; from then on a peer without keys cannot reach it.
 #[test]
 fn a_node_takes_the_keys_that_are_there_and_is_called_with_keys_alone() {
     let home = Home::new();

@@ -225,7 +225,7 @@ fn a_port_in_use_is_told_where_the_file_says_it() {
         std::fs::write(folder.path().join("bad.toml"), format!("{start}{line}\n")).unwrap();
         let refused = outcome(folder.path(), &["bad.toml"]);
         let told = text(&refused.stderr);
-        // Not the file's mistake alone: whoever restarts the node may try again.
+        // Not only a mistake in the file: a restart of the node may succeed.
         assert_eq!(refused.status.code(), Some(1), "{told}");
         assert!(told.starts_with(&format!("error: bad.toml:{place}: ")) && told.contains("in use"), "{told}");
     }

@@ -66,7 +66,7 @@ fn a_reflected_message_is_no_answer() {
     assert!(initiator.finish(&message).is_err());
 }
 
-/// A recorded first message is answered, and then nothing opens: whoever sent it cannot go on.
+/// A replayed first message is answered, and then nothing opens: its sender cannot go on.
 #[test]
 fn a_recorded_handshake_leads_to_no_channel() {
     let prologue = prologue(b"a", b"b");

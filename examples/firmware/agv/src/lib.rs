@@ -1,9 +1,9 @@
 //! The AGV of the examples as firmware, whatever the board. What it does is `cara_apps::agv`, the same as on Linux; a
 //! board adds its network, its clock, its settings and its button.
 //!
-//! [`provision`] is what a board has been told, and the keys with which it proves who it is. [`vehicle`] makes the unit and its services. A board then runs three tasks beside that of its network: the unit's
-//! [`Runner`], [`drive`] and [`call_mechanic`]. [`lamp`] says how a board tells what goes on; [`echo`] is a
-//! program without CARA to compare with.
+//! [`provision`] has a board's settings, and the keys that prove its identity. [`vehicle`] makes the unit and its
+//! services. A board then runs three tasks beside that of its network: the unit's [`Runner`], [`drive`] and
+//! [`call_mechanic`]. [`led`] is the status LED; [`echo`] is a program without CARA to compare with.
 
 #![no_std]
 
@@ -11,8 +11,8 @@
 extern crate std;
 
 pub mod echo;
-pub mod lamp;
 pub mod least;
+pub mod led;
 mod log;
 pub mod provision;
 #[cfg(feature = "tasks")]
@@ -37,24 +37,25 @@ pub type Vehicle = Handle<Agv>;
 /// Its memory: one manager, messages of 1 KiB.
 pub type VehicleResources = Resources<Agv>;
 
-/// Returns a text, for whoever measures the way to the vehicle and back.
+/// Returns its argument, for measurements of the round trip.
 const ECHO: &str = "echo(text: string[400]) -> (text: string[400])";
 
-/// Who may do what: m_units see and call all of its functions, and may offer it theirs. The only one that can join is the
-/// manager of the settings, whose name no table in an image knows. An s_unit, which has no business here, may do nothing.
+/// Permissions: m_units see and call all functions of the vehicle, and may publish theirs to it. Only the manager of
+/// the settings can join, and its name is not known when the image is built. S_units have no business here and may do
+/// nothing.
 const RULES: [Rule; 1] = [Rule::new(Who::M_UNITS, Functions::All, Verbs::ALL)];
 
 /// Sockets of the network stack that the vehicle needs, with one for DHCP.
 pub const SOCKETS: usize = VehicleResources::SOCKETS + 1;
 
-/// Whether somebody wants the vehicle to drive. An interrupt of the motors can read it: `DRIVING.is_live(now())` is
-/// false in time also when no task runs any more.
+/// The lease of the vehicle's driving. An interrupt of the motors can read it: `DRIVING.is_live(now())` becomes false
+/// in time even if no task runs any more.
 pub static DRIVING: Lease = Lease::new();
 /// Whether the vehicle has somewhere to go.
 static HAS_TARGET: AtomicBool = AtomicBool::new(false);
 
-/// Whether the motors may run now: the vehicle has somewhere to go, and somebody wants it to. The interrupt of a board's
-/// motors asks this each time, and cuts them off otherwise; so they stand in time also when no task runs any more.
+/// Whether the motors may run now: the vehicle has a target and a live lease. The interrupt of a board's motors asks
+/// this each time and cuts them off otherwise, so that they stop in time even if no task runs any more.
 pub fn may_move() -> bool {
     HAS_TARGET.load(Ordering::Acquire) && DRIVING.is_live(now())
 }
@@ -91,7 +92,7 @@ pub fn hardware_address(chip: &[u8]) -> [u8; 6] {
     [0x02, first, second, third, fourth, fifth]
 }
 
-/// Makes the AGV that the settings describe, which proves with `security` who it is.
+/// Makes the AGV that the settings describe; `security` proves its identity.
 pub fn vehicle(
     stack: Stack<'static>,
     resources: &'static mut VehicleResources,
@@ -104,7 +105,7 @@ pub fn vehicle(
     Ok((vehicle, runner))
 }
 
-/// Who the unit of the settings is.
+/// The unit's configuration from the settings.
 fn unit_config(settings: &Settings, security: Security) -> Result<Config, VehicleError> {
     let manager = settings.manager.as_ref().ok_or(VehicleError::NoManager)?;
     let identity = &settings.identity;

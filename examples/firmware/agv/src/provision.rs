@@ -1,5 +1,5 @@
-//! What a board has been told: who it is, and how it proves that. Without keys a board joins nobody, unless its settings say
-//! in words that it is to be insecure.
+//! What a board was provisioned with: its identity, and the keys that prove it. Without keys a board joins no manager,
+//! unless its settings opt in to plain mode explicitly.
 
 use cara_embassy::Security;
 #[cfg(feature = "secure")]
@@ -11,19 +11,19 @@ use cara_settings::page::{self, PageError};
 
 use crate::info;
 
-/// What a vehicle has been told.
+/// What a vehicle was provisioned with.
 pub struct Provision {
-    /// Who it is.
+    /// Its settings, with its identity.
     pub settings: Settings,
-    /// How it proves that.
+    /// How it proves its identity.
     pub proof: Proof,
 }
 
-/// How a board proves who it is.
-// One of them lives while a board starts; boxing its keys would need an allocator.
+/// How a board proves its identity.
+// Only one exists, while a board starts; boxing its keys would need an allocator.
 #[allow(clippy::large_enum_variant)]
 pub enum Proof {
-    /// Not at all: its settings say so in words.
+    /// Not at all: its settings opt in to plain mode.
     Insecure,
     /// With its keys.
     #[cfg(feature = "secure")]
@@ -90,8 +90,8 @@ impl Proof {
         }
     }
 
-    /// With numbers that are the same in each life, for tests only. Whoever knows them can compute every key of a link with
-    /// somebody who draws as badly.
+    /// With random numbers that are the same in each boot, for tests only: any holder of these numbers can compute the
+    /// keys of a link with another unit that draws as badly.
     pub fn begin_constant(self) -> Security {
         crate::error!("CONSTANT RANDOM NUMBERS: this image is for tests only, and keeps nothing secret");
         match self {

@@ -1,4 +1,4 @@
-//! Tasks that every board spawns as they are. Those of its network, button, lamp and watchdog are the board's own,
+//! Tasks that every board spawns as they are. Those of its network, button, LED and watchdog are the board's own,
 //! because their types are.
 
 use cara_apps::agv::Agv;

@@ -4,10 +4,10 @@
 //!
 //! Words that only this board knows:
 //!
-//! - `file=PATH`: more words stand in a file of the host, as `cara provision lm3s6965evb --output PATH` writes it. Keys do,
-//!   because whoever lists the processes of the host sees arguments;
-//! - `boots=PATH`: the file of the host that stands for the two pages of flash in which the board counts its lives;
-//! - `seed=N` replaces the hardware's noise, for tests in which each life has the same.
+//! - `file=PATH`: more words stand in a file of the host, as `cara provision lm3s6965evb --output PATH` writes it. Keys
+//!   do, because a list of the host's processes shows arguments;
+//! - `boots=PATH`: the file of the host that stands for the two pages of flash of the board's boot counter;
+//! - `seed=N` replaces the hardware's noise, for tests in which each boot has the same.
 
 use cara_settings::{Settings, TextError};
 #[cfg(not(feature = "secure"))]
@@ -31,7 +31,7 @@ pub struct Told {
     secrets: secured::Secrets,
 }
 
-/// Why the board does not know who it is.
+/// Why the board has no settings.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ArgumentError {
     /// The emulator gives none, or more than fit.
@@ -155,8 +155,8 @@ mod secured {
     }
 
     impl Told {
-        /// Who the board is, what proves that to peers, and the noise; moves the count of its lives. `None` without keys, which
-        /// the log tells.
+        /// The settings, the proof of identity, and the noise; raises the boot counter. `None` without keys, which is
+        /// logged.
         #[inline(never)]
         pub fn security(self) -> Option<(Settings, Security, u64)> {
             let Self { settings, noise, secrets: Secrets { keys, boots } } = self;
@@ -173,7 +173,7 @@ mod secured {
 
 #[cfg(not(feature = "secure"))]
 impl Told {
-    /// Who the board is, that nothing proves it if the settings say so in words, and the noise.
+    /// The settings, plain mode if the settings opt in to it, and the noise.
     pub fn security(self) -> Option<(Settings, cara_embassy::Security, u64)> {
         let Provision { settings, proof } = Provision::of(self.settings)?;
         Some((settings, proof.begin(halves(self.noise)), self.noise))

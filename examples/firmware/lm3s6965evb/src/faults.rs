@@ -52,7 +52,7 @@ struct Record {
     sleeps: bool,
     /// How late the emulator was to wake the processor for the last tick, because its host was busy: no chip is.
     late: CoreDuration,
-    /// Longest turn of the executor that has ended, while somebody wanted the vehicle to drive.
+    /// Longest completed turn of the executor during a live lease.
     turn: CoreDuration,
     /// Losses of the manager for which the hook has run.
     losses: u32,
@@ -195,8 +195,8 @@ pub(crate) fn order_begins() -> u32 {
     number
 }
 
-/// A turn of the executor begins; when, if somebody wants the vehicle to drive. Other turns hold nothing up: the longest of
-/// all are those of a proof, on a link that is not live yet, and the one that reads all that comes with a new link.
+/// A turn of the executor begins; when, if the lease is live. Other turns delay nothing: the longest of all are those
+/// of a proof, on a link that is not live yet, and the one that reads everything that comes with a new link.
 pub(crate) fn turn() -> Option<Instant> {
     let now = now();
     lasts_beyond(now).then_some(now)

@@ -24,7 +24,7 @@ pub mod watchdog;
 
 /// Starts the clock and paints the stack; call it first, once.
 ///
-/// The core's peripherals, for whoever needs more of them; `None` if they were taken before.
+/// The core's peripherals, for a program that needs more of them; `None` if they were taken before.
 pub fn start() -> Option<cortex_m::Peripherals> {
     stack::paint();
     let mut peripherals = cortex_m::Peripherals::take()?;

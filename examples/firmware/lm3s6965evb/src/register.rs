@@ -8,7 +8,8 @@ use lm3s6965::Interrupt;
 #[derive(Clone, Copy)]
 pub(crate) struct Register(*mut u32);
 
-// SAFETY: a register is the same for everybody; who may touch it when is the business of its peripheral's module.
+// SAFETY: every context sees the same register, and each access is volatile; the peripheral's module decides which
+// context accesses it when.
 unsafe impl Sync for Register {}
 
 /// The registers of a peripheral.

@@ -35,7 +35,7 @@ const BOUNCES: Duration = Duration::from_millis(50);
 
 /// The board.
 pub struct Board {
-    /// The pages of flash that tell who it is.
+    /// The pages of flash that hold its settings.
     pub pages: [&'static [u8]; 2],
     /// Counts its lives.
     pub lives: Lives,
@@ -44,7 +44,7 @@ pub struct Board {
     /// The network.
     pub device: Device,
     /// LD1, green.
-    pub lamp: Lamp,
+    pub led: Led,
     /// B1, blue.
     pub button: Button,
     /// Not yet running.
@@ -85,7 +85,7 @@ impl Board {
             lives: settings::lives(Flash::new_blocking(chip.FLASH)),
             seed: u64::from_le_bytes(seed),
             device,
-            lamp: Lamp(Output::new(chip.PB0, Level::Low, Speed::Low)),
+            led: Led(Output::new(chip.PB0, Level::Low, Speed::Low)),
             button: Button(ExtiInput::new(chip.PC13, chip.EXTI13, Pull::Down, Interrupts)),
             #[cfg(feature = "f767zi")]
             watchdog: Watchdog(IndependentWatchdog::new(chip.IWDG, HANGS.as_micros() as u32)),
@@ -95,10 +95,10 @@ impl Board {
     }
 }
 
-/// A lamp.
-pub struct Lamp(Output<'static>);
+/// An LED.
+pub struct Led(Output<'static>);
 
-impl Lamp {
+impl Led {
     /// Switches it.
     pub fn set(&mut self, on: bool) {
         self.0.set_level(Level::from(on));

@@ -1,4 +1,4 @@
-//! What ST's Nucleo-144 boards with a Cortex-M7 need below embassy: clocks, Ethernet, button, lamp, motors, watchdog, and the
+//! What ST's Nucleo-144 boards with a Cortex-M7 need below embassy: clocks, Ethernet, button, LED, motors, watchdog, and the
 //! settings in their flash. What the vehicle does is in `cara_vehicle`.
 //!
 //! Caches stay off, as the processor starts, because the Ethernet driver does not clean or invalidate any; see

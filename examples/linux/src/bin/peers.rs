@@ -52,7 +52,7 @@ fn main() -> Result<()> {
             Some(peer) if !told => told = tell(peer),
             _ => {}
         }
-        // One of the two ends first; then the other one finds nobody to tell.
+        // One of the two ends first; then the other one has no peer left to tell.
         if served.finished.load(Ordering::Acquire) && (told || peer.is_none()) {
             break Ok(());
         }

@@ -105,7 +105,7 @@ fn send((name, id): (&str, u32), manager: &NameAndId, count: i64, network: Netwo
         };
         number += 1;
         let speed = 1.0 + (number % 100) as f64 / 100.0;
-        // Nobody is told about one that could not go: the next one follows.
+        // A report that could not be sent is not an error: the next one follows.
         refused += i64::from(manager.request_with("report", &report(number, speed)?, &best_effort).is_err());
     }
     say!("sent {number}, refused here {refused}");

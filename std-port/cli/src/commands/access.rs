@@ -12,10 +12,10 @@ use crate::exit::{Ended, Exit};
 use crate::global::Global;
 use crate::output;
 
-/// The word for whoever has a unit's control socket.
+/// The word for the operator on a unit's control socket.
 const OPERATOR: &str = "operator";
 
-/// Access tables: who may see, call and publish which function.
+/// Access tables: which node may see, call and publish which function.
 #[derive(clap::Args)]
 pub(crate) struct Arguments {
     #[command(subcommand)]
@@ -36,7 +36,7 @@ enum What {
 struct Check {
     /// The table, in TOML.
     file: PathBuf,
-    /// Who asks: NAME/ID, with @m_unit or @s_unit where the table tells the two apart, or `operator`.
+    /// The node that asks: NAME/ID, with @m_unit or @s_unit where the table tells the two apart, or `operator`.
     #[arg(long, value_name = "NODE", requires = "question")]
     who: Option<String>,
     /// May it call this function?
@@ -94,7 +94,7 @@ fn answer(table: &AccessTable, who: &str, function: &str, verb: Verb, global: &G
     tell(table, who, function, verb, decisions[0], global)
 }
 
-/// Whoever may call a function sees it too.
+/// Permission to call includes permission to see.
 fn decide(table: &AccessTable, identity: &Identity, function: &str, verb: Verb) -> Decision {
     let who = Principal::Node(identity);
     match table.decide(who, function, verb) {

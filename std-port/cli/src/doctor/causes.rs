@@ -47,7 +47,7 @@ pub(crate) fn duplicate(node: &str, lives: &[Life]) -> Option<Finding> {
 
 const DUPLICATE_ADVICE: &str = "give each node a name and id of its own; the one that was connected first stays";
 
-/// Who comes without a key may be who was shut out: what is read at the first alarm must not let it in again.
+/// A node without a key may be a revoked one: the advice that is read first must not let it in again.
 const NO_PAIR_KEY_ADVICE: &str = "if it was revoked, or is not known to you, do nothing: it stays out. `cara keys show`, where \
                                   the fleet's root is, tells who was revoked; one that was never added and belongs here is \
                                   added there";

@@ -42,7 +42,7 @@ fn since(node: &NodeInfo) -> String {
         .map_or(String::new(), |ms| format!(", without a break for {:.1} s", Duration::from_millis(ms).as_secs_f32()))
 }
 
-/// Somebody else came in its name a short while ago, and was refused.
+/// Another node of its name was refused a short while ago.
 fn refused_twin(unit: &Running, name: &str) -> Option<Finding> {
     let recent = |ago_ms: u64| ago_ms < 30_000;
     let twin = unit.refused.iter().find(|refused| {

@@ -97,7 +97,7 @@ impl Evidence {
         names
     }
 
-    /// Everybody who has a name, other surveys left out.
+    /// All senders with an identity, except other surveys.
     pub(crate) fn units(&self) -> impl Iterator<Item = (&Heard, &Identity)> {
         self.heard
             .iter()

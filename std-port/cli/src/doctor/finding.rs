@@ -10,7 +10,7 @@ pub(crate) enum Severity {
     Error,
     /// Not as it should be.
     Warning,
-    /// Good to know; nobody has to act.
+    /// For information; no action is needed.
     Info,
 }
 

@@ -19,20 +19,20 @@ use crate::exit::Ended;
 use crate::global::Global;
 use crate::listening;
 
-/// Between two looks at what has come.
+/// Between two looks at what has arrived.
 const SLICE: Duration = Duration::from_millis(250);
 /// After listening for so long in vain, units of this host are dialled as well.
 const TRIES_OWN: Duration = Duration::from_secs(5);
 /// Between two questions to the units of this host.
 const REFRESH: Duration = Duration::from_secs(1);
-/// When all are asked, in seconds since the start: one broadcast alone may get lost.
+/// When broadcasts ask all nodes, in seconds since the start: a single one may get lost.
 const QUESTIONS: [u64; 5] = [0, 1, 2, 6, 12];
-/// When those are asked alone who have not answered with all.
+/// When nodes that did not answer the broadcasts are asked by unicast.
 const ALONE: Duration = Duration::from_secs(3);
 /// Most nodes that are asked alone, and most other fleets that are asked.
 const MOST_ALONE: usize = 64;
 const MOST_FLEETS: usize = 8;
-/// Most lives of connected nodes that are kept.
+/// Most boots of connected nodes that are kept.
 const MOST_LIVES: usize = 16_384;
 
 /// What was seen, and what it means.
@@ -187,7 +187,8 @@ impl Looking {
 
     fn ask(&mut self) {
         let due = QUESTIONS.get(self.questions).is_some_and(|at| self.survey.age() >= Duration::from_secs(*at));
-        // Whoever answers after having been asked alone has not answered to all.
+        // No more broadcasts once nodes were asked by unicast: an answer from then on shows that the unicast reached
+        // the node.
         if due && self.alone.is_none() {
             self.questions += 1;
             self.survey.ask(self.evidence.fleet);
@@ -203,7 +204,8 @@ impl Looking {
         }
     }
 
-    /// Asks those alone who were heard and have not answered; if nobody has, all that this host has to do with.
+    /// Asks each node that was heard and has not answered, by unicast; if there is none, all hosts that this host has
+    /// recently exchanged packets with.
     fn ask_alone(&mut self) {
         let m_units = self.evidence.m_units();
         let silent =

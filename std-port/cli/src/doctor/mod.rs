@@ -38,9 +38,9 @@ use self::which::Which;
 
 /// Finds out why a node is not there; or, without NAME, what is strange on this host and its network.
 ///
-/// It asks the m_units of the network to show themselves, listens, tries to connect to those that do, and asks the units
-/// that run on this host. It joins nothing and is nobody's manager. Each finding is explained in docs/troubleshooting.md.
-/// The exit code is 4 if something was found.
+/// It asks the m_units of the network to show themselves, listens, tries to connect to those that do, and asks the
+/// units that run on this host. It joins nothing and manages no node. Each finding is explained in
+/// docs/troubleshooting.md. The exit code is 4 if something was found.
 #[derive(clap::Args)]
 pub(crate) struct Arguments {
     /// NAME, NAME/ID or #ID of a node.

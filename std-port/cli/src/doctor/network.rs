@@ -1,4 +1,4 @@
-//! All that is strange on the network and on this host, for who asks about no node.
+//! Diagnostics of the network and of this host, when no node is named.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::IpAddr;
@@ -143,7 +143,7 @@ fn running(seen: &Evidence, unit: &Running) -> Vec<Finding> {
     found
 }
 
-/// A unit that is full, and whom it has refused for that.
+/// A unit that is full, and the nodes that it has refused for that.
 fn no_room(unit: &Running) -> Finding {
     let finding = full(&unit.name(), Some(unit.unit.constraints.maximum_nodes));
     let refused = unit.refused.iter().filter(|refused| refused.reason == "Full");

@@ -20,7 +20,7 @@ use super::secured;
 use super::which::{Which, quoted};
 use crate::close_names::close;
 
-/// M_units answer a survey within milliseconds: whoever has not after this does not.
+/// M_units answer a survey within milliseconds: one that has not answered after this time will not.
 pub(crate) const ANSWERED: Duration = Duration::from_millis(2_500);
 /// Two live m_units of one name have answered two questions each by then.
 const TWINS: Duration = Duration::from_millis(1_500);
@@ -124,11 +124,11 @@ fn silent(seen: &Evidence, which: &Which) -> Vec<Finding> {
     let (first, behind) = if seen.running.is_empty() { (no_way, Vec::new()) } else { (Vec::new(), no_way) };
     found.splice(0..0, first);
     found.extend(seen.answered_alone.first().map(|alone| one_way(seen, *alone)));
-    // A node that knows where its manager is dials it, again and again, and asks nobody meanwhile.
+    // A node that knows its manager's address dials it, again and again, and does not search meanwhile.
     let m_units = seen.m_units();
     let dials = m_units.iter().filter_map(|(heard, identity)| Some((dial_of(seen, heard)?, identity)));
     let blocked = dials.filter_map(|(dial, identity)| tcp_blocked(&identity.to_string(), dial));
-    // It may still turn out to look for somebody else.
+    // It may still turn out to search for another manager.
     found.extend(blocked.map(|finding| finding.certain(false)));
     // Its manager hears whatever it says, so that once it has had time to come back there is nothing to wait for.
     let lost = left::of(seen, which).map(|lost| lost.certain(seen.listened >= ANSWERED && left::for_long(seen, which)));
@@ -138,7 +138,7 @@ fn silent(seen: &Evidence, which: &Which) -> Vec<Finding> {
     if let Some(cause) = lost.or_else(|| no_manager_for_any(seen, which)) {
         return [cause].into_iter().chain(behind).collect();
     }
-    // Who cannot be read may be the one that is missed.
+    // A sender that cannot be decoded may be the missing node.
     let unreadable = seen.heard.iter().filter(|heard| heard.identity.is_none() && !heard.same_version());
     found.extend(unreadable.map(|heard| other_version("a node", heard)));
     found.truncate(8);

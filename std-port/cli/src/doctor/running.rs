@@ -89,8 +89,8 @@ pub(crate) struct Sources {
 }
 
 impl Sources {
-    /// Begins to ask the units that the options mean, or all of the fleet that they mean. Whoever names one that does not
-    /// answer gets an error; that none runs is none.
+    /// Begins to ask the units that the options select, or all of the fleet that they select. A named unit that does
+    /// not answer is an error; that no unit runs is not.
     pub(crate) fn open(which: Option<&Which>, global: &Global) -> anyhow::Result<Self> {
         let (clients, unasked, refused) = clients(global)?;
         let (sender, news) = channel();
@@ -148,7 +148,7 @@ fn clients(global: &Global) -> anyhow::Result<(Vec<Client>, Vec<RunningUnit>, Op
     Ok((asked.iter().filter_map(|unit| Client::connect(&unit.path).ok()).collect(), unasked, refused))
 }
 
-/// Asks a unit again and again, until it stops or nobody wants to know.
+/// Asks a unit again and again, until it stops or the receiver is gone.
 fn report(mut client: Client, which: Option<&Which>, tell: impl Fn(Option<Running>) -> bool) {
     loop {
         let began = Instant::now();

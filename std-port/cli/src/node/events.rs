@@ -1,4 +1,4 @@
-//! What happens to the node, as lines of its log. Whoever knocks at its port in vain gets few of them.
+//! Events of the node as lines of its log. Lines about refused connections are rate-limited.
 
 use std::collections::HashMap;
 use std::sync::mpsc::{Receiver, RecvTimeoutError};

@@ -7,7 +7,7 @@ use tracing_subscriber::filter::{LevelFilter, ParseError};
 
 use crate::exit::Ended;
 
-/// What is logged unless somebody says something else.
+/// The default log filter.
 const LEVEL: &str = "info";
 
 /// Changes what is logged.
@@ -59,7 +59,7 @@ impl Logging {
         // Another one is there only if a test has set it; that one may stay.
         let _ = builder.try_init();
         let change = Box::new(move |filter| {
-            // Fails only once nobody logs any more.
+            // Fails only once the subscriber is gone.
             let _ = handle.reload(filter);
         });
         Ok(Self { change, fixed })

@@ -39,8 +39,8 @@ const LONGEST_FILE: u64 = 1024 * 1024;
 
 /// Stays up as an m_unit, or as an s_unit, until SIGINT or SIGTERM.
 ///
-/// FILE says who it is, which limits it has and which functions it offers; options stand above the file. SIGHUP takes over
-/// the tables `constraints` and `log` of a file that has changed.
+/// FILE has its identity, its limits and the functions it offers; options override the file. SIGHUP takes over the
+/// tables `constraints` and `log` of a file that has changed.
 #[derive(clap::Args)]
 pub(crate) struct Arguments {
     /// The configuration, in TOML; without one, --name and --id suffice.
@@ -69,7 +69,7 @@ pub(crate) struct Arguments {
     /// Serve metrics at an address that other hosts reach too: plain HTTP, for everybody.
     #[arg(long)]
     metrics_anywhere: bool,
-    /// Who may see, call and publish what: an access table, which may change while the node runs.
+    /// Which node may see, call and publish which function: an access table, which may change while the node runs.
     #[arg(long, value_name = "TABLE")]
     access: Option<PathBuf>,
     /// What to log: error, warn, info, debug, trace, or as RUST_LOG.

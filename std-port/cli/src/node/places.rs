@@ -1,4 +1,4 @@
-//! A listener whose connections are few and do not stay idle: whoever reads metrics must not use up the descriptors that
+//! A listener with a limit of connections and an idle timeout: readers of metrics must not use up the descriptors that
 //! the node's links need.
 
 use std::io;
@@ -36,7 +36,7 @@ impl Listener for Places {
     type Addr = SocketAddr;
 
     async fn accept(&mut self) -> (Placed, SocketAddr) {
-        // Nobody closes the semaphore, so that there is always a place in the end.
+        // The semaphore is never closed, so that this succeeds once a permit is free.
         let place = self.free.clone().acquire_owned().await.ok();
         let (stream, address) = Listener::accept(&mut self.listener).await;
         (Placed { stream, _place: place, idle: Box::pin(sleep(IDLE)) }, address)

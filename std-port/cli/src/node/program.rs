@@ -110,7 +110,7 @@ impl Programs {
         };
         let output = running.output(deadline);
         let group = running.group;
-        // The process is not reaped yet, so that its number is nobody else's while it is listed.
+        // The process is not reaped yet, so that its pid cannot be reused while it is listed.
         self.lock().calls.retain(|(_, listed)| *listed != group);
         let status = running.end()?;
         let output = output?;
@@ -254,7 +254,7 @@ fn end_group(group: Pid) {
     let _ = kill_process_group(group, Signal::KILL);
 }
 
-/// Bytes as a file in memory: a program that does not read them keeps nobody waiting.
+/// Bytes as a file in memory: unlike a pipe, it does not block when the program does not read.
 fn as_file(bytes: &[u8]) -> io::Result<File> {
     let mut file = File::from(rustix::fs::memfd_create("arguments", MemfdFlags::CLOEXEC)?);
     file.write_all(bytes)?;

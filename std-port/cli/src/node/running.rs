@@ -123,7 +123,7 @@ fn listen(place: &Placed<SocketAddr>, settings: &Settings) -> anyhow::Result<Tcp
     })
 }
 
-/// One line for whoever waits for the node.
+/// One line that says that the node is up, for scripts that wait for it.
 fn tell_up(settings: &Settings, node: &Node, metrics: Option<SocketAddr>, global: &Global) -> anyhow::Result<()> {
     let Settings { name, id, fleet, .. } = settings;
     let (mode, discovery) = (shown_mode(node.mode()), node.discovery_port());

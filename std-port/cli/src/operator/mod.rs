@@ -1,4 +1,4 @@
-//! Who is asked: the m_unit that runs on this host, through its control socket, or one of this process. The same
+//! The m_unit that is asked: one that runs on this host, through its control socket, or one in this process. The same
 //! questions, the same answers.
 
 mod own;
@@ -79,7 +79,7 @@ impl Operator {
         Ok(Some(operator))
     }
 
-    /// How long nodes were waited for, as a remark on who is not there.
+    /// How long nodes were waited for, as a remark on missing ones.
     pub(crate) fn waited(&self) -> String {
         own::within(self.waited)
     }
@@ -185,7 +185,7 @@ impl Operator {
     }
 }
 
-/// The exit code of a failure: whoever typed the command must act on those of the configuration.
+/// The exit code of a failure; errors of the configuration are the caller's to correct.
 pub(crate) fn exit_of(failure: &Failure) -> Exit {
     if failure.cause == "configuration" { Exit::Usage } else { Exit::Failed }
 }

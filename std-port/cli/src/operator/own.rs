@@ -16,13 +16,13 @@ use crate::nodes::{self, Chosen};
 use crate::output;
 use crate::units::show_micros;
 
-/// Most nodes of such a unit: it should see everybody.
+/// Most nodes of such a unit: enough for a whole fleet.
 const MAXIMUM_NODES: u16 = 1024;
 /// How long a unit of the same name and ID may take to answer on the network.
 const TWIN: Duration = Duration::from_millis(500);
-/// Everybody has come when nobody came for so long.
+/// All nodes have joined when none joined for so long.
 const QUIET: Duration = Duration::from_millis(1500);
-/// How often is looked who has come.
+/// Interval between two looks at the nodes that have joined.
 const LOOK: Duration = Duration::from_millis(20);
 /// How long requests that need no reply are given to leave.
 const LEAVE: Duration = Duration::from_millis(300);
@@ -133,7 +133,7 @@ fn is_there(operator: &mut Operator, meant: &str) -> anyhow::Result<Option<Chose
     Ok(nodes::connected(operator, meant).ok())
 }
 
-/// Whether somebody is there and nothing has changed for a while.
+/// Whether a node is connected and nothing has changed for [`QUIET`].
 fn settled(operator: &mut Operator, offering: Option<&str>, (seen, since): &mut Seen) -> anyhow::Result<bool> {
     let all = nodes::all(operator, offering)?;
     let now: Vec<_> =

@@ -46,7 +46,7 @@ pub(super) fn next(board: &Board, content: &Content, first: &[u8], second: &[u8]
     Ok(Written { left, ..written(&content.settings, secrets.as_ref(), address, generation)? })
 }
 
-/// Both copies, for a board of which nobody knows what it holds.
+/// Both copies, for a board with unknown content.
 pub(super) fn both(board: &Board, Content { settings, secrets }: &Content) -> anyhow::Result<Vec<Written>> {
     let copies = (1..).zip(board.pages);
     copies.map(|(generation, address)| written(settings, secrets.as_ref(), address, generation)).collect()

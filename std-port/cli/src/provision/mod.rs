@@ -1,5 +1,5 @@
-//! `cara provision`: tells a board who it is. One image serves all boards of a kind; what differs is written to two pages
-//! of the board's flash.
+//! `cara provision`: gives a board its identity. One image serves all boards of a kind; what differs is written to two
+//! pages of the board's flash.
 //!
 //! [`told`] makes settings of the command line and [`secrets`] keys of a node's file, [`copy`] the bytes of the next copy and
 //! [`probe`] brings them to the board. [`show`] reads what a page says.
@@ -29,7 +29,7 @@ use zeroize::Zeroizing;
 use self::copy::{Content, Written};
 use self::secrets::Secrets;
 
-/// Writes to a board's flash who it is, whom it belongs to and how it gets its address.
+/// Writes a board's identity, manager and network settings to its flash.
 ///
 /// Without --output it goes to the board on this computer's debug probe, through probe-rs, which must be installed; the
 /// board then starts again. The board keeps two copies, and the newest one is never overwritten.

@@ -73,7 +73,7 @@ fn succeeded(arguments: &[&str]) -> anyhow::Result<()> {
 
 fn run(arguments: &[&str]) -> anyhow::Result<Output> {
     let mut command = Command::new(PROGRAM);
-    // It would ask which of several probes, where nobody sees the question.
+    // With several probes it would prompt for one, on a terminal that is not there.
     command.args(arguments).env("PROBE_RS_NON_INTERACTIVE", "true").stdin(Stdio::null());
     command.output().map_err(|error| match error.kind() {
         ErrorKind::NotFound => Ended::failed(

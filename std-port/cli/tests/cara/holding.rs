@@ -10,7 +10,7 @@ use crate::support::{PATIENCE, Running, Stage};
 
 const LEASE: Duration = Duration::from_millis(1_200);
 
-/// A vehicle that drives until it is told that it has arrived, or until nobody wants it to.
+/// A vehicle that drives until it is told that it has arrived, or until its lease ends.
 struct Driver {
     unit: Unit,
     lease: LeaseWatch,
@@ -105,7 +105,7 @@ fn what_is_held_stops_when_its_command_is_stopped_by_a_signal() {
     assert_eq!(driver.made_safe(), 1);
 }
 
-/// The manager has events all the time, and still sees at once that nobody holds any more.
+/// The manager has events all the time, and still detects at once that the lease is no longer held.
 #[test]
 fn who_goes_away_is_noticed_among_many_events() {
     let stage = Stage::with(&[]);

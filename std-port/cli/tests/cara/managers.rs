@@ -1,4 +1,4 @@
-//! `cara node` as the manager of a fleet: a second one of its identity, few descriptors, and who is missing.
+//! `cara node` as the manager of a fleet: a second one of its identity, few descriptors, and missing nodes.
 
 use std::io::{BufRead, BufReader};
 use std::net::TcpStream;

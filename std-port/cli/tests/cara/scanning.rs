@@ -182,7 +182,7 @@ fn a_survey_tells_whose_datagrams_are_proven() {
         three([["boss", "secured", "fleet"], ["open", "plain", "none"], ["stranger", "secured", "other_keys"]]);
     assert_eq!(proofs(modes.stage.fleet, &told), expected, "{told}");
     let boss = told["heard"].as_array().unwrap().iter().find(|heard| heard["name"] == "boss").unwrap();
-    // It answers the survey, and nobody who only listens.
+    // The manager answered the survey's question.
     assert!(boss["answers"].as_u64() > Some(0) && boss["generation"] == 1, "{told}");
     assert_eq!(told["keys_of"], serde_json::json!([modes.stage.fleet]));
     modes.scan(modes.keys.path(), &[]).says("secured, proven").says("secured, other keys").says("do not meet");
@@ -198,7 +198,7 @@ fn without_keys_a_survey_hears_secured_units_and_tells_how_to_get_keys() {
     assert_eq!(proofs(modes.stage.fleet, &told), expected, "{told}");
     let command = format!("`cara keys new-fleet --fleet {} ", modes.stage.fleet);
     modes.scan(empty.path(), &[]).says("secured, not checked").says(&command).says("--key-file");
-    // Whoever wants plain mode alone hears nothing else.
+    // In plain mode the survey hears plain units only.
     let told = modes.scan(modes.keys.path(), &["--json", "--insecure"]).json();
     assert!(
         proofs(modes.stage.fleet, &told).iter().all(|(_, mode, _)| mode == "plain")

@@ -35,7 +35,7 @@ pub(crate) struct Stage {
 }
 
 impl Stage {
-    /// Nobody there.
+    /// Without nodes.
     pub(crate) fn empty() -> Self {
         let fleet = RandomState::new().build_hasher().finish() as u32;
         let control = private_folder();

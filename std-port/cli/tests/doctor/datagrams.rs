@@ -8,11 +8,11 @@ use cara_std::keys::DiscoveryKey;
 /// The part of a far host that is a manager: see `namespace`.
 pub(crate) const MANAGER: &str = "manager";
 
-/// Bytes of the fleet's code, and of the shortest who-has with it.
+/// Bytes of the fleet's code, and of the shortest `WhoHas` with it.
 const CODE: usize = 16;
 const LEAST: usize = 120;
 
-/// A who-has for `boss/1`. All numbers are below 128, and so one byte each.
+/// A `WhoHas` for `boss/1`. All numbers are below 128, and so one byte each.
 pub(crate) struct Search {
     version: u8,
     fleet: u32,

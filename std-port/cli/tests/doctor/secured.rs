@@ -50,7 +50,7 @@ fn without_keys_of_the_fleet_the_doctor_says_so_with_the_command() {
     told.is(&["keys-missing", "not-heard"], 4);
     assert!(told.advice(0).contains(&format!("`cara keys new-fleet --fleet {} ", clinic.fleet)), "{told:?}");
     clinic.doctor_with_keys(nothing.path(), &["--listen", "3s"]).is(&["keys-missing", "no-manager"], 4);
-    // Whoever wants plain mode misses none.
+    // Plain mode needs no keys.
     clinic.doctor_with_keys(nothing.path(), &["agv", "--listen", "3s", "--insecure"]).is(&["not-heard"], 4);
     clinic.doctor(&["agv", "--listen", "3s"]).is(&["not-heard"], 4);
 }
@@ -123,7 +123,7 @@ fn a_key_file_that_others_can_read_is_told_with_the_command() {
     let told = clinic.doctor(&["--listen", "3s"]);
     told.is(&["key-file-refused"], 4);
     assert!(told.found(0).contains("chmod 600"), "{told:?}");
-    // Nothing but this file, and nobody there: that is why nothing is heard.
+    // With this key file only, and no other node: the file explains why nothing is heard.
     let clinic = Clinic::new();
     set_permissions(clinic.key_file("boss"), Permissions::from_mode(0o644)).unwrap();
     let told = clinic.doctor_with_keys(&clinic.key_file("boss"), &["agv", "--listen", "3s"]);

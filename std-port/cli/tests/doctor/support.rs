@@ -18,7 +18,7 @@ use crate::datagrams::Search;
 /// Longest wait for anything that is to happen.
 const PATIENCE: Duration = Duration::from_secs(180);
 
-/// A network that nobody else is on.
+/// A network of its own.
 pub(crate) struct Clinic {
     pub(crate) fleet: u32,
     pub(crate) port: u16,

@@ -5,10 +5,10 @@
 
 use cara_embassy::Security;
 use cara_nucleo::Board;
-use cara_nucleo::board::{Button, Device, Lamp, Watchdog};
+use cara_nucleo::board::{Button, Device, Led, Watchdog};
 use cara_settings::Settings;
 use cara_vehicle::provision::{Provision, halves};
-use cara_vehicle::{SOCKETS, Vehicle, VehicleResources, lamp, tasks};
+use cara_vehicle::{SOCKETS, Vehicle, VehicleResources, led, tasks};
 use defmt_rtt as _;
 use embassy_executor::{SpawnError, Spawner};
 use embassy_net::{Runner, StackResources};
@@ -21,14 +21,14 @@ async fn main(spawner: Spawner) {
     let known = Provision::read(first, second).and_then(|Provision { settings, proof }| {
         proof.begin(&mut board.lives, halves(board.seed)).map(|security| (settings, security))
     });
-    let Some((settings, security)) = known else { lamp::unprovisioned(async |on| board.lamp.set(on)).await };
+    let Some((settings, security)) = known else { led::unprovisioned(async |on| board.led.set(on)).await };
     defmt::unwrap!(spawn(
         spawner,
         settings,
         security,
         board.seed,
         board.device,
-        board.lamp,
+        board.led,
         board.button,
         board.watchdog
     ));
@@ -40,7 +40,7 @@ fn spawn(
     security: Security,
     seed: u64,
     device: Device,
-    lamp: Lamp,
+    led: Led,
     button: Button,
     watchdog: Watchdog,
 ) -> Result<(), SpawnError> {
@@ -56,7 +56,7 @@ fn spawn(
     spawner.spawn(tasks::unit(unit)?);
     spawner.spawn(tasks::drive(vehicle)?);
     spawner.spawn(call_mechanic(vehicle, button)?);
-    spawner.spawn(shine(vehicle, lamp)?);
+    spawner.spawn(shine(vehicle, led)?);
     watchdog.start();
     Ok(())
 }
@@ -72,6 +72,6 @@ async fn call_mechanic(vehicle: Vehicle, mut button: Button) -> ! {
 }
 
 #[embassy_executor::task]
-async fn shine(vehicle: Vehicle, mut lamp: Lamp) -> ! {
-    lamp::show(vehicle, async |on| lamp.set(on)).await
+async fn shine(vehicle: Vehicle, mut led: Led) -> ! {
+    led::show(vehicle, async |on| led.set(on)).await
 }

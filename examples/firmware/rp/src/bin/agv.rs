@@ -4,10 +4,10 @@
 #![no_main]
 
 use cara_rp::Board;
-use cara_rp::board::{Device, Lamp};
+use cara_rp::board::{Device, Led};
 use cara_rp::parts::Button;
 use cara_vehicle::provision::{Provision, halves};
-use cara_vehicle::{SOCKETS, Vehicle, VehicleResources, lamp, tasks};
+use cara_vehicle::{SOCKETS, Vehicle, VehicleResources, led, tasks};
 use defmt_rtt as _;
 use embassy_executor::{SpawnError, Spawner};
 use embassy_net::{Runner, StackResources};
@@ -21,15 +21,14 @@ async fn main(spawner: Spawner) {
 async fn run(spawner: Spawner) -> Result<(), SpawnError> {
     static SOCKETS_MEMORY: StaticCell<StackResources<SOCKETS>> = StaticCell::new();
     static RESOURCES: StaticCell<VehicleResources> = StaticCell::new();
-    let Board { pages: [first, second], mut lives, seed, lamp, button, watchdog, network } =
-        Board::start(spawner).await;
+    let Board { pages: [first, second], mut lives, seed, led, button, watchdog, network } = Board::start(spawner).await;
     let known = Provision::read(first, second).and_then(|Provision { settings, proof }| {
         proof.begin(&mut lives, halves(seed)).map(|security| (settings, security))
     });
     let Some((settings, security)) = known else {
-        spawner.spawn(flicker(lamp)?);
+        spawner.spawn(flicker(led)?);
         let (_, uplink) = network.start(spawner).await?;
-        uplink.only_lamp().await
+        uplink.only_led().await
     };
     let (device, uplink) = network.start(spawner).await?;
     let sockets = SOCKETS_MEMORY.init_with(StackResources::new);
@@ -43,7 +42,7 @@ async fn run(spawner: Spawner) -> Result<(), SpawnError> {
     spawner.spawn(tasks::unit(unit)?);
     spawner.spawn(tasks::drive(vehicle)?);
     spawner.spawn(call_mechanic(vehicle, button)?);
-    spawner.spawn(shine(vehicle, lamp)?);
+    spawner.spawn(shine(vehicle, led)?);
     watchdog.start();
     Ok(())
 }
@@ -59,11 +58,11 @@ async fn call_mechanic(vehicle: Vehicle, mut button: Button) -> ! {
 }
 
 #[embassy_executor::task]
-async fn shine(vehicle: Vehicle, mut lamp: Lamp) -> ! {
-    lamp::show(vehicle, async |on| lamp.set(on).await).await
+async fn shine(vehicle: Vehicle, mut led: Led) -> ! {
+    led::show(vehicle, async |on| led.set(on).await).await
 }
 
 #[embassy_executor::task]
-async fn flicker(mut lamp: Lamp) -> ! {
-    lamp::unprovisioned(async |on| lamp.set(on).await).await
+async fn flicker(mut led: Led) -> ! {
+    led::unprovisioned(async |on| led.set(on).await).await
 }

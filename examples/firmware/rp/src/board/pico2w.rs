@@ -1,5 +1,5 @@
 //! The devices of a Raspberry Pi Pico 2 W, taken and started. The radio has the board's LED on one of its own pins, so
-//! that the lamp goes on only once the radio runs.
+//! that the LED goes on only once the radio runs.
 
 use cara_settings::{Settings, Wifi};
 use cyw43::{A4, Aligned, Control, JoinOptions, NetDriver, PowerManagementMode, Runner, SpiBus, State};
@@ -40,19 +40,19 @@ const LOOKED_AT: Duration = Duration::from_secs(2);
 /// How long an access point may take to let the board in.
 const JOINS: Duration = Duration::from_secs(15);
 
-/// How the lamp should be.
+/// The wanted state of the LED.
 static LIGHT: Signal<CriticalSectionRawMutex, bool> = Signal::new();
 
 /// The board.
 pub struct Board {
-    /// The pages of flash that tell who it is.
+    /// The pages of flash that hold its settings.
     pub pages: [&'static [u8]; 2],
     /// Counts its lives.
     pub lives: Lives,
     /// A number that differs from boot to boot, from the jitter of the ring oscillator.
     pub seed: u64,
     /// The LED on the board, which the radio switches.
-    pub lamp: Lamp,
+    pub led: Led,
     /// GP14 to ground.
     pub button: Button,
     /// Not yet running.
@@ -85,7 +85,7 @@ impl Board {
             pages: settings::pages(),
             lives: settings::lives(Flash::new_blocking(chip.FLASH)),
             seed: RoscRng.next_u64(),
-            lamp: Lamp(()),
+            led: Led(()),
             button: Button(Input::new(chip.PIN_14, Pull::Up)),
             watchdog: Watchdog(watchdog),
             network: Network { device, control },
@@ -122,7 +122,7 @@ impl Network {
 pub struct Uplink(Control<'static>);
 
 impl Uplink {
-    /// Starts the task that joins the access point of the settings, again whenever it is lost, and switches the lamp.
+    /// Starts the task that joins the access point of the settings, again whenever it is lost, and switches the LED.
     pub fn keep(self, spawner: Spawner, stack: Stack<'static>, settings: Option<&Settings>) -> Result<(), SpawnError> {
         let wifi = settings.and_then(|settings| settings.wifi.clone());
         if wifi.is_none() {
@@ -132,8 +132,8 @@ impl Uplink {
         Ok(())
     }
 
-    /// Switches the lamp of a board that stays without network, for ever.
-    pub async fn only_lamp(mut self) -> ! {
+    /// Switches the LED of a board that stays without network, for ever.
+    pub async fn only_led(mut self) -> ! {
         loop {
             self.0.gpio_set(LED, LIGHT.wait().await).await;
         }
@@ -170,10 +170,10 @@ async fn join(control: &mut Control<'static>, wifi: &Wifi, stack: Stack<'static>
     }
 }
 
-/// The lamp, which only the radio's task can switch.
-pub struct Lamp(());
+/// The LED, which only the radio's task can switch.
+pub struct Led(());
 
-impl Lamp {
+impl Led {
     /// Switches it.
     pub async fn set(&mut self, on: bool) {
         LIGHT.signal(on);

@@ -34,14 +34,14 @@ const ABSENT: Duration = Duration::from_secs(2);
 
 /// The board.
 pub struct Board {
-    /// The pages of flash that tell who it is.
+    /// The pages of flash that hold its settings.
     pub pages: [&'static [u8]; 2],
     /// Counts its lives.
     pub lives: Lives,
     /// A number that differs from boot to boot, from the jitter of the ring oscillator.
     pub seed: u64,
     /// GP25, the LED on the board.
-    pub lamp: Lamp,
+    pub led: Led,
     /// GP14 to ground.
     pub button: Button,
     /// Not yet running.
@@ -88,7 +88,7 @@ impl Board {
             pages: settings::pages(),
             lives: settings::lives(flash),
             seed: RoscRng.next_u64(),
-            lamp: Lamp(Output::new(chip.PIN_25, Level::Low)),
+            led: Led(Output::new(chip.PIN_25, Level::Low)),
             button: Button(Input::new(chip.PIN_14, Pull::Up)),
             watchdog: Watchdog(watchdog),
             network: Network { bus, interrupt, reset, address },
@@ -125,7 +125,7 @@ impl Uplink {
     }
 
     /// Nothing to do.
-    pub async fn only_lamp(self) -> ! {
+    pub async fn only_led(self) -> ! {
         core::future::pending().await
     }
 }
@@ -155,10 +155,10 @@ fn hardware_address() -> [u8; 6] {
     cara_vehicle::hardware_address(&number.to_le_bytes())
 }
 
-/// A lamp.
-pub struct Lamp(Output<'static>);
+/// An LED.
+pub struct Led(Output<'static>);
 
-impl Lamp {
+impl Led {
     /// Switches it.
     pub async fn set(&mut self, on: bool) {
         self.0.set_level(Level::from(on));

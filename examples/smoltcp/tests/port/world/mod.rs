@@ -17,7 +17,7 @@ use vehicle::Vehicle;
 /// What a poll costs in virtual time, so that one that is due again at once does not stop the clock.
 const POLL: Duration = Duration::from_micros(1);
 
-/// The switch, shared by those who are connected to it.
+/// The switch, shared by the nodes that are connected to it.
 pub(crate) type SharedSwitch = Rc<RefCell<Switch>>;
 
 /// The network device of one node: a cable to the switch.
@@ -125,7 +125,7 @@ impl World {
         self.run_until(span, |_| false);
     }
 
-    /// Polls who is due; returns when somebody is next.
+    /// Polls the nodes that are due; returns when the next one is.
     fn step(&mut self) -> Instant {
         let now = self.now;
         for vehicle in self.vehicles.iter_mut().filter(|vehicle| vehicle.next() <= now) {
@@ -144,7 +144,7 @@ impl World {
             && self.manager.as_ref().is_some_and(|manager| manager.joined() == count)
     }
 
-    /// Runs until everybody has joined and read each other's functions.
+    /// Runs until all nodes have joined and know each other's functions.
     pub(crate) fn join(&mut self) {
         let seed = self.seed;
         assert!(self.run_until(Duration::from_secs(60), Self::all_joined), "nobody joined, seed {seed}");
@@ -155,13 +155,13 @@ impl World {
         self.manager.as_mut().expect("it is there")
     }
 
-    /// The manager is switched off, and on again later: another life of it.
+    /// Switches the manager off; it is switched on later, as another boot.
     pub(crate) fn power_cut(&mut self) -> Cable {
         self.manager.take().expect("it is there").cable
     }
 
     pub(crate) fn power_on(&mut self, cable: Cable, seed: u64) {
-        // What has arrived meanwhile was heard by nobody.
+        // Discards what arrived while it was off.
         while self.switch.borrow_mut().receive(self.now, cable.port).is_some() {}
         self.manager = Some(Manager::new(self.now, cable, manager::HOST, seed));
     }

@@ -1,4 +1,4 @@
-//! `cara scan`: who is there, and who was refused and why.
+//! `cara scan`: the nodes on the network, and the ones that were refused and why.
 
 mod survey;
 
@@ -19,10 +19,10 @@ use crate::units::{parse_time, show_bytes, show_micros};
 /// Nodes that a line lists.
 const LISTED: usize = 8;
 
-/// Shows who is there: name, ID, role, address, version and limits; and who was refused, with the reason.
+/// Shows the nodes on the network: name, ID, role, address, version and limits; and refused ones, with the reason.
 ///
-/// Through the m_unit that runs on this host: the nodes that it knows. With --as: those that join. Without either, a survey
-/// of the network: whoever answers.
+/// Through the m_unit that runs on this host: the nodes that it knows. With --as: those that join. Without either, a
+/// survey of the network: all that answer.
 #[derive(clap::Args)]
 pub(crate) struct Arguments {
     /// Only nodes that offer this function.

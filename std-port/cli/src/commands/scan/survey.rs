@@ -1,4 +1,4 @@
-//! A look at the network without a unit: whoever says something there.
+//! A survey of the network without a unit: every node that is heard.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -69,7 +69,7 @@ fn about_keys(survey: &Survey, heard: &[&Heard], asked: &[Fleet], global: &Globa
              a generation that is over, or somebody speaks in their name",
         )?;
     }
-    // Whoever wants plain mode needs none.
+    // Plain mode needs no keys.
     if global.insecure {
         return Ok(());
     }

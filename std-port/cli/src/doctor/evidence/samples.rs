@@ -14,7 +14,7 @@ use crate::doctor::running::{Counted, Running};
 
 pub(crate) const FLEET: Fleet = Fleet(7);
 
-/// Listened long enough, nobody heard.
+/// Listened long enough, and no node was heard.
 pub(crate) fn evidence() -> Evidence {
     Evidence {
         which: None,

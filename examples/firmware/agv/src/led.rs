@@ -1,13 +1,13 @@
-//! What a board's one lamp tells.
+//! Status LED of a board.
 
 use embassy_time::{Duration, Ticker};
 
 use crate::{DRIVING, Vehicle, now};
 
-/// What it tells.
+/// What it shows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Sign {
-    /// The board does not know who it is, or has no keys to prove it: it flickers, five times a second.
+    /// The board has no settings, or no keys: it flickers, five times a second.
     Unprovisioned,
     /// It looks for its manager: it blinks once a second, on for half of it.
     Looking,
@@ -29,7 +29,7 @@ impl Sign {
         }
     }
 
-    /// Whether the lamp is on in this tick; there are ten in a second.
+    /// Whether the LED is on in this tick; there are ten in a second.
     pub const fn is_on(self, tick: u32) -> bool {
         match self {
             Self::Unprovisioned => tick.is_multiple_of(2),
@@ -40,12 +40,12 @@ impl Sign {
     }
 }
 
-/// Shows how the vehicle is, for ever.
+/// Shows the state of the vehicle, for ever.
 pub async fn show(vehicle: Vehicle, set: impl AsyncFnMut(bool)) -> ! {
     shine(|| Sign::of(&vehicle), set).await
 }
 
-/// Shows that the board does not know who it is or cannot prove it, for ever.
+/// Shows [`Sign::Unprovisioned`], for ever.
 pub async fn unprovisioned(set: impl AsyncFnMut(bool)) -> ! {
     shine(|| Sign::Unprovisioned, set).await
 }
