@@ -1,8 +1,8 @@
-//! The hand-over of a link's lead, in every order in which threads can run it.
+//! The hand-over of a link's reader, in every order in which threads can run it.
 //!
-//! `Reader` and `Watch` are the port's own; around them stand the few steps of `calling.rs`, `keeping.rs`, `workers.rs`,
-//! `staying.rs` and `threads.rs` that they are used in, with a queue in the place of the socket and no time-outs: a wake-up that is lost blocks for ever, and the
-//! model reports that. With `--cfg cara_planted="lost_wakeup"` it must fail.
+//! `Reader` and `Watch` are the port's own. Around them stand the few steps of `calling.rs`, `keeping.rs`,
+//! `workers.rs`, `staying.rs` and `threads.rs` that use them, with a queue in place of the socket and no time-outs: a
+//! lost wake-up blocks for ever, and the model reports that. With `--cfg cara_planted="lost_wakeup"` it must fail.
 //!
 //! ```text
 //! cargo test -p cara-std --test hand_over
@@ -94,7 +94,8 @@ struct Link {
     together: usize,
     /// Callers expect to be back at once, and the clock looks after what they keep.
     keeps: bool,
-    /// Somebody reads; not part of the model, it adds no orders.
+    /// A thread reads the stream. A check of the model itself, with an atomic that loom does not see: it adds no
+    /// orders.
     reading: AtomicBool,
 }
 
@@ -122,7 +123,7 @@ impl Link {
         self.state.lock().unwrap()
     }
 
-    /// `Engine::settle`: the epoll set follows who reads. Somebody always does, or was told to.
+    /// `Engine::settle`: the epoll set follows the reader. There always is one, or a thread that was told to become it.
     fn settle(&self, state: MutexGuard<'_, State>) {
         self.set_interest(&state);
     }
@@ -172,7 +173,7 @@ impl Link {
         }
     }
 
-    /// `Engine::feed`: notes a reply and wakes who waits for it.
+    /// `Engine::feed`: records a reply and wakes its waiter.
     fn feed(&self, state: &mut State, item: Item) {
         let Item::Reply(id) = item else {
             state.called += 1;
@@ -421,7 +422,7 @@ fn the_lead_goes_on_from_caller_to_caller() {
     });
 }
 
-/// When the last caller has left, the pool reads what nobody leads for.
+/// Once the last caller has left, the pool reads.
 #[test]
 fn a_future_gets_its_reply_from_a_leader_or_from_the_pool() {
     check(3, || {
@@ -483,7 +484,7 @@ fn a_link_that_is_kept_comes_back_to_the_pool() {
     });
 }
 
-/// Two callers of whom each would keep the link: the other one gets the lead, or takes it.
+/// Two callers that would each keep the link: the second one is handed the lead, or takes it.
 #[test]
 fn a_link_that_is_kept_is_led_by_whoever_comes() {
     check(2, || {
@@ -497,7 +498,7 @@ fn a_link_that_is_kept_is_led_by_whoever_comes() {
     });
 }
 
-/// A future needs somebody who reads: nobody keeps the link while one waits, or it is given up.
+/// A future does not read, so a link on which one waits is not kept, or is given up to the pool.
 #[test]
 fn a_future_on_a_link_that_was_kept_gets_its_reply() {
     check(3, || {
@@ -540,7 +541,7 @@ fn a_caller_and_a_thread_that_stays_share_a_link() {
     });
 }
 
-/// What happens while the clock looks is seen by it, or tells it to look again.
+/// An event while the clock looks is seen by it, or tells it to look again.
 #[test]
 fn nothing_happens_behind_the_back_of_the_clock() {
     loom::model(|| {
@@ -554,7 +555,7 @@ fn nothing_happens_behind_the_back_of_the_clock() {
     });
 }
 
-/// The pool, without links: threads that run handlers though nobody waits, and the clock that stands in for them.
+/// The pool, without links: threads that run handlers without a relief, and the clock that relieves them.
 #[derive(Default)]
 struct Pool {
     calls: Mutex<VecDeque<Handler>>,
@@ -628,7 +629,7 @@ impl Pool {
     }
 }
 
-/// All threads are inside handlers that wait for a call which nobody has read: the clock starts one that reads it.
+/// All threads are inside handlers that wait for a call that is still unread: the clock starts a thread that reads it.
 #[test]
 fn the_clock_helps_when_all_threads_are_inside_handlers() {
     check(3, || {

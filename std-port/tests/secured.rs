@@ -1,4 +1,4 @@
-//! Units with keys, over real sockets on loopback: who has the key of the pair gets in, and nobody else.
+//! Units with keys, over real sockets on loopback: only a peer with the pair's key gets in.
 
 use std::hash::{BuildHasher, Hasher, RandomState};
 use std::path::Path;
@@ -231,7 +231,7 @@ fn plain_and_secured_units_do_not_meet_even_on_one_port() {
     }
 }
 
-/// Adding a vehicle restarts nothing, and who is revoked is gone.
+/// Adding a vehicle restarts nothing, and a revoked one is disconnected.
 #[test]
 fn a_running_manager_follows_its_key_file() {
     let fleet = fleet();

@@ -237,7 +237,7 @@ fn a_watch_sees_what_happens() {
     assert!(watching.ask(&Question::Unit).is_err() || watching.ask(&Question::Unit).is_err());
 }
 
-/// Who reads events more slowly than they come is told how many it has missed.
+/// A client that reads events more slowly than they come gets the number that it missed.
 #[test]
 fn a_slow_watch_loses_events_and_is_told_how_many() {
     let (depot, _agv) = Depot::with_agv();

@@ -126,13 +126,13 @@ fn half_a_line_is_no_question_and_costs_nothing() {
         raw.write(b"{\"ask\":\"sea");
         drop(raw);
     }
-    // The threads of those that are gone leave their places.
+    // The threads of closed connections free their slots.
     until("there is room", || Client::connect(&depot.path()).is_ok());
     let mut raw = Raw::new(&depot);
     raw.write(b"{\"ask\":\"sea");
     raw.write(b"rch\"}\n");
     assert_eq!(raw.read(), Answer::Done);
-    // Whoever asks nothing more still gets what it has asked.
+    // A client that has closed its sending direction still gets its answers.
     raw.write(b"{\"ask\":\"unit\"}\n{\"ask\":\"sea");
     raw.stream.shutdown(std::net::Shutdown::Write).unwrap();
     assert!(matches!(raw.read(), Answer::Unit(_)));
@@ -228,7 +228,8 @@ fn a_unit_that_hangs_holds_up_no_question_to_another() {
     let (found, of_another) = took(Some("other/9"));
     let (_, of_all) = took(None);
     assert_eq!(found.as_deref(), Some("other/9"));
-    // One time-out for all that hang, and none for who does not ask them: on any machine the longer one waits for it.
+    // One time-out for all hanging units together, and none for a question to another unit. Comparing the two does not
+    // depend on the speed of the machine.
     assert!(of_all >= Duration::from_secs(2) && of_another < of_all, "{of_another:?}, {of_all:?}");
     let units = running_in(directory).unwrap();
     assert_eq!(units.iter().filter(|unit| unit.state == UnitState::Silent).count(), 3);
@@ -316,7 +317,7 @@ fn a_client_finds_the_unit_that_runs_or_says_which_there_are() {
         system
     };
     let (_second, _third) = (beside("manager", 2, "b.sock"), beside("other", 3, "c.sock"));
-    // What nobody answers on is not there.
+    // A socket on which no process listens is not listed.
     drop(UnixListener::bind(directory.join("stale.sock")).unwrap());
     let units: Vec<_> = running_in(directory).unwrap().into_iter().map(|unit| unit.unit).collect();
     assert_eq!(units, ["manager/2", "other/3", "manager/1"]);

@@ -1,4 +1,4 @@
-//! Who may do what: tables that are set, and files that change while the unit runs.
+//! Access control: tables that are set, and files that change while the unit runs.
 
 use std::fs;
 use std::path::Path;

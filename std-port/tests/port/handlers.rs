@@ -120,7 +120,8 @@ fn a_slow_handler_delays_nobody_else() {
     });
 }
 
-/// Handlers that have been quick are run by threads that nobody stands in for; the clock starts one when all are inside.
+/// Handlers that have been quick run on threads without a relief; the clock starts a thread when all are inside
+/// handlers.
 #[test]
 fn quick_handlers_that_all_get_slow_leave_a_thread_that_reads() {
     const CALLERS: u32 = 5;

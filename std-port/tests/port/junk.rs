@@ -77,7 +77,7 @@ fn junk_on_every_port_changes_nothing() {
     }
     assert!(counter(&peer.counters(), "CallsTimedOut") == 0 && peer.is_connected());
     assert_eq!(manager.s_units().len(), 1);
-    // Who says nothing is shown out.
+    // Silent connections are closed.
     for mut stream in half_open {
         stream.set_read_timeout(Some(PATIENCE)).unwrap();
         let mut rest = Vec::new();
@@ -89,7 +89,7 @@ fn junk_on_every_port_changes_nothing() {
     assert_eq!(ask(&peer, "echo", 5), Ok(5));
 }
 
-/// More half-open connections than there is room for: those that hold a link keep it, and units still come.
+/// More half-open connections than the capacity: established links stay, and units still join.
 #[test]
 fn half_open_connections_do_not_keep_units_out_for_ever() {
     let fleet = fleet();
@@ -108,7 +108,7 @@ fn half_open_connections_do_not_keep_units_out_for_ever() {
     drop(silent);
 }
 
-/// A host that opens one connection after the other shuts out its own, and not that of another host that is slow.
+/// A host that opens many connections displaces its own, not that of another, slower host.
 #[test]
 fn half_open_connections_of_one_host_give_way_to_each_other_first() {
     let fleet = fleet();
@@ -117,7 +117,7 @@ fn half_open_connections_of_one_host_give_way_to_each_other_first() {
     let first = unit("first", 1, fleet).build_unit().unwrap();
     meet(&manager, &first);
     let port = stream_port(&first);
-    // Nobody may say nothing for longer than 2 s, so a machine that is slower than that tries again.
+    // A silent connection is closed after 2 s, so a machine that is slower than that tries again.
     let was_in_time = (0..20).any(|_| {
         let began = Instant::now();
         let slow = connection_from(Ipv4Addr::LOCALHOST, port);

@@ -1,4 +1,4 @@
-//! Leases over real sockets: what was started stops when nobody wants it any more.
+//! Leases over real sockets: without renewals, what a call started is stopped.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};

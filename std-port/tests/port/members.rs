@@ -1,4 +1,4 @@
-//! Who meets whom, who is refused, and who takes whose place.
+//! Membership: which units join, which are refused, and which replace another one.
 
 use std::io::{Read, Write};
 use std::net::{Ipv4Addr, Shutdown, SocketAddr, TcpListener, TcpStream};

@@ -92,7 +92,7 @@ fn as_child() {
             agv.publish_my_function_list().unwrap();
             agv.start().unwrap();
             until_input_ends();
-            // Its handlers may hang: nobody waits for them.
+            // Its handlers may hang: exit without joining their threads.
             std::process::exit(0);
         }
         _ => {

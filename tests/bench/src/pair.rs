@@ -19,7 +19,7 @@ const UNDER_WAY: Duration = Duration::from_millis(20);
 /// A message that was neither executed nor reported for so long is lost. Longer than a request may take.
 const QUIET: Duration = Duration::from_secs(4);
 
-/// Where and among whom a pair is measured.
+/// Where a pair is measured, and beside which others.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Setting {
     pub(crate) pin: Pin,

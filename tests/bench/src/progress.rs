@@ -1,4 +1,4 @@
-//! How far the run is, and whether somebody wants it to end.
+//! Progress of the run, and whether it was interrupted.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, PoisonError};

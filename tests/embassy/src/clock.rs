@@ -59,7 +59,7 @@ pub(crate) fn pass(span: Duration) {
     NOW.set(NOW.get() + span.as_micros());
 }
 
-/// Wakes who waits for a time that has come.
+/// Wakes the timers that are due.
 pub(crate) fn wake_due() {
     while let Some(waker) = TIMERS.with_borrow_mut(|timers| {
         let first = timers.first_entry()?;

@@ -21,7 +21,7 @@ pub(crate) struct Plug {
     pub(crate) port: PortId,
     pub(crate) mac: Mac,
     pub(crate) gate: Rc<RefCell<Gate>>,
-    /// Who is told when a frame has come or the cable was moved.
+    /// The waker for an arrived frame or a moved cable.
     pub(crate) listener: Rc<RefCell<Option<Waker>>>,
 }
 
@@ -37,7 +37,7 @@ impl Plug {
         }
     }
 
-    /// When the next frame comes, unless nobody has looked for the one before.
+    /// When the next frame arrives; `None` while the stack has not polled for the one before.
     pub(crate) fn next_arrival(&self) -> Option<Instant> {
         self.listener.borrow().as_ref()?;
         let held = self.gate.borrow().next();

@@ -1,5 +1,5 @@
-//! What a board does not hear, or hears late, of single other boards; the faults of the switch are those of a whole
-//! port.
+//! Faults between single boards: a board does not receive the frames of one other board, or receives them late. The
+//! faults of the switch apply to a whole port.
 
 use std::collections::BTreeMap;
 
@@ -9,7 +9,7 @@ use cara_ethernet::Mac;
 use cara_sim::Path;
 use smoltcp::wire::{EthernetFrame, EthernetProtocol, IpAddress, IpProtocol, Ipv4Packet, TcpPacket};
 
-/// Where a frame says who sent it.
+/// The source address in a frame.
 const SOURCE: std::ops::Range<usize> = 6..12;
 /// Both addresses and ports of a TCP segment in a frame.
 const FLOW: std::ops::Range<usize> = 26..38;

@@ -1,4 +1,4 @@
-//! What units on boards prove who they are with.
+//! Keys of units on boards.
 
 use cara_core::config::Mode;
 use cara_core::distribution::identity::{Fleet, Identity};

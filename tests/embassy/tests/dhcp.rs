@@ -13,7 +13,7 @@ use smoltcp::wire::{DhcpMessageType, DhcpPacket, DhcpRepr};
 
 const LONG: Duration = Duration::from_secs(60);
 
-/// Gives whoever asks the address of the cell.
+/// Leases the address in the cell to every client.
 fn serve(board: &Board, given: Rc<Cell<Ipv4Addr>>) {
     let (stack, own) = (board.stack(), board.address());
     board.spawn(async move {

@@ -20,7 +20,7 @@ use smoltcp::phy::{Device, Medium, RxToken as _, TunTapInterface, TxToken as _};
 
 /// Long enough for the slowest machine; nothing here is timed.
 const LONG: Duration = Duration::from_secs(60);
-/// How often the board's tasks are polled: a TAP device wakes nobody.
+/// How often the board's tasks are polled: a TAP device has no waker.
 const PAUSE: Duration = Duration::from_micros(300);
 /// Two addresses, a type and 1,500 bytes.
 const FRAME: usize = 1_514;

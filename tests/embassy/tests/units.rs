@@ -129,7 +129,7 @@ fn a_board_serves_its_manager_and_asks_it() {
     assert_eq!(list, "double(n: int) -> (n: int)\n");
 }
 
-/// Whom the tables of a board let call what.
+/// The access table of a board.
 const DOUBLERS: [Rule; 1] = [Rule::new(Who::node("manager", 1), Functions::Named(&["double"]), Verbs::CALL)];
 const OTHERS: [Rule; 1] = [Rule::new(Who::node("manager", 2), Functions::All, Verbs::CALL)];
 
@@ -557,7 +557,7 @@ fn keys_are_made_anew_while_calls_go_on() {
     assert_eq!([refused(manager), refused(agv)], [0, 0]);
 }
 
-/// Units that were told so in words, and those with keys of another fleet: each meets its like and nobody else.
+/// Units with an explicit opt-in to plain mode, and units with keys of another fleet: each meets only its like.
 #[test]
 fn an_insecure_unit_meets_insecure_units_only() {
     let bench = Bench::new(12);

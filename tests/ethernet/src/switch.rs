@@ -1,4 +1,4 @@
-//! The switch: who gets a frame, when, and what happens to it on the way.
+//! The switch: which ports get a frame, when, and with which faults.
 
 use std::fmt;
 
@@ -68,7 +68,7 @@ impl Switch {
         PortId(self.ports.len() - 1)
     }
 
-    /// What happens to frames from now on, whoever sends them.
+    /// Sets the faults of all frames from now on.
     pub fn set_faults(&mut self, faults: Faults) {
         self.faults = faults;
         self.ports.iter_mut().for_each(|port| port.faults = faults);

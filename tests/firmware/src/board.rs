@@ -19,7 +19,7 @@ use crate::trace::Trace;
 
 /// Long enough for the slowest machine.
 pub(crate) const LONG: Duration = Duration::from_secs(60);
-/// The fleet of all units here; nobody else is in this network.
+/// The fleet of all units here; the network has no other units.
 pub(crate) const FLEET: u32 = 4711;
 /// The manager's address.
 const MANAGER: &str = "10.77.0.1/24";

@@ -1,9 +1,9 @@
-//! How many instructions a board executes for a request, from the wake-up by its first frame until it sleeps again behind
-//! its last one, the acknowledgement of the reply included; and whose instructions they are.
+//! How many instructions a board executes for a request, from the wake-up by its first frame until it sleeps again
+//! after its last one, including the acknowledgement of the reply; and which code they belong to.
 //!
-//! Each request stands alone: the next one follows when the connection has come to rest. Wake-ups by timers are left
-//! out. Given is what one of eight requests does not exceed: what a frame of somebody else or a timer adds to the
-//! others is left out.
+//! Each request is measured alone: the next one follows when the connection is idle. Wake-ups by timers are left out.
+//! The figure is the bound that one in eight requests does not exceed: frames of other hosts and timers only add to the
+//! rest.
 
 use std::collections::BTreeMap;
 use std::io::{Read, Write};
@@ -149,7 +149,7 @@ fn functions(places: &Places, executed: &[(u32, Owner)]) {
     let mut last = String::new();
     for (address, _) in executed.iter().filter(|(_, owner)| *owner == Owner::Cara) {
         let place = places.place(*address);
-        // Copying and comparing count for whoever asked for it, and are named.
+        // Copying and comparing count for their caller, and are named.
         if place.owner.is_some() {
             last.clone_from(&place.function);
         }

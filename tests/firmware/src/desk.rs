@@ -126,7 +126,7 @@ impl Cara {
             }
             Some(words) => words,
         };
-        // Somebody types it as in any shell.
+        // The leading `cara` of a shell is accepted.
         let words = words.strip_prefix(["cara".to_owned()].as_slice()).unwrap_or(&words);
         if words.is_empty() {
             return Ok(());
@@ -160,7 +160,7 @@ const TYPED: [(&str, &str); 7] = [
     ("call 'agv-17", "a quote is open"),
 ];
 
-/// The desk, with what somebody might type piped into it.
+/// The emulator session, with commands piped into it.
 pub(crate) fn test(image: &Path, cara: Option<&Path>) -> Result<String> {
     let program = std::env::current_exe()?;
     let mut desk = Process::start("the desk", &program, arguments(image, cara))?;

@@ -17,10 +17,10 @@ use tempfile::TempDir;
 use crate::board::{FLEET, Who};
 use crate::signals::remove_at_end;
 
-/// The manager of all boards, unless somebody says another.
+/// The manager of all boards by default.
 pub(crate) const MANAGER: &str = "depot/1";
 
-/// What a manager and its boards prove who they are with.
+/// Keys of a manager and its boards.
 pub(crate) struct Keys {
     cara: PathBuf,
     /// The keys, and what boards have been told. It goes when this does.
@@ -36,12 +36,12 @@ enum Kind {
     Drawn,
     /// Everybody has been told in words to be insecure.
     Insecure,
-    /// Boards are told who they are, and get no keys.
+    /// Boards get settings and no keys.
     Missing,
 }
 
 impl Keys {
-    /// Draws keys for a manager and its vehicles, each as NAME/ID. Nobody else's keys fit them.
+    /// Draws keys for a manager and its vehicles, each as NAME/ID. They match no others.
     pub(crate) fn draw(cara: Option<&Path>, fleet: u32, manager: &str, vehicles: &[&str]) -> Result<Rc<Self>> {
         let keys = Self::new(cara, Kind::Drawn)?;
         let (fleet, manager) = (fleet.to_string(), format!("{manager}@m_unit"));

@@ -124,7 +124,7 @@ pub(crate) fn patiently(mut ask: impl FnMut() -> Result<(), Error>) -> Result<()
     }
 }
 
-/// Sends a vehicle to a place; `false` where this machine was too busy for that, and nobody wants it there any more.
+/// Sends a vehicle to a place; `false` if this machine was too busy for that and the lease has ended.
 pub(crate) fn sends(peer: &Peer, position: [i64; 2]) -> Result<bool> {
     match peer.block_request("go_to", &mut at(position)?) {
         Err(Error::TimedOut | Error::Expired | Error::Busy) => {

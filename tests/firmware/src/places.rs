@@ -1,5 +1,5 @@
-//! Whose code an instruction is, read from the debug information of an image: through everything that was inlined, the
-//! innermost function that belongs to somebody.
+//! The owner of an instruction, from the debug information of an image: of all functions inlined at that place, the
+//! innermost one that has an owner.
 
 use std::cell::RefCell;
 use std::collections::HashMap;
@@ -9,7 +9,7 @@ use std::rc::Rc;
 use addr2line::Loader;
 use anyhow::{Result, anyhow};
 
-/// Whose code it is.
+/// The owner of code.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Owner {
     /// The core, the port and the service.
@@ -20,8 +20,7 @@ pub(crate) enum Owner {
     Board,
 }
 
-/// Parts of the names of files, and whose they are. What is nobody's, such as the standard library, counts for its
-/// caller.
+/// Parts of file names and their owners. Code without an owner, such as the standard library, counts for its caller.
 const OWNERS: [(&str, Owner); 11] = [
     ("smoltcp-", Owner::Network),
     ("embassy-net-", Owner::Network),
@@ -39,7 +38,7 @@ const OWNERS: [(&str, Owner); 11] = [
 /// One instruction's.
 #[derive(Clone, Debug)]
 pub(crate) struct Place {
-    /// `None` for code that is nobody's and was not inlined, such as `memcpy`: it is its caller's.
+    /// `None` for code without an owner that was not inlined, such as `memcpy`: it counts for its caller.
     pub(crate) owner: Option<Owner>,
     /// The innermost function that has an owner, and the innermost of all.
     pub(crate) function: String,

@@ -28,7 +28,7 @@ const ATTEMPTS: usize = 24;
 /// Between the end of a link and the last that the board logs of it.
 const SETTLING: Duration = Duration::from_millis(150);
 
-/// What the board logs of somebody who proves nothing, and of a link that has ended.
+/// What the board logs of a peer without a proof, and of a link that has ended.
 const REFUSED: &str = "could not join";
 const LEFT: &str = "has left";
 
@@ -97,7 +97,7 @@ fn power(bench: &Bench, asked: &Receiver<(Seat, Sender<Powered>)>) {
     for (seat, answer) in asked {
         let who = Who { manager_address: Some(seat.place), ..Who::agv(17) };
         let board = bench.board(&seat.cable, &who);
-        // Who asked may have given up.
+        // The receiver may have given up.
         let _ = answer.send(board.map(|board| (seat, board)));
     }
 }
@@ -152,7 +152,7 @@ fn greeted(listener: &TcpListener) -> Result<TcpStream> {
     }
 }
 
-/// A board that loses its power when nobody asks about it any more.
+/// A board that is powered off when it is dropped.
 struct Guest<'b> {
     boards: &'b Boards,
     of: Option<(Seat, Board)>,

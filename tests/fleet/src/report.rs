@@ -20,7 +20,7 @@ const MANY: usize = 1_000;
 #[derive(Debug, Serialize)]
 pub(crate) struct Joining {
     pub(crate) all_ms: f64,
-    /// Who-has and announce together.
+    /// Searches and announces together.
     pub(crate) broadcasts: u64,
     /// Where it was sampled.
     pub(crate) most_in_a_second: Option<u64>,

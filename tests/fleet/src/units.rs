@@ -14,7 +14,7 @@ pub(crate) const MANAGER: (&str, u32) = ("depot", 1);
 /// Longest text that is sent there and back.
 pub(crate) const TEXT_BYTES: u32 = 20_000;
 
-/// Functions that every node offers as well, and nobody calls: a list of usual length.
+/// Further functions that every node offers and that are never called: a list of usual length.
 const FURTHER: [&str; 6] = ["go_to", "pos_info", "battery_state", "stop", "load", "unload"];
 
 struct Node {

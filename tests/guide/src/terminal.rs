@@ -16,7 +16,7 @@ use crate::expectation::{line_matches, matches};
 /// How long a command that stays may take until it has printed what the guide shows.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// What would lead to somebody's own keys.
+/// Variables that would lead to the user's own keys.
 const NOT_INHERITED: [&str; 2] = ["CARA_KEYS", "XDG_CONFIG_HOME"];
 
 /// What all terminals share: the checkout, and a home of their own that is empty.
@@ -30,7 +30,7 @@ impl Surroundings {
         Ok(Self { root: root.to_owned(), home: tempfile::tempdir()? })
     }
 
-    /// What differs from the environment of this program: nobody else's units are met, nothing is left behind, and what the
+    /// Differences from the environment of this program: no other units are met, nothing is left behind, and what the
     /// guide's programs have in common is built once and quickly.
     fn environment(&self) -> Vec<(&'static str, PathBuf)> {
         let before = PathBuf::from(std::env::var_os("HOME").unwrap_or_default());

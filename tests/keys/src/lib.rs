@@ -1,5 +1,5 @@
-//! Keys for the units of a test, drawn into a folder that goes with it: the units of its own process take their files from
-//! there, and those of others are told the folder in `CARA_KEYS`. No test looks at the keys of whoever runs it.
+//! Keys for the units of a test, drawn into a temporary folder: units of its own process take their files from there,
+//! and other processes get the folder in `CARA_KEYS`. No test reads the keys of the user that runs it.
 
 use std::path::{Path, PathBuf};
 
@@ -24,7 +24,7 @@ impl KeyFolder {
         Ok(drawn)
     }
 
-    /// Makes the keys of further nodes, and with them anew those of whom they talk to.
+    /// Makes the keys of further nodes, and updates those of their peers.
     pub fn add(&self, nodes: &[&str]) -> Result<()> {
         let mut store = loop {
             match Store::open(self.path(), self.fleet) {

@@ -1,4 +1,4 @@
-//! Distribution: parameters, functions, lists, who a node is.
+//! Distribution: parameters, functions, lists, identities.
 
 use cara_core::distribution::function::{Attributes, Definition, Signature};
 use cara_core::distribution::function_list::{Entry, FunctionList, TheirFunctionList};

@@ -1,5 +1,5 @@
-//! A network of one's own: the program runs itself again in a namespace, where it may do as it likes with interfaces,
-//! addresses and firewalls, and meets nobody. No interface is up there, loopback included. It ends with the process.
+//! A private network: the program runs itself again in a namespace, where it may change interfaces, addresses and
+//! firewalls freely, and meets no other host. No interface is up there, loopback included. It ends with the process.
 
 use std::ffi::OsStr;
 use std::io::Write;
@@ -72,7 +72,7 @@ fn again(needs: &[&str], tap: bool) -> Result<std::result::Result<Command, Strin
     Ok(Ok(again))
 }
 
-/// As root, and as a user who is root inside only.
+/// As root, and as a user that is root inside only.
 const KINDS: [&[&str]; 2] = [&["--net"], &["--user", "--map-root-user", "--net"]];
 
 fn unshare(kind: &[&str]) -> Command {

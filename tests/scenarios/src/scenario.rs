@@ -23,9 +23,9 @@ pub enum Need {
     AddressChange,
     /// A machine that sleeps.
     Suspend,
-    /// Somebody who connects and is no unit, or none of this version or fleet.
+    /// Clients that are no unit, or none of this version or fleet.
     Strangers,
-    /// One of them who has no key, and is taken, or told why it is not.
+    /// Such a client without a key, which is accepted or told why it is not.
     UnprovenStrangers,
     /// Connections that wait to be accepted, as many as come.
     Backlog,
@@ -37,7 +37,7 @@ pub enum Need {
     LongTime,
     /// Instants that do not depend on how busy the machine is.
     ExactTime,
-    /// The same random numbers in each life.
+    /// The same random numbers in each boot.
     SameSeed,
     /// A unit that goes on when a handler panics.
     Panics,

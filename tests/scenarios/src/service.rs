@@ -10,7 +10,7 @@ use cara_core::time::{Duration, Instant};
 
 /// What a service's body is told.
 pub struct Asked {
-    /// Who calls.
+    /// The caller.
     pub caller: Identity,
     /// When it runs, on the world's clock.
     pub at: Instant,

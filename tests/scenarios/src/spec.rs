@@ -96,7 +96,7 @@ impl Spec {
         self
     }
 
-    /// Who it is.
+    /// Its identity.
     pub(crate) fn identity(&self) -> Identity {
         let identity = match self.role {
             SpecRole::Manager => Identity::m_unit(&self.name, self.id),

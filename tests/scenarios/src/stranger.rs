@@ -1,4 +1,4 @@
-//! Whoever connects to a unit and is none, or behaves as none should: what it says, byte by byte, on any port.
+//! Clients that are no unit, or a misbehaving one: what they send, byte by byte, on any port.
 
 use cara_core::config::{Mode, PLAIN_MAGIC, Priority, VERSION};
 use cara_core::distribution::datagram::{SEARCH_BYTES, WhoHas};
@@ -14,10 +14,10 @@ const GARBAGE: usize = 24;
 /// The message that is broken off.
 const MESSAGE: usize = 900;
 
-/// Who comes.
+/// The kind of client.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Stranger {
-    /// Somebody who speaks another version of the protocol.
+    /// A unit of another version of the protocol.
     OtherVersion,
     /// An s_unit of another fleet that dials this manager all the same.
     OtherFleet,
@@ -25,11 +25,11 @@ pub enum Stranger {
     Garbage,
     /// An s_unit that joins, begins a message and closes in the middle of a chunk.
     ClosesInMidChunk,
-    /// So many connections on which nothing is said, held as long as the world is there.
+    /// So many silent connections, held as long as the world exists.
     Silent(usize),
 }
 
-/// What somebody does on one connection.
+/// The actions of a client on one connection.
 pub(crate) struct Visit {
     /// Said at once.
     pub(crate) says: Vec<u8>,

@@ -30,7 +30,7 @@ pub type Unit = Rc<dyn Node>;
 pub enum Port {
     /// Virtual network and time.
     Simulator,
-    /// The same with units that prove who they are and seal what they say.
+    /// The same with secured units.
     Secured,
     /// Sockets of this machine, over loopback.
     Linux,
@@ -70,7 +70,7 @@ pub enum Fault<'u> {
     Suspend(&'u Unit, Duration),
     /// What the first sends in streams is read at so many bytes a second by the second.
     SlowReader(&'u Unit, &'u Unit, usize),
-    /// Somebody comes to the manager who is no unit, or behaves as none should.
+    /// A client that is no unit, or a misbehaving one, connects to the manager.
     Stranger(&'u Unit, Stranger),
     /// The unit's only interface goes down.
     Unplug(&'u Unit),
@@ -93,7 +93,7 @@ pub enum Seen {
     ListChanged(Identity),
     /// An asynchronous request was not run, or failed.
     Failed(CallId, Error),
-    /// A service of the unit stopped because nobody renewed its lease.
+    /// A service of the unit stopped because its lease was not renewed.
     LeaseExpired(String),
     /// A lease that the unit held ended at the peer.
     LeaseEnded(String, LeaseEnd),
@@ -153,7 +153,7 @@ pub trait Node {
     fn stop(&self);
     /// Begins another life, with the services of its [`Spec`].
     fn start(&self);
-    /// Adds a service, which nobody sees before it is published.
+    /// Adds a service, which is invisible to peers before it is published.
     fn add_service(&self, service: &Service) -> Result<(), Error>;
     /// Puts a service in the place of the one of the same name.
     fn replace_service(&self, service: &Service) -> Result<(), Error>;

@@ -133,7 +133,7 @@ impl Attack {
     }
 
     /// Runs `what` while the attack's datagrams are broadcast `a_second` times a second, after they have been for
-    /// [`BEFORE`]; counts them in `sent`.
+    /// `BEFORE`; counts them in `sent`.
     pub fn beside<T>(&self, socket: &Datagrams, a_second: u64, sent: &AtomicU64, what: impl FnOnce() -> T) -> T {
         let over = AtomicBool::new(false);
         let pause = Duration::from_micros(1_000_000 / a_second);

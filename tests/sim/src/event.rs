@@ -46,7 +46,7 @@ pub enum NetEvent {
         host: HostId,
         /// Its end.
         stream: StreamId,
-        /// Nobody answered, rather than that the other host refused.
+        /// The dial timed out, rather than being refused by the other host.
         timed_out: bool,
     },
     /// Another host opened a stream to a listening port of this one.
@@ -57,7 +57,7 @@ pub enum NetEvent {
         port: u16,
         /// Its end of the new stream.
         stream: StreamId,
-        /// Who dialled.
+        /// The dialling end.
         from: SocketAddr,
     },
     /// Bytes can be read.

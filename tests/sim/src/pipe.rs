@@ -140,7 +140,7 @@ impl Pipe {
         self.transmitter = Transmitter::Idle;
     }
 
-    /// Frees the memory: nobody reads any more.
+    /// Frees the memory: the reader is gone.
     pub(crate) fn drop_all(&mut self) {
         *self = Self { end: End::Told, ..Self::new() };
     }

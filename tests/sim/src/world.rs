@@ -130,8 +130,7 @@ impl World {
         Self::of_mode(seed, Mode::Plain)
     }
 
-    /// The same with units that prove who they are and seal what they say. Units of one fleet have keys for each other,
-    /// unless they are told otherwise.
+    /// The same with secured units. Units of one fleet have keys for each other by default.
     pub fn secured(seed: u64) -> Self {
         Self::of_mode(seed, Mode::Secured)
     }

@@ -1,4 +1,4 @@
-//! A whole life of a link between two of the core's own sessions: what is written by whom, in order.
+//! A whole link between two of the core's own sessions: what each end writes, in order.
 
 use cara_core::config::Priority;
 use cara_core::distribution::function::Attributes;

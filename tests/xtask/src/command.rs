@@ -107,7 +107,7 @@ impl Run {
         Ok((output.status.success(), text(&output.stdout), text(&output.stderr)))
     }
 
-    /// The command as somebody would type it.
+    /// The command as typed in a shell.
     fn shown(&self) -> String {
         let program = Path::new(self.command.get_program());
         let program = program.file_name().unwrap_or(program.as_os_str());

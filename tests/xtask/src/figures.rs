@@ -39,8 +39,8 @@ impl Document {
         std::fs::write(self.path(), replaced).with_context(|| format!("cannot write {}", self.file))
     }
 
-    /// Fails when a figure has grown over what the document says, or is not in it. Another compiler makes other code,
-    /// for which nobody is to blame: then it warns.
+    /// Fails when a figure exceeds the document's, or is missing there. Another compiler makes other code, which is not
+    /// the change's fault: then it warns.
     pub(crate) fn check<R: Row>(&self, rows: &[R]) -> Result<()> {
         let text = self.read()?;
         let found = self.compared(rows, &rows_in(&text));

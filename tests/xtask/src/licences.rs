@@ -24,7 +24,7 @@ const ALLOWED: [&str; 12] = [
     "Zlib",
 ];
 
-/// Licences of what only tests use, unchanged, and nobody gets from us.
+/// Licences of crates that only tests use, unchanged and not distributed.
 const ALLOWED_IN_TESTS: [&str; 1] = ["MPL-2.0"];
 
 const REGISTRY: &str = "registry+https://github.com/rust-lang/crates.io-index";

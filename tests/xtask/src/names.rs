@@ -1,4 +1,4 @@
-//! Whoever knows the paper finds the Rust name: by the same word, or by a `#[doc(alias)]`.
+//! The paper's names lead to the Rust names: by the same word, or by a `#[doc(alias)]`.
 
 use std::path::Path;
 

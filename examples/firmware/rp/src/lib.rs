@@ -1,5 +1,5 @@
-//! What boards with Raspberry Pi's RP2040 or RP2350 need below embassy: network, button, LED, motors, watchdog, and the settings
-//! in their flash. What the vehicle does is in `cara_vehicle`.
+//! What boards with Raspberry Pi's RP2040 or RP2350 need below embassy: network, button, LED, motors, watchdog, and the
+//! settings in their flash. What the vehicle does is in `cara_vehicle`.
 //!
 //! [`Board`] is the same whatever the network: a W5500 on SPI, or the radio of a Pico 2 W.
 

@@ -22,7 +22,7 @@ const AT_A_TIME: usize = 8;
 pub struct Order {
     /// Length of the text.
     pub chars: u32,
-    /// Who call at the same time.
+    /// Concurrent callers.
     pub callers: u32,
     /// Calls of each that are timed.
     pub calls_per_caller: u32,

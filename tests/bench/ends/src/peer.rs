@@ -135,7 +135,7 @@ pub enum Delivery {
     BestEffort,
 }
 
-/// One who calls; used by one thread at a time.
+/// A caller; used by one thread at a time.
 pub trait Caller: Send {
     /// Sends `text` there and back, and makes a string of it at both ends; the length that came back in bytes.
     fn echo(&mut self, text: &str) -> Result<usize>;

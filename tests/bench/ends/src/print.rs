@@ -16,7 +16,7 @@ impl Printer {
             return;
         }
         let out = OUT.get_or_init(|| Mutex::new(LineWriter::new(stderr())));
-        // Whoever reads may have ended; the service goes on.
+        // The reader may have ended; the service goes on.
         let _ = writeln!(out.lock().unwrap_or_else(PoisonError::into_inner), "{text}");
     }
 }

@@ -1,6 +1,6 @@
 //! What the processes of a pair are asked: one line of JSON each way per question.
 //!
-//! A process ends when its standard input does, so none outlives who asks.
+//! A process ends when its standard input does, so none outlives its parent.
 
 use std::io::{Write, stdin, stdout};
 
@@ -43,7 +43,7 @@ pub enum ClientQuestion {
 /// What a process of a pair is told when it starts.
 #[derive(Debug, Clone, Args)]
 pub struct End {
-    /// Whom to play.
+    /// The role to play.
     #[arg(long)]
     pub peer: String,
     /// The CPU to stay on.

@@ -86,7 +86,8 @@ fn connect(group: &Group, pairs: &mut [Option<Pair>]) -> Result<()> {
     side_by_side(group.peers.iter().zip(pairs).collect(), group.peers.len(), connect).into_iter().collect()
 }
 
-/// Who missed a turn of this cell gets no further one, so that the turns of a cell are the first ones of the floor's.
+/// A contender that missed a turn of this cell gets no further one, so that its turns pair with the baseline's first
+/// ones.
 fn turn(
     contenders: &[Contender],
     pairs: &mut [Option<Pair>],

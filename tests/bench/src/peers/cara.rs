@@ -1,8 +1,8 @@
 //! CARA through its public API, discovery on: a passive m_unit that echoes and takes, a main m_unit that calls it,
 //! s_units that call beside it, and those of distribution 2. Both ends read the string as `&str`.
 //!
-//! Further callers are s_units, which have a link to the passive m_unit and to nobody else, and share threads. Each
-//! m_unit of a fleet connects with each other one: 64 would have 2,016 links among themselves.
+//! Further callers are s_units, which have a link to the passive m_unit only, and share threads. Every two m_units of a
+//! fleet connect: 64 would have 2,016 links among themselves.
 
 use std::path::Path;
 use std::process::{Child, Command, Stdio};

@@ -1,5 +1,6 @@
-//! The floor: blocking sockets and nothing else. A length-prefixed frame in one write and normally one read, no Nagle,
-//! a UTF-8 check and a string made at both ends. Whoever does less skips something that every middleware must do.
+//! The baseline: blocking sockets and nothing else. A length-prefixed frame in one write and normally one read, no
+//! Nagle, a UTF-8 check and a string made at both ends: less than this would skip something that every middleware must
+//! do.
 
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};

@@ -1,4 +1,5 @@
-//! Who is measured: our own peers, which this program plays itself, and other systems in programs of their own.
+//! The systems that are measured: our own peers, which this program plays itself, and other systems in programs of
+//! their own.
 
 pub(crate) mod cara;
 mod floor;

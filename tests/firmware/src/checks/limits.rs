@@ -28,7 +28,7 @@ pub(super) fn oversize(bench: &Bench, _: u32) -> Result<String> {
     Ok(format!("by the manager: {refused:?}; by the board: no mechanic"))
 }
 
-/// Where somebody who breaks the limits stands in for the manager.
+/// The address of a false manager that breaks the limits.
 const STRANGER: &str = "10.77.0.1:4000";
 /// A frame's header that announces the longest body there is.
 const TOO_LONG: [u8; 2] = u16::MAX.to_le_bytes();

@@ -75,7 +75,7 @@ pub(super) fn run(bench: &Bench, restarts: u32) -> Result<String> {
         reach(state, &manager, &board, &who).with_context(at)?;
         board.cut_power()?;
         if absence == Absence::Missed {
-            // Whoever has joined is known to be missed; of one that has not, nobody can tell.
+            // The manager detects the loss of a board that has joined; for one that has not, wait as long.
             if state >= State::Joined { manager.missed(&who).with_context(at)? } else { std::thread::sleep(MISSED) }
         }
         let board = bench.board(&cable, &who)?;

@@ -16,7 +16,7 @@ use cara_std::{CloseReason, UnitEvent};
 use crate::board::{Bench, LONG, Who};
 use crate::manager::{Manager, position};
 
-/// Where a manager listens that boards are told the address of, and where somebody listens in between.
+/// The ports of a manager whose address boards are given, and of a listener in between.
 const DIRECT_PORT: u16 = 4000;
 const DIRECT: &str = "10.77.0.1:4000";
 const BETWEEN: &str = "10.77.0.1:4001";
@@ -101,7 +101,7 @@ fn differ(lives: &[Said]) -> Result<()> {
     Ok(())
 }
 
-/// What a board says in each of its lives, heard by somebody between it and its manager.
+/// What a board sends in each boot, recorded between it and its manager.
 fn said(bench: &Bench, heard: &Receiver<Vec<u8>>) -> Result<Vec<Said>> {
     let cable = bench.cable()?;
     let manager = Manager::of(bench.keys.give(Manager::builder()?.tcp_port(DIRECT_PORT))?)?;

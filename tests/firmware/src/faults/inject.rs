@@ -293,7 +293,7 @@ impl Desk {
         Ok(())
     }
 
-    /// What the board has logged since, for whoever reads that something is wrong.
+    /// What the board has logged since, for an error message.
     pub(super) fn log(&self, line: usize) -> String {
         let number = |(at, said): (usize, String)| format!("\n    {:4} {said}", line + at + 1);
         self.board.lines(line).into_iter().enumerate().map(number).collect()

@@ -46,7 +46,7 @@ impl Peer for Zenoh {
         let echo = session.declare_queryable("echo").callback(|query| {
             let text = query.payload().and_then(|payload| payload.try_to_string().ok());
             let text = text.unwrap_or_default().into_owned();
-            // The one who asked may have gone.
+            // The client may be gone.
             let _ = query.reply(query.key_expr().clone(), text).wait();
         });
         let executed = Arc::new(Executed::default());

@@ -45,7 +45,7 @@ pub(super) struct LinuxWorld {
     start: std::time::Instant,
     fleet: u32,
     units: Vec<Arc<LinuxNode>>,
-    /// None where strangers come, who speak plain.
+    /// None for scenarios with unknown clients, which speak plain.
     keys: Option<Arc<Mutex<Keys>>>,
     /// AGVs dial through relays.
     relayed: bool,
@@ -135,7 +135,7 @@ impl LinuxWorld {
         for visit in stranger.visits(&unit.identity(), node.fleet) {
             let mut stream = TcpStream::connect(manager).expect("the manager listens");
             stream.set_read_timeout(Some(ANSWER)).expect("a span above zero");
-            // Who says what nobody understands may be shown out while it speaks.
+            // The unit may close the connection while garbage is still being written.
             let _ = stream.write_all(&visit.says);
             if visit.closes {
                 let _ = stream.read(&mut [0; 512]);

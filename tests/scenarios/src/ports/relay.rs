@@ -19,9 +19,9 @@ const KERNEL_BYTES: usize = 4 * 1024;
 /// Which way something goes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Way {
-    /// From the manager to who dialled.
+    /// From the manager to the dialling end.
     Down,
-    /// From who dialled to the manager.
+    /// From the dialling end to the manager.
     Up,
 }
 
@@ -96,7 +96,7 @@ impl Drop for Relay {
     fn drop(&mut self) {
         self.shared.over.store(true, Ordering::SeqCst);
         self.reset();
-        // Wakes who accepts.
+        // Wakes the accepting thread.
         drop(TcpStream::connect(self.address));
     }
 }

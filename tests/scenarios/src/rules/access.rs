@@ -1,4 +1,4 @@
-//! Who may do what.
+//! Access control.
 
 use cara_core::error::Error;
 use cara_core::services::access::{Functions, Rule, Verbs, Who};

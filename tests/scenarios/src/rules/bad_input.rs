@@ -232,7 +232,7 @@ fn a_peer_that_closes_in_mid_chunk_harms_nobody_else(world: &mut dyn World) {
     assert_eq!(manager.number_of_s_units(), 2);
 }
 
-/// Somebody opens connections and says nothing; a node comes meanwhile.
+/// A client opens connections and stays silent; a node joins meanwhile.
 fn a_thousand_silent_connections_keep_nobody_out(world: &mut dyn World) {
     // With room for fewer links than there are strangers.
     let manager = world.add(Spec::manager("manager", 1).limits(|limits| limits.maximum_nodes = 64));

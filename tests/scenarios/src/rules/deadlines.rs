@@ -26,7 +26,7 @@ fn a_time_out_frees_its_slot_and_the_late_reply_is_dropped(world: &mut dyn World
         let start = world.now();
         let asked = world.ask_with(&manager, "agv", "slow", &mut parameters, options);
         if asked == Ok(()) && !world.is_virtual() {
-            // This machine was so busy that nobody looked at the clock before the reply was there.
+            // This machine was so busy that the deadline was not checked before the reply was there.
             continue;
         }
         // The callee counts the way as age, so it may find a call too old a little before its caller does.

@@ -1,4 +1,4 @@
-//! Who connects to whom.
+//! Membership: which units connect.
 
 use cara_core::distribution::connection_handler::NodeCounter;
 use cara_core::error::{CloseReason, Refusal};

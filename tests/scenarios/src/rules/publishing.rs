@@ -1,4 +1,4 @@
-//! What is visible to whom.
+//! Which functions are visible to which peers.
 
 use cara_core::distribution::identity::Identity;
 use cara_core::error::Error;
@@ -75,7 +75,7 @@ fn publishing_waits_until_everybody_has_read(world: &mut dyn World) {
     manager.add_service(&Service::new("late()")).expect("there is room");
     let told = manager.begin_publish();
     let missing = world.finish(&told).expect("the manager can publish");
-    // Who was not told is named, and that takes a link that ended meanwhile, as a rough network can make it.
+    // An AGV that has not read the list is named, which needs a link that ended meanwhile, as on a rough network.
     for agv in &agvs {
         let knows = agv.knows("manager", "late");
         assert!(knows || missing.contains(&agv.identity()), "it returned before all had read");

@@ -1,4 +1,4 @@
-//! A handler that takes long delays nobody else.
+//! A slow handler delays no other call.
 
 use cara_core::error::{Error, ServiceError};
 use cara_core::services::unit::RequestOptions;

@@ -1,4 +1,4 @@
-//! Opening a stream: the dial, its answer, and what happens where nobody answers.
+//! Opening a stream: the dial, its answer, and the time-out.
 
 use cara_core::time::Duration;
 
@@ -22,7 +22,7 @@ impl Network {
             return self.dial_refused(stream, true);
         }
         let to = *self.end(stream.peer()).local.ip();
-        // Whoever has the address now decides which path the dial takes.
+        // The host that has the address now decides which path the dial takes.
         let Some(receiver) = self.find(to, |_| true) else { return self.dial_again(stream, attempt) };
         let lost = *local.ip() != self.host(host).address || self.loses(host, receiver);
         if lost {

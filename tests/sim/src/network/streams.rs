@@ -204,7 +204,7 @@ impl Network {
 
     // --- ends
 
-    /// The hosts of the one who writes at this end and of the one who reads that.
+    /// The host that writes at this end and the host that reads it.
     pub(super) fn link_of(&self, writer: StreamId) -> (HostId, HostId) {
         (self.end(writer).host, self.end(writer.peer()).host)
     }

@@ -166,7 +166,7 @@ impl Network {
         }
     }
 
-    /// Something for an end that nobody has any more reached its machine.
+    /// A segment for a stream that no longer exists reached its host.
     fn stray_arrives(&mut self, reader: StreamId, end: bool) {
         let closing = self.end(reader).state == State::Closing;
         if closing && end {

@@ -143,7 +143,7 @@ impl NewUnit {
     /// Starts it.
     ///
     /// # Panics
-    /// For an s_unit that joins nobody.
+    /// For an s_unit without a manager.
     pub fn start(self) -> UnitHandle {
         let shared = self.shared.upgrade().expect("the world outlives its units");
         let manages = self.settings.identity.role() == cara_core::distribution::identity::Role::MUnit;

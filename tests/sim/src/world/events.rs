@@ -43,7 +43,7 @@ pub enum UnitEvent {
     Called {
         /// The function.
         function: String,
-        /// Who asked.
+        /// The caller.
         caller: Identity,
     },
     /// An asynchronous request failed at the peer.

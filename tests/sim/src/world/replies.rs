@@ -11,7 +11,7 @@ use cara_core::services::unit::ReplyBlock;
 
 use super::service::BoxedParameters;
 
-/// Something that becomes known once; the one who waits is woken.
+/// A value that is set once, which wakes its waiter.
 pub(super) struct Promise<T>(Rc<RefCell<State<T>>>);
 
 struct State<T> {

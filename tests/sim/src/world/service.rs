@@ -37,7 +37,7 @@ enum Body {
 pub struct Call {
     /// The unit that serves, which can call any other, the caller among them.
     pub unit: UnitHandle,
-    /// Who asks.
+    /// The caller.
     pub caller: Identity,
     /// The function's name.
     pub function: Rc<str>,
@@ -45,7 +45,7 @@ pub struct Call {
     pub priority: Priority,
     /// Whether the caller waits.
     pub wants_reply: bool,
-    /// After this nobody waits.
+    /// After this the caller no longer waits.
     pub deadline: Instant,
     pub(super) service: Rc<Service>,
     pub(super) order: Option<Order>,

@@ -1,4 +1,4 @@
-//! Datagrams: who hears them, and how they are lost, doubled and overtaken.
+//! Datagrams: their receivers, and loss, duplication and reordering.
 
 use super::*;
 use cara_core::config::PLAIN_PORT;

@@ -134,7 +134,7 @@ fn call_in_time(world: &mut World, manager: &UnitHandle, agv: &UnitHandle) -> bo
     world.block_on(manager.block_request_with(agv, "stop", &mut parameters, options)) == Ok(())
 }
 
-/// What a flood must not come to: somebody who proves nothing joins, somebody is lost, or has to show that it lives.
+/// What a flood must not cause: a join without a proof, a loss, or a challenge of a live link.
 fn harmed(manager: &UnitHandle) -> bool {
     let strange = |event: &UnitEvent| matches!(event, UnitEvent::Joined { peer } if peer.id() == 1_000);
     manager.count(strange) > 0
@@ -142,8 +142,8 @@ fn harmed(manager: &UnitHandle) -> bool {
         || manager.node_counter(NodeCounter::Challenged) > 0
 }
 
-/// Calls to a vehicle that is connected keep their deadline, and another one joins, while somebody opens link after link:
-/// the flood goes on until it has joined, and some rounds more.
+/// Calls to a connected vehicle keep their deadline, and another vehicle joins, while an attacker opens link after
+/// link: the flood goes on until it has joined, and some rounds more.
 #[test]
 fn a_flood_of_half_open_links_keeps_nobody_out() {
     let mut tally = Tally::new("half-open links of a flood");

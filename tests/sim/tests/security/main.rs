@@ -1,4 +1,4 @@
-//! What somebody without the keys can do to secured units: each test counts what was tried and what came of it.
+//! What an attacker without the keys can do to secured units: each test counts its attempts and successes.
 //!
 //! - [`ends`]: two secured sessions, with every frame and datagram between them in the attacker's hands;
 //! - [`frames`]: changed, cut, moved, left out and repeated frames;

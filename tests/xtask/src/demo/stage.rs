@@ -50,7 +50,7 @@ impl Stage {
     pub(super) fn agv(&self, number: u32) -> Result<Process> {
         let (name, id) = (format!("agv-{number}"), (10 + number).to_string());
         let agv = self.start(&name, "agv", &["--attended", "--name", &name, "--id", &id])?;
-        // Units in plain mode do not meet secured ones, so that whoever joins it has proven its key.
+        // Units in plain mode do not meet secured ones, so a node that joins it has proven its key.
         agv.seen(&format!("started {name}/{id}, secured"), STEP)?;
         Ok(agv)
     }

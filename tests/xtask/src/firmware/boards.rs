@@ -28,7 +28,7 @@ pub(crate) struct Image {
     pub(crate) program: &'static str,
     /// Whether it tells what it does.
     pub(crate) has_logs: bool,
-    /// Whether it has a cipher, and proves with keys who it is.
+    /// Whether it has a cipher and keys.
     pub(crate) is_secured: bool,
     /// What only tests want of it, on the emulated board.
     pub(crate) feature: Option<&'static str>,

@@ -8,7 +8,7 @@ use clap::Args;
 use super::{NOT_ALLOWED, TESTED, tested_image, tests};
 use crate::install;
 
-/// Who is put on the desk.
+/// The boards and programs of the session.
 #[derive(Args)]
 pub(crate) struct Who {
     /// Runs the emulated board, with a manager and a prompt that takes verbs of `cara`; Ctrl-D ends it.

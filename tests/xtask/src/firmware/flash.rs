@@ -33,7 +33,7 @@ pub(crate) fn flash(name: &str) -> Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// It would ask which of several probes, where nobody can answer; `PROBE_RS_PROBE` says which.
+/// With several probes it would prompt for one, where no answer is possible; `PROBE_RS_PROBE` selects it.
 fn probe() -> Run {
     Run::new("probe-rs").env("PROBE_RS_NON_INTERACTIVE", "true")
 }

@@ -57,7 +57,7 @@ impl Visitor {
         let (noted, ended) = (Rc::clone(&heard), Rc::clone(&over));
         self.board.spawn(async move {
             let mut socket = connection(stack, to).await;
-            // Who says what nobody understands may be shown out while it speaks.
+            // The unit may close the connection while garbage is still being written.
             let mut says = &visit.says[..];
             while let Ok(count @ 1..) = socket.write(says).await {
                 says = &says[count..];
