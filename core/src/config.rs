@@ -65,11 +65,11 @@ pub const MISSED_KEEP_ALIVES: u8 = 3;
 pub const TCP_ONLY_LOSS: Duration = Duration::from_secs(8);
 /// One-way messages written this soon after the last write are gathered.
 pub const GATHER: Duration = Duration::from_micros(50);
-/// First pause between two searches; doubles up to [`LONGEST_SEARCH`], each with full jitter on top.
+/// First back-off between two searches; doubles up to [`LONGEST_SEARCH`], each with full jitter on top.
 pub const FIRST_SEARCH: Duration = Duration::from_millis(250);
-/// Longest pause between two searches.
+/// Longest back-off between two searches.
 pub const LONGEST_SEARCH: Duration = Duration::from_secs(8);
-/// Who-has datagrams per [`SEARCH_WINDOW`] on a network, own and heard, above which a unit defers its own.
+/// Searches per [`SEARCH_WINDOW`] on a network, own and heard, above which a unit defers its own.
 pub const SEARCH_BUDGET: u8 = 4;
 /// The window of [`SEARCH_BUDGET`].
 pub const SEARCH_WINDOW: Duration = Duration::from_secs(1);
@@ -118,12 +118,12 @@ impl Constraints {
     };
 }
 
-/// Whether units prove who they are and seal what they say. Units of different modes have nothing to do with each other.
+/// Whether units prove their identity and seal their frames. Units of different modes never connect.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Mode {
-    /// Everything travels as it is, and everybody is believed.
+    /// Frames are in clear, and every claimed identity is accepted.
     Plain,
-    /// Nobody is believed who does not prove the key of the pair.
+    /// A peer is accepted only with a proof of the pair's key; frames are sealed.
     Secured,
 }
 

@@ -1,8 +1,8 @@
-//! Everything that can go wrong, sorted by who must act. Small, `Copy`, and each text says what to do.
+//! Everything that can go wrong, sorted by where the remedy lies. Small, `Copy`, and each text says what to do.
 
 use crate::time::Duration;
 
-/// Who must act on an [`Error`].
+/// Where the remedy of an [`Error`] lies.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Cause {
     /// The program or its configuration must change; trying again does not help.
@@ -137,10 +137,10 @@ pub enum CloseReason {
     /// Request ids ran out; the pair connects again.
     #[error("request ids ran out: the link is opened anew, ask again")]
     Exhausted = 10,
-    /// The other end ended the link before it had proven who it is, so its reason counts for nothing.
+    /// The other end ended the link before it had proven its identity, so the reason it gave is ignored.
     #[error("the other end went before it proved who it is: has it the key of this pair, and the same version?")]
     Unproven = 11,
-    /// The other end has another key for this pair, or somebody changed what was sent.
+    /// The other end has another key for this pair, or a message was changed on its way.
     #[error(
         "the two have different keys for this pair, or what they sent was changed: compare their fingerprints; if one was revoked on purpose, do nothing"
     )]
@@ -321,7 +321,7 @@ pub enum Error {
 }
 
 impl Error {
-    /// Who must act.
+    /// Where the remedy lies.
     pub const fn cause(&self) -> Cause {
         match self {
             Self::UnknownFunction

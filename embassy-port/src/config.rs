@@ -1,4 +1,4 @@
-//! Who a unit is, before it starts.
+//! Configuration of a unit before it starts.
 
 use cara_core::config::{CHUNK_BYTES, Constraints, MINIMUM_CHUNK_BYTES};
 use cara_core::distribution::connection_handler::Target;
@@ -22,7 +22,7 @@ pub const fn message_buffer(message_size: u32) -> usize {
     buffer_bytes(message_size, OVERHEAD) + DATAGRAM_SLACK
 }
 
-/// Who a unit is and what limits it has.
+/// Identity and limits of a unit.
 #[derive(Debug)]
 pub struct Config {
     pub(crate) identity: Identity,
@@ -99,7 +99,7 @@ impl Config {
         self
     }
 
-    /// Who may do what; without a table whoever has joined may do everything. A `static`, or a `const` array of
+    /// The access table; without one, a joined node may do everything. A `static`, or a `const` array of
     /// [`Rule`](cara_core::services::access::Rule)s:
     ///
     /// ```

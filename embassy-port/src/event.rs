@@ -30,7 +30,7 @@ pub enum UnitEvent {
     NotJoined {
         /// The other end.
         address: SocketAddr,
-        /// Who it said it is.
+        /// The identity that it claimed.
         peer: Option<Identity>,
         /// Why.
         reason: CloseReason,
@@ -38,7 +38,7 @@ pub enum UnitEvent {
     /// The cable was plugged in or pulled, or the address changed; links that there were have ended. The unit's first
     /// address is no news.
     AddressChanged {
-        /// The address now; none while nobody can be reached.
+        /// The current address; `None` without a usable network.
         address: Option<Ipv4Addr>,
     },
     /// A node published or withdrew functions.
@@ -83,7 +83,7 @@ pub enum UnitEvent {
     },
 }
 
-/// Events that nobody has read yet; when it is full, new ones are lost and counted.
+/// Queue of unread events; when it is full, new ones are lost and counted.
 pub(crate) struct Events {
     slots: &'static mut [Option<UnitEvent>],
     first: usize,

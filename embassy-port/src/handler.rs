@@ -15,11 +15,11 @@ use crate::lease::LeaseWatch;
 
 /// What a handler is told about the call that it serves.
 pub struct Call<T: 'static> {
-    /// Who calls.
+    /// The caller.
     pub caller: Identity,
     /// The call's class.
     pub priority: Priority,
-    /// After this nobody waits for the answer; on the clock of [`now`](crate::now).
+    /// After this the caller no longer waits; on the clock of [`now`](crate::now).
     pub deadline: Instant,
     /// Whether the caller waits.
     pub wants_reply: bool,

@@ -29,14 +29,14 @@ enum Doing {
     },
 }
 
-/// What became of what a socket was doing.
+/// Progress of a socket's operation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Progress {
     /// Nothing new.
     None,
     /// The connection that was dialled is there.
     Connected,
-    /// Somebody has dialled.
+    /// A connection was accepted.
     Accepted(SocketAddr),
     /// The connection that was dialled could not be opened.
     Broken,
@@ -66,12 +66,12 @@ impl Line {
         matches!(self.doing, Doing::Open | Doing::Dialing)
     }
 
-    /// Somebody could dial it.
+    /// It is listening, or free to listen.
     pub(crate) fn takes_connections(&self) -> bool {
         matches!(self.doing, Doing::Listening | Doing::Nothing)
     }
 
-    /// Waits for somebody to dial, unless it does something else.
+    /// Listens, unless the socket is in use.
     pub(crate) fn listen(&mut self, port: u16) {
         if self.doing == Doing::Nothing && poll_once(self.socket.accept(port)).is_none() {
             self.doing = Doing::Listening;
@@ -163,7 +163,7 @@ impl Line {
         for slice in slices {
             let mut rest = *slice;
             while !rest.is_empty() {
-                // Asked first, because a write that would wait replaces the waker of whoever waits for room.
+                // Checked first, because a write that would block replaces the registered waker.
                 if !self.socket.can_send() {
                     return Ok(written);
                 }
@@ -204,7 +204,7 @@ impl Line {
         self.doing == Doing::Open && !self.socket.may_recv()
     }
 
-    /// Whether nothing has arrived that nobody has looked at, not even the end.
+    /// Whether everything that has arrived has been read, the end of the stream included.
     pub(crate) fn has_been_read(&self) -> bool {
         !self.socket.can_recv() && !self.has_ended()
     }

@@ -39,7 +39,7 @@ impl Mailman for EmbassyMailman {
 
 fn send(udp: &UdpSocket<'static>, address: Ipv4Addr, port: u16, datagram: &[u8]) -> bool {
     let to = IpEndpoint::new(IpAddress::Ipv4(address), port);
-    // Nobody waits for room for datagrams, so no waker is lost by this.
+    // No task waits for send space on this socket, so the no-op waker displaces none.
     let sent = udp.poll_send_to(datagram, to, &mut Context::from_waker(Waker::noop()));
     matches!(sent, Poll::Ready(Ok(())))
 }

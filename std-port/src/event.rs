@@ -26,7 +26,7 @@ pub enum UnitEvent {
     NotJoined {
         /// The other end.
         address: SocketAddr,
-        /// Who it said it is, or is thought to be.
+        /// The identity that it claimed, or that was expected.
         peer: Option<Identity>,
         /// Why.
         reason: CloseReason,

@@ -16,11 +16,11 @@ use crate::safe_hook::SafeHook;
 /// What a handler is told about the call that it serves.
 #[derive(Clone, Debug)]
 pub struct Call {
-    /// Who calls.
+    /// The caller.
     pub caller: Identity,
     /// The call's class.
     pub priority: Priority,
-    /// After this nobody waits for the answer; on the unit's clock.
+    /// After this the caller no longer waits; on the unit's clock.
     pub deadline: Instant,
     /// Whether the caller waits.
     pub wants_reply: bool,

@@ -1,7 +1,7 @@
 //! CARA on Linux: the paper's `Communication_System` and `Unit` over sockets and threads.
 //!
-//! Units prove who they are and seal what they say. A unit's [keys] lie in a file that `cara keys` makes; where there is none,
-//! building it is an error with the command that makes one. [`Builder::insecure`] does without.
+//! Units prove their identity and seal their frames. A unit's [keys] are in a file that `cara keys` makes; without one,
+//! building the unit is an error that names the command. [`Builder::insecure`] opts out.
 //!
 //! ```no_run
 //! use cara_std::{CommunicationSystem, Parameters};

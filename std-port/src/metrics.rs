@@ -23,7 +23,7 @@ use prometheus_client::registry::Registry;
 
 use crate::engine::{Engine, Group, Reading, read};
 
-/// The content type of [`metrics`](crate::CommunicationSystem::metrics), for who serves it.
+/// The content type of [`metrics`](crate::CommunicationSystem::metrics), for the HTTP response.
 pub const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 
 /// The text of a unit's counters.

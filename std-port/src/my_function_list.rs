@@ -47,7 +47,7 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
         self.put(definition, options, handler, FunctionList::add_function)
     }
 
-    /// Changes a function. Whoever knows the old one gets [`Error::StaleFunction`] until it is published again.
+    /// Changes a function. A caller that knows the old one gets [`Error::StaleFunction`] until it is published again.
     pub fn replace<Form>(
         &self,
         definition: &Definition,

@@ -1,9 +1,9 @@
 //! How many threads of a pool are inside handlers, and whether one more handler may begin.
 //!
-//! Some thread must always come back to read. Where another one waits in the epoll set, that is so. Where none does, a
-//! handler that has been quick may begin all the same, as starting a thread for a microsecond costs more than the
-//! handler; should it take long after all, the clock sees that nobody has come back, and starts a thread then. The
-//! clock has one more place than others who start threads, so that it always can.
+//! Some thread must always return to reading. That holds while another one waits in the epoll set. Without one, a
+//! handler that has been quick may begin all the same, since starting a thread costs more than such a handler; should
+//! it take long after all, the clock finds that no thread has come back and starts one. The clock has one slot more
+//! than the others that start threads, so that it always can.
 
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};

@@ -1,13 +1,13 @@
-//! Looking at a network without being one of its units: what can be heard, from whom, of which fleet, mode and version.
+//! Surveys of a network without being one of its units: the senders on it, with their fleet, mode and version.
 //!
-//! A [`Survey`] listens on the discovery port beside the units of the host, reads every datagram as far as it can be
-//! read, and, when it is told to, asks all m_units of a fleet to show themselves ([`Survey::ask`]). It takes no link,
-//! answers nobody, and sends nothing that it was not told to send. S_units that are connected say nothing to
-//! strangers, so they are not heard; their manager knows them.
+//! A [`Survey`] listens on the discovery port beside the units of the host, decodes every datagram as far as it can,
+//! and, on request, asks all m_units of a fleet to show themselves ([`Survey::ask`]). It accepts no link, answers
+//! nothing, and sends nothing unasked. Connected s_units do not answer unknown senders, so they are not heard; their
+//! manager knows them.
 //!
-//! What secured units say in discovery is signed and not sealed, so that it is heard without any key. With the fleet's
-//! discovery key ([`SurveyKeys`]) its m_units answer, and [`Standing`] tells whose datagrams the fleet's are. That key
-//! belongs to every unit of a fleet: it shows that a datagram comes from one of them, and not from which.
+//! Discovery of secured units is signed and not sealed, so that it is readable without any key. With the fleet's
+//! discovery key ([`SurveyKeys`]) its m_units answer, and [`Standing`] says which datagrams are the fleet's. Every unit
+//! of a fleet has that key: it shows that a datagram comes from one of them, and not from which.
 //!
 //! ```no_run
 //! use cara_std::survey::{Ports, Survey, SurveyKeys};
@@ -63,7 +63,7 @@ const BATCH: usize = 256;
 /// The token of the voice; each ear has its index.
 const VOICE: u64 = u64::MAX;
 
-/// One who looks at a network. See the [module](self).
+/// A survey of a network. See the [module](self).
 #[derive(Debug)]
 pub struct Survey {
     ports: Ports,
@@ -154,7 +154,7 @@ impl Survey {
         sent
     }
 
-    /// Asks who is at one address, without a broadcast. Of several units of one host, one alone is asked.
+    /// Asks the unit at one address, by unicast. Of several units of one host only one receives it.
     pub fn ask_at(&mut self, fleet: Fleet, address: SocketAddr) -> io::Result<()> {
         self.questions(fleet).iter().try_for_each(|(_, question)| send(&self.voice, address, question))
     }
@@ -183,7 +183,7 @@ impl Survey {
         }
     }
 
-    /// All lives of units that were heard, in the order in which they were first heard.
+    /// All boots of units that were heard, in the order in which they were first heard.
     pub fn heard(&self) -> &[Heard] {
         &self.heard
     }
@@ -193,7 +193,7 @@ impl Survey {
         self.heard.iter().map(|heard| heard.fleet).collect()
     }
 
-    /// Who sends something else to the discovery port.
+    /// Senders of other traffic to the discovery port.
     pub fn foreign(&self) -> &[Foreign] {
         &self.foreign
     }

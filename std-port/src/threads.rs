@@ -145,7 +145,7 @@ impl Source {
 /// A unit among those that the threads drive.
 struct Seat {
     driven: Arc<dyn Driven>,
-    /// Held for reading by each thread that is inside the unit; who stops the unit waits for them.
+    /// Held for reading by each thread that is inside the unit; stopping the unit waits for them.
     gate: RwLock<()>,
 }
 

@@ -13,7 +13,7 @@ pub struct Timers {
 }
 
 impl Timers {
-    /// Timers that nobody has set.
+    /// No timers.
     pub fn new() -> Self {
         Self::default()
     }

@@ -9,8 +9,8 @@
 //! | 8–11 | fleet, little-endian |
 //! | 12– | who-has, announce: postcard; session: link u16, zero u16, nonce u64, body |
 //!
-//! In secured mode a who-has and an announce end with the fleet's code, over everything before it. An answer to one
-//! unit has the pair's code as well, in front of the fleet's. A [`WhoHas`] and a broadcast [`Announce`] are padded with
+//! In secured mode a search and an answer end with the fleet's code, over everything before it. An answer to one unit
+//! has the pair's code as well, in front of the fleet's. A [`WhoHas`] and a broadcast [`Announce`] are padded with
 //! zeros to the length of the longest answer, so that a datagram with a forged source address is not amplified: the
 //! answer or question that it causes is no longer than itself.
 

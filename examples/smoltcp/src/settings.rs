@@ -1,4 +1,4 @@
-//! Who the unit is, and where.
+//! Identity and address of the unit.
 
 use core::net::Ipv4Addr;
 
@@ -10,7 +10,7 @@ use smoltcp::wire::Ipv4Cidr;
 
 use crate::resources::{CALLS, DATAGRAM_PORT, MESSAGE_BYTES};
 
-/// Who the unit is, and where.
+/// Identity and address of the unit.
 #[derive(Clone, Debug)]
 pub struct Settings {
     /// Name, id, fleet, manager and constraints; see the core.

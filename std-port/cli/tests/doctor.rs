@@ -179,7 +179,7 @@ fn a_node_that_was_lost_is_told_with_time_and_reason() {
     let told = clinic.doctor(&["agv", "--listen", "3s"]);
     told.is(&["lost"], 4);
     assert!(told.found(0).starts_with("agv/7 left boss/1 "), "{told:?}");
-    // Without a named node it is no error: the operator who stopped it knows.
+    // Without a named node it is no error: its operator stopped it.
     clinic.doctor(&["--listen", "3s"]).is(&["lost"], 0);
 }
 

@@ -1,5 +1,5 @@
-//! Who may see, call and publish what: a table that is set by the program, or read from a file that may change while the
-//! unit runs. What a table means is told in [`cara_core::services::access`]; `docs/access.md` has the file's form.
+//! Access tables, set by the program or read from a file that may change while the unit runs. Their semantics are in
+//! [`cara_core::services::access`]; `docs/access.md` has the file's form.
 
 mod error;
 #[cfg(feature = "access")]
@@ -109,8 +109,8 @@ pub fn shown(rule: &OwnedRule) -> impl fmt::Display + '_ {
     words::Shown(rule)
 }
 
-/// Whom the words of a file mean: `*`, `m_units`, `s_units`, `operator`, `NAME/ID`, `NAME/*` or `*/ID`, with `@m_unit` or
-/// `@s_unit` behind it where the role matters.
+/// The principals that a file's text names: `*`, `m_units`, `s_units`, `operator`, `NAME/ID`, `NAME/*` or `*/ID`, with
+/// `@m_unit` or `@s_unit` behind it where the role matters.
 pub fn who(words: &str) -> Result<Who<String>, NotWho> {
     words::who(words)
 }

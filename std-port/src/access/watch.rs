@@ -13,7 +13,7 @@ pub(crate) struct FileWatch {
     read: Option<Mark>,
     /// As it was at the last look.
     seen: Option<Mark>,
-    /// The state in which it could not be read, about which whoever asked has been told.
+    /// The state in which it could not be read and the error was reported.
     refused: Option<Option<Mark>>,
 }
 
@@ -26,9 +26,9 @@ impl FileWatch {
         Ok((Self { path, read: mark, seen: mark, refused: None }, table))
     }
 
-    /// The file's contents if they have changed, and have not since the last look: whoever writes it in place is given
-    /// the time to finish. What cannot be read is told once and tried again at each look, as it need not be the file's
-    /// fault.
+    /// The file's contents if they have changed, and are unchanged since the last look, so that a writer in place has
+    /// time to finish. An error is reported once and reading is tried again at each look, since the cause may be
+    /// outside the file.
     pub(crate) fn look(&mut self) -> Option<Result<AccessTable, AccessError>> {
         let now = Mark::of(&self.path).ok();
         let settled = now == self.seen;

@@ -17,14 +17,14 @@ const ROLES: [(&str, Role); 2] = [("@m_unit", Role::MUnit), ("@s_unit", Role::SU
 const VERBS: [(&str, Verb); 3] = [("list", Verb::List), ("call", Verb::Call), ("publish", Verb::Publish)];
 const SPANS: [(&str, u64); 3] = [("s", 1), ("min", 60), ("h", 3600)];
 
-/// The words mean nobody.
+/// The text names no principal.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
     "'{0}' is nobody: write NAME/ID, NAME/* or */ID, \"m_units\", \"s_units\", \"operator\", or \"*\" for every node"
 )]
 pub struct NotWho(String);
 
-/// Whom the words mean.
+/// The principals that the text names.
 pub(super) fn who(words: &str) -> Result<Who<String>, NotWho> {
     match words {
         OPERATOR => return Ok(Who::Operator),

@@ -13,7 +13,7 @@ use super::protocol::{Answer, Failure, Question};
 use super::{call, constraint, describe, everybody, hold, select};
 use crate::{CommunicationSystem, Finding, Identity, Peer};
 
-/// Where answers go; `Break` when nobody reads them any more.
+/// Where answers go; `Break` when the client is gone.
 pub(super) type Sink<'s> = &'s mut dyn FnMut(Answer) -> ControlFlow<()>;
 
 /// Whether the client is still there; where a span is given, also whether it has sent a [`BEAT`](super::protocol::BEAT)
@@ -31,7 +31,7 @@ pub(super) const LOOK: std::time::Duration = std::time::Duration::from_millis(20
 
 /// Why an answer ends early.
 pub(super) enum End {
-    /// Nobody reads it.
+    /// The client is gone.
     Gone,
     /// It could not be given.
     Failed(Failure),
@@ -67,7 +67,7 @@ pub(super) fn execute_for<T: Send + 'static>(
     sink: Sink<'_>,
     lives: Lives<'_>,
 ) {
-    // Whoever is gone does not hear it.
+    // A client that is gone misses its last answer.
     let _ = match attempt(system, question, sink, lives) {
         Ok(()) => sink(Answer::Done),
         Err(End::Failed(failure)) => sink(Answer::Failed(failure)),

@@ -83,7 +83,7 @@ pub(super) fn options(question: &CallQuestion) -> Result<RequestOptions, Failure
         timeout: question.timeout_ms.map(Duration::from_millis),
         priority: priority.transpose()?,
         delivery: if question.best_effort { Delivery::BestEffort } else { Delivery::Reliable },
-        // What an operator starts goes on for its lease and no longer: nobody would release it.
+        // What an operator starts runs for one lease and no longer: no client would release it.
         renew_lease: false,
     })
 }
@@ -174,7 +174,7 @@ impl Prepared {
         Ok(Outcome { results, call: None })
     }
 
-    /// Whoever wrote the arguments wants to see what was asked for.
+    /// The text of an error in the arguments shows the function's signature.
     fn explain(&self, error: Error) -> Failure {
         let failure = Failure::from(error);
         if error.cause() == Cause::Configuration { signed(failure, &self.function) } else { failure }

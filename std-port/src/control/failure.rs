@@ -1,4 +1,4 @@
-//! Errors as text: their name, who must act, and what to do.
+//! Errors as text: their name, where the remedy lies, and what to do.
 
 use std::fmt::Display;
 

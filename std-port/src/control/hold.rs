@@ -1,4 +1,4 @@
-//! A call whose lease is kept for as long as the operator who asked for it stays: the operator is the dead man's handle.
+//! A call whose lease is renewed for as long as the operator's client lives: the operator is the dead man's handle.
 
 use std::sync::mpsc::RecvTimeoutError;
 use std::time::{Duration, Instant};

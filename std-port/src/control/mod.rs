@@ -5,7 +5,7 @@
 //! removes it when it is stopped. [`Client`] is the other end; [`execute`] answers the same questions against a unit of
 //! this process. What travels is in [`protocol`].
 //!
-//! Whoever can open the socket can do what the program can: there is no finer right. So the directory is the owner's
+//! Access to the socket gives all rights of the program: there are no finer ones. So the directory belongs to its owner
 //! alone, and each connection must come from the same user or from root.
 
 mod answering;

@@ -119,7 +119,7 @@ fn fnv(bytes: &[u8]) -> u64 {
     bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, &byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3))
 }
 
-/// The sockets in a directory, whether somebody answers on them or not; none where others could have put them.
+/// The sockets in a directory, live or stale; none in a directory that other users can write to.
 pub(super) fn sockets(directory: &Path) -> Result<Vec<PathBuf>, PlaceError> {
     match enter(directory) {
         Ok(_) => {}
@@ -139,7 +139,7 @@ pub(super) fn sockets(directory: &Path) -> Result<Vec<PathBuf>, PlaceError> {
 #[derive(Debug)]
 pub(super) struct Place {
     path: PathBuf,
-    /// What tells it from another one, so that nobody else's is removed.
+    /// Identifies the file, so that a later one at the same path is not removed.
     file: Mark,
 }
 
@@ -156,7 +156,7 @@ impl Place {
         &self.path
     }
 
-    /// Opens the socket at `path`, in the place of one on which nobody answers.
+    /// Opens the socket at `path`, replacing a stale one.
     pub(super) fn open(path: &Path) -> Result<(Self, UnixListener), PlaceError> {
         let directory = parent(path)?;
         let made = DirBuilder::new().recursive(true).mode(0o700).create(directory);
@@ -165,7 +165,7 @@ impl Place {
         let _lock = lock(&directory).map_err(|error| PlaceError::system(path, error))?;
         make_room(path)?;
         let listener = listen_at(path, &directory).map_err(|error| PlaceError::system(path, error))?;
-        // Nobody else enters the directory, so nobody has come in between.
+        // Other users cannot enter the directory, so the socket was not reachable with wider permissions in between.
         set_permissions(path, Permissions::from_mode(0o600)).map_err(|error| PlaceError::system(path, error))?;
         let file = mark(path).map_err(|error| PlaceError::system(path, error))?;
         Ok((Self { path: path.to_owned(), file }, listener))
@@ -186,7 +186,7 @@ fn parent(path: &Path) -> Result<&Path, PlaceError> {
     directory.ok_or_else(|| PlaceError::NoDirectory(path.to_owned()))
 }
 
-/// Opens a directory that belongs to this user and that nobody else can enter.
+/// Opens a directory that belongs to this user and that no other user can enter.
 fn enter(path: &Path) -> Result<OwnedFd, PlaceError> {
     let flags = OFlags::DIRECTORY | OFlags::NOFOLLOW | OFlags::RDONLY | OFlags::CLOEXEC;
     let directory = open(path, flags, Mode::empty()).map_err(|errno| PlaceError::system(path, errno))?;
@@ -201,7 +201,7 @@ fn enter(path: &Path) -> Result<OwnedFd, PlaceError> {
     Ok(directory)
 }
 
-/// Whoever opens or removes a socket in a directory holds its lock; the descriptor that is returned holds it.
+/// Locks a directory while a socket in it is opened or removed; the returned descriptor holds the lock.
 fn lock(directory: &OwnedFd) -> io::Result<OwnedFd> {
     let own = rustix::fs::openat(directory, ".", OFlags::DIRECTORY | OFlags::RDONLY | OFlags::CLOEXEC, Mode::empty())?;
     let end = Instant::now() + PATIENCE;
@@ -214,7 +214,7 @@ fn lock(directory: &OwnedFd) -> io::Result<OwnedFd> {
     }
 }
 
-/// Removes a socket on which nobody answers.
+/// Removes a stale socket.
 fn make_room(path: &Path) -> Result<(), PlaceError> {
     let Ok(found) = path.symlink_metadata() else { return Ok(()) };
     if !found.file_type().is_socket() {

@@ -19,9 +19,10 @@ pub const LONGEST_LINE: usize = 4 * 1024 * 1024;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "ask", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Question {
-    /// Who are you? Answered by [`Answer::Unit`].
+    /// Asks for the unit's identity and state. Answered by [`Answer::Unit`].
     Unit,
-    /// Which nodes are known, and who was refused? An [`Answer::Node`] for each, an [`Answer::Refused`] for each refusal.
+    /// Asks for the known nodes and the refused ones. An [`Answer::Node`] for each, an [`Answer::Refused`] for each
+    /// refusal.
     Nodes {
         /// Only nodes that offer this function.
         offering: Option<String>,
@@ -263,7 +264,7 @@ pub enum Answer {
     Failed(Failure),
 }
 
-/// An error as text, and who must act on it.
+/// An error as text, and where its remedy lies.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Failure {
     /// `configuration`, `peer`, `resource` or `transport`.

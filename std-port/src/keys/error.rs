@@ -60,9 +60,9 @@ pub enum KeyError {
     Foreign {
         /// The file.
         path: PathBuf,
-        /// Whose it is.
+        /// Its owner.
         owner: u32,
-        /// Who asks.
+        /// The user of this process.
         own: u32,
     },
     /// A folder, a pipe or a device.
@@ -167,7 +167,7 @@ pub enum KeyError {
     },
 }
 
-/// Whom keys belong to.
+/// The node that keys belong to.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Owner {
     /// The node.
@@ -218,7 +218,7 @@ pub enum FleetError {
     /// What is named as a manager is no m_unit of the fleet.
     #[error("{0} is no m_unit of the fleet, so nothing can belong to it")]
     NotAManager(Identity),
-    /// An m_unit belongs to nobody.
+    /// A manager was named for an m_unit, which has none.
     #[error("{0} is an m_unit, and those belong to nobody: leave --manager away")]
     MUnit(Identity),
     /// A change of keys has begun and is not finished.

@@ -77,7 +77,7 @@ pub(super) fn advise(path: &Path, text: &str) {
 }
 
 fn open(path: &Path) -> Result<File, KeyError> {
-    // A pipe would keep us waiting for somebody to write.
+    // Opening a pipe would block until its other end writes.
     let flags = OFlags::NONBLOCK | OFlags::NOCTTY;
     let opened = OpenOptions::new().read(true).custom_flags(flags.bits() as i32).open(path);
     opened.map_err(|error| match (error.kind(), path.metadata()) {

@@ -7,7 +7,7 @@ use super::members::{Member, Members};
 use super::ring::Generation;
 use super::{FleetError, KeyError, KeyRing, draw};
 
-/// A fleet's root and its nodes. Whoever has it can speak as every node.
+/// A fleet's root and its nodes. Its holder can speak as every node.
 #[derive(Debug)]
 pub struct FleetKeys {
     root: RootKey,
@@ -54,15 +54,15 @@ impl FleetKeys {
     /// s_units.
     pub fn add_all(&mut self, nodes: &[Identity], managers: &[Identity]) -> Result<(), FleetError> {
         let (m_units, s_units): (Vec<_>, Vec<_>) = nodes.iter().partition(|node| node.role() == Role::MUnit);
-        // Where nobody else could be meant, it is a mistake to be told.
+        // Without s_units, managers can only be meant for the m_units, which is an error to report.
         let of_m_units = if s_units.is_empty() { managers } else { &[] };
         m_units.into_iter().try_for_each(|node| self.add(node, of_m_units))?;
         s_units.into_iter().try_for_each(|node| self.add(node, managers))
     }
 
-    /// Takes nodes out of all rings, and [begins](Self::rotate) a generation that they have nothing of. Until the change is
-    /// [finished](Self::finish) they can still make discovery messages that others take for the fleet's; nobody opens a
-    /// link to them. Where one of them is no node of the fleet, nothing changes; those that were revoked already stay so.
+    /// Takes nodes out of all rings, and [begins](Self::rotate) a generation without them. Until the change is
+    /// [finished](Self::finish) they can still make discovery messages that pass for the fleet's, but no link with them
+    /// is opened. If one of them is not in the fleet, nothing changes; nodes that were revoked already stay so.
     pub fn revoke(&mut self, identities: &[Identity]) -> Result<(), FleetError> {
         self.members.revoke(identities)
     }
@@ -155,7 +155,7 @@ mod tests {
         hears(one, other) && hears(other, one)
     }
 
-    /// A file of one step and one of the next are good for each other, whoever of the nodes has been given its own.
+    /// A file of one step works with one of the next, in whatever order the nodes get theirs.
     #[test]
     fn a_change_of_keys_locks_nobody_out_in_whatever_order_files_come() {
         let mut keys = fleet();

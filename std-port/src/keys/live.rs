@@ -24,7 +24,7 @@ struct Held {
     ring: Arc<KeyRing>,
     /// The file that it was read from. None where there is none.
     mark: Option<Mark>,
-    /// The file that could not be taken, about which whoever asked has been told; none in it where it is gone.
+    /// The state in which the file was refused and the error was reported; an inner `None` if the file was missing.
     refused: Option<Option<Mark>>,
 }
 

@@ -1,4 +1,4 @@
-//! Who belongs to a fleet, and which generations of keys are in use. Nothing of it is secret.
+//! The members of a fleet, and the generations of keys in use. Nothing in it is secret.
 //!
 //! ```text
 //! cara-fleet 2
@@ -11,8 +11,9 @@
 //! sum 8 hexadecimal digits
 //! ```
 //!
-//! `generations` tells the one in use, and behind it the one beside it if keys are being changed. `node` tells the first
-//! generation in which it has keys, `manager` whom the node above belongs to, and `revoked` the first one without the node.
+//! `generations` has the one in use, followed by the one beside it during a change of keys. `node` has the first
+//! generation in which the node has keys, `manager` a manager of the node above, and `revoked` the first generation
+//! without the node.
 
 use std::fmt::Write;
 
@@ -24,7 +25,7 @@ use super::text::{FORM, FormError, Line, Lines, push_identity, push_sum};
 /// A node of the fleet.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Member {
-    /// Who it is.
+    /// Its identity.
     pub identity: Identity,
     /// The first generation in which it has keys.
     pub since: u32,
@@ -35,7 +36,7 @@ pub struct Member {
 /// A node that was taken out.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Revoked {
-    /// Who it was.
+    /// Its identity.
     pub identity: Identity,
     /// The first generation without it.
     pub from: u32,

@@ -1,9 +1,9 @@
 //! Key files: the ring of each node, and the fleet that the rings come from.
 //!
 //! A node has one [`KeyRing`]: the key for discovery, and one key for each node that it may talk to. It lies in a file
-//! that only its owner can read; [`place::find`] tells where it is looked for, and [`LiveRing`] takes a new one while the
-//! node runs. A [`FleetKeys`] has the root from which all rings come, and belongs to whoever provisions; [`Store`] keeps
-//! it in a folder. The command `cara keys` does nothing that is not here.
+//! that only its owner can read; [`place::find`] tells where it is looked for, and [`LiveRing`] takes a new one while
+//! the node runs. A [`FleetKeys`] has the root from which all rings come, and stays where nodes are provisioned;
+//! [`Store`] keeps it in a folder. The command `cara keys` does nothing that is not here.
 //!
 //! ```
 //! use cara_std::keys::FleetKeys;

@@ -60,7 +60,7 @@ pub fn folders() -> Vec<PathBuf> {
     folders
 }
 
-/// The files with keys of units that are in those folders, whoever's they are, by name; or the one that `CARA_KEYS` names.
+/// The key files in those folders, of all owners, by name; or the one that `CARA_KEYS` names.
 pub fn rings() -> Vec<PathBuf> {
     if let Some(file) = Environment::of_process().file() {
         return vec![file.to_owned()];

@@ -18,7 +18,7 @@ use super::{FleetKeys, KeyError, KeyRing, file, place};
 /// Bytes of the root's file at most.
 const ROOT_BYTES: usize = 512;
 
-/// A fleet's keys in a folder, which nobody else changes while this is there.
+/// A fleet's keys in a folder, locked against changes by others while this exists.
 #[derive(Debug)]
 pub struct Store {
     folder: PathBuf,
@@ -107,8 +107,8 @@ impl Store {
         if stop() {
             return Err(KeyError::Stopped);
         }
-        // The root comes before the keys that are of it: what is killed here leaves no key of a root that nobody has, and
-        // `cara keys derive` writes the rest. A list alone is no fleet, nor in the way of the next try.
+        // The root is written before the keys derived from it: a process killed in between leaves no keys of a lost
+        // root, and `cara keys derive` writes the rest. A list alone is no fleet, and does not block the next try.
         let mut made = vec![list.path().to_owned()];
         let written = list.put().and_then(|()| root.put_new()).and_then(|()| {
             made.push(path);
@@ -252,12 +252,12 @@ impl Store {
 
     fn planned_removal(&self, identity: &Identity) -> Result<Option<Planned>, KeyError> {
         let to_be = self.to_be(identity, Change::Removed);
-        // Who can read it does not matter any more.
+        // Its permissions no longer matter.
         Ok(file::is_there(&to_be.path)?.then_some(Planned { to_be, text: None }))
     }
 
     fn planned_ring(&self, identity: &Identity) -> Result<Option<Planned>, KeyError> {
-        // Whoever is a member has a ring.
+        // Every member has a ring.
         let Ok(ring) = self.keys.ring(identity) else { return Ok(None) };
         let text = ring.text();
         // One that others can read is told, and not silently mended.

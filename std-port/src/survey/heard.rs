@@ -46,7 +46,7 @@ pub struct Heard {
     pub version: u8,
     /// Its fleet.
     pub fleet: Fleet,
-    /// Who it is; `None` where its datagrams could not be read beyond their header.
+    /// Its identity; `None` if its datagrams could not be decoded beyond their header.
     pub identity: Option<Identity>,
     /// Its life.
     pub epoch: Option<Epoch>,

@@ -20,7 +20,7 @@ const OLD: u32 = 16;
 /// Most files that are told as refused.
 const REFUSED: usize = 8;
 
-/// Discovery keys of fleets. Each shows that whoever has it belongs to the fleet; none of them opens a link.
+/// Discovery keys of fleets. Each proves membership in the fleet; none of them opens a link.
 #[derive(Debug, Default)]
 pub struct SurveyKeys {
     keys: Vec<Known>,
@@ -98,7 +98,7 @@ impl SurveyKeys {
         &self.refused
     }
 
-    /// What can be said of the sender of a who-has or announce of a fleet, from all its bytes.
+    /// The standing of the sender of a fleet's search or announce, from all its bytes.
     pub(super) fn standing(&self, fleet: Fleet, datagram: &[u8]) -> Standing {
         let Some((signed, code)) = datagram.split_last_chunk::<CODE_BYTES>().filter(|_| self.has(fleet)) else {
             return Standing::Unchecked;
@@ -136,7 +136,7 @@ impl SurveyKeys {
     }
 }
 
-/// Signs for a fleet with one key, as nobody who has a key of a pair.
+/// Signs for a fleet with its discovery key only; it has no pair keys.
 #[derive(Debug)]
 pub(super) struct Signer<'k>(&'k DiscoveryKey);
 

@@ -169,7 +169,7 @@ fn a_secured_manager_answers_with_the_fleets_key_and_to_nobody_else() {
     assert_eq!((answer.identity.as_ref(), answer.mode), (Some(&boss), Mode::Secured));
     assert_eq!((answer.standing, answer.room), (Standing::Proven(1), Some(Constraints::M_UNIT.maximum_nodes)));
     assert_eq!(answer.listens_at().map(|at| at.port()), Some(manager.tcp_port()));
-    // The manager keeps no refusal of who only looks.
+    // The manager records no refusal of a survey.
     assert!(manager.findings().is_empty(), "{:?}", manager.findings());
     // What it asks of its own accord is heard by all, and trusted by none with other keys.
     listen_until(&mut stranger, |stranger| stranger.heard().iter().any(|heard| heard.identity.as_ref() == Some(&boss)));

@@ -1,7 +1,7 @@
 //! TCP links: dial, accept, send without blocking, receive with or without.
 //!
-//! A connected socket is in blocking mode with a receive time-out of [`SLICE`], so that a caller who leads its link
-//! waits for the reply with one system call. Everything else asks not to wait, per call.
+//! A connected socket is in blocking mode with a receive time-out of [`SLICE`], so that a caller that reads its link
+//! waits for the reply with one system call. All other calls are non-blocking, by a flag per call.
 
 use std::io::{self, IoSlice};
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
@@ -200,7 +200,7 @@ fn dial_failed(errno: Errno) -> CloseReason {
 pub enum Accepted {
     /// A new connection and the address of its other end.
     Stream(Stream, SocketAddr),
-    /// Nobody is waiting.
+    /// No connection is waiting.
     WouldBlock,
     /// The process or the system is out of descriptors or memory. The connection still waits: watch the listener
     /// again after a pause, since it stays readable.
@@ -238,7 +238,7 @@ impl Listener {
         loop {
             match accept_with(&self.socket, SocketFlags::CLOEXEC) {
                 Ok(socket) => {
-                    // One that is gone by now is nobody's.
+                    // A connection that is closed by now is skipped.
                     let Ok(stream) = Stream::accepted(socket) else { continue };
                     let Some(peer) = stream.peer_address() else { continue };
                     return Accepted::Stream(stream, peer);
