@@ -258,9 +258,9 @@ fn a_running_manager_follows_its_key_file() {
     assert!(events.try_iter().any(|event| event == left));
 }
 
-/// A stranger's dial makes the manager look at its file between two looks: what was revoked is found then as well.
+/// The dial of a vehicle with other keys makes the manager look at its file between two looks: what was revoked is found then as well.
 #[test]
-fn a_stranger_who_dials_saves_no_revoked_vehicle() {
+fn an_unknown_vehicle_that_dials_saves_no_revoked_one() {
     let fleet = fleet();
     let folder = tempfile::tempdir().unwrap();
     let mut store = Store::create(folder.path(), keys(fleet, &[7, 8])).unwrap();
@@ -271,11 +271,11 @@ fn a_stranger_who_dials_saves_no_revoked_vehicle() {
     joined(&manager, 2);
     let address = first.manager().unwrap().address().unwrap();
     let of_others = keys(fleet, &[99]).ring(&agv(99)).unwrap();
-    let stranger = vehicle(fleet, 99).keys(of_others).manager_address(address).build_unit().unwrap();
+    let unknown = vehicle(fleet, 99).keys(of_others).manager_address(address).build_unit().unwrap();
 
     store.keys_mut().revoke(&[agv(7)]).unwrap();
     store.save().unwrap();
-    stranger.start().unwrap();
+    unknown.start().unwrap();
     until("the revoked one is gone", || manager.number_of_s_units() == 1);
     assert!(manager.s_units().iter().all(|peer| peer.is_connected() == (peer.identity() == &agv(8))));
 }

@@ -115,7 +115,7 @@ fn a_full_manager_is_told_by_itself_and_by_what_it_says_on_the_network() {
     until("the second was refused", || !manager.findings().is_empty());
     clinic.doctor(&["second"]).is(&["full"], 4);
     // As from another host: the manager cannot be asked.
-    let told = clinic.stranger(&["second"]);
+    let told = clinic.doctor_elsewhere(&["second"]);
     // If it kept silent for so long, it could be connected as well.
     assert!(matches!(told.ids()[..], ["full"] | ["full", "ask-its-manager"]), "{told:?}");
     clinic.doctor(&["first"]).is(&["connected"], 0);
@@ -192,7 +192,7 @@ fn a_node_that_is_not_there_at_all_is_not_heard() {
     told.is(&["not-heard"], 4);
     assert!(told.found(0).contains("there is agv-8/8"), "{told:?}");
     // Another host cannot know.
-    clinic.stranger(&["agv-7", "--listen", "3s"]).is(&["ask-its-manager"], 4);
+    clinic.doctor_elsewhere(&["agv-7", "--listen", "3s"]).is(&["ask-its-manager"], 4);
 }
 
 #[test]
@@ -208,7 +208,7 @@ fn a_node_that_is_connected_is_told_with_its_address() {
         assert!(told.found(0).contains(&address) && told.found(0).contains("boss/1"), "{told:?}");
     }
     clinic.doctor(&["boss"]).is(&["answers"], 0);
-    clinic.stranger(&["boss"]).is(&["answers"], 0);
+    clinic.doctor_elsewhere(&["boss"]).is(&["answers"], 0);
     clinic.doctor(&["--listen", "3s"]).is(&[], 0);
 }
 

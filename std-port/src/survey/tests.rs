@@ -156,13 +156,13 @@ fn a_secured_manager_answers_with_the_fleets_key_and_to_nobody_else() {
     let mut keys = SurveyKeys::default();
     keys.add_ring(&ring(&Identity::s_unit("agv", 7).unwrap()));
     let mut survey = survey().with_keys(keys);
-    let (port, mut stranger_keys) = (survey.reach()[0].port, SurveyKeys::default());
-    stranger_keys.add_ring(&fleet_keys(fleet).ring(&boss).unwrap());
-    let mut stranger = Survey::open(Interfaces::Loopback, port).unwrap().with_keys(stranger_keys);
+    let (port, mut other_keys) = (survey.reach()[0].port, SurveyKeys::default());
+    other_keys.add_ring(&fleet_keys(fleet).ring(&boss).unwrap());
+    let mut other = Survey::open(Interfaces::Loopback, port).unwrap().with_keys(other_keys);
     let manager = crate::CommunicationSystem::builder("boss", 1).unwrap().fleet(fleet).discovery_port(port);
     let manager = manager.interfaces(Interfaces::Loopback).keys(ring(&boss)).build_system().unwrap();
     manager.start().unwrap();
-    stranger.ask(Fleet(fleet));
+    other.ask(Fleet(fleet));
     survey.ask(Fleet(fleet));
     listen_until(&mut survey, |survey| survey.heard().iter().any(|heard| heard.to_us > 0));
     let answer = survey.heard().iter().find(|heard| heard.to_us > 0).unwrap();
@@ -172,8 +172,8 @@ fn a_secured_manager_answers_with_the_fleets_key_and_to_nobody_else() {
     // The manager records no refusal of a survey.
     assert!(manager.findings().is_empty(), "{:?}", manager.findings());
     // What it asks of its own accord is heard by all, and trusted by none with other keys.
-    listen_until(&mut stranger, |stranger| stranger.heard().iter().any(|heard| heard.identity.as_ref() == Some(&boss)));
-    let of_boss = stranger.heard().iter().filter(|heard| heard.identity.as_ref() == Some(&boss));
+    listen_until(&mut other, |other| other.heard().iter().any(|heard| heard.identity.as_ref() == Some(&boss)));
+    let of_boss = other.heard().iter().filter(|heard| heard.identity.as_ref() == Some(&boss));
     assert!(of_boss.clone().all(|heard| heard.standing == Standing::OtherKeys && heard.to_us == 0));
     assert!(of_boss.count() > 0);
 }

@@ -410,11 +410,11 @@ fn memory_that_cannot_hold_the_constraints_is_refused() {
 fn silent_connections_give_way_to_nodes() {
     let bench = Bench::new(9);
     let (_, manager) = manager(&bench);
-    let stranger = bench.board();
+    let unknown = bench.board();
     bench.run_for(Duration::from_millis(10));
     for _ in 0..8 {
-        let stack = stranger.stack();
-        stranger.spawn(async move {
+        let stack = unknown.stack();
+        unknown.spawn(async move {
             let (receive, send) = (Box::leak(Box::new([0; 64])), Box::leak(Box::new([0; 64])));
             let mut socket = TcpSocket::new(stack, receive, send);
             let _ = socket.connect((Ipv4Addr::new(10, 77, 0, 1), SECURED_PORT)).await;
@@ -577,15 +577,15 @@ fn a_unit_with_keys_of_another_root_is_not_heard() {
     let bench = Bench::new(13);
     let (_, manager) = manager(&bench);
     let board = bench.board();
-    let stranger = keys(1, &agv_identity(), 0, 7);
-    let agv = start(&board, Config::s_unit("agv", 7, "manager", 1, stranger).unwrap());
+    let unknown = keys(1, &agv_identity(), 0, 7);
+    let agv = start(&board, Config::s_unit("agv", 7, "manager", 1, unknown).unwrap());
     bench.run_for(LONG);
     assert!(!agv.is_connected() && !manager.is_connected());
     // Also where it need not search: the link ends before the node has heard of it.
     let address = (Ipv4Addr::new(10, 77, 0, 1), SECURED_PORT).into();
-    let stranger = keys(1, &agv_identity(), 0, 8);
+    let unknown = keys(1, &agv_identity(), 0, 8);
     let board = bench.board();
-    let config = Config::s_unit("agv", 7, "manager", 1, stranger).unwrap().manager_address(address);
+    let config = Config::s_unit("agv", 7, "manager", 1, unknown).unwrap().manager_address(address);
     let agv = start(&board, config);
     bench.run_for(LONG);
     assert!(!agv.is_connected() && !manager.is_connected());

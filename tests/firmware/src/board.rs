@@ -24,16 +24,16 @@ pub(crate) const FLEET: u32 = 4711;
 /// The manager's address.
 const MANAGER: &str = "10.77.0.1/24";
 
-/// The desk on which boards are put: image, bridge, names.
+/// The bench that boards run on: image, bridge, names.
 pub(crate) struct Bench {
     image: PathBuf,
     table: Arc<Table>,
     shows_logs: bool,
-    /// Another image, which draws the same random numbers in each life.
+    /// Another image, which draws the same random numbers in each boot.
     constant: Option<PathBuf>,
     /// The board's clock counts instructions.
     counts: bool,
-    /// How many there are, also of other desks on this bridge.
+    /// How many there are, also of other benches on this bridge.
     cables: Rc<Cell<u8>>,
     /// Of the boards, and of their manager.
     pub(crate) keys: Rc<Keys>,
@@ -58,7 +58,7 @@ impl Bench {
         Self { counts: true, ..self }
     }
 
-    /// The same desk for boards that are told other things.
+    /// The same bench for boards that are told other things.
     pub(crate) fn with(&self, keys: Rc<Keys>) -> Self {
         let (image, table, cables) = (self.image.clone(), Arc::clone(&self.table), Rc::clone(&self.cables));
         let Self { shows_logs, counts, .. } = *self;
@@ -70,7 +70,7 @@ impl Bench {
         Self { constant, ..self }
     }
 
-    /// The same desk for that image, if there is one.
+    /// The same bench for that image, if there is one.
     pub(crate) fn constant(&self) -> Result<Option<Self>> {
         let Some(image) = self.constant.clone() else { return Ok(None) };
         let table = table_of(&image)?;

@@ -7,7 +7,6 @@
 mod board;
 mod checks;
 mod count;
-mod desk;
 mod faults;
 mod kept_away;
 mod keys;
@@ -15,6 +14,7 @@ mod load;
 mod manager;
 mod places;
 mod security;
+mod session;
 mod signals;
 mod trace;
 
@@ -87,14 +87,14 @@ enum Part {
     Security(security::Security),
     /// Measures how long boards take to join beside recorded and forged discovery.
     KeptAway(kept_away::KeptAway),
-    /// Ends desks by signals at random moments, and fails if one leaves keys behind.
+    /// Ends sessions by signals at random moments, and fails if one leaves keys behind.
     Ends {
         /// How many.
         #[arg(long, default_value_t = 300)]
         times: u32,
     },
-    /// Puts a board on the desk, with its manager and a prompt for `cara`.
-    Desk(desk::Desk),
+    /// Starts a session: a board, its manager and a prompt for `cara`.
+    Session(session::Session),
 }
 
 fn main() -> ExitCode {
@@ -103,7 +103,7 @@ fn main() -> ExitCode {
         Some(Part::Manager { key_file }) => manager::stand_alone(key_file.as_deref()).map(|()| ExitCode::SUCCESS),
         Some(Part::Vehicle) => faults::stand_alone().map(|()| ExitCode::SUCCESS),
         Some(Part::Ends { times }) => {
-            desk::ends(&arguments.image, arguments.cara.as_deref(), *times).map(|()| ExitCode::SUCCESS)
+            session::ends(&arguments.image, arguments.cara.as_deref(), *times).map(|()| ExitCode::SUCCESS)
         }
         _ => in_own_network(&arguments),
     };
@@ -134,7 +134,7 @@ fn in_own_network(arguments: &Arguments) -> Result<ExitCode> {
 fn inside(arguments: &Arguments) -> Result<()> {
     signals::clean_up_at_signals()?;
     match &arguments.part {
-        Some(Part::Desk(desk)) => desk::run(&arguments.image, desk),
+        Some(Part::Session(session)) => session::run(&arguments.image, session),
         Some(Part::Instructions { of, profile }) => count::run(&bench(arguments)?, &arguments.image, *of, *profile),
         Some(Part::Faults(faults)) => faults::run(bench(arguments)?.counting(), faults),
         Some(Part::Security(options)) => security::run(&bench(arguments)?, options),
@@ -144,7 +144,7 @@ fn inside(arguments: &Arguments) -> Result<()> {
     }
 }
 
-/// A desk for boards, which get keys that are drawn now.
+/// A bench for boards, with freshly drawn keys.
 fn bench(arguments: &Arguments) -> Result<Bench> {
     let cara = arguments.cara.as_deref();
     let keys = if arguments.insecure { Keys::insecure(cara)? } else { Keys::of_boards(cara)? };
@@ -153,17 +153,17 @@ fn bench(arguments: &Arguments) -> Result<Bench> {
 
 /// What is tested from outside, because it makes a network of its own.
 fn after(arguments: &Arguments) -> Result<()> {
-    if arguments.part.is_some() || !DESK.contains(&arguments.only) {
+    if arguments.part.is_some() || !SESSION.contains(&arguments.only) {
         return Ok(());
     }
     let start = Instant::now();
-    let told = desk::test(&arguments.image, arguments.cara.as_deref()).context(DESK)?;
-    println!("{DESK:48} {:6.1} s  {told}", start.elapsed().as_secs_f64());
+    let told = session::test(&arguments.image, arguments.cara.as_deref()).context(SESSION)?;
+    println!("{SESSION:48} {:6.1} s  {told}", start.elapsed().as_secs_f64());
     Ok(())
 }
 
-/// The check of [`desk`].
-const DESK: &str = "a board on the desk answers what is typed";
+/// The check of [`session`].
+const SESSION: &str = "an emulator session answers what is typed";
 
 fn run(arguments: &Arguments) -> Result<()> {
     let bench = bench(arguments)?.with_constant(arguments.constant.clone());
@@ -174,7 +174,7 @@ fn run(arguments: &Arguments) -> Result<()> {
         println!("{:48} {:6.1} s  {told}", check.name, start.elapsed().as_secs_f64());
         passed += 1;
     }
-    if passed == 0 && !DESK.contains(&arguments.only) {
+    if passed == 0 && !SESSION.contains(&arguments.only) {
         bail!("no check has `{}` in its name", arguments.only);
     }
     println!("{passed} checks of firmware passed");

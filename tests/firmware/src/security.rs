@@ -50,7 +50,7 @@ struct Seat {
 /// A seat on which power is put, and its board.
 type Powered = Result<(Seat, Board)>;
 
-/// Boards, a new one for each visit. The desk belongs to another thread, which is asked for them.
+/// Boards, a new one for each visit. The bench belongs to another thread, which makes them.
 struct Boards {
     seats: Mutex<Vec<Seat>>,
     wanted: Mutex<Sender<(Seat, Sender<Powered>)>>,
@@ -136,8 +136,8 @@ impl Boards {
         // What the board before has dialled.
         while seat.listener.accept().is_ok() {}
         let (answer, powered) = channel();
-        lock(&self.wanted).send((seat, answer)).map_err(|_| anyhow::anyhow!("the desk is gone"))?;
-        powered.recv().context("the desk is gone")?
+        lock(&self.wanted).send((seat, answer)).map_err(|_| anyhow::anyhow!("the bench is gone"))?;
+        powered.recv().context("the bench is gone")?
     }
 }
 

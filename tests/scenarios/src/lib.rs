@@ -7,7 +7,7 @@
 //!
 //! ```
 //! use cara_scenarios::{Spec, Service, ports, secs};
-//! let mut world = ports::simulator(1, cara_scenarios::Weather::Rough, cara_core::config::Mode::Secured);
+//! let mut world = ports::simulator(1, cara_scenarios::FaultProfile::Rough, cara_core::config::Mode::Secured);
 //! let world = &mut *world;
 //! let manager = world.add(Spec::manager("manager", 1));
 //! world.add(Spec::agv("agv", 7).service(&Service::new("ping()")));
@@ -21,17 +21,17 @@ pub mod run;
 mod scenario;
 mod service;
 mod spec;
-mod stranger;
 pub mod suite;
 pub mod table;
+mod unknown_client;
 mod values;
 mod world;
 
 pub use measured::measurements;
 pub use rules::all;
-pub use scenario::{Need, Scenario, Weather};
-pub use service::{Asked, Diary, Service};
+pub use scenario::{FaultProfile, Need, Scenario};
+pub use service::{Asked, CallLog, Service};
 pub use spec::{Spec, SpecRole};
-pub use stranger::Stranger;
+pub use unknown_client::UnknownClient;
 pub use values::{boxed, millis, number, numbers, position, secs, text, variable};
 pub use world::{Fault, Node, Pending, PendingAll, Port, Seen, Unit, Unsupported, World};

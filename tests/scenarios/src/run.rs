@@ -8,7 +8,7 @@ use std::sync::Once;
 use cara_core::config::Mode;
 use cara_core::time::Duration;
 
-use crate::{Port, Scenario, Weather, World, ports};
+use crate::{FaultProfile, Port, Scenario, World, ports};
 
 /// What a run injected, reached and measured.
 #[derive(Clone, Debug, Default)]
@@ -52,13 +52,13 @@ pub(crate) const ON_PURPOSE: &str = "on purpose";
 pub type Failure = String;
 
 /// Runs a scenario once; a broken assertion comes back as text.
-pub fn once(scenario: &Scenario, port: Port, seed: u64, weather: Weather) -> Result<Report, Failure> {
+pub fn once(scenario: &Scenario, port: Port, seed: u64, profile: FaultProfile) -> Result<Report, Failure> {
     catch_quietly(|| {
         let mut world = match port {
-            Port::Simulator => ports::simulator(seed, weather, Mode::Plain),
-            Port::Secured => ports::simulator(seed, weather, Mode::Secured),
+            Port::Simulator => ports::simulator(seed, profile, Mode::Plain),
+            Port::Secured => ports::simulator(seed, profile, Mode::Secured),
             Port::Linux => ports::linux(scenario.needs),
-            Port::Embassy => ports::embassy(seed, weather, scenario.needs),
+            Port::Embassy => ports::embassy(seed, profile, scenario.needs),
         };
         (scenario.run)(&mut *world);
         world.report()

@@ -24,9 +24,9 @@ pub enum Need {
     /// A machine that sleeps.
     Suspend,
     /// Clients that are no unit, or none of this version or fleet.
-    Strangers,
+    UnknownClients,
     /// Such a client without a key, which is accepted or told why it is not.
-    UnprovenStrangers,
+    UnprovenClients,
     /// Connections that wait to be accepted, as many as come.
     Backlog,
     /// An interface that goes and comes.
@@ -57,8 +57,8 @@ impl Need {
         Self::Path,
         Self::AddressChange,
         Self::Suspend,
-        Self::Strangers,
-        Self::UnprovenStrangers,
+        Self::UnknownClients,
+        Self::UnprovenClients,
         Self::Backlog,
         Self::Interface,
         Self::ManyUnits,
@@ -82,7 +82,7 @@ impl Need {
     /// Of the simulator with secured units.
     const fn missing_on_secured(self) -> Option<&'static str> {
         match self {
-            Self::UnprovenStrangers => {
+            Self::UnprovenClients => {
                 Some("who proves nothing is neither taken nor told why; `tests/sim/tests/security` has what it tries")
             }
             _ => None,
@@ -107,8 +107,8 @@ impl Need {
             | Self::Freeze
             | Self::Reset
             | Self::SlowReader
-            | Self::Strangers
-            | Self::UnprovenStrangers
+            | Self::UnknownClients
+            | Self::UnprovenClients
             | Self::Backlog => {
                 return None;
             }
@@ -131,7 +131,7 @@ impl Need {
 
 /// What the network does by itself during the runs over many seeds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Weather {
+pub enum FaultProfile {
     /// Loss, delay, jitter, reordering, duplication, short partitions, split reads.
     Rough,
     /// Delay, jitter, reordering, duplication, split reads; nothing is lost.
@@ -148,10 +148,10 @@ pub struct Scenario {
     /// The rule that it shows: numbers of `docs/paper.md`, or the name of a behaviour that the design decides.
     pub rule: &'static str,
     /// What the network does by itself.
-    pub weather: Weather,
+    pub profile: FaultProfile,
     /// What it needs from the port.
     pub needs: &'static [Need],
-    /// Faults and states that its runs over many seeds must reach, beside those of its weather.
+    /// Faults and states that its runs over many seeds must reach, beside those of its fault profile.
     pub expects: &'static [&'static str],
     /// Runs it; panics where the rule is broken.
     pub run: fn(&mut dyn World),
@@ -163,25 +163,25 @@ impl Scenario {
         self.needs.iter().find_map(|need| need.missing_on(port))
     }
 
-    /// The faults that its weather injects.
-    pub fn weather_faults(&self) -> &'static [&'static str] {
-        match self.weather {
-            Weather::Rough => {
+    /// The faults that its profile injects.
+    pub fn profile_faults(&self) -> &'static [&'static str] {
+        match self.profile {
+            FaultProfile::Rough => {
                 &["loss", "retransmission", "delay", "jitter", "reorder", "duplicate", "split-read", "partition"]
             }
-            Weather::Light => &["delay", "jitter", "reorder", "duplicate", "split-read"],
-            Weather::Own => &[],
+            FaultProfile::Light => &["delay", "jitter", "reorder", "duplicate", "split-read"],
+            FaultProfile::Own => &[],
         }
     }
 }
 
-/// Declares the scenarios of a file: `scenarios![name: "rule", Weather, [needs], [expects]; …]`.
+/// Declares the scenarios of a file: `scenarios![name: "rule", FaultProfile, [needs], [expects]; …]`.
 macro_rules! scenarios {
-    ($($run:ident: $rule:literal, $weather:ident, [$($need:ident),*], [$($expects:literal),*];)*) => {
+    ($($run:ident: $rule:literal, $profile:ident, [$($need:ident),*], [$($expects:literal),*];)*) => {
         pub(super) const SCENARIOS: &[$crate::Scenario] = &[$($crate::Scenario {
             name: stringify!($run),
             rule: $rule,
-            weather: $crate::Weather::$weather,
+            profile: $crate::FaultProfile::$profile,
             needs: &[$($crate::Need::$need),*],
             expects: &[$($expects),*],
             run: $run,

@@ -1,4 +1,4 @@
-//! Services that both ports can run, and the diary of what they did.
+//! Services that both ports can run, and the log of what they did.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -18,7 +18,7 @@ pub struct Asked {
 
 type Body = dyn Fn(&Asked, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync;
 
-/// A service with its attributes; copies of it share one diary.
+/// A service with its attributes; copies of it share one log.
 #[derive(Clone)]
 pub struct Service {
     pub(crate) signature: String,
@@ -29,7 +29,7 @@ pub struct Service {
     pub(crate) priority: Priority,
     pub(crate) lease: Option<Duration>,
     pub(crate) in_turns: bool,
-    diary: Arc<Diary>,
+    log: Arc<CallLog>,
 }
 
 impl Service {
@@ -44,7 +44,7 @@ impl Service {
             priority: Priority::Normal,
             lease: None,
             in_turns: false,
-            diary: Arc::new(Diary::default()),
+            log: Arc::new(CallLog::default()),
         }
     }
 
@@ -61,7 +61,7 @@ impl Service {
         Self { takes: span, ..self }
     }
 
-    /// Its handler moves once in each `span` for as long as its call is wanted, and answers then. The diary notes the call's
+    /// Its handler moves once in each `span` for as long as its call is wanted, and answers then. The log notes the call's
     /// int `n` at each move.
     pub fn moves_every(self, span: Duration) -> Self {
         Self { moves_every: Some(span), ..self }
@@ -96,13 +96,13 @@ impl Service {
     /// Moves once, if the call of these parameters is wanted; the pause until the next move.
     pub(crate) fn moves_on(&self, is_wanted: bool, parameters: &ParametersView) -> Option<Duration> {
         let pause = self.moves_every.filter(|_| is_wanted)?;
-        self.diary.note(parameters.variable("n").ok()?);
+        self.log.note(parameters.variable("n").ok()?);
         Some(pause)
     }
 
     /// What it did so far, in all copies.
-    pub fn diary(&self) -> Arc<Diary> {
-        Arc::clone(&self.diary)
+    pub fn log(&self) -> Arc<CallLog> {
+        Arc::clone(&self.log)
     }
 
     /// The function's name.
@@ -113,71 +113,71 @@ impl Service {
 
 /// What a service did, and when.
 #[derive(Default)]
-pub struct Diary(Mutex<Pages>);
+pub struct CallLog(Mutex<Entries>);
 
 #[derive(Default)]
-struct Pages {
+struct Entries {
     began: Vec<Instant>,
     ended: Vec<Instant>,
     stops: Vec<Instant>,
     values: Vec<i64>,
 }
 
-impl Diary {
-    fn pages(&self) -> MutexGuard<'_, Pages> {
+impl CallLog {
+    fn entries(&self) -> MutexGuard<'_, Entries> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// How often its handler began.
     pub fn runs(&self) -> usize {
-        self.pages().began.len()
+        self.entries().began.len()
     }
 
     /// When its handler began.
     pub fn began(&self) -> Vec<Instant> {
-        self.pages().began.clone()
+        self.entries().began.clone()
     }
 
     /// When its handler ended.
     pub fn ended(&self) -> Vec<Instant> {
-        self.pages().ended.clone()
+        self.entries().ended.clone()
     }
 
     /// When its safe hook ran.
     pub fn stops(&self) -> Vec<Instant> {
-        self.pages().stops.clone()
+        self.entries().stops.clone()
     }
 
     /// The first int of the variable `n` of each run, as noted by a body that calls [`Self::note`].
     pub fn values(&self) -> Vec<i64> {
-        self.pages().values.clone()
+        self.entries().values.clone()
     }
 
     /// Notes a value.
     pub fn note(&self, value: i64) {
-        self.pages().values.push(value);
+        self.entries().values.push(value);
     }
 
     pub(crate) fn begin(&self, at: Instant) {
-        self.pages().began.push(at);
+        self.entries().began.push(at);
     }
 
     pub(crate) fn end(&self, at: Instant) {
-        self.pages().ended.push(at);
+        self.entries().ended.push(at);
     }
 
     pub(crate) fn stop(&self, at: Instant) {
-        self.pages().stops.push(at);
+        self.entries().stops.push(at);
     }
 }
 
 impl Service {
-    /// A service with one int `n`, which its diary notes at each run.
+    /// A service with one int `n`, which its log notes at each run.
     pub fn numbered(name: &str) -> Self {
         let service = Self::new(&format!("{name}(n: int[1]) -> (n: int[1])"));
-        let diary = service.diary();
+        let log = service.log();
         service.does(move |_, parameters| {
-            diary.note(parameters.variable::<i64>("n").map_err(|_| ServiceError::BadResults)?);
+            log.note(parameters.variable::<i64>("n").map_err(|_| ServiceError::BadResults)?);
             Ok(())
         })
     }

@@ -57,7 +57,7 @@ fn run_all(scenarios: &[Scenario], port: Port, threads: usize) -> Vec<Ended> {
 fn bounded(scenario: Scenario, port: Port) -> Result<(), Failure> {
     let (sender, receiver) = mpsc::channel();
     thread::spawn(move || {
-        let _ = sender.send(run::once(&scenario, port, SEED, scenario.weather).map(drop));
+        let _ = sender.send(run::once(&scenario, port, SEED, scenario.profile).map(drop));
     });
     receiver.recv_timeout(LIMIT).unwrap_or_else(|_| Err(format!("not over after {} s", LIMIT.as_secs())))
 }

@@ -15,13 +15,14 @@ const HEAD: &str = "# Scenarios
 
 Each rule is a function in `tests/scenarios/src/rules`, run on every port that can. `cargo test --package
 cara-scenarios` runs each once; `cargo run --release --package cara-scenarios --bin seeds` runs each for 1,000 seeds on
-the simulator. A rule's numbers are those of [paper.md](paper.md). Weather is what the network does by itself in those
-runs: rough is loss, delay, jitter, reordering, duplication, short partitions and split reads; light is the same without
-loss and partitions; own is only what the scenario injects. On Linux units have keys, as is the default, but where
-strangers come, who speak plain; on the simulator and on boards they are plain, and `--test secured` runs the rules once
-more on the simulator with keys. A letter instead of a port's ✓ leads to the reason below.
+the simulator. A rule's numbers are those of [paper.md](paper.md). The column *faults* names the fault profile of the
+simulated network: rough is loss, delay, jitter, reordering, duplication, short partitions and split reads; light is the
+same without loss and partitions; own is only what the scenario injects. On Linux units have keys, as is the default,
+except in scenarios with unknown clients, which speak plain. On the simulator and on boards units are plain, and
+`--test secured` runs the rules once more on the simulator with keys. A letter instead of a port's ✓ leads to the reason
+below.
 
-| scenario | rule | weather | simulator | with keys | Linux | embassy |
+| scenario | rule | faults | simulator | with keys | Linux | embassy |
 |---|---|---|---|---|---|---|
 ";
 
@@ -36,10 +37,10 @@ const PORTS: [(Port, &str); 3] = [
 pub fn text() -> String {
     let mut text = HEAD.to_owned();
     for scenario in all() {
-        let Scenario { name, rule, weather, .. } = scenario;
-        let weather = format!("{weather:?}").to_lowercase();
+        let Scenario { name, rule, profile, .. } = scenario;
+        let profile = format!("{profile:?}").to_lowercase();
         let cells: Vec<String> = PORTS.iter().map(|(port, _)| cell(&scenario, *port)).collect();
-        let _ = writeln!(text, "| `{name}` | {rule} | {weather} | ✓ | {} |", cells.join(" | "));
+        let _ = writeln!(text, "| `{name}` | {rule} | {profile} | ✓ | {} |", cells.join(" | "));
     }
     for (port, what) in PORTS {
         let _ = writeln!(text, "\nWhy a scenario does not run on {what}:\n");

@@ -17,7 +17,7 @@ use cara_core::services::unit::RequestOptions;
 use cara_core::time::{Duration, Instant};
 use cara_sim::{BoxedParameters, Path};
 
-use crate::{Need, Service, Spec, Stranger, boxed, secs};
+use crate::{Need, Service, Spec, UnknownClient, boxed, secs};
 
 /// Events of each unit that a failure shows.
 const LAST_EVENTS: usize = 12;
@@ -71,7 +71,7 @@ pub enum Fault<'u> {
     /// What the first sends in streams is read at so many bytes a second by the second.
     SlowReader(&'u Unit, &'u Unit, usize),
     /// A client that is no unit, or a misbehaving one, connects to the manager.
-    Stranger(&'u Unit, Stranger),
+    UnknownClient(&'u Unit, UnknownClient),
     /// The unit's only interface goes down.
     Unplug(&'u Unit),
     /// It comes back up.

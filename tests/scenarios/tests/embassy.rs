@@ -1,4 +1,4 @@
-//! Every scenario that boards can, on a switch in memory and in virtual time, in the weather that it says.
+//! Every scenario that boards can, on a switch in memory and in virtual time, under its fault profile.
 
 use std::process::ExitCode;
 

@@ -1,4 +1,4 @@
-//! Every scenario once on the simulator, in the weather that it says.
+//! Every scenario once on the simulator, under its fault profile.
 
 use std::process::ExitCode;
 

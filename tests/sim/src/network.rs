@@ -41,7 +41,7 @@ pub struct Network {
     by_address: BTreeMap<Ipv4Addr, Vec<HostId>>,
     ends: Vec<End>,
     calm: Path,
-    weather: Option<(u32, Path)>,
+    fault_profile: Option<(u32, Path)>,
     paths: BTreeMap<(HostId, HostId), (u32, Path)>,
     wires: BTreeMap<(HostId, HostId), Wire>,
     partitions: Vec<Partition>,
@@ -139,7 +139,7 @@ enum Happening {
         host: HostId,
         life: u32,
     },
-    WeatherEnds {
+    FaultProfileEnds {
         number: u32,
     },
     PathRecovers {
@@ -166,7 +166,7 @@ impl Network {
             by_address: BTreeMap::new(),
             ends: Vec::new(),
             calm: Path::LAN,
-            weather: None,
+            fault_profile: None,
             paths: BTreeMap::new(),
             wires: BTreeMap::new(),
             partitions: Vec::new(),
@@ -268,7 +268,9 @@ impl Network {
             Happening::Thaw { freeze } => self.thaw_if_due(freeze),
             Happening::Restart { host, life } if self.host(host).life == life => self.restart(host),
             Happening::Restart { .. } => (),
-            Happening::WeatherEnds { number } => self.weather = self.weather.filter(|(current, _)| *current != number),
+            Happening::FaultProfileEnds { number } => {
+                self.fault_profile = self.fault_profile.filter(|(current, _)| *current != number)
+            }
             Happening::PathRecovers { from, to, number } => self.path_recovers(from, to, number),
             Happening::Missed(event) => self.see_missed(event),
             Happening::SegmentHeard { segment } => self.quiet_segments.retain(|quiet| *quiet != segment),
@@ -298,7 +300,7 @@ impl Network {
 
     fn path(&self, from: HostId, to: HostId) -> Path {
         let special = if self.paths.is_empty() { None } else { self.paths.get(&(from, to)) };
-        special.or(self.weather.as_ref()).map_or(self.calm, |(_, path)| *path)
+        special.or(self.fault_profile.as_ref()).map_or(self.calm, |(_, path)| *path)
     }
 
     /// When something that leaves at `at` arrives.

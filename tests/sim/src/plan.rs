@@ -20,7 +20,7 @@ pub enum Crash {
 #[derive(Clone, Debug, PartialEq)]
 pub enum Action {
     /// All paths get this quality for a while.
-    Weather {
+    FaultProfile {
         /// The quality.
         path: Path,
         /// How long.
@@ -213,7 +213,7 @@ impl FaultPlan {
         let span = Duration::from_millis(1) + self.random.jitter(self.longest);
         let (host, other) = self.pair(hosts);
         let action = match self.random.below(17) {
-            0..4 => Action::Weather { path: self.quality(), span },
+            0..4 => Action::FaultProfile { path: self.quality(), span },
             4..6 => Action::Degrade { from: host, to: other, path: self.quality(), span },
             6..8 => self.cut(hosts, span),
             8 => Action::Freeze { from: host, to: other, span },

@@ -1,11 +1,11 @@
-//! `cargo xtask firmware` and `cargo xtask sizes`: what runs on boards is built, measured and put on a desk.
+//! `cargo xtask firmware` and `cargo xtask sizes`: what runs on boards is built, measured and run in an emulator.
 
-mod bill;
 mod boards;
-mod desk;
+mod breakdown;
 mod faults;
 mod flash;
 mod image;
+mod session;
 mod sizes;
 mod uf2;
 
@@ -21,9 +21,9 @@ use crate::groups::Outcome;
 use crate::{install, msrv};
 use boards::{BOARDS, Board};
 pub(crate) use boards::{built, find, image_build};
-pub(crate) use desk::{Who, desk};
 pub(crate) use faults::{Faults, check as check_faults, faults};
 pub(crate) use flash::flash;
+pub(crate) use session::{SessionOptions, session};
 pub(crate) use sizes::{check as check_sizes, sizes};
 
 /// Builds the images of one board, or of all of them, with the files that are flashed beside them.

@@ -120,7 +120,7 @@ enum Task {
         #[arg(long, requires = "board")]
         flash: bool,
         #[command(flatten)]
-        desk: firmware::Who,
+        session: firmware::SessionOptions,
     },
 }
 
@@ -140,7 +140,7 @@ fn main() -> ExitCode {
         Task::Faults(faults) => firmware::faults(&faults),
         Task::Bench(options) => bench::run(&options),
         Task::Firmware { board: Some(board), flash: true, .. } => firmware::flash(&board),
-        Task::Firmware { board, desk, .. } if desk.run => firmware::desk(board.as_deref(), &desk),
+        Task::Firmware { board, session, .. } if session.run => firmware::session(board.as_deref(), &session),
         Task::Firmware { board, .. } => firmware::build(board.as_deref()),
     };
     finished.unwrap_or_else(|error| {

@@ -15,7 +15,7 @@ pub(super) const NONE: u16 = u16::MAX;
 
 /// Capacity for nodes that were heard of and have never joined: the oldest gives way to the next. However many names an
 /// attacker makes up, they displace at most this many disconnected nodes from a full table.
-pub(super) const STRANGERS: usize = 8;
+pub(super) const UNJOINED: usize = 8;
 
 /// One row of the table's orders; ports allocate a slice of default ones. It belongs to no node in particular.
 #[derive(Clone, Copy, Debug)]
@@ -64,7 +64,7 @@ pub(super) struct Table<S: Storage> {
     oldest: u16,
     youngest: u16,
     /// Places of nodes that were heard of and have not joined, in that order.
-    strangers: heapless::Vec<u16, STRANGERS>,
+    unjoined: heapless::Vec<u16, UNJOINED>,
 }
 
 impl<S: Storage> Table<S> {
@@ -79,7 +79,7 @@ impl<S: Storage> Table<S> {
             m_units: 0,
             oldest: NONE,
             youngest: NONE,
-            strangers: heapless::Vec::new(),
+            unjoined: heapless::Vec::new(),
         }
     }
 
@@ -174,29 +174,29 @@ impl<S: Storage> Table<S> {
     }
 
     /// The place of a node that was heard of, new if need be; `true` when another one had to be forgotten for it. `None`
-    /// when there is no room for one more stranger.
+    /// when there is no capacity for another unjoined node.
     pub(super) fn hear_of(&mut self, identity: &Identity, address: SocketAddr, epoch: Epoch) -> Option<(usize, bool)> {
         if let Some(place) = self.find(identity) {
             return Some((place, false));
         }
-        let (place, forgotten) = if self.strangers.is_full() {
-            let stranger = self.idle_stranger()?;
-            self.forget(stranger)?;
-            (self.settle(stranger, identity, address, epoch)?, true)
+        let (place, forgotten) = if self.unjoined.is_full() {
+            let idle = self.idle_unjoined()?;
+            self.forget(idle)?;
+            (self.settle(idle, identity, address, epoch)?, true)
         } else {
             self.place_of(identity, address, epoch)?
         };
-        let _ = self.strangers.push(u16::try_from(place).ok()?);
+        let _ = self.unjoined.push(u16::try_from(place).ok()?);
         Some((place, forgotten))
     }
 
-    /// The stranger that was heard of first, of those that are not being dialled.
-    fn idle_stranger(&self) -> Option<usize> {
+    /// The unjoined node that was heard of first, of those that are not being dialled.
+    fn idle_unjoined(&self) -> Option<usize> {
         let away = |place: &usize| self.node(*place).is_some_and(|known| known.state == NodeState::Away);
-        self.strangers.iter().copied().map(usize::from).find(away)
+        self.unjoined.iter().copied().map(usize::from).find(away)
     }
 
-    /// The place of an identity, new if need be; `true` when a stranger, or else the node that was away longest, had to
+    /// The place of an identity, new if need be; `true` when an unjoined node, or else the node that was away longest, had to
     /// be forgotten for it. `None` when every place is taken by a node that is connected or being dialled.
     pub(super) fn place_of(&mut self, identity: &Identity, address: SocketAddr, epoch: Epoch) -> Option<(usize, bool)> {
         if let Some(place) = self.find(identity) {
@@ -206,7 +206,7 @@ impl<S: Storage> Table<S> {
         let (place, forgotten) = if self.len < capacity {
             (self.len, false)
         } else {
-            let oldest = self.idle_stranger().unwrap_or(usize::from(self.oldest));
+            let oldest = self.idle_unjoined().unwrap_or(usize::from(self.oldest));
             self.forget(oldest)?;
             (oldest, true)
         };
@@ -231,7 +231,7 @@ impl<S: Storage> Table<S> {
         let at = self.search(&self.node(place)?.identity).ok()?;
         self.cancel(place);
         self.end_rest(place);
-        self.strangers.retain(|stranger| usize::from(*stranger) != place);
+        self.unjoined.retain(|unjoined| usize::from(*unjoined) != place);
         let mut carried = NONE;
         for row in self.order.get_mut(at..self.len)?.iter_mut().rev() {
             core::mem::swap(&mut row.sorted, &mut carried);
@@ -267,7 +267,7 @@ impl<S: Storage> Table<S> {
 
     /// Gives a node that joins for the first time the lowest index that is free among its role.
     pub(super) fn keep_index(&mut self, place: usize) {
-        self.strangers.retain(|stranger| usize::from(*stranger) != place);
+        self.unjoined.retain(|unjoined| usize::from(*unjoined) != place);
         let Some(known) = self.node(place).filter(|known| known.index == NONE) else { return };
         let role = known.identity.role();
         let free = self.order.iter().position(|row| row.of(role) == NONE);

@@ -216,8 +216,8 @@ impl Looking {
             let known = neighbours(&fs::read_to_string("/proc/net/arp").unwrap_or_default());
             let ports = self.evidence.ports.numbers();
             let at = |ip| ports.iter().map(move |port| SocketAddr::new(IpAddr::V4(ip), *port));
-            let strangers = known.into_iter().flat_map(at);
-            targets.extend(strangers.take(MOST_ALONE));
+            let unknown = known.into_iter().flat_map(at);
+            targets.extend(unknown.take(MOST_ALONE));
         }
         for target in targets.iter().take(MOST_ALONE) {
             // What is not sent is not answered.

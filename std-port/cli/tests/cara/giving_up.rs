@@ -14,7 +14,7 @@ const WAYS: [&[&str]; 2] = [&["call", "lifter", "lift"], &["call", "lifter", "--
 
 /// What a vehicle has done so far.
 #[derive(Default)]
-struct Diary {
+struct EventLog {
     began: AtomicU32,
     ended: AtomicU32,
     made_safe: AtomicU32,
@@ -23,15 +23,15 @@ struct Diary {
 /// A vehicle whose service moves for as long as it is wanted, and answers then.
 struct Lifter {
     unit: Unit,
-    diary: Arc<Diary>,
+    log: Arc<EventLog>,
 }
 
 impl Lifter {
     fn join(stage: &Stage) -> Self {
         stage.know("lifter", 98);
         let unit = stage.vehicle("lifter", 98).build_unit().unwrap();
-        let diary = Arc::new(Diary::default());
-        let (moved, stopped) = (diary.clone(), diary.clone());
+        let log = Arc::new(EventLog::default());
+        let (moved, stopped) = (log.clone(), log.clone());
         let lift = move |call: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
             moved.began.fetch_add(1, Ordering::SeqCst);
             call.lease.as_ref().unwrap().wait_until_ended();
@@ -46,15 +46,15 @@ impl Lifter {
         unit.publish_my_function_list().unwrap();
         unit.start().unwrap();
         until("the lift is offered", || stage.cara(&["functions", "lifter"]).out.contains("lift()"));
-        Self { unit, diary }
+        Self { unit, log }
     }
 
     /// Its motion has ended, and its safe hook has run, as often as this; it is still its manager's.
     fn has_stopped(&self, times: u32) {
         let count = |counter: &AtomicU32| counter.load(Ordering::SeqCst);
-        until("the safe hook runs", || count(&self.diary.made_safe) == times);
-        until("the motion ends", || count(&self.diary.ended) == times);
-        assert_eq!(count(&self.diary.began), times);
+        until("the safe hook runs", || count(&self.log.made_safe) == times);
+        until("the motion ends", || count(&self.log.ended) == times);
+        assert_eq!(count(&self.log.began), times);
         assert!(self.unit.is_connected(), "the manager has gone, and that is what stopped it");
     }
 }
@@ -75,7 +75,7 @@ fn what_is_killed_while_it_waits_stops_though_the_manager_goes_on() {
     let lifter = Lifter::join(&stage);
     for (way, times) in WAYS.into_iter().zip(1..) {
         let mut waiting = Running::start(stage.command(way));
-        until("the lift begins", || lifter.diary.began.load(Ordering::SeqCst) == times);
+        until("the lift begins", || lifter.log.began.load(Ordering::SeqCst) == times);
         waiting.kill();
         lifter.has_stopped(times);
     }

@@ -28,7 +28,7 @@ fn a_plain_node_of_a_secured_manager_and_the_other_way_round_is_told() {
     let clinic = Clinic::new();
     let secured = manager(&clinic, |boss| boss);
     let _agv = clinic.started(clinic.unit("agv", 7, "boss").insecure());
-    for told in [clinic.doctor(&["agv"]), clinic.stranger(&["agv"]), clinic.doctor(&["--listen", "3s"])] {
+    for told in [clinic.doctor(&["agv"]), clinic.doctor_elsewhere(&["agv"]), clinic.doctor(&["--listen", "3s"])] {
         told.is(&["mode-mismatch"], 4);
         assert!(told.found(0).contains("agv/7 at ") && told.found(0).contains("boss/1 is secured"), "{told:?}");
     }
@@ -36,7 +36,7 @@ fn a_plain_node_of_a_secured_manager_and_the_other_way_round_is_told() {
     let clinic = Clinic::new();
     let _plain = manager(&clinic, |boss| boss.insecure());
     let _agv = clinic.started(clinic.unit("agv", 7, "boss"));
-    for told in [clinic.doctor(&["agv"]), clinic.stranger(&["agv"]), clinic.doctor(&["--listen", "3s"])] {
+    for told in [clinic.doctor(&["agv"]), clinic.doctor_elsewhere(&["agv"]), clinic.doctor(&["--listen", "3s"])] {
         told.is(&["mode-mismatch"], 4);
         assert!(told.found(0).contains("boss/1 is in plain mode"), "{told:?}");
     }
@@ -110,7 +110,7 @@ fn a_change_of_keys_that_left_a_node_behind_is_told() {
         assert!(told.found(0).contains("with generation 1 ") && told.found(0).contains("generation 2:"), "{told:?}");
     }
     // As on another host: both were heard, and neither takes the other.
-    clinic.stranger(&["agv"]).is(&["key-generations"], 4);
+    clinic.doctor_elsewhere(&["agv"]).is(&["key-generations"], 4);
 }
 
 #[test]
@@ -139,5 +139,5 @@ fn a_fleet_in_plain_mode_is_looked_at_in_plain_mode() {
     until("it has come", || plain.number_of_s_units() == 1);
     clinic.doctor_with_keys(nothing.path(), &["agv"]).is(&["connected"], 0);
     clinic.doctor_with_keys(nothing.path(), &["--listen", "3s", "--insecure"]).is(&[], 0);
-    clinic.stranger(&["boss", "--insecure"]).is(&["answers"], 0);
+    clinic.doctor_elsewhere(&["boss", "--insecure"]).is(&["answers"], 0);
 }

@@ -127,7 +127,7 @@ impl Clinic {
     }
 
     /// What it says where no unit can be asked.
-    pub(crate) fn stranger(&self, arguments: &[&str]) -> Told {
+    pub(crate) fn doctor_elsewhere(&self, arguments: &[&str]) -> Told {
         self.told(arguments, private_directory().path(), self.keys.path())
     }
 

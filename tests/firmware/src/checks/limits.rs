@@ -29,7 +29,7 @@ pub(super) fn oversize(bench: &Bench, _: u32) -> Result<String> {
 }
 
 /// The address of a false manager that breaks the limits.
-const STRANGER: &str = "10.77.0.1:4000";
+const FALSE_MANAGER: &str = "10.77.0.1:4000";
 /// A frame's header that announces the longest body there is.
 const TOO_LONG: [u8; 2] = u16::MAX.to_le_bytes();
 /// The frame that ends a link, and its code for what is too long (`docs/wire.md`, Frames).
@@ -43,8 +43,8 @@ const TOLD: usize = 3;
 /// taken its last words, they are lost with the link that they end.
 pub(super) fn breaks_its_limit(bench: &Bench, _: u32) -> Result<String> {
     let cable = bench.cable()?;
-    let listener = TcpListener::bind(STRANGER)?;
-    let _board = bench.board(&cable, &Who { manager_address: Some(STRANGER), ..Who::agv(17) })?;
+    let listener = TcpListener::bind(FALSE_MANAGER)?;
+    let _board = bench.board(&cable, &Who { manager_address: Some(FALSE_MANAGER), ..Who::agv(17) })?;
     let (mut told, mut cut) = (0, 0);
     while told < TOLD {
         ensure!(told + cut < LINKS, "{told} of {LINKS} links ended with the code");

@@ -31,7 +31,7 @@ const LEFT: &str = "depot has left";
 const HOOK: &str = "hook for the lost manager";
 
 /// A board with its cable.
-pub(super) struct Desk {
+pub(super) struct EmulatedBoard {
     pub(super) board: Board,
     pub(super) cable: Cable,
     pub(super) keys: Rc<Keys>,
@@ -47,7 +47,7 @@ struct Drive {
     line: usize,
 }
 
-impl Target for Desk {
+impl Target for EmulatedBoard {
     fn name(&self) -> &'static str {
         "emulated board"
     }
@@ -80,7 +80,7 @@ impl Target for Desk {
     }
 }
 
-impl Desk {
+impl EmulatedBoard {
     pub(super) fn new(bench: &Bench) -> Result<Self> {
         let cable = bench.cable()?;
         let who = Who::agv(17);

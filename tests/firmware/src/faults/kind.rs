@@ -3,7 +3,7 @@
 use anyhow::{Context, Result, ensure};
 use cara_std::{Constraints, Duration};
 
-use super::inject::Desk;
+use super::inject::EmulatedBoard;
 use super::processes::Processes;
 use super::{Stop, Target};
 use crate::board::{Bench, Way};
@@ -79,7 +79,7 @@ impl Kind {
     pub(super) fn target(&self, bench: &Bench) -> Result<Box<dyn Target>> {
         Ok(match self.failing {
             Failing::StateHeld | Failing::SecondManager => Box::new(Processes),
-            _ => Box::new(Desk::new(bench)?),
+            _ => Box::new(EmulatedBoard::new(bench)?),
         })
     }
 

@@ -8,7 +8,7 @@ use anyhow::{Context, Result, ensure};
 use cara_std::{Error, Parameters, Peer, RequestOptions};
 
 use super::Stop;
-use super::inject::{Desk, ON, STANDS, pause};
+use super::inject::{EmulatedBoard, ON, STANDS, pause};
 use super::kind::TIMEOUT;
 use crate::board::{FLEET, LONG, Way};
 use crate::keys::MANAGER;
@@ -21,7 +21,7 @@ const NEVER: i64 = 600_000;
 /// Of the image's tasks that look at their leases.
 const LOOKS: Duration = Duration::from_secs(1);
 
-impl Desk {
+impl EmulatedBoard {
     /// A call ends, and the next one comes before the first one's task has looked again.
     pub(super) fn task_looks_rarely(&self, dice: &mut fastrand::Rng) -> Result<Stop> {
         let manager = Manager::start(&self.keys)?;

@@ -18,7 +18,7 @@ use cara_scenarios::{Port, Scenario, all, measurements};
 
 /// Seeds of a quick run.
 const QUICK: u64 = 50;
-/// Below this many seeds the faults of the weather are not required.
+/// Below this many seeds the faults of the profile are not required.
 const FEW: u64 = 500;
 /// Failures that are shown of one scenario.
 const SHOWN: usize = 3;
@@ -154,7 +154,7 @@ fn run_each(scenario: &Scenario, port: Port, seeds: &[u64]) -> (Report, Vec<(u64
     let work = || {
         let (mut report, mut failures) = (Report::default(), Vec::new());
         while let Some(&seed) = seeds.get(next.fetch_add(1, Ordering::Relaxed)) {
-            match once(scenario, port, seed, scenario.weather) {
+            match once(scenario, port, seed, scenario.profile) {
                 Ok(run) => report.merge(run),
                 Err(failure) => failures.push((seed, failure)),
             }
@@ -176,9 +176,9 @@ fn run_each(scenario: &Scenario, port: Port, seeds: &[u64]) -> (Report, Vec<(u64
 
 /// What the runs should have injected or reached, and did not.
 fn missing(scenario: &Scenario, report: &Report, few: bool) -> Vec<&'static str> {
-    // In few runs of a scenario that sends a few datagrams, the weather may well spare them all.
-    let weather = if few { &[] } else { scenario.weather_faults() };
-    let expected = weather.iter().chain(scenario.expects);
+    // In few runs of a scenario that sends a few datagrams, the profile may well spare them all.
+    let profile = if few { &[] } else { scenario.profile_faults() };
+    let expected = profile.iter().chain(scenario.expects);
     expected.copied().filter(|name| !report.has(name)).collect()
 }
 

@@ -31,14 +31,14 @@ use super::keys::Keys;
 use super::relay::{Relay, Way};
 use crate::run::Report;
 use crate::{
-    Asked, Fault, Need, Node, Pending, PendingAll, Port, Seen, Service, Spec, SpecRole, Stranger, Unit, Unsupported,
-    World, boxed,
+    Asked, Fault, Need, Node, Pending, PendingAll, Port, Seen, Service, Spec, SpecRole, Unit, UnknownClient,
+    Unsupported, World, boxed,
 };
 
 /// How often a waiting scenario looks.
 const LOOK: std::time::Duration = std::time::Duration::from_millis(1);
 
-/// How long a stranger waits for an answer.
+/// How long an unknown client waits for an answer.
 const ANSWER: std::time::Duration = std::time::Duration::from_secs(5);
 
 pub(super) struct LinuxWorld {
@@ -123,16 +123,16 @@ impl LinuxWorld {
         Ok(())
     }
 
-    fn stranger(&mut self, unit: &Unit, stranger: Stranger) {
+    fn unknown_client(&mut self, unit: &Unit, client: UnknownClient) {
         let node = Arc::clone(&self.units[unit.number()]);
         let manager = (Ipv4Addr::LOCALHOST, node.tcp_port().expect("a manager runs"));
         let socket = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).expect("a socket");
         socket.set_broadcast(true).expect("it may broadcast");
-        for datagram in stranger.datagrams(node.fleet) {
+        for datagram in client.datagrams(node.fleet) {
             socket.send_to(&datagram, (Ipv4Addr::new(127, 255, 255, 255), PLAIN_PORT)).expect("loopback is up");
         }
         let mut heard = Vec::new();
-        for visit in stranger.visits(&unit.identity(), node.fleet) {
+        for visit in client.visits(&unit.identity(), node.fleet) {
             let mut stream = TcpStream::connect(manager).expect("the manager listens");
             stream.set_read_timeout(Some(ANSWER)).expect("a span above zero");
             // The unit may close the connection while garbage is still being written.
@@ -143,10 +143,10 @@ impl LinuxWorld {
                 let _ = stream.read_to_end(&mut heard);
             }
         }
-        if stranger.is_told().is_some_and(|told| told == heard) {
-            self.reached("stranger was told");
+        if client.is_told().is_some_and(|told| told == heard) {
+            self.reached("client was told");
         }
-        if let Stranger::Silent(count) = stranger {
+        if let UnknownClient::Silent(count) = client {
             for _ in 0..count {
                 self.silent.push(TcpStream::connect(manager).expect("the manager listens"));
             }
@@ -212,8 +212,8 @@ impl World for LinuxWorld {
                 return self.on_relay(from, to, |relay, way| relay.slow_down(way, pace), Need::SlowReader);
             }
             Fault::Reset(unit) => return self.on_relay(unit, unit, |relay, _| relay.reset(), Need::Reset),
-            Fault::Stranger(unit, stranger) => {
-                self.stranger(unit, stranger);
+            Fault::UnknownClient(unit, client) => {
+                self.unknown_client(unit, client);
                 return Ok(());
             }
             Fault::PowerCut(_) | Fault::Kill(_) | Fault::Restart(_) => Need::Crash,
@@ -346,11 +346,11 @@ impl LinuxNode {
 
     fn add(self: &Arc<Self>, service: &Service, replace: bool) -> Result<(), Error> {
         let definition = Definition::parse(&service.signature).map_err(|_| Error::BadName)?;
-        let diary = service.diary();
+        let log = service.log();
         let start = self.start;
         let mut options = ServiceOptions::new().priority(service.priority);
         if let Some(length) = service.lease {
-            options = options.lease(length, move || diary.stop(since(start)));
+            options = options.lease(length, move || log.stop(since(start)));
         }
         let (kept, node) = (service.clone(), Arc::downgrade(self));
         let in_turns = service.in_turns;
@@ -382,7 +382,7 @@ fn serve(
     parameters: &mut ParametersView,
 ) -> Result<(), ServiceError> {
     let node = node.upgrade().ok_or(ServiceError::NotReady)?;
-    service.diary().begin(node.now());
+    service.log().begin(node.now());
     if let Some(function) = &service.calls_back {
         let peer = node.peer(call.caller.name()).map_err(|_| ServiceError::NotReady)?;
         peer.block_request(function, parameters).map_err(|_| ServiceError::NotReady)?;
@@ -394,7 +394,7 @@ fn serve(
     while let Some(pause) = service.moves_on(call.lease.as_ref().is_some_and(LeaseWatch::is_live), parameters) {
         thread::sleep(pause.into());
     }
-    service.diary().end(node.now());
+    service.log().end(node.now());
     Ok(())
 }
 
@@ -542,7 +542,7 @@ impl Node for Handle {
     }
 
     fn request_all(&self, function: &str, parameters: &ParametersView) -> Vec<(Identity, Result<CallId, Error>)> {
-        let system = self.system().inspect(retire_strangers);
+        let system = self.system().inspect(retire_unknown_clients);
         let requested = system.map(|system| system.request_all(function, parameters)).unwrap_or_default();
         requested.into_iter().map(|(peer, result)| (peer.identity().clone(), result)).collect()
     }
@@ -566,7 +566,7 @@ impl Node for Handle {
         copy.copy_from(parameters).expect("what is asked of all is short");
         let system = self.system();
         thread::spawn(move || {
-            let system = system.inspect(retire_strangers);
+            let system = system.inspect(retire_unknown_clients);
             let outcomes = system.map(|system| system.block_request_all(&function, &copy, &RequestOptions::default()));
             let short = |(peer, outcome): (Peer, Result<_, Error>)| (peer.identity().clone(), outcome.map(drop));
             told.end(outcomes.map(|outcomes| outcomes.into_iter().map(short).collect()), node.now());
@@ -648,7 +648,7 @@ fn seen(event: UnitEvent) -> Option<Seen> {
 }
 
 /// All units of all scenarios have keys: those that this one has not started are not missed.
-fn retire_strangers(system: &CommunicationSystem) {
+fn retire_unknown_clients(system: &CommunicationSystem) {
     let never_joined = |peer: &&Peer| !peer.is_connected() && peer.left().is_none();
-    system.roster().iter().filter(never_joined).for_each(|stranger| assert!(stranger.retire()));
+    system.roster().iter().filter(never_joined).for_each(|client| assert!(client.retire()));
 }

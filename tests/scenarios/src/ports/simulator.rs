@@ -22,11 +22,11 @@ use cara_sim::{Action, Chance, Crash, Direction, HostId, Path, StreamId, UnitEve
 use super::lent;
 use crate::run::Report;
 use crate::{
-    Asked, Fault, Node, Pending, PendingAll, Port, Seen, Service, Spec, SpecRole, Stranger, Unit, Unsupported, Weather,
-    World, boxed, millis, secs,
+    Asked, Fault, FaultProfile, Node, Pending, PendingAll, Port, Seen, Service, Spec, SpecRole, Unit, UnknownClient,
+    Unsupported, World, boxed, millis, secs,
 };
 
-/// How long the weather of a run lasts: longer than any run.
+/// How long the fault profile of a run lasts: longer than any run.
 const ALWAYS: Duration = Duration::from_secs(24 * 3_600);
 /// How a service calls its caller back.
 const PATIENT: RequestOptions = RequestOptions {
@@ -37,16 +37,16 @@ const PATIENT: RequestOptions = RequestOptions {
 };
 /// Where simulated m_units listen.
 const M_UNIT_PORT: u16 = 7_000;
-/// How long the beginning of a run is worse than the rest, in rough weather.
+/// How long the beginning of a run is worse than the rest, under the rough profile.
 const BEGINNING: Duration = Duration::from_millis(300);
-/// Short partitions per unit that joins a world with rough weather.
+/// Short partitions per unit that joins a world under the rough profile.
 const PARTITIONS: u64 = 2;
 
 pub(super) struct SimWorld {
     world: cara_sim::World,
     mode: Mode,
     units: Vec<Rc<SimNode>>,
-    weather: Weather,
+    profile: FaultProfile,
     /// How often secured links make their keys anew, instead of every 12 h: in every other run.
     renews_every: Option<Duration>,
     random: Random,
@@ -60,26 +60,26 @@ struct SimNode {
 }
 
 impl SimWorld {
-    pub(super) fn new(seed: u64, weather: Weather, mode: Mode) -> Self {
+    pub(super) fn new(seed: u64, profile: FaultProfile, mode: Mode) -> Self {
         let world = cara_sim::World::of_mode(seed, mode);
         let mut random = Random::new(seed ^ 0x005C_E7A2_105E_ED00);
-        if weather != Weather::Own {
-            let path = path(&mut random, weather);
+        if profile != FaultProfile::Own {
+            let path = path(&mut random, profile);
             world.network(|network| {
-                network.set_weather(path, ALWAYS);
-                if weather == Weather::Rough {
+                network.set_fault_profile(path, ALWAYS);
+                if profile == FaultProfile::Rough {
                     // Discovery has to get through worse, and is over soon.
                     let worse = path.loss_percent(random.below(20) as f64);
-                    network.set_weather(worse, BEGINNING);
+                    network.set_fault_profile(worse, BEGINNING);
                     let now = network.now();
-                    network.schedule(now + BEGINNING, Action::Weather { path, span: ALWAYS });
+                    network.schedule(now + BEGINNING, Action::FaultProfile { path, span: ALWAYS });
                 }
                 network.split_reads(Chance::percent(random.below(40) as f64));
             });
         }
         let renews = mode == Mode::Secured && !seed.is_multiple_of(2);
         let renews_every = renews.then(|| secs(1) + random.jitter(secs(2)));
-        Self { world, mode, units: Vec::new(), weather, renews_every, random, report: Report::default() }
+        Self { world, mode, units: Vec::new(), profile, renews_every, random, report: Report::default() }
     }
 
     fn host(&self, unit: &Unit) -> HostId {
@@ -118,9 +118,9 @@ impl SimWorld {
     }
 }
 
-fn path(random: &mut Random, weather: Weather) -> Path {
+fn path(random: &mut Random, profile: FaultProfile) -> Path {
     let mut percent = |limit: u64| random.below(limit * 100) as f64 / 100.0;
-    let loss = if weather == Weather::Rough { percent(2) } else { 0.0 };
+    let loss = if profile == FaultProfile::Rough { percent(2) } else { 0.0 };
     let path = Path::LAN.loss_percent(loss).duplicate_percent(percent(12)).reorder_percent(percent(12));
     path.delay(Duration::from_micros(250) + random.jitter(millis(5))).jitter(random.jitter(millis(5)))
 }
@@ -167,7 +167,7 @@ impl World for SimWorld {
                 noted.borrow_mut().push(unit.now());
             }
         });
-        if self.weather == Weather::Rough {
+        if self.profile == FaultProfile::Rough {
             self.schedule_partitions(handle.host());
         }
         let node = Rc::new(SimNode { number: self.units.len(), handle, losses });
@@ -197,7 +197,7 @@ impl World for SimWorld {
                 let host = self.host(unit);
                 self.world.network(|network| network.suspend(host, span));
             }
-            Fault::Stranger(unit, stranger) => self.stranger(unit, stranger),
+            Fault::UnknownClient(unit, client) => self.unknown_client(unit, client),
             fault => self.inject_into_network(fault),
         }
         Ok(())
@@ -233,18 +233,18 @@ impl World for SimWorld {
 }
 
 impl SimWorld {
-    fn stranger(&mut self, unit: &Unit, stranger: Stranger) {
+    fn unknown_client(&mut self, unit: &Unit, client: UnknownClient) {
         let (manager, mut to) = (unit.identity(), self.node(unit).handle.address());
         let host = self.world.network(|network| network.add_host());
-        for datagram in stranger.datagrams(0) {
-            let datagram = Stranger::in_mode(self.mode, datagram);
+        for datagram in client.datagrams(0) {
+            let datagram = UnknownClient::in_mode(self.mode, datagram);
             self.world.network(|network| network.send_to(host, to, &datagram));
         }
         to.set_port(M_UNIT_PORT);
         let mut heard = Vec::new();
-        for visit in stranger.visits(&manager, 0) {
+        for visit in client.visits(&manager, 0) {
             let stream = self.world.network(|network| network.connect(host, to));
-            self.say(stream, &Stranger::in_mode(self.mode, visit.says));
+            self.say(stream, &UnknownClient::in_mode(self.mode, visit.says));
             if visit.closes {
                 self.world.run_for(millis(200));
                 self.world.network(|network| network.close(stream));
@@ -253,10 +253,10 @@ impl SimWorld {
                 self.hear(stream, &mut heard);
             }
         }
-        if stranger.is_told().is_some_and(|told| told == heard) {
-            self.reached("stranger was told");
+        if client.is_told().is_some_and(|told| told == heard) {
+            self.reached("client was told");
         }
-        if let Stranger::Silent(count) = stranger {
+        if let UnknownClient::Silent(count) = client {
             for _ in 0..count {
                 self.world.network(|network| network.connect(host, to));
             }
@@ -338,14 +338,14 @@ impl SimWorld {
 
 /// A service of the scenario as the simulator runs it.
 fn simulated(service: &Service) -> cara_sim::Service {
-    let diary = service.diary();
+    let log = service.log();
     let kept = service.clone();
     let plain = !service.awaits();
     let made = if plain {
         cara_sim::Service::new(move |call, parameters| {
-            kept.diary().begin(call.unit.now());
+            kept.log().begin(call.unit.now());
             let result = (kept.body)(&Asked { caller: call.caller.clone(), at: call.unit.now() }, parameters);
-            kept.diary().end(call.unit.now());
+            kept.log().end(call.unit.now());
             result
         })
         .survives_panics()
@@ -354,7 +354,7 @@ fn simulated(service: &Service) -> cara_sim::Service {
         cara_sim::Service::future(move |call, mut parameters| {
             let kept = Rc::clone(&kept);
             async move {
-                kept.diary().begin(call.unit.now());
+                kept.log().begin(call.unit.now());
                 if let Some(function) = &kept.calls_back {
                     let called = call.unit.block_request_with(&call.caller, function, &mut parameters, PATIENT).await;
                     called.map_err(|_| ServiceError::NotReady)?;
@@ -364,14 +364,14 @@ fn simulated(service: &Service) -> cara_sim::Service {
                 while let Some(pause) = kept.moves_on(call.may_act(), &parameters) {
                     call.unit.sleep(pause).await;
                 }
-                kept.diary().end(call.unit.now());
+                kept.log().end(call.unit.now());
                 Ok(parameters)
             }
         })
     };
     let made = made.priority(service.priority);
     match service.lease {
-        Some(length) => made.lease(length).on_lease_end(move |unit| diary.stop(unit.now())),
+        Some(length) => made.lease(length).on_lease_end(move |unit| log.stop(unit.now())),
         None => made,
     }
 }

@@ -30,14 +30,14 @@ fn a_peer_without_permission_is_refused_and_sees_nothing(world: &mut dyn World) 
     // It may have read the news by now, or not.
     let refused = world.ask(&other, "manager", "call_mechanic", &mut number("n", 1));
     assert!(matches!(refused, Err(Error::NotAllowed | Error::UnknownFunction)), "{refused:?}{}", world.story());
-    assert_eq!(mechanic.diary().runs(), 0);
+    assert_eq!(mechanic.log().runs(), 0);
     world.wait("it is not seen any more", || !other.knows("manager", "call_mechanic"), secs(20));
     assert_eq!(world.ask(&one, "manager", "call_mechanic", &mut number("n", 2)), Ok(()));
     let late = world.add(Spec::agv("late", 3));
     world.wait("the late one has joined", || late.is_connected("manager"), secs(40));
     world.run_for(secs(1));
     assert!(!late.knows("manager", "call_mechanic"));
-    assert_eq!(mechanic.diary().runs(), 1);
+    assert_eq!(mechanic.log().runs(), 1);
 }
 
 fn a_change_of_the_access_table_takes_effect(world: &mut dyn World) {
@@ -52,7 +52,7 @@ fn a_change_of_the_access_table_takes_effect(world: &mut dyn World) {
         met(world, &manager, "agv", "note");
         assert_eq!(world.ask(&manager, "agv", "note", &mut number("n", 3)), Ok(()));
     }
-    assert_eq!(note.diary().runs(), 3);
+    assert_eq!(note.log().runs(), 3);
 }
 
 fn what_a_peer_may_not_publish_is_not_seen(world: &mut dyn World) {
@@ -68,5 +68,5 @@ fn what_a_peer_may_not_publish_is_not_seen(world: &mut dyn World) {
     manager.set_access(None).expect("the manager runs");
     met(world, &manager, "other", "note");
     assert_eq!(world.ask(&manager, "agv", "note", &mut number("n", 2)), Ok(()));
-    assert_eq!((note.diary().runs(), other.diary().runs()), (1, 0));
+    assert_eq!((note.log().runs(), other.log().runs()), (1, 0));
 }

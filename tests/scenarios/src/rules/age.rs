@@ -42,7 +42,7 @@ fn frozen(world: &mut dyn World, service: &Service, options: RequestOptions) -> 
 fn a_stale_command_from_a_frozen_link_does_not_run(world: &mut dyn World) {
     let service = Service::numbered("go");
     let (manager, agv) = frozen(world, &service, RequestOptions::default());
-    assert_eq!(service.diary().runs(), 0);
+    assert_eq!(service.log().runs(), 0);
     assert_eq!(agv.counted(LinkCounter::RequestsExpired), 1);
     let expired = || manager.count(|event| matches!(event, Seen::Failed(_, Error::Expired)));
     world.wait("the caller is told", || expired() == 1, secs(10));
@@ -60,14 +60,14 @@ fn a_blocking_command_from_a_frozen_link_does_not_run(world: &mut dyn World) {
     assert_eq!(asked, Err(Error::TimedOut));
     assert!(took >= secs(2) && took <= secs(2) + world.slack().unwrap_or(secs(5)), "{} us", took.as_micros());
     world.run_for(secs(10));
-    assert_eq!(service.diary().runs(), 0);
+    assert_eq!(service.log().runs(), 0);
     assert_eq!(agv.counted(LinkCounter::RequestsExpired), 1);
 }
 
 fn without_a_deadline_a_frozen_command_runs_late(world: &mut dyn World) {
     let service = Service::numbered("go");
     let _units = frozen(world, &service, life(3_600));
-    assert_eq!(service.diary().runs(), 1);
+    assert_eq!(service.log().runs(), 1);
     world.reached("ran late");
 }
 
@@ -107,11 +107,11 @@ fn a_command_that_waited_too_long_does_not_run(world: &mut dyn World) {
         || manager.count(|event| matches!(event, Seen::Failed(_, Error::Expired))) == 1,
         secs(10),
     );
-    assert_eq!(go.diary().runs(), 0);
+    assert_eq!(go.log().runs(), 0);
 }
 
 fn without_a_deadline_a_waiting_command_runs(world: &mut dyn World) {
     let (go, _manager, _agv) = waiting(world, life(3_600));
-    world.wait("it runs", || go.diary().runs() == 1, secs(10));
+    world.wait("it runs", || go.log().runs() == 1, secs(10));
     world.reached("ran late");
 }

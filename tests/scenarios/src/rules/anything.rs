@@ -58,7 +58,7 @@ fn whatever_happens_the_fleet_comes_back(world: &mut dyn World) {
         }
         assert_eq!(asked, Ok(()), "{}", world.story());
     }
-    let mut values = note.diary().values();
+    let mut values = note.log().values();
     values.sort_unstable();
     assert!(values.windows(2).all(|pair| pair[0] < pair[1]), "something ran twice: {values:?}");
     world.reached("ran");
@@ -66,7 +66,7 @@ fn whatever_happens_the_fleet_comes_back(world: &mut dyn World) {
     world.run_for(LEASE + millis(1));
     for (agv, drive) in agvs.iter().zip(drives) {
         assert!(!agv.lease_is_live("drive"), "it moves without a manager");
-        assert!(drive.diary().stops().len() <= drive.diary().runs(), "a stop without a start");
+        assert!(drive.log().stops().len() <= drive.log().runs(), "a stop without a start");
     }
 }
 

@@ -33,7 +33,7 @@ fn a_doubled_datagram_runs_once(world: &mut dyn World) {
         world.run_for(millis(1));
     }
     world.run_for(millis(500));
-    let values = service.diary().values();
+    let values = service.log().values();
     assert_eq!(distinct(values.clone()), values.len(), "a request ran twice: {values:?}");
     assert_eq!(values.len(), 40, "nothing was lost");
     // Where datagrams are sealed their numbers tell the second copies first.
@@ -49,10 +49,10 @@ fn an_emergency_travels_twice_and_runs_once(world: &mut dyn World) {
     }
     // Those that come all at once after a cut may find the reserved place taken; then the caller is told.
     let reported = || manager.count(|event| matches!(event, Seen::Failed(_, Error::Busy | Error::Expired)));
-    world.wait("each ran or was reported", || service.diary().runs() + reported() == 20, secs(20));
+    world.wait("each ran or was reported", || service.log().runs() + reported() == 20, secs(20));
     world.wait("second copies came", || agv.counted(LinkCounter::RequestsRepeated) > 0, secs(20));
     world.run_for(millis(100));
-    let values = service.diary().values();
+    let values = service.log().values();
     assert_eq!(distinct(values.clone()), values.len(), "an emergency ran twice: {values:?}");
     assert_eq!(values.len() + reported(), 20);
 }
@@ -68,9 +68,9 @@ fn calls_run_in_the_order_of_asking(world: &mut dyn World) {
         }
         if n % 4 == 3 {
             let wanted = accepted.len();
-            world.wait("they ran", || service.diary().runs() == wanted, secs(20));
+            world.wait("they ran", || service.log().runs() == wanted, secs(20));
         }
     }
-    world.wait("all ran", || service.diary().runs() == accepted.len(), secs(20));
-    assert_eq!(service.diary().values(), accepted);
+    world.wait("all ran", || service.log().runs() == accepted.len(), secs(20));
+    assert_eq!(service.log().values(), accepted);
 }

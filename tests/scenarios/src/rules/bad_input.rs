@@ -9,7 +9,9 @@ use cara_core::services::unit::RequestOptions;
 
 use super::{Bystander, met, pair};
 use crate::scenario::scenarios;
-use crate::{Fault, Port, Seen, Service, Spec, Stranger, Unit, World, millis, number, numbers, position, secs, text};
+use crate::{
+    Fault, Port, Seen, Service, Spec, Unit, UnknownClient, World, millis, number, numbers, position, secs, text,
+};
 
 scenarios![
     bad_arguments_harm_nobody_else: "40–42, 47", Rough, [], ["RequestsWithheld"];
@@ -18,11 +20,11 @@ scenarios![
     full_tables_of_calls_name_their_limit: "full tables", Rough, [], ["RequestsBusy", "CallsTimedOut"];
     two_units_with_few_buffers_do_not_stop_each_other: "full tables", Light, [], ["answered"];
     a_second_manager_of_a_name_is_told_on_its_own_side: "known identity, new epoch", Rough, [], ["OwnIdentity"];
-    another_fleet_that_dials_is_refused_by_name: "fleet", Rough, [Strangers, UnprovenStrangers],
-        ["DatagramFleet", "RefusedFleet", "stranger was told"];
-    garbage_on_every_port_harms_nobody: "garbage", Rough, [Strangers], ["DatagramMagic", "DatagramFleet"];
-    a_peer_that_closes_in_mid_chunk_harms_nobody_else: "half a message", Rough, [Strangers, UnprovenStrangers], ["left"];
-    a_thousand_silent_connections_keep_nobody_out: "half-open connections", Light, [Strangers, Backlog], ["GaveWay"];
+    another_fleet_that_dials_is_refused_by_name: "fleet", Rough, [UnknownClients, UnprovenClients],
+        ["DatagramFleet", "RefusedFleet", "client was told"];
+    garbage_on_every_port_harms_nobody: "garbage", Rough, [UnknownClients], ["DatagramMagic", "DatagramFleet"];
+    a_peer_that_closes_in_mid_chunk_harms_nobody_else: "half a message", Rough, [UnknownClients, UnprovenClients], ["left"];
+    a_thousand_silent_connections_keep_nobody_out: "half-open connections", Light, [UnknownClients, Backlog], ["GaveWay"];
     a_reader_of_one_byte_a_second_harms_nobody_else: "slow reader", Own, [SlowReader], ["SendRefused"];
     a_unit_without_an_interface_finds_its_manager_when_it_has_one: "no interface", Light, [Interface],
         ["SendFailed", "unplugged"];
@@ -54,7 +56,7 @@ fn bad_arguments_harm_nobody_else(world: &mut dyn World) {
         assert_eq!(world.ask(&manager, "agv", function, &mut parameters), Err(error));
         bystander.goes_on(world, &manager);
     }
-    assert_eq!(service.diary().runs(), 0);
+    assert_eq!(service.log().runs(), 0);
     assert_eq!(world.ask(&manager, "agv", "go_to", &mut position()), Ok(()));
 }
 
@@ -80,7 +82,7 @@ fn what_is_too_long_is_an_error_in_either_direction(world: &mut dyn World) {
     let mut small = Parameters::<64>::sized();
     let refused = world.ask(&manager, "agv", "dump", &mut small);
     assert!(matches!(refused, Err(Error::ResultWouldNotFit { need, have }) if need > have), "{refused:?}");
-    assert_eq!((store.diary().runs(), dump.diary().runs()), (0, 0));
+    assert_eq!((store.log().runs(), dump.log().runs()), (0, 0));
     bystander.goes_on(world, &manager);
     // A result that is longer than the caller takes is not sent.
     manager.change(|limits| limits.message_size = 1_024);
@@ -197,7 +199,7 @@ fn a_second_manager_of_a_name_is_told_on_its_own_side(world: &mut dyn World) {
 
 fn another_fleet_that_dials_is_refused_by_name(world: &mut dyn World) {
     let (manager, _agv, mut bystander) = three(world, &Service::numbered("note"));
-    world.fault(Fault::Stranger(&manager, Stranger::OtherFleet));
+    world.fault(Fault::UnknownClient(&manager, UnknownClient::OtherFleet));
     let refused = Seen::NotJoined(CloseReason::Refused(Refusal::Fleet));
     world.wait("this side shows it", || manager.count(|event| *event == refused) == 1, secs(20));
     assert_eq!(manager.node_counted(NodeCounter::RefusedFleet), 1);
@@ -207,7 +209,7 @@ fn another_fleet_that_dials_is_refused_by_name(world: &mut dyn World) {
 fn garbage_on_every_port_harms_nobody(world: &mut dyn World) {
     let (manager, agv, mut bystander) = three(world, &Service::numbered("note"));
     bystander.goes_on(world, &manager);
-    world.fault(Fault::Stranger(&manager, Stranger::Garbage));
+    world.fault(Fault::UnknownClient(&manager, UnknownClient::Garbage));
     bystander.goes_on(world, &manager);
     let counted = || manager.node_counted(NodeCounter::DatagramMagic) > 0;
     world.wait("datagrams are counted", counted, secs(20));
@@ -223,7 +225,7 @@ fn garbage_on_every_port_harms_nobody(world: &mut dyn World) {
 fn a_peer_that_closes_in_mid_chunk_harms_nobody_else(world: &mut dyn World) {
     let (manager, _agv, mut bystander) = three(world, &Service::numbered("note"));
     for visit in 1..=3 {
-        world.fault(Fault::Stranger(&manager, Stranger::ClosesInMidChunk));
+        world.fault(Fault::UnknownClient(&manager, UnknownClient::ClosesInMidChunk));
         let left = |event: &Seen| matches!(event, Seen::Left(peer, CloseReason::Reset) if peer.name() == "stranger");
         world.wait("it has left", || manager.count(left) == visit, secs(20));
         bystander.goes_on(world, &manager);
@@ -234,7 +236,7 @@ fn a_peer_that_closes_in_mid_chunk_harms_nobody_else(world: &mut dyn World) {
 
 /// A client opens connections and stays silent; a node joins meanwhile.
 fn a_thousand_silent_connections_keep_nobody_out(world: &mut dyn World) {
-    // With room for fewer links than there are strangers.
+    // With room for fewer links than there are unknown clients.
     let manager = world.add(Spec::manager("manager", 1).limits(|limits| limits.maximum_nodes = 64));
     let service = Service::numbered("note");
     let agv = world.add(Spec::agv("agv", 7).service(&service));
@@ -244,7 +246,7 @@ fn a_thousand_silent_connections_keep_nobody_out(world: &mut dyn World) {
     met(world, &manager, "newcomer", "note");
     newcomer.stop();
     world.wait("it has left", || !manager.is_connected("newcomer"), secs(20));
-    world.fault(Fault::Stranger(&manager, Stranger::Silent(1_000)));
+    world.fault(Fault::UnknownClient(&manager, UnknownClient::Silent(1_000)));
     newcomer.start();
     for _ in 0..10 {
         bystander.goes_on(world, &manager);

@@ -27,9 +27,9 @@ fn best_effort_loses_without_blocking(world: &mut dyn World) {
         world.run_for(millis(1));
     }
     world.run_for(millis(200));
-    let runs = service.diary().runs();
+    let runs = service.log().runs();
     assert!((20..100).contains(&runs), "{runs} of 100");
-    assert!(service.diary().values().windows(2).all(|pair| pair[0] < pair[1]), "nothing comes again later");
+    assert!(service.log().values().windows(2).all(|pair| pair[0] < pair[1]), "nothing comes again later");
     world.reached("lost some");
 }
 
@@ -46,7 +46,7 @@ fn best_effort_arrives_in_one_datagram(world: &mut dyn World) {
     // The acknowledgement of a list may be among them.
     assert!(in_the_stream < 10, "{in_the_stream} messages over TCP for 20 requests");
     assert!(in_datagrams >= 20, "{in_datagrams} datagrams for 20 requests");
-    world.wait("most of it arrives", || service.diary().runs() >= 5, secs(10));
+    world.wait("most of it arrives", || service.log().runs() >= 5, secs(10));
 }
 
 fn best_effort_is_for_short_messages_without_a_reply(world: &mut dyn World) {

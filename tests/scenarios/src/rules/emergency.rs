@@ -41,8 +41,8 @@ fn stop_behind_a_message(world: &mut dyn World, priority: Priority) -> (Duration
     world.run_for(wait);
     let asked = world.now();
     manager.request_with("agv", "stop", &number("n", 1), options).expect("it is accepted");
-    world.wait("both ran", || stop.diary().runs() == 1 && store.diary().runs() == 1, secs(60));
-    (stop.diary().began()[0].since(asked), store.diary().began()[0].since(sent))
+    world.wait("both ran", || stop.log().runs() == 1 && store.log().runs() == 1, secs(60));
+    (stop.log().began()[0].since(asked), store.log().began()[0].since(sent))
 }
 
 fn an_emergency_overtakes_a_long_message(world: &mut dyn World) {
@@ -74,11 +74,11 @@ fn an_emergency_ignores_the_interval_and_finds_room(world: &mut dyn World) {
     met(world, &manager, "agv", "slow");
     let options = RequestOptions { timeout: Some(secs(30)), ..RequestOptions::default() };
     let calls: Vec<_> = (0..4).map(|n| manager.begin("agv", "slow", &number("n", n), options)).collect();
-    world.wait("the AGV is full", || slow.diary().runs() >= 1, secs(20));
+    world.wait("the AGV is full", || slow.log().runs() >= 1, secs(20));
     manager.change(|limits| limits.minimum_interval = secs(60));
     let asked = world.now();
     manager.request_with("agv", "stop", &number("n", 1), options).expect("neither interval nor limit stops it");
-    world.wait("it runs", || stop.diary().runs() == 1, secs(20));
+    world.wait("it runs", || stop.log().runs() == 1, secs(20));
     if world.is_virtual() {
         world.measured("emergency at a full vehicle", world.now().since(asked));
     }

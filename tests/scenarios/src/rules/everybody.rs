@@ -49,7 +49,7 @@ fn a_blocking_request_to_all_has_an_outcome_for_each(world: &mut dyn World) {
         };
         assert_eq!(outcome, expected, "{peer}");
     }
-    assert_eq!(service.diary().values(), [5, 5]);
+    assert_eq!(service.log().values(), [5, 5]);
 }
 
 fn an_asynchronous_request_to_all_has_an_id_for_each(world: &mut dyn World) {
@@ -62,7 +62,7 @@ fn an_asynchronous_request_to_all_has_an_id_for_each(world: &mut dyn World) {
         (5, 3),
         "{requested:?}"
     );
-    world.wait("two ran", || service.diary().runs() == 2, secs(20));
+    world.wait("two ran", || service.log().runs() == 2, secs(20));
     let failed = Seen::Failed(outcome("bad").expect("it was accepted"), Error::Service(ServiceError::Failed(7)));
     world.wait("the failure comes back", || manager.count(|event| *event == failed) == 1, secs(20));
     world.reached("failure came back");

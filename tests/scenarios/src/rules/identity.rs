@@ -66,5 +66,5 @@ fn a_board_that_draws_the_same_numbers_comes_back(world: &mut dyn World) {
         world.wait("it is back", || joins() > life && manager.knows("agv", "note"), secs(40));
         assert_eq!(world.ask(&manager, "agv", "note", &mut number("n", life as i64)), Ok(()));
     }
-    assert_eq!(service.diary().values(), [1, 2, 3], "no call of an earlier life is answered or run in a later one");
+    assert_eq!(service.log().values(), [1, 2, 3], "no call of an earlier life is answered or run in a later one");
 }

@@ -41,7 +41,7 @@ fn a_blocking_request_waits_for_the_interval(world: &mut dyn World) {
     if world.now().since(before) < millis(4 * INTERVAL_MILLIS) {
         world.reached("interval removed");
     }
-    assert_eq!(service.diary().runs(), 10);
+    assert_eq!(service.log().runs(), 10);
 }
 
 fn an_asynchronous_request_too_soon_is_refused(world: &mut dyn World) {
@@ -54,7 +54,7 @@ fn an_asynchronous_request_too_soon_is_refused(world: &mut dyn World) {
     manager.change(|limits| limits.minimum_interval = millis(0));
     manager.request("agv", "note", &number("n", 3)).expect("zero switches it off");
     world.reached("interval removed");
-    world.wait("both ran", || service.diary().values() == [1, 3], secs(10));
+    world.wait("both ran", || service.log().values() == [1, 3], secs(10));
 }
 
 fn each_node_has_an_interval_of_its_own(world: &mut dyn World) {
@@ -67,7 +67,7 @@ fn each_node_has_an_interval_of_its_own(world: &mut dyn World) {
     manager.request("one", "note", &number("n", 1)).expect("one was not asked yet");
     manager.request("two", "note", &number("n", 2)).expect("two was not asked yet");
     assert!(matches!(manager.request("one", "note", &number("n", 3)), Err(Error::TooSoon { .. })));
-    world.wait("both ran", || service.diary().runs() == 2, secs(10));
+    world.wait("both ran", || service.log().runs() == 2, secs(10));
 }
 
 fn the_callee_tells_its_interval(world: &mut dyn World) {

@@ -62,7 +62,7 @@ fn a_lease_lives_while_it_is_renewed(world: &mut dyn World) {
         world.run_for(millis(100));
         assert!(agv.lease_is_live("drive"));
     }
-    assert_eq!(service.diary().stops(), []);
+    assert_eq!(service.log().stops(), []);
     drop(manager);
 }
 
@@ -73,14 +73,14 @@ fn ends(world: &mut dyn World, what: &'static str, fault: impl Fn(&mut dyn World
     world.run_for(calm);
     let start = world.now();
     fault(world, &manager, &agv);
-    let diary = service.diary();
-    world.wait("the safe hook runs", || !diary.stops().is_empty(), secs(20));
-    let took = diary.stops()[0].since(start);
+    let log = service.log();
+    world.wait("the safe hook runs", || !log.stops().is_empty(), secs(20));
+    let took = log.stops()[0].since(start);
     assert!(took <= lease(world) + SLACK, "{} us after the fault", took.as_micros());
     assert!(!agv.lease_is_live("drive"));
     world.measured(what, took);
     world.run_for(secs(20));
-    assert_eq!((diary.runs(), diary.stops().len()), (1, 1), "nothing moves again by itself");
+    assert_eq!((log.runs(), log.stops().len()), (1, 1), "nothing moves again by itself");
     assert_eq!(agv.count(|event| matches!(event, Seen::LeaseExpired(_))), 1);
     assert!(!agv.lease_is_live("drive"));
 }
@@ -106,10 +106,10 @@ fn motion_ends_when_the_link_freezes(world: &mut dyn World) {
 fn motion_ends_when_the_manager_stops(world: &mut dyn World) {
     let (service, manager, agv) = driving(world);
     manager.stop();
-    world.wait("the safe hook runs", || service.diary().stops().len() == 1, secs(10));
+    world.wait("the safe hook runs", || service.log().stops().len() == 1, secs(10));
     assert!(!agv.lease_is_live("drive"));
     world.run_for(millis(500));
-    assert_eq!(service.diary().stops().len(), 1);
+    assert_eq!(service.log().stops().len(), 1);
     world.reached("stopped");
 }
 
@@ -120,7 +120,7 @@ fn without_a_lease_motion_goes_on(world: &mut dyn World) {
     manager.stop();
     let long = lease(world).times(4);
     world.run_for(long);
-    assert_eq!(service.diary().stops(), [], "nobody stops it");
+    assert_eq!(service.log().stops(), [], "nobody stops it");
     world.reached("went on");
 }
 
@@ -129,9 +129,9 @@ fn a_lease_that_is_not_renewed_ends(world: &mut dyn World) {
     let (manager, agv) = pair(world, &service);
     let options = RequestOptions { renew_lease: false, timeout: Some(secs(10)), ..RequestOptions::default() };
     assert_eq!(world.ask_with(&manager, "agv", "drive", &mut number("n", 1), options), Ok(()));
-    world.wait("the safe hook runs", || service.diary().stops().len() == 1, secs(10));
+    world.wait("the safe hook runs", || service.log().stops().len() == 1, secs(10));
     assert!(!agv.lease_is_live("drive"));
-    let took = service.diary().stops()[0].since(service.diary().began()[0]);
+    let took = service.log().stops()[0].since(service.log().began()[0]);
     assert!(!world.is_virtual() || took <= lease(world) + SLACK, "{} ms", took.as_millis());
     let expired = || manager.count(|event| *event == Seen::LeaseEnded("drive".to_owned(), LeaseEnd::Expired));
     // The caller holds no lease, so the news of its end is not its matter.
@@ -142,7 +142,7 @@ fn a_lease_that_is_not_renewed_ends(world: &mut dyn World) {
 fn a_released_lease_stops_at_once(world: &mut dyn World) {
     let (service, manager, agv) = driving(world);
     manager.release("agv", "drive").expect("it is held");
-    world.wait("the safe hook runs", || service.diary().stops().len() == 1, secs(10));
+    world.wait("the safe hook runs", || service.log().stops().len() == 1, secs(10));
     assert!(!agv.lease_is_live("drive"));
     world.reached("stopped");
 }
@@ -151,14 +151,14 @@ fn what_a_service_that_goes_has_started_stops_at_once(world: &mut dyn World) {
     let (first, manager, agv) = driving(world);
     let second = Service::new("drive(n: int[1])").lease(lease(world));
     agv.replace_service(&second).expect("it is there");
-    world.wait("what the first one started is safe", || first.diary().stops().len() == 1, secs(10));
+    world.wait("what the first one started is safe", || first.log().stops().len() == 1, secs(10));
     agv.publish().expect("it runs");
     drive(world, &manager);
     assert!(agv.lease_is_live("drive"));
     agv.remove_service("drive").expect("it is there");
-    world.wait("what the second one started is safe", || second.diary().stops().len() == 1, secs(10));
+    world.wait("what the second one started is safe", || second.log().stops().len() == 1, secs(10));
     world.run_for(lease(world).times(2));
-    let stops = [&first, &second].map(|service| service.diary().stops().len());
+    let stops = [&first, &second].map(|service| service.log().stops().len());
     assert_eq!(stops, [1, 1], "each hook runs once");
     world.reached("gone");
 }
@@ -175,7 +175,7 @@ fn what_is_finished_needs_no_safe_hook(world: &mut dyn World) {
     world.wait("the caller is told", || manager.count(finished) == 1, secs(10));
     let long = lease(world).times(3);
     world.run_for(long);
-    if service.diary().stops().is_empty() {
+    if service.log().stops().is_empty() {
         world.reached("finished");
     }
 }

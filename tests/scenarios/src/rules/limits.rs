@@ -28,7 +28,7 @@ fn asynchronous_requests_are_executed_or_reported(world: &mut dyn World) {
     }
     assert!(accepted >= 8, "{accepted}");
     let failed = || manager.count(|event| matches!(event, Seen::Failed(_, Error::Busy)));
-    let runs = || service.diary().runs();
+    let runs = || service.log().runs();
     world.wait("each is executed or reported", || runs() + failed() == accepted, secs(30));
     world.run_for(millis(500));
     assert_eq!(runs() + failed(), accepted);
@@ -48,7 +48,7 @@ fn blocking_requests_beyond_the_limit_are_busy(world: &mut dyn World) {
     let count = |wanted: Result<(), Error>| outcomes.iter().filter(|outcome| **outcome == wanted).count();
     assert_eq!(count(Ok(())) + count(Err(Error::Busy)), 12, "{outcomes:?}");
     assert!(count(Ok(())) >= 4 && count(Err(Error::Busy)) >= 1, "{outcomes:?}");
-    assert_eq!(service.diary().runs(), count(Ok(())), "what was busy did not run");
+    assert_eq!(service.log().runs(), count(Ok(())), "what was busy did not run");
     assert_eq!(world.ask(&manager, "agv", "note", &mut number("n", 99)), Ok(()), "every place is free again");
 }
 
@@ -90,7 +90,7 @@ fn few_buffers_delay_and_lose_nothing(world: &mut dyn World) {
             Err(other) => panic!("{other:?}{}", world.story()),
         }
     }
-    assert_eq!(service.diary().runs(), executed, "{}", world.story());
+    assert_eq!(service.log().runs(), executed, "{}", world.story());
     // A refusal that finds room nowhere is counted on both sides.
     assert_eq!(manager.counted(LinkCounter::RepliesDropped), unanswered, "{}", world.story());
     if executed > 0 {

@@ -24,7 +24,7 @@ fn interrupted(world: &mut dyn World, end: impl Fn(&mut dyn World, &Unit)) -> (U
     let (manager, agv) = pair(world, &service);
     let options = RequestOptions { timeout: Some(secs(30)), ..RequestOptions::default() };
     let call = manager.begin("agv", "slow", &number("n", 1), options);
-    world.wait("it runs", || service.diary().runs() == 1, secs(20));
+    world.wait("it runs", || service.log().runs() == 1, secs(20));
     end(world, &agv);
     assert_eq!(world.finish(&call).map(drop), Err(Error::Interrupted));
     world.reached("interrupted");

@@ -38,9 +38,9 @@ fn the_listing_runs_line_by_line(world: &mut dyn World) {
     assert_eq!(variable(&pos, "position"), [3, 4]);
     pos.set_value("position", [1, 2]).expect("it is there");
     manager.request("agv", "go_to", &pos).expect("it is accepted");
-    assert!(go_to.diary().ended().is_empty(), "it returns at once");
+    assert!(go_to.log().ended().is_empty(), "it returns at once");
     assert_eq!(variable(&pos, "position"), [1, 2]);
-    world.wait("go_to has run", || go_to.diary().ended().len() == 1, secs(10));
+    world.wait("go_to has run", || go_to.log().ended().len() == 1, secs(10));
     let mut told = position();
     assert_eq!(world.ask(&manager, "agv", "pos_info", &mut told), Ok(()));
     assert_eq!(variable(&told, "position"), [1, 2]);
@@ -52,7 +52,7 @@ fn the_listing_runs_line_by_line(world: &mut dyn World) {
     met(world, &agv, "manager", "call_mechanic");
     let mut place = numbers("place", &[5, 6]);
     assert_eq!(world.ask(&agv, "manager", "call_mechanic", &mut place), Ok(()));
-    assert_eq!(call_mechanic.diary().runs(), 1);
+    assert_eq!(call_mechanic.log().runs(), 1);
 }
 
 fn broadcasting_ends_once_an_agv_is_up(world: &mut dyn World) {
@@ -88,7 +88,7 @@ fn refused(world: &mut dyn World, mut parameters: Parameters, error: Error) {
     assert_eq!(world.ask(&manager, "agv", "go_to", &mut parameters), Err(error));
     assert_eq!(manager.request("agv", "go_to", &parameters), Err(error));
     world.run_for(millis(100));
-    assert_eq!(service.diary().runs(), 0);
+    assert_eq!(service.log().runs(), 0);
 }
 
 fn a_missing_argument_is_an_error(world: &mut dyn World) {
@@ -111,5 +111,5 @@ fn more_arguments_than_needed_are_allowed(world: &mut dyn World) {
     let mut parameters = number("n", 5);
     parameters.add_string("remark", 9).expect("there is room");
     assert_eq!(world.ask(&manager, "agv", "note", &mut parameters), Ok(()));
-    assert_eq!(service.diary().values(), [5]);
+    assert_eq!(service.log().values(), [5]);
 }

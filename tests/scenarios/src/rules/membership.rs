@@ -5,14 +5,14 @@ use cara_core::error::{CloseReason, Refusal};
 
 use super::met;
 use crate::scenario::scenarios;
-use crate::{Fault, Seen, Service, Spec, Stranger, Unit, World, millis, number, secs};
+use crate::{Fault, Seen, Service, Spec, Unit, UnknownClient, World, millis, number, secs};
 
 scenarios![
     an_index_keeps_its_meaning_when_another_node_leaves: "47", Rough, [], ["agv came back"];
     an_agv_joins_its_own_manager_only: "23", Rough, [], ["WrongManager"];
     different_fleets_do_not_meet: "fleet", Rough, [], ["DatagramFleet"];
-    another_version_is_refused_by_name: "version", Rough, [Strangers],
-        ["DatagramVersion", "datagram was counted", "stranger was told"];
+    another_version_is_refused_by_name: "version", Rough, [UnknownClients],
+        ["DatagramVersion", "datagram was counted", "client was told"];
     the_maximum_of_nodes_refuses_the_next: "51", Rough, [], ["RefusedFull"];
     two_m_units_meet_and_call_both_ways: "18, 20", Rough, [], ["Dialled"];
     an_m_unit_meets_the_m_units_that_it_has_chosen: "a choice of m_units", Rough, [Choice], ["WrongManager"];
@@ -64,7 +64,7 @@ fn different_fleets_do_not_meet(world: &mut dyn World) {
 fn another_version_is_refused_by_name(world: &mut dyn World) {
     let service = Service::numbered("note");
     let (manager, _agv) = super::pair(world, &service);
-    world.fault(Fault::Stranger(&manager, Stranger::OtherVersion));
+    world.fault(Fault::UnknownClient(&manager, UnknownClient::OtherVersion));
     if manager.node_counted(NodeCounter::DatagramVersion) > 0 {
         world.reached("datagram was counted");
     }
@@ -96,7 +96,7 @@ fn two_m_units_meet_and_call_both_ways(world: &mut dyn World) {
     met(world, &larger, "a", "note");
     assert_eq!(world.ask(&smaller, "b", "note", &mut number("n", 1)), Ok(()));
     assert_eq!(world.ask(&larger, "a", "note", &mut number("n", 2)), Ok(()));
-    assert_eq!(service.diary().values(), [1, 2]);
+    assert_eq!(service.log().values(), [1, 2]);
     assert!(smaller.node_counted(NodeCounter::Dialled) > 0);
     assert_eq!(larger.node_counted(NodeCounter::Dialled), 0, "the smaller identity dials");
 }

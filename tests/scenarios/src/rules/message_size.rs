@@ -53,12 +53,12 @@ fn the_longest_message_passes_and_one_byte_more_is_an_error(world: &mut dyn Worl
     met(world, &manager, "agv", "echo");
     let length = longest(world, &manager, 1_024);
     assert!((1_000..=1_024).contains(&length), "{length}");
-    let runs = service.diary().runs();
+    let runs = service.log().runs();
     assert_eq!(ask(world, &manager, length), Ok(()));
     assert_eq!(ask(world, &manager, length + 1), Err(Error::TooLarge { limit: 1_024 }));
     assert_eq!(manager.request("agv", "echo", &text(length + 1)), Err(Error::TooLarge { limit: 1_024 }));
     world.run_for(millis(100));
-    assert_eq!(service.diary().runs(), runs + 1);
+    assert_eq!(service.log().runs(), runs + 1);
 }
 
 fn the_message_size_can_be_changed_while_running(world: &mut dyn World) {

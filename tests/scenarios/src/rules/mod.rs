@@ -100,7 +100,7 @@ impl Bystander {
         self.calls += 1;
         let asked = world.ask(manager, "bystander", "count", &mut number("n", self.calls as i64));
         assert_eq!(asked, Ok(()), "another node's calls go on{}", world.story());
-        assert_eq!(self.service.diary().runs(), self.calls);
+        assert_eq!(self.service.log().runs(), self.calls);
     }
 }
 

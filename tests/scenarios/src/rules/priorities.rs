@@ -20,9 +20,9 @@ const EACH: usize = 12;
 /// Sends low, normal and high in turn over a slow path; the order in which they ran, by number of class.
 fn ran(world: &mut dyn World, classes: [Option<Priority>; 3]) -> Vec<i64> {
     let service = Service::new("store(n: int[1], text: string[500])");
-    let diary = service.diary();
+    let log = service.log();
     let service = service.does(move |_, parameters| {
-        diary.note(parameters.variable::<i64>("n").map_err(|_| ServiceError::BadResults)?);
+        log.note(parameters.variable::<i64>("n").map_err(|_| ServiceError::BadResults)?);
         Ok(())
     });
     let service = service.in_turns();
@@ -45,8 +45,8 @@ fn ran(world: &mut dyn World, classes: [Option<Priority>; 3]) -> Vec<i64> {
             manager.request_with("agv", "store", &parameters, options).expect("it is accepted");
         }
     }
-    world.wait("all ran", || service.diary().runs() == 3 * EACH, secs(60));
-    service.diary().values()
+    world.wait("all ran", || service.log().runs() == 3 * EACH, secs(60));
+    service.log().values()
 }
 
 /// The sum of a class's places in the order.

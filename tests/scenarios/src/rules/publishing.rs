@@ -109,7 +109,7 @@ fn a_changed_function_is_stale_until_it_is_published_again(world: &mut dyn World
     let changed = Service::numbered("note");
     agv.replace_service(&changed).expect("it is there");
     assert_eq!(world.ask(&manager, "agv", "note", &mut number("n", 1)), Err(Error::StaleFunction));
-    assert_eq!(changed.diary().runs(), 0);
+    assert_eq!(changed.log().runs(), 0);
     agv.publish().expect("it can be published");
     let mut asked = Err(Error::StaleFunction);
     for _ in 0..200 {
@@ -119,7 +119,7 @@ fn a_changed_function_is_stale_until_it_is_published_again(world: &mut dyn World
         }
         world.run_for(millis(20));
     }
-    assert_eq!((asked, changed.diary().values()), (Ok(()), vec![2]));
+    assert_eq!((asked, changed.log().values()), (Ok(()), vec![2]));
 }
 
 fn a_removed_function_is_gone_and_the_others_stay(world: &mut dyn World) {
@@ -132,7 +132,7 @@ fn a_removed_function_is_gone_and_the_others_stay(world: &mut dyn World) {
     world.wait("the news has come", || !manager.knows("agv", "gone"), secs(10));
     assert_eq!(world.ask(&manager, "agv", "gone", &mut number("n", 1)), Err(Error::UnknownFunction));
     assert_eq!(world.ask(&manager, "agv", "kept", &mut number("n", 1)), Ok(()));
-    assert_eq!((gone.diary().runs(), kept.diary().runs()), (0, 1));
+    assert_eq!((gone.log().runs(), kept.log().runs()), (0, 1));
 }
 
 fn what_a_peer_has_no_room_for_is_counted(world: &mut dyn World) {

@@ -33,7 +33,7 @@ fn a_slow_handler_delays_no_other_peer(world: &mut dyn World) {
     met(world, &manager, "one", "slow");
     met(world, &manager, "two", "quick");
     let long = manager.begin("one", "slow", &number("n", 1), PATIENT);
-    world.wait("it runs", || slow.diary().runs() == 1, secs(10));
+    world.wait("it runs", || slow.log().runs() == 1, secs(10));
     assert_eq!(world.ask(&manager, "two", "quick", &mut number("n", 1)), Ok(()));
     assert!(!long.is_over());
     assert!(world.finish(&long).is_ok());
@@ -54,9 +54,9 @@ fn a_quick_call_overtakes_slow_ones_that_began_before_it(world: &mut dyn World) 
     met(world, &manager, "agv", "slow");
     met(world, &manager, "agv", "quick");
     let long: Vec<_> = (0..3).map(|n| manager.begin("agv", "slow", &number("n", n), PATIENT)).collect();
-    world.wait("they run side by side", || slow.diary().runs() == 3, secs(10));
+    world.wait("they run side by side", || slow.log().runs() == 3, secs(10));
     assert_eq!(world.ask(&manager, "agv", "quick", &mut number("n", 1)), Ok(()));
-    assert!(slow.diary().ended().is_empty() && long.iter().all(|call| !call.is_over()), "it waited for none of them");
+    assert!(slow.log().ended().is_empty() && long.iter().all(|call| !call.is_over()), "it waited for none of them");
     assert!(long.iter().all(|call| world.finish(call).is_ok()));
     world.reached("overtook");
 }
@@ -71,7 +71,7 @@ fn a_service_calls_its_caller_back(world: &mut dyn World) {
     for n in 0..5 {
         assert_eq!(world.ask(&manager, "agv", "fetch", &mut number("n", n)), Ok(()));
     }
-    assert_eq!((order.diary().runs(), fetch.diary().runs()), (5, 5));
+    assert_eq!((order.log().runs(), fetch.log().runs()), (5, 5));
 }
 
 fn two_peers_call_each_other_at_the_same_time(world: &mut dyn World) {
@@ -89,7 +89,7 @@ fn two_peers_call_each_other_at_the_same_time(world: &mut dyn World) {
             assert!(world.finish(call).is_ok());
         }
     }
-    assert_eq!((one.diary().runs(), two.diary().runs()), (20, 20));
+    assert_eq!((one.log().runs(), two.log().runs()), (20, 20));
 }
 
 fn many_callers_share_one_link(world: &mut dyn World) {
@@ -104,7 +104,7 @@ fn many_callers_share_one_link(world: &mut dyn World) {
             assert_eq!(world.finish(call).map(drop), Ok(()));
         }
     }
-    let mut values = service.diary().values();
+    let mut values = service.log().values();
     values.sort_unstable();
     assert_eq!(values, (0..320).collect::<Vec<_>>());
 }

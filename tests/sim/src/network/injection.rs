@@ -60,11 +60,11 @@ impl Network {
     }
 
     /// The quality of every path for `span`, instead of the calm one. A later call ends an earlier one.
-    pub fn set_weather(&mut self, path: Path, span: Duration) {
+    pub fn set_fault_profile(&mut self, path: Path, span: Duration) {
         self.injected += 1;
         let number = self.injected;
-        self.weather = Some((number, path));
-        self.push(self.now + span, Happening::WeatherEnds { number });
+        self.fault_profile = Some((number, path));
+        self.push(self.now + span, Happening::FaultProfileEnds { number });
     }
 
     /// The quality of one directed path, until it is set again.
@@ -336,7 +336,7 @@ impl Network {
     /// Does `action` now.
     pub fn inject(&mut self, action: Action) {
         match action {
-            Action::Weather { path, span } => self.set_weather(path, span),
+            Action::FaultProfile { path, span } => self.set_fault_profile(path, span),
             Action::Degrade { from, to, path, span } => self.degrade(from, to, path, span),
             Action::Partition { first, second, direction, span } => {
                 self.partition_for(&first, &second, direction, span);

@@ -31,31 +31,31 @@ fn address(manager: &UnitHandle) -> std::net::SocketAddr {
     address
 }
 
-/// Two units that should have nothing to do with each other, for a minute.
-fn strangers(tally: &mut Tally, world: &mut World, manager: &UnitHandle, agv: &UnitHandle) {
+/// Runs two units for a minute; neither may join the other.
+fn stay_apart(tally: &mut Tally, world: &mut World, manager: &UnitHandle, agv: &UnitHandle) {
     world.run_for(secs(60));
     let joined = |unit: &UnitHandle| unit.count(|event| matches!(event, UnitEvent::Joined { .. })) > 0;
     tally.note(joined(manager) || joined(agv));
 }
 
 #[test]
-fn whoever_lacks_the_key_joins_nobody() {
+fn a_unit_without_the_key_joins_no_manager() {
     let mut tally = Tally::new("units with a wrong key, none, or another fleet's");
     for seed in 0..8 {
         let mut world = World::secured(seed);
         let manager = world.m_unit("depot", 1).program(program).start();
         let to = address(&manager);
         let other_root = world.s_unit("agv", 7).joins_at("depot", 1, to).keys_of_root(3).program(program).start();
-        strangers(&mut tally, &mut world, &manager, &other_root);
+        stay_apart(&mut tally, &mut world, &manager, &other_root);
         assert!(manager.link_counter(LinkCounter::ProofsFailed) > 0);
         let found = world.s_unit("agv", 8).joins("depot", 1).keys_of_root(3).program(program).start();
-        strangers(&mut tally, &mut world, &manager, &found);
+        stay_apart(&mut tally, &mut world, &manager, &found);
         assert!(manager.node_counter(NodeCounter::DatagramForged) > 0);
         let keyless = world.s_unit("agv", 9).joins_at("depot", 1, to).without_key_for("depot").start();
-        strangers(&mut tally, &mut world, &manager, &keyless);
+        stay_apart(&mut tally, &mut world, &manager, &keyless);
         assert!(keyless.node_counter(NodeCounter::RefusedKey) > 0);
         let fleet = world.s_unit("agv", 10).joins_at("depot", 1, to).fleet(5).program(program).start();
-        strangers(&mut tally, &mut world, &manager, &fleet);
+        stay_apart(&mut tally, &mut world, &manager, &fleet);
     }
     tally.close();
 }
@@ -81,8 +81,8 @@ fn plain_and_secured_units_never_meet() {
             let found = world.s_unit("agv", 7).joins("depot", 1).mode(agv_mode).program(program).start();
             let to = address(&manager);
             let dials = world.s_unit("agv", 8).joins_at("depot", 1, to).mode(agv_mode).program(program).start();
-            strangers(&mut tally, &mut world, &manager, &found);
-            strangers(&mut tally, &mut world, &manager, &dials);
+            stay_apart(&mut tally, &mut world, &manager, &found);
+            stay_apart(&mut tally, &mut world, &manager, &dials);
         }
     }
     tally.close();

@@ -1,4 +1,4 @@
-//! Secured links whose keys are made anew every second or two while the fleet works, in bad weather and under faults. That no
+//! Secured links that are rekeyed every second or two while the fleet works, under faults. That no
 //! number is ever sealed twice with one key, each of these worlds checks by itself.
 
 use super::*;
@@ -84,12 +84,12 @@ fn reported(fleet: &Fleet) -> usize {
 }
 
 #[test]
-fn nothing_is_lost_and_no_lease_ends_while_keys_are_made_anew_in_bad_weather() {
+fn nothing_is_lost_and_no_lease_ends_while_links_are_rekeyed_under_faults() {
     let figures = cara_sim::for_each_seed(20, |seed| {
         let mut fleet = fleet(seed);
         let path = Path::LAN.delay(millis(3)).jitter(millis(4)).loss_percent(2.0);
         let path = path.duplicate_percent(10.0).reorder_percent(10.0);
-        fleet.world.network(|network| network.set_weather(path, secs(3_600)));
+        fleet.world.network(|network| network.set_fault_profile(path, secs(3_600)));
         fleet.world.block_request(&fleet.manager, "agv", "drive", &mut Parameters::new()).unwrap();
         let accepted = ask(&mut fleet, 0..500);
         assert!(fleet.agv.lease_is_live("drive"), "the lease is renewed across keys, seed {seed}");

@@ -1,4 +1,4 @@
-//! The bill: what every firmware takes of its board, and which part of that is CARA's.
+//! The size breakdown: flash and RAM of every firmware, and the part of it that is CARA's.
 
 use std::path::Path;
 use std::process::ExitCode;
@@ -7,8 +7,8 @@ use anyhow::{Context, Result, bail};
 use cara_processes::files;
 use serde_json::{Value, json};
 
-use super::bill::Row;
 use super::boards::{BOARDS, Board, Image, RADIO, RESOURCES};
+use super::breakdown::Row;
 use super::image::{Footprint, footprint};
 use super::{NOT_ALLOWED, TESTED, tests};
 use crate::command::Run;
@@ -16,7 +16,7 @@ use crate::figures::{Document, table};
 use crate::groups::Outcome;
 use crate::install;
 
-/// Where the bill is committed.
+/// Where the breakdown is committed.
 const DOCUMENT: Document = Document { file: "docs/sizes.md", command: "cargo xtask sizes --write" };
 
 /// Builds every firmware, prints what it takes, and writes the same as JSON or into the document.

@@ -9,7 +9,7 @@ use super::super::table::Table;
 use super::super::timetable::Task;
 use super::*;
 
-/// Nodes that there is room for at first, and when the table has grown: no more than it knows strangers.
+/// Nodes that there is room for at first, and when the table has grown: no more than it keeps unjoined nodes.
 const CAPACITY: usize = 5;
 const GROWN: usize = 8;
 
@@ -49,7 +49,7 @@ struct Entry {
     index: Option<u16>,
     due: Option<u64>,
     /// When it was heard of, of a node that has not joined.
-    stranger: Option<usize>,
+    unjoined: Option<usize>,
 }
 
 type Model = BTreeMap<u8, Entry>;
@@ -60,13 +60,13 @@ fn meet(model: &mut Model, capacity: usize, clock: usize, who: u8, joins: bool) 
     }
     if model.len() == capacity {
         let away = model.iter().filter(|(_, entry)| !entry.joined);
-        let key = |entry: &Entry| (entry.stranger.is_none(), entry.stranger.unwrap_or(entry.rested));
+        let key = |entry: &Entry| (entry.unjoined.is_none(), entry.unjoined.unwrap_or(entry.rested));
         let Some(oldest) = away.min_by_key(|(_, entry)| key(entry)).map(|(who, _)| *who) else { return false };
         model.remove(&oldest);
     }
     model.insert(
         who,
-        Entry { joined: false, rested: clock, index: None, due: None, stranger: (!joins).then_some(clock) },
+        Entry { joined: false, rested: clock, index: None, due: None, unjoined: (!joins).then_some(clock) },
     );
     true
 }
@@ -116,7 +116,7 @@ proptest! {
                     let free = lowest_free(&model, identity(who).role());
                     let entry = model.get_mut(&who).unwrap();
                     entry.joined = true;
-                    entry.stranger = None;
+                    entry.unjoined = None;
                     entry.index.get_or_insert(free);
                 }
                 Step::Leave(who) => {

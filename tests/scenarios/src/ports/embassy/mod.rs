@@ -15,7 +15,7 @@ use cara_embassy_host::{Bench, Faults};
 use self::node::BoardNode;
 use self::visitor::Visitor;
 use crate::run::Report;
-use crate::{Fault, Need, Port, Spec, Stranger, Unit, Unsupported, Weather, World};
+use crate::{Fault, FaultProfile, Need, Port, Spec, Unit, UnknownClient, Unsupported, World};
 
 pub(super) struct EmbassyWorld {
     bench: Bench,
@@ -26,10 +26,10 @@ pub(super) struct EmbassyWorld {
 }
 
 impl EmbassyWorld {
-    pub(super) fn new(seed: u64, weather: Weather, mode: Mode) -> Self {
+    pub(super) fn new(seed: u64, profile: FaultProfile, mode: Mode) -> Self {
         let bench = Bench::new(seed);
         let mut random = Random::new(seed ^ 0x00E3_BA55);
-        bench.set_faults(faults(&mut random, weather));
+        bench.set_faults(faults(&mut random, profile));
         Self { bench, mode, units: Vec::new(), random, report: Report::default() }
     }
 
@@ -38,15 +38,15 @@ impl EmbassyWorld {
     }
 }
 
-fn faults(random: &mut Random, weather: Weather) -> Faults {
+fn faults(random: &mut Random, profile: FaultProfile) -> Faults {
     let mut percent = |limit: u64| random.below(limit * 100) as f64 / 10_000.0;
-    match weather {
-        Weather::Own => Faults::NONE,
+    match profile {
+        FaultProfile::Own => Faults::NONE,
         _ => Faults {
-            loss: if weather == Weather::Rough { percent(2) } else { 0.0 },
+            loss: if profile == FaultProfile::Rough { percent(2) } else { 0.0 },
             duplication: percent(5),
             // A segment that overtakes another costs smoltcp a retransmission, thus a second, as a lost one does.
-            reordering: if weather == Weather::Rough { percent(5) } else { 0.0 },
+            reordering: if profile == FaultProfile::Rough { percent(5) } else { 0.0 },
             delay: Duration::from_micros(250) + random.jitter(Duration::from_millis(2)),
             jitter: random.jitter(Duration::from_millis(2)),
             ..Faults::NONE
@@ -55,17 +55,17 @@ fn faults(random: &mut Random, weather: Weather) -> Faults {
 }
 
 impl EmbassyWorld {
-    fn stranger(&mut self, unit: &Unit, stranger: Stranger) {
+    fn unknown_client(&mut self, unit: &Unit, client: UnknownClient) {
         let visitor = Visitor::new(&self.bench, self.node(unit).board().address());
-        visitor.sends(stranger.datagrams(0));
+        visitor.sends(client.datagrams(0));
         let mut heard = Vec::new();
-        for visit in stranger.visits(&unit.identity(), 0) {
+        for visit in client.visits(&unit.identity(), 0) {
             heard.extend(visitor.pays(&self.bench, visit));
         }
-        if stranger.is_told().is_some_and(|told| told == heard) {
-            self.reached("stranger was told");
+        if client.is_told().is_some_and(|told| told == heard) {
+            self.reached("client was told");
         }
-        if let Stranger::Silent(count) = stranger {
+        if let UnknownClient::Silent(count) = client {
             visitor.stays(count);
         }
     }
@@ -116,7 +116,7 @@ impl World for EmbassyWorld {
                 other.set_path_from(&one, path);
             }
             Fault::SlowReader(..) => return Err(Unsupported(Need::SlowReader)),
-            Fault::Stranger(unit, stranger) => self.stranger(unit, stranger),
+            Fault::UnknownClient(unit, client) => self.unknown_client(unit, client),
             Fault::Unplug(unit) => self.node(unit).board().set_cable(false),
             Fault::Plug(unit) => self.node(unit).board().set_cable(true),
         }

@@ -23,8 +23,8 @@ pub(super) fn put(node: &Rc<BoardNode>, service: &Service, replace: bool) -> Res
     let lease: &'static Lease = Box::leak(Box::new(Lease::new()));
     let mut options = ServiceOptions::new().priority(service.priority);
     if let Some(length) = service.lease {
-        let diary = service.diary();
-        options = options.lease(length, lease, Box::leak(Box::new(move || diary.stop(now()))));
+        let log = service.log();
+        options = options.lease(length, lease, Box::leak(Box::new(move || log.stop(now()))));
     }
     let handler = if service.awaits() { Handler::task() } else { at_once(service.clone()) };
     match replace {
@@ -40,9 +40,9 @@ pub(super) fn put(node: &Rc<BoardNode>, service: &Service, replace: bool) -> Res
 
 fn at_once(service: Service) -> Handler<()> {
     Handler::free(Box::leak(Box::new(move |call: &cara_embassy::Call<()>, parameters: &mut _| {
-        service.diary().begin(now());
+        service.log().begin(now());
         let result = (service.body)(&Asked { caller: call.caller.clone(), at: now() }, parameters);
-        service.diary().end(now());
+        service.log().end(now());
         result
     })))
 }
@@ -64,10 +64,10 @@ async fn take_calls(node: Rc<BoardNode>, board: Board, unit: Handle, function: S
 }
 
 async fn serve(unit: Handle, service: &Service, call: TakenCall<()>, parameters: &mut ParametersView) {
-    service.diary().begin(now());
+    service.log().begin(now());
     let result = run(unit, service, &call, parameters).await;
     if result.is_ok() {
-        service.diary().end(now());
+        service.log().end(now());
     }
     call.reply(result.map(|()| &*parameters)).await;
 }

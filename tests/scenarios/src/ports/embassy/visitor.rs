@@ -1,4 +1,4 @@
-//! A stranger's board: it has sockets of its own and no unit.
+//! The board of an unknown client: it has sockets of its own and no unit.
 
 use std::cell::{Cell, RefCell};
 use std::net::Ipv4Addr;
@@ -12,7 +12,7 @@ use embassy_net::tcp::TcpSocket;
 use embassy_net::udp::{PacketMetadata, UdpSocket};
 use embassy_time::with_timeout;
 
-use crate::stranger::Visit;
+use crate::unknown_client::Visit;
 
 /// How long it listens to what comes back.
 const ANSWER: Duration = Duration::from_secs(5);

@@ -16,7 +16,7 @@ const MESSAGE: usize = 900;
 
 /// The kind of client.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Stranger {
+pub enum UnknownClient {
     /// A unit of another version of the protocol.
     OtherVersion,
     /// An s_unit of another fleet that dials this manager all the same.
@@ -37,7 +37,7 @@ pub(crate) struct Visit {
     pub(crate) closes: bool,
 }
 
-impl Stranger {
+impl UnknownClient {
     /// Datagrams for the discovery port.
     pub(crate) fn datagrams(self, fleet: u32) -> Vec<Vec<u8>> {
         match self {

@@ -1,8 +1,8 @@
-//! The bill in `docs/sizes.md`: what a line of it is, and by how much it may grow.
+//! Rows of the size breakdown in `docs/sizes.md`, and by how much they may grow.
 
 use crate::figures::{self, cells};
 
-/// A line of the bill, in bytes.
+/// A row of the breakdown, in bytes.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Row {
     pub(crate) board: String,

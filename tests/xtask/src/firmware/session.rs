@@ -10,7 +10,7 @@ use crate::install;
 
 /// The boards and programs of the session.
 #[derive(Args)]
-pub(crate) struct Who {
+pub(crate) struct SessionOptions {
     /// Runs the emulated board, with a manager and a prompt that takes verbs of `cara`; Ctrl-D ends it.
     #[arg(long)]
     pub(crate) run: bool,
@@ -29,18 +29,18 @@ pub(crate) struct Who {
 }
 
 /// Builds what is needed and runs it until the input ends.
-pub(crate) fn desk(board: Option<&str>, who: &Who) -> Result<ExitCode> {
+pub(crate) fn session(board: Option<&str>, options: &SessionOptions) -> Result<ExitCode> {
     if board != Some(TESTED) {
         bail!("only the emulated board runs here: cargo xtask firmware {TESTED} --run");
     }
     install::program("qemu-system-arm", "qemu-system-arm").map_err(anyhow::Error::msg)?;
     let image = tested_image()?;
-    let (id, fleet) = (who.id.to_string(), who.fleet.to_string());
-    let told = ["desk", "--name", &who.name, "--id", &id, "--manager", &who.manager, "--fleet", &fleet];
+    let (id, fleet) = (options.id.to_string(), options.fleet.to_string());
+    let told = ["session", "--name", &options.name, "--id", &id, "--manager", &options.manager, "--fleet", &fleet];
     match tests(&image)?.args(told).interactive().code()? {
         Some(0) => Ok(ExitCode::SUCCESS),
         Some(NOT_ALLOWED) => bail!("the board needs a network of its own, see above"),
-        Some(_) => bail!("the desk ended, for the reason above"),
-        None => bail!("a signal ended the desk"),
+        Some(_) => bail!("the session ended, for the reason above"),
+        None => bail!("a signal ended the session"),
     }
 }

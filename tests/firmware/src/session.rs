@@ -1,4 +1,4 @@
-//! A board on the desk: the firmware, its manager and a prompt for `cara` beside it, in a network of their own.
+//! An emulator session: the firmware, its manager and a prompt for `cara` beside it, in a network of their own.
 
 use std::ffi::OsString;
 use std::io::{BufRead, IsTerminal, Write};
@@ -17,9 +17,9 @@ use tempfile::TempDir;
 use crate::board::{Bench, LONG, Who};
 use crate::keys::Keys;
 
-/// What is on the desk.
+/// The board and the manager of a session.
 #[derive(Args, Clone, Debug)]
-pub(crate) struct Desk {
+pub(crate) struct Session {
     /// The vehicle's name.
     #[arg(long, default_value = "agv-17", value_parser = word)]
     name: String,
@@ -40,7 +40,7 @@ pub(crate) struct Desk {
 /// A name that can be told to a board.
 fn word(text: &str) -> Result<String, String> {
     if text.contains(char::is_whitespace) {
-        return Err("a board is told its settings as words, so that names on the desk have no blanks".into());
+        return Err("a board is told its settings as words, so that names in a session have no blanks".into());
     }
     Identity::s_unit(text, 1).map_err(|error| error.to_string())?;
     Ok(text.to_owned())
@@ -56,8 +56,8 @@ fn manager(text: &str) -> Result<String, String> {
 const PROMPT: &str = "cara> ";
 
 /// Starts everything, then runs what is typed until the input ends.
-pub(crate) fn run(image: &Path, desk: &Desk) -> Result<()> {
-    let Desk { name, id, manager, fleet, cara } = desk.clone();
+pub(crate) fn run(image: &Path, session: &Session) -> Result<()> {
+    let Session { name, id, manager, fleet, cara } = session.clone();
     let keys = Keys::draw(cara.as_deref(), fleet, &manager, &[&format!("{name}/{id}")])?;
     let bench = Bench::new(image, true, Rc::clone(&keys))?;
     let cable = bench.cable()?;
@@ -65,8 +65,8 @@ pub(crate) fn run(image: &Path, desk: &Desk) -> Result<()> {
     let _manager = cara.manager(&manager, fleet)?;
     let board = bench.board(&cable, &Who { name, id, manager, fleet, ..Who::agv(id) })?;
     board.logs("has joined")?;
-    cara.wait_for(&desk.name)?;
-    println!("verbs of cara can be typed, as scan, or: call {0} stop; Ctrl-D or `exit` ends it", desk.name);
+    cara.wait_for(&session.name)?;
+    println!("verbs of cara can be typed, as scan, or: call {0} stop; Ctrl-D or `exit` ends it", session.name);
     let input = std::io::stdin();
     let typed = input.is_terminal();
     prompt()?;
@@ -90,7 +90,7 @@ fn prompt() -> Result<()> {
     Ok(std::io::stdout().flush()?)
 }
 
-/// The command, with keys and control sockets of this desk only.
+/// The command, with keys and control sockets of this session only.
 struct Cara(Rc<Keys>);
 
 impl Cara {
@@ -163,16 +163,16 @@ const TYPED: [(&str, &str); 7] = [
 /// The emulator session, with commands piped into it.
 pub(crate) fn test(image: &Path, cara: Option<&Path>) -> Result<String> {
     let program = std::env::current_exe()?;
-    let mut desk = Process::start("the desk", &program, arguments(image, cara))?;
-    desk.seen("INFO started because of", LONG)?;
+    let mut session = Process::start("the session", &program, arguments(image, cara))?;
+    session.seen("INFO started because of", LONG)?;
     for (line, answer) in TYPED {
-        desk.send(line)?;
-        desk.expect(&format!("{PROMPT}{line}"), LONG)?;
-        desk.expect(answer, LONG)?;
+        session.send(line)?;
+        session.expect(&format!("{PROMPT}{line}"), LONG)?;
+        session.expect(answer, LONG)?;
     }
-    desk.seen("INFO arrived at 1 0", LONG)?;
-    desk.send("exit")?;
-    let ended = desk.wait(LONG)?;
+    session.seen("INFO arrived at 1 0", LONG)?;
+    session.send("exit")?;
+    let ended = session.wait(LONG)?;
     if !ended.success() {
         bail!("it ended with {ended}");
     }
@@ -183,27 +183,27 @@ pub(crate) fn test(image: &Path, cara: Option<&Path>) -> Result<String> {
 }
 
 fn arguments(image: &Path, cara: Option<&Path>) -> Vec<OsString> {
-    let mut arguments = vec!["--image".into(), image.as_os_str().to_owned(), "desk".into()];
+    let mut arguments = vec!["--image".into(), image.as_os_str().to_owned(), "session".into()];
     arguments.extend(cara.into_iter().flat_map(|cara| ["--cara".into(), cara.as_os_str().to_owned()]));
     arguments
 }
 
-/// A desk that a signal ends takes its keys along, whatever signals it was started to ignore.
+/// A session that a signal ends takes its keys along, whatever signals it was started to ignore.
 fn leaves_no_keys(wrapper: &str, program: &Path, image: &Path, cara: Option<&Path>) -> Result<()> {
     let folder = tempfile::tempdir()?;
-    let mut desk = process_in(&folder, wrapper, program, image, cara)?;
-    desk.seen("Ctrl-D", LONG)?;
-    ensure!(std::fs::read_dir(folder.path())?.next().is_some(), "the desk has its keys elsewhere");
-    desk.terminate(LONG)?;
+    let mut session = process_in(&folder, wrapper, program, image, cara)?;
+    session.seen("Ctrl-D", LONG)?;
+    ensure!(std::fs::read_dir(folder.path())?.next().is_some(), "the session has its keys elsewhere");
+    session.terminate(LONG)?;
     becomes_empty(&folder)
 }
 
-/// How long a desk takes until it can be typed at, on a machine that does nothing else.
+/// How long a session takes until it can be typed at, on a machine that does nothing else.
 const STARTS: Duration = Duration::from_millis(1_500);
-/// Signals that end a desk; the last one does not below `nohup`.
+/// Signals that end a session; the last one does not below `nohup`.
 const ENDS: [Signal; 3] = [Signal::TERM, Signal::INT, Signal::HUP];
 
-/// Ends desks by signals at random moments of their start, every second one below `nohup`; none leaves keys behind.
+/// Ends sessions by signals at random moments of their start, every second one below `nohup`; none leaves keys behind.
 pub(crate) fn ends(image: &Path, cara: Option<&Path>, times: u32) -> Result<()> {
     let program = std::env::current_exe()?;
     let mut dice = fastrand::Rng::new();
@@ -211,31 +211,31 @@ pub(crate) fn ends(image: &Path, cara: Option<&Path>, times: u32) -> Result<()> 
     for number in 0..times {
         let folder = tempfile::tempdir()?;
         let (wrapper, signals) = if number.is_multiple_of(2) { ("env", 3) } else { ("nohup", 2) };
-        let mut desk = process_in(&folder, wrapper, &program, image, cara)?;
+        let mut session = process_in(&folder, wrapper, &program, image, cara)?;
         std::thread::sleep(STARTS.mul_f64(dice.f64()));
         with_keys += u32::from(std::fs::read_dir(folder.path())?.next().is_some());
         let signal = dice.choice(ENDS.iter().take(signals)).copied().unwrap_or(Signal::TERM);
-        desk.signal(signal)?;
-        desk.wait(LONG)?;
+        session.signal(signal)?;
+        session.wait(LONG)?;
         becomes_empty(&folder).with_context(|| format!("end {number}, below {wrapper}, by {signal:?}"))?;
     }
-    println!("{times} desks ended by a signal, {with_keys} of them with keys; none left any");
+    println!("{times} sessions ended by a signal, {with_keys} of them with keys; none left any");
     Ok(())
 }
 
-/// A desk whose keys are in a folder.
+/// A session whose keys are in a folder.
 fn process_in(folder: &TempDir, wrapper: &str, program: &Path, image: &Path, cara: Option<&Path>) -> Result<Process> {
     let mut place = OsString::from("TMPDIR=");
     place.push(folder.path());
     let words = ["env".into(), place, program.as_os_str().to_owned()].into_iter().chain(arguments(image, cara));
-    Process::start("the desk", Path::new(wrapper), words)
+    Process::start("the session", Path::new(wrapper), words)
 }
 
-/// What runs in a desk's network ends a moment later than the desk.
+/// What runs in a session's network ends a moment later than the session.
 fn becomes_empty(folder: &TempDir) -> Result<()> {
     let deadline = Instant::now() + LONG;
     while std::fs::read_dir(folder.path())?.next().is_some() {
-        ensure!(Instant::now() < deadline, "the desk has left keys in {}", folder.path().display());
+        ensure!(Instant::now() < deadline, "the session has left keys in {}", folder.path().display());
         std::thread::sleep(Duration::from_millis(20));
     }
     Ok(())
