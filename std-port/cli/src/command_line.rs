@@ -4,9 +4,9 @@ use std::process::ExitCode;
 
 use clap::{Command, CommandFactory, FromArgMatches, Parser, Subcommand};
 
-use crate::exit::{self, EXIT_CODES, Ended};
-use crate::global::Global;
-use crate::{commands, doctor, keys, node, provision};
+use crate::{commands, node};
+use cara_tools::exit::{self, EXIT_CODES, Ended};
+use cara_tools::global::Global;
 
 /// Shows and calls the nodes of a CARA fleet, through the m_unit that runs on this host or as an m_unit itself.
 #[derive(Parser)]
@@ -31,10 +31,10 @@ pub(crate) enum Verb {
     Ping(commands::ping::Arguments),
     Bench(commands::bench::Arguments),
     Node(node::Arguments),
-    Doctor(doctor::Arguments),
-    Keys(keys::Arguments),
+    Doctor(cara_doctor::Arguments),
+    Keys(cara_keys::Arguments),
     Access(commands::access::Arguments),
-    Provision(provision::Arguments),
+    Provision(cara_provision::Arguments),
     Completions(commands::completions::Arguments),
     Man(commands::man::Arguments),
 }

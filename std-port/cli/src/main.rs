@@ -1,29 +1,17 @@
 //! The `cara` command: what is on the network, why something is not, and calls from the command line.
 
-mod close_names;
 mod command_line;
 mod commands;
-mod doctor;
-mod exit;
-mod files;
-mod global;
-mod interrupt;
-mod keys;
-mod listening;
-mod name_and_id;
 mod node;
 mod nodes;
 mod operator;
-mod output;
-mod provision;
 mod statistics;
 mod text;
-mod units;
 
 use std::process::ExitCode;
 
 use crate::command_line::{CommandLine, Verb};
-use crate::global::Global;
+use cara_tools::global::Global;
 
 fn main() -> ExitCode {
     let CommandLine { global, verb } = match command_line::parse() {
@@ -31,7 +19,7 @@ fn main() -> ExitCode {
         Err(code) => return code,
     };
     let outcome = global.check().and_then(|()| run(verb, &global));
-    exit::code_of(outcome, &global)
+    cara_tools::exit::code_of(outcome, &global)
 }
 
 fn run(verb: Verb, global: &Global) -> anyhow::Result<ExitCode> {
@@ -47,10 +35,10 @@ fn run(verb: Verb, global: &Global) -> anyhow::Result<ExitCode> {
         Verb::Ping(arguments) => commands::ping::run(arguments, global),
         Verb::Bench(arguments) => commands::bench::run(arguments, global),
         Verb::Node(arguments) => node::run(arguments, global),
-        Verb::Doctor(arguments) => doctor::run(arguments, global),
-        Verb::Keys(arguments) => keys::run(arguments, global),
+        Verb::Doctor(arguments) => cara_doctor::run(arguments, global),
+        Verb::Keys(arguments) => cara_keys::run(arguments, global),
         Verb::Access(arguments) => commands::access::run(arguments, global),
-        Verb::Provision(arguments) => provision::run(arguments, global),
+        Verb::Provision(arguments) => cara_provision::run(arguments, global),
         Verb::Completions(arguments) => commands::completions::run(arguments, global),
         Verb::Man(arguments) => commands::man::run(arguments, global),
     }

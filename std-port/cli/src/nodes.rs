@@ -2,10 +2,12 @@
 
 use cara_std::control::protocol::{Answer, FunctionInfo, NodeInfo, Question};
 
-use crate::close_names::close;
-use crate::doctor::quoted;
-use crate::exit::Ended;
+use cara_tools::close_names::close;
+
 use crate::operator::Operator;
+use cara_tools::exit::Ended;
+pub(crate) use cara_tools::name_and_id::full_name;
+use cara_tools::name_and_id::quoted;
 
 /// A node that is meant, and in which form a unit is asked about it.
 #[derive(Clone, Debug)]
@@ -21,11 +23,6 @@ impl Chosen {
         let selector = if twins > 1 { format!("{}@{}", full_name(node), node.role) } else { full_name(node) };
         Self { node: node.clone(), selector }
     }
-}
-
-/// Its `NAME/ID`.
-pub(crate) fn full_name(node: &NodeInfo) -> String {
-    format!("{}/{}", node.name, node.id)
 }
 
 /// A [selector](Chosen::selector) as `NAME/ID`.

@@ -35,7 +35,7 @@ impl Times {
 
     /// Median, p99 and the longest for people; a dash for none.
     pub(crate) fn shown(&self) -> [String; 3] {
-        let show = |micros: Option<f64>| micros.map_or("-".to_owned(), crate::units::show_micros);
+        let show = |micros: Option<f64>| micros.map_or("-".to_owned(), cara_tools::units::show_micros);
         [show(self.median_us), show(self.p99_us), show(self.max_us)]
     }
 }

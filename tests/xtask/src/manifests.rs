@@ -182,8 +182,9 @@ fn allowed(from: Place, to: Place, for_tests: bool) -> bool {
         (_, Place::Core | Place::CoreMember | Place::Port) => true,
         // The simulator is there for an application's own tests.
         (Place::Examples, Place::Tests) => for_tests,
+        (Place::CommandLine, Place::CommandLine) => true,
         (Place::Examples, Place::Examples) | (Place::Tests, Place::Tests | Place::Examples) => true,
-        (Place::Tests | Place::Examples, Place::CommandLine) | (Place::CommandLine, _) => false,
+        (Place::Tests | Place::Examples, Place::CommandLine) => false,
     }
 }
 

@@ -8,9 +8,9 @@ use cara_std::access::{AccessTable, Decision, Principal, Verb, shown};
 use cara_std::keys::parse_node;
 use serde_json::json;
 
-use crate::exit::{Ended, Exit};
-use crate::global::Global;
-use crate::output;
+use cara_tools::exit::{Ended, Exit};
+use cara_tools::global::Global;
+use cara_tools::output;
 
 /// The word for the operator on a unit's control socket.
 const OPERATOR: &str = "operator";

@@ -8,14 +8,14 @@ use cara_std::{Definition, Shown};
 use clap::ValueEnum;
 use serde_json::{Value, json};
 
-use crate::exit::{Ended, Exit};
-use crate::global::Global;
-use crate::interrupt;
 use crate::nodes::{self, Chosen};
 use crate::operator::{Need, Operator, exit_of};
-use crate::output::{self, BAD};
 use crate::text::{Mistake, Written, bind, read, show_call};
-use crate::units::{parse_time, show_micros};
+use cara_tools::exit::{Ended, Exit};
+use cara_tools::global::Global;
+use cara_tools::interrupt;
+use cara_tools::output::{self, BAD};
+use cara_tools::units::{parse_time, show_micros};
 
 /// Calls a function and prints its results in the form of a call.
 ///

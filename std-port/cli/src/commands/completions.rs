@@ -6,9 +6,9 @@ use clap_complete::{Shell, generate};
 use serde_json::json;
 
 use crate::command_line;
-use crate::exit::Exit;
-use crate::global::Global;
-use crate::output;
+use cara_tools::exit::Exit;
+use cara_tools::global::Global;
+use cara_tools::output;
 
 /// Prints a script with which a shell completes verbs and options.
 #[derive(clap::Args)]

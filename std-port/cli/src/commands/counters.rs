@@ -5,11 +5,11 @@ use std::process::ExitCode;
 use cara_std::control::protocol::{Answer, Question};
 use serde_json::{Map, Value, json};
 
-use crate::exit::{Ended, Exit};
-use crate::global::Global;
 use crate::nodes;
 use crate::operator::{Need, Operator};
-use crate::output::{self, FAINT, HEADING, PLAIN};
+use cara_tools::exit::{Ended, Exit};
+use cara_tools::global::Global;
+use cara_tools::output::{self, FAINT, HEADING, PLAIN};
 
 /// Shows counters: of the unit and of each link, or of the link to one node.
 #[derive(clap::Args)]

@@ -5,12 +5,12 @@ use std::process::ExitCode;
 use cara_std::control::protocol::FunctionInfo;
 use serde_json::json;
 
-use crate::exit::Exit;
-use crate::global::Global;
 use crate::nodes;
 use crate::operator::{Need, Operator};
-use crate::output::{self, PLAIN, Rows};
-use crate::units::show_micros;
+use cara_tools::exit::Exit;
+use cara_tools::global::Global;
+use cara_tools::output::{self, PLAIN, Rows};
+use cara_tools::units::show_micros;
 
 /// Shows what a node has published, with the form in which it is called.
 #[derive(clap::Args)]

@@ -9,9 +9,9 @@ use clap_mangen::Man;
 use serde_json::json;
 
 use crate::command_line;
-use crate::exit::Exit;
-use crate::global::Global;
-use crate::output;
+use cara_tools::exit::Exit;
+use cara_tools::global::Global;
+use cara_tools::output;
 
 /// Prints the man page, or writes it with one page for each verb into a folder.
 #[derive(clap::Args)]

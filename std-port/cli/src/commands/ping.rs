@@ -7,14 +7,14 @@ use cara_std::Shown;
 use cara_std::control::protocol::{Answer, Question};
 use serde_json::json;
 
-use crate::exit::Exit;
-use crate::global::Global;
-use crate::interrupt::Interrupt;
 use crate::nodes;
 use crate::operator::{Need, Operator};
-use crate::output::{self, BAD};
 use crate::statistics::Times;
-use crate::units::{parse_time, show_micros};
+use cara_tools::exit::Exit;
+use cara_tools::global::Global;
+use cara_tools::interrupt::Interrupt;
+use cara_tools::output::{self, BAD};
+use cara_tools::units::{parse_time, show_micros};
 
 /// Measures round trips to a node, with no function of it involved. Ctrl-C ends it with its summary.
 #[derive(clap::Args)]

@@ -6,12 +6,12 @@ use std::time::Duration;
 use cara_std::control::protocol::{Answer, Question};
 use serde_json::json;
 
-use crate::exit::Exit;
-use crate::global::Global;
 use crate::nodes;
 use crate::operator::{Need, Operator};
-use crate::output::{self, BAD};
-use crate::units::parse_time;
+use cara_tools::exit::Exit;
+use cara_tools::global::Global;
+use cara_tools::output::{self, BAD};
+use cara_tools::units::parse_time;
 
 /// Makes the unit's own functions visible: to one node, or to all, also later ones.
 #[derive(clap::Args)]

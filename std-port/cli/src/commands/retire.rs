@@ -5,11 +5,11 @@ use std::process::ExitCode;
 use cara_std::control::protocol::Question;
 use serde_json::json;
 
-use crate::exit::{Ended, Exit};
-use crate::global::Global;
 use crate::nodes;
 use crate::operator::{Need, Operator};
-use crate::output;
+use cara_tools::exit::{Ended, Exit};
+use cara_tools::global::Global;
+use cara_tools::output;
 
 /// Takes an absent node off the roster of the manager that runs on this host, until it joins again or the manager is started
 /// anew.

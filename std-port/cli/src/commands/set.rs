@@ -4,13 +4,13 @@ use std::process::ExitCode;
 
 use cara_std::control::protocol::{Answer, ConstraintsInfo, Question};
 
-use crate::close_names;
-use crate::exit::{Ended, Exit};
-use crate::global::Global;
 use crate::nodes;
 use crate::operator::{Need, Operator};
-use crate::output::{self, HEADING, PLAIN, Rows};
-use crate::units::{parse_bytes, parse_micros, show_bytes, show_micros};
+use cara_tools::close_names;
+use cara_tools::exit::{Ended, Exit};
+use cara_tools::global::Global;
+use cara_tools::output::{self, HEADING, PLAIN, Rows};
+use cara_tools::units::{parse_bytes, parse_micros, show_bytes, show_micros};
 
 /// Changes a constraint while the unit runs; peers are told what concerns them.
 #[derive(clap::Args)]

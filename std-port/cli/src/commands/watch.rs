@@ -7,11 +7,11 @@ use cara_std::Shown;
 use cara_std::control::protocol::{Answer, Question};
 use serde_json::json;
 
-use crate::exit::Exit;
-use crate::global::Global;
 use crate::operator::{Need, Operator};
-use crate::output::{self, BAD, FAINT, GOOD, PLAIN};
-use crate::units::parse_time;
+use cara_tools::exit::Exit;
+use cara_tools::global::Global;
+use cara_tools::output::{self, BAD, FAINT, GOOD, PLAIN};
+use cara_tools::units::parse_time;
 
 /// Shows what happens, as it happens: joined, left, refused, failed requests, leases that end. Ctrl-C ends it.
 #[derive(clap::Args)]

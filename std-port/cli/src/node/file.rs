@@ -8,7 +8,7 @@ use toml::Spanned;
 
 use super::mistake::{Mistake, Source};
 use super::values::{Size, Time};
-use crate::close_names::close;
+use cara_tools::close_names::close;
 
 /// A value that may be absent, with its place.
 pub(super) type Maybe<T> = Option<Spanned<T>>;

@@ -5,7 +5,7 @@ use std::io::IsTerminal;
 use tracing_subscriber::EnvFilter;
 use tracing_subscriber::filter::{LevelFilter, ParseError};
 
-use crate::exit::Ended;
+use cara_tools::exit::Ended;
 
 /// The default log filter.
 const LEVEL: &str = "info";

@@ -24,11 +24,11 @@ use std::process::ExitCode;
 use cara_std::Interfaces;
 use serde_json::json;
 
-use crate::exit::{Ended, Exit};
-use crate::files;
-use crate::global::Global;
-use crate::name_and_id::NameAndId;
-use crate::output;
+use cara_tools::exit::{Ended, Exit};
+use cara_tools::files;
+use cara_tools::global::Global;
+use cara_tools::name_and_id::NameAndId;
+use cara_tools::output;
 use mistake::{Mistakes, Source};
 use settings::{Overrides, Settings};
 

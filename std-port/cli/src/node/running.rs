@@ -17,10 +17,10 @@ use super::program::Programs;
 use super::settings::{Overrides, Placed, Settings};
 use super::unit::{Node, NotBuilt};
 use super::{events, http, wrong};
-use crate::exit::Ended;
-use crate::global::Global;
-use crate::listening::shown_mode;
-use crate::output;
+use cara_tools::exit::Ended;
+use cara_tools::global::Global;
+use cara_tools::listening::shown_mode;
+use cara_tools::output;
 
 /// Runs a node until it is asked to end.
 pub(super) fn run(settings: Settings, over: &Overrides, logging: &Logging, global: &Global) -> anyhow::Result<()> {
@@ -73,7 +73,7 @@ fn offer_all(node: &Node, settings: &Settings, programs: &Arc<Programs>) -> anyh
 fn not_built(error: BuildError, settings: &Settings) -> anyhow::Error {
     match error {
         BuildError::Unit(error) => not_made(error, settings),
-        BuildError::Keys(error) => crate::keys::failed(error),
+        BuildError::Keys(error) => cara_tools::keys::failed(error),
         other => Ended::failed("Failed", other.to_string()),
     }
 }

@@ -12,8 +12,8 @@ use super::file::{self, File, Maybe, Role};
 use super::functions::{self, Service};
 use super::limits;
 use super::mistake::{Mistake, Mistakes, Source};
-use crate::keys::Keys;
-use crate::name_and_id::NameAndId;
+use cara_tools::keys::Keys;
+use cara_tools::name_and_id::NameAndId;
 
 /// A value, and its place if it comes from the file.
 #[derive(Clone, Debug, PartialEq, Eq)]

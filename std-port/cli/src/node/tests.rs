@@ -7,7 +7,7 @@ use super::json::{self, BadOutput};
 use super::mistake::Source;
 use super::settings::{Overrides, Settings};
 use super::{EXAMPLE, limits};
-use crate::keys::Keys;
+use cara_tools::keys::Keys;
 
 fn settings(text: &str) -> Result<Settings, String> {
     let source = Source { name: "test.toml".into(), text: text.into() };

@@ -5,7 +5,7 @@ use std::fmt;
 use cara_std::Duration;
 use serde::de::{Deserialize, Deserializer, Error, Unexpected, Visitor};
 
-use crate::units::{parse_bytes, parse_micros};
+use cara_tools::units::{parse_bytes, parse_micros};
 
 /// A span of time: `"50ms"`, `"2s"`, or 0.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

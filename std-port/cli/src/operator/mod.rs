@@ -11,8 +11,8 @@ use cara_std::CommunicationSystem;
 use cara_std::control::protocol::{Answer, Failure, Question, UnitInfo};
 use cara_std::control::{Client, execute};
 
-use crate::exit::{Ended, Exit};
-use crate::global::Global;
+use cara_tools::exit::{Ended, Exit};
+use cara_tools::global::Global;
 
 /// What a command is about: as a manager of its own it waits until that is there.
 #[derive(Clone, Copy, Debug)]

@@ -8,13 +8,13 @@ use cara_std::survey::Survey;
 use cara_std::{BuildError, Builder, CommunicationSystem, Constraints, Fleet, Mode};
 
 use super::{Need, Operator, running};
-use crate::exit::Ended;
-use crate::global::Global;
-use crate::listening;
-use crate::name_and_id::NameAndId;
 use crate::nodes::{self, Chosen};
-use crate::output;
-use crate::units::show_micros;
+use cara_tools::exit::Ended;
+use cara_tools::global::Global;
+use cara_tools::listening;
+use cara_tools::name_and_id::NameAndId;
+use cara_tools::output;
+use cara_tools::units::show_micros;
 
 /// Most nodes of such a unit: enough for a whole fleet.
 const MAXIMUM_NODES: u16 = 1024;
@@ -39,7 +39,7 @@ pub(super) fn start(identity: &NameAndId, global: &Global) -> anyhow::Result<Com
     let builder = builder.constraints(constraints).control(Control::Off).tcp_port(global.as_port.unwrap_or(0));
     let keys = global.keys().unwrap_or_default();
     let system = keys.given_to(builder).build_system().map_err(|error| match error {
-        BuildError::Keys(error) => crate::keys::failed(error),
+        BuildError::Keys(error) => cara_tools::keys::failed(error),
         BuildError::Unit(error) => network(error),
         other => Ended::failed("Failed", other.to_string()),
     })?;

@@ -7,9 +7,9 @@ use cara_std::control::protocol::{Answer, Question};
 use cara_std::control::{Client, ControlError, Elsewhere, RunningUnit, directory, elsewhere, running, running_called};
 
 use super::error_of;
-use crate::exit::{Ended, Exit};
-use crate::global::Global;
-use crate::name_and_id::NameAndId;
+use cara_tools::exit::{Ended, Exit};
+use cara_tools::global::Global;
+use cara_tools::name_and_id::NameAndId;
 
 /// The unit that the options choose; `None` if they choose none and none runs.
 pub(super) fn choose(global: &Global) -> anyhow::Result<Option<Client>> {

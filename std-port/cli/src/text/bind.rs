@@ -7,7 +7,7 @@ use cara_std::{Signature, Type, VariableSpec};
 
 use super::read::{Literal, Placed, Value, Written};
 use super::{Mistake, print};
-use crate::close_names;
+use cara_tools::close_names;
 
 /// The arguments of a call in the signature's order.
 pub(crate) fn bind(written: &Written, signature: &Signature) -> Result<Vec<Argument>, Mistake> {

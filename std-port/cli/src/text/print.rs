@@ -2,7 +2,7 @@
 
 use cara_std::control::protocol::{Argument, ArgumentValue, Number};
 
-use crate::output::json;
+use cara_tools::output::json;
 
 /// A call, or results in the form of one: `go_to(position: [1, 2])`.
 pub(crate) fn show_call(function: &str, arguments: &[Argument]) -> String {

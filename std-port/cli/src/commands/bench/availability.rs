@@ -14,9 +14,9 @@ use serde::Serialize;
 
 use super::subject::Subject;
 use super::{Arguments, show};
-use crate::exit::Ended;
 use crate::nodes;
 use crate::operator::Operator;
+use cara_tools::exit::Ended;
 
 /// How long events are waited for after the blocking call behind a group.
 const STRAGGLERS: Duration = Duration::from_millis(100);

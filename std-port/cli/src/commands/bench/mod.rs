@@ -14,12 +14,12 @@ use std::time::Duration;
 
 use clap::ArgAction;
 
-use crate::exit::Exit;
-use crate::global::Global;
 use crate::nodes;
 use crate::operator::{Need, Operator};
-use crate::output;
-use crate::units::parse_time;
+use cara_tools::exit::Exit;
+use cara_tools::global::Global;
+use cara_tools::output;
+use cara_tools::units::parse_time;
 
 /// Measures response time and availability of a node, with strings through one of its functions.
 ///

@@ -7,8 +7,8 @@ use cara_std::Shown;
 use super::Arguments;
 use super::subject::Subject;
 use super::{availability, response};
-use crate::output::{HEADING, line};
-use crate::units::show_micros;
+use cara_tools::output::{HEADING, line};
+use cara_tools::units::show_micros;
 
 pub(crate) fn heading(node: &str, subject: &Subject, left_out: &[usize]) -> io::Result<()> {
     line(format_args!("{HEADING}{node}{HEADING:#}  {}", subject.signature))?;

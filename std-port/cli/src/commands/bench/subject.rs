@@ -3,9 +3,9 @@
 use cara_std::control::protocol::{Argument, ArgumentValue, CallQuestion, FunctionInfo};
 use cara_std::{Definition, Type};
 
-use crate::exit::Ended;
 use crate::nodes;
 use crate::operator::Operator;
+use cara_tools::exit::Ended;
 
 /// A function that takes one string.
 #[derive(Clone, Debug, PartialEq)]

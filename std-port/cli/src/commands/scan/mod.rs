@@ -9,12 +9,12 @@ use anstyle::Style;
 use cara_std::control::protocol::{Answer, LimitsInfo, NodeInfo, Question, RefusedInfo};
 use serde_json::json;
 
-use crate::exit::{Ended, Exit};
-use crate::global::Global;
 use crate::nodes;
 use crate::operator::{Need, Operator};
-use crate::output::{self, BAD, FAINT, PLAIN, Rows};
-use crate::units::{parse_time, show_bytes, show_micros};
+use cara_tools::exit::{Ended, Exit};
+use cara_tools::global::Global;
+use cara_tools::output::{self, BAD, FAINT, PLAIN, Rows};
+use cara_tools::units::{parse_time, show_bytes, show_micros};
 
 /// Nodes that a line lists.
 const LISTED: usize = 8;

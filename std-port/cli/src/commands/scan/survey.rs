@@ -7,9 +7,9 @@ use cara_std::survey::{Heard, Standing, Survey};
 use cara_std::{Fleet, Role};
 use serde_json::{Value, json};
 
-use crate::global::Global;
-use crate::listening::{self, shown_mode, shown_standing};
-use crate::output::{self, BAD, FAINT, PLAIN, Rows};
+use cara_tools::global::Global;
+use cara_tools::listening::{self, shown_mode, shown_standing};
+use cara_tools::output::{self, BAD, FAINT, PLAIN, Rows};
 
 /// How often a survey asks while it listens: one broadcast may be lost.
 const QUESTIONS: u32 = 2;

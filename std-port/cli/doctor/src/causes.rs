@@ -1,0 +1,201 @@
+//! Findings about nodes that several judgements share.
+
+use std::net::SocketAddr;
+
+use cara_std::Manager;
+use cara_std::control::protocol::RefusedInfo;
+use cara_std::survey::Heard;
+
+use super::dial::{Dial, Outcome};
+use super::evidence::{Evidence, Life, overlapping};
+use super::finding::{Finding, Id};
+use cara_tools::name_and_id::quoted;
+
+/// As the documentation and the command line write a manager.
+pub(crate) fn text_of(manager: &Manager) -> String {
+    format!("{}/{}", manager.name, manager.id)
+}
+
+pub(crate) fn other_version(about: &str, heard: &Heard) -> Finding {
+    let (theirs, ours) = (heard.version, super::VERSION);
+    let found =
+        format!("{about} at {} speaks version {theirs} of the protocol, and this is version {ours}", heard.source);
+    let advice =
+        if theirs < ours { "update the node" } else { "update the manager and this command, or put the node back" };
+    Finding::error(Id::OtherVersion, found, advice).about(about)
+}
+
+pub(crate) fn other_fleet(seen: &Evidence, about: &str, heard: &Heard) -> Finding {
+    let ours = seen.fleet.0;
+    let found = format!("{about} at {} is in fleet {}, and this is fleet {ours}", heard.source, heard.fleet.0);
+    let advice = match seen.fleet_known {
+        true => format!("set the same fleet in both (`--fleet {}` shows that one's nodes)", heard.fleet.0),
+        false => format!("no --fleet was given: try `--fleet {}`", heard.fleet.0),
+    };
+    Finding::error(Id::OtherFleet, found, advice).about(about)
+}
+
+/// Two lives of one identity at the same time.
+pub(crate) fn duplicate(node: &str, lives: &[Life]) -> Option<Finding> {
+    let (first, second) = overlapping(lives)?;
+    let found = format!(
+        "two live nodes are {node}: one at {} (epoch {:x}) and one at {} (epoch {:x})",
+        first.at, first.epoch, second.at, second.epoch
+    );
+    Some(Finding::error(Id::Duplicate, found, DUPLICATE_ADVICE).about(node))
+}
+
+const DUPLICATE_ADVICE: &str = "give each node a name and id of its own; the one that was connected first stays";
+
+/// A node without a key may be a revoked one: the advice that is read first must not let it in again.
+const NO_PAIR_KEY_ADVICE: &str = "if it was revoked, or is not known to you, do nothing: it stays out. `cara keys show`, where \
+                                  the fleet's root is, tells who was revoked; one that was never added and belongs here is \
+                                  added there";
+
+/// Managers of which there are two.
+pub(crate) fn twin_managers(seen: &Evidence) -> Vec<Finding> {
+    let twins = seen.managers().into_iter().filter_map(|name| duplicate(&name, &seen.lives(&name)));
+    twins.map(|finding| Finding { advice: TWIN_MANAGERS.to_owned(), ..finding }).collect()
+}
+
+const TWIN_MANAGERS: &str =
+    "stop one of the two, or give each a name and id of its own: as it is, each has some of the nodes";
+
+/// A node that has come with one epoch after the other.
+pub(crate) fn restarting(node: &str, lives: &[Life]) -> Option<Finding> {
+    let restarts = lives.len().checked_sub(1).filter(|restarts| *restarts > 0 && overlapping(lives).is_none())?;
+    let times = if restarts == 1 { "once".to_owned() } else { format!("{restarts} times") };
+    let span = lives.last()?.last.saturating_sub(lives.first()?.first).as_secs_f32();
+    let found = format!("{node} has started anew {times} within {span:.1} s");
+    let advice = "look at its power supply, its watchdog's reset reason and its log; a node that was just switched on or \
+                  updated is in order if this does not go on";
+    Some(Finding::error(Id::Restarting, found, advice).about(node).certain(restarts > 1))
+}
+
+/// A manager that says it takes no more nodes.
+pub(crate) fn full(manager: &str, limit: Option<u16>) -> Finding {
+    let found = match limit {
+        Some(limit) => format!("{manager} has as many nodes connected as it takes: maximum_nodes is {limit}"),
+        None => format!("{manager} says that it has room for no more nodes"),
+    };
+    let advice = format!(
+        "raise maximum_nodes of {manager}, or take a node away: `cara --unit {} set . maximum_nodes NUMBER` on its host takes \
+         up to 16 more than it was started with; more needs its configuration and a restart",
+        quoted(manager)
+    );
+    Finding::error(Id::Full, found, advice).about(manager)
+}
+
+/// A connection to an m_unit that did not open, though it shows itself.
+pub(crate) fn tcp_blocked(manager: &str, dial: &Dial) -> Option<Finding> {
+    let trouble = dial.outcome?.trouble()?;
+    let (port, host) = (dial.to.port(), dial.to.ip());
+    let found = format!("{manager} shows itself, and a connection to its TCP port {port} at {host} {trouble}");
+    let advice = match dial.outcome {
+        Some(Outcome::Refused) => format!(
+            "let TCP port {port} in in the firewall of {host}, which rejects it (`nft list ruleset`); if there is none, \
+             start the manager anew"
+        ),
+        _ => format!("let TCP port {port} in in the firewall of {host} (`nft list ruleset`, `iptables -S INPUT`)"),
+    };
+    Some(Finding::error(Id::TcpBlocked, found, advice).about(manager).certain(true))
+}
+
+/// The dial of what a manager tells of itself.
+pub(crate) fn dial_of<'e>(seen: &'e Evidence, heard: &Heard) -> Option<&'e Dial> {
+    let at = heard.listens_at()?;
+    seen.dials.iter().find(|dial| dial.to == at)
+}
+
+/// A node answers when it is asked alone, and not when all are.
+pub(crate) fn one_way(seen: &Evidence, at: SocketAddr) -> Finding {
+    let found = format!("the node at {at} answers when it is asked alone, and does not when all are asked");
+    let advice = format!(
+        "look for what keeps broadcasts to UDP port {} from it: a firewall there, a router between two networks, an access \
+         point that drops broadcasts; or tell s_units their manager's address",
+        seen.port
+    );
+    Finding::error(Id::BroadcastOneWay, found, advice).about(at).certain(true)
+}
+
+/// An m_unit that is heard, and answers no question.
+pub(crate) fn deaf(seen: &Evidence, name: &str, at: SocketAddr) -> Finding {
+    let found = format!("{name} is heard at {at}, and answers neither when all are asked nor when it is asked alone");
+    let advice = format!("let UDP in on the host of {name}: port {} for broadcasts, and port {}", seen.port, at.port());
+    Finding::error(Id::BroadcastOneWay, found, advice).about(name)
+}
+
+/// A node looks for a manager that does not run.
+pub(crate) fn missing_manager(seen: &Evidence, node: &str, wanted: &Manager) -> Finding {
+    let wanted_text = text_of(wanted);
+    let managers = seen.managers();
+    if managers.is_empty() {
+        let found =
+            format!("{node} looks for its manager {wanted_text}, and no manager of fleet {} runs", seen.fleet.0);
+        return Finding::error(Id::NoManager, found, format!("start {wanted_text}")).about(node);
+    }
+    let running = managers.join(", ");
+    let found = format!("{node} looks for the manager {wanted_text}, and {running} runs");
+    let advice =
+        format!("set the manager's name and id in {node} to those of the one that runs, or start {wanted_text}");
+    Finding::error(Id::WrongManager, found, advice).about(node)
+}
+
+/// A node that a unit of this host has refused.
+pub(crate) fn refusal(manager: &str, refused: &RefusedInfo) -> Option<Finding> {
+    let id = match refused.reason.as_str() {
+        "DuplicateIdentity" => Id::Duplicate,
+        "Full" => Id::Full,
+        "WrongManager" => Id::WrongManager,
+        "Fleet" => Id::OtherFleet,
+        "Version" => Id::OtherVersion,
+        "NoKey" => Id::NoPairKey,
+        // Each end has dialled the other: one link is refused, and the other one is in use.
+        "AlreadyConnected" => return None,
+        _ => Id::Refused,
+    };
+    let who = refused.node.as_deref().unwrap_or("a node");
+    let ago = refused.ago_ms / 1000;
+    let found = format!("{manager} refused {who} at {} {ago} s ago: {}", refused.address, refused.reason);
+    let advice = match id {
+        Id::Duplicate => DUPLICATE_ADVICE.to_owned(),
+        Id::NoPairKey => NO_PAIR_KEY_ADVICE.to_owned(),
+        _ => refused.text.clone(),
+    };
+    Some(Finding::error(id, found, advice).about(who))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::evidence::samples::life;
+    use super::*;
+
+    #[test]
+    fn lives_one_after_the_other_are_restarts_and_overlapping_ones_twins() {
+        let once = [life("a/1", 1, 0, 1000), life("a/1", 2, 2000, 2000)];
+        assert_eq!(duplicate("a/1", &once), None);
+        assert!(!restarting("a/1", &once).unwrap().certain);
+        let often = [life("a/1", 1, 0, 1000), life("a/1", 2, 2000, 2000), life("a/1", 3, 3000, 3000)];
+        assert!(restarting("a/1", &often).unwrap().certain);
+        let twins = [life("a/1", 1, 0, 3000), life("a/1", 2, 2000, 2000)];
+        assert_eq!(restarting("a/1", &twins), None);
+        assert_eq!(duplicate("a/1", &twins).unwrap().id, Id::Duplicate);
+        assert_eq!(restarting("a/1", &twins[..1]), None);
+    }
+
+    #[test]
+    fn a_refusal_of_the_second_link_of_a_pair_is_none() {
+        let refused = |reason: &str| RefusedInfo {
+            address: "10.0.0.2:5".into(),
+            node: Some("a/1".into()),
+            reason: reason.into(),
+            text: "text".into(),
+            ago_ms: 3000,
+        };
+        assert_eq!(refusal("m/1", &refused("AlreadyConnected")), None);
+        assert_eq!(refusal("m/1", &refused("Role")).unwrap().id, Id::Refused);
+        assert_eq!(refusal("m/1", &refused("Full")).unwrap().id, Id::Full);
+        let keyless = refusal("m/1", &refused("NoKey")).unwrap();
+        assert!(keyless.advice.contains("do nothing") && !keyless.advice.contains("derive"), "{}", keyless.advice);
+    }
+}

@@ -1,0 +1,71 @@
+//! `cara doctor`: why is a node not there, and what is strange on this host and its network?
+//!
+//! `look` gathers evidence: a survey of the network, connections that are tried, the units of this host through their
+//! control sockets. `node`, `connected`, `network`, `secured` and `host` judge it; they are pure.
+
+mod causes;
+mod connected;
+mod dial;
+mod evidence;
+mod finding;
+mod holder;
+mod host;
+mod left;
+mod look;
+mod network;
+mod node;
+mod report;
+mod running;
+mod secured;
+mod unasked;
+mod which;
+
+use std::process::ExitCode;
+use std::time::Duration;
+
+use cara_std::Role;
+use cara_std::survey::VERSION;
+
+use cara_tools::exit::{Ended, Exit};
+use cara_tools::global::Global;
+use cara_tools::output;
+use cara_tools::units::parse_time;
+
+use self::finding::Severity;
+use self::which::Which;
+
+/// Finds out why a node is not there; or, without NAME, what is strange on this host and its network.
+///
+/// It asks the m_units of the network to show themselves, listens, tries to connect to those that do, and asks the
+/// units that run on this host. It joins nothing and manages no node. Each finding is explained in
+/// docs/troubleshooting.md. The exit code is 4 if something was found.
+#[derive(clap::Args)]
+pub struct Arguments {
+    /// NAME, NAME/ID or #ID of a node.
+    #[arg(value_name = "NAME", value_parser = which::parse)]
+    node: Option<Which>,
+    /// How long to listen at most. A node that looks for its manager says something every 16 s at the latest.
+    #[arg(long, value_name = "TIME", default_value = "17s", value_parser = parse_time)]
+    listen: Duration,
+}
+
+/// Does what the command line asks, and prints it.
+pub fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
+    if global.act_as.is_some() {
+        return Err(Ended::usage("the doctor is nobody's manager: leave --as away"));
+    }
+    let looked = look::look(arguments.node, arguments.listen, global)?;
+    match global.json {
+        true => output::object(&report::object(&looked))?,
+        false => report::text(&looked)?,
+    }
+    let found = looked.findings.iter().any(|finding| finding.severity != Severity::Info);
+    Ok(if found { Exit::Findings } else { Exit::Done }.into())
+}
+
+const fn role(role: Role) -> &'static str {
+    match role {
+        Role::MUnit => "m_unit",
+        Role::SUnit => "s_unit",
+    }
+}

@@ -1,0 +1,206 @@
+//! `cara keys`: makes the keys of a fleet and of its nodes. All of the work is in `cara_std::keys`; `told` says what was
+//! changed and what to do next, and `show` what there is, never a key.
+
+mod show;
+mod told;
+
+use told::Done;
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use cara_core::distribution::identity::{Fleet, Identity};
+use cara_std::keys::place::own_folder;
+use cara_std::keys::{FleetError, FleetKeys, KeyError, Members, Store, parse_node};
+
+use cara_tools::exit::{Ended, Exit};
+use cara_tools::global::Global;
+use cara_tools::interrupt::Asked;
+use cara_tools::keys::failed;
+use cara_tools::name_and_id::NameAndId;
+
+/// Makes the keys of a fleet and of its nodes, shows whose there are, takes nodes out, and changes keys.
+///
+/// A fleet has one root, from which the keys of all nodes come; it stays in its folder. Each node has a file, which is
+/// brought to where the node runs.
+#[derive(clap::Args)]
+#[command(
+    flatten_help = true,
+    after_help = "\
+cara keys new-fleet --fleet 7 depot/1@m_unit agv-17/17
+cara keys derive --fleet 7 agv-18/18
+cara keys revoke --fleet 7 agv-17/17
+cara keys rotate --fleet 7 --finish"
+)]
+pub struct Arguments {
+    #[command(subcommand)]
+    action: Action,
+    /// The folder with the fleet's root [default: cara/keys in XDG_CONFIG_HOME or ~/.config; or CARA_KEYS].
+    #[arg(long, global = true, value_name = "FOLDER")]
+    dir: Option<PathBuf>,
+}
+
+#[derive(clap::Subcommand)]
+enum Action {
+    /// Draws the root of a fleet that has none yet, and makes the keys of its first nodes.
+    NewFleet(Nodes),
+    /// Makes the keys of nodes, or writes again what is missing, and updates the files of those that they talk to.
+    Derive(Nodes),
+    /// Shows the fleet's nodes, or what is in the file of one; fingerprints and never keys.
+    Show {
+        /// The file of a node.
+        file: Option<PathBuf>,
+    },
+    /// Takes nodes out: begins a generation of keys that they have nothing of.
+    Revoke {
+        /// NAME/ID of an s_unit, NAME/ID@m_unit of an m_unit.
+        #[arg(required = true, value_name = "NODE", value_parser = parse_node)]
+        nodes: Vec<Identity>,
+    },
+    /// Changes all keys, in three steps: begins a generation that all nodes take beside the one in use.
+    Rotate {
+        /// The second step, when all nodes have their files: the new generation is used, and the older one still taken.
+        #[arg(long)]
+        switch: bool,
+        /// The last step, when all nodes have their files: the older generation ends.
+        #[arg(long, conflicts_with = "switch")]
+        finish: bool,
+    },
+}
+
+/// Nodes that are added.
+#[derive(clap::Args)]
+struct Nodes {
+    /// NAME/ID of an s_unit, NAME/ID@m_unit of an m_unit.
+    #[arg(value_name = "NODE", value_parser = parse_node)]
+    nodes: Vec<Identity>,
+    /// The m_unit that these s_units belong to; may be repeated. Unless told, the only one of the fleet.
+    #[arg(long, value_name = "NAME/ID")]
+    manager: Vec<NameAndId>,
+}
+
+/// Does what the command line asks, and prints it.
+pub fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
+    let folder = || arguments.dir.clone().or_else(own_folder).ok_or_else(|| Ended::usage("say where: --dir FOLDER"));
+    match &arguments.action {
+        Action::NewFleet(nodes) => new_fleet(nodes, folder()?, global)?,
+        Action::Derive(nodes) => derive(nodes, folder()?, global)?,
+        Action::Show { file: Some(file) } => show::ring(file, global)?,
+        Action::Show { file: None } => show::fleet(&open(folder()?, global)?, global)?,
+        Action::Revoke { nodes } => revoke(nodes, folder()?, global)?,
+        Action::Rotate { switch: true, .. } => Step::Switch.make(folder()?, global)?,
+        Action::Rotate { finish: true, .. } => Step::Finish.make(folder()?, global)?,
+        Action::Rotate { .. } => Step::Begin.make(folder()?, global)?,
+    }
+    Ok(Exit::Done.into())
+}
+
+impl Nodes {
+    fn managers(&self) -> anyhow::Result<Vec<Identity>> {
+        self.manager.iter().map(m_unit).collect()
+    }
+}
+
+fn m_unit(NameAndId { name, id }: &NameAndId) -> anyhow::Result<Identity> {
+    Identity::m_unit(name, *id).map_err(|error| Ended::usage(format!("--manager {name}/{id}: {error}")))
+}
+
+fn new_fleet(nodes: &Nodes, folder: PathBuf, global: &Global) -> anyhow::Result<()> {
+    let mut keys = FleetKeys::draw(Fleet(global.fleet.unwrap_or(0))).map_err(failed)?;
+    let added = keys.add_all(&nodes.nodes, &nodes.managers()?);
+    added.map_err(|error| wrong(error.of_new_fleet()))?;
+    let asked = Asked::catch()?;
+    let made = Store::create_unless(&folder, keys, &|| asked.came());
+    let (store, written) = made.map_err(|error| not_changed(error, &asked))?;
+    told::tell(Done::Made, &store, &written, global)
+}
+
+fn derive(nodes: &Nodes, folder: PathBuf, global: &Global) -> anyhow::Result<()> {
+    let mut store = open(folder, global)?;
+    store.keys_mut().add_all(&nodes.nodes, &nodes.managers()?).map_err(wrong)?;
+    save(Done::Derived, &store, global)
+}
+
+/// Of nodes that were revoked already what was not written is, so that a command that stopped half-way can be repeated.
+fn revoke(nodes: &[Identity], folder: PathBuf, global: &Global) -> anyhow::Result<()> {
+    let mut store = open(folder, global)?;
+    let members = store.keys().members();
+    let already = nodes.iter().all(|node| members.is_revoked(node));
+    let done = if already { Done::RevokedAlready(nodes) } else { Done::Revoked };
+    store.keys_mut().revoke(nodes).map_err(wrong)?;
+    save(done, &store, global)
+}
+
+/// A step of a change of keys.
+#[derive(Clone, Copy)]
+enum Step {
+    Begin,
+    Switch,
+    Finish,
+}
+
+impl Step {
+    /// Makes the step, or completes it where it stopped half-way. Where another one did, that comes first.
+    fn make(self, folder: PathBuf, global: &Global) -> anyhow::Result<()> {
+        let mut store = open(folder, global)?;
+        if !store.is_behind().map_err(failed)? {
+            self.change(store.keys_mut()).map_err(wrong)?;
+            return save(Done::Stepped, &store, global);
+        }
+        let members = store.keys().members();
+        if !self.is_last(members) {
+            return Err(wrong(FleetError::Behind(members.fleet())));
+        }
+        save(Done::SteppedAlready, &store, global)
+    }
+
+    fn change(self, keys: &mut FleetKeys) -> Result<(), FleetError> {
+        match self {
+            Self::Begin => keys.rotate(),
+            Self::Switch => keys.switch(),
+            Self::Finish => keys.finish(),
+        }
+    }
+
+    /// Whether it is the one that was made last.
+    fn is_last(self, members: &Members) -> bool {
+        let begun = members.beside().map(|beside| beside > members.generation());
+        match self {
+            Self::Begin => begun == Some(true),
+            Self::Switch => begun == Some(false),
+            Self::Finish => begun.is_none(),
+        }
+    }
+}
+
+fn save(done: Done<'_>, store: &Store, global: &Global) -> anyhow::Result<()> {
+    let asked = Asked::catch()?;
+    let written = store.save_unless(&|| asked.came()).map_err(|error| not_changed(error, &asked))?;
+    told::tell(done, store, &written, global)
+}
+
+/// The keys of the fleet that is meant: of the only one in the folder, unless one is named.
+fn open(folder: PathBuf, global: &Global) -> anyhow::Result<Store> {
+    let fleet = match (global.fleet, Store::fleets(&folder).as_slice()) {
+        (Some(fleet), _) => Fleet(fleet),
+        (None, [only]) => *only,
+        (None, []) => Fleet(0),
+        (None, several) => {
+            let options: Vec<_> = several.iter().map(|fleet| format!("--fleet {}", fleet.0)).collect();
+            let text = format!("{} has several fleets: say {}", folder.display(), options.join(" or "));
+            return Err(Ended::usage(text));
+        }
+    };
+    Store::open(&folder, fleet).map_err(failed)
+}
+
+fn not_changed(error: KeyError, asked: &Asked) -> anyhow::Error {
+    match error {
+        KeyError::Stopped => Ended { exit: asked.exit(), text: error.to_string(), name: "Stopped".into() }.into(),
+        error => failed(error),
+    }
+}
+
+fn wrong(error: FleetError) -> anyhow::Error {
+    Ended::usage(error.to_string())
+}
