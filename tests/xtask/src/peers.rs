@@ -11,7 +11,7 @@ use crate::command::Run;
 use crate::workspace;
 
 /// The folder of the table and of everything that it names.
-const FOLDER: &str = "tests/peers";
+const FOLDER: &str = "tests/experiments/peers";
 
 /// One entry of the table, as far as it matters here; `cara-bench` reads the rest.
 struct Peer {

@@ -11,7 +11,7 @@ const FOLDERS: [(&str, &str); 11] = [
     ("std-port/", "Linux"),
     ("examples/linux/", "Linux"),
     ("examples/smoltcp/", "smoltcp"),
-    ("tests/bench/", "Linux"),
+    ("tests/experiments/bench/", "Linux"),
     ("tests/embassy/", "embassy"),
     ("tests/firmware/", "QEMU"),
     ("tests/sim/", "simulator"),

@@ -9,7 +9,7 @@ use serde_json::{Map, Value};
 
 /// Kinds of rows, each with the keys of its table.
 fn documented() -> BTreeMap<String, BTreeSet<String>> {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/performance.md");
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../docs/performance.md");
     let text = std::fs::read_to_string(path).unwrap();
     let mut kinds: BTreeMap<String, BTreeSet<String>> = BTreeMap::new();
     let mut kind = None;

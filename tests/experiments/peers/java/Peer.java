@@ -25,7 +25,7 @@ import java.util.regex.Matcher;
 import java.util.regex.Pattern;
 
 /**
- * Java RMI. It answers the questions of cara_bench_ends (see tests/bench/ends), one line of JSON each way, and measures as
+ * Java RMI. It answers the questions of cara_bench_ends (see tests/experiments/bench/ends), one line of JSON each way, and measures as
  * that does: RMI has no messages without an answer, so it knows no bursts.
  */
 public final class Peer {
