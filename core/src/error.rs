@@ -117,7 +117,7 @@ pub enum CloseReason {
     #[error("nothing was heard from the peer: check power, cable and manager")]
     Silent = 3,
     /// The same identity came back with a new boot epoch.
-    #[error("the peer restarted: it is taken again, ask it anew")]
+    #[error("the peer restarted: it is connected again, repeat the request")]
     PeerRestarted = 4,
     /// The other end broke the protocol.
     #[error("the peer broke the protocol: check its version")]
@@ -126,7 +126,7 @@ pub enum CloseReason {
     #[error("the peer sent more than the limit that it was told: check its version, or raise message_size here")]
     Oversize = 6,
     /// No hello came in time, or no proof behind it.
-    #[error("no hello or no proof came in time: whoever is there said nothing, or is no CARA unit of this mode")]
+    #[error("no hello or no proof came in time: the other end is silent, or no CARA unit of this mode")]
     HelloTimeout = 7,
     /// The unit refused the link.
     #[error("{0}")]
@@ -135,10 +135,10 @@ pub enum CloseReason {
     #[error("the connection could not be opened: is the peer's port reachable?")]
     DialFailed = 9,
     /// Request ids ran out; the pair connects again.
-    #[error("request ids ran out: the link is opened anew, ask again")]
+    #[error("request ids ran out: the link is opened again, repeat the request")]
     Exhausted = 10,
     /// The other end ended the link before it had proven its identity, so the reason it gave is ignored.
-    #[error("the other end went before it proved who it is: has it the key of this pair, and the same version?")]
+    #[error("the other end left before it proved its identity: has it the key of this pair, and the same version?")]
     Unproven = 11,
     /// The other end has another key for this pair, or a message was changed on its way.
     #[error(

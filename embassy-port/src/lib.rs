@@ -53,8 +53,8 @@
 //! }
 //! ```
 //!
-//! What stops a vehicle when nothing runs any more is the lease, which a motor's interrupt reads; when a handler or a
-//! task hangs, the watchdog. See `docs/notes/embassy-port.md`.
+//! When no task runs any more, the lease stops a vehicle, since a motor's interrupt reads it; when a handler or a task
+//! hangs, the watchdog does. See `docs/notes/embassy-port.md`.
 
 #![no_std]
 

@@ -73,7 +73,7 @@ def ring(root, fleet, generations, nodes, node):
         return both_manage or other in managers or node in nodes[other][1]
 
     shown = f"{node[1].decode()}/{node[0]}" + ("@m_unit" if node[2] == 0 else "")
-    out = [f"# The keys of {shown} in fleet {fleet}. Whoever reads them can speak as it."]
+    out = [f"# The keys of {shown} in fleet {fleet}. A holder of this file can speak as it."]
     out += ["cara-ring 2", f"fleet {fleet}", f"node {spelled(node)}"]
     for generation in generations:
         out += [f"generation {generation}", f"discovery {key(root, b'disc', fleet, generation).hex()}"]

@@ -20,7 +20,7 @@ pub const MESSAGE_BYTES: usize = 48;
 /// A handshake that cannot go on: the other end has another key or another prologue, or the message was changed. One
 /// error for all, so that an attacker that tries keys learns nothing else.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("the handshake failed: the other end has another key for this pair, or somebody changed what was sent")]
+#[error("the handshake failed: the other end has another key for this pair, or a message was changed")]
 pub struct HandshakeError;
 
 /// The end that opened the connection, until the other one has answered. It keeps what its message was made of, and makes

@@ -1,15 +1,15 @@
-//! What stops the motors of a board when the unit above cannot: an interrupt that looks each millisecond whether they may
-//! run, the ends of a program (panic, fault, stack overflow), a watchdog, and a linker script (`stack.x`) with which a stack
-//! overflow faults before it overwrites anything. The same for every board; a board tells with [`Board`] how its hardware
-//! does it, and calls [`guard!`] once.
+//! Stops the motors of a board when the unit above cannot: an interrupt that checks each millisecond whether they may run,
+//! handlers for panics, faults and stack overflows, a watchdog, and a linker script (`stack.x`) that makes a stack overflow
+//! fault before it overwrites anything. The same for every board; a board implements [`Board`] for its hardware, and calls
+//! [`guard!`] once.
 //!
 //! - A board's interrupt calls [`tick`] each millisecond. Nothing else switches the motors on.
 //! - A panic, and any fault of the processor, switches them off at once, notes why, and resets without waiting.
 //! - The watchdog is fed by [`tick`] only, and only if the unit's task, wrapped in [`watched`], has had a turn since the last
-//!   feeding: so neither a unit that hangs nor an interrupt that does not come keeps it fed.
-//! - A reset leaves pins as inputs: the motors' driver needs a pull-down. [`reason`] tells the next life why it began.
+//!   feeding: a unit that hangs, or an interrupt that no longer comes, causes a reset.
+//! - A reset leaves pins as inputs: the motors' driver needs a pull-down. [`reason`] is the reset reason of this boot.
 //!
-//! What masks interrupts and hangs is ended by the watchdog alone. Nothing here replaces a certified emergency stop, which
+//! Code that hangs with interrupts masked is ended by the watchdog alone. Nothing here replaces a certified emergency stop, which
 //! cuts the motors' power without a program.
 
 #![cfg_attr(target_os = "none", no_std)]

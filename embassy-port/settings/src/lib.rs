@@ -1,16 +1,16 @@
-//! One image for thirty vehicles: what differs from board to board is not compiled in, but stands in two pages of its
-//! flash, or comes as text where there is no flash to write.
+//! Settings of a board in two pages of its flash, so that one image serves all boards of a kind. Without writable flash
+//! they come as text.
 //!
-//! [`Settings`] is what a board is told. [`page`] is how it stands in flash: two copies, each with a generation and a
-//! checksum, so that a cut of power while one is written leaves the other. Its text (`FromStr` and `Display`) is how a person,
-//! a command line or an emulator's arguments say it.
+//! [`Settings`] is what a board is provisioned with. [`page`] is its layout in flash: two copies, each with a generation
+//! and a checksum, so that a power cut while one is written leaves the other. Its text form (`FromStr` and `Display`) is
+//! for command lines and an emulator's arguments.
 //!
-//! With the feature `keys`, [`keys`] stand behind the settings in the same copy, and [`boots`] counts the lives of the board
-//! in two pages of its own.
+//! With the feature `keys`, the module `keys` adds keys behind the settings in the same copy, and `boots` is the boot
+//! counter, in two pages of its own.
 //!
-//! [`board`] is the table of boards and of where their pages are; [`uf2`] is the file form that some boot loaders take.
+//! [`board`] is the table of boards and the addresses of their pages; [`uf2`] is the file format of some boot loaders.
 //!
-//! It knows no flash controller: a board lends the bytes of its pages, and for the count of its lives a driver.
+//! The crate drives no flash controller: a board lends the bytes of its pages, and a driver for the boot counter.
 
 #![no_std]
 

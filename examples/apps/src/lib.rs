@@ -1,4 +1,4 @@
-//! What the examples do, once, for every port: no socket, no thread and no clock. The binaries beside this crate are
+//! The logic of the examples, once, for every port: no socket, no thread and no clock. The binaries beside this crate are
 //! wiring only.
 //!
 //! Services take [`ParametersView`](cara_core::distribution::parameters::ParametersView) in place or

@@ -117,7 +117,7 @@ fn a_released_lease_stops_the_motion() {
     manager.send("go_to 0 100 100").unwrap();
     agv.seen("driving to [100", STEP).unwrap();
     manager.send("release 0").unwrap();
-    agv.seen("nobody wants go_to any more", STEP).unwrap();
+    agv.seen("the lease of go_to has ended", STEP).unwrap();
 }
 
 #[test]

@@ -67,7 +67,7 @@ impl Program for Vehicle {
 
     fn make_safe(&mut self, _: Slot) {
         if let Some(place) = self.agv.stop() {
-            println!("stopped at {place}: nobody wants go_to any more");
+            println!("stopped at {place}: the lease of go_to has ended");
         }
     }
 

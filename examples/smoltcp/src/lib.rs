@@ -2,8 +2,8 @@
 //! from for a new transport. `docs/porting.md` goes through it step by step.
 //!
 //! It has one s_unit with one link. The program owns clock, network device and main loop, and calls
-//! [`SUnit::poll`] in it, which never blocks; whatever the unit wants of the program it asks through [`Program`]. What
-//! it refuses to do: to wait, to be a manager, and to run a handler anywhere else than inside of `poll`.
+//! [`SUnit::poll`] in it, which never blocks; the unit calls the program back through [`Program`]. It
+//! never waits, is never a manager, and runs handlers only inside of `poll`.
 //!
 //! ```no_run
 //! use cara_core::distribution::connection_handler::Target;

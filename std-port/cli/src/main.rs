@@ -1,4 +1,4 @@
-//! The `cara` command: what is on the network, why something is not, and calls from the command line.
+//! The `cara` command: lists the nodes of a fleet, calls their functions, and finds out why a node is missing.
 
 mod command_line;
 mod commands;

@@ -255,7 +255,7 @@ fn every_mistake_is_told() {
     home.refused(&["new-fleet", "--dir", "file"], 1, "the folder file cannot be made");
     home.refused(&["new-fleet", "agv"], 2, "NAME/ID@m_unit for an m_unit");
     home.refused(&["new-fleet", "agv/1@manager"], 2, "0 to 4294967295");
-    home.refused(&["new-fleet", "depot/1@m_unit", "--manager", "depot/1"], 2, "leave --manager away");
+    home.refused(&["new-fleet", "depot/1@m_unit", "--manager", "depot/1"], 2, "leave out --manager");
     assert!(!home.folder().exists());
     let home = Home::with_fleet();
     home.refused(&["new-fleet", "--fleet", "7"], 1, "is there already");

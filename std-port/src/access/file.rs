@@ -52,7 +52,7 @@ impl AccessTable {
         }
         let mut open = OpenFile::open(path).map_err(|error| unreadable(error.to_string()))?;
         if found.mode() & OTHERS_WRITE != 0 {
-            return Err(unreadable(format!("everybody can write it: chmod o-w {file}")));
+            return Err(unreadable(format!("every user can write it: chmod o-w {file}")));
         }
         let mut text = String::new();
         let read = (&mut open).take(LONGEST_FILE + 1).read_to_string(&mut text);
@@ -292,7 +292,7 @@ mod tests {
         assert_eq!(
             found,
             [
-                (2, 7, "'agv' is nobody"),
+                (2, 7, "'agv' names no node"),
                 (3, 13, "'go to' is no function's name"),
                 (3, 13, "'*' is no function's name"),
                 (4, 9, "'cal' is no verb"),

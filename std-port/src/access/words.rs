@@ -20,7 +20,7 @@ const SPANS: [(&str, u64); 3] = [("s", 1), ("min", 60), ("h", 3600)];
 /// The text names no principal.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "'{0}' is nobody: write NAME/ID, NAME/* or */ID, \"m_units\", \"s_units\", \"operator\", or \"*\" for every node"
+    "'{0}' names no node: write NAME/ID, NAME/* or */ID, \"m_units\", \"s_units\", \"operator\", or \"*\" for every node"
 )]
 pub struct NotWho(String);
 

@@ -165,7 +165,7 @@ impl Shared {
         // Everything that is refused is small enough for an empty socket's buffer.
         let refuse = |failure| drop(write(&mut &stream, &Answer::Failed(failure)));
         if !peer_uid(&stream).is_ok_and(|uid| uid == own_uid() || uid == 0) {
-            return refuse(Failure::configuration("NotAllowed", "only the user who runs the unit may ask it"));
+            return refuse(Failure::configuration("NotAllowed", "only the user that runs the unit may ask it"));
         }
         let mut connections = lock(&self.connections);
         // A stop ends those that it finds.

@@ -219,7 +219,7 @@ pub enum FleetError {
     #[error("{0} is no m_unit of the fleet, so nothing can belong to it")]
     NotAManager(Identity),
     /// A manager was named for an m_unit, which has none.
-    #[error("{0} is an m_unit, and those belong to nobody: leave --manager away")]
+    #[error("{0} is an m_unit, which has no manager: leave out --manager")]
     MUnit(Identity),
     /// A change of keys has begun and is not finished.
     #[error(
@@ -243,7 +243,7 @@ pub enum FleetError {
     )]
     Behind(Fleet),
     /// Generations have an end.
-    #[error("there are no more generations: make the fleet's keys anew with `{} NODE...`", keys(*.0, &["new-fleet"]))]
+    #[error("there are no more generations: make new keys for the fleet with `{} NODE...`", keys(*.0, &["new-fleet"]))]
     Exhausted(Fleet),
 }
 
@@ -283,9 +283,9 @@ impl Kind {
         match self {
             Self::Root(fleet) => {
                 let anew = anew("If it may have been read", *fleet);
-                format!("Whoever has read this root can speak as every node, and no revocation ends that. {anew}")
+                format!("Anyone who has read this root can speak as every node, and no revocation ends that. {anew}")
             }
-            Self::Nodes(_) => "There is no key in it; if somebody may have changed it, take it from your copy".into(),
+            Self::Nodes(_) => "There is no key in it; if it may have been changed, take it from your copy".into(),
             Self::Ring(fleet) => {
                 format!("If its keys may have been read, revoke the node: `{} NODE`", keys_of(*fleet, &["revoke"]))
             }

@@ -1,7 +1,7 @@
 //! What one node needs to speak with its fleet.
 //!
 //! ```text
-//! # The keys of agv-17/17 in fleet 7. Whoever reads them can speak as it.
+//! # The keys of agv-17/17 in fleet 7. A holder of this file can speak as it.
 //! cara-ring 2
 //! fleet 7
 //! node s_unit 17 agv-17
@@ -166,7 +166,7 @@ impl KeyRing {
     fn push_to(&self, text: &mut String) {
         // Writing to text does not fail.
         let (name, fleet) = (full_name(&self.identity), self.fleet.0);
-        let _ = writeln!(text, "# The keys of {name} in fleet {fleet}. Whoever reads them can speak as it.");
+        let _ = writeln!(text, "# The keys of {name} in fleet {fleet}. A holder of this file can speak as it.");
         let _ = write!(text, "cara-ring {FORM}\nfleet {fleet}\nnode ");
         push_identity(text, &self.identity);
         text.push('\n');

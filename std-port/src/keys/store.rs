@@ -319,7 +319,7 @@ fn root_text(fleet: Fleet, root: &RootKey) -> Zeroizing<String> {
     let fleet = fleet.0;
     let mut text = Zeroizing::new(String::with_capacity(ROOT_BYTES));
     text.push_str(&format!(
-        "# The root of all keys of fleet {fleet}. Whoever reads it can speak as every node. It stays here; keep a copy.\n\
+        "# The root of all keys of fleet {fleet}. A holder of this file can speak as every node. It stays here; keep a copy.\n\
          cara-root {FORM}\nfleet {fleet}\nroot "
     ));
     push_key(&mut text, root.expose());

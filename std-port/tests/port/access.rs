@@ -98,7 +98,7 @@ fn a_file_is_followed_and_a_mistake_keeps_what_is_in_force() {
     assert!(matches!(unit("agv", 7, fleet).access_file(&path), Err(AccessError::Unreadable { .. })));
     write(&path, "[[allow]]\nwho = \"manager\"\n");
     let error = unit("agv", 7, fleet).access_file(&path).err().unwrap().to_string();
-    assert!(error.contains("access.toml:2:7: 'manager' is nobody"), "{error}");
+    assert!(error.contains("access.toml:2:7: 'manager' names no node"), "{error}");
     write(&path, &allowing("\"stop\""));
 
     let system = system(fleet).build_system().unwrap();

@@ -124,7 +124,7 @@ fn in_own_network(arguments: &Arguments) -> Result<ExitCode> {
         Own::Impossible(reason) => {
             eprintln!("skipped: {reason}");
             eprintln!(
-                "a board needs a network of its own: root, or a user who may make namespaces and open /dev/net/tun"
+                "a board needs a network of its own: root, or a user that may make namespaces and open /dev/net/tun"
             );
             Ok(ExitCode::from(SKIPPED))
         }

@@ -82,9 +82,9 @@ impl Need {
     /// Of the simulator with secured units.
     const fn missing_on_secured(self) -> Option<&'static str> {
         match self {
-            Self::UnprovenClients => {
-                Some("who proves nothing is neither taken nor told why; `tests/sim/tests/security` has what it tries")
-            }
+            Self::UnprovenClients => Some(
+                "a client without a proof is neither accepted nor told why; `tests/sim/tests/security` has what it tries",
+            ),
             _ => None,
         }
     }

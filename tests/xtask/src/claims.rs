@@ -62,7 +62,7 @@ fn problems(table: &str, exists: impl Fn(&str) -> bool, read: impl Fn(&str) -> S
     for (subject, tests) in rows {
         let named = references(tests);
         if !SUBJECTS.contains(&subject) {
-            wrong.push(format!("{subject}: nobody asks for this claim, so nobody would miss it"));
+            wrong.push(format!("{subject}: this claim is not in the list of claims, so its loss would not be noticed"));
         }
         if named.is_empty() {
             wrong.push(format!("{subject}: names no test"));

@@ -236,7 +236,7 @@ mod tests {
 
     #[test]
     fn lines_are_understood() {
-        assert_eq!(place("stopped at [3.480, 2.000]: nobody").unwrap(), "[3.480, 2.000]");
+        assert_eq!(place("stopped at [3.480, 2.000]: the lease").unwrap(), "[3.480, 2.000]");
         assert!(place("stopped").is_err());
         assert_eq!(epoch("= 2 s_units; 0 is a/1, away; 1 is agv-2/12, epoch 0f; 2 is b/3, away").unwrap(), "0f");
         assert!(epoch("= 1 s_units; 1 is agv-2/12, away").is_err());

@@ -51,10 +51,10 @@ impl Provision {
             Ok(keys) => return Some(Self { settings, proof: Proof::Keys(keys) }),
             Err(KeysError::Full) => info!("the keys are more than this board has room for: one manager's"),
             Err(KeysError::Absent | KeysError::Page(_)) => {
-                info!("there are no keys, and this board joins nobody without: give cara provision its --keys FILE")
+                info!("there are no keys, and this board joins no manager without: give cara provision its --keys FILE")
             }
             Err(KeysError::Unsound | KeysError::Text(_)) => {
-                info!("the keys are damaged, and this board joins nobody: write them again with cara provision")
+                info!("the keys are damaged, and this board joins no manager: write them again with cara provision")
             }
         }
         None
@@ -82,7 +82,7 @@ impl Proof {
                 Ok(random) => Some(Security::keys(lend(keys), random)),
                 Err(_) => {
                     crate::error!(
-                        "the count of starts cannot be kept, and this board joins nobody: its flash is worn out"
+                        "the count of starts cannot be kept, and this board joins no manager: its flash is worn out"
                     );
                     None
                 }
@@ -130,15 +130,15 @@ pub fn provisioned(read: Result<Settings, PageError>) -> Option<Settings> {
     match read {
         Ok(settings) if settings.manager.is_some() => return Some(settings),
         Ok(_) => info!("a vehicle belongs to a manager, and the settings name none: give cara provision a --manager"),
-        Err(PageError::Absent) => info!("who am I? There are no settings: write them with cara provision"),
+        Err(PageError::Absent) => info!("there are no settings: write them with cara provision"),
         Err(PageError::Layout(_layout)) => {
             info!("settings of layout {}: write them again, or update the image", _layout)
         }
         Err(PageError::Damaged) => {
-            info!("who am I? The settings are damaged: write them again with cara provision")
+            info!("the settings are damaged: write them again with cara provision")
         }
         Err(PageError::Unsound) => {
-            info!("who am I? The settings are of no unit: write them again with cara provision")
+            info!("the settings are of no unit: write them again with cara provision")
         }
     }
     None

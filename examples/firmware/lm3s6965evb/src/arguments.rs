@@ -46,9 +46,9 @@ impl ArgumentError {
     /// What the log says of it.
     pub const fn text(self) -> &'static str {
         match self {
-            Self::None => "who am I? There are no arguments, or more than this board has room for",
-            Self::File => "who am I? The file that the arguments name cannot be read",
-            Self::Settings(_) => "who am I? The arguments are no settings",
+            Self::None => "there are no arguments, or more than this board has room for",
+            Self::File => "the file that the arguments name cannot be read",
+            Self::Settings(_) => "the arguments are no settings",
         }
     }
 }

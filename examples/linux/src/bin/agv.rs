@@ -111,7 +111,7 @@ fn lock(agv: &Mutex<Agv>) -> MutexGuard<'_, Agv> {
 }
 
 fn not_wanted(place: cara_apps::agv::Place) {
-    say!("stopped at {place}: nobody wants go_to any more");
+    say!("stopped at {place}: the lease of go_to has ended");
 }
 
 /// Says what happens, and calls a mechanic, once, when the manager offers to send one.

@@ -66,7 +66,7 @@ pub(crate) fn restarting(node: &str, lives: &[Life]) -> Option<Finding> {
     let restarts = lives.len().checked_sub(1).filter(|restarts| *restarts > 0 && overlapping(lives).is_none())?;
     let times = if restarts == 1 { "once".to_owned() } else { format!("{restarts} times") };
     let span = lives.last()?.last.saturating_sub(lives.first()?.first).as_secs_f32();
-    let found = format!("{node} has started anew {times} within {span:.1} s");
+    let found = format!("{node} has restarted {times} within {span:.1} s");
     let advice = "look at its power supply, its watchdog's reset reason and its log; a node that was just switched on or \
                   updated is in order if this does not go on";
     Some(Finding::error(Id::Restarting, found, advice).about(node).certain(restarts > 1))
@@ -94,7 +94,7 @@ pub(crate) fn tcp_blocked(manager: &str, dial: &Dial) -> Option<Finding> {
     let advice = match dial.outcome {
         Some(Outcome::Refused) => format!(
             "let TCP port {port} in in the firewall of {host}, which rejects it (`nft list ruleset`); if there is none, \
-             start the manager anew"
+             restart the manager"
         ),
         _ => format!("let TCP port {port} in in the firewall of {host} (`nft list ruleset`, `iptables -S INPUT`)"),
     };

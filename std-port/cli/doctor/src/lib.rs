@@ -1,7 +1,7 @@
-//! `cara doctor`: why is a node not there, and what is strange on this host and its network?
+//! `cara doctor`: diagnostics for a missing node, and for this host and its network.
 //!
-//! `look` gathers evidence: a survey of the network, connections that are tried, the units of this host through their
-//! control sockets. `node`, `connected`, `network`, `secured` and `host` judge it; they are pure.
+//! `look` gathers evidence: a survey of the network, trial connections, the units of this host through their control
+//! sockets. `node`, `connected`, `network`, `secured` and `host` derive findings from it; they are pure functions.
 
 mod causes;
 mod connected;
@@ -52,7 +52,7 @@ pub struct Arguments {
 /// Does what the command line asks, and prints it.
 pub fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
     if global.act_as.is_some() {
-        return Err(Ended::usage("the doctor is nobody's manager: leave --as away"));
+        return Err(Ended::usage("the doctor is no manager: leave out --as"));
     }
     let looked = look::look(arguments.node, arguments.listen, global)?;
     match global.json {

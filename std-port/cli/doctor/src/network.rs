@@ -159,7 +159,7 @@ fn returns(unit: &Running) -> Option<Finding> {
     let hours = unit.unit.uptime_ms / 3_600_000 + 1;
     (count >= RETURNS && count >= hours * RETURNS_PER_HOUR).then(|| {
         let found =
-            format!("nodes of {} have started anew {count} times in {} s", unit.name(), unit.unit.uptime_ms / 1000);
+            format!("nodes of {} have restarted {count} times in {} s", unit.name(), unit.unit.uptime_ms / 1000);
         let advice = "see which with `cara watch`; look at power supply, watchdog and log of those";
         Finding::warning(Id::Restarting, found, advice).about(unit.name())
     })

@@ -188,7 +188,7 @@ fn ask(client: &mut Client, which: Option<&Which>) -> Result<Running, ControlErr
             }
         }
     }
-    let unit = unit.ok_or_else(|| io::Error::new(io::ErrorKind::InvalidData, "it did not say who it is"))?;
+    let unit = unit.ok_or_else(|| io::Error::new(io::ErrorKind::InvalidData, "it did not give its identity"))?;
     let files = files_of_tcp_port(unit.tcp_port);
     Ok(Running { unit, nodes, refused, counters, files })
 }

@@ -114,8 +114,7 @@ pub(crate) fn mode_mismatch(seen: &Evidence, about: &str, heard: &Heard, other: 
         ),
     };
     let found = format!("{about} at {} is {mode}, and {other} is {others}: the two modes do not meet", heard.source);
-    Finding::error(Id::ModeMismatch, found, format!("{advice}; plain mode is for networks on which nobody else is"))
-        .about(about)
+    Finding::error(Id::ModeMismatch, found, format!("{advice}; plain mode is for private networks")).about(about)
 }
 
 /// A node that speaks with a generation of keys that its manager does not take.

@@ -1,5 +1,5 @@
-//! `cara keys`: makes the keys of a fleet and of its nodes. All of the work is in `cara_std::keys`; `told` says what was
-//! changed and what to do next, and `show` what there is, never a key.
+//! `cara keys`: makes the keys of a fleet and of its nodes. The work is in `cara_std::keys`; `told` reports changes
+//! and next steps, and `show` the state, never a key.
 
 mod show;
 mod told;

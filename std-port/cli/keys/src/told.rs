@@ -51,8 +51,7 @@ fn headline(done: Done<'_>, store: &Store) -> String {
     let (fleet, generations) = (members.fleet().0, generations(members));
     match done {
         Done::Made => format!(
-            "fleet {fleet} has its root: {} ({}). Whoever reads it can speak as every node: keep a copy where nobody else \
-             gets it",
+            "fleet {fleet} has its root: {} ({}). A holder of it can speak as every node: keep a copy in a safe place",
             store.root_file().display(),
             shown(store.keys().fingerprint())
         ),

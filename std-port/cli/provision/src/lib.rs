@@ -188,7 +188,7 @@ fn report(
                 let what = match (has_keys, content.settings.insecure) {
                     (true, _) => "settings and keys",
                     (false, true) => "settings for plain mode, INSECURE,",
-                    (false, false) => "settings without keys, with which it joins nobody,",
+                    (false, false) => "settings without keys, with which it joins no manager,",
                 };
                 let name = board.name;
                 output::line(format_args!("{place}: {what} for {name} at {address:#x}, generation {generation}"))?;

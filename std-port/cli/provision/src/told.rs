@@ -161,7 +161,7 @@ fn manager_of(ring: &KeyRing) -> anyhow::Result<Manager> {
     match ring.peers().as_slice() {
         [only] => Manager::new(only.name(), only.id()).map_err(|error| Ended::usage(error.to_string())),
         [] => Err(Ended::usage(format!(
-            "{} has keys with nobody: give it an m_unit with `cara keys derive`",
+            "{} has keys for no peer: give it an m_unit with `cara keys derive`",
             full_name(ring.identity())
         ))),
         several => {

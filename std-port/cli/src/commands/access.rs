@@ -88,7 +88,8 @@ fn answer(table: &AccessTable, who: &str, function: &str, verb: Verb, global: &G
         Some(identity) => decide(table, &identity, function, verb),
     });
     if decisions[0] != decisions[1] {
-        let text = format!("an m_unit {who} is told something else than an s_unit: write {who}@m_unit or {who}@s_unit");
+        let text =
+            format!("the answer differs between an m_unit {who} and an s_unit: write {who}@m_unit or {who}@s_unit");
         return Err(Ended::usage(text));
     }
     tell(table, who, function, verb, decisions[0], global)

@@ -24,7 +24,7 @@ pub(crate) struct Arguments {
 
 pub(crate) fn run(Arguments { node }: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
     if global.act_as.is_some() {
-        return Err(Ended::usage("a manager for the time of a command has no roster to keep: leave --as away"));
+        return Err(Ended::usage("a manager for the time of a command has no roster to keep: leave out --as"));
     }
     let mut operator = Operator::open(global, &Need::Nothing)?;
     let node = nodes::known(&mut operator, &node)?.selector;
@@ -32,7 +32,7 @@ pub(crate) fn run(Arguments { node }: Arguments, global: &Global) -> anyhow::Res
     if global.json {
         output::object(&json!({ "retired": node }))?;
     } else {
-        output::line(format_args!("{node} is off the roster until it joins again, or the manager is started anew"))?;
+        output::line(format_args!("{node} is off the roster until it joins again, or the manager restarts"))?;
     }
     Ok(Exit::Done.into())
 }

@@ -142,7 +142,7 @@ fn overrides(arguments: &Arguments, global: &Global) -> anyhow::Result<Overrides
     over.check().map_err(Ended::usage)?;
     if arguments.file.is_none() && (over.name.is_none() || over.id.is_none()) {
         return Err(Ended::usage(
-            "who is the node? write --name and --id, or a FILE as `cara node --example` prints it",
+            "the node has no identity: write --name and --id, or a FILE as `cara node --example` prints it",
         ));
     }
     Ok(over)

@@ -40,7 +40,7 @@ pub(super) fn run(settings: Settings, over: &Overrides, logging: &Logging, globa
         http::serve(listener, node.metrics()).context("metrics cannot be served")?;
     }
     if let Err(error) = tell_up(&settings, &node, served, global) {
-        tracing::warn!(%error, "nobody reads that the node is up");
+        tracing::warn!(%error, "the line that the node is up could not be written");
     }
     let mut settings = settings;
     for signal in signals.forever() {

@@ -94,7 +94,7 @@ impl Overrides {
         let reached = self.metrics.filter(|address| !address.ip().is_loopback());
         match reached {
             Some(address) if !self.metrics_anywhere => Err(format!(
-                "--metrics: other hosts reach {address}, and everybody could read: add --metrics-anywhere if that is wanted"
+                "--metrics: other hosts reach {address}, and could read the metrics: add --metrics-anywhere if that is wanted"
             )),
             _ => Ok(()),
         }
@@ -292,7 +292,7 @@ fn metrics(file: &File, over: &Overrides, mistakes: &mut Vec<Mistake>) -> Option
     }
     let (value, span) = (written?, listen.as_ref().map(toml::Spanned::span));
     if !value.ip().is_loopback() && !over.metrics_anywhere {
-        let help = "write \"127.0.0.1:9464\", or start with --metrics-anywhere: everybody who reaches it can read it";
+        let help = "write \"127.0.0.1:9464\", or start with --metrics-anywhere: every host that reaches it can read it";
         mistakes.push(Mistake::new(span.clone().unwrap_or(0..0), "metrics are read on this host only", help));
     }
     Some(Placed { value, span })

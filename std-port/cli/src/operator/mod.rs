@@ -107,7 +107,7 @@ impl Operator {
     pub(crate) fn unit(&mut self) -> anyhow::Result<UnitInfo> {
         let answers = self.answers(&Question::Unit)?.into_iter();
         let unit = answers.filter_map(|answer| if let Answer::Unit(unit) = answer { Some(unit) } else { None }).next();
-        unit.ok_or_else(|| Ended::failed("Malformed", "the unit does not say who it is: update cara or the unit"))
+        unit.ok_or_else(|| Ended::failed("Malformed", "the unit does not give its identity: update cara or the unit"))
     }
 
     /// Whether that is the unit which is asked: `.`, its name, or its name and ID.

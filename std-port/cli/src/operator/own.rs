@@ -45,7 +45,7 @@ pub(super) fn start(identity: &NameAndId, global: &Global) -> anyhow::Result<Com
     })?;
     if system.mode() == Mode::Plain {
         output::warning(format_args!(
-            "{identity} is in plain mode, on port {}: whoever is on the network can read what it says, and speak as any unit",
+            "{identity} is in plain mode, on port {}: every host on the network can read what it says, and speak as any unit",
             system.discovery_port()
         ));
     }

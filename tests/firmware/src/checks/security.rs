@@ -26,7 +26,7 @@ pub(super) fn no_keys(bench: &Bench, _: u32) -> Result<String> {
     let manager = Manager::start(&bench.keys)?;
     let unknown = bench.with(bench.keys.none()?);
     let board = unknown.board(&cable, &Who::agv(17))?;
-    board.logs("there are no keys, and this board joins nobody without")?;
+    board.logs("there are no keys, and this board joins no manager without")?;
     let _other = bench.board(&other_cable, &Who::agv(18))?;
     manager.meet(&Who::agv(18))?;
     ensure!(manager.system.number_of_s_units() == 1, "it has joined");

@@ -29,7 +29,7 @@ pub(crate) fn flash(name: &str) -> Result<ExitCode> {
     probe().args(["download", "--chip", place.chip, &path]).stream()?;
     probe().args(["reset", "--chip", place.chip]).stream()?;
     println!("{name} runs; its log: probe-rs attach --chip {} {path}", place.chip);
-    println!("it does nothing until it is told who it is: cara provision {name} --help");
+    println!("it does nothing until it is provisioned: cara provision {name} --help");
     Ok(ExitCode::SUCCESS)
 }
 

@@ -32,7 +32,7 @@ fn spawn(spawner: Spawner) -> Result<(), &'static str> {
     static RESOURCES: StaticCell<LeastResources> = StaticCell::new();
     const NO_ROOM: &str = "no room for a task";
     let told = arguments::read().map_err(ArgumentError::text)?;
-    let (settings, security, noise) = told.security().ok_or("it joins nobody")?;
+    let (settings, security, noise) = told.security().ok_or("it joins no manager")?;
     let ethernet = ETHERNET.take();
     ethernet.start();
     let sockets = SOCKETS_MEMORY.take();

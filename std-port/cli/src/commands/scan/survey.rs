@@ -33,7 +33,7 @@ pub(crate) fn show(listen: Duration, global: &Global) -> anyhow::Result<()> {
         return Ok(output::object(&whole)?);
     }
     if heard.is_empty() {
-        output::line("nobody was heard; `cara doctor` looks for reasons")?;
+        output::line("no node was heard; `cara doctor` looks for reasons")?;
     }
     table(&heard).print()?;
     about_fleets(&heard)?;

@@ -36,7 +36,7 @@ fn spawn(spawner: Spawner) -> Result<(), &'static str> {
         ConstStaticCell::new(StackResources::new());
     static MEMORY: StaticCell<Memory> = StaticCell::new();
     const NO_ROOM: &str = "no room for a task";
-    let settings = arguments::read().map_err(|_| "who am I? The arguments are no settings")?.settings;
+    let settings = arguments::read().map_err(|_| "the arguments are no settings")?.settings;
     let manager = settings.manager.as_ref().ok_or("the arguments name no manager")?;
     let ethernet = ETHERNET.take();
     ethernet.start();
