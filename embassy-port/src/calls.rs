@@ -105,7 +105,7 @@ impl<T> Machine<T> {
             return Err(Error::Full(Limit::Calls));
         }
         let serial = self.link(link).map_or(0, |link| link.serial);
-        let called = self.with(link, |session, cx, _| {
+        let called = self.with(link, |session, cx| {
             let theirs = session.their_function_list().named(function).ok_or(Error::UnknownFunction)?;
             let (slot, generation) = (theirs.slot, theirs.generation);
             let id = session.request(cx, function, parameters, options, true)?;

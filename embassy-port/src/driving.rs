@@ -1,10 +1,10 @@
 //! What happened on a link goes to the machine of its unit, and what comes of it is done, as
-//! `docs/notes/driving-the-core.md` says. Nothing here waits or runs a handler.
+//! the front page of `cara_core::services` says. Nothing here waits or runs a handler.
 //!
 //! The large functions are kept apart: merged into their callers, the frames of all of them would lie on the stack at
 //! once, though only one runs at a time.
 
-use cara_core::distribution::connection_handler::{Action, Admission, NodeCounter, Sorted};
+use cara_core::distribution::connection_handler::{Command, NodeCounter, Sorted};
 use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::ParametersView;
@@ -37,15 +37,13 @@ const LOOK: Duration = Duration::from_millis(50);
 // A wide tag: the rest is then moved in words, and not byte by byte.
 #[repr(u32)]
 pub(crate) enum News {
-    Introduced,
-    Hello,
+    Joined,
     Failed(CallId, Error),
     ListChanged,
     Skipped(u16),
     Acknowledged,
     LeaseExpired(Slot),
     LeaseEnded { call: CallId, slot: Slot, why: LeaseEnd },
-    Answered,
     Closed(CloseReason),
     Reply,
 }
@@ -70,8 +68,7 @@ impl News {
     /// Of all events but replies. A call is no news: it is left where the runner finds it.
     fn of(event: &Event<'_>, begun: &mut Begun) -> Option<Self> {
         Some(match *event {
-            Event::Introduced => Self::Introduced,
-            Event::Hello => Self::Hello,
+            Event::Joined => Self::Joined,
             Event::Call(call) => {
                 *begun = Begun::Call(call);
                 return None;
@@ -83,8 +80,9 @@ impl News {
             Event::Acknowledged { skipped, .. } => Self::Skipped(skipped),
             Event::LeaseExpired(slot) => Self::LeaseExpired(slot),
             Event::LeaseEnded { call, slot, why } => Self::LeaseEnded { call, slot, why },
-            Event::Answered => Self::Answered,
             Event::Closed(reason) => Self::Closed(reason),
+            // No handle here pings.
+            Event::Answered => return None,
         })
     }
 }
@@ -93,10 +91,11 @@ impl<T> Machine<T> {
     /// Lets the session of a link do what is due: `None` when nothing is.
     #[inline(never)]
     pub(crate) fn poll_link(&mut self, index: u16) -> Option<News> {
-        let Self { links, mail, pool, functions, reply, access, begun, begun_on, .. } = self;
+        let Self { links, mail, pool, functions, reply, access, begun, begun_on, hub, proof, .. } = self;
         let link = links.get_mut(usize::from(index))?;
         let session = link.session.as_mut()?;
-        let mut cx = Context { now: now(), mailman: mail, buffers: pool, functions, access: access.0 };
+        let access = access.0;
+        let mut cx = Context { now: now(), mailman: mail, buffers: pool, functions, access, hub, keys: proof };
         if cx.now < session.deadline() {
             return None;
         }
@@ -119,7 +118,7 @@ impl<T> Machine<T> {
         scratch: &mut [u8],
         arguments: Option<&mut ParametersView>,
     ) -> Option<Option<News>> {
-        let Self { links, mail, pool, functions, reply, access, begun, begun_on, .. } = self;
+        let Self { links, mail, pool, functions, reply, access, begun, begun_on, hub, proof, .. } = self;
         let link = links.get_mut(usize::from(index))?;
         if link.session.is_none() || (reply.is_taken() && link.awaits_reply()) {
             return None;
@@ -127,7 +126,8 @@ impl<T> Machine<T> {
         let session = link.session.as_mut()?;
         let peeked = mail.lines.get_mut(usize::from(index))?.peek(scratch);
         let lent = scratch.get_mut(..peeked)?;
-        let mut cx = Context { now: now(), mailman: mail, buffers: pool, functions, access: access.0 };
+        let access = access.0;
+        let mut cx = Context { now: now(), mailman: mail, buffers: pool, functions, access, hub, keys: proof };
         let receipt = session.receive(&mut cx, lent, arguments);
         let consumed = receipt.consumed;
         let news = match &receipt.event {
@@ -167,17 +167,17 @@ impl<T> Machine<T> {
         };
         let from = SocketAddr::new(from.addr.into(), from.port);
         let bytes = scratch.get_mut(..length).unwrap_or_default();
-        match self.node.datagram(now(), from, bytes, self.proof.codes()) {
+        match self.hub.node.datagram(now(), from, bytes, self.proof.codes()) {
             Sorted::Done => {
-                if let Some(address) = self.node.take_twin() {
-                    let peer = Some(self.node.identity().clone());
+                if let Some(address) = self.hub.node.take_twin() {
+                    let peer = Some(self.hub.node.identity().clone());
                     let reason = CloseReason::Refused(Refusal::DuplicateIdentity);
                     self.tell(UnitEvent::NotJoined { address, peer, reason });
                 }
                 Some(None)
             }
             Sorted::Session { link, nonce, body } => {
-                let event = self.with(link.0, |session, cx, _| session.datagram(cx, from, nonce, body)).flatten();
+                let event = self.with(link.0, |session, cx| session.datagram(cx, from, nonce, body)).flatten();
                 self.begun_on = link.0;
                 Some(event.and_then(|event| Some((link.0, News::of(&event, &mut self.begun)?))))
             }
@@ -193,12 +193,12 @@ impl<T> Machine<T> {
             match line.progress(now) {
                 Progress::None => {}
                 Progress::Connected => {
-                    self.with(index, |session, cx, _| session.connected(cx));
+                    self.with(index, |session, cx| session.connected(cx));
                 }
                 Progress::Broken => self.disconnected(index, CloseReason::DialFailed),
                 Progress::Accepted(from) => match self.open(index, from, false) {
                     Some(()) => {
-                        self.with(index, |session, cx, _| session.connected(cx));
+                        self.with(index, |session, cx| session.connected(cx));
                     }
                     None => self.hang_up(index),
                 },
@@ -222,8 +222,8 @@ impl<T> Machine<T> {
         }
         let (since, index) = pending.chain(second).fold(first, core::cmp::min);
         if now >= since + PATIENCE {
-            self.node.counters.add(NodeCounter::GaveWay, 1);
-            self.with(index, |session, cx, _| session.close(cx, CloseReason::HelloTimeout));
+            self.hub.node.counters.add(NodeCounter::GaveWay, 1);
+            self.with(index, |session, cx| session.close(cx, CloseReason::HelloTimeout));
         }
     }
 
@@ -246,7 +246,7 @@ impl<T> Machine<T> {
             let wants =
                 self.link(index).and_then(|link| link.session.as_ref()).is_some_and(LinkSession::wants_to_write);
             if wants && self.mail.lines.get(usize::from(index)).is_some_and(crate::line::Line::can_write) {
-                self.with(index, |session, cx, _| session.writable(cx));
+                self.with(index, |session, cx| session.writable(cx));
             }
         }
     }
@@ -269,7 +269,7 @@ impl<T> Machine<T> {
         let address = address.map(|address| address.address());
         log!("the address is now {:?}", address.map(|address| address.octets()));
         if address.is_some() {
-            self.node.network_changed(now);
+            self.hub.node.network_changed(now);
         }
         // That there is one at last is no news at the start.
         if core::mem::replace(&mut self.has_begun, true) {
@@ -287,12 +287,7 @@ impl<T> Machine<T> {
     pub(crate) fn noted(&mut self, index: u16, news: News) -> Option<Job> {
         match news {
             News::Reply => {}
-            News::Introduced => self.prove(index),
-            News::Hello => self.greet(index),
-            News::Answered => {
-                let action = self.node.challenge_answered(now(), LinkId(index));
-                self.act(action);
-            }
+            News::Joined => self.joined(index),
             News::Closed(reason) => return self.closed(index, reason),
             News::LeaseExpired(slot) => {
                 let function = self.functions.function(slot).map_or("", |function| function.name());
@@ -321,54 +316,16 @@ impl<T> Machine<T> {
         }
     }
 
-    /// The peer of a link says who it is: each proves to the other that it has the pair's key.
-    #[cfg(feature = "secure")]
-    #[inline(never)]
-    fn prove(&mut self, index: u16) {
-        let Some(session) = self.link(index).and_then(|link| link.session.as_ref()) else { return };
-        let (Some(hello), address) = (session.hello().cloned(), session.address()) else { return };
-        // A proof is two long computations: other tasks have their turn between them.
-        self.yields = true;
-        match self.proof.credentials(&hello) {
-            Some(credentials) => {
-                self.with(index, |session, cx, _| session.prove(cx, credentials));
+    /// Does what the hub wants done.
+    pub(crate) fn act(&mut self, command: Command) {
+        match command {
+            Command::Dial { to, identity } => self.dial(to, identity.as_ref()),
+            Command::Tell(LinkId(index), directive) => {
+                let event = self.with(index, |session, cx| session.direct(cx, directive)).flatten();
+                if let Some(Event::Joined) = event {
+                    self.joined(index);
+                }
             }
-            None => {
-                self.node.refuse_without_key(now(), address, &hello.identity);
-                self.refuse(index, Refusal::NoKey);
-            }
-        }
-    }
-
-    /// Plain links prove nothing.
-    #[cfg(not(feature = "secure"))]
-    fn prove(&mut self, _index: u16) {}
-
-    /// The peer of a link has introduced itself.
-    #[inline(never)]
-    fn greet(&mut self, index: u16) {
-        let Some(session) = self.link(index).and_then(|link| link.session.as_ref()) else { return };
-        let (Some(hello), address) = (session.hello().cloned(), session.address()) else { return };
-        match self.node.admit(now(), LinkId(index), address, &hello) {
-            Admission::Accept => self.accept(index),
-            Admission::Refuse(refusal) => self.refuse(index, refusal),
-            Admission::Challenge { old } => {
-                self.with(old.0, |session, cx, _| session.challenge(cx));
-            }
-        }
-    }
-
-    /// Does what the node wants done.
-    pub(crate) fn act(&mut self, action: Option<Action>) {
-        match action {
-            None => {}
-            Some(Action::Dial { to, identity }) => self.dial(to, identity.as_ref()),
-            Some(Action::Supersede { old, new, reason }) => {
-                self.with(old.0, |session, cx, _| session.close(cx, reason));
-                self.accept(new.0);
-            }
-            Some(Action::Admit { new }) => self.accept(new.0),
-            Some(Action::Refuse { new, refusal }) => self.refuse(new.0, refusal),
         }
     }
 
@@ -381,32 +338,19 @@ impl<T> Machine<T> {
         match dialed {
             Some(index) => {
                 if self.open(index, to, true).is_some() {
-                    self.node.dialing(identity, LinkId(index));
+                    self.hub.node.dialing(identity, LinkId(index));
                 }
             }
-            None => self.node.dial_failed(now(), identity),
+            None => self.hub.node.dial_failed(now(), identity),
         }
     }
 
-    fn refuse(&mut self, index: u16, refusal: Refusal) {
-        self.with(index, |session, cx, _| session.refuse(cx, refusal));
-    }
-
-    /// The link is live: the peer sees what is published to it.
+    /// The link is live.
     #[inline(never)]
-    fn accept(&mut self, index: u16) {
+    fn joined(&mut self, index: u16) {
         let session = self.link(index).and_then(|link| link.session.as_ref());
         let Some(identity) = session.and_then(|session| session.identity().cloned()) else { return };
-        let live = self.with(index, |session, cx, publications| {
-            session.accept(cx);
-            if session.is_live() {
-                session.publish(cx, publications.visible_to(&identity));
-            }
-            session.is_live()
-        });
-        if live == Some(true)
-            && let Some(link) = self.link_mut(index)
-        {
+        if let Some(link) = self.link_mut(index) {
             link.peer = Some(identity.clone());
             log!("{} has joined", identity.name());
             self.tell(UnitEvent::Joined { peer: identity });
@@ -418,8 +362,7 @@ impl<T> Machine<T> {
         let (peer, told, address) = self.end(index)?;
         self.forget_calls_of(index);
         self.hang_up(index);
-        // Done in the next step, so that the hook for the loss comes first.
-        self.due = self.node.left(now(), LinkId(index), reason);
+        self.hub.node.left(now(), LinkId(index), reason);
         match peer {
             Some(peer) => {
                 log!("{} has left", peer.name());

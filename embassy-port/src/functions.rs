@@ -77,8 +77,8 @@ impl<T> Handle<T> {
             // What a call of it started would go on to the lease's end.
             let stop = removed.clear();
             machine.wakers.leases.wake();
-            machine.publications.withdraw(slot);
-            machine.each_live(|session, cx, _| {
+            machine.hub.publications.withdraw(slot);
+            machine.each_live(|session, cx| {
                 session.withdraw(cx, slot);
             });
             Ok::<_, Error>(stop)
@@ -91,7 +91,7 @@ impl<T> Handle<T> {
     pub fn end_lease(&self, name: &str) {
         self.act(|machine| {
             let Some(slot) = machine.functions.find(name) else { return };
-            machine.each_live(|session, cx, _| session.end_lease(cx, slot));
+            machine.each_live(|session, cx| session.end_lease(cx, slot));
             machine.wakers.leases.wake();
         });
     }

@@ -54,12 +54,12 @@ impl<T> Handle<T> {
 
     /// This unit's identity.
     pub fn identity(&self) -> Identity {
-        self.look(|machine| machine.node.identity().clone())
+        self.look(|machine| machine.hub.node.identity().clone())
     }
 
     /// Searches for nodes, or for the manager, now (paper, listing line 6).
     pub fn broadcast(&self) {
-        self.act(|machine| machine.node.broadcast(crate::now()));
+        self.act(|machine| machine.hub.node.broadcast(crate::now()));
     }
 
     /// Ends every link in an orderly way, and looks for nobody any more. Another life begins with a restart of the
@@ -68,7 +68,7 @@ impl<T> Handle<T> {
         self.act(|machine| {
             machine.stopped = true;
             for index in machine.indices() {
-                machine.with(index, |session, cx, _| session.close(cx, CloseReason::Stopped));
+                machine.with(index, |session, cx| session.close(cx, CloseReason::Stopped));
             }
         });
     }
@@ -77,14 +77,14 @@ impl<T> Handle<T> {
 
     /// The manager of an s_unit, while it is known.
     pub fn manager(&self) -> Option<Peer<T>> {
-        let manager = self.look(|machine| machine.node.m_units().next().map(|known| known.identity.clone()));
+        let manager = self.look(|machine| machine.hub.node.m_units().next().map(|known| known.identity.clone()));
         manager.map(|identity| Peer { unit: *self, identity })
     }
 
     /// The node of this name among those that have joined, connected or not. [`Error::NotConnected`] where there is none,
     /// [`Error::Ambiguous`] where there are several: take [`Self::peer_of`] then.
     pub fn peer(&self, name: &str) -> Result<Peer<T>, Error> {
-        let identity = self.look(|machine| machine.node.find(name).map(|known| known.identity.clone()));
+        let identity = self.look(|machine| machine.hub.node.find(name).map(|known| known.identity.clone()));
         identity.map(|identity| Peer { unit: *self, identity })
     }
 
@@ -95,13 +95,13 @@ impl<T> Handle<T> {
 
     /// The s_unit of an index, which goes on to mean the same node when others leave (paper, listing line 8).
     pub fn s_unit(&self, index: u16) -> Option<Peer<T>> {
-        let identity = self.look(|machine| machine.node.s_unit(index).map(|known| known.identity.clone()));
+        let identity = self.look(|machine| machine.hub.node.s_unit(index).map(|known| known.identity.clone()));
         identity.map(|identity| Peer { unit: *self, identity })
     }
 
     /// The m_unit of an index, likewise.
     pub fn m_unit(&self, index: u16) -> Option<Peer<T>> {
-        let identity = self.look(|machine| machine.node.m_unit(index).map(|known| known.identity.clone()));
+        let identity = self.look(|machine| machine.hub.node.m_unit(index).map(|known| known.identity.clone()));
         identity.map(|identity| Peer { unit: *self, identity })
     }
 
@@ -217,16 +217,16 @@ impl<T> Handle<T> {
 
     /// The constraints in force.
     pub fn constraints(&self) -> Constraints {
-        self.look(|machine| *machine.node.constraints())
+        self.look(|machine| *machine.hub.node.constraints())
     }
 
     /// Changes the constraints; peers are told. [`Error::BadConstraint`] for what the memory cannot hold.
     pub fn set_constraints(&self, constraints: Constraints) -> Result<(), Error> {
         self.act(|machine| {
             check(&constraints, machine.links.len(), machine.room.buffer)?;
-            machine.node.set_constraints(constraints);
+            machine.hub.node.set_constraints(constraints);
             for index in machine.indices() {
-                machine.with(index, |session, cx, _| session.set_constraints(cx, constraints));
+                machine.with(index, |session, cx| session.set_constraints(cx, constraints));
             }
             Ok(())
         })
@@ -236,7 +236,7 @@ impl<T> Handle<T> {
     pub fn set_access(&self, table: Option<&'static dyn Access>) {
         self.act(|machine| {
             machine.access = Table(table);
-            machine.each_live(|session, cx, _| {
+            machine.each_live(|session, cx| {
                 session.access_changed(cx);
             });
         });
@@ -256,12 +256,12 @@ impl<T> Handle<T> {
 
     /// What happened in discovery and membership.
     pub fn node_counted(&self, counter: NodeCounter) -> u64 {
-        self.look(|machine| machine.node.counters.value(counter))
+        self.look(|machine| machine.hub.node.counters.value(counter))
     }
 
     /// The last refusals.
     pub fn findings(&self) -> impl Iterator<Item = Finding> + use<T> {
         let unit = *self;
-        (0..).map_while(move |index| unit.look(|machine| machine.node.findings().nth(index).cloned()))
+        (0..).map_while(move |index| unit.look(|machine| machine.hub.node.findings().nth(index).cloned()))
     }
 }

@@ -1,12 +1,12 @@
 //! The core's two machines of one unit, in one cell, with the sockets and tables that they use.
 
 use cara_core::counters::Counters;
-use cara_core::distribution::connection_handler::{Action, Node};
+use cara_core::distribution::connection_handler::Command;
 use cara_core::distribution::function_list::FunctionList;
 use cara_core::distribution::identity::{Identity, Role};
 use cara_core::host::connections::LinkCounter;
 use cara_core::host::mailman::LinkId;
-use cara_core::services::publications::Publications;
+use cara_core::services::hub::Hub;
 use cara_core::services::unit::{Session, SessionConfig, SessionStorage};
 use cara_core::services::{Context, Port};
 use cara_core::storage::{Lent, Pool};
@@ -85,8 +85,7 @@ impl Link {
 
 /// What the unit is made of.
 pub(crate) struct Machine<T: 'static> {
-    pub(crate) node: Node<Lent>,
-    pub(crate) publications: Publications<Lent>,
+    pub(crate) hub: Hub<Lent>,
     /// What proves to peers who this unit is.
     pub(crate) proof: Proof,
     /// Who may do what.
@@ -98,8 +97,6 @@ pub(crate) struct Machine<T: 'static> {
     pub(crate) reply: ReplyBox,
     pub(crate) tasks: &'static mut [TaskSlot],
     pub(crate) events: Events,
-    /// What the node wants done next.
-    pub(crate) due: Option<Action>,
     pub(crate) begun: Begun,
     /// The link that it came on.
     pub(crate) begun_on: u16,
@@ -182,36 +179,37 @@ impl<T> Machine<T> {
             .find(|index| self.link(*index).is_some_and(|link| link.is_live() && link.peer.as_ref() == Some(peer)))
     }
 
-    /// Lends the session of a link with its context, and what is published to whom.
+    /// Lends the session of a link with its context.
     pub(crate) fn with<R>(
         &mut self,
         index: u16,
-        act: impl FnOnce(&mut LinkSession, &mut LinkContext<'_>, &Publications<Lent>) -> R,
+        act: impl FnOnce(&mut LinkSession, &mut LinkContext<'_>) -> R,
     ) -> Option<R> {
-        let (session, mut context, publications) = self.lend(index)?;
-        Some(act(session, &mut context, publications))
+        let (session, mut context) = self.lend(index)?;
+        Some(act(session, &mut context))
     }
 
     /// Kept apart from the many that use it.
     #[inline(never)]
-    fn lend(&mut self, index: u16) -> Option<(&mut LinkSession, LinkContext<'_>, &Publications<Lent>)> {
-        let Self { links, mail, pool, functions, publications, access, .. } = self;
+    fn lend(&mut self, index: u16) -> Option<(&mut LinkSession, LinkContext<'_>)> {
+        let Self { links, mail, pool, functions, access, hub, proof, .. } = self;
         let session = links.get_mut(usize::from(index))?.session.as_mut()?;
-        Some((session, Context { now: now(), mailman: mail, buffers: pool, functions, access: access.0 }, publications))
+        let access = access.0;
+        Some((session, Context { now: now(), mailman: mail, buffers: pool, functions, access, hub, keys: proof }))
     }
 
     /// Lets the node do what is due.
     #[inline(never)]
-    pub(crate) fn poll_node(&mut self) -> Option<Action> {
-        self.node.poll(now(), &mut self.mail, self.proof.codes())
+    pub(crate) fn poll_node(&mut self) -> Option<Command> {
+        self.hub.node.poll(now(), &mut self.mail, self.proof.codes())
     }
 
     /// Makes the session of a link. `None` when the link is in use.
     #[inline(never)]
     pub(crate) fn open(&mut self, index: u16, address: SocketAddr, dialed: bool) -> Option<()> {
         let storage = self.link_mut(index)?.storage.take()?;
-        let local = self.node.hello(now(), LinkId(index));
-        let constraints = *self.node.constraints();
+        let local = self.hub.node.hello(now(), LinkId(index));
+        let constraints = *self.hub.node.constraints();
         let config = SessionConfig { link: LinkId(index), dialed, address, local, constraints };
         let cipher = self.proof.cipher();
         let mut session = Session::new(now(), config, cipher, storage);
@@ -246,7 +244,7 @@ impl<T> Machine<T> {
 
     /// Takes connections with every socket that has nothing else to do, if the unit is one that is dialled.
     pub(crate) fn listen(&mut self) {
-        if self.node.identity().role() == Role::MUnit && self.address.is_some() && !self.stopped {
+        if self.hub.node.identity().role() == Role::MUnit && self.address.is_some() && !self.stopped {
             let port = self.tcp_port;
             self.mail.lines.iter_mut().for_each(|line| line.listen(port));
         }

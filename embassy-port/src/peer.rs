@@ -88,9 +88,9 @@ impl<T> Peer<T> {
         options: &RequestOptions,
     ) -> Result<CallId, Error> {
         let link = self.link()?;
-        let requested = self.unit.act(|machine| {
-            machine.with(link, |session, cx, _| session.request(cx, function, parameters, options, false))
-        });
+        let requested = self
+            .unit
+            .act(|machine| machine.with(link, |session, cx| session.request(cx, function, parameters, options, false)));
         requested.unwrap_or(Err(Error::NotConnected))
     }
 
@@ -99,7 +99,7 @@ impl<T> Peer<T> {
     pub fn release(&self, function: &str) -> Result<(), Error> {
         let link = self.link()?;
         let released = self.unit.act(|machine| {
-            machine.with(link, |session, cx, _| {
+            machine.with(link, |session, cx| {
                 let slot = session.their_function_list().find(function).ok_or(Error::UnknownFunction)?;
                 session.release(cx, slot)
             })
@@ -110,7 +110,7 @@ impl<T> Peer<T> {
     /// Sends one-way messages that gather now.
     pub fn flush(&self) -> Result<(), Error> {
         let link = self.link()?;
-        self.unit.act(|machine| machine.with(link, |session, cx, _| session.flush_gathered(cx)));
+        self.unit.act(|machine| machine.with(link, |session, cx| session.flush_gathered(cx)));
         Ok(())
     }
 

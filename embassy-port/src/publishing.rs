@@ -2,17 +2,12 @@
 
 use cara_core::distribution::identity::Identity;
 use cara_core::error::Error;
-use cara_core::services::publications::Publications;
-use cara_core::storage::Lent;
 
 use crate::machine::{LinkContext, LinkSession, Machine};
 
 impl<T> Machine<T> {
     /// Does something on each link to a peer.
-    pub(crate) fn each_live(
-        &mut self,
-        mut act: impl FnMut(&mut LinkSession, &mut LinkContext<'_>, &Publications<Lent>),
-    ) {
+    pub(crate) fn each_live(&mut self, mut act: impl FnMut(&mut LinkSession, &mut LinkContext<'_>)) {
         for index in self.indices() {
             if self.link(index).is_some_and(crate::machine::Link::is_live) {
                 self.with(index, &mut act);
@@ -22,8 +17,8 @@ impl<T> Machine<T> {
 
     /// Shows all functions to all nodes.
     pub(crate) fn publish(&mut self) -> Result<(), Error> {
-        let Self { functions, publications, .. } = self;
-        functions.iter().try_for_each(|function| publications.publish_to_all(function.slot))?;
+        let Self { functions, hub, .. } = self;
+        functions.iter().try_for_each(|function| hub.publications.publish_to_all(function.slot))?;
         for index in self.indices() {
             self.tell_list(index);
         }
@@ -32,8 +27,8 @@ impl<T> Machine<T> {
 
     /// Shows all functions to one node.
     pub(crate) fn publish_to(&mut self, identity: &Identity) -> Result<(), Error> {
-        let Self { functions, publications, .. } = self;
-        functions.iter().try_for_each(|function| publications.publish_to(identity, function.slot))?;
+        let Self { functions, hub, .. } = self;
+        functions.iter().try_for_each(|function| hub.publications.publish_to(identity, function.slot))?;
         if let Some(index) = self.link_to(identity) {
             self.tell_list(index);
         }
@@ -41,10 +36,10 @@ impl<T> Machine<T> {
     }
 
     fn tell_list(&mut self, index: u16) {
-        let Some(link) = self.link(index).filter(|link| link.is_live()) else { return };
-        let Some(identity) = link.peer.clone() else { return };
-        let serial =
-            self.with(index, |session, cx, publications| session.publish(cx, publications.visible_to(&identity)));
+        if self.link(index).is_none_or(|link| !link.is_live()) {
+            return;
+        }
+        let serial = self.with(index, |session, cx| session.publish(cx));
         if let Some(link) = self.link_mut(index) {
             link.told = serial;
         }

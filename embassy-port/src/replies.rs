@@ -159,7 +159,7 @@ impl<T> Machine<T> {
             place.take_if(|waiter| waiter.call == *call);
         }
         if link.serial == call.serial {
-            self.with(call.link, |session, cx, _| session.cancel(cx, call.id));
+            self.with(call.link, |session, cx| session.cancel(cx, call.id));
         }
         let _ = self.reply.take(call);
         self.wakers.runner.wake();

@@ -12,6 +12,7 @@ use cara_core::distribution::identity::{Epoch, Role};
 use cara_core::distribution::parameters::Parameters;
 use cara_core::error::Error;
 use cara_core::services::CallHead;
+use cara_core::services::hub::Hub;
 use cara_core::services::publications::{Publications, PublishedToOne};
 use cara_core::services::requests::Pending;
 use cara_core::services::unit::{Publication, SessionStorage};
@@ -333,11 +334,13 @@ pub fn new<
     let node = Node::new(now(), node_config, storage);
     let buffers = resources.buffers.each_mut().map(|buffer| Some(buffer.write([0; MESSAGE]).as_mut_slice()));
     let machine = Machine {
-        node,
-        publications: Publications::new(
-            resources.to_all.write([false; FUNCTIONS]).as_mut_slice(),
-            resources.to_one.write([const { [const { None }; FUNCTIONS] }; LINKS]).as_flattened_mut(),
-        ),
+        hub: Hub {
+            node,
+            publications: Publications::new(
+                resources.to_all.write([false; FUNCTIONS]).as_mut_slice(),
+                resources.to_one.write([const { [const { None }; FUNCTIONS] }; LINKS]).as_flattened_mut(),
+            ),
+        },
         proof,
         access,
         functions: FunctionList::new(
@@ -357,7 +360,6 @@ pub fn new<
             .tasks
             .write(resources.task_parameters.each_mut().map(|memory| TaskSlot::new(memory.write(Parameters::sized())))),
         events: Events::new(resources.events.write([const { None }; EVENTS])),
-        due: None,
         yields: false,
         lost_hook: None,
         tcp_port,

@@ -63,7 +63,8 @@ impl<T> Runner<T> {
             if is_through && self.rest(context) {
                 return Poll::Pending;
             }
-            if core::mem::take(&mut self.shared.machine.borrow_mut().yields) {
+            let machine = &mut *self.shared.machine.borrow_mut();
+            if core::mem::take(&mut machine.yields) | machine.proof.has_computed() {
                 break;
             }
         }
@@ -76,10 +77,6 @@ impl<T> Runner<T> {
     fn step(&mut self, context: &mut Context<'_>) -> Step {
         let shared = self.shared;
         let machine = &mut *shared.machine.borrow_mut();
-        if machine.due.is_some() {
-            let due = machine.due.take();
-            machine.act(due);
-        }
         // Anything may be due behind whatever is done, but nothing before the time to which the last rest has looked.
         let is_due = now() >= core::mem::replace(&mut self.rested_until, Instant::START);
         if is_due || machine.address.is_none() {
@@ -95,12 +92,12 @@ impl<T> Runner<T> {
         }
         self.answer_again(machine);
         machine.look_at_lines();
-        if is_due && !machine.stopped {
-            let action = machine.poll_node();
-            if action.is_some() {
-                machine.act(action);
-                return Step::Again;
-            }
+        if is_due
+            && !machine.stopped
+            && let Some(command) = machine.poll_node()
+        {
+            machine.act(command);
+            return Step::Again;
         }
         if let Some(news) = machine.read_datagram(self.scratch, context) {
             let job = news.and_then(|(index, news)| machine.noted(index, news));
@@ -118,8 +115,7 @@ impl<T> Runner<T> {
                 let job = news.and_then(|news| machine.noted(index, news));
                 return job.map_or(Step::Again, Step::Job);
             }
-            if !busy
-                && let Some(Some(call)) = machine.with(index, |session, cx, _| session.next_call(cx, self.arguments))
+            if !busy && let Some(Some(call)) = machine.with(index, |session, cx| session.next_call(cx, self.arguments))
             {
                 (machine.begun, machine.begun_on) = (Begun::Call(call), index);
                 return Step::Again;
@@ -241,7 +237,7 @@ impl<T> Machine<T> {
         let sessions = self.links.iter().filter_map(|link| link.session.as_ref());
         let sessions = sessions.map(LinkSession::deadline).min().unwrap_or(Instant::FAR_FUTURE);
         let lines = self.mail.lines.iter().map(crate::line::Line::deadline).min().unwrap_or(Instant::FAR_FUTURE);
-        let node = if self.stopped { Instant::FAR_FUTURE } else { self.node.next_deadline() };
+        let node = if self.stopped { Instant::FAR_FUTURE } else { self.hub.node.next_deadline() };
         let kept = self.reply_deadline().min(self.parked_deadline());
         sessions.min(lines).min(node).min(kept).min(self.look)
     }

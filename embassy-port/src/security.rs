@@ -42,11 +42,14 @@ mod secured {
     use cara_core::config::Mode;
     use cara_core::distribution::hello::Hello;
     use cara_core::distribution::identity::Identity;
+    use cara_core::services::Keys;
     use cara_secure::channel::TAG_BYTES;
     use cara_secure::keyring::{Codes, Keyring};
     use cara_secure::keys::{DiscoveryKey, PairKey};
     use cara_secure::link::{Cipher, Credentials};
     use cara_secure::random::Random;
+
+    use crate::machine::Board;
 
     pub(crate) type LinkCipher = Cipher;
 
@@ -56,8 +59,15 @@ mod secured {
     // One of them lives in each unit; boxing the larger ones would need an allocator.
     #[allow(clippy::large_enum_variant)]
     pub(crate) enum Proof {
-        Insecure { seed: u64 },
-        Keys { codes: Codes<Ring>, random: Random },
+        Insecure {
+            seed: u64,
+        },
+        Keys {
+            codes: Codes<Ring>,
+            random: Random,
+            /// A proof has begun: two long computations.
+            computes: bool,
+        },
     }
 
     /// The keys of the unit, wherever they are kept.
@@ -76,7 +86,7 @@ mod secured {
 
     impl Proof {
         pub(super) fn keys(keyring: &'static dyn Keyring, random: Random) -> Self {
-            Self::Keys { codes: Codes::Keyed(Ring(keyring)), random }
+            Self::Keys { codes: Codes::Keyed(Ring(keyring)), random, computes: false }
         }
 
         pub(super) const fn insecure(seed: u64) -> Self {
@@ -111,11 +121,21 @@ mod secured {
             }
         }
 
-        /// What proves this unit to the sender of a hello on this one link; what the peer has drawn is stirred in before.
-        /// `None` without a key for it.
+        /// Whether the step that has ended computed a proof: other tasks have their turn before the next one.
+        pub(crate) fn has_computed(&mut self) -> bool {
+            match self {
+                Self::Insecure { .. } => false,
+                Self::Keys { computes, .. } => core::mem::take(computes),
+            }
+        }
+    }
+
+    impl Keys<Board> for Proof {
+        /// What the peer has drawn is stirred in before.
         #[inline(never)]
-        pub(crate) fn credentials(&mut self, hello: &Hello) -> Option<Credentials> {
-            let Self::Keys { codes: Codes::Keyed(ring), random } = self else { return None };
+        fn credentials(&mut self, hello: &Hello) -> Option<Credentials> {
+            let Self::Keys { codes: Codes::Keyed(ring), random, computes } = self else { return None };
+            *computes = true;
             random.stir(&hello.nonce.to_le_bytes());
             ring.credentials(&hello.identity, random.draw())
         }
@@ -125,7 +145,11 @@ mod secured {
 #[cfg(not(feature = "secure"))]
 mod plain {
     use cara_core::config::Mode;
+    use cara_core::distribution::hello::Hello;
     use cara_core::host::secure::Plain;
+    use cara_core::services::Keys;
+
+    use crate::machine::Board;
 
     pub(crate) type LinkCipher = Plain;
 
@@ -155,6 +179,16 @@ mod plain {
 
         pub(crate) fn codes(&self) -> &Plain {
             &Plain
+        }
+
+        pub(crate) const fn has_computed(&mut self) -> bool {
+            false
+        }
+    }
+
+    impl Keys<Board> for Proof {
+        fn credentials(&mut self, _: &Hello) -> Option<()> {
+            None
         }
     }
 }

@@ -113,7 +113,7 @@ impl<T> Machine<T> {
         if self.link(running.link).is_none_or(|link| link.serial != running.serial) {
             return true;
         }
-        self.with(running.link, |session, cx, _| answer(session, cx, running, result)).unwrap_or(true)
+        self.with(running.link, |session, cx| answer(session, cx, running, result)).unwrap_or(true)
     }
 
     /// Keeps an answer until there is room for it; `false` when there is no room here either.
@@ -130,12 +130,13 @@ impl<T> Machine<T> {
     /// Tries again to answer what could not be answered.
     pub(crate) fn answer_parked(&mut self) {
         for index in 0..self.tasks.len() {
-            let Self { tasks, links, mail, pool, functions, access, .. } = self;
+            let Self { tasks, links, mail, pool, functions, access, hub, proof, .. } = self;
             let Some(TaskSlot { parameters, holds }) = tasks.get_mut(index) else { return };
             let Holds::Answer { running, result } = *holds else { continue };
             let link = links.get_mut(usize::from(running.link)).filter(|link| link.serial == running.serial);
             let kept = link.and_then(|link| link.session.as_mut()).is_none_or(|session| {
-                let mut cx = Context { now: now(), mailman: mail, buffers: pool, functions, access: access.0 };
+                let access = access.0;
+                let mut cx = Context { now: now(), mailman: mail, buffers: pool, functions, access, hub, keys: proof };
                 answer(session, &mut cx, &running, result.map(|()| &**parameters))
             });
             if kept {
@@ -272,7 +273,7 @@ impl<T> Drop for TakenCall<T> {
         machine.wake_runner();
         let error = Err(Error::Service(ServiceError::NotReady));
         if !machine.answer(&running, error) && !machine.park(running, error) {
-            machine.with(running.link, |session, _, _| session.drop_answer(running.ticket));
+            machine.with(running.link, |session, _| session.drop_answer(running.ticket));
         }
     }
 }

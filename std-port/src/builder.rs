@@ -10,6 +10,7 @@ use cara_core::distribution::function_list::{Entry, FunctionList};
 use cara_core::distribution::hello::Manager;
 use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
 use cara_core::error::Error;
+use cara_core::services::hub::Hub;
 use cara_core::services::publications::Publications;
 use core::net::SocketAddr;
 
@@ -18,7 +19,7 @@ use crate::access::AccessTable;
 use crate::access::{AccessError, watch::FileWatch};
 use crate::communication_system::{CommunicationSystem, Owner};
 use crate::config::Capacities;
-use crate::engine::{Engine, EngineParts, Keys, NodeCell, message_buffer_bytes, node_storage, system_refused};
+use crate::engine::{Engine, EngineParts, HubCell, Keys, message_buffer_bytes, node_storage, system_refused};
 use crate::error::StartError;
 use crate::keys::{KeyError, KeyRing, LiveRing};
 use crate::pool::MessagePool;
@@ -294,7 +295,7 @@ impl<T: Send + 'static> Builder<T> {
             own_threads,
             capacities,
             keys,
-            node: NodeCell::new(node, publications),
+            hub: HubCell::new(Hub { node, publications }),
             functions,
             pool: MessagePool::new(size, capacities.message_buffers, KEPT_BUFFERS),
             state: self.state,

@@ -217,17 +217,17 @@ impl<T: Send + 'static> CommunicationSystem<T> {
 
     /// This unit's identity.
     pub fn identity(&self) -> Identity {
-        lock(&self.engine().node).node.identity().clone()
+        lock(&self.engine().hub).hub.node.identity().clone()
     }
 
     /// The fleet that it belongs to.
     pub fn fleet(&self) -> Fleet {
-        lock(&self.engine().node).node.fleet()
+        lock(&self.engine().hub).hub.node.fleet()
     }
 
     /// Which of its runs this is: peers tell a restart by it.
     pub fn epoch(&self) -> Epoch {
-        lock(&self.engine().node).node.epoch()
+        lock(&self.engine().hub).hub.node.epoch()
     }
 
     /// Time since it was made.
@@ -406,7 +406,7 @@ impl<T: Send + 'static> CommunicationSystem<T> {
 
     /// The constraints in force.
     pub fn constraints(&self) -> Constraints {
-        *lock(&self.engine().node).node.constraints()
+        *lock(&self.engine().hub).hub.node.constraints()
     }
 
     /// Changes the constraints; peers are told. [`Error::BadConstraint`] for values that this unit cannot hold.
@@ -467,7 +467,7 @@ impl<T: Send + 'static> CommunicationSystem<T> {
 
     /// The last refusals, here or there.
     pub fn findings(&self) -> Vec<Finding> {
-        lock(&self.engine().node).node.findings().cloned().collect()
+        lock(&self.engine().hub).hub.node.findings().cloned().collect()
     }
 
     /// Time since a refusal.

@@ -155,7 +155,7 @@ impl<T: Send + 'static> Peer<T> {
 
     /// The constraints in force towards this node: the unit's own, unless they were changed for it.
     pub fn constraints(&self) -> Constraints {
-        let unit = *lock(&self.engine.node).node.constraints();
+        let unit = *lock(&self.engine.hub).hub.node.constraints();
         self.cell.constraints(unit)
     }
 

@@ -91,17 +91,17 @@ impl<T: Send + 'static> Unit<T> {
 
     /// This unit's identity.
     pub fn identity(&self) -> Identity {
-        lock(&self.engine().node).node.identity().clone()
+        lock(&self.engine().hub).hub.node.identity().clone()
     }
 
     /// The fleet that it belongs to.
     pub fn fleet(&self) -> Fleet {
-        lock(&self.engine().node).node.fleet()
+        lock(&self.engine().hub).hub.node.fleet()
     }
 
     /// Which of its runs this is: peers tell a restart by it.
     pub fn epoch(&self) -> Epoch {
-        lock(&self.engine().node).node.epoch()
+        lock(&self.engine().hub).hub.node.epoch()
     }
 
     /// Time since it was made.
@@ -177,7 +177,7 @@ impl<T: Send + 'static> Unit<T> {
 
     /// The constraints in force.
     pub fn constraints(&self) -> Constraints {
-        *lock(&self.engine().node).node.constraints()
+        *lock(&self.engine().hub).hub.node.constraints()
     }
 
     /// Changes the constraints; the manager is told.

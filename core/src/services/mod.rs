@@ -1,7 +1,188 @@
 //! COMMON SERVICES (paper, section 2): requesting, serving, publishing; the m_unit's and the s_unit's view of a peer.
+//!
+//! # How a port drives the machines
+//!
+//! A port owns sockets, time, threads and memory; the machines own every decision. A [`Hub`](hub::Hub) is what the links of one
+//! unit share: the [`Node`](crate::distribution::connection_handler::Node) that finds and admits peers, and the publications. A
+//! [`Session`](unit::Session) is one link. Both are called with the time and what they need, do what they can at once, and
+//! return what happened; neither waits, reads a clock or allocates.
+//!
+//! | what happens | what the port calls |
+//! |---|---|
+//! | the unit starts | `Node::new`, and [`Hub`](hub::Hub) around it |
+//! | at `node.next_deadline()`, and after anything else was done to the hub | `node.poll` until `None` |
+//! | … it returns `Command::Dial` | open a stream, `Session::new` with `dialed: true`, `node.dialing`; or `node.dial_failed` |
+//! | … it returns `Command::Tell(link, directive)` | `session.direct`, with nothing of the hub locked |
+//! | a stream that was dialled is open, or one was accepted | `session.connected` |
+//! | bytes have come | `session.receive` until nothing is consumed and no event comes, then `session.next_call` until `None`; what was `paused` is lent again after `direct`, or when a buffer may be free |
+//! | the stream takes bytes again, and `session.wants_to_write()` | `session.writable` |
+//! | a datagram has come | `node.datagram`; where it says `Sorted::Session`, `session.datagram` |
+//! | at `session.deadline()`, and after each call that may have ended it | `session.poll` until `None`, **before** anything that has arrived: leases end here |
+//! | a handler has run, outside of all locks | `session.answer`, then `session.next_call` |
+//! | the stream has ended | `session.disconnected` |
+//!
+//! | event | what the port does |
+//! |---|---|
+//! | [`LeaseExpired`](unit::Event::LeaseExpired) | runs the safe hook of the service, before anything else |
+//! | [`Call`](unit::Event::Call) | runs the handler, and answers by ticket; an `order` makes the handler's view of the service's [`Lease`](lease::Lease). A newer call of the service ends that view without an event, so wake what awaits it |
+//! | [`Reply`](unit::Event::Reply), [`Failed`](unit::Event::Failed), [`LeaseEnded`](unit::Event::LeaseEnded) | tells the program. It says `session.cancel` for a call that the program gives up, `session.release` for all of a function |
+//! | [`Joined`](unit::Event::Joined) | the peer is taken, and is being told what is published to it |
+//! | [`Closed`](unit::Event::Closed) | the last one: forgets the session (`into_storage` gives its slices back), then `node.left`, also for a link that never joined |
+//!
+//! What differs between ports is only who calls these, and under which lock. Two sessions are never locked at the same time; a
+//! session enters the hub itself, through the [`Door`](hub::Door) in its [`Context`].
+//!
+//! ```
+//! # use cara_core::config::Constraints;
+//! # use cara_core::distribution::connection_handler::{Command, Node, NodeConfig, NodeStorage, Target};
+//! # use cara_core::distribution::function::{Attributes, Definition};
+//! # use cara_core::distribution::function_list::{Entry, FunctionList};
+//! # use cara_core::distribution::identity::{Epoch, Fleet, Identity};
+//! # use cara_core::distribution::parameters::Parameters;
+//! # use cara_core::error::CloseReason;
+//! # use cara_core::host::mailman::{LinkId, Mailman};
+//! # use cara_core::host::secure::Plain;
+//! # use cara_core::services::hub::Hub;
+//! # use cara_core::services::publications::Publications;
+//! # use cara_core::services::unit::{Event, RequestOptions, Session, SessionConfig, SessionStorage};
+//! # use cara_core::services::{Context, Port};
+//! # use cara_core::storage::{Pool, Storage};
+//! # use cara_core::time::Instant;
+//! # use core::net::SocketAddr;
+//! # fn slice<T: Default>(count: usize) -> Box<[T]> { (0..count).map(|_| T::default()).collect() }
+//! // What the port is made of: slices on the heap, links in clear.
+//! enum Boxed {}
+//! impl Storage for Boxed {
+//!     type Slice<T: 'static> = Box<[T]>;
+//! }
+//! enum InMemory {}
+//! impl Port for InMemory {
+//!     type Storage = Boxed;
+//!     type Cipher = Plain;
+//! }
+//!
+//! /// The bytes on their way to the other end. This port has no datagrams.
+//! struct Wire(Vec<u8>);
+//! impl Mailman for Wire {
+//!     fn write(&mut self, _: LinkId, slices: &[&[u8]]) -> Result<usize, CloseReason> {
+//!         self.0.extend(slices.concat());
+//!         Ok(slices.iter().map(|slice| slice.len()).sum())
+//!     }
+//!     fn send_to(&mut self, _: SocketAddr, _: &[u8]) -> bool { false }
+//!     fn broadcast(&mut self, _: &[u8]) -> bool { false }
+//! }
+//!
+//! struct End {
+//!     hub: Hub<Boxed>,
+//!     session: Session<InMemory>,
+//!     functions: FunctionList<Boxed, ()>,
+//!     buffers: Pool<Boxed>,
+//!     wire: Wire,
+//!     replied: Option<i64>,
+//! }
+//!
+//! impl End {
+//!     /// Does all that can be done now with the bytes that have come; true if anything was.
+//!     fn work(&mut self, now: Instant, arrived: &mut [u8]) -> bool {
+//!         let Self { hub, session, functions, buffers, wire, replied } = self;
+//!         let mut arguments = Parameters::<256>::sized();
+//!         let (mut start, mut worked) = (0, false);
+//!         loop {
+//!             // What the hub wants of other links; here there is none, and what it dials is connected already.
+//!             while let Some(Command::Dial { .. }) = hub.node.poll(now, wire, &Plain) {}
+//!             let mut cx = Context { now, mailman: wire, buffers, functions, access: None, hub, keys: &mut () };
+//!             // What is due comes before what has arrived.
+//!             let mut consumed = 0;
+//!             let event = session.poll(&mut cx).or_else(|| {
+//!                 let receipt = session.receive(&mut cx, &mut arrived[start..], Some(&mut arguments));
+//!                 consumed = receipt.consumed;
+//!                 receipt.event
+//!             });
+//!             start += consumed;
+//!             worked |= consumed > 0;
+//!             match event {
+//!                 None if consumed == 0 => return worked,
+//!                 None | Some(Event::Joined | Event::ListChanged | Event::Acknowledged { .. }) => {}
+//!                 Some(Event::Call(call)) => {
+//!                     let n: i64 = arguments.variable("n").expect("the request was checked");
+//!                     arguments.clear();
+//!                     arguments.add_int("twice", 1).expect("there is room");
+//!                     arguments.set_value("twice", 2 * n).expect("it is an int");
+//!                     session.answer(&mut cx, call.ticket, Ok(&arguments)).expect("there is a buffer");
+//!                 }
+//!                 Some(Event::Reply(_, results)) => {
+//!                     let mut into = Parameters::<256>::sized();
+//!                     into.add_int("twice", 1).expect("there is room");
+//!                     results.expect("it was served").read_into(&mut into).expect("they are the results");
+//!                     *replied = into.variable("twice").ok();
+//!                 }
+//!                 Some(event) => panic!("unexpected: {event:?}"),
+//!             }
+//!         }
+//!     }
+//! }
+//! # fn end(now: Instant, identity: Identity, target: Target, dialed: bool) -> End {
+//! #     let constraints = Constraints::S_UNIT;
+//! #     let config = NodeConfig {
+//! #         identity, fleet: Fleet(1), epoch: Epoch(1), target, tcp_port: 0, udp_port: 0, constraints,
+//! #         seed: 1 + u64::from(dialed),
+//! #     };
+//! #     let storage = NodeStorage { nodes: slice(4), order: slice(4), links: slice(1), findings: slice(4) };
+//! #     let mut node = Node::new(now, config, storage);
+//! #     let address = SocketAddr::from(([192, 0, 2, 1], 7000));
+//! #     let local = node.hello(now, LinkId(0));
+//! #     let config = SessionConfig { link: LinkId(0), dialed, address, local, constraints };
+//! #     let storage = SessionStorage {
+//! #         small: slice(512), pending: slice(4), running: slice(4), publications: slice(4),
+//! #         their_functions: (0..4).map(|_| Entry::empty()).collect(), their_signatures: slice(256),
+//! #     };
+//! #     let mut end = End {
+//! #         hub: Hub { node, publications: Publications::new(slice(4), slice(4)) },
+//! #         session: Session::new(now, config, Plain, storage),
+//! #         functions: FunctionList::new((0..4).map(|_| Entry::empty()).collect(), slice(256)),
+//! #         buffers: Pool::new((0..4).map(|_| Some(slice(2_048))).collect()),
+//! #         wire: Wire(Vec::new()),
+//! #         replied: None,
+//! #     };
+//! #     if dialed { end.hub.node.dialing(None, LinkId(0)); }
+//! #     end
+//! # }
+//! # fn connect(end: &mut End, now: Instant) {
+//! #     let End { hub, session, functions, buffers, wire, .. } = end;
+//! #     session.connected(&mut Context { now, mailman: wire, buffers, functions, access: None, hub, keys: &mut () });
+//! # }
+//! # let now = Instant::START;
+//! # let identity = Identity::m_unit("depot", 1)?;
+//! # let manager = cara_core::distribution::hello::Manager::new("depot", 1)?;
+//! # let mut depot = end(now, identity, Target::Everybody, false);
+//! # let mut agv = end(now, Identity::s_unit("agv", 7)?, Target::Manager(manager), true);
+//! // The vehicle offers a function, and their streams are carried to and fro until nothing moves.
+//! let slot = agv.functions.add_function(&Definition::parse("double(n: int) -> (twice: int)")?, Attributes::default(), ())?;
+//! agv.hub.publications.publish_to_all(slot)?;
+//! # connect(&mut depot, now);
+//! # connect(&mut agv, now);
+//! let carry = |depot: &mut End, agv: &mut End| loop {
+//!     let (mut to_agv, mut to_depot) = (std::mem::take(&mut depot.wire.0), std::mem::take(&mut agv.wire.0));
+//!     if !(agv.work(now, &mut to_agv) | depot.work(now, &mut to_depot)) { break }
+//! };
+//! carry(&mut depot, &mut agv);
+//!
+//! let mut arguments = Parameters::<256>::sized();
+//! arguments.add_int("n", 1)?;
+//! arguments.set_value("n", 21)?;
+//! {
+//!     let End { hub, session, functions, buffers, wire, .. } = &mut depot;
+//!     let mut cx = Context { now, mailman: wire, buffers, functions, access: None, hub, keys: &mut () };
+//!     session.request(&mut cx, "double", &arguments, &RequestOptions::default(), true)?;
+//! }
+//! carry(&mut depot, &mut agv);
+//! assert_eq!(depot.replied, Some(42));
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
 
 pub mod access;
 mod calls;
+pub mod hub;
 pub mod lease;
 pub mod publications;
 pub mod requests;
@@ -10,6 +191,7 @@ pub mod unit;
 pub use calls::{CallHead, Ticket, slots_for};
 
 use crate::distribution::function_list::{Function, FunctionList, Generation, Slot};
+use crate::distribution::hello::Hello;
 use crate::error::Error;
 use crate::host::mailman::Mailman;
 use crate::host::secure::Secure;
@@ -37,6 +219,23 @@ pub struct Context<'c, P: Port> {
     pub functions: &'c dyn OwnFunctions,
     /// Who may do what; without a table whoever has joined may do everything.
     pub access: Option<&'c dyn access::Access>,
+    /// What the links of the unit share.
+    pub hub: &'c mut dyn hub::Door<P::Storage>,
+    /// The keys of the unit's pairs; `()` where links are not secured.
+    pub keys: &'c mut dyn Keys<P>,
+}
+
+/// Looks up the key of a pair.
+pub trait Keys<P: Port> {
+    /// The key of this unit and the peer that a hello names, with freshly drawn bytes; `None` where there is none. The hello
+    /// may be anybody's.
+    fn credentials(&mut self, hello: &Hello) -> Option<<P::Cipher as Secure>::Credentials>;
+}
+
+impl<P: Port> Keys<P> for () {
+    fn credentials(&mut self, _: &Hello) -> Option<<P::Cipher as Secure>::Credentials> {
+        None
+    }
 }
 
 /// A unit's own [`FunctionList`], whatever runs its services.

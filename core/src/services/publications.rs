@@ -17,24 +17,27 @@ pub struct PublishedToOne {
 pub struct Publications<S: Storage> {
     to_all: S::Slice<bool>,
     to_one: S::Slice<Option<PublishedToOne>>,
+    version: u32,
 }
 
 impl<S: Storage> Publications<S> {
     /// A record with one flag per function of the unit's list, and as many functions shown to single nodes as there are
     /// slots in `to_one`.
     pub fn new(to_all: S::Slice<bool>, to_one: S::Slice<Option<PublishedToOne>>) -> Self {
-        Self { to_all, to_one }
+        Self { to_all, to_one, version: 0 }
     }
 
     /// Shows a function to every node.
     pub fn publish_to_all(&mut self, slot: Slot) -> Result<(), Error> {
         let flag = self.to_all.get_mut(usize::from(slot.0)).ok_or(Error::Full(Limit::Functions))?;
         *flag = true;
+        self.version = self.version.wrapping_add(1);
         Ok(())
     }
 
     /// Shows a function to one node.
     pub fn publish_to(&mut self, identity: &Identity, slot: Slot) -> Result<(), Error> {
+        self.version = self.version.wrapping_add(1);
         if self.is_visible(identity, slot) {
             return Ok(());
         }
@@ -45,12 +48,18 @@ impl<S: Storage> Publications<S> {
 
     /// Hides a function from everybody.
     pub fn withdraw(&mut self, slot: Slot) {
+        self.version = self.version.wrapping_add(1);
         if let Some(flag) = self.to_all.get_mut(usize::from(slot.0)) {
             *flag = false;
         }
         for place in self.to_one.iter_mut() {
             place.take_if(|published| published.slot == slot);
         }
+    }
+
+    /// Another one after each change.
+    pub(crate) const fn version(&self) -> u32 {
+        self.version
     }
 
     /// Whether a node may see a function.

@@ -3,9 +3,9 @@
 
 use core::net::SocketAddr;
 
-use cara_core::distribution::connection_handler::{Action, Admission, Sorted};
+use cara_core::distribution::connection_handler::{Command, Sorted};
 use cara_core::distribution::identity::Identity;
-use cara_core::error::{CloseReason, Error, Refusal};
+use cara_core::error::{CloseReason, Error};
 use cara_core::host::mailman::LinkId;
 use cara_core::host::secure::Plain;
 use cara_core::services::unit::{Call, Event, Session, SessionConfig};
@@ -31,25 +31,26 @@ impl SUnit {
     }
 
     fn poll_node(&mut self, now: Instant) {
-        while let Some(action) = self.node.poll(now, &mut self.stack, &Plain) {
-            // With one link there is never a second one that could be in its way.
-            if let Action::Dial { to, identity } = action {
-                self.dial(now, to, identity.as_ref());
+        while let Some(command) = self.hub.node.poll(now, &mut self.stack, &Plain) {
+            match command {
+                Command::Dial { to, identity } => self.dial(now, to, identity.as_ref()),
+                // With one link there is never a second one of which it could be told.
+                Command::Tell(..) => {}
             }
         }
     }
 
     fn dial(&mut self, now: Instant, to: SocketAddr, identity: Option<&Identity>) {
         if self.session.is_some() || !self.stack.connect(to) {
-            return self.node.dial_failed(now, identity);
+            return self.hub.node.dial_failed(now, identity);
         }
         let Some(storage) = self.spare.take() else { return };
-        let constraints = *self.node.constraints();
-        let local = self.node.hello(now, LINK);
+        let constraints = *self.hub.node.constraints();
+        let local = self.hub.node.hello(now, LINK);
         let config = SessionConfig { link: LINK, dialed: true, address: to, local, constraints };
         self.session = Some(Session::new(now, config, Plain, storage));
         self.standing = Standing::Dialing;
-        self.node.dialing(identity, LINK);
+        self.hub.node.dialing(identity, LINK);
     }
 
     fn poll_session<P: Program>(&mut self, now: Instant, program: &mut P) {
@@ -71,7 +72,7 @@ impl SUnit {
     }
 
     fn take_datagram<P: Program>(&mut self, now: Instant, from: SocketAddr, bytes: &mut [u8], program: &mut P) {
-        let Sorted::Session { nonce, body, .. } = self.node.datagram(now, from, bytes, &Plain) else { return };
+        let Sorted::Session { nonce, body, .. } = self.hub.node.datagram(now, from, bytes, &Plain) else { return };
         let Some(session) = &mut self.session else { return };
         if let Some(event) = session.datagram(context!(self, now), from, nonce, body) {
             let rest = tell(event, program);
@@ -132,36 +133,19 @@ impl SUnit {
     fn go_on<P: Program>(&mut self, now: Instant, rest: Rest, program: &mut P) {
         match rest {
             Rest::Nothing => {}
-            Rest::Greet => self.greet(now, program),
+            Rest::Joined => {
+                self.standing = Standing::Joined;
+                program.hear(News::Joined);
+            }
             Rest::Serve(call) => self.serve(now, &call, program),
             Rest::Leave(reason) => self.leave(now, reason, program),
-        }
-    }
-
-    /// The manager has introduced itself, or somebody at its address.
-    fn greet<P: Program>(&mut self, now: Instant, program: &mut P) {
-        let Some(session) = &mut self.session else { return };
-        let Some(hello) = session.hello() else { return };
-        let refusal = match self.node.admit(now, LINK, session.address(), hello) {
-            Admission::Accept => None,
-            Admission::Refuse(refusal) => Some(refusal),
-            Admission::Challenge { .. } => Some(Refusal::AlreadyConnected),
-        };
-        if let Some(refusal) = refusal {
-            return session.refuse(context!(self, now), refusal);
-        }
-        session.accept(context!(self, now));
-        if session.is_live() {
-            self.standing = Standing::Joined;
-            self.publish(now);
-            program.hear(News::Joined);
         }
     }
 
     /// Shows the manager every function, on this link.
     pub(crate) fn publish(&mut self, now: Instant) {
         if let Some(session) = self.session.as_mut().filter(|session| session.is_live()) {
-            session.publish(context!(self, now), self.functions.iter().map(|function| function.slot));
+            session.publish(context!(self, now));
         }
     }
 
@@ -200,8 +184,7 @@ impl SUnit {
         self.spare = Some(session.into_storage(&mut self.buffers));
         self.unanswered = None;
         self.stack.close();
-        // With one link nobody can have waited for its end.
-        let _ = self.node.left(now, LINK, reason);
+        self.hub.node.left(now, LINK, reason);
         if self.standing == Standing::Joined {
             program.hear(News::Left(reason));
         }
@@ -211,7 +194,7 @@ impl SUnit {
 /// What is left for the unit to do about an event.
 enum Rest {
     Nothing,
-    Greet,
+    Joined,
     Serve(Call),
     Leave(CloseReason),
 }
@@ -224,9 +207,8 @@ fn tell<P: Program>(event: Event<'_>, program: &mut P) -> Rest {
         Event::Failed(id, error) => program.hear(News::Failed(id, error)),
         Event::ListChanged => program.hear(News::ListChanged),
         Event::LeaseEnded { slot, why, .. } => program.hear(News::LeaseEnded { function: slot, why }),
-        // Plain links prove nothing.
-        Event::Acknowledged { .. } | Event::Answered | Event::Introduced => {}
-        Event::Hello => return Rest::Greet,
+        Event::Acknowledged { .. } | Event::Answered => {}
+        Event::Joined => return Rest::Joined,
         Event::Call(call) => return Rest::Serve(call),
         Event::Closed(reason) => return Rest::Leave(reason),
     }

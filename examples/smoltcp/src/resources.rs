@@ -8,6 +8,7 @@ use cara_core::distribution::function_list::{Entry, FunctionList};
 use cara_core::distribution::parameters::Parameters;
 use cara_core::services::CallHead;
 use cara_core::services::lease::{Lease, Service};
+use cara_core::services::publications::{Publications, PublishedToOne};
 use cara_core::services::requests::Pending;
 use cara_core::services::unit::{Publication, SessionStorage, buffer_bytes};
 use cara_core::storage::{Lent, Pool};
@@ -62,6 +63,8 @@ pub struct Resources {
     order: [Order; NODES],
     links: [Option<u16>; 1],
     findings: [Option<Finding>; 4],
+    to_all: [bool; FUNCTIONS],
+    to_one: [Option<PublishedToOne>; 0],
     functions: [Entry<Offered>; FUNCTIONS],
     signatures: [u8; SIGNATURES],
     small: [u8; LINK_BUFFER_BYTES],
@@ -78,6 +81,7 @@ pub struct Resources {
 pub(crate) struct Parts {
     pub(crate) stack: &'static mut StackMemory,
     pub(crate) node: NodeStorage<Lent>,
+    pub(crate) publications: Publications<Lent>,
     pub(crate) link: SessionStorage<Lent>,
     pub(crate) functions: FunctionList<Lent, Offered>,
     pub(crate) buffers: Pool<Lent>,
@@ -101,6 +105,8 @@ impl Resources {
             order: from_fn(|_| Order::default()),
             links: [None; 1],
             findings: [const { None }; 4],
+            to_all: [false; FUNCTIONS],
+            to_one: [],
             functions: [const { Entry::empty() }; FUNCTIONS],
             signatures: [0; SIGNATURES],
             small: [0; LINK_BUFFER_BYTES],
@@ -126,6 +132,7 @@ impl Resources {
                 links: &mut self.links[..],
                 findings: &mut self.findings[..],
             },
+            publications: Publications::new(&mut self.to_all[..], &mut self.to_one[..]),
             link: SessionStorage {
                 small: &mut self.small[..],
                 pending: &mut self.pending[..],

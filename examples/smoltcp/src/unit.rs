@@ -6,6 +6,7 @@ use cara_core::distribution::function_list::{FunctionList, Slot, TheirFunctionLi
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error, ServiceError};
 use cara_core::host::secure::Plain;
+use cara_core::services::hub::Hub;
 use cara_core::services::lease::Lease;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::{RequestOptions, Session, SessionStorage};
@@ -34,7 +35,7 @@ impl Port for Smoltcp {
 /// An s_unit on smoltcp.
 pub struct SUnit {
     pub(crate) stack: Stack,
-    pub(crate) node: Node<Lent>,
+    pub(crate) hub: Hub<Lent>,
     pub(crate) functions: FunctionList<Lent, Offered>,
     pub(crate) buffers: Pool<Lent>,
     pub(crate) arguments: &'static mut Arguments,
@@ -65,6 +66,8 @@ macro_rules! context {
             buffers: &mut $unit.buffers,
             functions: &$unit.functions,
             access: None,
+            hub: &mut $unit.hub,
+            keys: &mut (),
         }
     };
 }
@@ -84,7 +87,7 @@ impl SUnit {
         stack.set_address(settings.address);
         Self {
             stack,
-            node: Node::new(now, settings.node, parts.node),
+            hub: Hub { node: Node::new(now, settings.node, parts.node), publications: parts.publications },
             functions: parts.functions,
             buffers: parts.buffers,
             arguments: parts.arguments,
@@ -109,6 +112,7 @@ impl SUnit {
             return Err(Error::BadConstraint);
         }
         let slot = self.functions.add_function(definition, attributes, Offered(lease))?;
+        self.hub.publications.publish_to_all(slot)?;
         self.publish(now);
         Ok(slot)
     }
@@ -133,7 +137,7 @@ impl SUnit {
 
     fn deadline(&mut self, now: Instant) -> Instant {
         let session = self.session.as_ref().map_or(Instant::FAR_FUTURE, Session::deadline);
-        session.min(self.node.next_deadline()).min(self.stack.deadline(now))
+        session.min(self.hub.node.next_deadline()).min(self.stack.deadline(now))
     }
 
     /// Requests a function of the manager. With `wants_reply` its end comes as [`Program::replied`] under the returned
@@ -186,7 +190,7 @@ impl SUnit {
 
     /// Discovery and membership, for its counters and findings.
     pub fn node(&self) -> &Node<Lent> {
-        &self.node
+        &self.hub.node
     }
 
     /// The link to the manager, for its counters.
@@ -204,7 +208,7 @@ impl SUnit {
 
     /// The cable is in again: the unit looks for its manager at once.
     pub fn link_up(&mut self, now: Instant) {
-        self.node.broadcast(now);
+        self.hub.node.broadcast(now);
     }
 
     /// The unit has another address, or none, as DHCP says. A link from the old one ends.

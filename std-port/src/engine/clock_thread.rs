@@ -50,8 +50,8 @@ impl<T: Send + 'static> Engine<T> {
     fn datagram(&self, from: SocketAddr, bytes: &mut [u8]) {
         let codes = self.keys.codes();
         let (sorted, twin) = {
-            let mut cell = lock(&self.node);
-            (cell.node.datagram(self.clock.now(), from, bytes, &codes), cell.node.take_twin())
+            let mut cell = lock(&self.hub);
+            (cell.hub.node.datagram(self.clock.now(), from, bytes, &codes), cell.hub.node.take_twin())
         };
         if let Some(address) = twin {
             self.twin_heard(address);

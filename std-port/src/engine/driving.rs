@@ -58,14 +58,14 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     fn identity(&self) -> (Identity, Fleet) {
-        let node = &lock(&self.node).node;
+        let node = &lock(&self.hub).hub.node;
         (node.identity().clone(), node.fleet())
     }
 
     fn warn_of_plain_mode(&self) {
         if self.mode() == Mode::Plain {
             tracing::warn!(
-                unit = %lock(&self.node).node.identity(), discovery_port = self.discovery_port(),
+                unit = %lock(&self.hub).hub.node.identity(), discovery_port = self.discovery_port(),
                 "plain mode, without keys: whoever is on the network can read what this unit says, and speak as any unit"
             );
         }

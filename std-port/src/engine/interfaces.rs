@@ -29,7 +29,7 @@ impl<T: Send + 'static> Engine<T> {
         let mut up = self.datagrams.usable();
         up.sort();
         let reaches = self.datagrams.reaches_others(&up);
-        watch.due = now + if lock(&self.node).node.connected() == 0 { ALONE } else { CONNECTED };
+        watch.due = now + if lock(&self.hub).hub.node.connected() == 0 { ALONE } else { CONNECTED };
         let due = watch.due;
         let first = watch.up.is_none();
         if watch.up.as_ref() == Some(&up) {
@@ -46,7 +46,7 @@ impl<T: Send + 'static> Engine<T> {
             tracing::info!(?up, "the network interfaces have changed");
         }
         if !first {
-            lock(&self.node).node.network_changed(now);
+            lock(&self.hub).hub.node.network_changed(now);
             self.wake_clock();
         }
         if !first || !reaches {

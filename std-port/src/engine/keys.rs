@@ -3,13 +3,14 @@
 use std::sync::Arc;
 
 use cara_core::config::Mode;
+use cara_core::distribution::hello::Hello;
 use cara_core::distribution::identity::Identity;
-use cara_core::error::Refusal;
+use cara_core::services;
 use cara_core::time::{Duration, Instant};
 use cara_secure::keyring::{Codes, Keyring};
 use cara_secure::link::{Cipher, Credentials};
 
-use super::link::{LinkCell, LinkState};
+use super::link::Linux;
 use super::{Engine, lock};
 use crate::keys::{DiscoveryKey, KeyRing, LiveRing, PairKey, draw};
 
@@ -120,21 +121,15 @@ fn refresh(live: &LiveRing) -> bool {
     }
 }
 
-impl<T: Send + 'static> Engine<T> {
-    /// The peer of a secured link says who it is: each proves to the other that it has the pair's key.
-    pub(super) fn prove(&self, link: &Arc<LinkCell>, state: &mut LinkState) {
-        let Some(peer) = state.session.identity().cloned() else { return };
-        let credentials = self.keys.credentials(&peer);
+impl<T: Send + 'static> services::Keys<Linux> for &Engine<T> {
+    fn credentials(&mut self, hello: &Hello) -> Option<Credentials> {
+        let credentials = self.keys.credentials(&hello.identity);
         self.watch_new_keys();
-        match credentials {
-            Some(credentials) => self.with(link, state, |session, cx| session.prove(cx, credentials)),
-            None => {
-                lock(&self.node).node.refuse_without_key(self.now(), state.session.address(), &peer);
-                self.with(link, state, |session, cx| session.refuse(cx, Refusal::NoKey));
-            }
-        }
+        credentials
     }
+}
 
+impl<T: Send + 'static> Engine<T> {
     /// Keys that were taken for somebody who came are held against all links at once.
     fn watch_new_keys(&self) {
         let Keys::Ring(live) = &self.keys else { return };
@@ -162,7 +157,7 @@ impl<T: Send + 'static> Engine<T> {
             watched.is_news(&ring).then_some(ring)
         };
         if let Some(ring) = ring {
-            lock(&self.node).node.expect(ring.nodes());
+            lock(&self.hub).hub.node.expect(ring.nodes());
             self.end_links_without_keys(&ring);
         }
         now + REFRESH
@@ -173,7 +168,7 @@ impl<T: Send + 'static> Engine<T> {
         for link in self.each_link() {
             let mut state = link.lock();
             if state.session.identity().is_some_and(|peer| ring.pair(peer).is_none()) {
-                self.with(&link, &mut state, |session, cx| session.refuse(cx, Refusal::NoKey));
+                self.with(&link, &mut state, |session, cx| session.revoke(cx));
             }
             self.settle(&link, state);
         }

@@ -135,7 +135,6 @@ pub(crate) enum Notice {
         skipped: u16,
     },
     Joined,
-    Challenge(LinkId),
     Answered,
     Left(CloseReason),
 }

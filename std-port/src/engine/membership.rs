@@ -4,13 +4,13 @@ use std::cmp::Reverse;
 use std::collections::HashMap;
 use std::sync::Arc;
 
-use cara_core::distribution::connection_handler::{Action, Admission, Node, NodeCounter};
+use cara_core::distribution::connection_handler::{Command, NodeCounter};
 use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::identity::Identity;
 use cara_core::error::{CloseReason, Error, Limit, Refusal};
 use cara_core::host::mailman::LinkId;
-use cara_core::services::publications::Publications;
-use cara_core::services::unit::{Session, SessionConfig};
+use cara_core::services::hub::{Door, Hub};
+use cara_core::services::unit::{Event, Session, SessionConfig};
 use cara_core::time::{Duration, Instant};
 use core::net::{IpAddr, SocketAddr};
 
@@ -25,21 +25,12 @@ use crate::sys::limits;
 use crate::sys::stream::Stream;
 use crate::threads::DATAGRAM;
 
-/// What the node's lock protects.
-pub(crate) struct NodeCell {
-    pub(crate) node: Node<Boxed>,
-    pub(crate) publications: Publications<Boxed>,
+/// What the hub's lock protects. Nothing is locked under it.
+pub(crate) struct HubCell {
+    pub(crate) hub: Hub<Boxed>,
     serial: u32,
-    /// The serial of the link that last had an index: what the node says of an index is meant for that one.
+    /// The serial of the link that last had an index: what the hub says of an index is meant for that one.
     serials: HashMap<LinkId, u32>,
-}
-
-/// What the node wants done, with the serials of the links that it speaks of. Another link may have the index of one of
-/// them by the time that it is done.
-pub(super) struct Directive {
-    action: Action,
-    old: Option<u32>,
-    new: Option<u32>,
 }
 
 /// Descriptors that links which have proven nothing leave to those that do, and to the control socket.
@@ -50,26 +41,35 @@ const KEPT_FOR_OPERATOR: u64 = 20;
 /// The node that a link is dialled for, as far as it is known.
 struct Dialed<'i>(Option<&'i Identity>);
 
-impl NodeCell {
-    pub(crate) fn new(node: Node<Boxed>, publications: Publications<Boxed>) -> Self {
-        Self { node, publications, serial: 0, serials: HashMap::new() }
+impl HubCell {
+    pub(crate) fn new(hub: Hub<Boxed>) -> Self {
+        Self { hub, serial: 0, serials: HashMap::new() }
     }
 
-    /// To be asked under the lock under which the node wanted it.
-    pub(super) fn directive(&self, action: Option<Action>) -> Option<Directive> {
-        let action = action?;
-        let serial = |link: LinkId| self.serials.get(&link).copied();
-        let (old, new) = match &action {
-            Action::Dial { .. } => (None, None),
-            Action::Supersede { old, new, .. } => (serial(*old), serial(*new)),
-            Action::Admit { new } | Action::Refuse { new, .. } => (None, serial(*new)),
-        };
-        Some(Directive { action, old, new })
+    /// The serial of the link that a command is for. Another link may have its index by the time that it is passed on.
+    fn serial_of(&self, command: &Command) -> Option<u32> {
+        match command {
+            Command::Dial { .. } => None,
+            Command::Tell(link, _) => self.serials.get(link).copied(),
+        }
     }
 
     /// Longest block of parameters that this unit takes.
     pub(crate) fn longest_message(&self) -> usize {
-        self.node.constraints().message_size as usize
+        self.hub.node.constraints().message_size as usize
+    }
+}
+
+/// The hub, for sessions: under the lock of one link.
+impl<T: Send + 'static> Door<Boxed> for &Engine<T> {
+    fn enter(&mut self, act: &mut dyn FnMut(&mut Hub<Boxed>)) {
+        let due = {
+            let mut cell = lock(&self.hub);
+            act(&mut cell.hub);
+            cell.hub.node.next_deadline()
+        };
+        // What concerns other links is passed on by the clock.
+        self.wake_clock_at(due);
     }
 }
 
@@ -82,14 +82,15 @@ impl<T: Send + 'static> Engine<T> {
         let now = self.clock.now();
         let storage = self.session_storage();
         let (serial, local, constraints) = {
-            let mut cell = lock(&self.node);
+            let mut cell = lock(&self.hub);
             cell.serial = cell.serial.wrapping_add(1);
             let serial = cell.serial;
             cell.serials.insert(id, serial);
+            let node = &mut cell.hub.node;
             if let Some(Dialed(identity)) = dialed {
-                cell.node.dialing(identity, id);
+                node.dialing(identity, id);
             }
-            (cell.serial, cell.node.hello(now, id), *cell.node.constraints())
+            (serial, node.hello(now, id), *node.constraints())
         };
         let dialed = dialed.is_some();
         let config = SessionConfig { link: id, dialed, address, local, constraints };
@@ -143,7 +144,7 @@ impl<T: Send + 'static> Engine<T> {
             }
             self.with(&link, &mut state, |session, cx| session.close(cx, CloseReason::HelloTimeout));
             self.settle(&link, state);
-            lock(&self.node).node.counters.add(NodeCounter::GaveWay, 1);
+            lock(&self.hub).hub.node.counters.add(NodeCounter::GaveWay, 1);
             return true;
         }
         false
@@ -164,7 +165,7 @@ impl<T: Send + 'static> Engine<T> {
     fn dial(&self, to: SocketAddr, identity: Option<&Identity>) {
         let stream = Stream::connect(to).ok();
         if stream.and_then(|stream| self.open_link(stream, to, Some(Dialed(identity)))).is_none() {
-            lock(&self.node).node.dial_failed(self.clock.now(), identity);
+            lock(&self.hub).hub.node.dial_failed(self.clock.now(), identity);
             let (peer, reason) = (identity.cloned(), CloseReason::DialFailed);
             self.tell(UnitEvent::NotJoined { address: to, peer, reason });
         }
@@ -174,7 +175,7 @@ impl<T: Send + 'static> Engine<T> {
     /// Another live unit has this one's identity.
     pub(super) fn twin_heard(&self, address: SocketAddr) {
         let refusal = Refusal::DuplicateIdentity;
-        let own = lock(&self.node).node.identity().clone();
+        let own = lock(&self.hub).hub.node.identity().clone();
         warn_seldom!(%address, name = own.name(), id = own.id(), "{refusal}");
         self.tell(UnitEvent::NotJoined { address, peer: Some(own), reason: CloseReason::Refused(refusal) });
     }
@@ -194,54 +195,30 @@ impl<T: Send + 'static> Engine<T> {
         }
     }
 
-    /// Asks the node about a hello that has come.
-    pub(super) fn admit(&self, link: &Arc<LinkCell>, state: &mut LinkState) {
-        let Some(hello) = state.session.hello().cloned() else { return };
-        let admission = lock(&self.node).node.admit(self.clock.now(), link.id, state.session.address(), &hello);
-        match admission {
-            Admission::Accept => self.join(link, state),
-            Admission::Refuse(refusal) => self.with(link, state, |session, cx| session.refuse(cx, refusal)),
-            Admission::Challenge { old } => state.notices.push(Notice::Challenge(old)),
-        }
-    }
-
-    /// The node has taken the peer: it is told what it may call, and has its place from here on.
-    fn join(&self, link: &Arc<LinkCell>, state: &mut LinkState) {
+    /// The hub has taken the peer, which has its place from here on.
+    pub(super) fn joined(&self, link: &Arc<LinkCell>, state: &mut LinkState) {
         let Some(identity) = state.session.identity().cloned() else { return };
-        self.with(link, state, |session, cx| session.accept(cx));
-        if !state.session.is_live() {
-            // It has ended meanwhile, and that is told by itself.
-            return;
-        }
-        let limit = usize::from(lock(&self.node).node.constraints().maximum_nodes);
+        let limit = usize::from(lock(&self.hub).hub.node.constraints().maximum_nodes);
         let peer = write(&self.peers).join(&identity, limit, link);
         if let Some(own) = peer.own_constraints(*state.session.constraints()) {
             self.with(link, state, |session, cx| session.set_constraints(cx, own));
         }
         let _ = link.peer.set(peer);
-        // Looked up last: who publishes from here on finds the peer, and waits for this link's lock to tell it.
-        let visible: Vec<Slot> = {
-            let cell = lock(&self.node);
-            cell.publications.visible_to(&identity).collect()
-        };
-        self.make_publication_room(state);
-        self.with(link, state, |session, cx| session.publish(cx, visible.into_iter()));
+        // Who publishes from here on finds the peer, and waits for this link's lock to tell it. What was published before,
+        // and after the session looked, or found no room in it, is told now.
+        let grew = self.make_publication_room(state);
+        self.with(link, state, |session, cx| {
+            if grew || session.is_behind(cx) {
+                session.publish(cx);
+            }
+        });
         state.notices.push(Notice::Joined);
     }
 
     /// Does what a notice asks for, or tells it.
     pub(super) fn act_on(&self, link: &Arc<LinkCell>, notice: Notice) {
         match notice {
-            Notice::Challenge(old) => self.challenge(old),
-            Notice::Answered => {
-                link.room.notify_all();
-                let directive = {
-                    let mut cell = lock(&self.node);
-                    let action = cell.node.challenge_answered(self.clock.now(), link.id);
-                    cell.directive(action)
-                };
-                self.carry_out(directive);
-            }
+            Notice::Answered => link.room.notify_all(),
             Notice::Left(reason) => self.link_ended(link, reason),
             notice => {
                 if let Some(event) = link.peer.get().and_then(|peer| self.describe(link, &peer.identity, &notice)) {
@@ -273,20 +250,8 @@ impl<T: Send + 'static> Engine<T> {
             }
             Notice::Acknowledged { skipped, .. } if skipped > 0 => UnitEvent::FunctionsSkipped { peer, skipped },
             Notice::Acknowledged { .. } => return None,
-            Notice::Challenge(_) | Notice::Answered | Notice::Left(_) => return None,
+            Notice::Answered | Notice::Left(_) => return None,
         })
-    }
-
-    fn challenge(&self, old: LinkId) {
-        let Some(link) = self.link(old) else {
-            let directive = self.left(old, CloseReason::Reset);
-            self.carry_out(directive);
-            return;
-        };
-        let mut state = link.lock();
-        self.with(&link, &mut state, |session, cx| session.challenge(cx));
-        self.settle(&link, state);
-        self.wake_clock();
     }
 
     /// The link's id is free for another link only when nothing here means the old one by it any more.
@@ -310,58 +275,40 @@ impl<T: Send + 'static> Engine<T> {
             self.tell(UnitEvent::NotJoined { address, peer, reason });
         }
         lock(&self.timers).cancel(u32::from(link.id.0));
-        let directive = self.left(link.id, reason);
+        lock(&self.hub).hub.node.left(self.clock.now(), link.id, reason);
         if let Some(place) = write(&self.links).get_mut(usize::from(link.id.0)) {
             place.take_if(|current| current.serial == link.serial);
         }
-        self.carry_out(directive);
-        // The node may have something to do earlier than before.
+        // The hub may have something to do earlier than before.
         self.wake_clock();
     }
 
-    fn left(&self, link: LinkId, reason: CloseReason) -> Option<Directive> {
-        let mut cell = lock(&self.node);
-        let action = cell.node.left(self.clock.now(), link, reason);
-        cell.directive(action)
-    }
-
-    /// Does what the node wants done, to the links that it meant and to no others.
-    pub(super) fn carry_out(&self, directive: Option<Directive>) {
-        let Some(Directive { action, old: old_serial, new: new_serial }) = directive else { return };
-        let meant = |id: LinkId, serial: Option<u32>| self.link(id).filter(|link| Some(link.serial) == serial);
-        match action {
-            Action::Dial { to, identity } => self.dial(to, identity.as_ref()),
-            Action::Supersede { old, new, reason } => {
-                if let Some(old) = meant(old, old_serial) {
-                    let mut state = old.lock();
-                    self.with(&old, &mut state, |session, cx| session.close(cx, reason));
-                    self.settle(&old, state);
+    /// Passes on what the hub wants done, to the link that it meant and to no other.
+    fn carry_out(&self, command: Command, serial: Option<u32>) {
+        match command {
+            Command::Dial { to, identity } => self.dial(to, identity.as_ref()),
+            Command::Tell(id, directive) => {
+                let Some(link) = self.link_of(id, serial) else { return };
+                let mut state = link.lock();
+                let event = self.with(&link, &mut state, |session, cx| session.direct(cx, directive));
+                if let Some(Event::Joined) = event {
+                    self.joined(&link, &mut state);
+                    // What follows the hello has waited.
+                    self.feed(self.now(), &link, &mut state, &mut [], None, None);
                 }
-                self.admit_waiting(meant(new, new_serial));
+                self.settle(&link, state);
             }
-            Action::Admit { new } => self.admit_waiting(meant(new, new_serial)),
-            Action::Refuse { new, refusal } => self.refuse_waiting(meant(new, new_serial), refusal),
         }
     }
 
-    fn admit_waiting(&self, new: Option<Arc<LinkCell>>) {
-        let Some(link) = new else { return };
-        let mut state = link.lock();
-        self.join(&link, &mut state);
-        self.feed(self.now(), &link, &mut state, &mut [], None, None);
-        self.settle(&link, state);
-    }
-
-    fn refuse_waiting(&self, new: Option<Arc<LinkCell>>, refusal: Refusal) {
-        let Some(link) = new else { return };
-        let mut state = link.lock();
-        self.with(&link, &mut state, |session, cx| session.refuse(cx, refusal));
-        self.settle(&link, state);
+    /// The link that a command means, unless that one has ended: another may have got its place.
+    fn link_of(&self, id: LinkId, serial: Option<u32>) -> Option<Arc<LinkCell>> {
+        self.link(id).filter(|link| Some(link.serial) == serial)
     }
 
     /// Searches for nodes now (paper, listing line 6).
     pub(crate) fn broadcast(&self) {
-        lock(&self.node).node.broadcast(self.clock.now());
+        lock(&self.hub).hub.node.broadcast(self.clock.now());
         self.wake_clock();
     }
 
@@ -370,26 +317,26 @@ impl<T: Send + 'static> Engine<T> {
     pub(crate) fn publish(&self, to: Option<&Identity>) -> Result<Vec<(Arc<LinkCell>, u32)>, Error> {
         let slots: Vec<Slot> = read(&self.functions).iter().map(|function| function.slot).collect();
         {
-            let mut cell = lock(&self.node);
+            let publications = &mut lock(&self.hub).hub.publications;
             for &slot in &slots {
                 match to {
-                    None => cell.publications.publish_to_all(slot)?,
-                    Some(identity) => cell.publications.publish_to(identity, slot)?,
+                    None => publications.publish_to_all(slot)?,
+                    Some(identity) => publications.publish_to(identity, slot)?,
                 }
             }
         }
         let peers: Vec<_> = read(&self.peers).connected().cloned().collect();
         let chosen = peers.into_iter().filter(|peer| to.is_none_or(|identity| peer.identity == *identity));
-        Ok(chosen.filter_map(|peer| self.publish_on(&peer.link()?, &slots)).collect())
+        Ok(chosen.filter_map(|peer| self.publish_on(&peer.link()?)).collect())
     }
 
-    fn publish_on(&self, link: &Arc<LinkCell>, slots: &[Slot]) -> Option<(Arc<LinkCell>, u32)> {
+    fn publish_on(&self, link: &Arc<LinkCell>) -> Option<(Arc<LinkCell>, u32)> {
         let mut state = link.lock();
         if !state.session.is_live() {
             return None;
         }
         self.make_publication_room(&mut state);
-        let serial = self.with(link, &mut state, |session, cx| session.publish(cx, slots.iter().copied()));
+        let serial = self.with(link, &mut state, |session, cx| session.publish(cx));
         self.settle(link, state);
         Some((link.clone(), serial))
     }
@@ -397,7 +344,7 @@ impl<T: Send + 'static> Engine<T> {
     /// Removes a function: its slot's callers learn that it is gone.
     pub(crate) fn remove_function(&self, name: &str) -> Result<(), Error> {
         let (slot, _) = write(&self.functions).remove(name)?;
-        lock(&self.node).publications.withdraw(slot);
+        lock(&self.hub).hub.publications.withdraw(slot);
         for link in self.each_link() {
             let mut state = link.lock();
             self.with(&link, &mut state, |session, cx| session.withdraw(cx, slot));
@@ -433,7 +380,7 @@ impl<T: Send + 'static> Engine<T> {
     pub(super) fn poll_node(&self) -> Instant {
         // Before the node's lock: a thread that reads a new key file keeps the ring to itself meanwhile.
         let codes = self.keys.codes();
-        if lock(&self.node).node.searches_at() <= self.now() {
+        if lock(&self.hub).hub.node.searches_at() <= self.now() {
             // What others have asked and answered may lie unread for as long as this thread was busy with other units.
             let mut buffer = [0; DATAGRAM];
             for socket in [Socket::Shared, Socket::Own] {
@@ -441,16 +388,16 @@ impl<T: Send + 'static> Engine<T> {
             }
         }
         loop {
-            let (directive, next) = {
-                let mut cell = lock(&self.node);
+            let (command, serial) = {
+                let mut cell = lock(&self.hub);
                 let mut mailman = StdMailman { stream: None, datagrams: &self.datagrams };
-                let action = cell.node.poll(self.clock.now(), &mut mailman, &codes);
-                (cell.directive(action), cell.node.next_deadline())
+                let Some(command) = cell.hub.node.poll(self.clock.now(), &mut mailman, &codes) else {
+                    return cell.hub.node.next_deadline();
+                };
+                let serial = cell.serial_of(&command);
+                (command, serial)
             };
-            if directive.is_none() {
-                return next;
-            }
-            self.carry_out(directive);
+            self.carry_out(command, serial);
         }
     }
 }
@@ -462,10 +409,9 @@ mod tests {
     use super::*;
     use crate::testing::{fleet, manager, until, vehicle};
 
-    /// A link ends after the node has said what is to become of it: it is not joined, and a link that has got its index
-    /// is neither joined for it nor ended.
+    /// A link ends after the hub has said what is to become of it: the command is not for the link that has got its place.
     #[test]
-    fn what_the_node_wanted_of_a_link_that_has_ended_befalls_no_other_link() {
+    fn a_command_for_a_link_that_has_ended_reaches_no_other_link() {
         let fleet = fleet();
         let manager = manager(fleet, Constraints::M_UNIT);
         let engine = manager.engine();
@@ -473,27 +419,18 @@ mod tests {
         first.start().unwrap();
         until(|| manager.number_of_s_units() == 1);
         let ended = engine.each_link().remove(0);
-        let (admit, supersede) = {
-            let cell = lock(&engine.node);
-            let (id, reason) = (ended.id, CloseReason::PeerRestarted);
-            let supersede = Action::Supersede { old: id, new: id, reason };
-            (cell.directive(Some(Action::Admit { new: id })), cell.directive(Some(supersede)))
-        };
+        let serial = lock(&engine.hub).serials.get(&ended.id).copied();
+        assert!(engine.link_of(ended.id, serial).is_some_and(|link| Arc::ptr_eq(&link, &ended)));
         first.stop();
         until(|| manager.number_of_s_units() == 0);
         until(|| engine.link(ended.id).is_none());
-        let events = manager.events();
-        engine.join(&ended, &mut ended.lock());
-        assert_eq!(ended.lock().notices, [], "a link that has ended does not join");
         let second = vehicle(fleet, 2, Constraints::S_UNIT);
         second.start().unwrap();
         until(|| manager.number_of_s_units() == 1);
         let newcomer = engine.each_link().remove(0);
         assert_eq!((newcomer.id, newcomer.serial != ended.serial), (ended.id, true), "it has the same index");
-        engine.carry_out(admit);
-        engine.carry_out(supersede);
-        assert!(newcomer.lock().session.is_live());
-        let joined = events.try_iter().filter(|event| matches!(event, UnitEvent::Joined { .. })).count();
-        assert_eq!((joined, manager.number_of_s_units()), (1, 1));
+        assert!(engine.link_of(ended.id, serial).is_none());
+        let its_own = lock(&engine.hub).serials.get(&newcomer.id).copied();
+        assert!(engine.link_of(newcomer.id, its_own).is_some());
     }
 }

@@ -37,7 +37,7 @@ pub(crate) use accounts::{Group, Reading};
 pub(crate) use calling::{CallFuture, worth_waiting};
 pub(crate) use clock_thread::system_refused;
 pub(crate) use keys::Keys;
-pub(crate) use membership::NodeCell;
+pub(crate) use membership::HubCell;
 pub(crate) use tables::node_storage;
 pub(crate) use workers::arena_bytes;
 
@@ -85,7 +85,7 @@ pub(crate) struct Engine<T: 'static> {
     me: Weak<Self>,
     pub(crate) clock: Clock,
     capacities: Capacities,
-    pub(crate) node: Mutex<NodeCell>,
+    pub(crate) hub: Mutex<HubCell>,
     pub(crate) functions: RwLock<FunctionList<Boxed, Handler<T>>>,
     pub(crate) peers: RwLock<Peers>,
     links: RwLock<Vec<Option<Arc<LinkCell>>>>,
@@ -163,7 +163,7 @@ pub(crate) struct EngineParts<T: 'static> {
     pub(crate) own_threads: bool,
     pub(crate) capacities: Capacities,
     pub(crate) keys: Keys,
-    pub(crate) node: NodeCell,
+    pub(crate) hub: HubCell,
     pub(crate) functions: FunctionList<Boxed, Handler<T>>,
     pub(crate) pool: MessagePool,
     pub(crate) state: T,
@@ -175,13 +175,13 @@ pub(crate) struct EngineParts<T: 'static> {
 
 impl<T: Send + 'static> Engine<T> {
     pub(crate) fn new(parts: EngineParts<T>) -> Arc<Self> {
-        let longest_message = AtomicUsize::new(parts.node.longest_message());
+        let longest_message = AtomicUsize::new(parts.hub.longest_message());
         let born = parts.threads.crew().clock.now();
         Arc::new_cyclic(|me| Self {
             me: me.clone(),
             clock: parts.threads.crew().clock,
             capacities: parts.capacities,
-            node: Mutex::new(parts.node),
+            hub: Mutex::new(parts.hub),
             functions: RwLock::new(parts.functions),
             peers: RwLock::new(Peers::default()),
             links: RwLock::new((0..parts.maximum_links).map(|_| None).collect()),
@@ -241,7 +241,16 @@ impl<T: Send + 'static> Engine<T> {
         let mut buffers = &self.pool;
         let asked = self.guard.ask();
         let access = asked.as_ref().map(|asked| asked as &dyn Access);
-        let mut cx = Context { now, mailman: &mut mailman, buffers: &mut buffers, functions: &*functions, access };
+        let (mut hub, mut keys) = (self, self);
+        let mut cx = Context {
+            now,
+            mailman: &mut mailman,
+            buffers: &mut buffers,
+            functions: &*functions,
+            access,
+            hub: &mut hub,
+            keys: &mut keys,
+        };
         act(&mut state.session, &mut cx)
     }
 
@@ -277,11 +286,8 @@ impl<T: Send + 'static> Engine<T> {
             call = call.or(step.call);
             // One emergency alone has a place to wait, and the next one may be among these bytes.
             self.dispatch_emergencies(link, state);
-            if step.introduced {
-                self.prove(link, state);
-            }
-            if step.hello {
-                self.admit(link, state);
+            if step.joined {
+                self.joined(link, state);
             }
             if step.paused && was_paused {
                 (state.leftover, state.leftover_at) = (earlier, position);
@@ -315,21 +321,28 @@ impl<T: Send + 'static> Engine<T> {
         let mut buffers = &self.pool;
         let asked = self.guard.ask();
         let access = asked.as_ref().map(|asked| asked as &dyn Access);
-        let mut cx = Context { now, mailman: &mut mailman, buffers: &mut buffers, functions: &*functions, access };
+        let (mut hub, mut keys) = (self, self);
+        let mut cx = Context {
+            now,
+            mailman: &mut mailman,
+            buffers: &mut buffers,
+            functions: &*functions,
+            access,
+            hub: &mut hub,
+            keys: &mut keys,
+        };
         let LinkState { session, waiters, notices, .. } = state;
         let receipt = session.receive(&mut cx, bytes, arguments.as_deref_mut());
         let mut step = Step {
             consumed: receipt.consumed,
             paused: receipt.paused,
             progress: receipt.consumed > 0 || receipt.event.is_some(),
-            introduced: false,
-            hello: false,
+            joined: false,
             call: None,
         };
         match receipt.event {
             None => {}
-            Some(Event::Introduced) => step.introduced = true,
-            Some(Event::Hello) => step.hello = true,
+            Some(Event::Joined) => step.joined = true,
             Some(Event::Call(call)) => {
                 let begun = self.begun(&functions, link, call);
                 match arguments.filter(|_| serving::is_emergency(&call)) {
@@ -391,7 +404,6 @@ impl<T: Send + 'static> Engine<T> {
                 Some(Event::Reply(id, outcome)) => {
                     state.finish(id, outcome.map(|_| Default::default()));
                 }
-                Some(Event::Introduced) => self.prove(link, state),
                 Some(event) => {
                     if let Event::Closed(_) = event {
                         link.stream.shutdown();
@@ -512,8 +524,8 @@ impl<T: Send + 'static> Engine<T> {
     pub(crate) fn set_constraints(&self, constraints: Constraints) -> Result<(), Error> {
         self.make_node_room(constraints.maximum_nodes)?;
         let longest = {
-            let mut cell = lock(&self.node);
-            cell.node.set_constraints(constraints);
+            let mut cell = lock(&self.hub);
+            cell.hub.node.set_constraints(constraints);
             cell.longest_message()
         };
         // Buffers first: peers send longer messages as soon as they are told.
@@ -530,7 +542,7 @@ impl<T: Send + 'static> Engine<T> {
 
     /// Changes what differs for one node from the unit's constraints.
     pub(crate) fn set_peer_constraints(&self, peer: &PeerCell, constraints: Constraints) -> Result<(), Error> {
-        let unit = *lock(&self.node).node.constraints();
+        let unit = *lock(&self.hub).hub.node.constraints();
         peer.set_constraints(unit, constraints)?;
         if let Some(link) = peer.link() {
             let mut state = link.lock();
@@ -610,15 +622,13 @@ struct Step {
     paused: bool,
     /// Something was consumed or came out: there may be more.
     progress: bool,
-    introduced: bool,
-    hello: bool,
+    joined: bool,
     call: Option<Begun>,
 }
 
 impl Step {
     /// Nothing was looked at.
-    const PAUSED: Self =
-        Self { consumed: 0, paused: true, progress: false, hello: false, introduced: false, call: None };
+    const PAUSED: Self = Self { consumed: 0, paused: true, progress: false, joined: false, call: None };
 }
 
 /// What a link is watched for.
@@ -643,6 +653,6 @@ fn notice(event: &Event<'_>) -> Option<Notice> {
         Event::Acknowledged { serial, skipped } => Notice::Acknowledged { serial, skipped },
         Event::Answered => Notice::Answered,
         Event::Closed(reason) => Notice::Left(reason),
-        Event::Introduced | Event::Hello | Event::Call(_) | Event::Reply(..) => return None,
+        Event::Joined | Event::Call(_) | Event::Reply(..) => return None,
     })
 }

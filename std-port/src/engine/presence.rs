@@ -20,7 +20,7 @@ impl<T: Send + 'static> Engine<T> {
     /// Where a live manager of this unit's identity answers; `None` after a wait in which none did.
     pub(super) fn running_elsewhere(&self) -> std::io::Result<Option<SocketAddr>> {
         let presence = {
-            let node = &lock(&self.node).node;
+            let node = &lock(&self.hub).hub.node;
             if node.identity().role() != Role::MUnit || !self.asks_for_itself {
                 return Ok(None);
             }

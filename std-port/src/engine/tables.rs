@@ -63,7 +63,7 @@ impl<T: Send + 'static> Engine<T> {
         }
         // The node first: it is to know every link that there can be.
         let longer = node_storage(nodes, links);
-        lock(&self.node).node.grow(longer.nodes, longer.order, longer.links);
+        lock(&self.hub).hub.node.grow(longer.nodes, longer.order, longer.links);
         let mut cells = write(&self.links);
         let length = cells.len().max(links);
         cells.resize_with(length, || None);
@@ -131,12 +131,14 @@ impl<T: Send + 'static> Engine<T> {
         }
     }
 
-    /// Makes room for all functions of the unit's own list, which may be published next.
-    pub(super) fn make_publication_room(&self, state: &mut LinkState) {
+    /// Makes room for all functions of the unit's own list, which may be published next; whether there was too little.
+    pub(super) fn make_publication_room(&self, state: &mut LinkState) -> bool {
         let functions = self.own_functions();
-        if functions > state.session.publication_slots() {
+        let grows = functions > state.session.publication_slots();
+        if grows {
             drop(state.session.lend_publications(filled_with(functions, Default::default)));
         }
+        grows
     }
 }
 

@@ -229,7 +229,7 @@ fn nothing_is_left_of_a_call_that_has_timed_out() {
     let open = open;
     for clock_is_held_up in [true, true, false] {
         // The clock ends the call, or the caller does where the clock waits for the node.
-        let held_up = clock_is_held_up.then(|| lock(&engine.node));
+        let held_up = clock_is_held_up.then(|| lock(&engine.hub));
         engine.wake_clock();
         let outcome = pair.peer.block_request_with("wait", &mut text(1), &options(Duration::from_millis(50)));
         assert_eq!(outcome, Err(Error::TimedOut));
@@ -253,7 +253,7 @@ fn what_lies_unread_is_read_before_a_question_goes_out() {
     };
     // None is started: this thread is their clock.
     let units: Vec<Unit> = (1..=UNITS).map(&mut vehicle).collect();
-    let is_due = |unit: &Unit| lock(&unit.engine().node).node.searches_at() <= unit.engine().now();
+    let is_due = |unit: &Unit| lock(&unit.engine().hub).hub.node.searches_at() <= unit.engine().now();
     until(|| units.iter().all(is_due));
     for (index, unit) in units.iter().enumerate() {
         if index > 0 {

@@ -2,20 +2,26 @@
 
 use core::net::SocketAddr;
 
-use cara_core::config::Constraints;
-use cara_core::distribution::connection_handler::{
-    Admission, Finding, Known, Node, NodeConfig, NodeStorage, Order, Target,
-};
+use cara_core::config::{Constraints, LINK_BUFFER_BYTES, Mode};
+use cara_core::distribution::connection_handler::{Finding, Known, Node, NodeConfig, NodeStorage, Order, Target};
 use cara_core::distribution::datagram::{Announce, SEARCH_BYTES, WhoHas};
+use cara_core::distribution::function_list::{Entry, FunctionList};
 use cara_core::distribution::hello::{Hello, Manager};
 use cara_core::distribution::identity::{Epoch, Fleet, Identity};
 use cara_core::error::CloseReason;
+use cara_core::host::frame::{self, Frame};
 use cara_core::host::mailman::{LinkId, Mailman};
 use cara_core::host::secure::Plain;
-use cara_core::storage::Lent;
+use cara_core::services::hub::Hub;
+use cara_core::services::publications::{Publications, PublishedToOne};
+use cara_core::services::requests::Pending;
+use cara_core::services::unit::{Event, Publication, Session, SessionConfig, SessionStorage};
+use cara_core::services::{CallHead, Context};
+use cara_core::storage::{Buffer, Lent, Pool};
 use cara_core::time::{Duration, Instant};
 
-use crate::{Meter, Of, Operation};
+use crate::pair::{Bench, Nothing};
+use crate::{Meter, Of, Operation, Uncounted};
 
 const FLEET: Fleet = Fleet(1);
 const DEPOT: &str = "depot";
@@ -28,6 +34,17 @@ pub struct DiscoveryMemory<const NODES: usize> {
     order: [Order; NODES],
     links: [Option<u16>; NODES],
     findings: [Option<Finding>; 4],
+    to_all: [bool; 1],
+    to_one: [Option<PublishedToOne>; 1],
+    functions: [Entry<Nothing>; 1],
+    signatures: [u8; 8],
+    pool: [Option<Buffer<Lent>>; 1],
+    small: [u8; LINK_BUFFER_BYTES],
+    pending: [Option<Pending>; 1],
+    running: [Option<CallHead>; 2],
+    publications: [Publication; 1],
+    their_functions: [Entry; 1],
+    their_signatures: [u8; 8],
 }
 
 impl<const NODES: usize> DiscoveryMemory<NODES> {
@@ -38,6 +55,17 @@ impl<const NODES: usize> DiscoveryMemory<NODES> {
             order: core::array::from_fn(|_| Order::default()),
             links: [None; NODES],
             findings: [const { None }; 4],
+            to_all: [false; 1],
+            to_one: [const { None }; 1],
+            functions: [const { Entry::empty() }; 1],
+            signatures: [0; 8],
+            pool: [const { None }; 1],
+            small: [0; LINK_BUFFER_BYTES],
+            pending: [const { None }; 1],
+            running: [const { None }; 2],
+            publications: [Publication::default(); 1],
+            their_functions: [const { Entry::empty() }; 1],
+            their_signatures: [0; 8],
         }
     }
 }
@@ -69,7 +97,11 @@ impl Mailman for Outbox {
 
 /// A manager with many AGVs.
 pub struct Discovery {
-    node: Node<Lent>,
+    hub: Hub<Lent>,
+    functions: FunctionList<Lent, Nothing>,
+    pool: Pool<Lent>,
+    /// What the session of the next newcomer lives in.
+    spare: Option<SessionStorage<Lent>>,
     now: Instant,
     link: LinkId,
     hello: Hello,
@@ -95,16 +127,32 @@ impl Discovery {
             links: memory.links.as_mut_slice(),
             findings: memory.findings.as_mut_slice(),
         };
-        let mut node = Node::new(Instant::START, config, storage);
-        let mut hello = node.hello(Instant::START, LinkId(0));
+        let publications = Publications::new(memory.to_all.as_mut_slice(), memory.to_one.as_mut_slice());
+        let mut hub = Hub { node: Node::new(Instant::START, config, storage), publications };
+        let mut hello = hub.node.hello(Instant::START, LinkId(0));
         hello.wanted = Manager::new(DEPOT, 1).ok();
-        let connected = NODES - SPARE;
-        for number in 0..connected as u16 {
-            hello.identity = agv(u32::from(number));
-            let admitted = node.admit(Instant::START, LinkId(number), address(&hello.identity), &hello);
-            assert_eq!(admitted, Admission::Accept);
+        let connected = (NODES - SPARE) as u16;
+        let spare = SessionStorage {
+            small: memory.small.as_mut_slice(),
+            pending: memory.pending.as_mut_slice(),
+            running: memory.running.as_mut_slice(),
+            publications: memory.publications.as_mut_slice(),
+            their_functions: memory.their_functions.as_mut_slice(),
+            their_signatures: memory.their_signatures.as_mut_slice(),
+        };
+        let mut discovery = Self {
+            hub,
+            functions: FunctionList::new(memory.functions.as_mut_slice(), memory.signatures.as_mut_slice()),
+            pool: Pool::new(memory.pool.as_mut_slice()),
+            spare: Some(spare),
+            now: Instant::START,
+            link: LinkId(connected),
+            hello,
+            sequence: 0,
+        };
+        for number in 0..connected {
+            discovery.introduce(LinkId(number), agv(u32::from(number)), &mut Uncounted);
         }
-        let mut discovery = Self { node, now: Instant::START, link: LinkId(connected as u16), hello, sequence: 0 };
         discovery.rest(&mut Outbox(0));
         discovery
     }
@@ -112,9 +160,9 @@ impl Discovery {
     /// Polls at each deadline of the next second.
     fn rest(&mut self, outbox: &mut Outbox) {
         let end = self.now + Duration::from_secs(1);
-        while self.node.next_deadline() <= end {
-            self.now = self.now.max(self.node.next_deadline());
-            while self.node.poll(self.now, outbox, &Plain).is_some() {}
+        while self.hub.node.next_deadline() <= end {
+            self.now = self.now.max(self.hub.node.next_deadline());
+            while self.hub.node.poll(self.now, outbox, &Plain).is_some() {}
         }
         self.now = end;
     }
@@ -143,9 +191,9 @@ impl Discovery {
         let length = who_has.encode(FLEET, &Plain, &mut bytes).expect("room for it").len();
         let mut outbox = Outbox(0);
         meter.count(&mut || {
-            self.node.datagram(self.now, from, &mut bytes[..length], &Plain);
-            self.now = self.now.max(self.node.next_deadline());
-            while self.node.poll(self.now, &mut outbox, &Plain).is_some() {}
+            self.hub.node.datagram(self.now, from, &mut bytes[..length], &Plain);
+            self.now = self.now.max(self.hub.node.next_deadline());
+            while self.hub.node.poll(self.now, &mut outbox, &Plain).is_some() {}
         });
         assert!(outbox.0 > 0, "the manager answers");
         self.rest(&mut outbox);
@@ -161,21 +209,45 @@ impl Discovery {
         let mut bytes = [0; SEARCH_BYTES];
         let length = announce.encode(FLEET, &Plain, None, &mut bytes).expect("room for it").len();
         meter.count(&mut || {
-            self.node.datagram(self.now, from, &mut bytes[..length], &Plain);
-            while self.node.poll(self.now, &mut Outbox(0), &Plain).is_some() {}
+            self.hub.node.datagram(self.now, from, &mut bytes[..length], &Plain);
+            while self.hub.node.poll(self.now, &mut Outbox(0), &Plain).is_some() {}
         });
         self.rest(&mut Outbox(0));
     }
 
-    /// An AGV has dialled and said who it is.
+    /// An AGV has dialled, says who it is, and is taken.
+    fn introduce(&mut self, link: LinkId, identity: Identity, meter: &mut dyn Meter) {
+        let address = address(&identity);
+        self.hello.identity = identity;
+        let (mut hello, mut bytes) = ([0; 320], [0; 324]);
+        let length = self.hello.encode(Mode::Plain, &mut hello).expect("room for it");
+        let length = frame::encode(&Frame::Hello(&hello[..length]), 0, &mut bytes);
+        let (local, constraints) = (self.hub.node.hello(self.now, link), *self.hub.node.constraints());
+        let config = SessionConfig { link, dialed: false, address, local, constraints };
+        let mut session: Session<Bench> =
+            Session::new(self.now, config, Plain, self.spare.take().expect("it was given back"));
+        let mut cx = Context {
+            now: self.now,
+            mailman: &mut Outbox(0),
+            buffers: &mut self.pool,
+            functions: &self.functions,
+            access: None,
+            hub: &mut self.hub,
+            keys: &mut (),
+        };
+        let mut has_joined = false;
+        meter.count(&mut || {
+            let receipt = session.receive(&mut cx, &mut bytes[..length], None);
+            has_joined = matches!(receipt.event, Some(Event::Joined));
+        });
+        assert!(has_joined);
+        self.spare = Some(session.into_storage(&mut self.pool));
+    }
+
     fn joins(&mut self, meter: &mut dyn Meter) {
         let identity = self.newcomer();
-        let (from, link) = (address(&identity), self.link);
-        self.hello.identity = identity;
-        let mut admitted = None;
-        meter.count(&mut || admitted = Some(self.node.admit(self.now, link, from, &self.hello)));
-        assert_eq!(admitted, Some(Admission::Accept));
-        self.node.left(self.now, link, CloseReason::Stopped);
+        self.introduce(self.link, identity, meter);
+        self.hub.node.left(self.now, self.link, CloseReason::Stopped);
         self.rest(&mut Outbox(0));
     }
 
@@ -185,7 +257,7 @@ impl Discovery {
         [
             Operation { name: "discovery, a who-has is heard and answered", of, run: Self::who_has },
             Operation { name: "discovery, an announce is heard", of, run: Self::announce },
-            Operation { name: "discovery, a node joins", of, run: Self::joins },
+            Operation { name: "discovery, a node says who it is and joins", of, run: Self::joins },
         ]
     }
 

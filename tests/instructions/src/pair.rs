@@ -1,20 +1,23 @@
 //! A request between two sessions that are joined in memory.
 //!
-//! Each side does what a port does with it, as `docs/notes/driving-the-core.md` says. What is no part of it: sockets,
+//! Each side does what a port does with it, as the front page of `cara_core::services` says. What is no part of it: sockets,
 //! locks, wakers, and the handler, which does nothing. The mailman copies what it is given once, as a socket would.
 
 use core::net::{Ipv4Addr, SocketAddr};
 
 use cara_core::config::{Constraints, LINK_BUFFER_BYTES};
+use cara_core::distribution::connection_handler::{Finding, Known, Node, NodeConfig, NodeStorage, Order, Target};
 use cara_core::distribution::function::{Attributes, Definition};
 use cara_core::distribution::function_list::{Entry, FunctionList};
-use cara_core::distribution::hello::{Hello, Limits};
+use cara_core::distribution::hello::{Hello, Limits, Manager};
 use cara_core::distribution::identity::{Epoch, Fleet, Identity};
 use cara_core::distribution::parameters::{Parameters, ParametersView};
 use cara_core::error::CloseReason;
 use cara_core::host::mailman::{LinkId, Mailman};
 use cara_core::host::secure::Plain;
+use cara_core::services::hub::Hub;
 use cara_core::services::lease::{Lease, Service};
+use cara_core::services::publications::{Publications, PublishedToOne};
 use cara_core::services::requests::{CallId, Pending};
 use cara_core::services::unit::{Call, Event, Publication, RequestOptions, Session, SessionConfig, SessionStorage};
 use cara_core::services::{CallHead, Context, Port};
@@ -27,6 +30,8 @@ const CALLS: usize = 4;
 const FUNCTIONS: usize = 4;
 const SIGNATURES: usize = 512;
 const BUFFERS: usize = 3;
+/// Nodes that an end knows.
+const NODES: usize = 2;
 /// Bytes of parameters beside the text.
 const NAMES: usize = 64;
 
@@ -52,6 +57,12 @@ struct SideMemory<const BUFFER: usize> {
     buffers: [[u8; BUFFER]; BUFFERS],
     pool: [Option<Buffer<Lent>>; BUFFERS],
     pipe: [u8; BUFFER],
+    nodes: [Option<Known>; NODES],
+    order: [Order; NODES],
+    links: [Option<u16>; 1],
+    findings: [Option<Finding>; 1],
+    to_all: [bool; FUNCTIONS],
+    to_one: [Option<PublishedToOne>; 1],
 }
 
 impl<const BUFFER: usize, const ARGUMENTS: usize> PairMemory<BUFFER, ARGUMENTS> {
@@ -88,6 +99,12 @@ impl<const BUFFER: usize> SideMemory<BUFFER> {
             buffers: [[0; BUFFER]; BUFFERS],
             pool: [const { None }; BUFFERS],
             pipe: [0; BUFFER],
+            nodes: [const { None }; NODES],
+            order: [Order::default(); NODES],
+            links: [None; 1],
+            findings: [const { None }; 1],
+            to_all: [false; FUNCTIONS],
+            to_one: [const { None }; 1],
         }
     }
 
@@ -103,6 +120,13 @@ impl<const BUFFER: usize> SideMemory<BUFFER> {
             their_functions: self.their_functions.as_mut_slice(),
             their_signatures: self.their_signatures.as_mut_slice(),
         };
+        let node = NodeStorage {
+            nodes: self.nodes.as_mut_slice(),
+            order: self.order.as_mut_slice(),
+            links: self.links.as_mut_slice(),
+            findings: self.findings.as_mut_slice(),
+        };
+        let publications = Publications::new(self.to_all.as_mut_slice(), self.to_one.as_mut_slice());
         let config = SessionConfig {
             link: LinkId(0),
             dialed: !caller,
@@ -116,12 +140,13 @@ impl<const BUFFER: usize> SideMemory<BUFFER> {
             functions: FunctionList::new(self.functions.as_mut_slice(), self.signatures.as_mut_slice()),
             pool: Pool::new(self.pool.as_mut_slice()),
             pipe: Pipe { bytes: &mut self.pipe, used: 0 },
+            hub: Hub { node: Node::new(Instant::START, node_config(constraints, caller), node), publications },
         }
     }
 }
 
 /// A service that does nothing.
-struct Nothing;
+pub(crate) struct Nothing;
 
 impl Service for Nothing {
     fn lease(&self) -> Option<&Lease> {
@@ -156,7 +181,7 @@ impl Mailman for Pipe {
 }
 
 /// Both sides, as the core's port.
-enum Bench {}
+pub(crate) enum Bench {}
 
 impl Port for Bench {
     type Storage = Lent;
@@ -169,6 +194,7 @@ struct Side {
     functions: FunctionList<Lent, Nothing>,
     pool: Pool<Lent>,
     pipe: Pipe,
+    hub: Hub<Lent>,
 }
 
 macro_rules! context {
@@ -179,6 +205,8 @@ macro_rules! context {
             buffers: &mut $side.pool,
             functions: &$side.functions,
             access: None,
+            hub: &mut $side.hub,
+            keys: &mut (),
         }
     };
 }
@@ -217,7 +245,6 @@ impl Side {
                     block.read_into(parameters).expect("the results fit");
                     done += 1;
                 }
-                Some(Event::Hello) => self.session.accept(context!(self)),
                 _ => {}
             }
             if nothing {
@@ -279,7 +306,10 @@ impl Pair {
         self.settle();
         let slots = ["pos_info", "echo"].map(|name| self.callee.functions.find(name).expect("it is there"));
         let callee = &mut self.callee;
-        callee.session.publish(context!(callee), slots.into_iter());
+        for slot in slots {
+            callee.hub.publications.publish_to_all(slot).expect("room for it");
+        }
+        callee.session.publish(context!(callee));
         self.settle();
         assert_eq!(self.caller.session.their_function_list().len(), 2, "of {characters} characters");
     }
@@ -325,12 +355,32 @@ impl Pair {
     }
 }
 
+fn identity(caller: bool) -> Identity {
+    if caller { Identity::m_unit("depot", 1) } else { Identity::s_unit("agv-17", 17) }.expect("a name")
+}
+
+fn depot() -> Manager {
+    Manager::new("depot", 1).expect("a name")
+}
+
+fn node_config(constraints: Constraints, caller: bool) -> NodeConfig {
+    NodeConfig {
+        identity: identity(caller),
+        fleet: Fleet(1),
+        epoch: Epoch(1),
+        target: if caller { Target::Everybody } else { Target::Manager(depot()) },
+        tcp_port: 0,
+        udp_port: 0,
+        constraints,
+        seed: 1,
+    }
+}
+
 fn hello(constraints: &Constraints, caller: bool) -> Hello {
-    let identity = if caller { Identity::m_unit("depot", 1) } else { Identity::s_unit("agv-17", 17) };
     Hello {
         fleet: Fleet(1),
-        identity: identity.expect("a name"),
-        wanted: None,
+        identity: identity(caller),
+        wanted: (!caller).then(depot),
         epoch: Epoch(1),
         nonce: if caller { 0x1234_5678 } else { 0x8765_4321 },
         term: 0,

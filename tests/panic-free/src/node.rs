@@ -61,16 +61,10 @@ entry!(node_hears, {
     keep(node().take_twin());
 });
 
-entry!(node_admits, {
-    keep(node().admit(*unknown(), *unknown(), *unknown(), unknown()));
-    node().refuse_without_key(*unknown(), *unknown(), identity());
-    keep(node().challenge_answered(*unknown(), *unknown()));
-});
-
 entry!(node_dials, {
     node().dialing(Some(identity()), *unknown());
     node().dial_failed(*unknown(), Some(identity()));
-    keep(node().left(*unknown(), *unknown(), *unknown()));
+    node().left(*unknown(), *unknown(), *unknown());
 });
 
 entry!(node_lists, {

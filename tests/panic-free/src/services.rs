@@ -114,16 +114,13 @@ entry!(session_asked, {
 
 entry!(session_connected, {
     session().connected(context());
-    session().accept(context());
-    session().challenge(context());
+    keep(session().direct(context(), *unknown()));
     keep((session().ping(context()), session().round_trip()));
     session().writable(context());
 });
 
 entry!(session_ended, {
     session().renew_every(*unknown());
-    session().prove(context(), *unknown());
-    session().refuse(context(), *unknown());
     session().close(context(), *unknown());
     session().disconnected(*unknown());
 });
@@ -161,8 +158,12 @@ entry!(session_serves, {
     session().drop_answer(*unknown());
 });
 
+entry!(session_revoked, {
+    session().revoke(context());
+});
+
 entry!(session_publishes, {
-    keep(session().publish(context(), unknown_slice().iter().copied()));
+    keep((session().publish(context()), session().is_behind(context())));
     keep(session().withdraw(context(), *unknown()));
 });
 

@@ -82,6 +82,7 @@
 
 mod event;
 mod faults;
+mod hub;
 mod network;
 mod path;
 mod pipe;
@@ -92,6 +93,7 @@ mod world;
 
 pub use event::{HostId, NetEvent, StreamId};
 pub use faults::{Fault, FaultCounts};
+pub use hub::hub;
 pub use network::{Broken, Direction, Network};
 pub use path::{Chance, Path};
 pub use plan::{Action, Crash, FaultPlan};

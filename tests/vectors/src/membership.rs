@@ -1,18 +1,16 @@
-//! Whether a unit takes a peer, as the core's node decides it.
-
-use core::net::SocketAddr;
+//! What decides whether a unit takes a peer.
 
 use cara_core::config::Constraints;
-use cara_core::distribution::connection_handler::{Admission, Node, NodeConfig, NodeStorage, Order, Target};
+use cara_core::distribution::connection_handler::{Node, NodeConfig, NodeStorage, Order, Target};
 use cara_core::distribution::hello::Hello;
-use cara_core::error::Refusal;
-use cara_core::host::mailman::LinkId;
+use cara_core::services::hub::Hub;
+use cara_core::services::publications::Publications;
 use cara_core::time::Instant;
 
 use crate::stream::Boxed;
 
-/// The node of the unit that `own` introduces, which takes `maximum` peers.
-pub(crate) fn node(own: &Hello, maximum: u16) -> Node<Boxed> {
+/// The hub of the unit that `own` introduces, which takes `maximum` peers.
+pub(crate) fn hub(own: &Hello, maximum: u16) -> Hub<Boxed> {
     let config = NodeConfig {
         identity: own.identity.clone(),
         fleet: own.fleet,
@@ -29,15 +27,6 @@ pub(crate) fn node(own: &Hello, maximum: u16) -> Node<Boxed> {
         links: vec![None; 512].into(),
         findings: vec![None; 4].into(),
     };
-    Node::new(Instant::START, config, storage)
-}
-
-/// What the node says to the first hello of all.
-pub(crate) fn decide(node: &mut Node<Boxed>, link: u16, peer: &Hello) -> Result<(), Refusal> {
-    let from = SocketAddr::from(([192, 0, 2, 1], 50_000));
-    match node.admit(Instant::START, LinkId(link), from, peer) {
-        Admission::Accept => Ok(()),
-        Admission::Refuse(refusal) => Err(refusal),
-        Admission::Challenge { .. } => Err(Refusal::DuplicateIdentity),
-    }
+    let publications = Publications::new(vec![false; 8].into(), vec![None; 1].into());
+    Hub { node: Node::new(Instant::START, config, storage), publications }
 }

@@ -3,7 +3,6 @@
 use core::net::SocketAddr;
 
 use cara_core::config::Constraints;
-use cara_core::distribution::connection_handler::Node;
 use cara_core::distribution::function::Attributes;
 use cara_core::distribution::function_list::{Entry, FunctionList, Slot};
 use cara_core::distribution::hello::Hello;
@@ -11,6 +10,7 @@ use cara_core::distribution::parameters::{Parameters, ParametersView};
 use cara_core::error::{CloseReason, Error};
 use cara_core::host::mailman::{LinkId, Mailman};
 use cara_core::host::secure::Plain;
+use cara_core::services::hub::Hub;
 use cara_core::services::unit::{Call, Delivery, Event, RequestOptions, Session, SessionConfig, SessionStorage};
 use cara_core::services::{Context, Port, Ticket};
 use cara_core::storage::Pool;
@@ -66,7 +66,7 @@ pub(crate) struct Side {
     session: Session<Vectors>,
     pool: Pool<Boxed>,
     functions: FunctionList<Boxed, ()>,
-    node: Node<Boxed>,
+    hub: Hub<Boxed>,
     kept: Kept,
     now: Instant,
     /// Calls that the peer has made and that wait for an answer.
@@ -91,7 +91,7 @@ impl Side {
             minimum_interval: Duration::from_micros(u64::from(hello.limits.minimum_interval)),
             ..Constraints::S_UNIT
         };
-        let node = membership::node(&hello, maximum);
+        let hub = membership::hub(&hello, maximum);
         let config = SessionConfig {
             link: LinkId(hello.link),
             dialed,
@@ -103,7 +103,7 @@ impl Side {
             session: Session::new(now, config, Plain, storage()),
             pool: buffers(8, 40_000),
             functions: FunctionList::new((0..8).map(|_| Entry::empty()).collect(), vec![0; 1024].into()),
-            node,
+            hub,
             kept: Kept::default(),
             now,
             calls: Vec::new(),
@@ -148,24 +148,12 @@ impl Side {
             let (consumed, noted, call) = self.receive(&mut rest);
             self.calls.extend(call);
             rest.drain(..consumed);
-            let hello = noted.as_deref() == Some("Hello");
             self.events.extend(noted.clone());
-            if hello {
-                self.decide();
-            }
             if consumed == 0 && noted.is_none() {
                 break;
             }
         }
         self.take_calls();
-    }
-
-    fn decide(&mut self) {
-        let Some(peer) = self.session.hello().cloned() else { return };
-        match membership::decide(&mut self.node, self.session.link().0, &peer) {
-            Ok(()) => self.with(|session, cx| session.accept(cx)),
-            Err(refusal) => self.with(|session, cx| session.refuse(cx, refusal)),
-        }
     }
 
     fn receive(&mut self, rest: &mut [u8]) -> (usize, Option<String>, Option<Call>) {
@@ -175,6 +163,8 @@ impl Side {
             buffers: &mut self.pool,
             functions: &self.functions,
             access: None,
+            hub: &mut self.hub,
+            keys: &mut (),
         };
         let receipt = self.session.receive(&mut cx, rest, None);
         let call = if let Some(Event::Call(call)) = &receipt.event { Some(*call) } else { None };
@@ -204,7 +194,11 @@ impl Side {
 
     /// Publishes functions of the list.
     pub(crate) fn publish(&mut self, slots: &[u16]) {
-        self.with(|session, cx| session.publish(cx, slots.iter().map(|&slot| Slot(slot))));
+        for &slot in slots {
+            let published = self.hub.publications.publish_to_all(Slot(slot));
+            published.unwrap_or_else(|error| panic!("{slot}: {error}"));
+        }
+        self.with(|session, cx| session.publish(cx));
     }
 
     /// Puts another function in the place of the one of its name.
@@ -242,6 +236,8 @@ impl Side {
             buffers: &mut self.pool,
             functions: &self.functions,
             access: None,
+            hub: &mut self.hub,
+            keys: &mut (),
         };
         act(&mut self.session, &mut cx)
     }

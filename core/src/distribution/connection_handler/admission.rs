@@ -3,9 +3,9 @@
 
 use core::net::SocketAddr;
 
-use super::known::{Newcomer, NodeState};
+use super::known::{Known, Newcomer, NodeState};
 use super::timetable::Task;
-use super::{Action, Node, NodeCounter};
+use super::{Command, Directive, Node, NodeCounter};
 use crate::config::CHALLENGE_TIMEOUT;
 use crate::distribution::hello::Hello;
 use crate::distribution::identity::{Identity, Role};
@@ -16,21 +16,18 @@ use crate::time::Instant;
 
 /// What the node says to a hello.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Admission {
-    /// The port accepts the link.
+pub(crate) enum Admission {
+    /// The link is taken.
     Accept,
-    /// The port refuses the link.
+    /// It is refused.
     Refuse(Refusal),
-    /// The port challenges link `old`; the newcomer waits for an [`Action`].
-    Challenge {
-        /// Has the newcomer's identity.
-        old: LinkId,
-    },
+    /// It waits for a [`Directive`], until it is clear whether another link of its identity is alive.
+    Wait,
 }
 
 impl<S: Storage> Node<S> {
     /// Decides about a link whose hello has come. `from` is the other end of the stream.
-    pub fn admit(&mut self, now: Instant, link: LinkId, from: SocketAddr, hello: &Hello) -> Admission {
+    pub(crate) fn admit(&mut self, now: Instant, link: LinkId, from: SocketAddr, hello: &Hello) -> Admission {
         if let Err(refusal) = self.check(hello) {
             return self.refuse(now, from, &hello.identity, refusal);
         }
@@ -38,14 +35,14 @@ impl<S: Storage> Node<S> {
         let old = self.table.find(&hello.identity).and_then(|place| Some((place, self.table.node(place)?.link()?)));
         match old {
             Some((_, old)) if old == link => Admission::Accept,
-            Some((place, old)) => self.meet(now, place, old, &hello.identity, newcomer),
+            Some((place, _)) => self.meet(now, place, &hello.identity, newcomer),
             None if self.is_full() => self.refuse(now, from, &hello.identity, Refusal::Full),
             None => self.join(now, &hello.identity, newcomer),
         }
     }
 
-    /// There is no key for this unit and the peer of a link, which the port refuses. The identity may be anybody's.
-    pub fn refuse_without_key(&mut self, now: Instant, from: SocketAddr, identity: &Identity) {
+    /// There is no key for this unit and the peer of a link, which is refused. The identity may be anybody's.
+    pub(crate) fn refuse_without_key(&mut self, now: Instant, from: SocketAddr, identity: &Identity) {
         self.refuse(now, from, identity, Refusal::NoKey);
     }
 
@@ -102,20 +99,13 @@ impl<S: Storage> Node<S> {
     }
 
     /// Another link has the identity of a node that is connected.
-    fn meet(
-        &mut self,
-        now: Instant,
-        place: usize,
-        old: LinkId,
-        identity: &Identity,
-        mut newcomer: Newcomer,
-    ) -> Admission {
+    fn meet(&mut self, now: Instant, place: usize, identity: &Identity, mut newcomer: Newcomer) -> Admission {
         let smaller = self.config.identity < *identity;
         let Some(known) = self.table.node_mut(place) else { return Admission::Refuse(Refusal::Full) };
         let same_life = known.epoch == newcomer.epoch;
         let dialed = known.dialing == Some(newcomer.link);
-        if known.newcomer.is_some() {
-            // One waits already: a second one is one too many, whoever it is.
+        if known.newcomer.is_some() || known.task == Some(Task::Admit) {
+            // One waits already: a second one is one too many.
             return self.refuse(now, newcomer.address, identity, Refusal::DuplicateIdentity);
         }
         // Both ends have dialled each other at once: both keep the link that the smaller one opened.
@@ -125,46 +115,62 @@ impl<S: Storage> Node<S> {
         }
         newcomer.decided = crossing;
         known.newcomer = Some(newcomer);
-        let at = if crossing { now } else { now + CHALLENGE_TIMEOUT };
-        self.table.schedule(place, at, Task::Supersede);
+        self.table.schedule(place, now, Task::Challenge);
         self.table.set_link(newcomer.link, Some(place));
         self.counters.add(NodeCounter::Challenged, 1);
-        Admission::Challenge { old }
+        Admission::Wait
+    }
+
+    /// The link that a newcomer would replace is to show whether it is alive.
+    pub(super) fn challenge(&mut self, now: Instant, place: usize) -> Option<Command> {
+        let known = self.table.node(place)?;
+        let (old, decided) = (known.link()?, known.newcomer.as_ref()?.decided);
+        let until = if decided { now } else { now + CHALLENGE_TIMEOUT };
+        self.table.schedule(place, until, Task::Supersede);
+        Some(Command::Tell(old, Directive::Challenge))
     }
 
     /// The challenged link has answered: the newcomer is not taken.
-    pub fn challenge_answered(&mut self, now: Instant, old: LinkId) -> Option<Action> {
-        let place = self.table.of_link(old)?;
-        let known = self.table.node_mut(place).filter(|known| known.link() == Some(old))?;
-        let newcomer = known.newcomer.take_if(|newcomer| !newcomer.decided)?;
+    pub(crate) fn challenge_answered(&mut self, now: Instant, old: LinkId) {
+        let Some(place) = self.table.of_link(old) else { return };
+        let waits = |known: &Known| known.newcomer.as_ref().is_some_and(|newcomer| !newcomer.decided);
+        if self.table.node(place).is_some_and(|known| known.link() == Some(old) && waits(known)) {
+            self.table.schedule(place, now, Task::Refuse);
+        }
+    }
+
+    pub(super) fn refuse_newcomer(&mut self, now: Instant, place: usize) -> Option<Command> {
+        let known = self.table.node_mut(place)?;
+        let newcomer = known.newcomer.take()?;
         known.dialing.take_if(|dialing| *dialing == newcomer.link);
         let (same_life, identity) = (known.epoch == newcomer.epoch, known.identity.clone());
         let refusal = if same_life { Refusal::AlreadyConnected } else { Refusal::DuplicateIdentity };
-        self.table.cancel(place);
         self.table.set_link(newcomer.link, None);
         self.refuse(now, newcomer.address, &identity, refusal);
-        Some(Action::Refuse { new: newcomer.link, refusal })
+        Some(Command::Tell(newcomer.link, Directive::Refuse(refusal)))
     }
 
-    /// The challenge has not been answered in time: the newcomer takes the place.
-    pub(super) fn supersede(&mut self, now: Instant, place: usize) -> Option<Action> {
+    /// The challenge has not been answered in time: the link makes room. The newcomer takes the place when it has
+    /// [left](Node::left).
+    pub(super) fn supersede(&mut self, place: usize) -> Option<Command> {
         let known = self.table.node_mut(place)?;
-        let old = known.link()?;
-        let newcomer = known.newcomer.take()?;
-        let reason = match (known.epoch == newcomer.epoch, newcomer.decided) {
+        let (old, epoch) = (known.link()?, known.epoch);
+        let newcomer = known.newcomer.as_mut()?;
+        let reason = match (epoch == newcomer.epoch, newcomer.decided) {
             (true, true) => CloseReason::Refused(Refusal::AlreadyConnected),
             (true, false) => CloseReason::Reset,
             (false, _) => CloseReason::PeerRestarted,
         };
-        self.table.set_link(old, None);
-        self.take_place(now, place, newcomer);
-        Some(Action::Supersede { old, new: newcomer.link, reason })
+        newcomer.decided = true;
+        Some(Command::Tell(old, Directive::Close(reason)))
     }
 
     /// A newcomer joins in the place of a link that is gone.
     pub(super) fn take_place(&mut self, now: Instant, place: usize, newcomer: Newcomer) {
-        if let Some(identity) = self.table.node(place).map(|known| known.identity.clone()) {
-            self.join(now, &identity, newcomer);
+        if let Some(identity) = self.table.node(place).map(|known| known.identity.clone())
+            && self.join(now, &identity, newcomer) == Admission::Accept
+        {
+            self.table.schedule(place, now, Task::Admit);
         }
     }
 

@@ -5,7 +5,7 @@ use core::net::SocketAddr;
 use super::known::NodeState;
 use super::search::pause;
 use super::timetable::Task;
-use super::{Action, Node, NodeCounter, Target};
+use super::{Command, Node, NodeCounter, Target};
 use crate::config::{ANSWER_SPREAD, FIRST_SEARCH, LONGEST_SEARCH, Mode};
 use crate::distribution::authenticator::Authenticator;
 use crate::distribution::datagram::{Announce, SEARCH_BYTES, WhoHas, short_hash};
@@ -231,7 +231,7 @@ impl<S: Storage> Node<S> {
     }
 
     /// The time to dial a node has come.
-    pub(super) fn dial(&mut self, now: Instant, place: usize) -> Option<Action> {
+    pub(super) fn dial(&mut self, now: Instant, place: usize) -> Option<Command> {
         if self.is_full() {
             self.retry(now, place);
             return None;
@@ -243,7 +243,7 @@ impl<S: Storage> Node<S> {
         self.table.set_state(place, NodeState::Dialing);
         self.table.schedule(place, now + DIAL_TIMEOUT, Task::GiveUp);
         self.counters.add(NodeCounter::Dialled, 1);
-        Some(Action::Dial { to, identity })
+        Some(Command::Dial { to, identity })
     }
 
     /// A node that was being dialled has not joined.

@@ -2,7 +2,7 @@
 
 use super::known::NodeState;
 use super::search::{LOST_LISTENING, pause};
-use super::{Action, Node, Target};
+use super::{Node, Target};
 use crate::distribution::identity::Identity;
 use crate::error::{CloseReason, Refusal};
 use crate::host::mailman::LinkId;
@@ -15,7 +15,7 @@ const SETTLED: Duration = Duration::from_secs(1);
 const HOPELESS: u8 = 5;
 
 impl<S: Storage> Node<S> {
-    /// The port is opening the link that [`Action::Dial`] asked for.
+    /// The port is opening the link that [`Command::Dial`] asked for.
     pub fn dialing(&mut self, identity: Option<&Identity>, link: LinkId) {
         let Some(place) = identity.and_then(|identity| self.table.find(identity)) else { return };
         let Some(known) = self.table.node_mut(place) else { return };
@@ -30,7 +30,7 @@ impl<S: Storage> Node<S> {
         }
     }
 
-    /// The link that [`Action::Dial`] asked for could not be opened at all.
+    /// The link that [`Command::Dial`] asked for could not be opened at all.
     pub fn dial_failed(&mut self, now: Instant, identity: Option<&Identity>) {
         let place = identity.and_then(|identity| self.table.find(identity));
         // An earlier dial to another address of it may still come through.
@@ -43,39 +43,38 @@ impl<S: Storage> Node<S> {
     }
 
     /// A link has ended, whatever it was. May free a newcomer that waited for that.
-    pub fn left(&mut self, now: Instant, link: LinkId, reason: CloseReason) -> Option<Action> {
-        let place = self.table.of_link(link)?;
+    pub fn left(&mut self, now: Instant, link: LinkId, reason: CloseReason) {
+        let Some(place) = self.table.of_link(link) else { return };
         self.table.set_link(link, None);
-        let known = self.table.node_mut(place)?;
+        let Some(known) = self.table.node_mut(place) else { return };
         let (address, identity) = (known.address, known.identity.clone());
         if known.newcomer.take_if(|newcomer| newcomer.link == link).is_some() {
             known.dialing.take_if(|dialing| *dialing == link);
             self.table.cancel(place);
-            return None;
+            return;
         }
-        if let CloseReason::Refused(refusal) = reason {
+        if let CloseReason::Refused(refusal) = reason
+            && known.newcomer.is_none()
+        {
             self.note_of(now, address, &identity, refusal);
         }
-        let known = self.table.node_mut(place)?;
+        let Some(known) = self.table.node_mut(place) else { return };
         if known.dialing.take_if(|dialing| *dialing == link).is_some() {
             if known.state == NodeState::Dialing {
                 self.lose_hope(now, place, reason);
                 self.dial_ended(now, place);
             }
-            return None;
+        } else if known.link() == Some(link) {
+            debug!("link {} left: {}", link.0, reason);
+            self.part(now, place, reason);
         }
-        if known.link() != Some(link) {
-            return None;
-        }
-        debug!("link {} left: {}", link.0, reason);
-        self.part(now, place, reason)
     }
 
     /// The link of a node that was connected has ended.
-    fn part(&mut self, now: Instant, place: usize, reason: CloseReason) -> Option<Action> {
+    fn part(&mut self, now: Instant, place: usize, reason: CloseReason) {
         self.table.set_state(place, NodeState::Away);
         self.table.cancel(place);
-        let known = self.table.node_mut(place)?;
+        let Some(known) = self.table.node_mut(place) else { return };
         let settled = now.since(known.since) >= SETTLED;
         if settled {
             known.attempts = 0;
@@ -83,10 +82,8 @@ impl<S: Storage> Node<S> {
             // A peer's hello comes before its refusal.
             self.lose_hope(now, place, reason);
         }
-        let known = self.table.node_mut(place)?;
-        if let Some(newcomer) = known.newcomer.take() {
-            self.take_place(now, place, newcomer);
-            return Some(Action::Admit { new: newcomer.link });
+        if let Some(newcomer) = self.table.node_mut(place).and_then(|known| known.newcomer.take()) {
+            return self.take_place(now, place, newcomer);
         }
         match self.config.target {
             // One that was stopped in an orderly way says so itself when it is back.
@@ -95,7 +92,6 @@ impl<S: Storage> Node<S> {
             Target::Manager(_) => {}
         }
         self.search_again(now, settled.then_some(LOST_LISTENING));
-        None
     }
 
     /// Who was dialled has refused for a reason that does not pass by itself.

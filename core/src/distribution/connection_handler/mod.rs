@@ -25,7 +25,7 @@ mod timetable;
 mod twins;
 mod views;
 
-pub use admission::Admission;
+pub(crate) use admission::Admission;
 pub use counter::NodeCounter;
 pub use known::{Known, NodeState};
 pub use table::Order;
@@ -100,9 +100,9 @@ pub struct NodeConfig {
     pub seed: u64,
 }
 
-/// What the port has to do.
+/// What is to be done, to one link at a time.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Action {
+pub enum Command {
     /// Open a link and report it with [`Node::dialing`], or [`Node::dial_failed`].
     Dial {
         /// Where.
@@ -110,27 +110,25 @@ pub enum Action {
         /// Whom; unknown for a fixed address.
         identity: Option<Identity>,
     },
-    /// Close link `old` with `reason` and accept `new`, which takes its place. The port reports `old` as left as usual.
-    Supersede {
-        /// Has not answered the challenge.
-        old: LinkId,
-        /// Has waited for that.
-        new: LinkId,
-        /// Why the old one ends.
-        reason: CloseReason,
-    },
-    /// Accept link `new`: the one in its way has ended.
-    Admit {
-        /// Has waited.
-        new: LinkId,
-    },
-    /// Refuse link `new`: the one in its way is alive.
-    Refuse {
-        /// Has waited.
-        new: LinkId,
-        /// Why.
-        refusal: Refusal,
-    },
+    /// Pass this on to a link.
+    Tell(LinkId, Directive),
+}
+
+/// What a link is told because of another one. Only the node makes one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Directive {
+    /// The peer shows whether it is alive: another link has its identity.
+    #[non_exhaustive]
+    Challenge,
+    /// It has waited, and is taken.
+    #[non_exhaustive]
+    Admit,
+    /// It has waited, and the link in its way is alive.
+    #[non_exhaustive]
+    Refuse(Refusal),
+    /// Another link takes its place.
+    #[non_exhaustive]
+    Close(CloseReason),
 }
 
 /// Whose a datagram is.
@@ -326,24 +324,29 @@ impl<S: Storage> Node<S> {
         self.search.next().min(self.answers.next()).min(self.hints.next()).min(self.table.next_due())
     }
 
-    /// Does what is due. Returns one action at a time; call it until it returns `None`.
+    /// Does what is due. Returns one command at a time; call it until it returns `None`.
     pub fn poll(
         &mut self,
         now: Instant,
         mailman: &mut dyn Mailman,
         authenticator: &dyn Authenticator,
-    ) -> Option<Action> {
+    ) -> Option<Command> {
         while let Some((place, task)) = self.table.pop_due(now) {
-            let action = match task {
-                Task::Supersede => self.supersede(now, place),
+            let command = match task {
                 Task::Dial => self.dial(now, place),
                 Task::GiveUp => {
                     self.dial_ended(now, place);
                     None
                 }
+                Task::Challenge => self.challenge(now, place),
+                Task::Supersede => self.supersede(place),
+                Task::Admit => {
+                    self.table.node(place).and_then(Known::link).map(|new| Command::Tell(new, Directive::Admit))
+                }
+                Task::Refuse => self.refuse_newcomer(now, place),
             };
-            if action.is_some() {
-                return action;
+            if command.is_some() {
+                return command;
             }
         }
         self.poll_answers(now, mailman, authenticator);

@@ -12,8 +12,14 @@ pub(super) enum Task {
     Dial,
     /// Stop waiting for the link that is being opened.
     GiveUp,
-    /// The newcomer with its identity takes the place of the link that has not answered.
+    /// Ask its link for a sign of life: a newcomer has its identity.
+    Challenge,
+    /// End the link that has not answered: the newcomer takes its place.
     Supersede,
+    /// Tell the newcomer that it has taken the place.
+    Admit,
+    /// Tell the newcomer that the link in its way is alive.
+    Refuse,
 }
 
 impl<S: Storage> Table<S> {

@@ -30,7 +30,7 @@ pub struct Receipt<'b> {
     pub consumed: usize,
     /// What they led to.
     pub event: Option<Event<'b>>,
-    /// The rest is to be offered again later: no message buffer is free, or the node has not decided yet.
+    /// The rest is to be offered again later: no message buffer is free, or the hub has not decided yet.
     pub paused: bool,
 }
 
@@ -91,7 +91,7 @@ impl<P: Port> Session<P> {
     ) -> Receipt<'b> {
         match self.phase {
             Phase::Ending(_) | Phase::Ended => return Receipt { consumed: lent.len(), event: None, paused: false },
-            Phase::Introduced { .. } | Phase::Deciding => {
+            Phase::Deciding => {
                 return Receipt { consumed: 0, event: None, paused: true };
             }
             Phase::AwaitingHello { .. } | Phase::Proving { .. } | Phase::Live => {}
@@ -190,7 +190,7 @@ impl<P: Port> Session<P> {
                 self.flush(cx);
                 Outcome::Nothing
             }
-            (Incoming::Pong, Phase::Live) => self.pong_arrived(cx.now),
+            (Incoming::Pong, Phase::Live) => self.pong_arrived(cx),
             (Incoming::Session(place), Phase::Live) => self.session_body(cx, place, lent),
             (Incoming::Message(priority, place), Phase::Live) => {
                 self.message_arrived(cx, priority, place, lent, arguments)
@@ -228,14 +228,12 @@ impl<P: Port> Session<P> {
                 self.send_datagram(cx, &SessionBody::PONG, &[]);
                 Outcome::Nothing
             }
-            Some(SessionBody::Pong) => self.answered(),
+            Some(SessionBody::Pong) => {
+                self.show_life(cx);
+                Outcome::Nothing
+            }
             None => self.unreadable_datagram(),
         }
-    }
-
-    /// The first answer to a challenge is news; more of them are not.
-    fn answered(&mut self) -> Outcome {
-        if core::mem::take(&mut self.challenged) { Event::Answered.into() } else { Outcome::Nothing }
     }
 
     fn unreadable_datagram(&mut self) -> Outcome {

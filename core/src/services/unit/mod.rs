@@ -1,23 +1,22 @@
 //! One link to one peer: the s_unit's session with its manager, and each peer of an m_unit.
 //!
-//! A [`Session`] turns bytes into [`Event`]s and requests into bytes. It never waits and never calls back: the port
-//! lends it a [`Context`], runs the handler of an [`Event::Call`] outside of any lock, and brings the answer with
-//! [`Session::answer`]. It reaches the unit's [`Node`](crate::distribution::connection_handler::Node) only through
-//! returned events: after [`Event::Hello`] the port asks the node and calls [`Session::accept`] or [`Session::refuse`].
+//! A [`Session`] turns bytes into [`Event`]s and requests into bytes. It never waits: the port lends it a [`Context`],
+//! runs the handler of an [`Event::Call`] outside of any lock, and brings the answer with [`Session::answer`]. It asks the
+//! unit's [`Hub`](super::hub::Hub) by itself, through the [`Door`](super::hub::Door) in its context.
 //!
 //! # What a port does
-//! - [`Event::Introduced`], which only secured links have, at their beginning and whenever their keys are made anew: look
-//!   the key of the pair up, then [`Session::prove`] with bytes that are freshly drawn, or [`Session::refuse`] with
-//!   [`Refusal::NoKey`]. On a live link it comes from [`Session::poll`] or [`Session::receive`], and nothing else changes;
 //! - bytes arrive: [`Session::receive`] until they are consumed and nothing more comes out, then [`Session::next_call`]
 //!   until it returns `None`, running what it returns;
 //! - the stream is writable: [`Session::writable`];
 //! - a session datagram arrives: [`Session::datagram`];
 //! - [`Session::deadline`] has come, and after every other call that may have ended the link: [`Session::poll`] until
 //!   it returns `None`;
-//! - [`Event::Closed`] is the last event: the port forgets the link and tells the node that it left.
+//! - the hub has a [`Command`](crate::distribution::connection_handler::Command) for a link: [`Session::direct`];
+//! - [`Event::Closed`] is the last event: the port forgets the link and tells the hub's node that it
+//!   [left](crate::distribution::connection_handler::Node::left).
 
 mod answering;
+mod consulting;
 mod granting;
 mod holding;
 mod inbound;
@@ -105,13 +104,8 @@ pub struct SessionStorage<S: Storage> {
 // A wide tag: the rest is then moved in words, and not byte by byte.
 #[repr(u32)]
 pub enum Event<'b> {
-    /// The peer says who it is ([`Session::identity`]) and is to prove it: [`Session::prove`] with the key of the pair, or
-    /// [`Session::refuse`] with [`Refusal::NoKey`]. On a link that is not live nothing else that it says counts yet. Never
-    /// in plain mode.
-    Introduced,
-    /// The peer introduced itself, and has proven who it is where links are secured: ask the node, then
-    /// [`Session::accept`] or [`Session::refuse`].
-    Hello,
+    /// Both ends have accepted each other: the link is live, and has told the peer what is published to it.
+    Joined,
     /// A call whose arguments are in the lent parameters: run its handler, then [`Session::answer`].
     Call(Call),
     /// The end of a call of this unit.
@@ -138,7 +132,7 @@ pub enum Event<'b> {
         /// Why.
         why: LeaseEnd,
     },
-    /// The peer answered a [`Session::challenge`] or a [`Session::ping`].
+    /// The peer answered a [`Session::ping`].
     Answered,
     /// The link has ended; every call in flight and every lease has been reported before.
     Closed(CloseReason),
@@ -166,11 +160,9 @@ pub struct Call {
 enum Phase {
     /// The port is opening the connection, or waits for the peer's hello.
     AwaitingHello { until: Instant },
-    /// The port looks for the key of the pair.
-    Introduced { until: Instant },
     /// The peer is to prove that it has the key: with a message, then with a sealed frame.
     Proving { until: Instant },
-    /// The node decides about the peer.
+    /// The hub decides about the peer.
     Deciding,
     /// Both have accepted.
     Live,
@@ -199,7 +191,7 @@ pub struct Session<P: Port> {
     remote: Option<Remote>,
     peer_address: SocketAddr,
     liveness: Liveness,
-    /// The node waits for a sign of life.
+    /// The hub waits for a sign of life.
     challenged: bool,
     pings: pinging::Pings,
     clock: PeerClock,
@@ -291,15 +283,15 @@ impl<P: Port> Session<P> {
     /// The peer has proven who it is, or has said it where nobody has to prove it. Of links that have not come so far, the
     /// oldest gives way to a new one.
     pub const fn is_proven(&self) -> bool {
-        self.remote.is_some() && !matches!(self.phase, Phase::Introduced { .. } | Phase::Proving { .. })
+        self.remote.is_some() && !matches!(self.phase, Phase::Proving { .. })
     }
 
-    /// The peer's hello, once it has come. It may be anybody's before [`Event::Hello`].
+    /// The peer's hello, once it has come. It may be anybody's as long as the peer [is not proven](Self::is_proven).
     pub fn hello(&self) -> Option<&Hello> {
         self.remote.as_ref().map(|remote| &remote.hello)
     }
 
-    /// The peer's identity, once it has told it. It may be anybody's before [`Event::Hello`].
+    /// The peer's identity, once it has told it. It may be anybody's as long as the peer [is not proven](Self::is_proven).
     pub fn identity(&self) -> Option<&Identity> {
         self.hello().map(|hello| &hello.identity)
     }
@@ -363,11 +355,8 @@ impl<P: Port> Session<P> {
         }
     }
 
-    /// The node takes the peer. The link is live from here on.
-    pub fn accept(&mut self, cx: &mut Context<'_, P>) {
-        if self.phase != Phase::Deciding {
-            return;
-        }
+    /// The hub takes the peer. The link is live from here on, unless it ends here.
+    fn accept(&mut self, cx: &mut Context<'_, P>) {
         if !self.dialed {
             self.reply_to_hello(cx);
         }
@@ -380,8 +369,8 @@ impl<P: Port> Session<P> {
         debug!("link {} is live", self.link.id().0);
     }
 
-    /// The node does not take the peer, which is told why.
-    pub fn refuse(&mut self, cx: &mut Context<'_, P>, refusal: Refusal) {
+    /// The peer is not taken, and told why.
+    fn refuse(&mut self, cx: &mut Context<'_, P>, refusal: Refusal) {
         match refusal {
             Refusal::NoKey => {
                 // Whoever tries identities does not learn for which of them there are keys.
@@ -391,6 +380,11 @@ impl<P: Port> Session<P> {
             _ => self.farewell(cx, &Frame::Refuse(refusal as u8)),
         }
         self.end(CloseReason::Refused(refusal));
+    }
+
+    /// Ends the link because the key of its pair is no longer valid.
+    pub fn revoke(&mut self, cx: &mut Context<'_, P>) {
+        self.refuse(cx, Refusal::NoKey);
     }
 
     /// Ends the link in an orderly way; [`poll`](Self::poll) reports what was in flight.
@@ -407,8 +401,8 @@ impl<P: Port> Session<P> {
         self.end(reason);
     }
 
-    /// Asks the peer of a live link for a sign of life; it comes as [`Event::Answered`].
-    pub fn challenge(&mut self, cx: &mut Context<'_, P>) {
+    /// Asks the peer of a live link for a sign of life.
+    fn challenge(&mut self, cx: &mut Context<'_, P>) {
         if self.phase == Phase::Live {
             self.challenged = true;
             self.send_ping(cx.now);

@@ -85,10 +85,9 @@ impl<P: Port> Session<P> {
         accepted
     }
 
-    pub(super) fn pong_arrived(&mut self, now: Instant) -> Outcome {
-        let own = self.pings.answered(now);
-        let challenge = core::mem::take(&mut self.challenged);
-        if own || challenge { Event::Answered.into() } else { Outcome::Nothing }
+    pub(super) fn pong_arrived(&mut self, cx: &mut Context<'_, P>) -> Outcome {
+        self.show_life(cx);
+        if self.pings.answered(cx.now) { Event::Answered.into() } else { Outcome::Nothing }
     }
 }
 

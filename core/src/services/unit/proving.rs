@@ -6,7 +6,7 @@
 use core::net::SocketAddr;
 
 use super::inbound::Outcome;
-use super::{Event, Phase, Remote, Session};
+use super::{Phase, Remote, Session};
 use crate::config::{MINIMUM_CHUNK_BYTES, Mode};
 use crate::distribution::hello::{Hello, HelloError};
 use crate::error::{CloseReason, Refusal};
@@ -17,16 +17,10 @@ use crate::services::{Context, Port};
 use crate::time::{Duration, Instant};
 
 impl<P: Port> Session<P> {
-    /// Proves to the peer of [`Event::Introduced`] that this unit has the pair's key, and waits for the same from it. It
-    /// comes as [`Event::Hello`]; if it does not, the link ends with [`CloseReason::BadProof`],
-    /// [`CloseReason::Unproven`] or [`CloseReason::HelloTimeout`]. On a live link the keys are made anew, and no event tells
-    /// that they are; failing that, the link ends with one of those reasons.
-    pub fn prove(&mut self, cx: &mut Context<'_, P>, credentials: <P::Cipher as Secure>::Credentials) {
-        let until = match self.phase {
-            Phase::Introduced { until } => until,
-            Phase::Live => return self.prove_anew(cx, credentials),
-            _ => return,
-        };
+    /// Proves to the peer that this unit has the pair's key, and waits for the same from it. If it does not come, the link
+    /// ends with [`CloseReason::BadProof`], [`CloseReason::Unproven`] or [`CloseReason::HelloTimeout`].
+    fn prove(&mut self, cx: &mut Context<'_, P>, until: Instant) {
+        let Some(credentials) = self.credentials(cx) else { return };
         match self.link.cipher().prove(self.dialed, credentials) {
             Ok(message) => {
                 self.phase = Phase::Proving { until };
@@ -56,7 +50,7 @@ impl<P: Port> Session<P> {
         let datagrams = SocketAddr::new(self.peer_address.ip(), hello.udp_port);
         self.remote = Some(Remote { hello, heard: cx.now, datagrams });
         if mode == Mode::Plain {
-            return self.peer_known(cx.now);
+            return self.peer_known(cx);
         }
         if !self.dialed {
             self.send_hello(cx);
@@ -64,8 +58,8 @@ impl<P: Port> Session<P> {
         if !matches!(self.phase, Phase::AwaitingHello { .. }) {
             return Outcome::Nothing;
         }
-        self.phase = Phase::Introduced { until };
-        Event::Introduced.into()
+        self.prove(cx, until);
+        Outcome::Nothing
     }
 
     /// The peer's message of the proof. The end that dialled confirms at once that it has the keys.
@@ -87,10 +81,10 @@ impl<P: Port> Session<P> {
             return Outcome::Nothing;
         }
         self.link.set_chunk_limit(usize::from(self.constraints.chunk_size).max(MINIMUM_CHUNK_BYTES));
-        self.peer_known(cx.now)
+        self.peer_known(cx)
     }
 
-    /// The node has taken the peer: it is told so with this end's hello, or on a secured link with its confirmation.
+    /// The hub has taken the peer: it is told so with this end's hello, or on a secured link with its confirmation.
     pub(super) fn reply_to_hello(&mut self, cx: &mut Context<'_, P>) {
         match self.mode() {
             Mode::Plain => self.send_hello(cx),
@@ -111,13 +105,13 @@ impl<P: Port> Session<P> {
     }
 
     /// What the hello told counts from here on.
-    fn peer_known(&mut self, now: Instant) -> Outcome {
+    fn peer_known(&mut self, cx: &mut Context<'_, P>) -> Outcome {
         let Some(Remote { hello, heard, .. }) = &self.remote else { return Outcome::Nothing };
         self.link.set_peer_limits(usize::from(hello.limits.chunk_size));
-        self.liveness = Liveness::new(now, Duration::from_millis(u64::from(hello.keep_alive)));
+        self.liveness = Liveness::new(cx.now, Duration::from_millis(u64::from(hello.keep_alive)));
         self.clock.hear(*heard, hello.stamp);
         self.phase = Phase::Deciding;
-        Event::Hello.into()
+        self.consult(cx)
     }
 
     fn send_proof(&mut self, cx: &mut Context<'_, P>, message: Option<&[u8]>) {

@@ -33,6 +33,8 @@ pub(super) enum Told {
 /// What one peer is to be told.
 pub(super) struct Publishing<S: Storage> {
     table: S::Slice<Publication>,
+    /// Of the unit's publications, when they were looked at last.
+    pub(super) version: u32,
     dirty: bool,
     serial: u32,
     end_due: bool,
@@ -67,6 +69,7 @@ impl<S: Storage> Publishing<S> {
     pub(super) fn new(table: S::Slice<Publication>) -> Self {
         Self {
             table,
+            version: 0,
             dirty: false,
             serial: 0,
             end_due: false,
@@ -128,6 +131,14 @@ impl<S: Storage> Publishing<S> {
         self.table.iter_mut().for_each(|publication| publication.bucket = Bucket::default());
     }
 
+    /// The peer is to see a function of this generation.
+    pub(super) fn want(&mut self, slot: Slot, generation: Option<Generation>) {
+        if let Some(publication) = self.table.get_mut(usize::from(slot.0)) {
+            publication.wanted = generation;
+            publication.ever |= generation.is_some();
+        }
+    }
+
     pub(super) fn acknowledge(&mut self, serial: u32) {
         self.acknowledgement_due = Some(serial);
     }
@@ -151,20 +162,6 @@ impl<S: Storage> Publishing<S> {
 }
 
 impl<P: Port> Session<P> {
-    /// Makes functions of this unit visible to the peer, as they are now and as far as the access table lets it see them.
-    /// Returns the serial that comes back with
-    /// [`Event::Acknowledged`](super::Event::Acknowledged).
-    pub fn publish(&mut self, cx: &mut Context<'_, P>, slots: impl Iterator<Item = Slot>) -> u32 {
-        for slot in slots {
-            let generation = cx.functions.generation(slot);
-            if let Some(publication) = self.publishing.table.get_mut(usize::from(slot.0)) {
-                publication.wanted = generation;
-                publication.ever |= generation.is_some();
-            }
-        }
-        self.end_of_changes(cx)
-    }
-
     /// Whether the peer has read this unit's list up to `serial`.
     pub fn is_acknowledged(&self, serial: u32) -> bool {
         self.publishing.acknowledged >= serial

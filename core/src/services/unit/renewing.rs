@@ -3,8 +3,7 @@
 //!
 //! ```text
 //! dialler                                        the other one
-//!   Introduced: the port brings the key
-//!   proof 1  ------------------------------------>  Introduced: the port brings the key
+//!   proof 1  ------------------------------------>
 //!            <------------------------------------  proof 2, turn | confirm
 //!   turn | confirm  ----------------------------->  its datagrams go under the new key
 //!            <------------------------------------  acknowledgement
@@ -14,8 +13,8 @@
 //! A turn is the last frame of its direction under the old keys, so each frame is opened with the keys that it was sealed
 //! with, however many are on their way. Only the end that dialled begins, so two renewals never meet.
 
+use super::Session;
 use super::inbound::Outcome;
-use super::{Event, Session};
 use crate::config::{HANDSHAKE_LIFE, Mode, PREVIOUS_KEY_LIFE, RENEWAL_TIMEOUT, SHORTEST_HANDSHAKE_LIFE};
 use crate::error::CloseReason;
 use crate::host::connections::{LinkCounter, Place};
@@ -38,8 +37,6 @@ pub(super) struct Renewal {
 enum Step {
     /// Nothing goes on. The end that dialled begins at this time; the other one lets it begin from then on.
     Resting { due: Instant },
-    /// The port looks for the key of the pair; the end that was dialled keeps the message that is to be answered.
-    Asked { until: Instant, message: [u8; PROOF_BYTES] },
     /// This end's message waits for room in the stream.
     Telling { until: Instant, message: [u8; PROOF_BYTES] },
     /// The peer is to go on.
@@ -59,10 +56,7 @@ impl Renewal {
         let step = match self.step {
             Step::Resting { due } if dialed => due,
             Step::Resting { .. } | Step::Acknowledging => Instant::FAR_FUTURE,
-            Step::Asked { until, .. }
-            | Step::Telling { until, .. }
-            | Step::Awaiting { until }
-            | Step::Confirming { until } => until,
+            Step::Telling { until, .. } | Step::Awaiting { until } | Step::Confirming { until } => until,
         };
         step.min(self.forget)
     }
@@ -92,38 +86,34 @@ impl<P: Port> Session<P> {
         Duration::from_micros(self.renewal.every.as_micros().saturating_sub(less))
     }
 
-    /// Does what is due of the renewal; tells whether the port is to bring the key of the pair.
-    pub(super) fn poll_renewal(&mut self, cx: &mut Context<'_, P>) -> Option<Event<'static>> {
+    /// Does what is due of the renewal.
+    pub(super) fn poll_renewal(&mut self, cx: &mut Context<'_, P>) {
         if cx.now >= self.renewal.forget {
             self.link.cipher().forget_previous();
             self.renewal.forget = Instant::FAR_FUTURE;
         }
         if let Step::Resting { due } = self.renewal.step {
-            let begins = self.dialed && (cx.now >= due || self.link.cipher().is_worn());
-            return begins.then(|| self.ask_for_key(cx.now, [0; PROOF_BYTES]));
+            if self.dialed && (cx.now >= due || self.link.cipher().is_worn()) {
+                self.begin_renewal(cx, &[0; PROOF_BYTES]);
+            }
+            return;
         }
         match cx.now >= self.renewal.deadline(self.dialed) {
             true => self.close(cx, CloseReason::HelloTimeout),
             false => self.pump_renewal(cx),
         }
-        None
     }
 
-    fn ask_for_key(&mut self, now: Instant, message: [u8; PROOF_BYTES]) -> Event<'static> {
-        self.renewal.step = Step::Asked { until: now + RENEWAL_TIMEOUT, message };
-        Event::Introduced
-    }
-
-    /// The port has brought the key of the pair of a live link.
-    pub(super) fn prove_anew(&mut self, cx: &mut Context<'_, P>, credentials: <P::Cipher as Secure>::Credentials) {
-        let Step::Asked { until, message } = self.renewal.step else { return };
+    /// Proves once more that this unit has the key of the pair; the end that was dialled answers the peer's `message`.
+    fn begin_renewal(&mut self, cx: &mut Context<'_, P>, message: &[u8; PROOF_BYTES]) {
+        let Some(credentials) = self.credentials(cx) else { return };
         let told = match self.link.cipher().prove(self.dialed, credentials) {
-            Ok(None) => self.link.cipher().answer(&message),
+            Ok(None) => self.link.cipher().answer(message),
             told => told,
         };
         match told {
             Ok(Some(message)) => {
-                self.renewal.step = Step::Telling { until, message };
+                self.renewal.step = Step::Telling { until: cx.now + RENEWAL_TIMEOUT, message };
                 self.pump_renewal(cx);
             }
             Ok(None) | Err(_) => self.fail(cx),
@@ -133,7 +123,7 @@ impl<P: Port> Session<P> {
     /// Sends what waits for room.
     pub(super) fn pump_renewal(&mut self, cx: &mut Context<'_, P>) {
         let sent = match self.renewal.step {
-            Step::Resting { .. } | Step::Asked { .. } | Step::Awaiting { .. } => return,
+            Step::Resting { .. } | Step::Awaiting { .. } => return,
             Step::Telling { message, .. } if self.dialed => self.link.send_frames(&[Frame::Proof(&message)]),
             Step::Telling { message, .. } => self.send_turn(Some(&message)),
             Step::Confirming { .. } => self.send_turn(None),
@@ -166,7 +156,9 @@ impl<P: Port> Session<P> {
             (None, _) if message.is_empty() => self.link.cipher().turned(),
             (Some(_), Step::Awaiting { .. }) if self.dialed => return self.answered_anew(cx, place, lent),
             (Some(first), Step::Resting { due }) if cx.now >= due && !self.dialed && message.len() == PROOF_BYTES => {
-                return self.ask_for_key(cx.now, *first).into();
+                let first = *first;
+                self.begin_renewal(cx, &first);
+                return Outcome::Nothing;
             }
             _ => Err(CloseReason::Protocol),
         };

@@ -95,7 +95,7 @@ impl<P: Port> Session<P> {
     /// When [`poll`](Self::poll) has something to do next.
     pub fn deadline(&self) -> Instant {
         match self.phase {
-            Phase::AwaitingHello { until } | Phase::Introduced { until } | Phase::Proving { until } => until,
+            Phase::AwaitingHello { until } | Phase::Proving { until } => until,
             Phase::Deciding => Instant::FAR_FUTURE,
             Phase::Ending(_) => Instant::START,
             Phase::Ended => Instant::FAR_FUTURE,
@@ -112,7 +112,7 @@ impl<P: Port> Session<P> {
     /// Does what is due. Returns one event at a time; call it until it returns `None`.
     pub fn poll(&mut self, cx: &mut Context<'_, P>) -> Option<Event<'static>> {
         match self.phase {
-            Phase::AwaitingHello { until } | Phase::Introduced { until } | Phase::Proving { until } => {
+            Phase::AwaitingHello { until } | Phase::Proving { until } => {
                 if cx.now < until {
                     return None;
                 }
@@ -153,9 +153,7 @@ impl<P: Port> Session<P> {
         if cx.now >= self.timers.keep_alive {
             self.send_keep_alive(cx);
         }
-        if let Some(event) = self.poll_renewal(cx) {
-            return Some(event);
-        }
+        self.poll_renewal(cx);
         self.look_for_peer(cx);
         match self.phase {
             Phase::Ending(reason) => self.poll_ending(cx, reason),

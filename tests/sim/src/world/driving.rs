@@ -1,9 +1,9 @@
-//! Events go to the machine of their unit, and what comes of them is done, as `docs/notes/driving-the-core.md` says.
+//! Events go to the machine of their unit, and what comes of them is done, as the front page of `cara_core::services` says.
 
 use std::net::SocketAddr;
 use std::rc::Rc;
 
-use cara_core::distribution::connection_handler::{Action, Admission, NodeCounter, Sorted};
+use cara_core::distribution::connection_handler::{Command, NodeCounter, Sorted};
 use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::identity::Identity;
 use cara_core::error::{CloseReason, Error, Refusal};
@@ -12,7 +12,7 @@ use cara_core::host::mailman::LinkId;
 use super::handle::UnitHandle;
 use super::links::{Happened, Link, Links};
 use super::service::{BoxedParameters, Call, Handler};
-use super::state::{Machine, NODE_TIMER};
+use super::state::NODE_TIMER;
 use super::tasks::Owner;
 use super::{Inner, Shared, UnitEvent};
 use crate::event::{HostId, NetEvent, StreamId};
@@ -103,7 +103,7 @@ impl Inner {
         let Some(machine) = &mut unit.machine else { return };
         let silent = if machine.links.free_index().is_none() { machine.links.oldest_silent() } else { None };
         if let Some(index) = silent {
-            machine.node.counters.add(NodeCounter::GaveWay, 1);
+            machine.links.hub.node.counters.add(NodeCounter::GaveWay, 1);
             self.close(shared, host, index, CloseReason::HelloTimeout);
         }
         let Some(machine) = &mut self.units[host.index()].machine else { return };
@@ -118,9 +118,9 @@ impl Inner {
 
     fn datagram(&mut self, shared: &Rc<Shared>, host: HostId, from: SocketAddr, bytes: &mut [u8]) {
         let Some(machine) = &mut self.units[host.index()].machine else { return };
-        match machine.node.datagram(self.network.now(), from, bytes, &machine.keys.codes) {
+        match machine.links.hub.node.datagram(self.network.now(), from, bytes, &machine.links.keys.codes) {
             Sorted::Done => {
-                if machine.node.take_twin().is_some() {
+                if machine.links.hub.node.take_twin().is_some() {
                     let reason = CloseReason::Refused(Refusal::DuplicateIdentity);
                     self.log(shared, host, UnitEvent::LinkEnded { reason });
                 }
@@ -139,7 +139,7 @@ impl Inner {
         let Some(machine) = &mut self.units[host.index()].machine else { return };
         let up = self.network.is_plugged(host);
         if up {
-            machine.node.network_changed(self.network.now());
+            machine.links.hub.node.network_changed(self.network.now());
         }
         self.log(shared, host, UnitEvent::InterfaceChanged { up });
         self.work_node(shared, host);
@@ -150,7 +150,7 @@ impl Inner {
         loop {
             let Some(machine) = &mut self.units[host.index()].machine else { return };
             match machine.poll_node(&mut self.network, host) {
-                Some(action) => self.act(shared, host, action),
+                Some(command) => self.act(shared, host, command),
                 None => return machine.arm_node(&mut self.network, host),
             }
         }
@@ -178,6 +178,8 @@ impl Inner {
         for happened in happened {
             self.one_happened(shared, host, index, happened);
         }
+        // What happened may have left the hub something to do.
+        self.work_node(shared, host);
     }
 
     fn one_happened(&mut self, shared: &Rc<Shared>, host: HostId, index: u16, happened: Happened) {
@@ -185,12 +187,7 @@ impl Inner {
         let Some(machine) = &mut unit.machine else { return };
         let peer = machine.links.link(index).and_then(|link| link.peer.clone());
         match happened {
-            Happened::Introduced => self.prove(shared, host, index),
-            Happened::Hello => self.greet(shared, host, index),
-            Happened::Answered => {
-                let action = machine.node.challenge_answered(self.network.now(), LinkId(index));
-                self.act_all(shared, host, action);
-            }
+            Happened::Joined => self.joined(shared, host, index),
             Happened::Closed(reason) => self.closed(shared, host, index, reason),
             Happened::Call(call, parameters) => self.serve(shared, host, index, &call, parameters),
             Happened::LeaseExpired(slot) => self.lease_expired(shared, host, slot),
@@ -207,52 +204,15 @@ impl Inner {
         }
     }
 
-    /// The peer of a secured link says who it is: each proves to the other that it has the pair's key.
-    fn prove(&mut self, shared: &Rc<Shared>, host: HostId, index: u16) {
-        let now = self.network.now();
-        let Some(machine) = &mut self.units[host.index()].machine else { return };
-        let Some(session) = machine.links.link(index).map(|link| &link.session) else { return };
-        let (Some(peer), address) = (session.identity().cloned(), session.address()) else { return };
-        let Some(credentials) = machine.keys.credentials(&peer) else {
-            machine.node.refuse_without_key(now, address, &peer);
-            return self.refuse(shared, host, index, Refusal::NoKey);
-        };
-        machine.links.with(&mut self.network, index, |session, cx| session.prove(cx, credentials));
-        self.work(shared, host, index);
-    }
-
-    /// The peer of a link has introduced itself.
-    fn greet(&mut self, shared: &Rc<Shared>, host: HostId, index: u16) {
-        let now = self.network.now();
-        let Some(machine) = &mut self.units[host.index()].machine else { return };
-        let Some(link) = machine.links.link(index) else { return };
-        let (Some(hello), address) = (link.session.hello().cloned(), link.session.address()) else { return };
-        match machine.node.admit(now, LinkId(index), address, &hello) {
-            Admission::Accept => self.accept(shared, host, index),
-            Admission::Refuse(refusal) => self.refuse(shared, host, index, refusal),
-            Admission::Challenge { old } => {
-                machine.links.with(&mut self.network, old.0, |session, cx| session.challenge(cx));
-                self.work_node(shared, host);
+    fn act(&mut self, shared: &Rc<Shared>, host: HostId, command: Command) {
+        match command {
+            Command::Dial { to, identity } => self.dial(host, to, identity.as_ref()),
+            Command::Tell(LinkId(index), directive) => {
+                let Some(machine) = &mut self.units[host.index()].machine else { return };
+                let happened = machine.links.direct(&mut self.network, index, directive);
+                self.happened(shared, host, index, happened);
+                self.resume(shared, host);
             }
-        }
-    }
-
-    fn act_all(&mut self, shared: &Rc<Shared>, host: HostId, action: Option<Action>) {
-        if let Some(action) = action {
-            self.act(shared, host, action);
-        }
-        self.work_node(shared, host);
-    }
-
-    fn act(&mut self, shared: &Rc<Shared>, host: HostId, action: Action) {
-        match action {
-            Action::Dial { to, identity } => self.dial(host, to, identity.as_ref()),
-            Action::Supersede { old, new, reason } => {
-                self.close(shared, host, old.0, reason);
-                self.accept(shared, host, new.0);
-            }
-            Action::Admit { new } => self.accept(shared, host, new.0),
-            Action::Refuse { new, refusal } => self.refuse(shared, host, new.0, refusal),
         }
     }
 
@@ -262,11 +222,11 @@ impl Inner {
         let Some(machine) = &mut unit.machine else { return };
         let now = self.network.now();
         if machine.links.free_index().is_none() {
-            return machine.node.dial_failed(now, identity);
+            return machine.links.hub.node.dial_failed(now, identity);
         }
         let stream = self.network.connect(host, to);
         if let Some(index) = machine.open(&mut self.network, functions, stream, to, true) {
-            machine.node.dialing(identity, LinkId(index));
+            machine.links.hub.node.dialing(identity, LinkId(index));
             machine.links.arm(&mut self.network, index);
         }
     }
@@ -278,33 +238,13 @@ impl Inner {
         }
     }
 
-    fn refuse(&mut self, shared: &Rc<Shared>, host: HostId, index: u16, refusal: Refusal) {
-        if let Some(machine) = &mut self.units[host.index()].machine {
-            machine.links.with(&mut self.network, index, |session, cx| session.refuse(cx, refusal));
-            self.work(shared, host, index);
-        }
-    }
-
-    /// The link is live: the peer sees what is published to it.
-    fn accept(&mut self, shared: &Rc<Shared>, host: HostId, index: u16) {
+    /// The link is live.
+    fn joined(&mut self, shared: &Rc<Shared>, host: HostId, index: u16) {
         let Some(machine) = &mut self.units[host.index()].machine else { return };
-        let Machine { links, publications, .. } = machine;
-        let Some(identity) = links.link(index).and_then(|link| link.session.identity().cloned()) else { return };
-        let live = links.with(&mut self.network, index, |session, cx| {
-            session.accept(cx);
-            if session.is_live() {
-                session.publish(cx, publications.visible_to(&identity));
-            }
-            session.is_live()
-        });
-        if live == Some(true)
-            && let Some(link) = links.link_mut(index)
-        {
-            link.peer = Some(identity.clone());
-            self.log(shared, host, UnitEvent::Joined { peer: identity });
-        }
-        self.work(shared, host, index);
-        self.work_node(shared, host);
+        let Some(link) = machine.links.link_mut(index) else { return };
+        let Some(identity) = link.session.identity().cloned() else { return };
+        link.peer = Some(identity.clone());
+        self.log(shared, host, UnitEvent::Joined { peer: identity });
     }
 
     fn closed(&mut self, shared: &Rc<Shared>, host: HostId, index: u16, reason: CloseReason) {
@@ -315,7 +255,7 @@ impl Inner {
         unit.counters.merge(link.session.counters());
         let peer = link.peer.clone();
         Link::abandon(link, Error::Interrupted);
-        let action = machine.node.left(now, LinkId(index), reason);
+        machine.links.hub.node.left(now, LinkId(index), reason);
         self.log(
             shared,
             host,
@@ -324,7 +264,6 @@ impl Inner {
                 None => UnitEvent::LinkEnded { reason },
             },
         );
-        self.act_all(shared, host, action);
     }
 
     /// Starts the service of a call.

@@ -108,12 +108,12 @@ impl UnitHandle {
 
     /// It has no key for units of this name any more, in this life.
     pub fn forget_key_of(&self, name: &str) -> Result<(), Error> {
-        self.machine(|machine, _| machine.keys.forget(name))
+        self.machine(|machine, _| machine.links.keys.forget(name))
     }
 
     /// It has the keys of this generation in this life, and those of the other one beside them. The first is 1.
     pub fn change_keys(&self, generation: u32, other: Option<u32>) -> Result<(), Error> {
-        self.machine(|machine, _| machine.keys.change(generation, other))
+        self.machine(|machine, _| machine.links.keys.change(generation, other))
     }
 
     // --- its own functions
@@ -153,7 +153,7 @@ impl UnitHandle {
     pub fn remove_function(&self, name: &str) -> Result<(), Error> {
         let (slot, Handler(service)) = self.machine(|machine, _| machine.links.functions.remove(name))??;
         service.goes(self);
-        self.machine(|machine, _| machine.publications.withdraw(slot))?;
+        self.machine(|machine, _| machine.links.hub.publications.withdraw(slot))?;
         self.each_live_link(|links, network, index| {
             links.with(network, index, |session, cx| session.withdraw(cx, slot));
         });
@@ -188,13 +188,12 @@ impl UnitHandle {
         let peer = peer.into();
         let index = self.link_to(&peer)?;
         self.machine(|machine, network| {
-            let Machine { links, publications, .. } = machine;
+            let links = &mut machine.links;
             let identity = links.link(index).and_then(|link| link.peer.clone()).ok_or(Error::NotConnected)?;
-            let slots: Vec<Slot> = links.functions.iter().map(|function| function.slot).collect();
-            for slot in slots {
-                publications.publish_to(&identity, slot)?;
+            for function in links.functions.iter() {
+                links.hub.publications.publish_to(&identity, function.slot)?;
             }
-            links.with(network, index, |session, cx| session.publish(cx, publications.visible_to(&identity)));
+            links.with(network, index, |session, cx| session.publish(cx));
             Ok::<_, Error>(())
         })??;
         self.work(index);
@@ -205,7 +204,7 @@ impl UnitHandle {
 
     /// Looks for nodes now.
     pub fn broadcast(&self) -> Result<(), Error> {
-        self.machine(|machine, network| machine.node.broadcast(network.now()))?;
+        self.machine(|machine, network| machine.links.hub.node.broadcast(network.now()))?;
         self.with_shared(|inner, shared| inner.work_node(shared, self.host));
         Ok(())
     }
@@ -223,7 +222,8 @@ impl UnitHandle {
 
     /// The s_units that have joined this life of the unit, connected or not.
     pub fn roster(&self) -> Vec<Identity> {
-        let joined = self.machine(|machine, _| machine.node.s_units().map(|known| known.identity.clone()).collect());
+        let joined =
+            self.machine(|machine, _| machine.links.hub.node.s_units().map(|known| known.identity.clone()).collect());
         joined.unwrap_or_default()
     }
 
@@ -231,7 +231,7 @@ impl UnitHandle {
     /// connected. One that has left keeps its place.
     pub fn s_units_ever(&self) -> Vec<(Identity, bool)> {
         let known = self.machine(|machine, _| {
-            let s_units = machine.node.nodes().filter(|known| known.identity.role() == Role::SUnit);
+            let s_units = machine.links.hub.node.nodes().filter(|known| known.identity.role() == Role::SUnit);
             s_units.map(|known| (known.identity.clone(), known.is_joined())).collect()
         });
         known.unwrap_or_default()
@@ -314,16 +314,15 @@ impl UnitHandle {
     fn publish_waiting(&self) -> Result<Vec<(Identity, Promise<bool>)>, Error> {
         self.machine(|machine, _| {
             let slots: Vec<Slot> = machine.links.functions.iter().map(|function| function.slot).collect();
-            slots.into_iter().try_for_each(|slot| machine.publications.publish_to_all(slot))
+            slots.into_iter().try_for_each(|slot| machine.links.hub.publications.publish_to_all(slot))
         })??;
         let mut waiting = Vec::new();
         for index in self.live_links() {
             let published = self.machine(|machine, network| {
-                let Machine { links, publications, .. } = machine;
+                let links = &mut machine.links;
                 let identity = links.link(index)?.peer.clone()?;
-                let visible = publications.visible_to(&identity);
-                let serial = links.with(network, index, |session, cx| session.publish(cx, visible))?;
-                Some((identity.clone(), links.await_acknowledgement(index, serial)))
+                let serial = links.with(network, index, |session, cx| session.publish(cx))?;
+                Some((identity, links.await_acknowledgement(index, serial)))
             });
             waiting.extend(published?);
             self.work(index);

@@ -4,14 +4,17 @@ use std::collections::BTreeSet;
 
 use cara_core::config::Mode;
 use cara_core::distribution::authenticator::Authenticator;
+use cara_core::distribution::hello::Hello;
 use cara_core::distribution::identity::{Fleet, Identity};
 use cara_core::random::Random;
+use cara_core::services;
 use cara_core::time::Duration;
 use cara_secure::keyring::{Codes, Keyring};
 use cara_secure::keys::{DiscoveryKey, PairKey, RootKey};
 use cara_secure::link::Credentials;
 
 use super::audited::{Audited, Seals};
+use super::links::Simulated;
 
 /// The generation of all keys at first.
 const GENERATION: u32 = 1;
@@ -115,12 +118,13 @@ impl Keys {
             ring.other_discovery = other.map(|other| ring.root.discovery(ring.fleet, other));
         }
     }
+}
 
-    /// What proves this unit to a peer. `None` without a key for it.
-    pub(super) fn credentials(&mut self, peer: &Identity) -> Option<Credentials> {
+impl services::Keys<Simulated> for Keys {
+    fn credentials(&mut self, hello: &Hello) -> Option<Credentials> {
         let Codes::Keyed(ring) = &self.codes else { return None };
         let mut fresh = [0; 32];
         fresh.chunks_exact_mut(8).for_each(|part| part.copy_from_slice(&self.random.bits().to_le_bytes()));
-        ring.credentials(peer, fresh)
+        ring.credentials(&hello.identity, fresh)
     }
 }

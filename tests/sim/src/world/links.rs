@@ -2,11 +2,13 @@
 
 use std::collections::BTreeMap;
 
+use cara_core::distribution::connection_handler::Directive;
 use cara_core::distribution::function_list::{FunctionList, Slot};
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error};
 use cara_core::services::access::Access;
+use cara_core::services::hub::Hub;
 use cara_core::services::lease::LeaseEnd;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::{Event, Session};
@@ -14,6 +16,7 @@ use cara_core::services::{Context, Port, Ticket};
 use cara_core::time::Instant;
 
 use super::audited::Audited;
+use super::keys::Keys;
 use super::mail::{LazyPool, SimMailman};
 use super::replies::{Promise, Waiting};
 use super::service::{BoxedParameters, Handler};
@@ -33,14 +36,12 @@ pub(super) type SimSession = Session<Simulated>;
 
 /// What a link led to that concerns more than the link.
 pub(super) enum Happened {
-    Introduced,
-    Hello,
+    Joined,
     Call(cara_core::services::unit::Call, BoxedParameters),
     Failed(CallId, Error),
     ListChanged,
     LeaseExpired(Slot),
     LeaseEnded { call: CallId, slot: Slot, why: LeaseEnd },
-    Answered,
     Closed(CloseReason),
 }
 
@@ -71,6 +72,8 @@ pub(super) struct Links {
     pub(super) buffers: LazyPool,
     /// Who may do what.
     pub(super) access: Option<&'static dyn Access>,
+    pub(super) hub: Hub<Boxed>,
+    pub(super) keys: Keys,
     arguments: BoxedParameters,
 }
 
@@ -83,6 +86,8 @@ impl Links {
         count: usize,
         functions: FunctionList<Boxed, Handler>,
         buffers: LazyPool,
+        hub: Hub<Boxed>,
+        keys: Keys,
         arguments: BoxedParameters,
     ) -> Self {
         let links = (0..count).map(|_| None).collect();
@@ -94,6 +99,8 @@ impl Links {
             functions,
             buffers,
             access: None,
+            hub,
+            keys,
             arguments,
         }
     }
@@ -161,6 +168,8 @@ impl Links {
             buffers: &mut self.buffers,
             functions: &self.functions,
             access: self.access,
+            hub: &mut self.hub,
+            keys: &mut self.keys,
         };
         Some(act(&mut link.session, &mut context))
     }
@@ -265,6 +274,8 @@ impl Links {
             buffers: &mut self.buffers,
             functions: &self.functions,
             access: self.access,
+            hub: &mut self.hub,
+            keys: &mut self.keys,
         };
         let Link { session, unread, waiting, acknowledgements, paused, .. } = link;
         let (mut start, mut any) = (0, false);
@@ -305,6 +316,18 @@ impl Links {
             return Vec::new();
         }
         self.iter().filter(|(_, link)| link.paused && link.session.is_live()).map(|(index, _)| index).collect()
+    }
+
+    /// Passes on what the hub tells a link.
+    pub(super) fn direct(&mut self, network: &mut Network, index: u16, directive: Directive) -> Vec<Happened> {
+        let mut happened = Vec::new();
+        if let Some(event) = self.with(network, index, |session, cx| session.direct(cx, directive)) {
+            let Some(link) = self.links.get_mut(usize::from(index)).and_then(Option::as_mut) else { return happened };
+            let Link { waiting, acknowledgements, .. } = link;
+            note(event, waiting, acknowledgements, &self.functions, &self.arguments, &mut happened);
+        }
+        happened.extend(self.work(network, index));
+        happened
     }
 
     /// Passes a session datagram to its link.
@@ -411,13 +434,12 @@ fn note(
             return;
         }
         Some(Event::Call(call)) => Happened::Call(call, own(functions, call.slot, arguments)),
-        Some(Event::Introduced) => Happened::Introduced,
-        Some(Event::Hello) => Happened::Hello,
+        Some(Event::Joined) => Happened::Joined,
+        Some(Event::Answered) => return,
         Some(Event::Failed(id, error)) => Happened::Failed(id, error),
         Some(Event::ListChanged) => Happened::ListChanged,
         Some(Event::LeaseExpired(slot)) => Happened::LeaseExpired(slot),
         Some(Event::LeaseEnded { call, slot, why }) => Happened::LeaseEnded { call, slot, why },
-        Some(Event::Answered) => Happened::Answered,
         Some(Event::Closed(reason)) => Happened::Closed(reason),
     });
 }

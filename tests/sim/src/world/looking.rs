@@ -31,7 +31,7 @@ impl UnitHandle {
                 return Err(Error::BadConstraint);
             }
             machine.constraints = constraints;
-            machine.node.set_constraints(constraints);
+            machine.links.hub.node.set_constraints(constraints);
             Ok(())
         })?;
         self.each_live_link(|links, network, index| {
@@ -60,7 +60,7 @@ impl UnitHandle {
 
     /// A counter of discovery and membership, of this life.
     pub fn node_counter(&self, counter: NodeCounter) -> u64 {
-        self.machine(|machine, _| machine.node.counters.value(counter)).unwrap_or(0)
+        self.machine(|machine, _| machine.links.hub.node.counters.value(counter)).unwrap_or(0)
     }
 
     /// When a suspension of it ends; in the past if there is none now.

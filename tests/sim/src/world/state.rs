@@ -5,14 +5,13 @@ use std::rc::Rc;
 
 use cara_core::config::{Constraints, Mode};
 use cara_core::counters::Counters;
-use cara_core::distribution::connection_handler::{Action, Node, NodeConfig, NodeStorage, Target};
+use cara_core::distribution::connection_handler::{Command, NodeConfig, Target};
 use cara_core::distribution::function_list::FunctionList;
 use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
 use cara_core::host::connections::LinkCounter;
 use cara_core::host::mailman::LinkId;
 use cara_core::host::secure::Seal;
 use cara_core::random::Random;
-use cara_core::services::publications::Publications;
 use cara_core::services::slots_for;
 use cara_core::services::unit::{Session, SessionConfig, SessionStorage, buffer_bytes};
 use cara_core::time::Instant;
@@ -24,6 +23,7 @@ use super::links::Links;
 use super::mail::{LazyPool, SimMailman};
 use super::service::boxed_parameters;
 use crate::event::{HostId, StreamId};
+use crate::hub::hub;
 use crate::network::Network;
 use crate::storage::Boxed;
 
@@ -71,11 +71,8 @@ pub(super) struct UnitState {
 
 /// One life of a unit.
 pub(super) struct Machine {
-    pub(super) node: Node<Boxed>,
     pub(super) links: Links,
-    pub(super) publications: Publications<Boxed>,
     pub(super) constraints: Constraints,
-    pub(super) keys: Keys,
     node_timer: Instant,
 }
 
@@ -112,13 +109,6 @@ impl UnitState {
             constraints: settings.constraints,
             seed: settings.boot_seed.unwrap_or(seed),
         };
-        let nodes = 2 * settings.links;
-        let storage = NodeStorage {
-            nodes: Boxed::slice(nodes),
-            order: Boxed::slice(nodes),
-            links: Boxed::slice(settings.links),
-            findings: Boxed::slice(8),
-        };
         let functions =
             FunctionList::new(Boxed::slice(settings.functions), Boxed::slice(settings.functions * SIGNATURE_BYTES));
         let message_size = settings.constraints.message_size;
@@ -126,16 +116,13 @@ impl UnitState {
         let buffers = LazyPool::new(buffer_bytes(message_size, keys.cipher().overhead()), settings.message_buffers);
         // A block reserves what its signature declares, which may be more than what it holds.
         let arguments = boxed_parameters(2 * message_size as usize + 1_024);
-        let mut node = Node::new(network.now(), config, storage);
+        let mut hub = hub(network.now(), config, settings.links, settings.functions);
         if let Some(m_units) = &settings.m_units {
-            node.choose(m_units.clone());
+            hub.node.choose(m_units.clone());
         }
         self.machine = Some(Machine {
-            node,
-            links: Links::new(self.host, settings.links, functions, buffers, arguments),
-            publications: Publications::new(Boxed::slice(settings.functions), Boxed::slice(4 * settings.functions)),
+            links: Links::new(self.host, settings.links, functions, buffers, hub, keys, arguments),
             constraints: settings.constraints,
-            keys,
             node_timer: Instant::FAR_FUTURE,
         });
     }
@@ -153,7 +140,7 @@ impl Machine {
     ) -> Option<u16> {
         let index = self.links.free_index()?;
         let now = network.now();
-        let hello = self.node.hello(now, LinkId(index));
+        let hello = self.links.hub.node.hello(now, LinkId(index));
         let calls = CALLS.max(usize::from(self.constraints.calls_per_peer));
         let storage = SessionStorage {
             small: Boxed::slice(cara_core::config::LINK_BUFFER_BYTES),
@@ -165,21 +152,22 @@ impl Machine {
         };
         let link = LinkId(index);
         let config = SessionConfig { link, dialed, address: peer, local: hello, constraints: self.constraints };
-        let mut session = Session::new(now, config, self.keys.cipher(), storage);
-        if let Some(span) = self.keys.renews_every {
+        let mut session = Session::new(now, config, self.links.keys.cipher(), storage);
+        if let Some(span) = self.links.keys.renews_every {
             session.renew_every(span);
         }
         self.links.insert(index, session, stream);
         Some(index)
     }
 
-    pub(super) fn poll_node(&mut self, network: &mut Network, host: HostId) -> Option<Action> {
+    pub(super) fn poll_node(&mut self, network: &mut Network, host: HostId) -> Option<Command> {
         let now = network.now();
-        self.node.poll(now, &mut SimMailman { network, host, streams: &[] }, &self.keys.codes)
+        let Links { hub, keys, .. } = &mut self.links;
+        hub.node.poll(now, &mut SimMailman { network, host, streams: &[] }, &keys.codes)
     }
 
     pub(super) fn arm_node(&mut self, network: &mut Network, host: HostId) {
-        let due = self.node.next_deadline();
+        let due = self.links.hub.node.next_deadline();
         if due < self.node_timer || self.node_timer <= network.now() {
             self.node_timer = due;
             if due != Instant::FAR_FUTURE {

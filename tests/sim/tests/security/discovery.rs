@@ -4,7 +4,9 @@ use std::net::SocketAddr;
 
 use cara_core::config::Constraints;
 use cara_core::distribution::authenticator::{Authenticator, CODE_BYTES};
-use cara_core::distribution::connection_handler::{Action, Node, NodeConfig, NodeCounter, NodeStorage, Sorted, Target};
+use cara_core::distribution::connection_handler::{
+    Command, Node, NodeConfig, NodeCounter, NodeStorage, Sorted, Target,
+};
 use cara_core::distribution::datagram::{ANSWER_BYTES, Announce, SEARCH_BYTES};
 use cara_core::distribution::hello::Manager;
 use cara_core::distribution::identity::{Epoch, Fleet, Identity};
@@ -130,7 +132,7 @@ impl Unit {
         while self.node.next_deadline() <= until {
             let now = self.node.next_deadline();
             while let Some(action) = self.node.poll(now, &mut self.outbox, &self.codes) {
-                if let Action::Dial { to, .. } = action {
+                if let Command::Dial { to, .. } = action {
                     self.dials.push(to);
                 }
             }

@@ -4,21 +4,23 @@ use std::collections::VecDeque;
 use std::net::SocketAddr;
 
 use cara_core::config::{Constraints, Mode, Priority};
+use cara_core::distribution::connection_handler::{NodeConfig, Target};
 use cara_core::distribution::function::{Attributes, Definition};
-use cara_core::distribution::function_list::{Entry, FunctionList, Slot};
-use cara_core::distribution::hello::{Hello, Limits};
+use cara_core::distribution::function_list::{Entry, FunctionList};
+use cara_core::distribution::hello::{Hello, Limits, Manager};
 use cara_core::distribution::identity::{Epoch, Fleet, Identity};
 use cara_core::distribution::parameters::Parameters;
-use cara_core::error::{CloseReason, Refusal};
+use cara_core::error::CloseReason;
 use cara_core::host::connections::LinkCounter;
 use cara_core::host::mailman::{LinkId, Mailman};
+use cara_core::services::hub::Hub;
 use cara_core::services::unit::{Event, RequestOptions, Session, SessionConfig, SessionStorage, buffer_bytes};
-use cara_core::services::{Context, Port};
+use cara_core::services::{Context, Keys, Port};
 use cara_core::storage::Pool;
 use cara_core::time::{Duration, Instant};
 use cara_secure::keys::{PairKey, RootKey};
 use cara_secure::link::{Cipher, Credentials};
-use cara_sim::Boxed;
+use cara_sim::{Boxed, hub};
 
 const FLEET: Fleet = Fleet(7);
 const BUFFERS: usize = 6;
@@ -61,6 +63,23 @@ impl Port for Attacked {
     type Cipher = Cipher;
 }
 
+/// The keys of an end.
+pub(crate) struct Ring {
+    /// The key that it proves, and one that it takes as well. Without one it refuses.
+    pub(crate) keys: Option<(PairKey, Option<PairKey>)>,
+    /// What it draws for the first proof of its link, and for each later one.
+    draws: [u8; 2],
+}
+
+impl Keys<Attacked> for Ring {
+    fn credentials(&mut self, _: &Hello) -> Option<Credentials> {
+        let [drawn, later] = self.draws;
+        self.draws = [later, later];
+        let (key, other) = self.keys.clone()?;
+        Some(Credentials::new(key, [drawn; 32]).or(other))
+    }
+}
+
 /// One end.
 pub(crate) struct End {
     pub(crate) session: Session<Attacked>,
@@ -68,14 +87,8 @@ pub(crate) struct End {
     pool: Pool<Boxed>,
     sent: Sent,
     now: Instant,
-    /// The key that it proves, and one that it takes as well. Without one it refuses.
-    pub(crate) keys: Option<(PairKey, Option<PairKey>)>,
-    /// What it draws for the first proof of its link, and for each later one.
-    draws: [u8; 2],
-    /// Whether it answers when the port is asked for a key.
-    pub(crate) answers: bool,
-    /// The node was asked about the peer.
-    pub(crate) greeted: bool,
+    pub(crate) ring: Ring,
+    hub: Hub<Boxed>,
     /// Services that ran.
     pub(crate) ran: u32,
     pub(crate) closed: Option<CloseReason>,
@@ -89,6 +102,8 @@ macro_rules! context {
             buffers: &mut $end.pool,
             functions: &$end.functions,
             access: None,
+            hub: &mut $end.hub,
+            keys: &mut $end.ring,
         }
     };
 }
@@ -103,13 +118,18 @@ pub(crate) fn key() -> PairKey {
     RootKey::new([1; 32]).pair(FLEET, 1, &manager, &agv)
 }
 
+fn config_of(identity: Identity, target: Target) -> NodeConfig {
+    let constraints = Constraints::M_UNIT;
+    NodeConfig { identity, fleet: FLEET, epoch: Epoch(1), target, tcp_port: 0, udp_port: 0, constraints, seed: 1 }
+}
+
 fn hello(agv: bool, run: u8) -> Hello {
     let [manager, vehicle] = names();
     let limits = Limits { message_size: 1_024, chunk_size: 1_024, calls: 4, minimum_interval: 0 };
     Hello {
         fleet: FLEET,
         identity: if agv { vehicle } else { manager },
-        wanted: None,
+        wanted: agv.then(|| Manager::new("depot", 1).expect("a name")),
         epoch: Epoch(1),
         nonce: 0x1_0000 + u64::from(run) * 2 + u64::from(agv),
         term: 0,
@@ -144,17 +164,27 @@ impl End {
         let size = buffer_bytes(1_024, 16);
         let mut functions = FunctionList::new((0..4).map(|_| Entry::empty()).collect(), Boxed::slice(512));
         let stop = Definition::parse("stop(n: int)").expect("a signature");
-        functions.add_function(&stop, Attributes::default(), ()).expect("room for it");
+        let slot = functions.add_function(&stop, Attributes::default(), ()).expect("room for it");
+        let hub = {
+            let [manager, _] = names();
+            let (target, identity) = match agv {
+                true => {
+                    (Target::Manager(Manager::new(manager.name(), manager.id()).expect("a name")), names()[1].clone())
+                }
+                false => (Target::Everybody, manager),
+            };
+            let mut hub = hub(now, config_of(identity, target), 2, 4);
+            hub.publications.publish_to_all(slot).expect("room for it");
+            hub
+        };
         Self {
             session: Session::new(now, config, Cipher::new(Mode::Secured), storage),
             functions,
             pool: Pool::new((0..BUFFERS).map(|_| Some(Boxed::slice(size))).collect()),
             sent: Sent::default(),
             now,
-            keys: Some((key, None)),
-            draws: [fresh, fresh ^ LATER],
-            answers: true,
-            greeted: false,
+            ring: Ring { keys: Some((key, None)), draws: [fresh, fresh ^ LATER] },
+            hub,
             ran: 0,
             closed: None,
         }
@@ -169,8 +199,6 @@ impl End {
             let quiet = receipt.consumed == 0 && receipt.event.is_none();
             let consumed = receipt.consumed;
             match receipt.event {
-                Some(Event::Introduced) => self.prove(),
-                Some(Event::Hello) => self.greet(),
                 Some(Event::Call(call)) => {
                     self.ran += 1;
                     let _ = self.session.answer(context!(self), call.ticket, Ok(&arguments));
@@ -194,23 +222,9 @@ impl End {
         self.work();
     }
 
-    fn prove(&mut self) {
-        let [drawn, later] = self.draws;
-        self.draws = [later, later];
-        match self.keys.clone() {
-            _ if !self.answers => {}
-            Some((key, other)) => {
-                let credentials = Credentials::new(key, [drawn; 32]).or(other);
-                self.session.prove(context!(self), credentials);
-            }
-            None => self.session.refuse(context!(self), Refusal::NoKey),
-        }
-    }
-
-    fn greet(&mut self) {
-        self.greeted = true;
-        self.session.accept(context!(self));
-        self.session.publish(context!(self), [Slot(0)].into_iter());
+    /// The hub has taken the peer, which has proven who it is.
+    pub(crate) fn greeted(&self) -> bool {
+        self.hub.node.connected() > 0
     }
 
     fn work(&mut self) {
@@ -222,7 +236,6 @@ impl End {
         while let Some(event) = self.session.poll(context!(self)) {
             match event {
                 Event::Closed(reason) => self.closed = Some(reason),
-                Event::Introduced => self.prove(),
                 _ => {}
             }
         }
@@ -298,7 +311,7 @@ impl Ends {
     pub(crate) fn repeating(run: u8) -> Self {
         let mut ends = Self::made(End::new(false, run, key(), 9), End::new(true, run, key(), 9));
         for end in [&mut ends.manager, &mut ends.agv] {
-            end.draws = [9; 2];
+            end.ring.draws = [9; 2];
         }
         ends.with_renewal()
     }

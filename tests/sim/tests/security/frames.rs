@@ -43,7 +43,7 @@ fn every_flipped_bit_of_a_handshake_fails_it() {
             let mut ends = with_changed(at, |carried| carried.bytes[bit / 8] ^= 1 << (bit % 8));
             let victim = ends.end(original.to_manager);
             victim.wait(Duration::from_secs(3));
-            tally.note(victim.greeted || ends.agv.ran + ends.manager.ran > 0);
+            tally.note(victim.greeted() || ends.agv.ran + ends.manager.ran > 0);
         }
     }
     tally.close();
@@ -87,9 +87,9 @@ fn whatever_was_recorded_is_of_no_use_in_another_link() {
                 let mut proven = false;
                 ends.converse(|ends, number, carried| {
                     if number == state {
-                        let before = (ends.manager.greeted, ends.agv.greeted);
+                        let before = (ends.manager.greeted(), ends.agv.greeted());
                         ends.deliver(&Carried { to_manager, ..old.clone() });
-                        proven = before != (ends.manager.greeted, ends.agv.greeted);
+                        proven = before != (ends.manager.greeted(), ends.agv.greeted());
                     }
                     ends.deliver(&carried);
                 });
@@ -114,9 +114,9 @@ fn whatever_was_said_is_of_no_use_later_in_the_same_link() {
                     record.push(carried);
                     if number == state {
                         let old = &record[again];
-                        let before = (ends.manager.greeted, ends.agv.greeted);
+                        let before = (ends.manager.greeted(), ends.agv.greeted());
                         ends.deliver(&Carried { to_manager: old.to_manager != reflected, ..old.clone() });
-                        proven = before != (ends.manager.greeted, ends.agv.greeted);
+                        proven = before != (ends.manager.greeted(), ends.agv.greeted());
                     }
                 });
                 tally.note(proven || ends.agv.ran > 2 || ends.manager.ran > 0);
@@ -139,7 +139,7 @@ fn a_recorded_peer_proves_nothing() {
             }
             let victim = ends.end(manager);
             victim.wait(Duration::from_secs(3));
-            tally.note(victim.greeted || victim.ran > 0 || victim.closed.is_none());
+            tally.note(victim.greeted() || victim.ran > 0 || victim.closed.is_none());
         }
     }
     tally.close();
@@ -187,7 +187,7 @@ fn what_is_cut_or_too_long_before_the_proof_costs_no_buffer() {
             let victim = ends.end(original.to_manager);
             let kept = victim.has_all_buffers();
             victim.wait(Duration::from_secs(3));
-            tally.note(victim.greeted || victim.closed.is_none() || !kept);
+            tally.note(victim.greeted() || victim.closed.is_none() || !kept);
         }
     }
     tally.close();
@@ -222,7 +222,7 @@ fn two_keys_are_told_by_both_ends() {
     ends.converse(|ends, _, carried| ends.deliver(&carried));
     assert_eq!(ends.manager.closed, Some(CloseReason::BadProof));
     assert_eq!(ends.agv.closed, Some(CloseReason::Unproven));
-    assert!(!ends.manager.greeted && !ends.agv.greeted);
+    assert!(!ends.manager.greeted() && !ends.agv.greeted());
     assert_eq!(ends.manager.counted(LinkCounter::ProofsFailed), 1);
     assert_eq!(ends.agv.counted(LinkCounter::FarewellsInClear), 1);
 }

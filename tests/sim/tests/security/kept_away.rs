@@ -3,7 +3,7 @@
 use std::net::SocketAddr;
 
 use cara_core::config::HELLO_TIMEOUT;
-use cara_core::distribution::connection_handler::{Action, Admission, Target};
+use cara_core::distribution::connection_handler::{Command, Target};
 use cara_core::distribution::datagram::{Announce, SEARCH_BYTES};
 use cara_core::distribution::hello::Manager;
 use cara_core::distribution::identity::Epoch;
@@ -100,7 +100,7 @@ impl Ground {
             match coming {
                 Coming::ToVehicle(from, bytes) => self.vehicle.hear(now, from, &bytes),
                 Coming::ToManager(from, bytes) => self.manager.hear(now, from, &bytes),
-                Coming::Silence(link) => drop(self.vehicle.node.left(now, link, CloseReason::HelloTimeout)),
+                Coming::Silence(link) => self.vehicle.node.left(now, link, CloseReason::HelloTimeout),
             }
         }
     }
@@ -123,7 +123,7 @@ impl Ground {
 
     fn work(&mut self, now: Instant) {
         while let Some(action) = self.vehicle.node.poll(now, &mut self.vehicle.outbox, &self.vehicle.codes) {
-            let Action::Dial { to, identity } = action else { panic!("{action:?}") };
+            let Command::Dial { to, identity } = action else { panic!("{action:?}") };
             let link = LinkId(self.links % 8);
             self.links += 1;
             self.vehicle.node.dialing(identity.as_ref(), link);
@@ -131,8 +131,6 @@ impl Ground {
                 self.coming.push((now + HELLO_TIMEOUT, Coming::Silence(link)));
                 continue;
             }
-            let hello = self.manager.node.hello(now, LinkId(0));
-            assert_eq!(self.vehicle.node.admit(now, link, to, &hello), Admission::Accept);
             self.joined = Some(now);
         }
         assert!(self.manager.node.poll(now, &mut self.manager.outbox, &self.manager.codes).is_none());

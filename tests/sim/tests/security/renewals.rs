@@ -157,7 +157,7 @@ fn datagrams_under_the_old_key_are_taken_for_five_seconds_more() {
 fn a_key_that_was_revoked_ends_the_link_at_its_next_renewal() {
     for manager in [true, false] {
         let mut ends = before();
-        ends.end(manager).keys = None;
+        ends.end(manager).ring.keys = None;
         ends.agv.wait(STEP);
         ends.carry();
         assert_eq!(ends.end(manager).closed, Some(CloseReason::Refused(Refusal::NoKey)));
@@ -168,7 +168,7 @@ fn a_key_that_was_revoked_ends_the_link_at_its_next_renewal() {
 #[test]
 fn another_key_ends_the_link_at_its_next_renewal() {
     let mut ends = before();
-    ends.agv.keys = Some((PairKey::new([7; 32]), None));
+    ends.agv.ring.keys = Some((PairKey::new([7; 32]), None));
     ends.agv.wait(STEP);
     ends.carry();
     assert_eq!((ends.manager.closed, ends.agv.closed), (Some(CloseReason::BadProof), Some(CloseReason::BadProof)));
@@ -179,12 +179,12 @@ fn another_key_ends_the_link_at_its_next_renewal() {
 #[test]
 fn keys_may_change_while_a_link_lives() {
     let mut ends = before();
-    let (old, _) = ends.manager.keys.clone().expect("it has one");
-    ends.manager.keys = Some((PairKey::new([7; 32]), Some(old)));
+    let (old, _) = ends.manager.ring.keys.clone().expect("it has one");
+    ends.manager.ring.keys = Some((PairKey::new([7; 32]), Some(old)));
     ends.agv.wait(STEP);
     ends.carry();
     assert_eq!((renewed(&ends.manager), renewed(&ends.agv)), (1, 1));
-    ends.agv.keys = Some((PairKey::new([7; 32]), None));
+    ends.agv.ring.keys = Some((PairKey::new([7; 32]), None));
     for _ in 0..3 {
         [true, false].into_iter().for_each(|end| ends.end(end).wait(STEP));
         ends.carry();
@@ -193,11 +193,11 @@ fn keys_may_change_while_a_link_lives() {
     assert!(ends.manager.session.is_live() && ends.agv.session.is_live());
 }
 
-/// The port of one end never brings a key: everything else goes on until the time for it is over.
+/// One end cannot say what it has to: the link goes on by datagrams until the time for it is over.
 #[test]
 fn a_peer_that_does_not_go_on_loses_its_link() {
     let mut ends = before();
-    ends.manager.answers = false;
+    ends.manager.clog();
     for _ in 0..RENEWAL_TIMEOUT.as_millis() / 1_000 {
         assert!(ends.agv.session.is_live() && ends.manager.session.is_live());
         [true, false].into_iter().for_each(|end| ends.end(end).wait(STEP));

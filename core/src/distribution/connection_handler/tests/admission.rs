@@ -67,8 +67,8 @@ fn the_next_node_is_refused_as_full_until_one_leaves_or_the_limit_is_raised() {
     assert_eq!(node.counters.value(NodeCounter::RefusedFull), 1);
     // One that is connected comes back: it takes no further place.
     let again = Hello { epoch: Epoch(50), ..hello_of(&s_unit("a", 1)) };
-    assert_eq!(decide(&mut node, &again), Admission::Challenge { old: LinkId(0) });
-    assert_eq!(node.left(at(11), LinkId(9), CloseReason::Reset), None);
+    assert_eq!(decide(&mut node, &again), Admission::Wait);
+    node.left(at(11), LinkId(9), CloseReason::Reset);
     node.left(at(12), LinkId(1), CloseReason::Reset);
     assert_eq!(decide(&mut node, &third), Admission::Accept);
     node.set_maximum_nodes(3);
@@ -113,16 +113,22 @@ fn of_crossing_links_both_ends_keep_the_one_that_the_smaller_dialled() {
         for link in [0, 1] {
             of_large.admit(at(101), LinkId(link), by_small_address, &hello_of(&small));
         }
-        let mut outbox = Outbox::default();
         for node in [&mut of_small, &mut of_large] {
-            assert_eq!(node.challenge_answered(at(101), LinkId(1)), None, "it is decided whatever is answered");
-            while let Some(action) = node.poll(at(101), &mut outbox, &Plain) {
-                let reason = CloseReason::Refused(Refusal::AlreadyConnected);
-                assert_eq!(action, Action::Supersede { old: LinkId(1), new: LinkId(0), reason });
-            }
+            // It is decided whatever is answered.
+            node.challenge_answered(at(101), LinkId(1));
+            let reason = CloseReason::Refused(Refusal::AlreadyConnected);
+            let decided = [tell(1, Directive::Challenge), tell(1, Directive::Close(reason))];
+            let commands = due(node, at(101));
+            assert!(commands.is_empty() || commands == decided, "{commands:?}");
+            node.left(at(101), LinkId(1), reason);
+            let admitted = due(node, at(101));
+            assert!(
+                admitted.is_empty() == commands.is_empty()
+                    && admitted.iter().all(|told| *told == tell(0, Directive::Admit))
+            );
             let link = node.nodes().next().unwrap().link();
             assert_eq!(link, Some(LinkId(0)), "first: {}", if small_first { "small" } else { "large" });
-            assert_eq!(node.left(at(102), LinkId(1), CloseReason::Reset), None);
+            node.left(at(102), LinkId(1), CloseReason::Reset);
             assert_eq!(node.connected(), 1);
         }
     }

@@ -73,8 +73,7 @@ impl Port {
             }
             Step::Answer(index) => {
                 if let Some(link) = self.choose(index) {
-                    let action = self.node.challenge_answered(self.now, LinkId(link));
-                    self.act(action);
+                    self.node.challenge_answered(self.now, LinkId(link));
                 }
             }
             Step::Heard(number) => {
@@ -84,8 +83,8 @@ impl Port {
             }
             Step::Wait(millis) => self.now = self.now + Duration::from_millis(millis),
         }
-        while let Some(action) = self.node.poll(self.now, &mut Outbox::default(), &Plain) {
-            self.act(Some(action));
+        while let Some(command) = self.node.poll(self.now, &mut Outbox::default(), &Plain) {
+            self.act(command);
         }
         assert!(self.node.next_deadline() > self.now);
         self.check();
@@ -104,8 +103,8 @@ impl Port {
                 assert_eq!(joined, None, "a second link of one identity was taken");
                 self.open.insert(link, (number, Open::Joined));
             }
-            Admission::Challenge { old } => {
-                assert_eq!(joined, Some(old.0));
+            Admission::Wait => {
+                assert!(joined.is_some());
                 self.open.insert(link, (number, Open::Waiting));
             }
             Admission::Refuse(_) => {
@@ -121,14 +120,12 @@ impl Port {
 
     fn end(&mut self, link: u16) {
         self.open.remove(&link);
-        let action = self.node.left(self.now, LinkId(link), CloseReason::Reset);
-        self.act(action);
+        self.node.left(self.now, LinkId(link), CloseReason::Reset);
     }
 
-    fn act(&mut self, action: Option<Action>) {
-        match action {
-            None => {}
-            Some(Action::Dial { identity, .. }) => {
+    fn act(&mut self, command: Command) {
+        match command {
+            Command::Dial { identity, .. } => {
                 let number = (0..6).find(|number| Some(peer(*number, 1).identity) == identity).unwrap();
                 assert_eq!(self.joined(number), None, "a connected node is dialled");
                 match self.free() {
@@ -139,23 +136,27 @@ impl Port {
                     None => self.node.dial_failed(self.now, identity.as_ref()),
                 }
             }
-            Some(Action::Supersede { old, new, .. }) => {
-                assert_eq!(self.open[&old.0].1, Open::Joined);
-                self.take(new);
-                self.end(old.0);
-            }
-            Some(Action::Admit { new }) => self.take(new),
-            Some(Action::Refuse { new, .. }) => {
-                assert_eq!(self.open[&new.0].1, Open::Waiting);
-                self.end(new.0);
-            }
+            Command::Tell(link, directive) => self.told(link.0, directive),
         }
     }
 
-    fn take(&mut self, new: LinkId) {
-        let open = self.open.get_mut(&new.0).unwrap();
-        assert_eq!(open.1, Open::Waiting, "only who waits is taken");
-        open.1 = Open::Joined;
+    fn told(&mut self, link: u16, directive: Directive) {
+        let open = self.open.get_mut(&link).unwrap();
+        match directive {
+            Directive::Challenge => assert_eq!(open.1, Open::Joined),
+            Directive::Admit => {
+                assert_eq!(open.1, Open::Waiting, "only who waits is taken");
+                open.1 = Open::Joined;
+            }
+            Directive::Refuse(_) => {
+                assert_eq!(open.1, Open::Waiting);
+                self.end(link);
+            }
+            Directive::Close(_) => {
+                assert_eq!(open.1, Open::Joined);
+                self.end(link);
+            }
+        }
     }
 
     fn check(&self) {

@@ -73,17 +73,17 @@ struct Port {
 impl Port {
     fn poll(&mut self, dial: u64) {
         let mut actions = 0;
-        while let Some(action) = self.node.poll(self.now, &mut self.outbox, &Plain) {
+        while let Some(command) = self.node.poll(self.now, &mut self.outbox, &Plain) {
             actions += 1;
             assert!(actions < 100, "polling ends");
-            self.act(action, dial);
+            self.act(command, dial);
         }
         assert!(self.node.next_deadline() > self.now, "nothing due remains after a poll");
     }
 
-    fn act(&mut self, action: Action, dial: u64) {
-        match action {
-            Action::Dial { identity, .. } => {
+    fn act(&mut self, command: Command, dial: u64) {
+        match command {
+            Command::Dial { identity, .. } => {
                 let free = (6..12).find(|link| !self.open.contains(link));
                 match (dial % 3, free) {
                     (0, _) | (_, None) => self.node.dial_failed(self.now, identity.as_ref()),
@@ -95,28 +95,24 @@ impl Port {
                     (_, Some(_)) => {}
                 }
             }
-            Action::Supersede { old, new, reason } => {
-                assert!(self.open.contains(&new.0), "{new:?} waits");
-                self.open.remove(&old.0);
-                assert_eq!(self.node.left(self.now, old, reason), None);
-            }
-            Action::Admit { new } => {
-                assert!(self.open.contains(&new.0), "{new:?} waits");
-                let known = self.node.node_of(new).expect("who is admitted has joined");
-                assert_eq!(known.link(), Some(new));
-            }
-            Action::Refuse { new, .. } => {
-                assert!(self.open.remove(&new.0), "{new:?} waits");
-                assert_eq!(self.node.left(self.now, new, CloseReason::Reset), None);
+            Command::Tell(link, directive) => {
+                assert!(self.open.contains(&link.0), "{link:?} is told {directive:?}");
+                match directive {
+                    Directive::Challenge => {}
+                    Directive::Admit => {
+                        let known = self.node.node_of(link).expect("who is admitted has joined");
+                        assert_eq!(known.link(), Some(link));
+                    }
+                    Directive::Refuse(refusal) => self.left(link.0, CloseReason::Refused(refusal)),
+                    Directive::Close(reason) => self.left(link.0, reason),
+                }
             }
         }
     }
 
     fn left(&mut self, link: u16, reason: CloseReason) {
         self.open.remove(&link);
-        if let Some(action) = self.node.left(self.now, LinkId(link), reason) {
-            self.act(action, 0);
-        }
+        self.node.left(self.now, LinkId(link), reason);
     }
 
     fn step(&mut self, step: &Step) {
@@ -138,11 +134,7 @@ impl Port {
                 self.node.hear(self.now, address(u32::from(who) + 1, 7_001), &announce_bytes(&announce));
             }
             Step::Admit { who, epoch, link } => self.admit(who, epoch, link),
-            Step::Answered(link) => {
-                if let Some(action) = self.node.challenge_answered(self.now, LinkId(link)) {
-                    self.act(action, 0);
-                }
-            }
+            Step::Answered(link) => self.node.challenge_answered(self.now, LinkId(link)),
             Step::Left(link, reason) => {
                 let link = if reason % 2 == 0 { link } else { link + 6 };
                 let reason = match reason {
@@ -174,7 +166,7 @@ impl Port {
                 assert_eq!(known.identity, hello.identity);
             }
             Admission::Refuse(refusal) => self.left(link, CloseReason::Refused(refusal)),
-            Admission::Challenge { old } => assert!(self.open.contains(&old.0) && old.0 != link),
+            Admission::Wait => {}
         }
     }
 

@@ -133,7 +133,7 @@ fn an_answer_to_this_units_question_is_dialled_at_once_and_to_another_never() {
     assert_eq!(node.counters.value(NodeCounter::Unasked), 1);
     assert_eq!(node.poll(at(60), &mut outbox, &Plain), None);
     node.hear(at(61), address(1, 7_001), &announce_bytes(&announce_of(&depot, 1, nonce)));
-    let dial = Action::Dial { to: address(1, 7_000), identity: Some(depot.identity) };
+    let dial = Command::Dial { to: address(1, 7_000), identity: Some(depot.identity) };
     assert_eq!(node.poll(at(61), &mut outbox, &Plain), Some(dial));
 }
 
@@ -171,7 +171,7 @@ fn own_s_units_ask_a_manager_that_broadcasts_and_dial_it_when_it_answers() {
     assert_eq!((*to, question.wanted, question.expected), (address(1, 7_001), Some(manager()), 0));
     assert_eq!(question.nonce, node.search.nonce);
     node.answered(at(500), address(1, 7_001), &announce_of(&m_unit(MANAGER, MANAGER_ID), 2, 0));
-    assert!(matches!(run(&mut node, at(501), &mut Outbox::default())[..], [(_, Action::Dial { .. })]));
+    assert!(matches!(run(&mut node, at(501), &mut Outbox::default())[..], [(_, Command::Dial { .. })]));
     assert!(questions(&[1, short_hash(&config.identity)]).1.is_empty());
 }
 
@@ -201,13 +201,13 @@ fn two_addresses_that_have_answered_are_dialled_side_by_side() {
     node.dialing(Some(&depot.identity), LinkId(0));
     node.answered(at(2), address(1, 7_001), &announce_of(&depot, 2, 0));
     let actions = run(&mut node, at(1_000), &mut outbox);
-    let Some((when, Action::Dial { to, .. })) = actions.first() else { panic!("{actions:?}") };
+    let Some((when, Command::Dial { to, .. })) = actions.first() else { panic!("{actions:?}") };
     assert!(*to == address(1, 7_000) && *when <= at(400) && actions.len() == 1, "{actions:?}");
     // There may be no room for another link: the first one goes on.
     node.dial_failed(at(1_000), Some(&depot.identity));
     assert_eq!(node.node(&depot.identity).map(Known::state), Some(NodeState::Dialing));
     node.dialing(Some(&depot.identity), LinkId(1));
-    assert_eq!(node.left(at(2_001), LinkId(0), CloseReason::HelloTimeout), None);
+    node.left(at(2_001), LinkId(0), CloseReason::HelloTimeout);
     join(&mut node, at(2_002), 1, &depot);
     assert_eq!(node.node(&depot.identity).map(Known::link), Some(Some(LinkId(1))));
 }
@@ -230,7 +230,7 @@ fn of_two_m_units_the_smaller_dials_and_the_larger_answers() {
     assert_eq!(outbox.sent.iter().map(|(to, _)| *to).collect::<Vec<_>>(), [address(1, 7_001); 2]);
     assert_eq!(as_announce(&outbox.sent[1].1).nonce, 77, "the answer to the broadcast");
     of_small.hear(at(200), address(2, 7_001), &outbox.sent[0].1);
-    let dial = Action::Dial { to: address(2, 7_000), identity: Some(large.identity) };
+    let dial = Command::Dial { to: address(2, 7_000), identity: Some(large.identity) };
     assert_eq!(run(&mut of_small, at(200), &mut Outbox::default()), [(at(200), dial)]);
 }
 
@@ -415,7 +415,7 @@ fn the_smaller_m_unit_dials_again_and_again() {
     let mut last = now + Duration::from_secs(5);
     while pauses.len() < 8 {
         now = node.next_deadline();
-        if let Some(Action::Dial { to, .. }) = node.poll(now, &mut Outbox::default(), &Plain) {
+        if let Some(Command::Dial { to, .. }) = node.poll(now, &mut Outbox::default(), &Plain) {
             assert_eq!(to, address(2, 7_000));
             pauses.push(now.since(last));
             last = now;
@@ -434,7 +434,7 @@ fn a_fixed_address_is_dialled_without_any_broadcast() {
     while dials < 5 {
         let now = node.next_deadline();
         if let Some(action) = node.poll(now, &mut outbox, &Plain) {
-            assert_eq!(action, Action::Dial { to, identity: Some(m_unit(MANAGER, MANAGER_ID).identity) });
+            assert_eq!(action, Command::Dial { to, identity: Some(m_unit(MANAGER, MANAGER_ID).identity) });
             node.dialing(Some(&m_unit(MANAGER, MANAGER_ID).identity), LinkId(0));
             node.left(now + Duration::from_secs(1), LinkId(0), CloseReason::DialFailed);
             dials += 1;
@@ -444,7 +444,7 @@ fn a_fixed_address_is_dialled_without_any_broadcast() {
     node.hear(at(100), address(1, 7_001), &announce_bytes(&announce_of(&m_unit(MANAGER, MANAGER_ID), 1, 0)));
     node.broadcast(at(101));
     let action = run(&mut node, at(101), &mut outbox).pop().map(|(_, action)| action);
-    assert!(matches!(action, Some(Action::Dial { to: found, .. }) if found == to), "{action:?}");
+    assert!(matches!(action, Some(Command::Dial { to: found, .. }) if found == to), "{action:?}");
     assert!(outbox.broadcasts.is_empty());
 }
 
@@ -514,7 +514,7 @@ fn an_m_unit_that_cannot_reach_a_peer_any_more_asks_where_it_is() {
     while node.next_deadline() < at(200_000) {
         let now = node.next_deadline();
         let mut outbox = Outbox::default();
-        if let Some(Action::Dial { identity, .. }) = node.poll(now, &mut outbox, &Plain) {
+        if let Some(Command::Dial { identity, .. }) = node.poll(now, &mut outbox, &Plain) {
             node.dial_failed(now, identity.as_ref());
         }
         searches.extend(outbox.broadcasts.iter().map(|_| now));
@@ -523,7 +523,7 @@ fn an_m_unit_that_cannot_reach_a_peer_any_more_asks_where_it_is() {
     let moved = announce_of(&peer, 2, node.search.nonce);
     node.hear(at(200_000), address(3, 7_001), &announce_bytes(&moved));
     let actions = run(&mut node, at(200_001), &mut Outbox::default());
-    assert!(matches!(actions[..], [(_, Action::Dial { to, .. })] if to == address(3, 7_000)), "{actions:?}");
+    assert!(matches!(actions[..], [(_, Command::Dial { to, .. })] if to == address(3, 7_000)), "{actions:?}");
 }
 
 /// Secured mode with the fleet's code alone: there is no key of any pair.

@@ -89,7 +89,7 @@ impl Fleet1000 {
     fn work(&mut self, index: usize, now: Instant) {
         let mut outbox = Outbox::default();
         while let Some(action) = self.units[index].poll(now, &mut outbox, &Plain) {
-            let Action::Dial { to, .. } = action else { panic!("{action:?}") };
+            let Command::Dial { to, .. } = action else { panic!("{action:?}") };
             assert_eq!(to, address(1, 7_000));
             self.connect(index, now);
         }

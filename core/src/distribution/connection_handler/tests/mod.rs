@@ -185,8 +185,8 @@ pub(super) fn as_announce(bytes: &[u8]) -> Announce {
     }
 }
 
-/// Polls at each deadline up to `end`; returns the actions and when each came.
-pub(super) fn run(node: &mut Node<Boxed>, end: Instant, outbox: &mut Outbox) -> Vec<(Instant, Action)> {
+/// Polls at each deadline up to `end`; returns the commands and when each came.
+pub(super) fn run(node: &mut Node<Boxed>, end: Instant, outbox: &mut Outbox) -> Vec<(Instant, Command)> {
     let mut actions = Vec::new();
     for _ in 0..100_000 {
         let now = node.next_deadline();
@@ -201,6 +201,16 @@ pub(super) fn run(node: &mut Node<Boxed>, end: Instant, outbox: &mut Outbox) -> 
     panic!("the node never rests");
 }
 
+/// What is to be done at once.
+pub(super) fn due(node: &mut Node<Boxed>, now: Instant) -> Vec<Command> {
+    core::iter::from_fn(|| node.poll(now, &mut Outbox::default(), &Plain)).collect()
+}
+
+/// What a link is told.
+pub(super) fn tell(link: u16, directive: Directive) -> Command {
+    Command::Tell(LinkId(link), directive)
+}
+
 /// Lets a unit join.
 pub(super) fn join(node: &mut Node<Boxed>, now: Instant, link: u16, config: &NodeConfig) {
     let from = address(config.identity.id(), 40_000);
@@ -213,7 +223,7 @@ pub(super) fn dial_manager(node: &mut Node<Boxed>, now: Instant, sequence: u32) 
     node.answered(now, address(1, 7_001), &announce);
     let actions = run(node, now + Duration::from_millis(200), &mut Outbox::default());
     match actions.as_slice() {
-        [(_, Action::Dial { to, identity: Some(identity) })] if manager().is(identity) => *to,
+        [(_, Command::Dial { to, identity: Some(identity) })] if manager().is(identity) => *to,
         other => panic!("one dial of the manager was expected: {other:?}"),
     }
 }

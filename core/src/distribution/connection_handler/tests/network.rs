@@ -185,7 +185,7 @@ impl Network {
         let mut outbox = Outbox::default();
         while let Some(node) = &mut self.units[index].node {
             let Some(action) = node.poll(now, &mut outbox, &Plain) else { break };
-            let Action::Dial { to, identity } = action else { panic!("{action:?}") };
+            let Command::Dial { to, identity } = action else { panic!("{action:?}") };
             node.dialing(identity.as_ref(), LinkId(0));
             self.dials += 1;
             let life = self.units[index].life;

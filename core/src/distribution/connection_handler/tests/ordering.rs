@@ -58,7 +58,7 @@ fn any_order_of_six_datagrams_ends_in_the_same_state() {
     let dialled: Vec<_> = run(&mut node, at(200), &mut Outbox::default())
         .into_iter()
         .map(|(_, action)| match action {
-            Action::Dial { to, .. } => to.port(),
+            Command::Dial { to, .. } => to.port(),
             other => panic!("{other:?}"),
         })
         .collect();

@@ -15,18 +15,19 @@ fn challenged() -> Node<Boxed> {
     let agv = s_unit("agv", 1);
     join(&mut node, at(1), 0, &agv);
     let admission = node.admit(at(1_000), LinkId(1), address(1, 41_000), &reborn(&agv));
-    assert_eq!(admission, Admission::Challenge { old: LinkId(0) });
+    assert_eq!(admission, Admission::Wait);
+    assert_eq!(due(&mut node, at(1_000)), [tell(0, Directive::Challenge)]);
     node
 }
 
 #[test]
 fn an_old_link_that_answers_stays_and_the_newcomer_is_a_duplicate() {
     let mut node = challenged();
-    let action = node.challenge_answered(at(1_100), LinkId(0));
-    assert_eq!(action, Some(Action::Refuse { new: LinkId(1), refusal: Refusal::DuplicateIdentity }));
-    assert_eq!(node.challenge_answered(at(1_101), LinkId(0)), None);
+    node.challenge_answered(at(1_100), LinkId(0));
+    assert_eq!(due(&mut node, at(1_100)), [tell(1, Directive::Refuse(Refusal::DuplicateIdentity))]);
+    node.challenge_answered(at(1_101), LinkId(0));
     assert_eq!(run(&mut node, at(2_000), &mut Outbox::default()), []);
-    assert_eq!(node.left(at(2_001), LinkId(1), CloseReason::Reset), None);
+    node.left(at(2_001), LinkId(1), CloseReason::Reset);
     let known = node.node_of(LinkId(0)).unwrap();
     assert_eq!((known.epoch, node.connected()), (Epoch(1), 1));
     let finding = node.findings().next().unwrap();
@@ -37,22 +38,24 @@ fn an_old_link_that_answers_stays_and_the_newcomer_is_a_duplicate() {
 #[test]
 fn an_old_link_that_is_silent_is_superseded_in_time() {
     let mut node = challenged();
-    let actions = run(&mut node, at(2_000), &mut Outbox::default());
-    let reason = CloseReason::PeerRestarted;
-    assert_eq!(
-        actions,
-        [(at(1_000) + CHALLENGE_TIMEOUT, Action::Supersede { old: LinkId(0), new: LinkId(1), reason })]
-    );
-    assert_eq!(node.left(at(2_001), LinkId(0), reason), None, "the old link's end is no news");
+    let commands = run(&mut node, at(2_000), &mut Outbox::default());
+    let (when, reason) = (at(1_000) + CHALLENGE_TIMEOUT, CloseReason::PeerRestarted);
+    assert_eq!(commands, [(when, tell(0, Directive::Close(reason)))]);
+    node.challenge_answered(at(2_000), LinkId(0));
+    assert_eq!(due(&mut node, at(2_000)), [], "too late");
+    node.left(at(2_001), LinkId(0), reason);
+    assert_eq!(due(&mut node, at(2_001)), [tell(1, Directive::Admit)]);
     assert_eq!(node.node_of(LinkId(1)).map(|known| known.epoch), Some(Epoch(999)));
     assert_eq!((node.connected(), node.counters.value(NodeCounter::Restarted)), (1, 1));
-    assert_eq!(node.challenge_answered(at(2_002), LinkId(0)), None, "too late");
+    node.challenge_answered(at(2_002), LinkId(0));
+    assert_eq!(due(&mut node, at(2_002)), [], "too late");
 }
 
 #[test]
 fn an_old_link_that_breaks_lets_the_newcomer_in_at_once() {
     let mut node = challenged();
-    assert_eq!(node.left(at(1_001), LinkId(0), CloseReason::Reset), Some(Action::Admit { new: LinkId(1) }));
+    node.left(at(1_001), LinkId(0), CloseReason::Reset);
+    assert_eq!(due(&mut node, at(1_001)), [tell(1, Directive::Admit)]);
     assert_eq!(node.node_of(LinkId(1)).map(Known::link), Some(Some(LinkId(1))));
     assert_eq!(run(&mut node, at(2_000), &mut Outbox::default()), []);
     assert_eq!(node.connected(), 1);
@@ -61,8 +64,8 @@ fn an_old_link_that_breaks_lets_the_newcomer_in_at_once() {
 #[test]
 fn a_newcomer_that_gives_up_leaves_everything_as_it_was() {
     let mut node = challenged();
-    assert_eq!(node.left(at(1_001), LinkId(1), CloseReason::Reset), None);
-    assert_eq!(node.challenge_answered(at(1_002), LinkId(0)), None);
+    node.left(at(1_001), LinkId(1), CloseReason::Reset);
+    node.challenge_answered(at(1_002), LinkId(0));
     assert_eq!(run(&mut node, at(2_000), &mut Outbox::default()), []);
     assert_eq!(node.node_of(LinkId(0)).map(|known| known.epoch), Some(Epoch(1)));
 }
@@ -73,12 +76,10 @@ fn the_link_of_a_refused_newcomer_is_no_nodes_link() {
     for hello in [reborn(&s_unit("agv", 1)), hello_of(&s_unit("agv", 1))] {
         let mut node = depot();
         join(&mut node, at(1), 0, &s_unit("agv", 1));
-        assert_eq!(
-            node.admit(at(1_000), LinkId(1), address(1, 41_000), &hello),
-            Admission::Challenge { old: LinkId(0) }
-        );
+        assert_eq!(node.admit(at(1_000), LinkId(1), address(1, 41_000), &hello), Admission::Wait);
         assert!(node.node_of(LinkId(1)).is_none() && node.table.of_link(LinkId(1)).is_some());
-        assert!(matches!(node.challenge_answered(at(1_001), LinkId(0)), Some(Action::Refuse { new: LinkId(1), .. })));
+        node.challenge_answered(at(1_001), LinkId(0));
+        assert!(matches!(due(&mut node, at(1_001))[..], [Command::Tell(LinkId(1), Directive::Refuse(_))]));
         assert_eq!(node.table.of_link(LinkId(1)), None);
         assert!(node.node_of(LinkId(0)).is_some());
     }
@@ -90,7 +91,8 @@ fn a_second_newcomer_is_refused() {
     let third = node.admit(at(1_001), LinkId(2), address(1, 42_000), &reborn(&s_unit("agv", 1)));
     assert_eq!(third, Admission::Refuse(Refusal::DuplicateIdentity));
     node.left(at(1_002), LinkId(2), CloseReason::Reset);
-    assert!(matches!(run(&mut node, at(2_000), &mut Outbox::default())[..], [(_, Action::Supersede { .. })]));
+    let commands = run(&mut node, at(2_000), &mut Outbox::default());
+    assert!(matches!(commands[..], [(_, Command::Tell(LinkId(0), Directive::Close(_)))]), "{commands:?}");
 }
 
 #[test]
@@ -99,13 +101,15 @@ fn a_peer_that_dials_again_in_one_life_waits_for_its_old_link_to_show_itself() {
     let mut node = depot();
     join(&mut node, at(1), 0, &agv);
     let again = |node: &mut Node<Boxed>| node.admit(at(1_000), LinkId(1), address(1, 41_000), &hello_of(&agv));
-    assert_eq!(again(&mut node), Admission::Challenge { old: LinkId(0) });
-    let refusal = Refusal::AlreadyConnected;
-    assert_eq!(node.challenge_answered(at(1_001), LinkId(0)), Some(Action::Refuse { new: LinkId(1), refusal }));
-    assert_eq!(again(&mut node), Admission::Challenge { old: LinkId(0) });
-    let actions = run(&mut node, at(1_500), &mut Outbox::default());
-    let reason = CloseReason::Reset;
-    assert_eq!(actions, [(at(1_300), Action::Supersede { old: LinkId(0), new: LinkId(1), reason })]);
+    assert_eq!(again(&mut node), Admission::Wait);
+    assert_eq!(due(&mut node, at(1_000)), [tell(0, Directive::Challenge)]);
+    node.challenge_answered(at(1_001), LinkId(0));
+    assert_eq!(due(&mut node, at(1_001)), [tell(1, Directive::Refuse(Refusal::AlreadyConnected))]);
+    assert_eq!(again(&mut node), Admission::Wait);
+    let commands = run(&mut node, at(1_500), &mut Outbox::default());
+    let superseded =
+        [(at(1_000), tell(0, Directive::Challenge)), (at(1_300), tell(0, Directive::Close(CloseReason::Reset)))];
+    assert_eq!(commands, superseded);
     assert_eq!(node.counters.value(NodeCounter::Restarted), 0);
 }
 

@@ -8,6 +8,7 @@ use super::super::{Call, RequestOptions};
 use super::setup::{self, Handler, Run};
 use super::side::{Arguments, Begun, Happened, Side, Table, context};
 use crate::config::{Constraints, Priority};
+use crate::distribution::connection_handler::Directive;
 use crate::distribution::function::Definition;
 use crate::distribution::function_list::{Generation, Slot};
 use crate::distribution::message::RequestHeader;
@@ -62,8 +63,10 @@ impl Side {
 
     /// Publishes everything that it offers.
     pub(super) fn publish(&mut self) -> u32 {
-        let slots: Vec<Slot> = self.functions.iter().map(|function| function.slot).collect();
-        self.session.publish(context!(self), slots.into_iter())
+        for function in self.functions.iter() {
+            self.hub.hub.publications.publish_to_all(function.slot).unwrap();
+        }
+        self.session.publish(context!(self))
     }
 
     pub(super) fn is_live(&self, slot: Slot) -> bool {
@@ -116,12 +119,9 @@ impl Side {
         self.session.close(context!(self), reason);
     }
 
-    pub(super) fn accept(&mut self) {
-        self.session.accept(context!(self));
-    }
-
-    pub(super) fn challenge(&mut self) {
-        self.session.challenge(context!(self));
+    /// What the hub tells the link because of another one.
+    pub(super) fn direct(&mut self, directive: Directive) {
+        self.session.direct(context!(self), directive);
     }
 
     pub(super) fn release(&mut self, slot: Slot) -> Result<(), Error> {
@@ -143,6 +143,7 @@ impl Side {
     }
 
     pub(super) fn withdraw(&mut self, slot: Slot) -> u32 {
+        self.hub.hub.publications.withdraw(slot);
         self.session.withdraw(context!(self), slot)
     }
 

@@ -7,6 +7,7 @@ use super::pair::{Happened, Pair};
 use super::setup::Setup;
 use super::side::Side;
 use super::{none, text, x};
+use crate::distribution::connection_handler::Directive;
 use crate::distribution::function_list::TheirFunctionList;
 use crate::error::{CloseReason, Error};
 use crate::storage::Boxed;
@@ -120,7 +121,7 @@ fn a_link_that_has_ended_does_and_keeps_nothing() {
     for side in [&mut pair.manager, &mut pair.agv] {
         assert_eq!(side.release(slot), Err(Error::NotConnected));
         side.end_lease(slot);
-        side.challenge();
+        side.direct(Directive::Challenge);
         side.publish();
         side.withdraw(slot);
         side.flush_gathered();
@@ -148,7 +149,7 @@ fn a_call_that_runs_when_the_link_ends_may_still_be_answered() {
 #[test]
 fn a_link_that_was_never_live_ends_as_well() {
     let mut pair = Pair::connected(&Setup::default());
-    pair.agv.decision = None;
+    pair.agv.hub.waits = true;
     pair.settle();
     pair.cut();
     assert!(pair.agv.has(&Happened::Closed(CloseReason::Reset)));

@@ -1,8 +1,9 @@
 //! How a link begins.
 
 use super::pair::{Happened, Pair};
-use super::setup::Setup;
+use super::setup::{self, Setup};
 use crate::config::HELLO_TIMEOUT;
+use crate::distribution::connection_handler::Directive;
 use crate::distribution::identity::Identity;
 use crate::error::{CloseReason, Refusal};
 use crate::time::Duration;
@@ -12,8 +13,10 @@ fn both_ends_learn_who_the_other_is() {
     let pair = Pair::live();
     assert_eq!(pair.manager.session.identity(), Some(&Identity::s_unit("agv-01", 1).unwrap()));
     assert_eq!(pair.agv.session.identity(), Some(&Identity::m_unit("manager", 1).unwrap()));
-    assert_eq!(pair.manager.happened, [Happened::Hello]);
-    assert_eq!(pair.agv.happened, [Happened::Hello]);
+    for side in [&pair.manager, &pair.agv] {
+        assert_eq!(side.happened.first(), Some(&Happened::Joined));
+        assert_eq!(side.count(|happened| *happened == Happened::Joined), 1);
+    }
 }
 
 #[test]
@@ -21,7 +24,7 @@ fn a_refusal_tells_the_reason_to_both() {
     for side_refuses in [true, false] {
         let mut pair = Pair::connected(&Setup::default());
         let refuses = if side_refuses { &mut pair.manager } else { &mut pair.agv };
-        refuses.decision = Some(Err(Refusal::WrongManager));
+        refuses.hub.hub = setup::hub(!side_refuses, "another");
         pair.settle();
         let closed = Happened::Closed(CloseReason::Refused(Refusal::WrongManager));
         assert!(pair.manager.has(&closed), "{:?}", pair.manager.happened);
@@ -66,13 +69,13 @@ fn what_is_no_hello_ends_the_link() {
 #[test]
 fn what_follows_the_hello_waits_for_the_decision() {
     let mut pair = Pair::connected(&Setup::default());
-    pair.agv.decision = None;
+    pair.agv.hub.waits = true;
     pair.settle();
     pair.manager.offer("stop()", |_| Ok(()));
     pair.manager.publish();
     pair.settle();
     assert!(pair.agv.session.their_function_list().is_empty());
-    pair.agv.accept();
+    pair.agv.direct(Directive::Admit);
     pair.settle();
     assert_eq!(pair.agv.session.their_function_list().len(), 1);
 }
@@ -80,12 +83,13 @@ fn what_follows_the_hello_waits_for_the_decision() {
 #[test]
 fn a_challenge_is_answered_once_and_only_on_a_live_link() {
     let mut pair = Pair::connected(&Setup::default());
-    pair.manager.challenge();
+    pair.manager.direct(Directive::Challenge);
     pair.settle();
     assert!(pair.manager.session.is_live(), "{:?}", pair.agv.happened);
-    assert!(!pair.manager.has(&Happened::Answered));
-    pair.manager.challenge();
+    let entered = |pair: &Pair| (pair.manager.hub.entered, pair.agv.hub.entered);
+    let before = entered(&pair);
+    pair.manager.direct(Directive::Challenge);
     pair.settle();
-    assert_eq!(pair.manager.count(|happened| *happened == Happened::Answered), 1);
-    assert!(!pair.agv.has(&Happened::Answered));
+    assert_eq!(entered(&pair), (before.0 + 1, before.1), "it is in the stream and in several datagrams");
+    assert!(!pair.manager.has(&Happened::Answered), "only a ping is told of");
 }

@@ -5,6 +5,7 @@ use super::net::Datagrams;
 use super::pair::{Happened, Pair};
 use super::{none, x};
 use crate::config::Priority;
+use crate::distribution::connection_handler::Directive;
 use crate::distribution::function_list::Slot;
 use crate::distribution::message::{Renewal, SessionBody};
 use crate::error::Error;
@@ -178,7 +179,7 @@ fn a_release_that_finds_no_room_is_sent_when_there_is_some() {
     // The stream is stuck and full to the brim; no datagram passes.
     (pair.manager.net.frozen, pair.manager.net.capacity, pair.manager.net.datagrams) = (true, 0, Datagrams::Lost);
     for _ in 0..1_000 {
-        pair.manager.challenge();
+        pair.manager.direct(Directive::Challenge);
     }
     let withheld = pair.manager.counter(LinkCounter::FramesWithheld);
     let second = go(&mut pair, Priority::High, true);

@@ -6,16 +6,19 @@ use std::vec;
 use super::super::{Publication, SessionStorage, buffer_bytes};
 use super::net::DATAGRAM_PORT;
 use crate::config::{Constraints, LINK_BUFFER_BYTES, Priority};
+use crate::distribution::connection_handler::{Node, NodeConfig, NodeStorage, Target};
 use crate::distribution::function::{Attributes, Definition};
 use crate::distribution::function_list::{Entry, FunctionList};
-use crate::distribution::hello::{Hello, Limits};
+use crate::distribution::hello::{Hello, Limits, Manager};
 use crate::distribution::identity::{Epoch, Fleet, Identity};
 use crate::distribution::parameters::ParametersView;
 use crate::error::Error;
+use crate::services::hub::Hub;
 use crate::services::lease::{Lease, Service};
+use crate::services::publications::Publications;
 use crate::services::slots_for;
 use crate::storage::{Boxed, Pool};
-use crate::time::Duration;
+use crate::time::{Duration, Instant};
 
 /// What may differ between pairs.
 pub(super) struct Setup {
@@ -87,7 +90,7 @@ pub(super) fn hello(constraints: &Constraints, agv: bool, datagrams: bool) -> He
     Hello {
         fleet: Fleet(1),
         identity: if agv { Identity::s_unit("agv-01", 1) } else { Identity::m_unit("manager", 1) }.unwrap(),
-        wanted: None,
+        wanted: agv.then(|| Manager::new("manager", 1).unwrap()),
         epoch: Epoch(1),
         nonce: if agv { 0xA61 } else { 0x3A6A6E2 },
         term: 0,
@@ -103,6 +106,30 @@ pub(super) fn hello(constraints: &Constraints, agv: bool, datagrams: bool) -> He
         stamp: 0,
         keep_alive: constraints.keep_alive.as_millis() as u32,
     }
+}
+
+/// The hub of an end whose manager has this name.
+pub(super) fn hub(agv: bool, manager: &str) -> Hub<Boxed> {
+    let target = if agv { Target::Manager(Manager::new(manager, 1).unwrap()) } else { Target::Everybody };
+    let identity = if agv { Identity::s_unit("agv-01", 1) } else { Identity::m_unit(manager, 1) }.unwrap();
+    let config = NodeConfig {
+        identity,
+        fleet: Fleet(1),
+        epoch: Epoch(1),
+        target,
+        tcp_port: 0,
+        udp_port: 0,
+        constraints: Constraints::M_UNIT,
+        seed: 1,
+    };
+    let storage = NodeStorage {
+        nodes: vec![None; 4].into_boxed_slice(),
+        order: vec![Default::default(); 4].into_boxed_slice(),
+        links: vec![None; 4].into_boxed_slice(),
+        findings: vec![None; 4].into_boxed_slice(),
+    };
+    let publications = Publications::new(vec![false; 16].into_boxed_slice(), vec![None; 16].into_boxed_slice());
+    Hub { node: Node::new(Instant::START, config, storage), publications }
 }
 
 pub(super) fn storage(running: usize, their_functions: usize) -> SessionStorage<Boxed> {

@@ -12,10 +12,11 @@ use super::setup::{self, Handler, Run, Setup};
 use crate::config::Priority;
 use crate::distribution::function_list::{FunctionList, Slot};
 use crate::distribution::parameters::Parameters;
-use crate::error::{CloseReason, Error, Refusal};
+use crate::error::{CloseReason, Error};
 use crate::host::mailman::LinkId;
 use crate::host::secure::Plain;
 use crate::services::access::{Access, Decision, Principal, Rule, Verb, decide};
+use crate::services::hub::{Door, Hub};
 use crate::services::lease::LeaseEnd;
 use crate::services::requests::CallId;
 use crate::services::{Context, Port};
@@ -28,8 +29,7 @@ pub(super) type Arguments = Box<Parameters<24_576>>;
 /// An event without what it borrows.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Happened {
-    Introduced,
-    Hello,
+    Joined,
     Reply(CallId, Result<(), Error>),
     Failed(CallId, Error),
     ListChanged,
@@ -74,6 +74,22 @@ impl Port for Tested {
     type Cipher = Plain;
 }
 
+/// A hub that can be kept from deciding.
+pub(super) struct Lobby {
+    pub(super) hub: Hub<Boxed>,
+    pub(super) waits: bool,
+    pub(super) entered: usize,
+}
+
+impl Door<Boxed> for Lobby {
+    fn enter(&mut self, act: &mut dyn FnMut(&mut Hub<Boxed>)) {
+        self.entered += 1;
+        if !self.waits {
+            act(&mut self.hub);
+        }
+    }
+}
+
 /// One end.
 pub(super) struct Side {
     pub(super) now: Instant,
@@ -86,8 +102,7 @@ pub(super) struct Side {
     pub(super) happened: Vec<Happened>,
     /// Calls that wait for an answer of the test.
     pub(super) held: Vec<Call>,
-    /// What the node answers a hello; `None` lets it wait.
-    pub(super) decision: Option<Result<(), Refusal>>,
+    pub(super) hub: Lobby,
     pub(super) inbox: Vec<u8>,
     pub(super) received: usize,
     /// Where the results of calls go.
@@ -107,6 +122,8 @@ macro_rules! context {
             buffers: &mut $side.pool,
             functions: &$side.functions,
             access: $side.table.as_ref().map(|table| table as &dyn crate::services::access::Access),
+            hub: &mut $side.hub,
+            keys: &mut (),
         }
     };
 }
@@ -134,7 +151,7 @@ impl Side {
             net: Net::default(),
             happened: Vec::new(),
             held: Vec::new(),
-            decision: Some(Ok(())),
+            hub: Lobby { hub: setup::hub(agv, "manager"), waits: false, entered: 0 },
             inbox: Vec::new(),
             received: 0,
             results: BTreeMap::new(),
@@ -240,13 +257,7 @@ impl Side {
 
     fn note(&mut self, event: Option<Happened>) {
         let Some(event) = event else { return };
-        let decision = self.decision.filter(|_| event == Happened::Hello);
         self.happened.push(event);
-        match decision {
-            Some(Ok(())) => self.session.accept(context!(self)),
-            Some(Err(refusal)) => self.session.refuse(context!(self), refusal),
-            None => {}
-        }
     }
 
     pub(super) fn end(&mut self) {
@@ -263,8 +274,7 @@ impl Happened {
 
 fn own(event: Event<'_>) -> Happened {
     match event {
-        Event::Introduced => Happened::Introduced,
-        Event::Hello => Happened::Hello,
+        Event::Joined => Happened::Joined,
         Event::Reply(id, Err(error)) => Happened::Reply(id, Err(error)),
         Event::Failed(id, error) => Happened::Failed(id, error),
         Event::ListChanged => Happened::ListChanged,

@@ -3,7 +3,7 @@
 use std::net::{Ipv4Addr, SocketAddr};
 
 use cara_core::config::{Constraints, LINK_BUFFER_BYTES, PLAIN_PORT};
-use cara_core::distribution::connection_handler::{Action, Admission, Node, NodeConfig, NodeStorage, Sorted, Target};
+use cara_core::distribution::connection_handler::{Command, Node, NodeConfig, NodeStorage, Sorted, Target};
 use cara_core::distribution::function::{Attributes, Definition};
 use cara_core::distribution::function_list::FunctionList;
 use cara_core::distribution::identity::{Epoch, Fleet, Identity};
@@ -11,6 +11,8 @@ use cara_core::distribution::parameters::Parameters;
 use cara_core::error::{CloseReason, Error};
 use cara_core::host::mailman::{LinkId, Mailman};
 use cara_core::host::secure::Plain;
+use cara_core::services::hub::Hub;
+use cara_core::services::publications::Publications;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::{Event, RequestOptions, Session, SessionConfig, SessionStorage, buffer_bytes};
 use cara_core::services::{Context, Port};
@@ -60,7 +62,7 @@ impl Port for OnHost {
 pub(crate) struct Manager {
     pub(crate) cable: Cable,
     net: Net,
-    node: Node<Boxed>,
+    hub: Hub<Boxed>,
     sessions: Vec<Option<Session<OnHost>>>,
     functions: FunctionList<Boxed, ()>,
     buffers: Pool<Boxed>,
@@ -142,6 +144,8 @@ macro_rules! context {
             buffers: &mut $manager.buffers,
             functions: &$manager.functions,
             access: None,
+            hub: &mut $manager.hub,
+            keys: &mut (),
         }
     };
 }
@@ -166,12 +170,14 @@ impl Manager {
         };
         let mut functions = FunctionList::new(Boxed::slice(FUNCTIONS), Boxed::slice(FUNCTIONS * 96));
         let mechanic = Definition::parse("mechanic(number: int) -> (number: int)").unwrap();
-        functions.add_function(&mechanic, Attributes::default(), ()).unwrap();
+        let slot = functions.add_function(&mechanic, Attributes::default(), ()).unwrap();
+        let mut publications = Publications::new(Boxed::slice(FUNCTIONS), Boxed::slice(0));
+        publications.publish_to_all(slot).unwrap();
         let size = buffer_bytes(Constraints::M_UNIT.message_size, 0);
         Self {
             net: Net::new(now, &mut cable, host, seed),
             cable,
-            node: Node::new(now, config, storage),
+            hub: Hub { node: Node::new(now, config, storage), publications },
             sessions: (0..LINKS).map(|_| None).collect(),
             functions,
             buffers: Pool::new((0..8).map(|_| Some(Boxed::slice(size))).collect()),
@@ -191,7 +197,7 @@ impl Manager {
     }
 
     pub(crate) fn joined(&self) -> usize {
-        self.node.number_of_s_units()
+        self.hub.node.number_of_s_units()
     }
 
     pub(crate) fn keep_alives_missed(&self) -> u64 {
@@ -233,14 +239,14 @@ impl Manager {
         for index in 0..LINKS {
             self.work(now, index);
         }
-        while let Some(action) = self.node.poll(now, &mut self.net, &Plain) {
-            self.act(now, action);
+        while let Some(command) = self.hub.node.poll(now, &mut self.net, &Plain) {
+            self.act(now, command);
         }
         self.net.interface.poll(smol(now), &mut self.cable, &mut self.net.sockets);
         let due = self.net.interface.poll_at(smol(now), &self.net.sockets);
         let due = due.map_or(Instant::FAR_FUTURE, |due| Instant::from_micros(due.total_micros() as u64));
         let sessions = self.sessions.iter().flatten().map(Session::deadline).min();
-        self.due = due.min(sessions.unwrap_or(Instant::FAR_FUTURE)).min(self.node.next_deadline());
+        self.due = due.min(sessions.unwrap_or(Instant::FAR_FUTURE)).min(self.hub.node.next_deadline());
     }
 
     fn take_datagrams(&mut self, now: Instant) {
@@ -249,7 +255,9 @@ impl Manager {
             let received = self.net.sockets.get_mut::<udp::Socket>(self.net.datagrams).recv_slice(&mut bytes);
             let Ok((length, from)) = received else { return };
             let from = from.endpoint.into();
-            if let Sorted::Session { link, nonce, body } = self.node.datagram(now, from, &mut bytes[..length], &Plain) {
+            if let Sorted::Session { link, nonce, body } =
+                self.hub.node.datagram(now, from, &mut bytes[..length], &Plain)
+            {
                 let index = usize::from(link.0);
                 let Some(session) = &mut self.sessions[index] else { continue };
                 let event = session.datagram(context!(self, now), from, nonce, body);
@@ -285,7 +293,7 @@ impl Manager {
     fn open(&mut self, now: Instant, index: usize) {
         let link = LinkId(index as u16);
         let address: SocketAddr = self.net.stream(index).remote_endpoint().unwrap().into();
-        let local = self.node.hello(now, link);
+        let local = self.hub.node.hello(now, link);
         let storage = SessionStorage {
             small: Boxed::slice(LINK_BUFFER_BYTES),
             pending: Boxed::slice(CALLS),
@@ -319,7 +327,7 @@ impl Manager {
                 self.replies.push((index, id, outcome));
                 None
             }
-            Some(Event::Hello) => Some(Event::Hello),
+            Some(Event::Joined) => Some(Event::Joined),
             Some(Event::Call(call)) => Some(Event::Call(call)),
             _ => None,
         };
@@ -338,7 +346,7 @@ impl Manager {
 
     fn happened(&mut self, now: Instant, index: usize, event: Option<Event<'static>>) {
         match event {
-            Some(Event::Hello) => self.greet(now, index),
+            Some(Event::Joined) => self.live[index] = true,
             Some(Event::Call(call)) => {
                 self.served += 1;
                 let Some(session) = &mut self.sessions[index] else { return };
@@ -348,54 +356,18 @@ impl Manager {
                 let error = outcome.err().unwrap_or(Error::Malformed);
                 self.replies.push((index, id, Err(error)));
             }
-            Some(Event::Answered) => {
-                if let Some(action) = self.node.challenge_answered(now, LinkId(index as u16)) {
-                    self.act(now, action);
-                }
-            }
             Some(Event::Closed(reason)) => self.leave(now, index, reason),
             _ => {}
         }
     }
 
-    fn greet(&mut self, now: Instant, index: usize) {
+    fn act(&mut self, now: Instant, command: Command) {
+        let Command::Tell(link, directive) = command else { unreachable!("a lone manager dials nobody") };
+        let index = usize::from(link.0);
         let Some(session) = &mut self.sessions[index] else { return };
-        let hello = session.hello().unwrap();
-        match self.node.admit(now, LinkId(index as u16), session.address(), hello) {
-            Admission::Accept => self.accept(now, index),
-            Admission::Refuse(refusal) => session.refuse(context!(self, now), refusal),
-            Admission::Challenge { old } => {
-                if let Some(old) = &mut self.sessions[usize::from(old.0)] {
-                    old.challenge(context!(self, now));
-                }
-            }
-        }
-    }
-
-    fn accept(&mut self, now: Instant, index: usize) {
-        let Some(session) = &mut self.sessions[index] else { return };
-        session.accept(context!(self, now));
-        session.publish(context!(self, now), self.functions.iter().map(|function| function.slot));
-        self.live[index] = session.is_live();
-    }
-
-    fn act(&mut self, now: Instant, action: Action) {
-        match action {
-            Action::Dial { .. } => unreachable!("a lone manager dials nobody"),
-            Action::Supersede { old, new, reason } => {
-                if let Some(old) = &mut self.sessions[usize::from(old.0)] {
-                    old.close(context!(self, now), reason);
-                }
-                self.poll_session(now, usize::from(old.0));
-                self.accept(now, usize::from(new.0));
-            }
-            Action::Admit { new } => self.accept(now, usize::from(new.0)),
-            Action::Refuse { new, refusal } => {
-                if let Some(new) = &mut self.sessions[usize::from(new.0)] {
-                    new.refuse(context!(self, now), refusal);
-                }
-            }
-        }
+        let event = session.direct(context!(self, now), directive);
+        self.happened(now, index, event);
+        self.poll_session(now, index);
     }
 
     fn leave(&mut self, now: Instant, index: usize, reason: CloseReason) {
@@ -404,9 +376,7 @@ impl Manager {
         if std::mem::take(&mut self.live[index]) {
             self.left.push((now, reason));
         }
-        if let Some(action) = self.node.left(now, LinkId(index as u16), reason) {
-            self.act(now, action);
-        }
+        self.hub.node.left(now, LinkId(index as u16), reason);
     }
 }
 

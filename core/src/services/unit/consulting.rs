@@ -1,0 +1,93 @@
+//! Where a session meets the hub of its unit: the only place.
+
+use super::inbound::Outcome;
+use super::{Event, Phase, Remote, Session};
+use crate::distribution::connection_handler::{Admission, Directive};
+use crate::error::Refusal;
+use crate::host::secure::Secure;
+use crate::services::{Context, Port};
+
+impl<P: Port> Session<P> {
+    /// The peer has said who it is, or has proven it: what becomes of the link?
+    pub(super) fn consult(&mut self, cx: &mut Context<'_, P>) -> Outcome {
+        let Some(remote) = &self.remote else { return Outcome::Nothing };
+        let (now, link, from, hello) = (cx.now, self.link.id(), self.peer_address, &remote.hello);
+        let mut admission = Admission::Wait;
+        cx.hub.enter(&mut |hub| admission = hub.node.admit(now, link, from, hello));
+        match admission {
+            Admission::Accept => return self.admitted(cx),
+            Admission::Refuse(refusal) => self.refuse(cx, refusal),
+            Admission::Wait => {}
+        }
+        Outcome::Nothing
+    }
+
+    /// The key of the pair, with which each end is to prove who it is. The link ends where there is none.
+    pub(super) fn credentials(&mut self, cx: &mut Context<'_, P>) -> Option<<P::Cipher as Secure>::Credentials> {
+        let Remote { hello, .. } = self.remote.as_ref()?;
+        let credentials = cx.keys.credentials(hello);
+        if credentials.is_none() {
+            let (now, from) = (cx.now, self.peer_address);
+            cx.hub.enter(&mut |hub| hub.node.refuse_without_key(now, from, &hello.identity));
+            self.refuse(cx, Refusal::NoKey);
+        }
+        credentials
+    }
+
+    /// The peer is alive, for which the hub may have asked.
+    pub(super) fn show_life(&mut self, cx: &mut Context<'_, P>) {
+        if core::mem::take(&mut self.challenged) {
+            let (now, link) = (cx.now, self.link.id());
+            cx.hub.enter(&mut |hub| hub.node.challenge_answered(now, link));
+        }
+    }
+
+    /// Does what the hub wants of this link because of another one. What it comes too late for, it passes over.
+    pub fn direct(&mut self, cx: &mut Context<'_, P>, directive: Directive) -> Option<Event<'static>> {
+        match directive {
+            Directive::Challenge => self.challenge(cx),
+            Directive::Admit => {
+                if let Outcome::Event(event) = self.admitted(cx) {
+                    return Some(event);
+                }
+            }
+            Directive::Refuse(refusal) => self.refuse(cx, refusal),
+            Directive::Close(reason) => self.close(cx, reason),
+        }
+        None
+    }
+
+    /// The hub has taken the peer, which is told what is published to it.
+    fn admitted(&mut self, cx: &mut Context<'_, P>) -> Outcome {
+        if self.phase != Phase::Deciding {
+            return Outcome::Nothing;
+        }
+        self.accept(cx);
+        if self.phase != Phase::Live {
+            return Outcome::Nothing;
+        }
+        self.publish(cx);
+        Event::Joined.into()
+    }
+
+    /// Makes what the hub has published to the peer visible to it, as it is now and as far as the access table lets it be
+    /// seen. Returns the serial that comes back with [`Event::Acknowledged`].
+    pub fn publish(&mut self, cx: &mut Context<'_, P>) -> u32 {
+        let Some(remote) = &self.remote else { return 0 };
+        let (functions, publishing, identity) = (cx.functions, &mut self.publishing, &remote.hello.identity);
+        cx.hub.enter(&mut |hub| {
+            let visible = hub.publications.visible_to(identity);
+            visible.for_each(|slot| publishing.want(slot, functions.generation(slot)));
+            publishing.version = hub.publications.version();
+        });
+        self.end_of_changes(cx)
+    }
+
+    /// Whether anything was published since the last [`publish`](Self::publish) here: where others publish meanwhile, a port
+    /// looks once more when they find the link.
+    pub fn is_behind(&self, cx: &mut Context<'_, P>) -> bool {
+        let mut newest = self.publishing.version;
+        cx.hub.enter(&mut |hub| newest = hub.publications.version());
+        newest != self.publishing.version
+    }
+}
