@@ -41,19 +41,19 @@ pub(crate) struct Security {
 }
 
 /// A cable and the attacker behind it.
-struct Seat {
+struct Slot {
     cable: Cable,
     listener: TcpListener,
     place: &'static str,
 }
 
-/// A seat on which power is put, and its board.
-type Powered = Result<(Seat, Board)>;
+/// A slot on which power is put, and its board.
+type Powered = Result<(Slot, Board)>;
 
 /// Boards, a new one for each visit. The bench belongs to another thread, which makes them.
 struct Boards {
-    seats: Mutex<Vec<Seat>>,
-    wanted: Mutex<Sender<(Seat, Sender<Powered>)>>,
+    slots: Mutex<Vec<Slot>>,
+    wanted: Mutex<Sender<(Slot, Sender<Powered>)>>,
     tried: Tried,
     /// How often boards that are gone have logged either.
     logged: Mutex<Counters>,
@@ -62,9 +62,9 @@ struct Boards {
 /// Attacks boards and prints what came of it.
 pub(crate) fn run(bench: &Bench, options: &Security) -> Result<()> {
     let (wanted, asked) = channel();
-    let seats = PLACES.iter().map(|place| seat(bench, place)).collect::<Result<Vec<_>>>()?;
+    let slots = PLACES.iter().map(|place| slot(bench, place)).collect::<Result<Vec<_>>>()?;
     let boards = Boards {
-        seats: Mutex::new(seats),
+        slots: Mutex::new(slots),
         wanted: Mutex::new(wanted),
         tried: tried(&bench.keys)?,
         logged: Mutex::default(),
@@ -88,17 +88,17 @@ fn write(report: &Report, json: Option<&Path>) -> Result<()> {
     json.map_or(Ok(()), |path| report.write(path))
 }
 
-fn seat(bench: &Bench, place: &'static str) -> Result<Seat> {
-    Ok(Seat { cable: bench.cable()?, listener: TcpListener::bind(place)?, place })
+fn slot(bench: &Bench, place: &'static str) -> Result<Slot> {
+    Ok(Slot { cable: bench.cable()?, listener: TcpListener::bind(place)?, place })
 }
 
 /// Puts power on boards as long as anybody wants one.
-fn power(bench: &Bench, asked: &Receiver<(Seat, Sender<Powered>)>) {
-    for (seat, answer) in asked {
-        let who = Who { manager_address: Some(seat.place), ..Who::agv(17) };
-        let board = bench.board(&seat.cable, &who);
+fn power(bench: &Bench, asked: &Receiver<(Slot, Sender<Powered>)>) {
+    for (slot, answer) in asked {
+        let who = Who { manager_address: Some(slot.place), ..Who::agv(17) };
+        let board = bench.board(&slot.cable, &who);
         // The receiver may have given up.
-        let _ = answer.send(board.map(|board| (seat, board)));
+        let _ = answer.send(board.map(|board| (slot, board)));
     }
 }
 
@@ -130,13 +130,13 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 
 impl Boards {
     /// A board with power that has never dialled anybody.
-    fn board(&self) -> Result<(Seat, Board)> {
-        let seat = lock(&self.seats).pop().context("each attacker has a seat")?;
-        seat.listener.set_nonblocking(true)?;
+    fn board(&self) -> Result<(Slot, Board)> {
+        let slot = lock(&self.slots).pop().context("each attacker has a slot")?;
+        slot.listener.set_nonblocking(true)?;
         // What the board before has dialled.
-        while seat.listener.accept().is_ok() {}
+        while slot.listener.accept().is_ok() {}
         let (answer, powered) = channel();
-        lock(&self.wanted).send((seat, answer)).map_err(|_| anyhow::anyhow!("the bench is gone"))?;
+        lock(&self.wanted).send((slot, answer)).map_err(|_| anyhow::anyhow!("the bench is gone"))?;
         powered.recv().context("the bench is gone")?
     }
 }
@@ -155,7 +155,7 @@ fn greeted(listener: &TcpListener) -> Result<TcpStream> {
 /// A board that is powered off when it is dropped.
 struct Guest<'b> {
     boards: &'b Boards,
-    of: Option<(Seat, Board)>,
+    of: Option<(Slot, Board)>,
 }
 
 impl Guest<'_> {
@@ -172,9 +172,9 @@ impl Drop for Guest<'_> {
             *logged.entry(name.to_owned()).or_default() += 1;
         }
         drop(logged);
-        if let Some((seat, board)) = self.of.take() {
+        if let Some((slot, board)) = self.of.take() {
             drop(board);
-            lock(&self.boards.seats).push(seat);
+            lock(&self.boards.slots).push(slot);
         }
     }
 }
@@ -198,8 +198,8 @@ impl Target for Boards {
 
     fn visit(&self) -> Result<Visit<'_>> {
         let guest = Guest { boards: self, of: Some(self.board()?) };
-        let (seat, _) = guest.of.as_ref().context("it has just been given")?;
-        let stream = greeted(&seat.listener)?;
+        let (slot, _) = guest.of.as_ref().context("it has just been given")?;
+        let stream = greeted(&slot.listener)?;
         let seen = move || {
             std::thread::sleep(SETTLING);
             let joins = guest.lines().iter().filter(|line| line.contains("has joined")).count();

@@ -1,4 +1,4 @@
-//! What waits to be written: one lane per class and the urgent frames that go between chunks.
+//! What waits to be written: one queue per class and the urgent frames that go between chunks.
 //!
 //! Frames are sealed just before they are written, in the order in which they go out. What is sealed cannot be
 //! overtaken, so no more is sealed at a time than a chunk, or than the port asks for ([`Mailman::seals_ahead`]), and one
@@ -23,15 +23,15 @@ const EMERGENCY_RESERVE: usize = EMERGENCY_BYTES + 64;
 pub(super) struct Sender<S: Storage> {
     cut: Cut,
     urgent: Urgent<URGENT_BYTES>,
-    lanes: [Option<Lane<S>>; 3],
-    /// The lane whose frames were sealed last and are not all written, or whose message is not complete.
+    queues: [Option<SendQueue<S>>; 3],
+    /// The queue whose frames were sealed last and are not all written, or whose message is not complete.
     current: Option<usize>,
     /// The network did not take all that it was offered, and something of it still waits.
     blocked: bool,
 }
 
 /// The framed messages of one class: written up to `start`, sealed up to `sealed`, filled up to `end`.
-struct Lane<S: Storage> {
+struct SendQueue<S: Storage> {
     buffer: Buffer<S>,
     start: usize,
     sealed: usize,
@@ -54,7 +54,7 @@ impl<S: Storage> Sender<S> {
         Self {
             cut: Cut { chunk: MINIMUM_CHUNK_BYTES, overhead },
             urgent: Urgent::new(),
-            lanes: [const { None }; 3],
+            queues: [const { None }; 3],
             current: None,
             blocked: false,
         }
@@ -70,15 +70,15 @@ impl<S: Storage> Sender<S> {
     }
 
     pub(super) fn queued(&self) -> usize {
-        self.lanes.iter().flatten().map(Lane::waiting).fold(self.urgent.len(), usize::saturating_add)
+        self.queues.iter().flatten().map(SendQueue::waiting).fold(self.urgent.len(), usize::saturating_add)
     }
 
-    /// Whether what waits in the lanes is in the way of one more message of `total` bytes: its class's lane is too full,
-    /// or the other lanes hold the buffer that it needs.
+    /// Whether what waits in the queues is in the way of one more message of `total` bytes: its class's queue is too full,
+    /// or the other queues hold the buffer that it needs.
     pub(super) fn is_in_the_way(&self, buffers: &mut dyn Buffers<S>, priority: Priority, total: usize) -> bool {
-        match lane_index(priority).and_then(|index| self.lanes.get(index)) {
-            Some(Some(lane)) => self.cut.framed_length(total) > lane.room(),
-            Some(None) if self.lanes.iter().any(Option::is_some) => match buffers.take_leaving(LEFT_BY_SENDING) {
+        match queue_index(priority).and_then(|index| self.queues.get(index)) {
+            Some(Some(queue)) => self.cut.framed_length(total) > queue.room(),
+            Some(None) if self.queues.iter().any(Option::is_some) => match buffers.take_leaving(LEFT_BY_SENDING) {
                 Some(buffer) => {
                     buffers.give(buffer);
                     false
@@ -96,17 +96,19 @@ impl<S: Storage> Sender<S> {
         total: usize,
         write: impl FnOnce(&mut ChunkWriter<'_>),
     ) -> Result<(), Error> {
-        let Some(index) = lane_index(priority) else { return self.accept_emergency(total, write) };
-        let slot = self.lanes.get_mut(index).ok_or(Error::Full(Limit::SendQueue))?;
-        let lane = match slot {
-            Some(lane) => lane,
-            None => slot.insert(Lane::new(buffers.take_leaving(LEFT_BY_SENDING).ok_or(Error::Full(Limit::Buffers))?)),
+        let Some(index) = queue_index(priority) else { return self.accept_emergency(total, write) };
+        let slot = self.queues.get_mut(index).ok_or(Error::Full(Limit::SendQueue))?;
+        let queue = match slot {
+            Some(queue) => queue,
+            None => {
+                slot.insert(SendQueue::new(buffers.take_leaving(LEFT_BY_SENDING).ok_or(Error::Full(Limit::Buffers))?))
+            }
         };
-        let Err(error) = lane.append(self.cut, priority, total, write) else { return Ok(()) };
-        if lane.waiting() == 0
-            && let Some(lane) = slot.take()
+        let Err(error) = queue.append(self.cut, priority, total, write) else { return Ok(()) };
+        if queue.waiting() == 0
+            && let Some(queue) = slot.take()
         {
-            buffers.give(lane.buffer);
+            buffers.give(queue.buffer);
         }
         Err(error)
     }
@@ -116,13 +118,13 @@ impl<S: Storage> Sender<S> {
     pub(super) fn takes_at_once(&self, priority: Priority, total: usize) -> bool {
         self.urgent.is_empty()
             && !self.blocked
-            && self.lanes.iter().all(Option::is_none)
+            && self.queues.iter().all(Option::is_none)
             && priority != Priority::Emergency
             && self.cut.framed_length(total) <= MINIMUM_CHUNK_BYTES
     }
 
     /// After an attempt to write the only message, which went with the urgent frames: if the network has not begun to
-    /// take it, it waits in its lane, where those of higher classes overtake it. A seal is not taken back.
+    /// take it, it waits in its queue, where those of higher classes overtake it. A seal is not taken back.
     pub(super) fn put_back(
         &mut self,
         buffers: &mut dyn Buffers<S>,
@@ -130,15 +132,15 @@ impl<S: Storage> Sender<S> {
         total: usize,
     ) -> Result<(), Error> {
         let framed = self.cut.framed_length(total);
-        let Some(index) = lane_index(priority) else { return Ok(()) };
+        let Some(index) = queue_index(priority) else { return Ok(()) };
         if !self.blocked || self.cut.overhead > 0 || self.urgent.len() != framed {
             return Ok(());
         }
-        let lane = buffers.take_leaving(LEFT_BY_SENDING).map(|buffer| Lane::of(buffer, self.urgent.sealed()));
+        let queue = buffers.take_leaving(LEFT_BY_SENDING).map(|buffer| SendQueue::of(buffer, self.urgent.sealed()));
         self.urgent.clear();
-        self.blocked = lane.is_some();
-        let slot = self.lanes.get_mut(index).ok_or(Error::Full(Limit::SendQueue))?;
-        *slot = lane;
+        self.blocked = queue.is_some();
+        let slot = self.queues.get_mut(index).ok_or(Error::Full(Limit::SendQueue))?;
+        *slot = queue;
         if slot.is_some() { Ok(()) } else { Err(Error::Full(Limit::Buffers)) }
     }
 
@@ -227,18 +229,18 @@ impl<S: Storage> Sender<S> {
         Ok(written)
     }
 
-    /// Writes what is sealed: the rest of the current lane's frames, then sealed urgent ones.
+    /// Writes what is sealed: the rest of the current queue's frames, then sealed urgent ones.
     fn write_sealed(
         &mut self,
         id: LinkId,
         mailman: &mut dyn Mailman,
         written: &mut u64,
     ) -> Result<Progress, CloseReason> {
-        if let Some(Some(lane)) = self.current.and_then(|index| self.lanes.get_mut(index)) {
-            let progress = lane.write(id, mailman, written)?;
+        if let Some(Some(queue)) = self.current.and_then(|index| self.queues.get_mut(index)) {
+            let progress = queue.write(id, mailman, written)?;
             if progress == Progress::Blocked {
                 if self.cut.overhead == 0 {
-                    lane.unseal();
+                    queue.unseal();
                 }
                 return Ok(progress);
             }
@@ -268,58 +270,58 @@ impl<S: Storage> Sender<S> {
         if self.urgent.has_sealed() {
             return Ok(true);
         }
-        self.current = self.next_lane();
-        let Some(Some(lane)) = self.current.and_then(|index| self.lanes.get_mut(index)) else { return Ok(false) };
+        self.current = self.next_queue();
+        let Some(Some(queue)) = self.current.and_then(|index| self.queues.get_mut(index)) else { return Ok(false) };
         let most = match self.cut.overhead {
             0 => usize::MAX,
             _ if self.blocked => 0,
             _ => ahead.max(self.cut.chunk),
         };
-        lane.seal(cipher, most)?;
+        queue.seal(cipher, most)?;
         Ok(true)
     }
 
-    /// The lane whose message is not complete, or else the highest one.
-    fn next_lane(&self) -> Option<usize> {
-        let unfinished = self.current.filter(|&index| match self.lanes.get(index) {
-            Some(Some(lane)) => !lane.at_boundary,
+    /// The queue whose message is not complete, or else the highest one.
+    fn next_queue(&self) -> Option<usize> {
+        let unfinished = self.current.filter(|&index| match self.queues.get(index) {
+            Some(Some(queue)) => !queue.at_boundary,
             _ => false,
         });
-        unfinished.or_else(|| self.lanes.iter().position(Option::is_some))
+        unfinished.or_else(|| self.queues.iter().position(Option::is_some))
     }
 
     fn give_drained(&mut self, buffers: &mut dyn Buffers<S>) {
-        for slot in &mut self.lanes {
-            if slot.as_ref().is_some_and(|lane| lane.waiting() == 0)
-                && let Some(lane) = slot.take()
+        for slot in &mut self.queues {
+            if slot.as_ref().is_some_and(|queue| queue.waiting() == 0)
+                && let Some(queue) = slot.take()
             {
-                buffers.give(lane.buffer);
+                buffers.give(queue.buffer);
             }
         }
     }
 
     pub(super) fn release(&mut self, buffers: &mut dyn Buffers<S>) {
-        for lane in self.lanes.iter_mut().filter_map(Option::take) {
-            buffers.give(lane.buffer);
+        for queue in self.queues.iter_mut().filter_map(Option::take) {
+            buffers.give(queue.buffer);
         }
         self.urgent.clear();
         self.blocked = false;
     }
 }
 
-impl<S: Storage> Lane<S> {
+impl<S: Storage> SendQueue<S> {
     fn new(buffer: Buffer<S>) -> Self {
         Self { buffer, start: 0, sealed: 0, end: 0, at_boundary: true, before: (0, true) }
     }
 
     /// One with the frames of a short message in it, for which there is room in any buffer.
     fn of(buffer: Buffer<S>, frames: &[u8]) -> Self {
-        let mut lane = Self::new(buffer);
-        if let Some(place) = lane.buffer.get_mut(..frames.len()) {
+        let mut queue = Self::new(buffer);
+        if let Some(place) = queue.buffer.get_mut(..frames.len()) {
             bytes::copy(frames, place);
-            lane.end = frames.len();
+            queue.end = frames.len();
         }
-        lane
+        queue
     }
 
     /// Bytes that are not written.
@@ -420,7 +422,7 @@ fn seal_first<C: Seal>(cipher: &mut C, frames: &mut [u8]) -> Result<usize, Close
     Ok(length)
 }
 
-const fn lane_index(priority: Priority) -> Option<usize> {
+const fn queue_index(priority: Priority) -> Option<usize> {
     match priority {
         Priority::Emergency => None,
         Priority::High => Some(0),

@@ -227,9 +227,9 @@ fn a_link_that_ends_gives_every_buffer_back() {
     assert_eq!((spare(&pool), link.queued()), (3, 0));
 }
 
-/// Bytes of the lanes that are sealed and not written.
+/// Bytes of the queues that are sealed and not written.
 fn sealed_ahead<C: Seal>(link: &Link<Boxed, C>) -> usize {
-    link.sender.lanes.iter().flatten().map(|lane| lane.sealed - lane.start).sum()
+    link.sender.queues.iter().flatten().map(|queue| queue.sealed - queue.start).sum()
 }
 
 /// Sends, flushes and stalls in any order; returns what was accepted.
