@@ -43,8 +43,8 @@ pub const LEASES: usize = 4;
 pub const WINDOW: u32 = 64;
 /// How long a unit waits on a new link for the peer's hello, and in secured mode for the whole proof, before it closes it.
 pub const HELLO_TIMEOUT: Duration = Duration::from_secs(2);
-/// A secured link makes its keys anew, in a new handshake, before they are so old. Up to an eighth less, by chance, so that a
-/// fleet that joined at once does not do it at once.
+/// A secured link is rekeyed, in a new handshake, before its keys reach this age. Up to an eighth less, by chance, so
+/// that a fleet that joined at once does not do it at once.
 pub const HANDSHAKE_LIFE: Duration = Duration::from_secs(12 * 3_600);
 /// The least time from one handshake of a link to the next.
 pub const SHORTEST_HANDSHAKE_LIFE: Duration = Duration::from_secs(1);

@@ -125,8 +125,7 @@ fn units_with_the_pair_s_key_meet_and_call_each_other() {
     assert!(peer.is_connected() && agv.is_connected());
 }
 
-/// The keys of the link are made anew about once a second, while several threads call and a text of many frames is on its
-/// way.
+/// The link is rekeyed about once a second, while several threads call and a message of many frames is in flight.
 #[test]
 fn calls_go_on_while_the_keys_of_their_link_are_made_anew() {
     let fleet = fleet();

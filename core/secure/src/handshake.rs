@@ -49,8 +49,7 @@ pub fn prologue(initiator: &[u8], responder: &[u8]) -> [u8; 32] {
     transcript.prologue()
 }
 
-/// The prologue of a handshake that makes the keys of a link anew: it covers the one before, and by that all that this one
-/// covered.
+/// The prologue of a handshake that rekeys a link: it covers the one before, and by that all that this one covered.
 pub fn renewal(binding: &[u8; 32]) -> [u8; 32] {
     Blake2s256::new_with_prefix(b"CARA renewal 1").chain_update(binding).finalize().into()
 }

@@ -120,7 +120,7 @@ struct Sealing {
     renewing: Renewing,
 }
 
-/// A handshake that makes the keys anew.
+/// A handshake that rekeys the link.
 #[allow(clippy::large_enum_variant)]
 enum Renewing {
     No,
@@ -151,7 +151,7 @@ impl Sealing {
         }
     }
 
-    /// Begins to make the keys anew.
+    /// Begins a rekey.
     fn prove(&mut self, dialed: bool, credentials: Credentials) -> Result<Message, CloseReason> {
         if !matches!(self.renewing, Renewing::No) {
             return Err(CloseReason::Protocol);

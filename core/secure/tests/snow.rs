@@ -55,7 +55,7 @@ fn snow_begins() {
     talk(agreed.channel, theirs);
 }
 
-/// The handshake with which a live link makes its keys anew covers the hash of the one before, which is Noise's.
+/// The handshake that rekeys a live link covers the hash of the one before, which is Noise's.
 #[test]
 fn snow_takes_part_in_a_renewal_in_both_roles() {
     let first = prologue(b"hello of one", b"hello of the other");

@@ -294,7 +294,7 @@ impl Builder {
         self.variable(self.arguments_at, spec)
     }
 
-    /// Adds a result. Results that are arguments as well are the same variables; all others count anew, since a
+    /// Adds a result. Results that are arguments as well are the same variables; all others are counted, since a
     /// `Parameters` must hold both.
     pub(super) fn result(&mut self, spec: VariableSpec<'_>) -> Result<(), Error> {
         let results_at = self.begin_results()?;

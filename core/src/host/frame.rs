@@ -42,7 +42,7 @@ pub enum Frame<'b> {
     Pong,
     /// A session body (keep-alive, renewal), as it otherwise travels in a datagram.
     Session(&'b [u8]),
-    /// A message of the proof that opens a secured link, or makes its keys anew.
+    /// A message of the proof that opens a secured link, or rekeys it.
     Proof(&'b [u8]),
     /// The first frame of an end under its keys: it has proven itself, and tells what is needed for its datagrams.
     Confirm(&'b [u8]),

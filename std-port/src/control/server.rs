@@ -31,7 +31,7 @@ pub(super) const FULL: &str = "Full";
 const WRITE_TIMEOUT: Duration = Duration::from_secs(2);
 /// A client that asks nothing for so long is ended. One that waits for an answer, as of a watch or a hold, is not idle.
 const IDLE_TIMEOUT: Duration = Duration::from_secs(600);
-/// Where all connections are taken, one that has asked nothing for so long gives way to the next client.
+/// With all connections in use, one that has been idle for this long gives way to the next client.
 const GIVES_WAY: Duration = Duration::from_secs(1);
 /// Samples gather for at most so long, so that writing them disturbs what they measure less.
 const GATHER: Duration = Duration::from_millis(50);

@@ -189,7 +189,7 @@ mod tests {
         let manager = keys.ring(&depot()).unwrap();
         assert!(manager.pair(&agv(1)).is_none());
         assert_eq!(generations(&manager, &agv(2)), [1, 2]);
-        // Its successor has no key with anybody that it had, and speaks with all.
+        // Its successor has none of its pair keys, and can speak with all its peers.
         keys.add(&agv(1), &[]).unwrap();
         let (manager, successor) = (keys.ring(&depot()).unwrap(), keys.ring(&agv(1)).unwrap());
         assert_eq!((generations(&manager, &agv(1)), generations(&successor, &depot())), (vec![2], vec![2]));

@@ -15,7 +15,7 @@ use crate::sys::interfaces::Interface;
 /// What shows that a datagram comes from its fleet.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Standing {
-    /// Nothing: plain mode, in which anybody can speak as anybody.
+    /// Nothing: plain mode, in which every host can speak as any unit.
     Plain,
     /// The fleet's code is right, made with the key of this generation. A unit's name is no more than what another one of
     /// the fleet may have said.

@@ -23,7 +23,7 @@ const SOCKETS: usize = 132;
 /// Boards are in 10.77.0.0/16.
 const PREFIX: u8 = 16;
 
-/// A switch with boards, and their time. The clock begins anew with each bench of a thread.
+/// A switch with boards, and their time. The clock restarts with each bench of a thread.
 #[derive(Clone)]
 pub struct Bench {
     inner: Rc<Inner>,

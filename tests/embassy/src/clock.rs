@@ -44,7 +44,7 @@ pub fn now() -> Instant {
     Instant::from_micros(NOW.get())
 }
 
-/// Begins anew.
+/// Restarts.
 pub(crate) fn reset() {
     NOW.set(0);
     TIMERS.take();

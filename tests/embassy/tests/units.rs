@@ -514,7 +514,7 @@ fn what_a_motors_interrupt_has_seen_dead_no_renewal_revives() {
     }
 }
 
-/// The keys of a live link are made anew every second, while both ends ask each other and one drives.
+/// A live link is rekeyed every second, while both ends call each other and one drives.
 #[test]
 fn keys_are_made_anew_while_calls_go_on() {
     let bench = Bench::new(15);

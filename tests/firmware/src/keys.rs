@@ -1,5 +1,5 @@
-//! The keys of a fleet of boards, drawn anew for each run, and what boards are told with them: made with the commands that a
-//! user types.
+//! The keys of a fleet of boards, drawn for each run, and the settings of boards with them: made with the commands that
+//! a user types.
 
 use std::ffi::OsStr;
 use std::fs::Permissions;
@@ -34,7 +34,7 @@ const SHOWN: usize = 16;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Kind {
     Drawn,
-    /// Everybody has been told in words to be insecure.
+    /// All units opt in to plain mode.
     Insecure,
     /// Boards get settings and no keys.
     Missing,

@@ -38,7 +38,7 @@ impl Manager {
         Ok(Self { system, events })
     }
 
-    /// Offers `call_mechanic` to everybody.
+    /// Offers `call_mechanic` to all vehicles.
     pub(crate) fn offer_mechanic(&self) -> Result<()> {
         let functions = self.system.my_function_list();
         functions.add_function("call_mechanic", &mechanic::arguments()?, mechanic::call_mechanic)?;

@@ -92,7 +92,7 @@ fn slot(bench: &Bench, place: &'static str) -> Result<Slot> {
     Ok(Slot { cable: bench.cable()?, listener: TcpListener::bind(place)?, place })
 }
 
-/// Puts power on boards as long as anybody wants one.
+/// Powers boards on request.
 fn power(bench: &Bench, asked: &Receiver<(Slot, Sender<Powered>)>) {
     for (slot, answer) in asked {
         let who = Who { manager_address: Some(slot.place), ..Who::agv(17) };
@@ -129,7 +129,7 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl Boards {
-    /// A board with power that has never dialled anybody.
+    /// A powered board that has not dialled yet.
     fn board(&self) -> Result<(Slot, Board)> {
         let slot = lock(&self.slots).pop().context("each attacker has a slot")?;
         slot.listener.set_nonblocking(true)?;

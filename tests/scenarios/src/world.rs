@@ -89,7 +89,7 @@ pub enum Seen {
     NotJoined(CloseReason),
     /// The unit's interface has come, or gone.
     InterfaceChanged(bool),
-    /// A peer's list was read anew.
+    /// A peer's list was read again.
     ListChanged(Identity),
     /// An asynchronous request was not run, or failed.
     Failed(CallId, Error),

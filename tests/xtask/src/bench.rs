@@ -22,7 +22,7 @@ pub(crate) struct Options {
     /// Only these other systems instead of all that `cargo xtask peers` has built; `none` for none.
     #[arg(long, value_name = "PEER", value_delimiter = ',')]
     peers: Vec<String>,
-    /// Also writes all rows here, after each experiment anew.
+    /// Also writes all rows here, again after each experiment.
     #[arg(long, value_name = "FILE")]
     json: Option<std::path::PathBuf>,
     /// Keeps the complete experiments of this file, which an earlier run of the same commit and form wrote on this

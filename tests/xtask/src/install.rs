@@ -31,7 +31,7 @@ pub(crate) fn program(program: &str, package: &str) -> Result<(), String> {
     if exists(program) { Ok(()) } else { Err(format!("package {package} did not bring {program}")) }
 }
 
-/// Tries the package lists as they are first: fetching them anew is slow.
+/// Tries the package lists as they are first: fetching them again is slow.
 fn apt_install(package: &str) -> anyhow::Result<()> {
     // Another group may be installing something at the same time.
     let install = ["install", "-y", "-o", "DPkg::Lock::Timeout=300", package];

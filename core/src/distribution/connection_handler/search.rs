@@ -187,7 +187,8 @@ impl<S: Storage> Node<S> {
         }
     }
 
-    /// The port has an interface again, or another one: what is searched for may be there, and pauses begin anew.
+    /// The port has an interface again, or another one: what is searched for may be there, and the back-off starts
+    /// over.
     pub fn network_changed(&mut self, now: Instant) {
         match self.config.target {
             Target::Fixed(..) if self.table.joined() == 0 => self.dial_target(now),
@@ -324,7 +325,8 @@ impl<S: Storage> Node<S> {
         self.search.next = self.search.next.max(later);
     }
 
-    /// An m_unit asks for everybody: its own s_units ask it whether it is there, and so does the smaller one of two m_units.
+    /// An m_unit asks for all nodes: its own s_units ask it whether it is there, and so does the smaller one of two
+    /// m_units.
     fn heard_m_unit(&mut self, now: Instant, from: SocketAddr, who_has: &WhoHas) {
         if !self.is_wanted(&who_has.identity) {
             self.counters.add(NodeCounter::WrongManager, 1);

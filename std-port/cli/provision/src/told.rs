@@ -194,7 +194,7 @@ fn agree(ring: &KeyRing, identity: &Identity, fleet: Fleet, manager: Option<&Man
     Err(Ended::usage(format!("{node} has no key with {manager}: `{command}`")))
 }
 
-/// The first line: passwords on a command line are seen by everybody on the computer.
+/// The first line: every user of the computer can see passwords on a command line.
 fn password(file: &Path) -> anyhow::Result<String> {
     let mut text = String::new();
     if file == Path::new("-") {

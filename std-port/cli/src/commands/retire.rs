@@ -11,8 +11,8 @@ use cara_tools::exit::{Ended, Exit};
 use cara_tools::global::Global;
 use cara_tools::output;
 
-/// Takes an absent node off the roster of the manager that runs on this host, until it joins again or the manager is started
-/// anew.
+/// Takes an absent node off the roster of the manager that runs on this host, until it joins again or the manager
+/// restarts.
 ///
 /// A manager misses each s_unit that its key file lists, or, in plain mode, that has joined since its start: `cara call --all`
 /// fails while one is missing. One that has left for good is taken out of the key file with `cara keys revoke`.

@@ -147,7 +147,7 @@ fn settled(operator: &mut Operator, offering: Option<&str>, (seen, since): &mut 
 /// One-way requests that gather leave, and get there before the unit says goodbye.
 pub(super) fn deliver(system: &CommunicationSystem) {
     for peer in system.s_units().iter().chain(&system.m_units()) {
-        // To one that has left nothing can be sent.
+        // Fails for a peer that has left.
         let _ = peer.flush();
     }
     std::thread::sleep(LEAVE);

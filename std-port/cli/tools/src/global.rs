@@ -44,8 +44,8 @@ pub struct Global {
     /// With --as, and for `node`: the file with the unit's keys, instead of where they are looked for.
     #[arg(long, global = true, value_name = "FILE")]
     pub key_file: Option<PathBuf>,
-    /// With --as, and for `node`, `scan` and `doctor`: plain mode, without keys, where anybody on the network can read what
-    /// units say and speak as any of them. It meets units in plain mode alone.
+    /// With --as, and for `node`, `scan` and `doctor`: plain mode, without keys, where every host on the network can
+    /// read what units say and speak as any of them. It meets units in plain mode alone.
     #[arg(long, global = true)]
     pub insecure: bool,
     /// Use loopback only.

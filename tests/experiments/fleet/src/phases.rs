@@ -11,7 +11,7 @@ use crate::proc::{self, Memory, ThreadWatch};
 use crate::report::{Comparison, Figures, Joining};
 use crate::units::TEXT_BYTES;
 
-/// How long everybody may take before the run is given up.
+/// How long a phase may take before the run is given up.
 const PATIENCE_MS: u64 = 60_000;
 /// Broadcasts are counted for so long after a start: the last of the four questions of a manager is among them.
 const COUNTED: Duration = Duration::from_secs(12);

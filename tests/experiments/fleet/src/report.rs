@@ -16,7 +16,7 @@ const FAR_COST: f64 = 3.0;
 /// With so many nodes what is not theirs does not count.
 const MANY: usize = 1_000;
 
-/// How everybody joined.
+/// How the units joined.
 #[derive(Debug, Serialize)]
 pub(crate) struct Joining {
     pub(crate) all_ms: f64,

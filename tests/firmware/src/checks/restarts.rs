@@ -34,7 +34,7 @@ const MISSED: Duration = Duration::from_secs(5);
 /// How long a board is without power.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Absence {
-    /// It is back before anybody has missed it: the manager challenges the old link.
+    /// It is back before its loss was detected: the manager challenges the old link.
     Short,
     /// The manager has given it up.
     Missed,

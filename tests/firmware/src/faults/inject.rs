@@ -22,7 +22,7 @@ const PHASES: u64 = 250;
 pub(super) const STANDS: Duration = Duration::from_millis(300);
 /// How often a manager renews that has its turns.
 const RENEWED: Duration = Duration::from_millis(100);
-/// Times that a drive is begun anew because this machine was too busy to renew a lease in time.
+/// Times that a drive is started again because this machine was too busy to renew a lease in time.
 const TRIES: u32 = 5;
 /// What the board logs.
 pub(super) const ON: &str = "motors on";
@@ -160,7 +160,7 @@ impl EmulatedBoard {
         agv.request("go_to", &at([-9_000, 0])?)?;
         let (behind, stop) = self.stopped(line)?;
         if number.is_multiple_of(2) {
-            // The link is there again before anybody has missed it, and the command comes through, too late.
+            // The link is back before its loss was detected, and the command arrives, too late.
             std::thread::sleep(GO_TO_LEASE.into());
             self.mend(failing)?;
             let ends = |event: &UnitEvent| matches!(event, UnitEvent::RequestFailed { .. } | UnitEvent::Left { .. });

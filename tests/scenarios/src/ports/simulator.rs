@@ -47,7 +47,7 @@ pub(super) struct SimWorld {
     mode: Mode,
     units: Vec<Rc<SimNode>>,
     profile: FaultProfile,
-    /// How often secured links make their keys anew, instead of every 12 h: in every other run.
+    /// How often secured links are rekeyed, instead of every 12 h: in every other run.
     renews_every: Option<Duration>,
     random: Random,
     report: Report,

@@ -24,7 +24,7 @@ scenarios![
     what_is_finished_needs_no_safe_hook: "lease of a service", Light, [], ["finished"];
 ];
 
-/// The lease in this file. In real time a busy machine may keep everybody from renewing it for a while.
+/// The lease in this file. In real time a busy machine may delay renewals.
 fn lease(world: &dyn World) -> Duration {
     millis(if world.is_virtual() { 400 } else { 1_200 })
 }

@@ -120,7 +120,7 @@ impl NewUnit {
         self
     }
 
-    /// The keys of links that it opens are made anew this often, instead of every 12 h.
+    /// Links that it opens are rekeyed this often, instead of every 12 h.
     pub fn renews_every(mut self, span: Duration) -> Self {
         self.settings.given.renews_every = Some(span);
         self

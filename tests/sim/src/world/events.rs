@@ -34,7 +34,7 @@ pub enum UnitEvent {
         /// It can be used now.
         up: bool,
     },
-    /// A peer's list of functions has been read anew.
+    /// A peer's list of functions has been read again.
     ListChanged {
         /// The peer.
         peer: Identity,

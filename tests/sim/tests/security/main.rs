@@ -4,7 +4,7 @@
 //! - [`frames`]: changed, cut, moved, left out and repeated frames;
 //! - [`discovery`]: changed, spoofed and repeated datagrams of discovery;
 //! - [`kept_away`]: recorded and forged discovery while a vehicle starts, and how long it takes to join;
-//! - [`renewals`]: what was recorded before the keys of a link were made anew, and keys that are gone or others;
+//! - [`renewals`]: recordings from before a link was rekeyed, and revoked or wrong keys;
 //! - [`vectors`]: the bytes of a conversation, as committed;
 //! - [`fleet`]: wrong keys, no keys, plain against secured, floods, on the virtual network.
 

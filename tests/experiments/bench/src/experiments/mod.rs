@@ -62,7 +62,7 @@ pub(crate) struct Options {
     loss_percent: u32,
     #[command(flatten)]
     outside: Selection,
-    /// Writes all rows there as one JSON object, after each experiment anew.
+    /// Writes all rows there as one JSON object, again after each experiment.
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
     /// Keeps the complete experiments of this file, which an earlier run of the same commit and form wrote on this
