@@ -11,7 +11,7 @@ pub(crate) fn copy(from: &[u8], to: &mut [u8]) {
     }
 }
 
-/// Whether two names are the same, word by word: what boards compare with does so byte by byte.
+/// Whether two names are equal, compared word by word: the `memcmp` of boards compares byte by byte.
 pub(crate) fn are_same(one: &[u8], other: &[u8]) -> bool {
     let ((words, rest), (other_words, other_rest)) = (one.as_chunks::<4>(), other.as_chunks::<4>());
     let same = |(one, other): (&[u8; 4], &[u8; 4])| u32::from_ne_bytes(*one) == u32::from_ne_bytes(*other);
@@ -29,7 +29,7 @@ pub(crate) fn as_text(bytes: &[u8]) -> Option<&str> {
     text.ok()
 }
 
-/// Whether the bytes are UTF-8. Most text is ASCII, which is found out in less time.
+/// Whether the bytes are UTF-8, with a fast path for ASCII.
 pub(crate) fn is_text(bytes: &[u8]) -> bool {
     (cfg!(not(feature = "simd")) && bytes.is_ascii()) || as_text(bytes).is_some()
 }

@@ -24,16 +24,16 @@ pub const SIGNATURE_BYTES: usize = 384;
 /// Bytes of the values and names in a `Parameters` whose size is not given.
 pub const PARAMETERS_BYTES: usize = 512;
 
-/// Longest frame body that the protocol allows, in bytes; a peer may tell less. Bounds how long an emergency waits
+/// Longest frame body that the protocol allows, in bytes; a peer may advertise less. Bounds how long an emergency waits
 /// behind another message: 4 KiB take 33 ms on a 1 Mbit/s link.
 pub const CHUNK_BYTES: usize = 4096;
-/// Shortest chunk that a unit may tell as its limit: an emergency must fit into one.
+/// Shortest chunk that a unit may advertise as its limit: an emergency must fit into one.
 pub const MINIMUM_CHUNK_BYTES: usize = 320;
 /// Longest emergency message, in bytes: fits one chunk and one datagram. Each link reserves room for one.
 pub const EMERGENCY_BYTES: usize = 256;
 /// Longest message of best-effort delivery, in bytes: one UDP datagram that is not fragmented on Ethernet.
 pub const DATAGRAM_BYTES: usize = 1400;
-/// The buffer that each link owns: partial frames and handshakes up to this length need none from the pool.
+/// The buffer that each link owns: partial frames and handshakes up to this length need no buffer of the pool.
 pub const LINK_BUFFER_BYTES: usize = 512;
 
 /// Leases that one peer may hold here, and this unit at one peer. Costs 32 bytes each per link.
@@ -50,14 +50,14 @@ pub const HANDSHAKE_LIFE: Duration = Duration::from_secs(12 * 3_600);
 pub const SHORTEST_HANDSHAKE_LIFE: Duration = Duration::from_secs(1);
 /// How long a peer that is heard may take for its part of a new handshake on a live link before the link is given up.
 pub const RENEWAL_TIMEOUT: Duration = Duration::from_secs(60);
-/// Datagrams under the key before are taken for so long after the first one under the new key.
+/// Datagrams under the previous key are accepted for this long after the first one under the new key.
 pub const PREVIOUS_KEY_LIFE: Duration = Duration::from_secs(5);
 /// How long an old link may take to answer the challenge that tells a restarted peer from a duplicate one.
 pub const CHALLENGE_TIMEOUT: Duration = Duration::from_millis(300);
 /// Shortest pause between two keep-alives.
 pub const SHORTEST_KEEP_ALIVE: Duration = Duration::from_millis(1);
-/// Longest pause between two keep-alives. A unit refuses a longer one of its own; a peer that tells one counts as telling
-/// this, so that whatever it tells, it is lost 210 s after it vanishes.
+/// Longest pause between two keep-alives. A unit refuses a longer one of its own. A longer one that a peer advertises
+/// is taken as this, so that a vanished peer is lost after 210 s at most.
 pub const LONGEST_KEEP_ALIVE: Duration = Duration::from_secs(60);
 /// Keep-alives that may be missed in a row.
 pub const MISSED_KEEP_ALIVES: u8 = 3;
@@ -79,7 +79,7 @@ pub const ANSWER_SPREAD: Duration = Duration::from_millis(1);
 /// What can be set by hand (paper, section 2), before the start and while running. Peers are told what concerns them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Constraints {
-    /// Time-out of a blocking request that names none; also the life of an asynchronous one.
+    /// Default time-out of blocking and asynchronous requests.
     pub request_timeout: Duration,
     /// Least time between two requests to one node; zero switches the limit off. The callee enforces its own as well.
     pub minimum_interval: Duration,
@@ -155,7 +155,7 @@ impl Mode {
 }
 
 /// Class of a request. An emergency goes between the chunks of other messages, ignores the minimum interval and has
-/// reserved room everywhere; the other classes take turns between messages, highest first.
+/// reserved capacity everywhere; the other classes take turns between messages, highest first.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 #[repr(u8)]
 pub enum Priority {

@@ -1,4 +1,4 @@
-//! Counters: one for every reason to drop, refuse or defer, so that nothing is lost in silence.
+//! Counters: one for every reason to drop, refuse or defer, so that nothing is lost silently.
 
 use core::fmt;
 use core::marker::PhantomData;

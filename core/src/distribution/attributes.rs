@@ -9,8 +9,8 @@ use crate::time::Duration;
 pub struct Attributes {
     /// Priority of calls that name none.
     pub priority: Priority,
-    /// What the function starts goes on for this long after the last call; whole milliseconds travel. It is renewed each
-    /// 5 ms at most: less than 20 ms cannot be kept.
+    /// How long what the function starts goes on after the last call or renewal, in whole milliseconds. Renewals are at
+    /// least 5 ms apart: a lease of less than 20 ms cannot be kept.
     pub lease: Option<Duration>,
     /// Running it twice is as good as running it once.
     pub idempotent: bool,

@@ -1,7 +1,7 @@
 //! postcard's layout, written and read by hand: numbers of several bytes as varints, texts and lists behind their length,
 //! one byte for a choice. What serde derives of it takes far more of a board's flash; the tests compare the two.
 //!
-//! Neither side stops at the first fault: it is noticed, and told at the end.
+//! Neither side stops at the first error: it is recorded, and returned at the end.
 
 use crate::config::NODE_NAME_BYTES;
 
@@ -64,7 +64,7 @@ impl<'o> Writer<'o> {
     }
 }
 
-/// Reads values one behind the other. Behind a fault all are zero.
+/// Reads values in sequence. After an error all are zero.
 pub(crate) struct Reader<'b> {
     rest: &'b [u8],
     sound: bool,

@@ -77,7 +77,7 @@ pub struct Announce {
 }
 
 /// A datagram, borrowed from the bytes that it came in.
-// Searches are rare and looked at where they are decoded: the size of this enum is never moved about.
+// Searches are rare and handled where they are decoded, so this enum is not moved.
 #[allow(clippy::large_enum_variant)]
 #[derive(Debug, PartialEq, Eq)]
 pub enum Datagram<'b> {
@@ -137,7 +137,7 @@ impl Header {
         Ok((Self { mode, version, fleet, kind, zero: [z0, z1] }, body))
     }
 
-    /// The body as this version reads it, which says little about one of another version. Codes are not looked at.
+    /// The body as this version decodes it, which may be wrong for another version. Codes are not checked.
     pub fn read<'b>(&self, body: &'b [u8]) -> Result<Datagram<'b>, DatagramError> {
         if self.zero != [0, 0] {
             return Err(DatagramError::Malformed);
@@ -299,8 +299,8 @@ pub fn session_header(mode: Mode, fleet: Fleet, link: u16, nonce: u64) -> [u8; S
     [h0, h1, h2, h3, h4, h5, h6, h7, h8, h9, h10, h11, l0, l1, 0, 0, n0, n1, n2, n3, n4, n5, n6, n7]
 }
 
-/// 32 bits that name an identity in a list of known nodes: FNV-1a over role (0 m_unit, 1 s_unit), id (little-endian) and
-/// name. Two nodes with one hash cost a search more, no more.
+/// 32 bits that name an identity in a list of known nodes: FNV-1a over role (0 m_unit, 1 s_unit), id (little-endian)
+/// and name. A collision costs one search more.
 pub fn short_hash(identity: &Identity) -> u32 {
     let role = match identity.role() {
         Role::MUnit => 0,

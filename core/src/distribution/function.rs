@@ -50,7 +50,8 @@ pub struct VariableSpec<'a> {
     pub size: u32,
 }
 
-/// A [`VariableSpec`] whose name is only compared: a look at its UTF-8 would cost a short request more than anything else.
+/// A [`VariableSpec`] with an unvalidated name, for comparison only: validating UTF-8 would dominate the cost of a
+/// short request.
 #[derive(Clone, Copy)]
 pub(super) struct RawSpec<'a> {
     pub(super) name: &'a [u8],

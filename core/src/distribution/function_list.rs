@@ -1,7 +1,7 @@
 //! The paper's `Function_list`: one's own functions with their handlers, and the functions of a peer.
 //!
 //! A function is named by slot and generation. Adding a function invalidates no other; removing or replacing one
-//! changes the generation of its slot only, so that a request with old news is a typed error.
+//! changes the generation of its slot only, so that a request with a stale list is a typed error.
 
 use core::fmt;
 
@@ -146,7 +146,8 @@ impl<S: Storage> TheirFunctionList<S> {
         self.only = Some(names);
     }
 
-    /// Takes in what the peer told about one of its slots; the news replaces whatever was in the slot or had the name.
+    /// Applies what the peer published about one of its slots; it replaces the function in the slot and any of the same
+    /// name.
     ///
     /// [`Error::Malformed`] leaves the list unchanged. [`Error::Full`] counts as skipped, and what was replaced is gone.
     pub fn insert(
@@ -177,7 +178,7 @@ impl<S: Storage> TheirFunctionList<S> {
         self.index_of(slot).and_then(|index| self.table.take(index)).is_some()
     }
 
-    /// Shows the functions whose names are wanted and hides the others, which keep their room: they can be shown again.
+    /// Shows the functions whose names are wanted and hides the others, which stay stored: they can be shown again.
     pub(crate) fn show_only(&mut self, mut wanted: impl FnMut(&str) -> bool) {
         for index in 0..self.table.entries.len() {
             let Some(hidden) = self.table.function(index).map(|function| !wanted(function.name())) else { continue };
@@ -210,8 +211,7 @@ impl<S: Storage> TheirFunctionList<S> {
         (self.table.entries.len(), self.table.bytes.len())
     }
 
-    /// Moves to longer slices and gives those back that are not needed any more, which are the new ones where they are
-    /// shorter.
+    /// Moves to longer slices and returns the unused ones: the old slices, or the new ones if they are shorter.
     pub(crate) fn grow(&mut self, entries: S::Slice<Entry>, bytes: S::Slice<u8>) -> (S::Slice<Entry>, S::Slice<u8>) {
         self.table.grow(entries, bytes)
     }
@@ -252,7 +252,7 @@ impl<S: Storage> TheirFunctionList<S> {
         self.len() == 0
     }
 
-    /// Functions that the peer told of and that were not kept, since the last [`clear`](Self::clear).
+    /// Functions that the peer published and that were not kept, since the last [`clear`](Self::clear).
     pub const fn skipped(&self) -> u32 {
         self.skipped
     }

@@ -1,7 +1,7 @@
 //! The hello: the first frame on each link, in both directions.
 //!
-//! Magic and version stand in fixed places, so that units of different versions can tell each other so; the rest is
-//! postcard.
+//! Magic and version stand in fixed places, so that units of different versions can refuse each other by name; the rest
+//! is postcard.
 
 use serde::{Deserialize, Serialize};
 

@@ -66,8 +66,8 @@ impl Identity {
         Self { id, name, role: if reader.choice(2) == 0 { Role::MUnit } else { Role::SUnit } }
     }
 
-    /// Whether the name is one: not empty, and without [hidden](is_hidden) characters, which could forge lines of a log or
-    /// make two names look alike.
+    /// Whether the name is valid: not empty, and without [hidden](is_hidden) characters, which could forge lines of a
+    /// log or make two names look alike.
     pub(crate) fn is_sound(&self) -> bool {
         !self.name.is_empty() && !self.name.chars().any(is_hidden)
     }

@@ -263,7 +263,7 @@ pub enum Control<'b> {
         /// Calls of one peer that the sender holds.
         calls: u16,
     },
-    /// The callee ended what a leased call started; renewing it is no use.
+    /// The callee ended what a leased call started; renewals have no effect.
     LeaseEnded {
         /// The caller's id of the call.
         call: u32,
@@ -358,8 +358,7 @@ pub enum SessionBody<'b> {
     Renew(Renewal),
     /// The caller no longer wants a leased call, wherever it is.
     Release(Release),
-    /// The caller no longer wants any call of a leased function that it has made up to the one with this id, wherever
-    /// they are.
+    /// The caller gives up all its calls of a leased function up to this id, whether in flight, queued or running.
     ReleaseAll(Slot, u32),
     /// One whole message: a best-effort request, or an emergency's second copy. The priority's byte, the message.
     Message(u8, &'b [u8]),
@@ -369,7 +368,7 @@ pub enum SessionBody<'b> {
     Pong,
 }
 
-/// The caller still wants what a leased call started; aged like a request.
+/// A renewal of a leased call; its age is bounded like a request's.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Renewal {
     /// The caller's id of the call.
@@ -382,7 +381,7 @@ pub struct Renewal {
     pub since: Duration,
 }
 
-/// The caller no longer wants a leased call: it ends, leaves the queue, or does not begin when it arrives later.
+/// The caller gives up a leased call: it ends, leaves the queue, or does not begin if it arrives later.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Release {
     /// The caller's id of the call.

@@ -1,4 +1,4 @@
-//! Whether a live unit has this unit's own identity already: asked before a manager starts.
+//! Duplicate detection before a manager starts: whether a live unit already has its identity.
 //!
 //! The question is a [`WhoHas`] for the unit itself, with a nonce of its own, and only holders of this identity's keys
 //! can answer it. If two units ask at once, the one with the greater epoch answers, so that only one of them starts.
@@ -16,7 +16,7 @@ pub const PRESENCE_WAIT: Duration = Duration::from_millis(300);
 /// Pause between two questions: one that is lost must not start a second manager.
 pub const PRESENCE_PAUSE: Duration = Duration::from_millis(90);
 
-/// A question after the unit's own identity. See the [module](self).
+/// A search for the unit's own identity. See the [module](self).
 #[derive(Clone, Debug)]
 pub struct Presence {
     identity: Identity,
@@ -31,7 +31,7 @@ pub struct Presence {
 pub enum Heard<'o> {
     /// Nothing.
     Nothing,
-    /// Another one asks the same and is to give way: the answer, for where the datagram came from.
+    /// Another unit asks the same and must give way: the answer, to be sent to the datagram's source.
     Answer(&'o [u8]),
     /// A live unit has this identity; where it can be dialled.
     Running(SocketAddr),
@@ -64,7 +64,7 @@ impl Presence {
         who_has.encode(self.fleet, authenticator, out)
     }
 
-    /// Looks at a datagram that came while the unit waits. Only an answer to this very question tells of a live unit.
+    /// Handles a datagram that arrives while the unit waits. Only an answer to its own question shows a live unit.
     pub fn hear<'o>(
         &self,
         from: SocketAddr,
@@ -83,7 +83,7 @@ impl Presence {
         }
     }
 
-    /// What this unit has said itself, repeated by another host, tells of no other unit.
+    /// This unit's own datagrams, replayed by another host, do not show another unit.
     fn is_answer(&self, announce: &Announce) -> bool {
         announce.identity == self.identity && announce.nonce == self.nonce && announce.epoch != self.epoch
     }

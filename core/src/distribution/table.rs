@@ -1,4 +1,4 @@
-//! What both function lists are made of: entries by index, and one arena for all their signatures without gaps.
+//! Storage of both function lists: entries by index, and one arena without gaps for all signatures.
 
 use core::fmt;
 

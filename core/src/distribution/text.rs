@@ -11,7 +11,7 @@ use super::function::{Builder, Definition, VariableSpec};
 use super::name::is_name_byte;
 use super::parameters::Type;
 
-/// Where a text stops being a signature, and what should stand there.
+/// The position of a syntax error, and what is expected there.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("expected {expected} at byte {position}")]
 pub struct ParseError {

@@ -32,7 +32,7 @@ pub trait Seal {
     /// Seals `frame`, whose last [`overhead`](Self::overhead) bytes are room for the tag.
     fn seal(&mut self, frame: &mut [u8]) -> Result<(), CloseReason>;
 
-    /// The frame that was sealed last was the last one under the keys so far.
+    /// Marks the frame that was sealed last as the last one under the current keys.
     fn turn(&mut self) -> Result<(), CloseReason> {
         Err(CloseReason::Protocol)
     }
@@ -63,19 +63,20 @@ pub trait Secure: Seal {
     /// begins it is not sealed, and everything behind it is.
     fn answer(&mut self, message: &[u8]) -> Result<Option<[u8; PROOF_BYTES]>, CloseReason>;
 
-    /// What this end tells in its first sealed frame, or in the first one under new keys.
+    /// The payload of this end's first sealed frame, or of its first one under new keys.
     fn confirmation(&self) -> [u8; CONFIRMATION_BYTES];
 
-    /// What the other end told in its first sealed frame, or in the first one under new keys. Datagrams under the key
-    /// before are taken until [`forget_previous`](Self::forget_previous).
+    /// The payload of the other end's first sealed frame, or of its first one under new keys. Datagrams under the
+    /// previous key are accepted until [`forget_previous`](Self::forget_previous).
     fn confirmed(&mut self, confirmation: &[u8]) -> Result<(), CloseReason>;
 
-    /// The frame that was opened last was the other end's last one under the keys so far.
+    /// Marks the frame that was opened last as the other end's last one under its current keys.
     fn turned(&mut self) -> Result<(), CloseReason> {
         Err(CloseReason::Protocol)
     }
 
-    /// The other end has what this one told under the new keys, which it seals its datagrams with from here on.
+    /// The other end has this end's confirmation under the new keys, so this end seals its datagrams with them from
+    /// here on.
     fn acknowledged(&mut self) -> Result<(), CloseReason> {
         Err(CloseReason::Protocol)
     }

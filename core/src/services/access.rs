@@ -145,7 +145,7 @@ impl<L> Functions<L> {
     }
 }
 
-/// How often each function may be called by each peer: so many calls at once, and as many in each span of time.
+/// How often each peer may call each function: a burst of so many calls, and as many in each span of time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Rate {
     calls: u32,
@@ -180,14 +180,14 @@ impl Rate {
     }
 }
 
-/// How far a rate is used up: tokens that come back with time, counted as the time at which all are back.
+/// A token bucket, stored as the time at which it is full again.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Bucket {
     full_at: Instant,
 }
 
 impl Bucket {
-    /// Takes one call out of the rate; [`Error::TooSoon`] when there is none.
+    /// Takes one token; [`Error::TooSoon`] if there is none.
     pub fn take(&mut self, now: Instant, rate: Rate) -> Result<(), Error> {
         let full_at = self.full_at.max(now) + rate.interval();
         let wait = full_at.since(now + rate.burst());
@@ -276,7 +276,7 @@ pub fn decide<N: AsRef<str>, L: AsRef<[N]>>(
     }
 }
 
-/// A table that can be asked: rules on a board, a file's contents on Linux.
+/// An access table: rules on a board, a file's contents on Linux.
 pub trait Access {
     /// What the table says; [`decide`] over its rules.
     fn decide(&self, who: Principal<'_>, function: &str, verb: Verb) -> Decision;

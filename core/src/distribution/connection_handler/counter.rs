@@ -35,11 +35,11 @@ crate::counters::counters! {
         AnnounceWithheld,
         /// Answers to another question than this unit's last one.
         Unasked,
-        /// Nodes that a broadcast told of and that were asked whether they are there.
+        /// Nodes that a broadcast hinted at and that were asked by unicast.
         HintsAsked,
         /// Broadcasts of a wanted node whose address was asked a short while ago, or for which there was no room.
         HintsIgnored,
-        /// Searches of others that put nothing off, because one of their host did a short while ago.
+        /// Searches of others that did not defer this unit's own, because one of the same host did a short while ago.
         WhoHasUnheeded,
         /// Searches and answers that the network did not take.
         SendFailed,
@@ -71,7 +71,7 @@ crate::counters::counters! {
         RefusedMode,
         /// Links refused because there is no key for the pair.
         RefusedKey,
-        /// Links that had to show whether they live, because another one had the same identity.
+        /// Links that were challenged to prove liveness, because another one had the same identity.
         Challenged,
         /// Nodes that came back with a new epoch.
         Restarted,
@@ -79,7 +79,7 @@ crate::counters::counters! {
         Forgotten,
         /// Nodes heard for which the table has no room.
         TableFull,
-        /// Links whose peers had said nothing yet, ended to make room for newer ones.
+        /// Links whose peers had sent nothing yet, ended in favour of newer ones.
         GaveWay,
     }
 }

@@ -1,9 +1,9 @@
 //! Hints: addresses at which broadcasts place a node. A recorded broadcast can be replayed, so a hint proves nothing.
 //!
-//! A hint leads to one question with a fresh nonce, to the address that it came from, and to nothing else; what is dialled
-//! has answered it. An address that has not answered is asked later and later, however often it is heard, and gives way
-//! to another one a second after it was asked. The unit's own search goes on beside: a hint delays it once, by a second
-//! at most.
+//! A hint leads to one question with a fresh nonce, to the address that it came from, and to nothing else; only an
+//! address that answers it is dialled. An address that does not answer is asked with growing back-off, however often it
+//! is heard, and is displaced by another one a second after it was asked. The unit's own search continues: a hint
+//! delays it once, by a second at most.
 
 use core::net::{IpAddr, SocketAddr};
 
@@ -20,11 +20,11 @@ use crate::time::{Duration, Instant};
 
 /// Addresses that are asked side by side.
 const HINTS: usize = 4;
-/// An address that was asked keeps its place for so long: no more than four a second are asked, however many are told.
+/// An address that was asked keeps its slot for this long: at most four a second are asked, however many hints arrive.
 const STAY: Duration = Duration::from_secs(1);
-/// The unit's own search waits for such a question so long at most.
+/// Longest time that the unit's own search waits for such a question.
 const LONGEST_WAIT: Duration = Duration::from_secs(1);
-/// One that has asked so and hears nothing broadcasts after this and a random part of it, if it would not do so earlier.
+/// Without an answer, the unit broadcasts after this time and a random part of it, unless its search is due earlier.
 const UNANSWERED: Duration = Duration::from_millis(500);
 /// A host's question counts once in this time, the longest for which units hold back.
 const HOST_PAUSE: Duration = LONGEST_SEARCH.times(2);
@@ -62,7 +62,7 @@ impl Hints {
         self.list.iter().filter_map(|hint| hint.due).min().unwrap_or(Instant::FAR_FUTURE)
     }
 
-    /// Plans a question. `false` where one is planned, or as many addresses as may be are asked.
+    /// Schedules a question. `false` if one is scheduled already, or the list is full.
     fn plan(&mut self, now: Instant, from: SocketAddr, who: &Identity, due: Instant) -> bool {
         if let Some(known) = self.list.iter_mut().find(|hint| is_same_host(hint.from, from) && hint.who == *who) {
             let is_free = known.due.is_none();
@@ -74,7 +74,7 @@ impl Hints {
         let who = who.clone();
         let hint = Hint { from, who, due: Some(due), asked: 0, not_before: now, since: now };
         let Err(hint) = self.list.push(hint) else { return true };
-        // The one that was asked longest ago gives way, even if it is to be asked again: it has had its time to answer.
+        // Displaces the one that was asked longest ago, even if it is to be asked again: it has had time to answer.
         let asked = self.list.iter_mut().filter(|known| known.asked > 0 && known.since + STAY <= now);
         asked.min_by_key(|known| known.since).map(|oldest| *oldest = hint).is_some()
     }
@@ -99,8 +99,8 @@ fn is_same_host(one: SocketAddr, other: SocketAddr) -> bool {
     one.ip() == other.ip() && (!one.ip().is_loopback() || one.port() == other.port())
 }
 
-/// Which hosts' questions have counted a short while ago: what anybody can send again puts this unit's own question off
-/// once, and not for as long as the sender likes.
+/// The hosts whose questions counted recently: a replayed question defers this unit's own once, and not for as long as
+/// the attacker likes.
 #[derive(Clone, Debug)]
 pub(super) struct Hosts {
     seed: u32,
@@ -113,7 +113,7 @@ impl Hosts {
         Self { seed, list: heapless::Deque::new() }
     }
 
-    /// Whether a question from there counts now; from here on it does not for a while.
+    /// Whether a question from this address counts now; after that it does not for a while.
     pub(super) fn counts(&mut self, now: Instant, from: SocketAddr) -> bool {
         while self.list.front().is_some_and(|(_, at)| *at + HOST_PAUSE <= now) {
             self.list.pop_front();
@@ -128,7 +128,7 @@ impl Hosts {
         self.list.push_back((host, now)).is_ok()
     }
 
-    /// 32 bits for a host. Two with one mark cost a search more, no more.
+    /// A hash of a host. A collision costs one search more.
     fn mark(&self, from: SocketAddr) -> u32 {
         let port = if from.ip().is_loopback() { from.port() } else { 0 };
         let host = match from.ip() {
@@ -144,7 +144,7 @@ const fn mix(bits: u32) -> u32 {
 }
 
 impl<S: Storage> Node<S> {
-    /// A broadcast says that a node which this unit dials is there: it is asked after `delay`, unless it is connected.
+    /// A broadcast hints at a node that this unit dials: it is asked after `delay`, unless it is connected.
     pub(super) fn hinted(&mut self, now: Instant, from: SocketAddr, who: &Identity, delay: Duration) {
         let away = self.node(who).is_none_or(|known| known.state == NodeState::Away && known.not_before <= now);
         if !away || matches!(self.config.target, Target::Fixed(..)) {
@@ -165,8 +165,8 @@ impl<S: Storage> Node<S> {
         }
     }
 
-    /// A question to one node is about to go out, and its answer makes a broadcast needless: the search waits for it, once
-    /// and not for long. `false` where none is.
+    /// Whether the search waits for the answer to a question to one node that is about to go out and makes a broadcast
+    /// needless: once, and not for long.
     pub(super) fn waits_for_hints(&mut self, now: Instant) -> bool {
         let due = self.hints.next();
         if self.search.waited || due == Instant::FAR_FUTURE {

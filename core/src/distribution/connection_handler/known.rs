@@ -16,7 +16,7 @@ pub struct Known {
     pub identity: Identity,
     /// The other end of its link; while it is away, where it was last heard.
     pub address: SocketAddr,
-    /// The life of it that is connected; while it is away, the newest that was heard.
+    /// The boot that is connected; while it is away, the newest that was heard.
     pub epoch: Epoch,
     /// What it takes, once it has joined.
     pub limits: Option<Limits>,
@@ -29,13 +29,13 @@ pub struct Known {
     pub(super) dialed: bool,
     /// The link that is being opened to it.
     pub(super) dialing: Option<LinkId>,
-    /// A link with its identity that waits for the present one to show whether it lives.
+    /// A link with its identity that waits for the outcome of the present one's challenge.
     pub(super) newcomer: Option<Newcomer>,
     /// When it joined, or was dialled last.
     pub(super) since: Instant,
     /// Dials that have failed in a row.
     pub(super) attempts: u8,
-    /// It has refused for a reason that stays: this life of it is not dialled earlier.
+    /// It has refused for a lasting reason: this boot of it is not dialled earlier.
     pub(super) not_before: Instant,
     pub(super) index: u16,
     pub(super) task: Option<Task>,
@@ -45,7 +45,7 @@ pub struct Known {
     pub(super) after: u16,
 }
 
-/// A link that waits until it is clear whether the older one of the same identity lives.
+/// A link that waits until the older one of the same identity has been challenged.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Newcomer {
     pub(super) link: LinkId,

@@ -22,8 +22,8 @@ pub(super) const FIRST_DELAY: Duration = Duration::from_millis(50);
 /// First searches of s_units wait a random part of this, mostly a late one: of a fleet that is switched on within seconds
 /// most hear a manager's answer to another one first.
 const FIRST_LISTENING: Duration = Duration::from_millis(400);
-/// The same where a manager has been lost: a whole fleet loses it, each unit when it notices, so that they begin within
-/// seconds of each other; and a node that has just left takes a moment to return.
+/// The same after the loss of a manager: each unit of a fleet detects it at another time, within seconds; and a node
+/// that has just left takes a moment to return.
 pub(super) const LOST_LISTENING: Duration = Duration::from_millis(800);
 /// Searches that an m_unit makes after its start, or after it lost its last node, even if nodes join meanwhile: a lost
 /// datagram must not keep two managers apart.
@@ -42,9 +42,9 @@ const STEPS: u32 = 12;
 #[derive(Clone, Debug)]
 pub(super) struct Search {
     pub(super) next: Instant,
-    /// The application asked for it: it goes out whatever else is heard until then.
+    /// A search that the application requested: it goes out whatever is heard until then.
     explicit: Option<Instant>,
-    /// Searches since the last success, own or of others with the same question.
+    /// Searches since the last success, own ones and those of others for the same manager.
     pub(super) attempt: u8,
     /// When `attempt` was raised last because of others.
     round: Instant,
@@ -54,7 +54,7 @@ pub(super) struct Search {
     stubborn: bool,
     /// Times in a row that the budget was used up.
     deferred: u8,
-    /// It has waited for the answer to a hint, and does so no more before it has gone out.
+    /// It has waited for the answer to a hint, and does not wait again before it has gone out.
     pub(super) waited: bool,
 }
 
@@ -90,9 +90,8 @@ fn fresh(random: &mut Random) -> u64 {
     random.bits() | 1
 }
 
-/// A delay in `[0, limit)` for something that one of many units should do for all, as far as they hear each other: half
-/// of them fall into the last step, a quarter into the one before, and so on, so that few are early, however many there
-/// are.
+/// A random delay in `[0, limit)` for an action that one of many units should take for all that hear it. Half of the
+/// units draw the last step, a quarter the one before, and so on: few are early, however many there are.
 pub(super) fn mostly_late(random: &mut Random, limit: Duration) -> Duration {
     let step = limit.divided_by(u64::from(STEPS));
     let last = STEPS.saturating_sub(1);
@@ -145,8 +144,8 @@ impl<S: Storage> Node<S> {
         }
     }
 
-    /// When the next search goes out. Another unit's question that is read before may put it off, so a port that lets
-    /// datagrams wait reads them first: of many units that one busy thread drives, each would ask otherwise.
+    /// When the next search goes out. Another unit's search may defer it, so a port reads waiting datagrams first:
+    /// otherwise each of many units that one busy thread drives would search.
     pub fn searches_at(&self) -> Instant {
         self.search.next()
     }
@@ -172,7 +171,7 @@ impl<S: Storage> Node<S> {
         }
     }
 
-    /// Looks again for what has been lost: an s_unit listens for so long first. `None`: it was lost at once.
+    /// Searches again after a loss: an s_unit listens for this long first. `None`: the link was lost at once.
     pub(super) fn search_again(&mut self, now: Instant, listening: Option<Duration>) {
         if self.table.joined() > 0 {
             return;
@@ -295,7 +294,7 @@ impl<S: Storage> Node<S> {
         }
     }
 
-    /// Whether another unit's question may put this unit's own off. One that asks a single node says nothing to others.
+    /// Whether another unit's search may defer this unit's own. One that asks a single node does not count.
     fn counts(&mut self, now: Instant, from: SocketAddr, who_has: &WhoHas) -> bool {
         let counts = who_has.expected > 0 && self.hosts.counts(now, from);
         if counts {
@@ -306,7 +305,7 @@ impl<S: Storage> Node<S> {
         counts
     }
 
-    /// Another unit asks this unit's question: the answer will reach both.
+    /// Another unit searches for the same manager: the answer will reach both.
     fn hold_back(&mut self, now: Instant) {
         if self.search.next == Instant::FAR_FUTURE || self.search.stubborn || !self.is_searching() {
             return;
@@ -371,7 +370,8 @@ impl<S: Storage> Node<S> {
             let delay = self.spread(announce.expected);
             self.hinted(now, from, &announce.identity, delay);
         } else {
-            // A full manager's broadcast is no invitation; one that asked it may be the one whose place is being kept.
+            // The broadcast of a full manager is no hint; but a unit that it answers directly may be the one that its
+            // capacity is reserved for.
             self.note_of(now, from, &announce.identity, Refusal::Full);
         }
     }

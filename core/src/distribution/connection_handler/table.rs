@@ -1,7 +1,7 @@
-//! The table of nodes: lent slots, an index by identity, one entry per link, and places that keep their meaning.
+//! The table of nodes: lent slots, an index by identity, one entry per link, and stable indices.
 //!
-//! Each event costs a binary search at most. Only a node that was never seen before costs more: its entry in the sorted
-//! index moves the others by two bytes each.
+//! Each event costs a binary search at most. Only a new node costs more: inserting into the sorted index moves two
+//! bytes for each entry behind it.
 
 use core::net::{IpAddr, SocketAddr};
 

@@ -1,4 +1,5 @@
-//! Another live node with this unit's own name and id: noticed on both sides, and told to the application.
+//! Duplicate identity: another live node with this unit's own name and id, detected on both sides and reported to the
+//! application.
 
 use core::net::SocketAddr;
 
@@ -35,8 +36,8 @@ impl<S: Storage> Node<S> {
         self.twins.news.take()
     }
 
-    /// This unit's own datagrams are ignored; another's in its name are noted. A manager answers the `question` of one,
-    /// which would hear nothing otherwise.
+    /// Ignores this unit's own datagrams, and records another's in its name. A manager answers the `question` of the
+    /// other one, which would not detect it otherwise.
     pub(super) fn is_own(
         &mut self,
         now: Instant,

@@ -9,7 +9,7 @@ use crate::host::mailman::LinkId;
 use crate::storage::Storage;
 
 impl<S: Storage> Node<S> {
-    /// All nodes that are known, in the order in which they became so, as long as none had to be forgotten.
+    /// All known nodes, in the order in which they were first heard of, as long as none had to be forgotten.
     pub fn nodes(&self) -> impl Iterator<Item = &Known> {
         self.table.iter()
     }

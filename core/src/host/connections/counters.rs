@@ -9,13 +9,13 @@ crate::counters::counters! {
         BytesReceived,
         /// Messages received whole.
         MessagesReceived,
-        /// Links ended because what came could not be read, did not open, or was longer than it may be.
+        /// Links ended because a frame was malformed, did not open, or was too long.
         FramesRefused,
         /// Messages accepted for sending.
         MessagesSent,
         /// Bytes that the network took.
         BytesSent,
-        /// Frames of the protocol itself (signs of life, renewals, farewells) for which there was no room.
+        /// Frames of the protocol itself (keep-alives, renewals, close) that were dropped for want of space.
         FramesWithheld,
         /// Messages refused because the class's buffer was full or none was free.
         SendRefused,
@@ -29,7 +29,7 @@ crate::counters::counters! {
         DatagramsDropped,
         /// Session datagrams that are not the peer's, or were changed on their way.
         DatagramsForged,
-        /// Session datagrams that came before, or are far older than others that came.
+        /// Session datagrams that are duplicates, or older than the replay window.
         DatagramsRepeated,
         /// Links whose peers did not prove possession of the pair key.
         ProofsFailed,

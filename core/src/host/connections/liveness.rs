@@ -3,14 +3,14 @@
 use crate::config::{LONGEST_KEEP_ALIVE, MISSED_KEEP_ALIVES, SHORTEST_KEEP_ALIVE, TCP_ONLY_LOSS};
 use crate::time::{Duration, Instant};
 
-/// While a keep-alive is missed, the peer is asked so often within each period. A live peer whose datagrams are lost at
-/// 10 % answers none of the eight questions until the link is given up once in 600,000 times.
+/// Pings per period while a keep-alive is missing. With 10 % loss, a live peer answers none of the eight pings before
+/// the link is given up once in 600,000 times.
 const QUESTIONS_PER_PERIOD: u64 = 4;
 
 /// Whether the peer is still there: any frame renews it, and each keep-alive period without one is counted.
 ///
-/// A peer that has missed a keep-alive is asked, again and again, until something of it comes: one that is alive is
-/// heard however many frames are lost, and one that is not is found lost no later. In calm nothing is asked.
+/// A peer that has missed a keep-alive is pinged repeatedly until a frame of it arrives: a live peer is heard despite
+/// lost frames, and a dead one is detected no later. While keep-alives arrive, no pings are sent.
 ///
 /// At most one keep-alive counts as missed per poll, so that a suspended host or a jumped clock ends nothing by itself.
 #[derive(Debug)]
@@ -36,8 +36,8 @@ pub struct Look {
 }
 
 impl Liveness {
-    /// A peer that was heard just now and sends a keep-alive every `period`. One outside the bounds is taken as the nearer of
-    /// them: a peer that tells 2^32-1 ms is lost 210 s after it vanished, and not never.
+    /// A peer that was heard just now and sends a keep-alive every `period`, which is clamped to the bounds: a peer
+    /// that advertises 2^32-1 ms is lost 210 s after it vanished, not never.
     pub fn new(now: Instant, period: Duration) -> Self {
         let period = period.clamp(SHORTEST_KEEP_ALIVE, LONGEST_KEEP_ALIVE);
         let next_check = now + period + period.divided_by(2);

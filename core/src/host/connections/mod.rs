@@ -25,7 +25,7 @@ use sender::Sender;
 
 /// A whole frame or message that arrived; [`Link::view`] shows the bytes.
 #[derive(Clone, Copy, Debug)]
-// A wide tag: the rest is then moved in words, and not byte by byte.
+// A wide tag, so that the rest is moved in words, not bytes.
 #[repr(u32)]
 pub enum Incoming {
     /// The peer's hello.
@@ -134,8 +134,8 @@ impl<S: Storage, C: Seal> Link<S, C> {
         &mut self.cipher
     }
 
-    /// Sets the longest chunk that this unit takes. While the peer has proven nothing that is little, so that it costs
-    /// little.
+    /// Sets the longest chunk that this unit accepts; small until the peer has proven itself, so that it costs little
+    /// memory.
     pub(crate) fn set_chunk_limit(&mut self, limit: usize) {
         self.receiver.set_chunk_limit(limit);
     }
@@ -151,8 +151,8 @@ impl<S: Storage, C: Seal> Link<S, C> {
         self.receiver.raise_message_limit(limit);
     }
 
-    /// Takes what the port has read. Call it again with the rest, and once with nothing, until it completes nothing:
-    /// that call gives the buffer of the last message back.
+    /// Ingests what the port has read. Call it again with the unconsumed rest, and then with an empty slice, until it
+    /// completes nothing: that last call returns the buffer of the last message.
     pub fn receive(&mut self, buffers: &mut dyn Buffers<S>, bytes: &mut [u8]) -> Result<Received, CloseReason> {
         let available = bytes.len();
         let mut received = Received { consumed: 0, incoming: None, paused: false };
@@ -170,7 +170,7 @@ impl<S: Storage, C: Seal> Link<S, C> {
         Ok(received)
     }
 
-    /// Whether anything is kept of what came: otherwise a [`receive`](Self::receive) of nothing does nothing.
+    /// Whether received data is retained; otherwise a [`receive`](Self::receive) of an empty slice does nothing.
     pub fn holds_received(&self) -> bool {
         self.receiver.holds_anything()
     }
@@ -267,7 +267,7 @@ impl<S: Storage, C: Seal> Link<S, C> {
         Ok(())
     }
 
-    /// Whether the network did not take all that it was offered: the port asks to be told when the stream is writable.
+    /// Whether the network accepted less than was offered: the port then waits for the stream to become writable.
     pub fn wants_to_write(&self) -> bool {
         self.sender.is_blocked()
     }
@@ -277,7 +277,7 @@ impl<S: Storage, C: Seal> Link<S, C> {
         self.sender.queued()
     }
 
-    /// Gives every borrowed buffer back. The link is of no use afterwards.
+    /// Returns every borrowed buffer. The link must not be used afterwards.
     pub fn release(&mut self, buffers: &mut dyn Buffers<S>) {
         self.receiver.release(buffers);
         self.sender.release(buffers);

@@ -1,8 +1,8 @@
 //! Puts frames and messages together from whatever pieces the network delivers.
 //!
-//! A link borrows one buffer at most for all that it receives: for a frame that is longer than the link's own bytes, for
-//! a message in several chunks, or for both, the frame behind what there is of the message. So a link that pauses for
-//! want of a buffer holds none, and links cannot wait for each other.
+//! A link borrows one buffer at most for all that it receives: for a frame that is longer than the link's own bytes,
+//! for a message in several chunks, or for both: the frame then follows the assembled part of the message. So a link
+//! that waits for a buffer holds none, and links cannot deadlock.
 
 use super::{Incoming, Place, Received, Store};
 use crate::bytes;
@@ -47,7 +47,7 @@ struct Piece {
 }
 
 /// A frame without its bytes, which are the tail of its body.
-// A wide tag: the rest is then moved in words, and not byte by byte.
+// A wide tag, so that the rest is moved in words, not bytes.
 #[repr(u32)]
 enum Content {
     Hello,
@@ -74,7 +74,7 @@ impl<S: Storage> Receiver<S> {
         self.message_limit = self.message_limit.max(limit);
     }
 
-    /// Whether anything is kept of what came: a frame in pieces, a message, or the buffer of one that was handed up.
+    /// Whether received data is retained: a frame in pieces, a message, or the buffer of one that was handed up.
     pub(super) fn holds_anything(&self) -> bool {
         self.partial.length > 0 || self.buffer.is_some()
     }
@@ -87,8 +87,8 @@ impl<S: Storage> Receiver<S> {
         }
     }
 
-    /// Takes bytes that have come, and says in `received` what became of them: it is lent, because moving it through
-    /// each layer would cost a board more than reading the frame.
+    /// Ingests bytes and reports in `received` what they completed. The report is lent, because moving it through each
+    /// layer would cost a board more than parsing the frame.
     pub(super) fn receive<C: Seal>(
         &mut self,
         cipher: &mut C,
@@ -99,8 +99,9 @@ impl<S: Storage> Receiver<S> {
         loop {
             let before = received.consumed;
             self.step(cipher, buffers, lent, received)?;
-            // The chunks of a message are taken in a row: the layers above have nothing to do with them. And one that had
-            // waited for a buffer would look as if nothing were left to do.
+            // Takes the chunks of a message in a row: returning between them would cost a call through the layers above
+            // for each, and a frame that had waited for a buffer consumes no bytes, which would look as if nothing were
+            // left to do.
             let progress = received.consumed > before;
             let goes_on = if progress { received.consumed < lent.len() } else { self.partial.done };
             if !goes_on || received.paused || received.incoming.is_some() {
@@ -330,7 +331,8 @@ impl<S: Storage> Receiver<S> {
         Ok(piece.last.then_some(whole))
     }
 
-    /// Puts the bytes at `place` into the buffer at `at`, which is not behind them where they are in it already.
+    /// Copies the bytes at `place` into the buffer at `at`; if they are in that buffer already, `at` is not behind
+    /// them.
     fn keep(&mut self, place: Place, lent: &[u8], at: usize) -> Result<(), CloseReason> {
         let buffer = self.buffer.as_mut().ok_or(CloseReason::Protocol)?;
         let from = match place.store {
@@ -378,7 +380,7 @@ impl<S: Storage> Receiver<S> {
 }
 
 impl Content {
-    /// What a frame holds, and how many bytes at the end of its body belong to that.
+    /// The content of a frame, and the length of its payload at the end of the body.
     fn of(frame: Frame<'_>) -> (Self, usize) {
         match frame {
             Frame::Hello(bytes) => (Self::Hello, bytes.len()),

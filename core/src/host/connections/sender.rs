@@ -15,9 +15,9 @@ use crate::host::mailman::{LinkId, Mailman};
 use crate::host::secure::Seal;
 use crate::storage::{Buffer, Buffers, LEFT_BY_SENDING, Storage};
 
-/// Room for one emergency and the frames that keep a link going.
+/// Space for one emergency and the frames that keep a link alive.
 const URGENT_BYTES: usize = 2 * EMERGENCY_RESERVE;
-/// What an emergency may need of it: no other frame may take the last of these bytes.
+/// The part reserved for an emergency: other frames must leave these bytes free.
 const EMERGENCY_RESERVE: usize = EMERGENCY_BYTES + 64;
 
 pub(super) struct Sender<S: Storage> {
@@ -26,7 +26,7 @@ pub(super) struct Sender<S: Storage> {
     queues: [Option<SendQueue<S>>; 3],
     /// The queue whose frames were sealed last and are not all written, or whose message is not complete.
     current: Option<usize>,
-    /// The network did not take all that it was offered, and something of it still waits.
+    /// The network took less than was offered, and the rest still waits.
     blocked: bool,
 }
 
@@ -42,7 +42,7 @@ struct SendQueue<S: Storage> {
     before: (usize, bool),
 }
 
-/// Whether a step of writing went through, or the network took no more.
+/// Whether a write completed, or the network took no more.
 #[derive(PartialEq, Eq)]
 enum Progress {
     Through,
@@ -73,8 +73,8 @@ impl<S: Storage> Sender<S> {
         self.queues.iter().flatten().map(SendQueue::waiting).fold(self.urgent.len(), usize::saturating_add)
     }
 
-    /// Whether what waits in the queues is in the way of one more message of `total` bytes: its class's queue is too full,
-    /// or the other queues hold the buffer that it needs.
+    /// Whether queued messages prevent one more message of `total` bytes: its class's queue is too full, or the other
+    /// queues hold the buffer that it needs.
     pub(super) fn is_in_the_way(&self, buffers: &mut dyn Buffers<S>, priority: Priority, total: usize) -> bool {
         match queue_index(priority).and_then(|index| self.queues.get(index)) {
             Some(Some(queue)) => self.cut.framed_length(total) > queue.room(),
@@ -113,8 +113,8 @@ impl<S: Storage> Sender<S> {
         Err(error)
     }
 
-    /// Whether a message is short and finds nothing that waits: it is written out of the link's own bytes, and needs no
-    /// buffer if the network takes it.
+    /// Whether a message is short and nothing else is queued: it is written from the link's own buffer, and needs none
+    /// of the pool if the network takes it.
     pub(super) fn takes_at_once(&self, priority: Priority, total: usize) -> bool {
         self.urgent.is_empty()
             && !self.blocked
@@ -151,7 +151,7 @@ impl<S: Storage> Sender<S> {
         if self.append_urgent(Priority::Emergency, total, write) { Ok(()) } else { Err(Error::Full(Limit::SendQueue)) }
     }
 
-    /// A whole message of one chunk that goes with the urgent frames. It leaves the room of an emergency.
+    /// A whole message of one chunk that goes with the urgent frames. It leaves the space reserved for an emergency.
     pub(super) fn accept_short(
         &mut self,
         priority: Priority,
@@ -180,7 +180,7 @@ impl<S: Storage> Sender<S> {
         self.append_frame(frame, self.cut.overhead)
     }
 
-    /// A frame that is not to be sealed, while there is none yet that is.
+    /// A frame in clear; only while no sealed frame is queued.
     pub(super) fn accept_clear(&mut self, frame: &Frame<'_>) -> bool {
         let accepted = !self.urgent.has_unsealed() && self.append_frame(frame, 0);
         if accepted {
@@ -314,7 +314,7 @@ impl<S: Storage> SendQueue<S> {
         Self { buffer, start: 0, sealed: 0, end: 0, at_boundary: true, before: (0, true) }
     }
 
-    /// One with the frames of a short message in it, for which there is room in any buffer.
+    /// A queue that holds the frames of a short message, which fit into any buffer.
     fn of(buffer: Buffer<S>, frames: &[u8]) -> Self {
         let mut queue = Self::new(buffer);
         if let Some(place) = queue.buffer.get_mut(..frames.len()) {

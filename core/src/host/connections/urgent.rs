@@ -1,5 +1,5 @@
-//! The link's own bytes for what goes between chunks: frames of the protocol itself, emergencies, and a short message for
-//! which no other one waits.
+//! The link's own send buffer, for what goes between chunks: frames of the protocol itself, emergencies, and a short
+//! message when no other is queued.
 
 use crate::bytes;
 
@@ -23,7 +23,7 @@ impl<const BYTES: usize> Urgent<BYTES> {
         self.filled == 0
     }
 
-    /// `count` more bytes, to be written now; `None` when there are no more so many.
+    /// `count` more bytes, to be written now; `None` if fewer are free.
     pub(super) fn append(&mut self, count: usize) -> Option<&mut [u8]> {
         let end = self.filled.checked_add(count)?;
         let place = self.bytes.get_mut(self.filled..end)?;
