@@ -24,10 +24,10 @@ use crate::machine::{LinkSession, Machine};
 use crate::replies::ended;
 use crate::time::now;
 
-/// How long somebody who has dialled may take to say, and to prove, who is there while nobody else could dial, or while
-/// another one has dialled. A slow controller takes most of it for the proof.
+/// How long a dialling peer may take for its hello, and for its proof, while no other one could dial, or while another
+/// one has dialled. A slow controller takes most of it for the proof.
 const PATIENCE: Duration = Duration::from_millis(300);
-/// That somebody could not join is logged this often at most, whatever is tried.
+/// Refused links are logged at most this often.
 const LOGGED: Duration = Duration::from_secs(1);
 /// How often the cable and the address are looked at, since the stack wakes one task only for them: it is left to the
 /// application's `wait_config_up`.
@@ -211,8 +211,8 @@ impl<T> Machine<T> {
         self.listen();
     }
 
-    /// The stack refuses who dials while no socket listens, so the oldest of those who have proven nothing gives way; and
-    /// also where more than one has proven nothing, since a board looks at one proof at a time.
+    /// Closes the oldest link without a proof, if no socket listens, because the stack then refuses dials; and if there
+    /// is a second one without a proof, since a board handles one proof at a time.
     fn show_one_out(&mut self, now: Instant) {
         let mut pending = self.pending();
         let Some(first) = pending.next() else { return };
@@ -377,7 +377,7 @@ impl<T> Machine<T> {
         }
     }
 
-    /// Links end in this way as fast as somebody dials, so the log has one line for many of them.
+    /// Peers can make links end in this way as fast as they can dial, so the log is rate-limited.
     fn log_refused(&mut self, told: Option<&Identity>, reason: CloseReason) {
         let now = now();
         if now >= self.logged {
@@ -386,7 +386,7 @@ impl<T> Machine<T> {
         }
     }
 
-    /// Gives the memory of a link's session back; whose it was, who it said it is, and where.
+    /// Returns the memory of a link's session: the peer's identity, the identity it claimed, and its address.
     #[inline(never)]
     fn end(&mut self, index: u16) -> Option<(Option<Identity>, Option<Identity>, SocketAddr)> {
         let Self { links, pool, counters, .. } = self;

@@ -23,7 +23,7 @@ type Put<T> = fn(
 ) -> Result<Slot, Error>;
 
 impl<T> Handle<T> {
-    /// Adds a service, which nobody sees before it is published. The signature is in the text form, as in
+    /// Adds a service, which is invisible to peers before it is published. The signature is in the text form, as in
     /// `go_to(position: int[2])`.
     ///
     /// [`Error::BadName`] for a signature that cannot be read, [`Error::TooLarge`] when arguments and results are
@@ -34,7 +34,7 @@ impl<T> Handle<T> {
         self.put(signature, options, handler, FunctionList::add_function)
     }
 
-    /// Changes a service. Whoever knows the old one gets [`Error::StaleFunction`] until it is published again.
+    /// Changes a service. A caller that knows the old one gets [`Error::StaleFunction`] until it is published again.
     pub fn replace_service(
         &self,
         signature: &str,

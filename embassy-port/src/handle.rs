@@ -62,8 +62,7 @@ impl<T> Handle<T> {
         self.act(|machine| machine.hub.node.broadcast(crate::now()));
     }
 
-    /// Ends every link in an orderly way, and looks for nobody any more. Another life begins with a restart of the
-    /// board.
+    /// Ends every link in an orderly way, and stops searching. The unit starts again only with a restart of the board.
     pub fn stop(&self) {
         self.act(|machine| {
             machine.stopped = true;
@@ -210,7 +209,7 @@ impl<T> Handle<T> {
         .await
     }
 
-    /// Events that nobody read in time.
+    /// Events that were lost because they were not read in time.
     pub fn events_lost(&self) -> u32 {
         self.look(|machine| machine.events.lost)
     }

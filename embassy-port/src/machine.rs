@@ -60,7 +60,7 @@ pub(crate) struct Link {
     /// The peer, from joining to leaving.
     pub(crate) peer: Option<Identity>,
     pub(crate) waiters: &'static mut [Option<Waiter>],
-    /// The serial of the list that the peer was last told, for those who wait until it is read.
+    /// The serial of the list that was last sent to the peer, for tasks that wait until it is read.
     pub(crate) told: Option<u32>,
 }
 
@@ -86,9 +86,9 @@ impl Link {
 /// What the unit is made of.
 pub(crate) struct Machine<T: 'static> {
     pub(crate) hub: Hub<Lent>,
-    /// What proves to peers who this unit is.
+    /// Proves this unit's identity to peers.
     pub(crate) proof: Proof,
-    /// Who may do what.
+    /// The access table.
     pub(crate) access: Table,
     pub(crate) functions: FunctionList<Lent, Listed<T>>,
     pub(crate) pool: Pool<Lent>,
@@ -111,9 +111,9 @@ pub(crate) struct Machine<T: 'static> {
     pub(crate) look: Instant,
     /// It has had an address.
     pub(crate) has_begun: bool,
-    /// It has been stopped, and does nothing any more but end its connections.
+    /// It has been stopped, and only ends its connections.
     pub(crate) stopped: bool,
-    /// When it was last logged that somebody could not join.
+    /// When the next refused link may be logged.
     pub(crate) logged: Instant,
     /// How old the keys of a link become.
     pub(crate) renews_every: Duration,
@@ -133,11 +133,11 @@ pub(crate) struct Room {
     pub(crate) parameters: usize,
 }
 
-/// Who waits for what.
+/// Wakers of waiting tasks.
 pub(crate) struct Wakers {
     /// The runner: something was asked of the unit.
     pub(crate) runner: WakerRegistration,
-    /// Whoever reads events.
+    /// The reader of events.
     pub(crate) events: WakerRegistration,
     /// A peer came, went or was told something.
     pub(crate) news: MultiWakerRegistration<TASKS_WAITING>,
@@ -232,8 +232,8 @@ impl<T> Machine<T> {
         if closing(&first) { candidates.find(|index| !closing(index)).or(Some(first)) } else { Some(first) }
     }
 
-    /// The links that others have opened and on which nobody has proven, or in plain mode said, who is there: when each was
-    /// opened, and its index.
+    /// The accepted links on which the peer has not proven its identity, or in plain mode not sent its hello: when each
+    /// was opened, and its index.
     pub(crate) fn pending(&self) -> impl Iterator<Item = (Instant, u16)> {
         self.indices().filter_map(|index| {
             let link = self.link(index)?;
@@ -250,10 +250,10 @@ impl<T> Machine<T> {
         }
     }
 
-    /// Tells the application.
+    /// Queues an event for the application.
     pub(crate) fn tell(&mut self, event: UnitEvent) {
         self.events.put(event);
-        // Whoever reads events gets its turn, so that few of them have room for any number.
+        // Lets the reader of events run, so that a short queue suffices for any number of events.
         self.yields |= self.wakers.events.occupied();
         self.wakers.events.wake();
         self.wakers.news.wake();

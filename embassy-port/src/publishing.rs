@@ -1,4 +1,4 @@
-//! Which of the unit's functions are visible to whom.
+//! Visibility of the unit's functions.
 
 use cara_core::distribution::identity::Identity;
 use cara_core::error::Error;

@@ -32,7 +32,7 @@ pub(crate) struct InFlight {
     pub(crate) id: CallId,
     pub(crate) slot: Slot,
     pub(crate) generation: Generation,
-    /// Nobody waits for the reply after this.
+    /// The caller waits for the reply until then.
     pub(crate) deadline: Instant,
 }
 
@@ -67,7 +67,7 @@ impl ReplyBox {
 }
 
 impl Link {
-    /// Whether a reply could come that somebody waits for.
+    /// Whether a task waits for a reply on this link.
     pub(crate) fn awaits_reply(&self) -> bool {
         self.waiters.iter().flatten().any(|waiter| waiter.call.serial == self.serial && waiter.outcome.is_none())
     }
@@ -92,7 +92,7 @@ impl Waiter {
     }
 }
 
-/// Keeps the end of a call for the task that waits for it; nobody may.
+/// Stores the outcome of a call for the task that waits for it, if there is one.
 pub(crate) fn ended(
     waiters: &mut [Option<Waiter>],
     reply: &mut ReplyBox,

@@ -386,7 +386,7 @@ pub fn new<
     Ok((Handle { shared }, runner))
 }
 
-/// What its node is told, and what proves who it is.
+/// The configuration of its node, and the proof of its identity.
 fn parts(config: Config) -> (NodeConfig, Proof) {
     let Config { identity, target, fleet, constraints, security: Security(proof), seed, epoch, tcp_port, .. } = config;
     let listens = identity.role() == Role::MUnit;

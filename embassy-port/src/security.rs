@@ -1,4 +1,4 @@
-//! How a unit proves to its peers who it is: with keys, or, where somebody has said so in words, not at all.
+//! How a unit proves its identity to its peers: with keys, or, by explicit opt-in to plain mode, not at all.
 //!
 //! Without the crate's feature `secure` there is nothing but plain mode, and no cipher in the image.
 
@@ -10,21 +10,21 @@ pub(crate) use self::secured::{LinkCipher, OVERHEAD, Proof};
 #[cfg(not(feature = "secure"))]
 pub(crate) use self::plain::{LinkCipher, OVERHEAD, Proof};
 
-/// What a unit is given to prove who it is; [`Config`](crate::Config) wants one.
+/// A unit's proof of identity, for its [`Config`](crate::Config).
 pub struct Security(pub(crate) Proof);
 
 impl Security {
-    /// Links are secured, and discovery is authenticated. `keyring` has the keys of this unit, as those that `cara provision`
-    /// writes to a board's flash (`cara_settings::keys::Keys`, in a static); `random` is the generator of this life of the
-    /// board, whose boot counter has been moved.
+    /// Links are secured, and discovery is authenticated. `keyring` has the keys of this unit, as those that `cara
+    /// provision` writes to a board's flash (`cara_settings::keys::Keys`, in a static); `random` is the generator of
+    /// this boot, whose boot counter has been raised.
     #[cfg(feature = "secure")]
     pub fn keys(keyring: &'static dyn cara_secure::keyring::Keyring, random: cara_secure::random::Random) -> Self {
         Self(Proof::keys(keyring, random))
     }
 
-    /// Plain mode: everybody on the network can read what is said, and can speak as anybody. Such a unit says so in its log
-    /// when it starts, and meets only units that are insecure too. `seed` should differ from boot to boot: the controller's
-    /// source of noise, or a count of its starts.
+    /// Plain mode: every host on the network can read what units say, and can speak as any unit. Such a unit warns in
+    /// its log when it starts, and connects only to units that are insecure too. `seed` should differ from boot to
+    /// boot: the controller's source of noise, or a count of its starts.
     pub const fn insecure(seed: u64) -> Self {
         Self(Proof::insecure(seed))
     }

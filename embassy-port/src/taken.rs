@@ -23,7 +23,7 @@ pub(crate) struct Running {
     pub(crate) link: u16,
     pub(crate) serial: u32,
     pub(crate) ticket: Ticket,
-    /// Nobody waits for the answer after this.
+    /// The caller waits for the answer until then.
     pub(crate) deadline: Instant,
 }
 
@@ -72,7 +72,7 @@ impl TaskSlot {
     }
 }
 
-/// Answers a call, or gives that up once nobody waits any more; `false` when the answer cannot be kept now.
+/// Answers a call, or gives up once its deadline has passed; `false` if the answer cannot be queued now.
 #[inline(never)]
 fn answer(
     session: &mut LinkSession,
@@ -199,11 +199,11 @@ impl<T> Machine<T> {
 pub struct TakenCall<T: 'static> {
     unit: Handle<T>,
     running: Option<Running>,
-    /// Who calls.
+    /// The caller.
     pub caller: Identity,
     /// The call's class.
     pub priority: Priority,
-    /// After this nobody waits for the answer; on the clock of [`now`](crate::now).
+    /// After this the caller no longer waits; on the clock of [`now`](crate::now).
     pub deadline: Instant,
     /// Whether the caller waits.
     pub wants_reply: bool,
@@ -215,7 +215,7 @@ impl<T> Handle<T> {
     /// Takes the next call of one of this unit's services that was added with
     /// [`Handler::task`](crate::Handler::task); its arguments are in `parameters`, with room for its results.
     ///
-    /// Cancelling loses nothing: the call waits for the next one who takes it, until its deadline or its lease ends.
+    /// Cancel-safe: the call waits for the next `next_call`, until its deadline or its lease ends.
     ///
     /// [`Error::UnknownFunction`] when there is no such service; an error of `parameters` when the arguments do not
     /// fit, in which case the caller gets [`ServiceError::NotReady`].

@@ -127,8 +127,8 @@ impl<T: Send + 'static> Builder<T> {
         self
     }
 
-    /// Plain mode: whoever is on the network can read what the unit says, and speak as anybody. It has a port of its own,
-    /// does not meet units with keys, and warns in the log when it starts.
+    /// Plain mode: every host on the network can read what the unit says, and speak as any unit. It has a port of its
+    /// own, does not connect to units with keys, and warns in the log when it starts.
     pub fn insecure(mut self) -> Self {
         self.keys = KeySource::Insecure;
         self
@@ -215,7 +215,7 @@ impl<T: Send + 'static> Builder<T> {
         self
     }
 
-    /// Who may do what, from the start: see [`access`](crate::access). Without a table whoever has joined may do everything.
+    /// The initial access table: see [`access`](crate::access). Without one, a joined node may do everything.
     pub fn access(mut self, table: AccessTable) -> Self {
         self.access = Some(table);
         self

@@ -421,7 +421,7 @@ impl<T: Send + 'static> CommunicationSystem<T> {
         self.engine().set_access(table);
     }
 
-    /// The access table in force; without one whoever has joined may do everything.
+    /// The access table in force; without one, a joined node may do everything.
     pub fn access(&self) -> Option<Arc<AccessTable>> {
         self.engine().access()
     }
@@ -445,7 +445,7 @@ impl<T: Send + 'static> CommunicationSystem<T> {
         self.engine().with_state(act)
     }
 
-    /// Gives back the memory of message buffers that nobody uses; a few are kept otherwise, for the next long messages.
+    /// Frees unused message buffers, of which a few are otherwise kept for the next long messages.
     pub fn trim_buffers(&self) {
         self.engine().pool.shrink();
     }

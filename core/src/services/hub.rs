@@ -1,8 +1,8 @@
-//! What the links of a unit share: who is known, and what is published to whom.
+//! State shared by the links of a unit: known nodes, and the functions published to each.
 //!
-//! A session enters the hub by itself, through the [`Door`] in its [`Context`](super::Context), when a peer has introduced
-//! itself or has shown that it is alive. What concerns another link, the port takes from [`Node::poll`] and passes on with
-//! [`Session::direct`](super::unit::Session::direct), while it holds nothing of the hub.
+//! A session enters the hub by itself, through the [`Door`] in its [`Context`](super::Context), when a peer has
+//! introduced itself or has shown that it is alive. Effects on another link, the port takes from [`Node::poll`] and
+//! passes on with [`Session::direct`](super::unit::Session::direct), while it does not hold the hub.
 
 use crate::distribution::connection_handler::Node;
 use crate::storage::Storage;
@@ -13,7 +13,7 @@ use super::publications::Publications;
 pub struct Hub<S: Storage> {
     /// Finds nodes and decides which links are taken.
     pub node: Node<S>,
-    /// What is published to whom.
+    /// The functions published to each node.
     pub publications: Publications<S>,
 }
 

@@ -29,8 +29,8 @@
 //! | [`Joined`](unit::Event::Joined) | the peer is taken, and is being told what is published to it |
 //! | [`Closed`](unit::Event::Closed) | the last one: forgets the session (`into_storage` gives its slices back), then `node.left`, also for a link that never joined |
 //!
-//! What differs between ports is only who calls these, and under which lock. Two sessions are never locked at the same time; a
-//! session enters the hub itself, through the [`Door`](hub::Door) in its [`Context`].
+//! Ports differ only in which thread or task makes these calls, and under which lock. Two sessions are never locked at
+//! the same time; a session enters the hub itself, through the [`Door`](hub::Door) in its [`Context`].
 //!
 //! ```
 //! # use cara_core::config::Constraints;
@@ -217,7 +217,7 @@ pub struct Context<'c, P: Port> {
     pub buffers: &'c mut dyn Buffers<P::Storage>,
     /// The unit's own functions.
     pub functions: &'c dyn OwnFunctions,
-    /// Who may do what; without a table whoever has joined may do everything.
+    /// The access table; without one, a joined node may do everything.
     pub access: Option<&'c dyn access::Access>,
     /// What the links of the unit share.
     pub hub: &'c mut dyn hub::Door<P::Storage>,

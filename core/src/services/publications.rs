@@ -1,5 +1,5 @@
-//! Which functions of a unit are visible to whom: to all, also to those that come later, or to one identity, also after
-//! it reconnects (paper, listing lines 23 and 24).
+//! Visibility of a unit's functions: to all nodes, including those that join later, or to one identity, also after it
+//! reconnects (paper, listing lines 23 and 24).
 
 use crate::distribution::function_list::Slot;
 use crate::distribution::identity::Identity;

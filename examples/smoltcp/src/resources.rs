@@ -15,7 +15,7 @@ use cara_core::storage::{Lent, Pool};
 use smoltcp::iface::SocketStorage;
 use smoltcp::socket::udp;
 
-/// Datagrams, broadcasts among them, come to this port and leave from it: nobody else on this host wants it.
+/// Datagrams, including broadcasts, arrive at this port and are sent from it: the host has no other user of it.
 pub(crate) const DATAGRAM_PORT: u16 = PLAIN_PORT;
 /// Longest block of arguments or results.
 pub(crate) const MESSAGE_BYTES: usize = 1_024;

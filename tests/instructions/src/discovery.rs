@@ -215,7 +215,7 @@ impl Discovery {
         self.rest(&mut Outbox(0));
     }
 
-    /// An AGV has dialled, says who it is, and is taken.
+    /// An AGV has dialled, sends its hello, and is accepted.
     fn introduce(&mut self, link: LinkId, identity: Identity, meter: &mut dyn Meter) {
         let address = address(&identity);
         self.hello.identity = identity;

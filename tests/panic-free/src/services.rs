@@ -1,4 +1,4 @@
-//! Common services: a session's whole life, leases, who sees which function.
+//! Common services: a session from hello to close, leases, visibility of functions.
 
 use core::mem::MaybeUninit;
 

@@ -94,8 +94,8 @@ fn forgeries(bytes: &[u8], fleet: Fleet) -> Vec<Vec<u8>> {
     vec![bytes.to_vec(), [signed, &[0; CODE_BYTES]].concat(), signed.to_vec(), flipped, plain, elsewhere]
 }
 
-/// The datagrams that an attacker without the fleet's key can send about `who`; `asked` is the nonce of the target's
-/// own question.
+/// The datagrams that an attacker without the fleet's key can send in the name of an identity; `asked` is the nonce of
+/// the target's own question.
 fn said_of(ground: &Ground, who: &Identity, asked: u64, port: u16) -> Vec<Vec<u8>> {
     let (fleet, mut out) = (ground.fleet, [0; SEARCH_BYTES]);
     let mut said = Vec::new();

@@ -1,4 +1,4 @@
-//! Answering those who search, and dialling those who were found.
+//! Answers to searches, and dials to the nodes that were found.
 
 use core::net::SocketAddr;
 
@@ -15,26 +15,26 @@ use crate::host::mailman::Mailman;
 use crate::storage::Storage;
 use crate::time::{Duration, Instant};
 
-/// A second unit that asks within this is answered by a broadcast as well: where two ask, more are holding back, and the
-/// longest time for which they do that is this one.
+/// A second unit that asks within this time is answered by a broadcast as well: where two ask, more are holding back,
+/// at most for this long.
 const SAME_QUESTION: Duration = LONGEST_SEARCH.times(2);
 /// Two broadcast answers are at least this far apart.
 const ANSWER_PAUSE: Duration = FIRST_SEARCH.times(2);
-/// An answer waits up to this long, so that one broadcast serves all who ask meanwhile.
+/// An answer waits up to this long, so that one broadcast serves all units that ask meanwhile.
 const ANSWER_GATHER: Duration = Duration::from_millis(20);
 /// Answers to single nodes that may wait for their random delay.
 const WAITING_ANSWERS: usize = 8;
-/// Of them to one host: units that share one are told by the broadcast.
+/// Of them to one host: further units of that host get the broadcast.
 const ANSWERS_TO_A_HOST: usize = 4;
-/// Dials are spread over as many nodes at least: those that hold back are more than those that are expected.
+/// Dials are spread over at least this many nodes: more hold back than are expected.
 const LEAST_SPREAD: u16 = 50;
-/// Dials are spread over as many nodes at most, whatever is expected: the last one dials two seconds later.
+/// Dials are spread over at most this many nodes, so that the last one dials two seconds later.
 const MOST_SPREAD: u16 = 2_000;
-/// An m_unit that has dialled a peer in vain this often asks where it is.
+/// An m_unit that has dialled a peer in vain this often searches for it.
 const MOVED_AFTER: u8 = 2;
-/// A dial that has been silent for so long no longer keeps another address of the same node waiting.
+/// A dial without an answer for this long no longer blocks another address of the same node.
 const DIAL_ALONE: Duration = Duration::from_millis(300);
-/// A link that is being opened is given up after this, however the network below thinks about it.
+/// A dial is given up after this time, even if the network below has not given it up.
 pub(super) const DIAL_TIMEOUT: Duration = Duration::from_secs(6);
 
 /// An answer to a single node.
@@ -42,7 +42,7 @@ pub(super) const DIAL_TIMEOUT: Duration = Duration::from_secs(6);
 struct Answer {
     at: Instant,
     to: SocketAddr,
-    /// Who asked.
+    /// The node that asked.
     who: Identity,
     nonce: u64,
 }
@@ -53,7 +53,7 @@ pub(super) struct Answers {
     single: heapless::Vec<Answer, WAITING_ANSWERS>,
     broadcast: Option<Instant>,
     last_broadcast: Option<Instant>,
-    /// Who asked last, and when.
+    /// The [`short_hash`] of the node that asked last, and when.
     asked: Option<(Instant, u32)>,
 }
 
@@ -108,14 +108,14 @@ impl<S: Storage> Node<S> {
         self.answer_unpaired(now + delay, from, who_has, mode);
     }
 
-    /// Plans an answer to one of whom and this unit there is no pair, and so no key.
+    /// Schedules an answer to a unit that has no pair key with this one.
     pub(super) fn answer_unpaired(&mut self, at: Instant, to: SocketAddr, who_has: &WhoHas, mode: Mode) {
         let nonce = if mode == Mode::Secured { 0 } else { who_has.nonce };
         self.answer_later(at, to, &who_has.identity, nonce);
     }
 
-    /// Plans an answer to one node. One that finds no room is left to the broadcast, or to the next question; one host
-    /// does not take all the room.
+    /// Schedules an answer to one node. If the list is full, the broadcast or the next question serves it; one host
+    /// cannot fill the list.
     pub(super) fn answer_later(&mut self, at: Instant, to: SocketAddr, who: &Identity, nonce: u64) {
         let single = &mut self.answers.single;
         if single.iter().any(|answer| answer.to == to && answer.nonce == nonce) {
@@ -257,7 +257,7 @@ impl<S: Storage> Node<S> {
         self.retry(now, place);
     }
 
-    /// Tries again later, and later each time: an s_unit asks anew, who has an address dials it.
+    /// Retries with growing back-off: an s_unit searches again, an m_unit that knows the address dials it.
     pub(super) fn retry(&mut self, now: Instant, place: usize) {
         let Some(known) = self.table.node_mut(place) else { return };
         let failed = known.attempts;
@@ -267,7 +267,7 @@ impl<S: Storage> Node<S> {
         match self.config.target {
             Target::Manager(_) => {
                 if failed == 0 {
-                    // It has just been heard, so it may have moved: however long it was away, it is asked for soon.
+                    // It has just been heard, so it may have moved: search soon, however long it was away.
                     self.search.attempt = 0;
                 }
                 self.plan_next(now);

@@ -9,9 +9,9 @@ use crate::host::mailman::LinkId;
 use crate::storage::Storage;
 use crate::time::{Duration, Instant};
 
-/// A link that lasted shorter than this counts as a failed try: what fails at once is not tried again at once.
+/// A link that lasted shorter than this counts as a failed try, so that it is not retried without back-off.
 const SETTLED: Duration = Duration::from_secs(1);
-/// Failed tries that count as this many when who was dialled has given a reason that only people can remove.
+/// Number of failed tries that a refusal counts as if its reason needs an operator.
 const HOPELESS: u8 = 5;
 
 impl<S: Storage> Node<S> {
@@ -94,7 +94,7 @@ impl<S: Storage> Node<S> {
         self.search_again(now, settled.then_some(LOST_LISTENING));
     }
 
-    /// Who was dialled has refused for a reason that does not pass by itself.
+    /// The dialled peer has refused for a reason that does not pass by itself.
     fn lose_hope(&mut self, now: Instant, place: usize, reason: CloseReason) {
         let CloseReason::Refused(refusal) = reason else { return };
         if matches!(refusal, Refusal::Full | Refusal::AlreadyConnected) {

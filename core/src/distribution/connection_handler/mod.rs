@@ -1,17 +1,17 @@
-//! The paper's `Connection_handler`: finds nodes, decides which links are taken, and holds what is known of each node.
+//! The paper's `Connection_handler`: finds nodes, decides which links are accepted, and has the state of each node.
 //!
-//! A [`Node`] is one unit's membership. It knows links by their ids only; what travels on them is the sessions' matter.
-//! The port polls it, gives it the datagrams that arrive, asks it about each hello ([`Node::admit`]) and tells it when a
+//! A [`Node`] is one unit's membership. It knows links by their ids only; frames on them are the sessions' matter. The
+//! port polls it, gives it the datagrams that arrive, asks it about each hello ([`Node::admit`]) and tells it when a
 //! link has ended ([`Node::left`]). What is to be done comes back as [`Action`]s.
 //!
 //! # Discovery (paper, section 2: "it works like the Address Resolution Protocol")
-//! - An s_unit broadcasts a who-has for its manager, waits longer and longer between two, and dials the one that answers.
-//!   When it hears another unit ask for the same manager it holds its own question back: the manager answers two with
-//!   one broadcast.
-//! - An m_unit broadcasts a who-has for everybody. Its own s_units ask it, after a random delay, and dial it when it
-//!   answers; of two m_units the smaller identity dials.
-//! - What is dialled has answered a question of this unit, in secured mode with the code of the pair. All else that is
-//!   heard is a hint of an address.
+//! - An s_unit broadcasts a search ([`WhoHas`](super::datagram::WhoHas)) for its manager, with growing back-off, and
+//!   dials the one that answers. A unit that hears another one search for the same manager defers its own search: the
+//!   manager answers both with one broadcast.
+//! - An m_unit broadcasts a search for all. Its own s_units ask it, after a random delay, and dial it when it answers;
+//!   of two m_units the smaller identity dials.
+//! - Only a node that has answered a question of this unit is dialled, in secured mode with the code of the pair.
+//!   Everything else that is heard is a hint of an address.
 
 mod admission;
 mod answers;
@@ -50,7 +50,7 @@ use table::Table;
 use timetable::Task;
 use twins::Twins;
 
-/// Whom a unit wants to reach.
+/// The nodes that a unit connects to.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Target {
     /// Every m_unit, or those that [`Node::choose`] names, and the s_units that belong to this one.
@@ -86,9 +86,9 @@ pub struct NodeConfig {
     pub identity: Identity,
     /// Its fleet.
     pub fleet: Fleet,
-    /// This life of it; must differ from boot to boot.
+    /// Its boot epoch; must differ from boot to boot.
     pub epoch: Epoch,
-    /// Whom it wants to reach.
+    /// The nodes that it connects to.
     pub target: Target,
     /// Where it can be dialled; 0 for nowhere.
     pub tcp_port: u16,
@@ -107,20 +107,20 @@ pub enum Command {
     Dial {
         /// Where.
         to: SocketAddr,
-        /// Whom; unknown for a fixed address.
+        /// The expected identity; unknown for a fixed address.
         identity: Option<Identity>,
     },
     /// Pass this on to a link.
     Tell(LinkId, Directive),
 }
 
-/// What a link is told because of another one. Only the node makes one.
+/// A directive to a link because of another one. Only the node makes one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Directive {
     /// The peer shows whether it is alive: another link has its identity.
     #[non_exhaustive]
     Challenge,
-    /// It has waited, and is taken.
+    /// It has waited, and is accepted.
     #[non_exhaustive]
     Admit,
     /// It has waited, and the link in its way is alive.
@@ -131,7 +131,7 @@ pub enum Directive {
     Close(CloseReason),
 }
 
-/// Whose a datagram is.
+/// The receiver of a datagram.
 #[derive(Debug, PartialEq, Eq)]
 pub enum Sorted<'b> {
     /// The node has dealt with it, or counted why not.
@@ -154,7 +154,7 @@ pub struct Finding {
     pub at: Instant,
     /// The other end.
     pub address: SocketAddr,
-    /// Who the other end is, if it said so.
+    /// The other end's identity, if it gave one.
     pub identity: Option<Identity>,
     /// Why.
     pub refusal: Refusal,

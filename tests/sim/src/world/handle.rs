@@ -118,7 +118,7 @@ impl UnitHandle {
 
     // --- its own functions
 
-    /// Adds a service, which nobody sees before it is published. The signature is in the text form, as in
+    /// Adds a service, which is invisible to peers before it is published. The signature is in the text form, as in
     /// `pos_info() -> (position: int[2])`.
     ///
     /// # Panics
@@ -131,8 +131,7 @@ impl UnitHandle {
         })?
     }
 
-    /// Puts another service in the place of one of the same name; whoever knew the old one is told when this one is
-    /// published.
+    /// Replaces the service of the same name; peers that knew the old one get the new one when it is published.
     ///
     /// # Panics
     /// For a signature that cannot be read.

@@ -70,7 +70,7 @@ pub(super) struct Links {
     by_stream: BTreeMap<StreamId, u16>,
     pub(super) functions: FunctionList<Boxed, Handler>,
     pub(super) buffers: LazyPool,
-    /// Who may do what.
+    /// The access table.
     pub(super) access: Option<&'static dyn Access>,
     pub(super) hub: Hub<Boxed>,
     pub(super) keys: Keys,
@@ -110,7 +110,7 @@ impl Links {
         self.links.iter().position(Option::is_none).map(|index| index as u16)
     }
 
-    /// The link, of those that others have opened, that has waited longest for its peer to say, or prove, who it is.
+    /// The accepted link that has waited longest for its peer's hello or proof.
     pub(super) fn oldest_silent(&self) -> Option<u16> {
         let silent = |index: &&u16| {
             let link = self.link(**index);
@@ -363,7 +363,7 @@ impl Links {
         }
     }
 
-    /// The link has ended: whoever still waits for something of it is told, and the stream is closed.
+    /// Removes a link that has ended, and closes its stream.
     pub(super) fn remove(&mut self, network: &mut Network, index: u16) -> Option<Link> {
         let link = self.links.get_mut(usize::from(index))?.take()?;
         self.streams[usize::from(index)] = None;
@@ -372,7 +372,7 @@ impl Links {
         Some(link)
     }
 
-    /// The unit is no more: the callers of all links are told.
+    /// The unit is gone: ends the calls of all links.
     pub(super) fn abandon(&mut self, error: Error) {
         for link in self.links.iter_mut().filter_map(Option::take) {
             link.abandon(error);
@@ -381,7 +381,7 @@ impl Links {
 }
 
 impl Link {
-    /// Tells whoever still waits for something of this link.
+    /// Ends everything that still waits for this link.
     pub(super) fn abandon(self, error: Error) {
         for waiting in self.waiting.into_values() {
             waiting.promise.keep(Err(error));

@@ -188,7 +188,7 @@ fn every_flipped_bit_of_a_question_or_answer_is_noticed() {
     tally.close();
 }
 
-/// Somebody announces every manager, with keys of another fleet, with none, in answer to the very question.
+/// An attacker announces every manager, with keys of another fleet and with none, with the nonce of the question.
 #[test]
 fn spoofed_announces_lead_nowhere() {
     let mut tally = Tally::new("spoofed announces");
@@ -297,7 +297,7 @@ fn nobody_without_a_manager_s_own_key_keeps_it_from_starting() {
     tally.close();
 }
 
-/// What a manager said once changes nothing when somebody says it again, at any time and from anywhere.
+/// A replayed answer of a manager changes nothing, at any time and from any address.
 #[test]
 fn an_announce_that_was_recorded_changes_nothing() {
     let mut tally = Tally::new("recorded announces once more");

@@ -222,7 +222,7 @@ impl End {
         self.work();
     }
 
-    /// The hub has taken the peer, which has proven who it is.
+    /// The hub has accepted the peer, which has proven its identity.
     pub(crate) fn greeted(&self) -> bool {
         self.hub.node.connected() > 0
     }

@@ -14,7 +14,7 @@ const HANDSHAKE: usize = 6;
 const RECORDED: u8 = 1;
 const ATTACKED: u8 = 2;
 
-/// Runs a conversation in which frame `at` arrives as `changed`; whether who got it was taken in.
+/// Runs a conversation in which frame `at` is passed through `change` before it is delivered.
 fn with_changed(at: usize, change: impl Fn(&mut Carried)) -> Ends {
     let mut ends = Ends::new(ATTACKED);
     ends.converse(|ends, number, mut carried| {
@@ -59,7 +59,7 @@ fn every_flipped_bit_of_a_sealed_frame_ends_the_link_and_of_a_datagram_changes_n
     let mut tally = Tally::new("bits of sealed frames and datagrams flipped");
     let record = Ends::recorded(ATTACKED);
     for (at, original) in record.iter().enumerate().skip(HANDSHAKE) {
-        // The length in front of a frame is no secret; who changes it only moves the frame's end.
+        // The length in front of a frame is not sealed; changing it only moves the frame's end.
         let first = if original.datagram { 24 } else { 2 };
         for bit in first * 8..original.bytes.len() * 8 {
             let mut ends = with_changed(at, |carried| carried.bytes[bit / 8] ^= 1 << (bit % 8));
@@ -126,7 +126,7 @@ fn whatever_was_said_is_of_no_use_later_in_the_same_link() {
     tally.close();
 }
 
-/// Whoever answers with everything that was ever recorded, in its order, is nobody.
+/// A peer that replays a whole recorded conversation proves nothing.
 #[test]
 fn a_recorded_peer_proves_nothing() {
     let mut tally = Tally::new("whole recorded conversations");
@@ -193,7 +193,7 @@ fn what_is_cut_or_too_long_before_the_proof_costs_no_buffer() {
     tally.close();
 }
 
-/// The length alone ends the link: nobody waits, with a buffer in hand, for the rest of a frame that is too long.
+/// The length alone ends the link: no buffer is held for the rest of a frame that is too long.
 #[test]
 fn the_beginning_of_an_oversize_frame_before_the_proof_ends_the_link() {
     let mut tally = Tally::new("beginnings of oversize frames before the proof");

@@ -25,11 +25,11 @@ const LIMIT: Duration = Duration::from_secs(2);
 #[derive(Clone, Copy, Debug)]
 enum Attack {
     Calm,
-    /// A who-has of each of two earlier lives of the manager, in turn.
+    /// A `WhoHas` of each of two earlier boots of the manager, in turn.
     EarlierLives,
-    /// Announces of the manager, each of another life, with the discovery key of a stolen vehicle.
+    /// Announces of the manager, each of another boot, with the discovery key of a stolen vehicle.
     Forged,
-    /// One who-has of another vehicle.
+    /// One `WhoHas` of another vehicle.
     Vehicle,
 }
 

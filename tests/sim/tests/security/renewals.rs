@@ -209,7 +209,7 @@ fn a_peer_that_does_not_go_on_loses_its_link() {
     assert_eq!(renewed(&ends.agv), 0);
 }
 
-/// Whoever has something to say and finds no room says it later.
+/// A frame of a renewal that does not fit the send queue is sent later.
 #[test]
 fn a_renewal_waits_for_room_in_the_stream() {
     for clogged in [true, false] {

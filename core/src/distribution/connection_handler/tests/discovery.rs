@@ -310,7 +310,7 @@ fn own_datagrams_are_ignored_and_a_double_is_told() {
     assert_eq!(other.take_twin(), Some(address(1, 7_001)));
 }
 
-/// Whoever claims one life after the other does not fill the application's log.
+/// A node that claims one boot after the other does not fill the application's log.
 #[test]
 fn doubles_are_told_now_and_then_only() {
     let mut node = depot();

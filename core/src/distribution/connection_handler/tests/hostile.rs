@@ -1,4 +1,4 @@
-//! What strangers on the network can do: fill tables, shout others down, keep a unit waiting.
+//! Attackers on the network: filling tables, suppressing searches, delaying a unit.
 
 use super::*;
 use crate::config::LONGEST_SEARCH;
@@ -100,7 +100,7 @@ fn hints_lead_to_few_questions_and_delay_nothing() {
             assert_eq!(node.nodes().count(), 0);
             let most = if hosts == 1 { 7 } else { 10 * hosts.min(4) as usize + 4 };
             assert!(outbox.sent.len() <= most, "{what}: {} questions", outbox.sent.len());
-            // Who speaks for many hosts uses up the budget of questions for some seconds.
+            // An attacker with many addresses exhausts the budget of searches for some seconds.
             let latest = if hosts <= 2 { at(2_700) } else { at(9_000) };
             assert!(first.is_some_and(|first| first <= latest), "{what}: asks itself at {first:?}");
         }
