@@ -8,15 +8,11 @@ mod keyed;
 use std::sync::mpsc::Receiver;
 use std::time::{Duration, Instant};
 
-use cara_processes::network;
+use cara_processes::network::{self, ip};
 use cara_std::control::Control;
 use cara_std::{CloseReason, CommunicationSystem, Error, Interfaces, Parameters, Unit, UnitEvent};
 
 const PATIENCE: Duration = Duration::from_secs(30);
-
-fn ip(words: &str) {
-    network::run(&format!("ip {words}")).unwrap();
-}
 
 /// A pair of interfaces, one of which is the far end of the cable.
 fn plug_in() {

@@ -14,8 +14,9 @@ use std::net::{Ipv4Addr, UdpSocket};
 use std::time::Duration;
 
 use crate::datagrams::{MANAGER, Search};
-use crate::namespace::{Peer, ip, nft};
+use crate::namespace::Peer;
 use crate::support::{Clinic, until, while_running};
+use cara_processes::network::{filter, ip};
 
 #[test]
 fn a_program_that_does_not_share_the_port_is_named_with_its_process() {
@@ -313,7 +314,7 @@ fn a_firewall_that_drops_the_tcp_port_is_told_with_the_port() {
         ip("link set lo up");
         let clinic = Clinic::new();
         let manager = clinic.manager("boss", 64);
-        nft("input", &format!("tcp dport {} drop", manager.tcp_port()));
+        filter("inet cara", "input", &format!("tcp dport {} drop", manager.tcp_port())).unwrap();
         let _agv = clinic.started(clinic.unit("agv", 7, "boss"));
         let told = clinic.doctor(&["agv"]);
         told.is(&["tcp-blocked"], 4);
@@ -327,7 +328,7 @@ fn a_firewall_that_rejects_the_tcp_port_is_told_with_the_port() {
         ip("link set lo up");
         let clinic = Clinic::new();
         let manager = clinic.manager("boss", 64);
-        nft("input", &format!("tcp dport {} reject with tcp reset", manager.tcp_port()));
+        filter("inet cara", "input", &format!("tcp dport {} reject with tcp reset", manager.tcp_port())).unwrap();
         let _agv = clinic.started(clinic.unit("agv", 7, "boss"));
         clinic.doctor(&["agv"]).is(&["tcp-blocked"], 4);
     });
@@ -338,7 +339,7 @@ fn broadcasts_that_the_own_firewall_drops_are_told() {
     namespace::inside("broadcasts_that_the_own_firewall_drops_are_told", &["nft"], || {
         ip("link set lo up");
         let clinic = Clinic::new();
-        nft("input", &format!("udp dport {} drop", clinic.port));
+        filter("inet cara", "input", &format!("udp dport {} drop", clinic.port)).unwrap();
         clinic.doctor(&["agv", "--listen", "3s"]).is(&["broadcast-lost"], 4);
     });
 }
@@ -348,7 +349,7 @@ fn broadcasts_that_the_own_firewall_does_not_let_out_are_told() {
     namespace::inside("broadcasts_that_the_own_firewall_does_not_let_out_are_told", &["nft"], || {
         ip("link set lo up");
         let clinic = Clinic::new();
-        nft("output", &format!("udp dport {} drop", clinic.port));
+        filter("inet cara", "output", &format!("udp dport {} drop", clinic.port)).unwrap();
         clinic.doctor(&["agv"]).is(&["send-refused"], 4);
     });
 }
@@ -364,7 +365,7 @@ fn a_link_on_which_signs_of_life_get_lost_is_told() {
         let agv = manager.s_unit("agv").unwrap();
         // Signs of life are datagrams beside the stream; discovery goes on. Half of them pass: where none ever has, both
         // ends ask in the stream with each one, and none counts as missed.
-        nft("input", &format!("udp dport != {} numgen random mod 2 0 drop", clinic.port));
+        filter("inet cara", "input", &format!("udp dport != {} numgen random mod 2 0 drop", clinic.port)).unwrap();
         let count = |name| agv.counters().iter().find(|(known, _)| *known == name).map_or(0, |(_, count)| *count);
         until("signs of life are missed", || count("KeepAlivesMissed") >= 3);
         let told = clinic.doctor(&["agv"]);
@@ -375,7 +376,7 @@ fn a_link_on_which_signs_of_life_get_lost_is_told() {
 /// Two hosts with a cable between them; the far one hears no broadcasts.
 #[test]
 fn broadcasts_that_do_not_reach_the_other_host_are_told() {
-    namespace::inside("broadcasts_that_do_not_reach_the_other_host_are_told", &["nft", "nsenter"], || {
+    namespace::inside("broadcasts_that_do_not_reach_the_other_host_are_told", &["nft"], || {
         let clinic = Clinic::on_all_interfaces();
         let far = Peer::start(&[
             MANAGER,
@@ -392,15 +393,17 @@ fn broadcasts_that_do_not_reach_the_other_host_are_told() {
             ip(command);
         }
         ip(&format!("link set v1 netns {}", far.process()));
-        far.ip("address add 10.77.0.2/24 broadcast + dev v1");
-        far.ip("link set v1 up");
-        far.nft("input", "meta pkttype broadcast udp dport 0-65535 drop");
+        let there = far.network();
+        there.run("ip address add 10.77.0.2/24 broadcast + dev v1").unwrap();
+        there.run("ip link set v1 up").unwrap();
+        let broadcasts = "meta pkttype broadcast udp dport 0-65535 drop";
+        there.within(|| filter("inet cara", "input", broadcasts)).unwrap();
         far.go();
         let told = clinic.doctor(&["boss"]);
         told.is(&["broadcast-one-way"], 4);
         assert!(told.found(0).contains("10.77.0.2:"), "{told:?}");
         // Without what keeps them away it answers.
-        far.no_firewall();
+        there.run("nft flush ruleset").unwrap();
         clinic.doctor(&["boss"]).is(&["answers"], 0);
     });
 }

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use cara_apps::agv::{Agv, BATTERY, GO_TO, GO_TO_LEASE, POS_INFO, Progress, TICK};
 use cara_core::services::lease::Lease;
 use cara_embassy::{Config, Handle, Handler, Resources, Security, ServiceOptions};
-use cara_processes::network;
+use cara_processes::network::{self, ip};
 use cara_secure::random::Random;
 use cara_std::keys::{FleetKeys, KeyRing};
 use cara_std::{CommunicationSystem, Error, Fleet, Identity, Interfaces, Parameters};
@@ -115,10 +115,10 @@ fn a_linux_manager_meets_a_vehicle_on_embassy() {
 }
 
 fn meet() {
-    network::run("ip link set lo up").unwrap();
-    network::run("ip tuntap add name tap0 mode tap").unwrap();
-    network::run("ip addr add 10.77.0.1/24 broadcast + dev tap0").unwrap();
-    network::run("ip link set tap0 up").unwrap();
+    ip("link set lo up");
+    ip("tuntap add name tap0 mode tap");
+    ip("addr add 10.77.0.1/24 broadcast + dev tap0");
+    ip("link set tap0 up");
     let fleet = cara_processes::random_fleet();
     let (own, vehicle) = (Identity::m_unit("manager", 1).unwrap(), Identity::s_unit("agv", 7).unwrap());
     let mut keys = FleetKeys::draw(Fleet(fleet)).unwrap();
@@ -145,10 +145,10 @@ fn meet() {
     assert_eq!(LOSSES.load(Ordering::Relaxed), 0);
     // The cable is pulled until both ends have noticed, and the vehicle comes back by itself.
     *PLUGGED_IN.lock().unwrap() = false;
-    network::run("ip link set tap0 down").unwrap();
+    ip("link set tap0 down");
     until("the manager gives the vehicle up", || manager.number_of_s_units() == 0);
     assert_eq!(LOSSES.load(Ordering::Relaxed), 1);
-    network::run("ip link set tap0 up").unwrap();
+    ip("link set tap0 up");
     *PLUGGED_IN.lock().unwrap() = true;
     until("the vehicle comes back", || manager.number_of_s_units() == 1);
     talk(&manager, [0, 1]);

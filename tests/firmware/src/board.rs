@@ -169,9 +169,7 @@ impl Cable {
             Way::ToBoard => ("output", "oifname"),
             Way::FromBoard => ("input", "iifname"),
         };
-        network::run(&format!("nft add table bridge {name}"))?;
-        network::run(&format!("nft add chain bridge {name} cut {{ type filter hook {hook} priority 0 ; }}"))?;
-        network::run(&format!("nft add rule bridge {name} cut {port} {name} drop"))
+        network::filter(&format!("bridge {name}"), hook, &format!("{port} {name} drop"))
     }
 
     /// Joins the wire that was cut.

@@ -6,7 +6,7 @@ mod tap_agv;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use cara_processes::network;
+use cara_processes::network::{self, ip};
 use cara_std::{CommunicationSystem, Interfaces, Parameters};
 
 /// Long enough for the slowest machine; nothing here is timed.
@@ -17,10 +17,6 @@ fn a_linux_manager_meets_a_vehicle_on_smoltcp() {
     if network::test("a_linux_manager_meets_a_vehicle_on_smoltcp", &[], true) {
         meet();
     }
-}
-
-fn ip(words: &str) {
-    network::run(&format!("ip {words}")).unwrap();
 }
 
 fn until(what: &str, mut done: impl FnMut() -> bool) {

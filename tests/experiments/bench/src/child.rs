@@ -102,7 +102,7 @@ impl Handle {
         thread::scope(|scope| {
             let starter = scope.spawn(|| {
                 pin::stay_on(end.cpu)?;
-                host.map_or(Ok(()), Host::enter)?;
+                host.map_or(Ok(()), |host| host.enter())?;
                 Self::spawn(command, patience)
             });
             let mut started = starter.join().expect("starting does not panic")?;

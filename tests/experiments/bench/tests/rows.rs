@@ -83,9 +83,8 @@ fn every_kind_of_row_has_the_documented_keys() {
 fn is_skipped(row: &Map<String, Value>) -> bool {
     let is_skipped = row.get("skipped").is_some_and(Value::is_string);
     if is_skipped {
-        assert!(std::env::var_os("CI").is_none(), "skipped, which counts as failed where CI is set: {row:?}");
         assert_eq!(row.keys().map(String::as_str).collect::<BTreeSet<_>>(), BTreeSet::from(["mbit", "skipped"]));
-        eprintln!("skipped: {row:?}");
+        cara_processes::skip(format_args!("{row:?}"));
     }
     is_skipped
 }
