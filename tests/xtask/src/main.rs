@@ -33,6 +33,7 @@ mod runner;
 mod sanitize;
 mod security;
 mod source;
+mod words;
 mod workspace;
 
 #[derive(Parser)]
