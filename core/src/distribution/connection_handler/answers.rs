@@ -3,7 +3,7 @@
 use core::net::SocketAddr;
 
 use super::known::NodeState;
-use super::search::pause;
+use super::search::back_off;
 use super::timetable::Task;
 use super::{Command, Node, NodeCounter, Target};
 use crate::config::{ANSWER_SPREAD, FIRST_SEARCH, LONGEST_SEARCH, Mode};
@@ -274,8 +274,8 @@ impl<S: Storage> Node<S> {
             }
             Target::Everybody if !smaller => {}
             Target::Everybody | Target::Fixed(..) if dials => {
-                let pause = pause(failed);
-                let at = now + pause + self.random.jitter(pause);
+                let back_off = back_off(failed);
+                let at = now + back_off + self.random.jitter(back_off);
                 self.table.schedule(place, at, Task::Dial);
                 if failed == MOVED_AFTER {
                     self.look_around(now);

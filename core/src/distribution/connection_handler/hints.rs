@@ -8,7 +8,7 @@
 use core::net::{IpAddr, SocketAddr};
 
 use super::known::NodeState;
-use super::search::{mostly_late, pause};
+use super::search::{back_off, mostly_late};
 use super::{Node, NodeCounter, Target};
 use crate::config::{FIRST_SEARCH, LONGEST_SEARCH};
 use crate::distribution::authenticator::Authenticator;
@@ -83,7 +83,7 @@ impl Hints {
     fn take(&mut self, now: Instant) -> Option<(SocketAddr, Identity)> {
         let hint = self.list.iter_mut().find(|hint| hint.due.is_some_and(|due| due <= now))?;
         hint.due = None;
-        (hint.since, hint.not_before) = (now, now + pause(hint.asked));
+        (hint.since, hint.not_before) = (now, now + back_off(hint.asked));
         hint.asked = hint.asked.saturating_add(1);
         Some((hint.from, hint.who.clone()))
     }

@@ -1,7 +1,7 @@
 //! Links that are being opened, and links that have ended.
 
 use super::known::NodeState;
-use super::search::{LOST_LISTENING, pause};
+use super::search::{LOST_LISTENING, back_off};
 use super::{Node, Target};
 use crate::distribution::identity::Identity;
 use crate::error::{CloseReason, Refusal};
@@ -105,7 +105,7 @@ impl<S: Storage> Node<S> {
         }
         if let Some(known) = self.table.node_mut(place) {
             known.attempts = known.attempts.max(HOPELESS);
-            known.not_before = now + pause(HOPELESS);
+            known.not_before = now + back_off(HOPELESS);
         }
     }
 }

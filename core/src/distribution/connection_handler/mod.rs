@@ -16,13 +16,13 @@
 mod admission;
 mod answers;
 mod counter;
+mod duplicates;
 mod hints;
 mod known;
 mod links;
 mod search;
 mod table;
 mod timetable;
-mod twins;
 mod views;
 
 pub(crate) use admission::Admission;
@@ -44,11 +44,11 @@ use crate::random::Random;
 use crate::storage::Storage;
 use crate::time::Instant;
 use answers::Answers;
+use duplicates::Duplicates;
 use hints::{Hints, Hosts};
 use search::{Budget, Search};
 use table::Table;
 use timetable::Task;
-use twins::Twins;
 
 /// The nodes that a unit connects to.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -191,7 +191,7 @@ pub struct Node<S: Storage> {
     hints: Hints,
     hosts: Hosts,
     answers: Answers,
-    twins: Twins,
+    duplicates: Duplicates,
     /// Of the last search or answer.
     sequence: u32,
     /// What happened.
@@ -217,7 +217,7 @@ impl<S: Storage> Node<S> {
             hints: Hints::new(),
             hosts: Hosts::new((config.seed >> 32) as u32 ^ config.seed as u32),
             answers: Answers::new(),
-            twins: Twins::default(),
+            duplicates: Duplicates::default(),
             sequence: 0,
             counters: Counters::new(),
             config,

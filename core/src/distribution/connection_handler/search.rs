@@ -29,7 +29,7 @@ pub(super) const LOST_LISTENING: Duration = Duration::from_millis(800);
 /// datagram must not keep two managers apart.
 const M_UNIT_SEARCHES: u8 = 4;
 /// The back-off doubles up to this attempt.
-const LONGEST_PAUSE_AFTER: u8 = 5;
+const LONGEST_BACK_OFF_AFTER: u8 = 5;
 /// With back-off at its longest, one in so many units that hold back searches regardless of what it hears. A unit that
 /// searches without end cannot silence a fleet for good, and a waiting fleet stays quiet.
 const STUBBORN: u64 = 1_024;
@@ -99,9 +99,9 @@ pub(super) fn mostly_late(random: &mut Random, limit: Duration) -> Duration {
     step.times(u64::from(last.saturating_sub(early))) + random.jitter(step)
 }
 
-/// The pause before the next try, without its jitter.
-pub(super) fn pause(attempt: u8) -> Duration {
-    FIRST_SEARCH.times(1 << attempt.min(LONGEST_PAUSE_AFTER)).min(LONGEST_SEARCH)
+/// The back-off before the next try, without its jitter.
+pub(super) fn back_off(attempt: u8) -> Duration {
+    FIRST_SEARCH.times(1 << attempt.min(LONGEST_BACK_OFF_AFTER)).min(LONGEST_SEARCH)
 }
 
 /// Searches on the network, own and heard: the times of the last few.
@@ -205,11 +205,11 @@ impl<S: Storage> Node<S> {
         }
     }
 
-    /// The next search comes after a pause that grows each time.
+    /// Schedules the next search with growing back-off.
     pub(super) fn plan_next(&mut self, now: Instant) {
-        let pause = pause(self.search.attempt);
+        let back_off = back_off(self.search.attempt);
         self.search.attempt = self.search.attempt.saturating_add(1);
-        self.search.next = now + pause + mostly_late(&mut self.random, pause);
+        self.search.next = now + back_off + mostly_late(&mut self.random, back_off);
     }
 
     pub(super) fn poll_search(&mut self, now: Instant, mailman: &mut dyn Mailman, authenticator: &dyn Authenticator) {
@@ -310,7 +310,7 @@ impl<S: Storage> Node<S> {
         if self.search.next == Instant::FAR_FUTURE || self.search.stubborn || !self.is_searching() {
             return;
         }
-        if self.search.attempt > LONGEST_PAUSE_AFTER && self.random.below(STUBBORN) == 0 {
+        if self.search.attempt > LONGEST_BACK_OFF_AFTER && self.random.below(STUBBORN) == 0 {
             self.search.stubborn = true;
             return;
         }
@@ -319,8 +319,8 @@ impl<S: Storage> Node<S> {
             self.search.attempt = self.search.attempt.saturating_add(1);
             self.search.round = now;
         }
-        let pause = pause(self.search.attempt.saturating_sub(1));
-        let later = now + pause + mostly_late(&mut self.random, pause);
+        let back_off = back_off(self.search.attempt.saturating_sub(1));
+        let later = now + back_off + mostly_late(&mut self.random, back_off);
         self.search.next = self.search.next.max(later);
     }
 

@@ -8,11 +8,11 @@
 )]
 
 mod admission;
-mod books;
 mod chaos;
 mod discovery;
 mod fleet;
 mod hostile;
+mod invariants;
 mod load;
 mod network;
 mod ordering;

@@ -1,4 +1,4 @@
-//! Whatever a port and its peers do, the books agree: a plain model of the links beside the node.
+//! Invariants of the node, whatever a port and its peers do, checked against a plain model of its links.
 
 use std::collections::BTreeMap;
 

@@ -13,18 +13,18 @@ use crate::time::Instant;
 
 /// What has been heard of others with this unit's identity.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Twins {
+pub(super) struct Duplicates {
     /// To be reported.
-    news: Option<SocketAddr>,
+    pending: Option<SocketAddr>,
     /// The boot that was reported last, and when: reports of a node that claims many boots are rate-limited.
-    told: Option<(Epoch, Instant)>,
+    reported: Option<(Epoch, Instant)>,
 }
 
-impl Twins {
+impl Duplicates {
     fn hear(&mut self, now: Instant, from: SocketAddr, epoch: Epoch) {
-        let known = self.told.is_some_and(|(told, at)| told == epoch || now < at + LONGEST_SEARCH);
+        let known = self.reported.is_some_and(|(reported, at)| reported == epoch || now < at + LONGEST_SEARCH);
         if !known {
-            (self.news, self.told) = (Some(from), Some((epoch, now)));
+            (self.pending, self.reported) = (Some(from), Some((epoch, now)));
         }
     }
 }
@@ -33,7 +33,7 @@ impl<S: Storage> Node<S> {
     /// The address of another live node with this unit's own name and id, reported once for each of its boots. It waits
     /// until this unit stops, or this one waits for it: give each node its own name or id.
     pub fn take_twin(&mut self) -> Option<SocketAddr> {
-        self.twins.news.take()
+        self.duplicates.pending.take()
     }
 
     /// Ignores this unit's own datagrams, and records another's in its name. A manager answers the `question` of the
@@ -52,7 +52,7 @@ impl<S: Storage> Node<S> {
         if epoch != self.config.epoch {
             self.counters.add(NodeCounter::OwnIdentity, 1);
             self.note_of(now, from, identity, Refusal::DuplicateIdentity);
-            self.twins.hear(now, from, epoch);
+            self.duplicates.hear(now, from, epoch);
             if let Some(who_has) = question.filter(|_| identity.role() == Role::MUnit) {
                 self.answer_later(now, from, identity, who_has.nonce);
             }
