@@ -1,4 +1,4 @@
-//! How a unit is made: identity first, then whatever differs from the defaults.
+//! Builder of a unit: identity first, then whatever differs from the defaults.
 
 use std::hash::{BuildHasher, Hasher, RandomState};
 use std::path::PathBuf;
@@ -90,7 +90,7 @@ impl Builder<()> {
 }
 
 impl<T: Send + 'static> Builder<T> {
-    /// Units of different fleets on one network do not meet; 0 unless set.
+    /// Units of different fleets on one network never connect; 0 unless set.
     pub fn fleet(mut self, fleet: u32) -> Self {
         self.fleet = Fleet(fleet);
         self
@@ -114,8 +114,7 @@ impl<T: Send + 'static> Builder<T> {
         self
     }
 
-    /// The file with the unit's keys, instead of where [`place`](crate::keys::place) looks, which is what a unit without
-    /// words about keys does.
+    /// The file with the unit's keys, instead of where [`place`](crate::keys::place) looks, which is the default.
     pub fn key_file(mut self, path: impl Into<PathBuf>) -> Self {
         self.keys = KeySource::File(path.into());
         self
@@ -134,7 +133,7 @@ impl<T: Send + 'static> Builder<T> {
         self
     }
 
-    /// The UDP port of broadcasts, equal for all units that are to meet. Unless set, the port of the unit's mode.
+    /// The UDP port of broadcasts, the same for all units of a fleet. Unless set, the port of the unit's mode.
     pub fn discovery_port(mut self, port: u16) -> Self {
         self.discovery_port = Some(port);
         self
@@ -147,8 +146,8 @@ impl<T: Send + 'static> Builder<T> {
         self
     }
 
-    /// An m_unit starts without asking whether a live one has its name and id. Two of one identity take each other's
-    /// s_units away: for tests of just that.
+    /// An m_unit starts without asking whether a live one has its name and id. Two of one identity take s_units from
+    /// each other: for tests of that.
     pub fn beside_another(mut self) -> Self {
         self.asks_for_itself = false;
         self
@@ -168,8 +167,9 @@ impl<T: Send + 'static> Builder<T> {
         self
     }
 
-    /// Of all m_units an m_unit connects to these alone, by name and ID number; to every one of its fleet unless set, and to
-    /// none with none named. A link takes the choice of both ends. An s_unit connects to its manager, whatever is set here.
+    /// Of all m_units an m_unit connects to these alone, by name and ID number; to every one of its fleet unless set,
+    /// and to none with none named. Two m_units connect only if each selects the other. An s_unit connects to its
+    /// manager, whatever is set here.
     ///
     /// ```no_run
     /// use cara_std::CommunicationSystem;

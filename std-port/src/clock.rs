@@ -1,5 +1,5 @@
-//! The port's clock: monotonic, microseconds since the unit was made, those included during which the system was suspended.
-//! Leases, ages and deadlines go by it, so that none of them survives a suspension that was longer.
+//! The port's clock: monotonic, microseconds since the unit was made, those included during which the system was
+//! suspended. Leases, ages and deadlines use it, so that none of them survives a longer suspension.
 
 use cara_core::time::{Duration, Instant};
 use rustix::time::{ClockId, clock_gettime};

@@ -94,7 +94,7 @@ impl<T: Send + 'static> Owner<T> {
     /// Opens the socket for the unit's operator, unless it is open or the unit is being stopped.
     fn open_control(&self) {
         let mut server = lock(&self.server);
-        // A server that is dropped in place of stopped leaves its threads.
+        // Dropping a server without stopping it would leak its threads.
         if server.is_none() && !self.engine.is_stopping() {
             let guest = Self::guest(self.engine.clone());
             *server = control::open(&self.control, CommunicationSystem::of(guest));
@@ -116,7 +116,7 @@ impl<T: Send + 'static> Clone for CommunicationSystem<T> {
     }
 }
 
-/// A handle that does not keep the unit running: what a handler of the unit itself holds to call others.
+/// A non-owning handle, for the unit's own handlers to call other nodes.
 pub struct WeakSystem<T: Send + 'static = ()> {
     owner: Weak<Owner<T>>,
 }
@@ -260,7 +260,7 @@ impl<T: Send + 'static> CommunicationSystem<T> {
         self.engine().broadcast();
     }
 
-    /// How many s_units are connected and have told what they offer (paper, listing line 3).
+    /// How many s_units are connected and have published their list (paper, listing line 3).
     #[doc(alias = "get_number_s_units")]
     pub fn number_of_s_units(&self) -> usize {
         self.number_of(Role::SUnit)
@@ -275,8 +275,8 @@ impl<T: Send + 'static> CommunicationSystem<T> {
         read(&self.engine().peers).of_role(role).filter(|peer| peer.is_introduced()).count()
     }
 
-    /// The s_units in the order in which they first told what they offer, then those that have not told it yet. One that has
-    /// left keeps its place, so an index goes on to mean the same node once that has told.
+    /// The s_units in the order in which they first published their list, then those that have not published it yet.
+    /// One that has left keeps its place, so an index stays that of the same node once it has published.
     pub fn s_units(&self) -> Vec<Peer<T>> {
         self.of_role(Role::SUnit)
     }
@@ -316,8 +316,8 @@ impl<T: Send + 'static> CommunicationSystem<T> {
         self.engine().node_of(identity).map(|cell| self.peer(&cell))
     }
 
-    /// The s_units that this manager is to have, connected or not: with keys those that its key file lists, in plain mode
-    /// those that have joined since its start. [`Peer::retire`] takes one off.
+    /// The s_units that this manager is expected to have, connected or not: with keys those that its key file lists, in
+    /// plain mode those that have joined since its start. [`Peer::retire`] takes one off.
     ///
     /// ```no_run
     /// # let depot = cara_std::CommunicationSystem::new("depot", 1)?;
@@ -415,7 +415,7 @@ impl<T: Send + 'static> CommunicationSystem<T> {
         self.engine().set_constraints(constraints)
     }
 
-    /// Another access table, or none: in force when this returns. A file that the unit follows is taken over again when it
+    /// Sets another access table, or none; in force when this returns. A file that the unit follows replaces it when it
     /// changes.
     pub fn set_access(&self, table: Option<AccessTable>) {
         self.engine().set_access(table);
@@ -426,7 +426,7 @@ impl<T: Send + 'static> CommunicationSystem<T> {
         self.engine().access()
     }
 
-    /// What no call returns: joined, left, failed. A subscriber that does not keep up loses events.
+    /// Subscribes to events: joined, left, failed. A subscriber that does not keep up loses events.
     pub fn events(&self) -> Receiver<UnitEvent> {
         let (sender, receiver) = sync_channel(EVENTS);
         self.engine().subscribe(sender);

@@ -1,5 +1,5 @@
-//! How much a unit on Linux has room for. A link takes little memory when it opens, and more up to these capacities
-//! when its peer offers more, or more calls are in flight.
+//! Capacities of a unit on Linux. A link uses little memory when it opens, and grows up to these capacities when its
+//! peer publishes more functions, or more calls are in flight.
 
 /// Sizes of a unit's tables.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -1,4 +1,4 @@
-//! The file of a table: TOML, read whole and checked before anything of it counts.
+//! The file of a table: TOML, read whole and validated before any of it takes effect.
 
 use std::fs::File as OpenFile;
 use std::io::Read;
@@ -40,7 +40,7 @@ enum Given<'t> {
 }
 
 impl AccessTable {
-    /// Reads a file. One that all users can write is refused: it grants what any of them likes.
+    /// Reads a file. One that all users can write is refused: any of them could grant any permission.
     pub fn read(path: impl AsRef<Path>) -> Result<Self, AccessError> {
         let path = path.as_ref();
         let file = path.display().to_string();
@@ -75,7 +75,7 @@ impl AccessTable {
         let mut mistakes = checker.mistakes;
         let of_meaning = mistakes.split_off(broken.len());
         let unread: Vec<usize> = mistakes.iter().map(|mistake| mistake.line).collect();
-        // What is left of a line that cannot be read is no mistake of its own.
+        // The rest of a line that cannot be parsed is not reported as a second mistake.
         mistakes.extend(of_meaning.into_iter().filter(|mistake| !unread.contains(&mistake.line)));
         mistakes.sort_by_key(|mistake| (mistake.line, mistake.column));
         if mistakes.is_empty() { Ok(table) } else { Err(AccessError::Mistakes(mistakes)) }

@@ -1,4 +1,4 @@
-//! Rules in words: how a file names nodes, verbs and rates, and how they are shown.
+//! Text form of rules: how a file names nodes, verbs and rates, and how they are shown.
 
 use std::fmt;
 

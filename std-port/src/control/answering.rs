@@ -25,8 +25,8 @@ const EVENTS: usize = 1024;
 /// Bytes of metrics in one answer.
 #[cfg(feature = "metrics")]
 const PIECE_BYTES: usize = 256 * 1024;
-/// How often a call and a watch look whether they are still wanted, and a pause whether the unit still runs: so long after
-/// its client has gone away, what a call started goes on.
+/// How often a call and a watch check that their client is still there, and a pause that the unit still runs. A call
+/// whose client has gone runs on for at most this long.
 pub(super) const LOOK: std::time::Duration = std::time::Duration::from_millis(20);
 
 /// Why an answer ends early.
@@ -176,7 +176,7 @@ fn nodes<T: Send + 'static>(
     for peer in &all {
         send(sink, Answer::Node(describe::node(peer, roster.contains(peer.identity()))))?;
     }
-    // One that was refused and is connected now is no news any more; a twin of it that was refused since is.
+    // A refusal of a node that is connected now is out of date; a later refusal of a duplicate of it is not.
     let has_joined_since = |finding: &Finding| {
         let peer = finding.identity.as_ref().and_then(|identity| system.node(identity));
         peer.and_then(|peer| peer.connected_for()).is_some_and(|connected| connected < system.age(finding))
@@ -294,7 +294,7 @@ fn metrics<T: Send + 'static>(system: &CommunicationSystem<T>, sink: Sink<'_>) -
     pieces(&text, PIECE_BYTES).try_for_each(|piece| send(sink, Answer::Metrics { text: piece.to_owned() }))
 }
 
-/// Whole lines in pieces of about so many bytes: with many nodes the text is longer than an answer may be.
+/// Splits the text into pieces of whole lines: with many nodes it is longer than an answer may be.
 #[cfg(feature = "metrics")]
 fn pieces(mut text: &str, bytes: usize) -> impl Iterator<Item = &str> {
     std::iter::from_fn(move || {

@@ -16,13 +16,14 @@ use crate::communication_system::thread_waker;
 use crate::engine::{CallFuture, worth_waiting};
 use crate::{CommunicationSystem, Delivery, Peer, RequestOptions, TheirFunction};
 
-/// Most bytes of parameters that are under way at a time when all nodes are called.
+/// Most bytes of parameters in flight when all nodes are called.
 const BYTES_AT_A_TIME: usize = 64 * 1024 * 1024;
 
 /// How long a call waits for room at a time.
 const PAUSE: Duration = Duration::from_millis(20);
 
-/// Calls one node, or all that offer the function. When `wanted` says no, calls that have not ended are given up.
+/// Calls one node, or all that offer the function. Once `wanted` returns `false`, calls that have not ended are given
+/// up.
 pub(super) fn call<T: Send + 'static>(
     system: &CommunicationSystem<T>,
     question: &CallQuestion,
@@ -117,7 +118,7 @@ pub(super) fn await_one<T: Send + 'static>(
     }
 }
 
-/// Sends the request as soon as the interval and the room allow, within the deadline.
+/// Sends the request as soon as interval and queue allow, within the deadline.
 fn begin<T: Send + 'static>(
     peer: &Peer<T>,
     function: &str,
@@ -263,7 +264,7 @@ fn block_all<T: Send + 'static>(
     }
 }
 
-/// Calls again and again, and tells how long each took. Each call begins a lease again, so that it takes a client that lives.
+/// Calls repeatedly and reports the duration of each call. Each call begins a lease again, so it needs a live client.
 pub(super) fn bench<T: Send + 'static>(
     system: &CommunicationSystem<T>,
     question: &CallQuestion,

@@ -1,4 +1,4 @@
-//! The other end: finds the socket of a running unit, asks, and reads the answers.
+//! The client: finds the socket of a running unit, asks, and reads the answers.
 
 use std::io::{self, Write};
 use std::os::fd::AsFd;
@@ -35,7 +35,7 @@ pub struct RunningUnit {
 pub enum UnitState {
     /// It answers.
     Answers,
-    /// It runs, and as many ask as may at a time: what it says to one more.
+    /// It runs and has no free connection; its refusal.
     Full(String),
     /// It holds its socket and does not answer: the process hangs or is stopped.
     Silent,
@@ -159,7 +159,8 @@ pub fn running_in(directory: &Path) -> Result<Vec<RunningUnit>, ControlError> {
     Ok(look_at(&place::sockets(directory)?))
 }
 
-/// As [`running_in`], of the units of this `NAME/ID` or `NAME` alone: one that hangs holds up nothing that asks another one.
+/// As [`running_in`], of the units of this `NAME/ID` or `NAME` alone: one that hangs does not delay a question to
+/// another one.
 pub fn running_called(directory: &Path, wanted: &str) -> Result<Vec<RunningUnit>, ControlError> {
     let sockets = place::sockets(directory)?;
     let may_be = |path: &&PathBuf| !place::tells_name(path) || RunningUnit::unasked(path, UnitState::Silent).is(wanted);
@@ -167,7 +168,7 @@ pub fn running_called(directory: &Path, wanted: &str) -> Result<Vec<RunningUnit>
     Ok(found.into_iter().filter(|unit| unit.is(wanted)).collect())
 }
 
-/// All at the same time: each one that hangs takes the whole time-out.
+/// In parallel: each one that hangs takes the whole time-out.
 fn look_at(sockets: &[PathBuf]) -> Vec<RunningUnit> {
     std::thread::scope(|scope| {
         let looking: Vec<_> = sockets.iter().map(|path| scope.spawn(|| look(path))).collect();
@@ -175,7 +176,7 @@ fn look_at(sockets: &[PathBuf]) -> Vec<RunningUnit> {
     })
 }
 
-/// The unit behind a socket. One that is just being stopped, or that speaks otherwise, is none.
+/// The unit behind a socket; `None` for one that is being stopped or speaks another protocol.
 fn look(path: &Path) -> Option<RunningUnit> {
     match Client::connect(path) {
         Ok(client) => Some(client.unit),
@@ -248,11 +249,11 @@ impl Client {
         &self.unit
     }
 
-    /// Asks. What has not been read of the answers to the question before is passed over, which for
-    /// [`Question::Watch`] never ends: drop the client instead.
+    /// Asks. Unread answers to the previous question are skipped, which for [`Question::Watch`] never ends: drop the
+    /// client instead.
     ///
-    /// [`Question::Hold`] and [`Question::Bench`] need signs of life, which the iterator sends while it waits for the next
-    /// answer: a program that does not go on reading loses what it holds.
+    /// [`Question::Hold`] and [`Question::Bench`] need heartbeats, which the iterator sends while it waits for the next
+    /// answer: a program that stops reading loses its lease.
     pub fn ask(&mut self, question: &Question) -> Result<Answers<'_>, ControlError> {
         while self.open {
             match self.next_answer() {
@@ -268,7 +269,7 @@ impl Client {
         Ok(Answers { client: self })
     }
 
-    /// Sends a sign of life as often as one is due until something has come.
+    /// Sends heartbeats until an answer arrives.
     fn beat_until_answered(&mut self) {
         while let Some(beaten) = self.beaten
             && !self.lines.has_more()
@@ -304,7 +305,7 @@ fn none(running: Vec<RunningUnit>, directory: &Path, wanted: Option<&str>) -> Co
     }
 }
 
-/// Connects; a queue of connections that stays full is a unit that takes none of them.
+/// Connects; a queue of connections that stays full means that the unit accepts none of them.
 fn dial(path: &Path) -> Result<UnixStream, ControlError> {
     let start = Instant::now();
     loop {

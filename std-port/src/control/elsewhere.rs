@@ -1,4 +1,4 @@
-//! Units of this host whose control sockets are not where this user looks, as those of another user's.
+//! Units of this host whose control sockets are in other directories, such as another user's.
 
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};

@@ -1,4 +1,4 @@
-//! A call of all: it has an outcome for each node that is to be asked, also for those that could not be.
+//! A call of all nodes, with an outcome for each, including those that could not be called.
 
 use std::collections::HashSet;
 use std::ops::ControlFlow;
@@ -7,7 +7,7 @@ use super::answering::{End, Sink, send};
 use super::protocol::{Answer, Failure};
 use crate::{CommunicationSystem, Peer};
 
-/// Makes the call, and then tells of each node that it has not reached.
+/// Makes the call, and then reports each node that it has not reached.
 pub(super) fn call<T: Send + 'static>(
     system: &CommunicationSystem<T>,
     function: &str,

@@ -18,7 +18,7 @@ impl Failure {
         Self::new(Cause::Resource, error, text)
     }
 
-    /// A call of all has passed a node over, which is connected and `lacks` the function, or is not connected.
+    /// A call of all skipped a node that is connected and `lacks` the function, or is not connected.
     pub fn not_called(lacks: Option<&str>) -> Self {
         let (error, text) = match lacks {
             Some(function) => {

@@ -18,8 +18,8 @@ const EVENTS: usize = 1024;
 /// So long the event of a lease's end may be on its way.
 const PATIENCE: Duration = Duration::from_secs(1);
 
-/// Calls one node, keeps the lease until what was started has ended there, and gives it up when the client has gone, or has
-/// given no sign of life for the length of the lease.
+/// Calls one node and renews the lease until what it started has ended there. Gives the lease up when the client has
+/// gone, or has sent no heartbeat for the length of the lease.
 pub(super) fn hold<T: Send + 'static>(
     system: &CommunicationSystem<T>,
     question: &CallQuestion,
@@ -49,7 +49,7 @@ pub(super) fn hold<T: Send + 'static>(
         if !system.operator_may_go_on(&question.function) {
             return Err(Failure::not_allowed(&question.function, Verb::Call).into());
         }
-        // Before each event: however many there are, a client that has gone away holds nothing any more.
+        // Checked before each event, so that a stream of events does not delay the end of a gone client's lease.
         if !is_wanted() {
             return Err(gone());
         }
@@ -99,11 +99,11 @@ pub(super) fn unattended(function: &str) -> Failure {
     Failure::resource("Unattended", text)
 }
 
-/// A lease that is kept; given up when it goes, however that comes.
+/// A renewed lease, given up on drop.
 struct Held<'h, T: Send + 'static> {
     peer: &'h Peer<T>,
     call: CallFuture<T>,
-    /// Since when it is not renewed any more, with no event that tells why.
+    /// Since when it is no longer renewed, without an event that says why.
     lost: Option<Instant>,
 }
 
@@ -132,7 +132,7 @@ impl<T: Send + 'static> Held<'_, T> {
 
 impl<T: Send + 'static> Drop for Held<'_, T> {
     fn drop(&mut self) {
-        // One that has ended there, or gone over to a newer call, is not this unit's any more: nothing is sent for it.
+        // Nothing is sent for a lease that has ended there, or that a newer call has taken over.
         self.call.release();
     }
 }

@@ -7,7 +7,7 @@ use super::protocol::LONGEST_LINE;
 /// A buffer that has held a long line is given back.
 const KEPT: usize = 64 * 1024;
 
-/// Reads line by line, and holds no more than the longest that is allowed.
+/// Reads line by line, and buffers at most the longest allowed line.
 pub(super) struct Lines<R> {
     reader: BufReader<R>,
     line: Vec<u8>,
@@ -36,14 +36,14 @@ impl<R: Read> Lines<R> {
         !self.reader.buffer().is_empty()
     }
 
-    /// Passes over the empty lines that come next; whether there were any. It waits where nothing has come.
+    /// Skips empty lines; whether there were any. Blocks without input.
     pub(super) fn skip_empty(&mut self) -> Result<bool> {
         let empty = self.reader.fill_buf()?.iter().take_while(|&&byte| byte == b'\n').count();
         self.reader.consume(empty);
         Ok(empty > 0)
     }
 
-    /// The next line; `None` at the end. What stands behind the last end of a line is no line.
+    /// The next line; `None` at the end. Text without a line end is no line.
     pub(super) fn next(&mut self) -> Result<Option<Line<'_>>> {
         self.line.clear();
         if self.line.capacity() > KEPT {

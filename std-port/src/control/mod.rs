@@ -1,9 +1,9 @@
-//! The operator's way in (design, section 7): a running m_unit answers questions on a Unix socket that only its owner
-//! can open.
+//! The operator's interface (design, section 7): a running m_unit answers questions on a Unix socket that only its
+//! owner can open.
 //!
 //! A unit opens its socket when it is started, unless its [`Builder`](crate::Builder) says otherwise ([`Control`]), and
 //! removes it when it is stopped. [`Client`] is the other end; [`execute`] answers the same questions against a unit of
-//! this process. What travels is in [`protocol`].
+//! this process. The messages are in [`protocol`].
 //!
 //! Access to the socket gives all rights of the program: there are no finer ones. So the directory belongs to its owner
 //! alone, and each connection must come from the same user or from root.
@@ -70,7 +70,8 @@ pub(crate) fn held(control: &Control, identity: &Identity, fleet: Fleet) -> Opti
     is_its_own.then_some(path)
 }
 
-/// Opens the socket of a unit that has been started. A unit that cannot have one runs without: it is warned of.
+/// Opens the socket of a unit that has been started. A unit that cannot have one runs without it, with a warning in the
+/// log.
 pub(crate) fn open<T: Send + 'static>(control: &Control, guest: CommunicationSystem<T>) -> Option<Server> {
     let path = match control {
         Control::Off => return None,

@@ -1,4 +1,4 @@
-//! Where control sockets are: a directory that only its owner enters, and one socket in it for each running unit.
+//! Control sockets: a directory that only its owner can enter, and one socket in it for each running unit.
 
 use std::fs::{DirBuilder, Permissions, set_permissions};
 use std::io;
@@ -77,7 +77,7 @@ pub(super) fn file_name(identity: &Identity, fleet: Fleet) -> String {
     format!("{name}-{}-{}{SUFFIX}", identity.id(), fleet.0)
 }
 
-/// The `NAME/ID` and the fleet that the name of a unit's socket tells; of another name, that and fleet 0.
+/// The `NAME/ID` and the fleet in the name of a unit's socket; for any other name, that name and fleet 0.
 pub(super) fn told_by_name(path: &Path) -> (String, u32) {
     let name = path.file_name().unwrap_or_default().to_string_lossy();
     told(&name).unwrap_or_else(|| (path.display().to_string(), 0))
@@ -230,7 +230,7 @@ fn make_room(path: &Path) -> Result<(), PlaceError> {
     }
 }
 
-/// Whether a process has the socket, also one that hangs: the system takes connections for it.
+/// Whether a process has the socket, including one that hangs: the system accepts connections for it.
 pub(super) fn is_held(path: &Path) -> bool {
     let is_own = parent(path).and_then(enter).is_ok();
     is_own && dial(path).map_or_else(|error| error.kind() == io::ErrorKind::WouldBlock, |_| true)

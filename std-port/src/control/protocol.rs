@@ -1,15 +1,15 @@
-//! What travels over the control socket: one JSON object a line. Each [`Question`] is answered by any number of
-//! [`Answer`]s, of which the last one is [`Answer::Done`] or [`Answer::Failed`]. A line that is no question is answered
-//! with `Failed`, and the next line is read. An empty line is a [`BEAT`] and not answered.
+//! Messages of the control socket: one JSON object a line. Each [`Question`] is answered by any number of [`Answer`]s,
+//! of which the last one is [`Answer::Done`] or [`Answer::Failed`]. A line that is no question is answered with
+//! `Failed`, and the next line is read. An empty line is a [`BEAT`] and not answered.
 
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize};
 
-/// First line from the manager's side, so that an older command and a newer manager tell each other apart.
+/// In the manager's first line, so that an older command recognises a newer manager.
 pub const CONTROL_VERSION: u32 = 2;
 
-/// How often a client sends an empty line, its sign of life, while a [`Question::Hold`] or a [`Question::Bench`] is
-/// answered. A process that is stopped sends none, and what it keeps moving stops.
+/// How often a client sends an empty line, its heartbeat, while a [`Question::Hold`] or a [`Question::Bench`] is
+/// answered. A stopped process sends none, so that its lease ends.
 pub const BEAT: std::time::Duration = std::time::Duration::from_millis(50);
 
 /// Longest line in bytes, in either direction: a call with 256 KiB of parameters, written as text.

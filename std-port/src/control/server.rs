@@ -29,11 +29,12 @@ pub(super) const MOST_CONNECTIONS: usize = 8;
 pub(super) const FULL: &str = "Full";
 /// A client that takes nothing for so long is cut off.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(2);
-/// A client that asks nothing for so long is ended. One that waits for an answer, as of a watch or a hold, is not idle.
+/// A client that asks nothing for this long is disconnected. One that waits for an answer, as of a watch or a hold, is
+/// not idle.
 const IDLE_TIMEOUT: Duration = Duration::from_secs(600);
 /// With all connections in use, one that has been idle for this long gives way to the next client.
 const GIVES_WAY: Duration = Duration::from_secs(1);
-/// Samples gather for at most so long, so that writing them disturbs what they measure less.
+/// Samples are batched for at most this long, so that writing them disturbs the measurement less.
 const GATHER: Duration = Duration::from_millis(50);
 /// How long a stop waits for all threads together.
 const PATIENCE: Duration = Duration::from_secs(1);
@@ -63,7 +64,7 @@ struct Connections {
 /// A connection.
 struct Open {
     stream: UnixStream,
-    /// Since when it has asked nothing; none while a question is answered.
+    /// Since when it is idle; `None` while a question is answered.
     idle: Arc<Mutex<Option<Instant>>>,
 }
 
@@ -94,7 +95,7 @@ impl Server {
         self.place.path()
     }
 
-    /// Ends all connections and threads, except the one that calls; for one that is stuck it waits only so long.
+    /// Ends all connections and threads except the calling one; waits only for a bounded time for a stuck one.
     pub(crate) fn stop(&self) {
         self.place.remove();
         self.shared.stopping.store(true, Ordering::Release);
@@ -184,7 +185,7 @@ impl Shared {
         let open = Open { stream: kept, idle: idle.clone() };
         let thread = std::thread::Builder::new().name("cara-control".into());
         let thread = thread.spawn(move || {
-            // An end of the connection is not worth a word: the client knows.
+            // The end of a connection is not logged: the client knows.
             let _ = own.serve(stream, &idle, &system);
             lock(&own.connections).open.remove(&number);
         });
