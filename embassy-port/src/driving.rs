@@ -120,6 +120,7 @@ impl<T> Machine<T> {
     ) -> Option<Option<News>> {
         let Self { links, mail, pool, functions, reply, access, begun, begun_on, hub, proof, .. } = self;
         let link = links.get_mut(usize::from(index))?;
+        // There is one place for a reply. While a task has not taken the last one, a link that may bring another one is not read.
         if link.session.is_none() || (reply.is_taken() && link.awaits_reply()) {
             return None;
         }
@@ -360,6 +361,7 @@ impl<T> Machine<T> {
     /// A link has ended.
     fn closed(&mut self, index: u16, reason: CloseReason) -> Option<Job> {
         let (peer, told, address) = self.end(index)?;
+        // Calls that no task has taken yet must not begin for a caller that is gone.
         self.forget_calls_of(index);
         self.hang_up(index);
         self.hub.node.left(now(), LinkId(index), reason);

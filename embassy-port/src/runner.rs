@@ -90,6 +90,7 @@ impl<T> Runner<T> {
             }
             machine.expire_reply(now());
         }
+        // Answers before new bytes: a call that waits for room holds the parameters that the next call needs.
         self.answer_again(machine);
         machine.look_at_lines();
         if is_due
@@ -103,6 +104,7 @@ impl<T> Runner<T> {
             let job = news.and_then(|(index, news)| machine.noted(index, news));
             return job.map_or(Step::Again, Step::Job);
         }
+        // What waits to be written goes out before more is read, or a peer that only sends would keep every answer back.
         machine.write_links();
         self.read(machine)
     }

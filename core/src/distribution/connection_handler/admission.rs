@@ -31,6 +31,7 @@ impl<S: Storage> Node<S> {
         if let Err(refusal) = self.check(hello) {
             return self.refuse(now, from, &hello.identity, refusal);
         }
+        // The identity decides before the number of nodes does: a node that restarts takes its own place, also in a full table.
         let newcomer = Newcomer { link, epoch: hello.epoch, limits: hello.limits, address: from, decided: false };
         let old = self.table.find(&hello.identity).and_then(|place| Some((place, self.table.node(place)?.link()?)));
         match old {
@@ -87,6 +88,7 @@ impl<S: Storage> Node<S> {
             known.newest = Some((epoch, 0));
         }
         (known.epoch, known.limits, known.address, known.since) = (epoch, Some(limits), address, now);
+        // A dial that is planned or under way has its aim; a second link of the same node would only be refused.
         self.table.cancel(place);
         self.table.set_state(place, NodeState::Joined(link));
         self.table.set_link(link, Some(place));
@@ -100,6 +102,7 @@ impl<S: Storage> Node<S> {
 
     /// Another link has the identity of a node that is connected.
     fn meet(&mut self, now: Instant, place: usize, identity: &Identity, mut newcomer: Newcomer) -> Admission {
+        // Both ends compare the same two identities, so they keep the same one of two links without asking each other.
         let smaller = self.config.identity < *identity;
         let Some(known) = self.table.node_mut(place) else { return Admission::Refuse(Refusal::Full) };
         let same_life = known.epoch == newcomer.epoch;
@@ -161,6 +164,7 @@ impl<S: Storage> Node<S> {
             (true, false) => CloseReason::Reset,
             (false, _) => CloseReason::PeerRestarted,
         };
+        // From here on an answer of the old link comes too late, and must not refuse a newcomer whose rival is being closed.
         newcomer.decided = true;
         Some(Command::Tell(old, Directive::Close(reason)))
     }

@@ -207,21 +207,25 @@ impl<S: Storage> Node<S> {
         };
         self.count_forgotten(forgotten);
         let Some(known) = self.table.node_mut(place) else { return };
+        // An answer that was held up names an address that the node may have left. Only the newest one counts.
         if !known.is_news(epoch, sequence) {
             self.counters.add(NodeCounter::Outdated, 1);
             return;
         }
         known.newest = Some((epoch, sequence));
+        // Kept also while the node is connected: it is where it is dialled when this link ends.
         let moved = known.listens.replace(address) != Some(address);
         if known.is_joined() {
             return;
         }
+        // A node that has restarted is not made to wait for what its earlier boot has failed at.
         if known.epoch != epoch {
             known.not_before = Instant::START;
             known.attempts = 0;
         }
         (known.address, known.epoch) = (address, epoch);
         let at = match known.state {
+            // A dial that is silent is not given up for another address, which may be forged: both are tried.
             NodeState::Dialing if moved => now.max(known.since + DIAL_ALONE),
             NodeState::Dialing => return,
             _ if known.task.is_some() => known.due.min(now.max(known.not_before)),

@@ -213,6 +213,7 @@ impl<S: Storage> Node<S> {
     }
 
     pub(super) fn poll_search(&mut self, now: Instant, mailman: &mut dyn Mailman, authenticator: &dyn Authenticator) {
+        // What the application asks for is sent whatever the others do, but counts in the budget like any search.
         if self.search.explicit.take_if(|at| *at <= now).is_some() {
             self.send_who_has(now, mailman, authenticator);
             return;
@@ -227,6 +228,8 @@ impl<S: Storage> Node<S> {
         if self.config.identity.role() == Role::SUnit && self.waits_for_hints(now) {
             return;
         }
+        // A unit that hears enough searches of others defers its own, since their answer reaches it as well; but a few times
+        // only, or a host that floods the network with searches would silence it for good.
         let allowed = self.budget.allowed_at(now);
         if allowed > now && !self.search.stubborn {
             self.search.deferred = self.search.deferred.saturating_add(1);
@@ -357,6 +360,7 @@ impl<S: Storage> Node<S> {
             return;
         }
         let broadcast = announce.nonce == 0;
+        // An answer must carry the nonce of the last search: a recorded one leads nowhere.
         if !broadcast && announce.nonce != self.search.nonce {
             self.counters.add(NodeCounter::Unasked, 1);
             return;

@@ -140,6 +140,7 @@ impl<S: Storage> Receiver<S> {
         received: &mut Received,
     ) -> Result<Option<(Store, usize, usize)>, CloseReason> {
         self.check_length(length)?;
+        // Before the frame is consumed: without a buffer its bytes stay with the port, and the peer's window fills.
         if !self.reserve(buffers, length) {
             received.paused = true;
             return Ok(None);
@@ -273,6 +274,7 @@ impl<S: Storage> Receiver<S> {
         lent: &[u8],
         received: &mut Received,
     ) -> Result<(), CloseReason> {
+        // Totals and lengths are the peer's word. Each arm compares them with the limits before a byte is copied.
         received.incoming = Some(match content {
             Content::Hello => Incoming::Hello(place),
             Content::Refuse(code) => Incoming::Refuse(code),
@@ -322,6 +324,8 @@ impl<S: Storage> Receiver<S> {
     fn go_on(&mut self, piece: &Piece, place: Place, lent: &[u8]) -> Result<Option<Place>, CloseReason> {
         let Some(Assembly { length, total, priority, .. }) = self.assembly else { return Err(CloseReason::Protocol) };
         let end = length.saturating_add(place.length());
+        // One message at a time and class: a chunk that does not continue it is no loss to be skipped, but another implementation's
+        // mistake, and guessing on would mix two messages.
         if piece.priority != priority || end > total || piece.last != (end == total) {
             return Err(CloseReason::Protocol);
         }

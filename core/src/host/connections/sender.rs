@@ -78,6 +78,7 @@ impl<S: Storage> Sender<S> {
     pub(super) fn is_in_the_way(&self, buffers: &mut dyn Buffers<S>, priority: Priority, total: usize) -> bool {
         match queue_index(priority).and_then(|index| self.queues.get(index)) {
             Some(Some(queue)) => self.cut.framed_length(total) > queue.room(),
+            // The buffer is only looked for, not kept: between this question and the message another link may need it.
             Some(None) if self.queues.iter().any(Option::is_some) => match buffers.take_leaving(LEFT_BY_SENDING) {
                 Some(buffer) => {
                     buffers.give(buffer);
@@ -258,6 +259,7 @@ impl<S: Storage> Sender<S> {
 
     /// Seals what is to be written next: urgent frames before all others. `false` when nothing waits.
     fn seal_next<C: Seal>(&mut self, cipher: &mut C, ahead: usize) -> Result<bool, CloseReason> {
+        // Urgent frames go between two frames of a message, never into one: the cipher counts frames in the order of the stream.
         while self.urgent.has_unsealed() {
             let rest = self.urgent.unsealed();
             let turns = frame::is_turn(rest, self.cut.overhead);
@@ -274,6 +276,7 @@ impl<S: Storage> Sender<S> {
         let Some(Some(queue)) = self.current.and_then(|index| self.queues.get_mut(index)) else { return Ok(false) };
         let most = match self.cut.overhead {
             0 => usize::MAX,
+            // A seal cannot be taken back, and what is sealed cannot be overtaken. So no more is sealed than the network takes now.
             _ if self.blocked => 0,
             _ => ahead.max(self.cut.chunk),
         };

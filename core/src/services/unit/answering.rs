@@ -86,6 +86,7 @@ impl<P: Port> Session<P> {
         if lease.is_some() && self.publishing.is_released(head.slot, head.id) {
             return Err(Error::Expired);
         }
+        // A slot first, then the lease: a lease that is granted and has no slot would run on without a call that ends it.
         let ticket = self.calls.begin(head, is_emergency(attributes, head.priority))?;
         let order = match lease.map_or(Ok(None), |length| self.grant(cx, &head, length)) {
             Ok(order) => order,
@@ -114,10 +115,12 @@ impl<P: Port> Session<P> {
                 Ok(_) => Ok(()),
                 Err(error) => self.send_error(cx, head.id, head.priority, head.wants_reply, error),
             };
+            // Returned before the call is closed: the port tries again, and the lease goes on meanwhile.
             if let Err(error @ Error::Full(_)) = sent {
                 return Err(error);
             }
         }
+        // A call that failed wants nothing any more, so what it started stops now and not at the end of its lease.
         if result.is_err() {
             self.cut_call(cx, head.id);
         }
@@ -143,6 +146,7 @@ impl<P: Port> Session<P> {
         let functions = cx.functions;
         let specs = match functions.lookup(head.slot, head.generation) {
             Ok(function) => function.signature.results(),
+            // The function was replaced while it ran. Its results have the layout of the old signature, which the caller cannot read.
             Err(_) => return self.send_error(cx, head.id, head.priority, true, Error::ResultLost),
         };
         let Ok(length) = block::measure(specs, results) else {

@@ -32,12 +32,15 @@ impl<P: Port> Session<P> {
         }
         let known = self.granted.iter().position(|known| known.slot == head.slot);
         let earlier = known.and_then(|index| self.granted.get(index)).copied();
+        // The safe hook of that lease is still to run, from `poll`. Granting now would let a new motion begin before it, and the hook
+        // would then stop the new one.
         if earlier.is_some_and(|earlier| earlier.end <= cx.now) {
             return Err(Error::Busy);
         }
         if earlier.is_none() && self.granted.is_full() {
             return Err(Error::Full(Limit::Leases));
         }
+        // The service's word is changed before the table here: where it refuses, nothing of this session has changed.
         let service = service_of(cx, head.slot, head.generation);
         let order = match service.map_or(Ok(None), |service| service.begin_lease(cx.now, end)) {
             Ok(order) => order,

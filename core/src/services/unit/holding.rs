@@ -109,9 +109,11 @@ impl<P: Port> Session<P> {
         let held = self.stop_renewing(id);
         let waited = pending.and_then(|pending| pending.leased);
         let Some(class) = held.map(|held| held.class).or(waited) else { return };
+        // A link that is not live needs no release: the callee ends all leases of the link by itself.
         if self.phase != Phase::Live || self.send_release(cx, id, class) {
             return;
         }
+        // Kept in the place that the call had: a release that is lost would let the vehicle drive on to the end of its lease.
         match (pending, held) {
             (Some(pending), _) => self.requests.keep_unsent_release(pending),
             (None, Some(held)) => drop(self.held.push(Held { release_unsent: true, ..held })),
@@ -127,6 +129,7 @@ impl<P: Port> Session<P> {
         if self.phase != Phase::Live {
             return Err(Error::NotConnected);
         }
+        // Renewals stop first, whether or not the peer can be told: at the latest the lease's end stops what runs.
         self.held.retain(|held| held.slot != slot || held.release_unsent);
         let newest = self.requests.newest();
         if self.send_release_all(cx, slot, newest) {

@@ -91,6 +91,7 @@ impl<P: Port> Session<P> {
     ) -> Receipt<'b> {
         match self.phase {
             Phase::Ending(_) | Phase::Ended => return Receipt { consumed: lent.len(), event: None, paused: false },
+            // What follows the hello is not looked at before the hub has decided: a request of a peer that is refused must not run.
             Phase::Deciding => {
                 return Receipt { consumed: 0, event: None, paused: true };
             }
@@ -100,6 +101,7 @@ impl<P: Port> Session<P> {
             Ok(received) => received,
             Err(reason) => {
                 match self.phase {
+                    // All that can go wrong before the proof looks the same from outside, so that nothing is learned from the reason.
                     Phase::Proving { .. } => self.fail(cx),
                     _ => self.close(cx, reason),
                 }
@@ -111,6 +113,8 @@ impl<P: Port> Session<P> {
         };
         self.liveness.heard(cx.now);
         let is_emergency = matches!(incoming, Incoming::Message(Priority::Emergency, _));
+        // A call begins here only when nothing has arrived behind it; otherwise it waits its turn, so that an emergency further back
+        // in the same bytes is reached first.
         let at_once = is_emergency || received.consumed == lent.len();
         let outcome = self.digest(cx, incoming, lent, arguments.filter(|_| at_once));
         Receipt { consumed: received.consumed, event: self.event(outcome, lent), paused: received.paused }
@@ -166,6 +170,7 @@ impl<P: Port> Session<P> {
         arguments: Option<&mut ParametersView>,
     ) -> Outcome {
         match (incoming, self.phase) {
+            // In clear anyone on the path can end a link, so it counts as no verdict of the peer, and the search goes on.
             (Incoming::Refuse(_) | Incoming::Close(_), _) if !self.link.cipher().is_sealing() => {
                 self.ended_in_clear();
                 Outcome::Nothing
@@ -185,6 +190,7 @@ impl<P: Port> Session<P> {
             }
             (Incoming::Proof(place), Phase::Live) => self.proof_on_live(cx, place, lent),
             (Incoming::Confirm(place), Phase::Live) => self.confirmation_on_live(cx, place, lent),
+            // Answered in the stream as well: only a reply that has passed the same queue shows that the stream moves.
             (Incoming::Ping, Phase::Live) => {
                 self.link.send_frame(&Frame::Pong);
                 self.flush(cx);
@@ -271,11 +277,13 @@ impl<P: Port> Session<P> {
 
     fn reply_arrived(&mut self, cx: &mut Context<'_, P>, id: CallId, error: Option<Error>, block: Place) -> Outcome {
         let Some(pending) = self.requests.close(id) else {
+            // The call has ended already, by time-out or cancellation. Its lease was released then; results that come now change nothing.
             self.link.counters.add(LinkCounter::RepliesLate, 1);
             return Outcome::Nothing;
         };
         match error {
             Some(error) => {
+                // The call failed at the peer, but a lease may have begun there before it did: it is not renewed any more.
                 self.release_call(cx, id, Some(pending));
                 Event::Reply(id, Err(error)).into()
             }
@@ -342,6 +350,7 @@ impl<P: Port> Session<P> {
         arguments: Option<&mut ParametersView>,
     ) -> Outcome {
         self.link.counters.add(LinkCounter::RequestsReceived, 1);
+        // First of all: a copy of a request must not even be refused, or its refusal could overtake the answer of the original.
         let seen = self.calls.note(priority, header.id);
         if seen == Seen::Before {
             self.link.counters.add(LinkCounter::RequestsRepeated, 1);
@@ -353,6 +362,7 @@ impl<P: Port> Session<P> {
         let result = self.check_request(cx, priority, header, seen, length, function).and_then(|(head, function)| {
             let bytes = self.link.view(block, lent);
             match arguments.filter(|_| self.calls.is_idle(priority)) {
+                // The arguments are checked before the call begins: a lease must not start for a request that is refused.
                 Some(arguments) => {
                     read_arguments(function.signature, bytes, arguments)?;
                     self.begin(cx, head, &function.attributes).map(Some)
@@ -396,10 +406,12 @@ impl<P: Port> Session<P> {
             return Err(Error::TooLarge { limit });
         }
         let sent_at = sent_at_earliest(cx.now, header.stamp, header.since).ok_or(Error::Malformed)?;
+        // Counted from the earliest time at which it can have been sent: a command that was held up is never taken for a fresh one.
         let deadline = sent_at + header.remaining;
         if deadline <= cx.now {
             return Err(Error::Expired);
         }
+        // By what this peer was told, not by what the unit offers: a function that was shown to another node stays unknown here.
         let function = match self.publishing.told(header.slot, header.generation) {
             Told::Never => return Err(Error::UnknownFunction),
             Told::Earlier => return Err(Error::StaleFunction),

@@ -84,6 +84,7 @@ impl<P: Port> Session<P> {
         options: &RequestOptions,
         wants_reply: bool,
     ) -> Result<CallId, Error> {
+        // All checks before the id is taken: a request that is refused leaves no trace, and no gap that at-most-once would count.
         let mut checked = self.check(cx, function, parameters, options, wants_reply)?;
         let slot = checked.header.slot;
         self.check_room_to_hold(checked.lease.is_some() && options.renew_lease, slot)?;
@@ -93,6 +94,7 @@ impl<P: Port> Session<P> {
             Delivery::BestEffort => self.send_best_effort(cx, &checked, parameters),
             Delivery::Reliable => self.send_reliable(cx, &checked, parameters),
         };
+        // Nothing of the message has left, since a message that does not fit is refused before its first byte.
         if let Err(error) = sent {
             self.requests.close(id);
             return Err(error);
@@ -120,6 +122,7 @@ impl<P: Port> Session<P> {
         let length = block::measure(function.signature.arguments(), parameters)?;
         self.check_length(priority, options.delivery, length)?;
         if wants_reply {
+            // Known before anything runs at the peer: a call whose results could not be kept must not move a vehicle.
             block::check_results_fit(function.signature.results(), parameters)?;
             if options.delivery == Delivery::BestEffort {
                 return Err(Error::BadConstraint);
@@ -178,9 +181,11 @@ impl<P: Port> Session<P> {
     ) -> Result<(), Error> {
         let Checked { header, priority, length, .. } = checked;
         let total = REQUEST_BYTES.saturating_add(*length);
+        // Beside the stream, which may be blocked; both copies have one id, and the callee runs it once.
         if *priority == Priority::Emergency {
             self.send_emergency_datagram(cx, header, parameters);
         }
+        // A caller that waits is not kept waiting for others, and an emergency for no one.
         let hold = !header.wants_reply && *priority != Priority::Emergency && self.timers.may_gather(cx.now);
         let Self { link, theirs, .. } = self;
         let signature = theirs.function(header.slot).ok_or(Error::StaleFunction)?.signature;

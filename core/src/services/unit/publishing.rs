@@ -202,6 +202,7 @@ impl<P: Port> Session<P> {
         if self.publishing.dirty {
             self.publishing.dirty = !self.send_news(cx);
         }
+        // The end of the list goes behind all of it: its acknowledgement says that the peer has read everything before.
         if self.publishing.end_due && !self.publishing.dirty {
             let serial = self.publishing.serial;
             self.publishing.end_due = !self.send_control(cx, &Control::ListEnd { serial });
@@ -249,6 +250,7 @@ impl<P: Port> Session<P> {
             if !sent {
                 return false;
             }
+            // Only once it is in the queue: after a full queue the loop begins again at the first function that is not told.
             if let Some(publication) = self.publishing.table.get_mut(index) {
                 publication.told = wanted;
             }

@@ -92,6 +92,7 @@ impl<P: Port> Session<P> {
             self.link.cipher().forget_previous();
             self.renewal.forget = Instant::FAR_FUTURE;
         }
+        // Only the end that dialled begins: two handshakes at once on one link would each wait for the other's answer.
         if let Step::Resting { due } = self.renewal.step {
             if self.dialed && (cx.now >= due || self.link.cipher().is_worn()) {
                 self.begin_renewal(cx, &[0; PROOF_BYTES]);
@@ -99,6 +100,7 @@ impl<P: Port> Session<P> {
             return;
         }
         match cx.now >= self.renewal.deadline(self.dialed) {
+            // A peer that keeps the link alive and does not go on would leave it under worn keys for ever.
             true => self.close(cx, CloseReason::HelloTimeout),
             false => self.pump_renewal(cx),
         }
@@ -155,6 +157,7 @@ impl<P: Port> Session<P> {
         let understood = match (message.first_chunk(), self.renewal.step) {
             (None, _) if message.is_empty() => self.link.cipher().turned(),
             (Some(_), Step::Awaiting { .. }) if self.dialed => return self.answered_anew(cx, place, lent),
+            // Not before it is due: a handshake costs a board much computing, which a peer could otherwise ask for at will.
             (Some(first), Step::Resting { due }) if cx.now >= due && !self.dialed && message.len() == PROOF_BYTES => {
                 let first = *first;
                 self.begin_renewal(cx, &first);

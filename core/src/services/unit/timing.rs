@@ -138,6 +138,7 @@ impl<P: Port> Session<P> {
             self.link.counters.add(LinkCounter::CallsTimedOut, 1);
             return Some(Event::Reply(id, Err(Error::TimedOut)));
         }
+        // From here on only frames are sent; what the port has to do for others was returned above, one event a call.
         if self.has_news() {
             self.pump(cx);
         }
