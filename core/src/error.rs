@@ -63,6 +63,29 @@ pub enum Limit {
     Handlers = 12,
 }
 
+/// A constraint for which a unit may have too little memory.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[repr(u8)]
+pub enum Constraint {
+    /// `Constraints::maximum_nodes`.
+    MaximumNodes,
+    /// `Constraints::message_size`.
+    MessageSize,
+    /// `Constraints::calls_per_peer`.
+    CallsPerPeer,
+}
+
+impl Constraint {
+    /// The constraint, and the limit of the memory that it needs.
+    pub const fn needs(self) -> &'static str {
+        match self {
+            Self::MaximumNodes => "maximum_nodes needs links",
+            Self::MessageSize => "message_size needs message_size",
+            Self::CallsPerPeer => "calls_per_peer needs calls",
+        }
+    }
+}
+
 /// What a unit tells the other end when it does not take a link.
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, thiserror::Error)]
@@ -243,6 +266,16 @@ pub enum Error {
     /// A constraint outside what its type or the lent storage allows.
     #[error("a constraint or option is outside what this unit can do: compare it with the bounds in its documentation")]
     BadConstraint,
+    /// A constraint needs more memory than the unit has.
+    #[error("{} = {need}, and the resources have {have}: ask for less, or raise the limit", constraint.needs())]
+    DoesNotFit {
+        /// The constraint.
+        constraint: Constraint,
+        /// The limit that it needs.
+        need: u32,
+        /// The limit that there is.
+        have: u32,
+    },
     /// A service of the emergency class was given a handler that needs the application's state, or a task.
     #[error(
         "an emergency service waits for nothing, and this handler may wait for the application's state or a task: give it the form without the state"
@@ -338,6 +371,7 @@ impl Error {
             | Self::TooLarge { .. }
             | Self::WouldDeadlock
             | Self::BadConstraint
+            | Self::DoesNotFit { .. }
             | Self::EmergencyWaits => Cause::Configuration,
             Self::NotConnected
             | Self::TimedOut

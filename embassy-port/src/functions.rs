@@ -51,7 +51,7 @@ impl<T> Handle<T> {
             return Err(Error::EmergencyWaits);
         }
         let stop = self.act(|machine| {
-            let limit = machine.room.parameters;
+            let limit = machine.limits.arguments;
             if definition.signature().parameters_bytes() as usize > limit {
                 return Err(Error::TooLarge { limit: u32::try_from(limit).unwrap_or(u32::MAX) });
             }

@@ -14,7 +14,7 @@ use cara_core::services::access::Access;
 use cara_core::services::requests::CallId;
 use cara_core::time::Duration;
 
-use crate::config::{Table, check};
+use crate::config::Table;
 use crate::event::UnitEvent;
 use crate::handler::Hook;
 use crate::machine::{Machine, Shared};
@@ -219,10 +219,10 @@ impl<T> Handle<T> {
         self.look(|machine| *machine.hub.node.constraints())
     }
 
-    /// Changes the constraints; peers are told. [`Error::BadConstraint`] for what the memory cannot hold.
+    /// Changes the constraints; peers are told. [`Error::DoesNotFit`] for what the memory cannot hold.
     pub fn set_constraints(&self, constraints: Constraints) -> Result<(), Error> {
         self.act(|machine| {
-            check(&constraints, machine.links.len(), machine.room.buffer)?;
+            machine.limits.fit(&constraints)?;
             machine.hub.node.set_constraints(constraints);
             for index in machine.indices() {
                 machine.with(index, |session, cx| session.set_constraints(cx, constraints));

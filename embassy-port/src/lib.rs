@@ -1,13 +1,13 @@
 //! CARA on microcontrollers: s_units and m_units over embassy-net.
 //!
-//! [`new`] makes a unit from a network stack and static memory ([`Resources`]): a [`Handle`], which every task may
-//! copy, and a [`Runner`], which wants a task of its own and drives everything. Nothing allocates, and nothing is sized
-//! at run time.
+//! [`new`] makes a unit from a network stack and static memory ([`resources!`], as much as its [`Limits`] say): a
+//! [`Handle`], which every task may copy, and a [`Runner`], which wants a task of its own and drives everything. Nothing
+//! allocates, and nothing is sized at run time.
 //!
 //! ```no_run
 //! use cara_core::services::lease::Lease;
 //! use cara_core::time::Duration;
-//! use cara_embassy::{Config, Handle, Handler, Resources, Runner, Security, ServiceOptions};
+//! use cara_embassy::{Config, Handle, Handler, Limits, Runner, Security, ServiceOptions, resources};
 //!
 //! /// The application's state, which services get.
 //! #[derive(Default)]
@@ -16,9 +16,14 @@
 //! /// Read by the motor's interrupt as well: `GO_TO.is_live(cara_embassy::now())`.
 //! static GO_TO: Lease = Lease::new();
 //!
+//! /// `embassy_net::StackResources<{ LIMITS.sockets() }>` has the sockets for it.
+//! const LIMITS: Limits = Limits { message_size: 512, ..Limits::S_UNIT };
+//! /// A static of it, `StaticCell<AgvResources>`, is made with `RESOURCES.init_with(Resources::new)`.
+//! type AgvResources = resources!(Agv, LIMITS);
+//!
 //! fn start(
 //!     stack: embassy_net::Stack<'static>,
-//!     resources: &'static mut Resources<Agv>,
+//!     resources: &'static mut AgvResources,
 //!     security: Security,
 //! ) -> Result<(Handle<Agv>, Runner<Agv>), cara_core::error::Error> {
 //!     let config = Config::s_unit("agv-07", 7, "manager", 1, security)?;
@@ -86,6 +91,7 @@ mod functions;
 mod handle;
 mod handler;
 mod lease;
+mod limits;
 mod line;
 mod machine;
 mod mail;
@@ -98,14 +104,15 @@ mod security;
 mod taken;
 mod time;
 
-pub use config::{Config, message_buffer};
+pub use config::Config;
 pub use event::{Name, UnitEvent};
 pub use functions::MyFunctionList;
 pub use handle::Handle;
 pub use handler::{Call, Free, Handler, Hook, Method, Safe, ServiceOptions};
 pub use lease::LeaseWatch;
+pub use limits::Limits;
 pub use peer::{Peer, TheirFunctionList};
-pub use resources::{Resources, new};
+pub use resources::{Memory, Resources, new};
 pub use runner::Runner;
 pub use security::Security;
 pub use taken::TakenCall;

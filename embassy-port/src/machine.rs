@@ -20,6 +20,7 @@ use crate::config::Table;
 use crate::driving::Begun;
 use crate::event::{Events, UnitEvent};
 use crate::handler::{Hook, Listed};
+use crate::limits::Limits;
 use crate::line::Line;
 use crate::mail::EmbassyMailman;
 use crate::replies::{ReplyBox, Waiter};
@@ -119,18 +120,8 @@ pub(crate) struct Machine<T: 'static> {
     pub(crate) renews_every: Duration,
     /// Of the links that have ended.
     pub(crate) counters: LinkCounters,
-    /// Longest message, and bytes of arguments and results, that the memory allows.
-    pub(crate) room: Room,
+    pub(crate) limits: &'static Limits,
     pub(crate) wakers: Wakers,
-}
-
-/// What the lent memory allows.
-#[derive(Clone, Copy)]
-pub(crate) struct Room {
-    /// Of a message buffer.
-    pub(crate) buffer: usize,
-    /// Of the parameters that a service runs with.
-    pub(crate) parameters: usize,
 }
 
 /// Wakers of waiting tasks.

@@ -6,7 +6,7 @@ use std::rc::Rc;
 
 use cara_core::distribution::identity::Identity;
 use cara_core::time::Duration;
-use cara_embassy::{Config, Handle, Resources, Security, UnitEvent, message_buffer};
+use cara_embassy::{Config, Handle, Limits, Resources, Security, UnitEvent, resources};
 use cara_embassy_host::{Bench, Board, keys};
 use embassy_net::udp::{PacketMetadata, UdpSocket};
 use smoltcp::wire::{DhcpMessageType, DhcpPacket, DhcpRepr};
@@ -50,8 +50,10 @@ fn serve(board: &Board, given: Rc<Cell<Ipv4Addr>>) {
     });
 }
 
+const LIMITS: Limits = Limits { links: 3, message_size: 256, ..Limits::S_UNIT };
+
 fn start(board: &Board, config: Config) -> Handle {
-    let memory: &'static mut Resources<(), 3, { message_buffer(256) }> = Box::leak(Box::new(Resources::new()));
+    let memory: &'static mut resources!((), LIMITS) = Box::leak(Box::new(Resources::new()));
     let (unit, mut runner) = cara_embassy::new(board.stack(), memory, config, ()).unwrap();
     board.spawn(async move { runner.run().await });
     unit
@@ -62,10 +64,10 @@ fn a_unit_joins_with_the_address_that_it_is_given_and_again_with_another() {
     let bench = Bench::new(21);
     let depot = bench.board();
     let manager = Identity::m_unit("manager", 1).unwrap();
-    let manager = start(&depot, Config::m_unit("manager", 1, proof(&manager)).unwrap().constraints(short()));
+    let manager = start(&depot, Config::m_unit("manager", 1, proof(&manager)).unwrap());
     let board = bench.board_on_dhcp();
     let agv = Identity::s_unit("agv", 7).unwrap();
-    let agv = start(&board, Config::s_unit("agv", 7, "manager", 1, proof(&agv)).unwrap().constraints(short()));
+    let agv = start(&board, Config::s_unit("agv", 7, "manager", 1, proof(&agv)).unwrap());
     bench.run_for(Duration::from_secs(5));
     assert!(!agv.is_connected(), "nobody has given it an address");
     let given = Rc::new(Cell::new(Ipv4Addr::new(10, 77, 5, 5)));
@@ -94,8 +96,4 @@ fn a_unit_joins_with_the_address_that_it_is_given_and_again_with_another() {
 
 fn proof(own: &Identity) -> Security {
     keys(0, own, 0, own.id().into())
-}
-
-fn short() -> cara_core::config::Constraints {
-    cara_core::config::Constraints { message_size: 256, maximum_nodes: 2, ..cara_core::config::Constraints::S_UNIT }
 }

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use cara_apps::agv::{Agv, BATTERY, GO_TO, GO_TO_LEASE, POS_INFO, Progress, TICK};
 use cara_core::services::lease::Lease;
-use cara_embassy::{Config, Handle, Handler, Resources, Security, ServiceOptions};
+use cara_embassy::{Config, Handle, Handler, Limits, Resources, Security, ServiceOptions, resources};
 use cara_processes::network::{self, ip};
 use cara_secure::random::Random;
 use cara_std::keys::{FleetKeys, KeyRing};
@@ -195,10 +195,10 @@ fn board(fleet: u32, keys: KeyRing) {
     let tap = TunTapInterface::new("tap0", Medium::Ethernet).expect("the device is there");
     let address = Ipv4Cidr::new(Ipv4Address::new(10, 77, 0, 2), 24);
     let config = StaticConfigV4 { address, gateway: None, dns_servers: Default::default() };
-    let resources = Box::leak(Box::new(StackResources::<{ Resources::<Agv>::SOCKETS }>::new()));
+    let resources = Box::leak(Box::new(StackResources::<{ Limits::S_UNIT.sockets() }>::new()));
     let config = embassy_net::Config::ipv4_static(config);
     let (stack, mut network) = embassy_net::new(Tap(tap), config, resources, u64::from(fleet));
-    let memory: &'static mut Resources<Agv> = Box::leak(Box::new(Resources::new()));
+    let memory: &'static mut resources!(Agv, Limits::S_UNIT) = Box::leak(Box::new(Resources::new()));
     let mut random = Random::constant();
     random.stir(&fleet.to_le_bytes());
     let security = Security::keys(Box::leak(Box::new(keys)), random);

@@ -11,13 +11,13 @@ use cara_core::config::{Constraints, SECURED_PORT};
 use cara_core::distribution::connection_handler::NodeCounter;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::Parameters;
-use cara_core::error::{CloseReason, Error, ServiceError};
+use cara_core::error::{CloseReason, Constraint, Error, ServiceError};
 use cara_core::host::connections::LinkCounter;
 use cara_core::services::access::{Functions, Rule, Verbs, Who};
 use cara_core::services::lease::Lease;
 use cara_core::services::unit::RequestOptions;
 use cara_core::time::{Duration, Instant};
-use cara_embassy::{Config, Handle, Handler, Hook, Resources, Security, ServiceOptions, UnitEvent, message_buffer};
+use cara_embassy::{Config, Handle, Handler, Hook, Limits, Security, ServiceOptions, UnitEvent, resources};
 use cara_embassy_host::{Bench, Board, keys};
 use embassy_net::tcp::TcpSocket;
 use embassy_time::{Timer, with_timeout};
@@ -35,7 +35,8 @@ struct State {
 }
 
 type Unit = Handle<State>;
-type Manager = Resources<State, 4, { message_buffer(1024) }, 6, 1536, 8, 8, 8, 2>;
+const LIMITS: Limits = Limits { links: 4, message_buffers: 6, calls: 8, tasks: 2, ..Limits::S_UNIT };
+type Manager = resources!(State, LIMITS);
 
 fn start(board: &Board, config: Config) -> Unit {
     let memory = Box::leak(Box::new(Manager::new()));
@@ -397,8 +398,23 @@ fn memory_that_cannot_hold_the_constraints_is_refused() {
     let constraints = Constraints { maximum_nodes: 4, ..Constraints::M_UNIT };
     let memory = Box::leak(Box::new(Manager::new()));
     let refused = cara_embassy::new(bench.board().stack(), memory, config.constraints(constraints), State::default());
-    assert_eq!(refused.err(), Some(Error::BadConstraint));
+    let does_not_fit = |constraint, need, have| Error::DoesNotFit { constraint, need, have };
+    assert_eq!(refused.err(), Some(does_not_fit(Constraint::MessageSize, 32 * 1024, 1024)));
     let (_, unit) = manager(&bench);
+    let follow = LIMITS.constraints();
+    assert_eq!((follow.maximum_nodes, follow.message_size, follow.calls_per_peer), (3, 1024, 12));
+    assert_eq!(unit.constraints(), follow);
+    let too_many = does_not_fit(Constraint::MaximumNodes, 5, 4);
+    assert_eq!(unit.set_constraints(Constraints { maximum_nodes: 5, ..follow }), Err(too_many));
+    assert_eq!(
+        too_many.to_string(),
+        "maximum_nodes needs links = 5, and the resources have 4: ask for less, or raise the limit"
+    );
+    let calls = does_not_fit(Constraint::CallsPerPeer, 9, 8);
+    assert_eq!(unit.set_constraints(Constraints { calls_per_peer: 13, ..follow }), Err(calls));
+    assert_eq!(unit.set_constraints(Constraints { calls_per_peer: 0, ..follow }), Err(Error::BadConstraint));
+    assert_eq!(unit.constraints(), follow, "what is refused changes nothing");
+    assert_eq!(unit.set_constraints(Constraints { maximum_nodes: 4, ..follow }), Ok(()));
     let huge = "huge(text: string[9000])";
     let refused = unit.add_service(huge, ServiceOptions::new(), Handler::task());
     assert!(matches!(refused, Err(Error::TooLarge { .. })), "{refused:?}");

@@ -2,7 +2,7 @@
 //! takes of a board when nothing else is there.
 
 use cara_core::error::{Error, ServiceError};
-use cara_embassy::{Handler, Resources, Runner, Security, ServiceOptions, message_buffer};
+use cara_embassy::{Handler, Limits, Runner, Security, ServiceOptions, resources};
 use cara_settings::Settings;
 use embassy_net::Stack;
 
@@ -11,24 +11,22 @@ use crate::{VehicleError, unit_config};
 /// One manager, messages of 1 KiB, two functions of its own and two of the manager's. What it gives up for being small:
 /// a best-effort request above 480 bytes is lost, results above 512 bytes are refused when they come back, and no call
 /// can wait for a task.
-const LINKS: usize = 1;
-const MESSAGE: usize = message_buffer(1024);
-const BUFFERS: usize = 2;
-const STREAM: usize = 1024;
-const FUNCTIONS: usize = 2;
-const THEIR: usize = 2;
-const CALLS: usize = 3;
-const TASKS: usize = 0;
-const ARGUMENTS: usize = 256;
-const DATAGRAM: usize = 512;
-const REPLY: usize = 512;
+pub const LIMITS: Limits = Limits {
+    message_buffers: 2,
+    stream: 1024,
+    functions: 2,
+    their_functions: 2,
+    calls: 3,
+    calls_waiting: 0,
+    tasks: 0,
+    arguments: 256,
+    datagram: Some(512),
+    reply: Some(512),
+    ..Limits::S_UNIT
+};
 
 /// Its memory.
-pub type LeastResources =
-    Resources<(), LINKS, MESSAGE, BUFFERS, STREAM, FUNCTIONS, THEIR, CALLS, TASKS, ARGUMENTS, DATAGRAM, REPLY>;
-
-/// Sockets of the network stack that it needs, with one for DHCP.
-pub const SOCKETS: usize = LeastResources::SOCKETS + 1;
+pub type LeastResources = resources!((), LIMITS);
 
 /// Makes the unit, whose one service adds two numbers.
 pub fn unit(

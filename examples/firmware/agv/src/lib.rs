@@ -27,15 +27,17 @@ use cara_core::config::Priority;
 use cara_core::error::{Cause, Error};
 use cara_core::services::access::{Functions, Rule, Verbs, Who};
 use cara_core::services::lease::Lease;
-use cara_embassy::{Config, Handle, Handler, Hook, Resources, Runner, Security, ServiceOptions, now};
+use cara_embassy::{Config, Handle, Handler, Hook, Limits, Runner, Security, ServiceOptions, now, resources};
 use cara_settings::{Network, Settings};
 use embassy_net::{Ipv4Cidr, Stack, StaticConfigV4};
 use embassy_time::{Duration, Ticker};
 
 /// An AGV.
 pub type Vehicle = Handle<Agv>;
-/// Its memory: one manager, messages of 1 KiB.
-pub type VehicleResources = Resources<Agv>;
+/// Its limits: one manager, messages of 1 KiB.
+pub const LIMITS: Limits = Limits::S_UNIT;
+/// Its memory.
+pub type VehicleResources = resources!(Agv, LIMITS);
 
 /// Returns its argument, for measurements of the round trip.
 const ECHO: &str = "echo(text: string[400]) -> (text: string[400])";
@@ -44,9 +46,6 @@ const ECHO: &str = "echo(text: string[400]) -> (text: string[400])";
 /// the settings can join, and its name is not known when the image is built. S_units have no business here and may do
 /// nothing.
 const RULES: [Rule; 1] = [Rule::new(Who::M_UNITS, Functions::All, Verbs::ALL)];
-
-/// Sockets of the network stack that the vehicle needs, with one for DHCP.
-pub const SOCKETS: usize = VehicleResources::SOCKETS + 1;
 
 /// The lease of the vehicle's driving. An interrupt of the motors can read it: `DRIVING.is_live(now())` becomes false
 /// in time even if no task runs any more.

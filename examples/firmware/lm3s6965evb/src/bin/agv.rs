@@ -8,7 +8,7 @@ use cara_embassy::Runner as UnitRunner;
 use cara_lm3s6965evb::arguments::{self, ArgumentError};
 use cara_lm3s6965evb::ethernet::Ethernet;
 use cara_lm3s6965evb::{executor, fault, motor, reset, stack, start, watchdog};
-use cara_vehicle::{SOCKETS, Vehicle, VehicleResources};
+use cara_vehicle::{LIMITS, Vehicle, VehicleResources};
 use embassy_executor::Spawner;
 use embassy_net::{Runner, StackResources};
 use embassy_time::{Duration, Timer};
@@ -38,14 +38,14 @@ fn main() -> ! {
 #[inline(never)]
 fn spawn(spawner: Spawner) -> Result<(), &'static str> {
     static ETHERNET: ConstStaticCell<Ethernet> = ConstStaticCell::new(Ethernet::new());
-    static SOCKETS_MEMORY: ConstStaticCell<StackResources<SOCKETS>> = ConstStaticCell::new(StackResources::new());
+    static SOCKETS: ConstStaticCell<StackResources<{ LIMITS.sockets() }>> = ConstStaticCell::new(StackResources::new());
     static RESOURCES: StaticCell<VehicleResources> = StaticCell::new();
     const NO_ROOM: &str = "no room for a task";
     let told = arguments::read().map_err(ArgumentError::text)?;
     let (settings, security, noise) = told.security().ok_or("it joins no manager")?;
     let ethernet = ETHERNET.take();
     ethernet.start();
-    let sockets = SOCKETS_MEMORY.take();
+    let sockets = SOCKETS.take();
     let (stack, network_runner) = embassy_net::new(ethernet, cara_vehicle::network(&settings), sockets, noise);
     let resources = RESOURCES.init_with(VehicleResources::new);
     let made = cara_vehicle::vehicle(stack, resources, &settings, security);

@@ -8,7 +8,7 @@ use cara_embassy::Runner as UnitRunner;
 use cara_lm3s6965evb::arguments::{self, ArgumentError};
 use cara_lm3s6965evb::ethernet::Ethernet;
 use cara_lm3s6965evb::{executor, fault, stack, start};
-use cara_vehicle::least::{self, LeastResources, SOCKETS};
+use cara_vehicle::least::{self, LIMITS, LeastResources};
 use embassy_executor::Spawner;
 use embassy_net::{Runner, StackResources};
 use static_cell::{ConstStaticCell, StaticCell};
@@ -28,14 +28,14 @@ fn main() -> ! {
 #[inline(never)]
 fn spawn(spawner: Spawner) -> Result<(), &'static str> {
     static ETHERNET: ConstStaticCell<Ethernet> = ConstStaticCell::new(Ethernet::new());
-    static SOCKETS_MEMORY: ConstStaticCell<StackResources<SOCKETS>> = ConstStaticCell::new(StackResources::new());
+    static SOCKETS: ConstStaticCell<StackResources<{ LIMITS.sockets() }>> = ConstStaticCell::new(StackResources::new());
     static RESOURCES: StaticCell<LeastResources> = StaticCell::new();
     const NO_ROOM: &str = "no room for a task";
     let told = arguments::read().map_err(ArgumentError::text)?;
     let (settings, security, noise) = told.security().ok_or("it joins no manager")?;
     let ethernet = ETHERNET.take();
     ethernet.start();
-    let sockets = SOCKETS_MEMORY.take();
+    let sockets = SOCKETS.take();
     let (stack, network_runner) = embassy_net::new(ethernet, cara_vehicle::network(&settings), sockets, noise);
     let made = least::unit(stack, RESOURCES.init_with(LeastResources::new), &settings, security);
     let unit_runner = made.map_err(|_| "the settings are of no s_unit")?;

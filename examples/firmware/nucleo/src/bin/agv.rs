@@ -8,7 +8,7 @@ use cara_nucleo::Board;
 use cara_nucleo::board::{Button, Device, Led, Watchdog};
 use cara_settings::Settings;
 use cara_vehicle::provision::{Provision, halves};
-use cara_vehicle::{SOCKETS, Vehicle, VehicleResources, led, tasks};
+use cara_vehicle::{LIMITS, Vehicle, VehicleResources, led, tasks};
 use defmt_rtt as _;
 use embassy_executor::{SpawnError, Spawner};
 use embassy_net::{Runner, StackResources};
@@ -44,9 +44,9 @@ fn spawn(
     button: Button,
     watchdog: Watchdog,
 ) -> Result<(), SpawnError> {
-    static SOCKETS_MEMORY: StaticCell<StackResources<SOCKETS>> = StaticCell::new();
+    static SOCKETS: StaticCell<StackResources<{ LIMITS.sockets() }>> = StaticCell::new();
     static RESOURCES: StaticCell<VehicleResources> = StaticCell::new();
-    let sockets = SOCKETS_MEMORY.init_with(StackResources::new);
+    let sockets = SOCKETS.init_with(StackResources::new);
     let (stack, network_runner) = embassy_net::new(device, cara_vehicle::network(&settings), sockets, seed);
     let resources = RESOURCES.init_with(VehicleResources::new);
     let made = cara_vehicle::vehicle(stack, resources, &settings, security);

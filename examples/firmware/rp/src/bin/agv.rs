@@ -7,7 +7,7 @@ use cara_rp::Board;
 use cara_rp::board::{Device, Led};
 use cara_rp::parts::Button;
 use cara_vehicle::provision::{Provision, halves};
-use cara_vehicle::{SOCKETS, Vehicle, VehicleResources, led, tasks};
+use cara_vehicle::{LIMITS, Vehicle, VehicleResources, led, tasks};
 use defmt_rtt as _;
 use embassy_executor::{SpawnError, Spawner};
 use embassy_net::{Runner, StackResources};
@@ -19,7 +19,7 @@ async fn main(spawner: Spawner) {
 }
 
 async fn run(spawner: Spawner) -> Result<(), SpawnError> {
-    static SOCKETS_MEMORY: StaticCell<StackResources<SOCKETS>> = StaticCell::new();
+    static SOCKETS: StaticCell<StackResources<{ LIMITS.sockets() }>> = StaticCell::new();
     static RESOURCES: StaticCell<VehicleResources> = StaticCell::new();
     let Board { pages: [first, second], mut lives, seed, led, button, watchdog, network } = Board::start(spawner).await;
     let known = Provision::read(first, second).and_then(|Provision { settings, proof }| {
@@ -31,7 +31,7 @@ async fn run(spawner: Spawner) -> Result<(), SpawnError> {
         uplink.only_led().await
     };
     let (device, uplink) = network.start(spawner).await?;
-    let sockets = SOCKETS_MEMORY.init_with(StackResources::new);
+    let sockets = SOCKETS.init_with(StackResources::new);
     let (stack, runner) = embassy_net::new(device, cara_vehicle::network(&settings), sockets, seed);
     uplink.keep(spawner, stack, Some(&settings))?;
     let resources = RESOURCES.init_with(VehicleResources::new);

@@ -3,7 +3,7 @@
 #![no_std]
 #![no_main]
 
-use cara_embassy::{Config, Handler, Resources, Runner as UnitRunner, Security, ServiceOptions, message_buffer};
+use cara_embassy::{Config, Handler, Limits, Runner as UnitRunner, Security, ServiceOptions, resources};
 use cara_lm3s6965evb::arguments;
 use cara_lm3s6965evb::ethernet::Ethernet;
 use cara_lm3s6965evb::{executor, fault, start};
@@ -12,8 +12,9 @@ use embassy_executor::Spawner;
 use embassy_net::{Runner, StackResources};
 use static_cell::{ConstStaticCell, StaticCell};
 
-/// The usual memory of an s_unit, with room for a text of 512 characters.
-type Memory = Resources<(), 1, { message_buffer(1024) }, 3, 1536, 8, 8, 4, 1, 640>;
+/// Those of an s_unit, with room for a text of 512 characters.
+const LIMITS: Limits = Limits { arguments: 640, ..Limits::S_UNIT };
+type Memory = resources!((), LIMITS);
 
 const SERVICES: [&str; 2] =
     ["pos_info(position: int[2]) -> (position: int[2])", "echo(text: string[512]) -> (text: string[512])"];
@@ -32,8 +33,7 @@ fn main() -> ! {
 #[inline(never)]
 fn spawn(spawner: Spawner) -> Result<(), &'static str> {
     static ETHERNET: ConstStaticCell<Ethernet> = ConstStaticCell::new(Ethernet::new());
-    static SOCKETS: ConstStaticCell<StackResources<{ Memory::SOCKETS + 1 }>> =
-        ConstStaticCell::new(StackResources::new());
+    static SOCKETS: ConstStaticCell<StackResources<{ LIMITS.sockets() }>> = ConstStaticCell::new(StackResources::new());
     static MEMORY: StaticCell<Memory> = StaticCell::new();
     const NO_ROOM: &str = "no room for a task";
     let settings = arguments::read().map_err(|_| "the arguments are no settings")?.settings;

@@ -1,7 +1,7 @@
 //! The memory of boards: static on a controller, so here it is never given back.
 
 use cara_core::error::Error;
-use cara_embassy::{Config, Handle, Resources, Runner, message_buffer};
+use cara_embassy::{Config, Handle, Limits, Runner, resources};
 use embassy_net::Stack;
 
 use crate::Spec;
@@ -15,35 +15,53 @@ const LONG: u32 = 32 * 1024 + 1;
 /// Fewer message buffers than this are wanted by scenarios about few of them.
 const FEW: usize = 6;
 
-const SMALL: usize = message_buffer(SHORT);
-const HUGE: usize = message_buffer(128 * 1024);
-const LARGE: usize = message_buffer(32 * 1024);
-
-type Agv = Resources<(), 2, SMALL, FEW, 4096, 16, 48, 10, 4, 8_192>;
-type Manager = Resources<(), LINKS, LARGE, 12, 8192, 32, 48, 66, 4, 90_000>;
-type Forgetful = Resources<(), LINKS, LARGE, 12, 8192, 32, 4, 66, 4, 90_000>;
-type Tight = Resources<(), LINKS, LARGE, 2, 8192, 32, 48, 66, 4, 90_000>;
+const AGV: Limits = Limits {
+    links: 2,
+    message_size: SHORT,
+    message_buffers: FEW,
+    stream: 4096,
+    functions: 16,
+    their_functions: 48,
+    calls: 10,
+    calls_waiting: 256,
+    tasks: 4,
+    arguments: 8_192,
+    ..Limits::S_UNIT
+};
+const MANAGER: Limits = Limits {
+    links: LINKS,
+    message_size: 32 * 1024,
+    message_buffers: 12,
+    stream: 8192,
+    functions: 32,
+    calls: 66,
+    arguments: 90_000,
+    ..AGV
+};
+const FORGETFUL: Limits = Limits { their_functions: 4, ..MANAGER };
+const TIGHT: Limits = Limits { message_buffers: 2, ..MANAGER };
 /// For messages that are not for boards at all.
-type Huge = Resources<(), 3, HUGE, 3, 8192, 8, 8, 66, 1, 130_000>;
+const HUGE: Limits =
+    Limits { links: 3, message_size: 128 * 1024, message_buffers: 3, arguments: 130_000, tasks: 1, ..MANAGER };
 
 macro_rules! unit {
-    ($memory:ty, $stack:expr, $config:expr) => {
-        cara_embassy::new($stack, Box::leak(Box::new(<$memory>::new())), $config, ())
+    ($limits:ident, $stack:expr, $config:expr) => {
+        cara_embassy::new($stack, Box::leak(Box::new(<resources!((), $limits)>::new())), $config, ())
     };
 }
 
 /// A unit in memory that suits its description.
 pub(super) fn unit(spec: &Spec, stack: Stack<'static>, config: Config) -> Result<(Handle, Runner<()>), Error> {
     if spec.their_functions <= 4 {
-        return unit!(Forgetful, stack, config);
+        return unit!(FORGETFUL, stack, config);
     }
     if spec.message_buffers < FEW && spec.constraints.message_size < LONG {
-        return unit!(Tight, stack, config);
+        return unit!(TIGHT, stack, config);
     }
     match spec.constraints.message_size {
-        LONG.. => unit!(Huge, stack, config),
-        ..=SHORT if spec.constraints.maximum_nodes == 1 => unit!(Agv, stack, config),
-        _ => unit!(Manager, stack, config),
+        LONG.. => unit!(HUGE, stack, config),
+        ..=SHORT if spec.constraints.maximum_nodes == 1 => unit!(AGV, stack, config),
+        _ => unit!(MANAGER, stack, config),
     }
 }
 
