@@ -203,7 +203,7 @@ pub struct TakenCall<T: 'static> {
     pub caller: Identity,
     /// The call's class.
     pub priority: Priority,
-    /// After this the caller no longer waits; on the clock of [`now`](crate::now).
+    /// After this the caller no longer waits; on the clock of [`now`].
     pub deadline: Instant,
     /// Whether the caller waits.
     pub wants_reply: bool,

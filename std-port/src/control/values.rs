@@ -1,4 +1,4 @@
-//! Values between the control socket's form and [`Parameters`](crate::Parameters).
+//! Values between the control socket's form and [`Parameters`].
 
 use cara_core::distribution::function::VariableSpecs;
 use cara_core::distribution::parameters::{Parameters, ParametersView, Type, Value};

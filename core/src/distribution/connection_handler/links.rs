@@ -15,7 +15,7 @@ const SETTLED: Duration = Duration::from_secs(1);
 const HOPELESS: u8 = 5;
 
 impl<S: Storage> Node<S> {
-    /// The port is opening the link that [`Command::Dial`] asked for.
+    /// The port is opening the link that [`Command::Dial`](super::Command::Dial) asked for.
     pub fn dialing(&mut self, identity: Option<&Identity>, link: LinkId) {
         let Some(place) = identity.and_then(|identity| self.table.find(identity)) else { return };
         let Some(known) = self.table.node_mut(place) else { return };
@@ -30,7 +30,7 @@ impl<S: Storage> Node<S> {
         }
     }
 
-    /// The link that [`Command::Dial`] asked for could not be opened at all.
+    /// The link that [`Command::Dial`](super::Command::Dial) asked for could not be opened at all.
     pub fn dial_failed(&mut self, now: Instant, identity: Option<&Identity>) {
         let place = identity.and_then(|identity| self.table.find(identity));
         // An earlier dial to another address of it may still come through.

@@ -1,8 +1,8 @@
 //! The paper's `Connection_handler`: finds nodes, decides which links are accepted, and has the state of each node.
 //!
 //! A [`Node`] is one unit's membership. It knows links by their ids only; frames on them are the sessions' matter. The
-//! port polls it, gives it the datagrams that arrive, asks it about each hello ([`Node::admit`]) and tells it when a
-//! link has ended ([`Node::left`]). What is to be done comes back as [`Action`]s.
+//! port polls it ([`Node::poll`]), gives it the datagrams that arrive ([`Node::datagram`]) and reports the end of each link
+//! ([`Node::left`]); a session asks it about the hello of its peer. What is to be done comes back as [`Command`]s.
 //!
 //! # Discovery (paper, section 2: "it works like the Address Resolution Protocol")
 //! - An s_unit broadcasts a search ([`WhoHas`](super::datagram::WhoHas)) for its manager, with growing back-off, and
