@@ -128,6 +128,14 @@ pub enum Mode {
 }
 
 impl Mode {
+    /// As people and files write it: `plain` or `secured`.
+    pub const fn as_str(self) -> &'static str {
+        match self {
+            Self::Plain => "plain",
+            Self::Secured => "secured",
+        }
+    }
+
     /// First four bytes of every datagram and hello.
     pub const fn magic(self) -> [u8; 4] {
         match self {

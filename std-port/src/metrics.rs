@@ -64,7 +64,7 @@ impl Snapshot {
         };
         let peers = cells.iter().map(|cell| PeerSnapshot {
             peer: cell.identity.to_string(),
-            role: if cell.identity.role() == Role::SUnit { "s_unit" } else { "m_unit" },
+            role: cell.identity.role().as_str(),
             connected: cell.is_connected(),
             readings: engine.peer_readings(cell),
         });

@@ -18,6 +18,16 @@ pub enum Role {
     SUnit,
 }
 
+impl Role {
+    /// As people and files write it: `m_unit` or `s_unit`.
+    pub const fn as_str(self) -> &'static str {
+        match self {
+            Self::MUnit => "m_unit",
+            Self::SUnit => "s_unit",
+        }
+    }
+}
+
 /// Units of different fleets on one network do not meet.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct Fleet(pub u32);

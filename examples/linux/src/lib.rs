@@ -6,7 +6,7 @@ mod output;
 mod stop;
 
 pub use events::show_events;
-pub use options::{NameAndId, Network, shown_mode};
+pub use options::{NameAndId, Network};
 pub use stop::{Stop, Stopper};
 
 use std::process::ExitCode;

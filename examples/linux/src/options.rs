@@ -4,7 +4,7 @@ use std::str::FromStr;
 
 use anyhow::Result;
 use cara_std::keys::{FleetKeys, KeyRing, parse_node};
-use cara_std::{Builder, Fleet, Interfaces, Mode};
+use cara_std::{Builder, Fleet, Interfaces};
 use clap::Args;
 
 /// Where a unit looks for others.
@@ -46,14 +46,6 @@ impl Network {
             keys.add(&parse_node(node).map_err(anyhow::Error::msg)?, &[])?;
         }
         Ok(keys)
-    }
-}
-
-/// A mode as the examples print it.
-pub fn shown_mode(mode: Mode) -> &'static str {
-    match mode {
-        Mode::Plain => "plain",
-        Mode::Secured => "secured",
     }
 }
 

@@ -1,8 +1,8 @@
 //! Units, nodes, refusals and events in the control socket's form.
 
-use cara_core::config::{Constraints, Mode, Priority, VERSION};
+use cara_core::config::{Constraints, Priority, VERSION};
 use cara_core::distribution::connection_handler::Finding;
-use cara_core::distribution::identity::{Epoch, Identity, Role};
+use cara_core::distribution::identity::{Epoch, Identity};
 use cara_core::services::lease::LeaseEnd;
 use cara_core::time::Duration;
 
@@ -18,9 +18,9 @@ pub(super) fn unit<T: Send + 'static>(system: &CommunicationSystem<T>) -> UnitIn
     UnitInfo {
         name: identity.name().to_owned(),
         id: identity.id(),
-        role: role(identity.role()).to_owned(),
+        role: identity.role().as_str().to_owned(),
         fleet: system.fleet().0,
-        mode: Some(mode(system.keys().mode()).to_owned()),
+        mode: Some(system.keys().mode().as_str().to_owned()),
         keys: system.keys().ring().map(keys),
         version: VERSION,
         discovery_port: system.discovery_port(),
@@ -30,13 +30,6 @@ pub(super) fn unit<T: Send + 'static>(system: &CommunicationSystem<T>) -> UnitIn
         interfaces: system.interfaces().iter().map(interface).collect(),
         constraints: constraints(&system.constraints()),
         connected: system.number_of_s_units() + system.number_of_m_units(),
-    }
-}
-
-const fn mode(mode: Mode) -> &'static str {
-    match mode {
-        Mode::Plain => "plain",
-        Mode::Secured => "secured",
     }
 }
 
@@ -61,7 +54,7 @@ pub(super) fn node<T: Send + 'static>(peer: &Peer<T>, expected: bool) -> NodeInf
     NodeInfo {
         name: peer.name().to_owned(),
         id: peer.id(),
-        role: role(peer.identity().role()).to_owned(),
+        role: peer.identity().role().as_str().to_owned(),
         connected: peer.is_connected(),
         expected,
         address: peer.address().map(|address| address.to_string()),
@@ -147,13 +140,6 @@ pub(super) fn event(event: &UnitEvent, at: Duration) -> Answer {
         }
     };
     Answer::Event { at_ms: at.as_millis(), event: name.to_owned(), node: node.map(Identity::to_string), text }
-}
-
-pub(super) const fn role(role: Role) -> &'static str {
-    match role {
-        Role::MUnit => "m_unit",
-        Role::SUnit => "s_unit",
-    }
 }
 
 const fn priority(priority: Priority) -> &'static str {

@@ -4,7 +4,6 @@ use std::collections::HashSet;
 
 use crate::{CommunicationSystem, Identity, Peer};
 
-use super::describe::role;
 use super::protocol::Failure;
 
 /// Most nodes that a failure lists.
@@ -13,7 +12,7 @@ const LISTED: usize = 20;
 /// The node that `selector` means; a failure lists what there is.
 pub(super) fn node<T: Send + 'static>(system: &CommunicationSystem<T>, selector: &str) -> Result<Peer<T>, Failure> {
     let all = nodes(system);
-    let is_meant = |peer: &&Peer<T>| means(selector, peer.name(), peer.id(), role(peer.identity().role()));
+    let is_meant = |peer: &&Peer<T>| means(selector, peer.name(), peer.id(), peer.identity().role().as_str());
     let mut meant: Vec<Peer<T>> = all.iter().filter(is_meant).cloned().collect();
     // One that is absent may be the one that is meant, unless it was taken off the roster.
     if meant.len() > 1 {
@@ -63,7 +62,7 @@ fn list<T: Send + 'static>(peers: &[Peer<T>]) -> String {
     let same = |name: &str| peers.iter().filter(|other| other.identity().to_string() == name).count();
     let full = |peer: &Peer<T>| match same(&peer.identity().to_string()) {
         1 => peer.identity().to_string(),
-        _ => format!("{}@{}", peer.identity(), role(peer.identity().role())),
+        _ => format!("{}@{}", peer.identity(), peer.identity().role().as_str()),
     };
     let mut names: Vec<String> = peers.iter().map(full).collect();
     names.sort();

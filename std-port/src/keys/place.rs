@@ -30,10 +30,7 @@ const OF_HOST: &str = "/etc/cara/keys";
 /// # Ok::<(), cara_std::Error>(())
 /// ```
 pub fn file_name(identity: &Identity, fleet: Fleet) -> String {
-    let role = match identity.role() {
-        Role::MUnit => "m_unit",
-        Role::SUnit => "s_unit",
-    };
+    let role = identity.role().as_str();
     format!("{}-{}-{role}-{}.keys", escape(identity.name()), identity.id(), fleet.0)
 }
 

@@ -167,10 +167,7 @@ impl<'t> Line<'t> {
 
 /// Adds `ROLE ID NAME`.
 pub(super) fn push_identity(text: &mut String, identity: &Identity) {
-    let role = match identity.role() {
-        Role::MUnit => "m_unit",
-        Role::SUnit => "s_unit",
-    };
+    let role = identity.role().as_str();
     // Writing to text does not fail.
     let _ = write!(text, "{role} {} {}", identity.id(), identity.name());
 }

@@ -152,5 +152,5 @@ entry!(plain_codes, {
 
 entry!(modes, {
     let mode: Mode = *unknown();
-    keep((mode.magic(), mode.port(), Mode::of_magic(*unknown())));
+    keep((mode.as_str(), mode.magic(), mode.port(), Mode::of_magic(*unknown())));
 });

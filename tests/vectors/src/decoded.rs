@@ -5,7 +5,7 @@ use cara_core::distribution::block;
 use cara_core::distribution::datagram::{Announce, Datagram, DatagramError, WhoHas};
 use cara_core::distribution::function::{Attributes, Signature};
 use cara_core::distribution::hello::{Hello, HelloError, Manager};
-use cara_core::distribution::identity::{Fleet, Identity, Role};
+use cara_core::distribution::identity::{Fleet, Identity};
 use cara_core::distribution::message::{Control, Message, SessionBody};
 use cara_core::distribution::parameters::{Parameters, Type, Value as Variable};
 use cara_core::error::{Error, ServiceError};
@@ -67,11 +67,7 @@ pub(crate) fn hello(bytes: &[u8]) -> Option<Value> {
 }
 
 fn identity(identity: &Identity) -> Value {
-    let role = match identity.role() {
-        Role::MUnit => "m_unit",
-        Role::SUnit => "s_unit",
-    };
-    json!({ "id": identity.id(), "name": identity.name(), "role": role })
+    json!({ "id": identity.id(), "name": identity.name(), "role": identity.role().as_str() })
 }
 
 fn manager(manager: Option<&Manager>) -> Value {

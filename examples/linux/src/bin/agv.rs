@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use anyhow::Result;
 use cara_apps::agv::{Agv, BATTERY, GO_TO, GO_TO_LEASE, POS_INFO, Progress, STOP, TICK};
 use cara_apps::mechanic;
-use cara_examples::{NameAndId, Network, Stop, log_to_stderr, say, shown_mode};
+use cara_examples::{NameAndId, Network, Stop, log_to_stderr, say};
 use cara_std::{Call, Definition, LeaseWatch, ParametersView, Priority, ServiceOptions, Unit, UnitEvent};
 use clap::Parser;
 
@@ -38,7 +38,7 @@ fn main() -> Result<()> {
     unit.on_manager_lost(|()| say!("manager lost"))?;
     follow(&unit);
     unit.start()?;
-    say!("started {name}/{id}, {}, at {}", shown_mode(unit.mode()), lock(&agv).place());
+    say!("started {name}/{id}, {}, at {}", unit.mode().as_str(), lock(&agv).place());
     drive(&unit, &agv, &lease, &stop)?;
     unit.stop();
     say!("ended at {}", lock(&agv).place());

@@ -23,7 +23,6 @@ mod which;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use cara_std::Role;
 use cara_std::survey::VERSION;
 
 use cara_tools::exit::{Ended, Exit};
@@ -61,11 +60,4 @@ pub fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
     }
     let found = looked.findings.iter().any(|finding| finding.severity != Severity::Info);
     Ok(if found { Exit::Findings } else { Exit::Done }.into())
-}
-
-const fn role(role: Role) -> &'static str {
-    match role {
-        Role::MUnit => "m_unit",
-        Role::SUnit => "s_unit",
-    }
 }

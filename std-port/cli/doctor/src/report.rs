@@ -6,6 +6,7 @@ use serde_json::{Value, json};
 
 use super::finding::{Finding, Severity};
 use super::look::Looked;
+use cara_std::Mode;
 use cara_tools::listening;
 use cara_tools::output::{self, BAD, FAINT, GOOD, HEADING, PLAIN};
 
@@ -21,11 +22,11 @@ pub(crate) fn object(looked: &Looked) -> Value {
                 "address": heard.source.to_string(),
                 "version": heard.version,
                 "fleet": heard.fleet.0,
-                "mode": listening::shown_mode(heard.mode),
+                "mode": heard.mode.as_str(),
                 "proof": listening::shown_standing(heard.standing).0,
                 "generation": listening::shown_standing(heard.standing).1,
                 "node": heard.identity.as_ref().map(ToString::to_string),
-                "role": heard.identity.as_ref().map(|identity| super::role(identity.role())),
+                "role": heard.identity.as_ref().map(|identity| identity.role().as_str()),
                 "epoch": heard.epoch.map(|epoch| format!("{:016x}", epoch.0)),
                 "looks_for": heard.wanted.as_ref().map(super::causes::text_of),
                 "tcp_port": heard.tcp_port,
@@ -40,7 +41,7 @@ pub(crate) fn object(looked: &Looked) -> Value {
     json!({
         "node": seen.which.as_ref().map(|which| &which.0),
         "fleet": seen.fleet.0,
-        "mode": seen.mode.map(listening::shown_mode),
+        "mode": seen.mode.map(Mode::as_str),
         "keys": seen.keys.has,
         "discovery_ports": seen.ports.numbers(),
         "listened_ms": seen.listened.as_millis() as u64,

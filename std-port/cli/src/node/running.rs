@@ -19,7 +19,6 @@ use super::unit::{Node, NotBuilt};
 use super::{events, http, wrong};
 use cara_tools::exit::Ended;
 use cara_tools::global::Global;
-use cara_tools::listening::shown_mode;
 use cara_tools::output;
 
 /// Runs a node until it is asked to end.
@@ -126,7 +125,7 @@ fn listen(place: &Placed<SocketAddr>, settings: &Settings) -> anyhow::Result<Tcp
 /// One line that says that the node is up, for scripts that wait for it.
 fn tell_up(settings: &Settings, node: &Node, metrics: Option<SocketAddr>, global: &Global) -> anyhow::Result<()> {
     let Settings { name, id, fleet, .. } = settings;
-    let (mode, discovery) = (shown_mode(node.mode()), node.discovery_port());
+    let (mode, discovery) = (node.mode().as_str(), node.discovery_port());
     let metrics = metrics.map(|address| format!("http://{address}/metrics"));
     let (tcp, control) = (node.tcp_port(), node.control_path());
     if global.json {

@@ -1,7 +1,7 @@
 //! Where a command listens that looks at a network, and the keys that it has for that.
 
 use cara_std::survey::{Ports, Standing, Survey, SurveyKeys};
-use cara_std::{Fleet, Mode, PLAIN_PORT};
+use cara_std::{Fleet, PLAIN_PORT};
 
 use crate::global::Global;
 
@@ -50,14 +50,6 @@ pub fn how_to_get_keys(fleet: Fleet) -> String {
          `cara keys derive --fleet {fleet}` on the host that has its root writes the files of its nodes: copy one into {folder}, or \
          name it with --key-file"
     )
-}
-
-/// A mode as it is written.
-pub const fn shown_mode(mode: Mode) -> &'static str {
-    match mode {
-        Mode::Plain => "plain",
-        Mode::Secured => "secured",
-    }
 }
 
 /// What shows that a datagram comes from its fleet, and the generation of the key with which that was shown.

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use anyhow::Result;
 use cara_apps::mechanic;
-use cara_examples::{Network, Stop, ended, log_to_stderr, say, shown_mode};
+use cara_examples::{Network, Stop, ended, log_to_stderr, say};
 use cara_std::{CommunicationSystem, Parameters};
 use clap::Parser;
 
@@ -60,7 +60,7 @@ fn listing(options: &Options, transcript: &Transcript) -> Result<CommunicationSy
     // README begins.
     let agv_manager = network.place(CommunicationSystem::builder(name, *id)?).build_system()?; // 1
     transcript.begin(&agv_manager);
-    transcript.after(1, format_args!("{}, {}", agv_manager.identity(), shown_mode(agv_manager.mode())))?;
+    transcript.after(1, format_args!("{}, {}", agv_manager.identity(), agv_manager.mode().as_str()))?;
     agv_manager.start()?; // 2
     transcript.after(2, "started")?;
     let mut s_unit_number = agv_manager.number_of_s_units(); // 3

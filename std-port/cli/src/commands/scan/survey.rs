@@ -3,12 +3,12 @@
 use std::collections::BTreeSet;
 use std::time::Duration;
 
+use cara_std::Fleet;
 use cara_std::survey::{Heard, Standing, Survey};
-use cara_std::{Fleet, Role};
 use serde_json::{Value, json};
 
 use cara_tools::global::Global;
-use cara_tools::listening::{self, shown_mode, shown_standing};
+use cara_tools::listening::{self, shown_standing};
 use cara_tools::output::{self, BAD, FAINT, PLAIN, Rows};
 
 /// How often a survey asks while it listens: one broadcast may be lost.
@@ -51,7 +51,7 @@ fn about_fleets(heard: &[&Heard]) -> std::io::Result<()> {
         let fleets: Vec<String> = fleets.iter().map(u32::to_string).collect();
         output::line(format_args!("\nfleets {} are here; units of different fleets do not meet", fleets.join(", ")))?;
     }
-    let modes: BTreeSet<&str> = heard.iter().map(|heard| shown_mode(heard.mode)).collect();
+    let modes: BTreeSet<&str> = heard.iter().map(|heard| heard.mode.as_str()).collect();
     if modes.len() > 1 {
         output::line("\nunits in plain mode and secured ones are here; they do not meet")?;
     }
@@ -104,7 +104,7 @@ fn table(heard: &[&Heard]) -> Rows {
             [
                 or_dash(identity.map(|identity| identity.name().to_owned())),
                 or_dash(identity.map(|identity| identity.id().to_string())),
-                or_dash(identity.map(|identity| role(identity.role()).to_owned())),
+                or_dash(identity.map(|identity| identity.role().as_str().to_owned())),
                 heard.fleet.0.to_string(),
                 mode.to_owned(),
                 heard.version.to_string(),
@@ -123,9 +123,9 @@ fn as_json(heard: &Heard) -> Value {
     json!({
         "name": identity.map(|identity| identity.name()),
         "id": identity.map(|identity| identity.id()),
-        "role": identity.map(|identity| role(identity.role())),
+        "role": identity.map(|identity| identity.role().as_str()),
         "fleet": heard.fleet.0,
-        "mode": shown_mode(heard.mode),
+        "mode": heard.mode.as_str(),
         "proof": proof,
         "generation": generation,
         "version": heard.version,
@@ -138,11 +138,4 @@ fn as_json(heard: &Heard) -> Value {
         "searches": heard.searches,
         "answers": heard.answers,
     })
-}
-
-const fn role(role: Role) -> &'static str {
-    match role {
-        Role::MUnit => "m_unit",
-        Role::SUnit => "s_unit",
-    }
 }
