@@ -18,11 +18,11 @@ use smoltcp::socket::udp;
 /// Datagrams, including broadcasts, arrive at this port and are sent from it: the host has no other user of it.
 pub(crate) const DATAGRAM_PORT: u16 = PLAIN_PORT;
 /// Longest block of arguments or results.
-pub(crate) const MESSAGE_BYTES: usize = 1_024;
+pub(crate) const MESSAGE_SIZE: usize = 1_024;
 /// Calls that may wait or run here, and calls of this unit that may wait for a reply.
 pub(crate) const CALLS: usize = 4;
 /// What a TCP buffer holds; the smaller, the less stands in the way of an emergency.
-const STREAM_BYTES: usize = 2_048;
+const STREAM: usize = 2_048;
 /// What the buffers for datagrams hold: two of the longest.
 const DATAGRAM_BYTES: usize = 3_072;
 /// Functions of this unit, and functions of the manager that are kept.
@@ -30,7 +30,7 @@ const FUNCTIONS: usize = 8;
 /// Bytes of signatures for those.
 const SIGNATURES: usize = 512;
 /// Message buffers: one is received into, one waits to be written, one waits to be served, one is spare.
-const BUFFERS: usize = 4;
+const MESSAGE_BUFFERS: usize = 4;
 /// Nodes that are known: the manager, and one that it took the place of.
 const NODES: usize = 2;
 
@@ -44,12 +44,12 @@ impl Service for Offered {
 }
 
 /// A buffer for arguments and results, names included.
-pub(crate) type Arguments = Parameters<{ 2 * MESSAGE_BYTES }>;
+pub(crate) type Arguments = Parameters<{ 2 * MESSAGE_SIZE }>;
 
 /// What the sockets live in: received, then sent.
 pub(crate) struct StackMemory {
     pub(crate) sockets: [SocketStorage<'static>; 2],
-    pub(crate) stream: [[u8; STREAM_BYTES]; 2],
+    pub(crate) stream: [[u8; STREAM]; 2],
     pub(crate) datagrams: [[u8; DATAGRAM_BYTES]; 2],
     pub(crate) datagram_heads: [[udp::PacketMetadata; 8]; 2],
 }
@@ -73,8 +73,8 @@ pub struct Resources {
     publications: [Publication; FUNCTIONS],
     their_functions: [Entry; FUNCTIONS],
     their_signatures: [u8; SIGNATURES],
-    buffers: [[u8; buffer_bytes(MESSAGE_BYTES as u32, 0)]; BUFFERS],
-    pool: [Option<&'static mut [u8]>; BUFFERS],
+    buffers: [[u8; buffer_bytes(MESSAGE_SIZE as u32, 0)]; MESSAGE_BUFFERS],
+    pool: [Option<&'static mut [u8]>; MESSAGE_BUFFERS],
 }
 
 /// The slices of the resources in the shape in which the core takes them.
@@ -95,7 +95,7 @@ impl Resources {
         Self {
             stack: StackMemory {
                 sockets: [SocketStorage::EMPTY; 2],
-                stream: [[0; STREAM_BYTES]; 2],
+                stream: [[0; STREAM]; 2],
                 datagrams: [[0; DATAGRAM_BYTES]; 2],
                 datagram_heads: [[udp::PacketMetadata::EMPTY; 8]; 2],
             },
@@ -115,8 +115,8 @@ impl Resources {
             publications: from_fn(|_| Publication::default()),
             their_functions: [const { Entry::empty() }; FUNCTIONS],
             their_signatures: [0; SIGNATURES],
-            buffers: [[0; buffer_bytes(MESSAGE_BYTES as u32, 0)]; BUFFERS],
-            pool: [const { None }; BUFFERS],
+            buffers: [[0; buffer_bytes(MESSAGE_SIZE as u32, 0)]; MESSAGE_BUFFERS],
+            pool: [const { None }; MESSAGE_BUFFERS],
         }
     }
 

@@ -8,7 +8,7 @@ use cara_core::distribution::identity::{Epoch, Fleet, Identity};
 use cara_core::error::Error;
 use smoltcp::wire::Ipv4Cidr;
 
-use crate::resources::{CALLS, DATAGRAM_PORT, MESSAGE_BYTES};
+use crate::resources::{CALLS, DATAGRAM_PORT, MESSAGE_SIZE};
 
 /// Identity and address of the unit.
 #[derive(Clone, Debug)]
@@ -25,7 +25,7 @@ impl Settings {
     /// boot, from a true random number or a counter in flash; delays and sequence numbers are drawn from it as well.
     pub fn new(name: &str, id: u32, target: Target, address: [u8; 4], prefix: u8, epoch: u64) -> Result<Self, Error> {
         let constraints =
-            Constraints { message_size: MESSAGE_BYTES as u32, calls_per_peer: CALLS as u16, ..Constraints::S_UNIT };
+            Constraints { message_size: MESSAGE_SIZE as u32, calls_per_peer: CALLS as u16, ..Constraints::S_UNIT };
         let node = NodeConfig {
             identity: Identity::s_unit(name, id)?,
             fleet: Fleet(0),
