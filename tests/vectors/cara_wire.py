@@ -104,9 +104,16 @@ def sized(data):
     return varint(len(data)) + data
 
 
+# Characters that are not seen, which no node's name may have.
+UNSEEN = (
+    (0x00, 0x1F), (0x7F, 0x9F), (0xAD, 0xAD), (0x61C, 0x61C), (0x200B, 0x200F), (0x2028, 0x202E),
+    (0x2060, 0x2064), (0x2066, 0x206F), (0xFEFF, 0xFEFF), (0xE0000, 0xE007F),
+)
+
+
 def is_node_name(name):
-    """Not empty, and without control characters."""
-    return name != "" and not any(ord(c) < 0x20 or 0x7F <= ord(c) < 0xA0 for c in name)
+    """Not empty, and all of it is seen."""
+    return name != "" and not any(first <= ord(c) <= last for c in name for first, last in UNSEEN)
 
 
 def read_identity(reader):

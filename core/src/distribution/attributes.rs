@@ -19,7 +19,10 @@ pub struct Attributes {
 impl Attributes {
     /// Bytes of the encoded form.
     pub const WIRE_BYTES: usize = 8;
+    const PRIORITY: u8 = 0b11;
     const IDEMPOTENT: u8 = 1 << 2;
+    /// All bits of the first byte that mean something; the others are zero.
+    const KNOWN: u8 = Self::PRIORITY | Self::IDEMPOTENT;
 
     /// Bits 0 and 1: priority; bit 2: idempotent; three bytes of zero; the lease in milliseconds, u32 little-endian, 0
     /// for none. A lease is rounded down, but never to none.
@@ -33,12 +36,12 @@ impl Attributes {
     /// The inverse of [`encode`](Self::encode); [`Error::Malformed`] for any other bytes.
     pub fn decode(bytes: &[u8]) -> Result<Self, Error> {
         let &[flags, 0, 0, 0, a, b, c, d] = bytes else { return Err(Error::Malformed) };
-        if flags >= Self::IDEMPOTENT << 1 {
+        if flags & !Self::KNOWN != 0 {
             return Err(Error::Malformed);
         }
         let lease = u32::from_le_bytes([a, b, c, d]);
         Ok(Self {
-            priority: Priority::from_wire(flags & 3).ok_or(Error::Malformed)?,
+            priority: Priority::from_wire(flags & Self::PRIORITY).ok_or(Error::Malformed)?,
             lease: (lease != 0).then(|| Duration::from_millis(u64::from(lease))),
             idempotent: flags & Self::IDEMPOTENT != 0,
         })
@@ -69,14 +72,19 @@ mod tests {
         assert_eq!(Attributes::decode(&all.encode()), Ok(all));
         let short = Attributes { lease: Some(Duration::from_micros(1)), ..usual };
         assert_eq!(Attributes::decode(&short.encode()).unwrap().lease, Some(Duration::from_millis(1)));
-        for wrong in [&[0; 7][..], &[8, 0, 0, 0, 0, 0, 0, 0], &[0, 1, 0, 0, 0, 0, 0, 0], &[0, 0, 0, 1, 0, 0, 0, 0]] {
+        for wrong in [
+            &[0; 7][..],
+            &[Attributes::KNOWN + 1, 0, 0, 0, 0, 0, 0, 0],
+            &[0, 1, 0, 0, 0, 0, 0, 0],
+            &[0, 0, 0, 1, 0, 0, 0, 0],
+        ] {
             assert_eq!(Attributes::decode(wrong), Err(Error::Malformed), "{wrong:?}");
         }
     }
 
     proptest! {
         #[test]
-        fn attributes_have_one_encoding(bytes in prop::collection::vec(0..16_u8, 8)) {
+        fn attributes_have_one_encoding(bytes in prop::collection::vec(0..2 * (Attributes::KNOWN + 1), 8)) {
             if let Ok(attributes) = Attributes::decode(&bytes) {
                 prop_assert_eq!(&attributes.encode()[..], &bytes[..]);
             }

@@ -221,7 +221,7 @@ fn error_of(code: u8, index: u8, first: u32, second: u32) -> Error {
     }
 }
 
-/// Messages that keep two units' views of each other in step.
+/// Messages between two units that are no requests: what they tell each other about their functions, limits and leases.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[cfg_attr(test, derive(Serialize, Deserialize))]
 pub enum Control<'b> {

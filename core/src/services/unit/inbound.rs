@@ -267,6 +267,7 @@ impl<P: Port> Session<P> {
                 self.release_call(cx, CallId(id), None);
                 Event::Failed(CallId(id), error).into()
             }
+            // Decoded again there: what it borrows of the link would keep the link from sending.
             Some(Message::Control(_)) => self.control_arrived(cx, place, lent),
             None => {
                 self.close(cx, CloseReason::Protocol);

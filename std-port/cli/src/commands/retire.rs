@@ -23,10 +23,8 @@ pub(crate) struct Arguments {
 }
 
 pub(crate) fn run(Arguments { node }: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
-    if global.act_as.is_some() {
-        return Err(Ended::usage("a manager for the time of a command has no roster to keep: leave out --as"));
-    }
-    let mut operator = Operator::open(global, &Need::Nothing)?;
+    let why_not = "a manager for the time of a command has no roster to keep";
+    let mut operator = Operator::open_running(global, why_not)?;
     let node = nodes::known(&mut operator, &node)?.selector;
     operator.ask(&Question::Retire { node: node.clone() }, |_| Ok(()))?;
     if global.json {

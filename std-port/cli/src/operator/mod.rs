@@ -21,7 +21,7 @@ pub(crate) enum Need<'n> {
     Nothing,
     /// All that come.
     Everybody,
-    /// A node, with functions.
+    /// A node; with `--as`, once it has published.
     Node(&'n str),
     /// The unit itself, or a node.
     UnitOrNode(&'n str),
@@ -48,22 +48,32 @@ enum Unit {
 /// What becomes of an answer; `false` when no more are wanted.
 type Each<'e> = &'e mut dyn FnMut(Answer) -> anyhow::Result<bool>;
 
+/// There is no unit to ask; `ways` says what can be done.
+fn none_runs(ways: &str) -> anyhow::Error {
+    let others = running::not_meant();
+    let of_others = running::of_others(None);
+    if others.is_empty() && !of_others.is_empty() {
+        return Ended::no_unit(of_others);
+    }
+    Ended::no_unit(format!("no such m_unit runs on this host{others}. {ways}"))
+}
+
 impl Operator {
     /// The unit that the options choose; with none there, an error that names the ways out.
     pub(crate) fn open(global: &Global, need: &Need) -> anyhow::Result<Self> {
-        let found = Self::open_if_any(global, need)?;
-        found.ok_or_else(|| {
-            let others = running::not_meant();
-            let of_others = running::of_others(None);
-            if others.is_empty() && !of_others.is_empty() {
-                return Ended::no_unit(of_others);
-            }
-            let text = format!(
-                "no such m_unit runs on this host{others}. Start a manager (`cara node --name NAME --id ID`), or be one \
-                 for the time of this command: --as NAME/ID with the fleet's --fleet NUMBER"
-            );
-            Ended::no_unit(text)
-        })
+        let ways = "Start a manager (`cara node --name NAME --id ID`), or be one for the time of this command: --as NAME/ID \
+                    with the fleet's --fleet NUMBER";
+        Self::open_if_any(global, need)?.ok_or_else(|| none_runs(ways))
+    }
+
+    /// The running unit that the options choose, for a verb that a manager for the time of a command has no use for.
+    /// `why_not` says why.
+    pub(crate) fn open_running(global: &Global, why_not: &str) -> anyhow::Result<Self> {
+        if global.act_as.is_some() {
+            return Err(Ended::usage(format!("{why_not}: leave out --as")));
+        }
+        let running = Self::open_if_any(global, &Need::Nothing)?;
+        running.ok_or_else(|| none_runs("This verb is for a manager that runs (`cara node --name NAME --id ID`)"))
     }
 
     /// The unit that the options choose; `None` if they choose none and none runs.

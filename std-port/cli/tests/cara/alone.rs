@@ -7,7 +7,8 @@ use std::process::Stdio;
 
 use crate::support::{Ran, Stage, private_folder};
 
-const VERBS: [&[&str]; 8] = [
+/// What an operator asks of a manager, running or for the time of the command.
+const VERBS: &[&[&str]] = &[
     &["functions", "agv-1"],
     &["call", "agv-1", "fail"],
     &["publish"],
@@ -21,11 +22,20 @@ const VERBS: [&[&str]; 8] = [
 #[test]
 fn with_no_unit_the_two_ways_out_are_named() {
     let stage = Stage::empty();
-    for verb in VERBS {
+    for &verb in VERBS {
         stage.ends(3, verb).says("cara node").says("--as NAME/ID");
         let told = stage.ends(3, &[verb, &["--json"]].concat()).error();
         assert_eq!((&told["exit"], &told["name"]), (&3.into(), &"NoUnit".into()), "{told}");
     }
+}
+
+/// A verb for a running manager alone does not advise what it refuses.
+#[test]
+fn with_no_unit_a_verb_for_a_running_manager_names_the_one_way_out() {
+    let stage = Stage::empty();
+    let told = stage.ends(3, &["retire", "agv-1"]).says("cara node").everything();
+    assert!(!told.contains("--as"), "{told}");
+    stage.ends(2, &["retire", "agv-1", "--as", "x/9", "--insecure"]).says("leave out --as");
 }
 
 #[test]
@@ -127,7 +137,7 @@ fn who_does_not_join_in_the_stated_time_is_told() {
 #[test]
 fn cara_does_not_pretend_to_be_a_unit_that_runs() {
     let stage = Stage::with(&["agv-1"]);
-    for verb in VERBS {
+    for &verb in VERBS {
         let ran = stage.ends(2, &[verb, &["--as", "manager/1"]].concat());
         ran.says("manager/1 runs on this host").says("without --as");
     }

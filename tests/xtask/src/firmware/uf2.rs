@@ -24,9 +24,9 @@ const LONGEST: usize = 16 * 1024 * 1024;
 pub(crate) fn write_beside(elf: &Path, board: &Board) -> Result<PathBuf> {
     let bytes = std::fs::read(elf).with_context(|| format!("cannot read {}", elf.display()))?;
     let flash = flash_of(&bytes).with_context(|| elf.display().to_string())?;
-    let [settings, _] = board.boots;
-    if flash.address as usize + flash.bytes.len() > settings as usize {
-        bail!("{}: code lies in the pages of the count of lives or of the settings, from {settings:#x}", elf.display());
+    let [end, _] = board.boots;
+    if flash.address as usize + flash.bytes.len() > end as usize {
+        bail!("{}: code lies in the pages of the count of lives or of the settings, from {end:#x}", elf.display());
     }
     let (extension, bytes) = match board.uf2 {
         Some(families) => ("uf2", uf2(&flash, families.image)),
