@@ -1,8 +1,10 @@
-//! The hand-over of a link's reader, in every order in which threads can run it.
+//! The hand-over of a link's token, in every order in which threads can run it.
 //!
-//! `Reader` and `Watch` are the port's own. Around them stand the few steps of `calling.rs`, `keeping.rs`,
-//! `workers.rs`, `staying.rs` and `threads.rs` that use them, with a queue in place of the socket and no time-outs: a
-//! lost wake-up blocks for ever, and the model reports that. With `--cfg cara_planted="lost_wakeup"` it must fail.
+//! `ReadPolicy` and `Watch` are the port's own: what decides which thread reads, what the epoll set is told, and which
+//! links the clock looks at, is what runs here. Around them stand the few steps of `calling.rs`, `workers.rs`,
+//! `staying.rs`, `reading.rs` and `threads.rs` that carry the decisions out, with a queue in the place of the socket and no
+//! time-outs: a wake-up that is lost blocks for ever, and the model reports that. With `--cfg cara_planted="lost_wakeup"`
+//! it must fail.
 //!
 //! ```text
 //! cargo test -p cara-std --test hand_over
@@ -18,11 +20,12 @@ mod watch;
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use cara_core::services::requests::CallId;
 use cara_core::time::{Duration, Instant};
 use loom::sync::atomic::{self, AtomicUsize};
 use loom::sync::{Arc, Condvar, Mutex, MutexGuard};
 use loom::thread;
-use reader::{Reader, Turn};
+use reader::{Cause, Duties, ReadPolicy, Reader, Registration, Token};
 use watch::Watch;
 
 /// What the stream brings: the reply to a call of this unit, or a call of the peer.
@@ -73,12 +76,14 @@ struct Waiter {
 }
 
 struct State {
-    reader: Reader,
+    reading: ReadPolicy,
+    registration: Registration,
     waiters: Vec<Waiter>,
-    /// Callers that were told to take the lead and have not looked yet.
+    /// Callers that were told to take the token and have not looked yet.
     told: Vec<u32>,
-    busy: bool,
     stopped: bool,
+    /// The clock is to look.
+    clock_told: bool,
     /// Calls of the peer that the pool has read.
     called: u32,
 }
@@ -88,30 +93,57 @@ struct Link {
     /// Bytes have come, or the epoll set was armed.
     readable: Condvar,
     state: Mutex<State>,
-    /// A future has its reply, a leader got busy, or the clock is to stop.
+    watch: Watch,
+    /// A future has its reply, the clock is told, or is to stop.
     changed: Condvar,
     /// The peer answers when it has this many requests, the last one first; 0: each at once.
     together: usize,
     /// Callers expect to be back at once, and the clock looks after what they keep.
     keeps: bool,
-    /// A thread reads the stream. A check of the model itself, with an atomic that loom does not see: it adds no
-    /// orders.
+    /// A thread reads; not part of the model, it adds no orders.
     reading: AtomicBool,
 }
 
+/// When all happens but the clock's looks.
+const NOW: Instant = Instant::START;
+/// What is kept, and each handler, has lasted too long by then.
+const LATER: Instant = Instant::from_micros(10_000);
+/// The only link.
+const LINK: u64 = 1;
+
 impl Link {
     fn new(together: usize) -> Arc<Self> {
-        Self::build(together, false)
+        Self::build(together, false, ReadPolicy::new(false))
     }
 
-    fn build(together: usize, keeps: bool) -> Arc<Self> {
-        let (reader, waiters, told) = (Reader::default(), vec![], vec![]);
-        let state = State { reader, waiters, told, busy: false, stopped: false, called: 0 };
+    /// A link whose callers call back to back, and have done so.
+    fn kept_by_callers() -> Arc<Self> {
+        let mut reading = ReadPolicy::new(false);
+        let token = reading.on(NOW, Cause::Wants).token.unwrap();
+        reading.on(NOW, Cause::Replied { token, asked: NOW, may_keep: true, waiter: None });
+        Self::build(0, true, reading)
+    }
+
+    /// A link that has been served by a quick handler, and has a call to be read.
+    fn served() -> Arc<Self> {
+        let mut reading = ReadPolicy::new(false);
+        reading.on(NOW, Cause::Ran { took: Duration::ZERO });
+        reading.on(NOW, Cause::Stays { served: 0, may: true });
+        let link = Self::build(0, false, reading);
+        link.wire.lock().unwrap().items.push_back(Item::Call);
+        link
+    }
+
+    fn build(together: usize, keeps: bool, reading: ReadPolicy) -> Arc<Self> {
+        let (waiters, told) = (vec![], vec![]);
+        let registration = Registration { readable: true, writable: false, is_out: false };
+        let state = State { reading, registration, waiters, told, stopped: false, clock_told: false, called: 0 };
         let wire = Wire { armed: true, ..Wire::default() };
         Arc::new(Self {
             wire: Mutex::new(wire),
             readable: Condvar::new(),
             state: Mutex::new(state),
+            watch: Watch::new(),
             changed: Condvar::new(),
             together,
             keeps,
@@ -123,15 +155,35 @@ impl Link {
         self.state.lock().unwrap()
     }
 
-    /// `Engine::settle`: the epoll set follows the reader. There always is one, or a thread that was told to become it.
-    fn settle(&self, state: MutexGuard<'_, State>) {
-        self.set_interest(&state);
+    /// `Engine::read_by`.
+    fn read_by(&self, state: &mut State, cause: Cause) -> Option<Token> {
+        let duties = state.reading.on(NOW, cause);
+        wake(state, duties);
+        if duties.enlist {
+            self.watch.enlist(LINK);
+            if self.watch.begins() {
+                state.clock_told = true;
+                self.changed.notify_all();
+            }
+        }
+        duties.token
     }
 
-    fn set_interest(&self, state: &State) {
-        let armed = state.reader.pool_reads();
-        let expected = !state.told.is_empty() || (self.keeps && state.reader.is_kept());
-        assert!(state.reader.is_led() || armed || expected, "nobody reads");
+    /// `Engine::settle`: the epoll set follows which thread reads. There is always one, or it was told to.
+    fn settle(&self, mut state: MutexGuard<'_, State>) {
+        self.set_interest(&mut state);
+    }
+
+    fn set_interest(&self, state: &mut State) {
+        state.registration = state.reading.registration(state.registration, false, false);
+        let armed = state.registration.readable;
+        let is_read = match state.reading.reader() {
+            Reader::Led { .. } | Reader::Serving { .. } => true,
+            Reader::Kept { .. } => self.keeps,
+            Reader::Offered => !state.told.is_empty(),
+            Reader::Opening | Reader::Pool => armed,
+        };
+        assert!(is_read, "no thread reads");
         let mut wire = self.wire.lock().unwrap();
         if wire.armed != armed {
             wire.armed = armed;
@@ -173,7 +225,7 @@ impl Link {
         }
     }
 
-    /// `Engine::feed`: records a reply and wakes its waiter.
+    /// `Engine::feed`: notes a reply and wakes what waits for it.
     fn feed(&self, state: &mut State, item: Item) {
         let Item::Reply(id) = item else {
             state.called += 1;
@@ -196,49 +248,47 @@ impl Link {
     }
 
     /// `Engine::leave`.
-    fn leave(&self, mut guard: MutexGuard<'_, State>, turn: Option<Turn>) {
-        let State { reader, waiters, told, .. } = &mut *guard;
-        reader.leave(turn, || pass_lead(waiters, told));
-        self.settle(guard);
+    fn leave(&self, mut state: MutexGuard<'_, State>, token: Option<Token>) {
+        let waiter = next_reader(&state);
+        self.read_by(&mut state, Cause::Leaves { token, waiter });
+        self.settle(state);
     }
 
     /// `Engine::leave_with_reply`.
-    fn leave_with_reply(&self, mut guard: MutexGuard<'_, State>, turn: Turn) {
-        let State { reader, waiters, told, .. } = &mut *guard;
-        reader.keep(turn, || pass_lead(waiters, told));
-        if reader.is_kept() {
-            self.changed.notify_all();
-        }
-        self.settle(guard);
+    fn leave_with_reply(&self, mut state: MutexGuard<'_, State>, token: Token) {
+        let may_keep = self.keeps && !state.waiters.iter().any(|waiter| waiter.thread.is_none());
+        let waiter = next_reader(&state);
+        self.read_by(&mut state, Cause::Replied { token, asked: NOW, may_keep, waiter });
+        self.settle(state);
     }
 
     /// `Engine::block_request`. A caller without `patience` gives up when it has looked twice.
     fn call(&self, id: u32, patience: bool) -> bool {
         let parker = Arc::new(Parker::default());
         let mut state = self.lock();
-        let mut turn = if patience { state.reader.take_lead() } else { None };
-        self.set_interest(&state);
+        let mut token = if patience { self.read_by(&mut state, Cause::Wants) } else { None };
+        self.set_interest(&mut state);
         state.waiters.push(Waiter { id, thread: Some(parker.clone()), done: false });
         self.send(id);
         let mut looks = 0;
         loop {
             state.told.retain(|told| *told != id);
             if self.take_outcome(&mut state, id) {
-                match turn.filter(|_| self.keeps) {
-                    Some(turn) => self.leave_with_reply(state, turn),
-                    None => self.leave(state, turn),
+                match token {
+                    Some(token) => self.leave_with_reply(state, token),
+                    None => self.leave(state, None),
                 }
                 return true;
             }
             if !patience && looks == 1 {
                 state.waiters.retain(|waiter| waiter.id != id);
-                self.leave(state, turn);
+                self.leave(state, token);
                 return false;
             }
             looks += 1;
-            turn = turn.or_else(|| state.reader.take_lead());
-            if turn.is_some() && patience {
-                state = self.lead(state, id);
+            token = token.or_else(|| self.read_by(&mut state, Cause::Wants));
+            if token.is_some() && patience {
+                state = self.read_for_reply(state, id);
             } else {
                 self.settle(state);
                 if patience {
@@ -251,8 +301,8 @@ impl Link {
         }
     }
 
-    /// `Engine::lead`.
-    fn lead<'l>(&'l self, mut state: MutexGuard<'l, State>, id: u32) -> MutexGuard<'l, State> {
+    /// `Engine::read_for_reply`.
+    fn read_for_reply<'l>(&'l self, mut state: MutexGuard<'l, State>, id: u32) -> MutexGuard<'l, State> {
         loop {
             self.settle(state);
             let (item, locked) = self.receive();
@@ -267,7 +317,7 @@ impl Link {
     /// `Engine::call_future`, awaited.
     fn call_future(&self, id: u32) {
         let mut state = self.lock();
-        state.reader.give_up_keeping();
+        self.read_by(&mut state, Cause::NeedsPool);
         state.waiters.push(Waiter { id, thread: None, done: false });
         self.send(id);
         self.settle(state);
@@ -278,7 +328,7 @@ impl Link {
         self.settle(state);
     }
 
-    /// `Engine::work`: waits in the epoll set and drains what is ready, unless a leader reads.
+    /// `Engine::work`: waits in the epoll set and drains what is ready, unless another thread has the token.
     fn pool(&self) {
         loop {
             let mut wire = self.wire.lock().unwrap();
@@ -290,7 +340,7 @@ impl Link {
             }
             drop(wire);
             let mut state = self.lock();
-            if !state.reader.is_led() {
+            if state.reading.is_free() {
                 self.begin();
                 let items: Vec<Item> = self.wire.lock().unwrap().items.drain(..).collect();
                 self.end();
@@ -303,10 +353,8 @@ impl Link {
     /// `Engine::stay`: a thread of the pool reads one call; its handler calls the peer back, or is quick.
     fn stay(&self, calls_back: Option<u32>) {
         let mut state = self.lock();
-        if !state.waiters.is_empty() || !state.reader.pool_reads() {
-            return;
-        }
-        let Some(turn) = state.reader.take_lead() else { return };
+        let may = state.waiters.is_empty();
+        let Some(token) = self.read_by(&mut state, Cause::Stays { served: 1, may }) else { return };
         self.settle(state);
         loop {
             let (item, mut state) = self.receive();
@@ -319,46 +367,50 @@ impl Link {
                     _ => break,
                 }
             }
-            state.reader.set_busy(turn, Some(Instant::START));
-            state.busy = true;
-            self.changed.notify_all();
+            self.read_by(&mut state, Cause::Begins(token));
             self.settle(state);
             if let Some(id) = calls_back {
                 assert!(self.call(id, true));
             }
             let mut state = self.lock();
-            state.busy = false;
-            state.reader.set_busy(turn, None);
-            let goes_on = state.reader.is_leader(turn);
+            self.read_by(&mut state, Cause::Ends(token));
+            let goes_on = state.reading.is_held(token);
             self.settle(state);
             if !goes_on || calls_back.is_some() {
                 break;
             }
         }
-        self.leave(self.lock(), Some(turn));
+        self.leave(self.lock(), Some(token));
     }
 
-    /// `Engine::watch_links`: the clock comes back as long as a leader is busy, or a link is kept.
+    /// `Engine::watch_links`: the clock looks when it is told to, and until it finds nothing on its list.
     fn clock(&self) {
         let mut state = self.lock();
         loop {
-            while !state.busy && !state.reader.is_kept() && !state.stopped {
+            while !state.clock_told && !state.stopped {
                 state = self.changed.wait(state).unwrap();
             }
             if state.stopped {
                 return;
             }
-            state.reader.give_up_keeping();
-            let State { reader, waiters, told, .. } = &mut *state;
-            reader.relieve(Instant::from_micros(10), Duration::ZERO, || pass_lead(waiters, told));
-            // It has been seen; the clock need not see it again.
-            state.busy = false;
-            self.settle(state);
+            state.clock_told = false;
+            drop(state);
+            while self.watch.look(|_| self.look_at_link()) {}
             state = self.lock();
         }
     }
 
-    /// Waits until the pool, or a leader, has read a call of the peer.
+    /// `Engine::look_at_link`.
+    fn look_at_link(&self) -> bool {
+        let mut state = self.lock();
+        let waiter = next_reader(&state);
+        let duties = state.reading.on(LATER, Cause::Looks { waiter });
+        wake(&mut state, duties);
+        self.settle(state);
+        duties.look_at.is_some()
+    }
+
+    /// Waits until the pool, or a holder of the token, has read a call of the peer.
     fn await_call(&self) {
         let mut state = self.lock();
         while state.called == 0 {
@@ -374,17 +426,20 @@ impl Link {
     }
 }
 
-fn pass_lead(waiters: &[Waiter], told: &mut Vec<u32>) -> bool {
-    let next =
-        waiters.iter().find_map(|waiter| waiter.thread.as_ref().filter(|_| !waiter.done).map(|t| (waiter.id, t)));
-    match next {
-        Some((id, thread)) => {
-            told.push(id);
-            thread.unpark();
-            true
-        }
-        None => false,
-    }
+/// `LinkState::next_reader`.
+fn next_reader(state: &State) -> Option<CallId> {
+    state.waiters.iter().find(|waiter| waiter.thread.is_some() && !waiter.done).map(|waiter| CallId(waiter.id))
+}
+
+fn wake(state: &mut State, duties: Duties) {
+    let Some(CallId(id)) = duties.wake else { return };
+    state.told.push(id);
+    state
+        .waiters
+        .iter()
+        .filter(|waiter| waiter.id == id)
+        .filter_map(|waiter| waiter.thread.as_ref())
+        .for_each(|thread| thread.unpark());
 }
 
 fn check(preemptions: usize, model: impl Fn() + Sync + Send + 'static) {
@@ -400,7 +455,7 @@ fn spawn(link: &Arc<Link>, act: impl FnOnce(&Link) + 'static) -> thread::JoinHan
 
 /// Two callers, whose replies come the other way round, and a thread of the pool.
 #[test]
-fn two_callers_get_their_replies_whoever_reads_them() {
+fn two_callers_get_their_replies_whichever_thread_reads_them() {
     check(3, || {
         let link = Link::new(2);
         let pool = spawn(&link, Link::pool);
@@ -413,7 +468,7 @@ fn two_callers_get_their_replies_whoever_reads_them() {
 }
 
 #[test]
-fn the_lead_goes_on_from_caller_to_caller() {
+fn the_token_goes_on_from_caller_to_caller() {
     check(2, || {
         let link = Link::new(3);
         let others = [2, 3].map(|id| spawn(&link, move |link| assert!(link.call(id, true))));
@@ -422,9 +477,9 @@ fn the_lead_goes_on_from_caller_to_caller() {
     });
 }
 
-/// Once the last caller has left, the pool reads.
+/// When the last caller has left, the pool reads what no thread has the token for.
 #[test]
-fn a_future_gets_its_reply_from_a_leader_or_from_the_pool() {
+fn a_future_gets_its_reply_from_a_caller_or_from_the_pool() {
     check(3, || {
         let link = Link::new(0);
         let pool = spawn(&link, Link::pool);
@@ -436,9 +491,9 @@ fn a_future_gets_its_reply_from_a_leader_or_from_the_pool() {
     });
 }
 
-/// The lead may be passed to a caller just when it gives up: it must not be lost with it.
+/// The token may be offered to a caller just when it gives up: it must not be lost with it.
 #[test]
-fn a_caller_that_gives_up_passes_the_lead_on() {
+fn a_caller_that_gives_up_passes_the_token_on() {
     check(2, || {
         let link = Link::new(3);
         let hasty = spawn(&link, |link| {
@@ -470,7 +525,7 @@ fn what_is_left_when_a_caller_gives_up_is_read_by_the_pool() {
 #[test]
 fn a_link_that_is_kept_comes_back_to_the_pool() {
     check(3, || {
-        let link = Link::build(0, true);
+        let link = Link::kept_by_callers();
         let pool = spawn(&link, Link::pool);
         let clock = spawn(&link, Link::clock);
         assert!(link.call(1, true));
@@ -484,11 +539,11 @@ fn a_link_that_is_kept_comes_back_to_the_pool() {
     });
 }
 
-/// Two callers that would each keep the link: the second one is handed the lead, or takes it.
+/// Two callers that each would keep the link: the other one is offered the token, or takes it.
 #[test]
-fn a_link_that_is_kept_is_led_by_whoever_comes() {
+fn a_link_that_is_kept_is_led_by_the_caller_that_comes() {
     check(2, || {
-        let link = Link::build(0, true);
+        let link = Link::kept_by_callers();
         let clock = spawn(&link, Link::clock);
         let other = spawn(&link, |link| assert!(link.call(2, true)));
         assert!(link.call(1, true));
@@ -498,11 +553,11 @@ fn a_link_that_is_kept_is_led_by_whoever_comes() {
     });
 }
 
-/// A future does not read, so a link on which one waits is not kept, or is given up to the pool.
+/// A future needs a thread that reads: the link is not kept while one waits, or goes to the pool when it comes.
 #[test]
 fn a_future_on_a_link_that_was_kept_gets_its_reply() {
     check(3, || {
-        let link = Link::build(0, true);
+        let link = Link::kept_by_callers();
         let pool = spawn(&link, Link::pool);
         assert!(link.call(1, true));
         link.call_future(2);
@@ -511,12 +566,11 @@ fn a_future_on_a_link_that_was_kept_gets_its_reply() {
     });
 }
 
-/// A thread that stays runs a handler, which calls back over the same link: the clock takes the lead from it.
+/// A thread that stays runs a handler, which calls back over the same link: the clock takes the token from it.
 #[test]
 fn a_handler_of_a_thread_that_stays_can_call_back() {
     check(3, || {
-        let link = Link::new(0);
-        link.wire.lock().unwrap().items.push_back(Item::Call);
+        let link = Link::served();
         let clock = spawn(&link, Link::clock);
         let staying = spawn(&link, |link| link.stay(Some(7)));
         staying.join().unwrap();
@@ -525,12 +579,11 @@ fn a_handler_of_a_thread_that_stays_can_call_back() {
     });
 }
 
-/// A caller comes while a thread stays; it gets its reply from that thread, or takes the lead when it leaves.
+/// A caller comes while a thread stays; it gets its reply from that thread, or takes the token when it leaves.
 #[test]
 fn a_caller_and_a_thread_that_stays_share_a_link() {
     check(2, || {
-        let link = Link::new(0);
-        link.wire.lock().unwrap().items.push_back(Item::Call);
+        let link = Link::served();
         let clock = spawn(&link, Link::clock);
         let staying = spawn(&link, |link| link.stay(None));
         let caller = spawn(&link, |link| assert!(link.call(1, true)));
@@ -541,22 +594,21 @@ fn a_caller_and_a_thread_that_stays_share_a_link() {
     });
 }
 
-/// An event while the clock looks is seen by it, or tells it to look again.
+/// What happens while the clock looks is seen by it, or tells it to look again.
 #[test]
 fn nothing_happens_behind_the_back_of_the_clock() {
     loom::model(|| {
-        let watch = Arc::new(Watch::default());
-        assert!(watch.begins(), "nobody has told the clock yet");
+        let watch = Arc::new(Watch::new());
+        assert!(watch.begins(), "no thread has told the clock yet");
         let other = watch.clone();
         let happens = thread::spawn(move || other.begins());
-        while watch.look() {}
+        while watch.look(|_| false) {}
         let is_told = happens.join().unwrap();
-        assert!(is_told || !watch.look(), "the clock sleeps, and has not seen it");
+        assert!(is_told || !watch.look(|_| false), "the clock sleeps, and has not seen it");
     });
 }
 
-/// The pool, without links: threads that run handlers without a relief, and the clock that relieves them.
-#[derive(Default)]
+/// The pool, without links: threads that run handlers though no other thread waits, and the clock that stands in for them.
 struct Pool {
     calls: Mutex<VecDeque<Handler>>,
     idle: AtomicUsize,
@@ -581,6 +633,16 @@ enum Handler {
 }
 
 impl Pool {
+    fn new() -> Self {
+        Self {
+            calls: Mutex::default(),
+            idle: AtomicUsize::default(),
+            watch: Watch::new(),
+            flags: Mutex::default(),
+            changed: Condvar::default(),
+        }
+    }
+
     /// `Crew::work`, for the calls that there are.
     fn work(&self) {
         loop {
@@ -617,7 +679,7 @@ impl Pool {
             drop(flags);
             let mut used = true;
             while used {
-                used = self.watch.look();
+                used = self.watch.look(|_| false);
                 let waiting = !self.calls.lock().unwrap().is_empty();
                 if waiting && self.idle.load(Ordering::SeqCst) == 0 {
                     // `Crew::relieve`: what it starts is this thread here.
@@ -629,11 +691,11 @@ impl Pool {
     }
 }
 
-/// All threads are inside handlers that wait for a call that is still unread: the clock starts a thread that reads it.
+/// All threads are inside handlers that wait for a call which no thread has read: the clock starts one that reads it.
 #[test]
 fn the_clock_helps_when_all_threads_are_inside_handlers() {
     check(3, || {
-        let pool = Arc::new(Pool::default());
+        let pool = Arc::new(Pool::new());
         pool.calls.lock().unwrap().extend([Handler::Waits, Handler::Waits, Handler::Releases]);
         let workers = [(); 2].map(|()| {
             let pool = pool.clone();

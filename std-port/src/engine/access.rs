@@ -8,7 +8,7 @@ use cara_core::error::Error;
 use cara_core::services::access::{Access, Bucket, Decision, Principal, Rate, Verb};
 use cara_core::time::{Duration, Instant};
 
-use super::link::Notice;
+use super::notices::Notice;
 use super::{Engine, lock, read, write};
 use crate::access::AccessTable;
 

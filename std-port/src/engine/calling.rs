@@ -13,7 +13,7 @@ use cara_core::services::unit::RequestOptions;
 use cara_core::time::{Duration, Instant};
 
 use super::link::{LinkCell, LinkState, Outcome, Waiter, Wake};
-use super::reader::Turn;
+use super::reader::{Cause, Token};
 use super::{Engine, OwnCall, READ_BYTES, RETRY};
 use crate::sys::stream::{Received, Wait};
 
@@ -24,14 +24,14 @@ const PAUSE: Duration = Duration::from_millis(20);
 const SHORT_PAUSE: Duration = Duration::from_millis(2);
 
 thread_local! {
-    /// What a leader reads into. A leader runs no handlers, so there is one at a time in a thread.
+    /// What a caller reads into. A caller that reads runs no handlers, so one is in use at a time in a thread.
     static READ_BUFFER: std::cell::RefCell<Vec<u8>> = const { std::cell::RefCell::new(Vec::new()) };
 }
 
 /// A call whose request has gone out.
 struct Begun<'l> {
     state: MutexGuard<'l, LinkState>,
-    turn: Option<Turn>,
+    token: Option<Token>,
     id: CallId,
     now: Instant,
     deadline: Instant,
@@ -82,17 +82,17 @@ impl<T: Send + 'static> Engine<T> {
         let deadline = now + timeout;
         loop {
             // Before the request goes out: a thread of the pool must not wake for the reply.
-            let turn = self.take_lead(link, &mut state);
+            let token = self.take_token(now, link, &mut state);
             let options = RequestOptions { timeout: Some(deadline.since(now)), ..*options };
             let sent = self.request_on(now, link, &mut state, function, parameters, &options, true);
             let (error, wait) = match sent {
                 Ok(id) => {
                     state.waiters.push(Waiter { id, wake: Wake::Thread(thread::current()), outcome: None });
-                    return Ok(Begun { state, turn, id, now, deadline });
+                    return Ok(Begun { state, token, id, now, deadline });
                 }
                 Err(error) => (error, worth_waiting(&error, PAUSE).unwrap_or(Duration::MAX)),
             };
-            self.leave(link, state, turn);
+            self.leave(link, state, token);
             if self.now() + wait >= deadline {
                 return Err(error);
             }
@@ -103,10 +103,11 @@ impl<T: Send + 'static> Engine<T> {
         }
     }
 
-    fn take_lead(&self, link: &LinkCell, state: &mut LinkState) -> Option<Turn> {
-        let turn = if state.session.is_live() { state.reader.take_lead() } else { None };
+    fn take_token(&self, now: Instant, link: &LinkCell, state: &mut LinkState) -> Option<Token> {
+        let is_live = state.session.is_live();
+        let token = is_live.then(|| self.read_by(now, link, state, Cause::Wants)).flatten();
         self.set_interest(link, state);
-        turn
+        token
     }
 
     fn await_reply(
@@ -115,30 +116,31 @@ impl<T: Send + 'static> Engine<T> {
         begun: Begun<'_>,
         parameters: &mut ParametersView,
     ) -> Result<(), Error> {
-        let Begun { mut state, mut turn, id, now: asked, deadline } = begun;
+        let Begun { mut state, mut token, id, now: asked, deadline } = begun;
         let mut now = asked;
         loop {
-            // The reply may have come through another thread before this one took the lead.
+            // The reply may have come through another thread before this one got the token. Without this look it would block in
+            // reading for a reply that is here.
             if let Some(outcome) = state.take_outcome(id) {
-                self.leave(link, state, turn);
+                self.leave(link, state, token);
                 return self.read_outcome(link, id, outcome, parameters);
             }
             if now >= deadline {
                 self.cancel(now, link, &mut state, id);
-                self.leave(link, state, turn);
+                self.leave(link, state, token);
                 return Err(Error::TimedOut);
             }
-            turn = turn.or_else(|| state.reader.take_lead());
-            if let Some(turn) = turn {
+            token = token.or_else(|| self.read_by(now, link, &mut state, Cause::Wants));
+            if let Some(token) = token {
                 let mut own = OwnCall { id, parameters, result: None };
-                (state, now) = self.lead(link, state, &mut own, now, deadline);
+                (state, now) = self.read_for_reply(link, state, &mut own, now, deadline);
                 if let Some(result) = own.result {
                     if result.is_err() {
                         // The results may not fit: what the call started is not wanted then.
                         self.cancel(now, link, &mut state, id);
                     }
                     state.forget(id);
-                    self.leave_with_reply(asked, now, link, state, turn);
+                    self.leave_with_reply(asked, now, link, state, token);
                     return result;
                 }
             } else {
@@ -150,9 +152,9 @@ impl<T: Send + 'static> Engine<T> {
         }
     }
 
-    /// Reads the link until the own reply has come, the deadline has passed, or somebody else has noted the end. Returns
+    /// Reads the link until the own reply has come, the deadline has passed, or another thread has noted the end. Returns
     /// the time of its last look at the clock as well.
-    fn lead<'l>(
+    fn read_for_reply<'l>(
         &self,
         link: &'l Arc<LinkCell>,
         mut state: MutexGuard<'l, LinkState>,
@@ -198,7 +200,7 @@ impl<T: Send + 'static> Engine<T> {
         })
     }
 
-    /// Looks at what a leader has read; calls of the peer are left to the pool.
+    /// Looks at what a caller has read; calls of the peer are left to the pool.
     fn take_in(
         &self,
         now: Instant,
@@ -208,40 +210,33 @@ impl<T: Send + 'static> Engine<T> {
         own: &mut OwnCall<'_>,
     ) {
         let call = self.feed(now, link, state, bytes, None, Some(own));
-        debug_assert!(call.is_none(), "a leader lends no room for arguments");
+        debug_assert!(call.is_none(), "a caller that reads lends no room for arguments");
         if state.session.has_next_call() {
             self.hand_over(link);
         }
     }
 
-    /// A caller is through: it passes the lead on if it has it, or was to have it.
-    pub(super) fn leave(&self, link: &Arc<LinkCell>, mut guard: MutexGuard<'_, LinkState>, turn: Option<Turn>) {
-        let LinkState { reader, waiters, .. } = &mut *guard;
-        reader.leave(turn, || pass_lead(waiters));
-        self.settle(link, guard);
+    /// A thread no longer waits for the link: the next caller gets its token, or the pool.
+    pub(super) fn leave(&self, link: &Arc<LinkCell>, mut state: MutexGuard<'_, LinkState>, token: Option<Token>) {
+        let (now, waiter) = (self.now(), state.next_reader());
+        self.read_by(now, link, &mut state, Cause::Leaves { token, waiter });
+        self.settle_at(now, link, state);
     }
 
-    /// The same for a leader who has had its reply to what it asked: if its calls follow each other at once, it keeps the
-    /// link.
+    /// The same for a caller that has read its own reply, and keeps the link if its calls follow each other at once.
     fn leave_with_reply(
         &self,
         asked: Instant,
         now: Instant,
         link: &Arc<LinkCell>,
-        mut guard: MutexGuard<'_, LinkState>,
-        turn: Turn,
+        mut state: MutexGuard<'_, LinkState>,
+        token: Token,
     ) {
-        let keeps = self.may_keep(asked, now, &mut guard);
-        let LinkState { reader, waiters, .. } = &mut *guard;
-        match keeps {
-            true => reader.keep(turn, || pass_lead(waiters)),
-            false => reader.leave(Some(turn), || pass_lead(waiters)),
-        }
-        if guard.reader.is_kept() {
-            self.take_out(link, &mut guard);
-            self.watch_kept(now, link, &mut guard);
-        }
-        self.settle_at(now, link, guard);
+        // A task reads nothing itself: it would wait until the clock gives the link to the pool.
+        let may_keep = state.session.is_live() && !state.is_paused() && !state.has_task() && !self.is_stopping();
+        let waiter = state.next_reader();
+        self.read_by(now, link, &mut state, Cause::Replied { token, asked, may_keep, waiter });
+        self.settle_at(now, link, state);
     }
 
     /// A request as a future: the pool reads its reply.
@@ -253,9 +248,10 @@ impl<T: Send + 'static> Engine<T> {
         options: &RequestOptions,
     ) -> Result<CallFuture<T>, Error> {
         let mut state = link.lock();
-        // Nobody may come to read for it.
-        state.reader.give_up_keeping();
-        let sent = self.request_on(self.now(), &link, &mut state, function, parameters, options, true);
+        let now = self.now();
+        // A link that is kept is read by no thread until its caller is back.
+        self.read_by(now, &link, &mut state, Cause::NeedsPool);
+        let sent = self.request_on(now, &link, &mut state, function, parameters, options, true);
         if let Ok(id) = sent {
             state.waiters.push(Waiter { id, wake: Wake::Task(None), outcome: None });
         }
@@ -325,7 +321,7 @@ impl<T: Send + 'static> Engine<T> {
     }
 }
 
-/// After what time a request that failed so may succeed; after `pause` where only somebody else's end makes room.
+/// After what time a request that failed so may succeed; after `pause` where only the end of another call makes room.
 pub(crate) fn worth_waiting(error: &Error, pause: Duration) -> Option<Duration> {
     match *error {
         Error::TooSoon { wait } => Some(wait),
@@ -334,22 +330,10 @@ pub(crate) fn worth_waiting(error: &Error, pause: Duration) -> Option<Duration> 
     }
 }
 
-/// Whether a leader need not read on: the link has ended, or another thread has noted the end of its call.
+/// Whether a caller need not read on: the link has ended, or another thread has noted the end of its call.
 fn is_over(state: &LinkState, id: CallId) -> bool {
     let ended = state.session.deadline() == Instant::START || state.session.is_ended();
     ended || state.waiters.iter().any(|waiter| waiter.id == id && waiter.outcome.is_some())
-}
-
-/// Wakes one thread that waits for a reply, so that it takes the lead. `false` when there is none.
-pub(super) fn pass_lead(waiters: &mut [Waiter]) -> bool {
-    let next = waiters.iter_mut().find(|w| w.outcome.is_none() && matches!(w.wake, Wake::Thread(_)));
-    match next {
-        Some(waiter) => {
-            waiter.wake.wake();
-            true
-        }
-        None => false,
-    }
 }
 
 /// A call in flight. Dropped before it has ended well, it is given up: nothing waits for its reply, and the lease that it

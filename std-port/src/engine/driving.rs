@@ -98,8 +98,6 @@ impl<T: Send + 'static> Engine<T> {
 
     /// From here on no thread works for the unit any more, except the one that calls.
     pub(super) fn release_threads(&self) {
-        let kept = std::mem::take(&mut *lock(&self.kept));
-        self.crew().watched.fetch_sub(kept.len(), Ordering::Relaxed);
         for socket in [Socket::Shared, Socket::Own] {
             self.crew().unwatch(self.datagrams.fd(socket));
         }
@@ -109,6 +107,8 @@ impl<T: Send + 'static> Engine<T> {
         if let Some(seat) = self.seat() {
             self.crew().leave(seat);
         }
+        // No thread puts a link there any more.
+        self.crew().watched.fetch_sub(self.watch.clear(), Ordering::Relaxed);
         if self.own_threads {
             self.crew().stop();
         }

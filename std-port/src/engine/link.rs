@@ -1,24 +1,22 @@
-//! One link as the threads share it: the session under its lock, who waits for what, and who reads.
+//! One link as the threads share it: the session under its lock, the calls that wait, and which thread reads.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError, TryLockError};
 use std::task::Waker;
 use std::thread::Thread;
 
-use cara_core::distribution::function_list::Slot;
 use cara_core::error::{CloseReason, Error};
 use cara_core::host::mailman::{LinkId, Mailman};
 use cara_core::services::Port;
-use cara_core::services::lease::LeaseEnd;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::Session;
 use cara_core::time::{Duration, Instant};
 use cara_secure::link::Cipher;
 use core::net::SocketAddr;
 
-use super::Registration;
+use super::notices::Notices;
 use super::peers::PeerCell;
-use super::reader::Reader;
+use super::reader::{ReadPolicy, Registration};
 use crate::storage::Boxed;
 use crate::sys::datagram::Datagrams;
 use crate::sys::stream::Stream;
@@ -59,43 +57,29 @@ pub(crate) struct LinkCell {
 pub(crate) struct LinkState {
     pub(crate) session: Session<Linux>,
     pub(crate) waiters: Vec<Waiter>,
-    pub(crate) reader: Reader,
-    /// The last handler that ran for this link was quick.
-    pub(crate) quick: bool,
-    /// The peer has called here.
-    pub(crate) is_called: bool,
-    /// The pool's count of calls when it last served this link.
-    pub(crate) served: usize,
-    /// When it did.
-    pub(crate) served_at: Option<Instant>,
-    /// When a caller last had its reply.
-    pub(crate) replied_at: Option<Instant>,
-    /// It is among the links that the clock looks at because they are left to a caller.
-    pub(crate) kept: bool,
-    /// What the epoll set watches the stream for.
+    pub(crate) reading: ReadPolicy,
+    /// What the epoll set has been told.
     pub(crate) registration: Registration,
-    /// It is not in the epoll set, for as long as it is watched for nothing.
-    pub(crate) is_out: bool,
-    /// The connection is still being opened.
-    pub(crate) connecting: bool,
-    /// Bytes that were read and cannot be looked at yet, behind those that were.
-    pub(crate) leftover: Vec<u8>,
-    pub(crate) leftover_at: usize,
-    /// When a call last ended, or there was no room for more of them.
-    pub(crate) moved_at: Instant,
+    pub(crate) backlog: Backlog,
     /// The timer that is set for the session.
     pub(crate) timer: Instant,
-    /// Somebody waits for the answer to a ping.
+    /// A thread waits for the answer to a ping.
     pub(crate) pinging: bool,
     /// What it has counted is among the sums of links that have ended.
     pub(crate) retired: bool,
-    /// What is to be done when the lock is given up.
-    pub(crate) notices: Vec<Notice>,
-    /// A thread acts on earlier ones.
-    pub(crate) telling: bool,
+    pub(crate) notices: Notices,
 }
 
-/// Somebody who waits for a reply.
+/// Bytes that were read and cannot be looked at yet, because calls that wait leave no room for more.
+pub(crate) struct Backlog {
+    bytes: Vec<u8>,
+    /// So many of them have been looked at.
+    position: usize,
+    /// When a call last ended, or there was no room for more of them.
+    moved_at: Instant,
+}
+
+/// A call that waits for its reply.
 pub(crate) struct Waiter {
     pub(crate) id: CallId,
     pub(crate) wake: Wake,
@@ -109,7 +93,7 @@ impl Waiter {
     }
 }
 
-/// How to wake somebody.
+/// How to wake the thread or the task of a call.
 pub(crate) enum Wake {
     Thread(Thread),
     Task(Option<Waker>),
@@ -117,27 +101,6 @@ pub(crate) enum Wake {
 
 /// How a call ended: the signature and the block of its results, or why there are none.
 pub(crate) type Outcome = Result<(Box<[u8]>, Box<[u8]>), Error>;
-
-/// What happened under a link's lock and is acted upon without it.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) enum Notice {
-    /// Its safe hook has been told.
-    LeaseExpired(Slot),
-    LeaseEnded {
-        call: CallId,
-        slot: Slot,
-        why: LeaseEnd,
-    },
-    Failed(CallId, Error),
-    ListChanged,
-    Acknowledged {
-        serial: u32,
-        skipped: u16,
-    },
-    Joined,
-    Answered,
-    Left(CloseReason),
-}
 
 impl LinkCell {
     pub(crate) fn new(
@@ -151,24 +114,13 @@ impl LinkCell {
         let state = LinkState {
             session,
             waiters: Vec::new(),
-            reader: Reader::default(),
-            quick: false,
-            is_called: false,
-            served: 0,
-            served_at: None,
-            replied_at: None,
-            kept: false,
-            registration: Registration { readable: true, writable: connecting },
-            is_out: false,
-            connecting,
-            leftover: Vec::new(),
-            leftover_at: 0,
-            moved_at: Instant::START,
+            reading: ReadPolicy::new(connecting),
+            registration: Registration { readable: true, writable: connecting, is_out: false },
+            backlog: Backlog { bytes: Vec::new(), position: 0, moved_at: Instant::START },
             timer: Instant::FAR_FUTURE,
             pinging: false,
             retired: false,
-            notices: Vec::new(),
-            telling: false,
+            notices: Notices::default(),
         };
         Self {
             seat,
@@ -202,7 +154,7 @@ impl LinkCell {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The state, unless somebody has it now.
+    /// The state, unless a thread has it now.
     pub(crate) fn try_lock(&self) -> Option<MutexGuard<'_, LinkState>> {
         match self.state.try_lock() {
             Ok(state) => Some(state),
@@ -215,26 +167,37 @@ impl LinkCell {
 impl LinkState {
     /// What was read cannot be looked at yet: nothing more is read meanwhile, so that the peer feels it.
     pub(crate) fn is_paused(&self) -> bool {
-        self.leftover_at < self.leftover.len()
+        self.backlog.is_waiting()
     }
 
     /// Whether to look no further at what was read, because the calls that wait leave no room for more: they run, and
     /// what follows stays where it is, so that the peer feels it. Replies may be among what follows, so it is looked at
-    /// where somebody waits for one, and requests that find no room are refused.
+    /// where a call waits for one, and requests that find no room are refused.
     pub(crate) fn holds_back(&self) -> bool {
         self.waiters.is_empty() && self.session.is_live() && !self.session.has_call_room()
     }
 
-    /// The calls that leave no room do not get on: what follows them is to be looked at.
-    pub(crate) fn is_stalled(&self, now: Instant) -> bool {
-        self.is_paused() && now >= self.moved_at + STALLED
+    /// A caller that waits for its reply, and could read the link for it.
+    pub(crate) fn next_reader(&self) -> Option<CallId> {
+        let waits = |waiter: &&Waiter| waiter.outcome.is_none() && matches!(waiter.wake, Wake::Thread(_));
+        self.waiters.iter().find(waits).map(|waiter| waiter.id)
     }
 
-    /// Notes how a call ended and wakes who waits for it.
+    /// Whether a call waits for its reply that does not read for it.
+    pub(crate) fn has_task(&self) -> bool {
+        self.waiters.iter().any(|waiter| matches!(waiter.wake, Wake::Task(_)))
+    }
+
+    /// Notes how a call ended and wakes what waits for it.
     pub(crate) fn finish(&mut self, id: CallId, outcome: Outcome) {
         if let Some(waiter) = self.waiters.iter_mut().find(|waiter| waiter.id == id) {
             waiter.finish(outcome);
         }
+    }
+
+    /// Wakes the thread or the task that waits for a call.
+    pub(crate) fn wake(&mut self, id: CallId) {
+        self.waiters.iter_mut().filter(|waiter| waiter.id == id).for_each(|waiter| waiter.wake.wake());
     }
 
     /// Takes out how a call ended, if it has.
@@ -244,9 +207,35 @@ impl LinkState {
         self.waiters.swap_remove(index).outcome
     }
 
-    /// Nobody waits for a call any more.
+    /// Nothing waits for a call any more.
     pub(crate) fn forget(&mut self, id: CallId) {
         self.waiters.retain(|waiter| waiter.id != id);
+    }
+}
+
+impl Backlog {
+    pub(crate) fn is_waiting(&self) -> bool {
+        self.position < self.bytes.len()
+    }
+
+    /// The calls that leave no room do not get on: what follows them is to be looked at.
+    pub(crate) fn is_stalled(&self, now: Instant) -> bool {
+        self.is_waiting() && now >= self.moved_at + STALLED
+    }
+
+    /// Calls get on, or have just been found not to.
+    pub(crate) fn moved(&mut self, now: Instant) {
+        self.moved_at = now;
+    }
+
+    /// The bytes, and how many of them have been looked at.
+    pub(crate) fn take(&mut self) -> (Vec<u8>, usize) {
+        (std::mem::take(&mut self.bytes), std::mem::take(&mut self.position))
+    }
+
+    /// Looked at up to `position`.
+    pub(crate) fn put(&mut self, bytes: Vec<u8>, position: usize) {
+        (self.bytes, self.position) = (bytes, position);
     }
 }
 

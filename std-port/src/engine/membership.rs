@@ -14,7 +14,9 @@ use cara_core::services::unit::{Event, Session, SessionConfig};
 use cara_core::time::{Duration, Instant};
 use core::net::{IpAddr, SocketAddr};
 
-use super::link::{LinkCell, LinkState, Notice, StdMailman};
+use super::link::{LinkCell, LinkState, StdMailman};
+use super::notices::Notice;
+use super::reader::Cause;
 use super::{Engine, lock, read, write};
 use crate::event::UnitEvent;
 use crate::seldom::warn_seldom;
@@ -185,11 +187,11 @@ impl<T: Send + 'static> Engine<T> {
         match link.stream.finish_connect() {
             Ok(false) => {}
             Ok(true) => {
-                state.connecting = false;
+                self.read_by(self.now(), link, state, Cause::Opened);
                 self.with(link, state, |session, cx| session.connected(cx));
             }
             Err(reason) => {
-                state.connecting = false;
+                self.read_by(self.now(), link, state, Cause::Opened);
                 state.session.disconnected(reason);
             }
         }
@@ -259,7 +261,7 @@ impl<T: Send + 'static> Engine<T> {
         {
             let mut state = link.lock();
             // It is not put back.
-            state.is_out = false;
+            state.registration.is_out = false;
             let _ = self.crew().epoll.remove(&link.stream);
         }
         self.retire(link);

@@ -11,14 +11,15 @@ mod calling;
 mod clock_thread;
 mod driving;
 mod interfaces;
-mod keeping;
 mod keys;
 pub(crate) mod link;
 mod membership;
+pub(crate) mod notices;
 pub(crate) mod peers;
 mod pinging;
 mod presence;
 pub(crate) mod reader;
+mod reading;
 mod roster;
 mod serving;
 mod state_gate;
@@ -64,12 +65,11 @@ use crate::handler::Handler;
 use crate::pool::MessagePool;
 use crate::storage::Boxed;
 use crate::sys::datagram::Datagrams;
-use crate::sys::epoll::{Interest, Trigger};
 use crate::sys::interfaces::Interface;
 use crate::sys::stream::Listener;
 use crate::threads::Threads;
 use crate::timers::Timers;
-use link::{LinkCell, LinkState, Linux, Notice, StdMailman};
+use link::{LinkCell, LinkState, Linux, StdMailman};
 use peers::{PeerCell, Peers};
 use serving::Begun;
 use state_gate::StateGate;
@@ -106,13 +106,8 @@ pub(crate) struct Engine<T: 'static> {
     longest_message: AtomicUsize,
     /// Bytes that the arguments and results of the largest function need.
     largest_function: AtomicUsize,
-    /// Links on which a thread of the pool stays.
-    stays: Mutex<Vec<LinkId>>,
-    /// Links that are left to a caller who calls back to back.
-    kept: Mutex<Vec<LinkId>>,
-    /// Whether the clock looks at these.
+    /// The links that the clock looks at.
     watch: watch::Watch,
-    next_look: staying::NextLook,
     interfaces: Mutex<interfaces::InterfaceWatch>,
     /// When connections are taken again, where there were no descriptors for them.
     listens_at: Mutex<Option<Instant>>,
@@ -137,7 +132,7 @@ struct Subscriber {
     lost: Arc<AtomicU64>,
 }
 
-/// The call of its own that a leader reads for.
+/// The call of its own that a thread reads for.
 struct OwnCall<'p> {
     id: CallId,
     parameters: &'p mut ParametersView,
@@ -196,10 +191,7 @@ impl<T: Send + 'static> Engine<T> {
             timers: Mutex::new(Timers::new()),
             longest_message,
             largest_function: AtomicUsize::new(0),
-            stays: Mutex::new(Vec::new()),
-            kept: Mutex::new(Vec::new()),
-            watch: watch::Watch::default(),
-            next_look: staying::NextLook::new(),
+            watch: watch::Watch::new(),
             interfaces: Mutex::default(),
             listens_at: Mutex::new(None),
             keys: parts.keys,
@@ -264,9 +256,8 @@ impl<T: Send + 'static> Engine<T> {
         mut arguments: Option<&mut ParametersView>,
         mut own: Option<&mut OwnCall<'_>>,
     ) -> Option<Begun> {
-        let (was_paused, stalled) = (state.is_paused(), state.is_stalled(now));
-        let mut earlier = std::mem::take(&mut state.leftover);
-        let mut position = std::mem::take(&mut state.leftover_at);
+        let (was_paused, stalled) = (state.is_paused(), state.backlog.is_stalled(now));
+        let (mut earlier, mut position) = state.backlog.take();
         let bytes = if was_paused {
             earlier.extend_from_slice(bytes);
             &mut earlier[..]
@@ -290,12 +281,12 @@ impl<T: Send + 'static> Engine<T> {
                 self.joined(link, state);
             }
             if step.paused && was_paused {
-                (state.leftover, state.leftover_at) = (earlier, position);
+                state.backlog.put(earlier, position);
                 return call;
             }
             if step.paused {
-                state.leftover = bytes.get(position..).unwrap_or_default().to_vec();
-                state.moved_at = now;
+                state.backlog.put(bytes.get(position..).unwrap_or_default().to_vec(), 0);
+                state.backlog.moved(now);
                 return call;
             }
             let through = position == bytes.len() && !state.session.holds_received();
@@ -369,7 +360,7 @@ impl<T: Send + 'static> Engine<T> {
                 if let Event::LeaseExpired(slot) = event {
                     self.wake_leased(&functions, slot);
                 }
-                notices.extend(notice(&event));
+                notices.note(&event);
             }
         }
         step
@@ -391,7 +382,7 @@ impl<T: Send + 'static> Engine<T> {
         }
         self.set_timer(now, deadline, link, state);
         self.set_interest(link, state);
-        if !state.notices.is_empty() {
+        if state.notices.begin() {
             self.act(link, guard);
         }
     }
@@ -420,7 +411,7 @@ impl<T: Send + 'static> Engine<T> {
         if let Event::LeaseExpired(slot) = *event {
             self.wake_leased(&read(&self.functions), slot);
         }
-        state.notices.extend(notice(event));
+        state.notices.note(event);
     }
 
     /// The thread that has read an emergency goes on reading.
@@ -447,34 +438,6 @@ impl<T: Send + 'static> Engine<T> {
             if lock(&self.timers).set(u32::from(link.id.0), deadline) {
                 self.wake_clock_at(deadline);
             }
-        }
-    }
-
-    /// Keeps the epoll registration in step with who reads and whether bytes wait to be written.
-    fn set_interest(&self, link: &LinkCell, state: &mut LinkState) {
-        let wanted = Registration {
-            readable: state.reader.pool_reads() && !state.is_paused(),
-            writable: state.connecting || state.session.wants_to_write(),
-        };
-        if state.registration == wanted {
-            return;
-        }
-        state.registration = wanted;
-        let interest = Interest { readable: wanted.readable, writable: wanted.writable, trigger: Trigger::Edge };
-        // A descriptor that cannot be watched is one whose link has ended.
-        let _ = match std::mem::take(&mut state.is_out) {
-            true => self.crew().epoll.add(&link.stream, link.token(), interest),
-            false => self.crew().epoll.modify(&link.stream, link.token(), interest),
-        };
-    }
-
-    /// Takes a link that the pool does not read out of the epoll set, for a row of calls: in the set, each arrival costs
-    /// a percent of a small round trip, although no thread is told of it. Taking it out and putting it back cost more than
-    /// disarming and arming it, so this is for those who stay.
-    fn take_out(&self, link: &LinkCell, state: &mut LinkState) {
-        self.set_interest(link, state);
-        if state.registration == Registration::NONE && !state.is_out {
-            state.is_out = self.crew().epoll.remove(&link.stream).is_ok();
         }
     }
 
@@ -629,30 +592,4 @@ struct Step {
 impl Step {
     /// Nothing was looked at.
     const PAUSED: Self = Self { consumed: 0, paused: true, progress: false, joined: false, call: None };
-}
-
-/// What a link is watched for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Registration {
-    pub(crate) readable: bool,
-    pub(crate) writable: bool,
-}
-
-impl Registration {
-    /// Nothing is told of it.
-    const NONE: Self = Self { readable: false, writable: false };
-}
-
-/// What an event without borrowed bytes means for the port.
-fn notice(event: &Event<'_>) -> Option<Notice> {
-    Some(match *event {
-        Event::LeaseExpired(slot) => Notice::LeaseExpired(slot),
-        Event::LeaseEnded { call, slot, why } => Notice::LeaseEnded { call, slot, why },
-        Event::Failed(id, error) => Notice::Failed(id, error),
-        Event::ListChanged => Notice::ListChanged,
-        Event::Acknowledged { serial, skipped } => Notice::Acknowledged { serial, skipped },
-        Event::Answered => Notice::Answered,
-        Event::Closed(reason) => Notice::Left(reason),
-        Event::Joined | Event::Call(_) | Event::Reply(..) => return None,
-    })
 }

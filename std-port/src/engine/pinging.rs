@@ -7,6 +7,7 @@ use cara_core::time::{Duration, Instant};
 
 use super::Engine;
 use super::link::{LinkCell, LinkState};
+use super::reader::Cause;
 
 impl<T: Send + 'static> Engine<T> {
     /// Asks for a sign of life and returns how long it took. Of several callers on a link each has its turn.
@@ -29,8 +30,8 @@ impl<T: Send + 'static> Engine<T> {
         mut state: MutexGuard<'l, LinkState>,
         deadline: Instant,
     ) -> Result<Duration, Error> {
-        // Nobody may come to read for it.
-        state.reader.give_up_keeping();
+        // A link that is kept is read by no thread until its caller is back.
+        self.read_by(self.now(), link, &mut state, Cause::NeedsPool);
         loop {
             match self.with(link, &mut state, |session, cx| session.ping(cx)) {
                 Ok(()) => break,

@@ -11,6 +11,7 @@ use cara_core::services::unit::Call;
 use cara_core::time::{Duration, Instant};
 
 use super::link::{LinkCell, LinkState};
+use super::reader::Cause;
 use super::state_gate::{Entered, Turn};
 use super::workers::{Worker, arena};
 use super::{Engine, read};
@@ -20,9 +21,6 @@ use crate::storage::Boxed;
 
 /// How long an answer waits for room at a time.
 const PAUSE: std::time::Duration = std::time::Duration::from_millis(20);
-
-/// A handler that takes less than this is quick: the thread that ran it may stay on the link.
-const QUICK: Duration = Duration::from_micros(50);
 
 /// A call that has begun.
 #[derive(Clone, Copy)]
@@ -76,7 +74,7 @@ impl<T: Send + 'static> Engine<T> {
         let result = match ran {
             Ran::Over(result) => result,
             Ran::NotYet(turn) => {
-                link.lock().quick = false;
+                self.ran(self.now(), link, &mut link.lock(), Duration::MAX);
                 let spare = arena(worker.longest());
                 let arguments = std::mem::replace(&mut worker.arguments, spare);
                 self.park(turn, Parked { link: link.clone(), call: begun.call, arguments });
@@ -85,10 +83,13 @@ impl<T: Send + 'static> Engine<T> {
         };
         let now = self.now();
         let mut state = link.lock();
-        state.quick = now.since(began) < QUICK;
-        state.is_called = true;
-        state.moved_at = now;
+        self.ran(now, link, &mut state, now.since(began));
+        state.backlog.moved(now);
         Some((self.answer(now, link, state, &begun.call, result, &worker.arguments), now))
+    }
+
+    fn ran(&self, now: Instant, link: &LinkCell, state: &mut LinkState, took: Duration) {
+        self.read_by(now, link, state, Cause::Ran { took });
     }
 
     /// Takes the next call that may begin on a link; another thread is told if there is one more.
@@ -103,7 +104,7 @@ impl<T: Send + 'static> Engine<T> {
         if state.is_paused() && !state.session.has_next_call() {
             self.feed(self.now(), link, &mut state, &mut [], None, None);
         }
-        if state.session.has_next_call() && self.may_run(state.quick) {
+        if state.session.has_next_call() && self.may_run(state.reading.is_quick()) {
             next = self.take_call(link, &mut state, worker);
         }
         if state.session.has_next_call() {
@@ -263,7 +264,7 @@ impl<T: Send + 'static> Engine<T> {
         Ok((run, told))
     }
 
-    /// Answers, waiting for room while somebody waits for the answer.
+    /// Answers, waiting for room until the call's deadline.
     fn answer<'l>(
         &self,
         mut now: Instant,

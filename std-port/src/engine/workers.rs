@@ -78,15 +78,15 @@ impl<T: Send + 'static> Engine<T> {
         let Some(link) = self.link_of_token(ready.token) else { return };
         worker.fit(self.call_bytes());
         let mut state = link.lock();
-        if state.connecting && ready.writable {
+        if state.reading.is_opening() && ready.writable {
             self.connected(&link, &mut state);
         }
-        if ready.writable && !state.connecting {
+        if ready.writable && !state.reading.is_opening() {
             self.with(&link, &mut state, |session, cx| session.writable(cx));
             link.room.notify_all();
         }
         let mut call = None;
-        if ready.readable && !state.connecting && !state.reader.is_led() && !state.is_paused() {
+        if ready.readable && state.reading.is_free() && !state.is_paused() {
             call = self.drain(&link, &mut state, ready.hung_up, worker);
         }
         match call {
@@ -111,8 +111,8 @@ impl<T: Send + 'static> Engine<T> {
                     return call;
                 }
             };
-            // Where nobody else goes on reading, the call waits in the session: most of what is read is none.
-            let at_once = call.is_none() && self.may_run_at_once(state.quick);
+            // Where no other thread goes on reading, the call waits in the session: most of what is read is none.
+            let at_once = call.is_none() && self.may_run_at_once(state.reading.is_quick());
             let arguments = if at_once { Some(&mut *worker.arguments) } else { None };
             let bytes = worker.buffer.get_mut(..count).unwrap_or_default();
             call = call.or(self.feed(self.now(), link, state, bytes, arguments, None));

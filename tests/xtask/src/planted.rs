@@ -34,7 +34,7 @@ pub(crate) fn loom() -> Result<()> {
     let model = || binaries::tests().args(["--test", "hand_over"]);
     model().stream()?;
     let (passed, output, _) = plant(model(), "lost_wakeup")?.captured()?;
-    if passed || !output.contains("nobody reads") {
+    if passed || !output.contains("no thread reads") {
         bail!("the planted lost wake-up was not found: {output}");
     }
     println!("the planted lost wake-up is found");
