@@ -27,9 +27,10 @@ use crate::access::AccessTable;
 use crate::builder::{self, BuildError, Builder};
 #[cfg(feature = "control")]
 use crate::control::{self, Control, Server};
-use crate::engine::{Engine, lock, pairs, read};
+use crate::engine::{Engine, pairs};
 use crate::error::StartError;
 use crate::event::UnitEvent;
+use crate::locks::lock;
 use crate::my_function_list::MyFunctionList;
 use crate::peer::Peer;
 use crate::sys::interfaces::Interface;
@@ -157,7 +158,7 @@ impl<T: Send + 'static> CommunicationSystem<T> {
 
     #[cfg(feature = "control")]
     pub(crate) fn keys(&self) -> &crate::engine::Keys {
-        &self.engine().keys
+        self.engine().keys()
     }
 
     /// Searches for nodes and keeps connections, in threads of its own (paper, listing line 2).
@@ -217,17 +218,17 @@ impl<T: Send + 'static> CommunicationSystem<T> {
 
     /// This unit's identity.
     pub fn identity(&self) -> Identity {
-        lock(&self.engine().hub).hub.node.identity().clone()
+        self.engine().hub().hub.node.identity().clone()
     }
 
     /// The fleet that it belongs to.
     pub fn fleet(&self) -> Fleet {
-        lock(&self.engine().hub).hub.node.fleet()
+        self.engine().hub().hub.node.fleet()
     }
 
     /// Which of its runs this is: peers tell a restart by it.
     pub fn epoch(&self) -> Epoch {
-        lock(&self.engine().hub).hub.node.epoch()
+        self.engine().hub().hub.node.epoch()
     }
 
     /// Time since it was made.
@@ -272,7 +273,7 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     }
 
     fn number_of(&self, role: Role) -> usize {
-        read(&self.engine().peers).of_role(role).filter(|peer| peer.is_introduced()).count()
+        self.engine().peers().of_role(role).filter(|peer| peer.is_introduced()).count()
     }
 
     /// The s_units in the order in which they first published their list, then those that have not published it yet.
@@ -287,7 +288,7 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     }
 
     fn of_role(&self, role: Role) -> Vec<Peer<T>> {
-        read(&self.engine().peers).of_role(role).map(|cell| self.peer(cell)).collect()
+        self.engine().peers().of_role(role).map(|cell| self.peer(cell)).collect()
     }
 
     fn peer(&self, cell: &Arc<crate::engine::peers::PeerCell>) -> Peer<T> {
@@ -354,7 +355,7 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     }
 
     fn connected(&self) -> impl Iterator<Item = Peer<T>> {
-        let peers: Vec<_> = read(&self.engine().peers).connected().map(|cell| self.peer(cell)).collect();
+        let peers: Vec<_> = self.engine().peers().connected().map(|cell| self.peer(cell)).collect();
         peers.into_iter()
     }
 
@@ -406,7 +407,7 @@ impl<T: Send + 'static> CommunicationSystem<T> {
 
     /// The constraints in force.
     pub fn constraints(&self) -> Constraints {
-        *lock(&self.engine().hub).hub.node.constraints()
+        *self.engine().hub().hub.node.constraints()
     }
 
     /// Changes the constraints; peers are told. [`Error::BadConstraint`] for values that this unit cannot hold.
@@ -467,12 +468,12 @@ impl<T: Send + 'static> CommunicationSystem<T> {
 
     /// The last refusals, here or there.
     pub fn findings(&self) -> Vec<Finding> {
-        lock(&self.engine().hub).hub.node.findings().cloned().collect()
+        self.engine().hub().hub.node.findings().cloned().collect()
     }
 
     /// Time since a refusal.
     pub fn age(&self, finding: &Finding) -> Duration {
-        self.engine().clock.now().since(finding.at)
+        self.engine().now().since(finding.at)
     }
 }
 

@@ -88,6 +88,12 @@ debug_is_display!(crate::access::AccessError);
 #[cfg(feature = "control")]
 debug_is_display!(crate::control::ControlError);
 
+/// What the system says goes to the log; the error tells where to look.
+pub(crate) fn system_refused(error: std::io::Error) -> Error {
+    tracing::error!(%error, "the operating system refused a thread, a socket or a descriptor");
+    Error::Network
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -6,9 +6,9 @@ use std::sync::{Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use crate::error::system_refused;
+use crate::locks::lock;
 use cara_core::error::Error;
-
-use crate::engine::{lock, system_refused};
 
 /// How long the end of a service waits for a thread that is inside one of its handlers.
 const PATIENCE: Duration = Duration::from_secs(1);

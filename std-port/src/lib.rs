@@ -36,6 +36,7 @@ mod handler;
 pub mod keys;
 mod lane;
 mod lease;
+mod locks;
 #[cfg(feature = "metrics")]
 pub mod metrics;
 mod my_function_list;

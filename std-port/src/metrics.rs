@@ -21,7 +21,7 @@ use prometheus_client::metrics::counter::ConstCounter;
 use prometheus_client::metrics::gauge::ConstGauge;
 use prometheus_client::registry::Registry;
 
-use crate::engine::{Engine, Group, Reading, read};
+use crate::engine::{Engine, Group, Reading};
 
 /// The content type of [`metrics`](crate::CommunicationSystem::metrics), for the HTTP response.
 pub const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
@@ -56,7 +56,7 @@ struct PeerSnapshot {
 impl Snapshot {
     fn of<T: Send + 'static>(engine: &Engine<T>, unit: &Identity) -> Self {
         let cells: Vec<_> = {
-            let peers = read(&engine.peers);
+            let peers = engine.peers();
             [Role::SUnit, Role::MUnit]
                 .into_iter()
                 .flat_map(|role| peers.of_role(role).cloned().collect::<Vec<_>>())

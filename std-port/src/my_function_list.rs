@@ -8,7 +8,7 @@ use cara_core::distribution::function_list::{FunctionList, Slot};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 
-use crate::engine::{Engine, arena_bytes, read, write};
+use crate::engine::{Engine, arena_bytes};
 use crate::handler::{Handler, IntoHandler, ServiceOptions};
 use crate::lane::Lane;
 use crate::lease::{LeaseWatch, ServiceLease};
@@ -88,8 +88,8 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
         let safe = self.safe_hook(&options, &lease)?;
         let kept = options.lease.map(|_| lease.clone());
         let handler = Handler { run, lease: kept, safe, lane };
-        put(&mut write(&self.engine.functions), definition, attributes, handler)?;
-        Ok(LeaseWatch::new(lease, None, self.engine.clock))
+        put(&mut self.engine.functions_mut(), definition, attributes, handler)?;
+        Ok(LeaseWatch::new(lease, None, self.engine.clock()))
     }
 
     fn safe_hook(
@@ -100,7 +100,7 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
         let Some(hook) = options.safe.clone() else { return Ok(None) };
         let then = options.then.clone().map(|then| self.engine.afterwards(then)).transpose()?;
         let late = self.engine.hooks_late();
-        let parts = Parts { lease: lease.clone(), clock: self.engine.clock, hook, then, late };
+        let parts = Parts { lease: lease.clone(), clock: self.engine.clock(), hook, then, late };
         SafeHook::start(parts).map(|hook| Some(Arc::new(hook)))
     }
 
@@ -123,14 +123,14 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
     }
 
     fn leased(&self, name: &str) -> Option<(Slot, Option<Arc<ServiceLease>>)> {
-        let functions = read(&self.engine.functions);
+        let functions = self.engine.functions();
         let slot = functions.find(name)?;
         Some((slot, functions.function(slot)?.handler.lease.clone()))
     }
 
     /// How many functions there are.
     pub fn len(&self) -> usize {
-        read(&self.engine.functions).len()
+        self.engine.functions().len()
     }
 
     /// Whether there are none.
@@ -140,11 +140,11 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
 
     #[cfg(feature = "control")]
     pub(crate) fn names(&self) -> Vec<String> {
-        read(&self.engine.functions).iter().map(|function| function.name().to_owned()).collect()
+        self.engine.functions().iter().map(|function| function.name().to_owned()).collect()
     }
 
     /// One line per function.
     pub fn show_functions(&self) -> String {
-        read(&self.engine.functions).show_functions().to_string()
+        self.engine.functions().show_functions().to_string()
     }
 }

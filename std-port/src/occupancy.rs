@@ -8,9 +8,8 @@
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
+use crate::locks::lock;
 use cara_core::time::{Duration, Instant};
-
-use crate::engine::lock;
 
 /// What the threads of a pool are about.
 #[derive(Debug)]

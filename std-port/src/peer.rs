@@ -20,7 +20,7 @@ use crate::builder;
 use crate::engine::CallFuture;
 use crate::engine::link::LinkCell;
 use crate::engine::peers::PeerCell;
-use crate::engine::{Engine, lock, pairs};
+use crate::engine::{Engine, pairs};
 
 /// A node, connected or not. Stays valid when the node leaves, and works again when it comes back.
 pub struct Peer<T: Send + 'static = ()> {
@@ -155,7 +155,7 @@ impl<T: Send + 'static> Peer<T> {
 
     /// The constraints in force towards this node: the unit's own, unless they were changed for it.
     pub fn constraints(&self) -> Constraints {
-        let unit = *lock(&self.engine.hub).hub.node.constraints();
+        let unit = *self.engine.hub().hub.node.constraints();
         self.cell.constraints(unit)
     }
 
@@ -202,8 +202,8 @@ impl<T: Send + 'static> Peer<T> {
 
     /// Waits until the node has published `function`; `false` after `timeout`.
     pub fn wait_for_function(&self, function: &str, timeout: impl Into<Duration>) -> bool {
-        let deadline = self.engine.clock.now() + timeout.into();
-        while self.engine.clock.now() < deadline {
+        let deadline = self.engine.now() + timeout.into();
+        while self.engine.now() < deadline {
             if self.their_function_list().contains(function) {
                 return true;
             }

@@ -17,9 +17,9 @@ use cara_core::services::lease::{Lease, Order};
 use cara_core::time::{Duration, Instant};
 
 use crate::clock::Clock;
-use crate::engine::lock;
 use crate::lane::OwnThread;
 use crate::lease::ServiceLease;
+use crate::locks::lock;
 
 /// A thread that waits for the end of a lease looks at the clock this often: its wait stands still while the system is
 /// suspended, and the clock goes on.

@@ -13,9 +13,10 @@ use cara_core::error::Error;
 use cara_core::time::{Duration, Instant};
 
 use crate::clock::Clock;
-use crate::engine::workers::Worker;
-use crate::engine::{lock, read, system_refused, write};
+use crate::engine::worker::Worker;
+use crate::error::system_refused;
 use crate::lane::Lane;
+use crate::locks::{lock, read, write};
 use crate::occupancy::Occupancy;
 use crate::sys::alarm::Alarm;
 use crate::sys::datagram::Socket;

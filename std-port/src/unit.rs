@@ -13,7 +13,7 @@ use cara_core::time::Duration;
 use crate::access::AccessTable;
 use crate::builder::{self, BuildError, Builder, manager};
 use crate::communication_system::Owner;
-use crate::engine::{Engine, lock, pairs, read};
+use crate::engine::{Engine, pairs};
 use crate::error::StartError;
 use crate::event::UnitEvent;
 use crate::my_function_list::MyFunctionList;
@@ -91,17 +91,17 @@ impl<T: Send + 'static> Unit<T> {
 
     /// This unit's identity.
     pub fn identity(&self) -> Identity {
-        lock(&self.engine().hub).hub.node.identity().clone()
+        self.engine().hub().hub.node.identity().clone()
     }
 
     /// The fleet that it belongs to.
     pub fn fleet(&self) -> Fleet {
-        lock(&self.engine().hub).hub.node.fleet()
+        self.engine().hub().hub.node.fleet()
     }
 
     /// Which of its runs this is: peers tell a restart by it.
     pub fn epoch(&self) -> Epoch {
-        lock(&self.engine().hub).hub.node.epoch()
+        self.engine().hub().hub.node.epoch()
     }
 
     /// Time since it was made.
@@ -126,7 +126,7 @@ impl<T: Send + 'static> Unit<T> {
 
     /// The manager, once it has been met.
     pub fn manager(&self) -> Option<Peer<T>> {
-        let peers = read(&self.engine().peers);
+        let peers = self.engine().peers();
         let cell = peers.of_role(Role::MUnit).next().cloned();
         cell.map(|cell| Peer { engine: self.engine().clone(), cell })
     }
@@ -177,7 +177,7 @@ impl<T: Send + 'static> Unit<T> {
 
     /// The constraints in force.
     pub fn constraints(&self) -> Constraints {
-        *lock(&self.engine().hub).hub.node.constraints()
+        *self.engine().hub().hub.node.constraints()
     }
 
     /// Changes the constraints; the manager is told.
@@ -208,7 +208,7 @@ impl<T: Send + 'static> Unit<T> {
     /// need not wait for so long.
     #[doc(hidden)]
     pub fn renew_keys_every(&self, span: cara_core::time::Duration) {
-        let _ = self.engine().renews_every.set(span);
+        self.engine().key_watch.renew_every(span);
     }
 
     /// Everything that is counted for the unit as a whole: (name, number), zeros included. What happened in discovery and

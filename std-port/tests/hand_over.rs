@@ -127,7 +127,7 @@ impl Link {
     /// A link that has been served by a quick handler, and has a call to be read.
     fn served() -> Arc<Self> {
         let mut reading = ReadPolicy::new(false);
-        reading.on(NOW, Cause::Ran { took: Duration::ZERO });
+        reading.ran(Duration::ZERO);
         reading.on(NOW, Cause::Stays { served: 0, may: true });
         let link = Self::build(0, false, reading);
         link.wire.lock().unwrap().items.push_back(Item::Call);

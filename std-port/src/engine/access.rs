@@ -8,9 +8,10 @@ use cara_core::error::Error;
 use cara_core::services::access::{Access, Bucket, Decision, Principal, Rate, Verb};
 use cara_core::time::{Duration, Instant};
 
+use super::Engine;
 use super::notices::Notice;
-use super::{Engine, lock, read, write};
 use crate::access::AccessTable;
+use crate::locks::{lock, read, write};
 
 /// Functions of which the operator's use of a rate is remembered, before those are forgotten whose rate is whole again.
 const OPERATOR_BUCKETS: usize = 256;
@@ -175,7 +176,7 @@ mod following {
                     std::thread::park_timeout(LOOK);
                 }
             };
-            thread.spawn(run).map(drop).map_err(crate::engine::system_refused)
+            thread.spawn(run).map(drop).map_err(crate::error::system_refused)
         }
 
         /// A mistake keeps the table that is in force.

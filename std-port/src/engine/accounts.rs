@@ -7,31 +7,22 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
 use cara_core::counters::{Counter, Counters};
-use cara_core::host::connections::LinkCounter;
 
+use super::Engine;
 use super::link::LinkCell;
-use super::peers::PeerCell;
-use super::{Engine, lock, read};
-
-/// The counters of a link, or of many.
-pub(crate) type LinkCounters = Counters<LinkCounter, { LinkCounter::COUNT }>;
+use super::peers::{LinkCounters, PeerCell};
+use crate::locks::Rank;
 
 /// What outlives the links, and what is counted outside of the core.
 #[derive(Default)]
 pub(crate) struct Accounts {
     /// Of links that have ended.
     ended: Mutex<LinkCounters>,
-    events_lost: AtomicU64,
     connections_refused: AtomicU64,
     hooks_late: Arc<AtomicU64>,
 }
 
 impl Accounts {
-    /// A subscriber did not keep up.
-    pub(super) fn event_lost(&self) {
-        self.events_lost.fetch_add(1, Ordering::Relaxed);
-    }
-
     /// A connection found no room. Returns how many did so before.
     pub(super) fn connection_refused(&self) {
         self.connections_refused.fetch_add(1, Ordering::Relaxed);
@@ -75,7 +66,7 @@ impl<T: Send + 'static> Engine<T> {
     /// Everything that is counted for the unit as a whole.
     pub(crate) fn readings(&self) -> Vec<Reading> {
         let (links, held) = self.sum_links();
-        let node = lock(&self.hub).hub.node.counters.clone();
+        let node = self.hub().hub.node.counters.clone();
         let mut readings: Vec<_> = of(Group::Node, &node).chain(of(Group::Links, &links)).collect();
         readings.extend(self.port_readings(&held));
         readings
@@ -83,7 +74,7 @@ impl<T: Send + 'static> Engine<T> {
 
     /// What the links to a node have counted.
     pub(crate) fn peer_readings(&self, peer: &PeerCell) -> Vec<Reading> {
-        let _accounts = lock(&self.accounts.ended);
+        let _accounts = Rank::Accounts.lock(&self.accounts.ended);
         let mut counters = peer.earlier();
         if let Some(link) = peer.link() {
             let state = link.lock();
@@ -96,7 +87,7 @@ impl<T: Send + 'static> Engine<T> {
 
     /// A link has ended: what it has counted is kept.
     pub(super) fn retire(&self, link: &LinkCell) {
-        let mut ended = lock(&self.accounts.ended);
+        let mut ended = Rank::Accounts.lock(&self.accounts.ended);
         let mut state = link.lock();
         if !std::mem::replace(&mut state.retired, true) {
             ended.merge(state.session.counters());
@@ -107,7 +98,7 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     fn sum_links(&self) -> (LinkCounters, Held) {
-        let ended = lock(&self.accounts.ended);
+        let ended = Rank::Accounts.lock(&self.accounts.ended);
         let (mut sum, mut held) = (ended.clone(), Held::default());
         for link in self.each_link() {
             let state = link.lock();
@@ -128,17 +119,13 @@ impl<T: Send + 'static> Engine<T> {
 
     fn port_readings(&self, held: &Held) -> [Reading; 14] {
         // One that is stuck has not counted itself.
-        read(&self.functions).iter().filter_map(|function| function.handler.safe.as_ref()).for_each(|safe| safe.look());
+        self.functions().iter().filter_map(|function| function.handler.safe.as_ref()).for_each(|safe| safe.look());
         let pool = self.pool.counters();
-        let connected = read(&self.peers).connected().count() as u64;
+        let connected = self.peers().connected().count() as u64;
         let file = &self.guard.file;
         let load = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
         [
-            count(
-                "EventsLost",
-                "Events that a subscriber lost because it did not keep up.",
-                load(&self.accounts.events_lost),
-            ),
+            count("EventsLost", "Events that a subscriber lost because it did not keep up.", self.events.lost()),
             count(
                 "ConnectionsRefused",
                 "Connections dropped because as many links were open as may be.",
@@ -197,17 +184,4 @@ const fn gauge(name: &'static str, help: &'static str, value: u64) -> Reading {
 /// Readings as the API shows them: name and number.
 pub(crate) fn pairs(readings: Vec<Reading>) -> Vec<(&'static str, u64)> {
     readings.into_iter().map(|reading| (reading.name, reading.value)).collect()
-}
-
-/// The counters that a node's earlier links have left.
-pub(super) type Earlier = Mutex<Option<Box<LinkCounters>>>;
-
-impl PeerCell {
-    fn earlier(&self) -> LinkCounters {
-        lock(&self.earlier).as_deref().cloned().unwrap_or_default()
-    }
-
-    fn keep(&self, counters: &LinkCounters) {
-        lock(&self.earlier).get_or_insert_default().merge(counters);
-    }
 }

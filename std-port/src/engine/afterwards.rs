@@ -7,9 +7,10 @@ use std::sync::{Arc, Mutex};
 
 use cara_core::error::Error;
 
-use super::{Engine, lock};
+use super::Engine;
 use crate::handler::Hook;
 use crate::lane::Lane;
+use crate::locks::lock;
 
 /// The thread, once there is a hook, and the hook for the loss of a peer.
 pub(super) struct Afterwards<T> {
@@ -57,7 +58,7 @@ impl<T> Afterwards<T> {
 impl<T: Send + 'static> Engine<T> {
     /// What makes a hook run with the state; it returns at once.
     pub(crate) fn afterwards(&self, hook: Arc<Hook<T>>) -> Result<Box<dyn Fn() + Send + Sync>, Error> {
-        self.afterwards.start()?;
+        self.services.afterwards.start()?;
         let (me, pending) = (self.me.clone(), Pending::new(hook));
         Ok(Box::new(move || {
             if let Some(engine) = me.upgrade() {
@@ -68,20 +69,20 @@ impl<T: Send + 'static> Engine<T> {
 
     /// Runs `hook` whenever a peer is lost.
     pub(crate) fn on_lost(&self, hook: Arc<Hook<T>>) -> Result<(), Error> {
-        self.afterwards.start()?;
-        *lock(&self.afterwards.lost) = Some(Pending::new(hook));
+        self.services.afterwards.start()?;
+        *lock(&self.services.afterwards.lost) = Some(Pending::new(hook));
         Ok(())
     }
 
     pub(super) fn run_lost_hook(&self) {
-        let pending = lock(&self.afterwards.lost).clone();
+        let pending = lock(&self.services.afterwards.lost).clone();
         if let Some(pending) = pending {
             self.run_afterwards(&pending);
         }
     }
 
     fn run_afterwards(&self, pending: &Arc<Pending<T>>) {
-        let lane = lock(&self.afterwards.lane).clone();
+        let lane = lock(&self.services.afterwards.lane).clone();
         let Some(lane) = lane.filter(|_| !pending.waits.swap(true, Ordering::AcqRel)) else { return };
         let (me, pending) = (self.me.clone(), pending.clone());
         lane.run(move || {

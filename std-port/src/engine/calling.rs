@@ -1,6 +1,6 @@
 //! Requests of this unit: blocking ones, whose caller reads its own reply, and those that do not wait.
 
-use std::sync::{Arc, MutexGuard, PoisonError};
+use std::sync::Arc;
 use std::task::{Context as TaskContext, Poll};
 use std::thread;
 
@@ -12,9 +12,13 @@ use cara_core::services::requests::CallId;
 use cara_core::services::unit::RequestOptions;
 use cara_core::time::{Duration, Instant};
 
+use super::Engine;
+use super::inbound::OwnCall;
 use super::link::{LinkCell, LinkState, Outcome, Waiter, Wake};
 use super::reader::{Cause, Token};
-use super::{Engine, OwnCall, READ_BYTES, RETRY};
+use super::settling::RETRY;
+use super::worker::READ_BYTES;
+use crate::locks::Locked;
 use crate::sys::stream::{Received, Wait};
 
 /// How long a caller waits at a time for room or for its turn, before it looks again.
@@ -30,7 +34,7 @@ thread_local! {
 
 /// A call whose request has gone out.
 struct Begun<'l> {
-    state: MutexGuard<'l, LinkState>,
+    state: Locked<'l, LinkState>,
     token: Option<Token>,
     id: CallId,
     now: Instant,
@@ -61,7 +65,7 @@ impl<T: Send + 'static> Engine<T> {
         parameters: &mut ParametersView,
         options: &RequestOptions,
     ) -> Result<(), Error> {
-        self.state.waiting_for(link.id, || {
+        self.services.state.waiting_for(link.id, || {
             self.go_on_with_parked();
             let begun = self.begin_call(link, function, parameters, options)?;
             self.await_reply(link, begun, parameters)
@@ -97,8 +101,7 @@ impl<T: Send + 'static> Engine<T> {
                 return Err(error);
             }
             state = link.lock();
-            let waited = link.room.wait_timeout(state, wait.into());
-            state = waited.unwrap_or_else(PoisonError::into_inner).0;
+            state = state.wait(&link.room, wait);
             now = self.now();
         }
     }
@@ -157,11 +160,11 @@ impl<T: Send + 'static> Engine<T> {
     fn read_for_reply<'l>(
         &self,
         link: &'l Arc<LinkCell>,
-        mut state: MutexGuard<'l, LinkState>,
+        mut state: Locked<'l, LinkState>,
         own: &mut OwnCall<'_>,
         mut now: Instant,
         deadline: Instant,
-    ) -> (MutexGuard<'l, LinkState>, Instant) {
+    ) -> (Locked<'l, LinkState>, Instant) {
         READ_BUFFER.with_borrow_mut(|buffer| {
             if buffer.is_empty() {
                 // Zeros of the system, none of which is touched before something is read.
@@ -217,7 +220,7 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     /// A thread no longer waits for the link: the next caller gets its token, or the pool.
-    pub(super) fn leave(&self, link: &Arc<LinkCell>, mut state: MutexGuard<'_, LinkState>, token: Option<Token>) {
+    pub(super) fn leave(&self, link: &Arc<LinkCell>, mut state: Locked<'_, LinkState>, token: Option<Token>) {
         let (now, waiter) = (self.now(), state.next_reader());
         self.read_by(now, link, &mut state, Cause::Leaves { token, waiter });
         self.settle_at(now, link, state);
@@ -229,7 +232,7 @@ impl<T: Send + 'static> Engine<T> {
         asked: Instant,
         now: Instant,
         link: &Arc<LinkCell>,
-        mut state: MutexGuard<'_, LinkState>,
+        mut state: Locked<'_, LinkState>,
         token: Token,
     ) {
         // A task reads nothing itself: it would wait until the clock gives the link to the pool.

@@ -2,12 +2,11 @@
 //! hooks, never sleeps, and looks at no file: [`look_around`](crate::threads::Driven::look_around) has a thread of its own.
 
 use cara_core::distribution::connection_handler::Sorted;
-use cara_core::error::Error;
-use cara_core::host::mailman::LinkId;
 use cara_core::time::{Duration, Instant};
 use core::net::SocketAddr;
 
-use super::{Engine, lock};
+use super::Engine;
+use crate::locks::lock;
 use crate::seldom::warn_seldom;
 use crate::sys::datagram::Socket;
 use crate::sys::stream::Accepted;
@@ -20,14 +19,11 @@ impl<T: Send + 'static> Engine<T> {
     /// Polls every link that is due; returns when the next one is.
     pub(super) fn poll_links(&self) -> Instant {
         loop {
-            let due = {
-                let mut timers = lock(&self.timers);
-                match timers.pop_due(self.clock.now()) {
-                    Some(due) => due,
-                    None => return timers.next().unwrap_or(Instant::FAR_FUTURE),
-                }
+            let due = match self.links.due(self.now()) {
+                Ok(due) => due,
+                Err(next) => return next,
             };
-            let Some(link) = self.link(LinkId(due as u16)) else { continue };
+            let Some(link) = self.link(due) else { continue };
             let mut state = link.lock();
             state.timer = Instant::FAR_FUTURE;
             if state.is_paused() {
@@ -42,16 +38,16 @@ impl<T: Send + 'static> Engine<T> {
 
     pub(super) fn datagrams_ready(&self, socket: Socket, buffer: &mut [u8]) {
         for _ in 0..BATCH {
-            let Some((count, from)) = self.datagrams.receive(socket, buffer) else { return };
+            let Some((count, from)) = self.sockets.datagrams.receive(socket, buffer) else { return };
             self.datagram(from, buffer.get_mut(..count).unwrap_or_default());
         }
     }
 
     fn datagram(&self, from: SocketAddr, bytes: &mut [u8]) {
-        let codes = self.keys.codes();
+        let codes = self.keys().codes();
         let (sorted, twin) = {
-            let mut cell = lock(&self.hub);
-            (cell.hub.node.datagram(self.clock.now(), from, bytes, &codes), cell.hub.node.take_twin())
+            let mut cell = self.hub();
+            (cell.hub.node.datagram(self.now(), from, bytes, &codes), cell.hub.node.take_twin())
         };
         if let Some(address) = twin {
             self.twin_heard(address);
@@ -71,7 +67,7 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     pub(super) fn connections_ready(&self) {
-        let Some(listener) = &self.listener else { return };
+        let Some(listener) = &self.sockets.listener else { return };
         for _ in 0..BATCH {
             match listener.accept() {
                 Accepted::Stream(stream, address) => self.accepted(stream, address),
@@ -94,18 +90,18 @@ const PAUSE: Duration = Duration::from_millis(100);
 
 impl<T: Send + 'static> Engine<T> {
     fn pause_listening(&self) {
-        let Some(listener) = &self.listener else { return };
+        let Some(listener) = &self.sockets.listener else { return };
         self.crew().unwatch(listener);
-        *lock(&self.listens_at) = Some(self.now() + PAUSE);
+        *lock(&self.sockets.listens_at) = Some(self.now() + PAUSE);
     }
 
     /// Takes connections again when the pause is over; returns when that is.
     pub(super) fn go_on_listening(&self) -> Instant {
-        let mut at = lock(&self.listens_at);
+        let mut at = lock(&self.sockets.listens_at);
         match *at {
             Some(due) if due <= self.now() => {
                 let seat = self.seat();
-                if let Some((listener, seat)) = self.listener.as_ref().zip(seat)
+                if let Some((listener, seat)) = self.sockets.listener.as_ref().zip(seat)
                     && self.crew().watch(seat, Source::Listener, listener).is_err()
                 {
                     *at = Some(self.now() + PAUSE);
@@ -118,10 +114,4 @@ impl<T: Send + 'static> Engine<T> {
             None => Instant::FAR_FUTURE,
         }
     }
-}
-
-/// What the system says goes to the log; the error tells where to look.
-pub(crate) fn system_refused(error: std::io::Error) -> Error {
-    tracing::error!(%error, "the operating system refused a thread, a socket or a descriptor");
-    Error::Network
 }

@@ -1,27 +1,71 @@
 //! The unit among those that its threads drive: how it begins, what wakes it, and how the threads let go of it.
 
 use std::path::PathBuf;
-use std::sync::Arc;
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, OnceLock};
 
 use cara_core::config::Mode;
 use cara_core::distribution::identity::{Fleet, Identity};
 use cara_core::error::Error;
 use cara_core::time::Instant;
 
-use super::{Engine, lock, system_refused, workers};
+use super::Engine;
+use super::worker::Worker;
+use crate::clock::Clock;
 use crate::error::StartError;
+use crate::error::system_refused;
 use crate::sys::datagram::Socket;
 use crate::sys::epoll::Ready;
-use crate::threads::{Crew, Driven, Source};
+use crate::threads::{Crew, Driven, Source, Threads};
+
+/// The threads that drive the unit, and whether they do.
+pub(super) struct Driver {
+    /// Its own, or those of several units.
+    threads: Threads,
+    clock: Clock,
+    /// No other unit has them.
+    own_threads: bool,
+    /// The unit's number among those that the threads drive, once it has been started.
+    seat: OnceLock<u16>,
+    /// A manager looks for a live one of its identity before it starts.
+    pub(super) asks_for_itself: bool,
+    stopping: AtomicBool,
+    /// When the unit was made.
+    born: Instant,
+}
+
+impl Driver {
+    pub(super) fn new(threads: Threads, own_threads: bool, asks_for_itself: bool) -> Self {
+        let clock = threads.crew().clock;
+        let (born, stopping) = (clock.now(), AtomicBool::new(false));
+        Self { threads, clock, own_threads, seat: OnceLock::new(), asks_for_itself, stopping, born }
+    }
+
+    pub(super) const fn clock(&self) -> Clock {
+        self.clock
+    }
+
+    pub(super) const fn born(&self) -> Instant {
+        self.born
+    }
+
+    pub(super) fn is_stopping(&self) -> bool {
+        self.stopping.load(Ordering::Acquire)
+    }
+
+    /// The unit stops; whether it did already.
+    pub(super) fn stop(&self) -> bool {
+        self.stopping.swap(true, Ordering::AcqRel)
+    }
+}
 
 impl<T: Send + 'static> Engine<T> {
     pub(super) fn crew(&self) -> &Arc<Crew> {
-        self.threads.crew()
+        self.driver.threads.crew()
     }
 
     pub(super) fn seat(&self) -> Option<u16> {
-        self.seat.get().copied()
+        self.driver.seat.get().copied()
     }
 
     /// Begins to search and to serve, driven by the unit's threads. One that runs already goes on; one that was stopped
@@ -43,13 +87,13 @@ impl<T: Send + 'static> Engine<T> {
             let (identity, fleet) = self.identity();
             return Err(StartError::AlreadyRunning { identity, fleet, at });
         }
-        if let Some(path) = self.asks_for_itself.then(holds).flatten() {
+        if let Some(path) = self.driver.asks_for_itself.then(holds).flatten() {
             let (identity, fleet) = self.identity();
             return Err(StartError::SocketHeld { identity, fleet, path });
         }
         self.crew().start()?;
         let seat = self.crew().seat(self.clone())?;
-        let _ = self.seat.set(seat);
+        let _ = self.driver.seat.set(seat);
         self.watch(seat).map_err(system_refused)?;
         self.warn_of_plain_mode();
         self.wake_looker();
@@ -58,14 +102,14 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     fn identity(&self) -> (Identity, Fleet) {
-        let node = &lock(&self.hub).hub.node;
+        let node = &self.hub().hub.node;
         (node.identity().clone(), node.fleet())
     }
 
     fn warn_of_plain_mode(&self) {
         if self.mode() == Mode::Plain {
             tracing::warn!(
-                unit = %lock(&self.hub).hub.node.identity(), discovery_port = self.discovery_port(),
+                unit = %self.hub().hub.node.identity(), discovery_port = self.discovery_port(),
                 "plain mode, without keys: whoever is on the network can read what this unit says, and speak as any unit"
             );
         }
@@ -73,9 +117,9 @@ impl<T: Send + 'static> Engine<T> {
 
     fn watch(&self, seat: u16) -> std::io::Result<()> {
         for socket in [Socket::Shared, Socket::Own] {
-            self.crew().watch(seat, Source::Datagrams(socket), self.datagrams.fd(socket))?;
+            self.crew().watch(seat, Source::Datagrams(socket), self.sockets.datagrams.fd(socket))?;
         }
-        self.listener.as_ref().map_or(Ok(()), |listener| self.crew().watch(seat, Source::Listener, listener))
+        self.sockets.listener.as_ref().map_or(Ok(()), |listener| self.crew().watch(seat, Source::Listener, listener))
     }
 
     /// Something is to be done now, or the time of the next thing has changed.
@@ -99,28 +143,28 @@ impl<T: Send + 'static> Engine<T> {
     /// From here on no thread works for the unit any more, except the one that calls.
     pub(super) fn release_threads(&self) {
         for socket in [Socket::Shared, Socket::Own] {
-            self.crew().unwatch(self.datagrams.fd(socket));
+            self.crew().unwatch(self.sockets.datagrams.fd(socket));
         }
-        if let Some(listener) = &self.listener {
+        if let Some(listener) = &self.sockets.listener {
             self.crew().unwatch(listener);
         }
         if let Some(seat) = self.seat() {
             self.crew().leave(seat);
         }
         // No thread puts a link there any more.
-        self.crew().watched.fetch_sub(self.watch.clear(), Ordering::Relaxed);
-        if self.own_threads {
+        self.crew().watched.fetch_sub(self.links.watch.clear(), Ordering::Relaxed);
+        if self.driver.own_threads {
             self.crew().stop();
         }
     }
 }
 
 impl<T: Send + 'static> Driven for Engine<T> {
-    fn ready(&self, ready: Ready, worker: &mut workers::Worker) {
+    fn ready(&self, ready: Ready, worker: &mut Worker) {
         self.link_ready(ready, worker);
     }
 
-    fn serve_waiting(&self, token: u64, worker: &mut workers::Worker) {
+    fn serve_waiting(&self, token: u64, worker: &mut Worker) {
         self.serve_link(token, worker);
     }
 

@@ -2,8 +2,9 @@
 
 use cara_core::time::{Duration, Instant};
 
-use super::{Engine, lock};
+use super::Engine;
 use crate::event::UnitEvent;
+use crate::locks::lock;
 
 /// A unit that is connected to nobody looks this often; a cable that is plugged in leads to a search at once.
 const ALONE: Duration = Duration::from_secs(3);
@@ -22,14 +23,14 @@ impl<T: Send + 'static> Engine<T> {
     /// Looks at the interfaces if it is time; returns when it will be.
     pub(super) fn watch_interfaces(&self) -> Instant {
         let now = self.now();
-        let mut watch = lock(&self.interfaces);
+        let mut watch = lock(&self.sockets.interfaces);
         if now < watch.due {
             return watch.due;
         }
-        let mut up = self.datagrams.usable();
+        let mut up = self.sockets.datagrams.usable();
         up.sort();
-        let reaches = self.datagrams.reaches_others(&up);
-        watch.due = now + if lock(&self.hub).hub.node.connected() == 0 { ALONE } else { CONNECTED };
+        let reaches = self.sockets.datagrams.reaches_others(&up);
+        watch.due = now + if self.hub().hub.node.connected() == 0 { ALONE } else { CONNECTED };
         let due = watch.due;
         let first = watch.up.is_none();
         if watch.up.as_ref() == Some(&up) {
@@ -46,7 +47,7 @@ impl<T: Send + 'static> Engine<T> {
             tracing::info!(?up, "the network interfaces have changed");
         }
         if !first {
-            lock(&self.hub).hub.node.network_changed(now);
+            self.hub().hub.node.network_changed(now);
             self.wake_clock();
         }
         if !first || !reaches {

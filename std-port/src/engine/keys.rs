@@ -1,6 +1,6 @@
 //! The keys of a unit that runs: what proves it on each link, and how they follow their file.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, OnceLock};
 
 use cara_core::config::Mode;
 use cara_core::distribution::hello::Hello;
@@ -10,9 +10,10 @@ use cara_core::time::{Duration, Instant};
 use cara_secure::keyring::{Codes, Keyring};
 use cara_secure::link::{Cipher, Credentials};
 
+use super::Engine;
 use super::link::Linux;
-use super::{Engine, lock};
 use crate::keys::{DiscoveryKey, KeyRing, LiveRing, PairKey, draw};
+use crate::locks::Rank;
 
 /// The file is looked at this often, and whenever somebody comes for whom there is no key.
 const REFRESH: Duration = Duration::from_secs(3);
@@ -83,16 +84,68 @@ impl Keys {
     }
 }
 
+/// The keys of a unit that runs, and how they follow their file.
+#[derive(Debug)]
+pub(crate) struct KeyWatch {
+    keys: Keys,
+    watched: Mutex<Watched>,
+    /// How old the keys of a link become, instead of 12 h.
+    renews_every: OnceLock<Duration>,
+}
+
+impl KeyWatch {
+    pub(super) fn new(keys: Keys, born: Instant) -> Self {
+        Self { keys, watched: Mutex::new(Watched::new(born)), renews_every: OnceLock::new() }
+    }
+
+    pub(crate) const fn keys(&self) -> &Keys {
+        &self.keys
+    }
+
+    pub(crate) fn renew_every(&self, span: Duration) {
+        let _ = self.renews_every.set(span);
+    }
+
+    pub(super) fn renews_every(&self) -> Option<Duration> {
+        self.renews_every.get().copied()
+    }
+
+    /// Keys that were taken for a unit that came are to be held against all links at once.
+    fn bring_forward(&self, now: Instant) -> bool {
+        let Keys::Ring(live) = &self.keys else { return false };
+        let mut watched = Rank::Leaf.lock(&self.watched);
+        let is_news = watched.checked.as_ref().is_some_and(|checked| !Arc::ptr_eq(checked, &live.ring()));
+        if is_news {
+            watched.due = now;
+        }
+        is_news
+    }
+
+    /// Looks at the file if it is time; returns the ring where links have not been held against it yet, and when the file
+    /// is looked at next.
+    fn look(&self, now: Instant) -> (Option<Arc<KeyRing>>, Instant) {
+        let Keys::Ring(live) = &self.keys else { return (None, Instant::FAR_FUTURE) };
+        let mut watched = Rank::Leaf.lock(&self.watched);
+        if now < watched.due {
+            return (None, watched.due);
+        }
+        watched.due = now + REFRESH;
+        refresh(live);
+        let ring = live.ring();
+        (watched.is_news(&ring).then_some(ring), watched.due)
+    }
+}
+
 /// When the keys are looked at next, and which links have been held against them.
 #[derive(Debug)]
-pub(super) struct Watched {
+struct Watched {
     due: Instant,
-    /// The ring in which every live link had its key. Another one may have been taken since, for somebody who came.
+    /// The ring in which every live link had its key. Another one may have been taken since, for a unit that came.
     checked: Option<Arc<KeyRing>>,
 }
 
 impl Watched {
-    pub(super) const fn new(born: Instant) -> Self {
+    const fn new(born: Instant) -> Self {
         Self { due: born, checked: None }
     }
 
@@ -123,47 +176,27 @@ fn refresh(live: &LiveRing) -> bool {
 
 impl<T: Send + 'static> services::Keys<Linux> for &Engine<T> {
     fn credentials(&mut self, hello: &Hello) -> Option<Credentials> {
-        let credentials = self.keys.credentials(&hello.identity);
-        self.watch_new_keys();
+        let credentials = self.keys().credentials(&hello.identity);
+        if self.key_watch.bring_forward(self.now()) {
+            self.wake_looker();
+        }
         credentials
     }
 }
 
 impl<T: Send + 'static> Engine<T> {
-    /// Keys that were taken for somebody who came are held against all links at once.
-    fn watch_new_keys(&self) {
-        let Keys::Ring(live) = &self.keys else { return };
-        let mut watched = lock(&self.watched_keys);
-        if watched.checked.as_ref().is_some_and(|checked| !Arc::ptr_eq(checked, &live.ring())) {
-            watched.due = self.now();
-            drop(watched);
-            self.wake_looker();
-        }
-    }
-
-    /// Looks at the file with the keys if it is time; returns when it will be. Whoever is not in the ring any more loses its
-    /// link, also where the ring was taken between two looks.
+    /// Looks at the file with the keys if it is time; returns when it will be. A peer that is not in the ring any more loses
+    /// its link, also where the ring was taken between two looks.
     pub(super) fn watch_keys(&self) -> Instant {
-        let Keys::Ring(live) = &self.keys else { return Instant::FAR_FUTURE };
-        let now = self.now();
-        let ring = {
-            let mut watched = lock(&self.watched_keys);
-            if now < watched.due {
-                return watched.due;
-            }
-            watched.due = now + REFRESH;
-            refresh(live);
-            let ring = live.ring();
-            watched.is_news(&ring).then_some(ring)
-        };
+        let (ring, due) = self.key_watch.look(self.now());
         if let Some(ring) = ring {
-            lock(&self.hub).hub.node.expect(ring.nodes());
+            self.hub().hub.node.expect(ring.nodes());
             self.end_links_without_keys(&ring);
         }
-        now + REFRESH
+        due
     }
 
-    /// Who was revoked loses its link.
+    /// A peer that was revoked loses its link.
     fn end_links_without_keys(&self, ring: &KeyRing) {
         for link in self.each_link() {
             let mut state = link.lock();

@@ -1,7 +1,7 @@
 //! One link as the threads share it: the session under its lock, the calls that wait, and which thread reads.
 
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError, TryLockError};
+use std::sync::{Arc, Condvar, Mutex, OnceLock};
 use std::task::Waker;
 use std::thread::Thread;
 
@@ -17,6 +17,7 @@ use core::net::SocketAddr;
 use super::notices::Notices;
 use super::peers::PeerCell;
 use super::reader::{ReadPolicy, Registration};
+use crate::locks::{Locked, Rank};
 use crate::storage::Boxed;
 use crate::sys::datagram::Datagrams;
 use crate::sys::stream::Stream;
@@ -150,17 +151,21 @@ impl LinkCell {
     }
 
     /// Handlers run outside of this lock, and no code under it leaves the state half changed.
-    pub(crate) fn lock(&self) -> MutexGuard<'_, LinkState> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    #[track_caller]
+    pub(crate) fn lock(&self) -> Locked<'_, LinkState> {
+        Rank::Link.lock(&self.state)
+    }
+
+    /// Holds the link up, from a test that goes on with the other end: two links of one unit are never locked.
+    #[cfg(test)]
+    pub(super) fn freeze(&self) -> std::sync::MutexGuard<'_, LinkState> {
+        crate::locks::lock(&self.state)
     }
 
     /// The state, unless a thread has it now.
-    pub(crate) fn try_lock(&self) -> Option<MutexGuard<'_, LinkState>> {
-        match self.state.try_lock() {
-            Ok(state) => Some(state),
-            Err(TryLockError::Poisoned(poisoned)) => Some(poisoned.into_inner()),
-            Err(TryLockError::WouldBlock) => None,
-        }
+    #[track_caller]
+    pub(crate) fn try_lock(&self) -> Option<Locked<'_, LinkState>> {
+        Rank::Link.try_lock(&self.state)
     }
 }
 
@@ -178,12 +183,14 @@ impl LinkState {
     }
 
     /// A caller that waits for its reply, and could read the link for it.
+    #[inline]
     pub(crate) fn next_reader(&self) -> Option<CallId> {
         let waits = |waiter: &&Waiter| waiter.outcome.is_none() && matches!(waiter.wake, Wake::Thread(_));
         self.waiters.iter().find(waits).map(|waiter| waiter.id)
     }
 
     /// Whether a call waits for its reply that does not read for it.
+    #[inline]
     pub(crate) fn has_task(&self) -> bool {
         self.waiters.iter().any(|waiter| matches!(waiter.wake, Wake::Task(_)))
     }

@@ -14,10 +14,10 @@ use cara_core::services::unit::{Event, Session, SessionConfig};
 use cara_core::time::{Duration, Instant};
 use core::net::{IpAddr, SocketAddr};
 
+use super::Engine;
 use super::link::{LinkCell, LinkState, StdMailman};
 use super::notices::Notice;
 use super::reader::Cause;
-use super::{Engine, lock, read, write};
 use crate::event::UnitEvent;
 use crate::seldom::warn_seldom;
 use crate::storage::Boxed;
@@ -66,7 +66,7 @@ impl HubCell {
 impl<T: Send + 'static> Door<Boxed> for &Engine<T> {
     fn enter(&mut self, act: &mut dyn FnMut(&mut Hub<Boxed>)) {
         let due = {
-            let mut cell = lock(&self.hub);
+            let mut cell = self.hub();
             act(&mut cell.hub);
             cell.hub.node.next_deadline()
         };
@@ -78,13 +78,13 @@ impl<T: Send + 'static> Door<Boxed> for &Engine<T> {
 impl<T: Send + 'static> Engine<T> {
     /// Puts a stream into the table of links. `None` when the table is full.
     fn open_link(&self, stream: Stream, address: SocketAddr, dialed: Option<Dialed<'_>>) -> Option<Arc<LinkCell>> {
-        let mut links = write(&self.links);
+        let mut links = self.links.table_mut();
         let index = links.iter().position(Option::is_none)?;
         let id = LinkId(u16::try_from(index).ok()?);
-        let now = self.clock.now();
+        let now = self.now();
         let storage = self.session_storage();
         let (serial, local, constraints) = {
-            let mut cell = lock(&self.hub);
+            let mut cell = self.hub();
             cell.serial = cell.serial.wrapping_add(1);
             let serial = cell.serial;
             cell.serials.insert(id, serial);
@@ -96,9 +96,9 @@ impl<T: Send + 'static> Engine<T> {
         };
         let dialed = dialed.is_some();
         let config = SessionConfig { link: id, dialed, address, local, constraints };
-        let mut session = Session::new(now, config, self.keys.cipher(), storage);
-        if let Some(span) = self.renews_every.get() {
-            session.renew_every(*span);
+        let mut session = Session::new(now, config, self.keys().cipher(), storage);
+        if let Some(span) = self.key_watch.renews_every() {
+            session.renew_every(span);
         }
         let link = Arc::new(LinkCell::new(self.seat()?, id, serial, stream, session, dialed));
         *links.get_mut(index)? = Some(link.clone());
@@ -122,7 +122,7 @@ impl<T: Send + 'static> Engine<T> {
             warn_seldom!(%address, "a connection was dropped: too few descriptors are left; raise the limit (ulimit -n)");
             return;
         }
-        if read(&self.links).iter().all(Option::is_some) {
+        if self.links.is_full() {
             self.make_room();
         }
         if self.open_link(stream, address, None).is_none() {
@@ -146,7 +146,7 @@ impl<T: Send + 'static> Engine<T> {
             }
             self.with(&link, &mut state, |session, cx| session.close(cx, CloseReason::HelloTimeout));
             self.settle(&link, state);
-            lock(&self.hub).hub.node.counters.add(NodeCounter::GaveWay, 1);
+            self.hub().hub.node.counters.add(NodeCounter::GaveWay, 1);
             return true;
         }
         false
@@ -167,7 +167,7 @@ impl<T: Send + 'static> Engine<T> {
     fn dial(&self, to: SocketAddr, identity: Option<&Identity>) {
         let stream = Stream::connect(to).ok();
         if stream.and_then(|stream| self.open_link(stream, to, Some(Dialed(identity)))).is_none() {
-            lock(&self.hub).hub.node.dial_failed(self.clock.now(), identity);
+            self.hub().hub.node.dial_failed(self.now(), identity);
             let (peer, reason) = (identity.cloned(), CloseReason::DialFailed);
             self.tell(UnitEvent::NotJoined { address: to, peer, reason });
         }
@@ -177,7 +177,7 @@ impl<T: Send + 'static> Engine<T> {
     /// Another live unit has this one's identity.
     pub(super) fn twin_heard(&self, address: SocketAddr) {
         let refusal = Refusal::DuplicateIdentity;
-        let own = lock(&self.hub).hub.node.identity().clone();
+        let own = self.hub().hub.node.identity().clone();
         warn_seldom!(%address, name = own.name(), id = own.id(), "{refusal}");
         self.tell(UnitEvent::NotJoined { address, peer: Some(own), reason: CloseReason::Refused(refusal) });
     }
@@ -200,8 +200,8 @@ impl<T: Send + 'static> Engine<T> {
     /// The hub has taken the peer, which has its place from here on.
     pub(super) fn joined(&self, link: &Arc<LinkCell>, state: &mut LinkState) {
         let Some(identity) = state.session.identity().cloned() else { return };
-        let limit = usize::from(lock(&self.hub).hub.node.constraints().maximum_nodes);
-        let peer = write(&self.peers).join(&identity, limit, link);
+        let limit = usize::from(self.hub().hub.node.constraints().maximum_nodes);
+        let peer = self.peers_mut().join(&identity, limit, link);
         if let Some(own) = peer.own_constraints(*state.session.constraints()) {
             self.with(link, state, |session, cx| session.set_constraints(cx, own));
         }
@@ -236,8 +236,7 @@ impl<T: Send + 'static> Engine<T> {
     /// The event that subscribers see.
     fn describe(&self, link: &LinkCell, peer: &Identity, notice: &Notice) -> Option<UnitEvent> {
         let peer = peer.clone();
-        let own_name =
-            |slot: Slot| read(&self.functions).function(slot).map(|f| f.name().to_owned()).unwrap_or_default();
+        let own_name = |slot: Slot| self.functions().function(slot).map(|f| f.name().to_owned()).unwrap_or_default();
         let their_name = |slot: Slot| {
             let state = link.lock();
             state.session.their_function_list().function(slot).map(|f| f.name().to_owned()).unwrap_or_default()
@@ -276,11 +275,9 @@ impl<T: Send + 'static> Engine<T> {
             };
             self.tell(UnitEvent::NotJoined { address, peer, reason });
         }
-        lock(&self.timers).cancel(u32::from(link.id.0));
-        lock(&self.hub).hub.node.left(self.clock.now(), link.id, reason);
-        if let Some(place) = write(&self.links).get_mut(usize::from(link.id.0)) {
-            place.take_if(|current| current.serial == link.serial);
-        }
+        self.links.cancel_timer(link.id);
+        self.hub().hub.node.left(self.now(), link.id, reason);
+        self.links.remove(link);
         // The hub may have something to do earlier than before.
         self.wake_clock();
     }
@@ -310,16 +307,16 @@ impl<T: Send + 'static> Engine<T> {
 
     /// Searches for nodes now (paper, listing line 6).
     pub(crate) fn broadcast(&self) {
-        lock(&self.hub).hub.node.broadcast(self.clock.now());
+        self.hub().hub.node.broadcast(self.now());
         self.wake_clock();
     }
 
     /// Makes all functions of the unit's list visible: to one node, or to all and those that come later. Returns the
     /// links that are to acknowledge, each with its serial.
     pub(crate) fn publish(&self, to: Option<&Identity>) -> Result<Vec<(Arc<LinkCell>, u32)>, Error> {
-        let slots: Vec<Slot> = read(&self.functions).iter().map(|function| function.slot).collect();
+        let slots: Vec<Slot> = self.functions().iter().map(|function| function.slot).collect();
         {
-            let publications = &mut lock(&self.hub).hub.publications;
+            let publications = &mut self.hub().hub.publications;
             for &slot in &slots {
                 match to {
                     None => publications.publish_to_all(slot)?,
@@ -327,7 +324,7 @@ impl<T: Send + 'static> Engine<T> {
                 }
             }
         }
-        let peers: Vec<_> = read(&self.peers).connected().cloned().collect();
+        let peers: Vec<_> = self.peers().connected().cloned().collect();
         let chosen = peers.into_iter().filter(|peer| to.is_none_or(|identity| peer.identity == *identity));
         Ok(chosen.filter_map(|peer| self.publish_on(&peer.link()?)).collect())
     }
@@ -345,8 +342,8 @@ impl<T: Send + 'static> Engine<T> {
 
     /// Removes a function: its slot's callers learn that it is gone.
     pub(crate) fn remove_function(&self, name: &str) -> Result<(), Error> {
-        let (slot, _) = write(&self.functions).remove(name)?;
-        lock(&self.hub).hub.publications.withdraw(slot);
+        let (slot, _) = self.functions_mut().remove(name)?;
+        self.hub().hub.publications.withdraw(slot);
         for link in self.each_link() {
             let mut state = link.lock();
             self.with(&link, &mut state, |session, cx| session.withdraw(cx, slot));
@@ -361,7 +358,7 @@ impl<T: Send + 'static> Engine<T> {
         told: &[(Arc<LinkCell>, u32)],
         timeout: Duration,
     ) -> Vec<Arc<LinkCell>> {
-        let deadline = self.clock.now() + timeout;
+        let deadline = self.now() + timeout;
         let missing = told.iter().filter(|(link, serial)| !self.await_acknowledgement(link, *serial, deadline));
         missing.map(|(link, _)| link.clone()).collect()
     }
@@ -369,20 +366,19 @@ impl<T: Send + 'static> Engine<T> {
     fn await_acknowledgement(&self, link: &LinkCell, serial: u32, deadline: Instant) -> bool {
         let mut state = link.lock();
         loop {
-            let now = self.clock.now();
+            let now = self.now();
             if state.session.is_acknowledged(serial) || !state.session.is_live() || now >= deadline {
                 return state.session.is_acknowledged(serial);
             }
-            let waited = link.room.wait_timeout(state, deadline.since(now).into());
-            state = waited.unwrap_or_else(std::sync::PoisonError::into_inner).0;
+            state = state.wait(&link.room, deadline.since(now));
         }
     }
 
     /// Lends the node the mailman of the unit's datagrams.
     pub(super) fn poll_node(&self) -> Instant {
         // Before the node's lock: a thread that reads a new key file keeps the ring to itself meanwhile.
-        let codes = self.keys.codes();
-        if lock(&self.hub).hub.node.searches_at() <= self.now() {
+        let codes = self.keys().codes();
+        if self.hub().hub.node.searches_at() <= self.now() {
             // What others have asked and answered may lie unread for as long as this thread was busy with other units.
             let mut buffer = [0; DATAGRAM];
             for socket in [Socket::Shared, Socket::Own] {
@@ -391,9 +387,9 @@ impl<T: Send + 'static> Engine<T> {
         }
         loop {
             let (command, serial) = {
-                let mut cell = lock(&self.hub);
-                let mut mailman = StdMailman { stream: None, datagrams: &self.datagrams };
-                let Some(command) = cell.hub.node.poll(self.clock.now(), &mut mailman, &codes) else {
+                let mut cell = self.hub();
+                let mut mailman = StdMailman { stream: None, datagrams: &self.sockets.datagrams };
+                let Some(command) = cell.hub.node.poll(self.now(), &mut mailman, &codes) else {
                     return cell.hub.node.next_deadline();
                 };
                 let serial = cell.serial_of(&command);
@@ -421,7 +417,7 @@ mod tests {
         first.start().unwrap();
         until(|| manager.number_of_s_units() == 1);
         let ended = engine.each_link().remove(0);
-        let serial = lock(&engine.hub).serials.get(&ended.id).copied();
+        let serial = engine.hub().serials.get(&ended.id).copied();
         assert!(engine.link_of(ended.id, serial).is_some_and(|link| Arc::ptr_eq(&link, &ended)));
         first.stop();
         until(|| manager.number_of_s_units() == 0);
@@ -432,7 +428,7 @@ mod tests {
         let newcomer = engine.each_link().remove(0);
         assert_eq!((newcomer.id, newcomer.serial != ended.serial), (ended.id, true), "it has the same index");
         assert!(engine.link_of(ended.id, serial).is_none());
-        let its_own = lock(&engine.hub).serials.get(&newcomer.id).copied();
+        let its_own = engine.hub().serials.get(&newcomer.id).copied();
         assert!(engine.link_of(newcomer.id, its_own).is_some());
     }
 }

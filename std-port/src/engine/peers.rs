@@ -6,14 +6,18 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use cara_core::config::Constraints;
+use cara_core::counters::Counters;
 use cara_core::distribution::identity::{Identity, Role};
 use cara_core::error::{CloseReason, Error};
+use cara_core::host::connections::LinkCounter;
 use cara_core::time::Duration;
 
-use super::accounts::Earlier;
 use super::link::LinkCell;
-use super::lock;
 use super::roster::Roster;
+use crate::locks::lock;
+
+/// The counters of a link, or of many.
+pub(crate) type LinkCounters = Counters<LinkCounter, { LinkCounter::COUNT }>;
 
 /// A node, connected or not.
 pub(crate) struct PeerCell {
@@ -25,7 +29,8 @@ pub(crate) struct PeerCell {
     left: Mutex<Option<(std::time::Instant, CloseReason)>>,
     /// What differs for this node from the unit's constraints, whether it is connected or not.
     own: Mutex<Option<OwnConstraints>>,
-    pub(super) earlier: Earlier,
+    /// What its earlier links have counted.
+    earlier: Mutex<Option<Box<LinkCounters>>>,
     /// It has told what it offers since it has its place, on this link or an earlier one.
     introduced: AtomicBool,
     /// The operator has taken it off the roster.
@@ -118,6 +123,14 @@ impl PeerCell {
             self.retired.store(true, Ordering::Relaxed);
         }
         link.is_none()
+    }
+
+    pub(super) fn earlier(&self) -> LinkCounters {
+        lock(&self.earlier).as_deref().cloned().unwrap_or_default()
+    }
+
+    pub(super) fn keep(&self, counters: &LinkCounters) {
+        lock(&self.earlier).get_or_insert_default().merge(counters);
     }
 
     fn join(&self, link: Arc<LinkCell>) {

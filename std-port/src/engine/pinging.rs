@@ -1,6 +1,6 @@
 //! Round trips of the protocol itself.
 
-use std::sync::{Arc, MutexGuard, PoisonError};
+use std::sync::Arc;
 
 use cara_core::error::Error;
 use cara_core::time::{Duration, Instant};
@@ -8,11 +8,12 @@ use cara_core::time::{Duration, Instant};
 use super::Engine;
 use super::link::{LinkCell, LinkState};
 use super::reader::Cause;
+use crate::locks::Locked;
 
 impl<T: Send + 'static> Engine<T> {
     /// Asks for a sign of life and returns how long it took. Of several callers on a link each has its turn.
     pub(crate) fn ping(&self, link: &Arc<LinkCell>, timeout: Duration) -> Result<Duration, Error> {
-        let deadline = self.clock.now() + timeout;
+        let deadline = self.now() + timeout;
         let mut state = link.lock();
         while state.pinging {
             state = self.wait(link, state, deadline)?;
@@ -27,7 +28,7 @@ impl<T: Send + 'static> Engine<T> {
     fn round_trip<'l>(
         &self,
         link: &'l Arc<LinkCell>,
-        mut state: MutexGuard<'l, LinkState>,
+        mut state: Locked<'l, LinkState>,
         deadline: Instant,
     ) -> Result<Duration, Error> {
         // A link that is kept is read by no thread until its caller is back.
@@ -53,17 +54,16 @@ impl<T: Send + 'static> Engine<T> {
     fn wait<'l>(
         &self,
         link: &'l LinkCell,
-        state: MutexGuard<'l, LinkState>,
+        state: Locked<'l, LinkState>,
         deadline: Instant,
-    ) -> Result<MutexGuard<'l, LinkState>, Error> {
+    ) -> Result<Locked<'l, LinkState>, Error> {
         if !state.session.is_live() {
             return Err(Error::NotConnected);
         }
-        let now = self.clock.now();
+        let now = self.now();
         if now >= deadline {
             return Err(Error::TimedOut);
         }
-        let waited = link.room.wait_timeout(state, deadline.since(now).into());
-        Ok(waited.unwrap_or_else(PoisonError::into_inner).0)
+        Ok(state.wait(&link.room, deadline.since(now)))
     }
 }

@@ -8,7 +8,7 @@ use cara_core::distribution::identity::Role;
 use cara_core::distribution::presence::{Heard, PRESENCE_PAUSE, PRESENCE_WAIT, Presence};
 use cara_core::time::Duration;
 
-use super::{Engine, lock};
+use super::Engine;
 use crate::builder::random;
 use crate::sys::datagram::Socket;
 use crate::sys::epoll::{Epoll, Events, Interest};
@@ -20,31 +20,32 @@ impl<T: Send + 'static> Engine<T> {
     /// Where a live manager of this unit's identity answers; `None` after a wait in which none did.
     pub(super) fn running_elsewhere(&self) -> std::io::Result<Option<SocketAddr>> {
         let presence = {
-            let node = &lock(&self.hub).hub.node;
-            if node.identity().role() != Role::MUnit || !self.asks_for_itself {
+            let node = &self.hub().hub.node;
+            if node.identity().role() != Role::MUnit || !self.driver.asks_for_itself {
                 return Ok(None);
             }
             Presence::new(node.identity().clone(), node.fleet(), node.epoch(), random())
         };
         let set = Epoll::new()?;
         for socket in [Socket::Shared, Socket::Own] {
-            set.add(self.datagrams.fd(socket), 0, Interest::READ_LEVEL)?;
+            set.add(self.sockets.datagrams.fd(socket), 0, Interest::READ_LEVEL)?;
         }
         self.wait_for_itself(presence, &set)
     }
 
     fn wait_for_itself(&self, mut presence: Presence, set: &Epoll) -> std::io::Result<Option<SocketAddr>> {
-        let (codes, mut events) = (self.keys.codes(), Events::new(2));
-        let mut next = self.clock.now();
+        let (codes, mut events) = (self.keys().codes(), Events::new(2));
+        let mut next = self.now();
         let end = next + PRESENCE_WAIT;
         loop {
-            let now = self.clock.now();
+            let now = self.now();
             if now >= end {
                 return Ok(None);
             }
             if now >= next {
                 let mut out = [0; SEARCH_BYTES];
-                let sent = presence.question(&codes, &mut out).map(|question| self.datagrams.broadcast(question));
+                let sent =
+                    presence.question(&codes, &mut out).map(|question| self.sockets.datagrams.broadcast(question));
                 tracing::debug!(?sent, "asked whether this unit runs already");
                 next = now + PRESENCE_PAUSE;
             }
@@ -59,11 +60,11 @@ impl<T: Send + 'static> Engine<T> {
         for socket in [Socket::Shared, Socket::Own] {
             let mut buffer = [0; SEARCH_BYTES + 1];
             for _ in 0..BATCH {
-                let Some((length, from)) = self.datagrams.receive(socket, &mut buffer) else { break };
+                let Some((length, from)) = self.sockets.datagrams.receive(socket, &mut buffer) else { break };
                 let mut out = [0; SEARCH_BYTES];
                 match presence.hear(from, buffer.get(..length).unwrap_or_default(), codes, &mut out) {
                     Heard::Nothing => {}
-                    Heard::Answer(answer) => drop(self.datagrams.send_to(from, answer)),
+                    Heard::Answer(answer) => drop(self.sockets.datagrams.send_to(from, answer)),
                     Heard::Running(at) => return Some(at),
                 }
             }

@@ -6,10 +6,10 @@ use std::sync::atomic::Ordering;
 
 use cara_core::time::Instant;
 
+use super::Engine;
 use super::link::{LinkCell, LinkState};
 use super::reader::{Cause, LOOK, RELIEF, Token};
 use super::watch::next_look;
-use super::{Engine, lock};
 use crate::sys::epoll::{Interest, Trigger};
 
 impl<T: Send + 'static> Engine<T> {
@@ -26,7 +26,7 @@ impl<T: Send + 'static> Engine<T> {
             Some(_) if self.is_stopping() => {}
             Some(_) => {
                 // Before the clock is told: it reads the list when it is.
-                self.watch.enlist(link.token());
+                self.links.watch.enlist(link.token());
                 self.crew().watched.fetch_add(1, Ordering::Relaxed);
                 self.begin_watch();
             }
@@ -56,7 +56,7 @@ impl<T: Send + 'static> Engine<T> {
 
     /// The clock is to look at links, until nothing happens there any more.
     pub(super) fn begin_watch(&self) {
-        if self.watch.begins() {
+        if self.links.watch.begins() {
             self.wake_clock();
         }
     }
@@ -64,22 +64,22 @@ impl<T: Send + 'static> Engine<T> {
     /// Ends what takes too long on the links of the clock's list; returns when to look again. The unit's `others` are due
     /// then.
     pub(super) fn watch_links(&self, others: Instant) -> Instant {
-        self.watch.set_next(Instant::FAR_FUTURE, others);
-        if !self.watch.is_on() {
+        self.links.watch.set_next(Instant::FAR_FUTURE, others);
+        if !self.links.watch.is_on() {
             return Instant::FAR_FUTURE;
         }
         let now = self.now();
-        let again = self.watch.look(|token| {
-            let stays = self.link_of_token(token).is_some_and(|link| self.look_at_link(now, &link));
+        let again = self.links.watch.look(|token| {
+            let stays = self.links.of_token(token).is_some_and(|link| self.look_at_link(now, &link));
             self.crew().watched.fetch_sub(usize::from(!stays), Ordering::Relaxed);
             stays
         });
         if !self.crew().relieve(now, RELIEF) && !again {
             return Instant::FAR_FUTURE;
         }
-        self.watch.go_on();
+        self.links.watch.go_on();
         let next = next_look(now);
-        self.watch.set_next(next, others);
+        self.links.watch.set_next(next, others);
         next
     }
 
@@ -101,7 +101,7 @@ impl<T: Send + 'static> Engine<T> {
     /// The clock need look at a link before `at` no more. Where it looks at no other link, its next look is put off: a
     /// wake-up every 2 ms would be in the way of each hundredth call.
     fn put_off_look(&self, now: Instant, at: Instant) {
-        let look = self.watch.next();
+        let look = self.links.watch.next();
         if look >= now + LOOK.divided_by(2)
             || self.crew().watched.load(Ordering::Relaxed) != 1
             || !self.crew().has_idle()
@@ -109,9 +109,9 @@ impl<T: Send + 'static> Engine<T> {
             return;
         }
         let Some(seat) = self.seat() else { return };
-        let due = || lock(&self.timers).next().unwrap_or(Instant::FAR_FUTURE).min(self.watch.others());
+        let due = || self.links.next_due().min(self.links.watch.others());
         if let Some(at) = self.crew().put_off(seat, look, || due().min(at)) {
-            self.watch.put_off(look, at);
+            self.links.watch.put_off(look, at);
         }
     }
 }

@@ -7,8 +7,8 @@ use std::sync::Arc;
 use cara_core::distribution::identity::{Identity, Role};
 use cara_core::error::Error;
 
+use super::Engine;
 use super::peers::{PeerCell, Peers};
-use super::{Engine, write};
 use crate::keys::KeyRing;
 
 /// Most nodes of a plain manager that are expected beyond those that have a place: names cost nothing there, so that
@@ -94,8 +94,8 @@ impl Peers {
 impl<T: Send + 'static> Engine<T> {
     /// The nodes with the roster as the keys are now.
     fn with_roster<R>(&self, act: impl FnOnce(&Peers) -> R) -> R {
-        let ring = self.keys.ring().map(|live| live.ring());
-        let mut peers = write(&self.peers);
+        let ring = self.keys().ring().map(|live| live.ring());
+        let mut peers = self.peers_mut();
         if let Some(ring) = ring {
             peers.expect(&ring);
         }

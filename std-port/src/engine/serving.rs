@@ -1,7 +1,7 @@
 //! Running the peers' calls: on the thread of the pool that read them; emergencies on the thread of their service.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::{Arc, MutexGuard, PoisonError};
+use std::sync::Arc;
 
 use cara_core::config::Priority;
 use cara_core::distribution::function_list::{FunctionList, Slot};
@@ -10,17 +10,17 @@ use cara_core::error::{Error, ServiceError};
 use cara_core::services::unit::Call;
 use cara_core::time::{Duration, Instant};
 
+use super::Engine;
 use super::link::{LinkCell, LinkState};
-use super::reader::Cause;
 use super::state_gate::{Entered, Turn};
-use super::workers::{Worker, arena};
-use super::{Engine, read};
+use super::worker::{Worker, arena};
 use crate::handler::{self, Handler, Run};
 use crate::lease::LeaseWatch;
+use crate::locks::Locked;
 use crate::storage::Boxed;
 
 /// How long an answer waits for room at a time.
-const PAUSE: std::time::Duration = std::time::Duration::from_millis(20);
+const PAUSE: Duration = Duration::from_millis(20);
 
 /// A call that has begun.
 #[derive(Clone, Copy)]
@@ -47,7 +47,7 @@ impl<T: Send + 'static> Engine<T> {
     /// A call has begun, under its link's lock: it takes its turn.
     pub(super) fn begun(&self, functions: &FunctionList<Boxed, Handler<T>>, link: &LinkCell, call: Call) -> Begun {
         let takes_state = functions.function(call.slot).is_some_and(|function| function.handler.run.takes_state());
-        Begun { call, turn: takes_state.then(|| self.state.take_turn(Some(link.id))) }
+        Begun { call, turn: takes_state.then(|| self.services.state.take_turn(Some(link.id))) }
     }
 
     /// Runs a call and those that waited behind it.
@@ -67,14 +67,14 @@ impl<T: Send + 'static> Engine<T> {
         link: &'l Arc<LinkCell>,
         begun: Begun,
         worker: &mut Worker,
-    ) -> Option<(MutexGuard<'l, LinkState>, Instant)> {
+    ) -> Option<(Locked<'l, LinkState>, Instant)> {
         let occupied = self.crew().occupancy.enter();
         let ran = self.run(link, begun, &mut worker.arguments);
         drop(occupied);
         let result = match ran {
             Ran::Over(result) => result,
             Ran::NotYet(turn) => {
-                self.ran(self.now(), link, &mut link.lock(), Duration::MAX);
+                link.lock().reading.ran(Duration::MAX);
                 let spare = arena(worker.longest());
                 let arguments = std::mem::replace(&mut worker.arguments, spare);
                 self.park(turn, Parked { link: link.clone(), call: begun.call, arguments });
@@ -83,20 +83,16 @@ impl<T: Send + 'static> Engine<T> {
         };
         let now = self.now();
         let mut state = link.lock();
-        self.ran(now, link, &mut state, now.since(began));
+        state.reading.ran(now.since(began));
         state.backlog.moved(now);
         Some((self.answer(now, link, state, &begun.call, result, &worker.arguments), now))
-    }
-
-    fn ran(&self, now: Instant, link: &LinkCell, state: &mut LinkState, took: Duration) {
-        self.read_by(now, link, state, Cause::Ran { took });
     }
 
     /// Takes the next call that may begin on a link; another thread is told if there is one more.
     pub(super) fn next_call(
         &self,
         link: &Arc<LinkCell>,
-        mut state: MutexGuard<'_, LinkState>,
+        mut state: Locked<'_, LinkState>,
         worker: &mut Worker,
     ) -> Option<Begun> {
         let mut next = None;
@@ -117,7 +113,7 @@ impl<T: Send + 'static> Engine<T> {
     /// Begins the next call of a link.
     pub(super) fn take_call(&self, link: &LinkCell, state: &mut LinkState, worker: &mut Worker) -> Option<Begun> {
         let call = self.with(link, state, |session, cx| session.next_call(cx, &mut worker.arguments))?;
-        Some(self.begun(&read(&self.functions), link, call))
+        Some(self.begun(&self.functions(), link, call))
     }
 
     /// Gives emergencies that have come to the threads of their services. No thread that reads runs them.
@@ -126,8 +122,8 @@ impl<T: Send + 'static> Engine<T> {
             let mut arguments = arena(self.call_bytes());
             let call = self.with(link, state, |session, cx| session.next_emergency(cx, &mut arguments));
             let Some(call) = call else { return };
-            let begun = self.begun(&read(&self.functions), link, call);
-            self.run_emergency(&read(&self.functions), link, begun, arguments);
+            let begun = self.begun(&self.functions(), link, call);
+            self.run_emergency(&self.functions(), link, begun, arguments);
         }
     }
 
@@ -162,13 +158,13 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     fn park(&self, turn: Turn, parked: Parked) {
-        self.state.park(turn, parked);
+        self.services.state.park(turn, parked);
         self.go_on_with_parked();
     }
 
     /// Calls that were parked and have their turn now are left to the pool.
     pub(super) fn go_on_with_parked(&self) {
-        if self.state.has_ready()
+        if self.services.state.has_ready()
             && let Some(seat) = self.seat()
         {
             self.crew().hand_over(crate::threads::token(seat, u64::MAX));
@@ -177,7 +173,7 @@ impl<T: Send + 'static> Engine<T> {
 
     /// Runs a call that was parked, and those that wait behind it on its link.
     pub(super) fn serve_parked(&self, worker: &mut Worker) {
-        let Some((Parked { link, call, arguments }, turn)) = self.state.take_ready() else { return };
+        let Some((Parked { link, call, arguments }, turn)) = self.services.state.take_ready() else { return };
         self.go_on_with_parked();
         let now = self.now();
         // A command that waited for its turn may no longer be wanted.
@@ -200,14 +196,14 @@ impl<T: Send + 'static> Engine<T> {
 
     /// Whether the lease of a call that has waited here still lasts, if it has one.
     fn is_wanted(&self, now: Instant, call: &Call) -> bool {
-        let functions = read(&self.functions);
+        let functions = self.functions();
         let lease = functions.function(call.slot).and_then(|function| function.handler.lease.as_ref()).zip(call.order);
         lease.is_none_or(|(service, order)| service.lease.is_live_for(order, now))
     }
 
     fn give_up(&self, turn: Option<Turn>) {
         if let Some(turn) = turn {
-            self.state.give_up(turn);
+            self.services.state.give_up(turn);
             self.go_on_with_parked();
         }
     }
@@ -227,8 +223,8 @@ impl<T: Send + 'static> Engine<T> {
                 Ran::Over(guarded(&told, || run(&told, arguments)))
             }
             Run::Method(run) => {
-                let turn = turn.unwrap_or_else(|| self.state.take_turn(Some(link.id)));
-                let result = match self.state.enter_by(turn) {
+                let turn = turn.unwrap_or_else(|| self.services.state.take_turn(Some(link.id)));
+                let result = match self.services.state.enter_by(turn) {
                     Entered::Held(mut state) => guarded(&told, || run(&mut state, &told, arguments)),
                     Entered::NotYet => return Ran::NotYet(turn),
                     Entered::Refused(error) => Err(error),
@@ -243,7 +239,7 @@ impl<T: Send + 'static> Engine<T> {
     fn prepare(&self, link: &LinkCell, call: &Call) -> Result<(Run<T>, handler::Call), Error> {
         let peer = link.peer.get().ok_or(Error::NotConnected)?;
         let (run, lease, safe) = {
-            let functions = read(&self.functions);
+            let functions = self.functions();
             let Handler { run, lease, safe, .. } = functions.function(call.slot).ok_or(Error::StaleFunction)?.handler;
             (run.clone(), lease.clone(), safe.clone())
         };
@@ -259,7 +255,7 @@ impl<T: Send + 'static> Engine<T> {
             priority: call.priority,
             deadline: call.deadline,
             wants_reply: call.wants_reply,
-            lease: lease.zip(call.order).map(|(lease, order)| LeaseWatch::new(lease, Some(order), self.clock)),
+            lease: lease.zip(call.order).map(|(lease, order)| LeaseWatch::new(lease, Some(order), self.clock())),
         };
         Ok((run, told))
     }
@@ -269,11 +265,11 @@ impl<T: Send + 'static> Engine<T> {
         &self,
         mut now: Instant,
         link: &'l Arc<LinkCell>,
-        mut state: MutexGuard<'l, LinkState>,
+        mut state: Locked<'l, LinkState>,
         call: &Call,
         result: Result<(), Error>,
         results: &ParametersView,
-    ) -> MutexGuard<'l, LinkState> {
+    ) -> Locked<'l, LinkState> {
         loop {
             let answer = match result {
                 Ok(()) => Ok(results),
@@ -289,7 +285,7 @@ impl<T: Send + 'static> Engine<T> {
             }
             self.settle(link, state);
             state = link.lock();
-            state = link.room.wait_timeout(state, PAUSE).unwrap_or_else(PoisonError::into_inner).0;
+            state = state.wait(&link.room, PAUSE);
             now = self.now();
         }
     }

@@ -15,10 +15,9 @@ use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::ThreadId;
 use std::time::{Duration, Instant};
 
+use crate::locks::lock;
 use cara_core::error::Error;
 use cara_core::host::mailman::LinkId;
-
-use super::lock;
 
 /// How long a thread of the pool waits for a turn before it parks the call: methods are short as a rule.
 const PATIENCE: Duration = Duration::from_millis(1);

@@ -6,8 +6,8 @@
 //! token away ([`Engine::watch_links`]), so that other threads read on; until then that link's stream waits, but not its
 //! datagrams, which carry emergencies and keep-alives as well, and no other link.
 
+use std::sync::Arc;
 use std::sync::atomic::Ordering;
-use std::sync::{Arc, MutexGuard};
 
 use cara_core::error::CloseReason;
 use cara_core::time::Instant;
@@ -17,7 +17,8 @@ use super::link::{LinkCell, LinkState};
 use super::reader::{Cause, Token};
 use super::serving::Begun;
 use super::watch::Staying;
-use super::workers::Worker;
+use super::worker::Worker;
+use crate::locks::Locked;
 use crate::sys::stream::{Received, Wait};
 
 impl<T: Send + 'static> Engine<T> {
@@ -47,7 +48,7 @@ impl<T: Send + 'static> Engine<T> {
         if !self.crew().has_idle() {
             return None;
         }
-        let staying = self.watch.stay()?;
+        let staying = self.links.watch.stay()?;
         let now = self.now();
         let mut state = link.lock();
         let may = state.waiters.is_empty() && state.session.is_live() && !state.is_paused();
@@ -61,7 +62,7 @@ impl<T: Send + 'static> Engine<T> {
         &self,
         now: Instant,
         link: &'l Arc<LinkCell>,
-        mut state: MutexGuard<'l, LinkState>,
+        mut state: Locked<'l, LinkState>,
         token: Token,
     ) -> bool {
         self.read_by(now, link, &mut state, Cause::Ends(token));

@@ -11,8 +11,8 @@ use cara_core::services::slots_for;
 use cara_core::services::unit::{RequestOptions, SessionStorage};
 use cara_core::time::Instant;
 
+use super::Engine;
 use super::link::{LinkCell, LinkState};
-use super::{Engine, lock, read, write};
 use crate::config::Capacities;
 use crate::storage::{Boxed, filled, filled_with};
 use crate::sys::limits;
@@ -54,8 +54,8 @@ impl<T: Send + 'static> Engine<T> {
     /// as many files open.
     pub(super) fn make_node_room(&self, nodes: u16) -> Result<(), Error> {
         let nodes = usize::from(nodes);
-        let links = nodes + self.capacities.pending_links;
-        if read(&self.links).len() >= links {
+        let links = nodes + self.links.capacities.pending_links;
+        if self.links.table().len() >= links {
             return Ok(());
         }
         if !limits::make_room_for(links) {
@@ -63,8 +63,8 @@ impl<T: Send + 'static> Engine<T> {
         }
         // The node first: it is to know every link that there can be.
         let longer = node_storage(nodes, links);
-        lock(&self.hub).hub.node.grow(longer.nodes, longer.order, longer.links);
-        let mut cells = write(&self.links);
+        self.hub().hub.node.grow(longer.nodes, longer.order, longer.links);
+        let mut cells = self.links.table_mut();
         let length = cells.len().max(links);
         cells.resize_with(length, || None);
         Ok(())
@@ -72,7 +72,8 @@ impl<T: Send + 'static> Engine<T> {
 
     /// The slices that a session begins with.
     pub(super) fn session_storage(&self) -> SessionStorage<Boxed> {
-        let Capacities { calls_in_flight, calls_running, their_functions, their_signature_bytes, .. } = self.capacities;
+        let Capacities { calls_in_flight, calls_running, their_functions, their_signature_bytes, .. } =
+            self.links.capacities;
         SessionStorage {
             small: filled(LINK_BUFFER_BYTES, 0),
             pending: filled(first_calls(calls_in_flight), None),
@@ -85,7 +86,7 @@ impl<T: Send + 'static> Engine<T> {
 
     /// Slots of the unit's own list that are in use: those up to its last function.
     fn own_functions(&self) -> usize {
-        let functions = read(&self.functions);
+        let functions = self.functions();
         functions.iter().map(|function| usize::from(function.slot.0) + 1).max().unwrap_or(0)
     }
 
@@ -107,7 +108,7 @@ impl<T: Send + 'static> Engine<T> {
             Err(Error::Full(Limit::Calls)) => {}
             outcome => return outcome,
         }
-        let most = self.capacities.calls_in_flight;
+        let most = self.links.capacities.calls_in_flight;
         if state.session.call_slots() >= most {
             return Err(Error::Full(Limit::Calls));
         }
@@ -121,7 +122,7 @@ impl<T: Send + 'static> Engine<T> {
         if entries > 0 && bytes >= SIGNATURE_BYTES {
             return;
         }
-        let Capacities { their_functions, their_signature_bytes, .. } = self.capacities;
+        let Capacities { their_functions, their_signature_bytes, .. } = self.links.capacities;
         let (all_entries, all_bytes) = state.session.their_function_list().capacity();
         let (used_entries, used_bytes) = (all_entries.saturating_sub(entries), all_bytes.saturating_sub(bytes));
         let entries = longer(all_entries, used_entries.saturating_add(1), their_functions);

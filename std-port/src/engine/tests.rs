@@ -10,6 +10,7 @@ use std::sync::{Arc, Mutex};
 use cara_core::config::{Constraints, LONGEST_KEEP_ALIVE, Mode};
 use cara_core::distribution::hello::Hello;
 use cara_core::distribution::identity::Epoch;
+use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 use cara_core::host::connections::LinkCounter;
 use cara_core::host::frame::{self, Frame};
@@ -19,6 +20,7 @@ use rustix::net::sockopt;
 
 use super::accounts::{Group, Reading};
 use super::*;
+use crate::locks::lock;
 use crate::sys::datagram::Socket;
 use crate::sys::epoll::wait_readable;
 use crate::testing::{Pair, fleet, until};
@@ -68,7 +70,7 @@ fn a_full_socket_is_watched_for_room_each_time() {
     sockopt::set_socket_send_buffer_size(&near.stream, 8 * 1024).unwrap();
     let mut sent = 0;
     for _ in 0..3 {
-        let frozen = far.lock();
+        let frozen = far.freeze();
         loop {
             let state = near.lock();
             if state.session.wants_to_write() {
@@ -118,7 +120,7 @@ fn a_proven_link_gives_way_to_none() {
     let (engine, near, far) = (pair.manager.engine(), pair.near(), pair.far());
     let dial = || TcpStream::connect((Ipv4Addr::LOCALHOST, engine.tcp_port())).unwrap();
     // Another life of the vehicle waits until the first one has been asked, and that one does not answer.
-    let frozen = far.lock();
+    let frozen = far.freeze();
     let earlier = near.lock().session.hello().unwrap().clone();
     let hello = Hello { epoch: Epoch(earlier.epoch.0 + 1), nonce: earlier.nonce + 1, ..earlier };
     let (mut bytes, mut framed) = ([0; 256], [0; 512]);
@@ -203,7 +205,7 @@ fn the_deadline_of_a_call_is_that_of_its_first_try() {
             scope.spawn(call);
             until(|| tries() > before);
             // It has begun, so that its time is over by then at the latest.
-            let latest = pair.agv.engine().clock.now() + TIMEOUT;
+            let latest = pair.agv.engine().now() + TIMEOUT;
             until(|| tries() > before + 20);
             buffers.into_iter().for_each(|buffer| pool.give(buffer));
             latest
@@ -229,7 +231,7 @@ fn nothing_is_left_of_a_call_that_has_timed_out() {
     let open = open;
     for clock_is_held_up in [true, true, false] {
         // The clock ends the call, or the caller does where the clock waits for the node.
-        let held_up = clock_is_held_up.then(|| lock(&engine.hub));
+        let held_up = clock_is_held_up.then(|| engine.freeze_hub());
         engine.wake_clock();
         let outcome = pair.peer.block_request_with("wait", &mut text(1), &options(Duration::from_millis(50)));
         assert_eq!(outcome, Err(Error::TimedOut));
@@ -253,11 +255,11 @@ fn what_lies_unread_is_read_before_a_question_goes_out() {
     };
     // None is started: this thread is their clock.
     let units: Vec<Unit> = (1..=UNITS).map(&mut vehicle).collect();
-    let is_due = |unit: &Unit| lock(&unit.engine().hub).hub.node.searches_at() <= unit.engine().now();
+    let is_due = |unit: &Unit| unit.engine().hub().hub.node.searches_at() <= unit.engine().now();
     until(|| units.iter().all(is_due));
     for (index, unit) in units.iter().enumerate() {
         if index > 0 {
-            wait_readable(unit.engine().datagrams.fd(Socket::Shared), PATIENT).unwrap();
+            wait_readable(unit.engine().sockets.datagrams.fd(Socket::Shared), PATIENT).unwrap();
         }
         unit.engine().keep_time();
     }

@@ -5,45 +5,18 @@
 //! quick it starts none: the clock does, should it take long after all.
 
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
 
-use cara_core::distribution::parameters::{Parameters, ParametersView};
 use cara_core::error::CloseReason;
 
+use super::Engine;
 use super::link::{LinkCell, LinkState};
 use super::serving::Begun;
-use super::{Engine, READ_BYTES};
+use super::worker::{READ_BYTES, Worker};
 use crate::sys::epoll::{Interest, Ready};
 use crate::sys::stream::{Received, Wait};
 
 /// Reads of one link in a row, so that a busy one does not keep a thread from the others.
 const READS: usize = 8;
-
-/// What a thread of the pool reads into and serves calls in, whichever unit they are for.
-pub(crate) struct Worker {
-    pub(super) buffer: Vec<u8>,
-    pub(super) arguments: Box<ParametersView>,
-    /// The longest call that `arguments` have room for.
-    longest: usize,
-}
-
-impl Worker {
-    pub(crate) fn new() -> Self {
-        Self { buffer: vec![0; READ_BYTES], arguments: arena(0), longest: 0 }
-    }
-
-    pub(super) const fn longest(&self) -> usize {
-        self.longest
-    }
-
-    /// The limit may have been raised since the last call.
-    pub(super) fn fit(&mut self, longest: usize) {
-        if self.longest < longest {
-            self.arguments = arena(longest);
-            self.longest = longest;
-        }
-    }
-}
 
 impl<T: Send + 'static> Engine<T> {
     /// Whether a call may be run: another thread goes on reading.
@@ -64,18 +37,18 @@ impl<T: Send + 'static> Engine<T> {
         may
     }
 
-    /// Bytes that the parameters of a served call may need: of a message, or of the largest function.
+    /// Bytes that the parameters of a served call may need.
     pub(super) fn call_bytes(&self) -> usize {
-        self.longest_message.load(Ordering::Acquire).max(self.largest_function.load(Ordering::Acquire))
+        self.services.call_bytes()
     }
 
     /// Calls are served with room for at least so many bytes of arguments and results.
     pub(crate) fn make_room_for(&self, bytes: usize) {
-        self.largest_function.fetch_max(bytes, Ordering::AcqRel);
+        self.services.make_room_for(bytes);
     }
 
     pub(super) fn link_ready(&self, ready: Ready, worker: &mut Worker) {
-        let Some(link) = self.link_of_token(ready.token) else { return };
+        let Some(link) = self.links.of_token(ready.token) else { return };
         worker.fit(self.call_bytes());
         let mut state = link.lock();
         if state.reading.is_opening() && ready.writable {
@@ -130,29 +103,10 @@ impl<T: Send + 'static> Engine<T> {
     pub(super) fn serve_link(&self, token: u64, worker: &mut Worker) {
         worker.fit(self.call_bytes());
         self.serve_parked(worker);
-        let Some(link) = self.link_of_token(token) else { return };
+        let Some(link) = self.links.of_token(token) else { return };
         let state = link.lock();
         if let Some(call) = self.next_call(&link, state, worker) {
             self.serve(&link, call, worker);
         }
-    }
-}
-
-/// Bytes of the parameters in which calls of up to `message` bytes are served: as much again for results and names.
-pub(crate) const fn arena_bytes(message: usize) -> usize {
-    match message {
-        0..=2048 => 8 * 1024,
-        2049..=20_000 => 48 * 1024,
-        20_001..=40_000 => 96 * 1024,
-        _ => 320 * 1024,
-    }
-}
-
-pub(super) fn arena(message: usize) -> Box<ParametersView> {
-    match message {
-        0..=2048 => Box::new(Parameters::<{ arena_bytes(0) }>::sized()),
-        2049..=20_000 => Box::new(Parameters::<{ arena_bytes(20_000) }>::sized()),
-        20_001..=40_000 => Box::new(Parameters::<{ arena_bytes(40_000) }>::sized()),
-        _ => Box::new(Parameters::<{ arena_bytes(usize::MAX) }>::sized()),
     }
 }

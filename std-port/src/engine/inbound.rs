@@ -1,0 +1,176 @@
+//! What arrives on a link: bytes are given to its session, and what comes out is a call, a reply, or something to be noted.
+
+use std::sync::Arc;
+
+use cara_core::distribution::function_list::FunctionList;
+use cara_core::distribution::parameters::ParametersView;
+use cara_core::error::Error;
+use cara_core::services::access::Access;
+use cara_core::services::unit::Event;
+use cara_core::services::{Context, requests::CallId};
+use cara_core::time::Instant;
+
+use super::Engine;
+use super::link::{LinkCell, LinkState, StdMailman};
+use super::serving::{self, Begun};
+use super::worker::arena;
+use crate::handler::Handler;
+use crate::storage::Boxed;
+
+/// The call of its own that a thread reads for.
+pub(super) struct OwnCall<'p> {
+    pub(super) id: CallId,
+    pub(super) parameters: &'p mut ParametersView,
+    pub(super) result: Option<Result<(), Error>>,
+}
+
+/// What one step of feeding led to.
+struct Step {
+    consumed: usize,
+    paused: bool,
+    /// Something was consumed or came out: there may be more.
+    progress: bool,
+    joined: bool,
+    call: Option<Begun>,
+}
+
+impl Step {
+    /// Nothing was looked at.
+    const PAUSED: Self = Self { consumed: 0, paused: true, progress: false, joined: false, call: None };
+}
+
+impl<T: Send + 'static> Engine<T> {
+    /// Gives the session what was read. Returns the call that is to be run, its arguments in `arguments`.
+    pub(super) fn feed(
+        &self,
+        now: Instant,
+        link: &Arc<LinkCell>,
+        state: &mut LinkState,
+        bytes: &mut [u8],
+        mut arguments: Option<&mut ParametersView>,
+        mut own: Option<&mut OwnCall<'_>>,
+    ) -> Option<Begun> {
+        let (was_paused, stalled) = (state.is_paused(), state.backlog.is_stalled(now));
+        let (mut earlier, mut position) = state.backlog.take();
+        let bytes = if was_paused {
+            earlier.extend_from_slice(bytes);
+            &mut earlier[..]
+        } else {
+            bytes
+        };
+        let mut call = None;
+        loop {
+            let rest = bytes.get_mut(position..).unwrap_or_default();
+            let step = if !rest.is_empty() && !stalled && state.holds_back() {
+                Step::PAUSED
+            } else {
+                let arguments = arguments.as_deref_mut().filter(|_| call.is_none());
+                self.step(now, link, state, rest, arguments, own.as_deref_mut())
+            };
+            position += step.consumed;
+            call = call.or(step.call);
+            // One emergency alone has a place to wait, and the next one may be among these bytes.
+            self.dispatch_emergencies(link, state);
+            if step.joined {
+                self.joined(link, state);
+            }
+            if step.paused && was_paused {
+                state.backlog.put(earlier, position);
+                return call;
+            }
+            if step.paused {
+                state.backlog.put(bytes.get(position..).unwrap_or_default().to_vec(), 0);
+                state.backlog.moved(now);
+                return call;
+            }
+            let through = position == bytes.len() && !state.session.holds_received();
+            if through || !step.progress {
+                return call;
+            }
+        }
+    }
+
+    /// One call of `Session::receive`, with its event taken apart; an emergency goes to the thread of its service.
+    fn step(
+        &self,
+        now: Instant,
+        link: &Arc<LinkCell>,
+        state: &mut LinkState,
+        bytes: &mut [u8],
+        mut arguments: Option<&mut ParametersView>,
+        own: Option<&mut OwnCall<'_>>,
+    ) -> Step {
+        self.make_list_room(state);
+        let functions = self.functions();
+        let mut mailman = StdMailman { stream: Some(&link.stream), datagrams: &self.sockets.datagrams };
+        let mut buffers = &self.pool;
+        let asked = self.guard.ask();
+        let access = asked.as_ref().map(|asked| asked as &dyn Access);
+        let (mut hub, mut keys) = (self, self);
+        let mut cx = Context {
+            now,
+            mailman: &mut mailman,
+            buffers: &mut buffers,
+            functions: &*functions,
+            access,
+            hub: &mut hub,
+            keys: &mut keys,
+        };
+        let LinkState { session, waiters, notices, .. } = state;
+        let receipt = session.receive(&mut cx, bytes, arguments.as_deref_mut());
+        let mut step = Step {
+            consumed: receipt.consumed,
+            paused: receipt.paused,
+            progress: receipt.consumed > 0 || receipt.event.is_some(),
+            joined: false,
+            call: None,
+        };
+        match receipt.event {
+            None => {}
+            Some(Event::Joined) => step.joined = true,
+            Some(Event::Call(call)) => {
+                let begun = self.begun(&functions, link, call);
+                match arguments.filter(|_| serving::is_emergency(&call)) {
+                    None => step.call = Some(begun),
+                    Some(arguments) => self.copy_emergency(&functions, link, begun, arguments),
+                }
+            }
+            Some(Event::Reply(id, outcome)) => match own.filter(|own| own.id == id) {
+                Some(own) => own.result = Some(outcome.and_then(|block| block.read_into(own.parameters))),
+                None => {
+                    let outcome =
+                        outcome.map(|block| (block.signature().as_bytes().into(), Box::<[u8]>::from(block.bytes())));
+                    if let Some(waiter) = waiters.iter_mut().find(|waiter| waiter.id == id) {
+                        waiter.finish(outcome);
+                    }
+                }
+            },
+            Some(event) => {
+                if matches!(event, Event::ListChanged) && !link.is_introduced() {
+                    // A node that counts has its place.
+                    link.peer.get().into_iter().for_each(|peer| self.peers_mut().introduce(peer));
+                    link.introduce();
+                }
+                if let Event::LeaseExpired(slot) = event {
+                    self.wake_leased(&functions, slot);
+                }
+                notices.note(&event);
+            }
+        }
+        step
+    }
+
+    /// The thread that has read an emergency goes on reading.
+    fn copy_emergency(
+        &self,
+        functions: &FunctionList<Boxed, Handler<T>>,
+        link: &Arc<LinkCell>,
+        begun: Begun,
+        arguments: &ParametersView,
+    ) {
+        let mut copy = arena(self.call_bytes());
+        if copy.copy_from(arguments).is_ok() {
+            self.run_emergency(functions, link, begun, copy);
+        }
+    }
+}

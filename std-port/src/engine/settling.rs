@@ -1,0 +1,90 @@
+//! Giving a link's lock up: whatever a thread has done under it, the session is polled, its timer and its registration with
+//! epoll are set, and what happened is acted upon.
+
+use std::sync::Arc;
+
+use cara_core::services::unit::Event;
+use cara_core::time::{Duration, Instant};
+
+use super::Engine;
+use super::link::{LinkCell, LinkState};
+use crate::locks::Locked;
+
+/// A link on which reading is paused is looked at again after this.
+pub(super) const RETRY: Duration = Duration::from_millis(1);
+
+impl<T: Send + 'static> Engine<T> {
+    /// Polls the session as far as something is due, sets its timer and epoll interest, gives the lock up, and acts on
+    /// what happened.
+    pub(crate) fn settle<'l>(&self, link: &'l Arc<LinkCell>, guard: Locked<'l, LinkState>) {
+        self.settle_at(self.now(), link, guard);
+    }
+
+    pub(super) fn settle_at<'l>(&self, now: Instant, link: &'l Arc<LinkCell>, mut guard: Locked<'l, LinkState>) {
+        let state = &mut *guard;
+        self.dispatch_emergencies(link, state);
+        let mut deadline = state.session.deadline();
+        if deadline <= now {
+            self.poll_session(link, state);
+            deadline = state.session.deadline();
+        }
+        self.set_timer(now, deadline, link, state);
+        self.set_interest(link, state);
+        if state.notices.begin() {
+            self.act(link, guard);
+        }
+    }
+
+    fn poll_session(&self, link: &Arc<LinkCell>, state: &mut LinkState) {
+        loop {
+            let event = self.with(link, state, |session, cx| session.poll(cx));
+            match event {
+                None => return,
+                Some(Event::Reply(id, outcome)) => {
+                    state.finish(id, outcome.map(|_| Default::default()));
+                }
+                Some(event) => {
+                    if let Event::Closed(_) = event {
+                        link.stream.shutdown();
+                        link.room.notify_all();
+                    }
+                    self.note(state, &event);
+                }
+            }
+        }
+    }
+
+    /// An event that is acted upon when the lock is given up; only what waits for the end of a lease is woken before.
+    pub(super) fn note(&self, state: &mut LinkState, event: &Event<'_>) {
+        if let Event::LeaseExpired(slot) = *event {
+            self.wake_leased(&self.functions(), slot);
+        }
+        state.notices.note(event);
+    }
+
+    fn set_timer(&self, now: Instant, mut deadline: Instant, link: &LinkCell, state: &mut LinkState) {
+        if state.is_paused() {
+            deadline = deadline.min(now + RETRY);
+        }
+        // A timer that is early does no harm: it is set again when it comes.
+        if deadline < state.timer {
+            state.timer = deadline;
+            if self.links.set_timer(link.id, deadline) {
+                self.wake_clock_at(deadline);
+            }
+        }
+    }
+
+    /// Gives up a link's lock and acts on what happened under it. What happens meanwhile is left to the thread that is
+    /// acting on earlier things.
+    fn act<'l>(&self, link: &'l Arc<LinkCell>, mut state: Locked<'l, LinkState>) {
+        if !state.notices.begin() {
+            return;
+        }
+        while let Some(notices) = state.notices.next() {
+            drop(state);
+            notices.into_iter().for_each(|notice| self.act_on(link, notice));
+            state = link.lock();
+        }
+    }
+}
