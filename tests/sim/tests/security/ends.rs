@@ -198,12 +198,9 @@ impl End {
             let receipt = self.session.receive(context!(self), &mut bytes, Some(&mut arguments));
             let quiet = receipt.consumed == 0 && receipt.event.is_none();
             let consumed = receipt.consumed;
-            match receipt.event {
-                Some(Event::Call(call)) => {
-                    self.ran += 1;
-                    let _ = self.session.answer(context!(self), call.ticket, Ok(&arguments));
-                }
-                _ => {}
+            if let Some(Event::Call(call)) = receipt.event {
+                self.ran += 1;
+                let _ = self.session.answer(context!(self), call.ticket, Ok(&arguments));
             }
             bytes.drain(..consumed);
             if quiet {
@@ -234,9 +231,8 @@ impl End {
             let _ = self.session.answer(context!(self), call.ticket, Ok(&arguments));
         }
         while let Some(event) = self.session.poll(context!(self)) {
-            match event {
-                Event::Closed(reason) => self.closed = Some(reason),
-                _ => {}
+            if let Event::Closed(reason) = event {
+                self.closed = Some(reason);
             }
         }
     }
