@@ -4,10 +4,10 @@
 //! |---|---|
 //! | 0–3 | magic of the mode |
 //! | 4 | version |
-//! | 5 | kind: 1 who-has, 2 announce, 3 session |
+//! | 5 | kind: 1 [`WhoHas`], 2 [`Announce`], 3 session |
 //! | 6–7 | zero |
 //! | 8–11 | fleet, little-endian |
-//! | 12– | who-has, announce: postcard; session: link u16, zero u16, nonce u64, body |
+//! | 12– | [`WhoHas`], [`Announce`]: postcard; session: link u16, zero u16, nonce u64, body |
 //!
 //! In secured mode a search and an answer end with the fleet's code, over everything before it. An answer to one unit
 //! has the pair's code as well, in front of the fleet's. A [`WhoHas`] and a broadcast [`Announce`] are padded with
