@@ -42,7 +42,9 @@ struct Wire {
     /// The epoll set reports the stream.
     armed: bool,
     /// Requests that the peer has, in the order in which they came.
-    asked: Vec<u32>,
+    asked: VecDeque<u32>,
+    /// The replies come in the order of the requests, and not the last one first.
+    in_order: bool,
     closed: bool,
 }
 
@@ -216,9 +218,9 @@ impl Link {
     /// The request goes out, and the peer answers.
     fn send(&self, id: u32) {
         let mut wire = self.wire.lock().unwrap();
-        wire.asked.push(id);
+        wire.asked.push_back(id);
         if wire.asked.len() >= self.together {
-            while let Some(id) = wire.asked.pop() {
+            while let Some(id) = if wire.in_order { wire.asked.pop_front() } else { wire.asked.pop_back() } {
                 wire.items.push_back(Item::Reply(id));
             }
             self.readable.notify_all();
@@ -496,6 +498,7 @@ fn a_future_gets_its_reply_from_a_caller_or_from_the_pool() {
 fn a_caller_that_gives_up_passes_the_token_on() {
     check(2, || {
         let link = Link::new(3);
+        link.wire.lock().unwrap().in_order = true;
         let hasty = spawn(&link, |link| {
             link.call(2, false);
         });
@@ -516,6 +519,23 @@ fn what_is_left_when_a_caller_gives_up_is_read_by_the_pool() {
         });
         link.call_future(1);
         hasty.join().unwrap();
+        link.close();
+        pool.join().unwrap();
+    });
+}
+
+/// A thread of the pool that was told of the link comes to read it when a caller does so already.
+#[test]
+fn the_pool_keeps_off_a_link_that_a_caller_reads() {
+    check(2, || {
+        let link = Link::new(0);
+        let pool = spawn(&link, Link::pool);
+        let peer = spawn(&link, |link| {
+            link.wire.lock().unwrap().items.push_back(Item::Call);
+            link.readable.notify_all();
+        });
+        assert!(link.call(1, true));
+        peer.join().unwrap();
         link.close();
         pool.join().unwrap();
     });
