@@ -2,7 +2,7 @@
 
 use crate::time::Duration;
 
-/// Where the remedy of an [`Error`] lies.
+/// Where the remedy of an [`Error`] lies. There are these four and no others, so a `match` on it needs no other arm.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Cause {
     /// The program or its configuration must change; trying again does not help.
@@ -19,6 +19,7 @@ pub enum Cause {
 /// are those of the Linux port, on a board they are the lengths of the lent slices.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, thiserror::Error)]
 #[repr(u8)]
+#[non_exhaustive]
 pub enum Limit {
     /// `Constraints::maximum_nodes`, or the table of nodes.
     #[error("as many nodes are connected as may be: raise maximum_nodes")]
@@ -90,6 +91,7 @@ impl Constraint {
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, thiserror::Error)]
 #[repr(u8)]
+#[non_exhaustive]
 pub enum Refusal {
     /// The two speak different versions of the protocol.
     #[error("the peer speaks another version of the protocol: update one of the two")]
@@ -129,6 +131,7 @@ pub enum Refusal {
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, thiserror::Error)]
 #[repr(u8)]
+#[non_exhaustive]
 pub enum CloseReason {
     /// The other unit was stopped in an orderly way.
     #[error("the peer was stopped: start it again if it is wanted")]
@@ -172,6 +175,7 @@ pub enum CloseReason {
 
 /// What a handler answers instead of results.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, thiserror::Error)]
+#[non_exhaustive]
 pub enum ServiceError {
     /// The service failed with a code of its own.
     #[error("the service failed with code {0}: see the peer's documentation for its meaning")]
@@ -191,6 +195,7 @@ pub enum ServiceError {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, thiserror::Error)]
 // A wide tag: the rest is then moved in words, and not byte by byte.
 #[repr(u32)]
+#[non_exhaustive]
 pub enum Error {
     // --- configuration
     /// The peer has published no function of this name to this unit.

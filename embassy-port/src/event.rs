@@ -12,6 +12,7 @@ pub type Name = heapless::String<NAME_BYTES>;
 
 /// Something happened that no call returned.
 #[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum UnitEvent {
     /// A node is connected.
     Joined {

@@ -8,6 +8,7 @@ use core::net::SocketAddr;
 
 /// Something happened that no call returned.
 #[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum UnitEvent {
     /// A node is connected.
     Joined {

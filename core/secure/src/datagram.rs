@@ -44,6 +44,7 @@ impl DatagramKey {
 
 /// Why a datagram is not taken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
 pub enum DatagramError {
     /// Shorter than any sealed one.
     #[error("the datagram is too short")]

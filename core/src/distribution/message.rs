@@ -324,6 +324,7 @@ impl<'b> Control<'b> {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 #[repr(u8)]
 #[cfg_attr(test, derive(Serialize, Deserialize))]
+#[non_exhaustive]
 pub enum LeaseEnd {
     /// The service has done what was asked for.
     Finished,

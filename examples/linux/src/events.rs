@@ -22,9 +22,11 @@ fn show(event: &UnitEvent) {
             LeaseEnd::Finished => say!("{function} at {peer} is finished"),
             LeaseEnd::Expired => say!("lease of {function} at {peer} expired"),
             LeaseEnd::Replaced => say!("{function} at {peer} goes on for a newer call"),
+            _ => say!("lease of {function} at {peer} {}", why.word()),
         },
         UnitEvent::NotJoined { address, reason, .. } => say!("{address} did not join: {reason}"),
         UnitEvent::InterfacesChanged { up } => say!("interfaces that are up: {}", up.join(" ")),
         UnitEvent::FunctionsSkipped { peer, skipped } => say!("{peer} has no room for {skipped} functions"),
+        _ => say!("{event:?}"),
     }
 }

@@ -5,6 +5,7 @@ use std::ops::Range;
 
 /// Why a file is no access table. `Display` has a line for each mistake: `FILE:LINE:COLUMN: what is wrong: what to do`.
 #[derive(Clone, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum AccessError {
     /// It cannot be read.
     Unreadable {

@@ -135,6 +135,7 @@ pub(super) fn event(event: &UnitEvent, at: Duration) -> Answer {
                 LeaseEnd::Finished => format!("'{function}' is finished there"),
                 LeaseEnd::Expired => format!("'{function}' stopped there: it was not renewed in time"),
                 LeaseEnd::Replaced => format!("'{function}' goes on there for a newer call"),
+                _ => format!("'{function}' ended there: {}", why.word()),
             };
             ("lease_ended", Some(peer), text)
         }

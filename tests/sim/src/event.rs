@@ -32,6 +32,7 @@ impl StreamId {
 
 /// Something that a host must look at. Each names the host, and most one of its streams.
 #[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum NetEvent {
     /// The stream that this host dialled is open.
     Connected {

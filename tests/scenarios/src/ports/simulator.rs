@@ -533,5 +533,7 @@ fn seen(event: UnitEvent) -> Option<Seen> {
         UnitEvent::LeaseEnded { function, why, .. } => Seen::LeaseEnded(function, why),
         UnitEvent::InterfaceChanged { up } => Seen::InterfaceChanged(up),
         UnitEvent::Started | UnitEvent::Stopped | UnitEvent::Called { .. } => return None,
+        // A scenario that did not see it would pass for the wrong reason.
+        other => panic!("no scenario knows {other:?}"),
     })
 }

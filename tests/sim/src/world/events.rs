@@ -7,6 +7,7 @@ use cara_core::services::requests::CallId;
 
 /// Something that happened to a unit.
 #[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum UnitEvent {
     /// The unit began a life.
     Started,

@@ -328,5 +328,7 @@ fn seen(event: UnitEvent) -> Option<Seen> {
         UnitEvent::LeaseEnded { function, why, .. } => Seen::LeaseEnded(function.to_string(), why),
         UnitEvent::AddressChanged { address } => Seen::InterfaceChanged(address.is_some()),
         UnitEvent::FunctionsSkipped { .. } => return None,
+        // A scenario that did not see it would pass for the wrong reason.
+        other => panic!("no scenario knows {other:?}"),
     })
 }
