@@ -1,17 +1,56 @@
-//! The core of CARA: discovery, links, requests and leases as state machines without IO.
+//! The core of CARA: state machines for calling services between AGVs and their managers, which a port polls.
 //!
-//! It has no operating system, allocator, clock, socket, thread or `unsafe`. A port lends it memory
-//! ([`storage`]), the current time ([`time::Instant`]), random numbers and a [`Mailman`](host::mailman::Mailman) for bytes,
-//! and polls it; time passes only through arguments. Three layers, of which each uses only those below it:
+//! It decides everything that both ends must agree on: who is found and taken, what may be called, how long a call or a
+//! motion goes on. It has no sockets, clock, threads, allocator or `async`. A program uses a port (`cara-std`,
+//! `cara-embassy`, the simulator); this crate is for those who write one.
 //!
-//! - [`services`]: a [`Session`](services::unit::Session) is one link with a peer: requests, replies, published functions,
-//!   leases, access control;
-//! - [`distribution`]: a [`Node`](distribution::connection_handler::Node) finds peers and decides which links are dialled,
-//!   accepted and refused; functions, parameters and messages and their encoding;
-//! - [`host`]: frames, chunks, send queues and the interface of the cipher.
+//! # Layers
+//! Each layer calls the one below; results come up as return values.
 //!
-//! Limits are in [`config`], errors in [`error`]. Applications use a port, such as `cara-std` or `cara-embassy`.
-//! `docs/porting.md` shows how one is written, `ARCHITECTURE.md` where everything is.
+//! | layer (paper, section 2) | holds |
+//! |---|---|
+//! | [`services`] | one link's conversation ([`Session`]), requests, calls, leases, access, publications |
+//! | [`distribution`] | parameters, signatures, function lists, messages, discovery and membership ([`Node`]) |
+//! | [`host`] | links: frames, chunks, liveness; the traits [`Mailman`] and [`Secure`](host::secure::Secure) |
+//!
+//! Beside them stand [`config`], [`error`], [`time`] and [`storage`], which every layer may use.
+//!
+//! # From one application to the other
+//! ```text
+//! request -> function list (find, check) -> message (encode in place) -> link -> frame -> Mailman => network
+//! network => Session::receive -> frame -> link -> message (decode, borrowed) -> Event::Call | Event::Reply | …
+//! ```
+//!
+//! # Polling
+//! The port calls a machine when bytes have come, when a stream can be written to again, and at its deadline. Each call is
+//! lent the time and everything else that it may touch in a [`Context`]. After each call the port takes events until there
+//! are none, and asks for the next deadline. A session that is not polled keeps its state and sends nothing.
+//!
+//! ```
+//! use cara_core::time::Instant;
+//! use cara_core::{Context, Event, Port, Session};
+//!
+//! /// Does what is due on a link; returns when to come back.
+//! fn poll<P: Port>(session: &mut Session<P>, cx: &mut Context<'_, P>) -> Instant {
+//!     while let Some(event) = session.poll(cx) {
+//!         match event {
+//!             Event::LeaseExpired(_function) => { /* its safe hook, before anything else */ }
+//!             Event::Closed(_reason) => { /* close the stream, tell the node that it left */ }
+//!             _ => { /* replies, news: to the application */ }
+//!         }
+//!     }
+//!     session.deadline()
+//! }
+//!
+//! /// Lends what a stream has brought; returns how much of it was used. The rest is to be lent again.
+//! fn read<P: Port>(session: &mut Session<P>, cx: &mut Context<'_, P>, bytes: &mut [u8]) -> usize {
+//!     let receipt = session.receive(cx, bytes, None);
+//!     if let Some(Event::Reply(_call, _results)) = receipt.event { /* wake its caller */ }
+//!     receipt.consumed
+//! }
+//! ```
+//!
+//! The whole contract stands in `docs/notes/driving-the-core.md`, the way to a new port in `docs/porting.md`.
 #![no_std]
 
 #[cfg(test)]
@@ -30,3 +69,13 @@ pub mod time;
 pub mod distribution;
 pub mod host;
 pub mod services;
+
+pub use distribution::connection_handler::Node;
+pub use distribution::function::{Definition, Signature};
+pub use distribution::identity::Identity;
+pub use distribution::parameters::{Parameters, ParametersView};
+pub use error::{Error, ServiceError};
+pub use host::mailman::Mailman;
+pub use services::hub::Hub;
+pub use services::unit::{Event, Session};
+pub use services::{Context, Port};

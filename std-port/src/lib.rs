@@ -42,16 +42,17 @@ pub mod metrics;
 mod my_function_list;
 mod occupancy;
 mod peer;
-pub mod pool;
+mod pool;
 mod safe_hook;
 mod seldom;
-pub mod storage;
+mod storage;
 pub mod survey;
+#[doc(hidden)]
 pub mod sys;
 #[cfg(test)]
 mod testing;
 mod threads;
-pub mod timers;
+mod timers;
 mod unit;
 
 pub use builder::{BuildError, Builder};

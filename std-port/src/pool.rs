@@ -11,7 +11,7 @@ use crate::storage::{Boxed, filled};
 
 /// Buffers of one size, at most `capacity` in use at a time; shared by all threads of a unit.
 #[derive(Debug)]
-pub struct MessagePool {
+pub(crate) struct MessagePool {
     state: Mutex<State>,
     capacity: usize,
     keep: usize,
@@ -29,7 +29,7 @@ struct State {
 
 /// What a pool has done so far.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct PoolCounters {
+pub(crate) struct PoolCounters {
     /// Buffers that are out now.
     pub in_use: usize,
     /// Most buffers that were out at one time.
@@ -42,18 +42,18 @@ pub struct PoolCounters {
 
 impl MessagePool {
     /// A pool of at most `capacity` buffers of `size` bytes, which keeps at most `keep` of them while idle.
-    pub fn new(size: usize, capacity: usize, keep: usize) -> Self {
+    pub(crate) fn new(size: usize, capacity: usize, keep: usize) -> Self {
         let state = State { idle: Vec::new(), size, in_use: 0, peak: 0, exhausted: 0 };
         Self { state: Mutex::new(state), capacity, keep }
     }
 
     /// Takes a buffer of zeros or of an earlier message's bytes; `None` when `capacity` are out.
-    pub fn take(&self) -> Option<Box<[u8]>> {
+    pub(crate) fn take(&self) -> Option<Box<[u8]>> {
         self.take_leaving(0)
     }
 
     /// Takes a buffer if `left` others may still be taken after it.
-    pub fn take_leaving(&self, left: usize) -> Option<Box<[u8]>> {
+    pub(crate) fn take_leaving(&self, left: usize) -> Option<Box<[u8]>> {
         let mut state = self.lock();
         if state.in_use.saturating_add(left) >= self.capacity {
             state.exhausted = state.exhausted.saturating_add(1);
@@ -70,7 +70,7 @@ impl MessagePool {
     }
 
     /// Gives a buffer back; it is freed when enough are kept, or when the size has changed since.
-    pub fn give(&self, buffer: Box<[u8]>) {
+    pub(crate) fn give(&self, buffer: Box<[u8]>) {
         let mut state = self.lock();
         state.in_use = state.in_use.saturating_sub(1);
         if state.idle.len() < self.keep && buffer.len() == state.size {
@@ -82,7 +82,7 @@ impl MessagePool {
     }
 
     /// Changes the size of the buffers that are taken from now on; those that are out keep theirs.
-    pub fn resize(&self, size: usize) {
+    pub(crate) fn resize(&self, size: usize) {
         let mut state = self.lock();
         if state.size != size {
             state.size = size;
@@ -91,12 +91,12 @@ impl MessagePool {
     }
 
     /// Frees every buffer that is kept. For a unit that has been idle for a while.
-    pub fn shrink(&self) {
+    pub(crate) fn shrink(&self) {
         self.lock().idle = Vec::new();
     }
 
     /// The counters as they are now.
-    pub fn counters(&self) -> PoolCounters {
+    pub(crate) fn counters(&self) -> PoolCounters {
         let state = self.lock();
         PoolCounters { in_use: state.in_use, peak: state.peak, idle: state.idle.len(), exhausted: state.exhausted }
     }

@@ -4,19 +4,19 @@ use cara_core::storage::Storage;
 
 /// Names boxed slices as the kind of storage of a state machine.
 #[derive(Debug, Clone, Copy)]
-pub enum Boxed {}
+pub(crate) enum Boxed {}
 
 impl Storage for Boxed {
     type Slice<T: 'static> = Box<[T]>;
 }
 
 /// A slice of `length` copies of `value`.
-pub fn filled<T: Clone>(length: usize, value: T) -> Box<[T]> {
+pub(crate) fn filled<T: Clone>(length: usize, value: T) -> Box<[T]> {
     vec![value; length].into_boxed_slice()
 }
 
 /// A slice of `length` values, each made by `value`; for types that cannot be cloned.
-pub fn filled_with<T>(length: usize, value: impl FnMut() -> T) -> Box<[T]> {
+pub(crate) fn filled_with<T>(length: usize, value: impl FnMut() -> T) -> Box<[T]> {
     std::iter::repeat_with(value).take(length).collect()
 }
 

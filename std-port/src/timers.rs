@@ -6,7 +6,7 @@ use cara_core::time::Instant;
 
 /// The deadline of each link, by its index. Every change costs O(log n).
 #[derive(Debug, Default)]
-pub struct Timers {
+pub(crate) struct Timers {
     ordered: BTreeSet<(Instant, u32)>,
     /// By link; what stands here stands in `ordered` as well.
     deadlines: Vec<Option<Instant>>,
@@ -14,14 +14,14 @@ pub struct Timers {
 
 impl Timers {
     /// No timers.
-    pub fn new() -> Self {
+    pub(crate) fn new() -> Self {
         Self::default()
     }
 
     /// Sets the deadline of `link`, in place of an earlier one. [`Instant::FAR_FUTURE`] cancels it.
     ///
     /// Returns whether the earliest deadline of all is now earlier than before, so that a waiting thread must be woken.
-    pub fn set(&mut self, link: u32, deadline: Instant) -> bool {
+    pub(crate) fn set(&mut self, link: u32, deadline: Instant) -> bool {
         if self.deadline(link) == Some(deadline) {
             return false;
         }
@@ -42,30 +42,30 @@ impl Timers {
     }
 
     /// As [`set`](Self::set), unless the deadline of `link` is earlier already.
-    pub fn bring_forward(&mut self, link: u32, deadline: Instant) -> bool {
+    pub(crate) fn bring_forward(&mut self, link: u32, deadline: Instant) -> bool {
         let earlier = self.deadline(link).is_none_or(|known| deadline < known);
         earlier && self.set(link, deadline)
     }
 
     /// Forgets the deadline of `link`, if it has one.
-    pub fn cancel(&mut self, link: u32) {
+    pub(crate) fn cancel(&mut self, link: u32) {
         if let Some(old) = self.deadlines.get_mut(link as usize).and_then(Option::take) {
             self.ordered.remove(&(old, link));
         }
     }
 
     /// The deadline of `link`.
-    pub fn deadline(&self, link: u32) -> Option<Instant> {
+    pub(crate) fn deadline(&self, link: u32) -> Option<Instant> {
         self.deadlines.get(link as usize).copied().flatten()
     }
 
     /// The earliest deadline of all.
-    pub fn next(&self) -> Option<Instant> {
+    pub(crate) fn next(&self) -> Option<Instant> {
         self.ordered.first().map(|&(deadline, _)| deadline)
     }
 
     /// Takes out the link whose deadline is the earliest, if it is not after `now`.
-    pub fn pop_due(&mut self, now: Instant) -> Option<u32> {
+    pub(crate) fn pop_due(&mut self, now: Instant) -> Option<u32> {
         let &(deadline, link) = self.ordered.first()?;
         if deadline > now {
             return None;
@@ -75,12 +75,14 @@ impl Timers {
     }
 
     /// How many links have a deadline.
-    pub fn len(&self) -> usize {
+    #[cfg(test)]
+    pub(crate) fn len(&self) -> usize {
         self.ordered.len()
     }
 
     /// Whether no link has a deadline.
-    pub fn is_empty(&self) -> bool {
+    #[cfg(test)]
+    pub(crate) fn is_empty(&self) -> bool {
         self.ordered.is_empty()
     }
 }

@@ -11,20 +11,20 @@ use super::timespec;
 /// A timer as a descriptor; to be watched with [`Trigger::Edge`](super::epoll::Trigger::Edge), so that it is never read.
 /// The time during which the system was suspended counts.
 #[derive(Debug)]
-pub struct Alarm {
+pub(crate) struct Alarm {
     timer: OwnedFd,
 }
 
 impl Alarm {
     /// An alarm that is not set.
-    pub fn new() -> io::Result<Self> {
+    pub(crate) fn new() -> io::Result<Self> {
         let flags = TimerfdFlags::CLOEXEC | TimerfdFlags::NONBLOCK;
         Ok(Self { timer: timerfd_create(TimerfdClockId::Boottime, flags)? })
     }
 
     /// Sets it to go off once at a time on the boot clock, instead of when it was set to before; at once if that has
     /// passed. A thread that is held up on its way here does not make it late.
-    pub fn set(&self, boot_time: Duration) {
+    pub(crate) fn set(&self, boot_time: Duration) {
         // Zero would unset it.
         let it_value = timespec(boot_time.max(Duration::from_micros(1)));
         let once = Itimerspec { it_interval: timespec(Duration::ZERO), it_value };

@@ -1,13 +1,13 @@
 //! The few system calls of the port, each behind a safe type: readiness, TCP streams, UDP datagrams, interfaces.
 //!
-//! Nothing here knows the protocol, starts a thread or holds a lock across a call that may block.
+//! It is public for this repository's tests, and no part of the port's interface. Nothing here knows the protocol, starts a thread or holds a lock across a call that may block.
 
-pub mod alarm;
+pub(crate) mod alarm;
 pub mod datagram;
 pub mod epoll;
 pub mod interfaces;
 pub mod limits;
-pub mod stream;
+pub(crate) mod stream;
 
 use cara_core::time::Duration;
 use rustix::time::Timespec;

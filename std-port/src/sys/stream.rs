@@ -18,11 +18,11 @@ use rustix::net::{
 use super::epoll::wait_readable;
 
 /// The longest that one blocking receive lasts; a waiting caller looks at its deadline and timers this often.
-pub const SLICE: Duration = Duration::from_millis(50);
+pub(crate) const SLICE: Duration = Duration::from_millis(50);
 
 /// Bytes that may wait unsent in the kernel before it calls the socket full: an emergency has no more in front of it
 /// than this and one message.
-pub const UNSENT_BYTES: u32 = 16 * 1024;
+pub(crate) const UNSENT_BYTES: u32 = 16 * 1024;
 
 /// Connections that the kernel completes ahead of `accept`: a fleet that dials a restarted manager at once.
 const BACKLOG: i32 = 1024;
@@ -32,7 +32,7 @@ const SLICES: usize = 8;
 
 /// How long [`Stream::receive`] may wait.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Wait {
+pub(crate) enum Wait {
     /// Not at all.
     Not,
     /// Up to [`SLICE`], in one system call.
@@ -44,7 +44,7 @@ pub enum Wait {
 
 /// What [`Stream::receive`] brought.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Received {
+pub(crate) enum Received {
     /// This many bytes, at least one, at the front of the buffer.
     Bytes(usize),
     /// Nothing came in the time given, or a signal ended the wait.
@@ -55,14 +55,14 @@ pub enum Received {
 
 /// A TCP connection, or one that is being dialled. Any thread may use it at any time.
 #[derive(Debug)]
-pub struct Stream {
+pub(crate) struct Stream {
     socket: OwnedFd,
 }
 
 impl Stream {
     /// Starts to connect to `to` and returns at once; the stream is writable when the attempt has ended, and
     /// [`finish_connect`](Self::finish_connect) tells how. Sending or receiving before that finds it closed or blocked.
-    pub fn connect(to: SocketAddr) -> Result<Self, CloseReason> {
+    pub(crate) fn connect(to: SocketAddr) -> Result<Self, CloseReason> {
         let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
         let socket = socket_with(AddressFamily::of(to), SocketType::STREAM, flags, None).map_err(dial_failed)?;
         set_options(&socket).map_err(dial_failed)?;
@@ -73,7 +73,7 @@ impl Stream {
     }
 
     /// How the attempt to connect has ended: `Ok(true)` connected and ready to use, `Ok(false)` not ended yet.
-    pub fn finish_connect(&self) -> Result<bool, CloseReason> {
+    pub(crate) fn finish_connect(&self) -> Result<bool, CloseReason> {
         sockopt::socket_error(&self.socket).and_then(|outcome| outcome).map_err(dial_failed)?;
         let peer = match getpeername(&self.socket) {
             Ok(peer) => peer,
@@ -89,7 +89,7 @@ impl Stream {
     }
 
     /// The same stream behind the lowest descriptor that is free, if that is lower than its own.
-    pub fn with_lowest_number(self) -> Self {
+    pub(crate) fn with_lowest_number(self) -> Self {
         match fcntl_dupfd_cloexec(&self.socket, 0) {
             Ok(socket) if socket.as_raw_fd() < self.socket.as_raw_fd() => Self { socket },
             _ => self,
@@ -97,19 +97,20 @@ impl Stream {
     }
 
     /// The peer's address; `None` when the stream is not connected.
-    pub fn peer_address(&self) -> Option<SocketAddr> {
+    pub(crate) fn peer_address(&self) -> Option<SocketAddr> {
         getpeername(&self.socket).ok().flatten()?.try_into().ok()
     }
 
     /// The address of this end; `None` when the stream is not connected.
-    pub fn local_address(&self) -> Option<SocketAddr> {
+    #[cfg(test)]
+    pub(crate) fn local_address(&self) -> Option<SocketAddr> {
         getsockname(&self.socket).ok()?.try_into().ok()
     }
 
     /// Sends what the kernel takes of `slices`, in order, without waiting; 0 when it has no room.
     ///
     /// One system call; from the ninth slice on, the next call sends the rest. No bytes to send are 0 as well.
-    pub fn send(&self, slices: &[&[u8]]) -> Result<usize, CloseReason> {
+    pub(crate) fn send(&self, slices: &[&[u8]]) -> Result<usize, CloseReason> {
         let flags = SendFlags::DONTWAIT | SendFlags::NOSIGNAL;
         loop {
             let sent = match slices {
@@ -139,7 +140,7 @@ impl Stream {
     }
 
     /// Receives into `buffer`, which must not be empty.
-    pub fn receive(&self, buffer: &mut [u8], wait: Wait) -> Received {
+    pub(crate) fn receive(&self, buffer: &mut [u8], wait: Wait) -> Received {
         let flags = match wait {
             Wait::Not => RecvFlags::DONTWAIT,
             Wait::Slice => RecvFlags::empty(),
@@ -159,13 +160,13 @@ impl Stream {
     }
 
     /// Whether bytes, or the stream's end, wait to be received.
-    pub fn has_unread(&self) -> bool {
+    pub(crate) fn has_unread(&self) -> bool {
         ioctl_fionread(&self.socket).is_ok_and(|count| count > 0)
     }
 
     /// Ends both directions: what was sent still goes out, a thread that waits in a receive returns, and both ends
     /// find the stream closed.
-    pub fn shutdown(&self) {
+    pub(crate) fn shutdown(&self) {
         // A stream that is not connected (any more) is closed already.
         let _ = shutdown(&self.socket, Shutdown::Both);
     }
@@ -197,7 +198,7 @@ fn dial_failed(errno: Errno) -> CloseReason {
 
 /// What [`Listener::accept`] brought.
 #[derive(Debug)]
-pub enum Accepted {
+pub(crate) enum Accepted {
     /// A new connection and the address of its other end.
     Stream(Stream, SocketAddr),
     /// No connection is waiting.
@@ -209,14 +210,14 @@ pub enum Accepted {
 
 /// Takes connections from other units.
 #[derive(Debug)]
-pub struct Listener {
+pub(crate) struct Listener {
     socket: OwnedFd,
     port: u16,
 }
 
 impl Listener {
     /// Listens on `port` of `address`; port 0 lets the kernel choose.
-    pub fn open(address: Ipv4Addr, port: u16) -> io::Result<Self> {
+    pub(crate) fn open(address: Ipv4Addr, port: u16) -> io::Result<Self> {
         let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
         let socket = socket_with(AddressFamily::INET, SocketType::STREAM, flags, None)?;
         // Connections of an earlier process that linger must not keep a restarted one from its port. Where the kernel
@@ -229,12 +230,12 @@ impl Listener {
     }
 
     /// The port that it listens on.
-    pub const fn port(&self) -> u16 {
+    pub(crate) const fn port(&self) -> u16 {
         self.port
     }
 
     /// Takes the next waiting connection, never waits for one.
-    pub fn accept(&self) -> Accepted {
+    pub(crate) fn accept(&self) -> Accepted {
         loop {
             match accept_with(&self.socket, SocketFlags::CLOEXEC) {
                 Ok(socket) => {
