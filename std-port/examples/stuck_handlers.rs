@@ -22,9 +22,9 @@ fn main() -> Result<(), Box<dyn Error>> {
     let rounds = std::env::args().nth(1).map_or(Ok(1_000), |rounds| rounds.parse::<usize>())?;
     let fleet = std::process::id();
     let manager = CommunicationSystem::builder("manager", 1)?.fleet(fleet).interfaces(Interfaces::Loopback);
-    let manager = manager.insecure().build_system()?;
+    let manager = manager.insecure().build()?;
     let vehicle = Unit::builder("agv", 7, "manager", 1)?.fleet(fleet).interfaces(Interfaces::Loopback);
-    let vehicle = vehicle.insecure().state(()).build_unit()?;
+    let vehicle = vehicle.insecure().state(()).build()?;
     vehicle.set_constraints(Constraints { calls_per_peer: 128, ..vehicle.constraints() })?;
     let (hook, hooks) = channel();
     offer(&vehicle, hook)?;

@@ -1,6 +1,7 @@
 //! Builder of a unit: identity first, then whatever differs from the defaults.
 
 use std::hash::{BuildHasher, Hasher, RandomState};
+use std::marker::PhantomData;
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -17,11 +18,11 @@ use core::net::SocketAddr;
 use crate::access::AccessTable;
 #[cfg(feature = "access")]
 use crate::access::{AccessError, watch::FileWatch};
-use crate::communication_system::{CommunicationSystem, Owner};
 use crate::config::Capacities;
 use crate::engine::{Engine, EngineParts, HubCell, Keys, message_buffer_bytes, node_storage};
 use crate::error::StartError;
 use crate::error::system_refused;
+use crate::handle::{Handle, MUnit, Owner, SUnit};
 use crate::keys::{KeyError, KeyRing, LiveRing};
 use crate::pool::MessagePool;
 use crate::storage::{filled, filled_with};
@@ -29,13 +30,18 @@ use crate::sys::datagram::Datagrams;
 use crate::sys::interfaces::Interfaces;
 use crate::sys::stream::Listener;
 use crate::threads::Threads;
-use crate::unit::Unit;
 
 /// Message buffers that a unit keeps while it is idle.
 const KEPT_BUFFERS: usize = 8;
 
-/// Makes a [`CommunicationSystem`] or a [`Unit`].
-pub struct Builder<T> {
+/// Makes a [`CommunicationSystem`](crate::CommunicationSystem) or a [`Unit`](crate::Unit), by the role `R`.
+///
+/// What only an m_unit has, an s_unit's builder does not:
+///
+/// ```compile_fail
+/// cara_std::Unit::builder("agv", 7, "depot", 1).unwrap().tcp_port(4000);
+/// ```
+pub struct Builder<T, R> {
     pub(crate) identity: Identity,
     pub(crate) target: Target,
     fleet: Fleet,
@@ -55,10 +61,16 @@ pub struct Builder<T> {
     access_file: Option<FileWatch>,
     asks_for_itself: bool,
     state: T,
+    role: PhantomData<fn() -> R>,
 }
 
-impl Builder<()> {
+impl<R> Builder<(), R> {
     pub(crate) fn new(identity: Identity, target: Target) -> Self {
+        #[cfg(feature = "control")]
+        let control = match identity.role() {
+            Role::MUnit => crate::control::Control::Default,
+            Role::SUnit => crate::control::Control::Off,
+        };
         let constraints = match identity.role() {
             Role::MUnit => Constraints::M_UNIT,
             Role::SUnit => Constraints {
@@ -80,17 +92,67 @@ impl Builder<()> {
             threads: None,
             m_units: None,
             #[cfg(feature = "control")]
-            control: crate::control::Control::Default,
+            control,
             access: None,
             #[cfg(feature = "access")]
             access_file: None,
             asks_for_itself: true,
             state: (),
+            role: PhantomData,
         }
     }
 }
 
-impl<T: Send + 'static> Builder<T> {
+impl<T: Send + 'static> Builder<T, MUnit> {
+    /// The TCP port on which the m_unit takes connections; one that is free unless set. For s_units that are told a
+    /// [`manager_address`](Self::manager_address).
+    pub fn tcp_port(mut self, port: u16) -> Self {
+        self.tcp_port = port;
+        self
+    }
+
+    /// It starts without asking whether a live one has its name and id. Two of one identity take s_units from
+    /// each other: for tests of that.
+    pub fn beside_another(mut self) -> Self {
+        self.asks_for_itself = false;
+        self
+    }
+
+    /// Of all m_units an m_unit connects to these alone, by name and ID number; to every one of its fleet unless set,
+    /// and to none with none named. Two m_units connect only if each selects the other. An s_unit connects to its
+    /// manager, whatever is set here.
+    ///
+    /// ```no_run
+    /// use cara_std::CommunicationSystem;
+    ///
+    /// let hall = CommunicationSystem::builder("hall", 2)?.m_units([("depot", 1), ("gate", 3)])?.build()?;
+    /// # Ok::<(), cara_std::BuildError>(())
+    /// ```
+    pub fn m_units<N: AsRef<str>>(mut self, m_units: impl IntoIterator<Item = (N, u32)>) -> Result<Self, Error> {
+        let identities = m_units.into_iter().map(|(name, id)| Identity::m_unit(name.as_ref(), id));
+        self.m_units = Some(identities.collect::<Result<_, _>>()?);
+        Ok(self)
+    }
+
+    /// Where an m_unit answers its operator once it is started; in the default directory unless set.
+    #[cfg(feature = "control")]
+    pub fn control(mut self, control: crate::control::Control) -> Self {
+        self.control = control;
+        self
+    }
+}
+
+impl<T: Send + 'static> Builder<T, SUnit> {
+    /// The manager is at this address: it is dialled, and nothing is broadcast.
+    pub fn manager_address(mut self, address: SocketAddr) -> Self {
+        if let Target::Manager(manager) = self.target {
+            self.target = Target::Fixed(manager, address);
+        }
+        self
+    }
+}
+
+impl<T: Send + 'static, R> Builder<T, R> {
     /// Units of different fleets on one network never connect; 0 unless set.
     pub fn fleet(mut self, fleet: u32) -> Self {
         self.fleet = Fleet(fleet);
@@ -140,53 +202,15 @@ impl<T: Send + 'static> Builder<T> {
         self
     }
 
-    /// The TCP port on which an m_unit takes connections; one that is free unless set. For s_units that are told a
-    /// [`manager_address`](Self::manager_address).
-    pub fn tcp_port(mut self, port: u16) -> Self {
-        self.tcp_port = port;
-        self
-    }
-
-    /// An m_unit starts without asking whether a live one has its name and id. Two of one identity take s_units from
-    /// each other: for tests of that.
-    pub fn beside_another(mut self) -> Self {
-        self.asks_for_itself = false;
-        self
-    }
-
     /// The unit shares these threads with others of its process; unless set, it has threads of its own.
     pub fn threads(mut self, threads: &Threads) -> Self {
         self.threads = Some(threads.clone());
         self
     }
 
-    /// An s_unit's manager is at this address: it is dialled, and nothing is broadcast.
-    pub fn manager_address(mut self, address: SocketAddr) -> Self {
-        if let Target::Manager(manager) = self.target {
-            self.target = Target::Fixed(manager, address);
-        }
-        self
-    }
-
-    /// Of all m_units an m_unit connects to these alone, by name and ID number; to every one of its fleet unless set,
-    /// and to none with none named. Two m_units connect only if each selects the other. An s_unit connects to its
-    /// manager, whatever is set here.
-    ///
-    /// ```no_run
-    /// use cara_std::CommunicationSystem;
-    ///
-    /// let hall = CommunicationSystem::builder("hall", 2)?.m_units([("depot", 1), ("gate", 3)])?.build_system()?;
-    /// # Ok::<(), cara_std::BuildError>(())
-    /// ```
-    pub fn m_units<N: AsRef<str>>(mut self, m_units: impl IntoIterator<Item = (N, u32)>) -> Result<Self, Error> {
-        let identities = m_units.into_iter().map(|(name, id)| Identity::m_unit(name.as_ref(), id));
-        self.m_units = Some(identities.collect::<Result<_, _>>()?);
-        Ok(self)
-    }
-
     /// The application's state, which methods get (paper, section 2: "the object class to be passed as a template
     /// parameter").
-    pub fn state<U: Send + 'static>(self, state: U) -> Builder<U> {
+    pub fn state<U: Send + 'static>(self, state: U) -> Builder<U, R> {
         Builder {
             identity: self.identity,
             target: self.target,
@@ -206,14 +230,8 @@ impl<T: Send + 'static> Builder<T> {
             access_file: self.access_file,
             asks_for_itself: self.asks_for_itself,
             state,
+            role: PhantomData,
         }
-    }
-
-    /// Where an m_unit answers its operator once it is started; in the default directory unless set.
-    #[cfg(feature = "control")]
-    pub fn control(mut self, control: crate::control::Control) -> Self {
-        self.control = control;
-        self
     }
 
     /// The initial access table: see [`access`](crate::access). Without one, a joined node may do everything.
@@ -231,27 +249,16 @@ impl<T: Send + 'static> Builder<T> {
         Ok(self.access(table))
     }
 
-    /// An m_unit; it does nothing until it is started.
-    pub fn build_system(self) -> Result<CommunicationSystem<T>, BuildError> {
-        match self.identity.role() {
-            Role::MUnit => {
-                #[cfg(feature = "control")]
-                let control = self.control.clone();
-                let system = Owner::new(self.engine()?);
-                #[cfg(feature = "control")]
-                let system = system.with_control(control);
-                Ok(CommunicationSystem::of(system))
-            }
-            Role::SUnit => Err(Error::BadConstraint.into()),
-        }
-    }
-
-    /// An s_unit; it does nothing until it is started.
-    pub fn build_unit(self) -> Result<Unit<T>, BuildError> {
-        match self.identity.role() {
-            Role::SUnit => Ok(Unit::of(Owner::new(self.engine()?))),
-            Role::MUnit => Err(Error::BadConstraint.into()),
-        }
+    /// The unit; it does nothing until it is started.
+    pub fn build(self) -> Result<Handle<T, R>, BuildError> {
+        #[cfg(feature = "control")]
+        let control = self.control.clone();
+        let engine = self.engine()?;
+        Ok(Handle::of(Owner::new(
+            engine,
+            #[cfg(feature = "control")]
+            control,
+        )))
     }
 
     fn engine(self) -> Result<Arc<Engine<T>>, BuildError> {

@@ -32,6 +32,7 @@ mod event;
 mod file_name;
 #[cfg(feature = "async")]
 mod future;
+mod handle;
 mod handler;
 pub mod keys;
 mod lane;
@@ -75,6 +76,7 @@ pub use error::StartError;
 pub use event::UnitEvent;
 #[cfg(feature = "async")]
 pub use future::PendingReply;
+pub use handle::{Handle, MUnit, SUnit, WeakHandle};
 pub use handler::{Call, IntoHandler, ServiceOptions};
 pub use lease::{LeaseEnded, LeaseWatch};
 pub use my_function_list::MyFunctionList;

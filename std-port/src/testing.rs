@@ -27,7 +27,7 @@ pub(crate) fn fleet() -> u32 {
 /// A manager in plain mode, started.
 pub(crate) fn manager(fleet: u32, constraints: Constraints) -> CommunicationSystem {
     let manager = CommunicationSystem::builder("manager", 1).unwrap().interfaces(Interfaces::Loopback);
-    let manager = manager.fleet(fleet).constraints(constraints).insecure().build_system().unwrap();
+    let manager = manager.fleet(fleet).constraints(constraints).insecure().build().unwrap();
     manager.start().unwrap();
     manager
 }
@@ -35,7 +35,7 @@ pub(crate) fn manager(fleet: u32, constraints: Constraints) -> CommunicationSyst
 /// A vehicle of that manager, not started.
 pub(crate) fn vehicle(fleet: u32, id: u32, constraints: Constraints) -> Unit {
     let unit = Unit::builder("agv", id, "manager", 1).unwrap().interfaces(Interfaces::Loopback);
-    unit.fleet(fleet).constraints(constraints).insecure().build_unit().unwrap()
+    unit.fleet(fleet).constraints(constraints).insecure().build().unwrap()
 }
 
 /// A manager and a vehicle that have met.

@@ -54,7 +54,7 @@ const UNIT_SHIFT: u32 = 48;
 ///
 /// let threads = Threads::new()?;
 /// for id in 0..1_000 {
-///     let agv = Unit::builder("agv", id, "depot", 1)?.threads(&threads).build_unit()?;
+///     let agv = Unit::builder("agv", id, "depot", 1)?.threads(&threads).build()?;
 ///     agv.start()?;
 /// #   std::mem::forget(agv);
 /// }

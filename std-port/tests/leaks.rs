@@ -23,8 +23,8 @@ fn until(what: impl Fn() -> String, condition: impl Fn() -> bool) {
 fn live_once(stops: bool) {
     let fleet = RandomState::new().build_hasher().finish() as u32;
     let (manager, agv) = keyed::pair(fleet);
-    let manager = manager.interfaces(Interfaces::Loopback).build_system().unwrap();
-    let agv = agv.interfaces(Interfaces::Loopback).build_unit().unwrap();
+    let manager = manager.interfaces(Interfaces::Loopback).build().unwrap();
+    let agv = agv.interfaces(Interfaces::Loopback).build().unwrap();
     let mut number = Parameters::new();
     number.add_int("number", 1).unwrap();
     let echo = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };

@@ -130,13 +130,13 @@ fn every_counter_of_the_api_is_in_the_text_with_its_value() {
     let own = Identity::m_unit(name, 1).unwrap();
     let others = [1, 2, 3].map(|id| Identity::s_unit("agv", id).unwrap());
     let manager = CommunicationSystem::builder(name, 1).unwrap().interfaces(Interfaces::Loopback);
-    let manager = keyed(manager, fleet, &own, &others).build_system().unwrap();
+    let manager = keyed(manager, fleet, &own, &others).build().unwrap();
     manager.start().unwrap();
     let agvs: Vec<_> = others
         .iter()
         .map(|other| {
             let agv = Unit::builder("agv", other.id(), name, 1).unwrap().interfaces(Interfaces::Loopback);
-            let agv = keyed(agv, fleet, other, slice::from_ref(&own)).build_unit().unwrap();
+            let agv = keyed(agv, fleet, other, slice::from_ref(&own)).build().unwrap();
             let fail = |_: &Call, _: &mut ParametersView| Err(ServiceError::NotReady);
             agv.my_function_list().add_function("fail", &Parameters::new(), fail).unwrap();
             agv.publish_my_function_list().unwrap();

@@ -24,14 +24,14 @@ fn plug_in() {
 
 /// Without a control socket: its place is the same in all of these networks.
 fn manager() -> (CommunicationSystem, Receiver<UnitEvent>) {
-    let manager = keyed::pair(0).0.interfaces(Interfaces::All).control(Control::Off).build_system().unwrap();
+    let manager = keyed::pair(0).0.interfaces(Interfaces::All).control(Control::Off).build().unwrap();
     let events = manager.events();
     manager.start().unwrap();
     (manager, events)
 }
 
 fn agv() -> (Unit, Receiver<UnitEvent>) {
-    let agv = keyed::pair(0).1.interfaces(Interfaces::All).build_unit().unwrap();
+    let agv = keyed::pair(0).1.interfaces(Interfaces::All).build().unwrap();
     agv.my_function_list().add_function("ping", &Parameters::new(), |parameters: Parameters| parameters).unwrap();
     agv.publish_my_function_list().unwrap();
     let events = agv.events();
@@ -122,7 +122,7 @@ fn a_fixed_address_without_a_route_is_told() {
     }
     ip("link set lo up");
     let (manager, agv) = keyed::pair(0);
-    let agv = agv.manager_address(([10, 77, 0, 1], 7_000).into()).build_unit().unwrap();
+    let agv = agv.manager_address(([10, 77, 0, 1], 7_000).into()).build().unwrap();
     let events = agv.events();
     agv.start().unwrap();
     let end = Instant::now() + PATIENCE;
@@ -135,7 +135,7 @@ fn a_fixed_address_without_a_route_is_told() {
     }
     // The manager comes to be there, with the cable.
     plug_in();
-    let manager = manager.tcp_port(7_000).control(Control::Off).build_system().unwrap();
+    let manager = manager.tcp_port(7_000).control(Control::Off).build().unwrap();
     manager.start().unwrap();
     until("it has joined", || manager.number_of_s_units() == 1);
 }

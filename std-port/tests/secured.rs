@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 
 use cara_std::keys::{FleetKeys, Store, place};
 use cara_std::{
-    BuildError, Builder, Call, CloseReason, CommunicationSystem, Fleet, Identity, Interfaces, Parameters,
-    ParametersView, Refusal, ServiceError, StartError, Unit, UnitEvent,
+    BuildError, Builder, Call, CloseReason, CommunicationSystem, Fleet, Identity, Interfaces, MUnit, Parameters,
+    ParametersView, Refusal, SUnit, ServiceError, StartError, Unit, UnitEvent,
 };
 
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -44,24 +44,24 @@ fn keys(fleet: Fleet, vehicles: &[u32]) -> FleetKeys {
 }
 
 /// Without a control socket, which would tell of it beside the network.
-fn manager(fleet: Fleet) -> Builder<()> {
+fn manager(fleet: Fleet) -> Builder<(), MUnit> {
     let builder = CommunicationSystem::builder("depot", 1).unwrap().fleet(fleet.0);
     builder.interfaces(Interfaces::Loopback).control(cara_std::control::Control::Off)
 }
 
-fn vehicle(fleet: Fleet, id: u32) -> Builder<()> {
+fn vehicle(fleet: Fleet, id: u32) -> Builder<(), SUnit> {
     Unit::builder("agv", id, "depot", 1).unwrap().fleet(fleet.0).interfaces(Interfaces::Loopback)
 }
 
-fn started_manager(builder: Builder<()>) -> CommunicationSystem {
-    let manager = builder.build_system().unwrap();
+fn started_manager(builder: Builder<(), MUnit>) -> CommunicationSystem {
+    let manager = builder.build().unwrap();
     manager.start().unwrap();
     manager
 }
 
 /// A vehicle that doubles a number and sends a text back.
-fn started_vehicle(builder: Builder<()>) -> Unit {
-    serving(builder.build_unit().unwrap())
+fn started_vehicle(builder: Builder<(), SUnit>) -> Unit {
+    serving(builder.build().unwrap())
 }
 
 fn serving(agv: Unit) -> Unit {
@@ -131,7 +131,7 @@ fn calls_go_on_while_the_keys_of_their_link_are_made_anew() {
     let fleet = fleet();
     let keys = keys(fleet, &[7]);
     let manager = started_manager(manager(fleet).keys(keys.ring(&depot()).unwrap()));
-    let agv = vehicle(fleet, 7).keys(keys.ring(&agv(7)).unwrap()).build_unit().unwrap();
+    let agv = vehicle(fleet, 7).keys(keys.ring(&agv(7)).unwrap()).build().unwrap();
     agv.renew_keys_every(cara_std::Duration::from_secs(1));
     let agv = serving(agv);
     joined(&manager, 1);
@@ -170,7 +170,7 @@ fn a_manager_starts_once_and_again_when_the_first_has_stopped() {
     let (fleet, other) = (fleet(), fleet());
     let root = keys(fleet, &[7]);
     let first = started_manager(manager(fleet).keys(root.ring(&depot()).unwrap()));
-    let second = manager(fleet).keys(root.ring(&depot()).unwrap()).build_system().unwrap();
+    let second = manager(fleet).keys(root.ring(&depot()).unwrap()).build().unwrap();
     let running = second.start();
     assert!(
         matches!(running, Err(StartError::AlreadyRunning { at, .. }) if at.port() == first.tcp_port()),
@@ -187,8 +187,7 @@ fn a_manager_starts_once_and_again_when_the_first_has_stopped() {
 fn of_two_managers_that_start_at_once_one_stays() {
     let fleet = fleet();
     let root = keys(fleet, &[7]);
-    let managers: Vec<_> =
-        (0..2).map(|_| manager(fleet).keys(root.ring(&depot()).unwrap()).build_system().unwrap()).collect();
+    let managers: Vec<_> = (0..2).map(|_| manager(fleet).keys(root.ring(&depot()).unwrap()).build().unwrap()).collect();
     let begin = std::sync::Barrier::new(2);
     let started: Vec<_> = std::thread::scope(|scope| {
         let threads: Vec<_> = managers
@@ -217,15 +216,17 @@ fn a_vehicle_of_another_root_stays_out() {
 fn plain_and_secured_units_do_not_meet_even_on_one_port() {
     let fleet = fleet();
     let keys = keys(fleet, &[7, 8]);
+    fn on<R>(port: Option<u16>, builder: Builder<(), R>) -> Builder<(), R> {
+        port.into_iter().fold(builder, Builder::discovery_port)
+    }
     for port in [None, Some(24_971)] {
-        let on = |builder: Builder<()>| port.into_iter().fold(builder, Builder::discovery_port);
-        let secured = started_manager(on(manager(fleet).keys(keys.ring(&depot()).unwrap())));
-        let plain = started_vehicle(on(vehicle(fleet, 7).insecure()));
+        let secured = started_manager(on(port, manager(fleet).keys(keys.ring(&depot()).unwrap())));
+        let plain = started_vehicle(on(port, vehicle(fleet, 7).insecure()));
         stays_out(&secured);
         secured.stop();
         plain.stop();
-        let plain = started_manager(on(manager(fleet).insecure()));
-        let _secured = started_vehicle(on(vehicle(fleet, 8).keys(keys.ring(&agv(8)).unwrap())));
+        let plain = started_manager(on(port, manager(fleet).insecure()));
+        let _secured = started_vehicle(on(port, vehicle(fleet, 8).keys(keys.ring(&agv(8)).unwrap())));
         stays_out(&plain);
     }
 }
@@ -270,7 +271,7 @@ fn an_unknown_vehicle_that_dials_saves_no_revoked_one() {
     joined(&manager, 2);
     let address = first.manager().unwrap().address().unwrap();
     let of_others = keys(fleet, &[99]).ring(&agv(99)).unwrap();
-    let unknown = vehicle(fleet, 99).keys(of_others).manager_address(address).build_unit().unwrap();
+    let unknown = vehicle(fleet, 99).keys(of_others).manager_address(address).build().unwrap();
 
     store.keys_mut().revoke(&[agv(7)]).unwrap();
     store.save().unwrap();
@@ -282,6 +283,6 @@ fn an_unknown_vehicle_that_dials_saves_no_revoked_one() {
 #[test]
 fn without_keys_the_error_says_which_command_makes_them() {
     let missing = Path::new("/nonexistent/depot.keys");
-    let error = manager(fleet()).key_file(missing).build_system().map(drop).unwrap_err();
+    let error = manager(fleet()).key_file(missing).build().map(drop).unwrap_err();
     assert!(matches!(error, BuildError::Keys(_)), "{error}");
 }

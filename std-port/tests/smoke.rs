@@ -23,8 +23,8 @@ fn until(what: &str, condition: impl Fn() -> bool) {
 fn pair() -> (CommunicationSystem, Unit<[i64; 2]>) {
     let fleet = fleet();
     let (manager, agv) = keyed::pair(fleet);
-    let manager = manager.interfaces(Interfaces::Loopback).build_system().unwrap();
-    let agv = agv.interfaces(Interfaces::Loopback).state([3_i64, 4]).build_unit().unwrap();
+    let manager = manager.interfaces(Interfaces::Loopback).build().unwrap();
+    let agv = agv.interfaces(Interfaces::Loopback).state([3_i64, 4]).build().unwrap();
     let mut position = Parameters::new();
     position.add_int("position", 2).unwrap();
     let pos_info = |state: &mut [i64; 2], _: &Call, view: &mut ParametersView| -> Result<(), ServiceError> {

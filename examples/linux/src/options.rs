@@ -27,14 +27,14 @@ pub struct Network {
 impl Network {
     /// A unit where the options say; without them, where the environment says. Unless told, it has the keys that are found
     /// for it.
-    pub fn place(&self, builder: Builder<()>) -> Builder<()> {
+    pub fn place<R>(&self, builder: Builder<(), R>) -> Builder<(), R> {
         let interfaces = if self.loopback { Interfaces::Loopback } else { Interfaces::from_environment() };
         let builder = builder.fleet(self.fleet).interfaces(interfaces);
         if self.insecure { builder.insecure() } else { builder }
     }
 
     /// The same for a unit whose keys were drawn in this process.
-    pub fn place_with(&self, builder: Builder<()>, ring: KeyRing) -> Builder<()> {
+    pub fn place_with<R>(&self, builder: Builder<(), R>, ring: KeyRing) -> Builder<(), R> {
         let builder = self.place(builder);
         if self.insecure { builder } else { builder.keys(ring) }
     }

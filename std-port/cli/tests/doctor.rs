@@ -46,7 +46,7 @@ fn a_node_of_another_fleet_is_told_with_both_fleets() {
 fn a_manager_of_another_fleet_is_why_its_node_waits() {
     let clinic = Clinic::new();
     let _agv = clinic.started(clinic.unit("agv", 7, "boss"));
-    let far = clinic.system("boss").fleet(clinic.fleet.wrapping_add(1)).build_system().unwrap();
+    let far = clinic.system("boss").fleet(clinic.fleet.wrapping_add(1)).build().unwrap();
     far.start().unwrap();
     let told = clinic.doctor(&["agv"]);
     told.is(&["other-fleet"], 4);
@@ -149,7 +149,7 @@ fn of_two_managers_with_one_name_is_told_first() {
     let _first = clinic.manager("boss", 64);
     // Its socket is another one's, as of a manager in a container.
     let second = clinic.system("boss").control(cara_std::control::Control::Off).beside_another();
-    let second = second.build_system().unwrap();
+    let second = second.build().unwrap();
     second.start().unwrap();
     clinic.doctor(&["boss"]).is(&["duplicate"], 4);
     assert_eq!(clinic.doctor(&["agv", "--listen", "4s"]).ids()[0], "duplicate");

@@ -292,7 +292,7 @@ impl Node {
     fn vehicle(&self, name: &str, id: u32) -> (Unit, Peer) {
         let unit = Unit::builder(name, id, "plant", 1).unwrap().fleet(self.fleet).interfaces(Interfaces::Loopback);
         let file = self.keys.file(&Identity::s_unit(name, id).unwrap()).unwrap();
-        let unit = unit.key_file(file).build_unit().unwrap();
+        let unit = unit.key_file(file).build().unwrap();
         unit.start().unwrap();
         until("the vehicle has joined", || {
             unit.manager().is_some_and(|manager| manager.their_function_list().len() == self.functions)

@@ -135,8 +135,8 @@ fn a_vehicle_of_a_manager_without_keys_says_a_command_that_makes_both() {
 #[test]
 fn a_program_that_says_nothing_about_keys_is_not_built_without() {
     let fleet = random_fleet();
-    let manager = CommunicationSystem::builder("yard", 3).unwrap().fleet(fleet).build_system().map(drop);
-    let vehicle = Unit::builder("agv", 7, "yard", 3).unwrap().fleet(fleet).build_unit().map(drop);
+    let manager = CommunicationSystem::builder("yard", 3).unwrap().fleet(fleet).build().map(drop);
+    let vehicle = Unit::builder("agv", 7, "yard", 3).unwrap().fleet(fleet).build().map(drop);
     for error in [manager.unwrap_err(), vehicle.unwrap_err()] {
         assert!(matches!(error, BuildError::Keys(_)), "{error}");
         let text = error.to_string();

@@ -36,7 +36,11 @@ use cara_core::distribution::identity::{Fleet, Identity};
 
 use crate::CommunicationSystem;
 
-/// Where a running m_unit answers its operator.
+/// Where a running m_unit answers its operator. An s_unit has no socket, and its builder no word for one:
+///
+/// ```compile_fail
+/// cara_std::Unit::builder("agv", 7, "depot", 1).unwrap().control(cara_std::control::Control::Default);
+/// ```
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum Control {
     /// In the [directory] of control sockets, under the unit's name, id and fleet.

@@ -70,11 +70,12 @@ impl<T: Send + 'static> Engine<T> {
 
     /// Begins to search and to serve, driven by the unit's threads. One that runs already goes on; one that was stopped
     /// does not start again.
+    #[cfg(not(feature = "control"))]
     pub(crate) fn start(self: &Arc<Self>) -> Result<(), StartError> {
         self.start_unless(|| None)
     }
 
-    /// As [`start`](Self::start), unless a process of this host `holds` what is this unit's, as one does that hangs and
+    /// Begins, as `start` does, unless a process of this host `holds` what is this unit's, as one does that hangs and
     /// does not say that it runs.
     pub(crate) fn start_unless(self: &Arc<Self>, holds: impl FnOnce() -> Option<PathBuf>) -> Result<(), StartError> {
         if self.is_stopping() {

@@ -249,7 +249,7 @@ fn what_lies_unread_is_read_before_a_question_goes_out() {
     let (fleet, mut port) = (fleet(), 0);
     let mut vehicle = |id| -> Unit {
         let unit = Unit::builder("agv", id, "manager", 1).unwrap().interfaces(Interfaces::Loopback);
-        let unit = unit.fleet(fleet).discovery_port(port).insecure().build_unit().unwrap();
+        let unit = unit.fleet(fleet).discovery_port(port).insecure().build().unwrap();
         port = unit.engine().discovery_port();
         unit
     };

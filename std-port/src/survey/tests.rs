@@ -110,7 +110,7 @@ fn a_manager_answers_and_own_broadcasts_come_back() {
     let port = survey.reach()[0].port;
     let fleet = random() as u32;
     let manager = crate::CommunicationSystem::builder("boss", 1).unwrap().fleet(fleet).discovery_port(port);
-    let manager = manager.insecure().interfaces(Interfaces::Loopback).build_system().unwrap();
+    let manager = manager.insecure().interfaces(Interfaces::Loopback).build().unwrap();
     manager.start().unwrap();
     assert!(survey.ask(Fleet(fleet)));
     listen_until(&mut survey, |survey| survey.heard().iter().any(|heard| heard.answers > 0));
@@ -160,7 +160,7 @@ fn a_secured_manager_answers_with_the_fleets_key_and_to_nobody_else() {
     other_keys.add_ring(&fleet_keys(fleet).ring(&boss).unwrap());
     let mut other = Survey::open(Interfaces::Loopback, port).unwrap().with_keys(other_keys);
     let manager = crate::CommunicationSystem::builder("boss", 1).unwrap().fleet(fleet).discovery_port(port);
-    let manager = manager.interfaces(Interfaces::Loopback).keys(ring(&boss)).build_system().unwrap();
+    let manager = manager.interfaces(Interfaces::Loopback).keys(ring(&boss)).build().unwrap();
     manager.start().unwrap();
     other.ask(Fleet(fleet));
     survey.ask(Fleet(fleet));

@@ -58,7 +58,7 @@ fn nodes_are_told_with_what_is_known_of_them() {
 #[test]
 fn who_was_refused_is_told_by_name_with_the_reason() {
     let (depot, agv) = Depot::with_agv();
-    let twin = vehicle("agv", 7, depot.fleet).build_unit().unwrap();
+    let twin = vehicle("agv", 7, depot.fleet).build().unwrap();
     twin.start().unwrap();
     let mut client = depot.client();
     until("the twin is refused", || {
@@ -268,10 +268,10 @@ fn a_connection_without_room_is_counted() {
     let capacities = cara_std::Capacities { pending_links: 0, ..Default::default() };
     let constraints = Constraints { maximum_nodes: 1, ..Constraints::M_UNIT };
     let small = manager("small", 2, fleet).capacities(capacities).constraints(constraints);
-    let small = small.control(cara_std::control::Control::Off).build_system().unwrap();
+    let small = small.control(cara_std::control::Control::Off).build().unwrap();
     small.start().unwrap();
     assert_eq!(small.control_path(), None);
-    let agv = vehicle_of(("small", 2), "lone-agv", 9, fleet).build_unit().unwrap();
+    let agv = vehicle_of(("small", 2), "lone-agv", 9, fleet).build().unwrap();
     agv.start().unwrap();
     until("the only link is taken", || small.number_of_s_units() == 1);
     let refused = || small.counters().iter().find(|(name, _)| *name == "ConnectionsRefused").unwrap().1;

@@ -218,7 +218,7 @@ fn a_unit_that_hangs_holds_up_no_question_to_another() {
     let _hung: Vec<_> =
         (1..4).map(|id| UnixListener::bind(directory.join(format!("hung-{id}-3.sock"))).unwrap()).collect();
     let other = manager("other", 9, depot.fleet).control(Control::Path(directory.join("other-9-3.sock")));
-    let other = other.build_system().unwrap();
+    let other = other.build().unwrap();
     other.start().unwrap();
     let took = |unit: Option<&str>| {
         let start = std::time::Instant::now();
@@ -311,8 +311,7 @@ fn a_client_finds_the_unit_that_runs_or_says_which_there_are() {
     let directory = depot.directory.path();
     assert_eq!(Client::find_in(directory, None).unwrap().unit().unit, "manager/1");
     let beside = |name: &str, id, file: &str| {
-        let system =
-            manager(name, id, depot.fleet).control(Control::Path(directory.join(file))).build_system().unwrap();
+        let system = manager(name, id, depot.fleet).control(Control::Path(directory.join(file))).build().unwrap();
         system.start().unwrap();
         system
     };

@@ -25,7 +25,7 @@ impl Drop for Process {
 #[ignore = "run by the other test here, in a process of its own"]
 fn as_child() {
     let fleet = std::env::var(FLEET).expect("the fleet").parse().unwrap();
-    let agv = vehicle("agv", 7, fleet).build_unit().unwrap();
+    let agv = vehicle("agv", 7, fleet).build().unwrap();
     let nothing =
         |_: &cara_std::Call, _: &mut cara_std::ParametersView| -> Result<(), cara_std::ServiceError> { Ok(()) };
     agv.my_function_list().add_service(&"nothing()".parse().unwrap(), Default::default(), nothing).unwrap();

@@ -12,7 +12,7 @@ use crate::support::{Depot, directory, manager, until, vehicle, vehicle_of};
 fn the_socket_is_its_owners_alone_and_goes_with_the_unit() {
     let depot = Depot::new();
     let path = depot.directory.path().join("made").join("x.sock");
-    let second = manager("second", 2, depot.fleet).control(Control::Path(path.clone())).build_system().unwrap();
+    let second = manager("second", 2, depot.fleet).control(Control::Path(path.clone())).build().unwrap();
     assert_eq!(second.control_path(), None, "not before it is started");
     second.start().unwrap();
     assert_eq!(second.control_path(), Some(path.clone()));
@@ -42,10 +42,10 @@ fn a_directory_that_others_enter_is_refused_and_the_unit_runs() {
     std::fs::create_dir(&open).unwrap();
     set_permissions(&open, Permissions::from_mode(0o755)).unwrap();
     let depot = Depot::new();
-    let lone = manager("lone", 2, depot.fleet).control(Control::Path(open.join("x.sock"))).build_system().unwrap();
+    let lone = manager("lone", 2, depot.fleet).control(Control::Path(open.join("x.sock"))).build().unwrap();
     lone.start().unwrap();
     assert_eq!((lone.control_path(), open.join("x.sock").exists()), (None, false));
-    let agv = vehicle_of(("lone", 2), "lone-agv", 9, depot.fleet).build_unit().unwrap();
+    let agv = vehicle_of(("lone", 2), "lone-agv", 9, depot.fleet).build().unwrap();
     agv.start().unwrap();
     until("it is a manager as any other", || lone.number_of_s_units() == 1);
     match Client::find_in(&open, None) {
@@ -57,7 +57,7 @@ fn a_directory_that_others_enter_is_refused_and_the_unit_runs() {
 #[test]
 fn a_second_unit_of_the_same_name_runs_without_a_socket_and_the_first_keeps_its_own() {
     let depot = Depot::new();
-    let twin = manager("manager", 1, depot.fleet ^ 1).control(Control::Path(depot.path())).build_system().unwrap();
+    let twin = manager("manager", 1, depot.fleet ^ 1).control(Control::Path(depot.path())).build().unwrap();
     twin.start().unwrap();
     assert_eq!(twin.control_path(), None);
     assert_eq!(depot.client().unit().fleet, depot.fleet);
@@ -72,18 +72,18 @@ fn a_socket_that_a_killed_process_has_left_is_replaced() {
     drop(UnixListener::bind(&path).unwrap());
     assert!(matches!(Client::connect(&path), Err(ControlError::NoneRunning(_))));
     let depot = Depot::new();
-    let system = manager("second", 2, depot.fleet).control(Control::Path(path.clone())).build_system().unwrap();
+    let system = manager("second", 2, depot.fleet).control(Control::Path(path.clone())).build().unwrap();
     system.start().unwrap();
     assert_eq!(Client::connect(&path).unwrap().unit().unit, "second/2");
 }
 
 #[test]
 fn an_s_unit_has_no_socket() {
-    let directory = directory();
-    let path = directory.path().join("x.sock");
-    let agv = vehicle("agv", 7, Depot::new().fleet).control(Control::Path(path.clone())).build_unit().unwrap();
+    let depot = Depot::new();
+    let agv = vehicle("agv", 7, depot.fleet).build().unwrap();
     agv.start().unwrap();
-    assert!(!path.exists());
+    let running = cara_std::control::running().unwrap();
+    assert!(running.iter().all(|unit| unit.fleet != depot.fleet || !unit.is("agv/7")), "{running:?}");
 }
 
 /// A unit that is started and stopped with clients leaves no file and no thread behind, which are counted elsewhere.

@@ -9,8 +9,8 @@ use std::time::{Duration, Instant};
 use cara_std::control::protocol::{Answer, Argument, ArgumentValue, CallQuestion, Failure, Question};
 use cara_std::control::{Client, Control, ControlError};
 use cara_std::{
-    Builder, Call, CommunicationSystem, Identity, Interfaces, ParametersView, Priority, ServiceError, ServiceOptions,
-    Unit,
+    Builder, Call, CommunicationSystem, Identity, Interfaces, MUnit, ParametersView, Priority, SUnit, ServiceError,
+    ServiceOptions, Unit,
 };
 use tempfile::TempDir;
 
@@ -71,7 +71,7 @@ impl Depot {
         let fleet = fleet();
         let directory = directory();
         let system = manager("manager", 1, fleet).control(Control::Path(directory.path().join("manager.sock")));
-        let system = system.build_system().unwrap();
+        let system = system.build().unwrap();
         system.start().unwrap();
         // All have keys, and each test starts those that it is about.
         system.roster().iter().for_each(|absent| assert!(absent.retire()));
@@ -95,7 +95,7 @@ impl Depot {
 
     /// A vehicle that has joined and published `echo`, `fail`, `slow` and `go_to`.
     pub(crate) fn agv(&self, name: &str, id: u32) -> Unit {
-        let agv = vehicle(name, id, self.fleet).build_unit().unwrap();
+        let agv = vehicle(name, id, self.fleet).build().unwrap();
         let list = agv.my_function_list();
         let echo = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
         let fail = |_: &Call, _: &mut ParametersView| Err(ServiceError::Failed(4));
@@ -120,17 +120,17 @@ impl Depot {
     }
 }
 
-pub(crate) fn manager(name: &str, id: u32, fleet: u32) -> Builder<()> {
+pub(crate) fn manager(name: &str, id: u32, fleet: u32) -> Builder<(), MUnit> {
     let builder = CommunicationSystem::builder(name, id).unwrap().interfaces(Interfaces::Loopback);
     keyed(builder, fleet, &Identity::m_unit(name, id).unwrap(), &vehicles())
 }
 
-pub(crate) fn vehicle(name: &str, id: u32, fleet: u32) -> Builder<()> {
+pub(crate) fn vehicle(name: &str, id: u32, fleet: u32) -> Builder<(), SUnit> {
     vehicle_of(("manager", 1), name, id, fleet)
 }
 
 /// A vehicle that joins another manager than `manager/1`.
-pub(crate) fn vehicle_of(manager: (&str, u32), name: &str, id: u32, fleet: u32) -> Builder<()> {
+pub(crate) fn vehicle_of(manager: (&str, u32), name: &str, id: u32, fleet: u32) -> Builder<(), SUnit> {
     let own = Identity::s_unit(name, id).unwrap();
     assert!(vehicles().contains(&own), "the managers have no key for {own}: name it in vehicles");
     let builder = Unit::builder(name, id, manager.0, manager.1).unwrap().interfaces(Interfaces::Loopback);

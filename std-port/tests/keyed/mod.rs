@@ -1,7 +1,7 @@
 //! Keys for units of tests. Their root is made of the fleet's number alone, so that all processes of a test have the same one.
 
 use cara_std::keys::{FleetKeys, KeyRing, RootKey};
-use cara_std::{Builder, CommunicationSystem, Fleet, Identity, Role, Unit};
+use cara_std::{Builder, CommunicationSystem, Fleet, Identity, MUnit, Role, SUnit, Unit};
 
 /// The ring of a unit of a test's fleet, which meets these others.
 pub(crate) fn ring(fleet: u32, own: &Identity, others: &[Identity]) -> KeyRing {
@@ -15,13 +15,13 @@ pub(crate) fn ring(fleet: u32, own: &Identity, others: &[Identity]) -> KeyRing {
 }
 
 /// Gives a unit its fleet and its keys.
-pub(crate) fn keyed(builder: Builder<()>, fleet: u32, own: &Identity, others: &[Identity]) -> Builder<()> {
+pub(crate) fn keyed<R>(builder: Builder<(), R>, fleet: u32, own: &Identity, others: &[Identity]) -> Builder<(), R> {
     builder.fleet(fleet).keys(ring(fleet, own, others))
 }
 
 /// `manager/1` and its `agv/7`.
 #[allow(dead_code, reason = "some tests have more units, and name them themselves")]
-pub(crate) fn pair(fleet: u32) -> (Builder<()>, Builder<()>) {
+pub(crate) fn pair(fleet: u32) -> (Builder<(), MUnit>, Builder<(), SUnit>) {
     let nodes = [Identity::m_unit("manager", 1).unwrap(), Identity::s_unit("agv", 7).unwrap()];
     let manager = CommunicationSystem::builder("manager", 1).unwrap();
     let agv = Unit::builder("agv", 7, "manager", 1).unwrap();

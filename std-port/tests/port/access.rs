@@ -48,8 +48,8 @@ fn a_table_that_is_set_while_the_unit_runs_is_in_force_at_once() {
 fn what_a_vehicle_may_not_publish_cannot_be_called_and_is_there_when_it_may() {
     let fleet = fleet();
     let publish = |functions: &[&str]| vec![rule(Who::S_UNITS, functions, Verbs::PUBLISH)].into();
-    let system = system(fleet).access(publish(&["stop"])).build_system().unwrap();
-    let agv = unit("agv", 7, fleet).build_unit().unwrap();
+    let system = system(fleet).access(publish(&["stop"])).build().unwrap();
+    let agv = unit("agv", 7, fleet).build().unwrap();
     offer(&agv);
     agv.publish_my_function_list().unwrap();
     system.start().unwrap();
@@ -101,8 +101,8 @@ fn a_file_is_followed_and_a_mistake_keeps_what_is_in_force() {
     assert!(error.contains("access.toml:2:7: 'manager' names no node"), "{error}");
     write(&path, &allowing("\"stop\""));
 
-    let system = system(fleet).build_system().unwrap();
-    let agv = unit("agv", 7, fleet).access_file(&path).unwrap().build_unit().unwrap();
+    let system = system(fleet).build().unwrap();
+    let agv = unit("agv", 7, fleet).access_file(&path).unwrap().build().unwrap();
     offer(&agv);
     agv.publish_my_function_list().unwrap();
     system.start().unwrap();

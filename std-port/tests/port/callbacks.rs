@@ -32,8 +32,8 @@ fn a_free_handler_calls_its_caller_back() {
 #[test]
 fn a_handler_with_the_state_calls_back_a_service_without_it() {
     let fleet = fleet();
-    let manager = system(fleet).state(0_i64).build_system().unwrap();
-    let agv = unit("agv", 7, fleet).state(0_i64).build_unit().unwrap();
+    let manager = system(fleet).state(0_i64).build().unwrap();
+    let agv = unit("agv", 7, fleet).state(0_i64).build().unwrap();
     let back: Back<i64> = Arc::default();
     let there = back.clone();
     let asks_back = move |state: &mut i64, _: &Call, view: &mut ParametersView| -> Result<(), ServiceError> {
@@ -57,8 +57,8 @@ fn a_handler_with_the_state_calls_back_a_service_without_it() {
 #[test]
 fn methods_that_need_both_states_are_told_at_once() {
     let fleet = fleet();
-    let manager = system(fleet).state(0_i64).build_system().unwrap();
-    let agv = unit("agv", 7, fleet).state(0_i64).build_unit().unwrap();
+    let manager = system(fleet).state(0_i64).build().unwrap();
+    let agv = unit("agv", 7, fleet).state(0_i64).build().unwrap();
     let back: Back<i64> = Arc::default();
     let there = back.clone();
     let forwards = move |_: &mut i64, _: &Call, view: &mut ParametersView| -> Result<(), ServiceError> {
@@ -84,8 +84,8 @@ fn methods_that_need_both_states_are_told_at_once() {
 #[test]
 fn a_hook_does_not_wait_for_the_method_whose_thread_runs_it() {
     let fleet = fleet();
-    let manager = system(fleet).build_system().unwrap();
-    let agv = unit("agv", 7, fleet).state(Vec::<&str>::new()).build_unit().unwrap();
+    let manager = system(fleet).build().unwrap();
+    let agv = unit("agv", 7, fleet).state(Vec::<&str>::new()).build().unwrap();
     let back: Back<Vec<&str>> = Arc::default();
     let there = back.clone();
     let asks_back =
@@ -114,7 +114,7 @@ fn a_hook_does_not_wait_for_the_method_whose_thread_runs_it() {
 
 #[test]
 fn the_application_is_told_when_it_holds_the_state_itself() {
-    let agv = unit("agv", 7, fleet()).state(5).build_unit().unwrap();
+    let agv = unit("agv", 7, fleet()).state(5).build().unwrap();
     let other = agv.clone();
     assert_eq!(agv.with_state(|_| other.with_state(|state| *state)), Ok(Err(Error::WouldDeadlock)));
 }

@@ -22,8 +22,8 @@ fn an_interval_set_while_running_holds_at_both_ends() {
 #[test]
 fn an_interval_set_for_one_node_holds_for_that_node_alone() {
     let fleet = fleet();
-    let manager = system(fleet).build_system().unwrap();
-    let units = [("first", 1), ("second", 2)].map(|(name, id)| unit(name, id, fleet).build_unit().unwrap());
+    let manager = system(fleet).build().unwrap();
+    let units = [("first", 1), ("second", 2)].map(|(name, id)| unit(name, id, fleet).build().unwrap());
     let [first, second] = units.each_ref().map(|agv| {
         agv.my_function_list().add_function("f", &number(0), service(|number| number)).unwrap();
         meet(&manager, agv).0
@@ -42,8 +42,8 @@ fn an_interval_set_for_one_node_holds_for_that_node_alone() {
 fn longer_messages_are_allowed_while_running() {
     let fleet = fleet();
     let small = Constraints { message_size: 1024, ..Constraints::M_UNIT };
-    let manager = system(fleet).constraints(small).build_system().unwrap();
-    let agv = unit("agv", 7, fleet).constraints(Constraints { maximum_nodes: 1, ..small }).build_unit().unwrap();
+    let manager = system(fleet).constraints(small).build().unwrap();
+    let agv = unit("agv", 7, fleet).constraints(Constraints { maximum_nodes: 1, ..small }).build().unwrap();
     let mut text = Parameters::<100_000>::sized();
     text.add_string("text", 40_000).unwrap();
     let echo = |_: &cara_std::Call, _: &mut cara_std::ParametersView| Ok(());
@@ -95,11 +95,11 @@ fn what_a_unit_cannot_hold_is_refused() {
 #[test]
 fn a_lower_maximum_of_nodes_refuses_the_next_one() {
     let fleet = fleet();
-    let manager = system(fleet).build_system().unwrap();
-    let first = unit("first", 1, fleet).build_unit().unwrap();
+    let manager = system(fleet).build().unwrap();
+    let first = unit("first", 1, fleet).build().unwrap();
     meet(&manager, &first);
     manager.set_constraints(Constraints { maximum_nodes: 1, ..manager.constraints() }).unwrap();
-    let second = unit("second", 2, fleet).build_unit().unwrap();
+    let second = unit("second", 2, fleet).build().unwrap();
     second.start().unwrap();
     until("it is refused", || !manager.findings().is_empty());
     assert_eq!(manager.number_of_s_units(), 1);

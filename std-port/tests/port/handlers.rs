@@ -38,8 +38,8 @@ fn method_in_place(state: &mut i64, _: &Call, view: &mut ParametersView) -> Resu
 #[test]
 fn all_four_forms_serve_in_both_roles() {
     let fleet = fleet();
-    let manager = system(fleet).state(100_i64).build_system().unwrap();
-    let agv = unit("agv", 7, fleet).state(200_i64).build_unit().unwrap();
+    let manager = system(fleet).state(100_i64).build().unwrap();
+    let agv = unit("agv", 7, fleet).state(200_i64).build().unwrap();
     for list in [manager.my_function_list(), agv.my_function_list()] {
         list.add_function("free", &number(0), free).unwrap();
         list.add_function("method", &number(0), method).unwrap();
@@ -66,8 +66,8 @@ fn all_four_forms_serve_in_both_roles() {
 #[test]
 fn a_handler_that_panics_harms_nobody_else() {
     let fleet = fleet();
-    let manager = system(fleet).build_system().unwrap();
-    let agv = unit("agv", 7, fleet).state(0_i64).build_unit().unwrap();
+    let manager = system(fleet).build().unwrap();
+    let agv = unit("agv", 7, fleet).state(0_i64).build().unwrap();
     let list = agv.my_function_list();
     list.add_function("free", &number(0), |_: &Call, _: &mut ParametersView| panic!("as the test wants")).unwrap();
     list.add_function("method", &number(0), |_: &mut i64, _: Parameters| -> Parameters { panic!("likewise") }).unwrap();
@@ -87,14 +87,14 @@ fn a_slow_handler_delays_nobody_else() {
     let fleet = fleet();
     let constraints =
         cara_std::Constraints { keep_alive: cara_std::Duration::from_millis(400), ..cara_std::Constraints::M_UNIT };
-    let manager = system(fleet).constraints(constraints).build_system().unwrap();
+    let manager = system(fleet).constraints(constraints).build().unwrap();
     let gate = Arc::new(Gate::default());
     manager.my_function_list().add_function("slow", &number(0), held(&gate)).unwrap();
     manager.my_function_list().add_function("quick", &number(0), service(|number| number + 1)).unwrap();
     let units: Vec<_> = (0..2)
         .map(|index| {
             let constraints = cara_std::Constraints { maximum_nodes: 1, ..constraints };
-            unit(&format!("agv{index}"), index, fleet).constraints(constraints).build_unit().unwrap()
+            unit(&format!("agv{index}"), index, fleet).constraints(constraints).build().unwrap()
         })
         .collect();
     let [first, second] = [&units[0], &units[1]].map(|unit| meet(&manager, unit));
@@ -126,7 +126,7 @@ fn a_slow_handler_delays_nobody_else() {
 fn quick_handlers_that_all_get_slow_leave_a_thread_that_reads() {
     const CALLERS: u32 = 5;
     let fleet = fleet();
-    let manager = system(fleet).build_system().unwrap();
+    let manager = system(fleet).build().unwrap();
     let gate = Arc::new(Gate::default());
     let at_gate = gate.clone();
     let work = service(move |number| {
@@ -137,7 +137,7 @@ fn quick_handlers_that_all_get_slow_leave_a_thread_that_reads() {
     });
     manager.my_function_list().add_function("work", &number(0), work).unwrap();
     let units: Vec<_> =
-        (0..=CALLERS).map(|index| unit(&format!("agv{index}"), index, fleet).build_unit().unwrap()).collect();
+        (0..=CALLERS).map(|index| unit(&format!("agv{index}"), index, fleet).build().unwrap()).collect();
     let met: Vec<_> = units.iter().map(|unit| meet(&manager, unit)).collect();
     let (last, callers) = met.split_last().unwrap();
     let options = RequestOptions { timeout: Some(cara_std::Duration::from_secs(20)), ..Default::default() };

@@ -10,8 +10,8 @@ use crate::support::{ask, fleet, meet, number, service, system, unit};
 #[test]
 fn a_port_in_use_is_an_error_that_says_what_to_do() {
     let fleet = fleet();
-    let manager = system(fleet).build_system().unwrap();
-    let agv = unit("agv", 7, fleet).build_unit().unwrap();
+    let manager = system(fleet).build().unwrap();
+    let agv = unit("agv", 7, fleet).build().unwrap();
     agv.my_function_list().add_function("echo", &number(0), service(|number| number)).unwrap();
     let (peer, _) = meet(&manager, &agv);
 
@@ -21,11 +21,11 @@ fn a_port_in_use_is_an_error_that_says_what_to_do() {
     };
     let stream = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
     let taken = stream.local_addr().unwrap().port();
-    assert_eq!(refused(system(fleet).tcp_port(taken).build_system()), Error::PortInUse);
-    assert_eq!(refused(system(fleet).tcp_port(manager.tcp_port()).build_system()), Error::PortInUse);
+    assert_eq!(refused(system(fleet).tcp_port(taken).build()), Error::PortInUse);
+    assert_eq!(refused(system(fleet).tcp_port(manager.tcp_port()).build()), Error::PortInUse);
     let datagrams = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).unwrap();
     let taken = datagrams.local_addr().unwrap().port();
-    assert_eq!(refused(system(fleet).discovery_port(taken).build_system()), Error::PortInUse);
+    assert_eq!(refused(system(fleet).discovery_port(taken).build()), Error::PortInUse);
     assert!(Error::PortInUse.to_string().contains("choose another port"));
     assert_eq!(ask(&peer, "echo", 5), Ok(5));
 }
@@ -34,9 +34,9 @@ fn a_port_in_use_is_an_error_that_says_what_to_do() {
 #[test]
 fn a_full_list_of_functions_names_the_setting_that_raises_it() {
     let fleet = fleet();
-    let manager = system(fleet).build_system().unwrap();
+    let manager = system(fleet).build().unwrap();
     let agv = unit("agv", 7, fleet).capacities(Capacities { functions: 2, ..Capacities::default() });
-    let agv = agv.build_unit().unwrap();
+    let agv = agv.build().unwrap();
     let add = |name: &str| agv.my_function_list().add_function(name, &number(0), service(|number| number));
     assert_eq!((add("echo"), add("second")), (Ok(()), Ok(())));
     let full = add("third").unwrap_err();

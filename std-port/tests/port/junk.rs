@@ -4,7 +4,7 @@ use std::io::{Read, Write};
 use std::net::{Ipv4Addr, SocketAddr, TcpStream, UdpSocket};
 use std::time::{Duration, Instant};
 
-use cara_std::{Builder, Constraints, Mode};
+use cara_std::{Constraints, Mode};
 use socket2::{Domain, Socket, Type};
 
 use crate::support::{PATIENCE, ask, counter, fleet, meet, number, service, system, unit, until};
@@ -50,9 +50,8 @@ fn junk_on_every_port_changes_nothing() {
     let fleet = fleet();
     // Below the ports that the system gives out.
     let discovery = 20_000 + (fleet % 10_000) as u16;
-    let with_port = |builder: Builder<()>| builder.discovery_port(discovery);
-    let manager = with_port(system(fleet)).build_system().unwrap();
-    let agv = with_port(unit("agv", 7, fleet)).build_unit().unwrap();
+    let manager = system(fleet).discovery_port(discovery).build().unwrap();
+    let agv = unit("agv", 7, fleet).discovery_port(discovery).build().unwrap();
     agv.my_function_list().add_function("echo", &number(0), service(|number| number)).unwrap();
     let (peer, _) = meet(&manager, &agv);
     let stream_port = stream_port(&agv);
@@ -93,8 +92,8 @@ fn junk_on_every_port_changes_nothing() {
 #[test]
 fn half_open_connections_do_not_keep_units_out_for_ever() {
     let fleet = fleet();
-    let manager = system(fleet).build_system().unwrap();
-    let first = unit("first", 1, fleet).build_unit().unwrap();
+    let manager = system(fleet).build().unwrap();
+    let first = unit("first", 1, fleet).build().unwrap();
     first.my_function_list().add_function("echo", &number(0), service(|number| number)).unwrap();
     let (peer, _) = meet(&manager, &first);
     let port = stream_port(&first);
@@ -102,7 +101,7 @@ fn half_open_connections_do_not_keep_units_out_for_ever() {
         (0..200).filter_map(|_| TcpStream::connect_timeout(&port, Duration::from_secs(5)).ok()).collect();
     assert!(silent.len() > 150);
     assert_eq!(ask(&peer, "echo", 5), Ok(5));
-    let second = unit("second", 2, fleet).build_unit().unwrap();
+    let second = unit("second", 2, fleet).build().unwrap();
     second.start().unwrap();
     until("the second comes", || manager.number_of_s_units() == 2);
     drop(silent);
@@ -113,8 +112,8 @@ fn half_open_connections_do_not_keep_units_out_for_ever() {
 fn half_open_connections_of_one_host_give_way_to_each_other_first() {
     let fleet = fleet();
     let constraints = Constraints { maximum_nodes: 4, ..Constraints::M_UNIT };
-    let manager = system(fleet).constraints(constraints).build_system().unwrap();
-    let first = unit("first", 1, fleet).build_unit().unwrap();
+    let manager = system(fleet).constraints(constraints).build().unwrap();
+    let first = unit("first", 1, fleet).build().unwrap();
     meet(&manager, &first);
     let port = stream_port(&first);
     // A silent connection is closed after 2 s, so a machine that is slower than that tries again.

@@ -23,8 +23,8 @@ struct Vehicle {
 /// A manager and a vehicle that offers `go_to` under a lease.
 fn vehicle() -> Vehicle {
     let fleet = fleet();
-    let manager = system(fleet).build_system().unwrap();
-    let agv = unit("agv", 7, fleet).state(0_i64).build_unit().unwrap();
+    let manager = system(fleet).build().unwrap();
+    let agv = unit("agv", 7, fleet).state(0_i64).build().unwrap();
     let stops = Arc::new(AtomicUsize::new(0));
     let stopped = stops.clone();
     let safe = move || {

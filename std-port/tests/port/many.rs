@@ -15,10 +15,10 @@ const NODES: u32 = 40;
 /// A manager for so many nodes, and s_units that share threads, none of them started.
 fn many(fleet: u32) -> (cara_std::CommunicationSystem, Threads, Vec<Unit>) {
     let constraints = Constraints { maximum_nodes: NODES as u16, ..Constraints::M_UNIT };
-    let manager = system(fleet).constraints(constraints).build_system().unwrap();
+    let manager = system(fleet).constraints(constraints).build().unwrap();
     let threads = Threads::new().unwrap();
     let agvs = (0..NODES).map(|id| {
-        let agv = unit(&format!("agv-{id}"), 10 + id, fleet).threads(&threads).build_unit().unwrap();
+        let agv = unit(&format!("agv-{id}"), 10 + id, fleet).threads(&threads).build().unwrap();
         let add = service(move |number| number + i64::from(id));
         agv.my_function_list().add_function("add", &number(0), add).unwrap();
         agv.publish_my_function_list().unwrap();
@@ -57,9 +57,9 @@ fn units_that_share_threads_serve_and_stop_each_by_itself() {
 #[test]
 fn a_handler_on_shared_threads_may_stop_units() {
     let fleet = fleet();
-    let manager = system(fleet).build_system().unwrap();
+    let manager = system(fleet).build().unwrap();
     let threads = Threads::new().unwrap();
-    let [one, two] = [1, 2].map(|id| unit(&format!("agv-{id}"), id, fleet).threads(&threads).build_unit().unwrap());
+    let [one, two] = [1, 2].map(|id| unit(&format!("agv-{id}"), id, fleet).threads(&threads).build().unwrap());
     let units = [two.downgrade(), one.downgrade()];
     let stop = service(move |number| {
         units.iter().filter_map(cara_std::WeakUnit::upgrade).for_each(|unit| unit.stop());
@@ -141,8 +141,8 @@ fn a_node_has_joined_before_anything_else_is_told_of_it() {
 fn tables_grow_to_the_capacities_and_no_further() {
     let fleet = fleet();
     let capacities = Capacities { calls_in_flight: 16, their_functions: 40, ..Capacities::default() };
-    let manager = system(fleet).capacities(capacities).build_system().unwrap();
-    let agv = unit("agv", 7, fleet).build_unit().unwrap();
+    let manager = system(fleet).capacities(capacities).build().unwrap();
+    let agv = unit("agv", 7, fleet).build().unwrap();
     agv.set_constraints(Constraints { calls_per_peer: 64, ..agv.constraints() }).unwrap();
     let gate = std::sync::Arc::new(Gate::default());
     agv.my_function_list().add_function("slow", &number(0), held(&gate)).unwrap();

@@ -25,9 +25,9 @@ fn refusal(events: &Receiver<UnitEvent>) -> CloseReason {
 #[test]
 fn units_of_other_fleets_and_other_managers_do_not_meet() {
     let (mine, other) = (fleet(), fleet());
-    let manager = system(mine).build_system().unwrap();
-    let wrong_fleet = unit("stranger", 1, other).build_unit().unwrap();
-    let wrong_manager = unit_of(("another", 1), "astray", 2, mine).build_unit().unwrap();
+    let manager = system(mine).build().unwrap();
+    let wrong_fleet = unit("stranger", 1, other).build().unwrap();
+    let wrong_manager = unit_of(("another", 1), "astray", 2, mine).build().unwrap();
     manager.start().unwrap();
     wrong_fleet.start().unwrap();
     wrong_manager.start().unwrap();
@@ -37,7 +37,7 @@ fn units_of_other_fleets_and_other_managers_do_not_meet() {
         wrong_manager.broadcast();
         manager.broadcast();
     }
-    let right = unit("right", 3, mine).build_unit().unwrap();
+    let right = unit("right", 3, mine).build().unwrap();
     meet(&manager, &right);
     assert_eq!(manager.s_units().len(), 1);
     assert!(wrong_fleet.manager().is_none() && wrong_manager.manager().is_none());
@@ -48,10 +48,10 @@ fn units_of_other_fleets_and_other_managers_do_not_meet() {
 fn a_full_manager_says_so() {
     let fleet = fleet();
     let manager = system(fleet).constraints(Constraints { maximum_nodes: 1, ..Constraints::M_UNIT });
-    let manager = manager.build_system().unwrap();
-    let first = unit("first", 1, fleet).build_unit().unwrap();
+    let manager = manager.build().unwrap();
+    let first = unit("first", 1, fleet).build().unwrap();
     meet(&manager, &first);
-    let second = unit("second", 2, fleet).build_unit().unwrap();
+    let second = unit("second", 2, fleet).build().unwrap();
     let events = second.events();
     second.start().unwrap();
     assert_eq!(refusal(&events), CloseReason::Refused(Refusal::Full));
@@ -67,11 +67,11 @@ fn a_full_manager_takes_more_when_its_maximum_is_raised() {
     const NODES: u16 = 40;
     let fleet = fleet();
     let few = Constraints { maximum_nodes: 1, ..Constraints::M_UNIT };
-    let manager = system(fleet).constraints(few).build_system().unwrap();
-    let first = unit("first", 1, fleet).build_unit().unwrap();
+    let manager = system(fleet).constraints(few).build().unwrap();
+    let first = unit("first", 1, fleet).build().unwrap();
     let (peer, _) = meet(&manager, &first);
     let threads = Threads::new().unwrap();
-    let other = |id: u32| unit(&format!("agv-{id}"), 10 + id, fleet).threads(&threads).build_unit().unwrap();
+    let other = |id: u32| unit(&format!("agv-{id}"), 10 + id, fleet).threads(&threads).build().unwrap();
     let others: Vec<Unit> = (1..NODES.into()).map(other).collect();
     others.iter().for_each(|unit| unit.start().unwrap());
     manager.set_constraints(Constraints { maximum_nodes: NODES, ..few }).unwrap();
@@ -83,11 +83,11 @@ fn a_full_manager_takes_more_when_its_maximum_is_raised() {
 #[test]
 fn a_second_node_of_one_name_is_refused_while_the_first_lives() {
     let fleet = fleet();
-    let manager = system(fleet).build_system().unwrap();
-    let first = unit("agv", 7, fleet).build_unit().unwrap();
+    let manager = system(fleet).build().unwrap();
+    let first = unit("agv", 7, fleet).build().unwrap();
     first.my_function_list().add_function("f", &number(0), service(|_| 1)).unwrap();
     let (peer, _) = meet(&manager, &first);
-    let second = unit("agv", 7, fleet).build_unit().unwrap();
+    let second = unit("agv", 7, fleet).build().unwrap();
     second.my_function_list().add_function("f", &number(0), service(|_| 2)).unwrap();
     second.publish_my_function_list().unwrap();
     let events = second.events();
@@ -102,9 +102,9 @@ fn a_second_node_of_one_name_is_refused_while_the_first_lives() {
 #[test]
 fn a_node_that_comes_back_has_its_place_and_its_handle() {
     let fleet = fleet();
-    let manager = system(fleet).build_system().unwrap();
+    let manager = system(fleet).build().unwrap();
     let build = |name: &str, id: u32, number_of_life: i64| {
-        let agv = unit(name, id, fleet).build_unit().unwrap();
+        let agv = unit(name, id, fleet).build().unwrap();
         agv.my_function_list().add_function("life", &number(0), service(move |_| number_of_life)).unwrap();
         agv
     };
@@ -130,7 +130,7 @@ fn a_node_that_comes_back_has_its_place_and_its_handle() {
 fn two_m_units_meet_and_call_each_other() {
     let fleet = fleet();
     let units = [("one", 1), ("two", 2)].map(|(name, id)| {
-        let unit = system_named(name, id, fleet).build_system().unwrap();
+        let unit = system_named(name, id, fleet).build().unwrap();
         unit.my_function_list().add_function("who", &number(0), service(move |_| i64::from(id))).unwrap();
         unit.publish_my_function_list().unwrap();
         unit.start().unwrap();
@@ -147,10 +147,10 @@ fn two_m_units_meet_and_call_each_other() {
 #[test]
 fn publishing_to_one_node_is_for_that_node() {
     let fleet = fleet();
-    let manager = system(fleet).build_system().unwrap();
+    let manager = system(fleet).build().unwrap();
     manager.start().unwrap();
     let start = |name: &str, id: u32| {
-        let agv = unit(name, id, fleet).build_unit().unwrap();
+        let agv = unit(name, id, fleet).build().unwrap();
         agv.start().unwrap();
         agv
     };
@@ -175,9 +175,9 @@ fn publishing_to_one_node_is_for_that_node() {
 fn a_function_published_while_a_node_joins_is_told() {
     for _ in 0..20 {
         let fleet = fleet();
-        let manager = system(fleet).build_system().unwrap();
+        let manager = system(fleet).build().unwrap();
         manager.start().unwrap();
-        let agv = unit("agv", 7, fleet).build_unit().unwrap();
+        let agv = unit("agv", 7, fleet).build().unwrap();
         agv.start().unwrap();
         let mut published = 0;
         while !agv.is_connected() {
@@ -197,11 +197,11 @@ fn a_function_published_while_a_node_joins_is_told() {
 #[test]
 fn a_fixed_address_needs_no_broadcast() {
     let fleet = fleet();
-    let manager = system(fleet).build_system().unwrap();
+    let manager = system(fleet).build().unwrap();
     let port = manager.tcp_port();
-    let taken = system(fleet).tcp_port(port).build_system();
+    let taken = system(fleet).tcp_port(port).build();
     assert!(matches!(taken, Err(BuildError::Unit(Error::PortInUse))), "the port is taken");
-    let agv = unit("agv", 7, fleet).manager_address(([127, 0, 0, 1], port).into()).build_unit().unwrap();
+    let agv = unit("agv", 7, fleet).manager_address(([127, 0, 0, 1], port).into()).build().unwrap();
     meet(&manager, &agv);
     assert_eq!(counter(&agv.counters(), "WhoHasSent"), 0);
 }
@@ -235,10 +235,10 @@ fn slow_link(to: SocketAddr) -> SocketAddr {
 fn a_node_counts_once_its_list_has_come_however_slowly() {
     const FUNCTIONS: usize = 30;
     let fleet = fleet();
-    let manager = system(fleet).build_system().unwrap();
+    let manager = system(fleet).build().unwrap();
     manager.start().unwrap();
     let relay = slow_link((Ipv4Addr::LOCALHOST, manager.tcp_port()).into());
-    let slow = unit("agv-1", 1, fleet).manager_address(relay).build_unit().unwrap();
+    let slow = unit("agv-1", 1, fleet).manager_address(relay).build().unwrap();
     for index in 0..FUNCTIONS {
         let name = format!("a_service_with_a_long_name_{index}");
         slow.my_function_list().add_function(&name, &number(0), service(|number| number)).unwrap();
@@ -246,7 +246,7 @@ fn a_node_counts_once_its_list_has_come_however_slowly() {
     slow.publish_my_function_list().unwrap();
     slow.start().unwrap();
     until("it has joined", || !manager.s_units().is_empty());
-    let quick = unit("agv-2", 2, fleet).build_unit().unwrap();
+    let quick = unit("agv-2", 2, fleet).build().unwrap();
     quick.start().unwrap();
     until("one is counted", || manager.number_of_s_units() > 0);
     let mut ids = vec![2, 1];

@@ -14,9 +14,9 @@ use crate::support::{
 /// A manager and `count` s_units with a function `f`, which the last one fails.
 fn fleet_with_one_that_fails(count: u32) -> (CommunicationSystem, Vec<Unit>) {
     let fleet = fleet();
-    let manager = system(fleet).build_system().unwrap();
+    let manager = system(fleet).build().unwrap();
     manager.start().unwrap();
-    let units: Vec<_> = (0..count).map(|id| unit(&format!("agv{id}"), id, fleet).build_unit().unwrap()).collect();
+    let units: Vec<_> = (0..count).map(|id| unit(&format!("agv{id}"), id, fleet).build().unwrap()).collect();
     for (id, agv) in units.iter().enumerate() {
         let fails = id as u32 + 1 == count;
         let f = move |_: &cara_std::Call, view: &mut cara_std::ParametersView| -> Result<(), ServiceError> {
@@ -77,8 +77,8 @@ fn a_request_to_all_tells_who_is_missing() {
 #[test]
 fn a_name_that_several_have_is_refused() {
     let fleet = fleet();
-    let manager = system(fleet).build_system().unwrap();
-    let units = [1, 11].map(|id| unit("agv-1", id, fleet).build_unit().unwrap());
+    let manager = system(fleet).build().unwrap();
+    let units = [1, 11].map(|id| unit("agv-1", id, fleet).build().unwrap());
     let named = || manager.s_unit("agv-1").map(|peer| peer.id());
     let (first, _) = meet(&manager, &units[0]);
     assert_eq!(named(), Err(Error::Ambiguous { ids: [1, 11] }), "the one that is absent may be meant");
@@ -133,8 +133,8 @@ fn a_request_without_waiting_returns_while_its_service_runs() {
 #[test]
 fn publishing_waits_until_all_have_acknowledged() {
     let fleet = fleet();
-    let manager = system(fleet).build_system().unwrap();
-    let units: Vec<_> = (0..2).map(|id| unit(&format!("agv{id}"), id, fleet).build_unit().unwrap()).collect();
+    let manager = system(fleet).build().unwrap();
+    let units: Vec<_> = (0..2).map(|id| unit(&format!("agv{id}"), id, fleet).build().unwrap()).collect();
     for agv in &units {
         meet(&manager, agv);
     }
@@ -150,8 +150,8 @@ fn a_blocking_request_waits_for_the_interval_and_another_is_told() {
     let interval = Duration::from_millis(60);
     let fleet = fleet();
     let constraints = Constraints { minimum_interval: interval.into(), ..Constraints::M_UNIT };
-    let manager = system(fleet).constraints(constraints).build_system().unwrap();
-    let agv = unit("agv", 7, fleet).build_unit().unwrap();
+    let manager = system(fleet).constraints(constraints).build().unwrap();
+    let agv = unit("agv", 7, fleet).build().unwrap();
     agv.my_function_list().add_function("f", &number(0), service(|number| number)).unwrap();
     let (peer, _) = meet(&manager, &agv);
     assert_eq!(ask(&peer, "f", 1), Ok(1));

@@ -76,7 +76,7 @@ fn as_child() {
     let (fleet, id, life) = (fleet.parse().unwrap(), id.parse().unwrap(), life.parse().unwrap());
     match kind {
         "agv" => {
-            let agv = unit(name, id, fleet).build_unit().unwrap();
+            let agv = unit(name, id, fleet).build().unwrap();
             let list = agv.my_function_list();
             list.add_function("life", &number(0), service(move |_| life)).unwrap();
             list.add_function(
@@ -96,7 +96,7 @@ fn as_child() {
             std::process::exit(0);
         }
         _ => {
-            let manager = system(fleet).control(Control::Off).build_system().unwrap();
+            let manager = system(fleet).control(Control::Off).build().unwrap();
             manager.start().unwrap();
             until("a vehicle has come", || manager.nodes_offering("go_to").len() == 1);
             manager.nodes_offering("go_to")[0].block_request("go_to", &mut number(1)).unwrap();
@@ -112,7 +112,7 @@ fn until_input_ends() {
 #[test]
 fn a_killed_peer_interrupts_its_callers_and_takes_its_place_again() {
     let fleet = fleet();
-    let manager = system(fleet).build_system().unwrap();
+    let manager = system(fleet).build().unwrap();
     manager.start().unwrap();
     let mut first = Process::agv(fleet, "first", 1, 1);
     until("the first has come", || manager.s_units().first().is_some_and(|peer| ask(peer, "life", 0) == Ok(1)));
@@ -151,7 +151,7 @@ fn several_processes_share_the_discovery_port() {
     let fleet = fleet();
     let _vehicles: Vec<_> = (0..3).map(|id| Process::agv(fleet, &format!("agv{id}"), id, i64::from(id))).collect();
     let _stranger = Process::agv(fleet.wrapping_add(1), "stranger", 9, 9);
-    let manager = system(fleet).build_system().unwrap();
+    let manager = system(fleet).build().unwrap();
     manager.start().unwrap();
     until("all have come", || manager.nodes_offering("life").len() == 3);
     for peer in manager.s_units() {
@@ -163,7 +163,7 @@ fn several_processes_share_the_discovery_port() {
 #[test]
 fn publishing_names_who_has_not_acknowledged() {
     let fleet = fleet();
-    let manager = system(fleet).build_system().unwrap();
+    let manager = system(fleet).build().unwrap();
     manager.start().unwrap();
     let _quick = Process::agv(fleet, "quick", 1, 1);
     let frozen = Process::agv(fleet, "frozen", 2, 2);
@@ -189,7 +189,7 @@ fn publishing_names_who_has_not_acknowledged() {
 #[test]
 fn a_restart_and_a_twin_are_told_apart() {
     let fleet = fleet();
-    let manager = system(fleet).build_system().unwrap();
+    let manager = system(fleet).build().unwrap();
     let events = manager.events();
     manager.start().unwrap();
     let _bystander = Process::agv(fleet, "bystander", 2, 20);
@@ -207,7 +207,7 @@ fn a_restart_and_a_twin_are_told_apart() {
     assert_eq!(left, Some(CloseReason::PeerRestarted), "it did not take three keep-alives to notice");
     assert_eq!(life("bystander"), Some(20));
 
-    let twin = unit("agv", 7, fleet).build_unit().unwrap();
+    let twin = unit("agv", 7, fleet).build().unwrap();
     let told = twin.events();
     twin.start().unwrap();
     loop {
@@ -229,10 +229,10 @@ fn a_restart_and_a_twin_are_told_apart() {
 fn a_second_manager_starts_only_where_the_first_does_not_answer() {
     let fleet = fleet();
     let first = Process::manager(fleet);
-    let agv = unit("agv", 7, fleet).build_unit().unwrap();
+    let agv = unit("agv", 7, fleet).build().unwrap();
     agv.start().unwrap();
     until("it has joined the first", || agv.is_connected());
-    let second = system(fleet).control(Control::Off).build_system().unwrap();
+    let second = system(fleet).control(Control::Off).build().unwrap();
     let port = agv.manager().and_then(|peer| peer.address()).map(|address| address.port());
     match second.start() {
         Err(StartError::AlreadyRunning { at, .. }) => assert_eq!(Some(at.port()), port),
@@ -248,7 +248,7 @@ fn a_vehicle_stops_once_when_its_manager_is_killed() {
     let fleet = fleet();
     let stops = Arc::new(AtomicUsize::new(0));
     let stopped = stops.clone();
-    let agv = unit("agv", 7, fleet).build_unit().unwrap();
+    let agv = unit("agv", 7, fleet).build().unwrap();
     let definition = "go_to(number: int[1]) -> (number: int[1])".parse().unwrap();
     let length = Duration::from_millis(1_500);
     let options = ServiceOptions::new().lease(length, move || {

@@ -41,9 +41,9 @@ fn a_waiting_caller_returns_at_once_when_its_unit_stops() {
 #[test]
 fn a_handler_may_stop_its_own_unit() {
     let fleet = fleet();
-    let manager = system(fleet).build_system().unwrap();
+    let manager = system(fleet).build().unwrap();
     let own: Arc<OnceLock<Unit<i64>>> = Arc::default();
-    let agv = unit("agv", 7, fleet).state(0_i64).build_unit().unwrap();
+    let agv = unit("agv", 7, fleet).state(0_i64).build().unwrap();
     let unit = own.clone();
     let stop = move |_: &mut i64, parameters: cara_std::Parameters| {
         unit.get().unwrap().stop();
@@ -68,8 +68,8 @@ fn a_handler_may_stop_its_own_unit() {
 #[test]
 fn stopping_with_the_state_held_does_not_hang() {
     let fleet = fleet();
-    let manager = system(fleet).build_system().unwrap();
-    let agv = unit("agv", 7, fleet).state(0_i64).build_unit().unwrap();
+    let manager = system(fleet).build().unwrap();
+    let agv = unit("agv", 7, fleet).state(0_i64).build().unwrap();
     agv.my_function_list().add_function("method", &number(0), |_: &mut i64, p: cara_std::Parameters| p).unwrap();
     let (peer, _) = meet(&manager, &agv);
     let began = Instant::now();
@@ -111,6 +111,6 @@ fn a_stopped_unit_says_so_and_stops_again_quietly() {
     }
     assert!(agv.start().is_err(), "it does not start again");
     assert!(!back.is_connected() && !peer.is_connected());
-    let never_started = unit("never", 1, fleet()).build_unit().unwrap();
+    let never_started = unit("never", 1, fleet()).build().unwrap();
     never_started.stop();
 }

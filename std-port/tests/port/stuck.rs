@@ -34,8 +34,8 @@ fn counting(hooks: &Arc<AtomicUsize>) -> impl Fn() + Send + Sync + 'static {
 impl Stuck {
     fn new() -> Self {
         let fleet = fleet();
-        let manager = system(fleet).build_system().unwrap();
-        let agv = unit("agv", 7, fleet).state(0_i64).build_unit().unwrap();
+        let manager = system(fleet).build().unwrap();
+        let agv = unit("agv", 7, fleet).state(0_i64).build().unwrap();
         agv.set_constraints(cara_std::Constraints { calls_per_peer: 64, ..agv.constraints() }).unwrap();
         let (gate, hooks) = (Arc::new(Gate::default()), Arc::new(AtomicUsize::new(0)));
         let list = agv.my_function_list();
@@ -130,8 +130,8 @@ fn a_quick_call_waits_for_none_of_three_slow_ones_before_it() {
 #[test]
 fn hooks_do_not_wait_for_each_other() {
     let fleet = fleet();
-    let manager = system(fleet).build_system().unwrap();
-    let agv = unit("agv", 7, fleet).build_unit().unwrap();
+    let manager = system(fleet).build().unwrap();
+    let agv = unit("agv", 7, fleet).build().unwrap();
     let (gate, hooks) = (Arc::new(Gate::default()), Arc::new(AtomicUsize::new(0)));
     let list = agv.my_function_list();
     let signature = |name: &str| format!("{name}(number: int[1]) -> (number: int[1])").parse().unwrap();
@@ -163,7 +163,7 @@ fn hooks_do_not_wait_for_each_other() {
 
 #[test]
 fn an_emergency_service_takes_no_handler_that_waits_for_the_state() {
-    let agv = unit("agv", 7, fleet()).state(0_i64).build_unit().unwrap();
+    let agv = unit("agv", 7, fleet()).state(0_i64).build().unwrap();
     let definition = "stop(number: int[1])".parse().unwrap();
     let stop = |_: &mut i64, parameters: Parameters| parameters;
     let refused = agv.my_function_list().add_service(&definition, emergency(), stop);

@@ -5,8 +5,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use cara_std::{
-    Builder, Call, CommunicationSystem, Error, Identity, Interfaces, Parameters, ParametersView, Peer, ServiceError,
-    Unit,
+    Builder, Call, CommunicationSystem, Error, Identity, Interfaces, MUnit, Parameters, ParametersView, Peer, SUnit,
+    ServiceError, Unit,
 };
 
 use crate::keyed::keyed;
@@ -37,23 +37,23 @@ pub(crate) fn within(span: Duration, mut condition: impl FnMut() -> bool) -> boo
 }
 
 /// The manager of a fleet, to be given a state or built.
-pub(crate) fn system(fleet: u32) -> Builder<()> {
+pub(crate) fn system(fleet: u32) -> Builder<(), MUnit> {
     system_named("manager", 1, fleet)
 }
 
-pub(crate) fn system_named(name: &str, id: u32, fleet: u32) -> Builder<()> {
+pub(crate) fn system_named(name: &str, id: u32, fleet: u32) -> Builder<(), MUnit> {
     let builder = CommunicationSystem::builder(name, id).unwrap().interfaces(Interfaces::Loopback);
     let others = [m_units(), s_units()].concat();
     keyed(builder, fleet, &Identity::m_unit(name, id).unwrap(), &others)
 }
 
 /// An s_unit of that manager.
-pub(crate) fn unit(name: &str, id: u32, fleet: u32) -> Builder<()> {
+pub(crate) fn unit(name: &str, id: u32, fleet: u32) -> Builder<(), SUnit> {
     unit_of(("manager", 1), name, id, fleet)
 }
 
 /// An s_unit of another manager. It has a key for `manager/1` as well, and so has that for it.
-pub(crate) fn unit_of(manager: (&str, u32), name: &str, id: u32, fleet: u32) -> Builder<()> {
+pub(crate) fn unit_of(manager: (&str, u32), name: &str, id: u32, fleet: u32) -> Builder<(), SUnit> {
     let own = Identity::s_unit(name, id).unwrap();
     assert!(s_units().contains(&own), "the managers have no key for {own}: name it in s_units");
     let builder = Unit::builder(name, id, manager.0, manager.1).unwrap().interfaces(Interfaces::Loopback);
@@ -90,7 +90,7 @@ fn s_units() -> Vec<Identity> {
 /// A manager and an s_unit `agv`, not started.
 pub(crate) fn pair() -> (CommunicationSystem, Unit) {
     let fleet = fleet();
-    (system(fleet).build_system().unwrap(), unit("agv", 7, fleet).build_unit().unwrap())
+    (system(fleet).build().unwrap(), unit("agv", 7, fleet).build().unwrap())
 }
 
 /// Starts both, publishes both lists and waits until they have met. Returns each one's view of the other.

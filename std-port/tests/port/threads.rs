@@ -47,11 +47,11 @@ fn sixteen_threads_share_a_link_while_the_peer_calls_back() {
 fn sixty_four_callers_have_a_link_each() {
     let fleet = fleet();
     let manager = system(fleet).constraints(Constraints { maximum_nodes: 64, ..Constraints::M_UNIT });
-    let manager = manager.build_system().unwrap();
+    let manager = manager.build().unwrap();
     manager.start().unwrap();
     let units: Vec<_> = (0..64)
         .map(|id| {
-            let agv = unit(&format!("agv{id}"), id, fleet).build_unit().unwrap();
+            let agv = unit(&format!("agv{id}"), id, fleet).build().unwrap();
             agv.my_function_list()
                 .add_function("echo", &number(0), service(move |number| number + i64::from(id)))
                 .unwrap();
@@ -76,8 +76,8 @@ fn sixty_four_callers_have_a_link_each() {
 #[test]
 fn calls_of_a_class_take_the_state_in_order() {
     let fleet = fleet();
-    let manager = system(fleet).build_system().unwrap();
-    let agv = crate::support::unit("agv", 7, fleet).state(-1_i64).build_unit().unwrap();
+    let manager = system(fleet).build().unwrap();
+    let agv = crate::support::unit("agv", 7, fleet).state(-1_i64).build().unwrap();
     let in_order = |last: &mut i64, parameters: cara_std::Parameters| {
         assert_eq!(crate::support::value(&parameters), *last + 1);
         *last += 1;

@@ -127,8 +127,7 @@ fn meet() {
     let vehicle = keys.ring(&vehicle).unwrap();
     std::thread::spawn(move || board(fleet, vehicle));
     let builder = CommunicationSystem::builder("manager", 1).unwrap();
-    let manager =
-        builder.keys(keys.ring(&own).unwrap()).fleet(fleet).interfaces(Interfaces::All).build_system().unwrap();
+    let manager = builder.keys(keys.ring(&own).unwrap()).fleet(fleet).interfaces(Interfaces::All).build().unwrap();
     let mut minutes = Parameters::new();
     minutes.add_int("minutes", 1).unwrap();
     let list = manager.my_function_list();

@@ -11,7 +11,7 @@ use std::rc::Rc;
 use anyhow::{Context, Result, ensure};
 use cara_processes::Process;
 use cara_std::keys::place;
-use cara_std::{Builder, Fleet, Identity};
+use cara_std::{Builder, Fleet, Identity, MUnit};
 use tempfile::TempDir;
 
 use crate::board::{FLEET, Who};
@@ -116,7 +116,7 @@ impl Keys {
     }
 
     /// Gives a manager its keys.
-    pub(crate) fn give(&self, builder: Builder<()>) -> Result<Builder<()>> {
+    pub(crate) fn give(&self, builder: Builder<(), MUnit>) -> Result<Builder<(), MUnit>> {
         match (self.kind, self.manager_file()) {
             (Kind::Insecure, _) => Ok(builder.insecure()),
             (_, file) => Ok(builder.key_file(file.context("there are no keys for a manager")?)),

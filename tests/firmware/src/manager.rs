@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, bail, ensure};
 use cara_apps::mechanic;
 use cara_std::control::Control;
-use cara_std::{Builder, CloseReason, CommunicationSystem, Error, Parameters, Peer, UnitEvent};
+use cara_std::{Builder, CloseReason, CommunicationSystem, Error, MUnit, Parameters, Peer, UnitEvent};
 
 use crate::board::{Board, FLEET, LONG, Who};
 use crate::keys::Keys;
@@ -26,13 +26,13 @@ impl Manager {
     }
 
     /// As it is, but for its keys.
-    pub(crate) fn builder() -> Result<Builder<()>> {
+    pub(crate) fn builder() -> Result<Builder<(), MUnit>> {
         Ok(CommunicationSystem::builder("depot", 1)?.fleet(FLEET).control(Control::Off))
     }
 
     /// Starts a manager that was given keys.
-    pub(crate) fn of(builder: Builder<()>) -> Result<Self> {
-        let system = builder.build_system()?;
+    pub(crate) fn of(builder: Builder<(), MUnit>) -> Result<Self> {
+        let system = builder.build()?;
         let events = Mutex::new(system.events());
         system.start()?;
         Ok(Self { system, events })

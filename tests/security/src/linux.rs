@@ -51,12 +51,11 @@ impl Linux {
         Ok(Self { ground: Ground::new(vehicles), threads: Threads::new()?, port, weakness })
     }
 
-    fn prepared(&self, builder: Builder<()>, identity: &Identity) -> Builder<()> {
+    fn prepared<R>(&self, builder: Builder<(), R>, identity: &Identity) -> Builder<(), R> {
         let builder = builder
             .fleet(self.ground.fleet.0)
             .interfaces(Interfaces::Loopback)
             .threads(&self.threads)
-            .control(Control::Off)
             .discovery_port(self.port);
         match self.weakness {
             Weakness::Plain => builder.insecure(),
@@ -69,7 +68,7 @@ impl Linux {
         // The capacity is below the number of links that attackers hold.
         let constraints = Constraints { maximum_nodes: 64, ..Constraints::M_UNIT };
         let builder = CommunicationSystem::builder("depot", 1)?.constraints(constraints);
-        let system = self.prepared(builder, &depot()).build_system()?;
+        let system = self.prepared(builder, &depot()).control(Control::Off).build()?;
         let log = EventLog::default();
         log.offer(&system.my_function_list())?;
         log.follow(system.events());
@@ -82,7 +81,7 @@ impl Linux {
     pub fn vehicle(&self, id: u32, manager: Option<SocketAddr>) -> Result<(Unit, EventLog)> {
         let builder = self.prepared(Unit::builder("agv", id, "depot", 1)?, &agv(id));
         let builder = manager.into_iter().fold(builder, Builder::manager_address);
-        let unit = builder.build_unit()?;
+        let unit = builder.build()?;
         let log = EventLog::default();
         log.offer(&unit.my_function_list())?;
         log.follow(unit.events());

@@ -84,11 +84,11 @@ fn a_live_link_ends_soon_after_its_key_is_revoked() {
     store.save().unwrap();
     let file = |node| folder.path().join(place::file_name(&node, fleet));
     let builder = CommunicationSystem::builder("depot", 1).unwrap().fleet(fleet.0).control(Control::Off);
-    let manager = builder.interfaces(Interfaces::Loopback).key_file(file(depot())).build_system().unwrap();
+    let manager = builder.interfaces(Interfaces::Loopback).key_file(file(depot())).build().unwrap();
     manager.start().unwrap();
     let units = [1, 2].map(|id| {
         let builder = Unit::builder("agv", id, "depot", 1).unwrap().fleet(fleet.0);
-        let unit = builder.interfaces(Interfaces::Loopback).key_file(file(agv(id))).build_unit().unwrap();
+        let unit = builder.interfaces(Interfaces::Loopback).key_file(file(agv(id))).build().unwrap();
         unit.start().unwrap();
         unit
     });

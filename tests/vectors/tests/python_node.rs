@@ -79,7 +79,7 @@ fn a_node_written_from_the_document_joins_a_manager() {
     };
     let manager = CommunicationSystem::builder("python_manager", 1).unwrap().fleet(fleet);
     // The node in Python has no cipher.
-    let manager = manager.interfaces(Interfaces::Loopback).insecure().build_system().unwrap();
+    let manager = manager.interfaces(Interfaces::Loopback).insecure().build().unwrap();
     manager.start().unwrap();
 
     wait_until("joining", || manager.number_of_s_units() == 1);

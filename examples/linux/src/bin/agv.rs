@@ -32,7 +32,7 @@ fn main() -> Result<()> {
     log_to_stderr();
     let stop = Stop::new(network.attended)?;
     let builder = network.place(Unit::builder(&name, id, &manager.name, manager.id)?);
-    let unit = builder.build_unit()?;
+    let unit = builder.build()?;
     let agv = Arc::new(Mutex::new(Agv::new([0, 0])));
     let lease = offer(&unit, &agv)?;
     unit.on_manager_lost(|()| say!("manager lost"))?;

@@ -32,7 +32,7 @@ fn run(network: Network) -> Result<()> {
     let keys = network.draw_keys(&["manager/1@m_unit", "depot/11"])?;
     let ring = keys.ring(&Identity::s_unit("depot", 11)?)?;
     let depot = network.place_with(Unit::builder("depot", 11, "manager", 1)?, ring);
-    let depot = depot.state(Depot::default()).build_unit()?;
+    let depot = depot.state(Depot::default()).build()?;
     let functions = depot.my_function_list();
     let take = |depot: &mut Depot, _: &Call, parcels: &mut ParametersView| depot.take(parcels);
     functions.add_service(&Definition::parse(STORE)?, ServiceOptions::new(), Depot::store)?;
@@ -41,7 +41,7 @@ fn run(network: Network) -> Result<()> {
     depot.start()?;
 
     let ring = keys.ring(&Identity::m_unit("manager", 1)?)?;
-    let manager = network.place_with(CommunicationSystem::builder("manager", 1)?, ring).build_system()?;
+    let manager = network.place_with(CommunicationSystem::builder("manager", 1)?, ring).build()?;
     let joined = manager.events();
     manager.start()?;
     manager.broadcast();

@@ -37,7 +37,7 @@ fn main() -> Result<()> {
     let Options { name, id, calls, network } = Options::parse();
     log_to_stderr();
     let stop = Stop::new(network.attended)?;
-    let zone = network.place(CommunicationSystem::builder(&name, id)?).build_system()?;
+    let zone = network.place(CommunicationSystem::builder(&name, id)?).build()?;
     let served = offer(&zone)?;
     zone.start()?;
     zone.broadcast();

@@ -60,7 +60,7 @@ fn main() -> Result<()> {
 
 fn receive(name: &str, id: u32, network: Network, stop: &Stop) -> Result<()> {
     let builder = network.place(CommunicationSystem::builder(name, id)?);
-    let manager = builder.state(Received::default()).build_system()?;
+    let manager = builder.state(Received::default()).build()?;
     let take = |received: &mut Received, _: &Call, view: &mut ParametersView| received.report(view);
     manager.my_function_list().add_service(&Definition::parse(REPORT)?, ServiceOptions::new(), take)?;
     manager.publish_my_function_list()?;
@@ -92,7 +92,7 @@ fn show(manager: &CommunicationSystem<Received>) -> Result<()> {
 }
 
 fn send((name, id): (&str, u32), manager: &NameAndId, count: i64, network: Network, stop: &Stop) -> Result<()> {
-    let unit = network.place(Unit::builder(name, id, &manager.name, manager.id)?).build_unit()?;
+    let unit = network.place(Unit::builder(name, id, &manager.name, manager.id)?).build()?;
     unit.start()?;
     let best_effort = RequestOptions { delivery: Delivery::BestEffort, ..RequestOptions::default() };
     let (mut number, mut refused) = (0, 0);

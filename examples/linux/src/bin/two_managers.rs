@@ -28,11 +28,11 @@ fn main() -> Result<()> {
     keys.add(&Identity::s_unit("agv-1", 11)?, &[Identity::m_unit("south", 2)?])?;
     let manager = |name, id| -> Result<CommunicationSystem> {
         let ring = keys.ring(&Identity::m_unit(name, id)?)?;
-        Ok(network.place_with(CommunicationSystem::builder(name, id)?, ring).build_system()?)
+        Ok(network.place_with(CommunicationSystem::builder(name, id)?, ring).build()?)
     };
     let (north, south) = (manager("north", 1)?, manager("south", 2)?);
     let ring = keys.ring(&Identity::s_unit("agv-1", 11)?)?;
-    let agv = network.place_with(Unit::builder("agv-1", 11, "south", 2)?, ring).build_unit()?;
+    let agv = network.place_with(Unit::builder("agv-1", 11, "south", 2)?, ring).build()?;
     north.start()?;
     south.start()?;
     agv.start()?;

@@ -47,7 +47,7 @@ fn meet() {
     };
     let vehicle = std::thread::spawn(move || tap_agv::run(&options, || STOPPED.load(Ordering::Relaxed)));
     let builder = CommunicationSystem::builder("AGV_manager", 1).unwrap();
-    let manager = builder.fleet(fleet).interfaces(Interfaces::All).insecure().build_system().unwrap();
+    let manager = builder.fleet(fleet).interfaces(Interfaces::All).insecure().build().unwrap();
     manager.start().unwrap();
     until("the vehicle joins", || manager.number_of_s_units() == 1);
     talk(&manager, [1, 1]);

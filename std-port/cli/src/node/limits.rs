@@ -96,7 +96,7 @@ mod tests {
     #[test]
     fn the_library_takes_what_a_file_may_say_and_nothing_else() {
         let system = CommunicationSystem::builder("limits", 1).unwrap().interfaces(Interfaces::Loopback).insecure();
-        let system = system.fleet(std::process::id()).build_system().unwrap();
+        let system = system.fleet(std::process::id()).build().unwrap();
         let base = Constraints::M_UNIT;
         let cases = [
             ("maximum_nodes = 1", Some(Constraints { maximum_nodes: 1, ..base })),
@@ -140,9 +140,9 @@ mod tests {
     #[test]
     fn the_defaults_are_those_of_the_library() {
         let system = CommunicationSystem::builder("limits", 1).unwrap().interfaces(Interfaces::Loopback).insecure();
-        assert_eq!(system.build_system().unwrap().constraints(), defaults(Role::MUnit));
+        assert_eq!(system.build().unwrap().constraints(), defaults(Role::MUnit));
         let unit = Unit::builder("limits", 1, "manager", 1).unwrap().interfaces(Interfaces::Loopback).insecure();
-        assert_eq!(unit.build_unit().unwrap().constraints(), defaults(Role::SUnit));
+        assert_eq!(unit.build().unwrap().constraints(), defaults(Role::SUnit));
         assert_eq!(capacities(&file::Capacities::default(), &mut Vec::new()), Capacities::default());
     }
 }

@@ -287,7 +287,7 @@ mod tests {
     #[test]
     fn nothing_is_started_for_a_lease_that_has_ended_or_a_node_that_ends() {
         let system = CommunicationSystem::builder("program", 1).unwrap().interfaces(Interfaces::Loopback).insecure();
-        let system = system.build_system().unwrap();
+        let system = system.build().unwrap();
         let nothing = |_: &Call, _: &mut ParametersView| Ok(());
         let options = ServiceOptions::new().lease(LONG, || {});
         let dead = system.my_function_list().add_service(&Definition::parse("f()").unwrap(), options, nothing).unwrap();

@@ -41,14 +41,19 @@ impl Node {
                 Some(m_units) => builder.m_units(m_units.iter().map(|m_unit| (&m_unit.name, m_unit.id)))?,
                 None => builder,
             };
-            return Ok(Self::Manager(with(builder, settings).map_err(NotBuilt::Access)?.build_system()?));
+            let builder = match &settings.tcp_port {
+                Some(port) => builder.tcp_port(port.value),
+                None => builder,
+            };
+            let builder = builder.control(settings.control.clone());
+            return Ok(Self::Manager(with(builder, settings).map_err(NotBuilt::Access)?.build()?));
         };
         let builder = Unit::builder(name, *id, &manager.name, manager.id)?;
         let builder = match manager.address {
             Some(address) => builder.manager_address(address),
             None => builder,
         };
-        Ok(Self::Vehicle(with(builder, settings).map_err(NotBuilt::Access)?.build_unit()?))
+        Ok(Self::Vehicle(with(builder, settings).map_err(NotBuilt::Access)?.build()?))
     }
 
     pub(super) fn start(&self) -> Result<(), StartError> {
@@ -141,17 +146,12 @@ impl Node {
     }
 }
 
-fn with(builder: Builder<()>, settings: &Settings) -> Result<Builder<()>, AccessError> {
+fn with<R>(builder: Builder<(), R>, settings: &Settings) -> Result<Builder<(), R>, AccessError> {
     let builder = builder.fleet(settings.fleet).interfaces(settings.interfaces);
     let builder = builder.constraints(settings.constraints).capacities(settings.capacities);
-    let builder = builder.control(settings.control.clone());
     let builder = settings.keys.given_to(builder);
     let builder = match &settings.discovery_port {
         Some(port) => builder.discovery_port(port.value),
-        None => builder,
-    };
-    let builder = match &settings.tcp_port {
-        Some(port) => builder.tcp_port(port.value),
         None => builder,
     };
     match &settings.access {

@@ -38,7 +38,7 @@ pub(super) fn start(identity: &NameAndId, global: &Global) -> anyhow::Result<Com
     let builder = global.discovery_port.into_iter().fold(builder, Builder::discovery_port);
     let builder = builder.constraints(constraints).control(Control::Off).tcp_port(global.as_port.unwrap_or(0));
     let keys = global.keys().unwrap_or_default();
-    let system = keys.given_to(builder).build_system().map_err(|error| match error {
+    let system = keys.given_to(builder).build().map_err(|error| match error {
         BuildError::Keys(error) => cara_tools::keys::failed(error),
         BuildError::Unit(error) => network(error),
         other => Ended::failed("Failed", other.to_string()),

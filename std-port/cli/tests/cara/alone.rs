@@ -118,7 +118,7 @@ fn a_node_that_is_told_an_address_is_met_there() {
         free.local_addr().unwrap()
     };
     stage.know("fixed", 5);
-    let agv = stage.vehicle("fixed", 5).manager_address(address).build_unit().unwrap();
+    let agv = stage.vehicle("fixed", 5).manager_address(address).build().unwrap();
     agv.start().unwrap();
     let port = address.port().to_string();
     let verb =

@@ -29,7 +29,7 @@ struct Lifter {
 impl Lifter {
     fn join(stage: &Stage) -> Self {
         stage.know("lifter", 98);
-        let unit = stage.vehicle("lifter", 98).build_unit().unwrap();
+        let unit = stage.vehicle("lifter", 98).build().unwrap();
         let log = Arc::new(EventLog::default());
         let (moved, stopped) = (log.clone(), log.clone());
         let lift = move |call: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {

@@ -20,7 +20,7 @@ struct Driver {
 impl Driver {
     fn join(stage: &Stage) -> Self {
         stage.know("driver", 99);
-        let unit = stage.vehicle("driver", 99).build_unit().unwrap();
+        let unit = stage.vehicle("driver", 99).build().unwrap();
         let drive = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
         let made_safe = Arc::new(AtomicU32::new(0));
         let counted = made_safe.clone();

@@ -29,7 +29,7 @@ fn a_scan_shows_who_is_there() {
 fn a_scan_shows_who_was_refused_and_why() {
     let stage = Stage::with(&["agv-1"]);
     // The same name and ID as the one that is there.
-    let twin = stage.vehicle("agv-1", 11).build_unit().unwrap();
+    let twin = stage.vehicle("agv-1", 11).build().unwrap();
     twin.start().unwrap();
     let start = std::time::Instant::now();
     loop {
@@ -48,7 +48,7 @@ fn a_scan_shows_who_was_refused_and_why() {
 fn without_a_manager_a_scan_surveys_the_network() {
     let stage = Stage::empty();
     let agv = Unit::builder("lost-agv", 5, "nobody", 9).unwrap().fleet(stage.fleet).interfaces(Interfaces::Loopback);
-    let agv = agv.insecure().build_unit().unwrap();
+    let agv = agv.insecure().build().unwrap();
     agv.start().unwrap();
     let told = stage.ends(0, &["scan", "--listen", "10s", "--json"]).json();
     agv.stop();
@@ -139,14 +139,14 @@ impl Modes {
         theirs.add(&stranger, &[]).unwrap();
         let manager = cara_std::CommunicationSystem::builder("boss", 1).unwrap().keys(ours.ring(&boss).unwrap());
         let manager = manager.fleet(stage.fleet).interfaces(Interfaces::Loopback).control(Control::Off);
-        let manager = manager.build_system().unwrap();
+        let manager = manager.build().unwrap();
         manager.start().unwrap();
         let vehicle = |name, id| {
             let unit = Unit::builder(name, id, "boss", 1).unwrap();
             unit.fleet(stage.fleet).interfaces(Interfaces::Loopback)
         };
         let stranger = vehicle("stranger", 6).keys(theirs.ring(&stranger).unwrap());
-        let units = [vehicle("open", 5).insecure(), stranger].map(|unit| unit.build_unit().unwrap());
+        let units = [vehicle("open", 5).insecure(), stranger].map(|unit| unit.build().unwrap());
         units.iter().for_each(|unit| unit.start().unwrap());
         // As on a host where the fleet's keys are made.
         Store::create(keys.path(), ours).unwrap().save().unwrap();

@@ -7,7 +7,7 @@ use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
-use cara_std::{Builder, Call, Identity, Interfaces, ParametersView, ServiceError, ServiceOptions, Unit};
+use cara_std::{Builder, Call, Identity, Interfaces, ParametersView, SUnit, ServiceError, ServiceOptions, Unit};
 use cara_test_keys::KeyFolder;
 use serde_json::Value;
 use tempfile::TempDir;
@@ -94,7 +94,7 @@ impl Stage {
     }
 
     /// The builder of an s_unit that is [known](Self::know).
-    pub(crate) fn vehicle(&self, name: &str, id: u32) -> Builder<()> {
+    pub(crate) fn vehicle(&self, name: &str, id: u32) -> Builder<(), SUnit> {
         let builder = Unit::builder(name, id, "manager", 1).unwrap().fleet(self.fleet);
         let file = self.keys.file(&Identity::s_unit(name, id).unwrap()).unwrap();
         builder.interfaces(Interfaces::Loopback).key_file(file)
@@ -274,8 +274,8 @@ impl Drop for Running {
     }
 }
 
-pub(crate) fn agv(builder: Builder<()>) -> Unit {
-    let unit = builder.build_unit().unwrap();
+pub(crate) fn agv(builder: Builder<(), SUnit>) -> Unit {
+    let unit = builder.build().unwrap();
     for signature in FUNCTIONS {
         let definition = signature.parse::<cara_std::Definition>().unwrap();
         let options = ServiceOptions::new();

@@ -68,8 +68,7 @@ fn as_peer() {
     let mut input = std::io::stdin();
     input.read_exact(&mut [0; 3]).unwrap();
     let system = CommunicationSystem::builder("boss", 1).unwrap().fleet(fleet.parse().unwrap());
-    let system =
-        system.discovery_port(port.parse().unwrap()).control(Control::Off).key_file(keys).build_system().unwrap();
+    let system = system.discovery_port(port.parse().unwrap()).control(Control::Off).key_file(keys).build().unwrap();
     system.start().unwrap();
     // Until the other end goes.
     let _ = input.read_to_end(&mut Vec::new());

@@ -4,7 +4,7 @@ use std::fs::{Permissions, set_permissions};
 use std::os::unix::fs::PermissionsExt;
 
 use cara_std::control::Control;
-use cara_std::{Builder, CommunicationSystem, Identity};
+use cara_std::{Builder, CommunicationSystem, Identity, MUnit};
 
 use crate::support::{Clinic, draw, private_directory, until};
 
@@ -17,8 +17,8 @@ fn agv() -> Identity {
 }
 
 /// The manager `boss/1` with what else is said of it, running.
-fn manager(clinic: &Clinic, with: impl FnOnce(Builder<()>) -> Builder<()>) -> CommunicationSystem {
-    let manager = with(clinic.system("boss")).build_system().unwrap();
+fn manager(clinic: &Clinic, with: impl FnOnce(Builder<(), MUnit>) -> Builder<(), MUnit>) -> CommunicationSystem {
+    let manager = with(clinic.system("boss")).build().unwrap();
     manager.start().unwrap();
     manager
 }

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use cara_std::control::Control;
 use cara_std::keys::{FleetKeys, KeyRing, Store, place};
-use cara_std::{Builder, CommunicationSystem, Constraints, Fleet, Identity, Interfaces, Unit};
+use cara_std::{Builder, CommunicationSystem, Constraints, Fleet, Identity, Interfaces, MUnit, SUnit, Unit};
 use serde_json::Value;
 
 use crate::datagrams::Search;
@@ -41,7 +41,7 @@ impl Clinic {
     }
 
     /// A builder of an m_unit `name/1`.
-    pub(crate) fn system(&self, name: &str) -> Builder<()> {
+    pub(crate) fn system(&self, name: &str) -> Builder<(), MUnit> {
         let system = CommunicationSystem::builder(name, 1).unwrap().fleet(self.fleet).discovery_port(self.port);
         let socket = self.sockets.path().join(format!("{name}.sock"));
         let system = system.keys(self.ring(&Identity::m_unit(name, 1).unwrap()));
@@ -51,7 +51,7 @@ impl Clinic {
     /// A running manager `name/1`.
     pub(crate) fn manager(&self, name: &str, maximum_nodes: u16) -> CommunicationSystem {
         let constraints = Constraints { maximum_nodes, ..Constraints::M_UNIT };
-        let manager = self.system(name).constraints(constraints).build_system().unwrap();
+        let manager = self.system(name).constraints(constraints).build().unwrap();
         manager.start().unwrap();
         manager
     }
@@ -74,7 +74,7 @@ impl Clinic {
     }
 
     /// An s_unit of the manager `manager/1`.
-    pub(crate) fn unit(&self, name: &str, id: u32, manager: &str) -> Builder<()> {
+    pub(crate) fn unit(&self, name: &str, id: u32, manager: &str) -> Builder<(), SUnit> {
         let unit = Unit::builder(name, id, manager, 1).unwrap().fleet(self.fleet).discovery_port(self.port);
         unit.keys(self.ring(&Identity::s_unit(name, id).unwrap())).interfaces(Interfaces::Loopback)
     }
@@ -99,8 +99,8 @@ impl Clinic {
         self.keys.path().join(place::file_name(&Identity::m_unit(name, 1).unwrap(), Fleet(self.fleet)))
     }
 
-    pub(crate) fn started(&self, unit: Builder<()>) -> Unit {
-        let unit = unit.build_unit().unwrap();
+    pub(crate) fn started(&self, unit: Builder<(), SUnit>) -> Unit {
+        let unit = unit.build().unwrap();
         unit.start().unwrap();
         unit
     }

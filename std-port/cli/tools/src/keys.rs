@@ -21,7 +21,7 @@ pub enum Keys {
 
 impl Keys {
     /// The builder of a unit that has them.
-    pub fn given_to<T: Send + 'static>(&self, builder: Builder<T>) -> Builder<T> {
+    pub fn given_to<T: Send + 'static, R>(&self, builder: Builder<T, R>) -> Builder<T, R> {
         match self {
             Self::Found => builder,
             Self::File(path) => builder.key_file(path),

@@ -67,7 +67,7 @@ fn name(id: u32) -> String {
 }
 
 impl Nodes {
-    fn placed(&self, builder: Builder<()>, identity: &Identity) -> Builder<()> {
+    fn placed<R>(&self, builder: Builder<(), R>, identity: &Identity) -> Builder<(), R> {
         let fleet = self.place.run;
         let builder = builder.fleet(fleet).discovery_port(self.place.discovery_port()).interfaces(Interfaces::Loopback);
         match &self.keys {
@@ -83,7 +83,7 @@ pub(crate) fn manager(nodes: &Nodes) -> Result<()> {
     let constraints = Constraints { maximum_nodes: u16::try_from(nodes.count)?, ..Constraints::M_UNIT };
     let builder = CommunicationSystem::builder(MANAGER.0, MANAGER.1)?;
     let builder = nodes.placed(builder, &Identity::m_unit(MANAGER.0, MANAGER.1)?);
-    let manager = builder.constraints(constraints).build_system()?;
+    let manager = builder.constraints(constraints).build()?;
     manager.start()?;
     answer_all(|question| {
         Ok(match question {
@@ -157,7 +157,7 @@ pub(crate) fn units(nodes: &Nodes) -> Result<()> {
 
 fn unit(nodes: &Nodes, id: u32, threads: &Threads) -> Result<Unit> {
     let builder = Unit::builder(&name(id), id, MANAGER.0, MANAGER.1)?;
-    let unit = nodes.placed(builder, &Identity::s_unit(&name(id), id)?).threads(threads).build_unit()?;
+    let unit = nodes.placed(builder, &Identity::s_unit(&name(id), id)?).threads(threads).build()?;
     unit.my_function_list().add_function("echo", &*text_parameters()?, same)?;
     unit.my_function_list().add_function("touch", &number()?, same)?;
     unit.publish_my_function_list()?;

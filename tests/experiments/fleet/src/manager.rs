@@ -20,7 +20,7 @@ pub(crate) fn run(arguments: &crate::Manager) -> Result<()> {
     let constraints = Constraints { maximum_nodes: arguments.nodes, ..Constraints::M_UNIT };
     let builder = CommunicationSystem::builder(MANAGER.0, MANAGER.1)?.constraints(constraints);
     let builder = builder.fleet(arguments.fleet).discovery_port(arguments.port).interfaces(Interfaces::Loopback);
-    let manager = builder.build_system()?;
+    let manager = builder.build()?;
     manager.start()?;
     child::serve(|question| answer(&manager, question))
 }

@@ -40,7 +40,7 @@ pub(crate) fn run(arguments: &crate::Units) -> Result<()> {
 fn start(arguments: &crate::Units, id: u32, threads: &Threads) -> Result<Node> {
     let builder = Unit::builder(&name(id), id, MANAGER.0, MANAGER.1)?;
     let builder = builder.fleet(arguments.fleet).discovery_port(arguments.port).interfaces(Interfaces::Loopback);
-    let unit = builder.threads(threads).build_unit()?;
+    let unit = builder.threads(threads).build()?;
     let runs = Arc::new(AtomicU32::new(0));
     let counted = runs.clone();
     let touch = move |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {

@@ -8,7 +8,6 @@ use std::time::Duration;
 use anyhow::{Context, Result, ensure};
 use cara_apps::agv::{GO_TO, GO_TO_LEASE};
 use cara_processes::Process;
-use cara_std::control::Control;
 use cara_std::{Call, Definition, LeaseWatch, ParametersView, ServiceOptions, Unit};
 use rustix::time::{ClockId, clock_gettime};
 
@@ -126,7 +125,7 @@ fn start(name: &str, arguments: &[&str]) -> Result<Process> {
 /// The vehicle's process: drives while its lease is live, and says when its motors go on and off.
 pub(crate) fn stand_alone() -> Result<()> {
     let Who { name, id, .. } = Who::agv(17);
-    let unit = Unit::builder(&name, id, "depot", 1)?.fleet(FLEET).control(Control::Off).insecure().build_unit()?;
+    let unit = Unit::builder(&name, id, "depot", 1)?.fleet(FLEET).insecure().build()?;
     let late = Arc::new(AtomicU64::new(0));
     let canary = late.clone();
     let safe = move || println!("{SAFE} {} {}", now(), canary.load(Ordering::Relaxed));

@@ -23,8 +23,8 @@ use cara_core::services::unit::RequestOptions;
 use cara_core::time::{Duration, Instant};
 use cara_std::access::AccessTable;
 use cara_std::{
-    BuildError, Call, Capacities, CommunicationSystem, Interfaces, LeaseWatch, MyFunctionList, Peer, ServiceOptions,
-    Unit as SUnit, UnitEvent,
+    BuildError, Builder, Call, Capacities, CommunicationSystem, Interfaces, LeaseWatch, MyFunctionList, Peer,
+    ServiceOptions, Unit as SUnit, UnitEvent,
 };
 
 use super::keys::Keys;
@@ -287,38 +287,44 @@ impl LinuxNode {
     }
 
     fn build(&self) -> Result<Machine, BuildError> {
-        let Spec { role, name, id, constraints, their_functions, message_buffers, .. } = &self.spec;
-        let builder = match role {
-            SpecRole::Manager => CommunicationSystem::builder(name, *id)?,
-            SpecRole::Agv(manager, manager_id) => SUnit::builder(name, *id, manager, *manager_id)?,
-        };
+        let Spec { role, name, id, .. } = &self.spec;
+        match role {
+            SpecRole::Manager => {
+                let builder = self.with_spec(CommunicationSystem::builder(name, *id)?);
+                let builder = if self.spec.beside_another { builder.beside_another() } else { builder };
+                let builder = match &self.spec.m_units {
+                    Some(m_units) => builder.m_units(m_units.iter().copied())?,
+                    None => builder,
+                };
+                Ok(Machine::Manager(builder.build()?))
+            }
+            SpecRole::Agv(manager, manager_id) => {
+                let builder = self.with_spec(SUnit::builder(name, *id, manager, *manager_id)?);
+                let builder = match self.dials {
+                    Some(address) => builder.manager_address(address),
+                    None => builder,
+                };
+                let unit = builder.build()?;
+                let (losses, start) = (Arc::clone(&self.losses), self.start);
+                unit.on_manager_lost(move |()| lock(&losses).push(since(start)))?;
+                Ok(Machine::Agv(unit))
+            }
+        }
+    }
+
+    fn with_spec<R>(&self, builder: Builder<(), R>) -> Builder<(), R> {
+        let Spec { constraints, their_functions, message_buffers, .. } = &self.spec;
         let capacities = Capacities {
             their_functions: *their_functions,
             message_buffers: *message_buffers,
             ..Capacities::default()
         };
         let builder = builder.fleet(self.fleet).constraints(*constraints).capacities(capacities);
-        let builder = if self.spec.beside_another { builder.beside_another() } else { builder };
-        let builder = match &self.spec.m_units {
-            Some(m_units) => builder.m_units(m_units.iter().copied())?,
-            None => builder,
-        };
         let builder = builder.interfaces(Interfaces::Loopback);
-        let builder = match &self.keys {
+        match &self.keys {
             Some(keys) => builder.keys(lock(keys).ring(self.fleet, &self.spec.identity())),
             None => builder.insecure(),
-        };
-        if *role == SpecRole::Manager {
-            return Ok(Machine::Manager(builder.build_system()?));
         }
-        let builder = match self.dials {
-            Some(address) => builder.manager_address(address),
-            None => builder,
-        };
-        let unit = builder.build_unit()?;
-        let (losses, start) = (Arc::clone(&self.losses), self.start);
-        unit.on_manager_lost(move |()| lock(&losses).push(since(start)))?;
-        Ok(Machine::Agv(unit))
     }
 
     fn stop(&self) {

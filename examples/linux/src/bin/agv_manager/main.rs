@@ -58,7 +58,7 @@ fn run() -> Result<()> {
 fn listing(options: &Options, transcript: &Transcript) -> Result<CommunicationSystem> {
     let Options { name, id, network, .. } = options;
     // README begins.
-    let agv_manager = network.place(CommunicationSystem::builder(name, *id)?).build_system()?; // 1
+    let agv_manager = network.place(CommunicationSystem::builder(name, *id)?).build()?; // 1
     transcript.begin(&agv_manager);
     transcript.after(1, format_args!("{}, {}", agv_manager.identity(), agv_manager.mode().as_str()))?;
     agv_manager.start()?; // 2

@@ -61,7 +61,7 @@ pub(crate) fn idle(place: &Place) -> Result<()> {
     let mut units = Vec::new();
     for id in 0..IDLE_LINKS {
         let builder = Unit::builder(&format!("idle-{id}"), id as u32, "passive", 1)?;
-        let unit = placed(builder, place).insecure().threads(&threads).build_unit()?;
+        let unit = placed(builder, place).insecure().threads(&threads).build()?;
         unit.start()?;
         units.push(unit);
     }
@@ -83,7 +83,7 @@ fn start_idle(place: &Place, passive: &CommunicationSystem) -> Result<Child> {
     Ok(child)
 }
 
-fn placed(builder: Builder<()>, place: &Place) -> Builder<()> {
+fn placed<R>(builder: Builder<(), R>, place: &Place) -> Builder<(), R> {
     let interfaces = if cable_end().is_some() { Interfaces::All } else { Interfaces::Loopback };
     builder.fleet(place.run).discovery_port(place.discovery_port()).interfaces(interfaces)
 }
@@ -121,7 +121,7 @@ fn draw_keys(place: &Place) -> Result<tempfile::TempDir> {
 
 impl Cara {
     /// Its keys from the folder that the server's address tells, or none.
-    fn keyed(&self, builder: Builder<()>, place: &Place, address: &str, identity: &Identity) -> Builder<()> {
+    fn keyed<R>(&self, builder: Builder<(), R>, place: &Place, address: &str, identity: &Identity) -> Builder<(), R> {
         let builder = placed(builder, place);
         match self {
             Self::Secured => builder.key_file(Path::new(address).join(file_name(identity, Fleet(place.run)))),
@@ -133,7 +133,7 @@ impl Cara {
         let constraints = Constraints { message_size: MESSAGE_BYTES, maximum_nodes: 2_000, ..Constraints::M_UNIT };
         let builder = CommunicationSystem::builder(name, id)?;
         let builder = self.keyed(builder, place, address, &Identity::m_unit(name, id)?);
-        let system = builder.constraints(constraints).build_system()?;
+        let system = builder.constraints(constraints).build()?;
         system.start()?;
         Ok(system)
     }
@@ -143,7 +143,7 @@ impl Cara {
         let builder = self.keyed(builder, place, address, &Identity::s_unit(name, id)?);
         let builder = threads.iter().fold(builder, Builder::threads);
         let constraints = Constraints { message_size: MESSAGE_BYTES, maximum_nodes: 1, ..Constraints::M_UNIT };
-        Ok(builder.constraints(constraints).build_unit()?)
+        Ok(builder.constraints(constraints).build()?)
     }
 }
 

@@ -1,0 +1,344 @@
+//! The handle to a unit: what m_units and s_units have in common.
+
+use std::fmt;
+use std::marker::PhantomData;
+#[cfg(feature = "control")]
+use std::sync::Mutex;
+#[cfg(feature = "control")]
+use std::sync::atomic::AtomicU64;
+use std::sync::mpsc::{Receiver, sync_channel};
+use std::sync::{Arc, Weak};
+
+use cara_core::config::{Constraints, Mode};
+use cara_core::distribution::connection_handler::Finding;
+use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
+use cara_core::error::Error;
+use cara_core::time::Duration;
+
+use crate::access::AccessTable;
+use crate::builder;
+#[cfg(feature = "control")]
+use crate::control::{self, Control, Server};
+use crate::engine::{Engine, pairs};
+use crate::error::StartError;
+use crate::event::UnitEvent;
+#[cfg(feature = "control")]
+use crate::locks::lock;
+use crate::my_function_list::MyFunctionList;
+use crate::sys::interfaces::Interface;
+
+/// The role of a [`CommunicationSystem`](crate::CommunicationSystem), as a type.
+#[derive(Debug)]
+pub enum MUnit {}
+
+/// The role of a [`Unit`](crate::Unit), as a type.
+#[derive(Debug)]
+pub enum SUnit {}
+
+/// A handle to a unit of this process, for any thread. Clones are handles to the same unit, which stops when the last one is
+/// dropped.
+///
+/// Its role is a type, so that what only one role can do is a method of that role alone: a [`Handle<T, MUnit>`] is called
+/// [`CommunicationSystem`](crate::CommunicationSystem), as in the paper, and a [`Handle<T, SUnit>`] is called
+/// [`Unit`](crate::Unit). `T` is the application's state.
+///
+/// ```
+/// use cara_std::Handle;
+///
+/// /// Of any role.
+/// fn introduce<R>(unit: &Handle<(), R>) -> String {
+///     format!("{} with {} functions", unit.identity(), unit.my_function_list().len())
+/// }
+/// ```
+///
+/// An s_unit has no nodes:
+///
+/// ```compile_fail
+/// fn count(unit: &cara_std::Unit) -> usize {
+///     unit.number_of_s_units()
+/// }
+/// ```
+///
+/// And an m_unit no manager:
+///
+/// ```compile_fail
+/// fn manager(system: &cara_std::CommunicationSystem) -> Option<cara_std::Peer> {
+///     system.manager()
+/// }
+/// ```
+pub struct Handle<T: Send + 'static, R> {
+    pub(crate) owner: Arc<Owner<T>>,
+    role: PhantomData<fn() -> R>,
+}
+
+impl<T: Send + 'static, R> Clone for Handle<T, R> {
+    fn clone(&self) -> Self {
+        Self::owned_by(self.owner.clone())
+    }
+}
+
+impl<T: Send + 'static, R> fmt::Debug for Handle<T, R> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}", self.identity())
+    }
+}
+
+/// Stops the unit's threads when the last handle goes.
+pub(crate) struct Owner<T: Send + 'static> {
+    pub(crate) engine: Arc<Engine<T>>,
+    /// It does not keep the unit running.
+    guest: bool,
+    #[cfg(feature = "control")]
+    control: Control,
+    #[cfg(feature = "control")]
+    pub(crate) server: Mutex<Option<Server>>,
+}
+
+impl<T: Send + 'static> Owner<T> {
+    pub(crate) fn new(engine: Arc<Engine<T>>, #[cfg(feature = "control")] control: Control) -> Self {
+        Self {
+            engine,
+            guest: false,
+            #[cfg(feature = "control")]
+            control,
+            #[cfg(feature = "control")]
+            server: Mutex::new(None),
+        }
+    }
+
+    fn stop(&self) {
+        self.engine.stop();
+        #[cfg(feature = "control")]
+        {
+            let server = lock(&self.server).take();
+            if let Some(server) = server {
+                server.stop();
+            }
+        }
+    }
+}
+
+#[cfg(feature = "control")]
+impl<T: Send + 'static> Owner<T> {
+    fn guest(engine: Arc<Engine<T>>) -> Self {
+        let mut guest = Self::new(engine, Control::Off);
+        guest.guest = true;
+        guest
+    }
+
+    /// Opens the socket for the unit's operator, unless it is open or the unit is being stopped.
+    fn open_control(&self) {
+        let mut server = lock(&self.server);
+        // Dropping a server without stopping it would leak its threads.
+        if server.is_none() && !self.engine.is_stopping() {
+            let guest = Self::guest(self.engine.clone());
+            *server = control::open(&self.control, Handle::of(guest));
+        }
+    }
+}
+
+impl<T: Send + 'static> Drop for Owner<T> {
+    fn drop(&mut self) {
+        if !self.guest {
+            self.stop();
+        }
+    }
+}
+
+/// A handle that does not keep the unit running: what a handler of the unit itself holds to call others.
+pub struct WeakHandle<T: Send + 'static, R> {
+    owner: Weak<Owner<T>>,
+    role: PhantomData<fn() -> R>,
+}
+
+impl<T: Send + 'static, R> Clone for WeakHandle<T, R> {
+    fn clone(&self) -> Self {
+        Self { owner: self.owner.clone(), role: PhantomData }
+    }
+}
+
+impl<T: Send + 'static, R> fmt::Debug for WeakHandle<T, R> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("WeakHandle")
+    }
+}
+
+impl<T: Send + 'static, R> WeakHandle<T, R> {
+    /// The unit, unless its last handle has been dropped.
+    pub fn upgrade(&self) -> Option<Handle<T, R>> {
+        self.owner.upgrade().map(Handle::owned_by)
+    }
+}
+
+impl<T: Send + 'static, R> Handle<T, R> {
+    fn owned_by(owner: Arc<Owner<T>>) -> Self {
+        Self { owner, role: PhantomData }
+    }
+
+    pub(crate) fn of(owner: Owner<T>) -> Self {
+        Self::owned_by(Arc::new(owner))
+    }
+
+    pub(crate) fn engine(&self) -> &Arc<Engine<T>> {
+        &self.owner.engine
+    }
+
+    /// Searches for nodes, or for the manager, and keeps connections, in threads of its own (paper, listing line 2).
+    ///
+    /// An m_unit first asks for its own identity and waits 300 ms: [`StartError::AlreadyRunning`] where a live m_unit answers.
+    /// One that is stopped (`SIGSTOP`) or hangs does not answer; on this host it holds its control socket, which is
+    /// [`StartError::SocketHeld`]. From one on another host, or without a socket, the links go to this one. See
+    /// [`Builder::beside_another`](crate::Builder::beside_another).
+    #[doc(alias = "start_thread")]
+    pub fn start(&self) -> Result<(), StartError> {
+        #[cfg(not(feature = "control"))]
+        self.engine().start()?;
+        #[cfg(feature = "control")]
+        {
+            self.engine().start_unless(|| control::held(&self.owner.control, &self.identity(), self.fleet()))?;
+            self.owner.open_control();
+        }
+        Ok(())
+    }
+
+    /// Ends every link in an orderly way and all of its threads.
+    pub fn stop(&self) {
+        self.owner.stop();
+    }
+
+    /// A handle for the unit's own handlers. One that owned a [`Handle`] would keep it running for ever.
+    pub fn downgrade(&self) -> WeakHandle<T, R> {
+        WeakHandle { owner: Arc::downgrade(&self.owner), role: PhantomData }
+    }
+
+    /// This unit's identity.
+    pub fn identity(&self) -> Identity {
+        self.engine().hub().hub.node.identity().clone()
+    }
+
+    /// The fleet that it belongs to.
+    pub fn fleet(&self) -> Fleet {
+        self.engine().hub().hub.node.fleet()
+    }
+
+    /// Which of its runs this is: peers tell a restart by it.
+    pub fn epoch(&self) -> Epoch {
+        self.engine().hub().hub.node.epoch()
+    }
+
+    /// Time since it was made.
+    pub fn uptime(&self) -> Duration {
+        self.engine().uptime()
+    }
+
+    /// Whether its links are secured, with keys, or plain.
+    pub fn mode(&self) -> Mode {
+        self.engine().mode()
+    }
+
+    /// The UDP port of broadcasts.
+    pub fn discovery_port(&self) -> u16 {
+        self.engine().discovery_port()
+    }
+
+    /// The interfaces that it uses, with those that are down, as they were at most a few seconds ago.
+    pub fn interfaces(&self) -> Vec<Interface> {
+        self.engine().interfaces().to_vec()
+    }
+
+    /// Searches for nodes, or for the manager, now (paper, listing line 6).
+    pub fn broadcast(&self) {
+        self.engine().broadcast();
+    }
+
+    /// The unit's own functions.
+    pub fn my_function_list(&self) -> MyFunctionList<'_, T> {
+        MyFunctionList { engine: self.engine() }
+    }
+
+    /// The constraints in force.
+    pub fn constraints(&self) -> Constraints {
+        *self.engine().hub().hub.node.constraints()
+    }
+
+    /// Changes the constraints; peers are told. [`Error::BadConstraint`] for values that this unit cannot hold.
+    pub fn set_constraints(&self, constraints: Constraints) -> Result<(), Error> {
+        builder::check(&constraints)?;
+        self.engine().set_constraints(constraints)
+    }
+
+    /// Sets another access table, or none; in force when this returns. A file that the unit follows replaces it when it
+    /// changes.
+    pub fn set_access(&self, table: Option<AccessTable>) {
+        self.engine().set_access(table);
+    }
+
+    /// The access table in force; without one, a joined node may do everything.
+    pub fn access(&self) -> Option<Arc<AccessTable>> {
+        self.engine().access()
+    }
+
+    /// Subscribes to events: joined, left, failed. A subscriber that does not keep up loses events.
+    pub fn events(&self) -> Receiver<UnitEvent> {
+        let (sender, receiver) = sync_channel(self.events_waiting());
+        self.engine().subscribe(sender);
+        receiver
+    }
+
+    /// Events that wait for a subscriber before it loses some: an m_unit has many nodes.
+    fn events_waiting(&self) -> usize {
+        match self.identity().role() {
+            Role::MUnit => 4096,
+            Role::SUnit => 256,
+        }
+    }
+
+    /// Events with room for so many, and how many have found none since it was last set to 0.
+    #[cfg(feature = "control")]
+    pub(crate) fn events_with_losses(&self, room: usize) -> (Receiver<UnitEvent>, Arc<AtomicU64>) {
+        let (sender, receiver) = sync_channel(room);
+        (receiver, self.engine().subscribe(sender))
+    }
+
+    /// Runs `act` with the application's state.
+    pub fn with_state<A>(&self, act: impl FnOnce(&mut T) -> A) -> Result<A, Error> {
+        self.engine().with_state(act)
+    }
+
+    /// Frees unused message buffers, of which a few are otherwise kept for the next long messages.
+    pub fn trim_buffers(&self) {
+        self.engine().pool.shrink();
+    }
+
+    /// Everything that is counted for the unit as a whole: (name, number), zeros included. What happened in discovery and
+    /// membership; on all links together, those that have ended included; in the port. The last seven
+    /// (`AccessFileWrong`, `BuffersInUse`, `BuffersPeak`, `LinksOpen`, `NodesConnected`, `CallsHeld`, `CallsInFlight`) tell
+    /// how it is now; no other ever goes back.
+    pub fn counters(&self) -> Vec<(&'static str, u64)> {
+        pairs(self.engine().readings())
+    }
+
+    /// Everything that is counted, for the unit and for each node that it knows, in the text form that Prometheus reads:
+    /// see [`metrics`](crate::metrics).
+    #[cfg(feature = "metrics")]
+    pub fn metrics(&self) -> String {
+        crate::metrics::text(self.engine(), &self.identity())
+    }
+
+    /// The last refusals, here or there.
+    pub fn findings(&self) -> Vec<Finding> {
+        self.engine().hub().hub.node.findings().cloned().collect()
+    }
+
+    /// Time since a refusal.
+    pub fn age(&self, finding: &Finding) -> Duration {
+        self.engine().now().since(finding.at)
+    }
+
+    /// The keys of links that this unit opens from here on are renewed this often, instead of every 12 h; once. So a test
+    /// need not wait for so long.
+    #[doc(hidden)]
+    pub fn renew_keys_every(&self, span: cara_core::time::Duration) {
+        self.engine().key_watch.renew_every(span);
+    }
+}
