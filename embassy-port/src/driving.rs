@@ -274,7 +274,7 @@ impl<T> Machine<T> {
         }
         // That there is one at last is no news at the start.
         if core::mem::replace(&mut self.has_begun, true) {
-            self.tell(UnitEvent::AddressChanged { address });
+            self.tell(UnitEvent::NetworkChanged { up: address });
         }
         for index in self.indices() {
             self.disconnected(index, CloseReason::Reset);

@@ -1,88 +1,13 @@
 //! What a unit tells its application.
 
 use cara_core::config::NAME_BYTES;
-use cara_core::distribution::identity::Identity;
-use cara_core::error::{CloseReason, Error};
-use cara_core::services::lease::LeaseEnd;
-use cara_core::services::requests::CallId;
-use core::net::{Ipv4Addr, SocketAddr};
+use core::net::Ipv4Addr;
 
 /// The name of a function.
 pub type Name = heapless::String<NAME_BYTES>;
 
-/// Something happened that no call returned.
-#[derive(Clone, Debug, PartialEq, Eq)]
-#[non_exhaustive]
-pub enum UnitEvent {
-    /// A node is connected.
-    Joined {
-        /// Which.
-        peer: Identity,
-    },
-    /// A node is no longer connected.
-    Left {
-        /// Which.
-        peer: Identity,
-        /// Why.
-        reason: CloseReason,
-    },
-    /// A link ended before it joined: refused here or there, silent, or it could not be opened. `DuplicateIdentity`
-    /// with this unit's own identity in `peer`: another live unit has it, and one of the two waits for the other's end.
-    NotJoined {
-        /// The other end.
-        address: SocketAddr,
-        /// The identity that it claimed.
-        peer: Option<Identity>,
-        /// Why.
-        reason: CloseReason,
-    },
-    /// The cable was plugged in or pulled, or the address changed; links that there were have ended. The unit's first
-    /// address is no news.
-    AddressChanged {
-        /// The current address; `None` without a usable network.
-        address: Option<Ipv4Addr>,
-    },
-    /// A node published or withdrew functions.
-    ListChanged {
-        /// Which.
-        peer: Identity,
-    },
-    /// A node keeps no room for some of this unit's functions.
-    FunctionsSkipped {
-        /// Which.
-        peer: Identity,
-        /// How many.
-        skipped: u16,
-    },
-    /// An asynchronous request was not run, or its service failed.
-    RequestFailed {
-        /// Asked of this node.
-        peer: Identity,
-        /// As returned by the request.
-        call: CallId,
-        /// Why.
-        error: Error,
-    },
-    /// A service of this unit stopped because its caller no longer wanted it. Its lease is dead, and its safe hook has
-    /// run.
-    LeaseExpired {
-        /// Whose call it was.
-        peer: Identity,
-        /// The service.
-        function: Name,
-    },
-    /// A node ended what this unit's call of a leased service started.
-    LeaseEnded {
-        /// Which.
-        peer: Identity,
-        /// The service.
-        function: Name,
-        /// The call that held the lease.
-        call: CallId,
-        /// Why.
-        why: LeaseEnd,
-    },
-}
+/// Something happened that no call returned: functions by their names, the network as the address that the board has.
+pub type UnitEvent = cara_core::services::event::UnitEvent<Name, Option<Ipv4Addr>>;
 
 /// Queue of unread events; when it is full, new ones are lost and counted.
 pub(crate) struct Events {
@@ -124,6 +49,7 @@ mod tests {
     extern crate std;
 
     use super::*;
+    use cara_core::distribution::identity::Identity;
     use std::boxed::Box;
     use std::vec::Vec;
 

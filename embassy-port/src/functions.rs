@@ -23,79 +23,6 @@ type Put<T> = fn(
 ) -> Result<Slot, Error>;
 
 impl<T> Handle<T> {
-    /// Adds a service, which is invisible to peers before it is published. The signature is in the text form, as in
-    /// `go_to(position: int[2])`.
-    ///
-    /// [`Error::BadName`] for a signature that cannot be read, [`Error::TooLarge`] when arguments and results are
-    /// declared larger than what services have room for, [`Error::Full`] when the list is full,
-    /// [`Error::EmergencyWaits`] for a handler of an emergency service that takes the application's state, or is a task.
-    #[doc(alias = "add_function")]
-    pub fn add_service(&self, signature: &str, options: ServiceOptions<T>, handler: Handler<T>) -> Result<(), Error> {
-        self.put(signature, options, handler, FunctionList::add_function)
-    }
-
-    /// Changes a service. A caller that knows the old one gets [`Error::StaleFunction`] until it is published again.
-    pub fn replace_service(
-        &self,
-        signature: &str,
-        options: ServiceOptions<T>,
-        handler: Handler<T>,
-    ) -> Result<(), Error> {
-        self.put(signature, options, handler, FunctionList::replace)
-    }
-
-    fn put(&self, signature: &str, options: ServiceOptions<T>, handler: Handler<T>, put: Put<T>) -> Result<(), Error> {
-        let definition = Definition::parse(signature).map_err(|_| Error::BadName)?;
-        let ServiceOptions { attributes, lease, safe, then } = options;
-        if attributes.priority == Priority::Emergency && handler.waits() {
-            return Err(Error::EmergencyWaits);
-        }
-        let stop = self.act(|machine| {
-            let limit = machine.limits.arguments;
-            if definition.signature().parameters_bytes() as usize > limit {
-                return Err(Error::TooLarge { limit: u32::try_from(limit).unwrap_or(u32::MAX) });
-            }
-            let listed = Listed { handler, lease, safe, then };
-            let replaced = machine.functions.find(definition.name()).and_then(|slot| machine.functions.function(slot));
-            let replaced = replaced.map(|function| *function.handler);
-            put(&mut machine.functions, &definition, attributes, listed)?;
-            // What a call of the service before started would go on to the end of its lease.
-            let stop = replaced.and_then(Listed::clear);
-            // Another service that had this lease may have left it dead, and no call would begin.
-            lease.map(Lease::clear);
-            machine.wakers.leases.wake();
-            Ok(stop)
-        })?;
-        stop.into_iter().for_each(|safe| safe());
-        Ok(())
-    }
-
-    /// Removes a service; peers that saw it are told.
-    pub fn remove_service(&self, name: &str) -> Result<(), Error> {
-        let stop = self.act(|machine| {
-            let (slot, removed) = machine.functions.remove(name)?;
-            // What a call of it started would go on to the lease's end.
-            let stop = removed.clear();
-            machine.wakers.leases.wake();
-            machine.hub.publications.withdraw(slot);
-            machine.each_live(|session, cx| {
-                session.withdraw(cx, slot);
-            });
-            Ok::<_, Error>(stop)
-        })?;
-        stop.into_iter().for_each(|safe| safe());
-        Ok(())
-    }
-
-    /// The service has finished what its caller started: the lease ends, and no hook runs.
-    pub fn end_lease(&self, name: &str) {
-        self.act(|machine| {
-            let Some(slot) = machine.functions.find(name) else { return };
-            machine.each_live(|session, cx| session.end_lease(cx, slot));
-            machine.wakers.leases.wake();
-        });
-    }
-
     /// Makes the unit's functions visible to all nodes, also to those that come later (paper, listing line 24).
     pub fn publish_my_function_list(&self) -> Result<(), Error> {
         self.act(Machine::publish)
@@ -126,12 +53,81 @@ impl<T> Handle<T> {
     }
 }
 
-/// The functions that a unit offers, looked at now.
+/// The functions that a unit offers, looked at now. Adding one makes nothing visible: that is what publishing
+/// is for.
 pub struct MyFunctionList<T: 'static> {
     unit: Handle<T>,
 }
 
 impl<T> MyFunctionList<T> {
+    /// Adds a service, which is invisible to peers before it is published. The signature is in the text form, as in
+    /// `go_to(position: int[2])`.
+    ///
+    /// [`Error::BadName`] for a signature that cannot be read, [`Error::TooLarge`] when arguments and results are
+    /// declared larger than what services have room for, [`Error::Full`] when the list is full,
+    /// [`Error::EmergencyWaits`] for a handler of an emergency service that takes the application's state, or is a task.
+    #[doc(alias = "add_function")]
+    pub fn add_service(&self, signature: &str, options: ServiceOptions<T>, handler: Handler<T>) -> Result<(), Error> {
+        self.put(signature, options, handler, FunctionList::add_function)
+    }
+
+    /// Changes a service. A caller that knows the old one gets [`Error::StaleFunction`] until it is published again.
+    pub fn replace(&self, signature: &str, options: ServiceOptions<T>, handler: Handler<T>) -> Result<(), Error> {
+        self.put(signature, options, handler, FunctionList::replace)
+    }
+
+    fn put(&self, signature: &str, options: ServiceOptions<T>, handler: Handler<T>, put: Put<T>) -> Result<(), Error> {
+        let definition = Definition::parse(signature).map_err(|_| Error::BadName)?;
+        let ServiceOptions { attributes, lease, safe, then } = options;
+        if attributes.priority == Priority::Emergency && handler.waits() {
+            return Err(Error::EmergencyWaits);
+        }
+        let stop = self.unit.act(|machine| {
+            let limit = machine.limits.arguments;
+            if definition.signature().parameters_bytes() as usize > limit {
+                return Err(Error::TooLarge { limit: u32::try_from(limit).unwrap_or(u32::MAX) });
+            }
+            let listed = Listed { handler, lease, safe, then };
+            let replaced = machine.functions.find(definition.name()).and_then(|slot| machine.functions.function(slot));
+            let replaced = replaced.map(|function| *function.handler);
+            put(&mut machine.functions, &definition, attributes, listed)?;
+            // What a call of the service before started would go on to the end of its lease.
+            let stop = replaced.and_then(Listed::clear);
+            // Another service that had this lease may have left it dead, and no call would begin.
+            lease.map(Lease::clear);
+            machine.wakers.leases.wake();
+            Ok(stop)
+        })?;
+        stop.into_iter().for_each(|safe| safe());
+        Ok(())
+    }
+
+    /// Removes a service; peers that saw it are told.
+    pub fn remove(&self, name: &str) -> Result<(), Error> {
+        let stop = self.unit.act(|machine| {
+            let (slot, removed) = machine.functions.remove(name)?;
+            // What a call of it started would go on to the lease's end.
+            let stop = removed.clear();
+            machine.wakers.leases.wake();
+            machine.hub.publications.withdraw(slot);
+            machine.each_live(|session, cx| {
+                session.withdraw(cx, slot);
+            });
+            Ok::<_, Error>(stop)
+        })?;
+        stop.into_iter().for_each(|safe| safe());
+        Ok(())
+    }
+
+    /// The service has finished what its caller started: the lease ends, and no hook runs.
+    pub fn end_lease(&self, name: &str) {
+        self.unit.act(|machine| {
+            let Some(slot) = machine.functions.find(name) else { return };
+            machine.each_live(|session, cx| session.end_lease(cx, slot));
+            machine.wakers.leases.wake();
+        });
+    }
+
     /// How many functions there are.
     pub fn len(&self) -> usize {
         self.unit.look(|machine| machine.functions.len())

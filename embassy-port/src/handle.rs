@@ -5,6 +5,7 @@ use core::future::poll_fn;
 use core::task::Poll;
 
 use cara_core::config::Constraints;
+use cara_core::counters::Counter;
 use cara_core::distribution::connection_handler::{Finding, NodeCounter};
 use cara_core::distribution::identity::{Identity, Role};
 use cara_core::distribution::parameters::ParametersView;
@@ -81,33 +82,65 @@ impl<T> Handle<T> {
     }
 
     /// The node of this name among those that have joined, connected or not. [`Error::NotConnected`] where there is none,
-    /// [`Error::Ambiguous`] where there are several: take [`Self::peer_of`] then.
+    /// [`Error::Ambiguous`] where there are several: take [`Self::node`] then.
     pub fn peer(&self, name: &str) -> Result<Peer<T>, Error> {
         let identity = self.look(|machine| machine.hub.node.find(name).map(|known| known.identity.clone()));
         identity.map(|identity| Peer { unit: *self, identity })
     }
 
-    /// The node of an identity, connected or not.
-    pub fn peer_of(&self, identity: &Identity) -> Peer<T> {
-        Peer { unit: *self, identity: identity.clone() }
+    /// The s_unit of this name, likewise.
+    pub fn s_unit(&self, name: &str) -> Result<Peer<T>, Error> {
+        self.only(Role::SUnit, name)
     }
 
-    /// The s_unit of an index, which goes on to mean the same node when others leave (paper, listing line 8).
-    pub fn s_unit(&self, index: u16) -> Option<Peer<T>> {
-        let identity = self.look(|machine| machine.hub.node.s_unit(index).map(|known| known.identity.clone()));
-        identity.map(|identity| Peer { unit: *self, identity })
+    /// The m_unit of this name, likewise.
+    pub fn m_unit(&self, name: &str) -> Result<Peer<T>, Error> {
+        self.only(Role::MUnit, name)
     }
 
-    /// The m_unit of an index, likewise.
-    pub fn m_unit(&self, index: u16) -> Option<Peer<T>> {
-        let identity = self.look(|machine| machine.hub.node.m_unit(index).map(|known| known.identity.clone()));
-        identity.map(|identity| Peer { unit: *self, identity })
+    fn only(&self, role: Role, name: &str) -> Result<Peer<T>, Error> {
+        let mut same = self.of_role(role).filter(|peer| peer.identity.name() == name);
+        match (same.next(), same.next()) {
+            (None, _) => Err(Error::NotConnected),
+            (Some(only), None) => Ok(only),
+            (Some(first), Some(second)) => Err(Error::Ambiguous { ids: [first.identity.id(), second.identity.id()] }),
+        }
     }
 
-    /// The s_units that have joined since the board's start, connected or not, in the order of joining.
-    pub fn roster(&self) -> impl Iterator<Item = Peer<T>> + use<T> {
+    /// The node of an identity, connected or not: `None` if it has never joined, or has been forgotten for others.
+    pub fn node(&self, identity: &Identity) -> Option<Peer<T>> {
+        let known = self.look(|machine| machine.hub.node.node(identity).is_some());
+        known.then(|| Peer { unit: *self, identity: identity.clone() })
+    }
+
+    /// The s_units that have joined since the board's start, connected or not, in the order of joining (paper, listing
+    /// line 8). One that has left keeps its place, so that an index goes on to mean the same node.
+    pub fn s_units(&self) -> impl Iterator<Item = Peer<T>> + use<T> {
+        self.of_role(Role::SUnit)
+    }
+
+    /// The m_units, likewise.
+    pub fn m_units(&self) -> impl Iterator<Item = Peer<T>> + use<T> {
+        self.of_role(Role::MUnit)
+    }
+
+    fn of_role(&self, role: Role) -> impl Iterator<Item = Peer<T>> + use<T> {
         let unit = *self;
-        (0..).map_while(move |index| unit.s_unit(index))
+        (0..).map_while(move |index| {
+            let identity = unit.look(|machine| {
+                let known = match role {
+                    Role::SUnit => machine.hub.node.s_unit(index),
+                    Role::MUnit => machine.hub.node.m_unit(index),
+                };
+                known.map(|known| known.identity.clone())
+            })?;
+            Some(Peer { unit, identity })
+        })
+    }
+
+    /// The s_units that this manager is to have: those that have joined since the board's start, connected or not.
+    pub fn roster(&self) -> impl Iterator<Item = Peer<T>> + use<T> {
+        self.s_units()
     }
 
     /// The connected node at a place of the unit's table of links, of which there are [`Self::links`].
@@ -256,6 +289,13 @@ impl<T> Handle<T> {
     /// What happened in discovery and membership.
     pub fn node_counted(&self, counter: NodeCounter) -> u64 {
         self.look(|machine| machine.hub.node.counters.value(counter))
+    }
+
+    /// Everything that is counted, in discovery and membership and on all links: (name, number), zeros included.
+    pub fn counters(&self) -> impl Iterator<Item = (&'static str, u64)> + use<T> {
+        let unit = *self;
+        let node = NodeCounter::ALL.iter().map(move |counter| (counter.name(), unit.node_counted(*counter)));
+        node.chain(LinkCounter::ALL.iter().map(move |counter| (counter.name(), unit.counted(*counter))))
     }
 
     /// The last refusals.

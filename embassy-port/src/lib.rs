@@ -31,11 +31,11 @@
 //!     let pos_info = Handler::method(&|agv: &mut Agv, _, p| {
 //!         p.set_value("position", agv.position).map_err(|_| cara_core::error::ServiceError::BadResults)
 //!     });
-//!     unit.add_service("pos_info() -> (position: int[2])", ServiceOptions::new(), pos_info)?;
+//!     unit.my_function_list().add_service("pos_info() -> (position: int[2])", ServiceOptions::new(), pos_info)?;
 //!     let forget: &'static cara_embassy::Hook<Agv> = &|agv| agv.target = None;
 //!     // The hook makes safe, and waits for nothing; what needs the state comes after it.
 //!     let leased = ServiceOptions::new().lease(Duration::from_millis(400), &GO_TO, &cut_power).then(forget);
-//!     unit.add_service("go_to(position: int[2])", leased, Handler::task())?;
+//!     unit.my_function_list().add_service("go_to(position: int[2])", leased, Handler::task())?;
 //!     unit.on_manager_lost(forget);
 //!     unit.publish_my_function_list()?;
 //!     Ok((unit, runner))

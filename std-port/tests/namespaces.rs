@@ -44,7 +44,7 @@ fn told(events: &Receiver<UnitEvent>) -> Vec<String> {
     let end = Instant::now() + PATIENCE;
     loop {
         let left = end.saturating_duration_since(Instant::now());
-        if let UnitEvent::InterfacesChanged { up } = events.recv_timeout(left).expect("it is told in time") {
+        if let UnitEvent::NetworkChanged { up } = events.recv_timeout(left).expect("it is told in time") {
             return up;
         }
     }
@@ -78,7 +78,7 @@ fn without_an_interface_a_unit_says_so_once_and_goes_on_when_there_is_one() {
         counters.iter().any(|(name, count)| *name == "SendFailed" && *count >= 3)
     });
     let again = |events: &Receiver<UnitEvent>| {
-        events.try_iter().filter(|event| matches!(event, UnitEvent::InterfacesChanged { .. })).count()
+        events.try_iter().filter(|event| matches!(event, UnitEvent::NetworkChanged { .. })).count()
     };
     assert_eq!((again(&of_manager), again(&of_agv)), (0, 0));
     assert!(!agv.is_connected());

@@ -182,6 +182,7 @@
 
 pub mod access;
 mod calls;
+pub mod event;
 pub mod hub;
 pub mod lease;
 pub mod publications;

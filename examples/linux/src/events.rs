@@ -25,7 +25,7 @@ fn show(event: &UnitEvent) {
             _ => say!("lease of {function} at {peer} {}", why.word()),
         },
         UnitEvent::NotJoined { address, reason, .. } => say!("{address} did not join: {reason}"),
-        UnitEvent::InterfacesChanged { up } => say!("interfaces that are up: {}", up.join(" ")),
+        UnitEvent::NetworkChanged { up } => say!("interfaces that are up: {}", up.join(" ")),
         UnitEvent::FunctionsSkipped { peer, skipped } => say!("{peer} has no room for {skipped} functions"),
         _ => say!("{event:?}"),
     }

@@ -118,7 +118,7 @@ pub(super) fn event(event: &UnitEvent, at: Duration) -> Answer {
         UnitEvent::Left { peer, reason } => ("left", Some(peer), reason.to_string()),
         UnitEvent::NotJoined { address, peer, reason } => ("not_joined", peer.as_ref(), format!("{address}: {reason}")),
         UnitEvent::ListChanged { peer } => ("list_changed", Some(peer), "published or withdrew functions".to_owned()),
-        UnitEvent::InterfacesChanged { up } => {
+        UnitEvent::NetworkChanged { up } => {
             ("interfaces_changed", None, format!("interfaces that are up: {}", up.join(" ")))
         }
         UnitEvent::FunctionsSkipped { peer, skipped } => {
@@ -139,6 +139,7 @@ pub(super) fn event(event: &UnitEvent, at: Duration) -> Answer {
             };
             ("lease_ended", Some(peer), text)
         }
+        other => ("other", None, format!("{other:?}")),
     };
     Answer::Event { at_ms: at.as_millis(), event: name.to_owned(), node: node.map(Identity::to_string), text }
 }

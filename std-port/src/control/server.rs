@@ -354,7 +354,7 @@ mod tests {
                 client(asks).read_to_string(&mut told).unwrap();
                 assert_eq!(told.lines().count(), answers, "{told}");
             }
-            system.engine().tell(UnitEvent::InterfacesChanged { up: Vec::new() });
+            system.engine().tell(UnitEvent::NetworkChanged { up: Vec::new() });
             assert!(matches!(next(&mut watching), Answer::Event { .. }));
         });
     }

@@ -169,7 +169,7 @@ fn an_event_that_finds_no_room_is_counted_for_its_subscriber_and_the_unit() {
     let (slow, slow_events) = sync_channel(1);
     let (quick, quick_events) = sync_channel(8);
     let (lost_by_slow, lost_by_quick) = (engine.subscribe(slow), engine.subscribe(quick));
-    let event = UnitEvent::InterfacesChanged { up: Vec::new() };
+    let event = UnitEvent::NetworkChanged { up: Vec::new() };
     (0..4).for_each(|_| engine.tell(event.clone()));
     let counted = [&lost_by_slow, &lost_by_quick].map(|lost| lost.load(Ordering::Relaxed));
     assert_eq!((counted, lost()), ([3, 0], 3));

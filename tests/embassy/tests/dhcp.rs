@@ -85,7 +85,7 @@ fn a_unit_joins_with_the_address_that_it_is_given_and_again_with_another() {
     let noted = Rc::clone(&told);
     board.spawn(async move {
         loop {
-            if matches!(agv.next_event().await, UnitEvent::AddressChanged { .. }) {
+            if matches!(agv.next_event().await, UnitEvent::NetworkChanged { .. }) {
                 noted.set(noted.get() + 1);
             }
         }

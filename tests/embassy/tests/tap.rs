@@ -226,12 +226,16 @@ impl Wake for Nobody {
 fn services(unit: Handle<Agv>) {
     let plain = ServiceOptions::new;
     let pos_info = Handler::method(&|agv: &mut Agv, _, parameters| agv.pos_info(parameters));
-    unit.add_service(POS_INFO, plain(), pos_info).unwrap();
-    unit.add_service(BATTERY, plain(), Handler::method(&|agv: &mut Agv, _, p| agv.battery(p))).unwrap();
+    unit.my_function_list().add_service(POS_INFO, plain(), pos_info).unwrap();
+    unit.my_function_list()
+        .add_service(BATTERY, plain(), Handler::method(&|agv: &mut Agv, _, p| agv.battery(p)))
+        .unwrap();
     let forget: &'static cara_embassy::Hook<Agv> = &|agv| {
         agv.stop();
     };
-    unit.add_service(GO_TO, plain().lease(GO_TO_LEASE, &DRIVING, &|| {}).then(forget), Handler::task()).unwrap();
+    unit.my_function_list()
+        .add_service(GO_TO, plain().lease(GO_TO_LEASE, &DRIVING, &|| {}).then(forget), Handler::task())
+        .unwrap();
     unit.on_manager_lost(&|agv| {
         agv.stop();
         LOSSES.fetch_add(1, Ordering::Relaxed);
@@ -252,7 +256,7 @@ async fn drive(unit: Handle<Agv>) {
                 break;
             }
         }
-        unit.end_lease("go_to");
+        unit.my_function_list().end_lease("go_to");
         call.reply(begun.map(|()| &*parameters)).await;
     }
 }

@@ -86,7 +86,7 @@ fn doubling(unit: Unit) {
         let n: i64 = parameters.variable("n").map_err(|_| ServiceError::BadResults)?;
         parameters.set_value("n", 2 * n).map_err(|_| ServiceError::BadResults)
     });
-    unit.add_service("double(n: int) -> (n: int)", ServiceOptions::new(), double).unwrap();
+    unit.my_function_list().add_service("double(n: int) -> (n: int)", ServiceOptions::new(), double).unwrap();
 }
 
 /// Runs a future on a board, and time until it is over.
@@ -142,7 +142,9 @@ fn a_board_has_a_table_from_the_start_and_gets_another_while_it_runs() {
     let config = agv_config(&bench).access(&DOUBLERS);
     let agv = start(&board, config);
     doubling(agv);
-    agv.add_service("secret(n: int) -> (n: int)", ServiceOptions::new(), Handler::method(&|_, _, _| Ok(()))).unwrap();
+    agv.my_function_list()
+        .add_service("secret(n: int) -> (n: int)", ServiceOptions::new(), Handler::method(&|_, _, _| Ok(())))
+        .unwrap();
     agv.publish_my_function_list().unwrap();
     assert!(bench.run_until(|| knows(manager, "agv", "double"), SHORT));
     assert_eq!(ask(&bench, &manager_board, manager, "agv", "double", 21), Ok(42));
@@ -170,7 +172,7 @@ async fn drive(unit: Unit) {
             driven += 1;
         }
         let result = parameters.set_value("n", driven).map_err(|_| ServiceError::BadResults);
-        unit.end_lease("go_to");
+        unit.my_function_list().end_lease("go_to");
         call.reply(result.map(|()| &*parameters)).await;
     }
 }
@@ -179,7 +181,7 @@ fn driving(board: &Board, unit: Unit) {
     let options = ServiceOptions::new()
         .lease(Duration::from_millis(400), &GO_TO, &|| {})
         .then(&|state: &mut State| state.stops += 1);
-    unit.add_service("go_to(n: int) -> (n: int)", options, Handler::task()).unwrap();
+    unit.my_function_list().add_service("go_to(n: int) -> (n: int)", options, Handler::task()).unwrap();
     board.spawn(drive(unit));
 }
 
@@ -219,7 +221,7 @@ fn made_safe() {
 fn hauling(board: &Board, unit: Unit, length: Duration) -> Rc<RefCell<Vec<(i64, Instant)>>> {
     let lease = Box::leak(Box::new(Lease::new()));
     let options = ServiceOptions::new().lease(length, lease, &made_safe).then(&|state: &mut State| state.stops += 1);
-    unit.add_service("haul(n: int)", options, Handler::task()).unwrap();
+    unit.my_function_list().add_service("haul(n: int)", options, Handler::task()).unwrap();
     let ended = Rc::new(RefCell::new(Vec::new()));
     let (told, own) = (Rc::clone(&ended), board.clone());
     board.spawn(async move {
@@ -263,7 +265,7 @@ fn a_task_awaits_the_end_of_its_own_call() {
     bench.run_for(AT_ONCE);
     assert_eq!((numbers(), stops()), (vec![1, 2], 1), "the second was released");
     call(3, true);
-    agv.end_lease("haul");
+    agv.my_function_list().end_lease("haul");
     bench.run_for(AT_ONCE);
     assert_eq!((numbers(), stops()), (vec![1, 2, 3], 1), "the third has finished");
     let asked = bench.now();
@@ -273,7 +275,7 @@ fn a_task_awaits_the_end_of_its_own_call() {
     assert!(took <= length + AT_ONCE && took + AT_ONCE >= length, "{} ms", took.as_millis());
     assert_eq!(MADE_SAFE.get(), 2);
     call(5, true);
-    agv.remove_service("haul").unwrap();
+    agv.my_function_list().remove("haul").unwrap();
     assert_eq!(MADE_SAFE.get(), 3, "the service of the fifth is gone");
     bench.run_for(AT_ONCE);
     assert_eq!((numbers(), MADE_SAFE.get()), (vec![1, 2, 3, 4, 5], 3));
@@ -287,7 +289,7 @@ fn a_pulled_cable_runs_each_hook_once_and_the_board_comes_back() {
     let options = ServiceOptions::new()
         .lease(Duration::from_millis(400), &STANDING, &|| {})
         .then(&|state: &mut State| state.stops += 1);
-    agv.add_service("go(n: int) -> (n: int)", options, Handler::method(&|_, _, _| Ok(()))).unwrap();
+    agv.my_function_list().add_service("go(n: int) -> (n: int)", options, Handler::method(&|_, _, _| Ok(()))).unwrap();
     agv.publish_my_function_list().unwrap();
     for round in 1..4 {
         assert!(bench.run_until(|| knows(manager, "agv", "go"), LONG), "round {round}");
@@ -416,9 +418,12 @@ fn memory_that_cannot_hold_the_constraints_is_refused() {
     assert_eq!(unit.constraints(), follow, "what is refused changes nothing");
     assert_eq!(unit.set_constraints(Constraints { maximum_nodes: 4, ..follow }), Ok(()));
     let huge = "huge(text: string[9000])";
-    let refused = unit.add_service(huge, ServiceOptions::new(), Handler::task());
+    let refused = unit.my_function_list().add_service(huge, ServiceOptions::new(), Handler::task());
     assert!(matches!(refused, Err(Error::TooLarge { .. })), "{refused:?}");
-    assert_eq!(unit.add_service("half(", ServiceOptions::new(), Handler::task()), Err(Error::BadName));
+    assert_eq!(
+        unit.my_function_list().add_service("half(", ServiceOptions::new(), Handler::task()),
+        Err(Error::BadName)
+    );
 }
 
 /// Nothing is said on as many connections as the manager has links for; its node comes all the same.
@@ -487,12 +492,12 @@ fn a_starved_vehicle_stops_by_its_lease_and_is_made_safe_first() {
     let length = Duration::from_millis(400);
     let safe: &'static Hook<State> = &|state| state.done.push("made safe");
     let options = ServiceOptions::new().lease(length, &MOVING, &|| {}).then(safe);
-    agv.add_service("go(n: int) -> (n: int)", options, Handler::method(&|_, _, _| Ok(()))).unwrap();
+    agv.my_function_list().add_service("go(n: int) -> (n: int)", options, Handler::method(&|_, _, _| Ok(()))).unwrap();
     let noted = Handler::method(&|state: &mut State, _, _| {
         state.done.push("served");
         Ok(())
     });
-    agv.add_service("note(n: int)", ServiceOptions::new(), noted).unwrap();
+    agv.my_function_list().add_service("note(n: int)", ServiceOptions::new(), noted).unwrap();
     agv.publish_my_function_list().unwrap();
     assert!(bench.run_until(|| knows(manager, "agv", "note"), SHORT));
     assert_eq!(ask(&bench, &manager_board, manager, "agv", "go", 1), Ok(1));
@@ -517,7 +522,7 @@ fn what_a_motors_interrupt_has_seen_dead_no_renewal_revives() {
     static MOVING: Lease = Lease::new();
     let length = Duration::from_millis(400);
     let options = ServiceOptions::new().lease(length, &MOVING, &|| {}).then(&|state: &mut State| state.stops += 1);
-    agv.add_service("go(n: int) -> (n: int)", options, Handler::method(&|_, _, _| Ok(()))).unwrap();
+    agv.my_function_list().add_service("go(n: int) -> (n: int)", options, Handler::method(&|_, _, _| Ok(()))).unwrap();
     agv.publish_my_function_list().unwrap();
     assert!(bench.run_until(|| knows(manager, "agv", "go"), SHORT));
     for round in 1..4 {
@@ -538,7 +543,7 @@ fn keys_are_made_anew_while_calls_go_on() {
     static MOVING: Lease = Lease::new();
     let stop: &'static Hook<State> = &|state| state.stops += 1;
     let options = ServiceOptions::new().lease(Duration::from_millis(400), &MOVING, &|| {}).then(stop);
-    agv.add_service("go(n: int) -> (n: int)", options, Handler::method(&|_, _, _| Ok(()))).unwrap();
+    agv.my_function_list().add_service("go(n: int) -> (n: int)", options, Handler::method(&|_, _, _| Ok(()))).unwrap();
     for unit in [manager, agv] {
         unit.renew_keys_every(Duration::from_secs(1));
         doubling(unit);

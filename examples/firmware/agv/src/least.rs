@@ -43,7 +43,7 @@ pub fn unit(
         };
         sum().map_err(|_: Error| ServiceError::BadResults)
     });
-    unit.add_service("add(a: int, b: int) -> (sum: int)", ServiceOptions::new(), add)?;
+    unit.my_function_list().add_service("add(a: int, b: int) -> (sum: int)", ServiceOptions::new(), add)?;
     unit.publish_my_function_list()?;
     Ok(runner)
 }

@@ -134,11 +134,11 @@ fn offer(vehicle: Vehicle) -> Result<(), Error> {
         info!("driving");
         Ok(())
     });
-    vehicle.add_service(POS_INFO, plain().idempotent(), pos_info)?;
-    vehicle.add_service(BATTERY, plain().idempotent(), battery)?;
-    vehicle.add_service(STOP, plain().idempotent().priority(Priority::Emergency), stop)?;
-    vehicle.add_service(ECHO, plain().idempotent(), Handler::method(&|_, _, _| Ok(())))?;
-    vehicle.add_service(GO_TO, plain().lease(GO_TO_LEASE, &DRIVING, &cut).then(stand), go_to)?;
+    vehicle.my_function_list().add_service(POS_INFO, plain().idempotent(), pos_info)?;
+    vehicle.my_function_list().add_service(BATTERY, plain().idempotent(), battery)?;
+    vehicle.my_function_list().add_service(STOP, plain().idempotent().priority(Priority::Emergency), stop)?;
+    vehicle.my_function_list().add_service(ECHO, plain().idempotent(), Handler::method(&|_, _, _| Ok(())))?;
+    vehicle.my_function_list().add_service(GO_TO, plain().lease(GO_TO_LEASE, &DRIVING, &cut).then(stand), go_to)?;
     vehicle.on_manager_lost(stand);
     vehicle.publish_my_function_list()
 }
@@ -175,7 +175,7 @@ pub async fn drive(vehicle: Vehicle) -> ! {
         match progress {
             Ok(Some(Progress::Arrived(place))) => {
                 let [_x, _y] = place.rounded();
-                vehicle.end_lease("go_to");
+                vehicle.my_function_list().end_lease("go_to");
                 info!("arrived at {} {}", _x, _y);
             }
             Ok(Some(Progress::Stopped(place))) => tell_stop(place),

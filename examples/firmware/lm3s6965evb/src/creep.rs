@@ -27,7 +27,7 @@ static MOTION: Mutex<Cell<Option<LeaseWatch>>> = Mutex::new(Cell::new(None));
 
 /// Offers the service.
 pub(crate) fn offer(vehicle: Vehicle) -> Result<(), Error> {
-    vehicle.add_service(
+    vehicle.my_function_list().add_service(
         CREEP,
         ServiceOptions::new().lease(GO_TO_LEASE, &CREEPING, &|| set_motion(None)),
         Handler::task(),

@@ -95,7 +95,7 @@ pub fn offer(vehicle: Vehicle) -> Result<(), Error> {
         fail(kind);
         Ok(())
     });
-    vehicle.add_service(FAULT, ServiceOptions::new(), fault)?;
+    vehicle.my_function_list().add_service(FAULT, ServiceOptions::new(), fault)?;
     let lost: &'static Hook<Agv> = &|agv| {
         cara_vehicle::stand_still(agv);
         let losses = Record::change(|record| {

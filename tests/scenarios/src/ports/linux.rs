@@ -648,7 +648,7 @@ fn seen(event: UnitEvent) -> Option<Seen> {
         UnitEvent::RequestFailed { call, error, .. } => Seen::Failed(call, error),
         UnitEvent::LeaseExpired { function, .. } => Seen::LeaseExpired(function),
         UnitEvent::LeaseEnded { function, why, .. } => Seen::LeaseEnded(function, why),
-        UnitEvent::InterfacesChanged { up } => Seen::InterfaceChanged(!up.is_empty()),
+        UnitEvent::NetworkChanged { up } => Seen::InterfaceChanged(!up.is_empty()),
         UnitEvent::FunctionsSkipped { .. } => return None,
         // A scenario that did not see it would pass for the wrong reason.
         other => panic!("no scenario knows {other:?}"),

@@ -51,7 +51,9 @@ fn spawn(spawner: Spawner) -> Result<(), &'static str> {
         cara_embassy::new(stack, MEMORY.init_with(Memory::new), config, ()).map_err(|_| "no such unit")?;
     for service in SERVICES {
         let nothing = Handler::method(&|(), _, _| Ok(()));
-        unit.add_service(service, ServiceOptions::new().idempotent(), nothing).map_err(|_| "no room for a service")?;
+        unit.my_function_list()
+            .add_service(service, ServiceOptions::new().idempotent(), nothing)
+            .map_err(|_| "no room for a service")?;
     }
     unit.publish_my_function_list().map_err(|_| "nothing is published")?;
     spawner.spawn(network(network_runner).map_err(|_| NO_ROOM)?);

@@ -169,7 +169,7 @@ impl Node for Rc<BoardNode> {
     }
 
     fn remove_service(&self, name: &str) -> Result<(), Error> {
-        self.unit()?.remove_service(name)?;
+        self.unit()?.my_function_list().remove(name)?;
         self.services.borrow_mut().remove(name);
         Ok(())
     }
@@ -272,7 +272,7 @@ impl Node for Rc<BoardNode> {
 
     fn end_lease(&self, function: &str) {
         if let Ok(unit) = self.unit() {
-            unit.end_lease(function);
+            unit.my_function_list().end_lease(function);
         }
     }
 
@@ -326,7 +326,7 @@ fn seen(event: UnitEvent) -> Option<Seen> {
         UnitEvent::RequestFailed { call, error, .. } => Seen::Failed(call, error),
         UnitEvent::LeaseExpired { function, .. } => Seen::LeaseExpired(function.to_string()),
         UnitEvent::LeaseEnded { function, why, .. } => Seen::LeaseEnded(function.to_string(), why),
-        UnitEvent::AddressChanged { address } => Seen::InterfaceChanged(address.is_some()),
+        UnitEvent::NetworkChanged { up } => Seen::InterfaceChanged(up.is_some()),
         UnitEvent::FunctionsSkipped { .. } => return None,
         // A scenario that did not see it would pass for the wrong reason.
         other => panic!("no scenario knows {other:?}"),

@@ -28,8 +28,8 @@ pub(super) fn put(node: &Rc<BoardNode>, service: &Service, replace: bool) -> Res
     }
     let handler = if service.awaits() { Handler::task() } else { at_once(service.clone()) };
     match replace {
-        true => unit.replace_service(&service.signature, options, handler),
-        false => unit.add_service(&service.signature, options, handler),
+        true => unit.my_function_list().replace(&service.signature, options, handler),
+        false => unit.my_function_list().add_service(&service.signature, options, handler),
     }?;
     let known = node.keep(service, lease);
     if service.awaits() && !known {
@@ -80,7 +80,11 @@ async fn run(
 ) -> Result<(), ServiceError> {
     if let Some(function) = &service.calls_back {
         let patient = RequestOptions { timeout: Some(Duration::from_secs(8)), ..RequestOptions::default() };
-        let called = unit.peer_of(&call.caller).block_request_with(function, parameters, &patient).await;
+        let called = unit
+            .node(&call.caller)
+            .expect("a caller has joined")
+            .block_request_with(function, parameters, &patient)
+            .await;
         called.map_err(|_| ServiceError::NotReady)?;
     }
     (service.body)(&Asked { caller: call.caller.clone(), at: now() }, parameters)?;

@@ -1,0 +1,86 @@
+//! What a unit tells its application: one type for all ports.
+
+use core::net::SocketAddr;
+
+use crate::distribution::identity::Identity;
+use crate::error::{CloseReason, Error};
+use crate::services::lease::LeaseEnd;
+use crate::services::requests::CallId;
+
+/// Something happened that no call returned.
+///
+/// A port fills in how it names a function (`F`) and what can be used of the network (`N`), and gives the whole a short name:
+/// a program for Linux sees `cara_std::UnitEvent`, one for a board `cara_embassy::UnitEvent`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum UnitEvent<F, N> {
+    /// A node is connected.
+    Joined {
+        /// Which.
+        peer: Identity,
+    },
+    /// A node is no longer connected.
+    Left {
+        /// Which.
+        peer: Identity,
+        /// Why.
+        reason: CloseReason,
+    },
+    /// A link ended before it joined: refused here or there, silent, or it could not be opened. `DuplicateIdentity` with
+    /// this unit's own identity in `peer`: another live unit has it, and one of the two waits for the other's end.
+    NotJoined {
+        /// The other end.
+        address: SocketAddr,
+        /// The identity that it claimed, or is expected to have.
+        peer: Option<Identity>,
+        /// Why.
+        reason: CloseReason,
+    },
+    /// The network that this unit can use has changed, and it searches again by itself. On Linux also when the unit finds
+    /// none at its start; a board's first address is not reported, and its links have ended.
+    NetworkChanged {
+        /// What can be used now. On Linux the names of the interfaces that are up, `lo` among them: where there is no other
+        /// one, no node on another host can be found. On a board its address, if it has one.
+        up: N,
+    },
+    /// A node published or withdrew functions.
+    ListChanged {
+        /// Which.
+        peer: Identity,
+    },
+    /// A node keeps no room for some of this unit's functions.
+    FunctionsSkipped {
+        /// Which.
+        peer: Identity,
+        /// How many.
+        skipped: u16,
+    },
+    /// An asynchronous request was not run, or its service failed.
+    RequestFailed {
+        /// Asked of this node.
+        peer: Identity,
+        /// As returned by the request.
+        call: CallId,
+        /// Why.
+        error: Error,
+    },
+    /// A service of this unit stopped because its caller no longer wanted it. Its lease is dead. On a board its safe hook
+    /// has run; on Linux it runs, on a thread of its own.
+    LeaseExpired {
+        /// Its caller.
+        peer: Identity,
+        /// The service.
+        function: F,
+    },
+    /// A node ended what this unit's call of a leased service started.
+    LeaseEnded {
+        /// Which.
+        peer: Identity,
+        /// The service.
+        function: F,
+        /// The call that held the lease.
+        call: CallId,
+        /// Why.
+        why: LeaseEnd,
+    },
+}
