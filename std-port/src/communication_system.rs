@@ -157,7 +157,7 @@ impl<T: Send + 'static> CommunicationSystem<T> {
 
     /// The connected nodes that offer a function to this unit.
     pub fn nodes_offering(&self, function: &str) -> Vec<Peer<T>> {
-        self.connected().filter(|peer| peer.their_function_list().contains(function)).collect()
+        self.connected().filter(|peer| peer.offers(function)).collect()
     }
 
     fn only(&self, wanted: impl Fn(&Identity) -> bool) -> Result<Peer<T>, Error> {

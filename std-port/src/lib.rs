@@ -41,6 +41,7 @@ mod locks;
 #[cfg(feature = "metrics")]
 pub mod metrics;
 mod my_function_list;
+mod news;
 mod occupancy;
 mod peer;
 mod pool;
@@ -80,7 +81,7 @@ pub use handle::{Handle, MUnit, SUnit, WeakHandle};
 pub use handler::{Call, IntoHandler, ServiceOptions};
 pub use lease::{LeaseEnded, LeaseWatch};
 pub use my_function_list::MyFunctionList;
-pub use peer::{FunctionNames, Peer, TheirFunction};
+pub use peer::{Peer, TheirFunction, TheirFunctionList};
 pub use sys::interfaces::{Interface, Interfaces};
 pub use threads::Threads;
 pub use unit::{Unit, WeakUnit};

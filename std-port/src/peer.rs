@@ -40,21 +40,26 @@ impl<T: Send + 'static> fmt::Debug for Peer<T> {
     }
 }
 
-/// A copy of the functions that a node has published.
+/// A copy of the functions that a node has published to this unit.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct FunctionNames {
-    functions: Vec<(String, String)>,
+pub struct TheirFunctionList {
+    functions: Vec<TheirFunction>,
 }
 
-impl FunctionNames {
+impl TheirFunctionList {
     /// One line per function (paper, listing line 10).
     pub fn show_functions(&self) -> impl fmt::Display + '_ {
         self
     }
 
+    /// The functions.
+    pub fn iter(&self) -> std::slice::Iter<'_, TheirFunction> {
+        self.functions.iter()
+    }
+
     /// The names.
     pub fn names(&self) -> impl Iterator<Item = &str> {
-        self.functions.iter().map(|(name, _)| name.as_str())
+        self.iter().map(|function| function.definition.name())
     }
 
     /// Whether a function is among them.
@@ -73,14 +78,24 @@ impl FunctionNames {
     }
 }
 
-impl fmt::Display for FunctionNames {
+impl fmt::Display for TheirFunctionList {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.functions.iter().try_for_each(|(_, text)| writeln!(f, "{text}"))
+        self.iter().try_for_each(|function| writeln!(f, "{}", function.definition.signature()))
+    }
+}
+
+impl<'l> IntoIterator for &'l TheirFunctionList {
+    type Item = &'l TheirFunction;
+    type IntoIter = std::slice::Iter<'l, TheirFunction>;
+
+    fn into_iter(self) -> Self::IntoIter {
+        self.iter()
     }
 }
 
 /// A function that a node has published to this unit.
 #[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct TheirFunction {
     /// Its name, arguments and results.
     pub definition: Definition,
@@ -89,10 +104,8 @@ pub struct TheirFunction {
 }
 
 impl TheirFunction {
-    /// What was checked when it came reads back from its text form.
-    fn of(function: Function<'_>) -> Option<Self> {
-        let definition = Definition::parse(&function.signature.to_string()).ok()?;
-        Some(Self { definition, attributes: function.attributes })
+    fn of(function: Function<'_>) -> Self {
+        Self { definition: function.signature.to_definition(), attributes: function.attributes }
     }
 }
 
@@ -178,38 +191,37 @@ impl<T: Send + 'static> Peer<T> {
     }
 
     /// What the node has published to this unit; empty while it is not connected.
-    pub fn their_function_list(&self) -> FunctionNames {
-        let Ok(link) = self.link() else { return FunctionNames::default() };
+    pub fn their_function_list(&self) -> TheirFunctionList {
+        let Ok(link) = self.link() else { return TheirFunctionList::default() };
         let state = link.lock();
-        let functions = state.session.their_function_list().iter();
-        FunctionNames { functions: functions.map(|f| (f.name().to_owned(), f.signature.to_string())).collect() }
+        TheirFunctionList { functions: state.session.their_function_list().iter().map(TheirFunction::of).collect() }
     }
 
-    /// The same with everything that is known of each.
-    pub fn functions(&self) -> Vec<TheirFunction> {
-        let Ok(link) = self.link() else { return Vec::new() };
-        let state = link.lock();
-        let functions = state.session.their_function_list().iter();
-        functions.filter_map(TheirFunction::of).collect()
-    }
-
-    /// One of them.
+    /// One of the functions that it has published to this unit.
     pub fn function(&self, name: &str) -> Option<TheirFunction> {
         let link = self.link().ok()?;
         let state = link.lock();
-        state.session.their_function_list().named(name).and_then(TheirFunction::of)
+        state.session.their_function_list().named(name).map(TheirFunction::of)
+    }
+
+    /// Whether it has published a function to this unit.
+    pub(crate) fn offers(&self, function: &str) -> bool {
+        self.link().is_ok_and(|link| link.lock().session.their_function_list().named(function).is_some())
     }
 
     /// Waits until the node has published `function`; `false` after `timeout`.
     pub fn wait_for_function(&self, function: &str, timeout: impl Into<Duration>) -> bool {
         let deadline = self.engine.now() + timeout.into();
-        while self.engine.now() < deadline {
-            if self.their_function_list().contains(function) {
-                return true;
+        // Counted before the look: what comes after it ends the wait.
+        let mut seen = self.engine.news.count();
+        while !self.offers(function) {
+            let left = deadline.since(self.engine.now());
+            if left == Duration::ZERO {
+                return false;
             }
-            std::thread::sleep(std::time::Duration::from_millis(2));
+            seen = self.engine.news.wait(seen, left);
         }
-        false
+        true
     }
 
     /// Calls a function and waits for its results, which update `parameters` (paper, listing line 13). On an error they

@@ -164,6 +164,12 @@ impl<'a> Signature<'a> {
         self.bytes
     }
 
+    /// A copy that owns its bytes.
+    pub fn to_definition(&self) -> Definition {
+        // What was checked is no longer than a definition.
+        Definition { bytes: heapless::Vec::from_slice(self.bytes).unwrap_or_default() }
+    }
+
     /// Bytes of a `Parameters` that holds all arguments and results, as the callee's does.
     pub fn parameters_bytes(&self) -> u32 {
         let arguments = self.arguments();

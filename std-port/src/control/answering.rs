@@ -201,7 +201,7 @@ fn functions<T: Send + 'static>(system: &CommunicationSystem<T>, node: &str, sin
     if !peer.is_connected() {
         return Err(Error::NotConnected.into());
     }
-    let functions = peer.functions();
+    let functions = peer.their_function_list();
     let mut seen = functions.iter().filter(|function| system.operator_sees(function.definition.name()));
     seen.try_for_each(|function| send(sink, Answer::Function(describe::function(function))))
 }

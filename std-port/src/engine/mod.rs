@@ -81,6 +81,7 @@ use crate::config::Capacities;
 use crate::event::UnitEvent;
 use crate::handler::Handler;
 use crate::locks::{Held, Locked, Rank};
+use crate::news::News;
 use crate::pool::MessagePool;
 use crate::storage::Boxed;
 use crate::sys::datagram::Datagrams;
@@ -111,6 +112,8 @@ pub(crate) struct Engine<T: 'static> {
     guard: access::Guard,
     accounts: accounts::Accounts,
     events: Events,
+    /// For threads that look for themselves at what has happened.
+    pub(crate) news: News,
 }
 
 /// The parts that [`Engine::new`] puts together.
@@ -146,6 +149,7 @@ impl<T: Send + 'static> Engine<T> {
             guard: access::Guard::default(),
             accounts: accounts::Accounts::default(),
             events: Events::default(),
+            news: News::default(),
         })
     }
 
@@ -240,6 +244,7 @@ impl<T: Send + 'static> Engine<T> {
     /// Tells subscribers.
     pub(crate) fn tell(&self, event: UnitEvent) {
         self.events.tell(&event);
+        self.news.add();
     }
 
     /// Tells `sender` what happens from here on; what is returned counts the events that found no room.
