@@ -403,6 +403,35 @@ impl From<ServiceError> for Error {
     }
 }
 
+/// So that a service may use `?` on what it does with its parameters and with other units. What it got from another service
+/// goes on to its caller; an error of the service's own program is [`ServiceError::BadResults`], and any other one, as of a
+/// peer that does not answer, [`ServiceError::NotReady`]: the service cannot do its work now.
+///
+/// ```
+/// use cara_core::{ParametersView, ServiceError};
+///
+/// fn double(parameters: &mut ParametersView) -> Result<(), ServiceError> {
+///     let number: i64 = parameters.variable("number")?;
+///     parameters.set_value("number", number.checked_mul(2).ok_or(ServiceError::Failed(1))?)?;
+///     Ok(())
+/// }
+/// # let mut parameters = cara_core::Parameters::new();
+/// # parameters.add_int("number", 1).unwrap();
+/// # parameters.set_value("number", 21).unwrap();
+/// # assert_eq!(double(&mut parameters), Ok(()));
+/// # assert_eq!(parameters.variable("number"), Ok(42));
+/// assert_eq!(double(&mut cara_core::Parameters::new()), Err(ServiceError::BadResults));
+/// ```
+impl From<Error> for ServiceError {
+    fn from(error: Error) -> Self {
+        match (error, error.cause()) {
+            (Error::Service(error), _) => error,
+            (_, Cause::Configuration) => Self::BadResults,
+            (_, Cause::Peer | Cause::Resource | Cause::Transport) => Self::NotReady,
+        }
+    }
+}
+
 impl From<Refusal> for Error {
     fn from(refusal: Refusal) -> Self {
         Self::Refused(refusal)

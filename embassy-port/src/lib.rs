@@ -28,9 +28,7 @@
 //! ) -> Result<(Handle<Agv>, Runner<Agv>), cara_core::error::Error> {
 //!     let config = Config::s_unit("agv-07", 7, "manager", 1, security)?;
 //!     let (unit, runner) = cara_embassy::new(stack, resources, config, Agv::default())?;
-//!     let pos_info = Handler::method(&|agv: &mut Agv, _, p| {
-//!         p.set_value("position", agv.position).map_err(|_| cara_core::error::ServiceError::BadResults)
-//!     });
+//!     let pos_info = Handler::method(&|agv: &mut Agv, _, p| Ok(p.set_value("position", agv.position)?));
 //!     unit.my_function_list().add_service("pos_info() -> (position: int[2])", ServiceOptions::new(), pos_info)?;
 //!     let forget: &'static cara_embassy::Hook<Agv> = &|agv| agv.target = None;
 //!     // The hook makes safe, and waits for nothing; what needs the state comes after it.

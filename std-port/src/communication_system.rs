@@ -37,6 +37,13 @@ impl CommunicationSystem {
     }
 
     /// An m_unit with other than defaults.
+    ///
+    /// ```no_run
+    /// use cara_std::{CommunicationSystem, Interfaces};
+    ///
+    /// let depot = CommunicationSystem::builder("depot", 1)?.fleet(7).interfaces(Interfaces::Loopback).build()?;
+    /// # Ok::<(), cara_std::BuildError>(())
+    /// ```
     pub fn builder(name: &str, id: u32) -> Result<Builder<(), MUnit>, BuildError> {
         Ok(Builder::new(Identity::m_unit(name, id)?, Target::Everybody))
     }
@@ -107,16 +114,28 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     }
 
     fn of_role(&self, role: Role) -> Vec<Peer<T>> {
-        self.engine().peers().of_role(role).map(|cell| self.peer(cell)).collect()
+        self.engine().peers().of_role(role).map(|cell| self.peer_of(cell)).collect()
     }
 
-    fn peer(&self, cell: &Arc<crate::engine::peers::PeerCell>) -> Peer<T> {
+    fn peer_of(&self, cell: &Arc<crate::engine::peers::PeerCell>) -> Peer<T> {
         Peer { engine: self.engine().clone(), cell: cell.clone() }
+    }
+
+    /// The node of a name, whatever its role, likewise.
+    pub fn peer(&self, name: &str) -> Result<Peer<T>, Error> {
+        self.only(|identity| identity.name() == name)
     }
 
     /// The s_unit of a name, connected or not. [`Error::NotConnected`] before it has joined; [`Error::Ambiguous`] where
     /// several s_units have that name, those included that the [roster](Self::roster) misses: the one that is here may not
     /// be the one that is meant. Ask by [identity](Self::node) then.
+    ///
+    /// ```no_run
+    /// # let depot = cara_std::CommunicationSystem::new("depot", 1)?;
+    /// let agv = depot.s_unit("agv-07")?;
+    /// println!("{agv:?} is at {:?}", agv.address());
+    /// # Ok::<(), cara_std::BuildError>(())
+    /// ```
     pub fn s_unit(&self, name: &str) -> Result<Peer<T>, Error> {
         self.only(|identity| identity.role() == Role::SUnit && identity.name() == name)
     }
@@ -133,7 +152,7 @@ impl<T: Send + 'static> CommunicationSystem<T> {
 
     /// The node of a name, an ID number and a role: `None` if it has neither joined nor stands on the [roster](Self::roster).
     pub fn node(&self, identity: &Identity) -> Option<Peer<T>> {
-        self.engine().node_of(identity).map(|cell| self.peer(&cell))
+        self.engine().node_of(identity).map(|cell| self.peer_of(&cell))
     }
 
     /// The s_units that this manager is expected to have, connected or not: with keys those that its key file lists, in
@@ -147,7 +166,7 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     /// # Ok::<(), cara_std::BuildError>(())
     /// ```
     pub fn roster(&self) -> Vec<Peer<T>> {
-        self.engine().roster().iter().map(|cell| self.peer(cell)).collect()
+        self.engine().roster().iter().map(|cell| self.peer_of(cell)).collect()
     }
 
     /// The connected nodes at an IP address.
@@ -161,7 +180,7 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     }
 
     fn only(&self, wanted: impl Fn(&Identity) -> bool) -> Result<Peer<T>, Error> {
-        self.engine().only_node(wanted).map(|cell| self.peer(&cell))
+        self.engine().only_node(wanted).map(|cell| self.peer_of(&cell))
     }
 
     /// Those of which a call to all has an outcome: the whole roster, and any other node that offers the function.
@@ -174,7 +193,7 @@ impl<T: Send + 'static> CommunicationSystem<T> {
     }
 
     fn connected(&self) -> impl Iterator<Item = Peer<T>> {
-        let peers: Vec<_> = self.engine().peers().connected().map(|cell| self.peer(cell)).collect();
+        let peers: Vec<_> = self.engine().peers().connected().map(|cell| self.peer_of(cell)).collect();
         peers.into_iter()
     }
 
@@ -201,6 +220,18 @@ impl<T: Send + 'static> CommunicationSystem<T> {
 
     /// Calls `function` of every node, all at the same time, and waits for all of them. There is an outcome for each, as of
     /// [`request_all`](Self::request_all).
+    ///
+    /// ```no_run
+    /// use cara_std::{Parameters, RequestOptions};
+    /// # let depot = cara_std::CommunicationSystem::new("depot", 1)?;
+    ///
+    /// for (agv, outcome) in depot.block_request_all("stop", &Parameters::new(), &RequestOptions::default()) {
+    ///     if let Err(error) = outcome {
+    ///         eprintln!("{agv:?} did not stop: {error}");
+    ///     }
+    /// }
+    /// # Ok::<(), cara_std::BuildError>(())
+    /// ```
     pub fn block_request_all<const BYTES: usize>(
         &self,
         function: &str,

@@ -10,9 +10,10 @@ use std::sync::mpsc::{Receiver, sync_channel};
 use std::sync::{Arc, Weak};
 
 use cara_core::config::{Constraints, Mode};
-use cara_core::distribution::connection_handler::Finding;
+use cara_core::distribution::connection_handler::{Finding, NodeCounter};
 use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
 use cara_core::error::Error;
+use cara_core::host::connections::LinkCounter;
 use cara_core::time::Duration;
 
 use crate::access::AccessTable;
@@ -279,6 +280,20 @@ impl<T: Send + 'static, R> Handle<T, R> {
     }
 
     /// Subscribes to events: joined, left, failed. A subscriber that does not keep up loses events.
+    ///
+    /// ```no_run
+    /// use cara_std::{CommunicationSystem, UnitEvent};
+    ///
+    /// let depot = CommunicationSystem::new("depot", 1)?;
+    /// let events = depot.events();
+    /// depot.start()?;
+    /// for event in events {
+    ///     if let UnitEvent::Left { peer, reason } = event {
+    ///         eprintln!("{peer}: {reason}");
+    ///     }
+    /// }
+    /// # Ok::<(), cara_std::BuildError>(())
+    /// ```
     pub fn events(&self) -> Receiver<UnitEvent> {
         let (sender, receiver) = sync_channel(self.events_waiting());
         self.engine().subscribe(sender);
@@ -301,6 +316,12 @@ impl<T: Send + 'static, R> Handle<T, R> {
     }
 
     /// Runs `act` with the application's state.
+    ///
+    /// ```no_run
+    /// let agv = cara_std::Unit::builder("agv", 7, "depot", 1)?.state([0_i64; 2]).build()?;
+    /// agv.with_state(|position| *position = [3, 4])?;
+    /// # Ok::<(), cara_std::BuildError>(())
+    /// ```
     pub fn with_state<A>(&self, act: impl FnOnce(&mut T) -> A) -> Result<A, Error> {
         self.engine().with_state(act)
     }
@@ -316,6 +337,16 @@ impl<T: Send + 'static, R> Handle<T, R> {
     /// how it is now; no other ever goes back.
     pub fn counters(&self) -> Vec<(&'static str, u64)> {
         pairs(self.engine().readings())
+    }
+
+    /// What happened on all links, also on those that have ended.
+    pub fn counted(&self, counter: LinkCounter) -> u64 {
+        self.engine().counted(counter)
+    }
+
+    /// What happened in discovery and membership.
+    pub fn node_counted(&self, counter: NodeCounter) -> u64 {
+        self.engine().hub().hub.node.counters.value(counter)
     }
 
     /// Everything that is counted, for the unit and for each node that it knows, in the text form that Prometheus reads:

@@ -52,6 +52,16 @@ impl LeaseWatch {
     }
 
     /// Whether the caller still wants what it started.
+    ///
+    /// ```no_run
+    /// # fn set_power(on: bool) {}
+    /// fn motor_loop(lease: cara_std::LeaseWatch) {
+    ///     loop {
+    ///         set_power(lease.is_live());
+    ///         std::thread::sleep(std::time::Duration::from_millis(1));
+    ///     }
+    /// }
+    /// ```
     pub fn is_live(&self) -> bool {
         let now = self.clock.now();
         match self.order {

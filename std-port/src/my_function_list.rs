@@ -22,6 +22,20 @@ pub struct MyFunctionList<'u, T: Send + 'static> {
 
 impl<T: Send + 'static> MyFunctionList<'_, T> {
     /// Adds a function whose arguments are also its results (paper, listing line 22).
+    ///
+    /// ```no_run
+    /// use cara_std::{Parameters, Unit};
+    ///
+    /// let agv = Unit::new("agv", 7, "depot", 1)?;
+    /// let mut pos = Parameters::new();
+    /// pos.add_int("position", 2)?;
+    /// agv.my_function_list().add_function("pos_info", &pos, |mut pos: Parameters| {
+    ///     pos.set_value("position", [3, 4]).expect("it is declared so");
+    ///     pos
+    /// })?;
+    /// agv.publish_my_function_list()?;
+    /// # Ok::<(), cara_std::BuildError>(())
+    /// ```
     pub fn add_function<Form>(
         &self,
         name: &str,
@@ -34,6 +48,20 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
 
     /// Adds a function by its definition, as made by `"go_to(position: int[2])".parse()`, with attributes. Returns its
     /// lease, which is dead unless the options ask for one.
+    ///
+    /// ```no_run
+    /// use cara_std::{Call, Definition, ParametersView, ServiceError, ServiceOptions, Unit};
+    ///
+    /// fn double(_: &Call, parameters: &mut ParametersView) -> Result<(), ServiceError> {
+    ///     let number: i64 = parameters.variable("number")?;
+    ///     Ok(parameters.set_value("number", 2 * number)?)
+    /// }
+    ///
+    /// let agv = Unit::new("agv", 7, "depot", 1)?;
+    /// let signature = Definition::parse("double(number: int) -> (number: int)").expect("it is a signature");
+    /// agv.my_function_list().add_service(&signature, ServiceOptions::new().idempotent(), double)?;
+    /// # Ok::<(), cara_std::BuildError>(())
+    /// ```
     ///
     /// [`Error::TooLarge`] when arguments and results are declared larger than any call can be served with,
     /// [`Error::EmergencyWaits`] for a handler of an emergency service that takes the application's state,

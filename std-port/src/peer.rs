@@ -191,6 +191,14 @@ impl<T: Send + 'static> Peer<T> {
     }
 
     /// What the node has published to this unit; empty while it is not connected.
+    ///
+    /// ```no_run
+    /// # let depot = cara_std::CommunicationSystem::new("depot", 1)?;
+    /// for function in &depot.s_unit("agv")?.their_function_list() {
+    ///     println!("{}: lease {:?}", function.definition.signature(), function.attributes.lease);
+    /// }
+    /// # Ok::<(), cara_std::BuildError>(())
+    /// ```
     pub fn their_function_list(&self) -> TheirFunctionList {
         let Ok(link) = self.link() else { return TheirFunctionList::default() };
         let state = link.lock();
@@ -210,6 +218,13 @@ impl<T: Send + 'static> Peer<T> {
     }
 
     /// Waits until the node has published `function`; `false` after `timeout`.
+    ///
+    /// ```no_run
+    /// # let depot = cara_std::CommunicationSystem::new("depot", 1)?;
+    /// let agv = depot.s_unit("agv")?;
+    /// assert!(agv.wait_for_function("go_to", std::time::Duration::from_secs(5)), "{agv:?} cannot drive");
+    /// # Ok::<(), cara_std::BuildError>(())
+    /// ```
     pub fn wait_for_function(&self, function: &str, timeout: impl Into<Duration>) -> bool {
         let deadline = self.engine.now() + timeout.into();
         // Counted before the look: what comes after it ends the wait.
@@ -226,12 +241,30 @@ impl<T: Send + 'static> Peer<T> {
 
     /// Calls a function and waits for its results, which update `parameters` (paper, listing line 13). On an error they
     /// are unchanged, and what the call started, or would start, stops if its service has a lease.
+    ///
+    /// ```no_run
+    /// # let depot = cara_std::CommunicationSystem::new("depot", 1)?;
+    /// let mut pos = cara_std::Parameters::new();
+    /// pos.add_int("position", 2)?;
+    /// depot.s_unit("agv")?.block_request("pos_info", &mut pos)?;
+    /// let [x, y]: [i64; 2] = pos.variable("position")?;
+    /// # Ok::<(), cara_std::BuildError>(())
+    /// ```
     #[doc(alias = "block_request_their_function")]
     pub fn block_request(&self, function: &str, parameters: &mut ParametersView) -> Result<(), Error> {
         self.block_request_with(function, parameters, &RequestOptions::default())
     }
 
     /// As [`block_request`](Self::block_request), with a time-out, class or lease of its own.
+    ///
+    /// ```no_run
+    /// use cara_std::{Duration, Parameters, RequestOptions};
+    /// # let depot = cara_std::CommunicationSystem::new("depot", 1)?;
+    ///
+    /// let patient = RequestOptions { timeout: Some(Duration::from_secs(30)), ..RequestOptions::default() };
+    /// depot.s_unit("agv")?.block_request_with("calibrate", &mut Parameters::new(), &patient)?;
+    /// # Ok::<(), cara_std::BuildError>(())
+    /// ```
     pub fn block_request_with(
         &self,
         function: &str,
@@ -243,6 +276,12 @@ impl<T: Send + 'static> Peer<T> {
 
     /// Calls a function without waiting (paper, listing line 19): accepted, not sent, not executed. A failure comes as
     /// [`UnitEvent::RequestFailed`](crate::UnitEvent::RequestFailed) under the returned id.
+    ///
+    /// ```no_run
+    /// # let depot = cara_std::CommunicationSystem::new("depot", 1)?;
+    /// let call = depot.s_unit("agv")?.request("blink", &cara_std::Parameters::new())?;
+    /// # Ok::<(), cara_std::BuildError>(())
+    /// ```
     #[doc(alias = "request_their_function")]
     pub fn request(&self, function: &str, parameters: &ParametersView) -> Result<CallId, Error> {
         self.request_with(function, parameters, &RequestOptions::default())

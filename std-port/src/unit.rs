@@ -19,6 +19,12 @@ pub type WeakUnit<T = ()> = WeakHandle<T, SUnit>;
 
 impl Unit {
     /// An s_unit with defaults, which joins the manager of the given name and id and no other.
+    ///
+    /// ```no_run
+    /// let agv = cara_std::Unit::new("agv", 7, "depot", 1)?;
+    /// agv.start()?;
+    /// # Ok::<(), cara_std::BuildError>(())
+    /// ```
     pub fn new(name: &str, id: u32, manager_name: &str, manager_id: u32) -> Result<Self, BuildError> {
         Self::builder(name, id, manager_name, manager_id)?.build()
     }

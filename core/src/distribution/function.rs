@@ -73,6 +73,11 @@ impl Definition {
     }
 
     /// A function from its text form, as in `go_to(position: int[2]) -> (done: bool)`.
+    ///
+    /// ```
+    /// let go_to = cara_core::Definition::parse("go_to(position: int[2]) -> (done: bool)").unwrap();
+    /// assert_eq!((go_to.name(), go_to.signature().arguments().count()), ("go_to", 1));
+    /// ```
     pub fn parse(text: &str) -> Result<Self, ParseError> {
         text::parse(text)
     }

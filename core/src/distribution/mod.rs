@@ -6,6 +6,7 @@ pub mod block;
 mod compact;
 pub mod connection_handler;
 pub mod datagram;
+mod display;
 mod element;
 pub mod function;
 pub mod function_list;

@@ -1,7 +1,7 @@
 //! The types of the IDL (paper, section 2), their values, and the Rust types that convert to and from them.
 //!
-//! Integers travel as `i64` and floats as `f64` bits; narrower Rust types convert with a check. Floats are never
-//! formatted here, so that no float formatting enters a firmware image.
+//! Integers travel as `i64` and floats as `f64` bits; narrower Rust types convert with a check. Floats are
+//! formatted by `Display` alone, so that no float formatting enters an image that does not show values.
 
 use core::fmt;
 

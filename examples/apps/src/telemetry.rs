@@ -30,8 +30,8 @@ pub struct Received {
 impl Received {
     /// Serves [`REPORT`]. A measurement that was overtaken is counted and not used.
     pub fn report(&mut self, parameters: &ParametersView) -> Result<(), ServiceError> {
-        let number: i64 = parameters.variable("number").map_err(|_| ServiceError::BadResults)?;
-        let speed: f64 = parameters.variable("speed").map_err(|_| ServiceError::BadResults)?;
+        let number: i64 = parameters.variable("number")?;
+        let speed: f64 = parameters.variable("speed")?;
         self.count = self.count.saturating_add(1);
         if number > self.newest {
             self.newest = number;

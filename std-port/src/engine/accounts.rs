@@ -7,6 +7,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
 use cara_core::counters::{Counter, Counters};
+use cara_core::host::connections::LinkCounter;
 
 use super::Engine;
 use super::link::LinkCell;
@@ -70,6 +71,11 @@ impl<T: Send + 'static> Engine<T> {
         let mut readings: Vec<_> = of(Group::Node, &node).chain(of(Group::Links, &links)).collect();
         readings.extend(self.port_readings(&held));
         readings
+    }
+
+    /// What all links have counted.
+    pub(crate) fn counted(&self, counter: LinkCounter) -> u64 {
+        self.sum_links().0.value(counter)
     }
 
     /// What the links to a node have counted.

@@ -61,13 +61,13 @@ impl Fleet {
 
     fn broadcasts(&self) -> u64 {
         let of = |unit: &UnitHandle| {
-            unit.node_counter(NodeCounter::WhoHasSent) + unit.node_counter(NodeCounter::AnnounceBroadcast)
+            unit.node_counted(NodeCounter::WhoHasSent) + unit.node_counted(NodeCounter::AnnounceBroadcast)
         };
         of(&self.manager) + self.searches()
     }
 
     fn searches(&self) -> u64 {
-        self.agvs.iter().map(|agv| agv.node_counter(NodeCounter::WhoHasSent)).sum()
+        self.agvs.iter().map(|agv| agv.node_counted(NodeCounter::WhoHasSent)).sum()
     }
 }
 

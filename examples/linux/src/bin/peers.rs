@@ -67,10 +67,10 @@ fn offer(zone: &CommunicationSystem) -> Result<Arc<Served>> {
     let served = Arc::new(Served::default());
     let (at_take_over, at_finished) = (served.clone(), served.clone());
     let take_over = move |call: &Call, view: &mut ParametersView| -> Result<(), ServiceError> {
-        let agv: i64 = view.variable("agv").map_err(|_| ServiceError::BadResults)?;
+        let agv: i64 = view.variable("agv")?;
         at_take_over.calls.fetch_add(1, Ordering::Relaxed);
         say!("served {}: agv {agv} taken over", call.caller);
-        view.set_value("taken", true).map_err(|_| ServiceError::BadResults)
+        Ok(view.set_value("taken", true)?)
     };
     let finished = move |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
         at_finished.finished.store(true, Ordering::Release);

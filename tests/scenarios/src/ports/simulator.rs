@@ -108,10 +108,10 @@ impl SimWorld {
         let mut sums = BTreeMap::new();
         for unit in &self.units {
             for counter in LinkCounter::ALL {
-                *sums.entry(counter.name()).or_default() += unit.handle.link_counter(*counter);
+                *sums.entry(counter.name()).or_default() += unit.handle.counted(*counter);
             }
             for counter in NodeCounter::ALL {
-                *sums.entry(counter.name()).or_default() += unit.handle.node_counter(*counter);
+                *sums.entry(counter.name()).or_default() += unit.handle.node_counted(*counter);
             }
         }
         sums
@@ -502,11 +502,11 @@ impl Node for SimNode {
     }
 
     fn counted(&self, counter: LinkCounter) -> u64 {
-        self.handle.link_counter(counter)
+        self.handle.counted(counter)
     }
 
     fn node_counted(&self, counter: NodeCounter) -> u64 {
-        self.handle.node_counter(counter)
+        self.handle.node_counted(counter)
     }
 
     fn events(&self) -> Vec<(Instant, Seen)> {

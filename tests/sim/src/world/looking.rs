@@ -50,7 +50,7 @@ impl UnitHandle {
     }
 
     /// A counter of all links of all its lives.
-    pub fn link_counter(&self, counter: LinkCounter) -> u64 {
+    pub fn counted(&self, counter: LinkCounter) -> u64 {
         self.with(|inner| {
             let unit = &inner.units[self.host().index()];
             let live = unit.machine.iter().flat_map(|machine| machine.links.iter());
@@ -59,7 +59,7 @@ impl UnitHandle {
     }
 
     /// A counter of discovery and membership, of this life.
-    pub fn node_counter(&self, counter: NodeCounter) -> u64 {
+    pub fn node_counted(&self, counter: NodeCounter) -> u64 {
         self.machine(|machine, _| machine.links.hub.node.counters.value(counter)).unwrap_or(0)
     }
 

@@ -47,13 +47,13 @@ fn a_unit_without_the_key_joins_no_manager() {
         let to = address(&manager);
         let other_root = world.s_unit("agv", 7).joins_at("depot", 1, to).keys_of_root(3).program(program).start();
         stay_apart(&mut tally, &mut world, &manager, &other_root);
-        assert!(manager.link_counter(LinkCounter::ProofsFailed) > 0);
+        assert!(manager.counted(LinkCounter::ProofsFailed) > 0);
         let found = world.s_unit("agv", 8).joins("depot", 1).keys_of_root(3).program(program).start();
         stay_apart(&mut tally, &mut world, &manager, &found);
-        assert!(manager.node_counter(NodeCounter::DatagramForged) > 0);
+        assert!(manager.node_counted(NodeCounter::DatagramForged) > 0);
         let keyless = world.s_unit("agv", 9).joins_at("depot", 1, to).without_key_for("depot").start();
         stay_apart(&mut tally, &mut world, &manager, &keyless);
-        assert!(keyless.node_counter(NodeCounter::RefusedKey) > 0);
+        assert!(keyless.node_counted(NodeCounter::RefusedKey) > 0);
         let fleet = world.s_unit("agv", 10).joins_at("depot", 1, to).fleet(5).program(program).start();
         stay_apart(&mut tally, &mut world, &manager, &fleet);
     }
@@ -66,7 +66,7 @@ fn a_manager_without_a_key_for_a_vehicle_says_so_to_its_operator_only() {
     let manager = world.m_unit("depot", 1).without_key_for("agv").start();
     let agv = world.s_unit("agv", 7).joins_at("depot", 1, address(&manager)).start();
     world.run_for(secs(20));
-    assert!(manager.node_counter(NodeCounter::RefusedKey) > 0 && manager.link_counter(LinkCounter::KeysMissing) > 0);
+    assert!(manager.node_counted(NodeCounter::RefusedKey) > 0 && manager.counted(LinkCounter::KeysMissing) > 0);
     let reasons = |unit: &UnitHandle, reason| unit.count(|event| *event == UnitEvent::LinkEnded { reason });
     assert!(reasons(&agv, CloseReason::Unproven) > 0);
 }
@@ -139,7 +139,7 @@ fn harmed(manager: &UnitHandle) -> bool {
     let strange = |event: &UnitEvent| matches!(event, UnitEvent::Joined { peer } if peer.id() == 1_000);
     manager.count(strange) > 0
         || manager.count(|event| matches!(event, UnitEvent::Left { .. })) > 0
-        || manager.node_counter(NodeCounter::Challenged) > 0
+        || manager.node_counted(NodeCounter::Challenged) > 0
 }
 
 /// Calls to a connected vehicle keep their deadline, and another vehicle joins, while an attacker opens link after
@@ -179,7 +179,7 @@ fn a_flood_of_half_open_links_keeps_nobody_out() {
             }
         }
         assert!(joined.is_some(), "nobody joins during a flood, seed {seed}");
-        assert!(manager.node_counter(NodeCounter::GaveWay) > 0);
+        assert!(manager.node_counted(NodeCounter::GaveWay) > 0);
     }
     tally.close();
 }

@@ -117,6 +117,6 @@ fn a_suspended_manager_counts_one_missed_keep_alive_and_its_vehicles_come_back()
     world.run_for(secs(61));
     let silent = UnitEvent::Left { peer: manager.identity(), reason: CloseReason::Silent };
     assert_eq!(agv.count(|event| *event == silent), 1, "the vehicle heard nothing for a minute");
-    assert!(manager.link_counter(LinkCounter::KeepAlivesMissed) <= 1, "the vehicle says that it left");
+    assert!(manager.counted(LinkCounter::KeepAlivesMissed) <= 1, "the vehicle says that it left");
     assert!(world.run_until(|_| manager.knows("agv", "go_to"), secs(20)));
 }

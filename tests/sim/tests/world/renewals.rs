@@ -60,7 +60,7 @@ fn fleet(seed: u64) -> Fleet {
 }
 
 fn renewed(unit: &UnitHandle) -> u64 {
-    unit.link_counter(LinkCounter::KeysRenewed)
+    unit.counted(LinkCounter::KeysRenewed)
 }
 
 fn left(unit: &UnitHandle) -> usize {
@@ -163,7 +163,7 @@ fn two_renewals_of_a_fleet_do_not_fall_together() {
         world.s_unit("agv", id).joins("manager", 1).renews_every(every).start();
     }
     assert!(world.run_until(|_| manager.s_units().len() == 40, secs(60)));
-    let renewed = |manager: &UnitHandle| manager.link_counter(LinkCounter::KeysRenewed);
+    let renewed = |manager: &UnitHandle| manager.counted(LinkCounter::KeysRenewed);
     world.run_for(secs(640));
     assert_eq!(renewed(&manager), 0);
     let mut busiest = 0;
