@@ -135,13 +135,22 @@ fn handshakes() -> Vec<Answer> {
     stray.wanted = None;
     let hello = |hello: &Hello| frame(&Frame::Hello(&encoded_hello(hello)));
     let same = hello(&manager_hello());
-    let taken = stream::decode(&Context::limits(4096, 32_800), &same);
+    let mut taken = stream::decode(&Context::limits(4096, 32_800), &same);
+    let empty_list = json!({ "priority": "high", "message": { "list_end": { "serial": 1 } } });
+    taken.as_array_mut().unwrap_or_else(|| panic!("a stream")).push(empty_list);
     let refuse = |code: u8| json!([{ "refuse": code }]);
     answers([
         ("other_version", "version 2", "fresh", frame(&Frame::Hello(&version)), 0, refuse(1)),
         ("other_magic", "not of this mode", "fresh", frame(&Frame::Hello(&magic)), 0, refuse(8)),
         ("small_chunks", "a chunk limit of 319", "fresh", frame(&Frame::Hello(&small)), 0, refuse(8)),
-        ("hello_taken", "answered with a hello", "fresh", hello(&agv_hello()), 0, taken),
+        (
+            "hello_taken",
+            "answered with a hello, and the end of a list that is empty",
+            "fresh",
+            hello(&agv_hello()),
+            0,
+            taken,
+        ),
         ("fleet_refused", "fleet 8 and fleet 7", "fresh", hello(&fleet), 0, refuse(2)),
         ("manager_refused", "an s_unit of no manager", "fresh", hello(&stray), 0, refuse(3)),
         ("full_refused", "no more nodes", "full", hello(&agv_hello()), 0, refuse(4)),
@@ -208,7 +217,7 @@ fn requests() -> Vec<Answer> {
     }}});
     let news = json!([
         refused(1, json!("stale_function")), publish,
-        { "priority": "high", "message": { "list_end": { "serial": 1 } } },
+        { "priority": "high", "message": { "list_end": { "serial": 2 } } },
     ]);
     let one_way = json!([{ "priority": "normal", "message": { "failure": { "id": 1, "error": "unknown_function" } } }]);
     let twice = [request(first(), &[]), request(first(), &[])].concat();

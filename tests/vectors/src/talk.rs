@@ -83,7 +83,9 @@ impl Talk {
 
     fn begin(&mut self) {
         self.pass(From::Agv, &[("talk_hello_agv", "the s_unit has dialled and introduces itself")]);
-        self.pass(From::Manager, &[("talk_hello_manager", "the manager takes it")]);
+        self.pass(From::Manager, &[("talk_hello_manager", "the manager takes it, and ends its list, which is empty")]);
+        self.pass(From::Agv, &[("talk_empty_list", "so does the s_unit, which has read the manager's")]);
+        self.pass(From::Manager, &[("talk_empty_list_ack", "the manager has read the s_unit's")]);
         self.wait(Duration::from_millis(1));
         self.agv.poll();
         self.manager.poll();
