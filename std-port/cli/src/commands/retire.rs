@@ -6,8 +6,8 @@ use cara_std::control::protocol::Question;
 use serde_json::json;
 
 use crate::nodes;
-use crate::operator::{Need, Operator};
-use cara_tools::exit::{Ended, Exit};
+use crate::operator::Operator;
+use cara_tools::exit::Exit;
 use cara_tools::global::Global;
 use cara_tools::output;
 
