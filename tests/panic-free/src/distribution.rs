@@ -87,6 +87,7 @@ entry!(signatures, {
         drain(signature.results());
         keep(signature.arguments().named(unknown_text()));
         keep((signature.name(), signature.as_bytes(), signature.parameters_bytes()));
+        keep(signature.to_definition());
     }
 });
 
