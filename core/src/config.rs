@@ -197,4 +197,14 @@ impl Priority {
             _ => None,
         }
     }
+
+    /// `emergency`, `high`, `normal`, `low`.
+    pub const fn word(self) -> &'static str {
+        match self {
+            Self::Emergency => "emergency",
+            Self::High => "high",
+            Self::Normal => "normal",
+            Self::Low => "low",
+        }
+    }
 }

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use cara_core::config::Priority;
+use cara_core::distribution::function::Attributes;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::{Parameters, ParametersView};
 use cara_core::error::{Error, ServiceError};
@@ -119,16 +120,14 @@ impl<T> Drop for Handler<T> {
 
 /// How a service wants to be called, and what makes it safe.
 pub struct ServiceOptions<T> {
-    pub(crate) priority: Priority,
-    pub(crate) lease: Option<Duration>,
-    pub(crate) idempotent: bool,
+    pub(crate) attributes: Attributes,
     pub(crate) safe: Option<Arc<Safe>>,
     pub(crate) then: Option<Arc<Hook<T>>>,
 }
 
 impl<T> Default for ServiceOptions<T> {
     fn default() -> Self {
-        Self { priority: Priority::Normal, lease: None, idempotent: false, safe: None, then: None }
+        Self { attributes: Attributes::default(), safe: None, then: None }
     }
 }
 
@@ -141,7 +140,7 @@ impl<T> ServiceOptions<T> {
     /// The class of calls that name none. A service of the class [`Priority::Emergency`] has a thread of its own, and
     /// takes a handler without the application's state: see [`Error::EmergencyWaits`](cara_core::error::Error).
     pub fn priority(mut self, priority: Priority) -> Self {
-        self.priority = priority;
+        self.attributes.priority = priority;
         self
     }
 
@@ -170,7 +169,7 @@ impl<T> ServiceOptions<T> {
     /// let options = ServiceOptions::<Agv>::new().lease(Duration::from_millis(400), |agv: &mut Agv| agv.speed = 0);
     /// ```
     pub fn lease(mut self, length: impl Into<Duration>, safe: impl Fn() + Send + Sync + 'static) -> Self {
-        self.lease = Some(length.into());
+        self.attributes.lease = Some(length.into());
         self.safe = Some(Arc::new(safe));
         self
     }
@@ -184,7 +183,13 @@ impl<T> ServiceOptions<T> {
 
     /// Running it twice is as good as running it once.
     pub fn idempotent(mut self) -> Self {
-        self.idempotent = true;
+        self.attributes.idempotent = true;
+        self
+    }
+
+    /// All attributes at once, except for the lease, which [`lease`](Self::lease) takes together with its hook.
+    pub fn attributes(mut self, attributes: Attributes) -> Self {
+        self.attributes = Attributes { lease: self.attributes.lease, ..attributes };
         self
     }
 }

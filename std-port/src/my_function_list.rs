@@ -105,16 +105,15 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
     ) -> Result<LeaseWatch, Error> {
         self.check_size(definition)?;
         let lease = Arc::new(ServiceLease::default());
-        let attributes =
-            Attributes { priority: options.priority, lease: options.lease, idempotent: options.idempotent };
+        let attributes = options.attributes;
         let run = handler.into_run().0;
-        let is_emergency = options.priority == Priority::Emergency;
+        let is_emergency = attributes.priority == Priority::Emergency;
         if is_emergency && run.takes_state() {
             return Err(Error::EmergencyWaits);
         }
         let lane = if is_emergency { Some(Arc::new(Lane::start("cara-emergency")?)) } else { None };
         let safe = self.safe_hook(&options, &lease)?;
-        let kept = options.lease.map(|_| lease.clone());
+        let kept = attributes.lease.map(|_| lease.clone());
         let handler = Handler { run, lease: kept, safe, lane };
         put(&mut self.engine.functions_mut(), definition, attributes, handler)?;
         Ok(LeaseWatch::new(lease, None, self.engine.clock()))

@@ -1,5 +1,7 @@
 //! How a function wants to be called: priority, lease, idempotence, and their form on the wire.
 
+use core::fmt;
+
 use crate::config::Priority;
 use crate::error::Error;
 use crate::time::Duration;
@@ -48,6 +50,17 @@ impl Attributes {
     }
 }
 
+/// In words, as `high, lease 400 ms, idempotent`.
+impl fmt::Display for Attributes {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.priority.word())?;
+        if let Some(lease) = self.lease {
+            write!(f, ", lease {} ms", lease.as_millis())?;
+        }
+        f.write_str(if self.idempotent { ", idempotent" } else { "" })
+    }
+}
+
 #[cfg(test)]
 mod tests {
     #![allow(
@@ -57,6 +70,8 @@ mod tests {
         clippy::panic,
         clippy::arithmetic_side_effects
     )]
+
+    use std::string::ToString;
 
     use proptest::prelude::*;
 
@@ -80,6 +95,15 @@ mod tests {
         ] {
             assert_eq!(Attributes::decode(wrong), Err(Error::Malformed), "{wrong:?}");
         }
+    }
+
+    #[test]
+    fn attributes_are_told_in_words() {
+        let leased = Attributes { lease: Some(Duration::from_millis(400)), ..Attributes::default() };
+        assert_eq!(Attributes::default().to_string(), "normal");
+        assert_eq!(leased.to_string(), "normal, lease 400 ms");
+        let all = Attributes { priority: Priority::High, idempotent: true, ..leased };
+        assert_eq!(all.to_string(), "high, lease 400 ms, idempotent");
     }
 
     proptest! {

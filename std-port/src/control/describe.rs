@@ -93,9 +93,7 @@ pub(super) fn function(function: &TheirFunction) -> FunctionInfo {
     FunctionInfo {
         name: function.definition.name().to_owned(),
         signature: function.definition.signature().to_string(),
-        priority: priority(function.attributes.priority).to_owned(),
-        lease_us: function.attributes.lease.map(Duration::as_micros),
-        idempotent: function.attributes.idempotent,
+        attributes: function.attributes,
     }
 }
 
@@ -144,18 +142,9 @@ pub(super) fn event(event: &UnitEvent, at: Duration) -> Answer {
     Answer::Event { at_ms: at.as_millis(), event: name.to_owned(), node: node.map(Identity::to_string), text }
 }
 
-const fn priority(priority: Priority) -> &'static str {
-    match priority {
-        Priority::Emergency => "emergency",
-        Priority::High => "high",
-        Priority::Normal => "normal",
-        Priority::Low => "low",
-    }
-}
-
 /// The class of a word.
 pub(super) fn priority_of(word: &str) -> Option<Priority> {
-    Priority::ALL.into_iter().find(|class| priority(*class) == word)
+    Priority::ALL.into_iter().find(|class| class.word() == word)
 }
 
 fn epoch(epoch: Epoch) -> String {

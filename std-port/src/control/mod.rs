@@ -9,6 +9,7 @@
 //! alone, and each connection must come from the same user or from root.
 
 mod answering;
+mod attributes;
 mod call;
 mod client;
 mod constraint;

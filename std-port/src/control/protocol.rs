@@ -2,6 +2,7 @@
 //! of which the last one is [`Answer::Done`] or [`Answer::Failed`]. A line that is no question is answered with
 //! `Failed`, and the next line is read. An empty line is a [`BEAT`] and not answered.
 
+use cara_core::distribution::function::Attributes;
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize};
 
@@ -429,10 +430,7 @@ pub struct FunctionInfo {
     pub name: String,
     /// Its text form, as `go_to(position: int[2]) -> (position: int[2])`.
     pub signature: String,
-    /// Its class.
-    pub priority: String,
-    /// Its lease.
-    pub lease_us: Option<u64>,
-    /// Whether it may run twice without harm.
-    pub idempotent: bool,
+    /// How it wants to be called: `priority`, `lease_us` (or null), `idempotent`.
+    #[serde(flatten, with = "super::attributes::Form")]
+    pub attributes: Attributes,
 }

@@ -98,9 +98,9 @@ fn functions_are_told_with_their_attributes() {
         assert_eq!(functions.len(), 4);
         let go_to = functions.iter().find(|function| function.name == "go_to").unwrap();
         assert_eq!(go_to.signature, "go_to(position: int[2])");
-        assert_eq!((go_to.priority.as_str(), go_to.lease_us, go_to.idempotent), ("high", Some(2_000_000), true));
+        assert_eq!(go_to.attributes.to_string(), "high, lease 2000 ms, idempotent");
         let fail = functions.iter().find(|function| function.name == "fail").unwrap();
-        assert_eq!((fail.priority.as_str(), fail.lease_us, fail.idempotent), ("normal", None, false));
+        assert_eq!(fail.attributes.to_string(), "normal");
     }
 }
 

@@ -7,7 +7,7 @@ use cara_core::distribution::parameters::{Parameters, ParametersView, Value};
 use cara_core::distribution::value::{Target, Type};
 use cara_core::storage::Lent;
 
-use crate::linkage::{drain, keep, unknown, unknown_slice, unknown_text};
+use crate::linkage::{drain, keep, show, unknown, unknown_slice, unknown_text};
 
 type Small = Parameters<64>;
 
@@ -93,6 +93,7 @@ entry!(signatures, {
 
 entry!(attributes, {
     keep((Attributes::decode(unknown_slice()), unknown::<Attributes>().encode()));
+    show(*unknown::<Attributes>());
 });
 
 entry!(own_list, {

@@ -40,6 +40,6 @@ entry!(errors, {
 });
 
 entry!(priorities, {
-    keep((Priority::from_wire(*unknown()), unknown::<Priority>().to_wire()));
+    keep((Priority::from_wire(*unknown()), unknown::<Priority>().to_wire(), unknown::<Priority>().word()));
     keep((Constraints::M_UNIT, Constraints::S_UNIT));
 });

@@ -4,8 +4,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use cara_std::control::protocol::{Answer, Argument, CallQuestion, Failure, FunctionInfo, Question};
-use cara_std::{Definition, Shown};
-use clap::ValueEnum;
+use cara_std::{Definition, Priority, Shown};
 use serde_json::{Value, json};
 
 use crate::nodes::{self, Chosen};
@@ -38,34 +37,14 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "TIME", value_parser = parse_time)]
     timeout: Option<Duration>,
     /// The class of the request, instead of the function's own.
-    #[arg(long, value_enum)]
-    priority: Option<Class>,
+    #[arg(long, value_parser = Priority::ALL.map(Priority::word))]
+    priority: Option<String>,
     /// In one datagram, now or never.
     #[arg(long, requires = "asynchronous")]
     best_effort: bool,
     /// Keep the lease of what the call starts until it has finished, or until Ctrl-C: then it stops.
     #[arg(long, conflicts_with_all = ["all", "asynchronous"])]
     hold: bool,
-}
-
-#[derive(Clone, Copy, ValueEnum)]
-enum Class {
-    Emergency,
-    High,
-    Normal,
-    Low,
-}
-
-impl Class {
-    fn word(self) -> String {
-        let word = match self {
-            Self::Emergency => "emergency",
-            Self::High => "high",
-            Self::Normal => "normal",
-            Self::Low => "low",
-        };
-        word.into()
-    }
 }
 
 impl Arguments {
@@ -103,13 +82,13 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
         arguments: bound(&written, &published)?,
         asynchronous: arguments.asynchronous,
         timeout_ms: arguments.timeout.map(|span| span.as_millis() as u64),
-        priority: arguments.priority.map(Class::word),
+        priority: arguments.priority,
         best_effort: arguments.best_effort,
     };
     if arguments.hold {
         interrupt::end_at_signals()?;
     }
-    let lease = published.lease_us.filter(|_| !arguments.hold);
+    let lease = published.attributes.lease.filter(|_| !arguments.hold).map(|lease| lease.as_micros());
     let exit = call(&mut operator, question, arguments.hold, lease, global)?;
     Ok(exit.into())
 }

@@ -10,7 +10,6 @@ use crate::operator::{Need, Operator};
 use cara_tools::exit::Exit;
 use cara_tools::global::Global;
 use cara_tools::output::{self, PLAIN, Rows};
-use cara_tools::units::show_micros;
 
 /// Shows what a node has published, with the form in which it is called.
 #[derive(clap::Args)]
@@ -34,11 +33,9 @@ pub(crate) fn run(Arguments { node }: Arguments, global: &Global) -> anyhow::Res
 }
 
 fn table(functions: &[FunctionInfo]) -> Rows {
-    let mut rows = Rows::new(["FUNCTION", "PRIORITY", "LEASE", "IDEMPOTENT"]);
-    for FunctionInfo { signature, priority, lease_us, idempotent, .. } in functions {
-        let lease = lease_us.map_or("-".into(), |micros| show_micros(micros as f64));
-        let idempotent = if *idempotent { "yes" } else { "no" };
-        rows.add(PLAIN, [signature.clone(), priority.clone(), lease, idempotent.into()]);
+    let mut rows = Rows::new(["FUNCTION", "ATTRIBUTES"]);
+    for FunctionInfo { signature, attributes, .. } in functions {
+        rows.add(PLAIN, [signature.clone(), attributes.to_string()]);
     }
     rows
 }

@@ -3,6 +3,7 @@
 
 use std::ops::Range;
 
+use cara_std::Attributes;
 use serde::Deserialize;
 use toml::Spanned;
 
@@ -132,6 +133,14 @@ pub(super) struct Function {
     pub(super) idempotent: bool,
     pub(super) lease: Maybe<Time>,
     pub(super) at_lease_end: Maybe<Vec<String>>,
+}
+
+impl Function {
+    /// All but the lease, whose length is checked with its place.
+    pub(super) fn attributes(&self) -> Attributes {
+        let priority = self.priority.map(Into::into).unwrap_or_default();
+        Attributes { priority, idempotent: self.idempotent, lease: None }
+    }
 }
 
 /// What a function does without a program.

@@ -4,7 +4,7 @@ use std::ops::Range;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 
-use cara_std::{Definition, Duration, Priority};
+use cara_std::{Attributes, Definition, Duration};
 use toml::Spanned;
 
 use super::file::{self, Answer, Maybe};
@@ -21,9 +21,9 @@ const PARAMETERS_BYTES: u32 = 320 * 1024;
 pub(super) struct Service {
     pub(super) definition: Definition,
     pub(super) work: Work,
-    pub(super) priority: Priority,
-    pub(super) idempotent: bool,
-    pub(super) lease: Option<Lease>,
+    pub(super) attributes: Attributes,
+    /// What makes safe what the service began; none for a service that begins nothing.
+    pub(super) at_lease_end: Option<Vec<String>>,
     /// Of its signature in the file.
     pub(super) span: Range<usize>,
 }
@@ -37,13 +37,6 @@ pub(super) enum Work {
     Log,
     /// A program of its own for each call.
     Program { command: Vec<String>, timeout: Duration },
-}
-
-/// A lease, and the program that makes safe what the service began; none for a service that begins nothing.
-#[derive(Clone, Debug)]
-pub(super) struct Lease {
-    pub(super) length: Duration,
-    pub(super) at_end: Option<Vec<String>>,
 }
 
 /// The services that a file describes.
@@ -86,9 +79,9 @@ fn service(source: &Source, table: &Spanned<file::Function>, mistakes: &mut Vec<
     if !matches!(work, Work::Program { .. }) {
         check_answerable(signature, &definition, mistakes);
     }
-    let priority = function.priority.map_or(Priority::Normal, Priority::from);
-    let idempotent = function.idempotent;
-    Some(Service { definition, work, priority, idempotent, lease, span: signature.span() })
+    let attributes = Attributes { lease, ..function.attributes() };
+    let at_lease_end = function.at_lease_end.as_ref().map(|command| command.get_ref().clone());
+    Some(Service { definition, work, attributes, at_lease_end, span: signature.span() })
 }
 
 fn definition(source: &Source, text: &Spanned<String>, mistakes: &mut Vec<Mistake>) -> Option<Definition> {
@@ -161,9 +154,8 @@ fn work(table: &Spanned<file::Function>, mistakes: &mut Vec<Mistake>) -> Option<
     }
 }
 
-fn lease(function: &file::Function, mistakes: &mut Vec<Mistake>) -> Option<Lease> {
+fn lease(function: &file::Function, mistakes: &mut Vec<Mistake>) -> Option<Duration> {
     function.at_lease_end.iter().for_each(|command| check_command(command, mistakes));
-    let at_end = function.at_lease_end.as_ref().map(|command| command.get_ref().clone());
     match (&function.lease, &function.at_lease_end) {
         (None, Some(command)) => {
             let help = "write how long, as lease = \"500ms\"";
@@ -175,7 +167,7 @@ fn lease(function: &file::Function, mistakes: &mut Vec<Mistake>) -> Option<Lease
             mistakes.push(Mistake::new(lease.span(), "nothing stops what the program began when its lease ends", help));
             None
         }
-        (lease, _) => lease.as_ref().map(|_| Lease { length: nonzero(lease, Duration::ZERO, mistakes), at_end }),
+        (lease, _) => lease.as_ref().map(|_| nonzero(lease, Duration::ZERO, mistakes)),
     }
 }
 

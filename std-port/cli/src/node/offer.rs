@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use cara_std::{Call, Definition, Error, MyFunctionList, ParametersView, ServiceError, ServiceOptions, Shown};
 
-use super::functions::{Lease, Service, Work};
+use super::functions::{Service, Work};
 use super::json;
 use super::program::{Programs, Task};
 
@@ -22,12 +22,9 @@ pub(super) fn offer(
     programs: &Arc<Programs>,
 ) -> Result<(), Error> {
     let definition = service.definition.clone();
-    let mut options = ServiceOptions::new().priority(service.priority);
-    if service.idempotent {
-        options = options.idempotent();
-    }
-    if let Some(lease) = &service.lease {
-        options = options.lease(lease.length, make_safe(number, &definition, lease, programs));
+    let mut options = ServiceOptions::new().attributes(service.attributes);
+    if let Some(length) = service.attributes.lease {
+        options = options.lease(length, make_safe(number, service, programs));
     }
     match &service.work {
         Work::Echo => list.add_service(&service.definition, options, echo)?,
@@ -59,13 +56,9 @@ fn log(definition: &Definition, call: &Call, view: &ParametersView) -> Result<()
 }
 
 /// What the unit runs at the end of a lease, also when it is stopped.
-fn make_safe(
-    number: usize,
-    definition: &Definition,
-    lease: &Lease,
-    programs: &Arc<Programs>,
-) -> impl Fn() + Send + Sync + 'static {
-    let (name, command, programs) = (definition.name().to_owned(), lease.at_end.clone(), programs.clone());
+fn make_safe(number: usize, service: &Service, programs: &Arc<Programs>) -> impl Fn() + Send + Sync + 'static {
+    let (name, command) = (service.definition.name().to_owned(), service.at_lease_end.clone());
+    let programs = programs.clone();
     move || {
         let Some(command) = &command else { return };
         let environment = [("CARA_FUNCTION", name.clone()), ("CARA_CALLER", String::new())];

@@ -77,11 +77,12 @@ pub(crate) fn choose(operator: &mut Operator, node: &str, name: Option<&str>) ->
 
 #[cfg(test)]
 mod tests {
+    use cara_std::Attributes;
+
     use super::{FunctionInfo, Subject};
 
     fn longest(signature: &str, echo: bool) -> Option<usize> {
-        let (name, priority) = ("f".into(), "normal".into());
-        let info = FunctionInfo { name, signature: signature.into(), priority, lease_us: None, idempotent: false };
+        let info = FunctionInfo { name: "f".into(), signature: signature.into(), attributes: Attributes::default() };
         Subject::of("agv/1", &info, echo).map(|subject| subject.longest())
     }
 
