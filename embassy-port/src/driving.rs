@@ -4,7 +4,9 @@
 //! The large functions are kept apart: merged into their callers, the frames of all of them would lie on the stack at
 //! once, though only one runs at a time.
 
-use cara_core::distribution::connection_handler::{Command, NodeCounter, Sorted};
+use cara_core::distribution::authenticator::Authenticator as _;
+use cara_core::distribution::connection_handler::{Command, NodeCounter};
+use cara_core::distribution::datagram;
 use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::ParametersView;
@@ -168,21 +170,20 @@ impl<T> Machine<T> {
         };
         let from = SocketAddr::new(from.addr.into(), from.port);
         let bytes = scratch.get_mut(..length).unwrap_or_default();
-        match self.hub.node.datagram(now(), from, bytes, self.proof.codes()) {
-            Sorted::Done => {
-                if let Some(address) = self.hub.node.take_twin() {
-                    let peer = Some(self.hub.node.identity().clone());
-                    let reason = CloseReason::Refused(Refusal::DuplicateIdentity);
-                    self.tell(UnitEvent::NotJoined { address, peer, reason });
-                }
-                Some(None)
-            }
-            Sorted::Session { link, nonce, body } => {
-                let event = self.with(link.0, |session, cx| session.datagram(cx, from, nonce, body)).flatten();
-                self.begun_on = link.0;
-                Some(event.and_then(|event| Some((link.0, News::of(&event, &mut self.begun)?))))
-            }
+        let (mode, fleet) = (self.proof.codes().mode(), self.hub.node.fleet());
+        if let Some((LinkId(link), nonce, body)) = datagram::for_session(bytes, mode, fleet)
+            && let Some(event) = self.with(link, |session, cx| session.datagram(cx, from, nonce, body))
+        {
+            self.begun_on = link;
+            return Some(event.and_then(|event| Some((link, News::of(&event, &mut self.begun)?))));
         }
+        self.hub.node.datagram(now(), from, bytes, self.proof.codes());
+        if let Some(address) = self.hub.node.take_twin() {
+            let peer = Some(self.hub.node.identity().clone());
+            let reason = CloseReason::Refused(Refusal::DuplicateIdentity);
+            self.tell(UnitEvent::NotJoined { address, peer, reason });
+        }
+        Some(None)
     }
 
     /// Looks what became of the sockets.

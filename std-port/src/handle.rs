@@ -219,7 +219,7 @@ impl<T: Send + 'static, R> Handle<T, R> {
 
     /// The fleet that it belongs to.
     pub fn fleet(&self) -> Fleet {
-        self.engine().hub().hub.node.fleet()
+        self.engine().fleet
     }
 
     /// Which of its runs this is: peers tell a restart by it.

@@ -20,6 +20,7 @@ use super::authenticator::{Authenticator, CODE_BYTES};
 use super::hello::Manager;
 use super::identity::{Epoch, Fleet, Identity, Role};
 use crate::config::{Mode, VERSION};
+use crate::host::mailman::LinkId;
 
 const WHO_HAS: u8 = 1;
 const ANNOUNCE: u8 = 2;
@@ -151,6 +152,19 @@ impl Header {
         .ok_or(DatagramError::Malformed)
     }
 
+    fn check(&self, mode: Mode, fleet: Fleet) -> Result<(), DatagramError> {
+        if self.mode != mode {
+            return Err(DatagramError::Magic);
+        }
+        if self.version != VERSION {
+            return Err(DatagramError::Version(self.version));
+        }
+        if self.fleet != fleet {
+            return Err(DatagramError::Fleet(self.fleet));
+        }
+        Ok(())
+    }
+
     fn who_has(&self, body: &[u8]) -> Option<WhoHas> {
         let (who_has, rest): (WhoHas, _) = postcard::take_from_bytes(body).ok()?;
         let filled = match self.mode {
@@ -177,15 +191,7 @@ impl<'b> Datagram<'b> {
     /// opened by their session.
     pub fn decode(bytes: &'b [u8], fleet: Fleet, authenticator: &dyn Authenticator) -> Result<Self, DatagramError> {
         let (header, body) = Header::decode(bytes)?;
-        if header.mode != authenticator.mode() {
-            return Err(DatagramError::Magic);
-        }
-        if header.version != VERSION {
-            return Err(DatagramError::Version(header.version));
-        }
-        if header.fleet != fleet {
-            return Err(DatagramError::Fleet(header.fleet));
-        }
+        header.check(authenticator.mode(), fleet)?;
         if header.mode == Mode::Plain || header.kind == SESSION {
             return header.read(body);
         }
@@ -198,6 +204,18 @@ impl<'b> Datagram<'b> {
             _ => Ok(datagram),
         }
     }
+}
+
+/// Link, nonce and body of a session datagram of this mode, version and fleet, by its header alone: for
+/// [`Session::datagram`](crate::services::unit::Session::datagram). All others are the node's.
+pub fn for_session(bytes: &mut [u8], mode: Mode, fleet: Fleet) -> Option<(LinkId, u64, &mut [u8])> {
+    let (header, body) = Header::decode(bytes).ok()?;
+    header.check(mode, fleet).ok()?;
+    if header.kind != SESSION || header.zero != [0, 0] {
+        return None;
+    }
+    let (link, nonce, _) = session(body)?;
+    Some((LinkId(link), nonce, bytes.get_mut(SESSION_HEADER_BYTES..)?))
 }
 
 /// Zeros, and a code behind them.
@@ -365,6 +383,27 @@ mod tests {
         out[0] = b'X';
         assert_eq!(Header::decode(&out[..length]), Err(DatagramError::Magic));
         assert_eq!(Header::decode(&out[..HEADER_BYTES - 1]), Err(DatagramError::Malformed));
+    }
+
+    #[test]
+    fn a_session_datagram_is_told_by_its_header() {
+        let datagram = |mode, fleet| [&session_header(mode, fleet, 3, 42)[..], &[1]].concat();
+        for mode in [Mode::Plain, Mode::Secured] {
+            let mut bytes = datagram(mode, FLEET);
+            assert_eq!(for_session(&mut bytes, mode, FLEET), Some((LinkId(3), 42, &mut [1][..])));
+            for at in 0..SESSION_HEADER_BYTES {
+                let mut changed = bytes.clone();
+                changed[at] ^= 0x80;
+                // Only link and nonce may be any.
+                assert_eq!(for_session(&mut changed, mode, FLEET).is_some(), at >= 16 || at == 12 || at == 13, "{at}");
+                assert_eq!(for_session(&mut bytes[..at].to_vec(), mode, FLEET), None);
+            }
+        }
+        assert_eq!(for_session(&mut datagram(Mode::Plain, FLEET), Mode::Secured, FLEET), None);
+        assert_eq!(for_session(&mut datagram(Mode::Plain, Fleet(8)), Mode::Plain, FLEET), None);
+        let mut out = [0; SEARCH_BYTES];
+        let length = who_has(1).encode(FLEET, &Plain, &mut out).unwrap().len();
+        assert_eq!(for_session(&mut out[..length], Mode::Plain, FLEET), None);
     }
 
     #[test]

@@ -16,7 +16,7 @@
 //! | a stream that was dialled is open, or one was accepted | `session.connected` |
 //! | bytes have come | `session.receive` until nothing is consumed and no event comes, then `session.next_call` until `None`; what was `paused` is lent again after `direct`, or when a buffer may be free |
 //! | the stream takes bytes again, and `session.wants_to_write()` | `session.writable` |
-//! | a datagram has come | `node.datagram`; where it says `Sorted::Session`, `session.datagram` |
+//! | a datagram has come | `session.datagram` of the link that [`for_session`](crate::distribution::datagram::for_session) names, if there is one; else `node.datagram` |
 //! | at `session.deadline()`, and after each call that may have ended it | `session.poll` until `None`, **before** anything that has arrived: leases end here |
 //! | a handler has run, outside of all locks | `session.answer`, then `session.next_call` |
 //! | the stream has ended | `session.disconnected` |

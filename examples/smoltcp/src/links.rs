@@ -3,7 +3,9 @@
 
 use core::net::SocketAddr;
 
-use cara_core::distribution::connection_handler::{Command, Sorted};
+use cara_core::config::Mode;
+use cara_core::distribution::connection_handler::Command;
+use cara_core::distribution::datagram;
 use cara_core::distribution::identity::Identity;
 use cara_core::error::{CloseReason, Error};
 use cara_core::host::mailman::LinkId;
@@ -72,12 +74,15 @@ impl SUnit {
     }
 
     fn take_datagram<P: Program>(&mut self, now: Instant, from: SocketAddr, bytes: &mut [u8], program: &mut P) {
-        let Sorted::Session { nonce, body, .. } = self.hub.node.datagram(now, from, bytes, &Plain) else { return };
-        let Some(session) = &mut self.session else { return };
-        if let Some(event) = session.datagram(context!(self, now), from, nonce, body) {
-            let rest = tell(event, program);
-            self.go_on(now, rest, program);
+        let for_session = datagram::for_session(bytes, Mode::Plain, self.hub.node.fleet());
+        if let (Some((LINK, nonce, body)), Some(session)) = (for_session, &mut self.session) {
+            if let Some(event) = session.datagram(context!(self, now), from, nonce, body) {
+                let rest = tell(event, program);
+                self.go_on(now, rest, program);
+            }
+            return;
         }
+        self.hub.node.datagram(now, from, bytes, &Plain);
     }
 
     /// Tells the session what has become of its stream.

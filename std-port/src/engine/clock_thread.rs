@@ -1,11 +1,13 @@
 //! The thread that keeps time: timers of links and of the node, datagrams, and new connections. It runs no handlers and no
 //! hooks, never sleeps, and looks at no file: [`look_around`](crate::threads::Driven::look_around) has a thread of its own.
 
-use cara_core::distribution::connection_handler::Sorted;
+use cara_core::distribution::datagram;
 use cara_core::time::{Duration, Instant};
 use core::net::SocketAddr;
+use std::sync::Arc;
 
 use super::Engine;
+use super::link::LinkCell;
 use crate::locks::lock;
 use crate::seldom::warn_seldom;
 use crate::sys::datagram::Socket;
@@ -43,27 +45,35 @@ impl<T: Send + 'static> Engine<T> {
         }
     }
 
-    fn datagram(&self, from: SocketAddr, bytes: &mut [u8]) {
+    pub(super) fn datagram(&self, from: SocketAddr, bytes: &mut [u8]) {
+        if let Some((link, nonce, body)) = datagram::for_session(bytes, self.mode(), self.fleet)
+            && let Some(link) = self.link(link)
+        {
+            return self.session_datagram(&link, from, nonce, body);
+        }
         let codes = self.keys().codes();
-        let (sorted, twin) = {
+        let twin = {
             let mut cell = self.hub();
-            (cell.hub.node.datagram(self.now(), from, bytes, &codes), cell.hub.node.take_twin())
+            cell.hub.node.datagram(self.now(), from, bytes, &codes);
+            cell.hub.node.take_twin()
         };
         if let Some(address) = twin {
             self.twin_heard(address);
         }
-        let Sorted::Session { link, nonce, body } = sorted else { return };
-        let Some(link) = self.link(link) else { return };
+    }
+
+    /// Without the hub, so that an emergency does not wait for a search.
+    fn session_datagram(&self, link: &Arc<LinkCell>, from: SocketAddr, nonce: u64, body: &mut [u8]) {
         let mut state = link.lock();
-        let event = self.with(&link, &mut state, |session, cx| session.datagram(cx, from, nonce, body));
+        let event = self.with(link, &mut state, |session, cx| session.datagram(cx, from, nonce, body));
         if let Some(event) = &event {
             self.note(&mut state, event);
         }
-        self.dispatch_emergencies(&link, &mut state);
+        self.dispatch_emergencies(link, &mut state);
         if state.session.has_next_call() {
-            self.hand_over(&link);
+            self.hand_over(link);
         }
-        self.settle(&link, state);
+        self.settle(link, state);
     }
 
     pub(super) fn connections_ready(&self) {

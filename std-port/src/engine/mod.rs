@@ -67,6 +67,7 @@ use std::sync::{Arc, Mutex, RwLock, RwLockReadGuard, RwLockWriteGuard, Weak};
 
 use cara_core::config::{Constraints, Mode};
 use cara_core::distribution::function_list::FunctionList;
+use cara_core::distribution::identity::Fleet;
 use cara_core::error::{CloseReason, Error};
 use cara_core::host::mailman::LinkId;
 use cara_core::host::secure::Seal;
@@ -102,6 +103,8 @@ pub(crate) struct Engine<T: 'static> {
     /// For work that is left to another thread.
     me: Weak<Self>,
     driver: Driver,
+    /// Beside the hub, whose lock a session's datagram does not take.
+    pub(crate) fleet: Fleet,
     sockets: Sockets,
     links: Links,
     hub: Mutex<HubCell>,
@@ -138,6 +141,7 @@ impl<T: Send + 'static> Engine<T> {
         let driver = Driver::new(parts.threads, parts.own_threads, parts.asks_for_itself);
         Arc::new_cyclic(|me| Self {
             me: me.clone(),
+            fleet: parts.hub.hub.node.fleet(),
             sockets: Sockets::new(parts.datagrams, parts.listener),
             links: Links::new(parts.maximum_links, parts.capacities),
             services: Services::new(parts.functions, parts.state, parts.hub.longest_message()),

@@ -8,8 +8,10 @@ use std::sync::mpsc::{channel, sync_channel};
 use std::sync::{Arc, Mutex};
 
 use cara_core::config::{Constraints, LONGEST_KEEP_ALIVE, Mode};
+use cara_core::distribution::datagram::session_header;
 use cara_core::distribution::hello::Hello;
 use cara_core::distribution::identity::Epoch;
+use cara_core::distribution::message::SessionBody;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 use cara_core::host::connections::LinkCounter;
@@ -265,4 +267,25 @@ fn what_lies_unread_is_read_before_a_question_goes_out() {
     }
     let asked = |unit: &Unit| value(&unit.engine().readings(), Group::Node, "WhoHasSent");
     assert_eq!(units.iter().map(asked).sum::<u64>(), 1);
+}
+
+/// A search that many answer keeps the hub busy, and neither a keep-alive nor an emergency waits for it.
+#[test]
+fn a_session_datagram_does_not_take_the_hubs_lock() {
+    let pair = Pair::new(Constraints::M_UNIT, |_| {});
+    let (engine, near, far) = (pair.manager.engine(), pair.near(), pair.far());
+    let (to, nonce) = (near.id.0, far.lock().session.hello().unwrap().nonce);
+    let header = session_header(Mode::Plain, engine.fleet, to, nonce);
+    let mut bytes = [&header[..], &SessionBody::keep_alive(0)].concat();
+    let from = near.lock().session.address();
+    let received = || near.lock().session.counters().value(LinkCounter::DatagramsReceived);
+    std::thread::scope(|scope| {
+        // The clock reads nothing meanwhile.
+        let frozen = engine.freeze_hub();
+        let before = received();
+        let reading = scope.spawn(|| engine.datagram(from, &mut bytes));
+        until(|| reading.is_finished());
+        assert!(received() > before);
+        drop(frozen);
+    });
 }

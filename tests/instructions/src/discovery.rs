@@ -191,7 +191,7 @@ impl Discovery {
         let length = who_has.encode(FLEET, &Plain, &mut bytes).expect("room for it").len();
         let mut outbox = Outbox(0);
         meter.count(&mut || {
-            self.hub.node.datagram(self.now, from, &mut bytes[..length], &Plain);
+            self.hub.node.datagram(self.now, from, &bytes[..length], &Plain);
             self.now = self.now.max(self.hub.node.next_deadline());
             while self.hub.node.poll(self.now, &mut outbox, &Plain).is_some() {}
         });
@@ -209,7 +209,7 @@ impl Discovery {
         let mut bytes = [0; SEARCH_BYTES];
         let length = announce.encode(FLEET, &Plain, None, &mut bytes).expect("room for it").len();
         meter.count(&mut || {
-            self.hub.node.datagram(self.now, from, &mut bytes[..length], &Plain);
+            self.hub.node.datagram(self.now, from, &bytes[..length], &Plain);
             while self.hub.node.poll(self.now, &mut Outbox(0), &Plain).is_some() {}
         });
         self.rest(&mut Outbox(0));

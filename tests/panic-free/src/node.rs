@@ -57,7 +57,7 @@ entry!(node_polled, {
 });
 
 entry!(node_hears, {
-    keep(node().datagram(*unknown(), *unknown(), unknown_slice(), &AnyCodes));
+    node().datagram(*unknown(), *unknown(), unknown_slice(), &AnyCodes);
     keep(node().take_twin());
 });
 
@@ -94,6 +94,7 @@ entry!(datagrams, {
     keep(Datagram::decode(unknown_slice(), *unknown(), &AnyCodes));
     keep(datagram::Header::decode(unknown_slice()));
     keep(unknown::<datagram::Header>().read(unknown_slice()));
+    keep(datagram::for_session(unknown_slice(), *unknown(), *unknown()));
     keep(unknown::<WhoHas>().encode(*unknown(), &AnyCodes, unknown_slice()));
     keep(unknown::<Announce>().encode(*unknown(), &AnyCodes, unknown::<Option<Identity>>().as_ref(), unknown_slice()));
     keep(datagram::short_hash(identity()));

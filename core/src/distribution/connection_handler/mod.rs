@@ -35,7 +35,7 @@ use core::net::SocketAddr;
 use crate::config::Constraints;
 use crate::counters::Counters;
 use crate::distribution::authenticator::Authenticator;
-use crate::distribution::datagram::{Datagram, DatagramError, SESSION_HEADER_BYTES};
+use crate::distribution::datagram::{Datagram, DatagramError};
 use crate::distribution::hello::{Hello, Limits, Manager};
 use crate::distribution::identity::{Epoch, Fleet, Identity, Role};
 use crate::error::{CloseReason, Error, Refusal};
@@ -129,22 +129,6 @@ pub enum Directive {
     /// Another link takes its place.
     #[non_exhaustive]
     Close(CloseReason),
-}
-
-/// The receiver of a datagram.
-#[derive(Debug, PartialEq, Eq)]
-pub enum Sorted<'b> {
-    /// The node has dealt with it, or counted why not.
-    Done,
-    /// For the session of a link.
-    Session {
-        /// The link.
-        link: LinkId,
-        /// To be compared with the session's.
-        nonce: u64,
-        /// For [`Session::datagram`](crate::services::unit::Session::datagram).
-        body: &'b mut [u8],
-    },
 }
 
 /// The last time that something was refused, here or there, for the operator.
@@ -355,30 +339,14 @@ impl<S: Storage> Node<S> {
         None
     }
 
-    /// Takes a datagram that arrived at any of the unit's sockets.
-    pub fn datagram<'b>(
-        &mut self,
-        now: Instant,
-        from: SocketAddr,
-        bytes: &'b mut [u8],
-        authenticator: &dyn Authenticator,
-    ) -> Sorted<'b> {
+    /// Takes a datagram that arrived at any of the unit's sockets and is [for no session](crate::distribution::datagram::for_session)
+    /// of this unit.
+    pub fn datagram(&mut self, now: Instant, from: SocketAddr, bytes: &[u8], authenticator: &dyn Authenticator) {
         match Datagram::decode(bytes, self.config.fleet, authenticator) {
-            Ok(Datagram::Session { link, nonce, .. }) => return self.sort(LinkId(link), nonce, bytes),
             Ok(Datagram::WhoHas(who_has)) => self.heard_who_has(now, from, &who_has, authenticator.mode()),
             Ok(Datagram::Announce(announce)) => self.heard_announce(now, from, &announce),
+            Ok(Datagram::Session { .. }) => self.counters.add(NodeCounter::DatagramUnknownLink, 1),
             Err(error) => self.unreadable(now, from, error),
-        }
-        Sorted::Done
-    }
-
-    fn sort<'b>(&mut self, link: LinkId, nonce: u64, bytes: &'b mut [u8]) -> Sorted<'b> {
-        match bytes.get_mut(SESSION_HEADER_BYTES..) {
-            Some(body) if self.table.of_link(link).is_some() => Sorted::Session { link, nonce, body },
-            _ => {
-                self.counters.add(NodeCounter::DatagramUnknownLink, 1);
-                Sorted::Done
-            }
         }
     }
 

@@ -120,7 +120,8 @@ impl<P: Port> Session<P> {
         Receipt { consumed: received.consumed, event: self.event(outcome, lent), paused: received.paused }
     }
 
-    /// Takes the body of a session datagram, which the node has found to be this link's. It is opened where it is.
+    /// Takes the body of a datagram that is [for the session](datagram::for_session) of this link, with the nonce that it names.
+    /// It is opened where it is; one of another session is dropped, and counted.
     pub fn datagram(
         &mut self,
         cx: &mut Context<'_, P>,

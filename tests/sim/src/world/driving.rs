@@ -3,7 +3,9 @@
 use std::net::SocketAddr;
 use std::rc::Rc;
 
-use cara_core::distribution::connection_handler::{Command, NodeCounter, Sorted};
+use cara_core::distribution::authenticator::Authenticator as _;
+use cara_core::distribution::connection_handler::{Command, NodeCounter};
+use cara_core::distribution::datagram;
 use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::identity::Identity;
 use cara_core::error::{CloseReason, Error, Refusal};
@@ -118,20 +120,19 @@ impl Inner {
 
     fn datagram(&mut self, shared: &Rc<Shared>, host: HostId, from: SocketAddr, bytes: &mut [u8]) {
         let Some(machine) = &mut self.units[host.index()].machine else { return };
-        match machine.links.hub.node.datagram(self.network.now(), from, bytes, &machine.links.keys.codes) {
-            Sorted::Done => {
-                if machine.links.hub.node.take_twin().is_some() {
-                    let reason = CloseReason::Refused(Refusal::DuplicateIdentity);
-                    self.log(shared, host, UnitEvent::LinkEnded { reason });
-                }
-                self.work_node(shared, host);
-            }
-            Sorted::Session { link, nonce, body } => {
-                let happened = machine.links.datagram(&mut self.network, link.0, from, nonce, body);
-                self.happened(shared, host, link.0, happened);
-                self.resume(shared, host);
-            }
+        let links = &mut machine.links;
+        let for_session = datagram::for_session(bytes, links.keys.codes.mode(), links.hub.node.fleet());
+        if let Some((LinkId(link), nonce, body)) = for_session.filter(|(link, ..)| links.link_mut(link.0).is_some()) {
+            let happened = links.datagram(&mut self.network, link, from, nonce, body);
+            self.happened(shared, host, link, happened);
+            return self.resume(shared, host);
         }
+        links.hub.node.datagram(self.network.now(), from, bytes, &links.keys.codes);
+        if links.hub.node.take_twin().is_some() {
+            let reason = CloseReason::Refused(Refusal::DuplicateIdentity);
+            self.log(shared, host, UnitEvent::LinkEnded { reason });
+        }
+        self.work_node(shared, host);
     }
 
     /// The host's interface went or came, or has another address.

@@ -4,9 +4,7 @@ use std::net::SocketAddr;
 
 use cara_core::config::Constraints;
 use cara_core::distribution::authenticator::{Authenticator, CODE_BYTES};
-use cara_core::distribution::connection_handler::{
-    Command, Node, NodeConfig, NodeCounter, NodeStorage, Sorted, Target,
-};
+use cara_core::distribution::connection_handler::{Command, Node, NodeConfig, NodeCounter, NodeStorage, Target};
 use cara_core::distribution::datagram::{ANSWER_BYTES, Announce, SEARCH_BYTES};
 use cara_core::distribution::hello::Manager;
 use cara_core::distribution::identity::{Epoch, Fleet, Identity};
@@ -125,7 +123,7 @@ impl Unit {
     }
 
     pub(super) fn hear(&mut self, now: Instant, from: SocketAddr, bytes: &[u8]) {
-        assert_eq!(self.node.datagram(now, from, &mut bytes.to_vec(), &self.codes), Sorted::Done);
+        self.node.datagram(now, from, bytes, &self.codes);
     }
 
     pub(super) fn run(&mut self, until: Instant) {

@@ -173,16 +173,9 @@ fn a_datagram_of_another_version_is_told() {
 }
 
 #[test]
-fn session_datagrams_reach_links_that_exist() {
+fn a_session_datagram_of_no_link_is_counted() {
     let mut node = depot();
-    join(&mut node, at(1), 3, &s_unit("agv", 1));
-    let datagram = |link| {
-        let mut bytes = crate::distribution::datagram::session_header(Mode::Plain, FLEET, link, 42).to_vec();
-        bytes.push(1);
-        bytes
-    };
-    let expected = Sorted::Session { link: LinkId(3), nonce: 42, body: &mut [1] };
-    assert_eq!(node.datagram(at(2), address(1, 1), &mut datagram(3), &Plain), expected);
-    node.hear(at(2), address(1, 1), &datagram(4));
+    let bytes = crate::distribution::datagram::session_header(Mode::Plain, FLEET, 4, 42);
+    node.hear(at(2), address(1, 1), &bytes);
     assert_eq!(node.counters.value(NodeCounter::DatagramUnknownLink), 1);
 }

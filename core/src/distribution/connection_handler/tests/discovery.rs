@@ -556,7 +556,7 @@ fn answers_of_secured(search: &WhoHas) -> (Vec<(SocketAddr, Vec<u8>)>, u64) {
     let mut node = depot();
     let (mut bytes, mut outbox) = ([0; SEARCH_BYTES], Outbox::default());
     let length = search.encode(FLEET, &FleetOnly, &mut bytes).unwrap().len();
-    assert_eq!(node.datagram(at(0), address(3, 7_001), &mut bytes[..length], &FleetOnly), Sorted::Done);
+    node.datagram(at(0), address(3, 7_001), &bytes[..length], &FleetOnly);
     while node.next_deadline() <= at(3_000) {
         node.poll(node.next_deadline(), &mut outbox, &FleetOnly);
     }

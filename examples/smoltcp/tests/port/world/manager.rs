@@ -2,8 +2,9 @@
 
 use std::net::{Ipv4Addr, SocketAddr};
 
-use cara_core::config::{Constraints, LINK_BUFFER_BYTES, PLAIN_PORT};
-use cara_core::distribution::connection_handler::{Command, Node, NodeConfig, NodeStorage, Sorted, Target};
+use cara_core::config::{Constraints, LINK_BUFFER_BYTES, Mode, PLAIN_PORT};
+use cara_core::distribution::connection_handler::{Command, Node, NodeConfig, NodeStorage, Target};
+use cara_core::distribution::datagram;
 use cara_core::distribution::function::{Attributes, Definition};
 use cara_core::distribution::function_list::FunctionList;
 use cara_core::distribution::identity::{Epoch, Fleet, Identity};
@@ -255,13 +256,14 @@ impl Manager {
             let received = self.net.sockets.get_mut::<udp::Socket>(self.net.datagrams).recv_slice(&mut bytes);
             let Ok((length, from)) = received else { return };
             let from = from.endpoint.into();
-            if let Sorted::Session { link, nonce, body } =
-                self.hub.node.datagram(now, from, &mut bytes[..length], &Plain)
+            let for_session = datagram::for_session(&mut bytes[..length], Mode::Plain, self.hub.node.fleet());
+            if let Some((LinkId(link), nonce, body)) = for_session
+                && let Some(Some(session)) = self.sessions.get_mut(usize::from(link))
             {
-                let index = usize::from(link.0);
-                let Some(session) = &mut self.sessions[index] else { continue };
                 let event = session.datagram(context!(self, now), from, nonce, body);
-                self.happened(now, index, event);
+                self.happened(now, usize::from(link), event);
+            } else {
+                self.hub.node.datagram(now, from, &bytes[..length], &Plain);
             }
         }
     }
