@@ -418,8 +418,9 @@ def decode_attributes(data):
 
 
 def encode_attributes(attributes):
-    flags = PRIORITIES.index(attributes["priority"]) | (4 if attributes["idempotent"] else 0)
-    return struct.pack("<B3sI", flags, b"\0\0\0", attributes["lease"] or 0)
+    """Those that are left out have their defaults."""
+    flags = PRIORITIES.index(attributes.get("priority", "normal")) | (4 if attributes.get("idempotent") else 0)
+    return struct.pack("<B3sI", flags, b"\0\0\0", attributes.get("lease") or 0)
 
 
 def decode_block(data, variables):

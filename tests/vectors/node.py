@@ -27,8 +27,8 @@ POS_INFO = {
 GO_TO = {"name": "go_to", "arguments": [{"name": "position", "type": "int", "size": 2}], "results": []}
 LEASE_MILLIS = 400
 FUNCTIONS = [
-    (POS_INFO, {"priority": "normal", "idempotent": False, "lease": None}),
-    (GO_TO, {"priority": "normal", "idempotent": False, "lease": LEASE_MILLIS}),
+    (POS_INFO, {}),
+    (GO_TO, {"lease": LEASE_MILLIS}),
 ]
 
 

@@ -2,11 +2,10 @@
 //! in postcard. With [`hello`](super::hello), [`datagram`](super::datagram) and [`block`](super::block) the only code
 //! that knows the encoding; `docs/wire.md` says it in words.
 
-#[cfg(test)]
-use serde::{Deserialize, Serialize};
+pub use super::control::{Control, LeaseEnd};
 
 use super::block::Put;
-use super::compact::{Reader, Writer};
+use super::compact::Reader;
 use super::function_list::{Generation, Slot};
 use crate::config::Priority;
 use crate::error::{Error, ServiceError};
@@ -15,7 +14,7 @@ use crate::time::Duration;
 
 const REQUEST: u8 = 1;
 const REPLY: u8 = 2;
-const CONTROL: u8 = 3;
+pub(super) const CONTROL: u8 = 3;
 const FAILURE: u8 = 4;
 
 const WANTS_REPLY: u8 = 1;
@@ -65,7 +64,7 @@ impl<'b> Message<'b> {
             }
             CONTROL => {
                 let mut reader = Reader::new(bytes.get(1..)?);
-                let control = Control::take(&mut reader);
+                let control = Control::take(&mut reader)?;
                 reader.is_through().then_some(Self::Control(control))
             }
             _ => None,
@@ -218,132 +217,6 @@ fn error_of(code: u8, index: u8, first: u32, second: u32) -> Error {
         22 => Error::Service(ServiceError::NotReady),
         23 => Error::Service(ServiceError::BadResults),
         _ => Error::Malformed,
-    }
-}
-
-/// Messages between two units that are no requests: what they tell each other about their functions, limits and leases.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[cfg_attr(test, derive(Serialize, Deserialize))]
-pub enum Control<'b> {
-    /// A function of the sender may now be called.
-    Publish {
-        /// Its slot.
-        slot: u16,
-        /// Its life.
-        generation: u16,
-        /// [`Attributes`](super::function::Attributes) in their wire form.
-        attributes: [u8; 8],
-        /// The encoded [`Signature`](super::function::Signature).
-        #[cfg_attr(test, serde(borrow))]
-        signature: &'b [u8],
-    },
-    /// A function of the sender may no longer be called.
-    Withdraw {
-        /// Its slot.
-        slot: u16,
-    },
-    /// All publishing and withdrawing up to here is to be acknowledged.
-    ListEnd {
-        /// Rises with each acknowledgement asked for.
-        serial: u32,
-    },
-    /// The list up to `serial` was read.
-    ListAck {
-        /// As in `ListEnd`.
-        serial: u32,
-        /// Functions that the reader keeps no room for.
-        skipped: u16,
-    },
-    /// The sender's limits changed.
-    Limits {
-        /// Longest message that the sender takes.
-        message_size: u32,
-        /// Least time between two requests to the sender, in microseconds.
-        minimum_interval: u32,
-        /// Calls of one peer that the sender holds.
-        calls: u16,
-    },
-    /// The callee ended what a leased call started; renewals have no effect.
-    LeaseEnded {
-        /// The caller's id of the call.
-        call: u32,
-        /// Why.
-        why: LeaseEnd,
-    },
-}
-
-impl<'b> Control<'b> {
-    /// Encodes into `out`, whole message; `None` where it does not fit.
-    pub fn encode<'o>(&self, out: &'o mut [u8]) -> Option<&'o [u8]> {
-        let mut writer = Writer::new(out);
-        writer.byte(CONTROL);
-        self.put(&mut writer);
-        let used = writer.finish()?;
-        out.get(..used)
-    }
-
-    fn put(&self, writer: &mut Writer<'_>) {
-        match *self {
-            Self::Publish { slot, generation, attributes, signature } => {
-                writer.numbers(&[0, slot.into(), generation.into()]);
-                writer.bytes(&attributes);
-                writer.text(signature);
-            }
-            Self::Withdraw { slot } => writer.numbers(&[1, slot.into()]),
-            Self::ListEnd { serial } => writer.numbers(&[2, serial]),
-            Self::ListAck { serial, skipped } => writer.numbers(&[3, serial, skipped.into()]),
-            Self::Limits { message_size, minimum_interval, calls } => {
-                writer.numbers(&[4, message_size, minimum_interval, calls.into()]);
-            }
-            Self::LeaseEnded { call, why } => writer.numbers(&[5, call, why as u32]),
-        }
-    }
-
-    fn take(reader: &mut Reader<'b>) -> Self {
-        match reader.choice(6) {
-            0 => Self::Publish {
-                slot: reader.u16(),
-                generation: reader.u16(),
-                attributes: reader.bytes(8).try_into().unwrap_or_default(),
-                signature: reader.text(),
-            },
-            1 => Self::Withdraw { slot: reader.u16() },
-            2 => Self::ListEnd { serial: reader.u32() },
-            3 => Self::ListAck { serial: reader.u32(), skipped: reader.u16() },
-            4 => Self::Limits { message_size: reader.u32(), minimum_interval: reader.u32(), calls: reader.u16() },
-            _ => {
-                let call = reader.u32();
-                let why = reader.choice(LeaseEnd::ALL.len() as u32);
-                Self::LeaseEnded { call, why: LeaseEnd::ALL.get(why as usize).copied().unwrap_or(LeaseEnd::Expired) }
-            }
-        }
-    }
-}
-
-/// Why the callee ended what a leased call started.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-#[repr(u8)]
-#[cfg_attr(test, derive(Serialize, Deserialize))]
-#[non_exhaustive]
-pub enum LeaseEnd {
-    /// The service has done what was asked for.
-    Finished,
-    /// It was not renewed in time, or the callee stopped it: the safe hook runs there.
-    Expired,
-    /// A newer call of the same function goes on in its place.
-    Replaced,
-}
-
-impl LeaseEnd {
-    pub(crate) const ALL: [Self; 3] = [Self::Finished, Self::Expired, Self::Replaced];
-
-    /// `finished`, `expired`, `replaced`.
-    pub const fn word(self) -> &'static str {
-        match self {
-            Self::Finished => "finished",
-            Self::Expired => "expired",
-            Self::Replaced => "replaced",
-        }
     }
 }
 
@@ -514,43 +387,12 @@ mod tests {
         }
 
         #[test]
-        fn control_messages_are_as_postcard_has_them(
-            bytes in prop::collection::vec(prop_oneof![any::<u8>(), 0..8_u8], 0..40),
-        ) {
-            let mut reader = Reader::new(&bytes);
-            let ours = Control::take(&mut reader);
-            let ours = reader.is_through().then_some(ours);
-            let theirs = postcard::take_from_bytes::<Control<'_>>(&bytes).ok();
-            let theirs = theirs.and_then(|(control, rest)| rest.is_empty().then_some(control));
-            prop_assert_eq!(ours, theirs);
-            if let Some(control) = ours {
-                let (mut ours, mut theirs) = ([0; 80], [0; 80]);
-                let written = &control.encode(&mut ours).unwrap()[1..];
-                prop_assert_eq!(written, &*postcard::to_slice(&control, &mut theirs).unwrap());
-            }
-        }
-
-        #[test]
         fn error_codes_are_total(code in 1..=255u8, index: u8, first: u32, second: u32) {
             let error = error_of(code, index, first, second);
             let bytes = encode_reply(7, Err(error));
             let Some(Message::Reply(7, Err(read))) = Message::decode(&bytes) else { panic!() };
             prop_assert_eq!(read, error);
         }
-    }
-
-    #[test]
-    fn control_messages_fit_their_bound() {
-        let worst = Control::Limits { message_size: u32::MAX, minimum_interval: u32::MAX, calls: u16::MAX };
-        let mut out = [0; CONTROL_BYTES];
-        assert!(worst.encode(&mut out).is_some());
-        let signature = [1; 300];
-        let publish =
-            Control::Publish { slot: u16::MAX, generation: u16::MAX, attributes: [255; 8], signature: &signature };
-        let mut out = [0; PUBLISH_BYTES + 300];
-        let bytes = publish.encode(&mut out).unwrap();
-        let Some(Message::Control(read)) = Message::decode(bytes) else { panic!() };
-        assert_eq!(read, publish);
     }
 
     #[test]

@@ -3,8 +3,9 @@
 mod attributes;
 pub mod authenticator;
 pub mod block;
-mod compact;
+pub(crate) mod compact;
 pub mod connection_handler;
+mod control;
 pub mod datagram;
 mod display;
 mod element;

@@ -127,7 +127,7 @@ fn errors() -> Vec<Vector> {
 
 fn controls() -> Vec<Vector> {
     let stop = definition("stop()");
-    let attributes = Attributes { priority: Priority::Emergency, lease: None, idempotent: true }.encode();
+    let attributes = Attributes { priority: Priority::Emergency, idempotent: true, ..Attributes::default() }.encode();
     let publish = Control::Publish { slot: 300, generation: 2, attributes, signature: stop.as_bytes() };
     let all: [(&'static str, &'static str, Control<'_>, Value); 7] = [
         (
