@@ -7,14 +7,14 @@ use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
 use cara_core::error::Error;
 use cara_core::services::access::Access;
 use core::fmt;
-use core::net::SocketAddr;
+use core::net::SocketAddrV4;
 
 use crate::security::Security;
 
 /// Identity of a unit, and constraints unless they follow from its [`Limits`](crate::Limits).
 #[derive(Debug)]
 pub struct Config {
-    pub(crate) node: NodeConfig,
+    pub(crate) node: NodeConfig<SocketAddrV4>,
     pub(crate) constraints: Option<Constraints>,
     pub(crate) security: Security,
     pub(crate) access: Table,
@@ -44,7 +44,7 @@ impl Config {
         Ok(unit.tcp_port(port))
     }
 
-    fn new(identity: Identity, target: Target, mut security: Security) -> Self {
+    fn new(identity: Identity, target: Target<SocketAddrV4>, mut security: Security) -> Self {
         let (seed, udp_port) = (security.0.seed(), security.0.mode().port());
         let (fleet, epoch, constraints) = (Fleet(0), Epoch(seed), Constraints::S_UNIT);
         let node = NodeConfig { identity, fleet, epoch, target, tcp_port: 0, udp_port, constraints, seed };
@@ -99,7 +99,7 @@ impl Config {
     }
 
     /// An s_unit's manager is at this address: it is dialled, and nothing is broadcast.
-    pub fn manager_address(mut self, address: SocketAddr) -> Self {
+    pub fn manager_address(mut self, address: SocketAddrV4) -> Self {
         if let Target::Manager(manager) = self.node.target {
             self.node.target = Target::Fixed(manager, address);
         }

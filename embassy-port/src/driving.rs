@@ -17,11 +17,11 @@ use cara_core::services::lease::LeaseEnd;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::{Call, Event};
 use cara_core::time::{Duration, Instant};
-use core::net::SocketAddr;
+use core::net::SocketAddrV4;
 use core::task::{Context as TaskContext, Poll};
 
 use crate::event::{Name, UnitEvent};
-use crate::line::Progress;
+use crate::line::{Progress, address_of};
 use crate::machine::{LinkSession, Machine};
 use crate::replies::ended;
 use crate::time::now;
@@ -168,7 +168,7 @@ impl<T> Machine<T> {
             Poll::Ready(Err(_)) => return Some(None),
             Poll::Ready(Ok((length, from))) => (length, from.endpoint),
         };
-        let from = SocketAddr::new(from.addr.into(), from.port);
+        let Some(from) = address_of(from) else { return Some(None) };
         let bytes = scratch.get_mut(..length).unwrap_or_default();
         let (mode, fleet) = (self.proof.codes().mode(), self.hub.node.fleet());
         if let Some((LinkId(link), nonce, body)) = datagram::for_session(bytes, mode, fleet)
@@ -319,7 +319,7 @@ impl<T> Machine<T> {
     }
 
     /// Does what the hub wants done.
-    pub(crate) fn act(&mut self, command: Command) {
+    pub(crate) fn act(&mut self, command: Command<SocketAddrV4>) {
         match command {
             Command::Dial { to, identity } => self.dial(to, identity.as_ref()),
             Command::Tell(LinkId(index), directive) => {
@@ -332,7 +332,7 @@ impl<T> Machine<T> {
     }
 
     #[inline(never)]
-    fn dial(&mut self, to: SocketAddr, identity: Option<&Identity>) {
+    fn dial(&mut self, to: SocketAddrV4, identity: Option<&Identity>) {
         let dialed = self.free_link().filter(|index| {
             let line = self.mail.lines.get_mut(usize::from(*index));
             line.is_some_and(|line| line.dial(to))
@@ -391,7 +391,7 @@ impl<T> Machine<T> {
 
     /// Returns the memory of a link's session: the peer's identity, the identity it claimed, and its address.
     #[inline(never)]
-    fn end(&mut self, index: u16) -> Option<(Option<Identity>, Option<Identity>, SocketAddr)> {
+    fn end(&mut self, index: u16) -> Option<(Option<Identity>, Option<Identity>, SocketAddrV4)> {
         let Self { links, pool, counters, .. } = self;
         let link = links.get_mut(usize::from(index))?;
         let session = link.session.as_ref()?;

@@ -1,13 +1,13 @@
 //! What a unit tells its application.
 
 use cara_core::config::NAME_BYTES;
-use core::net::Ipv4Addr;
+use core::net::{Ipv4Addr, SocketAddrV4};
 
 /// The name of a function.
 pub type Name = heapless::String<NAME_BYTES>;
 
 /// Something happened that no call returned: functions by their names, the network as the address that the board has.
-pub type UnitEvent = cara_core::services::event::UnitEvent<Name, Option<Ipv4Addr>>;
+pub type UnitEvent = cara_core::services::event::UnitEvent<Name, Option<Ipv4Addr>, SocketAddrV4>;
 
 /// Queue of unread events; when it is full, new ones are lost and counted.
 pub(crate) struct Events {

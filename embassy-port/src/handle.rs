@@ -2,6 +2,7 @@
 
 use core::fmt;
 use core::future::poll_fn;
+use core::net::SocketAddrV4;
 use core::task::Poll;
 
 use cara_core::config::Constraints;
@@ -299,7 +300,7 @@ impl<T> Handle<T> {
     }
 
     /// The last refusals.
-    pub fn findings(&self) -> impl Iterator<Item = Finding> + use<T> {
+    pub fn findings(&self) -> impl Iterator<Item = Finding<SocketAddrV4>> + use<T> {
         let unit = *self;
         (0..).map_while(move |index| unit.look(|machine| machine.hub.node.findings().nth(index).cloned()))
     }

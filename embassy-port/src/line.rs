@@ -2,7 +2,7 @@
 //! that state is kept here. Nothing in here waits.
 
 use core::future::Future;
-use core::net::{IpAddr, SocketAddr};
+use core::net::{SocketAddr, SocketAddrV4};
 use core::pin::pin;
 use core::task::{Context, Poll, Waker};
 
@@ -37,7 +37,7 @@ pub(crate) enum Progress {
     /// The connection that was dialled is there.
     Connected,
     /// A connection was accepted.
-    Accepted(SocketAddr),
+    Accepted(SocketAddrV4),
     /// The connection that was dialled could not be opened.
     Broken,
 }
@@ -79,12 +79,11 @@ impl Line {
     }
 
     /// Begins to open a connection; `false` when that cannot be.
-    pub(crate) fn dial(&mut self, to: SocketAddr) -> bool {
-        let IpAddr::V4(address) = to.ip() else { return false };
+    pub(crate) fn dial(&mut self, to: SocketAddrV4) -> bool {
         if self.doing != Doing::Nothing {
             self.socket.abort();
         }
-        let to = IpEndpoint::new(IpAddress::Ipv4(address), to.port());
+        let to = IpEndpoint::new(IpAddress::Ipv4(*to.ip()), to.port());
         let begun = !matches!(poll_once(self.socket.connect(to)), Some(Err(_)));
         self.doing = if begun { Doing::Dialing } else { Doing::Nothing };
         begun
@@ -138,12 +137,12 @@ impl Line {
     }
 
     fn accepted(&mut self) -> Progress {
-        let Some(from) = self.socket.remote_endpoint() else {
+        let Some(from) = self.socket.remote_endpoint().and_then(address_of) else {
             self.abort();
             return Progress::None;
         };
         self.doing = Doing::Open;
-        Progress::Accepted(SocketAddr::new(from.addr.into(), from.port))
+        Progress::Accepted(from)
     }
 
     /// When [`progress`](Self::progress) has something to do without an event of the network.
@@ -223,6 +222,14 @@ impl Line {
         if open {
             let _ = pin!(self.socket.wait_read_ready()).poll(context);
         }
+    }
+}
+
+/// Units of boards have IPv4 addresses only.
+pub(crate) fn address_of(end: IpEndpoint) -> Option<SocketAddrV4> {
+    match SocketAddr::new(end.addr.into(), end.port) {
+        SocketAddr::V4(address) => Some(address),
+        SocketAddr::V6(_) => None,
     }
 }
 

@@ -12,7 +12,7 @@ use cara_core::services::{Context, Port};
 use cara_core::storage::{Lent, Pool};
 use cara_core::time::{Duration, Instant};
 use core::cell::RefCell;
-use core::net::SocketAddr;
+use core::net::SocketAddrV4;
 use embassy_net::Ipv4Cidr;
 use embassy_sync::waitqueue::{MultiWakerRegistration, WakerRegistration};
 
@@ -37,6 +37,7 @@ pub(crate) enum Board {}
 impl Port for Board {
     type Storage = Lent;
     type Cipher = LinkCipher;
+    type Endpoint = SocketAddrV4;
 }
 
 pub(crate) type LinkSession = Session<Board>;
@@ -86,7 +87,7 @@ impl Link {
 
 /// What the unit is made of.
 pub(crate) struct Machine<T: 'static> {
-    pub(crate) hub: Hub<Lent>,
+    pub(crate) hub: Hub<Board>,
     /// Proves this unit's identity to peers.
     pub(crate) proof: Proof,
     /// The access table.
@@ -191,13 +192,13 @@ impl<T> Machine<T> {
 
     /// Lets the node do what is due.
     #[inline(never)]
-    pub(crate) fn poll_node(&mut self) -> Option<Command> {
+    pub(crate) fn poll_node(&mut self) -> Option<Command<SocketAddrV4>> {
         self.hub.node.poll(now(), &mut self.mail, self.proof.codes())
     }
 
     /// Makes the session of a link. `None` when the link is in use.
     #[inline(never)]
-    pub(crate) fn open(&mut self, index: u16, address: SocketAddr, dialed: bool) -> Option<()> {
+    pub(crate) fn open(&mut self, index: u16, address: SocketAddrV4, dialed: bool) -> Option<()> {
         let storage = self.link_mut(index)?.storage.take()?;
         let local = self.hub.node.hello(now(), LinkId(index));
         let constraints = *self.hub.node.constraints();

@@ -1,7 +1,7 @@
 //! A node as this unit sees it.
 
 use core::fmt;
-use core::net::SocketAddr;
+use core::net::SocketAddrV4;
 
 use cara_core::distribution::identity::{Epoch, Identity};
 use cara_core::distribution::parameters::ParametersView;
@@ -54,7 +54,7 @@ impl<T> Peer<T> {
     }
 
     /// The other end of its link, while it is connected.
-    pub fn address(&self) -> Option<SocketAddr> {
+    pub fn address(&self) -> Option<SocketAddrV4> {
         self.session(LinkSession::address)
     }
 

@@ -2,6 +2,7 @@
 
 use core::cell::RefCell;
 use core::mem::MaybeUninit;
+use core::net::SocketAddrV4;
 
 use cara_core::config::{HANDSHAKE_LIFE, LINK_BUFFER_BYTES, Mode};
 use cara_core::counters::Counters;
@@ -71,10 +72,10 @@ pub struct Resources<
     /// For each link, what is received and what is sent.
     streams: [[MaybeUninit<[u8; STREAM]>; 2]; LINKS],
     sessions: [SessionMemory<OWN, THEIR, CALLS>; LINKS],
-    nodes: MaybeUninit<[[Option<Known>; KNOWN]; LINKS]>,
+    nodes: MaybeUninit<[[Option<Known<SocketAddrV4>>; KNOWN]; LINKS]>,
     order: MaybeUninit<[[Order; KNOWN]; LINKS]>,
     node_links: MaybeUninit<[Option<u16>; LINKS]>,
-    findings: MaybeUninit<[Option<Finding>; FINDINGS]>,
+    findings: MaybeUninit<[Option<Finding<SocketAddrV4>>; FINDINGS]>,
     functions: MaybeUninit<[Entry<Listed<T>>; OWN]>,
     signatures: MaybeUninit<[[u8; SIGNATURE]; OWN]>,
     to_all: MaybeUninit<[bool; OWN]>,

@@ -43,7 +43,7 @@ const KEPT_BUFFERS: usize = 8;
 /// ```
 pub struct Builder<T, R> {
     pub(crate) identity: Identity,
-    pub(crate) target: Target,
+    pub(crate) target: Target<SocketAddr>,
     fleet: Fleet,
     constraints: Constraints,
     capacities: Capacities,
@@ -65,7 +65,7 @@ pub struct Builder<T, R> {
 }
 
 impl<R> Builder<(), R> {
-    pub(crate) fn new(identity: Identity, target: Target) -> Self {
+    pub(crate) fn new(identity: Identity, target: Target<SocketAddr>) -> Self {
         #[cfg(feature = "control")]
         let control = match identity.role() {
             Role::MUnit => crate::control::Control::Default,
@@ -349,7 +349,7 @@ enum KeySource {
 }
 
 impl KeySource {
-    fn open(self, identity: &Identity, target: &Target, fleet: Fleet) -> Result<Keys, BuildError> {
+    fn open(self, identity: &Identity, target: &Target<SocketAddr>, fleet: Fleet) -> Result<Keys, BuildError> {
         Ok(Keys::Ring(match self {
             Self::Found => LiveRing::find(identity, manager_of(target)?.as_ref(), fleet)?,
             Self::File(path) => LiveRing::open(&path, identity, fleet)?,
@@ -360,7 +360,7 @@ impl KeySource {
 }
 
 /// The manager that an s_unit joins.
-fn manager_of(target: &Target) -> Result<Option<Identity>, Error> {
+fn manager_of(target: &Target<SocketAddr>) -> Result<Option<Identity>, Error> {
     match target {
         Target::Everybody => Ok(None),
         Target::Manager(manager) | Target::Fixed(manager, _) => Identity::m_unit(&manager.name, manager.id).map(Some),
@@ -399,6 +399,6 @@ pub(crate) fn random() -> u64 {
     RandomState::new().build_hasher().finish()
 }
 
-pub(crate) fn manager(name: &str, id: u32) -> Result<Target, Error> {
+pub(crate) fn manager(name: &str, id: u32) -> Result<Target<SocketAddr>, Error> {
     Manager::new(name, id).map(Target::Manager)
 }

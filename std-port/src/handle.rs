@@ -10,7 +10,7 @@ use std::sync::mpsc::{Receiver, sync_channel};
 use std::sync::{Arc, Weak};
 
 use cara_core::config::{Constraints, Mode};
-use cara_core::distribution::connection_handler::{Finding, NodeCounter};
+use cara_core::distribution::connection_handler::NodeCounter;
 use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
 use cara_core::error::Error;
 use cara_core::host::connections::LinkCounter;
@@ -22,7 +22,7 @@ use crate::builder;
 use crate::control::{self, Control, Server};
 use crate::engine::{Engine, pairs};
 use crate::error::StartError;
-use crate::event::UnitEvent;
+use crate::event::{Finding, UnitEvent};
 #[cfg(feature = "control")]
 use crate::locks::lock;
 use crate::my_function_list::MyFunctionList;

@@ -59,7 +59,7 @@ mod unit;
 
 pub use builder::{BuildError, Builder};
 pub use cara_core::config::{Constraints, Mode, PLAIN_PORT, Priority, SECURED_PORT};
-pub use cara_core::distribution::connection_handler::{Finding, NodeCounter};
+pub use cara_core::distribution::connection_handler::NodeCounter;
 pub use cara_core::distribution::function::{Attributes, Definition, Signature, VariableSpec};
 pub use cara_core::distribution::hello::{Limits, Manager};
 pub use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
@@ -74,7 +74,7 @@ pub use cara_core::time::Duration;
 pub use communication_system::{CommunicationSystem, WeakSystem};
 pub use config::Capacities;
 pub use error::StartError;
-pub use event::UnitEvent;
+pub use event::{Finding, UnitEvent};
 #[cfg(feature = "async")]
 pub use future::PendingReply;
 pub use handle::{Handle, MUnit, SUnit, WeakHandle};

@@ -3,12 +3,11 @@
 //! The question is a [`WhoHas`] for the unit itself, with a nonce of its own, and only holders of this identity's keys
 //! can answer it. If two units ask at once, the one with the greater epoch answers, so that only one of them starts.
 
-use core::net::SocketAddr;
-
 use super::authenticator::Authenticator;
 use super::datagram::{Announce, Datagram, SEARCH_BYTES, WhoHas};
 use super::hello::Manager;
 use super::identity::{Epoch, Fleet, Identity};
+use crate::host::endpoint::Endpoint;
 use crate::time::Duration;
 
 /// How long a manager waits for an answer before it starts. A unit that is alive answers at once.
@@ -28,13 +27,13 @@ pub struct Presence {
 
 /// What a datagram means to a unit that asks.
 #[derive(Debug, PartialEq, Eq)]
-pub enum Heard<'o> {
+pub enum Heard<'o, E> {
     /// Nothing.
     Nothing,
     /// Another unit asks the same and must give way: the answer, to be sent to the datagram's source.
     Answer(&'o [u8]),
     /// A live unit has this identity; where it can be dialled.
-    Running(SocketAddr),
+    Running(E),
 }
 
 impl Presence {
@@ -65,16 +64,16 @@ impl Presence {
     }
 
     /// Handles a datagram that arrives while the unit waits. Only an answer to its own question shows a live unit.
-    pub fn hear<'o>(
+    pub fn hear<'o, E: Endpoint>(
         &self,
-        from: SocketAddr,
+        from: E,
         bytes: &[u8],
         authenticator: &dyn Authenticator,
         out: &'o mut [u8; SEARCH_BYTES],
-    ) -> Heard<'o> {
+    ) -> Heard<'o, E> {
         match Datagram::decode(bytes, self.fleet, authenticator) {
             Ok(Datagram::Announce(announce)) if self.is_answer(&announce) => {
-                Heard::Running(SocketAddr::new(from.ip(), announce.tcp_port))
+                Heard::Running(from.at_port(announce.tcp_port))
             }
             Ok(Datagram::WhoHas(who_has)) if self.gives_way(&who_has) => {
                 self.answer(who_has.nonce, authenticator, out).map_or(Heard::Nothing, Heard::Answer)

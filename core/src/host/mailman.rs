@@ -13,16 +13,14 @@
 //! - Readiness is drained until would-block or a budget; what remains is polled again.
 //! - A port bounds the unsent bytes in the kernel or stack, so that an emergency is not stuck behind them.
 
-use core::net::SocketAddr;
-
 use crate::error::CloseReason;
 
 /// Names one link of a unit: an index that the port chose, below its number of links.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct LinkId(pub u16);
 
-/// Sends bytes for the core: TCP streams, UDP datagrams, broadcasts.
-pub trait Mailman {
+/// Sends bytes for the core: TCP streams, UDP datagrams, broadcasts. `E` is the port's [`Endpoint`](super::endpoint::Endpoint).
+pub trait Mailman<E> {
     /// Writes to the stream of `link`; returns how many bytes were taken in all, 0 when the stream would block.
     fn write(&mut self, link: LinkId, slices: &[&[u8]]) -> Result<usize, CloseReason>;
 
@@ -34,7 +32,7 @@ pub trait Mailman {
     }
 
     /// Sends one datagram from the unit's own UDP port. `false` when the network refused it.
-    fn send_to(&mut self, to: SocketAddr, datagram: &[u8]) -> bool;
+    fn send_to(&mut self, to: E, datagram: &[u8]) -> bool;
 
     /// Sends one datagram to the discovery port of every node on every interface. `false` when none took it.
     fn broadcast(&mut self, datagram: &[u8]) -> bool;

@@ -1,7 +1,5 @@
 //! What a unit tells its application: one type for all ports.
 
-use core::net::SocketAddr;
-
 use crate::distribution::identity::Identity;
 use crate::error::{CloseReason, Error};
 use crate::services::lease::LeaseEnd;
@@ -9,11 +7,11 @@ use crate::services::requests::CallId;
 
 /// Something happened that no call returned.
 ///
-/// A port fills in how it names a function (`F`) and what can be used of the network (`N`), and gives the whole a short name:
+/// A port fills in how it names a function (`F`), what can be used of the network (`N`) and how it addresses nodes (`E`), and gives the whole a short name:
 /// a program for Linux sees `cara_std::UnitEvent`, one for a board `cara_embassy::UnitEvent`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
-pub enum UnitEvent<F, N> {
+pub enum UnitEvent<F, N, E> {
     /// A node is connected.
     Joined {
         /// Which.
@@ -30,7 +28,7 @@ pub enum UnitEvent<F, N> {
     /// this unit's own identity in `peer`: another live unit has it, and one of the two waits for the other's end.
     NotJoined {
         /// The other end.
-        address: SocketAddr,
+        address: E,
         /// The identity that it claimed, or is expected to have.
         peer: Option<Identity>,
         /// Why.

@@ -5,26 +5,26 @@
 //! passes on with [`Session::direct`](super::unit::Session::direct), while it does not hold the hub.
 
 use crate::distribution::connection_handler::Node;
-use crate::storage::Storage;
 
+use super::Port;
 use super::publications::Publications;
 
 /// One unit's membership and publications.
-pub struct Hub<S: Storage> {
+pub struct Hub<P: Port> {
     /// Finds nodes and decides which links are taken.
-    pub node: Node<S>,
+    pub node: Node<P>,
     /// The functions published to each node.
-    pub publications: Publications<S>,
+    pub publications: Publications<P::Storage>,
 }
 
 /// The way of a session to its hub. The hub itself is one; a port that shares it between threads locks it, and nothing is
 /// locked inside.
-pub trait Door<S: Storage> {
+pub trait Door<P: Port> {
     /// Lends the hub.
-    fn enter(&mut self, act: &mut dyn FnMut(&mut Hub<S>));
+    fn enter(&mut self, act: &mut dyn FnMut(&mut Hub<P>));
 }
 
-impl<S: Storage> Door<S> for Hub<S> {
+impl<P: Port> Door<P> for Hub<P> {
     fn enter(&mut self, act: &mut dyn FnMut(&mut Self)) {
         act(self);
     }

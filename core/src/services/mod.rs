@@ -48,7 +48,7 @@
 //! # use cara_core::services::{Context, Port};
 //! # use cara_core::storage::{Pool, Storage};
 //! # use cara_core::time::Instant;
-//! # use core::net::SocketAddr;
+//! # use core::net::{Ipv4Addr, SocketAddrV4};
 //! # fn slice<T: Default>(count: usize) -> Box<[T]> { (0..count).map(|_| T::default()).collect() }
 //! // What the port is made of: slices on the heap, links in clear.
 //! enum Boxed {}
@@ -59,21 +59,22 @@
 //! impl Port for InMemory {
 //!     type Storage = Boxed;
 //!     type Cipher = Plain;
+//!     type Endpoint = SocketAddrV4;
 //! }
 //!
 //! /// The bytes on their way to the other end. This port has no datagrams.
 //! struct Wire(Vec<u8>);
-//! impl Mailman for Wire {
+//! impl Mailman<SocketAddrV4> for Wire {
 //!     fn write(&mut self, _: LinkId, slices: &[&[u8]]) -> Result<usize, CloseReason> {
 //!         self.0.extend(slices.concat());
 //!         Ok(slices.iter().map(|slice| slice.len()).sum())
 //!     }
-//!     fn send_to(&mut self, _: SocketAddr, _: &[u8]) -> bool { false }
+//!     fn send_to(&mut self, _: SocketAddrV4, _: &[u8]) -> bool { false }
 //!     fn broadcast(&mut self, _: &[u8]) -> bool { false }
 //! }
 //!
 //! struct End {
-//!     hub: Hub<Boxed>,
+//!     hub: Hub<InMemory>,
 //!     session: Session<InMemory>,
 //!     functions: FunctionList<Boxed, ()>,
 //!     buffers: Pool<Boxed>,
@@ -121,7 +122,7 @@
 //!         }
 //!     }
 //! }
-//! # fn end(now: Instant, identity: Identity, target: Target, dialed: bool) -> End {
+//! # fn end(now: Instant, identity: Identity, target: Target<SocketAddrV4>, dialed: bool) -> End {
 //! #     let constraints = Constraints::S_UNIT;
 //! #     let config = NodeConfig {
 //! #         identity, fleet: Fleet(1), epoch: Epoch(1), target, tcp_port: 0, udp_port: 0, constraints,
@@ -129,7 +130,7 @@
 //! #     };
 //! #     let storage = NodeStorage { nodes: slice(4), order: slice(4), links: slice(1), findings: slice(4) };
 //! #     let mut node = Node::new(now, config, storage);
-//! #     let address = SocketAddr::from(([192, 0, 2, 1], 7000));
+//! #     let address = SocketAddrV4::new(Ipv4Addr::new(192, 0, 2, 1), 7000);
 //! #     let local = node.hello(now, LinkId(0));
 //! #     let config = SessionConfig { link: LinkId(0), dialed, address, local, constraints };
 //! #     let storage = SessionStorage {
@@ -189,6 +190,7 @@ pub mod publications;
 pub mod requests;
 pub mod unit;
 
+pub use crate::host::port::Port;
 pub use calls::{CallHead, Ticket, slots_for};
 
 use crate::distribution::function_list::{Function, FunctionList, Generation, Slot};
@@ -200,20 +202,12 @@ use crate::storage::{Buffers, Storage};
 use crate::time::Instant;
 use lease::Service;
 
-/// What a port is made of: the one type parameter of the machines that it holds. What is only lent for a call is `dyn`.
-pub trait Port: 'static {
-    /// Where tables and buffers live.
-    type Storage: Storage;
-    /// How links are secured; [`Plain`](crate::host::secure::Plain) where they are not.
-    type Cipher: Secure;
-}
-
 /// What a port lends to each call of a [`Session`](unit::Session).
 pub struct Context<'c, P: Port> {
     /// The time now.
     pub now: Instant,
     /// Writes to links and sends datagrams.
-    pub mailman: &'c mut dyn Mailman,
+    pub mailman: &'c mut dyn Mailman<P::Endpoint>,
     /// The unit's message buffers.
     pub buffers: &'c mut dyn Buffers<P::Storage>,
     /// The unit's own functions.
@@ -221,7 +215,7 @@ pub struct Context<'c, P: Port> {
     /// The access table; without one, a joined node may do everything.
     pub access: Option<&'c dyn access::Access>,
     /// What the links of the unit share.
-    pub hub: &'c mut dyn hub::Door<P::Storage>,
+    pub hub: &'c mut dyn hub::Door<P>,
     /// The keys of the unit's pairs; `()` where links are not secured.
     pub keys: &'c mut dyn Keys<P>,
 }

@@ -1,7 +1,7 @@
 //! The core's two machines, driven: the node's decisions are carried out, the session is given what has arrived, and
 //! what comes of it goes to the program.
 
-use core::net::SocketAddr;
+use core::net::SocketAddrV4;
 
 use cara_core::config::Mode;
 use cara_core::distribution::connection_handler::Command;
@@ -42,7 +42,7 @@ impl SUnit {
         }
     }
 
-    fn dial(&mut self, now: Instant, to: SocketAddr, identity: Option<&Identity>) {
+    fn dial(&mut self, now: Instant, to: SocketAddrV4, identity: Option<&Identity>) {
         if self.session.is_some() || !self.stack.connect(to) {
             return self.hub.node.dial_failed(now, identity);
         }
@@ -73,7 +73,7 @@ impl SUnit {
         self.serve_waiting(now, program);
     }
 
-    fn take_datagram<P: Program>(&mut self, now: Instant, from: SocketAddr, bytes: &mut [u8], program: &mut P) {
+    fn take_datagram<P: Program>(&mut self, now: Instant, from: SocketAddrV4, bytes: &mut [u8], program: &mut P) {
         let for_session = datagram::for_session(bytes, Mode::Plain, self.hub.node.fleet());
         if let (Some((LINK, nonce, body)), Some(session)) = (for_session, &mut self.session) {
             if let Some(event) = session.datagram(context!(self, now), from, nonce, body) {

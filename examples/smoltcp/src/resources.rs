@@ -1,6 +1,7 @@
 //! All memory of a unit, in one value that goes into a `static`; change the numbers to suit the program.
 
 use core::array::from_fn;
+use core::net::SocketAddrV4;
 
 use cara_core::config::{LINK_BUFFER_BYTES, PLAIN_PORT};
 use cara_core::distribution::connection_handler::{Finding, Known, NodeStorage, Order};
@@ -14,6 +15,8 @@ use cara_core::services::unit::{Publication, SessionStorage, buffer_bytes};
 use cara_core::storage::{Lent, Pool};
 use smoltcp::iface::SocketStorage;
 use smoltcp::socket::udp;
+
+use crate::unit::Smoltcp;
 
 /// Datagrams, including broadcasts, arrive at this port and are sent from it: the host has no other user of it.
 pub(crate) const DATAGRAM_PORT: u16 = PLAIN_PORT;
@@ -59,10 +62,10 @@ pub struct Resources {
     stack: StackMemory,
     arguments: Arguments,
     results: Arguments,
-    nodes: [Option<Known>; NODES],
+    nodes: [Option<Known<SocketAddrV4>>; NODES],
     order: [Order; NODES],
     links: [Option<u16>; 1],
-    findings: [Option<Finding>; 4],
+    findings: [Option<Finding<SocketAddrV4>>; 4],
     to_all: [bool; FUNCTIONS],
     to_one: [Option<PublishedToOne>; 0],
     functions: [Entry<Offered>; FUNCTIONS],
@@ -80,7 +83,7 @@ pub struct Resources {
 /// The slices of the resources in the shape in which the core takes them.
 pub(crate) struct Parts {
     pub(crate) stack: &'static mut StackMemory,
-    pub(crate) node: NodeStorage<Lent>,
+    pub(crate) node: NodeStorage<Smoltcp>,
     pub(crate) publications: Publications<Lent>,
     pub(crate) link: SessionStorage<Lent>,
     pub(crate) functions: FunctionList<Lent, Offered>,

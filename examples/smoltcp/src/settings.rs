@@ -1,6 +1,6 @@
 //! Identity and address of the unit.
 
-use core::net::Ipv4Addr;
+use core::net::{Ipv4Addr, SocketAddrV4};
 
 use cara_core::config::Constraints;
 use cara_core::distribution::connection_handler::{NodeConfig, Target};
@@ -14,7 +14,7 @@ use crate::resources::{CALLS, DATAGRAM_PORT, MESSAGE_SIZE};
 #[derive(Clone, Debug)]
 pub struct Settings {
     /// Name, id, fleet, manager and constraints; see the core.
-    pub node: NodeConfig,
+    pub node: NodeConfig<SocketAddrV4>,
     /// Its address and the length of the network's prefix. Without an address it waits for one:
     /// [`SUnit::set_address`](crate::SUnit::set_address).
     pub address: Option<Ipv4Cidr>,
@@ -23,7 +23,14 @@ pub struct Settings {
 impl Settings {
     /// The settings of an s_unit of fleet 0 with this address; [`Error::BadName`]. `epoch` must differ from boot to
     /// boot, from a true random number or a counter in flash; delays and sequence numbers are drawn from it as well.
-    pub fn new(name: &str, id: u32, target: Target, address: [u8; 4], prefix: u8, epoch: u64) -> Result<Self, Error> {
+    pub fn new(
+        name: &str,
+        id: u32,
+        target: Target<SocketAddrV4>,
+        address: [u8; 4],
+        prefix: u8,
+        epoch: u64,
+    ) -> Result<Self, Error> {
         let constraints =
             Constraints { message_size: MESSAGE_SIZE as u32, calls_per_peer: CALLS as u16, ..Constraints::S_UNIT };
         let node = NodeConfig {

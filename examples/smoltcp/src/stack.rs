@@ -1,6 +1,6 @@
 //! The network below: smoltcp's interface with one TCP and one UDP socket, and the core's [`Mailman`] over them.
 
-use core::net::SocketAddr;
+use core::net::{SocketAddr, SocketAddrV4};
 
 use cara_core::config::PLAIN_PORT;
 use cara_core::error::CloseReason;
@@ -9,7 +9,7 @@ use cara_core::time::Instant;
 use smoltcp::iface::{Config, Interface, PollIngressSingleResult, PollResult, SocketHandle, SocketSet};
 use smoltcp::phy::Device;
 use smoltcp::socket::{tcp, udp};
-use smoltcp::wire::{EthernetAddress, HardwareAddress, IpCidr, IpEndpoint, Ipv4Cidr};
+use smoltcp::wire::{EthernetAddress, HardwareAddress, IpCidr, Ipv4Cidr};
 
 use crate::resources::{DATAGRAM_PORT, StackMemory};
 
@@ -101,8 +101,8 @@ impl Stack {
     }
 
     /// Opens the stream; `false` when it cannot be: no address, or one that this network cannot reach.
-    pub(crate) fn connect(&mut self, to: SocketAddr) -> bool {
-        let (Some(to), stream) = (endpoint(to), self.sockets.get_mut::<tcp::Socket>(self.stream)) else { return false };
+    pub(crate) fn connect(&mut self, to: SocketAddrV4) -> bool {
+        let stream = self.sockets.get_mut::<tcp::Socket>(self.stream);
         stream.abort();
         // A live link's end is the core's to find out.
         stream.set_timeout(None);
@@ -143,19 +143,21 @@ impl Stack {
     }
 
     /// The next datagram and where it came from.
-    pub(crate) fn datagram(&mut self, bytes: &mut [u8]) -> Option<(SocketAddr, usize)> {
+    pub(crate) fn datagram(&mut self, bytes: &mut [u8]) -> Option<(SocketAddrV4, usize)> {
         let socket = self.sockets.get_mut::<udp::Socket>(self.datagrams);
         while socket.can_recv() {
             // A datagram longer than any of CARA does not fit the buffer: it is dropped, not truncated.
-            if let Ok((length, from)) = socket.recv_slice(bytes) {
-                return Some((from.endpoint.into(), length));
+            if let Ok((length, from)) = socket.recv_slice(bytes)
+                && let SocketAddr::V4(from) = from.endpoint.into()
+            {
+                return Some((from, length));
             }
         }
         None
     }
 }
 
-impl Mailman for Stack {
+impl Mailman<SocketAddrV4> for Stack {
     fn write(&mut self, _: LinkId, slices: &[&[u8]]) -> Result<usize, CloseReason> {
         let stream = self.sockets.get_mut::<tcp::Socket>(self.stream);
         let mut written = 0;
@@ -169,24 +171,17 @@ impl Mailman for Stack {
         Ok(written)
     }
 
-    fn send_to(&mut self, to: SocketAddr, datagram: &[u8]) -> bool {
+    fn send_to(&mut self, to: SocketAddrV4, datagram: &[u8]) -> bool {
         let socket = self.sockets.get_mut::<udp::Socket>(self.datagrams);
-        endpoint(to).is_some_and(|to| socket.send_slice(datagram, to).is_ok())
+        socket.send_slice(datagram, to).is_ok()
     }
 
     fn broadcast(&mut self, datagram: &[u8]) -> bool {
         let everybody = self.address.and_then(|address| address.broadcast());
-        everybody.is_some_and(|everybody| self.send_to(SocketAddr::new(everybody.into(), PLAIN_PORT), datagram))
+        everybody.is_some_and(|everybody| self.send_to(SocketAddrV4::new(everybody, PLAIN_PORT), datagram))
     }
 }
 
 fn instant(now: Instant) -> smoltcp::time::Instant {
     smoltcp::time::Instant::from_micros(i64::try_from(now.as_micros()).unwrap_or(i64::MAX))
-}
-
-fn endpoint(address: SocketAddr) -> Option<IpEndpoint> {
-    match address {
-        SocketAddr::V4(address) => Some(address.into()),
-        SocketAddr::V6(_) => None,
-    }
 }

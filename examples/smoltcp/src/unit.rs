@@ -1,5 +1,7 @@
 //! The unit that the program holds: what it offers and requests, and [`SUnit::poll`].
 
+use core::net::SocketAddrV4;
+
 use cara_core::distribution::connection_handler::Node;
 use cara_core::distribution::function::{Attributes, Definition};
 use cara_core::distribution::function_list::{FunctionList, Slot, TheirFunctionList};
@@ -30,12 +32,13 @@ pub enum Smoltcp {}
 impl Port for Smoltcp {
     type Storage = Lent;
     type Cipher = Plain;
+    type Endpoint = SocketAddrV4;
 }
 
 /// An s_unit on smoltcp.
 pub struct SUnit {
     pub(crate) stack: Stack,
-    pub(crate) hub: Hub<Lent>,
+    pub(crate) hub: Hub<Smoltcp>,
     pub(crate) functions: FunctionList<Lent, Offered>,
     pub(crate) buffers: Pool<Lent>,
     pub(crate) arguments: &'static mut Arguments,
@@ -189,7 +192,7 @@ impl SUnit {
     }
 
     /// Discovery and membership, for its counters and findings.
-    pub fn node(&self) -> &Node<Lent> {
+    pub fn node(&self) -> &Node<Smoltcp> {
         &self.hub.node
     }
 

@@ -1,7 +1,7 @@
 //! Units, nodes, refusals and events in the control socket's form.
 
+use crate::Finding;
 use cara_core::config::{Constraints, Priority, VERSION};
-use cara_core::distribution::connection_handler::Finding;
 use cara_core::distribution::identity::{Epoch, Identity};
 use cara_core::services::lease::LeaseEnd;
 use cara_core::time::Duration;

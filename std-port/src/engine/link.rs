@@ -29,6 +29,7 @@ pub(crate) enum Linux {}
 impl Port for Linux {
     type Storage = Boxed;
     type Cipher = Cipher;
+    type Endpoint = SocketAddr;
 }
 
 /// Calls that leave no room for more hold up what follows them for so long after the last one has ended.
@@ -265,7 +266,7 @@ pub(crate) struct StdMailman<'a> {
     pub(crate) datagrams: &'a Datagrams,
 }
 
-impl Mailman for StdMailman<'_> {
+impl Mailman<SocketAddr> for StdMailman<'_> {
     fn write(&mut self, _link: LinkId, slices: &[&[u8]]) -> Result<usize, CloseReason> {
         self.stream.map_or(Ok(0), |stream| stream.send(slices))
     }

@@ -15,12 +15,11 @@ use cara_core::time::{Duration, Instant};
 use core::net::{IpAddr, SocketAddr};
 
 use super::Engine;
-use super::link::{LinkCell, LinkState, StdMailman};
+use super::link::{LinkCell, LinkState, Linux, StdMailman};
 use super::notices::Notice;
 use super::reader::Cause;
 use crate::event::UnitEvent;
 use crate::seldom::warn_seldom;
-use crate::storage::Boxed;
 use crate::sys::datagram::Socket;
 use crate::sys::epoll::Interest;
 use crate::sys::limits;
@@ -29,7 +28,7 @@ use crate::threads::DATAGRAM;
 
 /// What the hub's lock protects. Nothing is locked under it.
 pub(crate) struct HubCell {
-    pub(crate) hub: Hub<Boxed>,
+    pub(crate) hub: Hub<Linux>,
     serial: u32,
     /// The serial of the link that last had an index: what the hub says of an index is meant for that one.
     serials: HashMap<LinkId, u32>,
@@ -44,12 +43,12 @@ const KEPT_FOR_OPERATOR: u64 = 20;
 struct Dialed<'i>(Option<&'i Identity>);
 
 impl HubCell {
-    pub(crate) fn new(hub: Hub<Boxed>) -> Self {
+    pub(crate) fn new(hub: Hub<Linux>) -> Self {
         Self { hub, serial: 0, serials: HashMap::new() }
     }
 
     /// The serial of the link that a command is for. Another link may have its index by the time that it is passed on.
-    fn serial_of(&self, command: &Command) -> Option<u32> {
+    fn serial_of(&self, command: &Command<SocketAddr>) -> Option<u32> {
         match command {
             Command::Dial { .. } => None,
             Command::Tell(link, _) => self.serials.get(link).copied(),
@@ -63,8 +62,8 @@ impl HubCell {
 }
 
 /// The hub, for sessions: under the lock of one link.
-impl<T: Send + 'static> Door<Boxed> for &Engine<T> {
-    fn enter(&mut self, act: &mut dyn FnMut(&mut Hub<Boxed>)) {
+impl<T: Send + 'static> Door<Linux> for &Engine<T> {
+    fn enter(&mut self, act: &mut dyn FnMut(&mut Hub<Linux>)) {
         let due = {
             let mut cell = self.hub();
             act(&mut cell.hub);
@@ -283,7 +282,7 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     /// Passes on what the hub wants done, to the link that it meant and to no other.
-    fn carry_out(&self, command: Command, serial: Option<u32>) {
+    fn carry_out(&self, command: Command<SocketAddr>, serial: Option<u32>) {
         match command {
             Command::Dial { to, identity } => self.dial(to, identity.as_ref()),
             Command::Tell(id, directive) => {

@@ -12,7 +12,7 @@ use cara_core::services::unit::{RequestOptions, SessionStorage};
 use cara_core::time::Instant;
 
 use super::Engine;
-use super::link::{LinkCell, LinkState};
+use super::link::{LinkCell, LinkState, Linux};
 use crate::config::Capacities;
 use crate::storage::{Boxed, filled, filled_with};
 use crate::sys::limits;
@@ -40,7 +40,7 @@ fn longer(length: usize, needed: usize, most: usize) -> usize {
 }
 
 /// The slices of a unit that may be connected to so many nodes, over so many links.
-pub(crate) fn node_storage(nodes: usize, links: usize) -> NodeStorage<Boxed> {
+pub(crate) fn node_storage(nodes: usize, links: usize) -> NodeStorage<Linux> {
     NodeStorage {
         nodes: filled(nodes + REMEMBERED_NODES, None),
         order: filled_with(nodes + REMEMBERED_NODES, Default::default),

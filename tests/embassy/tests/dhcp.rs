@@ -72,15 +72,15 @@ fn a_unit_joins_with_the_address_that_it_is_given_and_again_with_another() {
     assert!(!agv.is_connected(), "nobody has given it an address");
     let given = Rc::new(Cell::new(Ipv4Addr::new(10, 77, 5, 5)));
     serve(&depot, Rc::clone(&given));
-    let address = || manager.peer("agv").ok().and_then(|peer| peer.address()).map(|address| address.ip());
-    assert!(bench.run_until(|| address() == Some(given.get().into()), LONG));
+    let address = || manager.peer("agv").ok().and_then(|peer| peer.address()).map(|address| *address.ip());
+    assert!(bench.run_until(|| address() == Some(given.get()), LONG));
 
     // The cable is pulled, and where it is plugged in again another address is given.
     board.set_cable(false);
     assert!(bench.run_until(|| !agv.is_connected() && !manager.is_connected(), LONG));
     given.set(Ipv4Addr::new(10, 77, 6, 6));
     board.set_cable(true);
-    assert!(bench.run_until(|| address() == Some(given.get().into()), LONG));
+    assert!(bench.run_until(|| address() == Some(given.get()), LONG));
     let told = Rc::new(Cell::new(0));
     let noted = Rc::clone(&told);
     board.spawn(async move {

@@ -2,7 +2,7 @@
 //! cancelling.
 
 use std::cell::{Cell, RefCell};
-use std::net::Ipv4Addr;
+use std::net::{Ipv4Addr, SocketAddrV4};
 use std::pin::Pin;
 use std::rc::Rc;
 use std::task::{Context, Poll};
@@ -309,7 +309,7 @@ fn a_new_address_ends_the_link_and_the_board_is_found_there() {
     let ((_, manager), (agv_board, agv)) = (manager(&bench), agv(&bench));
     assert!(bench.run_until(|| manager.number_of_s_units() == 1 && agv.is_connected(), SHORT));
     agv_board.move_to(Ipv4Addr::new(10, 77, 9, 9));
-    let there = || manager.peer("agv").unwrap().address().is_some_and(|at| at.ip() == Ipv4Addr::new(10, 77, 9, 9));
+    let there = || manager.peer("agv").unwrap().address().is_some_and(|at| *at.ip() == Ipv4Addr::new(10, 77, 9, 9));
     assert!(bench.run_until(there, LONG));
     assert_eq!(agv.with_state(|state| state.losses), Ok(1));
 }
@@ -603,7 +603,7 @@ fn a_unit_with_keys_of_another_root_is_not_heard() {
     bench.run_for(LONG);
     assert!(!agv.is_connected() && !manager.is_connected());
     // Also where it need not search: the link ends before the node has heard of it.
-    let address = (Ipv4Addr::new(10, 77, 0, 1), SECURED_PORT).into();
+    let address = SocketAddrV4::new(Ipv4Addr::new(10, 77, 0, 1), SECURED_PORT);
     let unknown = keys(1, &agv_identity(), 0, 8);
     let board = bench.board();
     let config = Config::s_unit("agv", 7, "manager", 1, unknown).unwrap().manager_address(address);

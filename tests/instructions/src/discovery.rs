@@ -1,6 +1,6 @@
 //! One node is found among many that are connected.
 
-use core::net::SocketAddr;
+use core::net::{Ipv4Addr, SocketAddrV4};
 
 use cara_core::config::{Constraints, LINK_BUFFER_BYTES, Mode};
 use cara_core::distribution::connection_handler::{Finding, Known, Node, NodeConfig, NodeStorage, Order, Target};
@@ -30,10 +30,10 @@ const SPARE: usize = 4;
 
 /// The memory of a node: a row for each of `NODES`, four of which stay free.
 pub struct DiscoveryMemory<const NODES: usize> {
-    nodes: [Option<Known>; NODES],
+    nodes: [Option<Known<SocketAddrV4>>; NODES],
     order: [Order; NODES],
     links: [Option<u16>; NODES],
-    findings: [Option<Finding>; 4],
+    findings: [Option<Finding<SocketAddrV4>>; 4],
     to_all: [bool; 1],
     to_one: [Option<PublishedToOne>; 1],
     functions: [Entry<Nothing>; 1],
@@ -79,12 +79,12 @@ impl<const NODES: usize> Default for DiscoveryMemory<NODES> {
 /// Counts datagrams instead of sending them.
 struct Outbox(u32);
 
-impl Mailman for Outbox {
+impl Mailman<SocketAddrV4> for Outbox {
     fn write(&mut self, _: LinkId, _: &[&[u8]]) -> Result<usize, CloseReason> {
         Ok(0)
     }
 
-    fn send_to(&mut self, _: SocketAddr, _: &[u8]) -> bool {
+    fn send_to(&mut self, _: SocketAddrV4, _: &[u8]) -> bool {
         self.0 += 1;
         true
     }
@@ -97,7 +97,7 @@ impl Mailman for Outbox {
 
 /// A manager with many AGVs.
 pub struct Discovery {
-    hub: Hub<Lent>,
+    hub: Hub<Bench>,
     functions: FunctionList<Lent, Nothing>,
     pool: Pool<Lent>,
     /// What the session of the next newcomer lives in.
@@ -269,7 +269,7 @@ fn agv(id: u32) -> Identity {
     Identity::s_unit("agv", id).expect("a name")
 }
 
-fn address(identity: &Identity) -> SocketAddr {
+fn address(identity: &Identity) -> SocketAddrV4 {
     let [_, b, c, d] = identity.id().to_be_bytes();
-    SocketAddr::from(([10, b, c, d], 7_001))
+    SocketAddrV4::new(Ipv4Addr::new(10, b, c, d), 7_001)
 }

@@ -3,7 +3,7 @@
 //! Each side does what a port does with it, as the front page of `cara_core::services` says. What is no part of it: sockets,
 //! locks, wakers, and the handler, which does nothing. The mailman copies what it is given once, as a socket would.
 
-use core::net::{Ipv4Addr, SocketAddr};
+use core::net::{Ipv4Addr, SocketAddrV4};
 
 use cara_core::config::{Constraints, LINK_BUFFER_BYTES};
 use cara_core::distribution::connection_handler::{Finding, Known, Node, NodeConfig, NodeStorage, Order, Target};
@@ -57,10 +57,10 @@ struct SideMemory<const BUFFER: usize> {
     buffers: [[u8; BUFFER]; BUFFERS],
     pool: [Option<Buffer<Lent>>; BUFFERS],
     pipe: [u8; BUFFER],
-    nodes: [Option<Known>; NODES],
+    nodes: [Option<Known<SocketAddrV4>>; NODES],
     order: [Order; NODES],
     links: [Option<u16>; 1],
-    findings: [Option<Finding>; 1],
+    findings: [Option<Finding<SocketAddrV4>>; 1],
     to_all: [bool; FUNCTIONS],
     to_one: [Option<PublishedToOne>; 1],
 }
@@ -130,7 +130,7 @@ impl<const BUFFER: usize> SideMemory<BUFFER> {
         let config = SessionConfig {
             link: LinkId(0),
             dialed: !caller,
-            address: SocketAddr::from((Ipv4Addr::LOCALHOST, 7_000)),
+            address: SocketAddrV4::new(Ipv4Addr::LOCALHOST, 7_000),
             local: hello(&constraints, caller),
             constraints,
         };
@@ -160,7 +160,7 @@ struct Pipe {
     used: usize,
 }
 
-impl Mailman for Pipe {
+impl Mailman<SocketAddrV4> for Pipe {
     fn write(&mut self, _: LinkId, slices: &[&[u8]]) -> Result<usize, CloseReason> {
         let before = self.used;
         for slice in slices {
@@ -171,7 +171,7 @@ impl Mailman for Pipe {
         Ok(self.used - before)
     }
 
-    fn send_to(&mut self, _: SocketAddr, _: &[u8]) -> bool {
+    fn send_to(&mut self, _: SocketAddrV4, _: &[u8]) -> bool {
         false
     }
 
@@ -186,6 +186,7 @@ pub(crate) enum Bench {}
 impl Port for Bench {
     type Storage = Lent;
     type Cipher = Plain;
+    type Endpoint = SocketAddrV4;
 }
 
 struct Side {
@@ -194,7 +195,7 @@ struct Side {
     functions: FunctionList<Lent, Nothing>,
     pool: Pool<Lent>,
     pipe: Pipe,
-    hub: Hub<Lent>,
+    hub: Hub<Bench>,
 }
 
 macro_rules! context {
@@ -363,7 +364,7 @@ fn depot() -> Manager {
     Manager::new("depot", 1).expect("a name")
 }
 
-fn node_config(constraints: Constraints, caller: bool) -> NodeConfig {
+fn node_config(constraints: Constraints, caller: bool) -> NodeConfig<SocketAddrV4> {
     NodeConfig {
         identity: identity(caller),
         fleet: Fleet(1),

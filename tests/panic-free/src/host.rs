@@ -1,9 +1,10 @@
 //! Host infrastructure: frames, links, liveness.
 
-use core::net::SocketAddr;
+use core::net::{SocketAddr, SocketAddrV4};
 
 use cara_core::error::CloseReason;
 use cara_core::host::connections::{Incoming, Link, Liveness, Place};
+use cara_core::host::endpoint::Endpoint;
 use cara_core::host::frame::{self, ChunkWriter, Cut, Frame};
 use cara_core::host::mailman::{LinkId, Mailman};
 use cara_core::storage::{Lent, Pool};
@@ -14,13 +15,13 @@ use crate::secure::AnyCipher;
 /// A network that does anything.
 pub struct AnyMailman;
 
-impl Mailman for AnyMailman {
+impl Mailman<SocketAddrV4> for AnyMailman {
     fn write(&mut self, link: LinkId, slices: &[&[u8]]) -> Result<usize, CloseReason> {
         keep((link, slices));
         *unknown()
     }
 
-    fn send_to(&mut self, to: SocketAddr, datagram: &[u8]) -> bool {
+    fn send_to(&mut self, to: SocketAddrV4, datagram: &[u8]) -> bool {
         keep((to, datagram));
         *unknown()
     }
@@ -94,4 +95,14 @@ entry!(liveness, {
     liveness.heard(*unknown());
     liveness.heard_datagram(*unknown());
     keep((liveness.datagrams_pass(), liveness.deadline(), liveness.poll(*unknown())));
+});
+
+fn any_endpoint<E: Endpoint>(endpoint: &E) {
+    keep((endpoint.port(), endpoint.at_port(*unknown()), endpoint.is_of_host(unknown())));
+    keep((endpoint.is_loopback(), endpoint.host_bits()));
+}
+
+entry!(endpoints, {
+    any_endpoint::<SocketAddrV4>(unknown());
+    any_endpoint::<SocketAddr>(unknown());
 });

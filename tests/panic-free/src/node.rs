@@ -8,12 +8,14 @@ use cara_core::distribution::identity::Identity;
 use cara_core::distribution::presence::Presence;
 use cara_core::storage::Lent;
 use core::mem::MaybeUninit;
+use core::net::SocketAddrV4;
 
 use crate::host::AnyMailman;
 use crate::linkage::{drain, keep, unknown, unknown_slice, unknown_text};
 use crate::secure::AnyCodes;
+use crate::services::Any;
 
-type AnyNode = Node<Lent>;
+type AnyNode = Node<Any>;
 
 fn node() -> &'static mut AnyNode {
     unknown()
@@ -24,8 +26,8 @@ fn identity() -> &'static Identity {
 }
 
 entry!(node_made, {
-    let config = unknown::<Option<NodeConfig>>().take();
-    let storage = unknown::<Option<NodeStorage<Lent>>>().take();
+    let config = unknown::<Option<NodeConfig<SocketAddrV4>>>().take();
+    let storage = unknown::<Option<NodeStorage<Any>>>().take();
     if let (Some(config), Some(storage)) = (config, storage) {
         unknown::<MaybeUninit<AnyNode>>().write(Node::new(*unknown(), config, storage));
     }
@@ -75,7 +77,7 @@ entry!(node_lists, {
     drain(node.find_address(*unknown()));
     keep((node.s_unit(*unknown()), node.m_unit(*unknown()), node.node(identity()), node.node_of(*unknown())));
     keep((node.find(unknown_text()), node.find_id(*unknown())));
-    let known: &Known = unknown();
+    let known: &Known<SocketAddrV4> = unknown();
     keep((known.is_joined(), known.state(), known.link(), known.index()));
 });
 
@@ -103,5 +105,5 @@ entry!(datagrams, {
 entry!(presence, {
     let presence = unknown::<Presence>();
     keep(presence.question(&AnyCodes, unknown()));
-    keep(presence.hear(*unknown(), unknown_slice(), &AnyCodes, unknown()));
+    keep(presence.hear(*unknown::<SocketAddrV4>(), unknown_slice(), &AnyCodes, unknown()));
 });

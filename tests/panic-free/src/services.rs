@@ -1,5 +1,6 @@
 //! Common services: a session from hello to close, leases, visibility of functions.
 
+use core::net::SocketAddrV4;
 use core::mem::MaybeUninit;
 
 use cara_core::distribution::datagram;
@@ -28,11 +29,12 @@ impl Service for Handler {
 }
 
 /// A port of which nothing is known.
-enum Any {}
+pub enum Any {}
 
 impl Port for Any {
     type Storage = Lent;
     type Cipher = AnyCipher;
+    type Endpoint = SocketAddrV4;
 }
 
 type AnySession = Session<Any>;
@@ -68,7 +70,7 @@ entry!(own_functions, {
 });
 
 entry!(session_made, {
-    if let (Some(config), Some(storage)) = (taken::<SessionConfig>(), taken::<SessionStorage<Lent>>()) {
+    if let (Some(config), Some(storage)) = (taken::<SessionConfig<SocketAddrV4>>(), taken::<SessionStorage<Lent>>()) {
         unknown::<MaybeUninit<AnySession>>().write(Session::new(*unknown(), config, AnyCipher, storage));
     }
 });

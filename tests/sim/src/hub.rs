@@ -1,6 +1,7 @@
 //! A unit's hub on the heap, for tests that drive sessions themselves.
 
 use cara_core::distribution::connection_handler::{Node, NodeConfig, NodeStorage};
+use cara_core::services::Port;
 use cara_core::services::hub::Hub;
 use cara_core::services::publications::Publications;
 use cara_core::time::Instant;
@@ -8,7 +9,10 @@ use cara_core::time::Instant;
 use crate::storage::Boxed;
 
 /// The hub of a unit that may have so many links and functions, and knows twice as many nodes as it has links.
-pub fn hub(now: Instant, config: NodeConfig, links: usize, functions: usize) -> Hub<Boxed> {
+pub fn hub<P>(now: Instant, config: NodeConfig<P::Endpoint>, links: usize, functions: usize) -> Hub<P>
+where
+    P: Port<Storage = Boxed>,
+{
     let nodes = 2 * links;
     let storage = NodeStorage {
         nodes: Boxed::slice(nodes),

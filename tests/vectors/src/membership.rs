@@ -7,10 +7,10 @@ use cara_core::services::hub::Hub;
 use cara_core::services::publications::Publications;
 use cara_core::time::Instant;
 
-use crate::stream::Boxed;
+use crate::side::Vectors;
 
 /// The hub of the unit that `own` introduces, which takes `maximum` peers.
-pub(crate) fn hub(own: &Hello, maximum: u16) -> Hub<Boxed> {
+pub(crate) fn hub(own: &Hello, maximum: u16) -> Hub<Vectors> {
     let config = NodeConfig {
         identity: own.identity.clone(),
         fleet: own.fleet,

@@ -32,7 +32,7 @@ pub(crate) enum Written {
 #[derive(Default)]
 struct Kept(Vec<Written>);
 
-impl Mailman for Kept {
+impl Mailman<SocketAddr> for Kept {
     fn write(&mut self, _: LinkId, slices: &[&[u8]]) -> Result<usize, CloseReason> {
         let bytes = slices.concat();
         let count = bytes.len();
@@ -54,11 +54,12 @@ impl Mailman for Kept {
 }
 
 /// These ends, as the core's port.
-enum Vectors {}
+pub(crate) enum Vectors {}
 
 impl Port for Vectors {
     type Storage = Boxed;
     type Cipher = Plain;
+    type Endpoint = SocketAddr;
 }
 
 /// One end of a link, with a clock of its own.
@@ -66,7 +67,7 @@ pub(crate) struct Side {
     session: Session<Vectors>,
     pool: Pool<Boxed>,
     functions: FunctionList<Boxed, ()>,
-    hub: Hub<Boxed>,
+    hub: Hub<Vectors>,
     kept: Kept,
     now: Instant,
     /// Calls that the peer has made and that wait for an answer.

@@ -32,7 +32,7 @@ struct Purpose {
 }
 
 /// A layer talks to its neighbour. These are the exceptions of services; everything else of host goes through distribution.
-const HOST_FOR_SERVICES: [Purpose; 15] = [
+const HOST_FOR_SERVICES: [Purpose; 17] = [
     Purpose {
         what: "the cipher's trait, over which all of a session is generic",
         places: &["services"],
@@ -42,6 +42,12 @@ const HOST_FOR_SERVICES: [Purpose; 15] = [
         what: "what happens on a link is counted in the link",
         places: &["services/unit"],
         items: &["connections::LinkCounter"],
+    },
+    Purpose { what: "what a port is made of, for all layers", places: &["services/mod.rs"], items: &["port::Port"] },
+    Purpose {
+        what: "the peer's host, and where on it its datagrams go",
+        places: &["services/unit/inbound.rs", "services/unit/proving.rs", "services/unit/timing.rs"],
+        items: &["endpoint::Endpoint"],
     },
     Purpose {
         what: "the port's sockets, lent down to the link",
@@ -291,7 +297,10 @@ fn layer(module: &str) -> Option<Layer> {
     }
 }
 
-/// What the core refuses altogether: the standard library, an allocator, `unsafe`.
+/// The one file that knows of IP.
+const ENDPOINTS: &str = "host/endpoint.rs";
+
+/// What the core refuses altogether: the standard library, an allocator, `unsafe`, addresses of IP.
 fn forbidden_words(file: &Path, text: &str) -> Vec<Wrong> {
     let all = source::tokens(text);
     let kept = source::without_tests(&all);
@@ -309,6 +318,11 @@ fn forbidden_words(file: &Path, text: &str) -> Vec<Wrong> {
         match token.text {
             "unsafe" => found.push(wrong(token, "the core has no unsafe")),
             "std" | "alloc" if names_a_crate => found.push(wrong(token, "the core has no std and no alloc")),
+            "SocketAddr" | "SocketAddrV4" | "SocketAddrV6" | "IpAddr" | "Ipv4Addr" | "Ipv6Addr"
+                if file != Path::new(ENDPOINTS) =>
+            {
+                found.push(wrong(token, "an address is the port's own: host::endpoint::Endpoint"));
+            }
             "async" | "await" => found.push(wrong(token, "the core is polled, it has no async")),
             _ => {}
         }
@@ -435,10 +449,12 @@ mod tests {
     }
 
     #[test]
-    fn the_core_refuses_std_alloc_async_and_unsafe() {
+    fn the_core_refuses_std_alloc_async_unsafe_and_ip() {
         let words = |text: &str| forbidden_words(Path::new("time.rs"), text).len();
         assert_eq!(words("use std::time::Instant;"), 1);
         assert_eq!(words("extern crate alloc;"), 1);
+        assert_eq!(words("fn f(from: core::net::SocketAddr) {}"), 1);
+        assert_eq!(forbidden_words(Path::new("host/endpoint.rs"), "use core::net::SocketAddr;").len(), 0);
         assert_eq!(words("fn f() { unsafe { g() } }"), 1);
         assert_eq!(words("async fn f() {}"), 1);
         assert_eq!(words("#[cfg(test)] extern crate std; #[cfg(test)] mod tests { use std::vec; }"), 0);

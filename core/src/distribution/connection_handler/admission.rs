@@ -1,8 +1,6 @@
 //! Which links are taken: one per node, of the right fleet, role and manager, as many as the constraint allows; and how a
 //! node that restarted is told from another one with the same identity.
 
-use core::net::SocketAddr;
-
 use super::known::{Known, Newcomer, NodeState};
 use super::timetable::Task;
 use super::{Command, Directive, Node, NodeCounter};
@@ -11,7 +9,7 @@ use crate::distribution::hello::Hello;
 use crate::distribution::identity::{Identity, Role};
 use crate::error::{CloseReason, Refusal};
 use crate::host::mailman::LinkId;
-use crate::storage::Storage;
+use crate::host::port::Port;
 use crate::time::Instant;
 
 /// What the node says to a hello.
@@ -25,9 +23,9 @@ pub(crate) enum Admission {
     Wait,
 }
 
-impl<S: Storage> Node<S> {
+impl<P: Port> Node<P> {
     /// Decides about a link whose hello has come. `from` is the other end of the stream.
-    pub(crate) fn admit(&mut self, now: Instant, link: LinkId, from: SocketAddr, hello: &Hello) -> Admission {
+    pub(crate) fn admit(&mut self, now: Instant, link: LinkId, from: P::Endpoint, hello: &Hello) -> Admission {
         if let Err(refusal) = self.check(hello) {
             return self.refuse(now, from, &hello.identity, refusal);
         }
@@ -43,7 +41,7 @@ impl<S: Storage> Node<S> {
     }
 
     /// There is no key for this unit and the peer of a link, which is refused. The identity may be anybody's.
-    pub(crate) fn refuse_without_key(&mut self, now: Instant, from: SocketAddr, identity: &Identity) {
+    pub(crate) fn refuse_without_key(&mut self, now: Instant, from: P::Endpoint, identity: &Identity) {
         self.refuse(now, from, identity, Refusal::NoKey);
     }
 
@@ -72,7 +70,7 @@ impl<S: Storage> Node<S> {
         self.table.joined() >= self.config.constraints.maximum_nodes
     }
 
-    fn join(&mut self, now: Instant, identity: &Identity, newcomer: Newcomer) -> Admission {
+    fn join(&mut self, now: Instant, identity: &Identity, newcomer: Newcomer<P::Endpoint>) -> Admission {
         let Newcomer { link, epoch, limits, address, .. } = newcomer;
         let Some((place, forgotten)) = self.table.place_of(identity, address, epoch) else {
             return self.refuse(now, address, identity, Refusal::Full);
@@ -101,7 +99,13 @@ impl<S: Storage> Node<S> {
     }
 
     /// Another link has the identity of a node that is connected.
-    fn meet(&mut self, now: Instant, place: usize, identity: &Identity, mut newcomer: Newcomer) -> Admission {
+    fn meet(
+        &mut self,
+        now: Instant,
+        place: usize,
+        identity: &Identity,
+        mut newcomer: Newcomer<P::Endpoint>,
+    ) -> Admission {
         // Both ends compare the same two identities, so they keep the same one of two links without asking each other.
         let smaller = self.config.identity < *identity;
         let Some(known) = self.table.node_mut(place) else { return Admission::Refuse(Refusal::Full) };
@@ -125,7 +129,7 @@ impl<S: Storage> Node<S> {
     }
 
     /// The link that a newcomer would replace is to show whether it is alive.
-    pub(super) fn challenge(&mut self, now: Instant, place: usize) -> Option<Command> {
+    pub(super) fn challenge(&mut self, now: Instant, place: usize) -> Option<Command<P::Endpoint>> {
         let known = self.table.node(place)?;
         let (old, decided) = (known.link()?, known.newcomer.as_ref()?.decided);
         let until = if decided { now } else { now + CHALLENGE_TIMEOUT };
@@ -136,13 +140,13 @@ impl<S: Storage> Node<S> {
     /// The challenged link has answered: the newcomer is not taken.
     pub(crate) fn challenge_answered(&mut self, now: Instant, old: LinkId) {
         let Some(place) = self.table.of_link(old) else { return };
-        let waits = |known: &Known| known.newcomer.as_ref().is_some_and(|newcomer| !newcomer.decided);
+        let waits = |known: &Known<P::Endpoint>| known.newcomer.as_ref().is_some_and(|newcomer| !newcomer.decided);
         if self.table.node(place).is_some_and(|known| known.link() == Some(old) && waits(known)) {
             self.table.schedule(place, now, Task::Refuse);
         }
     }
 
-    pub(super) fn refuse_newcomer(&mut self, now: Instant, place: usize) -> Option<Command> {
+    pub(super) fn refuse_newcomer(&mut self, now: Instant, place: usize) -> Option<Command<P::Endpoint>> {
         let known = self.table.node_mut(place)?;
         let newcomer = known.newcomer.take()?;
         known.dialing.take_if(|dialing| *dialing == newcomer.link);
@@ -155,7 +159,7 @@ impl<S: Storage> Node<S> {
 
     /// The challenge has not been answered in time: the link makes room. The newcomer takes the place when it has
     /// [left](Node::left).
-    pub(super) fn supersede(&mut self, place: usize) -> Option<Command> {
+    pub(super) fn supersede(&mut self, place: usize) -> Option<Command<P::Endpoint>> {
         let known = self.table.node_mut(place)?;
         let (old, epoch) = (known.link()?, known.epoch);
         let newcomer = known.newcomer.as_mut()?;
@@ -170,7 +174,7 @@ impl<S: Storage> Node<S> {
     }
 
     /// A newcomer joins in the place of a link that is gone.
-    pub(super) fn take_place(&mut self, now: Instant, place: usize, newcomer: Newcomer) {
+    pub(super) fn take_place(&mut self, now: Instant, place: usize, newcomer: Newcomer<P::Endpoint>) {
         if let Some(identity) = self.table.node(place).map(|known| known.identity.clone())
             && self.join(now, &identity, newcomer) == Admission::Accept
         {
@@ -178,7 +182,7 @@ impl<S: Storage> Node<S> {
         }
     }
 
-    fn refuse(&mut self, now: Instant, address: SocketAddr, identity: &Identity, refusal: Refusal) -> Admission {
+    fn refuse(&mut self, now: Instant, address: P::Endpoint, identity: &Identity, refusal: Refusal) -> Admission {
         let counter = match refusal {
             Refusal::Version | Refusal::Malformed => NodeCounter::RefusedVersion,
             Refusal::Fleet => NodeCounter::RefusedFleet,

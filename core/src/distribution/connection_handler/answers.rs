@@ -1,7 +1,5 @@
 //! Answers to searches, and dials to the nodes that were found.
 
-use core::net::SocketAddr;
-
 use super::known::NodeState;
 use super::search::back_off;
 use super::timetable::Task;
@@ -11,8 +9,9 @@ use crate::distribution::authenticator::Authenticator;
 use crate::distribution::datagram::{Announce, SEARCH_BYTES, WhoHas, short_hash};
 use crate::distribution::identity::{Epoch, Identity, Role};
 use crate::error::Refusal;
+use crate::host::endpoint::Endpoint as _;
 use crate::host::mailman::Mailman;
-use crate::storage::Storage;
+use crate::host::port::Port;
 use crate::time::{Duration, Instant};
 
 /// A second unit that asks within this time is answered by a broadcast as well: where two ask, more are holding back,
@@ -39,9 +38,9 @@ pub(super) const DIAL_TIMEOUT: Duration = Duration::from_secs(6);
 
 /// An answer to a single node.
 #[derive(Clone, Debug)]
-struct Answer {
+struct Answer<E> {
     at: Instant,
-    to: SocketAddr,
+    to: E,
     /// The node that asked.
     who: Identity,
     nonce: u64,
@@ -49,15 +48,15 @@ struct Answer {
 
 /// Answers that are due.
 #[derive(Clone, Debug)]
-pub(super) struct Answers {
-    single: heapless::Vec<Answer, WAITING_ANSWERS>,
+pub(super) struct Answers<E> {
+    single: heapless::Vec<Answer<E>, WAITING_ANSWERS>,
     broadcast: Option<Instant>,
     last_broadcast: Option<Instant>,
     /// The [`short_hash`] of the node that asked last, and when.
     asked: Option<(Instant, u32)>,
 }
 
-impl Answers {
+impl<E> Answers<E> {
     pub(super) const fn new() -> Self {
         Self { single: heapless::Vec::new(), broadcast: None, last_broadcast: None, asked: None }
     }
@@ -82,9 +81,9 @@ impl Found {
     }
 }
 
-impl<S: Storage> Node<S> {
+impl<P: Port> Node<P> {
     /// A unit looks for this manager: the first is answered alone, and with the second all the others as well.
-    pub(super) fn answer_seeker(&mut self, now: Instant, from: SocketAddr, who_has: &WhoHas) {
+    pub(super) fn answer_seeker(&mut self, now: Instant, from: P::Endpoint, who_has: &WhoHas) {
         if who_has.expected == 0 {
             // It asks this unit alone, and has waited already.
             self.answer_later(now, from, &who_has.identity, who_has.nonce);
@@ -103,32 +102,37 @@ impl<S: Storage> Node<S> {
 
     /// An s_unit that looks for no manager looks at the network. There is no key of it and this unit: in secured mode it
     /// gets the answer of a broadcast, which the fleet's code alone is for.
-    pub(super) fn answer_survey(&mut self, now: Instant, from: SocketAddr, who_has: &WhoHas, mode: Mode) {
+    pub(super) fn answer_survey(&mut self, now: Instant, from: P::Endpoint, who_has: &WhoHas, mode: Mode) {
         let delay = self.spread(who_has.expected);
         self.answer_unpaired(now + delay, from, who_has, mode);
     }
 
     /// Schedules an answer to a unit that has no pair key with this one.
-    pub(super) fn answer_unpaired(&mut self, at: Instant, to: SocketAddr, who_has: &WhoHas, mode: Mode) {
+    pub(super) fn answer_unpaired(&mut self, at: Instant, to: P::Endpoint, who_has: &WhoHas, mode: Mode) {
         let nonce = if mode == Mode::Secured { 0 } else { who_has.nonce };
         self.answer_later(at, to, &who_has.identity, nonce);
     }
 
     /// Schedules an answer to one node. If the list is full, the broadcast or the next question serves it; one host
     /// cannot fill the list.
-    pub(super) fn answer_later(&mut self, at: Instant, to: SocketAddr, who: &Identity, nonce: u64) {
+    pub(super) fn answer_later(&mut self, at: Instant, to: P::Endpoint, who: &Identity, nonce: u64) {
         let single = &mut self.answers.single;
         if single.iter().any(|answer| answer.to == to && answer.nonce == nonce) {
             return;
         }
-        let of_host = single.iter().filter(|answer| answer.to.ip() == to.ip()).count();
-        let is_crowded = of_host >= ANSWERS_TO_A_HOST && !to.ip().is_loopback();
+        let of_host = single.iter().filter(|answer| answer.to.is_of_host(&to)).count();
+        let is_crowded = of_host >= ANSWERS_TO_A_HOST && !to.is_loopback();
         if is_crowded || single.push(Answer { at, to, who: who.clone(), nonce }).is_err() {
             self.counters.add(NodeCounter::AnnounceDropped, 1);
         }
     }
 
-    pub(super) fn poll_answers(&mut self, now: Instant, mailman: &mut dyn Mailman, authenticator: &dyn Authenticator) {
+    pub(super) fn poll_answers(
+        &mut self,
+        now: Instant,
+        mailman: &mut dyn Mailman<P::Endpoint>,
+        authenticator: &dyn Authenticator,
+    ) {
         while let Some(index) = self.answers.single.iter().position(|answer| answer.at <= now) {
             let Answer { to, who, nonce, .. } = self.answers.single.swap_remove(index);
             let send = |datagram: &[u8]| mailman.send_to(to, datagram);
@@ -195,12 +199,12 @@ impl<S: Storage> Node<S> {
 
     /// A node that this unit dials has answered it: it is dialled at once, unless it is connected. While a dial to another
     /// address of it is silent, this one is tried beside it.
-    pub(super) fn found(&mut self, now: Instant, identity: &Identity, from: SocketAddr, found: Found) {
+    pub(super) fn found(&mut self, now: Instant, identity: &Identity, from: P::Endpoint, found: Found) {
         let Found { epoch, sequence, tcp_port } = found;
         if tcp_port == 0 || matches!(self.config.target, Target::Fixed(..)) {
             return;
         }
-        let address = SocketAddr::new(from.ip(), tcp_port);
+        let address = from.at_port(tcp_port);
         let Some((place, forgotten)) = self.table.hear_of(identity, address, epoch) else {
             self.counters.add(NodeCounter::TableFull, 1);
             return;
@@ -235,7 +239,7 @@ impl<S: Storage> Node<S> {
     }
 
     /// The time to dial a node has come.
-    pub(super) fn dial(&mut self, now: Instant, place: usize) -> Option<Command> {
+    pub(super) fn dial(&mut self, now: Instant, place: usize) -> Option<Command<P::Endpoint>> {
         if self.is_full() {
             self.retry(now, place);
             return None;

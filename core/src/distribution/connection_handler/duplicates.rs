@@ -1,27 +1,29 @@
 //! Duplicate identity: another live node with this unit's own name and id, detected on both sides and reported to the
 //! application.
 
-use core::net::SocketAddr;
-
 use super::{Node, NodeCounter};
 use crate::config::LONGEST_SEARCH;
 use crate::distribution::datagram::WhoHas;
 use crate::distribution::identity::{Epoch, Identity, Role};
 use crate::error::Refusal;
-use crate::storage::Storage;
+use crate::host::port::Port;
 use crate::time::Instant;
 
 /// What has been heard of others with this unit's identity.
-#[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Duplicates {
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Duplicates<E> {
     /// To be reported.
-    pending: Option<SocketAddr>,
+    pending: Option<E>,
     /// The boot that was reported last, and when: reports of a node that claims many boots are rate-limited.
     reported: Option<(Epoch, Instant)>,
 }
 
-impl Duplicates {
-    fn hear(&mut self, now: Instant, from: SocketAddr, epoch: Epoch) {
+impl<E> Duplicates<E> {
+    pub(super) const fn new() -> Self {
+        Self { pending: None, reported: None }
+    }
+
+    fn hear(&mut self, now: Instant, from: E, epoch: Epoch) {
         let known = self.reported.is_some_and(|(reported, at)| reported == epoch || now < at + LONGEST_SEARCH);
         if !known {
             (self.pending, self.reported) = (Some(from), Some((epoch, now)));
@@ -29,10 +31,10 @@ impl Duplicates {
     }
 }
 
-impl<S: Storage> Node<S> {
+impl<P: Port> Node<P> {
     /// The address of another live node with this unit's own name and id, reported once for each of its boots. It waits
     /// until this unit stops, or this one waits for it: give each node its own name or id.
-    pub fn take_twin(&mut self) -> Option<SocketAddr> {
+    pub fn take_twin(&mut self) -> Option<P::Endpoint> {
         self.duplicates.pending.take()
     }
 
@@ -41,7 +43,7 @@ impl<S: Storage> Node<S> {
     pub(super) fn is_own(
         &mut self,
         now: Instant,
-        from: SocketAddr,
+        from: P::Endpoint,
         identity: &Identity,
         epoch: Epoch,
         question: Option<&WhoHas>,

@@ -5,8 +5,6 @@
 //! is heard, and is displaced by another one a second after it was asked. The unit's own search continues: a hint
 //! delays it once, by a second at most.
 
-use core::net::{IpAddr, SocketAddr};
-
 use super::known::NodeState;
 use super::search::{back_off, mostly_late};
 use super::{Node, NodeCounter, Target};
@@ -14,8 +12,9 @@ use crate::config::{FIRST_SEARCH, LONGEST_SEARCH};
 use crate::distribution::authenticator::Authenticator;
 use crate::distribution::hello::Manager;
 use crate::distribution::identity::Identity;
+use crate::host::endpoint::{Endpoint, mix};
 use crate::host::mailman::Mailman;
-use crate::storage::Storage;
+use crate::host::port::Port;
 use crate::time::{Duration, Instant};
 
 /// Addresses that are asked side by side.
@@ -33,8 +32,8 @@ const HOSTS: usize = 16;
 
 /// One address that a broadcast came from.
 #[derive(Clone, Debug)]
-struct Hint {
-    from: SocketAddr,
+struct Hint<E> {
+    from: E,
     /// The identity that the broadcast claims.
     who: Identity,
     /// When it is asked; `None` afterwards.
@@ -49,11 +48,11 @@ struct Hint {
 
 /// The addresses that are asked, or were a short while ago.
 #[derive(Clone, Debug)]
-pub(super) struct Hints {
-    list: heapless::Vec<Hint, HINTS>,
+pub(super) struct Hints<E> {
+    list: heapless::Vec<Hint<E>, HINTS>,
 }
 
-impl Hints {
+impl<E: Endpoint> Hints<E> {
     pub(super) const fn new() -> Self {
         Self { list: heapless::Vec::new() }
     }
@@ -63,7 +62,7 @@ impl Hints {
     }
 
     /// Schedules a question. `false` if one is scheduled already, or the list is full.
-    fn plan(&mut self, now: Instant, from: SocketAddr, who: &Identity, due: Instant) -> bool {
+    fn plan(&mut self, now: Instant, from: E, who: &Identity, due: Instant) -> bool {
         if let Some(known) = self.list.iter_mut().find(|hint| is_same_host(hint.from, from) && hint.who == *who) {
             let is_free = known.due.is_none();
             if is_free {
@@ -80,7 +79,7 @@ impl Hints {
     }
 
     /// A question that is due.
-    fn take(&mut self, now: Instant) -> Option<(SocketAddr, Identity)> {
+    fn take(&mut self, now: Instant) -> Option<(E, Identity)> {
         let hint = self.list.iter_mut().find(|hint| hint.due.is_some_and(|due| due <= now))?;
         hint.due = None;
         (hint.since, hint.not_before) = (now, now + back_off(hint.asked));
@@ -95,8 +94,8 @@ impl Hints {
 }
 
 /// Units of one host have ports of their own. On loopback all are of this host, and told apart by them.
-fn is_same_host(one: SocketAddr, other: SocketAddr) -> bool {
-    one.ip() == other.ip() && (!one.ip().is_loopback() || one.port() == other.port())
+fn is_same_host<E: Endpoint>(one: E, other: E) -> bool {
+    one.is_of_host(&other) && (!one.is_loopback() || one.port() == other.port())
 }
 
 /// The hosts whose questions counted recently: a replayed question defers this unit's own once, and not for as long as
@@ -114,7 +113,7 @@ impl Hosts {
     }
 
     /// Whether a question from this address counts now; after that it does not for a while.
-    pub(super) fn counts(&mut self, now: Instant, from: SocketAddr) -> bool {
+    pub(super) fn counts(&mut self, now: Instant, from: impl Endpoint) -> bool {
         while self.list.front().is_some_and(|(_, at)| *at + HOST_PAUSE <= now) {
             self.list.pop_front();
         }
@@ -129,23 +128,15 @@ impl Hosts {
     }
 
     /// A hash of a host. A collision costs one search more.
-    fn mark(&self, from: SocketAddr) -> u32 {
-        let port = if from.ip().is_loopback() { from.port() } else { 0 };
-        let host = match from.ip() {
-            IpAddr::V4(host) => u32::from_le_bytes(host.octets()),
-            IpAddr::V6(host) => host.segments().iter().fold(0, |sum, part| mix(sum ^ u32::from(*part))),
-        };
-        mix(mix(self.seed ^ host) ^ u32::from(port))
+    fn mark(&self, from: impl Endpoint) -> u32 {
+        let port = if from.is_loopback() { from.port() } else { 0 };
+        mix(mix(self.seed ^ from.host_bits()) ^ u32::from(port))
     }
 }
 
-const fn mix(bits: u32) -> u32 {
-    (bits ^ (bits >> 15)).wrapping_mul(0x9E37_79B1)
-}
-
-impl<S: Storage> Node<S> {
+impl<P: Port> Node<P> {
     /// A broadcast hints at a node that this unit dials: it is asked after `delay`, unless it is connected.
-    pub(super) fn hinted(&mut self, now: Instant, from: SocketAddr, who: &Identity, delay: Duration) {
+    pub(super) fn hinted(&mut self, now: Instant, from: P::Endpoint, who: &Identity, delay: Duration) {
         let away = self.node(who).is_none_or(|known| known.state == NodeState::Away && known.not_before <= now);
         if !away || matches!(self.config.target, Target::Fixed(..)) {
             return;
@@ -155,7 +146,12 @@ impl<S: Storage> Node<S> {
         }
     }
 
-    pub(super) fn poll_hints(&mut self, now: Instant, mailman: &mut dyn Mailman, authenticator: &dyn Authenticator) {
+    pub(super) fn poll_hints(
+        &mut self,
+        now: Instant,
+        mailman: &mut dyn Mailman<P::Endpoint>,
+        authenticator: &dyn Authenticator,
+    ) {
         while let Some((to, who)) = self.hints.take(now) {
             self.ask(to, &who, mailman, authenticator);
             if self.search.next != Instant::FAR_FUTURE {
@@ -178,7 +174,13 @@ impl<S: Storage> Node<S> {
     }
 
     /// Asks one node alone, which answers at once.
-    fn ask(&mut self, to: SocketAddr, who: &Identity, mailman: &mut dyn Mailman, authenticator: &dyn Authenticator) {
+    fn ask(
+        &mut self,
+        to: P::Endpoint,
+        who: &Identity,
+        mailman: &mut dyn Mailman<P::Endpoint>,
+        authenticator: &dyn Authenticator,
+    ) {
         let Ok(wanted) = Manager::new(who.name(), who.id()) else { return };
         let sent = self.say_who_has(Some(wanted), 0, authenticator, |datagram| mailman.send_to(to, datagram));
         self.counters.add(if sent { NodeCounter::HintsAsked } else { NodeCounter::SendFailed }, 1);

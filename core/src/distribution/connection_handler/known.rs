@@ -1,7 +1,5 @@
 //! What is known of one node.
 
-use core::net::SocketAddr;
-
 use super::table::NONE;
 use super::timetable::Task;
 use crate::distribution::hello::Limits;
@@ -9,19 +7,19 @@ use crate::distribution::identity::{Epoch, Identity};
 use crate::host::mailman::LinkId;
 use crate::time::Instant;
 
-/// What is known of a node.
+/// What is known of a node. `E` is the port's [`Endpoint`](crate::host::endpoint::Endpoint).
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Known {
+pub struct Known<E> {
     /// Its name, id and role.
     pub identity: Identity,
     /// The other end of its link; while it is away, where it was last heard.
-    pub address: SocketAddr,
+    pub address: E,
     /// The boot that is connected; while it is away, the newest that was heard.
     pub epoch: Epoch,
     /// What it takes, once it has joined.
     pub limits: Option<Limits>,
     /// Where it can be dialled, if that is known.
-    pub(super) listens: Option<SocketAddr>,
+    pub(super) listens: Option<E>,
     /// The newest answer of it.
     pub(super) newest: Option<(Epoch, u32)>,
     pub(super) state: NodeState,
@@ -30,7 +28,7 @@ pub struct Known {
     /// The link that is being opened to it.
     pub(super) dialing: Option<LinkId>,
     /// A link with its identity that waits for the outcome of the present one's challenge.
-    pub(super) newcomer: Option<Newcomer>,
+    pub(super) newcomer: Option<Newcomer<E>>,
     /// When it joined, or was dialled last.
     pub(super) since: Instant,
     /// Dials that have failed in a row.
@@ -47,11 +45,11 @@ pub struct Known {
 
 /// A link that waits until the older one of the same identity has been challenged.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Newcomer {
+pub(super) struct Newcomer<E> {
     pub(super) link: LinkId,
     pub(super) epoch: Epoch,
     pub(super) limits: Limits,
-    pub(super) address: SocketAddr,
+    pub(super) address: E,
     /// It takes the place whether the older one answers or not.
     pub(super) decided: bool,
 }
@@ -67,7 +65,7 @@ pub enum NodeState {
     Joined(LinkId),
 }
 
-impl Known {
+impl<E> Known<E> {
     /// Whether the node is connected.
     pub const fn is_joined(&self) -> bool {
         matches!(self.state, NodeState::Joined(_))
@@ -98,7 +96,7 @@ impl Known {
         self.newest.is_none_or(|(newest, last)| newest != epoch || sequence > last)
     }
 
-    pub(super) fn new(identity: Identity, address: SocketAddr, epoch: Epoch) -> Self {
+    pub(super) fn new(identity: Identity, address: E, epoch: Epoch) -> Self {
         Self {
             identity,
             address,

@@ -6,7 +6,7 @@ use super::{Node, Target};
 use crate::distribution::identity::Identity;
 use crate::error::{CloseReason, Refusal};
 use crate::host::mailman::LinkId;
-use crate::storage::Storage;
+use crate::host::port::Port;
 use crate::time::{Duration, Instant};
 
 /// A link that lasted shorter than this counts as a failed try, so that it is not retried without back-off.
@@ -14,7 +14,7 @@ const SETTLED: Duration = Duration::from_secs(1);
 /// Number of failed tries that a refusal counts as if its reason needs an operator.
 const HOPELESS: u8 = 5;
 
-impl<S: Storage> Node<S> {
+impl<P: Port> Node<P> {
     /// The port is opening the link that [`Command::Dial`](super::Command::Dial) asked for.
     pub fn dialing(&mut self, identity: Option<&Identity>, link: LinkId) {
         let Some(place) = identity.and_then(|identity| self.table.find(identity)) else { return };

@@ -30,8 +30,6 @@ pub use counter::NodeCounter;
 pub use known::{Known, NodeState};
 pub use table::Order;
 
-use core::net::SocketAddr;
-
 use crate::config::Constraints;
 use crate::counters::Counters;
 use crate::distribution::authenticator::Authenticator;
@@ -39,9 +37,10 @@ use crate::distribution::datagram::{Datagram, DatagramError};
 use crate::distribution::hello::{Hello, Limits, Manager};
 use crate::distribution::identity::{Epoch, Fleet, Identity, Role};
 use crate::error::{CloseReason, Error, Refusal};
+use crate::host::endpoint::Endpoint as _;
 use crate::host::mailman::{LinkId, Mailman};
+use crate::host::port::{Port, Slice};
 use crate::random::Random;
-use crate::storage::Storage;
 use crate::time::Instant;
 use answers::Answers;
 use duplicates::Duplicates;
@@ -50,15 +49,15 @@ use search::{Budget, Search};
 use table::Table;
 use timetable::Task;
 
-/// The nodes that a unit connects to.
+/// The nodes that a unit connects to. `E` is the port's [`Endpoint`](crate::host::endpoint::Endpoint).
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Target {
+pub enum Target<E> {
     /// Every m_unit, or those that [`Node::choose`] names, and the s_units that belong to this one.
     Everybody,
     /// The one manager of an s_unit, wherever it is.
     Manager(Manager),
     /// The one manager of an s_unit, at a fixed address: no broadcasts.
-    Fixed(Manager, SocketAddr),
+    Fixed(Manager, E),
 }
 
 impl Manager {
@@ -81,7 +80,7 @@ impl Manager {
 
 /// What a node is told when it is made.
 #[derive(Clone, Debug)]
-pub struct NodeConfig {
+pub struct NodeConfig<E> {
     /// Its identity.
     pub identity: Identity,
     /// Its fleet.
@@ -89,7 +88,7 @@ pub struct NodeConfig {
     /// Its boot epoch; must differ from boot to boot.
     pub epoch: Epoch,
     /// The nodes that it connects to.
-    pub target: Target,
+    pub target: Target<E>,
     /// Where it can be dialled; 0 for nowhere.
     pub tcp_port: u16,
     /// Where its session datagrams go; 0 for nowhere.
@@ -102,11 +101,11 @@ pub struct NodeConfig {
 
 /// What is to be done, to one link at a time.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Command {
+pub enum Command<E> {
     /// Open a link and report it with [`Node::dialing`], or [`Node::dial_failed`].
     Dial {
         /// Where.
-        to: SocketAddr,
+        to: E,
         /// The expected identity; unknown for a fixed address.
         identity: Option<Identity>,
     },
@@ -133,11 +132,11 @@ pub enum Directive {
 
 /// The last time that something was refused, here or there, for the operator.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Finding {
+pub struct Finding<E> {
     /// When.
     pub at: Instant,
     /// The other end.
-    pub address: SocketAddr,
+    pub address: E,
     /// The other end's identity, if it gave one.
     pub identity: Option<Identity>,
     /// Why.
@@ -145,46 +144,46 @@ pub struct Finding {
 }
 
 /// The slices that a node lives in.
-pub struct NodeStorage<S: Storage> {
+pub struct NodeStorage<P: Port> {
     /// One slot per node that is known, connected or not. More than `maximum_nodes` of them let nodes that left be
     /// remembered.
-    pub nodes: S::Slice<Option<Known>>,
+    pub nodes: Slice<P, Option<Known<P::Endpoint>>>,
     /// As many.
-    pub order: S::Slice<Order>,
+    pub order: Slice<P, Order>,
     /// One slot per link.
-    pub links: S::Slice<Option<u16>>,
+    pub links: Slice<P, Option<u16>>,
     /// A few: the last refusals.
-    pub findings: S::Slice<Option<Finding>>,
+    pub findings: Slice<P, Option<Finding<P::Endpoint>>>,
 }
 
 /// One unit's view of the network.
 #[doc(alias = "Connection_handler")]
-pub struct Node<S: Storage> {
-    config: NodeConfig,
+pub struct Node<P: Port> {
+    config: NodeConfig<P::Endpoint>,
     /// The manager of an s_unit.
     target: Option<Identity>,
     /// The m_units that an m_unit connects to, if not all.
-    chosen: Option<S::Slice<Identity>>,
+    chosen: Option<Slice<P, Identity>>,
     /// Nodes that there are to be met at most.
     known_nodes: u16,
-    table: Table<S>,
-    findings: S::Slice<Option<Finding>>,
+    table: Table<P>,
+    findings: Slice<P, Option<Finding<P::Endpoint>>>,
     random: Random,
     search: Search,
     budget: Budget,
-    hints: Hints,
+    hints: Hints<P::Endpoint>,
     hosts: Hosts,
-    answers: Answers,
-    duplicates: Duplicates,
+    answers: Answers<P::Endpoint>,
+    duplicates: Duplicates<P::Endpoint>,
     /// Of the last search or answer.
     sequence: u32,
     /// What happened.
     pub counters: Counters<NodeCounter, { NodeCounter::COUNT }>,
 }
 
-impl<S: Storage> Node<S> {
+impl<P: Port> Node<P> {
     /// A node that begins to search at once.
-    pub fn new(now: Instant, config: NodeConfig, storage: NodeStorage<S>) -> Self {
+    pub fn new(now: Instant, config: NodeConfig<P::Endpoint>, storage: NodeStorage<P>) -> Self {
         let mut random = Random::new(config.seed);
         let target = match &config.target {
             Target::Everybody => None,
@@ -201,7 +200,7 @@ impl<S: Storage> Node<S> {
             hints: Hints::new(),
             hosts: Hosts::new((config.seed >> 32) as u32 ^ config.seed as u32),
             answers: Answers::new(),
-            duplicates: Duplicates::default(),
+            duplicates: Duplicates::new(),
             sequence: 0,
             counters: Counters::new(),
             config,
@@ -247,7 +246,12 @@ impl<S: Storage> Node<S> {
     }
 
     /// Moves to longer tables, for a higher maximum of nodes; does nothing where one is shorter. Findings stay where they are.
-    pub fn grow(&mut self, nodes: S::Slice<Option<Known>>, order: S::Slice<Order>, links: S::Slice<Option<u16>>) {
+    pub fn grow(
+        &mut self,
+        nodes: Slice<P, Option<Known<P::Endpoint>>>,
+        order: Slice<P, Order>,
+        links: Slice<P, Option<u16>>,
+    ) {
         self.table.grow(nodes, order, links);
     }
 
@@ -258,7 +262,7 @@ impl<S: Storage> Node<S> {
 
     /// Of all m_units this one connects to these alone, from here on; links that there are stay. A link of two m_units takes
     /// both: one that is not chosen is not answered, and refused where it dials.
-    pub fn choose(&mut self, m_units: S::Slice<Identity>) {
+    pub fn choose(&mut self, m_units: Slice<P, Identity>) {
         self.chosen = Some(m_units);
     }
 
@@ -299,7 +303,7 @@ impl<S: Storage> Node<S> {
     }
 
     /// The last refusals, in no order.
-    pub fn findings(&self) -> impl Iterator<Item = &Finding> {
+    pub fn findings(&self) -> impl Iterator<Item = &Finding<P::Endpoint>> {
         self.findings.iter().flatten()
     }
 
@@ -312,9 +316,9 @@ impl<S: Storage> Node<S> {
     pub fn poll(
         &mut self,
         now: Instant,
-        mailman: &mut dyn Mailman,
+        mailman: &mut dyn Mailman<P::Endpoint>,
         authenticator: &dyn Authenticator,
-    ) -> Option<Command> {
+    ) -> Option<Command<P::Endpoint>> {
         while let Some((place, task)) = self.table.pop_due(now) {
             let command = match task {
                 Task::Dial => self.dial(now, place),
@@ -341,7 +345,7 @@ impl<S: Storage> Node<S> {
 
     /// Takes a datagram that arrived at any of the unit's sockets and is [for no session](crate::distribution::datagram::for_session)
     /// of this unit.
-    pub fn datagram(&mut self, now: Instant, from: SocketAddr, bytes: &[u8], authenticator: &dyn Authenticator) {
+    pub fn datagram(&mut self, now: Instant, from: P::Endpoint, bytes: &[u8], authenticator: &dyn Authenticator) {
         match Datagram::decode(bytes, self.config.fleet, authenticator) {
             Ok(Datagram::WhoHas(who_has)) => self.heard_who_has(now, from, &who_has, authenticator.mode()),
             Ok(Datagram::Announce(announce)) => self.heard_announce(now, from, &announce),
@@ -350,7 +354,7 @@ impl<S: Storage> Node<S> {
         }
     }
 
-    fn unreadable(&mut self, now: Instant, from: SocketAddr, error: DatagramError) {
+    fn unreadable(&mut self, now: Instant, from: P::Endpoint, error: DatagramError) {
         let counter = match error {
             DatagramError::Magic => NodeCounter::DatagramMagic,
             DatagramError::Version(_) => NodeCounter::DatagramVersion,
@@ -366,9 +370,9 @@ impl<S: Storage> Node<S> {
     }
 
     /// Keeps a refusal for the operator: the newest of each host, unit and reason, the oldest of all gives way.
-    fn note(&mut self, finding: Finding) {
-        let same = |known: &Finding| {
-            known.address.ip() == finding.address.ip()
+    fn note(&mut self, finding: Finding<P::Endpoint>) {
+        let same = |known: &Finding<P::Endpoint>| {
+            known.address.is_of_host(&finding.address)
                 && known.refusal == finding.refusal
                 && known.identity == finding.identity
         };
@@ -380,7 +384,7 @@ impl<S: Storage> Node<S> {
         }
     }
 
-    fn note_of(&mut self, at: Instant, address: SocketAddr, identity: &Identity, refusal: Refusal) {
+    fn note_of(&mut self, at: Instant, address: P::Endpoint, identity: &Identity, refusal: Refusal) {
         self.note(Finding { at, address, identity: Some(identity.clone()), refusal });
     }
 

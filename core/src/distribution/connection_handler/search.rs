@@ -1,7 +1,5 @@
 //! Searching, within a budget of broadcasts, and what is heard from others.
 
-use core::net::SocketAddr;
-
 use super::answers::Found;
 use super::known::NodeState;
 use super::timetable::Task;
@@ -13,8 +11,8 @@ use crate::distribution::hello::Manager;
 use crate::distribution::identity::{Epoch, Identity, Role};
 use crate::error::Refusal;
 use crate::host::mailman::Mailman;
+use crate::host::port::Port;
 use crate::random::Random;
-use crate::storage::Storage;
 use crate::time::{Duration, Instant};
 
 /// First searches of m_units wait a random part of this: there are few, and their question serves a whole fleet.
@@ -131,7 +129,7 @@ impl Budget {
     }
 }
 
-impl<S: Storage> Node<S> {
+impl<P: Port> Node<P> {
     /// Searches now, or as soon as the budget allows (paper, listing line 6). A unit with a fixed address dials instead.
     pub fn broadcast(&mut self, now: Instant) {
         match (&self.config.target, self.table.joined()) {
@@ -212,7 +210,12 @@ impl<S: Storage> Node<S> {
         self.search.next = now + back_off + mostly_late(&mut self.random, back_off);
     }
 
-    pub(super) fn poll_search(&mut self, now: Instant, mailman: &mut dyn Mailman, authenticator: &dyn Authenticator) {
+    pub(super) fn poll_search(
+        &mut self,
+        now: Instant,
+        mailman: &mut dyn Mailman<P::Endpoint>,
+        authenticator: &dyn Authenticator,
+    ) {
         // What the application asks for is sent whatever the others do, but counts in the budget like any search.
         if self.search.explicit.take_if(|at| *at <= now).is_some() {
             self.send_who_has(now, mailman, authenticator);
@@ -241,7 +244,12 @@ impl<S: Storage> Node<S> {
         self.send_who_has(now, mailman, authenticator);
     }
 
-    fn send_who_has(&mut self, now: Instant, mailman: &mut dyn Mailman, authenticator: &dyn Authenticator) {
+    fn send_who_has(
+        &mut self,
+        now: Instant,
+        mailman: &mut dyn Mailman<P::Endpoint>,
+        authenticator: &dyn Authenticator,
+    ) {
         self.plan_next(now);
         (self.search.stubborn, self.search.deferred, self.search.waited) = (false, 0, false);
         self.budget.note(now);
@@ -275,7 +283,7 @@ impl<S: Storage> Node<S> {
         who_has.encode(self.config.fleet, authenticator, &mut bytes).is_some_and(send)
     }
 
-    pub(super) fn heard_who_has(&mut self, now: Instant, from: SocketAddr, who_has: &WhoHas, mode: Mode) {
+    pub(super) fn heard_who_has(&mut self, now: Instant, from: P::Endpoint, who_has: &WhoHas, mode: Mode) {
         if self.is_own(now, from, &who_has.identity, who_has.epoch, Some(who_has)) {
             return;
         }
@@ -298,7 +306,7 @@ impl<S: Storage> Node<S> {
     }
 
     /// Whether another unit's search may defer this unit's own. One that asks a single node does not count.
-    fn counts(&mut self, now: Instant, from: SocketAddr, who_has: &WhoHas) -> bool {
+    fn counts(&mut self, now: Instant, from: P::Endpoint, who_has: &WhoHas) -> bool {
         let counts = who_has.expected > 0 && self.hosts.counts(now, from);
         if counts {
             self.budget.note(now);
@@ -329,7 +337,7 @@ impl<S: Storage> Node<S> {
 
     /// An m_unit asks for all nodes: its own s_units ask it whether it is there, and so does the smaller one of two
     /// m_units.
-    fn heard_m_unit(&mut self, now: Instant, from: SocketAddr, who_has: &WhoHas) {
+    fn heard_m_unit(&mut self, now: Instant, from: P::Endpoint, who_has: &WhoHas) {
         if !self.is_wanted(&who_has.identity) {
             self.counters.add(NodeCounter::WrongManager, 1);
             return;
@@ -347,7 +355,7 @@ impl<S: Storage> Node<S> {
         self.hinted(now, from, &who_has.identity, delay);
     }
 
-    pub(super) fn heard_announce(&mut self, now: Instant, from: SocketAddr, announce: &Announce) {
+    pub(super) fn heard_announce(&mut self, now: Instant, from: P::Endpoint, announce: &Announce) {
         if self.is_own(now, from, &announce.identity, announce.epoch, None) {
             return;
         }

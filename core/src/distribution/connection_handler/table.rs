@@ -3,12 +3,11 @@
 //! Each event costs a binary search at most. Only a new node costs more: inserting into the sorted index moves two
 //! bytes for each entry behind it.
 
-use core::net::{IpAddr, SocketAddr};
-
 use super::known::{Known, NodeState};
 use crate::distribution::identity::{Epoch, Identity, Role};
+use crate::host::endpoint::Endpoint as _;
 use crate::host::mailman::LinkId;
-use crate::storage::Storage;
+use crate::host::port::{Port, Slice};
 
 /// No place, position or index.
 pub(super) const NONE: u16 = u16::MAX;
@@ -52,10 +51,10 @@ impl Order {
     }
 }
 
-pub(super) struct Table<S: Storage> {
-    nodes: S::Slice<Option<Known>>,
-    pub(super) order: S::Slice<Order>,
-    links: S::Slice<Option<u16>>,
+pub(super) struct Table<P: Port> {
+    nodes: Slice<P, Option<Known<P::Endpoint>>>,
+    pub(super) order: Slice<P, Order>,
+    links: Slice<P, Option<u16>>,
     len: usize,
     pub(super) due_len: usize,
     s_units: u16,
@@ -67,8 +66,12 @@ pub(super) struct Table<S: Storage> {
     unjoined: heapless::Vec<u16, UNJOINED>,
 }
 
-impl<S: Storage> Table<S> {
-    pub(super) fn new(nodes: S::Slice<Option<Known>>, order: S::Slice<Order>, links: S::Slice<Option<u16>>) -> Self {
+impl<P: Port> Table<P> {
+    pub(super) fn new(
+        nodes: Slice<P, Option<Known<P::Endpoint>>>,
+        order: Slice<P, Order>,
+        links: Slice<P, Option<u16>>,
+    ) -> Self {
         Self {
             nodes,
             order,
@@ -86,9 +89,9 @@ impl<S: Storage> Table<S> {
     /// Moves to longer slices; does nothing where one is shorter. Places, indices and orders stay.
     pub(super) fn grow(
         &mut self,
-        mut nodes: S::Slice<Option<Known>>,
-        mut order: S::Slice<Order>,
-        mut links: S::Slice<Option<u16>>,
+        mut nodes: Slice<P, Option<Known<P::Endpoint>>>,
+        mut order: Slice<P, Order>,
+        mut links: Slice<P, Option<u16>>,
     ) {
         if nodes.len() < self.nodes.len() || order.len() < self.order.len() || links.len() < self.links.len() {
             return;
@@ -99,17 +102,17 @@ impl<S: Storage> Table<S> {
         (self.nodes, self.order, self.links) = (nodes, order, links);
     }
 
-    pub(super) fn iter(&self) -> impl Iterator<Item = &Known> {
+    pub(super) fn iter(&self) -> impl Iterator<Item = &Known<P::Endpoint>> {
         self.nodes.iter().flatten()
     }
 
     #[cfg_attr(target_os = "none", inline(never))]
-    pub(super) fn node(&self, place: usize) -> Option<&Known> {
+    pub(super) fn node(&self, place: usize) -> Option<&Known<P::Endpoint>> {
         self.nodes.get(place)?.as_ref()
     }
 
     #[cfg_attr(target_os = "none", inline(never))]
-    pub(super) fn node_mut(&mut self, place: usize) -> Option<&mut Known> {
+    pub(super) fn node_mut(&mut self, place: usize) -> Option<&mut Known<P::Endpoint>> {
         self.nodes.get_mut(place)?.as_mut()
     }
 
@@ -127,16 +130,16 @@ impl<S: Storage> Table<S> {
     }
 
     /// The nodes of one role that have joined, by index.
-    pub(super) fn by_index(&self, role: Role) -> impl Iterator<Item = &Known> {
+    pub(super) fn by_index(&self, role: Role) -> impl Iterator<Item = &Known<P::Endpoint>> {
         self.order.iter().take(self.len).filter_map(move |row| self.node(usize::from(row.of(role))))
     }
 
-    pub(super) fn at_index(&self, role: Role, index: u16) -> Option<&Known> {
+    pub(super) fn at_index(&self, role: Role, index: u16) -> Option<&Known<P::Endpoint>> {
         self.node(usize::from(self.order.get(usize::from(index))?.of(role)))
     }
 
     /// The first node with this id, connected ones before others.
-    pub(super) fn with_id(&self, id: u32) -> Option<&Known> {
+    pub(super) fn with_id(&self, id: u32) -> Option<&Known<P::Endpoint>> {
         let sorted = self.order.get(..self.len)?;
         let place = |row: &Order| self.node(usize::from(row.sorted));
         let start = sorted.partition_point(|row| place(row).is_some_and(|known| known.identity.id() < id));
@@ -145,8 +148,8 @@ impl<S: Storage> Table<S> {
         if first.is_joined() { Some(first) } else { same.find(|known| known.is_joined()).or(Some(first)) }
     }
 
-    pub(super) fn with_address(&self, ip: IpAddr) -> impl Iterator<Item = &Known> {
-        self.iter().filter(move |known| known.address.ip() == ip)
+    pub(super) fn of_host(&self, address: P::Endpoint) -> impl Iterator<Item = &Known<P::Endpoint>> {
+        self.iter().filter(move |known| known.address.is_of_host(&address))
     }
 
     pub(super) fn of_link(&self, link: LinkId) -> Option<usize> {
@@ -175,7 +178,7 @@ impl<S: Storage> Table<S> {
 
     /// The place of a node that was heard of, new if need be; `true` when another one had to be forgotten for it. `None`
     /// when there is no capacity for another unjoined node.
-    pub(super) fn hear_of(&mut self, identity: &Identity, address: SocketAddr, epoch: Epoch) -> Option<(usize, bool)> {
+    pub(super) fn hear_of(&mut self, identity: &Identity, address: P::Endpoint, epoch: Epoch) -> Option<(usize, bool)> {
         if let Some(place) = self.find(identity) {
             return Some((place, false));
         }
@@ -198,7 +201,12 @@ impl<S: Storage> Table<S> {
 
     /// The place of an identity, new if need be; `true` when an unjoined node, or else the node that was away longest, had to
     /// be forgotten for it. `None` when every place is taken by a node that is connected or being dialled.
-    pub(super) fn place_of(&mut self, identity: &Identity, address: SocketAddr, epoch: Epoch) -> Option<(usize, bool)> {
+    pub(super) fn place_of(
+        &mut self,
+        identity: &Identity,
+        address: P::Endpoint,
+        epoch: Epoch,
+    ) -> Option<(usize, bool)> {
         if let Some(place) = self.find(identity) {
             return Some((place, false));
         }
@@ -214,7 +222,7 @@ impl<S: Storage> Table<S> {
     }
 
     /// Puts a new node into a free place.
-    fn settle(&mut self, place: usize, identity: &Identity, address: SocketAddr, epoch: Epoch) -> Option<usize> {
+    fn settle(&mut self, place: usize, identity: &Identity, address: P::Endpoint, epoch: Epoch) -> Option<usize> {
         let at = self.search(identity).err()?;
         let mut carried = u16::try_from(place).ok()?;
         for row in self.order.get_mut(at..=self.len)? {

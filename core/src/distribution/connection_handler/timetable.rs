@@ -2,7 +2,7 @@
 //! at all nodes.
 
 use super::table::{NONE, Table};
-use crate::storage::Storage;
+use crate::host::port::Port;
 use crate::time::Instant;
 
 /// What is due for a node. One thing at a time: each excludes the others.
@@ -22,7 +22,7 @@ pub(super) enum Task {
     Refuse,
 }
 
-impl<S: Storage> Table<S> {
+impl<P: Port> Table<P> {
     /// Sets what is due for a node, in place of what was.
     pub(super) fn schedule(&mut self, place: usize, at: Instant, task: Task) {
         let Some(known) = self.node_mut(place) else { return };

@@ -1,48 +1,46 @@
 //! The registry: nodes by place, name, id, address and link (paper, section 2).
 
-use core::net::IpAddr;
-
 use super::{Known, Node};
 use crate::distribution::identity::{Identity, Role};
 use crate::error::Error;
 use crate::host::mailman::LinkId;
-use crate::storage::Storage;
+use crate::host::port::Port;
 
-impl<S: Storage> Node<S> {
+impl<P: Port> Node<P> {
     /// All known nodes, in the order in which they were first heard of, as long as none had to be forgotten.
-    pub fn nodes(&self) -> impl Iterator<Item = &Known> {
+    pub fn nodes(&self) -> impl Iterator<Item = &Known<P::Endpoint>> {
         self.table.iter()
     }
 
     /// The s_units that have joined, those that left included, in the order of joining (paper, listing line 8). The
     /// index of each is its [`Known::index`].
-    pub fn s_units(&self) -> impl Iterator<Item = &Known> {
+    pub fn s_units(&self) -> impl Iterator<Item = &Known<P::Endpoint>> {
         self.table.by_index(Role::SUnit)
     }
 
     /// The m_units that have joined, those that left included, in the order of joining.
-    pub fn m_units(&self) -> impl Iterator<Item = &Known> {
+    pub fn m_units(&self) -> impl Iterator<Item = &Known<P::Endpoint>> {
         self.table.by_index(Role::MUnit)
     }
 
     /// The s_unit with this index. It keeps its index while others leave, and while it is away itself.
-    pub fn s_unit(&self, index: u16) -> Option<&Known> {
+    pub fn s_unit(&self, index: u16) -> Option<&Known<P::Endpoint>> {
         self.table.at_index(Role::SUnit, index)
     }
 
     /// The m_unit with this index.
-    pub fn m_unit(&self, index: u16) -> Option<&Known> {
+    pub fn m_unit(&self, index: u16) -> Option<&Known<P::Endpoint>> {
         self.table.at_index(Role::MUnit, index)
     }
 
     /// The node of an identity.
-    pub fn node(&self, identity: &Identity) -> Option<&Known> {
+    pub fn node(&self, identity: &Identity) -> Option<&Known<P::Endpoint>> {
         self.table.find(identity).and_then(|place| self.table.node(place))
     }
 
     /// The node with this name among those that have joined, connected or not. [`Error::NotConnected`] where there is none,
     /// [`Error::Ambiguous`] where there are several: the one that is connected may not be the one that is meant.
-    pub fn find(&self, name: &str) -> Result<&Known, Error> {
+    pub fn find(&self, name: &str) -> Result<&Known<P::Endpoint>, Error> {
         let mut same = self.s_units().chain(self.m_units()).filter(|known| known.identity.name() == name);
         let first = same.next().ok_or(Error::NotConnected)?;
         match same.next() {
@@ -52,17 +50,17 @@ impl<S: Storage> Node<S> {
     }
 
     /// The first node with this id, connected ones before others.
-    pub fn find_id(&self, id: u32) -> Option<&Known> {
+    pub fn find_id(&self, id: u32) -> Option<&Known<P::Endpoint>> {
         self.table.with_id(id)
     }
 
-    /// The nodes of one host.
-    pub fn find_address(&self, ip: IpAddr) -> impl Iterator<Item = &Known> {
-        self.table.with_address(ip)
+    /// The nodes at the host of an address.
+    pub fn find_address(&self, address: P::Endpoint) -> impl Iterator<Item = &Known<P::Endpoint>> {
+        self.table.of_host(address)
     }
 
     /// The node at the other end of a link.
-    pub fn node_of(&self, link: LinkId) -> Option<&Known> {
+    pub fn node_of(&self, link: LinkId) -> Option<&Known<P::Endpoint>> {
         let known = self.table.of_link(link).and_then(|place| self.table.node(place))?;
         (known.link() == Some(link) || known.dialing == Some(link)).then_some(known)
     }

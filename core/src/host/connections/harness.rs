@@ -35,7 +35,7 @@ impl Wire {
     }
 }
 
-impl Mailman for Wire {
+impl Mailman<SocketAddr> for Wire {
     fn write(&mut self, _: LinkId, slices: &[&[u8]]) -> Result<usize, CloseReason> {
         let before = self.bytes.len();
         self.offered = self.offered.max(slices.iter().map(|slice| slice.len()).sum());

@@ -184,9 +184,9 @@ impl<S: Storage, C: Seal> Link<S, C> {
     /// unless it is to `hold`. Refused before the first byte when it cannot be kept: [`Error::Full`] when it can be
     /// later, [`Error::TooLarge`] when it never can.
     #[cfg_attr(target_os = "none", inline(never))]
-    pub fn send_message(
+    pub fn send_message<E>(
         &mut self,
-        mailman: &mut dyn Mailman,
+        mailman: &mut dyn Mailman<E>,
         buffers: &mut dyn Buffers<S>,
         priority: Priority,
         total: usize,
@@ -209,9 +209,9 @@ impl<S: Storage, C: Seal> Link<S, C> {
     }
 
     /// The same for a short message while nothing waits.
-    fn send_at_once(
+    fn send_at_once<E>(
         &mut self,
-        mailman: &mut dyn Mailman,
+        mailman: &mut dyn Mailman<E>,
         buffers: &mut dyn Buffers<S>,
         priority: Priority,
         total: usize,
@@ -261,7 +261,7 @@ impl<S: Storage, C: Seal> Link<S, C> {
     }
 
     /// Writes what the network takes now.
-    pub fn flush(&mut self, mailman: &mut dyn Mailman, buffers: &mut dyn Buffers<S>) -> Result<(), CloseReason> {
+    pub fn flush<E>(&mut self, mailman: &mut dyn Mailman<E>, buffers: &mut dyn Buffers<S>) -> Result<(), CloseReason> {
         let written = self.sender.flush(self.id, &mut self.cipher, mailman, buffers)?;
         self.counters.add(LinkCounter::BytesSent, written);
         Ok(())

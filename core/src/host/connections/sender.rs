@@ -209,11 +209,11 @@ impl<S: Storage> Sender<S> {
     }
 
     /// Writes what the network takes now; returns how many bytes that were.
-    pub(super) fn flush<C: Seal>(
+    pub(super) fn flush<C: Seal, E>(
         &mut self,
         id: LinkId,
         cipher: &mut C,
-        mailman: &mut dyn Mailman,
+        mailman: &mut dyn Mailman<E>,
         buffers: &mut dyn Buffers<S>,
     ) -> Result<u64, CloseReason> {
         let mut written = 0;
@@ -231,10 +231,10 @@ impl<S: Storage> Sender<S> {
     }
 
     /// Writes what is sealed: the rest of the current queue's frames, then sealed urgent ones.
-    fn write_sealed(
+    fn write_sealed<E>(
         &mut self,
         id: LinkId,
-        mailman: &mut dyn Mailman,
+        mailman: &mut dyn Mailman<E>,
         written: &mut u64,
     ) -> Result<Progress, CloseReason> {
         if let Some(Some(queue)) = self.current.and_then(|index| self.queues.get_mut(index)) {
@@ -403,7 +403,12 @@ impl<S: Storage> SendQueue<S> {
         self.before = (sealed, at_boundary);
     }
 
-    fn write(&mut self, id: LinkId, mailman: &mut dyn Mailman, written: &mut u64) -> Result<Progress, CloseReason> {
+    fn write<E>(
+        &mut self,
+        id: LinkId,
+        mailman: &mut dyn Mailman<E>,
+        written: &mut u64,
+    ) -> Result<Progress, CloseReason> {
         while self.start < self.sealed {
             let piece = self.buffer.get(self.start..self.sealed).unwrap_or(&[]);
             let count = mailman.write(id, &[piece])?;

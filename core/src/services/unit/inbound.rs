@@ -1,7 +1,5 @@
 //! The way up: bytes become frames, frames messages, messages events.
 
-use core::net::SocketAddr;
-
 use super::answering::{is_emergency, read_arguments};
 use super::permitting::may_publish;
 use super::publishing::Told;
@@ -15,6 +13,7 @@ use crate::distribution::parameters::ParametersView;
 use crate::distribution::{block, datagram};
 use crate::error::{CloseReason, Error, Refusal};
 use crate::host::connections::{Incoming, LinkCounter, Place};
+use crate::host::endpoint::Endpoint as _;
 use crate::host::frame::Frame;
 use crate::host::secure::{Secure, Unopened};
 use crate::services::calls::{CallHead, Seen};
@@ -125,11 +124,11 @@ impl<P: Port> Session<P> {
     pub fn datagram(
         &mut self,
         cx: &mut Context<'_, P>,
-        from: SocketAddr,
+        from: P::Endpoint,
         nonce: u64,
         body: &mut [u8],
     ) -> Option<Event<'static>> {
-        if self.phase != Phase::Live || nonce != self.local.nonce || from.ip() != self.peer_address.ip() {
+        if self.phase != Phase::Live || nonce != self.local.nonce || !from.is_of_host(&self.peer_address) {
             self.link.counters.add(LinkCounter::DatagramsDropped, 1);
             return None;
         }

@@ -34,8 +34,6 @@ pub use lending::ListSlices;
 pub use outbound::{Delivery, RequestOptions};
 pub use publishing::Publication;
 
-use core::net::SocketAddr;
-
 use crate::config::{Constraints, HELLO_TIMEOUT, LEASES, LINK_BUFFER_BYTES, Mode, Priority};
 use crate::counters::Counters;
 use crate::distribution::function_list::{Entry, Slot, TheirFunctionList};
@@ -70,13 +68,13 @@ const LEAST_MESSAGE_BYTES: usize = 512;
 
 /// What a session begins with.
 #[derive(Clone, Debug)]
-pub struct SessionConfig {
+pub struct SessionConfig<E> {
     /// The link's index.
     pub link: LinkId,
     /// This unit opens the connection, as opposed to: it accepted one.
     pub dialed: bool,
     /// The other end of the stream.
-    pub address: SocketAddr,
+    pub address: E,
     /// This unit's hello, with a nonce that is fresh.
     pub local: Hello,
     /// This unit's constraints.
@@ -173,12 +171,12 @@ enum Phase {
 }
 
 /// What is known of the peer since its hello.
-struct Remote {
+struct Remote<E> {
     hello: Hello,
     /// When its hello came.
     heard: Instant,
     /// Where its session datagrams go.
-    datagrams: SocketAddr,
+    datagrams: E,
 }
 
 /// One link to one peer.
@@ -188,8 +186,8 @@ pub struct Session<P: Port> {
     dialed: bool,
     local: Hello,
     constraints: Constraints,
-    remote: Option<Remote>,
-    peer_address: SocketAddr,
+    remote: Option<Remote<P::Endpoint>>,
+    peer_address: P::Endpoint,
     liveness: Liveness,
     /// The hub waits for a sign of life.
     challenged: bool,
@@ -209,7 +207,12 @@ pub struct Session<P: Port> {
 
 impl<P: Port> Session<P> {
     /// A session on a link that is being opened or was accepted.
-    pub fn new(now: Instant, config: SessionConfig, cipher: P::Cipher, storage: SessionStorage<P::Storage>) -> Self {
+    pub fn new(
+        now: Instant,
+        config: SessionConfig<P::Endpoint>,
+        cipher: P::Cipher,
+        storage: SessionStorage<P::Storage>,
+    ) -> Self {
         let SessionConfig { link, dialed, address, local, constraints } = config;
         let chunk_limit = usize::from(constraints.chunk_size);
         debug_assert!(storage.small.len() >= LINK_BUFFER_BYTES);
@@ -302,7 +305,7 @@ impl<P: Port> Session<P> {
     }
 
     /// The other end of the stream.
-    pub const fn address(&self) -> SocketAddr {
+    pub const fn address(&self) -> P::Endpoint {
         self.peer_address
     }
 

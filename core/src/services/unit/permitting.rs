@@ -10,7 +10,12 @@ use crate::services::lease::Service;
 use crate::services::{Context, Port};
 
 /// What the table says about the peer; without a table everything is allowed.
-pub(super) fn decide(access: Option<&dyn Access>, remote: Option<&Remote>, function: &str, verb: Verb) -> Decision {
+pub(super) fn decide<E>(
+    access: Option<&dyn Access>,
+    remote: Option<&Remote<E>>,
+    function: &str,
+    verb: Verb,
+) -> Decision {
     match (access, remote) {
         (None, _) => Decision::Allowed { rule: 0, rate: None },
         (Some(access), Some(remote)) => access.decide(Principal::Node(&remote.hello.identity), function, verb),
@@ -72,7 +77,7 @@ impl<P: Port> Session<P> {
 /// Whether what the peer publishes is shown here.
 pub(super) fn may_publish<P: Port>(
     cx: &Context<'_, P>,
-    remote: Option<&Remote>,
+    remote: Option<&Remote<P::Endpoint>>,
     refusals: &mut Refusals,
     signature: &[u8],
 ) -> bool {
@@ -88,7 +93,7 @@ pub(super) fn may_publish<P: Port>(
 /// Says in the log what was refused, once a second at most.
 pub(super) fn log_refusal<P: Port>(
     cx: &Context<'_, P>,
-    remote: Option<&Remote>,
+    remote: Option<&Remote<P::Endpoint>>,
     refusals: &mut Refusals,
     function: &str,
     verb: &str,

@@ -3,14 +3,13 @@
 //! Until the peer's first sealed frame has opened, what it says costs a bounded time and the link's own bytes, and reaches
 //! nobody: no limit, no clock and no decision of the node depends on it.
 
-use core::net::SocketAddr;
-
 use super::inbound::Outcome;
 use super::{Phase, Remote, Session};
 use crate::config::{MINIMUM_CHUNK_BYTES, Mode};
 use crate::distribution::hello::{Hello, HelloError};
 use crate::error::{CloseReason, Refusal};
 use crate::host::connections::{LinkCounter, Liveness, Place};
+use crate::host::endpoint::Endpoint as _;
 use crate::host::frame::Frame;
 use crate::host::secure::Secure;
 use crate::services::{Context, Port};
@@ -47,7 +46,7 @@ impl<P: Port> Session<P> {
             }
         };
         self.link.introduce(place, lent);
-        let datagrams = SocketAddr::new(self.peer_address.ip(), hello.udp_port);
+        let datagrams = self.peer_address.at_port(hello.udp_port);
         self.remote = Some(Remote { hello, heard: cx.now, datagrams });
         if mode == Mode::Plain {
             return self.peer_known(cx);

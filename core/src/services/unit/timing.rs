@@ -1,7 +1,5 @@
 //! What a session does because time has passed: keep-alives, deadlines, leases, the end of a silent link.
 
-use core::net::SocketAddr;
-
 use super::granting::expire_granted;
 use super::{Event, Phase, Session};
 use crate::config::{DATAGRAM_BYTES, GATHER};
@@ -9,6 +7,7 @@ use crate::distribution::datagram;
 use crate::distribution::message::{SESSION_BODY_BYTES, SessionBody};
 use crate::error::{CloseReason, Error};
 use crate::host::connections::LinkCounter;
+use crate::host::endpoint::Endpoint as _;
 use crate::host::frame::Frame;
 use crate::host::secure::{DATAGRAM_OVERHEAD, Secure};
 use crate::services::{Context, Port};
@@ -235,7 +234,7 @@ impl<P: Port> Session<P> {
         sent
     }
 
-    fn datagram_header(&mut self) -> Option<(SocketAddr, [u8; datagram::SESSION_HEADER_BYTES])> {
+    fn datagram_header(&mut self) -> Option<(P::Endpoint, [u8; datagram::SESSION_HEADER_BYTES])> {
         let mode = self.mode();
         let remote = self.remote.as_ref()?;
         if remote.datagrams.port() == 0 {

@@ -18,7 +18,6 @@ pub mod provision;
 #[cfg(feature = "tasks")]
 pub mod tasks;
 
-use core::net::SocketAddr;
 use core::sync::atomic::{AtomicBool, Ordering};
 
 use cara_apps::agv::{Agv, BATTERY, GO_TO, GO_TO_LEASE, POS_INFO, Place, Progress, STOP, TICK};
@@ -111,7 +110,7 @@ fn unit_config(settings: &Settings, security: Security) -> Result<Config, Vehicl
     let config = Config::s_unit(identity.name(), identity.id(), &manager.name, manager.id, security)?;
     let config = config.fleet(settings.fleet.0);
     Ok(match settings.manager_address {
-        Some(address) => config.manager_address(SocketAddr::V4(address)),
+        Some(address) => config.manager_address(address),
         None => config,
     })
 }

@@ -205,7 +205,7 @@ impl Inner {
         }
     }
 
-    fn act(&mut self, shared: &Rc<Shared>, host: HostId, command: Command) {
+    fn act(&mut self, shared: &Rc<Shared>, host: HostId, command: Command<SocketAddr>) {
         match command {
             Command::Dial { to, identity } => self.dial(host, to, identity.as_ref()),
             Command::Tell(LinkId(index), directive) => {

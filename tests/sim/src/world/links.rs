@@ -30,6 +30,7 @@ pub(super) enum Simulated {}
 impl Port for Simulated {
     type Storage = Boxed;
     type Cipher = Audited;
+    type Endpoint = std::net::SocketAddr;
 }
 
 pub(super) type SimSession = Session<Simulated>;
@@ -72,7 +73,7 @@ pub(super) struct Links {
     pub(super) buffers: LazyPool,
     /// The access table.
     pub(super) access: Option<&'static dyn Access>,
-    pub(super) hub: Hub<Boxed>,
+    pub(super) hub: Hub<Simulated>,
     pub(super) keys: Keys,
     arguments: BoxedParameters,
 }
@@ -86,7 +87,7 @@ impl Links {
         count: usize,
         functions: FunctionList<Boxed, Handler>,
         buffers: LazyPool,
-        hub: Hub<Boxed>,
+        hub: Hub<Simulated>,
         keys: Keys,
         arguments: BoxedParameters,
     ) -> Self {

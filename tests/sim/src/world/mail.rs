@@ -18,7 +18,7 @@ pub(super) struct SimMailman<'n> {
     pub(super) streams: &'n [Option<StreamId>],
 }
 
-impl Mailman for SimMailman<'_> {
+impl Mailman<SocketAddr> for SimMailman<'_> {
     fn write(&mut self, link: LinkId, slices: &[&[u8]]) -> Result<usize, CloseReason> {
         let stream = self.streams.get(usize::from(link.0)).copied().flatten().ok_or(CloseReason::Reset)?;
         self.network.write(stream, slices).map_err(|_| CloseReason::Reset)

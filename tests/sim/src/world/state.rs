@@ -45,7 +45,7 @@ pub(super) type LinkCounters = Counters<LinkCounter, { LinkCounter::COUNT }>;
 pub(super) struct Settings {
     pub(super) identity: Identity,
     pub(super) fleet: Fleet,
-    pub(super) target: Target,
+    pub(super) target: Target<SocketAddr>,
     /// The m_units that an m_unit connects to, if not all.
     pub(super) m_units: Option<Box<[Identity]>>,
     pub(super) constraints: Constraints,
@@ -160,7 +160,7 @@ impl Machine {
         Some(index)
     }
 
-    pub(super) fn poll_node(&mut self, network: &mut Network, host: HostId) -> Option<Command> {
+    pub(super) fn poll_node(&mut self, network: &mut Network, host: HostId) -> Option<Command<SocketAddr>> {
         let now = network.now();
         let Links { hub, keys, .. } = &mut self.links;
         hub.node.poll(now, &mut SimMailman { network, host, streams: &[] }, &keys.codes)

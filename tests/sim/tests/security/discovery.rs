@@ -17,6 +17,7 @@ use cara_secure::keys::{DiscoveryKey, PairKey, RootKey};
 use cara_sim::Boxed;
 
 use super::Tally;
+use super::ends::Attacked;
 
 pub(super) const FLEET: Fleet = Fleet(7);
 
@@ -47,7 +48,7 @@ pub(super) struct Outbox {
     pub(super) sent: Vec<(SocketAddr, Vec<u8>)>,
 }
 
-impl Mailman for Outbox {
+impl Mailman<SocketAddr> for Outbox {
     fn write(&mut self, _: LinkId, _: &[&[u8]]) -> Result<usize, CloseReason> {
         Ok(0)
     }
@@ -65,7 +66,7 @@ impl Mailman for Outbox {
 
 /// A node with its keys, and what it did.
 pub(super) struct Unit {
-    pub(super) node: Node<Boxed>,
+    pub(super) node: Node<Attacked>,
     pub(super) codes: Codes<Ring>,
     pub(super) outbox: Outbox,
     pub(super) dials: Vec<SocketAddr>,
@@ -88,12 +89,12 @@ pub(super) fn host(number: u8) -> SocketAddr {
 }
 
 impl Unit {
-    fn new(identity: &Identity, target: Target) -> Self {
+    fn new(identity: &Identity, target: Target<SocketAddr>) -> Self {
         Self::of_life(identity, target, at(0), u64::from(identity.id()) + 40)
     }
 
     /// A life of a unit that begins at `now`, with delays of its own.
-    pub(super) fn of_life(identity: &Identity, target: Target, now: Instant, life: u64) -> Self {
+    pub(super) fn of_life(identity: &Identity, target: Target<SocketAddr>, now: Instant, life: u64) -> Self {
         let config = NodeConfig {
             identity: identity.clone(),
             fleet: FLEET,

@@ -38,7 +38,7 @@ struct Sent {
     full: bool,
 }
 
-impl Mailman for Sent {
+impl Mailman<SocketAddr> for Sent {
     fn write(&mut self, _: LinkId, slices: &[&[u8]]) -> Result<usize, CloseReason> {
         let bytes = if self.full { Vec::new() } else { slices.concat() };
         self.stream.extend(&bytes);
@@ -61,6 +61,7 @@ pub(crate) enum Attacked {}
 impl Port for Attacked {
     type Storage = Boxed;
     type Cipher = Cipher;
+    type Endpoint = SocketAddr;
 }
 
 /// The keys of an end.
@@ -88,7 +89,7 @@ pub(crate) struct End {
     sent: Sent,
     now: Instant,
     pub(crate) ring: Ring,
-    hub: Hub<Boxed>,
+    hub: Hub<Attacked>,
     /// Services that ran.
     pub(crate) ran: u32,
     pub(crate) closed: Option<CloseReason>,
@@ -118,7 +119,7 @@ pub(crate) fn key() -> PairKey {
     RootKey::new([1; 32]).pair(FLEET, 1, &manager, &agv)
 }
 
-fn config_of(identity: Identity, target: Target) -> NodeConfig {
+fn config_of(identity: Identity, target: Target<SocketAddr>) -> NodeConfig<SocketAddr> {
     let constraints = Constraints::M_UNIT;
     NodeConfig { identity, fleet: FLEET, epoch: Epoch(1), target, tcp_port: 0, udp_port: 0, constraints, seed: 1 }
 }

@@ -39,7 +39,7 @@ fn recorded(mut unit: Unit) -> Vec<u8> {
     unit.outbox.broadcasts.remove(0)
 }
 
-fn wanted() -> Target {
+fn wanted() -> Target<SocketAddr> {
     Target::Manager(Manager::new("depot", 1).expect("a name"))
 }
 

@@ -2,7 +2,7 @@
 
 use super::*;
 
-fn decide(node: &mut Node<Boxed>, hello: &Hello) -> Admission {
+fn decide(node: &mut Node<InMemory>, hello: &Hello) -> Admission {
     node.admit(at(10), LinkId(9), address(9, 40_000), hello)
 }
 
@@ -78,7 +78,7 @@ fn the_next_node_is_refused_as_full_until_one_leaves_or_the_limit_is_raised() {
 
 #[test]
 fn a_table_that_is_full_of_connected_nodes_refuses_as_full() {
-    let mut node: Node<Boxed> = Node::new(at(0), m_unit(MANAGER, MANAGER_ID), storage(2));
+    let mut node: Node<InMemory> = Node::new(at(0), m_unit(MANAGER, MANAGER_ID), storage(2));
     join(&mut node, at(1), 0, &s_unit("a", 1));
     join(&mut node, at(1), 1, &s_unit("b", 2));
     assert_eq!(decide(&mut node, &hello_of(&s_unit("c", 3))), Admission::Refuse(Refusal::Full));
@@ -94,7 +94,7 @@ fn of_crossing_links_both_ends_keep_the_one_that_the_smaller_dialled() {
         let mut of_small = node(small.clone());
         let mut of_large = node(large.clone());
         // Link 0 is the one that `small` dials, link 1 the one that `large` dials.
-        let hear = |node: &mut Node<Boxed>, peer: &NodeConfig| {
+        let hear = |node: &mut Node<InMemory>, peer: &NodeConfig<SocketAddr>| {
             node.answered(at(1), address(peer.identity.id(), 7_001), &announce_of(peer, 1, 0));
         };
         hear(&mut of_small, &large);

@@ -51,7 +51,7 @@ fn step() -> impl Strategy<Value = Step> {
     ]
 }
 
-fn who_is(who: u8, epoch: u64, port: u16) -> NodeConfig {
+fn who_is(who: u8, epoch: u64, port: u16) -> NodeConfig<SocketAddr> {
     let config = match who {
         0 => m_unit(MANAGER, MANAGER_ID),
         1 => m_unit("smaller", 1),
@@ -63,7 +63,7 @@ fn who_is(who: u8, epoch: u64, port: u16) -> NodeConfig {
 
 /// A port that forgets nothing but is told nonsense.
 struct Port {
-    node: Node<Boxed>,
+    node: Node<InMemory>,
     now: Instant,
     outbox: Outbox,
     /// Links that are open: taken, waiting or being dialled.
@@ -81,7 +81,7 @@ impl Port {
         assert!(self.node.next_deadline() > self.now, "nothing due remains after a poll");
     }
 
-    fn act(&mut self, command: Command, dial: u64) {
+    fn act(&mut self, command: Command<SocketAddr>, dial: u64) {
         match command {
             Command::Dial { identity, .. } => {
                 let free = (6..12).find(|link| !self.open.contains(link));

@@ -8,7 +8,7 @@ use crate::distribution::datagram::{Datagram, short_hash};
 const SOON: u64 = 400;
 
 /// The times at which a node broadcasts up to `end`.
-fn search_times(node: &mut Node<Boxed>, end: Instant) -> Vec<Instant> {
+fn search_times(node: &mut Node<InMemory>, end: Instant) -> Vec<Instant> {
     let mut times = Vec::new();
     while node.next_deadline() <= end {
         let now = node.next_deadline();
@@ -100,7 +100,7 @@ fn the_first_seeker_is_answered_alone_and_the_second_with_all_others() {
     let mut node = depot();
     let mut outbox = Outbox::default();
     run(&mut node, at(40_000), &mut Outbox::default());
-    let ask = |node: &mut Node<Boxed>, millis, host| {
+    let ask = |node: &mut Node<InMemory>, millis, host| {
         node.hear(at(millis), address(host, 7_001), &who_has_bytes(&search_of(&s_unit("agv", host), 1)));
     };
     ask(&mut node, 40_001, 1);
@@ -237,7 +237,7 @@ fn of_two_m_units_the_smaller_dials_and_the_larger_answers() {
 /// Each node that is expected costs the others a millisecond.
 #[test]
 fn a_manager_expects_no_more_nodes_than_it_knows_of() {
-    let expected = |node: &mut Node<Boxed>| {
+    let expected = |node: &mut Node<InMemory>| {
         let mut outbox = Outbox::default();
         run(node, at(100), &mut outbox);
         as_who_has(&outbox.broadcasts[0]).expected
@@ -257,8 +257,8 @@ fn an_m_unit_that_has_chosen_others_meets_those_alone() {
     let [chosen, larger, smaller] = ["z", "x", "b"].map(|name| m_unit(name, 1));
     let mut node = node(own.clone());
     node.choose(Box::new([chosen.identity.clone()]));
-    let question = |config: &NodeConfig| who_has_bytes(&search_of(config, 1));
-    let asks = |config: &NodeConfig| {
+    let question = |config: &NodeConfig<SocketAddr>| who_has_bytes(&search_of(config, 1));
+    let asks = |config: &NodeConfig<SocketAddr>| {
         let wanted = Some(Manager::new("m", 1).unwrap());
         who_has_bytes(&WhoHas { wanted, expected: 0, ..search_of(config, 2) })
     };
@@ -274,7 +274,7 @@ fn an_m_unit_that_has_chosen_others_meets_those_alone() {
     node.hear(at(200), address(3, 7_001), &asks(&s_unit("agv", 1)));
     assert_eq!(run(&mut node, at(2_000), &mut outbox), []);
     assert_eq!(outbox.sent.len(), 2, "one question to the chosen one, and the answer to its own s_unit");
-    let admitted = |node: &mut Node<Boxed>, config: &NodeConfig, link| {
+    let admitted = |node: &mut Node<InMemory>, config: &NodeConfig<SocketAddr>, link| {
         let hello = Hello {
             wanted: config.identity.name().eq("agv").then(|| Manager::new("m", 1).unwrap()),
             ..hello_of(config)

@@ -11,8 +11,8 @@ const UNITS: u32 = 1_000;
 type Flight = (Instant, u64, usize, usize, Vec<u8>);
 
 struct Fleet1000 {
-    units: Vec<Node<Boxed>>,
-    configs: Vec<NodeConfig>,
+    units: Vec<Node<InMemory>>,
+    configs: Vec<NodeConfig<SocketAddr>>,
     /// When each unit is switched on.
     on: Vec<Instant>,
     flying: BinaryHeap<Reverse<Flight>>,
@@ -38,7 +38,7 @@ impl Fleet1000 {
         let mut on = std::vec![units_at; configs.len()];
         on[0] = manager_at;
         let nodes = |index| if index == 0 { UNITS as usize + 8 } else { 2 };
-        let units: Vec<Node<Boxed>> = configs
+        let units: Vec<Node<InMemory>> = configs
             .iter()
             .enumerate()
             .map(|(index, config)| Node::new(on[index], config.clone(), storage(nodes(index))))

@@ -3,7 +3,7 @@
 use super::*;
 use crate::config::LONGEST_SEARCH;
 
-fn announce(node: &mut Node<Boxed>, now: Instant, from: u32, announce: &Announce) {
+fn announce(node: &mut Node<InMemory>, now: Instant, from: u32, announce: &Announce) {
     node.answered(now, address(from, 7_001), announce);
 }
 
@@ -30,7 +30,7 @@ fn made_up_names_neither_push_out_known_nodes_nor_are_kept() {
 
 #[test]
 fn a_few_strangers_are_kept_even_where_there_is_room_for_more() {
-    let mut node: Node<Boxed> = Node::new(at(0), m_unit(MANAGER, MANAGER_ID), storage(64));
+    let mut node: Node<InMemory> = Node::new(at(0), m_unit(MANAGER, MANAGER_ID), storage(64));
     for id in 0..100 {
         announce(&mut node, at(1), id + 1, &announce_of(&m_unit("made-up", 1_000 + id), 1, 0));
     }
@@ -41,7 +41,7 @@ fn a_few_strangers_are_kept_even_where_there_is_room_for_more() {
 
 #[test]
 fn strangers_that_are_being_dialled_leave_no_room_until_they_are_given_up() {
-    let mut node: Node<Boxed> = Node::new(at(0), m_unit(MANAGER, MANAGER_ID), storage(64));
+    let mut node: Node<InMemory> = Node::new(at(0), m_unit(MANAGER, MANAGER_ID), storage(64));
     for id in 0..8 {
         announce(&mut node, at(1), id + 1, &announce_of(&m_unit("made-up", 1_000 + id), 1, 0));
     }
@@ -124,7 +124,7 @@ fn addresses_that_do_not_answer_give_way_to_a_new_one() {
 }
 
 /// How many searches a unit sends within ten minutes in which `others` ask every `pause`.
-fn searches_among(others: &NodeConfig, pause: Duration, seed: u64) -> usize {
+fn searches_among(others: &NodeConfig<SocketAddr>, pause: Duration, seed: u64) -> usize {
     let mut node = node(NodeConfig { seed, ..s_unit("agv", 1) });
     let mut outbox = Outbox::default();
     let mut now = at(0);

@@ -33,7 +33,7 @@ fn step() -> impl Strategy<Value = Step> {
     ]
 }
 
-fn peer(number: u8, life: u64) -> NodeConfig {
+fn peer(number: u8, life: u64) -> NodeConfig<SocketAddr> {
     let id = u32::from(number) + 3;
     let config = if number.is_multiple_of(2) { m_unit("m", id + 10) } else { s_unit("s", id) };
     NodeConfig { epoch: Epoch(life), ..config }
@@ -48,7 +48,7 @@ enum Open {
 
 /// A port: which links are open, whose they are, and how far they are.
 struct Port {
-    node: Node<Boxed>,
+    node: Node<InMemory>,
     now: Instant,
     open: BTreeMap<u16, (u8, Open)>,
 }
@@ -123,7 +123,7 @@ impl Port {
         self.node.left(self.now, LinkId(link), CloseReason::Reset);
     }
 
-    fn act(&mut self, command: Command) {
+    fn act(&mut self, command: Command<SocketAddr>) {
         match command {
             Command::Dial { identity, .. } => {
                 let number = (0..6).find(|number| Some(peer(*number, 1).identity) == identity).unwrap();

@@ -19,21 +19,22 @@ mod ordering;
 mod restart;
 mod table;
 
+use core::net::SocketAddr;
 use std::boxed::Box;
 use std::vec::Vec;
 
 use super::*;
 use crate::config::Mode;
 use crate::distribution::datagram::{Announce, SEARCH_BYTES, WhoHas};
+use crate::host::port::InMemory;
 use crate::host::secure::Plain;
-use crate::storage::Boxed;
 use crate::time::Duration;
 
 pub(super) const FLEET: Fleet = Fleet(7);
 pub(super) const MANAGER: &str = "depot";
 pub(super) const MANAGER_ID: u32 = 5;
 
-impl Node<Boxed> {
+impl Node<InMemory> {
     /// Takes a datagram in plain mode.
     pub(super) fn hear(&mut self, now: Instant, from: SocketAddr, bytes: &[u8]) {
         self.datagram(now, from, bytes, &Plain);
@@ -53,7 +54,7 @@ pub(super) struct Outbox {
     pub(super) sent: Vec<(SocketAddr, Vec<u8>)>,
 }
 
-impl Mailman for Outbox {
+impl Mailman<SocketAddr> for Outbox {
     fn write(&mut self, _: LinkId, _: &[&[u8]]) -> Result<usize, CloseReason> {
         panic!("a node never writes to links")
     }
@@ -82,7 +83,7 @@ pub(super) fn manager() -> Manager {
     Manager::new(MANAGER, MANAGER_ID).unwrap()
 }
 
-pub(super) fn m_unit(name: &str, id: u32) -> NodeConfig {
+pub(super) fn m_unit(name: &str, id: u32) -> NodeConfig<SocketAddr> {
     NodeConfig {
         identity: Identity::m_unit(name, id).unwrap(),
         fleet: FLEET,
@@ -95,7 +96,7 @@ pub(super) fn m_unit(name: &str, id: u32) -> NodeConfig {
     }
 }
 
-pub(super) fn s_unit(name: &str, id: u32) -> NodeConfig {
+pub(super) fn s_unit(name: &str, id: u32) -> NodeConfig<SocketAddr> {
     NodeConfig {
         identity: Identity::s_unit(name, id).unwrap(),
         fleet: FLEET,
@@ -112,25 +113,25 @@ pub(super) fn slice<T: Default>(count: usize) -> Box<[T]> {
     (0..count).map(|_| T::default()).collect()
 }
 
-pub(super) fn storage(nodes: usize) -> NodeStorage<Boxed> {
+pub(super) fn storage(nodes: usize) -> NodeStorage<InMemory> {
     NodeStorage { nodes: slice(nodes), order: slice(nodes), links: slice(nodes * 2), findings: slice(4) }
 }
 
 /// A node that was made at the start of the clock.
-pub(super) fn node(config: NodeConfig) -> Node<Boxed> {
+pub(super) fn node(config: NodeConfig<SocketAddr>) -> Node<InMemory> {
     Node::new(Instant::START, config, storage(16))
 }
 
-pub(super) fn depot() -> Node<Boxed> {
+pub(super) fn depot() -> Node<InMemory> {
     node(m_unit(MANAGER, MANAGER_ID))
 }
 
 /// The hello of a unit, as its node would make it.
-pub(super) fn hello_of(config: &NodeConfig) -> Hello {
+pub(super) fn hello_of(config: &NodeConfig<SocketAddr>) -> Hello {
     node(config.clone()).hello(Instant::START, LinkId(0))
 }
 
-pub(super) fn search_of(config: &NodeConfig, sequence: u32) -> WhoHas {
+pub(super) fn search_of(config: &NodeConfig<SocketAddr>, sequence: u32) -> WhoHas {
     let wanted = match &config.target {
         Target::Everybody => None,
         Target::Manager(manager) | Target::Fixed(manager, _) => Some(manager.clone()),
@@ -147,7 +148,7 @@ pub(super) fn search_of(config: &NodeConfig, sequence: u32) -> WhoHas {
     }
 }
 
-pub(super) fn announce_of(config: &NodeConfig, sequence: u32, nonce: u64) -> Announce {
+pub(super) fn announce_of(config: &NodeConfig<SocketAddr>, sequence: u32, nonce: u64) -> Announce {
     Announce {
         identity: config.identity.clone(),
         epoch: config.epoch,
@@ -186,7 +187,7 @@ pub(super) fn as_announce(bytes: &[u8]) -> Announce {
 }
 
 /// Polls at each deadline up to `end`; returns the commands and when each came.
-pub(super) fn run(node: &mut Node<Boxed>, end: Instant, outbox: &mut Outbox) -> Vec<(Instant, Command)> {
+pub(super) fn run(node: &mut Node<InMemory>, end: Instant, outbox: &mut Outbox) -> Vec<(Instant, Command<SocketAddr>)> {
     let mut actions = Vec::new();
     for _ in 0..100_000 {
         let now = node.next_deadline();
@@ -202,23 +203,23 @@ pub(super) fn run(node: &mut Node<Boxed>, end: Instant, outbox: &mut Outbox) -> 
 }
 
 /// What is to be done at once.
-pub(super) fn due(node: &mut Node<Boxed>, now: Instant) -> Vec<Command> {
+pub(super) fn due(node: &mut Node<InMemory>, now: Instant) -> Vec<Command<SocketAddr>> {
     core::iter::from_fn(|| node.poll(now, &mut Outbox::default(), &Plain)).collect()
 }
 
 /// What a link is told.
-pub(super) fn tell(link: u16, directive: Directive) -> Command {
+pub(super) fn tell(link: u16, directive: Directive) -> Command<SocketAddr> {
     Command::Tell(LinkId(link), directive)
 }
 
 /// Lets a unit join.
-pub(super) fn join(node: &mut Node<Boxed>, now: Instant, link: u16, config: &NodeConfig) {
+pub(super) fn join(node: &mut Node<InMemory>, now: Instant, link: u16, config: &NodeConfig<SocketAddr>) {
     let from = address(config.identity.id(), 40_000);
     assert_eq!(node.admit(now, LinkId(link), from, &hello_of(config)), Admission::Accept);
 }
 
 /// Lets an s_unit be found by its manager's answer; returns where it dials.
-pub(super) fn dial_manager(node: &mut Node<Boxed>, now: Instant, sequence: u32) -> SocketAddr {
+pub(super) fn dial_manager(node: &mut Node<InMemory>, now: Instant, sequence: u32) -> SocketAddr {
     let announce = announce_of(&m_unit(MANAGER, MANAGER_ID), sequence, 0);
     node.answered(now, address(1, 7_001), &announce);
     let actions = run(node, now + Duration::from_millis(200), &mut Outbox::default());

@@ -34,8 +34,8 @@ pub(super) enum Sort {
 }
 
 pub(super) struct Unit {
-    config: NodeConfig,
-    pub(super) node: Option<Node<Boxed>>,
+    config: NodeConfig<SocketAddr>,
+    pub(super) node: Option<Node<InMemory>>,
     nodes: usize,
     /// Rises each time that it is switched on.
     life: u64,
@@ -76,7 +76,7 @@ impl Network {
     }
 
     /// Adds a unit that is switched on at `on` and knows up to `nodes` others.
-    pub(super) fn add(&mut self, config: NodeConfig, on: Instant, nodes: usize) -> usize {
+    pub(super) fn add(&mut self, config: NodeConfig<SocketAddr>, on: Instant, nodes: usize) -> usize {
         let index = self.units.len();
         self.units.push(Unit { config, node: None, nodes, life: 0, joined: None });
         self.plan(on, index, Happening::On);

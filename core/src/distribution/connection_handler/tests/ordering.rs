@@ -17,7 +17,7 @@ fn orders<T: Clone>(items: &[T], chosen: &mut Vec<T>, visit: &mut impl FnMut(&[T
     }
 }
 
-fn state(node: &Node<Boxed>) -> Vec<impl Clone + PartialEq + core::fmt::Debug + use<>> {
+fn state(node: &Node<InMemory>) -> Vec<impl Clone + PartialEq + core::fmt::Debug + use<>> {
     let mut all: Vec<_> = node
         .nodes()
         .map(|known| (known.identity.clone(), known.newest, known.listens, known.address, known.epoch, known.state()))
@@ -29,7 +29,7 @@ fn state(node: &Node<Boxed>) -> Vec<impl Clone + PartialEq + core::fmt::Debug + 
 #[test]
 fn any_order_of_six_datagrams_ends_in_the_same_state() {
     let (one, two) = (m_unit("one", 11), m_unit("two", 12));
-    let moved = |config: &NodeConfig, tcp_port| NodeConfig { tcp_port, ..config.clone() };
+    let moved = |config: &NodeConfig<SocketAddr>, tcp_port| NodeConfig { tcp_port, ..config.clone() };
     let nonce = depot().search.nonce;
     let datagrams = [
         who_has_bytes(&search_of(&moved(&one, 7_000), 9)),
@@ -101,7 +101,7 @@ proptest! {
         noise in prop::collection::vec(any::<u8>(), 0..64),
     ) {
         for config in [m_unit(MANAGER, MANAGER_ID), s_unit("agv", 1)] {
-            let mut node: Node<Boxed> = Node::new(at(0), config, storage(4));
+            let mut node: Node<InMemory> = Node::new(at(0), config, storage(4));
             node.hear(at(1), address(9, 9), &noise);
             for (kind, mutations) in &kinds {
                 let mut bytes = valid(*kind);

@@ -6,11 +6,11 @@ use super::*;
 use crate::config::CHALLENGE_TIMEOUT;
 use crate::error::Error;
 
-fn reborn(config: &NodeConfig) -> Hello {
+fn reborn(config: &NodeConfig<SocketAddr>) -> Hello {
     Hello { epoch: Epoch(999), ..hello_of(config) }
 }
 
-fn challenged() -> Node<Boxed> {
+fn challenged() -> Node<InMemory> {
     let mut node = depot();
     let agv = s_unit("agv", 1);
     join(&mut node, at(1), 0, &agv);
@@ -100,7 +100,7 @@ fn a_peer_that_dials_again_in_one_life_waits_for_its_old_link_to_show_itself() {
     let agv = s_unit("agv", 1);
     let mut node = depot();
     join(&mut node, at(1), 0, &agv);
-    let again = |node: &mut Node<Boxed>| node.admit(at(1_000), LinkId(1), address(1, 41_000), &hello_of(&agv));
+    let again = |node: &mut Node<InMemory>| node.admit(at(1_000), LinkId(1), address(1, 41_000), &hello_of(&agv));
     assert_eq!(again(&mut node), Admission::Wait);
     assert_eq!(due(&mut node, at(1_000)), [tell(0, Directive::Challenge)]);
     node.challenge_answered(at(1_001), LinkId(0));
@@ -121,7 +121,7 @@ fn an_index_keeps_meaning_the_same_node_when_another_leaves() {
     for (link, agv) in (0..).zip(&agvs) {
         join(&mut node, at(2), link, agv);
     }
-    let name = |node: &Node<Boxed>, index| node.s_unit(index).unwrap().identity.name().to_string();
+    let name = |node: &Node<InMemory>, index| node.s_unit(index).unwrap().identity.name().to_string();
     node.left(at(3), LinkId(0), CloseReason::Reset);
     assert_eq!((name(&node, 1), name(&node, 2)), ("agv-2".into(), "agv-3".into()));
     assert!(!node.s_unit(0).unwrap().is_joined());
@@ -149,7 +149,7 @@ fn nodes_are_found_by_name_id_and_address() {
     assert_eq!(node.find_id(1).unwrap().identity.name(), "b", "connected ones come first");
     assert_eq!(node.find("d").err(), Some(Error::NotConnected));
     assert!(node.find_id(2).is_none());
-    let names: Vec<_> = node.find_address(address(1, 9).ip()).map(|known| known.identity.name()).collect();
+    let names: Vec<_> = node.find_address(address(1, 9)).map(|known| known.identity.name()).collect();
     assert_eq!(names, ["a", "b"]);
     let gone = node.find("a").unwrap();
     assert_eq!((gone.state(), gone.epoch, gone.limits.is_some()), (NodeState::Away, Epoch(1), true));
@@ -169,7 +169,7 @@ fn a_name_that_several_nodes_have_is_refused() {
 
 #[test]
 fn the_node_that_left_first_is_forgotten_first() {
-    let mut node: Node<Boxed> = Node::new(at(0), m_unit(MANAGER, MANAGER_ID), storage(3));
+    let mut node: Node<InMemory> = Node::new(at(0), m_unit(MANAGER, MANAGER_ID), storage(3));
     for (link, name) in (0..).zip(["a", "b", "c"]) {
         join(&mut node, at(1), link, &s_unit(name, 10 - u32::from(link)));
     }

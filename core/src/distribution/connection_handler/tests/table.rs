@@ -76,7 +76,7 @@ fn lowest_free(model: &Model, role: Role) -> u16 {
     (0..).find(|index| !taken(*index)).unwrap()
 }
 
-fn check(table: &Table<Boxed>, model: &Model) {
+fn check(table: &Table<InMemory>, model: &Model) {
     for who in 0..16 {
         let found = table.find(&identity(who)).and_then(|place| table.node(place));
         let entry = model.get(&who);
@@ -99,7 +99,7 @@ fn check(table: &Table<Boxed>, model: &Model) {
 proptest! {
     #[test]
     fn the_table_is_what_its_model_is(steps in prop::collection::vec(step(), 1..120)) {
-        let mut table: Table<Boxed> = Table::new(slice(CAPACITY), slice(CAPACITY), slice(4));
+        let mut table: Table<InMemory> = Table::new(slice(CAPACITY), slice(CAPACITY), slice(4));
         let (mut model, mut capacity) = (Model::new(), CAPACITY);
         for (clock, step) in steps.into_iter().enumerate() {
             match step {

@@ -17,6 +17,7 @@ mod hello;
 mod hostile;
 mod leases;
 mod limits;
+mod lines;
 mod lists;
 mod liveness;
 mod net;

@@ -50,7 +50,7 @@ impl Net {
     }
 }
 
-impl Mailman for Net {
+impl Mailman<SocketAddr> for Net {
     fn write(&mut self, _: LinkId, slices: &[&[u8]]) -> Result<usize, CloseReason> {
         let before = self.pipe.len();
         for slice in slices {

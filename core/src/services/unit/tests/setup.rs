@@ -5,6 +5,7 @@ use std::vec;
 
 use super::super::{Publication, SessionStorage, buffer_bytes};
 use super::net::DATAGRAM_PORT;
+use super::side::Tested;
 use crate::config::{Constraints, LINK_BUFFER_BYTES, Priority};
 use crate::distribution::connection_handler::{Node, NodeConfig, NodeStorage, Target};
 use crate::distribution::function::{Attributes, Definition};
@@ -109,7 +110,7 @@ pub(super) fn hello(constraints: &Constraints, agv: bool, datagrams: bool) -> He
 }
 
 /// The hub of an end whose manager has this name.
-pub(super) fn hub(agv: bool, manager: &str) -> Hub<Boxed> {
+pub(super) fn hub(agv: bool, manager: &str) -> Hub<Tested> {
     let target = if agv { Target::Manager(Manager::new(manager, 1).unwrap()) } else { Target::Everybody };
     let identity = if agv { Identity::s_unit("agv-01", 1) } else { Identity::m_unit(manager, 1) }.unwrap();
     let config = NodeConfig {

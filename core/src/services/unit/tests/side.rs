@@ -72,17 +72,18 @@ pub(super) enum Tested {}
 impl Port for Tested {
     type Storage = Boxed;
     type Cipher = Plain;
+    type Endpoint = SocketAddr;
 }
 
 /// A hub that can be kept from deciding.
 pub(super) struct Lobby {
-    pub(super) hub: Hub<Boxed>,
+    pub(super) hub: Hub<Tested>,
     pub(super) waits: bool,
     pub(super) entered: usize,
 }
 
-impl Door<Boxed> for Lobby {
-    fn enter(&mut self, act: &mut dyn FnMut(&mut Hub<Boxed>)) {
+impl Door<Tested> for Lobby {
+    fn enter(&mut self, act: &mut dyn FnMut(&mut Hub<Tested>)) {
         self.entered += 1;
         if !self.waits {
             act(&mut self.hub);

@@ -1,6 +1,6 @@
 //! The manager of these tests: the core's two machines over smoltcp, with a few links.
 
-use std::net::{Ipv4Addr, SocketAddr};
+use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
 
 use cara_core::config::{Constraints, LINK_BUFFER_BYTES, Mode, PLAIN_PORT};
 use cara_core::distribution::connection_handler::{Command, Node, NodeConfig, NodeStorage, Target};
@@ -34,8 +34,8 @@ const LINKS: usize = 8;
 const FUNCTIONS: usize = 8;
 const CALLS: usize = 16;
 
-pub(crate) fn address() -> SocketAddr {
-    SocketAddr::from(([10, 0, 0, HOST], TCP_PORT))
+pub(crate) fn address() -> SocketAddrV4 {
+    SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, HOST), TCP_PORT)
 }
 
 pub(crate) fn mac(host: u8) -> [u8; 6] {
@@ -58,12 +58,13 @@ enum OnHost {}
 impl Port for OnHost {
     type Storage = Boxed;
     type Cipher = Plain;
+    type Endpoint = SocketAddrV4;
 }
 
 pub(crate) struct Manager {
     pub(crate) cable: Cable,
     net: Net,
-    hub: Hub<Boxed>,
+    hub: Hub<OnHost>,
     sessions: Vec<Option<Session<OnHost>>>,
     functions: FunctionList<Boxed, ()>,
     buffers: Pool<Boxed>,
@@ -84,7 +85,7 @@ struct Net {
     datagrams: SocketHandle,
 }
 
-impl Mailman for Net {
+impl Mailman<SocketAddrV4> for Net {
     fn write(&mut self, link: LinkId, slices: &[&[u8]]) -> Result<usize, CloseReason> {
         let stream = self.sockets.get_mut::<tcp::Socket>(self.streams[usize::from(link.0)]);
         let mut written = 0;
@@ -98,13 +99,12 @@ impl Mailman for Net {
         Ok(written)
     }
 
-    fn send_to(&mut self, to: SocketAddr, datagram: &[u8]) -> bool {
-        let SocketAddr::V4(to) = to else { return false };
+    fn send_to(&mut self, to: SocketAddrV4, datagram: &[u8]) -> bool {
         self.sockets.get_mut::<udp::Socket>(self.datagrams).send_slice(datagram, to).is_ok()
     }
 
     fn broadcast(&mut self, datagram: &[u8]) -> bool {
-        self.send_to(SocketAddr::from(([10, 0, 0, 255], PLAIN_PORT)), datagram)
+        self.send_to(SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, 255), PLAIN_PORT), datagram)
     }
 }
 
@@ -255,7 +255,7 @@ impl Manager {
         loop {
             let received = self.net.sockets.get_mut::<udp::Socket>(self.net.datagrams).recv_slice(&mut bytes);
             let Ok((length, from)) = received else { return };
-            let from = from.endpoint.into();
+            let SocketAddr::V4(from) = from.endpoint.into() else { continue };
             let for_session = datagram::for_session(&mut bytes[..length], Mode::Plain, self.hub.node.fleet());
             if let Some((LinkId(link), nonce, body)) = for_session
                 && let Some(Some(session)) = self.sessions.get_mut(usize::from(link))
@@ -294,7 +294,7 @@ impl Manager {
 
     fn open(&mut self, now: Instant, index: usize) {
         let link = LinkId(index as u16);
-        let address: SocketAddr = self.net.stream(index).remote_endpoint().unwrap().into();
+        let SocketAddr::V4(address) = self.net.stream(index).remote_endpoint().unwrap().into() else { return };
         let local = self.hub.node.hello(now, link);
         let storage = SessionStorage {
             small: Boxed::slice(LINK_BUFFER_BYTES),
@@ -363,7 +363,7 @@ impl Manager {
         }
     }
 
-    fn act(&mut self, now: Instant, command: Command) {
+    fn act(&mut self, now: Instant, command: Command<SocketAddrV4>) {
         let Command::Tell(link, directive) = command else { unreachable!("a lone manager dials nobody") };
         let index = usize::from(link.0);
         let Some(session) = &mut self.sessions[index] else { return };

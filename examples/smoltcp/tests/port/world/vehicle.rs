@@ -1,5 +1,7 @@
 //! A vehicle: the port under test, and a program that notes what it is asked to do.
 
+use std::net::SocketAddrV4;
+
 use cara_core::distribution::connection_handler::Target;
 use cara_core::distribution::function::{Attributes, Definition};
 use cara_core::distribution::function_list::Slot;
@@ -94,7 +96,13 @@ impl Program for Notes {
 }
 
 impl Vehicle {
-    pub(crate) fn new(now: Instant, switch: &SharedSwitch, number: u8, seed: u64, target: Target) -> Self {
+    pub(crate) fn new(
+        now: Instant,
+        switch: &SharedSwitch,
+        number: u8,
+        seed: u64,
+        target: Target<SocketAddrV4>,
+    ) -> Self {
         let mac = [2, 0, 0, 0, 1, number];
         let mut cable = Cable::new(switch, mac);
         let epoch = (seed << 8) | u64::from(number);
@@ -145,10 +153,10 @@ pub(crate) fn manager_name() -> Manager {
     Manager::new("manager", 1).unwrap()
 }
 
-pub(crate) fn by_broadcast() -> Target {
+pub(crate) fn by_broadcast() -> Target<SocketAddrV4> {
     Target::Manager(manager_name())
 }
 
-pub(crate) fn by_address() -> Target {
+pub(crate) fn by_address() -> Target<SocketAddrV4> {
     Target::Fixed(manager_name(), manager::address())
 }

@@ -1,0 +1,30 @@
+//! What a port is made of.
+
+use super::endpoint::Endpoint;
+use super::secure::Secure;
+use crate::storage::Storage;
+
+/// What a port is made of: the one type parameter of the machines that it holds. What is only lent for a call is `dyn`.
+pub trait Port: 'static {
+    /// Where tables and buffers live.
+    type Storage: Storage;
+    /// How links are secured; [`Plain`](crate::host::secure::Plain) where they are not.
+    type Cipher: Secure;
+    /// How nodes are addressed: [`SocketAddr`](core::net::SocketAddr) or the smaller [`SocketAddrV4`](core::net::SocketAddrV4)
+    /// over IP.
+    type Endpoint: Endpoint;
+}
+
+/// Slices of a port's storage.
+pub type Slice<P, T> = <<P as Port>::Storage as Storage>::Slice<T>;
+
+/// The port of tests without links.
+#[cfg(test)]
+pub(crate) enum InMemory {}
+
+#[cfg(test)]
+impl Port for InMemory {
+    type Storage = crate::storage::Boxed;
+    type Cipher = super::secure::Plain;
+    type Endpoint = core::net::SocketAddr;
+}
