@@ -6,7 +6,6 @@ use cara_core::distribution::datagram::{self, Announce, Datagram, WhoHas};
 use cara_core::distribution::hello::Manager;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::presence::Presence;
-use cara_core::storage::Lent;
 use core::mem::MaybeUninit;
 use core::net::SocketAddrV4;
 

@@ -1,7 +1,7 @@
 //! Common services: a session from hello to close, leases, visibility of functions.
 
-use core::net::SocketAddrV4;
 use core::mem::MaybeUninit;
+use core::net::SocketAddrV4;
 
 use cara_core::distribution::datagram;
 use cara_core::distribution::function_list::FunctionList;
