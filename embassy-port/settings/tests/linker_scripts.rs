@@ -3,16 +3,7 @@
 use std::fs;
 use std::path::Path;
 
-use cara_settings::board::{self, Board};
-
-/// Memory maps of the boards, below the folder of firmware.
-const MAPS: [(&Board, &str); 5] = [
-    (&board::NUCLEO_F767ZI, "nucleo/memory/f767zi.x"),
-    (&board::NUCLEO_H743ZI, "nucleo/memory/h743zi.x"),
-    (&board::RP2040_W5500, "rp/memory/rp2040.x"),
-    (&board::RP2350_W5500, "rp/memory/rp2350.x"),
-    (&board::PICO2W, "rp/memory/pico2w.x"),
-];
+use cara_settings::board::BOARDS;
 
 /// Start and end of a region of a linker script.
 fn region(map: &str, name: &str) -> (u32, u32) {
@@ -38,12 +29,36 @@ fn number(text: &str) -> u32 {
     }
 }
 
+/// A file of the repository.
+fn read(file: &str) -> String {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").join(file);
+    fs::read_to_string(&path).unwrap_or_else(|error| panic!("{file}: {error}"))
+}
+
+#[test]
+fn the_page_of_boards_says_the_same() {
+    let page = read("docs/boards.md");
+    for board in BOARDS {
+        let ([first, second], [one, other]) = (board.pages, board.boots);
+        let erased = board.erase_bytes / 1024;
+        for line in [
+            format!("| `{}` | {} | [{2}](../examples/firmware/{2}) |", board.name, board.description, board.folder),
+            format!(
+                "| `{}` | {first:#010X} | {second:#010X} | {one:#010X}, {other:#010X} | {erased} KiB |",
+                board.name
+            ),
+        ] {
+            let line = line.replace("0X", "0x");
+            assert!(page.contains(&line), "docs/boards.md has no line `{line}`");
+        }
+    }
+}
+
 #[test]
 fn linker_scripts_keep_the_pages_free() {
-    assert_eq!(MAPS.map(|(board, _)| board.name), board::BOARDS.map(|board| board.name));
-    for (board, file) in MAPS {
-        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/firmware").join(file);
-        let map = fs::read_to_string(&path).unwrap_or_else(|error| panic!("{file}: {error}"));
+    for board in BOARDS {
+        let file = format!("examples/firmware/{}/memory/{}.x", board.folder, board.feature);
+        let map = read(&file);
         for (name, [first, second]) in [("SETTINGS", board.pages), ("BOOTS", board.boots)] {
             assert_eq!(region(&map, name), (first, second + board.erase_bytes), "{file}");
         }

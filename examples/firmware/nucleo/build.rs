@@ -4,18 +4,26 @@ use std::path::PathBuf;
 use std::{env, fs};
 
 fn main() {
-    let is = |feature: &str| env::var_os(format!("CARGO_FEATURE_{feature}")).is_some();
-    let map = match (is("F767ZI"), is("H743ZI")) {
-        (true, false) => "memory/f767zi.x",
-        (false, true) => "memory/h743zi.x",
-        _ => panic!("choose one board: --no-default-features --features f767zi, or h743zi"),
+    let is_chosen = |board: &String| env::var_os(format!("CARGO_FEATURE_{}", board.to_uppercase())).is_some();
+    let boards = boards();
+    let mut chosen = boards.iter().filter(|board| is_chosen(board));
+    let (Some(board), None) = (chosen.next(), chosen.next()) else {
+        panic!("choose one board: --no-default-features --features {}", boards.join(", or "));
     };
+    println!("cargo::rustc-env=CARA_BOARD={board}");
     let place = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets it"));
-    fs::copy(map, place.join("memory.x")).expect("the memory map is copied");
+    fs::copy(format!("memory/{board}.x"), place.join("memory.x")).expect("the memory map is copied");
     println!("cargo::rustc-link-search={}", place.display());
     for argument in ["--nmagic", "-Tlink.x", "-Tdefmt.x"] {
         println!("cargo::rustc-link-arg-bins={argument}");
     }
     println!("cargo::rerun-if-changed=build.rs");
     println!("cargo::rerun-if-changed=memory");
+}
+
+/// The boards that have a memory map; each is a feature as well.
+fn boards() -> Vec<String> {
+    let maps = fs::read_dir("memory").expect("the folder of maps is there");
+    let names = maps.filter_map(|map| map.ok()?.file_name().into_string().ok());
+    names.filter_map(|name| Some(name.strip_suffix(".x")?.to_owned())).collect()
 }

@@ -12,12 +12,13 @@ const RADIO_FILES: [&str; 3] = ["43439A0.bin", "43439A0_clm.bin", "nvram_rp2040.
 
 fn main() {
     let is = |feature: &str| env::var_os(format!("CARGO_FEATURE_{feature}")).is_some();
-    let (maps, link): (&[&str], &[&str]) = match (is("RP2040"), is("RP2350"), is("PICO2W")) {
-        (true, false, false) => (&["memory/rp2040.x"], &["-Tlink-rp.x"]),
-        (false, true, false) => (&["memory/rp2350.x", "memory/blocks.x"], &[]),
-        (false, false, true) => (&["memory/pico2w.x", "memory/blocks.x"], &[]),
+    let (board, maps, link): (_, &[&str], &[&str]) = match (is("RP2040"), is("RP2350"), is("PICO2W")) {
+        (true, false, false) => ("rp2040", &["memory/rp2040.x"], &["-Tlink-rp.x"]),
+        (false, true, false) => ("rp2350", &["memory/rp2350.x", "memory/blocks.x"], &[]),
+        (false, false, true) => ("pico2w", &["memory/pico2w.x", "memory/blocks.x"], &[]),
         _ => panic!("choose one board: --no-default-features --features rp2040, rp2350 or pico2w"),
     };
+    println!("cargo::rustc-env=CARA_BOARD={board}");
     let place = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets it"));
     let map: String = maps.iter().map(|map| fs::read_to_string(map).expect("the memory map is read")).collect();
     fs::write(place.join("memory.x"), map).expect("the memory map is written");

@@ -137,8 +137,9 @@ fn every_mistake_is_told() {
     let folder = folder();
     let output = ["--output", "page.bin"];
     let long = "n".repeat(33);
+    let boards = board::BOARDS.map(|board| board.name);
     refused(folder.path(), &[], 2, "BOARD");
-    refused(folder.path(), &told("toaster", &output), 2, "there are: nucleo-f767zi, nucleo-h743zi, rp2040");
+    refused(folder.path(), &told("toaster", &output), 2, &format!("there are: {}", boards.join(", ")));
     refused(folder.path(), &told("lm3s6965evb", &[]), 2, "a file of this computer");
     refused(folder.path(), &["rp2040", "--output", "page.bin"], 2, "--name and an --id");
     refused(folder.path(), &["rp2040", "--name", "a"], 2, "--id");

@@ -39,6 +39,21 @@ impl Document {
         std::fs::write(self.path(), replaced).with_context(|| format!("cannot write {}", self.file))
     }
 
+    /// Puts some rows in the place of those that they are measured for, or behind all others. What the document says of its
+    /// date and commit stays: the other rows are of then.
+    pub(crate) fn write_some<R: Row>(&self, rows: Vec<R>, is_measured: impl Fn(&R) -> bool) -> Result<()> {
+        let text = self.read()?;
+        let compiler = compiler()?;
+        ensure!(
+            compiler_in(&text) == Some(&*compiler),
+            "{} was made by another compiler than {compiler}: write all of it",
+            self.file
+        );
+        let all = merged(rows_in(&text), rows, is_measured);
+        let replaced = self.replaced(&text, &all, &[])?;
+        std::fs::write(self.path(), replaced).with_context(|| format!("cannot write {}", self.file))
+    }
+
     /// Fails when a figure exceeds the document's, or is missing there. Another compiler makes other code, which is not
     /// the change's fault: then it warns.
     pub(crate) fn check<R: Row>(&self, rows: &[R]) -> Result<()> {
@@ -91,6 +106,14 @@ impl Document {
         ensure!(wrong.is_empty(), "{}; if that must be: {command}", wrong.join("; "));
         Ok(())
     }
+}
+
+/// Rows of a document, with others for those that were measured again.
+fn merged<R>(mut rows: Vec<R>, measured: Vec<R>, is_measured: impl Fn(&R) -> bool) -> Vec<R> {
+    let place = rows.iter().position(&is_measured).unwrap_or(rows.len());
+    rows.retain(|row| !is_measured(row));
+    rows.splice(place..place, measured);
+    rows
 }
 
 /// The table for a document.
@@ -164,6 +187,15 @@ mod tests {
     #[test]
     fn a_table_is_read_as_it_was_written() {
         assert_eq!(rows_in::<Pears>(&table(&rows(1, 2))), rows(1, 2));
+    }
+
+    #[test]
+    fn some_rows_are_written_in_their_place() {
+        let merged =
+            |name: &'static str| super::merged(rows(1, 2).into(), vec![Pears(name.into(), 9)], |row| row.0 == name);
+        assert_eq!(merged("red"), rows(9, 2));
+        assert_eq!(merged("blue"), rows(1, 9));
+        assert_eq!(merged("green").last(), Some(&Pears("green".into(), 9)));
     }
 
     #[test]

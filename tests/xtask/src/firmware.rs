@@ -43,7 +43,7 @@ pub(crate) fn build(name: Option<&str>) -> Result<ExitCode> {
 
 /// Builds and links the images of all boards, with a Rust as old as promised as far as their dependencies say.
 pub(crate) fn link() -> Outcome {
-    for board in &BOARDS {
+    for board in BOARDS.iter() {
         if let Err(reason) = install::rust_target(board.target) {
             return Outcome::Skipped(reason);
         }

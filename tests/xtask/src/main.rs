@@ -70,6 +70,9 @@ enum Task {
     },
     /// Prints the sizes of the firmware images and the memory that each capacity costs.
     Sizes {
+        /// Only those of this board.
+        #[arg(value_name = "BOARD")]
+        board: Option<String>,
         /// Also writes the figures here.
         #[arg(long, value_name = "FILE")]
         json: Option<PathBuf>,
@@ -130,7 +133,7 @@ fn main() -> ExitCode {
         Task::Demo => demo::run(),
         Task::Test { list: true, .. } => runner::list(),
         Task::Test { groups, quick, list: false } => runner::run(&groups, quick),
-        Task::Sizes { json, write } => firmware::sizes(json.as_deref(), write),
+        Task::Sizes { board, json, write } => firmware::sizes(board.as_deref(), json.as_deref(), write),
         Task::Instructions { json, write } => instructions::run(json.as_deref(), write),
         Task::Paper { write: true, .. } => paper::write_ports().map(|()| ExitCode::SUCCESS),
         Task::Paper { numbers, write: false } => paper::broken::run(&numbers),

@@ -5,9 +5,9 @@ use embassy_stm32::exti::{self, ExtiInput};
 use embassy_stm32::gpio::{Level, Output, Pull, Speed};
 use embassy_stm32::interrupt::typelevel::EXTI15_10;
 use embassy_stm32::mode::Async;
-#[cfg(feature = "f767zi")]
+#[cfg(feature = "f7")]
 use embassy_stm32::peripherals::IWDG;
-#[cfg(feature = "h743zi")]
+#[cfg(feature = "h7")]
 use embassy_stm32::peripherals::IWDG1 as IWDG;
 use embassy_stm32::peripherals::{ETH, ETH_SMA, RNG};
 use embassy_stm32::rng::{self, Rng};
@@ -87,9 +87,9 @@ impl Board {
             device,
             led: Led(Output::new(chip.PB0, Level::Low, Speed::Low)),
             button: Button(ExtiInput::new(chip.PC13, chip.EXTI13, Pull::Down, Interrupts)),
-            #[cfg(feature = "f767zi")]
+            #[cfg(feature = "f7")]
             watchdog: Watchdog(IndependentWatchdog::new(chip.IWDG, HANGS.as_micros() as u32)),
-            #[cfg(feature = "h743zi")]
+            #[cfg(feature = "h7")]
             watchdog: Watchdog(IndependentWatchdog::new(chip.IWDG1, HANGS.as_micros() as u32)),
         }
     }

@@ -4,14 +4,14 @@ use embassy_stm32::Config;
 use embassy_stm32::rcc::*;
 
 /// Cycles of the processor in a millisecond.
-#[cfg(feature = "f767zi")]
+#[cfg(feature = "f7")]
 pub(crate) const CYCLES: u32 = 216_000;
 /// Cycles of the processor in a millisecond.
-#[cfg(feature = "h743zi")]
+#[cfg(feature = "h7")]
 pub(crate) const CYCLES: u32 = 400_000;
 
 /// Clocks from the 8 MHz that the board's debug probe gives.
-#[cfg(feature = "f767zi")]
+#[cfg(feature = "f7")]
 pub(crate) fn config() -> Config {
     use embassy_stm32::time::Hertz;
 
@@ -34,7 +34,7 @@ pub(crate) fn config() -> Config {
 }
 
 /// Clocks from the chip's own oscillator.
-#[cfg(feature = "h743zi")]
+#[cfg(feature = "h7")]
 pub(crate) fn config() -> Config {
     let mut config = Config::default();
     let rcc = &mut config.rcc;

@@ -5,9 +5,9 @@ use cortex_m::peripheral::SCB;
 use embassy_stm32::Peri;
 use embassy_stm32::gpio::{Level, Output, Speed};
 use embassy_stm32::pac::GPIOF;
-#[cfg(feature = "f767zi")]
+#[cfg(feature = "f7")]
 use embassy_stm32::pac::IWDG;
-#[cfg(feature = "h743zi")]
+#[cfg(feature = "h7")]
 use embassy_stm32::pac::IWDG1 as IWDG;
 use embassy_stm32::pac::iwdg::vals::Key;
 use embassy_stm32::peripherals::PF13;

@@ -4,7 +4,7 @@ use cara_board::Reason;
 use embassy_stm32::pac::RCC;
 
 /// What the register tells of this start. It keeps reasons until they are cleared, which this does: ask once.
-#[cfg(feature = "f767zi")]
+#[cfg(feature = "f7")]
 pub(crate) fn reason() -> Reason {
     let cause = RCC.csr().read();
     RCC.csr().modify(|register| register.set_rmvf(true));
@@ -19,7 +19,7 @@ pub(crate) fn reason() -> Reason {
 }
 
 /// What the register tells of this start. It keeps reasons until they are cleared, which this does: ask once.
-#[cfg(feature = "h743zi")]
+#[cfg(feature = "h7")]
 pub(crate) fn reason() -> Reason {
     let cause = RCC.rsr().read();
     RCC.rsr().modify(|register| register.set_rmvf(true));

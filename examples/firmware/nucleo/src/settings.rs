@@ -6,10 +6,8 @@ use cara_settings::boots::Boots;
 use cara_settings::page;
 use embassy_stm32::flash::{self, Blocking};
 
-#[cfg(feature = "f767zi")]
-const BOARD: board::Board = board::NUCLEO_F767ZI;
-#[cfg(feature = "h743zi")]
-const BOARD: board::Board = board::NUCLEO_H743ZI;
+/// The build script chooses it by the feature.
+const BOARD: board::Board = board::of_feature(env!("CARA_BOARD"));
 
 /// The driver.
 pub type Flash = flash::Flash<'static, Blocking>;

@@ -7,12 +7,8 @@ use cara_settings::page;
 use embassy_rp::flash::{self, Blocking};
 use embassy_rp::peripherals::FLASH;
 
-#[cfg(feature = "rp2040")]
-const BOARD: board::Board = board::RP2040_W5500;
-#[cfg(feature = "rp2350")]
-const BOARD: board::Board = board::RP2350_W5500;
-#[cfg(feature = "pico2w")]
-const BOARD: board::Board = board::PICO2W;
+/// The build script chooses it by the feature.
+const BOARD: board::Board = board::of_feature(env!("CARA_BOARD"));
 
 #[cfg(not(feature = "pico2w"))]
 const BYTES: usize = 2 * 1024 * 1024;

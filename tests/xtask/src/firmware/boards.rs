@@ -1,6 +1,7 @@
 //! The boards: where their firmware is and for which processor.
 
 use std::path::{Path, PathBuf};
+use std::sync::LazyLock;
 
 use anyhow::{Context, Result, bail};
 
@@ -82,57 +83,26 @@ pub(crate) const CONSTANT: Image = Image { name: "agv-constant-random", feature:
 /// Says what each capacity of a unit costs.
 pub(crate) const RESOURCES: Image = Image::plain("resources", "resources").secured();
 
-/// All of them.
-pub(crate) const BOARDS: [Board; 6] = [
-    Board {
+/// All of them: the emulated one, and those of the table of boards with settings.
+pub(crate) static BOARDS: LazyLock<Vec<Board>> = LazyLock::new(|| {
+    let emulated = Board {
         name: "lm3s6965evb",
         folder: "lm3s6965evb",
         feature: None,
         target: "thumbv7m-none-eabi",
         images: EMULATED,
         has_radio: false,
-    },
-    Board {
-        name: "nucleo-f767zi",
-        folder: "nucleo",
-        feature: Some("f767zi"),
-        target: "thumbv7em-none-eabihf",
+    };
+    let real = cara_settings::board::BOARDS.into_iter().map(|board| Board {
+        name: board.name,
+        folder: board.folder,
+        feature: Some(board.feature),
+        target: board.target,
         images: IMAGES,
-        has_radio: false,
-    },
-    Board {
-        name: "nucleo-h743zi",
-        folder: "nucleo",
-        feature: Some("h743zi"),
-        target: "thumbv7em-none-eabihf",
-        images: IMAGES,
-        has_radio: false,
-    },
-    Board {
-        name: "rp2040",
-        folder: "rp",
-        feature: Some("rp2040"),
-        target: "thumbv6m-none-eabi",
-        images: IMAGES,
-        has_radio: false,
-    },
-    Board {
-        name: "rp2350",
-        folder: "rp",
-        feature: Some("rp2350"),
-        target: "thumbv8m.main-none-eabihf",
-        images: IMAGES,
-        has_radio: false,
-    },
-    Board {
-        name: "pico2w",
-        folder: "rp",
-        feature: Some("pico2w"),
-        target: "thumbv8m.main-none-eabihf",
-        images: IMAGES,
-        has_radio: true,
-    },
-];
+        has_radio: board.wireless,
+    });
+    std::iter::once(emulated).chain(real).collect()
+});
 
 /// The board of a name; the error lists all.
 pub(crate) fn find(name: &str) -> Result<&'static Board> {
@@ -203,16 +173,4 @@ pub(crate) fn built(target: &str, image: &str) -> PathBuf {
 
 fn place() -> PathBuf {
     workspace::root().join("target/firmware")
-}
-
-#[cfg(test)]
-mod tests {
-    use super::BOARDS;
-
-    /// What is provisioned can be built, and what is built can be provisioned or is emulated.
-    #[test]
-    fn boards_are_those_with_settings() {
-        let built: Vec<&str> = BOARDS.iter().map(|board| board.name).filter(|name| *name != "lm3s6965evb").collect();
-        assert_eq!(built, cara_settings::board::BOARDS.map(|board| board.name));
-    }
 }

@@ -7,7 +7,7 @@ use anyhow::{Context, Result, bail};
 use cara_processes::files;
 use serde_json::{Value, json};
 
-use super::boards::{BOARDS, Board, Image, RADIO, RESOURCES};
+use super::boards::{self, BOARDS, Board, Image, RADIO, RESOURCES};
 use super::breakdown::Row;
 use super::image::{Footprint, footprint};
 use super::{NOT_ALLOWED, TESTED, tests};
@@ -19,20 +19,25 @@ use crate::install;
 /// Where the breakdown is committed.
 const DOCUMENT: Document = Document { file: "docs/sizes.md", command: "cargo xtask sizes --write" };
 
-/// Builds every firmware, prints what it takes, and writes the same as JSON or into the document.
-pub(crate) fn sizes(json: Option<&Path>, write: bool) -> Result<ExitCode> {
+/// Builds the firmware of one board or of all, prints what it takes, and writes the same as JSON or into the document.
+pub(crate) fn sizes(board: Option<&str>, json: Option<&Path>, write: bool) -> Result<ExitCode> {
     json.map_or(Ok(()), files::can_write)?;
-    let rows = measured()?;
+    let board = board.map(boards::find).transpose()?;
+    let rows = board.map_or_else(measured, of_board)?;
     println!("{}", table(&rows));
     println!("The stack is measured on the emulated board only; the others were linked, and not run.");
-    print_resources()?;
+    if board.is_none() {
+        print_resources()?;
+    }
     if let Some(path) = json {
         let rows: Vec<Value> = rows.iter().map(to_json).collect();
         let written = std::fs::write(path, serde_json::to_string_pretty(&rows)? + "\n");
         written.with_context(|| format!("cannot write {}", path.display()))?;
     }
-    if write {
-        DOCUMENT.write(&rows)?;
+    match board {
+        _ if !write => {}
+        None => DOCUMENT.write(&rows)?,
+        Some(board) => DOCUMENT.write_some(rows, |row| row.board == board.name)?,
     }
     Ok(ExitCode::SUCCESS)
 }
@@ -47,7 +52,7 @@ pub(crate) fn check() -> Outcome {
 
 fn measured() -> Result<Vec<Row>> {
     let mut rows = Vec::new();
-    for board in &BOARDS {
+    for board in BOARDS.iter() {
         if board.has_radio && std::env::var_os(RADIO).is_none() {
             println!("{} is left out: {RADIO} does not say where its radio's files are", board.name);
             continue;
@@ -104,7 +109,7 @@ fn stack(path: &Path, image: &Image) -> Result<Option<u64>> {
 
 /// Prints what each capacity of `Resources` costs, as the board itself tells.
 fn print_resources() -> Result<()> {
-    let board = super::boards::find(TESTED)?;
+    let board = boards::find(TESTED)?;
     let image = board.build(&RESOURCES)?;
     if install::program("qemu-system-arm", "qemu-system-arm").is_err() {
         return Ok(());
