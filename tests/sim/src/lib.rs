@@ -20,8 +20,8 @@
 //!         parameters.set_value("position", [3, 4]).expect("the signature declares it");
 //!         Ok(())
 //!     });
-//!     unit.add_function("pos_info() -> (position: int[2])", pos_info).unwrap();
-//!     unit.publish().unwrap();
+//!     unit.my_function_list().add_service("pos_info() -> (position: int[2])", pos_info).unwrap();
+//!     unit.publish_my_function_list().unwrap();
 //! });
 //! let agv = agv.start();
 //! assert!(world.run_until(|_| manager.knows("agv", "pos_info"), Duration::from_secs(5)));
@@ -99,6 +99,6 @@ pub use path::{Chance, Path};
 pub use plan::{Action, Crash, FaultPlan};
 pub use storage::Boxed;
 pub use world::{
-    BoxedParameters, Call, NewUnit, Outcome, Peer, Ring, Service, UnitEvent, UnitHandle, World, boxed_parameters,
-    for_each_seed, seeds,
+    BoxedParameters, Call, LeaseWatch, MyFunctionList, NewUnit, Outcome, Peer, Ring, Service, UnitEvent, UnitHandle,
+    World, boxed_parameters, for_each_seed, seeds,
 };

@@ -24,6 +24,7 @@ mod audited;
 mod builder;
 mod driving;
 mod events;
+mod functions;
 mod handle;
 mod keys;
 mod links;
@@ -37,9 +38,10 @@ mod tasks;
 
 pub use builder::NewUnit;
 pub use events::UnitEvent;
+pub use functions::MyFunctionList;
 pub use handle::{Peer, UnitHandle};
 pub use keys::Ring;
-pub use service::{BoxedParameters, Call, Outcome, Service, boxed_parameters};
+pub use service::{BoxedParameters, Call, LeaseWatch, Outcome, Service, boxed_parameters};
 
 use audited::Seals;
 use replies::Promise;

@@ -79,8 +79,8 @@ fn start_agv(world: &World, id: u32, runs: &Rc<Cell<u32>>) -> UnitHandle {
             runs.set(runs.get() + 1);
             Ok(())
         });
-        unit.add_function("touch(number: int) -> (number: int)", touch).expect("the list is empty");
-        unit.publish().expect("it runs");
+        unit.my_function_list().add_service("touch(number: int) -> (number: int)", touch).expect("the list is empty");
+        unit.publish_my_function_list().expect("it runs");
     };
     world.s_unit(&format!("agv-{id}"), id).joins("depot", 1).functions(FUNCTIONS).program(program).start()
 }

@@ -17,7 +17,7 @@ use cara_core::services::access::Rule;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::RequestOptions;
 use cara_core::time::{Duration, Instant};
-use cara_sim::{Action, Chance, Crash, Direction, HostId, Path, StreamId, UnitEvent, UnitHandle};
+use cara_sim::{Action, Chance, Crash, Direction, HostId, LeaseWatch, Path, StreamId, UnitEvent, UnitHandle};
 
 use super::lent;
 use crate::run::Report;
@@ -153,10 +153,12 @@ impl World for SimWorld {
         };
         let program = move |unit: &UnitHandle| {
             for service in &services {
-                unit.add_function(&service.signature, simulated(service)).expect("a unit has room for its services");
+                unit.my_function_list()
+                    .add_service(&service.signature, simulated(service))
+                    .expect("a unit has room for its services");
             }
             if published {
-                unit.publish().expect("what was added can be published");
+                unit.publish_my_function_list().expect("what was added can be published");
             }
         };
         let handle = new.program(program).start();
@@ -361,7 +363,8 @@ fn simulated(service: &Service) -> cara_sim::Service {
                 }
                 (kept.body)(&Asked { caller: call.caller.clone(), at: call.unit.now() }, &mut parameters)?;
                 call.unit.sleep(kept.takes).await;
-                while let Some(pause) = kept.moves_on(call.may_act(), &parameters) {
+                while let Some(pause) = kept.moves_on(call.lease.as_ref().is_none_or(LeaseWatch::is_live), &parameters)
+                {
                     call.unit.sleep(pause).await;
                 }
                 kept.log().end(call.unit.now());
@@ -371,7 +374,7 @@ fn simulated(service: &Service) -> cara_sim::Service {
     };
     let made = made.priority(service.priority);
     match service.lease {
-        Some(length) => made.lease(length).on_lease_end(move |unit| log.stop(unit.now())),
+        Some(length) => made.lease(length, move |unit| log.stop(unit.now())),
         None => made,
     }
 }
@@ -394,23 +397,23 @@ impl Node for SimNode {
     }
 
     fn add_service(&self, service: &Service) -> Result<(), Error> {
-        self.handle.add_function(&service.signature, simulated(service))
+        self.handle.my_function_list().add_service(&service.signature, simulated(service))
     }
 
     fn replace_service(&self, service: &Service) -> Result<(), Error> {
-        self.handle.replace_function(&service.signature, simulated(service))
+        self.handle.my_function_list().replace(&service.signature, simulated(service))
     }
 
     fn remove_service(&self, name: &str) -> Result<(), Error> {
-        self.handle.remove_function(name)
+        self.handle.my_function_list().remove(name)
     }
 
     fn publish(&self) -> Result<(), Error> {
-        self.handle.publish()
+        self.handle.publish_my_function_list()
     }
 
     fn publish_to(&self, peer: &str) -> Result<(), Error> {
-        self.handle.publish_to(peer)
+        self.handle.publish_my_function_list_to(peer)
     }
 
     fn begin_publish(&self) -> Pending<Vec<Identity>> {
@@ -421,7 +424,7 @@ impl Node for SimNode {
     }
 
     fn my_function_list(&self) -> String {
-        self.handle.my_function_list()
+        self.handle.my_function_list().show_functions()
     }
 
     fn s_units(&self) -> Vec<(Identity, bool)> {

@@ -13,7 +13,7 @@ use cara_core::host::mailman::LinkId;
 
 use super::handle::UnitHandle;
 use super::links::{Happened, Link, Links};
-use super::service::{BoxedParameters, Call, Handler};
+use super::service::{BoxedParameters, Call, Handler, LeaseWatch};
 use super::state::NODE_TIMER;
 use super::tasks::Owner;
 use super::{Inner, Shared, UnitEvent};
@@ -286,14 +286,12 @@ impl Inner {
         let (ticket, stream) = (call.ticket, link.stream);
         let handle = UnitHandle::new(Rc::downgrade(shared), host);
         let told = Call {
-            unit: handle.clone(),
             caller: caller.clone(),
-            function: Rc::clone(&function),
             priority: call.priority,
-            wants_reply: call.wants_reply,
             deadline: call.deadline,
-            service: Rc::clone(&service),
-            order: call.order,
+            wants_reply: call.wants_reply,
+            lease: LeaseWatch::new(&service, call.order, &handle),
+            unit: handle.clone(),
         };
         let owner = Owner { host, life: unit.life };
         let job = async move {

@@ -1,19 +1,20 @@
 //! What tests and services do with a unit: the same words as on the real ports.
 
+use std::fmt;
 use std::future::Future;
 use std::net::SocketAddr;
 use std::rc::{Rc, Weak};
 
-use cara_core::distribution::function::Definition;
 use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::identity::{Identity, Role};
 use cara_core::error::Error;
 use cara_core::services::Ticket;
 use cara_core::time::{Duration, Instant};
 
+use super::functions::MyFunctionList;
 use super::links::{Link, Links, SimSession};
 use super::replies::Promise;
-use super::service::{BoxedParameters, Handler, Service};
+use super::service::BoxedParameters;
 use super::state::Machine;
 use super::tasks::Owner;
 use super::{Inner, Shared};
@@ -74,6 +75,12 @@ pub struct UnitHandle {
     host: HostId,
 }
 
+impl fmt::Debug for UnitHandle {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "UnitHandle({:?})", self.host)
+    }
+}
+
 impl UnitHandle {
     pub(super) fn new(shared: Weak<Shared>, host: HostId) -> Self {
         Self { shared, host }
@@ -118,60 +125,17 @@ impl UnitHandle {
 
     // --- its own functions
 
-    /// Adds a service, which is invisible to peers before it is published. The signature is in the text form, as in
-    /// `pos_info() -> (position: int[2])`.
-    ///
-    /// # Panics
-    /// For a signature that cannot be read.
-    pub fn add_function(&self, signature: &str, service: Service) -> Result<(), Error> {
-        let definition = definition(signature);
-        let attributes = service.attributes;
-        self.machine(|machine, _| {
-            machine.links.functions.add_function(&definition, attributes, Handler(Rc::new(service))).map(|_| ())
-        })?
-    }
-
-    /// Replaces the service of the same name; peers that knew the old one get the new one when it is published.
-    ///
-    /// # Panics
-    /// For a signature that cannot be read.
-    pub fn replace_function(&self, signature: &str, service: Service) -> Result<(), Error> {
-        let definition = definition(signature);
-        let attributes = service.attributes;
-        let replaced = self.machine(|machine, _| {
-            let functions = &mut machine.links.functions;
-            let before = functions.find(definition.name()).and_then(|slot| functions.function(slot));
-            let before = before.map(|function| Rc::clone(&function.handler.0));
-            functions.replace(&definition, attributes, Handler(Rc::new(service))).map(|_| before)
-        })??;
-        replaced.into_iter().for_each(|service| service.goes(self));
-        Ok(())
-    }
-
-    /// Removes a service; peers that saw it are told.
-    pub fn remove_function(&self, name: &str) -> Result<(), Error> {
-        let (slot, Handler(service)) = self.machine(|machine, _| machine.links.functions.remove(name))??;
-        service.goes(self);
-        self.machine(|machine, _| machine.links.hub.publications.withdraw(slot))?;
-        self.each_live_link(|links, network, index| {
-            links.with(network, index, |session, cx| session.withdraw(cx, slot));
-        });
-        Ok(())
-    }
-
-    /// Its own functions in the text form, one in a line.
-    pub fn my_function_list(&self) -> String {
-        let shown = self.machine(|machine, _| machine.links.functions.show_functions().to_string());
-        shown.unwrap_or_default()
+    /// The functions that it offers.
+    pub fn my_function_list(&self) -> MyFunctionList<'_> {
+        MyFunctionList { unit: self }
     }
 
     /// Publishes all of its functions to all nodes, those that come later among them.
-    #[doc(alias = "publish_my_function_list")]
-    pub fn publish(&self) -> Result<(), Error> {
+    pub fn publish_my_function_list(&self) -> Result<(), Error> {
         self.publish_waiting().map(drop)
     }
 
-    /// As [`Self::publish`], and returns when every connected node has read the list; names those that have not.
+    /// As [`Self::publish_my_function_list`], and returns when every connected node has read the list; names those that have not.
     pub async fn publish_and_wait(&self) -> Result<Vec<Identity>, Error> {
         let mut missing = Vec::new();
         for (peer, acknowledged) in self.publish_waiting()? {
@@ -183,7 +147,7 @@ impl UnitHandle {
     }
 
     /// Publishes all of its functions to one node only, also after that node reconnects.
-    pub fn publish_to(&self, peer: impl Into<Peer>) -> Result<(), Error> {
+    pub fn publish_my_function_list_to(&self, peer: impl Into<Peer>) -> Result<(), Error> {
         let peer = peer.into();
         let index = self.link_to(&peer)?;
         self.machine(|machine, network| {
@@ -375,12 +339,5 @@ impl UnitHandle {
     pub(super) fn with_shared<R>(&self, act: impl FnOnce(&mut Inner, &Rc<Shared>) -> R) -> R {
         let shared = self.shared.upgrade().expect("a unit is not used after its world");
         shared.with(|inner| act(inner, &shared))
-    }
-}
-
-fn definition(signature: &str) -> Definition {
-    match Definition::parse(signature) {
-        Ok(definition) => definition,
-        Err(error) => panic!("`{signature}` is no signature: {error:?}"),
     }
 }

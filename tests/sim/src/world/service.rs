@@ -1,6 +1,7 @@
 //! Services of simulated units: a closure that runs at one virtual instant, or a future that lives through many.
 
 use std::cell::RefCell;
+use std::fmt;
 use std::future::Future;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::pin::Pin;
@@ -32,31 +33,46 @@ enum Body {
     Future(Box<dyn Fn(Call, BoxedParameters) -> Running>),
 }
 
-/// What is known of the call that a service answers.
-#[derive(Clone)]
+/// What a handler is told about the call that it serves.
+#[derive(Clone, Debug)]
 pub struct Call {
-    /// The unit that serves, which can call any other, the caller among them.
-    pub unit: UnitHandle,
     /// The caller.
     pub caller: Identity,
-    /// The function's name.
-    pub function: Rc<str>,
-    /// Its class.
+    /// The call's class.
     pub priority: Priority,
+    /// After this the caller no longer waits; in virtual time.
+    pub deadline: Instant,
     /// Whether the caller waits.
     pub wants_reply: bool,
-    /// After this the caller no longer waits.
-    pub deadline: Instant,
-    pub(super) service: Rc<Service>,
-    pub(super) order: Option<Order>,
+    /// The call's hold of the service's lease, if there is one: what the call starts may go on while it is live.
+    pub lease: Option<LeaseWatch>,
+    /// The unit that serves, which can request from any other, the caller among them.
+    pub unit: UnitHandle,
 }
 
-impl Call {
-    /// Whether this call's hold of its service's lease is live now; true for a service without one. Once it has said no,
-    /// it says so for ever, whatever call comes next.
-    pub fn may_act(&self) -> bool {
-        let hold = self.service.lease.as_ref().zip(self.order);
-        hold.is_none_or(|(lease, order)| lease.is_live_for(order, self.unit.now()))
+/// The lease of one call. Once dead it is dead for ever, whatever call comes next.
+#[derive(Clone)]
+pub struct LeaseWatch {
+    service: Rc<Service>,
+    order: Order,
+    unit: UnitHandle,
+}
+
+impl LeaseWatch {
+    /// A call's hold of the lease of its service.
+    pub(super) fn new(service: &Rc<Service>, order: Option<Order>, unit: &UnitHandle) -> Option<Self> {
+        Some(Self { service: Rc::clone(service), order: order?, unit: unit.clone() })
+    }
+
+    /// Whether the caller still wants what this call started.
+    pub fn is_live(&self) -> bool {
+        self.service.lease.as_ref().is_some_and(|lease| lease.is_live_for(self.order, self.unit.now()))
+    }
+}
+
+impl fmt::Debug for LeaseWatch {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "LeaseWatch(live: {})", self.is_live())
     }
 }
 
@@ -67,7 +83,7 @@ impl Call {
 /// use cara_sim::Service;
 /// let slow = Service::new(|_, _| Ok(())).takes(Duration::from_millis(300));
 /// let walking = Service::future(|call, parameters| async move {
-///     while call.may_act() {
+///     while call.lease.as_ref().is_some_and(|lease| lease.is_live()) {
 ///         call.unit.sleep(Duration::from_millis(10)).await;
 ///     }
 ///     Ok(parameters)
@@ -133,23 +149,19 @@ impl Service {
         Self { takes: span, ..self }
     }
 
-    /// The class that requests for it have.
+    /// The class of calls that name none.
     pub fn priority(self, priority: Priority) -> Self {
         Self { attributes: Attributes { priority, ..self.attributes }, ..self }
     }
 
-    /// What it starts may go on only this long after the last renewal.
-    pub fn lease(self, length: Duration) -> Self {
+    /// What it starts goes on for this long after the caller's last sign that it wants it; then `safe` runs, once, before
+    /// anything else the unit does.
+    pub fn lease(self, length: Duration, safe: impl Fn(&UnitHandle) + 'static) -> Self {
         let attributes = Attributes { lease: Some(length), ..self.attributes };
-        Self { attributes, lease: Some(Lease::new()), ..self }
+        Self { attributes, lease: Some(Lease::new()), safe_hook: Some(Box::new(safe)), ..self }
     }
 
-    /// Runs when the lease ends without having been renewed, before anything else the unit does.
-    pub fn on_lease_end(self, hook: impl Fn(&UnitHandle) + 'static) -> Self {
-        Self { safe_hook: Some(Box::new(hook)), ..self }
-    }
-
-    /// It may be called twice without harm.
+    /// Running it twice is as good as running it once.
     pub fn idempotent(self) -> Self {
         Self { attributes: Attributes { idempotent: true, ..self.attributes }, ..self }
     }

@@ -21,8 +21,8 @@ fn secs(secs: u64) -> Duration {
 }
 
 fn program(unit: &UnitHandle) {
-    unit.add_function("stop()", Service::new(|_, _| Ok(()))).expect("room for it");
-    unit.publish().expect("it was added");
+    unit.my_function_list().add_service("stop()", Service::new(|_, _| Ok(()))).expect("room for it");
+    unit.publish_my_function_list().expect("it was added");
 }
 
 fn address(manager: &UnitHandle) -> std::net::SocketAddr {

@@ -25,8 +25,8 @@ fn the_papers_listing() {
     world.block_request(&manager, "agv", "pos_info", &mut told).unwrap();
     assert_eq!(told, pos);
 
-    manager.add_function("call_mechanic(place: int[2])", Service::new(|_, _| Ok(()))).unwrap();
-    manager.publish_to("agv").unwrap();
+    manager.my_function_list().add_service("call_mechanic(place: int[2])", Service::new(|_, _| Ok(()))).unwrap();
+    manager.publish_my_function_list_to("agv").unwrap();
     assert!(world.run_until(|_| agv.knows("manager", "call_mechanic"), secs(1)));
     let mut place = Parameters::new();
     place.add_int("place", 2).unwrap();
@@ -38,8 +38,8 @@ fn two_managers_call_each_other() {
     let mut world = World::new(3);
     let units = [world.m_unit("one", 1).start(), world.m_unit("two", 2).start()];
     for unit in &units {
-        unit.add_function("ping()", Service::new(|_, _| Ok(()))).unwrap();
-        unit.publish().unwrap();
+        unit.my_function_list().add_service("ping()", Service::new(|_, _| Ok(()))).unwrap();
+        unit.publish_my_function_list().unwrap();
     }
     assert!(world.run_until(|_| units[0].knows("two", "ping") && units[1].knows("one", "ping"), secs(10)));
     world.block_request(&units[0], "two", "ping", &mut Parameters::new()).unwrap();
@@ -51,14 +51,15 @@ fn two_managers_call_each_other() {
 fn a_service_calls_its_caller_back() {
     let (mut world, manager, agv) = pair(1);
     manager
-        .add_function(
+        .my_function_list()
+        .add_service(
             "where_to() -> (position: int[2])",
             Service::new(|_, parameters| {
                 parameters.set_value("position", [5, 6]).map_err(|_| ServiceError::BadResults)
             }),
         )
         .unwrap();
-    manager.publish().unwrap();
+    manager.publish_my_function_list().unwrap();
     let fetch = Service::future(|call, mut parameters| async move {
         let mut order = position();
         let asked = call.unit.block_request(&call.caller, "where_to", &mut order).await;
@@ -66,8 +67,8 @@ fn a_service_calls_its_caller_back() {
         parameters.copy_from(&order).map_err(|_| ServiceError::BadResults)?;
         Ok(parameters)
     });
-    agv.add_function("fetch() -> (position: int[2])", fetch).unwrap();
-    agv.publish().unwrap();
+    agv.my_function_list().add_service("fetch() -> (position: int[2])", fetch).unwrap();
+    agv.publish_my_function_list().unwrap();
     assert!(world.run_until(|_| manager.knows("agv", "fetch") && agv.knows("manager", "where_to"), secs(1)));
     let mut order = position();
     world.block_request(&manager, "agv", "fetch", &mut order).unwrap();
@@ -77,8 +78,8 @@ fn a_service_calls_its_caller_back() {
 #[test]
 fn a_slow_service_delays_no_other_unit_and_no_keep_alive() {
     let (mut world, manager, agv) = pair(1);
-    agv.add_function("lift()", Service::new(|_, _| Ok(())).takes(secs(20))).unwrap();
-    agv.publish().unwrap();
+    agv.my_function_list().add_service("lift()", Service::new(|_, _| Ok(())).takes(secs(20))).unwrap();
+    agv.publish_my_function_list().unwrap();
     let other = start_agv(&world, "other", 8);
     assert!(world.run_until(|_| manager.knows("agv", "lift") && manager.knows("other", "pos_info"), secs(5)));
     let (done, result) = shared(None);
@@ -105,8 +106,8 @@ fn a_slow_service_delays_no_other_unit_and_no_keep_alive() {
 #[test]
 fn a_call_ends_with_its_deadline_and_frees_its_slot() {
     let (mut world, manager, agv) = pair(1);
-    agv.add_function("sleep()", Service::new(|_, _| Ok(())).takes(secs(60))).unwrap();
-    agv.publish().unwrap();
+    agv.my_function_list().add_service("sleep()", Service::new(|_, _| Ok(())).takes(secs(60))).unwrap();
+    agv.publish_my_function_list().unwrap();
     assert!(world.run_until(|_| manager.knows("agv", "sleep"), secs(1)));
     let start = world.now();
     assert_eq!(world.block_request(&manager, "agv", "sleep", &mut Parameters::new()), Err(Error::TimedOut));
@@ -117,8 +118,8 @@ fn a_call_ends_with_its_deadline_and_frees_its_slot() {
 #[test]
 fn a_service_that_panics_is_answered_when_it_may() {
     let (mut world, manager, agv) = pair(1);
-    agv.add_function("crash()", Service::new(|_, _| panic!("on purpose")).survives_panics()).unwrap();
-    agv.publish().unwrap();
+    agv.my_function_list().add_service("crash()", Service::new(|_, _| panic!("on purpose")).survives_panics()).unwrap();
+    agv.publish_my_function_list().unwrap();
     assert!(world.run_until(|_| manager.knows("agv", "crash"), secs(1)));
     let crashed = world.block_request(&manager, "agv", "crash", &mut Parameters::new());
     assert_eq!(crashed, Err(Error::Service(ServiceError::Panicked)));
@@ -140,7 +141,7 @@ fn a_call_to_everybody_has_an_outcome_for_each() {
 #[test]
 fn publishing_can_wait_for_everybody_to_have_read() {
     let (mut world, manager, agv) = pair(1);
-    manager.add_function("late()", Service::new(|_, _| Ok(()))).unwrap();
+    manager.my_function_list().add_service("late()", Service::new(|_, _| Ok(()))).unwrap();
     assert_eq!(world.block_on(manager.publish_and_wait()), Ok(vec![]));
     assert!(agv.knows("manager", "late"));
 }
@@ -153,8 +154,10 @@ fn long_strings_cross_a_split_and_slow_network_whole() {
         network.split_reads(cara_sim::Chance::percent(50.0));
     });
     let (one, two) = (world.m_unit("one", 1).start(), world.m_unit("two", 2).start());
-    two.add_function("echo(text: string[20000]) -> (text: string[20000])", Service::new(|_, _| Ok(()))).unwrap();
-    two.publish().unwrap();
+    two.my_function_list()
+        .add_service("echo(text: string[20000]) -> (text: string[20000])", Service::new(|_, _| Ok(())))
+        .unwrap();
+    two.publish_my_function_list().unwrap();
     assert!(world.run_until(|_| one.knows("two", "echo"), secs(20)));
     let text: String = (0..20_000).map(|index| char::from(b'a' + (index % 26) as u8)).collect();
     let mut parameters = cara_sim::boxed_parameters(40_000);

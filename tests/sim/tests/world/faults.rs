@@ -26,8 +26,8 @@ fn a_restarted_vehicle_comes_back_with_its_state_lost() {
 #[test]
 fn a_call_whose_callee_dies_is_interrupted() {
     let (mut world, manager, agv) = pair(1);
-    agv.add_function("lift()", Service::new(|_, _| Ok(())).takes(secs(60))).unwrap();
-    agv.publish().unwrap();
+    agv.my_function_list().add_service("lift()", Service::new(|_, _| Ok(())).takes(secs(60))).unwrap();
+    agv.publish_my_function_list().unwrap();
     assert!(world.run_until(|_| manager.knows("agv", "lift"), secs(1)));
     let (done, result) = shared(None);
     let caller = manager.clone();

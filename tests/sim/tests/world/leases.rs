@@ -3,7 +3,7 @@
 use super::*;
 use cara_core::services::lease::LeaseEnd;
 use cara_core::services::unit::RequestOptions;
-use cara_sim::{Crash, Direction, UnitEvent};
+use cara_sim::{Crash, Direction, LeaseWatch, UnitEvent};
 
 const LEASE: Duration = Duration::from_millis(500);
 
@@ -17,15 +17,15 @@ fn driving(seed: u64) -> (World, UnitHandle, UnitHandle, Rc<RefCell<u32>>, Rc<Re
         let ticks = Rc::clone(&ticks);
         let moving = call.clone();
         call.unit.spawn(async move {
-            while moving.may_act() {
+            while moving.lease.as_ref().is_some_and(LeaseWatch::is_live) {
                 *ticks.borrow_mut() += 1;
                 moving.unit.sleep(millis(10)).await;
             }
         });
         async move { Ok(parameters) }
     });
-    agv.add_function("drive()", drive.lease(LEASE).on_lease_end(move |_| *stops.borrow_mut() += 1)).unwrap();
-    agv.publish().unwrap();
+    agv.my_function_list().add_service("drive()", drive.lease(LEASE, move |_| *stops.borrow_mut() += 1)).unwrap();
+    agv.publish_my_function_list().unwrap();
     assert!(world.run_until(|_| manager.knows("agv", "drive"), secs(10)));
     world.block_request(&manager, "agv", "drive", &mut Parameters::new()).unwrap();
     (world, manager, agv, driven, stopped)

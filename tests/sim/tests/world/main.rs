@@ -41,9 +41,9 @@ fn agv(unit: &UnitHandle) {
         parameters.variable_into("position", &mut *position.borrow_mut()).expect("the core checked it");
         Ok(())
     });
-    unit.add_function("pos_info() -> (position: int[2])", pos_info).unwrap();
-    unit.add_function("go_to(position: int[2])", go_to).unwrap();
-    unit.publish().unwrap();
+    unit.my_function_list().add_service("pos_info() -> (position: int[2])", pos_info).unwrap();
+    unit.my_function_list().add_service("go_to(position: int[2])", go_to).unwrap();
+    unit.publish_my_function_list().unwrap();
 }
 
 fn position() -> Parameters {

@@ -42,10 +42,10 @@ fn fleet(seed: u64) -> Fleet {
             ran.borrow_mut().push(parameters.variable::<i64>("n").expect("the core checked it"));
             Ok(())
         });
-        unit.add_function("note(n: int)", note).unwrap();
-        let drive = Service::new(|_, _| Ok(())).lease(LEASE).on_lease_end(move |_| *stops.borrow_mut() += 1);
-        unit.add_function("drive()", drive).unwrap();
-        unit.publish().unwrap();
+        unit.my_function_list().add_service("note(n: int)", note).unwrap();
+        let drive = Service::new(|_, _| Ok(())).lease(LEASE, move |_| *stops.borrow_mut() += 1);
+        unit.my_function_list().add_service("drive()", drive).unwrap();
+        unit.publish_my_function_list().unwrap();
     };
     let constraints = Constraints { calls_per_peer: 64, ..Constraints::S_UNIT };
     let agv = world

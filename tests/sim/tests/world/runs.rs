@@ -59,7 +59,7 @@ fn start_stoppable(world: &World, id: u32, seen: &Rc<RefCell<BTreeSet<i64>>>) ->
             assert!(seen.borrow_mut().insert(number), "{number} was run twice");
             Ok(())
         });
-        unit.add_function("stop(number: int)", stop.priority(Priority::Emergency)).unwrap();
+        unit.my_function_list().add_service("stop(number: int)", stop.priority(Priority::Emergency)).unwrap();
         agv(unit);
     };
     world.s_unit("agv", id).joins("manager", 1).message_buffers(BUFFERS).program(program).start()
@@ -87,6 +87,6 @@ fn errors_of_a_unit_that_is_down_are_typed() {
     let (mut world, manager, agv) = pair(1);
     world.crash(&agv, cara_sim::Crash::PowerCut);
     assert_eq!(world.block_request(&agv, &manager, "x", &mut position()), Err(Error::NotRunning));
-    assert_eq!(agv.publish(), Err(Error::NotRunning));
+    assert_eq!(agv.publish_my_function_list(), Err(Error::NotRunning));
     assert!(agv.peers().is_empty());
 }

@@ -74,10 +74,10 @@ impl Pair {
             counted.set(counted.get() + 1);
             Ok(())
         });
-        passive.add_function(&format!("take(text: string[{chars}])"), take)?;
+        passive.my_function_list().add_service(&format!("take(text: string[{chars}])"), take)?;
         let echo = format!("echo(text: string[{chars}]) -> (text: string[{chars}])");
-        passive.add_function(&echo, Service::new(|_, _| Ok(())))?;
-        passive.publish()?;
+        passive.my_function_list().add_service(&echo, Service::new(|_, _| Ok(())))?;
+        passive.publish_my_function_list()?;
         let known = main.clone();
         ensure!(world.run_until(|_| known.knows("passive", "take"), Duration::from_secs(10)), "they did not meet");
         let mut parameters = boxed_parameters(chars as usize + 1_024);
