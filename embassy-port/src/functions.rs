@@ -59,6 +59,12 @@ pub struct MyFunctionList<T: 'static> {
     unit: Handle<T>,
 }
 
+impl<T> fmt::Debug for MyFunctionList<T> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("MyFunctionList").finish_non_exhaustive()
+    }
+}
+
 impl<T> MyFunctionList<T> {
     /// Adds a service, which is invisible to peers before it is published. The signature is in the text form, as in
     /// `go_to(position: int[2])`.

@@ -1,6 +1,7 @@
 //! What runs a service: the runner itself, or a task that takes the calls.
 
 use core::cell::RefCell;
+use core::fmt;
 
 use cara_core::config::Priority;
 use cara_core::distribution::function::Attributes;
@@ -27,6 +28,18 @@ pub struct Call<T: 'static> {
     pub lease: Option<LeaseWatch>,
     /// The unit that serves, which can request from any other, the caller among them.
     pub unit: Handle<T>,
+}
+
+impl<T> fmt::Debug for Call<T> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Call")
+            .field("caller", &self.caller)
+            .field("priority", &self.priority)
+            .field("deadline", &self.deadline)
+            .field("wants_reply", &self.wants_reply)
+            .field("lease", &self.lease)
+            .finish_non_exhaustive()
+    }
 }
 
 impl<T> Call<T> {
@@ -57,6 +70,12 @@ pub type Hook<T> = dyn Fn(&mut T);
 /// | by a task that awaits | `Handler::task()`, and there `unit.next_call("go_to", &mut parameters).await` |
 pub struct Handler<T: 'static> {
     run: Run<T>,
+}
+
+impl<T> fmt::Debug for Handler<T> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Handler").finish_non_exhaustive()
+    }
 }
 
 impl<T> Clone for Handler<T> {
@@ -150,6 +169,12 @@ pub struct ServiceOptions<T: 'static> {
     pub(crate) lease: Option<&'static Lease>,
     pub(crate) safe: Option<&'static Safe>,
     pub(crate) then: Option<&'static Hook<T>>,
+}
+
+impl<T> fmt::Debug for ServiceOptions<T> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("ServiceOptions").field("attributes", &self.attributes).finish_non_exhaustive()
+    }
 }
 
 impl<T> Default for ServiceOptions<T> {

@@ -130,6 +130,12 @@ pub struct TheirFunctionList<'p, T: 'static> {
     peer: &'p Peer<T>,
 }
 
+impl<T> fmt::Debug for TheirFunctionList<'_, T> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("TheirFunctionList").field("peer", &self.peer).finish_non_exhaustive()
+    }
+}
+
 impl<T> TheirFunctionList<'_, T> {
     /// One line per function (paper, listing line 10).
     pub fn show_functions(&self) -> impl fmt::Display + '_ {

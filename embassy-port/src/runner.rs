@@ -1,6 +1,7 @@
 //! The task that drives a unit.
 
 use core::convert::Infallible;
+use core::fmt;
 use core::future::{Future, poll_fn};
 use core::pin::pin;
 use core::task::{Context, Poll};
@@ -31,6 +32,12 @@ pub struct Runner<T: 'static> {
     pub(crate) rested_until: Instant,
     /// A call whose results are still in there, because they could be kept nowhere else.
     pub(crate) unanswered: Option<(Running, Result<(), Error>)>,
+}
+
+impl<T> fmt::Debug for Runner<T> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Runner").finish_non_exhaustive()
+    }
 }
 
 /// What a step led to.

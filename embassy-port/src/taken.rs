@@ -8,6 +8,7 @@ use cara_core::error::{Error, ServiceError};
 use cara_core::services::unit::Call as CoreCall;
 use cara_core::services::{Context, Ticket};
 use cara_core::time::{Duration, Instant};
+use core::fmt;
 
 use crate::handle::Handle;
 use crate::lease::LeaseWatch;
@@ -209,6 +210,15 @@ pub struct TakenCall<T: 'static> {
     pub wants_reply: bool,
     /// The call's hold of the service's lease, if there is one: what the call starts may go on while it is live.
     pub lease: Option<LeaseWatch>,
+}
+
+impl<T> fmt::Debug for TakenCall<T> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("TakenCall")
+            .field("caller", &self.caller)
+            .field("priority", &self.priority)
+            .finish_non_exhaustive()
+    }
 }
 
 impl<T> Handle<T> {

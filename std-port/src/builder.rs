@@ -1,5 +1,6 @@
 //! Builder of a unit: identity first, then whatever differs from the defaults.
 
+use std::fmt;
 use std::hash::{BuildHasher, Hasher, RandomState};
 use std::marker::PhantomData;
 use std::path::PathBuf;
@@ -62,6 +63,12 @@ pub struct Builder<T, R> {
     asks_for_itself: bool,
     state: T,
     role: PhantomData<fn() -> R>,
+}
+
+impl<T, R> fmt::Debug for Builder<T, R> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Builder").field("identity", &self.identity).field("fleet", &self.fleet).finish_non_exhaustive()
+    }
 }
 
 impl<R> Builder<(), R> {

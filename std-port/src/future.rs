@@ -1,5 +1,6 @@
 //! The asynchronous face, for tokio or any other executor: the unit's own threads read, and wake the task.
 
+use std::fmt;
 use std::future::Future;
 use std::pin::Pin;
 use std::task::{Context, Poll};
@@ -15,6 +16,12 @@ use crate::engine::CallFuture;
 pub struct PendingReply<'p, T: Send + 'static> {
     call: CallFuture<T>,
     parameters: &'p mut ParametersView,
+}
+
+impl<T: Send + 'static> fmt::Debug for PendingReply<'_, T> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("PendingReply").finish_non_exhaustive()
+    }
 }
 
 impl<'p, T: Send + 'static> PendingReply<'p, T> {

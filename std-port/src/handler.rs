@@ -1,5 +1,6 @@
 //! What runs a service: functions and methods, in the paper's form (`Parameters` in, `Parameters` out) and in place.
 
+use std::fmt;
 use std::sync::Arc;
 
 use cara_core::config::Priority;
@@ -125,6 +126,12 @@ pub struct ServiceOptions<T> {
     pub(crate) then: Option<Arc<Hook<T>>>,
 }
 
+impl<T> fmt::Debug for ServiceOptions<T> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("ServiceOptions").field("attributes", &self.attributes).finish_non_exhaustive()
+    }
+}
+
 impl<T> Default for ServiceOptions<T> {
     fn default() -> Self {
         Self { attributes: Attributes::default(), safe: None, then: None }
@@ -210,6 +217,12 @@ pub trait IntoHandler<T, Form> {
 /// A handler's form, erased.
 #[doc(hidden)]
 pub struct RunOf<T>(pub(crate) Run<T>);
+
+impl<T> fmt::Debug for RunOf<T> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("RunOf").finish_non_exhaustive()
+    }
+}
 
 impl<T, F, const BYTES: usize> IntoHandler<T, fn(Parameters<BYTES>) -> Parameters<BYTES>> for F
 where

@@ -1,5 +1,6 @@
 //! A unit's own list of functions (paper: `my_function_list`).
 
+use std::fmt;
 use std::sync::Arc;
 
 use cara_core::config::Priority;
@@ -18,6 +19,12 @@ use crate::storage::Boxed;
 /// The functions that a unit offers. Adding one makes nothing visible: that is what publishing is for.
 pub struct MyFunctionList<'u, T: Send + 'static> {
     pub(crate) engine: &'u Arc<Engine<T>>,
+}
+
+impl<T: Send + 'static> fmt::Debug for MyFunctionList<'_, T> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("MyFunctionList").finish_non_exhaustive()
+    }
 }
 
 impl<T: Send + 'static> MyFunctionList<'_, T> {

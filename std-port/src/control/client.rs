@@ -1,5 +1,6 @@
 //! The client: finds the socket of a running unit, asks, and reads the answers.
 
+use std::fmt;
 use std::io::{self, Write};
 use std::os::fd::AsFd;
 use std::os::unix::net::UnixStream;
@@ -41,8 +42,8 @@ pub enum UnitState {
     Silent,
 }
 
-impl std::fmt::Display for RunningUnit {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+impl fmt::Display for RunningUnit {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{} (fleet {})", self.unit, self.fleet)
     }
 }
@@ -209,6 +210,12 @@ pub struct Client {
     beaten: Option<Instant>,
 }
 
+impl fmt::Debug for Client {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Client").field("unit", &self.unit).finish_non_exhaustive()
+    }
+}
+
 impl Client {
     /// Connects to the socket at a path.
     pub fn connect(path: &Path) -> Result<Self, ControlError> {
@@ -358,6 +365,7 @@ fn read(lines: &mut Lines<UnixStream>) -> Result<Answer, ControlError> {
 }
 
 /// The answers to one question, up to its end.
+#[derive(Debug)]
 pub struct Answers<'c> {
     client: &'c mut Client,
 }
