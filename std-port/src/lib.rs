@@ -41,6 +41,7 @@ mod locks;
 #[cfg(feature = "metrics")]
 pub mod metrics;
 mod my_function_list;
+mod name_and_id;
 mod news;
 mod occupancy;
 mod peer;
@@ -81,6 +82,7 @@ pub use handle::{Handle, MUnit, SUnit, WeakHandle};
 pub use handler::{Call, IntoHandler, ServiceOptions};
 pub use lease::{LeaseEnded, LeaseWatch};
 pub use my_function_list::MyFunctionList;
+pub use name_and_id::NameAndId;
 pub use peer::{Peer, TheirFunction, TheirFunctionList};
 pub use sys::interfaces::{Interface, Interfaces};
 pub use threads::Threads;

@@ -5,8 +5,9 @@ mod options;
 mod output;
 mod stop;
 
+pub use cara_std::NameAndId;
 pub use events::show_events;
-pub use options::{NameAndId, Network};
+pub use options::Network;
 pub use stop::{Stop, Stopper};
 
 use std::process::ExitCode;

@@ -1,7 +1,5 @@
 //! Options that all examples have.
 
-use std::str::FromStr;
-
 use anyhow::Result;
 use cara_std::keys::{FleetKeys, KeyRing, parse_node};
 use cara_std::{Builder, Fleet, Interfaces};
@@ -46,36 +44,5 @@ impl Network {
             keys.add(&parse_node(node).map_err(anyhow::Error::msg)?, &[])?;
         }
         Ok(keys)
-    }
-}
-
-/// A unit's name and ID number, written as `AGV_manager/1`.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct NameAndId {
-    /// The name.
-    pub name: String,
-    /// The ID number.
-    pub id: u32,
-}
-
-impl FromStr for NameAndId {
-    type Err = &'static str;
-
-    fn from_str(text: &str) -> Result<Self, Self::Err> {
-        let (name, id) = text.rsplit_once('/').ok_or("write NAME/ID, as in AGV_manager/1")?;
-        let id = id.parse().map_err(|_| "the ID behind the slash is a number from 0 to 4294967295")?;
-        Ok(Self { name: name.to_owned(), id })
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::NameAndId;
-
-    #[test]
-    fn a_name_and_an_id_are_told_apart() {
-        assert_eq!("a/b/7".parse(), Ok(NameAndId { name: "a/b".into(), id: 7 }));
-        assert!("agv".parse::<NameAndId>().is_err());
-        assert!("agv/x".parse::<NameAndId>().is_err());
     }
 }

@@ -35,9 +35,11 @@ fn scaled(text: &str, units: &[(&str, f64)]) -> Option<u64> {
     (value < u64::MAX as f64).then_some(value as u64)
 }
 
-/// A span of time as people read it: `2 s`, `50 ms`, `1.5 ms`, `12.3 us`.
+/// A span of time as people read it: `3 h`, `1.5 min`, `2 s`, `50 ms`, `12.3 us`.
 pub fn show_micros(micros: f64) -> String {
     let (value, unit) = match micros {
+        micros if micros >= 3600e6 => (micros / 3600e6, "h"),
+        micros if micros >= 60e6 => (micros / 60e6, "min"),
         micros if micros >= 1e6 => (micros / 1e6, "s"),
         micros if micros >= 1e3 => (micros / 1e3, "ms"),
         micros => (micros, "us"),
@@ -85,8 +87,8 @@ mod tests {
     #[test]
     fn times_and_sizes_are_shown_short() {
         assert_eq!(
-            [2e6, 5e4, 1500.0, 12.34, 0.0, 123_456.0, 100.0].map(show_micros),
-            ["2 s", "50 ms", "1.5 ms", "12.34 us", "0 us", "123 ms", "100 us"]
+            [2e6, 5e4, 1500.0, 12.34, 0.0, 123_456.0, 100.0, 90e6, 7200e6].map(show_micros),
+            ["2 s", "50 ms", "1.5 ms", "12.34 us", "0 us", "123 ms", "100 us", "1.5 min", "2 h"]
         );
         assert_eq!([0, 1000, 32_768, 1_048_576].map(show_bytes), ["0 B", "1000 B", "32 KiB", "1 MiB"]);
     }
