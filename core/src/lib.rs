@@ -45,12 +45,14 @@
 //! /// Lends what a stream has brought; returns how much of it was used. The rest is to be lent again.
 //! fn read<P: Port>(session: &mut Session<P>, cx: &mut Context<'_, P>, bytes: &mut [u8]) -> usize {
 //!     let receipt = session.receive(cx, bytes, None);
-//!     if let Some(Event::Reply(_call, _results)) = receipt.event { /* wake its caller */ }
+//!     if let Some(Event::Reply(_call, Ok(results))) = receipt.event {
+//!         let _block = session.results(&results, bytes); /* to its caller */
+//!     }
 //!     receipt.consumed
 //! }
 //! ```
 //!
-//! The whole contract stands in `docs/notes/driving-the-core.md`, the way to a new port in `docs/porting.md`.
+//! The whole contract stands on the front page of [`services`], the way to a new port in `docs/porting.md`.
 #![no_std]
 
 #[cfg(test)]

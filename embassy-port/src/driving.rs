@@ -7,14 +7,12 @@
 use cara_core::distribution::authenticator::Authenticator as _;
 use cara_core::distribution::connection_handler::{Command, NodeCounter};
 use cara_core::distribution::datagram;
-use cara_core::distribution::function_list::Slot;
+use cara_core::distribution::function_list::{Function, Slot};
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::ParametersView;
-use cara_core::error::{CloseReason, Error, Refusal};
+use cara_core::error::{CloseReason, Refusal};
 use cara_core::host::mailman::LinkId;
 use cara_core::services::Context;
-use cara_core::services::lease::LeaseEnd;
-use cara_core::services::requests::CallId;
 use cara_core::services::unit::{Call, Event};
 use cara_core::time::{Duration, Instant};
 use core::net::SocketAddrV4;
@@ -35,21 +33,6 @@ const LOGGED: Duration = Duration::from_secs(1);
 /// application's `wait_config_up`.
 const LOOK: Duration = Duration::from_millis(50);
 
-/// What happened on a link, without what it borrowed.
-// A wide tag: the rest is then moved in words, and not byte by byte.
-#[repr(u32)]
-pub(crate) enum News {
-    Joined,
-    Failed(CallId, Error),
-    ListChanged,
-    Skipped(u16),
-    Acknowledged,
-    LeaseExpired(Slot),
-    LeaseEnded { call: CallId, slot: Slot, why: LeaseEnd },
-    Closed(CloseReason),
-    Reply,
-}
-
 /// What the runner has to do outside of the machine.
 pub(crate) enum Job {
     /// Run the safe hook of a service.
@@ -66,34 +49,11 @@ pub(crate) enum Begun {
     Call(Call),
 }
 
-impl News {
-    /// Of all events but replies. A call is no news: it is left where the runner finds it.
-    fn of(event: &Event<'_>, begun: &mut Begun) -> Option<Self> {
-        Some(match *event {
-            Event::Joined => Self::Joined,
-            Event::Call(call) => {
-                *begun = Begun::Call(call);
-                return None;
-            }
-            Event::Reply(..) => Self::Reply,
-            Event::Failed(id, error) => Self::Failed(id, error),
-            Event::ListChanged => Self::ListChanged,
-            Event::Acknowledged { skipped: 0, .. } => Self::Acknowledged,
-            Event::Acknowledged { skipped, .. } => Self::Skipped(skipped),
-            Event::LeaseExpired(slot) => Self::LeaseExpired(slot),
-            Event::LeaseEnded { call, slot, why } => Self::LeaseEnded { call, slot, why },
-            Event::Closed(reason) => Self::Closed(reason),
-            // No handle here pings.
-            Event::Answered => return None,
-        })
-    }
-}
-
 impl<T> Machine<T> {
     /// Lets the session of a link do what is due: `None` when nothing is.
     #[inline(never)]
-    pub(crate) fn poll_link(&mut self, index: u16) -> Option<News> {
-        let Self { links, mail, pool, functions, reply, access, begun, begun_on, hub, proof, .. } = self;
+    pub(crate) fn poll_link(&mut self, index: u16) -> Option<Event> {
+        let Self { links, mail, pool, functions, reply, access, hub, proof, .. } = self;
         let link = links.get_mut(usize::from(index))?;
         let session = link.session.as_mut()?;
         let access = access.0;
@@ -101,16 +61,9 @@ impl<T> Machine<T> {
         if cx.now < session.deadline() {
             return None;
         }
-        match session.poll(&mut cx)? {
-            Event::Reply(id, result) => {
-                ended(link.waiters, reply, link.serial, id, result);
-                Some(News::Reply)
-            }
-            event => {
-                *begun_on = index;
-                News::of(&event, begun)
-            }
-        }
+        let event = session.poll(&mut cx)?;
+        ended(link, reply, &event, &[]);
+        Some(event)
     }
 
     /// Reads what has arrived on a link: `None` when there was nothing that led anywhere.
@@ -119,8 +72,8 @@ impl<T> Machine<T> {
         index: u16,
         scratch: &mut [u8],
         arguments: Option<&mut ParametersView>,
-    ) -> Option<Option<News>> {
-        let Self { links, mail, pool, functions, reply, access, begun, begun_on, hub, proof, .. } = self;
+    ) -> Option<Option<Event>> {
+        let Self { links, mail, pool, functions, reply, access, hub, proof, .. } = self;
         let link = links.get_mut(usize::from(index))?;
         // There is one place for a reply. While a task has not taken the last one, a link that may bring another one is not read.
         if link.session.is_none() || (reply.is_taken() && link.awaits_reply()) {
@@ -132,20 +85,11 @@ impl<T> Machine<T> {
         let access = access.0;
         let mut cx = Context { now: now(), mailman: mail, buffers: pool, functions, access, hub, keys: proof };
         let receipt = session.receive(&mut cx, lent, arguments);
-        let consumed = receipt.consumed;
-        let news = match &receipt.event {
-            Some(Event::Reply(id, result)) => {
-                ended(link.waiters, reply, link.serial, *id, *result);
-                Some(News::Reply)
-            }
-            Some(event) => {
-                *begun_on = index;
-                News::of(event, begun)
-            }
-            None => None,
-        };
-        mail.lines.get_mut(usize::from(index))?.take(consumed);
-        if consumed == 0 && news.is_none() { None } else { Some(news) }
+        if let Some(event) = &receipt.event {
+            ended(link, reply, event, lent);
+        }
+        mail.lines.get_mut(usize::from(index))?.take(receipt.consumed);
+        (receipt.consumed > 0 || receipt.event.is_some()).then_some(receipt.event)
     }
 
     /// Whether no link has anything left to read, or a call to begin.
@@ -162,7 +106,7 @@ impl<T> Machine<T> {
         &mut self,
         scratch: &mut [u8],
         context: &mut TaskContext<'_>,
-    ) -> Option<Option<(u16, News)>> {
+    ) -> Option<Option<(u16, Event)>> {
         let (length, from) = match self.mail.udp.poll_recv_from(scratch, context) {
             Poll::Pending => return None,
             Poll::Ready(Err(_)) => return Some(None),
@@ -174,8 +118,7 @@ impl<T> Machine<T> {
         if let Some((LinkId(link), nonce, body)) = datagram::for_session(bytes, mode, fleet)
             && let Some(event) = self.with(link, |session, cx| session.datagram(cx, from, nonce, body))
         {
-            self.begun_on = link;
-            return Some(event.and_then(|event| Some((link, News::of(&event, &mut self.begun)?))));
+            return Some(event.map(|event| (link, event)));
         }
         self.hub.node.datagram(now(), from, bytes, self.proof.codes());
         if let Some(address) = self.hub.node.take_twin() {
@@ -285,36 +228,33 @@ impl<T> Machine<T> {
         }
     }
 
-    /// Does what the news ask for, or leaves it to the runner.
-    pub(crate) fn noted(&mut self, index: u16, news: News) -> Option<Job> {
-        match news {
-            News::Reply => {}
-            News::Joined => self.joined(index),
-            News::Closed(reason) => return self.closed(index, reason),
-            News::LeaseExpired(slot) => {
-                let function = self.functions.function(slot).map_or("", |function| function.name());
-                let function = Name::try_from(function).unwrap_or_default();
-                self.tell_of(index, |peer| UnitEvent::LeaseExpired { peer, function });
+    /// Does what an event asks for, or leaves it to the runner.
+    pub(crate) fn noted(&mut self, index: u16, event: Event) -> Option<Job> {
+        match event {
+            // No handle here pings.
+            Event::Reply(..) | Event::Answered => {}
+            Event::Call(call) => (self.begun, self.begun_on) = (Begun::Call(call), index),
+            Event::Joined => self.joined(index),
+            Event::Closed(reason) => return self.closed(index, reason),
+            Event::Acknowledged { skipped: 0, .. } => self.wakers.news.wake(),
+            Event::LeaseExpired(slot) => {
+                self.tell_of(index, event);
                 self.wakers.leases.wake();
                 return Some(Job::Safe(slot));
             }
-            News::ListChanged => self.tell_of(index, |peer| UnitEvent::ListChanged { peer }),
-            News::Acknowledged => self.wakers.news.wake(),
-            News::Skipped(skipped) => self.tell_of(index, |peer| UnitEvent::FunctionsSkipped { peer, skipped }),
-            News::Failed(call, error) => self.tell_of(index, |peer| UnitEvent::RequestFailed { peer, call, error }),
-            News::LeaseEnded { call, slot, why } => {
-                let session = self.link(index).and_then(|link| link.session.as_ref());
-                let function = session.and_then(|session| session.their_function_list().function(slot));
-                let function = Name::try_from(function.map_or("", |function| function.name())).unwrap_or_default();
-                self.tell_of(index, |peer| UnitEvent::LeaseEnded { peer, function, call, why });
-            }
+            event => self.tell_of(index, event),
         }
         None
     }
 
-    fn tell_of(&mut self, index: u16, event: impl FnOnce(Identity) -> UnitEvent) {
-        if let Some(peer) = self.link(index).and_then(|link| link.peer.clone()) {
-            self.tell(event(peer));
+    #[inline(never)]
+    fn tell_of(&mut self, index: u16, event: Event) {
+        let Some(link) = self.links.get(usize::from(index)) else { return };
+        let Some(peer) = &link.peer else { return };
+        let own_name = |slot| name(self.functions.function(slot));
+        let their_name = |slot| name(link.session.as_ref().and_then(|s| s.their_function_list().function(slot)));
+        if let Some(event) = UnitEvent::of(event, peer, own_name, their_name) {
+            self.tell(event);
         }
     }
 
@@ -353,9 +293,9 @@ impl<T> Machine<T> {
         let session = self.link(index).and_then(|link| link.session.as_ref());
         let Some(identity) = session.and_then(|session| session.identity().cloned()) else { return };
         if let Some(link) = self.link_mut(index) {
-            link.peer = Some(identity.clone());
             log!("{} has joined", identity.name());
-            self.tell(UnitEvent::Joined { peer: identity });
+            link.peer = Some(identity);
+            self.tell_of(index, Event::Joined);
         }
     }
 
@@ -403,4 +343,8 @@ impl<T> Machine<T> {
         link.serial = link.serial.wrapping_add(1);
         Some((link.peer.take(), told, address))
     }
+}
+
+fn name<H: ?Sized>(function: Option<Function<'_, H>>) -> Name {
+    Name::try_from(function.map_or("", |function| function.name())).unwrap_or_default()
 }

@@ -10,7 +10,7 @@ use cara_core::distribution::function_list::{Generation, Slot};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 use cara_core::services::requests::CallId;
-use cara_core::services::unit::ReplyBlock;
+use cara_core::services::unit::Event;
 use cara_core::time::Instant;
 
 use crate::line::copy;
@@ -92,18 +92,15 @@ impl Waiter {
     }
 }
 
-/// Stores the outcome of a call for the task that waits for it, if there is one.
-pub(crate) fn ended(
-    waiters: &mut [Option<Waiter>],
-    reply: &mut ReplyBox,
-    serial: u32,
-    id: CallId,
-    result: Result<ReplyBlock<'_>, Error>,
-) {
-    let mut waiting = waiters.iter_mut().flatten();
-    if let Some(waiter) = waiting.find(|waiter| waiter.call.serial == serial && waiter.call.id == id) {
-        let kept = result.and_then(|block| reply.put(waiter.call, block.bytes()));
-        waiter.end(kept);
+/// Stores the outcome of a call for the task that waits for it, if that is what happened and there is one.
+pub(crate) fn ended(link: &mut Link, reply: &mut ReplyBox, event: &Event, lent: &[u8]) {
+    let Event::Reply(id, outcome) = event else { return };
+    let (serial, session) = (link.serial, &link.session);
+    let mut waiting = link.waiters.iter_mut().flatten();
+    if let Some(waiter) = waiting.find(|waiter| waiter.call.serial == serial && waiter.call.id == *id) {
+        let session = session.as_ref().ok_or(Error::ResultLost);
+        let results = outcome.and_then(|results| session?.results(&results, lent));
+        waiter.end(results.and_then(|block| reply.put(waiter.call, block.bytes())));
     }
 }
 

@@ -91,8 +91,8 @@ impl<T> Runner<T> {
         }
         if is_due {
             for index in machine.indices() {
-                if let Some(news) = machine.poll_link(index) {
-                    return machine.noted(index, news).map_or(Step::Again, Step::Job);
+                if let Some(event) = machine.poll_link(index) {
+                    return machine.noted(index, event).map_or(Step::Again, Step::Job);
                 }
             }
             machine.expire_reply(now());
@@ -107,8 +107,8 @@ impl<T> Runner<T> {
             machine.act(command);
             return Step::Again;
         }
-        if let Some(news) = machine.read_datagram(self.scratch, context) {
-            let job = news.and_then(|(index, news)| machine.noted(index, news));
+        if let Some(event) = machine.read_datagram(self.scratch, context) {
+            let job = event.and_then(|(index, event)| machine.noted(index, event));
             return job.map_or(Step::Again, Step::Job);
         }
         // What waits to be written goes out before more is read, or a peer that only sends would keep every answer back.
@@ -120,8 +120,8 @@ impl<T> Runner<T> {
         let busy = self.unanswered.is_some();
         for index in machine.indices() {
             let arguments = if busy { None } else { Some(&mut *self.arguments) };
-            if let Some(news) = machine.read_link(index, self.scratch, arguments) {
-                let job = news.and_then(|news| machine.noted(index, news));
+            if let Some(event) = machine.read_link(index, self.scratch, arguments) {
+                let job = event.and_then(|event| machine.noted(index, event));
                 return job.map_or(Step::Again, Step::Job);
             }
             if !busy && let Some(Some(call)) = machine.with(index, |session, cx| session.next_call(cx, self.arguments))

@@ -1,9 +1,11 @@
 //! What a unit tells its application: one type for all ports.
 
+use crate::distribution::function_list::Slot;
 use crate::distribution::identity::Identity;
 use crate::error::{CloseReason, Error};
 use crate::services::lease::LeaseEnd;
 use crate::services::requests::CallId;
+use crate::services::unit::Event;
 
 /// Something happened that no call returned.
 ///
@@ -81,4 +83,31 @@ pub enum UnitEvent<F, N, E> {
         /// Why.
         why: LeaseEnd,
     },
+}
+
+impl<F, N, E> UnitEvent<F, N, E> {
+    /// What the application is told of an event on the link to `peer`, from its joining to its leaving; `None` where it is told
+    /// nothing. A link that ends before is [`NotJoined`](Self::NotJoined), which the port tells by itself.
+    pub fn of(
+        event: Event,
+        peer: &Identity,
+        own_name: impl FnOnce(Slot) -> F,
+        their_name: impl FnOnce(Slot) -> F,
+    ) -> Option<Self> {
+        let peer = || peer.clone();
+        Some(match event {
+            Event::Joined => Self::Joined { peer: peer() },
+            Event::Closed(reason) => Self::Left { peer: peer(), reason },
+            Event::ListChanged => Self::ListChanged { peer: peer() },
+            Event::Failed(call, error) => Self::RequestFailed { peer: peer(), call, error },
+            Event::LeaseExpired(slot) => Self::LeaseExpired { peer: peer(), function: own_name(slot) },
+            Event::LeaseEnded { call, slot, why } => {
+                Self::LeaseEnded { peer: peer(), function: their_name(slot), call, why }
+            }
+            Event::Acknowledged { skipped: 0, .. } | Event::Answered | Event::Call(_) | Event::Reply(..) => {
+                return None;
+            }
+            Event::Acknowledged { skipped, .. } => Self::FunctionsSkipped { peer: peer(), skipped },
+        })
+    }
 }

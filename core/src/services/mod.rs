@@ -25,7 +25,7 @@
 //! |---|---|
 //! | [`LeaseExpired`](unit::Event::LeaseExpired) | runs the safe hook of the service, before anything else |
 //! | [`Call`](unit::Event::Call) | runs the handler, and answers by ticket; an `order` makes the handler's view of the service's [`Lease`](lease::Lease). A newer call of the service ends that view without an event, so wake what awaits it |
-//! | [`Reply`](unit::Event::Reply), [`Failed`](unit::Event::Failed), [`LeaseEnded`](unit::Event::LeaseEnded) | tells the program. It says `session.cancel` for a call that the program gives up, `session.release` for all of a function |
+//! | [`Reply`](unit::Event::Reply), [`Failed`](unit::Event::Failed), and all others | tells the program what [`UnitEvent::of`](event::UnitEvent::of) makes of it, and the results of a reply, which `session.results` shows. It says `session.cancel` for a call that the program gives up, `session.release` for all of a function |
 //! | [`Joined`](unit::Event::Joined) | the peer is taken, and is being told what is published to it |
 //! | [`Closed`](unit::Event::Closed) | the last one: forgets the session (`into_storage` gives its slices back), then `node.left`, also for a link that never joined |
 //!
@@ -93,9 +93,9 @@
 //!             while let Some(Command::Dial { .. }) = hub.node.poll(now, wire, &Plain) {}
 //!             let mut cx = Context { now, mailman: wire, buffers, functions, access: None, hub, keys: &mut () };
 //!             // What is due comes before what has arrived.
-//!             let mut consumed = 0;
+//!             let (mut consumed, lent) = (0, &mut arrived[start..]);
 //!             let event = session.poll(&mut cx).or_else(|| {
-//!                 let receipt = session.receive(&mut cx, &mut arrived[start..], Some(&mut arguments));
+//!                 let receipt = session.receive(&mut cx, lent, Some(&mut arguments));
 //!                 consumed = receipt.consumed;
 //!                 receipt.event
 //!             });
@@ -111,7 +111,8 @@
 //!                     arguments.set_value("twice", 2 * n).expect("it is an int");
 //!                     session.answer(&mut cx, call.ticket, Ok(&arguments)).expect("there is a buffer");
 //!                 }
-//!                 Some(Event::Reply(_, results)) => {
+//!                 Some(Event::Reply(_, outcome)) => {
+//!                     let results = outcome.and_then(|results| session.results(&results, lent));
 //!                     let mut into = Parameters::<256>::sized();
 //!                     into.add_int("twice", 1).expect("there is room");
 //!                     results.expect("it was served").read_into(&mut into).expect("they are the results");

@@ -19,9 +19,9 @@ use cara_core::distribution::identity::Fleet;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::ServiceError;
 use cara_core::services::lease::Lease;
-use cara_core::services::unit::Call;
+use cara_core::services::unit::{Call, Event};
 use cara_core::time::{Duration, Instant};
-use cara_smoltcp::{News, Program, Resources, SUnit, Served, Settings};
+use cara_smoltcp::{Program, Resources, SUnit, Served, Settings};
 use clap::Parser;
 use smoltcp::phy::{Medium, TunTapInterface, wait};
 
@@ -71,8 +71,8 @@ impl Program for Vehicle {
         }
     }
 
-    fn hear(&mut self, news: News) {
-        println!("{news:?}");
+    fn hear(&mut self, event: Event) {
+        println!("{event:?}");
     }
 }
 

@@ -49,7 +49,7 @@ mod settings;
 mod stack;
 mod unit;
 
-pub use program::{News, Program, Served};
+pub use program::{Program, Served};
 pub use resources::Resources;
 pub use settings::Settings;
 pub use unit::SUnit;

@@ -14,7 +14,7 @@ use cara_core::services::unit::{Call, Event, Session, SessionConfig};
 use cara_core::services::{Context, Ticket};
 use cara_core::time::Instant;
 
-use crate::program::{News, Program, Served};
+use crate::program::{Program, Served};
 use crate::stack::Stream;
 use crate::unit::{SUnit, Standing, context};
 
@@ -57,8 +57,7 @@ impl SUnit {
 
     fn poll_session<P: Program>(&mut self, now: Instant, program: &mut P) {
         while let Some(event) = self.session.as_mut().and_then(|session| session.poll(context!(self, now))) {
-            let rest = tell(event, program);
-            self.go_on(now, rest, program);
+            self.happened(now, event, &[], program);
         }
     }
 
@@ -77,8 +76,7 @@ impl SUnit {
         let for_session = datagram::for_session(bytes, Mode::Plain, self.hub.node.fleet());
         if let (Some((LINK, nonce, body)), Some(session)) = (for_session, &mut self.session) {
             if let Some(event) = session.datagram(context!(self, now), from, nonce, body) {
-                let rest = tell(event, program);
-                self.go_on(now, rest, program);
+                self.happened(now, event, &[], program);
             }
             return;
         }
@@ -110,11 +108,11 @@ impl SUnit {
         let length = self.stack.peek(lent);
         let arguments = self.unanswered.is_none().then_some(self.arguments.as_mut_view());
         let receipt = session.receive(context!(self, now), &mut lent[..length], arguments);
-        let (consumed, moved) = (receipt.consumed, receipt.consumed > 0 || receipt.event.is_some());
-        let rest = receipt.event.map_or(Rest::Nothing, |event| tell(event, program));
-        self.stack.consume(consumed);
-        self.go_on(now, rest, program);
-        moved
+        self.stack.consume(receipt.consumed);
+        if let Some(event) = receipt.event {
+            self.happened(now, event, lent, program);
+        }
+        receipt.consumed > 0 || receipt.event.is_some()
     }
 
     /// Serves the calls that waited for their turn.
@@ -135,15 +133,21 @@ impl SUnit {
         }
     }
 
-    fn go_on<P: Program>(&mut self, now: Instant, rest: Rest, program: &mut P) {
-        match rest {
-            Rest::Nothing => {}
-            Rest::Joined => {
-                self.standing = Standing::Joined;
-                program.hear(News::Joined);
+    /// Does what an event asks for; `lent` is what it came of.
+    fn happened<P: Program>(&mut self, now: Instant, event: Event, lent: &[u8], program: &mut P) {
+        match event {
+            Event::LeaseExpired(function) => program.make_safe(function),
+            Event::Call(call) => self.serve(now, &call, program),
+            Event::Reply(id, outcome) => {
+                let Some(session) = &self.session else { return };
+                program.replied(id, outcome.and_then(|results| session.results(&results, lent)));
             }
-            Rest::Serve(call) => self.serve(now, &call, program),
-            Rest::Leave(reason) => self.leave(now, reason, program),
+            Event::Closed(reason) => self.leave(now, reason, program),
+            Event::Joined => {
+                self.standing = Standing::Joined;
+                program.hear(event);
+            }
+            event => program.hear(event),
         }
     }
 
@@ -191,31 +195,7 @@ impl SUnit {
         self.stack.close();
         self.hub.node.left(now, LINK, reason);
         if self.standing == Standing::Joined {
-            program.hear(News::Left(reason));
+            program.hear(Event::Closed(reason));
         }
     }
-}
-
-/// What is left for the unit to do about an event.
-enum Rest {
-    Nothing,
-    Joined,
-    Serve(Call),
-    Leave(CloseReason),
-}
-
-/// Tells the program what concerns it.
-fn tell<P: Program>(event: Event<'_>, program: &mut P) -> Rest {
-    match event {
-        Event::LeaseExpired(function) => program.make_safe(function),
-        Event::Reply(id, outcome) => program.replied(id, outcome),
-        Event::Failed(id, error) => program.hear(News::Failed(id, error)),
-        Event::ListChanged => program.hear(News::ListChanged),
-        Event::LeaseEnded { slot, why, .. } => program.hear(News::LeaseEnded { function: slot, why }),
-        Event::Acknowledged { .. } | Event::Answered => {}
-        Event::Joined => return Rest::Joined,
-        Event::Call(call) => return Rest::Serve(call),
-        Event::Closed(reason) => return Rest::Leave(reason),
-    }
-    Rest::Nothing
 }

@@ -2,10 +2,9 @@
 
 use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::parameters::ParametersView;
-use cara_core::error::{CloseReason, Error, ServiceError};
-use cara_core::services::lease::LeaseEnd;
+use cara_core::error::{Error, ServiceError};
 use cara_core::services::requests::CallId;
-use cara_core::services::unit::{Call, ReplyBlock};
+use cara_core::services::unit::{Call, Event, ReplyBlock};
 
 /// The program around a unit, as [`SUnit::poll`](crate::SUnit::poll) sees it. Each method runs inside of `poll`, so each
 /// returns soon: nothing is read and no keep-alive leaves meanwhile.
@@ -21,9 +20,9 @@ pub trait Program {
         let _ = (call, outcome);
     }
 
-    /// Something else has happened.
-    fn hear(&mut self, news: News) {
-        let _ = news;
+    /// Something else has happened on the link: [`Event::Joined`] and what comes behind it, up to [`Event::Closed`].
+    fn hear(&mut self, event: Event) {
+        let _ = event;
     }
 }
 
@@ -34,24 +33,4 @@ pub enum Served {
     Now(Result<(), ServiceError>),
     /// The program answers it with [`SUnit::answer`](crate::SUnit::answer) when it is done.
     Later,
-}
-
-/// What a program may want to know.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum News {
-    /// The manager has taken the unit.
-    Joined,
-    /// The link to the manager has ended; leases and calls of it have been reported before.
-    Left(CloseReason),
-    /// The manager has published or withdrawn functions.
-    ListChanged,
-    /// A request that wanted no reply was refused, or its service has failed.
-    Failed(CallId, Error),
-    /// The manager has ended the lease that this unit held on a function of it.
-    LeaseEnded {
-        /// The manager's function.
-        function: Slot,
-        /// Why.
-        why: LeaseEnd,
-    },
 }

@@ -6,10 +6,10 @@ use std::sync::{Arc, Mutex, RwLock};
 
 use cara_core::error::Error;
 use cara_core::services::access::{Access, Bucket, Decision, Principal, Rate, Verb};
+use cara_core::services::unit::Event;
 use cara_core::time::{Duration, Instant};
 
 use super::Engine;
-use super::notices::Notice;
 use crate::access::AccessTable;
 use crate::locks::{lock, read, write};
 
@@ -142,7 +142,7 @@ impl<T: Send + 'static> Engine<T> {
             let mut state = link.lock();
             if state.session.is_live() {
                 self.with(&link, &mut state, |session, cx| session.access_changed(cx));
-                state.notices.push(Notice::ListChanged);
+                state.notices.push(Event::ListChanged);
             }
             self.settle(&link, state);
         }

@@ -66,7 +66,7 @@ impl<T: Send + 'static> Engine<T> {
     fn session_datagram(&self, link: &Arc<LinkCell>, from: SocketAddr, nonce: u64, body: &mut [u8]) {
         let mut state = link.lock();
         let event = self.with(link, &mut state, |session, cx| session.datagram(cx, from, nonce, body));
-        if let Some(event) = &event {
+        if let Some(event) = event {
             self.note(&mut state, event);
         }
         self.dispatch_emergencies(link, &mut state);

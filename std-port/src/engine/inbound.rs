@@ -5,13 +5,12 @@ use std::sync::Arc;
 use cara_core::distribution::function_list::FunctionList;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
-use cara_core::services::access::Access;
+use cara_core::services::requests::CallId;
 use cara_core::services::unit::Event;
-use cara_core::services::{Context, requests::CallId};
 use cara_core::time::Instant;
 
 use super::Engine;
-use super::link::{LinkCell, LinkState, StdMailman};
+use super::link::{LinkCell, LinkState};
 use super::serving::{self, Begun};
 use super::worker::arena;
 use crate::handler::Handler;
@@ -102,22 +101,10 @@ impl<T: Send + 'static> Engine<T> {
     ) -> Step {
         self.make_list_room(state);
         let functions = self.functions();
-        let mut mailman = StdMailman { stream: Some(&link.stream), datagrams: &self.sockets.datagrams };
-        let mut buffers = &self.pool;
-        let asked = self.guard.ask();
-        let access = asked.as_ref().map(|asked| asked as &dyn Access);
-        let (mut hub, mut keys) = (self, self);
-        let mut cx = Context {
-            now,
-            mailman: &mut mailman,
-            buffers: &mut buffers,
-            functions: &*functions,
-            access,
-            hub: &mut hub,
-            keys: &mut keys,
-        };
         let LinkState { session, waiters, notices, .. } = state;
-        let receipt = session.receive(&mut cx, bytes, arguments.as_deref_mut());
+        let receipt = self.with_functions(now, &functions, link, session, |session, cx| {
+            session.receive(cx, bytes, arguments.as_deref_mut())
+        });
         let mut step = Step {
             consumed: receipt.consumed,
             paused: receipt.paused,
@@ -135,16 +122,14 @@ impl<T: Send + 'static> Engine<T> {
                     Some(arguments) => self.copy_emergency(&functions, link, begun, arguments),
                 }
             }
-            Some(Event::Reply(id, outcome)) => match own.filter(|own| own.id == id) {
-                Some(own) => own.result = Some(outcome.and_then(|block| block.read_into(own.parameters))),
-                None => {
-                    let outcome =
-                        outcome.map(|block| (block.signature().as_bytes().into(), Box::<[u8]>::from(block.bytes())));
-                    if let Some(waiter) = waiters.iter_mut().find(|waiter| waiter.id == id) {
-                        waiter.finish(outcome);
-                    }
+            Some(Event::Reply(id, outcome)) => {
+                let outcome = outcome.and_then(|results| session.results(&results, bytes));
+                if let Some(own) = own.filter(|own| own.id == id) {
+                    own.result = Some(outcome.and_then(|block| block.read_into(own.parameters)));
+                } else if let Some(waiter) = waiters.iter_mut().find(|waiter| waiter.id == id) {
+                    waiter.finish(outcome.map(|block| (block.signature().as_bytes().into(), block.bytes().into())));
                 }
-            },
+            }
             Some(event) => {
                 if matches!(event, Event::ListChanged) && !link.is_introduced() {
                     // A node that counts has its place.
@@ -154,7 +139,7 @@ impl<T: Send + 'static> Engine<T> {
                 if let Event::LeaseExpired(slot) = event {
                     self.wake_leased(&functions, slot);
                 }
-                notices.note(&event);
+                notices.push(event);
             }
         }
         step

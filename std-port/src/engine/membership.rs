@@ -16,7 +16,6 @@ use core::net::{IpAddr, SocketAddr};
 
 use super::Engine;
 use super::link::{LinkCell, LinkState, Linux, StdMailman};
-use super::notices::Notice;
 use super::reader::Cause;
 use crate::event::UnitEvent;
 use crate::seldom::warn_seldom;
@@ -213,45 +212,31 @@ impl<T: Send + 'static> Engine<T> {
                 session.publish(cx);
             }
         });
-        state.notices.push(Notice::Joined);
+        state.notices.push(Event::Joined);
     }
 
-    /// Does what a notice asks for, or tells it.
-    pub(super) fn act_on(&self, link: &Arc<LinkCell>, notice: Notice) {
-        match notice {
-            Notice::Answered => link.room.notify_all(),
-            Notice::Left(reason) => self.link_ended(link, reason),
-            notice => {
-                if let Some(event) = link.peer.get().and_then(|peer| self.describe(link, &peer.identity, &notice)) {
-                    self.tell(event);
-                }
-                if let Notice::Acknowledged { .. } = notice {
-                    link.room.notify_all();
-                }
-            }
+    /// Does what an event asks for, and tells it.
+    pub(super) fn act_on(&self, link: &Arc<LinkCell>, event: Event) {
+        if let Event::Closed(reason) = event {
+            return self.link_ended(link, reason);
+        }
+        self.tell_of(link, event);
+        if let Event::Answered | Event::Acknowledged { .. } = event {
+            link.room.notify_all();
         }
     }
 
-    /// The event that subscribers see.
-    fn describe(&self, link: &LinkCell, peer: &Identity, notice: &Notice) -> Option<UnitEvent> {
-        let peer = peer.clone();
+    /// Tells subscribers of an event on the link of a node that has joined.
+    fn tell_of(&self, link: &LinkCell, event: Event) {
+        let Some(peer) = link.peer.get() else { return };
         let own_name = |slot: Slot| self.functions().function(slot).map(|f| f.name().to_owned()).unwrap_or_default();
         let their_name = |slot: Slot| {
             let state = link.lock();
             state.session.their_function_list().function(slot).map(|f| f.name().to_owned()).unwrap_or_default()
         };
-        Some(match *notice {
-            Notice::Joined => UnitEvent::Joined { peer },
-            Notice::ListChanged => UnitEvent::ListChanged { peer },
-            Notice::Failed(call, error) => UnitEvent::RequestFailed { peer, call, error },
-            Notice::LeaseExpired(slot) => UnitEvent::LeaseExpired { peer, function: own_name(slot) },
-            Notice::LeaseEnded { call, slot, why } => {
-                UnitEvent::LeaseEnded { peer, function: their_name(slot), call, why }
-            }
-            Notice::Acknowledged { skipped, .. } if skipped > 0 => UnitEvent::FunctionsSkipped { peer, skipped },
-            Notice::Acknowledged { .. } => return None,
-            Notice::Answered | Notice::Left(_) => return None,
-        })
+        if let Some(event) = UnitEvent::of(event, &peer.identity, own_name, their_name) {
+            self.tell(event);
+        }
     }
 
     /// The link's id is free for another link only when nothing here means the old one by it any more.
@@ -266,7 +251,7 @@ impl<T: Send + 'static> Engine<T> {
         if let Some(peer) = link.peer.get() {
             peer.leave(link, reason);
             self.run_lost_hook();
-            self.tell(UnitEvent::Left { peer: peer.identity.clone(), reason });
+            self.tell_of(link, Event::Closed(reason));
         } else {
             let (peer, address) = {
                 let state = link.lock();

@@ -213,7 +213,18 @@ impl<T: Send + 'static> Engine<T> {
         state: &mut LinkState,
         act: impl FnOnce(&mut Session<Linux>, &mut Context<'_, Linux>) -> R,
     ) -> R {
-        let functions = self.functions();
+        self.with_functions(now, &self.functions(), link, &mut state.session, act)
+    }
+
+    /// The same with the functions that the caller reads, and goes on to read.
+    fn with_functions<R>(
+        &self,
+        now: Instant,
+        functions: &FunctionList<Boxed, Handler<T>>,
+        link: &LinkCell,
+        session: &mut Session<Linux>,
+        act: impl FnOnce(&mut Session<Linux>, &mut Context<'_, Linux>) -> R,
+    ) -> R {
         let mut mailman = StdMailman { stream: Some(&link.stream), datagrams: &self.sockets.datagrams };
         let mut buffers = &self.pool;
         let asked = self.guard.ask();
@@ -223,12 +234,12 @@ impl<T: Send + 'static> Engine<T> {
             now,
             mailman: &mut mailman,
             buffers: &mut buffers,
-            functions: &*functions,
+            functions,
             access,
             hub: &mut hub,
             keys: &mut keys,
         };
-        act(&mut state.session, &mut cx)
+        act(session, &mut cx)
     }
 
     /// Where the unit takes connections; 0 for nowhere.

@@ -48,18 +48,18 @@ impl<T: Send + 'static> Engine<T> {
                         link.stream.shutdown();
                         link.room.notify_all();
                     }
-                    self.note(state, &event);
+                    self.note(state, event);
                 }
             }
         }
     }
 
     /// An event that is acted upon when the lock is given up; only what waits for the end of a lease is woken before.
-    pub(super) fn note(&self, state: &mut LinkState, event: &Event<'_>) {
-        if let Event::LeaseExpired(slot) = *event {
+    pub(super) fn note(&self, state: &mut LinkState, event: Event) {
+        if let Event::LeaseExpired(slot) = event {
             self.wake_leased(&self.functions(), slot);
         }
-        state.notices.note(event);
+        state.notices.push(event);
     }
 
     fn set_timer(&self, now: Instant, mut deadline: Instant, link: &LinkCell, state: &mut LinkState) {
@@ -83,7 +83,7 @@ impl<T: Send + 'static> Engine<T> {
         }
         while let Some(notices) = state.notices.next() {
             drop(state);
-            notices.into_iter().for_each(|notice| self.act_on(link, notice));
+            notices.into_iter().for_each(|event| self.act_on(link, event));
             state = link.lock();
         }
     }

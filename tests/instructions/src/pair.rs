@@ -242,7 +242,8 @@ impl Side {
                     self.answer(call, parameters);
                     done += 1;
                 }
-                Some(Event::Reply(_, Ok(block))) => {
+                Some(Event::Reply(_, Ok(results))) => {
+                    let block = self.session.results(&results, lent).expect("they are the last ones");
                     block.read_into(parameters).expect("the results fit");
                     done += 1;
                 }

@@ -179,7 +179,9 @@ entry!(session_leases, {
 });
 
 entry!(replies, {
-    if let Event::Reply(_, Ok(block)) = unknown::<Event<'static>>() {
+    if let Event::Reply(_, Ok(results)) = unknown::<Event>()
+        && let Ok(block) = session().results(results, unknown_slice())
+    {
         keep((block.read_into(parameters()), block.signature(), block.bytes()));
     }
     keep(unknown::<ReplyBlock<'static>>().read_into(parameters()));

@@ -1,5 +1,6 @@
 //! What a scenario can do, whatever the port.
 
+use std::fmt::Debug;
 use std::rc::Rc;
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -11,6 +12,7 @@ use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error};
 use cara_core::host::connections::LinkCounter;
 use cara_core::services::access::Rule;
+use cara_core::services::event::UnitEvent;
 use cara_core::services::lease::LeaseEnd;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::RequestOptions;
@@ -97,6 +99,28 @@ pub enum Seen {
     LeaseExpired(String),
     /// A lease that the unit held ended at the peer.
     LeaseEnded(String, LeaseEnd),
+}
+
+impl Seen {
+    /// What a scenario sees of what a port tells. `is_up`: whether the network that it names can be used.
+    pub(crate) fn of<F: ToString + Debug, N: Debug, E: Debug>(
+        event: UnitEvent<F, N, E>,
+        is_up: impl FnOnce(&N) -> bool,
+    ) -> Option<Self> {
+        Some(match event {
+            UnitEvent::Joined { peer } => Self::Joined(peer),
+            UnitEvent::Left { peer, reason } => Self::Left(peer, reason),
+            UnitEvent::NotJoined { reason, .. } => Self::NotJoined(reason),
+            UnitEvent::NetworkChanged { up } => Self::InterfaceChanged(is_up(&up)),
+            UnitEvent::ListChanged { peer } => Self::ListChanged(peer),
+            UnitEvent::RequestFailed { call, error, .. } => Self::Failed(call, error),
+            UnitEvent::LeaseExpired { function, .. } => Self::LeaseExpired(function.to_string()),
+            UnitEvent::LeaseEnded { function, why, .. } => Self::LeaseEnded(function.to_string(), why),
+            UnitEvent::FunctionsSkipped { .. } => return None,
+            // A scenario that did not see it would pass for the wrong reason.
+            other => panic!("no scenario knows {other:?}"),
+        })
+    }
 }
 
 /// How a call ended, and when.

@@ -41,7 +41,7 @@
 //! - [`UnitHandle`] has what the real ports have, in the same words; what blocks there is a future here.
 //! - [`Service`] is a closure or a future, with priority, lease and safe hook; it may sleep, and call any unit back.
 //! - A program ([`NewUnit::program`]) runs at each start of its unit, so that a restart loses what a real one loses.
-//! - [`UnitEvent`]s tell what each unit saw, with its time.
+//! - [`LogEvent`]s tell what each unit saw, with its time.
 //!
 //! If a test panics, its world prints the seed; `CARA_SIM_SEED=…` replays it. [`seeds`] and [`for_each_seed`] run a
 //! test over many seeds; `CARA_SIM_SEEDS=…` says over how many.
@@ -99,6 +99,6 @@ pub use path::{Chance, Path};
 pub use plan::{Action, Crash, FaultPlan};
 pub use storage::Boxed;
 pub use world::{
-    BoxedParameters, Call, LeaseWatch, MyFunctionList, NewUnit, Outcome, Peer, Ring, Service, UnitEvent, UnitHandle,
-    World, boxed_parameters, for_each_seed, seeds,
+    BoxedParameters, Call, LeaseWatch, LogEvent, MyFunctionList, NewUnit, Outcome, Peer, Ring, Service, UnitEvent,
+    UnitHandle, World, boxed_parameters, for_each_seed, seeds,
 };

@@ -37,7 +37,7 @@ mod state;
 mod tasks;
 
 pub use builder::NewUnit;
-pub use events::UnitEvent;
+pub use events::{LogEvent, UnitEvent};
 pub use functions::MyFunctionList;
 pub use handle::{Peer, UnitHandle};
 pub use keys::Ring;

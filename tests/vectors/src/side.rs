@@ -189,7 +189,7 @@ impl Side {
         }
     }
 
-    fn note(&mut self, event: &Event<'_>) {
+    fn note(&mut self, event: &Event) {
         self.events.push(told(event));
     }
 
@@ -252,7 +252,7 @@ pub(crate) enum How {
     BestEffort,
 }
 
-fn told(event: &Event<'_>) -> String {
+fn told(event: &Event) -> String {
     let text = format!("{event:?}");
     text.split(['(', ' ']).next().unwrap_or_default().to_owned()
 }

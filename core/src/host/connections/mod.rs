@@ -49,7 +49,7 @@ pub enum Incoming {
 }
 
 /// Where bytes that arrived lie, until the next call of [`Link::receive`].
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Place {
     store: Store,
     start: usize,
@@ -79,7 +79,7 @@ impl Place {
 }
 
 /// Which bytes a [`Place`] is in.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Store {
     /// Those that the port lent.
     Lent,

@@ -1,6 +1,5 @@
 //! Where a session meets the hub of its unit: the only place.
 
-use super::inbound::Outcome;
 use super::{Event, Phase, Remote, Session};
 use crate::distribution::connection_handler::{Admission, Directive};
 use crate::error::Refusal;
@@ -9,8 +8,8 @@ use crate::services::{Context, Port};
 
 impl<P: Port> Session<P> {
     /// The peer has said who it is, or has proven it: what becomes of the link?
-    pub(super) fn consult(&mut self, cx: &mut Context<'_, P>) -> Outcome {
-        let Some(remote) = &self.remote else { return Outcome::Nothing };
+    pub(super) fn consult(&mut self, cx: &mut Context<'_, P>) -> Option<Event> {
+        let Some(remote) = &self.remote else { return None };
         let (now, link, from, hello) = (cx.now, self.link.id(), self.peer_address, &remote.hello);
         let mut admission = Admission::Wait;
         cx.hub.enter(&mut |hub| admission = hub.node.admit(now, link, from, hello));
@@ -19,7 +18,7 @@ impl<P: Port> Session<P> {
             Admission::Refuse(refusal) => self.refuse(cx, refusal),
             Admission::Wait => {}
         }
-        Outcome::Nothing
+        None
     }
 
     /// The key of the pair, with which each end is to prove who it is. The link ends where there is none.
@@ -43,14 +42,10 @@ impl<P: Port> Session<P> {
     }
 
     /// Does what the hub wants of this link because of another one. What it comes too late for, it passes over.
-    pub fn direct(&mut self, cx: &mut Context<'_, P>, directive: Directive) -> Option<Event<'static>> {
+    pub fn direct(&mut self, cx: &mut Context<'_, P>, directive: Directive) -> Option<Event> {
         match directive {
             Directive::Challenge => self.challenge(cx),
-            Directive::Admit => {
-                if let Outcome::Event(event) = self.admitted(cx) {
-                    return Some(event);
-                }
-            }
+            Directive::Admit => return self.admitted(cx),
             Directive::Refuse(refusal) => self.refuse(cx, refusal),
             Directive::Close(reason) => self.close(cx, reason),
         }
@@ -58,16 +53,16 @@ impl<P: Port> Session<P> {
     }
 
     /// The hub has taken the peer, which is told what is published to it.
-    fn admitted(&mut self, cx: &mut Context<'_, P>) -> Outcome {
+    fn admitted(&mut self, cx: &mut Context<'_, P>) -> Option<Event> {
         if self.phase != Phase::Deciding {
-            return Outcome::Nothing;
+            return None;
         }
         self.accept(cx);
         if self.phase != Phase::Live {
-            return Outcome::Nothing;
+            return None;
         }
         self.publish(cx);
-        Event::Joined.into()
+        Some(Event::Joined)
     }
 
     /// Makes what the hub has published to the peer visible to it, as it is now and as far as the access table lets it be

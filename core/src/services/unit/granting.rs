@@ -1,6 +1,5 @@
 //! Leases that the peer's calls hold on functions of this unit.
 
-use super::inbound::Outcome;
 use super::timing::sent_at_earliest;
 use super::{Event, Session};
 use crate::config::LEASES;
@@ -144,22 +143,22 @@ impl<P: Port> Session<P> {
 
     /// The caller gave up a call: its lease ends now, as if it had expired. If it waits for its turn, or is still on its
     /// way, it does not begin.
-    pub(super) fn released(&mut self, cx: &mut Context<'_, P>, release: Release) -> Outcome {
+    pub(super) fn released(&mut self, cx: &mut Context<'_, P>, release: Release) -> Option<Event> {
         let Release { call, class } = release;
         self.calls.give_up(class, call);
         self.end_released(cx, |granted| granted.call == call)
     }
 
     /// The same for all calls of a function up to `id`.
-    pub(super) fn released_all(&mut self, cx: &mut Context<'_, P>, slot: Slot, id: u32) -> Outcome {
+    pub(super) fn released_all(&mut self, cx: &mut Context<'_, P>, slot: Slot, id: u32) -> Option<Event> {
         self.publishing.release(slot, id);
         self.end_released(cx, |granted| granted.slot == slot && granted.call <= id)
     }
 
-    fn end_released(&mut self, cx: &mut Context<'_, P>, is_released: impl Fn(&Granted) -> bool) -> Outcome {
+    fn end_released(&mut self, cx: &mut Context<'_, P>, is_released: impl Fn(&Granted) -> bool) -> Option<Event> {
         let index = self.granted.iter().position(is_released);
-        let Some(granted) = index.and_then(|index| take_at(&mut self.granted, index)) else { return Outcome::Nothing };
-        if expire_granted(cx, &granted) { Event::LeaseExpired(granted.slot).into() } else { Outcome::Nothing }
+        let granted = index.and_then(|index| take_at(&mut self.granted, index))?;
+        if expire_granted(cx, &granted) { Some(Event::LeaseExpired(granted.slot)) } else { None }
     }
 
     /// Ends a lease that is due; its function, whose hook is to run.

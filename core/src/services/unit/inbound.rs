@@ -18,19 +18,29 @@ use crate::host::frame::Frame;
 use crate::host::secure::{Secure, Unopened};
 use crate::services::calls::{CallHead, Seen};
 use crate::services::lease::Service;
-use crate::services::requests::CallId;
+use crate::services::requests::{CallId, Pending};
 use crate::services::{Context, Port};
 use crate::storage::LEFT_BY_WAITING;
 
 /// Result of [`Session::receive`].
-#[derive(Debug)]
-pub struct Receipt<'b> {
+#[derive(Clone, Copy, Debug)]
+pub struct Receipt {
     /// How many of the lent bytes are used up.
     pub consumed: usize,
     /// What they led to.
-    pub event: Option<Event<'b>>,
+    pub event: Option<Event>,
     /// The rest is to be offered again later: no message buffer is free, or the hub has not decided yet.
     pub paused: bool,
+}
+
+/// Where the results of a call lie until the session next receives; [`Session::results`] shows them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Results {
+    slot: Slot,
+    generation: Generation,
+    block: Place,
+    /// Refuses those of an earlier [`receive`](Session::receive), whose place may hold other bytes by now.
+    step: u32,
 }
 
 /// The results of a call, still in the buffer that they came in.
@@ -60,21 +70,6 @@ impl<'b> ReplyBlock<'b> {
 /// Longest block of an emergency, whose message has its header as well.
 const EMERGENCY_BLOCK_BYTES: u32 = (EMERGENCY_BYTES - REQUEST_BYTES) as u32;
 
-/// What a frame led to, before anything is borrowed for the port.
-// A wide tag: the rest is then moved in words, and not byte by byte.
-#[repr(u32)]
-pub(super) enum Outcome {
-    Nothing,
-    Event(Event<'static>),
-    Reply { id: CallId, slot: Slot, generation: Generation, block: Place },
-}
-
-impl From<Event<'static>> for Outcome {
-    fn from(event: Event<'static>) -> Self {
-        Self::Event(event)
-    }
-}
-
 impl<P: Port> Session<P> {
     /// Takes bytes that the port has read from the stream. Call it again with the rest, and finally with nothing, until
     /// it consumes nothing and returns no event.
@@ -82,12 +77,13 @@ impl<P: Port> Session<P> {
     /// The arguments of a call that may run at once are put into `arguments`; without them, or when more bytes follow
     /// that must be looked at first, the call waits for [`next_call`](Self::next_call). Nothing that follows comes before
     /// an emergency, and one alone has a place to wait: it begins at once.
-    pub fn receive<'b>(
-        &'b mut self,
+    pub fn receive(
+        &mut self,
         cx: &mut Context<'_, P>,
-        lent: &'b mut [u8],
+        lent: &mut [u8],
         arguments: Option<&mut ParametersView>,
-    ) -> Receipt<'b> {
+    ) -> Receipt {
+        self.step = self.step.wrapping_add(1);
         match self.phase {
             Phase::Ending(_) | Phase::Ended => return Receipt { consumed: lent.len(), event: None, paused: false },
             // What follows the hello is not looked at before the hub has decided: a request of a peer that is refused must not run.
@@ -115,8 +111,8 @@ impl<P: Port> Session<P> {
         // A call begins here only when nothing has arrived behind it; otherwise it waits its turn, so that an emergency further back
         // in the same bytes is reached first.
         let at_once = is_emergency || received.consumed == lent.len();
-        let outcome = self.digest(cx, incoming, lent, arguments.filter(|_| at_once));
-        Receipt { consumed: received.consumed, event: self.event(outcome, lent), paused: received.paused }
+        let event = self.digest(cx, incoming, lent, arguments.filter(|_| at_once));
+        Receipt { consumed: received.consumed, event, paused: received.paused }
     }
 
     /// Takes the body of a datagram that is [for the session](datagram::for_session) of this link, with the nonce that it names.
@@ -127,7 +123,7 @@ impl<P: Port> Session<P> {
         from: P::Endpoint,
         nonce: u64,
         body: &mut [u8],
-    ) -> Option<Event<'static>> {
+    ) -> Option<Event> {
         if self.phase != Phase::Live || nonce != self.local.nonce || !from.is_of_host(&self.peer_address) {
             self.link.counters.add(LinkCounter::DatagramsDropped, 1);
             return None;
@@ -143,22 +139,18 @@ impl<P: Port> Session<P> {
         self.link.counters.add(LinkCounter::DatagramsReceived, 1);
         self.liveness.heard_datagram(cx.now);
         self.datagram_opened(cx.now);
-        match self.session_body(cx, Place::lent(body.len()), body) {
-            Outcome::Event(event) => Some(event),
-            _ => None,
-        }
+        self.session_body(cx, Place::lent(body.len()), body)
     }
 
-    fn event<'b>(&'b self, outcome: Outcome, lent: &'b [u8]) -> Option<Event<'b>> {
-        match outcome {
-            Outcome::Nothing => None,
-            Outcome::Event(event) => Some(event),
-            Outcome::Reply { id, slot, generation, block } => {
-                let function = self.theirs.function(slot).filter(|function| function.generation == generation);
-                let block = function
-                    .map(|function| ReplyBlock { signature: function.signature, bytes: self.link.view(block, lent) });
-                Some(Event::Reply(id, block.ok_or(Error::ResultLost)))
+    /// The results that an [`Event::Reply`] names; `lent` is what was lent to the [`receive`](Self::receive) that returned it.
+    /// [`Error::ResultLost`] when the peer has replaced the function, or the session has received since then.
+    pub fn results<'b>(&'b self, results: &Results, lent: &'b [u8]) -> Result<ReplyBlock<'b>, Error> {
+        let function = self.theirs.function(results.slot).filter(|function| function.generation == results.generation);
+        match function {
+            Some(Function { signature, .. }) if results.step == self.step => {
+                Ok(ReplyBlock { signature, bytes: self.link.view(results.block, lent) })
             }
+            _ => Err(Error::ResultLost),
         }
     }
 
@@ -168,20 +160,20 @@ impl<P: Port> Session<P> {
         incoming: Incoming,
         lent: &[u8],
         arguments: Option<&mut ParametersView>,
-    ) -> Outcome {
+    ) -> Option<Event> {
         match (incoming, self.phase) {
             // In clear anyone on the path can end a link, so it counts as no verdict of the peer, and the search goes on.
             (Incoming::Refuse(_) | Incoming::Close(_), _) if !self.link.cipher().is_sealing() => {
                 self.ended_in_clear();
-                Outcome::Nothing
+                None
             }
             (Incoming::Refuse(code), _) => {
                 self.end(CloseReason::Refused(refusal(code)));
-                Outcome::Nothing
+                None
             }
             (Incoming::Close(code), _) => {
                 self.end(close_reason(code));
-                Outcome::Nothing
+                None
             }
             (Incoming::Hello(place), Phase::AwaitingHello { until }) => self.hello_arrived(cx, until, place, lent),
             (Incoming::Proof(place), Phase::Proving { .. }) => self.proof_arrived(cx, place, lent),
@@ -194,7 +186,7 @@ impl<P: Port> Session<P> {
             (Incoming::Ping, Phase::Live) => {
                 self.link.send_frame(&Frame::Pong);
                 self.flush(cx);
-                Outcome::Nothing
+                None
             }
             (Incoming::Pong, Phase::Live) => self.pong_arrived(cx),
             (Incoming::Session(place), Phase::Live) => self.session_body(cx, place, lent),
@@ -203,20 +195,20 @@ impl<P: Port> Session<P> {
             }
             _ => {
                 self.close(cx, CloseReason::Protocol);
-                Outcome::Nothing
+                None
             }
         }
     }
 
-    fn session_body(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8]) -> Outcome {
+    fn session_body(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8]) -> Option<Event> {
         match SessionBody::decode(self.link.view(place, lent)) {
             Some(SessionBody::KeepAlive { stamp }) => {
                 self.clock.hear(cx.now, stamp);
-                Outcome::Nothing
+                None
             }
             Some(SessionBody::Renew(renewal)) => {
                 self.renewed(cx, &renewal);
-                Outcome::Nothing
+                None
             }
             Some(SessionBody::Release(release)) => self.released(cx, release),
             Some(SessionBody::ReleaseAll(slot, id)) => self.released_all(cx, slot, id),
@@ -232,19 +224,19 @@ impl<P: Port> Session<P> {
             }
             Some(SessionBody::Ping) => {
                 self.send_datagram(cx, &SessionBody::PONG, &[]);
-                Outcome::Nothing
+                None
             }
             Some(SessionBody::Pong) => {
                 self.show_life(cx);
-                Outcome::Nothing
+                None
             }
             None => self.unreadable_datagram(),
         }
     }
 
-    fn unreadable_datagram(&mut self) -> Outcome {
+    fn unreadable_datagram(&mut self) -> Option<Event> {
         self.link.counters.add(LinkCounter::DatagramsDropped, 1);
-        Outcome::Nothing
+        None
     }
 
     fn message_arrived(
@@ -254,7 +246,7 @@ impl<P: Port> Session<P> {
         place: Place,
         lent: &[u8],
         arguments: Option<&mut ParametersView>,
-    ) -> Outcome {
+    ) -> Option<Event> {
         match Message::decode(self.link.view(place, lent)) {
             Some(Message::Request(header, _)) => {
                 self.request_arrived(cx, priority, &header, place.after(REQUEST_BYTES), lent, arguments)
@@ -265,36 +257,45 @@ impl<P: Port> Session<P> {
             }
             Some(Message::Failure(id, error)) => {
                 self.release_call(cx, CallId(id), None);
-                Event::Failed(CallId(id), error).into()
+                Some(Event::Failed(CallId(id), error))
             }
             // Decoded again there: what it borrows of the link would keep the link from sending.
             Some(Message::Control(_)) => self.control_arrived(cx, place, lent),
             None => {
                 self.close(cx, CloseReason::Protocol);
-                Outcome::Nothing
+                None
             }
         }
     }
 
-    fn reply_arrived(&mut self, cx: &mut Context<'_, P>, id: CallId, error: Option<Error>, block: Place) -> Outcome {
+    fn reply_arrived(
+        &mut self,
+        cx: &mut Context<'_, P>,
+        id: CallId,
+        error: Option<Error>,
+        block: Place,
+    ) -> Option<Event> {
         let Some(pending) = self.requests.close(id) else {
             // The call has ended already, by time-out or cancellation. Its lease was released then; results that come now change nothing.
             self.link.counters.add(LinkCounter::RepliesLate, 1);
-            return Outcome::Nothing;
+            return None;
         };
         match error {
             Some(error) => {
                 // The call failed at the peer, but a lease may have begun there before it did: it is not renewed any more.
                 self.release_call(cx, id, Some(pending));
-                Event::Reply(id, Err(error)).into()
+                Some(Event::Reply(id, Err(error)))
             }
-            None => Outcome::Reply { id, slot: pending.slot, generation: pending.generation, block },
+            None => {
+                let Pending { slot, generation, .. } = pending;
+                Some(Event::Reply(id, Ok(Results { slot, generation, block, step: self.step })))
+            }
         }
     }
 
-    fn control_arrived(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8]) -> Outcome {
+    fn control_arrived(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8]) -> Option<Event> {
         let Some(Message::Control(control)) = Message::decode(self.link.view(place, lent)) else {
-            return Outcome::Nothing;
+            return None;
         };
         match control {
             Control::Publish { slot, generation, attributes, signature } => {
@@ -311,20 +312,20 @@ impl<P: Port> Session<P> {
                     Err(Error::Full(_)) => self.link.counters.add(LinkCounter::FunctionsSkipped, 1),
                     Err(_) => self.close(cx, CloseReason::Protocol),
                 }
-                Outcome::Nothing
+                None
             }
             Control::Withdraw { slot } => {
                 self.theirs.remove(Slot(slot));
-                Outcome::Nothing
+                None
             }
             Control::ListEnd { serial } => {
                 self.publishing.acknowledge(serial);
                 self.pump(cx);
-                Event::ListChanged.into()
+                Some(Event::ListChanged)
             }
             Control::ListAck { serial, skipped } => {
                 self.publishing.was_acknowledged(serial);
-                Event::Acknowledged { serial, skipped }.into()
+                Some(Event::Acknowledged { serial, skipped })
             }
             Control::Limits { message_size, minimum_interval, calls } => {
                 if let Some(remote) = &mut self.remote {
@@ -332,12 +333,12 @@ impl<P: Port> Session<P> {
                     remote.hello.limits.minimum_interval = minimum_interval;
                     remote.hello.limits.calls = calls;
                 }
-                Outcome::Nothing
+                None
             }
-            Control::LeaseEnded { call, why } => match self.stop_renewing(CallId(call)) {
-                Some(held) => Event::LeaseEnded { call: held.call, slot: held.slot, why }.into(),
-                None => Outcome::Nothing,
-            },
+            Control::LeaseEnded { call, why } => {
+                let held = self.stop_renewing(CallId(call))?;
+                Some(Event::LeaseEnded { call: held.call, slot: held.slot, why })
+            }
         }
     }
 
@@ -349,13 +350,13 @@ impl<P: Port> Session<P> {
         block: Place,
         lent: &[u8],
         arguments: Option<&mut ParametersView>,
-    ) -> Outcome {
+    ) -> Option<Event> {
         self.link.counters.add(LinkCounter::RequestsReceived, 1);
         // First of all: a copy of a request must not even be refused, or its refusal could overtake the answer of the original.
         let seen = self.calls.note(priority, header.id);
         if seen == Seen::Before {
             self.link.counters.add(LinkCounter::RequestsRepeated, 1);
-            return Outcome::Nothing;
+            return None;
         }
         // Once for all that a request needs of it.
         let function = cx.functions.lookup(header.slot, header.generation);
@@ -376,11 +377,11 @@ impl<P: Port> Session<P> {
             }
         });
         match result {
-            Ok(Some(call)) => Event::Call(call).into(),
-            Ok(None) => Outcome::Nothing,
+            Ok(Some(call)) => Some(Event::Call(call)),
+            Ok(None) => None,
             Err(error) => {
                 self.refuse_request(cx, header.id, header.slot, priority, header.wants_reply, error);
-                Outcome::Nothing
+                None
             }
         }
     }

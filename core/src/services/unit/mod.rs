@@ -29,7 +29,7 @@ mod publishing;
 mod renewing;
 mod timing;
 
-pub use inbound::{Receipt, ReplyBlock};
+pub use inbound::{Receipt, ReplyBlock, Results};
 pub use lending::ListSlices;
 pub use outbound::{Delivery, RequestOptions};
 pub use publishing::Publication;
@@ -98,16 +98,16 @@ pub struct SessionStorage<S: Storage> {
 }
 
 /// What happened on a link.
-#[derive(Debug)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 // A wide tag: the rest is then moved in words, and not byte by byte.
 #[repr(u32)]
-pub enum Event<'b> {
+pub enum Event {
     /// Both ends have accepted each other: the link is live, and has told the peer what is published to it.
     Joined,
     /// A call whose arguments are in the lent parameters: run its handler, then [`Session::answer`].
     Call(Call),
-    /// The end of a call of this unit.
-    Reply(CallId, Result<ReplyBlock<'b>, Error>),
+    /// The end of a call of this unit; [`Session::results`] shows what it returned.
+    Reply(CallId, Result<Results, Error>),
     /// An asynchronous request was refused by the peer, or its service failed.
     Failed(CallId, Error),
     /// The peer's list of functions changed.
@@ -203,6 +203,8 @@ pub struct Session<P: Port> {
     ends: granting::Ends,
     held: heapless::Vec<Held, LEASES>,
     releases: holding::Releases,
+    /// How often something was received, by which [`Results`] are known to be the last ones.
+    step: u32,
 }
 
 impl<P: Port> Session<P> {
@@ -244,6 +246,7 @@ impl<P: Port> Session<P> {
             ends: granting::Ends::new(),
             held: heapless::Vec::new(),
             releases: holding::Releases::new(),
+            step: 0,
         }
     }
 

@@ -1,6 +1,5 @@
 //! Round trips of the protocol itself, with no function involved.
 
-use super::inbound::Outcome;
 use super::{Event, Phase, Session};
 use crate::error::{Error, Limit};
 use crate::host::frame::Frame;
@@ -85,9 +84,9 @@ impl<P: Port> Session<P> {
         accepted
     }
 
-    pub(super) fn pong_arrived(&mut self, cx: &mut Context<'_, P>) -> Outcome {
+    pub(super) fn pong_arrived(&mut self, cx: &mut Context<'_, P>) -> Option<Event> {
         self.show_life(cx);
-        if self.pings.answered(cx.now) { Event::Answered.into() } else { Outcome::Nothing }
+        if self.pings.answered(cx.now) { Some(Event::Answered) } else { None }
     }
 }
 

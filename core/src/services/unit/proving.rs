@@ -3,8 +3,7 @@
 //! Until the peer's first sealed frame has opened, what it says costs a bounded time and the link's own bytes, and reaches
 //! nobody: no limit, no clock and no decision of the node depends on it.
 
-use super::inbound::Outcome;
-use super::{Phase, Remote, Session};
+use super::{Event, Phase, Remote, Session};
 use crate::config::{MINIMUM_CHUNK_BYTES, Mode};
 use crate::distribution::hello::{Hello, HelloError};
 use crate::error::{CloseReason, Refusal};
@@ -35,14 +34,14 @@ impl<P: Port> Session<P> {
         until: Instant,
         place: Place,
         lent: &[u8],
-    ) -> Outcome {
+    ) -> Option<Event> {
         let mode = self.mode();
         let hello = match Hello::decode(self.link.view(place, lent), mode) {
             Ok(hello) => hello,
             Err(error) => {
                 self.link.counters.add(LinkCounter::FramesRefused, 1);
                 self.refuse(cx, refusal_of(error));
-                return Outcome::Nothing;
+                return None;
             }
         };
         self.link.introduce(place, lent);
@@ -55,14 +54,14 @@ impl<P: Port> Session<P> {
             self.send_hello(cx);
         }
         if !matches!(self.phase, Phase::AwaitingHello { .. }) {
-            return Outcome::Nothing;
+            return None;
         }
         self.prove(cx, until);
-        Outcome::Nothing
+        None
     }
 
     /// The peer's message of the proof. The end that dialled confirms at once that it has the keys.
-    pub(super) fn proof_arrived(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8]) -> Outcome {
+    pub(super) fn proof_arrived(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8]) -> Option<Event> {
         match self.link.answer(place, lent) {
             Ok(answer) => self.send_proof(cx, answer.as_ref().map(|answer| &answer[..])),
             Err(_) => self.fail(cx),
@@ -70,14 +69,14 @@ impl<P: Port> Session<P> {
         if self.dialed && matches!(self.phase, Phase::Proving { .. }) {
             self.send_confirmation(cx);
         }
-        Outcome::Nothing
+        None
     }
 
     /// The peer's first sealed frame has opened: it is who it says it is.
-    pub(super) fn confirmation_arrived(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8]) -> Outcome {
+    pub(super) fn confirmation_arrived(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8]) -> Option<Event> {
         if self.link.confirmed(place, lent).is_err() {
             self.fail(cx);
-            return Outcome::Nothing;
+            return None;
         }
         self.link.set_chunk_limit(usize::from(self.constraints.chunk_size).max(MINIMUM_CHUNK_BYTES));
         self.peer_known(cx)
@@ -104,8 +103,8 @@ impl<P: Port> Session<P> {
     }
 
     /// What the hello told counts from here on.
-    fn peer_known(&mut self, cx: &mut Context<'_, P>) -> Outcome {
-        let Some(Remote { hello, heard, .. }) = &self.remote else { return Outcome::Nothing };
+    fn peer_known(&mut self, cx: &mut Context<'_, P>) -> Option<Event> {
+        let Some(Remote { hello, heard, .. }) = &self.remote else { return None };
         self.link.set_peer_limits(usize::from(hello.limits.chunk_size));
         self.liveness = Liveness::new(cx.now, Duration::from_millis(u64::from(hello.keep_alive)));
         self.clock.hear(*heard, hello.stamp);

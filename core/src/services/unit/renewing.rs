@@ -13,8 +13,7 @@
 //! A turn is the last frame of its direction under the old keys, so each frame is opened with the keys that it was sealed
 //! with, however many are on their way. Only the end that dialled begins, so two renewals never meet.
 
-use super::Session;
-use super::inbound::Outcome;
+use super::{Event, Session};
 use crate::config::{HANDSHAKE_LIFE, Mode, PREVIOUS_KEY_LIFE, RENEWAL_TIMEOUT, SHORTEST_HANDSHAKE_LIFE};
 use crate::error::CloseReason;
 use crate::host::connections::{LinkCounter, Place};
@@ -152,7 +151,7 @@ impl<P: Port> Session<P> {
     }
 
     /// A proof frame on a live link: the peer's message, or its turn.
-    pub(super) fn proof_on_live(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8]) -> Outcome {
+    pub(super) fn proof_on_live(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8]) -> Option<Event> {
         let message = self.link.view(place, lent);
         let understood = match (message.first_chunk(), self.renewal.step) {
             (None, _) if message.is_empty() => self.link.cipher().turned(),
@@ -161,28 +160,28 @@ impl<P: Port> Session<P> {
             (Some(first), Step::Resting { due }) if cx.now >= due && !self.dialed && message.len() == PROOF_BYTES => {
                 let first = *first;
                 self.begin_renewal(cx, &first);
-                return Outcome::Nothing;
+                return None;
             }
             _ => Err(CloseReason::Protocol),
         };
         if let Err(reason) = understood {
             self.close(cx, reason);
         }
-        Outcome::Nothing
+        None
     }
 
-    fn answered_anew(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8]) -> Outcome {
+    fn answered_anew(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8]) -> Option<Event> {
         if self.link.answer(place, lent) != Ok(None) {
             self.fail(cx);
         }
-        Outcome::Nothing
+        None
     }
 
     /// A confirm frame on a live link: the first one under the peer's new keys, or what acknowledges this end's.
-    pub(super) fn confirmation_on_live(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8]) -> Outcome {
+    pub(super) fn confirmation_on_live(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8]) -> Option<Event> {
         let Step::Awaiting { until } = self.renewal.step else {
             self.close(cx, CloseReason::Protocol);
-            return Outcome::Nothing;
+            return None;
         };
         let understood = match self.link.view(place, lent).is_empty() {
             true if self.dialed => self.adopt_keys().map(|()| self.rest_until_renewal(cx.now)),
@@ -192,7 +191,7 @@ impl<P: Port> Session<P> {
         if let Err(reason) = understood {
             self.close(cx, reason);
         }
-        Outcome::Nothing
+        None
     }
 
     /// The peer has turned and confirmed. Its confirmation also says that it has that of an end that was dialled.

@@ -109,7 +109,7 @@ impl<P: Port> Session<P> {
     }
 
     /// Does what is due. Returns one event at a time; call it until it returns `None`.
-    pub fn poll(&mut self, cx: &mut Context<'_, P>) -> Option<Event<'static>> {
+    pub fn poll(&mut self, cx: &mut Context<'_, P>) -> Option<Event> {
         match self.phase {
             Phase::AwaitingHello { until } | Phase::Proving { until } => {
                 if cx.now < until {
@@ -124,7 +124,7 @@ impl<P: Port> Session<P> {
         }
     }
 
-    fn poll_live(&mut self, cx: &mut Context<'_, P>) -> Option<Event<'static>> {
+    fn poll_live(&mut self, cx: &mut Context<'_, P>) -> Option<Event> {
         // Leases come first: what moves must stop before anything else is done.
         if cx.now >= self.timers.lease
             && let Some(slot) = self.expire_lease(cx)
@@ -181,7 +181,7 @@ impl<P: Port> Session<P> {
     }
 
     /// Reports what ended with the link, one by one: leases first.
-    fn poll_ending(&mut self, cx: &mut Context<'_, P>, reason: CloseReason) -> Option<Event<'static>> {
+    fn poll_ending(&mut self, cx: &mut Context<'_, P>, reason: CloseReason) -> Option<Event> {
         while let Some(granted) = self.granted.pop() {
             if expire_granted(cx, &granted) {
                 return Some(Event::LeaseExpired(granted.slot));
@@ -192,6 +192,8 @@ impl<P: Port> Session<P> {
         }
         self.link.release(cx.buffers);
         self.calls.release(cx.buffers);
+        // Results that were not looked at were in a buffer that has gone back.
+        self.step = self.step.wrapping_add(1);
         self.phase = Phase::Ended;
         Some(Event::Closed(reason))
     }

@@ -2,10 +2,10 @@
 
 use cara_core::config::Priority;
 use cara_core::error::{Error, ServiceError};
+use cara_core::services::unit::Event;
 use cara_core::services::unit::RequestOptions;
 use cara_core::time::Duration;
 use cara_ethernet::{Fault, Faults};
-use cara_smoltcp::News;
 
 use crate::world::World;
 use crate::world::manager::number;
@@ -206,5 +206,5 @@ fn what_is_finished_is_not_made_safe() {
     world.run(SECOND.times(5));
     assert_eq!(world.vehicles[0].program.made_safe, []);
     assert!(!world.vehicles[0].lease.is_live(world.now));
-    assert!(!world.vehicles[0].program.news.iter().any(|(_, news)| matches!(news, News::Left(_))));
+    assert!(!world.vehicles[0].program.news.iter().any(|(_, news)| matches!(news, Event::Closed(_))));
 }

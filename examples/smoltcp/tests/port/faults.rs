@@ -1,9 +1,9 @@
 //! What the port survives: cables, managers and addresses that go and come, one direction that fails, a flood.
 
 use cara_core::error::CloseReason;
+use cara_core::services::unit::Event;
 use cara_core::time::Duration;
 use cara_ethernet::{Fault, Faults, Mac};
-use cara_smoltcp::News;
 use smoltcp::wire::Ipv4Cidr;
 use std::net::Ipv4Addr;
 
@@ -56,7 +56,7 @@ fn a_manager_that_is_gone_is_noticed_in_time_and_found_again() {
         let cable = world.power_cut();
         assert!(world.run_until(SECOND.times(10), |world| world.vehicles[0].left() == 1));
         let (left, news) = *world.vehicles[0].program.news.last().unwrap();
-        assert_eq!(news, News::Left(CloseReason::Silent));
+        assert_eq!(news, Event::Closed(CloseReason::Silent));
         let millis = left.since(gone).as_millis();
         assert!((2_500..=3_550).contains(&millis), "{millis} ms, seed {seed}");
         world.power_on(cable, seed + 100);
@@ -85,8 +85,8 @@ fn a_manager_that_restarts_at_once_resets_the_link() {
     let cable = world.power_cut();
     world.power_on(cable, 15);
     assert!(world.run_until(SECOND.times(10), |world| world.vehicles[0].left() == 1));
-    let left = world.vehicles[0].program.news.iter().find(|(_, news)| matches!(news, News::Left(_))).unwrap();
-    assert_eq!(left.1, News::Left(CloseReason::Reset));
+    let left = world.vehicles[0].program.news.iter().find(|(_, news)| matches!(news, Event::Closed(_))).unwrap();
+    assert_eq!(left.1, Event::Closed(CloseReason::Reset));
     // A question in the stream follows the first missed keep-alive. The new manager knows nothing of the stream, and is
     // asked twice, since it must find out first where to answer.
     assert!(left.0.since(gone).as_millis() <= 2_600, "{:?}", left.0.since(gone));

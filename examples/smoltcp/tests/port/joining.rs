@@ -1,15 +1,15 @@
 //! How a vehicle finds its manager, and finds it again.
 
 use crate::world::World;
+use cara_core::services::unit::Event;
 use cara_core::time::Duration;
 use cara_ethernet::Faults;
-use cara_smoltcp::News;
 
 #[test]
 fn a_vehicle_finds_its_manager_by_broadcast() {
     let mut world = World::new(1, 1, Faults::NONE);
     world.join();
-    assert_eq!(world.vehicles[0].program.news.iter().filter(|(_, news)| *news == News::Joined).count(), 1);
+    assert_eq!(world.vehicles[0].program.news.iter().filter(|(_, news)| *news == Event::Joined).count(), 1);
     let functions = world.vehicles[0].unit.their_function_list().unwrap().show_functions().to_string();
     assert_eq!(functions, "mechanic(number: int) -> (number: int)\n");
 }

@@ -341,7 +341,8 @@ impl LinuxNode {
         let receiver = lock(&self.receiver);
         let Some(receiver) = receiver.as_ref() else { return };
         let now = self.now();
-        lock(&self.events).extend(receiver.try_iter().filter_map(|event| Some((now, seen(event)?))));
+        lock(&self.events)
+            .extend(receiver.try_iter().filter_map(|event| Some((now, Seen::of(event, |up| !up.is_empty())?))));
     }
 
     fn peer(&self, name: &str) -> Result<Peer, Error> {
@@ -637,22 +638,6 @@ impl Node for Handle {
     fn number(&self) -> usize {
         self.number
     }
-}
-
-fn seen(event: UnitEvent) -> Option<Seen> {
-    Some(match event {
-        UnitEvent::Joined { peer } => Seen::Joined(peer),
-        UnitEvent::Left { peer, reason } => Seen::Left(peer, reason),
-        UnitEvent::NotJoined { reason, .. } => Seen::NotJoined(reason),
-        UnitEvent::ListChanged { peer } => Seen::ListChanged(peer),
-        UnitEvent::RequestFailed { call, error, .. } => Seen::Failed(call, error),
-        UnitEvent::LeaseExpired { function, .. } => Seen::LeaseExpired(function),
-        UnitEvent::LeaseEnded { function, why, .. } => Seen::LeaseEnded(function, why),
-        UnitEvent::NetworkChanged { up } => Seen::InterfaceChanged(!up.is_empty()),
-        UnitEvent::FunctionsSkipped { .. } => return None,
-        // A scenario that did not see it would pass for the wrong reason.
-        other => panic!("no scenario knows {other:?}"),
-    })
 }
 
 /// All units of all scenarios have keys: those that this one has not started are not missed.

@@ -513,7 +513,11 @@ impl Node for SimNode {
     }
 
     fn events(&self) -> Vec<(Instant, Seen)> {
-        self.handle.log().into_iter().filter_map(|(at, event)| Some((at, seen(event)?))).collect()
+        self.handle
+            .log()
+            .into_iter()
+            .filter_map(|(at, event)| Some((at, Seen::of(event.told()?.clone(), |up| *up)?)))
+            .collect()
     }
 
     fn manager_losses(&self) -> Vec<Instant> {
@@ -523,20 +527,4 @@ impl Node for SimNode {
     fn number(&self) -> usize {
         self.number
     }
-}
-
-fn seen(event: UnitEvent) -> Option<Seen> {
-    Some(match event {
-        UnitEvent::Joined { peer } => Seen::Joined(peer),
-        UnitEvent::Left { peer, reason } => Seen::Left(peer, reason),
-        UnitEvent::LinkEnded { reason } => Seen::NotJoined(reason),
-        UnitEvent::ListChanged { peer } => Seen::ListChanged(peer),
-        UnitEvent::Failed { id, error, .. } => Seen::Failed(id, error),
-        UnitEvent::LeaseExpired { function } => Seen::LeaseExpired(function),
-        UnitEvent::LeaseEnded { function, why, .. } => Seen::LeaseEnded(function, why),
-        UnitEvent::InterfaceChanged { up } => Seen::InterfaceChanged(up),
-        UnitEvent::Started | UnitEvent::Stopped | UnitEvent::Called { .. } => return None,
-        // A scenario that did not see it would pass for the wrong reason.
-        other => panic!("no scenario knows {other:?}"),
-    })
 }

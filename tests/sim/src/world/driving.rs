@@ -6,17 +6,18 @@ use std::rc::Rc;
 use cara_core::distribution::authenticator::Authenticator as _;
 use cara_core::distribution::connection_handler::{Command, NodeCounter};
 use cara_core::distribution::datagram;
-use cara_core::distribution::function_list::Slot;
+use cara_core::distribution::function_list::{Function, Slot};
 use cara_core::distribution::identity::Identity;
 use cara_core::error::{CloseReason, Error, Refusal};
 use cara_core::host::mailman::LinkId;
+use cara_core::services::unit::Event;
 
 use super::handle::UnitHandle;
 use super::links::{Happened, Link, Links};
 use super::service::{BoxedParameters, Call, Handler, LeaseWatch};
 use super::state::NODE_TIMER;
 use super::tasks::Owner;
-use super::{Inner, Shared, UnitEvent};
+use super::{Inner, LogEvent, Shared, UnitEvent};
 use crate::event::{HostId, NetEvent, StreamId};
 use crate::network::Network;
 
@@ -26,7 +27,7 @@ impl Inner {
         let unit = &mut self.units[host.index()];
         unit.boot(&mut self.network);
         let program = unit.settings.program.clone();
-        self.log(shared, host, UnitEvent::Started);
+        self.log(shared, host, LogEvent::Started);
         if let Some(program) = program {
             let handle = UnitHandle::new(Rc::downgrade(shared), host);
             self.urgent.push_back(Box::new(move || program(&handle)));
@@ -43,7 +44,7 @@ impl Inner {
                 unit.counters.merge(link.session.counters());
             }
             machine.links.abandon(Error::NotRunning);
-            self.log(shared, host, UnitEvent::Stopped);
+            self.log(shared, host, LogEvent::Stopped);
         }
     }
 
@@ -128,9 +129,10 @@ impl Inner {
             return self.resume(shared, host);
         }
         links.hub.node.datagram(self.network.now(), from, bytes, &links.keys.codes);
-        if links.hub.node.take_twin().is_some() {
+        if let Some(address) = links.hub.node.take_twin() {
+            let peer = Some(links.hub.node.identity().clone());
             let reason = CloseReason::Refused(Refusal::DuplicateIdentity);
-            self.log(shared, host, UnitEvent::LinkEnded { reason });
+            self.log(shared, host, UnitEvent::NotJoined { address, peer, reason });
         }
         self.work_node(shared, host);
     }
@@ -142,7 +144,7 @@ impl Inner {
         if up {
             machine.links.hub.node.network_changed(self.network.now());
         }
-        self.log(shared, host, UnitEvent::InterfaceChanged { up });
+        self.log(shared, host, UnitEvent::NetworkChanged { up });
         self.work_node(shared, host);
     }
 
@@ -184,23 +186,15 @@ impl Inner {
     }
 
     fn one_happened(&mut self, shared: &Rc<Shared>, host: HostId, index: u16, happened: Happened) {
-        let unit = &mut self.units[host.index()];
-        let Some(machine) = &mut unit.machine else { return };
-        let peer = machine.links.link(index).and_then(|link| link.peer.clone());
         match happened {
-            Happened::Joined => self.joined(shared, host, index),
-            Happened::Closed(reason) => self.closed(shared, host, index, reason),
-            Happened::Call(call, parameters) => self.serve(shared, host, index, &call, parameters),
-            Happened::LeaseExpired(slot) => self.lease_expired(shared, host, slot),
-            Happened::ListChanged => self.log_of(shared, host, peer, |peer| UnitEvent::ListChanged { peer }),
-            Happened::Failed(id, error) => {
-                self.log_of(shared, host, peer, |peer| UnitEvent::Failed { peer, id, error });
-            }
-            Happened::LeaseEnded { call, slot, why } => {
-                let theirs = machine.links.link(index).map(|link| link.session.their_function_list());
-                let function = theirs.and_then(|list| list.function(slot));
-                let function = function.map(|function| function.name().to_owned()).unwrap_or_default();
-                self.log_of(shared, host, peer, |peer| UnitEvent::LeaseEnded { peer, function, call, why });
+            (Event::Call(call), Some(parameters)) => self.serve(shared, host, index, &call, parameters),
+            (Event::Joined, _) => self.joined(shared, host, index),
+            (Event::Closed(reason), _) => self.closed(shared, host, index, reason),
+            (event, _) => {
+                if let Event::LeaseExpired(slot) = event {
+                    self.make_safe(shared, host, slot);
+                }
+                self.log_of(shared, host, index, event);
             }
         }
     }
@@ -243,9 +237,8 @@ impl Inner {
     fn joined(&mut self, shared: &Rc<Shared>, host: HostId, index: u16) {
         let Some(machine) = &mut self.units[host.index()].machine else { return };
         let Some(link) = machine.links.link_mut(index) else { return };
-        let Some(identity) = link.session.identity().cloned() else { return };
-        link.peer = Some(identity.clone());
-        self.log(shared, host, UnitEvent::Joined { peer: identity });
+        link.peer = link.session.identity().cloned();
+        self.log_of(shared, host, index, Event::Joined);
     }
 
     fn closed(&mut self, shared: &Rc<Shared>, host: HostId, index: u16, reason: CloseReason) {
@@ -254,17 +247,16 @@ impl Inner {
         let Some(machine) = &mut unit.machine else { return };
         let Some(link) = machine.links.remove(&mut self.network, index) else { return };
         unit.counters.merge(link.session.counters());
-        let peer = link.peer.clone();
+        let event = match &link.peer {
+            Some(peer) => UnitEvent::Left { peer: peer.clone(), reason },
+            None => {
+                let (address, peer) = (link.session.address(), link.session.identity().cloned());
+                UnitEvent::NotJoined { address, peer, reason }
+            }
+        };
         Link::abandon(link, Error::Interrupted);
         machine.links.hub.node.left(now, LinkId(index), reason);
-        self.log(
-            shared,
-            host,
-            match peer {
-                Some(peer) => UnitEvent::Left { peer, reason },
-                None => UnitEvent::LinkEnded { reason },
-            },
-        );
+        self.log(shared, host, event);
     }
 
     /// Starts the service of a call.
@@ -299,44 +291,48 @@ impl Inner {
             handle.answer(stream, ticket, outcome.map_err(Error::Service));
         };
         self.spawned.push((owner, Box::pin(job)));
-        self.log(shared, host, UnitEvent::Called { function: function.to_string(), caller });
+        self.log(shared, host, LogEvent::Called { function: function.to_string(), caller });
     }
 
     /// The safe hook runs before any other work of any unit.
-    fn lease_expired(&mut self, shared: &Rc<Shared>, host: HostId, slot: Slot) {
+    fn make_safe(&mut self, shared: &Rc<Shared>, host: HostId, slot: Slot) {
         let Some(machine) = &self.units[host.index()].machine else { return };
         let Some(function) = machine.links.functions.function(slot) else { return };
         let Handler(service) = function.handler;
-        let (service, function) = (Rc::clone(service), function.name().to_owned());
+        let service = Rc::clone(service);
         let handle = UnitHandle::new(Rc::downgrade(shared), host);
         self.urgent.push_front(Box::new(move || {
             if let Some(hook) = &service.safe_hook {
                 hook(&handle);
             }
         }));
-        self.log(shared, host, UnitEvent::LeaseExpired { function });
     }
 
-    fn log_of(
-        &mut self,
-        shared: &Rc<Shared>,
-        host: HostId,
-        peer: Option<Identity>,
-        event: impl FnOnce(Identity) -> UnitEvent,
-    ) {
-        if let Some(peer) = peer {
-            self.log(shared, host, event(peer));
+    /// Logs an event of a link whose peer has joined.
+    fn log_of(&mut self, shared: &Rc<Shared>, host: HostId, index: u16, event: Event) {
+        let Some(machine) = &self.units[host.index()].machine else { return };
+        let Some(link) = machine.links.link(index) else { return };
+        let Some(peer) = &link.peer else { return };
+        let own_name = |slot| name(machine.links.functions.function(slot));
+        let their_name = |slot| name(link.session.their_function_list().function(slot));
+        if let Some(event) = UnitEvent::of(event, peer, own_name, their_name) {
+            self.log(shared, host, event);
         }
     }
 
-    fn log(&mut self, shared: &Rc<Shared>, host: HostId, event: UnitEvent) {
+    fn log(&mut self, shared: &Rc<Shared>, host: HostId, event: impl Into<LogEvent>) {
+        let event = event.into();
         let now = self.network.now();
         self.network.note(host, event.words().as_bytes());
         let unit = &mut self.units[host.index()];
-        for hook in &unit.hooks {
+        for (hook, event) in unit.hooks.iter().filter_map(|hook| Some((hook, event.told()?))) {
             let (hook, event, handle) = (Rc::clone(hook), event.clone(), UnitHandle::new(Rc::downgrade(shared), host));
             self.urgent.push_back(Box::new(move || hook(&handle, &event)));
         }
         unit.log.push((now, event));
     }
+}
+
+fn name<H>(function: Option<Function<'_, H>>) -> String {
+    function.map_or_else(String::new, |function| function.name().to_owned())
 }

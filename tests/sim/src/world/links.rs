@@ -6,10 +6,9 @@ use cara_core::distribution::connection_handler::Directive;
 use cara_core::distribution::function_list::{FunctionList, Slot};
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::ParametersView;
-use cara_core::error::{CloseReason, Error};
+use cara_core::error::Error;
 use cara_core::services::access::Access;
 use cara_core::services::hub::Hub;
-use cara_core::services::lease::LeaseEnd;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::{Event, Session};
 use cara_core::services::{Context, Port, Ticket};
@@ -35,16 +34,8 @@ impl Port for Simulated {
 
 pub(super) type SimSession = Session<Simulated>;
 
-/// What a link led to that concerns more than the link.
-pub(super) enum Happened {
-    Joined,
-    Call(cara_core::services::unit::Call, BoxedParameters),
-    Failed(CallId, Error),
-    ListChanged,
-    LeaseExpired(Slot),
-    LeaseEnded { call: CallId, slot: Slot, why: LeaseEnd },
-    Closed(CloseReason),
-}
+/// What a link led to that concerns more than the link; with a call come its arguments.
+pub(super) type Happened = (Event, Option<BoxedParameters>);
 
 /// One link.
 pub(super) struct Link {
@@ -278,36 +269,43 @@ impl Links {
             hub: &mut self.hub,
             keys: &mut self.keys,
         };
-        let Link { session, unread, waiting, acknowledgements, paused, .. } = link;
+        let mut unread = std::mem::take(&mut link.unread);
         let (mut start, mut any) = (0, false);
         loop {
-            let receipt = session.receive(&mut cx, &mut unread[start..], Some(&mut self.arguments));
+            let lent = &mut unread[start..];
+            let receipt = link.session.receive(&mut cx, lent, Some(&mut self.arguments));
             let quiet = receipt.consumed == 0 && receipt.event.is_none();
             start += receipt.consumed;
-            *paused = receipt.paused;
+            link.paused = receipt.paused;
             any |= !quiet;
-            note(receipt.event, waiting, acknowledgements, &self.functions, &self.arguments, happened);
-            if quiet || *paused {
+            note(link, receipt.event, lent, &self.functions, &self.arguments, happened);
+            if quiet || link.paused {
                 break;
             }
         }
         unread.drain(..start);
+        link.unread = unread;
         any
     }
 
     fn begin_calls(&mut self, network: &mut Network, index: u16, happened: &mut Vec<Happened>) {
         let mut arguments = std::mem::replace(&mut self.arguments, super::service::boxed_parameters(0));
         while let Some(Some(call)) = self.with(network, index, |session, cx| session.next_call(cx, &mut arguments)) {
-            happened.push(Happened::Call(call, own(&self.functions, call.slot, &arguments)));
+            happened.push((Event::Call(call), Some(own(&self.functions, call.slot, &arguments))));
         }
         self.arguments = arguments;
     }
 
     fn poll(&mut self, network: &mut Network, index: u16, happened: &mut Vec<Happened>) {
         while let Some(Some(event)) = self.with(network, index, |session, cx| session.poll(cx)) {
-            let Some(link) = self.links.get_mut(usize::from(index)).and_then(Option::as_mut) else { return };
-            let Link { waiting, acknowledgements, .. } = link;
-            note(Some(event), waiting, acknowledgements, &self.functions, &self.arguments, happened);
+            self.note(index, Some(event), happened);
+        }
+    }
+
+    /// Notes an event that came of nothing that was lent.
+    fn note(&mut self, index: u16, event: Option<Event>, happened: &mut Vec<Happened>) {
+        if let Some(link) = self.links.get_mut(usize::from(index)).and_then(Option::as_mut) {
+            note(link, event, &[], &self.functions, &self.arguments, happened);
         }
     }
 
@@ -323,9 +321,7 @@ impl Links {
     pub(super) fn direct(&mut self, network: &mut Network, index: u16, directive: Directive) -> Vec<Happened> {
         let mut happened = Vec::new();
         if let Some(event) = self.with(network, index, |session, cx| session.direct(cx, directive)) {
-            let Some(link) = self.links.get_mut(usize::from(index)).and_then(Option::as_mut) else { return happened };
-            let Link { waiting, acknowledgements, .. } = link;
-            note(event, waiting, acknowledgements, &self.functions, &self.arguments, &mut happened);
+            self.note(index, event, &mut happened);
         }
         happened.extend(self.work(network, index));
         happened
@@ -342,9 +338,7 @@ impl Links {
     ) -> Vec<Happened> {
         let mut happened = Vec::new();
         if let Some(event) = self.with(network, index, |session, cx| session.datagram(cx, from, nonce, body)) {
-            let Some(link) = self.links.get_mut(usize::from(index)).and_then(Option::as_mut) else { return happened };
-            let Link { waiting, acknowledgements, .. } = link;
-            note(event, waiting, acknowledgements, &self.functions, &self.arguments, &mut happened);
+            self.note(index, event, &mut happened);
         }
         happened.extend(self.work(network, index));
         happened
@@ -408,39 +402,32 @@ fn own(functions: &FunctionList<Boxed, Handler>, slot: Slot, arguments: &Paramet
     parameters
 }
 
+/// Keeps what waits for the link alone, and leaves the rest to the unit. `lent` is what the event came of.
 fn note(
-    event: Option<Event<'_>>,
-    waiting: &mut BTreeMap<CallId, Waiting>,
-    acknowledgements: &mut Vec<(u32, Promise<bool>)>,
+    link: &mut Link,
+    event: Option<Event>,
+    lent: &[u8],
     functions: &FunctionList<Boxed, Handler>,
     arguments: &ParametersView,
     happened: &mut Vec<Happened>,
 ) {
-    happened.push(match event {
-        None => return,
-        Some(Event::Reply(id, result)) => {
-            if let Some(waiting) = waiting.remove(&id) {
-                waiting.finish(result);
+    match event {
+        None | Some(Event::Answered) => {}
+        Some(Event::Reply(id, outcome)) => {
+            if let Some(waiting) = link.waiting.remove(&id) {
+                waiting.finish(outcome.and_then(|results| link.session.results(&results, lent)));
             }
-            return;
         }
         Some(Event::Acknowledged { serial, .. }) => {
-            acknowledgements.retain(|(wanted, promise)| {
+            link.acknowledgements.retain(|(wanted, promise)| {
                 let reached = wanted.wrapping_sub(serial) as i32 <= 0;
                 if reached {
                     promise.keep(true);
                 }
                 !reached
             });
-            return;
         }
-        Some(Event::Call(call)) => Happened::Call(call, own(functions, call.slot, arguments)),
-        Some(Event::Joined) => Happened::Joined,
-        Some(Event::Answered) => return,
-        Some(Event::Failed(id, error)) => Happened::Failed(id, error),
-        Some(Event::ListChanged) => Happened::ListChanged,
-        Some(Event::LeaseExpired(slot)) => Happened::LeaseExpired(slot),
-        Some(Event::LeaseEnded { call, slot, why }) => Happened::LeaseEnded { call, slot, why },
-        Some(Event::Closed(reason)) => Happened::Closed(reason),
-    });
+        Some(event @ Event::Call(call)) => happened.push((event, Some(own(functions, call.slot, arguments)))),
+        Some(event) => happened.push((event, None)),
+    }
 }

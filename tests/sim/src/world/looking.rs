@@ -9,10 +9,10 @@ use cara_core::host::connections::LinkCounter;
 use cara_core::services::access::Access;
 use cara_core::time::Instant;
 
-use super::UnitEvent;
 use super::handle::UnitHandle;
 use super::links::SimSession;
 use super::state::UnitState;
+use super::{LogEvent, UnitEvent};
 
 impl UnitHandle {
     /// Its constraints.
@@ -84,16 +84,17 @@ impl UnitHandle {
     }
 
     /// Everything that happened to it, in all its lives.
-    pub fn log(&self) -> Vec<(Instant, UnitEvent)> {
+    pub fn log(&self) -> Vec<(Instant, LogEvent)> {
         self.with(|inner| inner.units[self.host().index()].log.clone())
     }
 
-    /// How many events of its log match.
+    /// How many of the events that its program was told match.
     pub fn count(&self, matches: impl Fn(&UnitEvent) -> bool) -> usize {
-        self.with(|inner| inner.units[self.host().index()].log.iter().filter(|(_, event)| matches(event)).count())
+        let matches = |(_, event): &&(_, LogEvent)| event.told().is_some_and(&matches);
+        self.with(|inner| inner.units[self.host().index()].log.iter().filter(matches).count())
     }
 
-    /// Runs at each event from now on, in all its lives.
+    /// Runs at each event that its program is told from now on, in all its lives.
     pub fn on_event(&self, hook: impl Fn(&Self, &UnitEvent) + 'static) {
         self.with(|inner| inner.units[self.host().index()].hooks.push(Rc::new(hook)));
     }

@@ -16,12 +16,12 @@ use cara_core::services::slots_for;
 use cara_core::services::unit::{Session, SessionConfig, SessionStorage, buffer_bytes};
 use cara_core::time::Instant;
 
-use super::UnitEvent;
 use super::handle::UnitHandle;
 use super::keys::{Given, Keys};
 use super::links::Links;
 use super::mail::{LazyPool, SimMailman};
 use super::service::boxed_parameters;
+use super::{LogEvent, UnitEvent};
 use crate::event::{HostId, StreamId};
 use crate::hub::hub;
 use crate::network::Network;
@@ -63,7 +63,7 @@ pub(super) struct UnitState {
     pub(super) settings: Settings,
     pub(super) life: u32,
     pub(super) machine: Option<Machine>,
-    pub(super) log: Vec<(Instant, UnitEvent)>,
+    pub(super) log: Vec<(Instant, LogEvent)>,
     pub(super) hooks: Vec<EventHook>,
     /// Of the links that have ended.
     pub(super) counters: LinkCounters,

@@ -67,7 +67,9 @@ fn a_manager_without_a_key_for_a_vehicle_says_so_to_its_operator_only() {
     let agv = world.s_unit("agv", 7).joins_at("depot", 1, address(&manager)).start();
     world.run_for(secs(20));
     assert!(manager.node_counted(NodeCounter::RefusedKey) > 0 && manager.counted(LinkCounter::KeysMissing) > 0);
-    let reasons = |unit: &UnitHandle, reason| unit.count(|event| *event == UnitEvent::LinkEnded { reason });
+    let reasons = |unit: &UnitHandle, reason| {
+        unit.count(|event| matches!(event, UnitEvent::NotJoined { reason: found, .. } if *found == reason))
+    };
     assert!(reasons(&agv, CloseReason::Unproven) > 0);
 }
 

@@ -80,7 +80,7 @@ fn ask(fleet: &mut Fleet, numbers: std::ops::Range<i64>) -> usize {
 
 /// What did not run was reported.
 fn reported(fleet: &Fleet) -> usize {
-    fleet.manager.count(|event| matches!(event, UnitEvent::Failed { .. }))
+    fleet.manager.count(|event| matches!(event, UnitEvent::RequestFailed { .. }))
 }
 
 #[test]

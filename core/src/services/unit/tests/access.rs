@@ -1,6 +1,7 @@
 //! What the access table lets a peer see, call and publish.
 
-use super::pair::{Happened, Pair};
+use super::super::Event;
+use super::pair::Pair;
 use super::setup::Setup;
 use super::side::Table;
 use super::{none, x};
@@ -104,7 +105,7 @@ fn an_asynchronous_request_is_refused_too_and_in_a_datagram_as_well() {
     let mut pair = under(table([row(MANAGER, &["go"], Verbs::LIST)]));
     let id = pair.manager.tell("go", &x(1)).unwrap();
     pair.run(Duration::from_millis(1));
-    assert!(pair.manager.has(&Happened::Failed(id, Error::NotAllowed)));
+    assert!(pair.manager.has(&Event::Failed(id, Error::NotAllowed)));
     let emergency = RequestOptions { priority: Some(Priority::Emergency), ..RequestOptions::default() };
     pair.manager.request_with("go", &x(1), &emergency, false).unwrap();
     pair.settle();
@@ -117,7 +118,7 @@ fn a_change_of_the_table_withdraws_and_tells() {
     let mut pair = under(table([row(MANAGER, &["pos_info"], Verbs::CALL)]));
     let serial = pair.agv.set_table(table([row(MANAGER, &["go"], Verbs::CALL)]));
     pair.settle();
-    assert!(pair.agv.has(&Happened::Acknowledged { serial, skipped: 0 }));
+    assert!(pair.agv.has(&Event::Acknowledged { serial, skipped: 0 }));
     assert_eq!(seen(&pair), ["go"]);
     let id = pair.manager.call("go", &x(1)).unwrap();
     pair.settle();
@@ -158,8 +159,8 @@ fn a_lease_ends_with_the_permission() {
     pair.agv.set_table(table([row(MANAGER, &["turn"], Verbs::CALL)]));
     assert!(!pair.agv.is_live(slots[0]), "at once");
     pair.settle();
-    assert!(pair.agv.has(&Happened::LeaseExpired(slots[0])));
-    assert!(pair.manager.has(&Happened::LeaseEnded(CallId(1), LeaseEnd::Expired)));
+    assert!(pair.agv.has(&Event::LeaseExpired(slots[0])));
+    assert!(pair.manager.is_told(CallId(1), LeaseEnd::Expired));
     pair.run(Duration::from_secs(2));
     assert!(!pair.agv.is_live(slots[0]) && pair.agv.is_live(slots[1]));
 }
@@ -173,7 +174,7 @@ fn what_a_peer_may_not_publish_is_not_seen() {
     let serial = pair.agv.publish();
     pair.settle();
     assert_eq!(seen(&pair), ["pos_info"]);
-    assert!(pair.agv.has(&Happened::Acknowledged { serial, skipped: 0 }), "there was room");
+    assert!(pair.agv.has(&Event::Acknowledged { serial, skipped: 0 }), "there was room");
     assert_eq!(pair.manager.counter(LinkCounter::FunctionsForbidden), 1);
     pair.manager.set_table(table([]));
     assert!(seen(&pair).is_empty(), "nor what it might before");

@@ -4,9 +4,9 @@ use std::boxed::Box;
 use std::vec;
 use std::vec::Vec;
 
-use super::super::{Call, RequestOptions};
+use super::super::{Call, Event, RequestOptions};
 use super::setup::{self, Handler, Run};
-use super::side::{Arguments, Begun, Happened, Side, Table, context};
+use super::side::{Arguments, Begun, Side, Table, context};
 use crate::config::{Constraints, Priority};
 use crate::distribution::connection_handler::Directive;
 use crate::distribution::function::Definition;
@@ -17,6 +17,7 @@ use crate::error::{CloseReason, Error, ServiceError};
 use crate::host::connections::LinkCounter;
 use crate::host::frame::{ChunkWriter, Cut};
 use crate::services::Context;
+use crate::services::lease::LeaseEnd;
 use crate::services::requests::CallId;
 use crate::storage::Buffers;
 use crate::time::Duration;
@@ -209,9 +210,9 @@ impl Side {
 
     /// What became of a call, once it has ended.
     pub(super) fn outcome(&self, id: CallId) -> Option<Result<&ParametersView, Error>> {
-        self.happened.iter().find_map(|happened| match happened {
-            Happened::Reply(known, result) if *known == id => {
-                Some(result.map(|()| self.results.get(&id).unwrap().as_view()))
+        self.happened.iter().find_map(|event| match event {
+            Event::Reply(known, result) if *known == id => {
+                Some(result.map(|_| self.results.get(&id).unwrap().as_view()))
             }
             _ => None,
         })
@@ -224,14 +225,19 @@ impl Side {
 
     /// The handlers that were begun, in order.
     pub(super) fn begun(&self) -> impl Iterator<Item = &Begun> {
-        self.happened.iter().filter_map(Happened::begun)
+        self.ran.iter()
     }
 
-    pub(super) fn count(&self, wanted: impl Fn(&Happened) -> bool) -> usize {
-        self.happened.iter().filter(|happened| wanted(happened)).count()
+    pub(super) fn count(&self, wanted: impl Fn(&Event) -> bool) -> usize {
+        self.happened.iter().filter(|event| wanted(event)).count()
     }
 
-    pub(super) fn has(&self, wanted: &Happened) -> bool {
+    pub(super) fn has(&self, wanted: &Event) -> bool {
         self.happened.contains(wanted)
+    }
+
+    /// It has been told that a lease of this call of it ended, and why.
+    pub(super) fn is_told(&self, wanted: CallId, reason: LeaseEnd) -> bool {
+        self.count(|event| matches!(*event, Event::LeaseEnded { call, why, .. } if (call, why) == (wanted, reason))) > 0
     }
 }

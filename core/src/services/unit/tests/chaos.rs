@@ -6,8 +6,9 @@ use std::vec::Vec;
 
 use proptest::prelude::*;
 
+use super::super::Event;
 use super::net::Datagrams;
-use super::pair::{Happened, Pair};
+use super::pair::Pair;
 use super::setup::Setup;
 use super::side::Side;
 use super::x;
@@ -154,7 +155,7 @@ fn check(caller: &Side, callee: &Side, calls: &BTreeMap<CallId, i64>) {
     }
     assert!(ran.values().all(|count| *count == 1), "something ran twice: {ran:?}");
     for (id, x) in calls {
-        let ends = caller.count(|happened| matches!(happened, Happened::Reply(known, _) if known == id));
+        let ends = caller.count(|event| matches!(event, Event::Reply(known, _) if *known == *id));
         assert_eq!(ends, 1, "call {id:?} ended {ends} times");
         match caller.outcome(*id).unwrap() {
             Ok(_) => assert!(ran.contains_key(x), "{id:?} was answered and never ran"),

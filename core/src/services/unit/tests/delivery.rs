@@ -3,8 +3,9 @@
 use std::vec;
 use std::vec::Vec;
 
+use super::super::Event;
 use super::net::Datagrams;
-use super::pair::{Happened, Pair};
+use super::pair::Pair;
 use super::setup::Setup;
 use super::{none, text, x};
 use crate::config::{EMERGENCY_BYTES, Priority, WINDOW};
@@ -76,7 +77,7 @@ fn what_a_frozen_link_held_back_is_not_run() {
     pair.settle();
     assert!(pair.agv.ran().is_empty());
     assert_eq!(pair.manager.outcome(call).unwrap().unwrap_err(), Error::TimedOut);
-    assert!(pair.manager.has(&Happened::Failed(told, Error::Expired)));
+    assert!(pair.manager.has(&Event::Failed(told, Error::Expired)));
     assert_eq!(pair.agv.counter(LinkCounter::RequestsExpired), 2);
 }
 
@@ -107,7 +108,7 @@ fn a_call_that_waited_too_long_for_its_turn_is_not_run() {
     pair.agv.answer_held(Ok(&*none()));
     pair.settle();
     assert_eq!(pair.agv.ran(), ["work"]);
-    assert!(pair.manager.has(&Happened::Failed(told, Error::Expired)));
+    assert!(pair.manager.has(&Event::Failed(told, Error::Expired)));
 }
 
 #[test]
@@ -124,7 +125,7 @@ fn what_falls_behind_the_window_is_stale() {
         pair.run(Duration::from_millis(1));
         pair.manager.net.frozen = false;
         pair.settle();
-        assert_eq!(pair.manager.has(&Happened::Failed(overtaken, Error::Stale)), stale);
+        assert_eq!(pair.manager.has(&Event::Failed(overtaken, Error::Stale)), stale);
         assert_eq!(pair.agv.ran().len() as u32, overtaking + u32::from(!stale));
     }
 }

@@ -2,8 +2,9 @@
 
 use std::vec::Vec;
 
+use super::super::Event;
 use super::super::Publication;
-use super::pair::{Happened, Pair};
+use super::pair::Pair;
 use super::setup::Setup;
 use super::side::Side;
 use super::{none, text, x};
@@ -26,9 +27,9 @@ fn leases_end_first_then_calls_then_the_link_each_once() {
     pair.settle();
     pair.agv.happened.clear();
     pair.cut();
-    let interrupted = calls.iter().map(|&id| Happened::Reply(id, Err(Error::Interrupted)));
-    let mut expected: Vec<Happened> = [Happened::LeaseExpired(slot)].into_iter().chain(interrupted).collect();
-    expected.push(Happened::Closed(CloseReason::Reset));
+    let interrupted = calls.iter().map(|&id| Event::Reply(id, Err(Error::Interrupted)));
+    let mut expected: Vec<Event> = [Event::LeaseExpired(slot)].into_iter().chain(interrupted).collect();
+    expected.push(Event::Closed(CloseReason::Reset));
     assert_eq!(pair.agv.happened, expected);
     assert!(!pair.agv.is_live(slot));
     pair.run(Duration::from_secs(20));
@@ -63,8 +64,8 @@ fn an_orderly_end_is_told_to_the_peer() {
     let mut pair = Pair::with_position();
     pair.manager.close(CloseReason::Stopped);
     pair.settle();
-    assert!(pair.manager.has(&Happened::Closed(CloseReason::Stopped)));
-    assert!(pair.agv.has(&Happened::Closed(CloseReason::Stopped)));
+    assert!(pair.manager.has(&Event::Closed(CloseReason::Stopped)));
+    assert!(pair.agv.has(&Event::Closed(CloseReason::Stopped)));
 }
 
 #[test]
@@ -76,8 +77,8 @@ fn a_peer_that_breaks_the_protocol_is_told_so() {
         let mut pair = Pair::live();
         pair.manager.hear(&bytes);
         pair.settle();
-        assert!(pair.manager.has(&Happened::Closed(CloseReason::Protocol)), "{bytes:?}");
-        assert!(pair.agv.has(&Happened::Closed(CloseReason::Protocol)), "{bytes:?}");
+        assert!(pair.manager.has(&Event::Closed(CloseReason::Protocol)), "{bytes:?}");
+        assert!(pair.agv.has(&Event::Closed(CloseReason::Protocol)), "{bytes:?}");
     }
 }
 
@@ -86,8 +87,8 @@ fn a_frame_above_the_told_limit_ends_the_link_with_that_reason() {
     let mut pair = Pair::live();
     pair.agv.hear(&[0xFF, 0xFF]);
     pair.settle();
-    assert!(pair.agv.has(&Happened::Closed(CloseReason::Oversize)));
-    assert!(pair.manager.has(&Happened::Closed(CloseReason::Oversize)));
+    assert!(pair.agv.has(&Event::Closed(CloseReason::Oversize)));
+    assert!(pair.manager.has(&Event::Closed(CloseReason::Oversize)));
 }
 
 #[test]
@@ -130,7 +131,7 @@ fn a_link_that_has_ended_does_and_keeps_nothing() {
     }
     pair.settle();
     assert!(pair.manager.net.writes.is_empty() && pair.agv.net.writes.is_empty());
-    assert_eq!(pair.manager.count(|happened| matches!(happened, Happened::Closed(_))), 1);
+    assert_eq!(pair.manager.count(|event| matches!(event, Event::Closed(_))), 1);
 }
 
 #[test]
@@ -152,6 +153,6 @@ fn a_link_that_was_never_live_ends_as_well() {
     pair.agv.hub.waits = true;
     pair.settle();
     pair.cut();
-    assert!(pair.agv.has(&Happened::Closed(CloseReason::Reset)));
-    assert!(pair.manager.has(&Happened::Closed(CloseReason::Reset)));
+    assert!(pair.agv.has(&Event::Closed(CloseReason::Reset)));
+    assert!(pair.manager.has(&Event::Closed(CloseReason::Reset)));
 }

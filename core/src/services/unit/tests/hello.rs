@@ -1,6 +1,7 @@
 //! How a link begins.
 
-use super::pair::{Happened, Pair};
+use super::super::Event;
+use super::pair::Pair;
 use super::setup::{self, Setup};
 use crate::config::HELLO_TIMEOUT;
 use crate::distribution::connection_handler::Directive;
@@ -14,8 +15,8 @@ fn both_ends_learn_who_the_other_is() {
     assert_eq!(pair.manager.session.identity(), Some(&Identity::s_unit("agv-01", 1).unwrap()));
     assert_eq!(pair.agv.session.identity(), Some(&Identity::m_unit("manager", 1).unwrap()));
     for side in [&pair.manager, &pair.agv] {
-        assert_eq!(side.happened.first(), Some(&Happened::Joined));
-        assert_eq!(side.count(|happened| *happened == Happened::Joined), 1);
+        assert_eq!(side.happened.first(), Some(&Event::Joined));
+        assert_eq!(side.count(|event| *event == Event::Joined), 1);
     }
 }
 
@@ -26,7 +27,7 @@ fn a_refusal_tells_the_reason_to_both() {
         let refuses = if side_refuses { &mut pair.manager } else { &mut pair.agv };
         refuses.hub.hub = setup::hub(!side_refuses, "another");
         pair.settle();
-        let closed = Happened::Closed(CloseReason::Refused(Refusal::WrongManager));
+        let closed = Event::Closed(CloseReason::Refused(Refusal::WrongManager));
         assert!(pair.manager.has(&closed), "{:?}", pair.manager.happened);
         assert!(pair.agv.has(&closed), "{:?}", pair.agv.happened);
     }
@@ -39,7 +40,7 @@ fn no_hello_in_time_ends_the_link() {
     pair.run(HELLO_TIMEOUT - Duration::from_micros(1));
     assert!(pair.manager.happened.is_empty());
     pair.run(Duration::from_micros(1));
-    assert_eq!(pair.manager.happened, [Happened::Closed(CloseReason::HelloTimeout)]);
+    assert_eq!(pair.manager.happened, [Event::Closed(CloseReason::HelloTimeout)]);
 }
 
 #[test]
@@ -50,7 +51,7 @@ fn another_version_is_told_to_both() {
     bytes[2 + 1 + 4] += 1;
     pair.manager.hear(&bytes);
     pair.settle();
-    let closed = Happened::Closed(CloseReason::Refused(Refusal::Version));
+    let closed = Event::Closed(CloseReason::Refused(Refusal::Version));
     for side in [&pair.manager, &pair.agv] {
         assert_eq!(side.happened, std::slice::from_ref(&closed));
     }
@@ -91,5 +92,5 @@ fn a_challenge_is_answered_once_and_only_on_a_live_link() {
     pair.manager.direct(Directive::Challenge);
     pair.settle();
     assert_eq!(entered(&pair), (before.0 + 1, before.1), "it is in the stream and in several datagrams");
-    assert!(!pair.manager.has(&Happened::Answered), "only a ping is told of");
+    assert!(!pair.manager.has(&Event::Answered), "only a ping is told of");
 }

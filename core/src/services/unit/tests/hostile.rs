@@ -196,7 +196,7 @@ fn a_function_list_that_no_unit_makes_ends_the_link() {
     let mut pair = Pair::live();
     pair.manager.hear_message(&control(&publish(0, 0, KNOWN[2])), Priority::High);
     pair.settle();
-    assert!(pair.manager.has(&super::pair::Happened::Closed(CloseReason::Protocol)));
+    assert!(pair.manager.has(&super::super::Event::Closed(CloseReason::Protocol)));
 }
 
 #[test]

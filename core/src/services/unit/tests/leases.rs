@@ -2,8 +2,9 @@
 
 use proptest::prelude::*;
 
+use super::super::Event;
 use super::net::Datagrams;
-use super::pair::{Happened, Pair};
+use super::pair::Pair;
 use super::setup::Setup;
 use super::{none, x};
 use crate::distribution::function_list::Slot;
@@ -29,12 +30,12 @@ fn moving(renew: bool) -> (Pair, Slot) {
 }
 
 fn expirations(pair: &Pair) -> usize {
-    pair.agv.count(|happened| matches!(happened, Happened::LeaseExpired(_)))
+    pair.agv.count(|event| matches!(event, Event::LeaseExpired(_)))
 }
 
 /// The manager has been told so of its first call.
 fn is_told(pair: &Pair, why: LeaseEnd) -> bool {
-    pair.manager.has(&Happened::LeaseEnded(CallId(1), why))
+    pair.manager.is_told(CallId(1), why)
 }
 
 #[test]
@@ -73,7 +74,7 @@ fn a_lease_that_is_not_renewed_expires_once_in_time() {
     pair.run(Duration::from_millis(2));
     assert!(!pair.agv.is_live(slot));
     pair.run(Duration::from_secs(2));
-    assert!(pair.agv.has(&Happened::LeaseExpired(slot)));
+    assert!(pair.agv.has(&Event::LeaseExpired(slot)));
     assert_eq!((expirations(&pair), pair.agv.counter(LinkCounter::LeasesExpired)), (1, 1));
 }
 
@@ -132,7 +133,7 @@ fn an_order_does_not_take_the_place_of_a_motion_that_an_interrupt_has_seen_dead(
     assert!(!pair.agv.is_live_behind(slot, LEASE));
     let early = pair.manager.tell("go", &none()).unwrap();
     pair.run(Duration::from_millis(1));
-    assert!(pair.manager.has(&Happened::Failed(early, Error::Busy)), "the hook comes first");
+    assert!(pair.manager.has(&Event::Failed(early, Error::Busy)), "the hook comes first");
     assert_eq!((expirations(&pair), pair.agv.is_live(slot)), (1, false));
     pair.manager.tell("go", &none()).unwrap();
     pair.run(Duration::from_millis(1));
@@ -253,7 +254,7 @@ fn a_request_older_than_its_lease_is_not_run() {
     pair.manager.net.frozen = false;
     pair.settle();
     assert!(pair.agv.ran().is_empty() && !pair.agv.is_live(slot));
-    assert!(pair.manager.has(&Happened::Failed(id, Error::Expired)));
+    assert!(pair.manager.has(&Event::Failed(id, Error::Expired)));
     assert_eq!(pair.agv.session.calls_held(), 0);
 }
 
@@ -283,8 +284,8 @@ fn a_motion_that_is_given_up_before_it_began_does_not_begin() {
     pair.agv.answer_held(Ok(&*none()));
     pair.settle();
     assert_eq!((pair.agv.ran().len(), pair.agv.is_live(slot)), (1, false));
-    assert!(pair.manager.has(&Happened::Failed(told, Error::Expired)));
-    assert!(pair.manager.has(&Happened::Failed(late, Error::Expired)));
+    assert!(pair.manager.has(&Event::Failed(told, Error::Expired)));
+    assert!(pair.manager.has(&Event::Failed(late, Error::Expired)));
     pair.manager.tell("go", &none()).unwrap();
     pair.run(Duration::from_millis(1));
     assert_eq!((pair.agv.ran().len(), pair.agv.is_live(slot)), (2, true));

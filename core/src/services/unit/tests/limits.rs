@@ -2,7 +2,8 @@
 
 use std::vec;
 
-use super::pair::{Happened, Pair};
+use super::super::Event;
+use super::pair::Pair;
 use super::setup::Setup;
 use super::{none, text, x};
 use crate::config::{Constraints, Priority};
@@ -51,7 +52,7 @@ fn an_emergency_above_its_limit_is_refused() {
         block.resize(block.len().next_multiple_of(8), 0);
         pair.agv.hear_request(&header, Priority::Emergency, &block);
         pair.settle();
-        let failed = outcome.map(|error| Happened::Failed(CallId(id), error));
+        let failed = outcome.map(|error| Event::Failed(CallId(id), error));
         assert!(failed.is_none_or(|failed| pair.manager.has(&failed)), "{:?}", pair.manager.happened);
         assert_eq!(pair.agv.ran().len(), 1, "the first one only");
     }
@@ -169,7 +170,7 @@ fn a_call_that_finds_no_buffer_to_wait_in_is_refused_without_one() {
     assert_eq!(pair.agv.counter(LinkCounter::RequestsBusy), 2);
     assert_eq!(pair.manager.outcome(last), None);
     assert_eq!(pair.manager.outcome(second).unwrap().unwrap_err(), Error::Busy);
-    assert!(pair.manager.has(&Happened::Failed(told, Error::Busy)));
+    assert!(pair.manager.has(&Event::Failed(told, Error::Busy)));
     assert_eq!(pair.agv.counter(LinkCounter::RepliesDropped), 0);
 }
 
@@ -213,8 +214,5 @@ fn refusals_without_a_buffer_are_bounded_and_leave_room_for_an_emergency() {
     pair.run(Duration::from_millis(5));
     pair.agv.give_buffers(others);
     assert!(pair.agv.outcome(stop).unwrap().is_ok());
-    assert_eq!(
-        pair.manager.count(|happened| matches!(happened, Happened::Failed(_, Error::Busy))) as u64,
-        39 - dropped
-    );
+    assert_eq!(pair.manager.count(|event| matches!(event, Event::Failed(_, Error::Busy))) as u64, 39 - dropped);
 }

@@ -1,6 +1,7 @@
 //! What a peer sees of one's functions.
 
-use super::pair::{Happened, Pair};
+use super::super::Event;
+use super::pair::Pair;
 use super::setup::Setup;
 use super::{none, x};
 use crate::error::Error;
@@ -15,8 +16,8 @@ fn what_is_published_is_visible_and_acknowledged() {
     assert!(pair.manager.session.their_function_list().is_empty(), "adding shows nothing");
     let serial = pair.agv.publish();
     pair.settle();
-    assert!(pair.manager.has(&Happened::ListChanged));
-    assert!(pair.agv.has(&Happened::Acknowledged { serial, skipped: 0 }));
+    assert!(pair.manager.has(&Event::ListChanged));
+    assert!(pair.agv.has(&Event::Acknowledged { serial, skipped: 0 }));
     let shown = pair.manager.session.their_function_list().show_functions();
     assert_eq!(std::format!("{shown}"), "pos_info() -> (position: int[2])\ngo_to(position: int[2])\n");
 }
@@ -41,7 +42,7 @@ fn what_is_withdrawn_is_gone_and_can_come_back() {
     let slot = pair.agv.functions.find("pos_info").unwrap();
     let serial = pair.agv.withdraw(slot);
     pair.settle();
-    assert!(pair.agv.has(&Happened::Acknowledged { serial, skipped: 0 }));
+    assert!(pair.agv.has(&Event::Acknowledged { serial, skipped: 0 }));
     assert_eq!(pair.manager.call("pos_info", &none()), Err(Error::UnknownFunction));
     pair.publish();
     assert!(pair.manager.call("pos_info", &none()).is_ok());
@@ -98,7 +99,7 @@ fn functions_beyond_the_readers_room_are_skipped_and_told() {
     pair.agv.offer("three()", |_| Ok(()));
     let serial = pair.agv.publish();
     pair.settle();
-    assert!(pair.agv.has(&Happened::Acknowledged { serial, skipped: 2 }));
+    assert!(pair.agv.has(&Event::Acknowledged { serial, skipped: 2 }));
     assert_eq!(pair.manager.counter(LinkCounter::FunctionsSkipped), 2);
 }
 
@@ -112,7 +113,7 @@ fn a_list_that_finds_no_room_goes_out_when_there_is_some() {
     let serial = pair.agv.publish();
     assert!(!pair.agv.session.their_function_list().is_empty() || pair.agv.counter(LinkCounter::SendRefused) > 0);
     pair.settle();
-    assert!(pair.agv.has(&Happened::Acknowledged { serial, skipped: 8 }));
+    assert!(pair.agv.has(&Event::Acknowledged { serial, skipped: 8 }));
 }
 
 #[test]
@@ -127,5 +128,5 @@ fn what_was_published_stays_so_in_a_longer_table() {
     assert!(pair.manager.outcome(id).unwrap().is_ok());
     let serial = pair.agv.publish();
     pair.settle();
-    assert!(pair.agv.has(&Happened::Acknowledged { serial, skipped: 0 }));
+    assert!(pair.agv.has(&Event::Acknowledged { serial, skipped: 0 }));
 }

@@ -1,7 +1,8 @@
 //! When a silent peer is given up, and when not.
 
+use super::super::Event;
 use super::net::Datagrams;
-use super::pair::{Happened, Pair};
+use super::pair::Pair;
 use super::setup::Setup;
 use crate::config::Constraints;
 use crate::error::CloseReason;
@@ -19,7 +20,7 @@ fn silence(mut pair: Pair) -> u64 {
         side.net.frozen = true;
         side.net.datagrams = Datagrams::Lost;
     }
-    let silent = Happened::Closed(CloseReason::Silent);
+    let silent = Event::Closed(CloseReason::Silent);
     for millis in (0..20_000).step_by(100) {
         if pair.manager.has(&silent) && pair.agv.has(&silent) {
             return millis;
@@ -57,7 +58,7 @@ fn datagrams_that_pass_in_one_direction_only_end_nothing() {
     pair.settle();
     pair.run(Duration::from_secs(60));
     assert!(pair.manager.session.is_live() && pair.agv.session.is_live(), "{:?}", pair.manager.happened);
-    assert!(!pair.manager.has(&Happened::Answered));
+    assert!(!pair.manager.has(&Event::Answered));
 }
 
 #[test]

@@ -1,8 +1,9 @@
 //! A lease belongs to one call: the failure of a call ends what it started, and nothing else.
 
+use super::super::Event;
 use super::super::{Call, RequestOptions};
 use super::net::Datagrams;
-use super::pair::{Happened, Pair};
+use super::pair::Pair;
 use super::{none, x};
 use crate::config::Priority;
 use crate::distribution::connection_handler::Directive;
@@ -44,11 +45,11 @@ fn begun(pair: &mut Pair, class: Priority) -> (CallId, Call) {
 }
 
 fn expirations(pair: &Pair) -> usize {
-    pair.agv.count(|happened| matches!(happened, Happened::LeaseExpired(_)))
+    pair.agv.count(|event| matches!(event, Event::LeaseExpired(_)))
 }
 
 fn is_told(pair: &Pair, call: CallId, why: LeaseEnd) -> bool {
-    pair.manager.has(&Happened::LeaseEnded(call, why))
+    pair.manager.is_told(call, why)
 }
 
 #[test]
@@ -326,7 +327,7 @@ fn a_new_call_never_takes_the_place_of_a_dead_lease_before_its_hook_has_run() {
         assert_eq!((pair.agv.ran().len(), expirations(&pair)), (1, 1), "with a word: {has_word}");
         assert!(!has_word || !pair.agv.is_live(slot));
         pair.settle();
-        assert!(pair.manager.has(&Happened::Failed(early, Error::Busy)));
+        assert!(pair.manager.has(&Event::Failed(early, Error::Busy)));
     }
 }
 

@@ -2,7 +2,6 @@
 
 use super::net::Net;
 use super::setup::Setup;
-pub(super) use super::side::Happened;
 use super::side::{Side, context};
 use crate::distribution::parameters::ParametersView;
 use crate::error::{CloseReason, Error};
@@ -142,7 +141,7 @@ impl Drop for Pair {
             side.end();
             assert!(side.session.is_ended());
             assert_eq!(side.pool.free(), side.buffers, "a buffer leaked");
-            let closed = side.count(|happened| matches!(happened, Happened::Closed(_)));
+            let closed = side.count(|event| matches!(event, super::super::Event::Closed(_)));
             assert!(closed <= 1, "closed {closed} times");
         }
     }

@@ -1,15 +1,19 @@
 //! Calls and their answers.
 
-use super::pair::{Happened, Pair};
+use super::super::Event;
+use super::pair::Pair;
 use super::setup::Setup;
+use super::side::context;
 use super::{none, parameters, text, x};
 use crate::config::{Constraints, EMERGENCY_BYTES, Priority};
 use crate::distribution::message::RequestHeader;
 use crate::distribution::parameters::Parameters;
 use crate::error::{Error, Limit, ServiceError};
 use crate::host::connections::LinkCounter;
+use crate::services::Context;
 use crate::services::unit::{Delivery, RequestOptions};
 use crate::time::Duration;
+use std::vec::Vec;
 
 #[test]
 fn a_request_updates_the_callers_parameters() {
@@ -43,6 +47,37 @@ fn a_link_counts_what_becomes_of_its_messages() {
     pair.settle();
     let counted = [LinkCounter::RequestsWithheld, LinkCounter::CallsTimedOut, LinkCounter::RepliesLate];
     assert_eq!(counted.map(|counter| count(&pair, counter)), [[1, 0]; 3]);
+}
+
+/// What is behind them may be other bytes by then.
+#[test]
+fn results_are_shown_until_the_session_receives_again_or_ends() {
+    for ends in [false, true] {
+        let mut pair = Pair::live();
+        pair.agv.offer("echo(text: string[20000]) -> (text: string[20000])", |_| Ok(()));
+        pair.publish();
+        pair.manager.call("echo", &text(20_000)).unwrap();
+        let (manager, mut lent) = (&mut pair.manager, Vec::new());
+        let results = loop {
+            pair.agv.inbox.extend(manager.net.deliver().0);
+            pair.agv.work(Vec::new());
+            lent.extend(pair.agv.net.deliver().0);
+            let receipt = manager.session.receive(context!(manager), &mut lent, None);
+            if let Some(Event::Reply(_, outcome)) = receipt.event {
+                break outcome.unwrap();
+            }
+            lent.drain(..receipt.consumed);
+            manager.session.writable(context!(manager));
+        };
+        let block = manager.session.results(&results, &lent).unwrap();
+        assert!(block.bytes().len() > 20_000);
+        if ends {
+            manager.end();
+        } else {
+            manager.session.receive(context!(manager), &mut [], None);
+        }
+        assert_eq!(manager.session.results(&results, &lent).err(), Some(Error::ResultLost));
+    }
 }
 
 #[test]
@@ -112,7 +147,7 @@ fn the_callee_checks_what_the_caller_should_have_checked() {
     pair.settle();
     assert!(pair.agv.ran().is_empty());
     assert_eq!(pair.agv.counter(LinkCounter::RequestsRejected), 3);
-    assert_eq!(pair.manager.count(|happened| matches!(happened, Happened::Failed(..))), 3);
+    assert_eq!(pair.manager.count(|event| matches!(event, Event::Failed(..))), 3);
 }
 
 #[test]
@@ -138,7 +173,7 @@ fn a_call_without_answer_times_out_and_its_late_answer_is_counted() {
     pair.agv.answer_held(Ok(&*none()));
     pair.settle();
     assert_eq!(pair.manager.counter(LinkCounter::RepliesLate), 1);
-    assert_eq!(pair.manager.count(|happened| matches!(happened, Happened::Reply(..))), 1);
+    assert_eq!(pair.manager.count(|event| matches!(event, Event::Reply(..))), 1);
 }
 
 #[test]
@@ -197,7 +232,7 @@ fn a_failing_service_says_why() {
     assert_eq!(pair.block_request("lie", &mut *x(5)), Err(Error::Service(ServiceError::BadResults)));
     let id = pair.manager.tell("fail", &none()).unwrap();
     pair.settle();
-    assert!(pair.manager.has(&Happened::Failed(id, Error::Service(ServiceError::Failed(7)))));
+    assert!(pair.manager.has(&Event::Failed(id, Error::Service(ServiceError::Failed(7)))));
 }
 
 #[test]

@@ -10,14 +10,13 @@ use super::super::{Call, Event, Session, SessionConfig};
 use super::net::{DATAGRAM_PORT, Net};
 use super::setup::{self, Handler, Run, Setup};
 use crate::config::Priority;
-use crate::distribution::function_list::{FunctionList, Slot};
+use crate::distribution::function_list::FunctionList;
 use crate::distribution::parameters::Parameters;
 use crate::error::{CloseReason, Error};
 use crate::host::mailman::LinkId;
 use crate::host::secure::Plain;
 use crate::services::access::{Access, Decision, Principal, Rule, Verb, decide};
 use crate::services::hub::{Door, Hub};
-use crate::services::lease::LeaseEnd;
 use crate::services::requests::CallId;
 use crate::services::{Context, Port};
 use crate::storage::{Boxed, Pool};
@@ -25,25 +24,6 @@ use crate::time::{Duration, Instant};
 
 /// Parameters that hold any message of these tests.
 pub(super) type Arguments = Box<Parameters<24_576>>;
-
-/// An event without what it borrows.
-#[derive(Clone, Debug, PartialEq)]
-pub(super) enum Happened {
-    Joined,
-    Reply(CallId, Result<(), Error>),
-    Failed(CallId, Error),
-    ListChanged,
-    Acknowledged {
-        serial: u32,
-        skipped: u16,
-    },
-    LeaseExpired(Slot),
-    LeaseEnded(CallId, LeaseEnd),
-    Answered,
-    Closed(CloseReason),
-    /// A handler was begun.
-    Ran(Begun),
-}
 
 /// A handler that was begun.
 #[derive(Clone, Debug, PartialEq)]
@@ -100,7 +80,9 @@ pub(super) struct Side {
     /// Who may do what here.
     pub(super) table: Option<Table>,
     pub(super) net: Net,
-    pub(super) happened: Vec<Happened>,
+    pub(super) happened: Vec<Event>,
+    /// Handlers that were begun.
+    pub(super) ran: Vec<Begun>,
     /// Calls that wait for an answer of the test.
     pub(super) held: Vec<Call>,
     pub(super) hub: Lobby,
@@ -151,6 +133,7 @@ impl Side {
             pool: setup::pool(setup.buffers, setup.buffer_size),
             net: Net::default(),
             happened: Vec::new(),
+            ran: Vec::new(),
             held: Vec::new(),
             hub: Lobby { hub: setup::hub(agv, "manager"), waits: false, entered: 0 },
             inbox: Vec::new(),
@@ -171,8 +154,8 @@ impl Side {
         }
         worked |= self.read();
         worked |= self.run_calls();
-        while let Some(event) = self.session.poll(context!(self)).map(own) {
-            self.note(Some(event));
+        while let Some(event) = self.session.poll(context!(self)) {
+            self.note(Some(event), &mut Arguments::default());
             worked = true;
         }
         for (call, result) in core::mem::take(&mut self.unanswered) {
@@ -185,8 +168,8 @@ impl Side {
 
     /// A datagram arrives from an address, which may be another one than the peer's.
     pub(super) fn hear_datagram_from(&mut self, from: SocketAddr, nonce: u64, mut body: Vec<u8>) {
-        let event = self.session.datagram(context!(self), from, nonce, &mut body).map(own);
-        self.note(event);
+        let event = self.session.datagram(context!(self), from, nonce, &mut body);
+        self.note(event, &mut Arguments::default());
         self.run_calls();
     }
 
@@ -196,27 +179,11 @@ impl Side {
         loop {
             let lent = &mut self.inbox;
             let receipt = self.session.receive(context!(self), lent, Some(&mut *arguments));
-            let (consumed, paused) = (receipt.consumed, receipt.paused);
-            let mut call = None;
-            let event = match receipt.event {
-                Some(Event::Call(begun)) => {
-                    call = Some(begun);
-                    None
-                }
-                Some(Event::Reply(id, Ok(block))) => {
-                    let results = self.results.get_mut(&id).unwrap();
-                    Some(Happened::Reply(id, block.read_into(results)))
-                }
-                event => event.map(own),
-            };
-            self.inbox.drain(..consumed);
-            let more = consumed > 0 || event.is_some() || call.is_some();
+            let more = receipt.consumed > 0 || receipt.event.is_some();
             worked |= more;
-            self.note(event);
-            if let Some(call) = call {
-                self.run(call, &mut arguments);
-            }
-            if paused || !more {
+            self.note(receipt.event, &mut arguments);
+            self.inbox.drain(..receipt.consumed);
+            if receipt.paused || !more {
                 return worked;
             }
         }
@@ -234,12 +201,12 @@ impl Side {
 
     fn run(&mut self, call: Call, arguments: &mut Arguments) {
         let function = self.functions.function(call.slot).unwrap();
-        self.happened.push(Happened::Ran(Begun {
+        self.ran.push(Begun {
             function: function.name().to_string(),
             priority: call.priority,
             received: self.received,
             x: arguments.variable("x").ok(),
-        }));
+        });
         match function.handler.run {
             Run::Held => self.held.push(call),
             Run::Now(run) => {
@@ -256,34 +223,24 @@ impl Side {
         }
     }
 
-    fn note(&mut self, event: Option<Happened>) {
-        let Some(event) = event else { return };
-        self.happened.push(event);
+    /// A call has its arguments in `arguments`, and results are in what has arrived.
+    fn note(&mut self, event: Option<Event>, arguments: &mut Arguments) {
+        match event {
+            None => {}
+            Some(Event::Call(call)) => self.run(call, arguments),
+            Some(Event::Reply(id, outcome)) => {
+                let outcome = outcome.and_then(|results| {
+                    let block = self.session.results(&results, &self.inbox)?;
+                    block.read_into(self.results.get_mut(&id).unwrap()).map(|()| results)
+                });
+                self.happened.push(Event::Reply(id, outcome));
+            }
+            Some(event) => self.happened.push(event),
+        }
     }
 
     pub(super) fn end(&mut self) {
         self.session.disconnected(CloseReason::Stopped);
         while self.session.poll(context!(self)).is_some() {}
-    }
-}
-
-impl Happened {
-    pub(super) fn begun(&self) -> Option<&Begun> {
-        if let Self::Ran(begun) = self { Some(begun) } else { None }
-    }
-}
-
-fn own(event: Event<'_>) -> Happened {
-    match event {
-        Event::Joined => Happened::Joined,
-        Event::Reply(id, Err(error)) => Happened::Reply(id, Err(error)),
-        Event::Failed(id, error) => Happened::Failed(id, error),
-        Event::ListChanged => Happened::ListChanged,
-        Event::Acknowledged { serial, skipped } => Happened::Acknowledged { serial, skipped },
-        Event::LeaseExpired(slot) => Happened::LeaseExpired(slot),
-        Event::LeaseEnded { call, why, .. } => Happened::LeaseEnded(call, why),
-        Event::Answered => Happened::Answered,
-        Event::Closed(reason) => Happened::Closed(reason),
-        Event::Call(_) | Event::Reply(_, Ok(_)) => panic!("only `read` gets what borrows"),
     }
 }

@@ -261,7 +261,7 @@ impl Manager {
                 && let Some(Some(session)) = self.sessions.get_mut(usize::from(link))
             {
                 let event = session.datagram(context!(self, now), from, nonce, body);
-                self.happened(now, usize::from(link), event);
+                self.happened(now, usize::from(link), event, &[]);
             } else {
                 self.hub.node.datagram(now, from, &bytes[..length], &Plain);
             }
@@ -274,7 +274,7 @@ impl Manager {
         while let Some(session) = &mut self.sessions[index]
             && let Some(call) = session.next_call(context!(self, now), &mut *self.arguments)
         {
-            self.happened(now, index, Some(Event::Call(call)));
+            self.happened(now, index, Some(Event::Call(call)), &[]);
         }
         self.poll_session(now, index);
     }
@@ -318,35 +318,20 @@ impl Manager {
         let length = come.len();
         lent[..length].copy_from_slice(come);
         let receipt = session.receive(context!(self, now), &mut lent[..length], Some(&mut *self.arguments));
-        let (consumed, moved) = (receipt.consumed, receipt.consumed > 0 || receipt.event.is_some());
-        let event = match receipt.event {
-            Some(Event::Reply(id, outcome)) => {
-                let outcome = outcome.and_then(|block| {
-                    let mut results = number(0);
-                    block.read_into(&mut results)?;
-                    results.variable::<[i64; 1]>("number").map(|[number]| number)
-                });
-                self.replies.push((index, id, outcome));
-                None
-            }
-            Some(Event::Joined) => Some(Event::Joined),
-            Some(Event::Call(call)) => Some(Event::Call(call)),
-            _ => None,
-        };
-        let _ = self.net.stream(index).recv(|bytes| (consumed.min(bytes.len()), ()));
-        self.happened(now, index, event);
-        moved
+        let _ = self.net.stream(index).recv(|bytes| (receipt.consumed.min(bytes.len()), ()));
+        self.happened(now, index, receipt.event, &lent);
+        receipt.consumed > 0 || receipt.event.is_some()
     }
 
     fn poll_session(&mut self, now: Instant, index: usize) {
         while let Some(session) = &mut self.sessions[index]
             && let Some(event) = session.poll(context!(self, now))
         {
-            self.happened(now, index, Some(event));
+            self.happened(now, index, Some(event), &[]);
         }
     }
 
-    fn happened(&mut self, now: Instant, index: usize, event: Option<Event<'static>>) {
+    fn happened(&mut self, now: Instant, index: usize, event: Option<Event>, lent: &[u8]) {
         match event {
             Some(Event::Joined) => self.live[index] = true,
             Some(Event::Call(call)) => {
@@ -355,8 +340,13 @@ impl Manager {
                 session.answer(context!(self, now), call.ticket, Ok(&*self.arguments)).unwrap();
             }
             Some(Event::Reply(id, outcome)) => {
-                let error = outcome.err().unwrap_or(Error::Malformed);
-                self.replies.push((index, id, Err(error)));
+                let Some(session) = &self.sessions[index] else { return };
+                let outcome = outcome.and_then(|places| {
+                    let mut results = number(0);
+                    session.results(&places, lent)?.read_into(&mut results)?;
+                    results.variable::<[i64; 1]>("number").map(|[number]| number)
+                });
+                self.replies.push((index, id, outcome));
             }
             Some(Event::Closed(reason)) => self.leave(now, index, reason),
             _ => {}
@@ -368,7 +358,7 @@ impl Manager {
         let index = usize::from(link.0);
         let Some(session) = &mut self.sessions[index] else { return };
         let event = session.direct(context!(self, now), directive);
-        self.happened(now, index, event);
+        self.happened(now, index, event, &[]);
         self.poll_session(now, index);
     }
 

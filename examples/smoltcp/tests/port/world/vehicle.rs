@@ -11,9 +11,9 @@ use cara_core::error::{Error, ServiceError};
 use cara_core::services::Ticket;
 use cara_core::services::lease::Lease;
 use cara_core::services::requests::CallId;
-use cara_core::services::unit::{Call, ReplyBlock};
+use cara_core::services::unit::{Call, Event, ReplyBlock};
 use cara_core::time::{Duration, Instant};
-use cara_smoltcp::{News, Program, Resources, SUnit, Served, Settings};
+use cara_smoltcp::{Program, Resources, SUnit, Served, Settings};
 
 use super::{Cable, SharedSwitch, manager};
 
@@ -45,7 +45,7 @@ pub(crate) struct Notes {
     pub(crate) made_safe: Vec<Instant>,
     /// What came first.
     pub(crate) order: Vec<&'static str>,
-    pub(crate) news: Vec<(Instant, News)>,
+    pub(crate) news: Vec<(Instant, Event)>,
     pub(crate) replies: Vec<(CallId, Result<i64, Error>)>,
     pub(crate) waiting: Option<Ticket>,
 }
@@ -90,8 +90,8 @@ impl Program for Notes {
         self.replies.push((call, outcome));
     }
 
-    fn hear(&mut self, news: News) {
-        self.news.push((self.now, news));
+    fn hear(&mut self, event: Event) {
+        self.news.push((self.now, event));
     }
 }
 
@@ -145,7 +145,7 @@ impl Vehicle {
 
     /// How often it was told that its link had ended.
     pub(crate) fn left(&self) -> usize {
-        self.program.news.iter().filter(|(_, news)| matches!(news, News::Left(_))).count()
+        self.program.news.iter().filter(|(_, news)| matches!(news, Event::Closed(_))).count()
     }
 }
 

@@ -15,7 +15,7 @@ use cara_core::services::lease::Lease;
 use cara_core::services::requests::CallId;
 use cara_core::services::unit::RequestOptions;
 use cara_core::time::Instant;
-use cara_embassy::{Config, Handle, Peer, UnitEvent};
+use cara_embassy::{Config, Handle, Peer};
 use cara_embassy_host::{Bench, Board, now, security};
 use embassy_time::with_timeout;
 
@@ -100,7 +100,7 @@ impl BoardNode {
         let events = Rc::clone(&self.events);
         board.spawn(async move {
             loop {
-                let seen = seen(unit.next_event().await);
+                let seen = Seen::of(unit.next_event().await, Option::is_some);
                 events.borrow_mut().extend(seen.map(|seen| (now(), seen)));
             }
         });
@@ -315,20 +315,4 @@ impl Node for Rc<BoardNode> {
     fn number(&self) -> usize {
         self.number
     }
-}
-
-fn seen(event: UnitEvent) -> Option<Seen> {
-    Some(match event {
-        UnitEvent::Joined { peer } => Seen::Joined(peer),
-        UnitEvent::Left { peer, reason } => Seen::Left(peer, reason),
-        UnitEvent::NotJoined { reason, .. } => Seen::NotJoined(reason),
-        UnitEvent::ListChanged { peer } => Seen::ListChanged(peer),
-        UnitEvent::RequestFailed { call, error, .. } => Seen::Failed(call, error),
-        UnitEvent::LeaseExpired { function, .. } => Seen::LeaseExpired(function.to_string()),
-        UnitEvent::LeaseEnded { function, why, .. } => Seen::LeaseEnded(function.to_string(), why),
-        UnitEvent::NetworkChanged { up } => Seen::InterfaceChanged(up.is_some()),
-        UnitEvent::FunctionsSkipped { .. } => return None,
-        // A scenario that did not see it would pass for the wrong reason.
-        other => panic!("no scenario knows {other:?}"),
-    })
 }
