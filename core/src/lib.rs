@@ -79,5 +79,5 @@ pub use distribution::parameters::{Parameters, ParametersView};
 pub use error::{Error, ServiceError};
 pub use host::mailman::Mailman;
 pub use services::hub::Hub;
-pub use services::unit::{Event, Session};
+pub use services::session::{Event, Session};
 pub use services::{Context, Port};

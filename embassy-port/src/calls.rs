@@ -5,7 +5,7 @@ use core::task::Poll;
 
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, Limit};
-use cara_core::services::unit::RequestOptions;
+use cara_core::services::session::RequestOptions;
 use cara_core::time::{Duration, Instant};
 
 use crate::handle::Handle;

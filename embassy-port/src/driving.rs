@@ -13,7 +13,7 @@ use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Refusal};
 use cara_core::host::mailman::LinkId;
 use cara_core::services::Context;
-use cara_core::services::unit::{Call, Event};
+use cara_core::services::session::{Call, Event};
 use cara_core::time::{Duration, Instant};
 use core::net::SocketAddrV4;
 use core::task::{Context as TaskContext, Poll};
@@ -121,7 +121,7 @@ impl<T> Machine<T> {
             return Some(event.map(|event| (link, event)));
         }
         self.hub.node.datagram(now(), from, bytes, self.proof.codes());
-        if let Some(address) = self.hub.node.take_twin() {
+        if let Some(address) = self.hub.node.take_duplicate() {
             let peer = Some(self.hub.node.identity().clone());
             let reason = CloseReason::Refused(Refusal::DuplicateIdentity);
             self.tell(UnitEvent::NotJoined { address, peer, reason });

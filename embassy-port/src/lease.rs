@@ -5,7 +5,7 @@ use core::future::poll_fn;
 use core::task::Poll;
 
 use cara_core::services::lease::{Lease, Order};
-use cara_core::services::unit::Call;
+use cara_core::services::session::Call;
 
 use crate::handle::Handle;
 use crate::time::now;

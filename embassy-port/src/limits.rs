@@ -3,7 +3,7 @@
 use cara_core::config::{CHUNK_BYTES, Constraints, LONGEST_KEEP_ALIVE, MINIMUM_CHUNK_BYTES, SHORTEST_KEEP_ALIVE};
 use cara_core::error::{Constraint, Error};
 use cara_core::host::secure::DATAGRAM_OVERHEAD;
-use cara_core::services::unit::buffer_bytes;
+use cara_core::services::session::buffer_bytes;
 
 use crate::security::OVERHEAD;
 

@@ -7,7 +7,7 @@ use cara_core::distribution::identity::{Identity, Role};
 use cara_core::host::connections::LinkCounter;
 use cara_core::host::mailman::LinkId;
 use cara_core::services::hub::Hub;
-use cara_core::services::unit::{Session, SessionConfig, SessionStorage};
+use cara_core::services::session::{Session, SessionConfig, SessionStorage};
 use cara_core::services::{Context, Port};
 use cara_core::storage::{Lent, Pool};
 use cara_core::time::{Duration, Instant};

@@ -8,7 +8,7 @@ use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 use cara_core::host::connections::LinkCounter;
 use cara_core::services::requests::CallId;
-use cara_core::services::unit::RequestOptions;
+use cara_core::services::session::RequestOptions;
 
 use crate::handle::Handle;
 use crate::machine::LinkSession;

@@ -10,7 +10,7 @@ use cara_core::distribution::function_list::{Generation, Slot};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 use cara_core::services::requests::CallId;
-use cara_core::services::unit::Event;
+use cara_core::services::session::Event;
 use cara_core::time::Instant;
 
 use crate::line::copy;

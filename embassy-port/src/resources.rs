@@ -15,7 +15,7 @@ use cara_core::services::CallHead;
 use cara_core::services::hub::Hub;
 use cara_core::services::publications::{Publications, PublishedToOne};
 use cara_core::services::requests::Pending;
-use cara_core::services::unit::{Publication, SessionStorage};
+use cara_core::services::session::{Publication, SessionStorage};
 use cara_core::storage::Pool;
 use cara_core::time::Instant;
 use embassy_net::Stack;

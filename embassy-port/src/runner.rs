@@ -8,7 +8,7 @@ use core::task::{Context, Poll};
 
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
-use cara_core::services::unit::Call as CoreCall;
+use cara_core::services::session::Call as CoreCall;
 use cara_core::time::Instant;
 
 use crate::driving::{Begun, Job};

@@ -5,7 +5,7 @@ use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, ServiceError};
-use cara_core::services::unit::Call as CoreCall;
+use cara_core::services::session::Call as CoreCall;
 use cara_core::services::{Context, Ticket};
 use cara_core::time::{Duration, Instant};
 use core::fmt;

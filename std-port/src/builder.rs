@@ -293,7 +293,7 @@ impl<T: Send + 'static, R> Builder<T, R> {
             constraints: self.constraints,
             seed: random(),
         };
-        let mut node = Node::new(threads.crew().clock.now(), config, node_storage(nodes, maximum_links));
+        let mut node = Node::new(threads.thread_pool().clock.now(), config, node_storage(nodes, maximum_links));
         if let Some(m_units) = self.m_units {
             node.choose(m_units);
         }

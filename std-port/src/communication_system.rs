@@ -13,7 +13,7 @@ use cara_core::error::Error;
 #[cfg(feature = "control")]
 use cara_core::services::access::Verb;
 use cara_core::services::requests::CallId;
-use cara_core::services::unit::RequestOptions;
+use cara_core::services::session::RequestOptions;
 use cara_core::time::Duration;
 use core::net::IpAddr;
 

@@ -11,7 +11,7 @@ use cara_core::error::{Error, ServiceError};
 use cara_core::services::lease::{Lease, Order, Service};
 use cara_core::time::{Duration, Instant};
 
-use crate::lane::Lane;
+use crate::executor::Executor;
 use crate::lease::{LeaseEnded, LeaseWatch, ServiceLease};
 use crate::safe_hook::SafeHook;
 
@@ -76,7 +76,7 @@ pub(crate) struct Handler<T> {
     pub(crate) lease: Option<Arc<ServiceLease>>,
     pub(crate) safe: Option<Arc<SafeHook>>,
     /// Where its emergencies run, if it is a service for those.
-    pub(crate) lane: Option<Arc<Lane>>,
+    pub(crate) executor: Option<Arc<Executor>>,
 }
 
 impl<T: 'static> Service for Handler<T> {

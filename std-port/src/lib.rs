@@ -29,13 +29,13 @@ pub mod control;
 mod engine;
 mod error;
 mod event;
+mod executor;
 mod file_name;
 #[cfg(feature = "async")]
 mod future;
 mod handle;
 mod handler;
 pub mod keys;
-mod lane;
 mod lease;
 mod locks;
 #[cfg(feature = "metrics")]
@@ -70,7 +70,7 @@ pub use cara_core::error::{Cause, CloseReason, Error, Limit, Refusal, ServiceErr
 pub use cara_core::host::connections::LinkCounter;
 pub use cara_core::services::lease::LeaseEnd;
 pub use cara_core::services::requests::CallId;
-pub use cara_core::services::unit::{Delivery, RequestOptions};
+pub use cara_core::services::session::{Delivery, RequestOptions};
 pub use cara_core::time::Duration;
 pub use communication_system::{CommunicationSystem, WeakSystem};
 pub use config::Capacities;

@@ -10,8 +10,8 @@ use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 
 use crate::engine::{Engine, arena_bytes};
+use crate::executor::Executor;
 use crate::handler::{Handler, IntoHandler, ServiceOptions};
-use crate::lane::Lane;
 use crate::lease::{LeaseWatch, ServiceLease};
 use crate::safe_hook::{Parts, SafeHook};
 use crate::storage::Boxed;
@@ -118,10 +118,10 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
         if is_emergency && run.takes_state() {
             return Err(Error::EmergencyWaits);
         }
-        let lane = if is_emergency { Some(Arc::new(Lane::start("cara-emergency")?)) } else { None };
+        let executor = if is_emergency { Some(Arc::new(Executor::start("cara-emergency")?)) } else { None };
         let safe = self.safe_hook(&options, &lease)?;
         let kept = attributes.lease.map(|_| lease.clone());
-        let handler = Handler { run, lease: kept, safe, lane };
+        let handler = Handler { run, lease: kept, safe, executor };
         put(&mut self.engine.functions_mut(), definition, attributes, handler)?;
         Ok(LeaseWatch::new(lease, None, self.engine.clock()))
     }

@@ -17,7 +17,7 @@ use cara_core::services::lease::{Lease, Order};
 use cara_core::time::{Duration, Instant};
 
 use crate::clock::Clock;
-use crate::lane::OwnThread;
+use crate::executor::OwnThread;
 use crate::lease::ServiceLease;
 use crate::locks::lock;
 

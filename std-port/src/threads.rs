@@ -15,7 +15,7 @@ use cara_core::time::{Duration, Instant};
 use crate::clock::Clock;
 use crate::engine::worker::Worker;
 use crate::error::system_refused;
-use crate::lane::Lane;
+use crate::executor::Executor;
 use crate::locks::{lock, read, write};
 use crate::occupancy::Occupancy;
 use crate::sys::alarm::Alarm;
@@ -67,18 +67,18 @@ pub struct Threads {
 
 impl std::fmt::Debug for Threads {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Threads").field("running", &lock(&self.owner.crew.threads).len()).finish()
+        f.debug_struct("Threads").field("running", &lock(&self.owner.thread_pool.threads).len()).finish()
     }
 }
 
 /// Ends the threads when the last unit and the last handle are gone.
 struct Owner {
-    crew: Arc<Crew>,
+    thread_pool: Arc<ThreadPool>,
 }
 
 impl Drop for Owner {
     fn drop(&mut self) {
-        self.crew.stop();
+        self.thread_pool.stop();
     }
 }
 
@@ -94,11 +94,13 @@ impl Threads {
 
     /// Threads for one unit.
     pub(crate) fn of_one() -> Result<Self, Error> {
-        Crew::new().map(|crew| Self { owner: Arc::new(Owner { crew: Arc::new(crew) }) }).map_err(system_refused)
+        ThreadPool::new()
+            .map(|thread_pool| Self { owner: Arc::new(Owner { thread_pool: Arc::new(thread_pool) }) })
+            .map_err(system_refused)
     }
 
-    pub(crate) fn crew(&self) -> &Arc<Crew> {
-        &self.owner.crew
+    pub(crate) fn thread_pool(&self) -> &Arc<ThreadPool> {
+        &self.owner.thread_pool
     }
 }
 
@@ -144,26 +146,26 @@ impl Source {
 }
 
 /// A unit among those that the threads drive.
-struct Seat {
+struct DrivenUnit {
     driven: Arc<dyn Driven>,
     /// Held for reading by each thread that is inside the unit; stopping the unit waits for them.
     gate: RwLock<()>,
 }
 
 thread_local! {
-    /// The address of the crew whose clock this thread is.
+    /// The address of the thread pool whose clock this thread is.
     static CLOCK_OF: Cell<usize> = const { Cell::new(0) };
 }
 
 /// The threads themselves and what they share.
-pub(crate) struct Crew {
+pub(crate) struct ThreadPool {
     pub(crate) clock: Clock,
     /// The links of all units.
     pub(crate) epoll: Epoll,
     clock_epoll: Epoll,
     clock_waker: Waker,
     pool_waker: Waker,
-    seats: RwLock<Vec<Option<Arc<Seat>>>>,
+    units: RwLock<Vec<Option<Arc<DrivenUnit>>>>,
     /// When each unit's time has come.
     due: Mutex<Timers>,
     /// Wakes the clock for the first of them; set under the lock of `due`.
@@ -183,20 +185,20 @@ pub(crate) struct Crew {
     /// When files and interfaces are looked at next, for each unit.
     looks: (Mutex<Timers>, Condvar),
     /// Where emergencies run that are for no emergency service.
-    lane: OnceLock<Arc<Lane>>,
+    executor: OnceLock<Arc<Executor>>,
     stopping: AtomicBool,
 }
 
 /// A unit's number and what the event is about, as an epoll set carries it.
-pub(crate) const fn token(seat: u16, what: u64) -> u64 {
-    ((seat as u64) << UNIT_SHIFT) | (what & ((1 << UNIT_SHIFT) - 1))
+pub(crate) const fn token(unit_number: u16, what: u64) -> u64 {
+    ((unit_number as u64) << UNIT_SHIFT) | (what & ((1 << UNIT_SHIFT) - 1))
 }
 
-const fn seat_of(token: u64) -> u16 {
+const fn unit_of(token: u64) -> u16 {
     (token >> UNIT_SHIFT) as u16
 }
 
-impl Crew {
+impl ThreadPool {
     fn new() -> std::io::Result<Self> {
         let (epoll, clock_epoll, pool_waker, clock_waker) =
             (Epoll::new()?, Epoll::new()?, Waker::new()?, Waker::new()?);
@@ -210,7 +212,7 @@ impl Crew {
             clock_epoll,
             clock_waker,
             pool_waker,
-            seats: RwLock::new(Vec::new()),
+            units: RwLock::new(Vec::new()),
             due: Mutex::new(Timers::new()),
             alarm,
             watched: AtomicUsize::new(0),
@@ -222,27 +224,27 @@ impl Crew {
             started: OnceLock::new(),
             threads: Mutex::new(Vec::new()),
             looks: (Mutex::new(Timers::new()), Condvar::new()),
-            lane: OnceLock::new(),
+            executor: OnceLock::new(),
             stopping: AtomicBool::new(false),
         })
     }
 
     /// Gives a unit its number. Nothing happens to it before its sockets are watched and its clock is woken.
-    pub(crate) fn seat(&self, driven: Arc<dyn Driven>) -> Result<u16, Error> {
-        let mut seats = write(&self.seats);
-        let free = seats.iter().position(Option::is_none).unwrap_or(seats.len());
+    pub(crate) fn register(&self, driven: Arc<dyn Driven>) -> Result<u16, Error> {
+        let mut units = write(&self.units);
+        let free = units.iter().position(Option::is_none).unwrap_or(units.len());
         let number = u16::try_from(free).ok().filter(|number| *number < u16::MAX).ok_or(Error::BadConstraint)?;
-        let seat = Some(Arc::new(Seat { driven, gate: RwLock::new(()) }));
-        match seats.get_mut(free) {
-            Some(place) => *place = seat,
-            None => seats.push(seat),
+        let unit_number = Some(Arc::new(DrivenUnit { driven, gate: RwLock::new(()) }));
+        match units.get_mut(free) {
+            Some(place) => *place = unit_number,
+            None => units.push(unit_number),
         }
         Ok(number)
     }
 
     /// Watches one of the unit's sockets.
-    pub(crate) fn watch(&self, seat: u16, source: Source, fd: impl std::os::fd::AsFd) -> std::io::Result<()> {
-        self.clock_epoll.add(fd, token(seat, source.code()), Interest::READ_LEVEL)
+    pub(crate) fn watch(&self, unit_number: u16, source: Source, fd: impl std::os::fd::AsFd) -> std::io::Result<()> {
+        self.clock_epoll.add(fd, token(unit_number, source.code()), Interest::READ_LEVEL)
     }
 
     /// Watches a socket no more.
@@ -251,23 +253,23 @@ impl Crew {
     }
 
     /// The unit has something to do at `at`.
-    pub(crate) fn wake_at(&self, seat: u16, at: Instant) {
-        if lock(&self.due).bring_forward(u32::from(seat), at) && !self.keeps_time_here() {
+    pub(crate) fn wake_at(&self, unit_number: u16, at: Instant) {
+        if lock(&self.due).bring_forward(u32::from(unit_number), at) && !self.keeps_time_here() {
             self.clock_waker.wake();
         }
     }
 
     /// What the unit was to do at `from` is put off until the time that `to` gives, without waking the clock. `None` where
     /// the unit has something else to do before, or the clock has begun.
-    pub(crate) fn put_off(&self, seat: u16, from: Instant, to: impl FnOnce() -> Instant) -> Option<Instant> {
+    pub(crate) fn put_off(&self, unit_number: u16, from: Instant, to: impl FnOnce() -> Instant) -> Option<Instant> {
         let mut due = self.due.try_lock().ok()?;
-        if due.deadline(u32::from(seat)) != Some(from) {
+        if due.deadline(u32::from(unit_number)) != Some(from) {
             return None;
         }
         // Under the lock: what comes to be due from here on brings the new time forward again.
         let to = to();
         let before = due.next();
-        due.set(u32::from(seat), to);
+        due.set(u32::from(unit_number), to);
         // Also where another unit comes first: `to` may be before its time.
         if let Some(next) = due.next().filter(|next| before != Some(*next)) {
             self.alarm.set(self.clock.boot_time_of(next));
@@ -275,7 +277,7 @@ impl Crew {
         Some(to)
     }
 
-    /// This thread is the crew's clock, which looks at what is due before it next waits.
+    /// This thread is the thread pool's clock, which looks at what is due before it next waits.
     fn keeps_time_here(&self) -> bool {
         CLOCK_OF.get() == std::ptr::from_ref(self).addr()
     }
@@ -313,38 +315,38 @@ impl Crew {
         !self.occupancy.is_stuck(now, limit) || self.start_worker(MOST_WORKERS + 1)
     }
 
-    /// Takes a unit out. When it returns no thread is inside the unit any more, except one of the crew that does it itself.
-    pub(crate) fn leave(&self, seat: u16) {
-        // Before the seat is free: the next one on it may set its time at once.
-        lock(&self.due).cancel(u32::from(seat));
-        lock(&self.looks.0).cancel(u32::from(seat));
-        let place = write(&self.seats).get_mut(usize::from(seat)).and_then(Option::take);
-        if let Some(seat) = place.filter(|_| !self.is_own_thread()) {
-            drop(write(&seat.gate));
+    /// Takes a unit out. When it returns no thread is inside the unit any more, except one of the thread pool that does it itself.
+    pub(crate) fn leave(&self, unit_number: u16) {
+        // Before the unit_number is free: the next one on it may set its time at once.
+        lock(&self.due).cancel(u32::from(unit_number));
+        lock(&self.looks.0).cancel(u32::from(unit_number));
+        let place = write(&self.units).get_mut(usize::from(unit_number)).and_then(Option::take);
+        if let Some(unit_number) = place.filter(|_| !self.is_own_thread()) {
+            drop(write(&unit_number.gate));
         }
     }
 
     /// Starts the threads, once.
     pub(crate) fn start(self: &Arc<Self>) -> Result<(), Error> {
         *self.started.get_or_init(|| {
-            let crew = self.clone();
+            let thread_pool = self.clone();
             let clock = std::thread::Builder::new().name("cara-clock".into());
-            let clock = clock.spawn(move || crew.keep_time()).map_err(system_refused)?;
+            let clock = clock.spawn(move || thread_pool.keep_time()).map_err(system_refused)?;
             lock(&self.threads).push(clock);
-            let crew = self.clone();
+            let thread_pool = self.clone();
             let looker = std::thread::Builder::new().name("cara-files".into());
-            let looker = looker.spawn(move || crew.look_around()).map_err(system_refused)?;
+            let looker = looker.spawn(move || thread_pool.look_around()).map_err(system_refused)?;
             lock(&self.threads).push(looker);
-            let _ = self.lane.set(Arc::new(Lane::start("cara-emergency")?));
+            let _ = self.executor.set(Arc::new(Executor::start("cara-emergency")?));
             if (0..FIRST_WORKERS).all(|_| self.start_worker(MOST_WORKERS)) { Ok(()) } else { Err(Error::Network) }
         })
     }
 
     fn start_worker(self: &Arc<Self>, most: usize) -> bool {
         let started = self.workers.fetch_add(1, Ordering::AcqRel) < most;
-        let crew = self.clone();
+        let thread_pool = self.clone();
         let thread = std::thread::Builder::new().name("cara-pool".into());
-        match started.then(|| thread.spawn(move || crew.work())) {
+        match started.then(|| thread.spawn(move || thread_pool.work())) {
             Some(Ok(thread)) => {
                 lock(&self.threads).push(thread);
                 true
@@ -365,8 +367,8 @@ impl Crew {
         lock(&self.threads).iter().any(|thread| thread.thread().id() == own)
     }
 
-    pub(crate) fn lane(&self) -> Option<Arc<Lane>> {
-        self.lane.get().cloned()
+    pub(crate) fn executor(&self) -> Option<Arc<Executor>> {
+        self.executor.get().cloned()
     }
 
     /// Ends all threads, and waits for it unless one of them calls.
@@ -376,15 +378,15 @@ impl Crew {
         }
         self.clock_waker.wake();
         self.pool_waker.wake();
-        // Under the lock: the looker has seen that the crew stops, or waits.
+        // Under the lock: the looker has seen that the thread pool stops, or waits.
         drop(lock(&self.looks.0));
         self.looks.1.notify_all();
         let own = self.is_own_thread();
         let threads = std::mem::take(&mut *lock(&self.threads));
         // A handler that stops its unit does not wait for the others: one of them may wait for it.
         if !own {
-            if let Some(lane) = self.lane.get() {
-                lane.end();
+            if let Some(executor) = self.executor.get() {
+                executor.end();
             }
             threads.into_iter().for_each(|thread| drop(thread.join()));
         }
@@ -392,13 +394,13 @@ impl Crew {
 
     /// Does something in the unit that a token means, unless it is gone or going.
     fn enter<R>(&self, token: u64, act: impl FnOnce(&dyn Driven) -> R) -> Option<R> {
-        let seat = read(&self.seats).get(usize::from(seat_of(token))).cloned().flatten()?;
-        let _inside = match seat.gate.try_read() {
+        let unit_number = read(&self.units).get(usize::from(unit_of(token))).cloned().flatten()?;
+        let _inside = match unit_number.gate.try_read() {
             Ok(inside) => inside,
             Err(std::sync::TryLockError::Poisoned(poisoned)) => PoisonError::into_inner(poisoned),
             Err(std::sync::TryLockError::WouldBlock) => return None,
         };
-        Some(act(&*seat.driven))
+        Some(act(&*unit_number.driven))
     }
 
     fn work(self: Arc<Self>) {
@@ -414,7 +416,7 @@ impl Crew {
                 return;
             }
             match events.iter().next() {
-                // While the crew stops, the waker stays set, so that every thread wakes.
+                // While the thread pool stops, the waker stays set, so that every thread wakes.
                 Some(ready) if ready.token == WAKER && self.is_stopping() => return,
                 Some(ready) if ready.token == WAKER => {
                     self.pool_waker.reset();
@@ -442,27 +444,27 @@ impl Crew {
     }
 
     /// The thread that looks at files and interfaces looks at those of this unit now.
-    pub(crate) fn wake_looker(&self, seat: u16) {
-        lock(&self.looks.0).bring_forward(u32::from(seat), Instant::START);
+    pub(crate) fn wake_looker(&self, unit_number: u16) {
+        lock(&self.looks.0).bring_forward(u32::from(unit_number), Instant::START);
         self.looks.1.notify_all();
     }
 
     /// One unit at a time, each when it is due: where a thousand units start, a look at all for each would be a million.
     fn look_around(&self) {
-        while let Some(seat) = self.wait_for_look() {
-            if let Some(next) = self.enter(token(seat, 0), |driven| driven.look_around()) {
-                lock(&self.looks.0).bring_forward(u32::from(seat), next);
+        while let Some(unit_number) = self.wait_for_look() {
+            if let Some(next) = self.enter(token(unit_number, 0), |driven| driven.look_around()) {
+                lock(&self.looks.0).bring_forward(u32::from(unit_number), next);
             }
         }
     }
 
-    /// The unit whose files and interfaces are to be looked at; `None` when the crew stops.
+    /// The unit whose files and interfaces are to be looked at; `None` when the thread pool stops.
     fn wait_for_look(&self) -> Option<u16> {
         let mut looks = lock(&self.looks.0);
         while !self.is_stopping() {
             let now = self.clock.now();
-            if let Some(seat) = looks.pop_due(now) {
-                return Some(seat as u16);
+            if let Some(unit_number) = looks.pop_due(now) {
+                return Some(unit_number as u16);
             }
             let wait = looks.next().unwrap_or(Instant::FAR_FUTURE).since(now).min(LONGEST_LOOK);
             looks = self.looks.1.wait_timeout(looks, wait.into()).unwrap_or_else(PoisonError::into_inner).0;
@@ -490,7 +492,7 @@ impl Crew {
                     Source::Listener => driven.accept(),
                 });
                 // What was read may be acted upon at once.
-                lock(&self.due).bring_forward(u32::from(seat_of(ready.token)), Instant::START);
+                lock(&self.due).bring_forward(u32::from(unit_of(ready.token)), Instant::START);
             }
         }
     }
@@ -498,16 +500,16 @@ impl Crew {
     /// Lets every unit whose time has come do what is due; returns how long to wait at most for the next one's.
     fn poll_due(&self) -> Duration {
         loop {
-            let seat = {
+            let unit_number = {
                 let mut due = lock(&self.due);
                 let now = self.clock.now();
                 match due.pop_due(now) {
-                    Some(seat) => seat as u16,
+                    Some(unit_number) => unit_number as u16,
                     None => return self.set_alarm(now, due.next().unwrap_or(Instant::FAR_FUTURE)),
                 }
             };
-            if let Some(next) = self.enter(token(seat, 0), |driven| driven.keep_time()) {
-                lock(&self.due).bring_forward(u32::from(seat), next);
+            if let Some(next) = self.enter(token(unit_number, 0), |driven| driven.keep_time()) {
+                lock(&self.due).bring_forward(u32::from(unit_number), next);
             }
         }
     }
@@ -558,7 +560,7 @@ mod tests {
     #[test]
     fn tokens_keep_unit_and_meaning_apart() {
         let longest = (u64::from(u32::MAX) << 16) | u64::from(u16::MAX);
-        assert_eq!(seat_of(token(7, longest)), 7);
+        assert_eq!(unit_of(token(7, longest)), 7);
         assert_eq!(token(7, longest) & ((1 << UNIT_SHIFT) - 1), longest);
         for source in [Source::Datagrams(Socket::Shared), Source::Datagrams(Socket::Own), Source::Listener] {
             assert_eq!(Source::of(token(65_534, source.code())), source);
@@ -568,59 +570,59 @@ mod tests {
     #[test]
     fn a_unit_is_polled_when_its_time_comes_and_not_after_it_left() {
         let threads = Threads::new().unwrap();
-        let crew = threads.crew();
-        crew.start().unwrap();
+        let thread_pool = threads.thread_pool();
+        thread_pool.start().unwrap();
         let (first, second) = (Arc::new(Counting::default()), Arc::new(Counting::default()));
-        let seats = [&first, &second].map(|unit| crew.seat(unit.clone()).unwrap());
-        assert_eq!(seats, [0, 1]);
-        crew.wake_at(1, crew.clock.now());
+        let units = [&first, &second].map(|unit| thread_pool.register(unit.clone()).unwrap());
+        assert_eq!(units, [0, 1]);
+        thread_pool.wake_at(1, thread_pool.clock.now());
         until(|| second.polls.load(Ordering::SeqCst) == 1);
-        crew.leave(1);
-        crew.wake_at(1, Instant::START);
-        crew.wake_at(0, Instant::START);
+        thread_pool.leave(1);
+        thread_pool.wake_at(1, Instant::START);
+        thread_pool.wake_at(0, Instant::START);
         until(|| first.polls.load(Ordering::SeqCst) == 1);
         assert_eq!(second.polls.load(Ordering::SeqCst), 1);
         assert_eq!(Arc::strong_count(&second), 1, "a unit that has left is held no more");
-        assert_eq!(crew.seat(second).unwrap(), 1, "its number is free again");
+        assert_eq!(thread_pool.register(second).unwrap(), 1, "its number is free again");
     }
 
     #[test]
     fn only_what_a_unit_waits_for_is_put_off() {
         let threads = Threads::new().unwrap();
-        let crew = threads.crew();
-        let at = |seconds| crew.clock.now() + Duration::from_secs(seconds);
+        let thread_pool = threads.thread_pool();
+        let at = |seconds| thread_pool.clock.now() + Duration::from_secs(seconds);
         let (look, later, between) = (at(100), at(300), at(200));
-        crew.wake_at(4, look);
-        assert_eq!(crew.put_off(4, between, || later), None, "it waits for something else");
-        assert_eq!(crew.put_off(4, look, || later), Some(later));
-        assert_eq!(crew.put_off(4, look, || later), None, "it was put off already");
-        crew.wake_at(4, between);
-        assert_eq!(crew.put_off(4, later, || later), None, "something is due before");
-        assert_eq!(lock(&crew.due).next(), Some(between));
+        thread_pool.wake_at(4, look);
+        assert_eq!(thread_pool.put_off(4, between, || later), None, "it waits for something else");
+        assert_eq!(thread_pool.put_off(4, look, || later), Some(later));
+        assert_eq!(thread_pool.put_off(4, look, || later), None, "it was put off already");
+        thread_pool.wake_at(4, between);
+        assert_eq!(thread_pool.put_off(4, later, || later), None, "something is due before");
+        assert_eq!(lock(&thread_pool.due).next(), Some(between));
     }
 
     /// The clock waits with the alarm set to what is due first, and is not woken.
     #[test]
     fn the_alarm_is_set_to_what_is_due_first_whichever_unit_it_is_for() {
         let threads = Threads::new().unwrap();
-        let crew = threads.crew();
-        let (hour, now) = (Duration::from_secs(3_600), crew.clock.now());
+        let thread_pool = threads.thread_pool();
+        let (hour, now) = (Duration::from_secs(3_600), thread_pool.clock.now());
         let (first, later) = (now + hour, now + hour + hour);
-        for (seat, at) in [(1, first), (4, later)] {
-            crew.wake_at(seat, at);
+        for (unit_number, at) in [(1, first), (4, later)] {
+            thread_pool.wake_at(unit_number, at);
         }
-        crew.clock_waker.reset();
+        thread_pool.clock_waker.reset();
         let goes_off = |within: Duration| {
             let mut events = Events::new(1);
-            crew.clock_epoll.wait(&mut events, Some(within)).unwrap();
+            thread_pool.clock_epoll.wait(&mut events, Some(within)).unwrap();
             events.iter().next().is_some()
         };
         assert!(!goes_off(Duration::ZERO));
-        let soon = crew.clock.now() + Duration::from_millis(20);
-        assert_eq!(crew.put_off(4, later, || soon), Some(soon));
+        let soon = thread_pool.clock.now() + Duration::from_millis(20);
+        assert_eq!(thread_pool.put_off(4, later, || soon), Some(soon));
         assert!(goes_off(Duration::from_secs(20)), "unit 4 is due before unit 1, and the alarm is not set");
-        assert_eq!(crew.put_off(4, soon, || later), Some(later));
-        assert_eq!(crew.put_off(1, first, || later + hour), Some(later + hour));
+        assert_eq!(thread_pool.put_off(4, soon, || later), Some(later));
+        assert_eq!(thread_pool.put_off(1, first, || later + hour), Some(later + hour));
         assert!(!goes_off(Duration::from_millis(40)), "both are put off");
     }
 
@@ -628,11 +630,11 @@ mod tests {
     #[test]
     fn a_unit_that_starts_is_looked_at_alone() {
         let threads = Threads::new().unwrap();
-        let crew = threads.crew();
-        crew.start().unwrap();
+        let thread_pool = threads.thread_pool();
+        thread_pool.start().unwrap();
         let units: [Arc<Counting>; 20] = Default::default();
         for unit in &units {
-            crew.wake_looker(crew.seat(unit.clone()).unwrap());
+            thread_pool.wake_looker(thread_pool.register(unit.clone()).unwrap());
             until(|| unit.looks.load(Ordering::SeqCst) > 0);
         }
         assert_eq!(units.map(|unit| unit.looks.load(Ordering::SeqCst)), [1; 20]);
@@ -641,20 +643,20 @@ mod tests {
     #[test]
     fn leaving_waits_for_the_threads_that_are_inside() {
         let threads = Threads::new().unwrap();
-        let crew = threads.crew();
-        crew.start().unwrap();
+        let thread_pool = threads.thread_pool();
+        thread_pool.start().unwrap();
         let unit = Arc::new(Counting::default());
-        let seat = crew.seat(unit.clone()).unwrap();
+        let unit_number = thread_pool.register(unit.clone()).unwrap();
         let inside = lock(&unit.closed);
-        crew.wake_at(seat, Instant::START);
+        thread_pool.wake_at(unit_number, Instant::START);
         until(|| unit.polls.load(Ordering::SeqCst) == 1);
         let left = AtomicBool::new(false);
         std::thread::scope(|scope| {
             scope.spawn(|| {
-                crew.leave(seat);
+                thread_pool.leave(unit_number);
                 left.store(true, Ordering::SeqCst);
             });
-            until(|| read(&crew.seats).iter().all(Option::is_none));
+            until(|| read(&thread_pool.units).iter().all(Option::is_none));
             std::thread::sleep(std::time::Duration::from_millis(20));
             assert!(!left.load(Ordering::SeqCst));
             drop(inside);

@@ -663,7 +663,7 @@ impl Pool {
         }
     }
 
-    /// `Crew::work`, for the calls that there are.
+    /// `ThreadPool::work`, for the calls that there are.
     fn work(&self) {
         loop {
             self.idle.fetch_add(1, Ordering::SeqCst);
@@ -702,7 +702,7 @@ impl Pool {
                 used = self.watch.look(|_| false);
                 let waiting = !self.calls.lock().unwrap().is_empty();
                 if waiting && self.idle.load(Ordering::SeqCst) == 0 {
-                    // `Crew::relieve`: what it starts is this thread here.
+                    // `ThreadPool::relieve`: what it starts is this thread here.
                     self.work();
                 }
             }

@@ -207,7 +207,7 @@ impl<'b> Datagram<'b> {
 }
 
 /// Link, nonce and body of a session datagram of this mode, version and fleet, by its header alone: for
-/// [`Session::datagram`](crate::services::unit::Session::datagram). All others are the node's.
+/// [`Session::datagram`](crate::services::session::Session::datagram). All others are the node's.
 pub fn for_session(bytes: &mut [u8], mode: Mode, fleet: Fleet) -> Option<(LinkId, u64, &mut [u8])> {
     let (header, body) = Header::decode(bytes).ok()?;
     header.check(mode, fleet).ok()?;

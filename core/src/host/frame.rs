@@ -168,14 +168,14 @@ fn length_bytes(body_length: usize) -> [u8; 2] {
 
 /// How a sender cuts messages: the peer's chunk limit (of a frame's body) and what sealing adds.
 #[derive(Clone, Copy, Debug)]
-pub struct Cut {
+pub struct Chunking {
     /// Longest body of a frame.
     pub chunk: usize,
     /// Bytes that sealing adds to a body.
     pub overhead: usize,
 }
 
-impl Cut {
+impl Chunking {
     #[inline]
     fn first_payload(self) -> usize {
         self.chunk.saturating_sub(FIRST_CHUNK_BYTES).saturating_sub(self.overhead)
@@ -201,7 +201,7 @@ impl Cut {
 /// Writes one message of known length as chunk frames, copying each byte once.
 pub struct ChunkWriter<'b> {
     writer: Writer<'b>,
-    cut: Cut,
+    chunking: Chunking,
     priority: Priority,
     /// Bytes of the message that no frame header covers yet.
     uncovered: usize,
@@ -210,12 +210,12 @@ pub struct ChunkWriter<'b> {
 }
 
 impl<'b> ChunkWriter<'b> {
-    /// A writer of a message of `total` bytes into `out`, which must hold [`Cut::framed_length`] of them.
+    /// A writer of a message of `total` bytes into `out`, which must hold [`Chunking::framed_length`] of them.
     #[inline]
-    pub fn new(out: &'b mut [u8], cut: Cut, priority: Priority, total: usize) -> Option<Self> {
-        let out = out.get_mut(..cut.framed_length(total))?;
-        let mut writer = Self { writer: Writer { out, position: 0 }, cut, priority, uncovered: total, room: 0 };
-        let payload = total.min(cut.first_payload());
+    pub fn new(out: &'b mut [u8], chunking: Chunking, priority: Priority, total: usize) -> Option<Self> {
+        let out = out.get_mut(..chunking.framed_length(total))?;
+        let mut writer = Self { writer: Writer { out, position: 0 }, chunking, priority, uncovered: total, room: 0 };
+        let payload = total.min(chunking.first_payload());
         writer.open_frame(FIRST, FIRST_CHUNK_BYTES, payload);
         writer.writer.put(&(total as u32).to_le_bytes());
         Some(writer)
@@ -240,8 +240,8 @@ impl<'b> ChunkWriter<'b> {
                 if self.uncovered == 0 {
                     return;
                 }
-                self.writer.skip(self.cut.overhead);
-                self.open_frame(0, CHUNK_BYTES, self.uncovered.min(self.cut.next_payload()));
+                self.writer.skip(self.chunking.overhead);
+                self.open_frame(0, CHUNK_BYTES, self.uncovered.min(self.chunking.next_payload()));
             }
             let (now, later) = bytes.split_at_checked(self.room).unwrap_or((bytes, &[]));
             self.writer.put(now);
@@ -255,7 +255,7 @@ impl<'b> ChunkWriter<'b> {
         self.uncovered = self.uncovered.saturating_sub(payload);
         self.room = payload;
         let last = if self.uncovered == 0 { LAST } else { 0 };
-        let body = head.saturating_add(payload).saturating_add(self.cut.overhead);
+        let body = head.saturating_add(payload).saturating_add(self.chunking.overhead);
         self.writer.put(&length_bytes(body));
         self.writer.put(&[CHUNK | first | last, self.priority.to_wire()]);
     }
@@ -328,9 +328,9 @@ mod tests {
             overhead in prop::sample::select(vec![0usize, 16]),
             piece in 1..3000usize,
         ) {
-            let cut = Cut { chunk, overhead };
-            let mut out = vec![0; cut.framed_length(message.len())];
-            let mut writer = ChunkWriter::new(&mut out, cut, Priority::Normal, message.len()).unwrap();
+            let chunking = Chunking { chunk, overhead };
+            let mut out = vec![0; chunking.framed_length(message.len())];
+            let mut writer = ChunkWriter::new(&mut out, chunking, Priority::Normal, message.len()).unwrap();
             for piece in message.chunks(piece) {
                 writer.put(piece);
             }
@@ -345,9 +345,9 @@ mod tests {
 
     #[test]
     fn a_writer_refuses_a_buffer_that_is_too_short() {
-        let cut = Cut { chunk: 1024, overhead: 0 };
+        let chunking = Chunking { chunk: 1024, overhead: 0 };
         let mut out = [0; 100];
-        assert!(ChunkWriter::new(&mut out, cut, Priority::Normal, 100).is_none());
+        assert!(ChunkWriter::new(&mut out, chunking, Priority::Normal, 100).is_none());
     }
 
     #[test]

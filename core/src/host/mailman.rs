@@ -2,7 +2,7 @@
 //!
 //! It is synchronous and never blocks; a port lends it to each call that may write. Reading is turned round: the port
 //! reads (a Linux thread blocks in the read without any lock), lends what it has to
-//! [`Session::receive`](crate::services::unit::Session::receive) or
+//! [`Session::receive`](crate::services::session::Session::receive) or
 //! [`Node::datagram`](crate::distribution::connection_handler::Node::datagram), and is told how much was consumed.
 //!
 //! # Contract

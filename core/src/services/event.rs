@@ -5,7 +5,7 @@ use crate::distribution::identity::Identity;
 use crate::error::{CloseReason, Error};
 use crate::services::lease::LeaseEnd;
 use crate::services::requests::CallId;
-use crate::services::unit::Event;
+use crate::services::session::Event;
 
 /// Something happened that no call returned.
 ///

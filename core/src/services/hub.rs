@@ -2,7 +2,7 @@
 //!
 //! A session enters the hub by itself, through the [`Door`] in its [`Context`](super::Context), when a peer has
 //! introduced itself or has shown that it is alive. Effects on another link, the port takes from [`Node::poll`] and
-//! passes on with [`Session::direct`](super::unit::Session::direct), while it does not hold the hub.
+//! passes on with [`Session::direct`](super::session::Session::direct), while it does not hold the hub.
 
 use crate::distribution::connection_handler::Node;
 

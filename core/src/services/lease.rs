@@ -206,7 +206,7 @@ pub trait Service {
     }
 
     /// [`Lease::end`], because its caller no longer wants it. Where this is `true`, the safe hook is due: the event
-    /// [`LeaseExpired`](crate::services::unit::Event::LeaseExpired) says so to a port that has not started it here.
+    /// [`LeaseExpired`](crate::services::session::Event::LeaseExpired) says so to a port that has not started it here.
     fn expire_lease(&self, order: Order) -> bool {
         self.finish_lease(order)
     }

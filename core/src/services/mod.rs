@@ -4,7 +4,7 @@
 //!
 //! A port owns sockets, time, threads and memory; the machines own every decision. A [`Hub`](hub::Hub) is what the links of one
 //! unit share: the [`Node`](crate::distribution::connection_handler::Node) that finds and admits peers, and the publications. A
-//! [`Session`](unit::Session) is one link. Both are called with the time and what they need, do what they can at once, and
+//! [`Session`](session::Session) is one link. Both are called with the time and what they need, do what they can at once, and
 //! return what happened; neither waits, reads a clock or allocates.
 //!
 //! | what happens | what the port calls |
@@ -23,11 +23,11 @@
 //!
 //! | event | what the port does |
 //! |---|---|
-//! | [`LeaseExpired`](unit::Event::LeaseExpired) | runs the safe hook of the service, before anything else |
-//! | [`Call`](unit::Event::Call) | runs the handler, and answers by ticket; an `order` makes the handler's view of the service's [`Lease`](lease::Lease). A newer call of the service ends that view without an event, so wake what awaits it |
-//! | [`Reply`](unit::Event::Reply), [`Failed`](unit::Event::Failed), and all others | tells the program what [`UnitEvent::of`](event::UnitEvent::of) makes of it, and the results of a reply, which `session.results` shows. It says `session.cancel` for a call that the program gives up, `session.release` for all of a function |
-//! | [`Joined`](unit::Event::Joined) | the peer is taken, and is being told what is published to it |
-//! | [`Closed`](unit::Event::Closed) | the last one: forgets the session (`into_storage` gives its slices back), then `node.left`, also for a link that never joined |
+//! | [`LeaseExpired`](session::Event::LeaseExpired) | runs the safe hook of the service, before anything else |
+//! | [`Call`](session::Event::Call) | runs the handler, and answers by ticket; an `order` makes the handler's view of the service's [`Lease`](lease::Lease). A newer call of the service ends that view without an event, so wake what awaits it |
+//! | [`Reply`](session::Event::Reply), [`Failed`](session::Event::Failed), and all others | tells the program what [`UnitEvent::of`](event::UnitEvent::of) makes of it, and the results of a reply, which `session.results` shows. It says `session.cancel` for a call that the program gives up, `session.release` for all of a function |
+//! | [`Joined`](session::Event::Joined) | the peer is taken, and is being told what is published to it |
+//! | [`Closed`](session::Event::Closed) | the last one: forgets the session (`into_storage` gives its slices back), then `node.left`, also for a link that never joined |
 //!
 //! Ports differ only in which thread or task makes these calls, and under which lock. Two sessions are never locked at
 //! the same time; a session enters the hub itself, through the [`Door`](hub::Door) in its [`Context`].
@@ -44,7 +44,7 @@
 //! # use cara_core::host::secure::Plain;
 //! # use cara_core::services::hub::Hub;
 //! # use cara_core::services::publications::Publications;
-//! # use cara_core::services::unit::{Event, RequestOptions, Session, SessionConfig, SessionStorage};
+//! # use cara_core::services::session::{Event, RequestOptions, Session, SessionConfig, SessionStorage};
 //! # use cara_core::services::{Context, Port};
 //! # use cara_core::storage::{Pool, Storage};
 //! # use cara_core::time::Instant;
@@ -189,7 +189,7 @@ pub mod hub;
 pub mod lease;
 pub mod publications;
 pub mod requests;
-pub mod unit;
+pub mod session;
 
 pub use crate::host::port::Port;
 pub use calls::{CallHead, Ticket, slots_for};
@@ -203,7 +203,7 @@ use crate::storage::{Buffers, Storage};
 use crate::time::Instant;
 use lease::Service;
 
-/// What a port lends to each call of a [`Session`](unit::Session).
+/// What a port lends to each call of a [`Session`](session::Session).
 pub struct Context<'c, P: Port> {
     /// The time now.
     pub now: Instant,

@@ -19,7 +19,7 @@ use cara_core::distribution::identity::Fleet;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::ServiceError;
 use cara_core::services::lease::Lease;
-use cara_core::services::unit::{Call, Event};
+use cara_core::services::session::{Call, Event};
 use cara_core::time::{Duration, Instant};
 use cara_smoltcp::{Program, Resources, SUnit, Served, Settings};
 use clap::Parser;

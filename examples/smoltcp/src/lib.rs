@@ -12,7 +12,7 @@
 //! use cara_core::distribution::hello::Manager;
 //! use cara_core::distribution::parameters::ParametersView;
 //! use cara_core::error::ServiceError;
-//! use cara_core::services::unit::Call;
+//! use cara_core::services::session::Call;
 //! use cara_core::time::Instant;
 //! use cara_smoltcp::{Program, Resources, SUnit, Served, Settings};
 //!

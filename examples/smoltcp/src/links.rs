@@ -10,7 +10,7 @@ use cara_core::distribution::identity::Identity;
 use cara_core::error::{CloseReason, Error};
 use cara_core::host::mailman::LinkId;
 use cara_core::host::secure::Plain;
-use cara_core::services::unit::{Call, Event, Session, SessionConfig};
+use cara_core::services::session::{Call, Event, Session, SessionConfig};
 use cara_core::services::{Context, Ticket};
 use cara_core::time::Instant;
 

@@ -4,7 +4,7 @@ use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, ServiceError};
 use cara_core::services::requests::CallId;
-use cara_core::services::unit::{Call, Event, ReplyBlock};
+use cara_core::services::session::{Call, Event, ReplyBlock};
 
 /// The program around a unit, as [`SUnit::poll`](crate::SUnit::poll) sees it. Each method runs inside of `poll`, so each
 /// returns soon: nothing is read and no keep-alive leaves meanwhile.

@@ -11,7 +11,7 @@ use cara_core::services::CallHead;
 use cara_core::services::lease::{Lease, Service};
 use cara_core::services::publications::{Publications, PublishedToOne};
 use cara_core::services::requests::Pending;
-use cara_core::services::unit::{Publication, SessionStorage, buffer_bytes};
+use cara_core::services::session::{Publication, SessionStorage, buffer_bytes};
 use cara_core::storage::{Lent, Pool};
 use smoltcp::iface::SocketStorage;
 use smoltcp::socket::udp;

@@ -11,7 +11,7 @@ use cara_core::host::secure::Plain;
 use cara_core::services::hub::Hub;
 use cara_core::services::lease::Lease;
 use cara_core::services::requests::CallId;
-use cara_core::services::unit::{RequestOptions, Session, SessionStorage};
+use cara_core::services::session::{RequestOptions, Session, SessionStorage};
 use cara_core::services::{Context, Port, Ticket};
 use cara_core::storage::{Lent, Pool};
 use cara_core::time::Instant;

@@ -19,8 +19,8 @@ pub(crate) struct Chosen {
 
 impl Chosen {
     pub(crate) fn among(nodes: &[NodeInfo], node: &NodeInfo) -> Self {
-        let twins = nodes.iter().filter(|other| other.connected && full_name(other) == full_name(node)).count();
-        let selector = if twins > 1 { format!("{}@{}", full_name(node), node.role) } else { full_name(node) };
+        let duplicates = nodes.iter().filter(|other| other.connected && full_name(other) == full_name(node)).count();
+        let selector = if duplicates > 1 { format!("{}@{}", full_name(node), node.role) } else { full_name(node) };
         Self { node: node.clone(), selector }
     }
 }

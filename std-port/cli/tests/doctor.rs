@@ -101,8 +101,8 @@ fn of_two_nodes_with_one_identity_the_manager_tells() {
 #[test]
 fn two_lives_of_one_identity_at_the_same_time_are_two_nodes() {
     let clinic = Clinic::new();
-    let twins = [1, 2].map(|epoch| clinic.search("agv", 7, epoch));
-    let say = || twins.iter().for_each(Search::send);
+    let duplicates = [1, 2].map(|epoch| clinic.search("agv", 7, epoch));
+    let say = || duplicates.iter().for_each(Search::send);
     while_running(say, || clinic.doctor(&["agv"]).is(&["duplicate"], 4));
 }
 

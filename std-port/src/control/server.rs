@@ -18,7 +18,7 @@ use super::lines::{Line, Lines};
 use super::place::{Place, PlaceError, own_uid, peer_uid};
 use super::protocol::{Answer, CONTROL_VERSION, Failure, LONGEST_LINE, Question};
 use crate::CommunicationSystem;
-use crate::lane::OwnThread;
+use crate::executor::OwnThread;
 use crate::locks::lock;
 use crate::seldom::warn_seldom;
 use crate::sys::epoll::{Epoll, Events, Interest, Waker};

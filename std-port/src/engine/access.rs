@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, RwLock};
 
 use cara_core::error::Error;
 use cara_core::services::access::{Access, Bucket, Decision, Principal, Rate, Verb};
-use cara_core::services::unit::Event;
+use cara_core::services::session::Event;
 use cara_core::time::{Duration, Instant};
 
 use super::Engine;

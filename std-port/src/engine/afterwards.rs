@@ -8,19 +8,19 @@ use std::sync::{Arc, Mutex};
 use cara_core::error::Error;
 
 use super::Engine;
+use crate::executor::Executor;
 use crate::handler::Hook;
-use crate::lane::Lane;
 use crate::locks::lock;
 
 /// The thread, once there is a hook, and the hook for the loss of a peer.
 pub(super) struct Afterwards<T> {
-    lane: Mutex<Option<Arc<Lane>>>,
+    executor: Mutex<Option<Arc<Executor>>>,
     lost: Mutex<Option<Arc<Pending<T>>>>,
 }
 
 impl<T> Default for Afterwards<T> {
     fn default() -> Self {
-        Self { lane: Mutex::new(None), lost: Mutex::new(None) }
+        Self { executor: Mutex::new(None), lost: Mutex::new(None) }
     }
 }
 
@@ -39,18 +39,18 @@ impl<T> Pending<T> {
 impl<T> Afterwards<T> {
     /// The thread is there from here on. [`Error::Network`] when the system refuses it.
     fn start(&self) -> Result<(), Error> {
-        let mut lane = lock(&self.lane);
-        if lane.is_none() {
-            *lane = Some(Arc::new(Lane::start("cara-after")?));
+        let mut executor = lock(&self.executor);
+        if executor.is_none() {
+            *executor = Some(Arc::new(Executor::start("cara-after")?));
         }
         Ok(())
     }
 
     /// Waits for the hooks that are due, and ends the thread.
     pub(super) fn end(&self) {
-        let lane = lock(&self.lane).take();
-        if let Some(lane) = lane {
-            lane.end();
+        let executor = lock(&self.executor).take();
+        if let Some(executor) = executor {
+            executor.end();
         }
     }
 }
@@ -82,10 +82,10 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     fn run_afterwards(&self, pending: &Arc<Pending<T>>) {
-        let lane = lock(&self.services.afterwards.lane).clone();
-        let Some(lane) = lane.filter(|_| !pending.waits.swap(true, Ordering::AcqRel)) else { return };
+        let executor = lock(&self.services.afterwards.executor).clone();
+        let Some(executor) = executor.filter(|_| !pending.waits.swap(true, Ordering::AcqRel)) else { return };
         let (me, pending) = (self.me.clone(), pending.clone());
-        lane.run(move || {
+        executor.run(move || {
             let Some(engine) = me.upgrade() else { return };
             let ran = engine.with_state(|state| {
                 pending.waits.store(false, Ordering::Release);

@@ -9,7 +9,7 @@ use cara_core::distribution::function::Signature;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error, Limit};
 use cara_core::services::requests::CallId;
-use cara_core::services::unit::RequestOptions;
+use cara_core::services::session::RequestOptions;
 use cara_core::time::{Duration, Instant};
 
 use super::Engine;

@@ -52,13 +52,13 @@ impl<T: Send + 'static> Engine<T> {
             return self.session_datagram(&link, from, nonce, body);
         }
         let codes = self.keys().codes();
-        let twin = {
+        let duplicate = {
             let mut cell = self.hub();
             cell.hub.node.datagram(self.now(), from, bytes, &codes);
-            cell.hub.node.take_twin()
+            cell.hub.node.take_duplicate()
         };
-        if let Some(address) = twin {
-            self.twin_heard(address);
+        if let Some(address) = duplicate {
+            self.duplicate_heard(address);
         }
     }
 
@@ -101,7 +101,7 @@ const PAUSE: Duration = Duration::from_millis(100);
 impl<T: Send + 'static> Engine<T> {
     fn pause_listening(&self) {
         let Some(listener) = &self.sockets.listener else { return };
-        self.crew().unwatch(listener);
+        self.thread_pool().unwatch(listener);
         *lock(&self.sockets.listens_at) = Some(self.now() + PAUSE);
     }
 
@@ -110,9 +110,9 @@ impl<T: Send + 'static> Engine<T> {
         let mut at = lock(&self.sockets.listens_at);
         match *at {
             Some(due) if due <= self.now() => {
-                let seat = self.seat();
-                if let Some((listener, seat)) = self.sockets.listener.as_ref().zip(seat)
-                    && self.crew().watch(seat, Source::Listener, listener).is_err()
+                let unit_number = self.unit_number();
+                if let Some((listener, unit_number)) = self.sockets.listener.as_ref().zip(unit_number)
+                    && self.thread_pool().watch(unit_number, Source::Listener, listener).is_err()
                 {
                     *at = Some(self.now() + PAUSE);
                     return self.now() + PAUSE;

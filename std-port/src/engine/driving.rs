@@ -16,7 +16,7 @@ use crate::error::StartError;
 use crate::error::system_refused;
 use crate::sys::datagram::Socket;
 use crate::sys::epoll::Ready;
-use crate::threads::{Crew, Driven, Source, Threads};
+use crate::threads::{Driven, Source, ThreadPool, Threads};
 
 /// The threads that drive the unit, and whether they do.
 pub(super) struct Driver {
@@ -26,7 +26,7 @@ pub(super) struct Driver {
     /// No other unit has them.
     own_threads: bool,
     /// The unit's number among those that the threads drive, once it has been started.
-    seat: OnceLock<u16>,
+    unit_number: OnceLock<u16>,
     /// A manager looks for a live one of its identity before it starts.
     pub(super) asks_for_itself: bool,
     stopping: AtomicBool,
@@ -36,9 +36,9 @@ pub(super) struct Driver {
 
 impl Driver {
     pub(super) fn new(threads: Threads, own_threads: bool, asks_for_itself: bool) -> Self {
-        let clock = threads.crew().clock;
+        let clock = threads.thread_pool().clock;
         let (born, stopping) = (clock.now(), AtomicBool::new(false));
-        Self { threads, clock, own_threads, seat: OnceLock::new(), asks_for_itself, stopping, born }
+        Self { threads, clock, own_threads, unit_number: OnceLock::new(), asks_for_itself, stopping, born }
     }
 
     pub(super) const fn clock(&self) -> Clock {
@@ -60,12 +60,12 @@ impl Driver {
 }
 
 impl<T: Send + 'static> Engine<T> {
-    pub(super) fn crew(&self) -> &Arc<Crew> {
-        self.driver.threads.crew()
+    pub(super) fn thread_pool(&self) -> &Arc<ThreadPool> {
+        self.driver.threads.thread_pool()
     }
 
-    pub(super) fn seat(&self) -> Option<u16> {
-        self.driver.seat.get().copied()
+    pub(super) fn unit_number(&self) -> Option<u16> {
+        self.driver.unit_number.get().copied()
     }
 
     /// Begins to search and to serve, driven by the unit's threads. One that runs already goes on; one that was stopped
@@ -81,7 +81,7 @@ impl<T: Send + 'static> Engine<T> {
         if self.is_stopping() {
             return Err(Error::NotRunning.into());
         }
-        if self.seat().is_some() {
+        if self.unit_number().is_some() {
             return Ok(());
         }
         if let Some(at) = self.running_elsewhere().map_err(system_refused)? {
@@ -92,10 +92,10 @@ impl<T: Send + 'static> Engine<T> {
             let (identity, fleet) = self.identity();
             return Err(StartError::SocketHeld { identity, fleet, path });
         }
-        self.crew().start()?;
-        let seat = self.crew().seat(self.clone())?;
-        let _ = self.driver.seat.set(seat);
-        self.watch(seat).map_err(system_refused)?;
+        self.thread_pool().start()?;
+        let unit_number = self.thread_pool().register(self.clone())?;
+        let _ = self.driver.unit_number.set(unit_number);
+        self.watch(unit_number).map_err(system_refused)?;
         self.warn_of_plain_mode();
         self.wake_looker();
         self.wake_clock();
@@ -116,11 +116,14 @@ impl<T: Send + 'static> Engine<T> {
         }
     }
 
-    fn watch(&self, seat: u16) -> std::io::Result<()> {
+    fn watch(&self, unit_number: u16) -> std::io::Result<()> {
         for socket in [Socket::Shared, Socket::Own] {
-            self.crew().watch(seat, Source::Datagrams(socket), self.sockets.datagrams.fd(socket))?;
+            self.thread_pool().watch(unit_number, Source::Datagrams(socket), self.sockets.datagrams.fd(socket))?;
         }
-        self.sockets.listener.as_ref().map_or(Ok(()), |listener| self.crew().watch(seat, Source::Listener, listener))
+        self.sockets
+            .listener
+            .as_ref()
+            .map_or(Ok(()), |listener| self.thread_pool().watch(unit_number, Source::Listener, listener))
     }
 
     /// Something is to be done now, or the time of the next thing has changed.
@@ -129,33 +132,33 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     pub(super) fn wake_clock_at(&self, at: Instant) {
-        if let Some(seat) = self.seat() {
-            self.crew().wake_at(seat, at);
+        if let Some(unit_number) = self.unit_number() {
+            self.thread_pool().wake_at(unit_number, at);
         }
     }
 
     /// Files and interfaces are looked at now.
     pub(super) fn wake_looker(&self) {
-        if let Some(seat) = self.seat() {
-            self.crew().wake_looker(seat);
+        if let Some(unit_number) = self.unit_number() {
+            self.thread_pool().wake_looker(unit_number);
         }
     }
 
     /// From here on no thread works for the unit any more, except the one that calls.
     pub(super) fn release_threads(&self) {
         for socket in [Socket::Shared, Socket::Own] {
-            self.crew().unwatch(self.sockets.datagrams.fd(socket));
+            self.thread_pool().unwatch(self.sockets.datagrams.fd(socket));
         }
         if let Some(listener) = &self.sockets.listener {
-            self.crew().unwatch(listener);
+            self.thread_pool().unwatch(listener);
         }
-        if let Some(seat) = self.seat() {
-            self.crew().leave(seat);
+        if let Some(unit_number) = self.unit_number() {
+            self.thread_pool().leave(unit_number);
         }
         // No thread puts a link there any more.
-        self.crew().watched.fetch_sub(self.links.watch.clear(), Ordering::Relaxed);
+        self.thread_pool().watched.fetch_sub(self.links.watch.clear(), Ordering::Relaxed);
         if self.driver.own_threads {
-            self.crew().stop();
+            self.thread_pool().stop();
         }
     }
 }

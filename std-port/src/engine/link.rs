@@ -9,7 +9,7 @@ use cara_core::error::{CloseReason, Error};
 use cara_core::host::mailman::{LinkId, Mailman};
 use cara_core::services::Port;
 use cara_core::services::requests::CallId;
-use cara_core::services::unit::Session;
+use cara_core::services::session::Session;
 use cara_core::time::{Duration, Instant};
 use cara_secure::link::Cipher;
 use core::net::SocketAddr;
@@ -42,7 +42,7 @@ const SEALED_AHEAD: usize = 64 * 1024;
 /// One link of the unit.
 pub(crate) struct LinkCell {
     /// The unit's number among those that its threads drive.
-    seat: u16,
+    unit_number: u16,
     pub(crate) id: LinkId,
     /// Tells this link from an earlier one with the same id.
     pub(crate) serial: u32,
@@ -106,7 +106,7 @@ pub(crate) type Outcome = Result<(Box<[u8]>, Box<[u8]>), Error>;
 
 impl LinkCell {
     pub(crate) fn new(
-        seat: u16,
+        unit_number: u16,
         id: LinkId,
         serial: u32,
         stream: Stream,
@@ -125,7 +125,7 @@ impl LinkCell {
             notices: Notices::default(),
         };
         Self {
-            seat,
+            unit_number,
             id,
             serial,
             stream,
@@ -148,7 +148,7 @@ impl LinkCell {
 
     /// The epoll token: unit, id and serial, so that an event of an earlier link with the same id is known.
     pub(crate) fn token(&self) -> u64 {
-        threads::token(self.seat, u64::from(self.serial) << 16 | u64::from(self.id.0))
+        threads::token(self.unit_number, u64::from(self.serial) << 16 | u64::from(self.id.0))
     }
 
     /// Handlers run outside of this lock, and no code under it leaves the state half changed.

@@ -10,7 +10,7 @@ use cara_core::distribution::identity::Identity;
 use cara_core::error::{CloseReason, Error, Limit, Refusal};
 use cara_core::host::mailman::LinkId;
 use cara_core::services::hub::{Door, Hub};
-use cara_core::services::unit::{Event, Session, SessionConfig};
+use cara_core::services::session::{Event, Session, SessionConfig};
 use cara_core::time::{Duration, Instant};
 use core::net::{IpAddr, SocketAddr};
 
@@ -98,11 +98,11 @@ impl<T: Send + 'static> Engine<T> {
         if let Some(span) = self.key_watch.renews_every() {
             session.renew_every(span);
         }
-        let link = Arc::new(LinkCell::new(self.seat()?, id, serial, stream, session, dialed));
+        let link = Arc::new(LinkCell::new(self.unit_number()?, id, serial, stream, session, dialed));
         *links.get_mut(index)? = Some(link.clone());
         drop(links);
         let interest = if dialed { Interest::READ_EDGE.and_writable() } else { Interest::READ_EDGE };
-        if self.crew().epoll.add(&link.stream, link.token(), interest).is_err() {
+        if self.thread_pool().epoll.add(&link.stream, link.token(), interest).is_err() {
             link.lock().session.disconnected(CloseReason::DialFailed);
         }
         self.settle(&link, link.lock());
@@ -173,7 +173,7 @@ impl<T: Send + 'static> Engine<T> {
     }
 
     /// Another live unit has this one's identity.
-    pub(super) fn twin_heard(&self, address: SocketAddr) {
+    pub(super) fn duplicate_heard(&self, address: SocketAddr) {
         let refusal = Refusal::DuplicateIdentity;
         let own = self.hub().hub.node.identity().clone();
         warn_seldom!(%address, name = own.name(), id = own.id(), "{refusal}");
@@ -245,7 +245,7 @@ impl<T: Send + 'static> Engine<T> {
             let mut state = link.lock();
             // It is not put back.
             state.registration.is_out = false;
-            let _ = self.crew().epoll.remove(&link.stream);
+            let _ = self.thread_pool().epoll.remove(&link.stream);
         }
         self.retire(link);
         if let Some(peer) = link.peer.get() {

@@ -73,7 +73,7 @@ use cara_core::host::mailman::LinkId;
 use cara_core::host::secure::Seal;
 use cara_core::services::Context;
 use cara_core::services::access::Access;
-use cara_core::services::unit::{Session, buffer_bytes};
+use cara_core::services::session::{Session, buffer_bytes};
 use cara_core::time::{Duration, Instant};
 use cara_secure::link::Cipher;
 
@@ -337,7 +337,7 @@ impl<T: Send + 'static> Engine<T> {
         // What moved stops, and is heard of, before the unit is gone.
         handlers.iter().filter_map(|handler| handler.safe.as_ref()).for_each(|safe| safe.end());
         self.services.afterwards.end();
-        handlers.iter().filter_map(|handler| handler.lane.as_ref()).for_each(|lane| lane.end());
+        handlers.iter().filter_map(|handler| handler.executor.as_ref()).for_each(|executor| executor.end());
         self.release_threads();
     }
 

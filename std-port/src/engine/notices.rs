@@ -1,6 +1,6 @@
 //! What happened on a link and is acted upon when its lock has been given up, in the order in which it happened.
 
-use cara_core::services::unit::Event;
+use cara_core::services::session::Event;
 
 /// The notices of a link that wait. One thread at a time acts on them, so that nothing is heard of a node's list before
 /// the node has joined, or after it has left.

@@ -230,7 +230,7 @@ pub(super) mod tests {
     use cara_core::distribution::hello::{Hello, Limits};
     use cara_core::distribution::identity::{Epoch, Fleet};
     use cara_core::host::mailman::LinkId;
-    use cara_core::services::unit::{Session, SessionConfig, SessionStorage};
+    use cara_core::services::session::{Session, SessionConfig, SessionStorage};
     use cara_core::time::Instant;
     use cara_secure::link::Cipher;
 

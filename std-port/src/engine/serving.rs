@@ -7,7 +7,7 @@ use cara_core::config::Priority;
 use cara_core::distribution::function_list::{FunctionList, Slot};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, ServiceError};
-use cara_core::services::unit::Call;
+use cara_core::services::session::Call;
 use cara_core::time::{Duration, Instant};
 
 use super::Engine;
@@ -68,7 +68,7 @@ impl<T: Send + 'static> Engine<T> {
         begun: Begun,
         worker: &mut Worker,
     ) -> Option<(Locked<'l, LinkState>, Instant)> {
-        let occupied = self.crew().occupancy.enter();
+        let occupied = self.thread_pool().occupancy.enter();
         let ran = self.run(link, begun, &mut worker.arguments);
         drop(occupied);
         let result = match ran {
@@ -137,10 +137,10 @@ impl<T: Send + 'static> Engine<T> {
         mut arguments: Box<ParametersView>,
     ) {
         let Some(engine) = self.me.upgrade() else { return };
-        let lane = functions.function(begun.call.slot).and_then(|function| function.handler.lane.clone());
-        let Some(lane) = lane.or_else(|| self.crew().lane()) else { return };
+        let executor = functions.function(begun.call.slot).and_then(|function| function.handler.executor.clone());
+        let Some(executor) = executor.or_else(|| self.thread_pool().executor()) else { return };
         let link = link.clone();
-        lane.run(move || match engine.run(&link, begun, &mut arguments) {
+        executor.run(move || match engine.run(&link, begun, &mut arguments) {
             Ran::Over(result) => {
                 let state = engine.answer(engine.now(), &link, link.lock(), &begun.call, result, &arguments);
                 if state.session.has_next_call() {
@@ -154,7 +154,7 @@ impl<T: Send + 'static> Engine<T> {
 
     /// Leaves a link's calls to another thread of the pool.
     pub(super) fn hand_over(&self, link: &LinkCell) {
-        self.crew().hand_over(link.token());
+        self.thread_pool().hand_over(link.token());
     }
 
     fn park(&self, turn: Turn, parked: Parked) {
@@ -165,9 +165,9 @@ impl<T: Send + 'static> Engine<T> {
     /// Calls that were parked and have their turn now are left to the pool.
     pub(super) fn go_on_with_parked(&self) {
         if self.services.state.has_ready()
-            && let Some(seat) = self.seat()
+            && let Some(unit_number) = self.unit_number()
         {
-            self.crew().hand_over(crate::threads::token(seat, u64::MAX));
+            self.thread_pool().hand_over(crate::threads::token(unit_number, u64::MAX));
         }
     }
 

@@ -3,7 +3,7 @@
 
 use std::sync::Arc;
 
-use cara_core::services::unit::Event;
+use cara_core::services::session::Event;
 use cara_core::time::{Duration, Instant};
 
 use super::Engine;

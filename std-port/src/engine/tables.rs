@@ -7,8 +7,8 @@ use cara_core::distribution::function_list::Entry;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, Limit};
 use cara_core::services::requests::CallId;
+use cara_core::services::session::{RequestOptions, SessionStorage};
 use cara_core::services::slots_for;
-use cara_core::services::unit::{RequestOptions, SessionStorage};
 use cara_core::time::Instant;
 
 use super::Engine;

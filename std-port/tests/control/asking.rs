@@ -58,10 +58,10 @@ fn nodes_are_told_with_what_is_known_of_them() {
 #[test]
 fn who_was_refused_is_told_by_name_with_the_reason() {
     let (depot, agv) = Depot::with_agv();
-    let twin = vehicle("agv", 7, depot.fleet).build().unwrap();
-    twin.start().unwrap();
+    let duplicate = vehicle("agv", 7, depot.fleet).build().unwrap();
+    duplicate.start().unwrap();
     let mut client = depot.client();
-    until("the twin is refused", || {
+    until("the duplicate is refused", || {
         let answers = ask(&mut client, Question::Nodes { offering: None }).unwrap();
         answers.iter().any(|answer| match answer {
             Answer::Refused(refused) => {
@@ -75,7 +75,7 @@ fn who_was_refused_is_told_by_name_with_the_reason() {
     assert_eq!(finding.identity.as_ref().map(|identity| identity.id()), Some(7));
     // Once it has joined, that it was refused before is no news.
     agv.stop();
-    until("the twin has joined", || twin.is_connected());
+    until("the duplicate has joined", || duplicate.is_connected());
     until("it is not told as refused", || {
         let answers = ask(&mut client, Question::Nodes { offering: None }).unwrap();
         !answers.iter().any(|answer| matches!(answer, Answer::Refused(_)))
@@ -109,15 +109,15 @@ fn a_node_that_is_not_meant_alone_is_a_failure_that_lists_what_there_is() {
     let depot = Depot::new();
     let mut client = depot.client();
     let functions = |node: &str| Question::Functions { node: node.to_owned() };
-    assert!(ask(&mut client, functions("twin")).unwrap_err().text.contains("none has joined"));
-    let _agvs = [depot.agv("twin", 7), depot.agv("twin", 8)];
-    let failure = ask(&mut client, functions("twin")).unwrap_err();
+    assert!(ask(&mut client, functions("duplicate")).unwrap_err().text.contains("none has joined"));
+    let _agvs = [depot.agv("duplicate", 7), depot.agv("duplicate", 8)];
+    let failure = ask(&mut client, functions("duplicate")).unwrap_err();
     assert_eq!((failure.error.as_str(), failure.cause.as_str()), ("AmbiguousNode", "configuration"));
-    assert!(failure.text.contains("twin/7") && failure.text.contains("twin/8"), "{failure}");
-    let failure = ask(&mut client, functions("twin/9")).unwrap_err();
+    assert!(failure.text.contains("duplicate/7") && failure.text.contains("duplicate/8"), "{failure}");
+    let failure = ask(&mut client, functions("duplicate/9")).unwrap_err();
     assert_eq!(failure.error, "UnknownNode");
-    assert!(failure.text.contains("twin/7, twin/8"), "{failure}");
-    assert!(ask(&mut client, functions("twin/8")).is_ok());
+    assert!(failure.text.contains("duplicate/7, duplicate/8"), "{failure}");
+    assert!(ask(&mut client, functions("duplicate/8")).is_ok());
 }
 
 #[test]

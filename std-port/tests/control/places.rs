@@ -57,11 +57,11 @@ fn a_directory_that_others_enter_is_refused_and_the_unit_runs() {
 #[test]
 fn a_second_unit_of_the_same_name_runs_without_a_socket_and_the_first_keeps_its_own() {
     let depot = Depot::new();
-    let twin = manager("manager", 1, depot.fleet ^ 1).control(Control::Path(depot.path())).build().unwrap();
-    twin.start().unwrap();
-    assert_eq!(twin.control_path(), None);
+    let duplicate = manager("manager", 1, depot.fleet ^ 1).control(Control::Path(depot.path())).build().unwrap();
+    duplicate.start().unwrap();
+    assert_eq!(duplicate.control_path(), None);
     assert_eq!(depot.client().unit().fleet, depot.fleet);
-    drop(twin);
+    drop(duplicate);
     assert_eq!(depot.client().unit().fleet, depot.fleet, "it removes nothing that is not its own");
 }
 

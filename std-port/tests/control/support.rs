@@ -140,7 +140,8 @@ pub(crate) fn vehicle_of(manager: (&str, u32), name: &str, id: u32, fleet: u32) 
 /// All vehicles of these tests.
 fn vehicles() -> Vec<Identity> {
     let numbered = (0..4).map(|id| (format!("agv{id}"), id));
-    let named = [("agv", 7), ("twin", 7), ("twin", 8), ("lone-agv", 9)].map(|(name, id)| (name.to_owned(), id));
+    let named =
+        [("agv", 7), ("duplicate", 7), ("duplicate", 8), ("lone-agv", 9)].map(|(name, id)| (name.to_owned(), id));
     let all = named.into_iter().chain(numbered);
     all.map(|(name, id)| Identity::s_unit(&name, id).unwrap()).collect()
 }

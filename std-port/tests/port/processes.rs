@@ -207,16 +207,16 @@ fn a_restart_and_a_twin_are_told_apart() {
     assert_eq!(left, Some(CloseReason::PeerRestarted), "it did not take three keep-alives to notice");
     assert_eq!(life("bystander"), Some(20));
 
-    let twin = unit("agv", 7, fleet).build().unwrap();
-    let told = twin.events();
-    twin.start().unwrap();
+    let duplicate = unit("agv", 7, fleet).build().unwrap();
+    let told = duplicate.events();
+    duplicate.start().unwrap();
     loop {
         match told.recv_timeout(PATIENCE).unwrap() {
             UnitEvent::NotJoined { reason: CloseReason::Refused(refusal), .. } => {
                 assert_eq!(refusal, Refusal::DuplicateIdentity);
                 break;
             }
-            UnitEvent::Joined { .. } => panic!("the twin was taken while the second lives"),
+            UnitEvent::Joined { .. } => panic!("the duplicate was taken while the second lives"),
             _ => {}
         }
     }

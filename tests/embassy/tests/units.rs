@@ -15,7 +15,7 @@ use cara_core::error::{CloseReason, Constraint, Error, ServiceError};
 use cara_core::host::connections::LinkCounter;
 use cara_core::services::access::{Functions, Rule, Verbs, Who};
 use cara_core::services::lease::Lease;
-use cara_core::services::unit::RequestOptions;
+use cara_core::services::session::RequestOptions;
 use cara_core::time::{Duration, Instant};
 use cara_embassy::{Config, Handle, Handler, Hook, Limits, Security, ServiceOptions, UnitEvent, resources};
 use cara_embassy_host::{Bench, Board, keys};

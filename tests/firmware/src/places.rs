@@ -105,7 +105,7 @@ mod tests {
 
     #[test]
     fn files_have_owners() {
-        assert_eq!(owner("./core/src/services/unit/inbound.rs"), Some(Owner::Cara));
+        assert_eq!(owner("./core/src/services/session/inbound.rs"), Some(Owner::Cara));
         assert_eq!(owner("cargo/registry/src/index/smoltcp-0.13.1/src/socket/tcp.rs"), Some(Owner::Network));
         assert_eq!(owner("./examples/firmware/lm3s6965evb/src/ethernet.rs"), Some(Owner::Board));
         assert_eq!(owner("/rustc/5980/library/core/src/slice/mod.rs"), None);

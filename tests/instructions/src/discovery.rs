@@ -15,7 +15,7 @@ use cara_core::host::secure::Plain;
 use cara_core::services::hub::Hub;
 use cara_core::services::publications::{Publications, PublishedToOne};
 use cara_core::services::requests::Pending;
-use cara_core::services::unit::{Event, Publication, Session, SessionConfig, SessionStorage};
+use cara_core::services::session::{Event, Publication, Session, SessionConfig, SessionStorage};
 use cara_core::services::{CallHead, Context};
 use cara_core::storage::{Buffer, Lent, Pool};
 use cara_core::time::{Duration, Instant};

@@ -4,7 +4,7 @@
 //! `valgrind --tool=callgrind --toggle-collect='*counted_by_callgrind*' cara-instructions N` for each.
 
 use cara_core::distribution::parameters::Parameters;
-use cara_core::services::unit::buffer_bytes;
+use cara_core::services::session::buffer_bytes;
 use cara_instructions::{Blocks, Discovery, DiscoveryMemory, Meter, Operation, Pair, PairMemory};
 
 const CHARACTERS: u32 = 20_000;

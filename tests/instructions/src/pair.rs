@@ -19,7 +19,7 @@ use cara_core::services::hub::Hub;
 use cara_core::services::lease::{Lease, Service};
 use cara_core::services::publications::{Publications, PublishedToOne};
 use cara_core::services::requests::{CallId, Pending};
-use cara_core::services::unit::{Call, Event, Publication, RequestOptions, Session, SessionConfig, SessionStorage};
+use cara_core::services::session::{Call, Event, Publication, RequestOptions, Session, SessionConfig, SessionStorage};
 use cara_core::services::{CallHead, Context, Port};
 use cara_core::storage::{Buffer, Lent, Pool};
 use cara_core::time::{Duration, Instant};

@@ -5,7 +5,7 @@ use core::net::{SocketAddr, SocketAddrV4};
 use cara_core::error::CloseReason;
 use cara_core::host::connections::{Incoming, Link, Liveness, Place};
 use cara_core::host::endpoint::Endpoint;
-use cara_core::host::frame::{self, ChunkWriter, Cut, Frame};
+use cara_core::host::frame::{self, ChunkWriter, Chunking, Frame};
 use cara_core::host::mailman::{LinkId, Mailman};
 use cara_core::storage::{Lent, Pool};
 
@@ -43,9 +43,9 @@ entry!(frames, {
 });
 
 entry!(chunks, {
-    let cut: &Cut = unknown();
-    keep(cut.framed_length(*unknown()));
-    if let Some(mut writer) = ChunkWriter::new(unknown_slice(), *cut, *unknown(), *unknown()) {
+    let chunking: &Chunking = unknown();
+    keep(chunking.framed_length(*unknown()));
+    if let Some(mut writer) = ChunkWriter::new(unknown_slice(), *chunking, *unknown(), *unknown()) {
         writer.put(unknown_slice());
         keep(writer);
     }

@@ -59,7 +59,7 @@ entry!(node_polled, {
 
 entry!(node_hears, {
     node().datagram(*unknown(), *unknown(), unknown_slice(), &AnyCodes);
-    keep(node().take_twin());
+    keep(node().take_duplicate());
 });
 
 entry!(node_dials, {

@@ -12,7 +12,7 @@ use cara_core::services::access::{self, Access, Bucket, Functions, Principal, Ra
 use cara_core::services::lease::{Lease, Service};
 use cara_core::services::publications::Publications;
 use cara_core::services::requests::Requests;
-use cara_core::services::unit::{self, Event, ReplyBlock, Session, SessionConfig, SessionStorage};
+use cara_core::services::session::{self, Event, ReplyBlock, Session, SessionConfig, SessionStorage};
 use cara_core::services::{Context, OwnFunctions, Port, slots_for};
 use cara_core::storage::{Lent, Pool};
 
@@ -143,7 +143,7 @@ entry!(session_polled, {
 
 entry!(session_set, {
     session().set_constraints(context(), *unknown());
-    keep(unit::buffer_bytes(*unknown(), *unknown()));
+    keep(session::buffer_bytes(*unknown(), *unknown()));
 });
 
 entry!(session_requests, {

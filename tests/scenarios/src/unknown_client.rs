@@ -5,7 +5,7 @@ use cara_core::distribution::datagram::{SEARCH_BYTES, WhoHas};
 use cara_core::distribution::hello::{Hello, Limits, Manager};
 use cara_core::distribution::identity::{Epoch, Fleet, Identity};
 use cara_core::error::Refusal;
-use cara_core::host::frame::{self, ChunkWriter, Cut, Frame};
+use cara_core::host::frame::{self, ChunkWriter, Chunking, Frame};
 use cara_core::host::secure::Plain;
 use cara_core::random::Random;
 
@@ -137,7 +137,7 @@ fn who_has(fleet: u32) -> Vec<u8> {
 
 /// All of the first chunk of a message but its last bytes.
 fn half_a_message() -> Vec<u8> {
-    let cut = Cut { chunk: 500, overhead: 0 };
+    let cut = Chunking { chunk: 500, overhead: 0 };
     let mut bytes = vec![0; cut.framed_length(MESSAGE)];
     let writer = ChunkWriter::new(&mut bytes, cut, Priority::Normal, MESSAGE);
     writer.expect("there is room").put(&[1; MESSAGE]);

@@ -15,7 +15,7 @@ use cara_core::services::access::Rule;
 use cara_core::services::event::UnitEvent;
 use cara_core::services::lease::LeaseEnd;
 use cara_core::services::requests::CallId;
-use cara_core::services::unit::RequestOptions;
+use cara_core::services::session::RequestOptions;
 use cara_core::time::{Duration, Instant};
 use cara_sim::{BoxedParameters, Path};
 

@@ -11,7 +11,7 @@ use cara_core::error::{CloseReason, Error};
 use cara_core::host::mailman::{LinkId, Mailman};
 use cara_core::host::secure::Plain;
 use cara_core::services::hub::Hub;
-use cara_core::services::unit::{Call, Delivery, Event, RequestOptions, Session, SessionConfig, SessionStorage};
+use cara_core::services::session::{Call, Delivery, Event, RequestOptions, Session, SessionConfig, SessionStorage};
 use cara_core::services::{Context, Port, Ticket};
 use cara_core::storage::Pool;
 use cara_core::time::{Duration, Instant};

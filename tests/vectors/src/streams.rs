@@ -2,7 +2,7 @@
 
 use cara_core::config::Priority;
 use cara_core::distribution::message::{SessionBody, encode_reply};
-use cara_core::host::frame::{ChunkWriter, Cut, Frame, encode};
+use cara_core::host::frame::{ChunkWriter, Chunking, Frame, encode};
 use serde_json::{Value, json};
 
 use crate::decoded::hex;
@@ -23,7 +23,7 @@ pub(crate) fn frame(frame: &Frame<'_>) -> Vec<u8> {
 
 /// A message in chunks of at most `chunk` bytes.
 pub(crate) fn chunked(chunk: usize, priority: Priority, message: &[u8]) -> Vec<u8> {
-    let cut = Cut { chunk, overhead: 0 };
+    let cut = Chunking { chunk, overhead: 0 };
     let mut out = vec![0; cut.framed_length(message.len())];
     if let Some(mut writer) = ChunkWriter::new(&mut out, cut, priority, message.len()) {
         writer.put(message);

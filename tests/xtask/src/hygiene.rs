@@ -125,7 +125,7 @@ mod tests {
         let told = |file: &str, text: &str| loses_failing_cases(Path::new(file), text, &files).is_some();
         assert!(told("core/tests/hostile.rs", "proptest! {}"));
         assert!(!told("core/tests/hostile.rs", "use proptest::prelude::*; // proptest! {}"));
-        assert!(!told("core/src/services/unit/tests.rs", "proptest! {}"));
+        assert!(!told("core/src/services/session/tests.rs", "proptest! {}"));
         assert!(!told("sim/tests/network/streams.rs", "proptest! {}"));
     }
 }

@@ -40,13 +40,13 @@ const HOST_FOR_SERVICES: [Purpose; 17] = [
     },
     Purpose {
         what: "what happens on a link is counted in the link",
-        places: &["services/unit"],
+        places: &["services/session"],
         items: &["connections::LinkCounter"],
     },
     Purpose { what: "what a port is made of, for all layers", places: &["services/mod.rs"], items: &["port::Port"] },
     Purpose {
         what: "the peer's host, and where on it its datagrams go",
-        places: &["services/unit/inbound.rs", "services/unit/proving.rs", "services/unit/timing.rs"],
+        places: &["services/session/inbound.rs", "services/session/proving.rs", "services/session/timing.rs"],
         items: &["endpoint::Endpoint"],
     },
     Purpose {
@@ -56,54 +56,54 @@ const HOST_FOR_SERVICES: [Purpose; 17] = [
     },
     Purpose {
         what: "the link that a session owns, and the port's name of it",
-        places: &["services/unit/mod.rs"],
+        places: &["services/session/mod.rs"],
         items: &["connections::Link", "mailman::LinkId"],
     },
     Purpose {
         what: "whether the peer is still there decides how long a session lasts",
-        places: &["services/unit/mod.rs", "services/unit/proving.rs"],
+        places: &["services/session/mod.rs", "services/session/proving.rs"],
         items: &["connections::Liveness"],
     },
-    Purpose { what: "hello and farewell", places: &["services/unit/mod.rs"], items: &["frame::Frame"] },
-    Purpose { what: "a ping", places: &["services/unit/pinging.rs"], items: &["frame::Frame"] },
+    Purpose { what: "hello and farewell", places: &["services/session/mod.rs"], items: &["frame::Frame"] },
+    Purpose { what: "a ping", places: &["services/session/pinging.rs"], items: &["frame::Frame"] },
     Purpose {
         what: "session bodies: leases, and what else fits a datagram",
-        places: &["services/unit/holding.rs", "services/unit/timing.rs"],
+        places: &["services/session/holding.rs", "services/session/timing.rs"],
         items: &["frame::Frame"],
     },
     Purpose {
         what: "proof and renewal of keys: their frames, and where they lie",
-        places: &["services/unit/proving.rs", "services/unit/renewing.rs"],
+        places: &["services/session/proving.rs", "services/session/renewing.rs"],
         items: &["connections::Place", "frame::Frame"],
     },
     Purpose {
         what: "the step of a renewal that is kept until it can be sent",
-        places: &["services/unit/renewing.rs"],
+        places: &["services/session/renewing.rs"],
         items: &["secure::PROOF_BYTES"],
     },
     Purpose {
         what: "what a link has received whole, where it lies, and the answer to a ping",
-        places: &["services/unit/inbound.rs"],
+        places: &["services/session/inbound.rs"],
         items: &["connections::Incoming", "connections::Place", "frame::Frame"],
     },
     Purpose {
         what: "why a session datagram is dropped",
-        places: &["services/unit/inbound.rs"],
+        places: &["services/session/inbound.rs"],
         items: &["secure::Unopened"],
     },
     Purpose {
         what: "how large a frame is that needs no buffer, and what a chunk adds",
-        places: &["services/unit/mod.rs"],
+        places: &["services/session/mod.rs"],
         items: &["frame::HEADER_BYTES"],
     },
     Purpose {
         what: "how large a buffer is that a session datagram fits",
-        places: &["services/unit/timing.rs"],
+        places: &["services/session/timing.rs"],
         items: &["secure::DATAGRAM_OVERHEAD"],
     },
     Purpose {
         what: "requests and replies are encoded in place",
-        places: &["services/unit/answering.rs", "services/unit/outbound.rs"],
+        places: &["services/session/answering.rs", "services/session/outbound.rs"],
         items: &["frame::ChunkWriter"],
     },
 ];
@@ -344,8 +344,8 @@ mod tests {
 
     #[test]
     fn arrows_down_are_right() {
-        assert_eq!(arrows("services/unit.rs", "use crate::distribution::message::Message;"), 0);
-        assert_eq!(arrows("services/unit/mod.rs", "use crate::host::{connections::Link, mailman::LinkId};"), 0);
+        assert_eq!(arrows("services/session.rs", "use crate::distribution::message::Message;"), 0);
+        assert_eq!(arrows("services/session/mod.rs", "use crate::host::{connections::Link, mailman::LinkId};"), 0);
         assert_eq!(arrows("distribution/message.rs", "use crate::{host::frame::Frame, error::Error};"), 0);
         assert_eq!(arrows("host/frame.rs", "use super::mailman::LinkId; use crate::config::CHUNK_BYTES;"), 0);
         assert_eq!(arrows("error.rs", "use crate::time::Duration;"), 0);
@@ -353,13 +353,13 @@ mod tests {
 
     #[test]
     fn an_arrow_up_is_wrong_in_every_spelling() {
-        assert_eq!(arrows("host/frame.rs", "use crate::services::unit::Unit;"), 1);
+        assert_eq!(arrows("host/frame.rs", "use crate::services::session::Unit;"), 1);
         assert_eq!(arrows("host/frame.rs", "use super::super::distribution::message;"), 1);
         assert_eq!(arrows("host/frame.rs", "use crate::{error::Error, distribution::{message, identity}};"), 2);
-        assert_eq!(arrows("host/frame/inner.rs", "fn f() { super::super::super::services::unit::run() }"), 1);
+        assert_eq!(arrows("host/frame/inner.rs", "fn f() { super::super::super::services::session::run() }"), 1);
         assert_eq!(arrows("host/mod.rs", "pub use super::distribution::message;"), 1);
         assert_eq!(arrows("time.rs", "use crate::host::mailman::LinkId;"), 1);
-        assert_eq!(arrows("distribution/message.rs", "use cara_core::services::unit::Unit;"), 1);
+        assert_eq!(arrows("distribution/message.rs", "use cara_core::services::session::Unit;"), 1);
     }
 
     #[test]
@@ -369,30 +369,30 @@ mod tests {
 
     #[test]
     fn services_reach_past_their_neighbour_only_where_it_is_written() {
-        assert_eq!(arrows("services/unit.rs", "use crate::host::something_else::Thing;"), 1);
-        assert_eq!(arrows("services/unit.rs", "use crate::host;"), 1);
+        assert_eq!(arrows("services/session.rs", "use crate::host::something_else::Thing;"), 1);
+        assert_eq!(arrows("services/session.rs", "use crate::host;"), 1);
         // Of each module of the host layer: what is not listed, the module as a whole, everything in it.
         for module in ["connections", "frame", "mailman", "secure"] {
             for item in ["Unlisted", "*", "{self}", "{*}", "{Unlisted as Link}"] {
                 let text = format!("use crate::host::{module}::{item};");
-                assert_eq!(arrows("services/unit/mod.rs", &text), 1, "{text}");
+                assert_eq!(arrows("services/session/mod.rs", &text), 1, "{text}");
             }
-            assert_eq!(arrows("services/unit.rs", &format!("use crate::host::{module};")), 1);
+            assert_eq!(arrows("services/session.rs", &format!("use crate::host::{module};")), 1);
         }
-        assert_eq!(arrows("services/unit/mod.rs", "use crate::host::connections::{Link, Received};"), 1);
-        assert_eq!(arrows("services/unit.rs", "fn f() { crate::host::frame::encode() }"), 1);
+        assert_eq!(arrows("services/session/mod.rs", "use crate::host::connections::{Link, Received};"), 1);
+        assert_eq!(arrows("services/session.rs", "fn f() { crate::host::frame::encode() }"), 1);
         assert_eq!(arrows("distribution/message.rs", "use crate::host::frame::Cut;"), 0, "a neighbour");
     }
 
     #[test]
     fn a_purpose_holds_for_its_files_only() {
         let writer = "fn f(writer: &mut crate::host::frame::ChunkWriter<'_>) {}";
-        assert_eq!(arrows("services/unit/outbound.rs", writer), 0);
-        for other in ["services/unit/granting.rs", "services/unit/outbound_too.rs", "services/requests.rs"] {
+        assert_eq!(arrows("services/session/outbound.rs", writer), 0);
+        for other in ["services/session/granting.rs", "services/session/outbound_too.rs", "services/requests.rs"] {
             assert_eq!(arrows(other, writer), 1, "{other}");
         }
         let counter = "use crate::host::connections::LinkCounter;";
-        assert_eq!((arrows("services/unit/new.rs", counter), arrows("services/lease.rs", counter)), (0, 1));
+        assert_eq!((arrows("services/session/new.rs", counter), arrows("services/lease.rs", counter)), (0, 1));
         assert_eq!(arrows("services/lease.rs", "use crate::host::secure::Secure;"), 0);
     }
 
@@ -403,7 +403,7 @@ mod tests {
             unused_exceptions(&used_of_host(&source, &HashSet::new())).len()
         };
         let all: usize = HOST_FOR_SERVICES.iter().map(|purpose| purpose.places.len() * purpose.items.len()).sum();
-        let file = "services/unit/pinging.rs";
+        let file = "services/session/pinging.rs";
         assert_eq!(unused(file, ""), all);
         assert_eq!(unused(file, "use crate::host::frame::Frame;"), all - 1);
         assert_eq!(unused("services/requests.rs", "use crate::host::frame::Frame;"), all);
@@ -412,7 +412,7 @@ mod tests {
 
     #[test]
     fn tests_may_use_any_layer() {
-        assert_eq!(arrows("host/frame.rs", "#[cfg(test)] mod tests { use crate::services::unit::Unit; }"), 0);
+        assert_eq!(arrows("host/frame.rs", "#[cfg(test)] mod tests { use crate::services::session::Unit; }"), 0);
     }
 
     #[test]

@@ -34,7 +34,7 @@ impl<E> Duplicates<E> {
 impl<P: Port> Node<P> {
     /// The address of another live node with this unit's own name and id, reported once for each of its boots. It waits
     /// until this unit stops, or this one waits for it: give each node its own name or id.
-    pub fn take_twin(&mut self) -> Option<P::Endpoint> {
+    pub fn take_duplicate(&mut self) -> Option<P::Endpoint> {
         self.duplicates.pending.take()
     }
 

@@ -8,7 +8,7 @@ use std::vec::Vec;
 use super::{Incoming, Link};
 use crate::config::{LINK_BUFFER_BYTES, Priority};
 use crate::error::CloseReason;
-use crate::host::frame::{self, ChunkWriter, Cut, Frame};
+use crate::host::frame::{self, ChunkWriter, Chunking, Frame};
 use crate::host::mailman::{LinkId, Mailman};
 use crate::host::secure::Seal;
 use crate::storage::{Boxed, Pool};
@@ -149,9 +149,9 @@ pub(super) fn read<C: Seal>(cipher: C, bytes: &[u8]) -> Vec<Item> {
 
 /// A message as plain frames.
 pub(super) fn message(priority: Priority, bytes: &[u8], chunk: usize) -> Vec<u8> {
-    let cut = Cut { chunk, overhead: 0 };
-    let mut out = vec![0; cut.framed_length(bytes.len())];
-    ChunkWriter::new(&mut out, cut, priority, bytes.len()).unwrap().put(bytes);
+    let chunking = Chunking { chunk, overhead: 0 };
+    let mut out = vec![0; chunking.framed_length(bytes.len())];
+    ChunkWriter::new(&mut out, chunking, priority, bytes.len()).unwrap().put(bytes);
     out
 }
 

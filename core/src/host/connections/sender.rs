@@ -10,7 +10,7 @@ use super::urgent::Urgent;
 use crate::bytes;
 use crate::config::{EMERGENCY_BYTES, MINIMUM_CHUNK_BYTES, Priority};
 use crate::error::{CloseReason, Error, Limit};
-use crate::host::frame::{self, ChunkWriter, Cut, Frame};
+use crate::host::frame::{self, ChunkWriter, Chunking, Frame};
 use crate::host::mailman::{LinkId, Mailman};
 use crate::host::secure::Seal;
 use crate::storage::{Buffer, Buffers, LEFT_BY_SENDING, Storage};
@@ -21,7 +21,7 @@ const URGENT_BYTES: usize = 2 * EMERGENCY_RESERVE;
 const EMERGENCY_RESERVE: usize = EMERGENCY_BYTES + 64;
 
 pub(super) struct Sender<S: Storage> {
-    cut: Cut,
+    chunking: Chunking,
     urgent: Urgent<URGENT_BYTES>,
     queues: [Option<SendQueue<S>>; 3],
     /// The queue whose frames were sealed last and are not all written, or whose message is not complete.
@@ -52,7 +52,7 @@ enum Progress {
 impl<S: Storage> Sender<S> {
     pub(super) fn new(overhead: usize) -> Self {
         Self {
-            cut: Cut { chunk: MINIMUM_CHUNK_BYTES, overhead },
+            chunking: Chunking { chunk: MINIMUM_CHUNK_BYTES, overhead },
             urgent: Urgent::new(),
             queues: [const { None }; 3],
             current: None,
@@ -61,7 +61,7 @@ impl<S: Storage> Sender<S> {
     }
 
     pub(super) fn set_chunk(&mut self, chunk: usize) {
-        self.cut.chunk = chunk;
+        self.chunking.chunk = chunk;
     }
 
     /// The network did not take all that it was offered.
@@ -77,7 +77,7 @@ impl<S: Storage> Sender<S> {
     /// queues hold the buffer that it needs.
     pub(super) fn is_in_the_way(&self, buffers: &mut dyn Buffers<S>, priority: Priority, total: usize) -> bool {
         match queue_index(priority).and_then(|index| self.queues.get(index)) {
-            Some(Some(queue)) => self.cut.framed_length(total) > queue.room(),
+            Some(Some(queue)) => self.chunking.framed_length(total) > queue.room(),
             // The buffer is only looked for, not kept: between this question and the message another link may need it.
             Some(None) if self.queues.iter().any(Option::is_some) => match buffers.take_leaving(LEFT_BY_SENDING) {
                 Some(buffer) => {
@@ -105,7 +105,7 @@ impl<S: Storage> Sender<S> {
                 slot.insert(SendQueue::new(buffers.take_leaving(LEFT_BY_SENDING).ok_or(Error::Full(Limit::Buffers))?))
             }
         };
-        let Err(error) = queue.append(self.cut, priority, total, write) else { return Ok(()) };
+        let Err(error) = queue.append(self.chunking, priority, total, write) else { return Ok(()) };
         if queue.waiting() == 0
             && let Some(queue) = slot.take()
         {
@@ -121,7 +121,7 @@ impl<S: Storage> Sender<S> {
             && !self.blocked
             && self.queues.iter().all(Option::is_none)
             && priority != Priority::Emergency
-            && self.cut.framed_length(total) <= MINIMUM_CHUNK_BYTES
+            && self.chunking.framed_length(total) <= MINIMUM_CHUNK_BYTES
     }
 
     /// After an attempt to write the only message, which went with the urgent frames: if the network has not begun to
@@ -132,9 +132,9 @@ impl<S: Storage> Sender<S> {
         priority: Priority,
         total: usize,
     ) -> Result<(), Error> {
-        let framed = self.cut.framed_length(total);
+        let framed = self.chunking.framed_length(total);
         let Some(index) = queue_index(priority) else { return Ok(()) };
-        if !self.blocked || self.cut.overhead > 0 || self.urgent.len() != framed {
+        if !self.blocked || self.chunking.overhead > 0 || self.urgent.len() != framed {
             return Ok(());
         }
         let queue = buffers.take_leaving(LEFT_BY_SENDING).map(|buffer| SendQueue::of(buffer, self.urgent.sealed()));
@@ -159,7 +159,7 @@ impl<S: Storage> Sender<S> {
         total: usize,
         write: impl FnOnce(&mut ChunkWriter<'_>),
     ) -> bool {
-        let framed = self.cut.framed_length(total);
+        let framed = self.chunking.framed_length(total);
         let end = self.urgent.len().saturating_add(framed);
         framed <= MINIMUM_CHUNK_BYTES
             && end <= URGENT_BYTES.saturating_sub(EMERGENCY_RESERVE)
@@ -172,13 +172,13 @@ impl<S: Storage> Sender<S> {
         total: usize,
         write: impl FnOnce(&mut ChunkWriter<'_>),
     ) -> bool {
-        let place = self.urgent.append(self.cut.framed_length(total));
-        let writer = place.and_then(|place| ChunkWriter::new(place, self.cut, priority, total));
+        let place = self.urgent.append(self.chunking.framed_length(total));
+        let writer = place.and_then(|place| ChunkWriter::new(place, self.chunking, priority, total));
         writer.map(|mut writer| write(&mut writer)).is_some()
     }
 
     pub(super) fn accept_frame(&mut self, frame: &Frame<'_>) -> bool {
-        self.append_frame(frame, self.cut.overhead)
+        self.append_frame(frame, self.chunking.overhead)
     }
 
     /// A frame in clear; only while no sealed frame is queued.
@@ -203,7 +203,7 @@ impl<S: Storage> Sender<S> {
 
     /// Whether all of these frames that are no chunks would be accepted now.
     pub(super) fn has_room_for_frames(&self, frames: &[Frame<'_>]) -> bool {
-        let length = |frame| frame::encoded_length(frame, self.cut.overhead);
+        let length = |frame| frame::encoded_length(frame, self.chunking.overhead);
         let end = frames.iter().map(length).fold(self.urgent.len(), usize::saturating_add);
         end <= URGENT_BYTES.saturating_sub(EMERGENCY_RESERVE)
     }
@@ -240,7 +240,7 @@ impl<S: Storage> Sender<S> {
         if let Some(Some(queue)) = self.current.and_then(|index| self.queues.get_mut(index)) {
             let progress = queue.write(id, mailman, written)?;
             if progress == Progress::Blocked {
-                if self.cut.overhead == 0 {
+                if self.chunking.overhead == 0 {
                     queue.unseal();
                 }
                 return Ok(progress);
@@ -262,7 +262,7 @@ impl<S: Storage> Sender<S> {
         // Urgent frames go between two frames of a message, never into one: the cipher counts frames in the order of the stream.
         while self.urgent.has_unsealed() {
             let rest = self.urgent.unsealed();
-            let turns = frame::is_turn(rest, self.cut.overhead);
+            let turns = frame::is_turn(rest, self.chunking.overhead);
             let length = seal_first(cipher, rest)?;
             self.urgent.note_sealed(length);
             if turns {
@@ -274,11 +274,11 @@ impl<S: Storage> Sender<S> {
         }
         self.current = self.next_queue();
         let Some(Some(queue)) = self.current.and_then(|index| self.queues.get_mut(index)) else { return Ok(false) };
-        let most = match self.cut.overhead {
+        let most = match self.chunking.overhead {
             0 => usize::MAX,
             // A seal cannot be taken back, and what is sealed cannot be overtaken. So no more is sealed than the network takes now.
             _ if self.blocked => 0,
-            _ => ahead.max(self.cut.chunk),
+            _ => ahead.max(self.chunking.chunk),
         };
         queue.seal(cipher, most)?;
         Ok(true)
@@ -339,12 +339,12 @@ impl<S: Storage> SendQueue<S> {
 
     fn append(
         &mut self,
-        cut: Cut,
+        chunking: Chunking,
         priority: Priority,
         total: usize,
         write: impl FnOnce(&mut ChunkWriter<'_>),
     ) -> Result<(), Error> {
-        let framed = cut.framed_length(total);
+        let framed = chunking.framed_length(total);
         let size = self.buffer.len();
         if framed > size {
             let limit = size.saturating_sub(framed.saturating_sub(total));
@@ -358,7 +358,7 @@ impl<S: Storage> SendQueue<S> {
         }
         let end = self.end.saturating_add(framed);
         let place = self.buffer.get_mut(self.end..end).unwrap_or(&mut []);
-        let mut writer = ChunkWriter::new(place, cut, priority, total).ok_or(Error::Full(Limit::SendQueue))?;
+        let mut writer = ChunkWriter::new(place, chunking, priority, total).ok_or(Error::Full(Limit::SendQueue))?;
         write(&mut writer);
         self.end = end;
         Ok(())

@@ -2,8 +2,8 @@
 
 use cara_core::config::Priority;
 use cara_core::error::{Error, ServiceError};
-use cara_core::services::unit::Event;
-use cara_core::services::unit::RequestOptions;
+use cara_core::services::session::Event;
+use cara_core::services::session::RequestOptions;
 use cara_core::time::Duration;
 use cara_ethernet::{Fault, Faults};
 

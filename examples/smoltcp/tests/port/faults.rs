@@ -1,7 +1,7 @@
 //! What the port survives: cables, managers and addresses that go and come, one direction that fails, a flood.
 
 use cara_core::error::CloseReason;
-use cara_core::services::unit::Event;
+use cara_core::services::session::Event;
 use cara_core::time::Duration;
 use cara_ethernet::{Fault, Faults, Mac};
 use smoltcp::wire::Ipv4Cidr;

@@ -1,7 +1,7 @@
 //! How a vehicle finds its manager, and finds it again.
 
 use crate::world::World;
-use cara_core::services::unit::Event;
+use cara_core::services::session::Event;
 use cara_core::time::Duration;
 use cara_ethernet::Faults;
 

@@ -53,12 +53,12 @@ const NO_PAIR_KEY_ADVICE: &str = "if it was revoked, or is not known to you, do 
                                   added there";
 
 /// Managers of which there are two.
-pub(crate) fn twin_managers(seen: &Evidence) -> Vec<Finding> {
-    let twins = seen.managers().into_iter().filter_map(|name| duplicate(&name, &seen.lives(&name)));
-    twins.map(|finding| Finding { advice: TWIN_MANAGERS.to_owned(), ..finding }).collect()
+pub(crate) fn duplicate_managers(seen: &Evidence) -> Vec<Finding> {
+    let duplicates = seen.managers().into_iter().filter_map(|name| duplicate(&name, &seen.lives(&name)));
+    duplicates.map(|finding| Finding { advice: DUPLICATE_MANAGERS.to_owned(), ..finding }).collect()
 }
 
-const TWIN_MANAGERS: &str =
+const DUPLICATE_MANAGERS: &str =
     "stop one of the two, or give each a name and id of its own: as it is, each has some of the nodes";
 
 /// A node that has come with one epoch after the other.
@@ -171,16 +171,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lives_one_after_the_other_are_restarts_and_overlapping_ones_twins() {
+    fn lives_one_after_the_other_are_restarts_and_overlapping_ones_duplicates() {
         let once = [life("a/1", 1, 0, 1000), life("a/1", 2, 2000, 2000)];
         assert_eq!(duplicate("a/1", &once), None);
         assert!(!restarting("a/1", &once).unwrap().certain);
         let often = [life("a/1", 1, 0, 1000), life("a/1", 2, 2000, 2000), life("a/1", 3, 3000, 3000)];
         assert!(restarting("a/1", &often).unwrap().certain);
-        let twins = [life("a/1", 1, 0, 3000), life("a/1", 2, 2000, 2000)];
-        assert_eq!(restarting("a/1", &twins), None);
-        assert_eq!(duplicate("a/1", &twins).unwrap().id, Id::Duplicate);
-        assert_eq!(restarting("a/1", &twins[..1]), None);
+        let duplicates = [life("a/1", 1, 0, 3000), life("a/1", 2, 2000, 2000)];
+        assert_eq!(restarting("a/1", &duplicates), None);
+        assert_eq!(duplicate("a/1", &duplicates).unwrap().id, Id::Duplicate);
+        assert_eq!(restarting("a/1", &duplicates[..1]), None);
     }
 
     #[test]

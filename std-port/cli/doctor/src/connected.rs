@@ -22,8 +22,8 @@ const LOSSY: u64 = 50;
 pub(crate) fn check(seen: &Evidence, unit: &Running, node: &NodeInfo) -> Vec<Finding> {
     let name = format!("{}/{}", node.name, node.id);
     let lives = seen.lives(&name);
-    let twins = duplicate(&name, &lives).or_else(|| refused_twin(unit, &name));
-    let mut found: Vec<Finding> = twins.map(|finding| finding.certain(true)).into_iter().collect();
+    let duplicates = duplicate(&name, &lives).or_else(|| refused_duplicate(unit, &name));
+    let mut found: Vec<Finding> = duplicates.map(|finding| finding.certain(true)).into_iter().collect();
     found.extend(restarting(&name, &lives));
     found.extend(lossy(unit, &name));
     if !found.is_empty() {
@@ -43,12 +43,12 @@ fn since(node: &NodeInfo) -> String {
 }
 
 /// Another node of its name was refused a short while ago.
-fn refused_twin(unit: &Running, name: &str) -> Option<Finding> {
+fn refused_duplicate(unit: &Running, name: &str) -> Option<Finding> {
     let recent = |ago_ms: u64| ago_ms < 30_000;
-    let twin = unit.refused.iter().find(|refused| {
+    let duplicate = unit.refused.iter().find(|refused| {
         refused.reason == "DuplicateIdentity" && recent(refused.ago_ms) && refused.node.as_deref() == Some(name)
     });
-    twin.and_then(|refused| refusal(&unit.name(), refused))
+    duplicate.and_then(|refused| refusal(&unit.name(), refused))
 }
 
 /// A link on which signs of life get lost.
@@ -98,7 +98,7 @@ mod tests {
     }
 
     #[test]
-    fn a_life_that_goes_on_beside_the_connected_one_is_a_twin() {
+    fn a_life_that_goes_on_beside_the_connected_one_is_a_duplicate() {
         let mut seen = connected();
         seen.connected_lives = vec![life("agv/7", 1, 0, 9000), life("agv/7", 2, 3000, 3000)];
         assert_eq!(ids(&seen), [Id::Duplicate]);

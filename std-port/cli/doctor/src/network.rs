@@ -6,8 +6,8 @@ use std::net::IpAddr;
 use cara_std::Role;
 
 use super::causes::{
-    dial_of, duplicate, full, missing_manager, one_way, other_version, refusal, restarting, tcp_blocked, text_of,
-    twin_managers,
+    dial_of, duplicate, duplicate_managers, full, missing_manager, one_way, other_version, refusal, restarting,
+    tcp_blocked, text_of,
 };
 use super::connected::lossy;
 use super::evidence::Evidence;
@@ -56,10 +56,10 @@ fn once(found: Vec<Finding>) -> Vec<Finding> {
 fn lives(seen: &Evidence) -> Vec<Finding> {
     let mut nodes: BTreeSet<String> = seen.ours().map(|(_, identity)| identity.to_string()).collect();
     nodes.extend(seen.connected_lives.iter().map(|life| life.node.clone()));
-    let twins = twin_managers(seen);
+    let duplicates = duplicate_managers(seen);
     let judged = nodes.iter().filter_map(|node| {
         let lives = seen.lives(node);
-        let managers = twins.iter().find(|twin| twin.about.as_ref() == Some(node)).cloned();
+        let managers = duplicates.iter().find(|duplicate| duplicate.about.as_ref() == Some(node)).cloned();
         managers.or_else(|| duplicate(node, &lives)).or_else(|| restarting(node, &lives))
     });
     judged.take(MOST).collect()

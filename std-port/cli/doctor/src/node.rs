@@ -7,8 +7,8 @@ use cara_std::survey::Heard;
 use cara_std::{Identity, Manager, Role};
 
 use super::causes::{
-    deaf, dial_of, duplicate, full, missing_manager, one_way, other_fleet, other_version, refusal, restarting,
-    tcp_blocked, text_of, twin_managers,
+    deaf, dial_of, duplicate, duplicate_managers, full, missing_manager, one_way, other_fleet, other_version, refusal,
+    restarting, tcp_blocked, text_of,
 };
 use super::connected;
 use super::evidence::Evidence;
@@ -44,7 +44,7 @@ pub(crate) fn check(seen: &Evidence, which: &Which) -> Vec<Finding> {
     if let Some((heard, identity)) = ours.last().filter(|(_, identity)| identity.role() == Role::MUnit) {
         return heard_m_unit(seen, heard, identity);
     }
-    let mut found = twin_managers(seen);
+    let mut found = duplicate_managers(seen);
     let heard = match ours.last() {
         Some((heard, identity)) => Some(heard_s_unit(seen, which, heard, identity)),
         None => strange(seen, which),
@@ -60,10 +60,10 @@ pub(crate) fn check(seen: &Evidence, which: &Which) -> Vec<Finding> {
 }
 
 fn runs_here(seen: &Evidence, unit: &Running) -> Vec<Finding> {
-    let mut twins = twin_managers(seen);
-    twins.retain(|finding| finding.about.as_deref() == Some(&unit.name()));
-    if !twins.is_empty() {
-        return twins.into_iter().map(|finding| finding.certain(true)).collect();
+    let mut duplicates = duplicate_managers(seen);
+    duplicates.retain(|finding| finding.about.as_deref() == Some(&unit.name()));
+    if !duplicates.is_empty() {
+        return duplicates.into_iter().map(|finding| finding.certain(true)).collect();
     }
     let found = format!("{} is a unit of this host and has run for {} s", unit.name(), unit.unit.uptime_ms / 1000);
     // Another one of its name has had time to show itself twice.
@@ -270,8 +270,8 @@ fn heard_m_unit(seen: &Evidence, heard: &Heard, identity: &Identity) -> Vec<Find
 fn heard_s_unit(seen: &Evidence, which: &Which, heard: &Heard, identity: &Identity) -> Vec<Finding> {
     let name = identity.to_string();
     let lives = seen.lives(&name);
-    let twins = duplicate(&name, &lives);
-    if let Some(found) = twins {
+    let duplicates = duplicate(&name, &lives);
+    if let Some(found) = duplicates {
         return vec![found.certain(true)];
     }
     let refused = refusals(seen, which, Some(heard));

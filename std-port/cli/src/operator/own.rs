@@ -76,14 +76,14 @@ fn refuse_if_it_answers(identity: &NameAndId, global: &Global) -> anyhow::Result
     let Ok(mut survey) = survey else { return Ok(()) };
     let fleet = Fleet(global.fleet.unwrap_or(0));
     let is_it = |survey: &Survey| {
-        let twin = survey.heard().iter().find(|heard| {
+        let duplicate = survey.heard().iter().find(|heard| {
             let same = heard.identity.as_ref().is_some_and(|other| {
                 // A vehicle of the same name and ID would be mistaken for it, too.
                 other.name() == identity.name && other.id() == identity.id
             });
             same && heard.fleet == fleet
         });
-        twin.map(|twin| twin.source)
+        duplicate.map(|duplicate| duplicate.source)
     };
     survey.ask(fleet);
     survey.listen_until(Instant::now().checked_add(TWIN), |survey| is_it(survey).is_some());

@@ -29,8 +29,8 @@ fn a_scan_shows_who_is_there() {
 fn a_scan_shows_who_was_refused_and_why() {
     let stage = Stage::with(&["agv-1"]);
     // The same name and ID as the one that is there.
-    let twin = stage.vehicle("agv-1", 11).build().unwrap();
-    twin.start().unwrap();
+    let duplicate = stage.vehicle("agv-1", 11).build().unwrap();
+    duplicate.start().unwrap();
     let start = std::time::Instant::now();
     loop {
         let told = stage.ends(0, &["scan", "--json"]).json();
@@ -41,7 +41,7 @@ fn a_scan_shows_who_was_refused_and_why() {
         std::thread::sleep(std::time::Duration::from_millis(100));
     }
     stage.ends(0, &["scan"]).says("DuplicateIdentity").says("give each node its own");
-    twin.stop();
+    duplicate.stop();
 }
 
 #[test]

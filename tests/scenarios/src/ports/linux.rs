@@ -19,7 +19,7 @@ use cara_core::error::{Error, ServiceError};
 use cara_core::host::connections::LinkCounter;
 use cara_core::services::access::Rule;
 use cara_core::services::requests::CallId;
-use cara_core::services::unit::RequestOptions;
+use cara_core::services::session::RequestOptions;
 use cara_core::time::{Duration, Instant};
 use cara_std::access::AccessTable;
 use cara_std::{

@@ -15,7 +15,7 @@ use cara_core::host::connections::LinkCounter;
 use cara_core::random::Random;
 use cara_core::services::access::Rule;
 use cara_core::services::requests::CallId;
-use cara_core::services::unit::RequestOptions;
+use cara_core::services::session::RequestOptions;
 use cara_core::time::{Duration, Instant};
 use cara_sim::{Action, Chance, Crash, Direction, HostId, LeaseWatch, Path, StreamId, UnitEvent, UnitHandle};
 
@@ -32,7 +32,7 @@ const ALWAYS: Duration = Duration::from_secs(24 * 3_600);
 const PATIENT: RequestOptions = RequestOptions {
     timeout: Some(Duration::from_secs(8)),
     priority: None,
-    delivery: cara_core::services::unit::Delivery::Reliable,
+    delivery: cara_core::services::session::Delivery::Reliable,
     renew_lease: true,
 };
 /// Where simulated m_units listen.

@@ -1,6 +1,6 @@
 //! Whatever happens, one thing after another: nothing runs twice, nothing moves unwanted, and all come back.
 
-use cara_core::services::unit::RequestOptions;
+use cara_core::services::session::RequestOptions;
 use cara_core::time::Duration;
 use cara_sim::Path;
 

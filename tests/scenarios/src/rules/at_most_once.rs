@@ -3,7 +3,7 @@
 use cara_core::config::Priority;
 use cara_core::error::Error;
 use cara_core::host::connections::LinkCounter;
-use cara_core::services::unit::{Delivery, RequestOptions};
+use cara_core::services::session::{Delivery, RequestOptions};
 use cara_sim::Path;
 
 use super::pair;

@@ -5,7 +5,7 @@ use cara_core::distribution::connection_handler::NodeCounter;
 use cara_core::distribution::parameters::{Parameters, ParametersView};
 use cara_core::error::{CloseReason, Error, Limit, Refusal, ServiceError};
 use cara_core::host::connections::LinkCounter;
-use cara_core::services::unit::RequestOptions;
+use cara_core::services::session::RequestOptions;
 
 use super::{Bystander, met, pair};
 use crate::scenario::scenarios;

@@ -2,7 +2,7 @@
 
 use cara_core::error::Error;
 use cara_core::host::connections::LinkCounter;
-use cara_core::services::unit::RequestOptions;
+use cara_core::services::session::RequestOptions;
 
 use super::{Bystander, pair};
 use crate::scenario::scenarios;

@@ -1,7 +1,7 @@
 //! An emergency overtakes what is being sent.
 
 use cara_core::config::Priority;
-use cara_core::services::unit::RequestOptions;
+use cara_core::services::session::RequestOptions;
 use cara_core::time::Duration;
 use cara_sim::Path;
 

@@ -1,7 +1,7 @@
 //! The minimum time between requests to one node.
 
 use cara_core::error::Error;
-use cara_core::services::unit::RequestOptions;
+use cara_core::services::session::RequestOptions;
 
 use super::{met, pair};
 use crate::scenario::scenarios;

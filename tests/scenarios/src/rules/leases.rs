@@ -2,7 +2,7 @@
 
 use cara_core::error::Error;
 use cara_core::services::lease::LeaseEnd;
-use cara_core::services::unit::RequestOptions;
+use cara_core::services::session::RequestOptions;
 use cara_core::time::Duration;
 
 use super::{met, pair};

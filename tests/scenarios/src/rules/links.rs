@@ -1,7 +1,7 @@
 //! What happens when a link ends, and when it does not.
 
 use cara_core::error::{CloseReason, Error};
-use cara_core::services::unit::RequestOptions;
+use cara_core::services::session::RequestOptions;
 
 use super::{met, pair};
 use crate::scenario::scenarios;

@@ -2,7 +2,7 @@
 
 use cara_core::error::Error;
 use cara_core::services::lease::LeaseEnd;
-use cara_core::services::unit::RequestOptions;
+use cara_core::services::session::RequestOptions;
 
 use super::pair;
 use crate::scenario::scenarios;
@@ -17,7 +17,7 @@ scenarios![
 const PATIENT: RequestOptions = RequestOptions {
     timeout: Some(secs(60)),
     priority: None,
-    delivery: cara_core::services::unit::Delivery::Reliable,
+    delivery: cara_core::services::session::Delivery::Reliable,
     renew_lease: true,
 };
 

@@ -2,7 +2,7 @@
 
 use cara_core::config::Priority;
 use cara_core::error::ServiceError;
-use cara_core::services::unit::RequestOptions;
+use cara_core::services::session::RequestOptions;
 use cara_sim::Path;
 
 use super::met;

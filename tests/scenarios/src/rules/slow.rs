@@ -1,7 +1,7 @@
 //! A slow handler delays no other call.
 
 use cara_core::error::{Error, ServiceError};
-use cara_core::services::unit::RequestOptions;
+use cara_core::services::session::RequestOptions;
 
 use super::{met, pair};
 use crate::scenario::scenarios;
@@ -20,7 +20,7 @@ scenarios![
 const PATIENT: RequestOptions = RequestOptions {
     timeout: Some(secs(30)),
     priority: None,
-    delivery: cara_core::services::unit::Delivery::Reliable,
+    delivery: cara_core::services::session::Delivery::Reliable,
     renew_lease: true,
 };
 

@@ -10,7 +10,7 @@ use cara_core::distribution::function_list::{Function, Slot};
 use cara_core::distribution::identity::Identity;
 use cara_core::error::{CloseReason, Error, Refusal};
 use cara_core::host::mailman::LinkId;
-use cara_core::services::unit::Event;
+use cara_core::services::session::Event;
 
 use super::handle::UnitHandle;
 use super::links::{Happened, Link, Links};
@@ -129,7 +129,7 @@ impl Inner {
             return self.resume(shared, host);
         }
         links.hub.node.datagram(self.network.now(), from, bytes, &links.keys.codes);
-        if let Some(address) = links.hub.node.take_twin() {
+        if let Some(address) = links.hub.node.take_duplicate() {
             let peer = Some(links.hub.node.identity().clone());
             let reason = CloseReason::Refused(Refusal::DuplicateIdentity);
             self.log(shared, host, UnitEvent::NotJoined { address, peer, reason });
@@ -265,7 +265,7 @@ impl Inner {
         shared: &Rc<Shared>,
         host: HostId,
         index: u16,
-        call: &cara_core::services::unit::Call,
+        call: &cara_core::services::session::Call,
         parameters: BoxedParameters,
     ) {
         let unit = &mut self.units[host.index()];

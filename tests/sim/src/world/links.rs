@@ -10,7 +10,7 @@ use cara_core::error::Error;
 use cara_core::services::access::Access;
 use cara_core::services::hub::Hub;
 use cara_core::services::requests::CallId;
-use cara_core::services::unit::{Event, Session};
+use cara_core::services::session::{Event, Session};
 use cara_core::services::{Context, Port, Ticket};
 use cara_core::time::Instant;
 
@@ -173,7 +173,7 @@ impl Links {
         index: u16,
         function: &str,
         parameters: &ParametersView,
-        options: &cara_core::services::unit::RequestOptions,
+        options: &cara_core::services::session::RequestOptions,
         waiting: Option<Waiting>,
     ) -> Result<CallId, Error> {
         let wants_reply = waiting.is_some();

@@ -7,7 +7,7 @@ use std::rc::Rc;
 use std::task::{Context, Poll, Waker};
 
 use cara_core::error::Error;
-use cara_core::services::unit::ReplyBlock;
+use cara_core::services::session::ReplyBlock;
 
 use super::service::BoxedParameters;
 

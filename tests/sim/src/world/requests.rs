@@ -4,7 +4,7 @@ use cara_core::distribution::identity::{Identity, Role};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 use cara_core::services::requests::CallId;
-use cara_core::services::unit::RequestOptions;
+use cara_core::services::session::RequestOptions;
 
 use super::handle::{Peer, UnitHandle};
 use super::replies::{Promise, Waiting};

@@ -12,8 +12,8 @@ use cara_core::host::connections::LinkCounter;
 use cara_core::host::mailman::LinkId;
 use cara_core::host::secure::Seal;
 use cara_core::random::Random;
+use cara_core::services::session::{Session, SessionConfig, SessionStorage, buffer_bytes};
 use cara_core::services::slots_for;
-use cara_core::services::unit::{Session, SessionConfig, SessionStorage, buffer_bytes};
 use cara_core::time::Instant;
 
 use super::handle::UnitHandle;

@@ -14,7 +14,7 @@ use cara_core::error::CloseReason;
 use cara_core::host::connections::LinkCounter;
 use cara_core::host::mailman::{LinkId, Mailman};
 use cara_core::services::hub::Hub;
-use cara_core::services::unit::{Event, RequestOptions, Session, SessionConfig, SessionStorage, buffer_bytes};
+use cara_core::services::session::{Event, RequestOptions, Session, SessionConfig, SessionStorage, buffer_bytes};
 use cara_core::services::{Context, Keys, Port};
 use cara_core::storage::Pool;
 use cara_core::time::{Duration, Instant};

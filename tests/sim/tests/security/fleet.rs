@@ -8,7 +8,7 @@ use cara_core::distribution::parameters::Parameters;
 use cara_core::error::CloseReason;
 use cara_core::host::connections::LinkCounter;
 use cara_core::host::frame::{self, Frame};
-use cara_core::services::unit::RequestOptions;
+use cara_core::services::session::RequestOptions;
 use cara_core::time::Duration;
 use cara_sim::{Crash, HostId, Service, StreamId, UnitEvent, UnitHandle, World};
 

@@ -3,7 +3,7 @@
 use super::*;
 use cara_core::config::Constraints;
 use cara_core::error::{Error, ServiceError};
-use cara_core::services::unit::RequestOptions;
+use cara_core::services::session::RequestOptions;
 use cara_sim::UnitEvent;
 
 #[test]

@@ -90,15 +90,15 @@ fn a_vehicle_whose_address_changed_is_found_at_the_new_one() {
 #[test]
 fn a_second_vehicle_of_the_same_identity_is_refused() {
     let (mut world, manager, agv) = pair(7);
-    let twin = start_agv(&world, "agv", 7);
+    let duplicate = start_agv(&world, "agv", 7);
     world.run_for(secs(5));
     let refused = CloseReason::Refused(Refusal::DuplicateIdentity);
     assert!(
-        twin.count(|event| matches!(event, UnitEvent::NotJoined { reason, .. } if *reason == refused)) > 0,
+        duplicate.count(|event| matches!(event, UnitEvent::NotJoined { reason, .. } if *reason == refused)) > 0,
         "{:?}",
-        twin.log()
+        duplicate.log()
     );
-    assert!(agv.is_connected("manager") && !twin.is_connected("manager"));
+    assert!(agv.is_connected("manager") && !duplicate.is_connected("manager"));
     assert_eq!(manager.s_units().len(), 1);
 }
 

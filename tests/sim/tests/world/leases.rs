@@ -2,7 +2,7 @@
 
 use super::*;
 use cara_core::services::lease::LeaseEnd;
-use cara_core::services::unit::RequestOptions;
+use cara_core::services::session::RequestOptions;
 use cara_sim::{Crash, Direction, LeaseWatch, UnitEvent};
 
 const LEASE: Duration = Duration::from_millis(500);

@@ -3,7 +3,7 @@
 use super::*;
 use cara_core::config::Priority;
 use cara_core::error::Error;
-use cara_core::services::unit::RequestOptions;
+use cara_core::services::session::RequestOptions;
 use cara_sim::{FaultCounts, FaultPlan, for_each_seed};
 use std::collections::BTreeSet;
 

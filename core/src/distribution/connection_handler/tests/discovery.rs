@@ -298,16 +298,16 @@ fn own_datagrams_are_ignored_and_a_double_is_told() {
     assert_eq!(node.counters.value(NodeCounter::OwnIdentity), 1);
     assert_eq!(node.findings().next().map(|finding| finding.refusal), Some(Refusal::DuplicateIdentity));
     // It is told once, and the double is answered, since it would hear nothing otherwise.
-    assert_eq!((node.take_twin(), node.take_twin()), (Some(address(2, 7_001)), None));
+    assert_eq!((node.take_duplicate(), node.take_duplicate()), (Some(address(2, 7_001)), None));
     let mut outbox = Outbox::default();
     run(&mut node, at(1), &mut outbox);
     assert_eq!(outbox.sent.iter().map(|(to, _)| *to).collect::<Vec<_>>(), [address(2, 7_001)]);
     node.hear(at(2), address(2, 7_001), &who_has_bytes(&search_of(&double, 2)));
-    assert_eq!(node.take_twin(), None);
+    assert_eq!(node.take_duplicate(), None);
     let announce = as_announce(&outbox.sent[0].1);
     let mut other = super::node(double);
     other.hear(at(3), address(1, 7_001), &announce_bytes(&announce));
-    assert_eq!(other.take_twin(), Some(address(1, 7_001)));
+    assert_eq!(other.take_duplicate(), Some(address(1, 7_001)));
 }
 
 /// A node that claims one boot after the other does not fill the application's log.
@@ -319,7 +319,7 @@ fn doubles_are_told_now_and_then_only() {
     for life in 0..1_000 {
         let double = NodeConfig { epoch: Epoch(1_000 + life), ..own.clone() };
         node.hear(at(life * 20), address(2, 7_001), &who_has_bytes(&search_of(&double, 1)));
-        told += u32::from(node.take_twin().is_some());
+        told += u32::from(node.take_duplicate().is_some());
     }
     assert_eq!(told, 3, "in 20 s");
 }
@@ -572,8 +572,8 @@ fn whoever_looks_at_a_secured_network_needs_the_fleets_key_alone() {
     let Ok(Datagram::Announce(answer)) = read else { panic!("{read:?}") };
     assert_eq!((answer.nonce, answer.identity.name()), (0, MANAGER));
     // A second manager of one name hears of the first by what only their identity can sign.
-    let twin = NodeConfig { epoch: Epoch(77), ..m_unit(MANAGER, MANAGER_ID) };
-    let (sent, withheld) = answers_of_secured(&WhoHas { wanted: None, ..search_of(&twin, 1) });
+    let duplicate = NodeConfig { epoch: Epoch(77), ..m_unit(MANAGER, MANAGER_ID) };
+    let (sent, withheld) = answers_of_secured(&WhoHas { wanted: None, ..search_of(&duplicate, 1) });
     assert_eq!((sent.len(), withheld), (0, 1));
     // A vehicle without a key of the pair gets none, and the operator is told.
     let (sent, withheld) = answers_of_secured(&search_of(&s_unit("agv", 9), 1));

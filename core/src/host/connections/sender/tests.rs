@@ -249,7 +249,7 @@ fn exercise<C: Seal>(link: &mut Link<Boxed, C>, wire: &mut Wire, steps: &[(u8, u
                 link.flush(wire, &mut pool).unwrap();
             }
         }
-        let most = if link.sender.cut.overhead == 0 { 0 } else { wire.ahead.max(1026) };
+        let most = if link.sender.chunking.overhead == 0 { 0 } else { wire.ahead.max(1026) };
         let ahead = sealed_ahead(link);
         assert!(ahead <= most.max(1026), "{ahead} bytes are sealed ahead of {most}");
     }

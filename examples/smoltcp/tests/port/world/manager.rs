@@ -15,7 +15,7 @@ use cara_core::host::secure::Plain;
 use cara_core::services::hub::Hub;
 use cara_core::services::publications::Publications;
 use cara_core::services::requests::CallId;
-use cara_core::services::unit::{Event, RequestOptions, Session, SessionConfig, SessionStorage, buffer_bytes};
+use cara_core::services::session::{Event, RequestOptions, Session, SessionConfig, SessionStorage, buffer_bytes};
 use cara_core::services::{Context, Port};
 use cara_core::storage::Pool;
 use cara_core::time::Instant;

@@ -11,7 +11,7 @@ use cara_core::error::{Error, ServiceError};
 use cara_core::services::Ticket;
 use cara_core::services::lease::Lease;
 use cara_core::services::requests::CallId;
-use cara_core::services::unit::{Call, Event, ReplyBlock};
+use cara_core::services::session::{Call, Event, ReplyBlock};
 use cara_core::time::{Duration, Instant};
 use cara_smoltcp::{Program, Resources, SUnit, Served, Settings};
 

@@ -5,7 +5,7 @@
 #![no_main]
 
 use cara_core::distribution::parameters::Parameters;
-use cara_core::services::unit::buffer_bytes;
+use cara_core::services::session::buffer_bytes;
 use cara_instructions::{Blocks, Discovery, DiscoveryMemory, Meter, Operation, Pair, PairMemory, Sealing};
 use cara_lm3s6965evb as _;
 use defmt_semihosting as _;

@@ -13,7 +13,7 @@ use cara_core::host::connections::LinkCounter;
 use cara_core::services::access::Rule;
 use cara_core::services::lease::Lease;
 use cara_core::services::requests::CallId;
-use cara_core::services::unit::RequestOptions;
+use cara_core::services::session::RequestOptions;
 use cara_core::time::Instant;
 use cara_embassy::{Config, Handle, Peer};
 use cara_embassy_host::{Bench, Board, now, security};

@@ -5,7 +5,7 @@ use std::rc::Rc;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, ServiceError};
 use cara_core::services::lease::Lease;
-use cara_core::services::unit::RequestOptions;
+use cara_core::services::session::RequestOptions;
 use cara_core::time::Duration;
 use cara_embassy::{Handle, Handler, ServiceOptions, TakenCall};
 use cara_embassy_host::{Board, now};

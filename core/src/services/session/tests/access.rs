@@ -11,7 +11,7 @@ use crate::host::connections::LinkCounter;
 use crate::services::access::{Functions, Rate, Rule, Verb, Verbs, Who};
 use crate::services::lease::LeaseEnd;
 use crate::services::requests::CallId;
-use crate::services::unit::RequestOptions;
+use crate::services::session::RequestOptions;
 use crate::time::Duration;
 use proptest::prelude::*;
 use std::string::{String, ToString};

@@ -15,7 +15,7 @@ use crate::distribution::message::RequestHeader;
 use crate::distribution::parameters::ParametersView;
 use crate::error::{CloseReason, Error, ServiceError};
 use crate::host::connections::LinkCounter;
-use crate::host::frame::{ChunkWriter, Cut};
+use crate::host::frame::{ChunkWriter, Chunking};
 use crate::services::Context;
 use crate::services::lease::LeaseEnd;
 use crate::services::requests::CallId;
@@ -181,9 +181,9 @@ impl Side {
 
     /// A message arrives that the other end did not send.
     pub(super) fn hear_message(&mut self, message: &[u8], priority: Priority) {
-        let cut = Cut { chunk: 1_024, overhead: 0 };
-        let mut frames = vec![0; cut.framed_length(message.len())];
-        ChunkWriter::new(&mut frames, cut, priority, message.len()).unwrap().put(message);
+        let chunking = Chunking { chunk: 1_024, overhead: 0 };
+        let mut frames = vec![0; chunking.framed_length(message.len())];
+        ChunkWriter::new(&mut frames, chunking, priority, message.len()).unwrap().put(message);
         self.hear(&frames);
     }
 

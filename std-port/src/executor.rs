@@ -16,12 +16,12 @@ const PATIENCE: Duration = Duration::from_secs(1);
 type Job = Box<dyn FnOnce() + Send>;
 
 /// One thread that runs what it is given, in order.
-pub(crate) struct Lane {
+pub(crate) struct Executor {
     jobs: Mutex<Option<Sender<Job>>>,
     thread: OwnThread,
 }
 
-impl Lane {
+impl Executor {
     /// Starts the thread. [`Error::Network`] when the system refuses it.
     pub(crate) fn start(name: &str) -> Result<Self, Error> {
         let (sender, receiver): (Sender<Job>, Receiver<Job>) = channel();
@@ -90,26 +90,26 @@ mod tests {
 
     #[test]
     fn a_lane_runs_what_it_was_given_in_order_and_before_it_ends() {
-        let lane = Lane::start("test").unwrap();
+        let executor = Executor::start("test").unwrap();
         let (sender, receiver) = channel();
         for number in 0..100 {
             let sender = sender.clone();
-            lane.run(move || sender.send(number).unwrap());
+            executor.run(move || sender.send(number).unwrap());
         }
-        lane.end();
+        executor.end();
         drop(sender);
         assert_eq!(receiver.into_iter().collect::<Vec<_>>(), (0..100).collect::<Vec<_>>());
-        lane.run(|| panic!("it has ended"));
+        executor.run(|| panic!("it has ended"));
     }
 
     #[test]
     fn a_lane_that_is_stuck_holds_no_stop_up_for_ever() {
-        let (lane, (open, gate)) = (Lane::start("test").unwrap(), channel::<()>());
-        lane.run(move || {
+        let (executor, (open, gate)) = (Executor::start("test").unwrap(), channel::<()>());
+        executor.run(move || {
             let _ = gate.recv();
         });
         let began = Instant::now();
-        lane.end();
+        executor.end();
         assert!(began.elapsed() >= PATIENCE);
         drop(open);
     }

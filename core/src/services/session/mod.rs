@@ -59,7 +59,7 @@ const HELLO_BYTES: usize = 320;
 /// Longest frame body of a peer that has proven nothing: with its header too short to need a buffer of the pool.
 const UNPROVEN_BYTES: usize = crate::config::MINIMUM_CHUNK_BYTES - HEADER_BYTES - 1;
 /// A challenge goes in the stream and in so many datagrams: one lost segment or datagram must not make a live peer look
-/// dead, and its place go to a twin.
+/// dead, and its place go to a duplicate.
 const CHALLENGE_DATAGRAMS: usize = 3;
 /// Most that a chunk adds to its piece of a message, without sealing.
 const FRAME_BYTES: usize = HEADER_BYTES + 6;

@@ -11,7 +11,7 @@ use crate::distribution::parameters::Parameters;
 use crate::error::{Error, Limit, ServiceError};
 use crate::host::connections::LinkCounter;
 use crate::services::Context;
-use crate::services::unit::{Delivery, RequestOptions};
+use crate::services::session::{Delivery, RequestOptions};
 use crate::time::Duration;
 use std::vec::Vec;
 

@@ -12,7 +12,7 @@ use crate::distribution::message::RequestHeader;
 use crate::error::Error;
 use crate::host::connections::LinkCounter;
 use crate::services::requests::CallId;
-use crate::services::unit::RequestOptions;
+use crate::services::session::RequestOptions;
 use crate::storage::LEFT_BY_WAITING;
 use crate::time::Duration;
 

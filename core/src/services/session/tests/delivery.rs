@@ -11,7 +11,7 @@ use super::{none, text, x};
 use crate::config::{EMERGENCY_BYTES, Priority, WINDOW};
 use crate::error::Error;
 use crate::host::connections::LinkCounter;
-use crate::services::unit::{Delivery, RequestOptions};
+use crate::services::session::{Delivery, RequestOptions};
 use crate::time::Duration;
 
 fn urgent(priority: Priority) -> RequestOptions {

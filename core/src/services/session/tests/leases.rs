@@ -12,7 +12,7 @@ use crate::error::{Error, Limit};
 use crate::host::connections::LinkCounter;
 use crate::services::lease::LeaseEnd;
 use crate::services::requests::CallId;
-use crate::services::unit::RequestOptions;
+use crate::services::session::RequestOptions;
 use crate::time::Duration;
 
 const LEASE: Duration = Duration::from_millis(500);

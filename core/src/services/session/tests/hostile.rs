@@ -15,7 +15,7 @@ use crate::distribution::message::{
     Control, Release, Renewal, RequestHeader, SessionBody, encode_failure, encode_reply,
 };
 use crate::error::{CloseReason, Error};
-use crate::host::frame::{self, ChunkWriter, Cut, Frame};
+use crate::host::frame::{self, ChunkWriter, Chunking, Frame};
 use crate::time::Duration;
 
 /// What can be said of two pairs of small numbers, so that many of them mean something to the one who hears it.
@@ -86,10 +86,10 @@ fn control(control: &Control<'_>) -> Vec<u8> {
 fn frames() -> impl Strategy<Value = Vec<u8>> {
     let chunk = prop_oneof![Just(1_024_usize), 320..1_024_usize];
     let chunked = (message(), 1..4_u8, chunk).prop_map(|(message, priority, chunk)| {
-        let cut = Cut { chunk, overhead: 0 };
-        let mut out = vec![0; cut.framed_length(message.len())];
+        let chunking = Chunking { chunk, overhead: 0 };
+        let mut out = vec![0; chunking.framed_length(message.len())];
         let priority = Priority::from_wire(priority).unwrap();
-        ChunkWriter::new(&mut out, cut, priority, message.len()).unwrap().put(&message);
+        ChunkWriter::new(&mut out, chunking, priority, message.len()).unwrap().put(&message);
         out
     });
     let body = prop_oneof![

@@ -5,7 +5,7 @@ use super::setup::Setup;
 use super::{none, text, x};
 use crate::config::{GATHER, Priority};
 use crate::host::connections::LinkCounter;
-use crate::services::unit::RequestOptions;
+use crate::services::session::RequestOptions;
 use crate::storage::LEFT_BY_SENDING;
 use crate::time::Duration;
 

@@ -18,7 +18,7 @@ use crate::host::mailman::{LinkId, Mailman};
 use crate::host::secure::Plain;
 use crate::services::hub::Hub;
 use crate::services::publications::Publications;
-use crate::services::unit::{Event, Session, SessionConfig};
+use crate::services::session::{Event, Session, SessionConfig};
 use crate::services::{Context, Port};
 use crate::storage::{Boxed, Pool};
 use crate::time::{Duration, Instant};

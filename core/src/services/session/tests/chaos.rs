@@ -15,7 +15,7 @@ use super::x;
 use crate::config::{Constraints, GATHER, Priority};
 use crate::error::Error;
 use crate::services::requests::CallId;
-use crate::services::unit::{Delivery, RequestOptions};
+use crate::services::session::{Delivery, RequestOptions};
 use crate::time::Duration;
 
 #[derive(Clone, Copy, Debug)]
