@@ -4,11 +4,12 @@ use core::mem::MaybeUninit;
 use core::net::SocketAddrV4;
 
 use cara_core::distribution::datagram;
-use cara_core::distribution::function_list::FunctionList;
+use cara_core::distribution::function_list::{FunctionList, Slot};
 use cara_core::distribution::hello::Hello;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::{Parameters, ParametersView};
 use cara_core::services::access::{self, Access, Bucket, Functions, Principal, Rate, Rule, Verbs, Who};
+use cara_core::services::event::UnitEvent;
 use cara_core::services::lease::{Lease, Service};
 use cara_core::services::publications::Publications;
 use cara_core::services::requests::Requests;
@@ -185,6 +186,11 @@ entry!(replies, {
         keep((block.read_into(parameters()), block.signature(), block.bytes()));
     }
     keep(unknown::<ReplyBlock<'static>>().read_into(parameters()));
+});
+
+entry!(events, {
+    let name = |slot| slot;
+    keep(UnitEvent::<Slot, (), SocketAddrV4>::of(*unknown(), unknown::<Identity>(), name, name));
 });
 
 entry!(leases, {
