@@ -42,7 +42,7 @@ pub(crate) enum Job {
 }
 
 /// The call that the runner is to run next, if there is one; its arguments are in the runner's parameters.
-// A wide tag, as above, and nothing narrow beside the call.
+// A wide tag, and nothing narrow beside the call: it is then moved in words, and not byte by byte.
 #[repr(u32)]
 pub(crate) enum Begun {
     Nothing,

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::compact::{Reader, Writer};
 use super::identity::{Epoch, Fleet, Identity};
-use crate::config::{MINIMUM_CHUNK_BYTES, Mode, NODE_NAME_BYTES, VERSION};
+use crate::config::{Constraints, MINIMUM_CHUNK_BYTES, Mode, NODE_NAME_BYTES, VERSION};
 
 /// Bytes of magic and version.
 const PREFIX_BYTES: usize = 5;
@@ -33,6 +33,17 @@ pub struct Limits {
     pub calls: u16,
     /// Least time between two requests to it, in microseconds.
     pub minimum_interval: u32,
+}
+
+impl From<&Constraints> for Limits {
+    fn from(constraints: &Constraints) -> Self {
+        Self {
+            message_size: constraints.message_size,
+            chunk_size: constraints.chunk_size,
+            calls: constraints.calls_per_peer,
+            minimum_interval: constraints.minimum_interval.as_wire(),
+        }
+    }
 }
 
 /// How a unit introduces itself on a link.

@@ -9,8 +9,8 @@ use crate::services::session::Event;
 
 /// Something happened that no call returned.
 ///
-/// A port fills in how it names a function (`F`), what can be used of the network (`N`) and how it addresses nodes (`E`), and gives the whole a short name:
-/// a program for Linux sees `cara_std::UnitEvent`, one for a board `cara_embassy::UnitEvent`.
+/// A port fills in how it names a function (`F`), what can be used of the network (`N`) and how it addresses nodes (`E`),
+/// and gives the whole a short name: a program for Linux sees `cara_std::UnitEvent`, one for a board `cara_embassy::UnitEvent`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum UnitEvent<F, N, E> {

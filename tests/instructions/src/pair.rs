@@ -9,7 +9,7 @@ use cara_core::config::{Constraints, LINK_BUFFER_BYTES};
 use cara_core::distribution::connection_handler::{Finding, Known, Node, NodeConfig, NodeStorage, Order, Target};
 use cara_core::distribution::function::{Attributes, Definition};
 use cara_core::distribution::function_list::{Entry, FunctionList};
-use cara_core::distribution::hello::{Hello, Limits, Manager};
+use cara_core::distribution::hello::{Hello, Manager};
 use cara_core::distribution::identity::{Epoch, Fleet, Identity};
 use cara_core::distribution::parameters::{Parameters, ParametersView};
 use cara_core::error::CloseReason;
@@ -387,12 +387,7 @@ fn hello(constraints: &Constraints, caller: bool) -> Hello {
         nonce: if caller { 0x1234_5678 } else { 0x8765_4321 },
         term: 0,
         capabilities: 0,
-        limits: Limits {
-            message_size: constraints.message_size,
-            chunk_size: constraints.chunk_size,
-            calls: constraints.calls_per_peer,
-            minimum_interval: constraints.minimum_interval.as_wire(),
-        },
+        limits: constraints.into(),
         link: 0,
         udp_port: 0,
         stamp: 0,

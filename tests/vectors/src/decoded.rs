@@ -33,15 +33,6 @@ pub(crate) fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-pub(crate) const fn priority(priority: Priority) -> &'static str {
-    match priority {
-        Priority::Emergency => "emergency",
-        Priority::High => "high",
-        Priority::Normal => "normal",
-        Priority::Low => "low",
-    }
-}
-
 pub(crate) fn hello(bytes: &[u8]) -> Option<Value> {
     match Hello::decode(bytes, Mode::Plain) {
         Ok(hello) => Some(json!({
@@ -151,7 +142,7 @@ fn signature(signature: Signature<'_>) -> Value {
 
 fn attributes(attributes: &Attributes) -> Value {
     json!({
-        "priority": priority(attributes.priority),
+        "priority": attributes.priority.word(),
         "idempotent": attributes.idempotent,
         "lease": attributes.lease.map(|lease| lease.as_millis()),
     })
@@ -183,17 +174,17 @@ pub(crate) fn session_body(bytes: &[u8]) -> Option<Value> {
         SessionBody::Ping => json!({ "ping": {} }),
         SessionBody::Pong => json!({ "pong": {} }),
         SessionBody::Renew(renewal) => json!({ "renew": {
-            "class": priority(renewal.class),
+            "class": renewal.class.word(),
             "call": renewal.call,
             "stamp": renewal.stamp,
             "since": renewal.since.as_micros(),
         }}),
         SessionBody::Release(release) => {
-            json!({ "release": { "class": priority(release.class), "call": release.call } })
+            json!({ "release": { "class": release.class.word(), "call": release.call } })
         }
         SessionBody::ReleaseAll(slot, call) => json!({ "release_all": { "slot": slot.0, "call": call } }),
         SessionBody::Message(byte, message) => json!({ "message": {
-            "priority": priority(Priority::from_wire(byte)?), "message": self::message(message)?,
+            "priority": Priority::from_wire(byte)?.word(), "message": self::message(message)?,
         }}),
     })
 }

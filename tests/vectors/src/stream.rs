@@ -82,7 +82,7 @@ fn value(link: &Link<Boxed, Plain>, incoming: Incoming, lent: &[u8]) -> Option<V
             json!({ "session": decoded::session_body(bytes).unwrap_or_else(|| unreadable(bytes)) })
         }
         Incoming::Message(priority, place) => json!({
-            "priority": decoded::priority(priority),
+            "priority": priority.word(),
             "message": decoded::message(link.view(place, lent))?,
         }),
     })

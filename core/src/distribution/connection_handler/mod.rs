@@ -34,7 +34,7 @@ use crate::config::Constraints;
 use crate::counters::Counters;
 use crate::distribution::authenticator::Authenticator;
 use crate::distribution::datagram::{Datagram, DatagramError};
-use crate::distribution::hello::{Hello, Limits, Manager};
+use crate::distribution::hello::{Hello, Manager};
 use crate::distribution::identity::{Epoch, Fleet, Identity, Role};
 use crate::error::{CloseReason, Error, Refusal};
 use crate::host::endpoint::Endpoint as _;
@@ -282,12 +282,7 @@ impl<P: Port> Node<P> {
             nonce: self.random.bits(),
             term: 0,
             capabilities: 0,
-            limits: Limits {
-                message_size: constraints.message_size,
-                chunk_size: constraints.chunk_size,
-                calls: constraints.calls_per_peer,
-                minimum_interval: constraints.minimum_interval.as_wire(),
-            },
+            limits: constraints.into(),
             link: link.0,
             udp_port: self.config.udp_port,
             stamp: now.as_micros(),

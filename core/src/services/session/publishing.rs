@@ -3,6 +3,7 @@
 use super::{Phase, Session};
 use crate::config::{Priority, SIGNATURE_BYTES};
 use crate::distribution::function_list::{Generation, Slot};
+use crate::distribution::hello::Limits;
 use crate::distribution::message::{CONTROL_BYTES, Control, PUBLISH_BYTES};
 use crate::services::access::Bucket;
 use crate::services::{Context, Port};
@@ -217,12 +218,8 @@ impl<P: Port> Session<P> {
     }
 
     fn send_limits(&mut self, cx: &mut Context<'_, P>) -> bool {
-        let control = Control::Limits {
-            message_size: self.constraints.message_size,
-            minimum_interval: self.constraints.minimum_interval.as_wire(),
-            calls: self.constraints.calls_per_peer,
-        };
-        self.send_control(cx, &control)
+        let Limits { message_size, minimum_interval, calls, .. } = Limits::from(&self.constraints);
+        self.send_control(cx, &Control::Limits { message_size, minimum_interval, calls })
     }
 
     /// Sends each function whose news the peer does not have; `false` when there was no more room.

@@ -24,7 +24,7 @@ use cara_tools::name_and_id::quoted;
 /// M_units answer a survey within milliseconds: one that has not answered after this time will not.
 pub(crate) const ANSWERED: Duration = Duration::from_millis(2_500);
 /// Two live m_units of one name have answered two questions each by then.
-const TWINS: Duration = Duration::from_millis(1_500);
+const DUPLICATES: Duration = Duration::from_millis(1_500);
 /// Refusals of this long before the listening are looked at: the longest pause of a node that tries again, and a bit.
 const BEFORE: Duration = Duration::from_secs(20);
 
@@ -67,7 +67,7 @@ fn runs_here(seen: &Evidence, unit: &Running) -> Vec<Finding> {
     }
     let found = format!("{} is a unit of this host and has run for {} s", unit.name(), unit.unit.uptime_ms / 1000);
     // Another one of its name has had time to show itself twice.
-    let certain = seen.listened >= TWINS;
+    let certain = seen.listened >= DUPLICATES;
     vec![Finding::info(Id::Answers, found, "nothing needs to be done").about(unit.name()).certain(certain)]
 }
 

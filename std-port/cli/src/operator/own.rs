@@ -19,7 +19,7 @@ use cara_tools::units::show_micros;
 /// Most nodes of such a unit: enough for a whole fleet.
 const MAXIMUM_NODES: u16 = 1024;
 /// How long a unit of the same name and ID may take to answer on the network.
-const TWIN: Duration = Duration::from_millis(500);
+const DUPLICATE: Duration = Duration::from_millis(500);
 /// All nodes have joined when none joined for so long.
 const QUIET: Duration = Duration::from_millis(1500);
 /// Interval between two looks at the nodes that have joined.
@@ -86,7 +86,7 @@ fn refuse_if_it_answers(identity: &NameAndId, global: &Global) -> anyhow::Result
         duplicate.map(|duplicate| duplicate.source)
     };
     survey.ask(fleet);
-    survey.listen_until(Instant::now().checked_add(TWIN), |survey| is_it(survey).is_some());
+    survey.listen_until(Instant::now().checked_add(DUPLICATE), |survey| is_it(survey).is_some());
     match is_it(&survey) {
         None => Ok(()),
         Some(source) => Err(Ended::usage(format!(

@@ -10,7 +10,7 @@ use crate::config::{Constraints, LINK_BUFFER_BYTES, Priority};
 use crate::distribution::connection_handler::{Node, NodeConfig, NodeStorage, Target};
 use crate::distribution::function::{Attributes, Definition};
 use crate::distribution::function_list::{Entry, FunctionList};
-use crate::distribution::hello::{Hello, Limits, Manager};
+use crate::distribution::hello::{Hello, Manager};
 use crate::distribution::identity::{Epoch, Fleet, Identity};
 use crate::distribution::parameters::ParametersView;
 use crate::error::Error;
@@ -96,12 +96,7 @@ pub(super) fn hello(constraints: &Constraints, agv: bool, datagrams: bool) -> He
         nonce: if agv { 0xA61 } else { 0x3A6A6E2 },
         term: 0,
         capabilities: 0,
-        limits: Limits {
-            message_size: constraints.message_size,
-            chunk_size: constraints.chunk_size,
-            calls: constraints.calls_per_peer,
-            minimum_interval: constraints.minimum_interval.as_wire(),
-        },
+        limits: constraints.into(),
         link: u16::from(agv),
         udp_port: if datagrams { DATAGRAM_PORT } else { 0 },
         stamp: 0,
