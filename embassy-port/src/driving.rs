@@ -7,7 +7,7 @@
 use cara_core::distribution::authenticator::Authenticator as _;
 use cara_core::distribution::connection_handler::{Command, NodeCounter};
 use cara_core::distribution::datagram;
-use cara_core::distribution::function_list::{Function, Slot};
+use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Refusal};
@@ -234,7 +234,6 @@ impl<T> Machine<T> {
             // No handle here pings.
             Event::Reply(..) | Event::Answered => {}
             Event::Call(call) => (self.begun, self.begun_on) = (Begun::Call(call), index),
-            Event::Joined => self.joined(index),
             Event::Closed(reason) => return self.closed(index, reason),
             Event::Acknowledged { skipped: 0, .. } => self.wakers.news.wake(),
             Event::LeaseExpired(slot) => {
@@ -249,13 +248,16 @@ impl<T> Machine<T> {
 
     #[inline(never)]
     fn tell_of(&mut self, index: u16, event: Event) {
-        let Some(link) = self.links.get(usize::from(index)) else { return };
-        let Some(peer) = &link.peer else { return };
-        let own_name = |slot| name(self.functions.function(slot));
-        let their_name = |slot| name(link.session.as_ref().and_then(|s| s.their_function_list().function(slot)));
-        if let Some(event) = UnitEvent::of(event, peer, own_name, their_name) {
-            self.tell(event);
+        let Some(session) = self.link(index).and_then(|link| link.session.as_ref()) else { return };
+        let name = |name: &str| Name::try_from(name).unwrap_or_default();
+        let Some(told) = UnitEvent::of(event, session, &self.functions, name) else { return };
+        match &told {
+            UnitEvent::Joined { peer } => log!("{} has joined", peer.name()),
+            UnitEvent::Left { peer, .. } => log!("{} has left", peer.name()),
+            UnitEvent::NotJoined { peer, reason, .. } => self.log_refused(peer.as_ref(), *reason),
+            _ => {}
         }
+        self.tell(told);
     }
 
     /// Does what the hub wants done.
@@ -263,9 +265,8 @@ impl<T> Machine<T> {
         match command {
             Command::Dial { to, identity } => self.dial(to, identity.as_ref()),
             Command::Tell(LinkId(index), directive) => {
-                let event = self.with(index, |session, cx| session.direct(cx, directive)).flatten();
-                if let Some(Event::Joined) = event {
-                    self.joined(index);
+                if let Some(Some(event)) = self.with(index, |session, cx| session.direct(cx, directive)) {
+                    self.tell_of(index, event);
                 }
             }
         }
@@ -287,37 +288,15 @@ impl<T> Machine<T> {
         }
     }
 
-    /// The link is live.
-    #[inline(never)]
-    fn joined(&mut self, index: u16) {
-        let session = self.link(index).and_then(|link| link.session.as_ref());
-        let Some(identity) = session.and_then(|session| session.identity().cloned()) else { return };
-        if let Some(link) = self.link_mut(index) {
-            log!("{} has joined", identity.name());
-            link.peer = Some(identity);
-            self.tell_of(index, Event::Joined);
-        }
-    }
-
     /// A link has ended.
     fn closed(&mut self, index: u16, reason: CloseReason) -> Option<Job> {
-        let (peer, told, address) = self.end(index)?;
+        self.tell_of(index, Event::Closed(reason));
+        let had_joined = self.end(index)?;
         // Calls that no task has taken yet must not begin for a caller that is gone.
         self.forget_calls_of(index);
         self.hang_up(index);
         self.hub.node.left(now(), LinkId(index), reason);
-        match peer {
-            Some(peer) => {
-                log!("{} has left", peer.name());
-                self.tell(UnitEvent::Left { peer, reason });
-                Some(Job::Lost)
-            }
-            None => {
-                self.log_refused(told.as_ref(), reason);
-                self.tell(UnitEvent::NotJoined { address, peer: told, reason });
-                None
-            }
-        }
+        had_joined.then_some(Job::Lost)
     }
 
     /// Peers can make links end in this way as fast as they can dial, so the log is rate-limited.
@@ -329,22 +308,18 @@ impl<T> Machine<T> {
         }
     }
 
-    /// Returns the memory of a link's session: the peer's identity, the identity it claimed, and its address.
+    /// Gets the memory of a link's session back. Whether its peer had joined.
     #[inline(never)]
-    fn end(&mut self, index: u16) -> Option<(Option<Identity>, Option<Identity>, SocketAddrV4)> {
+    fn end(&mut self, index: u16) -> Option<bool> {
         let Self { links, pool, counters, .. } = self;
         let link = links.get_mut(usize::from(index))?;
-        let session = link.session.as_ref()?;
+        let session = link.session.take()?;
         counters.merge(session.counters());
-        let (told, address) = (session.identity().cloned(), session.address());
-        link.storage = link.session.take().map(|session| session.into_storage(pool));
+        let had_joined = session.peer().is_some();
+        link.storage = Some(session.into_storage(pool));
         link.interrupt();
         link.told = None;
         link.serial = link.serial.wrapping_add(1);
-        Some((link.peer.take(), told, address))
+        Some(had_joined)
     }
-}
-
-fn name<H: ?Sized>(function: Option<Function<'_, H>>) -> Name {
-    Name::try_from(function.map_or("", |function| function.name())).unwrap_or_default()
 }

@@ -146,7 +146,7 @@ impl<T> Handle<T> {
 
     /// The connected node at a place of the unit's table of links, of which there are [`Self::links`].
     pub fn peer_at(&self, link: u16) -> Option<Peer<T>> {
-        let identity = self.look(|machine| machine.link(link).and_then(|link| link.peer.clone()));
+        let identity = self.look(|machine| machine.link(link).and_then(|link| link.peer().cloned()));
         identity.map(|identity| Peer { unit: *self, identity })
     }
 

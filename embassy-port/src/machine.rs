@@ -59,8 +59,6 @@ pub(crate) struct Link {
     pub(crate) serial: u32,
     /// When it was opened.
     pub(crate) since: Instant,
-    /// The peer, from joining to leaving.
-    pub(crate) peer: Option<Identity>,
     pub(crate) waiters: &'static mut [Option<Waiter>],
     /// The serial of the list that was last sent to the peer, for tasks that wait until it is read.
     pub(crate) told: Option<u32>,
@@ -68,15 +66,12 @@ pub(crate) struct Link {
 
 impl Link {
     pub(crate) fn new(storage: SessionStorage<Lent>, waiters: &'static mut [Option<Waiter>]) -> Self {
-        Self {
-            session: None,
-            storage: Some(storage),
-            serial: 0,
-            since: Instant::START,
-            peer: None,
-            waiters,
-            told: None,
-        }
+        Self { session: None, storage: Some(storage), serial: 0, since: Instant::START, waiters, told: None }
+    }
+
+    /// The peer, from joining to leaving.
+    pub(crate) fn peer(&self) -> Option<&Identity> {
+        self.session.as_ref().and_then(LinkSession::peer)
     }
 
     /// Whether it leads to a peer that requests can be made of.
@@ -167,8 +162,7 @@ impl<T> Machine<T> {
 
     /// The live link to a peer.
     pub(crate) fn link_to(&self, peer: &Identity) -> Option<u16> {
-        self.indices()
-            .find(|index| self.link(*index).is_some_and(|link| link.is_live() && link.peer.as_ref() == Some(peer)))
+        self.indices().find(|index| self.link(*index).is_some_and(|link| link.is_live() && link.peer() == Some(peer)))
     }
 
     /// Lends the session of a link with its context.

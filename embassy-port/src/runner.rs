@@ -206,7 +206,7 @@ impl<T> Runner<T> {
                 return Some(Err(Error::StaleFunction));
             };
             let Listed { handler, lease, .. } = *function.handler;
-            let Some(caller) = machine.link(running.link).and_then(|link| link.peer.clone()) else {
+            let Some(caller) = machine.link(running.link).and_then(|link| link.peer().cloned()) else {
                 return Some(Err(Error::NotConnected));
             };
             if call.order.is_some() {

@@ -1,11 +1,11 @@
 //! What a unit tells its application: one type for all ports.
 
-use crate::distribution::function_list::Slot;
 use crate::distribution::identity::Identity;
 use crate::error::{CloseReason, Error};
 use crate::services::lease::LeaseEnd;
 use crate::services::requests::CallId;
-use crate::services::session::Event;
+use crate::services::session::{Event, Session};
+use crate::services::{OwnFunctions, Port};
 
 /// Something happened that no call returned.
 ///
@@ -86,23 +86,28 @@ pub enum UnitEvent<F, N, E> {
 }
 
 impl<F, N, E> UnitEvent<F, N, E> {
-    /// What the application is told of an event on the link to `peer`, from its joining to its leaving; `None` where it is told
-    /// nothing. A link that ends before is [`NotJoined`](Self::NotJoined), which the port tells by itself.
-    pub fn of(
+    /// What the application is told of an event on a link; `None` where it is told nothing.
+    pub fn of<P: Port<Endpoint = E>>(
         event: Event,
-        peer: &Identity,
-        own_name: impl FnOnce(Slot) -> F,
-        their_name: impl FnOnce(Slot) -> F,
+        session: &Session<P>,
+        functions: &dyn OwnFunctions,
+        name: impl FnOnce(&str) -> F,
     ) -> Option<Self> {
+        let Some(peer) = session.peer() else {
+            let Event::Closed(reason) = event else { return None };
+            return Some(Self::NotJoined { address: session.address(), peer: session.identity().cloned(), reason });
+        };
         let peer = || peer.clone();
+        let own_name = |slot| functions.function(slot).map_or("", |function| function.name());
+        let their_name = |slot| session.their_function_list().function(slot).map_or("", |function| function.name());
         Some(match event {
             Event::Joined => Self::Joined { peer: peer() },
             Event::Closed(reason) => Self::Left { peer: peer(), reason },
             Event::ListChanged => Self::ListChanged { peer: peer() },
             Event::Failed(call, error) => Self::RequestFailed { peer: peer(), call, error },
-            Event::LeaseExpired(slot) => Self::LeaseExpired { peer: peer(), function: own_name(slot) },
+            Event::LeaseExpired(slot) => Self::LeaseExpired { peer: peer(), function: name(own_name(slot)) },
             Event::LeaseEnded { call, slot, why } => {
-                Self::LeaseEnded { peer: peer(), function: their_name(slot), call, why }
+                Self::LeaseEnded { peer: peer(), function: name(their_name(slot)), call, why }
             }
             Event::Acknowledged { skipped: 0, .. } | Event::Answered | Event::Call(_) | Event::Reply(..) => {
                 return None;

@@ -26,7 +26,7 @@
 //! | [`LeaseExpired`](session::Event::LeaseExpired) | runs the safe hook of the service, before anything else |
 //! | [`Call`](session::Event::Call) | runs the handler, and answers by ticket; an `order` makes the handler's view of the service's [`Lease`](lease::Lease). A newer call of the service ends that view without an event, so wake what awaits it |
 //! | [`Reply`](session::Event::Reply), [`Failed`](session::Event::Failed), and all others | tells the program what [`UnitEvent::of`](event::UnitEvent::of) makes of it, and the results of a reply, which `session.results` shows. It says `session.cancel` for a call that the program gives up, `session.release` for all of a function |
-//! | [`Joined`](session::Event::Joined) | the peer is taken, and is being told what is published to it |
+//! | [`Joined`](session::Event::Joined) | the peer is taken, and is being told what is published to it; from here on it is `session.peer()` |
 //! | [`Closed`](session::Event::Closed) | the last one: forgets the session (`into_storage` gives its slices back), then `node.left`, also for a link that never joined |
 //!
 //! Ports differ only in which thread or task makes these calls, and under which lock. Two sessions are never locked at

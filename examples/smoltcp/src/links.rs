@@ -16,7 +16,7 @@ use cara_core::time::Instant;
 
 use crate::program::{Program, Served};
 use crate::stack::Stream;
-use crate::unit::{SUnit, Standing, context};
+use crate::unit::{SUnit, context};
 
 /// The only link.
 const LINK: LinkId = LinkId(0);
@@ -51,7 +51,7 @@ impl SUnit {
         let local = self.hub.node.hello(now, LINK);
         let config = SessionConfig { link: LINK, dialed: true, address: to, local, constraints };
         self.session = Some(Session::new(now, config, Plain, storage));
-        self.standing = Standing::Dialing;
+        self.is_dialing = true;
         self.hub.node.dialing(identity, LINK);
     }
 
@@ -86,19 +86,19 @@ impl SUnit {
     /// Tells the session what has become of its stream.
     fn follow_stream(&mut self, now: Instant) {
         let Some(session) = &mut self.session else { return };
-        match (self.stack.stream(), self.standing) {
+        match (self.stack.stream(), self.is_dialing) {
             (Stream::Opening, _) => {}
-            (Stream::Open, Standing::Dialing) => {
-                self.standing = Standing::Connected;
+            (Stream::Open, true) => {
+                self.is_dialing = false;
                 session.connected(context!(self, now));
             }
-            (Stream::Open, _) => {
+            (Stream::Open, false) => {
                 if session.wants_to_write() && self.stack.stream_takes_bytes() {
                     session.writable(context!(self, now));
                 }
             }
-            (Stream::Ended, Standing::Dialing) => session.disconnected(CloseReason::DialFailed),
-            (Stream::Ended, _) => session.disconnected(CloseReason::Reset),
+            (Stream::Ended, true) => session.disconnected(CloseReason::DialFailed),
+            (Stream::Ended, false) => session.disconnected(CloseReason::Reset),
         }
     }
 
@@ -143,10 +143,6 @@ impl SUnit {
                 program.replied(id, outcome.and_then(|results| session.results(&results, lent)));
             }
             Event::Closed(reason) => self.leave(now, reason, program),
-            Event::Joined => {
-                self.standing = Standing::Joined;
-                program.hear(event);
-            }
             event => program.hear(event),
         }
     }
@@ -190,11 +186,12 @@ impl SUnit {
     /// The link has ended, and everything of it has been told: its memory serves the next one.
     fn leave<P: Program>(&mut self, now: Instant, reason: CloseReason, program: &mut P) {
         let Some(session) = self.session.take() else { return };
+        let had_joined = session.peer().is_some();
         self.spare = Some(session.into_storage(&mut self.buffers));
         self.unanswered = None;
         self.stack.close();
         self.hub.node.left(now, LINK, reason);
-        if self.standing == Standing::Joined {
+        if had_joined {
             program.hear(Event::Closed(reason));
         }
     }

@@ -46,18 +46,11 @@ pub struct SUnit {
     pub(crate) session: Option<Session<Smoltcp>>,
     /// What the next link will live in.
     pub(crate) spare: Option<SessionStorage<Lent>>,
-    pub(crate) standing: Standing,
+    /// Its stream has not opened yet.
+    pub(crate) is_dialing: bool,
     /// A call that was served and whose answer found no room yet, and its results.
     pub(crate) results: &'static mut Arguments,
     pub(crate) unanswered: Option<(Ticket, Result<(), Error>)>,
-}
-
-/// How far the link has come, as long as there is one.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Standing {
-    Dialing,
-    Connected,
-    Joined,
 }
 
 /// Lends a session what it needs. A macro, since it borrows the unit's parts one by one.
@@ -96,7 +89,7 @@ impl SUnit {
             arguments: parts.arguments,
             session: None,
             spare: Some(parts.link),
-            standing: Standing::Dialing,
+            is_dialing: false,
             results: parts.results,
             unanswered: None,
         }

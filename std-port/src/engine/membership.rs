@@ -226,17 +226,10 @@ impl<T: Send + 'static> Engine<T> {
         }
     }
 
-    /// Tells subscribers of an event on the link of a node that has joined.
+    /// Tells subscribers of an event on a link.
     fn tell_of(&self, link: &LinkCell, event: Event) {
-        let Some(peer) = link.peer.get() else { return };
-        let own_name = |slot: Slot| self.functions().function(slot).map(|f| f.name().to_owned()).unwrap_or_default();
-        let their_name = |slot: Slot| {
-            let state = link.lock();
-            state.session.their_function_list().function(slot).map(|f| f.name().to_owned()).unwrap_or_default()
-        };
-        if let Some(event) = UnitEvent::of(event, &peer.identity, own_name, their_name) {
-            self.tell(event);
-        }
+        let told = UnitEvent::of(event, &link.lock().session, &*self.functions(), str::to_owned);
+        told.into_iter().for_each(|event| self.tell(event));
     }
 
     /// The link's id is free for another link only when nothing here means the old one by it any more.
@@ -251,14 +244,8 @@ impl<T: Send + 'static> Engine<T> {
         if let Some(peer) = link.peer.get() {
             peer.leave(link, reason);
             self.run_lost_hook();
-            self.tell_of(link, Event::Closed(reason));
-        } else {
-            let (peer, address) = {
-                let state = link.lock();
-                (state.session.identity().cloned(), state.session.address())
-            };
-            self.tell(UnitEvent::NotJoined { address, peer, reason });
         }
+        self.tell_of(link, Event::Closed(reason));
         self.links.cancel_timer(link.id);
         self.hub().hub.node.left(self.now(), link.id, reason);
         self.links.remove(link);

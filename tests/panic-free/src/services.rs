@@ -4,7 +4,7 @@ use core::mem::MaybeUninit;
 use core::net::SocketAddrV4;
 
 use cara_core::distribution::datagram;
-use cara_core::distribution::function_list::{FunctionList, Slot};
+use cara_core::distribution::function_list::FunctionList;
 use cara_core::distribution::hello::Hello;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::{Parameters, ParametersView};
@@ -103,7 +103,7 @@ entry!(session_asked, {
         session.is_ended(),
         session.hello(),
     ));
-    keep((session.identity(), session.epoch(), session.address(), session.nonce(), session.deadline()));
+    keep((session.identity(), session.peer(), session.epoch(), session.address(), session.nonce(), session.deadline()));
     keep((session.their_function_list(), session.counters(), session.calls_in_flight(), session.calls_held()));
     keep((
         session.wants_to_write(),
@@ -189,8 +189,8 @@ entry!(replies, {
 });
 
 entry!(events, {
-    let name = |slot| slot;
-    keep(UnitEvent::<Slot, (), SocketAddrV4>::of(*unknown(), unknown::<Identity>(), name, name));
+    let functions: &dyn OwnFunctions = unknown::<FunctionList<Lent, Handler>>();
+    keep(UnitEvent::<usize, (), SocketAddrV4>::of(*unknown(), session(), functions, str::len));
 });
 
 entry!(leases, {

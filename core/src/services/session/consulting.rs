@@ -61,6 +61,7 @@ impl<P: Port> Session<P> {
         if self.phase != Phase::Live {
             return None;
         }
+        self.joined = true;
         self.publish(cx);
         Some(Event::Joined)
     }

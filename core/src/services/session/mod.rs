@@ -184,6 +184,8 @@ pub struct Session<P: Port> {
     link: Link<P::Storage, P::Cipher>,
     phase: Phase,
     dialed: bool,
+    /// The hub has taken the peer.
+    joined: bool,
     local: Hello,
     constraints: Constraints,
     remote: Option<Remote<P::Endpoint>>,
@@ -228,6 +230,7 @@ impl<P: Port> Session<P> {
             link,
             phase: Phase::AwaitingHello { until: now + HELLO_TIMEOUT },
             dialed,
+            joined: false,
             local,
             constraints,
             remote: None,
@@ -300,6 +303,11 @@ impl<P: Port> Session<P> {
     /// The peer's identity, once it has told it. It may be anybody's as long as the peer [is not proven](Self::is_proven).
     pub fn identity(&self) -> Option<&Identity> {
         self.hello().map(|hello| &hello.identity)
+    }
+
+    /// The peer, from joining on.
+    pub fn peer(&self) -> Option<&Identity> {
+        self.identity().filter(|_| self.joined)
     }
 
     /// The peer's boot epoch, once it has told it.

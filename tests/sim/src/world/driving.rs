@@ -6,7 +6,7 @@ use std::rc::Rc;
 use cara_core::distribution::authenticator::Authenticator as _;
 use cara_core::distribution::connection_handler::{Command, NodeCounter};
 use cara_core::distribution::datagram;
-use cara_core::distribution::function_list::{Function, Slot};
+use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::identity::Identity;
 use cara_core::error::{CloseReason, Error, Refusal};
 use cara_core::host::mailman::LinkId;
@@ -188,7 +188,6 @@ impl Inner {
     fn one_happened(&mut self, shared: &Rc<Shared>, host: HostId, index: u16, happened: Happened) {
         match happened {
             (Event::Call(call), Some(parameters)) => self.serve(shared, host, index, &call, parameters),
-            (Event::Joined, _) => self.joined(shared, host, index),
             (Event::Closed(reason), _) => self.closed(shared, host, index, reason),
             (event, _) => {
                 if let Event::LeaseExpired(slot) = event {
@@ -233,30 +232,16 @@ impl Inner {
         }
     }
 
-    /// The link is live.
-    fn joined(&mut self, shared: &Rc<Shared>, host: HostId, index: u16) {
-        let Some(machine) = &mut self.units[host.index()].machine else { return };
-        let Some(link) = machine.links.link_mut(index) else { return };
-        link.peer = link.session.identity().cloned();
-        self.log_of(shared, host, index, Event::Joined);
-    }
-
     fn closed(&mut self, shared: &Rc<Shared>, host: HostId, index: u16, reason: CloseReason) {
         let now = self.network.now();
         let unit = &mut self.units[host.index()];
         let Some(machine) = &mut unit.machine else { return };
         let Some(link) = machine.links.remove(&mut self.network, index) else { return };
         unit.counters.merge(link.session.counters());
-        let event = match &link.peer {
-            Some(peer) => UnitEvent::Left { peer: peer.clone(), reason },
-            None => {
-                let (address, peer) = (link.session.address(), link.session.identity().cloned());
-                UnitEvent::NotJoined { address, peer, reason }
-            }
-        };
+        let told = UnitEvent::of(Event::Closed(reason), &link.session, &machine.links.functions, str::to_owned);
         Link::abandon(link, Error::Interrupted);
         machine.links.hub.node.left(now, LinkId(index), reason);
-        self.log(shared, host, event);
+        told.into_iter().for_each(|event| self.log(shared, host, event));
     }
 
     /// Starts the service of a call.
@@ -274,7 +259,7 @@ impl Inner {
         let Handler(service) = function.handler;
         let (service, function): (_, Rc<str>) = (Rc::clone(service), Rc::from(function.name()));
         let Some(link) = machine.links.link_mut(index) else { return };
-        let Some(caller) = link.peer.clone() else { return };
+        let Some(caller) = link.session.peer().cloned() else { return };
         let (ticket, stream) = (call.ticket, link.stream);
         let handle = UnitHandle::new(Rc::downgrade(shared), host);
         let told = Call {
@@ -308,16 +293,12 @@ impl Inner {
         }));
     }
 
-    /// Logs an event of a link whose peer has joined.
+    /// Logs what an event of a link means to the program.
     fn log_of(&mut self, shared: &Rc<Shared>, host: HostId, index: u16, event: Event) {
         let Some(machine) = &self.units[host.index()].machine else { return };
         let Some(link) = machine.links.link(index) else { return };
-        let Some(peer) = &link.peer else { return };
-        let own_name = |slot| name(machine.links.functions.function(slot));
-        let their_name = |slot| name(link.session.their_function_list().function(slot));
-        if let Some(event) = UnitEvent::of(event, peer, own_name, their_name) {
-            self.log(shared, host, event);
-        }
+        let told = UnitEvent::of(event, &link.session, &machine.links.functions, str::to_owned);
+        told.into_iter().for_each(|event| self.log(shared, host, event));
     }
 
     fn log(&mut self, shared: &Rc<Shared>, host: HostId, event: impl Into<LogEvent>) {
@@ -331,8 +312,4 @@ impl Inner {
         }
         unit.log.push((now, event));
     }
-}
-
-fn name<H>(function: Option<Function<'_, H>>) -> String {
-    function.map_or_else(String::new, |function| function.name().to_owned())
 }

@@ -152,7 +152,8 @@ impl UnitHandle {
         let index = self.link_to(&peer)?;
         self.machine(|machine, network| {
             let links = &mut machine.links;
-            let identity = links.link(index).and_then(|link| link.peer.clone()).ok_or(Error::NotConnected)?;
+            let identity =
+                links.link(index).and_then(|link| link.session.peer()).cloned().ok_or(Error::NotConnected)?;
             for function in links.functions.iter() {
                 links.hub.publications.publish_to(&identity, function.slot)?;
             }
@@ -174,7 +175,8 @@ impl UnitHandle {
 
     /// The connected nodes, in the order of their links.
     pub fn peers(&self) -> Vec<Identity> {
-        let peers = self.machine(|machine, _| machine.links.iter().filter_map(|(_, link)| link.peer.clone()).collect());
+        let peers = self
+            .machine(|machine, _| machine.links.iter().filter_map(|(_, link)| link.session.peer().cloned()).collect());
         peers.unwrap_or_default()
     }
 
@@ -214,7 +216,8 @@ impl UnitHandle {
     pub fn nodes_offering(&self, function: &str) -> Vec<Identity> {
         let offers = |link: &Link| link.session.their_function_list().find(function).is_some();
         let nodes = self.machine(|machine, _| {
-            machine.links.iter().filter(|(_, link)| offers(link)).filter_map(|(_, link)| link.peer.clone()).collect()
+            let offering = machine.links.iter().filter(|(_, link)| offers(link));
+            offering.filter_map(|(_, link)| link.session.peer().cloned()).collect()
         });
         nodes.unwrap_or_default()
     }
@@ -283,7 +286,7 @@ impl UnitHandle {
         for index in self.live_links() {
             let published = self.machine(|machine, network| {
                 let links = &mut machine.links;
-                let identity = links.link(index)?.peer.clone()?;
+                let identity = links.link(index)?.session.peer()?.clone();
                 let serial = links.with(network, index, |session, cx| session.publish(cx))?;
                 Some((identity, links.await_acknowledgement(index, serial)))
             });
@@ -300,7 +303,7 @@ impl UnitHandle {
 
     pub(super) fn link_to(&self, peer: &Peer) -> Result<u16, Error> {
         self.machine(|machine, _| {
-            let is = |link: &Link| link.session.is_live() && link.peer.as_ref().is_some_and(|other| peer.is(other));
+            let is = |link: &Link| link.session.is_live() && link.session.peer().is_some_and(|other| peer.is(other));
             machine.links.iter().find(|(_, link)| is(link)).map(|(index, _)| index)
         })?
         .ok_or(Error::NotConnected)

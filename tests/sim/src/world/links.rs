@@ -4,7 +4,6 @@ use std::collections::BTreeMap;
 
 use cara_core::distribution::connection_handler::Directive;
 use cara_core::distribution::function_list::{FunctionList, Slot};
-use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 use cara_core::services::access::Access;
@@ -50,8 +49,6 @@ pub(super) struct Link {
     unanswered: Vec<(Ticket, Result<BoxedParameters, Error>)>,
     /// The session wants no bytes now: the unit is out of buffers or has not decided about the peer.
     paused: bool,
-    /// The peer, from joining to leaving.
-    pub(super) peer: Option<Identity>,
 }
 
 /// All links of a unit, and what they share.
@@ -123,7 +120,6 @@ impl Links {
             acknowledgements: Vec::new(),
             unanswered: Vec::new(),
             paused: false,
-            peer: None,
         });
     }
 
