@@ -1,9 +1,15 @@
 //! Every limit of CARA in one place: what can be set while running ([`Constraints`]) and what is fixed when compiling.
 
+use core::fmt;
+
 use crate::time::Duration;
 
-/// Protocol version, one byte in every datagram and hello. Units of different versions refuse each other by name.
-pub const VERSION: u8 = 1;
+/// The versions of the protocol that this unit speaks, told in every hello and who-has. Two units use the highest one
+/// that both speak, and refuse each other where there is none.
+pub const VERSIONS: Versions = Versions { first: 2, last: if LATER { 3 } else { 2 } };
+/// Set in a build that passes for a later version: it says more than this one knows wherever the wire format has room for
+/// it, for the tests of units that do not. Nothing else sets it.
+pub(crate) const LATER: bool = cfg!(cara_later);
 /// First four bytes of every datagram and hello in plain mode. Secured mode has its own, so the two never meet.
 pub const PLAIN_MAGIC: [u8; 4] = *b"CARp";
 /// First four bytes of every datagram and hello in secured mode.
@@ -75,6 +81,38 @@ pub const SEARCH_BUDGET: u8 = 4;
 pub const SEARCH_WINDOW: Duration = Duration::from_secs(1);
 /// An answer to a broadcast is delayed at random by up to this much per node that is expected to answer as well.
 pub const ANSWER_SPREAD: Duration = Duration::from_millis(1);
+
+/// Versions of the protocol, from the first to the last.
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct Versions {
+    /// The lowest one.
+    pub first: u8,
+    /// The highest one.
+    pub last: u8,
+}
+
+impl Versions {
+    /// The highest version that is among both.
+    pub const fn common(self, other: Self) -> Option<u8> {
+        let first = if self.first > other.first { self.first } else { other.first };
+        let last = if self.last < other.last { self.last } else { other.last };
+        if first <= last { Some(last) } else { None }
+    }
+
+    /// Of the two bytes on the wire. Version 1 has something else where the last version is now.
+    pub(crate) const fn from_wire(first: u8, last: u8) -> Self {
+        Self { first, last: if first <= 1 || last < first { first } else { last } }
+    }
+}
+
+/// `2`, or `2 to 4`.
+impl fmt::Display for Versions {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}", self.first)?;
+        if self.last == self.first { Ok(()) } else { write!(f, " to {}", self.last) }
+    }
+}
 
 /// What can be set by hand (paper, section 2), before the start and while running. Peers are told what concerns them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -150,6 +188,14 @@ impl Mode {
             PLAIN_MAGIC => Some(Self::Plain),
             SECURED_MAGIC => Some(Self::Secured),
             _ => None,
+        }
+    }
+
+    /// Cipher suites that a unit of this mode has, a bit each: bit 0 is `Noise_NNpsk0_25519_ChaChaPoly_BLAKE2s`.
+    pub const fn suites(self) -> u16 {
+        match self {
+            Self::Plain => 0,
+            Self::Secured => 1,
         }
     }
 

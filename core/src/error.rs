@@ -1,5 +1,6 @@
 //! Everything that can go wrong, sorted by where the remedy lies. Small, `Copy`, and each text says what to do.
 
+use crate::config::{VERSIONS, Versions};
 use crate::time::Duration;
 
 /// Where the remedy of an [`Error`] lies. There are these four and no others, so a `match` on it needs no other arm.
@@ -90,41 +91,80 @@ impl Constraint {
 /// What a unit tells the other end when it does not take a link.
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, thiserror::Error)]
-#[repr(u8)]
 #[non_exhaustive]
 pub enum Refusal {
-    /// The two speak different versions of the protocol.
-    #[error("the peer speaks another version of the protocol: update one of the two")]
-    Version = 1,
+    /// The two have no version of the protocol in common; the peer speaks these.
+    #[error("the peer speaks version {0} of the protocol, and this unit {VERSIONS}: update one of the two")]
+    Version(Versions),
     /// The two belong to different fleets.
     #[error("the peer belongs to another fleet: set the same fleet on both")]
-    Fleet = 2,
+    Fleet,
     /// An s_unit of another manager.
     #[error("the s_unit belongs to another manager: check the manager's name and id set in it")]
-    WrongManager = 3,
+    WrongManager,
     /// `Constraints::maximum_nodes` is reached.
     #[error("the peer has as many nodes as it may: raise its maximum_nodes")]
-    Full = 4,
+    Full,
     /// Another live node has the same name, id and role.
     #[error("another live node has the same name and id: give each node its own")]
-    DuplicateIdentity = 5,
+    DuplicateIdentity,
     /// Both ends have the same role or identity where that cannot be.
     #[error("the two roles cannot be joined: make one of them an m_unit, which s_units join")]
-    Role = 6,
+    Role,
     /// The peers are connected already.
     #[error("the two nodes are connected already by another link: nothing need be done")]
-    AlreadyConnected = 7,
+    AlreadyConnected,
     /// The hello could not be read.
     #[error("the peer's hello could not be read: is it a CARA unit?")]
-    Malformed = 8,
+    Malformed,
     /// One of the two is plain, and the other one secured.
     #[error("one of the two units is plain and the other one secured: give both keys, or start both in plain mode")]
-    Mode = 9,
+    Mode,
     /// There is no key for these two units.
     #[error(
         "there is no key for this pair of units: one was revoked, or never added; if that is on purpose, do nothing"
     )]
-    NoKey = 10,
+    NoKey,
+    /// The two have no cipher suite in common.
+    #[error("the two units have no cipher suite in common: update one of the two")]
+    Suite,
+}
+
+impl Refusal {
+    /// The byte on the wire.
+    pub const fn to_wire(self) -> u8 {
+        match self {
+            Self::Version(_) => 1,
+            Self::Fleet => 2,
+            Self::WrongManager => 3,
+            Self::Full => 4,
+            Self::DuplicateIdentity => 5,
+            Self::Role => 6,
+            Self::AlreadyConnected => 7,
+            Self::Malformed => 8,
+            Self::Mode => 9,
+            Self::NoKey => 10,
+            Self::Suite => 11,
+        }
+    }
+
+    /// The refusal of a byte on the wire. A unit that speaks other versions has told them in its hello before; only version
+    /// 1 did not.
+    pub const fn from_wire(code: u8) -> Self {
+        match code {
+            1 => Self::Version(Versions { first: 1, last: 1 }),
+            2 => Self::Fleet,
+            3 => Self::WrongManager,
+            4 => Self::Full,
+            5 => Self::DuplicateIdentity,
+            6 => Self::Role,
+            7 => Self::AlreadyConnected,
+            9 => Self::Mode,
+            10 => Self::NoKey,
+            11 => Self::Suite,
+            _ => Self::Malformed,
+        }
+    }
 }
 
 /// Why a link ended.
@@ -315,6 +355,9 @@ pub enum Error {
     /// The callee could not read the message; it did not run it.
     #[error("the peer could not read the request: check its version")]
     Malformed,
+    /// The callee is of an earlier version, which does not know something that the request depends on; it did not run it.
+    #[error("the peer's version does not know what the request asks for: update the peer, or ask without it")]
+    Unsupported,
     /// The callee's rules do not let this unit call the function.
     #[error(
         "the peer's access table does not let this unit call the function: change the table, or ask with another unit"
@@ -386,6 +429,7 @@ impl Error {
             | Self::ResultLost
             | Self::Busy
             | Self::Malformed
+            | Self::Unsupported
             | Self::NotAllowed
             | Self::Service(_)
             | Self::Refused(_) => Cause::Peer,

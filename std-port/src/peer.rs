@@ -161,6 +161,11 @@ impl<T: Send + 'static> Peer<T> {
         self.cell.link().and_then(|link| link.lock().session.epoch())
     }
 
+    /// The version of the protocol that is spoken with the node; `None` while it is not connected.
+    pub fn version(&self) -> Option<u8> {
+        self.cell.link().and_then(|link| link.lock().session.version())
+    }
+
     /// What the node takes, as it last told; `None` while it is not connected.
     pub fn limits(&self) -> Option<Limits> {
         self.cell.link().and_then(|link| link.lock().session.hello().map(|hello| hello.limits))

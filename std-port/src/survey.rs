@@ -47,7 +47,7 @@ pub use self::ports::Ports;
 use crate::sys::datagram::{Datagrams, Socket};
 use crate::sys::epoll::{Epoll, Events, Interest};
 use crate::sys::interfaces::Interfaces;
-pub use cara_core::config::VERSION;
+pub use cara_core::config::{VERSIONS, Versions};
 
 /// Most lives of units that are kept; beyond them only those that are kept already are counted on.
 pub const HEARD: usize = 4096;
@@ -224,6 +224,7 @@ impl Survey {
             tcp_port: 0,
             expected: 0,
             known: Default::default(),
+            skipped: 0,
         };
         let plain = self.asks_in_plain.then(|| encoded(&question(first.wrapping_add(1)), fleet, &Plain));
         let secured = self.keys.signers(fleet).zip(2..);
@@ -288,7 +289,7 @@ impl Survey {
             (Mode::Plain, _) => Standing::Plain,
             (Mode::Secured, Some(Datagram::Session { .. })) => Standing::Unchecked,
             // How another version signs is not known here.
-            (Mode::Secured, _) if header.version != VERSION => Standing::Unchecked,
+            (Mode::Secured, _) if VERSIONS.common(header.versions).is_none() => Standing::Unchecked,
             (Mode::Secured, _) => self.keys.standing(header.fleet, bytes),
         }
     }

@@ -13,6 +13,7 @@ import cara_wire as wire
 
 MAGIC = b"CARs"
 SUITE = b"Noise_NNpsk0_25519_ChaChaPoly_BLAKE2s"
+SUITES = 1
 TAG_BYTES = 16
 FRAMES_PER_KEY = 1 << 20
 HELLO, PROOF, CONFIRM = 1, 7, 8
@@ -253,7 +254,8 @@ class Conversation:
         if body[0] == HELLO:
             require(end == ("vehicle", "manager")[len(self.hellos)] and body[1:5] == MAGIC, "no hello in its turn")
             self.hellos.append(body[1:])
-            hello = wire.decode_hello(wire.MAGIC + body[5:])
+            hello = wire.decode_hello(body[1:], MAGIC, SUITES)
+            require("identity" in hello, "a hello of other versions")
             return {"hello": hello}
         require(body[0] == PROOF and len(self.hellos) == 2, "a frame that must be sealed")
         if self.prologue is None:
@@ -309,7 +311,9 @@ class Conversation:
     def datagram(self, end, data):
         """A session datagram; what it says."""
         header, generation, number = data[:DATAGRAM_HEADER], data[24], data[25:33]
-        require(header[:4] == MAGIC and generation in self.datagram_keys[end], "a datagram of no known key")
+        version = bytes([wire.VERSION])
+        require(header[:8] == MAGIC + version + b"\3" + version + b"\0" and header[14:16] == b"\0\0", "another header")
+        require(generation in self.datagram_keys[end], "a datagram of no known key")
         further = (bytes([len(header), generation]) + number + header).ljust(58, b"\0")
         key, number = self.datagram_keys[end][generation], struct.unpack("<Q", number)[0]
         body = open_sealed(key, number, further, data[33:])

@@ -1,4 +1,4 @@
-"""CARA's wire format, version 1, in Python: written from docs/wire.md alone, standard library only.
+"""CARA's wire format, version 2, in Python: written from docs/wire.md alone, standard library only.
 
 Each `decode_…` takes bytes and returns plain values, or raises Malformed; each `encode_…` is its inverse. `Link` takes a
 stream apart. Nothing here opens a socket.
@@ -7,7 +7,9 @@ stream apart. Nothing here opens a socket.
 import struct
 
 MAGIC = b"CARp"
-VERSION = 1
+# That of every link, and what this end speaks.
+VERSION = 2
+VERSIONS = [VERSION, VERSION]
 PORT = 21970
 PRIORITIES = ["emergency", "high", "normal", "low"]
 ROLES = ["m_unit", "s_unit"]
@@ -18,6 +20,9 @@ EMERGENCY_BYTES = 256
 MINIMUM_CHUNK = 320
 LEAST_MESSAGE = 512
 REQUEST_BYTES = 32
+LONGEST_HEADER = 64
+REPLY_BYTES = 16
+MUST_UNDERSTAND = 0x8000
 
 
 class Malformed(Exception):
@@ -63,11 +68,6 @@ class Reader:
                 require(number >> bits == 0)
                 return number
         raise Malformed()
-
-    def boolean(self):
-        byte = self.u8()
-        require(byte <= 1)
-        return byte == 1
 
     def sized(self):
         return self.take(self.varint(64))
@@ -116,29 +116,132 @@ def is_node_name(name):
     return name != "" and not any(first <= ord(c) <= last for c in name for first, last in UNSEEN)
 
 
-def read_identity(reader):
-    identity = {"id": reader.varint(32), "name": reader.text(32)}
-    role = reader.varint(32)
-    require(role < len(ROLES) and is_node_name(identity["name"]))
-    identity["role"] = ROLES[role]
-    return identity
+# --- items (section 1)
 
 
-def write_identity(identity):
-    role = ROLES.index(identity["role"])
-    return varint(identity["id"]) + sized(identity["name"].encode()) + varint(role)
+def items_of(data):
+    """The items of a list: (kind, body) of each."""
+    reader, items = Reader(data), []
+    while reader.at < len(data):
+        kind, length = reader.fixed("HH")
+        body = reader.take(length)
+        reader.take(-length % 4)
+        if kind != 0:
+            items.append((kind, body))
+    return items
 
 
-def read_manager(reader):
-    if not reader.boolean():
-        return None
-    return {"name": reader.text(32), "id": reader.varint(32)}
+def item(kind, body):
+    return struct.pack("<HH", kind, len(body)) + body + bytes(-len(body) % 4)
 
 
-def write_manager(manager):
-    if manager is None:
-        return b"\0"
-    return b"\1" + sized(manager["name"].encode()) + varint(manager["id"])
+# kind: (name, fields and their encodings)
+ITEMS = {
+    1: ("unit", [("id", 32), ("name", "name"), ("role", "role"), ("epoch", 64)]),
+    2: ("wanted", [("name", "name"), ("id", 32)]),
+    3: ("link", [("nonce", 64), ("link", 16), ("udp_port", 16), ("stamp", 64), ("keep_alive", 32)]),
+    4: ("limits", [("message_size", 32), ("chunk_size", 16), ("calls", 16), ("minimum_interval", 32)]),
+    5: ("search", [("sequence", 32), ("nonce", 64), ("tcp_port", 16), ("expected", 16)]),
+    6: ("known", None),
+    7: ("answer", [("sequence", 32), ("nonce", 64), ("tcp_port", 16), ("room", 16), ("expected", 16)]),
+}
+HELLO_ITEMS = ("unit", "wanted", "link", "limits")
+WHO_HAS_ITEMS = ("unit", "wanted", "search", "known")
+ANNOUNCE_ITEMS = ("unit", "answer")
+
+
+def read_fields(reader, fields):
+    """What follows them is of a later version."""
+    value = {}
+    for name, encoding in fields:
+        if encoding == "name":
+            value[name] = reader.text(32)
+        elif encoding == "role":
+            value[name] = one_of(ROLES, reader.u8())
+        elif encoding == "lease_end":
+            why = reader.varint(32)
+            value[name] = LEASE_ENDS[why] if why < len(LEASE_ENDS) else "expired"
+        elif encoding == "bytes":
+            value[name] = reader.sized().hex()
+        else:
+            value[name] = reader.varint(encoding)
+    return value
+
+
+def write_fields(value, fields):
+    out = b""
+    for name, encoding in fields:
+        if encoding == "name":
+            out += sized(value[name].encode())
+        elif encoding == "role":
+            out += bytes([ROLES.index(value[name])])
+        elif encoding == "lease_end":
+            out += varint(LEASE_ENDS.index(value[name]))
+        elif encoding == "bytes":
+            out += sized(bytes.fromhex(value[name]))
+        else:
+            out += varint(int(value[name]))
+    return out
+
+
+def one_of(names, number):
+    require(number < len(names))
+    return names[number]
+
+
+def passed_over(kind):
+    """An unknown kind may be passed over, unless it must be understood."""
+    require(kind & MUST_UNDERSTAND == 0)
+    return 1
+
+
+def read_items(data, wanted, needed):
+    """The items of these names, the last one of each, and how many others there were."""
+    found, skipped = {"skipped": 0}, 0
+    for kind, body in items_of(data):
+        name, fields = ITEMS.get(kind, (None, None))
+        if name not in wanted:
+            skipped += passed_over(kind)
+        elif name == "known":
+            require(len(body) % 4 == 0)
+            found[name] = list(struct.unpack("<%dI" % (len(body) // 4), body))[:64]
+        else:
+            found[name] = read_fields(Reader(body), fields)
+    require(all(name in found for name in needed))
+    require(is_node_name(found["unit"]["name"]))
+    found["skipped"] = skipped
+    found["identity"] = {name: found["unit"][name] for name in ("id", "name", "role")}
+    return found
+
+
+def write_items(value, names):
+    """The items of a value in which all fields stand side by side."""
+    out = b""
+    for kind, (name, fields) in ITEMS.items():
+        if name not in names:
+            continue
+        if name == "unit":
+            out += item(kind, write_fields({**value, **value["identity"]}, fields))
+        elif name == "wanted":
+            out += item(kind, write_fields(value[name], fields)) if value[name] else b""
+        elif name == "known":
+            out += item(kind, struct.pack("<%dI" % len(value[name]), *value[name])) if value[name] else b""
+        else:
+            out += item(kind, write_fields(value, fields))
+    return out
+
+
+# --- versions (section 1)
+
+
+def versions_of(first, last):
+    return [first, first if first <= 1 or last < first else last]
+
+
+def in_common(theirs):
+    """The highest version that both speak, None without one."""
+    last = min(theirs[1], VERSIONS[1])
+    return last if last >= max(theirs[0], VERSIONS[0]) else None
 
 
 def short_hash(identity):
@@ -151,31 +254,29 @@ def short_hash(identity):
 
 # --- the hello (section 7)
 
-HELLO_TAIL = [
-    ("epoch", 64), ("nonce", 64), ("term", 32), ("capabilities", 32), ("message_size", 32), ("chunk_size", 16),
-    ("calls", 16), ("minimum_interval", 32), ("link", 16), ("udp_port", 16), ("stamp", 64), ("keep_alive", 32),
-]
 
-
-def decode_hello(data):
+def decode_hello(data, magic=MAGIC, suites=0):
+    """A hello of this mode, by default the plain one; `suites` are those of which one must be in it."""
     reader = Reader(data)
-    magic = reader.take(4)
-    version = reader.u8()
-    require(magic == MAGIC)
-    if version != VERSION:
-        return {"other_version": version}
-    hello = {"fleet": reader.varint(32), "identity": read_identity(reader), "wanted": read_manager(reader)}
-    for name, bits in HELLO_TAIL:
-        hello[name] = reader.varint(bits)
-    reader.end()
-    require(is_node_name(hello["identity"]["name"]) and hello["chunk_size"] >= MINIMUM_CHUNK)
-    return hello
+    theirs, first, last, their_suites, fleet, capabilities = reader.fixed("4sBBHIQ")
+    require(theirs == magic)
+    versions = versions_of(first, last)
+    if in_common(versions) is None:
+        return {"other_versions": versions}
+    require(suites == 0 or their_suites & suites != 0)
+    found = read_items(reader.rest(), HELLO_ITEMS, ("unit", "link", "limits"))
+    require(found["limits"]["chunk_size"] >= MINIMUM_CHUNK)
+    return {
+        "versions": versions, "capabilities": capabilities, "fleet": fleet, "identity": found["identity"],
+        "wanted": found.get("wanted"), "epoch": found["unit"]["epoch"], **found["link"], **found["limits"],
+        "skipped": found["skipped"],
+    }
 
 
 def encode_hello(hello):
-    head = MAGIC + bytes([VERSION]) + varint(hello["fleet"])
-    head += write_identity(hello["identity"]) + write_manager(hello["wanted"])
-    return head + b"".join(varint(hello[name]) for name, _ in HELLO_TAIL)
+    first, last = hello["versions"]
+    head = struct.pack("<4sBBHIQ", MAGIC, first, last, 0, hello["fleet"], hello["capabilities"])
+    return head + write_items(hello, HELLO_ITEMS)
 
 
 # --- datagrams (section 3)
@@ -184,55 +285,39 @@ def encode_hello(hello):
 def decode_datagram(data, fleet):
     require(len(data) >= 12)
     reader = Reader(data)
-    magic, version, kind, zero, theirs = reader.fixed("4sBBHI")
+    magic, first, kind, last, codes, theirs = reader.fixed("4sBBBBI")
     require(magic == MAGIC)
-    if version != VERSION:
-        return {"other_version": version}
+    versions = versions_of(first, last)
+    if in_common(versions) is None:
+        return {"other_versions": versions}
     if theirs != fleet:
         return {"other_fleet": theirs}
-    require(zero == 0)
+    if kind == 3:
+        link, _, nonce = reader.fixed("HHQ")
+        return {"session": {"link": link, "nonce": nonce, "body": decode_session_body(reader.rest())}}
+    require(codes == 0)
     if kind == 1:
-        return {"who_has": read_who_has(reader)}
-    if kind == 2:
-        return {"announce": read_announce(reader)}
-    require(kind == 3)
-    link, zero, nonce = reader.fixed("HHQ")
-    require(zero == 0)
-    return {"session": {"link": link, "nonce": nonce, "body": decode_session_body(reader.rest())}}
+        return {"who_has": read_datagram(reader.rest(), WHO_HAS_ITEMS, "search")}
+    require(kind == 2)
+    return {"announce": read_datagram(reader.rest(), ANNOUNCE_ITEMS, "answer")}
+
+
+def read_datagram(data, items, own):
+    found = read_items(data, items, ("unit", own))
+    value = {"identity": found["identity"], "epoch": found["unit"]["epoch"], **found[own], "skipped": found["skipped"]}
+    if own == "search":
+        value.update(wanted=found.get("wanted"), known=found.get("known", []))
+    return value
 
 
 def encode_datagram(datagram, fleet):
     (name, value), = datagram.items()
     kind = ["who_has", "announce", "session"].index(name) + 1
-    head = MAGIC + struct.pack("<BBHI", VERSION, kind, 0, fleet)
+    first, last = (VERSION, VERSION) if name == "session" else VERSIONS
+    head = MAGIC + struct.pack("<BBBBI", first, kind, last, 0, fleet)
     if name == "session":
         return head + struct.pack("<HHQ", value["link"], 0, value["nonce"]) + encode_session_body(value["body"])
-    body = write_identity(value["identity"])
-    body += varint(value["epoch"]) + varint(value["sequence"]) + varint(value["nonce"])
-    if name == "who_has":
-        known = b"".join(varint(item) for item in value["known"])
-        body += write_manager(value["wanted"]) + varint(value["tcp_port"]) + varint(value["expected"])
-        return head + body + varint(len(value["known"])) + known
-    return head + body + varint(value["tcp_port"]) + varint(value["room"]) + varint(value["expected"])
-
-
-def read_who_has(reader):
-    search = {"identity": read_identity(reader), "epoch": reader.varint(64), "sequence": reader.varint(32)}
-    search.update(nonce=reader.varint(64), wanted=read_manager(reader))
-    search.update(tcp_port=reader.varint(16), expected=reader.varint(16))
-    count = reader.varint(64)
-    require(count <= 64)
-    search["known"] = [reader.varint(32) for _ in range(count)]
-    reader.end()
-    return search
-
-
-def read_announce(reader):
-    answer = {"identity": read_identity(reader), "epoch": reader.varint(64), "sequence": reader.varint(32)}
-    answer.update(nonce=reader.varint(64), tcp_port=reader.varint(16))
-    answer.update(room=reader.varint(16), expected=reader.varint(16))
-    reader.end()
-    return answer
+    return head + write_items(value, WHO_HAS_ITEMS if name == "who_has" else ANNOUNCE_ITEMS)
 
 
 # --- messages (section 9)
@@ -243,20 +328,22 @@ ERRORS = {
     4: ("wrong_type", ("index",)), 5: ("wrong_size", ("index", "expected", "found")), 6: ("expired", ()),
     7: ("stale", ()), 8: ("busy", ()), 9: ("malformed", ()), 10: ("not_allowed", ()), 11: ("would_deadlock", ()),
     12: ("too_large", ("limit",)), 13: ("too_soon", ("wait",)), 14: ("result_would_not_fit", ("need", "have")),
-    15: ("result_lost", ()),
+    15: ("result_lost", ()), 16: ("unsupported", ()),
     20: ("service_failed", ("code",)), 21: ("service_panicked", ()), 22: ("service_not_ready", ()),
     23: ("service_bad_results", ()),
 }
 
-# name: fields and their encodings
-CONTROLS = [
-    ("publish", [("slot", 16), ("generation", 16), ("attributes", "u8[8]"), ("signature", "bytes")]),
-    ("withdraw", [("slot", 16)]),
-    ("list_end", [("serial", 32)]),
-    ("list_ack", [("serial", 32), ("skipped", 16)]),
-    ("limits", [("message_size", 32), ("minimum_interval", 32), ("calls", 16)]),
-    ("lease_ended", [("call", 32), ("why", "lease_end")]),
-]
+# kind of the item: (name, fields and their encodings)
+CONTROLS = {
+    1: ("publish", [("slot", 16), ("generation", 16), ("attributes", "bytes"), ("signature", "bytes")]),
+    2: ("withdraw", [("slot", 16)]),
+    3: ("list_end", [("serial", 32)]),
+    4: ("list_ack", [("serial", 32), ("skipped", 16)]),
+    5: ("limits", [("message_size", 32), ("minimum_interval", 32), ("calls", 16)]),
+    6: ("lease_ended", [("call", 32), ("why", "lease_end")]),
+}
+# Behind one of these nothing follows in a message.
+LAST_ITEMS = ("list_end", "list_ack", "lease_ended")
 LEASE_ENDS = ["finished", "expired", "replaced"]
 
 
@@ -268,7 +355,8 @@ def decode_message(data):
     if kind == 2:
         return {"reply": read_answer(Reader(data))}
     if kind == 3:
-        return read_control(Reader(data[1:]))
+        require(len(data) >= 4)
+        return {"control": [read_control(*each) for each in items_of(data[4:])]}
     require(kind == 4)
     failure = read_answer(Reader(data))
     require("error" in failure)
@@ -278,31 +366,36 @@ def decode_message(data):
 def encode_message(message):
     (name, value), = message.items()
     if name == "request":
-        flags = 1 if value["wants_reply"] else 0
+        flags = value["unknown"] | (1 if value["wants_reply"] else 0)
         numbers = (value["id"], value["remaining"], value["stamp"], value["since"], 0)
-        head = struct.pack("<BBHHHIIQII", 1, flags, value["slot"], value["generation"], 0, *numbers)
-        return head + bytes.fromhex(value["block"])
+        place = (value["slot"], value["generation"], REQUEST_BYTES // 4, 0)
+        return struct.pack("<BBHHBBIIQII", 1, flags, *place, *numbers) + bytes.fromhex(value["block"])
     if name in ("reply", "failure"):
         return write_answer(2 if name == "reply" else 4, value)
-    return write_control(name, value)
+    return bytes([3, 0, 0, 0]) + b"".join(write_control(*told) for each in value for told in each.items())
+
+
+def behind_header(reader, words, least):
+    """The block, behind a header that says its length in words."""
+    require(4 * words >= least)
+    reader.take(4 * words - least)
+    return reader.rest().hex()
 
 
 def read_request(reader):
-    form = "BBHHHIIQII"
-    _, flags, slot, generation, zero, number, remaining, stamp, since, zero_too = reader.fixed(form)
-    require(flags <= 1 and zero == 0 and zero_too == 0)
+    form = "BBHHBBIIQII"
+    _, flags, slot, generation, words, _, number, remaining, stamp, since, _ = reader.fixed(form)
     return {
-        "id": number, "slot": slot, "generation": generation, "wants_reply": flags == 1, "remaining": remaining,
-        "stamp": stamp, "since": since, "block": reader.rest().hex(),
+        "id": number, "slot": slot, "generation": generation, "wants_reply": flags & 1 == 1, "unknown": flags & 0xF0,
+        "remaining": remaining, "stamp": stamp, "since": since, "block": behind_header(reader, words, REQUEST_BYTES),
     }
 
 
 def read_answer(reader):
-    _, code, index, zero, number, first, second = reader.fixed("BBBBIII")
-    require(zero == 0)
+    kind, code, index, words, number, first, second = reader.fixed("BBBBIII")
+    block = behind_header(reader, words, REPLY_BYTES) if kind == 2 else ""
     if code == 0:
-        return {"id": number, "block": reader.rest().hex()}
-    reader.end()
+        return {"id": number, "block": block}
     name, fields = ERRORS.get(code, ("malformed", ()))
     if not fields:
         return {"id": number, "error": name}
@@ -315,47 +408,27 @@ def read_answer(reader):
 
 def write_answer(kind, value):
     if "block" in value:
-        return struct.pack("<BBBBIII", kind, 0, 0, 0, value["id"], 0, 0) + bytes.fromhex(value["block"])
+        return struct.pack("<BBBBIII", kind, 0, 0, REPLY_BYTES // 4, value["id"], 0, 0) + bytes.fromhex(value["block"])
     error = value["error"]
     name, fields = next(iter(error.items())) if isinstance(error, dict) else (error, {})
     code = next(code for code, (known, _) in ERRORS.items() if known == name)
     numbers = [fields[field] for field in ERRORS[code][1] if field != "index"] + [0, 0]
-    return struct.pack("<BBBBIII", kind, code, fields.get("index", 0), 0, value["id"], *numbers[:2])
+    return struct.pack("<BBBBIII", kind, code, fields.get("index", 0), REPLY_BYTES // 4, value["id"], *numbers[:2])
 
 
-def read_control(reader):
-    number = reader.varint(32)
-    require(number < len(CONTROLS))
-    name, fields = CONTROLS[number]
-    value = {}
-    for field, encoding in fields:
-        if encoding == "u8[8]":
-            value[field] = reader.take(8).hex()
-        elif encoding == "bytes":
-            value[field] = reader.sized().hex()
-        elif encoding == "lease_end":
-            number = reader.varint(32)
-            require(number < len(LEASE_ENDS))
-            value[field] = LEASE_ENDS[number]
-        else:
-            value[field] = reader.varint(encoding)
-    reader.end()
-    return {name: value}
+def read_control(kind, body):
+    if kind not in CONTROLS:
+        passed_over(kind)
+        return {"unknown": {"kind": kind, "body": body.hex()}}
+    name, fields = CONTROLS[kind]
+    return {name: read_fields(Reader(body), fields)}
 
 
 def write_control(name, value):
-    number = [known for known, _ in CONTROLS].index(name)
-    out = b"\3" + varint(number)
-    for field, encoding in CONTROLS[number][1]:
-        if encoding == "u8[8]":
-            out += bytes.fromhex(value[field])
-        elif encoding == "bytes":
-            out += sized(bytes.fromhex(value[field]))
-        elif encoding == "lease_end":
-            out += varint(LEASE_ENDS.index(value[field]))
-        else:
-            out += varint(int(value[field]))
-    return out
+    if name == "unknown":
+        return item(value["kind"], bytes.fromhex(value["body"]))
+    (kind, fields), = [(kind, fields) for kind, (known, fields) in CONTROLS.items() if known == name]
+    return item(kind, write_fields(value, fields))
 
 
 # --- functions and values (section 10)
@@ -411,9 +484,7 @@ def text_form(name, arguments, results):
 
 
 def decode_attributes(data):
-    require(len(data) == 8)
-    flags, zeros, lease = struct.unpack("<B3sI", data)
-    require(flags < 8 and zeros == b"\0\0\0")
+    flags, _, lease = Reader(data).fixed("B3sI")
     return {"priority": PRIORITIES[flags & 3], "idempotent": flags & 4 != 0, "lease": lease or None}
 
 
@@ -494,7 +565,6 @@ def decode_session_body(data):
         priority = reader.u8()
         require(priority < len(PRIORITIES))
         body = {"message": {"priority": PRIORITIES[priority], "message": decode_message(reader.rest())}}
-    reader.end()
     return body
 
 
@@ -567,13 +637,15 @@ class Link:
         if kind & ~3 == 0x10:
             return self.chunk(kind, body)
         if kind in (FRAMES["refuse"], FRAMES["close"]):
-            require(len(payload) == 1)
+            require(len(payload) >= 1)
             return {"refuse" if kind == FRAMES["refuse"] else "close": payload[0]}
         if kind in (FRAMES["ping"], FRAMES["pong"]):
             require(len(payload) == 0)
             return "ping" if kind == FRAMES["ping"] else "pong"
         if kind == FRAMES["hello"]:
             return {"hello": readable(decode_hello, payload)}
+        if 0x40 <= kind <= 0x7F:
+            return "skipped"
         require(kind == FRAMES["session"])
         return {"session": readable(decode_session_body, payload)}
 

@@ -55,7 +55,7 @@ class SUnit:
         self.lease_end = None
         self.leased_call = 0
         self.renewals = 0
-        self.theirs = {}
+        self.theirs, self.not_kept = {}, 0
         self.windows = {priority: (0, set()) for priority in wire.PRIORITIES}
         self.next_id = 1
         self.waiting = {}
@@ -100,12 +100,12 @@ class SUnit:
         self.tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         hello = {
             "fleet": self.options.fleet, "identity": self.identity, "wanted": self.wanted, "epoch": self.epoch,
-            "nonce": self.nonce, "term": 0, "capabilities": 0, "message_size": MESSAGE_SIZE, "chunk_size": CHUNK_SIZE,
+            "nonce": self.nonce, "versions": wire.VERSIONS, "capabilities": 0, "message_size": MESSAGE_SIZE, "chunk_size": CHUNK_SIZE,
             "calls": 8, "minimum_interval": 0, "link": 0, "udp_port": self.udp.getsockname()[1], "stamp": clock(),
             "keep_alive": int(KEEP_ALIVE * 1000),
         }
         self.write(wire.encode_frame("hello", wire.encode_hello(hello)))
-        self.link = wire.Link(CHUNK_SIZE, MESSAGE_SIZE + wire.REQUEST_BYTES)
+        self.link = wire.Link(CHUNK_SIZE, MESSAGE_SIZE + wire.LONGEST_HEADER)
         self.peer = None
         while self.peer is None:
             for incoming in self.link.receive(self.read()):
@@ -119,6 +119,9 @@ class SUnit:
             self.hear_stamp(self.peer["stamp"])
         elif self.peer is not None:
             self.dispatch(incoming)
+        elif isinstance(incoming, dict) and "other_versions" in incoming.get("hello", {}):
+            self.write(wire.encode_frame("refuse", b"\1"))
+            sys.exit("not taken: it speaks %s, this unit %s" % (incoming["hello"]["other_versions"], wire.VERSIONS))
         else:
             sys.exit("not taken: %s" % incoming)
 
@@ -134,23 +137,27 @@ class SUnit:
     def send(self, priority, message):
         self.write(b"".join(wire.encode_chunks(priority, wire.encode_message(message), self.peer_chunk())))
 
+    def tell(self, name, value):
+        """A control message of one item."""
+        self.send("high", {"control": [{name: value}]})
+
     def peer_chunk(self):
         return self.peer["chunk_size"]
 
     def publish(self):
         for slot, (signature, attributes) in enumerate(FUNCTIONS):
-            self.send("high", {"publish": {
+            self.tell("publish", {
                 "slot": slot, "generation": 0, "attributes": wire.encode_attributes(attributes).hex(),
                 "signature": wire.encode_signature(signature).hex(),
-            }})
-        self.send("high", {"list_end": {"serial": 1}})
+            })
+        self.tell("list_end", {"serial": 1})
 
     # --- the loop
 
     def run(self):
         """Serves until the manager closes the link."""
         self.tcp.settimeout(None)
-        next_keep_alive, heard = time.monotonic(), time.monotonic()
+        next_keep_alive = self.heard = time.monotonic()
         pause = self.peer["keep_alive"] / 1000
         next_question, missed = 0, 0
         while True:
@@ -160,9 +167,9 @@ class SUnit:
                 next_keep_alive = now + KEEP_ALIVE
             if self.lease_end is not None and clock() >= self.lease_end:
                 self.end_lease(expired=True)
-            if now - heard > 3.5 * pause:
+            if now - self.heard > 3.5 * pause:
                 self.close(3, "silence")
-            before, missed = missed, int((now - heard) / pause + 0.5) - 1
+            before, missed = missed, int((now - self.heard) / pause + 0.5) - 1
             if self.datagrams_pass and missed > 0 and now >= next_question:
                 self.send_datagram(wire.encode_session_body({"ping": {}}))
                 next_question = now + pause / 4
@@ -170,7 +177,6 @@ class SUnit:
                 self.write(wire.encode_frame("ping"))
             due = min(next_keep_alive - now, 0.01 if self.lease_end is not None else pause / 4)
             ready, _, _ = select.select([self.tcp, self.udp], [], [], max(due, 0))
-            heard = now if ready else heard
             if self.udp in ready:
                 self.datagram()
             if self.tcp in ready:
@@ -210,10 +216,13 @@ class SUnit:
         if mine and source[0] == self.tcp.getpeername()[0]:
             if not self.datagrams_pass:
                 say("datagrams pass")
-            self.datagrams_pass = True
+            self.datagrams_pass, self.heard = True, time.monotonic()
             self.session_body(session["body"])
 
     def dispatch(self, incoming):
+        if incoming == "skipped":
+            return
+        self.heard = time.monotonic()
         if incoming == "ping":
             self.write(wire.encode_frame("pong"))
         elif incoming == "pong":
@@ -259,7 +268,7 @@ class SUnit:
         if self.lease_end is None or value["call"] != self.leased_call:
             newest, seen = self.windows[value["class"]]
             if value["call"] in seen or value["call"] + 64 <= newest:
-                self.send("high", {"lease_ended": {"call": value["call"], "why": "expired"}})
+                self.tell("lease_ended", {"call": value["call"], "why": "expired"})
         elif value["stamp"] <= clock():
             self.renewals += 1
             made = min(value["stamp"] + value["since"], clock())
@@ -268,7 +277,7 @@ class SUnit:
     def end_lease(self, expired):
         say("stopped after", self.renewals, "renewals")
         self.lease_end = None
-        self.send("high", {"lease_ended": {"call": self.leased_call, "why": "expired" if expired else "finished"}})
+        self.tell("lease_ended", {"call": self.leased_call, "why": "expired" if expired else "finished"})
 
     # --- messages (sections 9, 11 and 12)
 
@@ -278,20 +287,30 @@ class SUnit:
             self.request(priority, value)
         elif kind in ("reply", "failure"):
             self.answered(value)
-        elif kind == "publish":
-            signature = wire.decode_signature(bytes.fromhex(value["signature"]))
-            wire.decode_attributes(bytes.fromhex(value["attributes"]))
-            self.theirs = {name: known for name, known in self.theirs.items() if known[0] != value["slot"]}
-            self.theirs[signature["name"]] = (value["slot"], value["generation"], signature)
-        elif kind == "withdraw":
-            self.theirs = {name: known for name, known in self.theirs.items() if known[0] != value["slot"]}
-        elif kind == "list_end":
-            self.send("high", {"list_ack": {"serial": value["serial"], "skipped": 0}})
+        else:
+            items = [item for each in value for item in each.items()]
+            if any(name in wire.LAST_ITEMS for name, _ in items[:-1]):
+                self.close(5, "something behind an item that is the last")
+            for name, told in items:
+                self.control(name, told)
+
+    def control(self, name, told):
+        if name in ("publish", "withdraw"):
+            self.theirs = {known: what for known, what in self.theirs.items() if what[0] != told["slot"]}
+        if name == "publish":
+            wire.decode_attributes(bytes.fromhex(told["attributes"]))
+            try:
+                signature = wire.decode_signature(bytes.fromhex(told["signature"]))
+                self.theirs[signature["name"]] = (told["slot"], told["generation"], signature)
+            except wire.Malformed:
+                self.not_kept += 1
+        elif name == "list_end":
+            self.tell("list_ack", {"serial": told["serial"], "skipped": self.not_kept})
             self.call_mechanic()
-        elif kind == "list_ack":
+        elif name == "list_ack":
             say("published")
-        elif kind == "limits":
-            self.peer.update(value)
+        elif name == "limits":
+            self.peer.update(told)
 
     def call_mechanic(self):
         """Calls the manager's function, once; every argument at its smallest."""
@@ -302,8 +321,8 @@ class SUnit:
         values = {each["name"]: empty[each["type"]](each["size"]) for each in signature["arguments"]}
         self.waiting[self.next_id] = signature
         self.send("normal", {"request": {
-            "id": self.next_id, "slot": slot, "generation": generation, "wants_reply": True, "remaining": 2_000_000,
-            "stamp": self.stamp, "since": clock() - self.heard_at,
+            "id": self.next_id, "slot": slot, "generation": generation, "wants_reply": True, "unknown": 0,
+            "remaining": 2_000_000, "stamp": self.stamp, "since": clock() - self.heard_at,
             "block": wire.encode_block(values, signature["arguments"]).hex(),
         }})
         self.next_id += 1
@@ -340,6 +359,8 @@ class SUnit:
 
     def refusal(self, request):
         """Why a request is not run, by its header alone."""
+        if request["unknown"]:
+            return "unsupported"
         if request["stamp"] > clock():
             return "malformed"
         made = min(request["stamp"] + request["since"], clock())
@@ -356,7 +377,7 @@ class SUnit:
         if signature is GO_TO:
             self.position = arguments["position"]
             if self.lease_end is not None:
-                self.send("high", {"lease_ended": {"call": self.leased_call, "why": "replaced"}})
+                self.tell("lease_ended", {"call": self.leased_call, "why": "replaced"})
             self.leased_call = request["id"]
             self.lease_end = clock() + LEASE_MILLIS * 1000
             return b""

@@ -2,7 +2,7 @@
 
 use core::fmt;
 
-use crate::config::Priority;
+use crate::config::{LATER, Priority};
 use crate::error::Error;
 use crate::time::Duration;
 
@@ -20,11 +20,9 @@ pub struct Attributes {
 
 impl Attributes {
     /// Bytes of the encoded form.
-    pub const WIRE_BYTES: usize = 8;
+    pub const WIRE_BYTES: usize = if LATER { 12 } else { 8 };
     const PRIORITY: u8 = 0b11;
     const IDEMPOTENT: u8 = 1 << 2;
-    /// All bits of the first byte that mean something; the others are zero.
-    const KNOWN: u8 = Self::PRIORITY | Self::IDEMPOTENT;
 
     /// Bits 0 and 1: priority; bit 2: idempotent; three bytes of zero; the lease in milliseconds, u32 little-endian, 0
     /// for none. A lease is rounded down, but never to none.
@@ -32,15 +30,17 @@ impl Attributes {
         let flags = self.priority as u8 | if self.idempotent { Self::IDEMPOTENT } else { 0 };
         let lease = self.lease.map_or(0, |lease| u32::try_from(lease.as_millis()).unwrap_or(u32::MAX).max(1));
         let [a, b, c, d] = lease.to_le_bytes();
-        [flags, 0, 0, 0, a, b, c, d]
+        let mut bytes = [0; Self::WIRE_BYTES];
+        if let Some(place) = bytes.first_chunk_mut() {
+            *place = [if LATER { flags | 0xF8 } else { flags }, 0, 0, 0, a, b, c, d];
+        }
+        bytes
     }
 
-    /// The inverse of [`encode`](Self::encode); [`Error::Malformed`] for any other bytes.
+    /// The inverse of [`encode`](Self::encode). Other bits, and bytes that follow, are of a later version and passed over;
+    /// [`Error::Malformed`] for fewer bytes.
     pub fn decode(bytes: &[u8]) -> Result<Self, Error> {
-        let &[flags, 0, 0, 0, a, b, c, d] = bytes else { return Err(Error::Malformed) };
-        if flags & !Self::KNOWN != 0 {
-            return Err(Error::Malformed);
-        }
+        let &[flags, _, _, _, a, b, c, d, ..] = bytes else { return Err(Error::Malformed) };
         let lease = u32::from_le_bytes([a, b, c, d]);
         Ok(Self {
             priority: Priority::from_wire(flags & Self::PRIORITY).ok_or(Error::Malformed)?,
@@ -73,8 +73,6 @@ mod tests {
 
     use std::string::ToString;
 
-    use proptest::prelude::*;
-
     use super::*;
 
     #[test]
@@ -87,14 +85,9 @@ mod tests {
         assert_eq!(Attributes::decode(&all.encode()), Ok(all));
         let short = Attributes { lease: Some(Duration::from_micros(1)), ..usual };
         assert_eq!(Attributes::decode(&short.encode()).unwrap().lease, Some(Duration::from_millis(1)));
-        for wrong in [
-            &[0; 7][..],
-            &[Attributes::KNOWN + 1, 0, 0, 0, 0, 0, 0, 0],
-            &[0, 1, 0, 0, 0, 0, 0, 0],
-            &[0, 0, 0, 1, 0, 0, 0, 0],
-        ] {
-            assert_eq!(Attributes::decode(wrong), Err(Error::Malformed), "{wrong:?}");
-        }
+        let later = [4 | 0xF8, 9, 9, 9, 0x34, 0x12, 0, 0, 7, 7];
+        assert_eq!(Attributes::decode(&later), Ok(all), "a later version says more");
+        assert_eq!(Attributes::decode(&later[..7]), Err(Error::Malformed));
     }
 
     #[test]
@@ -104,14 +97,5 @@ mod tests {
         assert_eq!(leased.to_string(), "normal, lease 400 ms");
         let all = Attributes { priority: Priority::High, idempotent: true, ..leased };
         assert_eq!(all.to_string(), "high, lease 400 ms, idempotent");
-    }
-
-    proptest! {
-        #[test]
-        fn attributes_have_one_encoding(bytes in prop::collection::vec(0..2 * (Attributes::KNOWN + 1), 8)) {
-            if let Ok(attributes) = Attributes::decode(&bytes) {
-                prop_assert_eq!(&attributes.encode()[..], &bytes[..]);
-            }
-        }
     }
 }

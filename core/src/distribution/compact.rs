@@ -3,7 +3,11 @@
 //!
 //! Neither side stops at the first error: it is recorded, and returned at the end.
 
-use crate::config::NODE_NAME_BYTES;
+use super::items::ALIGNMENT;
+use crate::config::{LATER, NODE_NAME_BYTES};
+
+/// What a later version puts in front of every item.
+const UNKNOWN_ITEM: [u8; 8] = [0xF0, 0x7F, 3, 0, 1, 2, 3, 0];
 
 /// Writes values one behind the other.
 pub(crate) struct Writer<'o> {
@@ -56,6 +60,33 @@ impl<'o> Writer<'o> {
     pub(crate) fn text(&mut self, text: &[u8]) {
         self.number(text.len() as u64);
         self.bytes(text);
+    }
+
+    /// Begins an item of a list that can grow (see [`items`](super::items)); [`end`](Self::end) takes what is returned.
+    pub(crate) fn begin(&mut self, kind: u16) -> usize {
+        if LATER {
+            self.bytes(&UNKNOWN_ITEM);
+        }
+        self.bytes(&kind.to_le_bytes());
+        self.bytes(&[0, 0]);
+        self.used
+    }
+
+    /// Ends the item whose body begins at `start`: its length is put in front of it, and zeros behind it.
+    #[cfg_attr(target_os = "none", inline(never))]
+    pub(crate) fn end(&mut self, start: usize) {
+        if LATER {
+            self.bytes(&[0; ALIGNMENT]);
+        }
+        let length = self.used.saturating_sub(start);
+        let place = self.out.get_mut(start.saturating_sub(2)..).and_then(|out| out.first_chunk_mut());
+        match (u16::try_from(length), place) {
+            (Ok(length), Some(place)) => *place = length.to_le_bytes(),
+            _ => self.fits = false,
+        }
+        for _ in length..length.next_multiple_of(ALIGNMENT) {
+            self.byte(0);
+        }
     }
 
     /// How many bytes were written; `None` where they did not fit.
@@ -153,15 +184,6 @@ impl<'b> Reader<'b> {
         byte == 1
     }
 
-    /// One of so many variants.
-    pub(crate) fn choice(&mut self, variants: u32) -> u32 {
-        let choice = self.u32();
-        if choice >= variants {
-            self.fail();
-        }
-        choice
-    }
-
     /// A text, or bytes behind their length.
     pub(crate) fn text(&mut self) -> &'b [u8] {
         let length = self.length();
@@ -177,9 +199,15 @@ impl<'b> Reader<'b> {
         })
     }
 
-    /// Whether all of it could be read, and nothing is left.
-    pub(crate) const fn is_through(&self) -> bool {
-        self.sound && self.rest.is_empty()
+    /// Whether all that was asked for could be read. More may be left: what a later version has put behind it.
+    pub(crate) const fn is_sound(&self) -> bool {
+        self.sound
+    }
+
+    /// How many bytes are left.
+    #[cfg(test)]
+    pub(crate) const fn left(&self) -> usize {
+        self.rest.len()
     }
 }
 
@@ -192,7 +220,7 @@ mod tests {
     fn read<'b, T>(bytes: &'b [u8], read: impl FnOnce(&mut Reader<'b>) -> T) -> Option<T> {
         let mut reader = Reader::new(bytes);
         let value = read(&mut reader);
-        reader.is_through().then_some(value)
+        (reader.is_sound() && reader.left() == 0).then_some(value)
     }
 
     fn whole<'b, T: serde::Deserialize<'b>>(bytes: &'b [u8]) -> Option<T> {

@@ -1,19 +1,16 @@
 //! Control messages: what two units tell each other beside requests and replies. One table has them all: it makes the enum
-//! and both directions of its encoding, which is postcard's.
-
-#[cfg(test)]
-use serde::{Deserialize, Serialize};
+//! and both directions of its encoding, an [item](super::items) each.
 
 use super::compact::{Reader, Writer};
+use super::items::{Item, Malformed};
 use super::message::CONTROL;
 
-/// Makes [`Control`] of its table: each row is the kind on the wire, the variant and its fields in their order.
+/// Makes [`Control`] of its table: each row is the item's kind, the variant and its fields in their order.
 macro_rules! controls {
     ($($(#[$about:meta])* $kind:literal => $name:ident { $($(#[$field_about:meta])* $field:ident: $type:ty,)* })*) => {
         /// Messages between two units that are no requests: what they tell each other about their functions, limits and
         /// leases.
         #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-        #[cfg_attr(test, derive(Serialize, Deserialize))]
         pub enum Control<'b> {
             $($(#[$about])* $name { $($(#[$field_about])* $field: $type,)* },)*
         }
@@ -21,23 +18,24 @@ macro_rules! controls {
         impl<'b> Control<'b> {
             /// How many kinds there are.
             #[cfg(test)]
-            pub(crate) const KINDS: u8 = [$($kind),*].len() as u8;
+            pub(crate) const KINDS: u16 = [$($kind),*].len() as u16;
 
             fn put(&self, writer: &mut Writer<'_>) {
                 match *self {
                     $(Self::$name { $($field),* } => {
-                        writer.byte($kind);
+                        let item = writer.begin($kind);
                         $($field.put(writer);)*
+                        writer.end(item);
                     })*
                 }
             }
 
-            /// Whether it could be read, and whether something follows, is known to the reader; `None` for an unknown kind.
-            pub(crate) fn take(reader: &mut Reader<'b>) -> Option<Self> {
-                Some(match reader.u32() {
-                    $($kind => Self::$name { $($field: Field::take(reader)),* },)*
-                    _ => return None,
-                })
+            /// Reads an item of a control message; `None` for a kind that this version does not know.
+            pub fn take(item: &Item<'b>) -> Result<Option<Self>, Malformed> {
+                match item.kind {
+                    $($kind => item.read(|reader| Some(Self::$name { $($field: Field::take(reader)),* })),)*
+                    _ => Ok(None),
+                }
             }
         }
     };
@@ -45,36 +43,35 @@ macro_rules! controls {
 
 controls! {
     /// A function of the sender may now be called.
-    0 => Publish {
+    1 => Publish {
         /// Its slot.
         slot: u16,
         /// Its life.
         generation: u16,
         /// [`Attributes`](super::function::Attributes) in their wire form.
-        attributes: [u8; 8],
+        attributes: &'b [u8],
         /// The encoded [`Signature`](super::function::Signature).
-        #[cfg_attr(test, serde(borrow))]
         signature: &'b [u8],
     }
     /// A function of the sender may no longer be called.
-    1 => Withdraw {
+    2 => Withdraw {
         /// Its slot.
         slot: u16,
     }
     /// All publishing and withdrawing up to here is to be acknowledged.
-    2 => ListEnd {
+    3 => ListEnd {
         /// Rises with each acknowledgement asked for.
         serial: u32,
     }
     /// The list up to `serial` was read.
-    3 => ListAck {
+    4 => ListAck {
         /// As in `ListEnd`.
         serial: u32,
         /// Functions that the reader keeps no room for.
         skipped: u16,
     }
     /// The sender's limits changed.
-    4 => Limits {
+    5 => Limits {
         /// Longest message that the sender takes.
         message_size: u32,
         /// Least time between two requests to the sender, in microseconds.
@@ -83,7 +80,7 @@ controls! {
         calls: u16,
     }
     /// The callee ended what a leased call started; renewals have no effect.
-    5 => LeaseEnded {
+    6 => LeaseEnded {
         /// The caller's id of the call.
         call: u32,
         /// Why.
@@ -95,7 +92,7 @@ impl Control<'_> {
     /// Encodes into `out`, whole message; `None` where it does not fit.
     pub fn encode<'o>(&self, out: &'o mut [u8]) -> Option<&'o [u8]> {
         let mut writer = Writer::new(out);
-        writer.byte(CONTROL);
+        writer.bytes(&[CONTROL, 0, 0, 0]);
         self.put(&mut writer);
         let used = writer.finish()?;
         out.get(..used)
@@ -105,12 +102,12 @@ impl Control<'_> {
 /// Why the callee ended what a leased call started.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 #[repr(u8)]
-#[cfg_attr(test, derive(Serialize, Deserialize))]
 #[non_exhaustive]
 pub enum LeaseEnd {
     /// The service has done what was asked for.
     Finished,
-    /// It was not renewed in time, or the callee stopped it: the safe hook runs there.
+    /// It was not renewed in time, or the callee stopped it: the safe hook runs there. Also any reason that this version
+    /// does not know.
     Expired,
     /// A newer call of the same function goes on in its place.
     Replaced,
@@ -155,16 +152,6 @@ impl Field<'_> for u32 {
     }
 }
 
-impl Field<'_> for [u8; 8] {
-    fn put(self, writer: &mut Writer<'_>) {
-        writer.bytes(&self);
-    }
-
-    fn take(reader: &mut Reader<'_>) -> Self {
-        reader.bytes(8).try_into().unwrap_or_default()
-    }
-}
-
 impl<'b> Field<'b> for &'b [u8] {
     fn put(self, writer: &mut Writer<'_>) {
         writer.text(self);
@@ -181,8 +168,8 @@ impl Field<'_> for LeaseEnd {
     }
 
     fn take(reader: &mut Reader<'_>) -> Self {
-        let why = reader.choice(Self::ALL.len() as u32);
-        Self::ALL.get(why as usize).copied().unwrap_or(Self::Expired)
+        // A reason of a later version is an end all the same.
+        Self::ALL.get(reader.u32() as usize).copied().unwrap_or(Self::Expired)
     }
 }
 
@@ -191,24 +178,23 @@ mod tests {
     #![allow(clippy::unwrap_used, clippy::indexing_slicing, clippy::panic)]
     use proptest::prelude::*;
 
+    use super::super::items::Items;
     use super::super::message::{CONTROL_BYTES, Message, PUBLISH_BYTES};
     use super::*;
 
+    /// The only item of a message.
+    fn read(bytes: &[u8]) -> Option<Control<'_>> {
+        let Some(Message::Control(items)) = Message::decode(bytes) else { panic!("no control message") };
+        let item = Items::new(items).next().unwrap().unwrap();
+        Control::take(&item).ok().flatten()
+    }
+
     proptest! {
         #[test]
-        fn control_messages_are_as_postcard_has_them(
-            bytes in prop::collection::vec(prop_oneof![any::<u8>(), 0..8_u8], 0..40),
-        ) {
-            let mut reader = Reader::new(&bytes);
-            let ours = Control::take(&mut reader);
-            let ours = ours.filter(|_| reader.is_through());
-            let theirs = postcard::take_from_bytes::<Control<'_>>(&bytes).ok();
-            let theirs = theirs.and_then(|(control, rest)| rest.is_empty().then_some(control));
-            prop_assert_eq!(ours, theirs);
-            if let Some(control) = ours {
-                let (mut ours, mut theirs) = ([0; 80], [0; 80]);
-                let written = &control.encode(&mut ours).unwrap()[1..];
-                prop_assert_eq!(written, &*postcard::to_slice(&control, &mut theirs).unwrap());
+        fn what_is_read_is_written_again(kind in 0..8_u16, body in prop::collection::vec(prop_oneof![any::<u8>(), 0..8_u8], 0..40)) {
+            if let Ok(Some(control)) = Control::take(&Item { kind, body: &body }) {
+                let mut out = [0; 80];
+                prop_assert_eq!(read(control.encode(&mut out).unwrap()), Some(control));
             }
         }
     }
@@ -220,10 +206,17 @@ mod tests {
         assert!(worst.encode(&mut out).is_some());
         let signature = [1; 300];
         let publish =
-            Control::Publish { slot: u16::MAX, generation: u16::MAX, attributes: [255; 8], signature: &signature };
+            Control::Publish { slot: u16::MAX, generation: u16::MAX, attributes: &[255; 8], signature: &signature };
         let mut out = [0; PUBLISH_BYTES + 300];
-        let bytes = publish.encode(&mut out).unwrap();
-        let Some(Message::Control(read)) = Message::decode(bytes) else { panic!() };
-        assert_eq!(read, publish);
+        assert_eq!(read(publish.encode(&mut out).unwrap()), Some(publish));
+    }
+
+    #[test]
+    fn a_later_version_may_say_more() {
+        let ended = Control::LeaseEnded { call: 7, why: LeaseEnd::Replaced };
+        let longer = Item { kind: 6, body: &[7, 2, 99, 99] };
+        assert_eq!(Control::take(&longer), Ok(Some(ended)));
+        assert_eq!(Control::take(&Item { kind: 6, body: &[7] }), Err(Malformed));
+        assert_eq!(Control::take(&Item { kind: 700, body: &[7] }), Ok(None));
     }
 }

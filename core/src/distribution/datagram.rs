@@ -3,23 +3,24 @@
 //! | bytes | meaning |
 //! |---|---|
 //! | 0–3 | magic of the mode |
-//! | 4 | version |
+//! | 4 | first version that can read it |
 //! | 5 | kind: 1 [`WhoHas`], 2 [`Announce`], 3 session |
-//! | 6–7 | zero |
+//! | 6 | last version that the sender speaks |
+//! | 7 | how many codes are at the end |
 //! | 8–11 | fleet, little-endian |
-//! | 12– | [`WhoHas`], [`Announce`]: postcard; session: link u16, zero u16, nonce u64, body |
+//! | 12– | [`WhoHas`], [`Announce`]: [items](super::items); session: link u16, zero u16, nonce u64, body |
 //!
 //! In secured mode a search and an answer end with the fleet's code, over everything before it. An answer to one unit
-//! has the pair's code as well, in front of the fleet's. A [`WhoHas`] and a broadcast [`Announce`] are padded with
-//! zeros to the length of the longest answer, so that a datagram with a forged source address is not amplified: the
+//! has the pair's code as well, in front of the fleet's. A [`WhoHas`] and a broadcast [`Announce`] are filled up with
+//! room to the length of the longest answer, so that a datagram with a forged source address is not amplified: the
 //! answer or question that it causes is no longer than itself.
 
-use serde::{Deserialize, Serialize};
-
 use super::authenticator::{Authenticator, CODE_BYTES};
-use super::hello::Manager;
+use super::compact::{Reader, Writer};
+use super::hello::{Manager, kind};
 use super::identity::{Epoch, Fleet, Identity, Role};
-use crate::config::{Mode, VERSION};
+use super::items::{self, Items, Malformed};
+use crate::config::{Mode, VERSIONS, Versions};
 use crate::host::mailman::LinkId;
 
 const WHO_HAS: u8 = 1;
@@ -35,10 +36,10 @@ pub const KNOWN_NODES: usize = 64;
 /// Longest [`WhoHas`].
 pub const SEARCH_BYTES: usize = 512;
 /// Longest [`Announce`] of secured mode, and the shortest [`WhoHas`].
-pub const ANSWER_BYTES: usize = 120;
+pub const ANSWER_BYTES: usize = 128;
 
 /// A search, broadcast (paper: "one node broadcasts a message containing its identifier").
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct WhoHas {
     /// The sender.
     pub identity: Identity,
@@ -56,10 +57,12 @@ pub struct WhoHas {
     pub expected: u16,
     /// [`short_hash`] of nodes that are connected already and stay silent.
     pub known: heapless::Vec<u32, KNOWN_NODES>,
+    /// Items that the reader did not know and passed over. Not sent.
+    pub skipped: u16,
 }
 
 /// An answer, to the node that asked, or broadcast when several ask.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Announce {
     /// The sender.
     pub identity: Identity,
@@ -75,6 +78,8 @@ pub struct Announce {
     pub room: u16,
     /// How many nodes it expects to dial because of this announce.
     pub expected: u16,
+    /// Items that the reader did not know and passed over. Not sent.
+    pub skipped: u16,
 }
 
 /// A datagram, borrowed from the bytes that it came in.
@@ -102,8 +107,8 @@ pub enum Datagram<'b> {
 pub enum DatagramError {
     /// Not of this mode, or of no unit at all.
     Magic,
-    /// Another version, this one.
-    Version(u8),
+    /// It is of none of our versions, but of these.
+    Version(Versions),
     /// Another fleet, this one.
     Fleet(Fleet),
     /// The code that shows that it comes from the fleet is wrong, or there is none.
@@ -114,75 +119,130 @@ pub enum DatagramError {
     Malformed,
 }
 
+impl From<Malformed> for DatagramError {
+    fn from(Malformed: Malformed) -> Self {
+        Self::Malformed
+    }
+}
+
 /// The fixed part of a datagram of any mode, version and fleet, for tools that inspect a network without being one of
 /// its units. Units decode with [`Datagram::decode`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Header {
     /// The sender's mode.
     pub mode: Mode,
-    /// The sender's version.
-    pub version: u8,
+    /// The first version that can read the datagram, to the last one that the sender speaks.
+    pub versions: Versions,
     /// The sender's fleet.
     pub fleet: Fleet,
     kind: u8,
-    zero: [u8; 2],
+    codes: u8,
 }
 
 impl Header {
     /// The header and the bytes behind it; [`DatagramError::Magic`] or [`DatagramError::Malformed`] where there is none.
     pub fn decode(bytes: &[u8]) -> Result<(Self, &[u8]), DatagramError> {
         let (header, body) = bytes.split_first_chunk::<HEADER_BYTES>().ok_or(DatagramError::Malformed)?;
-        let [m0, m1, m2, m3, version, kind, z0, z1, f0, f1, f2, f3] = *header;
+        let [m0, m1, m2, m3, first, kind, last, codes, f0, f1, f2, f3] = *header;
         let mode = Mode::of_magic([m0, m1, m2, m3]).ok_or(DatagramError::Magic)?;
-        let fleet = Fleet(u32::from_le_bytes([f0, f1, f2, f3]));
-        Ok((Self { mode, version, fleet, kind, zero: [z0, z1] }, body))
+        let (versions, fleet) = (Versions::from_wire(first, last), Fleet(u32::from_le_bytes([f0, f1, f2, f3])));
+        Ok((Self { mode, versions, fleet, kind, codes }, body))
     }
 
-    /// The body as this version decodes it, which may be wrong for another version. Codes are not checked.
+    /// The body as the versions of this unit have it. Codes are not checked.
     pub fn read<'b>(&self, body: &'b [u8]) -> Result<Datagram<'b>, DatagramError> {
-        if self.zero != [0, 0] {
-            return Err(DatagramError::Malformed);
-        }
-        match self.kind {
-            WHO_HAS => self.who_has(body).map(Datagram::WhoHas),
-            ANNOUNCE => self.announce(body).map(Datagram::Announce),
-            SESSION => session(body).map(|(link, nonce, body)| Datagram::Session { link, nonce, body }),
-            _ => None,
-        }
-        .ok_or(DatagramError::Malformed)
+        Ok(match self.kind {
+            WHO_HAS if self.codes == self.codes_of(0) => Datagram::WhoHas(WhoHas::take(self.items(body)?)?),
+            ANNOUNCE => {
+                let announce = Announce::take(self.items(body)?)?;
+                if self.codes != self.codes_of(announce.nonce) {
+                    return Err(DatagramError::Malformed);
+                }
+                Datagram::Announce(announce)
+            }
+            SESSION => {
+                let (link, nonce, body) = session(body).ok_or(DatagramError::Malformed)?;
+                Datagram::Session { link, nonce, body }
+            }
+            _ => return Err(DatagramError::Malformed),
+        })
+    }
+
+    /// All but the codes.
+    fn items<'b>(&self, body: &'b [u8]) -> Result<&'b [u8], DatagramError> {
+        let codes = usize::from(self.codes).saturating_mul(CODE_BYTES);
+        body.len().checked_sub(codes).and_then(|length| body.get(..length)).ok_or(DatagramError::Malformed)
+    }
+
+    /// How many codes a search has, or an answer to this nonce.
+    const fn codes_of(&self, nonce: u64) -> u8 {
+        codes(self.mode, nonce != 0)
     }
 
     fn check(&self, mode: Mode, fleet: Fleet) -> Result<(), DatagramError> {
         if self.mode != mode {
             return Err(DatagramError::Magic);
         }
-        if self.version != VERSION {
-            return Err(DatagramError::Version(self.version));
+        if VERSIONS.common(self.versions).is_none() {
+            return Err(DatagramError::Version(self.versions));
         }
         if self.fleet != fleet {
             return Err(DatagramError::Fleet(self.fleet));
         }
         Ok(())
     }
+}
 
-    fn who_has(&self, body: &[u8]) -> Option<WhoHas> {
-        let (who_has, rest): (WhoHas, _) = postcard::take_from_bytes(body).ok()?;
-        let filled = match self.mode {
-            Mode::Plain => rest.is_empty(),
-            Mode::Secured => is_filled(rest),
-        };
-        (filled && who_has.identity.is_sound()).then_some(who_has)
+/// The fleet's code, and that of the pair where the datagram is for one unit; none in plain mode.
+const fn codes(mode: Mode, for_one: bool) -> u8 {
+    match mode {
+        Mode::Plain => 0,
+        Mode::Secured if for_one => 2,
+        Mode::Secured => 1,
     }
+}
 
-    fn announce(&self, body: &[u8]) -> Option<Announce> {
-        let (announce, rest): (Announce, _) = postcard::take_from_bytes(body).ok()?;
-        let complete = match self.mode {
-            Mode::Plain => rest.is_empty(),
-            Mode::Secured if announce.nonce == 0 => is_filled(rest),
-            Mode::Secured => rest.len() == 2 * CODE_BYTES,
-        };
-        (complete && announce.identity.is_sound()).then_some(announce)
+/// What a search says.
+struct Search {
+    sequence: u32,
+    nonce: u64,
+    tcp_port: u16,
+    expected: u16,
+}
+
+impl Search {
+    fn take(reader: &mut Reader<'_>) -> Self {
+        Self { sequence: reader.u32(), nonce: reader.u64(), tcp_port: reader.u16(), expected: reader.u16() }
     }
+}
+
+/// What an answer says.
+struct Answer {
+    sequence: u32,
+    nonce: u64,
+    tcp_port: u16,
+    room: u16,
+    expected: u16,
+}
+
+impl Answer {
+    fn take(reader: &mut Reader<'_>) -> Self {
+        Self {
+            sequence: reader.u32(),
+            nonce: reader.u64(),
+            tcp_port: reader.u16(),
+            room: reader.u16(),
+            expected: reader.u16(),
+        }
+    }
+}
+
+/// The hashes of an item [`kind::KNOWN`], four bytes each.
+fn hashes(body: &[u8]) -> Result<heapless::Vec<u32, KNOWN_NODES>, Malformed> {
+    let (hashes, []) = body.as_chunks() else { return Err(Malformed) };
+    let mut known = heapless::Vec::new();
+    known.extend(hashes.iter().take(KNOWN_NODES).map(|hash| u32::from_le_bytes(*hash)));
+    Ok(known)
 }
 
 impl<'b> Datagram<'b> {
@@ -211,24 +271,11 @@ impl<'b> Datagram<'b> {
 pub fn for_session(bytes: &mut [u8], mode: Mode, fleet: Fleet) -> Option<(LinkId, u64, &mut [u8])> {
     let (header, body) = Header::decode(bytes).ok()?;
     header.check(mode, fleet).ok()?;
-    if header.kind != SESSION || header.zero != [0, 0] {
+    if header.kind != SESSION {
         return None;
     }
     let (link, nonce, _) = session(body)?;
     Some((LinkId(link), nonce, bytes.get_mut(SESSION_HEADER_BYTES..)?))
-}
-
-/// Zeros, and a code behind them.
-fn is_filled(rest: &[u8]) -> bool {
-    rest.split_last_chunk::<CODE_BYTES>().is_some_and(|(zeros, _)| zeros.iter().all(|byte| *byte == 0))
-}
-
-/// Zeros behind the first `length` bytes of `out`, so that the whole with the fleet's code is as long as the longest
-/// answer; the length with them.
-fn fill(length: usize, out: &mut [u8]) -> Option<usize> {
-    let filled = length.max(ANSWER_BYTES.saturating_sub(CODE_BYTES));
-    out.get_mut(length..filled)?.fill(0);
-    Some(filled)
 }
 
 /// All but the fleet's code, if that is right.
@@ -245,22 +292,15 @@ fn is_for_us(signed: &[u8], announce: &Announce, authenticator: &dyn Authenticat
 /// Link, nonce and body of a session datagram.
 fn session(body: &[u8]) -> Option<(u16, u64, &[u8])> {
     let (head, body) = body.split_first_chunk::<{ SESSION_HEADER_BYTES - HEADER_BYTES }>()?;
-    let [l0, l1, 0, 0, n0, n1, n2, n3, n4, n5, n6, n7] = *head else { return None };
+    let [l0, l1, _, _, n0, n1, n2, n3, n4, n5, n6, n7] = *head;
     let nonce = u64::from_le_bytes([n0, n1, n2, n3, n4, n5, n6, n7]);
     Some((u16::from_le_bytes([l0, l1]), nonce, body))
 }
 
-fn header(kind: u8, mode: Mode, fleet: Fleet) -> [u8; HEADER_BYTES] {
+fn header(kind: u8, mode: Mode, versions: Versions, codes: u8, fleet: Fleet) -> [u8; HEADER_BYTES] {
     let [m0, m1, m2, m3] = mode.magic();
     let [f0, f1, f2, f3] = fleet.0.to_le_bytes();
-    [m0, m1, m2, m3, VERSION, kind, 0, 0, f0, f1, f2, f3]
-}
-
-/// Header and body; their length.
-fn encode(kind: u8, mode: Mode, fleet: Fleet, body: &impl Serialize, out: &mut [u8]) -> Option<usize> {
-    let (head, rest) = out.split_first_chunk_mut()?;
-    *head = header(kind, mode, fleet);
-    postcard::to_slice(body, rest).ok()?.len().checked_add(HEADER_BYTES)
+    [m0, m1, m2, m3, versions.first, kind, versions.last, codes, f0, f1, f2, f3]
 }
 
 /// Puts a code behind the first `length` bytes of `out`; the length with it.
@@ -274,10 +314,46 @@ fn sign_for_fleet(length: usize, authenticator: &dyn Authenticator, out: &mut [u
 }
 
 impl WhoHas {
+    fn take(body: &[u8]) -> Result<Self, DatagramError> {
+        let (mut unit, mut wanted, mut search, mut known, mut skipped) = (None, None, None, heapless::Vec::new(), 0);
+        for item in Items::new(body) {
+            let item = item?;
+            match item.kind {
+                kind::UNIT => unit = Some(item.read(Identity::take)?),
+                kind::WANTED => wanted = Some(item.read(Manager::take)?),
+                kind::SEARCH => search = Some(item.read(Search::take)?),
+                kind::KNOWN => known = hashes(item.body)?,
+                _ => item.skip(&mut skipped)?,
+            }
+        }
+        let (Some((identity, epoch)), Some(search)) = (unit, search) else { return Err(DatagramError::Malformed) };
+        if !identity.is_sound() {
+            return Err(DatagramError::Malformed);
+        }
+        let Search { sequence, nonce, tcp_port, expected } = search;
+        Ok(Self { identity, epoch, sequence, nonce, wanted, tcp_port, expected, known, skipped })
+    }
+
     /// The datagram, in `out`; `None` where it does not fit.
     pub fn encode<'o>(&self, fleet: Fleet, authenticator: &dyn Authenticator, out: &'o mut [u8]) -> Option<&'o [u8]> {
         let mode = authenticator.mode();
-        let mut length = encode(WHO_HAS, mode, fleet, self, out)?;
+        let mut writer = Writer::new(out);
+        writer.bytes(&header(WHO_HAS, mode, VERSIONS, codes(mode, false), fleet));
+        self.identity.put(self.epoch, &mut writer);
+        Manager::put(self.wanted.as_ref(), &mut writer);
+        let item = writer.begin(kind::SEARCH);
+        writer.number(self.sequence.into());
+        writer.number(self.nonce);
+        writer.numbers(&[self.tcp_port.into(), self.expected.into()]);
+        writer.end(item);
+        if !self.known.is_empty() {
+            let item = writer.begin(kind::KNOWN);
+            for hash in &self.known {
+                writer.bytes(&hash.to_le_bytes());
+            }
+            writer.end(item);
+        }
+        let mut length = writer.finish()?;
         if mode == Mode::Secured {
             length = sign_for_fleet(fill(length, out)?, authenticator, out)?;
         }
@@ -286,6 +362,24 @@ impl WhoHas {
 }
 
 impl Announce {
+    fn take(body: &[u8]) -> Result<Self, DatagramError> {
+        let (mut unit, mut answer, mut skipped) = (None, None, 0);
+        for item in Items::new(body) {
+            let item = item?;
+            match item.kind {
+                kind::UNIT => unit = Some(item.read(Identity::take)?),
+                kind::ANSWER => answer = Some(item.read(Answer::take)?),
+                _ => item.skip(&mut skipped)?,
+            }
+        }
+        let (Some((identity, epoch)), Some(answer)) = (unit, answer) else { return Err(DatagramError::Malformed) };
+        if !identity.is_sound() {
+            return Err(DatagramError::Malformed);
+        }
+        let Answer { sequence, nonce, tcp_port, room, expected } = answer;
+        Ok(Self { identity, epoch, sequence, nonce, tcp_port, room, expected, skipped })
+    }
+
     /// The datagram, in `out`; `None` where it does not fit, or in secured mode where it answers `to` and there is no key
     /// for the pair.
     pub fn encode<'o>(
@@ -296,22 +390,37 @@ impl Announce {
         out: &'o mut [u8],
     ) -> Option<&'o [u8]> {
         let mode = authenticator.mode();
-        let mut length = encode(ANNOUNCE, mode, fleet, self, out)?;
+        let to = to.filter(|_| self.nonce != 0);
+        let mut writer = Writer::new(out);
+        writer.bytes(&header(ANNOUNCE, mode, VERSIONS, codes(mode, to.is_some()), fleet));
+        self.identity.put(self.epoch, &mut writer);
+        let item = writer.begin(kind::ANSWER);
+        writer.number(self.sequence.into());
+        writer.number(self.nonce);
+        writer.numbers(&[self.tcp_port.into(), self.room.into(), self.expected.into()]);
+        writer.end(item);
+        let mut length = writer.finish()?;
         if mode == Mode::Secured {
-            if let Some(to) = to.filter(|_| self.nonce != 0) {
-                length = append(authenticator.sign_for(to, out.get(..length)?)?, length, out)?;
-            } else {
-                length = fill(length, out)?;
-            }
+            length = match to {
+                Some(to) => append(authenticator.sign_for(to, out.get(..length)?)?, length, out)?,
+                None => fill(length, out)?,
+            };
             length = sign_for_fleet(length, authenticator, out)?;
         }
         out.get(..length)
     }
 }
 
-/// The header of a session datagram to `link` of the receiver, named by the receiver's `nonce`.
-pub fn session_header(mode: Mode, fleet: Fleet, link: u16, nonce: u64) -> [u8; SESSION_HEADER_BYTES] {
-    let [h0, h1, h2, h3, h4, h5, h6, h7, h8, h9, h10, h11] = header(SESSION, mode, fleet);
+/// Room behind the first `length` bytes of `out`, so that the whole with the fleet's code is as long as the longest
+/// answer; the length with it.
+fn fill(length: usize, out: &mut [u8]) -> Option<usize> {
+    items::fill(length, ANSWER_BYTES.saturating_sub(CODE_BYTES), out)
+}
+
+/// The header of a session datagram of a link with this version, to `link` of the receiver, named by the receiver's `nonce`.
+pub fn session_header(mode: Mode, version: u8, fleet: Fleet, link: u16, nonce: u64) -> [u8; SESSION_HEADER_BYTES] {
+    let versions = Versions { first: version, last: version };
+    let [h0, h1, h2, h3, h4, h5, h6, h7, h8, h9, h10, h11] = header(SESSION, mode, versions, 0, fleet);
     let [l0, l1] = link.to_le_bytes();
     let [n0, n1, n2, n3, n4, n5, n6, n7] = nonce.to_le_bytes();
     [h0, h1, h2, h3, h4, h5, h6, h7, h8, h9, h10, h11, l0, l1, 0, 0, n0, n1, n2, n3, n4, n5, n6, n7]
@@ -347,6 +456,7 @@ mod tests {
             tcp_port: u16::MAX,
             expected: u16::MAX,
             known: (0..known).map(|_| u32::MAX).collect(),
+            skipped: 0,
         }
     }
 
@@ -363,8 +473,12 @@ mod tests {
         let mut out = [0; SEARCH_BYTES];
         let length = who_has(0).encode(FLEET, &Plain, &mut out).unwrap().len();
         assert_eq!(Datagram::decode(&out[..length], Fleet(8), &Plain), Err(DatagramError::Fleet(FLEET)));
+        // A later version that can still speak ours is heard; one that cannot is told.
+        out[6] = 9;
+        assert!(Datagram::decode(&out[..length], FLEET, &Plain).is_ok());
         out[4] = 9;
-        assert_eq!(Datagram::decode(&out[..length], FLEET, &Plain), Err(DatagramError::Version(9)));
+        let versions = Versions { first: 9, last: 9 };
+        assert_eq!(Datagram::decode(&out[..length], FLEET, &Plain), Err(DatagramError::Version(versions)));
         for other in [*b"Xarp", Mode::Secured.magic()] {
             out[..4].copy_from_slice(&other);
             assert_eq!(Datagram::decode(&out[..length], FLEET, &Plain), Err(DatagramError::Magic));
@@ -375,9 +489,9 @@ mod tests {
     fn a_header_is_read_whatever_its_version_and_fleet() {
         let mut out = [0; SEARCH_BYTES];
         let length = who_has(0).encode(FLEET, &Plain, &mut out).unwrap().len();
-        out[4] = 9;
+        (out[4], out[6]) = (8, 9);
         let (header, body) = Header::decode(&out[..length]).unwrap();
-        assert_eq!((header.version, header.fleet), (9, FLEET));
+        assert_eq!((header.versions, header.fleet), (Versions { first: 8, last: 9 }, FLEET));
         assert_eq!(header.read(body), Ok(Datagram::WhoHas(who_has(0))));
         assert_eq!(header.read(&body[..body.len() - 1]), Err(DatagramError::Malformed));
         out[0] = b'X';
@@ -387,15 +501,16 @@ mod tests {
 
     #[test]
     fn a_session_datagram_is_told_by_its_header() {
-        let datagram = |mode, fleet| [&session_header(mode, fleet, 3, 42)[..], &[1]].concat();
+        let datagram = |mode, fleet: Fleet| [&session_header(mode, VERSIONS.last, fleet, 3, 42)[..], &[1]].concat();
         for mode in [Mode::Plain, Mode::Secured] {
             let mut bytes = datagram(mode, FLEET);
             assert_eq!(for_session(&mut bytes, mode, FLEET), Some((LinkId(3), 42, &mut [1][..])));
             for at in 0..SESSION_HEADER_BYTES {
                 let mut changed = bytes.clone();
                 changed[at] ^= 0x80;
-                // Only link and nonce may be any.
-                assert_eq!(for_session(&mut changed, mode, FLEET).is_some(), at >= 16 || at == 12 || at == 13, "{at}");
+                // Link and nonce may be any, and what a later version may have told.
+                let any = at >= 12 || at == 6 || at == 7;
+                assert_eq!(for_session(&mut changed, mode, FLEET).is_some(), any, "{at}");
                 assert_eq!(for_session(&mut bytes[..at].to_vec(), mode, FLEET), None);
             }
         }
@@ -408,7 +523,8 @@ mod tests {
 
     #[test]
     fn a_session_datagram_carries_its_link_and_nonce() {
-        let mut bytes = std::vec::Vec::from(session_header(Mode::Plain, FLEET, 300, 0x0102_0304_0506_0708));
+        let mut bytes =
+            std::vec::Vec::from(session_header(Mode::Plain, VERSIONS.last, FLEET, 300, 0x0102_0304_0506_0708));
         bytes.push(42);
         let expected = Datagram::Session { link: 300, nonce: 0x0102_0304_0506_0708, body: &[42] };
         assert_eq!(Datagram::decode(&bytes, FLEET, &Plain), Ok(expected));
@@ -418,16 +534,18 @@ mod tests {
     fn every_cut_every_tail_and_every_unknown_kind_is_refused() {
         let mut out = [0; SEARCH_BYTES];
         let length = who_has(2).encode(FLEET, &Plain, &mut out).unwrap().len();
-        for cut in 0..length {
-            assert_eq!(Datagram::decode(&out[..cut], FLEET, &Plain), Err(DatagramError::Malformed));
+        // The nodes that stay silent are told last, and need not be.
+        let known = 4 + 2 * 4;
+        for cut in (0..length).filter(|cut| *cut != length - known) {
+            assert_eq!(Datagram::decode(&out[..cut], FLEET, &Plain), Err(DatagramError::Malformed), "{cut}");
         }
         assert_eq!(Datagram::decode(&out[..length + 1], FLEET, &Plain), Err(DatagramError::Malformed));
-        for (place, byte) in [(5, 0), (5, 4), (6, 1), (7, 1)] {
+        for (place, byte) in [(5, 0), (5, 4), (7, 1)] {
             let mut changed = out;
             changed[place] = byte;
             assert_eq!(Datagram::decode(&changed[..length], FLEET, &Plain), Err(DatagramError::Malformed));
         }
-        let session = session_header(Mode::Plain, FLEET, 1, 2);
+        let session = session_header(Mode::Plain, VERSIONS.last, FLEET, 1, 2);
         assert_eq!(
             Datagram::decode(&session[..SESSION_HEADER_BYTES - 1], FLEET, &Plain),
             Err(DatagramError::Malformed)
@@ -438,10 +556,10 @@ mod tests {
     fn a_node_without_a_name_is_refused() {
         let mut out = [0; SEARCH_BYTES];
         let length = who_has(0).encode(FLEET, &Plain, &mut out).unwrap().len();
-        // The identity begins with its id in five bytes; the name's length follows.
-        let at = HEADER_BYTES + 5;
-        assert_eq!(out[at], 32);
-        out[at] = 0;
+        // The identity is behind the head of its item; it begins with its id in five bytes, and the name's length follows.
+        let at = HEADER_BYTES + 4 + 5;
+        assert_eq!((out[HEADER_BYTES + 2], out[at]), (49, 32));
+        (out[HEADER_BYTES + 2], out[at]) = (17, 0);
         let mut bytes = std::vec::Vec::from(&out[..length]);
         bytes.drain(at + 1..=at + 32);
         assert_eq!(Datagram::decode(&bytes, FLEET, &Plain), Err(DatagramError::Malformed));
@@ -472,7 +590,7 @@ mod tests {
             }
             let _ = Datagram::decode(&out[..length.min(cut)], FLEET, &Plain);
             if let Ok(Datagram::WhoHas(read)) = Datagram::decode(&out[..length], FLEET, &Plain) {
-                let mut again = [0; SEARCH_BYTES];
+                let (read, mut again) = (WhoHas { skipped: 0, ..read }, [0; SEARCH_BYTES]);
                 let bytes = read.encode(FLEET, &Plain, &mut again).unwrap();
                 prop_assert_eq!(Datagram::decode(bytes, FLEET, &Plain), Ok(Datagram::WhoHas(read)));
             }

@@ -149,7 +149,8 @@ impl<S: Storage> TheirFunctionList<S> {
     /// Applies what the peer published about one of its slots; it replaces the function in the slot and any of the same
     /// name.
     ///
-    /// [`Error::Malformed`] leaves the list unchanged. [`Error::Full`] counts as skipped, and what was replaced is gone.
+    /// On an error what was in the slot is gone, and the function counts as skipped: [`Error::Full`], or [`Error::Malformed`]
+    /// for a signature that this version cannot read.
     pub fn insert(
         &mut self,
         slot: Slot,
@@ -157,8 +158,14 @@ impl<S: Storage> TheirFunctionList<S> {
         attributes: Attributes,
         signature: &[u8],
     ) -> Result<(), Error> {
-        let name = Signature::decode(signature)?.name();
         self.remove(slot);
+        let name = match Signature::decode(signature) {
+            Ok(signature) => signature.name(),
+            Err(error) => {
+                self.skipped = self.skipped.saturating_add(1);
+                return Err(error);
+            }
+        };
         if let Some(index) = self.table.find(name) {
             self.table.take(index);
         }

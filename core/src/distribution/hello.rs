@@ -1,16 +1,41 @@
 //! The hello: the first frame on each link, in both directions.
 //!
-//! Magic and version stand in fixed places, so that units of different versions can refuse each other by name; the rest
-//! is postcard.
+//! | bytes | meaning |
+//! |---|---|
+//! | 0–3 | magic of the mode |
+//! | 4, 5 | first and last version that the sender speaks |
+//! | 6–7 | cipher suites that it has, a bit each |
+//! | 8–11 | fleet, little-endian |
+//! | 12–19 | capabilities, a bit each: one counts when both ends have it |
+//! | 20– | [items](super::items) |
 
 use serde::{Deserialize, Serialize};
 
 use super::compact::{Reader, Writer};
 use super::identity::{Epoch, Fleet, Identity};
-use crate::config::{Constraints, MINIMUM_CHUNK_BYTES, Mode, NODE_NAME_BYTES, VERSION};
+use super::items::{Item, Items, Malformed};
+use crate::config::{Constraints, LATER, MINIMUM_CHUNK_BYTES, Mode, NODE_NAME_BYTES, VERSIONS, Versions};
 
-/// Bytes of magic and version.
-const PREFIX_BYTES: usize = 5;
+/// Bytes before the items.
+const PREFIX_BYTES: usize = 20;
+
+/// Kinds of items that hello, who-has and announce have. One namespace, so that a kind means the same in all of them.
+pub(super) mod kind {
+    /// Identity and epoch of the sender.
+    pub(in crate::distribution) const UNIT: u16 = 1;
+    /// The manager that the sender belongs to, or looks for.
+    pub(in crate::distribution) const WANTED: u16 = 2;
+    /// What a session needs of this link.
+    pub(in crate::distribution) const LINK: u16 = 3;
+    /// What the sender takes.
+    pub(in crate::distribution) const LIMITS: u16 = 4;
+    /// A search.
+    pub(in crate::distribution) const SEARCH: u16 = 5;
+    /// Nodes that stay silent.
+    pub(in crate::distribution) const KNOWN: u16 = 6;
+    /// An answer.
+    pub(in crate::distribution) const ANSWER: u16 = 7;
+}
 
 /// Which manager an s_unit belongs to (paper, section 2: "the manually set properties of the m_unit object").
 #[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -23,7 +48,6 @@ pub struct Manager {
 
 /// What a unit takes, told so that nothing longer is sent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[cfg_attr(test, derive(Serialize, Deserialize))]
 pub struct Limits {
     /// Longest block of parameters, in bytes.
     pub message_size: u32,
@@ -48,8 +72,11 @@ impl From<&Constraints> for Limits {
 
 /// How a unit introduces itself on a link.
 #[derive(Clone, Debug, PartialEq, Eq)]
-#[cfg_attr(test, derive(Serialize, Deserialize))]
 pub struct Hello {
+    /// The versions that the unit speaks.
+    pub versions: Versions,
+    /// Abilities that no version implies, a bit each; 0 now.
+    pub capabilities: u64,
     /// Units of different fleets refuse each other.
     pub fleet: Fleet,
     /// Name, id and role.
@@ -60,10 +87,6 @@ pub struct Hello {
     pub epoch: Epoch,
     /// Fresh for each link; the peer's session datagrams carry it.
     pub nonce: u64,
-    /// For fail-over between managers, later; 0 now.
-    pub term: u32,
-    /// Abilities beyond this version; 0 now.
-    pub capabilities: u32,
     /// What the unit takes.
     pub limits: Limits,
     /// The index by which the unit wants this link's session datagrams addressed.
@@ -74,6 +97,8 @@ pub struct Hello {
     pub stamp: u64,
     /// Pause between the unit's keep-alives, in milliseconds.
     pub keep_alive: u32,
+    /// Items that the reader did not know and passed over. Not sent.
+    pub skipped: u16,
 }
 
 /// Why a hello cannot be used.
@@ -83,91 +108,139 @@ pub enum HelloError {
     Magic,
     /// A unit of the other mode.
     Mode,
-    /// Another version, this one.
-    Version(u8),
-    /// The rest cannot be read.
+    /// The unit speaks none of our versions, but these.
+    Version(Versions),
+    /// No cipher suite that both have.
+    Suite,
+    /// The rest cannot be read, or says what must be understood and is not.
     Malformed,
+}
+
+impl From<Malformed> for HelloError {
+    fn from(Malformed: Malformed) -> Self {
+        Self::Malformed
+    }
 }
 
 impl Manager {
     pub(super) fn put(wanted: Option<&Self>, writer: &mut Writer<'_>) {
-        writer.flag(wanted.is_some());
-        if let Some(Self { name, id }) = wanted {
-            writer.text(name.as_bytes());
-            writer.number((*id).into());
-        }
+        let Some(Self { name, id }) = wanted else { return };
+        let item = writer.begin(kind::WANTED);
+        writer.text(name.as_bytes());
+        writer.number((*id).into());
+        writer.end(item);
     }
 
-    pub(super) fn take(reader: &mut Reader<'_>) -> Option<Self> {
-        reader.flag().then(|| Self { name: reader.name(), id: reader.u32() })
+    pub(super) fn take(reader: &mut Reader<'_>) -> Self {
+        Self { name: reader.name(), id: reader.u32() }
     }
 }
 
-impl Hello {
-    /// Encodes into `out`; the length, or `None` where it does not fit.
-    pub fn encode(&self, mode: Mode, out: &mut [u8]) -> Option<usize> {
-        let (prefix, rest) = out.split_first_chunk_mut::<PREFIX_BYTES>()?;
-        let [m0, m1, m2, m3] = mode.magic();
-        *prefix = [m0, m1, m2, m3, VERSION];
-        let mut writer = Writer::new(rest);
-        self.put(&mut writer);
-        writer.finish()?.checked_add(PREFIX_BYTES)
-    }
+/// What an item [`kind::LINK`] says.
+struct Link {
+    nonce: u64,
+    link: u16,
+    udp_port: u16,
+    stamp: u64,
+    keep_alive: u32,
+}
 
-    fn put(&self, writer: &mut Writer<'_>) {
-        let Self { fleet, identity, wanted, epoch, nonce, term, capabilities, limits, .. } = self;
-        writer.number(fleet.0.into());
-        identity.put(writer);
-        Manager::put(wanted.as_ref(), writer);
-        let Limits { message_size, chunk_size, calls, minimum_interval } = *limits;
-        writer.number(epoch.0);
-        writer.number(*nonce);
-        writer.numbers(&[*term, *capabilities, message_size, chunk_size.into(), calls.into(), minimum_interval]);
-        writer.numbers(&[self.link.into(), self.udp_port.into()]);
-        writer.number(self.stamp);
-        writer.number(self.keep_alive.into());
-    }
-
+impl Link {
     fn take(reader: &mut Reader<'_>) -> Self {
         Self {
-            fleet: Fleet(reader.u32()),
-            identity: Identity::take(reader),
-            wanted: Manager::take(reader),
-            epoch: Epoch(reader.u64()),
             nonce: reader.u64(),
-            term: reader.u32(),
-            capabilities: reader.u32(),
-            limits: Limits {
-                message_size: reader.u32(),
-                chunk_size: reader.u16(),
-                calls: reader.u16(),
-                minimum_interval: reader.u32(),
-            },
             link: reader.u16(),
             udp_port: reader.u16(),
             stamp: reader.u64(),
             keep_alive: reader.u32(),
         }
     }
+}
 
-    /// Reads a hello of this mode: all of it, nothing behind it.
+impl Limits {
+    fn take(reader: &mut Reader<'_>) -> Self {
+        Self {
+            message_size: reader.u32(),
+            chunk_size: reader.u16(),
+            calls: reader.u16(),
+            minimum_interval: reader.u32(),
+        }
+    }
+}
+
+impl Hello {
+    /// Encodes into `out`; the length, or `None` where it does not fit.
+    pub fn encode(&self, mode: Mode, out: &mut [u8]) -> Option<usize> {
+        let mut writer = Writer::new(out);
+        writer.bytes(&mode.magic());
+        writer.bytes(&[self.versions.first, self.versions.last]);
+        writer.bytes(&(mode.suites() | if LATER { 1 << 15 } else { 0 }).to_le_bytes());
+        writer.bytes(&self.fleet.0.to_le_bytes());
+        writer.bytes(&self.capabilities.to_le_bytes());
+        self.identity.put(self.epoch, &mut writer);
+        Manager::put(self.wanted.as_ref(), &mut writer);
+        let item = writer.begin(kind::LINK);
+        writer.number(self.nonce);
+        writer.numbers(&[self.link.into(), self.udp_port.into()]);
+        writer.number(self.stamp);
+        writer.number(self.keep_alive.into());
+        writer.end(item);
+        let Limits { message_size, chunk_size, calls, minimum_interval } = self.limits;
+        let item = writer.begin(kind::LIMITS);
+        writer.numbers(&[message_size, chunk_size.into(), calls.into(), minimum_interval]);
+        writer.end(item);
+        writer.finish()
+    }
+
+    /// Reads a hello of this mode. Items that this version does not know are passed over, and counted.
     pub fn decode(bytes: &[u8], mode: Mode) -> Result<Self, HelloError> {
-        let (prefix, rest) = bytes.split_first_chunk::<PREFIX_BYTES>().ok_or(HelloError::Malformed)?;
-        let [m0, m1, m2, m3, version] = *prefix;
+        let (prefix, items) = bytes.split_first_chunk::<PREFIX_BYTES>().ok_or(HelloError::Malformed)?;
+        let [m0, m1, m2, m3, first, last, s0, s1, f0, f1, f2, f3, capabilities @ ..] = *prefix;
         match Mode::of_magic([m0, m1, m2, m3]) {
             None => return Err(HelloError::Magic),
             Some(other) if other != mode => return Err(HelloError::Mode),
             Some(_) => {}
         }
-        if version != VERSION {
-            return Err(HelloError::Version(version));
+        let versions = Versions::from_wire(first, last);
+        if VERSIONS.common(versions).is_none() {
+            return Err(HelloError::Version(versions));
         }
-        let mut reader = Reader::new(rest);
-        let hello = Self::take(&mut reader);
-        let sound = reader.is_through()
-            && hello.identity.is_sound()
-            && usize::from(hello.limits.chunk_size) >= MINIMUM_CHUNK_BYTES;
-        if sound { Ok(hello) } else { Err(HelloError::Malformed) }
+        if mode.suites() != 0 && mode.suites() & u16::from_le_bytes([s0, s1]) == 0 {
+            return Err(HelloError::Suite);
+        }
+        let (mut unit, mut wanted, mut link, mut limits, mut skipped) = (None, None, None, None, 0);
+        for item in Items::new(items) {
+            let item: Item<'_> = item?;
+            match item.kind {
+                kind::UNIT => unit = Some(item.read(Identity::take)?),
+                kind::WANTED => wanted = Some(item.read(Manager::take)?),
+                kind::LINK => link = Some(item.read(Link::take)?),
+                kind::LIMITS => limits = Some(item.read(Limits::take)?),
+                _ => item.skip(&mut skipped)?,
+            }
+        }
+        let (Some((identity, epoch)), Some(link), Some(limits)) = (unit, link, limits) else {
+            return Err(HelloError::Malformed);
+        };
+        if !identity.is_sound() || usize::from(limits.chunk_size) < MINIMUM_CHUNK_BYTES {
+            return Err(HelloError::Malformed);
+        }
+        let Link { nonce, link, udp_port, stamp, keep_alive } = link;
+        Ok(Self {
+            versions,
+            capabilities: u64::from_le_bytes(capabilities),
+            fleet: Fleet(u32::from_le_bytes([f0, f1, f2, f3])),
+            identity,
+            wanted,
+            epoch,
+            nonce,
+            limits,
+            link,
+            udp_port,
+            stamp,
+            keep_alive,
+            skipped,
+        })
     }
 }
 
@@ -183,13 +256,13 @@ mod tests {
     fn longest() -> Hello {
         let name = "a-manager-with-a-name-of-32-byte";
         Hello {
+            versions: VERSIONS,
+            capabilities: u64::MAX,
             fleet: Fleet(u32::MAX),
             identity: Identity::s_unit(name, u32::MAX).unwrap(),
             wanted: Some(Manager { name: name.try_into().unwrap(), id: u32::MAX }),
             epoch: Epoch(u64::MAX),
             nonce: u64::MAX,
-            term: u32::MAX,
-            capabilities: u32::MAX,
             limits: Limits {
                 message_size: u32::MAX,
                 chunk_size: u16::MAX,
@@ -200,7 +273,22 @@ mod tests {
             udp_port: u16::MAX,
             stamp: u64::MAX,
             keep_alive: u32::MAX,
+            skipped: 0,
         }
+    }
+
+    /// The hello with these items in front of its own.
+    fn with_items(hello: &Hello, mode: Mode, items: &[(u16, &[u8])]) -> std::vec::Vec<u8> {
+        let (mut out, mut more) = ([0; 2 * ROOM], [0; ROOM]);
+        let length = hello.encode(mode, &mut out).unwrap();
+        let mut writer = Writer::new(&mut more);
+        for (kind, body) in items {
+            let item = writer.begin(*kind);
+            writer.bytes(body);
+            writer.end(item);
+        }
+        let used = writer.finish().unwrap();
+        [&out[..PREFIX_BYTES], &more[..used], &out[PREFIX_BYTES..length]].concat()
     }
 
     #[test]
@@ -208,9 +296,16 @@ mod tests {
         let mut out = [0; ROOM];
         let length = longest().encode(PLAIN, &mut out).unwrap();
         assert_eq!(Hello::decode(&out[..length], PLAIN), Ok(longest()));
-        assert_eq!(postcard::from_bytes(&out[PREFIX_BYTES..length]), Ok(longest()));
         assert_eq!(longest().encode(PLAIN, &mut out[..length - 1]), None);
-        assert_eq!(Hello::decode(&out[..length + 1], PLAIN), Err(HelloError::Malformed), "nothing may follow");
+    }
+
+    #[test]
+    fn a_hello_of_a_later_version_is_read() {
+        let later = Hello { versions: Versions { first: VERSIONS.last, last: 9 }, ..longest() };
+        let bytes = with_items(&later, PLAIN, &[(0x7000, b"unknown"), (0, &[0; 4]), (0x7001, &[])]);
+        assert_eq!(Hello::decode(&bytes, PLAIN), Ok(Hello { skipped: 2, ..later.clone() }));
+        let bytes = with_items(&later, PLAIN, &[(0xF000, b"must be understood")]);
+        assert_eq!(Hello::decode(&bytes, PLAIN), Err(HelloError::Malformed));
     }
 
     #[test]
@@ -224,19 +319,25 @@ mod tests {
         };
         assert_eq!(with(0, b'X'), Err(HelloError::Magic));
         assert_eq!(with(3, b's'), Err(HelloError::Mode));
-        assert_eq!(with(4, VERSION + 1), Err(HelloError::Version(VERSION + 1)));
+        assert_eq!(with(4, 3), Err(HelloError::Version(Versions { first: 3, last: 3 })));
+        assert_eq!(with(4, 1), Err(HelloError::Version(Versions { first: 1, last: 1 })), "it has its fleet in byte 5");
         for cut in 0..length {
-            assert_eq!(Hello::decode(&out[..cut], PLAIN), Err(HelloError::Malformed));
+            assert_eq!(Hello::decode(&out[..cut], PLAIN), Err(HelloError::Malformed), "{cut}");
         }
         let small = Limits { chunk_size: (MINIMUM_CHUNK_BYTES - 1) as u16, ..longest().limits };
         let length = Hello { limits: small, ..longest() }.encode(PLAIN, &mut out).unwrap();
         assert_eq!(Hello::decode(&out[..length], PLAIN), Err(HelloError::Malformed), "an emergency would not fit");
+        let length = longest().encode(Mode::Secured, &mut out).unwrap();
+        out[6] = 0b10;
+        assert_eq!(Hello::decode(&out[..length], Mode::Secured), Err(HelloError::Suite));
+        out[6] = 0b11;
+        assert_eq!(Hello::decode(&out[..length], Mode::Secured), Ok(longest()));
     }
 
     proptest! {
         #[test]
         fn what_is_read_from_changed_bytes_can_be_written_again(
-            changes in prop::collection::vec((5usize..160, any::<u8>()), 0..6),
+            changes in prop::collection::vec((PREFIX_BYTES..190, any::<u8>()), 0..6),
             cut in 0..ROOM,
         ) {
             let mut out = [0; ROOM];
@@ -245,16 +346,10 @@ mod tests {
                 out[place] = byte;
             }
             let _ = Hello::decode(&out[..cut], PLAIN);
-            // Whatever the bytes are, postcard reads the same.
-            let mut reader = Reader::new(&out[PREFIX_BYTES..length]);
-            let hello = Hello::take(&mut reader);
-            let theirs = postcard::take_from_bytes::<Hello>(&out[PREFIX_BYTES..length]).ok();
-            let theirs = theirs.and_then(|(hello, rest)| rest.is_empty().then_some(hello));
-            prop_assert_eq!(reader.is_through().then_some(hello), theirs);
             if let Ok(hello) = Hello::decode(&out[..length], PLAIN) {
                 let mut again = [0; ROOM];
                 let length = hello.encode(PLAIN, &mut again).unwrap();
-                prop_assert_eq!(Hello::decode(&again[..length], PLAIN), Ok(hello));
+                prop_assert_eq!(Hello::decode(&again[..length], PLAIN), Ok(Hello { skipped: 0, ..hello }));
             }
         }
     }

@@ -5,6 +5,7 @@ use core::fmt;
 use serde::{Deserialize, Serialize};
 
 use super::compact::{Reader, Writer};
+use super::hello::kind;
 use super::name::is_hidden;
 use crate::config::NODE_NAME_BYTES;
 use crate::error::Error;
@@ -65,15 +66,20 @@ impl Identity {
         if identity.is_sound() { Ok(identity) } else { Err(Error::BadName) }
     }
 
-    pub(super) fn put(&self, writer: &mut Writer<'_>) {
+    /// The item that says which unit this is, and which life of it.
+    pub(super) fn put(&self, epoch: Epoch, writer: &mut Writer<'_>) {
+        let item = writer.begin(kind::UNIT);
         writer.number(self.id.into());
         writer.text(self.name.as_bytes());
         writer.flag(self.role == Role::SUnit);
+        writer.number(epoch.0);
+        writer.end(item);
     }
 
-    pub(super) fn take(reader: &mut Reader<'_>) -> Self {
+    pub(super) fn take(reader: &mut Reader<'_>) -> (Self, Epoch) {
         let (id, name) = (reader.u32(), reader.name());
-        Self { id, name, role: if reader.choice(2) == 0 { Role::MUnit } else { Role::SUnit } }
+        let role = if reader.flag() { Role::SUnit } else { Role::MUnit };
+        (Self { id, name, role }, Epoch(reader.u64()))
     }
 
     /// Whether the name is valid: not empty, and without [hidden](is_hidden) characters, which could forge lines of a

@@ -1,13 +1,12 @@
-//! Messages of a session: requests and replies with fixed headers in front of a block of parameters, control messages
-//! in postcard. With [`hello`](super::hello), [`datagram`](super::datagram) and [`block`](super::block) the only code
+//! Messages of a session: requests and replies with headers in front of a block of parameters, control messages of
+//! [items](super::items). Headers tell their length, so that a later version can put more into them. With [`hello`](super::hello), [`datagram`](super::datagram) and [`block`](super::block) the only code
 //! that knows the encoding; `docs/wire.md` says it in words.
 
 pub use super::control::{Control, LeaseEnd};
 
 use super::block::Put;
-use super::compact::Reader;
 use super::function_list::{Generation, Slot};
-use crate::config::Priority;
+use crate::config::{LATER, Priority};
 use crate::error::{Error, ServiceError};
 use crate::host::frame::ChunkWriter;
 use crate::time::Duration;
@@ -18,15 +17,33 @@ pub(super) const CONTROL: u8 = 3;
 const FAILURE: u8 = 4;
 
 const WANTS_REPLY: u8 = 1;
+/// Flags that a callee must understand to run the request; the others it may pass over.
+const CRITICAL: u8 = 0xF0;
+/// The others that this version does not know.
+const SKIPPABLE: u8 = 0x0E;
 
 /// Bytes before a request's block.
-pub const REQUEST_BYTES: usize = 32;
+pub const REQUEST_BYTES: usize = LEAST_REQUEST_BYTES + MORE_BYTES;
 /// Bytes before a reply's block.
-pub const REPLY_BYTES: usize = 16;
+pub const REPLY_BYTES: usize = LEAST_REPLY_BYTES + MORE_BYTES;
+/// The header of a request that each version has.
+const LEAST_REQUEST_BYTES: usize = 32;
+/// The header of a reply that each version has.
+const LEAST_REPLY_BYTES: usize = 16;
+/// What a later version has behind them.
+const MORE_BYTES: usize = if LATER { 8 } else { 0 };
+/// Longest header that a receiver has room for in front of its longest block: those of later versions may be longer.
+pub const LONGEST_HEADER_BYTES: usize = 64;
+/// Bytes before the items of a control message.
+pub const CONTROL_HEADER_BYTES: usize = 4;
+/// Headers tell their length in these.
+const WORD: usize = 4;
+const REQUEST_WORDS: u8 = (REQUEST_BYTES / WORD) as u8;
+const REPLY_WORDS: u8 = (REPLY_BYTES / WORD) as u8;
 /// Longest control message that is not a `Publish`.
-pub const CONTROL_BYTES: usize = 48;
+pub const CONTROL_BYTES: usize = 48 + 2 * MORE_BYTES;
 /// Bytes that a `Publish` needs beside the signature.
-pub const PUBLISH_BYTES: usize = 24;
+pub const PUBLISH_BYTES: usize = 32 + 3 * MORE_BYTES;
 
 /// A message, borrowed from the bytes that it came in.
 #[derive(Debug)]
@@ -37,8 +54,8 @@ pub enum Message<'b> {
     Reply(u32, Result<&'b [u8], Error>),
     /// An asynchronous request was not run, or its service failed.
     Failure(u32, Error),
-    /// Lists, limits, leases.
-    Control(Control<'b>),
+    /// Lists, limits, leases: [items](super::items), of which [`Control`] is one each.
+    Control(&'b [u8]),
 }
 
 impl<'b> Message<'b> {
@@ -47,29 +64,39 @@ impl<'b> Message<'b> {
     pub fn decode(bytes: &'b [u8]) -> Option<Self> {
         match *bytes.first()? {
             REQUEST => {
-                let (header, block) = bytes.split_first_chunk()?;
-                Some(Self::Request(RequestHeader::decode(header)?, block))
+                let header = RequestHeader::decode(bytes.first_chunk()?);
+                Some(Self::Request(header, behind_header(bytes, bytes.get(6)?, LEAST_REQUEST_BYTES)?))
             }
             REPLY => {
-                let (header, block) = bytes.split_first_chunk()?;
-                let (id, status) = decode_reply(header)?;
-                match status {
-                    Ok(()) => Some(Self::Reply(id, Ok(block))),
-                    Err(error) => block.is_empty().then_some(Self::Reply(id, Err(error))),
-                }
+                let (id, status) = decode_reply(bytes.first_chunk()?);
+                let block = behind_header(bytes, bytes.get(3)?, LEAST_REPLY_BYTES)?;
+                Some(Self::Reply(id, status.map(|()| block)))
             }
             FAILURE => {
-                let (id, status) = decode_reply(bytes.try_into().ok()?)?;
+                let (id, status) = decode_reply(bytes.first_chunk()?);
                 Some(Self::Failure(id, status.err()?))
             }
-            CONTROL => {
-                let mut reader = Reader::new(bytes.get(1..)?);
-                let control = Control::take(&mut reader)?;
-                reader.is_through().then_some(Self::Control(control))
-            }
+            CONTROL => Some(Self::Control(bytes.get(CONTROL_HEADER_BYTES..)?)),
             _ => None,
         }
     }
+}
+
+/// What follows a header that says so many words of itself; it may be longer than this version's, and not shorter.
+#[inline]
+fn behind_header<'b>(bytes: &'b [u8], words: &u8, least: usize) -> Option<&'b [u8]> {
+    let length = usize::from(*words).saturating_mul(WORD);
+    if length < least { None } else { bytes.get(length..) }
+}
+
+/// A header as this build sends it.
+#[inline]
+fn with_more<const LEAST: usize, const ALL: usize>(header: [u8; LEAST]) -> [u8; ALL] {
+    let mut bytes = [0; ALL];
+    if let Some(place) = bytes.first_chunk_mut() {
+        *place = header;
+    }
+    bytes
 }
 
 impl Put for ChunkWriter<'_> {
@@ -90,6 +117,8 @@ pub struct RequestHeader {
     pub generation: Generation,
     /// The caller waits for a reply.
     pub wants_reply: bool,
+    /// Flags that this version does not know, without which the request must not be run.
+    pub unknown: u8,
     /// Time until the caller's deadline when the request was made, saturating.
     pub remaining: Duration,
     /// The callee's clock as the caller last heard it, in microseconds.
@@ -102,35 +131,63 @@ impl RequestHeader {
     /// The header's bytes.
     #[inline]
     pub fn encode(&self) -> [u8; REQUEST_BYTES] {
-        let flags = if self.wants_reply { WANTS_REPLY } else { 0 };
+        let flags = self.unknown | if self.wants_reply { WANTS_REPLY } else { 0 } | if LATER { SKIPPABLE } else { 0 };
         let [s0, s1] = self.slot.0.to_le_bytes();
         let [g0, g1] = self.generation.0.to_le_bytes();
         let [i0, i1, i2, i3] = self.id.to_le_bytes();
         let [r0, r1, r2, r3] = self.remaining.as_wire().to_le_bytes();
         let [t0, t1, t2, t3, t4, t5, t6, t7] = self.stamp.to_le_bytes();
         let [e0, e1, e2, e3] = self.since.as_wire().to_le_bytes();
-        [
-            REQUEST, flags, s0, s1, g0, g1, 0, 0, i0, i1, i2, i3, r0, r1, r2, r3, t0, t1, t2, t3, t4, t5, t6, t7, e0,
-            e1, e2, e3, 0, 0, 0, 0,
-        ]
+        with_more([
+            REQUEST,
+            flags,
+            s0,
+            s1,
+            g0,
+            g1,
+            REQUEST_WORDS,
+            0,
+            i0,
+            i1,
+            i2,
+            i3,
+            r0,
+            r1,
+            r2,
+            r3,
+            t0,
+            t1,
+            t2,
+            t3,
+            t4,
+            t5,
+            t6,
+            t7,
+            e0,
+            e1,
+            e2,
+            e3,
+            0,
+            0,
+            0,
+            0,
+        ])
     }
 
     #[inline]
-    fn decode(bytes: &[u8; REQUEST_BYTES]) -> Option<Self> {
-        let [_, flags, s0, s1, g0, g1, 0, 0, i0, i1, i2, i3, r0, r1, r2, r3, rest @ ..] = bytes else { return None };
-        let [t0, t1, t2, t3, t4, t5, t6, t7, e0, e1, e2, e3, 0, 0, 0, 0] = rest else { return None };
-        if flags & !WANTS_REPLY != 0 {
-            return None;
-        }
-        Some(Self {
+    fn decode(bytes: &[u8; LEAST_REQUEST_BYTES]) -> Self {
+        let [_, flags, s0, s1, g0, g1, _, _, i0, i1, i2, i3, r0, r1, r2, r3, rest @ ..] = bytes;
+        let [t0, t1, t2, t3, t4, t5, t6, t7, e0, e1, e2, e3, ..] = rest;
+        Self {
             id: u32::from_le_bytes([*i0, *i1, *i2, *i3]),
             slot: Slot(u16::from_le_bytes([*s0, *s1])),
             generation: Generation(u16::from_le_bytes([*g0, *g1])),
             wants_reply: flags & WANTS_REPLY != 0,
+            unknown: flags & CRITICAL,
             remaining: micros([*r0, *r1, *r2, *r3]),
             stamp: u64::from_le_bytes([*t0, *t1, *t2, *t3, *t4, *t5, *t6, *t7]),
             since: micros([*e0, *e1, *e2, *e3]),
-        })
+        }
     }
 }
 
@@ -156,18 +213,18 @@ fn answer(kind: u8, id: u32, status: Result<(), Error>) -> [u8; REPLY_BYTES] {
     let [i0, i1, i2, i3] = id.to_le_bytes();
     let [a0, a1, a2, a3] = first.to_le_bytes();
     let [b0, b1, b2, b3] = second.to_le_bytes();
-    [kind, code, index, 0, i0, i1, i2, i3, a0, a1, a2, a3, b0, b1, b2, b3]
+    with_more([kind, code, index, REPLY_WORDS, i0, i1, i2, i3, a0, a1, a2, a3, b0, b1, b2, b3])
 }
 
 #[inline]
-fn decode_reply(bytes: &[u8; REPLY_BYTES]) -> Option<(u32, Result<(), Error>)> {
-    let &[_, code, index, 0, i0, i1, i2, i3, a0, a1, a2, a3, b0, b1, b2, b3] = bytes else { return None };
+fn decode_reply(bytes: &[u8; LEAST_REPLY_BYTES]) -> (u32, Result<(), Error>) {
+    let &[_, code, index, _, i0, i1, i2, i3, a0, a1, a2, a3, b0, b1, b2, b3] = bytes;
     let id = u32::from_le_bytes([i0, i1, i2, i3]);
     if code == 0 {
-        return Some((id, Ok(())));
+        return (id, Ok(()));
     }
     let (first, second) = (u32::from_le_bytes([a0, a1, a2, a3]), u32::from_le_bytes([b0, b1, b2, b3]));
-    Some((id, Err(error_of(code, index, first, second))))
+    (id, Err(error_of(code, index, first, second)))
 }
 
 /// (code, index, first number, second number) of an error that a callee answers.
@@ -187,6 +244,7 @@ fn error_code(error: Error) -> (u8, u8, u32, u32) {
         Error::TooSoon { wait } => (13, 0, wait.as_wire(), 0),
         Error::ResultWouldNotFit { need, have } => (14, 0, need, have),
         Error::ResultLost => (15, 0, 0, 0),
+        Error::Unsupported => (16, 0, 0, 0),
         Error::Service(ServiceError::Failed(code)) => (20, 0, u32::from(code), 0),
         Error::Service(ServiceError::Panicked) => (21, 0, 0, 0),
         Error::Service(ServiceError::NotReady) => (22, 0, 0, 0),
@@ -212,6 +270,7 @@ fn error_of(code: u8, index: u8, first: u32, second: u32) -> Error {
         13 => Error::TooSoon { wait: Duration::from_micros(u64::from(first)) },
         14 => Error::ResultWouldNotFit { need: first, have: second },
         15 => Error::ResultLost,
+        16 => Error::Unsupported,
         20 => Error::Service(ServiceError::Failed(first as u16)),
         21 => Error::Service(ServiceError::Panicked),
         22 => Error::Service(ServiceError::NotReady),
@@ -276,11 +335,11 @@ const RELEASE: u8 = 6;
 const RELEASE_ALL: u8 = 7;
 
 impl<'b> SessionBody<'b> {
-    /// Reads a session body.
+    /// Reads a session body. All but a message may be longer than this version knows; `None` for what it does not know.
     pub fn decode(bytes: &'b [u8]) -> Option<Self> {
         let (&kind, rest) = bytes.split_first()?;
         match kind {
-            KEEP_ALIVE => Some(Self::KeepAlive { stamp: u64::from_le_bytes(rest.try_into().ok()?) }),
+            KEEP_ALIVE => Some(Self::KeepAlive { stamp: u64::from_le_bytes(*rest.first_chunk()?) }),
             RENEW => {
                 let (&class, rest) = rest.split_first()?;
                 let (call, rest) = rest.split_first_chunk()?;
@@ -289,25 +348,24 @@ impl<'b> SessionBody<'b> {
                     call: u32::from_le_bytes(*call),
                     class: Priority::from_wire(class)?,
                     stamp: u64::from_le_bytes(*stamp),
-                    since: micros(rest.try_into().ok()?),
+                    since: micros(*rest.first_chunk()?),
                 }))
             }
             RELEASE => {
                 let (&class, call) = rest.split_first()?;
-                let (call, class) = (u32::from_le_bytes(call.try_into().ok()?), Priority::from_wire(class)?);
+                let (call, class) = (u32::from_le_bytes(*call.first_chunk()?), Priority::from_wire(class)?);
                 Some(Self::Release(Release { call, class }))
             }
             RELEASE_ALL => {
                 let (slot, id) = rest.split_first_chunk()?;
-                let id = u32::from_le_bytes(id.try_into().ok()?);
-                Some(Self::ReleaseAll(Slot(u16::from_le_bytes(*slot)), id))
+                Some(Self::ReleaseAll(Slot(u16::from_le_bytes(*slot)), u32::from_le_bytes(*id.first_chunk()?)))
             }
             MESSAGE => {
                 let (&priority, message) = rest.split_first()?;
                 Some(Self::Message(priority, message))
             }
-            PING if rest.is_empty() => Some(Self::Ping),
-            PONG if rest.is_empty() => Some(Self::Pong),
+            PING => Some(Self::Ping),
+            PONG => Some(Self::Pong),
             _ => None,
         }
     }
@@ -351,17 +409,22 @@ impl<'b> SessionBody<'b> {
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used, clippy::indexing_slicing, clippy::panic)]
+    #![allow(clippy::unwrap_used, clippy::indexing_slicing, clippy::panic, clippy::arithmetic_side_effects)]
+    use std::format;
+    use std::vec::Vec;
+
     use super::*;
     use proptest::prelude::*;
 
     fn headers() -> impl Strategy<Value = RequestHeader> {
-        (any::<u32>(), any::<u16>(), any::<u16>(), any::<bool>(), any::<u32>(), any::<u64>(), any::<u32>()).prop_map(
-            |(id, slot, generation, wants_reply, remaining, stamp, since)| RequestHeader {
+        let numbers = (any::<u32>(), any::<u16>(), any::<u16>(), any::<u32>(), any::<u64>(), any::<u32>());
+        (numbers, any::<bool>(), any::<u8>()).prop_map(
+            |((id, slot, generation, remaining, stamp, since), wants_reply, unknown)| RequestHeader {
                 id,
                 slot: Slot(slot),
                 generation: Generation(generation),
                 wants_reply,
+                unknown: unknown & CRITICAL,
                 remaining: Duration::from_micros(u64::from(remaining)),
                 stamp,
                 since: Duration::from_micros(u64::from(since)),
@@ -379,6 +442,26 @@ mod tests {
         }
 
         #[test]
+        fn a_longer_header_of_a_later_version_is_read(header in headers(), more in 0..20_usize, flags in 0..16_u8) {
+            let mut bytes = Vec::from(header.encode());
+            bytes[1] |= flags & !WANTS_REPLY;
+            bytes[6] += more as u8;
+            bytes[7] = 99;
+            bytes.extend((0..more * WORD + 3).map(|_| 0xEE));
+            let Some(Message::Request(read, block)) = Message::decode(&bytes) else { panic!() };
+            prop_assert_eq!((read, block), (header, &[0xEE; 3][..]));
+            bytes[6] = REQUEST_WORDS - 1;
+            prop_assert!(Message::decode(&bytes).is_none());
+            let mut reply = Vec::from(encode_reply(7, Ok(())));
+            reply[3] += more as u8;
+            reply.extend((0..more * WORD + 3).map(|_| 0xEE));
+            let Some(Message::Reply(7, Ok(block))) = Message::decode(&reply) else { panic!() };
+            prop_assert_eq!(block, &[0xEE; 3]);
+            reply[3] = REPLY_WORDS - 1;
+            prop_assert!(Message::decode(&reply).is_none());
+        }
+
+        #[test]
         fn decoding_never_panics(bytes in prop::collection::vec(any::<u8>(), 0..80), kind in 0..5u8) {
             let mut bytes = bytes;
             bytes.insert(0, kind);
@@ -393,6 +476,25 @@ mod tests {
             let Some(Message::Reply(7, Err(read))) = Message::decode(&bytes) else { panic!() };
             prop_assert_eq!(read, error);
         }
+    }
+
+    #[test]
+    fn session_bodies_may_be_longer() {
+        let longer = |bytes: &[u8]| format!("{:?}", SessionBody::decode(&[bytes, &[0xEE; 5]].concat()));
+        let exact = |bytes: &[u8]| format!("{:?}", SessionBody::decode(bytes));
+        let renewal = Renewal { call: 1, class: Priority::Low, stamp: 3, since: Duration::from_micros(4) };
+        let bodies: [&[u8]; 6] = [
+            &SessionBody::PING,
+            &SessionBody::PONG,
+            &SessionBody::keep_alive(9),
+            &SessionBody::renewal(&renewal),
+            &SessionBody::release(&Release { call: 5, class: Priority::High }),
+            &SessionBody::release_all(Slot(6), 7),
+        ];
+        for body in bodies {
+            assert_eq!(longer(body), exact(body));
+        }
+        assert_eq!(SessionBody::decode(&[200, 1, 2]), None);
     }
 
     #[test]

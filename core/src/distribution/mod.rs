@@ -13,6 +13,7 @@ pub mod function;
 pub mod function_list;
 pub mod hello;
 pub mod identity;
+pub mod items;
 pub mod message;
 pub mod name;
 pub mod parameters;

@@ -59,6 +59,7 @@ impl Presence {
             tcp_port: 0,
             expected: 1,
             known: heapless::Vec::new(),
+            skipped: 0,
         };
         who_has.encode(self.fleet, authenticator, out)
     }
@@ -106,6 +107,7 @@ impl Presence {
             tcp_port: 0,
             room: 0,
             expected: 1,
+            skipped: 0,
         };
         announce.encode(self.fleet, authenticator, Some(&self.identity), out)
     }

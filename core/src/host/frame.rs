@@ -5,7 +5,7 @@
 //! two chunks of another message. The first chunk tells the message's length.
 
 use crate::bytes::copy;
-use crate::config::{MINIMUM_CHUNK_BYTES, Priority};
+use crate::config::{LATER, MINIMUM_CHUNK_BYTES, Priority};
 use crate::error::CloseReason;
 
 /// Bytes before a frame's body.
@@ -24,6 +24,8 @@ const SESSION: u8 = 6;
 const PROOF: u8 = 7;
 const CONFIRM: u8 = 8;
 const CHUNK: u8 = 0x10;
+/// Kinds of frames that a live link passes over if it does not know them.
+const SKIPPABLE: core::ops::RangeInclusive<u8> = 0x40..=0x7F;
 const FIRST: u8 = 0x01;
 const LAST: u8 = 0x02;
 
@@ -48,6 +50,8 @@ pub enum Frame<'b> {
     Confirm(&'b [u8]),
     /// A piece of a message.
     Chunk(Chunk<'b>),
+    /// Of a later version; a live link passes over it.
+    Skipped,
 }
 
 /// A piece of a message.
@@ -75,23 +79,17 @@ impl<'b> Frame<'b> {
         let (&kind, rest) = body.split_first().ok_or(CloseReason::Protocol)?;
         match kind {
             HELLO => Ok(Self::Hello(rest)),
-            REFUSE => Ok(Self::Refuse(only_byte(rest)?)),
-            CLOSE => Ok(Self::Close(only_byte(rest)?)),
+            REFUSE => Ok(Self::Refuse(*rest.first().ok_or(CloseReason::Protocol)?)),
+            CLOSE => Ok(Self::Close(*rest.first().ok_or(CloseReason::Protocol)?)),
             PING if rest.is_empty() => Ok(Self::Ping),
             PONG if rest.is_empty() => Ok(Self::Pong),
             SESSION => Ok(Self::Session(rest)),
             PROOF => Ok(Self::Proof(rest)),
             CONFIRM => Ok(Self::Confirm(rest)),
             kind if kind & !(FIRST | LAST) == CHUNK => Chunk::parse(kind, body.len(), rest).map(Self::Chunk),
+            kind if SKIPPABLE.contains(&kind) => Ok(Self::Skipped),
             _ => Err(CloseReason::Protocol),
         }
-    }
-}
-
-fn only_byte(rest: &[u8]) -> Result<u8, CloseReason> {
-    match rest {
-        [byte] => Ok(*byte),
-        _ => Err(CloseReason::Protocol),
     }
 }
 
@@ -137,7 +135,7 @@ pub fn encoded_length(frame: &Frame<'_>, overhead: usize) -> usize {
     payload.saturating_add(HEADER_BYTES).saturating_add(1).saturating_add(overhead)
 }
 
-/// `None` for a chunk.
+/// `None` for a chunk, and for what this version does not send.
 fn kind_and_payload<'b>(frame: &'b Frame<'_>) -> Option<(u8, &'b [u8])> {
     Some(match frame {
         Frame::Hello(bytes) => (HELLO, bytes),
@@ -148,7 +146,8 @@ fn kind_and_payload<'b>(frame: &'b Frame<'_>) -> Option<(u8, &'b [u8])> {
         Frame::Session(bytes) => (SESSION, bytes),
         Frame::Proof(bytes) => (PROOF, bytes),
         Frame::Confirm(bytes) => (CONFIRM, bytes),
-        Frame::Chunk(_) => return None,
+        Frame::Skipped if LATER => (0x5F, b"later"),
+        Frame::Chunk(_) | Frame::Skipped => return None,
     })
 }
 

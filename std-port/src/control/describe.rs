@@ -1,7 +1,7 @@
 //! Units, nodes, refusals and events in the control socket's form.
 
 use crate::Finding;
-use cara_core::config::{Constraints, Priority, VERSION};
+use cara_core::config::{Constraints, Priority, VERSIONS};
 use cara_core::distribution::identity::{Epoch, Identity};
 use cara_core::services::lease::LeaseEnd;
 use cara_core::time::Duration;
@@ -22,7 +22,7 @@ pub(super) fn unit<T: Send + 'static>(system: &CommunicationSystem<T>) -> UnitIn
         fleet: system.fleet().0,
         mode: Some(system.keys().mode().as_str().to_owned()),
         keys: system.keys().ring().map(keys),
-        version: VERSION,
+        version: VERSIONS.last,
         discovery_port: system.discovery_port(),
         tcp_port: system.tcp_port(),
         epoch: epoch(system.epoch()),
@@ -58,8 +58,7 @@ pub(super) fn node<T: Send + 'static>(peer: &Peer<T>, expected: bool) -> NodeInf
         connected: peer.is_connected(),
         expected,
         address: peer.address().map(|address| address.to_string()),
-        // Nodes of another version are refused.
-        version: limits.map(|_| VERSION),
+        version: peer.version(),
         epoch: peer.epoch().map(epoch),
         connected_ms: peer.connected_for().map(Duration::as_millis),
         left_ms: left.map(|(ago, _)| ago.as_millis()),

@@ -255,18 +255,19 @@ pub(super) mod tests {
             their_signatures: filled(64, 0),
         };
         let local = Hello {
+            versions: cara_core::config::VERSIONS,
+            capabilities: 0,
             fleet: Fleet(0),
             identity: Identity::m_unit("manager", 1).unwrap(),
             wanted: None,
             epoch: Epoch(1),
             nonce: 1,
-            term: 0,
-            capabilities: 0,
             limits: Limits { message_size: 0, chunk_size: 0, calls: 0, minimum_interval: 0 },
             link: 0,
             udp_port: 0,
             keep_alive: 0,
             stamp: 0,
+            skipped: 0,
         };
         let config = SessionConfig { link: LinkId(0), dialed: true, address, local, constraints: Constraints::M_UNIT };
         let session = Session::new(Instant::START, config, Cipher::new(cara_core::config::Mode::Plain), storage);

@@ -275,7 +275,7 @@ fn a_session_datagram_does_not_take_the_hubs_lock() {
     let pair = Pair::new(Constraints::M_UNIT, |_| {});
     let (engine, near, far) = (pair.manager.engine(), pair.near(), pair.far());
     let (to, nonce) = (near.id.0, far.lock().session.hello().unwrap().nonce);
-    let header = session_header(Mode::Plain, engine.fleet, to, nonce);
+    let header = session_header(Mode::Plain, cara_core::config::VERSIONS.last, engine.fleet, to, nonce);
     let mut bytes = [&header[..], &SessionBody::keep_alive(0)].concat();
     let from = near.lock().session.address();
     let received = || near.lock().session.counters().value(LinkCounter::DatagramsReceived);

@@ -4,7 +4,7 @@ use std::io;
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use cara_core::config::{Mode, VERSION};
+use cara_core::config::{Mode, VERSIONS, Versions};
 use cara_core::distribution::datagram::{Datagram, Header};
 use cara_core::distribution::hello::Manager;
 use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
@@ -42,8 +42,8 @@ pub struct Heard {
     pub mode: Mode,
     /// What shows that it belongs to its fleet, as heard last.
     pub standing: Standing,
-    /// Its protocol version. What is said below of another version than this one's is read as if it were of this one.
-    pub version: u8,
+    /// The protocol versions that it speaks. Where none of them is this one's, what is said below may be wrong or missing.
+    pub versions: Versions,
     /// Its fleet.
     pub fleet: Fleet,
     /// Its identity; `None` if its datagrams could not be decoded beyond their header.
@@ -78,9 +78,9 @@ impl Heard {
         self.tcp_port.map(|port| SocketAddr::new(self.source.ip(), port))
     }
 
-    /// Whether it speaks this version.
+    /// Whether it speaks a version that this one speaks as well.
     pub const fn same_version(&self) -> bool {
-        self.version == VERSION
+        VERSIONS.common(self.versions).is_some()
     }
 
     /// Whether it is a survey, of this or another host.
@@ -92,7 +92,7 @@ impl Heard {
         self.source == news.source
             && self.mode == news.header.mode
             && self.standing.is_like(news.standing)
-            && self.version == news.header.version
+            && self.versions == news.header.versions
             && self.fleet == news.header.fleet
             && self.identity.as_ref() == news.identity
             && self.epoch == news.epoch
@@ -103,7 +103,7 @@ impl Heard {
             source: news.source,
             mode: news.header.mode,
             standing: news.standing,
-            version: news.header.version,
+            versions: news.header.versions,
             fleet: news.header.fleet,
             identity: news.identity.cloned(),
             epoch: news.epoch,

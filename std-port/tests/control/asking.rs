@@ -40,7 +40,7 @@ fn nodes_are_told_with_what_is_known_of_them() {
     let answers = ask(&mut client, Question::Nodes { offering: None }).unwrap();
     let [node] = nodes(&answers)[..] else { panic!("{answers:?}") };
     assert_eq!((node.name.as_str(), node.id, node.role.as_str(), node.connected), ("agv", 7, "s_unit", true));
-    assert_eq!((node.functions, node.version), (4, Some(1)));
+    assert_eq!((node.functions, node.version), (4, Some(2)));
     assert_eq!(node.epoch.as_deref(), Some(format!("{:016x}", agv.epoch().0).as_str()));
     assert_eq!(node.limits.unwrap().calls, agv.constraints().calls_per_peer);
     assert!(node.address.as_ref().unwrap().starts_with("127."), "{node:?}");

@@ -186,6 +186,7 @@ impl Discovery {
             tcp_port: 0,
             expected: 1,
             known: Default::default(),
+            skipped: 0,
         };
         let mut bytes = [0; SEARCH_BYTES];
         let length = who_has.encode(FLEET, &Plain, &mut bytes).expect("room for it").len();
@@ -205,7 +206,16 @@ impl Discovery {
         let identity = Identity::m_unit("other", 500_000 + self.sequence).expect("a name");
         let from = address(&identity);
         // Nowhere to be dialled, so that nothing follows from it.
-        let announce = Announce { identity, epoch: Epoch(1), sequence: 1, nonce: 0, tcp_port: 0, room: 8, expected: 8 };
+        let announce = Announce {
+            identity,
+            epoch: Epoch(1),
+            sequence: 1,
+            nonce: 0,
+            tcp_port: 0,
+            room: 8,
+            expected: 8,
+            skipped: 0,
+        };
         let mut bytes = [0; SEARCH_BYTES];
         let length = announce.encode(FLEET, &Plain, None, &mut bytes).expect("room for it").len();
         meter.count(&mut || {

@@ -380,17 +380,18 @@ fn node_config(constraints: Constraints, caller: bool) -> NodeConfig<SocketAddrV
 
 fn hello(constraints: &Constraints, caller: bool) -> Hello {
     Hello {
+        versions: cara_core::config::VERSIONS,
+        capabilities: 0,
         fleet: Fleet(1),
         identity: identity(caller),
         wanted: (!caller).then(depot),
         epoch: Epoch(1),
         nonce: if caller { 0x1234_5678 } else { 0x8765_4321 },
-        term: 0,
-        capabilities: 0,
         limits: constraints.into(),
         link: 0,
         udp_port: 0,
         stamp: 0,
         keep_alive: constraints.keep_alive.as_millis() as u32,
+        skipped: 0,
     }
 }

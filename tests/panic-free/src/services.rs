@@ -3,11 +3,15 @@
 use core::mem::MaybeUninit;
 use core::net::SocketAddrV4;
 
+use cara_core::config::{Mode, VERSIONS};
 use cara_core::distribution::datagram;
 use cara_core::distribution::function_list::FunctionList;
 use cara_core::distribution::hello::Hello;
 use cara_core::distribution::identity::Identity;
+use cara_core::distribution::items::Items;
+use cara_core::distribution::message::Control;
 use cara_core::distribution::parameters::{Parameters, ParametersView};
+use cara_core::error::Refusal;
 use cara_core::services::access::{self, Access, Bucket, Functions, Principal, Rate, Rule, Verbs, Who};
 use cara_core::services::event::UnitEvent;
 use cara_core::services::lease::{Lease, Service};
@@ -103,6 +107,7 @@ entry!(session_asked, {
         session.is_ended(),
         session.hello(),
     ));
+    keep(session.version());
     keep((session.identity(), session.peer(), session.epoch(), session.address(), session.nonce(), session.deadline()));
     keep((session.their_function_list(), session.counters(), session.calls_in_flight(), session.calls_held()));
     keep((
@@ -240,6 +245,12 @@ entry!(requests, {
 
 entry!(hellos, {
     keep(Hello::decode(unknown_slice(), *unknown()));
+    keep((VERSIONS.common(*unknown()), unknown::<Mode>().suites()));
+    keep((unknown::<Refusal>().to_wire(), Refusal::from_wire(*unknown())));
+    let mut items = Items::new(unknown_slice());
+    while let Some(Ok(item)) = items.next() {
+        keep((Control::take(&item), items.rest()));
+    }
     keep(unknown::<Hello>().encode(*unknown(), unknown_slice()));
-    keep(datagram::session_header(*unknown(), *unknown(), *unknown(), *unknown()));
+    keep(datagram::session_header(*unknown(), *unknown(), *unknown(), *unknown(), *unknown()));
 });

@@ -1,6 +1,6 @@
 //! Clients that are no unit, or a misbehaving one: what they send, byte by byte, on any port.
 
-use cara_core::config::{Mode, PLAIN_MAGIC, Priority, VERSION};
+use cara_core::config::{Mode, PLAIN_MAGIC, Priority, VERSIONS, Versions};
 use cara_core::distribution::datagram::{SEARCH_BYTES, WhoHas};
 use cara_core::distribution::hello::{Hello, Limits, Manager};
 use cara_core::distribution::identity::{Epoch, Fleet, Identity};
@@ -38,6 +38,9 @@ pub(crate) struct Visit {
 }
 
 impl UnknownClient {
+    /// What a unit of another version speaks.
+    pub(crate) const OTHER_VERSIONS: Versions = Versions { first: VERSIONS.last + 1, last: VERSIONS.last + 1 };
+
     /// Datagrams for the discovery port.
     pub(crate) fn datagrams(self, fleet: u32) -> Vec<Vec<u8>> {
         match self {
@@ -76,12 +79,12 @@ impl UnknownClient {
     /// What it must be told before the end.
     pub(crate) fn is_told(self) -> Option<Vec<u8>> {
         let refusal = match self {
-            Self::OtherVersion => Refusal::Version,
+            Self::OtherVersion => Refusal::Version(Self::OTHER_VERSIONS),
             Self::OtherFleet => Refusal::Fleet,
             _ => return None,
         };
         let mut refused = [0; 16];
-        let length = frame::encode(&Frame::Refuse(refusal as u8), 0, &mut refused);
+        let length = frame::encode(&Frame::Refuse(refusal.to_wire()), 0, &mut refused);
         Some(refused[..length].to_vec())
     }
 }
@@ -89,7 +92,8 @@ impl UnknownClient {
 fn other_version() -> Vec<u8> {
     let mut said = vec![0; 32];
     said[..4].copy_from_slice(&PLAIN_MAGIC);
-    said[4] = VERSION + 1;
+    said[4] = UnknownClient::OTHER_VERSIONS.first;
+    said[5] = UnknownClient::OTHER_VERSIONS.last;
     said
 }
 
@@ -102,18 +106,19 @@ fn framed(hello: &[u8]) -> Vec<u8> {
 
 fn hello(manager: &Identity, fleet: u32) -> Vec<u8> {
     let hello = Hello {
+        versions: cara_core::config::VERSIONS,
+        capabilities: 0,
         fleet: Fleet(fleet),
         identity: Identity::s_unit("stranger", 66).expect("a short name"),
         wanted: Manager::new(manager.name(), manager.id()).ok(),
         epoch: Epoch(6),
         nonce: 6,
-        term: 0,
-        capabilities: 0,
         limits: Limits { message_size: 1024, chunk_size: 1024, calls: 8, minimum_interval: 0 },
         link: 0,
         udp_port: 0,
         stamp: 0,
         keep_alive: 1_000,
+        skipped: 0,
     };
     let mut bytes = [0; 320];
     let length = hello.encode(Mode::Plain, &mut bytes).expect("a hello fits");
@@ -130,6 +135,7 @@ fn who_has(fleet: u32) -> Vec<u8> {
         tcp_port: 0,
         expected: 1,
         known: Default::default(),
+        skipped: 0,
     };
     let mut bytes = [0; SEARCH_BYTES];
     who_has.encode(Fleet(fleet), &Plain, &mut bytes).expect("a search fits").to_vec()
@@ -153,7 +159,7 @@ fn garbage() -> Vec<Vec<u8>> {
         let mut bytes: Vec<u8> = (0..length).map(|_| random.bits() as u8).collect();
         if !number.is_multiple_of(3) {
             bytes[..4].copy_from_slice(&PLAIN_MAGIC);
-            bytes[4] = VERSION;
+            bytes[4] = VERSIONS.last;
         }
         if number % 3 == 2 {
             bytes.truncate(200);

@@ -70,12 +70,13 @@ fn who_has(who: &Identity, wanted_depot: bool) -> WhoHas {
         tcp_port: 666,
         expected: 1,
         known: Default::default(),
+        skipped: 0,
     }
 }
 
 fn announce(who: &Identity, nonce: u64, tcp_port: u16) -> Announce {
     let epoch = Epoch(fastrand::u64(..));
-    Announce { identity: who.clone(), epoch, sequence: u32::MAX, nonce, tcp_port, room: 100, expected: 1 }
+    Announce { identity: who.clone(), epoch, sequence: u32::MAX, nonce, tcp_port, room: 100, expected: 1, skipped: 0 }
 }
 
 /// Datagrams without a valid code, made from one with another sender's codes.

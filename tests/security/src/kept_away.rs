@@ -124,7 +124,8 @@ impl Attack {
         let announce = |_| {
             let epoch = Epoch(fastrand::u64(..));
             let (sequence, room, expected) = (u32::MAX, 100, u16::MAX);
-            let announce = Announce { identity: depot(), epoch, sequence, nonce: 0, tcp_port, room, expected };
+            let announce =
+                Announce { identity: depot(), epoch, sequence, nonce: 0, tcp_port, room, expected, skipped: 0 };
             let mut out = [0; SEARCH_BYTES];
             announce.encode(fleet, &codes, None, &mut out).map(<[u8]>::to_vec).context("it fits")
         };

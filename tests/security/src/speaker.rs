@@ -351,6 +351,7 @@ impl Speaker {
             slot: Slot(slot),
             generation: Generation(0),
             wants_reply,
+            unknown: 0,
             remaining: cara_core::time::Duration::from_secs(600),
             stamp: self.theirs.as_ref().map_or(0, |them| them.stamp),
             since: cara_core::time::Duration::ZERO,
@@ -363,7 +364,8 @@ impl Speaker {
     pub fn request_in_datagram(&mut self, slot: u16) -> Said {
         let body = [&[3, 2][..], &self.message(slot, false)].concat();
         let (link, nonce) = self.theirs.as_ref().map_or((0, 0), |them| (them.link, them.nonce));
-        let header = session_header(self.cipher.mode(), self.claim.fleet, link, nonce);
+        let header =
+            session_header(self.cipher.mode(), cara_core::config::VERSIONS.last, self.claim.fleet, link, nonce);
         let (front, behind) = self.cipher.datagram_room();
         let mut sealed = [&vec![0; front][..], &body, &vec![0; behind]].concat();
         self.cipher.seal_datagram(&header, &mut sealed);
@@ -397,6 +399,7 @@ pub fn request_in_clear() -> Vec<u8> {
         slot: Slot(0),
         generation: Generation(0),
         wants_reply: true,
+        unknown: 0,
         remaining: cara_core::time::Duration::from_secs(600),
         stamp: 0,
         since: cara_core::time::Duration::ZERO,
@@ -409,18 +412,19 @@ pub fn request_in_clear() -> Vec<u8> {
 /// The hello of a claimed identity.
 pub fn hello(claim: &Claim, mode: Mode, udp_port: u16) -> Vec<u8> {
     let hello = Hello {
+        versions: cara_core::config::VERSIONS,
+        capabilities: 0,
         fleet: claim.fleet,
         identity: claim.identity.clone(),
         wanted: claim.wanted.clone(),
         epoch: Epoch(u64::from_le_bytes(random())),
         nonce: u64::from_le_bytes(random()),
-        term: 0,
-        capabilities: 0,
         limits: Limits { message_size: 1_024, chunk_size: 1_024, calls: 8, minimum_interval: 0 },
         link: 0,
         udp_port,
         stamp: 0,
         keep_alive: 1_000,
+        skipped: 0,
     };
     let mut bytes = [0; 320];
     let length = hello.encode(mode, &mut bytes).expect("a hello fits");

@@ -13,7 +13,7 @@ use serde::Serialize;
 use serde_json::{Value, json};
 
 use crate::decoded::hex;
-use crate::introductions::{agv_hello, encoded_hello, manager_hello};
+use crate::introductions::{agv_hello, encoded_hello, hello_of, hello_with, item, manager_hello};
 use crate::side::{Side, Written};
 use crate::stream;
 use crate::streams::{chunked, frame};
@@ -103,16 +103,28 @@ fn control(control: &Control<'_>) -> Vec<u8> {
     normal(control.encode(&mut bytes).unwrap_or(&[]))
 }
 
+/// A control message of these items.
+fn items(items: &[Vec<u8>]) -> Vec<u8> {
+    normal(&[&[3, 0, 0, 0][..], &items.concat()].concat())
+}
+
+/// A control message of one item, as it is written.
+fn told(item: Value) -> Value {
+    json!({ "priority": "high", "message": { "control": [item] } })
+}
+
 fn close(code: u8) -> Value {
     json!([{ "close": code }])
 }
 
 fn frames() -> Vec<Answer> {
-    let long = [&[0x00, 0x04, 0x11, 2][..], &1057_u32.to_le_bytes(), &[0; 1018]].concat();
+    let long = [&[0x00, 0x04, 0x11, 2][..], &1089_u32.to_le_bytes(), &[0; 1018]].concat();
     answers([
         ("ping", "answered at once", "live", frame(&Frame::Ping), 0, json!(["pong"])),
         ("pong_unasked", "no harm", "live", frame(&Frame::Pong), 0, json!([])),
         ("frame_unknown", "there is no kind 7", "live", vec![1, 0, 7], 0, close(5)),
+        ("frame_skipped", "kind 0x40 is passed over", "live", vec![3, 0, 0x40, 1, 2], 0, json!([])),
+        ("frame_not_skipped", "kind 0x80 is not", "live", vec![1, 0, 0x80], 0, close(5)),
         ("frame_oversize", "1,025 bytes, 1,024 are taken", "live", vec![0x01, 0x04], 0, close(6)),
         ("message_oversize", "1,057 bytes, 1,024 + 32 are taken", "live", long, 0, close(6)),
         ("chunk_without_first", "nothing was begun", "live", vec![3, 0, 0x12, 2, 9], 0, close(5)),
@@ -122,9 +134,7 @@ fn frames() -> Vec<Answer> {
 }
 
 fn handshakes() -> Vec<Answer> {
-    let mut version = encoded_hello(&agv_hello());
-    version[4] = 2;
-    let mut magic = version.clone();
+    let mut magic = hello_of(3, 5);
     magic[0] = b'X';
     let mut small = agv_hello();
     small.limits.chunk_size = 319;
@@ -136,11 +146,26 @@ fn handshakes() -> Vec<Answer> {
     let hello = |hello: &Hello| frame(&Frame::Hello(&encoded_hello(hello)));
     let same = hello(&manager_hello());
     let mut taken = stream::decode(&Context::limits(4096, 32_800), &same);
-    let empty_list = json!({ "priority": "high", "message": { "list_end": { "serial": 1 } } });
-    taken.as_array_mut().unwrap_or_else(|| panic!("a stream")).push(empty_list);
+    let mut other_versions = taken.clone();
+    let then = |seen: &mut Value, next| seen.as_array_mut().unwrap_or_else(|| panic!("a stream")).push(next);
+    then(&mut taken, told(json!({ "list_end": { "serial": 1 } })));
+    then(&mut other_versions, json!({ "refuse": 1 }));
     let refuse = |code: u8| json!([{ "refuse": code }]);
+    let given = |hello: &[u8]| frame(&Frame::Hello(hello));
+    let later = given(&[&hello_of(2, 9)[..], &item(0x7000, b"later")].concat());
+    let strict = given(&hello_with(&item(0xF000, b"later")));
     answers([
-        ("other_version", "version 2", "fresh", frame(&Frame::Hello(&version)), 0, refuse(1)),
+        (
+            "other_versions",
+            "3 to 5: answered with a hello, which tells the versions of this end, and refused",
+            "fresh",
+            given(&hello_of(3, 5)),
+            0,
+            other_versions.clone(),
+        ),
+        ("version_1", "the same", "fresh", given(&hello_of(1, 7)), 0, other_versions),
+        ("more_versions", "2 to 9, and an unknown item: taken", "fresh", later, 0, taken.clone()),
+        ("must_understand", "an unknown item that must be understood", "fresh", strict, 0, refuse(8)),
         ("other_magic", "not of this mode", "fresh", frame(&Frame::Hello(&magic)), 0, refuse(8)),
         ("small_chunks", "a chunk limit of 319", "fresh", frame(&Frame::Hello(&small)), 0, refuse(8)),
         (
@@ -157,6 +182,7 @@ fn handshakes() -> Vec<Answer> {
         ("own_identity", "the manager's own name and id", "fresh", same, 0, refuse(5)),
         ("role_refused", "two s_units", "fresh s_unit", hello(&other_agv()), 0, refuse(6)),
         ("ping_before_hello", "too early", "fresh", frame(&Frame::Ping), 0, close(5)),
+        ("skipped_before_hello", "passed over on a live link only", "fresh", vec![1, 0, 0x40], 0, close(5)),
         ("no_hello", "none within 2 s", "fresh", Vec::new(), 2_000, close(7)),
     ])
 }
@@ -167,9 +193,11 @@ fn other_agv() -> Hello {
 }
 
 fn messages() -> Vec<Answer> {
-    let publish =
-        Control::Publish { slot: 0, generation: 0, attributes: [2, 0, 0, 0, 0, 0, 0, 0], signature: &[0, 0, 0] };
-    let ack = json!([{ "priority": "high", "message": { "list_ack": { "serial": 9, "skipped": 0 } } }]);
+    let list_end = item(3, &[9]);
+    let nameless = item(1, &[0, 0, 8, 2, 0, 0, 0, 0, 0, 0, 0, 3, 0, 0, 0]);
+    let withdraw = item(2, &[77]);
+    let attributes = Control::Publish { slot: 0, generation: 0, attributes: &[2; 7], signature: &[0, 0, 0] };
+    let ack = |skipped| told(json!({ "list_ack": { "serial": 9, "skipped": skipped } }));
     answers([
         ("message_unknown", "there is no kind 5", "live", normal(&[5; 16]), 0, close(5)),
         (
@@ -181,9 +209,41 @@ fn messages() -> Vec<Answer> {
             close(5),
         ),
         ("reply_to_nobody", "dropped", "live", normal(&encode_reply(77, Err(Error::Busy))), 0, json!([])),
-        ("publish_malformed", "a function without a name", "live", control(&publish), 0, close(5)),
+        (
+            "publish_unreadable",
+            "a function without a name is not kept, and counted",
+            "live",
+            items(&[nameless, list_end.clone()]),
+            0,
+            json!([ack(1)]),
+        ),
+        ("publish_malformed", "attributes of 7 bytes", "live", control(&attributes), 0, close(5)),
         ("withdraw_unknown", "no harm", "live", control(&Control::Withdraw { slot: 77 }), 0, json!([])),
-        ("list_end", "acknowledged", "live", control(&Control::ListEnd { serial: 9 }), 0, ack),
+        ("list_end", "acknowledged", "live", control(&Control::ListEnd { serial: 9 }), 0, json!([ack(0)])),
+        (
+            "list_end_last",
+            "behind an unknown item and a withdrawal",
+            "live",
+            items(&[item(0x7000, b"later"), withdraw.clone(), list_end.clone()]),
+            0,
+            json!([ack(0)]),
+        ),
+        (
+            "list_end_not_last",
+            "nothing may follow it in its message",
+            "live",
+            items(&[list_end, withdraw]),
+            0,
+            json!([ack(0), { "close": 5 }]),
+        ),
+        (
+            "control_must_understand",
+            "an unknown item that must be understood",
+            "live",
+            items(&[item(0xF000, b"later")]),
+            0,
+            close(5),
+        ),
     ])
 }
 
@@ -195,6 +255,7 @@ fn header(id: u32, slot: u16) -> RequestHeader {
         slot: Slot(slot),
         generation: Generation(0),
         wants_reply: true,
+        unknown: 0,
         remaining: Duration::from_secs(1),
         stamp: 1_001_000,
         since: Duration::ZERO,
@@ -211,14 +272,12 @@ fn refused(id: u32, error: Value) -> Value {
 
 fn requests() -> Vec<Answer> {
     let first = || header(1, 0);
-    let publish = json!({ "priority": "high", "message": { "publish": {
+    let publish = json!({ "publish": {
         "slot": 0, "generation": 0, "attributes": "0200000000000000",
         "signature": "08706f735f696e666f0001000802000000706f736974696f6e",
-    }}});
-    let news = json!([
-        refused(1, json!("stale_function")), publish,
-        { "priority": "high", "message": { "list_end": { "serial": 2 } } },
-    ]);
+    }});
+    let stale = refused(1, json!("stale_function"));
+    let news = json!([stale, told(publish), told(json!({ "list_end": { "serial": 2 } }))]);
     let one_way = json!([{ "priority": "normal", "message": { "failure": { "id": 1, "error": "unknown_function" } } }]);
     let twice = [request(first(), &[]), request(first(), &[])].concat();
     let below = [request(header(100, 0), &[]), request(header(36, 0), &[]), request(header(37, 0), &[])].concat();
@@ -228,6 +287,10 @@ fn requests() -> Vec<Answer> {
     let late = RequestHeader { stamp: 1_000_000, remaining: Duration::from_micros(1_000), ..first() };
     let just = RequestHeader { stamp: 1_000_000, remaining: Duration::from_micros(1_001), ..first() };
     let unknown = RequestHeader { wants_reply: false, ..header(1, 7) };
+    let critical = RequestHeader { unknown: 0x80, ..first() };
+    let unsupported = [request(critical, &[0; 8]), request(critical, &[])].concat();
+    let mut passed_over = [&first().encode()[..], &[0xEE; 4]].concat();
+    (passed_over[1], passed_over[6]) = (0x0F, 9);
     answers([
         ("request_accepted", "it runs, and is answered later", "live", request(first(), &[]), 0, json!([])),
         (
@@ -274,6 +337,22 @@ fn requests() -> Vec<Answer> {
         ("request_in_time", "1 us younger: it runs", "live", request(just, &[]), 0, json!([])),
         ("request_twice", "the second copy is dropped without an answer", "live", twice, 0, json!([])),
         (
+            "request_unsupported",
+            "a flag that must be understood, whatever its block; the second copy is dropped",
+            "live",
+            unsupported,
+            0,
+            json!([refused(1, json!("unsupported"))]),
+        ),
+        (
+            "request_of_a_later_version",
+            "flags that may be passed over, and a longer header: it runs",
+            "live",
+            normal(&passed_over),
+            0,
+            json!([]),
+        ),
+        (
             "request_below_window",
             "64 below the newest is refused, 63 runs",
             "live",
@@ -313,7 +392,7 @@ fn leases() -> Vec<Answer> {
     let released = vec![started.clone(), release.clone()];
     let all = vec![started.clone(), body(&SessionBody::release_all(Slot(1), 9))];
     let overtaken = vec![release, request(RequestHeader { wants_reply: true, ..go_to }, &position)];
-    let ended = |why: &str| json!([{ "priority": "high", "message": { "lease_ended": { "call": 1, "why": why } } }]);
+    let ended = |why: &str| json!([told(json!({ "lease_ended": { "call": 1, "why": why } }))]);
     let failure = json!([{ "priority": "normal", "message": { "failure": { "id": 1, "error": "expired" } } }]);
     let lease_released = answer(("lease_released", "it ends without an answer", "live", released, 600, json!([])));
     let mut leases = answers([

@@ -1,11 +1,12 @@
 //! What bytes mean, as JSON: the core's decoders, and nothing beside them.
 
-use cara_core::config::{Mode, Priority};
+use cara_core::config::{Mode, Priority, Versions};
 use cara_core::distribution::block;
 use cara_core::distribution::datagram::{Announce, Datagram, DatagramError, WhoHas};
 use cara_core::distribution::function::{Attributes, Signature};
 use cara_core::distribution::hello::{Hello, HelloError, Manager};
 use cara_core::distribution::identity::{Fleet, Identity};
+use cara_core::distribution::items::{Item, Items, Malformed};
 use cara_core::distribution::message::{Control, Message, SessionBody};
 use cara_core::distribution::parameters::{Parameters, Type, Value as Variable};
 use cara_core::error::{Error, ServiceError};
@@ -36,13 +37,13 @@ pub(crate) fn hex(bytes: &[u8]) -> String {
 pub(crate) fn hello(bytes: &[u8]) -> Option<Value> {
     match Hello::decode(bytes, Mode::Plain) {
         Ok(hello) => Some(json!({
+            "versions": versions(hello.versions),
+            "capabilities": hello.capabilities,
             "fleet": hello.fleet.0,
             "identity": identity(&hello.identity),
             "wanted": manager(hello.wanted.as_ref()),
             "epoch": hello.epoch.0,
             "nonce": hello.nonce,
-            "term": hello.term,
-            "capabilities": hello.capabilities,
             "message_size": hello.limits.message_size,
             "chunk_size": hello.limits.chunk_size,
             "calls": hello.limits.calls,
@@ -51,10 +52,15 @@ pub(crate) fn hello(bytes: &[u8]) -> Option<Value> {
             "udp_port": hello.udp_port,
             "stamp": hello.stamp,
             "keep_alive": hello.keep_alive,
+            "skipped": hello.skipped,
         })),
-        Err(HelloError::Version(version)) => Some(json!({ "other_version": version })),
-        Err(HelloError::Magic | HelloError::Mode | HelloError::Malformed) => None,
+        Err(HelloError::Version(theirs)) => Some(json!({ "other_versions": versions(theirs) })),
+        Err(HelloError::Magic | HelloError::Mode | HelloError::Suite | HelloError::Malformed) => None,
     }
+}
+
+fn versions(versions: Versions) -> Value {
+    json!([versions.first, versions.last])
 }
 
 fn identity(identity: &Identity) -> Value {
@@ -72,6 +78,7 @@ pub(crate) fn message(bytes: &[u8]) -> Option<Value> {
             "slot": header.slot.0,
             "generation": header.generation.0,
             "wants_reply": header.wants_reply,
+            "unknown": header.unknown,
             "remaining": header.remaining.as_micros(),
             "stamp": header.stamp,
             "since": header.since.as_micros(),
@@ -80,7 +87,7 @@ pub(crate) fn message(bytes: &[u8]) -> Option<Value> {
         Message::Reply(id, Ok(block)) => json!({ "reply": { "id": id, "block": hex(block) } }),
         Message::Reply(id, Err(error)) => json!({ "reply": { "id": id, "error": self::error(error) } }),
         Message::Failure(id, error) => json!({ "failure": { "id": id, "error": self::error(error) } }),
-        Message::Control(control) => self::control(&control),
+        Message::Control(items) => json!({ "control": controls(items)? }),
     })
 }
 
@@ -105,6 +112,7 @@ fn error(error: Error) -> Value {
             json!({ "result_would_not_fit": { "need": need, "have": have } })
         }
         Error::ResultLost => json!("result_lost"),
+        Error::Unsupported => json!("unsupported"),
         Error::Service(ServiceError::Failed(code)) => json!({ "service_failed": { "code": code } }),
         Error::Service(ServiceError::Panicked) => json!("service_panicked"),
         Error::Service(ServiceError::NotReady) => json!("service_not_ready"),
@@ -113,10 +121,24 @@ fn error(error: Error) -> Value {
     }
 }
 
+/// The items of a control message. One that is unknown is shown as it is, unless it must be understood.
+fn controls(items: &[u8]) -> Option<Value> {
+    const MUST_UNDERSTAND: u16 = 1 << 15;
+    let value = |item: Result<Item<'_>, Malformed>| {
+        let item = item.ok()?;
+        match Control::take(&item).ok()? {
+            Some(control) => Some(self::control(&control)),
+            None if item.kind & MUST_UNDERSTAND != 0 => None,
+            None => Some(json!({ "unknown": { "kind": item.kind, "body": hex(item.body) } })),
+        }
+    };
+    Items::new(items).map(value).collect()
+}
+
 fn control(control: &Control<'_>) -> Value {
     match *control {
         Control::Publish { slot, generation, attributes, signature } => json!({ "publish": {
-            "slot": slot, "generation": generation, "attributes": hex(&attributes), "signature": hex(signature),
+            "slot": slot, "generation": generation, "attributes": hex(attributes), "signature": hex(signature),
         }}),
         Control::Withdraw { slot } => json!({ "withdraw": { "slot": slot } }),
         Control::ListEnd { serial } => json!({ "list_end": { "serial": serial } }),
@@ -196,7 +218,7 @@ pub(crate) fn datagram(fleet: u32, bytes: &[u8]) -> Option<Value> {
         Ok(Datagram::Session { link, nonce, body }) => {
             Some(json!({ "session": { "link": link, "nonce": nonce, "body": session_body(body)? } }))
         }
-        Err(DatagramError::Version(version)) => Some(json!({ "other_version": version })),
+        Err(DatagramError::Version(theirs)) => Some(json!({ "other_versions": versions(theirs) })),
         Err(DatagramError::Fleet(fleet)) => Some(json!({ "other_fleet": fleet.0 })),
         Err(DatagramError::Magic | DatagramError::Forged | DatagramError::NotForUs | DatagramError::Malformed) => None,
     }
@@ -212,6 +234,7 @@ fn who_has(search: &WhoHas) -> Value {
         "tcp_port": search.tcp_port,
         "expected": search.expected,
         "known": search.known.as_slice(),
+        "skipped": search.skipped,
     })
 }
 
@@ -224,5 +247,6 @@ fn announce(answer: &Announce) -> Value {
         "tcp_port": answer.tcp_port,
         "room": answer.room,
         "expected": answer.expected,
+        "skipped": answer.skipped,
     })
 }

@@ -49,7 +49,7 @@ struct Document {
 impl Document {
     fn new() -> Self {
         let vectors = [values::all(), introductions::all(), messages::all(), streams::all(), talk::all()].concat();
-        Self { version: cara_core::config::VERSION, vectors, answers: answers::all() }
+        Self { version: cara_core::config::VERSIONS.last, vectors, answers: answers::all() }
     }
 }
 

@@ -11,6 +11,7 @@ use cara_core::time::Duration;
 use serde_json::{Value, json};
 
 use crate::decoded::hex;
+use crate::introductions::item;
 use crate::values::{GO_TO, arguments, motion};
 use crate::vector::{Context, Kind, Vector, definition};
 
@@ -25,6 +26,7 @@ fn request(wants_reply: bool, block: &[u8]) -> Vec<u8> {
         slot: Slot(5),
         generation: Generation(0x0203),
         wants_reply,
+        unknown: 0,
         remaining: Duration::from_millis(2_000),
         stamp: 0x0001_0203_0405_0607,
         since: Duration::from_micros(250_000),
@@ -40,20 +42,42 @@ fn messages() -> Vec<Vector> {
     let block = arguments(GO_TO, &motion().unwrap_or_default());
     let fields = |wants_reply: bool, block: &[u8]| {
         json!({ "request": {
-            "id": 0x0102_0304, "slot": 5, "generation": 0x0203, "wants_reply": wants_reply, "remaining": 2_000_000,
-            "stamp": 0x0001_0203_0405_0607_u64, "since": 250_000, "block": hex(block),
+            "id": 0x0102_0304, "slot": 5, "generation": 0x0203, "wants_reply": wants_reply, "unknown": 0,
+            "remaining": 2_000_000, "stamp": 0x0001_0203_0405_0607_u64, "since": 250_000, "block": hex(block),
         }})
     };
+    let flags = |flags: u8| {
+        let mut bytes = request(true, &[]);
+        bytes[1] |= flags;
+        bytes
+    };
+    let mut critical = fields(true, &[]);
+    critical["request"]["unknown"] = json!(0x90);
+    let mut longer = request(true, &[0xEE; 4]);
+    longer[6] += 1;
+    longer.extend(&block);
+    let mut shorter = request(true, &[]);
+    shorter[6] -= 1;
     let results: Vec<u8> = (1..=16).collect();
+    let mut longer_reply = [&encode_reply(0x0102_0304, Ok(()))[..], &[0xEE; 4], &results].concat();
+    longer_reply[3] += 1;
     let reply = [&encode_reply(0x0102_0304, Ok(()))[..], &results].concat();
+    let replied = json!({ "reply": { "id": 0x0102_0304, "block": "0102030405060708090a0b0c0d0e0f10" } });
     vec![
         message(("request", "a blocking request with arguments"), &request(true, &block), &fields(true, &block)),
         message(("request_one_way", "an asynchronous request without any"), &request(false, &[]), &fields(false, &[])),
         message(
-            ("reply", "results"),
-            &reply,
-            &json!({ "reply": { "id": 0x0102_0304, "block": "0102030405060708090a0b0c0d0e0f10" } }),
-        ),
+            ("request_longer_header", "a later version has more in front of the block"),
+            &longer,
+            &fields(true, &block),
+        )
+        .lossy(),
+        message(("request_shorter_header", "refused: 7 words"), &shorter, &Value::Null),
+        message(("request_flags", "flags that may be passed over"), &flags(0x0E), &fields(true, &[])).lossy(),
+        message(("request_critical_flags", "flags that must be understood"), &flags(0x90), &critical),
+        message(("reply", "results"), &reply, &replied),
+        message(("reply_longer_header", "a later version has more in front of the block"), &longer_reply, &replied)
+            .lossy(),
         message(("message_of_no_kind", "refused: there is no kind 5"), &[5; 16], &Value::Null),
         message(("request_cut", "refused: a header of 31 bytes"), &request(true, &[])[..31], &Value::Null),
         message(
@@ -62,17 +86,18 @@ fn messages() -> Vec<Vector> {
             &Value::Null,
         ),
         message(
-            ("error_with_block", "refused: nothing follows an error"),
+            ("error_with_more", "what follows an error is passed over"),
             &[&encode_reply(1, Err(Error::Busy))[..], &[0; 8]].concat(),
-            &Value::Null,
-        ),
+            &json!({ "reply": { "id": 1, "error": "busy" } }),
+        )
+        .lossy(),
     ]
 }
 
 fn errors() -> Vec<Vector> {
     let wait = Duration::from_millis(30);
     let service = |error: ServiceError| Error::Service(error);
-    let answers: [(&'static str, Error, Value); 20] = [
+    let answers: [(&'static str, Error, Value); 21] = [
         ("error_unknown_function", Error::UnknownFunction, json!("unknown_function")),
         ("error_stale_function", Error::StaleFunction, json!("stale_function")),
         ("error_missing_argument", Error::MissingArgument { index: 3 }, json!({ "missing_argument": { "index": 3 } })),
@@ -96,6 +121,7 @@ fn errors() -> Vec<Vector> {
             json!({ "result_would_not_fit": { "need": 40, "have": 16 } }),
         ),
         ("error_result_lost", Error::ResultLost, json!("result_lost")),
+        ("error_unsupported", Error::Unsupported, json!("unsupported")),
         ("error_service_failed", service(ServiceError::Failed(513)), json!({ "service_failed": { "code": 513 } })),
         ("error_service_panicked", service(ServiceError::Panicked), json!("service_panicked")),
         ("error_service_not_ready", service(ServiceError::NotReady), json!("service_not_ready")),
@@ -117,7 +143,7 @@ fn errors() -> Vec<Vector> {
             ),
             message(
                 ("error_of_a_later_version", "an unknown code reads as malformed"),
-                &[2, 99, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0],
+                &[2, 99, 0, 4, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0],
                 &later,
             )
             .lossy(),
@@ -128,7 +154,7 @@ fn errors() -> Vec<Vector> {
 fn controls() -> Vec<Vector> {
     let stop = definition("stop()");
     let attributes = Attributes { priority: Priority::Emergency, idempotent: true, ..Attributes::default() }.encode();
-    let publish = Control::Publish { slot: 300, generation: 2, attributes, signature: stop.as_bytes() };
+    let publish = Control::Publish { slot: 300, generation: 2, attributes: &attributes, signature: stop.as_bytes() };
     let all: [(&'static str, &'static str, Control<'_>, Value); 7] = [
         (
             "publish",
@@ -172,20 +198,45 @@ fn controls() -> Vec<Vector> {
     ];
     let encoded = |(name, about, control, value): (_, _, Control<'_>, _)| {
         let mut bytes = [0; 128];
-        message((name, about), control.encode(&mut bytes).unwrap_or(&[]), &value)
+        message((name, about), control.encode(&mut bytes).unwrap_or(&[]), &json!({ "control": [value] }))
     };
     let mut vectors: Vec<Vector> = all.into_iter().map(encoded).collect();
-    vectors.push(
-        message(
-            ("long_varint", "a number in more bytes than needed is read all the same"),
-            &[3, 5, 0x84, 0x00, 0],
-            &json!({ "lease_ended": { "call": 4, "why": "finished" } }),
+    let control =
+        |names, items: &[Vec<u8>], value: &Value| message(names, &[&[3, 0, 0, 0][..], &items.concat()].concat(), value);
+    let withdrawn = json!({ "withdraw": { "slot": 300 } });
+    let later = json!({ "unknown": { "kind": 0x7000, "body": "6c61746572" } });
+    let ended = json!({ "control": [{ "lease_ended": { "call": 4, "why": "expired" } }] });
+    vectors.extend([
+        control(
+            ("control_items", "two items that are known, and one between them that is not"),
+            &[item(2, &[0xAC, 2]), item(0x7000, b"later"), item(3, &[9])],
+            &json!({ "control": [withdrawn, later, { "list_end": { "serial": 9 } }] }),
+        ),
+        control(("control_nothing", "no item at all"), &[], &json!({ "control": [] })),
+        control(
+            ("control_padding", "padding means nothing"),
+            &[item(0, &[9; 3]), item(2, &[0xAC, 2])],
+            &json!({ "control": [withdrawn] }),
         )
         .lossy(),
-    );
-    vectors.push(message(("varint_too_big", "refused: beyond 16 bits"), &[3, 1, 0x84, 0x80, 0x04], &Value::Null));
-    vectors.push(message(("control_behind", "refused: a byte follows"), &[3, 5, 4, 1, 0], &Value::Null));
-    vectors.push(message(("lease_end_unknown", "refused: no such reason"), &[3, 5, 4, 3], &Value::Null));
+        control(
+            ("control_must_understand", "refused: an unknown item that must be understood"),
+            &[item(0xF000, b"later")],
+            &Value::Null,
+        ),
+        control(("control_cut", "refused: an item without its padding"), &[vec![2, 0, 1, 0, 7]], &Value::Null),
+        control(("control_longer", "what follows the fields is passed over"), &[item(6, &[4, 1, 9])], &ended).lossy(),
+        control(("control_shorter", "refused: a field is missing"), &[item(6, &[4])], &Value::Null),
+        control(
+            ("long_varint", "a number in more bytes than needed is read all the same"),
+            &[item(6, &[0x84, 0x00, 1])],
+            &ended,
+        )
+        .lossy(),
+        control(("varint_too_big", "refused: beyond 16 bits"), &[item(2, &[0x84, 0x80, 0x04])], &Value::Null),
+        control(("lease_end_unknown", "a reason of a later version counts as expired"), &[item(6, &[4, 3])], &ended)
+            .lossy(),
+    ]);
     vectors
 }
 
@@ -227,11 +278,18 @@ fn session_bodies() -> Vec<Vector> {
         ),
         body(("release_class", "refused: no such class"), &[6, 4, 1, 0, 0, 0], &Value::Null),
         body(
+            ("release_longer", "what follows the fields is passed over"),
+            &[&SessionBody::release(&release)[..], &[9, 9]].concat(),
+            &json!({ "release": { "class": "low", "call": 0x0102_0304 } }),
+        )
+        .lossy(),
+        body(("session_body_unknown", "refused: there is no kind 9"), &[9, 9], &Value::Null),
+        body(
             ("session_message", "an emergency's second copy"),
             &emergency,
             &json!({ "message": { "priority": "emergency", "message": { "request": {
-                "id": 0x0102_0304, "slot": 5, "generation": 0x0203, "wants_reply": false, "remaining": 2_000_000,
-                "stamp": 0x0001_0203_0405_0607_u64, "since": 250_000, "block": "",
+                "id": 0x0102_0304, "slot": 5, "generation": 0x0203, "wants_reply": false, "unknown": 0,
+                "remaining": 2_000_000, "stamp": 0x0001_0203_0405_0607_u64, "since": 250_000, "block": "",
             }}}}),
         ),
     ]

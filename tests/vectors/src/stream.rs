@@ -75,6 +75,7 @@ fn value(link: &Link<Boxed, Plain>, incoming: Incoming, lent: &[u8]) -> Option<V
         Incoming::Close(code) => json!({ "close": code }),
         Incoming::Ping => json!("ping"),
         Incoming::Pong => json!("pong"),
+        Incoming::Skipped => json!("skipped"),
         // Of secured links only.
         Incoming::Proof(_) | Incoming::Confirm(_) => return None,
         Incoming::Session(place) => {

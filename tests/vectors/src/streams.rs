@@ -68,6 +68,20 @@ fn small_frames() -> Vec<Vector> {
             &frames[2][..7],
             &json!([{ "incomplete": 7 }]),
         ),
+        stream(
+            ("frame_skipped", "a kind from 0x40 to 0x7F is passed over on a live link"),
+            (320, 512),
+            &[&frames[0][..], &[3, 0, 0x40, 1, 2], &frames[1]].concat(),
+            &json!(["ping", "skipped", "pong"]),
+        )
+        .lossy(),
+        stream(
+            ("close_longer", "what follows the code is passed over"),
+            (320, 512),
+            &[3, 0, 3, 1, 9],
+            &json!([{ "close": 1 }]),
+        )
+        .lossy(),
     ]
 }
 
@@ -107,7 +121,7 @@ fn violations() -> Vec<Vector> {
         stream(("frame_empty", "a frame without a kind"), (320, 512), &[0, 0], &protocol),
         stream(("frame_of_no_kind", "there is no kind 7"), (320, 512), &[1, 0, 7], &protocol),
         stream(("ping_with_body", "a ping has no body"), (320, 512), &[2, 0, 4, 0], &protocol),
-        stream(("close_without_code", "a close has one byte"), (320, 512), &[1, 0, 3], &protocol),
+        stream(("close_without_code", "a close has a code"), (320, 512), &[1, 0, 3], &protocol),
         stream(("frame_too_long", "told by its header alone"), (320, 512), &[0x41, 1, 4], &oversize),
         stream(("message_too_long", "told by its first chunk alone"), (320, 512), &long[..322], &oversize),
         stream(("chunk_of_nothing", "a later chunk without a first one"), (320, 1024), &long[322..], &protocol),

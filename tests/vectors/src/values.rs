@@ -97,6 +97,21 @@ fn attributes() -> Vec<Vector> {
             &leased.encode(),
             &json!({ "priority": "high", "idempotent": true, "lease": 500 }),
         ),
+        Vector::new(
+            ("attributes_of_a_later_version", "other bits, and what follows, are passed over"),
+            Kind::Attributes,
+            Context::default(),
+            &[0xF8 | 5, 9, 9, 9, 0xF4, 1, 0, 0, 7, 7],
+            &json!({ "priority": "high", "idempotent": true, "lease": 500 }),
+        )
+        .lossy(),
+        Vector::new(
+            ("attributes_cut", "refused: a byte is missing"),
+            Kind::Attributes,
+            Context::default(),
+            &leased.encode()[..7],
+            &Value::Null,
+        ),
     ]
 }
 

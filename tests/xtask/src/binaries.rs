@@ -4,6 +4,10 @@
 //! everything that is built with it. So binaries are built as members of the whole workspace, and those that are not
 //! optimised as if its tests were built too, as they are in CI: otherwise the same crates are compiled again for each of them.
 
+use std::fs::{self, Permissions};
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+
 use anyhow::Result;
 
 use crate::command::Run;
@@ -44,4 +48,17 @@ fn workspace_build(names: &[&str]) -> Run {
 /// `cargo test` of the whole workspace.
 pub(crate) fn tests() -> Run {
     Run::cargo().args(["test", "--workspace", "--features", FEATURES])
+}
+
+/// Sets a cfg in the crates of the workspace alone: what they depend on is that of every other build. Cargo tells builds
+/// apart by the path of the wrapper; what this one makes goes to a folder of its own, so that nothing else runs it.
+pub(crate) fn with_cfg(build: Run, folder: &Path, cfg: &str) -> Result<Run> {
+    fs::create_dir_all(folder)?;
+    let wrapper = folder.join("rustc-with-cfg");
+    fs::write(&wrapper, format!("#!/bin/sh\nexec \"$@\" --cfg '{cfg}'\n"))?;
+    fs::set_permissions(&wrapper, Permissions::from_mode(0o755))?;
+    Ok(build
+        .env("RUSTC_WORKSPACE_WRAPPER", &wrapper.to_string_lossy())
+        .env("CARGO_BUILD_BUILD_DIR", &workspace::target().to_string_lossy())
+        .env("CARGO_TARGET_DIR", &folder.to_string_lossy()))
 }

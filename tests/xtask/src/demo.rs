@@ -2,6 +2,7 @@
 //!
 //! Everything is checked from what the processes print; each wait has a deadline, and no process outlives this one.
 
+use std::path::Path;
 use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -9,7 +10,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, bail, ensure};
 use cara_processes::Process;
 
-use crate::binaries;
+use crate::{binaries, workspace};
 
 mod listing;
 mod stage;
@@ -24,13 +25,23 @@ const DRIVES_ON: Duration = Duration::from_millis(400 + 20 + 150);
 /// How many of its reports, two a second, an AGV that stopped must show that it stands.
 const REPORTS: usize = 4;
 
+/// What takes part in it.
+pub(crate) const PROGRAMS: [&str; 3] = ["agv", "agv_manager", "cara"];
+
 /// Runs the demonstration; success only if everything in it happened.
 pub(crate) fn run() -> Result<ExitCode> {
-    binaries::build(&["agv", "agv_manager", "cara"])?;
-    let stage = Stage::new()?;
+    binaries::build(&PROGRAMS)?;
+    let programs = workspace::target().join("debug");
+    between(&programs, &programs)?;
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Runs it with a manager and AGVs of two folders, which may be of different builds.
+pub(crate) fn between(manager: &Path, agvs: &Path) -> Result<()> {
+    let stage = Stage::new(manager, agvs)?;
     play(&stage).context("the demonstration failed")?;
     println!("\neverything happened, in {:.1} s", stage.seconds());
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }
 
 fn play(stage: &Stage) -> Result<()> {

@@ -6,8 +6,8 @@ use anyhow::{Result, bail};
 
 use crate::command::Run;
 use crate::{
-    bad_input, binaries, claims, demo, dependencies, firmware, fleet, hygiene, install, instructions, layers, licences,
-    links, manifests, msrv, names, panic_free, paper, planted, security, words, workspace,
+    bad_input, binaries, claims, demo, dependencies, firmware, fleet, hygiene, install, instructions, later, layers,
+    licences, links, manifests, msrv, names, panic_free, paper, planted, security, words, workspace,
 };
 
 /// A group of checks that is run and reported as one.
@@ -41,7 +41,7 @@ pub(crate) enum Outcome {
 }
 
 /// All groups, in the order in which they run: cheap ones first.
-pub(crate) const GROUPS: [Group; 24] = [
+pub(crate) const GROUPS: [Group; 25] = [
     Group {
         name: "format",
         what: "every crate is formatted",
@@ -161,7 +161,7 @@ pub(crate) const GROUPS: [Group; 24] = [
     },
     Group {
         name: "scenarios",
-        what: "every scenario on the simulator, with faults, for 1,000 seeds (quick: 50)",
+        what: "every scenario on the simulator, with faults, for 1,000 seeds (quick: 150)",
         budget: 200,
         quick: Some(90),
         by_default: true,
@@ -176,6 +176,15 @@ pub(crate) const GROUPS: [Group; 24] = [
         by_default: true,
         waits: true,
         run: |_| planted::scenarios().into(),
+    },
+    Group {
+        name: "later",
+        what: "units of this version and of a later one, which says what this one does not know: scenarios, the demonstration",
+        budget: 150,
+        quick: None,
+        by_default: true,
+        waits: true,
+        run: |_| later::check().into(),
     },
     Group {
         name: "security",
@@ -344,7 +353,7 @@ fn vectors() -> Result<()> {
 
 fn scenarios(extent: Extent) -> Result<()> {
     present("tests/scenarios/Cargo.toml")?;
-    let seeds = if extent == Extent::Full { "1000" } else { "50" };
+    let seeds = if extent == Extent::Full { "1000" } else { "150" };
     binaries::release("seeds")?.args(["--seeds", seeds]).stream()
 }
 

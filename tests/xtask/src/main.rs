@@ -19,6 +19,7 @@ mod groups;
 mod hygiene;
 mod install;
 mod instructions;
+mod later;
 mod layers;
 mod licences;
 mod links;

@@ -1,7 +1,5 @@
 //! Bugs that are planted on purpose, behind the cfg `cara_planted` that nothing else sets: each has to be found.
 
-use std::fs::{self, Permissions};
-use std::os::unix::fs::PermissionsExt;
 use std::path::PathBuf;
 
 use anyhow::{Result, bail};
@@ -19,7 +17,7 @@ pub(crate) fn scenarios() -> Result<()> {
         plant(binaries::debug_build(&["seeds"]), bug)?.stream()?;
         let seeds = folder(bug).join("debug/seeds");
         let (passed, output, errors) = Run::new(&seeds.to_string_lossy()).args(["--seeds", "10"]).captured()?;
-        let finders = finders(&output);
+        let finders = failed(&output);
         if passed || finders.is_empty() {
             bail!("no scenario found the planted {bug}: {output}{errors}");
         }
@@ -41,18 +39,8 @@ pub(crate) fn loom() -> Result<()> {
     Ok(())
 }
 
-/// Sets the cfg in the crates of the workspace alone: what they depend on is that of every other build. Cargo tells builds
-/// apart by the path of the wrapper; what this one makes goes to a folder of its own, so that nothing else runs it.
 fn plant(build: Run, bug: &str) -> Result<Run> {
-    let folder = folder(bug);
-    fs::create_dir_all(&folder)?;
-    let wrapper = folder.join("rustc-with-bug");
-    fs::write(&wrapper, format!("#!/bin/sh\nexec \"$@\" --cfg 'cara_planted=\"{bug}\"'\n"))?;
-    fs::set_permissions(&wrapper, Permissions::from_mode(0o755))?;
-    Ok(build
-        .env("RUSTC_WORKSPACE_WRAPPER", &wrapper.to_string_lossy())
-        .env("CARGO_BUILD_BUILD_DIR", &workspace::target().to_string_lossy())
-        .env("CARGO_TARGET_DIR", &folder.to_string_lossy()))
+    binaries::with_cfg(build, &folder(bug), &format!("cara_planted=\"{bug}\""))
 }
 
 fn folder(bug: &str) -> PathBuf {
@@ -60,27 +48,27 @@ fn folder(bug: &str) -> PathBuf {
 }
 
 /// Scenarios of which the output says that a run of theirs failed.
-fn finders(output: &str) -> Vec<&str> {
+pub(crate) fn failed(output: &str) -> Vec<&str> {
     let mut current = "";
-    let mut finders = Vec::new();
+    let mut failed = Vec::new();
     for line in output.lines() {
         if !line.starts_with(' ') {
             current = line.split_whitespace().next().unwrap_or_default();
-        } else if line.starts_with("  FAILED with seed") && finders.last() != Some(&current) {
-            finders.push(current);
+        } else if line.starts_with("  FAILED with seed") && failed.last() != Some(&current) {
+            failed.push(current);
         }
     }
-    finders
+    failed
 }
 
 #[cfg(test)]
 mod tests {
-    use super::finders;
+    use super::failed;
 
     #[test]
     fn failed_scenarios_are_named_once() {
         let output = "a (1): 10 seeds, 0.1 s\n  faults: none\n  FAILED with seed 1: x\n    assertion\n  FAILED with seed 2: x\n\
                       b (2): 10 seeds\n  FAILED: `x` was never reached\n";
-        assert_eq!(finders(output), ["a"]);
+        assert_eq!(failed(output), ["a"]);
     }
 }

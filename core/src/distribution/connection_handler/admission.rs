@@ -184,7 +184,7 @@ impl<P: Port> Node<P> {
 
     fn refuse(&mut self, now: Instant, address: P::Endpoint, identity: &Identity, refusal: Refusal) -> Admission {
         let counter = match refusal {
-            Refusal::Version | Refusal::Malformed => NodeCounter::RefusedVersion,
+            Refusal::Version(_) | Refusal::Suite | Refusal::Malformed => NodeCounter::RefusedVersion,
             Refusal::Fleet => NodeCounter::RefusedFleet,
             Refusal::WrongManager => NodeCounter::WrongManager,
             Refusal::Full => NodeCounter::RefusedFull,

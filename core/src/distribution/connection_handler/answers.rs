@@ -166,6 +166,7 @@ impl<P: Port> Node<P> {
             tcp_port: self.config.tcp_port,
             room: self.room(),
             expected: self.expected(),
+            skipped: 0,
         };
         self.sequence = announce.sequence;
         let mut bytes = [0; SEARCH_BYTES];

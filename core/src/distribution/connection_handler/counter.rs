@@ -55,7 +55,9 @@ crate::counters::counters! {
         DialFailed,
         /// Links taken.
         Joined,
-        /// Links refused because of their version.
+        /// Items of a later version in searches and answers that were passed over.
+        DatagramItemsSkipped,
+        /// Links refused because of their version, or for want of a cipher suite in common.
         RefusedVersion,
         /// Links refused because of their fleet.
         RefusedFleet,

@@ -30,7 +30,7 @@ pub use counter::NodeCounter;
 pub use known::{Known, NodeState};
 pub use table::Order;
 
-use crate::config::Constraints;
+use crate::config::{Constraints, LATER, VERSIONS};
 use crate::counters::Counters;
 use crate::distribution::authenticator::Authenticator;
 use crate::distribution::datagram::{Datagram, DatagramError};
@@ -275,18 +275,19 @@ impl<P: Port> Node<P> {
     pub fn hello(&mut self, now: Instant, link: LinkId) -> Hello {
         let constraints = &self.config.constraints;
         Hello {
+            versions: VERSIONS,
+            capabilities: if LATER { 1 << 63 } else { 0 },
             fleet: self.config.fleet,
             identity: self.config.identity.clone(),
             wanted: self.manager().cloned(),
             epoch: self.config.epoch,
             nonce: self.random.bits(),
-            term: 0,
-            capabilities: 0,
             limits: constraints.into(),
             link: link.0,
             udp_port: self.config.udp_port,
             stamp: now.as_micros(),
             keep_alive: u32::try_from(constraints.keep_alive.as_millis()).unwrap_or(u32::MAX),
+            skipped: 0,
         }
     }
 
@@ -342,8 +343,14 @@ impl<P: Port> Node<P> {
     /// of this unit.
     pub fn datagram(&mut self, now: Instant, from: P::Endpoint, bytes: &[u8], authenticator: &dyn Authenticator) {
         match Datagram::decode(bytes, self.config.fleet, authenticator) {
-            Ok(Datagram::WhoHas(who_has)) => self.heard_who_has(now, from, &who_has, authenticator.mode()),
-            Ok(Datagram::Announce(announce)) => self.heard_announce(now, from, &announce),
+            Ok(Datagram::WhoHas(who_has)) => {
+                self.counters.add(NodeCounter::DatagramItemsSkipped, who_has.skipped.into());
+                self.heard_who_has(now, from, &who_has, authenticator.mode());
+            }
+            Ok(Datagram::Announce(announce)) => {
+                self.counters.add(NodeCounter::DatagramItemsSkipped, announce.skipped.into());
+                self.heard_announce(now, from, &announce);
+            }
             Ok(Datagram::Session { .. }) => self.counters.add(NodeCounter::DatagramUnknownLink, 1),
             Err(error) => self.unreadable(now, from, error),
         }
@@ -359,8 +366,9 @@ impl<P: Port> Node<P> {
             DatagramError::Malformed => NodeCounter::DatagramMalformed,
         };
         self.counters.add(counter, 1);
-        if let DatagramError::Version(_) = error {
-            self.note(Finding { at: now, address: from, identity: None, refusal: Refusal::Version });
+        if let DatagramError::Version(versions) = error {
+            let refusal = Refusal::Version(versions);
+            self.note(Finding { at: now, address: from, identity: None, refusal });
         }
     }
 

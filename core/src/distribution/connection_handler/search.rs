@@ -277,6 +277,7 @@ impl<P: Port> Node<P> {
             tcp_port: self.config.tcp_port,
             expected,
             known: known.take(KNOWN_NODES).collect(),
+            skipped: 0,
         };
         self.sequence = who_has.sequence;
         let mut bytes = [0; SEARCH_BYTES];

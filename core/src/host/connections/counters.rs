@@ -15,6 +15,8 @@ crate::counters::counters! {
         MessagesSent,
         /// Bytes that the network took.
         BytesSent,
+        /// Items and frames of a later version that were passed over.
+        ItemsSkipped,
         /// Frames of the protocol itself (keep-alives, renewals, close) that were dropped for want of space.
         FramesWithheld,
         /// Messages refused because the class's buffer was full or none was free.

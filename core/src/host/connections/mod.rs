@@ -46,6 +46,8 @@ pub enum Incoming {
     Confirm(Place),
     /// A whole message.
     Message(Priority, Place),
+    /// A frame of a later version, which a live link passes over.
+    Skipped,
 }
 
 /// Where bytes that arrived lie, until the next call of [`Link::receive`].
@@ -67,10 +69,10 @@ impl Place {
         matches!(self.store, Store::Buffer)
     }
 
-    /// The same without its first `count` bytes.
+    /// The last `length` bytes of it.
     #[inline]
-    pub fn after(self, count: usize) -> Self {
-        Self { start: self.start.saturating_add(count).min(self.end), ..self }
+    pub fn last(self, length: usize) -> Self {
+        Self { start: self.end.saturating_sub(length).max(self.start), ..self }
     }
 
     fn length(self) -> usize {

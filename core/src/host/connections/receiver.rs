@@ -58,6 +58,7 @@ enum Content {
     Session,
     Proof,
     Confirm,
+    Skipped,
     Piece(Piece),
 }
 
@@ -284,6 +285,7 @@ impl<S: Storage> Receiver<S> {
             Content::Session => Incoming::Session(place),
             Content::Proof => Incoming::Proof(place),
             Content::Confirm => Incoming::Confirm(place),
+            Content::Skipped => Incoming::Skipped,
             Content::Piece(Piece { priority, total: Some(total), last: true }) => {
                 self.check_whole(place, total as usize)?;
                 Incoming::Message(priority, place)
@@ -395,6 +397,7 @@ impl Content {
             Frame::Session(bytes) => (Self::Session, bytes.len()),
             Frame::Proof(bytes) => (Self::Proof, bytes.len()),
             Frame::Confirm(bytes) => (Self::Confirm, bytes.len()),
+            Frame::Skipped => (Self::Skipped, 0),
             Frame::Chunk(Chunk { priority, total, last, bytes }) => {
                 (Self::Piece(Piece { priority, total, last }), bytes.len())
             }

@@ -8,7 +8,8 @@ use super::{Event, Phase, Session, close_reason};
 use crate::config::{EMERGENCY_BYTES, Priority};
 use crate::distribution::function::{Attributes, Signature};
 use crate::distribution::function_list::{Function, Generation, Slot};
-use crate::distribution::message::{Control, Message, REPLY_BYTES, REQUEST_BYTES, RequestHeader, SessionBody};
+use crate::distribution::items::{Items, Malformed};
+use crate::distribution::message::{Control, Message, REQUEST_BYTES, RequestHeader, SessionBody};
 use crate::distribution::parameters::ParametersView;
 use crate::distribution::{block, datagram};
 use crate::error::{CloseReason, Error, Refusal};
@@ -106,7 +107,15 @@ impl<P: Port> Session<P> {
         let Some(incoming) = received.incoming else {
             return Receipt { consumed: received.consumed, event: None, paused: received.paused };
         };
-        self.liveness.heard(cx.now);
+        let is_known = match incoming {
+            Incoming::Skipped => false,
+            Incoming::Session(place) => SessionBody::decode(self.link.view(place, lent)).is_some(),
+            _ => true,
+        };
+        // What a later version says shows no life that this one understands.
+        if is_known {
+            self.liveness.heard(cx.now);
+        }
         let is_emergency = matches!(incoming, Incoming::Message(Priority::Emergency, _));
         // A call begins here only when nothing has arrived behind it; otherwise it waits its turn, so that an emergency further back
         // in the same bytes is reached first.
@@ -128,7 +137,8 @@ impl<P: Port> Session<P> {
             self.link.counters.add(LinkCounter::DatagramsDropped, 1);
             return None;
         }
-        let header = datagram::session_header(self.mode(), self.local.fleet, self.link.id().0, nonce);
+        let version = self.remote.as_ref()?.version;
+        let header = datagram::session_header(self.mode(), version, self.local.fleet, self.link.id().0, nonce);
         let body = match self.link.cipher().open_datagram(&header, body) {
             Ok(body) => &*body,
             Err(error) => {
@@ -137,7 +147,9 @@ impl<P: Port> Session<P> {
             }
         };
         self.link.counters.add(LinkCounter::DatagramsReceived, 1);
-        self.liveness.heard_datagram(cx.now);
+        if SessionBody::decode(body).is_some() {
+            self.liveness.heard_datagram(cx.now);
+        }
         self.datagram_opened(cx.now);
         self.session_body(cx, Place::lent(body.len()), body)
     }
@@ -168,7 +180,7 @@ impl<P: Port> Session<P> {
                 None
             }
             (Incoming::Refuse(code), _) => {
-                self.end(CloseReason::Refused(refusal(code)));
+                self.end(CloseReason::Refused(Refusal::from_wire(code)));
                 None
             }
             (Incoming::Close(code), _) => {
@@ -193,6 +205,10 @@ impl<P: Port> Session<P> {
             (Incoming::Message(priority, place), Phase::Live) => {
                 self.message_arrived(cx, priority, place, lent, arguments)
             }
+            (Incoming::Skipped, Phase::Live) => {
+                self.link.counters.add(LinkCounter::ItemsSkipped, 1);
+                None
+            }
             _ => {
                 self.close(cx, CloseReason::Protocol);
                 None
@@ -213,10 +229,9 @@ impl<P: Port> Session<P> {
             Some(SessionBody::Release(release)) => self.released(cx, release),
             Some(SessionBody::ReleaseAll(slot, id)) => self.released_all(cx, slot, id),
             Some(SessionBody::Message(priority, message)) => {
-                let prefix = self.link.view(place, lent).len().saturating_sub(message.len());
                 match (Priority::from_wire(priority), Message::decode(message)) {
-                    (Some(priority), Some(Message::Request(header, _))) => {
-                        let block = place.after(prefix).after(REQUEST_BYTES);
+                    (Some(priority), Some(Message::Request(header, block))) => {
+                        let block = place.last(block.len());
                         self.request_arrived(cx, priority, &header, block, lent, None)
                     }
                     _ => self.unreadable_datagram(),
@@ -248,19 +263,22 @@ impl<P: Port> Session<P> {
         arguments: Option<&mut ParametersView>,
     ) -> Option<Event> {
         match Message::decode(self.link.view(place, lent)) {
-            Some(Message::Request(header, _)) => {
-                self.request_arrived(cx, priority, &header, place.after(REQUEST_BYTES), lent, arguments)
+            Some(Message::Request(header, block)) => {
+                let block = place.last(block.len());
+                self.request_arrived(cx, priority, &header, block, lent, arguments)
             }
             Some(Message::Reply(id, result)) => {
-                let error = result.err();
-                self.reply_arrived(cx, CallId(id), error, place.after(REPLY_BYTES))
+                let block = result.map(|block| place.last(block.len()));
+                self.reply_arrived(cx, CallId(id), block)
             }
             Some(Message::Failure(id, error)) => {
                 self.release_call(cx, CallId(id), None);
                 Some(Event::Failed(CallId(id), error))
             }
-            // Decoded again there: what it borrows of the link would keep the link from sending.
-            Some(Message::Control(_)) => self.control_arrived(cx, place, lent),
+            Some(Message::Control(items)) => {
+                let items = place.last(items.len());
+                self.controls_arrived(cx, items, lent)
+            }
             None => {
                 self.close(cx, CloseReason::Protocol);
                 None
@@ -268,78 +286,98 @@ impl<P: Port> Session<P> {
         }
     }
 
-    fn reply_arrived(
-        &mut self,
-        cx: &mut Context<'_, P>,
-        id: CallId,
-        error: Option<Error>,
-        block: Place,
-    ) -> Option<Event> {
+    /// Does what the items of a control message say, in their order. One of which a program is told is the last.
+    fn controls_arrived(&mut self, cx: &mut Context<'_, P>, items: Place, lent: &[u8]) -> Option<Event> {
+        let (mut left, mut event) = (self.link.view(items, lent).len(), None);
+        while left > 0 && event.is_none() && self.phase == Phase::Live {
+            (left, event) = self.control_arrived(cx, items.last(left), lent);
+        }
+        if event.is_some() && Items::new(self.link.view(items.last(left), lent)).next().is_some() {
+            self.close(cx, CloseReason::Protocol);
+        }
+        event
+    }
+
+    fn reply_arrived(&mut self, cx: &mut Context<'_, P>, id: CallId, result: Result<Place, Error>) -> Option<Event> {
         let Some(pending) = self.requests.close(id) else {
             // The call has ended already, by time-out or cancellation. Its lease was released then; results that come now change nothing.
             self.link.counters.add(LinkCounter::RepliesLate, 1);
             return None;
         };
-        match error {
-            Some(error) => {
+        match result {
+            Err(error) => {
                 // The call failed at the peer, but a lease may have begun there before it did: it is not renewed any more.
                 self.release_call(cx, id, Some(pending));
                 Some(Event::Reply(id, Err(error)))
             }
-            None => {
+            Ok(block) => {
                 let Pending { slot, generation, .. } = pending;
                 Some(Event::Reply(id, Ok(Results { slot, generation, block, step: self.step })))
             }
         }
     }
 
-    fn control_arrived(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8]) -> Option<Event> {
-        let Some(Message::Control(control)) = Message::decode(self.link.view(place, lent)) else {
-            return None;
-        };
-        match control {
-            Control::Publish { slot, generation, attributes, signature } => {
-                let kept = Attributes::decode(&attributes).and_then(|attributes| {
-                    self.theirs.insert(Slot(slot), Generation(generation), attributes, signature)
-                });
-                let allowed = may_publish(cx, self.remote.as_ref(), &mut self.publishing.refusals, signature);
-                match kept {
-                    Ok(()) if allowed => {}
-                    Ok(()) => {
-                        self.theirs.hide(Slot(slot));
-                        self.link.counters.add(LinkCounter::FunctionsForbidden, 1);
+    /// Does what the first item says; returns how many bytes of items are left.
+    fn control_arrived(&mut self, cx: &mut Context<'_, P>, items: Place, lent: &[u8]) -> (usize, Option<Event>) {
+        let mut items = Items::new(self.link.view(items, lent));
+        let Some(item) = items.next() else { return (0, None) };
+        let (left, mut skipped) = (items.rest().len(), 0);
+        let control = item.and_then(|item| match Control::take(&item)? {
+            None => item.skip(&mut skipped).map(|()| None),
+            control => Ok(control),
+        });
+        let event =
+            match control {
+                Err(Malformed) => {
+                    self.close(cx, CloseReason::Protocol);
+                    return (0, None);
+                }
+                Ok(None) => None,
+                Ok(Some(control)) => match control {
+                    Control::Publish { slot, generation, attributes, signature } => {
+                        let kept = Attributes::decode(attributes).map(|attributes| {
+                            self.theirs.insert(Slot(slot), Generation(generation), attributes, signature)
+                        });
+                        let allowed = may_publish(cx, self.remote.as_ref(), &mut self.publishing.refusals, signature);
+                        match kept {
+                            Ok(Ok(())) if allowed => {}
+                            Ok(Ok(())) => {
+                                self.theirs.hide(Slot(slot));
+                                self.link.counters.add(LinkCounter::FunctionsForbidden, 1);
+                            }
+                            Ok(Err(_)) => self.link.counters.add(LinkCounter::FunctionsSkipped, 1),
+                            Err(_) => self.close(cx, CloseReason::Protocol),
+                        }
+                        None
                     }
-                    Err(Error::Full(_)) => self.link.counters.add(LinkCounter::FunctionsSkipped, 1),
-                    Err(_) => self.close(cx, CloseReason::Protocol),
-                }
-                None
-            }
-            Control::Withdraw { slot } => {
-                self.theirs.remove(Slot(slot));
-                None
-            }
-            Control::ListEnd { serial } => {
-                self.publishing.acknowledge(serial);
-                self.pump(cx);
-                Some(Event::ListChanged)
-            }
-            Control::ListAck { serial, skipped } => {
-                self.publishing.was_acknowledged(serial);
-                Some(Event::Acknowledged { serial, skipped })
-            }
-            Control::Limits { message_size, minimum_interval, calls } => {
-                if let Some(remote) = &mut self.remote {
-                    remote.hello.limits.message_size = message_size;
-                    remote.hello.limits.minimum_interval = minimum_interval;
-                    remote.hello.limits.calls = calls;
-                }
-                None
-            }
-            Control::LeaseEnded { call, why } => {
-                let held = self.stop_renewing(CallId(call))?;
-                Some(Event::LeaseEnded { call: held.call, slot: held.slot, why })
-            }
-        }
+                    Control::Withdraw { slot } => {
+                        self.theirs.remove(Slot(slot));
+                        None
+                    }
+                    Control::ListEnd { serial } => {
+                        self.publishing.acknowledge(serial);
+                        self.pump(cx);
+                        Some(Event::ListChanged)
+                    }
+                    Control::ListAck { serial, skipped } => {
+                        self.publishing.was_acknowledged(serial);
+                        Some(Event::Acknowledged { serial, skipped })
+                    }
+                    Control::Limits { message_size, minimum_interval, calls } => {
+                        if let Some(remote) = &mut self.remote {
+                            remote.hello.limits.message_size = message_size;
+                            remote.hello.limits.minimum_interval = minimum_interval;
+                            remote.hello.limits.calls = calls;
+                        }
+                        None
+                    }
+                    Control::LeaseEnded { call, why } => self
+                        .stop_renewing(CallId(call))
+                        .map(|held| Event::LeaseEnded { call: held.call, slot: held.slot, why }),
+                },
+            };
+        self.link.counters.add(LinkCounter::ItemsSkipped, skipped.into());
+        (left, event)
     }
 
     fn request_arrived(
@@ -399,6 +437,9 @@ impl<P: Port> Session<P> {
         if seen == Seen::TooOld {
             return Err(Error::Stale);
         }
+        if header.unknown != 0 {
+            return Err(Error::Unsupported);
+        }
         // The limit may have become lower while the request was on its way.
         let limit = match priority {
             Priority::Emergency => self.constraints.message_size.min(EMERGENCY_BLOCK_BYTES),
@@ -442,19 +483,5 @@ const fn counter_of(error: Unopened) -> LinkCounter {
     match error {
         Unopened::Repeated => LinkCounter::DatagramsRepeated,
         Unopened::Forged => LinkCounter::DatagramsForged,
-    }
-}
-
-fn refusal(code: u8) -> Refusal {
-    match code {
-        1 => Refusal::Version,
-        2 => Refusal::Fleet,
-        3 => Refusal::WrongManager,
-        4 => Refusal::Full,
-        5 => Refusal::DuplicateIdentity,
-        6 => Refusal::Role,
-        7 => Refusal::AlreadyConnected,
-        9 => Refusal::Mode,
-        _ => Refusal::Malformed,
     }
 }

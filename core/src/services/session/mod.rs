@@ -39,7 +39,7 @@ use crate::counters::Counters;
 use crate::distribution::function_list::{Entry, Slot, TheirFunctionList};
 use crate::distribution::hello::Hello;
 use crate::distribution::identity::{Epoch, Identity};
-use crate::distribution::message::REQUEST_BYTES;
+use crate::distribution::message::LONGEST_HEADER_BYTES;
 use crate::distribution::message::SessionBody;
 use crate::error::{CloseReason, Error, Refusal};
 use crate::host::connections::{Link, LinkCounter, Liveness};
@@ -173,6 +173,8 @@ enum Phase {
 /// What is known of the peer since its hello.
 struct Remote<E> {
     hello: Hello,
+    /// The highest version that both ends speak.
+    version: u8,
     /// When its hello came.
     heard: Instant,
     /// Where its session datagrams go.
@@ -300,6 +302,11 @@ impl<P: Port> Session<P> {
         self.remote.as_ref().map(|remote| &remote.hello)
     }
 
+    /// The version of the protocol that the link uses, once the peer's hello has come.
+    pub fn version(&self) -> Option<u8> {
+        self.remote.as_ref().map(|remote| remote.version)
+    }
+
     /// The peer's identity, once it has told it. It may be anybody's as long as the peer [is not proven](Self::is_proven).
     pub fn identity(&self) -> Option<&Identity> {
         self.hello().map(|hello| &hello.identity)
@@ -391,7 +398,7 @@ impl<P: Port> Session<P> {
                 self.link.counters.add(LinkCounter::KeysMissing, 1);
                 self.farewell(cx, &Frame::Close(close_code(CloseReason::BadProof)));
             }
-            _ => self.farewell(cx, &Frame::Refuse(refusal as u8)),
+            _ => self.farewell(cx, &Frame::Refuse(refusal.to_wire())),
         }
         self.end(CloseReason::Refused(refusal));
     }
@@ -500,12 +507,12 @@ impl<P: Port> Session<P> {
 }
 
 fn message_limit(constraints: &Constraints) -> usize {
-    (constraints.message_size as usize).saturating_add(REQUEST_BYTES).max(LEAST_MESSAGE_BYTES)
+    (constraints.message_size as usize).saturating_add(LONGEST_HEADER_BYTES).max(LEAST_MESSAGE_BYTES)
 }
 
 /// Bytes that a pool buffer needs so that a message of `message_size` fits, framed, in chunks of any allowed size.
 pub const fn buffer_bytes(message_size: u32, overhead: usize) -> usize {
-    let total = (message_size as usize).saturating_add(REQUEST_BYTES);
+    let total = (message_size as usize).saturating_add(LONGEST_HEADER_BYTES);
     let total = if total < LEAST_MESSAGE_BYTES { LEAST_MESSAGE_BYTES } else { total };
     let payload = crate::config::MINIMUM_CHUNK_BYTES.saturating_sub(overhead).saturating_sub(FRAME_BYTES);
     let frames = match total.checked_div(payload) {

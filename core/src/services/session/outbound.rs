@@ -138,6 +138,7 @@ impl<P: Port> Session<P> {
             slot: function.slot,
             generation: function.generation,
             wants_reply,
+            unknown: 0,
             remaining,
             stamp,
             since,

@@ -4,7 +4,7 @@
 //! nobody: no limit, no clock and no decision of the node depends on it.
 
 use super::{Event, Phase, Remote, Session};
-use crate::config::{MINIMUM_CHUNK_BYTES, Mode};
+use crate::config::{MINIMUM_CHUNK_BYTES, Mode, VERSIONS};
 use crate::distribution::hello::{Hello, HelloError};
 use crate::error::{CloseReason, Refusal};
 use crate::host::connections::{LinkCounter, Liveness, Place};
@@ -40,13 +40,19 @@ impl<P: Port> Session<P> {
             Ok(hello) => hello,
             Err(error) => {
                 self.link.counters.add(LinkCounter::FramesRefused, 1);
+                if matches!(error, HelloError::Version(_)) && !self.dialed {
+                    // The other end learns our versions from our hello.
+                    self.send_hello(cx);
+                }
                 self.refuse(cx, refusal_of(error));
                 return None;
             }
         };
         self.link.introduce(place, lent);
+        self.link.counters.add(LinkCounter::ItemsSkipped, hello.skipped.into());
         let datagrams = self.peer_address.at_port(hello.udp_port);
-        self.remote = Some(Remote { hello, heard: cx.now, datagrams });
+        let version = VERSIONS.common(hello.versions).unwrap_or(VERSIONS.last);
+        self.remote = Some(Remote { hello, version, heard: cx.now, datagrams });
         if mode == Mode::Plain {
             return self.peer_known(cx);
         }
@@ -133,7 +139,8 @@ impl<P: Port> Session<P> {
 
 const fn refusal_of(error: HelloError) -> Refusal {
     match error {
-        HelloError::Version(_) => Refusal::Version,
+        HelloError::Version(versions) => Refusal::Version(versions),
+        HelloError::Suite => Refusal::Suite,
         HelloError::Mode => Refusal::Mode,
         HelloError::Magic | HelloError::Malformed => Refusal::Malformed,
     }

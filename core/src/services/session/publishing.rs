@@ -238,7 +238,7 @@ impl<P: Port> Session<P> {
                     let control = Control::Publish {
                         slot: slot.0,
                         generation: function.generation.0,
-                        attributes: function.attributes.encode(),
+                        attributes: &function.attributes.encode(),
                         signature: function.signature.as_bytes(),
                     };
                     self.send_control(cx, &control)

@@ -2,7 +2,7 @@
 
 use super::granting::expire_granted;
 use super::{Event, Phase, Session};
-use crate::config::{DATAGRAM_BYTES, GATHER};
+use crate::config::{DATAGRAM_BYTES, GATHER, LATER};
 use crate::distribution::datagram;
 use crate::distribution::message::{SESSION_BODY_BYTES, SessionBody};
 use crate::error::{CloseReason, Error};
@@ -203,6 +203,10 @@ impl<P: Port> Session<P> {
         let told = Duration::from_millis(u64::from(self.local.keep_alive));
         self.timers.keep_alive = cx.now + self.constraints.keep_alive.min(told).max(Duration::from_millis(1));
         let body = SessionBody::keep_alive(cx.now.as_micros());
+        if LATER {
+            self.link.send_frame(&Frame::Skipped);
+            self.send_datagram(cx, &[200], &[]);
+        }
         self.send_datagram(cx, &body, &[]);
         if !self.liveness.datagrams_pass() {
             self.link.send_frame(&Frame::Session(&body));
@@ -215,6 +219,7 @@ impl<P: Port> Session<P> {
     /// Sends a session datagram; `body` and `rest` follow each other in it. `false` when the network refused it.
     pub(super) fn send_datagram(&mut self, cx: &mut Context<'_, P>, body: &[u8], rest: &[u8]) -> bool {
         let Some((to, header)) = self.datagram_header() else { return false };
+        let rest = if LATER && rest.is_empty() { &[0xEE; 4] } else { rest };
         let (front, back) = self.link.cipher().datagram_room();
         let mut bytes = [0; LONGEST_DATAGRAM];
         let start = header.len().saturating_add(front);
@@ -242,7 +247,8 @@ impl<P: Port> Session<P> {
         if remote.datagrams.port() == 0 {
             return None;
         }
-        let header = datagram::session_header(mode, self.local.fleet, remote.hello.link, remote.hello.nonce);
+        let header =
+            datagram::session_header(mode, remote.version, self.local.fleet, remote.hello.link, remote.hello.nonce);
         Some((remote.datagrams, header))
     }
 }

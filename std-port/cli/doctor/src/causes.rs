@@ -17,11 +17,14 @@ pub(crate) fn text_of(manager: &Manager) -> String {
 }
 
 pub(crate) fn other_version(about: &str, heard: &Heard) -> Finding {
-    let (theirs, ours) = (heard.version, super::VERSION);
+    let (theirs, ours) = (heard.versions, super::VERSIONS);
     let found =
         format!("{about} at {} speaks version {theirs} of the protocol, and this is version {ours}", heard.source);
-    let advice =
-        if theirs < ours { "update the node" } else { "update the manager and this command, or put the node back" };
+    let advice = if theirs.last < ours.first {
+        "update the node"
+    } else {
+        "update the manager and this command, or put the node back"
+    };
     Finding::error(Id::OtherVersion, found, advice).about(about)
 }
 

@@ -23,7 +23,7 @@ mod which;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use cara_std::survey::VERSION;
+use cara_std::survey::VERSIONS;
 
 use cara_tools::exit::{Ended, Exit};
 use cara_tools::global::Global;

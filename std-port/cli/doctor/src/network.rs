@@ -211,7 +211,7 @@ mod tests {
     use cara_std::{Epoch, Fleet};
     use std::time::Duration;
 
-    use super::super::evidence::samples::{answering, evidence, node_info, running, searching};
+    use super::super::evidence::samples::{LATER, answering, evidence, node_info, running, searching};
     use super::super::running::Counted;
     use super::*;
 
@@ -235,7 +235,11 @@ mod tests {
     fn all_that_is_strange_is_listed_the_gravest_first() {
         let mut seen = in_order();
         seen.heard.push(Heard { fleet: Fleet(9), ..searching("far", 1, "chief") });
-        seen.heard.push(Heard { version: 9, source: "10.0.0.8:1".parse().unwrap(), ..searching("old", 2, "boss") });
+        seen.heard.push(Heard {
+            versions: LATER,
+            source: "10.0.0.8:1".parse().unwrap(),
+            ..searching("old", 2, "boss")
+        });
         seen.heard.push(searching("lost", 3, "boos"));
         seen.heard.push(Heard { epoch: Some(Epoch(5)), first: Duration::from_secs(4), ..searching("lost", 3, "boos") });
         seen.foreign = vec![Foreign { source: "10.0.0.5:1".parse().unwrap(), datagrams: 3 }];

@@ -20,7 +20,7 @@ pub(crate) fn object(looked: &Looked) -> Value {
         .map(|heard| {
             json!({
                 "address": heard.source.to_string(),
-                "version": heard.version,
+                "versions": [heard.versions.first, heard.versions.last],
                 "fleet": heard.fleet.0,
                 "mode": heard.mode.as_str(),
                 "proof": listening::shown_standing(heard.standing).0,

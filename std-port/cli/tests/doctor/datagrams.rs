@@ -10,7 +10,7 @@ pub(crate) const MANAGER: &str = "manager";
 
 /// Bytes of the fleet's code, and of the shortest `WhoHas` with it.
 const CODE: usize = 16;
-const LEAST: usize = 120;
+const LEAST: usize = 128;
 
 /// A `WhoHas` for `boss/1`. All numbers are below 128, and so one byte each.
 pub(crate) struct Search {
@@ -29,7 +29,7 @@ impl Search {
     pub(crate) fn new(fleet: u32, port: u16, key: DiscoveryKey, name: &'static str, id: u8, epoch: u8) -> Self {
         let socket = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
         socket.set_broadcast(true).unwrap();
-        Self { version: 1, fleet, port, name, id, epoch, key, socket }
+        Self { version: 2, fleet, port, name, id, epoch, key, socket }
     }
 
     pub(crate) fn of_version(self, version: u8) -> Self {
@@ -42,19 +42,24 @@ impl Search {
     }
 
     fn bytes(&self) -> Vec<u8> {
-        let mut bytes = vec![0x43, 0x41, 0x52, 0x73, self.version, 1, 0, 0];
+        let (who_has, codes, m_unit_wanted, s_unit) = (1, 1, b"boss", 1);
+        let mut bytes = vec![0x43, 0x41, 0x52, 0x73, self.version, who_has, self.version, codes];
         bytes.extend(self.fleet.to_le_bytes());
-        bytes.extend([self.id, self.name.len() as u8]);
-        bytes.extend(self.name.bytes());
-        let (s_unit, sequence, nonce) = (1, 1, 5);
-        bytes.extend([s_unit, self.epoch, sequence, nonce]);
-        bytes.extend([1, 4]);
-        bytes.extend(b"boss");
-        let (id_of_boss, tcp_port, expected, known) = (1, 0, 1, 0);
-        bytes.extend([id_of_boss, tcp_port, expected, known]);
-        bytes.resize(LEAST - CODE, 0);
+        let (sequence, nonce, tcp_port, expected, id_of_boss) = (1, 5, 0, 1, 1);
+        let name = self.name.as_bytes();
+        bytes.extend(item(1, &[&[self.id, name.len() as u8], name, &[s_unit, self.epoch]].concat()));
+        bytes.extend(item(2, &[&[m_unit_wanted.len() as u8], &m_unit_wanted[..], &[id_of_boss]].concat()));
+        bytes.extend(item(5, &[sequence, nonce, tcp_port, expected]));
+        bytes.extend(item(0, &vec![0; LEAST - CODE - bytes.len() - 4]));
         let code: [u8; CODE] = self.key.code(&[&bytes]);
         bytes.extend(code);
         bytes
     }
+}
+
+/// Kind, length, body, and zeros up to a multiple of four.
+fn item(kind: u16, body: &[u8]) -> Vec<u8> {
+    let mut bytes = [&kind.to_le_bytes()[..], &(body.len() as u16).to_le_bytes(), body].concat();
+    bytes.resize(bytes.len().next_multiple_of(4), 0);
+    bytes
 }

@@ -68,7 +68,8 @@ fn another_version_is_refused_by_name(world: &mut dyn World) {
     if manager.node_counted(NodeCounter::DatagramVersion) > 0 {
         world.reached("datagram was counted");
     }
-    let refused = Seen::NotJoined(CloseReason::Refused(Refusal::Version));
+    let refusal = Refusal::Version(UnknownClient::OTHER_VERSIONS);
+    let refused = Seen::NotJoined(CloseReason::Refused(refusal));
     world.wait("this side shows it", || manager.count(|event| *event == refused) == 1, secs(20));
     assert_eq!(world.ask(&manager, "agv", "note", &mut number("n", 1)), Ok(()));
 }

@@ -210,6 +210,7 @@ fn spoofed_announces_lead_nowhere() {
                 tcp_port: 666,
                 room: 100,
                 expected: 1,
+                skipped: 0,
             };
             let mut bytes = [0; SEARCH_BYTES];
             let forged = codes(9, &name);
@@ -277,6 +278,7 @@ fn nobody_without_a_manager_s_own_key_keeps_it_from_starting() {
                 tcp_port: 666,
                 room: 1,
                 expected: 1,
+                skipped: 0,
             };
             let mut bytes = [0; SEARCH_BYTES];
             for to in [None, Some(depot()), Some(agv(18))] {

@@ -128,18 +128,19 @@ fn hello(agv: bool, run: u8) -> Hello {
     let [manager, vehicle] = names();
     let limits = Limits { message_size: 1_024, chunk_size: 1_024, calls: 4, minimum_interval: 0 };
     Hello {
+        versions: cara_core::config::VERSIONS,
+        capabilities: 0,
         fleet: FLEET,
         identity: if agv { vehicle } else { manager },
         wanted: agv.then(|| Manager::new("depot", 1).expect("a name")),
         epoch: Epoch(1),
         nonce: 0x1_0000 + u64::from(run) * 2 + u64::from(agv),
-        term: 0,
-        capabilities: 0,
         limits,
         link: u16::from(agv),
         udp_port: 7_001,
         stamp: 0,
         keep_alive: 1_000,
+        skipped: 0,
     }
 }
 

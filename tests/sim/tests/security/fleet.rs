@@ -94,18 +94,19 @@ fn plain_and_secured_units_never_meet() {
 fn hello(id: u32, nonce: u64) -> Vec<u8> {
     let limits = Limits { message_size: 1_024, chunk_size: 1_024, calls: 8, minimum_interval: 0 };
     let hello = Hello {
+        versions: cara_core::config::VERSIONS,
+        capabilities: 0,
         fleet: Fleet(0),
         identity: Identity::s_unit("agv", id).expect("a name"),
         wanted: Some(cara_core::distribution::hello::Manager::new("depot", 1).expect("a name")),
         epoch: Epoch(nonce),
         nonce,
-        term: 0,
-        capabilities: 0,
         limits,
         link: 0,
         udp_port: 7_001,
         stamp: 0,
         keep_alive: 1_000,
+        skipped: 0,
     };
     let (mut bytes, mut framed) = ([0; 300], [0; 320]);
     let length = hello.encode(Mode::Secured, &mut bytes).expect("it fits");

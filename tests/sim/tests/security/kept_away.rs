@@ -60,6 +60,7 @@ fn recordings(attack: Attack) -> Vec<Vec<u8>> {
                     tcp_port: 666,
                     room: 100,
                     expected: u16::MAX,
+                    skipped: 0,
                 };
                 let mut bytes = [0; SEARCH_BYTES];
                 announce.encode(FLEET, &codes(1, &agv(18)), None, &mut bytes).expect("it fits").to_vec()

@@ -16,24 +16,25 @@ const NODES: [&str; 4] = ["AGV_manager/1@m_unit", "agv-1/11", "agv-2/12", "agv-3
 
 /// One fleet on loopback, with keys of its own.
 pub(super) struct Stage {
-    programs: PathBuf,
+    /// Where the manager and `cara` are.
+    manager: PathBuf,
+    /// Where the AGVs' program is.
+    agvs: PathBuf,
     fleet: String,
     keys: TempDir,
     began: Instant,
 }
 
 impl Stage {
-    /// The examples lie beside this program.
-    pub(super) fn new() -> Result<Self> {
-        let own = std::env::current_exe().context("cannot tell where the examples are")?;
-        let programs = own.parent().context("this program is in no folder")?.to_owned();
+    pub(super) fn new(manager: &Path, agvs: &Path) -> Result<Self> {
+        let (manager, agvs) = (manager.to_owned(), agvs.to_owned());
         let keys = tempfile::tempdir().context("there is no room for keys")?;
-        Ok(Self { programs, fleet: random_fleet().to_string(), keys, began: Instant::now() })
+        Ok(Self { manager, agvs, fleet: random_fleet().to_string(), keys, began: Instant::now() })
     }
 
     /// Makes the fleet's keys, with the command that a newcomer types.
     pub(super) fn make_keys(&self) -> Result<()> {
-        let mut command = Command::new(self.programs.join("cara"));
+        let mut command = Command::new(self.manager.join("cara"));
         command.args(["keys", "new-fleet", "--fleet", &self.fleet]).args(NODES).env("CARA_KEYS", self.keys.path());
         let made = command.output().context("cannot start cara")?;
         ensure!(made.status.success(), "no keys were made: {}", String::from_utf8_lossy(&made.stderr));
@@ -43,22 +44,22 @@ impl Stage {
 
     /// The manager, which waits behind each line of the listing and takes commands then.
     pub(super) fn manager(&self) -> Result<Process> {
-        self.start("manager", "agv_manager", &["--console"])
+        self.start("manager", self.manager.join("agv_manager"), &["--console"])
     }
 
     /// AGV number `number`, as `agv-1/11`.
     pub(super) fn agv(&self, number: u32) -> Result<Process> {
         let (name, id) = (format!("agv-{number}"), (10 + number).to_string());
-        let agv = self.start(&name, "agv", &["--attended", "--name", &name, "--id", &id])?;
+        let agv = self.start(&name, self.agvs.join("agv"), &["--attended", "--name", &name, "--id", &id])?;
         // Units in plain mode do not meet secured ones, so a node that joins it has proven its key.
         agv.seen(&format!("started {name}/{id}, secured"), STEP)?;
         Ok(agv)
     }
 
-    fn start(&self, name: &str, program: &str, arguments: &[&str]) -> Result<Process> {
+    fn start(&self, name: &str, program: PathBuf, arguments: &[&str]) -> Result<Process> {
         let network = ["--loopback", "--fleet", &self.fleet];
         let keys = format!("CARA_KEYS={}", self.keys.path().display());
-        let program = self.programs.join(program).display().to_string();
+        let program = program.display().to_string();
         let words = [keys.as_str(), program.as_str()];
         Process::start(name, Path::new("env"), words.iter().chain(arguments).chain(&network))
     }

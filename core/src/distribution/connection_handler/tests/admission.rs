@@ -1,6 +1,7 @@
 //! Every outcome of a hello.
 
 use super::*;
+use crate::config::Versions;
 
 fn decide(node: &mut Node<InMemory>, hello: &Hello) -> Admission {
     node.admit(at(10), LinkId(9), address(9, 40_000), hello)
@@ -168,14 +169,15 @@ fn a_datagram_of_another_version_is_told() {
     bytes[4] = 9;
     node.hear(at(1), address(1, 7_001), &bytes);
     let finding = node.findings().next().unwrap();
-    assert_eq!((finding.refusal, finding.address), (Refusal::Version, address(1, 7_001)));
+    let versions = Versions { first: 9, last: 9 };
+    assert_eq!((finding.refusal, finding.address), (Refusal::Version(versions), address(1, 7_001)));
     assert_eq!(node.counters.value(NodeCounter::DatagramVersion), 1);
 }
 
 #[test]
 fn a_session_datagram_of_no_link_is_counted() {
     let mut node = depot();
-    let bytes = crate::distribution::datagram::session_header(Mode::Plain, FLEET, 4, 42);
+    let bytes = crate::distribution::datagram::session_header(Mode::Plain, VERSIONS.last, FLEET, 4, 42);
     node.hear(at(2), address(1, 1), &bytes);
     assert_eq!(node.counters.value(NodeCounter::DatagramUnknownLink), 1);
 }

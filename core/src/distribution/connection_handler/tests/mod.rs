@@ -145,6 +145,7 @@ pub(super) fn search_of(config: &NodeConfig<SocketAddr>, sequence: u32) -> WhoHa
         tcp_port: config.tcp_port,
         expected: 1,
         known: heapless::Vec::new(),
+        skipped: 0,
     }
 }
 
@@ -157,6 +158,7 @@ pub(super) fn announce_of(config: &NodeConfig<SocketAddr>, sequence: u32, nonce:
         tcp_port: config.tcp_port,
         room: 10,
         expected: 10,
+        skipped: 0,
     }
 }
 

@@ -72,7 +72,7 @@ fn an_orderly_end_is_told_to_the_peer() {
 fn a_peer_that_breaks_the_protocol_is_told_so() {
     let second_hello: Vec<u8> = [&[2, 0, 1, 0][..]].concat();
     let no_message = [&[8, 0, 0x13, 2, 2, 0, 0, 0, 99, 99][..]].concat();
-    let no_frame = [&[3, 0, 77, 1, 2][..]].concat();
+    let no_frame = [&[3, 0, 0x3F, 1, 2][..]].concat();
     for bytes in [second_hello, no_message, no_frame] {
         let mut pair = Pair::live();
         pair.manager.hear(&bytes);

@@ -3,7 +3,7 @@
 use super::super::Event;
 use super::pair::Pair;
 use super::setup::{self, Setup};
-use crate::config::HELLO_TIMEOUT;
+use crate::config::{HELLO_TIMEOUT, VERSIONS, Versions};
 use crate::distribution::connection_handler::Directive;
 use crate::distribution::identity::Identity;
 use crate::error::{CloseReason, Refusal};
@@ -47,11 +47,19 @@ fn no_hello_in_time_ends_the_link() {
 fn another_version_is_told_to_both() {
     let mut pair = Pair::connected(&Setup::default());
     let mut bytes = pair.agv.net.deliver().0;
-    // Behind length, kind and magic.
-    bytes[2 + 1 + 4] += 1;
+    // Behind length, kind and magic: the first version that the end speaks.
+    const FIRST: usize = 2 + 1 + 4;
+    bytes[FIRST] += 1;
     pair.manager.hear(&bytes);
+    pair.step();
+    // It answers with its own hello, from which the other end learns the versions that it speaks.
+    let mut answer = pair.manager.net.deliver().0;
+    assert_eq!(answer[2], 1, "a hello, and a refusal behind it");
+    answer[FIRST] += 1;
+    pair.agv.hear(&answer);
     pair.settle();
-    let closed = Event::Closed(CloseReason::Refused(Refusal::Version));
+    let versions = Versions { first: VERSIONS.last + 1, last: VERSIONS.last + 1 };
+    let closed = Event::Closed(CloseReason::Refused(Refusal::Version(versions)));
     for side in [&pair.manager, &pair.agv] {
         assert_eq!(side.happened, std::slice::from_ref(&closed));
     }

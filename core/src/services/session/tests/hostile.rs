@@ -5,16 +5,19 @@ use std::vec::Vec;
 
 use proptest::prelude::*;
 
+use super::super::Event;
+use super::net::Datagrams;
 use super::pair::Pair;
 use super::{none, parameters, x};
 use crate::config::Priority;
-use crate::distribution::compact::{Reader, Writer};
+use crate::distribution::compact::Writer;
 use crate::distribution::function::Definition;
 use crate::distribution::function_list::{Generation, Slot};
 use crate::distribution::message::{
     Control, Release, Renewal, RequestHeader, SessionBody, encode_failure, encode_reply,
 };
 use crate::error::{CloseReason, Error};
+use crate::host::connections::LinkCounter;
 use crate::host::frame::{self, ChunkWriter, Chunking, Frame};
 use crate::time::Duration;
 
@@ -27,7 +30,7 @@ fn message() -> impl Strategy<Value = Vec<u8>> {
         2 => Just(vec![0; 8]),
         1 => Just(vec![0; 5_000]),
     ];
-    (0..7 + Control::KINDS, number.clone(), number.clone(), number, stamp, block, any::<bool>()).prop_map(
+    (0..9 + Control::KINDS, number.clone(), number.clone(), number, stamp, block, any::<bool>()).prop_map(
         |(kind, one, two, three, stamp, block, flag)| match kind {
             0..=3 => {
                 let header = RequestHeader {
@@ -35,6 +38,7 @@ fn message() -> impl Strategy<Value = Vec<u8>> {
                     slot: Slot(two as u16),
                     generation: Generation(three as u16 / 3),
                     wants_reply: flag,
+                    unknown: if two == 5 { 0x10 } else { 0 },
                     remaining: Duration::from_millis(u64::from(one) * 100),
                     stamp,
                     since: Duration::from_micros(two.into()),
@@ -47,7 +51,9 @@ fn message() -> impl Strategy<Value = Vec<u8>> {
             7 => {
                 control(&publish(two, three, if flag { &block } else { KNOWN.get(one as usize).unwrap_or(&KNOWN[0]) }))
             }
-            kind => any_control(kind - 7, &[one, two, three]),
+            // The last one is of a later version, and must be understood.
+            8 => any_items(&[(0x8000, &[]), (1, &[])]),
+            kind => any_items(&[(0x700, &[one]), (kind - 8, &[one, two, three]), (kind - 8, &[three, two, one])]),
         },
     )
 }
@@ -63,18 +69,23 @@ fn publish(slot: u32, generation: u32, signature: &[u8]) -> Control<'_> {
     Control::Publish {
         slot: slot as u16,
         generation: generation as u16,
-        attributes: [2, 0, 0, 0, 9, 0, 0, 0],
+        attributes: &[2, 0, 0, 0, 9, 0, 0, 0],
         signature,
     }
 }
 
-/// A control message of a kind, with numbers for its fields as far as they fit there.
-fn any_control(kind: u8, numbers: &[u32]) -> Vec<u8> {
-    let mut bytes = [0; 64];
+/// A control message of items of these kinds, with numbers for their fields as far as they fit there.
+fn any_items(items: &[(u16, &[u32])]) -> Vec<u8> {
+    let mut bytes = [0; 128];
     let mut writer = Writer::new(&mut bytes);
-    writer.byte(kind);
-    writer.numbers(numbers);
-    control(&Control::take(&mut Reader::new(&bytes)).unwrap())
+    writer.bytes(&[3, 0, 0, 0]);
+    for (kind, numbers) in items {
+        let item = writer.begin(*kind);
+        writer.numbers(numbers);
+        writer.end(item);
+    }
+    let length = writer.finish().unwrap();
+    bytes[..length].to_vec()
 }
 
 fn control(control: &Control<'_>) -> Vec<u8> {
@@ -192,11 +203,60 @@ fn a_reply_that_does_not_fit_its_signature_is_an_error_of_the_call_only() {
 }
 
 #[test]
-fn a_function_list_that_no_unit_makes_ends_the_link() {
+fn a_signature_of_a_later_version_is_passed_over_and_told() {
     let mut pair = Pair::live();
     pair.manager.hear_message(&control(&publish(0, 0, KNOWN[2])), Priority::High);
+    pair.manager.hear_message(&control(&Control::ListEnd { serial: 9 }), Priority::High);
     pair.settle();
-    assert!(pair.manager.has(&super::super::Event::Closed(CloseReason::Protocol)));
+    assert!(pair.manager.session.is_live() && pair.manager.session.their_function_list().is_empty());
+    assert_eq!(pair.manager.session.counters().value(LinkCounter::FunctionsSkipped), 1);
+    assert!(pair.agv.has(&Event::Acknowledged { serial: 9, skipped: 1 }));
+}
+
+#[test]
+fn what_must_be_understood_and_is_not_ends_the_link() {
+    let mut pair = Pair::live();
+    pair.manager.hear_message(&any_items(&[(0x8700, &[])]), Priority::High);
+    pair.settle();
+    assert!(pair.manager.has(&Event::Closed(CloseReason::Protocol)));
+}
+
+#[test]
+fn what_a_later_version_says_beside_it_is_counted_and_passed_over() {
+    let mut pair = Pair::live();
+    let skipped = |pair: &Pair| pair.manager.session.counters().value(LinkCounter::ItemsSkipped);
+    let withdrawn = |slot| (2, slot);
+    let (one, two) = (withdrawn(&[1][..]), withdrawn(&[2][..]));
+    pair.manager.hear_message(&any_items(&[(0x700, &[7]), one, (0x701, &[]), two]), Priority::High);
+    pair.settle();
+    assert_eq!(skipped(&pair), 2);
+    // A frame with 40 hex as its kind, and a session body 200.
+    pair.manager.hear(&[3, 0, 0x40, 1, 2, 2, 0, 6, 200]);
+    pair.settle();
+    assert_eq!(skipped(&pair), 3);
+    assert_eq!(pair.manager.session.counters().value(LinkCounter::DatagramsDropped), 1);
+    assert!(pair.manager.session.is_live());
+}
+
+#[test]
+fn nothing_follows_what_a_program_is_told() {
+    let mut pair = Pair::live();
+    pair.manager.hear_message(&any_items(&[(3, &[9]), (2, &[1])]), Priority::High);
+    pair.settle();
+    assert!(pair.manager.has(&Event::ListChanged));
+    assert!(pair.manager.has(&Event::Closed(CloseReason::Protocol)));
+}
+
+#[test]
+fn frames_of_a_later_version_are_no_sign_of_life() {
+    let mut pair = Pair::live();
+    pair.agv.net.frozen = true;
+    pair.agv.net.datagrams = Datagrams::Lost;
+    for _ in 0..20 {
+        pair.manager.hear(&[2, 0, 0x7F, 1]);
+        pair.run(Duration::from_millis(500));
+    }
+    assert!(pair.manager.has(&Event::Closed(CloseReason::Silent)));
 }
 
 #[test]

@@ -3,7 +3,7 @@
 use core::net::SocketAddr;
 use std::vec::Vec;
 
-use crate::config::{PLAIN_MAGIC, VERSION};
+use crate::config::{PLAIN_MAGIC, VERSIONS};
 use crate::distribution::datagram::SESSION_HEADER_BYTES;
 use crate::error::CloseReason;
 use crate::host::mailman::{LinkId, Mailman};
@@ -66,7 +66,7 @@ impl Mailman<SocketAddr> for Net {
 
     fn send_to(&mut self, to: SocketAddr, datagram: &[u8]) -> bool {
         assert_eq!(to.port(), DATAGRAM_PORT);
-        assert_eq!((&datagram[..4], datagram[4], datagram[5]), (&PLAIN_MAGIC[..], VERSION, 3));
+        assert_eq!((&datagram[..4], datagram[4], datagram[5]), (&PLAIN_MAGIC[..], VERSIONS.last, 3));
         let nonce = u64::from_le_bytes(datagram[16..24].try_into().unwrap());
         let copies = match self.datagrams {
             Datagrams::Lost => 0,

@@ -6,7 +6,7 @@ use std::vec;
 use super::super::{Publication, SessionStorage, buffer_bytes};
 use super::net::DATAGRAM_PORT;
 use super::side::Tested;
-use crate::config::{Constraints, LINK_BUFFER_BYTES, Priority};
+use crate::config::{Constraints, LINK_BUFFER_BYTES, Priority, VERSIONS};
 use crate::distribution::connection_handler::{Node, NodeConfig, NodeStorage, Target};
 use crate::distribution::function::{Attributes, Definition};
 use crate::distribution::function_list::{Entry, FunctionList};
@@ -89,18 +89,19 @@ pub(super) fn attributes(definition: &Definition, lease_millis: u64) -> Attribut
 
 pub(super) fn hello(constraints: &Constraints, agv: bool, datagrams: bool) -> Hello {
     Hello {
+        versions: VERSIONS,
+        capabilities: 0,
         fleet: Fleet(1),
         identity: if agv { Identity::s_unit("agv-01", 1) } else { Identity::m_unit("manager", 1) }.unwrap(),
         wanted: agv.then(|| Manager::new("manager", 1).unwrap()),
         epoch: Epoch(1),
         nonce: if agv { 0xA61 } else { 0x3A6A6E2 },
-        term: 0,
-        capabilities: 0,
         limits: constraints.into(),
         link: u16::from(agv),
         udp_port: if datagrams { DATAGRAM_PORT } else { 0 },
         stamp: 0,
         keep_alive: constraints.keep_alive.as_millis() as u32,
+        skipped: 0,
     }
 }
 

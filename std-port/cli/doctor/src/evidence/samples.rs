@@ -4,15 +4,17 @@ use std::net::SocketAddr;
 use std::time::Duration;
 
 use cara_std::control::protocol::{ConstraintsInfo, KeysInfo, NodeInfo, UnitInfo};
-use cara_std::survey::{Heard, Ports, Reach, Standing};
+use cara_std::survey::{Heard, Ports, Reach, Standing, Versions};
 use cara_std::sys::interfaces::Interface;
 use cara_std::{Epoch, Fleet, Identity, Interfaces, Manager, Mode};
 
 use super::{Evidence, KeysSeen, Life};
-use crate::VERSION;
+use crate::VERSIONS;
 use crate::running::{Counted, Running};
 
 pub(crate) const FLEET: Fleet = Fleet(7);
+/// What a unit speaks that is too new.
+pub(crate) const LATER: Versions = Versions { first: 9, last: 9 };
 
 /// Listened long enough, and no node was heard.
 pub(crate) fn evidence() -> Evidence {
@@ -68,7 +70,7 @@ fn heard(identity: Identity, wanted: Option<Manager>) -> Heard {
         source: SocketAddr::new("10.0.0.9".parse().unwrap(), 5000),
         mode: Mode::Secured,
         standing: Standing::Proven(1),
-        version: VERSION,
+        versions: VERSIONS,
         fleet: FLEET,
         identity: Some(identity),
         epoch: Some(Epoch(1)),
@@ -103,7 +105,7 @@ pub(crate) fn running(name: &str, id: u32) -> Running {
         fleet: FLEET.0,
         mode: Some("secured".into()),
         keys: Some(KeysInfo { file: None, generations: vec![1] }),
-        version: VERSION,
+        version: VERSIONS.last,
         discovery_port: 21_971,
         tcp_port: 4000,
         epoch: "1".into(),

@@ -3,7 +3,7 @@ use std::net::SocketAddr;
 use cara_std::Fleet;
 
 use super::super::dial::{Dial, Outcome};
-use super::super::evidence::samples::{answering, evidence, node_info, running, searching};
+use super::super::evidence::samples::{LATER, answering, evidence, node_info, running, searching};
 use super::*;
 
 fn ids(seen: &Evidence) -> Vec<Id> {
@@ -107,12 +107,12 @@ fn another_fleet_or_version_counts_only_where_ours_is_silent() {
     let mut seen = evidence();
     seen.heard = vec![Heard { fleet: Fleet(9), ..searching("agv", 7, "boss") }];
     assert_eq!(ids(&seen), [Id::OtherFleet]);
-    seen.heard = vec![Heard { version: 9, ..searching("agv", 7, "boss") }];
+    seen.heard = vec![Heard { versions: LATER, ..searching("agv", 7, "boss") }];
     assert_eq!(ids(&seen), [Id::OtherVersion]);
     seen.heard.extend(both().heard);
     seen.dials = both().dials;
     assert_eq!(ids(&seen), [Id::NotJoining]);
-    seen.heard = vec![Heard { version: 9, identity: None, ..searching("agv", 7, "boss") }];
+    seen.heard = vec![Heard { versions: LATER, identity: None, ..searching("agv", 7, "boss") }];
     assert_eq!(ids(&seen), [Id::OtherVersion, Id::NotHeard], "one that cannot be read may be the one");
 }
 
@@ -126,7 +126,7 @@ fn the_manager_that_it_looks_for_is_compared_with_those_that_run() {
     assert_eq!(ids(&seen), [Id::NoManager]);
     seen.heard.push(Heard { fleet: Fleet(9), ..answering("boss", 3) });
     assert_eq!(ids(&seen), [Id::OtherFleet]);
-    seen.heard[1] = Heard { version: 9, ..answering("boss", 3) };
+    seen.heard[1] = Heard { versions: LATER, ..answering("boss", 3) };
     assert_eq!(ids(&seen), [Id::OtherVersion]);
 }
 
