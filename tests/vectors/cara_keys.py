@@ -1,5 +1,6 @@
 #!/usr/bin/env python3
-"""Makes a node's key file from a fleet's root and its list of nodes: written from docs/keys.md, standard library only.
+"""Makes a node's key file from a fleet's root and its list of nodes, and reads such a file: written from docs/keys.md,
+standard library only.
 
     cara_keys.py FOLDER FLEET ROLE ID NAME
 
@@ -11,6 +12,7 @@ import struct
 import sys
 import zlib
 from pathlib import Path
+from urllib.parse import quote
 
 ROLES = ["m_unit", "s_unit"]
 
@@ -83,6 +85,41 @@ def ring(root, fleet, generations, nodes, node):
                 out.append(f"pair {pair.hex()} {spelled(peer)}")
     text = ("\n".join(out) + "\n").encode()
     return text + b"sum %08x\n" % zlib.crc32(text)
+
+
+class Ring:
+    """A node's keys, from its file, or its file in a folder; the generation in use first."""
+
+    def __init__(self, path, fleet, node):
+        path = Path(path)
+        if path.is_dir():
+            name = quote(node["name"], safe="").replace("~", "%7E")
+            name = "%2E" + name[1:] if name.startswith(".") else name
+            path /= f"{name}-{node['id']}-{node['role']}-{fleet}.keys"
+        if path.stat().st_mode & 0o077:
+            sys.exit(f"{path}: others could read or write it; `chmod 600` mends that")
+        self.generations, told = [], []
+        for word, rest in lines(path, "cara-ring"):
+            if word == "discovery":
+                self.generations.append((bytes.fromhex(rest), {}))
+            elif word == "pair":
+                pair, peer = rest.split(" ", 1)
+                self.generations[-1][1][identity(peer)] = bytes.fromhex(pair)
+            elif word != "generation":
+                told.append((word, rest))
+        if told != [("fleet", str(fleet)), ("node", spelled(place_of(node)))]:
+            sys.exit(f"{path} is the file of another node or fleet: {told}")
+
+    def discovery_keys(self):
+        return [discovery for discovery, _ in self.generations]
+
+    def pair_keys(self, peer):
+        return [pairs[place_of(peer)] for _, pairs in self.generations if place_of(peer) in pairs]
+
+
+def place_of(node):
+    """The identity of a unit, as these files have it."""
+    return node["id"], node["name"].encode(), ROLES.index(node["role"])
 
 
 def main(folder, fleet, role, number, name):

@@ -273,20 +273,21 @@ def decode_hello(data, magic=MAGIC, suites=0):
     }
 
 
-def encode_hello(hello):
+def encode_hello(hello, magic=MAGIC, suites=0):
     first, last = hello["versions"]
-    head = struct.pack("<4sBBHIQ", MAGIC, first, last, 0, hello["fleet"], hello["capabilities"])
+    head = struct.pack("<4sBBHIQ", magic, first, last, suites, hello["fleet"], hello["capabilities"])
     return head + write_items(hello, HELLO_ITEMS)
 
 
 # --- datagrams (section 3)
 
 
-def decode_datagram(data, fleet):
+def decode_datagram(data, fleet, magic=MAGIC, codes=0):
+    """A datagram of this mode, by default the plain one, without the codes behind it; `codes` is how many these were."""
     require(len(data) >= 12)
     reader = Reader(data)
-    magic, first, kind, last, codes, theirs = reader.fixed("4sBBBBI")
-    require(magic == MAGIC)
+    their_magic, first, kind, last, their_codes, theirs = reader.fixed("4sBBBBI")
+    require(their_magic == magic)
     versions = versions_of(first, last)
     if in_common(versions) is None:
         return {"other_versions": versions}
@@ -295,7 +296,7 @@ def decode_datagram(data, fleet):
     if kind == 3:
         link, _, nonce = reader.fixed("HHQ")
         return {"session": {"link": link, "nonce": nonce, "body": decode_session_body(reader.rest())}}
-    require(codes == 0)
+    require(their_codes == codes)
     if kind == 1:
         return {"who_has": read_datagram(reader.rest(), WHO_HAS_ITEMS, "search")}
     require(kind == 2)
@@ -310,17 +311,34 @@ def read_datagram(data, items, own):
     return value
 
 
-def encode_datagram(datagram, fleet):
+def encode_datagram(datagram, fleet, magic=MAGIC, codes=0):
     (name, value), = datagram.items()
-    kind = ["who_has", "announce", "session"].index(name) + 1
-    first, last = (VERSION, VERSION) if name == "session" else VERSIONS
-    head = MAGIC + struct.pack("<BBBBI", first, kind, last, 0, fleet)
     if name == "session":
-        return head + struct.pack("<HHQ", value["link"], 0, value["nonce"]) + encode_session_body(value["body"])
-    return head + write_items(value, WHO_HAS_ITEMS if name == "who_has" else ANNOUNCE_ITEMS)
+        return session_header(value["link"], value["nonce"], fleet, magic) + encode_session_body(value["body"])
+    kind, items = (1, WHO_HAS_ITEMS) if name == "who_has" else (2, ANNOUNCE_ITEMS)
+    return struct.pack("<4sBBBBI", magic, VERSIONS[0], kind, VERSIONS[1], codes, fleet) + write_items(value, items)
+
+
+def session_header(link, nonce, fleet, magic=MAGIC):
+    return struct.pack("<4sBBBBIHHQ", magic, VERSION, 3, VERSION, 0, fleet, link, 0, nonce)
 
 
 # --- messages (section 9)
+
+
+class Window:
+    """The newest number, and which of the 64 up to it have come: each counts once (sections 12 and 17)."""
+
+    def __init__(self):
+        self.newest, self.seen = 0, set()
+
+    def is_behind(self, number):
+        return number + 64 <= self.newest
+
+    def note(self, number):
+        self.newest = max(self.newest, number)
+        self.seen = {each for each in self.seen | {number} if not self.is_behind(each)}
+
 
 # code: (name, names of what travels in index, first and second)
 ERRORS = {
@@ -585,7 +603,7 @@ def encode_session_body(body):
 
 # --- frames and chunks (sections 5 and 6)
 
-FRAMES = {"hello": 1, "refuse": 2, "close": 3, "ping": 4, "pong": 5, "session": 6}
+FRAMES = {"hello": 1, "refuse": 2, "close": 3, "ping": 4, "pong": 5, "session": 6, "proof": 7, "confirm": 8}
 
 
 def encode_frame(name, payload=b""):
@@ -610,6 +628,8 @@ def encode_chunks(priority, message, limit):
 
 class Link:
     """One direction of a stream: bytes in, frames and whole messages out, and the limits of who reads."""
+
+    magic, suites = MAGIC, 0
 
     def __init__(self, chunk_limit, message_limit):
         self.chunk_limit = chunk_limit
@@ -643,7 +663,8 @@ class Link:
             require(len(payload) == 0)
             return "ping" if kind == FRAMES["ping"] else "pong"
         if kind == FRAMES["hello"]:
-            return {"hello": readable(decode_hello, payload)}
+            self.hello = payload
+            return {"hello": readable(decode_hello, payload, self.magic, self.suites)}
         if 0x40 <= kind <= 0x7F:
             return "skipped"
         require(kind == FRAMES["session"])
@@ -685,9 +706,9 @@ class Link:
         return {"priority": PRIORITIES[priority], "message": decode_message(data)}
 
 
-def readable(decode, data):
+def readable(decode, data, *mode):
     """An unreadable hello is refused, and an unreadable session body dropped: neither is the link's matter."""
     try:
-        return decode(data)
+        return decode(data, *mode)
     except Malformed:
         return {"unreadable": data.hex()}

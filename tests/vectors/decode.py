@@ -4,8 +4,8 @@ core.
 
 For each vector: its bytes decode to its value, the value encodes to its bytes, and every change of a single byte is
 accepted or refused, and read, exactly as the core does it. The examples in docs/wire.md must be vectors. Of the secured
-conversation each message of the handshakes is made again, and everything sealed is opened. Exits with 1 and a line for
-each difference.
+conversation each message of the handshakes is made again, and everything sealed is opened; codes of discovery are made and
+checked. Exits with 1 and a line for each difference.
 """
 
 import json
@@ -205,6 +205,13 @@ def check_secured():
     wrong = [] if link.renewals == 1 else ["secured.txt: the keys are made anew %d times" % link.renewals]
     if [what for what in said if what in HANDSHAKE] != HANDSHAKE[:2] + HANDSHAKE:
         wrong.append("secured.txt: the keys are made anew in another order")
+    for end, how, data in carried:
+        if how == "datagram":
+            try:
+                link.datagram(end, data)
+                wrong.append("secured.txt: a datagram is opened twice")
+            except secure.Refused:
+                pass
     for at in range(2, len(carried)):
         end, how, data = carried[at]
         changed = data[:-1] + bytes([data[-1] ^ 1])
@@ -214,6 +221,61 @@ def check_secured():
         except secure.Refused:
             pass
     return wrong, len(carried)
+
+
+class Ring:
+    """Keys for discovery: those in use, and those beside."""
+
+    @staticmethod
+    def discovery_keys():
+        return [bytes([1]) * 32, bytes([2]) * 32]
+
+    @staticmethod
+    def pair_keys(_):
+        return [bytes([3]) * 32, bytes([4]) * 32]
+
+
+class Beside(Ring):
+    """A unit that goes over to the other keys."""
+
+    @staticmethod
+    def discovery_keys():
+        return Ring.discovery_keys()[::-1]
+
+    @staticmethod
+    def pair_keys(_):
+        return Ring.pair_keys(_)[::-1]
+
+
+def check_discovery(vectors):
+    """With the codes of secured mode who-has and announce are read, made with either keys, and no byte of them can be changed."""
+    who_has, answer = vectors["who_has_s_unit"]["value"], vectors["announce"]["value"]
+    broadcast = {"announce": {**answer["announce"], "nonce": 0}}
+    wrong = []
+    for datagram, to, codes in ((who_has, None, 1), (broadcast, None, 1), (answer, "the asking one", 2)):
+        for ring in (Ring, Beside):
+            data = secure.encode_discovery(datagram, 7, ring, to)
+            if data[7] != codes or secure.decode_discovery(data, 7, Ring) != datagram:
+                wrong.append("secured discovery: %s is read otherwise" % datagram)
+            if len(data) < 128 and to is None or len(data) > 128 and to is not None:
+                wrong.append("secured discovery: %s has %d bytes" % (datagram, len(data)))
+        for at, byte in enumerate(data):
+            try:
+                secure.decode_discovery(data[:at] + bytes([byte ^ 1]) + data[at + 1 :], 7, Ring)
+                wrong.append("secured discovery: %s is read although byte %d was changed" % (datagram, at))
+            except wire.Malformed:
+                pass
+    # The fleet's code alone, which every unit of the fleet can make, makes no answer.
+    bare = secure.encode_discovery(answer, 7, Ring)
+    foreign = secure.encode_discovery(answer, 7, Ring, "the asking one")[:-32] + bytes(16)
+    foreign += secure.code(Ring.discovery_keys()[0], b"fmac", foreign)
+    for data in (bare, foreign, secure.encode_discovery(broadcast, 7, Ring, "all")):
+        try:
+            secure.decode_discovery(data, 7, Ring)
+            wrong.append("secured discovery: an announce counts with other codes than it must have")
+        except wire.Malformed:
+            pass
+    return wrong
 
 
 def main():
@@ -232,6 +294,7 @@ def main():
     wrong += differences
     differences, secured = check_secured()
     wrong += differences
+    wrong += check_discovery(vectors)
     for line in wrong:
         print(line, file=sys.stderr)
     seconds = time.monotonic() - begin

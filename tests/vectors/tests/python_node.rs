@@ -1,58 +1,33 @@
-//! A node that was written from `docs/wire.md`, in Python, joins a manager of the Linux port.
+//! A node that was written from `docs/wire.md`, in Python, joins a manager of the Linux port, in plain and in secured mode.
 //!
-//! On loopback, in a fleet of its own. Every wait is bounded.
+//! On loopback, in fleets of their own. Every wait is bounded.
 
-use std::io::{BufRead, BufReader};
-use std::process::{Child, Command, Stdio};
-use std::sync::mpsc::{Receiver, channel};
+use std::path::Path;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use cara_std::{CommunicationSystem, Interfaces, Parameters};
+use cara_processes::{Process, random_fleet, skip};
+use cara_std::{Builder, CommunicationSystem, Identity, Interfaces, MUnit, Parameters};
+use cara_test_keys::KeyFolder;
 
 const PATIENCE: Duration = Duration::from_secs(20);
 
-/// The Python node, and the lines that it says.
-struct PythonNode {
-    child: Child,
-    lines: Receiver<String>,
-    said: Vec<String>,
-}
-
-impl PythonNode {
-    /// `None` where there is no Python.
-    fn start(fleet: u32) -> Option<Self> {
-        let script = concat!(env!("CARGO_MANIFEST_DIR"), "/node.py");
-        let mut child = Command::new("python3")
-            .args([script, "--fleet", &fleet.to_string(), "--manager", "python_manager/1"])
-            .stdout(Stdio::piped())
-            .spawn()
-            .ok()?;
-        let stdout = BufReader::new(child.stdout.take()?);
-        let (sender, lines) = channel();
-        thread::spawn(move || stdout.lines().map_while(Result::ok).for_each(|line| drop(sender.send(line))));
-        Some(Self { child, lines, said: Vec::new() })
-    }
-
-    /// Waits for a line that begins so.
-    fn says(&mut self, beginning: &str) -> String {
-        let end = Instant::now() + PATIENCE;
-        loop {
-            let left = end.saturating_duration_since(Instant::now());
-            let line = self.lines.recv_timeout(left).unwrap_or_else(|_| panic!("no {beginning:?} in {:?}", self.said));
-            self.said.push(line.clone());
-            if line.starts_with(beginning) {
-                return line;
-            }
+/// The Python node, with these options; `None` where there is no Python.
+fn python(fleet: u32, options: &[&str]) -> Option<Process> {
+    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/node.py");
+    let fleet = fleet.to_string();
+    let arguments = [&[script, "--fleet", &fleet, "--manager", "python_manager/1"], options].concat();
+    match Process::start("node.py", Path::new("python3"), arguments) {
+        Ok(node) => Some(node),
+        Err(_) => {
+            skip("python3 is not installed");
+            None
         }
     }
 }
 
-impl Drop for PythonNode {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
+fn builder(fleet: u32) -> Builder<(), MUnit> {
+    CommunicationSystem::builder("python_manager", 1).unwrap().fleet(fleet).interfaces(Interfaces::Loopback)
 }
 
 fn wait_until(what: &str, mut holds: impl FnMut() -> bool) {
@@ -70,45 +45,73 @@ fn position(manager: &CommunicationSystem) -> [i64; 2] {
     pos.variable("position").unwrap()
 }
 
-#[test]
-fn a_node_written_from_the_document_joins_a_manager() {
-    let fleet = std::process::id() ^ 0x5AFE_0000;
-    let Some(mut node) = PythonNode::start(fleet) else {
-        eprintln!("skipped: there is no python3");
-        return;
-    };
-    let manager = CommunicationSystem::builder("python_manager", 1).unwrap().fleet(fleet);
-    // The node in Python has no cipher.
-    let manager = manager.interfaces(Interfaces::Loopback).insecure().build().unwrap();
-    manager.start().unwrap();
+/// What the counters of the link to the node say.
+fn counted(manager: &CommunicationSystem, counter: &str) -> u64 {
+    let counters = manager.s_units()[0].counters();
+    counters.iter().find(|(name, _)| *name == counter).map(|(_, count)| *count).unwrap()
+}
 
+/// The whole conversation, until the manager stops.
+fn talk(mut node: Process, manager: &CommunicationSystem, while_leased: impl FnOnce(&mut Process)) {
     wait_until("joining", || manager.number_of_s_units() == 1);
     let agv = manager.s_units()[0].clone();
     assert_eq!((agv.name(), agv.id()), ("agv_in_python", 77));
     assert!(agv.wait_for_function("go_to", PATIENCE));
-    assert_eq!(position(&manager), [3, -4]);
-    node.says("datagrams pass");
+    assert_eq!(position(manager), [3, -4]);
+    node.seen("datagrams pass", PATIENCE).unwrap();
 
-    // The lease of 400 ms is renewed for longer than it lasts, then given up.
+    // The lease of a second is renewed for longer than it lasts, then given up.
     let mut target = Parameters::new();
     target.add_int("position", 2).unwrap();
     target.set_value("position", [1, 2]).unwrap();
     agv.request("go_to", &target).unwrap();
-    assert_eq!(node.says("run go_to"), "run go_to {'position': [1, 2]}");
-    thread::sleep(Duration::from_millis(1_000));
-    assert_eq!(position(&manager), [1, 2]);
+    assert_eq!(node.expect("run go_to", PATIENCE).unwrap().text, "run go_to {'position': [1, 2]}");
+    while_leased(&mut node);
+    assert_eq!(position(manager), [1, 2]);
     agv.release("go_to").unwrap();
-    node.says("released");
-    assert!(!node.said.iter().any(|line| line.starts_with("stopped")), "{:?}", node.said);
+    node.expect("released", PATIENCE).unwrap();
+    assert!(!node.has("stopped"), "{:?}", node.lines());
 
     let mut arguments = Parameters::new();
     arguments.add_string("fault", 64).unwrap();
     arguments.add_int("minutes", 1).unwrap();
     manager.my_function_list().add_function("call_mechanic", &arguments, |arguments: Parameters| arguments).unwrap();
     manager.publish_my_function_list().unwrap();
-    assert_eq!(node.says("call_mechanic"), "call_mechanic {'fault': 'flat tyre', 'minutes': [7]}");
+    node.expect("call_mechanic {'fault': 'flat tyre', 'minutes': [7]}", PATIENCE).unwrap();
 
+    wait_until("a datagram", || counted(manager, "DatagramsReceived") > 0);
+    for never in ["DatagramsDropped", "DatagramsForged", "DatagramsRepeated", "FramesRefused", "ItemsSkipped"] {
+        assert_eq!(counted(manager, never), 0, "{never}");
+    }
     manager.stop();
-    assert_eq!(node.says("ended"), "ended close 1");
-    assert!(node.child.wait().unwrap().success());
+    node.expect("ended close 1", PATIENCE).unwrap();
+    assert!(node.wait(PATIENCE).unwrap().success());
+}
+
+#[test]
+fn a_node_written_from_the_document_joins_a_manager() {
+    let fleet = random_fleet();
+    let Some(node) = python(fleet, &["--insecure"]) else { return };
+    let manager = builder(fleet).insecure().build().unwrap();
+    manager.start().unwrap();
+    talk(node, &manager, |_| thread::sleep(Duration::from_secs(2)));
+}
+
+/// As the last one, with keys, which the node makes anew about once a second.
+#[test]
+fn a_node_written_from_the_document_joins_a_secured_manager() {
+    let fleet = random_fleet();
+    let keys = KeyFolder::draw(fleet, &["python_manager/1@m_unit", "agv_in_python/77"]).unwrap();
+    let folder = keys.path().display().to_string();
+    let Some(node) = python(fleet, &["--keys", &folder, "--renew", "1"]) else { return };
+    let file = keys.file(&Identity::m_unit("python_manager", 1).unwrap()).unwrap();
+    let manager = builder(fleet).key_file(file).build().unwrap();
+    manager.start().unwrap();
+    talk(node, &manager, |node| {
+        // The lease is renewed under each of these keys.
+        for _ in 0..3 {
+            node.expect("new keys", PATIENCE).unwrap();
+        }
+        wait_until("new keys", || counted(&manager, "KeysRenewed") >= 3);
+    });
 }
