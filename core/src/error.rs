@@ -358,6 +358,23 @@ pub enum Error {
     /// The callee is of an earlier version, which does not know something that the request depends on; it did not run it.
     #[error("the peer's version does not know what the request asks for: update the peer, or ask without it")]
     Unsupported,
+    /// Another unit, with this ID number, moves what the function moves. The callee did not run it.
+    #[error("the unit with the ID {by} holds what this function moves: wait until it has released it, or take it over")]
+    Held {
+        /// The ID number of the holder.
+        by: u32,
+    },
+    /// What the function moves was stopped, by the unit with this ID number or, with 0, by the callee itself, and has not been
+    /// reset. The callee did not run it.
+    #[error(
+        "what it moves was stopped by the unit with the ID {by} (0: by itself), reason {reason}: look why, then call its function that resets"
+    )]
+    Inhibited {
+        /// The ID number of the unit that stopped it; 0 for the callee itself.
+        by: u32,
+        /// Why, as the callee numbers its reasons; 0 for a function that stops.
+        reason: u16,
+    },
     /// The callee's rules do not let this unit call the function.
     #[error(
         "the peer's access table does not let this unit call the function: change the table, or ask with another unit"
@@ -430,6 +447,8 @@ impl Error {
             | Self::Busy
             | Self::Malformed
             | Self::Unsupported
+            | Self::Held { .. }
+            | Self::Inhibited { .. }
             | Self::NotAllowed
             | Self::Service(_)
             | Self::Refused(_) => Cause::Peer,

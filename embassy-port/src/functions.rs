@@ -100,7 +100,10 @@ impl<T> MyFunctionList<T> {
             // What a call of the service before started would go on to the end of its lease.
             let stop = replaced.and_then(Listed::clear);
             // Another service that had this lease may have left it dead, and no call would begin.
-            lease.map(Lease::clear);
+            let shares =
+                |listed: &Listed<T>| listed.lease.zip(lease).is_some_and(|(one, other)| core::ptr::eq(one, other));
+            let sharing = machine.functions.iter().filter(|function| shares(function.handler)).count();
+            lease.filter(|_| sharing == 1).map(Lease::clear);
             machine.wakers.leases.wake();
             Ok(stop)
         })?;

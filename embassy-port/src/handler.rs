@@ -8,7 +8,7 @@ use cara_core::distribution::function::Attributes;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::{Parameters, ParametersView};
 use cara_core::error::{Error, ServiceError};
-use cara_core::services::lease::{Lease, Service};
+use cara_core::services::lease::{Ended, Lease, Service};
 use cara_core::time::{Duration, Instant};
 
 use crate::handle::Handle;
@@ -43,6 +43,14 @@ impl<T> fmt::Debug for Call<T> {
 }
 
 impl<T> Call<T> {
+    /// Does what the call wants to change, unless its order has ended; always for a service without a lease.
+    pub fn commit<R>(&self, change: impl FnOnce() -> R) -> Result<R, Ended> {
+        match &self.lease {
+            Some(lease) => lease.commit(change),
+            None => Ok(change()),
+        }
+    }
+
     /// Ends when what the call starts may go on no longer, for whatever reason; never for a service without a lease.
     /// Cancelling loses nothing.
     pub async fn lease_ended(&self) {
@@ -186,7 +194,14 @@ impl<T> Default for ServiceOptions<T> {
 impl<T> ServiceOptions<T> {
     /// Normal priority, no lease.
     pub const fn new() -> Self {
-        let attributes = Attributes { priority: Priority::Normal, lease: None, idempotent: false };
+        let attributes = Attributes {
+            priority: Priority::Normal,
+            lease: None,
+            idempotent: false,
+            actuator: 0,
+            stop: false,
+            reset: false,
+        };
         Self { attributes, lease: None, safe: None, then: None }
     }
 
@@ -199,11 +214,39 @@ impl<T> ServiceOptions<T> {
     /// What the service starts goes on for this long after the caller's last sign that it wants it; then `safe` runs,
     /// once, before any other work. It must be short, and does not get the application's state: what it switches off is
     /// a pin, or a static that the motors read; what needs the state belongs in [`then`](Self::then). `lease` is a static
-    /// of this service alone, which a motor's interrupt can read: it is dead in time also when no task runs any more.
+    /// of what the service moves, which a motor's interrupt can read: it is dead in time also when no task runs any more.
+    /// Services that move the same thing share one, and its hook: an order of one of them takes the place of any other's.
     pub fn lease(mut self, length: impl Into<Duration>, lease: &'static Lease, safe: &'static Safe) -> Self {
         self.attributes.lease = Some(length.into());
         self.lease = Some(lease);
         self.safe = Some(safe);
+        self
+    }
+
+    /// Before the handler runs, whichever order holds this lease ends, and its hook runs before any other work; none begins
+    /// until it is reset, and none that was asked for before, ever. The stop of this unit, not a substitute for an emergency
+    /// stop that is certified.
+    pub const fn stops(mut self, lease: &'static Lease) -> Self {
+        self.lease = Some(lease);
+        self.stops_all()
+    }
+
+    /// As [`stops`](Self::stops), for all leases of the unit.
+    pub const fn stops_all(mut self) -> Self {
+        self.attributes.stop = true;
+        self
+    }
+
+    /// When the handler has returned results, orders of this lease may begin again, unless it was stopped meanwhile. A
+    /// handler that finds it unsafe answers with an error.
+    pub const fn resets(mut self, lease: &'static Lease) -> Self {
+        self.lease = Some(lease);
+        self.resets_all()
+    }
+
+    /// As [`resets`](Self::resets), for all leases of the unit.
+    pub const fn resets_all(mut self) -> Self {
+        self.attributes.reset = true;
         self
     }
 
@@ -240,7 +283,9 @@ impl<T> Listed<T> {
     /// The service goes: an order that has not ended does so. Its safe hook is to run then; the one behind it, which takes the
     /// application's state, does not.
     pub(crate) fn clear(self) -> Option<&'static Safe> {
-        self.lease?.clear().then_some(self.safe).flatten()
+        // A service without a hook moves nothing: it stops or resets what others move.
+        let safe = self.safe?;
+        self.lease?.clear().then_some(safe)
     }
 }
 

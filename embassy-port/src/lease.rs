@@ -4,7 +4,7 @@ use core::fmt;
 use core::future::poll_fn;
 use core::task::Poll;
 
-use cara_core::services::lease::{Lease, Order};
+use cara_core::services::lease::{Ended, Lease, Order};
 use cara_core::services::session::Call;
 
 use crate::handle::Handle;
@@ -33,6 +33,11 @@ impl LeaseWatch {
     /// A call's hold of the lease of its service.
     pub(crate) fn new(lease: Option<&'static Lease>, call: &Call) -> Option<Self> {
         lease.zip(call.order).map(|(lease, order)| Self { lease, order })
+    }
+
+    /// Does what the call wants to change, or nothing once its order has ended.
+    pub fn commit<R>(&self, change: impl FnOnce() -> R) -> Result<R, Ended> {
+        if self.is_live() { Ok(change()) } else { Err(Ended) }
     }
 
     /// Whether the caller still wants what this call started. Once it has said no, it says so for ever.

@@ -8,12 +8,12 @@ use cara_core::distribution::function::Attributes;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::{Parameters, ParametersView};
 use cara_core::error::{Error, ServiceError};
-use cara_core::services::lease::{Lease, Order, Service};
+use cara_core::services::lease::{Claim, Ended, Latch, Lease, Order, Service};
 use cara_core::time::{Duration, Instant};
 
+use crate::actuator::Actuator;
 use crate::executor::Executor;
-use crate::lease::{LeaseEnded, LeaseWatch, ServiceLease};
-use crate::safe_hook::SafeHook;
+use crate::lease::{LeaseEnded, LeaseWatch};
 
 /// What a handler is told about the call that it serves.
 #[derive(Clone, Debug)]
@@ -31,6 +31,27 @@ pub struct Call {
 }
 
 impl Call {
+    /// Does what the call wants to change, unless its order has ended; always for a service without a lease. See
+    /// [`LeaseWatch::commit`].
+    ///
+    /// ```
+    /// # use std::sync::atomic::{AtomicI64, Ordering};
+    /// # use cara_std::{Call, ParametersView, ServiceError};
+    /// static TARGET: AtomicI64 = AtomicI64::new(0);
+    ///
+    /// fn go_to(call: &Call, parameters: &mut ParametersView) -> Result<(), ServiceError> {
+    ///     let target: i64 = parameters.variable("target")?;
+    ///     call.commit(|| TARGET.store(target, Ordering::SeqCst))?;
+    ///     Ok(())
+    /// }
+    /// ```
+    pub fn commit<R>(&self, change: impl FnOnce() -> R) -> Result<R, Ended> {
+        match &self.lease {
+            Some(lease) => lease.commit(change),
+            None => Ok(change()),
+        }
+    }
+
     /// Ends when what the call starts may go on no longer, for whatever reason; never for a service without a lease.
     /// [`LeaseWatch::wait_until_ended`] is the form that blocks.
     pub fn lease_ended(&self) -> LeaseEnded {
@@ -72,49 +93,60 @@ impl<T> Run<T> {
 /// A service as the list of functions holds it.
 pub(crate) struct Handler<T> {
     pub(crate) run: Run<T>,
-    /// To be read; a service has it together with the hook, which writes it.
-    pub(crate) lease: Option<Arc<ServiceLease>>,
-    pub(crate) safe: Option<Arc<SafeHook>>,
+    /// What it moves, or what it alone stops or resets.
+    pub(crate) actuator: Option<Actuator>,
+    /// It moves it.
+    pub(crate) moves: bool,
     /// Where its emergencies run, if it is a service for those.
     pub(crate) executor: Option<Arc<Executor>>,
 }
 
 impl<T: 'static> Service for Handler<T> {
     fn lease(&self) -> Option<&Lease> {
-        self.lease.as_ref().map(|service| &service.lease)
+        self.actuator.as_ref().map(Actuator::word)
     }
 
-    fn begin_lease(&self, now: Instant, end: Instant) -> Result<Option<Order>, Error> {
-        let Some(safe) = &self.safe else { return Ok(None) };
-        safe.begin(now, end).map(Some).ok_or(Error::Busy)
+    fn begin_lease(&self, now: Instant, end: Instant, claim: &Claim) -> Result<Option<Order>, Error> {
+        self.actuator.as_ref().map(|actuator| actuator.safe.begin(now, end, claim)).transpose()
+    }
+
+    fn inhibit(&self, now: Instant, latch: Latch) {
+        if let Some(actuator) = &self.actuator {
+            actuator.safe.inhibit(now, latch);
+            actuator.lease.wake();
+        }
+    }
+
+    fn reset(&self, now: Instant, made: Instant) {
+        if let Some(actuator) = &self.actuator {
+            actuator.safe.reset(now, made);
+        }
     }
 
     fn renew_lease(&self, order: Order, end: Instant) -> bool {
-        self.safe.as_ref().is_none_or(|safe| safe.renew(order, end))
+        self.actuator.as_ref().is_none_or(|actuator| actuator.safe.renew(order, end))
     }
 
     fn cut_lease(&self, order: Order) {
-        if let Some(safe) = &self.safe {
-            safe.cut(order);
+        if let Some(actuator) = &self.actuator {
+            actuator.safe.cut(order);
         }
     }
 
     fn finish_lease(&self, order: Order) -> bool {
-        self.safe.as_ref().is_none_or(|safe| safe.finish(order))
+        self.actuator.as_ref().is_none_or(|actuator| actuator.safe.finish(order))
     }
 
     fn expire_lease(&self, order: Order) -> bool {
-        self.safe.as_ref().is_none_or(|safe| safe.expire(order))
+        self.actuator.as_ref().is_none_or(|actuator| actuator.safe.expire(order))
     }
 }
 
 impl<T> Drop for Handler<T> {
     fn drop(&mut self) {
-        if let Some(safe) = &self.safe {
-            safe.clear();
-        }
-        if let Some(lease) = &self.lease {
-            lease.wake();
+        if let Some(actuator) = self.actuator.as_ref().filter(|_| self.moves) {
+            actuator.safe.clear();
+            actuator.lease.wake();
         }
     }
 }
@@ -122,6 +154,7 @@ impl<T> Drop for Handler<T> {
 /// How a service wants to be called, and what makes it safe.
 pub struct ServiceOptions<T> {
     pub(crate) attributes: Attributes,
+    pub(crate) actuator: Option<Actuator>,
     pub(crate) safe: Option<Arc<Safe>>,
     pub(crate) then: Option<Arc<Hook<T>>>,
 }
@@ -134,7 +167,7 @@ impl<T> fmt::Debug for ServiceOptions<T> {
 
 impl<T> Default for ServiceOptions<T> {
     fn default() -> Self {
-        Self { attributes: Attributes::default(), safe: None, then: None }
+        Self { attributes: Attributes::default(), actuator: None, safe: None, then: None }
     }
 }
 
@@ -178,6 +211,40 @@ impl<T> ServiceOptions<T> {
     pub fn lease(mut self, length: impl Into<Duration>, safe: impl Fn() + Send + Sync + 'static) -> Self {
         self.attributes.lease = Some(length.into());
         self.safe = Some(Arc::new(safe));
+        self
+    }
+
+    /// As [`lease`](Self::lease), for what several services move: an order of one of them takes the place of any other's, and
+    /// the hook is the actuator's.
+    pub fn moves(mut self, actuator: &Actuator, length: impl Into<Duration>) -> Self {
+        self.attributes.lease = Some(length.into());
+        self.actuator = Some(actuator.clone());
+        self
+    }
+
+    /// Before the handler runs, whichever order moves this ends and its hook starts; none begins until it is reset, and none that
+    /// was asked for before, ever. The stop of this unit, not a substitute for an emergency stop that is certified.
+    pub fn stops(mut self, actuator: &Actuator) -> Self {
+        self.actuator = Some(actuator.clone());
+        self.stops_all()
+    }
+
+    /// As [`stops`](Self::stops), for all that the unit moves.
+    pub const fn stops_all(mut self) -> Self {
+        self.attributes.stop = true;
+        self
+    }
+
+    /// When the handler has returned results, orders of this actuator may begin again, unless it was stopped meanwhile. A
+    /// handler that finds it unsafe answers with an error.
+    pub fn resets(mut self, actuator: &Actuator) -> Self {
+        self.actuator = Some(actuator.clone());
+        self.resets_all()
+    }
+
+    /// As [`resets`](Self::resets), for all that the unit moves.
+    pub const fn resets_all(mut self) -> Self {
+        self.attributes.reset = true;
         self
     }
 

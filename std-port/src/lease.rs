@@ -7,9 +7,11 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::task::{Context, Poll, Waker};
 use std::time::Duration;
 
-use cara_core::services::lease::{Lease, Order};
+use cara_core::services::lease::{Ended, Lease, Order};
 
+use crate::actuator::Actuator;
 use crate::clock::Clock;
+use crate::safe_hook::SafeHook;
 
 /// A service's lease, and the threads and tasks that await its end.
 #[derive(Debug, Default)]
@@ -41,14 +43,21 @@ impl ServiceLease {
 #[derive(Clone)]
 pub struct LeaseWatch {
     service: Arc<ServiceLease>,
-    order: Option<Order>,
+    /// The order that it is of, and the hook under whose lock that one ends.
+    order: Option<(Order, Arc<SafeHook>)>,
     clock: Clock,
 }
 
 impl LeaseWatch {
-    /// Of the service, or of one order.
-    pub(crate) fn new(service: Arc<ServiceLease>, order: Option<Order>, clock: Clock) -> Self {
-        Self { service, order, clock }
+    /// Of whichever order there is.
+    pub(crate) const fn new(service: Arc<ServiceLease>, clock: Clock) -> Self {
+        Self { service, order: None, clock }
+    }
+
+    /// Of one order.
+    pub(crate) fn of(order: Order, actuator: Actuator) -> Self {
+        let Actuator { lease, safe, clock } = actuator;
+        Self { service: lease, order: Some((order, safe)), clock }
     }
 
     /// Whether the caller still wants what it started.
@@ -64,9 +73,19 @@ impl LeaseWatch {
     /// ```
     pub fn is_live(&self) -> bool {
         let now = self.clock.now();
-        match self.order {
-            Some(order) => self.service.lease.is_live_for(order, now),
+        match &self.order {
+            Some((order, _)) => self.service.lease.is_live_for(*order, now),
             None => self.service.lease.is_live(now),
+        }
+    }
+
+    /// Does what the order wants, or nothing once it has ended: neither its end nor its safe hook comes in between, and
+    /// both wait for it. So `change` must be short, and ask nothing of the unit.
+    pub fn commit<R>(&self, change: impl FnOnce() -> R) -> Result<R, Ended> {
+        match &self.order {
+            Some((order, safe)) => safe.commit(*order, change),
+            None if self.is_live() => Ok(change()),
+            None => Err(Ended),
         }
     }
 

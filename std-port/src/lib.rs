@@ -20,6 +20,7 @@
 //! ```
 
 pub mod access;
+mod actuator;
 mod builder;
 mod clock;
 mod communication_system;
@@ -58,6 +59,7 @@ mod threads;
 mod timers;
 mod unit;
 
+pub use actuator::Actuator;
 pub use builder::{BuildError, Builder};
 pub use cara_core::config::{Constraints, Mode, PLAIN_PORT, Priority, SECURED_PORT};
 pub use cara_core::distribution::connection_handler::NodeCounter;
@@ -68,7 +70,7 @@ pub use cara_core::distribution::name::{Shown, is_hidden};
 pub use cara_core::distribution::parameters::{Parameters, ParametersView, Type, Value};
 pub use cara_core::error::{Cause, CloseReason, Error, Limit, Refusal, ServiceError};
 pub use cara_core::host::connections::LinkCounter;
-pub use cara_core::services::lease::LeaseEnd;
+pub use cara_core::services::lease::{Ended, Latch, LeaseEnd};
 pub use cara_core::services::requests::CallId;
 pub use cara_core::services::session::{Delivery, RequestOptions};
 pub use cara_core::time::Duration;

@@ -9,9 +9,10 @@ use cara_core::distribution::function_list::{FunctionList, Slot};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 
+use crate::actuator::Actuator;
 use crate::engine::{Engine, arena_bytes};
 use crate::executor::Executor;
-use crate::handler::{Handler, IntoHandler, ServiceOptions};
+use crate::handler::{Handler, Hook, IntoHandler, Safe, ServiceOptions};
 use crate::lease::{LeaseWatch, ServiceLease};
 use crate::safe_hook::{Parts, SafeHook};
 use crate::storage::Boxed;
@@ -111,7 +112,6 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
         put: impl FnOnce(&mut FunctionList<Boxed, Handler<T>>, &Definition, Attributes, Handler<T>) -> Result<Slot, Error>,
     ) -> Result<LeaseWatch, Error> {
         self.check_size(definition)?;
-        let lease = Arc::new(ServiceLease::default());
         let attributes = options.attributes;
         let run = handler.into_run().0;
         let is_emergency = attributes.priority == Priority::Emergency;
@@ -119,23 +119,34 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
             return Err(Error::EmergencyWaits);
         }
         let executor = if is_emergency { Some(Arc::new(Executor::start("cara-emergency")?)) } else { None };
-        let safe = self.safe_hook(&options, &lease)?;
-        let kept = attributes.lease.map(|_| lease.clone());
-        let handler = Handler { run, lease: kept, safe, executor };
+        let actuator = match (options.actuator, options.safe) {
+            (Some(_), _) if options.then.is_some() => return Err(Error::BadConstraint),
+            (None, Some(hook)) => Some(self.make_actuator(hook, options.then)?),
+            (actuator, _) => actuator,
+        };
+        let watch = actuator.as_ref().map_or_else(|| self.never(), Actuator::watch);
+        let handler = Handler { run, actuator, moves: attributes.lease.is_some(), executor };
         put(&mut self.engine.functions_mut(), definition, attributes, handler)?;
-        Ok(LeaseWatch::new(lease, None, self.engine.clock()))
+        Ok(watch)
     }
 
-    fn safe_hook(
-        &self,
-        options: &ServiceOptions<T>,
-        lease: &Arc<ServiceLease>,
-    ) -> Result<Option<Arc<SafeHook>>, Error> {
-        let Some(hook) = options.safe.clone() else { return Ok(None) };
-        let then = options.then.clone().map(|then| self.engine.afterwards(then)).transpose()?;
+    /// The lease of a service that has none.
+    fn never(&self) -> LeaseWatch {
+        LeaseWatch::new(Arc::default(), self.engine.clock())
+    }
+
+    /// What several services [move](ServiceOptions::moves), with the hook that makes it safe: see
+    /// [`ServiceOptions::lease`]. [`Error::Network`] when the system refuses the hook's thread.
+    pub fn actuator(&self, safe: impl Fn() + Send + Sync + 'static) -> Result<Actuator, Error> {
+        self.make_actuator(Arc::new(safe), None)
+    }
+
+    fn make_actuator(&self, hook: Arc<Safe>, then: Option<Arc<Hook<T>>>) -> Result<Actuator, Error> {
+        let (lease, clock) = (Arc::<ServiceLease>::default(), self.engine.clock());
+        let then = then.map(|then| self.engine.afterwards(then)).transpose()?;
         let late = self.engine.hooks_late();
-        let parts = Parts { lease: lease.clone(), clock: self.engine.clock(), hook, then, late };
-        SafeHook::start(parts).map(|hook| Some(Arc::new(hook)))
+        let safe = Arc::new(SafeHook::start(Parts { lease: lease.clone(), clock, hook, then, late })?);
+        Ok(Actuator { lease, safe, clock })
     }
 
     /// Removes a function; peers are told.
@@ -159,7 +170,8 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
     fn leased(&self, name: &str) -> Option<(Slot, Option<Arc<ServiceLease>>)> {
         let functions = self.engine.functions();
         let slot = functions.find(name)?;
-        Some((slot, functions.function(slot)?.handler.lease.clone()))
+        let actuator = functions.function(slot)?.handler.actuator.as_ref();
+        Some((slot, actuator.map(|actuator| actuator.lease.clone())))
     }
 
     /// How many functions there are.

@@ -13,7 +13,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 
 use cara_core::error::Error;
-use cara_core::services::lease::{Lease, Order};
+use cara_core::services::lease::{Claim, Ended, Latch, Lease, Order};
 use cara_core::time::{Duration, Instant};
 
 use crate::clock::Clock;
@@ -76,11 +76,33 @@ impl SafeHook {
     }
 
     /// Begins an order: the thread looks when its lease ends.
-    pub(crate) fn begin(&self, now: Instant, end: Instant) -> Option<Order> {
+    pub(crate) fn begin(&self, now: Instant, end: Instant, claim: &Claim) -> Result<Order, Error> {
         let _writing = lock(&self.shared.state);
-        let order = self.shared.lease().begin(now, end)?;
+        let order = self.shared.lease().claim(now, end, claim)?;
         self.shared.changed.notify_all();
-        Some(order)
+        Ok(order)
+    }
+
+    /// Does what an order wants, unless it has ended: neither its end nor its hook comes in between.
+    pub(crate) fn commit<R>(&self, order: Order, change: impl FnOnce() -> R) -> Result<R, Ended> {
+        let _writing = lock(&self.shared.state);
+        let is_live = self.shared.lease().is_live_for(order, self.shared.parts.clock.now());
+        if is_live { Ok(change()) } else { Err(Ended) }
+    }
+
+    /// Lets no order begin, and starts the hook for the one that there is: its unit reports that end later.
+    pub(crate) fn inhibit(&self, now: Instant, latch: Latch) {
+        let mut state = lock(&self.shared.state);
+        self.shared.lease().inhibit(now, latch);
+        if self.shared.lease().left(now).is_some() && !state.started_early && !state.due {
+            (state.due, state.started_early) = (true, true);
+        }
+        self.shared.changed.notify_all();
+    }
+
+    pub(crate) fn reset(&self, now: Instant, made: Instant) {
+        let _writing = lock(&self.shared.state);
+        self.shared.lease().reset(now, made);
     }
 
     pub(crate) fn renew(&self, order: Order, end: Instant) -> bool {
@@ -239,9 +261,10 @@ mod tests {
     use crate::testing::until;
 
     static AHEAD: AtomicU64 = AtomicU64::new(0);
+    const CLAIM: Claim = Claim { holder: 1, replaces: None, takes_over: true };
 
     fn begin(safe: &SafeHook, clock: Clock, length: Duration) -> Order {
-        safe.begin(clock.now(), clock.now() + length).expect("the order before has ended")
+        safe.begin(clock.now(), clock.now() + length, &CLAIM).expect("the order before has ended")
     }
 
     /// The unit does nothing here: the thread sees the end of a lease that a suspension has outlasted, and what the unit
@@ -299,7 +322,7 @@ mod tests {
         const LONG: Duration = Duration::from_secs(3_600);
         type Write = fn(&SafeHook, Order, Instant) -> bool;
         let writes: [Write; 6] = [
-            |safe, _, now| safe.begin(now, now + LONG).is_some(),
+            |safe, _, now| safe.begin(now, now + LONG, &CLAIM).is_ok(),
             |safe, order, now| safe.renew(order, now + LONG + LONG),
             |safe, order, now| {
                 safe.cut(order);
@@ -355,7 +378,7 @@ mod tests {
         let serve = || {
             for call in 0..CALLS {
                 let now = clock.now();
-                let Some(order) = safe.begin(now, now + LONG) else { panic!("call {call}: busy for ever") };
+                let Ok(order) = safe.begin(now, now + LONG, &CLAIM) else { panic!("call {call}: busy for ever") };
                 if safe.has_run() {
                     let before = runs.load(Ordering::SeqCst);
                     let renewed = safe.renew(order, now + LONG);

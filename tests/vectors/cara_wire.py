@@ -346,7 +346,7 @@ ERRORS = {
     4: ("wrong_type", ("index",)), 5: ("wrong_size", ("index", "expected", "found")), 6: ("expired", ()),
     7: ("stale", ()), 8: ("busy", ()), 9: ("malformed", ()), 10: ("not_allowed", ()), 11: ("would_deadlock", ()),
     12: ("too_large", ("limit",)), 13: ("too_soon", ("wait",)), 14: ("result_would_not_fit", ("need", "have")),
-    15: ("result_lost", ()), 16: ("unsupported", ()),
+    15: ("result_lost", ()), 16: ("unsupported", ()), 17: ("held", ("by",)), 18: ("inhibited", ("by", "reason")),
     20: ("service_failed", ("code",)), 21: ("service_panicked", ()), 22: ("service_not_ready", ()),
     23: ("service_bad_results", ()),
 }
@@ -362,7 +362,7 @@ CONTROLS = {
 }
 # Behind one of these nothing follows in a message.
 LAST_ITEMS = ("list_end", "list_ack", "lease_ended")
-LEASE_ENDS = ["finished", "expired", "replaced"]
+LEASE_ENDS = ["finished", "expired", "replaced", "stopped"]
 
 
 def decode_message(data):
@@ -384,7 +384,7 @@ def decode_message(data):
 def encode_message(message):
     (name, value), = message.items()
     if name == "request":
-        flags = value["unknown"] | (1 if value["wants_reply"] else 0)
+        flags = value["unknown"] | (1 if value["wants_reply"] else 0) | (16 if value.get("takes_over") else 0)
         numbers = (value["id"], value["remaining"], value["stamp"], value["since"], 0)
         place = (value["slot"], value["generation"], REQUEST_BYTES // 4, 0)
         return struct.pack("<BBHHBBIIQII", 1, flags, *place, *numbers) + bytes.fromhex(value["block"])
@@ -404,7 +404,8 @@ def read_request(reader):
     form = "BBHHBBIIQII"
     _, flags, slot, generation, words, _, number, remaining, stamp, since, _ = reader.fixed(form)
     return {
-        "id": number, "slot": slot, "generation": generation, "wants_reply": flags & 1 == 1, "unknown": flags & 0xF0,
+        "id": number, "slot": slot, "generation": generation, "wants_reply": flags & 1 == 1,
+        "takes_over": flags & 0x10 != 0, "unknown": flags & 0xE0,
         "remaining": remaining, "stamp": stamp, "since": since, "block": behind_header(reader, words, REQUEST_BYTES),
     }
 
@@ -419,8 +420,9 @@ def read_answer(reader):
         return {"id": number, "error": name}
     values = {"index": index} if fields[0] == "index" else {}
     values.update(zip([field for field in fields if field != "index"], (first, second)))
-    if name == "service_failed":
-        values["code"] &= 0xFFFF
+    for short in ("code", "reason"):
+        if short in values:
+            values[short] &= 0xFFFF
     return {"id": number, "error": {name: values}}
 
 
@@ -502,14 +504,19 @@ def text_form(name, arguments, results):
 
 
 def decode_attributes(data):
-    flags, _, lease = Reader(data).fixed("B3sI")
-    return {"priority": PRIORITIES[flags & 3], "idempotent": flags & 4 != 0, "lease": lease or None}
+    flags, actuator, _, lease = Reader(data).fixed("BB2sI")
+    return {
+        "priority": PRIORITIES[flags & 3], "idempotent": flags & 4 != 0, "lease": lease or None,
+        "actuator": actuator, "stop": flags & 8 != 0, "reset": flags & 16 != 0,
+    }
 
 
 def encode_attributes(attributes):
     """Those that are left out have their defaults."""
-    flags = PRIORITIES.index(attributes.get("priority", "normal")) | (4 if attributes.get("idempotent") else 0)
-    return struct.pack("<B3sI", flags, b"\0\0\0", attributes.get("lease") or 0)
+    flags = PRIORITIES.index(attributes.get("priority", "normal"))
+    for name, bit in (("idempotent", 4), ("stop", 8), ("reset", 16)):
+        flags |= bit if attributes.get(name) else 0
+    return struct.pack("<BB2sI", flags, attributes.get("actuator", 0), b"\0\0", attributes.get("lease") or 0)
 
 
 def decode_block(data, variables):

@@ -16,6 +16,13 @@ pub struct Attributes {
     pub lease: Option<Duration>,
     /// Running it twice is as good as running it once.
     pub idempotent: bool,
+    /// Functions of one unit with the same number, which is not 0, move the same thing. Of a unit's own functions it is
+    /// told by the leases that they share.
+    pub actuator: u8,
+    /// A call of it ends the orders of its actuator, or of all, and inhibits new ones until a function with `reset` is called.
+    pub stop: bool,
+    /// A call of it that its service answers with results lets its actuator, or all, move again.
+    pub reset: bool,
 }
 
 impl Attributes {
@@ -23,16 +30,22 @@ impl Attributes {
     pub const WIRE_BYTES: usize = if LATER { 12 } else { 8 };
     const PRIORITY: u8 = 0b11;
     const IDEMPOTENT: u8 = 1 << 2;
+    const STOP: u8 = 1 << 3;
+    const RESET: u8 = 1 << 4;
 
-    /// Bits 0 and 1: priority; bit 2: idempotent; three bytes of zero; the lease in milliseconds, u32 little-endian, 0
-    /// for none. A lease is rounded down, but never to none.
+    /// Bits 0 and 1: priority; bits 2 to 4: idempotent, stop, reset; actuator, u8; two bytes of zero; the lease in
+    /// milliseconds, u32 little-endian, 0 for none. A lease is rounded down, but never to none.
     pub fn encode(&self) -> [u8; Self::WIRE_BYTES] {
-        let flags = self.priority as u8 | if self.idempotent { Self::IDEMPOTENT } else { 0 };
+        let bit = |set, bit| if set { bit } else { 0 };
+        let flags = self.priority as u8
+            | bit(self.idempotent, Self::IDEMPOTENT)
+            | bit(self.stop, Self::STOP)
+            | bit(self.reset, Self::RESET);
         let lease = self.lease.map_or(0, |lease| u32::try_from(lease.as_millis()).unwrap_or(u32::MAX).max(1));
         let [a, b, c, d] = lease.to_le_bytes();
         let mut bytes = [0; Self::WIRE_BYTES];
         if let Some(place) = bytes.first_chunk_mut() {
-            *place = [if LATER { flags | 0xF8 } else { flags }, 0, 0, 0, a, b, c, d];
+            *place = [if LATER { flags | 0xE0 } else { flags }, self.actuator, 0, 0, a, b, c, d];
         }
         bytes
     }
@@ -40,24 +53,31 @@ impl Attributes {
     /// The inverse of [`encode`](Self::encode). Other bits, and bytes that follow, are of a later version and passed over;
     /// [`Error::Malformed`] for fewer bytes.
     pub fn decode(bytes: &[u8]) -> Result<Self, Error> {
-        let &[flags, _, _, _, a, b, c, d, ..] = bytes else { return Err(Error::Malformed) };
+        let &[flags, actuator, _, _, a, b, c, d, ..] = bytes else { return Err(Error::Malformed) };
         let lease = u32::from_le_bytes([a, b, c, d]);
         Ok(Self {
             priority: Priority::from_wire(flags & Self::PRIORITY).ok_or(Error::Malformed)?,
             lease: (lease != 0).then(|| Duration::from_millis(u64::from(lease))),
             idempotent: flags & Self::IDEMPOTENT != 0,
+            actuator,
+            stop: flags & Self::STOP != 0,
+            reset: flags & Self::RESET != 0,
         })
     }
 }
 
-/// In words, as `high, lease 400 ms, idempotent`.
+/// In words, as `high, lease 400 ms, actuator 1, idempotent`.
 impl fmt::Display for Attributes {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(self.priority.word())?;
         if let Some(lease) = self.lease {
             write!(f, ", lease {} ms", lease.as_millis())?;
         }
-        f.write_str(if self.idempotent { ", idempotent" } else { "" })
+        if self.actuator != 0 {
+            write!(f, ", actuator {}", self.actuator)?;
+        }
+        let words = [(self.stop, ", stop"), (self.reset, ", reset"), (self.idempotent, ", idempotent")];
+        words.iter().filter(|(set, _)| *set).try_for_each(|(_, word)| f.write_str(word))
     }
 }
 
@@ -79,13 +99,19 @@ mod tests {
     fn attributes_travel() {
         let usual = Attributes::default();
         assert_eq!(usual.encode(), [2, 0, 0, 0, 0, 0, 0, 0]);
-        let all =
-            Attributes { priority: Priority::Emergency, lease: Some(Duration::from_millis(0x1234)), idempotent: true };
-        assert_eq!(all.encode(), [4, 0, 0, 0, 0x34, 0x12, 0, 0]);
+        let all = Attributes {
+            priority: Priority::Emergency,
+            lease: Some(Duration::from_millis(0x1234)),
+            idempotent: true,
+            actuator: 7,
+            stop: true,
+            reset: true,
+        };
+        assert_eq!(all.encode(), [0x1C, 7, 0, 0, 0x34, 0x12, 0, 0]);
         assert_eq!(Attributes::decode(&all.encode()), Ok(all));
         let short = Attributes { lease: Some(Duration::from_micros(1)), ..usual };
         assert_eq!(Attributes::decode(&short.encode()).unwrap().lease, Some(Duration::from_millis(1)));
-        let later = [4 | 0xF8, 9, 9, 9, 0x34, 0x12, 0, 0, 7, 7];
+        let later = [0x1C | 0xE0, 7, 9, 9, 0x34, 0x12, 0, 0, 7, 7];
         assert_eq!(Attributes::decode(&later), Ok(all), "a later version says more");
         assert_eq!(Attributes::decode(&later[..7]), Err(Error::Malformed));
     }
@@ -97,5 +123,9 @@ mod tests {
         assert_eq!(leased.to_string(), "normal, lease 400 ms");
         let all = Attributes { priority: Priority::High, idempotent: true, ..leased };
         assert_eq!(all.to_string(), "high, lease 400 ms, idempotent");
+        let drive = Attributes { actuator: 2, ..leased };
+        assert_eq!(drive.to_string(), "normal, lease 400 ms, actuator 2");
+        let stop = Attributes { stop: true, priority: Priority::Emergency, ..Attributes::default() };
+        assert_eq!(stop.to_string(), "emergency, stop");
     }
 }

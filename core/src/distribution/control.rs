@@ -109,19 +109,22 @@ pub enum LeaseEnd {
     /// It was not renewed in time, or the callee stopped it: the safe hook runs there. Also any reason that this version
     /// does not know.
     Expired,
-    /// A newer call of the same function goes on in its place.
+    /// A newer call goes on in its place.
     Replaced,
+    /// What it moved was stopped: the safe hook runs there, and nothing moves it before a reset.
+    Stopped,
 }
 
 impl LeaseEnd {
-    pub(crate) const ALL: [Self; 3] = [Self::Finished, Self::Expired, Self::Replaced];
+    pub(crate) const ALL: [Self; 4] = [Self::Finished, Self::Expired, Self::Replaced, Self::Stopped];
 
-    /// `finished`, `expired`, `replaced`.
+    /// `finished`, `expired`, `replaced`, `stopped`.
     pub const fn word(self) -> &'static str {
         match self {
             Self::Finished => "finished",
             Self::Expired => "expired",
             Self::Replaced => "replaced",
+            Self::Stopped => "stopped",
         }
     }
 }

@@ -17,9 +17,11 @@ pub(super) const CONTROL: u8 = 3;
 const FAILURE: u8 = 4;
 
 const WANTS_REPLY: u8 = 1;
-/// Flags that a callee must understand to run the request; the others it may pass over.
-const CRITICAL: u8 = 0xF0;
-/// The others that this version does not know.
+/// What another caller moves is taken over.
+const TAKES_OVER: u8 = 0x10;
+/// Flags without which a callee must not run the request, and which this version does not know.
+const UNKNOWN: u8 = 0xE0;
+/// Flags that a callee may pass over, and which this version does not know.
 const SKIPPABLE: u8 = 0x0E;
 
 /// Bytes before a request's block.
@@ -117,6 +119,8 @@ pub struct RequestHeader {
     pub generation: Generation,
     /// The caller waits for a reply.
     pub wants_reply: bool,
+    /// What another caller moves is taken over.
+    pub takes_over: bool,
     /// Flags that this version does not know, without which the request must not be run.
     pub unknown: u8,
     /// Time until the caller's deadline when the request was made, saturating.
@@ -131,7 +135,10 @@ impl RequestHeader {
     /// The header's bytes.
     #[inline]
     pub fn encode(&self) -> [u8; REQUEST_BYTES] {
-        let flags = self.unknown | if self.wants_reply { WANTS_REPLY } else { 0 } | if LATER { SKIPPABLE } else { 0 };
+        let flags = if self.wants_reply { WANTS_REPLY } else { 0 }
+            | if self.takes_over { TAKES_OVER } else { 0 }
+            | if LATER { SKIPPABLE } else { 0 }
+            | self.unknown;
         let [s0, s1] = self.slot.0.to_le_bytes();
         let [g0, g1] = self.generation.0.to_le_bytes();
         let [i0, i1, i2, i3] = self.id.to_le_bytes();
@@ -183,7 +190,8 @@ impl RequestHeader {
             slot: Slot(u16::from_le_bytes([*s0, *s1])),
             generation: Generation(u16::from_le_bytes([*g0, *g1])),
             wants_reply: flags & WANTS_REPLY != 0,
-            unknown: flags & CRITICAL,
+            takes_over: flags & TAKES_OVER != 0,
+            unknown: flags & UNKNOWN,
             remaining: micros([*r0, *r1, *r2, *r3]),
             stamp: u64::from_le_bytes([*t0, *t1, *t2, *t3, *t4, *t5, *t6, *t7]),
             since: micros([*e0, *e1, *e2, *e3]),
@@ -245,6 +253,8 @@ fn error_code(error: Error) -> (u8, u8, u32, u32) {
         Error::ResultWouldNotFit { need, have } => (14, 0, need, have),
         Error::ResultLost => (15, 0, 0, 0),
         Error::Unsupported => (16, 0, 0, 0),
+        Error::Held { by } => (17, 0, by, 0),
+        Error::Inhibited { by, reason } => (18, 0, by, reason.into()),
         Error::Service(ServiceError::Failed(code)) => (20, 0, u32::from(code), 0),
         Error::Service(ServiceError::Panicked) => (21, 0, 0, 0),
         Error::Service(ServiceError::NotReady) => (22, 0, 0, 0),
@@ -271,6 +281,8 @@ fn error_of(code: u8, index: u8, first: u32, second: u32) -> Error {
         14 => Error::ResultWouldNotFit { need: first, have: second },
         15 => Error::ResultLost,
         16 => Error::Unsupported,
+        17 => Error::Held { by: first },
+        18 => Error::Inhibited { by: first, reason: second as u16 },
         20 => Error::Service(ServiceError::Failed(first as u16)),
         21 => Error::Service(ServiceError::Panicked),
         22 => Error::Service(ServiceError::NotReady),
@@ -424,7 +436,8 @@ mod tests {
                 slot: Slot(slot),
                 generation: Generation(generation),
                 wants_reply,
-                unknown: unknown & CRITICAL,
+                takes_over: unknown & 1 != 0,
+                unknown: unknown & UNKNOWN,
                 remaining: Duration::from_micros(u64::from(remaining)),
                 stamp,
                 since: Duration::from_micros(u64::from(since)),

@@ -77,6 +77,10 @@ pub struct CallHead {
     pub priority: Priority,
     /// Whether the caller waits.
     pub wants_reply: bool,
+    /// Whether it takes over what another caller moves.
+    pub takes_over: bool,
+    /// Whether its results let what was stopped move again; known once it begins.
+    pub resets: bool,
     /// After this the caller no longer waits, and the call is not begun.
     pub deadline: Instant,
     /// The earliest time at which the caller can have made the request: its age is counted from here.
@@ -440,19 +444,19 @@ impl<S: Storage> Queue<S> {
 
 fn encode_head(head: &CallHead, block: usize) -> impl Iterator<Item = u8> {
     let length = (block as u32).to_le_bytes();
-    let wants_reply = [u8::from(head.wants_reply), 0, 0, 0];
+    let flags = [u8::from(head.wants_reply), u8::from(head.takes_over), 0, 0];
     length
         .into_iter()
         .chain(head.id.to_le_bytes())
         .chain(head.slot.0.to_le_bytes())
         .chain(head.generation.0.to_le_bytes())
-        .chain(wants_reply)
+        .chain(flags)
         .chain(head.deadline.as_micros().to_le_bytes())
         .chain(head.sent_at.as_micros().to_le_bytes())
 }
 
 fn decode_head(bytes: &[u8; HEAD_BYTES], priority: Priority) -> (CallHead, usize) {
-    let [l0, l1, l2, l3, i0, i1, i2, i3, s0, s1, g0, g1, wants_reply, _, _, _, rest @ ..] = *bytes;
+    let [l0, l1, l2, l3, i0, i1, i2, i3, s0, s1, g0, g1, wants_reply, takes_over, _, _, rest @ ..] = *bytes;
     let [d0, d1, d2, d3, d4, d5, d6, d7, m0, m1, m2, m3, m4, m5, m6, m7] = rest;
     let head = CallHead {
         id: u32::from_le_bytes([i0, i1, i2, i3]),
@@ -460,6 +464,8 @@ fn decode_head(bytes: &[u8; HEAD_BYTES], priority: Priority) -> (CallHead, usize
         generation: Generation(u16::from_le_bytes([g0, g1])),
         priority,
         wants_reply: wants_reply != 0,
+        takes_over: takes_over != 0,
+        resets: false,
         deadline: Instant::from_micros(u64::from_le_bytes([d0, d1, d2, d3, d4, d5, d6, d7])),
         sent_at: Instant::from_micros(u64::from_le_bytes([m0, m1, m2, m3, m4, m5, m6, m7])),
     };
@@ -501,6 +507,8 @@ mod tests {
             generation: Generation(id as u16),
             priority,
             wants_reply: id.is_multiple_of(2),
+            takes_over: id.is_multiple_of(3),
+            resets: false,
             deadline: Instant::from_micros(u64::from(id) << 20),
             sent_at: Instant::from_micros(u64::from(id) << 10),
         }

@@ -12,7 +12,7 @@ use core::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use crate::config::Priority;
 use crate::distribution::function_list::{Generation, Slot};
 pub use crate::distribution::message::LeaseEnd;
-use crate::error::Error;
+use crate::error::{Error, ServiceError};
 use crate::services::requests::CallId;
 use crate::time::{Duration, Instant};
 
@@ -26,7 +26,19 @@ impl Order {
     }
 }
 
-/// Says until when a leased service may act. Written by the unit, read anywhere.
+/// On whose behalf an order begins.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Claim {
+    /// The ID number of the caller.
+    pub holder: u32,
+    /// The caller's own order, which gives way.
+    pub replaces: Option<Order>,
+    /// The order of any other caller gives way as well.
+    pub takes_over: bool,
+}
+
+/// Says until when a leased service may act. Written by the unit, read anywhere. Services that share one move the same
+/// thing: one order of all of them holds it.
 ///
 /// A reader may be later than the unit, which renews the lease as of the time at which it began to look at a renewal: an
 /// interrupt can fall between, and a thread can be held up there. So a lease that has been seen dead remembers it, and no
@@ -44,12 +56,55 @@ pub struct Lease {
     seen_dead: AtomicBool,
     /// The order that holds it, or held it last; 0 before the first.
     order: AtomicU32,
+    /// The ID number of the one that made it.
+    holder: AtomicU32,
+    /// When it was inhibited, as `end` has its time; 0 when it is not.
+    inhibited: AtomicU32,
+    /// The ID number of the unit that inhibited it; 0 for this one.
+    inhibitor: AtomicU32,
+    /// Why.
+    reason: AtomicU32,
+}
+
+/// Why nothing begins on a lease that is inhibited.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Latch {
+    /// The ID number of the unit that stopped it; 0 for this one.
+    pub by: u32,
+    /// Why, as this unit numbers its reasons; 0 for a function that stops.
+    pub reason: u16,
+}
+
+/// The order that something was to be done for has ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("the order has ended: its caller no longer wants it, or it was stopped")]
+pub struct Ended;
+
+/// So that a service may use `?`: what it was asked for it does not do.
+impl From<Ended> for ServiceError {
+    fn from(Ended: Ended) -> Self {
+        Self::NotReady
+    }
+}
+
+impl From<Latch> for Error {
+    fn from(Latch { by, reason }: Latch) -> Self {
+        Self::Inhibited { by, reason }
+    }
 }
 
 impl Lease {
     /// A lease without an order.
     pub const fn new() -> Self {
-        Self { end: AtomicU32::new(0), seen_dead: AtomicBool::new(false), order: AtomicU32::new(0) }
+        Self {
+            end: AtomicU32::new(0),
+            seen_dead: AtomicBool::new(false),
+            order: AtomicU32::new(0),
+            holder: AtomicU32::new(0),
+            inhibited: AtomicU32::new(0),
+            inhibitor: AtomicU32::new(0),
+            reason: AtomicU32::new(0),
+        }
     }
 
     /// Whether the service may act at `now`, which is no time to come, for whichever order holds the lease. Never later
@@ -59,7 +114,7 @@ impl Lease {
             return false;
         }
         let end = self.end.load(Ordering::Acquire);
-        let live = is_before(now, end);
+        let live = is_before(now, end) && !self.is_inhibited();
         if end != 0 && !live {
             self.seen_dead.store(true, Ordering::Release);
         }
@@ -80,7 +135,8 @@ impl Lease {
 
     /// Whether it lasts beyond `at` as things are, for measurements: nothing is remembered, so `at` may be to come.
     pub fn lasts_beyond(&self, at: Instant) -> bool {
-        !self.seen_dead.load(Ordering::Acquire) && is_before(at, self.end.load(Ordering::Acquire))
+        let ended = self.seen_dead.load(Ordering::Acquire) || self.is_inhibited();
+        !ended && is_before(at, self.end.load(Ordering::Acquire))
     }
 
     /// How long it still lasts as things are: zero once it has passed its end, `None` when nothing is granted. It is only
@@ -91,6 +147,21 @@ impl Lease {
         let left = i64::from(end.wrapping_sub(millis as u32) as i32).saturating_mul(1_000);
         let left = u64::try_from(left).unwrap_or(0).saturating_sub(rest);
         (end != 0).then(|| Duration::from_micros(left))
+    }
+
+    /// [`begin`](Self::begin) for this caller: [`Error::Held`] where another one holds it and is not taken over,
+    /// [`Error::Busy`] where an earlier order is dead and its safe hook comes first, [`Error::Inhibited`] where it was stopped.
+    pub fn claim(&self, now: Instant, end: Instant, claim: &Claim) -> Result<Order, Error> {
+        if let Some(latch) = self.latch() {
+            return Err(latch.into());
+        }
+        let is_own = claim.replaces.is_some_and(|order| self.is_held_by(order));
+        if !is_own && !claim.takes_over && self.is_live(now) {
+            return Err(Error::Held { by: self.holder.load(Ordering::Acquire) });
+        }
+        let order = self.begin(now, end).ok_or(Error::Busy)?;
+        self.holder.store(claim.holder, Ordering::Release);
+        Ok(order)
     }
 
     /// Lets the service act for a new order, until [`Lease::seen_end`] of `end`. `None` where an earlier order is dead and
@@ -107,9 +178,12 @@ impl Lease {
             self.seen_dead.store(false, Ordering::Release);
         }
         self.end.store(odd_millis(end) as u32, Ordering::Release);
-        // The earlier order may have been seen dead in between.
-        if self.seen_dead.load(Ordering::Acquire) {
+        // The earlier order may have been seen dead in between, or all of them inhibited.
+        if self.seen_dead.load(Ordering::Acquire) || self.is_inhibited() {
             self.order.store(before, Ordering::Release);
+            if !runs {
+                self.end.store(0, Ordering::Release);
+            }
             return None;
         }
         Some(Order(order))
@@ -119,7 +193,8 @@ impl Lease {
     /// stays so.
     #[must_use]
     pub fn renew(&self, order: Order, end: Instant) -> bool {
-        let ended = self.seen_dead.load(Ordering::Acquire) || self.end.load(Ordering::Acquire) == 0;
+        let ended =
+            self.seen_dead.load(Ordering::Acquire) || self.is_inhibited() || self.end.load(Ordering::Acquire) == 0;
         if ended || !self.is_held_by(order) {
             return false;
         }
@@ -139,6 +214,49 @@ impl Lease {
         if self.is_held_by(order) {
             self.seen_dead.store(true, Ordering::Release);
         }
+    }
+
+    /// Stops whichever order holds it and lets none begin until [`reset`](Self::reset): a stop that a unit was sent, or the
+    /// vehicle's own, as of a bumper; then `latch.by` is 0. May be called from an interrupt. The first latch stays when
+    /// there is one, but with the time of the newest. The safe hook is due like that of an order that was [`cut`](Self::cut).
+    pub fn inhibit(&self, now: Instant, latch: Latch) {
+        if !self.is_inhibited() {
+            self.inhibitor.store(latch.by, Ordering::Release);
+            self.reason.store(latch.reason.into(), Ordering::Release);
+        }
+        self.inhibited.store(odd_millis(now) as u32, Ordering::Release);
+        self.seen_dead.store(true, Ordering::Release);
+    }
+
+    /// Lets orders begin again, if it was inhibited before `made`, at which the reset was asked for: an earlier wish does not
+    /// undo a later stop, nor one made within 3 ms of it.
+    pub fn reset(&self, now: Instant, made: Instant) {
+        let inhibited = self.inhibited.load(Ordering::Acquire);
+        // As long as the word's 49 days, after which a reset may have to be asked for twice; the age of a wish is seconds.
+        let since = ((now.as_micros() / 1_000) as u32).wrapping_sub(inhibited);
+        let age = now.since(made).as_millis();
+        // The moment is rounded down by up to 2 ms; at the clock's beginning it is rounded up.
+        if inhibited != 0 && since != u32::MAX && age.saturating_add(2) < u64::from(since) {
+            self.inhibited.store(0, Ordering::Release);
+        }
+    }
+
+    /// What inhibits it.
+    pub fn latch(&self) -> Option<Latch> {
+        self.is_inhibited().then(|| Latch {
+            by: self.inhibitor.load(Ordering::Acquire),
+            reason: self.reason.load(Ordering::Acquire) as u16,
+        })
+    }
+
+    /// Whether no order may begin.
+    pub fn is_inhibited(&self) -> bool {
+        self.inhibited.load(Ordering::Acquire) != 0
+    }
+
+    /// Whether an order is dead and has not been ended: it was cut or inhibited, or a reader saw its time pass.
+    pub fn is_cut(&self, order: Order) -> bool {
+        self.seen_dead.load(Ordering::Acquire) && self.is_held_by(order)
     }
 
     /// Ends an order; `false` when a newer one holds the lease.
@@ -182,10 +300,23 @@ pub trait Service {
         None
     }
 
-    /// [`Lease::begin`]; `Ok(None)` for a service without a lease, [`Error::Busy`] where a dead order has not been ended.
-    fn begin_lease(&self, now: Instant, end: Instant) -> Result<Option<Order>, Error> {
-        let Some(lease) = self.lease() else { return Ok(None) };
-        lease.begin(now, end).map(Some).ok_or(Error::Busy)
+    /// [`Lease::claim`]; `Ok(None)` for a service without a lease.
+    fn begin_lease(&self, now: Instant, end: Instant, claim: &Claim) -> Result<Option<Order>, Error> {
+        self.lease().map(|lease| lease.claim(now, end, claim)).transpose()
+    }
+
+    /// [`Lease::inhibit`]. A port that runs safe hooks by itself starts that of an order which this stops.
+    fn inhibit(&self, now: Instant, latch: Latch) {
+        if let Some(lease) = self.lease() {
+            lease.inhibit(now, latch);
+        }
+    }
+
+    /// [`Lease::reset`]
+    fn reset(&self, now: Instant, made: Instant) {
+        if let Some(lease) = self.lease() {
+            lease.reset(now, made);
+        }
     }
 
     /// [`Lease::renew`]
@@ -214,7 +345,7 @@ pub trait Service {
 
 impl Service for () {}
 
-/// The lease that a call of the peer holds on a function of this unit: one for each function.
+/// The lease that a call of the peer holds on a function of this unit: one for each function, or for all that share it.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Granted {
     /// The peer's id of the call.
@@ -276,6 +407,18 @@ mod tests {
         assert!(lease.is_live(at(wrap - 100_000)));
         assert!(lease.is_live(at(wrap + 200_000)));
         assert!(!lease.is_live(at(wrap + 300_000)));
+    }
+
+    #[test]
+    fn an_interrupt_that_inhibits_between_two_stores_of_a_new_order_leaves_it_dead() {
+        let lease = Lease::new();
+        lease.inhibit(START, Latch { by: 0, reason: 1 });
+        // What `begin` stores behind it.
+        lease.seen_dead.store(false, Ordering::Release);
+        lease.end.store(odd_millis(at(500_000)) as u32, Ordering::Release);
+        assert!(!lease.is_live(at(1_000)) && !lease.lasts_beyond(at(1_000)));
+        lease.reset(at(100_000), at(100_000));
+        assert!(!lease.is_live(at(100_000)), "a reader has seen it dead");
     }
 
     #[test]

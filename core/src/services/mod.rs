@@ -14,7 +14,7 @@
 //! | … it returns `Command::Dial` | open a stream, `Session::new` with `dialed: true`, `node.dialing`; or `node.dial_failed` |
 //! | … it returns `Command::Tell(link, directive)` | `session.direct`, with nothing of the hub locked |
 //! | a stream that was dialled is open, or one was accepted | `session.connected` |
-//! | bytes have come | `session.receive` until nothing is consumed and no event comes, then `session.next_call` until `None`; what was `paused` is lent again after `direct`, or when a buffer may be free |
+//! | bytes have come | `session.receive` until nothing is consumed and no event comes, then `session.poll` and `session.next_call`, each until `None`; what was `paused` is lent again after `direct`, or when a buffer may be free |
 //! | the stream takes bytes again, and `session.wants_to_write()` | `session.writable` |
 //! | a datagram has come | `session.datagram` of the link that [`for_session`](crate::distribution::datagram::for_session) names, if there is one; else `node.datagram` |
 //! | at `session.deadline()`, and after each call that may have ended it | `session.poll` until `None`, **before** anything that has arrived: leases end here |

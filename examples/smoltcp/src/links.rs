@@ -69,6 +69,8 @@ impl SUnit {
         }
         self.follow_stream(now);
         while self.take_bytes(now, &mut lent, program) {}
+        // What moves stops before a call begins.
+        self.poll_session(now, program);
         self.serve_waiting(now, program);
     }
 

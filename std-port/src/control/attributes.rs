@@ -16,6 +16,12 @@ pub(super) struct Form {
     lease: Option<Duration>,
     #[serde(default)]
     idempotent: bool,
+    #[serde(default)]
+    actuator: u8,
+    #[serde(default)]
+    stop: bool,
+    #[serde(default)]
+    reset: bool,
 }
 
 mod class {

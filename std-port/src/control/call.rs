@@ -86,6 +86,7 @@ pub(super) fn options(question: &CallQuestion) -> Result<RequestOptions, Failure
         delivery: if question.best_effort { Delivery::BestEffort } else { Delivery::Reliable },
         // What an operator starts runs for one lease and no longer: no client would release it.
         renew_lease: false,
+        take_over: question.take_over,
     })
 }
 

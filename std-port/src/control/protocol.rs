@@ -121,6 +121,9 @@ pub struct CallQuestion {
     pub priority: Option<String>,
     /// In one datagram, now or never; asynchronous calls only.
     pub best_effort: bool,
+    /// Take over what another unit moves.
+    #[serde(default)]
+    pub take_over: bool,
 }
 
 /// A variable with its value.

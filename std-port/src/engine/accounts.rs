@@ -125,7 +125,9 @@ impl<T: Send + 'static> Engine<T> {
 
     fn port_readings(&self, held: &Held) -> [Reading; 14] {
         // One that is stuck has not counted itself.
-        self.functions().iter().filter_map(|function| function.handler.safe.as_ref()).for_each(|safe| safe.look());
+        let functions = self.functions();
+        let actuators = functions.iter().filter_map(|function| function.handler.actuator.as_ref());
+        actuators.for_each(|actuator| actuator.safe.look());
         let pool = self.pool.counters();
         let connected = self.peers().connected().count() as u64;
         let file = &self.guard.file;

@@ -335,7 +335,7 @@ impl<T: Send + 'static> Engine<T> {
         // A handler may own a handle to a peer of this unit, and so the unit itself: without handlers nothing is left.
         let handlers = self.take_handlers();
         // What moved stops, and is heard of, before the unit is gone.
-        handlers.iter().filter_map(|handler| handler.safe.as_ref()).for_each(|safe| safe.end());
+        handlers.iter().filter_map(|handler| handler.actuator.as_ref()).for_each(|actuator| actuator.safe.end());
         self.services.afterwards.end();
         handlers.iter().filter_map(|handler| handler.executor.as_ref()).for_each(|executor| executor.end());
         self.release_threads();

@@ -197,8 +197,8 @@ impl<T: Send + 'static> Engine<T> {
     /// Whether the lease of a call that has waited here still lasts, if it has one.
     fn is_wanted(&self, now: Instant, call: &Call) -> bool {
         let functions = self.functions();
-        let lease = functions.function(call.slot).and_then(|function| function.handler.lease.as_ref()).zip(call.order);
-        lease.is_none_or(|(service, order)| service.lease.is_live_for(order, now))
+        let actuator = functions.function(call.slot).and_then(|function| function.handler.actuator.as_ref());
+        actuator.zip(call.order).is_none_or(|(actuator, order)| actuator.word().is_live_for(order, now))
     }
 
     fn give_up(&self, turn: Option<Turn>) {
@@ -238,24 +238,25 @@ impl<T: Send + 'static> Engine<T> {
     /// How a call is run, and what its handler is told.
     fn prepare(&self, link: &LinkCell, call: &Call) -> Result<(Run<T>, handler::Call), Error> {
         let peer = link.peer.get().ok_or(Error::NotConnected)?;
-        let (run, lease, safe) = {
+        let (run, actuator) = {
             let functions = self.functions();
-            let Handler { run, lease, safe, .. } = functions.function(call.slot).ok_or(Error::StaleFunction)?.handler;
-            (run.clone(), lease.clone(), safe.clone())
+            let Handler { run, actuator, .. } = functions.function(call.slot).ok_or(Error::StaleFunction)?.handler;
+            (run.clone(), actuator.clone())
         };
-        if safe.is_some_and(|safe| !safe.has_run()) {
-            return Err(Error::Service(ServiceError::NotReady));
-        }
-        if let Some(lease) = lease.as_ref().filter(|_| call.order.is_some()) {
-            // An earlier call of the service has given way.
-            lease.wake();
+        let moved = actuator.zip(call.order);
+        if let Some((actuator, _)) = &moved {
+            if !actuator.safe.has_run() {
+                return Err(Error::Service(ServiceError::NotReady));
+            }
+            // An earlier call has given way.
+            actuator.lease.wake();
         }
         let told = handler::Call {
             caller: peer.identity.clone(),
             priority: call.priority,
             deadline: call.deadline,
             wants_reply: call.wants_reply,
-            lease: lease.zip(call.order).map(|(lease, order)| LeaseWatch::new(lease, Some(order), self.clock())),
+            lease: moved.map(|(actuator, order)| LeaseWatch::of(order, actuator)),
         };
         Ok((run, told))
     }
@@ -292,8 +293,8 @@ impl<T: Send + 'static> Engine<T> {
 
     /// The lease of a service has ended, and its safe hook is running: whatever waits for the end of the lease looks again.
     pub(super) fn wake_leased(&self, functions: &FunctionList<Boxed, Handler<T>>, slot: Slot) {
-        if let Some(lease) = functions.function(slot).and_then(|function| function.handler.lease.as_ref()) {
-            lease.wake();
+        if let Some(actuator) = functions.function(slot).and_then(|function| function.handler.actuator.as_ref()) {
+            actuator.lease.wake();
         }
     }
 }

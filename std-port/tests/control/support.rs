@@ -171,6 +171,7 @@ pub(crate) fn call(node: Option<&str>, function: &str, arguments: Vec<Argument>)
         timeout_ms: Some(20_000),
         priority: None,
         best_effort: false,
+        take_over: false,
     }
 }
 

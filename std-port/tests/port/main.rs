@@ -5,6 +5,7 @@
 
 #[cfg(feature = "access")]
 mod access;
+mod actuators;
 #[cfg(feature = "async")]
 mod asynchronous;
 mod callbacks;

@@ -52,6 +52,7 @@ impl Blocks {
             slot: Slot(1),
             generation: Generation(1),
             wants_reply: true,
+            takes_over: false,
             unknown: 0,
             remaining: Duration::from_millis(500),
             stamp: 1_000_000,

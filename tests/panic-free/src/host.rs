@@ -59,7 +59,7 @@ entry!(link_receives, {
     let link: &mut AnyLink = unknown();
     keep(link.receive(unknown::<Pool<Lent>>(), unknown_slice()));
     if let Incoming::Message(_, place) = unknown() {
-        keep(link.view(place.after(*unknown()), unknown_slice()));
+        keep(link.view(place.last(*unknown()), unknown_slice()));
     }
     keep(link.view(*unknown::<Place>(), unknown_slice()));
     keep(link.view(Place::lent(*unknown()), unknown_slice()));

@@ -68,7 +68,9 @@ entry!(own_functions, {
     keep((functions.function(*unknown()).is_some(), functions.generation(*unknown())));
     if let Ok(function) = functions.lookup(*unknown(), *unknown()) {
         let service = function.handler;
-        keep((service.begin_lease(*unknown(), *unknown()), service.renew_lease(*unknown(), *unknown())));
+        keep((service.begin_lease(*unknown(), *unknown(), unknown()), service.renew_lease(*unknown(), *unknown())));
+        service.inhibit(*unknown(), *unknown());
+        service.reset(*unknown(), *unknown());
         keep((service.finish_lease(*unknown()), service.expire_lease(*unknown())));
         service.cut_lease(*unknown());
     }
@@ -200,7 +202,10 @@ entry!(events, {
 
 entry!(leases, {
     let lease = Lease::new();
-    keep(lease.begin(*unknown(), *unknown()));
+    keep((lease.begin(*unknown(), *unknown()), lease.claim(*unknown(), *unknown(), unknown())));
+    lease.inhibit(*unknown(), *unknown());
+    lease.reset(*unknown(), *unknown());
+    keep((lease.latch(), lease.is_inhibited(), lease.is_cut(*unknown())));
     keep((lease.renew(*unknown(), *unknown()), lease.lasts_beyond(*unknown())));
     keep((lease.is_live(*unknown()), lease.is_live_for(*unknown(), *unknown()), Lease::seen_end(*unknown())));
     keep((lease.left(*unknown()), lease.end(*unknown())));

@@ -78,6 +78,7 @@ pub(crate) fn message(bytes: &[u8]) -> Option<Value> {
             "slot": header.slot.0,
             "generation": header.generation.0,
             "wants_reply": header.wants_reply,
+            "takes_over": header.takes_over,
             "unknown": header.unknown,
             "remaining": header.remaining.as_micros(),
             "stamp": header.stamp,
@@ -104,6 +105,8 @@ fn error(error: Error) -> Value {
         Error::Expired => json!("expired"),
         Error::Stale => json!("stale"),
         Error::Busy => json!("busy"),
+        Error::Held { by } => json!({ "held": { "by": by } }),
+        Error::Inhibited { by, reason } => json!({ "inhibited": { "by": by, "reason": reason } }),
         Error::NotAllowed => json!("not_allowed"),
         Error::WouldDeadlock => json!("would_deadlock"),
         Error::TooLarge { limit } => json!({ "too_large": { "limit": limit } }),
@@ -166,6 +169,9 @@ fn attributes(attributes: &Attributes) -> Value {
     json!({
         "priority": attributes.priority.word(),
         "idempotent": attributes.idempotent,
+        "actuator": attributes.actuator,
+        "stop": attributes.stop,
+        "reset": attributes.reset,
         "lease": attributes.lease.map(|lease| lease.as_millis()),
     })
 }

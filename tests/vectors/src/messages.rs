@@ -26,6 +26,7 @@ fn request(wants_reply: bool, block: &[u8]) -> Vec<u8> {
         slot: Slot(5),
         generation: Generation(0x0203),
         wants_reply,
+        takes_over: false,
         unknown: 0,
         remaining: Duration::from_millis(2_000),
         stamp: 0x0001_0203_0405_0607,
@@ -42,7 +43,7 @@ fn messages() -> Vec<Vector> {
     let block = arguments(GO_TO, &motion().unwrap_or_default());
     let fields = |wants_reply: bool, block: &[u8]| {
         json!({ "request": {
-            "id": 0x0102_0304, "slot": 5, "generation": 0x0203, "wants_reply": wants_reply, "unknown": 0,
+            "id": 0x0102_0304, "slot": 5, "generation": 0x0203, "wants_reply": wants_reply, "takes_over": false, "unknown": 0,
             "remaining": 2_000_000, "stamp": 0x0001_0203_0405_0607_u64, "since": 250_000, "block": hex(block),
         }})
     };
@@ -52,7 +53,9 @@ fn messages() -> Vec<Vector> {
         bytes
     };
     let mut critical = fields(true, &[]);
-    critical["request"]["unknown"] = json!(0x90);
+    critical["request"]["unknown"] = json!(0xA0);
+    let mut taking_over = fields(true, &[]);
+    taking_over["request"]["takes_over"] = json!(true);
     let mut longer = request(true, &[0xEE; 4]);
     longer[6] += 1;
     longer.extend(&block);
@@ -74,7 +77,8 @@ fn messages() -> Vec<Vector> {
         .lossy(),
         message(("request_shorter_header", "refused: 7 words"), &shorter, &Value::Null),
         message(("request_flags", "flags that may be passed over"), &flags(0x0E), &fields(true, &[])).lossy(),
-        message(("request_critical_flags", "flags that must be understood"), &flags(0x90), &critical),
+        message(("request_critical_flags", "flags that must be understood"), &flags(0xA0), &critical),
+        message(("request_takes_over", "it takes over what another caller moves"), &flags(0x10), &taking_over),
         message(("reply", "results"), &reply, &replied),
         message(("reply_longer_header", "a later version has more in front of the block"), &longer_reply, &replied)
             .lossy(),
@@ -97,7 +101,7 @@ fn messages() -> Vec<Vector> {
 fn errors() -> Vec<Vector> {
     let wait = Duration::from_millis(30);
     let service = |error: ServiceError| Error::Service(error);
-    let answers: [(&'static str, Error, Value); 21] = [
+    let answers: [(&'static str, Error, Value); 23] = [
         ("error_unknown_function", Error::UnknownFunction, json!("unknown_function")),
         ("error_stale_function", Error::StaleFunction, json!("stale_function")),
         ("error_missing_argument", Error::MissingArgument { index: 3 }, json!({ "missing_argument": { "index": 3 } })),
@@ -122,6 +126,8 @@ fn errors() -> Vec<Vector> {
         ),
         ("error_result_lost", Error::ResultLost, json!("result_lost")),
         ("error_unsupported", Error::Unsupported, json!("unsupported")),
+        ("error_held", Error::Held { by: 7 }, json!({ "held": { "by": 7 } })),
+        ("error_inhibited", Error::Inhibited { by: 0, reason: 9 }, json!({ "inhibited": { "by": 0, "reason": 9 } })),
         ("error_service_failed", service(ServiceError::Failed(513)), json!({ "service_failed": { "code": 513 } })),
         ("error_service_panicked", service(ServiceError::Panicked), json!("service_panicked")),
         ("error_service_not_ready", service(ServiceError::NotReady), json!("service_not_ready")),
@@ -234,7 +240,7 @@ fn controls() -> Vec<Vector> {
         )
         .lossy(),
         control(("varint_too_big", "refused: beyond 16 bits"), &[item(2, &[0x84, 0x80, 0x04])], &Value::Null),
-        control(("lease_end_unknown", "a reason of a later version counts as expired"), &[item(6, &[4, 3])], &ended)
+        control(("lease_end_unknown", "a reason of a later version counts as expired"), &[item(6, &[4, 99])], &ended)
             .lossy(),
     ]);
     vectors
@@ -288,7 +294,7 @@ fn session_bodies() -> Vec<Vector> {
             ("session_message", "an emergency's second copy"),
             &emergency,
             &json!({ "message": { "priority": "emergency", "message": { "request": {
-                "id": 0x0102_0304, "slot": 5, "generation": 0x0203, "wants_reply": false, "unknown": 0,
+                "id": 0x0102_0304, "slot": 5, "generation": 0x0203, "wants_reply": false, "takes_over": false, "unknown": 0,
                 "remaining": 2_000_000, "stamp": 0x0001_0203_0405_0607_u64, "since": 250_000, "block": "",
             }}}}),
         ),

@@ -81,28 +81,48 @@ fn signatures() -> Vec<Vector> {
 }
 
 fn attributes() -> Vec<Vector> {
-    let leased = Attributes { priority: Priority::High, lease: Some(Duration::from_millis(500)), idempotent: true };
+    let leased = Attributes {
+        priority: Priority::High,
+        lease: Some(Duration::from_millis(500)),
+        idempotent: true,
+        ..Attributes::default()
+    };
+    let drive = Attributes { actuator: 3, idempotent: false, ..leased };
+    let stop = Attributes { priority: Priority::Emergency, idempotent: true, stop: true, ..Attributes::default() };
+    let reset = Attributes { reset: true, actuator: 3, ..Attributes::default() };
+    let json = |priority: &str, idempotent: bool, lease: Option<u32>, actuator: u8, stop: bool, reset: bool| {
+        json!({
+            "priority": priority, "idempotent": idempotent, "lease": lease,
+            "actuator": actuator, "stop": stop, "reset": reset,
+        })
+    };
+    let made = |names, attributes: &Attributes, value: &Value| {
+        Vector::new(names, Kind::Attributes, Context::default(), &attributes.encode(), value)
+    };
     vec![
         Vector::new(
             ("attributes_default", "normal priority, no lease"),
             Kind::Attributes,
             Context::default(),
             &Attributes::default().encode(),
-            &json!({ "priority": "normal", "idempotent": false, "lease": null }),
+            &json("normal", false, None, 0, false, false),
         ),
         Vector::new(
             ("attributes_leased", "high priority, idempotent, a lease of half a second"),
             Kind::Attributes,
             Context::default(),
             &leased.encode(),
-            &json!({ "priority": "high", "idempotent": true, "lease": 500 }),
+            &json("high", true, Some(500), 0, false, false),
         ),
+        made(("attributes_actuator", "it moves actuator 3"), &drive, &json("high", false, Some(500), 3, false, false)),
+        made(("attributes_stop", "it stops all"), &stop, &json("emergency", true, None, 0, true, false)),
+        made(("attributes_reset", "it resets actuator 3"), &reset, &json("normal", false, None, 3, false, true)),
         Vector::new(
             ("attributes_of_a_later_version", "other bits, and what follows, are passed over"),
             Kind::Attributes,
             Context::default(),
-            &[0xF8 | 5, 9, 9, 9, 0xF4, 1, 0, 0, 7, 7],
-            &json!({ "priority": "high", "idempotent": true, "lease": 500 }),
+            &[0xE0 | 5, 0, 9, 9, 0xF4, 1, 0, 0, 7, 7],
+            &json("high", true, Some(500), 0, false, false),
         )
         .lossy(),
         Vector::new(

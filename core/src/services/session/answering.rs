@@ -17,7 +17,8 @@ use crate::services::{Context, Port};
 
 impl<P: Port> Session<P> {
     /// The next call that waited and may begin now, its arguments in `arguments`. Call it after
-    /// [`receive`](Self::receive) is through and after each [`answer`](Self::answer), until it returns `None`.
+    /// [`receive`](Self::receive) is through and after each [`answer`](Self::answer), until it returns `None`, and
+    /// [`poll`](Self::poll) before it: what was stopped has its safe hook first.
     pub fn next_call(&mut self, cx: &mut Context<'_, P>, arguments: &mut ParametersView) -> Option<Call> {
         while self.phase == Phase::Live {
             if let Ok(call) = self.begin_next(cx, arguments)? {
@@ -86,6 +87,7 @@ impl<P: Port> Session<P> {
         if lease.is_some() && self.publishing.is_released(head.slot, head.id) {
             return Err(Error::Expired);
         }
+        let head = CallHead { resets: attributes.reset, ..head };
         // A slot first, then the lease: a lease that is granted and has no slot would run on without a call that ends it.
         let ticket = self.calls.begin(head, is_emergency(attributes, head.priority))?;
         let order = match lease.map_or(Ok(None), |length| self.grant(cx, &head, length)) {
@@ -119,6 +121,9 @@ impl<P: Port> Session<P> {
             if let Err(error @ Error::Full(_)) = sent {
                 return Err(error);
             }
+        }
+        if head.resets && result.is_ok() {
+            self.reset_orders(cx, &head);
         }
         // A call that failed wants nothing any more, so what it started stops now and not at the end of its lease.
         if result.is_err() {

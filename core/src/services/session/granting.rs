@@ -4,11 +4,12 @@ use super::timing::sent_at_earliest;
 use super::{Event, Session};
 use crate::config::LEASES;
 use crate::distribution::function_list::{Generation, Slot};
-use crate::distribution::message::{Control, Release, Renewal};
+use crate::distribution::identity::Identity;
+use crate::distribution::message::{Control, Release, Renewal, RequestHeader};
 use crate::error::{Error, Limit};
 use crate::host::connections::LinkCounter;
 use crate::services::calls::CallHead;
-use crate::services::lease::{Granted, Lease, LeaseEnd, Order, Service};
+use crate::services::lease::{Claim, Granted, Latch, Lease, LeaseEnd, Order, Service};
 use crate::services::{Context, Port};
 use crate::storage::take_at;
 use crate::time::{Duration, Instant};
@@ -29,7 +30,11 @@ impl<P: Port> Session<P> {
         if end <= cx.now {
             return Err(Error::Expired);
         }
-        let known = self.granted.iter().position(|known| known.slot == head.slot);
+        let service = service_of(cx, head.slot, head.generation);
+        let is_same = |known: &Granted| {
+            known.slot == head.slot || share_a_lease(service, service_of(cx, known.slot, known.generation))
+        };
+        let known = self.granted.iter().position(is_same);
         let earlier = known.and_then(|index| self.granted.get(index)).copied();
         // The safe hook of that lease is still to run, from `poll`. Granting now would let a new motion begin before it, and the hook
         // would then stop the new one.
@@ -39,13 +44,17 @@ impl<P: Port> Session<P> {
         if earlier.is_none() && self.granted.is_full() {
             return Err(Error::Full(Limit::Leases));
         }
+        let claim = Claim {
+            holder: self.identity().map_or(0, Identity::id),
+            replaces: earlier.and_then(|earlier| earlier.order),
+            takes_over: head.takes_over,
+        };
         // The service's word is changed before the table here: where it refuses, nothing of this session has changed.
-        let service = service_of(cx, head.slot, head.generation);
-        let order = match service.map_or(Ok(None), |service| service.begin_lease(cx.now, end)) {
+        let order = match service.map_or(Ok(None), |service| service.begin_lease(cx.now, end, &claim)) {
             Ok(order) => order,
             Err(error) => {
                 // A reader has looked later than at `cx.now`, and has stopped the motion.
-                if let Some(index) = known {
+                if let Some(index) = known.filter(|_| error == Error::Busy) {
                     self.cut_lease(cx, index);
                 }
                 return Err(error);
@@ -54,7 +63,7 @@ impl<P: Port> Session<P> {
         let (slot, generation) = (head.slot, head.generation);
         let granted = Granted { call: head.id, slot, generation, order, length, end };
         self.timers.lease = self.timers.lease.min(end);
-        match self.granted.iter_mut().find(|known| known.slot == slot) {
+        match known.and_then(|index| self.granted.get_mut(index)) {
             Some(known) => {
                 let replaced = core::mem::replace(known, granted).call;
                 self.tell_end(cx, replaced, LeaseEnd::Replaced);
@@ -120,6 +129,54 @@ impl<P: Port> Session<P> {
         }
     }
 
+    /// A function that stops was called: what it stops is dead before its handler runs, and calls that were made before it
+    /// begin no more.
+    pub(super) fn stop_orders(&mut self, cx: &mut Context<'_, P>, header: &RequestHeader) {
+        let latch = Latch { by: self.identity().map_or(0, Identity::id), reason: 0 };
+        for (slot, service) in self.moved_by(cx, header.slot, header.generation) {
+            service.inhibit(cx.now, latch);
+            self.publishing.release(slot, header.id);
+        }
+        if self.was_stopped(cx) {
+            self.timers.lease = cx.now;
+        }
+    }
+
+    /// A function that resets has been answered with results: what it resets may move again, unless it was stopped after the
+    /// call was made.
+    pub(super) fn reset_orders(&mut self, cx: &Context<'_, P>, head: &CallHead) {
+        for (_, service) in self.moved_by(cx, head.slot, head.generation) {
+            service.reset(cx.now, head.sent_at);
+        }
+    }
+
+    /// The leased services that move what a function has in its charge: its own actuator, or all.
+    fn moved_by<'c>(
+        &self,
+        cx: &Context<'c, P>,
+        slot: Slot,
+        generation: Generation,
+    ) -> impl Iterator<Item = (Slot, &'c dyn Service)> + use<'c, P> {
+        let (functions, charge) = (cx.functions, service_of(cx, slot, generation));
+        let all = charge.and_then(Service::lease).is_none();
+        self.publishing.all_slots().filter_map(move |slot| {
+            let function = functions.function(slot)?;
+            let is_meant = all || share_a_lease(charge, Some(function.handler));
+            (is_meant && function.attributes.lease.is_some()).then_some((slot, function.handler))
+        })
+    }
+
+    /// The number that the functions of this unit which move the same thing have in common; 0 for one that shares nothing.
+    pub(super) fn actuator_of(&self, cx: &Context<'_, P>, service: &dyn Service) -> u8 {
+        let shares = |slot: &Slot| {
+            let function = cx.functions.function(*slot);
+            function.is_some_and(|function| share_a_lease(Some(function.handler), Some(service)))
+        };
+        let mut sharing = self.publishing.all_slots().filter(shares);
+        let first = sharing.next().filter(|_| sharing.next().is_some());
+        first.and_then(|first| u8::try_from(first.0.saturating_add(1)).ok()).unwrap_or(0)
+    }
+
     /// Ends the leases of services that are gone: their callers are told.
     pub(super) fn cut_gone(&mut self, cx: &mut Context<'_, P>) {
         for index in 0..self.granted.len() {
@@ -161,15 +218,22 @@ impl<P: Port> Session<P> {
         if expire_granted(cx, &granted) { Some(Event::LeaseExpired(granted.slot)) } else { None }
     }
 
+    /// Whether what a call of the peer moves was stopped: by the vehicle itself, or through another link.
+    pub(super) fn was_stopped(&self, cx: &Context<'_, P>) -> bool {
+        self.granted.iter().any(|granted| is_dead(cx, granted))
+    }
+
     /// Ends a lease that is due; its function, whose hook is to run.
     pub(super) fn expire_lease(&mut self, cx: &mut Context<'_, P>) -> Option<Slot> {
-        let now = cx.now;
-        let due = |granted: &Granted| granted.end <= now;
-        while let Some(granted) = self.granted.iter().position(due).and_then(|index| take_at(&mut self.granted, index))
-        {
+        loop {
+            let due = |granted: &Granted| granted.end <= cx.now || is_dead(cx, granted);
+            let index = self.granted.iter().position(due);
+            let Some(granted) = index.and_then(|index| take_at(&mut self.granted, index)) else { break };
+            let is_inhibited = lease_of(cx, &granted).is_some_and(Lease::is_inhibited);
+            let why = if is_inhibited { LeaseEnd::Stopped } else { LeaseEnd::Expired };
             if expire_granted(cx, &granted) {
                 self.link.counters.add(LinkCounter::LeasesExpired, 1);
-                self.tell_end(cx, granted.call, LeaseEnd::Expired);
+                self.tell_end(cx, granted.call, why);
                 return Some(granted.slot);
             }
             let is_gone = service_of(cx, granted.slot, granted.generation).is_none();
@@ -193,6 +257,21 @@ impl<P: Port> Session<P> {
             self.ends.pop();
         }
     }
+}
+
+fn lease_of<'c, P: Port>(cx: &Context<'c, P>, granted: &Granted) -> Option<&'c Lease> {
+    service_of(cx, granted.slot, granted.generation).and_then(Service::lease)
+}
+
+/// Whether an order has been ended by others than its link, and its safe hook is due.
+fn is_dead<P: Port>(cx: &Context<'_, P>, granted: &Granted) -> bool {
+    lease_of(cx, granted).zip(granted.order).is_some_and(|(lease, order)| lease.is_cut(order))
+}
+
+/// Whether two services move the same thing.
+fn share_a_lease(one: Option<&dyn Service>, other: Option<&dyn Service>) -> bool {
+    let leases = one.and_then(Service::lease).zip(other.and_then(Service::lease));
+    leases.is_some_and(|(one, other)| core::ptr::eq(one, other))
 }
 
 fn service_of<'c, P: Port>(cx: &Context<'c, P>, slot: Slot, generation: Generation) -> Option<&'c dyn Service> {

@@ -400,6 +400,8 @@ impl<P: Port> Session<P> {
         let function = cx.functions.lookup(header.slot, header.generation);
         let length = self.link.view(block, lent).len();
         let result = self.check_request(cx, priority, header, seen, length, function).and_then(|(head, function)| {
+            // The handler of a function that stops waits where a safe hook is to run first: `poll` comes before `next_call`.
+            let arguments = arguments.filter(|_| !(function.attributes.stop && self.timers.lease <= cx.now));
             let bytes = self.link.view(block, lent);
             match arguments.filter(|_| self.calls.is_idle(priority)) {
                 // The arguments are checked before the call begins: a lease must not start for a request that is refused.
@@ -427,7 +429,7 @@ impl<P: Port> Session<P> {
     /// Everything that can be said of a request without looking at its arguments.
     fn check_request<'f>(
         &mut self,
-        cx: &Context<'_, P>,
+        cx: &mut Context<'_, P>,
         priority: Priority,
         header: &RequestHeader,
         seen: Seen,
@@ -461,6 +463,10 @@ impl<P: Port> Session<P> {
             Told::Now => function?,
         };
         self.permit_call(cx, &function)?;
+        // Whatever its handler has to wait for, or is refused for.
+        if function.attributes.stop {
+            self.stop_orders(cx, header);
+        }
         if priority != Priority::Emergency {
             self.calls.interval(cx.now, self.constraints.minimum_interval)?;
         }
@@ -472,6 +478,8 @@ impl<P: Port> Session<P> {
             generation: header.generation,
             priority,
             wants_reply: header.wants_reply,
+            takes_over: header.takes_over,
+            resets: false,
             deadline,
             sent_at,
         };

@@ -37,11 +37,20 @@ pub struct RequestOptions {
     /// Renew the lease that the call begins until it is released, or the call fails. Without it, what the call starts goes
     /// on for the length of the lease.
     pub renew_lease: bool,
+    /// Take over what another caller moves, in place of [`Error::Held`].
+    pub take_over: bool,
+}
+
+impl RequestOptions {
+    /// The default, for constants.
+    pub const fn new() -> Self {
+        Self { timeout: None, priority: None, delivery: Delivery::Reliable, renew_lease: true, take_over: false }
+    }
 }
 
 impl Default for RequestOptions {
     fn default() -> Self {
-        Self { timeout: None, priority: None, delivery: Delivery::Reliable, renew_lease: true }
+        Self::new()
     }
 }
 
@@ -138,6 +147,7 @@ impl<P: Port> Session<P> {
             slot: function.slot,
             generation: function.generation,
             wants_reply,
+            takes_over: options.take_over,
             unknown: 0,
             remaining,
             stamp,

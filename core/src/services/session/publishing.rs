@@ -2,6 +2,7 @@
 
 use super::{Phase, Session};
 use crate::config::{Priority, SIGNATURE_BYTES};
+use crate::distribution::function::Attributes;
 use crate::distribution::function_list::{Generation, Slot};
 use crate::distribution::hello::Limits;
 use crate::distribution::message::{CONTROL_BYTES, Control, PUBLISH_BYTES};
@@ -108,6 +109,11 @@ impl<S: Storage> Publishing<S> {
             Some(publication) if publication.ever => Told::Earlier,
             _ => Told::Never,
         }
+    }
+
+    /// The places of this unit's functions.
+    pub(super) fn all_slots(&self) -> impl Iterator<Item = Slot> + use<S> {
+        (0..self.table.len()).map(|index| Slot(index as u16))
     }
 
     /// The peer releases its requests up to `id`.
@@ -235,10 +241,11 @@ impl<P: Port> Session<P> {
             let sent = match function {
                 None => self.send_control(cx, &Control::Withdraw { slot: slot.0 }),
                 Some(function) => {
+                    let actuator = self.actuator_of(cx, function.handler);
                     let control = Control::Publish {
                         slot: slot.0,
                         generation: function.generation.0,
-                        attributes: &function.attributes.encode(),
+                        attributes: &Attributes { actuator, ..function.attributes }.encode(),
                         signature: function.signature.as_bytes(),
                     };
                     self.send_control(cx, &control)

@@ -126,7 +126,7 @@ impl<P: Port> Session<P> {
 
     fn poll_live(&mut self, cx: &mut Context<'_, P>) -> Option<Event> {
         // Leases come first: what moves must stop before anything else is done.
-        if cx.now >= self.timers.lease
+        if (cx.now >= self.timers.lease || self.was_stopped(cx))
             && let Some(slot) = self.expire_lease(cx)
         {
             return Some(Event::LeaseExpired(slot));

@@ -127,8 +127,8 @@ fn offer(vehicle: Vehicle) -> Result<(), Error> {
         cut();
         Ok(())
     });
-    let go_to = Handler::method(&|agv: &mut Agv, _, pos| {
-        agv.go_to(pos)?;
+    let go_to = Handler::method(&|agv: &mut Agv, call, pos| {
+        call.commit(|| agv.go_to(pos))??;
         HAS_TARGET.store(true, Ordering::Release);
         info!("driving");
         Ok(())

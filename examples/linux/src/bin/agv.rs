@@ -51,9 +51,9 @@ fn offer(unit: &Unit, agv: &Arc<Mutex<Agv>>) -> Result<LeaseWatch> {
     let agv = own();
     let pos_info = move |_: &Call, pos: &mut ParametersView| lock(&agv).pos_info(pos);
     let agv = own();
-    let go_to = move |_: &Call, pos: &mut ParametersView| {
+    let go_to = move |call: &Call, pos: &mut ParametersView| {
         let mut agv = lock(&agv);
-        agv.go_to(pos)?;
+        call.commit(|| agv.go_to(pos))??;
         agv.target().into_iter().for_each(|target| say!("driving to {target}"));
         Ok(())
     };

@@ -42,6 +42,9 @@ pub(crate) struct Arguments {
     /// In one datagram, now or never.
     #[arg(long, requires = "asynchronous")]
     best_effort: bool,
+    /// Take over what another unit moves, instead of the error that names it.
+    #[arg(long)]
+    take_over: bool,
     /// Keep the lease of what the call starts until it has finished, or until Ctrl-C: then it stops.
     #[arg(long, conflicts_with_all = ["all", "asynchronous"])]
     hold: bool,
@@ -84,6 +87,7 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
         timeout_ms: arguments.timeout.map(|span| span.as_millis() as u64),
         priority: arguments.priority,
         best_effort: arguments.best_effort,
+        take_over: arguments.take_over,
     };
     if arguments.hold {
         interrupt::end_at_signals()?;

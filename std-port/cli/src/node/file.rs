@@ -131,6 +131,10 @@ pub(super) struct Function {
     pub(super) priority: Option<Priority>,
     #[serde(default)]
     pub(super) idempotent: bool,
+    #[serde(default)]
+    pub(super) stop: bool,
+    #[serde(default)]
+    pub(super) reset: bool,
     pub(super) lease: Maybe<Time>,
     pub(super) at_lease_end: Maybe<Vec<String>>,
 }
@@ -139,7 +143,8 @@ impl Function {
     /// All but the lease, whose length is checked with its place.
     pub(super) fn attributes(&self) -> Attributes {
         let priority = self.priority.map(Into::into).unwrap_or_default();
-        Attributes { priority, idempotent: self.idempotent, lease: None }
+        let Self { idempotent, stop, reset, .. } = *self;
+        Attributes { priority, idempotent, stop, reset, lease: None, actuator: 0 }
     }
 }
 

@@ -29,12 +29,7 @@ use crate::{
 /// How long the fault profile of a run lasts: longer than any run.
 const ALWAYS: Duration = Duration::from_secs(24 * 3_600);
 /// How a service calls its caller back.
-const PATIENT: RequestOptions = RequestOptions {
-    timeout: Some(Duration::from_secs(8)),
-    priority: None,
-    delivery: cara_core::services::session::Delivery::Reliable,
-    renew_lease: true,
-};
+const PATIENT: RequestOptions = RequestOptions { timeout: Some(Duration::from_secs(8)), ..RequestOptions::new() };
 /// Where simulated m_units listen.
 const M_UNIT_PORT: u16 = 7_000;
 /// How long the beginning of a run is worse than the rest, under the rough profile.

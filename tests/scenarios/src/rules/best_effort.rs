@@ -15,8 +15,7 @@ scenarios![
     best_effort_is_for_short_messages_without_a_reply: "delivery", Rough, [], ["RequestsWithheld"];
 ];
 
-const BEST_EFFORT: RequestOptions =
-    RequestOptions { timeout: None, priority: None, delivery: Delivery::BestEffort, renew_lease: true };
+const BEST_EFFORT: RequestOptions = RequestOptions { delivery: Delivery::BestEffort, ..RequestOptions::new() };
 
 fn best_effort_loses_without_blocking(world: &mut dyn World) {
     let service = Service::numbered("telemetry");

@@ -14,12 +14,7 @@ scenarios![
     a_replaced_call_does_not_move_by_the_next_ones_lease: "lease of a service", Light, [], ["RequestsRun"];
 ];
 
-const PATIENT: RequestOptions = RequestOptions {
-    timeout: Some(secs(60)),
-    priority: None,
-    delivery: cara_core::services::session::Delivery::Reliable,
-    renew_lease: true,
-};
+const PATIENT: RequestOptions = RequestOptions { timeout: Some(secs(60)), ..RequestOptions::new() };
 
 /// Moves once a second while it is wanted. Its lease is longer than any wait here, so that time alone ends nothing.
 fn mover() -> Service {

@@ -17,12 +17,7 @@ scenarios![
     a_handler_that_panics_is_answered: "handler panics", Rough, [Panics], ["panicked"];
 ];
 
-const PATIENT: RequestOptions = RequestOptions {
-    timeout: Some(secs(30)),
-    priority: None,
-    delivery: cara_core::services::session::Delivery::Reliable,
-    renew_lease: true,
-};
+const PATIENT: RequestOptions = RequestOptions { timeout: Some(secs(30)), ..RequestOptions::new() };
 
 fn a_slow_handler_delays_no_other_peer(world: &mut dyn World) {
     let slow = Service::numbered("slow").takes(secs(3));

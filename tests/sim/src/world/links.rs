@@ -220,6 +220,8 @@ impl Links {
         let mut happened = Vec::new();
         self.answer_again(network, index);
         self.receive(network, index, &mut happened);
+        // What moves stops before a call begins.
+        self.poll(network, index, &mut happened);
         self.begin_calls(network, index, &mut happened);
         self.poll(network, index, &mut happened);
         self.arm(network, index);

@@ -1,6 +1,7 @@
 //! What a test lets one end do, and asks of it.
 
 use std::boxed::Box;
+use std::rc::Rc;
 use std::vec;
 use std::vec::Vec;
 
@@ -9,7 +10,7 @@ use super::setup::{self, Handler, Run};
 use super::side::{Arguments, Begun, Side, Table, context};
 use crate::config::{Constraints, Priority};
 use crate::distribution::connection_handler::Directive;
-use crate::distribution::function::Definition;
+use crate::distribution::function::{Attributes, Definition};
 use crate::distribution::function_list::{Generation, Slot};
 use crate::distribution::message::RequestHeader;
 use crate::distribution::parameters::ParametersView;
@@ -17,7 +18,7 @@ use crate::error::{CloseReason, Error, ServiceError};
 use crate::host::connections::LinkCounter;
 use crate::host::frame::{ChunkWriter, Chunking};
 use crate::services::Context;
-use crate::services::lease::LeaseEnd;
+use crate::services::lease::{Lease, LeaseEnd};
 use crate::services::requests::CallId;
 use crate::storage::Buffers;
 use crate::time::Duration;
@@ -56,10 +57,29 @@ impl Side {
         self.add(definition, lease.as_millis(), Run::Now(run))
     }
 
+    /// Adds a function that moves what the one in `other` moves.
+    pub(super) fn offer_sharing(&mut self, definition: &str, lease: Duration, other: Slot) -> Slot {
+        let word = self.functions.function(other).unwrap().handler.lease.clone();
+        let attributes = Attributes { lease: Some(lease), ..Attributes::default() };
+        self.add_with(definition, attributes, Run::Now(|_| Ok(())), word)
+    }
+
+    /// Adds a function that stops or resets all, or what the one in `charge` moves. It fails for a negative `x`.
+    pub(super) fn offer_control(&mut self, definition: &str, attributes: Attributes, charge: Option<Slot>) -> Slot {
+        let word = charge.and_then(|slot| self.functions.function(slot).unwrap().handler.lease.clone());
+        self.add_with(definition, attributes, Run::Held, word)
+    }
+
+    fn add_with(&mut self, definition: &str, attributes: Attributes, run: Run, lease: Option<Rc<Lease>>) -> Slot {
+        let definition = Definition::parse(definition).unwrap();
+        self.functions.add_function(&definition, attributes, Handler::new(run, lease)).unwrap()
+    }
+
     fn add(&mut self, definition: &str, lease: u64, run: Run) -> Slot {
         let definition = Definition::parse(definition).unwrap();
         let attributes = setup::attributes(&definition, lease);
-        self.functions.add_function(&definition, attributes, Handler::new(run)).unwrap()
+        let lease = attributes.lease.map(|_| Rc::default());
+        self.functions.add_function(&definition, attributes, Handler::new(run, lease)).unwrap()
     }
 
     /// Publishes everything that it offers.
@@ -76,7 +96,13 @@ impl Side {
 
     /// What an interrupt is told that falls so long behind the moment at which the session began to look at something.
     pub(super) fn is_live_behind(&self, slot: Slot, later: Duration) -> bool {
-        self.functions.function(slot).unwrap().handler.lease.is_live(self.now + later)
+        self.functions
+            .function(slot)
+            .unwrap()
+            .handler
+            .lease
+            .as_ref()
+            .is_some_and(|lease| lease.is_live(self.now + later))
     }
 
     pub(super) fn request_with(
@@ -136,7 +162,7 @@ impl Side {
     /// Whether an order of a function may go on, by its own look.
     pub(super) fn goes_on(&self, call: &Call) -> bool {
         let lease = &self.functions.function(call.slot).unwrap().handler.lease;
-        lease.is_live_for(call.order.unwrap(), self.now)
+        lease.as_ref().unwrap().is_live_for(call.order.unwrap(), self.now)
     }
 
     pub(super) fn end_lease(&mut self, slot: Slot) {
@@ -165,7 +191,7 @@ impl Side {
     /// Puts another function in the place of the one of its name, and publishes nothing.
     pub(super) fn replace(&mut self, definition: &str) {
         let definition = Definition::parse(definition).unwrap();
-        let handler = Handler::new(Run::Now(|_| Ok(())));
+        let handler = Handler::new(Run::Now(|_| Ok(())), Some(Rc::default()));
         self.functions.replace(&definition, setup::attributes(&definition, 0), handler).unwrap();
     }
 

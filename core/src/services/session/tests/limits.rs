@@ -43,6 +43,7 @@ fn an_emergency_above_its_limit_is_refused() {
             slot,
             generation: Generation(0),
             wants_reply: false,
+            takes_over: false,
             unknown: 0,
             remaining: Duration::from_secs(1),
             stamp: pair.agv.now.as_micros(),

@@ -9,6 +9,7 @@
 
 mod access;
 mod acts;
+mod actuators;
 mod chaos;
 mod delivery;
 mod ends;

@@ -1,6 +1,7 @@
 //! What a pair is made of: constraints, storage, hellos, handlers.
 
 use core::cell::Cell;
+use std::rc::Rc;
 use std::vec;
 
 use super::super::{Publication, SessionStorage, buffer_bytes};
@@ -53,7 +54,7 @@ impl Default for Setup {
 /// A service of a test.
 pub(super) struct Handler {
     pub(super) run: Run,
-    pub(super) lease: Lease,
+    pub(super) lease: Option<Rc<Lease>>,
     /// It has a word that motors read. Without one, the unit alone knows of the lease.
     pub(super) has_word: Cell<bool>,
 }
@@ -68,14 +69,14 @@ pub(super) enum Run {
 }
 
 impl Handler {
-    pub(super) fn new(run: Run) -> Self {
-        Self { run, lease: Lease::new(), has_word: Cell::new(true) }
+    pub(super) fn new(run: Run, lease: Option<Rc<Lease>>) -> Self {
+        Self { run, lease, has_word: Cell::new(true) }
     }
 }
 
 impl Service for Handler {
     fn lease(&self) -> Option<&Lease> {
-        self.has_word.get().then_some(&self.lease)
+        self.lease.as_deref().filter(|_| self.has_word.get())
     }
 }
 

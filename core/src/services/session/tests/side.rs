@@ -32,6 +32,8 @@ pub(super) struct Begun {
     pub(super) priority: Priority,
     /// Bytes of the stream that had arrived by then.
     pub(super) received: usize,
+    /// Events that had happened by then.
+    pub(super) happened: usize,
     /// The argument `x`, if there is one.
     pub(super) x: Option<i64>,
 }
@@ -154,14 +156,20 @@ impl Side {
         }
         worked |= self.read();
         worked |= self.run_calls();
-        while let Some(event) = self.session.poll(context!(self)) {
-            self.note(Some(event), &mut Arguments::default());
-            worked = true;
-        }
+        worked |= self.poll();
         for (call, result) in core::mem::take(&mut self.unanswered) {
             let unanswered = self.unanswered.len();
             self.answer(call, result);
             worked |= self.unanswered.len() == unanswered;
+        }
+        worked
+    }
+
+    fn poll(&mut self) -> bool {
+        let mut worked = false;
+        while let Some(event) = self.session.poll(context!(self)) {
+            self.note(Some(event), &mut Arguments::default());
+            worked = true;
         }
         worked
     }
@@ -190,7 +198,7 @@ impl Side {
     }
 
     fn run_calls(&mut self) -> bool {
-        let mut worked = false;
+        let mut worked = self.poll();
         let mut arguments: Arguments = Box::default();
         while let Some(call) = self.session.next_call(context!(self), &mut *arguments) {
             self.run(call, &mut arguments);
@@ -205,6 +213,7 @@ impl Side {
             function: function.name().to_string(),
             priority: call.priority,
             received: self.received,
+            happened: self.happened.len(),
             x: arguments.variable("x").ok(),
         });
         match function.handler.run {

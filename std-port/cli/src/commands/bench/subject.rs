@@ -51,6 +51,7 @@ impl Subject {
             timeout_ms: None,
             priority: None,
             best_effort: false,
+            take_over: false,
         }
     }
 }

@@ -1,0 +1,260 @@
+//! What moves is an actuator: functions share it, one order at a time has it, a stop ends that order and lets none begin.
+
+use super::super::{Event, RequestOptions};
+use super::none;
+use super::pair::Pair;
+use crate::config::Priority;
+use crate::distribution::function::Attributes;
+use crate::distribution::function_list::Slot;
+use crate::error::{Error, ServiceError};
+use crate::services::lease::{Claim, Latch, Lease, LeaseEnd, Service as _};
+use crate::services::requests::CallId;
+use crate::time::{Duration, Instant};
+
+const LEASE: Duration = Duration::from_millis(500);
+/// Longer than what is rounded away of the time of a latch.
+const MOMENT: Duration = Duration::from_millis(5);
+
+const STOP: Attributes =
+    Attributes { priority: Priority::Emergency, lease: None, idempotent: true, actuator: 0, stop: true, reset: false };
+const RESET: Attributes = Attributes { priority: Priority::Normal, stop: false, reset: true, ..STOP };
+
+/// A vehicle whose `go()` and `dock()` move the drive, and `lift()` the fork; `halt()` stops all, `free()` resets all.
+fn vehicle() -> (Pair, [Slot; 3]) {
+    let mut pair = Pair::live();
+    let go = pair.agv.offer_leased("go()", LEASE);
+    let dock = pair.agv.offer_sharing("dock()", LEASE, go);
+    let lift = pair.agv.offer_leased("lift()", LEASE);
+    pair.agv.offer_control("halt()", STOP, None);
+    pair.agv.offer_control("free()", RESET, None);
+    pair.publish();
+    (pair, [go, dock, lift])
+}
+
+fn call(pair: &mut Pair, function: &str) -> CallId {
+    let id = pair.manager.call(function, &none()).unwrap();
+    pair.settle();
+    id
+}
+
+/// The same, for a function whose calls the test answers: what it answers.
+fn control(pair: &mut Pair, function: &str, answer: Result<(), Error>) -> CallId {
+    let id = call(pair, function);
+    answer_held(pair, answer);
+    id
+}
+
+fn answer_held(pair: &mut Pair, answer: Result<(), Error>) {
+    let results = none();
+    match answer {
+        Ok(()) => pair.agv.answer_held(Ok(&results)),
+        Err(error) => pair.agv.answer_held(Err(error)),
+    }
+    pair.settle();
+}
+
+fn outcome(pair: &Pair, id: CallId) -> Result<(), Error> {
+    pair.manager.outcome(id).expect("it has an outcome").map(|_| ())
+}
+
+fn hooks(pair: &Pair) -> usize {
+    pair.agv.count(|event| matches!(event, Event::LeaseExpired(_)))
+}
+
+fn latch(pair: &Pair, slot: Slot) -> Option<Latch> {
+    pair.agv.functions.function(slot).unwrap().handler.lease().unwrap().latch()
+}
+
+#[test]
+fn a_newer_order_of_the_same_actuator_takes_the_place_of_the_older_one_without_the_hook() {
+    let (mut pair, [go, dock, lift]) = vehicle();
+    let (first, other) = (call(&mut pair, "go"), call(&mut pair, "lift"));
+    let second = call(&mut pair, "dock");
+    assert_eq!((outcome(&pair, first), outcome(&pair, second)), (Ok(()), Ok(())));
+    assert!(pair.manager.is_told(first, LeaseEnd::Replaced) && hooks(&pair) == 0);
+    pair.run(Duration::from_secs(2));
+    assert!(pair.agv.is_live(go) && pair.agv.is_live(dock) && pair.agv.is_live(lift), "{other:?} goes on as well");
+    assert!(pair.manager.session.holds(second) && !pair.manager.session.holds(first));
+    // Its holder gives it up: the drive stands, the fork does not.
+    pair.manager.release(dock).unwrap();
+    pair.settle();
+    assert!(!pair.agv.is_live(go) && pair.agv.is_live(lift) && hooks(&pair) == 1);
+}
+
+#[test]
+fn functions_that_move_the_same_thing_are_published_with_the_same_number() {
+    let (pair, slots) = vehicle();
+    let theirs = pair.manager.session.their_function_list();
+    let number = |slot| theirs.function(slot).unwrap().attributes.actuator;
+    let [go, dock, lift] = slots.map(number);
+    assert!(go != 0 && go == dock && lift == 0, "it shares its own with none");
+    assert_eq!(number(theirs.named("halt").unwrap().slot), 0);
+}
+
+#[test]
+fn what_another_caller_moves_is_held_unless_it_is_taken_over() {
+    let (mut pair, [go, ..]) = vehicle();
+    let word = pair.agv.functions.function(go).unwrap().handler.lease.clone().unwrap();
+    let other = Claim { holder: 77, replaces: None, takes_over: false };
+    let order = word.claim(pair.agv.now, pair.agv.now + LEASE, &other).unwrap();
+    let refused = call(&mut pair, "dock");
+    assert_eq!(outcome(&pair, refused), Err(Error::Held { by: 77 }));
+    assert!(word.is_live_for(order, pair.agv.now));
+    let options = RequestOptions { take_over: true, ..RequestOptions::default() };
+    let taken = pair.manager.request_with("dock", &none(), &options, true).unwrap();
+    pair.settle();
+    assert_eq!(outcome(&pair, taken), Ok(()));
+    assert!(!word.is_live_for(order, pair.agv.now) && pair.agv.is_live(go));
+    assert!(!word.renew(order, pair.agv.now + LEASE), "it is dead for ever");
+    let refused = word.claim(pair.agv.now, pair.agv.now + LEASE, &other);
+    assert_eq!(refused, Err(Error::Held { by: 1 }), "the manager's ID");
+}
+
+#[test]
+fn a_stop_ends_all_orders_before_its_handler_runs_and_lets_none_begin() {
+    let (mut pair, [go, _, lift]) = vehicle();
+    let (driving, lifting) = (call(&mut pair, "go"), call(&mut pair, "lift"));
+    pair.run(MOMENT);
+    let stopping = call(&mut pair, "halt");
+    assert!(pair.manager.outcome(stopping).is_none(), "its handler has not answered");
+    assert!(!pair.agv.is_live(go) && !pair.agv.is_live(lift) && hooks(&pair) == 2);
+    let before = &pair.agv.happened[..pair.agv.ran.last().unwrap().happened];
+    let expired = before.iter().filter(|event| matches!(event, Event::LeaseExpired(_)));
+    assert_eq!(expired.count(), 2, "both hooks have run when the handler does");
+    assert!(pair.manager.is_told(driving, LeaseEnd::Stopped) && pair.manager.is_told(lifting, LeaseEnd::Stopped));
+    let refused = call(&mut pair, "dock");
+    assert_eq!(outcome(&pair, refused), Err(Error::Inhibited { by: 1, reason: 0 }));
+    // It lasts until a reset, whatever becomes of the link and of the stop's own handler.
+    answer_held(&mut pair, Ok(()));
+    pair.run(Duration::from_secs(60));
+    let refused = call(&mut pair, "go");
+    assert_eq!(outcome(&pair, refused), Err(Error::Inhibited { by: 1, reason: 0 }));
+    assert_eq!(control(&mut pair, "free", Ok(())), CallId(refused.0 + 1));
+    let moving = call(&mut pair, "go");
+    assert_eq!(outcome(&pair, moving), Ok(()));
+    assert!(pair.agv.is_live(go) && hooks(&pair) == 2);
+}
+
+#[test]
+fn a_stop_of_one_actuator_leaves_the_others() {
+    let mut pair = Pair::live();
+    let go = pair.agv.offer_leased("go()", LEASE);
+    let lift = pair.agv.offer_leased("lift()", LEASE);
+    pair.agv.offer_control("halt_drive()", STOP, Some(go));
+    pair.agv.offer_control("free_drive()", RESET, Some(go));
+    pair.publish();
+    let lifting = call(&mut pair, "lift");
+    call(&mut pair, "go");
+    pair.run(MOMENT);
+    control(&mut pair, "halt_drive", Ok(()));
+    assert!(!pair.agv.is_live(go) && pair.agv.is_live(lift) && pair.manager.session.holds(lifting));
+    let theirs = pair.manager.session.their_function_list();
+    let number = |name: &str| theirs.named(name).unwrap().attributes.actuator;
+    assert_eq!((number("halt_drive"), number("free_drive")), (number("go"), number("go")));
+    pair.run(MOMENT);
+    control(&mut pair, "free_drive", Ok(()));
+    assert_eq!(latch(&pair, go), None);
+}
+
+#[test]
+fn a_reset_that_its_service_refuses_lifts_nothing() {
+    let (mut pair, [go, ..]) = vehicle();
+    control(&mut pair, "halt", Ok(()));
+    pair.run(MOMENT);
+    control(&mut pair, "free", Err(Error::Service(ServiceError::Failed(3))));
+    assert_eq!(latch(&pair, go), Some(Latch { by: 1, reason: 0 }));
+    control(&mut pair, "free", Ok(()));
+    assert_eq!(latch(&pair, go), None);
+}
+
+#[test]
+fn a_reset_does_not_undo_a_stop_that_came_while_it_ran() {
+    let (mut pair, [go, ..]) = vehicle();
+    control(&mut pair, "halt", Ok(()));
+    pair.run(MOMENT);
+    let resetting = call(&mut pair, "free");
+    pair.run(MOMENT);
+    // The vehicle's own: a bumper. The first reason stays.
+    let now = pair.agv.now;
+    let function = pair.agv.functions.function(go).unwrap();
+    function.handler.inhibit(now, Latch { by: 0, reason: 9 });
+    answer_held(&mut pair, Ok(()));
+    assert_eq!(outcome(&pair, resetting), Ok(()));
+    assert_eq!(latch(&pair, go), Some(Latch { by: 1, reason: 0 }));
+}
+
+#[test]
+fn the_vehicles_own_latch_is_told_with_its_reason() {
+    let (mut pair, [go, ..]) = vehicle();
+    let driving = call(&mut pair, "go");
+    let now = pair.agv.now;
+    pair.agv.functions.function(go).unwrap().handler.inhibit(now, Latch { by: 0, reason: 9 });
+    assert!(!pair.agv.is_live(go), "at once");
+    pair.run(LEASE);
+    assert!(pair.manager.is_told(driving, LeaseEnd::Stopped) && hooks(&pair) == 1);
+    let refused = call(&mut pair, "go");
+    assert_eq!(outcome(&pair, refused), Err(Error::Inhibited { by: 0, reason: 9 }));
+}
+
+#[test]
+fn a_stop_is_noticed_on_a_link_that_has_nothing_to_do() {
+    let mut pair = Pair::live();
+    let go = pair.agv.offer_leased("go()", Duration::from_secs(600));
+    pair.publish();
+    let driving = call(&mut pair, "go");
+    let now = pair.agv.now;
+    pair.agv.functions.function(go).unwrap().handler.inhibit(now, Latch { by: 0, reason: 9 });
+    // A keep-alive later.
+    pair.run(Duration::from_millis(1_001));
+    assert!(pair.manager.is_told(driving, LeaseEnd::Stopped) && hooks(&pair) == 1);
+}
+
+#[test]
+fn a_call_that_was_made_before_the_stop_does_not_begin_after_the_reset() {
+    let (mut pair, [go, ..]) = vehicle();
+    // The stop overtakes it: it is in another class, and the stream stands still.
+    pair.manager.net.frozen = true;
+    let old = pair.manager.call("go", &none()).unwrap();
+    pair.manager.call("halt", &none()).unwrap();
+    pair.settle();
+    assert!(!pair.agv.held.is_empty(), "the datagram of the stop has come");
+    pair.run(MOMENT);
+    let word = pair.agv.functions.function(go).unwrap().handler.lease.clone().unwrap();
+    word.reset(pair.agv.now, pair.agv.now);
+    assert!(!word.is_inhibited());
+    pair.manager.net.frozen = false;
+    pair.settle();
+    assert_eq!(outcome(&pair, old), Err(Error::Expired));
+    assert!(!pair.agv.is_live(go));
+}
+
+#[test]
+fn nothing_comes_alive_under_a_latch() {
+    let (lease, now) = (Lease::new(), Instant::from_micros(1_000_000));
+    let claim = Claim { holder: 1, replaces: None, takes_over: true };
+    let order = lease.claim(now, now + LEASE, &claim).unwrap();
+    lease.inhibit(now, Latch { by: 0, reason: 1 });
+    assert!(!lease.is_live(now) && !lease.lasts_beyond(now) && !lease.renew(order, now + LEASE));
+    assert_eq!(lease.claim(now, now + LEASE, &claim), Err(Error::Inhibited { by: 0, reason: 1 }));
+    assert_eq!(lease.begin(now, now + LEASE), None);
+    // Its hook is still to run when the latch is lifted.
+    lease.reset(now + MOMENT, now + MOMENT);
+    assert_eq!(lease.latch(), None);
+    assert_eq!(lease.claim(now + MOMENT, now + LEASE, &claim), Err(Error::Busy));
+    assert!(!lease.is_live_for(order, now + MOMENT));
+    assert!(lease.end(order) && lease.claim(now + MOMENT, now + LEASE, &claim).is_ok());
+}
+
+#[test]
+fn a_reset_counts_from_when_it_was_made_however_long_the_latch_is_old() {
+    let day = Duration::from_secs(24 * 3_600);
+    for days in [0, 1, 24, 25, 26, 49] {
+        let (lease, now) = (Lease::new(), Instant::from_micros(7_000_000));
+        lease.inhibit(now, Latch { by: 0, reason: 1 });
+        let later = now + day.times(days) + Duration::from_secs(10);
+        lease.reset(later, now);
+        assert!(lease.is_inhibited(), "after {days} days: it was made when the stop was");
+        lease.reset(later, later);
+        assert!(!lease.is_inhibited(), "after {days} days");
+    }
+}
