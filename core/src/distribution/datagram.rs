@@ -8,7 +8,7 @@
 //! | 6 | last version that the sender speaks |
 //! | 7 | how many codes are at the end |
 //! | 8–11 | fleet, little-endian |
-//! | 12– | [`WhoHas`], [`Announce`]: [items](super::items); session: link u16, zero u16, nonce u64, body |
+//! | 12– | [`WhoHas`], [`Announce`]: [items]; session: link u16, zero u16, nonce u64, body |
 //!
 //! In secured mode a search and an answer end with the fleet's code, over everything before it. An answer to one unit
 //! has the pair's code as well, in front of the fleet's. A [`WhoHas`] and a broadcast [`Announce`] are filled up with

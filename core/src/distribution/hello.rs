@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 
 use super::compact::{Reader, Writer};
 use super::identity::{Epoch, Fleet, Identity};
-use super::items::{Item, Items, Malformed};
+use super::items::{Items, Malformed};
 use crate::config::{Constraints, LATER, MINIMUM_CHUNK_BYTES, Mode, NODE_NAME_BYTES, VERSIONS, Versions};
 
 /// Bytes before the items.
@@ -210,7 +210,7 @@ impl Hello {
         }
         let (mut unit, mut wanted, mut link, mut limits, mut skipped) = (None, None, None, None, 0);
         for item in Items::new(items) {
-            let item: Item<'_> = item?;
+            let item = item?;
             match item.kind {
                 kind::UNIT => unit = Some(item.read(Identity::take)?),
                 kind::WANTED => wanted = Some(item.read(Manager::take)?),
@@ -247,6 +247,7 @@ impl Hello {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used, clippy::indexing_slicing, clippy::arithmetic_side_effects)]
+    use super::super::items::list;
     use super::*;
     use proptest::prelude::*;
 
@@ -279,16 +280,10 @@ mod tests {
 
     /// The hello with these items in front of its own.
     fn with_items(hello: &Hello, mode: Mode, items: &[(u16, &[u8])]) -> std::vec::Vec<u8> {
-        let (mut out, mut more) = ([0; 2 * ROOM], [0; ROOM]);
+        let mut out = [0; ROOM];
         let length = hello.encode(mode, &mut out).unwrap();
-        let mut writer = Writer::new(&mut more);
-        for (kind, body) in items {
-            let item = writer.begin(*kind);
-            writer.bytes(body);
-            writer.end(item);
-        }
-        let used = writer.finish().unwrap();
-        [&out[..PREFIX_BYTES], &more[..used], &out[PREFIX_BYTES..length]].concat()
+        let more = list(items, |writer, body| writer.bytes(body));
+        [&out[..PREFIX_BYTES], &more, &out[PREFIX_BYTES..length]].concat()
     }
 
     #[test]

@@ -105,6 +105,20 @@ pub(crate) fn fill(length: usize, whole: usize, out: &mut [u8]) -> Option<usize>
     Some(whole)
 }
 
+/// A list of items of these kinds, each with a body that `put` makes.
+#[cfg(test)]
+pub(crate) fn list<B: Copy>(items: &[(u16, B)], put: impl Fn(&mut super::compact::Writer<'_>, B)) -> std::vec::Vec<u8> {
+    let mut out = [0xAA; 600];
+    let mut writer = super::compact::Writer::new(&mut out);
+    for (kind, body) in items {
+        let item = writer.begin(*kind);
+        put(&mut writer, *body);
+        writer.end(item);
+    }
+    let used = writer.finish().unwrap_or(0);
+    out.get(..used).unwrap_or(&[]).to_vec()
+}
+
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used, clippy::indexing_slicing, clippy::arithmetic_side_effects)]
@@ -112,19 +126,10 @@ mod tests {
 
     use proptest::prelude::*;
 
-    use super::super::compact::Writer;
     use super::*;
 
     fn list(items: &[(u16, &[u8])]) -> Vec<u8> {
-        let mut out = [0xAA; 600];
-        let mut writer = Writer::new(&mut out);
-        for (kind, body) in items {
-            let start = writer.begin(*kind);
-            writer.bytes(body);
-            writer.end(start);
-        }
-        let used = writer.finish().unwrap();
-        out[..used].to_vec()
+        super::list(items, |writer, body| writer.bytes(body))
     }
 
     #[test]

@@ -1,5 +1,6 @@
 //! Messages of a session: requests and replies with headers in front of a block of parameters, control messages of
-//! [items](super::items). Headers tell their length, so that a later version can put more into them. With [`hello`](super::hello), [`datagram`](super::datagram) and [`block`](super::block) the only code
+//! [items](super::items). Headers tell their length, so that a later version can put more into them. With
+//! [`hello`](super::hello), [`datagram`](super::datagram) and [`block`](super::block) the only code
 //! that knows the encoding; `docs/wire.md` says it in words.
 
 pub use super::control::{Control, LeaseEnd};
@@ -37,7 +38,7 @@ const MORE_BYTES: usize = if LATER { 8 } else { 0 };
 /// Longest header that a receiver has room for in front of its longest block: those of later versions may be longer.
 pub const LONGEST_HEADER_BYTES: usize = 64;
 /// Bytes before the items of a control message.
-pub const CONTROL_HEADER_BYTES: usize = 4;
+const CONTROL_HEADER_BYTES: usize = 4;
 /// Headers tell their length in these.
 const WORD: usize = 4;
 const REQUEST_WORDS: u8 = (REQUEST_BYTES / WORD) as u8;

@@ -1,4 +1,4 @@
-//! A manager that was written from `docs/wire.md`, in Python, calls the example AGV, and answers when keys are made anew.
+//! A manager that was written from `docs/wire.md`, in Python, calls the example AGV, and takes part when a link is rekeyed.
 //!
 //! On loopback, in fleets of their own, which have keys. Every wait is bounded.
 
@@ -87,8 +87,8 @@ fn a_manager_written_from_the_document_calls_the_agv() {
     assert!(agv.terminate(PATIENCE).unwrap().success());
 }
 
-/// An s_unit makes the keys of its link anew about once a second; each emergency comes twice and is run once, and a lease that
-/// would outlast the test is released.
+/// The s_unit rekeys its link about once a second. Each emergency is sent twice and runs once. A lease that would outlast the
+/// test is released.
 #[test]
 fn a_manager_written_from_the_document_follows_new_keys() {
     let fleet = random_fleet();

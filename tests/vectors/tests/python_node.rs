@@ -97,7 +97,7 @@ fn a_node_written_from_the_document_joins_a_manager() {
     talk(node, &manager, |_| thread::sleep(Duration::from_secs(2)));
 }
 
-/// As the last one, with keys, which the node makes anew about once a second.
+/// The same as the test above, on a secured link, which the node rekeys about once a second.
 #[test]
 fn a_node_written_from_the_document_joins_a_secured_manager() {
     let fleet = random_fleet();

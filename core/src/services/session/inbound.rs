@@ -13,7 +13,7 @@ use crate::distribution::message::{Control, Message, REQUEST_BYTES, RequestHeade
 use crate::distribution::parameters::ParametersView;
 use crate::distribution::{block, datagram};
 use crate::error::{CloseReason, Error, Refusal};
-use crate::host::connections::{Incoming, LinkCounter, Place};
+use crate::host::connections::{Incoming, LinkCounter, Liveness, Place};
 use crate::host::endpoint::Endpoint as _;
 use crate::host::frame::Frame;
 use crate::host::secure::{Secure, Unopened};
@@ -22,6 +22,7 @@ use crate::services::lease::Service;
 use crate::services::requests::{CallId, Pending};
 use crate::services::{Context, Port};
 use crate::storage::LEFT_BY_WAITING;
+use crate::time::Instant;
 
 /// Result of [`Session::receive`].
 #[derive(Clone, Copy, Debug)]
@@ -107,13 +108,8 @@ impl<P: Port> Session<P> {
         let Some(incoming) = received.incoming else {
             return Receipt { consumed: received.consumed, event: None, paused: received.paused };
         };
-        let is_known = match incoming {
-            Incoming::Skipped => false,
-            Incoming::Session(place) => SessionBody::decode(self.link.view(place, lent)).is_some(),
-            _ => true,
-        };
-        // What a later version says shows no life that this one understands.
-        if is_known {
+        // What a later version says shows no life that this one understands; of a session body it is known once it is read.
+        if !matches!(incoming, Incoming::Skipped | Incoming::Session(_)) {
             self.liveness.heard(cx.now);
         }
         let is_emergency = matches!(incoming, Incoming::Message(Priority::Emergency, _));
@@ -147,11 +143,8 @@ impl<P: Port> Session<P> {
             }
         };
         self.link.counters.add(LinkCounter::DatagramsReceived, 1);
-        if SessionBody::decode(body).is_some() {
-            self.liveness.heard_datagram(cx.now);
-        }
         self.datagram_opened(cx.now);
-        self.session_body(cx, Place::lent(body.len()), body)
+        self.session_body(cx, Place::lent(body.len()), body, Liveness::heard_datagram)
     }
 
     /// The results that an [`Event::Reply`] names; `lent` is what was lent to the [`receive`](Self::receive) that returned it.
@@ -201,7 +194,7 @@ impl<P: Port> Session<P> {
                 None
             }
             (Incoming::Pong, Phase::Live) => self.pong_arrived(cx),
-            (Incoming::Session(place), Phase::Live) => self.session_body(cx, place, lent),
+            (Incoming::Session(place), Phase::Live) => self.session_body(cx, place, lent, Liveness::heard),
             (Incoming::Message(priority, place), Phase::Live) => {
                 self.message_arrived(cx, priority, place, lent, arguments)
             }
@@ -216,8 +209,19 @@ impl<P: Port> Session<P> {
         }
     }
 
-    fn session_body(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8]) -> Option<Event> {
-        match SessionBody::decode(self.link.view(place, lent)) {
+    /// Does what a session body says, which shows life as `heard` notes it if it can be read.
+    fn session_body(
+        &mut self,
+        cx: &mut Context<'_, P>,
+        place: Place,
+        lent: &[u8],
+        heard: fn(&mut Liveness, Instant),
+    ) -> Option<Event> {
+        let body = SessionBody::decode(self.link.view(place, lent));
+        if body.is_some() {
+            heard(&mut self.liveness, cx.now);
+        }
+        match body {
             Some(SessionBody::KeepAlive { stamp }) => {
                 self.clock.hear(cx.now, stamp);
                 None
@@ -321,62 +325,64 @@ impl<P: Port> Session<P> {
     fn control_arrived(&mut self, cx: &mut Context<'_, P>, items: Place, lent: &[u8]) -> (usize, Option<Event>) {
         let mut items = Items::new(self.link.view(items, lent));
         let Some(item) = items.next() else { return (0, None) };
-        let (left, mut skipped) = (items.rest().len(), 0);
+        let left = items.rest().len();
+        let mut skipped = 0;
         let control = item.and_then(|item| match Control::take(&item)? {
             None => item.skip(&mut skipped).map(|()| None),
             control => Ok(control),
         });
-        let event =
-            match control {
-                Err(Malformed) => {
-                    self.close(cx, CloseReason::Protocol);
-                    return (0, None);
+        let control = match control {
+            Ok(Some(control)) => control,
+            Ok(None) => {
+                self.link.counters.add(LinkCounter::ItemsSkipped, skipped.into());
+                return (left, None);
+            }
+            Err(Malformed) => {
+                self.close(cx, CloseReason::Protocol);
+                return (0, None);
+            }
+        };
+        let event = match control {
+            Control::Publish { slot, generation, attributes, signature } => {
+                let kept = Attributes::decode(attributes)
+                    .map(|attributes| self.theirs.insert(Slot(slot), Generation(generation), attributes, signature));
+                let allowed = may_publish(cx, self.remote.as_ref(), &mut self.publishing.refusals, signature);
+                match kept {
+                    Ok(Ok(())) if allowed => {}
+                    Ok(Ok(())) => {
+                        self.theirs.hide(Slot(slot));
+                        self.link.counters.add(LinkCounter::FunctionsForbidden, 1);
+                    }
+                    Ok(Err(_)) => self.link.counters.add(LinkCounter::FunctionsSkipped, 1),
+                    Err(_) => self.close(cx, CloseReason::Protocol),
                 }
-                Ok(None) => None,
-                Ok(Some(control)) => match control {
-                    Control::Publish { slot, generation, attributes, signature } => {
-                        let kept = Attributes::decode(attributes).map(|attributes| {
-                            self.theirs.insert(Slot(slot), Generation(generation), attributes, signature)
-                        });
-                        let allowed = may_publish(cx, self.remote.as_ref(), &mut self.publishing.refusals, signature);
-                        match kept {
-                            Ok(Ok(())) if allowed => {}
-                            Ok(Ok(())) => {
-                                self.theirs.hide(Slot(slot));
-                                self.link.counters.add(LinkCounter::FunctionsForbidden, 1);
-                            }
-                            Ok(Err(_)) => self.link.counters.add(LinkCounter::FunctionsSkipped, 1),
-                            Err(_) => self.close(cx, CloseReason::Protocol),
-                        }
-                        None
-                    }
-                    Control::Withdraw { slot } => {
-                        self.theirs.remove(Slot(slot));
-                        None
-                    }
-                    Control::ListEnd { serial } => {
-                        self.publishing.acknowledge(serial);
-                        self.pump(cx);
-                        Some(Event::ListChanged)
-                    }
-                    Control::ListAck { serial, skipped } => {
-                        self.publishing.was_acknowledged(serial);
-                        Some(Event::Acknowledged { serial, skipped })
-                    }
-                    Control::Limits { message_size, minimum_interval, calls } => {
-                        if let Some(remote) = &mut self.remote {
-                            remote.hello.limits.message_size = message_size;
-                            remote.hello.limits.minimum_interval = minimum_interval;
-                            remote.hello.limits.calls = calls;
-                        }
-                        None
-                    }
-                    Control::LeaseEnded { call, why } => self
-                        .stop_renewing(CallId(call))
-                        .map(|held| Event::LeaseEnded { call: held.call, slot: held.slot, why }),
-                },
-            };
-        self.link.counters.add(LinkCounter::ItemsSkipped, skipped.into());
+                None
+            }
+            Control::Withdraw { slot } => {
+                self.theirs.remove(Slot(slot));
+                None
+            }
+            Control::ListEnd { serial } => {
+                self.publishing.acknowledge(serial);
+                self.pump(cx);
+                Some(Event::ListChanged)
+            }
+            Control::ListAck { serial, skipped } => {
+                self.publishing.was_acknowledged(serial);
+                Some(Event::Acknowledged { serial, skipped })
+            }
+            Control::Limits { message_size, minimum_interval, calls } => {
+                if let Some(remote) = &mut self.remote {
+                    remote.hello.limits.message_size = message_size;
+                    remote.hello.limits.minimum_interval = minimum_interval;
+                    remote.hello.limits.calls = calls;
+                }
+                None
+            }
+            Control::LeaseEnded { call, why } => {
+                self.stop_renewing(CallId(call)).map(|held| Event::LeaseEnded { call: held.call, slot: held.slot, why })
+            }
+        };
         (left, event)
     }
 

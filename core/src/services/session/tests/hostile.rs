@@ -10,9 +10,9 @@ use super::net::Datagrams;
 use super::pair::Pair;
 use super::{none, parameters, x};
 use crate::config::Priority;
-use crate::distribution::compact::Writer;
 use crate::distribution::function::Definition;
 use crate::distribution::function_list::{Generation, Slot};
+use crate::distribution::items::list;
 use crate::distribution::message::{
     Control, Release, Renewal, RequestHeader, SessionBody, encode_failure, encode_reply,
 };
@@ -77,16 +77,7 @@ fn publish(slot: u32, generation: u32, signature: &[u8]) -> Control<'_> {
 
 /// A control message of items of these kinds, with numbers for their fields as far as they fit there.
 fn any_items(items: &[(u16, &[u32])]) -> Vec<u8> {
-    let mut bytes = [0; 128];
-    let mut writer = Writer::new(&mut bytes);
-    writer.bytes(&[3, 0, 0, 0]);
-    for (kind, numbers) in items {
-        let item = writer.begin(*kind);
-        writer.numbers(numbers);
-        writer.end(item);
-    }
-    let length = writer.finish().unwrap();
-    bytes[..length].to_vec()
+    [&[3, 0, 0, 0][..], &list(items, |writer, numbers| writer.numbers(numbers))].concat()
 }
 
 fn control(control: &Control<'_>) -> Vec<u8> {
