@@ -111,6 +111,11 @@ impl<P: Port> Session<P> {
         result: Result<&ParametersView, Error>,
     ) -> Result<(), Error> {
         let Some(head) = self.calls.call(ticket) else { return Ok(()) };
+        // Before the answer leaves: one that says it was reset is true.
+        let result = match result {
+            Ok(results) if head.resets => self.reset_orders(cx, &head).map(|()| results),
+            result => result,
+        };
         if self.phase == Phase::Live {
             let sent = match result {
                 Ok(results) if head.wants_reply => self.send_results(cx, &head, results),
@@ -121,9 +126,6 @@ impl<P: Port> Session<P> {
             if let Err(error @ Error::Full(_)) = sent {
                 return Err(error);
             }
-        }
-        if head.resets && result.is_ok() {
-            self.reset_orders(cx, &head);
         }
         // A call that failed wants nothing any more, so what it started stops now and not at the end of its lease.
         if result.is_err() {

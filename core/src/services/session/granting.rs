@@ -143,11 +143,15 @@ impl<P: Port> Session<P> {
     }
 
     /// A function that resets has been answered with results: what it resets may move again, unless it was stopped after the
-    /// call was made.
-    pub(super) fn reset_orders(&mut self, cx: &Context<'_, P>, head: &CallHead) {
+    /// call was made, which is [`Error::Inhibited`].
+    pub(super) fn reset_orders(&self, cx: &Context<'_, P>, head: &CallHead) -> Result<(), Error> {
+        let mut outcome = Ok(());
         for (_, service) in self.moved_by(cx, head.slot, head.generation) {
             service.reset(cx.now, head.sent_at);
+            let latch = service.lease().and_then(Lease::latch);
+            outcome = outcome.and(latch.map_or(Ok(()), |latch| Err(latch.into())));
         }
+        outcome
     }
 
     /// The leased services that move what a function has in its charge: its own actuator, or all.

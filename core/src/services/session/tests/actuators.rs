@@ -179,7 +179,7 @@ fn a_reset_does_not_undo_a_stop_that_came_while_it_ran() {
     let function = pair.agv.functions.function(go).unwrap();
     function.handler.inhibit(now, Latch { by: 0, reason: 9 });
     answer_held(&mut pair, Ok(()));
-    assert_eq!(outcome(&pair, resetting), Ok(()));
+    assert_eq!(outcome(&pair, resetting), Err(Error::Inhibited { by: 1, reason: 0 }), "its caller is told");
     assert_eq!(latch(&pair, go), Some(Latch { by: 1, reason: 0 }));
 }
 
