@@ -24,6 +24,8 @@ pub(crate) enum Verb {
     Functions(commands::functions::Arguments),
     Call(commands::call::Arguments),
     Publish(commands::publish::Arguments),
+    Stop(commands::stop::Stop),
+    Reset(commands::stop::Reset),
     Retire(commands::retire::Arguments),
     Set(commands::set::Arguments),
     Watch(commands::watch::Arguments),

@@ -28,6 +28,8 @@ fn run(verb: Verb, global: &Global) -> anyhow::Result<ExitCode> {
         Verb::Functions(arguments) => commands::functions::run(arguments, global),
         Verb::Call(arguments) => commands::call::run(arguments, global),
         Verb::Publish(arguments) => commands::publish::run(arguments, global),
+        Verb::Stop(arguments) => commands::stop::stop(arguments, global),
+        Verb::Reset(arguments) => commands::stop::reset(arguments, global),
         Verb::Retire(arguments) => commands::retire::run(arguments, global),
         Verb::Set(arguments) => commands::set::run(arguments, global),
         Verb::Watch(arguments) => commands::watch::run(arguments, global),

@@ -10,6 +10,7 @@ use cara_core::services::access::Verb;
 use cara_core::time::Duration;
 
 use super::protocol::{Answer, Failure, Question};
+use super::stop::{self, Which};
 use super::{call, constraint, describe, everybody, hold, select};
 use crate::{CommunicationSystem, Finding, Identity, Peer};
 
@@ -104,6 +105,8 @@ fn attempt<T: Send + 'static>(
             permit(system, &question.function, Verb::Call)?;
             hold::hold(system, question, sink, lives)
         }
+        Question::Stop { node } => stop::call(system, Which::Stop, node.as_deref(), sink, wanted),
+        Question::Reset { node } => stop::call(system, Which::Reset, node.as_deref(), sink, wanted),
         Question::Publish { node, timeout_ms } => {
             let own = system.my_function_list().names();
             own.iter().try_for_each(|function| permit(system, function, Verb::Publish))?;

@@ -206,27 +206,28 @@ fn call_all<T: Send + 'static>(
         return Err(Failure::configuration("UnknownFunction", text).into());
     }
     if !question.asynchronous {
-        return block_all(&peers, question, options, sink, wanted);
+        let calls: Vec<_> = peers.iter().map(|peer| (peer, question)).collect();
+        return block_all(&calls, options, wanted, &mut |_, answer| send(sink, answer));
     }
     peers.iter().try_for_each(|peer| tell(peer, question, options, sink))
 }
 
-/// All at the same time, as far as the memory for their parameters reaches; answers come in the order of the replies.
-fn block_all<T: Send + 'static>(
-    peers: &[Peer<T>],
-    question: &CallQuestion,
+/// All at the same time, as far as the memory for their parameters reaches; `tell` gets the answers in the order of the replies,
+/// each with the index of its call.
+pub(super) fn block_all<T: Send + 'static>(
+    calls: &[(&Peer<T>, &CallQuestion)],
     options: &RequestOptions,
-    sink: Sink<'_>,
     wanted: &dyn Fn() -> bool,
+    tell: &mut dyn FnMut(usize, Answer) -> Result<(), End>,
 ) -> Result<(), End> {
-    let mut peers = peers.iter();
+    let mut calls = calls.iter().enumerate();
     let mut under_way = Vec::new();
     let mut bytes = 0;
     let waker = thread_waker();
     let mut cx = std::task::Context::from_waker(&waker);
     loop {
         while bytes < BYTES_AT_A_TIME
-            && let Some(peer) = peers.next()
+            && let Some((number, &(peer, question))) = calls.next()
         {
             let started = Instant::now();
             let begun = prepare(peer, question).and_then(|prepared| {
@@ -236,9 +237,9 @@ fn block_all<T: Send + 'static>(
             match begun {
                 Ok((prepared, call)) => {
                     bytes += size_of_val(&*prepared.parameters);
-                    under_way.push((peer, started, prepared, call));
+                    under_way.push((number, peer, started, prepared, call));
                 }
-                Err(failure) => send(sink, called(peer, Err(failure), started))?,
+                Err(failure) => tell(number, called(peer, Err(failure), started))?,
             }
         }
         if under_way.is_empty() {
@@ -246,12 +247,12 @@ fn block_all<T: Send + 'static>(
         }
         let before = under_way.len();
         let mut index = 0;
-        while let Some((peer, started, prepared, call)) = under_way.get_mut(index) {
+        while let Some((number, peer, started, prepared, call)) = under_way.get_mut(index) {
             if let Poll::Ready(outcome) = call.poll(&mut cx, &mut prepared.parameters) {
                 bytes -= size_of_val(&*prepared.parameters);
-                let answer = called(peer, prepared.outcome(outcome), *started);
+                let (number, answer) = (*number, called(peer, prepared.outcome(outcome), *started));
                 drop(under_way.swap_remove(index));
-                send(sink, answer)?;
+                tell(number, answer)?;
             } else {
                 index += 1;
             }

@@ -13,6 +13,11 @@ impl Failure {
         Self::new(Cause::Configuration, error, text)
     }
 
+    /// A failure of the node that was asked.
+    pub(super) fn peer(error: &str, text: impl Display) -> Self {
+        Self::new(Cause::Peer, error, text)
+    }
+
     /// A failure for which the unit lacks something.
     pub fn resource(error: &str, text: impl Display) -> Self {
         Self::new(Cause::Resource, error, text)

@@ -23,6 +23,7 @@ mod place;
 pub mod protocol;
 mod select;
 mod server;
+mod stop;
 mod values;
 
 use std::path::PathBuf;

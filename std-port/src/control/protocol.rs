@@ -47,6 +47,18 @@ pub enum Question {
     /// then it stops; likewise after the length of the lease without a [`BEAT`] of the client. An [`Answer::Called`], then
     /// an [`Answer::Ended`].
     Hold(CallQuestion),
+    /// Call each function with the attribute `stop`, all of them at the same time and in the class emergency. An
+    /// [`Answer::Called`] for each node, when its last one has answered: `NoStop` is the error of a node without one,
+    /// `NotConnected` that of one that is absent.
+    Stop {
+        /// `NAME`, `NAME/ID` or `#ID`; each s_unit of the roster, and each m_unit that has such a function, if absent.
+        node: Option<String>,
+    },
+    /// As [`Stop`](Self::Stop), for the attribute `reset`; the error of a node without one is `NoReset`.
+    Reset {
+        /// As there.
+        node: Option<String>,
+    },
     /// Publish this unit's functions. An [`Answer::Unread`] for each node that has not read the list in time.
     Publish {
         /// To this node alone; to all, also later ones, if absent.

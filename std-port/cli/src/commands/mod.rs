@@ -12,4 +12,5 @@ pub(crate) mod publish;
 pub(crate) mod retire;
 pub(crate) mod scan;
 pub(crate) mod set;
+pub(crate) mod stop;
 pub(crate) mod watch;

@@ -11,6 +11,8 @@ use crate::support::{Ran, Stage, private_folder};
 const VERBS: &[&[&str]] = &[
     &["functions", "agv-1"],
     &["call", "agv-1", "fail"],
+    &["stop", "agv-1"],
+    &["reset", "--all"],
     &["publish"],
     &["set", ".", "request_timeout", "2s"],
     &["watch"],

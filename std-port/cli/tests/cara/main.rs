@@ -10,5 +10,6 @@ mod holding;
 mod managers;
 mod measuring;
 mod scanning;
+mod stopping;
 mod support;
 mod watching;

@@ -1,0 +1,170 @@
+//! `cara stop` and `cara reset`: by attribute, whatever the functions are called, with an outcome for each s_unit.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use cara_std::{Call, Definition, ParametersView, Priority, ServiceError, ServiceOptions, Unit};
+
+use crate::support::{Stage, until};
+
+/// A vehicle that moves by `go()`, and whose reset is refused while it is not safe.
+struct Vehicle {
+    unit: Unit,
+    is_safe: Arc<AtomicBool>,
+}
+
+impl Vehicle {
+    /// With as many drives as there are names of functions that stop one each; `free()` resets all.
+    fn start(stage: &Stage, name: &str, id: u32, stops: &[&str]) -> Self {
+        let is_safe = Arc::new(AtomicBool::new(true));
+        stage.know(name, id);
+        let unit = stage.vehicle(name, id).build().unwrap();
+        let functions = unit.my_function_list();
+        let define = |text: String| Definition::parse(&text).unwrap();
+        let nothing = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+        for (number, stop) in stops.iter().enumerate() {
+            let drive = functions.actuator(|| ()).unwrap();
+            let moves = ServiceOptions::new().moves(&drive, std::time::Duration::from_secs(600));
+            let go = if number == 0 { "go()".to_owned() } else { format!("go_{number}()") };
+            functions.add_service(&define(go), moves, nothing).unwrap();
+            let options = ServiceOptions::new().stops(&drive).priority(Priority::Emergency);
+            functions.add_service(&define(format!("{stop}()")), options, nothing).unwrap();
+        }
+        let safe = is_safe.clone();
+        let free = move |_: &Call, _: &mut ParametersView| match safe.load(Ordering::SeqCst) {
+            true => Ok(()),
+            false => Err(ServiceError::Failed(2)),
+        };
+        functions.add_service(&define("free()".into()), ServiceOptions::new().resets_all(), free).unwrap();
+        unit.publish_my_function_list().unwrap();
+        unit.start().unwrap();
+        Self { unit, is_safe }
+    }
+}
+
+impl Drop for Vehicle {
+    fn drop(&mut self) {
+        self.unit.stop();
+    }
+}
+
+/// Waits until the manager knows what each node offers.
+fn known(stage: &Stage, nodes: &[&str]) {
+    for node in nodes {
+        until("it has published", || stage.cara(&["functions", node]).out.contains("free()"));
+    }
+}
+
+fn is_stopped(stage: &Stage, node: &str, by: u32) {
+    stage.ends(1, &["call", node, "go"]).says("Inhibited").says(&format!("by the unit with the ID {by} "));
+}
+
+/// A reset counts from the earliest time at which it can have been asked for: one right behind the stop is refused.
+fn reset(stage: &Stage, of: &str) {
+    until("it is reset", || stage.cara(&["reset", of]).code == 0);
+}
+
+#[test]
+fn all_are_stopped_whatever_their_functions_are_called_until_they_are_reset() {
+    let stage = Stage::with(&[]);
+    let _vehicles = [Vehicle::start(&stage, "agv", 21, &["halt"]), Vehicle::start(&stage, "lift", 22, &["stand"])];
+    known(&stage, &["agv", "lift"]);
+    let shown = stage.ends(0, &["stop", "--all"]);
+    shown.says("agv/21  acknowledged after ").says("lift/22  acknowledged after ");
+    assert!(shown.out.lines().last().unwrap().starts_with("2 of 2 acknowledged, the last after "), "{}", shown.out);
+    is_stopped(&stage, "agv", 1);
+    is_stopped(&stage, "lift", 1);
+    // One of them alone.
+    reset(&stage, "lift");
+    stage.ends(0, &["call", "lift", "go"]);
+    is_stopped(&stage, "agv", 1);
+    let told = stage.ends(0, &["stop", "lift", "--json"]).lines();
+    assert_eq!((told.len(), &told[0]["node"], &told[0]["error"]), (2, &"lift/22".into(), &serde_json::Value::Null));
+    assert_eq!((&told[1]["nodes"], &told[1]["acknowledged"]), (&1.into(), &1.into()));
+    assert!(told[0]["took_us"].is_u64() && told[1]["last_us"] == told[0]["took_us"], "{told:?}");
+    is_stopped(&stage, "lift", 1);
+    reset(&stage, "--all");
+    stage.ends(0, &["call", "--all", "go"]);
+}
+
+#[test]
+fn who_was_not_reached_and_who_cannot_be_stopped_is_told_by_name() {
+    let mut stage = Stage::with(&[]);
+    stage.ends(1, &["stop", "--all"]).says("no s_unit is known");
+    stage.ends(2, &["stop"]);
+    stage.ends(2, &["stop", "agv", "--all"]);
+    let vehicle = Vehicle::start(&stage, "agv", 21, &["halt"]);
+    stage.start_agv("depot", 30);
+    stage.know("gone", 31);
+    known(&stage, &["agv"]);
+    until("depot has published", || stage.cara(&["functions", "depot"]).out.contains("echo"));
+    until("the key file was read", || stage.cara(&["scan"]).out.contains("gone"));
+    let shown = stage.ends(1, &["stop", "--all"]);
+    shown.says("agv/21  acknowledged").says("gone/31: not reached: it was not connected").says("depot/30: NoStop: ");
+    shown.says("1 of 3 acknowledged");
+    is_stopped(&stage, "agv", 1);
+    let told = stage.ends(1, &["reset", "--all", "--json"]).lines();
+    let error = |node: &str| told.iter().find(|line| line["node"] == node).map(|line| line["error"]["error"].clone());
+    assert_eq!((error("depot/30"), error("gone/31")), (Some("NoReset".into()), Some("NotConnected".into())));
+    assert_eq!(told.last().unwrap()["nodes"], 3);
+    stage.ends(1, &["stop", "depot"]).says("NoStop");
+    stage.ends(1, &["stop", "gone"]).says("not reached");
+    drop(vehicle);
+    until("it has left", || stage.cara(&["stop", "agv"]).out.contains("agv/21: not reached"));
+}
+
+#[test]
+fn a_vehicle_may_refuse_the_reset() {
+    let stage = Stage::with(&[]);
+    let vehicle = Vehicle::start(&stage, "agv", 21, &["halt"]);
+    known(&stage, &["agv"]);
+    vehicle.is_safe.store(false, Ordering::SeqCst);
+    stage.ends(0, &["stop", "agv"]);
+    stage.ends(1, &["reset", "--all"]).says("agv/21: Service:").says("code 2").says("0 of 1 acknowledged");
+    is_stopped(&stage, "agv", 1);
+    vehicle.is_safe.store(true, Ordering::SeqCst);
+    reset(&stage, "agv");
+    stage.ends(0, &["call", "agv", "go"]);
+}
+
+/// A node takes two emergencies of one peer at a time; the others are asked again.
+#[test]
+fn each_drive_of_a_vehicle_is_stopped() {
+    let stage = Stage::with(&[]);
+    let _vehicle = Vehicle::start(&stage, "agv", 21, &["stop_a", "stop_b", "stop_c", "stop_d", "stop_e"]);
+    known(&stage, &["agv"]);
+    stage.ends(0, &["stop", "--all"]).says("1 of 1 acknowledged");
+    for go in ["go", "go_1", "go_2", "go_3", "go_4"] {
+        stage.ends(1, &["call", "agv", go]).says("Inhibited");
+    }
+}
+
+#[test]
+fn without_the_right_to_a_function_nothing_is_reset() {
+    let mut stage = Stage::empty();
+    let table = stage.control().join("access.toml");
+    let rules = "[[allow]]\nwho = \"s_units\"\nfunctions = \"*\"\nverbs = \"publish\"\n\
+                 [[allow]]\nwho = \"operator\"\nfunctions = [\"halt\", \"go\"]\nverbs = [\"list\", \"call\"]\n\
+                 [[allow]]\nwho = \"operator\"\nfunctions = [\"free\"]\nverbs = \"list\"\n";
+    std::fs::write(&table, rules).unwrap();
+    stage.start_manager_with(&["--access", table.to_str().unwrap()]);
+    let _vehicle = Vehicle::start(&stage, "agv", 21, &["halt"]);
+    known(&stage, &["agv"]);
+    stage.ends(0, &["stop", "--all"]);
+    stage.ends(1, &["reset", "--all"]).says("agv/21: NotAllowed:").says("does not let the operator call 'free'");
+    is_stopped(&stage, "agv", 1);
+}
+
+#[test]
+fn a_stop_outlasts_the_manager() {
+    let mut stage = Stage::with(&[]);
+    let _vehicle = Vehicle::start(&stage, "agv", 21, &["halt"]);
+    known(&stage, &["agv"]);
+    stage.ends(0, &["stop", "agv"]);
+    stage.kill_manager();
+    stage.start_manager();
+    known(&stage, &["agv"]);
+    is_stopped(&stage, "agv", 1);
+    reset(&stage, "agv");
+    stage.ends(0, &["call", "agv", "go"]);
+}

@@ -1,0 +1,150 @@
+//! A stop or a reset by an operator: each function with that attribute, of one node or of the whole roster, at the same time.
+
+use std::collections::{HashMap, HashSet};
+use std::time::Instant;
+
+use cara_core::config::Priority;
+use cara_core::distribution::function::Attributes;
+use cara_core::services::access::Verb;
+
+use super::answering::{End, LOOK, Sink, permit, send};
+use super::call::{block_all, called};
+use super::protocol::{Answer, CallQuestion, Failure};
+use super::select;
+use crate::{CommunicationSystem, Identity, Peer, RequestOptions};
+
+/// Which functions are called.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Which {
+    Stop,
+    Reset,
+}
+
+impl Which {
+    const fn has(self, attributes: &Attributes) -> bool {
+        match self {
+            Self::Stop => attributes.stop,
+            Self::Reset => attributes.reset,
+        }
+    }
+
+    fn missing(self) -> Failure {
+        let (error, does) = match self {
+            Self::Stop => ("NoStop", "stops"),
+            Self::Reset => ("NoReset", "resets"),
+        };
+        Failure::peer(error, format!("it has published no function that {does}"))
+    }
+}
+
+/// What has come of a node.
+struct Outcome<'p, T: Send + 'static> {
+    peer: &'p Peer<T>,
+    /// Functions that have not answered.
+    open: usize,
+    error: Option<Failure>,
+}
+
+/// An [`Answer::Called`] for each node, once all its functions that stop (or reset) have answered. What could not be called is
+/// told last: calls come first.
+pub(super) fn call<T: Send + 'static>(
+    system: &CommunicationSystem<T>,
+    which: Which,
+    node: Option<&str>,
+    sink: Sink<'_>,
+    wanted: &dyn Fn() -> bool,
+) -> Result<(), End> {
+    let started = Instant::now();
+    let peers = match node {
+        Some(node) => vec![select::node(system, node)?],
+        None => everybody(system, which),
+    };
+    let mut allowed = HashMap::new();
+    let (mut questions, mut outcomes, mut missed) = (Vec::new(), Vec::new(), Vec::new());
+    for peer in &peers {
+        let mut outcome = Outcome { peer, open: 0, error: None };
+        match functions(peer, which) {
+            Err(failure) => outcome.error = Some(failure),
+            Ok(functions) => {
+                for function in functions {
+                    let may = allowed.entry(function.clone()).or_insert_with(|| permit(system, &function, Verb::Call));
+                    match may {
+                        Ok(()) => questions.push((outcomes.len(), question(function))),
+                        Err(failure) => outcome.error = Some(failure.clone()),
+                    }
+                }
+                outcome.open = questions.iter().filter(|(of, _)| *of == outcomes.len()).count();
+            }
+        }
+        if outcome.open > 0 { outcomes.push(outcome) } else { missed.push(outcome) }
+    }
+    let timeout = system.constraints().request_timeout;
+    while !questions.is_empty() {
+        let left = timeout - started.elapsed().into();
+        let options = RequestOptions {
+            timeout: Some(left),
+            priority: Some(Priority::Emergency),
+            renew_lease: false,
+            ..RequestOptions::default()
+        };
+        let calls: Vec<_> = questions.iter().filter_map(|(of, call)| Some((outcomes.get(*of)?.peer, call))).collect();
+        let mut again = Vec::new();
+        block_all(&calls, &options, wanted, &mut |number, answer| {
+            let Some((of, question)) = questions.get(number) else { return Ok(()) };
+            let (Answer::Called { error, .. }, Some(outcome)) = (answer, outcomes.get_mut(*of)) else { return Ok(()) };
+            // It has not run: a node takes few calls of one class at a time.
+            let is_full = error.as_ref().is_some_and(|failure| matches!(failure.error.as_str(), "Busy" | "Full"));
+            if is_full && LOOK < left.into() {
+                again.push((*of, question.clone()));
+                return Ok(());
+            }
+            outcome.open -= 1;
+            outcome.error = outcome.error.take().or(error);
+            if outcome.open == 0 { told(outcome, started, sink) } else { Ok(()) }
+        })?;
+        questions = again;
+        if !questions.is_empty() {
+            std::thread::sleep(LOOK);
+        }
+    }
+    missed.iter().try_for_each(|outcome| told(outcome, started, sink))
+}
+
+/// The whole roster, and any other node that can be stopped (or reset).
+fn everybody<T: Send + 'static>(system: &CommunicationSystem<T>, which: Which) -> Vec<Peer<T>> {
+    let mut all = system.roster();
+    let others = select::nodes(system).into_iter().filter(|peer| functions(peer, which).is_ok());
+    let known: HashSet<Identity> = all.iter().map(|peer| peer.identity().clone()).collect();
+    all.extend(others.filter(|peer| !known.contains(peer.identity())));
+    all
+}
+
+/// The names of the functions that are called; why there are none.
+fn functions<T: Send + 'static>(peer: &Peer<T>, which: Which) -> Result<Vec<String>, Failure> {
+    if !peer.is_connected() {
+        return Err(Failure::not_called(None));
+    }
+    let list = peer.their_function_list();
+    let meant = list.iter().filter(|function| which.has(&function.attributes));
+    let names: Vec<String> = meant.map(|function| function.definition.name().to_owned()).collect();
+    if names.is_empty() { Err(which.missing()) } else { Ok(names) }
+}
+
+/// The call of a function, whose node is known otherwise.
+const fn question(function: String) -> CallQuestion {
+    CallQuestion {
+        node: None,
+        function,
+        arguments: Vec::new(),
+        asynchronous: false,
+        timeout_ms: None,
+        priority: None,
+        best_effort: false,
+        take_over: false,
+    }
+}
+
+fn told<T: Send + 'static>(outcome: &Outcome<'_, T>, started: Instant, sink: Sink<'_>) -> Result<(), End> {
+    let error = outcome.error.clone();
+    send(sink, called(outcome.peer, error.map_or_else(|| Ok(Default::default()), Err), started))
+}
