@@ -12,8 +12,10 @@ pub const POS_INFO: &str = "pos_info(position: int[2]) -> (position: int[2])";
 pub const GO_TO: &str = "go_to(position: int[2])";
 /// Tells how full the battery is, in percent.
 pub const BATTERY: &str = "battery() -> (charge: float)";
-/// Stops at once.
+/// Stops at once, and keeps the vehicle from driving until [`RESET`].
 pub const STOP: &str = "stop()";
+/// Lets the vehicle drive again, unless its bumper is pressed.
+pub const RESET: &str = "reset()";
 
 /// How long [`GO_TO`] goes on after the manager's last renewal.
 pub const GO_TO_LEASE: Duration = Duration::from_millis(400);
@@ -22,6 +24,11 @@ pub const TICK: Duration = Duration::from_millis(20);
 
 /// The code of the error for a position that is out of the warehouse.
 pub const OUT_OF_THE_WAREHOUSE: u16 = 1;
+/// The code of the error for a reset while the bumper is pressed.
+pub const BUMPER_IS_PRESSED: u16 = 2;
+
+/// Why the vehicle stops itself, as callers are told: its bumper was pressed.
+pub const BUMPER: u16 = 1;
 
 /// The warehouse reaches this many units from its middle, in each direction.
 const WAREHOUSE: i64 = 10_000;
@@ -82,12 +89,13 @@ pub struct Agv {
     target: Option<Place>,
     /// Parts of a unit that it has driven.
     driven: i64,
+    bumper: bool,
 }
 
 impl Agv {
     /// A vehicle that stands.
     pub const fn new(position: [i64; 2]) -> Self {
-        Self { place: Place::at(position), target: None, driven: 0 }
+        Self { place: Place::at(position), target: None, driven: 0, bumper: false }
     }
 
     /// Where it is.
@@ -124,6 +132,16 @@ impl Agv {
         self.target.take().map(|_| self.place)
     }
 
+    /// Notes whether the bumper is pressed.
+    pub fn set_bumper(&mut self, pressed: bool) {
+        self.bumper = pressed;
+    }
+
+    /// Serves [`RESET`].
+    pub fn reset(&self) -> Result<(), ServiceError> {
+        if self.bumper { Err(ServiceError::Failed(BUMPER_IS_PRESSED)) } else { Ok(()) }
+    }
+
     /// Serves [`POS_INFO`].
     pub fn pos_info(&self, parameters: &mut ParametersView) -> Result<(), ServiceError> {
         parameters.set_value("position", self.place.rounded()).map_err(|_| ServiceError::BadResults)
@@ -156,7 +174,7 @@ fn approach(from: &mut i64, to: i64, budget: i64) -> i64 {
 
 #[cfg(test)]
 mod tests {
-    use super::{Agv, OUT_OF_THE_WAREHOUSE, Place, Progress, TICK};
+    use super::{Agv, BUMPER_IS_PRESSED, OUT_OF_THE_WAREHOUSE, Place, Progress, TICK};
     use cara_core::distribution::parameters::Parameters;
     use cara_core::error::ServiceError;
 
@@ -207,6 +225,15 @@ mod tests {
             assert_eq!(agv.go_to(&position([0, far])), Err(ServiceError::Failed(OUT_OF_THE_WAREHOUSE)));
         }
         assert_eq!(agv.target(), None);
+    }
+
+    #[test]
+    fn a_reset_waits_for_the_bumper() {
+        let mut agv = Agv::new([0, 0]);
+        agv.set_bumper(true);
+        assert_eq!(agv.reset(), Err(ServiceError::Failed(BUMPER_IS_PRESSED)));
+        agv.set_bumper(false);
+        assert_eq!(agv.reset(), Ok(()));
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! The end of an example: Ctrl-C, SIGTERM, or its work is done.
 
-use std::io::Read;
+use std::io::BufRead;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::time::Duration;
 
@@ -27,6 +27,11 @@ impl Stopper {
 impl Stop {
     /// Ends at Ctrl-C and SIGTERM; also when standard input is closed, if `attended`.
     pub fn new(attended: bool) -> Result<Self> {
+        Self::hearing(attended, |_| ())
+    }
+
+    /// As [`new`](Self::new), and `hear` gets each line of standard input before its end.
+    pub fn hearing(attended: bool, mut hear: impl FnMut(&str) + Send + 'static) -> Result<Self> {
         let (sender, ended) = channel();
         let stopper = Stopper(sender);
         let at_signal = stopper.clone();
@@ -34,7 +39,9 @@ impl Stop {
         if attended {
             let at_end = stopper.clone();
             std::thread::spawn(move || {
-                let _ = std::io::stdin().read_to_end(&mut Vec::new());
+                // What is no text is no line to be heard.
+                let lines = std::io::stdin().lock().split(b'\n').map_while(std::result::Result::ok);
+                lines.for_each(|line| hear(String::from_utf8_lossy(&line).trim()));
                 at_end.stop(Ok(()));
             });
         }

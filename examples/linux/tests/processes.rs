@@ -1,7 +1,7 @@
 //! Each example as processes, in a fleet of its own on loopback, within bounds of time.
 
 use std::path::Path;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use cara_processes::{Process, random_fleet};
 use cara_test_keys::KeyFolder;
@@ -33,6 +33,16 @@ impl Fleet {
 fn ends_well(process: &mut Process) {
     let status = process.wait(STEP).unwrap();
     assert!(status.success(), "{}: {status}", process.name());
+}
+
+/// A reset counts from the earliest time at which it can have been asked for: one right behind the stop is refused.
+fn resets(manager: &mut Process) {
+    let end = Instant::now() + STEP;
+    manager.send("reset 0").unwrap();
+    while manager.expect("= may drive again", Duration::from_millis(200)).is_err() {
+        assert!(Instant::now() < end, "it is not reset: {:?}", manager.lines());
+        manager.send("reset 0").unwrap();
+    }
 }
 
 #[test]
@@ -81,7 +91,7 @@ fn the_console_answers_each_command() {
     agv.seen("arrived at", STEP).unwrap();
     for (command, answer) in [
         ("units", "= 1 s_units; 0 is seven/7, epoch "),
-        ("functions 0", "= pos_info, battery, stop, go_to"),
+        ("functions 0", "= pos_info, battery, stop, reset, go_to"),
         ("pos_info 0", "= position [1, 2]"),
         ("battery 0", "= charge 99.9 %"),
         ("go_to 0 100 100", "= accepted [100, 100]"),
@@ -92,7 +102,10 @@ fn the_console_answers_each_command() {
     agv.seen("driving to [100.000, 100.000]", STEP).unwrap();
     manager.send("stop 0").unwrap();
     manager.expect("= stopped", STEP).unwrap();
-    agv.seen("AGV_manager/1 said so", STEP).unwrap();
+    agv.seen("stop: AGV_manager/1 said so", STEP).unwrap();
+    resets(&mut manager);
+    manager.send("go_to 0 50 50").unwrap();
+    agv.seen("driving to [50.000, 50.000]", STEP).unwrap();
     for mistake in ["pos_info 1", "pos_info", "go_to 0 a b", "dance"] {
         manager.send(mistake).unwrap();
         manager.expect("! ", STEP).unwrap();
@@ -117,7 +130,37 @@ fn a_released_lease_stops_the_motion() {
     manager.send("go_to 0 100 100").unwrap();
     agv.seen("driving to [100", STEP).unwrap();
     manager.send("release 0").unwrap();
-    agv.seen("the lease of go_to has ended", STEP).unwrap();
+    agv.seen("the order has ended", STEP).unwrap();
+}
+
+/// The bumper stops the vehicle, and a reset does nothing while it is pressed.
+#[test]
+fn the_bumper_stops_the_motion_until_a_reset() {
+    let fleet = Fleet::new();
+    let mut manager = fleet.start("manager", env!("CARGO_BIN_EXE_agv_manager"), &["--console"]);
+    let mut agv = fleet.start("agv", env!("CARGO_BIN_EXE_agv"), &["--attended"]);
+    for _ in 0..13 {
+        manager.expect("line ", STEP).unwrap();
+        manager.send("").unwrap();
+    }
+    agv.seen("arrived at", STEP).unwrap();
+    let mut tell = |command: &str, answer: &str| {
+        manager.send(command).unwrap();
+        manager.expect(answer, STEP).unwrap();
+    };
+    tell("go_to 0 100 100", "= accepted");
+    agv.expect("driving to [100", STEP).unwrap();
+    agv.send("press").unwrap();
+    agv.seen("the order has ended", STEP).unwrap();
+    tell("reset 0", "! the service failed with code 2");
+    tell("go_to 0 70 70", "request to agv-1/11 failed: what it moves was stopped");
+    agv.send("release").unwrap();
+    agv.expect("the bumper is free", STEP).unwrap();
+    tell("go_to 0 70 70", "request to agv-1/11 failed: what it moves was stopped");
+    resets(&mut manager);
+    manager.send("go_to 0 50 50").unwrap();
+    agv.seen("driving to [50", STEP).unwrap();
+    assert!(!agv.has("driving to [70"));
 }
 
 #[test]

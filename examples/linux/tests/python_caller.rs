@@ -65,7 +65,7 @@ fn a_manager_written_from_the_document_calls_the_agv() {
     tell(&mut manager, "go_to 2 -100", "lease of go_to ended: replaced");
     agv.expect("driving to [2.000, -100.000]", PATIENCE).unwrap();
     manager.send("release").unwrap();
-    agv.expect("the lease of go_to has ended", PATIENCE).unwrap();
+    agv.expect("the order has ended", PATIENCE).unwrap();
 
     // One that is renewed no more ends by itself.
     tell(&mut manager, "go_to 100 0", "go_to {}");

@@ -9,7 +9,7 @@ use std::os::fd::AsRawFd;
 use std::time;
 
 use anyhow::{Context, Result};
-use cara_apps::agv::{Agv, BATTERY, GO_TO, GO_TO_LEASE, POS_INFO, Progress, STOP, TICK};
+use cara_apps::agv::{Agv, BATTERY, GO_TO, GO_TO_LEASE, POS_INFO, Progress, RESET, STOP, TICK};
 use cara_core::config::Priority;
 use cara_core::distribution::connection_handler::Target;
 use cara_core::distribution::function::{Attributes, Definition};
@@ -57,6 +57,7 @@ struct Vehicle {
     pos_info: Slot,
     battery: Slot,
     stop: Slot,
+    reset: Slot,
     lease: &'static Lease,
 }
 
@@ -67,7 +68,7 @@ impl Program for Vehicle {
 
     fn make_safe(&mut self, _: Slot) {
         if let Some(place) = self.agv.stop() {
-            println!("stopped at {place}: the lease of go_to has ended");
+            println!("stopped at {place}: the order has ended");
         }
     }
 
@@ -85,6 +86,8 @@ impl Vehicle {
         } else if function == self.stop {
             self.agv.stop();
             Ok(())
+        } else if function == self.reset {
+            self.agv.reset()
         } else {
             self.agv.go_to(parameters)
         }
@@ -138,9 +141,10 @@ fn offer(unit: &mut SUnit, now: Instant) -> Result<(Vehicle, Slot)> {
         stop: unit.offer(
             now,
             &Definition::parse(STOP)?,
-            Attributes { priority: Priority::Emergency, ..plain },
+            Attributes { priority: Priority::Emergency, stop: true, ..plain },
             None,
         )?,
+        reset: unit.offer(now, &Definition::parse(RESET)?, Attributes { reset: true, ..plain }, None)?,
         lease: &LEASE,
     };
     let leased = Attributes { lease: Some(GO_TO_LEASE), ..plain };

@@ -10,7 +10,7 @@ use cara_std::Parameters;
 use clap::ValueEnum;
 
 use crate::board::{self, Bench, Board, Cable, LONG, Who};
-use crate::manager::{Manager, at, patiently, position, sets_out};
+use crate::manager::{Manager, at, patiently, position, reset, sets_out};
 
 /// An image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -70,6 +70,7 @@ fn vehicle(bench: &Bench, board: &Board, cable: &Cable, round: u32) -> Result<()
     }
     ensure!(agv.block_request("fly_to", &mut at([0, 0])?).is_err(), "it flies");
     patiently(|| agv.block_request("stop", &mut Parameters::<512>::new()))?;
+    reset(&agv)?;
     drop(manager);
     board.logs_behind(line, "depot has left")?;
     // A list that is full with other functions has no room for the mechanic.

@@ -124,6 +124,18 @@ pub(crate) fn patiently(mut ask: impl FnMut() -> Result<(), Error>) -> Result<()
     }
 }
 
+/// Lets a vehicle that was stopped drive again. A reset counts from the earliest time at which it can have been asked for, so
+/// one right behind the stop is refused.
+pub(crate) fn reset(peer: &Peer) -> Result<()> {
+    let deadline = Instant::now() + LONG;
+    loop {
+        match peer.block_request("reset", &mut Parameters::<512>::new()) {
+            Err(Error::TimedOut | Error::Expired | Error::Inhibited { .. }) if Instant::now() < deadline => {}
+            ended => return Ok(ended?),
+        }
+    }
+}
+
 /// Sends a vehicle to a place; `false` if this machine was too busy for that and the lease has ended.
 pub(crate) fn sends(peer: &Peer, position: [i64; 2]) -> Result<bool> {
     match peer.block_request("go_to", &mut at(position)?) {

@@ -20,12 +20,12 @@ pub mod tasks;
 
 use core::sync::atomic::{AtomicBool, Ordering};
 
-use cara_apps::agv::{Agv, BATTERY, GO_TO, GO_TO_LEASE, POS_INFO, Place, Progress, STOP, TICK};
+use cara_apps::agv::{Agv, BATTERY, BUMPER, GO_TO, GO_TO_LEASE, POS_INFO, Place, Progress, RESET, STOP, TICK};
 use cara_apps::mechanic;
 use cara_core::config::Priority;
 use cara_core::error::{Cause, Error};
 use cara_core::services::access::{Functions, Rule, Verbs, Who};
-use cara_core::services::lease::Lease;
+use cara_core::services::lease::{Latch, Lease};
 use cara_embassy::{Config, Handle, Handler, Hook, Limits, Runner, Security, ServiceOptions, now, resources};
 use cara_settings::{Network, Settings};
 use embassy_net::{Ipv4Cidr, Stack, StaticConfigV4};
@@ -51,6 +51,16 @@ const RULES: [Rule; 1] = [Rule::new(Who::M_UNITS, Functions::All, Verbs::ALL)];
 pub static DRIVING: Lease = Lease::new();
 /// Whether the vehicle has somewhere to go.
 static HAS_TARGET: AtomicBool = AtomicBool::new(false);
+static BUMPER_PRESSED: AtomicBool = AtomicBool::new(false);
+
+/// The vehicle's bumper, from its interrupt if the board has one: the motors are off with their next tick, and stay so until a
+/// reset, which is refused while the bumper is pressed.
+pub fn bumper(pressed: bool) {
+    BUMPER_PRESSED.store(pressed, Ordering::Release);
+    if pressed {
+        DRIVING.inhibit(now(), Latch { by: 0, reason: BUMPER });
+    }
+}
 
 /// Whether the motors may run now: the vehicle has a target and a live lease. The interrupt of a board's motors asks
 /// this each time and cuts them off otherwise, so that they stop in time even if no task runs any more.
@@ -121,21 +131,22 @@ fn offer(vehicle: Vehicle) -> Result<(), Error> {
     let stand: &'static Hook<Agv> = &stand_still;
     let pos_info = Handler::method(&|agv: &mut Agv, _, pos| agv.pos_info(pos));
     let battery = Handler::method(&|agv: &mut Agv, _, charge| agv.battery(charge));
-    // The motors' interrupt sees it at once; the motors' loop sees it as well, and forgets the target.
-    let stop = Handler::free(&|_, _| {
-        DRIVING.clear();
-        cut();
-        Ok(())
+    // The order has ended before this runs, which the motors' interrupt sees at once; the hooks do the rest.
+    let stop = Handler::free(&|_, _| Ok(()));
+    let reset = Handler::method(&|agv: &mut Agv, _, _| {
+        agv.set_bumper(BUMPER_PRESSED.load(Ordering::Acquire));
+        agv.reset()
     });
     let go_to = Handler::method(&|agv: &mut Agv, call, pos| {
-        call.commit(|| agv.go_to(pos))??;
-        HAS_TARGET.store(true, Ordering::Release);
+        call.commit(|| agv.go_to(pos).inspect(|()| HAS_TARGET.store(true, Ordering::Release)))??;
         info!("driving");
         Ok(())
     });
     vehicle.my_function_list().add_service(POS_INFO, plain().idempotent(), pos_info)?;
     vehicle.my_function_list().add_service(BATTERY, plain().idempotent(), battery)?;
-    vehicle.my_function_list().add_service(STOP, plain().idempotent().priority(Priority::Emergency), stop)?;
+    let stops = plain().idempotent().priority(Priority::Emergency).stops(&DRIVING);
+    vehicle.my_function_list().add_service(STOP, stops, stop)?;
+    vehicle.my_function_list().add_service(RESET, plain().idempotent().resets(&DRIVING), reset)?;
     vehicle.my_function_list().add_service(ECHO, plain().idempotent(), Handler::method(&|_, _, _| Ok(())))?;
     vehicle.my_function_list().add_service(GO_TO, plain().lease(GO_TO_LEASE, &DRIVING, &cut).then(stand), go_to)?;
     vehicle.on_manager_lost(stand);

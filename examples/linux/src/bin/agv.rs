@@ -4,16 +4,16 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
-use cara_apps::agv::{Agv, BATTERY, GO_TO, GO_TO_LEASE, POS_INFO, Progress, STOP, TICK};
+use cara_apps::agv::{Agv, BATTERY, BUMPER, GO_TO, GO_TO_LEASE, POS_INFO, Progress, RESET, STOP, TICK};
 use cara_apps::mechanic;
 use cara_examples::{NameAndId, Network, Stop, log_to_stderr, say};
-use cara_std::{Call, Definition, LeaseWatch, ParametersView, Priority, ServiceOptions, Unit, UnitEvent};
+use cara_std::{Actuator, Call, Definition, ParametersView, Priority, ServiceOptions, Unit, UnitEvent};
 use clap::Parser;
 
 /// How often the AGV says where it is.
 const POSITION_EVERY: Duration = Duration::from_millis(500);
 
-/// An AGV that joins one manager.
+/// An AGV that joins one manager. With --attended, the lines `press` and `release` on standard input are its bumper.
 #[derive(Parser)]
 struct Options {
     #[arg(long, default_value = "agv-1")]
@@ -30,23 +30,24 @@ struct Options {
 fn main() -> Result<()> {
     let Options { name, id, manager, network } = Options::parse();
     log_to_stderr();
-    let stop = Stop::new(network.attended)?;
     let builder = network.place(Unit::builder(&name, id, &manager.name, manager.id)?);
     let unit = builder.build()?;
     let agv = Arc::new(Mutex::new(Agv::new([0, 0])));
-    let lease = offer(&unit, &agv)?;
+    let drive = offer(&unit, &agv)?;
+    let (bumped, motors) = (agv.clone(), drive.clone());
+    let stop = Stop::hearing(network.attended, move |line| bumper(line, &bumped, &motors))?;
     unit.on_manager_lost(|()| say!("manager lost"))?;
     follow(&unit);
     unit.start()?;
     say!("started {name}/{id}, {}, at {}", unit.mode().as_str(), lock(&agv).place());
-    drive(&unit, &agv, &lease, &stop)?;
+    run_motors(&unit, &agv, &drive, &stop)?;
     unit.stop();
     say!("ended at {}", lock(&agv).place());
     Ok(())
 }
 
-/// Publishes the AGV's services. Returns the lease of driving.
-fn offer(unit: &Unit, agv: &Arc<Mutex<Agv>>) -> Result<LeaseWatch> {
+/// Publishes the AGV's services. Returns what they move.
+fn offer(unit: &Unit, agv: &Arc<Mutex<Agv>>) -> Result<Actuator> {
     let own = || agv.clone();
     let agv = own();
     let pos_info = move |_: &Call, pos: &mut ParametersView| lock(&agv).pos_info(pos);
@@ -59,26 +60,51 @@ fn offer(unit: &Unit, agv: &Arc<Mutex<Agv>>) -> Result<LeaseWatch> {
     };
     let agv = own();
     let battery = move |_: &Call, charge: &mut ParametersView| lock(&agv).battery(charge);
-    let agv = own();
+    // The order has ended before this runs, and the hook makes the vehicle stand.
     let stop = move |call: &Call, _: &mut ParametersView| {
-        lock(&agv).stop().into_iter().for_each(|place| say!("stopped at {place}: {} said so", call.caller));
+        say!("stop: {} said so", call.caller);
+        Ok(())
+    };
+    let agv = own();
+    let reset = move |call: &Call, _: &mut ParametersView| {
+        lock(&agv).reset()?;
+        say!("reset: {} said so", call.caller);
         Ok(())
     };
     let agv = own();
     let safe = move || lock(&agv).stop().into_iter().for_each(not_wanted);
     let functions = unit.my_function_list();
+    let drive = functions.actuator(safe)?;
     let plain = ServiceOptions::new;
+    let stops = plain().idempotent().priority(Priority::Emergency).stops(&drive);
     functions.add_service(&Definition::parse(POS_INFO)?, plain().idempotent(), pos_info)?;
     functions.add_service(&Definition::parse(BATTERY)?, plain().idempotent(), battery)?;
-    functions.add_service(&Definition::parse(STOP)?, plain().idempotent().priority(Priority::Emergency), stop)?;
-    let lease = functions.add_service(&Definition::parse(GO_TO)?, plain().lease(GO_TO_LEASE, safe), go_to)?;
+    functions.add_service(&Definition::parse(STOP)?, stops, stop)?;
+    functions.add_service(&Definition::parse(RESET)?, plain().idempotent().resets(&drive), reset)?;
+    functions.add_service(&Definition::parse(GO_TO)?, plain().moves(&drive, GO_TO_LEASE), go_to)?;
     unit.publish_my_function_list()?;
-    Ok(lease)
+    Ok(drive)
 }
 
-/// The motors' loop: drives while the lease is live.
-fn drive(unit: &Unit, agv: &Mutex<Agv>, lease: &LeaseWatch, stop: &Stop) -> Result<()> {
-    let (mut last, mut said) = (Instant::now(), Instant::now());
+/// The bumper, by hand: while it is pressed no reset lets the vehicle drive.
+fn bumper(line: &str, agv: &Mutex<Agv>, drive: &Actuator) {
+    match line {
+        "press" => {
+            lock(agv).set_bumper(true);
+            drive.inhibit(BUMPER);
+            say!("the bumper is pressed");
+        }
+        "release" => {
+            lock(agv).set_bumper(false);
+            say!("the bumper is free: a reset lets it drive");
+        }
+        _ => say!("the bumper is pressed by `press` and freed by `release`"),
+    }
+}
+
+/// The motors' loop: drives while an order is live.
+fn run_motors(unit: &Unit, agv: &Mutex<Agv>, drive: &Actuator, stop: &Stop) -> Result<()> {
+    let (order, mut last, mut said) = (drive.watch(), Instant::now(), Instant::now());
     loop {
         if let Some(outcome) = stop.wait_for(TICK.into()) {
             return outcome;
@@ -87,7 +113,7 @@ fn drive(unit: &Unit, agv: &Mutex<Agv>, lease: &LeaseWatch, stop: &Stop) -> Resu
         last += elapsed;
         let (progress, place) = {
             let mut agv = lock(agv);
-            (agv.step(elapsed.into(), lease.is_live()), agv.place())
+            (agv.step(elapsed.into(), order.is_live()), agv.place())
         };
         match progress {
             Some(Progress::Passed(place)) => say!("passed {place}"),
@@ -111,7 +137,7 @@ fn lock(agv: &Mutex<Agv>) -> MutexGuard<'_, Agv> {
 }
 
 fn not_wanted(place: cara_apps::agv::Place) {
-    say!("stopped at {place}: the lease of go_to has ended");
+    say!("stopped at {place}: the order has ended");
 }
 
 /// Says what happens, and calls a mechanic, once, when the manager offers to send one.

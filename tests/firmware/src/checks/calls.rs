@@ -4,13 +4,14 @@ use anyhow::{Context, Result, ensure};
 use cara_std::{Delivery, Error, Parameters, RequestOptions, UnitEvent};
 
 use crate::board::{Bench, Who};
-use crate::manager::{Manager, arrives, at, drives, patiently, position, sets_out};
+use crate::manager::{Manager, arrives, at, drives, patiently, position, reset, sets_out};
 
 /// What the board offers, in the order in which it was added.
 const FUNCTIONS: &str = "\
 pos_info(position: int[2]) -> (position: int[2])
 battery() -> (charge: float)
 stop()
+reset()
 echo(text: string[400]) -> (text: string[400])
 go_to(position: int[2])
 ";
@@ -74,7 +75,11 @@ pub(super) fn not_renewed(bench: &Bench, _: u32) -> Result<String> {
     sets_out(&agv, [1_000, 0])?;
     patiently(|| agv.block_request("stop", &mut Parameters::<512>::new()))?;
     board.logs_behind(line, "stopped at")?;
-    Ok(format!("without renewal after {x} units; on release; by an emergency"))
+    let refused = agv.block_request("go_to", &mut at([0, 0])?);
+    ensure!(matches!(refused, Err(Error::Inhibited { by: 1, reason: 0 })), "behind the stop it says {refused:?}");
+    reset(&agv)?;
+    sets_out(&agv, [0, 0])?;
+    Ok(format!("without renewal after {x} units; on release; by a stop, until a reset"))
 }
 
 pub(super) fn wrong(bench: &Bench, _: u32) -> Result<String> {

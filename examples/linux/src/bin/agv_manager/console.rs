@@ -10,8 +10,7 @@ use cara_std::{CommunicationSystem, Parameters, Peer};
 
 /// How long an s_unit may take to tell its functions.
 const PATIENCE: Duration = Duration::from_secs(2);
-const HELP: &str =
-    "units | functions N | pos_info N | go_to N X Y | release N | battery N | stop N | quit; N is an s_unit's index";
+const HELP: &str = "units | functions N | pos_info N | go_to N X Y | release N | battery N | stop N | reset N | quit; N is an s_unit's index";
 
 /// Takes commands until `quit` or the end of the input.
 pub(crate) fn run(agv_manager: &CommunicationSystem) -> Result<()> {
@@ -53,7 +52,8 @@ fn answer(agv_manager: &CommunicationSystem, words: &[&str]) -> Result<String> {
         ["go_to", index, x, y] => go_to(&s_unit(agv_manager, index)?, [x.parse()?, y.parse()?]),
         ["release", index] => Ok(s_unit(agv_manager, index)?.release("go_to").map(|()| "released".to_owned())?),
         ["battery", index] => battery(&s_unit(agv_manager, index)?),
-        ["stop", index] => stop(&s_unit(agv_manager, index)?),
+        ["stop", index] => tell(&s_unit(agv_manager, index)?, "stop", "stopped"),
+        ["reset", index] => tell(&s_unit(agv_manager, index)?, "reset", "may drive again"),
         _ => bail!("no such command: {HELP}"),
     }
 }
@@ -97,7 +97,7 @@ fn battery(agv: &Peer) -> Result<String> {
     Ok(format!("charge {:.1} %", charge.variable::<f64>("charge")?))
 }
 
-fn stop(agv: &Peer) -> Result<String> {
-    agv.block_request("stop", &mut Parameters::new())?;
-    Ok("stopped".to_owned())
+fn tell(agv: &Peer, function: &str, done: &str) -> Result<String> {
+    agv.block_request(function, &mut Parameters::new())?;
+    Ok(done.to_owned())
 }
