@@ -1,6 +1,7 @@
 //! Everything that can go wrong, sorted by where the remedy lies. Small, `Copy`, and each text says what to do.
 
 use crate::config::{VERSIONS, Versions};
+use crate::term::Term;
 use crate::time::Duration;
 
 /// Where the remedy of an [`Error`] lies. There are these four and no others, so a `match` on it needs no other arm.
@@ -128,6 +129,14 @@ pub enum Refusal {
     /// The two have no cipher suite in common.
     #[error("the two units have no cipher suite in common: update one of the two")]
     Suite,
+    /// The manager's term is older than one that the vehicle has obeyed, this one.
+    #[error(
+        "another manager of this name and id has taken over with term {term}: stop one of the two; to command with this one again, start it with --take-over"
+    )]
+    Fenced {
+        /// The newest term that the vehicle has obeyed.
+        term: Term,
+    },
 }
 
 impl Refusal {
@@ -145,11 +154,12 @@ impl Refusal {
             Self::Mode => 9,
             Self::NoKey => 10,
             Self::Suite => 11,
+            Self::Fenced { .. } => 12,
         }
     }
 
     /// The refusal of a byte on the wire. A unit that speaks other versions has told them in its hello before; only version
-    /// 1 did not.
+    /// 1 did not. The term of one that is fenced is in the hellos, too.
     pub const fn from_wire(code: u8) -> Self {
         match code {
             1 => Self::Version(Versions { first: 1, last: 1 }),
@@ -162,6 +172,7 @@ impl Refusal {
             9 => Self::Mode,
             10 => Self::NoKey,
             11 => Self::Suite,
+            12 => Self::Fenced { term: Term::NONE },
             _ => Self::Malformed,
         }
     }

@@ -27,7 +27,7 @@ REPLY_WITHIN = 2.0
 WITHOUT_DATAGRAMS = 8.0
 KEYS_LIVE, SHORTEST_HANDSHAKE_LIFE, RENEWAL_WITHIN = 12 * 3600.0, 0.5, 60.0
 REFUSED_VERSION, REFUSED_FLEET, REFUSED_MANAGER, REFUSED_DUPLICATE, REFUSED_ROLE = 1, 2, 3, 5, 6
-REFUSED_MALFORMED, REFUSED_MODE, REFUSED_SUITE = 8, 9, 11
+REFUSED_MALFORMED, REFUSED_MODE, REFUSED_SUITE, REFUSED_FENCED = 8, 9, 11, 12
 
 
 def say(*words):
@@ -50,6 +50,7 @@ def options_of(description, name, number):
     parser.add_argument("--name", default=name)
     parser.add_argument("--id", type=int, default=number)
     parser.add_argument("--fleet", type=int, default=0)
+    parser.add_argument("--term", type=int, default=0, help="a manager's own, or the newest that a vehicle has obeyed")
     parser.add_argument("--address", default="127.0.0.1", help="own address; loopback unless set")
     parser.add_argument("--broadcast", default="127.255.255.255", help="where who-has is sent")
     parser.add_argument("--port", type=int, help="UDP port of broadcasts")
@@ -80,7 +81,7 @@ class Unit:
     def __init__(self, options, role, functions):
         self.options, self.functions = options, functions
         self.identity = {"id": options.id, "name": options.name, "role": role}
-        self.epoch, self.sequence = secrets.randbits(64), 0
+        self.epoch, self.sequence, self.term = secrets.randbits(64), 0, options.term
         if options.insecure:
             self.ring, self.magic, self.suites = None, wire.MAGIC, 0
         else:
@@ -99,7 +100,7 @@ class Unit:
     def discovery(self, kind, to=None, **fields):
         """A who-has, or an announce to a unit."""
         self.sequence += 1
-        value = {"identity": self.identity, "epoch": self.epoch, "sequence": self.sequence, **fields}
+        value = {"identity": self.identity, "epoch": self.epoch, "term": self.term, "sequence": self.sequence, **fields}
         if self.ring is None:
             return wire.encode_datagram({kind: value}, self.options.fleet)
         return secure.encode_discovery({kind: value}, self.options.fleet, self.ring, to)
@@ -149,6 +150,7 @@ class Unit:
         self.nonce = secrets.randbits(64)
         hello = {
             "fleet": self.options.fleet, "identity": self.identity, "wanted": self.wanted, "epoch": self.epoch,
+            "term": self.term,
             "nonce": self.nonce, "versions": wire.VERSIONS, "capabilities": 0, "message_size": MESSAGE_SIZE,
             "chunk_size": CHUNK_SIZE, "calls": 8, "minimum_interval": 0, "link": 0, "udp_port": self.udp.getsockname()[1],
             "stamp": clock(), "keep_alive": int(KEEP_ALIVE * 1000),
@@ -210,7 +212,16 @@ class Unit:
             return REFUSED_DUPLICATE
         if peer["identity"]["role"] == self.identity["role"] == "s_unit":
             return REFUSED_ROLE
-        return None if self.belongs(peer) else REFUSED_MANAGER
+        if not self.belongs(peer):
+            return REFUSED_MANAGER
+        if self.identity["role"] == "s_unit":
+            if wire.is_newer(self.term, peer["term"]):
+                return REFUSED_FENCED
+            # As long as it runs: one that moves keeps the term.
+            self.term = peer["term"] if wire.is_newer(peer["term"], self.term) else self.term
+        elif peer["identity"]["role"] == "s_unit" and wire.is_newer(peer["term"], self.term):
+            return REFUSED_FENCED
+        return None
 
     # --- the stream
 

@@ -144,10 +144,11 @@ ITEMS = {
     5: ("search", [("sequence", 32), ("nonce", 64), ("tcp_port", 16), ("expected", 16)]),
     6: ("known", None),
     7: ("answer", [("sequence", 32), ("nonce", 64), ("tcp_port", 16), ("room", 16), ("expected", 16)]),
+    8: ("authority", [("term", 32)]),
 }
-HELLO_ITEMS = ("unit", "wanted", "link", "limits")
+HELLO_ITEMS = ("unit", "wanted", "link", "limits", "authority")
 WHO_HAS_ITEMS = ("unit", "wanted", "search", "known")
-ANNOUNCE_ITEMS = ("unit", "answer")
+ANNOUNCE_ITEMS = ("unit", "answer", "authority")
 
 
 def read_fields(reader, fields):
@@ -210,6 +211,7 @@ def read_items(data, wanted, needed):
     require(all(name in found for name in needed))
     require(is_node_name(found["unit"]["name"]))
     found["skipped"] = skipped
+    found["term"] = found.get("authority", {"term": 0})["term"]
     found["identity"] = {name: found["unit"][name] for name in ("id", "name", "role")}
     return found
 
@@ -222,6 +224,8 @@ def write_items(value, names):
             continue
         if name == "unit":
             out += item(kind, write_fields({**value, **value["identity"]}, fields))
+        elif name == "authority":
+            out += item(kind, write_fields(value, fields)) if value.get("term") else b""
         elif name == "wanted":
             out += item(kind, write_fields(value[name], fields)) if value[name] else b""
         elif name == "known":
@@ -252,6 +256,11 @@ def short_hash(identity):
     return number
 
 
+def is_newer(term, other):
+    """Whether a manager of this term commands, and one of the other term does not."""
+    return term != 0 and (other == 0 or 0 < (term - other) % 2**32 < 2**31)
+
+
 # --- the hello (section 7)
 
 
@@ -268,7 +277,8 @@ def decode_hello(data, magic=MAGIC, suites=0):
     require(found["limits"]["chunk_size"] >= MINIMUM_CHUNK)
     return {
         "versions": versions, "capabilities": capabilities, "fleet": fleet, "identity": found["identity"],
-        "wanted": found.get("wanted"), "epoch": found["unit"]["epoch"], **found["link"], **found["limits"],
+        "wanted": found.get("wanted"), "epoch": found["unit"]["epoch"], "term": found["term"],
+        **found["link"], **found["limits"],
         "skipped": found["skipped"],
     }
 
@@ -308,6 +318,8 @@ def read_datagram(data, items, own):
     value = {"identity": found["identity"], "epoch": found["unit"]["epoch"], **found[own], "skipped": found["skipped"]}
     if own == "search":
         value.update(wanted=found.get("wanted"), known=found.get("known", []))
+    else:
+        value.update(term=found["term"])
     return value
 
 

@@ -17,11 +17,12 @@
 
 use super::authenticator::{Authenticator, CODE_BYTES};
 use super::compact::{Reader, Writer};
-use super::hello::{Manager, kind};
+use super::hello::{Manager, kind, put_term, take_term};
 use super::identity::{Epoch, Fleet, Identity, Role};
 use super::items::{self, Items, Malformed};
 use crate::config::{Mode, VERSIONS, Versions};
 use crate::host::mailman::LinkId;
+use crate::term::Term;
 
 const WHO_HAS: u8 = 1;
 const ANNOUNCE: u8 = 2;
@@ -36,7 +37,7 @@ pub const KNOWN_NODES: usize = 64;
 /// Longest [`WhoHas`].
 pub const SEARCH_BYTES: usize = 512;
 /// Longest [`Announce`] of secured mode, and the shortest [`WhoHas`].
-pub const ANSWER_BYTES: usize = 128;
+pub const ANSWER_BYTES: usize = 140;
 
 /// A search, broadcast (paper: "one node broadcasts a message containing its identifier").
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -68,6 +69,8 @@ pub struct Announce {
     pub identity: Identity,
     /// Its boot.
     pub epoch: Epoch,
+    /// Its term.
+    pub term: Term,
     /// Rises with each announce of this boot.
     pub sequence: u32,
     /// The nonce of the search that is answered; 0 in a broadcast.
@@ -363,12 +366,13 @@ impl WhoHas {
 
 impl Announce {
     fn take(body: &[u8]) -> Result<Self, DatagramError> {
-        let (mut unit, mut answer, mut skipped) = (None, None, 0);
+        let (mut unit, mut answer, mut term, mut skipped) = (None, None, Term::NONE, 0);
         for item in Items::new(body) {
             let item = item?;
             match item.kind {
                 kind::UNIT => unit = Some(item.read(Identity::take)?),
                 kind::ANSWER => answer = Some(item.read(Answer::take)?),
+                kind::AUTHORITY => term = item.read(take_term)?,
                 _ => item.skip(&mut skipped)?,
             }
         }
@@ -377,7 +381,7 @@ impl Announce {
             return Err(DatagramError::Malformed);
         }
         let Answer { sequence, nonce, tcp_port, room, expected } = answer;
-        Ok(Self { identity, epoch, sequence, nonce, tcp_port, room, expected, skipped })
+        Ok(Self { identity, epoch, term, sequence, nonce, tcp_port, room, expected, skipped })
     }
 
     /// The datagram, in `out`; `None` where it does not fit, or in secured mode where it answers `to` and there is no key
@@ -399,6 +403,7 @@ impl Announce {
         writer.number(self.nonce);
         writer.numbers(&[self.tcp_port.into(), self.room.into(), self.expected.into()]);
         writer.end(item);
+        put_term(self.term, &mut writer);
         let mut length = writer.finish()?;
         if mode == Mode::Secured {
             length = match to {

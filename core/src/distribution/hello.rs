@@ -15,6 +15,7 @@ use super::compact::{Reader, Writer};
 use super::identity::{Epoch, Fleet, Identity};
 use super::items::{Items, Malformed};
 use crate::config::{Constraints, LATER, MINIMUM_CHUNK_BYTES, Mode, NODE_NAME_BYTES, VERSIONS, Versions};
+use crate::term::Term;
 
 /// Bytes before the items.
 const PREFIX_BYTES: usize = 20;
@@ -35,6 +36,8 @@ pub(super) mod kind {
     pub(in crate::distribution) const KNOWN: u16 = 6;
     /// An answer.
     pub(in crate::distribution) const ANSWER: u16 = 7;
+    /// The term of a manager, or the newest that an s_unit has obeyed.
+    pub(in crate::distribution) const AUTHORITY: u16 = 8;
 }
 
 /// Which manager an s_unit belongs to (paper, section 2: "the manually set properties of the m_unit object").
@@ -85,6 +88,8 @@ pub struct Hello {
     pub wanted: Option<Manager>,
     /// This life of the unit.
     pub epoch: Epoch,
+    /// The term of an m_unit, or the newest that an s_unit has obeyed.
+    pub term: Term,
     /// Fresh for each link; the peer's session datagrams carry it.
     pub nonce: u64,
     /// What the unit takes.
@@ -134,6 +139,20 @@ impl Manager {
     pub(super) fn take(reader: &mut Reader<'_>) -> Self {
         Self { name: reader.name(), id: reader.u32() }
     }
+}
+
+/// The item that says a term, if there is one.
+pub(super) fn put_term(term: Term, writer: &mut Writer<'_>) {
+    if term != Term::NONE {
+        let item = writer.begin(kind::AUTHORITY);
+        writer.number(term.0.into());
+        writer.end(item);
+    }
+}
+
+/// What an item [`kind::AUTHORITY`] says.
+pub(super) fn take_term(reader: &mut Reader<'_>) -> Term {
+    Term(reader.u32())
 }
 
 /// What an item [`kind::LINK`] says.
@@ -189,6 +208,7 @@ impl Hello {
         let item = writer.begin(kind::LIMITS);
         writer.numbers(&[message_size, chunk_size.into(), calls.into(), minimum_interval]);
         writer.end(item);
+        put_term(self.term, &mut writer);
         writer.finish()
     }
 
@@ -208,7 +228,8 @@ impl Hello {
         if mode.suites() != 0 && mode.suites() & u16::from_le_bytes([s0, s1]) == 0 {
             return Err(HelloError::Suite);
         }
-        let (mut unit, mut wanted, mut link, mut limits, mut skipped) = (None, None, None, None, 0);
+        let (mut unit, mut wanted, mut link, mut limits) = (None, None, None, None);
+        let (mut term, mut skipped) = (Term::NONE, 0);
         for item in Items::new(items) {
             let item = item?;
             match item.kind {
@@ -216,6 +237,7 @@ impl Hello {
                 kind::WANTED => wanted = Some(item.read(Manager::take)?),
                 kind::LINK => link = Some(item.read(Link::take)?),
                 kind::LIMITS => limits = Some(item.read(Limits::take)?),
+                kind::AUTHORITY => term = item.read(take_term)?,
                 _ => item.skip(&mut skipped)?,
             }
         }
@@ -233,6 +255,7 @@ impl Hello {
             identity,
             wanted,
             epoch,
+            term,
             nonce,
             limits,
             link,
@@ -263,6 +286,7 @@ mod tests {
             identity: Identity::s_unit(name, u32::MAX).unwrap(),
             wanted: Some(Manager { name: name.try_into().unwrap(), id: u32::MAX }),
             epoch: Epoch(u64::MAX),
+            term: Term(u32::MAX),
             nonce: u64::MAX,
             limits: Limits {
                 message_size: u32::MAX,
@@ -316,7 +340,8 @@ mod tests {
         assert_eq!(with(3, b's'), Err(HelloError::Mode));
         assert_eq!(with(4, 3), Err(HelloError::Version(Versions { first: 3, last: 3 })));
         assert_eq!(with(4, 1), Err(HelloError::Version(Versions { first: 1, last: 1 })), "it has its fleet in byte 5");
-        for cut in 0..length {
+        // The term, which is last, may be missing.
+        for cut in (0..length).filter(|cut| *cut != length - 12) {
             assert_eq!(Hello::decode(&out[..cut], PLAIN), Err(HelloError::Malformed), "{cut}");
         }
         let small = Limits { chunk_size: (MINIMUM_CHUNK_BYTES - 1) as u16, ..longest().limits };

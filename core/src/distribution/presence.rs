@@ -8,6 +8,7 @@ use super::datagram::{Announce, Datagram, SEARCH_BYTES, WhoHas};
 use super::hello::Manager;
 use super::identity::{Epoch, Fleet, Identity};
 use crate::host::endpoint::Endpoint;
+use crate::term::Term;
 use crate::time::Duration;
 
 /// How long a manager waits for an answer before it starts. A unit that is alive answers at once.
@@ -32,8 +33,13 @@ pub enum Heard<'o, E> {
     Nothing,
     /// Another unit asks the same and must give way: the answer, to be sent to the datagram's source.
     Answer(&'o [u8]),
-    /// A live unit has this identity; where it can be dialled.
-    Running(E),
+    /// A live unit has this identity.
+    Running {
+        /// Where it can be dialled.
+        at: E,
+        /// Its term: one that takes over claims the next.
+        term: Term,
+    },
 }
 
 impl Presence {
@@ -74,7 +80,7 @@ impl Presence {
     ) -> Heard<'o, E> {
         match Datagram::decode(bytes, self.fleet, authenticator) {
             Ok(Datagram::Announce(announce)) if self.is_answer(&announce) => {
-                Heard::Running(from.at_port(announce.tcp_port))
+                Heard::Running { at: from.at_port(announce.tcp_port), term: announce.term }
             }
             Ok(Datagram::WhoHas(who_has)) if self.gives_way(&who_has) => {
                 self.answer(who_has.nonce, authenticator, out).map_or(Heard::Nothing, Heard::Answer)
@@ -102,6 +108,7 @@ impl Presence {
         let announce = Announce {
             identity: self.identity.clone(),
             epoch: self.epoch,
+            term: Term::NONE,
             sequence: self.sequence,
             nonce,
             tcp_port: 0,

@@ -6,6 +6,7 @@ use crate::services::lease::LeaseEnd;
 use crate::services::requests::CallId;
 use crate::services::session::{Event, Session};
 use crate::services::{OwnFunctions, Port};
+use crate::term::Term;
 
 /// Something happened that no call returned.
 ///
@@ -35,6 +36,13 @@ pub enum UnitEvent<F, N, E> {
         peer: Option<Identity>,
         /// Why.
         reason: CloseReason,
+    },
+    /// A manager with this m_unit's name and id and a newer term commands: this one is fenced. Its links have ended, and with
+    /// them what it ordered; it does nothing more, and is to be stopped. Where it is started again while the other one runs,
+    /// it does not start unless it is to take over.
+    Fenced {
+        /// The newer term.
+        term: Term,
     },
     /// The network that this unit can use has changed, and it searches again by itself. On Linux also when the unit finds
     /// none at its start; a board's first address is not reported, and its links have ended.

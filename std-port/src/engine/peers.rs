@@ -261,6 +261,7 @@ pub(super) mod tests {
             identity: Identity::m_unit("manager", 1).unwrap(),
             wanted: None,
             epoch: Epoch(1),
+            term: cara_core::term::Term::NONE,
             nonce: 1,
             limits: Limits { message_size: 0, chunk_size: 0, calls: 0, minimum_interval: 0 },
             link: 0,

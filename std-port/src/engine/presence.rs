@@ -65,7 +65,7 @@ impl<T: Send + 'static> Engine<T> {
                 match presence.hear(from, buffer.get(..length).unwrap_or_default(), codes, &mut out) {
                     Heard::Nothing => {}
                     Heard::Answer(answer) => drop(self.sockets.datagrams.send_to(from, answer)),
-                    Heard::Running(at) => return Some(at),
+                    Heard::Running { at, .. } => return Some(at),
                 }
             }
         }

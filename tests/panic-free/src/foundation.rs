@@ -4,6 +4,7 @@ use cara_core::config::{Constraints, Priority};
 use cara_core::error::Error;
 use cara_core::random::Random;
 use cara_core::storage::{Buffers, Lent, Pool};
+use cara_core::term::Term;
 use cara_core::time::{Duration, Instant};
 
 use crate::linkage::{keep, unknown, unknown_slice};
@@ -26,6 +27,11 @@ entry!(durations, {
 entry!(random, {
     let mut random = Random::new(*unknown());
     keep((random.bits(), random.below(*unknown()), random.jitter(*unknown())));
+});
+
+entry!(terms, {
+    let (one, other) = (*unknown::<Term>(), *unknown::<Term>());
+    keep((one.is_newer_than(other), one.newer(other), one.next()));
 });
 
 entry!(pools, {

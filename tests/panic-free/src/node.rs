@@ -60,6 +60,8 @@ entry!(node_polled, {
 entry!(node_hears, {
     node().datagram(*unknown(), *unknown(), unknown_slice(), &AnyCodes);
     keep(node().take_duplicate());
+    node().set_term(*unknown());
+    keep((node().term(), node().take_newer_term(), node().another_proven_at()));
 });
 
 entry!(node_dials, {

@@ -8,6 +8,7 @@ use cara_core::distribution::authenticator::CODE_BYTES;
 use cara_core::distribution::datagram::{Announce, Datagram, Header, SEARCH_BYTES, WhoHas};
 use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
 use cara_core::host::secure::Plain;
+use cara_core::term::Term;
 use cara_secure::keyring::{Codes, Keyring};
 use cara_secure::keys::{DiscoveryKey, PairKey};
 use cara_std::Interfaces;
@@ -76,7 +77,17 @@ fn who_has(who: &Identity, wanted_depot: bool) -> WhoHas {
 
 fn announce(who: &Identity, nonce: u64, tcp_port: u16) -> Announce {
     let epoch = Epoch(fastrand::u64(..));
-    Announce { identity: who.clone(), epoch, sequence: u32::MAX, nonce, tcp_port, room: 100, expected: 1, skipped: 0 }
+    Announce {
+        identity: who.clone(),
+        epoch,
+        term: Term::NONE,
+        sequence: u32::MAX,
+        nonce,
+        tcp_port,
+        room: 100,
+        expected: 1,
+        skipped: 0,
+    }
 }
 
 /// Datagrams without a valid code, made from one with another sender's codes.

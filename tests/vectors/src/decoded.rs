@@ -43,6 +43,7 @@ pub(crate) fn hello(bytes: &[u8]) -> Option<Value> {
             "identity": identity(&hello.identity),
             "wanted": manager(hello.wanted.as_ref()),
             "epoch": hello.epoch.0,
+            "term": hello.term.0,
             "nonce": hello.nonce,
             "message_size": hello.limits.message_size,
             "chunk_size": hello.limits.chunk_size,
@@ -248,6 +249,7 @@ fn announce(answer: &Announce) -> Value {
     json!({
         "identity": identity(&answer.identity),
         "epoch": answer.epoch.0,
+        "term": answer.term.0,
         "sequence": answer.sequence,
         "nonce": answer.nonce,
         "tcp_port": answer.tcp_port,

@@ -26,11 +26,15 @@ pub(crate) enum Admission {
 impl<P: Port> Node<P> {
     /// Decides about a link whose hello has come. `from` is the other end of the stream.
     pub(crate) fn admit(&mut self, now: Instant, link: LinkId, from: P::Endpoint, hello: &Hello) -> Admission {
-        if let Err(refusal) = self.check(hello) {
+        if let Err(refusal) = self.check(hello).and_then(|()| self.check_term(hello)) {
+            if let Refusal::Fenced { term } = refusal {
+                self.fenced_at_vehicle(term);
+            }
             return self.refuse(now, from, &hello.identity, refusal);
         }
         // The identity decides before the number of nodes does: a node that restarts takes its own place, also in a full table.
-        let newcomer = Newcomer { link, epoch: hello.epoch, limits: hello.limits, address: from, decided: false };
+        let Hello { epoch, term, limits, .. } = *hello;
+        let newcomer = Newcomer { link, epoch, term, limits, address: from, decided: false };
         let old = self.table.find(&hello.identity).and_then(|place| Some((place, self.table.node(place)?.link()?)));
         match old {
             Some((_, old)) if old == link => Admission::Accept,
@@ -71,7 +75,7 @@ impl<P: Port> Node<P> {
     }
 
     fn join(&mut self, now: Instant, identity: &Identity, newcomer: Newcomer<P::Endpoint>) -> Admission {
-        let Newcomer { link, epoch, limits, address, .. } = newcomer;
+        let Newcomer { link, epoch, term, limits, address, .. } = newcomer;
         let Some((place, forgotten)) = self.table.place_of(identity, address, epoch) else {
             return self.refuse(now, address, identity, Refusal::Full);
         };
@@ -94,6 +98,7 @@ impl<P: Port> Node<P> {
         self.counters.add(NodeCounter::Restarted, u64::from(restarted));
         self.counters.add(NodeCounter::Joined, 1);
         self.hints.forget(identity);
+        self.obey(term);
         debug!("link {} joins", link.0);
         Admission::Accept
     }
@@ -108,6 +113,8 @@ impl<P: Port> Node<P> {
     ) -> Admission {
         // Both ends compare the same two identities, so they keep the same one of two links without asking each other.
         let smaller = self.config.identity < *identity;
+        // A manager with a newer term commands, whether the older one is alive or not.
+        let takes_over = self.config.identity.role() == Role::SUnit && newcomer.term.is_newer_than(self.term());
         let Some(known) = self.table.node_mut(place) else { return Admission::Refuse(Refusal::Full) };
         let same_life = known.epoch == newcomer.epoch;
         let dialed = known.dialing == Some(newcomer.link);
@@ -120,7 +127,7 @@ impl<P: Port> Node<P> {
         if crossing && dialed != smaller {
             return self.refuse(now, newcomer.address, identity, Refusal::AlreadyConnected);
         }
-        newcomer.decided = crossing;
+        newcomer.decided = crossing || takes_over;
         known.newcomer = Some(newcomer);
         self.table.schedule(place, now, Task::Challenge);
         self.table.set_link(newcomer.link, Some(place));
@@ -193,6 +200,7 @@ impl<P: Port> Node<P> {
             Refusal::AlreadyConnected => NodeCounter::RefusedConnected,
             Refusal::Mode => NodeCounter::RefusedMode,
             Refusal::NoKey => NodeCounter::RefusedKey,
+            Refusal::Fenced { .. } => NodeCounter::RefusedFenced,
         };
         self.counters.add(counter, 1);
         self.note_of(now, address, identity, refusal);

@@ -161,6 +161,7 @@ impl<P: Port> Node<P> {
         let announce = Announce {
             identity: self.config.identity.clone(),
             epoch: self.config.epoch,
+            term: self.term(),
             sequence: self.sequence.wrapping_add(1),
             nonce,
             tcp_port: self.config.tcp_port,

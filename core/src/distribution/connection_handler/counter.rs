@@ -73,6 +73,8 @@ crate::counters::counters! {
         RefusedMode,
         /// Links refused because there is no key for the pair.
         RefusedKey,
+        /// Links refused because the manager's term is older than one that the vehicle has obeyed.
+        RefusedFenced,
         /// Links that were challenged to prove liveness, because another one had the same identity.
         Challenged,
         /// Nodes that came back with a new epoch.

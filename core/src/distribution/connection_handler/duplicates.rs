@@ -39,7 +39,7 @@ impl<P: Port> Node<P> {
     }
 
     /// Ignores this unit's own datagrams, and records another's in its name. A manager answers the `question` of the
-    /// other one, which would not detect it otherwise.
+    /// other one, which would not detect it otherwise, and asks it in turn, for its term.
     pub(super) fn is_own(
         &mut self,
         now: Instant,
@@ -57,6 +57,10 @@ impl<P: Port> Node<P> {
             self.duplicates.hear(now, from, epoch);
             if let Some(who_has) = question.filter(|_| identity.role() == Role::MUnit) {
                 self.answer_later(now, from, identity, who_has.nonce);
+                // Not what asks this unit alone, or the two would ask each other without end.
+                if who_has.wanted.is_none() {
+                    self.hints.plan(now, from, identity, now);
+                }
             }
         }
         true

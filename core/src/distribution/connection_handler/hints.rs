@@ -62,7 +62,7 @@ impl<E: Endpoint> Hints<E> {
     }
 
     /// Schedules a question. `false` if one is scheduled already, or the list is full.
-    fn plan(&mut self, now: Instant, from: E, who: &Identity, due: Instant) -> bool {
+    pub(super) fn plan(&mut self, now: Instant, from: E, who: &Identity, due: Instant) -> bool {
         if let Some(known) = self.list.iter_mut().find(|hint| is_same_host(hint.from, from) && hint.who == *who) {
             let is_free = known.due.is_none();
             if is_free {
@@ -154,7 +154,7 @@ impl<P: Port> Node<P> {
     ) {
         while let Some((to, who)) = self.hints.take(now) {
             self.ask(to, &who, mailman, authenticator);
-            if self.search.next != Instant::FAR_FUTURE {
+            if self.search.next != Instant::FAR_FUTURE && who != self.config.identity {
                 let soon = now + UNANSWERED + mostly_late(&mut self.random, UNANSWERED);
                 self.search.next = self.search.next.min(soon);
             }

@@ -5,6 +5,7 @@ use super::timetable::Task;
 use crate::distribution::hello::Limits;
 use crate::distribution::identity::{Epoch, Identity};
 use crate::host::mailman::LinkId;
+use crate::term::Term;
 use crate::time::Instant;
 
 /// What is known of a node. `E` is the port's [`Endpoint`](crate::host::endpoint::Endpoint).
@@ -48,6 +49,7 @@ pub struct Known<E> {
 pub(super) struct Newcomer<E> {
     pub(super) link: LinkId,
     pub(super) epoch: Epoch,
+    pub(super) term: Term,
     pub(super) limits: Limits,
     pub(super) address: E,
     /// It takes the place whether the older one answers or not.

@@ -22,6 +22,7 @@ mod known;
 mod links;
 mod search;
 mod table;
+mod terms;
 mod timetable;
 mod views;
 
@@ -29,6 +30,7 @@ pub(crate) use admission::Admission;
 pub use counter::NodeCounter;
 pub use known::{Known, NodeState};
 pub use table::Order;
+pub use terms::NewerTerm;
 
 use crate::config::{Constraints, LATER, VERSIONS};
 use crate::counters::Counters;
@@ -47,6 +49,7 @@ use duplicates::Duplicates;
 use hints::{Hints, Hosts};
 use search::{Budget, Search};
 use table::Table;
+use terms::Terms;
 use timetable::Task;
 
 /// The nodes that a unit connects to. `E` is the port's [`Endpoint`](crate::host::endpoint::Endpoint).
@@ -175,6 +178,7 @@ pub struct Node<P: Port> {
     hosts: Hosts,
     answers: Answers<P::Endpoint>,
     duplicates: Duplicates<P::Endpoint>,
+    terms: Terms,
     /// Of the last search or answer.
     sequence: u32,
     /// What happened.
@@ -201,6 +205,7 @@ impl<P: Port> Node<P> {
             hosts: Hosts::new((config.seed >> 32) as u32 ^ config.seed as u32),
             answers: Answers::new(),
             duplicates: Duplicates::new(),
+            terms: Terms::new(),
             sequence: 0,
             counters: Counters::new(),
             config,
@@ -281,6 +286,7 @@ impl<P: Port> Node<P> {
             identity: self.config.identity.clone(),
             wanted: self.manager().cloned(),
             epoch: self.config.epoch,
+            term: self.terms.own,
             nonce: self.random.bits(),
             limits: constraints.into(),
             link: link.0,

@@ -358,6 +358,9 @@ impl<P: Port> Node<P> {
 
     pub(super) fn heard_announce(&mut self, now: Instant, from: P::Endpoint, announce: &Announce) {
         if self.is_own(now, from, &announce.identity, announce.epoch, None) {
+            if announce.epoch != self.config.epoch {
+                self.another_answered(now, announce);
+            }
             return;
         }
         self.counters.add(NodeCounter::AnnounceHeard, 1);

@@ -7,6 +7,7 @@ use cara_core::config::{Constraints, Mode};
 use cara_core::distribution::connection_handler::Target;
 use cara_core::distribution::hello::Manager;
 use cara_core::distribution::identity::{Fleet, Identity};
+use cara_core::term::Term;
 use cara_core::time::Duration;
 
 use super::Shared;
@@ -48,6 +49,7 @@ impl NewUnit {
             boot_seed: None,
             given: Given::new(mode, seals),
             program: None,
+            term: Term::NONE,
         };
         Self { shared: Rc::downgrade(shared), settings, segment: 0 }
     }
@@ -129,6 +131,12 @@ impl NewUnit {
     /// The segment of the network that hears its broadcasts.
     pub fn in_segment(mut self, segment: u8) -> Self {
         self.segment = segment;
+        self
+    }
+
+    /// The term that it has kept; none unless set. An m_unit claims the next one in each of its lives.
+    pub fn kept_term(mut self, term: u32) -> Self {
+        self.settings.term = Term(term);
         self
     }
 

@@ -4,7 +4,7 @@ use std::net::SocketAddr;
 use std::rc::Rc;
 
 use cara_core::distribution::authenticator::Authenticator as _;
-use cara_core::distribution::connection_handler::{Command, NodeCounter};
+use cara_core::distribution::connection_handler::{Command, NewerTerm, NodeCounter};
 use cara_core::distribution::datagram;
 use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::identity::Identity;
@@ -135,6 +135,27 @@ impl Inner {
             self.log(shared, host, UnitEvent::NotJoined { address, peer, reason });
         }
         self.work_node(shared, host);
+        self.look_at_terms(shared, host);
+    }
+
+    /// An s_unit keeps a newer term; an m_unit that hears of one steps down.
+    fn look_at_terms(&mut self, shared: &Rc<Shared>, host: HostId) {
+        let unit = &mut self.units[host.index()];
+        let Some(machine) = &mut unit.machine else { return };
+        let term = match machine.links.hub.node.take_newer_term() {
+            None => return,
+            Some(NewerTerm::Obeyed(term)) => {
+                unit.term = term;
+                return;
+            }
+            Some(NewerTerm::AtVehicle(term) | NewerTerm::OfManager(term)) => term,
+        };
+        let links: Vec<u16> = machine.links.iter().map(|(index, _)| index).collect();
+        for index in links {
+            machine.links.with(&mut self.network, index, |session, cx| session.close(cx, CloseReason::Stopped));
+        }
+        self.log(shared, host, UnitEvent::Fenced { term });
+        self.network.stop(host);
     }
 
     /// The host's interface went or came, or has another address.
@@ -180,6 +201,7 @@ impl Inner {
     fn happened(&mut self, shared: &Rc<Shared>, host: HostId, index: u16, happened: Vec<Happened>) {
         for happened in happened {
             self.one_happened(shared, host, index, happened);
+            self.look_at_terms(shared, host);
         }
         // What happened may have left the hub something to do.
         self.work_node(shared, host);

@@ -9,6 +9,7 @@ use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::identity::{Identity, Role};
 use cara_core::error::Error;
 use cara_core::services::Ticket;
+use cara_core::term::Term;
 use cara_core::time::{Duration, Instant};
 
 use super::functions::MyFunctionList;
@@ -249,6 +250,16 @@ impl UnitHandle {
             inner.sleep_until(self.host, at)
         });
         promise.await;
+    }
+
+    /// What it keeps of terms: that of an m_unit, or the newest that an s_unit has obeyed.
+    pub fn term(&self) -> Term {
+        self.with(|inner| inner.units[self.host.index()].term)
+    }
+
+    /// Replaces what it keeps of terms, for its next life: as where it is lost, or wrong.
+    pub fn keep_term(&self, term: Term) {
+        self.with(|inner| inner.units[self.host.index()].term = term);
     }
 
     /// Stops it in an orderly way: peers are told.

@@ -14,6 +14,7 @@ use cara_core::host::secure::Seal;
 use cara_core::random::Random;
 use cara_core::services::session::{Session, SessionConfig, SessionStorage, buffer_bytes};
 use cara_core::services::slots_for;
+use cara_core::term::Term;
 use cara_core::time::Instant;
 
 use super::handle::UnitHandle;
@@ -55,6 +56,8 @@ pub(super) struct Settings {
     pub(super) boot_seed: Option<u64>,
     pub(super) given: Given,
     pub(super) program: Option<Program>,
+    /// What it has kept of terms before its first life.
+    pub(super) term: Term,
 }
 
 /// A unit with its log, and with its machine while it lives.
@@ -62,6 +65,8 @@ pub(super) struct UnitState {
     pub(super) host: HostId,
     pub(super) settings: Settings,
     pub(super) life: u32,
+    /// What it keeps of terms: that of an m_unit, or the newest that an s_unit has obeyed.
+    pub(super) term: Term,
     pub(super) machine: Option<Machine>,
     pub(super) log: Vec<(Instant, LogEvent)>,
     pub(super) hooks: Vec<EventHook>,
@@ -89,7 +94,16 @@ impl Settings {
 
 impl UnitState {
     pub(super) fn new(host: HostId, settings: Settings) -> Self {
-        Self { host, settings, life: 0, machine: None, log: Vec::new(), hooks: Vec::new(), counters: Counters::new() }
+        Self {
+            host,
+            life: 0,
+            term: settings.term,
+            settings,
+            machine: None,
+            log: Vec::new(),
+            hooks: Vec::new(),
+            counters: Counters::new(),
+        }
     }
 
     pub(super) fn boot(&mut self, network: &mut Network) {
@@ -97,6 +111,7 @@ impl UnitState {
         let listens = settings.identity.role() == Role::MUnit;
         if listens {
             network.listen(self.host, TCP_PORT);
+            self.term = self.term.next();
         }
         let (epoch, seed) = (network.random().bits(), network.random().bits());
         let config = NodeConfig {
@@ -120,6 +135,7 @@ impl UnitState {
         if let Some(m_units) = &settings.m_units {
             hub.node.choose(m_units.clone());
         }
+        hub.node.set_term(self.term);
         self.machine = Some(Machine {
             links: Links::new(self.host, settings.links, functions, buffers, hub, keys, arguments),
             constraints: settings.constraints,

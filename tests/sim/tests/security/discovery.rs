@@ -11,6 +11,7 @@ use cara_core::distribution::identity::{Epoch, Fleet, Identity};
 use cara_core::distribution::presence::{Heard, Presence};
 use cara_core::error::CloseReason;
 use cara_core::host::mailman::{LinkId, Mailman};
+use cara_core::term::Term;
 use cara_core::time::{Duration, Instant};
 use cara_secure::keyring::{Codes, Keyring};
 use cara_secure::keys::{DiscoveryKey, PairKey, RootKey};
@@ -115,7 +116,7 @@ impl Unit {
         Self { node, codes: codes(1, identity), outbox: Outbox::default(), dials: Vec::new() }
     }
 
-    fn manager() -> Self {
+    pub(super) fn manager() -> Self {
         Self::new(&depot(), Target::Everybody)
     }
 
@@ -205,6 +206,7 @@ fn spoofed_announces_lead_nowhere() {
             let announce = Announce {
                 identity: name.clone(),
                 epoch: Epoch(u64::from(id)),
+                term: Term::NONE,
                 sequence: u32::MAX,
                 nonce,
                 tcp_port: 666,
@@ -257,13 +259,13 @@ fn nobody_without_a_manager_s_own_key_keeps_it_from_starting() {
     running.run(at(2_001));
     let answer = running.outbox.sent.last().expect("it answers").1.clone();
     let told = asking.hear(host(1), &answer, &own, &mut out);
-    assert_eq!(told, Heard::Running(SocketAddr::from(([10, 0, 0, 1], 7_000))));
+    assert_eq!(told, Heard::Running { at: SocketAddr::from(([10, 0, 0, 1], 7_000)), term: Term::NONE });
     assert!(answer.len() <= question.len());
     // The next start has another nonce, and that answer is an old one.
     let next = Presence::new(depot(), FLEET, Epoch(600), 78);
     for bytes in [&answer, &question] {
         for codes in [&own, &codes(9, &depot())] {
-            tally.note(matches!(next.hear(host(66), bytes, codes, &mut out), Heard::Running(_)));
+            tally.note(matches!(next.hear(host(66), bytes, codes, &mut out), Heard::Running { .. }));
         }
     }
     // With the fleet's key and another pair's.
@@ -273,6 +275,7 @@ fn nobody_without_a_manager_s_own_key_keeps_it_from_starting() {
             let announce = Announce {
                 identity: depot(),
                 epoch: Epoch(epoch),
+                term: Term::NONE,
                 sequence: 9,
                 nonce,
                 tcp_port: 666,
@@ -283,7 +286,7 @@ fn nobody_without_a_manager_s_own_key_keeps_it_from_starting() {
             let mut bytes = [0; SEARCH_BYTES];
             for to in [None, Some(depot()), Some(agv(18))] {
                 let Some(bytes) = announce.encode(FLEET, &thief, to.as_ref(), &mut bytes) else { continue };
-                tally.note(matches!(next.hear(host(66), bytes, &own, &mut out), Heard::Running(_)));
+                tally.note(matches!(next.hear(host(66), bytes, &own, &mut out), Heard::Running { .. }));
             }
         }
     }

@@ -100,6 +100,7 @@ fn hello(id: u32, nonce: u64) -> Vec<u8> {
         identity: Identity::s_unit("agv", id).expect("a name"),
         wanted: Some(cara_core::distribution::hello::Manager::new("depot", 1).expect("a name")),
         epoch: Epoch(nonce),
+        term: cara_core::term::Term::NONE,
         nonce,
         limits,
         link: 0,

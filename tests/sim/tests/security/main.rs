@@ -5,6 +5,7 @@
 //! - [`discovery`]: changed, spoofed and repeated datagrams of discovery;
 //! - [`kept_away`]: recorded and forged discovery while a vehicle starts, and how long it takes to join;
 //! - [`renewals`]: recordings from before a link was rekeyed, and revoked or wrong keys;
+//! - [`terms`]: forged answers and hellos that claim a newer term;
 //! - [`vectors`]: the bytes of a conversation, as committed;
 //! - [`fleet`]: wrong keys, no keys, plain against secured, floods, on the virtual network.
 
@@ -14,6 +15,7 @@ mod fleet;
 mod frames;
 mod kept_away;
 mod renewals;
+mod terms;
 mod vectors;
 
 /// Attempts of one kind, and how many of them came to something.

@@ -5,6 +5,7 @@ mod faults;
 mod leases;
 mod renewals;
 mod runs;
+mod terms;
 
 use cara_core::distribution::parameters::Parameters;
 use cara_core::time::Duration;

@@ -18,6 +18,7 @@ mod network;
 mod ordering;
 mod restart;
 mod table;
+mod terms;
 
 use core::net::SocketAddr;
 use std::boxed::Box;
@@ -28,6 +29,7 @@ use crate::config::Mode;
 use crate::distribution::datagram::{Announce, SEARCH_BYTES, WhoHas};
 use crate::host::port::InMemory;
 use crate::host::secure::Plain;
+use crate::term::Term;
 use crate::time::Duration;
 
 pub(super) const FLEET: Fleet = Fleet(7);
@@ -153,6 +155,7 @@ pub(super) fn announce_of(config: &NodeConfig<SocketAddr>, sequence: u32, nonce:
     Announce {
         identity: config.identity.clone(),
         epoch: config.epoch,
+        term: Term::NONE,
         sequence,
         nonce,
         tcp_port: config.tcp_port,

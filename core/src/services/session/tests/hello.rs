@@ -7,6 +7,7 @@ use crate::config::{HELLO_TIMEOUT, VERSIONS, Versions};
 use crate::distribution::connection_handler::Directive;
 use crate::distribution::identity::Identity;
 use crate::error::{CloseReason, Refusal};
+use crate::term::Term;
 use crate::time::Duration;
 
 #[test]
@@ -30,6 +31,21 @@ fn a_refusal_tells_the_reason_to_both() {
         let closed = Event::Closed(CloseReason::Refused(Refusal::WrongManager));
         assert!(pair.manager.has(&closed), "{:?}", pair.manager.happened);
         assert!(pair.agv.has(&closed), "{:?}", pair.agv.happened);
+    }
+}
+
+#[test]
+fn a_term_that_is_over_is_told_to_both() {
+    let (over, newer) = (Term(5), Term(6));
+    for manager_refuses in [true, false] {
+        let mut pair = Pair::of_terms(&Setup::default(), over, newer);
+        // One that does not look what the vehicle has obeyed is refused by it.
+        pair.manager.hub.hub.node.set_term(if manager_refuses { over } else { newer });
+        pair.agv.hub.hub.node.set_term(newer);
+        pair.settle();
+        let closed = Event::Closed(CloseReason::Refused(Refusal::Fenced { term: newer }));
+        assert!(pair.agv.has(&closed), "{:?}", pair.agv.happened);
+        assert!(pair.manager.has(&closed), "{:?}", pair.manager.happened);
     }
 }
 

@@ -6,6 +6,7 @@ use super::side::{Side, context};
 use crate::distribution::parameters::ParametersView;
 use crate::error::{CloseReason, Error};
 use crate::services::Context;
+use crate::term::Term;
 use crate::time::{Duration, Instant};
 
 /// A manager and an AGV on one network. Every buffer must have come back when it is dropped.
@@ -18,8 +19,14 @@ pub(super) struct Pair {
 impl Pair {
     /// Two ends whose connection is open, and nothing sent yet.
     pub(super) fn connected(setup: &Setup) -> Self {
+        Self::of_terms(setup, Term::NONE, Term::NONE)
+    }
+
+    /// The same where the hellos say these terms.
+    pub(super) fn of_terms(setup: &Setup, manager: Term, agv: Term) -> Self {
         let mut pair =
             Self { manager: Side::new(setup, false, 1), agv: Side::new(setup, true, 2), elapsed: Duration::ZERO };
+        (pair.manager.session.local.term, pair.agv.session.local.term) = (manager, agv);
         pair.manager.session.connected(context!(pair.manager));
         pair.agv.session.connected(context!(pair.agv));
         pair
