@@ -61,6 +61,8 @@ pub struct Builder<T, R> {
     #[cfg(feature = "access")]
     access_file: Option<FileWatch>,
     asks_for_itself: bool,
+    state_folder: Option<PathBuf>,
+    takes_over: bool,
     state: T,
     role: PhantomData<fn() -> R>,
 }
@@ -104,6 +106,8 @@ impl<R> Builder<(), R> {
             #[cfg(feature = "access")]
             access_file: None,
             asks_for_itself: true,
+            state_folder: crate::terms::folder(),
+            takes_over: false,
             state: (),
             role: PhantomData,
         }
@@ -122,6 +126,14 @@ impl<T: Send + 'static> Builder<T, MUnit> {
     /// each other: for tests of that.
     pub fn beside_another(mut self) -> Self {
         self.asks_for_itself = false;
+        self
+    }
+
+    /// It starts although a live one of its name and id answers, with the next [term](crate::Term): the other one steps down, its
+    /// orders end, and its s_units come to this one. A decision of the operator's: between two that both take over, the later one
+    /// wins.
+    pub fn take_over(mut self, takes_over: bool) -> Self {
+        self.takes_over = takes_over;
         self
     }
 
@@ -203,6 +215,14 @@ impl<T: Send + 'static, R> Builder<T, R> {
         self
     }
 
+    /// The folder in which the unit keeps its [term](crate::Term), made if it is not there; what `CARA_STATE` names unless set, or
+    /// systemd's `STATE_DIRECTORY`. Without one, an m_unit begins with the first term again, and an s_unit forgets with its end
+    /// which managers it has to refuse.
+    pub fn state_folder(mut self, folder: impl Into<PathBuf>) -> Self {
+        self.state_folder = Some(folder.into());
+        self
+    }
+
     /// The UDP port of broadcasts, the same for all units of a fleet. Unless set, the port of the unit's mode.
     pub fn discovery_port(mut self, port: u16) -> Self {
         self.discovery_port = Some(port);
@@ -236,6 +256,8 @@ impl<T: Send + 'static, R> Builder<T, R> {
             #[cfg(feature = "access")]
             access_file: self.access_file,
             asks_for_itself: self.asks_for_itself,
+            state_folder: self.state_folder,
+            takes_over: self.takes_over,
             state,
             role: PhantomData,
         }
@@ -318,6 +340,8 @@ impl<T: Send + 'static, R> Builder<T, R> {
             listener,
             maximum_links,
             asks_for_itself: self.asks_for_itself,
+            state_folder: self.state_folder,
+            takes_over: self.takes_over,
         };
         let engine = Engine::new(parts);
         if self.access.is_some() {

@@ -40,6 +40,9 @@ pub enum StartError {
         /// The socket.
         path: PathBuf,
     },
+    /// An m_unit cannot keep its term, which it must before it speaks with it.
+    #[error("the term of this manager cannot be kept: {0}; name another folder of state (CARA_STATE), or none")]
+    Term(String),
     /// Something about the unit itself, or what the system refuses.
     #[error(transparent)]
     Unit(#[from] Error),
@@ -50,6 +53,10 @@ impl StartError {
     /// a supervisor should not start them again.
     pub const ALREADY_RUNNING_EXIT: u8 = 5;
 
+    /// The exit code with which `cara node` and the examples end where a manager with a newer term has taken over
+    /// ([`UnitEvent::Fenced`](crate::UnitEvent::Fenced)): a supervisor should not start them again.
+    pub const FENCED_EXIT: u8 = 6;
+
     /// Whether another one of this identity is why it does not start.
     pub fn is_running_already(&self) -> bool {
         matches!(self, Self::AlreadyRunning { .. } | Self::SocketHeld { .. })
@@ -59,6 +66,7 @@ impl StartError {
     pub fn code(&self) -> String {
         match self {
             Self::AlreadyRunning { .. } | Self::SocketHeld { .. } => "AlreadyRunning".to_owned(),
+            Self::Term(_) => "Term".to_owned(),
             Self::Unit(error) => format!("{error:?}"),
         }
     }

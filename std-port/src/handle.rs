@@ -14,6 +14,7 @@ use cara_core::distribution::connection_handler::NodeCounter;
 use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
 use cara_core::error::Error;
 use cara_core::host::connections::LinkCounter;
+use cara_core::term::Term;
 use cara_core::time::Duration;
 
 use crate::access::AccessTable;
@@ -93,6 +94,18 @@ pub(crate) struct Owner<T: Send + 'static> {
     control: Control,
     #[cfg(feature = "control")]
     pub(crate) server: Mutex<Option<Server>>,
+}
+
+/// One that takes over waits so long for the control socket of one on this host that steps down.
+#[cfg(feature = "control")]
+const STEPPING_DOWN: std::time::Duration = std::time::Duration::from_secs(3);
+
+#[cfg(feature = "control")]
+fn wait_until(limit: std::time::Duration, condition: impl Fn() -> bool) {
+    let end = std::time::Instant::now() + limit;
+    while !condition() && std::time::Instant::now() < end {
+        std::thread::sleep(std::time::Duration::from_millis(20));
+    }
 }
 
 impl<T: Send + 'static> Owner<T> {
@@ -188,15 +201,20 @@ impl<T: Send + 'static, R> Handle<T, R> {
     ///
     /// An m_unit first asks for its own identity and waits 300 ms: [`StartError::AlreadyRunning`] where a live m_unit answers.
     /// One that is stopped (`SIGSTOP`) or hangs does not answer; on this host it holds its control socket, which is
-    /// [`StartError::SocketHeld`]. From one on another host, or without a socket, the links go to this one. See
-    /// [`Builder::beside_another`](crate::Builder::beside_another).
+    /// [`StartError::SocketHeld`]. From one on another host, or without a socket, the links go to this one. One that is to
+    /// [take over](crate::Builder::take_over) starts all the same.
     #[doc(alias = "start_thread")]
     pub fn start(&self) -> Result<(), StartError> {
         #[cfg(not(feature = "control"))]
         self.engine().start()?;
         #[cfg(feature = "control")]
         {
-            self.engine().start_unless(|| control::held(&self.owner.control, &self.identity(), self.fleet()))?;
+            let held = || control::held(&self.owner.control, &self.identity(), self.fleet());
+            self.engine().start_unless(held)?;
+            if self.engine().takes_over() {
+                // The one that steps down has the socket until it ends.
+                wait_until(STEPPING_DOWN, || held().is_none());
+            }
             self.owner.open_control();
         }
         Ok(())
@@ -210,6 +228,11 @@ impl<T: Send + 'static, R> Handle<T, R> {
     /// A handle for the unit's own handlers. One that owned a [`Handle`] would keep it running for ever.
     pub fn downgrade(&self) -> WeakHandle<T, R> {
         WeakHandle { owner: Arc::downgrade(&self.owner), role: PhantomData }
+    }
+
+    /// The term of an m_unit, or the newest that an s_unit has obeyed.
+    pub fn term(&self) -> Term {
+        self.engine().hub().hub.node.term()
     }
 
     /// This unit's identity.

@@ -53,6 +53,7 @@ mod storage;
 pub mod survey;
 #[doc(hidden)]
 pub mod sys;
+mod terms;
 #[cfg(test)]
 mod testing;
 mod threads;
@@ -73,6 +74,7 @@ pub use cara_core::host::connections::LinkCounter;
 pub use cara_core::services::lease::{Ended, Latch, LeaseEnd};
 pub use cara_core::services::requests::CallId;
 pub use cara_core::services::session::{Delivery, RequestOptions};
+pub use cara_core::term::Term;
 pub use cara_core::time::Duration;
 pub use communication_system::{CommunicationSystem, WeakSystem};
 pub use config::Capacities;

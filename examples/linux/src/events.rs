@@ -2,7 +2,7 @@
 
 use std::sync::mpsc::Receiver;
 
-use cara_std::{LeaseEnd, UnitEvent};
+use cara_std::{LeaseEnd, StartError, UnitEvent};
 
 use crate::say;
 
@@ -14,6 +14,11 @@ pub fn show_events(events: Receiver<UnitEvent>) {
 fn show(event: &UnitEvent) {
     match event {
         UnitEvent::Joined { peer } => say!("joined {peer}"),
+        UnitEvent::Fenced { term } => {
+            // The unit has stopped. A supervisor is not to start it again.
+            say!("another manager of this name and id has taken over with term {term}");
+            std::process::exit(i32::from(StartError::FENCED_EXIT));
+        }
         UnitEvent::Left { peer, reason } => say!("left {peer}: {reason}"),
         UnitEvent::ListChanged { peer } => say!("new function list of {peer}"),
         UnitEvent::RequestFailed { peer, error, .. } => say!("request to {peer} failed: {error}"),

@@ -60,6 +60,7 @@ impl<T: Send + 'static> Engine<T> {
         if let Some(address) = duplicate {
             self.duplicate_heard(address);
         }
+        self.look_at_terms();
     }
 
     /// Without the hub, so that an emergency does not wait for a search.

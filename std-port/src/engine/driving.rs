@@ -7,6 +7,7 @@ use std::sync::{Arc, OnceLock};
 use cara_core::config::Mode;
 use cara_core::distribution::identity::{Fleet, Identity};
 use cara_core::error::Error;
+use cara_core::term::Term;
 use cara_core::time::Instant;
 
 use super::Engine;
@@ -84,14 +85,17 @@ impl<T: Send + 'static> Engine<T> {
         if self.unit_number().is_some() {
             return Ok(());
         }
-        if let Some(at) = self.running_elsewhere().map_err(system_refused)? {
+        let running = self.running_elsewhere().map_err(system_refused)?;
+        let takes_over = self.terms.takes_over;
+        if let Some((at, _)) = running.filter(|_| !takes_over) {
             let (identity, fleet) = self.identity();
             return Err(StartError::AlreadyRunning { identity, fleet, at });
         }
-        if let Some(path) = self.driver.asks_for_itself.then(holds).flatten() {
+        if let Some(path) = (self.driver.asks_for_itself && !takes_over).then(holds).flatten() {
             let (identity, fleet) = self.identity();
             return Err(StartError::SocketHeld { identity, fleet, path });
         }
+        self.claim(running.map_or(Term::NONE, |(_, term)| term))?;
         self.thread_pool().start()?;
         let unit_number = self.thread_pool().register(self.clone())?;
         let _ = self.driver.unit_number.set(unit_number);
@@ -102,7 +106,7 @@ impl<T: Send + 'static> Engine<T> {
         Ok(())
     }
 
-    fn identity(&self) -> (Identity, Fleet) {
+    pub(super) fn identity(&self) -> (Identity, Fleet) {
         let node = &self.hub().hub.node;
         (node.identity().clone(), node.fleet())
     }
@@ -179,7 +183,7 @@ impl<T: Send + 'static> Driven for Engine<T> {
     }
 
     fn look_around(&self) -> Instant {
-        self.watch_interfaces().min(self.watch_keys())
+        self.watch_interfaces().min(self.watch_keys()).min(self.watch_terms())
     }
 
     fn read_datagrams(&self, socket: Socket, buffer: &mut [u8]) {

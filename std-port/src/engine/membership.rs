@@ -204,6 +204,7 @@ impl<T: Send + 'static> Engine<T> {
             self.with(link, state, |session, cx| session.set_constraints(cx, own));
         }
         let _ = link.peer.set(peer);
+        self.look_at_terms();
         // Who publishes from here on finds the peer, and waits for this link's lock to tell it. What was published before,
         // and after the session looked, or found no room in it, is told now.
         let grew = self.make_publication_room(state);
@@ -248,6 +249,7 @@ impl<T: Send + 'static> Engine<T> {
         self.tell_of(link, Event::Closed(reason));
         self.links.cancel_timer(link.id);
         self.hub().hub.node.left(self.now(), link.id, reason);
+        self.look_at_terms();
         self.links.remove(link);
         // The hub may have something to do earlier than before.
         self.wake_clock();

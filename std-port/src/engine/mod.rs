@@ -45,6 +45,7 @@ mod sockets;
 mod state_gate;
 mod staying;
 mod tables;
+mod terms;
 #[cfg(test)]
 mod tests;
 mod watch;
@@ -61,6 +62,7 @@ pub(crate) use membership::HubCell;
 pub(crate) use tables::node_storage;
 pub(crate) use worker::arena_bytes;
 
+use std::path::PathBuf;
 use std::sync::atomic::{self, AtomicU64};
 use std::sync::mpsc::SyncSender;
 use std::sync::{Arc, Mutex, RwLock, RwLockReadGuard, RwLockWriteGuard, Weak};
@@ -113,6 +115,7 @@ pub(crate) struct Engine<T: 'static> {
     pub(crate) pool: MessagePool,
     pub(crate) key_watch: KeyWatch,
     guard: access::Guard,
+    terms: terms::Terms,
     accounts: accounts::Accounts,
     events: Events,
     /// For threads that look for themselves at what has happened.
@@ -134,6 +137,8 @@ pub(crate) struct EngineParts<T: 'static> {
     pub(crate) listener: Option<Listener>,
     pub(crate) maximum_links: usize,
     pub(crate) asks_for_itself: bool,
+    pub(crate) state_folder: Option<PathBuf>,
+    pub(crate) takes_over: bool,
 }
 
 impl<T: Send + 'static> Engine<T> {
@@ -151,6 +156,7 @@ impl<T: Send + 'static> Engine<T> {
             key_watch: KeyWatch::new(parts.keys, driver.born()),
             driver,
             guard: access::Guard::default(),
+            terms: terms::Terms::new(parts.state_folder, parts.takes_over),
             accounts: accounts::Accounts::default(),
             events: Events::default(),
             news: News::default(),

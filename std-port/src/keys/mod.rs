@@ -30,6 +30,7 @@ mod named;
 pub mod place;
 mod ring;
 mod store;
+mod term;
 mod text;
 
 pub use cara_secure::keys::{DeviceSecret, DiscoveryKey, KEY_BYTES, PairKey, RootKey};
@@ -43,6 +44,7 @@ pub use members::{Member, Members, Revoked};
 pub use named::{full_name, parse_node};
 pub use ring::KeyRing;
 pub use store::{Change, Store, Written};
+pub(crate) use term::{read_term, write_term};
 
 /// Fills an array with random bytes of the kernel's.
 pub fn draw<const BYTES: usize>() -> Result<zeroize::Zeroizing<[u8; BYTES]>, KeyError> {

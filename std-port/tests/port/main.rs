@@ -24,4 +24,5 @@ mod processes;
 mod stopping;
 mod stuck;
 mod support;
+mod terms;
 mod threads;

@@ -45,7 +45,7 @@ impl<P: Port> Node<P> {
     }
 
     /// What this unit has kept: the newest term that an s_unit has obeyed, or the one that an m_unit claims, which it keeps
-    /// before it is told here. For the start; an m_unit that claims another one later has ended its links before.
+    /// before it is told here. Links that there are stay as they are.
     pub fn set_term(&mut self, term: Term) {
         self.terms.own = term;
     }

@@ -4,18 +4,18 @@ use std::collections::HashMap;
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::{Duration, Instant};
 
-use cara_std::{CloseReason, UnitEvent};
+use cara_std::{CloseReason, Term, UnitEvent};
 
 /// Links that did not come about for one reason are one line in this time: a port scan has hundreds a second.
 const PERIOD: Duration = Duration::from_secs(1);
 
-/// Tells what happens to the node, in a thread that ends with the unit.
-pub(super) fn log(events: Receiver<UnitEvent>) -> anyhow::Result<()> {
-    std::thread::Builder::new().name("cara-log".into()).spawn(move || log_all(&events))?;
+/// Tells what happens to the node, in a thread that ends with the unit; `fenced` once another manager has taken over.
+pub(super) fn log(events: Receiver<UnitEvent>, fenced: impl Fn(Term) + Send + 'static) -> anyhow::Result<()> {
+    std::thread::Builder::new().name("cara-log".into()).spawn(move || log_all(&events, &fenced))?;
     Ok(())
 }
 
-fn log_all(events: &Receiver<UnitEvent>) {
+fn log_all(events: &Receiver<UnitEvent>, fenced: &dyn Fn(Term)) {
     let mut sparing = Sparing::default();
     loop {
         let event = match sparing.0.is_empty() {
@@ -24,6 +24,7 @@ fn log_all(events: &Receiver<UnitEvent>) {
         };
         match event {
             Ok(UnitEvent::NotJoined { reason, .. }) if !sparing.admits(reason, Instant::now()) => {}
+            Ok(UnitEvent::Fenced { term }) => fenced(term),
             Ok(event) => log_event(event),
             Err(RecvTimeoutError::Timeout) => {}
             Err(RecvTimeoutError::Disconnected) => return sparing.0.into_iter().for_each(left_out),

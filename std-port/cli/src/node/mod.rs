@@ -63,6 +63,12 @@ pub(crate) struct Arguments {
     /// The TCP port for connections of others; a free one unless told.
     #[arg(long, value_name = "PORT")]
     tcp_port: Option<u16>,
+    /// Start although a live m_unit has this one's name and ID: it steps down, and its vehicles come to this one.
+    #[arg(long)]
+    take_over: bool,
+    /// The folder in which the node keeps its term; CARA_STATE or STATE_DIRECTORY unless told.
+    #[arg(long, value_name = "DIR")]
+    state: Option<PathBuf>,
     /// Serve http://ADDR/metrics for Prometheus, as 127.0.0.1:9464.
     #[arg(long, value_name = "ADDR", value_parser = address)]
     metrics: Option<SocketAddr>,
@@ -84,6 +90,9 @@ pub(crate) fn run(arguments: Arguments, global: &Global) -> anyhow::Result<ExitC
     }
     let over = overrides(&arguments, global)?;
     let settings = Settings::of(read(arguments.file.as_deref())?, &over).map_err(wrong)?;
+    if over.takes_over && settings.manager.is_some() {
+        return Err(Ended::usage("--take-over is for an m_unit: an s_unit takes nothing over"));
+    }
     if arguments.check {
         tell_correct(&settings, global)?;
         return Ok(Exit::Done.into());
@@ -134,6 +143,8 @@ fn overrides(arguments: &Arguments, global: &Global) -> anyhow::Result<Overrides
         discovery_port: global.discovery_port,
         m_units: arguments.m_units.clone(),
         tcp_port: arguments.tcp_port,
+        takes_over: arguments.take_over,
+        state: arguments.state.clone(),
         metrics: arguments.metrics,
         metrics_anywhere: arguments.metrics_anywhere,
         access: arguments.access.clone(),

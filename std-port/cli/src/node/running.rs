@@ -2,7 +2,7 @@
 
 use std::io::ErrorKind;
 use std::net::{SocketAddr, TcpListener};
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use anyhow::Context;
 use cara_std::{BuildError, Error};
@@ -32,7 +32,12 @@ pub(super) fn run(settings: Settings, over: &Overrides, logging: &Logging, globa
     })?;
     offer_all(&node, &settings, &programs)?;
     let metrics = settings.metrics.as_ref().map(|place| listen(place, &settings)).transpose()?;
-    events::log(node.events())?;
+    let (ending, fenced) = (signals.handle(), Arc::new(OnceLock::new()));
+    let told = fenced.clone();
+    events::log(node.events(), move |term| {
+        let _ = told.set(term);
+        ending.close();
+    })?;
     node.start().map_err(Ended::not_started)?;
     let served = metrics.as_ref().map(TcpListener::local_addr).transpose()?;
     if let Some(listener) = metrics {
@@ -53,7 +58,10 @@ pub(super) fn run(settings: Settings, over: &Overrides, logging: &Logging, globa
     programs.end_calls();
     node.stop();
     programs.finish();
-    Ok(())
+    match fenced.get() {
+        None => Ok(()),
+        Some(term) => Err(Ended::fenced(*term)),
+    }
 }
 
 /// Puts the file's services into the unit's list, and publishes them to all.

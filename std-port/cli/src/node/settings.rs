@@ -40,6 +40,10 @@ pub(super) struct Settings {
     pub(super) constraints: Constraints,
     pub(super) capacities: Capacities,
     pub(super) control: Control,
+    /// It starts although a live one has its identity.
+    pub(super) takes_over: bool,
+    /// Where it keeps its term.
+    pub(super) state: Option<PathBuf>,
     pub(super) metrics: Option<Placed<SocketAddr>>,
     /// The file of the access table.
     pub(super) access: Option<PathBuf>,
@@ -67,6 +71,8 @@ pub(super) struct Overrides {
     pub(super) discovery_port: Option<u16>,
     pub(super) m_units: Vec<NameAndId>,
     pub(super) tcp_port: Option<u16>,
+    pub(super) takes_over: bool,
+    pub(super) state: Option<PathBuf>,
     pub(super) metrics: Option<SocketAddr>,
     pub(super) metrics_anywhere: bool,
     pub(super) access: Option<PathBuf>,
@@ -124,6 +130,8 @@ fn checked(source: Source, file: &File, over: &Overrides, mistakes: &mut Vec<Mis
         id: own_id(file, over, mistakes),
         manager: manager(file, role, mistakes),
         m_units: m_units(file, role, over, mistakes),
+        takes_over: over.takes_over,
+        state: over.state.clone(),
         fleet: over.fleet.or(file.fleet).unwrap_or(0),
         interfaces: over
             .interfaces

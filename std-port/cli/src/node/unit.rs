@@ -45,7 +45,7 @@ impl Node {
                 Some(port) => builder.tcp_port(port.value),
                 None => builder,
             };
-            let builder = builder.control(settings.control.clone());
+            let builder = builder.control(settings.control.clone()).take_over(settings.takes_over);
             return Ok(Self::Manager(with(builder, settings).map_err(NotBuilt::Access)?.build()?));
         };
         let builder = Unit::builder(name, *id, &manager.name, manager.id)?;
@@ -152,6 +152,10 @@ fn with<R>(builder: Builder<(), R>, settings: &Settings) -> Result<Builder<(), R
     let builder = settings.keys.given_to(builder);
     let builder = match &settings.discovery_port {
         Some(port) => builder.discovery_port(port.value),
+        None => builder,
+    };
+    let builder = match &settings.state {
+        Some(folder) => builder.state_folder(folder),
         None => builder,
     };
     match &settings.access {

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
-use crate::support::{PATIENCE, Ran, Stage, agv, until};
+use crate::support::{PATIENCE, Ran, Running, Stage, agv, private_folder, until};
 
 const NODE: [&str; 5] = ["node", "--name", "manager", "--id", "1"];
 
@@ -30,6 +30,37 @@ fn a_second_manager_of_one_identity_does_not_start_and_the_first_goes_on() {
     stage.kill_manager();
     stage.start_manager();
     until("the vehicle is back", || stage.ready() == 1);
+}
+
+/// The running one ends with a code of its own, also when it has been frozen meanwhile, and the vehicle changes over.
+#[test]
+fn a_manager_takes_over_and_the_other_one_ends_with_its_own_code() {
+    let stage = Stage::empty();
+    stage.know("agv-1", 11);
+    let state = private_folder();
+    let start = |more: &[&str]| {
+        let mut command = stage.command(&[&NODE[..], more].concat());
+        command.env("CARA_STATE", state.path());
+        let mut node = Running::start(command);
+        node.expect(" is up: ");
+        node
+    };
+    let first = start(&[]);
+    let vehicle = agv(stage.vehicle("agv-1", 11));
+    until("the vehicle has joined", || vehicle.is_connected() && vehicle.term().0 == 1);
+    let second = start(&["--take-over"]);
+    assert_eq!(first.end(), 6);
+    until("the vehicle has changed over", || vehicle.is_connected() && vehicle.term().0 == 2);
+    stage.ends(0, &["scan", "--json"]);
+    second.freeze();
+    let third = start(&["--take-over"]);
+    until("the vehicle has changed over again", || vehicle.is_connected() && vehicle.term().0 == 3);
+    second.thaw();
+    assert_eq!(second.end(), 6);
+    assert!(vehicle.is_connected() && vehicle.term().0 == 3);
+    third.interrupt();
+    assert_eq!(third.end(), 0);
+    vehicle.stop();
 }
 
 #[test]

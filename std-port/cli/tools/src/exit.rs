@@ -4,7 +4,7 @@ use std::fmt;
 use std::io::Write;
 use std::process::ExitCode;
 
-use cara_std::{StartError, is_hidden};
+use cara_std::{StartError, Term, is_hidden};
 use serde_json::json;
 
 use crate::global::Global;
@@ -19,6 +19,7 @@ Exit codes:
   3  no unit to talk to: no m_unit runs on this host, and --as is not given
   4  the doctor found something
   5  a live m_unit has this one's name and ID: `cara node` does not start
+  6  another m_unit of this name and ID has taken over from `cara node`
   130  Ctrl-C ended it (143: SIGTERM)";
 
 /// The exit codes.
@@ -40,6 +41,8 @@ pub enum Exit {
     Terminated = 143,
     /// A live m_unit has the identity of the one that was to start.
     AlreadyRunning = StartError::ALREADY_RUNNING_EXIT as isize,
+    /// A manager with a newer term has taken over.
+    Fenced = StartError::FENCED_EXIT as isize,
 }
 
 impl From<Exit> for ExitCode {
@@ -74,6 +77,15 @@ impl Ended {
     pub fn not_started(error: StartError) -> anyhow::Error {
         let exit = if error.is_running_already() { Exit::AlreadyRunning } else { Exit::Failed };
         Self { exit, text: error.to_string(), name: error.code() }.into()
+    }
+
+    /// A manager with a newer term has taken over from a node.
+    pub fn fenced(term: Term) -> anyhow::Error {
+        let text = format!(
+            "another m_unit of this name and ID has taken over with term {term}: stop one of the two; this one takes over \
+             again with `--take-over`"
+        );
+        Self { exit: Exit::Fenced, text, name: "Fenced".into() }.into()
     }
 
     /// No unit to talk to.
