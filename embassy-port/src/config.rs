@@ -6,6 +6,7 @@ use cara_core::distribution::hello::Manager;
 use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
 use cara_core::error::Error;
 use cara_core::services::access::Access;
+use cara_core::term::Term;
 use core::fmt;
 use core::net::SocketAddrV4;
 
@@ -18,6 +19,8 @@ pub struct Config {
     pub(crate) constraints: Option<Constraints>,
     pub(crate) security: Security,
     pub(crate) access: Table,
+    pub(crate) term: Term,
+    pub(crate) keep_term: Option<fn(Term)>,
 }
 
 /// The access table, if there is one.
@@ -48,7 +51,7 @@ impl Config {
         let (seed, udp_port) = (security.0.seed(), security.0.mode().port());
         let (fleet, epoch, constraints) = (Fleet(0), Epoch(seed), Constraints::S_UNIT);
         let node = NodeConfig { identity, fleet, epoch, target, tcp_port: 0, udp_port, constraints, seed };
-        Self { node, constraints: None, security, access: Table(None) }
+        Self { node, constraints: None, security, access: Table(None), term: Term::NONE, keep_term: None }
     }
 
     /// Units of different fleets on one network do not meet; 0 unless set.
@@ -95,6 +98,16 @@ impl Config {
     /// ```
     pub fn access(mut self, table: &'static dyn Access) -> Self {
         self.access = Table(Some(table));
+        self
+    }
+
+    /// The term that the board has kept, and what keeps another one. Of an s_unit that is the newest that it has obeyed: `keep` is
+    /// called when a manager with a newer one has joined, before a call of it runs and while no order is live, so that it may
+    /// write to flash. It must not use the unit. Without this, a board that restarts forgets which managers it has to refuse.
+    ///
+    /// An m_unit says `kept`, which its program has claimed and kept before; `keep` is not called.
+    pub fn term(mut self, kept: Term, keep: fn(Term)) -> Self {
+        (self.term, self.keep_term) = (kept, Some(keep));
         self
     }
 

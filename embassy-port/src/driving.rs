@@ -5,7 +5,7 @@
 //! once, though only one runs at a time.
 
 use cara_core::distribution::authenticator::Authenticator as _;
-use cara_core::distribution::connection_handler::{Command, NodeCounter};
+use cara_core::distribution::connection_handler::{Command, NewerTerm, NodeCounter};
 use cara_core::distribution::datagram;
 use cara_core::distribution::function_list::Slot;
 use cara_core::distribution::identity::Identity;
@@ -126,7 +126,33 @@ impl<T> Machine<T> {
             let reason = CloseReason::Refused(Refusal::DuplicateIdentity);
             self.tell(UnitEvent::NotJoined { address, peer, reason });
         }
+        self.look_at_terms();
         Some(None)
+    }
+
+    /// An s_unit keeps a newer term before a call of the manager runs; an m_unit that is fenced stops.
+    #[inline(never)]
+    fn look_at_terms(&mut self) {
+        match self.hub.node.take_newer_term() {
+            None => {}
+            Some(NewerTerm::Obeyed(term)) => {
+                if let Some(keep) = self.keep_term {
+                    keep(term);
+                }
+            }
+            Some(NewerTerm::AtVehicle(term) | NewerTerm::OfManager(term)) => {
+                self.stop();
+                self.tell(UnitEvent::Fenced { term });
+            }
+        }
+    }
+
+    /// Ends every connection in an orderly way, and searches no more.
+    pub(crate) fn stop(&mut self) {
+        self.stopped = true;
+        for index in self.indices() {
+            self.with(index, |session, cx| session.close(cx, CloseReason::Stopped));
+        }
     }
 
     /// Looks what became of the sockets.
@@ -251,6 +277,9 @@ impl<T> Machine<T> {
         let Some(session) = self.link(index).and_then(|link| link.session.as_ref()) else { return };
         let name = |name: &str| Name::try_from(name).unwrap_or_default();
         let Some(told) = UnitEvent::of(event, session, &self.functions, name) else { return };
+        if event == Event::Joined {
+            self.look_at_terms();
+        }
         match &told {
             UnitEvent::Joined { peer } => log!("{} has joined", peer.name()),
             UnitEvent::Left { peer, .. } => log!("{} has left", peer.name()),
@@ -296,6 +325,7 @@ impl<T> Machine<T> {
         self.forget_calls_of(index);
         self.hang_up(index);
         self.hub.node.left(now(), LinkId(index), reason);
+        self.look_at_terms();
         had_joined.then_some(Job::Lost)
     }
 

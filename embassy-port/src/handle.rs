@@ -10,10 +10,11 @@ use cara_core::counters::Counter;
 use cara_core::distribution::connection_handler::{Finding, NodeCounter};
 use cara_core::distribution::identity::{Identity, Role};
 use cara_core::distribution::parameters::ParametersView;
-use cara_core::error::{CloseReason, Error};
+use cara_core::error::Error;
 use cara_core::host::connections::LinkCounter;
 use cara_core::services::access::Access;
 use cara_core::services::requests::CallId;
+use cara_core::term::Term;
 use cara_core::time::Duration;
 
 use crate::config::Table;
@@ -66,12 +67,12 @@ impl<T> Handle<T> {
 
     /// Ends every link in an orderly way, and stops searching. The unit starts again only with a restart of the board.
     pub fn stop(&self) {
-        self.act(|machine| {
-            machine.stopped = true;
-            for index in machine.indices() {
-                machine.with(index, |session, cx| session.close(cx, CloseReason::Stopped));
-            }
-        });
+        self.act(Machine::stop);
+    }
+
+    /// The term of an m_unit, or the newest that an s_unit has obeyed.
+    pub fn term(&self) -> Term {
+        self.look(|machine| machine.hub.node.term())
     }
 
     // --- peers

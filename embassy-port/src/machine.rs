@@ -10,6 +10,7 @@ use cara_core::services::hub::Hub;
 use cara_core::services::session::{Session, SessionConfig, SessionStorage};
 use cara_core::services::{Context, Port};
 use cara_core::storage::{Lent, Pool};
+use cara_core::term::Term;
 use cara_core::time::{Duration, Instant};
 use core::cell::RefCell;
 use core::net::SocketAddrV4;
@@ -87,6 +88,8 @@ pub(crate) struct Machine<T: 'static> {
     pub(crate) proof: Proof,
     /// The access table.
     pub(crate) access: Table,
+    /// Keeps a newer term.
+    pub(crate) keep_term: Option<fn(Term)>,
     pub(crate) functions: FunctionList<Lent, Listed<T>>,
     pub(crate) pool: Pool<Lent>,
     pub(crate) links: &'static mut [Link],

@@ -247,7 +247,8 @@ impl<
             findings: self.findings.write([const { None }; FINDINGS]).as_mut_slice(),
         };
         let (port, tcp_port) = (config.node.udp_port, config.node.tcp_port);
-        let node = Node::new(now(), config.node, storage);
+        let mut node = Node::new(now(), config.node, storage);
+        node.set_term(config.term);
         let pool = self.pool.write([const { None }; BUFFERS]);
         for (place, buffer) in pool.iter_mut().zip(self.buffers.write([[0; BUFFER]; BUFFERS])) {
             *place = Some(buffer);
@@ -263,6 +264,7 @@ impl<
                 },
                 proof: config.security.0,
                 access: config.access,
+                keep_term: config.keep_term,
                 functions: FunctionList::new(
                     self.functions.write([const { Entry::empty() }; OWN]).as_mut_slice(),
                     self.signatures.write([[0; SIGNATURE]; OWN]).as_flattened_mut(),

@@ -8,12 +8,16 @@
 //! |---|---|---|
 //! | 0 | 4 | `CARb` |
 //! | 4 | 8 | the count, little-endian, from 1 |
-//! | 12 | 16 | zero |
+//! | 12 | 4 | the term that the unit keeps, little-endian; 0 for none |
+//! | 16 | 12 | zero |
 //! | 28 | 4 | CRC-32 (ISO-HDLC) of all before, little-endian |
+//!
+//! A term that is kept is a record with a count of its own; each later one repeats it, so that it is where the count is.
 //!
 //! A count is returned once its record has been read back, and counts only rise: wherever power is cut, no count is
 //! returned twice. Nothing else erases the pages; a full chip erase takes the keys with them.
 
+use cara_core::term::Term;
 use cara_secure::random::BootCounter;
 use embedded_storage::nor_flash::NorFlash;
 
@@ -26,6 +30,7 @@ const USED_BYTES: u32 = 16 * 1024;
 
 const MAGIC: [u8; 4] = *b"CARb";
 const COUNT: core::ops::Range<usize> = 4..12;
+const TERM: core::ops::Range<usize> = 12..16;
 const SUMMED: usize = RECORD_BYTES - 4;
 const ERASED: [u8; RECORD_BYTES] = [0xFF; RECORD_BYTES];
 
@@ -58,6 +63,8 @@ pub struct Boots<F> {
 struct Seen {
     /// The highest count, or 0.
     newest: u64,
+    /// The term beside it.
+    term: Term,
     /// Where the page is erased from.
     free: u32,
 }
@@ -83,13 +90,15 @@ impl<F: NorFlash> Boots<F> {
     }
 
     fn look(&mut self, page: u32) -> Result<Seen, F::Error> {
-        let mut seen = Seen { newest: 0, free: 0 };
+        let mut seen = Seen { newest: 0, term: Term::NONE, free: 0 };
         for offset in self.offsets() {
             let record = self.read(page + offset)?;
             if record != ERASED {
                 seen.free = offset + RECORD_BYTES as u32;
             }
-            seen.newest = seen.newest.max(count(&record).unwrap_or(0));
+            if let Some((count, term)) = count(&record).filter(|(count, _)| *count > seen.newest) {
+                (seen.newest, seen.term) = (count, term);
+            }
         }
         Ok(seen)
     }
@@ -111,16 +120,33 @@ impl<F: NorFlash> Boots<F> {
     }
 }
 
-impl<F: NorFlash> BootCounter for Boots<F> {
-    type Error = BootError<F::Error>;
+impl<F: NorFlash> Boots<F> {
+    /// The term that is kept.
+    pub fn term(&mut self) -> Result<Term, BootError<F::Error>> {
+        Ok(self.newest()?.1.term)
+    }
 
-    fn advance(&mut self) -> Result<u64, Self::Error> {
+    /// Keeps a term, which costs one record; nothing where it is kept already. When a page is full the other one is erased, for
+    /// which the processor may stand still: not while anything moves.
+    pub fn keep_term(&mut self, term: Term) -> Result<(), BootError<F::Error>> {
+        if self.term()? != term {
+            self.append(Some(term))?;
+        }
+        Ok(())
+    }
+
+    /// The page with the highest count, what stands in it, and the other page.
+    fn newest(&mut self) -> Result<(u32, Seen, u32), F::Error> {
         let [one, two] = self.pages;
         let (first, second) = (self.look(one)?, self.look(two)?);
-        let is_second = second.newest > first.newest;
-        let (page, seen, other) = if is_second { (two, second, one) } else { (one, first, two) };
+        Ok(if second.newest > first.newest { (two, second, one) } else { (one, first, two) })
+    }
+
+    /// Writes the next count, with the term that is kept or another one.
+    fn append(&mut self, term: Option<Term>) -> Result<u64, BootError<F::Error>> {
+        let (page, seen, other) = self.newest()?;
         let next = seen.newest.checked_add(1).ok_or(BootError::Worn)?;
-        let record = record(next);
+        let record = record(next, term.unwrap_or(seen.term));
         if self.put(page, seen.free, &record)? {
             return Ok(next);
         }
@@ -129,22 +155,32 @@ impl<F: NorFlash> BootCounter for Boots<F> {
     }
 }
 
-fn record(count: u64) -> [u8; RECORD_BYTES] {
+impl<F: NorFlash> BootCounter for Boots<F> {
+    type Error = BootError<F::Error>;
+
+    fn advance(&mut self) -> Result<u64, Self::Error> {
+        self.append(None)
+    }
+}
+
+fn record(count: u64, term: Term) -> [u8; RECORD_BYTES] {
     let mut record = [0; RECORD_BYTES];
     let (summed, sum) = record.split_at_mut(SUMMED);
     let (magic, rest) = summed.split_at_mut(MAGIC.len());
     magic.copy_from_slice(&MAGIC);
-    let (number, _) = rest.split_at_mut(COUNT.len());
+    let (number, rest) = rest.split_at_mut(COUNT.len());
     number.copy_from_slice(&count.to_le_bytes());
+    let (number, _) = rest.split_at_mut(TERM.len());
+    number.copy_from_slice(&term.0.to_le_bytes());
     sum.copy_from_slice(&SUM.checksum(summed).to_le_bytes());
     record
 }
 
-/// The count of a sound record.
-fn count(record: &[u8; RECORD_BYTES]) -> Option<u64> {
-    let number = record.get(COUNT)?.first_chunk()?;
-    let count = u64::from_le_bytes(*number);
-    (*record == self::record(count)).then_some(count)
+/// The count of a sound record, and the term in it.
+fn count(record: &[u8; RECORD_BYTES]) -> Option<(u64, Term)> {
+    let count = u64::from_le_bytes(*record.get(COUNT)?.first_chunk()?);
+    let term = Term(u32::from_le_bytes(*record.get(TERM)?.first_chunk()?));
+    (*record == self::record(count, term)).then_some((count, term))
 }
 
 #[cfg(test)]
@@ -182,6 +218,14 @@ mod tests {
         fn spend(&mut self) -> Result<(), PowerCut> {
             self.power = self.power.checked_sub(1).ok_or(PowerCut)?;
             Ok(())
+        }
+
+        fn keep(&mut self, term: Term) -> Result<(), BootError<PowerCut>> {
+            Boots::new(self, [0, PAGE as u32], PAGE as u32).keep_term(term)
+        }
+
+        fn term(&mut self) -> Term {
+            Boots::new(self, [0, PAGE as u32], PAGE as u32).term().unwrap()
         }
 
         fn boot(&mut self) -> Result<u64, BootError<PowerCut>> {
@@ -279,6 +323,47 @@ mod tests {
     }
 
     #[test]
+    fn a_term_is_kept_through_starts_and_pages() {
+        let mut chip = Chip::new();
+        assert_eq!(chip.term(), Term::NONE);
+        let mut count = 0;
+        for term in [Term(1), Term(2), Term(u32::MAX), Term(1)] {
+            chip.keep(term).unwrap();
+            let bytes = chip.bytes.clone();
+            chip.keep(term).unwrap();
+            assert_eq!(chip.bytes, bytes, "nothing is written for the same one");
+            for _ in 0..11 {
+                let next = chip.boot().unwrap();
+                assert!(next > count && chip.term() == term);
+                count = next;
+            }
+        }
+    }
+
+    /// Power is cut in each word that is written or erased for a term: the one before it is kept, or the new one.
+    #[test]
+    fn wherever_power_is_cut_there_is_a_term() {
+        let (old, new) = (Term(4), Term(5));
+        for lives in 0..12 {
+            for power in 0.. {
+                let mut chip = Chip::new();
+                chip.keep(old).unwrap();
+                (0..lives).for_each(|_| assert!(chip.boot().is_ok()));
+                chip.power = power;
+                let kept = chip.keep(new).is_ok();
+                chip.power = usize::MAX;
+                let found = chip.term();
+                assert!(found == new || (found == old && !kept), "{lives}, {power}: {found}");
+                chip.boot().unwrap();
+                assert_eq!(chip.term(), found);
+                if kept {
+                    break;
+                }
+            }
+        }
+    }
+
+    #[test]
     fn places_that_are_worn_are_passed_over_until_none_is_left() {
         let mut chip = Chip::new();
         chip.worn = std::vec![1, 2, 4];
@@ -307,7 +392,7 @@ mod tests {
         fn nothing_in_flash_panics(bytes in prop::collection::vec(any::<u8>(), 2 * PAGE), sound in 0_usize..8, high: u64) {
             let mut chip = Chip::new();
             chip.bytes = bytes;
-            chip.bytes[sound * RECORD_BYTES..][..RECORD_BYTES].copy_from_slice(&record(high));
+            chip.bytes[sound * RECORD_BYTES..][..RECORD_BYTES].copy_from_slice(&record(high, Term(7)));
             match chip.boot() {
                 Ok(count) => {
                     prop_assert!(count > high);

@@ -16,6 +16,7 @@ use cara_core::host::connections::LinkCounter;
 use cara_core::services::access::{Functions, Rule, Verbs, Who};
 use cara_core::services::lease::Lease;
 use cara_core::services::session::RequestOptions;
+use cara_core::term::Term;
 use cara_core::time::{Duration, Instant};
 use cara_embassy::{Config, Handle, Handler, Hook, Limits, Security, ServiceOptions, UnitEvent, resources};
 use cara_embassy_host::{Bench, Board, keys};
@@ -128,6 +129,43 @@ fn a_board_serves_its_manager_and_asks_it() {
     assert_eq!(ask(&bench, &agv_board, agv, "manager", "halve", 4), Err(Error::UnknownFunction));
     let list = manager.peer("agv").unwrap().their_function_list().show_functions().to_string();
     assert_eq!(list, "double(n: int) -> (n: int)\n");
+}
+
+thread_local! {
+    /// What the flash of a board keeps.
+    static KEPT: core::cell::Cell<Term> = const { core::cell::Cell::new(Term::NONE) };
+}
+
+fn keep(term: Term) {
+    KEPT.set(term);
+}
+
+/// A board keeps the term that it obeys, and refuses an older one in its next life; a fenced manager stops.
+#[test]
+fn a_board_obeys_the_newest_term_and_fences_older_managers() {
+    let bench = Bench::new(21);
+    let manager_of = |term| {
+        let board = bench.board();
+        let config = Config::m_unit("manager", 1, proof(&bench, &manager_identity())).unwrap();
+        start(&board, config.term(Term(term), keep))
+    };
+    let agv_of = || start(&bench.board(), agv_config(&bench).term(KEPT.get(), keep));
+    let (first, agv) = (manager_of(5), agv_of());
+    assert!(bench.run_until(|| agv.is_connected(), LONG));
+    assert_eq!((KEPT.get(), agv.term()), (Term(5), Term(5)));
+    let second = manager_of(6);
+    assert!(bench.run_until(|| KEPT.get() == Term(6) && second.is_connected(), LONG));
+    assert!(!first.is_connected(), "it has stepped down");
+    agv.stop();
+    second.stop();
+    bench.run_for(SHORT);
+    let agv = agv_of();
+    let older = manager_of(5);
+    bench.run_for(LONG);
+    assert!(!agv.is_connected() && !older.is_connected() && KEPT.get() == Term(6));
+    let newer = manager_of(7);
+    assert!(bench.run_until(|| agv.is_connected() && newer.is_connected(), LONG));
+    assert_eq!(KEPT.get(), Term(7));
 }
 
 /// The access table of a board.
