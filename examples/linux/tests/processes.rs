@@ -71,6 +71,21 @@ fn the_listing_runs_and_both_end_when_asked_to() {
 }
 
 #[test]
+fn a_manager_takes_over_from_another_one() {
+    let fleet = Fleet::new();
+    let mut first = fleet.start("first", env!("CARGO_BIN_EXE_agv_manager"), &[]);
+    let mut agv = fleet.start("agv", env!("CARGO_BIN_EXE_agv"), &["--attended"]);
+    first.expect("line 24: published to all", STEP).unwrap();
+    let mut second = fleet.start("second", env!("CARGO_BIN_EXE_agv_manager"), &["--take-over"]);
+    second.expect("line 24: published to all", STEP).unwrap();
+    assert_eq!(first.wait(STEP).unwrap().code(), Some(6));
+    first.seen("has taken over with term 2", STEP).unwrap();
+    agv.end_input();
+    ends_well(&mut agv);
+    assert!(second.terminate(STEP).unwrap().success());
+}
+
+#[test]
 fn a_manager_that_finds_nobody_ends_when_asked_to() {
     let fleet = Fleet::new();
     let mut manager = fleet.start("manager", env!("CARGO_BIN_EXE_agv_manager"), &[]);

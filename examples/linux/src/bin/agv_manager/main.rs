@@ -27,6 +27,9 @@ struct Options {
     /// them.
     #[arg(long, conflicts_with = "attended")]
     console: bool,
+    /// Start although a live manager has this one's name and id: it steps down, and its AGVs come to this one.
+    #[arg(long)]
+    take_over: bool,
     #[command(flatten)]
     network: Network,
 }
@@ -56,9 +59,9 @@ fn run() -> Result<()> {
 
 /// Comments are line numbers of the paper's listing. Behind each line, `transcript` says what came of it.
 fn listing(options: &Options, transcript: &Transcript) -> Result<CommunicationSystem> {
-    let Options { name, id, network, .. } = options;
+    let Options { name, id, take_over, network, .. } = options;
     // README begins.
-    let agv_manager = network.place(CommunicationSystem::builder(name, *id)?).build()?; // 1
+    let agv_manager = network.place(CommunicationSystem::builder(name, *id)?.take_over(*take_over)).build()?; // 1
     transcript.begin(&agv_manager);
     transcript.after(1, format_args!("{}, {}", agv_manager.identity(), agv_manager.mode().as_str()))?;
     agv_manager.start()?; // 2
