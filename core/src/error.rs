@@ -332,6 +332,14 @@ pub enum Error {
         /// The limit that there is.
         have: u32,
     },
+    /// The heart that a call of a leased function names may let the lease end between two beats.
+    #[error("the heart beats every {have} ms, and the function's lease needs it every {need} ms: let it beat as often")]
+    SlowHeart {
+        /// Twice within the lease, in milliseconds.
+        need: u32,
+        /// The heart's period in milliseconds.
+        have: u32,
+    },
     /// A service of the emergency class was given a handler that needs the application's state, or a task.
     #[error(
         "an emergency service waits for nothing, and this handler may wait for the application's state or a task: give it the form without the state"
@@ -448,6 +456,7 @@ impl Error {
             | Self::WouldDeadlock
             | Self::BadConstraint
             | Self::DoesNotFit { .. }
+            | Self::SlowHeart { .. }
             | Self::EmergencyWaits => Cause::Configuration,
             Self::NotConnected
             | Self::TimedOut

@@ -1,5 +1,6 @@
 //! Requests that are awaited.
 
+use core::fmt;
 use core::future::poll_fn;
 use core::task::Poll;
 
@@ -36,16 +37,28 @@ impl<T> Peer<T> {
         parameters: &mut ParametersView,
         options: &RequestOptions,
     ) -> Result<(), Error> {
+        let mut call = self.hold(function, parameters, options).await?;
+        call.is_wanted = true;
+        Ok(())
+    }
+
+    /// As [`block_request_with`](Self::block_request_with); what the call has started goes on until the returned guard is
+    /// dropped, and at most for as long as the options' `renew` says.
+    pub async fn hold(
+        &self,
+        function: &str,
+        parameters: &mut ParametersView,
+        options: &RequestOptions,
+    ) -> Result<Hold<T>, Error> {
         let timeout = options.timeout.unwrap_or(self.unit.constraints().request_timeout);
         let deadline = now() + timeout;
-        let mut call = self.begin(function, parameters, options, deadline).await?;
-        let result = poll_fn(|cx| {
+        let call = self.begin(function, parameters, options, deadline).await?;
+        poll_fn(|cx| {
             let mut machine = self.unit.shared.machine.borrow_mut();
             machine.outcome(&call.call, parameters, cx.waker()).map_or(Poll::Pending, Poll::Ready)
         })
-        .await;
-        call.has_succeeded = result.is_ok();
-        result
+        .await?;
+        Ok(call)
     }
 
     /// Sends the request as soon as the interval and the room allow, within the deadline.
@@ -55,13 +68,13 @@ impl<T> Peer<T> {
         parameters: &ParametersView,
         options: &RequestOptions,
         deadline: Instant,
-    ) -> Result<CallGuard<T>, Error> {
+    ) -> Result<Hold<T>, Error> {
         loop {
             let options = RequestOptions { timeout: Some(deadline.since(now())), ..*options };
             let link = self.link()?;
             let sent = self.unit.act(|machine| machine.call(link, function, parameters, &options, deadline));
             let (error, wait) = match sent {
-                Ok(call) => return Ok(CallGuard { unit: self.unit, call, has_succeeded: false }),
+                Ok(call) => return Ok(Hold { unit: self.unit, call, is_wanted: false }),
                 Err(error @ Error::TooSoon { wait }) => (error, wait),
                 Err(error @ Error::Full(Limit::SendQueue | Limit::Buffers | Limit::Calls)) => (error, PAUSE),
                 Err(error) => return Err(error),
@@ -74,16 +87,24 @@ impl<T> Peer<T> {
     }
 }
 
-/// A call in flight, which is given up when this is dropped before it has ended well.
-struct CallGuard<T: 'static> {
+/// A call that is given up when this is dropped: what it started, or would start, stops if its service has a lease.
+#[must_use = "dropped, it is released at once"]
+pub struct Hold<T: 'static> {
     unit: Handle<T>,
     call: InFlight,
-    has_succeeded: bool,
+    /// Also behind the end of this.
+    is_wanted: bool,
 }
 
-impl<T> Drop for CallGuard<T> {
+impl<T> fmt::Debug for Hold<T> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Hold").finish_non_exhaustive()
+    }
+}
+
+impl<T> Drop for Hold<T> {
     fn drop(&mut self) {
-        if self.has_succeeded {
+        if self.is_wanted {
             return;
         }
         if let Ok(mut machine) = self.unit.shared.machine.try_borrow_mut() {

@@ -102,6 +102,7 @@ mod security;
 mod taken;
 mod time;
 
+pub use calls::Hold;
 pub use config::Config;
 pub use event::{Name, UnitEvent};
 pub use functions::MyFunctionList;

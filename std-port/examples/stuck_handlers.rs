@@ -11,7 +11,7 @@ use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use cara_std::{
-    Call, CommunicationSystem, Constraints, Interfaces, Parameters, ParametersView, Priority, RequestOptions,
+    Call, CommunicationSystem, Constraints, Interfaces, Parameters, ParametersView, Priority, Renew, RequestOptions,
     ServiceError, ServiceOptions, Unit,
 };
 
@@ -50,7 +50,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         peer.block_request("stop", &mut Parameters::new())?;
         emergencies.note(asked.elapsed(), canary.late());
     }
-    let once = RequestOptions { renew_lease: false, ..RequestOptions::default() };
+    let once = RequestOptions { renew: Renew::Never, ..RequestOptions::default() };
     for _ in 0..rounds {
         canary.reset();
         let asked = Instant::now();

@@ -24,6 +24,7 @@ use crate::control::{self, Control, Server};
 use crate::engine::{Engine, pairs};
 use crate::error::StartError;
 use crate::event::{Finding, UnitEvent};
+use crate::heart::Heart;
 #[cfg(feature = "control")]
 use crate::locks::lock;
 use crate::my_function_list::MyFunctionList;
@@ -336,6 +337,12 @@ impl<T: Send + 'static, R> Handle<T, R> {
     pub(crate) fn events_with_losses(&self, room: usize) -> (Receiver<UnitEvent>, Arc<AtomicU64>) {
         let (sender, receiver) = sync_channel(room);
         (receiver, self.engine().subscribe(sender))
+    }
+
+    /// A heart for one loop of the program, which is to beat it at least once in `period`: half of the shortest lease that
+    /// is named with it, or less.
+    pub fn heart(&self, period: impl Into<Duration>) -> Heart {
+        Heart::new(self.engine(), period.into())
     }
 
     /// Runs `act` with the application's state.

@@ -21,6 +21,7 @@ use crate::engine::CallFuture;
 use crate::engine::link::LinkCell;
 use crate::engine::peers::PeerCell;
 use crate::engine::{Engine, pairs};
+use crate::heart::Hold;
 
 /// A node, connected or not. Stays valid when the node leaves, and works again when it comes back.
 pub struct Peer<T: Send + 'static = ()> {
@@ -276,7 +277,30 @@ impl<T: Send + 'static> Peer<T> {
         parameters: &mut ParametersView,
         options: &RequestOptions,
     ) -> Result<(), Error> {
-        self.engine.block_request(&self.link()?, function, parameters, options)
+        self.engine.block_request(&self.link()?, function, parameters, options).map(drop)
+    }
+
+    /// As [`block_request_with`](Self::block_request_with); what the call has started goes on until the returned guard is
+    /// dropped, and at most for as long as the options' `renew` says.
+    ///
+    /// ```no_run
+    /// use cara_std::{Duration, Parameters, RequestOptions};
+    /// # let depot = cara_std::CommunicationSystem::new("depot", 1)?;
+    ///
+    /// let heart = depot.heart(Duration::from_millis(100));
+    /// let wanted = RequestOptions::renewing(heart.renew());
+    /// let lifting = depot.s_unit("fork")?.hold("lift", &mut Parameters::new(), &wanted)?;
+    /// // …
+    /// drop(lifting);
+    /// # Ok::<(), cara_std::BuildError>(())
+    /// ```
+    pub fn hold(
+        &self,
+        function: &str,
+        parameters: &mut ParametersView,
+        options: &RequestOptions,
+    ) -> Result<Hold<T>, Error> {
+        self.engine.hold(self.link()?, function, parameters, options).map(Hold::new)
     }
 
     /// Calls a function without waiting (paper, listing line 19): accepted, not sent, not executed. A failure comes as

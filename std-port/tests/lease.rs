@@ -13,7 +13,7 @@ mod lease;
 
 use cara_core::{config, distribution, error, time};
 mod services {
-    pub(crate) use cara_core::services::requests;
+    pub(crate) use cara_core::services::{heart, requests};
 }
 mod sync {
     /// Loom's atomics in a model, and those of the standard library in the tests of the file itself.

@@ -313,8 +313,11 @@ class Unit:
             self.next_keep_alive = now + KEEP_ALIVE
         if self.lease is not None and clock() >= self.lease["end"]:
             self.end_lease("expired")
-        for number, held in self.held.items():
-            if now >= held["next"]:
+        for number, held in list(self.held.items()):
+            if now >= held["next"] and now >= held["answered"] + held["lease"]:
+                say("lease of", held["name"], "ended: unanswered")
+                self.release(number)
+            elif now >= held["next"]:
                 held["next"] = now + held["every"]
                 self.renew_held(number, held)
         for number in [number for number, (_, _, until) in self.waiting.items() if now >= until]:
@@ -368,7 +371,7 @@ class Unit:
             raise Ended("%s %d" % incoming.popitem(), by_peer=True)
         elif "session" in incoming:
             if "unreadable" not in incoming["session"]:
-                self.session_body(incoming["session"])
+                self.session_body(incoming["session"], self.send_in_stream)
         elif "message" in incoming:
             self.message(incoming["priority"], incoming["message"])
         elif "proof" in incoming:
@@ -398,7 +401,7 @@ class Unit:
         if not self.datagrams_pass:
             say("datagrams pass")
         self.datagrams_pass, self.heard = True, time.monotonic()
-        self.session_body(body)
+        self.session_body(body, self.send_datagram)
 
     def session_of(self, data):
         if self.end is not None:
@@ -409,7 +412,8 @@ class Unit:
             raise wire.Malformed("not of this link")
         return session["body"]
 
-    def session_body(self, body):
+    def session_body(self, body, answer):
+        """`answer` sends on the way that it came."""
         (kind, value), = body.items()
         if kind == "keep_alive":
             self.hear_stamp(value["stamp"])
@@ -417,6 +421,10 @@ class Unit:
             self.send_datagram({"pong": {}})
         elif kind == "renew":
             self.renewed(value)
+            answer({"renewed": {"call": value["call"]}})
+        elif kind == "renewed":
+            if value["call"] in self.held:
+                self.held[value["call"]]["answered"] = time.monotonic()
         elif kind == "release":
             self.windows[value["class"]].note(value["call"])
             if self.lease is not None and value["call"] == self.lease["call"]:
@@ -513,7 +521,9 @@ class Unit:
         self.waiting[number] = name, theirs["signature"], now + REPLY_WITHIN
         if lease is not None:
             every = max(lease / 4000, 0.005)
-            self.held[number] = {"name": name, "class": priority, "every": every, "next": now + every}
+            self.held[number] = {
+                "name": name, "class": priority, "every": every, "next": now + every, "lease": lease / 1e6, "answered": now,
+            }
         request = {"request": {
             "id": number, "slot": theirs["slot"], "generation": theirs["generation"], "wants_reply": True, "unknown": 0,
             "remaining": int(REPLY_WITHIN * 1e6), "stamp": self.stamp, "since": clock() - self.heard_at,
@@ -543,11 +553,16 @@ class Unit:
     def in_both(self, body):
         """As a datagram and in the stream."""
         self.send_datagram(body)
+        self.send_in_stream(body)
+
+    def send_in_stream(self, body):
         self.send_frame("session", wire.encode_session_body(body))
 
     def renew_held(self, number, held):
         since = clock() - self.heard_at
-        self.in_both({"renew": {"class": held["class"], "call": number, "stamp": self.stamp, "since": since}})
+        self.in_both({"renew": {
+            "class": held["class"], "call": number, "stamp": self.stamp, "since": since, "age": 0,
+        }})
 
     def release(self, number):
         self.in_both({"release": {"class": self.held.pop(number)["class"], "call": number}})
@@ -609,7 +624,7 @@ class Unit:
                 self.tell("lease_ended", {"call": value["call"], "why": "expired"})
         elif value["stamp"] <= clock():
             self.renewals += 1
-            self.lease["end"] = max(self.lease["end"], made(value) + self.lease["length"])
+            self.lease["end"] = max(self.lease["end"], made(value) - value["age"] + self.lease["length"])
 
     def end_lease(self, why):
         say("stopped after", self.renewals, "renewals:", why)

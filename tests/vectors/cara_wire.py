@@ -585,9 +585,12 @@ def decode_session_body(data):
         stamp, = reader.fixed("Q")
         body = {"keep_alive": {"stamp": stamp}}
     elif kind == 2:
-        priority, call, stamp, since = reader.fixed("BIQI")
+        priority, call, stamp, since, age = reader.fixed("BIQII")
         require(priority < len(PRIORITIES))
-        body = {"renew": {"class": PRIORITIES[priority], "call": call, "stamp": stamp, "since": since}}
+        body = {"renew": {"class": PRIORITIES[priority], "call": call, "stamp": stamp, "since": since, "age": age}}
+    elif kind == 8:
+        call, = reader.fixed("I")
+        body = {"renewed": {"call": call}}
     elif kind == 6:
         priority, call = reader.fixed("BI")
         require(priority < len(PRIORITIES))
@@ -612,7 +615,10 @@ def encode_session_body(body):
     if name in ("ping", "pong"):
         return bytes([4 if name == "ping" else 5])
     if name == "renew":
-        return struct.pack("<BBIQI", 2, PRIORITIES.index(value["class"]), value["call"], value["stamp"], value["since"])
+        numbers = value["call"], value["stamp"], value["since"], value["age"]
+        return struct.pack("<BBIQII", 2, PRIORITIES.index(value["class"]), *numbers)
+    if name == "renewed":
+        return struct.pack("<BI", 8, value["call"])
     if name == "release":
         return struct.pack("<BBI", 6, PRIORITIES.index(value["class"]), value["call"])
     if name == "release_all":

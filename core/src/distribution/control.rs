@@ -113,18 +113,22 @@ pub enum LeaseEnd {
     Replaced,
     /// What it moved was stopped: the safe hook runs there, and nothing moves it before a reset.
     Stopped,
+    /// Never told by a callee, which did not answer renewals for the length of the lease: it is renewed no more, and ends
+    /// there within another one.
+    Unanswered,
 }
 
 impl LeaseEnd {
     pub(crate) const ALL: [Self; 4] = [Self::Finished, Self::Expired, Self::Replaced, Self::Stopped];
 
-    /// `finished`, `expired`, `replaced`, `stopped`.
+    /// `finished`, `expired`, `replaced`, `stopped`, `unanswered`.
     pub const fn word(self) -> &'static str {
         match self {
             Self::Finished => "finished",
             Self::Expired => "expired",
             Self::Replaced => "replaced",
             Self::Stopped => "stopped",
+            Self::Unanswered => "unanswered",
         }
     }
 }

@@ -300,8 +300,10 @@ pub enum SessionBody<'b> {
         /// The sender's clock.
         stamp: u64,
     },
-    /// The caller still wants what a leased call started.
+    /// The caller still wants what a leased call started. To be answered at once, on the way that it came.
     Renew(Renewal),
+    /// The answer: the caller's id of the call.
+    Renewed(u32),
     /// The caller no longer wants a leased call, wherever it is.
     Release(Release),
     /// The caller gives up all its calls of a leased function up to this id, whether in flight, queued or running.
@@ -325,6 +327,8 @@ pub struct Renewal {
     pub stamp: u64,
     /// Time since then.
     pub since: Duration,
+    /// How long before that the caller has last been seen to want it.
+    pub age: Duration,
 }
 
 /// The caller gives up a leased call: it ends, leaves the queue, or does not begin if it arrives later.
@@ -337,7 +341,7 @@ pub struct Release {
 }
 
 /// Longest session body that is not a message.
-pub const SESSION_BODY_BYTES: usize = 20;
+pub const SESSION_BODY_BYTES: usize = 22;
 
 const KEEP_ALIVE: u8 = 1;
 const RENEW: u8 = 2;
@@ -346,6 +350,7 @@ const PING: u8 = 4;
 const PONG: u8 = 5;
 const RELEASE: u8 = 6;
 const RELEASE_ALL: u8 = 7;
+const RENEWED: u8 = 8;
 
 impl<'b> SessionBody<'b> {
     /// Reads a session body. All but a message may be longer than this version knows; `None` for what it does not know.
@@ -357,13 +362,16 @@ impl<'b> SessionBody<'b> {
                 let (&class, rest) = rest.split_first()?;
                 let (call, rest) = rest.split_first_chunk()?;
                 let (stamp, rest) = rest.split_first_chunk()?;
+                let (since, rest) = rest.split_first_chunk()?;
                 Some(Self::Renew(Renewal {
                     call: u32::from_le_bytes(*call),
                     class: Priority::from_wire(class)?,
                     stamp: u64::from_le_bytes(*stamp),
-                    since: micros(*rest.first_chunk()?),
+                    since: micros(*since),
+                    age: micros(*rest.first_chunk()?),
                 }))
             }
+            RENEWED => Some(Self::Renewed(u32::from_le_bytes(*rest.first_chunk()?))),
             RELEASE => {
                 let (&class, call) = rest.split_first()?;
                 let (call, class) = (u32::from_le_bytes(*call.first_chunk()?), Priority::from_wire(class)?);
@@ -390,11 +398,18 @@ impl<'b> SessionBody<'b> {
     }
 
     /// A renewal's bytes.
-    pub fn renewal(renewal: &Renewal) -> [u8; 18] {
+    pub fn renewal(renewal: &Renewal) -> [u8; 22] {
         let [c0, c1, c2, c3] = renewal.call.to_le_bytes();
         let [a, b, c, d, e, f, g, h] = renewal.stamp.to_le_bytes();
         let [w, x, y, z] = renewal.since.as_wire().to_le_bytes();
-        [RENEW, renewal.class.to_wire(), c0, c1, c2, c3, a, b, c, d, e, f, g, h, w, x, y, z]
+        let [a0, a1, a2, a3] = renewal.age.as_wire().to_le_bytes();
+        [RENEW, renewal.class.to_wire(), c0, c1, c2, c3, a, b, c, d, e, f, g, h, w, x, y, z, a0, a1, a2, a3]
+    }
+
+    /// The answer's bytes.
+    pub fn renewed(call: u32) -> [u8; 5] {
+        let [c0, c1, c2, c3] = call.to_le_bytes();
+        [RENEWED, c0, c1, c2, c3]
     }
 
     /// The bytes that release one call.
@@ -428,6 +443,8 @@ mod tests {
 
     use super::*;
     use proptest::prelude::*;
+
+    const MS: Duration = Duration::from_millis(1);
 
     fn headers() -> impl Strategy<Value = RequestHeader> {
         let numbers = (any::<u32>(), any::<u16>(), any::<u16>(), any::<u32>(), any::<u64>(), any::<u32>());
@@ -496,12 +513,13 @@ mod tests {
     fn session_bodies_may_be_longer() {
         let longer = |bytes: &[u8]| format!("{:?}", SessionBody::decode(&[bytes, &[0xEE; 5]].concat()));
         let exact = |bytes: &[u8]| format!("{:?}", SessionBody::decode(bytes));
-        let renewal = Renewal { call: 1, class: Priority::Low, stamp: 3, since: Duration::from_micros(4) };
-        let bodies: [&[u8]; 6] = [
+        let renewal = Renewal { call: 1, class: Priority::Low, stamp: 3, since: Duration::from_micros(4), age: MS };
+        let bodies: [&[u8]; 7] = [
             &SessionBody::PING,
             &SessionBody::PONG,
             &SessionBody::keep_alive(9),
             &SessionBody::renewal(&renewal),
+            &SessionBody::renewed(9),
             &SessionBody::release(&Release { call: 5, class: Priority::High }),
             &SessionBody::release_all(Slot(6), 7),
         ];
@@ -516,8 +534,9 @@ mod tests {
         assert_eq!(SessionBody::decode(&SessionBody::PING), Some(SessionBody::Ping));
         assert_eq!(SessionBody::decode(&SessionBody::PONG), Some(SessionBody::Pong));
         assert_eq!(SessionBody::decode(&SessionBody::keep_alive(9)), Some(SessionBody::KeepAlive { stamp: 9 }));
-        let renewal = Renewal { call: 1, class: Priority::Low, stamp: 3, since: Duration::from_micros(4) };
+        let renewal = Renewal { call: 1, class: Priority::Low, stamp: 3, since: Duration::from_micros(4), age: MS };
         assert_eq!(SessionBody::decode(&SessionBody::renewal(&renewal)), Some(SessionBody::Renew(renewal)));
+        assert_eq!(SessionBody::decode(&SessionBody::renewed(7)), Some(SessionBody::Renewed(7)));
         let release = Release { call: 5, class: Priority::Emergency };
         assert_eq!(SessionBody::decode(&SessionBody::release(&release)), Some(SessionBody::Release(release)));
         let all = SessionBody::ReleaseAll(Slot(6), 7);

@@ -13,6 +13,7 @@ use crate::config::Priority;
 use crate::distribution::function_list::{Generation, Slot};
 pub use crate::distribution::message::LeaseEnd;
 use crate::error::{Error, ServiceError};
+use crate::services::heart::Renew;
 use crate::services::requests::CallId;
 use crate::time::{Duration, Instant};
 
@@ -358,14 +359,19 @@ pub(crate) struct Granted {
     pub(crate) end: Instant,
 }
 
-/// The lease that a call of this unit holds on a function of the peer, renewed until it is released.
+/// The lease that a call of this unit holds on a function of the peer, until it is released.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Held {
     pub(crate) call: CallId,
     pub(crate) slot: Slot,
     pub(crate) class: Priority,
-    pub(crate) every: Duration,
+    pub(crate) lease: Duration,
+    /// For whom it is renewed.
+    pub(crate) renew: Renew,
+    /// The next renewal.
     pub(crate) next: Instant,
+    /// When the peer answered a renewal last.
+    pub(crate) answered: Instant,
     /// It is renewed no more, and its release has yet to be sent in the stream.
     pub(crate) release_unsent: bool,
 }

@@ -185,6 +185,7 @@
 pub mod access;
 mod calls;
 pub mod event;
+pub mod heart;
 pub mod hub;
 pub mod lease;
 pub mod publications;

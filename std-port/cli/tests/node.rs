@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use cara_processes::{Process, random_fleet};
 use cara_std::control::Client;
 use cara_std::control::protocol::{Answer, Question};
-use cara_std::{Error, Identity, Interfaces, Parameters, Peer, ServiceError, Unit};
+use cara_std::{Error, Identity, Interfaces, Parameters, Peer, Renew, RequestOptions, ServiceError, Unit};
 use cara_test_keys::KeyFolder;
 use rustix::process::{Pid, Signal, kill_process};
 use tempfile::TempDir;
@@ -467,7 +467,7 @@ fn the_end_of_a_lease_ends_the_program_first() {
     let (unit, manager) = node.vehicle("agv", 7);
     let mut parameters = number(1);
     parameters.add_int("m", 1).unwrap();
-    manager.request("go", &parameters).unwrap();
+    manager.request_with("go", &parameters, &RequestOptions::renewing(Renew::Process)).unwrap();
     until("it drives", || motion(&node) == "going\n");
     unit.stop();
     until("it is stopped", || motion(&node) == "going\nstopped\n");

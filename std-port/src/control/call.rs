@@ -6,6 +6,7 @@ use std::time::Instant;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Cause, Error};
 use cara_core::services::access::Verb;
+use cara_core::services::heart::Renew;
 use cara_core::time::Duration;
 
 use super::answering::{End, LOOK, Lives, Sink, pause, permit, send};
@@ -85,7 +86,7 @@ pub(super) fn options(question: &CallQuestion) -> Result<RequestOptions, Failure
         priority: priority.transpose()?,
         delivery: if question.best_effort { Delivery::BestEffort } else { Delivery::Reliable },
         // What an operator starts runs for one lease and no longer: no client would release it.
-        renew_lease: false,
+        renew: Renew::Never,
         take_over: question.take_over,
     })
 }

@@ -4,6 +4,7 @@ use std::sync::mpsc::RecvTimeoutError;
 use std::time::{Duration, Instant};
 
 use cara_core::services::access::Verb;
+use cara_core::services::heart::Renew;
 use cara_core::services::lease::LeaseEnd;
 
 use super::answering::{End, LOOK, Lives, Sink, send};
@@ -28,7 +29,7 @@ pub(super) fn hold<T: Send + 'static>(
 ) -> Result<(), End> {
     let peer = held_node(system, question)?;
     let lease = lease_of(&peer, &question.function);
-    let options = RequestOptions { renew_lease: true, ..options(question)? };
+    let options = RequestOptions { renew: Renew::Process, ..options(question)? };
     // Before the call: it may be finished before it is answered.
     let events = system.events_with_losses(EVENTS).0;
     let is_wanted = || lives(lease) && !system.is_stopped();
@@ -65,7 +66,7 @@ pub(super) fn hold<T: Send + 'static>(
                     format!("another call of '{}' took over what was held at {}", question.function, peer.identity());
                 return Err(Failure::resource("TakenOver", text).into());
             }
-            Some(why) => return send(sink, Answer::Ended { expired: why == LeaseEnd::Expired }),
+            Some(why) => return send(sink, Answer::Ended { expired: why != LeaseEnd::Finished }),
         }
     }
 }

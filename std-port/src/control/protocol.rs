@@ -231,7 +231,7 @@ pub enum Answer {
     },
     /// What a call started has ended.
     Ended {
-        /// Its lease ended there without being renewed, or the node was lost, as opposed to: it has finished.
+        /// Its lease ended there without being renewed, it was stopped, or the node was lost, as opposed to: it has finished.
         expired: bool,
     },
     /// A node that has not read the published list in time.

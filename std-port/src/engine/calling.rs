@@ -8,6 +8,7 @@ use cara_core::distribution::block;
 use cara_core::distribution::function::Signature;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error, Limit};
+use cara_core::services::heart::Beats;
 use cara_core::services::requests::CallId;
 use cara_core::services::session::RequestOptions;
 use cara_core::time::{Duration, Instant};
@@ -64,12 +65,25 @@ impl<T: Send + 'static> Engine<T> {
         function: &str,
         parameters: &mut ParametersView,
         options: &RequestOptions,
-    ) -> Result<(), Error> {
+    ) -> Result<CallId, Error> {
         self.services.state.waiting_for(link.id, || {
             self.go_on_with_parked();
             let begun = self.begin_call(link, function, parameters, options)?;
-            self.await_reply(link, begun, parameters)
+            let id = begun.id;
+            self.await_reply(link, begun, parameters).map(|()| id)
         })
+    }
+
+    /// The same; what the call has started is given up with what is returned.
+    pub(crate) fn hold(
+        self: &Arc<Self>,
+        link: Arc<LinkCell>,
+        function: &str,
+        parameters: &mut ParametersView,
+        options: &RequestOptions,
+    ) -> Result<CallFuture<T>, Error> {
+        let id = self.block_request(&link, function, parameters, options)?;
+        Ok(CallFuture { engine: self.clone(), link, id, has_succeeded: false })
     }
 
     /// Sends the request as soon as the interval and the room allow, within the deadline.
@@ -269,6 +283,15 @@ impl<T: Send + 'static> Engine<T> {
         self.settle(link, state);
     }
 
+    /// A loop has ended: what it wanted is released on all links.
+    pub(crate) fn release_beats(&self, beats: Beats) {
+        for link in self.each_link() {
+            let mut state = link.lock();
+            self.with(&link, &mut state, |session, cx| session.release_beats(cx, beats));
+            self.settle(&link, state);
+        }
+    }
+
     fn cancel(&self, now: Instant, link: &LinkCell, state: &mut LinkState, id: CallId) {
         self.with_at(now, link, state, |session, cx| session.cancel(cx, id));
         state.forget(id);
@@ -356,7 +379,6 @@ impl<T: Send + 'static> CallFuture<T> {
     }
 
     /// Whether the lease that it has begun is renewed.
-    #[cfg(feature = "control")]
     pub(crate) fn is_held(&self) -> bool {
         self.link.lock().session.holds(self.id)
     }

@@ -5,8 +5,8 @@ use std::sync::mpsc::Receiver;
 use std::sync::{Arc, Mutex};
 
 use cara_std::{
-    Actuator, Call, CommunicationSystem, Definition, Error, Parameters, ParametersView, Peer, Priority, RequestOptions,
-    ServiceError, ServiceOptions, UnitEvent,
+    Actuator, Call, CommunicationSystem, Definition, Error, Parameters, ParametersView, Peer, Priority, Renew,
+    RequestOptions, ServiceError, ServiceOptions, UnitEvent,
 };
 
 use crate::support::{fleet, system, system_named, until};
@@ -77,7 +77,11 @@ impl Crane {
     }
 
     fn ask(&self, caller: usize, function: &str) -> Result<(), Error> {
-        self.peer(caller).block_request(function, &mut Parameters::new())
+        self.peer(caller).block_request_with(
+            function,
+            &mut Parameters::new(),
+            &RequestOptions::renewing(Renew::Process),
+        )
     }
 
     fn moves(&self) -> bool {

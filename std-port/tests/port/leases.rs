@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use cara_std::{
-    CommunicationSystem, Error, LeaseEnd, LeaseWatch, Peer, RequestOptions, ServiceOptions, Unit, UnitEvent,
+    CommunicationSystem, Error, LeaseEnd, LeaseWatch, Peer, Renew, RequestOptions, ServiceOptions, Unit, UnitEvent,
 };
 
 use crate::support::{PATIENCE, fleet, meet, number, service, system, unit, until};
@@ -44,9 +44,9 @@ fn vehicle() -> Vehicle {
 }
 
 impl Vehicle {
-    fn go(&self, renew_lease: bool) {
+    fn go(&self, renew: Renew) {
         assert!(!self.lease.is_live());
-        let options = RequestOptions { renew_lease, ..Default::default() };
+        let options = RequestOptions { renew, ..Default::default() };
         self.peer.block_request_with("go_to", &mut number(1), &options).unwrap();
         assert!(self.lease.is_live());
         assert_eq!(self.speed(), 5);
@@ -71,7 +71,7 @@ impl Vehicle {
 #[test]
 fn motion_goes_on_while_it_is_renewed_and_ends_when_it_is_released() {
     let vehicle = vehicle();
-    vehicle.go(true);
+    vehicle.go(Renew::Process);
     let began = Instant::now();
     while began.elapsed() < 3 * LEASE {
         assert!(vehicle.lease.is_live());
@@ -91,7 +91,7 @@ fn without_renewal_motion_ends_with_the_lease() {
     let vehicle = vehicle();
     let events = vehicle.manager.events();
     let began = Instant::now();
-    vehicle.go(false);
+    vehicle.go(Renew::Never);
     vehicle.assert_stopped();
     let took = began.elapsed();
     // A lease is rounded down, by 2 ms at most.
@@ -108,7 +108,7 @@ fn without_renewal_motion_ends_with_the_lease() {
 #[test]
 fn a_manager_that_goes_away_stops_the_vehicle_at_once() {
     let vehicle = vehicle();
-    vehicle.go(true);
+    vehicle.go(Renew::Process);
     let Vehicle { manager, peer, .. } = &vehicle;
     assert!(peer.is_connected());
     manager.stop();
@@ -121,7 +121,7 @@ fn a_manager_that_goes_away_stops_the_vehicle_at_once() {
 fn what_has_finished_ends_without_the_hook() {
     let vehicle = vehicle();
     let events = vehicle.manager.events();
-    vehicle.go(true);
+    vehicle.go(Renew::Process);
     vehicle.agv.my_function_list().end_lease("go_to");
     assert!(!vehicle.lease.is_live());
     loop {
@@ -131,7 +131,7 @@ fn what_has_finished_ends_without_the_hook() {
         }
     }
     assert_eq!((vehicle.stops(), vehicle.speed()), (0, 5));
-    vehicle.go(true);
+    vehicle.go(Renew::Process);
     vehicle.peer.release("go_to").unwrap();
     vehicle.assert_stopped();
 }
@@ -140,7 +140,7 @@ fn what_has_finished_ends_without_the_hook() {
 fn what_a_service_has_started_stops_when_it_is_removed_or_replaced() {
     for is_replaced in [false, true] {
         let vehicle = vehicle();
-        vehicle.go(true);
+        vehicle.go(Renew::Process);
         let functions = vehicle.agv.my_function_list();
         if is_replaced {
             let definition = "go_to(number: int[1]) -> (number: int[1])".parse().unwrap();
@@ -177,7 +177,7 @@ fn the_loss_of_the_manager_is_told_to_the_hook_once() {
 #[test]
 fn a_hook_waits_for_nobody_who_holds_the_state() {
     let vehicle = vehicle();
-    vehicle.go(false);
+    vehicle.go(Renew::Never);
     let agv = vehicle.agv.clone();
     agv.with_state(|speed| {
         until("the hook has run", || vehicle.stops() == 1);

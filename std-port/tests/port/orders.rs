@@ -3,7 +3,9 @@
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::time::Duration;
 
-use cara_std::{Call, CommunicationSystem, ParametersView, Peer, RequestOptions, ServiceError, ServiceOptions, Unit};
+use cara_std::{
+    Call, CommunicationSystem, ParametersView, Peer, Renew, RequestOptions, ServiceError, ServiceOptions, Unit,
+};
 
 use crate::support::{PATIENCE, meet, number, pair, value};
 
@@ -43,9 +45,9 @@ fn vehicle(length: Duration) -> Vehicle {
 }
 
 impl Vehicle {
-    fn go(&self, call: i64, renew_lease: bool) {
+    fn go(&self, call: i64, renew: Renew) {
         let timeout = Some(cara_std::Duration::from_secs(20));
-        let options = RequestOptions { renew_lease, timeout, ..Default::default() };
+        let options = RequestOptions { renew, timeout, ..Default::default() };
         self.peer.block_request_with("go", &mut number(call), &options).unwrap();
     }
 
@@ -65,9 +67,9 @@ impl Vehicle {
 #[test]
 fn the_end_of_a_call_that_is_replaced_is_told_and_that_of_the_newer_is_not() {
     let vehicle = vehicle(LONG);
-    vehicle.go(1, true);
+    vehicle.go(1, Renew::Process);
     vehicle.assert_none_ended();
-    vehicle.go(2, true);
+    vehicle.go(2, Renew::Process);
     vehicle.assert_ended(1);
     vehicle.assert_none_ended();
     vehicle.peer.release("go").unwrap();
@@ -77,7 +79,7 @@ fn the_end_of_a_call_that_is_replaced_is_told_and_that_of_the_newer_is_not() {
 #[test]
 fn the_end_by_time_alone_is_told() {
     let vehicle = vehicle(SHORT);
-    vehicle.go(1, false);
+    vehicle.go(1, Renew::Never);
     vehicle.assert_ended(1);
     assert!(vehicle.peer.is_connected());
 }
@@ -85,7 +87,7 @@ fn the_end_by_time_alone_is_told() {
 #[test]
 fn the_end_of_what_has_finished_is_told() {
     let vehicle = vehicle(LONG);
-    vehicle.go(1, true);
+    vehicle.go(1, Renew::Process);
     vehicle.agv.my_function_list().end_lease("go");
     vehicle.assert_ended(1);
 }
@@ -93,7 +95,7 @@ fn the_end_of_what_has_finished_is_told() {
 #[test]
 fn the_end_of_a_service_that_is_removed_is_told() {
     let vehicle = vehicle(LONG);
-    vehicle.go(1, true);
+    vehicle.go(1, Renew::Process);
     vehicle.agv.my_function_list().remove("go").unwrap();
     vehicle.assert_ended(1);
 }
@@ -101,7 +103,7 @@ fn the_end_of_a_service_that_is_removed_is_told() {
 #[test]
 fn the_end_with_the_manager_is_told() {
     let vehicle = vehicle(LONG);
-    vehicle.go(1, true);
+    vehicle.go(1, Renew::Process);
     vehicle.manager.stop();
     vehicle.assert_ended(1);
 }

@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use cara_std::control::Control;
-use cara_std::{CloseReason, Error, Refusal, ServiceOptions, StartError, UnitEvent};
+use cara_std::{CloseReason, Error, Refusal, Renew, RequestOptions, ServiceOptions, StartError, UnitEvent};
 use rustix::process::{Pid, Signal, kill_process};
 
 use crate::support::{PATIENCE, ask, fleet, number, service, system, unit, until};
@@ -99,7 +99,9 @@ fn as_child() {
             let manager = system(fleet).control(Control::Off).build().unwrap();
             manager.start().unwrap();
             until("a vehicle has come", || manager.nodes_offering("go_to").len() == 1);
-            manager.nodes_offering("go_to")[0].block_request("go_to", &mut number(1)).unwrap();
+            manager.nodes_offering("go_to")[0]
+                .block_request_with("go_to", &mut number(1), &RequestOptions::renewing(Renew::Process))
+                .unwrap();
             until_input_ends();
         }
     }

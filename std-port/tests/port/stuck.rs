@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
-use cara_std::{Error, Parameters, Peer, Priority, RequestOptions, ServiceError, ServiceOptions, Unit};
+use cara_std::{Error, Parameters, Peer, Priority, Renew, RequestOptions, ServiceError, ServiceOptions, Unit};
 
 use crate::support::{Gate, PATIENCE, ask, counter, fleet, held, meet, number, service, system, unit, until};
 
@@ -59,13 +59,13 @@ impl Stuck {
     /// Calls without waiting, and without an end that the test could see.
     fn call(&self, function: &str) {
         let options =
-            RequestOptions { timeout: Some(PATIENCE.into()), renew_lease: false, ..RequestOptions::default() };
+            RequestOptions { timeout: Some(PATIENCE.into()), renew: Renew::Never, ..RequestOptions::default() };
         self.peer.request_with(function, &number(1), &options).unwrap();
         self.peer.flush().unwrap();
     }
 
     fn go(&self) {
-        let options = RequestOptions { renew_lease: false, ..RequestOptions::default() };
+        let options = RequestOptions { renew: Renew::Never, ..RequestOptions::default() };
         self.peer.block_request_with("go", &mut number(1), &options).unwrap();
     }
 
@@ -141,7 +141,7 @@ fn hooks_do_not_wait_for_each_other() {
     let sound = ServiceOptions::new().lease(LEASE, counting(&hooks));
     list.add_service(&signature("sound"), sound, service(|number| number)).unwrap();
     let (peer, _) = meet(&manager, &agv);
-    let options = RequestOptions { renew_lease: false, ..RequestOptions::default() };
+    let options = RequestOptions { renew: Renew::Never, ..RequestOptions::default() };
     let call = |function: &str| peer.block_request_with(function, &mut number(1), &options);
     assert_eq!(call("stuck"), Ok(()));
     until("its hook is stuck", || gate.came() == 1);

@@ -13,7 +13,7 @@ use cara_embassy::{Config, Handle, Handler, Limits, Resources, Security, Service
 use cara_processes::network::{self, ip};
 use cara_secure::random::Random;
 use cara_std::keys::{FleetKeys, KeyRing};
-use cara_std::{CommunicationSystem, Error, Fleet, Identity, Interfaces, Parameters};
+use cara_std::{CommunicationSystem, Error, Fleet, Identity, Interfaces, Parameters, Renew, RequestOptions};
 use embassy_net::{Ipv4Address, Ipv4Cidr, StackResources, StaticConfigV4};
 use embassy_net_driver::{Capabilities, Driver, HardwareAddress, LinkState, RxToken, TxToken};
 use smoltcp::phy::{Device, Medium, RxToken as _, TunTapInterface, TxToken as _};
@@ -174,7 +174,7 @@ fn position(value: [i64; 2]) -> Parameters {
 fn talk(manager: &CommunicationSystem, to: [i64; 2]) {
     let agv = manager.s_unit("agv").expect("it has joined");
     assert!(agv.wait_for_function("go_to", LONG), "it publishes what it offers");
-    let options = cara_std::RequestOptions { timeout: Some(LONG.into()), ..Default::default() };
+    let options = RequestOptions { timeout: Some(LONG.into()), ..RequestOptions::renewing(Renew::Process) };
     agv.block_request_with("go_to", &mut position(to), &options).unwrap();
     let mut there = position([9, 9]);
     agv.block_request("pos_info", &mut there).unwrap();

@@ -14,6 +14,7 @@ use cara_core::distribution::parameters::Parameters;
 use cara_core::error::{CloseReason, Constraint, Error, ServiceError};
 use cara_core::host::connections::LinkCounter;
 use cara_core::services::access::{Functions, Rule, Verbs, Who};
+use cara_core::services::heart::Renew;
 use cara_core::services::lease::Lease;
 use cara_core::services::session::RequestOptions;
 use cara_core::term::Term;
@@ -106,7 +107,7 @@ fn ask(bench: &Bench, board: &Board, unit: Unit, peer: &str, function: &str, n: 
     let (peer, function) = (unit.peer(peer).unwrap(), function.to_owned());
     finish(bench, board, async move {
         let mut parameters = number(n);
-        peer.block_request(&function, &mut parameters).await?;
+        peer.block_request_with(&function, &mut parameters, &RequestOptions::renewing(Renew::Process)).await?;
         parameters.variable("n")
     })
 }
@@ -289,30 +290,30 @@ fn a_task_awaits_the_end_of_its_own_call() {
     assert!(bench.run_until(|| knows(manager, "agv", "haul"), SHORT));
     let peer = manager.peer("agv").unwrap();
     let numbers = || ended.borrow().iter().map(|(number, _)| *number).collect::<Vec<_>>();
-    let call = |number_of: i64, renew_lease| {
-        let options = RequestOptions { renew_lease, ..RequestOptions::default() };
+    let call = |number_of: i64, renew| {
+        let options = RequestOptions { renew, ..RequestOptions::default() };
         peer.request_with("haul", &number(number_of), &options).unwrap();
         bench.run_for(Duration::from_secs(1));
     };
     let stops = || agv.with_state(|state| state.stops).unwrap();
-    call(1, true);
+    call(1, Renew::Process);
     assert_eq!(numbers(), [0; 0]);
-    call(2, true);
+    call(2, Renew::Process);
     assert_eq!((numbers(), stops()), (vec![1], 0), "the first was replaced, without the hook");
     peer.release("haul").unwrap();
     bench.run_for(AT_ONCE);
     assert_eq!((numbers(), stops()), (vec![1, 2], 1), "the second was released");
-    call(3, true);
+    call(3, Renew::Process);
     agv.my_function_list().end_lease("haul");
     bench.run_for(AT_ONCE);
     assert_eq!((numbers(), stops()), (vec![1, 2, 3], 1), "the third has finished");
     let asked = bench.now();
-    call(4, false);
+    call(4, Renew::Never);
     assert!(bench.run_until(|| ended.borrow().len() == 4, Duration::from_secs(90)));
     let took = ended.borrow()[3].1.since(asked);
     assert!(took <= length + AT_ONCE && took + AT_ONCE >= length, "{} ms", took.as_millis());
     assert_eq!(MADE_SAFE.get(), 2);
-    call(5, true);
+    call(5, Renew::Process);
     agv.my_function_list().remove("haul").unwrap();
     assert_eq!(MADE_SAFE.get(), 3, "the service of the fifth is gone");
     bench.run_for(AT_ONCE);
@@ -331,7 +332,11 @@ fn a_pulled_cable_runs_each_hook_once_and_the_board_comes_back() {
     agv.publish_my_function_list().unwrap();
     for round in 1..4 {
         assert!(bench.run_until(|| knows(manager, "agv", "go"), LONG), "round {round}");
-        manager.peer("agv").unwrap().request("go", &number(round)).unwrap();
+        manager
+            .peer("agv")
+            .unwrap()
+            .request_with("go", &number(round), &RequestOptions::renewing(Renew::Process))
+            .unwrap();
         assert!(bench.run_until(|| STANDING.is_live(cara_embassy::now()), SHORT));
         agv_board.set_cable(false);
         assert!(bench.run_until(|| !STANDING.is_live(cara_embassy::now()), SHORT));

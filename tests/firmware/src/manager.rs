@@ -9,7 +9,9 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, bail, ensure};
 use cara_apps::mechanic;
 use cara_std::control::Control;
-use cara_std::{Builder, CloseReason, CommunicationSystem, Error, MUnit, Parameters, Peer, UnitEvent};
+use cara_std::{
+    Builder, CloseReason, CommunicationSystem, Error, MUnit, Parameters, Peer, Renew, RequestOptions, UnitEvent,
+};
 
 use crate::board::{Board, FLEET, LONG, Who};
 use crate::keys::Keys;
@@ -138,7 +140,7 @@ pub(crate) fn reset(peer: &Peer) -> Result<()> {
 
 /// Sends a vehicle to a place; `false` if this machine was too busy for that and the lease has ended.
 pub(crate) fn sends(peer: &Peer, position: [i64; 2]) -> Result<bool> {
-    match peer.block_request("go_to", &mut at(position)?) {
+    match peer.block_request_with("go_to", &mut at(position)?, &RequestOptions::renewing(Renew::Process)) {
         Err(Error::TimedOut | Error::Expired | Error::Busy) => {
             // The call may have run all the same, and its lease is not renewed then.
             peer.release("go_to")?;

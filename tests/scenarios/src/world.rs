@@ -1,5 +1,6 @@
 //! What a scenario can do, whatever the port.
 
+use cara_core::services::heart::Renew;
 use std::fmt::Debug;
 use std::rc::Rc;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -244,7 +245,7 @@ pub trait Node {
 impl dyn Node {
     /// The asynchronous request with defaults.
     pub fn request(&self, peer: &str, function: &str, parameters: &ParametersView) -> Result<CallId, Error> {
-        self.request_with(peer, function, parameters, RequestOptions::default())
+        self.request_with(peer, function, parameters, RequestOptions::renewing(Renew::Process))
     }
 
     /// Whether a peer of this name is connected.
@@ -351,7 +352,7 @@ impl dyn World + '_ {
         function: &str,
         parameters: &mut ParametersView,
     ) -> Result<(), Error> {
-        let options = RequestOptions { timeout: Some(secs(10)), ..RequestOptions::default() };
+        let options = RequestOptions { timeout: Some(secs(10)), ..RequestOptions::renewing(Renew::Process) };
         self.ask_with(unit, peer, function, parameters, options)
     }
 

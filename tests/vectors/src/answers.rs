@@ -385,7 +385,8 @@ fn leases() -> Vec<Answer> {
     let go_to = RequestHeader { wants_reply: false, ..header(1, 1) };
     let old = RequestHeader { stamp: 501_000, remaining: Duration::from_secs(9), ..go_to };
     let body = |body: &[u8]| frame(&Frame::Session(body));
-    let renewal = Renewal { call: 1, class: Priority::Normal, stamp: 1_001_000, since: Duration::ZERO };
+    let renewal =
+        Renewal { call: 1, class: Priority::Normal, stamp: 1_001_000, since: Duration::ZERO, age: Duration::ZERO };
     let renew = body(&SessionBody::renewal(&renewal));
     let started = request(go_to, &position);
     let release = body(&SessionBody::release(&Release { call: 1, class: Priority::Normal }));
@@ -393,20 +394,21 @@ fn leases() -> Vec<Answer> {
     let released = vec![started.clone(), release.clone()];
     let all = vec![started.clone(), body(&SessionBody::release_all(Slot(1), 9))];
     let overtaken = vec![release, request(RequestHeader { wants_reply: true, ..go_to }, &position)];
-    let ended = |why: &str| json!([told(json!({ "lease_ended": { "call": 1, "why": why } }))]);
+    let expired = || told(json!({ "lease_ended": { "call": 1, "why": "expired" } }));
+    let heard = || json!({ "session": { "renewed": { "call": 1 } } });
     let failure = json!([{ "priority": "normal", "message": { "failure": { "id": 1, "error": "expired" } } }]);
     let lease_released = answer(("lease_released", "it ends without an answer", "live", released, 600, json!([])));
     let mut leases = answers([
-        ("lease_expires", "500 ms after the request was made", "live", started.clone(), 500, ended("expired")),
+        ("lease_expires", "500 ms after the request was made", "live", started.clone(), 500, json!([expired()])),
         ("lease_lives", "1 ms less", "live", started, 499, json!([])),
-        ("renewal_too_early", "the call has not arrived", "live", renew, 0, json!([])),
+        ("renewal_too_early", "the call has not arrived", "live", renew, 0, json!([heard()])),
         ("lease_over", "made 500 ms ago, though its deadline is later", "live", request(old, &position), 0, failure),
     ]);
     leases.push(lease_released);
     for (name, about, given, after, expected) in [
         ("leases_released", "all of a function", all, 600, json!([])),
         ("release_overtakes", "the call is dropped when it arrives", overtaken, 0, json!([])),
-        ("renewal_of_nothing", "the call has ended", renewed_after, 0, ended("expired")),
+        ("renewal_of_nothing", "the call has ended", renewed_after, 0, json!([expired(), heard()])),
     ] {
         leases.push(answer((name, about, "live", given, after, expected)));
     }

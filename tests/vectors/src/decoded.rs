@@ -207,7 +207,9 @@ pub(crate) fn session_body(bytes: &[u8]) -> Option<Value> {
             "call": renewal.call,
             "stamp": renewal.stamp,
             "since": renewal.since.as_micros(),
+            "age": renewal.age.as_micros(),
         }}),
+        SessionBody::Renewed(call) => json!({ "renewed": { "call": call } }),
         SessionBody::Release(release) => {
             json!({ "release": { "class": release.class.word(), "call": release.call } })
         }

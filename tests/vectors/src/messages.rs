@@ -252,6 +252,7 @@ fn session_bodies() -> Vec<Vector> {
         class: Priority::Normal,
         stamp: 0x0001_0203_0405_0607,
         since: Duration::from_micros(80_000),
+        age: Duration::from_micros(100_000),
     };
     let release = Release { call: 0x0102_0304, class: Priority::Low };
     let emergency = [&SessionBody::message_prefix(0)[..], &request(false, &[])].concat();
@@ -270,7 +271,13 @@ fn session_bodies() -> Vec<Vector> {
             &SessionBody::renewal(&renewal),
             &json!({ "renew": {
                 "class": "normal", "call": 0x0102_0304, "stamp": 0x0001_0203_0405_0607_u64, "since": 80_000,
+                "age": 100_000,
             }}),
+        ),
+        body(
+            ("renewed", "the answer, on the way that the renewal came"),
+            &SessionBody::renewed(0x0102_0304),
+            &json!({ "renewed": { "call": 0x0102_0304 } }),
         ),
         body(
             ("release", "the caller no longer wants a leased call"),

@@ -10,6 +10,7 @@ use cara_core::distribution::parameters::{Parameters, ParametersView};
 use cara_core::error::{CloseReason, Error};
 use cara_core::host::mailman::{LinkId, Mailman};
 use cara_core::host::secure::Plain;
+use cara_core::services::heart::Renew;
 use cara_core::services::hub::Hub;
 use cara_core::services::session::{Call, Delivery, Event, RequestOptions, Session, SessionConfig, SessionStorage};
 use cara_core::services::{Context, Port, Ticket};
@@ -210,7 +211,7 @@ impl Side {
     /// Requests a function of the peer.
     pub(crate) fn request(&mut self, function: &str, parameters: &ParametersView, how: How) -> Result<(), Error> {
         let delivery = if how == How::BestEffort { Delivery::BestEffort } else { Delivery::Reliable };
-        let options = RequestOptions { delivery, ..RequestOptions::default() };
+        let options = RequestOptions { delivery, renew: Renew::Process, ..RequestOptions::default() };
         let wants_reply = how == How::Blocking;
         self.with(|session, cx| session.request(cx, function, parameters, &options, wants_reply)).map(|_| ())
     }

@@ -140,6 +140,10 @@ impl Talk {
                 ("talk_renew_stream", "and in the stream"),
             ],
         );
+        self.pass(
+            From::Agv,
+            &[("talk_renewed", "it has been heard"), ("talk_renewed_stream", "which is told on both ways")],
+        );
         let call = self.agv.calls.pop().ok_or(Error::NotConnected)?;
         self.agv.answer(call.ticket, Err(cara_core::error::ServiceError::Failed(7).into()))?;
         self.agv.end_lease(1);

@@ -7,7 +7,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use cara_processes::{Process, random_fleet, skip};
-use cara_std::{Builder, CommunicationSystem, Identity, Interfaces, MUnit, Parameters};
+use cara_std::{Builder, CommunicationSystem, Identity, Interfaces, MUnit, Parameters, Renew, RequestOptions};
 use cara_test_keys::KeyFolder;
 
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -64,7 +64,8 @@ fn talk(mut node: Process, manager: &CommunicationSystem, while_leased: impl FnO
     let mut target = Parameters::new();
     target.add_int("position", 2).unwrap();
     target.set_value("position", [1, 2]).unwrap();
-    agv.request("go_to", &target).unwrap();
+    let wanted = RequestOptions::renewing(Renew::Process);
+    agv.request_with("go_to", &target, &wanted).unwrap();
     assert_eq!(node.expect("run go_to", PATIENCE).unwrap().text, "run go_to {'position': [1, 2]}");
     while_leased(&mut node);
     assert_eq!(position(manager), [1, 2]);

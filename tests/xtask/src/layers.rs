@@ -61,7 +61,7 @@ const HOST_FOR_SERVICES: [Purpose; 17] = [
     },
     Purpose {
         what: "whether the peer is still there decides how long a session lasts",
-        places: &["services/session/mod.rs", "services/session/inbound.rs", "services/session/proving.rs"],
+        places: &["services/session/mod.rs", "services/session/proving.rs"],
         items: &["connections::Liveness"],
     },
     Purpose { what: "hello and farewell", places: &["services/session/mod.rs"], items: &["frame::Frame"] },

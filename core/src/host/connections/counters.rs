@@ -81,5 +81,7 @@ crate::counters::counters! {
         RenewalsIgnored,
         /// Leases of calls of this unit that it renews no longer because newer calls of the same function took their places.
         RenewalsStopped,
+        /// Leases of calls of this unit that it released because the peer answered no renewal for the length of the lease.
+        RenewalsUnanswered,
     }
 }

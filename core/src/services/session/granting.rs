@@ -91,7 +91,8 @@ impl<P: Port> Session<P> {
             return;
         }
         let Some(sent_at) = sent_at_earliest(cx.now, renewal.stamp, renewal.since) else { return };
-        let end = Lease::seen_end(sent_at + granted.length);
+        let wanted_at = Instant::from_micros(sent_at.as_micros().saturating_sub(renewal.age.as_micros()));
+        let end = Lease::seen_end(wanted_at + granted.length);
         // What was late on its way takes nothing away from what came before it, and revives nothing.
         if end > granted.end && granted.end > cx.now {
             self.prolong(cx, index, end);

@@ -3,14 +3,15 @@
 //! A call *holds* a lease as long as this unit renews it. It is *released* when the peer is told that the call is not
 //! wanted, wherever it is: when it has failed, and when its caller *cancels* it.
 
-use super::{Phase, Session};
+use super::{Event, Phase, Session};
 use crate::config::{LEASES, Priority};
 use crate::distribution::function_list::Slot;
 use crate::distribution::message::{Release, Renewal, RequestHeader, SessionBody};
 use crate::error::{Error, Limit};
 use crate::host::connections::LinkCounter;
 use crate::host::frame::Frame;
-use crate::services::lease::Held;
+use crate::services::heart::{Beats, Renew};
+use crate::services::lease::{Held, LeaseEnd};
 use crate::services::requests::{CallId, Pending};
 use crate::services::{Context, Port};
 use crate::storage::take_at;
@@ -18,6 +19,8 @@ use crate::time::{Duration, Instant};
 
 /// A held lease is renewed this often within its length, so that lost renewals do not end it.
 const RENEWALS_PER_LEASE: u64 = 4;
+/// A heart beats so often within the length of a lease at least.
+const BEATS_PER_LEASE: u64 = 2;
 /// Renewals of a lease are so far apart at least, as those of one of 20 ms. A shorter one, which a peer may publish, ends
 /// before it is renewed: its renewals would fill the network.
 const SHORTEST_INTERVAL: Duration = Duration::from_millis(5);
@@ -27,16 +30,28 @@ const RETRY: Duration = Duration::from_millis(20);
 /// Releases of whole functions that are still to be sent in the stream: the function, and the newest call.
 pub(super) type Releases = heapless::Vec<(Slot, CallId), LEASES>;
 
+fn between_renewals(lease: Duration) -> Duration {
+    lease.divided_by(RENEWALS_PER_LEASE).max(SHORTEST_INTERVAL)
+}
+
 impl<P: Port> Session<P> {
     /// Whether this unit renews the lease of a call.
     pub fn holds(&self, call: CallId) -> bool {
         self.held.iter().any(|held| held.call == call && !held.release_unsent)
     }
 
-    /// [`Error::Full`] when a call of a leased function could not be renewed: there is no room, and no earlier call of the
-    /// same function that would give way.
-    pub(super) fn check_room_to_hold(&self, wanted: bool, slot: Slot) -> Result<(), Error> {
-        let fits = !wanted || !self.held.is_full() || self.oldest_held(slot).is_some();
+    /// Whether a call of a function could be renewed. [`Error::Full`] when there is no room, and no earlier call of the same
+    /// function that would give way; [`Error::SlowHeart`] for one that would let the lease end between two beats.
+    pub(super) fn check_held(&self, lease: Option<Duration>, renew: Renew, slot: Slot) -> Result<(), Error> {
+        let Some(lease) = lease else { return Ok(()) };
+        let slowest = lease.divided_by(BEATS_PER_LEASE);
+        if let Renew::Heart(beats) = renew
+            && beats.period() > slowest
+        {
+            let [need, have] = [slowest, beats.period()].map(|span| span.as_millis() as u32);
+            return Err(Error::SlowHeart { need, have });
+        }
+        let fits = !self.held.is_full() || self.oldest_held(slot).is_some();
         if fits { Ok(()) } else { Err(Error::Full(Limit::Leases)) }
     }
 
@@ -52,6 +67,7 @@ impl<P: Port> Session<P> {
         header: &RequestHeader,
         class: Priority,
         lease: Duration,
+        renew: Renew,
     ) {
         // Not refused: the new call may be the one that stops what the earlier ones started, whose leases it takes over.
         if self.held.is_full()
@@ -60,20 +76,30 @@ impl<P: Port> Session<P> {
             take_at(&mut self.held, oldest);
             self.link.counters.add(LinkCounter::RenewalsStopped, 1);
         }
-        let every = lease.divided_by(RENEWALS_PER_LEASE).max(SHORTEST_INTERVAL);
-        let (call, slot, next) = (CallId(header.id), header.slot, cx.now + every);
-        let _ = self.held.push(Held { call, slot, class, every, next, release_unsent: false });
+        let (call, slot, next) = (CallId(header.id), header.slot, cx.now + between_renewals(lease));
+        let answered = cx.now;
+        let _ = self.held.push(Held { call, slot, class, lease, renew, next, answered, release_unsent: false });
         self.timers.renewal = self.timers.renewal.min(next);
     }
 
-    pub(super) fn renew_leases(&mut self, cx: &mut Context<'_, P>) {
+    /// Renews what is due. What the peer has not answered for the length of a lease is not renewed blindly: it is released,
+    /// and returned, one at a time.
+    pub(super) fn renew_leases(&mut self, cx: &mut Context<'_, P>) -> Option<Event> {
         let (stamp, since) = self.clock.tell(cx.now);
         let now = cx.now;
         for index in 0..self.held.len() {
             let due = self.held.get_mut(index).filter(|held| held.next <= now && !held.release_unsent);
             let Some(held) = due else { continue };
-            held.next = now + held.every;
-            let renewal = Renewal { call: held.call.0, class: held.class, stamp, since };
+            if held.answered + held.lease <= now {
+                let Held { call, slot, .. } = *held;
+                self.link.counters.add(LinkCounter::RenewalsUnanswered, 1);
+                self.release_call(cx, call, None);
+                return Some(Event::LeaseEnded { call, slot, why: LeaseEnd::Unanswered });
+            }
+            held.next = now + between_renewals(held.lease);
+            // A heart that does not beat renews nothing. Whether it is too late when it beats again is for the peer to say.
+            let Some(age) = held.renew.age(now).filter(|age| *age < held.lease) else { continue };
+            let renewal = Renewal { call: held.call.0, class: held.class, stamp, since, age };
             let body = SessionBody::renewal(&renewal);
             // Both ways: one lost datagram must not stop a vehicle, nor must a retransmission in the stream.
             self.send_datagram(cx, &body, &[]);
@@ -82,6 +108,22 @@ impl<P: Port> Session<P> {
         let renewed = self.held.iter().filter(|held| !held.release_unsent);
         self.timers.renewal = renewed.map(|held| held.next).min().unwrap_or(Instant::FAR_FUTURE);
         self.flush(cx);
+        None
+    }
+
+    /// The peer has answered a renewal.
+    pub(super) fn was_renewed(&mut self, now: Instant, call: CallId) {
+        if let Some(held) = self.held.iter_mut().find(|held| held.call == call) {
+            held.answered = now;
+        }
+    }
+
+    /// A heart has stopped: what names it is released.
+    pub fn release_beats(&mut self, cx: &mut Context<'_, P>, beats: Beats) {
+        let of_it = |held: &&Held| held.renew == Renew::Heart(beats) && !held.release_unsent;
+        while let Some(call) = self.held.iter().find(of_it).map(|held| held.call) {
+            self.release_call(cx, call, None);
+        }
     }
 
     /// The peer has ended the lease of a call.

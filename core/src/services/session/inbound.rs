@@ -13,7 +13,7 @@ use crate::distribution::message::{Control, Message, REQUEST_BYTES, RequestHeade
 use crate::distribution::parameters::ParametersView;
 use crate::distribution::{block, datagram};
 use crate::error::{CloseReason, Error};
-use crate::host::connections::{Incoming, LinkCounter, Liveness, Place};
+use crate::host::connections::{Incoming, LinkCounter, Place};
 use crate::host::endpoint::Endpoint as _;
 use crate::host::frame::Frame;
 use crate::host::secure::{Secure, Unopened};
@@ -22,7 +22,13 @@ use crate::services::lease::Service;
 use crate::services::requests::{CallId, Pending};
 use crate::services::{Context, Port};
 use crate::storage::LEFT_BY_WAITING;
-use crate::time::Instant;
+
+/// On which of the two ways between two units something came.
+#[derive(Clone, Copy)]
+enum Way {
+    Stream,
+    Datagram,
+}
 
 /// Result of [`Session::receive`].
 #[derive(Clone, Copy, Debug)]
@@ -144,7 +150,7 @@ impl<P: Port> Session<P> {
         };
         self.link.counters.add(LinkCounter::DatagramsReceived, 1);
         self.datagram_opened(cx.now);
-        self.session_body(cx, Place::lent(body.len()), body, Liveness::heard_datagram)
+        self.session_body(cx, Place::lent(body.len()), body, Way::Datagram)
     }
 
     /// The results that an [`Event::Reply`] names; `lent` is what was lent to the [`receive`](Self::receive) that returned it.
@@ -194,7 +200,7 @@ impl<P: Port> Session<P> {
                 None
             }
             (Incoming::Pong, Phase::Live) => self.pong_arrived(cx),
-            (Incoming::Session(place), Phase::Live) => self.session_body(cx, place, lent, Liveness::heard),
+            (Incoming::Session(place), Phase::Live) => self.session_body(cx, place, lent, Way::Stream),
             (Incoming::Message(priority, place), Phase::Live) => {
                 self.message_arrived(cx, priority, place, lent, arguments)
             }
@@ -209,17 +215,14 @@ impl<P: Port> Session<P> {
         }
     }
 
-    /// Does what a session body says, which shows life as `heard` notes it if it can be read.
-    fn session_body(
-        &mut self,
-        cx: &mut Context<'_, P>,
-        place: Place,
-        lent: &[u8],
-        heard: fn(&mut Liveness, Instant),
-    ) -> Option<Event> {
+    /// Does what a session body says, which shows life if it can be read.
+    fn session_body(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8], way: Way) -> Option<Event> {
         let body = SessionBody::decode(self.link.view(place, lent));
         if body.is_some() {
-            heard(&mut self.liveness, cx.now);
+            match way {
+                Way::Stream => self.liveness.heard(cx.now),
+                Way::Datagram => self.liveness.heard_datagram(cx.now),
+            }
         }
         match body {
             Some(SessionBody::KeepAlive { stamp }) => {
@@ -228,6 +231,18 @@ impl<P: Port> Session<P> {
             }
             Some(SessionBody::Renew(renewal)) => {
                 self.renewed(cx, &renewal);
+                let answer = SessionBody::renewed(renewal.call);
+                match way {
+                    Way::Datagram => drop(self.send_datagram(cx, &answer, &[])),
+                    Way::Stream => {
+                        self.link.send_frame(&Frame::Session(&answer));
+                        self.flush(cx);
+                    }
+                }
+                None
+            }
+            Some(SessionBody::Renewed(call)) => {
+                self.was_renewed(cx.now, CallId(call));
                 None
             }
             Some(SessionBody::Release(release)) => self.released(cx, release),

@@ -8,6 +8,7 @@ use crate::distribution::message::{REQUEST_BYTES, RequestHeader, SessionBody};
 use crate::distribution::parameters::ParametersView;
 use crate::error::{CloseReason, Error};
 use crate::host::connections::LinkCounter;
+use crate::services::heart::Renew;
 use crate::services::requests::CallId;
 use crate::services::{Context, Port};
 use crate::time::{Duration, Instant};
@@ -34,9 +35,8 @@ pub struct RequestOptions {
     pub priority: Option<Priority>,
     /// Stream or datagram.
     pub delivery: Delivery,
-    /// Renew the lease that the call begins until it is released, or the call fails. Without it, what the call starts goes
-    /// on for the length of the lease.
-    pub renew_lease: bool,
+    /// How long what the call starts is wanted, if its function has a lease.
+    pub renew: Renew,
     /// Take over what another caller moves, in place of [`Error::Held`].
     pub take_over: bool,
 }
@@ -44,7 +44,12 @@ pub struct RequestOptions {
 impl RequestOptions {
     /// The default, for constants.
     pub const fn new() -> Self {
-        Self { timeout: None, priority: None, delivery: Delivery::Reliable, renew_lease: true, take_over: false }
+        Self { timeout: None, priority: None, delivery: Delivery::Reliable, renew: Renew::Never, take_over: false }
+    }
+
+    /// The default, for a call of a leased function whose motion is wanted so long.
+    pub const fn renewing(renew: Renew) -> Self {
+        Self { renew, ..Self::new() }
     }
 }
 
@@ -68,7 +73,7 @@ impl<P: Port> Session<P> {
     ///
     /// Nothing is sent on an error: [`Error::UnknownFunction`], [`Error::MissingArgument`], [`Error::WrongType`],
     /// [`Error::WrongSize`], [`Error::ResultWouldNotFit`], [`Error::TooLarge`], [`Error::TooSoon`], [`Error::Full`],
-    /// [`Error::NotConnected`].
+    /// [`Error::SlowHeart`], [`Error::NotConnected`].
     pub fn request(
         &mut self,
         cx: &mut Context<'_, P>,
@@ -96,7 +101,8 @@ impl<P: Port> Session<P> {
         // All checks before the id is taken: a request that is refused leaves no trace, and no gap that at-most-once would count.
         let mut checked = self.check(cx, function, parameters, options, wants_reply)?;
         let slot = checked.header.slot;
-        self.check_room_to_hold(checked.lease.is_some() && options.renew_lease, slot)?;
+        let held = checked.lease.filter(|_| options.renew != Renew::Never);
+        self.check_held(held, options.renew, slot)?;
         let id = self.take_id(cx, &checked, wants_reply)?;
         checked.header.id = id.0;
         let sent = match options.delivery {
@@ -109,8 +115,8 @@ impl<P: Port> Session<P> {
             return Err(error);
         }
         self.requests.sent(cx.now);
-        if let Some(lease) = checked.lease.filter(|_| options.renew_lease) {
-            self.hold_lease(cx, &checked.header, checked.priority, lease);
+        if let Some(lease) = held {
+            self.hold_lease(cx, &checked.header, checked.priority, lease, options.renew);
         }
         Ok(id)
     }

@@ -147,8 +147,10 @@ impl<P: Port> Session<P> {
         if cx.now >= self.timers.gathered {
             self.flush(cx);
         }
-        if cx.now >= self.timers.renewal {
-            self.renew_leases(cx);
+        if cx.now >= self.timers.renewal
+            && let Some(event) = self.renew_leases(cx)
+        {
+            return Some(event);
         }
         if cx.now >= self.timers.keep_alive {
             self.send_keep_alive(cx);

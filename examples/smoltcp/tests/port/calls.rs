@@ -2,6 +2,7 @@
 
 use cara_core::config::Priority;
 use cara_core::error::{Error, ServiceError};
+use cara_core::services::heart::Renew;
 use cara_core::services::session::Event;
 use cara_core::services::session::RequestOptions;
 use cara_core::time::Duration;
@@ -30,7 +31,7 @@ fn call(world: &mut World, function: &str, value: i64) -> Result<i64, Error> {
 
 fn drive(world: &mut World) {
     let (now, link) = (world.now, world.manager().links()[0]);
-    world.manager().request(now, link, "go_to", 5, &RequestOptions::default(), false).unwrap();
+    world.manager().request(now, link, "go_to", 5, &RequestOptions::renewing(Renew::Process), false).unwrap();
     world.run(SECOND.times(10));
     let vehicle = &world.vehicles[0];
     assert!(vehicle.program.driving && vehicle.lease.is_live(world.now));

@@ -1,7 +1,7 @@
 //! A board and its manager while nothing is broken.
 
 use anyhow::{Context, Result, ensure};
-use cara_std::{Delivery, Error, Parameters, RequestOptions, UnitEvent};
+use cara_std::{Delivery, Error, Parameters, Renew, RequestOptions, UnitEvent};
 
 use crate::board::{Bench, Who};
 use crate::manager::{Manager, arrives, at, drives, patiently, position, reset, sets_out};
@@ -36,7 +36,9 @@ pub(super) fn driven(bench: &Bench, _: u32) -> Result<String> {
     let board = bench.board(&cable, &Who::agv(17))?;
     let agv = manager.meet(&Who::agv(17))?;
     ensure!(position(&agv)? == [0, 0], "it begins elsewhere");
-    drives(&board, [1, 2], || Ok(agv.request("go_to", &at([1, 2])?).map(drop)?))?;
+    drives(&board, [1, 2], || {
+        Ok(agv.request_with("go_to", &at([1, 2])?, &RequestOptions::renewing(Renew::Process)).map(drop)?)
+    })?;
     arrives(&agv, [1, 2])?;
     drives(&board, [0, 2], || sets_out(&agv, [0, 2]))?;
     arrives(&agv, [0, 2])?;
@@ -61,7 +63,7 @@ pub(super) fn not_renewed(bench: &Bench, _: u32) -> Result<String> {
     let manager = Manager::start(&bench.keys)?;
     let board = bench.board(&cable, &Who::agv(17))?;
     let agv = manager.meet(&Who::agv(17))?;
-    let once = RequestOptions { renew_lease: false, ..RequestOptions::default() };
+    let once = RequestOptions { renew: Renew::Never, ..RequestOptions::default() };
     let mut far = at([1_000, 0])?;
     patiently(|| agv.block_request_with("go_to", &mut far, &once))?;
     board.logs("stopped at")?;
@@ -115,7 +117,7 @@ pub(super) fn best_effort(bench: &Bench, _: u32) -> Result<String> {
     let manager = Manager::start(&bench.keys)?;
     let board = bench.board(&cable, &Who::agv(17))?;
     let agv = manager.meet(&Who::agv(17))?;
-    let one_datagram = RequestOptions { delivery: Delivery::BestEffort, ..RequestOptions::default() };
+    let one_datagram = RequestOptions { delivery: Delivery::BestEffort, ..RequestOptions::renewing(Renew::Process) };
     drives(&board, [1, 1], || Ok(agv.request_with("go_to", &at([1, 1])?, &one_datagram).map(drop)?))?;
     Ok("in one datagram".into())
 }

@@ -1,6 +1,7 @@
 //! A vehicle does only what its manager still wants.
 
 use cara_core::error::Error;
+use cara_core::services::heart::Renew;
 use cara_core::services::lease::LeaseEnd;
 use cara_core::services::session::RequestOptions;
 use cara_core::time::Duration;
@@ -127,7 +128,7 @@ fn without_a_lease_motion_goes_on(world: &mut dyn World) {
 fn a_lease_that_is_not_renewed_ends(world: &mut dyn World) {
     let service = Service::new("drive(n: int[1])").lease(lease(world));
     let (manager, agv) = pair(world, &service);
-    let options = RequestOptions { renew_lease: false, timeout: Some(secs(10)), ..RequestOptions::default() };
+    let options = RequestOptions { renew: Renew::Never, timeout: Some(secs(10)), ..RequestOptions::default() };
     assert_eq!(world.ask_with(&manager, "agv", "drive", &mut number("n", 1), options), Ok(()));
     world.wait("the safe hook runs", || service.log().stops().len() == 1, secs(10));
     assert!(!agv.lease_is_live("drive"));

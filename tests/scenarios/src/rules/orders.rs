@@ -1,6 +1,7 @@
 //! A lease belongs to one call: what is not waited for stops, and an older call never moves again.
 
 use cara_core::error::Error;
+use cara_core::services::heart::Renew;
 use cara_core::services::lease::LeaseEnd;
 use cara_core::services::session::RequestOptions;
 
@@ -14,7 +15,7 @@ scenarios![
     a_replaced_call_does_not_move_by_the_next_ones_lease: "lease of a service", Light, [], ["RequestsRun"];
 ];
 
-const PATIENT: RequestOptions = RequestOptions { timeout: Some(secs(60)), ..RequestOptions::new() };
+const PATIENT: RequestOptions = RequestOptions { timeout: Some(secs(60)), ..RequestOptions::renewing(Renew::Process) };
 
 /// Moves once a second while it is wanted. Its lease is longer than any wait here, so that time alone ends nothing.
 fn mover() -> Service {
@@ -24,8 +25,8 @@ fn mover() -> Service {
 fn a_call_that_is_not_answered_in_time_stops_at_once(world: &mut dyn World) {
     let service = mover();
     let (manager, agv) = pair(world, &service);
-    for (renew_lease, times) in [(true, 1), (false, 2)] {
-        let options = RequestOptions { timeout: Some(secs(3)), renew_lease, ..PATIENT };
+    for (renew, times) in [(Renew::Process, 1), (Renew::Never, 2)] {
+        let options = RequestOptions { timeout: Some(secs(3)), renew, ..PATIENT };
         assert_eq!(world.ask_with(&manager, "agv", "drive", &mut number("n", 1), options), Err(Error::TimedOut));
         let log = service.log();
         let start = world.now();

@@ -1,6 +1,7 @@
 //! A vehicle moves only while its manager wants it to.
 
 use super::*;
+use cara_core::services::heart::Renew;
 use cara_core::services::lease::LeaseEnd;
 use cara_core::services::session::RequestOptions;
 use cara_sim::{Crash, Direction, LeaseWatch, UnitEvent};
@@ -27,7 +28,8 @@ fn driving(seed: u64) -> (World, UnitHandle, UnitHandle, Rc<RefCell<u32>>, Rc<Re
     agv.my_function_list().add_service("drive()", drive.lease(LEASE, move |_| *stops.borrow_mut() += 1)).unwrap();
     agv.publish_my_function_list().unwrap();
     assert!(world.run_until(|_| manager.knows("agv", "drive"), secs(10)));
-    world.block_request(&manager, "agv", "drive", &mut Parameters::new()).unwrap();
+    manager.request_with("agv", "drive", &Parameters::new(), RequestOptions::renewing(Renew::Process)).unwrap();
+    world.run_for(millis(100));
     (world, manager, agv, driven, stopped)
 }
 
@@ -69,7 +71,7 @@ fn without_renewal_the_lease_ends_by_itself() {
     let (mut world, manager, _agv, _, stopped) = driving(3);
     manager.release("agv", "drive").unwrap();
     world.run_for(millis(20));
-    let options = RequestOptions { renew_lease: false, ..RequestOptions::default() };
+    let options = RequestOptions { renew: Renew::Never, ..RequestOptions::default() };
     manager.request_with("agv", "drive", &Parameters::new(), options).unwrap();
     world.run_for(LEASE - millis(50));
     assert_eq!(*stopped.borrow(), 1, "the release");

@@ -90,7 +90,11 @@ fn nothing_is_lost_and_no_lease_ends_while_links_are_rekeyed_under_faults() {
         let path = Path::LAN.delay(millis(3)).jitter(millis(4)).loss_percent(2.0);
         let path = path.duplicate_percent(10.0).reorder_percent(10.0);
         fleet.world.network(|network| network.set_fault_profile(path, secs(3_600)));
-        fleet.world.block_request(&fleet.manager, "agv", "drive", &mut Parameters::new()).unwrap();
+        fleet
+            .manager
+            .request_with("agv", "drive", &Parameters::new(), RequestOptions::renewing(Renew::Process))
+            .unwrap();
+        fleet.world.run_for(millis(100));
         let accepted = ask(&mut fleet, 0..500);
         assert!(fleet.agv.lease_is_live("drive"), "the lease is renewed across keys, seed {seed}");
         fleet.world.run_for(secs(20));

@@ -9,6 +9,7 @@ use crate::config::Priority;
 use crate::error::Error;
 use crate::host::connections::LinkCounter;
 use crate::services::access::{Functions, Rate, Rule, Verb, Verbs, Who};
+use crate::services::heart::Renew;
 use crate::services::lease::LeaseEnd;
 use crate::services::requests::CallId;
 use crate::services::session::RequestOptions;
@@ -151,7 +152,7 @@ fn a_lease_ends_with_the_permission() {
     let slots = [("go()", "go"), ("turn()", "turn")].map(|(definition, name)| {
         let slot = pair.agv.offer_leased(definition, Duration::from_millis(500));
         pair.publish();
-        let renewed = RequestOptions { renew_lease: true, ..RequestOptions::default() };
+        let renewed = RequestOptions { renew: Renew::Process, ..RequestOptions::default() };
         pair.manager.request_with(name, &none(), &renewed, true).unwrap();
         pair.settle();
         slot

@@ -18,10 +18,14 @@ use crate::error::{CloseReason, Error, ServiceError};
 use crate::host::connections::LinkCounter;
 use crate::host::frame::{ChunkWriter, Chunking};
 use crate::services::Context;
+use crate::services::heart::{Beats, Renew};
 use crate::services::lease::{Lease, LeaseEnd};
 use crate::services::requests::CallId;
 use crate::storage::Buffers;
 use crate::time::Duration;
+
+/// What is called without options goes on while it is wanted, if its function has a lease.
+const WANTED: RequestOptions = RequestOptions::renewing(Renew::Process);
 
 impl Side {
     pub(super) fn counter(&self, counter: LinkCounter) -> u64 {
@@ -123,12 +127,12 @@ impl Side {
 
     /// A request that waits for its reply.
     pub(super) fn call(&mut self, function: &str, parameters: &ParametersView) -> Result<CallId, Error> {
-        self.request_with(function, parameters, &RequestOptions::default(), true)
+        self.request_with(function, parameters, &WANTED, true)
     }
 
     /// A request that wants no reply.
     pub(super) fn tell(&mut self, function: &str, parameters: &ParametersView) -> Result<CallId, Error> {
-        self.request_with(function, parameters, &RequestOptions::default(), false)
+        self.request_with(function, parameters, &WANTED, false)
     }
 
     /// Answers the oldest call that waits.
@@ -153,6 +157,10 @@ impl Side {
 
     pub(super) fn release(&mut self, slot: Slot) -> Result<(), Error> {
         self.session.release(context!(self), slot)
+    }
+
+    pub(super) fn release_beats(&mut self, beats: Beats) {
+        self.session.release_beats(context!(self), beats);
     }
 
     pub(super) fn cancel(&mut self, call: CallId) {

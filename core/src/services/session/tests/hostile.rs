@@ -121,7 +121,8 @@ fn frames() -> impl Strategy<Value = Vec<u8>> {
 
 fn renewal(call: u32, class: u8, stamp: u64) -> Vec<u8> {
     let since = Duration::from_micros(stamp & 0xFFFF);
-    SessionBody::renewal(&Renewal { call, class: Priority::from_wire(class).unwrap(), stamp, since }).to_vec()
+    let class = Priority::from_wire(class).unwrap();
+    SessionBody::renewal(&Renewal { call, class, stamp, since, age: Duration::ZERO }).to_vec()
 }
 
 fn release(call: u32, class: u8) -> Vec<u8> {

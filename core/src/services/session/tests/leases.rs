@@ -10,6 +10,7 @@ use super::{none, x};
 use crate::distribution::function_list::Slot;
 use crate::error::{Error, Limit};
 use crate::host::connections::LinkCounter;
+use crate::services::heart::Renew;
 use crate::services::lease::LeaseEnd;
 use crate::services::requests::CallId;
 use crate::services::session::RequestOptions;
@@ -22,7 +23,8 @@ fn moving(renew: bool) -> (Pair, Slot) {
     let mut pair = Pair::live();
     let slot = pair.agv.offer_leased("go()", LEASE);
     pair.publish();
-    let options = RequestOptions { renew_lease: renew, ..RequestOptions::default() };
+    let options =
+        RequestOptions { renew: if renew { Renew::Process } else { Renew::Never }, ..RequestOptions::default() };
     pair.manager.request_with("go", &none(), &options, true).unwrap();
     pair.settle();
     assert!(pair.agv.is_live(slot));
@@ -81,7 +83,7 @@ fn a_lease_that_is_not_renewed_expires_once_in_time() {
 #[test]
 fn each_further_request_renews_a_lease() {
     let (mut pair, slot) = moving(false);
-    let options = RequestOptions { renew_lease: false, ..RequestOptions::default() };
+    let options = RequestOptions { renew: Renew::Never, ..RequestOptions::default() };
     for _ in 0..5 {
         pair.run(LEASE - Duration::from_millis(10));
         assert!(pair.agv.is_live(slot));
@@ -233,7 +235,7 @@ fn a_lease_counts_from_when_the_request_was_made() {
     let slot = pair.agv.offer_leased("go()", LEASE);
     pair.publish();
     pair.manager.net.frozen = true;
-    let options = RequestOptions { renew_lease: false, ..RequestOptions::default() };
+    let options = RequestOptions { renew: Renew::Never, ..RequestOptions::default() };
     pair.manager.request_with("go", &none(), &options, false).unwrap();
     pair.run(Duration::from_millis(400));
     pair.manager.net.frozen = false;
@@ -249,7 +251,7 @@ fn a_request_older_than_its_lease_is_not_run() {
     let slot = pair.agv.offer_leased("go()", LEASE);
     pair.publish();
     pair.manager.net.frozen = true;
-    let options = RequestOptions { renew_lease: false, ..RequestOptions::default() };
+    let options = RequestOptions { renew: Renew::Never, ..RequestOptions::default() };
     let id = pair.manager.request_with("go", &none(), &options, false).unwrap();
     pair.run(LEASE);
     pair.manager.net.frozen = false;

@@ -14,6 +14,7 @@ mod chaos;
 mod delivery;
 mod ends;
 mod gathering;
+mod hearts;
 mod hello;
 mod hostile;
 mod leases;

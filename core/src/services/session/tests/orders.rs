@@ -11,6 +11,7 @@ use crate::distribution::function_list::Slot;
 use crate::distribution::message::{Renewal, SessionBody};
 use crate::error::Error;
 use crate::host::connections::LinkCounter;
+use crate::services::heart::Renew;
 use crate::services::lease::LeaseEnd;
 use crate::services::requests::CallId;
 use crate::time::Duration;
@@ -31,15 +32,14 @@ fn vehicle() -> (Pair, Slot) {
 }
 
 /// Calls `go()`; in classes of their own, two calls run side by side.
-fn go(pair: &mut Pair, class: Priority, renew_lease: bool) -> CallId {
-    let options =
-        RequestOptions { renew_lease, priority: Some(class), timeout: Some(TIMEOUT), ..RequestOptions::default() };
+fn go(pair: &mut Pair, class: Priority, renew: Renew) -> CallId {
+    let options = RequestOptions { renew, priority: Some(class), timeout: Some(TIMEOUT), ..RequestOptions::default() };
     pair.manager.request_with("go", &none(), &options, true).unwrap()
 }
 
 /// The same, begun; what its handler was given.
 fn begun(pair: &mut Pair, class: Priority) -> (CallId, Call) {
-    let id = go(pair, class, true);
+    let id = go(pair, class, Renew::Process);
     pair.settle();
     (id, *pair.agv.held.last().unwrap())
 }
@@ -54,14 +54,14 @@ fn is_told(pair: &Pair, call: CallId, why: LeaseEnd) -> bool {
 
 #[test]
 fn a_call_that_times_out_is_released_at_once_renewed_or_not() {
-    for renewed in [true, false] {
+    for renew in [Renew::Process, Renew::Never] {
         let (mut pair, slot) = vehicle();
-        let id = go(&mut pair, Priority::Normal, renewed);
+        let id = go(&mut pair, Priority::Normal, renew);
         pair.run(TIMEOUT - millis(1));
         assert!(pair.agv.is_live(slot));
         pair.run(millis(1));
         assert_eq!(pair.manager.outcome(id), Some(Err(Error::TimedOut)));
-        assert_eq!((pair.agv.is_live(slot), expirations(&pair)), (false, 1), "renewed: {renewed}");
+        assert_eq!((pair.agv.is_live(slot), expirations(&pair)), (false, 1), "{renew:?}");
         pair.agv.answer_held(Ok(&*none()));
         pair.run(LEASE.times(2));
         assert_eq!((pair.agv.is_live(slot), expirations(&pair)), (false, 1));
@@ -72,7 +72,7 @@ fn a_call_that_times_out_is_released_at_once_renewed_or_not() {
 #[test]
 fn a_call_whose_answer_does_not_come_through_is_released_at_once() {
     let (mut pair, slot) = vehicle();
-    let id = go(&mut pair, Priority::Normal, true);
+    let id = go(&mut pair, Priority::Normal, Renew::Process);
     pair.settle();
     (pair.agv.net.frozen, pair.agv.net.datagrams) = (true, Datagrams::Lost);
     pair.agv.answer_held(Ok(&*none()));
@@ -134,7 +134,7 @@ fn a_newer_call_replaces_an_older_one_for_ever_and_without_the_hook() {
 fn a_call_that_is_released_on_its_way_does_not_begin_and_those_beside_it_do() {
     let (mut pair, slot) = vehicle();
     pair.manager.net.frozen = true;
-    let options = RequestOptions { renew_lease: false, ..RequestOptions::default() };
+    let options = RequestOptions { renew: Renew::Never, ..RequestOptions::default() };
     let calls = [0; 3].map(|_| pair.manager.request_with("go", &none(), &options, true).unwrap());
     pair.manager.cancel(calls[1]);
     pair.settle();
@@ -183,7 +183,7 @@ fn a_release_that_finds_no_room_is_sent_when_there_is_some() {
         pair.manager.direct(Directive::Challenge);
     }
     let withheld = pair.manager.counter(LinkCounter::FramesWithheld);
-    let second = go(&mut pair, Priority::High, true);
+    let second = go(&mut pair, Priority::High, Renew::Process);
     pair.manager.cancel(first);
     pair.manager.cancel(second);
     assert!(pair.manager.counter(LinkCounter::FramesWithheld) > withheld);
@@ -225,7 +225,7 @@ fn a_lost_link_ends_every_order() {
 fn in_a_full_table_the_oldest_call_of_the_function_gives_way() {
     let (mut pair, _) = vehicle();
     pair.manager.net.frozen = true;
-    let calls = [0; 5].map(|_| go(&mut pair, Priority::Normal, true));
+    let calls = [0; 5].map(|_| go(&mut pair, Priority::Normal, Renew::Process));
     assert_eq!(calls.map(|call| pair.manager.session.holds(call)), [false, true, true, true, true]);
     assert_eq!(pair.manager.counter(LinkCounter::RenewalsStopped), 1);
     calls.into_iter().for_each(|call| pair.manager.cancel(call));
@@ -237,7 +237,7 @@ fn in_a_full_table_the_oldest_call_of_the_function_gives_way() {
 /// A renewal that the manager made so long ago, as it arrives at the vehicle.
 fn renewal_arrives(pair: &mut Pair, call: CallId, class: Priority, age: Duration) {
     let stamp = (pair.agv.now - age).as_micros();
-    let renewal = Renewal { call: call.0, class, stamp, since: Duration::ZERO };
+    let renewal = Renewal { call: call.0, class, stamp, since: Duration::ZERO, age: Duration::ZERO };
     let nonce = pair.agv.session.nonce();
     pair.agv.hear_datagram(nonce, &SessionBody::renewal(&renewal));
 }
@@ -245,9 +245,9 @@ fn renewal_arrives(pair: &mut Pair, call: CallId, class: Priority, age: Duration
 #[test]
 fn a_renewal_of_an_older_call_does_not_prolong_the_newer() {
     let (mut pair, slot) = vehicle();
-    let old = go(&mut pair, Priority::Normal, false);
+    let old = go(&mut pair, Priority::Normal, Renew::Never);
     pair.settle();
-    let new = go(&mut pair, Priority::High, false);
+    let new = go(&mut pair, Priority::High, Renew::Never);
     pair.settle();
     (0..2).for_each(|_| pair.agv.answer_held(Ok(&*none())));
     pair.run(millis(400));
@@ -262,7 +262,7 @@ fn a_renewal_of_an_older_call_does_not_prolong_the_newer() {
 #[test]
 fn a_renewal_counts_from_when_it_was_made_and_not_from_its_arrival() {
     let (mut pair, slot) = vehicle();
-    let call = go(&mut pair, Priority::Normal, false);
+    let call = go(&mut pair, Priority::Normal, Renew::Never);
     pair.settle();
     pair.agv.answer_held(Ok(&*none()));
     pair.run(millis(400));
@@ -277,7 +277,7 @@ fn a_renewal_counts_from_when_it_was_made_and_not_from_its_arrival() {
 #[test]
 fn a_renewal_does_nothing_for_a_function_that_was_replaced_since() {
     let (mut pair, _) = vehicle();
-    let call = go(&mut pair, Priority::Normal, false);
+    let call = go(&mut pair, Priority::Normal, Renew::Never);
     pair.settle();
     pair.agv.answer_held(Ok(&*none()));
     pair.agv.replace("go()");
@@ -293,7 +293,7 @@ fn a_renewal_does_nothing_for_a_function_that_was_replaced_since() {
 #[test]
 fn who_holds_a_lease_of_a_function_that_is_removed_is_told_at_once() {
     let (mut pair, slot) = vehicle();
-    let call = go(&mut pair, Priority::Normal, true);
+    let call = go(&mut pair, Priority::Normal, Renew::Process);
     pair.settle();
     pair.agv.answer_held(Ok(&*none()));
     pair.settle();
@@ -313,7 +313,7 @@ fn a_new_call_never_takes_the_place_of_a_dead_lease_before_its_hook_has_run() {
         let slot = pair.agv.offer_leased("go()", LEASE);
         pair.agv.functions.function(slot).unwrap().handler.has_word.set(has_word);
         pair.publish();
-        let options = RequestOptions { renew_lease: false, ..RequestOptions::default() };
+        let options = RequestOptions { renew: Renew::Never, ..RequestOptions::default() };
         pair.manager.request_with("go", &none(), &options, false).unwrap();
         pair.run(LEASE - millis(10));
         let early = pair.manager.request_with("go", &none(), &options, false).unwrap();
@@ -336,7 +336,7 @@ fn the_unit_ends_a_lease_not_later_than_the_motor_sees_it_dead() {
     for late in 0..4 {
         let (mut pair, slot) = vehicle();
         pair.run(millis(late));
-        go(&mut pair, Priority::Normal, false);
+        go(&mut pair, Priority::Normal, Renew::Never);
         pair.settle();
         pair.agv.answer_held(Ok(&*none()));
         while pair.agv.is_live_behind(slot, Duration::ZERO) {

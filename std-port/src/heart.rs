@@ -1,0 +1,105 @@
+//! Hearts of control loops.
+
+use std::fmt;
+use std::sync::{Arc, Mutex};
+
+use cara_core::services::heart::{self, Beats, Renew};
+use cara_core::time::Duration;
+
+use crate::clock::Clock;
+use crate::engine::{CallFuture, Engine};
+use crate::locks::lock;
+
+/// Words of hearts that are not in use. A session may look at one at any time, so they are never freed.
+static FREE: Mutex<Vec<&'static heart::Heart>> = Mutex::new(Vec::new());
+
+/// Shows that one loop of the program runs: [`Handle::heart`](crate::Handle::heart). What names it goes on only while the
+/// loop beats it, and ends at once when it is dropped.
+///
+/// It belongs to one loop and can't be cloned: a beat of another one would hide that this one hangs.
+///
+/// ```no_run
+/// use cara_std::{Duration, Parameters, RequestOptions};
+/// # let depot = cara_std::CommunicationSystem::new("depot", 1)?;
+/// # fn is_still_wanted() -> bool { true }
+///
+/// let mut heart = depot.heart(Duration::from_millis(100));
+/// let wanted = RequestOptions::renewing(heart.renew());
+/// let mut position = Parameters::new();
+/// position.add_int("position", 2)?;
+/// depot.s_unit("agv")?.block_request_with("go_to", &mut position, &wanted)?;
+/// while is_still_wanted() {
+///     heart.beat();
+///     std::thread::sleep(std::time::Duration::from_millis(50));
+/// }
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+pub struct Heart {
+    word: &'static heart::Heart,
+    beats: Beats,
+    clock: Clock,
+    /// Releases what names it.
+    release: Box<dyn Fn(Beats) + Send>,
+}
+
+impl Heart {
+    pub(crate) fn new<T: Send + 'static>(engine: &Arc<Engine<T>>, period: Duration) -> Self {
+        let word = lock(&FREE).pop().unwrap_or_else(|| Box::leak(Box::new(heart::Heart::new(period))));
+        word.set_period(period);
+        let unit = Arc::downgrade(engine);
+        let release = move |beats| {
+            if let Some(engine) = unit.upgrade() {
+                engine.release_beats(beats);
+            }
+        };
+        Self { word, beats: word.beats(), clock: engine.clock(), release: Box::new(release) }
+    }
+
+    /// The loop has come round.
+    pub fn beat(&mut self) {
+        self.word.beat(self.clock.now());
+    }
+
+    /// For the calls of this loop: their leases are renewed as of its last beat.
+    pub const fn renew(&self) -> Renew {
+        Renew::Heart(self.beats)
+    }
+}
+
+impl fmt::Debug for Heart {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Heart").finish_non_exhaustive()
+    }
+}
+
+impl Drop for Heart {
+    fn drop(&mut self) {
+        self.word.stop();
+        (self.release)(self.beats);
+        lock(&FREE).push(self.word);
+    }
+}
+
+/// What a call has started goes on as long as this is kept, if its caller is alive: [`Peer::hold`](crate::Peer::hold).
+#[must_use = "dropped, it is released at once"]
+pub struct Hold<T: Send + 'static = ()> {
+    call: CallFuture<T>,
+}
+
+impl<T: Send + 'static> Hold<T> {
+    pub(crate) const fn new(call: CallFuture<T>) -> Self {
+        Self { call }
+    }
+
+    /// Whether it is renewed: no longer when it has ended there, which [`UnitEvent::LeaseEnded`](crate::UnitEvent::LeaseEnded)
+    /// tells as well.
+    pub fn is_held(&self) -> bool {
+        self.call.is_held()
+    }
+}
+
+impl<T: Send + 'static> fmt::Debug for Hold<T> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Hold").field("is_held", &self.is_held()).finish()
+    }
+}
