@@ -81,12 +81,8 @@ pub(super) fn call<T: Send + 'static>(
     let timeout = system.constraints().request_timeout;
     while !questions.is_empty() {
         let left = timeout - started.elapsed().into();
-        let options = RequestOptions {
-            timeout: Some(left),
-            priority: Some(Priority::Emergency),
-            renew_lease: false,
-            ..RequestOptions::default()
-        };
+        let options =
+            RequestOptions { timeout: Some(left), priority: Some(Priority::Emergency), ..RequestOptions::default() };
         let calls: Vec<_> = questions.iter().filter_map(|(of, call)| Some((outcomes.get(*of)?.peer, call))).collect();
         let mut again = Vec::new();
         block_all(&calls, &options, wanted, &mut |number, answer| {

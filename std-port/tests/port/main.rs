@@ -11,6 +11,7 @@ mod asynchronous;
 mod callbacks;
 mod constraints;
 mod handlers;
+mod hearts;
 mod in_use;
 mod junk;
 #[path = "../keyed/mod.rs"]

@@ -237,7 +237,8 @@ fn a_task_takes_calls_and_awaits_before_it_replies() {
     let (told, peer) = (Rc::clone(&driven), manager.peer("agv").unwrap());
     manager_board.spawn(async move {
         let mut parameters = number(50);
-        told.replace(Some(peer.block_request("go_to", &mut parameters).await.and_then(|()| parameters.variable("n"))));
+        let driven = peer.block_request_with("go_to", &mut parameters, &RequestOptions::renewing(Renew::Process)).await;
+        told.replace(Some(driven.and_then(|()| parameters.variable("n"))));
     });
     bench.run_for(Duration::from_millis(100));
     assert_eq!(ask(&bench, &manager_board, manager, "agv", "double", 1), Ok(2), "other services run meanwhile");

@@ -26,6 +26,7 @@ entry!(messages_written, {
     keep(unknown::<Control<'static>>().encode(unknown_slice()));
     keep((SessionBody::keep_alive(*unknown()), SessionBody::renewal(unknown())));
     keep((SessionBody::release(unknown()), SessionBody::release_all(*unknown(), *unknown())));
+    keep(SessionBody::renewed(*unknown()));
     keep(SessionBody::message_prefix(*unknown()));
 });
 

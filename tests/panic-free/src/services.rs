@@ -14,6 +14,7 @@ use cara_core::distribution::parameters::{Parameters, ParametersView};
 use cara_core::error::Refusal;
 use cara_core::services::access::{self, Access, Bucket, Functions, Principal, Rate, Rule, Verbs, Who};
 use cara_core::services::event::UnitEvent;
+use cara_core::services::heart::Heart;
 use cara_core::services::lease::{Lease, Service};
 use cara_core::services::publications::Publications;
 use cara_core::services::requests::Requests;
@@ -184,6 +185,7 @@ entry!(call_slots, {
 entry!(session_leases, {
     session().end_lease(context(), *unknown());
     keep(session().release(context(), *unknown()));
+    session().release_beats(context(), *unknown());
 });
 
 entry!(replies, {
@@ -212,6 +214,11 @@ entry!(leases, {
     lease.cut(*unknown());
     lease.clear();
     keep(unknown::<Lease>().is_live(*unknown()));
+    let heart = unknown::<Heart>();
+    heart.set_period(*unknown());
+    heart.beat(*unknown());
+    keep((heart.beats(), Heart::new(*unknown()), session::RequestOptions::renewing(*unknown())));
+    heart.stop();
 });
 
 entry!(publications, {

@@ -1,7 +1,8 @@
 //! What fails, and within which time the motors must stand then.
 
 use anyhow::{Context, Result, ensure};
-use cara_std::{Constraints, Duration};
+use cara_apps::agv::GO_TO_LEASE;
+use cara_std::Duration;
 
 use super::inject::EmulatedBoard;
 use super::processes::Processes;
@@ -86,9 +87,9 @@ impl Kind {
     /// From the last sign before the fault until the motors stood.
     pub(super) fn took(&self, stop: &Stop) -> u64 {
         match self.failing {
-            // The manager goes on renewing until it notices, by its own clock: where that took longer, or seems to, its
+            // The manager goes on renewing for one lease, by its own clock: where that took longer, or seems to, its
             // machine was busy.
-            Failing::Wire(Way::FromBoard) => stop.announced.min(SILENCE.as_micros() + stop.renewed),
+            Failing::Wire(Way::FromBoard) => stop.announced.min(GO_TO_LEASE.as_micros() + stop.renewed),
             // Likewise, for as long as the caller waits, or until the manager asks for it: by the manager's clock.
             Failing::Caller { killed } => stop.announced.min(waits(killed) + stop.renewed),
             // From when the new call's task had its turn, by the board's clock.
@@ -116,15 +117,11 @@ pub(super) struct Bound {
     pub(super) of: &'static str,
 }
 
-/// A peer is given up after so long: one and a half keep-alives until the first is missed, and two more.
-const SILENCE: Duration = Constraints::M_UNIT.keep_alive.times(7).divided_by(2);
-
 impl Bound {
     /// From the constants that the image has logged.
     pub(super) fn of(kind: &Kind, said: &str) -> Result<Self> {
         let lease = value(said, "lease=")?;
         let [poll, tick] = [value(said, "poll=")?, value(said, "tick=")?];
-        let silence = SILENCE.as_micros();
         Ok(match kind.failing {
             Failing::Board { reason: "Panic", .. } => Self { micros: tick, of: "tick" },
             // The image takes up to a tick to fill its stack.
@@ -134,9 +131,8 @@ impl Bound {
                 let of = if killed { "question + lease + poll + tick" } else { "time-out + lease + poll + tick" };
                 Self { micros: waits(killed) + lease + poll + tick, of }
             }
-            Failing::Wire(Way::FromBoard) => {
-                Self { micros: silence + lease + poll + tick, of: "silence + lease + poll + tick" }
-            }
+            // The last answer, and the last renewal behind it.
+            Failing::Wire(Way::FromBoard) => Self { micros: 2 * lease + poll + tick, of: "2 leases + poll + tick" },
             _ => Self { micros: lease + poll + tick, of: "lease + poll + tick" },
         })
     }

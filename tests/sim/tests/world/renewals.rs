@@ -5,6 +5,7 @@ use super::*;
 use cara_core::config::{Constraints, Priority};
 use cara_core::error::{CloseReason, Refusal};
 use cara_core::host::connections::LinkCounter;
+use cara_core::services::heart::Renew;
 use cara_core::services::session::RequestOptions;
 use cara_sim::{Action, FaultPlan, Path, UnitEvent};
 use std::collections::BTreeSet;
