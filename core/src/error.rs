@@ -1,7 +1,6 @@
 //! Everything that can go wrong, sorted by where the remedy lies. Small, `Copy`, and each text says what to do.
 
 use crate::config::{VERSIONS, Versions};
-use crate::term::Term;
 use crate::time::Duration;
 
 /// Where the remedy of an [`Error`] lies. There are these four and no others, so a `match` on it needs no other arm.
@@ -129,14 +128,11 @@ pub enum Refusal {
     /// The two have no cipher suite in common.
     #[error("the two units have no cipher suite in common: update one of the two")]
     Suite,
-    /// The manager's term is older than one that the vehicle has obeyed, this one.
+    /// The manager's term is older than one that the vehicle has obeyed, which the vehicle's hello says.
     #[error(
-        "another manager of this name and id has taken over with term {term}: stop one of the two; to command with this one again, start it with --take-over"
+        "another manager of this name and id has taken over: stop one of the two; to command with this one again, start it with --take-over"
     )]
-    Fenced {
-        /// The newest term that the vehicle has obeyed.
-        term: Term,
-    },
+    Fenced,
 }
 
 impl Refusal {
@@ -154,12 +150,12 @@ impl Refusal {
             Self::Mode => 9,
             Self::NoKey => 10,
             Self::Suite => 11,
-            Self::Fenced { .. } => 12,
+            Self::Fenced => 12,
         }
     }
 
     /// The refusal of a byte on the wire. A unit that speaks other versions has told them in its hello before; only version
-    /// 1 did not. The term of one that is fenced is in the hellos, too.
+    /// 1 did not.
     pub const fn from_wire(code: u8) -> Self {
         match code {
             1 => Self::Version(Versions { first: 1, last: 1 }),
@@ -172,7 +168,7 @@ impl Refusal {
             9 => Self::Mode,
             10 => Self::NoKey,
             11 => Self::Suite,
-            12 => Self::Fenced { term: Term::NONE },
+            12 => Self::Fenced,
             _ => Self::Malformed,
         }
     }

@@ -27,8 +27,8 @@ impl<P: Port> Node<P> {
     /// Decides about a link whose hello has come. `from` is the other end of the stream.
     pub(crate) fn admit(&mut self, now: Instant, link: LinkId, from: P::Endpoint, hello: &Hello) -> Admission {
         if let Err(refusal) = self.check(hello).and_then(|()| self.check_term(hello)) {
-            if let Refusal::Fenced { term } = refusal {
-                self.fenced_at_vehicle(term);
+            if refusal == Refusal::Fenced {
+                self.fenced_at_vehicle(hello.term);
             }
             return self.refuse(now, from, &hello.identity, refusal);
         }
@@ -200,7 +200,7 @@ impl<P: Port> Node<P> {
             Refusal::AlreadyConnected => NodeCounter::RefusedConnected,
             Refusal::Mode => NodeCounter::RefusedMode,
             Refusal::NoKey => NodeCounter::RefusedKey,
-            Refusal::Fenced { .. } => NodeCounter::RefusedFenced,
+            Refusal::Fenced => NodeCounter::RefusedFenced,
         };
         self.counters.add(counter, 1);
         self.note_of(now, address, identity, refusal);

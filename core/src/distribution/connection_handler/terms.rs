@@ -68,7 +68,7 @@ impl<P: Port> Node<P> {
             (Role::MUnit, Role::SUnit) => (self.terms.own, hello.term),
             (Role::MUnit, Role::MUnit) => return Ok(()),
         };
-        if obeyed.is_newer_than(manager) { Err(Refusal::Fenced { term: obeyed }) } else { Ok(()) }
+        if obeyed.is_newer_than(manager) { Err(Refusal::Fenced) } else { Ok(()) }
     }
 
     /// A vehicle that has proven itself has obeyed a newer term than this manager's.

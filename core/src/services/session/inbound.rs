@@ -12,7 +12,7 @@ use crate::distribution::items::{Items, Malformed};
 use crate::distribution::message::{Control, Message, REQUEST_BYTES, RequestHeader, SessionBody};
 use crate::distribution::parameters::ParametersView;
 use crate::distribution::{block, datagram};
-use crate::error::{CloseReason, Error};
+use crate::error::{CloseReason, Error, Refusal};
 use crate::host::connections::{Incoming, LinkCounter, Place};
 use crate::host::endpoint::Endpoint as _;
 use crate::host::frame::Frame;
@@ -179,7 +179,7 @@ impl<P: Port> Session<P> {
                 None
             }
             (Incoming::Refuse(code), _) => {
-                self.refused(code);
+                self.end(CloseReason::Refused(Refusal::from_wire(code)));
                 None
             }
             (Incoming::Close(code), _) => {

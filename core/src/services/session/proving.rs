@@ -12,7 +12,6 @@ use crate::host::endpoint::Endpoint as _;
 use crate::host::frame::Frame;
 use crate::host::secure::Secure;
 use crate::services::{Context, Port};
-use crate::term::Term;
 use crate::time::{Duration, Instant};
 
 impl<P: Port> Session<P> {
@@ -107,15 +106,6 @@ impl<P: Port> Session<P> {
     pub(super) fn ended_in_clear(&mut self) {
         self.link.counters.add(LinkCounter::FarewellsInClear, 1);
         self.end(CloseReason::Unproven);
-    }
-
-    /// The peer does not take the link. Of a manager and a vehicle the newer term is the vehicle's.
-    pub(super) fn refused(&mut self, code: u8) {
-        let theirs = self.remote.as_ref().map_or(Term::NONE, |remote| remote.hello.term);
-        self.end(CloseReason::Refused(match Refusal::from_wire(code) {
-            Refusal::Fenced { .. } => Refusal::Fenced { term: self.local.term.newer(theirs) },
-            refusal => refusal,
-        }));
     }
 
     /// What the hello told counts from here on.

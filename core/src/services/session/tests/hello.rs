@@ -43,7 +43,7 @@ fn a_term_that_is_over_is_told_to_both() {
         pair.manager.hub.hub.node.set_term(if manager_refuses { over } else { newer });
         pair.agv.hub.hub.node.set_term(newer);
         pair.settle();
-        let closed = Event::Closed(CloseReason::Refused(Refusal::Fenced { term: newer }));
+        let closed = Event::Closed(CloseReason::Refused(Refusal::Fenced));
         assert!(pair.agv.has(&closed), "{:?}", pair.agv.happened);
         assert!(pair.manager.has(&closed), "{:?}", pair.manager.happened);
     }
