@@ -65,6 +65,8 @@ fn a_vehicle_fences_by_itself_and_keeps_what_it_has_obeyed() {
         world.restart(&agv);
         world.restart(&manager);
         assert!(world.run_until(|_| is_fenced(&manager, 2), secs(60)), "seed {seed}: {:?}", manager.log());
+        // What the manager said last is on its way.
+        world.run_for(secs(1));
         let fenced = CloseReason::Refused(Refusal::Fenced);
         let told = |event: &UnitEvent| matches!(event, UnitEvent::NotJoined { reason, .. } if *reason == fenced);
         assert!(agv.count(told) > 0 && agv.term() == Term(2), "seed {seed}: {:?}", agv.log());
