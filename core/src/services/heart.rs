@@ -110,3 +110,57 @@ impl Renew {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::arithmetic_side_effects)]
+    use std::boxed::Box;
+
+    use super::*;
+
+    const fn at(millis: u64) -> Instant {
+        Instant::from_micros(millis * 1_000)
+    }
+
+    fn heart() -> &'static Heart {
+        Box::leak(Box::new(Heart::new(Duration::from_millis(100))))
+    }
+
+    fn age(heart: &'static Heart, millis: u64) -> Option<u64> {
+        heart.beats().age(at(millis)).map(Duration::as_millis)
+    }
+
+    #[test]
+    fn it_has_no_age_before_its_first_beat_and_behind_its_stop() {
+        let heart = heart();
+        assert_eq!(age(heart, 1), None);
+        heart.beat(at(10));
+        assert!(age(heart, 10).is_some());
+        let before = heart.beats();
+        heart.stop();
+        assert_eq!((before.age(at(11)), age(heart, 11)), (None, None));
+        heart.beat(at(12));
+        assert!(before.age(at(12)).is_none() && age(heart, 12).is_some());
+    }
+
+    #[test]
+    fn its_age_is_never_too_small_and_too_large_by_two_milliseconds_at_most() {
+        let heart = heart();
+        let wrap = 1_u64 << 32;
+        for beaten in [1, 2, 1_001, wrap - 1, wrap, wrap + 1, 3 * wrap + 500] {
+            heart.beat(at(beaten));
+            for later in [0, 1, 399, 400, 1_000_000] {
+                let told = age(heart, beaten + later);
+                assert!(told > Some(later) || told == Some(later), "{beaten} {later}: {told:?}");
+                assert!(told <= Some(later + 2), "{beaten} {later}: {told:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_beat_that_is_newer_than_the_look_is_new() {
+        let heart = heart();
+        heart.beat(at(500));
+        assert_eq!(age(heart, 490), Some(1));
+    }
+}
