@@ -20,7 +20,7 @@ use cara_core::time::Duration;
 use crate::access::AccessTable;
 use crate::builder;
 #[cfg(feature = "control")]
-use crate::control::{self, Control, Server};
+use crate::control::{self, Audit, Control, Server};
 use crate::engine::{Engine, pairs};
 use crate::error::StartError;
 use crate::event::{Finding, UnitEvent};
@@ -94,6 +94,8 @@ pub(crate) struct Owner<T: Send + 'static> {
     #[cfg(feature = "control")]
     control: Control,
     #[cfg(feature = "control")]
+    audit: Option<Arc<Audit>>,
+    #[cfg(feature = "control")]
     pub(crate) server: Mutex<Option<Server>>,
 }
 
@@ -110,12 +112,18 @@ fn wait_until(limit: std::time::Duration, condition: impl Fn() -> bool) {
 }
 
 impl<T: Send + 'static> Owner<T> {
-    pub(crate) fn new(engine: Arc<Engine<T>>, #[cfg(feature = "control")] control: Control) -> Self {
+    pub(crate) fn new(
+        engine: Arc<Engine<T>>,
+        #[cfg(feature = "control")] control: Control,
+        #[cfg(feature = "control")] audit: Option<Arc<Audit>>,
+    ) -> Self {
         Self {
             engine,
             guest: false,
             #[cfg(feature = "control")]
             control,
+            #[cfg(feature = "control")]
+            audit,
             #[cfg(feature = "control")]
             server: Mutex::new(None),
         }
@@ -136,7 +144,7 @@ impl<T: Send + 'static> Owner<T> {
 #[cfg(feature = "control")]
 impl<T: Send + 'static> Owner<T> {
     fn guest(engine: Arc<Engine<T>>) -> Self {
-        let mut guest = Self::new(engine, Control::Off);
+        let mut guest = Self::new(engine, Control::Off, None);
         guest.guest = true;
         guest
     }
@@ -147,7 +155,7 @@ impl<T: Send + 'static> Owner<T> {
         // Dropping a server without stopping it would leak its threads.
         if server.is_none() && !self.engine.is_stopping() {
             let guest = Self::guest(self.engine.clone());
-            *server = control::open(&self.control, Handle::of(guest));
+            *server = control::open(&self.control, self.audit.clone(), Handle::of(guest));
         }
     }
 }

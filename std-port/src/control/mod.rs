@@ -10,6 +10,7 @@
 
 mod answering;
 mod attributes;
+mod audit;
 mod call;
 mod client;
 mod constraint;
@@ -27,8 +28,10 @@ mod stop;
 mod values;
 
 use std::path::PathBuf;
+use std::sync::Arc;
 
 pub use answering::execute;
+pub(crate) use audit::Audit;
 pub use client::{Answers, Client, ControlError, RunningUnit, UnitState, running, running_called, running_in};
 pub use elsewhere::{Elsewhere, elsewhere};
 pub use place::directory;
@@ -78,13 +81,17 @@ pub(crate) fn held(control: &Control, identity: &Identity, fleet: Fleet) -> Opti
 
 /// Opens the socket of a unit that has been started. A unit that cannot have one runs without it, with a warning in the
 /// log.
-pub(crate) fn open<T: Send + 'static>(control: &Control, guest: CommunicationSystem<T>) -> Option<Server> {
+pub(crate) fn open<T: Send + 'static>(
+    control: &Control,
+    audit: Option<Arc<Audit>>,
+    guest: CommunicationSystem<T>,
+) -> Option<Server> {
     let path = match control {
         Control::Off => return None,
         Control::Path(path) => path.clone(),
         Control::Default => directory().join(place::file_name(&guest.identity(), guest.fleet())),
     };
-    match Server::open(&path, guest) {
+    match Server::open(&path, audit, guest) {
         Ok(server) => Some(server),
         Err(error) => {
             tracing::warn!(%error, "there is no control socket: the `cara` command will not find this unit");

@@ -14,6 +14,7 @@ use std::time::{Duration, Instant};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use super::answering::execute_for;
+use super::audit::{Audit, Entry, Who};
 use super::lines::{Line, Lines};
 use super::place::{Place, PlaceError, own_uid, peer_uid};
 use super::protocol::{Answer, CONTROL_VERSION, Failure, LONGEST_LINE, Question};
@@ -51,6 +52,7 @@ struct Shared {
     waker: Waker,
     stopping: AtomicBool,
     idle_limit: Duration,
+    audit: Option<Arc<Audit>>,
     connections: Mutex<Connections>,
 }
 
@@ -79,9 +81,13 @@ impl Connections {
 
 impl Server {
     /// Answers questions about `system` at `path`. The handle must not be one that keeps the unit running.
-    pub(super) fn open<T: Send + 'static>(path: &Path, system: CommunicationSystem<T>) -> Result<Self, PlaceError> {
+    pub(super) fn open<T: Send + 'static>(
+        path: &Path,
+        audit: Option<Arc<Audit>>,
+        system: CommunicationSystem<T>,
+    ) -> Result<Self, PlaceError> {
         let (place, listener) = Place::open(path)?;
-        let started = Shared::new(IDLE_TIMEOUT).and_then(|shared| shared.accept_with(listener, system));
+        let started = Shared::new(IDLE_TIMEOUT, audit).and_then(|shared| shared.accept_with(listener, system));
         match started {
             Ok(shared) => Ok(Self { place, shared }),
             Err(error) => {
@@ -111,9 +117,9 @@ impl Server {
 }
 
 impl Shared {
-    fn new(idle_limit: Duration) -> io::Result<Arc<Self>> {
+    fn new(idle_limit: Duration, audit: Option<Arc<Audit>>) -> io::Result<Arc<Self>> {
         let (waker, stopping, connections) = (Waker::new()?, AtomicBool::new(false), Mutex::default());
-        Ok(Arc::new(Self { waker, stopping, idle_limit, connections }))
+        Ok(Arc::new(Self { waker, stopping, idle_limit, audit, connections }))
     }
 
     fn accept_with<T: Send + 'static>(
@@ -208,6 +214,7 @@ impl Shared {
         stream.set_write_timeout(Some(WRITE_TIMEOUT))?;
         let mut writer = Answers::new(&stream);
         let mut lines = Lines::new(&stream);
+        let who = Who::of(&stream)?;
         let unit = system.identity();
         writer.give(&Answer::Hello {
             control_version: CONTROL_VERSION,
@@ -226,7 +233,12 @@ impl Shared {
                 Ok(question) => {
                     let client = RefCell::new(Beats { stream: &stream, lines: &mut lines, last: Instant::now() });
                     let lives = |within| !self.is_stopping() && client.borrow_mut().lives(within);
-                    execute_for(system, &question, &mut |answer| writer.sink(&answer), &lives);
+                    let mut entry = self.audit.as_ref().and_then(|audit| Entry::of(audit, &who, &question));
+                    let mut sink = |answer| {
+                        entry.iter_mut().for_each(|entry| entry.note(&answer));
+                        writer.sink(&answer)
+                    };
+                    execute_for(system, &question, &mut sink, &lives);
                 }
                 Err(failure) => drop(writer.sink(&Answer::Failed(failure))),
             }
@@ -327,11 +339,29 @@ mod tests {
     use crate::UnitEvent;
     use crate::testing::{fleet, manager};
 
+    #[test]
+    fn what_a_client_has_done_is_noted_with_who_asked() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("audit");
+        let system = manager(fleet(), Constraints::M_UNIT);
+        let shared = Shared::new(IDLE_TIMEOUT, Some(Arc::new(Audit::open(&path).unwrap()))).unwrap();
+        let (mut client, served) = UnixStream::pair().unwrap();
+        client.write_all(b"{\"ask\":\"retire\",\"node\":\"agv/1\"}\n{\"ask\":\"nodes\"}\n").unwrap();
+        client.shutdown(Shutdown::Write).unwrap();
+        let _ = shared.serve(served, &Mutex::default(), &system);
+        let line: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(&path).unwrap()).unwrap();
+        assert_eq!(
+            (&line["ask"], &line["node"], &line["pid"]),
+            (&"retire".into(), &"agv/1".into(), &std::process::id().into())
+        );
+        assert_eq!(line["outcome"], "UnknownNode");
+    }
+
     /// Each client has asked before it is served, so that its time to ask is no race.
     #[test]
     fn a_client_that_asks_nothing_is_ended_and_one_that_waits_for_an_answer_is_not() {
         let system = manager(fleet(), Constraints::M_UNIT);
-        let shared = Shared::new(Duration::from_millis(20)).unwrap();
+        let shared = Shared::new(Duration::from_millis(20), None).unwrap();
         std::thread::scope(|scope| {
             let client = |asks: &[u8]| {
                 let (client, served) = UnixStream::pair().unwrap();

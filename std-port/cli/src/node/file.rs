@@ -104,6 +104,7 @@ pub(super) struct Capacities {
 pub(super) struct Control {
     pub(super) off: Maybe<bool>,
     pub(super) path: Maybe<String>,
+    pub(super) audit: Maybe<String>,
 }
 
 /// `[metrics]`

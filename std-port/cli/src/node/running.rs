@@ -2,6 +2,7 @@
 
 use std::io::ErrorKind;
 use std::net::{SocketAddr, TcpListener};
+use std::path::Path;
 use std::sync::{Arc, OnceLock};
 
 use anyhow::Context;
@@ -29,6 +30,10 @@ pub(super) fn run(settings: Settings, over: &Overrides, logging: &Logging, globa
     let node = Node::build(&settings).map_err(|error| match error {
         NotBuilt::Unit(error) => not_built(error, &settings),
         NotBuilt::Access(error) => Ended::usage(error.to_string()),
+        NotBuilt::Audit(error) => {
+            let path = settings.audit.as_deref().unwrap_or(Path::new("")).display();
+            Ended::usage(format!("the audit log {path} cannot be written: {error}"))
+        }
     })?;
     offer_all(&node, &settings, &programs)?;
     let metrics = settings.metrics.as_ref().map(|place| listen(place, &settings)).transpose()?;

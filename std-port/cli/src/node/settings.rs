@@ -40,6 +40,8 @@ pub(super) struct Settings {
     pub(super) constraints: Constraints,
     pub(super) capacities: Capacities,
     pub(super) control: Control,
+    /// Where it notes what operators have it do.
+    pub(super) audit: Option<PathBuf>,
     /// It starts although a live one has its identity.
     pub(super) takes_over: bool,
     /// Where it keeps its term.
@@ -142,6 +144,7 @@ fn checked(source: Source, file: &File, over: &Overrides, mistakes: &mut Vec<Mis
         tcp_port: tcp_port(file, role, over, mistakes),
         constraints: limits::constraints(&file.constraints, role, mistakes),
         control: control(&file.control, role, mistakes),
+        audit: audit(&file.control, mistakes),
         metrics: metrics(file, over, mistakes),
         access: access(file, over, mistakes),
         file_log: log(file, mistakes),
@@ -281,15 +284,28 @@ fn placed<T: Copy>(over: Option<T>, written: &Maybe<T>) -> Option<Placed<T>> {
 
 fn control(table: &file::Control, role: Role, mistakes: &mut Vec<Mistake>) -> Control {
     let off = table.off.as_ref().is_some_and(|off| *off.get_ref());
-    let Some(path) = &table.path else { return if off { Control::Off } else { Control::Default } };
     if role == Role::SUnit {
         let help = "take the line out; operators reach the vehicle through its manager";
-        mistakes.push(Mistake::new(path.span(), "an s_unit has no control socket", help));
-    } else if off || path.get_ref().is_empty() || path.get_ref().contains('\0') {
+        for path in [&table.path, &table.audit].into_iter().flatten() {
+            mistakes.push(Mistake::new(path.span(), "an s_unit has no control socket", help));
+        }
+    }
+    let Some(path) = &table.path else { return if off { Control::Off } else { Control::Default } };
+    if off || path.get_ref().is_empty() || path.get_ref().contains('\0') {
         let help = "write a path, or off = true, or neither for the usual place";
         mistakes.push(Mistake::new(path.span(), "there is no control socket at this path", help));
     }
     Control::Path(path.get_ref().into())
+}
+
+fn audit(table: &file::Control, mistakes: &mut Vec<Mistake>) -> Option<PathBuf> {
+    let path = table.audit.as_ref()?;
+    let is_asked = table.off.as_ref().is_none_or(|off| !*off.get_ref());
+    if !is_asked || path.get_ref().is_empty() || path.get_ref().contains('\0') {
+        let help = "write a file's path, and leave the control socket on: what comes through it is noted";
+        mistakes.push(Mistake::new(path.span(), "there is no audit log at this path", help));
+    }
+    Some(path.get_ref().into())
 }
 
 fn metrics(file: &File, over: &Overrides, mistakes: &mut Vec<Mistake>) -> Option<Placed<SocketAddr>> {

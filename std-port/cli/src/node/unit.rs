@@ -23,6 +23,8 @@ pub(super) enum NotBuilt {
     Unit(BuildError),
     /// Its access table was correct when it was looked at first.
     Access(AccessError),
+    /// Its audit log.
+    Audit(std::io::Error),
 }
 
 impl<E: Into<BuildError>> From<E> for NotBuilt {
@@ -46,6 +48,10 @@ impl Node {
                 None => builder,
             };
             let builder = builder.control(settings.control.clone()).take_over(settings.takes_over);
+            let builder = match &settings.audit {
+                Some(path) => builder.audit(path).map_err(NotBuilt::Audit)?,
+                None => builder,
+            };
             return Ok(Self::Manager(with(builder, settings).map_err(NotBuilt::Access)?.build()?));
         };
         let builder = Unit::builder(name, *id, &manager.name, manager.id)?;
