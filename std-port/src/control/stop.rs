@@ -7,7 +7,7 @@ use cara_core::config::Priority;
 use cara_core::distribution::function::Attributes;
 use cara_core::services::access::Verb;
 
-use super::answering::{End, LOOK, Sink, permit, send};
+use super::answering::{End, Sink, permit, send};
 use super::call::{block_all, called};
 use super::protocol::{Answer, CallQuestion, Failure};
 use super::select;
@@ -78,31 +78,15 @@ pub(super) fn call<T: Send + 'static>(
         }
         if outcome.open > 0 { outcomes.push(outcome) } else { missed.push(outcome) }
     }
-    let timeout = system.constraints().request_timeout;
-    while !questions.is_empty() {
-        let left = timeout - started.elapsed().into();
-        let options =
-            RequestOptions { timeout: Some(left), priority: Some(Priority::Emergency), ..RequestOptions::default() };
-        let calls: Vec<_> = questions.iter().filter_map(|(of, call)| Some((outcomes.get(*of)?.peer, call))).collect();
-        let mut again = Vec::new();
-        block_all(&calls, &options, wanted, &mut |number, answer| {
-            let Some((of, question)) = questions.get(number) else { return Ok(()) };
-            let (Answer::Called { error, .. }, Some(outcome)) = (answer, outcomes.get_mut(*of)) else { return Ok(()) };
-            // It has not run: a node takes few calls of one class at a time.
-            let is_full = error.as_ref().is_some_and(|failure| matches!(failure.error.as_str(), "Busy" | "Full"));
-            if is_full && LOOK < left.into() {
-                again.push((*of, question.clone()));
-                return Ok(());
-            }
-            outcome.open -= 1;
-            outcome.error = outcome.error.take().or(error);
-            if outcome.open == 0 { told(outcome, started, sink) } else { Ok(()) }
-        })?;
-        questions = again;
-        if !questions.is_empty() {
-            std::thread::sleep(LOOK);
-        }
-    }
+    let options = RequestOptions { priority: Some(Priority::Emergency), ..RequestOptions::default() };
+    let calls: Vec<_> = questions.iter().filter_map(|(of, call)| Some((outcomes.get(*of)?.peer, call))).collect();
+    block_all(&calls, &options, wanted, &mut |number, answer| {
+        let Some(outcome) = questions.get(number).and_then(|(of, _)| outcomes.get_mut(*of)) else { return Ok(()) };
+        let Answer::Called { error, .. } = answer else { return Ok(()) };
+        outcome.open -= 1;
+        outcome.error = outcome.error.take().or(error);
+        if outcome.open == 0 { told(outcome, started, sink) } else { Ok(()) }
+    })?;
     missed.iter().try_for_each(|outcome| told(outcome, started, sink))
 }
 

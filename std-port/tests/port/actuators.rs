@@ -24,6 +24,7 @@ struct Crane {
     /// What `slow` could change, at its beginning and once its order had ended.
     committed: Arc<Mutex<Vec<bool>>>,
     callers: [CommunicationSystem; 2],
+    fleet: u32,
 }
 
 impl Crane {
@@ -65,7 +66,7 @@ impl Crane {
         functions.add_service(&define("free()"), ServiceOptions::new().resets(&drive), nothing).unwrap();
         unit.publish_my_function_list().unwrap();
         let callers = [("one", 1), ("two", 2)].map(|(name, id)| system_named(name, id, fleet).build().unwrap());
-        let crane = Self { unit, drive, hooks, moved_in_halt, committed, callers };
+        let crane = Self { unit, drive, hooks, moved_in_halt, committed, callers, fleet };
         crane.unit.start().unwrap();
         crane.callers.iter().for_each(|caller| caller.start().unwrap());
         until("both see it", || crane.callers.iter().all(|caller| caller.nodes_offering("free").len() == 1));
@@ -142,10 +143,28 @@ fn a_stop_of_a_second_unit_ends_the_order_of_the_first_and_lasts_until_a_reset()
     crane.callers[1].stop();
     until("it has left", || crane.unit.number_of_m_units() == 1);
     assert_eq!(crane.ask(0, "go"), stopped);
-    assert_eq!(crane.ask(0, "free"), Ok(()));
+    // A reset counts from the earliest time at which it can have been asked for: one right behind the stop is refused.
+    until("it is reset", || crane.ask(0, "free") == Ok(()));
     // The order of the first has ended there as well once its link has looked.
     until("it moves again", || crane.ask(0, "go") == Ok(()));
     assert!(crane.moves() && crane.hooks() == 1);
+}
+
+/// The unit that stopped it is killed or loses its link, and another process of its name is no other unit.
+#[test]
+fn a_stop_outlasts_the_link_and_the_start_of_the_unit_that_stopped_it() {
+    let crane = Crane::new();
+    assert_eq!(crane.ask(1, "halt"), Ok(()));
+    crane.callers[1].stop();
+    until("it has left", || crane.unit.number_of_m_units() == 1);
+    let again = system_named("two", 2, crane.fleet).build().unwrap();
+    again.start().unwrap();
+    until("it has come back", || again.nodes_offering("free").len() == 1);
+    let dock = |by: &CommunicationSystem| by.nodes_offering("dock")[0].block_request("dock", &mut Parameters::new());
+    let stopped = Err(Error::Inhibited { by: 2, reason: 0 });
+    assert_eq!((dock(&again), dock(&crane.callers[0])), (stopped, stopped));
+    until("it is reset", || again.nodes_offering("free")[0].block_request("free", &mut Parameters::new()) == Ok(()));
+    assert_eq!(dock(&crane.callers[0]), Ok(()));
 }
 
 #[test]

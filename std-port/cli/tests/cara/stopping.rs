@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use cara_std::{Call, Definition, ParametersView, Priority, ServiceError, ServiceOptions, Unit};
+use cara_std::{Call, Constraints, Definition, ParametersView, Priority, ServiceError, ServiceOptions, Unit};
 
 use crate::support::{Stage, until};
 
@@ -18,9 +18,15 @@ impl Vehicle {
     fn start(stage: &Stage, name: &str, id: u32, stops: &[&str]) -> Self {
         let is_safe = Arc::new(AtomicBool::new(true));
         stage.know(name, id);
-        let unit = stage.vehicle(name, id).build().unwrap();
+        let constraints = Constraints { calls_per_peer: 2, ..Constraints::S_UNIT };
+        let unit = stage.vehicle(name, id).constraints(constraints).build().unwrap();
         let functions = unit.my_function_list();
         let define = |text: String| Definition::parse(&text).unwrap();
+        // So that the calls of several functions meet.
+        let slow = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+            std::thread::sleep(std::time::Duration::from_millis(100));
+            Ok(())
+        };
         let nothing = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
         for (number, stop) in stops.iter().enumerate() {
             let drive = functions.actuator(|| ()).unwrap();
@@ -28,7 +34,7 @@ impl Vehicle {
             let go = if number == 0 { "go()".to_owned() } else { format!("go_{number}()") };
             functions.add_service(&define(go), moves, nothing).unwrap();
             let options = ServiceOptions::new().stops(&drive).priority(Priority::Emergency);
-            functions.add_service(&define(format!("{stop}()")), options, nothing).unwrap();
+            functions.add_service(&define(format!("{stop}()")), options, slow).unwrap();
         }
         let safe = is_safe.clone();
         let free = move |_: &Call, _: &mut ParametersView| match safe.load(Ordering::SeqCst) {
@@ -127,7 +133,7 @@ fn a_vehicle_may_refuse_the_reset() {
     stage.ends(0, &["call", "agv", "go"]);
 }
 
-/// A node takes two emergencies of one peer at a time; the others are asked again.
+/// As many at the same time as the vehicle takes of other calls, and more.
 #[test]
 fn each_drive_of_a_vehicle_is_stopped() {
     let stage = Stage::with(&[]);
