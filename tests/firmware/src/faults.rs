@@ -8,6 +8,8 @@ mod inject;
 mod kind;
 mod orders;
 mod processes;
+mod shared;
+mod stopping;
 
 use anyhow::{Result, ensure};
 use clap::Args;
@@ -15,6 +17,7 @@ use clap::Args;
 use crate::board::{Bench, INSTRUCTION};
 use kind::{Bound, KINDS, Kind};
 pub(crate) use processes::stand_alone;
+pub(crate) use shared::stand_alone as stand_alone_shared;
 
 /// How often what fails.
 #[derive(Args, Clone, Debug)]
@@ -41,6 +44,8 @@ pub(crate) struct Stop {
     announced: u64,
     /// From the last renewal of the lease until then.
     renewed: u64,
+    /// From the first datagram behind that call until then; 0 where none came.
+    heard: u64,
     /// The longest turn of the executor so far.
     turn: u64,
 }

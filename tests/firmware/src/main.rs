@@ -67,7 +67,11 @@ enum Part {
         key_file: Option<PathBuf>,
     },
     /// A vehicle that can hold its own state for ever.
-    Vehicle,
+    Vehicle {
+        /// An m_unit with an actuator, for two callers.
+        #[arg(long)]
+        shared: bool,
+    },
     /// Puts a board under load and prints how deep its stack was.
     Stack {
         /// What the image is.
@@ -101,7 +105,8 @@ fn main() -> ExitCode {
     let arguments = Arguments::parse();
     let outcome = match &arguments.part {
         Some(Part::Manager { key_file }) => manager::stand_alone(key_file.as_deref()).map(|()| ExitCode::SUCCESS),
-        Some(Part::Vehicle) => faults::stand_alone().map(|()| ExitCode::SUCCESS),
+        Some(Part::Vehicle { shared: true }) => faults::stand_alone_shared().map(|()| ExitCode::SUCCESS),
+        Some(Part::Vehicle { shared: false }) => faults::stand_alone().map(|()| ExitCode::SUCCESS),
         Some(Part::Ends { times }) => {
             session::ends(&arguments.image, arguments.cara.as_deref(), *times).map(|()| ExitCode::SUCCESS)
         }

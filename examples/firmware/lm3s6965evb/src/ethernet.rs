@@ -166,7 +166,10 @@ impl RxToken for Received<'_> {
             }
         }
         let end = (length.saturating_sub(CHECKSUM_BYTES)).clamp(LENGTH_BYTES, LENGTH_BYTES + FRAME_BYTES);
-        act(&mut self.buffer[LENGTH_BYTES..end])
+        let frame = &mut self.buffer[LENGTH_BYTES..end];
+        #[cfg(feature = "faults")]
+        crate::faults::received(frame);
+        act(frame)
     }
 }
 

@@ -9,6 +9,7 @@
 
 use core::cell::Cell;
 use core::mem::{MaybeUninit, size_of};
+use core::sync::atomic::{AtomicBool, Ordering};
 
 use cara_apps::agv::{Agv, GO_TO_LEASE};
 use cara_board::Reason;
@@ -25,7 +26,8 @@ use crate::creep::{self, CREEPING};
 use crate::motor;
 
 /// Makes the board fail: 0 notes that something outside is about to fail, 1 hangs in the handler, 2 starves all tasks,
-/// 3 panics, 4 calls itself until the stack is full, 5 has a frame larger than the stack.
+/// 3 panics, 4 calls itself until the stack is full, 5 has a frame larger than the stack, 6 presses the bumper in an
+/// interrupt, 7 frees it.
 const FAULT: &str = "fault(kind: int)";
 /// Longest turn of the executor while nothing is broken: until it ends, a frame that has arrived may wait.
 const POLL: CoreDuration = CoreDuration::from_millis(20);
@@ -35,6 +37,7 @@ const STEP: CoreDuration = CoreDuration::from_millis(1);
 /// Words of a lease in memory.
 const LEASE_WORDS: usize = size_of::<Lease>() / size_of::<u32>();
 
+static PRESSING: AtomicBool = AtomicBool::new(false);
 static STARVING: Signal<CriticalSectionRawMutex, ()> = Signal::new();
 static RECORD: Mutex<Cell<Record>> = Mutex::new(Cell::new(Record::NEW));
 
@@ -42,6 +45,8 @@ static RECORD: Mutex<Cell<Record>> = Mutex::new(Cell::new(Record::NEW));
 struct Record {
     /// When the fault was announced.
     marked: Instant,
+    /// When the first datagram behind that was taken from the network's controller.
+    heard: Option<Instant>,
     /// The last tick before which a renewal of the lease was seen.
     renewed: Instant,
     /// How far the lease is known to reach.
@@ -65,6 +70,7 @@ struct Record {
 impl Record {
     const NEW: Self = Self {
         marked: Instant::START,
+        heard: None,
         renewed: Instant::START,
         reaches: Instant::START,
         ticked: Instant::START,
@@ -91,7 +97,7 @@ impl Record {
 pub fn offer(vehicle: Vehicle) -> Result<(), Error> {
     let fault = Handler::method(&|_: &mut Agv, _, parameters| {
         let kind = parameters.variable::<i64>("kind").map_err(|_| ServiceError::BadResults)?;
-        Record::change(|record| record.marked = now());
+        Record::change(|record| (record.marked, record.heard) = (now(), None));
         fail(kind);
         Ok(())
     });
@@ -118,6 +124,8 @@ fn fail(kind: i64) {
         2 => STARVING.signal(()),
         3 => panic!("asked for"),
         4 | 5 => overflow(kind),
+        6 => PRESSING.store(true, Ordering::Release),
+        7 => cara_vehicle::bumper(false),
         _ => {}
     }
 }
@@ -237,18 +245,46 @@ pub(crate) fn tick() {
     });
 }
 
+/// A frame was taken from the network's controller.
+pub(crate) fn received(frame: &[u8]) {
+    const IPV4: [u8; 2] = [8, 0];
+    const UDP: u8 = 17;
+    let is_own = frame.first().is_some_and(|first| first & 1 == 0);
+    if is_own && frame.get(12..14) == Some(&IPV4) && frame.get(23) == Some(&UDP) {
+        Record::change(|record| record.heard = record.heard.or(Some(now())));
+    }
+}
+
+/// The motors' interrupt has looked: the latest moment before its next look, as an interrupt of a bumper may have it.
+pub(crate) fn ticked() {
+    // There is no swap on this processor; a press that is asked for in between is seen with the next tick.
+    if PRESSING.load(Ordering::Acquire) {
+        PRESSING.store(false, Ordering::Release);
+        Record::change(|record| record.marked = now());
+        cara_vehicle::bumper(true);
+    }
+}
+
 /// The motors were, and are, on.
 pub(crate) fn switched(before: bool, on: bool) {
     if before == on {
         return;
     }
     let now = now();
-    let Record { marked, renewed, turn, late, .. } = Record::change(|record| *record);
+    let Record { marked, heard, renewed, turn, late, .. } = Record::change(|record| *record);
     if on {
         defmt::info!("motors on");
         return;
     }
     let [marked, renewed] = [marked, renewed].map(|sign| now.since(sign).as_micros());
+    let heard = heard.map_or(0, |heard| now.since(heard).as_micros());
     let [turn, late] = [turn, late].map(CoreDuration::as_micros);
-    defmt::info!("motors off: announced={=u64} renewed={=u64} late={=u64} turn={=u64}", marked, renewed, late, turn);
+    defmt::info!(
+        "motors off: announced={=u64} renewed={=u64} heard={=u64} late={=u64} turn={=u64}",
+        marked,
+        renewed,
+        heard,
+        late,
+        turn
+    );
 }

@@ -91,5 +91,7 @@ mod handlers {
         #[cfg(feature = "faults")]
         crate::faults::tick();
         cara_board::tick::<Board>(may_move());
+        #[cfg(feature = "faults")]
+        crate::faults::ticked();
     }
 }

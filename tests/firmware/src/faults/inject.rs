@@ -23,10 +23,10 @@ pub(super) const STANDS: Duration = Duration::from_millis(300);
 /// How often a manager renews that has its turns.
 const RENEWED: Duration = Duration::from_millis(100);
 /// Times that a drive is started again because this machine was too busy to renew a lease in time.
-const TRIES: u32 = 5;
+pub(super) const TRIES: u32 = 5;
 /// What the board logs.
 pub(super) const ON: &str = "motors on";
-const OFF: &str = "motors off:";
+pub(super) const OFF: &str = "motors off:";
 const LEFT: &str = "depot has left";
 const HOOK: &str = "hook for the lost manager";
 
@@ -41,10 +41,10 @@ pub(super) struct EmulatedBoard {
 }
 
 /// A vehicle that drives, and whose fault has been announced.
-struct Drive {
-    agv: Peer,
+pub(super) struct Drive {
+    pub(super) agv: Peer,
     /// Where the log of its motors begins.
-    line: usize,
+    pub(super) line: usize,
 }
 
 impl Target for EmulatedBoard {
@@ -71,11 +71,15 @@ impl Target for EmulatedBoard {
             Failing::Caller { killed: true } => self.caller_is_killed(dice),
             Failing::Caller { killed: false } => self.caller_times_out(number, dice),
             Failing::Board { asked, reason } => self.board_fails(in_turn(asked, number), reason, dice),
-            Failing::StateHeld | Failing::SecondManager => bail!("only processes of Linux fail so"),
+            Failing::Flooded => self.is_stopped(dice),
+            Failing::Bumper => self.stops_itself(dice),
+            Failing::StateHeld | Failing::SecondManager | Failing::Held | Failing::NoRight => {
+                bail!("only processes of Linux fail so")
+            }
         };
         let which = || format!("{}, number {number}", kind.name);
         let stop = stop.with_context(which)?;
-        stop.check(&self.constants).with_context(which)?;
+        stop.check(&self.constants, kind).with_context(which)?;
         Ok(stop)
     }
 }
@@ -219,7 +223,7 @@ impl EmulatedBoard {
     }
 
     /// Sends the vehicle on its way, and announces a fault at some moment.
-    fn drive(&self, manager: &Manager, dice: &mut fastrand::Rng) -> Result<Drive> {
+    pub(super) fn drive(&self, manager: &Manager, dice: &mut fastrand::Rng) -> Result<Drive> {
         for _ in 0..TRIES {
             let agv = manager.meet(&self.who)?;
             let line = self.board.line();

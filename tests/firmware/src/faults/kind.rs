@@ -32,6 +32,14 @@ pub(super) enum Failing {
         /// Its process is killed; otherwise it has waited for as long as it wants to.
         killed: bool,
     },
+    /// The manager stops the vehicle while its other calls keep it busy.
+    Flooded,
+    /// The vehicle stops itself, in an interrupt.
+    Bumper,
+    /// Another caller wants to move the vehicle, on Linux, and then the first one wants no more.
+    Held,
+    /// A caller stops the vehicle, on Linux, and may not reset it.
+    NoRight,
     /// Nothing gives the application's state back, on Linux.
     StateHeld,
     /// A second manager of the first one's name starts, on Linux.
@@ -52,7 +60,7 @@ pub(super) struct Kind {
 }
 
 /// All of them.
-pub(super) const KINDS: [Kind; 16] = [
+pub(super) const KINDS: [Kind; 20] = [
     Kind { name: "manager killed", failing: Failing::Manager { frozen: false } },
     Kind { name: "manager frozen", failing: Failing::Manager { frozen: true } },
     Kind { name: "manager held up", failing: Failing::Turns },
@@ -68,6 +76,10 @@ pub(super) const KINDS: [Kind; 16] = [
     Kind { name: "order replaced", failing: Failing::Replaced },
     Kind { name: "caller timed out", failing: Failing::Caller { killed: false } },
     Kind { name: "caller killed", failing: Failing::Caller { killed: true } },
+    Kind { name: "stopped while calls flood it", failing: Failing::Flooded },
+    Kind { name: "stopped by its bumper", failing: Failing::Bumper },
+    Kind { name: "another holder's call, then released", failing: Failing::Held },
+    Kind { name: "stopped, and reset without right", failing: Failing::NoRight },
     Kind { name: "state held for ever", failing: Failing::StateHeld },
     Kind { name: "second manager", failing: Failing::SecondManager },
 ];
@@ -79,7 +91,7 @@ impl Kind {
     /// Where it happens.
     pub(super) fn target(&self, bench: &Bench) -> Result<Box<dyn Target>> {
         Ok(match self.failing {
-            Failing::StateHeld | Failing::SecondManager => Box::new(Processes),
+            Failing::StateHeld | Failing::SecondManager | Failing::Held | Failing::NoRight => Box::new(Processes),
             _ => Box::new(EmulatedBoard::new(bench)?),
         })
     }
@@ -94,6 +106,11 @@ impl Kind {
             Failing::Caller { killed } => stop.announced.min(waits(killed) + stop.renewed),
             // From when the new call's task had its turn, by the board's clock.
             Failing::Replaced => stop.announced,
+            // The lease goes on, and is not what ends the motion.
+            Failing::Bumper => stop.announced,
+            // From when the board took the datagram of the stop, if that came before the stop in the stream.
+            Failing::Flooded if stop.heard > 0 => stop.heard,
+            Failing::Flooded => stop.announced,
             _ => stop.announced.min(stop.renewed),
         }
     }
@@ -103,6 +120,12 @@ impl Kind {
 pub(super) const TIMEOUT: Duration = Duration::from_millis(1_500);
 /// How often a manager asks whether the process of a caller is there: `cara_std`'s control socket.
 const ASKED: Duration = Duration::from_millis(100);
+
+/// The longest turn of the executor while calls come faster than the board answers them.
+const FLOODED: Duration = Duration::from_millis(40);
+
+/// For so long at most the image masks interrupts, as while it logs: a tick may be late by that.
+const MASKED: Duration = Duration::from_micros(500);
 
 /// How long a manager goes on for a caller that fails, in microseconds.
 fn waits(killed: bool) -> u64 {
@@ -127,6 +150,8 @@ impl Bound {
             // The image takes up to a tick to fill its stack.
             Failing::Board { reason: OVERFLOW, .. } => Self { micros: 2 * tick, of: "filling + tick" },
             Failing::Replaced => Self { micros: tick, of: "tick" },
+            Failing::Bumper => Self { micros: MASKED.as_micros() + tick, of: "masked + tick" },
+            Failing::Flooded => Self { micros: FLOODED.as_micros() + tick, of: "turn of a flood + tick" },
             Failing::Caller { killed } => {
                 let of = if killed { "question + lease + poll + tick" } else { "time-out + lease + poll + tick" };
                 Self { micros: waits(killed) + lease + poll + tick, of }
@@ -143,14 +168,20 @@ impl Stop {
     pub(super) fn read(said: &str) -> Result<Self> {
         let late = value(said, "late=")?;
         let since = |name| value(said, name).map(|micros| micros.saturating_sub(late));
-        Ok(Self { announced: since("announced=")?, renewed: since("renewed=")?, turn: value(said, "turn=")? })
+        Ok(Self {
+            announced: since("announced=")?,
+            renewed: since("renewed=")?,
+            heard: since("heard=")?,
+            turn: value(said, "turn=")?,
+        })
     }
 
     /// No turn of the executor may be longer than the bound takes it to be, and no lease may last longer than it does.
-    pub(super) fn check(&self, said: &str) -> Result<()> {
+    pub(super) fn check(&self, said: &str, kind: &Kind) -> Result<()> {
         let [lease, poll, tick] = ["lease=", "poll=", "tick="].map(|name| value(said, name));
         let (poll, tick) = (poll?, tick?);
         let allowed = lease? + poll + tick;
+        let poll = if kind.failing == Failing::Flooded { FLOODED.as_micros() } else { poll };
         let Self { renewed, turn, .. } = self;
         ensure!(*turn <= poll, "a turn of the executor took {turn} µs, and the bound has {poll} of them");
         ensure!(*renewed <= allowed, "motors off {renewed} µs behind the last renewal, and {allowed} are allowed");

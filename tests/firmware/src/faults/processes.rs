@@ -13,13 +13,13 @@ use rustix::time::{ClockId, clock_gettime};
 
 use super::inject::{STANDS, pause};
 use super::kind::{Bound, Failing, Kind};
-use super::{Stop, Target};
+use super::{Stop, Target, shared};
 use crate::board::{FLEET, LONG, Who};
 
 /// What the vehicle prints, each with the time of the system's clock in microseconds.
-const ON: &str = "motors on";
-const OFF: &str = "motors off";
-const SAFE: &str = "safe hook";
+pub(super) const ON: &str = "motors on";
+pub(super) const OFF: &str = "motors off";
+pub(super) const SAFE: &str = "safe hook";
 /// What it is told.
 const HOLD: &str = "hold";
 /// Between two looks of the motors' loop at the lease.
@@ -41,17 +41,22 @@ impl Target for Processes {
         false
     }
 
-    fn bound(&self, _: &Kind) -> Result<Bound> {
+    fn bound(&self, kind: &Kind) -> Result<Bound> {
+        if matches!(kind.failing, Failing::Held | Failing::NoRight) {
+            return Ok(Bound { micros: micros(TURN), of: "turn" });
+        }
         Ok(Bound { micros: BOUND, of: "lease + turn" })
     }
 
     fn fail(&self, kind: &Kind, number: u32, dice: &mut fastrand::Rng) -> Result<Stop> {
         let stopped = match kind.failing {
             Failing::StateHeld => state_is_held(dice),
+            Failing::Held => shared::held(dice),
+            Failing::NoRight => shared::stopped_without_right(dice),
             _ => second_manager(dice),
         };
         let announced = stopped.with_context(|| format!("{}, number {number}", kind.name))?;
-        Ok(Stop { announced, renewed: announced, turn: 0 })
+        Ok(Stop { announced, renewed: announced, ..Stop::default() })
     }
 }
 
@@ -64,7 +69,7 @@ fn state_is_held(dice: &mut fastrand::Rng) -> Result<u64> {
     pause(dice);
     let fault = now();
     manager.freeze()?;
-    stopped(&vehicle, fault)
+    stopped(&vehicle, fault, 1, true)
 }
 
 /// A second manager does not start beside the first one, starts when the first one hangs, and the first one moves nothing
@@ -78,7 +83,7 @@ fn second_manager(dice: &mut fastrand::Rng) -> Result<u64> {
     pause(dice);
     let fault = now();
     first.freeze()?;
-    let took = stopped(&vehicle, fault)?;
+    let took = stopped(&vehicle, fault, 1, true)?;
     let second = manager()?;
     vehicle.expect(ON, LONG)?;
     first.thaw()?;
@@ -90,17 +95,25 @@ fn second_manager(dice: &mut fastrand::Rng) -> Result<u64> {
     Ok(took)
 }
 
-/// From the fault until both the motors' loop and the safe hook have stopped the vehicle, in microseconds, less what the
-/// vehicle's canary was late meanwhile.
-fn stopped(vehicle: &Process, fault: u64) -> Result<u64> {
+/// From the fault until both the motors' loop and the safe hook have stopped the vehicle for the `nth` time, in microseconds;
+/// where it is `excused`, less what the vehicle's canary was late meanwhile.
+pub(super) fn stopped(vehicle: &Process, fault: u64, nth: usize, excused: bool) -> Result<u64> {
+    let deadline = std::time::Instant::now() + LONG;
     let at = |what: &str| -> Result<(u64, u64)> {
-        let line = vehicle.seen(what, LONG)?;
+        let line = loop {
+            let line = vehicle.lines().into_iter().filter(|line| line.text.starts_with(what)).nth(nth - 1);
+            if let Some(line) = line {
+                break line;
+            }
+            ensure!(std::time::Instant::now() < deadline, "no `{what}` in {:?}", vehicle.lines());
+            std::thread::sleep(TICK);
+        };
         let mut numbers = line.text.split_whitespace().filter_map(|word| word.parse().ok());
         let missing = || format!("no times in `{}`", line.text);
         Ok((numbers.next().with_context(missing)?, numbers.next().with_context(missing)?))
     };
     let ((motors, motors_late), (hook, hook_late)) = (at(OFF)?, at(SAFE)?);
-    let took = |at: u64, late: u64| at.saturating_sub(fault).saturating_sub(late);
+    let took = |at: u64, late: u64| at.saturating_sub(fault).saturating_sub(if excused { late } else { 0 });
     let (motors, hook) = (took(motors, motors_late), took(hook, hook_late));
     if motors.max(hook) > BOUND {
         println!(
@@ -118,7 +131,7 @@ fn manager() -> Result<Process> {
     start("manager", &["--image", "none", "manager"])
 }
 
-fn start(name: &str, arguments: &[&str]) -> Result<Process> {
+pub(super) fn start(name: &str, arguments: &[&str]) -> Result<Process> {
     Process::start(name, &std::env::current_exe()?, arguments)
 }
 
@@ -153,7 +166,7 @@ fn hold() {
 }
 
 /// The motors' loop. It is the canary as well: how late its turns came within the last lease, at the worst.
-fn motors(lease: &LeaseWatch, late: &AtomicU64) {
+pub(super) fn motors(lease: &LeaseWatch, late: &AtomicU64) {
     let mut on = false;
     let mut worst = (now(), 0);
     loop {
@@ -172,7 +185,7 @@ fn motors(lease: &LeaseWatch, late: &AtomicU64) {
 }
 
 /// The system's clock, which is the same in all processes.
-fn now() -> u64 {
+pub(super) fn now() -> u64 {
     let time = clock_gettime(ClockId::Boottime);
     time.tv_sec as u64 * 1_000_000 + time.tv_nsec as u64 / 1_000
 }
