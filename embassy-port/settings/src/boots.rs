@@ -155,6 +155,25 @@ impl<F: NorFlash> Boots<F> {
     }
 }
 
+/// The term in [`Boots`], whatever the flash: a program of several boards has one static for it.
+pub trait TermStore: Send {
+    /// The term that is kept; `None` if the flash cannot be read.
+    fn stored(&mut self) -> Option<Term>;
+
+    /// Keeps a term, as [`Boots::keep_term`] does; whether it is kept.
+    fn store(&mut self, term: Term) -> bool;
+}
+
+impl<F: NorFlash + Send> TermStore for Boots<F> {
+    fn stored(&mut self) -> Option<Term> {
+        self.term().ok()
+    }
+
+    fn store(&mut self, term: Term) -> bool {
+        self.keep_term(term).is_ok()
+    }
+}
+
 impl<F: NorFlash> BootCounter for Boots<F> {
     type Error = BootError<F::Error>;
 

@@ -5,6 +5,7 @@ mod limits;
 mod losses;
 mod restarts;
 mod security;
+mod terms;
 
 use anyhow::Result;
 
@@ -17,7 +18,7 @@ pub(crate) struct Check {
 }
 
 /// All of them.
-pub(crate) const CHECKS: [Check; 18] = [
+pub(crate) const CHECKS: [Check; 19] = [
     Check { name: "it is found by broadcast and shows its functions", run: calls::found },
     Check { name: "it drives where it is sent, and arrives", run: calls::driven },
     Check { name: "it stops when nobody renews its lease", run: calls::not_renewed },
@@ -35,5 +36,6 @@ pub(crate) const CHECKS: [Check; 18] = [
     Check { name: "with keys of others it joins no manager", run: security::other_keys },
     Check { name: "a board that is told to be insecure is", run: security::insecure },
     Check { name: "no two lives have one key", run: security::lives },
+    Check { name: "after its restart it refuses an older manager", run: terms::kept },
     Check { name: "it comes back from every loss of power", run: restarts::run },
 ];

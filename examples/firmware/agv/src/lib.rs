@@ -17,6 +17,8 @@ mod log;
 pub mod provision;
 #[cfg(feature = "tasks")]
 pub mod tasks;
+#[cfg(feature = "secure")]
+mod terms;
 
 use core::sync::atomic::{AtomicBool, Ordering};
 
@@ -119,6 +121,11 @@ fn unit_config(settings: &Settings, security: Security) -> Result<Config, Vehicl
     let identity = &settings.identity;
     let config = Config::s_unit(identity.name(), identity.id(), &manager.name, manager.id, security)?;
     let config = config.fleet(settings.fleet.0);
+    #[cfg(feature = "secure")]
+    let config = match terms::kept() {
+        Some(kept) => config.term(kept, terms::keep),
+        None => config,
+    };
     Ok(match settings.manager_address {
         Some(address) => config.manager_address(address),
         None => config,

@@ -6,10 +6,14 @@ use cara_embassy::Security;
 use cara_secure::random::{BootCounter, Random};
 use cara_settings::Settings;
 #[cfg(feature = "secure")]
+use cara_settings::boots::TermStore;
+#[cfg(feature = "secure")]
 use cara_settings::keys::{Keys, KeysError};
 use cara_settings::page::{self, PageError};
 
 use crate::info;
+#[cfg(feature = "secure")]
+use crate::terms;
 
 /// What a vehicle was provisioned with.
 pub struct Provision {
@@ -75,11 +79,15 @@ impl Provision {
 impl Proof {
     /// Begins a life of the board: moves the count of its starts, before the network starts, and draws from it and from what
     /// noise the hardware has. `None` when the count cannot be kept, which the log tells: the board could repeat itself.
-    pub fn begin<C: BootCounter>(self, boots: &mut C, noise: [u32; 2]) -> Option<Security> {
+    /// With keys, the vehicle keeps the term that it obeys beside the count.
+    pub fn begin<C: BootCounter + TermStore>(self, boots: &'static mut C, noise: [u32; 2]) -> Option<Security> {
         match self {
             Self::Insecure => Some(Security::insecure(seed(noise))),
             Self::Keys(keys) => match Random::start(keys.secret().clone(), boots, &noise) {
-                Ok(random) => Some(Security::keys(lend(keys), random)),
+                Ok(random) => {
+                    terms::lend(boots);
+                    Some(Security::keys(lend(keys), random))
+                }
                 Err(_) => {
                     crate::error!(
                         "the count of starts cannot be kept, and this board joins no manager: its flash is worn out"
@@ -171,7 +179,9 @@ mod tests {
     #[cfg(feature = "secure")]
     #[test]
     fn a_board_that_cannot_count_its_starts_joins_nobody() {
+        use cara_core::term::Term;
         use cara_secure::keys::{DeviceSecret, DiscoveryKey};
+        use std::boxed::Box;
 
         struct Worn;
 
@@ -183,8 +193,19 @@ mod tests {
             }
         }
 
+        impl TermStore for Worn {
+            fn stored(&mut self) -> Option<Term> {
+                None
+            }
+
+            fn store(&mut self, _: Term) -> bool {
+                false
+            }
+        }
+
+        let worn = || Box::leak(Box::new(Worn));
         let keys = Keys::new(DeviceSecret::new([1; 32]), 1, DiscoveryKey::new([2; 32]));
-        assert!(Proof::Keys(keys).begin(&mut Worn, [0; 2]).is_none());
-        assert!(Proof::Insecure.begin(&mut Worn, [0; 2]).is_some());
+        assert!(Proof::Keys(keys).begin(worn(), [0; 2]).is_none());
+        assert!(Proof::Insecure.begin(worn(), [0; 2]).is_some());
     }
 }

@@ -6,7 +6,8 @@
 //!
 //! - `file=PATH`: more words stand in a file of the host, as `cara provision lm3s6965evb --output PATH` writes it. Keys
 //!   do, because a list of the host's processes shows arguments;
-//! - `boots=PATH`: the file of the host that stands for the two pages of flash of the board's boot counter;
+//! - `boots=PATH`: the file of the host that stands for the two pages of flash of the board's boot counter and its
+//!   term;
 //! - `seed=N` replaces the hardware's noise, for tests in which each boot has the same.
 
 use cara_settings::{Settings, TextError};
@@ -137,6 +138,8 @@ mod secured {
     use cara_settings::keys::{Keys, KeysError, of_text};
     use cara_vehicle::provision::{Provision, halves};
 
+    use static_cell::StaticCell;
+
     use super::{Path, Told, Words};
     use crate::boots;
 
@@ -159,12 +162,13 @@ mod secured {
         /// logged.
         #[inline(never)]
         pub fn security(self) -> Option<(Settings, Security, u64)> {
+            static BOOTS: StaticCell<boots::File> = StaticCell::new();
             let Self { settings, noise, secrets: Secrets { keys, boots } } = self;
             let Provision { settings, proof } = Provision::of(settings, || keys)?;
             let security = if cfg!(feature = "constant-random") {
                 proof.begin_constant()
             } else {
-                proof.begin(&mut boots::File(&boots), halves(noise))?
+                proof.begin(BOOTS.init(boots::File(boots)), halves(noise))?
             };
             Some((settings, security, noise))
         }

@@ -1,10 +1,11 @@
-//! The count of the board's lives, in a file of the host: QEMU's board has no flash that can be written, and none that
+//! The count of the board's lives and the term that it obeys, in a file of the host: QEMU's board has no flash that can be written, and none that
 //! outlives it. The file stands for two small pages of such flash; what is written to them is what a real board writes.
 
 use core::ffi::CStr;
 
+use cara_core::term::Term;
 use cara_secure::random::BootCounter;
-use cara_settings::boots::{BootError, Boots};
+use cara_settings::boots::{BootError, Boots, TermStore};
 use embedded_storage::nor_flash::{ErrorType, NorFlash, NorFlashError, NorFlashErrorKind, ReadNorFlash};
 use semihosting::fs;
 use semihosting::io::{Read, Seek, SeekFrom, Write};
@@ -15,7 +16,13 @@ use crate::arguments::Path;
 const PAGE: u32 = 512;
 
 /// The file with this path, which is made where there is none.
-pub(crate) struct File<'p>(pub(crate) &'p Path);
+pub(crate) struct File(pub(crate) Path);
+
+impl File {
+    fn boots(&self) -> Result<Boots<Pages>, Refused> {
+        Ok(Boots::new(Pages::open(&self.0)?, [0, PAGE], PAGE))
+    }
+}
 
 /// The host does not let the board read or write the file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -27,14 +34,23 @@ impl NorFlashError for Refused {
     }
 }
 
-impl BootCounter for File<'_> {
+impl BootCounter for File {
     type Error = BootError<Refused>;
 
     fn advance(&mut self) -> Result<u64, Self::Error> {
-        let mut boots = Boots::new(Pages::open(self.0)?, [0, PAGE], PAGE);
-        let count = boots.advance()?;
+        let count = self.boots()?.advance()?;
         cara_vehicle::info!("start number {}", count);
         Ok(count)
+    }
+}
+
+impl TermStore for File {
+    fn stored(&mut self) -> Option<Term> {
+        self.boots().ok()?.term().ok()
+    }
+
+    fn store(&mut self, term: Term) -> bool {
+        self.boots().is_ok_and(|mut boots| boots.keep_term(term).is_ok())
     }
 }
 

@@ -1,4 +1,4 @@
-//! What flash keeps: the settings with the keys, and the count of the board's lives.
+//! What flash keeps: the settings with the keys, and the count of the board's lives with the term that it obeys.
 #![allow(unsafe_code)]
 
 use cara_settings::board;
@@ -6,6 +6,7 @@ use cara_settings::boots::Boots;
 use cara_settings::page;
 use embassy_rp::flash::{self, Blocking};
 use embassy_rp::peripherals::FLASH;
+use static_cell::StaticCell;
 
 /// The build script chooses it by the feature.
 const BOARD: board::Board = board::of_feature(env!("CARA_BOARD"));
@@ -29,9 +30,10 @@ pub(crate) fn pages() -> [&'static [u8]; 2] {
     BOARD.pages.map(page)
 }
 
-/// The count of the board's lives, in pages of its own.
-pub(crate) fn lives(flash: Flash) -> Lives {
-    Boots::new(flash, BOARD.boots.map(|address| address - START), BOARD.erase_bytes)
+/// The count of the board's lives, in pages of its own. Called once.
+pub(crate) fn lives(flash: Flash) -> &'static mut Lives {
+    static LIVES: StaticCell<Lives> = StaticCell::new();
+    LIVES.init(Boots::new(flash, BOARD.boots.map(|address| address - START), BOARD.erase_bytes))
 }
 
 fn page(address: u32) -> &'static [u8] {

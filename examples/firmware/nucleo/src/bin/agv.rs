@@ -19,7 +19,7 @@ async fn main(spawner: Spawner) {
     let mut board = Board::start();
     let [first, second] = board.pages;
     let known = Provision::read(first, second).and_then(|Provision { settings, proof }| {
-        proof.begin(&mut board.lives, halves(board.seed)).map(|security| (settings, security))
+        proof.begin(board.lives, halves(board.seed)).map(|security| (settings, security))
     });
     let Some((settings, security)) = known else { led::unprovisioned(async |on| board.led.set(on)).await };
     defmt::unwrap!(spawn(

@@ -21,9 +21,9 @@ async fn main(spawner: Spawner) {
 async fn run(spawner: Spawner) -> Result<(), SpawnError> {
     static SOCKETS: StaticCell<StackResources<{ LIMITS.sockets() }>> = StaticCell::new();
     static RESOURCES: StaticCell<VehicleResources> = StaticCell::new();
-    let Board { pages: [first, second], mut lives, seed, led, button, watchdog, network } = Board::start(spawner).await;
+    let Board { pages: [first, second], lives, seed, led, button, watchdog, network } = Board::start(spawner).await;
     let known = Provision::read(first, second).and_then(|Provision { settings, proof }| {
-        proof.begin(&mut lives, halves(seed)).map(|security| (settings, security))
+        proof.begin(lives, halves(seed)).map(|security| (settings, security))
     });
     let Some((settings, security)) = known else {
         spawner.spawn(flicker(led)?);

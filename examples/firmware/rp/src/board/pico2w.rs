@@ -47,8 +47,8 @@ static LIGHT: Signal<CriticalSectionRawMutex, bool> = Signal::new();
 pub struct Board {
     /// The pages of flash that hold its settings.
     pub pages: [&'static [u8]; 2],
-    /// Counts its lives.
-    pub lives: Lives,
+    /// Counts its lives, and keeps the term that it obeys.
+    pub lives: &'static mut Lives,
     /// A number that differs from boot to boot, from the jitter of the ring oscillator.
     pub seed: u64,
     /// The LED on the board, which the radio switches.
