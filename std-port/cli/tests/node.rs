@@ -311,7 +311,7 @@ fn number(value: i64) -> Parameters {
 }
 
 fn call(peer: &Peer, function: &str, n: i64) -> Result<i64, Error> {
-    let options = cara_std::RequestOptions { timeout: Some(PATIENCE.into()), ..Default::default() };
+    let options = RequestOptions { timeout: Some(PATIENCE.into()), ..RequestOptions::renewing(Renew::Process) };
     let mut parameters = number(n);
     parameters.add_int("m", 1).unwrap();
     peer.block_request_with(function, &mut parameters, &options).map(|()| parameters.variable("m").unwrap())

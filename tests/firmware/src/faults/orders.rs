@@ -5,7 +5,7 @@ use std::process::Stdio;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
-use cara_std::{Error, Parameters, Peer, RequestOptions};
+use cara_std::{Error, Parameters, Peer, Renew, RequestOptions};
 
 use super::Stop;
 use super::inject::{EmulatedBoard, ON, STANDS, pause};
@@ -62,7 +62,7 @@ impl EmulatedBoard {
         let (outcome, ends) = std::thread::scope(|scope| {
             let call = scope.spawn(|| {
                 let timeout = Some(TIMEOUT);
-                let options = RequestOptions { timeout, ..RequestOptions::default() };
+                let options = RequestOptions { timeout, ..RequestOptions::renewing(Renew::Process) };
                 agv.block_request_with(CREEP, &mut arguments(1, NEVER)?, &options)
             });
             let cut = self.board.logs_behind(line, ON).and_then(|line| {
@@ -144,7 +144,8 @@ const MOVES: &str = " moves";
 
 /// Calls the service, which answers at once and goes on.
 fn creep(agv: &Peer, speed: i64) -> Result<()> {
-    agv.block_request(CREEP, &mut arguments(speed, 0)?).context(CREEP)
+    let wanted = RequestOptions::renewing(Renew::Process);
+    agv.block_request_with(CREEP, &mut arguments(speed, 0)?, &wanted).context(CREEP)
 }
 
 fn arguments(speed: i64, answers: i64) -> Result<Parameters, Error> {

@@ -1,5 +1,6 @@
 //! Whatever happens, one thing after another: nothing runs twice, nothing moves unwanted, and all come back.
 
+use cara_core::services::heart::Renew;
 use cara_core::services::session::RequestOptions;
 use cara_core::time::Duration;
 use cara_sim::Path;
@@ -73,7 +74,7 @@ fn whatever_happens_the_fleet_comes_back(world: &mut dyn World) {
 impl Fleet {
     /// A numbered request to each AGV, asynchronous or not, and the wish that one drives.
     fn ask(&mut self, world: &mut dyn World) {
-        let options = RequestOptions { timeout: Some(secs(1)), ..RequestOptions::default() };
+        let options = RequestOptions { timeout: Some(secs(1)), ..RequestOptions::renewing(Renew::Process) };
         for index in 0..AGVS {
             let (name, parameters) = (format!("agv-{index}"), number("n", self.next));
             self.next += 1;
