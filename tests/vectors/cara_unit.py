@@ -522,7 +522,7 @@ class Unit:
         if lease is not None:
             every = max(lease / 4000, 0.005)
             self.held[number] = {
-                "name": name, "class": priority, "every": every, "next": now + every, "lease": lease / 1e6, "answered": now,
+                "name": name, "class": priority, "every": every, "next": now + every, "lease": lease / 1000, "answered": now,
             }
         request = {"request": {
             "id": number, "slot": theirs["slot"], "generation": theirs["generation"], "wants_reply": True, "unknown": 0,

@@ -20,6 +20,7 @@ pub struct EventLog(Arc<Mutex<Entries>>);
 struct Entries {
     of: HashMap<Identity, Seen>,
     ran: Vec<&'static str>,
+    calls: u64,
 }
 
 impl EventLog {
@@ -54,6 +55,11 @@ impl EventLog {
         std::mem::take(&mut self.entries().ran)
     }
 
+    /// How many calls have run in all.
+    pub fn calls(&self) -> u64 {
+        self.entries().calls
+    }
+
     /// Records joins until the unit is gone.
     pub fn follow(&self, events: Receiver<UnitEvent>) {
         let log = self.clone();
@@ -76,6 +82,7 @@ impl EventLog {
                 let mut entries = log.entries();
                 entries.of.entry(call.caller.clone()).or_default().marks.push(mark);
                 entries.ran.push(name);
+                entries.calls += 1;
                 Ok(())
             };
             functions.add_service(&definition, ServiceOptions::new(), note)?;

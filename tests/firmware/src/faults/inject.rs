@@ -8,7 +8,7 @@ use std::time::Duration;
 use anyhow::{Context, Result, bail, ensure};
 use cara_apps::agv::GO_TO_LEASE;
 use cara_processes::Process;
-use cara_std::{CloseReason, Error, Peer, Renew, RequestOptions, UnitEvent};
+use cara_std::{CloseReason, Error, Peer, UnitEvent};
 
 use super::kind::{Bound, Failing, Kind, OVERFLOW};
 use super::{Stop, Target};
@@ -161,7 +161,7 @@ impl EmulatedBoard {
         let manager = Manager::start(&self.keys)?;
         let Drive { agv, line } = self.drive(&manager, dice)?;
         self.cut(failing)?;
-        agv.request_with("go_to", &at([-9_000, 0])?, &RequestOptions::renewing(Renew::Process))?;
+        agv.request("go_to", &at([-9_000, 0])?)?;
         let (behind, stop) = self.stopped(line)?;
         if number.is_multiple_of(2) {
             // The link is back before its loss was detected, and the command arrives, too late.
@@ -204,7 +204,7 @@ impl EmulatedBoard {
         manager.forget_events();
         agv.request("fault", &fault(asked)?)?;
         // Whatever becomes of it, the next life of the board does not run it.
-        let _ = agv.request_with("go_to", &at([-9_000, 0])?, &RequestOptions::renewing(Renew::Process));
+        let _ = agv.request("go_to", &at([-9_000, 0])?);
         let (behind, stop) = self.stopped(line)?;
         if reason == OVERFLOW {
             self.board.logs_behind(behind, "the lease's words are as they were")?;
