@@ -284,9 +284,9 @@ const fn is_before(time: Instant, end: u32) -> bool {
     end != 0 && (end.wrapping_sub(time) as i32) > 0
 }
 
-/// The end in milliseconds, rounded down to an odd number, which is never the 0 of "no lease".
-const fn odd_millis(end: Instant) -> u64 {
-    let millis = end.as_micros() / 1_000;
+/// A time in milliseconds, rounded down to an odd number, which is never the 0 of "none".
+pub(crate) const fn odd_millis(time: Instant) -> u64 {
+    let millis = time.as_micros() / 1_000;
     if millis & 1 == 0 { millis.saturating_sub(1) | 1 } else { millis }
 }
 
@@ -366,7 +366,7 @@ pub(crate) struct Held {
     pub(crate) slot: Slot,
     pub(crate) class: Priority,
     pub(crate) lease: Duration,
-    /// For whom it is renewed.
+    /// For how long the call wants it.
     pub(crate) renew: Renew,
     /// The next renewal.
     pub(crate) next: Instant,

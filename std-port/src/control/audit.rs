@@ -21,7 +21,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use rustix::net::sockopt::socket_peercred;
 use serde_json::{Value, json};
 
-use super::protocol::{Answer, Question};
+use super::protocol::{Answer, CallQuestion, Question};
 use crate::locks::lock;
 use crate::seldom::warn_seldom;
 
@@ -86,26 +86,28 @@ impl Who {
     }
 }
 
-/// One question that changes something, and what comes of it.
-pub(super) struct Entry<'a> {
-    audit: &'a Audit,
-    who: &'a Who,
-    question: &'a Question,
-    is_told: bool,
+/// What a question asks for.
+#[derive(Clone, Copy)]
+struct Asked<'q> {
+    ask: &'static str,
+    call: Option<&'q CallQuestion>,
+    node: Option<&'q String>,
 }
 
-impl<'a> Entry<'a> {
+impl<'q> Asked<'q> {
     /// `None` for a question that only looks.
-    pub(super) fn of(audit: &'a Audit, who: &'a Who, question: &'a Question) -> Option<Self> {
-        let acts = match question {
-            Question::Call(_)
-            | Question::Hold(_)
-            | Question::Stop { .. }
-            | Question::Reset { .. }
-            | Question::Bench { .. }
-            | Question::Publish { .. }
-            | Question::Set { .. }
-            | Question::Retire { .. } => true,
+    fn of(question: &'q Question) -> Option<Self> {
+        let of_node = |ask, node| Some(Self { ask, call: None, node });
+        let of_call = |ask, call: &'q CallQuestion| Some(Self { ask, call: Some(call), node: call.node.as_ref() });
+        match question {
+            Question::Call(call) => of_call("call", call),
+            Question::Hold(call) => of_call("hold", call),
+            Question::Bench { call, .. } => of_call("bench", call),
+            Question::Stop { node } => of_node("stop", node.as_ref()),
+            Question::Reset { node } => of_node("reset", node.as_ref()),
+            Question::Publish { node, .. } => of_node("publish", node.as_ref()),
+            Question::Set { node, .. } => of_node("set", node.as_ref()),
+            Question::Retire { node } => of_node("retire", Some(node)),
             Question::Unit
             | Question::Nodes { .. }
             | Question::Search
@@ -113,9 +115,23 @@ impl<'a> Entry<'a> {
             | Question::Watch
             | Question::Counters { .. }
             | Question::Metrics
-            | Question::Ping { .. } => false,
-        };
-        acts.then(|| Self { audit, who, question, is_told: false })
+            | Question::Ping { .. } => None,
+        }
+    }
+}
+
+/// One question that changes something, and what comes of it.
+pub(super) struct Entry<'a> {
+    audit: &'a Audit,
+    who: &'a Who,
+    asked: Asked<'a>,
+    is_told: bool,
+}
+
+impl<'a> Entry<'a> {
+    /// `None` for a question that only looks.
+    pub(super) fn of(audit: &'a Audit, who: &'a Who, question: &'a Question) -> Option<Self> {
+        Some(Self { audit, who, asked: Asked::of(question)?, is_told: false })
     }
 
     /// An answer on its way to the operator.
@@ -134,22 +150,13 @@ impl<'a> Entry<'a> {
 
     fn tell(&mut self, node: Option<String>, outcome: &str) {
         self.is_told = true;
-        // Its name is its tag.
-        let ask = serde_json::to_value(self.question).unwrap_or_default()["ask"].take();
-        let (function, takes_over, asked_of) = match self.question {
-            Question::Call(call) | Question::Hold(call) | Question::Bench { call, .. } => {
-                (Some(&call.function), call.take_over, call.node.as_ref())
-            }
-            Question::Stop { node } | Question::Reset { node } => (None, false, node.as_ref()),
-            Question::Retire { node } => (None, false, Some(node)),
-            _ => (None, false, None),
-        };
+        let Asked { ask, call, node: asked_of } = self.asked;
         let at = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         let Who { uid, pid, program } = self.who;
         self.audit.write(&json!({
             "at_ms": at.as_millis() as u64, "uid": uid, "pid": pid, "program": program,
-            "ask": ask, "function": function, "take_over": takes_over,
-            "node": node.or_else(|| asked_of.cloned()), "outcome": outcome,
+            "ask": ask, "function": call.map(|call| &call.function), "take_over": call.is_some_and(|call| call.take_over),
+            "node": node.as_ref().or(asked_of), "outcome": outcome,
         }));
     }
 }

@@ -116,7 +116,7 @@ impl Question {
 }
 
 /// A call as an operator makes it.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CallQuestion {
     /// `NAME`, `NAME/ID` or `#ID`; every node that offers the function if absent.

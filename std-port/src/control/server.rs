@@ -214,7 +214,10 @@ impl Shared {
         stream.set_write_timeout(Some(WRITE_TIMEOUT))?;
         let mut writer = Answers::new(&stream);
         let mut lines = Lines::new(&stream);
-        let who = Who::of(&stream)?;
+        let audit = match &self.audit {
+            Some(audit) => Some((audit, Who::of(&stream)?)),
+            None => None,
+        };
         let unit = system.identity();
         writer.give(&Answer::Hello {
             control_version: CONTROL_VERSION,
@@ -233,7 +236,7 @@ impl Shared {
                 Ok(question) => {
                     let client = RefCell::new(Beats { stream: &stream, lines: &mut lines, last: Instant::now() });
                     let lives = |within| !self.is_stopping() && client.borrow_mut().lives(within);
-                    let mut entry = self.audit.as_ref().and_then(|audit| Entry::of(audit, &who, &question));
+                    let mut entry = audit.as_ref().and_then(|(audit, who)| Entry::of(audit, who, &question));
                     let mut sink = |answer| {
                         entry.iter_mut().for_each(|entry| entry.note(&answer));
                         writer.sink(&answer)

@@ -69,11 +69,13 @@ pub(super) fn call<T: Send + 'static>(
                 for function in functions {
                     let may = allowed.entry(function.clone()).or_insert_with(|| permit(system, &function, Verb::Call));
                     match may {
-                        Ok(()) => questions.push((outcomes.len(), question(function))),
+                        Ok(()) => {
+                            questions.push((outcomes.len(), CallQuestion { function, ..CallQuestion::default() }));
+                            outcome.open += 1;
+                        }
                         Err(failure) => outcome.error = Some(failure.clone()),
                     }
                 }
-                outcome.open = questions.iter().filter(|(of, _)| *of == outcomes.len()).count();
             }
         }
         if outcome.open > 0 { outcomes.push(outcome) } else { missed.push(outcome) }
@@ -108,20 +110,6 @@ fn functions<T: Send + 'static>(peer: &Peer<T>, which: Which) -> Result<Vec<Stri
     let meant = list.iter().filter(|function| which.has(&function.attributes));
     let names: Vec<String> = meant.map(|function| function.definition.name().to_owned()).collect();
     if names.is_empty() { Err(which.missing()) } else { Ok(names) }
-}
-
-/// The call of a function, whose node is known otherwise.
-const fn question(function: String) -> CallQuestion {
-    CallQuestion {
-        node: None,
-        function,
-        arguments: Vec::new(),
-        asynchronous: false,
-        timeout_ms: None,
-        priority: None,
-        best_effort: false,
-        take_over: false,
-    }
 }
 
 fn told<T: Send + 'static>(outcome: &Outcome<'_, T>, started: Instant, sink: Sink<'_>) -> Result<(), End> {

@@ -22,6 +22,11 @@ use super::ends::Attacked;
 
 pub(super) const FLEET: Fleet = Fleet(7);
 
+/// An answer in the manager's name, that it is elsewhere.
+pub(super) fn made_up(epoch: Epoch, term: Term, nonce: u64) -> Announce {
+    Announce { identity: depot(), epoch, term, sequence: 9, nonce, tcp_port: 666, room: 1, expected: 1, skipped: 0 }
+}
+
 pub(super) struct Ring {
     root: RootKey,
     discovery: DiscoveryKey,
@@ -272,17 +277,7 @@ fn nobody_without_a_manager_s_own_key_keeps_it_from_starting() {
     let thief = codes(1, &agv(18));
     for epoch in [1, 599, 600, 601, u64::MAX] {
         for nonce in [0, 1, 78 | 1] {
-            let announce = Announce {
-                identity: depot(),
-                epoch: Epoch(epoch),
-                term: Term::NONE,
-                sequence: 9,
-                nonce,
-                tcp_port: 666,
-                room: 1,
-                expected: 1,
-                skipped: 0,
-            };
+            let announce = made_up(Epoch(epoch), Term::NONE, nonce);
             let mut bytes = [0; SEARCH_BYTES];
             for to in [None, Some(depot()), Some(agv(18))] {
                 let Some(bytes) = announce.encode(FLEET, &thief, to.as_ref(), &mut bytes) else { continue };

@@ -8,7 +8,7 @@ use cara_core::time::Duration;
 use cara_sim::World;
 
 use super::Tally;
-use super::discovery::{FLEET, Unit, agv, at, codes, depot, host};
+use super::discovery::{FLEET, Unit, agv, at, codes, depot, host, made_up};
 
 /// The question of a running manager to another one of its identity, and the manager.
 fn asked() -> (Unit, u64) {
@@ -28,17 +28,7 @@ fn asked() -> (Unit, u64) {
 }
 
 fn answer(nonce: u64) -> Announce {
-    Announce {
-        identity: depot(),
-        epoch: Epoch(99),
-        term: Term(6),
-        sequence: 9,
-        nonce,
-        tcp_port: 666,
-        room: 1,
-        expected: 1,
-        skipped: 0,
-    }
+    made_up(Epoch(99), Term(6), nonce)
 }
 
 /// With no key, with those of a stolen vehicle, and with an answer to another question.
