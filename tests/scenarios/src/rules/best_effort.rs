@@ -18,7 +18,7 @@ scenarios![
 const BEST_EFFORT: RequestOptions = RequestOptions { delivery: Delivery::BestEffort, ..RequestOptions::new() };
 
 fn best_effort_loses_without_blocking(world: &mut dyn World) {
-    let service = Service::numbered("telemetry");
+    let service = Service::numbered("telemetry").in_turns();
     let (manager, agv) = pair(world, &service);
     world.fault(Fault::Path(&manager, &agv, Path::LAN.loss_percent(40.0)));
     for n in 0..100 {

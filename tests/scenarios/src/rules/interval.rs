@@ -45,7 +45,7 @@ fn a_blocking_request_waits_for_the_interval(world: &mut dyn World) {
 }
 
 fn an_asynchronous_request_too_soon_is_refused(world: &mut dyn World) {
-    let service = Service::numbered("note");
+    let service = Service::numbered("note").in_turns();
     let (manager, _agv) = pair(world, &service);
     manager.change(|limits| limits.minimum_interval = secs(5));
     manager.request("agv", "note", &number("n", 1)).expect("the first is accepted");
