@@ -39,7 +39,8 @@
 //!
 //! - [`World`] makes units, runs them and injects faults; nothing moves unless it is told to run.
 //! - [`UnitHandle`] has what the real ports have, in the same words; what blocks there is a future here.
-//! - [`Service`] is a closure or a future, with priority, lease and safe hook; it may sleep, and call any unit back.
+//! - [`Service`] is a closure or a future, with priority, lease and safe hook; it may sleep, and call any unit back. What
+//!   several services move is an [`Actuator`]; a caller's loop has a [`Heart`].
 //! - A program ([`NewUnit::program`]) runs at each start of its unit, so that a restart loses what a real one loses.
 //! - [`LogEvent`]s tell what each unit saw, with its time.
 //!
@@ -99,6 +100,6 @@ pub use path::{Chance, Path};
 pub use plan::{Action, Crash, FaultPlan};
 pub use storage::Boxed;
 pub use world::{
-    BoxedParameters, Call, LeaseWatch, LogEvent, MyFunctionList, NewUnit, Outcome, Peer, Ring, Service, UnitEvent,
-    UnitHandle, World, boxed_parameters, for_each_seed, seeds,
+    Actuator, BoxedParameters, Call, Heart, Hold, LeaseWatch, LogEvent, MyFunctionList, NewUnit, Outcome, Peer, Ring,
+    Service, UnitEvent, UnitHandle, World, boxed_parameters, for_each_seed, seeds,
 };

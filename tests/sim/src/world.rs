@@ -20,6 +20,7 @@ use crate::network::Network;
 use crate::plan::{Crash, FaultPlan};
 use crate::queue::Queue;
 
+mod actuator;
 mod audited;
 mod builder;
 mod driving;
@@ -36,11 +37,13 @@ mod service;
 mod state;
 mod tasks;
 
+pub use actuator::{Actuator, Heart};
 pub use builder::NewUnit;
 pub use events::{LogEvent, UnitEvent};
 pub use functions::MyFunctionList;
 pub use handle::{Peer, UnitHandle};
 pub use keys::Ring;
+pub use requests::Hold;
 pub use service::{BoxedParameters, Call, LeaseWatch, Outcome, Service, boxed_parameters};
 
 use audited::Seals;

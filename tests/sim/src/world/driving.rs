@@ -150,6 +150,8 @@ impl Inner {
             }
             Some(NewerTerm::AtVehicle(term) | NewerTerm::OfManager(term)) => term,
         };
+        // Kept, so that its next start claims the one behind it.
+        unit.term = term;
         let links: Vec<u16> = machine.links.iter().map(|(index, _)| index).collect();
         for index in links {
             machine.links.with(&mut self.network, index, |session, cx| session.close(cx, CloseReason::Stopped));
@@ -203,8 +205,18 @@ impl Inner {
             self.one_happened(shared, host, index, happened);
             self.look_at_terms(shared, host);
         }
+        self.look_at_stops(shared, host);
         // What happened may have left the hub something to do.
         self.work_node(shared, host);
+    }
+
+    /// What was stopped through one link may be the order of another one, whose safe hook is due.
+    fn look_at_stops(&mut self, shared: &Rc<Shared>, host: HostId) {
+        let Some(machine) = &mut self.units[host.index()].machine else { return };
+        if machine.links.take_stopped() {
+            let live: Vec<u16> = machine.links.iter().map(|(index, _)| index).collect();
+            live.into_iter().for_each(|index| self.work(shared, host, index));
+        }
     }
 
     fn one_happened(&mut self, shared: &Rc<Shared>, host: HostId, index: u16, happened: Happened) {
@@ -309,8 +321,8 @@ impl Inner {
         let service = Rc::clone(service);
         let handle = UnitHandle::new(Rc::downgrade(shared), host);
         self.urgent.push_front(Box::new(move || {
-            if let Some(hook) = &service.safe_hook {
-                hook(&handle);
+            if let Some(actuator) = &service.actuator {
+                actuator.make_safe(&handle);
             }
         }));
     }

@@ -338,6 +338,11 @@ impl UnitHandle {
         self.with_shared(|inner, shared| inner.work(shared, self.host, index));
     }
 
+    /// Whether its world does: what drops later has nothing to do there.
+    pub(super) fn exists(&self) -> bool {
+        self.shared.strong_count() > 0
+    }
+
     pub(super) fn machine<R>(&self, act: impl FnOnce(&mut Machine, &mut Network) -> R) -> Result<R, Error> {
         self.with(|inner| {
             let Inner { units, network, .. } = inner;

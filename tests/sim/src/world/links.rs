@@ -315,6 +315,12 @@ impl Links {
         self.iter().filter(|(_, link)| link.paused && link.session.is_live()).map(|(index, _)| index).collect()
     }
 
+    /// Whether anything that its functions move was stopped since this was asked last.
+    pub(super) fn take_stopped(&self) -> bool {
+        let actuators = self.functions.iter().filter_map(|function| function.handler.0.actuator.as_ref());
+        actuators.fold(false, |stopped, actuator| stopped | actuator.take_stopped())
+    }
+
     /// Passes on what the hub tells a link.
     pub(super) fn direct(&mut self, network: &mut Network, index: u16, directive: Directive) -> Vec<Happened> {
         let mut happened = Vec::new();

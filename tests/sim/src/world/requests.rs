@@ -76,6 +76,19 @@ impl UnitHandle {
         }
     }
 
+    /// A call whose lease ends when what this returns is dropped.
+    pub async fn hold(
+        &self,
+        peer: impl Into<Peer>,
+        function: &str,
+        parameters: &mut ParametersView,
+        options: RequestOptions,
+    ) -> Result<Hold, Error> {
+        let call = self.call(&peer.into(), function, parameters, &options)?;
+        parameters.copy_from(&call.promise.clone().await?)?;
+        Ok(Hold { _call: call })
+    }
+
     fn asked_with_all(&self, function: &str) -> Vec<Identity> {
         let mut asked = self.roster();
         asked.extend(self.nodes_offering(function).into_iter().filter(|node| node.role() == Role::MUnit));
@@ -163,6 +176,19 @@ impl UnitHandle {
     }
 }
 
+/// What a call has started goes on as long as this is kept, if its caller renews it.
+#[must_use = "dropped, it is released at once"]
+pub struct Hold {
+    /// Not marked as successful, so that dropping it gives up the call.
+    _call: InFlight,
+}
+
+impl std::fmt::Debug for Hold {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Hold").finish_non_exhaustive()
+    }
+}
+
 /// A call in flight, which is given up when this is dropped before it has ended well.
 struct InFlight {
     unit: UnitHandle,
@@ -182,7 +208,7 @@ impl InFlight {
 
 impl Drop for InFlight {
     fn drop(&mut self) {
-        if self.has_succeeded || self.unit.shared.strong_count() == 0 {
+        if self.has_succeeded || !self.unit.exists() {
             return;
         }
         let _ = self.unit.machine(|machine, network| {

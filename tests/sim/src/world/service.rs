@@ -12,10 +12,11 @@ use cara_core::distribution::function::Attributes;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::{Parameters, ParametersView};
 use cara_core::error::ServiceError;
-use cara_core::services::lease::{Lease, Order};
+use cara_core::services::lease::{Ended, Latch, Lease, Order};
 use cara_core::time::{Duration, Instant};
 
-use super::UnitHandle;
+use super::actuator::Actuator;
+use super::handle::UnitHandle;
 
 /// Parameters of any size on the heap.
 pub type BoxedParameters = Box<ParametersView>;
@@ -26,7 +27,6 @@ pub type Outcome = Result<BoxedParameters, ServiceError>;
 type Running = Pin<Box<dyn Future<Output = Outcome>>>;
 
 type AtOnce = dyn FnMut(&Call, &mut ParametersView) -> Result<(), ServiceError>;
-type SafeHook = dyn Fn(&UnitHandle);
 
 enum Body {
     AtOnce(Box<RefCell<AtOnce>>),
@@ -50,10 +50,20 @@ pub struct Call {
     pub unit: UnitHandle,
 }
 
+impl Call {
+    /// Does what the call wants to change, unless its order has ended; always for a service without a lease.
+    pub fn commit<R>(&self, change: impl FnOnce() -> R) -> Result<R, Ended> {
+        match &self.lease {
+            Some(lease) => lease.commit(change),
+            None => Ok(change()),
+        }
+    }
+}
+
 /// The lease of one call. Once dead it is dead for ever, whatever call comes next.
 #[derive(Clone)]
 pub struct LeaseWatch {
-    service: Rc<Service>,
+    actuator: Actuator,
     order: Order,
     unit: UnitHandle,
 }
@@ -61,12 +71,17 @@ pub struct LeaseWatch {
 impl LeaseWatch {
     /// A call's hold of the lease of its service.
     pub(super) fn new(service: &Rc<Service>, order: Option<Order>, unit: &UnitHandle) -> Option<Self> {
-        Some(Self { service: Rc::clone(service), order: order?, unit: unit.clone() })
+        Some(Self { actuator: service.actuator.clone()?, order: order?, unit: unit.clone() })
     }
 
     /// Whether the caller still wants what this call started.
     pub fn is_live(&self) -> bool {
-        self.service.lease.as_ref().is_some_and(|lease| lease.is_live_for(self.order, self.unit.now()))
+        self.actuator.word().is_live_for(self.order, self.unit.now())
+    }
+
+    /// Does what the order wants, or nothing once it has ended.
+    pub fn commit<R>(&self, change: impl FnOnce() -> R) -> Result<R, Ended> {
+        if self.is_live() { Ok(change()) } else { Err(Ended) }
     }
 }
 
@@ -95,8 +110,8 @@ pub struct Service {
     takes: Duration,
     survives_panics: bool,
     pub(super) attributes: Attributes,
-    lease: Option<Lease>,
-    pub(super) safe_hook: Option<Box<SafeHook>>,
+    /// What it moves, or what it alone stops or resets.
+    pub(super) actuator: Option<Actuator>,
 }
 
 impl Service {
@@ -126,22 +141,15 @@ impl Service {
 
     /// What a call of it started is made safe when the service goes.
     pub(super) fn goes(&self, unit: &UnitHandle) {
-        if self.lease.as_ref().is_some_and(Lease::clear)
-            && let Some(hook) = &self.safe_hook
+        if let Some(actuator) = self.actuator.as_ref().filter(|_| self.attributes.lease.is_some())
+            && actuator.word().clear()
         {
-            hook(unit);
+            actuator.make_safe(unit);
         }
     }
 
     fn with(body: Body) -> Self {
-        Self {
-            body,
-            takes: Duration::ZERO,
-            survives_panics: false,
-            attributes: Attributes::default(),
-            lease: None,
-            safe_hook: None,
-        }
+        Self { body, takes: Duration::ZERO, survives_panics: false, attributes: Attributes::default(), actuator: None }
     }
 
     /// It answers this much later; the unit goes on with everything else meanwhile.
@@ -157,8 +165,34 @@ impl Service {
     /// What it starts goes on for this long after the caller's last sign that it wants it; then `safe` runs, once, before
     /// anything else the unit does.
     pub fn lease(self, length: Duration, safe: impl Fn(&UnitHandle) + 'static) -> Self {
+        self.moves(&Actuator::new(safe), length)
+    }
+
+    /// As [`lease`](Self::lease), for what several services move: an order of one of them takes the place of any other's, and
+    /// the hook is the actuator's.
+    pub fn moves(self, actuator: &Actuator, length: Duration) -> Self {
         let attributes = Attributes { lease: Some(length), ..self.attributes };
-        Self { attributes, lease: Some(Lease::new()), safe_hook: Some(Box::new(safe)), ..self }
+        Self { attributes, actuator: Some(actuator.clone()), ..self }
+    }
+
+    /// Before its handler runs, whichever order moves this ends, and none begins until it is reset.
+    pub fn stops(self, actuator: &Actuator) -> Self {
+        Self { actuator: Some(actuator.clone()), ..self.stops_all() }
+    }
+
+    /// As [`stops`](Self::stops), for all that the unit moves.
+    pub fn stops_all(self) -> Self {
+        Self { attributes: Attributes { stop: true, ..self.attributes }, ..self }
+    }
+
+    /// When its handler has returned results, orders of this actuator may begin again, unless it was stopped meanwhile.
+    pub fn resets(self, actuator: &Actuator) -> Self {
+        Self { actuator: Some(actuator.clone()), ..self.resets_all() }
+    }
+
+    /// As [`resets`](Self::resets), for all that the unit moves.
+    pub fn resets_all(self) -> Self {
+        Self { attributes: Attributes { reset: true, ..self.attributes }, ..self }
     }
 
     /// Running it twice is as good as running it once.
@@ -173,7 +207,7 @@ impl Service {
 
     /// Whether its lease is live at `now`; `None` without one.
     pub(super) fn lease_is_live(&self, now: Instant) -> Option<bool> {
-        self.lease.as_ref().map(|lease| lease.is_live(now))
+        self.actuator.as_ref().map(|actuator| actuator.word().is_live(now))
     }
 
     pub(super) async fn run(self: Rc<Self>, call: Call, mut parameters: BoxedParameters) -> Outcome {
@@ -195,7 +229,13 @@ impl Service {
 
 impl cara_core::services::lease::Service for Handler {
     fn lease(&self) -> Option<&Lease> {
-        self.0.lease.as_ref()
+        self.0.actuator.as_ref().map(Actuator::word)
+    }
+
+    fn inhibit(&self, now: Instant, latch: Latch) {
+        if let Some(actuator) = &self.0.actuator {
+            actuator.stop(now, latch);
+        }
     }
 }
 

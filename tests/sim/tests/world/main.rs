@@ -1,5 +1,6 @@
 //! Fleets in the simulator: the core through the eyes of its users.
 
+mod actuators;
 mod calls;
 mod faults;
 mod leases;
