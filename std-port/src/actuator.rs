@@ -5,6 +5,8 @@ use std::sync::Arc;
 
 use cara_core::services::lease::{Latch, Lease};
 
+use cara_core::time::Instant;
+
 use crate::clock::Clock;
 use crate::lease::{LeaseWatch, ServiceLease};
 use crate::safe_hook::SafeHook;
@@ -40,6 +42,8 @@ pub struct Actuator {
     pub(crate) lease: Arc<ServiceLease>,
     pub(crate) safe: Arc<SafeHook>,
     pub(crate) clock: Clock,
+    /// Lets the unit look at the orders of all its links.
+    pub(crate) look: Arc<dyn Fn() + Send + Sync>,
 }
 
 impl Actuator {
@@ -52,8 +56,13 @@ impl Actuator {
     /// until a service [resets](crate::ServiceOptions::resets) it, or [`reset`](Self::reset) does. Callers are told `reason`,
     /// as [`Error::Inhibited`](crate::Error::Inhibited).
     pub fn inhibit(&self, reason: u16) {
-        self.safe.inhibit(self.clock.now(), Latch { by: 0, reason });
+        self.inhibit_at(self.clock.now(), Latch { by: 0, reason });
+    }
+
+    pub(crate) fn inhibit_at(&self, now: Instant, latch: Latch) {
+        self.safe.inhibit(now, latch);
         self.lease.wake();
+        (self.look)();
     }
 
     /// Lets it move again.

@@ -8,7 +8,7 @@ use cara_core::distribution::function::Attributes;
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::{Parameters, ParametersView};
 use cara_core::error::{Error, ServiceError};
-use cara_core::services::lease::{Claim, Ended, Latch, Lease, Order, Service};
+use cara_core::services::lease::{ActuatorState, Claim, Ended, Latch, Lease, LeaseEnd, Order, Service};
 use cara_core::time::{Duration, Instant};
 
 use crate::actuator::Actuator;
@@ -112,8 +112,7 @@ impl<T: 'static> Service for Handler<T> {
 
     fn inhibit(&self, now: Instant, latch: Latch) {
         if let Some(actuator) = &self.actuator {
-            actuator.safe.inhibit(now, latch);
-            actuator.lease.wake();
+            actuator.inhibit_at(now, latch);
         }
     }
 
@@ -137,8 +136,12 @@ impl<T: 'static> Service for Handler<T> {
         self.actuator.as_ref().is_none_or(|actuator| actuator.safe.finish(order))
     }
 
-    fn expire_lease(&self, order: Order) -> bool {
-        self.actuator.as_ref().is_none_or(|actuator| actuator.safe.expire(order))
+    fn expire_lease(&self, order: Order, how: LeaseEnd) -> bool {
+        self.actuator.as_ref().is_none_or(|actuator| actuator.safe.expire(order, how))
+    }
+
+    fn state(&self) -> ActuatorState {
+        self.actuator.as_ref().map(|actuator| actuator.safe.state()).unwrap_or_default()
     }
 }
 

@@ -56,7 +56,7 @@ impl LeaseWatch {
 
     /// Of one order.
     pub(crate) fn of(order: Order, actuator: Actuator) -> Self {
-        let Actuator { lease, safe, clock } = actuator;
+        let Actuator { lease, safe, clock, .. } = actuator;
         Self { service: lease, order: Some((order, safe)), clock }
     }
 

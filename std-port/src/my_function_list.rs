@@ -146,7 +146,9 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
         let then = then.map(|then| self.engine.afterwards(then)).transpose()?;
         let late = self.engine.hooks_late();
         let safe = Arc::new(SafeHook::start(Parts { lease: lease.clone(), clock, hook, then, late })?);
-        Ok(Actuator { lease, safe, clock })
+        let engine = Arc::downgrade(self.engine);
+        let look = Arc::new(move || engine.upgrade().into_iter().for_each(|engine| engine.look_at_orders()));
+        Ok(Actuator { lease, safe, clock, look })
     }
 
     /// Removes a function; peers are told.

@@ -10,6 +10,7 @@ use cara_core::distribution::hello::Limits;
 use cara_core::distribution::identity::{Epoch, Identity};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error};
+use cara_core::services::lease::{ActuatorState, OrderOutcome};
 use cara_core::services::requests::CallId;
 use cara_core::services::session::RequestOptions;
 use cara_core::time::Duration;
@@ -301,6 +302,50 @@ impl<T: Send + 'static> Peer<T> {
         options: &RequestOptions,
     ) -> Result<Hold<T>, Error> {
         self.engine.hold(self.link()?, function, parameters, options).map(Hold::new)
+    }
+
+    /// What has become of the newest call of a leased function by this unit, as the node tells after it has joined again: for
+    /// one whose reply was lost, as with [`Error::Interrupted`]. [`OrderOutcome::Unknown`] while it is not connected.
+    ///
+    /// ```no_run
+    /// use cara_std::{Error, OrderOutcome, Parameters};
+    /// # let depot = cara_std::CommunicationSystem::new("depot", 1)?;
+    /// let agv = depot.s_unit("agv")?;
+    ///
+    /// if agv.block_request("go_to", &mut Parameters::new()) == Err(Error::Interrupted) {
+    ///     agv.wait_for_function("go_to", std::time::Duration::from_secs(10));
+    ///     match agv.outcome_of("go_to") {
+    ///         OrderOutcome::Ended(how) => println!("it began, and is over: {}", how.word()),
+    ///         OrderOutcome::NotBegun => println!("it did not move"),
+    ///         outcome => println!("look where it is: {outcome:?}"),
+    ///     }
+    /// }
+    /// # Ok::<(), cara_std::BuildError>(())
+    /// ```
+    pub fn outcome_of(&self, function: &str) -> OrderOutcome {
+        let order = self.cell.last_order(function);
+        let outcome =
+            order.zip(self.actuator_state(function)).map(|((link, call), state)| state.outcome_of(link, call.0));
+        outcome.unwrap_or(OrderOutcome::Unknown)
+    }
+
+    /// The state of what a function of the node moves: what inhibits it, and the order that it has or had last, as the node
+    /// tells when it joins, and within a keep-alive interval after a change. `None` while it is not
+    /// connected, and as long as it has nothing to tell.
+    pub fn actuator_state(&self, function: &str) -> Option<ActuatorState> {
+        let link = self.link().ok()?;
+        let state = link.lock();
+        let slot = state.session.their_function_list().named(function)?.slot;
+        state.actuators.get(&slot).copied()
+    }
+
+    /// How long what calls of this unit have started at the node goes on at most if no more renewal gets there; `None` where
+    /// nothing is renewed.
+    pub fn lease_left(&self, function: &str) -> Option<Duration> {
+        let link = self.link().ok()?;
+        let state = link.lock();
+        let slot = state.session.their_function_list().named(function)?.slot;
+        state.session.lease_left(self.engine.now(), slot)
     }
 
     /// Calls a function without waiting (paper, listing line 19): accepted, not sent, not executed. A failure comes as

@@ -13,7 +13,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 
 use cara_core::error::Error;
-use cara_core::services::lease::{Claim, Ended, Latch, Lease, Order};
+use cara_core::services::lease::{ActuatorState, Claim, Ended, Latch, Lease, LeaseEnd, Order};
 use cara_core::time::{Duration, Instant};
 
 use crate::clock::Clock;
@@ -118,19 +118,24 @@ impl SafeHook {
     /// Ends an order whose work is done: the hook does not run.
     pub(crate) fn finish(&self, order: Order) -> bool {
         let mut state = lock(&self.shared.state);
-        let is_over = self.shared.lease().end(order);
+        let is_over = self.shared.lease().end(order, LeaseEnd::Finished);
         state.started_early &= !is_over;
         is_over
     }
 
     /// Ends an order and starts the hook, unless it was started early. Returns at once.
-    pub(crate) fn expire(&self, order: Order) -> bool {
+    pub(crate) fn expire(&self, order: Order, how: LeaseEnd) -> bool {
         let mut state = lock(&self.shared.state);
-        let is_over = self.shared.lease().end(order);
+        let is_over = self.shared.lease().end(order, how);
         if is_over {
             self.shared.start(&mut state);
         }
         is_over
+    }
+
+    pub(crate) fn state(&self) -> ActuatorState {
+        let _writing = lock(&self.shared.state);
+        self.shared.lease().state()
     }
 
     /// The service is removed: an order that has not ended does so, and the hook starts.
@@ -261,7 +266,7 @@ mod tests {
     use crate::testing::until;
 
     static AHEAD: AtomicU64 = AtomicU64::new(0);
-    const CLAIM: Claim = Claim { holder: 1, replaces: None, takes_over: true };
+    const CLAIM: Claim = Claim { holder: 1, replaces: None, takes_over: true, link: 0, call: 0 };
 
     fn begin(safe: &SafeHook, clock: Clock, length: Duration) -> Order {
         safe.begin(clock.now(), clock.now() + length, &CLAIM).expect("the order before has ended")
@@ -285,7 +290,7 @@ mod tests {
             AHEAD.fetch_add(7_200_000_000, Ordering::SeqCst);
             assert!(!lease.lease.is_live(clock.now()));
             until(|| runs.load(Ordering::SeqCst) == round);
-            assert!(safe.expire(order) && safe.has_run());
+            assert!(safe.expire(order, LeaseEnd::Expired) && safe.has_run());
         }
         safe.end();
         assert_eq!(runs.load(Ordering::SeqCst), 3);
@@ -301,7 +306,7 @@ mod tests {
         let parts = Parts { lease: lease.clone(), clock, hook, then: None, late: Arc::default() };
         let safe = SafeHook::start(parts).unwrap();
         let order = begin(&safe, clock, Duration::from_secs(3_600));
-        assert!(safe.expire(order));
+        assert!(safe.expire(order, LeaseEnd::Expired));
         until(|| runs.load(Ordering::SeqCst) == 1);
         let order = begin(&safe, clock, Duration::from_millis(30));
         assert!(safe.finish(order));
@@ -329,7 +334,7 @@ mod tests {
                 !safe.shared.lease().is_live(now)
             },
             |safe, order, _| safe.finish(order),
-            |safe, order, _| safe.expire(order),
+            |safe, order, _| safe.expire(order, LeaseEnd::Expired),
             |safe, order, now| {
                 safe.clear();
                 !safe.shared.lease().is_live_for(order, now)
@@ -388,7 +393,7 @@ mod tests {
                     assert!(!live || after == before, "call {call}: the hook of an earlier order ran");
                     assert!(!live || renewed, "call {call}: a live order was not renewed");
                 }
-                safe.expire(order);
+                safe.expire(order, LeaseEnd::Expired);
             }
         };
         std::thread::scope(|scope| (0..2).for_each(|_| drop(scope.spawn(serve))));

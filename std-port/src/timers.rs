@@ -47,6 +47,14 @@ impl Timers {
         earlier && self.set(link, deadline)
     }
 
+    /// Every deadline becomes this one.
+    pub(crate) fn bring_all_forward(&mut self, deadline: Instant) {
+        let links = self.ordered.iter().map(|&(_, link)| link).collect::<Vec<_>>();
+        for link in links {
+            self.bring_forward(link, deadline);
+        }
+    }
+
     /// Forgets the deadline of `link`, if it has one.
     pub(crate) fn cancel(&mut self, link: u32) {
         if let Some(old) = self.deadlines.get_mut(link as usize).and_then(Option::take) {

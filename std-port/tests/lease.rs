@@ -60,7 +60,7 @@ mod sync {
 
 use std::cell::Cell;
 
-use lease::{Lease, Order};
+use lease::{Lease, LeaseEnd, Order};
 use loom::sync::{Arc, Mutex};
 use loom::thread;
 use time::Instant;
@@ -98,6 +98,8 @@ impl Shared {
 fn begun(lock: Option<Mutex<()>>) -> (Arc<Shared>, Order) {
     let shared = Arc::new(Shared { lease: Lease::new(), lock });
     let order = shared.lease.begin(NOW, END).unwrap();
+    // Every atomic is made before the threads begin.
+    let _ = shared.lease.state();
     (shared, order)
 }
 
@@ -110,11 +112,11 @@ fn both_end((shared, first): (Arc<Shared>, Order)) {
     let other = shared.clone();
     let other = thread::spawn(move || {
         if let Some(second) = other.write(|lease| lease.begin(NOW, END)) {
-            other.write(|lease| lease.end(second));
+            other.write(|lease| lease.end(second, LeaseEnd::Expired));
         }
     });
     let _renewed = shared.write(|lease| lease.renew(first, LATER));
-    shared.write(|lease| lease.end(first));
+    shared.write(|lease| lease.end(first, LeaseEnd::Expired));
     other.join().unwrap();
     assert!(shared.lease.left(NOW).is_none(), "the lease lives, and no order has it");
 }

@@ -162,6 +162,13 @@ def read_fields(reader, fields):
         elif encoding == "lease_end":
             why = reader.varint(32)
             value[name] = LEASE_ENDS[why] if why < len(LEASE_ENDS) else "expired"
+        elif encoding == "latch":
+            reason, by = reader.varint(32), reader.varint(32)
+            value[name] = {"by": by, "reason": min(reason - 1, 0xFFFF)} if reason else None
+        elif encoding == "order":
+            how, holder, link, call = (reader.varint(32) for _ in range(4))
+            end = None if how < 2 else LEASE_ENDS[how - 2] if how - 2 < len(LEASE_ENDS) else "expired"
+            value[name] = {"holder": holder, "link": link, "call": call, "end": end} if how else None
         elif encoding == "bytes":
             value[name] = reader.sized().hex()
         else:
@@ -178,6 +185,13 @@ def write_fields(value, fields):
             out += bytes([ROLES.index(value[name])])
         elif encoding == "lease_end":
             out += varint(LEASE_ENDS.index(value[name]))
+        elif encoding == "latch":
+            latch = value[name] or {"by": 0, "reason": -1}
+            out += varint(latch["reason"] + 1) + varint(latch["by"])
+        elif encoding == "order":
+            order = value[name] or {"holder": 0, "link": 0, "call": 0, "end": None}
+            how = LEASE_ENDS.index(order["end"]) + 2 if order["end"] else int(value[name] is not None)
+            out += b"".join(varint(number) for number in (how, order["holder"], order["link"], order["call"]))
         elif encoding == "bytes":
             out += sized(bytes.fromhex(value[name]))
         else:
@@ -371,9 +385,10 @@ CONTROLS = {
     4: ("list_ack", [("serial", 32), ("skipped", 16)]),
     5: ("limits", [("message_size", 32), ("minimum_interval", 32), ("calls", 16)]),
     6: ("lease_ended", [("call", 32), ("why", "lease_end")]),
+    7: ("actuator", [("slot", 16), ("latch", "latch"), ("last", "order")]),
 }
 # Behind one of these nothing follows in a message.
-LAST_ITEMS = ("list_end", "list_ack", "lease_ended")
+LAST_ITEMS = ("list_end", "list_ack", "lease_ended", "actuator")
 LEASE_ENDS = ["finished", "expired", "replaced", "stopped"]
 
 

@@ -4,6 +4,7 @@
 use super::compact::{Reader, Writer};
 use super::items::{Item, Malformed};
 use super::message::CONTROL;
+use crate::error::Error;
 
 /// Makes [`Control`] of its table: each row is the item's kind, the variant and its fields in their order.
 macro_rules! controls {
@@ -86,6 +87,15 @@ controls! {
         /// Why.
         why: LeaseEnd,
     }
+    /// The state of what a function of the sender moves.
+    7 => Actuator {
+        /// Its slot.
+        slot: u16,
+        /// What keeps every order from beginning.
+        latch: Option<Latch>,
+        /// The order that it has, or had last.
+        last: Option<LastOrder>,
+    }
 }
 
 impl Control<'_> {
@@ -96,6 +106,69 @@ impl Control<'_> {
         self.put(&mut writer);
         let used = writer.finish()?;
         out.get(..used)
+    }
+}
+
+/// Why nothing begins on a lease that is inhibited.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Latch {
+    /// The ID number of the unit that stopped it; 0 for this one.
+    pub by: u32,
+    /// Why, as this unit numbers its reasons; 0 for a function that stops.
+    pub reason: u16,
+}
+
+/// The state of what a service moves, as callers are told without asking.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ActuatorState {
+    /// What keeps every order from beginning.
+    pub latch: Option<Latch>,
+    /// The order that has it, or had it last; `None` when there was none since the unit's start.
+    pub last: Option<LastOrder>,
+}
+
+/// The order that a service has, or had last.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct LastOrder {
+    /// The ID number of its caller.
+    pub holder: u32,
+    /// The low half of the nonce in its caller's hello on the link that it came by; 0 for other units than its caller.
+    pub link: u32,
+    /// Its caller's id of the call on that link; 0 for other units than its caller.
+    pub call: u32,
+    /// How it ended; `None` while it has not.
+    pub end: Option<LeaseEnd>,
+}
+
+/// What a node tells of a call that moved something there, or was to: of one that was [interrupted](Error::Interrupted).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum OrderOutcome {
+    /// It has not ended.
+    Runs,
+    /// It began, and ended so.
+    Ended(LeaseEnd),
+    /// It has not begun, and does not any more, because its link has ended.
+    NotBegun,
+    /// The node cannot tell: it was started since, or has done something for another caller, or by an earlier link.
+    Unknown,
+}
+
+impl ActuatorState {
+    /// What it tells of the newest call that a caller made by one of its links.
+    pub fn outcome_of(&self, link: u32, call: u32) -> OrderOutcome {
+        match self.last {
+            Some(last) if last.link != link || last.call == 0 => OrderOutcome::Unknown,
+            Some(LastOrder { call: begun, .. }) if begun < call => OrderOutcome::NotBegun,
+            Some(LastOrder { end: None, .. }) => OrderOutcome::Runs,
+            Some(LastOrder { end: Some(end), .. }) => OrderOutcome::Ended(end),
+            None => OrderOutcome::Unknown,
+        }
+    }
+}
+
+impl From<Latch> for Error {
+    fn from(Latch { by, reason }: Latch) -> Self {
+        Self::Inhibited { by, reason }
     }
 }
 
@@ -120,6 +193,11 @@ pub enum LeaseEnd {
 
 impl LeaseEnd {
     pub(crate) const ALL: [Self; 4] = [Self::Finished, Self::Expired, Self::Replaced, Self::Stopped];
+
+    /// By its number on the wire; a reason of a later version is an end all the same.
+    pub fn of(number: u32) -> Self {
+        Self::ALL.get(number as usize).copied().unwrap_or(Self::Expired)
+    }
 
     /// `finished`, `expired`, `replaced`, `stopped`, `unanswered`.
     pub const fn word(self) -> &'static str {
@@ -175,8 +253,38 @@ impl Field<'_> for LeaseEnd {
     }
 
     fn take(reader: &mut Reader<'_>) -> Self {
-        // A reason of a later version is an end all the same.
-        Self::ALL.get(reader.u32() as usize).copied().unwrap_or(Self::Expired)
+        Self::of(reader.u32())
+    }
+}
+
+/// The reason and 1, or 0 for none; then by whom.
+impl Field<'_> for Option<Latch> {
+    fn put(self, writer: &mut Writer<'_>) {
+        writer.number(self.map_or(0, |latch| u64::from(latch.reason).saturating_add(1)));
+        writer.number(self.map_or(0, |latch| latch.by).into());
+    }
+
+    fn take(reader: &mut Reader<'_>) -> Self {
+        let (reason, by) = (reader.u32(), reader.u32());
+        reason.checked_sub(1).map(|reason| Latch { by, reason: u16::try_from(reason).unwrap_or(u16::MAX) })
+    }
+}
+
+/// 0 for none, 1 for one that has not ended, 2 and how it has; then holder, link and call.
+impl Field<'_> for Option<LastOrder> {
+    fn put(self, writer: &mut Writer<'_>) {
+        let LastOrder { holder, link, call, end } =
+            self.unwrap_or(LastOrder { holder: 0, link: 0, call: 0, end: None });
+        let how = end.map_or(u64::from(self.is_some()), |end| (end as u64).saturating_add(2));
+        for number in [how, holder.into(), link.into(), call.into()] {
+            writer.number(number);
+        }
+    }
+
+    fn take(reader: &mut Reader<'_>) -> Self {
+        let [how, holder, link, call] = [(); 4].map(|()| reader.u32());
+        let end = how.checked_sub(2).map(LeaseEnd::of);
+        (how != 0).then_some(LastOrder { holder, link, call, end })
     }
 }
 
@@ -198,7 +306,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn what_is_read_is_written_again(kind in 0..8_u16, body in prop::collection::vec(prop_oneof![any::<u8>(), 0..8_u8], 0..40)) {
+        fn what_is_read_is_written_again(kind in 0..9_u16, body in prop::collection::vec(prop_oneof![any::<u8>(), 0..8_u8], 0..40)) {
             if let Ok(Some(control)) = Control::take(&Item { kind, body: &body }) {
                 let mut out = [0; 80];
                 prop_assert_eq!(read(control.encode(&mut out).unwrap()), Some(control));
@@ -216,6 +324,19 @@ mod tests {
             Control::Publish { slot: u16::MAX, generation: u16::MAX, attributes: &[255; 8], signature: &signature };
         let mut out = [0; PUBLISH_BYTES + 300];
         assert_eq!(read(publish.encode(&mut out).unwrap()), Some(publish));
+    }
+
+    #[test]
+    fn only_what_is_certain_of_an_order_is_told() {
+        let last = LastOrder { holder: 1, link: 9, call: 7, end: Some(LeaseEnd::Finished) };
+        let told = |last| ActuatorState { latch: None, last }.outcome_of(9, 7);
+        assert_eq!(told(None), OrderOutcome::Unknown, "the node was started since");
+        assert_eq!(told(Some(last)), OrderOutcome::Ended(LeaseEnd::Finished));
+        assert_eq!(told(Some(LastOrder { end: None, ..last })), OrderOutcome::Runs);
+        assert_eq!(told(Some(LastOrder { call: 6, ..last })), OrderOutcome::NotBegun);
+        assert_eq!(told(Some(LastOrder { link: 8, ..last })), OrderOutcome::Unknown, "of another link");
+        let others = LastOrder { holder: 2, link: 0, call: 0, end: None };
+        assert_eq!(told(Some(others)), OrderOutcome::Unknown);
     }
 
     #[test]

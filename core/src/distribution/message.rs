@@ -3,7 +3,7 @@
 //! [`hello`](super::hello), [`datagram`](super::datagram) and [`block`](super::block) the only code
 //! that knows the encoding; `docs/wire.md` says it in words.
 
-pub use super::control::{Control, LeaseEnd};
+pub use super::control::{ActuatorState, Control, LastOrder, Latch, LeaseEnd, OrderOutcome};
 
 use super::block::Put;
 use super::function_list::{Generation, Slot};

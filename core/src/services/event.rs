@@ -2,7 +2,7 @@
 
 use crate::distribution::identity::Identity;
 use crate::error::{CloseReason, Error};
-use crate::services::lease::LeaseEnd;
+use crate::services::lease::{Latch, LeaseEnd};
 use crate::services::requests::CallId;
 use crate::services::session::{Event, Session};
 use crate::services::{OwnFunctions, Port};
@@ -91,6 +91,16 @@ pub enum UnitEvent<F, N, E> {
         /// Why.
         why: LeaseEnd,
     },
+    /// What a service of a node moves was stopped, so that no order begins, or has been reset. Boards are not told: a call
+    /// is refused as inhibited all the same.
+    Inhibited {
+        /// Which.
+        peer: Identity,
+        /// The service.
+        function: F,
+        /// What inhibits it; `None` once it has been reset.
+        latch: Option<Latch>,
+    },
 }
 
 impl<F, N, E> UnitEvent<F, N, E> {
@@ -117,7 +127,11 @@ impl<F, N, E> UnitEvent<F, N, E> {
             Event::LeaseEnded { call, slot, why } => {
                 Self::LeaseEnded { peer: peer(), function: name(their_name(slot)), call, why }
             }
-            Event::Acknowledged { skipped: 0, .. } | Event::Answered | Event::Call(_) | Event::Reply(..) => {
+            Event::Acknowledged { skipped: 0, .. }
+            | Event::Answered
+            | Event::Call(_)
+            | Event::Reply(..)
+            | Event::Actuator { .. } => {
                 return None;
             }
             Event::Acknowledged { skipped, .. } => Self::FunctionsSkipped { peer: peer(), skipped },

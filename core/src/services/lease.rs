@@ -11,7 +11,7 @@ use core::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 
 use crate::config::Priority;
 use crate::distribution::function_list::{Generation, Slot};
-pub use crate::distribution::message::LeaseEnd;
+pub use crate::distribution::message::{ActuatorState, LastOrder, Latch, LeaseEnd, OrderOutcome};
 use crate::error::{Error, ServiceError};
 use crate::services::heart::Renew;
 use crate::services::requests::CallId;
@@ -36,6 +36,10 @@ pub struct Claim {
     pub replaces: Option<Order>,
     /// The order of any other caller gives way as well.
     pub takes_over: bool,
+    /// The caller's name for the link, as in [`LastOrder`].
+    pub link: u32,
+    /// The caller's id of the call.
+    pub call: u32,
 }
 
 /// Says until when a leased service may act. Written by the unit, read anywhere. Services that share one move the same
@@ -59,21 +63,18 @@ pub struct Lease {
     order: AtomicU32,
     /// The ID number of the one that made it.
     holder: AtomicU32,
+    /// That one's name for the link.
+    link: AtomicU32,
+    /// That one's name for the call.
+    call: AtomicU32,
+    /// How it ended, as the number of a [`LeaseEnd`].
+    how: AtomicU32,
     /// When it was inhibited, as `end` has its time; 0 when it is not.
     inhibited: AtomicU32,
     /// The ID number of the unit that inhibited it; 0 for this one.
     inhibitor: AtomicU32,
     /// Why.
     reason: AtomicU32,
-}
-
-/// Why nothing begins on a lease that is inhibited.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Latch {
-    /// The ID number of the unit that stopped it; 0 for this one.
-    pub by: u32,
-    /// Why, as this unit numbers its reasons; 0 for a function that stops.
-    pub reason: u16,
 }
 
 /// The order that something was to be done for has ended.
@@ -88,12 +89,6 @@ impl From<Ended> for ServiceError {
     }
 }
 
-impl From<Latch> for Error {
-    fn from(Latch { by, reason }: Latch) -> Self {
-        Self::Inhibited { by, reason }
-    }
-}
-
 impl Lease {
     /// A lease without an order.
     pub const fn new() -> Self {
@@ -102,6 +97,9 @@ impl Lease {
             seen_dead: AtomicBool::new(false),
             order: AtomicU32::new(0),
             holder: AtomicU32::new(0),
+            link: AtomicU32::new(0),
+            call: AtomicU32::new(0),
+            how: AtomicU32::new(0),
             inhibited: AtomicU32::new(0),
             inhibitor: AtomicU32::new(0),
             reason: AtomicU32::new(0),
@@ -162,13 +160,15 @@ impl Lease {
         }
         let order = self.begin(now, end).ok_or(Error::Busy)?;
         self.holder.store(claim.holder, Ordering::Release);
+        self.link.store(claim.link, Ordering::Release);
+        self.call.store(claim.call, Ordering::Release);
         Ok(order)
     }
 
     /// Lets the service act for a new order, until [`Lease::seen_end`] of `end`. `None` where an earlier order is dead and
     /// has not been ended: its safe hook comes first.
     pub fn begin(&self, now: Instant, end: Instant) -> Option<Order> {
-        let runs = self.end.load(Ordering::Acquire) != 0;
+        let runs = self.has_order();
         if runs && !self.is_live(now) {
             return None;
         }
@@ -194,8 +194,7 @@ impl Lease {
     /// stays so.
     #[must_use]
     pub fn renew(&self, order: Order, end: Instant) -> bool {
-        let ended =
-            self.seen_dead.load(Ordering::Acquire) || self.is_inhibited() || self.end.load(Ordering::Acquire) == 0;
+        let ended = self.seen_dead.load(Ordering::Acquire) || self.is_inhibited() || !self.has_order();
         if ended || !self.is_held_by(order) {
             return false;
         }
@@ -261,17 +260,44 @@ impl Lease {
     }
 
     /// Ends an order; `false` when a newer one holds the lease.
-    pub fn end(&self, order: Order) -> bool {
+    pub fn end(&self, order: Order, how: LeaseEnd) -> bool {
         let held = self.is_held_by(order);
         if held {
+            self.how.store(how as u32, Ordering::Release);
             self.end.store(0, Ordering::Release);
         }
         held
     }
 
+    /// The state of what it moves. What other threads write meanwhile may be in it in part: see [`Service::state`].
+    pub fn state(&self) -> ActuatorState {
+        let how = LeaseEnd::of(self.how.load(Ordering::Acquire));
+        let end = if self.has_order() { None } else { Some(how) };
+        let has_begun = self.order.load(Ordering::Acquire) != 0;
+        let last = has_begun.then(|| LastOrder {
+            holder: self.holder.load(Ordering::Acquire),
+            link: self.link.load(Ordering::Acquire),
+            call: self.call.load(Ordering::Acquire),
+            end,
+        });
+        ActuatorState { latch: self.latch(), last }
+    }
+
+    /// Differs when the [state](Self::state) does; 0 for one that nothing has happened to.
+    pub(crate) fn changes(&self) -> u32 {
+        let order = self.order.load(Ordering::Acquire);
+        let inhibited = self.inhibited.load(Ordering::Acquire);
+        order.wrapping_mul(2).wrapping_add(self.has_order().into()) ^ inhibited.reverse_bits()
+    }
+
+    fn has_order(&self) -> bool {
+        self.end.load(Ordering::Acquire) != 0
+    }
+
     /// Ends whichever order holds it, as when the service is removed: whether there is one, whose safe hook is to run.
     pub fn clear(&self) -> bool {
-        let has_order = self.end.load(Ordering::Acquire) != 0;
+        let has_order = self.has_order();
+        self.how.store(LeaseEnd::Expired as u32, Ordering::Release);
         self.end.store(0, Ordering::Release);
         has_order
     }
@@ -334,13 +360,19 @@ pub trait Service {
 
     /// [`Lease::end`], because what the order has started is finished: no hook runs.
     fn finish_lease(&self, order: Order) -> bool {
-        self.lease().is_none_or(|lease| lease.end(order))
+        self.lease().is_none_or(|lease| lease.end(order, LeaseEnd::Finished))
     }
 
-    /// [`Lease::end`], because its caller no longer wants it. Where this is `true`, the safe hook is due: the event
-    /// [`LeaseExpired`](crate::services::session::Event::LeaseExpired) says so to a port that has not started it here.
-    fn expire_lease(&self, order: Order) -> bool {
-        self.finish_lease(order)
+    /// [`Lease::end`], because its caller no longer wants it or it was stopped. Where this is `true`, the safe hook is due:
+    /// the event [`LeaseExpired`](crate::services::session::Event::LeaseExpired) says so to a port that has not started it
+    /// here.
+    fn expire_lease(&self, order: Order, how: LeaseEnd) -> bool {
+        self.lease().is_none_or(|lease| lease.end(order, how))
+    }
+
+    /// [`Lease::state`], between two writes.
+    fn state(&self) -> ActuatorState {
+        self.lease().map(Lease::state).unwrap_or_default()
     }
 }
 
@@ -397,10 +429,10 @@ mod tests {
         assert!(lease.renew(order, at(501_000)));
         assert!(lease.is_live(at(500_000)));
         assert!(!lease.is_live(at(501_000)));
-        assert!(lease.end(order));
+        assert!(lease.end(order, LeaseEnd::Expired));
         let order = lease.begin(START, at(500_000)).unwrap();
         assert!(!lease.is_live(at(500_000)));
-        assert!(lease.end(order) && lease.begin(START, at(500_000)).is_some());
+        assert!(lease.end(order, LeaseEnd::Expired) && lease.begin(START, at(500_000)).is_some());
         assert!(lease.clear() && !lease.clear());
         assert!(!lease.is_live(START));
     }
@@ -441,13 +473,13 @@ mod tests {
         let lease = Lease::new();
         let first = lease.begin(START, at(500_000)).unwrap();
         assert!(lease.begin(at(500_000), at(900_000)).is_none(), "its time is over");
-        assert!(lease.end(first) && lease.begin(at(500_000), at(900_000)).is_some());
+        assert!(lease.end(first, LeaseEnd::Expired) && lease.begin(at(500_000), at(900_000)).is_some());
         let lease = Lease::new();
         let first = lease.begin(START, at(500_000)).unwrap();
         lease.cut(first);
         assert!(!lease.is_live(START) && !lease.renew(first, at(600_000)));
         assert!(lease.begin(START, at(900_000)).is_none(), "it was cut");
-        assert!(lease.end(first) && lease.begin(START, at(900_000)).is_some());
+        assert!(lease.end(first, LeaseEnd::Expired) && lease.begin(START, at(900_000)).is_some());
     }
 
     #[test]
@@ -457,7 +489,7 @@ mod tests {
         let second = lease.begin(at(100_000), at(600_000)).unwrap();
         assert!(!lease.is_live_for(first, at(100_000)) && lease.is_live_for(second, at(100_000)));
         lease.cut(first);
-        assert!(!lease.end(first) && !lease.renew(first, at(900_000)));
+        assert!(!lease.end(first, LeaseEnd::Expired) && !lease.renew(first, at(900_000)));
         assert!(lease.is_live_for(second, at(598_000)));
         assert!(!lease.is_live_for(second, at(600_000)) && !lease.is_live_for(second, START));
     }
@@ -470,10 +502,10 @@ mod tests {
         let left = [0, 500_999, 501_000, 900_000].map(|now| lease.left(at(now)).map(Duration::as_micros));
         assert_eq!(left, [Some(501_000), Some(1), Some(0), Some(0)]);
         let wrap = (1_u64 << 32) * 1_000;
-        assert!(lease.end(order));
+        assert!(lease.end(order, LeaseEnd::Expired));
         let order = lease.begin(at(wrap - 1_000), at(wrap + 301_000)).unwrap();
         assert_eq!(lease.left(at(wrap - 1_000)), Some(Duration::from_millis(302)));
-        assert!(lease.end(order));
+        assert!(lease.end(order, LeaseEnd::Expired));
         assert_eq!(lease.left(at(0)), None);
     }
 
@@ -522,7 +554,7 @@ mod tests {
                     }
                     Step::End => {
                         if let Some((order, _)) = orders.last() {
-                            prop_assert!(lease.end(*order));
+                            prop_assert!(lease.end(*order, LeaseEnd::Expired));
                         }
                         dead = true;
                     }

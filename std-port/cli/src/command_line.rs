@@ -22,6 +22,7 @@ pub(crate) struct CommandLine {
 pub(crate) enum Verb {
     Scan(commands::scan::Arguments),
     Functions(commands::functions::Arguments),
+    Orders(commands::orders::Arguments),
     Call(commands::call::Arguments),
     Publish(commands::publish::Arguments),
     Stop(commands::stop::Stop),

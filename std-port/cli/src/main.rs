@@ -26,6 +26,7 @@ fn run(verb: Verb, global: &Global) -> anyhow::Result<ExitCode> {
     match verb {
         Verb::Scan(arguments) => commands::scan::run(arguments, global),
         Verb::Functions(arguments) => commands::functions::run(arguments, global),
+        Verb::Orders(arguments) => commands::orders::run(arguments, global),
         Verb::Call(arguments) => commands::call::run(arguments, global),
         Verb::Publish(arguments) => commands::publish::run(arguments, global),
         Verb::Stop(arguments) => commands::stop::stop(arguments, global),

@@ -92,6 +92,7 @@ fn attempt<T: Send + 'static>(
         }
         Question::Retire { node } => retire(system, node),
         Question::Functions { node } => functions(system, node, sink),
+        Question::Orders { node } => orders(system, node.as_deref(), sink),
         Question::Call(question) => {
             permit(system, &question.function, Verb::Call)?;
             match question.node {
@@ -207,6 +208,25 @@ fn functions<T: Send + 'static>(system: &CommunicationSystem<T>, node: &str, sin
     let functions = peer.their_function_list();
     let mut seen = functions.iter().filter(|function| system.operator_sees(function.definition.name()));
     seen.try_for_each(|function| send(sink, Answer::Function(describe::function(function))))
+}
+
+fn orders<T: Send + 'static>(system: &CommunicationSystem<T>, node: Option<&str>, sink: Sink<'_>) -> Result<(), End> {
+    let peers = match node {
+        Some(node) => vec![select::node(system, node)?],
+        None => select::nodes(system),
+    };
+    if node.is_some() && !peers.iter().all(Peer::is_connected) {
+        return Err(Error::NotConnected.into());
+    }
+    for peer in &peers {
+        let functions = peer.their_function_list();
+        let moves = functions.iter().filter(|function| function.attributes.lease.is_some());
+        let mut seen = moves.filter(|function| system.operator_sees(function.definition.name()));
+        seen.try_for_each(|function| {
+            send(sink, Answer::Order(describe::order(system.identity().id(), peer, function.definition.name())))
+        })?;
+    }
+    Ok(())
 }
 
 fn publish<T: Send + 'static>(

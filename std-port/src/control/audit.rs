@@ -112,6 +112,7 @@ impl<'q> Asked<'q> {
             | Question::Nodes { .. }
             | Question::Search
             | Question::Functions { .. }
+            | Question::Orders { .. }
             | Question::Watch
             | Question::Counters { .. }
             | Question::Metrics

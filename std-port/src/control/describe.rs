@@ -3,12 +3,13 @@
 use crate::Finding;
 use cara_core::config::{Constraints, Priority, VERSIONS};
 use cara_core::distribution::identity::{Epoch, Identity};
-use cara_core::services::lease::LeaseEnd;
+use cara_core::services::lease::{ActuatorState, LastOrder, Latch, LeaseEnd};
 use cara_core::time::Duration;
 
 use super::failure::name_of;
 use super::protocol::{
-    Answer, ConstraintsInfo, FunctionInfo, InterfaceInfo, KeysInfo, LimitsInfo, NodeInfo, RefusedInfo, UnitInfo,
+    Answer, ConstraintsInfo, FunctionInfo, InhibitedInfo, InterfaceInfo, KeysInfo, LimitsInfo, NodeInfo, OrderInfo,
+    RefusedInfo, UnitInfo,
 };
 use crate::keys::LiveRing;
 use crate::{CommunicationSystem, Interface, Limits, Peer, TheirFunction, UnitEvent};
@@ -96,6 +97,27 @@ pub(super) fn function(function: &TheirFunction) -> FunctionInfo {
     }
 }
 
+/// As the unit `own` knows it.
+pub(super) fn order<T: Send + 'static>(own: u32, peer: &Peer<T>, function: &str) -> OrderInfo {
+    let ActuatorState { latch, last } = peer.actuator_state(function).unwrap_or_default();
+    let left = peer.lease_left(function);
+    // What is renewed here runs, also where the node has not told it yet.
+    let (order, holder) = match last {
+        _ if left.is_some() => ("runs", Some(own)),
+        None => ("none", None),
+        Some(LastOrder { end, holder, .. }) => (end.map_or("runs", LeaseEnd::word), Some(holder)),
+    };
+    OrderInfo {
+        node: peer.name().to_owned(),
+        id: peer.id(),
+        function: function.to_owned(),
+        order: order.to_owned(),
+        holder,
+        left_ms: left.map(|left| left.as_millis()),
+        inhibited: latch.map(|Latch { by, reason }| InhibitedInfo { by, reason }),
+    }
+}
+
 pub(super) const fn constraints(constraints: &Constraints) -> ConstraintsInfo {
     ConstraintsInfo {
         request_timeout_us: constraints.request_timeout.as_micros(),
@@ -136,6 +158,16 @@ pub(super) fn event(event: &UnitEvent, at: Duration) -> Answer {
                 _ => format!("'{function}' ended there: {}", why.word()),
             };
             ("lease_ended", Some(peer), text)
+        }
+        UnitEvent::Inhibited { peer, function, latch } => {
+            let text = match latch {
+                Some(Latch { by: 0, reason }) => {
+                    format!("'{function}' was stopped by the node itself, reason {reason}")
+                }
+                Some(Latch { by, .. }) => format!("'{function}' was stopped there by unit {by}"),
+                None => format!("'{function}' was reset there"),
+            };
+            ("inhibited", Some(peer), text)
         }
         other => ("other", None, format!("{other:?}")),
     };

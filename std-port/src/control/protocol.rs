@@ -40,6 +40,11 @@ pub enum Question {
         /// `NAME`, `NAME/ID` or `#ID`.
         node: String,
     },
+    /// An [`Answer::Order`] for each leased function of a node, of all connected ones if absent.
+    Orders {
+        /// `NAME`, `NAME/ID` or `#ID`.
+        node: Option<String>,
+    },
     /// Call a function. An [`Answer::Called`] for each node; of all, also for each s_unit of the roster that was not called. No lease is renewed: what the call starts goes on for the
     /// length of its lease.
     Call(CallQuestion),
@@ -214,6 +219,8 @@ pub enum Answer {
     Refused(RefusedInfo),
     /// A function of a node.
     Function(FunctionInfo),
+    /// The state of what a function of a node moves.
+    Order(OrderInfo),
     /// How a call ended.
     Called {
         /// The node's name.
@@ -448,4 +455,33 @@ pub struct FunctionInfo {
     /// How it wants to be called: `priority`, `lease_us` (or null), `idempotent`.
     #[serde(flatten, with = "super::attributes::Form")]
     pub attributes: Attributes,
+}
+
+/// The state of what a function of a node moves, as the node told.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct OrderInfo {
+    /// The node's name.
+    pub node: String,
+    /// The node's id.
+    pub id: u32,
+    /// The function's name.
+    pub function: String,
+    /// Of the order that has it, or had it last: `none` since the node's start, `runs`, or how it ended: `finished`,
+    /// `expired`, `replaced`, `stopped`.
+    pub order: String,
+    /// The ID number of its caller.
+    pub holder: Option<u32>,
+    /// How long it goes on at most if no more renewal of the unit that is asked gets there.
+    pub left_ms: Option<u64>,
+    /// What keeps every order from beginning.
+    pub inhibited: Option<InhibitedInfo>,
+}
+
+/// What inhibits a function.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct InhibitedInfo {
+    /// The ID number of the unit that stopped it; 0 for the node itself.
+    pub by: u32,
+    /// Why, as the node numbers its reasons; 0 for a function that stops.
+    pub reason: u16,
 }

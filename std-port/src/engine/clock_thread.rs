@@ -34,8 +34,16 @@ impl<T: Send + 'static> Engine<T> {
                     self.hand_over(&link);
                 }
             }
+            // Also before its deadline, where another thread wants it looked at.
+            self.poll_session(&link, &mut state);
             self.settle(&link, state);
         }
+    }
+
+    /// What a unit moves has been stopped: its links look at their orders now.
+    pub(crate) fn look_at_orders(&self) {
+        self.links.bring_timers_forward();
+        self.wake_clock();
     }
 
     pub(super) fn datagrams_ready(&self, socket: Socket, buffer: &mut [u8]) {

@@ -1,13 +1,16 @@
 //! One link as the threads share it: the session under its lock, the calls that wait, and which thread reads.
 
+use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Condvar, Mutex, OnceLock};
 use std::task::Waker;
 use std::thread::Thread;
 
+use cara_core::distribution::function_list::Slot;
 use cara_core::error::{CloseReason, Error};
 use cara_core::host::mailman::{LinkId, Mailman};
 use cara_core::services::Port;
+use cara_core::services::lease::ActuatorState;
 use cara_core::services::requests::CallId;
 use cara_core::services::session::Session;
 use cara_core::time::{Duration, Instant};
@@ -70,6 +73,8 @@ pub(crate) struct LinkState {
     /// What it has counted is among the sums of links that have ended.
     pub(crate) retired: bool,
     pub(crate) notices: Notices,
+    /// The state of what functions of the peer move, as far as it has told.
+    pub(crate) actuators: BTreeMap<Slot, ActuatorState>,
 }
 
 /// Bytes that were read and cannot be looked at yet, because calls that wait leave no room for more.
@@ -123,6 +128,7 @@ impl LinkCell {
             pinging: false,
             retired: false,
             notices: Notices::default(),
+            actuators: BTreeMap::new(),
         };
         Self {
             unit_number,

@@ -69,6 +69,11 @@ impl Links {
         Rank::Leaf.lock(&self.timers).set(u32::from(id.0), at)
     }
 
+    /// The sessions of all links are to be polled now.
+    pub(super) fn bring_timers_forward(&self) {
+        Rank::Leaf.lock(&self.timers).bring_all_forward(Instant::START);
+    }
+
     pub(super) fn cancel_timer(&self, id: LinkId) {
         Rank::Leaf.lock(&self.timers).cancel(u32::from(id.0));
     }

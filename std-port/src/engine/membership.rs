@@ -10,6 +10,7 @@ use cara_core::distribution::identity::Identity;
 use cara_core::error::{CloseReason, Error, Limit, Refusal};
 use cara_core::host::mailman::LinkId;
 use cara_core::services::hub::{Door, Hub};
+use cara_core::services::lease::ActuatorState;
 use cara_core::services::session::{Event, Session, SessionConfig};
 use cara_core::time::{Duration, Instant};
 use core::net::{IpAddr, SocketAddr};
@@ -221,9 +222,24 @@ impl<T: Send + 'static> Engine<T> {
         if let Event::Closed(reason) = event {
             return self.link_ended(link, reason);
         }
+        if let Event::Actuator { slot, state } = event {
+            return self.actuator_told(link, slot, state);
+        }
         self.tell_of(link, event);
         if let Event::Answered | Event::Acknowledged { .. } = event {
             link.room.notify_all();
+        }
+    }
+
+    /// The peer has told the state of what a function moves. Subscribers hear of its latch alone.
+    fn actuator_told(&self, link: &LinkCell, slot: Slot, state: ActuatorState) {
+        let mut held = link.lock();
+        let before = held.actuators.insert(slot, state).unwrap_or_default();
+        let Some(peer) = link.peer.get().filter(|_| before.latch != state.latch) else { return };
+        let name = held.session.their_function_list().function(slot).map(|function| function.name().to_owned());
+        drop(held);
+        if let Some(function) = name {
+            self.tell(UnitEvent::Inhibited { peer: peer.identity.clone(), function, latch: state.latch });
         }
     }
 

@@ -10,6 +10,7 @@ use cara_core::counters::Counters;
 use cara_core::distribution::identity::{Identity, Role};
 use cara_core::error::{CloseReason, Error};
 use cara_core::host::connections::LinkCounter;
+use cara_core::services::requests::CallId;
 use cara_core::time::Duration;
 
 use super::link::LinkCell;
@@ -29,6 +30,8 @@ pub(crate) struct PeerCell {
     left: Mutex<Option<(std::time::Instant, CloseReason)>>,
     /// What differs for this node from the unit's constraints, whether it is connected or not.
     own: Mutex<Option<OwnConstraints>>,
+    /// The newest call of each function that was to move something, and the link that it was made by.
+    orders: Mutex<HashMap<String, (u32, CallId)>>,
     /// What its earlier links have counted.
     earlier: Mutex<Option<Box<LinkCounters>>>,
     /// It has told what it offers since it has its place, on this link or an earlier one.
@@ -100,6 +103,7 @@ impl PeerCell {
             joined: Mutex::new(None),
             left: Mutex::new(None),
             own: Mutex::new(None),
+            orders: Mutex::default(),
             earlier: Mutex::new(None),
             introduced: AtomicBool::new(false),
             retired: AtomicBool::new(false),
@@ -123,6 +127,20 @@ impl PeerCell {
             self.retired.store(true, Ordering::Relaxed);
         }
         link.is_none()
+    }
+
+    /// A call that is to move something goes out.
+    pub(super) fn ordered(&self, function: &str, link: u32, call: CallId) {
+        let mut orders = lock(&self.orders);
+        match orders.get_mut(function) {
+            Some(known) => *known = (link, call),
+            None => drop(orders.insert(function.to_owned(), (link, call))),
+        }
+    }
+
+    /// The newest call of a function that was to move something, and the link that it was made by.
+    pub(crate) fn last_order(&self, function: &str) -> Option<(u32, CallId)> {
+        lock(&self.orders).get(function).copied()
     }
 
     pub(super) fn earlier(&self) -> LinkCounters {

@@ -35,7 +35,7 @@ impl<T: Send + 'static> Engine<T> {
         }
     }
 
-    fn poll_session(&self, link: &Arc<LinkCell>, state: &mut LinkState) {
+    pub(super) fn poll_session(&self, link: &Arc<LinkCell>, state: &mut LinkState) {
         loop {
             let event = self.with(link, state, |session, cx| session.poll(cx));
             match event {

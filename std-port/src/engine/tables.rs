@@ -104,16 +104,19 @@ impl<T: Send + 'static> Engine<T> {
     ) -> Result<CallId, Error> {
         let mut attempt =
             || self.with_at(now, link, state, |session, cx| session.request(cx, function, parameters, options, wait));
-        match attempt() {
-            Err(Error::Full(Limit::Calls)) => {}
-            outcome => return outcome,
-        }
+        let mut outcome = attempt();
         let most = self.links.capacities.calls_in_flight;
-        if state.session.call_slots() >= most {
-            return Err(Error::Full(Limit::Calls));
+        if outcome == Err(Error::Full(Limit::Calls)) && state.session.call_slots() < most {
+            drop(state.session.lend_calls(filled(most, None)));
+            outcome = self.with(link, state, |session, cx| session.request(cx, function, parameters, options, wait));
         }
-        drop(state.session.lend_calls(filled(most, None)));
-        self.with(link, state, |session, cx| session.request(cx, function, parameters, options, wait))
+        if let Ok(id) = outcome
+            && state.session.last_order().is_some_and(|(_, order)| order == id)
+            && let Some(peer) = link.peer.get()
+        {
+            peer.ordered(function, state.session.nonce() as u32, id);
+        }
+        outcome
     }
 
     /// Makes room for one more function of the peer, which may be what comes next.

@@ -5,7 +5,7 @@ use std::sync::mpsc::Receiver;
 use std::sync::{Arc, Mutex};
 
 use cara_std::{
-    Actuator, Call, CommunicationSystem, Definition, Error, Parameters, ParametersView, Peer, Priority, Renew,
+    Actuator, Call, CommunicationSystem, Definition, Error, Latch, Parameters, ParametersView, Peer, Priority, Renew,
     RequestOptions, ServiceError, ServiceOptions, UnitEvent,
 };
 
@@ -101,6 +101,13 @@ fn told(events: &Receiver<UnitEvent>, word: &str) {
     });
 }
 
+/// Waits until a caller is told of this state of the drive's latch.
+fn latched(events: &Receiver<UnitEvent>, wanted: Option<Latch>) {
+    until("it is told of the latch", || {
+        events.try_iter().any(|event| matches!(event, UnitEvent::Inhibited { latch, .. } if latch == wanted))
+    });
+}
+
 #[test]
 fn two_services_of_one_actuator_replace_each_other_without_the_hook() {
     let crane = Crane::new();
@@ -171,14 +178,18 @@ fn a_stop_outlasts_the_link_and_the_start_of_the_unit_that_stopped_it() {
 fn the_vehicles_own_stop_is_told_with_its_reason_and_its_hook_waits_for_nothing() {
     let crane = Crane::new();
     let events = crane.callers[0].events();
+    let others = crane.callers[1].events();
     assert_eq!(crane.ask(0, "go"), Ok(()));
     crane.drive.inhibit(9);
     assert!(!crane.moves());
+    // At once, and not when the lease would have ended.
+    told(&events, "stopped");
     until("the hook ran", || crane.hooks() == 1);
     assert_eq!(crane.ask(0, "go"), Err(Error::Inhibited { by: 0, reason: 9 }));
-    told(&events, "stopped");
+    latched(&others, Some(Latch { by: 0, reason: 9 }));
     crane.drive.reset();
-    until("it moves again", || crane.ask(0, "go") == Ok(()));
+    assert_eq!(crane.ask(0, "go"), Ok(()));
+    latched(&others, None);
     assert_eq!(crane.hooks(), 1);
 }
 

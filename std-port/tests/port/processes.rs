@@ -10,7 +10,10 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use cara_std::control::Control;
-use cara_std::{CloseReason, Error, Refusal, Renew, RequestOptions, ServiceOptions, StartError, UnitEvent};
+use cara_std::{
+    Call, CloseReason, Definition, Error, LeaseEnd, OrderOutcome, Parameters, ParametersView, Refusal, Renew,
+    RequestOptions, ServiceError, ServiceOptions, StartError, UnitEvent,
+};
 use rustix::process::{Pid, Signal, kill_process};
 
 use crate::support::{PATIENCE, ask, fleet, number, service, system, unit, until};
@@ -89,6 +92,12 @@ fn as_child() {
                 }),
             )
             .unwrap();
+            let moves = ServiceOptions::new().lease(Duration::from_millis(400), || ());
+            let drive = |call: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+                call.lease.as_ref().unwrap().wait_until_ended();
+                Ok(())
+            };
+            list.add_service(&Definition::parse("drive()").unwrap(), moves, drive).unwrap();
             agv.publish_my_function_list().unwrap();
             agv.start().unwrap();
             until_input_ends();
@@ -145,6 +154,36 @@ fn a_killed_peer_interrupts_its_callers_and_takes_its_place_again() {
         let names: Vec<_> = manager.s_units().iter().map(|peer| peer.name().to_owned()).collect();
         assert_eq!(names, ["first", "second"]);
     }
+}
+
+/// The vehicle stands still for longer than the link lives, and then is started again: what has become of the call.
+#[test]
+fn an_interrupted_order_is_resolved_when_the_vehicle_is_back() {
+    let fleet = fleet();
+    let manager = system(fleet).build().unwrap();
+    manager.start().unwrap();
+    let mut vehicle = Process::agv(fleet, "first", 1, 1);
+    until("it has come", || manager.nodes_offering("drive").len() == 1);
+    let peer = manager.s_units()[0].clone();
+    assert_eq!(peer.outcome_of("drive"), OrderOutcome::Unknown);
+    std::thread::scope(|scope| {
+        let drives = scope.spawn(|| {
+            let options = RequestOptions { timeout: Some(PATIENCE.into()), ..RequestOptions::renewing(Renew::Process) };
+            peer.block_request_with("drive", &mut Parameters::new(), &options)
+        });
+        until("it drives", || peer.outcome_of("drive") == OrderOutcome::Runs);
+        vehicle.freeze();
+        assert_eq!(drives.join().unwrap(), Err(Error::Interrupted));
+    });
+    until("it is lost", || !peer.is_connected());
+    assert_eq!(peer.outcome_of("drive"), OrderOutcome::Unknown);
+    vehicle.signal(Signal::CONT);
+    until("it tells", || peer.outcome_of("drive") == OrderOutcome::Ended(LeaseEnd::Expired));
+    vehicle.kill();
+    until("it has left", || !peer.is_connected());
+    let _again = Process::agv(fleet, "first", 1, 2);
+    until("it is back", || peer.is_connected() && peer.function("drive").is_some());
+    assert_eq!(peer.outcome_of("drive"), OrderOutcome::Unknown);
 }
 
 /// The discovery port belongs to no process alone: units in five of them find each other.

@@ -158,7 +158,7 @@ entry!(session_set, {
 entry!(session_requests, {
     keep(session().request(context(), unknown_text(), parameters(), unknown(), *unknown()));
     session().cancel(context(), *unknown());
-    keep(session().holds(*unknown()));
+    keep((session().holds(*unknown()), session().last_order(), session().lease_left(*unknown(), *unknown())));
 });
 
 entry!(session_serves, {
@@ -210,7 +210,8 @@ entry!(leases, {
     keep((lease.latch(), lease.is_inhibited(), lease.is_cut(*unknown())));
     keep((lease.renew(*unknown(), *unknown()), lease.lasts_beyond(*unknown())));
     keep((lease.is_live(*unknown()), lease.is_live_for(*unknown(), *unknown()), Lease::seen_end(*unknown())));
-    keep((lease.left(*unknown()), lease.end(*unknown())));
+    keep((lease.left(*unknown()), lease.end(*unknown(), LeaseEnd::Expired)));
+    keep((lease.state(), lease.state().outcome_of(*unknown(), *unknown())));
     lease.cut(*unknown());
     lease.clear();
     keep(unknown::<Lease>().is_live(*unknown()));

@@ -11,6 +11,7 @@ use cara_core::distribution::message::{Control, Message, SessionBody};
 use cara_core::distribution::parameters::{Parameters, Type, Value as Variable};
 use cara_core::error::{Error, ServiceError};
 use cara_core::host::secure::Plain;
+use cara_core::services::lease::{LastOrder, Latch, LeaseEnd};
 use serde_json::{Value, json};
 
 use crate::stream;
@@ -151,6 +152,13 @@ fn control(control: &Control<'_>) -> Value {
             "message_size": message_size, "minimum_interval": minimum_interval, "calls": calls,
         }}),
         Control::LeaseEnded { call, why } => json!({ "lease_ended": { "call": call, "why": why.word() } }),
+        Control::Actuator { slot, latch, last } => {
+            let latch = latch.map(|Latch { by, reason }| json!({ "by": by, "reason": reason }));
+            let last = last.map(|LastOrder { holder, link, call, end }| {
+                json!({ "holder": holder, "link": link, "call": call, "end": end.map(LeaseEnd::word) })
+            });
+            json!({ "actuator": { "slot": slot, "latch": latch, "last": last } })
+        }
     }
 }
 

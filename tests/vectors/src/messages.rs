@@ -4,7 +4,7 @@ use cara_core::config::Priority;
 use cara_core::distribution::function::Attributes;
 use cara_core::distribution::function_list::{Generation, Slot};
 use cara_core::distribution::message::{
-    Control, LeaseEnd, Release, Renewal, RequestHeader, SessionBody, encode_failure, encode_reply,
+    Control, LastOrder, Latch, LeaseEnd, Release, Renewal, RequestHeader, SessionBody, encode_failure, encode_reply,
 };
 use cara_core::error::{Error, ServiceError};
 use cara_core::time::Duration;
@@ -161,7 +161,7 @@ fn controls() -> Vec<Vector> {
     let stop = definition("stop()");
     let attributes = Attributes { priority: Priority::Emergency, idempotent: true, ..Attributes::default() }.encode();
     let publish = Control::Publish { slot: 300, generation: 2, attributes: &attributes, signature: stop.as_bytes() };
-    let all: [(&'static str, &'static str, Control<'_>, Value); 7] = [
+    let all: [(&'static str, &'static str, Control<'_>, Value); 10] = [
         (
             "publish",
             "a function may be called",
@@ -200,6 +200,38 @@ fn controls() -> Vec<Vector> {
             "a newer call of the same function goes on",
             Control::LeaseEnded { call: 4, why: LeaseEnd::Replaced },
             json!({ "lease_ended": { "call": 4, "why": "replaced" } }),
+        ),
+        (
+            "actuator_free",
+            "nothing has moved since the sender's start, and nothing is stopped",
+            Control::Actuator { slot: 3, latch: None, last: None },
+            json!({ "actuator": { "slot": 3, "latch": null, "last": null } }),
+        ),
+        (
+            "actuator_runs",
+            "an order of the reader has it",
+            Control::Actuator {
+                slot: 3,
+                latch: None,
+                last: Some(LastOrder { holder: 1, link: 0xC0FF_EE00, call: 700, end: None }),
+            },
+            json!({ "actuator": {
+                "slot": 3, "latch": null,
+                "last": { "holder": 1, "link": 0xC0FF_EE00_u32, "call": 700, "end": null },
+            } }),
+        ),
+        (
+            "actuator_stopped",
+            "a unit has stopped it, and with it the order of a third one",
+            Control::Actuator {
+                slot: 300,
+                latch: Some(Latch { by: 70_000, reason: 12 }),
+                last: Some(LastOrder { holder: 2, link: 0, call: 0, end: Some(LeaseEnd::Stopped) }),
+            },
+            json!({ "actuator": {
+                "slot": 300, "latch": { "by": 70_000, "reason": 12 },
+                "last": { "holder": 2, "link": 0, "call": 0, "end": "stopped" },
+            } }),
         ),
     ];
     let encoded = |(name, about, control, value): (_, _, Control<'_>, _)| {

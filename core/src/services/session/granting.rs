@@ -48,6 +48,8 @@ impl<P: Port> Session<P> {
             holder: self.identity().map_or(0, Identity::id),
             replaces: earlier.and_then(|earlier| earlier.order),
             takes_over: head.takes_over,
+            link: self.hello().map_or(0, |hello| hello.nonce as u32),
+            call: head.id,
         };
         // The service's word is changed before the table here: where it refuses, nothing of this session has changed.
         let order = match service.map_or(Ok(None), |service| service.begin_lease(cx.now, end, &claim)) {
@@ -141,12 +143,14 @@ impl<P: Port> Session<P> {
         if self.was_stopped(cx) {
             self.timers.lease = cx.now;
         }
+        self.publishing.actuators_due = true;
     }
 
     /// A function that resets has been answered with results: what it resets may move again, unless it was stopped after the
     /// call was made, which is [`Error::Inhibited`].
-    pub(super) fn reset_orders(&self, cx: &Context<'_, P>, head: &CallHead) -> Result<(), Error> {
+    pub(super) fn reset_orders(&mut self, cx: &Context<'_, P>, head: &CallHead) -> Result<(), Error> {
         let mut outcome = Ok(());
+        self.publishing.actuators_due = true;
         for (_, service) in self.moved_by(cx, head.slot, head.generation) {
             service.reset(cx.now, head.sent_at);
             let latch = service.lease().and_then(Lease::latch);
@@ -220,7 +224,7 @@ impl<P: Port> Session<P> {
     fn end_released(&mut self, cx: &mut Context<'_, P>, is_released: impl Fn(&Granted) -> bool) -> Option<Event> {
         let index = self.granted.iter().position(is_released);
         let granted = index.and_then(|index| take_at(&mut self.granted, index))?;
-        if expire_granted(cx, &granted) { Some(Event::LeaseExpired(granted.slot)) } else { None }
+        if expire_granted(cx, &granted, LeaseEnd::Expired) { Some(Event::LeaseExpired(granted.slot)) } else { None }
     }
 
     /// Whether what a call of the peer moves was stopped: by the vehicle itself, or through another link.
@@ -236,7 +240,8 @@ impl<P: Port> Session<P> {
             let Some(granted) = index.and_then(|index| take_at(&mut self.granted, index)) else { break };
             let is_inhibited = lease_of(cx, &granted).is_some_and(Lease::is_inhibited);
             let why = if is_inhibited { LeaseEnd::Stopped } else { LeaseEnd::Expired };
-            if expire_granted(cx, &granted) {
+            if expire_granted(cx, &granted, why) {
+                self.publishing.actuators_due |= is_inhibited;
                 self.link.counters.add(LinkCounter::LeasesExpired, 1);
                 self.tell_end(cx, granted.call, why);
                 return Some(granted.slot);
@@ -285,7 +290,7 @@ fn service_of<'c, P: Port>(cx: &Context<'c, P>, slot: Slot, generation: Generati
 
 /// Whether the safe hook is to run: not when a call of another peer holds the lease now, whose motion goes on, and not when
 /// the service is gone, with which its hook has run.
-pub(super) fn expire_granted<P: Port>(cx: &Context<'_, P>, granted: &Granted) -> bool {
+pub(super) fn expire_granted<P: Port>(cx: &Context<'_, P>, granted: &Granted, how: LeaseEnd) -> bool {
     let service = service_of(cx, granted.slot, granted.generation);
-    service.is_some_and(|service| granted.order.is_none_or(|order| service.expire_lease(order)))
+    service.is_some_and(|service| granted.order.is_none_or(|order| service.expire_lease(order, how)))
 }

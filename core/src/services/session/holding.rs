@@ -40,6 +40,13 @@ impl<P: Port> Session<P> {
         self.held.iter().any(|held| held.call == call && !held.release_unsent)
     }
 
+    /// How long the leases that calls of a function hold last at most if no more renewal is answered; `None` where none is
+    /// renewed.
+    pub fn lease_left(&self, now: Instant, slot: Slot) -> Option<Duration> {
+        let of_slot = self.held.iter().filter(|held| held.slot == slot && !held.release_unsent);
+        of_slot.map(|held| (held.answered + held.lease).since(now)).max()
+    }
+
     /// Whether a call of a function could be renewed. [`Error::Full`] when there is no room, and no earlier call of the same
     /// function that would give way; [`Error::SlowHeart`] for one that would let the lease end between two beats.
     pub(super) fn check_held(&self, lease: Option<Duration>, renew: Renew, slot: Slot) -> Result<(), Error> {

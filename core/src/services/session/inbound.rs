@@ -18,6 +18,7 @@ use crate::host::endpoint::Endpoint as _;
 use crate::host::frame::Frame;
 use crate::host::secure::{Secure, Unopened};
 use crate::services::calls::{CallHead, Seen};
+use crate::services::lease::ActuatorState;
 use crate::services::lease::Service;
 use crate::services::requests::{CallId, Pending};
 use crate::services::{Context, Port};
@@ -393,6 +394,9 @@ impl<P: Port> Session<P> {
                     remote.hello.limits.calls = calls;
                 }
                 None
+            }
+            Control::Actuator { slot, latch, last } => {
+                Some(Event::Actuator { slot: Slot(slot), state: ActuatorState { latch, last } })
             }
             Control::LeaseEnded { call, why } => {
                 self.stop_renewing(CallId(call)).map(|held| Event::LeaseEnded { call: held.call, slot: held.slot, why })

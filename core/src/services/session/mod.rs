@@ -47,7 +47,7 @@ use crate::host::frame::{Frame, HEADER_BYTES};
 use crate::host::mailman::LinkId;
 use crate::host::secure::Secure;
 use crate::services::calls::{CallHead, Calls, Ticket};
-use crate::services::lease::{Granted, Held, LeaseEnd, Order};
+use crate::services::lease::{ActuatorState, Granted, Held, LeaseEnd, Order};
 use crate::services::requests::{CallId, Pending, Requests};
 use crate::services::{Context, Port};
 use crate::storage::{Buffers, Storage};
@@ -130,6 +130,14 @@ pub enum Event {
         /// Why.
         why: LeaseEnd,
     },
+    /// The peer tells the state of what a function of it moves: before its list is complete for one that has had an order
+    /// or is inhibited, and when that changes, within a keep-alive interval.
+    Actuator {
+        /// The peer's function.
+        slot: Slot,
+        /// Its state.
+        state: ActuatorState,
+    },
     /// The peer answered a [`Session::ping`].
     Answered,
     /// The link has ended; every call in flight and every lease has been reported before.
@@ -207,6 +215,8 @@ pub struct Session<P: Port> {
     ends: granting::Ends,
     held: heapless::Vec<Held, LEASES>,
     releases: holding::Releases,
+    /// The newest call that was to move something.
+    last_order: Option<(Slot, CallId)>,
     /// How often something was received, by which [`Results`] are known to be the last ones.
     step: u32,
 }
@@ -251,6 +261,7 @@ impl<P: Port> Session<P> {
             ends: granting::Ends::new(),
             held: heapless::Vec::new(),
             releases: holding::Releases::new(),
+            last_order: None,
             step: 0,
         }
     }
@@ -345,6 +356,11 @@ impl<P: Port> Session<P> {
     /// What happened on this link.
     pub const fn counters(&self) -> &Counters<LinkCounter, { LinkCounter::COUNT }> {
         &self.link.counters
+    }
+
+    /// The newest call of a leased function of the peer.
+    pub const fn last_order(&self) -> Option<(Slot, CallId)> {
+        self.last_order
     }
 
     /// Calls of this unit that wait for a reply.

@@ -115,6 +115,9 @@ impl<P: Port> Session<P> {
             return Err(error);
         }
         self.requests.sent(cx.now);
+        if checked.lease.is_some() {
+            self.last_order = Some((slot, id));
+        }
         if let Some(lease) = held {
             self.hold_lease(cx, &checked.header, checked.priority, lease, options.renew);
         }

@@ -5,8 +5,10 @@ use crate::config::{Priority, SIGNATURE_BYTES};
 use crate::distribution::function::Attributes;
 use crate::distribution::function_list::{Generation, Slot};
 use crate::distribution::hello::Limits;
+use crate::distribution::identity::Identity;
 use crate::distribution::message::{CONTROL_BYTES, Control, PUBLISH_BYTES};
 use crate::services::access::Bucket;
+use crate::services::lease::{ActuatorState, LastOrder};
 use crate::services::{Context, Port};
 use crate::storage::Storage;
 use crate::time::{Duration, Instant};
@@ -44,6 +46,10 @@ pub(super) struct Publishing<S: Storage> {
     acknowledged: u32,
     acknowledgement_due: Option<u32>,
     limits_due: bool,
+    /// The peer may have been told another state of what is moved here.
+    pub(super) actuators_due: bool,
+    /// What the peer was told, as the sum of [`Lease::changes`].
+    actuators_told: u32,
     pub(super) refusals: Refusals,
 }
 
@@ -78,6 +84,8 @@ impl<S: Storage> Publishing<S> {
             acknowledged: 0,
             acknowledgement_due: None,
             limits_due: false,
+            actuators_due: false,
+            actuators_told: 0,
             refusals: Refusals { count: 0, logged: None },
         }
     }
@@ -209,8 +217,11 @@ impl<P: Port> Session<P> {
         if self.publishing.dirty {
             self.publishing.dirty = !self.send_news(cx);
         }
+        if self.publishing.actuators_due && !self.publishing.dirty {
+            self.publishing.actuators_due = !self.send_actuators(cx);
+        }
         // The end of the list goes behind all of it: its acknowledgement says that the peer has read everything before.
-        if self.publishing.end_due && !self.publishing.dirty {
+        if self.publishing.end_due && !self.publishing.dirty && !self.publishing.actuators_due {
             let serial = self.publishing.serial;
             self.publishing.end_due = !self.send_control(cx, &Control::ListEnd { serial });
         }
@@ -220,7 +231,31 @@ impl<P: Port> Session<P> {
     pub(super) fn has_news(&self) -> bool {
         let publishing = &self.publishing;
         let told = publishing.acknowledgement_due.is_none() && self.ends.is_empty();
-        publishing.dirty || publishing.end_due || publishing.limits_due || !told
+        publishing.dirty || publishing.end_due || publishing.limits_due || publishing.actuators_due || !told
+    }
+
+    /// Tells the state of what each function moves, if it has changed; `false` when there was no more room.
+    fn send_actuators(&mut self, cx: &mut Context<'_, P>) -> bool {
+        let functions = cx.functions;
+        let moves = |slot| functions.function(slot).filter(|function| function.attributes.lease.is_some());
+        let leases = self.publishing.all_slots().filter_map(|slot| moves(slot)?.handler.lease());
+        let changes = leases.fold(0, |sum: u32, lease| sum.wrapping_add(lease.changes()));
+        if changes == self.publishing.actuators_told {
+            return true;
+        }
+        let peer = self.identity().map_or(0, Identity::id);
+        for slot in self.publishing.all_slots() {
+            let told = self.publishing.table.get(usize::from(slot.0)).and_then(|publication| publication.told);
+            let Some(function) = moves(slot).filter(|function| told == Some(function.generation)) else { continue };
+            let ActuatorState { latch, last } = function.handler.state();
+            // A link's nonce is its own caller's alone.
+            let last = last.map(|last| if last.holder == peer { last } else { LastOrder { link: 0, call: 0, ..last } });
+            if !self.send_control(cx, &Control::Actuator { slot: slot.0, latch, last }) {
+                return false;
+            }
+        }
+        self.publishing.actuators_told = changes;
+        true
     }
 
     fn send_limits(&mut self, cx: &mut Context<'_, P>) -> bool {
@@ -253,6 +288,9 @@ impl<P: Port> Session<P> {
             };
             if !sent {
                 return false;
+            }
+            if function.is_some_and(|function| function.attributes.lease.is_some()) {
+                (self.publishing.actuators_due, self.publishing.actuators_told) = (true, 0);
             }
             // Only once it is in the queue: after a full queue the loop begins again at the first function that is not told.
             if let Some(publication) = self.publishing.table.get_mut(index) {

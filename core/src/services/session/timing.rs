@@ -10,6 +10,7 @@ use crate::host::connections::LinkCounter;
 use crate::host::endpoint::Endpoint as _;
 use crate::host::frame::Frame;
 use crate::host::secure::{DATAGRAM_OVERHEAD, Secure};
+use crate::services::lease::LeaseEnd;
 use crate::services::{Context, Port};
 use crate::time::{Duration, Instant};
 
@@ -185,7 +186,7 @@ impl<P: Port> Session<P> {
     /// Reports what ended with the link, one by one: leases first.
     fn poll_ending(&mut self, cx: &mut Context<'_, P>, reason: CloseReason) -> Option<Event> {
         while let Some(granted) = self.granted.pop() {
-            if expire_granted(cx, &granted) {
+            if expire_granted(cx, &granted, LeaseEnd::Expired) {
                 return Some(Event::LeaseExpired(granted.slot));
             }
         }
@@ -204,6 +205,8 @@ impl<P: Port> Session<P> {
         // The peer counts by what it was told in the hello.
         let told = Duration::from_millis(u64::from(self.local.keep_alive));
         self.timers.keep_alive = cx.now + self.constraints.keep_alive.min(told).max(Duration::from_millis(1));
+        self.publishing.actuators_due = true;
+        self.pump(cx);
         let body = SessionBody::keep_alive(cx.now.as_micros());
         if LATER {
             self.link.send_frame(&Frame::Skipped);

@@ -7,6 +7,7 @@ pub(crate) mod completions;
 pub(crate) mod counters;
 pub(crate) mod functions;
 pub(crate) mod man;
+pub(crate) mod orders;
 pub(crate) mod ping;
 pub(crate) mod publish;
 pub(crate) mod retire;

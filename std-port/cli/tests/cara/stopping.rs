@@ -174,3 +174,35 @@ fn a_stop_outlasts_the_manager() {
     reset(&stage, "agv");
     stage.ends(0, &["call", "agv", "go"]);
 }
+
+#[test]
+fn who_moves_what_is_shown_with_what_inhibits_it() {
+    let stage = Stage::with(&[]);
+    stage.ends(0, &["orders"]).says("no node has published a function with a lease");
+    let _vehicle = Vehicle::start(&stage, "agv", 21, &["halt"]);
+    known(&stage, &["agv"]);
+    let row = || {
+        stage
+            .cara(&["orders", "agv"])
+            .out
+            .lines()
+            .nth(1)
+            .unwrap_or_default()
+            .split_whitespace()
+            .collect::<Vec<_>>()
+            .join(" ")
+    };
+    assert_eq!(row(), "agv/21 go none - - -");
+    stage.ends(0, &["call", "agv", "go"]);
+    until("it runs", || row() == "agv/21 go runs 1 - -");
+    stage.ends(0, &["stop", "agv"]);
+    until("it is stopped", || row() == "agv/21 go stopped 1 - by unit 1");
+    let told = &stage.ends(0, &["orders", "--json"]).lines()[0]["orders"][0];
+    assert_eq!(
+        (&told["node"], &told["order"], &told["inhibited"]["by"]),
+        (&"agv".into(), &"stopped".into(), &1.into())
+    );
+    reset(&stage, "agv");
+    until("it is free", || row() == "agv/21 go stopped 1 - -");
+    stage.ends(1, &["orders", "lift"]);
+}

@@ -7,7 +7,7 @@ use crate::config::Priority;
 use crate::distribution::function::Attributes;
 use crate::distribution::function_list::Slot;
 use crate::error::{Error, ServiceError};
-use crate::services::lease::{Claim, Latch, Lease, LeaseEnd, Service as _};
+use crate::services::lease::{ActuatorState, Claim, LastOrder, Latch, Lease, LeaseEnd, Service as _};
 use crate::services::requests::CallId;
 use crate::time::{Duration, Instant};
 
@@ -57,6 +57,15 @@ fn outcome(pair: &Pair, id: CallId) -> Result<(), Error> {
     pair.manager.outcome(id).expect("it has an outcome").map(|_| ())
 }
 
+/// What the manager was told last of what a function of the vehicle moves.
+fn state(pair: &Pair, slot: Slot) -> Option<ActuatorState> {
+    let told = pair.manager.happened.iter().rev();
+    told.copied().find_map(|event| match event {
+        Event::Actuator { slot: of, state } => (of == slot).then_some(state),
+        _ => None,
+    })
+}
+
 fn hooks(pair: &Pair) -> usize {
     pair.agv.count(|event| matches!(event, Event::LeaseExpired(_)))
 }
@@ -95,7 +104,7 @@ fn functions_that_move_the_same_thing_are_published_with_the_same_number() {
 fn what_another_caller_moves_is_held_unless_it_is_taken_over() {
     let (mut pair, [go, ..]) = vehicle();
     let word = pair.agv.functions.function(go).unwrap().handler.lease.clone().unwrap();
-    let other = Claim { holder: 77, replaces: None, takes_over: false };
+    let other = Claim { holder: 77, replaces: None, takes_over: false, link: 0, call: 0 };
     let order = word.claim(pair.agv.now, pair.agv.now + LEASE, &other).unwrap();
     let refused = call(&mut pair, "dock");
     assert_eq!(outcome(&pair, refused), Err(Error::Held { by: 77 }));
@@ -231,7 +240,7 @@ fn a_call_that_was_made_before_the_stop_does_not_begin_after_the_reset() {
 #[test]
 fn nothing_comes_alive_under_a_latch() {
     let (lease, now) = (Lease::new(), Instant::from_micros(1_000_000));
-    let claim = Claim { holder: 1, replaces: None, takes_over: true };
+    let claim = Claim { holder: 1, replaces: None, takes_over: true, link: 0, call: 0 };
     let order = lease.claim(now, now + LEASE, &claim).unwrap();
     lease.inhibit(now, Latch { by: 0, reason: 1 });
     assert!(!lease.is_live(now) && !lease.lasts_beyond(now) && !lease.renew(order, now + LEASE));
@@ -242,7 +251,7 @@ fn nothing_comes_alive_under_a_latch() {
     assert_eq!(lease.latch(), None);
     assert_eq!(lease.claim(now + MOMENT, now + LEASE, &claim), Err(Error::Busy));
     assert!(!lease.is_live_for(order, now + MOMENT));
-    assert!(lease.end(order) && lease.claim(now + MOMENT, now + LEASE, &claim).is_ok());
+    assert!(lease.end(order, LeaseEnd::Expired) && lease.claim(now + MOMENT, now + LEASE, &claim).is_ok());
 }
 
 #[test]
@@ -257,4 +266,70 @@ fn a_reset_counts_from_when_it_was_made_however_long_the_latch_is_old() {
         lease.reset(later, later);
         assert!(!lease.is_inhibited(), "after {days} days");
     }
+}
+
+#[test]
+fn the_caller_is_told_the_state_of_what_it_moves() {
+    let (mut pair, [go, dock, lift]) = vehicle();
+    pair.run(Duration::from_secs(3));
+    assert_eq!([go, dock, lift].map(|slot| state(&pair, slot)), [None; 3], "there is nothing to say");
+    let moves = call(&mut pair, "go");
+    pair.run(Duration::from_secs(1));
+    let link = pair.manager.session.local.nonce as u32;
+    let last = LastOrder { holder: 1, link, call: moves.0, end: None };
+    assert_eq!([go, dock].map(|slot| state(&pair, slot)), [Some(ActuatorState { latch: None, last: Some(last) }); 2]);
+    assert_eq!(state(&pair, lift), Some(ActuatorState::default()));
+    let events = pair.manager.happened.len();
+    pair.run(Duration::from_secs(5));
+    assert_eq!(pair.manager.happened.len(), events, "what has not changed is not told again");
+    pair.agv.end_lease(go);
+    pair.run(Duration::from_secs(1));
+    let last = LastOrder { end: Some(LeaseEnd::Finished), ..last };
+    assert_eq!(state(&pair, dock).unwrap().last, Some(last));
+}
+
+#[test]
+fn a_latch_and_its_end_are_told_at_once() {
+    let (mut pair, [go, _, lift]) = vehicle();
+    let lifts = call(&mut pair, "lift");
+    control(&mut pair, "halt", Ok(()));
+    let latch = Some(Latch { by: 1, reason: 0 });
+    let told = state(&pair, lift).unwrap();
+    assert_eq!((told.latch, state(&pair, go).unwrap().latch), (latch, latch));
+    let last = told.last.unwrap();
+    assert_eq!((last.call, last.end), (lifts.0, Some(LeaseEnd::Stopped)));
+    pair.run(MOMENT);
+    control(&mut pair, "free", Ok(()));
+    assert_eq!(state(&pair, go).unwrap().latch, None);
+}
+
+#[test]
+fn the_vehicles_own_latch_is_told_within_a_keep_alive() {
+    let (mut pair, [go, ..]) = vehicle();
+    let latch = Latch { by: 0, reason: 7 };
+    pair.agv.functions.function(go).unwrap().handler.inhibit(pair.agv.now, latch);
+    pair.run(crate::config::Constraints::S_UNIT.keep_alive);
+    assert_eq!(state(&pair, go), Some(ActuatorState { latch: Some(latch), last: None }));
+}
+
+/// Its link's nonce is a secret where there are no keys.
+#[test]
+fn who_moves_it_is_told_to_others_but_not_by_which_link() {
+    let (mut pair, [go, ..]) = vehicle();
+    let word = pair.agv.functions.function(go).unwrap().handler.lease.clone().unwrap();
+    let other = Claim { holder: 77, replaces: None, takes_over: false, link: 5, call: 6 };
+    word.claim(pair.agv.now, pair.agv.now + LEASE, &other).unwrap();
+    pair.run(crate::config::Constraints::S_UNIT.keep_alive);
+    let last = state(&pair, go).unwrap().last.unwrap();
+    assert_eq!(last, LastOrder { holder: 77, link: 0, call: 0, end: None });
+}
+
+#[test]
+fn what_the_peer_may_call_later_is_told_as_well() {
+    let (mut pair, [go, ..]) = vehicle();
+    call(&mut pair, "go");
+    pair.run(Duration::from_secs(2));
+    let park = pair.agv.offer_sharing("park()", LEASE, go);
+    pair.publish();
+    assert!(state(&pair, park).unwrap().last.is_some());
 }
