@@ -4,7 +4,7 @@ use core::fmt;
 use core::future::poll_fn;
 use core::task::Poll;
 
-use cara_core::services::lease::{Ended, Lease, Order};
+use cara_core::services::lease::{Ended, Lease, Order, Stage};
 use cara_core::services::session::Call;
 
 use crate::handle::Handle;
@@ -43,6 +43,11 @@ impl LeaseWatch {
     /// Whether the caller still wants what this call started. Once it has said no, it says so for ever.
     pub fn is_live(&self) -> bool {
         self.lease.is_live_for(self.order, now())
+    }
+
+    /// What may be done for it: see [`Lease::stage`].
+    pub fn stage(&self) -> Stage {
+        self.lease.stage_for(self.order, now())
     }
 }
 

@@ -52,6 +52,14 @@ impl Actuator {
         LeaseWatch::new(self.lease.clone(), self.clock)
     }
 
+    /// What it moves takes so long to stand still: an order that ends before it is finished is
+    /// [stopping](LeaseWatch::stage) for so long, and no other one begins meanwhile (`Busy`). At most a minute.
+    #[must_use]
+    pub fn ramp(self, span: impl Into<cara_core::time::Duration>) -> Self {
+        self.word().set_ramp(span.into());
+        self
+    }
+
     /// The vehicle's own stop, as of a bumper or a switch for manual mode: the order ends, its hook starts, and none begins
     /// until a service [resets](crate::ServiceOptions::resets) it, or [`reset`](Self::reset) does. Callers are told `reason`,
     /// as [`Error::Inhibited`](crate::Error::Inhibited).

@@ -132,12 +132,12 @@ impl<T: 'static> Service for Handler<T> {
         }
     }
 
-    fn finish_lease(&self, order: Order) -> bool {
-        self.actuator.as_ref().is_none_or(|actuator| actuator.safe.finish(order))
+    fn finish_lease(&self, now: Instant, order: Order) -> bool {
+        self.actuator.as_ref().is_none_or(|actuator| actuator.safe.finish(now, order))
     }
 
-    fn expire_lease(&self, order: Order, how: LeaseEnd) -> bool {
-        self.actuator.as_ref().is_none_or(|actuator| actuator.safe.expire(order, how))
+    fn expire_lease(&self, now: Instant, order: Order, how: LeaseEnd) -> bool {
+        self.actuator.as_ref().is_none_or(|actuator| actuator.safe.expire(now, order, how))
     }
 
     fn state(&self) -> ActuatorState {

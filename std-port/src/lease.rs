@@ -7,7 +7,7 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::task::{Context, Poll, Waker};
 use std::time::Duration;
 
-use cara_core::services::lease::{Ended, Lease, Order};
+use cara_core::services::lease::{Ended, Lease, Order, Stage};
 
 use crate::actuator::Actuator;
 use crate::clock::Clock;
@@ -76,6 +76,33 @@ impl LeaseWatch {
         match &self.order {
             Some((order, _)) => self.service.lease.is_live_for(*order, now),
             None => self.service.lease.is_live(now),
+        }
+    }
+
+    /// What a loop may do that moves what cannot stand still at once. The [ramp](crate::Actuator::ramp) is part of the
+    /// bound: a vehicle stands at the latest a lease, a ramp and a turn of this loop after its manager's last sign.
+    ///
+    /// ```no_run
+    /// # use cara_std::Stage;
+    /// # fn drive() {}
+    /// # fn brake() {}
+    /// # fn set_power(on: bool) {}
+    /// fn motor_loop(lease: cara_std::LeaseWatch) {
+    ///     loop {
+    ///         match lease.stage() {
+    ///             Stage::Live => drive(),
+    ///             Stage::Stopping => brake(),
+    ///             Stage::Dead => set_power(false),
+    ///         }
+    ///         std::thread::sleep(std::time::Duration::from_millis(1));
+    ///     }
+    /// }
+    /// ```
+    pub fn stage(&self) -> Stage {
+        let now = self.clock.now();
+        match &self.order {
+            Some((order, _)) => self.service.lease.stage_for(*order, now),
+            None => self.service.lease.stage(now),
         }
     }
 

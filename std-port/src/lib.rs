@@ -73,7 +73,7 @@ pub use cara_core::distribution::parameters::{Parameters, ParametersView, Type, 
 pub use cara_core::error::{Cause, CloseReason, Error, Limit, Refusal, ServiceError};
 pub use cara_core::host::connections::LinkCounter;
 pub use cara_core::services::heart::Renew;
-pub use cara_core::services::lease::{ActuatorState, Ended, LastOrder, Latch, LeaseEnd, OrderOutcome};
+pub use cara_core::services::lease::{ActuatorState, Ended, LastOrder, Latch, LeaseEnd, OrderOutcome, Stage};
 pub use cara_core::services::requests::CallId;
 pub use cara_core::services::session::{Delivery, RequestOptions};
 pub use cara_core::term::Term;

@@ -116,17 +116,17 @@ impl SafeHook {
     }
 
     /// Ends an order whose work is done: the hook does not run.
-    pub(crate) fn finish(&self, order: Order) -> bool {
+    pub(crate) fn finish(&self, now: Instant, order: Order) -> bool {
         let mut state = lock(&self.shared.state);
-        let is_over = self.shared.lease().end(order, LeaseEnd::Finished);
+        let is_over = self.shared.lease().end(now, order, LeaseEnd::Finished);
         state.started_early &= !is_over;
         is_over
     }
 
     /// Ends an order and starts the hook, unless it was started early. Returns at once.
-    pub(crate) fn expire(&self, order: Order, how: LeaseEnd) -> bool {
+    pub(crate) fn expire(&self, now: Instant, order: Order, how: LeaseEnd) -> bool {
         let mut state = lock(&self.shared.state);
-        let is_over = self.shared.lease().end(order, how);
+        let is_over = self.shared.lease().end(now, order, how);
         if is_over {
             self.shared.start(&mut state);
         }
@@ -290,7 +290,7 @@ mod tests {
             AHEAD.fetch_add(7_200_000_000, Ordering::SeqCst);
             assert!(!lease.lease.is_live(clock.now()));
             until(|| runs.load(Ordering::SeqCst) == round);
-            assert!(safe.expire(order, LeaseEnd::Expired) && safe.has_run());
+            assert!(safe.expire(clock.now(), order, LeaseEnd::Expired) && safe.has_run());
         }
         safe.end();
         assert_eq!(runs.load(Ordering::SeqCst), 3);
@@ -306,10 +306,10 @@ mod tests {
         let parts = Parts { lease: lease.clone(), clock, hook, then: None, late: Arc::default() };
         let safe = SafeHook::start(parts).unwrap();
         let order = begin(&safe, clock, Duration::from_secs(3_600));
-        assert!(safe.expire(order, LeaseEnd::Expired));
+        assert!(safe.expire(clock.now(), order, LeaseEnd::Expired));
         until(|| runs.load(Ordering::SeqCst) == 1);
         let order = begin(&safe, clock, Duration::from_millis(30));
-        assert!(safe.finish(order));
+        assert!(safe.finish(clock.now(), order));
         std::thread::sleep(std::time::Duration::from_millis(60));
         safe.end();
         assert_eq!(runs.load(Ordering::SeqCst), 1);
@@ -333,8 +333,8 @@ mod tests {
                 safe.cut(order);
                 !safe.shared.lease().is_live(now)
             },
-            |safe, order, _| safe.finish(order),
-            |safe, order, _| safe.expire(order, LeaseEnd::Expired),
+            |safe, order, now| safe.finish(now, order),
+            |safe, order, now| safe.expire(now, order, LeaseEnd::Expired),
             |safe, order, now| {
                 safe.clear();
                 !safe.shared.lease().is_live_for(order, now)
@@ -393,7 +393,7 @@ mod tests {
                     assert!(!live || after == before, "call {call}: the hook of an earlier order ran");
                     assert!(!live || renewed, "call {call}: a live order was not renewed");
                 }
-                safe.expire(order, LeaseEnd::Expired);
+                safe.expire(clock.now(), order, LeaseEnd::Expired);
             }
         };
         std::thread::scope(|scope| (0..2).for_each(|_| drop(scope.spawn(serve))));

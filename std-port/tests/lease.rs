@@ -112,11 +112,11 @@ fn both_end((shared, first): (Arc<Shared>, Order)) {
     let other = shared.clone();
     let other = thread::spawn(move || {
         if let Some(second) = other.write(|lease| lease.begin(NOW, END)) {
-            other.write(|lease| lease.end(second, LeaseEnd::Expired));
+            other.write(|lease| lease.end(NOW, second, LeaseEnd::Expired));
         }
     });
     let _renewed = shared.write(|lease| lease.renew(first, LATER));
-    shared.write(|lease| lease.end(first, LeaseEnd::Expired));
+    shared.write(|lease| lease.end(NOW, first, LeaseEnd::Expired));
     other.join().unwrap();
     assert!(shared.lease.left(NOW).is_none(), "the lease lives, and no order has it");
 }

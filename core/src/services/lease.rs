@@ -42,6 +42,11 @@ pub struct Claim {
     pub call: u32,
 }
 
+/// Longest ramp, in milliseconds.
+const LONGEST_RAMP: u64 = 60_000;
+/// A reader's clock may be so many milliseconds behind the unit's.
+const NEWER: u32 = 10;
+
 /// Says until when a leased service may act. Written by the unit, read anywhere. Services that share one move the same
 /// thing: one order of all of them holds it.
 ///
@@ -75,6 +80,21 @@ pub struct Lease {
     inhibitor: AtomicU32,
     /// Why.
     reason: AtomicU32,
+    /// How long what moves takes to stand still, in milliseconds.
+    ramp: AtomicU32,
+    /// When the last order was stopped, as `end` has its time; 0 where none was since the last one began.
+    stopped: AtomicU32,
+}
+
+/// What may be done for an order, as of now: for a loop that moves what cannot stand still at once.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Stage {
+    /// What it wants.
+    Live,
+    /// Nothing but to slow down: it is over, and its [ramp](Lease::set_ramp) is not.
+    Stopping,
+    /// Nothing: power off.
+    Dead,
 }
 
 /// The order that something was to be done for has ended.
@@ -103,6 +123,8 @@ impl Lease {
             inhibited: AtomicU32::new(0),
             inhibitor: AtomicU32::new(0),
             reason: AtomicU32::new(0),
+            ramp: AtomicU32::new(0),
+            stopped: AtomicU32::new(0),
         }
     }
 
@@ -118,6 +140,49 @@ impl Lease {
             self.seen_dead.store(true, Ordering::Release);
         }
         live
+    }
+
+    /// So long an order is [stopping](Stage::Stopping) when it has ended in any other way than by being finished or replaced,
+    /// and until then no other one begins ([`Error::Busy`]). To be set before the first order; at most a minute. The safe
+    /// hook runs when the ramp begins, and what moves is to stand still when the loop that reads [`stage`](Self::stage) finds
+    /// it dead: lease and ramp are the bound.
+    pub fn set_ramp(&self, span: Duration) {
+        self.ramp.store(span.as_millis().min(LONGEST_RAMP) as u32, Ordering::Release);
+    }
+
+    /// As [`is_live`](Self::is_live), with what comes between live and dead.
+    pub fn stage(&self, now: Instant) -> Stage {
+        if self.is_live(now) {
+            return Stage::Live;
+        }
+        let end = self.end.load(Ordering::Acquire);
+        // The unit has not looked at it since: it was cut, or its time is over.
+        let runs_out = end != 0 && (is_before(now, end) || self.is_on_ramp(now, end));
+        let is_stopping =
+            if self.stopped.load(Ordering::Acquire) == 0 { runs_out && self.has_ramp() } else { self.is_stopping(now) };
+        if is_stopping { Stage::Stopping } else { Stage::Dead }
+    }
+
+    /// The same for one order; it is dead at once where a newer one holds the lease.
+    pub fn stage_for(&self, order: Order, now: Instant) -> Stage {
+        let stage = if self.is_held_by(order) { self.stage(now) } else { Stage::Dead };
+        // As in `is_live_for`.
+        if self.is_held_by(order) { stage } else { Stage::Dead }
+    }
+
+    fn has_ramp(&self) -> bool {
+        self.ramp.load(Ordering::Acquire) != 0
+    }
+
+    /// Whether the ramp of an order that was ended is not over. Again for as long each 49 days, where no order has begun since.
+    fn is_stopping(&self, now: Instant) -> bool {
+        self.is_on_ramp(now, self.stopped.load(Ordering::Acquire))
+    }
+
+    fn is_on_ramp(&self, now: Instant, begun: u32) -> bool {
+        // A reader may have looked at the clock a little before the unit did.
+        let since = ((now.as_micros() / 1_000) as u32).wrapping_sub(begun).wrapping_add(NEWER);
+        begun != 0 && self.has_ramp() && since < self.ramp.load(Ordering::Acquire).saturating_add(NEWER)
     }
 
     /// The same for one order: once it is dead it stays so, also when another order holds the lease.
@@ -169,9 +234,10 @@ impl Lease {
     /// has not been ended: its safe hook comes first.
     pub fn begin(&self, now: Instant, end: Instant) -> Option<Order> {
         let runs = self.has_order();
-        if runs && !self.is_live(now) {
+        if runs && !self.is_live(now) || self.is_stopping(now) {
             return None;
         }
+        self.stopped.store(0, Ordering::Release);
         let before = self.order.load(Ordering::Acquire);
         let order = NonZeroU32::new(before.wrapping_add(1)).unwrap_or(NonZeroU32::MIN);
         self.order.store(order.get(), Ordering::Release);
@@ -224,6 +290,7 @@ impl Lease {
             self.inhibitor.store(latch.by, Ordering::Release);
             self.reason.store(latch.reason.into(), Ordering::Release);
         }
+        self.stop_at(now, self.end.load(Ordering::Acquire));
         self.inhibited.store(odd_millis(now) as u32, Ordering::Release);
         self.seen_dead.store(true, Ordering::Release);
     }
@@ -259,10 +326,23 @@ impl Lease {
         self.seen_dead.load(Ordering::Acquire) && self.is_held_by(order)
     }
 
+    /// The ramp begins, unless it has: at `now`, or when the order's time was over.
+    fn stop_at(&self, now: Instant, end: u32) {
+        if self.stopped.load(Ordering::Acquire) == 0 {
+            let begun = if is_before(now, end) { odd_millis(now) as u32 } else { end };
+            self.stopped.store(begun, Ordering::Release);
+        }
+    }
+
     /// Ends an order; `false` when a newer one holds the lease.
-    pub fn end(&self, order: Order, how: LeaseEnd) -> bool {
+    pub fn end(&self, now: Instant, order: Order, how: LeaseEnd) -> bool {
         let held = self.is_held_by(order);
         if held {
+            if how == LeaseEnd::Finished {
+                self.stopped.store(0, Ordering::Release);
+            } else {
+                self.stop_at(now, self.end.load(Ordering::Acquire));
+            }
             self.how.store(how as u32, Ordering::Release);
             self.end.store(0, Ordering::Release);
         }
@@ -359,15 +439,15 @@ pub trait Service {
     }
 
     /// [`Lease::end`], because what the order has started is finished: no hook runs.
-    fn finish_lease(&self, order: Order) -> bool {
-        self.lease().is_none_or(|lease| lease.end(order, LeaseEnd::Finished))
+    fn finish_lease(&self, now: Instant, order: Order) -> bool {
+        self.lease().is_none_or(|lease| lease.end(now, order, LeaseEnd::Finished))
     }
 
     /// [`Lease::end`], because its caller no longer wants it or it was stopped. Where this is `true`, the safe hook is due:
     /// the event [`LeaseExpired`](crate::services::session::Event::LeaseExpired) says so to a port that has not started it
     /// here.
-    fn expire_lease(&self, order: Order, how: LeaseEnd) -> bool {
-        self.lease().is_none_or(|lease| lease.end(order, how))
+    fn expire_lease(&self, now: Instant, order: Order, how: LeaseEnd) -> bool {
+        self.lease().is_none_or(|lease| lease.end(now, order, how))
     }
 
     /// [`Lease::state`], between two writes.
@@ -420,6 +500,76 @@ mod tests {
 
     const START: Instant = Instant::START;
 
+    /// 500 ms and a ramp of 300 ms, from 1 s on.
+    fn on_a_ramp() -> (Lease, Order) {
+        let lease = Lease::new();
+        lease.set_ramp(Duration::from_millis(300));
+        let order = lease.begin(at(1_000_000), at(1_501_000)).unwrap();
+        (lease, order)
+    }
+
+    fn stages(lease: &Lease, millis: &[u64]) -> std::vec::Vec<Stage> {
+        millis.iter().map(|millis| lease.stage(at(millis * 1_000))).collect()
+    }
+
+    #[test]
+    fn an_order_that_has_ended_slows_down_for_the_length_of_its_ramp() {
+        let (lease, order) = on_a_ramp();
+        let whole = [Stage::Live, Stage::Stopping, Stage::Stopping, Stage::Dead];
+        assert_eq!(stages(&lease, &[1_499, 1_501, 1_800, 1_802]), whole, "the unit does not look");
+        assert!(lease.end(at(1_600_000), order, LeaseEnd::Expired));
+        assert_eq!(
+            stages(&lease, &[1_800, 1_802]),
+            [Stage::Stopping, Stage::Dead],
+            "counted from its end, not from the look"
+        );
+        assert!(lease.begin(at(1_700_000), at(3_000_000)).is_none(), "the ramp comes first");
+        let next = lease.begin(at(1_802_000), at(3_000_000)).unwrap();
+        assert_eq!(stages(&lease, &[1_803]), [Stage::Live]);
+        // Released before its time.
+        assert!(lease.end(at(2_000_000), next, LeaseEnd::Expired));
+        assert_eq!(stages(&lease, &[2_000, 2_298, 2_299]), [Stage::Stopping, Stage::Stopping, Stage::Dead]);
+    }
+
+    #[test]
+    fn a_stop_begins_the_ramp_once() {
+        let (lease, order) = on_a_ramp();
+        let latch = Latch { by: 0, reason: 1 };
+        lease.inhibit(at(1_100_000), latch);
+        lease.inhibit(at(1_300_000), latch);
+        assert_eq!(stages(&lease, &[1_101, 1_398, 1_399]), [Stage::Stopping, Stage::Stopping, Stage::Dead]);
+        assert!(lease.end(at(1_350_000), order, LeaseEnd::Stopped));
+        assert_eq!(stages(&lease, &[1_398, 1_399]), [Stage::Stopping, Stage::Dead]);
+        // Nothing moved when it was stopped again.
+        lease.inhibit(at(2_000_000), latch);
+        assert_eq!(stages(&lease, &[2_001]), [Stage::Dead]);
+    }
+
+    #[test]
+    fn what_is_finished_or_has_no_ramp_is_dead_at_once() {
+        let (lease, order) = on_a_ramp();
+        assert!(lease.end(at(1_100_000), order, LeaseEnd::Finished));
+        assert_eq!(stages(&lease, &[1_100, 1_200]), [Stage::Dead; 2]);
+        assert!(lease.begin(at(1_100_000), at(1_500_000)).is_some());
+        let lease = Lease::new();
+        let order = lease.begin(at(1_000_000), at(1_501_000)).unwrap();
+        assert_eq!(stages(&lease, &[1_100, 1_501]), [Stage::Live, Stage::Dead]);
+        lease.cut(order);
+        assert!(lease.end(at(1_600_000), order, LeaseEnd::Expired));
+        assert!(lease.stage(at(1_601_000)) == Stage::Dead && lease.begin(at(1_602_000), at(2_000_000)).is_some());
+    }
+
+    #[test]
+    fn a_ramp_of_long_ago_keeps_nothing_from_beginning() {
+        for days in [1, 24, 25, 26, 40, 49] {
+            let (lease, order) = on_a_ramp();
+            assert!(lease.end(at(1_200_000), order, LeaseEnd::Expired));
+            let later = at(1_200_000 + days * 86_400_000_000);
+            assert_eq!(lease.stage(later), Stage::Dead, "{days}");
+            assert!(lease.begin(later, later + Duration::from_secs(1)).is_some(), "{days}");
+        }
+    }
+
     #[test]
     fn a_lease_lives_until_its_end_and_not_longer() {
         let lease = Lease::new();
@@ -429,10 +579,10 @@ mod tests {
         assert!(lease.renew(order, at(501_000)));
         assert!(lease.is_live(at(500_000)));
         assert!(!lease.is_live(at(501_000)));
-        assert!(lease.end(order, LeaseEnd::Expired));
+        assert!(lease.end(START, order, LeaseEnd::Expired));
         let order = lease.begin(START, at(500_000)).unwrap();
         assert!(!lease.is_live(at(500_000)));
-        assert!(lease.end(order, LeaseEnd::Expired) && lease.begin(START, at(500_000)).is_some());
+        assert!(lease.end(START, order, LeaseEnd::Expired) && lease.begin(START, at(500_000)).is_some());
         assert!(lease.clear() && !lease.clear());
         assert!(!lease.is_live(START));
     }
@@ -473,13 +623,13 @@ mod tests {
         let lease = Lease::new();
         let first = lease.begin(START, at(500_000)).unwrap();
         assert!(lease.begin(at(500_000), at(900_000)).is_none(), "its time is over");
-        assert!(lease.end(first, LeaseEnd::Expired) && lease.begin(at(500_000), at(900_000)).is_some());
+        assert!(lease.end(START, first, LeaseEnd::Expired) && lease.begin(at(500_000), at(900_000)).is_some());
         let lease = Lease::new();
         let first = lease.begin(START, at(500_000)).unwrap();
         lease.cut(first);
         assert!(!lease.is_live(START) && !lease.renew(first, at(600_000)));
         assert!(lease.begin(START, at(900_000)).is_none(), "it was cut");
-        assert!(lease.end(first, LeaseEnd::Expired) && lease.begin(START, at(900_000)).is_some());
+        assert!(lease.end(START, first, LeaseEnd::Expired) && lease.begin(START, at(900_000)).is_some());
     }
 
     #[test]
@@ -489,7 +639,7 @@ mod tests {
         let second = lease.begin(at(100_000), at(600_000)).unwrap();
         assert!(!lease.is_live_for(first, at(100_000)) && lease.is_live_for(second, at(100_000)));
         lease.cut(first);
-        assert!(!lease.end(first, LeaseEnd::Expired) && !lease.renew(first, at(900_000)));
+        assert!(!lease.end(START, first, LeaseEnd::Expired) && !lease.renew(first, at(900_000)));
         assert!(lease.is_live_for(second, at(598_000)));
         assert!(!lease.is_live_for(second, at(600_000)) && !lease.is_live_for(second, START));
     }
@@ -502,10 +652,10 @@ mod tests {
         let left = [0, 500_999, 501_000, 900_000].map(|now| lease.left(at(now)).map(Duration::as_micros));
         assert_eq!(left, [Some(501_000), Some(1), Some(0), Some(0)]);
         let wrap = (1_u64 << 32) * 1_000;
-        assert!(lease.end(order, LeaseEnd::Expired));
+        assert!(lease.end(START, order, LeaseEnd::Expired));
         let order = lease.begin(at(wrap - 1_000), at(wrap + 301_000)).unwrap();
         assert_eq!(lease.left(at(wrap - 1_000)), Some(Duration::from_millis(302)));
-        assert!(lease.end(order, LeaseEnd::Expired));
+        assert!(lease.end(START, order, LeaseEnd::Expired));
         assert_eq!(lease.left(at(0)), None);
     }
 
@@ -554,7 +704,7 @@ mod tests {
                     }
                     Step::End => {
                         if let Some((order, _)) = orders.last() {
-                            prop_assert!(lease.end(*order, LeaseEnd::Expired));
+                            prop_assert!(lease.end(START, *order, LeaseEnd::Expired));
                         }
                         dead = true;
                     }

@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex};
 
 use cara_std::{
     Actuator, Call, CommunicationSystem, Definition, Error, Latch, Parameters, ParametersView, Peer, Priority, Renew,
-    RequestOptions, ServiceError, ServiceOptions, UnitEvent,
+    RequestOptions, ServiceError, ServiceOptions, Stage, UnitEvent,
 };
 
 use crate::support::{fleet, system, system_named, until};
@@ -202,4 +202,17 @@ fn a_handler_changes_nothing_for_an_order_that_has_ended() {
     assert_eq!(crane.ask(1, "halt"), Ok(()));
     until("it has seen the end", || crane.committed.lock().unwrap().len() == 2);
     assert_eq!(*crane.committed.lock().unwrap(), [true, false]);
+}
+
+#[test]
+fn what_cannot_stand_still_at_once_slows_down_and_begins_nothing_meanwhile() {
+    let crane = Crane::new();
+    let drive = crane.drive.clone().ramp(LEASE.divided_by(20));
+    assert_eq!(crane.ask(0, "go"), Ok(()));
+    assert_eq!(drive.watch().stage(), Stage::Live);
+    crane.peer(0).release("go").unwrap();
+    until("it slows down", || drive.watch().stage() == Stage::Stopping);
+    until("the hook ran", || crane.hooks() == 1);
+    assert_eq!(crane.ask(0, "dock"), Err(Error::Busy), "the ramp comes first");
+    assert_eq!(drive.watch().stage(), Stage::Stopping);
 }

@@ -72,7 +72,7 @@ entry!(own_functions, {
         keep((service.begin_lease(*unknown(), *unknown(), unknown()), service.renew_lease(*unknown(), *unknown())));
         service.inhibit(*unknown(), *unknown());
         service.reset(*unknown(), *unknown());
-        keep((service.finish_lease(*unknown()), service.expire_lease(*unknown())));
+        keep((service.finish_lease(*unknown(), *unknown()), service.expire_lease(*unknown(), *unknown(), *unknown())));
         service.cut_lease(*unknown());
     }
 });
@@ -210,8 +210,10 @@ entry!(leases, {
     keep((lease.latch(), lease.is_inhibited(), lease.is_cut(*unknown())));
     keep((lease.renew(*unknown(), *unknown()), lease.lasts_beyond(*unknown())));
     keep((lease.is_live(*unknown()), lease.is_live_for(*unknown(), *unknown()), Lease::seen_end(*unknown())));
-    keep((lease.left(*unknown()), lease.end(*unknown(), LeaseEnd::Expired)));
+    keep((lease.left(*unknown()), lease.end(*unknown(), *unknown(), *unknown())));
     keep((lease.state(), lease.state().outcome_of(*unknown(), *unknown())));
+    lease.set_ramp(*unknown());
+    keep((lease.stage(*unknown()), lease.stage_for(*unknown(), *unknown())));
     lease.cut(*unknown());
     lease.clear();
     keep(unknown::<Lease>().is_live(*unknown()));

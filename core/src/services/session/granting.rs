@@ -119,7 +119,7 @@ impl<P: Port> Session<P> {
         if let Some(granted) = index.and_then(|index| take_at(&mut self.granted, index)) {
             let service = service_of(cx, granted.slot, granted.generation);
             if let Some((service, order)) = service.zip(granted.order) {
-                service.finish_lease(order);
+                service.finish_lease(cx.now, order);
             }
             self.tell_end(cx, granted.call, LeaseEnd::Finished);
         }
@@ -292,5 +292,5 @@ fn service_of<'c, P: Port>(cx: &Context<'c, P>, slot: Slot, generation: Generati
 /// the service is gone, with which its hook has run.
 pub(super) fn expire_granted<P: Port>(cx: &Context<'_, P>, granted: &Granted, how: LeaseEnd) -> bool {
     let service = service_of(cx, granted.slot, granted.generation);
-    service.is_some_and(|service| granted.order.is_none_or(|order| service.expire_lease(order, how)))
+    service.is_some_and(|service| granted.order.is_none_or(|order| service.expire_lease(cx.now, order, how)))
 }

@@ -251,7 +251,7 @@ fn nothing_comes_alive_under_a_latch() {
     assert_eq!(lease.latch(), None);
     assert_eq!(lease.claim(now + MOMENT, now + LEASE, &claim), Err(Error::Busy));
     assert!(!lease.is_live_for(order, now + MOMENT));
-    assert!(lease.end(order, LeaseEnd::Expired) && lease.claim(now + MOMENT, now + LEASE, &claim).is_ok());
+    assert!(lease.end(now, order, LeaseEnd::Expired) && lease.claim(now + MOMENT, now + LEASE, &claim).is_ok());
 }
 
 #[test]
