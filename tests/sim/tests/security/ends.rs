@@ -13,7 +13,9 @@ use cara_core::distribution::parameters::Parameters;
 use cara_core::error::CloseReason;
 use cara_core::host::connections::LinkCounter;
 use cara_core::host::mailman::{LinkId, Mailman};
+use cara_core::services::heart::Renew;
 use cara_core::services::hub::Hub;
+use cara_core::services::lease::{ActuatorState, Lease, Service};
 use cara_core::services::session::{Event, RequestOptions, Session, SessionConfig, SessionStorage, buffer_bytes};
 use cara_core::services::{Context, Keys, Port};
 use cara_core::storage::Pool;
@@ -82,10 +84,19 @@ impl Keys<Attacked> for Ring {
     }
 }
 
+/// What a service moves, if anything.
+pub(crate) struct Moves(Option<Lease>);
+
+impl Service for Moves {
+    fn lease(&self) -> Option<&Lease> {
+        self.0.as_ref()
+    }
+}
+
 /// One end.
 pub(crate) struct End {
     pub(crate) session: Session<Attacked>,
-    functions: FunctionList<Boxed, ()>,
+    functions: FunctionList<Boxed, Moves>,
     pool: Pool<Boxed>,
     sent: Sent,
     now: Instant,
@@ -168,7 +179,7 @@ impl End {
         let size = buffer_bytes(1_024, 16);
         let mut functions = FunctionList::new((0..4).map(|_| Entry::empty()).collect(), Boxed::slice(512));
         let stop = Definition::parse("stop(n: int)").expect("a signature");
-        let slot = functions.add_function(&stop, Attributes::default(), ()).expect("room for it");
+        let slot = functions.add_function(&stop, Attributes::default(), Moves(None)).expect("room for it");
         let hub = {
             let [manager, _] = names();
             let (target, identity) = match agv {
@@ -250,6 +261,34 @@ impl End {
         self.session.flush_gathered(context!(self));
     }
 
+    /// Offers a function, before the ends meet.
+    fn offer(&mut self, signature: &str, attributes: Attributes, moves: Moves) {
+        let definition = Definition::parse(signature).expect("a signature");
+        let slot = self.functions.add_function(&definition, attributes, moves).expect("room for it");
+        self.hub.publications.publish_to_all(slot).expect("room for it");
+    }
+
+    /// Asks for `function`, and renews it if it has a lease, until [`Self::give_up`].
+    pub(crate) fn order(&mut self, function: &str) {
+        let options = RequestOptions::renewing(Renew::Process);
+        let asked = self.session.request(context!(self), function, &Parameters::<64>::sized(), &options, false);
+        assert!(asked.is_ok(), "{function}: {asked:?}");
+        self.session.flush_gathered(context!(self));
+    }
+
+    /// Wants what it has asked for last no longer.
+    pub(crate) fn give_up(&mut self) {
+        let (_, call) = self.session.last_order().expect("it has asked for something");
+        self.session.cancel(context!(self), call);
+    }
+
+    /// What the vehicle moves, as its motors see it.
+    pub(crate) fn drive(&self) -> Drive {
+        let lease = self.functions.iter().find_map(|function| function.handler.lease()).expect("it moves something");
+        let left = lease.left(self.now).filter(|_| lease.is_live(self.now));
+        Drive { left, state: lease.state(), ran: self.ran }
+    }
+
     /// The network takes nothing more into the stream, and all room for frames of the protocol itself is in use.
     pub(crate) fn clog(&mut self) {
         self.sent.full = true;
@@ -282,6 +321,15 @@ impl End {
     }
 }
 
+/// How the vehicle's drive stands.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Drive {
+    /// How long it moves on, if it does.
+    pub(crate) left: Option<Duration>,
+    pub(crate) state: ActuatorState,
+    pub(crate) ran: u32,
+}
+
 /// Something on its way.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Carried {
@@ -305,6 +353,17 @@ impl Ends {
 
     pub(crate) fn with_keys(run: u8, manager: PairKey, agv: PairKey) -> Self {
         Self::made(End::new(false, run, manager, run), End::new(true, run, agv, run | 0x80))
+    }
+
+    /// Two ends of which the vehicle moves by `go()`, is stopped by `halt()` and reset by `free()`.
+    pub(crate) fn moving(run: u8) -> Self {
+        let mut agv = End::new(true, run, key(), run | 0x80);
+        let plain = Attributes::default();
+        let moves = Attributes { lease: Some(Duration::from_millis(400)), ..plain };
+        agv.offer("go()", moves, Moves(Some(Lease::new())));
+        agv.offer("halt()", Attributes { stop: true, priority: Priority::Emergency, ..plain }, Moves(None));
+        agv.offer("free()", Attributes { reset: true, ..plain }, Moves(None));
+        Self::made(End::new(false, run, key(), run), agv)
     }
 
     /// Two ends that draw the same numbers, the same in each run and for each proof; only the nonces of their hellos differ.

@@ -4,6 +4,7 @@
 //! - [`frames`]: changed, cut, moved, left out and repeated frames;
 //! - [`discovery`]: changed, spoofed and repeated datagrams of discovery;
 //! - [`kept_away`]: recorded and forged discovery while a vehicle starts, and how long it takes to join;
+//! - [`orders`]: orders, renewals, releases, stops and resets, forged, repeated and held back;
 //! - [`renewals`]: recordings from before a link was rekeyed, and revoked or wrong keys;
 //! - [`terms`]: forged answers and hellos that claim a newer term;
 //! - [`vectors`]: the bytes of a conversation, as committed;
@@ -14,6 +15,7 @@ mod ends;
 mod fleet;
 mod frames;
 mod kept_away;
+mod orders;
 mod renewals;
 mod terms;
 mod vectors;
