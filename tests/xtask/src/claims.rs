@@ -10,13 +10,14 @@ use crate::{paper, workspace};
 const TABLE: &str = "docs/security.md";
 
 /// What the table must make a claim about, once each.
-const SUBJECTS: [&str; 29] = [
+const SUBJECTS: [&str; 30] = [
     "wrong key",
     "no key",
     "key of another fleet",
     "revoked key",
     "key of another unit",
     "replay",
+    "orders",
     "flipped bits",
     "in the middle",
     "lengths",
