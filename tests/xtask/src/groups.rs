@@ -7,7 +7,7 @@ use anyhow::{Result, bail};
 use crate::command::Run;
 use crate::{
     bad_input, binaries, claims, demo, dependencies, firmware, fleet, hygiene, install, instructions, later, layers,
-    licences, links, manifests, msrv, names, panic_free, paper, planted, security, words, workspace,
+    licences, links, manifests, msrv, names, orders, panic_free, paper, planted, security, words, workspace,
 };
 
 /// A group of checks that is run and reported as one.
@@ -85,7 +85,7 @@ pub(crate) const GROUPS: [Group; 25] = [
         quick: Some(2),
         by_default: true,
         waits: false,
-        run: |_| all(&[paper::check, bad_input::check, claims::check]),
+        run: |_| all(&[paper::check, bad_input::check, claims::check, orders::check]),
     },
     Group {
         name: "names",

@@ -26,6 +26,7 @@ mod links;
 mod manifests;
 mod msrv;
 mod names;
+mod orders;
 mod panic_free;
 mod paper;
 mod peers;
@@ -98,6 +99,8 @@ enum Task {
         #[arg(value_name = "PEER")]
         names: Vec<String>,
     },
+    /// Runs fleets on the simulator from many seeds, in which nothing may move that is not wanted; or with planted bugs.
+    Orders(orders::Orders),
     /// Puts many s_units on one manager and measures how they join, what they cost, and how they come back.
     Fleet {
         /// How many s_units; 1,000 if not given.
@@ -140,6 +143,7 @@ fn main() -> ExitCode {
         Task::Paper { numbers, write: false } => paper::broken::run(&numbers),
         Task::Fleet { nodes, processes, json } => fleet::run(nodes, processes, json.as_deref()),
         Task::Peers { names } => peers::run(&names),
+        Task::Orders(options) => orders::run(&options),
         Task::Sanitize => sanitize::run(),
         Task::Security(options) => security::run(&options),
         Task::Faults(faults) => firmware::faults(&faults),

@@ -45,7 +45,7 @@ impl Patch {
 }
 
 /// Lines around a change that must be there: of the two in a patch the further ones may have changed.
-const CONTEXT: &str = "-C1";
+pub(crate) const CONTEXT: &str = "-C1";
 
 /// Fewest rows that have a patch.
 const LEAST: usize = 40;
@@ -92,7 +92,7 @@ pub(crate) fn run(numbers: &[String]) -> Result<ExitCode> {
         let start = Instant::now();
         let verdict = test(patch).and_then(|test| {
             ensure!(sound.contains(test), "its test does not pass without it");
-            tree.finds(patch, test)
+            tree.finds(&patch.file, test)
         });
         let verdict = match verdict {
             Ok(test) => {
@@ -108,13 +108,13 @@ pub(crate) fn run(numbers: &[String]) -> Result<ExitCode> {
 }
 
 /// A clone of the last commit, with builds of its own.
-struct Tree {
+pub(crate) struct Tree {
     root: PathBuf,
-    commit: String,
+    pub(crate) commit: String,
 }
 
 impl Tree {
-    fn new() -> Result<Self> {
+    pub(crate) fn new() -> Result<Self> {
         let root = workspace::root().join("target/paper/tree");
         if !root.join(".git").exists() {
             let clone = Run::new("git").args(["clone", "--quiet", "--shared", "--no-checkout", "."]);
@@ -130,7 +130,7 @@ impl Tree {
         Run::new("git").within(&self.root).args(arguments).text()
     }
 
-    fn passes_as_it_is(&self, test: &str) -> bool {
+    pub(crate) fn passes_as_it_is(&self, test: &str) -> bool {
         match self.passes(test) {
             Ok((_, passed)) => passed,
             Err(error) => {
@@ -140,9 +140,9 @@ impl Tree {
         }
     }
 
-    /// The name of the test, if it fails with the patch.
-    fn finds(&self, patch: &Patch, test: &str) -> Result<String> {
-        let file = workspace::root().join(&patch.file);
+    /// The name of the test, if it fails with the patch, which is relative to the root.
+    pub(crate) fn finds(&self, patch: &Path, test: &str) -> Result<String> {
+        let file = workspace::root().join(patch);
         self.git(&["apply", CONTEXT, &file.to_string_lossy()])?;
         let ended = self.passes(test);
         self.git(&["reset", "--quiet", "--hard"])?;

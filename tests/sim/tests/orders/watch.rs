@@ -1,0 +1,476 @@
+//! What must hold of orders, stops and terms whatever fails, judged by what happens at vehicles and what callers have done.
+//! It knows the one true time and every caller's wish, and nothing of how the core keeps its promises.
+
+use std::collections::BTreeMap;
+
+use cara_core::services::lease::LeaseEnd;
+use cara_core::term::Term;
+use cara_core::time::{Duration, Instant};
+use cara_sim::LeaseWatch;
+
+/// What a vehicle moves.
+pub(crate) const DRIVE: usize = 0;
+pub(crate) const FORK: usize = 1;
+/// How long each goes on without its caller.
+pub(crate) const LENGTHS: [Duration; 2] = [Duration::from_millis(400), Duration::from_millis(300)];
+/// A process shows so often that it runs.
+pub(crate) const PULSE: Duration = Duration::from_millis(10);
+
+/// What a call does at a vehicle.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Does {
+    Move(usize),
+    Stop(&'static [usize]),
+    Reset(&'static [usize]),
+    Nothing,
+}
+
+/// For how long a call wants what it moves.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Wanted {
+    Once,
+    Process,
+    /// While this heart beats.
+    Heart(usize),
+}
+
+/// A call as its caller has made it; they are numbered in the order in which they were made.
+#[derive(Clone, Debug)]
+pub(crate) struct Made {
+    /// The process that made it.
+    pub(crate) by: usize,
+    pub(crate) at: Instant,
+    pub(crate) vehicle: usize,
+    pub(crate) function: &'static str,
+    pub(crate) does: Does,
+    pub(crate) wanted: Wanted,
+    pub(crate) takes_over: bool,
+    pub(crate) is_emergency: bool,
+}
+
+struct Call {
+    made: Made,
+    /// When its caller no longer wanted it.
+    ended: Option<Instant>,
+    /// Calls from this number on were made after the vehicle was told that.
+    told: Option<usize>,
+    has_started: bool,
+    /// Its order has ended: it moves nothing any more, ever.
+    is_dead: bool,
+}
+
+/// One life of a caller.
+struct Process {
+    id: u32,
+    term: Term,
+    /// When it ran last.
+    pulse: Instant,
+}
+
+/// What is known of a thing that a vehicle moves.
+#[derive(Default)]
+struct Moved {
+    /// The call whose order has it, until its end has been seen to be made safe.
+    open: Option<(usize, LeaseWatch)>,
+    /// Whether it was seen dead, without its safe hook.
+    is_unsafe: bool,
+    /// When it was stopped last, and whether a reset that was made later has run.
+    latched: Option<(Instant, bool)>,
+    /// Calls that have stopped it.
+    stops: Vec<usize>,
+}
+
+struct Vehicle {
+    /// Obeys terms.
+    is_s_unit: bool,
+    executed: Term,
+    moved: [Moved; 2],
+}
+
+/// How a vehicle is when something happens to it.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Seen {
+    pub(crate) now: Instant,
+    pub(crate) term: Term,
+    /// Whether its actuators may move, for whichever order.
+    pub(crate) live: [bool; 2],
+    /// Whether they say that they are stopped.
+    pub(crate) latched: [bool; 2],
+}
+
+/// Counts what a run has come to.
+pub(crate) type Reached = BTreeMap<&'static str, u64>;
+
+/// What a run must have come to at least once: one that does nothing breaks no rule.
+pub(crate) const MUST_REACH: [&str; 26] = [
+    "begun",
+    "moved",
+    "committed",
+    "commit refused",
+    "replaced",
+    "taken over",
+    "held",
+    "expired",
+    "inhibited",
+    "stopped",
+    "stopped in part",
+    "stopped by itself",
+    "order ended by a stop",
+    "reset",
+    "reset by itself",
+    "reset too old",
+    "reset refused",
+    "released",
+    "given up",
+    "hold dropped",
+    "heart hung",
+    "heart dropped",
+    "unanswered",
+    "ended by time",
+    "finished",
+    "newer term obeyed",
+];
+
+/// What comes seldom, and has to come in many runs.
+pub(crate) const SELDOM: [&str; 2] = ["busy", "dead when its handler starts"];
+
+#[derive(Default)]
+pub(crate) struct Watch {
+    calls: Vec<Call>,
+    processes: Vec<Process>,
+    /// When each beat last.
+    hearts: Vec<Instant>,
+    vehicles: Vec<Vehicle>,
+    /// The calls that a peer of a process knows by these numbers.
+    named: BTreeMap<(usize, usize, u32), usize>,
+    pub(crate) reached: Reached,
+}
+
+impl Watch {
+    pub(crate) fn add_vehicle(&mut self, is_s_unit: bool) {
+        self.vehicles.push(Vehicle { is_s_unit, executed: Term::NONE, moved: Default::default() });
+    }
+
+    pub(crate) fn reach(&mut self, what: &'static str) {
+        *self.reached.entry(what).or_default() += 1;
+    }
+
+    // --- what callers do
+
+    pub(crate) fn process(&mut self, id: u32, term: Term, now: Instant) -> usize {
+        self.processes.push(Process { id, term, pulse: now });
+        self.processes.len() - 1
+    }
+
+    pub(crate) fn pulse(&mut self, process: usize, now: Instant) {
+        self.processes[process].pulse = now;
+    }
+
+    pub(crate) fn heart(&mut self, now: Instant) -> usize {
+        self.hearts.push(now);
+        self.hearts.len() - 1
+    }
+
+    pub(crate) fn beat(&mut self, heart: usize, now: Instant) {
+        self.hearts[heart] = now;
+    }
+
+    pub(crate) fn make(&mut self, made: Made) -> usize {
+        self.calls.push(Call { made, ended: None, told: None, has_started: false, is_dead: false });
+        self.calls.len() - 1
+    }
+
+    /// What the session calls a call.
+    pub(crate) fn name(&mut self, n: usize, id: u32) {
+        let Made { by, vehicle, .. } = self.calls[n].made;
+        self.named.insert((by, vehicle, id), n);
+    }
+
+    /// The call of this name.
+    pub(crate) fn named(&self, by: usize, vehicle: usize, id: u32) -> Option<usize> {
+        self.named.get(&(by, vehicle, id)).copied()
+    }
+
+    /// The caller does not want a call any more, and has said so if it was `told`.
+    pub(crate) fn give_up(&mut self, n: usize, now: Instant, told: bool) {
+        let told = told && !self.may_be_forgotten(n);
+        let next = self.calls.len();
+        let call = &mut self.calls[n];
+        call.ended = call.ended.or(Some(now));
+        call.told = call.told.or(told.then_some(next));
+    }
+
+    /// Whether a newer call of the same function follows it. Where a session holds no more calls, such a one takes the place
+    /// of the oldest: that is not renewed any more, and no release is sent for it.
+    fn may_be_forgotten(&self, n: usize) -> bool {
+        let Made { by, vehicle, function, .. } = self.calls[n].made;
+        let is_same = |made: &Made| made.by == by && made.vehicle == vehicle && made.function == function;
+        self.calls[n + 1..].iter().any(|call| is_same(&call.made))
+    }
+
+    /// The same for all calls of a process that match.
+    pub(crate) fn give_up_all(&mut self, by: usize, now: Instant, told: bool, matches: impl Fn(&Made) -> bool) {
+        for n in 0..self.calls.len() {
+            if self.calls[n].made.by == by && matches(&self.calls[n].made) {
+                self.give_up(n, now, told);
+            }
+        }
+    }
+
+    /// A caller was told that what a call moved has ended.
+    pub(crate) fn order_ended(&mut self, by: usize, vehicle: usize, id: u32, why: LeaseEnd, now: Instant) {
+        if why == LeaseEnd::Unanswered {
+            self.reach("unanswered");
+        }
+        if let Some(n) = self.named(by, vehicle, id) {
+            self.give_up(n, now, false);
+        }
+    }
+
+    /// Whether a vehicle is stopped, for callers that choose what to do.
+    pub(crate) fn is_stopped(&self, vehicle: usize) -> bool {
+        self.vehicles[vehicle].moved.iter().any(|moved| moved.latched.is_some_and(|(_, lifted)| !lifted))
+    }
+
+    pub(crate) fn newest_term(&self) -> Term {
+        self.processes.iter().fold(Term::NONE, |newest, process| newest.newer(process.term))
+    }
+
+    /// The last time at which the caller of a call can have wanted it.
+    fn wanted_at(&self, n: usize, now: Instant) -> Instant {
+        let Call { made, ended, .. } = &self.calls[n];
+        let wanted = match made.wanted {
+            Wanted::Once => made.at,
+            Wanted::Process => self.processes[made.by].pulse + PULSE,
+            Wanted::Heart(heart) => self.hearts[heart],
+        };
+        wanted.min(ended.unwrap_or(now)).max(made.at).min(now)
+    }
+
+    fn end_of(&self, n: usize, actuator: usize, now: Instant) -> Instant {
+        self.wanted_at(n, now) + LENGTHS[actuator]
+    }
+
+    // --- what happens at vehicles
+
+    /// A life of a vehicle begins: what stopped it is forgotten with all else.
+    pub(crate) fn started(&mut self, vehicle: usize) {
+        self.vehicles[vehicle].moved = Default::default();
+    }
+
+    /// The handler of a call starts. `order` is its hold of what it moves.
+    pub(crate) fn handler(&mut self, n: usize, vehicle: usize, order: Option<&LeaseWatch>, seen: Seen) {
+        let made = self.calls[n].made.clone();
+        assert_eq!(made.vehicle, vehicle, "a call runs where it was sent");
+        assert!(!std::mem::replace(&mut self.calls[n].has_started, true), "call {n} runs twice");
+        self.executes(n);
+        let moves = if let Does::Move(actuator) = made.does { Some(actuator) } else { None };
+        for actuator in [DRIVE, FORK].into_iter().filter(|actuator| moves != Some(*actuator)) {
+            self.look_at_open(n, actuator, seen.live[actuator]);
+        }
+        match made.does {
+            Does::Move(actuator) => self.order_begins(n, actuator, order.expect("it moves something"), seen),
+            Does::Stop(actuators) => self.stops(n, actuators, seen),
+            Does::Reset(_) | Does::Nothing => {}
+        }
+    }
+
+    /// What is executed is of terms that never decrease.
+    fn executes(&mut self, n: usize) {
+        let Made { by, vehicle, .. } = self.calls[n].made;
+        let (term, vehicle) = (self.processes[by].term, &mut self.vehicles[vehicle]);
+        if !vehicle.is_s_unit {
+            return;
+        }
+        let before = std::mem::replace(&mut vehicle.executed, term);
+        assert!(!before.is_newer_than(term), "call {n} of term {term} runs after one of {before}");
+        if before != Term::NONE && term.is_newer_than(before) {
+            self.reach("newer term obeyed");
+        }
+    }
+
+    /// A live order is of the term that its vehicle obeys.
+    fn term_is_obeyed(&self, n: usize, seen: Seen) {
+        let Made { by, vehicle, .. } = self.calls[n].made;
+        let (term, obeyed) = (self.processes[by].term, seen.term);
+        let is_obeyed = !self.vehicles[vehicle].is_s_unit || term == obeyed;
+        assert!(is_obeyed, "call {n} of term {term} is live, and {obeyed} is obeyed");
+    }
+
+    /// A handler starts while another order has an actuator.
+    fn look_at_open(&self, n: usize, actuator: usize, moves: bool) {
+        let Made { by, vehicle, is_emergency, .. } = self.calls[n].made;
+        let Some((open, watch)) = &self.vehicles[vehicle].moved[actuator].open else { return };
+        let other = &self.calls[*open];
+        if other.made.by != by {
+            return;
+        }
+        let is_live = watch.is_live();
+        // The handler of the order that has taken its place may be still to start.
+        assert!(is_live || moves, "call {n} runs before the safe hook of {open}, which has ended");
+        // An emergency overtakes what was sent before it.
+        let was_told = other.told.is_some_and(|told| told <= n) && !is_emergency;
+        assert!(!(was_told && is_live), "call {open} was released before {n} was made, and still moves");
+    }
+
+    fn order_begins(&mut self, n: usize, actuator: usize, order: &LeaseWatch, seen: Seen) {
+        let now = seen.now;
+        let made = self.calls[n].made.clone();
+        let moved = &mut self.vehicles[made.vehicle].moved[actuator];
+        if !order.is_live() {
+            self.calls[n].is_dead = true;
+            // It had the place for no time at all: a third order has it now, whose handler follows.
+            let before = moved.open.take_if(|(_, before)| seen.live[actuator] && !before.is_live());
+            if let Some((before, _)) = before {
+                self.gives_way(before, n, actuator, now);
+            }
+            return self.reach("dead when its handler starts");
+        }
+        self.term_is_obeyed(n, seen);
+        assert!(now < self.end_of(n, actuator, now), "call {n} begins when it is not wanted any more");
+        let moved = &mut self.vehicles[made.vehicle].moved[actuator];
+        assert!(moved.latched.is_none_or(|(_, lifted)| lifted), "call {n} begins while its vehicle is stopped");
+        for stop in moved.stops.iter().filter(|stop| self.calls[**stop].made.by == made.by) {
+            assert!(*stop < n, "call {n} begins behind {stop}, which stopped it");
+        }
+        let before = moved.open.replace((n, order.clone()));
+        self.reach("begun");
+        if let Some((before, _)) = before {
+            self.gives_way(before, n, actuator, now);
+        }
+    }
+
+    /// An order takes the place of an earlier one that was not made safe before.
+    fn gives_way(&mut self, before: usize, n: usize, actuator: usize, now: Instant) {
+        let Made { vehicle, takes_over, .. } = self.calls[n].made;
+        let was_unsafe = std::mem::take(&mut self.vehicles[vehicle].moved[actuator].is_unsafe);
+        assert!(!was_unsafe, "call {n} begins before the safe hook of {before}, which was dead");
+        let is_over = now >= self.end_of(before, actuator, now);
+        assert!(!is_over, "call {n} begins before the safe hook of {before}, whose time is over");
+        let [other, own] = [before, n].map(|n| self.processes[self.calls[n].made.by].id);
+        assert!(other == own || takes_over, "call {n} of {own} takes what {before} of {other} holds");
+        self.calls[before].is_dead = true;
+        self.reach(if other == own { "replaced" } else { "taken over" });
+    }
+
+    fn stops(&mut self, n: usize, actuators: &'static [usize], seen: Seen) {
+        let vehicle = self.calls[n].made.vehicle;
+        for actuator in actuators {
+            let moved = &mut self.vehicles[vehicle].moved[*actuator];
+            assert!(seen.latched[*actuator], "{n} stops, and latches nothing");
+            let open = moved.open.as_ref().map(|(open, _)| *open);
+            assert_eq!(open, None, "{n} stops before the safe hook of what moves has run");
+            moved.latched = Some((seen.now, false));
+            moved.stops.push(n);
+        }
+        self.reach(if actuators.len() == 1 { "stopped in part" } else { "stopped" });
+    }
+
+    /// The vehicle is about to stop itself.
+    pub(crate) fn stops_itself(&mut self, vehicle: usize, actuator: usize, now: Instant) {
+        self.vehicles[vehicle].moved[actuator].latched = Some((now, false));
+        self.reach("stopped by itself");
+    }
+
+    /// The handler of a reset says whether it may be.
+    pub(crate) fn resets(&mut self, n: usize, actuators: &[usize]) {
+        let Made { vehicle, at, .. } = self.calls[n].made;
+        self.reset_made(vehicle, actuators, at);
+    }
+
+    /// The vehicle is about to reset itself.
+    pub(crate) fn resets_itself(&mut self, vehicle: usize, actuator: usize, now: Instant) {
+        self.reset_made(vehicle, &[actuator], now);
+        self.reach("reset by itself");
+    }
+
+    fn reset_made(&mut self, vehicle: usize, actuators: &[usize], at: Instant) {
+        for actuator in actuators {
+            let Some((since, lifted)) = &mut self.vehicles[vehicle].moved[*actuator].latched else { continue };
+            let is_later = *since < at;
+            *lifted |= is_later;
+            self.reach(if is_later { "reset" } else { "reset too old" });
+        }
+    }
+
+    /// The application has finished what a call moves, if that call's order still has it.
+    pub(crate) fn finish(&mut self, n: usize, actuator: usize) {
+        let Made { vehicle, .. } = self.calls[n].made;
+        let moved = &mut self.vehicles[vehicle].moved[actuator];
+        if moved.open.take_if(|(open, _)| *open == n).is_some() {
+            moved.is_unsafe = false;
+            self.calls[n].is_dead = true;
+            self.reach("finished");
+        }
+    }
+
+    /// A safe hook runs.
+    pub(crate) fn hook(&mut self, vehicle: usize, actuator: usize, seen: Seen) {
+        let moved = &mut self.vehicles[vehicle].moved[actuator];
+        moved.is_unsafe = false;
+        let is_stopped = moved.latched.is_some_and(|(_, lifted)| !lifted) || seen.latched[actuator];
+        let Some((open, watch)) = moved.open.take() else { return };
+        assert!(!watch.is_live(), "the safe hook of another order runs while {open} moves");
+        self.calls[open].is_dead = true;
+        if is_stopped {
+            self.reach("order ended by a stop");
+        }
+        if self.calls[open].ended.is_none()
+            && self.end_of(open, actuator, seen.now) <= seen.now + Duration::from_millis(3)
+        {
+            self.reach("ended by time");
+        }
+    }
+
+    /// A handler has tried to change something for its order.
+    pub(crate) fn commit(&mut self, n: usize, actuator: usize, done: bool, seen: Seen) {
+        if done {
+            self.moves(n, actuator, seen);
+            self.reach("committed");
+        } else {
+            self.calls[n].is_dead = true;
+            self.reach("commit refused");
+        }
+    }
+
+    /// The loop of an order looks whether to go on, and does nothing else; whether it is to look again.
+    pub(crate) fn looks(&mut self, n: usize, actuator: usize, is_live: bool, seen: Seen) -> bool {
+        let vehicle = self.calls[n].made.vehicle;
+        let moved = &mut self.vehicles[vehicle].moved[actuator];
+        let is_stopped = moved.latched.is_some_and(|(_, lifted)| !lifted);
+        assert!(
+            !is_stopped || seen.latched[actuator],
+            "what stopped the vehicle is gone without a reset made after it"
+        );
+        if is_live {
+            self.moves(n, actuator, seen);
+            self.reach("moved");
+            return true;
+        }
+        self.calls[n].is_dead = true;
+        let is_open = moved.open.as_ref().is_some_and(|(open, _)| *open == n);
+        if is_open {
+            let was_unsafe = std::mem::replace(&mut moved.is_unsafe, true);
+            assert!(!was_unsafe, "the order of {n} was dead {PULSE:?} ago, and its safe hook has not run");
+        }
+        is_open
+    }
+
+    /// Something moves for a call.
+    fn moves(&mut self, n: usize, actuator: usize, seen: Seen) {
+        let end = self.end_of(n, actuator, seen.now);
+        assert!(
+            seen.now < end,
+            "call {n} moves at {:?}, and was not wanted from {end:?} on: {:?}",
+            seen.now,
+            self.calls[n].made
+        );
+        assert!(!self.calls[n].is_dead, "call {n} moves, and its order had ended");
+        let Made { vehicle, .. } = self.calls[n].made;
+        let moved = &self.vehicles[vehicle].moved[actuator];
+        assert!(moved.open.as_ref().is_some_and(|(open, _)| *open == n), "call {n} moves what another one has");
+        let is_stopped = moved.latched.is_some_and(|(_, lifted)| !lifted);
+        assert!(!is_stopped && !seen.latched[actuator], "call {n} moves what is stopped");
+        self.term_is_obeyed(n, seen);
+    }
+}
