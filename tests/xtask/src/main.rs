@@ -119,6 +119,12 @@ enum Task {
     Security(security::Security),
     /// Makes things fail while an emulated vehicle drives, and prints how long its motors went on, beside the bound.
     Faults(firmware::Faults),
+    /// Runs the demonstration between this version and builds of earlier ones, either way round.
+    Versions {
+        /// Commits or tags; each tag `wire-N` if not given.
+        #[arg(value_name = "REVISION")]
+        revisions: Vec<String>,
+    },
     /// Builds the firmware of a board, or of all boards; or runs the emulated one.
     Firmware {
         /// Which board.
@@ -138,6 +144,7 @@ fn main() -> ExitCode {
         Task::Test { list: true, .. } => runner::list(),
         Task::Test { groups, quick, list: false } => runner::run(&groups, quick),
         Task::Sizes { board, json, write } => firmware::sizes(board.as_deref(), json.as_deref(), write),
+        Task::Versions { revisions } => later::versions(&revisions).map(|()| ExitCode::SUCCESS),
         Task::Instructions { json, write } => instructions::run(json.as_deref(), write),
         Task::Paper { write: true, .. } => paper::write_ports().map(|()| ExitCode::SUCCESS),
         Task::Paper { numbers, write: false } => paper::broken::run(&numbers),
