@@ -66,6 +66,8 @@ struct Host {
     life: u32,
     /// Until then it neither sees nor does anything.
     suspended: Instant,
+    /// Its clock is so far ahead of the virtual time.
+    ahead: Duration,
     udp_port: u16,
     listeners: Vec<u16>,
     accept_limit: usize,

@@ -2,7 +2,7 @@
 
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
 
-use cara_core::time::Instant;
+use cara_core::time::{Duration, Instant};
 
 use super::{Host, Network};
 use crate::event::{HostId, Trace};
@@ -41,6 +41,7 @@ impl Network {
             plugged: true,
             life: 0,
             suspended: Instant::START,
+            ahead: Duration::ZERO,
             udp_port,
             listeners: Vec::new(),
             accept_limit: usize::MAX,
@@ -53,6 +54,24 @@ impl Network {
         });
         self.by_address.entry(address).or_default().push(id);
         id
+    }
+
+    /// Its clock is so far ahead of the virtual time, by which everything here goes; zero at first.
+    pub fn set_clock(&mut self, host: HostId, ahead: Duration) {
+        self.host_mut(host).ahead = ahead;
+    }
+
+    /// What the clock of a host shows.
+    pub fn clock(&self, host: HostId) -> Instant {
+        self.now + self.host(host).ahead
+    }
+
+    /// The virtual time at which the clock of a host shows this.
+    pub fn time_of(&self, host: HostId, clock: Instant) -> Instant {
+        match clock {
+            Instant::FAR_FUTURE => clock,
+            _ => Instant::START + clock.since(Instant::START + self.host(host).ahead),
+        }
     }
 
     /// All hosts in the order of adding.

@@ -45,20 +45,20 @@ impl Actuator {
         Self(Rc::new(Moved { word: Lease::new(), safe: Box::new(safe), stopped: Cell::new(false) }))
     }
 
-    /// Whether it may move at `now`, on behalf of whichever order has it.
-    pub fn is_live(&self, now: Instant) -> bool {
-        self.word().is_live(now)
+    /// Whether it may move now, on behalf of whichever order has it.
+    pub fn is_live(&self, unit: &UnitHandle) -> bool {
+        self.word().is_live(unit.clock())
     }
 
     /// The vehicle's own stop, as of a bumper: the order ends, and none begins until it is reset. Callers are told `reason`.
     pub fn inhibit(&self, unit: &UnitHandle, reason: u16) {
-        self.stop(unit.now(), Latch { by: 0, reason });
+        self.stop(unit.clock(), Latch { by: 0, reason });
         unit.each_live_link(|_, _, _| ());
     }
 
     /// Lets it move again.
     pub fn reset(&self, unit: &UnitHandle) {
-        let now = unit.now();
+        let now = unit.clock();
         self.word().reset(now, now);
     }
 
@@ -110,7 +110,7 @@ impl UnitHandle {
 impl Heart {
     /// The loop has come round.
     pub fn beat(&mut self) {
-        self.word.beat(self.unit.now());
+        self.word.beat(self.unit.clock());
     }
 
     /// For the calls of this loop.

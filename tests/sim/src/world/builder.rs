@@ -22,6 +22,7 @@ pub struct NewUnit {
     shared: Weak<Shared>,
     settings: Settings,
     segment: u8,
+    ahead: Duration,
 }
 
 impl NewUnit {
@@ -51,7 +52,7 @@ impl NewUnit {
             program: None,
             term: Term::NONE,
         };
-        Self { shared: Rc::downgrade(shared), settings, segment: 0 }
+        Self { shared: Rc::downgrade(shared), settings, segment: 0, ahead: Duration::ZERO }
     }
 
     /// The manager that an s_unit belongs to.
@@ -140,6 +141,12 @@ impl NewUnit {
         self
     }
 
+    /// Its own clock is so far ahead of the virtual time; what it is told comes in virtual time all the same.
+    pub fn clock(mut self, ahead: Duration) -> Self {
+        self.ahead = ahead;
+        self
+    }
+
     /// What it does when it starts, in this life and after each restart: add services, publish, spawn futures. State
     /// that is made in here is lost in a crash, as in a real program.
     pub fn program(mut self, program: impl Fn(&UnitHandle) + 'static) -> Self {
@@ -158,6 +165,7 @@ impl NewUnit {
         assert!(manages || self.settings.target != Target::Everybody, "an s_unit joins a manager");
         let host = shared.with(|inner| {
             let host = inner.network.add_host_in(self.segment);
+            inner.network.set_clock(host, self.ahead);
             inner.units.push(UnitState::new(host, self.settings));
             inner.start(&shared, host);
             host

@@ -128,7 +128,7 @@ impl Inner {
             self.happened(shared, host, link, happened);
             return self.resume(shared, host);
         }
-        links.hub.node.datagram(self.network.now(), from, bytes, &links.keys.codes);
+        links.hub.node.datagram(self.network.clock(host), from, bytes, &links.keys.codes);
         if let Some(address) = links.hub.node.take_duplicate() {
             let peer = Some(links.hub.node.identity().clone());
             let reason = CloseReason::Refused(Refusal::DuplicateIdentity);
@@ -165,7 +165,7 @@ impl Inner {
         let Some(machine) = &mut self.units[host.index()].machine else { return };
         let up = self.network.is_plugged(host);
         if up {
-            machine.links.hub.node.network_changed(self.network.now());
+            machine.links.hub.node.network_changed(self.network.clock(host));
         }
         self.log(shared, host, UnitEvent::NetworkChanged { up });
         self.work_node(shared, host);
@@ -248,7 +248,7 @@ impl Inner {
         let unit = &mut self.units[host.index()];
         let functions = unit.settings.functions;
         let Some(machine) = &mut unit.machine else { return };
-        let now = self.network.now();
+        let now = self.network.clock(host);
         if machine.links.free_index().is_none() {
             return machine.links.hub.node.dial_failed(now, identity);
         }
@@ -267,7 +267,7 @@ impl Inner {
     }
 
     fn closed(&mut self, shared: &Rc<Shared>, host: HostId, index: u16, reason: CloseReason) {
-        let now = self.network.now();
+        let now = self.network.clock(host);
         let unit = &mut self.units[host.index()];
         let Some(machine) = &mut unit.machine else { return };
         let Some(link) = machine.links.remove(&mut self.network, index) else { return };
@@ -299,7 +299,7 @@ impl Inner {
         let told = Call {
             caller: caller.clone(),
             priority: call.priority,
-            deadline: call.deadline,
+            deadline: self.network.time_of(host, call.deadline),
             wants_reply: call.wants_reply,
             lease: LeaseWatch::new(&service, call.order, &handle),
             unit: handle.clone(),

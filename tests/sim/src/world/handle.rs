@@ -107,6 +107,11 @@ impl UnitHandle {
         self.with(|inner| inner.network.now())
     }
 
+    /// What its own clock shows: the virtual time, unless it was [set ahead](super::NewUnit::clock).
+    pub fn clock(&self) -> Instant {
+        self.with(|inner| inner.network.clock(self.host))
+    }
+
     /// Whether it lives.
     pub fn is_running(&self) -> bool {
         self.with(|inner| inner.units[self.host.index()].machine.is_some())
@@ -169,7 +174,7 @@ impl UnitHandle {
 
     /// Looks for nodes now.
     pub fn broadcast(&self) -> Result<(), Error> {
-        self.machine(|machine, network| machine.links.hub.node.broadcast(network.now()))?;
+        self.machine(|machine, network| machine.links.hub.node.broadcast(network.clock(self.host)))?;
         self.with_shared(|inner, shared| inner.work_node(shared, self.host));
         Ok(())
     }

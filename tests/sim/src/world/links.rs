@@ -94,6 +94,10 @@ impl Links {
         }
     }
 
+    pub(super) const fn host(&self) -> HostId {
+        self.host
+    }
+
     /// An index that no link has.
     pub(super) fn free_index(&self) -> Option<u16> {
         self.links.iter().position(Option::is_none).map(|index| index as u16)
@@ -148,7 +152,7 @@ impl Links {
         act: impl FnOnce(&mut SimSession, &mut Context<'_, Simulated>) -> R,
     ) -> Option<R> {
         let link = self.links.get_mut(usize::from(index))?.as_mut()?;
-        let now = network.now();
+        let now = network.clock(self.host);
         let mut mailman = SimMailman { network, host: self.host, streams: &self.streams };
         let mut context = Context {
             now,
@@ -256,7 +260,7 @@ impl Links {
     /// Offers what was read until nothing more comes of it; `false` if nothing came at all.
     fn digest(&mut self, network: &mut Network, index: u16, happened: &mut Vec<Happened>) -> bool {
         let Some(link) = self.links.get_mut(usize::from(index)).and_then(Option::as_mut) else { return false };
-        let now = network.now();
+        let now = network.clock(self.host);
         let mut mailman = SimMailman { network, host: self.host, streams: &self.streams };
         let mut cx = Context {
             now,
@@ -351,13 +355,13 @@ impl Links {
     /// Sets the network's timer for what the session has to do next.
     pub(super) fn arm(&mut self, network: &mut Network, index: u16) {
         let host = self.host;
-        let now = network.now();
+        let now = network.clock(host);
         let Some(link) = self.link_mut(index) else { return };
         let due = link.session.deadline();
         if due < link.timer || link.timer <= now {
             link.timer = due;
             if due != Instant::FAR_FUTURE {
-                network.set_timer(host, due, timer_token(index));
+                network.set_timer(host, network.time_of(host, due), timer_token(index));
             }
         }
     }

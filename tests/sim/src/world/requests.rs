@@ -148,7 +148,7 @@ impl UnitHandle {
         let live = self.machine(|machine, network| {
             let functions = &machine.links.functions;
             let function = functions.find(function).and_then(|slot| functions.function(slot))?;
-            function.handler.0.lease_is_live(network.now())
+            function.handler.0.lease_is_live(network.clock(self.host()))
         });
         matches!(live, Ok(Some(true)))
     }

@@ -76,7 +76,7 @@ impl LeaseWatch {
 
     /// Whether the caller still wants what this call started.
     pub fn is_live(&self) -> bool {
-        self.actuator.word().is_live_for(self.order, self.unit.now())
+        self.actuator.word().is_live_for(self.order, self.unit.clock())
     }
 
     /// Does what the order wants, or nothing once it has ended.

@@ -131,7 +131,7 @@ impl UnitState {
         let buffers = LazyPool::new(buffer_bytes(message_size, keys.cipher().overhead()), settings.message_buffers);
         // A block reserves what its signature declares, which may be more than what it holds.
         let arguments = boxed_parameters(2 * message_size as usize + 1_024);
-        let mut hub = hub(network.now(), config, settings.links, settings.functions);
+        let mut hub = hub(network.clock(self.host), config, settings.links, settings.functions);
         if let Some(m_units) = &settings.m_units {
             hub.node.choose(m_units.clone());
         }
@@ -155,7 +155,7 @@ impl Machine {
         dialed: bool,
     ) -> Option<u16> {
         let index = self.links.free_index()?;
-        let now = network.now();
+        let now = network.clock(self.links.host());
         let hello = self.links.hub.node.hello(now, LinkId(index));
         let calls = CALLS.max(usize::from(self.constraints.calls_per_peer));
         let storage = SessionStorage {
@@ -177,17 +177,17 @@ impl Machine {
     }
 
     pub(super) fn poll_node(&mut self, network: &mut Network, host: HostId) -> Option<Command<SocketAddr>> {
-        let now = network.now();
+        let now = network.clock(host);
         let Links { hub, keys, .. } = &mut self.links;
         hub.node.poll(now, &mut SimMailman { network, host, streams: &[] }, &keys.codes)
     }
 
     pub(super) fn arm_node(&mut self, network: &mut Network, host: HostId) {
         let due = self.links.hub.node.next_deadline();
-        if due < self.node_timer || self.node_timer <= network.now() {
+        if due < self.node_timer || self.node_timer <= network.clock(host) {
             self.node_timer = due;
             if due != Instant::FAR_FUTURE {
-                network.set_timer(host, due, NODE_TIMER);
+                network.set_timer(host, network.time_of(host, due), NODE_TIMER);
             }
         }
     }

@@ -93,7 +93,7 @@ pub(crate) fn run(seed: u64, size: Size) -> (Reached, FaultCounts) {
         } else {
             world.s_unit(identity.name(), identity.id()).joins("manager", 1)
         };
-        unit.program(move |unit| vehicle(unit, &watch, number, seed)).start()
+        unit.clock(ahead(&mut random)).program(move |unit| vehicle(unit, &watch, number, seed)).start()
     };
     let units: Vec<UnitHandle> = vehicles.iter().enumerate().map(start).collect();
     // The first one is the traffic control; of the managers one runs at first.
@@ -101,7 +101,7 @@ pub(crate) fn run(seed: u64, size: Size) -> (Reached, FaultCounts) {
         .map(|number| {
             let (name, id) = if number == 0 { ("traffic", 2) } else { ("manager", 1) };
             let (current, seed) = (Rc::new(Cell::new(0)), random.bits());
-            let unit = world.m_unit(name, id).constraints(constraints);
+            let unit = world.m_unit(name, id).constraints(constraints).clock(ahead(&mut random));
             let unit = unit.program({
                 let (watch, vehicles, current) = (Rc::clone(&watch), Rc::clone(&vehicles), Rc::clone(&current));
                 move |unit| caller(unit, &watch, &current, &vehicles, seed)
@@ -150,6 +150,14 @@ pub(crate) fn run(seed: u64, size: Size) -> (Reached, FaultCounts) {
     (watch.take().reached, counts)
 }
 
+/// How far the clock of a unit is ahead, another time after each crash: no two are the same, and some pass 2^32 ms while they run.
+fn ahead(random: &mut Random) -> Duration {
+    match random.below(4) {
+        0 => Duration::from_millis((1 << 32) - random.below(20_000)),
+        _ => Duration::from_micros(random.below(1 << 42)),
+    }
+}
+
 /// A manager that has stepped down, or crashed, is started again now and then, and takes over.
 fn supervise(random: &mut Random, watch: &Shared, managers: &[UnitHandle]) {
     let chance = if managers.iter().any(UnitHandle::is_running) { 40 } else { 10 };
@@ -178,7 +186,11 @@ fn something_happens(
     let running: Vec<UnitHandle> = managers.iter().filter(|manager| manager.is_running()).cloned().collect();
     let crash = if one_in(random, 2) { Crash::PowerCut } else { Crash::Process };
     match random.below(10) {
-        0 if !running.is_empty() => world.crash(&pick(random, &running), crash),
+        0 if !running.is_empty() => {
+            let (unit, clock) = (pick(random, &running), ahead(random));
+            world.crash(&unit, crash);
+            world.network(|network| network.set_clock(unit.host(), clock));
+        }
         1 | 2 if !running.is_empty() => {
             let hangs = pick(random, &running);
             world.suspend(&hangs, between(random, 100, 6_000));
@@ -208,7 +220,11 @@ fn something_happens(
             0 | 1 => world.suspend(&unit, between(random, 20, 1_500)),
             2 => {
                 let down = between(random, 50, 2_000);
-                world.network(|network| network.crash_for(unit.host(), crash, down));
+                let clock = ahead(random);
+                world.network(|network| {
+                    network.crash_for(unit.host(), crash, down);
+                    network.set_clock(unit.host(), clock);
+                });
             }
             _ => {}
         }
@@ -240,7 +256,7 @@ fn race(world: &World, mut caller: Caller, vehicles: &[UnitHandle]) {
 
 fn seen(unit: &UnitHandle, actuators: &[Actuator; 2]) -> Seen {
     let latched = [DRIVE, FORK].map(|actuator| actuators[actuator].latch().is_some());
-    let live = [DRIVE, FORK].map(|actuator| actuators[actuator].is_live(unit.now()));
+    let live = [DRIVE, FORK].map(|actuator| actuators[actuator].is_live(unit));
     Seen { now: unit.now(), term: unit.term(), live, latched }
 }
 

@@ -65,7 +65,7 @@ impl Yard {
     }
 
     fn is_live(&self) -> bool {
-        self.drive.is_live(self.world.now())
+        self.drive.is_live(&self.crane)
     }
 
     fn hooks(&self) -> u32 {
