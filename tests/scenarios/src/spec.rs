@@ -28,6 +28,7 @@ pub struct Spec {
     pub(crate) message_buffers: usize,
     pub(crate) same_seed: bool,
     pub(crate) beside_another: bool,
+    pub(crate) takes_over: bool,
     pub(crate) m_units: Option<Vec<(&'static str, u32)>>,
 }
 
@@ -55,6 +56,7 @@ impl Spec {
             message_buffers: 32,
             same_seed: false,
             beside_another: false,
+            takes_over: false,
             m_units: None,
         }
     }
@@ -62,6 +64,11 @@ impl Spec {
     /// A manager that starts although one of its identity is there.
     pub fn beside_another(self) -> Self {
         Self { beside_another: true, ..self }
+    }
+
+    /// A manager that takes over from a live one of its identity, with the second term.
+    pub fn takes_over(self) -> Self {
+        Self { takes_over: true, ..self }
     }
 
     /// The m_units that an m_unit connects to, instead of all.

@@ -17,6 +17,7 @@ use cara_core::services::event::UnitEvent;
 use cara_core::services::lease::LeaseEnd;
 use cara_core::services::requests::CallId;
 use cara_core::services::session::RequestOptions;
+use cara_core::term::Term;
 use cara_core::time::{Duration, Instant};
 use cara_sim::{BoxedParameters, Path};
 
@@ -100,6 +101,8 @@ pub enum Seen {
     LeaseExpired(String),
     /// A lease that the unit held ended at the peer.
     LeaseEnded(String, LeaseEnd),
+    /// A manager of a newer term commands, and this one has stepped down.
+    Fenced(Term),
 }
 
 impl Seen {
@@ -117,6 +120,7 @@ impl Seen {
             UnitEvent::RequestFailed { call, error, .. } => Self::Failed(call, error),
             UnitEvent::LeaseExpired { function, .. } => Self::LeaseExpired(function.to_string()),
             UnitEvent::LeaseEnded { function, why, .. } => Self::LeaseEnded(function.to_string(), why),
+            UnitEvent::Fenced { term } => Self::Fenced(term),
             UnitEvent::FunctionsSkipped { .. } => return None,
             // A scenario that did not see it would pass for the wrong reason.
             other => panic!("no scenario knows {other:?}"),
@@ -165,6 +169,28 @@ impl<T> Pending<T> {
 
     fn take(&self) -> Option<Result<T, Error>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).take().map(|(result, _)| result)
+    }
+}
+
+/// A heart of a loop, as its port has it.
+pub struct Heart {
+    renew: Renew,
+    beat: Box<dyn FnMut()>,
+}
+
+impl Heart {
+    pub(crate) fn new(renew: Renew, beat: impl FnMut() + 'static) -> Self {
+        Self { renew, beat: Box::new(beat) }
+    }
+
+    /// The loop has come round.
+    pub fn beat(&mut self) {
+        (self.beat)();
+    }
+
+    /// For the calls of the loop.
+    pub fn renew(&self) -> Renew {
+        self.renew
     }
 }
 
@@ -218,6 +244,8 @@ pub trait Node {
     fn begin_all(&self, function: &str, parameters: &ParametersView) -> PendingAll;
     /// Gives up the lease on a function of a peer.
     fn release(&self, peer: &str, function: &str) -> Result<(), Error>;
+    /// A heart for one loop of the unit.
+    fn heart(&self, period: Duration) -> Heart;
     /// What a leased service started is finished.
     fn end_lease(&self, function: &str);
     /// Whether a service's lease is live.

@@ -31,7 +31,7 @@ use super::keys::Keys;
 use super::relay::{Relay, Way};
 use crate::run::Report;
 use crate::{
-    Asked, Fault, Need, Node, Pending, PendingAll, Port, Seen, Service, Spec, SpecRole, Unit, UnknownClient,
+    Asked, Fault, Heart, Need, Node, Pending, PendingAll, Port, Seen, Service, Spec, SpecRole, Unit, UnknownClient,
     Unsupported, World, boxed,
 };
 
@@ -292,6 +292,7 @@ impl LinuxNode {
             SpecRole::Manager => {
                 let builder = self.with_spec(CommunicationSystem::builder(name, *id)?);
                 let builder = if self.spec.beside_another { builder.beside_another() } else { builder };
+                let builder = builder.take_over(self.spec.takes_over);
                 let builder = match &self.spec.m_units {
                     Some(m_units) => builder.m_units(m_units.iter().copied())?,
                     None => builder,
@@ -583,6 +584,11 @@ impl Node for Handle {
 
     fn release(&self, peer: &str, function: &str) -> Result<(), Error> {
         self.node.peer(peer)?.release(function)
+    }
+
+    fn heart(&self, period: Duration) -> Heart {
+        let mut heart = self.system().expect("it is an m_unit that runs").heart(period);
+        Heart::new(heart.renew(), move || heart.beat())
     }
 
     fn end_lease(&self, function: &str) {

@@ -22,8 +22,8 @@ use cara_sim::{Action, Chance, Crash, Direction, HostId, LeaseWatch, Path, Strea
 use super::lent;
 use crate::run::Report;
 use crate::{
-    Asked, Fault, FaultProfile, Node, Pending, PendingAll, Port, Seen, Service, Spec, SpecRole, Unit, UnknownClient,
-    Unsupported, World, boxed, millis, secs,
+    Asked, Fault, FaultProfile, Heart, Node, Pending, PendingAll, Port, Seen, Service, Spec, SpecRole, Unit,
+    UnknownClient, Unsupported, World, boxed, millis, secs,
 };
 
 /// How long the fault profile of a run lasts: longer than any run.
@@ -139,6 +139,7 @@ impl World for SimWorld {
             SpecRole::Manager => self.world.m_unit(&name, id),
             SpecRole::Agv(manager, manager_id) => self.world.s_unit(&name, id).joins(&manager, manager_id),
         };
+        let new = if spec.takes_over { new.kept_term(1) } else { new };
         let new = if spec.same_seed { new.boot_seed(4) } else { new };
         let new = spec.m_units.iter().fold(new, |new, m_units| new.m_units(m_units));
         let new = new.fleet(fleet).constraints(constraints).functions(their_functions).message_buffers(message_buffers);
@@ -477,6 +478,11 @@ impl Node for SimNode {
 
     fn release(&self, peer: &str, function: &str) -> Result<(), Error> {
         self.handle.release(peer, function)
+    }
+
+    fn heart(&self, period: Duration) -> Heart {
+        let mut heart = self.handle.heart(period);
+        Heart::new(heart.renew(), move || heart.beat())
     }
 
     fn end_lease(&self, function: &str) {

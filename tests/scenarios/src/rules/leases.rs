@@ -4,11 +4,12 @@ use cara_core::error::Error;
 use cara_core::services::heart::Renew;
 use cara_core::services::lease::LeaseEnd;
 use cara_core::services::session::RequestOptions;
+use cara_core::term::Term;
 use cara_core::time::Duration;
 
 use super::{met, pair};
 use crate::scenario::scenarios;
-use crate::{Fault, Seen, Service, Spec, Unit, World, millis, number, secs};
+use crate::{Fault, Heart, Seen, Service, Spec, Unit, World, millis, number, secs};
 
 scenarios![
     a_lease_lives_while_it_is_renewed: "lease of a service", Light, [], ["RequestsRun"];
@@ -20,6 +21,8 @@ scenarios![
     motion_ends_when_the_manager_stops: "lease of a service", Light, [], ["stopped"];
     without_a_lease_motion_goes_on: "lease of a service (lease removed)", Rough, [], ["went on"];
     a_lease_that_is_not_renewed_ends: "lease of a service", Light, [], ["LeasesExpired"];
+    a_loop_that_hangs_ends_what_it_wanted_and_nothing_else: "heart of a loop", Light, [], ["hung"];
+    a_manager_that_takes_over_has_the_vehicle_alone: "terms of managers", Light, [], ["fenced"];
     a_released_lease_stops_at_once: "lease of a service", Light, [], ["stopped"];
     what_a_service_that_goes_has_started_stops_at_once: "lease of a service", Light, [], ["gone"];
     what_is_finished_needs_no_safe_hook: "lease of a service", Light, [], ["finished"];
@@ -138,6 +141,66 @@ fn a_lease_that_is_not_renewed_ends(world: &mut dyn World) {
     // The caller holds no lease, so the news of its end is not its matter.
     world.run_for(millis(200));
     assert_eq!(expired(), 0);
+}
+
+/// Asks for a motion that goes on while a heart beats.
+fn want(world: &mut dyn World, manager: &Unit, function: &str, heart: &mut Heart) {
+    let mut asked = Err(Error::Expired);
+    for _ in 0..200 {
+        heart.beat();
+        let options = RequestOptions { timeout: Some(secs(10)), ..RequestOptions::renewing(heart.renew()) };
+        asked = world.ask_with(manager, "agv", function, &mut number("n", 1), options);
+        if !matches!(asked, Err(Error::Expired | Error::StaleFunction)) {
+            break;
+        }
+    }
+    assert_eq!(asked, Ok(()));
+}
+
+fn a_loop_that_hangs_ends_what_it_wanted_and_nothing_else(world: &mut dyn World) {
+    let services = ["drive", "lift"].map(|name| Service::new(&format!("{name}(n: int[1])")).lease(lease(world)));
+    let [drives, lifts] = services.each_ref().map(Service::log);
+    let manager = world.add(Spec::manager("manager", 1));
+    let agv = world.add(Spec::agv("agv", 7).service(&services[0]).service(&services[1]));
+    met(world, &manager, "agv", "lift");
+    let round = lease(world).divided_by(8);
+    let [mut driving, mut lifting] = [(); 2].map(|()| manager.heart(round.times(2)));
+    want(world, &manager, "lift", &mut lifting);
+    want(world, &manager, "drive", &mut driving);
+    // On a busy machine a loop may come round so late that its motion has ended, which is as it should be.
+    let (start, mut last, mut longest, mut hung) = (world.now(), world.now(), Duration::ZERO, None);
+    while lifts.stops().is_empty() || world.now() < start + lease(world).times(4) {
+        longest = longest.max(world.now().since(last));
+        last = world.now();
+        driving.beat();
+        if world.now() < start + lease(world).times(2) {
+            lifting.beat();
+            hung = Some(last);
+        }
+        assert!(world.now() < start + secs(60), "the loop hangs, and what it wanted goes on");
+        world.run_for(round);
+    }
+    if longest > round.times(2) {
+        return;
+    }
+    let (hung, stopped) = (hung.expect("it has beaten"), lifts.stops()[0]);
+    assert!(stopped > hung, "it ended while its loop came round");
+    assert_eq!((agv.lease_is_live("drive"), drives.stops().len(), lifts.stops().len()), (true, 0, 1));
+    world.measured("last beat to safe hook", stopped.since(hung));
+    world.reached("hung");
+}
+
+fn a_manager_that_takes_over_has_the_vehicle_alone(world: &mut dyn World) {
+    let (service, first, agv) = driving(world);
+    let second = world.add(Spec::manager("manager", 1).takes_over());
+    met(world, &second, "agv", "drive");
+    world.wait("the first is told", || first.count(|event| *event == Seen::Fenced(Term(2))) == 1, secs(40));
+    assert!(!agv.lease_is_live("drive"), "what the first wanted has ended");
+    assert_eq!(service.log().stops().len(), 1);
+    assert!(first.request("agv", "drive", &number("n", 1)).is_err());
+    drive(world, &second);
+    assert!(agv.lease_is_live("drive"));
+    world.reached("fenced");
 }
 
 fn a_released_lease_stops_at_once(world: &mut dyn World) {

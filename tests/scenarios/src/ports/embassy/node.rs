@@ -11,10 +11,12 @@ use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 use cara_core::host::connections::LinkCounter;
 use cara_core::services::access::Rule;
+use cara_core::services::heart::{self, Renew};
 use cara_core::services::lease::Lease;
 use cara_core::services::requests::CallId;
 use cara_core::services::session::RequestOptions;
-use cara_core::time::Instant;
+use cara_core::term::Term;
+use cara_core::time::{Duration, Instant};
 use cara_embassy::{Config, Handle, Peer};
 use cara_embassy_host::{Bench, Board, now, security};
 use embassy_time::with_timeout;
@@ -22,7 +24,7 @@ use embassy_time::with_timeout;
 use super::super::lent;
 use super::memory;
 use super::services;
-use crate::{Node, Pending, PendingAll, Seen, Service, Spec, SpecRole, boxed};
+use crate::{Heart, Node, Pending, PendingAll, Seen, Service, Spec, SpecRole, boxed};
 
 pub(super) struct BoardNode {
     number: usize,
@@ -116,6 +118,7 @@ impl BoardNode {
             SpecRole::Manager => Config::m_unit(&name, id, security)?,
             SpecRole::Agv(manager, manager_id) => Config::s_unit(&name, id, &manager, manager_id, security)?,
         };
+        let config = if self.spec.takes_over { config.term(Term(2), drop) } else { config };
         let epoch = self.bench.random(u64::MAX);
         Ok(config.fleet(fleet).constraints(constraints).epoch(epoch))
     }
@@ -268,6 +271,11 @@ impl Node for Rc<BoardNode> {
 
     fn release(&self, peer: &str, function: &str) -> Result<(), Error> {
         self.peer(peer)?.release(function)
+    }
+
+    fn heart(&self, period: Duration) -> Heart {
+        let heart: &'static heart::Heart = Box::leak(Box::new(heart::Heart::new(period)));
+        Heart::new(Renew::Heart(heart.beats()), move || heart.beat(now()))
     }
 
     fn end_lease(&self, function: &str) {
