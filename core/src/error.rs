@@ -373,11 +373,17 @@ pub enum Error {
     /// The callee is of an earlier version, which does not know something that the request depends on; it did not run it.
     #[error("the peer's version does not know what the request asks for: update the peer, or ask without it")]
     Unsupported,
-    /// Another unit, with this ID number, moves what the function moves. The callee did not run it.
-    #[error("the unit with the ID {by} holds what this function moves: wait until it has released it, or take it over")]
+    /// Another unit, with this ID number, moves what the function moves, or an operator of it. For a program an operator of its
+    /// own unit is another one, and the reverse. The callee did not run it.
+    #[error(
+        "what this function moves is held by {}unit {by}: wait until it is released, or take it over",
+        if *operator { "an operator of " } else { "" }
+    )]
     Held {
         /// The ID number of the holder.
         by: u32,
+        /// An operator holds it, and not the unit's program.
+        operator: bool,
     },
     /// What the function moves was stopped, by the unit with this ID number or, with 0, by the callee itself, and has not been
     /// reset. The callee did not run it.

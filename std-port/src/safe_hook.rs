@@ -266,7 +266,7 @@ mod tests {
     use crate::testing::until;
 
     static AHEAD: AtomicU64 = AtomicU64::new(0);
-    const CLAIM: Claim = Claim { holder: 1, replaces: None, takes_over: true, link: 0, call: 0 };
+    const CLAIM: Claim = Claim { holder: 1, replaces: None, takes_over: true, operator: false, link: 0, call: 0 };
 
     fn begin(safe: &SafeHook, clock: Clock, length: Duration) -> Order {
         safe.begin(clock.now(), clock.now() + length, &CLAIM).expect("the order before has ended")

@@ -59,6 +59,10 @@ def options_of(description, name, number):
     return parser
 
 
+class Refused(Exception):
+    """A request is not run, with this error."""
+
+
 class Ended(Exception):
     """The link is over; the words say why."""
 
@@ -582,6 +586,8 @@ class Unit:
                 return
             except wire.Malformed:
                 error = "malformed"
+            except Refused as refused:
+                (error,) = refused.args
         self.answer(priority, request, {"error": error})
 
     def error_of(self, request):
@@ -603,12 +609,19 @@ class Unit:
         function = self.functions[request["slot"]]
         signature = function.signature
         arguments = wire.decode_block(bytes.fromhex(request["block"]), signature["arguments"])
+        if function.lease and self.lease is not None:
+            # An operator and the program of the peer hold for themselves.
+            operator = self.lease["operator"]
+            if operator != request["operator"] and not request["takes_over"]:
+                raise Refused({"held": {"by": self.peer["identity"]["id"], "operator": operator}})
+            self.end_lease("replaced")
         say("run", signature["name"], arguments)
         if function.lease:
-            if self.lease is not None:
-                self.end_lease("replaced")
             end = made(request) + function.lease
-            self.lease = {"slot": request["slot"], "call": request["id"], "end": end, "length": function.lease}
+            self.lease = {
+                "slot": request["slot"], "call": request["id"], "end": end, "length": function.lease,
+                "operator": request["operator"],
+            }
         return wire.encode_block(function.run(arguments), signature["results"])
 
     def answer(self, priority, request, outcome):

@@ -372,7 +372,7 @@ ERRORS = {
     4: ("wrong_type", ("index",)), 5: ("wrong_size", ("index", "expected", "found")), 6: ("expired", ()),
     7: ("stale", ()), 8: ("busy", ()), 9: ("malformed", ()), 10: ("not_allowed", ()), 11: ("would_deadlock", ()),
     12: ("too_large", ("limit",)), 13: ("too_soon", ("wait",)), 14: ("result_would_not_fit", ("need", "have")),
-    15: ("result_lost", ()), 16: ("unsupported", ()), 17: ("held", ("by",)), 18: ("inhibited", ("by", "reason")),
+    15: ("result_lost", ()), 16: ("unsupported", ()), 17: ("held", ("by", "operator")), 18: ("inhibited", ("by", "reason")),
     20: ("service_failed", ("code",)), 21: ("service_panicked", ()), 22: ("service_not_ready", ()),
     23: ("service_bad_results", ()),
 }
@@ -412,6 +412,7 @@ def encode_message(message):
     (name, value), = message.items()
     if name == "request":
         flags = value["unknown"] | (1 if value["wants_reply"] else 0) | (16 if value.get("takes_over") else 0)
+        flags |= 4 if value.get("operator") else 0
         numbers = (value["id"], value["remaining"], value["stamp"], value["since"], 0)
         place = (value["slot"], value["generation"], REQUEST_BYTES // 4, 0)
         return struct.pack("<BBHHBBIIQII", 1, flags, *place, *numbers) + bytes.fromhex(value["block"])
@@ -432,7 +433,7 @@ def read_request(reader):
     _, flags, slot, generation, words, _, number, remaining, stamp, since, _ = reader.fixed(form)
     return {
         "id": number, "slot": slot, "generation": generation, "wants_reply": flags & 1 == 1,
-        "takes_over": flags & 0x10 != 0, "unknown": flags & 0xE0,
+        "takes_over": flags & 0x10 != 0, "operator": flags & 4 != 0, "unknown": flags & 0xE0,
         "remaining": remaining, "stamp": stamp, "since": since, "block": behind_header(reader, words, REQUEST_BYTES),
     }
 
@@ -450,6 +451,8 @@ def read_answer(reader):
     for short in ("code", "reason"):
         if short in values:
             values[short] &= 0xFFFF
+    if "operator" in values:
+        values["operator"] = values["operator"] & 1 == 1
     return {"id": number, "error": {name: values}}
 
 

@@ -127,7 +127,7 @@ pub struct ActuatorState {
     pub last: Option<LastOrder>,
 }
 
-/// The order that a service has, or had last.
+/// The order that a service has, or had last. An operator's is not told from one of the program of the same unit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct LastOrder {
     /// The ID number of its caller.

@@ -18,12 +18,14 @@ pub(super) const CONTROL: u8 = 3;
 const FAILURE: u8 = 4;
 
 const WANTS_REPLY: u8 = 1;
+/// An operator made it, and not the unit's program.
+const OPERATOR: u8 = 0x04;
 /// What another caller moves is taken over.
 const TAKES_OVER: u8 = 0x10;
 /// Flags without which a callee must not run the request, and which this version does not know.
 const UNKNOWN: u8 = 0xE0;
 /// Flags that a callee may pass over, and which this version does not know.
-const SKIPPABLE: u8 = 0x0E;
+const SKIPPABLE: u8 = 0x0A;
 
 /// Bytes before a request's block.
 pub const REQUEST_BYTES: usize = LEAST_REQUEST_BYTES + MORE_BYTES;
@@ -122,6 +124,8 @@ pub struct RequestHeader {
     pub wants_reply: bool,
     /// What another caller moves is taken over.
     pub takes_over: bool,
+    /// An operator made it, and not the unit's program.
+    pub operator: bool,
     /// Flags that this version does not know, without which the request must not be run.
     pub unknown: u8,
     /// Time until the caller's deadline when the request was made, saturating.
@@ -138,6 +142,7 @@ impl RequestHeader {
     pub fn encode(&self) -> [u8; REQUEST_BYTES] {
         let flags = if self.wants_reply { WANTS_REPLY } else { 0 }
             | if self.takes_over { TAKES_OVER } else { 0 }
+            | if self.operator { OPERATOR } else { 0 }
             | if LATER { SKIPPABLE } else { 0 }
             | self.unknown;
         let [s0, s1] = self.slot.0.to_le_bytes();
@@ -192,6 +197,7 @@ impl RequestHeader {
             generation: Generation(u16::from_le_bytes([*g0, *g1])),
             wants_reply: flags & WANTS_REPLY != 0,
             takes_over: flags & TAKES_OVER != 0,
+            operator: flags & OPERATOR != 0,
             unknown: flags & UNKNOWN,
             remaining: micros([*r0, *r1, *r2, *r3]),
             stamp: u64::from_le_bytes([*t0, *t1, *t2, *t3, *t4, *t5, *t6, *t7]),
@@ -254,7 +260,7 @@ fn error_code(error: Error) -> (u8, u8, u32, u32) {
         Error::ResultWouldNotFit { need, have } => (14, 0, need, have),
         Error::ResultLost => (15, 0, 0, 0),
         Error::Unsupported => (16, 0, 0, 0),
-        Error::Held { by } => (17, 0, by, 0),
+        Error::Held { by, operator } => (17, 0, by, operator.into()),
         Error::Inhibited { by, reason } => (18, 0, by, reason.into()),
         Error::Service(ServiceError::Failed(code)) => (20, 0, u32::from(code), 0),
         Error::Service(ServiceError::Panicked) => (21, 0, 0, 0),
@@ -282,7 +288,7 @@ fn error_of(code: u8, index: u8, first: u32, second: u32) -> Error {
         14 => Error::ResultWouldNotFit { need: first, have: second },
         15 => Error::ResultLost,
         16 => Error::Unsupported,
-        17 => Error::Held { by: first },
+        17 => Error::Held { by: first, operator: second & 1 != 0 },
         18 => Error::Inhibited { by: first, reason: second as u16 },
         20 => Error::Service(ServiceError::Failed(first as u16)),
         21 => Error::Service(ServiceError::Panicked),
@@ -455,6 +461,7 @@ mod tests {
                 generation: Generation(generation),
                 wants_reply,
                 takes_over: unknown & 1 != 0,
+                operator: unknown & 2 != 0,
                 unknown: unknown & UNKNOWN,
                 remaining: Duration::from_micros(u64::from(remaining)),
                 stamp,
@@ -475,7 +482,7 @@ mod tests {
         #[test]
         fn a_longer_header_of_a_later_version_is_read(header in headers(), more in 0..20_usize, flags in 0..16_u8) {
             let mut bytes = Vec::from(header.encode());
-            bytes[1] |= flags & !WANTS_REPLY;
+            bytes[1] |= flags & SKIPPABLE;
             bytes[6] += more as u8;
             bytes[7] = 99;
             bytes.extend((0..more * WORD + 3).map(|_| 0xEE));
@@ -506,6 +513,32 @@ mod tests {
             let bytes = encode_reply(7, Err(error));
             let Some(Message::Reply(7, Err(read))) = Message::decode(&bytes) else { panic!() };
             prop_assert_eq!(read, error);
+        }
+    }
+
+    /// Flag 2 is one that a callee which does not know it passes over, and the answer says it in what had been a 0.
+    #[test]
+    fn an_operators_origin_is_told_both_ways() {
+        let header = RequestHeader {
+            id: 7,
+            slot: Slot(1),
+            generation: Generation(2),
+            wants_reply: false,
+            takes_over: false,
+            operator: true,
+            unknown: 0,
+            remaining: MS,
+            stamp: 3,
+            since: MS,
+        };
+        let (operators, programs) = (header.encode(), RequestHeader { operator: false, ..header }.encode());
+        assert_eq!((operators[1] & !SKIPPABLE, programs[1] & !SKIPPABLE), (1 << 2, 0));
+        assert_eq!(operators[2..], programs[2..]);
+        for operator in [true, false] {
+            let reply = encode_reply(7, Err(Error::Held { by: 9, operator }));
+            assert_eq!((reply[1], reply[8], reply[12]), (17, 9, operator.into()));
+            let Some(Message::Reply(7, Err(error))) = Message::decode(&reply) else { panic!() };
+            assert_eq!(error, Error::Held { by: 9, operator });
         }
     }
 

@@ -79,6 +79,8 @@ pub struct CallHead {
     pub wants_reply: bool,
     /// Whether it takes over what another caller moves.
     pub takes_over: bool,
+    /// Whether an operator of the caller's unit made it.
+    pub operator: bool,
     /// Whether its results let what was stopped move again; known once it begins.
     pub resets: bool,
     /// After this the caller no longer waits, and the call is not begun.
@@ -444,7 +446,7 @@ impl<S: Storage> Queue<S> {
 
 fn encode_head(head: &CallHead, block: usize) -> impl Iterator<Item = u8> {
     let length = (block as u32).to_le_bytes();
-    let flags = [u8::from(head.wants_reply), u8::from(head.takes_over), 0, 0];
+    let flags = [u8::from(head.wants_reply), u8::from(head.takes_over), u8::from(head.operator), 0];
     length
         .into_iter()
         .chain(head.id.to_le_bytes())
@@ -456,7 +458,7 @@ fn encode_head(head: &CallHead, block: usize) -> impl Iterator<Item = u8> {
 }
 
 fn decode_head(bytes: &[u8; HEAD_BYTES], priority: Priority) -> (CallHead, usize) {
-    let [l0, l1, l2, l3, i0, i1, i2, i3, s0, s1, g0, g1, wants_reply, takes_over, _, _, rest @ ..] = *bytes;
+    let [l0, l1, l2, l3, i0, i1, i2, i3, s0, s1, g0, g1, wants_reply, takes_over, operator, _, rest @ ..] = *bytes;
     let [d0, d1, d2, d3, d4, d5, d6, d7, m0, m1, m2, m3, m4, m5, m6, m7] = rest;
     let head = CallHead {
         id: u32::from_le_bytes([i0, i1, i2, i3]),
@@ -465,6 +467,7 @@ fn decode_head(bytes: &[u8; HEAD_BYTES], priority: Priority) -> (CallHead, usize
         priority,
         wants_reply: wants_reply != 0,
         takes_over: takes_over != 0,
+        operator: operator != 0,
         resets: false,
         deadline: Instant::from_micros(u64::from_le_bytes([d0, d1, d2, d3, d4, d5, d6, d7])),
         sent_at: Instant::from_micros(u64::from_le_bytes([m0, m1, m2, m3, m4, m5, m6, m7])),
@@ -508,6 +511,7 @@ mod tests {
             priority,
             wants_reply: id.is_multiple_of(2),
             takes_over: id.is_multiple_of(3),
+            operator: id.is_multiple_of(5),
             resets: false,
             deadline: Instant::from_micros(u64::from(id) << 20),
             sent_at: Instant::from_micros(u64::from(id) << 10),

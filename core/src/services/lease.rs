@@ -36,6 +36,8 @@ pub struct Claim {
     pub replaces: Option<Order>,
     /// The order of any other caller gives way as well.
     pub takes_over: bool,
+    /// An operator of the caller's unit made it, and not its program: they hold for themselves.
+    pub operator: bool,
     /// The caller's name for the link, as in [`LastOrder`].
     pub link: u32,
     /// The caller's id of the call.
@@ -64,6 +66,8 @@ pub struct Lease {
     end: AtomicU32,
     /// A reader has been told that it has passed its end, or the unit has cut it: its safe hook is due.
     seen_dead: AtomicBool,
+    /// An operator of `holder` made the order.
+    operator: AtomicBool,
     /// The order that holds it, or held it last; 0 before the first.
     order: AtomicU32,
     /// The ID number of the one that made it.
@@ -115,6 +119,7 @@ impl Lease {
         Self {
             end: AtomicU32::new(0),
             seen_dead: AtomicBool::new(false),
+            operator: AtomicBool::new(false),
             order: AtomicU32::new(0),
             holder: AtomicU32::new(0),
             link: AtomicU32::new(0),
@@ -213,18 +218,21 @@ impl Lease {
         (end != 0).then(|| Duration::from_micros(left))
     }
 
-    /// [`begin`](Self::begin) for this caller: [`Error::Held`] where another one holds it and is not taken over,
+    /// [`begin`](Self::begin) for this caller: [`Error::Held`] where another one holds it and is not taken over, be it the
+    /// operator or the program of the same unit,
     /// [`Error::Busy`] where an earlier order is dead and its safe hook comes first, [`Error::Inhibited`] where it was stopped.
     pub fn claim(&self, now: Instant, end: Instant, claim: &Claim) -> Result<Order, Error> {
         if let Some(latch) = self.latch() {
             return Err(latch.into());
         }
-        let is_own = claim.replaces.is_some_and(|order| self.is_held_by(order));
+        let operator = self.operator.load(Ordering::Acquire);
+        let is_own = operator == claim.operator && claim.replaces.is_some_and(|order| self.is_held_by(order));
         if !is_own && !claim.takes_over && self.is_live(now) {
-            return Err(Error::Held { by: self.holder.load(Ordering::Acquire) });
+            return Err(Error::Held { by: self.holder.load(Ordering::Acquire), operator });
         }
         let order = self.begin(now, end).ok_or(Error::Busy)?;
         self.holder.store(claim.holder, Ordering::Release);
+        self.operator.store(claim.operator, Ordering::Release);
         self.link.store(claim.link, Ordering::Release);
         self.call.store(claim.call, Ordering::Release);
         Ok(order)
@@ -476,6 +484,8 @@ pub(crate) struct Granted {
 pub(crate) struct Held {
     pub(crate) call: CallId,
     pub(crate) slot: Slot,
+    /// An operator made it.
+    pub(crate) operator: bool,
     pub(crate) class: Priority,
     pub(crate) lease: Duration,
     /// For how long the call wants it.

@@ -127,11 +127,11 @@ fn two_services_of_one_actuator_replace_each_other_without_the_hook() {
 fn another_callers_order_is_held_unless_it_is_taken_over() {
     let crane = Crane::new();
     assert_eq!(crane.ask(0, "go"), Ok(()));
-    assert_eq!(crane.ask(1, "dock"), Err(Error::Held { by: 1 }));
+    assert_eq!(crane.ask(1, "dock"), Err(Error::Held { by: 1, operator: false }));
     assert!(crane.moves() && crane.hooks() == 0);
     let options = RequestOptions { take_over: true, ..RequestOptions::new() };
     assert_eq!(crane.peer(1).block_request_with("dock", &mut Parameters::new(), &options), Ok(()));
-    assert_eq!(crane.ask(0, "go"), Err(Error::Held { by: 2 }));
+    assert_eq!(crane.ask(0, "go"), Err(Error::Held { by: 2, operator: false }));
     // The earlier holder gives up what it no longer has: nothing stops.
     crane.peer(0).release("go").unwrap();
     assert!(crane.moves() && crane.hooks() == 0);

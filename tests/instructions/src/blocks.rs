@@ -53,6 +53,7 @@ impl Blocks {
             generation: Generation(1),
             wants_reply: true,
             takes_over: false,
+            operator: false,
             unknown: 0,
             remaining: Duration::from_millis(500),
             stamp: 1_000_000,

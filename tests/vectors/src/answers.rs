@@ -256,6 +256,7 @@ fn header(id: u32, slot: u16) -> RequestHeader {
         generation: Generation(0),
         wants_reply: true,
         takes_over: false,
+        operator: false,
         unknown: 0,
         remaining: Duration::from_secs(1),
         stamp: 1_001_000,

@@ -27,6 +27,7 @@ fn request(wants_reply: bool, block: &[u8]) -> Vec<u8> {
         generation: Generation(0x0203),
         wants_reply,
         takes_over: false,
+        operator: false,
         unknown: 0,
         remaining: Duration::from_millis(2_000),
         stamp: 0x0001_0203_0405_0607,
@@ -43,7 +44,8 @@ fn messages() -> Vec<Vector> {
     let block = arguments(GO_TO, &motion().unwrap_or_default());
     let fields = |wants_reply: bool, block: &[u8]| {
         json!({ "request": {
-            "id": 0x0102_0304, "slot": 5, "generation": 0x0203, "wants_reply": wants_reply, "takes_over": false, "unknown": 0,
+            "id": 0x0102_0304, "slot": 5, "generation": 0x0203, "wants_reply": wants_reply, "takes_over": false, "operator": false,
+            "unknown": 0,
             "remaining": 2_000_000, "stamp": 0x0001_0203_0405_0607_u64, "since": 250_000, "block": hex(block),
         }})
     };
@@ -56,6 +58,8 @@ fn messages() -> Vec<Vector> {
     critical["request"]["unknown"] = json!(0xA0);
     let mut taking_over = fields(true, &[]);
     taking_over["request"]["takes_over"] = json!(true);
+    let mut operators = fields(true, &[]);
+    operators["request"]["operator"] = json!(true);
     let mut longer = request(true, &[0xEE; 4]);
     longer[6] += 1;
     longer.extend(&block);
@@ -76,9 +80,10 @@ fn messages() -> Vec<Vector> {
         )
         .lossy(),
         message(("request_shorter_header", "refused: 7 words"), &shorter, &Value::Null),
-        message(("request_flags", "flags that may be passed over"), &flags(0x0E), &fields(true, &[])).lossy(),
+        message(("request_flags", "flags that may be passed over"), &flags(0x0A), &fields(true, &[])).lossy(),
         message(("request_critical_flags", "flags that must be understood"), &flags(0xA0), &critical),
         message(("request_takes_over", "it takes over what another caller moves"), &flags(0x10), &taking_over),
+        message(("request_of_operator", "an operator made it, and not the program"), &flags(0x04), &operators),
         message(("reply", "results"), &reply, &replied),
         message(("reply_longer_header", "a later version has more in front of the block"), &longer_reply, &replied)
             .lossy(),
@@ -101,7 +106,7 @@ fn messages() -> Vec<Vector> {
 fn errors() -> Vec<Vector> {
     let wait = Duration::from_millis(30);
     let service = |error: ServiceError| Error::Service(error);
-    let answers: [(&'static str, Error, Value); 23] = [
+    let answers: [(&'static str, Error, Value); 24] = [
         ("error_unknown_function", Error::UnknownFunction, json!("unknown_function")),
         ("error_stale_function", Error::StaleFunction, json!("stale_function")),
         ("error_missing_argument", Error::MissingArgument { index: 3 }, json!({ "missing_argument": { "index": 3 } })),
@@ -126,7 +131,12 @@ fn errors() -> Vec<Vector> {
         ),
         ("error_result_lost", Error::ResultLost, json!("result_lost")),
         ("error_unsupported", Error::Unsupported, json!("unsupported")),
-        ("error_held", Error::Held { by: 7 }, json!({ "held": { "by": 7 } })),
+        ("error_held", Error::Held { by: 7, operator: false }, json!({ "held": { "by": 7, "operator": false } })),
+        (
+            "error_held_by_operator",
+            Error::Held { by: 7, operator: true },
+            json!({ "held": { "by": 7, "operator": true } }),
+        ),
         ("error_inhibited", Error::Inhibited { by: 0, reason: 9 }, json!({ "inhibited": { "by": 0, "reason": 9 } })),
         ("error_service_failed", service(ServiceError::Failed(513)), json!({ "service_failed": { "code": 513 } })),
         ("error_service_panicked", service(ServiceError::Panicked), json!("service_panicked")),
@@ -333,8 +343,8 @@ fn session_bodies() -> Vec<Vector> {
             ("session_message", "an emergency's second copy"),
             &emergency,
             &json!({ "message": { "priority": "emergency", "message": { "request": {
-                "id": 0x0102_0304, "slot": 5, "generation": 0x0203, "wants_reply": false, "takes_over": false, "unknown": 0,
-                "remaining": 2_000_000, "stamp": 0x0001_0203_0405_0607_u64, "since": 250_000, "block": "",
+                "id": 0x0102_0304, "slot": 5, "generation": 0x0203, "wants_reply": false, "takes_over": false, "operator": false,
+                "unknown": 0, "remaining": 2_000_000, "stamp": 0x0001_0203_0405_0607_u64, "since": 250_000, "block": "",
             }}}}),
         ),
     ]

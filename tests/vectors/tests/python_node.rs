@@ -7,7 +7,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use cara_processes::{Process, random_fleet, skip};
-use cara_std::{Builder, CommunicationSystem, Identity, Interfaces, MUnit, Parameters, Renew, RequestOptions};
+use cara_std::{Builder, CommunicationSystem, Error, Identity, Interfaces, MUnit, Parameters, Renew, RequestOptions};
 use cara_test_keys::KeyFolder;
 
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -69,9 +69,20 @@ fn talk(mut node: Process, manager: &CommunicationSystem, while_leased: impl FnO
     assert_eq!(node.expect("run go_to", PATIENCE).unwrap().text, "run go_to {'position': [1, 2]}");
     while_leased(&mut node);
     assert_eq!(position(manager), [1, 2]);
+    // An operator does not get what the program holds, unless it takes over.
+    let operators = |take_over| {
+        let options = RequestOptions { operator: true, take_over, ..wanted };
+        agv.block_request_with("go_to", &mut target.clone(), &options)
+    };
+    assert_eq!(operators(false), Err(Error::Held { by: 1, operator: false }));
+    assert!(!node.has("replaced"), "{:?}", node.lines());
+    assert_eq!(operators(true), Ok(()));
+    node.expect("renewals: replaced", PATIENCE).unwrap();
+    let programs = agv.block_request_with("go_to", &mut target.clone(), &wanted);
+    assert_eq!(programs, Err(Error::Held { by: 1, operator: true }));
     agv.release("go_to").unwrap();
     node.expect("released", PATIENCE).unwrap();
-    assert!(!node.has("stopped"), "{:?}", node.lines());
+    assert!(!node.has("expired"), "{:?}", node.lines());
 
     let mut arguments = Parameters::new();
     arguments.add_string("fault", 64).unwrap();

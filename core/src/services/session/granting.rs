@@ -48,6 +48,7 @@ impl<P: Port> Session<P> {
             holder: self.identity().map_or(0, Identity::id),
             replaces: earlier.and_then(|earlier| earlier.order),
             takes_over: head.takes_over,
+            operator: head.operator,
             link: self.hello().map_or(0, |hello| hello.nonce as u32),
             call: head.id,
         };

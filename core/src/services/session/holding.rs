@@ -3,7 +3,7 @@
 //! A call *holds* a lease as long as this unit renews it. It is *released* when the peer is told that the call is not
 //! wanted, wherever it is: when it has failed, and when its caller *cancels* it.
 
-use super::{Event, Phase, Session};
+use super::{Event, Phase, RequestOptions, Session};
 use crate::config::{LEASES, Priority};
 use crate::distribution::function_list::Slot;
 use crate::distribution::message::{Release, Renewal, RequestHeader, SessionBody};
@@ -48,22 +48,29 @@ impl<P: Port> Session<P> {
     }
 
     /// Whether a call of a function could be renewed. [`Error::Full`] when there is no room, and no earlier call of the same
-    /// function that would give way; [`Error::SlowHeart`] for one that would let the lease end between two beats.
-    pub(super) fn check_held(&self, lease: Option<Duration>, renew: Renew, slot: Slot) -> Result<(), Error> {
+    /// function and of the same origin that would give way; [`Error::SlowHeart`] for one that would let the lease end between two beats.
+    pub(super) fn check_held(
+        &self,
+        lease: Option<Duration>,
+        options: &RequestOptions,
+        slot: Slot,
+    ) -> Result<(), Error> {
         let Some(lease) = lease else { return Ok(()) };
         let slowest = lease.divided_by(BEATS_PER_LEASE);
-        if let Renew::Heart(beats) = renew
+        if let Renew::Heart(beats) = options.renew
             && beats.period() > slowest
         {
             let [need, have] = [slowest, beats.period()].map(|span| span.as_millis() as u32);
             return Err(Error::SlowHeart { need, have });
         }
-        let fits = !self.held.is_full() || self.oldest_held(slot).is_some();
+        let fits = !self.held.is_full() || self.oldest_held(slot, options.operator).is_some();
         if fits { Ok(()) } else { Err(Error::Full(Limit::Leases)) }
     }
 
-    fn oldest_held(&self, slot: Slot) -> Option<usize> {
-        let of_slot = self.held.iter().enumerate().filter(|(_, held)| held.slot == slot && !held.release_unsent);
+    /// An operator's calls and the program's do not give way to each other.
+    fn oldest_held(&self, slot: Slot, operator: bool) -> Option<usize> {
+        let is_same = |held: &Held| held.slot == slot && held.operator == operator && !held.release_unsent;
+        let of_slot = self.held.iter().enumerate().filter(|(_, held)| is_same(held));
         of_slot.min_by_key(|(_, held)| held.call).map(|(index, _)| index)
     }
 
@@ -78,14 +85,15 @@ impl<P: Port> Session<P> {
     ) {
         // Not refused: the new call may be the one that stops what the earlier ones started, whose leases it takes over.
         if self.held.is_full()
-            && let Some(oldest) = self.oldest_held(header.slot)
+            && let Some(oldest) = self.oldest_held(header.slot, header.operator)
         {
             take_at(&mut self.held, oldest);
             self.link.counters.add(LinkCounter::RenewalsStopped, 1);
         }
         let (call, slot, next) = (CallId(header.id), header.slot, cx.now + between_renewals(lease));
-        let answered = cx.now;
-        let _ = self.held.push(Held { call, slot, class, lease, renew, next, answered, release_unsent: false });
+        let (answered, operator) = (cx.now, header.operator);
+        let _ =
+            self.held.push(Held { call, slot, operator, class, lease, renew, next, answered, release_unsent: false });
         self.timers.renewal = self.timers.renewal.min(next);
     }
 

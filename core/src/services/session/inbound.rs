@@ -504,6 +504,7 @@ impl<P: Port> Session<P> {
             priority,
             wants_reply: header.wants_reply,
             takes_over: header.takes_over,
+            operator: header.operator,
             resets: false,
             deadline,
             sent_at,

@@ -39,12 +39,21 @@ pub struct RequestOptions {
     pub renew: Renew,
     /// Take over what another caller moves, in place of [`Error::Held`].
     pub take_over: bool,
+    /// An operator makes it, and not the unit's program: each of them holds for itself what it moves.
+    pub operator: bool,
 }
 
 impl RequestOptions {
     /// The default, for constants.
     pub const fn new() -> Self {
-        Self { timeout: None, priority: None, delivery: Delivery::Reliable, renew: Renew::Never, take_over: false }
+        Self {
+            timeout: None,
+            priority: None,
+            delivery: Delivery::Reliable,
+            renew: Renew::Never,
+            take_over: false,
+            operator: false,
+        }
     }
 
     /// The default, for a call of a leased function whose motion is wanted so long.
@@ -102,7 +111,7 @@ impl<P: Port> Session<P> {
         let mut checked = self.check(cx, function, parameters, options, wants_reply)?;
         let slot = checked.header.slot;
         let held = checked.lease.filter(|_| options.renew != Renew::Never);
-        self.check_held(held, options.renew, slot)?;
+        self.check_held(held, options, slot)?;
         let id = self.take_id(cx, &checked, wants_reply)?;
         checked.header.id = id.0;
         let sent = match options.delivery {
@@ -157,6 +166,7 @@ impl<P: Port> Session<P> {
             generation: function.generation,
             wants_reply,
             takes_over: options.take_over,
+            operator: options.operator,
             unknown: 0,
             remaining,
             stamp,

@@ -47,7 +47,7 @@ pub(super) fn held(dice: &mut fastrand::Rng) -> Result<u64> {
             one.release("go_to")?;
             continue;
         }
-        ensure!(refused == Err(Error::Held { by: 1 }), "the second caller's call came to {refused:?}");
+        ensure!(refused == Err(Error::Held { by: 1, operator: false }), "the second caller's call came to {refused:?}");
         let fault = now();
         one.release("go_to")?;
         seen += 1;

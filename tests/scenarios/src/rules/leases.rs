@@ -23,6 +23,7 @@ scenarios![
     a_lease_that_is_not_renewed_ends: "lease of a service", Light, [], ["LeasesExpired"];
     a_loop_that_hangs_ends_what_it_wanted_and_nothing_else: "heart of a loop", Light, [], ["hung"];
     a_manager_that_takes_over_has_the_vehicle_alone: "terms of managers", Light, [], ["fenced"];
+    an_operator_and_the_program_of_a_manager_hold_for_themselves: "lease of a service", Light, [], ["taken over"];
     a_released_lease_stops_at_once: "lease of a service", Light, [], ["stopped"];
     what_a_service_that_goes_has_started_stops_at_once: "lease of a service", Light, [], ["gone"];
     what_is_finished_needs_no_safe_hook: "lease of a service", Light, [], ["finished"];
@@ -201,6 +202,36 @@ fn a_manager_that_takes_over_has_the_vehicle_alone(world: &mut dyn World) {
     drive(world, &second);
     assert!(agv.lease_is_live("drive"));
     world.reached("fenced");
+}
+
+/// Neither replaces the order of the other one, who goes on, unless it takes over.
+fn an_operator_and_the_program_of_a_manager_hold_for_themselves(world: &mut dyn World) {
+    // So long that nothing ends by time.
+    let service = Service::new("drive(n: int[1])").lease(secs(60));
+    let (manager, agv) = pair(world, &service);
+    let ask = |world: &mut dyn World, operator, take_over| {
+        let mut asked = Err(Error::Expired);
+        for _ in 0..200 {
+            let wanted = RequestOptions::renewing(Renew::Process);
+            let options = RequestOptions { timeout: Some(secs(10)), operator, take_over, ..wanted };
+            asked = world.ask_with(&manager, "agv", "drive", &mut number("n", 1), options);
+            if !matches!(asked, Err(Error::Expired | Error::StaleFunction)) {
+                break;
+            }
+        }
+        asked
+    };
+    let by = manager.identity().id();
+    for operator in [false, true] {
+        assert_eq!(ask(world, operator, true), Ok(()));
+        assert_eq!(ask(world, !operator, false), Err(Error::Held { by, operator }));
+        assert_eq!(ask(world, operator, false), Ok(()), "its own gives way");
+        assert!(agv.lease_is_live("drive"));
+    }
+    assert_eq!(service.log().stops(), [], "a new order takes the place of the one before at once");
+    world.reached("taken over");
+    manager.release("agv", "drive").expect("it is held");
+    world.wait("the safe hook runs", || service.log().stops().len() == 1, secs(10));
 }
 
 fn a_released_lease_stops_at_once(world: &mut dyn World) {

@@ -86,8 +86,23 @@ fn an_order_is_replaced_by_its_own_caller_and_held_against_others_unless_taken_o
     yard.world.run_for(millis(500));
     assert_eq!(*yard.committed.borrow(), [true, true, false, true], "the first was replaced");
     assert!(yard.is_told(0, LeaseEnd::Replaced));
-    assert_eq!(yard.call(1, "go", WANTED), Err(Error::Held { by: 1 }));
+    assert_eq!(yard.call(1, "go", WANTED), Err(Error::Held { by: 1, operator: false }));
     assert_eq!(yard.call(1, "go", RequestOptions { take_over: true, ..WANTED }), Ok(()));
+    assert_eq!((yard.is_live(), yard.hooks()), (true, 0));
+}
+
+#[test]
+fn what_the_program_of_a_unit_moves_is_held_against_its_operator_and_the_reverse() {
+    let mut yard = yard();
+    let operators = RequestOptions { operator: true, ..WANTED };
+    assert_eq!(yard.call(0, "go", WANTED), Ok(()));
+    assert_eq!(yard.call(0, "dock", operators), Err(Error::Held { by: 1, operator: false }));
+    assert_eq!(yard.call(0, "dock", RequestOptions { take_over: true, ..operators }), Ok(()));
+    assert!(yard.is_told(0, LeaseEnd::Replaced));
+    for caller in [0, 1] {
+        assert_eq!(yard.call(caller, "go", WANTED), Err(Error::Held { by: 1, operator: true }));
+    }
+    assert_eq!(yard.call(0, "go", operators), Ok(()));
     assert_eq!((yard.is_live(), yard.hooks()), (true, 0));
 }
 

@@ -1,12 +1,15 @@
 //! What moves is an actuator: functions share it, one order at a time has it, a stop ends that order and lets none begin.
 
+use std::vec::Vec;
+
 use super::super::{Event, RequestOptions};
 use super::none;
 use super::pair::Pair;
-use crate::config::Priority;
+use crate::config::{LEASES, Priority};
 use crate::distribution::function::Attributes;
 use crate::distribution::function_list::Slot;
-use crate::error::{Error, ServiceError};
+use crate::error::{Error, Limit, ServiceError};
+use crate::services::heart::Renew;
 use crate::services::lease::{ActuatorState, Claim, LastOrder, Latch, Lease, LeaseEnd, Service as _};
 use crate::services::requests::CallId;
 use crate::time::{Duration, Instant};
@@ -104,10 +107,10 @@ fn functions_that_move_the_same_thing_are_published_with_the_same_number() {
 fn what_another_caller_moves_is_held_unless_it_is_taken_over() {
     let (mut pair, [go, ..]) = vehicle();
     let word = pair.agv.functions.function(go).unwrap().handler.lease.clone().unwrap();
-    let other = Claim { holder: 77, replaces: None, takes_over: false, link: 0, call: 0 };
+    let other = Claim { holder: 77, replaces: None, takes_over: false, operator: false, link: 0, call: 0 };
     let order = word.claim(pair.agv.now, pair.agv.now + LEASE, &other).unwrap();
     let refused = call(&mut pair, "dock");
-    assert_eq!(outcome(&pair, refused), Err(Error::Held { by: 77 }));
+    assert_eq!(outcome(&pair, refused), Err(Error::Held { by: 77, operator: false }));
     assert!(word.is_live_for(order, pair.agv.now));
     let options = RequestOptions { take_over: true, ..RequestOptions::default() };
     let taken = pair.manager.request_with("dock", &none(), &options, true).unwrap();
@@ -116,7 +119,77 @@ fn what_another_caller_moves_is_held_unless_it_is_taken_over() {
     assert!(!word.is_live_for(order, pair.agv.now) && pair.agv.is_live(go));
     assert!(!word.renew(order, pair.agv.now + LEASE), "it is dead for ever");
     let refused = word.claim(pair.agv.now, pair.agv.now + LEASE, &other);
-    assert_eq!(refused, Err(Error::Held { by: 1 }), "the manager's ID");
+    assert_eq!(refused, Err(Error::Held { by: 1, operator: false }), "the manager's ID");
+}
+
+/// A call of `function`, renewed until it is released.
+fn call_of(pair: &mut Pair, operator: bool, take_over: bool, function: &str) -> CallId {
+    let options = RequestOptions { operator, take_over, ..RequestOptions::renewing(Renew::Process) };
+    let id = pair.manager.request_with(function, &none(), &options, true).unwrap();
+    pair.settle();
+    id
+}
+
+#[test]
+fn an_operator_and_the_program_of_one_unit_hold_for_themselves() {
+    for operator in [true, false] {
+        let (mut pair, [go, ..]) = vehicle();
+        let first = call_of(&mut pair, operator, false, "go");
+        let refused = call_of(&mut pair, !operator, false, "dock");
+        assert_eq!(outcome(&pair, refused), Err(Error::Held { by: 1, operator }));
+        pair.run(Duration::from_secs(2));
+        assert!(pair.agv.is_live(go) && pair.manager.session.holds(first) && hooks(&pair) == 0, "it goes on");
+        // Its own one replaces it, without a word.
+        let newer = call_of(&mut pair, operator, false, "dock");
+        assert_eq!(outcome(&pair, newer), Ok(()));
+        assert!(pair.manager.is_told(first, LeaseEnd::Replaced));
+        let taken = call_of(&mut pair, !operator, true, "go");
+        assert_eq!(outcome(&pair, taken), Ok(()));
+        assert!(pair.manager.is_told(newer, LeaseEnd::Replaced) && !pair.manager.session.holds(newer));
+        let refused = call_of(&mut pair, operator, false, "go");
+        assert_eq!(outcome(&pair, refused), Err(Error::Held { by: 1, operator: !operator }));
+        pair.run(Duration::from_secs(2));
+        assert!(pair.agv.is_live(go) && pair.manager.session.holds(taken) && hooks(&pair) == 0);
+        // What has ended is held by none.
+        pair.manager.release(go).unwrap();
+        pair.settle();
+        assert!(!pair.agv.is_live(go) && hooks(&pair) == 1);
+        let next = call_of(&mut pair, operator, false, "go");
+        assert_eq!(outcome(&pair, next), Ok(()));
+    }
+}
+
+#[test]
+fn a_stop_ends_the_order_of_an_operator_and_of_the_program_alike() {
+    for operator in [true, false] {
+        let (mut pair, [go, ..]) = vehicle();
+        let driving = call_of(&mut pair, operator, false, "go");
+        let options = RequestOptions { operator: !operator, ..RequestOptions::new() };
+        pair.manager.request_with("halt", &none(), &options, true).unwrap();
+        pair.settle();
+        assert!(!pair.agv.is_live(go) && pair.manager.is_told(driving, LeaseEnd::Stopped));
+        let refused = call_of(&mut pair, operator, true, "go");
+        assert_eq!(outcome(&pair, refused), Err(Error::Inhibited { by: 1, reason: 0 }));
+    }
+}
+
+#[test]
+fn calls_of_an_operator_do_not_give_way_to_those_of_the_program() {
+    let (mut pair, _) = vehicle();
+    // The vehicle says nothing of what it has replaced.
+    pair.manager.net.frozen = true;
+    let options = |operator| RequestOptions { operator, ..RequestOptions::renewing(Renew::Process) };
+    let request = |pair: &mut Pair, operator| pair.manager.request_with("go", &none(), &options(operator), false);
+    let first = request(&mut pair, true).unwrap();
+    let others: Vec<_> = (1..LEASES).map(|_| request(&mut pair, false).unwrap()).collect();
+    let newest = request(&mut pair, false).unwrap();
+    let held = |id: &CallId| pair.manager.session.holds(*id);
+    assert!(held(&first) && held(&newest) && !held(&others[0]) && others[1..].iter().all(held));
+    let (mut pair, _) = vehicle();
+    pair.manager.net.frozen = true;
+    let all: Vec<_> = (0..LEASES).map(|_| request(&mut pair, false).unwrap()).collect();
+    assert_eq!(request(&mut pair, true), Err(Error::Full(Limit::Leases)));
+    assert!(all.iter().all(|id| pair.manager.session.holds(*id)));
 }
 
 #[test]
@@ -240,7 +313,7 @@ fn a_call_that_was_made_before_the_stop_does_not_begin_after_the_reset() {
 #[test]
 fn nothing_comes_alive_under_a_latch() {
     let (lease, now) = (Lease::new(), Instant::from_micros(1_000_000));
-    let claim = Claim { holder: 1, replaces: None, takes_over: true, link: 0, call: 0 };
+    let claim = Claim { holder: 1, replaces: None, takes_over: true, operator: false, link: 0, call: 0 };
     let order = lease.claim(now, now + LEASE, &claim).unwrap();
     lease.inhibit(now, Latch { by: 0, reason: 1 });
     assert!(!lease.is_live(now) && !lease.lasts_beyond(now) && !lease.renew(order, now + LEASE));
@@ -317,7 +390,7 @@ fn the_vehicles_own_latch_is_told_within_a_keep_alive() {
 fn who_moves_it_is_told_to_others_but_not_by_which_link() {
     let (mut pair, [go, ..]) = vehicle();
     let word = pair.agv.functions.function(go).unwrap().handler.lease.clone().unwrap();
-    let other = Claim { holder: 77, replaces: None, takes_over: false, link: 5, call: 6 };
+    let other = Claim { holder: 77, replaces: None, takes_over: false, operator: false, link: 5, call: 6 };
     word.claim(pair.agv.now, pair.agv.now + LEASE, &other).unwrap();
     pair.run(crate::config::Constraints::S_UNIT.keep_alive);
     let last = state(&pair, go).unwrap().last.unwrap();

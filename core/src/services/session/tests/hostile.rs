@@ -39,6 +39,7 @@ fn message() -> impl Strategy<Value = Vec<u8>> {
                     generation: Generation(three as u16 / 3),
                     wants_reply: flag,
                     takes_over: false,
+                    operator: false,
                     unknown: if two == 5 { 0x10 } else { 0 },
                     remaining: Duration::from_millis(u64::from(one) * 100),
                     stamp,

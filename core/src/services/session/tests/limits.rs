@@ -44,6 +44,7 @@ fn an_emergency_above_its_limit_is_refused() {
             generation: Generation(0),
             wants_reply: false,
             takes_over: false,
+            operator: false,
             unknown: 0,
             remaining: Duration::from_secs(1),
             stamp: pair.agv.now.as_micros(),

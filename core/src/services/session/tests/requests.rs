@@ -136,6 +136,7 @@ fn the_callee_checks_what_the_caller_should_have_checked() {
         generation: told.generation,
         wants_reply: false,
         takes_over: false,
+        operator: false,
         unknown: 0,
         remaining: Duration::from_secs(1),
         stamp: pair.agv.now.as_micros(),
