@@ -305,7 +305,8 @@ impl<T: Send + 'static> Peer<T> {
     }
 
     /// What has become of the newest call of a leased function by this unit, as the node tells after it has joined again: for
-    /// one whose reply was lost, as with [`Error::Interrupted`]. [`OrderOutcome::Unknown`] while it is not connected.
+    /// one whose reply was lost, as with [`Error::Interrupted`]. Calls of [operators](RequestOptions::operator) do not count.
+    /// [`OrderOutcome::Unknown`] while it is not connected.
     ///
     /// ```no_run
     /// use cara_std::{Error, OrderOutcome, Parameters};

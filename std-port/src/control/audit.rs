@@ -5,7 +5,7 @@
 //! | `at_ms` | milliseconds since 1970 |
 //! | `uid`, `pid`, `program` | who asked through the control socket |
 //! | `ask`, `function` | what for; `function` of calls alone |
-//! | `take_over` | `true` where another unit's order was to give way |
+//! | `take_over` | `true` where an order of another unit, or of this unit's program, was to give way |
 //! | `node` | of which node, as far as one has answered |
 //! | `outcome` | `ok`, `ended`, `expired`, the error's name, or `gone` where the client went before the answer |
 

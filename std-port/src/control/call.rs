@@ -88,6 +88,7 @@ pub(super) fn options(question: &CallQuestion) -> Result<RequestOptions, Failure
         // What an operator starts runs for one lease and no longer: no client would release it.
         renew: Renew::Never,
         take_over: question.take_over,
+        operator: true,
     })
 }
 

@@ -138,7 +138,7 @@ pub struct CallQuestion {
     pub priority: Option<String>,
     /// In one datagram, now or never; asynchronous calls only.
     pub best_effort: bool,
-    /// Take over what another unit moves.
+    /// Take over what another unit, or the program of this one, moves.
     #[serde(default)]
     pub take_over: bool,
 }

@@ -80,7 +80,7 @@ pub(super) fn call<T: Send + 'static>(
         }
         if outcome.open > 0 { outcomes.push(outcome) } else { missed.push(outcome) }
     }
-    let options = RequestOptions { priority: Some(Priority::Emergency), ..RequestOptions::default() };
+    let options = RequestOptions { priority: Some(Priority::Emergency), operator: true, ..RequestOptions::default() };
     let calls: Vec<_> = questions.iter().filter_map(|(of, call)| Some((outcomes.get(*of)?.peer, call))).collect();
     block_all(&calls, &options, wanted, &mut |number, answer| {
         let Some(outcome) = questions.get(number).and_then(|(of, _)| outcomes.get_mut(*of)) else { return Ok(()) };

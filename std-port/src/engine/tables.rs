@@ -110,7 +110,9 @@ impl<T: Send + 'static> Engine<T> {
             drop(state.session.lend_calls(filled(most, None)));
             outcome = self.with(link, state, |session, cx| session.request(cx, function, parameters, options, wait));
         }
+        // An operator's is not the program's to ask after.
         if let Ok(id) = outcome
+            && !options.operator
             && state.session.last_order().is_some_and(|(_, order)| order == id)
             && let Some(peer) = link.peer.get()
         {

@@ -7,5 +7,6 @@ mod frozen;
 #[path = "../keyed/mod.rs"]
 mod keyed;
 mod operator;
+mod origin;
 mod places;
 mod support;

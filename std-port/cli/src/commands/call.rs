@@ -42,7 +42,7 @@ pub(crate) struct Arguments {
     /// In one datagram, now or never.
     #[arg(long, requires = "asynchronous")]
     best_effort: bool,
-    /// Take over what another unit moves, instead of the error that names it.
+    /// Take over what another unit or this unit's program moves, instead of the error that names it.
     #[arg(long)]
     take_over: bool,
     /// Keep the lease of what the call starts until it has finished, or until Ctrl-C: then it stops.

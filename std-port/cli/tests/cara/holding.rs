@@ -4,7 +4,10 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
-use cara_std::{Call, Definition, LeaseWatch, ParametersView, ServiceError, ServiceOptions, Unit};
+use cara_std::{
+    Call, Definition, Error, LeaseWatch, Parameters, ParametersView, Renew, RequestOptions, ServiceError,
+    ServiceOptions, Unit,
+};
 
 use crate::support::{PATIENCE, Running, Stage};
 
@@ -166,6 +169,30 @@ fn a_newer_holding_takes_over() {
     newer.interrupt();
     until(|| driver.made_safe() == 1);
     newer.end();
+}
+
+#[test]
+fn what_the_program_of_a_manager_moves_is_held_unless_it_is_taken_over() {
+    let stage = Stage::empty();
+    let manager = stage.manager().build().unwrap();
+    manager.start().unwrap();
+    let driver = Driver::join(&stage);
+    let peer = manager.s_unit("driver").unwrap();
+    let wanted = RequestOptions::renewing(Renew::Process);
+    let program = || peer.block_request_with("drive", &mut Parameters::new(), &wanted);
+    assert_eq!(program(), Ok(()));
+    stage.ends(1, &["call", "driver", "drive"]).says("driver/99: Held: ").says("is held by unit 1:");
+    stage.ends(1, &["call", "driver", "--hold", "drive"]).says("is held by unit 1:");
+    assert_eq!(stage.ends(1, &["call", "driver", "drive", "--json"]).json()["error"]["error"], "Held");
+    assert_eq!(driver.made_safe(), 0);
+    let mut held = Running::start(stage.command(&["call", "driver", "--hold", "--take-over", "drive"]));
+    held.expect("drive()");
+    assert_eq!(program(), Err(Error::Held { by: 1, operator: true }));
+    assert!(driver.lease.is_live());
+    held.interrupt();
+    until(|| driver.made_safe() == 1);
+    held.end();
+    until(|| program() == Ok(()));
 }
 
 #[test]

@@ -7,7 +7,11 @@ use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
-use cara_std::{Builder, Call, Identity, Interfaces, ParametersView, SUnit, ServiceError, ServiceOptions, Unit};
+use cara_std::control::Control;
+use cara_std::{
+    Builder, Call, CommunicationSystem, Identity, Interfaces, MUnit, ParametersView, SUnit, ServiceError,
+    ServiceOptions, Unit,
+};
 use cara_test_keys::KeyFolder;
 use serde_json::Value;
 use tempfile::TempDir;
@@ -81,6 +85,14 @@ impl Stage {
         }
         // Other tests run at the same time.
         self.ends(0, &["set", ".", "request_timeout", "20s"]);
+    }
+
+    /// The builder of `manager/1` as a program, with its control socket at the place where `cara` looks.
+    pub(crate) fn manager(&self) -> Builder<(), MUnit> {
+        let file = self.keys.file(&Identity::m_unit("manager", 1).unwrap()).unwrap();
+        let socket = self.control().join(format!("manager-1-{}.sock", self.fleet));
+        let builder = CommunicationSystem::builder("manager", 1).unwrap().fleet(self.fleet).key_file(file);
+        builder.interfaces(Interfaces::Loopback).control(Control::Path(socket))
     }
 
     pub(crate) fn start_agv(&mut self, name: &str, id: u32) {
