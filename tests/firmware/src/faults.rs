@@ -4,6 +4,8 @@
 //! itself, so that a busy host changes nothing but the phase of each fault. A fault is counted from the last sign before
 //! it that the manager wants the vehicle to drive, as the image's `faults` module says.
 
+mod fenced;
+mod hearts;
 mod inject;
 mod kind;
 mod orders;

@@ -115,6 +115,11 @@ impl Keys {
         (self.kind == Kind::Drawn).then(|| self.file_of(&manager, FLEET))
     }
 
+    /// Where they are.
+    pub(crate) fn folder(&self) -> &Path {
+        self.folder.path()
+    }
+
     /// Gives a manager its keys.
     pub(crate) fn give(&self, builder: Builder<(), MUnit>) -> Result<Builder<(), MUnit>> {
         match (self.kind, self.manager_file()) {

@@ -65,6 +65,9 @@ enum Part {
         /// Its keys; without them it is insecure.
         #[arg(long)]
         key_file: Option<PathBuf>,
+        /// Where it keeps its term.
+        #[arg(long)]
+        state: Option<PathBuf>,
     },
     /// A vehicle that can hold its own state for ever.
     Vehicle {
@@ -104,7 +107,9 @@ enum Part {
 fn main() -> ExitCode {
     let arguments = Arguments::parse();
     let outcome = match &arguments.part {
-        Some(Part::Manager { key_file }) => manager::stand_alone(key_file.as_deref()).map(|()| ExitCode::SUCCESS),
+        Some(Part::Manager { key_file, state }) => {
+            manager::stand_alone(key_file.as_deref(), state.as_deref()).map(|()| ExitCode::SUCCESS)
+        }
         Some(Part::Vehicle { shared: true }) => faults::stand_alone_shared().map(|()| ExitCode::SUCCESS),
         Some(Part::Vehicle { shared: false }) => faults::stand_alone().map(|()| ExitCode::SUCCESS),
         Some(Part::Ends { times }) => {

@@ -10,7 +10,8 @@ use anyhow::{Context, Result, bail, ensure};
 use cara_apps::mechanic;
 use cara_std::control::Control;
 use cara_std::{
-    Builder, CloseReason, CommunicationSystem, Error, MUnit, Parameters, Peer, Renew, RequestOptions, UnitEvent,
+    Builder, CloseReason, CommunicationSystem, Constraints, Duration as CoreDuration, Error, MUnit, Parameters, Peer,
+    Renew, RequestOptions, StartError, UnitEvent,
 };
 
 use crate::board::{Board, FLEET, LONG, Who};
@@ -139,8 +140,8 @@ pub(crate) fn reset(peer: &Peer) -> Result<()> {
 }
 
 /// Sends a vehicle to a place; `false` if this machine was too busy for that and the lease has ended.
-pub(crate) fn sends(peer: &Peer, position: [i64; 2]) -> Result<bool> {
-    match peer.block_request_with("go_to", &mut at(position)?, &RequestOptions::renewing(Renew::Process)) {
+pub(crate) fn sends(peer: &Peer, position: [i64; 2], renew: Renew) -> Result<bool> {
+    match peer.block_request_with("go_to", &mut at(position)?, &RequestOptions::renewing(renew)) {
         Err(Error::TimedOut | Error::Expired | Error::Busy) => {
             // The call may have run all the same, and its lease is not renewed then.
             peer.release("go_to")?;
@@ -153,7 +154,7 @@ pub(crate) fn sends(peer: &Peer, position: [i64; 2]) -> Result<bool> {
 /// Sends a vehicle on its way, again where this machine was too busy for that.
 pub(crate) fn sets_out(peer: &Peer, position: [i64; 2]) -> Result<()> {
     let deadline = Instant::now() + LONG;
-    while !sends(peer, position)? {
+    while !sends(peer, position, Renew::Process)? {
         ensure!(Instant::now() < deadline, "it does not set out");
     }
     Ok(())
@@ -202,34 +203,67 @@ pub(crate) fn fault(kind: i64) -> Result<Parameters, Error> {
     Ok(parameters)
 }
 
-/// The arguments with which this program is a manager for itself.
-pub(crate) fn command(keys: &Keys) -> Vec<OsString> {
+/// The arguments with which this program is a manager for itself, which keeps its term in a folder, if it has one.
+pub(crate) fn command(keys: &Keys, state: Option<&Path>) -> Vec<OsString> {
     let words = ["--image", "none", "manager"].map(OsString::from);
     words
         .into_iter()
         .chain(keys.manager_file().into_iter().flat_map(|file| ["--key-file".into(), file.into()]))
+        .chain(state.into_iter().flat_map(|folder| ["--state".into(), folder.into()]))
         .collect()
 }
 
-/// A manager for itself, until it is killed or its standard input ends: it sends the vehicle of its fleet on a long way,
+/// A manager for itself, until it is killed, fenced, or its standard input ends: it sends the vehicle of its fleet on a long way,
 /// and announces its end when it is told to.
-pub(crate) fn stand_alone(key_file: Option<&Path>) -> Result<()> {
+pub(crate) fn stand_alone(key_file: Option<&Path>, state: Option<&Path>) -> Result<()> {
     let builder = Manager::builder()?;
+    let builder = match state {
+        // A vehicle misses it soon where it is frozen.
+        Some(folder) => {
+            builder.state_folder(folder).constraints(Constraints { keep_alive: MISSED_SOON, ..Constraints::M_UNIT })
+        }
+        None => builder,
+    };
     let manager = Manager::of(match key_file {
         Some(file) => builder.key_file(file),
         None => builder.insecure(),
     })?;
+    let events = manager.system.events();
+    std::thread::spawn(move || {
+        if events.iter().any(|event| matches!(event, UnitEvent::Fenced { .. })) {
+            std::process::exit(StartError::FENCED_EXIT.into());
+        }
+    });
     let agv = manager.meet(&Who::agv(17))?;
     sets_out(&agv, [1_000, 0])?;
     println!("driving");
     for line in std::io::stdin().lines() {
-        if line? == ANNOUNCE {
-            announce(&agv)?;
-            println!("announced");
+        match line?.as_str() {
+            ANNOUNCE => {
+                announce(&agv)?;
+                println!("announced");
+            }
+            INSIST => {
+                insists(&manager);
+                break;
+            }
+            _ => {}
         }
     }
     Ok(())
 }
 
+/// Whatever becomes of its calls, the manager wants the vehicle to drive, until it does.
+fn insists(manager: &Manager) {
+    let drives = |agv: &Peer| sends(agv, [1_000, 0], Renew::Process).is_ok_and(|drives| drives);
+    while !manager.system.s_unit(&Who::agv(17).name).is_ok_and(|agv| drives(&agv)) {
+        std::thread::sleep(Duration::from_millis(2));
+    }
+}
+
+/// Between two signs of life of a manager that is to be missed soon.
+const MISSED_SOON: CoreDuration = CoreDuration::from_millis(250);
 /// Tells a manager for itself to announce its end.
 pub(crate) const ANNOUNCE: &str = "announce";
+/// Tells it to drive, whatever comes.
+pub(crate) const INSIST: &str = "insist";

@@ -39,6 +39,11 @@ pub(crate) fn may_move() -> bool {
     critical_section::with(|section| MOTION.borrow(section).get()).is_some_and(|lease| lease.is_live())
 }
 
+/// Whether a call of it has moved the vehicle, and is wanted.
+pub(crate) fn moves() -> bool {
+    critical_section::with(|section| MOTION.borrow(section).get()).is_some()
+}
+
 fn set_motion(lease: Option<LeaseWatch>) {
     critical_section::with(|section| MOTION.borrow(section).set(lease));
 }

@@ -192,6 +192,11 @@ fn lasts_beyond(at: Instant) -> bool {
     DRIVING.lasts_beyond(at) || CREEPING.lasts_beyond(at)
 }
 
+/// Whether one that moves the vehicle does.
+fn moves_beyond(at: Instant) -> bool {
+    DRIVING.lasts_beyond(at) || (creep::moves() && CREEPING.lasts_beyond(at))
+}
+
 /// A task has taken a call that moves, or is to end the motion of another one; its number. A fault counts from here.
 pub(crate) fn order_begins() -> u32 {
     let number = Record::change(|record| {
@@ -223,13 +228,13 @@ pub(crate) fn sleeps(it_does: bool) {
     Record::change(|record| record.sleeps = it_does);
 }
 
-/// The motors' interrupt looks: has the lease become longer since the last tick?
+/// The motors' interrupt looks: has the lease of what moves become longer since the last tick?
 pub(crate) fn tick() {
     Record::change(|record| {
         let now = now();
-        if record.reaches <= now || lasts_beyond(record.reaches) {
+        if record.reaches <= now || moves_beyond(record.reaches) {
             record.reaches = record.reaches.max(now);
-            while lasts_beyond(record.reaches) {
+            while moves_beyond(record.reaches) {
                 record.reaches = record.reaches + STEP;
                 record.renewed = record.ticked;
             }

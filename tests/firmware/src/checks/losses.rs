@@ -67,7 +67,7 @@ pub(super) fn manager(bench: &Bench, _: u32) -> Result<String> {
     let who = Who::agv(17);
     let board = bench.board(&cable, &who)?;
     let program = std::env::current_exe()?;
-    let arguments = crate::manager::command(&bench.keys);
+    let arguments = crate::manager::command(&bench.keys, None);
     let mut process = Process::start("manager", Path::new(&program), arguments)?;
     process.expect("driving", LONG)?;
     board.logs("driving")?;

@@ -8,7 +8,7 @@ use std::time::Duration;
 use anyhow::{Context, Result, bail, ensure};
 use cara_apps::agv::GO_TO_LEASE;
 use cara_processes::Process;
-use cara_std::{CloseReason, Error, Peer, UnitEvent};
+use cara_std::{CloseReason, Error, Peer, Renew, UnitEvent};
 
 use super::kind::{Bound, Failing, Kind, OVERFLOW};
 use super::{Stop, Target};
@@ -17,17 +17,17 @@ use crate::keys::Keys;
 use crate::manager::{self, ANNOUNCE, Manager, announce, at, fault, position, sends};
 
 /// Longer than the pause between two renewals: faults come in every phase of it.
-const PHASES: u64 = 250;
+pub(super) const PHASES: u64 = 250;
 /// In which a vehicle that drives would be seen to.
 pub(super) const STANDS: Duration = Duration::from_millis(300);
 /// How often a manager renews that has its turns.
-const RENEWED: Duration = Duration::from_millis(100);
+pub(super) const RENEWED: Duration = Duration::from_millis(100);
 /// Times that a drive is started again because this machine was too busy to renew a lease in time.
 pub(super) const TRIES: u32 = 5;
 /// What the board logs.
 pub(super) const ON: &str = "motors on";
 pub(super) const OFF: &str = "motors off:";
-const LEFT: &str = "depot has left";
+pub(super) const LEFT: &str = "depot has left";
 const HOOK: &str = "hook for the lost manager";
 
 /// A board with its cable.
@@ -73,6 +73,9 @@ impl Target for EmulatedBoard {
             Failing::Board { asked, reason } => self.board_fails(in_turn(asked, number), reason, dice),
             Failing::Flooded => self.is_stopped(dice),
             Failing::Bumper => self.stops_itself(dice),
+            Failing::Loop => self.loop_hangs(dice),
+            Failing::Guard => self.guard_is_dropped(dice),
+            Failing::Fenced => self.manager_is_fenced(number, dice),
             Failing::StateHeld | Failing::SecondManager | Failing::Held | Failing::NoRight => {
                 bail!("only processes of Linux fail so")
             }
@@ -143,7 +146,7 @@ impl EmulatedBoard {
 
     fn manager_process(&self) -> Result<Process> {
         let program = std::env::current_exe()?;
-        let mut process = Process::start("manager", Path::new(&program), manager::command(&self.keys))?;
+        let mut process = Process::start("manager", Path::new(&program), manager::command(&self.keys, None))?;
         process.expect("driving", LONG)?;
         Ok(process)
     }
@@ -227,7 +230,7 @@ impl EmulatedBoard {
         for _ in 0..TRIES {
             let agv = manager.meet(&self.who)?;
             let line = self.board.line();
-            if !sends(&agv, [9_000, 0])? {
+            if !sends(&agv, [9_000, 0], Renew::Process)? {
                 continue;
             }
             let line = self.board.logs_behind(line, ON)?;
@@ -261,7 +264,7 @@ impl EmulatedBoard {
     }
 
     /// Waits until the hook for the lost manager has run, and looks that it ran once and before anything else.
-    fn lost_once(&self, line: usize) -> Result<()> {
+    pub(super) fn lost_once(&self, line: usize) -> Result<()> {
         self.board.logs_behind(line, HOOK)?;
         let losses = self.hooks_follow_losses(line)?;
         ensure!(losses == 1, "{losses} losses of one manager; the board logged{}", self.log(line));

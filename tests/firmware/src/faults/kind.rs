@@ -19,6 +19,12 @@ pub(super) enum Failing {
     },
     /// The manager's process gets no turn for about as long as its lease lasts, again and again.
     Turns,
+    /// A loop of the manager's program, beside another one that goes on.
+    Loop,
+    /// The manager's program drops the guard of its call.
+    Guard,
+    /// The manager's process gets no turn until another one of its identity has taken over.
+    Fenced,
     /// One wire of the cable is cut.
     Wire(Way),
     /// The cable is pulled.
@@ -60,10 +66,13 @@ pub(super) struct Kind {
 }
 
 /// All of them.
-pub(super) const KINDS: [Kind; 20] = [
+pub(super) const KINDS: [Kind; 23] = [
     Kind { name: "manager killed", failing: Failing::Manager { frozen: false } },
     Kind { name: "manager frozen", failing: Failing::Manager { frozen: true } },
     Kind { name: "manager held up", failing: Failing::Turns },
+    Kind { name: "loop hung", failing: Failing::Loop },
+    Kind { name: "guard dropped", failing: Failing::Guard },
+    Kind { name: "manager fenced", failing: Failing::Fenced },
     Kind { name: "link cut towards the board", failing: Failing::Wire(Way::ToBoard) },
     Kind { name: "link cut towards the manager", failing: Failing::Wire(Way::FromBoard) },
     Kind { name: "link cut in both directions", failing: Failing::Cable },
@@ -108,9 +117,11 @@ impl Kind {
             Failing::Replaced => stop.announced,
             // The lease goes on, and is not what ends the motion.
             Failing::Bumper => stop.announced,
-            // From when the board took the datagram of the stop, if that came before the stop in the stream.
-            Failing::Flooded if stop.heard > 0 => stop.heard,
-            Failing::Flooded => stop.announced,
+            // The other loop's renewals go on. The beat from which the last one of this loop counts came behind the announcement.
+            Failing::Loop => stop.announced,
+            // From when the board took the datagram of the stop or release, if that came before the same in the stream.
+            Failing::Flooded | Failing::Guard if stop.heard > 0 => stop.heard,
+            Failing::Flooded | Failing::Guard => stop.announced,
             _ => stop.announced.min(stop.renewed),
         }
     }
@@ -123,6 +134,9 @@ const ASKED: Duration = Duration::from_millis(100);
 
 /// The longest turn of the executor while calls come faster than the board answers them.
 const FLOODED: Duration = Duration::from_millis(40);
+
+/// As the image's: in which a manager whose machine has time for it has its answer.
+pub(super) const POLL: Duration = Duration::from_millis(20);
 
 /// For so long at most the image masks interrupts, as while it logs: a tick may be late by that.
 const MASKED: Duration = Duration::from_micros(500);
@@ -151,6 +165,7 @@ impl Bound {
             Failing::Board { reason: OVERFLOW, .. } => Self { micros: 2 * tick, of: "filling + tick" },
             Failing::Replaced => Self { micros: tick, of: "tick" },
             Failing::Bumper => Self { micros: MASKED.as_micros() + tick, of: "masked + tick" },
+            Failing::Guard => Self { micros: poll + tick, of: "poll + tick" },
             Failing::Flooded => Self { micros: FLOODED.as_micros() + tick, of: "turn of a flood + tick" },
             Failing::Caller { killed } => {
                 let of = if killed { "question + lease + poll + tick" } else { "time-out + lease + poll + tick" };

@@ -15,7 +15,7 @@ use crate::keys::MANAGER;
 use crate::manager::{Manager, announce};
 
 /// The service of the image whose calls tasks take.
-const CREEP: &str = "creep";
+pub(super) const CREEP: &str = "creep";
 /// Longer than all waiting of the caller.
 const NEVER: i64 = 600_000;
 /// Of the image's tasks that look at their leases.
@@ -148,7 +148,7 @@ fn creep(agv: &Peer, speed: i64) -> Result<()> {
     agv.block_request_with(CREEP, &mut arguments(speed, 0)?, &wanted).context(CREEP)
 }
 
-fn arguments(speed: i64, answers: i64) -> Result<Parameters, Error> {
+pub(super) fn arguments(speed: i64, answers: i64) -> Result<Parameters, Error> {
     let mut parameters = Parameters::new();
     for (name, value) in [("speed", speed), ("answers", answers)] {
         parameters.add_int(name, 1)?;
