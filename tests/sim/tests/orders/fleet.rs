@@ -435,6 +435,7 @@ fn told(unit: &UnitHandle, event: &UnitEvent, watch: &mut Watch, process: usize,
 
 fn word_of(error: Error) -> &'static str {
     match error {
+        Error::Held { operator: true, .. } => "held by an operator",
         Error::Held { .. } => "held",
         Error::Inhibited { .. } => "inhibited",
         Error::Busy => "busy",
@@ -523,6 +524,7 @@ impl Caller {
             timeout: Some(between(&mut self.random, 50, 1_500)),
             renew,
             take_over: one_in(&mut self.random, 3),
+            operator: one_in(&mut self.random, 4),
             ..RequestOptions::new()
         };
         let asked = Asked { vehicle, function, options, wanted };
@@ -554,6 +556,7 @@ impl Caller {
             does,
             wanted: asked.wanted,
             takes_over: asked.options.take_over,
+            operator: asked.options.operator,
             is_emergency: function == "halt",
         });
         let mut parameters = Parameters::new();

@@ -45,6 +45,8 @@ pub(crate) struct Made {
     pub(crate) does: Does,
     pub(crate) wanted: Wanted,
     pub(crate) takes_over: bool,
+    /// An operator of the unit made it, and not its program.
+    pub(crate) operator: bool,
     pub(crate) is_emergency: bool,
 }
 
@@ -102,7 +104,7 @@ pub(crate) struct Seen {
 pub(crate) type Reached = BTreeMap<&'static str, u64>;
 
 /// What a run must have come to at least once: one that does nothing breaks no rule.
-pub(crate) const MUST_REACH: [&str; 26] = [
+pub(crate) const MUST_REACH: [&str; 27] = [
     "begun",
     "moved",
     "committed",
@@ -110,6 +112,7 @@ pub(crate) const MUST_REACH: [&str; 26] = [
     "replaced",
     "taken over",
     "held",
+    "held by an operator",
     "expired",
     "inhibited",
     "stopped",
@@ -347,8 +350,12 @@ impl Watch {
         assert!(!was_unsafe, "call {n} begins before the safe hook of {before}, which was dead");
         let is_over = now >= self.end_of(before, actuator, now);
         assert!(!is_over, "call {n} begins before the safe hook of {before}, whose time is over");
-        let [other, own] = [before, n].map(|n| self.processes[self.calls[n].made.by].id);
-        assert!(other == own || takes_over, "call {n} of {own} takes what {before} of {other} holds");
+        // An operator and the program of one unit are two.
+        let [other, own] = [before, n].map(|n| {
+            let Made { by, operator, .. } = self.calls[n].made;
+            (self.processes[by].id, operator)
+        });
+        assert!(other == own || takes_over, "call {n} of {own:?} takes what {before} of {other:?} holds");
         self.calls[before].is_dead = true;
         self.reach(if other == own { "replaced" } else { "taken over" });
     }
