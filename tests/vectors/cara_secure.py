@@ -309,13 +309,18 @@ class End:
 
     # Either end's two messages of a handshake.
 
+    @property
+    def begins(self):
+        """The end that was dialled begins the first handshake, the dialler all others."""
+        return self.dialed != (self.own is None)
+
     def propose(self):
-        require(self.dialed and self.handshake is None, "a proof within a proof")
+        require(self.begins and self.handshake is None, "a proof within a proof")
         self.handshake = self.new_handshake(self.keys[0], self.draw())
         return self.handshake.write_first()
 
     def answer(self, message):
-        require(not self.dialed and self.handshake is None and len(message) == 48, "a proof that was not to come")
+        require(not self.begins and self.handshake is None and len(message) == 48, "a proof that was not to come")
         fresh = self.draw()
         for key in self.keys:
             handshake = self.new_handshake(key, fresh)
@@ -329,7 +334,7 @@ class End:
         raise NotProven("another key")
 
     def finish(self, message):
-        require(self.dialed and self.handshake is not None and len(message) == 48, "an answer to nothing")
+        require(self.begins and self.handshake is not None and len(message) == 48, "an answer to nothing")
         try:
             self.handshake.read_second(message)
         except Refused:
@@ -345,9 +350,9 @@ class End:
     def agreed(self, handshake):
         require(self.next_sending is None and self.next_receiving is None, "keys that were not taken into use")
         keys = [Direction(key) for key in handshake.split()]
-        self.next_sending, self.next_receiving = keys if self.dialed else reversed(keys)
+        self.next_sending, self.next_receiving = keys if self.begins else reversed(keys)
         generation = 0 if self.own is None else self.own[0] + 1 & 255
-        use = b"dgrI" if self.dialed else b"dgrR"
+        use = b"dgrI" if self.begins else b"dgrR"
         self.told = generation, blake2s(use, handshake.hash, key=handshake.fresh)
         self.prologue, self.handshake = blake2s(b"CARA renewal 1", handshake.hash), None
 
@@ -468,23 +473,23 @@ class Conversation:
             self.nonces[name] = hello["nonce"]
             return {"hello": hello}
         require(body[0] == PROOF and len(self.hellos) == 2, "a frame that must be sealed")
-        if name == "vehicle":
+        if name == "manager":
             for end in self.ends.values():
                 end.begin(*self.hellos.values())
         said = self.proof(name, body[1:])
-        if name == "manager":
+        if name == "vehicle":
             for end in self.ends.values():
                 end.turn()
         return said
 
     def proof(self, name, message):
         """Either of the two messages: it is what this implementation makes of the same numbers."""
-        if name == "vehicle":
+        if self.ends[name].begins:
             require(self.ends[name].propose() == message, "another first message")
             self.first = message
             return "proof 1"
         require(self.ends[name].answer(self.first) == message, "another second message")
-        self.ends["vehicle"].finish(message)
+        self.ends[self.ENDS[name]].finish(message)
         return "proof 2"
 
     def turn(self, end, other):

@@ -197,7 +197,7 @@ class Unit:
             self.close(12, "no key for %s" % peer)
         self.link.end = self.end = end = secure.End(self.dialed, pair_keys)
         end.begin(*hellos)
-        if self.dialed:
+        if end.begins:
             self.send_frame("proof", end.propose())
             end.finish(self.expect("proof"))
         else:

@@ -2,8 +2,9 @@
 //! leaks later does not reveal them.
 //!
 //! The **prologue** is what both ends must have seen alike: a hash over it goes into every key, so that a bit that was
-//! changed on the way fails the handshake. The responder knows the initiator only when the first sealed frame opens:
-//! the first message alone may be a recorded one, so nothing is decided and nothing runs before that frame.
+//! changed on the way fails the handshake. The initiator is the end that was dialled, which has both hellos first; where
+//! keys are made anew it is the dialler. Nothing is decided and nothing runs before the other end's first sealed frame has
+//! opened: the first message proves its sender only if the prologue has something of the responder that is fresh.
 
 use blake2::{Blake2s256, Digest};
 use noise_protocol::patterns::noise_nn_psk0;
@@ -23,7 +24,7 @@ pub const MESSAGE_BYTES: usize = 48;
 #[error("the handshake failed: the other end has another key for this pair, or a message was changed")]
 pub struct HandshakeError;
 
-/// The end that opened the connection, until the other one has answered. It keeps what its message was made of, and makes
+/// The end that begins, until the other one has answered. It keeps what its message was made of, and makes
 /// it again when the answer comes: the state of a handshake is three times as large.
 pub struct Initiator {
     key: PairKey,
@@ -41,11 +42,11 @@ pub struct Agreed {
     pub binding: [u8; 32],
 }
 
-/// What both ends have seen, in the order initiator, responder.
-pub fn prologue(initiator: &[u8], responder: &[u8]) -> [u8; 32] {
+/// What both ends have seen, in the order of its coming: the dialler's, then that of the end that was dialled.
+pub fn prologue(dialler: &[u8], dialed: &[u8]) -> [u8; 32] {
     let mut transcript = Transcript::new();
-    transcript.add(initiator);
-    transcript.add(responder);
+    transcript.add(dialler);
+    transcript.add(dialed);
     transcript.prologue()
 }
 
@@ -63,7 +64,7 @@ impl Transcript {
         Self(Blake2s256::new_with_prefix(b"CARA prologue 1"))
     }
 
-    /// The next part: the initiator's, then the responder's.
+    /// The next part: the dialler's, then that of the end that was dialled.
     pub fn add(&mut self, part: &[u8]) {
         self.0.update((part.len() as u64).to_le_bytes());
         self.0.update(part);
@@ -130,7 +131,7 @@ impl Initiator {
     }
 }
 
-/// The end that took the connection answers an initiator's message. The channel must open a frame before anything that
+/// The other end answers an initiator's message. The channel must open a frame before anything that
 /// came is believed.
 pub fn answer(
     key: &PairKey,

@@ -26,8 +26,8 @@ impl Credentials {
         Self { key, other: None, fresh: Fresh(fresh) }
     }
 
-    /// Also takes a peer that dials with `other`, the key of the generation before or behind: so keys are changed in a
-    /// fleet that runs, first at those that are dialled.
+    /// Also takes a peer that begins with `other`, the key of the generation before or behind: so keys are changed in a
+    /// fleet that runs.
     #[must_use]
     pub fn or(mut self, other: Option<PairKey>) -> Self {
         self.other = other;
@@ -54,8 +54,8 @@ impl Fresh {
     }
 
     /// The key of this end's datagrams, another one than that of the other end whatever is drawn.
-    fn datagrams(&self, dialed: bool, binding: &[u8; 32]) -> DatagramKey {
-        DatagramKey::new(self.secret(if dialed { b"dgrI" } else { b"dgrR" }, binding))
+    fn datagrams(&self, began: bool, binding: &[u8; 32]) -> DatagramKey {
+        DatagramKey::new(self.secret(if began { b"dgrI" } else { b"dgrR" }, binding))
     }
 }
 
@@ -82,9 +82,9 @@ enum Proving {
 type Message = Option<[u8; PROOF_BYTES]>;
 
 impl Proving {
-    /// What was begun, and the message of the end that dialled.
-    fn begin(dialed: bool, prologue: [u8; 32], credentials: Credentials) -> Result<(Self, Message), CloseReason> {
-        if !dialed {
+    /// What was begun, and the message of the end that begins.
+    fn begin(begins: bool, prologue: [u8; 32], credentials: Credentials) -> Result<(Self, Message), CloseReason> {
+        if !begins {
             return Ok((Self::Responding(prologue, credentials), None));
         }
         let begun = Initiator::begin(&credentials.key, &prologue, &credentials.fresh.ephemeral(&prologue));
@@ -92,7 +92,7 @@ impl Proving {
         Ok((Self::Initiating(initiator, credentials.fresh.clone()), Some(message)))
     }
 
-    /// What both ends have agreed on, the key of this end's datagrams, and the answer of the end that was dialled.
+    /// What both ends have agreed on, the key of this end's datagrams, and the answer of the end that did not begin.
     fn finish(self, message: &[u8]) -> Result<(Agreed, DatagramKey, Message), CloseReason> {
         match self {
             Self::Initiating(initiator, fresh) => {
@@ -152,11 +152,11 @@ impl Sealing {
     }
 
     /// Begins a rekey.
-    fn prove(&mut self, dialed: bool, credentials: Credentials) -> Result<Message, CloseReason> {
+    fn prove(&mut self, begins: bool, credentials: Credentials) -> Result<Message, CloseReason> {
         if !matches!(self.renewing, Renewing::No) {
             return Err(CloseReason::Protocol);
         }
-        let (proving, message) = Proving::begin(dialed, handshake::renewal(&self.binding), credentials)?;
+        let (proving, message) = Proving::begin(begins, handshake::renewal(&self.binding), credentials)?;
         self.renewing = Renewing::Proving(proving);
         Ok(message)
     }
@@ -296,14 +296,14 @@ impl Secure for Noise {
         }
     }
 
-    fn prove(&mut self, dialed: bool, credentials: Credentials) -> Result<Message, CloseReason> {
+    fn prove(&mut self, begins: bool, credentials: Credentials) -> Result<Message, CloseReason> {
         if let Some(sealing) = self.sealing() {
-            return sealing.prove(dialed, credentials);
+            return sealing.prove(begins, credentials);
         }
         let State::Introducing(transcript) = core::mem::replace(&mut self.0, State::Ended) else {
             return Err(CloseReason::Protocol);
         };
-        let (proving, message) = Proving::begin(dialed, transcript.prologue(), credentials)?;
+        let (proving, message) = Proving::begin(begins, transcript.prologue(), credentials)?;
         self.0 = State::Proving(proving);
         Ok(message)
     }
@@ -463,10 +463,10 @@ impl Secure for Cipher {
         either!(self, cipher => cipher.introduce(hello));
     }
 
-    fn prove(&mut self, dialed: bool, credentials: Credentials) -> Result<Option<[u8; PROOF_BYTES]>, CloseReason> {
+    fn prove(&mut self, begins: bool, credentials: Credentials) -> Result<Option<[u8; PROOF_BYTES]>, CloseReason> {
         match self {
-            Self::Plain(plain) => plain.prove(dialed, ()),
-            Self::Noise(noise) => noise.prove(dialed, credentials),
+            Self::Plain(plain) => plain.prove(begins, ()),
+            Self::Noise(noise) => noise.prove(begins, credentials),
         }
     }
 

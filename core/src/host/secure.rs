@@ -4,9 +4,9 @@
 //! # How a secured link begins
 //! Both hellos travel in clear, the dialler's first; each end gives both to [`Secure::introduce`] in that order. When
 //! the peer's has come, the port brings the pair's key, and the cipher proves it with one message in each direction
-//! ([`Secure::prove`], [`Secure::answer`]). From then on all frames are sealed. The first sealed frame of each end
-//! confirms that it has the keys, and tells the key of its datagrams ([`Secure::confirmation`]). Nothing that the peer
-//! has said counts before that frame has opened.
+//! ([`Secure::prove`], [`Secure::answer`]); the end that was dialled begins. From then on all frames are sealed. The first
+//! sealed frame of each end confirms that it has the keys, and tells the key of its datagrams ([`Secure::confirmation`]).
+//! Nothing that the peer has said counts before that frame has opened. The dialler may say more behind its own.
 //!
 //! # How a link is rekeyed
 //! On a long-lived link the same proof is made again, in sealed frames, and covers what the one before has agreed on.
@@ -55,11 +55,11 @@ pub trait Secure: Seal {
     /// A hello as it travels: first the dialler's, then the other one's. The proof covers both.
     fn introduce(&mut self, hello: &[u8]);
 
-    /// Begins the proof, or, where frames are sealed, a rekey. The end that dialled gets the message to send.
-    fn prove(&mut self, dialed: bool, credentials: Self::Credentials)
+    /// A proof, or, where frames are sealed, a rekey. The end that `begins` gets the message to send.
+    fn prove(&mut self, begins: bool, credentials: Self::Credentials)
     -> Result<Option<[u8; PROOF_BYTES]>, CloseReason>;
 
-    /// Takes the other end's message. The end that was dialled gets the answer to send. In the proof with which a link
+    /// Takes the other end's message. The end that did not begin gets the answer to send. In the proof with which a link
     /// begins it is not sealed, and everything behind it is.
     fn answer(&mut self, message: &[u8]) -> Result<Option<[u8; PROOF_BYTES]>, CloseReason>;
 
@@ -145,7 +145,7 @@ impl Secure for Plain {
 
     fn introduce(&mut self, _hello: &[u8]) {}
 
-    fn prove(&mut self, _dialed: bool, (): ()) -> Result<Option<[u8; PROOF_BYTES]>, CloseReason> {
+    fn prove(&mut self, _begins: bool, (): ()) -> Result<Option<[u8; PROOF_BYTES]>, CloseReason> {
         Err(CloseReason::Protocol)
     }
 

@@ -216,19 +216,19 @@ impl Speaker {
             (true, 0) | (false, 0) => self.introduce(),
             (true, 1) => {
                 self.hear_hello()?;
-                self.prove().map(|proof| framed(&Frame::Proof(&proof.unwrap_or([0; 48]))))
-            }
-            (false, 1) => {
                 self.prove()?;
                 // With another key there is no valid answer; random bytes are sent in its place.
                 let answer = self.hear_proof().ok().flatten();
                 Ok(framed(&Frame::Proof(&answer.unwrap_or_else(random))))
             }
+            (false, 1) => self.prove().map(|proof| framed(&Frame::Proof(&proof.unwrap_or([0; 48])))),
             (dials, _) => {
-                if dials {
+                if !dials {
                     self.hear_proof()?;
-                } else {
                     self.hear_confirmation()?;
+                } else if !self.cipher.is_sealing() {
+                    self.hear()?;
+                    return Err(over("another key"));
                 }
                 let confirmation = self.cipher.confirmation();
                 Ok(self.sealed(&[&[8][..], &confirmation].concat()))
@@ -246,7 +246,7 @@ impl Speaker {
     }
 
     fn prove(&mut self) -> io::Result<Option<[u8; 48]>> {
-        self.cipher.prove(self.dials, Credentials::new(self.key.clone(), random())).map_err(|_| over("no proof"))
+        self.cipher.prove(!self.dials, Credentials::new(self.key.clone(), random())).map_err(|_| over("no proof"))
     }
 
     fn hear_hello(&mut self) -> io::Result<()> {

@@ -62,7 +62,11 @@ impl<P: Port> Session<P> {
             return None;
         }
         self.joined = true;
-        self.publish(cx);
+        if self.is_told(cx) {
+            self.pump(cx);
+        } else {
+            self.publish(cx);
+        }
         Some(Event::Joined)
     }
 

@@ -176,7 +176,7 @@ impl<P: Port> Session<P> {
         match (incoming, self.phase) {
             // In clear anyone on the path can end a link, so it counts as no verdict of the peer, and the search goes on.
             (Incoming::Refuse(_) | Incoming::Close(_), _) if !self.link.cipher().is_sealing() => {
-                self.ended_in_clear();
+                self.ended_in_clear(incoming);
                 None
             }
             (Incoming::Refuse(code), _) => {

@@ -410,7 +410,7 @@ impl<P: Port> Session<P> {
     fn refuse(&mut self, cx: &mut Context<'_, P>, refusal: Refusal) {
         match refusal {
             Refusal::NoKey => {
-                // Whoever tries identities does not learn for which of them there are keys.
+                // The code of a proof that failed: the peer need not know which of the two it was.
                 self.link.counters.add(LinkCounter::KeysMissing, 1);
                 self.farewell(cx, &Frame::Close(close_code(CloseReason::BadProof)));
             }

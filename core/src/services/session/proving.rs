@@ -3,26 +3,28 @@
 //! Until the peer's first sealed frame has opened, what it says costs a bounded time and the link's own bytes, and reaches
 //! nobody: no limit, no clock and no decision of the node depends on it.
 
-use super::{Event, Phase, Remote, Session};
+use super::{Event, Phase, Remote, Session, close_reason};
 use crate::config::{MINIMUM_CHUNK_BYTES, Mode, VERSIONS};
 use crate::distribution::hello::{Hello, HelloError};
 use crate::error::{CloseReason, Refusal};
-use crate::host::connections::{LinkCounter, Liveness, Place};
+use crate::host::connections::{Incoming, LinkCounter, Liveness, Place};
 use crate::host::endpoint::Endpoint as _;
 use crate::host::frame::Frame;
-use crate::host::secure::Secure;
+use crate::host::secure::{PROOF_BYTES, Secure};
 use crate::services::{Context, Port};
 use crate::time::{Duration, Instant};
 
 impl<P: Port> Session<P> {
     /// Proves to the peer that this unit has the pair's key, and waits for the same from it. If it does not come, the link
     /// ends with [`CloseReason::BadProof`], [`CloseReason::Unproven`] or [`CloseReason::HelloTimeout`].
+    ///
+    /// The end that was dialled begins: it is the first one to have both hellos, which the proof covers.
     fn prove(&mut self, cx: &mut Context<'_, P>, until: Instant) {
         let Some(credentials) = self.credentials(cx) else { return };
-        match self.link.cipher().prove(self.dialed, credentials) {
+        match self.link.cipher().prove(!self.dialed, credentials) {
             Ok(message) => {
                 self.phase = Phase::Proving { until };
-                self.send_proof(cx, message.as_ref().map(|message| &message[..]));
+                self.send_proof(cx, message);
             }
             Err(_) => self.fail(cx),
         }
@@ -66,14 +68,18 @@ impl<P: Port> Session<P> {
         None
     }
 
-    /// The peer's message of the proof. The end that dialled confirms at once that it has the keys.
+    /// The peer's message of the proof. To the end that dialled it proves the peer, since it covers this link's fresh nonce:
+    /// that end answers, confirms that it has the keys, and says what it has published. The peer reads the list once it has
+    /// decided to take this unit.
     pub(super) fn proof_arrived(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8]) -> Option<Event> {
         match self.link.answer(place, lent) {
-            Ok(answer) => self.send_proof(cx, answer.as_ref().map(|answer| &answer[..])),
+            Ok(answer) => self.send_proof(cx, answer),
             Err(_) => self.fail(cx),
         }
         if self.dialed && matches!(self.phase, Phase::Proving { .. }) {
             self.send_confirmation(cx);
+            self.limit_to_peer();
+            self.publish(cx);
         }
         None
     }
@@ -102,25 +108,36 @@ impl<P: Port> Session<P> {
         self.close(cx, CloseReason::BadProof);
     }
 
-    /// What somebody who has proven nothing says about the end of the link is no more than its end.
-    pub(super) fn ended_in_clear(&mut self) {
+    /// What a peer that has proven nothing says about the end of the link is no more than its end. That it has no use for this
+    /// end's proof is counted: most often one of the two has another key.
+    pub(super) fn ended_in_clear(&mut self, farewell: Incoming) {
         self.link.counters.add(LinkCounter::FarewellsInClear, 1);
+        let unfit = matches!(farewell, Incoming::Close(code) if close_reason(code) == CloseReason::BadProof);
+        if unfit && matches!(self.phase, Phase::Proving { .. }) {
+            self.link.counters.add(LinkCounter::ProofsFailed, 1);
+        }
         self.end(CloseReason::Unproven);
     }
 
     /// What the hello told counts from here on.
     fn peer_known(&mut self, cx: &mut Context<'_, P>) -> Option<Event> {
+        self.limit_to_peer();
         let Some(Remote { hello, heard, .. }) = &self.remote else { return None };
-        self.link.set_peer_limits(usize::from(hello.limits.chunk_size));
         self.liveness = Liveness::new(cx.now, Duration::from_millis(u64::from(hello.keep_alive)));
         self.clock.hear(*heard, hello.stamp);
         self.phase = Phase::Deciding;
         self.consult(cx)
     }
 
-    fn send_proof(&mut self, cx: &mut Context<'_, P>, message: Option<&[u8]>) {
+    /// Sends nothing that is longer than the peer takes.
+    fn limit_to_peer(&mut self) {
+        let chunk_size = self.hello().map_or(MINIMUM_CHUNK_BYTES, |hello| usize::from(hello.limits.chunk_size));
+        self.link.set_peer_limits(chunk_size);
+    }
+
+    fn send_proof(&mut self, cx: &mut Context<'_, P>, message: Option<[u8; PROOF_BYTES]>) {
         let Some(message) = message else { return };
-        if self.link.send_clear(&Frame::Proof(message)) {
+        if self.link.send_clear(&Frame::Proof(&message)) {
             self.flush(cx);
         } else {
             self.close(cx, CloseReason::Protocol);

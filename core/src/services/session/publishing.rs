@@ -7,6 +7,7 @@ use crate::distribution::function_list::{Generation, Slot};
 use crate::distribution::hello::Limits;
 use crate::distribution::identity::Identity;
 use crate::distribution::message::{CONTROL_BYTES, Control, PUBLISH_BYTES};
+use crate::host::secure::Secure;
 use crate::services::access::Bucket;
 use crate::services::lease::{ActuatorState, LastOrder};
 use crate::services::{Context, Port};
@@ -201,7 +202,7 @@ impl<P: Port> Session<P> {
 
     /// Tells the peer what it is still to be told, as far as there is room.
     pub(super) fn pump(&mut self, cx: &mut Context<'_, P>) {
-        if self.phase != Phase::Live {
+        if !self.may_tell() {
             return;
         }
         self.send_ends(cx);
@@ -225,6 +226,20 @@ impl<P: Port> Session<P> {
             let serial = self.publishing.serial;
             self.publishing.end_due = !self.send_control(cx, &Control::ListEnd { serial });
         }
+    }
+
+    /// Whether the peer may be told what is published: it has proven itself to this end, which dialled, or the link is live.
+    fn may_tell(&mut self) -> bool {
+        match self.phase {
+            Phase::Live => true,
+            Phase::Proving { .. } => self.dialed && self.link.cipher().is_sealing(),
+            _ => false,
+        }
+    }
+
+    /// Whether the peer was told of everything up to the unit's newest publication, or will be as soon as there is room.
+    pub(super) fn is_told(&self, cx: &mut Context<'_, P>) -> bool {
+        self.publishing.serial != 0 && !self.is_behind(cx)
     }
 
     /// Whether something waits for room.
@@ -302,7 +317,7 @@ impl<P: Port> Session<P> {
 
     /// Sends a control message; `false` when there is no room, or nobody to send it to.
     pub(super) fn send_control(&mut self, cx: &mut Context<'_, P>, control: &Control<'_>) -> bool {
-        if self.phase != Phase::Live {
+        if !self.may_tell() {
             return false;
         }
         let mut bytes = [0; CONTROL_BYTES + PUBLISH_BYTES + SIGNATURE_BYTES];

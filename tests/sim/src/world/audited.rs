@@ -73,8 +73,8 @@ impl Secure for Audited {
         self.cipher.introduce(hello);
     }
 
-    fn prove(&mut self, dialed: bool, credentials: Credentials) -> Result<Option<[u8; PROOF_BYTES]>, CloseReason> {
-        self.cipher.prove(dialed, credentials)
+    fn prove(&mut self, begins: bool, credentials: Credentials) -> Result<Option<[u8; PROOF_BYTES]>, CloseReason> {
+        self.cipher.prove(begins, credentials)
     }
 
     fn answer(&mut self, message: &[u8]) -> Result<Option<[u8; PROOF_BYTES]>, CloseReason> {

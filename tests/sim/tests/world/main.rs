@@ -7,6 +7,7 @@ mod leases;
 mod renewals;
 mod runs;
 mod terms;
+mod trips;
 
 use cara_core::distribution::parameters::Parameters;
 use cara_core::time::Duration;
