@@ -130,7 +130,7 @@ pub enum Refusal {
     Suite,
     /// The manager's term is older than one that the vehicle has obeyed, which the vehicle's hello says.
     #[error(
-        "another manager of this name and id has taken over: stop one of the two; to command with this one again, start it with --take-over"
+        "another manager of this name and id has taken over: find out which of the two is to command, and stop the other one before this one starts again"
     )]
     Fenced,
 }

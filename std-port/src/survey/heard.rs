@@ -8,6 +8,7 @@ use cara_core::config::{Mode, VERSIONS, Versions};
 use cara_core::distribution::datagram::{Datagram, Header};
 use cara_core::distribution::hello::Manager;
 use cara_core::distribution::identity::{Epoch, Fleet, Identity, Role};
+use cara_core::term::Term;
 
 use super::NAME;
 use crate::sys::interfaces::Interface;
@@ -56,6 +57,8 @@ pub struct Heard {
     pub tcp_port: Option<u16>,
     /// How many more nodes it takes, as it said last.
     pub room: Option<u16>,
+    /// The term of an m_unit, as it said last.
+    pub term: Option<Term>,
     /// Searches of it.
     pub searches: u32,
     /// Answers of it.
@@ -110,6 +113,7 @@ impl Heard {
             wanted: None,
             tcp_port: None,
             room: None,
+            term: None,
             searches: 0,
             answers: 0,
             others: 0,
@@ -134,6 +138,7 @@ impl Heard {
                 self.answers = self.answers.saturating_add(1);
                 self.tcp_port = Some(answer.tcp_port).filter(|port| *port > 0);
                 self.room = Some(answer.room);
+                self.term = Some(answer.term).filter(|term| *term != Term::NONE);
             }
             Some(Datagram::Session { .. }) | None => self.others = self.others.saturating_add(1),
         }

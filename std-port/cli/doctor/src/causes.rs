@@ -57,9 +57,40 @@ const NO_PAIR_KEY_ADVICE: &str = "if it was revoked, or is not known to you, do 
 
 /// Managers of which there are two.
 pub(crate) fn duplicate_managers(seen: &Evidence) -> Vec<Finding> {
-    let duplicates = seen.managers().into_iter().filter_map(|name| duplicate(&name, &seen.lives(&name)));
-    duplicates.map(|finding| Finding { advice: DUPLICATE_MANAGERS.to_owned(), ..finding }).collect()
+    seen.managers().into_iter().filter_map(|name| duplicate_manager(seen, &name)).collect()
 }
+
+/// Two live managers of one identity: terms decide which commands, where they differ.
+pub(crate) fn duplicate_manager(seen: &Evidence, name: &str) -> Option<Finding> {
+    let lives = seen.lives(name);
+    let same = duplicate(name, &lives).map(|finding| Finding { advice: DUPLICATE_MANAGERS.to_owned(), ..finding })?;
+    Some(fenced(seen, name, &lives).unwrap_or(same))
+}
+
+fn fenced(seen: &Evidence, name: &str, lives: &[Life]) -> Option<Finding> {
+    let (first, second) = overlapping(lives)?;
+    let [one, other] = [first, second].map(|life| seen.term(life));
+    let (one, other) = (one?, other?);
+    let (new, newer, old, older) = if one.is_newer_than(other) {
+        (first, one, second, other)
+    } else if other.is_newer_than(one) {
+        (second, other, first, one)
+    } else {
+        return None;
+    };
+    let found = format!(
+        "two live managers are {name}: vehicles obey the one at {} (term {newer}), and refuse the one at {} (term {older}) once \
+         they have met it",
+        new.at, old.at
+    );
+    Some(Finding::error(Id::Fenced, found, FENCED_ADVICE).about(name))
+}
+
+/// Taking over moves vehicles from a manager that may be the one that is meant: the advice does not begin there.
+const FENCED_ADVICE: &str = "find out which manager of this name and id is to command. If it is the one with the newer term, stop \
+                             the other one and leave it stopped. If not, stop the one with the newer term first, and see that its \
+                             process has ended, also where it hangs or is cut off; then start the other one again: it claims a \
+                             newer term by itself";
 
 const DUPLICATE_MANAGERS: &str =
     "stop one of the two, or give each a name and id of its own: as it is, each has some of the nodes";
@@ -153,6 +184,7 @@ pub(crate) fn refusal(manager: &str, refused: &RefusedInfo) -> Option<Finding> {
         "Fleet" => Id::OtherFleet,
         "Version" => Id::OtherVersion,
         "NoKey" => Id::NoPairKey,
+        "Fenced" => Id::Fenced,
         // Each end has dialled the other: one link is refused, and the other one is in use.
         "AlreadyConnected" => return None,
         _ => Id::Refused,
@@ -163,6 +195,7 @@ pub(crate) fn refusal(manager: &str, refused: &RefusedInfo) -> Option<Finding> {
     let advice = match id {
         Id::Duplicate => DUPLICATE_ADVICE.to_owned(),
         Id::NoPairKey => NO_PAIR_KEY_ADVICE.to_owned(),
+        Id::Fenced => FENCED_ADVICE.to_owned(),
         _ => refused.text.clone(),
     };
     Some(Finding::error(id, found, advice).about(who))
@@ -170,7 +203,11 @@ pub(crate) fn refusal(manager: &str, refused: &RefusedInfo) -> Option<Finding> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::evidence::samples::life;
+    use std::time::Duration;
+
+    use cara_std::{Epoch, Term};
+
+    use super::super::evidence::samples::{answering, evidence, life};
     use super::*;
 
     #[test]
@@ -187,6 +224,32 @@ mod tests {
     }
 
     #[test]
+    fn of_two_live_managers_the_newer_term_commands() {
+        let said = |epoch, term: u32| Heard {
+            epoch: Some(Epoch(epoch)),
+            term: Some(Term(term)),
+            last: Duration::from_secs(3),
+            ..answering("boss", 1)
+        };
+        let found = |one, other| {
+            let seen = Evidence { heard: vec![said(1, one), said(2, other)], ..evidence() };
+            let mut found = duplicate_managers(&seen);
+            assert_eq!(found.len(), 1);
+            found.remove(0)
+        };
+        for finding in [found(4, u32::MAX), found(u32::MAX, 4)] {
+            let told = "(term 4), and refuse the one at 10.0.0.9:5000 (term 4294967295)";
+            assert!(finding.id == Id::Fenced && finding.found.contains(told), "{finding:?}");
+            assert_eq!(finding.about.as_deref(), Some("boss/1"));
+        }
+        let equal = found(4, 4);
+        assert_eq!((equal.id, equal.advice.as_str()), (Id::Duplicate, DUPLICATE_MANAGERS));
+        let mut untold = Evidence { heard: vec![said(1, 4), said(2, 5)], ..evidence() };
+        untold.heard[0].term = None;
+        assert_eq!(duplicate_managers(&untold)[0].id, Id::Duplicate);
+    }
+
+    #[test]
     fn a_refusal_of_the_second_link_of_a_pair_is_none() {
         let refused = |reason: &str| RefusedInfo {
             address: "10.0.0.2:5".into(),
@@ -198,6 +261,9 @@ mod tests {
         assert_eq!(refusal("m/1", &refused("AlreadyConnected")), None);
         assert_eq!(refusal("m/1", &refused("Role")).unwrap().id, Id::Refused);
         assert_eq!(refusal("m/1", &refused("Full")).unwrap().id, Id::Full);
+        let fenced = refusal("m/1", &refused("Fenced")).unwrap();
+        assert!(fenced.id == Id::Fenced && fenced.about.as_deref() == Some("a/1"), "{fenced:?}");
+        assert!(fenced.advice.contains("has ended") && !fenced.advice.contains("take-over"), "{}", fenced.advice);
         let keyless = refusal("m/1", &refused("NoKey")).unwrap();
         assert!(keyless.advice.contains("do nothing") && !keyless.advice.contains("derive"), "{}", keyless.advice);
     }

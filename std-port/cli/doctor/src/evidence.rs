@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use cara_std::control::RunningUnit;
 use cara_std::survey::{Foreign, Heard, Ports, Reach, Standing};
-use cara_std::{Fleet, Identity, Interfaces, Manager, Mode, Role};
+use cara_std::{Fleet, Identity, Interfaces, Manager, Mode, Role, Term};
 
 use super::dial::Dial;
 use super::running::Running;
@@ -128,7 +128,7 @@ impl Evidence {
     /// M_units of our fleet that were heard, each once, as it was heard last.
     pub(crate) fn m_units(&self) -> Vec<(&Heard, &Identity)> {
         let mut found: Vec<(&Heard, &Identity)> = Vec::new();
-        for (heard, identity) in self.ours().filter(|(_, identity)| identity.role() == Role::MUnit) {
+        for (heard, identity) in self.m_units_heard() {
             match found.iter_mut().find(|(_, known)| *known == identity) {
                 Some(known) if known.0.last < heard.last => *known = (heard, identity),
                 Some(_) => {}
@@ -136,6 +136,10 @@ impl Evidence {
             }
         }
         found
+    }
+
+    fn m_units_heard(&self) -> impl Iterator<Item = (&Heard, &Identity)> {
+        self.ours().filter(|(_, identity)| identity.role() == Role::MUnit)
     }
 
     /// Names of the m_units of our fleet that run, heard or on this host.
@@ -159,6 +163,13 @@ impl Evidence {
     /// What was heard of a manager, in our fleet.
     pub(crate) fn manager(&self, wanted: &Manager) -> Option<&Heard> {
         self.m_units().into_iter().find(|(_, identity)| wanted.is(identity)).map(|(heard, _)| heard)
+    }
+
+    /// The term of one life of a manager of our fleet, as it said last.
+    pub(crate) fn term(&self, life: &Life) -> Option<Term> {
+        let of_it = |heard: &&Heard| heard.epoch.is_some_and(|epoch| epoch.0 == life.epoch);
+        let said = self.m_units_heard().filter(|(_, identity)| identity.to_string() == life.node);
+        said.map(|(heard, _)| heard).filter(of_it).max_by_key(|heard| heard.last)?.term
     }
 
     /// The lives of a node of our fleet, heard or connected, the earliest first.

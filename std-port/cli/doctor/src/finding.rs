@@ -58,6 +58,8 @@ pub(crate) enum Id {
     NoPairKey,
     /// Two live nodes with one identity.
     Duplicate,
+    /// A manager with a newer term commands in the place of one of its identity.
+    Fenced,
     /// A node that starts again and again.
     Restarting,
     /// The manager takes no more nodes.
@@ -97,7 +99,7 @@ pub(crate) enum Id {
 impl Id {
     /// All of them, in the order of the documentation.
     #[cfg(test)]
-    pub(crate) const ALL: [Self; 37] = [
+    pub(crate) const ALL: [Self; 38] = [
         Self::PortInUse,
         Self::NoInterface,
         Self::InterfaceDown,
@@ -118,6 +120,7 @@ impl Id {
         Self::KeyGenerations,
         Self::NoPairKey,
         Self::Duplicate,
+        Self::Fenced,
         Self::Restarting,
         Self::Full,
         Self::WrongManager,
@@ -160,6 +163,7 @@ impl Id {
             Self::KeyGenerations => "key-generations",
             Self::NoPairKey => "no-pair-key",
             Self::Duplicate => "duplicate",
+            Self::Fenced => "fenced",
             Self::Restarting => "restarting",
             Self::Full => "full",
             Self::WrongManager => "wrong-manager",

@@ -7,8 +7,8 @@ use cara_std::survey::Heard;
 use cara_std::{Identity, Manager, Role};
 
 use super::causes::{
-    deaf, dial_of, duplicate, duplicate_managers, full, missing_manager, one_way, other_fleet, other_version, refusal,
-    restarting, tcp_blocked, text_of,
+    deaf, dial_of, duplicate, duplicate_manager, duplicate_managers, full, missing_manager, one_way, other_fleet,
+    other_version, refusal, restarting, tcp_blocked, text_of,
 };
 use super::connected;
 use super::evidence::Evidence;
@@ -249,7 +249,7 @@ fn waiting_for_another(seen: &Evidence) -> Option<Finding> {
 fn heard_m_unit(seen: &Evidence, heard: &Heard, identity: &Identity) -> Vec<Finding> {
     let name = identity.to_string();
     let lives = seen.lives(&name);
-    let mut found: Vec<Finding> = duplicate(&name, &lives).into_iter().chain(restarting(&name, &lives)).collect();
+    let mut found: Vec<Finding> = duplicate_manager(seen, &name).into_iter().chain(restarting(&name, &lives)).collect();
     let dial = dial_of(seen, heard);
     found.extend(dial.and_then(|dial| tcp_blocked(&name, dial)));
     let answers = seen.ours().any(|(heard, other)| other == identity && heard.to_us > 0);
