@@ -175,8 +175,12 @@ impl<P: Port> Session<P> {
     ) -> Option<Event> {
         match (incoming, self.phase) {
             // In clear anyone on the path can end a link, so it counts as no verdict of the peer, and the search goes on.
-            (Incoming::Refuse(_) | Incoming::Close(_), _) if !self.link.cipher().is_sealing() => {
-                self.ended_in_clear(incoming);
+            (Incoming::Refuse(_), _) if !self.link.cipher().is_sealing() => {
+                self.ended_in_clear(None);
+                None
+            }
+            (Incoming::Close(code), _) if !self.link.cipher().is_sealing() => {
+                self.ended_in_clear(Some(close_reason(code)));
                 None
             }
             (Incoming::Refuse(code), _) => {

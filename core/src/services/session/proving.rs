@@ -3,14 +3,14 @@
 //! Until the peer's first sealed frame has opened, what it says costs a bounded time and the link's own bytes, and reaches
 //! nobody: no limit, no clock and no decision of the node depends on it.
 
-use super::{Event, Phase, Remote, Session, close_reason};
+use super::{Event, Phase, Remote, Session};
 use crate::config::{MINIMUM_CHUNK_BYTES, Mode, VERSIONS};
 use crate::distribution::hello::{Hello, HelloError};
 use crate::error::{CloseReason, Refusal};
-use crate::host::connections::{Incoming, LinkCounter, Liveness, Place};
+use crate::host::connections::{LinkCounter, Liveness, Place};
 use crate::host::endpoint::Endpoint as _;
 use crate::host::frame::Frame;
-use crate::host::secure::{PROOF_BYTES, Secure};
+use crate::host::secure::Secure;
 use crate::services::{Context, Port};
 use crate::time::{Duration, Instant};
 
@@ -24,7 +24,7 @@ impl<P: Port> Session<P> {
         match self.link.cipher().prove(!self.dialed, credentials) {
             Ok(message) => {
                 self.phase = Phase::Proving { until };
-                self.send_proof(cx, message);
+                self.send_proof(cx, message.as_ref().map(|message| &message[..]));
             }
             Err(_) => self.fail(cx),
         }
@@ -73,7 +73,7 @@ impl<P: Port> Session<P> {
     /// decided to take this unit.
     pub(super) fn proof_arrived(&mut self, cx: &mut Context<'_, P>, place: Place, lent: &[u8]) -> Option<Event> {
         match self.link.answer(place, lent) {
-            Ok(answer) => self.send_proof(cx, answer),
+            Ok(answer) => self.send_proof(cx, answer.as_ref().map(|answer| &answer[..])),
             Err(_) => self.fail(cx),
         }
         if self.dialed && matches!(self.phase, Phase::Proving { .. }) {
@@ -110,10 +110,9 @@ impl<P: Port> Session<P> {
 
     /// What a peer that has proven nothing says about the end of the link is no more than its end. That it has no use for this
     /// end's proof is counted: most often one of the two has another key.
-    pub(super) fn ended_in_clear(&mut self, farewell: Incoming) {
+    pub(super) fn ended_in_clear(&mut self, reason: Option<CloseReason>) {
         self.link.counters.add(LinkCounter::FarewellsInClear, 1);
-        let unfit = matches!(farewell, Incoming::Close(code) if close_reason(code) == CloseReason::BadProof);
-        if unfit && matches!(self.phase, Phase::Proving { .. }) {
+        if reason == Some(CloseReason::BadProof) && matches!(self.phase, Phase::Proving { .. }) {
             self.link.counters.add(LinkCounter::ProofsFailed, 1);
         }
         self.end(CloseReason::Unproven);
@@ -135,9 +134,9 @@ impl<P: Port> Session<P> {
         self.link.set_peer_limits(chunk_size);
     }
 
-    fn send_proof(&mut self, cx: &mut Context<'_, P>, message: Option<[u8; PROOF_BYTES]>) {
+    fn send_proof(&mut self, cx: &mut Context<'_, P>, message: Option<&[u8]>) {
         let Some(message) = message else { return };
-        if self.link.send_clear(&Frame::Proof(&message)) {
+        if self.link.send_clear(&Frame::Proof(message)) {
             self.flush(cx);
         } else {
             self.close(cx, CloseReason::Protocol);
