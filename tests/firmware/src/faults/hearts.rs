@@ -108,9 +108,14 @@ impl EmulatedBoard {
 
 /// A loop that holds another call of the board until it is told to end, and whether the board holds it still.
 fn goes_on(manager: &Manager, agv: &Peer, is_held: &SyncSender<()>, ends: &AtomicBool) -> Result<bool> {
-    let mut heart = manager.system.heart(PERIOD);
-    heart.beat();
-    let held = agv.hold(CREEP, &mut arguments(0, 0)?, &RequestOptions::renewing(heart.renew())).context(CREEP)?;
+    let (mut heart, deadline) = (manager.system.heart(PERIOD), Instant::now() + LONG);
+    let held = loop {
+        heart.beat();
+        match agv.hold(CREEP, &mut arguments(0, 0)?, &RequestOptions::renewing(heart.renew())) {
+            Err(Error::TimedOut | Error::Expired | Error::Busy) if Instant::now() < deadline => {}
+            held => break held.context(CREEP)?,
+        }
+    };
     is_held.send(())?;
     while !ends.load(Ordering::Acquire) {
         comes_round(&mut heart, ROUND);
