@@ -82,8 +82,8 @@ impl Ended {
     /// A manager with a newer term has taken over from a node.
     pub fn fenced(term: Term) -> anyhow::Error {
         let text = format!(
-            "another m_unit of this name and ID has taken over with term {term}: stop one of the two; this one takes over \
-             again with `--take-over`"
+            "another m_unit of this name and ID has taken over with term {term}: find out which of the two is to \
+             command, and stop the other one before this one starts again"
         );
         Self { exit: Exit::Fenced, text, name: "Fenced".into() }.into()
     }
