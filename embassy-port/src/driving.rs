@@ -13,6 +13,7 @@ use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Refusal};
 use cara_core::host::mailman::LinkId;
 use cara_core::services::Context;
+use cara_core::services::lease::Lease;
 use cara_core::services::session::{Call, Event};
 use cara_core::time::{Duration, Instant};
 use core::net::SocketAddrV4;
@@ -50,15 +51,25 @@ pub(crate) enum Begun {
 }
 
 impl<T> Machine<T> {
-    /// Lets the session of a link do what is due: `None` when nothing is.
+    /// Whether something has been stopped, or seen to be over, and its safe hook is to run: also by an interrupt, or on another
+    /// link than the one that is to end its order.
+    pub(crate) fn awaits_hook(&self) -> bool {
+        self.leases().any(Lease::awaits_hook)
+    }
+
+    pub(crate) fn leases(&self) -> impl Iterator<Item = &Lease> {
+        self.functions.iter().filter_map(|function| function.handler.lease)
+    }
+
+    /// Lets the session of a link do what is due, or look whether it is: `None` when nothing is.
     #[inline(never)]
-    pub(crate) fn poll_link(&mut self, index: u16) -> Option<Event> {
+    pub(crate) fn poll_link(&mut self, index: u16, look: bool) -> Option<Event> {
         let Self { links, mail, pool, functions, reply, access, hub, proof, .. } = self;
         let link = links.get_mut(usize::from(index))?;
         let session = link.session.as_mut()?;
         let access = access.0;
         let mut cx = Context { now: now(), mailman: mail, buffers: pool, functions, access, hub, keys: proof };
-        if cx.now < session.deadline() {
+        if cx.now < session.deadline() && !look {
             return None;
         }
         let event = session.poll(&mut cx)?;

@@ -9,7 +9,7 @@ use core::task::{Context, Poll};
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::Error;
 use cara_core::services::session::Call as CoreCall;
-use cara_core::time::Instant;
+use cara_core::time::{Duration, Instant};
 
 use crate::driving::{Begun, Job};
 use crate::handle::Handle;
@@ -21,6 +21,8 @@ use crate::time::{now, timer};
 
 /// Steps in a row before other tasks get their turn.
 const BUDGET: usize = 64;
+/// While something moves, it is looked at least this often whether an interrupt has stopped it.
+const LOOK: Duration = Duration::from_millis(20);
 /// Drives a unit; the one that [`new`](crate::new) returns. It needs a task of its own.
 pub struct Runner<T: 'static> {
     pub(crate) shared: &'static Shared<T>,
@@ -85,13 +87,14 @@ impl<T> Runner<T> {
         let shared = self.shared;
         let machine = &mut *shared.machine.borrow_mut();
         // Anything may be due behind whatever is done, but nothing before the time to which the last rest has looked.
-        let is_due = now() >= core::mem::replace(&mut self.rested_until, Instant::START);
+        let awaits_hook = machine.awaits_hook();
+        let is_due = awaits_hook | (now() >= core::mem::replace(&mut self.rested_until, Instant::START));
         if is_due || machine.address.is_none() {
             machine.look_at_network();
         }
         if is_due {
             for index in machine.indices() {
-                if let Some(event) = machine.poll_link(index) {
+                if let Some(event) = machine.poll_link(index, awaits_hook) {
                     return machine.noted(index, event).map_or(Step::Again, Step::Job);
                 }
             }
@@ -140,7 +143,7 @@ impl<T> Runner<T> {
         for (link, line) in machine.links.iter().zip(machine.mail.lines.iter()) {
             line.wake_on_news(context, link.session.as_ref().is_some_and(LinkSession::wants_to_write));
         }
-        self.rested_until = machine.deadline();
+        self.rested_until = machine.next_look();
         pin!(timer(self.rested_until)).poll(context).is_pending()
     }
 
@@ -241,6 +244,13 @@ impl<T> Runner<T> {
 }
 
 impl<T> Machine<T> {
+    /// When something is due, or may be: an interrupt that stops what moves wakes no task.
+    fn next_look(&self) -> Instant {
+        let (now, deadline) = (now(), self.deadline());
+        let moves = deadline > now + LOOK && self.leases().any(|lease| lease.left(now).is_some());
+        if moves { now + LOOK } else { deadline }
+    }
+
     /// When something is due.
     fn deadline(&self) -> Instant {
         let sessions = self.links.iter().filter_map(|link| link.session.as_ref());

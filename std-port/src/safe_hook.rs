@@ -12,7 +12,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 
-use cara_core::error::Error;
+use cara_core::error::{Error, ServiceError};
 use cara_core::services::lease::{ActuatorState, Claim, Ended, Latch, Lease, LeaseEnd, Order};
 use cara_core::time::{Duration, Instant};
 
@@ -77,7 +77,11 @@ impl SafeHook {
 
     /// Begins an order: the thread looks when its lease ends.
     pub(crate) fn begin(&self, now: Instant, end: Instant, claim: &Claim) -> Result<Order, Error> {
-        let _writing = lock(&self.shared.state);
+        // The order before this one is safe first: until then what reads the lease would act for this one by the wish of that.
+        let (_writing, is_safe) = self.shared.await_hook(lock(&self.shared.state));
+        if !is_safe {
+            return Err(ServiceError::NotReady.into());
+        }
         let order = self.shared.lease().claim(now, end, claim)?;
         self.shared.changed.notify_all();
         Ok(order)
@@ -92,8 +96,9 @@ impl SafeHook {
 
     /// Lets no order begin, and starts the hook for the one that there is: its unit reports that end later.
     pub(crate) fn inhibit(&self, now: Instant, latch: Latch) {
-        let mut state = lock(&self.shared.state);
+        // Before the lock, which a handler may hold in `commit`: it may come between any two other writes.
         self.shared.lease().inhibit(now, latch);
+        let mut state = lock(&self.shared.state);
         if self.shared.lease().left(now).is_some() && !state.started_early && !state.due {
             (state.due, state.started_early) = (true, true);
         }
@@ -149,16 +154,7 @@ impl SafeHook {
     /// Waits until the hook has run as often as it was to: the next order of the service comes after it. `false` when
     /// that takes long.
     pub(crate) fn has_run(&self) -> bool {
-        let mut state = lock(&self.shared.state);
-        let until = self.shared.parts.clock.now() + LATE;
-        while state.due || state.running_since.is_some() {
-            let now = self.shared.parts.clock.now();
-            if self.shared.count_if_late(&mut state, now) || now >= until {
-                return false;
-            }
-            state = self.shared.wait(state, Some(LATE));
-        }
-        true
+        self.shared.await_hook(lock(&self.shared.state)).1
     }
 
     /// Counts a hook that is stuck.
@@ -233,6 +229,19 @@ impl Shared {
         }
     }
 
+    /// Waits until the hook has run, if it is to: `false` when that takes long.
+    fn await_hook<'s>(&self, mut state: MutexGuard<'s, State>) -> (MutexGuard<'s, State>, bool) {
+        let until = self.parts.clock.now() + LATE;
+        while state.due || state.running_since.is_some() {
+            let now = self.parts.clock.now();
+            if self.count_if_late(&mut state, now) || now >= until {
+                return (state, false);
+            }
+            state = self.wait(state, Some(LATE));
+        }
+        (state, true)
+    }
+
     fn wait<'s>(&self, state: MutexGuard<'s, State>, at_most: Option<Duration>) -> MutexGuard<'s, State> {
         match at_most {
             None => self.changed.wait(state).unwrap_or_else(PoisonError::into_inner),
@@ -266,7 +275,8 @@ mod tests {
     use crate::testing::until;
 
     static AHEAD: AtomicU64 = AtomicU64::new(0);
-    const CLAIM: Claim = Claim { holder: 1, replaces: None, takes_over: true, operator: false, link: 0, call: 0 };
+    const CLAIM: Claim =
+        Claim { holder: 1, replaces: None, takes_over: true, operator: false, link: 0, call: 0, made: Instant::START };
 
     fn begin(safe: &SafeHook, clock: Clock, length: Duration) -> Order {
         safe.begin(clock.now(), clock.now() + length, &CLAIM).expect("the order before has ended")

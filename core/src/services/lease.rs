@@ -42,6 +42,8 @@ pub struct Claim {
     pub link: u32,
     /// The caller's id of the call.
     pub call: u32,
+    /// When it was made: an order that is older than a stop does not begin, whatever was reset since.
+    pub made: Instant,
 }
 
 /// Longest ramp, in milliseconds.
@@ -78,8 +80,11 @@ pub struct Lease {
     call: AtomicU32,
     /// How it ended, as the number of a [`LeaseEnd`].
     how: AtomicU32,
-    /// When it was inhibited, as `end` has its time; 0 when it is not.
+    /// When it was inhibited last, as `end` has its time; 0 when it never was. Written by [`inhibit`](Self::inhibit) alone, which
+    /// may interrupt a reset.
     inhibited: AtomicU32,
+    /// What `inhibited` was when it was reset last. Where the two differ, no order begins.
+    cleared: AtomicU32,
     /// The ID number of the unit that inhibited it; 0 for this one.
     inhibitor: AtomicU32,
     /// Why.
@@ -126,6 +131,7 @@ impl Lease {
             call: AtomicU32::new(0),
             how: AtomicU32::new(0),
             inhibited: AtomicU32::new(0),
+            cleared: AtomicU32::new(0),
             inhibitor: AtomicU32::new(0),
             reason: AtomicU32::new(0),
             ramp: AtomicU32::new(0),
@@ -220,10 +226,14 @@ impl Lease {
 
     /// [`begin`](Self::begin) for this caller: [`Error::Held`] where another one holds it and is not taken over, be it the
     /// operator or the program of the same unit,
-    /// [`Error::Busy`] where an earlier order is dead and its safe hook comes first, [`Error::Inhibited`] where it was stopped.
+    /// [`Error::Busy`] where an earlier order is dead and its safe hook comes first, [`Error::Inhibited`] where it was stopped,
+    /// [`Error::Expired`] where it was stopped after the call was made.
     pub fn claim(&self, now: Instant, end: Instant, claim: &Claim) -> Result<Order, Error> {
         if let Some(latch) = self.latch() {
             return Err(latch.into());
+        }
+        if !self.is_behind_stop(now, claim.made) {
+            return Err(Error::Expired);
         }
         let operator = self.operator.load(Ordering::Acquire);
         let is_own = operator == claim.operator && claim.replaces.is_some_and(|order| self.is_held_by(order));
@@ -246,7 +256,7 @@ impl Lease {
             return None;
         }
         self.stopped.store(0, Ordering::Release);
-        let before = self.order.load(Ordering::Acquire);
+        let (before, end_before) = (self.order.load(Ordering::Acquire), self.end.load(Ordering::Acquire));
         let order = NonZeroU32::new(before.wrapping_add(1)).unwrap_or(NonZeroU32::MIN);
         self.order.store(order.get(), Ordering::Release);
         if !runs {
@@ -256,9 +266,7 @@ impl Lease {
         // The earlier order may have been seen dead in between, or all of them inhibited.
         if self.seen_dead.load(Ordering::Acquire) || self.is_inhibited() {
             self.order.store(before, Ordering::Release);
-            if !runs {
-                self.end.store(0, Ordering::Release);
-            }
+            self.end.store(end_before, Ordering::Release);
             return None;
         }
         Some(Order(order))
@@ -299,21 +307,26 @@ impl Lease {
             self.reason.store(latch.reason.into(), Ordering::Release);
         }
         self.stop_at(now, self.end.load(Ordering::Acquire));
-        self.inhibited.store(odd_millis(now) as u32, Ordering::Release);
+        let at = odd_millis(now) as u32;
+        let at = if at == self.cleared.load(Ordering::Acquire) { at.wrapping_add(2) } else { at };
+        self.inhibited.store(at, Ordering::Release);
         self.seen_dead.store(true, Ordering::Release);
     }
 
     /// Lets orders begin again, if it was inhibited before `made`, at which the reset was asked for: an earlier wish does not
     /// undo a later stop, nor one made within 3 ms of it.
     pub fn reset(&self, now: Instant, made: Instant) {
+        // A stop that interrupts this is not undone: it writes another time.
         let inhibited = self.inhibited.load(Ordering::Acquire);
-        // As long as the word's 49 days, after which a reset may have to be asked for twice; the age of a wish is seconds.
-        let since = ((now.as_micros() / 1_000) as u32).wrapping_sub(inhibited);
-        let age = now.since(made).as_millis();
-        // The moment is rounded down by up to 2 ms; at the clock's beginning it is rounded up.
-        if inhibited != 0 && since != u32::MAX && age.saturating_add(2) < u64::from(since) {
-            self.inhibited.store(0, Ordering::Release);
+        if is_behind(now, made, inhibited) {
+            self.cleared.store(inhibited, Ordering::Release);
         }
+    }
+
+    /// Whether what was `made` then was made after the last stop, reset or not.
+    fn is_behind_stop(&self, now: Instant, made: Instant) -> bool {
+        let inhibited = self.inhibited.load(Ordering::Acquire);
+        inhibited == 0 || is_behind(now, made, inhibited)
     }
 
     /// What inhibits it.
@@ -326,7 +339,12 @@ impl Lease {
 
     /// Whether no order may begin.
     pub fn is_inhibited(&self) -> bool {
-        self.inhibited.load(Ordering::Acquire) != 0
+        self.inhibited.load(Ordering::Acquire) != self.cleared.load(Ordering::Acquire)
+    }
+
+    /// Whether an order is dead and has not been ended: its safe hook comes before anything else.
+    pub fn awaits_hook(&self) -> bool {
+        self.seen_dead.load(Ordering::Acquire) && self.has_order()
     }
 
     /// Whether an order is dead and has not been ended: it was cut or inhibited, or a reader saw its time pass.
@@ -374,8 +392,8 @@ impl Lease {
     /// Differs when the [state](Self::state) does; 0 for one that nothing has happened to.
     pub(crate) fn changes(&self) -> u32 {
         let order = self.order.load(Ordering::Acquire);
-        let inhibited = self.inhibited.load(Ordering::Acquire);
-        order.wrapping_mul(2).wrapping_add(self.has_order().into()) ^ inhibited.reverse_bits()
+        let latched = self.inhibited.load(Ordering::Acquire) ^ self.cleared.load(Ordering::Acquire);
+        order.wrapping_mul(2).wrapping_add(self.has_order().into()) ^ latched.reverse_bits()
     }
 
     fn has_order(&self) -> bool {
@@ -396,6 +414,15 @@ const fn is_before(time: Instant, end: u32) -> bool {
     let time = (time.as_micros() / 1_000) as u32;
     // A lease is far shorter than half of the range, so the sign of the difference tells the order.
     end != 0 && (end.wrapping_sub(time) as i32) > 0
+}
+
+/// Whether what was `made` then is later than a stop, of which the time is one of [`odd_millis`].
+fn is_behind(now: Instant, made: Instant, stop: u32) -> bool {
+    // As long as the word's 49 days, after which a wish may have to be made twice; its age is seconds.
+    let since = ((now.as_micros() / 1_000) as u32).wrapping_sub(stop);
+    let age = now.since(made).as_millis();
+    // The moment is rounded down by up to 2 ms; at the clock's beginning it is rounded up.
+    stop != 0 && since != u32::MAX && age.saturating_add(2) < u64::from(since)
 }
 
 /// A time in milliseconds, rounded down to an odd number, which is never the 0 of "none".

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use super::lines::{Line, Lines};
 use super::place::{self, PlaceError, directory, own_uid, peer_uid};
 use super::protocol::{Answer, BEAT, CONTROL_VERSION, Failure, Question};
-use super::server::FULL;
+use super::server::{FULL, full};
 use crate::sys::epoll::wait_readable;
 
 /// How long a unit may take to introduce itself.
@@ -219,6 +219,17 @@ impl fmt::Debug for Client {
 impl Client {
     /// Connects to the socket at a path.
     pub fn connect(path: &Path) -> Result<Self, ControlError> {
+        match Self::connect_to_stop(path)? {
+            Self { unit: RunningUnit { unit, state: UnitState::Full(text), .. }, .. } => {
+                Err(ControlError::Full { unit, text })
+            }
+            client => Ok(client),
+        }
+    }
+
+    /// As [`connect`](Self::connect), also where all connections are in use: a few are kept for [`Question::Stop`], and the
+    /// [state](RunningUnit::state) of such a one is [`UnitState::Full`].
+    pub fn connect_to_stop(path: &Path) -> Result<Self, ControlError> {
         let stream = dial(path)?;
         let owner = peer_uid(&stream)?;
         if ![owner, own_uid()].contains(&0) && owner != own_uid() {
@@ -227,9 +238,9 @@ impl Client {
         }
         stream.set_read_timeout(Some(HELLO_TIMEOUT))?;
         let mut lines = Lines::new(stream);
-        let (unit, fleet) = hello(&mut lines).map_err(|error| refused(path, error))?;
+        let (unit, fleet, state) = hello(&mut lines).map_err(|error| refused(path, error))?;
         lines.source().set_read_timeout(None)?;
-        let unit = RunningUnit { unit, fleet, path: path.to_owned(), state: UnitState::Answers };
+        let unit = RunningUnit { unit, fleet, path: path.to_owned(), state };
         Ok(Self { lines, unit, open: false, beaten: None })
     }
 
@@ -346,10 +357,12 @@ fn refused(path: &Path, error: ControlError) -> ControlError {
     }
 }
 
-/// The unit's `NAME/ID` and fleet.
-fn hello(lines: &mut Lines<UnixStream>) -> Result<(String, u32), ControlError> {
+/// The unit's `NAME/ID` and fleet, and whether it can be asked.
+fn hello(lines: &mut Lines<UnixStream>) -> Result<(String, u32, UnitState), ControlError> {
     match read(lines)? {
-        Answer::Hello { control_version: CONTROL_VERSION, unit, fleet } => Ok((unit, fleet)),
+        Answer::Hello { control_version: CONTROL_VERSION, unit, fleet, full: is_full } => {
+            Ok((unit, fleet, if is_full { UnitState::Full(full().text) } else { UnitState::Answers }))
+        }
         Answer::Hello { control_version: theirs, .. } => Err(ControlError::Version { theirs }),
         Answer::Failed(failure) => Err(ControlError::Failed(failure)),
         _ => Err(io::Error::new(io::ErrorKind::InvalidData, "it did not introduce itself").into()),

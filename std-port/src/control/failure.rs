@@ -30,7 +30,7 @@ impl Failure {
                 ("UnknownFunction", format!("it does not offer '{function}' to this unit, and was not called"))
             }
             None => {
-                let text = "it was not connected, and was not called; `cara retire` takes it off the roster";
+                let text = "it was not connected, and was not called: ask again when it is back";
                 ("NotConnected", text.to_owned())
             }
         };

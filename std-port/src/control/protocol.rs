@@ -118,6 +118,11 @@ impl Question {
     pub(super) fn needs_beats(&self) -> bool {
         matches!(self, Self::Hold(_) | Self::Bench { .. })
     }
+
+    /// Whether it is answered also where all connections are in use.
+    pub(super) fn is_of_a_stop(&self) -> bool {
+        matches!(self, Self::Stop { .. } | Self::Unit | Self::Nodes { .. })
+    }
 }
 
 /// A call as an operator makes it.
@@ -210,6 +215,10 @@ pub enum Answer {
         unit: String,
         /// Its fleet.
         fleet: u32,
+        /// All connections are in use: on this one nothing but [`Question::Stop`] is answered, and
+        /// what helps to ask it: [`Question::Unit`] and [`Question::Nodes`].
+        #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+        full: bool,
     },
     /// This unit.
     Unit(UnitInfo),

@@ -26,8 +26,15 @@ use crate::sys::epoll::{Epoll, Events, Interest, Waker};
 
 /// Connections at a time.
 pub(super) const MOST_CONNECTIONS: usize = 8;
-/// The name of the failure that one more connection ends with.
+/// Connections beyond them, on which a unit can only be stopped.
+const RESERVED: usize = 4;
+/// The name of the failure that anything else ends with there.
 pub(super) const FULL: &str = "Full";
+
+/// Why no more is done for a client.
+pub(super) fn full() -> Failure {
+    Failure::resource(FULL, format!("{MOST_CONNECTIONS} connections are open already: close one"))
+}
 /// A client that takes nothing for so long is cut off.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(2);
 /// A client that asks nothing for this long is disconnected. One that waits for an answer, as of a watch or a hold, is
@@ -180,9 +187,9 @@ impl Shared {
             return;
         }
         connections.threads.retain(|thread| !thread.is_finished());
-        if connections.open.len() >= MOST_CONNECTIONS && !connections.make_room() {
-            let text = format!("{MOST_CONNECTIONS} connections are open already: close one");
-            return refuse(Failure::resource(FULL, text));
+        let is_full = connections.open.len() >= MOST_CONNECTIONS && !connections.make_room();
+        if is_full && connections.open.len() >= MOST_CONNECTIONS + RESERVED {
+            return refuse(full());
         }
         let Ok(kept) = stream.try_clone() else { return };
         let number = connections.next;
@@ -192,7 +199,7 @@ impl Shared {
         let thread = std::thread::Builder::new().name("cara-control".into());
         let thread = thread.spawn(move || {
             // The end of a connection is not logged: the client knows.
-            let _ = own.serve(stream, &idle, &system);
+            let _ = own.serve(stream, &idle, is_full, &system);
             lock(&own.connections).open.remove(&number);
         });
         if let Ok(thread) = thread {
@@ -206,6 +213,7 @@ impl Shared {
         &self,
         stream: UnixStream,
         idle: &Mutex<Option<Instant>>,
+        full_when_opened: bool,
         system: &CommunicationSystem<T>,
     ) -> io::Result<()> {
         stream.set_nonblocking(false)?;
@@ -223,6 +231,7 @@ impl Shared {
             control_version: CONTROL_VERSION,
             unit: unit.to_string(),
             fleet: system.fleet().0,
+            full: full_when_opened,
         })?;
         while !self.is_stopping()
             && let Some(line) = lines.next()?
@@ -233,6 +242,9 @@ impl Shared {
             }
             *lock(idle) = None;
             match question(line) {
+                Ok(question) if full_when_opened && !question.is_of_a_stop() => {
+                    let _ = writer.sink(&Answer::Failed(full()));
+                }
                 Ok(question) => {
                     let client = RefCell::new(Beats { stream: &stream, lines: &mut lines, last: Instant::now() });
                     let lives = |within| !self.is_stopping() && client.borrow_mut().lives(within);
@@ -351,7 +363,7 @@ mod tests {
         let (mut client, served) = UnixStream::pair().unwrap();
         client.write_all(b"{\"ask\":\"retire\",\"node\":\"agv/1\"}\n{\"ask\":\"nodes\"}\n").unwrap();
         client.shutdown(Shutdown::Write).unwrap();
-        let _ = shared.serve(served, &Mutex::default(), &system);
+        let _ = shared.serve(served, &Mutex::default(), false, &system);
         let line: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(&path).unwrap()).unwrap();
         assert_eq!(
             (&line["ask"], &line["node"], &line["pid"]),
@@ -371,7 +383,7 @@ mod tests {
                 client.set_read_timeout(Some(Duration::from_secs(20))).unwrap();
                 (&client).write_all(asks).unwrap();
                 let (shared, system) = (&shared, &system);
-                scope.spawn(move || drop(shared.serve(served, &Mutex::default(), system)));
+                scope.spawn(move || drop(shared.serve(served, &Mutex::default(), false, system)));
                 BufReader::new(client)
             };
             let next = |client: &mut BufReader<UnixStream>| {

@@ -188,6 +188,13 @@ fn the_ninth_client_is_told_why_it_is_not_taken() {
     let units = running_in(depot.directory.path()).unwrap();
     assert!(matches!(&units[..], [RunningUnit { state: UnitState::Full(_), .. }]), "{units:?}");
     assert!(matches!(Client::find_in(depot.directory.path(), None), Err(ControlError::Full { .. })));
+    let mut stops = Client::connect_to_stop(&depot.path()).unwrap();
+    assert!(
+        stops.ask(&Question::Stop { node: None }).unwrap().all(|answer| answer.is_ok()),
+        "there is nothing to be stopped"
+    );
+    let other: Vec<_> = stops.ask(&Question::Metrics).unwrap().collect();
+    assert!(matches!(&other[..], [Err(ControlError::Failed(failure))] if failure.error == "Full"), "{other:?}");
     clients.pop();
     until("there is room again", || Client::connect(&depot.path()).is_ok());
 }

@@ -113,9 +113,15 @@ impl<P: Port> Session<P> {
         let Some(head) = self.calls.call(ticket) else { return Ok(()) };
         // Before the answer leaves: one that says it was reset is true.
         let result = match result {
+            // Its caller has been told that it failed, and may not know that anything may move again.
+            Ok(_) if head.resets && head.deadline <= cx.now => Err(Error::Expired),
             Ok(results) if head.resets => self.reset_orders(cx, &head).map(|()| results),
             result => result,
         };
+        // A call that failed wants nothing any more, so what it started stops now: also where its answer has no room yet.
+        if result.is_err() {
+            self.cut_call(cx, head.id);
+        }
         if self.phase == Phase::Live {
             let sent = match result {
                 Ok(results) if head.wants_reply => self.send_results(cx, &head, results),
@@ -127,12 +133,11 @@ impl<P: Port> Session<P> {
                 return Err(error);
             }
         }
-        // A call that failed wants nothing any more, so what it started stops now and not at the end of its lease.
-        if result.is_err() {
-            self.cut_call(cx, head.id);
-        }
         if !cfg!(cara_planted = "leaked_slot") {
             self.calls.end(ticket);
+        }
+        if head.resets {
+            self.pump(cx);
         }
         Ok(())
     }

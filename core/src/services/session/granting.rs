@@ -51,6 +51,7 @@ impl<P: Port> Session<P> {
             operator: head.operator,
             link: self.hello().map_or(0, |hello| hello.nonce as u32),
             call: head.id,
+            made: head.sent_at,
         };
         // The service's word is changed before the table here: where it refuses, nothing of this session has changed.
         let order = match service.map_or(Ok(None), |service| service.begin_lease(cx.now, end, &claim)) {
@@ -114,9 +115,11 @@ impl<P: Port> Session<P> {
         }
     }
 
-    /// The application has finished what calls of the leased function started: no renewal keeps it alive, no hook runs.
+    /// The application has finished what calls of the leased function started: no renewal keeps it alive, no hook runs. What
+    /// has ended before was not finished, and its hook runs.
     pub fn end_lease(&mut self, cx: &mut Context<'_, P>, slot: Slot) {
-        let index = self.granted.iter().position(|granted| granted.slot == slot);
+        let is_live = |granted: &Granted| granted.end > cx.now && !is_dead(cx, granted);
+        let index = self.granted.iter().position(|granted| granted.slot == slot && is_live(granted));
         if let Some(granted) = index.and_then(|index| take_at(&mut self.granted, index)) {
             let service = service_of(cx, granted.slot, granted.generation);
             if let Some((service, order)) = service.zip(granted.order) {
@@ -134,12 +137,11 @@ impl<P: Port> Session<P> {
     }
 
     /// A function that stops was called: what it stops is dead before its handler runs, and calls that were made before it
-    /// begin no more.
+    /// begin no more, on any link.
     pub(super) fn stop_orders(&mut self, cx: &mut Context<'_, P>, header: &RequestHeader) {
         let latch = Latch { by: self.identity().map_or(0, Identity::id), reason: 0 };
-        for (slot, service) in self.moved_by(cx, header.slot, header.generation) {
+        for service in self.moved_by(cx, header.slot, header.generation) {
             service.inhibit(cx.now, latch);
-            self.publishing.release(slot, header.id);
         }
         if self.was_stopped(cx) {
             self.timers.lease = cx.now;
@@ -152,7 +154,7 @@ impl<P: Port> Session<P> {
     pub(super) fn reset_orders(&mut self, cx: &Context<'_, P>, head: &CallHead) -> Result<(), Error> {
         let mut outcome = Ok(());
         self.publishing.actuators_due = true;
-        for (_, service) in self.moved_by(cx, head.slot, head.generation) {
+        for service in self.moved_by(cx, head.slot, head.generation) {
             service.reset(cx.now, head.sent_at);
             let latch = service.lease().and_then(Lease::latch);
             outcome = outcome.and(latch.map_or(Ok(()), |latch| Err(latch.into())));
@@ -166,13 +168,13 @@ impl<P: Port> Session<P> {
         cx: &Context<'c, P>,
         slot: Slot,
         generation: Generation,
-    ) -> impl Iterator<Item = (Slot, &'c dyn Service)> + use<'c, P> {
+    ) -> impl Iterator<Item = &'c dyn Service> + use<'c, P> {
         let (functions, charge) = (cx.functions, service_of(cx, slot, generation));
         let all = charge.and_then(Service::lease).is_none();
         self.publishing.all_slots().filter_map(move |slot| {
             let function = functions.function(slot)?;
             let is_meant = all || share_a_lease(charge, Some(function.handler));
-            (is_meant && function.attributes.lease.is_some()).then_some((slot, function.handler))
+            (is_meant && function.attributes.lease.is_some()).then_some(function.handler)
         })
     }
 
@@ -226,6 +228,11 @@ impl<P: Port> Session<P> {
         let index = self.granted.iter().position(is_released);
         let granted = index.and_then(|index| take_at(&mut self.granted, index))?;
         if expire_granted(cx, &granted, LeaseEnd::Expired) { Some(Event::LeaseExpired(granted.slot)) } else { None }
+    }
+
+    /// Whether a function stops what is dead and not yet safe, whichever link moved it: its handler waits for the hook.
+    pub(super) fn awaits_hook(&self, cx: &Context<'_, P>, slot: Slot, generation: Generation) -> bool {
+        self.moved_by(cx, slot, generation).any(|service| service.lease().is_some_and(Lease::awaits_hook))
     }
 
     /// Whether what a call of the peer moves was stopped: by the vehicle itself, or through another link.

@@ -430,7 +430,8 @@ impl<P: Port> Session<P> {
         let length = self.link.view(block, lent).len();
         let result = self.check_request(cx, priority, header, seen, length, function).and_then(|(head, function)| {
             // The handler of a function that stops waits where a safe hook is to run first: `poll` comes before `next_call`.
-            let arguments = arguments.filter(|_| !(function.attributes.stop && self.timers.lease <= cx.now));
+            let waits = function.attributes.stop && self.awaits_hook(cx, header.slot, header.generation);
+            let arguments = arguments.filter(|_| !waits);
             let bytes = self.link.view(block, lent);
             match arguments.filter(|_| self.calls.is_idle(priority)) {
                 // The arguments are checked before the call begins: a lease must not start for a request that is refused.

@@ -49,7 +49,7 @@ pub(super) struct Publishing<S: Storage> {
     limits_due: bool,
     /// The peer may have been told another state of what is moved here.
     pub(super) actuators_due: bool,
-    /// What the peer was told, as the sum of [`Lease::changes`].
+    /// What the peer was told, as a sum of all [`Lease::changes`], each at places of its own.
     actuators_told: u32,
     pub(super) refusals: Refusals,
 }
@@ -254,7 +254,7 @@ impl<P: Port> Session<P> {
         let functions = cx.functions;
         let moves = |slot| functions.function(slot).filter(|function| function.attributes.lease.is_some());
         let leases = self.publishing.all_slots().filter_map(|slot| moves(slot)?.handler.lease());
-        let changes = leases.fold(0, |sum: u32, lease| sum.wrapping_add(lease.changes()));
+        let changes = leases.fold(0, |sum: u32, lease| sum.rotate_left(7).wrapping_add(lease.changes()));
         if changes == self.publishing.actuators_told {
             return true;
         }

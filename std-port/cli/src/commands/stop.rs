@@ -40,16 +40,21 @@ struct Of {
 }
 
 pub(crate) fn stop(Stop { of }: Stop, global: &Global) -> anyhow::Result<ExitCode> {
-    run(of, |node| Question::Stop { node }, global)
+    run(of, Operator::open_to_stop, |node| Question::Stop { node }, global)
 }
 
 pub(crate) fn reset(Reset { of }: Reset, global: &Global) -> anyhow::Result<ExitCode> {
-    run(of, |node| Question::Reset { node }, global)
+    run(of, Operator::open, |node| Question::Reset { node }, global)
 }
 
-fn run(of: Of, question: impl FnOnce(Option<String>) -> Question, global: &Global) -> anyhow::Result<ExitCode> {
+fn run(
+    of: Of,
+    open: fn(&Global, &Need<'_>) -> anyhow::Result<Operator>,
+    question: impl FnOnce(Option<String>) -> Question,
+    global: &Global,
+) -> anyhow::Result<ExitCode> {
     let need = of.node.as_deref().map_or(Need::Everybody, Need::Node);
-    let mut operator = Operator::open(global, &need)?;
+    let mut operator = open(global, &need)?;
     let node = match of.node {
         Some(node) => Some(nodes::known(&mut operator, &node)?.selector),
         None => None,

@@ -66,6 +66,16 @@ impl Operator {
         Self::open_if_any(global, need)?.ok_or_else(|| none_runs(ways))
     }
 
+    /// As [`open`](Self::open), for a question that is answered also where all connections of a unit are in use.
+    pub(crate) fn open_to_stop(global: &Global, need: &Need) -> anyhow::Result<Self> {
+        if global.act_as.is_none()
+            && let Some(client) = running::choose(global, Client::connect_to_stop)?
+        {
+            return Ok(Self { unit: Unit::Running(client), waited: None });
+        }
+        Self::open(global, need)
+    }
+
     /// The running unit that the options choose, for a verb that a manager for the time of a command has no use for.
     /// `why_not` says why.
     pub(crate) fn open_running(global: &Global, why_not: &str) -> anyhow::Result<Self> {
@@ -79,7 +89,7 @@ impl Operator {
     /// The unit that the options choose; `None` if they choose none and none runs.
     pub(crate) fn open_if_any(global: &Global, need: &Need) -> anyhow::Result<Option<Self>> {
         let Some(identity) = &global.act_as else {
-            let client = running::choose(global)?;
+            let client = running::choose(global, Client::connect)?;
             return Ok(client.map(|client| Self { unit: Unit::Running(client), waited: None }));
         };
         let system = own::start(identity, global)?;

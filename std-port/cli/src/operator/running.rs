@@ -4,17 +4,22 @@ use std::ops::ControlFlow;
 use std::path::Path;
 
 use cara_std::control::protocol::{Answer, Question};
-use cara_std::control::{Client, ControlError, Elsewhere, RunningUnit, directory, elsewhere, running, running_called};
+use cara_std::control::{
+    Client, ControlError, Elsewhere, RunningUnit, UnitState, directory, elsewhere, running, running_called,
+};
 
 use super::error_of;
 use cara_tools::exit::{Ended, Exit};
 use cara_tools::global::Global;
 use cara_tools::name_and_id::NameAndId;
 
+/// How a unit is connected to.
+pub(super) type Connect = fn(&Path) -> Result<Client, ControlError>;
+
 /// The unit that the options choose; `None` if they choose none and none runs.
-pub(super) fn choose(global: &Global) -> anyhow::Result<Option<Client>> {
+pub(super) fn choose(global: &Global, connect: Connect) -> anyhow::Result<Option<Client>> {
     if let Some(path) = &global.socket {
-        return Client::connect(path).map(Some).map_err(error);
+        return connect(path).map(Some).map_err(error);
     }
     let wanted = global.unit.as_ref().map(NameAndId::to_string);
     let all = match &wanted {
@@ -33,7 +38,11 @@ pub(super) fn choose(global: &Global) -> anyhow::Result<Option<Client>> {
             "" => format!("{wanted} does not run on this host{}", not_meant()),
             others => others.to_owned(),
         })),
-        ([only], _) => only.refusal().map_or_else(|| Client::connect(&only.path), Err).map(Some).map_err(error),
+        ([only], _) => match (&only.state, only.refusal()) {
+            // Whether there is a connection for what is wanted, it says itself.
+            (UnitState::Full(_), _) | (_, None) => connect(&only.path).map(Some).map_err(error),
+            (_, Some(refusal)) => Err(error(refusal)),
+        },
         (several, _) => Err(Ended::usage(format!(
             "several units run on this host: {}; choose one with --unit, --fleet or --socket",
             list(several.iter().copied())

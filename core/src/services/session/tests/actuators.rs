@@ -107,7 +107,8 @@ fn functions_that_move_the_same_thing_are_published_with_the_same_number() {
 fn what_another_caller_moves_is_held_unless_it_is_taken_over() {
     let (mut pair, [go, ..]) = vehicle();
     let word = pair.agv.functions.function(go).unwrap().handler.lease.clone().unwrap();
-    let other = Claim { holder: 77, replaces: None, takes_over: false, operator: false, link: 0, call: 0 };
+    let other =
+        Claim { holder: 77, replaces: None, takes_over: false, operator: false, link: 0, call: 0, made: pair.agv.now };
     let order = word.claim(pair.agv.now, pair.agv.now + LEASE, &other).unwrap();
     let refused = call(&mut pair, "dock");
     assert_eq!(outcome(&pair, refused), Err(Error::Held { by: 77, operator: false }));
@@ -310,10 +311,55 @@ fn a_call_that_was_made_before_the_stop_does_not_begin_after_the_reset() {
     assert!(!pair.agv.is_live(go));
 }
 
+/// A wish that is older than a stop begins on no link, whichever one brought the stop.
+#[test]
+fn a_call_of_another_unit_that_was_made_before_the_stop_does_not_begin_after_the_reset() {
+    let (mut pair, [go, ..]) = vehicle();
+    pair.manager.net.frozen = true;
+    let old = pair.manager.call("go", &none()).unwrap();
+    pair.settle();
+    pair.run(MOMENT);
+    let word = pair.agv.functions.function(go).unwrap().handler.lease.clone().unwrap();
+    word.inhibit(pair.agv.now, Latch { by: 77, reason: 0 });
+    pair.run(MOMENT);
+    word.reset(pair.agv.now, pair.agv.now);
+    assert!(!word.is_inhibited());
+    pair.manager.net.frozen = false;
+    pair.settle();
+    assert_eq!(outcome(&pair, old), Err(Error::Expired));
+    assert!(!pair.agv.is_live(go));
+    let new = call(&mut pair, "go");
+    assert!(pair.agv.is_live(go), "{:?}", outcome(&pair, new));
+}
+
+/// A stop from an interrupt may fall between the two steps of a reset; it may come in the millisecond of the one before.
+#[test]
+fn a_reset_lifts_no_stop_but_the_one_that_it_saw() {
+    let (lease, now) = (Lease::new(), Instant::from_micros(1_000_000));
+    for _ in 0..3 {
+        lease.inhibit(now, Latch { by: 0, reason: 1 });
+        assert!(lease.is_inhibited());
+        lease.reset(now + MOMENT, now + MOMENT);
+        assert!(!lease.is_inhibited());
+    }
+}
+
+/// What was stopped was not finished, even if its program says so before anything has looked.
+#[test]
+fn what_was_stopped_is_made_safe_and_not_finished() {
+    let (mut pair, [go, ..]) = vehicle();
+    let driving = call(&mut pair, "go");
+    let now = pair.agv.now;
+    pair.agv.functions.function(go).unwrap().handler.inhibit(now, Latch { by: 0, reason: 9 });
+    pair.agv.end_lease(go);
+    pair.run(LEASE);
+    assert!(pair.manager.is_told(driving, LeaseEnd::Stopped) && hooks(&pair) == 1);
+}
+
 #[test]
 fn nothing_comes_alive_under_a_latch() {
     let (lease, now) = (Lease::new(), Instant::from_micros(1_000_000));
-    let claim = Claim { holder: 1, replaces: None, takes_over: true, operator: false, link: 0, call: 0 };
+    let claim = Claim { holder: 1, replaces: None, takes_over: true, operator: false, link: 0, call: 0, made: now };
     let order = lease.claim(now, now + LEASE, &claim).unwrap();
     lease.inhibit(now, Latch { by: 0, reason: 1 });
     assert!(!lease.is_live(now) && !lease.lasts_beyond(now) && !lease.renew(order, now + LEASE));
@@ -322,6 +368,8 @@ fn nothing_comes_alive_under_a_latch() {
     // Its hook is still to run when the latch is lifted.
     lease.reset(now + MOMENT, now + MOMENT);
     assert_eq!(lease.latch(), None);
+    assert_eq!(lease.claim(now + MOMENT, now + LEASE, &claim), Err(Error::Expired), "it was made before the stop");
+    let claim = Claim { made: now + MOMENT, ..claim };
     assert_eq!(lease.claim(now + MOMENT, now + LEASE, &claim), Err(Error::Busy));
     assert!(!lease.is_live_for(order, now + MOMENT));
     assert!(lease.end(now, order, LeaseEnd::Expired) && lease.claim(now + MOMENT, now + LEASE, &claim).is_ok());
@@ -390,7 +438,8 @@ fn the_vehicles_own_latch_is_told_within_a_keep_alive() {
 fn who_moves_it_is_told_to_others_but_not_by_which_link() {
     let (mut pair, [go, ..]) = vehicle();
     let word = pair.agv.functions.function(go).unwrap().handler.lease.clone().unwrap();
-    let other = Claim { holder: 77, replaces: None, takes_over: false, operator: false, link: 5, call: 6 };
+    let other =
+        Claim { holder: 77, replaces: None, takes_over: false, operator: false, link: 5, call: 6, made: pair.agv.now };
     word.claim(pair.agv.now, pair.agv.now + LEASE, &other).unwrap();
     pair.run(crate::config::Constraints::S_UNIT.keep_alive);
     let last = state(&pair, go).unwrap().last.unwrap();
