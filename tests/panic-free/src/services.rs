@@ -207,7 +207,7 @@ entry!(leases, {
     keep((lease.begin(*unknown(), *unknown()), lease.claim(*unknown(), *unknown(), unknown())));
     lease.inhibit(*unknown(), *unknown());
     lease.reset(*unknown(), *unknown());
-    keep((lease.latch(), lease.is_inhibited(), lease.is_cut(*unknown())));
+    keep((lease.latch(), lease.is_inhibited(), lease.awaits_hook(), lease.is_cut(*unknown())));
     keep((lease.renew(*unknown(), *unknown()), lease.lasts_beyond(*unknown())));
     keep((lease.is_live(*unknown()), lease.is_live_for(*unknown(), *unknown()), Lease::seen_end(*unknown())));
     keep((lease.left(*unknown()), lease.end(*unknown(), *unknown(), *unknown())));
