@@ -121,7 +121,7 @@ pub(crate) fn patiently(mut ask: impl FnMut() -> Result<(), Error>) -> Result<()
     let deadline = Instant::now() + LONG;
     loop {
         match ask() {
-            Err(Error::TimedOut | Error::Expired) if Instant::now() < deadline => {}
+            Err(Error::TimedOut | Error::Expired | Error::Busy) if Instant::now() < deadline => {}
             ended => return Ok(ended?),
         }
     }
