@@ -54,11 +54,12 @@ impl<T> Machine<T> {
     /// Whether something has been stopped, or seen to be over, and its safe hook is to run: also by an interrupt, or on another
     /// link than the one that is to end its order.
     pub(crate) fn awaits_hook(&self) -> bool {
-        self.leases().any(Lease::awaits_hook)
+        self.moves() && self.functions.iter().any(|function| function.handler.lease.is_some_and(Lease::awaits_hook))
     }
 
-    pub(crate) fn leases(&self) -> impl Iterator<Item = &Lease> {
-        self.functions.iter().filter_map(|function| function.handler.lease)
+    /// Whether a call of a peer moves something.
+    pub(crate) fn moves(&self) -> bool {
+        self.links.iter().any(|link| link.session.as_ref().is_some_and(LinkSession::moves))
     }
 
     /// Lets the session of a link do what is due, or look whether it is: `None` when nothing is.

@@ -246,9 +246,8 @@ impl<T> Runner<T> {
 impl<T> Machine<T> {
     /// When something is due, or may be: an interrupt that stops what moves wakes no task.
     fn next_look(&self) -> Instant {
-        let (now, deadline) = (now(), self.deadline());
-        let moves = deadline > now + LOOK && self.leases().any(|lease| lease.left(now).is_some());
-        if moves { now + LOOK } else { deadline }
+        let deadline = self.deadline();
+        if self.moves() { deadline.min(now() + LOOK) } else { deadline }
     }
 
     /// When something is due.

@@ -368,6 +368,11 @@ impl<P: Port> Session<P> {
         self.requests.in_flight()
     }
 
+    /// Whether a call of the peer moves something here.
+    pub fn moves(&self) -> bool {
+        !self.granted.is_empty()
+    }
+
     /// Calls of the peer that run or wait here.
     pub const fn calls_held(&self) -> u16 {
         self.calls.held()
