@@ -112,7 +112,13 @@ entry!(session_asked, {
     ));
     keep(session.version());
     keep((session.identity(), session.peer(), session.epoch(), session.address(), session.nonce(), session.deadline()));
-    keep((session.their_function_list(), session.counters(), session.calls_in_flight(), session.calls_held(), session.moves()));
+    keep((
+        session.their_function_list(),
+        session.counters(),
+        session.calls_in_flight(),
+        session.calls_held(),
+        session.moves(),
+    ));
     keep((
         session.wants_to_write(),
         session.has_next_call(),
