@@ -1,7 +1,7 @@
 //! The nodes that this unit knows, in the order in which they first told what they offer: a node keeps its place when
 //! another one leaves, and finds it again when it comes back.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -31,7 +31,7 @@ pub(crate) struct PeerCell {
     /// What differs for this node from the unit's constraints, whether it is connected or not.
     own: Mutex<Option<OwnConstraints>>,
     /// The newest call of each function that was to move something, and the link that it was made by.
-    orders: Mutex<HashMap<String, (u32, CallId)>>,
+    orders: Mutex<BTreeMap<String, (u32, CallId)>>,
     /// What its earlier links have counted.
     earlier: Mutex<Option<Box<LinkCounters>>>,
     /// It has told what it offers since it has its place, on this link or an earlier one.

@@ -28,6 +28,8 @@ const FIRST_CALLS: usize = 4;
 const FIRST_FUNCTIONS: usize = 4;
 /// Bytes of their signatures: those of the longest.
 const FIRST_SIGNATURES: usize = SIGNATURE_BYTES;
+/// The room for signatures grows by so many bytes, beyond which there is always some for the longest.
+const SIGNATURES_STEP: usize = 64;
 
 /// Slots for calls to begin with: at most [`FIRST_CALLS`], and so many that `most` is a multiple of them.
 fn first_calls(most: usize) -> usize {
@@ -131,7 +133,8 @@ impl<T: Send + 'static> Engine<T> {
         let (all_entries, all_bytes) = state.session.their_function_list().capacity();
         let (used_entries, used_bytes) = (all_entries.saturating_sub(entries), all_bytes.saturating_sub(bytes));
         let entries = longer(all_entries, used_entries.saturating_add(1), their_functions);
-        let bytes = longer(all_bytes, used_bytes.saturating_add(SIGNATURE_BYTES), their_signature_bytes);
+        let needed = used_bytes.saturating_add(SIGNATURE_BYTES).next_multiple_of(SIGNATURES_STEP);
+        let bytes = needed.min(their_signature_bytes).max(all_bytes);
         if (entries, bytes) != (all_entries, all_bytes) {
             drop(state.session.lend_functions((filled_with(entries, Entry::empty), filled(bytes, 0))));
         }
