@@ -221,11 +221,6 @@ impl Side {
         self.with(|session, cx| session.answer(cx, ticket, result))
     }
 
-    /// Ends the lease on a function of this unit, which is finished.
-    pub(crate) fn end_lease(&mut self, slot: u16) {
-        self.with(|session, cx| session.end_lease(cx, Slot(slot)));
-    }
-
     /// Ends the link.
     pub(crate) fn stop(&mut self) {
         self.with(|session, cx| session.close(cx, CloseReason::Stopped));

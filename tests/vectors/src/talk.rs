@@ -146,7 +146,7 @@ impl Talk {
         );
         let call = self.agv.calls.pop().ok_or(Error::NotConnected)?;
         self.agv.answer(call.ticket, Err(cara_core::error::ServiceError::Failed(7).into()))?;
-        self.agv.end_lease(1);
+        self.agv.poll();
         self.pass(From::Agv, &[("talk_failure", "the service has failed with code 7, and its lease is ended")]);
         assert_eq!(self.manager.events.last().map(String::as_str), Some("Failed"));
         self.pass(

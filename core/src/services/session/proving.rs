@@ -109,11 +109,15 @@ impl<P: Port> Session<P> {
     }
 
     /// What a peer that has proven nothing says about the end of the link is no more than its end. That it has no use for this
-    /// end's proof is counted: most often one of the two has another key.
+    /// end's proof is counted, and told where it has dialled: most often one of the two has another key. An end that dialled
+    /// goes on searching.
     pub(super) fn ended_in_clear(&mut self, reason: Option<CloseReason>) {
         self.link.counters.add(LinkCounter::FarewellsInClear, 1);
         if reason == Some(CloseReason::BadProof) && matches!(self.phase, Phase::Proving { .. }) {
             self.link.counters.add(LinkCounter::ProofsFailed, 1);
+            if !self.dialed {
+                return self.end(CloseReason::BadProof);
+            }
         }
         self.end(CloseReason::Unproven);
     }

@@ -233,7 +233,7 @@ fn the_beginning_of_an_oversize_frame_before_the_proof_ends_the_link() {
 fn two_keys_are_told_by_both_ends() {
     let mut ends = Ends::with_keys(ATTACKED, PairKey::new([1; 32]), PairKey::new([2; 32]));
     ends.converse(|ends, _, carried| ends.deliver(&carried));
-    assert_eq!(ends.manager.closed, Some(CloseReason::Unproven));
+    assert_eq!(ends.manager.closed, Some(CloseReason::BadProof));
     assert_eq!(ends.agv.closed, Some(CloseReason::BadProof));
     assert!(!ends.manager.greeted() && !ends.agv.greeted());
     assert_eq!([&ends.manager, &ends.agv].map(|end| end.counted(LinkCounter::ProofsFailed)), [1, 1]);
