@@ -12,7 +12,7 @@ use super::inject::{EmulatedBoard, ON, STANDS, pause};
 use super::kind::TIMEOUT;
 use crate::board::{FLEET, LONG, Way};
 use crate::keys::MANAGER;
-use crate::manager::{Manager, announce};
+use crate::manager::{Manager, announce, patiently};
 
 /// The service of the image whose calls tasks take.
 pub(super) const CREEP: &str = "creep";
@@ -145,7 +145,7 @@ const MOVES: &str = " moves";
 /// Calls the service, which answers at once and goes on.
 fn creep(agv: &Peer, speed: i64) -> Result<()> {
     let wanted = RequestOptions::renewing(Renew::Process);
-    agv.block_request_with(CREEP, &mut arguments(speed, 0)?, &wanted).context(CREEP)
+    patiently(|| agv.block_request_with(CREEP, &mut arguments(speed, 0)?, &wanted)).context(CREEP)
 }
 
 pub(super) fn arguments(speed: i64, answers: i64) -> Result<Parameters, Error> {
