@@ -63,7 +63,13 @@ impl EmulatedBoard {
             let call = scope.spawn(|| {
                 let timeout = Some(TIMEOUT);
                 let options = RequestOptions { timeout, ..RequestOptions::renewing(Renew::Process) };
-                agv.block_request_with(CREEP, &mut arguments(1, NEVER)?, &options)
+                loop {
+                    match agv.block_request_with(CREEP, &mut arguments(1, NEVER)?, &options) {
+                        // It did not begin.
+                        Err(Error::Expired | Error::Busy) => {}
+                        outcome => break outcome,
+                    }
+                }
             });
             let cut = self.board.logs_behind(line, ON).and_then(|line| {
                 pause(dice);
