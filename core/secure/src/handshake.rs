@@ -2,9 +2,9 @@
 //! leaks later does not reveal them.
 //!
 //! The **prologue** is what both ends must have seen alike: a hash over it goes into every key, so that a bit that was
-//! changed on the way fails the handshake. The initiator is the end that was dialled, which has both hellos first; where
-//! keys are made anew it is the dialler. Nothing is decided and nothing runs before the other end's first sealed frame has
-//! opened: the first message proves its sender only if the prologue has something of the responder that is fresh.
+//! changed on the way fails the handshake. The initiator is the end that was dialled, since it has both hellos first. A
+//! rekey is begun by the dialler. An end decides and runs nothing before a sealed frame of the other end has opened. The
+//! first message proves its sender as well where the prologue has fresh bytes of the responder.
 
 use blake2::{Blake2s256, Digest};
 use noise_protocol::patterns::noise_nn_psk0;

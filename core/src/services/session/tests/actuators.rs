@@ -301,13 +301,18 @@ fn a_call_that_was_made_before_the_stop_does_not_begin_after_the_reset() {
     pair.manager.call("halt", &none()).unwrap();
     pair.settle();
     assert!(!pair.agv.held.is_empty(), "the datagram of the stop has come");
+    is_older_than_the_stop(&mut pair, go, old);
+}
+
+/// The stop is reset, and what was called before it comes.
+fn is_older_than_the_stop(pair: &mut Pair, go: Slot, old: CallId) {
     pair.run(MOMENT);
     let word = pair.agv.functions.function(go).unwrap().handler.lease.clone().unwrap();
     word.reset(pair.agv.now, pair.agv.now);
     assert!(!word.is_inhibited());
     pair.manager.net.frozen = false;
     pair.settle();
-    assert_eq!(outcome(&pair, old), Err(Error::Expired));
+    assert_eq!(outcome(pair, old), Err(Error::Expired));
     assert!(!pair.agv.is_live(go));
 }
 
@@ -321,13 +326,7 @@ fn a_call_of_another_unit_that_was_made_before_the_stop_does_not_begin_after_the
     pair.run(MOMENT);
     let word = pair.agv.functions.function(go).unwrap().handler.lease.clone().unwrap();
     word.inhibit(pair.agv.now, Latch { by: 77, reason: 0 });
-    pair.run(MOMENT);
-    word.reset(pair.agv.now, pair.agv.now);
-    assert!(!word.is_inhibited());
-    pair.manager.net.frozen = false;
-    pair.settle();
-    assert_eq!(outcome(&pair, old), Err(Error::Expired));
-    assert!(!pair.agv.is_live(go));
+    is_older_than_the_stop(&mut pair, go, old);
     let new = call(&mut pair, "go");
     assert!(pair.agv.is_live(go), "{:?}", outcome(&pair, new));
 }
