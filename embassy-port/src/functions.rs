@@ -119,7 +119,7 @@ impl<T> MyFunctionList<T> {
             let stop = removed.clear();
             machine.wakers.leases.wake();
             machine.hub.publications.withdraw(slot);
-            machine.each_live(|session, cx| {
+            machine.each_link(|session, cx| {
                 session.withdraw(cx, slot);
             });
             Ok::<_, Error>(stop)
@@ -132,7 +132,7 @@ impl<T> MyFunctionList<T> {
     pub fn end_lease(&self, name: &str) {
         self.unit.act(|machine| {
             let Some(slot) = machine.functions.find(name) else { return };
-            machine.each_live(|session, cx| session.end_lease(cx, slot));
+            machine.each_link(|session, cx| session.end_lease(cx, slot));
             machine.wakers.leases.wake();
         });
     }

@@ -259,9 +259,7 @@ impl<T> Handle<T> {
         self.act(|machine| {
             machine.limits.fit(&constraints)?;
             machine.hub.node.set_constraints(constraints);
-            for index in machine.indices() {
-                machine.with(index, |session, cx| session.set_constraints(cx, constraints));
-            }
+            machine.each_link(|session, cx| session.set_constraints(cx, constraints));
             Ok(())
         })
     }
@@ -270,7 +268,7 @@ impl<T> Handle<T> {
     pub fn set_access(&self, table: Option<&'static dyn Access>) {
         self.act(|machine| {
             machine.access = Table(table);
-            machine.each_live(|session, cx| {
+            machine.each_link(|session, cx| {
                 session.access_changed(cx);
             });
         });

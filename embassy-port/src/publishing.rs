@@ -6,12 +6,10 @@ use cara_core::error::Error;
 use crate::machine::{LinkContext, LinkSession, Machine};
 
 impl<T> Machine<T> {
-    /// Does something on each link to a peer.
-    pub(crate) fn each_live(&mut self, mut act: impl FnMut(&mut LinkSession, &mut LinkContext<'_>)) {
+    /// Does something on each link; one that is not live yet may have told its list.
+    pub(crate) fn each_link(&mut self, mut act: impl FnMut(&mut LinkSession, &mut LinkContext<'_>)) {
         for index in self.indices() {
-            if self.link(index).is_some_and(crate::machine::Link::is_live) {
-                self.with(index, &mut act);
-            }
+            self.with(index, &mut act);
         }
     }
 

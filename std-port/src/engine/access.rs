@@ -140,8 +140,9 @@ impl<T: Send + 'static> Engine<T> {
         self.guard.set(table);
         for link in self.each_link() {
             let mut state = link.lock();
+            // One that is not live yet may have told its list.
+            self.with(&link, &mut state, |session, cx| session.access_changed(cx));
             if state.session.is_live() {
-                self.with(&link, &mut state, |session, cx| session.access_changed(cx));
                 state.notices.push(Event::ListChanged);
             }
             self.settle(&link, state);

@@ -76,8 +76,11 @@ impl<P: Port> Session<P> {
         let Some(remote) = &self.remote else { return 0 };
         let (functions, publishing, identity) = (cx.functions, &mut self.publishing, &remote.hello.identity);
         cx.hub.enter(&mut |hub| {
-            let visible = hub.publications.visible_to(identity);
-            visible.for_each(|slot| publishing.want(slot, functions.generation(slot)));
+            // What was hidden since the last time is withdrawn: a change that comes before the link is live reaches it only here.
+            for slot in publishing.all_slots() {
+                let is_visible = hub.publications.is_visible(identity, slot);
+                publishing.want(slot, functions.generation(slot).filter(|_| is_visible));
+            }
             publishing.version = hub.publications.version();
         });
         self.end_of_changes(cx)

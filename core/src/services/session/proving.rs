@@ -6,7 +6,6 @@
 use super::{Event, Phase, Remote, Session};
 use crate::config::{MINIMUM_CHUNK_BYTES, Mode, VERSIONS};
 use crate::distribution::hello::{Hello, HelloError};
-use crate::distribution::message::SessionBody;
 use crate::error::{CloseReason, Refusal};
 use crate::host::connections::{LinkCounter, Liveness, Place};
 use crate::host::endpoint::Endpoint as _;
@@ -80,8 +79,6 @@ impl<P: Port> Session<P> {
         if self.dialed && matches!(self.phase, Phase::Proving { .. }) {
             self.send_confirmation(cx);
             self.limit_to_peer();
-            // The peer's first call is as old as what it has heard of this end's clock: that of the hello was before the proof.
-            self.link.send_frame(&Frame::Session(&SessionBody::keep_alive(cx.now.as_micros())));
             self.publish(cx);
         }
         None

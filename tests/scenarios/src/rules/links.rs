@@ -78,6 +78,7 @@ fn a_half_open_link_is_noticed_on_both_sides(world: &mut dyn World) {
 
 fn the_hook_for_a_lost_manager_runs_once(world: &mut dyn World) {
     let (manager, agv) = pair(world, &Service::numbered("note"));
+    world.wait("it has a manager to lose", || agv.is_connected("manager"), secs(10));
     assert_eq!(agv.manager_losses().len(), 0);
     manager.stop();
     world.wait("the hook runs", || agv.manager_losses().len() == 1, secs(10));
@@ -86,6 +87,7 @@ fn the_hook_for_a_lost_manager_runs_once(world: &mut dyn World) {
     assert_eq!(agv.manager_losses().len(), 1);
     manager.start();
     met(world, &manager, "agv", "note");
+    world.wait("it has a manager to lose again", || agv.is_connected("manager"), secs(10));
     world.reached("found again");
     assert_eq!(agv.manager_losses().len(), 1);
     manager.stop();

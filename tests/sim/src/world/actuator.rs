@@ -53,7 +53,7 @@ impl Actuator {
     /// The vehicle's own stop, as of a bumper: the order ends, and none begins until it is reset. Callers are told `reason`.
     pub fn inhibit(&self, unit: &UnitHandle, reason: u16) {
         self.stop(unit.clock(), Latch { by: 0, reason });
-        unit.each_live_link(|_, _, _| ());
+        unit.each_link(|_, _, _| ());
     }
 
     /// Lets it move again.
@@ -128,7 +128,7 @@ impl Drop for Heart {
         let beats = self.beats();
         self.word.stop();
         if self.unit.exists() {
-            self.unit.each_live_link(|links, network, index| {
+            self.unit.each_link(|links, network, index| {
                 links.with(network, index, |session, cx| session.release_beats(cx, beats));
             });
         }

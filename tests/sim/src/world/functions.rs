@@ -49,7 +49,7 @@ impl MyFunctionList<'_> {
         let (slot, Handler(service)) = self.unit.machine(|machine, _| machine.links.functions.remove(name))??;
         service.goes(self.unit);
         self.unit.machine(|machine, _| machine.links.hub.publications.withdraw(slot))?;
-        self.unit.each_live_link(|links, network, index| {
+        self.unit.each_link(|links, network, index| {
             links.with(network, index, |session, cx| session.withdraw(cx, slot));
         });
         Ok(())

@@ -269,7 +269,7 @@ impl UnitHandle {
 
     /// Stops it in an orderly way: peers are told.
     pub fn stop(&self) {
-        self.each_live_link(|links, network, index| {
+        self.each_link(|links, network, index| {
             links.with(network, index, |session, cx| session.close(cx, cara_core::error::CloseReason::Stopped));
         });
         self.with(|inner| inner.network.stop(self.host));
@@ -332,8 +332,10 @@ impl UnitHandle {
         live.unwrap_or_default()
     }
 
-    pub(super) fn each_live_link(&self, mut act: impl FnMut(&mut Links, &mut Network, u16)) {
-        for index in self.live_links() {
+    /// Does something on each link; one that is not live yet may have told its list.
+    pub(super) fn each_link(&self, mut act: impl FnMut(&mut Links, &mut Network, u16)) {
+        let all = self.machine(|machine, _| machine.links.iter().map(|(index, _)| index).collect::<Vec<_>>());
+        for index in all.unwrap_or_default() {
             let _ = self.machine(|machine, network| act(&mut machine.links, network, index));
             self.work(index);
         }

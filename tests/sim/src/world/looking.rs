@@ -34,7 +34,7 @@ impl UnitHandle {
             machine.links.hub.node.set_constraints(constraints);
             Ok(())
         })?;
-        self.each_live_link(|links, network, index| {
+        self.each_link(|links, network, index| {
             links.with(network, index, |session, cx| session.set_constraints(cx, constraints));
         });
         Ok(())
@@ -43,7 +43,7 @@ impl UnitHandle {
     /// Another access table for this life of the unit, or none: in force when this returns, and peers are told.
     pub fn set_access(&self, table: Option<&'static dyn Access>) -> Result<(), Error> {
         self.machine(|machine, _| machine.links.access = table)?;
-        self.each_live_link(|links, network, index| {
+        self.each_link(|links, network, index| {
             links.with(network, index, |session, cx| session.access_changed(cx));
         });
         Ok(())

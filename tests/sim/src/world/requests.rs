@@ -137,7 +137,7 @@ impl UnitHandle {
     /// What a leased service of this unit started is finished: its lease ends, and no safe hook runs.
     pub fn end_lease(&self, function: &str) -> Result<(), Error> {
         let slot = self.machine(|machine, _| machine.links.functions.find(function))?.ok_or(Error::UnknownFunction)?;
-        self.each_live_link(|links, network, index| {
+        self.each_link(|links, network, index| {
             links.with(network, index, |session, cx| session.end_lease(cx, slot));
         });
         Ok(())
