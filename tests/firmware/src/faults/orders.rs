@@ -65,7 +65,7 @@ impl EmulatedBoard {
                 let options = RequestOptions { timeout, ..RequestOptions::renewing(Renew::Process) };
                 loop {
                     match agv.block_request_with(CREEP, &mut arguments(1, NEVER)?, &options) {
-                        // It did not begin.
+                        // It did not begin: the clock of this board runs ahead while it computes a proof.
                         Err(Error::Expired | Error::Busy) => {}
                         outcome => break outcome,
                     }
