@@ -30,6 +30,16 @@ const RETRY: Duration = Duration::from_millis(20);
 /// Releases of whole functions that are still to be sent in the stream: the function, and the newest call.
 pub(super) type Releases = heapless::Vec<(Slot, CallId), LEASES>;
 
+/// Calls of leased functions that the peer has answered and not ended: by this they are released, renewed or not.
+pub(super) type Answered = heapless::Vec<AnsweredCall, LEASES>;
+
+#[derive(Clone, Copy)]
+pub(super) struct AnsweredCall {
+    call: CallId,
+    slot: Slot,
+    class: Priority,
+}
+
 fn between_renewals(lease: Duration) -> Duration {
     lease.divided_by(RENEWALS_PER_LEASE).max(SHORTEST_INTERVAL)
 }
@@ -141,8 +151,20 @@ impl<P: Port> Session<P> {
         }
     }
 
+    /// The peer has answered a call with results.
+    pub(super) fn note_answered(&mut self, pending: &Pending) {
+        let Pending { id: call, slot, leased: Some(class), .. } = *pending else { return };
+        // The peer says of each one when it has ended, and of more than there is room for it has refused some.
+        if self.answered.is_full() {
+            let oldest = self.answered.iter().enumerate().min_by_key(|(_, known)| known.call);
+            oldest.map(|(index, _)| index).and_then(|index| take_at(&mut self.answered, index));
+        }
+        let _ = self.answered.push(AnsweredCall { call, slot, class });
+    }
+
     /// The peer has ended the lease of a call.
     pub(super) fn stop_renewing(&mut self, call: CallId) -> Option<Held> {
+        self.answered.retain(|known| known.call != call);
         let index = self.held.iter().position(|held| held.call == call && !held.release_unsent)?;
         take_at(&mut self.held, index)
     }
@@ -163,9 +185,11 @@ impl<P: Port> Session<P> {
 
     /// Releases a call that has failed or was cancelled. `pending` is what was known of it while it waited for its reply.
     pub(super) fn release_call(&mut self, cx: &mut Context<'_, P>, id: CallId, pending: Option<Pending>) {
+        let answered = self.answered.iter().find(|known| known.call == id).copied();
         let held = self.stop_renewing(id);
         let waited = pending.and_then(|pending| pending.leased);
-        let Some(class) = held.map(|held| held.class).or(waited) else { return };
+        let class = held.map(|held| held.class).or(waited).or(answered.map(|known| known.class));
+        let Some(class) = class else { return };
         // A link that is not live needs no release: the callee ends all leases of the link by itself.
         if self.phase != Phase::Live || self.send_release(cx, id, class) {
             return;
@@ -174,7 +198,7 @@ impl<P: Port> Session<P> {
         match (pending, held) {
             (Some(pending), _) => self.requests.keep_unsent_release(pending),
             (None, Some(held)) => drop(self.held.push(Held { release_unsent: true, ..held })),
-            (None, None) => {}
+            (None, None) => drop(answered.map(|known| self.releases.push((known.slot, id)))),
         }
         self.timers.release = cx.now + RETRY;
     }

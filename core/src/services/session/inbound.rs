@@ -335,6 +335,7 @@ impl<P: Port> Session<P> {
                 Some(Event::Reply(id, Err(error)))
             }
             Ok(block) => {
+                self.note_answered(&pending);
                 let Pending { slot, generation, .. } = pending;
                 Some(Event::Reply(id, Ok(Results { slot, generation, block, step: self.step })))
             }

@@ -214,6 +214,7 @@ pub struct Session<P: Port> {
     granted: heapless::Vec<Granted, LEASES>,
     ends: granting::Ends,
     held: heapless::Vec<Held, LEASES>,
+    answered: holding::Answered,
     releases: holding::Releases,
     /// The newest call that was to move something.
     last_order: Option<(Slot, CallId)>,
@@ -260,6 +261,7 @@ impl<P: Port> Session<P> {
             granted: heapless::Vec::new(),
             ends: granting::Ends::new(),
             held: heapless::Vec::new(),
+            answered: holding::Answered::new(),
             releases: holding::Releases::new(),
             last_order: None,
             step: 0,
