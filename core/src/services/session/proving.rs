@@ -56,6 +56,7 @@ impl<P: Port> Session<P> {
         let version = VERSIONS.common(hello.versions).unwrap_or(VERSIONS.last);
         self.remote = Some(Remote { hello, version, heard: cx.now, datagrams });
         if mode == Mode::Plain {
+            self.limit_to_peer();
             return self.peer_known(cx);
         }
         if !self.dialed {
@@ -78,7 +79,6 @@ impl<P: Port> Session<P> {
         }
         if self.dialed && matches!(self.phase, Phase::Proving { .. }) {
             self.send_confirmation(cx);
-            self.limit_to_peer();
             self.publish(cx);
         }
         None
@@ -124,7 +124,6 @@ impl<P: Port> Session<P> {
 
     /// What the hello told counts from here on.
     fn peer_known(&mut self, cx: &mut Context<'_, P>) -> Option<Event> {
-        self.limit_to_peer();
         let Some(Remote { hello, heard, .. }) = &self.remote else { return None };
         self.liveness = Liveness::new(cx.now, Duration::from_millis(u64::from(hello.keep_alive)));
         self.clock.hear(*heard, hello.stamp);
@@ -147,7 +146,9 @@ impl<P: Port> Session<P> {
         }
     }
 
+    /// Confirms that this end has the keys, to a peer that has proven itself: what follows may be as long as it takes.
     fn send_confirmation(&mut self, cx: &mut Context<'_, P>) {
+        self.limit_to_peer();
         let confirmation = self.link.cipher().confirmation();
         if self.link.send_frame(&Frame::Confirm(&confirmation)) {
             self.flush(cx);
