@@ -8,12 +8,12 @@ use cara_core::config::Priority;
 use cara_core::distribution::function::Definition;
 use cara_core::distribution::function_list::{FunctionList, Slot};
 use cara_core::error::Error;
-use cara_core::services::lease::Lease;
 use cara_core::storage::Lent;
 
 use crate::handle::Handle;
 use crate::handler::{Handler, Listed, ServiceOptions};
 use crate::machine::Machine;
+use crate::time::now;
 
 type Put<T> = fn(
     &mut FunctionList<Lent, Listed<T>>,
@@ -103,7 +103,7 @@ impl<T> MyFunctionList<T> {
             let shares =
                 |listed: &Listed<T>| listed.lease.zip(lease).is_some_and(|(one, other)| core::ptr::eq(one, other));
             let sharing = machine.functions.iter().filter(|function| shares(function.handler)).count();
-            lease.filter(|_| sharing == 1).map(Lease::clear);
+            lease.filter(|_| sharing == 1).map(|lease| lease.clear(now()));
             machine.wakers.leases.wake();
             Ok(stop)
         })?;
@@ -126,15 +126,6 @@ impl<T> MyFunctionList<T> {
         })?;
         stop.into_iter().for_each(|safe| safe());
         Ok(())
-    }
-
-    /// The service has finished what its caller started: the lease ends, and no hook runs.
-    pub fn end_lease(&self, name: &str) {
-        self.unit.act(|machine| {
-            let Some(slot) = machine.functions.find(name) else { return };
-            machine.each_link(|session, cx| session.end_lease(cx, slot));
-            machine.wakers.leases.wake();
-        });
     }
 
     /// How many functions there are.

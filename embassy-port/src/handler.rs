@@ -13,6 +13,7 @@ use cara_core::time::{Duration, Instant};
 
 use crate::handle::Handle;
 use crate::lease::LeaseWatch;
+use crate::time::now;
 
 /// What a handler is told about the call that it serves.
 pub struct Call<T: 'static> {
@@ -285,7 +286,7 @@ impl<T> Listed<T> {
     pub(crate) fn clear(self) -> Option<&'static Safe> {
         // A service without a hook moves nothing: it stops or resets what others move.
         let safe = self.safe?;
-        self.lease?.clear().then_some(safe)
+        self.lease?.clear(now()).then_some(safe)
     }
 }
 

@@ -52,6 +52,17 @@ impl LeaseWatch {
 }
 
 impl<T> Handle<T> {
+    /// What an order ([`Call::lease`](crate::Call::lease)) has started is finished: it ends, no hook runs, and its caller is told
+    /// so. `false` for one that has ended before, as when a newer call has replaced it.
+    pub fn end_order(&self, order: &LeaseWatch) -> bool {
+        self.act(|machine| {
+            let mut is_finished = false;
+            machine.each_link(|session, cx| is_finished |= session.end_order(cx, order.lease, order.order));
+            machine.wakers.leases.wake();
+            is_finished
+        })
+    }
+
     /// Ends when a lease of one of this unit's calls is dead; never without one. Cancelling loses nothing.
     pub(crate) async fn lease_ended(&self, lease: Option<LeaseWatch>) {
         poll_fn(|cx| {

@@ -25,6 +25,7 @@ use crate::engine::{Engine, pairs};
 use crate::error::StartError;
 use crate::event::{Finding, UnitEvent};
 use crate::heart::Heart;
+use crate::lease::LeaseWatch;
 #[cfg(feature = "control")]
 use crate::locks::lock;
 use crate::my_function_list::MyFunctionList;
@@ -287,6 +288,21 @@ impl<T: Send + 'static, R> Handle<T, R> {
     /// The unit's own functions.
     pub fn my_function_list(&self) -> MyFunctionList<'_, T> {
         MyFunctionList { engine: self.engine() }
+    }
+
+    /// What an order ([`Call::lease`](crate::Call::lease)) has started is finished: it ends, no hook runs, and its caller is told
+    /// so. `false` for one that has ended before, as when a newer call has replaced it, and for a lease that is of no call.
+    pub fn end_order(&self, order: &LeaseWatch) -> bool {
+        let Some((word, order)) = order.order() else { return false };
+        let engine = self.engine();
+        let is_finished = engine.each_link().into_iter().any(|link| {
+            let mut state = link.lock();
+            let is_finished = engine.with(&link, &mut state, |session, cx| session.end_order(cx, &word.lease, order));
+            engine.settle(&link, state);
+            is_finished
+        });
+        word.wake();
+        is_finished
     }
 
     /// The constraints in force.

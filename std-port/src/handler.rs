@@ -106,8 +106,8 @@ impl<T: 'static> Service for Handler<T> {
         self.actuator.as_ref().map(Actuator::word)
     }
 
-    fn begin_lease(&self, now: Instant, end: Instant, claim: &Claim) -> Result<Option<Order>, Error> {
-        self.actuator.as_ref().map(|actuator| actuator.safe.begin(now, end, claim)).transpose()
+    fn begin_lease(&self, _: Instant, end: Instant, claim: &Claim) -> Result<Option<Order>, Error> {
+        self.actuator.as_ref().map(|actuator| actuator.safe.begin(end, claim)).transpose()
     }
 
     fn inhibit(&self, now: Instant, latch: Latch) {
@@ -133,7 +133,7 @@ impl<T: 'static> Service for Handler<T> {
     }
 
     fn finish_lease(&self, now: Instant, order: Order) -> bool {
-        self.actuator.as_ref().is_none_or(|actuator| actuator.safe.finish(now, order))
+        self.actuator.as_ref().is_some_and(|actuator| actuator.safe.finish(now, order))
     }
 
     fn expire_lease(&self, now: Instant, order: Order, how: LeaseEnd) -> bool {

@@ -60,6 +60,11 @@ impl LeaseWatch {
         Self { service: lease, order: Some((order, safe)), clock }
     }
 
+    /// The order that it is of, and its actuator's word.
+    pub(crate) fn order(&self) -> Option<(&ServiceLease, Order)> {
+        self.order.as_ref().map(|(order, _)| (&*self.service, *order))
+    }
+
     /// Whether the caller still wants what it started.
     ///
     /// ```no_run

@@ -156,26 +156,6 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
         self.engine.remove_function(name)
     }
 
-    /// The service has finished what its caller started: the lease ends, and no hook runs.
-    pub fn end_lease(&self, name: &str) {
-        let Some((slot, lease)) = self.leased(name) else { return };
-        for link in self.engine.each_link() {
-            let mut state = link.lock();
-            self.engine.with(&link, &mut state, |session, cx| session.end_lease(cx, slot));
-            self.engine.settle(&link, state);
-        }
-        if let Some(lease) = lease {
-            lease.wake();
-        }
-    }
-
-    fn leased(&self, name: &str) -> Option<(Slot, Option<Arc<ServiceLease>>)> {
-        let functions = self.engine.functions();
-        let slot = functions.find(name)?;
-        let actuator = functions.function(slot)?.handler.actuator.as_ref();
-        Some((slot, actuator.map(|actuator| actuator.lease.clone())))
-    }
-
     /// How many functions there are.
     pub fn len(&self) -> usize {
         self.engine.functions().len()

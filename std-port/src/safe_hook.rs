@@ -76,11 +76,16 @@ impl SafeHook {
     }
 
     /// Begins an order: the thread looks when its lease ends.
-    pub(crate) fn begin(&self, now: Instant, end: Instant, claim: &Claim) -> Result<Order, Error> {
+    pub(crate) fn begin(&self, end: Instant, claim: &Claim) -> Result<Order, Error> {
         // The order before this one is safe first: until then what reads the lease would act for this one by the wish of that.
         let (_writing, is_safe) = self.shared.await_hook(lock(&self.shared.state));
         if !is_safe {
             return Err(ServiceError::NotReady.into());
+        }
+        // It may have waited for that longer than the lease lasts.
+        let now = self.shared.parts.clock.now();
+        if Lease::seen_end(end) <= now {
+            return Err(Error::Expired);
         }
         let order = self.shared.lease().claim(now, end, claim)?;
         self.shared.changed.notify_all();
@@ -120,12 +125,10 @@ impl SafeHook {
         self.shared.lease().cut(order);
     }
 
-    /// Ends an order whose work is done: the hook does not run.
+    /// Ends an order whose work is done: the hook does not run. `false` for one that has ended before, whose hook does.
     pub(crate) fn finish(&self, now: Instant, order: Order) -> bool {
-        let mut state = lock(&self.shared.state);
-        let is_over = self.shared.lease().end(now, order, LeaseEnd::Finished);
-        state.started_early &= !is_over;
-        is_over
+        let _writing = lock(&self.shared.state);
+        self.shared.lease().finish(now, order)
     }
 
     /// Ends an order and starts the hook, unless it was started early. Returns at once.
@@ -146,7 +149,7 @@ impl SafeHook {
     /// The service is removed: an order that has not ended does so, and the hook starts.
     pub(crate) fn clear(&self) {
         let mut state = lock(&self.shared.state);
-        if self.shared.lease().clear() {
+        if self.shared.lease().clear(self.shared.parts.clock.now()) {
             self.shared.start(&mut state);
         }
     }
@@ -279,7 +282,7 @@ mod tests {
         Claim { holder: 1, replaces: None, takes_over: true, operator: false, link: 0, call: 0, made: Instant::START };
 
     fn begin(safe: &SafeHook, clock: Clock, length: Duration) -> Order {
-        safe.begin(clock.now(), clock.now() + length, &CLAIM).expect("the order before has ended")
+        safe.begin(clock.now() + length, &CLAIM).expect("the order before has ended")
     }
 
     /// The unit does nothing here: the thread sees the end of a lease that a suspension has outlasted, and what the unit
@@ -325,6 +328,39 @@ mod tests {
         assert_eq!(runs.load(Ordering::SeqCst), 1);
     }
 
+    /// A call waits for the hook of the order before it. What was to begin is over by then, and is told to have begun by
+    /// nothing.
+    #[test]
+    fn an_order_whose_time_passes_while_it_waits_for_the_hook_does_not_begin() {
+        static AHEAD: AtomicU64 = AtomicU64::new(0);
+        let clock = Clock::moved_by(&AHEAD);
+        let (runs, (goes_on, may_go_on)) = (Arc::new(AtomicUsize::new(0)), channel::<()>());
+        let (counted, may_go_on) = (runs.clone(), Mutex::new(may_go_on));
+        let hook = Arc::new(move || {
+            counted.fetch_add(1, Ordering::SeqCst);
+            let _ = lock(&may_go_on).recv();
+        });
+        let parts = Parts { lease: Arc::default(), clock, hook, then: None, late: Arc::default() };
+        let safe = SafeHook::start(parts).unwrap();
+        for (millis, begins) in [(40, false), (3_600_000, true)] {
+            let order = begin(&safe, clock, Duration::from_secs(3_600));
+            let before = runs.load(Ordering::SeqCst);
+            assert!(safe.expire(clock.now(), order, LeaseEnd::Expired));
+            until(|| runs.load(Ordering::SeqCst) == before + 1);
+            let end = clock.now() + Duration::from_millis(millis);
+            std::thread::scope(|scope| {
+                let waits = scope.spawn(|| safe.begin(end, &CLAIM));
+                // Less than a hook may take.
+                AHEAD.fetch_add(50_000, Ordering::SeqCst);
+                goes_on.send(()).unwrap();
+                let order = waits.join().unwrap();
+                assert_eq!(order.err(), (!begins).then_some(Error::Expired));
+                assert_eq!(safe.shared.lease().is_live(clock.now()), begins);
+            });
+        }
+        safe.end();
+    }
+
     #[test]
     fn the_thread_rests_between_two_looks() {
         let waits = [0, 1, 5_000, 3_600_000_000].map(|left| until_next_look(Duration::from_micros(left)).as_micros());
@@ -337,7 +373,7 @@ mod tests {
         const LONG: Duration = Duration::from_secs(3_600);
         type Write = fn(&SafeHook, Order, Instant) -> bool;
         let writes: [Write; 6] = [
-            |safe, _, now| safe.begin(now, now + LONG, &CLAIM).is_ok(),
+            |safe, _, now| safe.begin(now + LONG, &CLAIM).is_ok(),
             |safe, order, now| safe.renew(order, now + LONG + LONG),
             |safe, order, now| {
                 safe.cut(order);
@@ -393,7 +429,7 @@ mod tests {
         let serve = || {
             for call in 0..CALLS {
                 let now = clock.now();
-                let Ok(order) = safe.begin(now, now + LONG, &CLAIM) else { panic!("call {call}: busy for ever") };
+                let Ok(order) = safe.begin(now + LONG, &CLAIM) else { panic!("call {call}: busy for ever") };
                 if safe.has_run() {
                     let before = runs.load(Ordering::SeqCst);
                     let renewed = safe.renew(order, now + LONG);

@@ -364,15 +364,24 @@ impl Lease {
     pub fn end(&self, now: Instant, order: Order, how: LeaseEnd) -> bool {
         let held = self.is_held_by(order);
         if held {
-            if how == LeaseEnd::Finished {
-                self.stopped.store(0, Ordering::Release);
-            } else {
-                self.stop_at(now, self.end.load(Ordering::Acquire));
-            }
-            self.how.store(how as u32, Ordering::Release);
-            self.end.store(0, Ordering::Release);
+            self.end_any(now, how);
         }
         held
+    }
+
+    /// Ends an order because what it has started is finished: no hook runs. `false` for one that is dead, which was not.
+    pub fn finish(&self, now: Instant, order: Order) -> bool {
+        self.is_live_for(order, now) && self.end(now, order, LeaseEnd::Finished)
+    }
+
+    fn end_any(&self, now: Instant, how: LeaseEnd) {
+        if how == LeaseEnd::Finished {
+            self.stopped.store(0, Ordering::Release);
+        } else {
+            self.stop_at(now, self.end.load(Ordering::Acquire));
+        }
+        self.how.store(how as u32, Ordering::Release);
+        self.end.store(0, Ordering::Release);
     }
 
     /// The state of what it moves. What other threads write meanwhile may be in it in part: see [`Service::state`].
@@ -401,10 +410,11 @@ impl Lease {
     }
 
     /// Ends whichever order holds it, as when the service is removed: whether there is one, whose safe hook is to run.
-    pub fn clear(&self) -> bool {
+    pub fn clear(&self, now: Instant) -> bool {
         let has_order = self.has_order();
-        self.how.store(LeaseEnd::Expired as u32, Ordering::Release);
-        self.end.store(0, Ordering::Release);
+        if has_order {
+            self.end_any(now, LeaseEnd::Expired);
+        }
         has_order
     }
 }
@@ -473,9 +483,9 @@ pub trait Service {
         }
     }
 
-    /// [`Lease::end`], because what the order has started is finished: no hook runs.
+    /// [`Lease::finish`]
     fn finish_lease(&self, now: Instant, order: Order) -> bool {
-        self.lease().is_none_or(|lease| lease.end(now, order, LeaseEnd::Finished))
+        self.lease().is_some_and(|lease| lease.finish(now, order))
     }
 
     /// [`Lease::end`], because its caller no longer wants it or it was stopped. Where this is `true`, the safe hook is due:
@@ -597,6 +607,32 @@ mod tests {
     }
 
     #[test]
+    fn what_goes_with_its_service_slows_down_like_what_has_ended() {
+        let (lease, _) = on_a_ramp();
+        assert!(lease.clear(at(1_100_000)) && !lease.clear(at(1_200_000)));
+        assert_eq!(stages(&lease, &[1_101, 1_398, 1_399]), [Stage::Stopping, Stage::Stopping, Stage::Dead]);
+        assert!(lease.begin(at(1_300_000), at(3_000_000)).is_none(), "the ramp comes first");
+        let next = lease.begin(at(1_400_000), at(3_000_000)).unwrap();
+        assert!(lease.finish(at(1_500_000), next));
+        // What had ended before keeps its end.
+        assert!(!lease.clear(at(1_600_000)) && stages(&lease, &[1_601]) == [Stage::Dead]);
+        assert_eq!(lease.state().last.unwrap().end, Some(LeaseEnd::Finished));
+    }
+
+    #[test]
+    fn what_is_dead_or_was_replaced_is_not_finished() {
+        let (lease, first) = on_a_ramp();
+        let second = lease.begin(at(1_100_000), at(1_501_000)).unwrap();
+        assert!(!lease.finish(at(1_200_000), first) && lease.is_live_for(second, at(1_200_000)));
+        assert!(!lease.finish(at(1_501_000), second) && lease.awaits_hook(), "its time is over");
+        assert!(lease.end(at(1_502_000), second, LeaseEnd::Expired));
+        assert!(!lease.finish(at(1_502_000), second));
+        let third = lease.begin(at(2_000_000), at(3_000_000)).unwrap();
+        assert!(lease.finish(at(2_100_000), third) && !lease.finish(at(2_100_000), third));
+        assert_eq!(stages(&lease, &[2_100]), [Stage::Dead], "nothing moves");
+    }
+
+    #[test]
     fn a_ramp_of_long_ago_keeps_nothing_from_beginning() {
         for days in [1, 24, 25, 26, 40, 49] {
             let (lease, order) = on_a_ramp();
@@ -620,7 +656,7 @@ mod tests {
         let order = lease.begin(START, at(500_000)).unwrap();
         assert!(!lease.is_live(at(500_000)));
         assert!(lease.end(START, order, LeaseEnd::Expired) && lease.begin(START, at(500_000)).is_some());
-        assert!(lease.clear() && !lease.clear());
+        assert!(lease.clear(START) && !lease.clear(START));
         assert!(!lease.is_live(START));
     }
 

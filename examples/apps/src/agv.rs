@@ -82,20 +82,23 @@ pub enum Progress {
     Stopped(Place),
 }
 
-/// A vehicle. It stands until [`Agv::go_to`], and moves in [`Agv::step`] only.
+/// A vehicle. It stands until [`Agv::go_to`], and moves in [`Agv::step`] only. `Order` is what names a call in its port, by which
+/// the vehicle says that it has done what that call wanted.
 #[derive(Clone, Debug, Default)]
-pub struct Agv {
+pub struct Agv<Order = ()> {
     place: Place,
     target: Option<Place>,
+    /// The order of the last target.
+    order: Option<Order>,
     /// Parts of a unit that it has driven.
     driven: i64,
     bumper: bool,
 }
 
-impl Agv {
+impl<Order> Agv<Order> {
     /// A vehicle that stands.
     pub const fn new(position: [i64; 2]) -> Self {
-        Self { place: Place::at(position), target: None, driven: 0, bumper: false }
+        Self { place: Place::at(position), target: None, order: None, driven: 0, bumper: false }
     }
 
     /// Where it is.
@@ -127,8 +130,14 @@ impl Agv {
         (self.place.rounded() != before).then_some(Progress::Passed(self.place))
     }
 
+    /// The order whose target it has reached, once: the one that is finished, whichever has begun since.
+    pub fn finished(&mut self) -> Option<Order> {
+        self.order.take_if(|_| self.target.is_none())
+    }
+
     /// Stops at once; where, if it was driving.
     pub fn stop(&mut self) -> Option<Place> {
+        self.order = None;
         self.target.take().map(|_| self.place)
     }
 
@@ -147,14 +156,14 @@ impl Agv {
         parameters.set_value("position", self.place.rounded()).map_err(|_| ServiceError::BadResults)
     }
 
-    /// Serves [`GO_TO`]; a later call replaces the target of an earlier one.
-    pub fn go_to(&mut self, parameters: &ParametersView) -> Result<(), ServiceError> {
+    /// Serves [`GO_TO`]; a later call replaces the target of an earlier one, and its order.
+    pub fn go_to(&mut self, parameters: &ParametersView, order: Option<Order>) -> Result<(), ServiceError> {
         let outside = ServiceError::Failed(OUT_OF_THE_WAREHOUSE);
         let position: [i64; 2] = parameters.variable("position").map_err(|_| outside)?;
         if position.iter().any(|along| !(-WAREHOUSE..=WAREHOUSE).contains(along)) {
             return Err(outside);
         }
-        self.target = Some(Place::at(position));
+        (self.target, self.order) = (Some(Place::at(position)), order);
         Ok(())
     }
 
@@ -185,9 +194,9 @@ mod tests {
         parameters
     }
 
-    fn driving_to(target: [i64; 2]) -> Agv {
+    fn driving_to(target: [i64; 2]) -> Agv<u8> {
         let mut agv = Agv::new([0, 0]);
-        agv.go_to(&position(target)).unwrap();
+        agv.go_to(&position(target), Some(1)).unwrap();
         agv
     }
 
@@ -198,6 +207,7 @@ mod tests {
         assert_eq!(steps, 75);
         assert_eq!(agv.place(), Place::at([1, -2]));
         assert_eq!(agv.step(TICK, true), None);
+        assert_eq!((agv.finished(), agv.finished()), (Some(1), None));
     }
 
     #[test]
@@ -220,16 +230,16 @@ mod tests {
 
     #[test]
     fn it_stays_in_the_warehouse() {
-        let mut agv = Agv::new([0, 0]);
+        let mut agv = Agv::<()>::new([0, 0]);
         for far in [i64::MAX, i64::MIN, 10_001] {
-            assert_eq!(agv.go_to(&position([0, far])), Err(ServiceError::Failed(OUT_OF_THE_WAREHOUSE)));
+            assert_eq!(agv.go_to(&position([0, far]), None), Err(ServiceError::Failed(OUT_OF_THE_WAREHOUSE)));
         }
         assert_eq!(agv.target(), None);
     }
 
     #[test]
     fn a_reset_waits_for_the_bumper() {
-        let mut agv = Agv::new([0, 0]);
+        let mut agv = Agv::<()>::new([0, 0]);
         agv.set_bumper(true);
         assert_eq!(agv.reset(), Err(ServiceError::Failed(BUMPER_IS_PRESSED)));
         agv.set_bumper(false);

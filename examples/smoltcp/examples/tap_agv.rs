@@ -18,7 +18,7 @@ use cara_core::distribution::hello::Manager;
 use cara_core::distribution::identity::Fleet;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::ServiceError;
-use cara_core::services::lease::Lease;
+use cara_core::services::lease::{Lease, Order};
 use cara_core::services::session::{Call, Event};
 use cara_core::time::{Duration, Instant};
 use cara_smoltcp::{Program, Resources, SUnit, Served, Settings};
@@ -53,7 +53,7 @@ pub(crate) struct Options {
 
 /// The functions by their slots, and the vehicle that they move.
 struct Vehicle {
-    agv: Agv,
+    agv: Agv<Order>,
     pos_info: Slot,
     battery: Slot,
     stop: Slot,
@@ -63,7 +63,7 @@ struct Vehicle {
 
 impl Program for Vehicle {
     fn serve(&mut self, call: &Call, parameters: &mut ParametersView) -> Served {
-        Served::Now(self.outcome(call.slot, parameters))
+        Served::Now(self.outcome(call, parameters))
     }
 
     fn make_safe(&mut self, _: Slot) {
@@ -78,7 +78,8 @@ impl Program for Vehicle {
 }
 
 impl Vehicle {
-    fn outcome(&mut self, function: Slot, parameters: &mut ParametersView) -> Result<(), ServiceError> {
+    fn outcome(&mut self, call: &Call, parameters: &mut ParametersView) -> Result<(), ServiceError> {
+        let function = call.slot;
         if function == self.pos_info {
             self.agv.pos_info(parameters)
         } else if function == self.battery {
@@ -89,7 +90,7 @@ impl Vehicle {
         } else if function == self.reset {
             self.agv.reset()
         } else {
-            self.agv.go_to(parameters)
+            self.agv.go_to(parameters, call.order)
         }
     }
 }
@@ -113,7 +114,7 @@ pub(crate) fn run(options: &Options, stopped: impl Fn() -> bool) -> Result<()> {
     let [_, _, third, fourth] = options.address.octets();
     let resources: &'static mut Resources = Box::leak(Box::default());
     let mut unit = SUnit::new(now(), settings, [2, 0xCA, 0x7A, 0, third, fourth], &mut device, resources);
-    let (mut vehicle, go_to) = offer(&mut unit, now())?;
+    let mut vehicle = offer(&mut unit, now())?;
     let mut ticked = now();
     while !stopped() {
         let due = unit.poll(now(), &mut device, &mut vehicle);
@@ -122,7 +123,9 @@ pub(crate) fn run(options: &Options, stopped: impl Fn() -> bool) -> Result<()> {
             let live = vehicle.lease.is_live(ticks);
             if let Some(Progress::Arrived(place)) = vehicle.agv.step(ticks.since(ticked), live) {
                 println!("arrived at {place}");
-                unit.end_lease(now(), go_to);
+            }
+            if let Some(order) = vehicle.agv.finished() {
+                unit.end_order(now(), vehicle.lease, order);
             }
             ticked = ticks;
         }
@@ -131,7 +134,7 @@ pub(crate) fn run(options: &Options, stopped: impl Fn() -> bool) -> Result<()> {
     Ok(())
 }
 
-fn offer(unit: &mut SUnit, now: Instant) -> Result<(Vehicle, Slot)> {
+fn offer(unit: &mut SUnit, now: Instant) -> Result<Vehicle> {
     static LEASE: Lease = Lease::new();
     let plain = Attributes::default();
     let vehicle = Vehicle {
@@ -148,8 +151,8 @@ fn offer(unit: &mut SUnit, now: Instant) -> Result<(Vehicle, Slot)> {
         lease: &LEASE,
     };
     let leased = Attributes { lease: Some(GO_TO_LEASE), ..plain };
-    let go_to = unit.offer(now, &Definition::parse(GO_TO)?, leased, Some(&LEASE))?;
-    Ok((vehicle, go_to))
+    unit.offer(now, &Definition::parse(GO_TO)?, leased, Some(&LEASE))?;
+    Ok(vehicle)
 }
 
 /// Waits for a frame, at most for `span`.

@@ -9,7 +9,7 @@ use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{CloseReason, Error, ServiceError};
 use cara_core::host::secure::Plain;
 use cara_core::services::hub::Hub;
-use cara_core::services::lease::Lease;
+use cara_core::services::lease::{Lease, Order};
 use cara_core::services::requests::CallId;
 use cara_core::services::session::{RequestOptions, Session, SessionStorage};
 use cara_core::services::{Context, Port, Ticket};
@@ -161,11 +161,11 @@ impl SUnit {
         session.answer(context!(self, now), ticket, results.map_err(Error::Service))
     }
 
-    /// What a leased function of this unit started is finished: its lease ends, and nothing is made safe.
-    pub fn end_lease(&mut self, now: Instant, function: Slot) {
-        if let Some(session) = &mut self.session {
-            session.end_lease(context!(self, now), function);
-        }
+    /// What an order of this lease ([`Call::order`](cara_core::services::session::Call::order)) has started is finished: it ends,
+    /// and nothing is made safe. `false` for one that has ended before.
+    pub fn end_order(&mut self, now: Instant, lease: &'static Lease, order: Order) -> bool {
+        let Some(session) = &mut self.session else { return false };
+        session.end_order(context!(self, now), lease, order)
     }
 
     /// Gives up the leases that calls of a function of the manager have begun or will begin.

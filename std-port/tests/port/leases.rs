@@ -1,11 +1,12 @@
 //! Leases over real sockets: without renewals, what a call started is stopped.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use cara_std::{
-    CommunicationSystem, Error, LeaseEnd, LeaseWatch, Peer, Renew, RequestOptions, ServiceOptions, Unit, UnitEvent,
+    Call, CommunicationSystem, Error, LeaseEnd, LeaseWatch, ParametersView, Peer, Renew, RequestOptions, ServiceError,
+    ServiceOptions, Unit, UnitEvent,
 };
 
 use crate::support::{PATIENCE, fleet, meet, number, service, system, unit, until};
@@ -17,6 +18,8 @@ struct Vehicle {
     agv: Unit<i64>,
     peer: Peer,
     lease: LeaseWatch,
+    /// That of the last call.
+    order: Arc<Mutex<Option<LeaseWatch>>>,
     stops: Arc<AtomicUsize>,
 }
 
@@ -30,17 +33,19 @@ fn vehicle() -> Vehicle {
     let safe = move || {
         stopped.fetch_add(1, Ordering::SeqCst);
     };
-    let go_to = |speed: &mut i64, mut parameters: cara_std::Parameters| {
+    let order = Arc::<Mutex<Option<LeaseWatch>>>::default();
+    let newest = order.clone();
+    let go_to = move |speed: &mut i64, call: &Call, parameters: &mut ParametersView| -> Result<(), ServiceError> {
         *speed = 5;
-        parameters.set_value("number", *speed).unwrap();
-        parameters
+        newest.lock().unwrap().clone_from(&call.lease);
+        Ok(parameters.set_value("number", *speed)?)
     };
     let definition = "go_to(number: int[1]) -> (number: int[1])".parse().unwrap();
     let options = ServiceOptions::new().lease(LEASE, safe).then(|speed: &mut i64| *speed = 0);
     let lease = agv.my_function_list().add_service(&definition, options, go_to).unwrap();
     agv.my_function_list().add_function("echo", &number(0), service(|number| number)).unwrap();
     let (peer, _) = meet(&manager, &agv);
-    Vehicle { manager, agv, peer, lease, stops }
+    Vehicle { manager, agv, peer, lease, order, stops }
 }
 
 impl Vehicle {
@@ -122,8 +127,9 @@ fn what_has_finished_ends_without_the_hook() {
     let vehicle = vehicle();
     let events = vehicle.manager.events();
     vehicle.go(Renew::Process);
-    vehicle.agv.my_function_list().end_lease("go_to");
-    assert!(!vehicle.lease.is_live());
+    assert!(!vehicle.agv.end_order(&vehicle.lease), "the service's lease is of no call");
+    let order = vehicle.order.lock().unwrap().clone().unwrap();
+    assert!(vehicle.agv.end_order(&order) && !vehicle.lease.is_live());
     loop {
         if let UnitEvent::LeaseEnded { function, why, .. } = events.recv_timeout(PATIENCE).unwrap() {
             assert_eq!((function.as_str(), why), ("go_to", LeaseEnd::Finished));

@@ -1,10 +1,12 @@
 //! The end of a call's hold of its service's lease, awaited by a thread and by a task.
 
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use cara_std::{
-    Call, CommunicationSystem, ParametersView, Peer, Renew, RequestOptions, ServiceError, ServiceOptions, Unit,
+    Call, CommunicationSystem, LeaseWatch, ParametersView, Peer, Renew, RequestOptions, ServiceError, ServiceOptions,
+    Unit,
 };
 
 use crate::support::{PATIENCE, meet, number, pair, value};
@@ -19,15 +21,20 @@ struct Vehicle {
     peer: Peer,
     /// The number of each call whose end has been awaited, once by a thread and once by a task.
     ended: Receiver<i64>,
+    /// The order of each call.
+    orders: Arc<Mutex<Vec<LeaseWatch>>>,
 }
 
 /// A vehicle whose service answers at once, and leaves a thread and a task to await the end of what it started.
 fn vehicle(length: Duration) -> Vehicle {
     let (manager, agv) = pair();
     let (tell, ended) = channel();
+    let orders = Arc::<Mutex<Vec<LeaseWatch>>>::default();
+    let begun = orders.clone();
     let go = move |call: &Call, parameters: &mut ParametersView| -> Result<(), ServiceError> {
         let (number, lease, end) = (value(parameters), call.lease.clone().unwrap(), call.lease_ended());
         let (thread, task) = (tell.clone(), tell.clone());
+        begun.lock().unwrap().push(lease.clone());
         std::thread::spawn(move || {
             lease.wait_until_ended();
             let _ = thread.send(number);
@@ -41,7 +48,7 @@ fn vehicle(length: Duration) -> Vehicle {
     let definition = "go(number: int)".parse().unwrap();
     agv.my_function_list().add_service(&definition, ServiceOptions::new().lease(length, || {}), go).unwrap();
     let (peer, _) = meet(&manager, &agv);
-    Vehicle { manager, agv, peer, ended }
+    Vehicle { manager, agv, peer, ended, orders }
 }
 
 impl Vehicle {
@@ -88,8 +95,14 @@ fn the_end_by_time_alone_is_told() {
 fn the_end_of_what_has_finished_is_told() {
     let vehicle = vehicle(LONG);
     vehicle.go(1, Renew::Process);
-    vehicle.agv.my_function_list().end_lease("go");
+    let first = vehicle.orders.lock().unwrap()[0].clone();
+    vehicle.go(2, Renew::Process);
     vehicle.assert_ended(1);
+    assert!(!vehicle.agv.end_order(&first), "it was replaced");
+    vehicle.assert_none_ended();
+    let second = vehicle.orders.lock().unwrap()[1].clone();
+    assert!(vehicle.agv.end_order(&second) && !vehicle.agv.end_order(&second));
+    vehicle.assert_ended(2);
 }
 
 #[test]

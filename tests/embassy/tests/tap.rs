@@ -248,7 +248,7 @@ async fn drive(unit: Handle<Agv>) {
     let mut parameters = Parameters::new();
     loop {
         let call = unit.next_call("go_to", &mut parameters).await.expect("it is there");
-        let begun = unit.with_state(|agv| agv.go_to(&parameters)).unwrap();
+        let begun = unit.with_state(|agv| agv.go_to(&parameters, None)).unwrap();
         while begun.is_ok() {
             embassy_time::Timer::after_micros(TICK.as_micros()).await;
             let progress = unit.with_state(|agv| agv.step(TICK, DRIVING.is_live(cara_embassy::now()))).unwrap();
@@ -256,7 +256,9 @@ async fn drive(unit: Handle<Agv>) {
                 break;
             }
         }
-        unit.my_function_list().end_lease("go_to");
+        if let Some(order) = &call.lease {
+            unit.end_order(order);
+        }
         call.reply(begun.map(|()| &*parameters)).await;
     }
 }

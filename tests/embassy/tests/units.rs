@@ -19,7 +19,7 @@ use cara_core::services::lease::Lease;
 use cara_core::services::session::RequestOptions;
 use cara_core::term::Term;
 use cara_core::time::{Duration, Instant};
-use cara_embassy::{Config, Handle, Handler, Hook, Limits, Security, ServiceOptions, UnitEvent, resources};
+use cara_embassy::{Config, Handle, Handler, Hook, LeaseWatch, Limits, Security, ServiceOptions, UnitEvent, resources};
 use cara_embassy_host::{Bench, Board, keys};
 use embassy_net::tcp::TcpSocket;
 use embassy_time::{Timer, with_timeout};
@@ -211,7 +211,7 @@ async fn drive(unit: Unit) {
             driven += 1;
         }
         let result = parameters.set_value("n", driven).map_err(|_| ServiceError::BadResults);
-        unit.my_function_list().end_lease("go_to");
+        unit.end_order(&lease);
         call.reply(result.map(|()| &*parameters)).await;
     }
 }
@@ -257,16 +257,20 @@ fn made_safe() {
     MADE_SAFE.set(MADE_SAFE.get() + 1);
 }
 
+/// When the end of each call was told.
+type Ends = Rc<RefCell<Vec<(i64, Instant)>>>;
+
 /// Calls of `haul` in tasks of their own, each of which does no more than await the end of what was started.
-fn hauling(board: &Board, unit: Unit, length: Duration) -> Rc<RefCell<Vec<(i64, Instant)>>> {
+fn hauling(board: &Board, unit: Unit, length: Duration) -> (Ends, Rc<RefCell<Vec<LeaseWatch>>>) {
     let lease = Box::leak(Box::new(Lease::new()));
     let options = ServiceOptions::new().lease(length, lease, &made_safe).then(&|state: &mut State| state.stops += 1);
     unit.my_function_list().add_service("haul(n: int)", options, Handler::task()).unwrap();
-    let ended = Rc::new(RefCell::new(Vec::new()));
-    let (told, own) = (Rc::clone(&ended), board.clone());
+    let (ended, orders) = (Ends::default(), Rc::new(RefCell::new(Vec::new())));
+    let (told, begun, own) = (Rc::clone(&ended), Rc::clone(&orders), board.clone());
     board.spawn(async move {
         let mut parameters = Parameters::new();
         while let Ok(call) = unit.next_call("haul", &mut parameters).await {
+            begun.borrow_mut().extend(call.lease);
             let (told, number) = (Rc::clone(&told), parameters.variable("n").unwrap());
             own.spawn(async move {
                 call.lease_ended().await;
@@ -275,7 +279,7 @@ fn hauling(board: &Board, unit: Unit, length: Duration) -> Rc<RefCell<Vec<(i64, 
             });
         }
     });
-    ended
+    (ended, orders)
 }
 
 /// As much as a message needs from board to board, and the 2 ms by which the end of a lease is rounded down.
@@ -286,7 +290,7 @@ fn a_task_awaits_the_end_of_its_own_call() {
     let bench = Bench::new(15);
     let ((_manager_board, manager), (board, agv)) = (manager(&bench), agv(&bench));
     let length = Duration::from_secs(60);
-    let ended = hauling(&board, agv, length);
+    let (ended, orders) = hauling(&board, agv, length);
     agv.publish_my_function_list().unwrap();
     assert!(bench.run_until(|| knows(manager, "agv", "haul"), SHORT));
     let peer = manager.peer("agv").unwrap();
@@ -305,7 +309,11 @@ fn a_task_awaits_the_end_of_its_own_call() {
     bench.run_for(AT_ONCE);
     assert_eq!((numbers(), stops()), (vec![1, 2], 1), "the second was released");
     call(3, Renew::Process);
-    agv.my_function_list().end_lease("haul");
+    let order = |number: usize| orders.borrow()[number - 1];
+    assert!(!agv.end_order(&order(2)), "the second has ended");
+    bench.run_for(AT_ONCE);
+    assert_eq!((numbers(), stops()), (vec![1, 2], 1), "the third goes on");
+    assert!(agv.end_order(&order(3)));
     bench.run_for(AT_ONCE);
     assert_eq!((numbers(), stops()), (vec![1, 2, 3], 1), "the third has finished");
     let asked = bench.now();

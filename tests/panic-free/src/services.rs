@@ -189,7 +189,7 @@ entry!(call_slots, {
 });
 
 entry!(session_leases, {
-    session().end_lease(context(), *unknown());
+    keep(session().end_order(context(), unknown(), *unknown()));
     keep(session().release(context(), *unknown()));
     session().release_beats(context(), *unknown());
 });
@@ -221,7 +221,7 @@ entry!(leases, {
     lease.set_ramp(*unknown());
     keep((lease.stage(*unknown()), lease.stage_for(*unknown(), *unknown())));
     lease.cut(*unknown());
-    lease.clear();
+    keep((lease.clear(*unknown()), lease.finish(*unknown(), *unknown())));
     keep(unknown::<Lease>().is_live(*unknown()));
     let heart = unknown::<Heart>();
     heart.set_period(*unknown());

@@ -246,8 +246,9 @@ pub trait Node {
     fn release(&self, peer: &str, function: &str) -> Result<(), Error>;
     /// A heart for one loop of the unit.
     fn heart(&self, period: Duration) -> Heart;
-    /// What a leased service started is finished.
-    fn end_lease(&self, function: &str);
+    /// What a call of a leased service started is finished; calls of all services of this name are counted, from 0. Whether
+    /// it was live.
+    fn end_order(&self, function: &str, call: usize) -> bool;
     /// Whether a service's lease is live.
     fn lease_is_live(&self, function: &str) -> bool;
 

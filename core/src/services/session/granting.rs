@@ -115,18 +115,21 @@ impl<P: Port> Session<P> {
         }
     }
 
-    /// The application has finished what calls of the leased function started: no renewal keeps it alive, no hook runs. What
-    /// has ended before was not finished, and its hook runs.
-    pub fn end_lease(&mut self, cx: &mut Context<'_, P>, slot: Slot) {
-        let is_live = |granted: &Granted| granted.end > cx.now && !is_dead(cx, granted);
-        let index = self.granted.iter().position(|granted| granted.slot == slot && is_live(granted));
-        if let Some(granted) = index.and_then(|index| take_at(&mut self.granted, index)) {
-            let service = service_of(cx, granted.slot, granted.generation);
-            if let Some((service, order)) = service.zip(granted.order) {
-                service.finish_lease(cx.now, order);
-            }
+    /// The application has finished what an order of this lease started: no renewal keeps it alive, no hook runs. `false` where
+    /// no call of this peer has that order, or it has ended before: that one was not finished, and its hook runs.
+    pub fn end_order(&mut self, cx: &mut Context<'_, P>, lease: &Lease, order: Order) -> bool {
+        // Not the function's newest one: it may have begun after the application saw that this one is done.
+        let is_meant = |granted: &Granted| {
+            granted.order == Some(order) && lease_of(cx, granted).is_some_and(|word| core::ptr::eq(word, lease))
+        };
+        let index = self.granted.iter().position(is_meant);
+        let granted = index.and_then(|index| self.granted.get(index));
+        let service = granted.and_then(|granted| service_of(cx, granted.slot, granted.generation));
+        let is_finished = service.is_some_and(|service| service.finish_lease(cx.now, order));
+        if is_finished && let Some(granted) = index.and_then(|index| take_at(&mut self.granted, index)) {
             self.tell_end(cx, granted.call, LeaseEnd::Finished);
         }
+        is_finished
     }
 
     /// A call has failed here: the lease that it holds, if it does, expires at once.

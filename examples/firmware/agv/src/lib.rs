@@ -22,17 +22,21 @@ mod terms;
 
 use core::sync::atomic::{AtomicBool, Ordering};
 
-use cara_apps::agv::{Agv, BATTERY, BUMPER, GO_TO, GO_TO_LEASE, POS_INFO, Place, Progress, RESET, STOP, TICK};
+use cara_apps::agv::{BATTERY, BUMPER, GO_TO, GO_TO_LEASE, POS_INFO, Place, Progress, RESET, STOP, TICK};
 use cara_apps::mechanic;
 use cara_core::config::Priority;
 use cara_core::error::{Cause, Error};
 use cara_core::services::access::{Functions, Rule, Verbs, Who};
 use cara_core::services::lease::{Latch, Lease};
-use cara_embassy::{Config, Handle, Handler, Hook, Limits, Runner, Security, ServiceOptions, now, resources};
+use cara_embassy::{
+    Config, Handle, Handler, Hook, LeaseWatch, Limits, Runner, Security, ServiceOptions, now, resources,
+};
 use cara_settings::{Network, Settings};
 use embassy_net::{Ipv4Cidr, Stack, StaticConfigV4};
 use embassy_time::{Duration, Ticker};
 
+/// The vehicle, which keeps the lease of the call that it drives for.
+pub type Agv = cara_apps::agv::Agv<LeaseWatch>;
 /// An AGV.
 pub type Vehicle = Handle<Agv>;
 /// Its limits: one manager, messages of 1 KiB.
@@ -145,7 +149,7 @@ fn offer(vehicle: Vehicle) -> Result<(), Error> {
         agv.reset()
     });
     let go_to = Handler::method(&|agv: &mut Agv, call, pos| {
-        call.commit(|| agv.go_to(pos).inspect(|()| HAS_TARGET.store(true, Ordering::Release)))??;
+        call.commit(|| agv.go_to(pos, call.lease).inspect(|()| HAS_TARGET.store(true, Ordering::Release)))??;
         info!("driving");
         Ok(())
     });
@@ -187,15 +191,18 @@ pub async fn drive(vehicle: Vehicle) -> ! {
         let progress = vehicle.with_state(|agv| {
             let progress = agv.step(TICK, DRIVING.is_live(now()));
             HAS_TARGET.store(agv.target().is_some(), Ordering::Release);
-            progress
+            (progress, agv.finished())
         });
+        let Ok((progress, finished)) = progress else { continue };
+        if let Some(order) = finished {
+            vehicle.end_order(&order);
+        }
         match progress {
-            Ok(Some(Progress::Arrived(place))) => {
+            Some(Progress::Arrived(place)) => {
                 let [_x, _y] = place.rounded();
-                vehicle.my_function_list().end_lease("go_to");
                 info!("arrived at {} {}", _x, _y);
             }
-            Ok(Some(Progress::Stopped(place))) => tell_stop(place),
+            Some(Progress::Stopped(place)) => tell_stop(place),
             _ => {}
         }
     }

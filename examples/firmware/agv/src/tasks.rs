@@ -1,10 +1,9 @@
 //! Tasks that every board spawns as they are. Those of its network, button, LED and watchdog are the board's own,
 //! because their types are.
 
-use cara_apps::agv::Agv;
 use cara_embassy::Runner;
 
-use crate::Vehicle;
+use crate::{Agv, Vehicle};
 
 /// The unit's task, which the watchdog looks at.
 #[embassy_executor::task]

@@ -4,12 +4,12 @@
 
 use core::cell::Cell;
 
-use cara_apps::agv::{Agv, GO_TO_LEASE};
+use cara_apps::agv::GO_TO_LEASE;
 use cara_core::distribution::parameters::{Parameters, ParametersView};
 use cara_core::error::Error;
 use cara_core::services::lease::Lease;
 use cara_embassy::{Handler, LeaseWatch, ServiceOptions, TakenCall};
-use cara_vehicle::Vehicle;
+use cara_vehicle::{Agv, Vehicle};
 use critical_section::Mutex;
 use embassy_time::{Duration, Instant, Timer};
 

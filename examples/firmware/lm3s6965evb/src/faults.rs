@@ -11,13 +11,13 @@ use core::cell::Cell;
 use core::mem::{MaybeUninit, size_of};
 use core::sync::atomic::{AtomicBool, Ordering};
 
-use cara_apps::agv::{Agv, GO_TO_LEASE};
+use cara_apps::agv::GO_TO_LEASE;
 use cara_board::Reason;
 use cara_core::error::{Error, ServiceError};
 use cara_core::services::lease::Lease;
 use cara_core::time::{Duration as CoreDuration, Instant};
 use cara_embassy::{Handler, Hook, ServiceOptions, now};
-use cara_vehicle::{DRIVING, Vehicle};
+use cara_vehicle::{Agv, DRIVING, Vehicle};
 use critical_section::Mutex;
 use embassy_sync::blocking_mutex::raw::CriticalSectionRawMutex;
 use embassy_sync::signal::Signal;

@@ -4,11 +4,14 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
-use cara_apps::agv::{Agv, BATTERY, BUMPER, GO_TO, GO_TO_LEASE, POS_INFO, Progress, RESET, STOP, TICK};
+use cara_apps::agv::{BATTERY, BUMPER, GO_TO, GO_TO_LEASE, POS_INFO, Progress, RESET, STOP, TICK};
 use cara_apps::mechanic;
 use cara_examples::{NameAndId, Network, Stop, log_to_stderr, say};
-use cara_std::{Actuator, Call, Definition, ParametersView, Priority, ServiceOptions, Unit, UnitEvent};
+use cara_std::{Actuator, Call, Definition, LeaseWatch, ParametersView, Priority, ServiceOptions, Unit, UnitEvent};
 use clap::Parser;
+
+/// The vehicle, which keeps the lease of the call that it drives for.
+type Agv = cara_apps::agv::Agv<LeaseWatch>;
 
 /// How often the AGV says where it is.
 const POSITION_EVERY: Duration = Duration::from_millis(500);
@@ -54,7 +57,7 @@ fn offer(unit: &Unit, agv: &Arc<Mutex<Agv>>) -> Result<Actuator> {
     let agv = own();
     let go_to = move |call: &Call, pos: &mut ParametersView| {
         let mut agv = lock(&agv);
-        call.commit(|| agv.go_to(pos))??;
+        call.commit(|| agv.go_to(pos, call.lease.clone()))??;
         agv.target().into_iter().for_each(|target| say!("driving to {target}"));
         Ok(())
     };
@@ -111,16 +114,16 @@ fn run_motors(unit: &Unit, agv: &Mutex<Agv>, drive: &Actuator, stop: &Stop) -> R
         }
         let elapsed = last.elapsed();
         last += elapsed;
-        let (progress, place) = {
+        let (progress, place, finished) = {
             let mut agv = lock(agv);
-            (agv.step(elapsed.into(), order.is_live()), agv.place())
+            (agv.step(elapsed.into(), order.is_live()), agv.place(), agv.finished())
         };
+        if let Some(order) = finished {
+            unit.end_order(&order);
+        }
         match progress {
             Some(Progress::Passed(place)) => say!("passed {place}"),
-            Some(Progress::Arrived(place)) => {
-                unit.my_function_list().end_lease("go_to");
-                say!("arrived at {place}");
-            }
+            Some(Progress::Arrived(place)) => say!("arrived at {place}"),
             Some(Progress::Stopped(place)) => not_wanted(place),
             None => {}
         }

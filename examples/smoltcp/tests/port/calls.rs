@@ -201,8 +201,8 @@ fn what_is_finished_is_not_made_safe() {
     drive(&mut world);
     let now = world.now;
     let vehicle = &mut world.vehicles[0];
-    let go_to = vehicle.program.go_to.unwrap();
-    vehicle.unit.end_lease(now, go_to);
+    let order = vehicle.program.drives_for.unwrap();
+    assert!(vehicle.unit.end_order(now, vehicle.lease, order) && !vehicle.unit.end_order(now, vehicle.lease, order));
     vehicle.wake();
     world.run(SECOND.times(5));
     assert_eq!(world.vehicles[0].program.made_safe, []);

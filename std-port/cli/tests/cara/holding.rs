@@ -1,7 +1,7 @@
 //! `cara call --hold`: the operator keeps the lease, and gives it up by going away.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use cara_std::{
@@ -17,6 +17,8 @@ const LEASE: Duration = Duration::from_millis(1_200);
 struct Driver {
     unit: Unit,
     lease: LeaseWatch,
+    /// That of the last call.
+    order: Arc<Mutex<Option<LeaseWatch>>>,
     made_safe: Arc<AtomicU32>,
 }
 
@@ -24,7 +26,13 @@ impl Driver {
     fn join(stage: &Stage) -> Self {
         stage.know("driver", 99);
         let unit = stage.vehicle("driver", 99).build().unwrap();
-        let drive = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
+        let order = Arc::<Mutex<Option<LeaseWatch>>>::default();
+        let newest = order.clone();
+        let drive = move |call: &Call, _: &mut ParametersView| -> Result<(), ServiceError> {
+            newest.lock().unwrap().clone_from(&call.lease);
+            Ok(())
+        };
+        let look = |_: &Call, _: &mut ParametersView| -> Result<(), ServiceError> { Ok(()) };
         let made_safe = Arc::new(AtomicU32::new(0));
         let counted = made_safe.clone();
         let safe = move || {
@@ -40,11 +48,11 @@ impl Driver {
         };
         let short = ServiceOptions::new().lease(LEASE, || {});
         functions.add_service(&Definition::parse("carry()").unwrap(), short, carry).unwrap();
-        functions.add_service(&Definition::parse("look()").unwrap(), ServiceOptions::new(), drive).unwrap();
+        functions.add_service(&Definition::parse("look()").unwrap(), ServiceOptions::new(), look).unwrap();
         unit.publish_my_function_list().unwrap();
         unit.start().unwrap();
         until(|| stage.cara(&["functions", "driver"]).out.contains("drive()"));
-        Self { unit, lease, made_safe }
+        Self { unit, lease, order, made_safe }
     }
 
     /// `cara call driver --hold drive`, when the vehicle has driven for some lengths of its lease.
@@ -77,7 +85,8 @@ fn what_is_held_goes_on_until_it_has_finished() {
     let stage = Stage::with(&[]);
     let driver = Driver::join(&stage);
     let mut held = driver.held(&stage);
-    driver.unit.my_function_list().end_lease("drive");
+    let order = driver.order.lock().unwrap().clone().unwrap();
+    assert!(driver.unit.end_order(&order));
     held.expect("finished");
     assert_eq!(held.end(), 0);
     assert_eq!(driver.made_safe(), 0, "what has finished needs no safe hook");

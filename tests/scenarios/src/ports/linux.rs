@@ -75,6 +75,8 @@ struct LinuxNode {
     events: Mutex<Vec<(Instant, Seen)>>,
     losses: Arc<Mutex<Vec<Instant>>>,
     leases: Mutex<BTreeMap<String, LeaseWatch>>,
+    /// Of the calls of each service.
+    orders: Mutex<BTreeMap<String, Vec<LeaseWatch>>>,
 }
 
 struct Handle {
@@ -183,6 +185,7 @@ impl World for LinuxWorld {
             events: Mutex::default(),
             losses: Arc::default(),
             leases: Mutex::default(),
+            orders: Mutex::default(),
         });
         node.start();
         self.units.push(Arc::clone(&node));
@@ -391,6 +394,7 @@ fn serve(
 ) -> Result<(), ServiceError> {
     let node = node.upgrade().ok_or(ServiceError::NotReady)?;
     service.log().begin(node.now());
+    lock(&node.orders).entry(service.name().to_owned()).or_default().extend(call.lease.clone());
     if let Some(function) = &service.calls_back {
         let peer = node.peer(call.caller.name()).map_err(|_| ServiceError::NotReady)?;
         peer.block_request(function, parameters).map_err(|_| ServiceError::NotReady)?;
@@ -591,9 +595,11 @@ impl Node for Handle {
         Heart::new(heart.renew(), move || heart.beat())
     }
 
-    fn end_lease(&self, function: &str) {
-        if let Ok(machine) = self.node.machine() {
-            machine.functions().end_lease(function);
+    fn end_order(&self, function: &str, call: usize) -> bool {
+        let order = lock(&self.node.orders)[function][call].clone();
+        match &*self.node.machine().expect("the unit runs") {
+            Machine::Manager(system) => system.end_order(&order),
+            Machine::Agv(unit) => unit.end_order(&order),
         }
     }
 

@@ -52,7 +52,11 @@ struct SimNode {
     number: usize,
     handle: UnitHandle,
     losses: Rc<RefCell<Vec<Instant>>>,
+    orders: Orders,
 }
+
+/// Of the calls of each service.
+type Orders = Rc<RefCell<BTreeMap<String, Vec<LeaseWatch>>>>;
 
 impl SimWorld {
     pub(super) fn new(seed: u64, profile: FaultProfile, mode: Mode) -> Self {
@@ -147,10 +151,14 @@ impl World for SimWorld {
             Some(span) => new.renews_every(span),
             None => new,
         };
+        let orders = Orders::default();
+        let begun = Rc::clone(&orders);
         let program = move |unit: &UnitHandle| {
+            // Of this life alone.
+            begun.borrow_mut().clear();
             for service in &services {
                 unit.my_function_list()
-                    .add_service(&service.signature, simulated(service))
+                    .add_service(&service.signature, simulated(service, &begun))
                     .expect("a unit has room for its services");
             }
             if published {
@@ -168,7 +176,7 @@ impl World for SimWorld {
         if self.profile == FaultProfile::Rough {
             self.schedule_partitions(handle.host());
         }
-        let node = Rc::new(SimNode { number: self.units.len(), handle, losses });
+        let node = Rc::new(SimNode { number: self.units.len(), handle, losses, orders });
         self.units.push(Rc::clone(&node));
         node
     }
@@ -335,13 +343,18 @@ impl SimWorld {
 }
 
 /// A service of the scenario as the simulator runs it.
-fn simulated(service: &Service) -> cara_sim::Service {
+fn simulated(service: &Service, orders: &Orders) -> cara_sim::Service {
     let log = service.log();
+    let (orders, name) = (Rc::clone(orders), service.name().to_owned());
+    let begins = move |call: &cara_sim::Call| {
+        orders.borrow_mut().entry(name.clone()).or_default().extend(call.lease.clone());
+    };
     let kept = service.clone();
     let plain = !service.awaits();
     let made = if plain {
         cara_sim::Service::new(move |call, parameters| {
             kept.log().begin(call.unit.now());
+            begins(call);
             let result = (kept.body)(&Asked { caller: call.caller.clone(), at: call.unit.now() }, parameters);
             kept.log().end(call.unit.now());
             result
@@ -351,6 +364,7 @@ fn simulated(service: &Service) -> cara_sim::Service {
         let kept = Rc::new(kept);
         cara_sim::Service::future(move |call, mut parameters| {
             let kept = Rc::clone(&kept);
+            begins(&call);
             async move {
                 kept.log().begin(call.unit.now());
                 if let Some(function) = &kept.calls_back {
@@ -393,11 +407,11 @@ impl Node for SimNode {
     }
 
     fn add_service(&self, service: &Service) -> Result<(), Error> {
-        self.handle.my_function_list().add_service(&service.signature, simulated(service))
+        self.handle.my_function_list().add_service(&service.signature, simulated(service, &self.orders))
     }
 
     fn replace_service(&self, service: &Service) -> Result<(), Error> {
-        self.handle.my_function_list().replace(&service.signature, simulated(service))
+        self.handle.my_function_list().replace(&service.signature, simulated(service, &self.orders))
     }
 
     fn remove_service(&self, name: &str) -> Result<(), Error> {
@@ -485,8 +499,9 @@ impl Node for SimNode {
         Heart::new(heart.renew(), move || heart.beat())
     }
 
-    fn end_lease(&self, function: &str) {
-        let _ = self.handle.end_lease(function);
+    fn end_order(&self, function: &str, call: usize) -> bool {
+        let order = self.orders.borrow()[function][call].clone();
+        self.handle.end_order(&order)
     }
 
     fn lease_is_live(&self, function: &str) -> bool {

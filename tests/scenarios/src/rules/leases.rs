@@ -27,6 +27,7 @@ scenarios![
     a_released_lease_stops_at_once: "lease of a service", Light, [], ["stopped"];
     what_a_service_that_goes_has_started_stops_at_once: "lease of a service", Light, [], ["gone"];
     what_is_finished_needs_no_safe_hook: "lease of a service", Light, [], ["finished"];
+    what_is_finished_is_one_order_and_not_the_newer_one: "lease of a service", Light, [], ["went on"];
 ];
 
 /// The lease in this file. In real time a busy machine may delay renewals.
@@ -264,7 +265,7 @@ fn what_is_finished_needs_no_safe_hook(world: &mut dyn World) {
     let agv = world.add(Spec::agv("agv", 7).service(&service));
     met(world, &manager, "agv", "drive");
     drive(world, &manager);
-    agv.end_lease("drive");
+    assert!(agv.end_order("drive", 0));
     assert!(!agv.lease_is_live("drive"));
     let finished = |event: &Seen| *event == Seen::LeaseEnded("drive".to_owned(), LeaseEnd::Finished);
     world.wait("the caller is told", || manager.count(finished) == 1, secs(10));
@@ -273,4 +274,20 @@ fn what_is_finished_needs_no_safe_hook(world: &mut dyn World) {
     if service.log().stops().is_empty() {
         world.reached("finished");
     }
+}
+
+fn what_is_finished_is_one_order_and_not_the_newer_one(world: &mut dyn World) {
+    // So long that nothing ends by time.
+    let service = Service::new("drive(n: int[1])").lease(secs(60));
+    let (manager, agv) = pair(world, &service);
+    drive(world, &manager);
+    drive(world, &manager);
+    assert!(!agv.end_order("drive", 0), "the second one has replaced it");
+    let finished = |event: &Seen| *event == Seen::LeaseEnded("drive".to_owned(), LeaseEnd::Finished);
+    world.run_for(millis(300));
+    assert!(agv.lease_is_live("drive") && manager.count(finished) == 0);
+    world.reached("went on");
+    assert!(agv.end_order("drive", 1) && !agv.lease_is_live("drive"));
+    world.wait("the caller is told", || manager.count(finished) == 1, secs(10));
+    assert_eq!(service.log().stops(), []);
 }

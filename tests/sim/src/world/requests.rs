@@ -8,7 +8,7 @@ use cara_core::services::session::RequestOptions;
 
 use super::handle::{Peer, UnitHandle};
 use super::replies::{Promise, Waiting};
-use super::service::{BoxedParameters, boxed_parameters};
+use super::service::{BoxedParameters, LeaseWatch, boxed_parameters};
 use crate::event::StreamId;
 
 impl UnitHandle {
@@ -134,13 +134,15 @@ impl UnitHandle {
         Ok(())
     }
 
-    /// What a leased service of this unit started is finished: its lease ends, and no safe hook runs.
-    pub fn end_lease(&self, function: &str) -> Result<(), Error> {
-        let slot = self.machine(|machine, _| machine.links.functions.find(function))?.ok_or(Error::UnknownFunction)?;
+    /// What an order of this unit (`call.lease`) has started is finished: it ends, no safe hook runs, and its caller is told so.
+    /// `false` for one that has ended before.
+    pub fn end_order(&self, order: &LeaseWatch) -> bool {
+        let mut is_finished = false;
         self.each_link(|links, network, index| {
-            links.with(network, index, |session, cx| session.end_lease(cx, slot));
+            let ended = links.with(network, index, |session, cx| session.end_order(cx, order.word(), order.order()));
+            is_finished |= ended == Some(true);
         });
-        Ok(())
+        is_finished
     }
 
     /// Whether the lease of one of its own services is live now; false for one without a lease.

@@ -74,9 +74,17 @@ impl LeaseWatch {
         Some(Self { actuator: service.actuator.clone()?, order: order?, unit: unit.clone() })
     }
 
+    pub(super) fn word(&self) -> &Lease {
+        self.actuator.word()
+    }
+
+    pub(super) const fn order(&self) -> Order {
+        self.order
+    }
+
     /// Whether the caller still wants what this call started.
     pub fn is_live(&self) -> bool {
-        self.actuator.word().is_live_for(self.order, self.unit.clock())
+        self.word().is_live_for(self.order, self.unit.clock())
     }
 
     /// Does what the order wants, or nothing once it has ended.
@@ -142,7 +150,7 @@ impl Service {
     /// What a call of it started is made safe when the service goes.
     pub(super) fn goes(&self, unit: &UnitHandle) {
         if let Some(actuator) = self.actuator.as_ref().filter(|_| self.attributes.lease.is_some())
-            && actuator.word().clear()
+            && actuator.word().clear(unit.clock())
         {
             actuator.make_safe(unit);
         }

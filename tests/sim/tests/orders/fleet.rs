@@ -275,7 +275,7 @@ fn vehicle(unit: &UnitHandle, watch: &Shared, number: usize, seed: u64) {
     *known.borrow_mut() = Some(actuators.clone());
     for (function, does) in FUNCTIONS {
         let service = match does {
-            Does::Move(actuator) => mover(watch, number, actuator, function, &actuators),
+            Does::Move(actuator) => mover(watch, number, actuator, &actuators),
             _ => plain(watch, number, does, &actuators),
         };
         let service = match does {
@@ -342,7 +342,7 @@ fn plain(watch: &Shared, number: usize, does: Does, actuators: &[Actuator; 2]) -
 }
 
 /// What moves: it commits at once, moves while it may, and commits again.
-fn mover(watch: &Shared, number: usize, actuator: usize, function: &'static str, actuators: &[Actuator; 2]) -> Service {
+fn mover(watch: &Shared, number: usize, actuator: usize, actuators: &[Actuator; 2]) -> Service {
     let (watch, all) = (Rc::clone(watch), actuators.clone());
     let service = Service::future(move |call, parameters| {
         let (watch, actuators, n) = (Rc::clone(&watch), all.clone(), number_of(&parameters));
@@ -352,7 +352,7 @@ fn mover(watch: &Shared, number: usize, actuator: usize, function: &'static str,
             watch.borrow_mut().handler(n, number, Some(&order), seen(&call.unit));
             let commit = || watch.borrow_mut().commit(n, actuator, call.commit(|| ()).is_ok(), seen(&call.unit));
             commit();
-            call.unit.spawn(moving(Rc::clone(&watch), n, actuator, function, actuators.clone(), call.clone()));
+            call.unit.spawn(moving(Rc::clone(&watch), n, actuator, actuators.clone(), call.clone()));
             if n % 3 == 0 {
                 call.unit.sleep(millis(20 * (n as u64 % 23))).await;
                 commit();
@@ -364,19 +364,12 @@ fn mover(watch: &Shared, number: usize, actuator: usize, function: &'static str,
 }
 
 /// The loop of one order.
-async fn moving(
-    watch: Shared,
-    n: usize,
-    actuator: usize,
-    function: &'static str,
-    actuators: [Actuator; 2],
-    call: cara_sim::Call,
-) {
+async fn moving(watch: Shared, n: usize, actuator: usize, actuators: [Actuator; 2], call: cara_sim::Call) {
     let order = call.lease.clone().expect("it has a lease");
     for turn in 0_u64.. {
         call.unit.sleep(PULSE).await;
         if n % 16 == 2 && turn == 40 && order.is_live() {
-            call.unit.end_lease(function).expect("it is there");
+            assert!(call.unit.end_order(&order), "it is live");
             watch.borrow_mut().finish(n, actuator);
         }
         let (is_live, seen) = (order.is_live(), seen(&call.unit, &actuators));

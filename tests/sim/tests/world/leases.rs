@@ -80,11 +80,25 @@ fn without_renewal_the_lease_ends_by_itself() {
 }
 
 #[test]
-fn what_is_finished_ends_its_lease_without_the_safe_hook() {
+fn what_is_finished_is_one_order_and_ends_without_the_safe_hook() {
     let (mut world, manager, agv, _, stopped) = driving(4);
-    world.run_for(millis(100));
-    agv.end_lease("drive").unwrap();
+    let ((begun, orders), (stops, lifted)) = (shared(Vec::<LeaseWatch>::new()), shared(0));
+    let lift = Service::new(move |call, _| {
+        begun.borrow_mut().extend(call.lease.clone());
+        Ok(())
+    });
+    agv.my_function_list().add_service("lift()", lift.lease(LEASE, move |_| *stops.borrow_mut() += 1)).unwrap();
+    agv.publish_my_function_list().unwrap();
+    assert!(world.run_until(|_| manager.knows("agv", "lift"), secs(10)));
+    for _ in 0..2 {
+        manager.request_with("agv", "lift", &Parameters::new(), RequestOptions::renewing(Renew::Process)).unwrap();
+        world.run_for(millis(100));
+    }
+    let [older, newer] = &orders.borrow()[..] else { panic!("two have begun") };
+    assert!(!agv.end_order(older), "it was replaced");
     world.run_for(secs(2));
-    assert_eq!(*stopped.borrow(), 0);
+    assert!(agv.lease_is_live("lift") && agv.end_order(newer) && !agv.end_order(newer));
+    world.run_for(secs(2));
+    assert_eq!((*lifted.borrow(), *stopped.borrow(), agv.lease_is_live("drive")), (0, 0, true));
     assert_eq!(manager.count(|event| matches!(event, UnitEvent::LeaseEnded { why: LeaseEnd::Finished, .. })), 1);
 }

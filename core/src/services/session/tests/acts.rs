@@ -19,7 +19,7 @@ use crate::host::connections::LinkCounter;
 use crate::host::frame::{ChunkWriter, Chunking};
 use crate::services::Context;
 use crate::services::heart::{Beats, Renew};
-use crate::services::lease::{Lease, LeaseEnd};
+use crate::services::lease::{Lease, LeaseEnd, Order};
 use crate::services::requests::CallId;
 use crate::storage::Buffers;
 use crate::time::Duration;
@@ -173,8 +173,16 @@ impl Side {
         lease.as_ref().unwrap().is_live_for(call.order.unwrap(), self.now)
     }
 
-    pub(super) fn end_lease(&mut self, slot: Slot) {
-        self.session.end_lease(context!(self), slot);
+    /// The vehicle's program says that it has finished an order of a function.
+    pub(super) fn end_order(&mut self, slot: Slot, order: Order) -> bool {
+        let lease = self.functions.function(slot).unwrap().handler.lease.clone().unwrap();
+        self.session.end_order(context!(self), &lease, order)
+    }
+
+    /// The order that a call of the peer has here.
+    pub(super) fn order_of(&self, call: CallId) -> Order {
+        let granted = self.session.granted.iter().find(|granted| granted.call == call.0);
+        granted.and_then(|granted| granted.order).unwrap()
     }
 
     pub(super) fn withdraw(&mut self, slot: Slot) -> u32 {

@@ -343,6 +343,23 @@ fn a_reset_lifts_no_stop_but_the_one_that_it_saw() {
     }
 }
 
+/// Orders of two actuators may have the same number.
+#[test]
+fn what_is_finished_is_an_order_of_the_actuator_that_was_named() {
+    let (mut pair, [go, dock, lift]) = vehicle();
+    let (drives, lifts) = (call(&mut pair, "go"), call(&mut pair, "lift"));
+    let [driving, lifting] = [drives, lifts].map(|call| pair.agv.order_of(call));
+    assert_eq!(driving, lifting);
+    assert!(pair.agv.end_order(lift, lifting) && !pair.agv.end_order(lift, driving));
+    pair.run(LEASE);
+    assert!(pair.agv.is_live(go) && !pair.agv.is_live(lift));
+    assert!(pair.manager.is_told(lifts, LeaseEnd::Finished) && pair.manager.session.holds(drives));
+    // Whichever function moves it: the order is the actuator's.
+    assert!(pair.agv.end_order(dock, driving));
+    pair.run(LEASE);
+    assert!(pair.manager.is_told(drives, LeaseEnd::Finished) && hooks(&pair) == 0);
+}
+
 /// What was stopped was not finished, even if its program says so before anything has looked.
 #[test]
 fn what_was_stopped_is_made_safe_and_not_finished() {
@@ -350,7 +367,8 @@ fn what_was_stopped_is_made_safe_and_not_finished() {
     let driving = call(&mut pair, "go");
     let now = pair.agv.now;
     pair.agv.functions.function(go).unwrap().handler.inhibit(now, Latch { by: 0, reason: 9 });
-    pair.agv.end_lease(go);
+    let order = pair.agv.order_of(driving);
+    assert!(!pair.agv.end_order(go, order));
     pair.run(LEASE);
     assert!(pair.manager.is_told(driving, LeaseEnd::Stopped) && hooks(&pair) == 1);
 }
@@ -402,7 +420,8 @@ fn the_caller_is_told_the_state_of_what_it_moves() {
     let events = pair.manager.happened.len();
     pair.run(Duration::from_secs(5));
     assert_eq!(pair.manager.happened.len(), events, "what has not changed is not told again");
-    pair.agv.end_lease(go);
+    let order = pair.agv.order_of(moves);
+    assert!(pair.agv.end_order(go, order));
     pair.run(Duration::from_secs(1));
     let last = LastOrder { end: Some(LeaseEnd::Finished), ..last };
     assert_eq!(state(&pair, dock).unwrap().last, Some(last));

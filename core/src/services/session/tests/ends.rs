@@ -6,11 +6,13 @@ use super::super::Event;
 use super::super::Publication;
 use super::pair::Pair;
 use super::setup::Setup;
-use super::side::Side;
+use super::side::{Side, context};
 use super::{none, text, x};
 use crate::distribution::connection_handler::Directive;
 use crate::distribution::function_list::TheirFunctionList;
 use crate::error::{CloseReason, Error};
+use crate::services::Context;
+use crate::services::lease::Lease;
 use crate::storage::Boxed;
 use crate::time::{Duration, Instant};
 
@@ -119,9 +121,11 @@ fn a_link_that_has_ended_does_and_keeps_nothing() {
     pair.manager.call("pos_info", &super::parameters(|p| p.add_int("position", 2).unwrap())).unwrap();
     pair.cut();
     assert_eq!(pair.manager.call("pos_info", &none()), Err(Error::NotConnected));
+    let lease = Lease::new();
+    let order = lease.begin(Instant::START, Instant::FAR_FUTURE).unwrap();
     for side in [&mut pair.manager, &mut pair.agv] {
         assert_eq!(side.release(slot), Err(Error::NotConnected));
-        side.end_lease(slot);
+        assert!(!side.session.end_order(context!(side), &lease, order));
         side.direct(Directive::Challenge);
         side.publish();
         side.withdraw(slot);

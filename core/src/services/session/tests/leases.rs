@@ -315,12 +315,31 @@ fn an_order_that_fails_leaves_nothing_going_on() {
 #[test]
 fn a_motion_that_is_finished_ends_its_lease_without_the_hook() {
     let (mut pair, slot) = moving(true);
-    pair.agv.end_lease(slot);
+    let order = pair.agv.order_of(CallId(1));
+    assert!(pair.agv.end_order(slot, order) && !pair.agv.end_order(slot, order));
     pair.settle();
     assert!(!pair.agv.is_live(slot));
     assert!(is_told(&pair, LeaseEnd::Finished));
     pair.run(Duration::from_secs(2));
     assert_eq!((expirations(&pair), pair.agv.counter(LinkCounter::RenewalsIgnored)), (0, 0));
+}
+
+/// The program has seen that the first order is done, and says so when the next one of the same function has begun.
+#[test]
+fn what_is_finished_is_the_order_that_was_named_and_not_the_newer_one() {
+    let (mut pair, slot) = moving(true);
+    let older = pair.agv.order_of(CallId(1));
+    let newer = pair.manager.call("go", &none()).unwrap();
+    pair.settle();
+    assert!(!pair.agv.end_order(slot, older), "it was replaced");
+    pair.run(Duration::from_secs(2));
+    assert!(pair.agv.is_live(slot) && pair.manager.session.holds(newer), "the newer one goes on");
+    assert!(is_told(&pair, LeaseEnd::Replaced) && !pair.manager.is_told(newer, LeaseEnd::Finished));
+    let order = pair.agv.order_of(newer);
+    assert!(pair.agv.end_order(slot, order));
+    pair.settle();
+    assert!(!pair.agv.is_live(slot) && pair.manager.is_told(newer, LeaseEnd::Finished));
+    assert_eq!(expirations(&pair), 0);
 }
 
 #[test]

@@ -1,11 +1,13 @@
 //! A lease belongs to one call: the failure of a call ends what it started, and nothing else.
 
+use std::vec::Vec;
+
 use super::super::Event;
 use super::super::{Call, RequestOptions};
 use super::net::Datagrams;
 use super::pair::Pair;
 use super::{none, x};
-use crate::config::Priority;
+use crate::config::{LEASES, Priority};
 use crate::distribution::connection_handler::Directive;
 use crate::distribution::function_list::Slot;
 use crate::distribution::message::{Renewal, SessionBody};
@@ -85,24 +87,65 @@ fn a_call_whose_answer_does_not_come_through_is_released_at_once() {
 }
 
 #[test]
-fn a_cancelled_call_is_released_at_once_waited_for_or_answered() {
-    for answered in [false, true] {
+fn a_cancelled_call_is_released_at_once_waited_for_or_answered_renewed_or_not() {
+    for (answered, renew) in
+        [(false, Renew::Process), (true, Renew::Process), (false, Renew::Never), (true, Renew::Never)]
+    {
         let (mut pair, slot) = vehicle();
-        let (id, _) = begun(&mut pair, Priority::Normal);
+        let id = go(&mut pair, Priority::High, renew);
+        pair.settle();
         if answered {
             pair.agv.answer_held(Ok(&*none()));
             pair.settle();
         }
         pair.run(millis(100));
-        assert!(pair.agv.is_live(slot) && pair.manager.session.holds(id));
+        assert!(pair.agv.is_live(slot) && pair.manager.session.holds(id) == (renew == Renew::Process));
         pair.manager.cancel(id);
         pair.settle();
-        assert_eq!((pair.agv.is_live(slot), expirations(&pair)), (false, 1), "answered: {answered}");
+        assert_eq!((pair.agv.is_live(slot), expirations(&pair)), (false, 1), "answered: {answered}, {renew:?}");
         assert!(!pair.manager.session.holds(id));
+        let sent = pair.manager.counter(LinkCounter::DatagramsSent);
         pair.manager.cancel(id);
+        assert_eq!(pair.manager.counter(LinkCounter::DatagramsSent), sent, "it is released once");
         pair.run(LEASE);
         assert_eq!(expirations(&pair), 1);
     }
+}
+
+#[test]
+fn nothing_is_sent_for_an_answered_call_that_the_peer_has_ended() {
+    let (mut pair, slot) = vehicle();
+    let id = go(&mut pair, Priority::Normal, Renew::Never);
+    pair.settle();
+    pair.agv.answer_held(Ok(&*none()));
+    pair.run(LEASE.times(2));
+    assert!(!pair.agv.is_live(slot));
+    let sent = pair.manager.counter(LinkCounter::DatagramsSent);
+    pair.manager.cancel(id);
+    assert_eq!(pair.manager.counter(LinkCounter::DatagramsSent), sent);
+}
+
+#[test]
+fn answered_calls_of_several_functions_are_released_at_once_however_often_one_of_them_was_called() {
+    let mut pair = Pair::live();
+    let slots: Vec<Slot> = (0..LEASES).map(|at| pair.agv.offer_leased(&std::format!("go_{at}()"), LEASE)).collect();
+    pair.publish();
+    let call = |pair: &mut Pair, at: usize| {
+        let options = RequestOptions { timeout: Some(TIMEOUT), ..RequestOptions::default() };
+        let id = pair.manager.request_with(&std::format!("go_{at}"), &none(), &options, true).unwrap();
+        pair.settle();
+        id
+    };
+    let calls: Vec<CallId> = (0..LEASES).map(|at| call(&mut pair, at)).collect();
+    // Of one function the newest: the peer has replaced those before it.
+    let newest = [1; 6].map(|at| call(&mut pair, at))[5];
+    for (at, id) in [(0, calls[0]), (1, newest), (2, calls[2]), (3, calls[3])] {
+        assert!(pair.agv.is_live(slots[at]), "go_{at}");
+        pair.manager.cancel(id);
+        pair.settle();
+        assert!(!pair.agv.is_live(slots[at]), "go_{at}");
+    }
+    assert_eq!(expirations(&pair), 4);
 }
 
 #[test]
@@ -173,8 +216,15 @@ fn a_best_effort_call_that_arrives_behind_its_release_does_not_begin() {
 
 #[test]
 fn a_release_that_finds_no_room_is_sent_when_there_is_some() {
+    for renew in [Renew::Process, Renew::Never] {
+        release_without_room(renew);
+    }
+}
+
+fn release_without_room(renew: Renew) {
     let (mut pair, slot) = vehicle();
-    let (first, _) = begun(&mut pair, Priority::Normal);
+    let first = go(&mut pair, Priority::Normal, renew);
+    pair.settle();
     pair.agv.answer_held(Ok(&*none()));
     pair.settle();
     // The stream is stuck and full to the brim; no datagram passes.
@@ -232,6 +282,34 @@ fn in_a_full_table_the_oldest_call_of_the_function_gives_way() {
     pair.manager.net.frozen = false;
     pair.settle();
     assert_eq!(pair.agv.ran().len(), 0);
+}
+
+/// The table of renewed calls is full, and the newer call of a function is still on its way when the older one is dropped.
+#[test]
+fn what_gives_way_in_a_full_table_is_released_at_once_when_its_caller_drops_it() {
+    let (mut pair, slot) = vehicle();
+    for at in 1..LEASES {
+        pair.agv.offer_leased(&std::format!("lift_{at}()"), LEASE);
+    }
+    pair.publish();
+    let (older, _) = begun(&mut pair, Priority::Normal);
+    pair.agv.answer_held(Ok(&*none()));
+    pair.settle();
+    for at in 1..LEASES {
+        pair.manager.call(&std::format!("lift_{at}"), &none()).unwrap();
+    }
+    pair.settle();
+    pair.manager.net.frozen = true;
+    let newer = go(&mut pair, Priority::High, Renew::Process);
+    assert_eq!([older, newer].map(|call| pair.manager.session.holds(call)), [false, true]);
+    pair.run(millis(1));
+    assert!(pair.agv.is_live(slot));
+    pair.manager.cancel(older);
+    pair.run(millis(1));
+    assert_eq!((pair.agv.is_live(slot), expirations(&pair)), (false, 1));
+    pair.manager.net.frozen = false;
+    pair.settle();
+    assert!(pair.agv.is_live(slot), "the newer one begins");
 }
 
 /// A renewal that the manager made so long ago, as it arrives at the vehicle.

@@ -3,12 +3,11 @@
 #![no_std]
 #![no_main]
 
-use cara_apps::agv::Agv;
 use cara_embassy::Runner as UnitRunner;
 use cara_lm3s6965evb::arguments::{self, ArgumentError};
 use cara_lm3s6965evb::ethernet::Ethernet;
 use cara_lm3s6965evb::{executor, fault, motor, reset, stack, start, watchdog};
-use cara_vehicle::{LIMITS, Vehicle, VehicleResources};
+use cara_vehicle::{Agv, LIMITS, Vehicle, VehicleResources};
 use embassy_executor::Spawner;
 use embassy_net::{Runner, StackResources};
 use embassy_time::{Duration, Timer};

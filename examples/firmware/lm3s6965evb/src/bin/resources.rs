@@ -3,10 +3,9 @@
 #![no_std]
 #![no_main]
 
-use cara_apps::agv::Agv;
 use cara_embassy::{Limits, resources};
 use cara_lm3s6965evb as _;
-use cara_vehicle::{LIMITS, VehicleResources};
+use cara_vehicle::{Agv, LIMITS, VehicleResources};
 use semihosting::println;
 
 const BYTES: usize = VehicleResources::BYTES;

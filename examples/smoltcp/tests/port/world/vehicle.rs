@@ -9,7 +9,7 @@ use cara_core::distribution::hello::Manager;
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, ServiceError};
 use cara_core::services::Ticket;
-use cara_core::services::lease::Lease;
+use cara_core::services::lease::{Lease, Order};
 use cara_core::services::requests::CallId;
 use cara_core::services::session::{Call, Event, ReplyBlock};
 use cara_core::time::{Duration, Instant};
@@ -42,6 +42,8 @@ pub(crate) struct Notes {
     /// Numbers that `echo` was called with.
     pub(crate) echoed: Vec<i64>,
     pub(crate) driving: bool,
+    /// The order of the last call of `go_to`.
+    pub(crate) drives_for: Option<Order>,
     pub(crate) made_safe: Vec<Instant>,
     /// What came first.
     pub(crate) order: Vec<&'static str>,
@@ -66,7 +68,7 @@ impl Program for Notes {
             Err(_) => return Served::Now(Err(ServiceError::Failed(1))),
         };
         if Some(call.slot) == self.go_to {
-            self.driving = true;
+            (self.driving, self.drives_for) = (true, call.order);
         } else {
             self.echoed.push(number);
             self.order.push("echo");

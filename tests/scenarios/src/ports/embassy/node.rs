@@ -17,7 +17,7 @@ use cara_core::services::requests::CallId;
 use cara_core::services::session::RequestOptions;
 use cara_core::term::Term;
 use cara_core::time::{Duration, Instant};
-use cara_embassy::{Config, Handle, Peer};
+use cara_embassy::{Config, Handle, LeaseWatch, Peer};
 use cara_embassy_host::{Bench, Board, now, security};
 use embassy_time::with_timeout;
 
@@ -35,6 +35,8 @@ pub(super) struct BoardNode {
     unit: RefCell<Option<Handle>>,
     /// Services of this life, with their leases.
     services: RefCell<BTreeMap<String, (Service, &'static Lease)>>,
+    /// Of the calls of each service.
+    orders: RefCell<BTreeMap<String, Vec<LeaseWatch>>>,
     events: Rc<RefCell<Vec<(Instant, Seen)>>>,
     losses: Rc<RefCell<Vec<Instant>>>,
 }
@@ -49,6 +51,7 @@ impl BoardNode {
             board: RefCell::new(bench.board()),
             unit: RefCell::new(None),
             services: RefCell::default(),
+            orders: RefCell::default(),
             events: Rc::default(),
             losses: Rc::default(),
         });
@@ -80,6 +83,11 @@ impl BoardNode {
     /// Notes a service; whether one of its name was there.
     pub(super) fn keep(&self, service: &Service, lease: &'static Lease) -> bool {
         self.services.borrow_mut().insert(service.name().to_owned(), (service.clone(), lease)).is_some()
+    }
+
+    /// A call of a service has begun.
+    pub(super) fn begins(&self, name: &str, order: Option<LeaseWatch>) {
+        self.orders.borrow_mut().entry(name.to_owned()).or_default().extend(order);
     }
 
     pub(super) fn service(&self, name: &str) -> Option<Service> {
@@ -278,10 +286,9 @@ impl Node for Rc<BoardNode> {
         Heart::new(Renew::Heart(heart.beats()), move || heart.beat(now()))
     }
 
-    fn end_lease(&self, function: &str) {
-        if let Ok(unit) = self.unit() {
-            unit.my_function_list().end_lease(function);
-        }
+    fn end_order(&self, function: &str, call: usize) -> bool {
+        let order = self.orders.borrow()[function][call];
+        self.unit().expect("the unit runs").end_order(&order)
     }
 
     fn lease_is_live(&self, function: &str) -> bool {

@@ -1,6 +1,6 @@
 //! Services of scenarios on boards: those that end at once run in the runner, the others in a task of each call.
 
-use std::rc::Rc;
+use std::rc::{Rc, Weak};
 
 use cara_core::distribution::parameters::ParametersView;
 use cara_core::error::{Error, ServiceError};
@@ -26,7 +26,7 @@ pub(super) fn put(node: &Rc<BoardNode>, service: &Service, replace: bool) -> Res
         let log = service.log();
         options = options.lease(length, lease, Box::leak(Box::new(move || log.stop(now()))));
     }
-    let handler = if service.awaits() { Handler::task() } else { at_once(service.clone()) };
+    let handler = if service.awaits() { Handler::task() } else { at_once(Rc::downgrade(node), service.clone()) };
     match replace {
         true => unit.my_function_list().replace(&service.signature, options, handler),
         false => unit.my_function_list().add_service(&service.signature, options, handler),
@@ -38,9 +38,10 @@ pub(super) fn put(node: &Rc<BoardNode>, service: &Service, replace: bool) -> Res
     Ok(())
 }
 
-fn at_once(service: Service) -> Handler<()> {
+fn at_once(node: Weak<BoardNode>, service: Service) -> Handler<()> {
     Handler::free(Box::leak(Box::new(move |call: &cara_embassy::Call<()>, parameters: &mut _| {
         service.log().begin(now());
+        node.upgrade().into_iter().for_each(|node| node.begins(service.name(), call.lease));
         let result = (service.body)(&Asked { caller: call.caller.clone(), at: now() }, parameters);
         service.log().end(now());
         result
@@ -57,6 +58,7 @@ async fn take_calls(node: Rc<BoardNode>, board: Board, unit: Handle, function: S
                 let Some(service) = node.service(&function) else { return };
                 let mut own = boxed_parameters(PARAMETERS);
                 own.copy_from(&parameters).expect("there is as much room");
+                node.begins(&function, call.lease);
                 board.spawn(async move { serve(unit, &service, call, &mut own).await });
             }
         }
