@@ -1,5 +1,7 @@
 //! Everything that can go wrong, sorted by where the remedy lies. Small, `Copy`, and each text says what to do.
 
+use core::fmt;
+
 use crate::config::{VERSIONS, Versions};
 use crate::time::Duration;
 
@@ -218,6 +220,9 @@ pub enum CloseReason {
         "the two have different keys for this pair, or what they sent was changed: compare their fingerprints; if one was revoked on purpose, do nothing"
     )]
     BadProof = 12,
+    /// This unit was stopped in an orderly way. Its peer is told [`Stopped`](Self::Stopped).
+    #[error("this unit was stopped")]
+    StoppedHere = 13,
 }
 
 /// What a handler answers instead of results.
@@ -388,7 +393,7 @@ pub enum Error {
     /// What the function moves was stopped, by the unit with this ID number or, with 0, by the callee itself, and has not been
     /// reset. The callee did not run it.
     #[error(
-        "what it moves was stopped by the unit with the ID {by} (0: by itself), reason {reason}: look why, then call its function that resets"
+        "what it moves was stopped by {}, reason {reason}: look why, then call its function that resets", Stopper(*by)
     )]
     Inhibited {
         /// The ID number of the unit that stopped it; 0 for the callee itself.
@@ -482,6 +487,18 @@ impl Error {
     }
 }
 
+/// What stopped an actuator, by the ID number that it is told with.
+struct Stopper(u32);
+
+impl fmt::Display for Stopper {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.0 {
+            0 => f.write_str("the vehicle itself"),
+            id => write!(f, "unit {id}"),
+        }
+    }
+}
+
 impl From<ServiceError> for Error {
     fn from(error: ServiceError) -> Self {
         Self::Service(error)
@@ -520,5 +537,25 @@ impl From<Error> for ServiceError {
 impl From<Refusal> for Error {
     fn from(refusal: Refusal) -> Self {
         Self::Refused(refusal)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::string::ToString as _;
+
+    use super::*;
+
+    #[test]
+    fn a_stop_is_told_with_what_stopped() {
+        let text = |by| Error::Inhibited { by, reason: 3 }.to_string();
+        assert!(text(0).starts_with("what it moves was stopped by the vehicle itself, reason 3: look why"), "{}", text(0));
+        assert!(text(12).starts_with("what it moves was stopped by unit 12, reason 3: look why"), "{}", text(12));
+    }
+
+    #[test]
+    fn an_orderly_end_is_told_with_what_was_stopped() {
+        assert_eq!(CloseReason::StoppedHere.to_string(), "this unit was stopped");
+        assert!(CloseReason::Stopped.to_string().starts_with("the peer was stopped:"));
     }
 }

@@ -163,7 +163,7 @@ impl<T> Machine<T> {
     pub(crate) fn stop(&mut self) {
         self.stopped = true;
         for index in self.indices() {
-            self.with(index, |session, cx| session.close(cx, CloseReason::Stopped));
+            self.with(index, |session, cx| session.close(cx, CloseReason::StoppedHere));
         }
     }
 

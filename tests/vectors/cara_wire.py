@@ -389,7 +389,7 @@ CONTROLS = {
 }
 # Behind one of these nothing follows in a message.
 LAST_ITEMS = ("list_end", "list_ack", "lease_ended", "actuator")
-LEASE_ENDS = ["finished", "expired", "replaced", "stopped"]
+LEASE_ENDS = ["finished", "expired", "replaced", "stopped", "released"]
 
 
 def decode_message(data):

@@ -186,26 +186,30 @@ pub enum LeaseEnd {
     Replaced,
     /// What it moved was stopped: the safe hook runs there, and nothing moves it before a reset.
     Stopped,
+    /// Its caller gave it up: the safe hook runs there. It is no news to that caller, whose events do not have it.
+    Released,
     /// Never told by a callee, which did not answer renewals for the length of the lease: it is renewed no more, and ends
     /// there within another one.
     Unanswered,
 }
 
 impl LeaseEnd {
-    pub(crate) const ALL: [Self; 4] = [Self::Finished, Self::Expired, Self::Replaced, Self::Stopped];
+    pub(crate) const ALL: [Self; 5] =
+        [Self::Finished, Self::Expired, Self::Replaced, Self::Stopped, Self::Released];
 
     /// By its number on the wire; a reason of a later version is an end all the same.
     pub fn of(number: u32) -> Self {
         Self::ALL.get(number as usize).copied().unwrap_or(Self::Expired)
     }
 
-    /// `finished`, `expired`, `replaced`, `stopped`, `unanswered`.
+    /// `finished`, `expired`, `replaced`, `stopped`, `released`, `unanswered`.
     pub const fn word(self) -> &'static str {
         match self {
             Self::Finished => "finished",
             Self::Expired => "expired",
             Self::Replaced => "replaced",
             Self::Stopped => "stopped",
+            Self::Released => "released",
             Self::Unanswered => "unanswered",
         }
     }

@@ -333,7 +333,7 @@ impl<T: Send + 'static> Engine<T> {
         }
         for link in self.each_link() {
             let mut state = link.lock();
-            self.with(&link, &mut state, |session, cx| session.close(cx, CloseReason::Stopped));
+            self.with(&link, &mut state, |session, cx| session.close(cx, CloseReason::StoppedHere));
             self.settle(&link, state);
         }
         self.services.state.stop();

@@ -223,7 +223,7 @@ impl Side {
 
     /// Ends the link.
     pub(crate) fn stop(&mut self) {
-        self.with(|session, cx| session.close(cx, CloseReason::Stopped));
+        self.with(|session, cx| session.close(cx, CloseReason::StoppedHere));
     }
 
     fn with<R>(&mut self, act: impl FnOnce(&mut Session<Vectors>, &mut Context<'_, Vectors>) -> R) -> R {

@@ -87,7 +87,7 @@ impl<P: Port> Node<P> {
         }
         match self.config.target {
             // One that was stopped in an orderly way says so itself when it is back.
-            Target::Everybody if reason == CloseReason::Stopped => {}
+            Target::Everybody if matches!(reason, CloseReason::Stopped | CloseReason::StoppedHere) => {}
             Target::Everybody | Target::Fixed(..) => self.retry(now, place),
             Target::Manager(_) => {}
         }

@@ -213,7 +213,7 @@ impl<P: Port> Session<P> {
         }
     }
 
-    /// The caller gave up a call: its lease ends now, as if it had expired. If it waits for its turn, or is still on its
+    /// The caller gave up a call: its lease ends now, and its hook runs as if it had expired. If it waits for its turn, or is still on its
     /// way, it does not begin.
     pub(super) fn released(&mut self, cx: &mut Context<'_, P>, release: Release) -> Option<Event> {
         let Release { call, class } = release;
@@ -230,7 +230,9 @@ impl<P: Port> Session<P> {
     fn end_released(&mut self, cx: &mut Context<'_, P>, is_released: impl Fn(&Granted) -> bool) -> Option<Event> {
         let index = self.granted.iter().position(is_released);
         let granted = index.and_then(|index| take_at(&mut self.granted, index))?;
-        if expire_granted(cx, &granted, LeaseEnd::Expired) { Some(Event::LeaseExpired(granted.slot)) } else { None }
+        // What was dead before is not told as given up.
+        let how = if is_live(cx, &granted) { LeaseEnd::Released } else { how_it_died(cx, &granted) };
+        if expire_granted(cx, &granted, how) { Some(Event::LeaseExpired(granted.slot)) } else { None }
     }
 
     /// Whether a function stops what is dead and not yet safe, whichever link moved it: its handler waits for the hook.
@@ -249,10 +251,9 @@ impl<P: Port> Session<P> {
             let due = |granted: &Granted| granted.end <= cx.now || is_dead(cx, granted);
             let index = self.granted.iter().position(due);
             let Some(granted) = index.and_then(|index| take_at(&mut self.granted, index)) else { break };
-            let is_inhibited = lease_of(cx, &granted).is_some_and(Lease::is_inhibited);
-            let why = if is_inhibited { LeaseEnd::Stopped } else { LeaseEnd::Expired };
+            let why = how_it_died(cx, &granted);
             if expire_granted(cx, &granted, why) {
-                self.publishing.actuators_due |= is_inhibited;
+                self.publishing.actuators_due |= why == LeaseEnd::Stopped;
                 self.link.counters.add(LinkCounter::LeasesExpired, 1);
                 self.tell_end(cx, granted.call, why);
                 return Some(granted.slot);
@@ -287,6 +288,16 @@ fn lease_of<'c, P: Port>(cx: &Context<'c, P>, granted: &Granted) -> Option<&'c L
 /// Whether an order has been ended by others than its link, and its safe hook is due.
 fn is_dead<P: Port>(cx: &Context<'_, P>, granted: &Granted) -> bool {
     lease_of(cx, granted).zip(granted.order).is_some_and(|(lease, order)| lease.is_cut(order))
+}
+
+fn is_live<P: Port>(cx: &Context<'_, P>, granted: &Granted) -> bool {
+    granted.end > cx.now && !is_dead(cx, granted)
+}
+
+/// How an order has ended that its caller had not given up.
+fn how_it_died<P: Port>(cx: &Context<'_, P>, granted: &Granted) -> LeaseEnd {
+    let is_inhibited = lease_of(cx, granted).is_some_and(Lease::is_inhibited);
+    if is_inhibited { LeaseEnd::Stopped } else { LeaseEnd::Expired }
 }
 
 /// Whether two services move the same thing.

@@ -547,7 +547,7 @@ pub const fn buffer_bytes(message_size: u32, overhead: usize) -> usize {
 
 const fn close_code(reason: CloseReason) -> u8 {
     match reason {
-        CloseReason::Stopped => 1,
+        CloseReason::Stopped | CloseReason::StoppedHere => 1,
         CloseReason::Reset => 2,
         CloseReason::Silent => 3,
         CloseReason::PeerRestarted => 4,

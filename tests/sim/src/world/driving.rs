@@ -154,7 +154,7 @@ impl Inner {
         unit.term = term;
         let links: Vec<u16> = machine.links.iter().map(|(index, _)| index).collect();
         for index in links {
-            machine.links.with(&mut self.network, index, |session, cx| session.close(cx, CloseReason::Stopped));
+            machine.links.with(&mut self.network, index, |session, cx| session.close(cx, CloseReason::StoppedHere));
         }
         self.log(shared, host, UnitEvent::Fenced { term });
         self.network.stop(host);

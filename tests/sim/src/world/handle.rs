@@ -270,7 +270,7 @@ impl UnitHandle {
     /// Stops it in an orderly way: peers are told.
     pub fn stop(&self) {
         self.each_link(|links, network, index| {
-            links.with(network, index, |session, cx| session.close(cx, cara_core::error::CloseReason::Stopped));
+            links.with(network, index, |session, cx| session.close(cx, cara_core::error::CloseReason::StoppedHere));
         });
         self.with(|inner| inner.network.stop(self.host));
     }

@@ -428,6 +428,27 @@ fn the_caller_is_told_the_state_of_what_it_moves() {
 }
 
 #[test]
+fn what_its_caller_gave_up_is_told_as_released() {
+    let (mut pair, [go, dock, _]) = vehicle();
+    let ended = |pair: &Pair| state(pair, dock).and_then(|told| told.last).and_then(|last| last.end);
+    let moves = call(&mut pair, "go");
+    pair.manager.cancel(moves);
+    pair.run(Duration::from_secs(1));
+    assert_eq!((ended(&pair), hooks(&pair)), (Some(LeaseEnd::Released), 1));
+    call(&mut pair, "go");
+    pair.manager.release(go).unwrap();
+    pair.run(Duration::from_secs(1));
+    assert_eq!((ended(&pair), hooks(&pair)), (Some(LeaseEnd::Released), 2));
+    // Its link's session hears of the release before it looks whether something else was faster.
+    let moves = call(&mut pair, "go");
+    let now = pair.agv.now;
+    pair.agv.functions.function(go).unwrap().handler.inhibit(now, Latch { by: 0, reason: 9 });
+    pair.manager.cancel(moves);
+    pair.run(Duration::from_secs(1));
+    assert_eq!((ended(&pair), hooks(&pair)), (Some(LeaseEnd::Stopped), 3));
+}
+
+#[test]
 fn a_latch_and_its_end_are_told_at_once() {
     let (mut pair, [go, _, lift]) = vehicle();
     let lifts = call(&mut pair, "lift");

@@ -64,9 +64,9 @@ fn the_slices_of_a_link_come_back_empty_for_the_next_one() {
 #[test]
 fn an_orderly_end_is_told_to_the_peer() {
     let mut pair = Pair::with_position();
-    pair.manager.close(CloseReason::Stopped);
+    pair.manager.close(CloseReason::StoppedHere);
     pair.settle();
-    assert!(pair.manager.has(&Event::Closed(CloseReason::Stopped)));
+    assert!(pair.manager.has(&Event::Closed(CloseReason::StoppedHere)));
     assert!(pair.agv.has(&Event::Closed(CloseReason::Stopped)));
 }
 
