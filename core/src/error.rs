@@ -549,7 +549,11 @@ mod tests {
     #[test]
     fn a_stop_is_told_with_what_stopped() {
         let text = |by| Error::Inhibited { by, reason: 3 }.to_string();
-        assert!(text(0).starts_with("what it moves was stopped by the vehicle itself, reason 3: look why"), "{}", text(0));
+        assert!(
+            text(0).starts_with("what it moves was stopped by the vehicle itself, reason 3: look why"),
+            "{}",
+            text(0)
+        );
         assert!(text(12).starts_with("what it moves was stopped by unit 12, reason 3: look why"), "{}", text(12));
     }
 

@@ -164,8 +164,9 @@ impl<T: Send + 'static> Builder<T, MUnit> {
         self
     }
 
-    /// Notes what operators have it do: one line of JSON at the end of this file for each order, stop, reset and refusal, with
-    /// who asked (`docs/cara.md`, "Audit log"). A file of 4 MiB is put aside under the name with `.1` behind it.
+    /// Notes what operators have it do, and what this program moves, stops and resets: one line of JSON at the end of this file
+    /// for each order, stop, reset and refusal, with who asked (`docs/cara.md`, "Audit log"). A line of the program's is written
+    /// by the thread that called, once the outcome is known. A file of 4 MiB is put aside under the name with `.1` behind it.
     #[cfg(feature = "control")]
     pub fn audit(mut self, path: impl AsRef<std::path::Path>) -> std::io::Result<Self> {
         self.audit = Some(Arc::new(crate::control::Audit::open(path.as_ref())?));
@@ -358,6 +359,8 @@ impl<T: Send + 'static, R> Builder<T, R> {
             asks_for_itself: self.asks_for_itself,
             state_folder: self.state_folder,
             takes_over: self.takes_over,
+            #[cfg(feature = "control")]
+            audit: self.audit,
         };
         let engine = Engine::new(parts);
         if self.access.is_some() {

@@ -194,8 +194,7 @@ pub enum LeaseEnd {
 }
 
 impl LeaseEnd {
-    pub(crate) const ALL: [Self; 5] =
-        [Self::Finished, Self::Expired, Self::Replaced, Self::Stopped, Self::Released];
+    pub(crate) const ALL: [Self; 5] = [Self::Finished, Self::Expired, Self::Replaced, Self::Stopped, Self::Released];
 
     /// By its number on the wire; a reason of a later version is an end all the same.
     pub fn of(number: u32) -> Self {

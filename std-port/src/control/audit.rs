@@ -1,13 +1,15 @@
-//! What operators have had a unit do: one line of JSON for each order, stop, reset, take-over and refusal, at the end of a file.
+//! What operators have had a unit do, and what its own program has moved, stopped and reset: one line of JSON for each order,
+//! stop, reset, take-over and refusal, at the end of a file.
 //!
 //! | key | |
 //! |---|---|
 //! | `at_ms` | milliseconds since 1970 |
-//! | `uid`, `pid`, `program` | who asked through the control socket |
-//! | `ask`, `function` | what for; `function` of calls alone |
-//! | `take_over` | `true` where an order of another unit, or of this unit's program, was to give way |
-//! | `node` | of which node, as far as one has answered |
-//! | `outcome` | `ok`, `ended`, `expired`, the error's name, or `gone` where the client went before the answer |
+//! | `origin` | `operator`, through the control socket, or `program` |
+//! | `uid`, `pid`, `program` | the process that asked |
+//! | `ask`, `function` | what for; several functions of a stop or a reset with a comma between them |
+//! | `take_over` | `true` where an order of another unit, or of the other origin, was to give way |
+//! | `node` | of which node, as far as it is known |
+//! | `outcome` | `ok`, the error's name, or `gone` where the asking ended before the answer; of what was held, how it ended: `ended`, `expired`, `released` by its client, an error; `stopped` where the unit itself was stopped first |
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Write};
@@ -15,12 +17,16 @@ use std::os::fd::AsFd;
 use std::os::unix::fs::OpenOptionsExt;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
-use std::sync::Mutex;
+use std::sync::{Arc, Mutex};
 use std::time::{SystemTime, UNIX_EPOCH};
 
+use cara_core::distribution::function::Attributes;
+use cara_core::error::Error;
 use rustix::net::sockopt::socket_peercred;
+use rustix::process::{getpid, getuid};
 use serde_json::{Value, json};
 
+use super::failure::name_of;
 use super::protocol::{Answer, CallQuestion, Question};
 use crate::locks::lock;
 use crate::seldom::warn_seldom;
@@ -33,12 +39,15 @@ const LONGEST: u64 = 4 * 1024 * 1024;
 pub(crate) struct Audit {
     path: PathBuf,
     longest: u64,
+    /// This process.
+    own: Who,
     file: Mutex<Option<File>>,
 }
 
 impl Audit {
     pub(crate) fn open(path: &Path) -> io::Result<Self> {
-        Ok(Self { path: path.to_owned(), longest: LONGEST, file: Mutex::new(Some(Self::append_to(path)?)) })
+        let own = Who::own();
+        Ok(Self { path: path.to_owned(), longest: LONGEST, own, file: Mutex::new(Some(Self::append_to(path)?)) })
     }
 
     fn append_to(path: &Path) -> io::Result<File> {
@@ -67,6 +76,25 @@ impl Audit {
         *place = Some(file);
         written
     }
+
+    fn tell(&self, origin: &str, who: &Who, line: &Line<'_>) {
+        let at = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+        let Who { uid, pid, program } = who;
+        let Line { ask, function, take_over, node, outcome } = line;
+        self.write(&json!({
+            "at_ms": at.as_millis() as u64, "origin": origin, "uid": uid, "pid": pid, "program": program, "ask": ask,
+            "function": function, "take_over": take_over, "node": node, "outcome": outcome,
+        }));
+    }
+}
+
+/// What a line tells beside who and when.
+struct Line<'l> {
+    ask: &'l str,
+    function: Option<&'l str>,
+    take_over: bool,
+    node: Option<&'l str>,
+    outcome: &'l str,
 }
 
 /// Who asks, as far as the system tells.
@@ -84,6 +112,65 @@ impl Who {
         let program = std::fs::read_to_string(format!("/proc/{pid}/comm")).unwrap_or_default();
         Ok(Self { uid, pid, program: program.trim_end().to_owned() })
     }
+
+    fn own() -> Self {
+        let (uid, pid) = (getuid().as_raw(), getpid().as_raw_nonzero().get());
+        let program = std::fs::read_to_string("/proc/self/comm").unwrap_or_default();
+        Self { uid, pid, program: program.trim_end().to_owned() }
+    }
+}
+
+/// A call by the unit's own program, and what comes of it.
+#[derive(Debug)]
+pub(crate) struct ProgramCall {
+    audit: Arc<Audit>,
+    ask: &'static str,
+    function: String,
+    take_over: bool,
+    node: String,
+    is_told: bool,
+}
+
+impl ProgramCall {
+    /// `None` for a call that moves, stops and resets nothing. `attributes` are those of the function, if it is known.
+    pub(crate) fn of(
+        audit: &Arc<Audit>,
+        function: &str,
+        attributes: Option<Attributes>,
+        take_over: bool,
+        node: impl FnOnce() -> String,
+    ) -> Option<Self> {
+        let ask = match attributes {
+            Some(Attributes { stop: true, .. }) => "stop",
+            Some(Attributes { reset: true, .. }) => "reset",
+            Some(Attributes { lease: Some(_), .. }) => "call",
+            _ if take_over => "call",
+            _ => return None,
+        };
+        let (audit, function) = (audit.clone(), function.to_owned());
+        Some(Self { audit, ask, function, take_over, node: node(), is_told: false })
+    }
+
+    /// Notes how it has ended.
+    pub(crate) fn ended(mut self, outcome: Result<(), Error>) {
+        let name = outcome.map_or_else(|error| name_of(&error), |()| "ok".to_owned());
+        self.tell(&name);
+    }
+
+    fn tell(&mut self, outcome: &str) {
+        self.is_told = true;
+        let Self { ask, ref function, take_over, ref node, .. } = *self;
+        let line = Line { ask, function: Some(function), take_over, node: Some(node), outcome };
+        self.audit.tell("program", &self.audit.own, &line);
+    }
+}
+
+impl Drop for ProgramCall {
+    fn drop(&mut self) {
+        if !self.is_told {
+            self.tell("gone");
+        }
+    }
 }
 
 /// What a question asks for.
@@ -92,13 +179,17 @@ struct Asked<'q> {
     ask: &'static str,
     call: Option<&'q CallQuestion>,
     node: Option<&'q String>,
+    /// What the call starts is kept, and its end is told.
+    holds: bool,
 }
 
 impl<'q> Asked<'q> {
     /// `None` for a question that only looks.
     fn of(question: &'q Question) -> Option<Self> {
-        let of_node = |ask, node| Some(Self { ask, call: None, node });
-        let of_call = |ask, call: &'q CallQuestion| Some(Self { ask, call: Some(call), node: call.node.as_ref() });
+        let of_node = |ask, node| Some(Self { ask, call: None, node, holds: false });
+        let of_call = |ask, call: &'q CallQuestion| {
+            Some(Self { ask, call: Some(call), node: call.node.as_ref(), holds: ask == "hold" })
+        };
         match question {
             Question::Call(call) => of_call("call", call),
             Question::Hold(call) => of_call("hold", call),
@@ -126,47 +217,72 @@ pub(super) struct Entry<'a> {
     audit: &'a Audit,
     who: &'a Who,
     asked: Asked<'a>,
-    is_told: bool,
+    told: Told,
+}
+
+/// How much of an entry has been told.
+enum Told {
+    Nothing,
+    /// That the node is held, whose end is to be told as well.
+    Held(String),
+    All,
 }
 
 impl<'a> Entry<'a> {
     /// `None` for a question that only looks.
     pub(super) fn of(audit: &'a Audit, who: &'a Who, question: &'a Question) -> Option<Self> {
-        Some(Self { audit, who, asked: Asked::of(question)?, is_told: false })
+        Some(Self { audit, who, asked: Asked::of(question)?, told: Told::Nothing })
     }
 
     /// An answer on its way to the operator.
     pub(super) fn note(&mut self, answer: &Answer) {
         match answer {
-            Answer::Called { node, id, error, .. } => {
+            Answer::Called { node, id, error, functions, .. } => {
+                let node = format!("{node}/{id}");
                 let outcome = error.as_ref().map_or("ok", |failure| failure.error.as_str());
-                self.tell(Some(format!("{node}/{id}")), outcome);
+                let functions = (!functions.is_empty()).then(|| functions.join(","));
+                self.tell(Some(&node), functions.as_deref(), outcome);
+                self.told = if self.asked.holds && error.is_none() { Told::Held(node) } else { Told::All };
             }
-            Answer::Ended { expired } => self.tell(None, if *expired { "expired" } else { "ended" }),
-            Answer::Failed(failure) => self.tell(None, &failure.error),
-            Answer::Done if !self.is_told => self.tell(None, "ok"),
+            Answer::Ended { expired } => self.end(if *expired { "expired" } else { "ended" }),
+            Answer::Failed(failure) => self.end(&failure.error),
+            Answer::Done => {
+                if let Told::Nothing = self.told {
+                    self.end("ok");
+                }
+            }
             _ => {}
         }
     }
 
-    fn tell(&mut self, node: Option<String>, outcome: &str) {
-        self.is_told = true;
-        let Asked { ask, call, node: asked_of } = self.asked;
-        let at = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-        let Who { uid, pid, program } = self.who;
-        self.audit.write(&json!({
-            "at_ms": at.as_millis() as u64, "uid": uid, "pid": pid, "program": program,
-            "ask": ask, "function": call.map(|call| &call.function), "take_over": call.is_some_and(|call| call.take_over),
-            "node": node.as_ref().or(asked_of), "outcome": outcome,
-        }));
+    /// No more answers come: the client has gone, or the unit stops.
+    pub(super) fn give_up(&mut self, unit_stops: bool) {
+        match self.told {
+            Told::All => {}
+            _ if unit_stops => self.end("stopped"),
+            Told::Nothing => self.end("gone"),
+            Told::Held(_) => self.end("released"),
+        }
+    }
+
+    fn end(&mut self, outcome: &str) {
+        match std::mem::replace(&mut self.told, Told::All) {
+            Told::Held(node) => self.tell(Some(&node), None, outcome),
+            Told::Nothing | Told::All => self.tell(None, None, outcome),
+        }
+    }
+
+    fn tell(&self, node: Option<&str>, functions: Option<&str>, outcome: &str) {
+        let Asked { ask, call, node: asked_of, .. } = self.asked;
+        let function = functions.or_else(|| Some(call?.function.as_str()));
+        let (node, take_over) = (node.or(asked_of.map(String::as_str)), call.is_some_and(|call| call.take_over));
+        self.audit.tell("operator", self.who, &Line { ask, function, take_over, node, outcome });
     }
 }
 
 impl Drop for Entry<'_> {
     fn drop(&mut self) {
-        if !self.is_told {
-            self.tell(None, "gone");
-        }
+        self.give_up(false);
     }
 }
 
@@ -193,6 +309,7 @@ mod tests {
             call: None,
             error,
             took_us: 1,
+            functions: vec!["halt".to_owned(), "brake".to_owned()],
         };
         let mut entry = Entry::of(&audit, &who, &stop).unwrap();
         entry.note(&called(1, None));
@@ -205,7 +322,44 @@ mod tests {
         let expected = [("agv/1", "ok"), ("agv/2", "NoStop")].map(|(node, outcome)| [json!(node), json!(outcome)]);
         assert_eq!(told[..2], expected);
         assert_eq!(told[2..], [[Value::Null, json!("gone")]]);
-        assert_eq!((&lines(&path)[0]["ask"], &lines(&path)[0]["uid"]), (&json!("stop"), &json!(7)));
+        let first = &lines(&path)[0];
+        assert_eq!((&first["ask"], &first["uid"], &first["origin"]), (&json!("stop"), &json!(7), &json!("operator")));
+        assert_eq!(first["function"], "halt,brake");
+    }
+
+    #[test]
+    fn the_end_of_what_was_held_is_a_line_however_it_ends() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("audit");
+        let audit = Audit::open(&path).unwrap();
+        let who = Who { uid: 7, pid: 8, program: "cara".to_owned() };
+        let hold = Question::Hold(CallQuestion { function: "go".to_owned(), ..CallQuestion::default() });
+        let ends: [fn(&mut Entry<'_>); 5] = [
+            |entry| entry.note(&Answer::Ended { expired: false }),
+            |entry| entry.note(&Answer::Ended { expired: true }),
+            |entry| entry.note(&Answer::Failed(super::super::protocol::Failure::configuration("TakenOver", ""))),
+            |entry| entry.give_up(true),
+            |entry| entry.give_up(false),
+        ];
+        for end in ends {
+            let mut entry = Entry::of(&audit, &who, &hold).unwrap();
+            entry.note(&Answer::Called {
+                node: "agv".to_owned(),
+                id: 1,
+                results: Vec::new(),
+                call: None,
+                error: None,
+                took_us: 1,
+                functions: Vec::new(),
+            });
+            end(&mut entry);
+            entry.note(&Answer::Done);
+        }
+        let told = lines(&path);
+        assert!(told.iter().all(|line| line["node"] == "agv/1" && line["function"] == "go"), "{told:?}");
+        let outcomes: Vec<_> = told.iter().map(|line| line["outcome"].as_str().unwrap()).collect();
+        let expected = ["ended", "expired", "TakenOver", "stopped", "released"].map(|end| ["ok", end]);
+        assert_eq!(outcomes, expected.concat());
     }
 
     #[test]

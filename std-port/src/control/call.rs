@@ -192,7 +192,7 @@ pub(super) fn called<T: Send + 'static>(peer: &Peer<T>, outcome: Result<Outcome,
         Err(failure) => (Outcome::default(), Some(failure)),
     };
     let (node, id) = (peer.name().to_owned(), peer.id());
-    Answer::Called { node, id, results: outcome.results, call: outcome.call, error, took_us }
+    Answer::Called { node, id, results: outcome.results, call: outcome.call, error, took_us, functions: Vec::new() }
 }
 
 fn call_all<T: Send + 'static>(

@@ -36,5 +36,6 @@ fn missing<T: Send + 'static>(peer: &Peer<T>, function: &str) -> Answer {
     let lacks_it = peer.is_connected() && !peer.their_function_list().contains(function);
     let failure = Failure::not_called(lacks_it.then_some(function));
     let (node, id) = (peer.name().to_owned(), peer.id());
-    Answer::Called { node, id, results: Vec::new(), call: None, error: Some(failure), took_us: 0 }
+    let (results, functions) = (Vec::new(), Vec::new());
+    Answer::Called { node, id, results, call: None, error: Some(failure), took_us: 0, functions }
 }

@@ -3,6 +3,7 @@
 use std::sync::mpsc::RecvTimeoutError;
 use std::time::{Duration, Instant};
 
+use cara_core::error::CloseReason;
 use cara_core::services::access::Verb;
 use cara_core::services::heart::Renew;
 use cara_core::services::lease::LeaseEnd;
@@ -117,6 +118,8 @@ impl<T: Send + 'static> Held<'_, T> {
             {
                 Some(*why)
             }
+            // The end of this unit is no end of the node.
+            UnitEvent::Left { reason: CloseReason::StoppedHere, .. } => None,
             UnitEvent::Left { peer, .. } if peer == self.peer.identity() => Some(LeaseEnd::Expired),
             _ => None,
         }

@@ -31,7 +31,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 pub use answering::execute;
-pub(crate) use audit::Audit;
+pub(crate) use audit::{Audit, ProgramCall};
 pub use client::{Answers, Client, ControlError, RunningUnit, UnitState, running, running_called, running_in};
 pub use elsewhere::{Elsewhere, elsewhere};
 pub use place::directory;

@@ -119,6 +119,12 @@ impl Question {
         matches!(self, Self::Hold(_) | Self::Bench { .. })
     }
 
+    /// Whether it is carried out only while its client is there: what moves something, or may let it move again, is not wanted
+    /// any more by a client that has gone before its turn came, as where the unit's process was stopped meanwhile.
+    pub(super) fn needs_its_client(&self) -> bool {
+        matches!(self, Self::Call(_) | Self::Hold(_) | Self::Bench { .. } | Self::Reset { .. })
+    }
+
     /// Whether it is answered also where all connections are in use.
     pub(super) fn is_of_a_stop(&self) -> bool {
         matches!(self, Self::Stop { .. } | Self::Unit | Self::Nodes { .. })
@@ -244,6 +250,9 @@ pub enum Answer {
         error: Option<Failure>,
         /// From asking to the end, in microseconds.
         took_us: u64,
+        /// Of a stop or a reset: the functions that this is the end of.
+        #[serde(default, skip_serializing_if = "Vec::is_empty")]
+        functions: Vec<String>,
     },
     /// What a call started has ended.
     Ended {
@@ -476,7 +485,7 @@ pub struct OrderInfo {
     /// The function's name.
     pub function: String,
     /// Of the order that has it, or had it last: `none` since the node's start, `runs`, or how it ended: `finished`,
-    /// `expired`, `replaced`, `stopped`.
+    /// `expired`, `replaced`, `stopped`, `released`.
     pub order: String,
     /// The ID number of its caller.
     pub holder: Option<u32>,

@@ -220,12 +220,40 @@ impl Shared {
         // Between questions alone is anything read.
         stream.set_read_timeout(Some(self.idle_limit))?;
         stream.set_write_timeout(Some(WRITE_TIMEOUT))?;
-        let mut writer = Answers::new(&stream);
         let mut lines = Lines::new(&stream);
         let audit = match &self.audit {
-            Some(audit) => Some((audit, Who::of(&stream)?)),
+            Some(audit) => Some((&**audit, Who::of(&stream)?)),
             None => None,
         };
+        let outcome = self.converse(&mut lines, idle, full_when_opened, audit.as_ref(), system);
+        if let Some((audit, who)) = &audit {
+            // It is given up; what was sent before can still be read.
+            let _ = stream.shutdown(Shutdown::Both);
+            self.note_rest(&mut lines, audit, who, system.is_stopped());
+        }
+        outcome
+    }
+
+    /// What a client has asked for that was never looked at, since it had gone: while the process was stopped it may have been
+    /// asked for much, and none of it is carried out.
+    fn note_rest(&self, lines: &mut Lines<&UnixStream>, audit: &Audit, who: &Who, unit_stops: bool) {
+        while let Ok(Some(line)) = lines.next() {
+            if let Some(mut entry) = question(line).ok().as_ref().and_then(|question| Entry::of(audit, who, question)) {
+                entry.give_up(unit_stops || self.is_stopping());
+            }
+        }
+    }
+
+    fn converse<T: Send + 'static>(
+        &self,
+        lines: &mut Lines<&UnixStream>,
+        idle: &Mutex<Option<Instant>>,
+        full_when_opened: bool,
+        audit: Option<&(&Audit, Who)>,
+        system: &CommunicationSystem<T>,
+    ) -> io::Result<()> {
+        let stream = *lines.source();
+        let mut writer = Answers::new(stream);
         let unit = system.identity();
         writer.give(&Answer::Hello {
             control_version: CONTROL_VERSION,
@@ -242,18 +270,21 @@ impl Shared {
             }
             *lock(idle) = None;
             match question(line) {
-                Ok(question) if full_when_opened && !question.is_of_a_stop() => {
-                    let _ = writer.sink(&Answer::Failed(full()));
-                }
                 Ok(question) => {
-                    let client = RefCell::new(Beats { stream: &stream, lines: &mut lines, last: Instant::now() });
+                    let client = RefCell::new(Beats { stream, lines, last: Instant::now() });
                     let lives = |within| !self.is_stopping() && client.borrow_mut().lives(within);
-                    let mut entry = audit.as_ref().and_then(|(audit, who)| Entry::of(audit, who, &question));
+                    let mut entry = audit.and_then(|(audit, who)| Entry::of(audit, who, &question));
                     let mut sink = |answer| {
                         entry.iter_mut().for_each(|entry| entry.note(&answer));
                         writer.sink(&answer)
                     };
-                    execute_for(system, &question, &mut sink, &lives);
+                    if full_when_opened && !question.is_of_a_stop() {
+                        let _ = sink(Answer::Failed(full()));
+                    } else if !question.needs_its_client() || lives(None) {
+                        execute_for(system, &question, &mut sink, &lives);
+                    }
+                    let unit_stops = system.is_stopped() || self.is_stopping();
+                    entry.iter_mut().for_each(|entry| entry.give_up(unit_stops));
                 }
                 Err(failure) => drop(writer.sink(&Answer::Failed(failure))),
             }
@@ -370,6 +401,47 @@ mod tests {
             (&"retire".into(), &"agv/1".into(), &std::process::id().into())
         );
         assert_eq!(line["outcome"], "UnknownNode");
+    }
+
+    /// As while the process was stopped: what was asked by a client that has gone is noted, and moves nothing.
+    #[test]
+    fn what_a_client_asked_that_has_gone_is_noted_and_moves_nothing() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("audit");
+        let system = manager(fleet(), Constraints::M_UNIT);
+        let shared = Shared::new(IDLE_TIMEOUT, Some(Arc::new(Audit::open(&path).unwrap()))).unwrap();
+        let asked = [
+            r#"{"ask":"stop","node":null}"#,
+            r#"{"ask":"reset","node":"agv/1"}"#,
+            r#"{"ask":"nodes","offering":null}"#,
+            r#"{"ask":"stop","node":"agv/2"}"#,
+        ];
+        let noted = |from: usize| {
+            let text = std::fs::read_to_string(&path).unwrap();
+            let lines: Vec<serde_json::Value> = text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+            let word = |value: &serde_json::Value| value.as_str().unwrap_or("-").to_owned();
+            let told = lines[from..].iter().map(|line| ["ask", "node", "outcome"].map(|key| word(&line[key])));
+            told.map(|words| words.join(" ")).collect::<Vec<_>>()
+        };
+        // It has gone before it was greeted.
+        let (mut client, served) = UnixStream::pair().unwrap();
+        client.write_all(format!("{}\n", asked.join("\n")).as_bytes()).unwrap();
+        drop(client);
+        assert!(shared.serve(served, &Mutex::default(), false, &system).is_err());
+        assert_eq!(noted(0), ["stop - gone", "reset agv/1 gone", "stop agv/2 gone"]);
+        // It goes behind what it asked, which is looked at all the same: a stop is carried out.
+        let (mut client, served) = UnixStream::pair().unwrap();
+        client.write_all(format!("{{\"ask\":\"watch\"}}\n{}\n{}\n", asked[1], asked[3]).as_bytes()).unwrap();
+        std::thread::scope(|scope| {
+            let serving = scope.spawn(|| shared.serve(served, &Mutex::default(), false, &system));
+            let mut client = BufReader::new(client);
+            for _ in ["hello", "watching"] {
+                client.read_line(&mut String::new()).unwrap();
+            }
+            drop(client);
+            let _ = serving.join().unwrap();
+        });
+        assert_eq!(noted(3), ["reset agv/1 gone", "stop agv/2 UnknownNode"]);
     }
 
     /// Each client has asked before it is served, so that its time to ask is no race.

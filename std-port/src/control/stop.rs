@@ -40,6 +40,8 @@ impl Which {
 /// What has come of a node.
 struct Outcome<'p, T: Send + 'static> {
     peer: &'p Peer<T>,
+    /// Those that are called.
+    functions: Vec<String>,
     /// Functions that have not answered.
     open: usize,
     error: Option<Failure>,
@@ -62,10 +64,11 @@ pub(super) fn call<T: Send + 'static>(
     let mut allowed = HashMap::new();
     let (mut questions, mut outcomes, mut missed) = (Vec::new(), Vec::new(), Vec::new());
     for peer in &peers {
-        let mut outcome = Outcome { peer, open: 0, error: None };
+        let mut outcome = Outcome { peer, functions: Vec::new(), open: 0, error: None };
         match functions(peer, which) {
             Err(failure) => outcome.error = Some(failure),
             Ok(functions) => {
+                outcome.functions.clone_from(&functions);
                 for function in functions {
                     let may = allowed.entry(function.clone()).or_insert_with(|| permit(system, &function, Verb::Call));
                     match may {
@@ -114,5 +117,9 @@ fn functions<T: Send + 'static>(peer: &Peer<T>, which: Which) -> Result<Vec<Stri
 
 fn told<T: Send + 'static>(outcome: &Outcome<'_, T>, started: Instant, sink: Sink<'_>) -> Result<(), End> {
     let error = outcome.error.clone();
-    send(sink, called(outcome.peer, error.map_or_else(|| Ok(Default::default()), Err), started))
+    let mut answer = called(outcome.peer, error.map_or_else(|| Ok(Default::default()), Err), started);
+    if let Answer::Called { functions, .. } = &mut answer {
+        functions.clone_from(&outcome.functions);
+    }
+    send(sink, answer)
 }

@@ -16,6 +16,7 @@ use cara_core::time::{Duration, Instant};
 use super::Engine;
 use super::inbound::OwnCall;
 use super::link::{LinkCell, LinkState, Outcome, Waiter, Wake};
+use super::noting::Noted;
 use super::reader::{Cause, Token};
 use super::settling::RETRY;
 use super::worker::READ_BYTES;
@@ -51,10 +52,14 @@ impl<T: Send + 'static> Engine<T> {
         parameters: &ParametersView,
         options: &RequestOptions,
     ) -> Result<CallId, Error> {
+        let noted = self.noted(link, function, options);
         let now = self.now();
         let mut state = link.lock();
         let result = self.request_on(now, link, &mut state, function, parameters, options, false);
         self.settle_at(now, link, state);
+        if let Some(noted) = noted {
+            noted.ended(result.map(drop));
+        }
         result
     }
 
@@ -66,12 +71,17 @@ impl<T: Send + 'static> Engine<T> {
         parameters: &mut ParametersView,
         options: &RequestOptions,
     ) -> Result<CallId, Error> {
-        self.services.state.waiting_for(link.id, || {
+        let noted = self.noted(link, function, options);
+        let result = self.services.state.waiting_for(link.id, || {
             self.go_on_with_parked();
             let begun = self.begin_call(link, function, parameters, options)?;
             let id = begun.id;
             self.await_reply(link, begun, parameters).map(|()| id)
-        })
+        });
+        if let Some(noted) = noted {
+            noted.ended(result.map(drop));
+        }
+        result
     }
 
     /// The same; what the call has started is given up with what is returned.
@@ -83,7 +93,7 @@ impl<T: Send + 'static> Engine<T> {
         options: &RequestOptions,
     ) -> Result<CallFuture<T>, Error> {
         let id = self.block_request(&link, function, parameters, options)?;
-        Ok(CallFuture { engine: self.clone(), link, id, has_succeeded: false })
+        Ok(CallFuture { engine: self.clone(), link, id, has_succeeded: false, noted: None })
     }
 
     /// Sends the request as soon as the interval and the room allow, within the deadline.
@@ -264,6 +274,17 @@ impl<T: Send + 'static> Engine<T> {
         parameters: &ParametersView,
         options: &RequestOptions,
     ) -> Result<CallFuture<T>, Error> {
+        let noted = self.noted(&link, function, options);
+        note_attempt(self.try_call_future(link, function, parameters, options), noted)
+    }
+
+    fn try_call_future(
+        self: &Arc<Self>,
+        link: Arc<LinkCell>,
+        function: &str,
+        parameters: &ParametersView,
+        options: &RequestOptions,
+    ) -> Result<CallFuture<T>, Error> {
         let mut state = link.lock();
         let now = self.now();
         // A link that is kept is read by no thread until its caller is back.
@@ -273,7 +294,7 @@ impl<T: Send + 'static> Engine<T> {
             state.waiters.push(Waiter { id, wake: Wake::Task(None), outcome: None });
         }
         self.settle(&link, state);
-        sent.map(|id| CallFuture { engine: self.clone(), link, id, has_succeeded: false })
+        sent.map(|id| CallFuture { engine: self.clone(), link, id, has_succeeded: false, noted: None })
     }
 
     /// Nothing waits for a call any more, and what it started is not wanted.
@@ -326,23 +347,44 @@ impl<T: Send + 'static> Engine<T> {
     ) -> Vec<Result<CallFuture<T>, Error>> {
         let began = self.now();
         let mut calls: Vec<_> = links.iter().map(|_| None).collect();
+        let mut noted: Vec<_> = links.iter().map(|link| self.noted(link.as_ref().ok()?, function, options)).collect();
         loop {
             let mut pause = Duration::MAX;
-            for (link, call) in links.iter().zip(&mut calls).filter(|(_, call)| call.is_none()) {
+            let open = links.iter().zip(&mut calls).zip(&mut noted).filter(|((_, call), _)| call.is_none());
+            for ((link, call), noted) in open {
                 let Ok(link) = link.as_ref().map_err(|error| *call = Some(Err(*error))) else { continue };
                 let usual = || link.lock().session.constraints().request_timeout;
                 let deadline = began + options.timeout.unwrap_or_else(usual);
                 let options = RequestOptions { timeout: Some(deadline.since(self.now())), ..*options };
-                let attempt = self.call_future(link.clone(), function, parameters, &options);
+                let attempt = self.try_call_future(link.clone(), function, parameters, &options);
                 match attempt.as_ref().err().and_then(|error| worth_waiting(error, SHORT_PAUSE)) {
                     Some(wait) if self.now() + wait < deadline => pause = pause.min(wait),
-                    _ => *call = Some(attempt),
+                    _ => *call = Some(note_attempt(attempt, noted.take())),
                 }
             }
             if pause == Duration::MAX {
                 return calls.into_iter().flatten().collect();
             }
             thread::sleep(pause.into());
+        }
+    }
+}
+
+/// A call that was sent notes its end itself.
+fn note_attempt<T: Send + 'static>(
+    attempt: Result<CallFuture<T>, Error>,
+    noted: Option<Noted>,
+) -> Result<CallFuture<T>, Error> {
+    match attempt {
+        Ok(mut call) => {
+            call.noted = noted;
+            Ok(call)
+        }
+        Err(error) => {
+            if let Some(noted) = noted {
+                noted.ended(Err(error));
+            }
+            Err(error)
         }
     }
 }
@@ -369,6 +411,7 @@ pub(crate) struct CallFuture<T: Send + 'static> {
     link: Arc<LinkCell>,
     id: CallId,
     has_succeeded: bool,
+    noted: Option<Noted>,
 }
 
 impl<T: Send + 'static> CallFuture<T> {
@@ -400,6 +443,9 @@ impl<T: Send + 'static> CallFuture<T> {
             drop(state);
             let result = self.engine.read_outcome(&self.link, self.id, outcome, parameters);
             self.has_succeeded = result.is_ok();
+            if let Some(noted) = self.noted.take() {
+                noted.ended(result);
+            }
             return Poll::Ready(result);
         }
         match state.waiters.iter_mut().find(|waiter| waiter.id == self.id) {
@@ -407,7 +453,12 @@ impl<T: Send + 'static> CallFuture<T> {
                 waiter.wake = Wake::Task(Some(cx.waker().clone()));
                 Poll::Pending
             }
-            None => Poll::Ready(Err(Error::Interrupted)),
+            None => {
+                if let Some(noted) = self.noted.take() {
+                    noted.ended(Err(Error::Interrupted));
+                }
+                Poll::Ready(Err(Error::Interrupted))
+            }
         }
     }
 }

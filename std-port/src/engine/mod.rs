@@ -32,6 +32,7 @@ pub(crate) mod link;
 mod links;
 mod membership;
 pub(crate) mod notices;
+mod noting;
 pub(crate) mod peers;
 mod pinging;
 mod presence;
@@ -81,6 +82,8 @@ use cara_secure::link::Cipher;
 
 use crate::clock::Clock;
 use crate::config::Capacities;
+#[cfg(feature = "control")]
+use crate::control::Audit;
 use crate::event::UnitEvent;
 use crate::handler::Handler;
 use crate::locks::{Held, Locked, Rank};
@@ -117,6 +120,8 @@ pub(crate) struct Engine<T: 'static> {
     guard: access::Guard,
     terms: terms::Terms,
     accounts: accounts::Accounts,
+    #[cfg(feature = "control")]
+    audit: Option<Arc<Audit>>,
     events: Events,
     /// For threads that look for themselves at what has happened.
     pub(crate) news: News,
@@ -139,6 +144,8 @@ pub(crate) struct EngineParts<T: 'static> {
     pub(crate) asks_for_itself: bool,
     pub(crate) state_folder: Option<PathBuf>,
     pub(crate) takes_over: bool,
+    #[cfg(feature = "control")]
+    pub(crate) audit: Option<Arc<Audit>>,
 }
 
 impl<T: Send + 'static> Engine<T> {
@@ -158,6 +165,8 @@ impl<T: Send + 'static> Engine<T> {
             guard: access::Guard::default(),
             terms: terms::Terms::new(parts.state_folder, parts.takes_over),
             accounts: accounts::Accounts::default(),
+            #[cfg(feature = "control")]
+            audit: parts.audit,
             events: Events::default(),
             news: News::default(),
         })

@@ -1,6 +1,7 @@
 //! The control socket of a running m_unit, from its client's side and below it.
 
 mod asking;
+mod audit;
 mod calling;
 mod clients;
 mod frozen;

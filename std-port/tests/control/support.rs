@@ -2,7 +2,7 @@
 
 use std::hash::{BuildHasher, Hasher, RandomState};
 use std::os::unix::fs::PermissionsExt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::{Condvar, Mutex};
 use std::time::{Duration, Instant};
 
@@ -68,10 +68,14 @@ pub(crate) struct Depot {
 
 impl Depot {
     pub(crate) fn new() -> Self {
+        Self::of(|fleet, directory| manager("manager", 1, fleet).control(Control::Path(directory.join("manager.sock"))))
+    }
+
+    /// With a manager of the caller's making, by fleet and directory.
+    pub(crate) fn of(manager: impl FnOnce(u32, &Path) -> Builder<(), MUnit>) -> Self {
         let fleet = fleet();
         let directory = directory();
-        let system = manager("manager", 1, fleet).control(Control::Path(directory.path().join("manager.sock")));
-        let system = system.build().unwrap();
+        let system = manager(fleet, directory.path()).build().unwrap();
         system.start().unwrap();
         // All have keys, and each test starts those that it is about.
         system.roster().iter().for_each(|absent| assert!(absent.retire()));

@@ -112,7 +112,7 @@ fn call(
             worst = if expired { Exit::Failed } else { worst };
             return Ok(show_end(expired, global)?);
         }
-        let Answer::Called { node, id, results, call, error, took_us } = answer else { return Ok(()) };
+        let Answer::Called { node, id, results, call, error, took_us, .. } = answer else { return Ok(()) };
         // The lease counts from when the call was made, and its end is on its way like any answer.
         let ended = not_kept_us.filter(|lease| took_us >= lease / 4 * 3);
         let error = error.map(|failure| of_its_lease(failure, &function, ended));

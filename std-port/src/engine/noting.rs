@@ -1,0 +1,38 @@
+//! What the audit log has of calls by the unit's own program: those that move, stop or reset something. An operator's are noted
+//! where they are asked for.
+
+#[cfg(feature = "control")]
+pub(super) use crate::control::ProgramCall as Noted;
+
+use cara_core::services::session::RequestOptions;
+
+use super::Engine;
+use super::link::LinkCell;
+
+/// Without operators there is no audit log.
+#[cfg(not(feature = "control"))]
+#[derive(Debug)]
+pub(super) enum Noted {}
+
+#[cfg(not(feature = "control"))]
+impl Noted {
+    pub(super) fn ended(self, _: Result<(), cara_core::error::Error>) {
+        match self {}
+    }
+}
+
+impl<T: Send + 'static> Engine<T> {
+    /// What is to be noted of a call that is about to be made.
+    #[cfg(feature = "control")]
+    pub(super) fn noted(&self, link: &LinkCell, function: &str, options: &RequestOptions) -> Option<Noted> {
+        let audit = self.audit.as_ref().filter(|_| !options.operator)?;
+        let attributes = link.lock().session.their_function_list().named(function).map(|known| known.attributes);
+        let node = || link.peer.get().map(|peer| peer.identity.to_string()).unwrap_or_default();
+        Noted::of(audit, function, attributes, options.take_over, node)
+    }
+
+    #[cfg(not(feature = "control"))]
+    pub(super) fn noted(&self, _: &LinkCell, _: &str, _: &RequestOptions) -> Option<Noted> {
+        None
+    }
+}
