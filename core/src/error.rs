@@ -494,7 +494,7 @@ impl fmt::Display for Stopper {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.0 {
             0 => f.write_str("the vehicle itself"),
-            id => write!(f, "unit {id}"),
+            id => write!(f, "the unit with the ID {id}"),
         }
     }
 }
@@ -554,7 +554,11 @@ mod tests {
             "{}",
             text(0)
         );
-        assert!(text(12).starts_with("what it moves was stopped by unit 12, reason 3: look why"), "{}", text(12));
+        assert!(
+            text(12).starts_with("what it moves was stopped by the unit with the ID 12, reason 3: look why"),
+            "{}",
+            text(12)
+        );
     }
 
     #[test]

@@ -50,8 +50,9 @@ impl<P: Port> Session<P> {
         self.held.iter().any(|held| held.call == call && !held.release_unsent)
     }
 
-    /// How long the leases that calls of a function hold last at most if no more renewal is answered; `None` where none is
-    /// renewed.
+    /// How long the leases that calls of a function hold last, counted from when the last answer to a renewal came; `None` where
+    /// none is renewed. An answer names its call and not its renewal, of which several may be on their way: one that was held up
+    /// makes this too long by as much.
     pub fn lease_left(&self, now: Instant, slot: Slot) -> Option<Duration> {
         let of_slot = self.held.iter().filter(|held| held.slot == slot && !held.release_unsent);
         of_slot.map(|held| (held.answered + held.lease).since(now)).max()
