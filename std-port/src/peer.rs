@@ -340,8 +340,13 @@ impl<T: Send + 'static> Peer<T> {
         state.actuators.get(&slot).copied()
     }
 
-    /// How long what calls of this unit have started at the node goes on at most if no more renewal gets there; `None` where
-    /// nothing is renewed.
+    /// How long what calls of this unit have started at the node goes on if no more renewal gets there; `None` where nothing is
+    /// renewed.
+    ///
+    /// It is the length of the lease, counted from when the node's last answer to a renewal came, or else from the request. The
+    /// node counts from when the renewal was made, and an answer does not say which one it is for: while the way back holds
+    /// answers up, this is too long by as much as they are late, and too short by what renewals that got there have added since.
+    /// What bounds a motion is the lease itself, which the node keeps.
     pub fn lease_left(&self, function: &str) -> Option<Duration> {
         let link = self.link().ok()?;
         let state = link.lock();

@@ -162,7 +162,8 @@ fn a_manager_that_stands_still_is_told_and_nobody_is_to_start_a_second_one() {
     let manager = clinic.manager_of_few_files(1024);
     until("it is up", || clinic.doctor(&["boss", "--listen", "0s"]).ids() == ["answers"]);
     manager.stand_still();
-    for arguments in [&["agv", "--listen", "3s"][..], &["boss"], &["--listen", "3s"]] {
+    let of_unit = ["--unit", "boss/1", "--listen", "3s"];
+    for arguments in [&["agv", "--listen", "3s"][..], &["boss"], &["--listen", "3s"], &of_unit] {
         let told = clinic.doctor(arguments);
         told.is(&["unit-hangs"], 4);
         assert!(told.found(0).starts_with("boss/1 "), "{told:?}");

@@ -489,7 +489,8 @@ pub struct OrderInfo {
     pub order: String,
     /// The ID number of its caller.
     pub holder: Option<u32>,
-    /// How long it goes on at most if no more renewal of the unit that is asked gets there.
+    /// How long it goes on if no more renewal of the unit that is asked gets there, counted from the node's last answer: too long by
+    /// as much as that was held up.
     pub left_ms: Option<u64>,
     /// What keeps every order from beginning.
     pub inhibited: Option<InhibitedInfo>,

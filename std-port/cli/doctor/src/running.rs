@@ -89,8 +89,8 @@ pub(crate) struct Sources {
 }
 
 impl Sources {
-    /// Begins to ask the units that the options select, or all of the fleet that they select. A named unit that does
-    /// not answer is an error; that no unit runs is not.
+    /// Begins to ask the units that the options select, or all of the fleet that they select. That a named unit
+    /// does not run is an error; that no unit runs is not.
     pub(crate) fn open(which: Option<&Which>, global: &Global) -> anyhow::Result<Self> {
         let (clients, unasked, refused) = clients(global)?;
         let (sender, news) = channel();
@@ -136,16 +136,32 @@ fn clients(global: &Global) -> anyhow::Result<(Vec<Client>, Vec<RunningUnit>, Op
     if let Some(path) = &global.socket {
         return Ok((vec![Client::connect(path).map_err(no_unit)?], Vec::new(), None));
     }
-    if let Some(unit) = &global.unit {
-        return Ok((vec![Client::find(Some(&unit.to_string())).map_err(no_unit)?], Vec::new(), None));
-    }
-    let (running, refused) = match control::running() {
-        Ok(running) => (running, None),
-        Err(error) => (Vec::new(), Some(error.to_string())),
+    let (running, refused) = match &global.unit {
+        Some(unit) => (named(&unit.to_string()).map_err(no_unit)?, None),
+        None => match control::running() {
+            Ok(running) => (running, None),
+            Err(error) => (Vec::new(), Some(error.to_string())),
+        },
     };
     let ours = running.into_iter().filter(|unit| global.fleet.is_none_or(|fleet| fleet == unit.fleet));
     let (asked, unasked): (Vec<_>, Vec<_>) = ours.partition(|unit| unit.state == UnitState::Answers);
     Ok((asked.iter().filter_map(|unit| Client::connect(&unit.path).ok()).collect(), unasked, refused))
+}
+
+/// The units of a name and id, of which one that cannot be asked is a finding; that none runs is an error.
+fn named(wanted: &str) -> Result<Vec<RunningUnit>, ControlError> {
+    let directory = control::directory();
+    let named = control::running_called(&directory, wanted)?;
+    if !named.is_empty() {
+        return Ok(named);
+    }
+    let running = control::running()?;
+    let wanted = wanted.to_owned();
+    Err(if running.is_empty() {
+        ControlError::NoneRunning(directory)
+    } else {
+        ControlError::NotRunning { wanted, running }
+    })
 }
 
 /// Asks a unit again and again, until it stops or the receiver is gone.
