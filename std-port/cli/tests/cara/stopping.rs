@@ -62,7 +62,7 @@ fn known(stage: &Stage, nodes: &[&str]) {
 }
 
 fn is_stopped(stage: &Stage, node: &str, by: u32) {
-    stage.ends(1, &["call", node, "go"]).says("Inhibited").says(&format!("by the unit with the ID {by} "));
+    stage.ends(1, &["call", node, "go"]).says("Inhibited").says(&format!("by the unit with the ID {by}, "));
 }
 
 /// A reset counts from the earliest time at which it can have been asked for: one right behind the stop is refused.
