@@ -36,6 +36,14 @@ impl<C: Counter, const N: usize> Counters<C, N> {
         }
     }
 
+    /// Adds one; saturates.
+    #[cfg_attr(target_os = "none", inline(never))]
+    pub fn count(&mut self, counter: C) {
+        if let Some(value) = self.values.get_mut(counter.index()) {
+            *value = value.saturating_add(1);
+        }
+    }
+
     /// The value of one counter.
     pub fn value(&self, counter: C) -> u64 {
         self.values.get(counter.index()).copied().unwrap_or(0)

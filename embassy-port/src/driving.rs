@@ -205,7 +205,7 @@ impl<T> Machine<T> {
         }
         let (since, index) = pending.chain(second).fold(first, core::cmp::min);
         if now >= since + PATIENCE {
-            self.hub.node.counters.add(NodeCounter::GaveWay, 1);
+            self.hub.node.counters.count(NodeCounter::GaveWay);
             self.with(index, |session, cx| session.close(cx, CloseReason::HelloTimeout));
         }
     }

@@ -85,6 +85,7 @@ entry!(link_set, {
 entry!(link_counters, {
     let link: &mut AnyLink = unknown();
     link.counters.add(*unknown(), *unknown());
+    link.counters.count(*unknown());
     link.counters.merge(unknown());
     keep(link.counters.value(*unknown()));
     drain(link.counters.iter());

@@ -96,7 +96,7 @@ impl<P: Port> Node<P> {
         self.table.set_link(link, Some(place));
         self.table.keep_index(place);
         self.counters.add(NodeCounter::Restarted, u64::from(restarted));
-        self.counters.add(NodeCounter::Joined, 1);
+        self.counters.count(NodeCounter::Joined);
         self.hints.forget(identity);
         self.obey(term);
         debug!("link {} joins", link.0);
@@ -131,7 +131,7 @@ impl<P: Port> Node<P> {
         known.newcomer = Some(newcomer);
         self.table.schedule(place, now, Task::Challenge);
         self.table.set_link(newcomer.link, Some(place));
-        self.counters.add(NodeCounter::Challenged, 1);
+        self.counters.count(NodeCounter::Challenged);
         Admission::Wait
     }
 
@@ -202,7 +202,7 @@ impl<P: Port> Node<P> {
             Refusal::NoKey => NodeCounter::RefusedKey,
             Refusal::Fenced => NodeCounter::RefusedFenced,
         };
-        self.counters.add(counter, 1);
+        self.counters.count(counter);
         self.note_of(now, address, identity, refusal);
         Admission::Refuse(refusal)
     }

@@ -123,7 +123,7 @@ impl<P: Port> Node<P> {
         let of_host = single.iter().filter(|answer| answer.to.is_of_host(&to)).count();
         let is_crowded = of_host >= ANSWERS_TO_A_HOST && !to.is_loopback();
         if is_crowded || single.push(Answer { at, to, who: who.clone(), nonce }).is_err() {
-            self.counters.add(NodeCounter::AnnounceDropped, 1);
+            self.counters.count(NodeCounter::AnnounceDropped);
         }
     }
 
@@ -137,7 +137,7 @@ impl<P: Port> Node<P> {
             let Answer { to, who, nonce, .. } = self.answers.single.swap_remove(index);
             let send = |datagram: &[u8]| mailman.send_to(to, datagram);
             if !self.send_announce(authenticator, nonce, Some(&who), NodeCounter::AnnounceSent, send) {
-                self.counters.add(NodeCounter::AnnounceWithheld, 1);
+                self.counters.count(NodeCounter::AnnounceWithheld);
                 self.note_of(now, to, &who, Refusal::NoKey);
             }
         }
@@ -172,7 +172,7 @@ impl<P: Port> Node<P> {
         self.sequence = announce.sequence;
         let mut bytes = [0; SEARCH_BYTES];
         let Some(datagram) = announce.encode(self.config.fleet, authenticator, to, &mut bytes) else { return false };
-        self.counters.add(if send(datagram) { counter } else { NodeCounter::SendFailed }, 1);
+        self.counters.count(if send(datagram) { counter } else { NodeCounter::SendFailed });
         true
     }
 
@@ -208,14 +208,14 @@ impl<P: Port> Node<P> {
         }
         let address = from.at_port(tcp_port);
         let Some((place, forgotten)) = self.table.hear_of(identity, address, epoch) else {
-            self.counters.add(NodeCounter::TableFull, 1);
+            self.counters.count(NodeCounter::TableFull);
             return;
         };
         self.count_forgotten(forgotten);
         let Some(known) = self.table.node_mut(place) else { return };
         // An answer that was held up names an address that the node may have left. Only the newest one counts.
         if !known.is_news(epoch, sequence) {
-            self.counters.add(NodeCounter::Outdated, 1);
+            self.counters.count(NodeCounter::Outdated);
             return;
         }
         known.newest = Some((epoch, sequence));
@@ -252,7 +252,7 @@ impl<P: Port> Node<P> {
         known.since = now;
         self.table.set_state(place, NodeState::Dialing);
         self.table.schedule(place, now + DIAL_TIMEOUT, Task::GiveUp);
-        self.counters.add(NodeCounter::Dialled, 1);
+        self.counters.count(NodeCounter::Dialled);
         Some(Command::Dial { to, identity })
     }
 
@@ -261,7 +261,7 @@ impl<P: Port> Node<P> {
         if let Some(known) = self.table.node_mut(place) {
             known.dialing = None;
         }
-        self.counters.add(NodeCounter::DialFailed, 1);
+        self.counters.count(NodeCounter::DialFailed);
         self.table.set_state(place, NodeState::Away);
         self.table.cancel(place);
         self.retry(now, place);

@@ -52,7 +52,7 @@ impl<P: Port> Node<P> {
             return false;
         }
         if epoch != self.config.epoch {
-            self.counters.add(NodeCounter::OwnIdentity, 1);
+            self.counters.count(NodeCounter::OwnIdentity);
             self.note_of(now, from, identity, Refusal::DuplicateIdentity);
             self.duplicates.hear(now, from, epoch);
             if let Some(who_has) = question.filter(|_| identity.role() == Role::MUnit) {

@@ -142,7 +142,7 @@ impl<P: Port> Node<P> {
             return;
         }
         if !self.hints.plan(now, from, who, now + delay) {
-            self.counters.add(NodeCounter::HintsIgnored, 1);
+            self.counters.count(NodeCounter::HintsIgnored);
         }
     }
 
@@ -183,6 +183,6 @@ impl<P: Port> Node<P> {
     ) {
         let Ok(wanted) = Manager::new(who.name(), who.id()) else { return };
         let sent = self.say_who_has(Some(wanted), 0, authenticator, |datagram| mailman.send_to(to, datagram));
-        self.counters.add(if sent { NodeCounter::HintsAsked } else { NodeCounter::SendFailed }, 1);
+        self.counters.count(if sent { NodeCounter::HintsAsked } else { NodeCounter::SendFailed });
     }
 }

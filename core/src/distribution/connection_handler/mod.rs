@@ -357,7 +357,7 @@ impl<P: Port> Node<P> {
                 self.counters.add(NodeCounter::DatagramItemsSkipped, announce.skipped.into());
                 self.heard_announce(now, from, &announce);
             }
-            Ok(Datagram::Session { .. }) => self.counters.add(NodeCounter::DatagramUnknownLink, 1),
+            Ok(Datagram::Session { .. }) => self.counters.count(NodeCounter::DatagramUnknownLink),
             Err(error) => self.unreadable(now, from, error),
         }
     }
@@ -371,7 +371,7 @@ impl<P: Port> Node<P> {
             DatagramError::NotForUs => NodeCounter::DatagramNotForUs,
             DatagramError::Malformed => NodeCounter::DatagramMalformed,
         };
-        self.counters.add(counter, 1);
+        self.counters.count(counter);
         if let DatagramError::Version(versions) = error {
             let refusal = Refusal::Version(versions);
             self.note(Finding { at: now, address: from, identity: None, refusal });

@@ -237,7 +237,7 @@ impl<P: Port> Node<P> {
         if allowed > now && !self.search.stubborn {
             self.search.deferred = self.search.deferred.saturating_add(1);
             self.search.stubborn = self.search.deferred >= DEFERRALS;
-            self.counters.add(NodeCounter::WhoHasDeferred, 1);
+            self.counters.count(NodeCounter::WhoHasDeferred);
             self.search.next = allowed + mostly_late(&mut self.random, FIRST_SEARCH);
             return;
         }
@@ -255,7 +255,7 @@ impl<P: Port> Node<P> {
         self.budget.note(now);
         let (wanted, expected) = (self.manager().cloned(), self.expected().max(1));
         let sent = self.say_who_has(wanted, expected, authenticator, |datagram| mailman.broadcast(datagram));
-        self.counters.add(if sent { NodeCounter::WhoHasSent } else { NodeCounter::SendFailed }, 1);
+        self.counters.count(if sent { NodeCounter::WhoHasSent } else { NodeCounter::SendFailed });
     }
 
     /// Encodes a [`WhoHas`] and sends it; `expected` is 0 in one that asks a single node.
@@ -288,7 +288,7 @@ impl<P: Port> Node<P> {
         if self.is_own(now, from, &who_has.identity, who_has.epoch, Some(who_has)) {
             return;
         }
-        self.counters.add(NodeCounter::WhoHasHeard, 1);
+        self.counters.count(NodeCounter::WhoHasHeard);
         let here = self.config.identity.role() == Role::MUnit;
         let counts = self.counts(now, from, who_has);
         match &who_has.wanted {
@@ -302,7 +302,7 @@ impl<P: Port> Node<P> {
             }
             None if who_has.identity.role() == Role::MUnit => self.heard_m_unit(now, from, who_has),
             None if here => self.answer_survey(now, from, who_has, mode),
-            _ => self.counters.add(NodeCounter::WrongManager, 1),
+            _ => self.counters.count(NodeCounter::WrongManager),
         }
     }
 
@@ -312,7 +312,7 @@ impl<P: Port> Node<P> {
         if counts {
             self.budget.note(now);
         } else {
-            self.counters.add(NodeCounter::WhoHasUnheeded, 1);
+            self.counters.count(NodeCounter::WhoHasUnheeded);
         }
         counts
     }
@@ -326,7 +326,7 @@ impl<P: Port> Node<P> {
             self.search.stubborn = true;
             return;
         }
-        self.counters.add(NodeCounter::WhoHasDeferred, 1);
+        self.counters.count(NodeCounter::WhoHasDeferred);
         if self.search.attempt == 0 || now >= self.search.round + FIRST_SEARCH {
             self.search.attempt = self.search.attempt.saturating_add(1);
             self.search.round = now;
@@ -340,7 +340,7 @@ impl<P: Port> Node<P> {
     /// m_units.
     fn heard_m_unit(&mut self, now: Instant, from: P::Endpoint, who_has: &WhoHas) {
         if !self.is_wanted(&who_has.identity) {
-            self.counters.add(NodeCounter::WrongManager, 1);
+            self.counters.count(NodeCounter::WrongManager);
             return;
         }
         if who_has.known.contains(&short_hash(&self.config.identity)) {
@@ -363,9 +363,9 @@ impl<P: Port> Node<P> {
             }
             return;
         }
-        self.counters.add(NodeCounter::AnnounceHeard, 1);
+        self.counters.count(NodeCounter::AnnounceHeard);
         if announce.identity.role() != Role::MUnit || !self.is_wanted(&announce.identity) {
-            self.counters.add(NodeCounter::WrongManager, 1);
+            self.counters.count(NodeCounter::WrongManager);
             if self.chosen.is_none() {
                 self.note_of(now, from, &announce.identity, Refusal::WrongManager);
             }
@@ -374,7 +374,7 @@ impl<P: Port> Node<P> {
         let broadcast = announce.nonce == 0;
         // An answer must carry the nonce of the last search: a recorded one leads nowhere.
         if !broadcast && announce.nonce != self.search.nonce {
-            self.counters.add(NodeCounter::Unasked, 1);
+            self.counters.count(NodeCounter::Unasked);
             return;
         }
         if !self.dials(&announce.identity) {

@@ -161,13 +161,13 @@ impl<S: Storage, C: Seal> Link<S, C> {
         self.receiver.receive(&mut self.cipher, buffers, bytes, &mut received)?;
         self.counters.add(LinkCounter::BytesReceived, received.consumed as u64);
         if received.paused && available > 0 {
-            self.counters.add(LinkCounter::ReadPaused, 1);
+            self.counters.count(LinkCounter::ReadPaused);
         }
         if received.incoming.is_some() {
-            self.counters.add(LinkCounter::FramesReceived, 1);
+            self.counters.count(LinkCounter::FramesReceived);
         }
         if let Some(Incoming::Message(..)) = received.incoming {
-            self.counters.add(LinkCounter::MessagesReceived, 1);
+            self.counters.count(LinkCounter::MessagesReceived);
         }
         Ok(received)
     }
@@ -203,10 +203,10 @@ impl<S: Storage, C: Seal> Link<S, C> {
             self.flush(mailman, buffers).map_err(Error::Closed)?;
         }
         if let Err(error) = self.sender.accept(buffers, priority, total, write) {
-            self.counters.add(LinkCounter::SendRefused, 1);
+            self.counters.count(LinkCounter::SendRefused);
             return Err(error);
         }
-        self.counters.add(LinkCounter::MessagesSent, 1);
+        self.counters.count(LinkCounter::MessagesSent);
         if hold { Ok(()) } else { self.flush(mailman, buffers).map_err(Error::Closed) }
     }
 
@@ -223,7 +223,7 @@ impl<S: Storage, C: Seal> Link<S, C> {
         self.flush(mailman, buffers).map_err(Error::Closed)?;
         let kept = self.sender.put_back(buffers, priority, total);
         let counter = if kept.is_ok() { LinkCounter::MessagesSent } else { LinkCounter::SendRefused };
-        self.counters.add(counter, 1);
+        self.counters.count(counter);
         kept
     }
 
@@ -236,7 +236,7 @@ impl<S: Storage, C: Seal> Link<S, C> {
         write: impl FnOnce(&mut ChunkWriter<'_>),
     ) -> bool {
         let accepted = self.sender.accept_short(priority, total, write);
-        self.counters.add(if accepted { LinkCounter::MessagesSent } else { LinkCounter::FramesWithheld }, 1);
+        self.counters.count(if accepted { LinkCounter::MessagesSent } else { LinkCounter::FramesWithheld });
         accepted
     }
 
@@ -244,7 +244,7 @@ impl<S: Storage, C: Seal> Link<S, C> {
     pub fn send_frame(&mut self, frame: &Frame<'_>) -> bool {
         let accepted = self.sender.accept_frame(frame);
         if !accepted {
-            self.counters.add(LinkCounter::FramesWithheld, 1);
+            self.counters.count(LinkCounter::FramesWithheld);
         }
         accepted
     }

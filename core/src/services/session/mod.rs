@@ -418,7 +418,7 @@ impl<P: Port> Session<P> {
         match refusal {
             Refusal::NoKey => {
                 // The code of a proof that failed: the peer need not know which of the two it was.
-                self.link.counters.add(LinkCounter::KeysMissing, 1);
+                self.link.counters.count(LinkCounter::KeysMissing);
                 self.farewell(cx, &Frame::Close(close_code(CloseReason::BadProof)));
             }
             _ => self.farewell(cx, &Frame::Refuse(refusal.to_wire())),
@@ -434,7 +434,7 @@ impl<P: Port> Session<P> {
     /// Ends the link in an orderly way; [`poll`](Self::poll) reports what was in flight.
     pub fn close(&mut self, cx: &mut Context<'_, P>, reason: CloseReason) {
         if matches!(reason, CloseReason::Protocol | CloseReason::Oversize) {
-            self.link.counters.add(LinkCounter::FramesRefused, 1);
+            self.link.counters.count(LinkCounter::FramesRefused);
         }
         self.farewell(cx, &Frame::Close(close_code(reason)));
         self.end(reason);

@@ -41,7 +41,7 @@ impl<P: Port> Session<P> {
         let hello = match Hello::decode(self.link.view(place, lent), mode) {
             Ok(hello) => hello,
             Err(error) => {
-                self.link.counters.add(LinkCounter::FramesRefused, 1);
+                self.link.counters.count(LinkCounter::FramesRefused);
                 if matches!(error, HelloError::Version(_)) && !self.dialed {
                     // The other end learns our versions from our hello.
                     self.send_hello(cx);
@@ -104,7 +104,7 @@ impl<P: Port> Session<P> {
 
     /// Ends a link whose peer has not proven who it is.
     pub(super) fn fail(&mut self, cx: &mut Context<'_, P>) {
-        self.link.counters.add(LinkCounter::ProofsFailed, 1);
+        self.link.counters.count(LinkCounter::ProofsFailed);
         self.close(cx, CloseReason::BadProof);
     }
 
@@ -112,9 +112,9 @@ impl<P: Port> Session<P> {
     /// end's proof is counted, and told where it has dialled: most often one of the two has another key. An end that dialled
     /// goes on searching.
     pub(super) fn ended_in_clear(&mut self, reason: Option<CloseReason>) {
-        self.link.counters.add(LinkCounter::FarewellsInClear, 1);
+        self.link.counters.count(LinkCounter::FarewellsInClear);
         if reason == Some(CloseReason::BadProof) && matches!(self.phase, Phase::Proving { .. }) {
-            self.link.counters.add(LinkCounter::ProofsFailed, 1);
+            self.link.counters.count(LinkCounter::ProofsFailed);
             if !self.dialed {
                 return self.end(CloseReason::BadProof);
             }

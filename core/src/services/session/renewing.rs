@@ -210,7 +210,7 @@ impl<P: Port> Session<P> {
     /// The peer has the key of this end's datagrams.
     fn adopt_keys(&mut self) -> Result<(), CloseReason> {
         self.link.cipher().acknowledged()?;
-        self.link.counters.add(LinkCounter::KeysRenewed, 1);
+        self.link.counters.count(LinkCounter::KeysRenewed);
         debug!("link {} has new keys", self.link.id().0);
         Ok(())
     }
