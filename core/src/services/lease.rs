@@ -7,7 +7,7 @@
 //! one stays dead for ever, whatever comes after it.
 
 use core::num::NonZeroU32;
-use core::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use core::sync::atomic::{AtomicBool, AtomicU8, AtomicU16, AtomicU32, Ordering};
 
 use crate::config::Priority;
 use crate::distribution::function_list::{Generation, Slot};
@@ -47,7 +47,7 @@ pub struct Claim {
 }
 
 /// Longest ramp, in milliseconds.
-const LONGEST_RAMP: u64 = 60_000;
+const LONGEST_RAMP: u16 = 60_000;
 /// A reader's clock may be so many milliseconds behind the unit's.
 const NEWER: u32 = 10;
 
@@ -79,7 +79,7 @@ pub struct Lease {
     /// That one's name for the call.
     call: AtomicU32,
     /// How it ended, as the number of a [`LeaseEnd`].
-    how: AtomicU32,
+    how: AtomicU8,
     /// When it was inhibited last, as `end` has its time; 0 when it never was. Written by [`inhibit`](Self::inhibit) alone, which
     /// may interrupt a reset.
     inhibited: AtomicU32,
@@ -88,9 +88,9 @@ pub struct Lease {
     /// The ID number of the unit that inhibited it; 0 for this one.
     inhibitor: AtomicU32,
     /// Why.
-    reason: AtomicU32,
+    reason: AtomicU16,
     /// How long what moves takes to stand still, in milliseconds.
-    ramp: AtomicU32,
+    ramp: AtomicU16,
     /// When the last order was stopped, as `end` has its time; 0 where none was since the last one began.
     stopped: AtomicU32,
 }
@@ -129,12 +129,12 @@ impl Lease {
             holder: AtomicU32::new(0),
             link: AtomicU32::new(0),
             call: AtomicU32::new(0),
-            how: AtomicU32::new(0),
+            how: AtomicU8::new(0),
             inhibited: AtomicU32::new(0),
             cleared: AtomicU32::new(0),
             inhibitor: AtomicU32::new(0),
-            reason: AtomicU32::new(0),
-            ramp: AtomicU32::new(0),
+            reason: AtomicU16::new(0),
+            ramp: AtomicU16::new(0),
             stopped: AtomicU32::new(0),
         }
     }
@@ -158,7 +158,7 @@ impl Lease {
     /// hook runs when the ramp begins, and what moves is to stand still when the loop that reads [`stage`](Self::stage) finds
     /// it dead: lease and ramp are the bound.
     pub fn set_ramp(&self, span: Duration) {
-        self.ramp.store(span.as_millis().min(LONGEST_RAMP) as u32, Ordering::Release);
+        self.ramp.store(span.as_millis().min(LONGEST_RAMP.into()) as u16, Ordering::Release);
     }
 
     /// As [`is_live`](Self::is_live), with what comes between live and dead.
@@ -193,7 +193,7 @@ impl Lease {
     fn is_on_ramp(&self, now: Instant, begun: u32) -> bool {
         // A reader may have looked at the clock a little before the unit did.
         let since = ((now.as_micros() / 1_000) as u32).wrapping_sub(begun).wrapping_add(NEWER);
-        begun != 0 && self.has_ramp() && since < self.ramp.load(Ordering::Acquire).saturating_add(NEWER)
+        begun != 0 && self.has_ramp() && since < u32::from(self.ramp.load(Ordering::Acquire)).saturating_add(NEWER)
     }
 
     /// The same for one order: once it is dead it stays so, also when another order holds the lease.
@@ -304,7 +304,7 @@ impl Lease {
     pub fn inhibit(&self, now: Instant, latch: Latch) {
         if !self.is_inhibited() {
             self.inhibitor.store(latch.by, Ordering::Release);
-            self.reason.store(latch.reason.into(), Ordering::Release);
+            self.reason.store(latch.reason, Ordering::Release);
         }
         self.stop_at(now, self.end.load(Ordering::Acquire));
         let at = odd_millis(now) as u32;
@@ -331,10 +331,8 @@ impl Lease {
 
     /// What inhibits it.
     pub fn latch(&self) -> Option<Latch> {
-        self.is_inhibited().then(|| Latch {
-            by: self.inhibitor.load(Ordering::Acquire),
-            reason: self.reason.load(Ordering::Acquire) as u16,
-        })
+        self.is_inhibited()
+            .then(|| Latch { by: self.inhibitor.load(Ordering::Acquire), reason: self.reason.load(Ordering::Acquire) })
     }
 
     /// Whether no order may begin.
@@ -380,13 +378,13 @@ impl Lease {
         } else {
             self.stop_at(now, self.end.load(Ordering::Acquire));
         }
-        self.how.store(how as u32, Ordering::Release);
+        self.how.store(how as u8, Ordering::Release);
         self.end.store(0, Ordering::Release);
     }
 
     /// The state of what it moves. What other threads write meanwhile may be in it in part: see [`Service::state`].
     pub fn state(&self) -> ActuatorState {
-        let how = LeaseEnd::of(self.how.load(Ordering::Acquire));
+        let how = LeaseEnd::of(self.how.load(Ordering::Acquire).into());
         let end = if self.has_order() { None } else { Some(how) };
         let has_begun = self.order.load(Ordering::Acquire) != 0;
         let last = has_begun.then(|| LastOrder {
@@ -524,15 +522,26 @@ pub(crate) struct Held {
     /// An operator made it.
     pub(crate) operator: bool,
     pub(crate) class: Priority,
-    pub(crate) lease: Duration,
+    /// In milliseconds, as the peer has published it.
+    pub(crate) lease: u32,
     /// For how long the call wants it.
     pub(crate) renew: Renew,
-    /// The next renewal.
+    /// The next renewal; in the far future when it is renewed no more, and its release has yet to be sent in the stream.
     pub(crate) next: Instant,
     /// When the peer answered a renewal last.
     pub(crate) answered: Instant,
-    /// It is renewed no more, and its release has yet to be sent in the stream.
-    pub(crate) release_unsent: bool,
+}
+
+impl Held {
+    /// Whether it is renewed.
+    pub(crate) fn is_renewed(&self) -> bool {
+        self.next != Instant::FAR_FUTURE
+    }
+
+    /// The lease's length.
+    pub(crate) fn length(&self) -> Duration {
+        Duration::from_millis(self.lease.into())
+    }
 }
 
 #[cfg(test)]

@@ -47,15 +47,15 @@ fn between_renewals(lease: Duration) -> Duration {
 impl<P: Port> Session<P> {
     /// Whether this unit renews the lease of a call.
     pub fn holds(&self, call: CallId) -> bool {
-        self.held.iter().any(|held| held.call == call && !held.release_unsent)
+        self.held.iter().any(|held| held.call == call && held.is_renewed())
     }
 
     /// How long the leases that calls of a function hold last, counted from when the last answer to a renewal came; `None` where
     /// none is renewed. An answer names its call and not its renewal, of which several may be on their way: one that was held up
     /// makes this too long by as much.
     pub fn lease_left(&self, now: Instant, slot: Slot) -> Option<Duration> {
-        let of_slot = self.held.iter().filter(|held| held.slot == slot && !held.release_unsent);
-        of_slot.map(|held| (held.answered + held.lease).since(now)).max()
+        let of_slot = self.held.iter().filter(|held| held.slot == slot && held.is_renewed());
+        of_slot.map(|held| (held.answered + held.length()).since(now)).max()
     }
 
     /// Whether a call of a function could be renewed. [`Error::Full`] when there is no room, and no earlier call of the same
@@ -80,7 +80,7 @@ impl<P: Port> Session<P> {
 
     /// An operator's calls and the program's do not give way to each other.
     fn oldest_held(&self, slot: Slot, operator: bool) -> Option<usize> {
-        let is_same = |held: &Held| held.slot == slot && held.operator == operator && !held.release_unsent;
+        let is_same = |held: &Held| held.slot == slot && held.operator == operator && held.is_renewed();
         let of_slot = self.held.iter().enumerate().filter(|(_, held)| is_same(held));
         of_slot.min_by_key(|(_, held)| held.call).map(|(index, _)| index)
     }
@@ -99,12 +99,12 @@ impl<P: Port> Session<P> {
             && let Some(oldest) = self.oldest_held(header.slot, header.operator)
         {
             take_at(&mut self.held, oldest);
-            self.link.counters.add(LinkCounter::RenewalsStopped, 1);
+            self.link.counters.count(LinkCounter::RenewalsStopped);
         }
         let (call, slot, next) = (CallId(header.id), header.slot, cx.now + between_renewals(lease));
         let (answered, operator) = (cx.now, header.operator);
-        let _ =
-            self.held.push(Held { call, slot, operator, class, lease, renew, next, answered, release_unsent: false });
+        let lease = u32::try_from(lease.as_millis()).unwrap_or(u32::MAX);
+        let _ = self.held.push(Held { call, slot, operator, class, lease, renew, next, answered });
         self.timers.renewal = self.timers.renewal.min(next);
     }
 
@@ -114,25 +114,25 @@ impl<P: Port> Session<P> {
         let (stamp, since) = self.clock.tell(cx.now);
         let now = cx.now;
         for index in 0..self.held.len() {
-            let due = self.held.get_mut(index).filter(|held| held.next <= now && !held.release_unsent);
+            let due = self.held.get_mut(index).filter(|held| held.next <= now);
             let Some(held) = due else { continue };
-            if held.answered + held.lease <= now {
+            let length = held.length();
+            if held.answered + length <= now {
                 let Held { call, slot, .. } = *held;
-                self.link.counters.add(LinkCounter::RenewalsUnanswered, 1);
+                self.link.counters.count(LinkCounter::RenewalsUnanswered);
                 self.release_call(cx, call, None);
                 return Some(Event::LeaseEnded { call, slot, why: LeaseEnd::Unanswered });
             }
-            held.next = now + between_renewals(held.lease);
+            held.next = now + between_renewals(length);
             // A heart that does not beat renews nothing. Whether it is too late when it beats again is for the peer to say.
-            let Some(age) = held.renew.age(now).filter(|age| *age < held.lease) else { continue };
+            let Some(age) = held.renew.age(now).filter(|age| *age < length) else { continue };
             let renewal = Renewal { call: held.call.0, class: held.class, stamp, since, age };
             let body = SessionBody::renewal(&renewal);
             // Both ways: one lost datagram must not stop a vehicle, nor must a retransmission in the stream.
             self.send_datagram(cx, &body, &[]);
             self.link.send_frame(&Frame::Session(&body));
         }
-        let renewed = self.held.iter().filter(|held| !held.release_unsent);
-        self.timers.renewal = renewed.map(|held| held.next).min().unwrap_or(Instant::FAR_FUTURE);
+        self.timers.renewal = self.held.iter().map(|held| held.next).min().unwrap_or(Instant::FAR_FUTURE);
         self.flush(cx);
         None
     }
@@ -146,7 +146,7 @@ impl<P: Port> Session<P> {
 
     /// A heart has stopped: what names it is released.
     pub fn release_beats(&mut self, cx: &mut Context<'_, P>, beats: Beats) {
-        let of_it = |held: &&Held| held.renew == Renew::Heart(beats) && !held.release_unsent;
+        let of_it = |held: &&Held| held.renew == Renew::Heart(beats) && held.is_renewed();
         while let Some(call) = self.held.iter().find(of_it).map(|held| held.call) {
             self.release_call(cx, call, None);
         }
@@ -166,7 +166,7 @@ impl<P: Port> Session<P> {
     /// The peer has ended the lease of a call.
     pub(super) fn stop_renewing(&mut self, call: CallId) -> Option<Held> {
         self.answered.retain(|known| known.call != call);
-        let index = self.held.iter().position(|held| held.call == call && !held.release_unsent)?;
+        let index = self.held.iter().position(|held| held.call == call && held.is_renewed())?;
         take_at(&mut self.held, index)
     }
 
@@ -179,7 +179,7 @@ impl<P: Port> Session<P> {
             // Its caller may have noticed the time-out before this session was polled.
             let is_late = pending.deadline <= cx.now;
             let counter = if is_late { LinkCounter::CallsTimedOut } else { LinkCounter::CallsCancelled };
-            self.link.counters.add(counter, 1);
+            self.link.counters.count(counter);
         }
         self.release_call(cx, id, pending);
     }
@@ -198,7 +198,7 @@ impl<P: Port> Session<P> {
         // Kept in the place that the call had: a release that is lost would let the vehicle drive on to the end of its lease.
         match (pending, held) {
             (Some(pending), _) => self.requests.keep_unsent_release(pending),
-            (None, Some(held)) => drop(self.held.push(Held { release_unsent: true, ..held })),
+            (None, Some(held)) => drop(self.held.push(Held { next: Instant::FAR_FUTURE, ..held })),
             (None, None) => drop(answered.map(|known| self.releases.push((known.slot, id)))),
         }
         self.timers.release = cx.now + RETRY;
@@ -212,7 +212,7 @@ impl<P: Port> Session<P> {
             return Err(Error::NotConnected);
         }
         // Renewals stop first, whether or not the peer can be told: at the latest the lease's end stops what runs.
-        self.held.retain(|held| held.slot != slot || held.release_unsent);
+        self.held.retain(|held| held.slot != slot || !held.is_renewed());
         let newest = self.requests.newest();
         if self.send_release_all(cx, slot, newest) {
             return Ok(());
@@ -237,7 +237,7 @@ impl<P: Port> Session<P> {
             }
             self.releases.pop();
         }
-        while let Some(Held { call, class, .. }) = self.held.iter().find(|held| held.release_unsent).copied() {
+        while let Some(Held { call, class, .. }) = self.held.iter().find(|held| !held.is_renewed()).copied() {
             if !self.send_release(cx, call, class) {
                 return;
             }
