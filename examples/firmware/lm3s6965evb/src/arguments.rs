@@ -168,7 +168,7 @@ mod secured {
             let security = if cfg!(feature = "constant-random") {
                 proof.begin_constant()
             } else {
-                proof.begin(BOOTS.init(boots::File(boots)), halves(noise))?
+                proof.begin(BOOTS.init(boots::File::open(&boots)), halves(noise))?
             };
             Some((settings, security, noise))
         }

@@ -15,12 +15,13 @@ use crate::arguments::Path;
 /// Of each of the two pages: small, so that tests come to their ends.
 const PAGE: u32 = 512;
 
-/// The file with this path, which is made where there is none.
-pub(crate) struct File(pub(crate) Path);
+/// The count and the term in a file, which stays open for this life of the board.
+pub(crate) struct File(Boots<Pages>);
 
 impl File {
-    fn boots(&self) -> Result<Boots<Pages>, Refused> {
-        Ok(Boots::new(Pages::open(&self.0)?, [0, PAGE], PAGE))
+    /// The file with this path, which is made where there is none. Of one that cannot be opened nothing can be read.
+    pub(crate) fn open(path: &Path) -> Self {
+        Self(Boots::new(Pages(open(path).ok()), [0, PAGE], PAGE))
     }
 }
 
@@ -38,7 +39,7 @@ impl BootCounter for File {
     type Error = BootError<Refused>;
 
     fn advance(&mut self) -> Result<u64, Self::Error> {
-        let count = self.boots()?.advance()?;
+        let count = self.0.advance()?;
         cara_vehicle::info!("start number {}", count);
         Ok(count)
     }
@@ -46,35 +47,42 @@ impl BootCounter for File {
 
 impl TermStore for File {
     fn stored(&mut self) -> Option<Term> {
-        self.boots().ok()?.term().ok()
+        self.0.stored()
     }
 
     fn store(&mut self, term: Term) -> bool {
-        self.boots().is_ok_and(|mut boots| boots.keep_term(term).is_ok())
+        self.0.store(term)
     }
 }
 
-struct Pages(fs::File);
+struct Pages(Option<fs::File>);
+
+fn open(path: &Path) -> Result<fs::File, Refused> {
+    let mut path = path.clone();
+    path.push('\0').map_err(|_| Refused)?;
+    let path = CStr::from_bytes_with_nul(path.as_bytes()).map_err(|_| Refused)?;
+    if path.is_empty() {
+        return Err(Refused);
+    }
+    if let Ok(file) = fs::File::options().read(true).write(true).open(path) {
+        return Ok(file);
+    }
+    let file = fs::File::options().read(true).write(true).create(true).truncate(true).open(path);
+    let mut file = file.map_err(|_| Refused)?;
+    erase(&mut file, 2 * PAGE)?;
+    Ok(file)
+}
+
+fn erase(file: &mut fs::File, bytes: u32) -> Result<(), Refused> {
+    (0..bytes).try_for_each(|_| file.write_all(&[0xFF])).map_err(|_| Refused)
+}
 
 impl Pages {
-    fn open(path: &Path) -> Result<Self, Refused> {
-        let mut path = path.clone();
-        path.push('\0').map_err(|_| Refused)?;
-        let path = CStr::from_bytes_with_nul(path.as_bytes()).map_err(|_| Refused)?;
-        if path.is_empty() {
-            return Err(Refused);
-        }
-        if let Ok(file) = fs::File::options().read(true).write(true).open(path) {
-            return Ok(Self(file));
-        }
-        let file = fs::File::options().read(true).write(true).create(true).truncate(true).open(path);
-        let mut pages = Self(file.map_err(|_| Refused)?);
-        pages.erase(0, 2 * PAGE)?;
-        Ok(pages)
-    }
-
-    fn seek(&mut self, offset: u32) -> Result<(), Refused> {
-        self.0.seek(SeekFrom::Start(offset.into())).map(drop).map_err(|_| Refused)
+    /// The file, at this place of it.
+    fn at(&mut self, offset: u32) -> Result<&mut fs::File, Refused> {
+        let file = self.0.as_mut().ok_or(Refused)?;
+        file.seek(SeekFrom::Start(offset.into())).map_err(|_| Refused)?;
+        Ok(file)
     }
 }
 
@@ -86,8 +94,7 @@ impl ReadNorFlash for Pages {
     const READ_SIZE: usize = 1;
 
     fn read(&mut self, offset: u32, bytes: &mut [u8]) -> Result<(), Refused> {
-        self.seek(offset)?;
-        self.0.read_exact(bytes).map_err(|_| Refused)
+        self.at(offset)?.read_exact(bytes).map_err(|_| Refused)
     }
 
     fn capacity(&self) -> usize {
@@ -100,12 +107,10 @@ impl NorFlash for Pages {
     const ERASE_SIZE: usize = PAGE as usize;
 
     fn erase(&mut self, from: u32, to: u32) -> Result<(), Refused> {
-        self.seek(from)?;
-        (from..to).try_for_each(|_| self.0.write_all(&[0xFF])).map_err(|_| Refused)
+        erase(self.at(from)?, to.saturating_sub(from))
     }
 
     fn write(&mut self, offset: u32, bytes: &[u8]) -> Result<(), Refused> {
-        self.seek(offset)?;
-        self.0.write_all(bytes).map_err(|_| Refused)
+        self.at(offset)?.write_all(bytes).map_err(|_| Refused)
     }
 }
