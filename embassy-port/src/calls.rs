@@ -27,7 +27,7 @@ impl<T> Peer<T> {
     /// still run, once.
     #[doc(alias = "block_request_their_function")]
     pub async fn block_request(&self, function: &str, parameters: &mut ParametersView) -> Result<(), Error> {
-        self.block_request_with(function, parameters, &RequestOptions::default()).await
+        self.block_request_with(function, parameters, const { &RequestOptions::new() }).await
     }
 
     /// As [`block_request`](Self::block_request), with a time-out, class or lease of its own.
@@ -70,20 +70,39 @@ impl<T> Peer<T> {
         deadline: Instant,
     ) -> Result<Hold<T>, Error> {
         loop {
-            let options = RequestOptions { timeout: Some(deadline.since(now())), ..*options };
-            let link = self.link()?;
-            let sent = self.unit.act(|machine| machine.call(link, function, parameters, &options, deadline));
-            let (error, wait) = match sent {
+            let again = match self.try_begin(function, parameters, options, deadline) {
                 Ok(call) => return Ok(Hold { unit: self.unit, call, is_wanted: false }),
-                Err(error @ Error::TooSoon { wait }) => (error, wait),
-                Err(error @ Error::Full(Limit::SendQueue | Limit::Buffers | Limit::Calls)) => (error, PAUSE),
-                Err(error) => return Err(error),
+                Err((error, None)) => return Err(error),
+                Err((_, Some(again))) => again,
             };
-            if now() + wait >= deadline {
-                return Err(error);
-            }
-            timer(now() + wait).await;
+            timer(again).await;
         }
+    }
+}
+
+impl<T> Peer<T> {
+    /// Sends the request, if it can be sent now; with the error, when it may be tried again. What this needs is no part of a
+    /// future.
+    fn try_begin(
+        &self,
+        function: &str,
+        parameters: &ParametersView,
+        options: &RequestOptions,
+        deadline: Instant,
+    ) -> Result<InFlight, (Error, Option<Instant>)> {
+        let now = now();
+        let options = RequestOptions { timeout: Some(deadline.since(now)), ..*options };
+        let link = self.link().map_err(|error| (error, None))?;
+        let sent = self.unit.act(|machine| machine.call(link, function, parameters, &options, deadline));
+        sent.map_err(|error| {
+            let wait = match error {
+                Error::TooSoon { wait } => wait,
+                Error::Full(Limit::SendQueue | Limit::Buffers | Limit::Calls) => PAUSE,
+                _ => return (error, None),
+            };
+            let again = now + wait;
+            (error, (again < deadline).then_some(again))
+        })
     }
 }
 

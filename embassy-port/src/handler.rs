@@ -153,10 +153,10 @@ impl<T> Handler<T> {
         let result = match self.run {
             Run::Free(run) => run(call, parameters),
             Run::Method(run) => run(&mut *state()?, call, parameters),
-            Run::Paper(run) => by_value(parameters, run),
+            Run::Paper(run) => by_value(parameters, &mut |arguments| run(arguments)),
             Run::PaperMethod(run) => {
                 let mut state = state()?;
-                by_value(parameters, |arguments| run(&mut state, arguments))
+                by_value(parameters, &mut |arguments| run(&mut state, arguments))
             }
             Run::Task => Err(ServiceError::NotReady),
         };
@@ -166,7 +166,7 @@ impl<T> Handler<T> {
 
 /// Runs a service of the paper's form on the parameters of a call. Kept apart: only such services pay for copies.
 #[inline(never)]
-fn by_value(view: &mut ParametersView, service: impl FnOnce(Parameters) -> Parameters) -> Result<(), ServiceError> {
+fn by_value(view: &mut ParametersView, service: &mut dyn FnMut(Parameters) -> Parameters) -> Result<(), ServiceError> {
     let mut arguments = Parameters::new();
     arguments.copy_from(view).map_err(|_| ServiceError::BadResults)?;
     view.copy_from(&service(arguments)).map_err(|_| ServiceError::BadResults)
