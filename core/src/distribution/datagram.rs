@@ -438,8 +438,10 @@ pub fn short_hash(identity: &Identity) -> u32 {
         Role::MUnit => 0,
         Role::SUnit => 1,
     };
-    let bytes = core::iter::once(role).chain(identity.id().to_le_bytes()).chain(identity.name().bytes());
-    bytes.fold(0x811C_9DC5, |hash, byte| (hash ^ u32::from(byte)).wrapping_mul(0x0100_0193))
+    let fold = |hash, bytes: &[u8]| {
+        bytes.iter().fold(hash, |hash: u32, byte| (hash ^ u32::from(*byte)).wrapping_mul(0x0100_0193))
+    };
+    fold(fold(fold(0x811C_9DC5, &[role]), &identity.id().to_le_bytes()), identity.name().as_bytes())
 }
 
 #[cfg(test)]

@@ -405,10 +405,8 @@ impl<S: Storage> Queue<S> {
         }
         let end = self.end.saturating_add(needed);
         let place = self.buffer.get_mut(self.end..end).ok_or(Error::Busy)?;
-        let (head_place, block_place) = place.split_at_mut_checked(HEAD_BYTES).ok_or(Error::Busy)?;
-        for (place, byte) in head_place.iter_mut().zip(encode_head(&head, block.len())) {
-            *place = byte;
-        }
+        let (head_place, block_place) = place.split_first_chunk_mut().ok_or(Error::Busy)?;
+        *head_place = encode_head(&head, block.len());
         bytes::copy(block, block_place);
         self.end = end;
         Ok(())
@@ -444,17 +442,17 @@ impl<S: Storage> Queue<S> {
     }
 }
 
-fn encode_head(head: &CallHead, block: usize) -> impl Iterator<Item = u8> {
-    let length = (block as u32).to_le_bytes();
-    let flags = [u8::from(head.wants_reply), u8::from(head.takes_over), u8::from(head.operator), 0];
-    length
-        .into_iter()
-        .chain(head.id.to_le_bytes())
-        .chain(head.slot.0.to_le_bytes())
-        .chain(head.generation.0.to_le_bytes())
-        .chain(flags)
-        .chain(head.deadline.as_micros().to_le_bytes())
-        .chain(head.sent_at.as_micros().to_le_bytes())
+fn encode_head(head: &CallHead, block: usize) -> [u8; HEAD_BYTES] {
+    let [l0, l1, l2, l3] = (block as u32).to_le_bytes();
+    let [i0, i1, i2, i3] = head.id.to_le_bytes();
+    let ([s0, s1], [g0, g1]) = (head.slot.0.to_le_bytes(), head.generation.0.to_le_bytes());
+    let [f0, f1, f2] = [head.wants_reply, head.takes_over, head.operator].map(u8::from);
+    let [d0, d1, d2, d3, d4, d5, d6, d7] = head.deadline.as_micros().to_le_bytes();
+    let [m0, m1, m2, m3, m4, m5, m6, m7] = head.sent_at.as_micros().to_le_bytes();
+    [
+        l0, l1, l2, l3, i0, i1, i2, i3, s0, s1, g0, g1, f0, f1, f2, 0, d0, d1, d2, d3, d4, d5, d6, d7, m0, m1, m2, m3,
+        m4, m5, m6, m7,
+    ]
 }
 
 fn decode_head(bytes: &[u8; HEAD_BYTES], priority: Priority) -> (CallHead, usize) {

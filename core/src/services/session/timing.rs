@@ -2,6 +2,7 @@
 
 use super::granting::expire_granted;
 use super::{Event, Phase, Session};
+use crate::bytes::copy;
 use crate::config::{DATAGRAM_BYTES, GATHER, LATER};
 use crate::distribution::datagram;
 use crate::distribution::message::{SESSION_BODY_BYTES, SessionBody};
@@ -135,7 +136,7 @@ impl<P: Port> Session<P> {
         if let Some(pending) = self.requests.expire(cx.now) {
             let id = pending.id;
             self.release_call(cx, id, Some(pending));
-            self.link.counters.add(LinkCounter::CallsTimedOut, 1);
+            self.link.counters.count(LinkCounter::CallsTimedOut);
             return Some(Event::Reply(id, Err(Error::TimedOut)));
         }
         // From here on only frames are sent; what the port has to do for others was returned above, one event a call.
@@ -168,7 +169,7 @@ impl<P: Port> Session<P> {
     fn look_for_peer(&mut self, cx: &mut Context<'_, P>) {
         let look = self.liveness.poll(cx.now);
         if look.missed {
-            self.link.counters.add(LinkCounter::KeepAlivesMissed, 1);
+            self.link.counters.count(LinkCounter::KeepAlivesMissed);
         }
         if look.lost {
             return self.close(cx, CloseReason::Silent);
@@ -229,10 +230,10 @@ impl<P: Port> Session<P> {
         let mut bytes = [0; LONGEST_DATAGRAM];
         let start = header.len().saturating_add(front);
         let end = start.saturating_add(body.len()).saturating_add(rest.len());
-        let Some(place) = bytes.get_mut(start..end) else { return false };
-        for (place, byte) in place.iter_mut().zip(body.iter().chain(rest)) {
-            *place = *byte;
-        }
+        let place = bytes.get_mut(start..end).and_then(|place| place.split_at_mut_checked(body.len()));
+        let Some((place, behind)) = place else { return false };
+        copy(body, place);
+        copy(rest, behind);
         let Some(whole) = bytes.get_mut(..end.saturating_add(back)) else { return false };
         let Some((head, sealed)) = whole.split_first_chunk_mut() else { return false };
         *head = header;
@@ -241,7 +242,7 @@ impl<P: Port> Session<P> {
         }
         let sent = cx.mailman.send_to(to, whole);
         if sent {
-            self.link.counters.add(LinkCounter::DatagramsSent, 1);
+            self.link.counters.count(LinkCounter::DatagramsSent);
         }
         sent
     }
