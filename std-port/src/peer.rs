@@ -107,7 +107,7 @@ pub struct TheirFunction {
 
 impl TheirFunction {
     fn of(function: Function<'_>) -> Self {
-        Self { definition: function.signature.to_definition(), attributes: function.attributes }
+        Self { definition: function.signature.to_definition(), attributes: *function.attributes }
     }
 }
 

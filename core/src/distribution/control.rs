@@ -33,10 +33,10 @@ macro_rules! controls {
 
             /// Reads an item of a control message; `None` for a kind that this version does not know.
             pub fn take(item: &Item<'b>) -> Result<Option<Self>, Malformed> {
-                match item.kind {
-                    $($kind => item.read(|reader| Some(Self::$name { $($field: Field::take(reader)),* })),)*
-                    _ => Ok(None),
-                }
+                item.read(|reader| match item.kind {
+                    $($kind => Some(Self::$name { $($field: Field::take(reader)),* }),)*
+                    _ => None,
+                })
             }
         }
     };

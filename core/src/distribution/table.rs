@@ -28,7 +28,7 @@ pub struct Function<'a, H: ?Sized = ()> {
     /// Its name, arguments and results.
     pub signature: Signature<'a>,
     /// How it wants to be called.
-    pub attributes: Attributes,
+    pub attributes: &'a Attributes,
     /// What runs it.
     pub handler: &'a H,
 }
@@ -201,7 +201,7 @@ impl<S: Storage, H: 'static> Table<S, H> {
             slot: stored.slot,
             generation: entry.generation,
             signature: Signature::of_checked(self.signature(stored)),
-            attributes: stored.attributes,
+            attributes: &stored.attributes,
             handler: &stored.handler,
         })
     }

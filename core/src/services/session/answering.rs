@@ -52,7 +52,7 @@ impl<P: Port> Session<P> {
             }
             read_arguments(function.signature, block, arguments).map(|()| function.attributes)
         })?;
-        let begun = read.and_then(|attributes| self.begin(cx, head, &attributes));
+        let begun = read.and_then(|attributes| self.begin(cx, head, attributes));
         if let Err(error) = begun {
             self.refuse_request(cx, head.id, head.slot, head.priority, head.wants_reply, error);
         }
@@ -79,7 +79,7 @@ impl<P: Port> Session<P> {
     pub(super) fn begin(
         &mut self,
         cx: &mut Context<'_, P>,
-        head: CallHead,
+        mut head: CallHead,
         attributes: &Attributes,
     ) -> Result<Call, Error> {
         let lease = attributes.lease;
@@ -87,7 +87,7 @@ impl<P: Port> Session<P> {
         if lease.is_some() && self.publishing.is_released(head.slot, head.id) {
             return Err(Error::Expired);
         }
-        let head = CallHead { resets: attributes.reset, ..head };
+        head.resets = attributes.reset;
         // A slot first, then the lease: a lease that is granted and has no slot would run on without a call that ends it.
         let ticket = self.calls.begin(head, is_emergency(attributes, head.priority))?;
         let order = match lease.map_or(Ok(None), |length| self.grant(cx, &head, length)) {
@@ -97,7 +97,7 @@ impl<P: Port> Session<P> {
                 return Err(error);
             }
         };
-        self.link.counters.add(LinkCounter::RequestsRun, 1);
+        self.link.counters.count(LinkCounter::RequestsRun);
         let CallHead { slot, priority, wants_reply, deadline, .. } = head;
         Ok(Call { ticket, slot, priority, wants_reply, deadline, order })
     }
@@ -112,11 +112,10 @@ impl<P: Port> Session<P> {
     ) -> Result<(), Error> {
         let Some(head) = self.calls.call(ticket) else { return Ok(()) };
         // Before the answer leaves: one that says it was reset is true.
-        let result = match result {
-            // Its caller has been told that it failed, and may not know that anything may move again.
-            Ok(_) if head.resets && head.deadline <= cx.now => Err(Error::Expired),
-            Ok(results) if head.resets => self.reset_orders(cx, &head).map(|()| results),
-            result => result,
+        let result = if head.resets {
+            result.and_then(|results| self.reset_orders(cx, &head).map(|()| results))
+        } else {
+            result
         };
         // A call that failed wants nothing any more, so what it started stops now: also where its answer has no room yet.
         if result.is_err() {
@@ -145,7 +144,7 @@ impl<P: Port> Session<P> {
     /// Gives up on answering a call whose answer could not be kept.
     pub fn drop_answer(&mut self, ticket: Ticket) {
         if self.calls.end(ticket) {
-            self.link.counters.add(LinkCounter::RepliesDropped, 1);
+            self.link.counters.count(LinkCounter::RepliesDropped);
         }
     }
 
@@ -191,8 +190,9 @@ impl<P: Port> Session<P> {
         error: Error,
     ) -> Result<(), Error> {
         let header = if wants_reply { encode_reply(id, Err(error)) } else { encode_failure(id, error) };
-        match self.send(cx, priority, REPLY_BYTES, &mut |writer| writer.put(&header)) {
-            Err(Error::Full(_)) if self.link.send_short(priority, REPLY_BYTES, |writer| writer.put(&header)) => {
+        let write: &mut dyn FnMut(&mut ChunkWriter<'_>) = &mut |writer| writer.put(&header);
+        match self.send(cx, priority, REPLY_BYTES, write) {
+            Err(Error::Full(_)) if self.link.send_short(priority, REPLY_BYTES, write) => {
                 self.flush(cx);
                 Ok(())
             }
@@ -229,7 +229,7 @@ impl<P: Port> Session<P> {
             Error::NotAllowed => LinkCounter::RequestsForbidden,
             _ => LinkCounter::RequestsRejected,
         };
-        self.link.counters.add(counter, 1);
+        self.link.counters.count(counter);
         if error == Error::NotAllowed
             && let Some(function) = cx.functions.function(slot)
         {
@@ -243,7 +243,7 @@ impl<P: Port> Session<P> {
             error => error,
         };
         if self.send_error(cx, id, priority, wants_reply, error).is_err() {
-            self.link.counters.add(LinkCounter::RepliesDropped, 1);
+            self.link.counters.count(LinkCounter::RepliesDropped);
         }
         if error == Error::StaleFunction {
             self.publishing.tell_again(slot);

@@ -80,7 +80,7 @@ impl<P: Port> Session<P> {
     /// The caller still wants a call: its lease goes on, as of when the renewal was made.
     pub(super) fn renewed(&mut self, cx: &mut Context<'_, P>, renewal: &Renewal) {
         let Some(index) = self.granted.iter().position(|granted| granted.call == renewal.call) else {
-            self.link.counters.add(LinkCounter::RenewalsIgnored, 1);
+            self.link.counters.count(LinkCounter::RenewalsIgnored);
             // A call that is on its way or waits for its turn has no lease yet.
             let Renewal { call, class, .. } = *renewal;
             if self.calls.has_arrived(class, call) && !self.calls.is_waiting(class, call) {
@@ -91,7 +91,7 @@ impl<P: Port> Session<P> {
         let Some(granted) = self.granted.get(index).copied() else { return };
         // A function that has been replaced since started it, and nothing of it is prolonged.
         if cx.functions.lookup(granted.slot, granted.generation).is_err() {
-            self.link.counters.add(LinkCounter::RenewalsIgnored, 1);
+            self.link.counters.count(LinkCounter::RenewalsIgnored);
             return;
         }
         let Some(sent_at) = sent_at_earliest(cx.now, renewal.stamp, renewal.since) else { return };
@@ -141,11 +141,10 @@ impl<P: Port> Session<P> {
 
     /// A function that stops was called: what it stops is dead before its handler runs, and calls that were made before it
     /// begin no more, on any link.
+    #[inline(never)]
     pub(super) fn stop_orders(&mut self, cx: &mut Context<'_, P>, header: &RequestHeader) {
         let latch = Latch { by: self.identity().map_or(0, Identity::id), reason: 0 };
-        for service in self.moved_by(cx, header.slot, header.generation) {
-            service.inhibit(cx.now, latch);
-        }
+        self.each_moved_by(cx, header.slot, header.generation, &mut |service| service.inhibit(cx.now, latch));
         if self.was_stopped(cx) {
             self.timers.lease = cx.now;
         }
@@ -154,31 +153,39 @@ impl<P: Port> Session<P> {
 
     /// A function that resets has been answered with results: what it resets may move again, unless it was stopped after the
     /// call was made, which is [`Error::Inhibited`].
+    #[inline(never)]
     pub(super) fn reset_orders(&mut self, cx: &Context<'_, P>, head: &CallHead) -> Result<(), Error> {
-        let mut outcome = Ok(());
-        self.publishing.actuators_due = true;
-        for service in self.moved_by(cx, head.slot, head.generation) {
-            service.reset(cx.now, head.sent_at);
-            let latch = service.lease().and_then(Lease::latch);
-            outcome = outcome.and(latch.map_or(Ok(()), |latch| Err(latch.into())));
+        // Its caller has been told that it failed, and may not know that anything may move again.
+        if head.deadline <= cx.now {
+            return Err(Error::Expired);
         }
-        outcome
+        let mut latched = None;
+        self.publishing.actuators_due = true;
+        self.each_moved_by(cx, head.slot, head.generation, &mut |service| {
+            service.reset(cx.now, head.sent_at);
+            latched = latched.or_else(|| service.lease().and_then(Lease::latch));
+        });
+        latched.map_or(Ok(()), |latch| Err(latch.into()))
     }
 
-    /// The leased services that move what a function has in its charge: its own actuator, or all.
-    fn moved_by<'c>(
+    /// The leased services that move what a function has in its charge: its own actuator, or all. One piece of code whatever
+    /// is done with them.
+    #[inline(never)]
+    fn each_moved_by(
         &self,
-        cx: &Context<'c, P>,
+        cx: &Context<'_, P>,
         slot: Slot,
         generation: Generation,
-    ) -> impl Iterator<Item = &'c dyn Service> + use<'c, P> {
-        let (functions, charge) = (cx.functions, service_of(cx, slot, generation));
+        act: &mut dyn FnMut(&dyn Service),
+    ) {
+        let charge = service_of(cx, slot, generation);
         let all = charge.and_then(Service::lease).is_none();
-        self.publishing.all_slots().filter_map(move |slot| {
-            let function = functions.function(slot)?;
+        for function in self.publishing.all_slots().filter_map(|slot| cx.functions.function(slot)) {
             let is_meant = all || share_a_lease(charge, Some(function.handler));
-            (is_meant && function.attributes.lease.is_some()).then_some(function.handler)
-        })
+            if is_meant && function.attributes.lease.is_some() {
+                act(function.handler);
+            }
+        }
     }
 
     /// The number that the functions of this unit which move the same thing have in common; 0 for one that shares nothing.
@@ -236,8 +243,13 @@ impl<P: Port> Session<P> {
     }
 
     /// Whether a function stops what is dead and not yet safe, whichever link moved it: its handler waits for the hook.
+    #[inline(never)]
     pub(super) fn awaits_hook(&self, cx: &Context<'_, P>, slot: Slot, generation: Generation) -> bool {
-        self.moved_by(cx, slot, generation).any(|service| service.lease().is_some_and(Lease::awaits_hook))
+        let mut awaits = false;
+        self.each_moved_by(cx, slot, generation, &mut |service| {
+            awaits |= service.lease().is_some_and(Lease::awaits_hook);
+        });
+        awaits
     }
 
     /// Whether what a call of the peer moves was stopped: by the vehicle itself, or through another link.
@@ -254,7 +266,7 @@ impl<P: Port> Session<P> {
             let why = how_it_died(cx, &granted);
             if expire_granted(cx, &granted, why) {
                 self.publishing.actuators_due |= why == LeaseEnd::Stopped;
-                self.link.counters.add(LinkCounter::LeasesExpired, 1);
+                self.link.counters.count(LinkCounter::LeasesExpired);
                 self.tell_end(cx, granted.call, why);
                 return Some(granted.slot);
             }

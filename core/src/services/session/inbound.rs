@@ -137,7 +137,7 @@ impl<P: Port> Session<P> {
         body: &mut [u8],
     ) -> Option<Event> {
         if self.phase != Phase::Live || nonce != self.local.nonce || !from.is_of_host(&self.peer_address) {
-            self.link.counters.add(LinkCounter::DatagramsDropped, 1);
+            self.link.counters.count(LinkCounter::DatagramsDropped);
             return None;
         }
         let version = self.remote.as_ref()?.version;
@@ -145,11 +145,11 @@ impl<P: Port> Session<P> {
         let body = match self.link.cipher().open_datagram(&header, body) {
             Ok(body) => &*body,
             Err(error) => {
-                self.link.counters.add(counter_of(error), 1);
+                self.link.counters.count(counter_of(error));
                 return None;
             }
         };
-        self.link.counters.add(LinkCounter::DatagramsReceived, 1);
+        self.link.counters.count(LinkCounter::DatagramsReceived);
         self.datagram_opened(cx.now);
         self.session_body(cx, Place::lent(body.len()), body, Way::Datagram)
     }
@@ -210,7 +210,7 @@ impl<P: Port> Session<P> {
                 self.message_arrived(cx, priority, place, lent, arguments)
             }
             (Incoming::Skipped, Phase::Live) => {
-                self.link.counters.add(LinkCounter::ItemsSkipped, 1);
+                self.link.counters.count(LinkCounter::ItemsSkipped);
                 None
             }
             _ => {
@@ -274,7 +274,7 @@ impl<P: Port> Session<P> {
     }
 
     fn unreadable_datagram(&mut self) -> Option<Event> {
-        self.link.counters.add(LinkCounter::DatagramsDropped, 1);
+        self.link.counters.count(LinkCounter::DatagramsDropped);
         None
     }
 
@@ -325,7 +325,7 @@ impl<P: Port> Session<P> {
     fn reply_arrived(&mut self, cx: &mut Context<'_, P>, id: CallId, result: Result<Place, Error>) -> Option<Event> {
         let Some(pending) = self.requests.close(id) else {
             // The call has ended already, by time-out or cancellation. Its lease was released then; results that come now change nothing.
-            self.link.counters.add(LinkCounter::RepliesLate, 1);
+            self.link.counters.count(LinkCounter::RepliesLate);
             return None;
         };
         match result {
@@ -372,9 +372,9 @@ impl<P: Port> Session<P> {
                     Ok(Ok(())) if allowed => {}
                     Ok(Ok(())) => {
                         self.theirs.hide(Slot(slot));
-                        self.link.counters.add(LinkCounter::FunctionsForbidden, 1);
+                        self.link.counters.count(LinkCounter::FunctionsForbidden);
                     }
-                    Ok(Err(_)) => self.link.counters.add(LinkCounter::FunctionsSkipped, 1),
+                    Ok(Err(_)) => self.link.counters.count(LinkCounter::FunctionsSkipped),
                     Err(_) => self.close(cx, CloseReason::Protocol),
                 }
                 None
@@ -419,11 +419,11 @@ impl<P: Port> Session<P> {
         lent: &[u8],
         arguments: Option<&mut ParametersView>,
     ) -> Option<Event> {
-        self.link.counters.add(LinkCounter::RequestsReceived, 1);
+        self.link.counters.count(LinkCounter::RequestsReceived);
         // First of all: a copy of a request must not even be refused, or its refusal could overtake the answer of the original.
         let seen = self.calls.note(priority, header.id);
         if seen == Seen::Before {
-            self.link.counters.add(LinkCounter::RequestsRepeated, 1);
+            self.link.counters.count(LinkCounter::RequestsRepeated);
             return None;
         }
         // Once for all that a request needs of it.
@@ -438,7 +438,7 @@ impl<P: Port> Session<P> {
                 // The arguments are checked before the call begins: a lease must not start for a request that is refused.
                 Some(arguments) => {
                     read_arguments(function.signature, bytes, arguments)?;
-                    self.begin(cx, head, &function.attributes).map(Some)
+                    self.begin(cx, head, function.attributes).map(Some)
                 }
                 None => {
                     // A buffer that the request lies in is back in the pool at once.
@@ -493,7 +493,9 @@ impl<P: Port> Session<P> {
             Told::Earlier => return Err(Error::StaleFunction),
             Told::Now => function?,
         };
-        self.permit_call(cx, &function)?;
+        if cx.access.is_some() {
+            self.permit_call(cx, &function)?;
+        }
         // Whatever its handler has to wait for, or is refused for.
         if function.attributes.stop {
             self.stop_orders(cx, header);
@@ -501,7 +503,7 @@ impl<P: Port> Session<P> {
         if priority != Priority::Emergency {
             self.calls.interval(cx.now, self.constraints.minimum_interval)?;
         }
-        let is_emergency = is_emergency(&function.attributes, priority);
+        let is_emergency = is_emergency(function.attributes, priority);
         self.calls.admit(header.slot, is_emergency, self.constraints.calls_per_peer)?;
         let head = CallHead {
             id: header.id,

@@ -8,6 +8,7 @@ use crate::distribution::message::{REQUEST_BYTES, RequestHeader, SessionBody};
 use crate::distribution::parameters::ParametersView;
 use crate::error::{CloseReason, Error};
 use crate::host::connections::LinkCounter;
+use crate::host::frame::ChunkWriter;
 use crate::services::heart::Renew;
 use crate::services::requests::CallId;
 use crate::services::{Context, Port};
@@ -94,8 +95,8 @@ impl<P: Port> Session<P> {
     ) -> Result<CallId, Error> {
         let result = self.try_request(cx, function, parameters, options, wants_reply);
         match result {
-            Ok(_) => self.link.counters.add(LinkCounter::RequestsSent, 1),
-            Err(_) => self.link.counters.add(LinkCounter::RequestsWithheld, 1),
+            Ok(_) => self.link.counters.count(LinkCounter::RequestsSent),
+            Err(_) => self.link.counters.count(LinkCounter::RequestsWithheld),
         }
         result
     }
@@ -226,7 +227,8 @@ impl<P: Port> Session<P> {
         let hold = !header.wants_reply && *priority != Priority::Emergency && self.timers.may_gather(cx.now);
         let Self { link, theirs, .. } = self;
         let signature = theirs.function(header.slot).ok_or(Error::StaleFunction)?.signature;
-        let write = |writer: &mut crate::host::frame::ChunkWriter<'_>| {
+        // The piece of code that also sends answers.
+        let write: &mut dyn FnMut(&mut ChunkWriter<'_>) = &mut |writer| {
             writer.put(&header.encode());
             block::write(signature.arguments(), parameters, writer);
         };

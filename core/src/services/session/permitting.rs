@@ -54,15 +54,12 @@ impl<P: Port> Session<P> {
         function.is_none_or(|function| decide(cx.access, self.remote.as_ref(), function.name(), verb).is_allowed())
     }
 
-    /// A request has arrived for a function that the peer was told of: may it be called, and so soon?
+    /// A request has arrived for a function that the peer was told of, and there is a table: may it be called, and so soon?
     pub(super) fn permit_call(
         &mut self,
         cx: &Context<'_, P>,
         function: &Function<'_, dyn Service>,
     ) -> Result<(), Error> {
-        if cx.access.is_none() {
-            return Ok(());
-        }
         match decide(cx.access, self.remote.as_ref(), function.name(), Verb::Call) {
             Decision::Denied => Err(Error::NotAllowed),
             Decision::Allowed { rate: None, .. } => Ok(()),

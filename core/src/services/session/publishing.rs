@@ -58,19 +58,19 @@ pub(super) struct Publishing<S: Storage> {
 pub(super) struct Refusals {
     /// Since the last line.
     count: u32,
-    logged: Option<Instant>,
+    /// The next line may be written from here on.
+    next: Instant,
 }
 
 impl Refusals {
     /// Counts one; how many there were since the last line, if there may be one now.
     pub(super) fn count(&mut self, now: Instant) -> Option<u32> {
         self.count = self.count.saturating_add(1);
-        let due = self.logged.is_none_or(|logged| now >= logged + Duration::from_secs(1));
-        due.then_some(self.count)
+        (now >= self.next).then_some(self.count)
     }
 
     pub(super) fn was_logged(&mut self, now: Instant) {
-        *self = Self { count: 0, logged: Some(now) };
+        *self = Self { count: 0, next: now + Duration::from_secs(1) };
     }
 }
 
@@ -87,7 +87,7 @@ impl<S: Storage> Publishing<S> {
             limits_due: false,
             actuators_due: false,
             actuators_told: 0,
-            refusals: Refusals { count: 0, logged: None },
+            refusals: Refusals { count: 0, next: Instant::START },
         }
     }
 
@@ -295,7 +295,7 @@ impl<P: Port> Session<P> {
                     let control = Control::Publish {
                         slot: slot.0,
                         generation: function.generation.0,
-                        attributes: &Attributes { actuator, ..function.attributes }.encode(),
+                        attributes: &Attributes { actuator, ..*function.attributes }.encode(),
                         signature: function.signature.as_bytes(),
                     };
                     self.send_control(cx, &control)
