@@ -54,6 +54,8 @@ mod sync {
         }
 
         atomic!(AtomicBool, bool);
+        atomic!(AtomicU8, u8);
+        atomic!(AtomicU16, u16);
         atomic!(AtomicU32, u32);
     }
 }

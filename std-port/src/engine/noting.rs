@@ -26,7 +26,7 @@ impl<T: Send + 'static> Engine<T> {
     #[cfg(feature = "control")]
     pub(super) fn noted(&self, link: &LinkCell, function: &str, options: &RequestOptions) -> Option<Noted> {
         let audit = self.audit.as_ref().filter(|_| !options.operator)?;
-        let attributes = link.lock().session.their_function_list().named(function).map(|known| known.attributes);
+        let attributes = link.lock().session.their_function_list().named(function).map(|known| *known.attributes);
         let node = || link.peer.get().map(|peer| peer.identity.to_string()).unwrap_or_default();
         Noted::of(audit, function, attributes, options.take_over, node)
     }
