@@ -171,7 +171,7 @@ fn controls() -> Vec<Vector> {
     let stop = definition("stop()");
     let attributes = Attributes { priority: Priority::Emergency, idempotent: true, ..Attributes::default() }.encode();
     let publish = Control::Publish { slot: 300, generation: 2, attributes: &attributes, signature: stop.as_bytes() };
-    let all: [(&'static str, &'static str, Control<'_>, Value); 10] = [
+    let all: [(&'static str, &'static str, Control<'_>, Value); 11] = [
         (
             "publish",
             "a function may be called",
@@ -241,6 +241,19 @@ fn controls() -> Vec<Vector> {
             json!({ "actuator": {
                 "slot": 300, "latch": { "by": 70_000, "reason": 12 },
                 "last": { "holder": 2, "link": 0, "call": 0, "end": "stopped" },
+            } }),
+        ),
+        (
+            "actuator_released",
+            "its caller gave the order up",
+            Control::Actuator {
+                slot: 3,
+                latch: None,
+                last: Some(LastOrder { holder: 1, link: 0xC0FF_EE00, call: 700, end: Some(LeaseEnd::Released) }),
+            },
+            json!({ "actuator": {
+                "slot": 3, "latch": null,
+                "last": { "holder": 1, "link": 0xC0FF_EE00_u32, "call": 700, "end": "released" },
             } }),
         ),
     ];
