@@ -147,13 +147,13 @@ impl<'a> Signature<'a> {
     }
 
     /// What a caller must pass.
-    #[inline]
+    #[cfg_attr(not(target_os = "none"), inline)]
     pub fn arguments(&self) -> VariableSpecs<'a> {
         VariableSpecs::of_checked(self.behind_length().and_then(|(length, rest)| rest.get(length..)))
     }
 
     /// What a caller gets back.
-    #[inline]
+    #[cfg_attr(not(target_os = "none"), inline)]
     pub fn results(&self) -> VariableSpecs<'a> {
         VariableSpecs::of_checked(self.arguments().behind())
     }

@@ -28,13 +28,13 @@ pub(super) struct Terms {
     pub(super) own: Term,
     /// To be reported.
     newer: Option<NewerTerm>,
-    /// When another manager of this identity proved itself last.
-    another: Option<Instant>,
+    /// When another manager of this identity proved itself last; in the far future while none has.
+    another: Instant,
 }
 
 impl Terms {
     pub(super) const fn new() -> Self {
-        Self { own: Term::NONE, newer: None, another: None }
+        Self { own: Term::NONE, newer: None, another: Instant::FAR_FUTURE }
     }
 }
 
@@ -57,8 +57,8 @@ impl<P: Port> Node<P> {
     }
 
     /// When another live manager of this m_unit's identity proved itself last.
-    pub const fn another_proven_at(&self) -> Option<Instant> {
-        self.terms.another
+    pub fn another_proven_at(&self) -> Option<Instant> {
+        Some(self.terms.another).filter(|at| *at != Instant::FAR_FUTURE)
     }
 
     /// Whether the link's manager has the right to command its vehicle, whichever of the two this unit is.
@@ -89,7 +89,7 @@ impl<P: Port> Node<P> {
     /// Another unit with this one's identity has answered, to be heard only if it answers a question of this one.
     pub(super) fn another_answered(&mut self, now: Instant, announce: &Announce) {
         if self.config.identity.role() == Role::MUnit && announce.nonce == self.search.nonce {
-            self.terms.another = Some(now);
+            self.terms.another = now;
             if announce.term.is_newer_than(self.terms.own) {
                 self.terms.newer = Some(NewerTerm::OfManager(announce.term));
             }

@@ -163,9 +163,15 @@ impl<P: Port> Session<P> {
         let _ = self.answered.push(AnsweredCall { call, slot, class });
     }
 
+    #[inline(never)]
+    fn take_answered(&mut self, call: CallId) -> Option<AnsweredCall> {
+        let index = self.answered.iter().position(|known| known.call == call)?;
+        take_at(&mut self.answered, index)
+    }
+
     /// The peer has ended the lease of a call.
     pub(super) fn stop_renewing(&mut self, call: CallId) -> Option<Held> {
-        self.answered.retain(|known| known.call != call);
+        self.take_answered(call);
         let index = self.held.iter().position(|held| held.call == call && held.is_renewed())?;
         take_at(&mut self.held, index)
     }
@@ -186,7 +192,7 @@ impl<P: Port> Session<P> {
 
     /// Releases a call that has failed or was cancelled. `pending` is what was known of it while it waited for its reply.
     pub(super) fn release_call(&mut self, cx: &mut Context<'_, P>, id: CallId, pending: Option<Pending>) {
-        let answered = self.answered.iter().find(|known| known.call == id).copied();
+        let answered = self.take_answered(id);
         let held = self.stop_renewing(id);
         let waited = pending.and_then(|pending| pending.leased);
         let class = held.map(|held| held.class).or(waited).or(answered.map(|known| known.class));

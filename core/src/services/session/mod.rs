@@ -251,7 +251,7 @@ impl<P: Port> Session<P> {
             liveness: Liveness::new(now, constraints.keep_alive),
             challenged: false,
             pings: pinging::Pings::new(),
-            clock: PeerClock::default(),
+            clock: PeerClock::new(),
             timers: Timers::new(now),
             renewal: renewing::Renewal::new(),
             requests: Requests::new(storage.pending),

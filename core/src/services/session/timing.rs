@@ -16,11 +16,11 @@ use crate::services::{Context, Port};
 use crate::time::{Duration, Instant};
 
 /// A peer's clock as last heard, so that it can bound the age of what we send.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug)]
 pub(super) struct PeerClock {
     stamp: u64,
-    /// When the stamp came; nothing has come before.
-    heard: Option<Instant>,
+    /// When the stamp came; in the far future while none has.
+    heard: Instant,
 }
 
 /// Longest session datagram.
@@ -32,22 +32,24 @@ const SAMPLE_LIFE: Duration = Duration::from_secs(10);
 const DRIFT: u64 = 1_000;
 
 impl PeerClock {
+    pub(super) const fn new() -> Self {
+        Self { stamp: 0, heard: Instant::FAR_FUTURE }
+    }
+
     /// Notes the peer's clock. A sample that was held up on its way would make everything that is sent look old, so it
     /// is passed over while a better one is fresh.
     pub(super) fn hear(&mut self, now: Instant, stamp: u64) {
-        let better = self.heard.is_none_or(|heard| {
-            let elapsed = now.since(heard);
-            let expected = Duration::from_micros(self.stamp) + elapsed - elapsed.divided_by(DRIFT);
-            Duration::from_micros(stamp) >= expected || elapsed >= SAMPLE_LIFE
-        });
-        if better {
-            *self = Self { stamp: stamp.max(self.stamp), heard: Some(now) };
+        // Nothing has elapsed and the stamp is 0 while none has come: the first one is better.
+        let elapsed = now.since(self.heard);
+        let expected = Duration::from_micros(self.stamp) + elapsed - elapsed.divided_by(DRIFT);
+        if Duration::from_micros(stamp) >= expected || elapsed >= SAMPLE_LIFE {
+            *self = Self { stamp: stamp.max(self.stamp), heard: now };
         }
     }
 
     /// (the stamp, time since it was heard).
     pub(super) fn tell(&self, now: Instant) -> (u64, Duration) {
-        (self.stamp, self.heard.map_or(Duration::ZERO, |heard| now.since(heard)))
+        (self.stamp, now.since(self.heard))
     }
 }
 
