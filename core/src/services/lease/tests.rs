@@ -1,0 +1,254 @@
+use super::*;
+use proptest::prelude::*;
+
+const fn at(micros: u64) -> Instant {
+    Instant::from_micros(micros)
+}
+
+const START: Instant = Instant::START;
+
+/// 500 ms and a ramp of 300 ms, from 1 s on.
+fn on_a_ramp() -> (Lease, Order) {
+    let lease = Lease::new();
+    lease.set_ramp(Duration::from_millis(300));
+    let order = lease.begin(at(1_000_000), at(1_501_000)).unwrap();
+    (lease, order)
+}
+
+fn stages(lease: &Lease, millis: &[u64]) -> std::vec::Vec<Stage> {
+    millis.iter().map(|millis| lease.stage(at(millis * 1_000))).collect()
+}
+
+#[test]
+fn an_order_that_has_ended_slows_down_for_the_length_of_its_ramp() {
+    let (lease, order) = on_a_ramp();
+    let whole = [Stage::Live, Stage::Stopping, Stage::Stopping, Stage::Dead];
+    assert_eq!(stages(&lease, &[1_499, 1_501, 1_800, 1_802]), whole, "the unit does not look");
+    assert!(lease.end(at(1_600_000), order, LeaseEnd::Expired));
+    assert_eq!(
+        stages(&lease, &[1_800, 1_802]),
+        [Stage::Stopping, Stage::Dead],
+        "counted from its end, not from the look"
+    );
+    assert!(lease.begin(at(1_700_000), at(3_000_000)).is_none(), "the ramp comes first");
+    let next = lease.begin(at(1_802_000), at(3_000_000)).unwrap();
+    assert_eq!(stages(&lease, &[1_803]), [Stage::Live]);
+    // Released before its time.
+    assert!(lease.end(at(2_000_000), next, LeaseEnd::Expired));
+    assert_eq!(stages(&lease, &[2_000, 2_298, 2_299]), [Stage::Stopping, Stage::Stopping, Stage::Dead]);
+}
+
+#[test]
+fn a_stop_begins_the_ramp_once() {
+    let (lease, order) = on_a_ramp();
+    let latch = Latch { by: 0, reason: 1 };
+    lease.inhibit(at(1_100_000), latch);
+    lease.inhibit(at(1_300_000), latch);
+    assert_eq!(stages(&lease, &[1_101, 1_398, 1_399]), [Stage::Stopping, Stage::Stopping, Stage::Dead]);
+    assert!(lease.end(at(1_350_000), order, LeaseEnd::Stopped));
+    assert_eq!(stages(&lease, &[1_398, 1_399]), [Stage::Stopping, Stage::Dead]);
+    // Nothing moved when it was stopped again.
+    lease.inhibit(at(2_000_000), latch);
+    assert_eq!(stages(&lease, &[2_001]), [Stage::Dead]);
+}
+
+#[test]
+fn what_is_finished_or_has_no_ramp_is_dead_at_once() {
+    let (lease, order) = on_a_ramp();
+    assert!(lease.end(at(1_100_000), order, LeaseEnd::Finished));
+    assert_eq!(stages(&lease, &[1_100, 1_200]), [Stage::Dead; 2]);
+    assert!(lease.begin(at(1_100_000), at(1_500_000)).is_some());
+    let lease = Lease::new();
+    let order = lease.begin(at(1_000_000), at(1_501_000)).unwrap();
+    assert_eq!(stages(&lease, &[1_100, 1_501]), [Stage::Live, Stage::Dead]);
+    lease.cut(order);
+    assert!(lease.end(at(1_600_000), order, LeaseEnd::Expired));
+    assert!(lease.stage(at(1_601_000)) == Stage::Dead && lease.begin(at(1_602_000), at(2_000_000)).is_some());
+}
+
+#[test]
+fn what_goes_with_its_service_slows_down_like_what_has_ended() {
+    let (lease, _) = on_a_ramp();
+    assert!(lease.clear(at(1_100_000)) && !lease.clear(at(1_200_000)));
+    assert_eq!(stages(&lease, &[1_101, 1_398, 1_399]), [Stage::Stopping, Stage::Stopping, Stage::Dead]);
+    assert!(lease.begin(at(1_300_000), at(3_000_000)).is_none(), "the ramp comes first");
+    let next = lease.begin(at(1_400_000), at(3_000_000)).unwrap();
+    assert!(lease.finish(at(1_500_000), next));
+    // What had ended before keeps its end.
+    assert!(!lease.clear(at(1_600_000)) && stages(&lease, &[1_601]) == [Stage::Dead]);
+    assert_eq!(lease.state().last.unwrap().end, Some(LeaseEnd::Finished));
+}
+
+#[test]
+fn what_is_dead_or_was_replaced_is_not_finished() {
+    let (lease, first) = on_a_ramp();
+    let second = lease.begin(at(1_100_000), at(1_501_000)).unwrap();
+    assert!(!lease.finish(at(1_200_000), first) && lease.is_live_for(second, at(1_200_000)));
+    assert!(!lease.finish(at(1_501_000), second) && lease.awaits_hook(), "its time is over");
+    assert!(lease.end(at(1_502_000), second, LeaseEnd::Expired));
+    assert!(!lease.finish(at(1_502_000), second));
+    let third = lease.begin(at(2_000_000), at(3_000_000)).unwrap();
+    assert!(lease.finish(at(2_100_000), third) && !lease.finish(at(2_100_000), third));
+    assert_eq!(stages(&lease, &[2_100]), [Stage::Dead], "nothing moves");
+}
+
+#[test]
+fn a_ramp_of_long_ago_keeps_nothing_from_beginning() {
+    for days in [1, 24, 25, 26, 40, 49] {
+        let (lease, order) = on_a_ramp();
+        assert!(lease.end(at(1_200_000), order, LeaseEnd::Expired));
+        let later = at(1_200_000 + days * 86_400_000_000);
+        assert_eq!(lease.stage(later), Stage::Dead, "{days}");
+        assert!(lease.begin(later, later + Duration::from_secs(1)).is_some(), "{days}");
+    }
+}
+
+#[test]
+fn a_lease_lives_until_its_end_and_not_longer() {
+    let lease = Lease::new();
+    assert!(!lease.is_live(START));
+    let order = lease.begin(START, at(500_000)).unwrap();
+    assert!(lease.is_live(at(498_000)));
+    assert!(lease.renew(order, at(501_000)));
+    assert!(lease.is_live(at(500_000)));
+    assert!(!lease.is_live(at(501_000)));
+    assert!(lease.end(START, order, LeaseEnd::Expired));
+    let order = lease.begin(START, at(500_000)).unwrap();
+    assert!(!lease.is_live(at(500_000)));
+    assert!(lease.end(START, order, LeaseEnd::Expired) && lease.begin(START, at(500_000)).is_some());
+    assert!(lease.clear(START) && !lease.clear(START));
+    assert!(!lease.is_live(START));
+}
+
+#[test]
+fn a_lease_survives_the_wrap_of_its_clock() {
+    let wrap = u64::from(u32::MAX) * 1_000;
+    let lease = Lease::new();
+    assert!(lease.begin(at(wrap - 200_000), at(wrap + 300_000)).is_some());
+    assert!(lease.is_live(at(wrap - 100_000)));
+    assert!(lease.is_live(at(wrap + 200_000)));
+    assert!(!lease.is_live(at(wrap + 300_000)));
+}
+
+#[test]
+fn an_interrupt_that_inhibits_between_two_stores_of_a_new_order_leaves_it_dead() {
+    let lease = Lease::new();
+    lease.inhibit(START, Latch { by: 0, reason: 1 });
+    // What `begin` stores behind it.
+    lease.seen_dead.store(false, Ordering::Release);
+    lease.end.store(odd_millis(at(500_000)) as u32, Ordering::Release);
+    assert!(!lease.is_live(at(1_000)) && !lease.lasts_beyond(at(1_000)));
+    lease.reset(at(100_000), at(100_000));
+    assert!(!lease.is_live(at(100_000)), "a reader has seen it dead");
+}
+
+#[test]
+fn looking_ahead_ends_nothing() {
+    let lease = Lease::new();
+    let order = lease.begin(START, at(500_000)).unwrap();
+    assert!(lease.lasts_beyond(at(498_000)) && !lease.lasts_beyond(at(500_000)));
+    assert!(lease.is_live(at(498_000)) && lease.renew(order, at(600_000)));
+    assert!(!lease.is_live(at(600_000)) && !lease.lasts_beyond(at(0)));
+}
+
+#[test]
+fn an_order_does_not_take_the_place_of_a_dead_one_before_that_has_been_ended() {
+    let lease = Lease::new();
+    let first = lease.begin(START, at(500_000)).unwrap();
+    assert!(lease.begin(at(500_000), at(900_000)).is_none(), "its time is over");
+    assert!(lease.end(START, first, LeaseEnd::Expired) && lease.begin(at(500_000), at(900_000)).is_some());
+    let lease = Lease::new();
+    let first = lease.begin(START, at(500_000)).unwrap();
+    lease.cut(first);
+    assert!(!lease.is_live(START) && !lease.renew(first, at(600_000)));
+    assert!(lease.begin(START, at(900_000)).is_none(), "it was cut");
+    assert!(lease.end(START, first, LeaseEnd::Expired) && lease.begin(START, at(900_000)).is_some());
+}
+
+#[test]
+fn what_belongs_to_an_earlier_order_does_nothing_to_a_newer_one() {
+    let lease = Lease::new();
+    let first = lease.begin(START, at(500_000)).unwrap();
+    let second = lease.begin(at(100_000), at(600_000)).unwrap();
+    assert!(!lease.is_live_for(first, at(100_000)) && lease.is_live_for(second, at(100_000)));
+    lease.cut(first);
+    assert!(!lease.end(START, first, LeaseEnd::Expired) && !lease.renew(first, at(900_000)));
+    assert!(lease.is_live_for(second, at(598_000)));
+    assert!(!lease.is_live_for(second, at(600_000)) && !lease.is_live_for(second, START));
+}
+
+#[test]
+fn what_is_left_of_a_lease_is_told_until_its_end() {
+    let lease = Lease::new();
+    assert_eq!(lease.left(at(7)), None);
+    let order = lease.begin(START, at(501_000)).unwrap();
+    let left = [0, 500_999, 501_000, 900_000].map(|now| lease.left(at(now)).map(Duration::as_micros));
+    assert_eq!(left, [Some(501_000), Some(1), Some(0), Some(0)]);
+    let wrap = (1_u64 << 32) * 1_000;
+    assert!(lease.end(START, order, LeaseEnd::Expired));
+    let order = lease.begin(at(wrap - 1_000), at(wrap + 301_000)).unwrap();
+    assert_eq!(lease.left(at(wrap - 1_000)), Some(Duration::from_millis(302)));
+    assert!(lease.end(START, order, LeaseEnd::Expired));
+    assert_eq!(lease.left(at(0)), None);
+}
+
+/// What befalls a lease whose reader's clock goes on by so much in between.
+#[derive(Clone, Copy, Debug)]
+enum Step {
+    Look(u64),
+    /// A renewal until so long behind a time that was read earlier.
+    Renew(u64),
+    Begin(u64),
+    End,
+}
+
+fn step() -> impl Strategy<Value = Step> {
+    prop_oneof![
+        4 => (0..150_000_u64).prop_map(Step::Look),
+        4 => (0..400_000_u64).prop_map(Step::Renew),
+        1 => (0..400_000_u64).prop_map(Step::Begin),
+        1 => Just(Step::End),
+    ]
+}
+
+proptest! {
+    #[test]
+    fn what_was_seen_dead_lives_only_by_a_new_order(steps in prop::collection::vec(step(), 0..60)) {
+        let lease = Lease::new();
+        let (mut now, mut dead) = (0, true);
+        let mut orders: std::vec::Vec<(Order, bool)> = std::vec::Vec::new();
+        for step in steps {
+            match step {
+                Step::Look(later) => {
+                    now += later;
+                    let live = lease.is_live(at(now));
+                    prop_assert!(!(live && dead), "it was seen dead, and lives at {now}");
+                    dead = !live;
+                }
+                Step::Renew(length) => {
+                    let renewed = orders.last().is_some_and(|(order, _)| lease.renew(*order, at(now + length)));
+                    prop_assert_eq!(renewed, !dead);
+                }
+                Step::Begin(length) => {
+                    if let Some(order) = lease.begin(at(now), at(now + length)) {
+                        orders.push((order, false));
+                        dead = false;
+                    }
+                }
+                Step::End => {
+                    if let Some((order, _)) = orders.last() {
+                        prop_assert!(lease.end(START, *order, LeaseEnd::Expired));
+                    }
+                    dead = true;
+                }
+            }
+            for index in 0..orders.len() {
+                let live = lease.is_live_for(orders[index].0, at(now));
+                prop_assert!(!(live && orders[index].1), "an order was dead, and lives");
+                prop_assert!(!live || index + 1 == orders.len(), "an earlier order lives");
+                orders[index].1 = !live;
+                dead |= index + 1 == orders.len() && !live;
+            }
+        }
+    }
+}
