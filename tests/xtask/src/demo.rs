@@ -115,7 +115,8 @@ fn hang_manager(stage: &Stage, manager: &mut Process, agv: &mut Process) -> Resu
     stage.heard(&agv.seen(EXPIRED, STEP)?, agv);
     manager.thaw()?;
     stage.tell("the manager goes on (SIGCONT)");
-    stage.heard(&manager.expect("lease of go_to at agv-1/11 expired", STEP)?, manager);
+    // `expired` where the vehicle's word is read first, `unanswered` where the manager looks first how long no renewal was answered.
+    stage.heard(&manager.expect("lease of go_to at agv-1/11 ", STEP)?, manager);
     stands(stage, agv, &place)?;
     stage.command(manager, "units", "= 3 s_units")?;
     Ok(())
