@@ -78,9 +78,7 @@ impl<T> Peer<T> {
             timer(again).await;
         }
     }
-}
 
-impl<T> Peer<T> {
     /// Sends the request, if it can be sent now; with the error, when it may be tried again. What this needs is no part of a
     /// future.
     fn try_begin(

@@ -238,7 +238,6 @@ entry!(publications, {
     keep(publications.publish_to(identity, *unknown()));
     publications.withdraw(*unknown());
     keep(publications.is_visible(identity, *unknown()));
-    drain(publications.visible_to(identity));
 });
 
 entry!(access, {

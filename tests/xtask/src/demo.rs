@@ -115,8 +115,11 @@ fn hang_manager(stage: &Stage, manager: &mut Process, agv: &mut Process) -> Resu
     stage.heard(&agv.seen(EXPIRED, STEP)?, agv);
     manager.thaw()?;
     stage.tell("the manager goes on (SIGCONT)");
-    // `expired` where the vehicle's word is read first, `unanswered` where the manager looks first how long no renewal was answered.
-    stage.heard(&manager.expect("lease of go_to at agv-1/11 ", STEP)?, manager);
+    // Which of the two comes first: the vehicle's word, or the manager's look how long no renewal was answered.
+    let end = manager.expect("lease of go_to at agv-1/11 ", STEP)?;
+    let is_told = ["expired", "unanswered"].iter().any(|word| end.text.contains(word));
+    ensure!(is_told, "the lease of a frozen manager ended otherwise: {}", end.text);
+    stage.heard(&end, manager);
     stands(stage, agv, &place)?;
     stage.command(manager, "units", "= 3 s_units")?;
     Ok(())
