@@ -375,6 +375,22 @@ impl<S: Storage> Calls<S> {
         self.held = self.running.iter().flatten().count() as u16;
     }
 
+    /// Moves the running calls to more slots. Returns the slots that are not needed any more.
+    pub(crate) fn grow(&mut self, mut running: S::Slice<Option<CallHead>>) -> S::Slice<Option<CallHead>> {
+        if running.len() < self.running.len() {
+            return running;
+        }
+        running.iter_mut().for_each(|slot| *slot = None);
+        // A ticket names its slot by number.
+        running.iter_mut().zip(self.running.iter()).for_each(|(new, old)| *new = *old);
+        core::mem::replace(&mut self.running, running)
+    }
+
+    /// Slots, and those of them that are empty.
+    pub(crate) fn slots(&self) -> (usize, usize) {
+        (self.running.len(), self.running.iter().filter(|slot| slot.is_none()).count())
+    }
+
     /// The slots, all empty.
     pub(crate) fn into_slots(mut self) -> S::Slice<Option<CallHead>> {
         self.running.iter_mut().for_each(|slot| *slot = None);
@@ -656,6 +672,18 @@ mod tests {
             let slots = slots_for(running);
             assert_eq!(slots - kept(slots), running, "{running} of {slots}");
         }
+    }
+
+    #[test]
+    fn a_running_call_keeps_its_ticket_when_there_are_more_slots() {
+        let mut calls = calls(slots_for(1));
+        let first = calls.begin(head(1, Priority::Normal), false).unwrap();
+        assert!(!calls.is_idle(Priority::Normal));
+        assert_eq!(calls.grow(vec![None; 1].into()).len(), 1, "fewer are given back");
+        assert_eq!(calls.grow(vec![Some(head(9, Priority::Normal)); slots_for(3)].into()).len(), slots_for(1));
+        assert_eq!(calls.slots(), (slots_for(3), slots_for(3) - 1));
+        let second = calls.begin(head(2, Priority::Normal), false).unwrap();
+        assert!(calls.end(first) && calls.end(second) && !calls.end(first));
     }
 
     #[test]

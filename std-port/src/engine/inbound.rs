@@ -100,6 +100,7 @@ impl<T: Send + 'static> Engine<T> {
         own: Option<&mut OwnCall<'_>>,
     ) -> Step {
         self.make_list_room(state);
+        self.make_call_room(state);
         let functions = self.functions();
         let LinkState { session, waiters, notices, .. } = state;
         let receipt = self.with_functions(now, &functions, link, session, |session, cx| {

@@ -22,7 +22,7 @@ const REMEMBERED_NODES: usize = 16;
 /// Refusals that are remembered for the operator.
 const FINDINGS: usize = 32;
 
-/// Calls in flight to a peer that a link begins with room for.
+/// Calls in flight to a peer, and of the peer, that a link begins with room for.
 const FIRST_CALLS: usize = 4;
 /// Functions of a peer that a link begins with room for.
 const FIRST_FUNCTIONS: usize = 4;
@@ -79,7 +79,7 @@ impl<T: Send + 'static> Engine<T> {
         SessionStorage {
             small: filled(LINK_BUFFER_BYTES, 0),
             pending: filled(first_calls(calls_in_flight), None),
-            running: filled(slots_for(calls_running), None),
+            running: filled(slots_for(calls_running.min(FIRST_CALLS)), None),
             publications: filled_with(self.own_functions(), Default::default),
             their_functions: filled_with(their_functions.min(FIRST_FUNCTIONS), Entry::empty),
             their_signatures: filled(their_signature_bytes.min(FIRST_SIGNATURES), 0),
@@ -121,6 +121,15 @@ impl<T: Send + 'static> Engine<T> {
             peer.ordered(function, state.session.nonce() as u32, id);
         }
         outcome
+    }
+
+    /// Makes room for as many calls of the peer as it may have here, once it has more than one.
+    pub(super) fn make_call_room(&self, state: &mut LinkState) {
+        let most = slots_for(self.links.capacities.calls_running);
+        let (slots, empty) = state.session.running_slots();
+        if slots < most && slots.saturating_sub(empty) > 1 {
+            drop(state.session.lend_running(filled(most, None)));
+        }
     }
 
     /// Makes room for one more function of the peer, which may be what comes next.

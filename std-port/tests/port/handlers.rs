@@ -120,6 +120,24 @@ fn a_slow_handler_delays_nobody_else() {
     });
 }
 
+/// A link begins with slots for fewer.
+#[test]
+fn as_many_calls_of_one_peer_run_as_it_may_have() {
+    const CALLS: usize = 6;
+    let (manager, agv) = pair();
+    let gate = Arc::new(Gate::default());
+    manager.my_function_list().add_function("slow", &number(0), held(&gate)).unwrap();
+    let (_, peer) = meet(&manager, &agv);
+    let options = RequestOptions { timeout: Some(cara_std::Duration::from_secs(20)), ..Default::default() };
+    std::thread::scope(|scope| {
+        let call = || peer.block_request_with("slow", &mut number(1), &options);
+        let calls: Vec<_> = (0..CALLS).map(|_| scope.spawn(call)).collect();
+        until("all of them run", || gate.came() == CALLS);
+        gate.open();
+        assert!(calls.into_iter().all(|call| call.join().unwrap() == Ok(())));
+    });
+}
+
 /// Handlers that have been quick run on threads without a relief; the clock starts a thread when all are inside
 /// handlers.
 #[test]

@@ -94,9 +94,10 @@ entry!(session_dismantled, {
 
 entry!(session_grown, {
     let session = session();
-    keep((session.call_slots(), session.publication_slots()));
+    keep((session.call_slots(), session.running_slots(), session.publication_slots()));
     keep(session.lend_calls(unknown_slice()));
     keep(session.lend_functions((unknown_slice(), unknown_slice())));
+    keep(session.lend_running(unknown_slice()));
     keep(session.lend_publications(unknown_slice()));
 });
 

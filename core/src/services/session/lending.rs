@@ -2,7 +2,7 @@
 //! its peer needs and no more.
 
 use super::publishing::Publication;
-use super::{Entry, Pending, Session};
+use super::{CallHead, Entry, Pending, Session};
 use crate::services::Port;
 use crate::storage::Storage;
 
@@ -22,6 +22,20 @@ impl<P: Port> Session<P> {
         pending: <P::Storage as Storage>::Slice<Option<Pending>>,
     ) -> <P::Storage as Storage>::Slice<Option<Pending>> {
         self.requests.grow(pending)
+    }
+
+    /// Slots for calls of the peer that run here, and those of them that are empty.
+    pub fn running_slots(&self) -> (usize, usize) {
+        self.calls.slots()
+    }
+
+    /// Lends more slots for calls of the peer that run here. Returns the slots that are not needed any more: the new ones if
+    /// they are fewer than before.
+    pub fn lend_running(
+        &mut self,
+        running: <P::Storage as Storage>::Slice<Option<CallHead>>,
+    ) -> <P::Storage as Storage>::Slice<Option<CallHead>> {
+        self.calls.grow(running)
     }
 
     /// Lends more room for the peer's list; functions that were skipped before stay so until the peer tells them again.
