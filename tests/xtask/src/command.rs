@@ -1,7 +1,7 @@
 //! Child processes: started in the project's root, output streamed through or captured as text.
 
 use std::ffi::OsStr;
-use std::io::{ErrorKind, Read};
+use std::io::{BufRead, BufReader, ErrorKind};
 use std::path::Path;
 use std::process::{Command, Stdio};
 
@@ -86,18 +86,24 @@ impl Run {
         Ok(output)
     }
 
-    /// Standard output and standard error as one text, in the order in which they were written.
-    pub(crate) fn merged(mut self) -> Result<String> {
+    /// Standard output and standard error as one text, in the order in which they were written; each line is `told` at once.
+    pub(crate) fn merged(mut self, told: impl Fn(&str)) -> Result<String> {
         let shown = self.shown();
-        let (mut reader, writer) = std::io::pipe()?;
+        let (reader, writer) = std::io::pipe()?;
+        let mut reader = BufReader::new(reader);
         self.command.stdout(writer.try_clone()?).stderr(writer);
         let mut child = self.command.spawn().with_context(|| format!("cannot start `{shown}`"))?;
         // The ends that this process would write to, without which the text has no end.
         drop(self);
-        let mut output = Vec::new();
-        reader.read_to_end(&mut output)?;
+        let (mut output, mut line) = (String::new(), Vec::new());
+        while reader.read_until(b'\n', &mut line)? > 0 {
+            let text = String::from_utf8_lossy(&line);
+            told(&text);
+            output.push_str(&text);
+            line.clear();
+        }
         child.wait()?;
-        Ok(String::from_utf8_lossy(&output).into_owned())
+        Ok(output)
     }
 
     /// Whether it succeeded, its standard output and its standard error.

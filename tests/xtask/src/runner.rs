@@ -1,7 +1,8 @@
 //! Runs groups of checks, and reports what each showed and what it cost.
 //!
-//! Groups that fill the processors run one after the other. Groups that mostly wait (for an emulator, for a time-out, for a
-//! linker with one thread) run three at a time behind them, each as a process of its own whose output is printed at its end.
+//! Each group is a process of its own. Groups that fill the processors run one after the other. Groups that mostly wait (for an
+//! emulator, for a time-out, for a linker with one thread) run three at a time behind them, and what one printed is printed at its
+//! end. The last lines of what failed are repeated behind the table: a log that was cut has them.
 
 use std::collections::VecDeque;
 use std::process::ExitCode;
@@ -22,6 +23,8 @@ struct Report {
     /// Of the processors, by all processes that it waited for. None outside Linux.
     cpu: f64,
     budget: u64,
+    /// The last of what it printed, where that was seen.
+    tail: Vec<String>,
 }
 
 /// Prints the table of groups.
@@ -41,7 +44,10 @@ pub(crate) fn run(names: &[String], quick: bool) -> Result<ExitCode> {
     let (start, before) = (Instant::now(), cpu_of_children());
     let (waiting, busy): (Vec<&Group>, Vec<&Group>) =
         chosen.into_iter().partition(|group| group.waits && names.is_empty());
-    let mut reports: Vec<Report> = busy.into_iter().map(|group| run_group(group, quick)).collect();
+    // One group is run here; of several, each is a process of its own.
+    let alone = busy.len() == 1 && waiting.is_empty();
+    let here = |group| if alone { run_group(group, quick) } else { run_apart(group, quick, true) };
+    let mut reports: Vec<Report> = busy.into_iter().map(here).collect();
     reports.extend(run_side_by_side(waiting, quick));
     summarise(&reports);
     let (seconds, cpu) = (start.elapsed().as_secs_f64(), cpu_of_children() - before);
@@ -75,7 +81,7 @@ fn run_group(group: &'static Group, quick: bool) -> Report {
     let (start, before) = (Instant::now(), cpu_of_children());
     let outcome = (group.run)(extent);
     let (seconds, cpu) = (start.elapsed().as_secs_f64(), cpu_of_children() - before);
-    let report = Report { group, outcome, seconds, cpu, budget };
+    let report = Report { group, outcome, seconds, cpu, budget, tail: Vec::new() };
     println!("{REPORT}{}", report.line());
     report.warn();
     report
@@ -104,7 +110,7 @@ fn run_side_by_side(groups: Vec<&'static Group>, quick: bool) -> Vec<Report> {
         loop {
             let next = queue.lock().unwrap_or_else(PoisonError::into_inner).pop_front();
             let Some(group) = next else { return };
-            let report = run_apart(group, quick);
+            let report = run_apart(group, quick, false);
             reports.lock().unwrap_or_else(PoisonError::into_inner).push(report);
         }
     };
@@ -112,25 +118,38 @@ fn run_side_by_side(groups: Vec<&'static Group>, quick: bool) -> Vec<Report> {
     reports.into_inner().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Runs a group as a process of its own, and prints at once what it printed.
-fn run_apart(group: &'static Group, quick: bool) -> Report {
+/// Of what a group printed that failed, so many lines are repeated at the end.
+const TAIL: usize = 40;
+
+/// Runs a group as a process of its own, and prints what it printed: each line `at_once`, or all at its end.
+fn run_apart(group: &'static Group, quick: bool, at_once: bool) -> Report {
     let (_, budget) = extent_of(group, quick);
     let start = Instant::now();
-    let ended = apart(group.name, quick);
-    let (outcome, cpu) = ended.unwrap_or_else(|error| (Outcome::Failed(format!("{error:#}")), 0.0));
-    let report = Report { group, outcome, seconds: start.elapsed().as_secs_f64(), cpu, budget };
-    report.warn();
-    report
+    let output = apart(group.name, quick, at_once).unwrap_or_else(|error| format!("{error:#}\n"));
+    if !at_once {
+        println!("{output}");
+    }
+    let lines: Vec<&str> = output.lines().collect();
+    Report {
+        group,
+        outcome: outcome_in(group.name, &output),
+        seconds: start.elapsed().as_secs_f64(),
+        cpu: cpu_in(group.name, &output),
+        budget,
+        tail: lines.iter().skip(lines.len().saturating_sub(TAIL)).map(ToString::to_string).collect(),
+    }
 }
 
-/// How a group ended in a process of its own, and what it took of the processors.
-fn apart(name: &str, quick: bool) -> Result<(Outcome, f64)> {
+/// What a group printed in a process of its own.
+fn apart(name: &str, quick: bool, at_once: bool) -> Result<String> {
     let this = std::env::current_exe()?;
     let run = Run::new(&this.to_string_lossy()).args(["test", name]);
     let run = if quick { run.args(["--quick"]) } else { run };
-    let output = run.merged()?;
-    println!("{output}");
-    Ok((outcome_in(name, &output), cpu_in(name, &output)))
+    run.merged(|line| {
+        if at_once {
+            print!("{line}")
+        }
+    })
 }
 
 /// The line with which a group's own process reports it, or an empty one.
@@ -173,6 +192,11 @@ fn summarise(reports: &[Report]) {
     println!("\n{:<14}{:>10}{:>10}{:>10}  result", "group", "time s", "CPU s", "budget s");
     for report in reports {
         println!("{}", report.line());
+    }
+    let failed =
+        reports.iter().filter(|report| matches!(report.outcome, Outcome::Failed(_)) && !report.tail.is_empty());
+    for Report { group, tail, .. } in failed {
+        println!("\n== the last lines of {}:\n{}\n", group.name, tail.join("\n"));
     }
 }
 
@@ -222,7 +246,7 @@ mod tests {
     fn reports(outcomes: Vec<Outcome>) -> Vec<Report> {
         outcomes
             .into_iter()
-            .map(|outcome| Report { group: &GROUPS[0], outcome, seconds: 1.0, cpu: 2.5, budget: 1 })
+            .map(|outcome| Report { group: &GROUPS[0], outcome, seconds: 1.0, cpu: 2.5, budget: 1, tail: Vec::new() })
             .collect()
     }
 
