@@ -63,10 +63,11 @@ impl EmulatedBoard {
         }
         let line = self.board.logs_behind(line, ON)?;
         comes_round(&mut heart, Duration::from_millis(dice.u64(..PHASES)));
+        // The board counts from the announcement, and the beat came before it: however busy this machine is, the beat's lease
+        // ends within a lease of that. Where the announcement takes long, too little is shown.
+        heart.beat();
         let began = Instant::now();
         announce(agv)?;
-        heart.beat();
-        // The vehicle may drive for a lease from the beat on, and the figure begins at the announcement.
         if began.elapsed() > Duration::from(POLL) || self.has_logged(line, OFF) {
             return Ok(None);
         }
