@@ -81,4 +81,9 @@ pub use error::{Error, ServiceError};
 pub use host::mailman::Mailman;
 pub use services::hub::Hub;
 pub use services::session::{Event, Session};
+pub use services::typed;
+pub use services::typed::{AnyCall, Variables};
+
+#[cfg(feature = "derive")]
+pub use cara_derive::{Variables, interface};
 pub use services::{Context, Port};

@@ -45,12 +45,22 @@ impl<S: Storage, H: 'static> FunctionList<S, H> {
 
     /// Adds a function; [`Error::NameTaken`] or [`Error::Full`] leave the list unchanged.
     pub fn add_function(&mut self, definition: &Definition, attributes: Attributes, handler: H) -> Result<Slot, Error> {
-        if self.find(definition.name()).is_some() {
+        self.add_signature(definition.signature(), attributes, handler)
+    }
+
+    /// As [`add_function`](Self::add_function), by a signature.
+    pub fn add_signature(
+        &mut self,
+        signature: Signature<'_>,
+        attributes: Attributes,
+        handler: H,
+    ) -> Result<Slot, Error> {
+        if self.find(signature.name()).is_some() {
             return Err(Error::NameTaken);
         }
         let index = self.table.free_index().ok_or(Error::Full(Limit::Functions))?;
         let slot = Slot(u16::try_from(index).map_err(|_| Error::Full(Limit::Functions))?);
-        self.table.put(index, slot, attributes, definition.as_bytes(), handler)?;
+        self.table.put(index, slot, attributes, signature.as_bytes(), handler)?;
         Ok(slot)
     }
 
@@ -65,14 +75,24 @@ impl<S: Storage, H: 'static> FunctionList<S, H> {
     /// Puts another function in the place of the one of its name; [`Error::UnknownFunction`] or [`Error::Full`] leave
     /// the list unchanged.
     pub fn replace(&mut self, definition: &Definition, attributes: Attributes, handler: H) -> Result<Slot, Error> {
-        let index = self.table.find(definition.name()).ok_or(Error::UnknownFunction)?;
+        self.replace_signature(definition.signature(), attributes, handler)
+    }
+
+    /// As [`replace`](Self::replace), by a signature.
+    pub fn replace_signature(
+        &mut self,
+        signature: Signature<'_>,
+        attributes: Attributes,
+        handler: H,
+    ) -> Result<Slot, Error> {
+        let index = self.table.find(signature.name()).ok_or(Error::UnknownFunction)?;
         let freed = self.table.function(index).map_or(0, |old| old.signature.as_bytes().len());
-        if definition.as_bytes().len() > self.table.free_bytes().saturating_add(freed) {
+        if signature.as_bytes().len() > self.table.free_bytes().saturating_add(freed) {
             return Err(Error::Full(Limit::SignatureBytes));
         }
         let old = self.table.take(index).ok_or(Error::UnknownFunction)?;
         self.table.bump(index);
-        self.table.put(index, old.slot, attributes, definition.as_bytes(), handler)?;
+        self.table.put(index, old.slot, attributes, signature.as_bytes(), handler)?;
         Ok(old.slot)
     }
 

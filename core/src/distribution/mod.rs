@@ -20,4 +20,5 @@ pub mod parameters;
 pub mod presence;
 mod table;
 pub mod text;
+pub mod typed;
 pub mod value;

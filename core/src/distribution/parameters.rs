@@ -10,6 +10,8 @@ use core::ops::{Deref, DerefMut};
 use crate::config::{PARAMETERS_BYTES, VARIABLES};
 use crate::error::{Error, Limit};
 
+use super::block::prepare_results;
+use super::function::Signature;
 use super::name::check_name;
 pub use super::value::{Element, FromValue, IntoValue, Target, Type, Value};
 use super::value::{read_elements, saturate};
@@ -257,6 +259,29 @@ impl ParametersView {
             return Err(Error::NameTaken);
         }
         self.add_checked(name.as_bytes(), kind, size)
+    }
+
+    /// Replaces all variables by the arguments of a function, then its other results, each 0, `false` or empty: in the order
+    /// in which a service gets them.
+    #[doc(hidden)]
+    pub fn lay_out(&mut self, function: Signature<'_>) -> Result<(), Error> {
+        self.clear();
+        for spec in function.arguments() {
+            self.add_checked(spec.name.as_bytes(), spec.kind, spec.size)?;
+        }
+        prepare_results(function.results(), self)
+    }
+
+    /// The value of the variable in a place; [`Error::UnknownVariable`] where there is none.
+    #[doc(hidden)]
+    pub fn value_of(&self, place: usize) -> Result<Value<'_>, Error> {
+        self.value_at(place).filter(|_| place < self.len()).ok_or(Error::UnknownVariable)
+    }
+
+    /// The variable in a place, to be set.
+    #[doc(hidden)]
+    pub fn target_of(&mut self, place: usize) -> Result<Target<'_>, Error> {
+        if place < self.len() { self.target(place).ok_or(Error::UnknownVariable) } else { Err(Error::UnknownVariable) }
     }
 
     /// Adds a variable whose name may be one, and is not there.

@@ -191,6 +191,7 @@ pub mod lease;
 pub mod publications;
 pub mod requests;
 pub mod session;
+pub mod typed;
 
 pub use crate::host::port::Port;
 pub use calls::{CallHead, Ticket, slots_for};

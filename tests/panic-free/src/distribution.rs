@@ -1,11 +1,15 @@
 //! Distribution: parameters, functions, lists, identities.
 
-use cara_core::distribution::function::{Attributes, Definition, Signature};
+use cara_core::distribution::function::{Attributes, Definition, Signature, VariableSpec};
 use cara_core::distribution::function_list::{Entry, FunctionList, TheirFunctionList};
 use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::{Parameters, ParametersView, Value};
 use cara_core::distribution::value::{Target, Type};
+use cara_core::error::{Error, ServiceError};
+use cara_core::services::requests::CallId;
+use cara_core::services::session::RequestOptions;
 use cara_core::storage::Lent;
+use cara_core::typed::{self, Caller, Field};
 
 use crate::linkage::{drain, keep, show, unknown, unknown_slice, unknown_text};
 
@@ -57,6 +61,66 @@ entry!(parameters_read, {
     parameters.clear();
 });
 
+entry!(parameters_placed, {
+    let parameters = parameters();
+    keep(parameters.lay_out(*unknown::<Signature<'static>>()));
+    keep((parameters.value_of(*unknown()), parameters.target_of(*unknown()).is_ok()));
+});
+
+entry!(typed_signatures, {
+    let (arguments, results) = (unknown_slice::<VariableSpec<'static>>(), unknown_slice::<VariableSpec<'static>>());
+    keep(typed::encoded_bytes(unknown_text(), arguments, results));
+    keep(typed::parameters_bytes(arguments, results));
+    keep(typed::place(&typed::places_of_results(arguments, results), *unknown()));
+    if let Ok(encoded) = typed::Encoded::<64>::new(unknown_text(), arguments, results) {
+        keep(encoded.signature().name());
+    }
+    if let Err(mismatch) = typed::Mismatch::check(*unknown::<Signature<'static>>(), *unknown::<Signature<'static>>()) {
+        show(&mismatch);
+    }
+});
+
+entry!(typed_values, {
+    let parameters = parameters();
+    keep(typed::argument::<u16>(parameters, *unknown()));
+    keep(typed::argument::<[f32; 3]>(parameters, *unknown()));
+    keep(typed::argument::<typed::heapless::String<8>>(parameters, *unknown()));
+    keep(typed::argument::<typed::heapless::Vec<u8, 8>>(parameters, *unknown()));
+    keep(typed::borrowed::<&str>(parameters, *unknown()));
+    keep(typed::refused(*unknown()));
+    if let Ok(target) = parameters.target_of(*unknown()) {
+        keep(unknown::<typed::heapless::String<8>>().to_field(target));
+    }
+    if let Ok(target) = parameters.target_of(*unknown()) {
+        keep(unknown::<typed::heapless::Vec<u8, 8>>().to_field(target));
+    }
+    if let Ok(target) = parameters.target_of(*unknown()) {
+        keep(unknown::<[i8; 3]>().to_field(target));
+    }
+});
+
+/// A peer of which nothing is known.
+struct Peer;
+
+impl typed::Caller for Peer {
+    fn published<R>(&self, _: &str, look: impl Fn(Option<Signature<'_>>) -> R) -> R {
+        look(*unknown())
+    }
+
+    fn send(&self, _: &str, _: &ParametersView, _: &RequestOptions) -> Result<CallId, Error> {
+        *unknown()
+    }
+}
+
+entry!(typed_clients, {
+    let client = typed::Client::at(unknown::<Peer>()).with(*unknown()).renewing(*unknown());
+    keep((client.peer().published("", |_| ()), client.options().timeout));
+    if let Err(error) = client.prepare(*unknown::<Signature<'static>>(), parameters()) {
+        show(&error);
+        keep(ServiceError::from(error));
+    }
+});
+
 entry!(values, {
     let value: &Value<'static> = unknown();
     drain(value.ints());
@@ -102,6 +166,8 @@ entry!(own_list, {
     let list: &mut FunctionList<Lent, u32> = unknown();
     keep(list.add_function(unknown(), *unknown(), *unknown()));
     keep(list.replace(unknown(), *unknown(), *unknown()));
+    keep(list.add_signature(*unknown::<Signature<'static>>(), *unknown(), *unknown()));
+    keep(list.replace_signature(*unknown::<Signature<'static>>(), *unknown(), *unknown()));
     keep(list.remove(unknown_text()));
     keep((list.find(unknown_text()), list.function(*unknown()), list.lookup(*unknown(), *unknown())));
     keep(list.handler_mut(*unknown()));

@@ -1,0 +1,115 @@
+//! How a function wants to be called, as its attributes say.
+
+use proc_macro2::TokenStream;
+use quote::{format_ident, quote};
+use syn::parse::{Parse, ParseStream};
+use syn::punctuated::Punctuated;
+use syn::spanned::Spanned;
+use syn::{Attribute, Error, Ident, Lit, LitInt, LitStr, Result, Token};
+
+use crate::attributes::{extract, flag, plain, set};
+
+/// How a function wants to be called.
+#[derive(Default)]
+pub(crate) struct Attributes {
+    pub(crate) priority: Option<Ident>,
+    pub(crate) lease: Option<LitInt>,
+    pub(crate) actuator: Option<Ident>,
+    pub(crate) stop: bool,
+    pub(crate) reset: bool,
+    pub(crate) idempotent: bool,
+}
+
+/// The classes, as the attribute and as `Priority` name them.
+const PRIORITIES: [(&str, &str); 4] =
+    [("emergency", "Emergency"), ("high", "High"), ("normal", "Normal"), ("low", "Low")];
+/// A shorter lease cannot be kept.
+const SHORTEST_LEASE: u64 = 20;
+
+impl Attributes {
+    /// Takes them away from others.
+    pub(crate) fn take(attributes: &mut Vec<Attribute>) -> Result<Self> {
+        let names = ["priority", "lease", "actuator", "stop", "reset", "idempotent"];
+        let mut found = Self::default();
+        for attribute in extract(attributes, &names) {
+            match attribute.path().get_ident().map(ToString::to_string).unwrap_or_default().as_str() {
+                "priority" => set(&mut found.priority, read_priority(&attribute)?, &attribute)?,
+                "lease" => set(&mut found.lease, read_lease(&attribute)?, &attribute)?,
+                "actuator" => {
+                    let wrong = |_| Error::new(attribute.span(), "write #[actuator(drive)]: the name of what it moves");
+                    set(&mut found.actuator, attribute.parse_args().map_err(wrong)?, &attribute)?;
+                }
+                "stop" => found.stop = flag(&attribute).map(|()| true)?,
+                "reset" => found.reset = flag(&attribute).map(|()| true)?,
+                _ => found.idempotent = flag(&attribute).map(|()| true)?,
+            }
+        }
+        Ok(found)
+    }
+
+    /// As an expression of the core's type.
+    pub(crate) fn expression(&self, root: &TokenStream) -> TokenStream {
+        let Self { priority, lease, stop, reset, idempotent, .. } = self;
+        let parts = quote!(#root::typed::parts);
+        let word = priority.as_ref().map_or("normal".to_owned(), ToString::to_string);
+        let class = PRIORITIES.iter().find(|(name, _)| *name == word).map_or("Normal", |(_, class)| class);
+        let class = format_ident!("{class}");
+        let lease = match lease {
+            Some(ms) => quote!(::core::option::Option::Some(#parts::Duration::from_millis(#ms))),
+            None => quote!(::core::option::Option::None),
+        };
+        quote!(#parts::Attributes {
+            priority: #parts::Priority::#class,
+            lease: #lease,
+            idempotent: #idempotent,
+            actuator: 0,
+            stop: #stop,
+            reset: #reset,
+        })
+    }
+}
+
+fn read_priority(attribute: &Attribute) -> Result<Ident> {
+    let wrong = "a priority is `emergency`, `high`, `normal` or `low`: #[priority(high)]";
+    let word: Ident = attribute.parse_args().map_err(|_| Error::new(attribute.span(), wrong))?;
+    if PRIORITIES.iter().any(|(name, _)| word == name) { Ok(word) } else { Err(Error::new(word.span(), wrong)) }
+}
+
+fn read_lease(attribute: &Attribute) -> Result<LitInt> {
+    let wrong = || Error::new(attribute.span(), "write #[lease(ms = 400)]: milliseconds after the caller's last sign");
+    let pair: Pair = attribute.parse_args().map_err(|_| wrong())?;
+    let Lit::Int(ms) = pair.value else { return Err(wrong()) };
+    if pair.name != "ms" {
+        return Err(wrong());
+    }
+    match ms.base10_parse::<u32>()? {
+        length if u64::from(length) < SHORTEST_LEASE => {
+            Err(Error::new(ms.span(), "a lease of less than 20 ms cannot be kept: renewals are 5 ms apart"))
+        }
+        _ => Ok(ms),
+    }
+}
+
+pub(crate) fn read_units(attribute: &Attribute) -> Result<Vec<(String, LitStr)>> {
+    let wrong = || Error::new(attribute.span(), "write #[unit(position = \"m\")]");
+    let pairs = attribute.parse_args_with(Punctuated::<Pair, Token![,]>::parse_terminated).map_err(|_| wrong())?;
+    let unit = |pair: Pair| match pair.value {
+        Lit::Str(unit) => Ok((plain(&pair.name), unit)),
+        _ => Err(wrong()),
+    };
+    pairs.into_iter().map(unit).collect()
+}
+
+/// `name = literal`.
+struct Pair {
+    name: Ident,
+    value: Lit,
+}
+
+impl Parse for Pair {
+    fn parse(input: ParseStream<'_>) -> Result<Self> {
+        let name = input.parse()?;
+        input.parse::<Token![=]>()?;
+        Ok(Self { name, value: input.parse()? })
+    }
+}

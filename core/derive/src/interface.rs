@@ -1,0 +1,388 @@
+//! `#[interface]`: what the trait says, and what is made of it.
+
+use proc_macro2::{Span, TokenStream};
+use quote::{ToTokens, format_ident, quote};
+use syn::parse::{Parse, ParseStream};
+use syn::punctuated::Punctuated;
+use syn::{
+    Attribute, Error, Expr, ExprLit, FnArg, GenericArgument, Ident, ItemTrait, Lit, LitInt, LitStr, Meta, Pat,
+    PathArguments, Result, ReturnType, Token, TraitItem, TraitItemFn, Type,
+};
+
+use crate::attributes::{OfVariable, extract, flag, plain, set, text};
+use crate::calling::{Attributes, read_units};
+use crate::kind::Variable;
+use crate::{client, server};
+
+/// A trait, read.
+pub(crate) struct Interface {
+    pub(crate) item: ItemTrait,
+    pub(crate) functions: Vec<Function>,
+}
+
+/// One of its functions.
+pub(crate) struct Function {
+    pub(crate) ident: Ident,
+    /// Its name in the signature.
+    pub(crate) name: String,
+    pub(crate) takes_state: bool,
+    pub(crate) inputs: Vec<Input>,
+    pub(crate) results: Results,
+    /// It returns a `Result`.
+    pub(crate) can_fail: bool,
+    pub(crate) attributes: Attributes,
+    pub(crate) help: String,
+    pub(crate) units: Vec<(String, LitStr)>,
+}
+
+/// What a function is called with.
+pub(crate) enum Input {
+    /// What tells about the call.
+    Call,
+    Variable(Ident, Variable),
+    /// A struct whose fields are the arguments.
+    Struct(Ident, Type),
+}
+
+/// What a function gives back.
+pub(crate) enum Results {
+    /// A type that names them itself, as `()` does.
+    Struct(Type),
+    /// One or, as a tuple, several with names that are told.
+    Named(Vec<Variable>),
+}
+
+/// The trait with all that is made of it, or what is wrong with it.
+pub(crate) fn expand(attribute: TokenStream, input: TokenStream, root: &TokenStream) -> TokenStream {
+    let made = || {
+        if !attribute.is_empty() {
+            return Err(Error::new_spanned(&attribute, "#[interface] takes nothing"));
+        }
+        let interface = Interface::read(syn::parse2(input)?)?;
+        let (item, constants) = (&interface.item, constants(&interface, root));
+        let (server, client) = (server::make(&interface, root), client::make(&interface, root));
+        Ok(quote!(#item #constants #server #client))
+    };
+    made().unwrap_or_else(Error::into_compile_error)
+}
+
+impl Interface {
+    fn read(mut item: ItemTrait) -> Result<Self> {
+        if !item.generics.params.is_empty() {
+            return Err(Error::new_spanned(
+                item.generics,
+                "an interface has no generics: peers know one signature of each function",
+            ));
+        }
+        let mut functions = Vec::new();
+        for member in &mut item.items {
+            match member {
+                TraitItem::Fn(function) => functions.push(Function::read(function)?),
+                other => return Err(Error::new_spanned(other, "an interface has functions only")),
+            }
+        }
+        if functions.is_empty() {
+            return Err(Error::new_spanned(&item.ident, "an interface has a function at least"));
+        }
+        Ok(Self { item, functions })
+    }
+
+    /// The type that holds the constants of its functions.
+    pub(crate) fn holder(&self) -> Ident {
+        format_ident!("__{}Functions", self.item.ident)
+    }
+
+    /// What its functions move, stop and reset, each once.
+    pub(crate) fn actuators(&self) -> Vec<&Ident> {
+        let mut found: Vec<&Ident> = Vec::new();
+        for actuator in self.functions.iter().filter_map(|function| function.attributes.actuator.as_ref()) {
+            if !found.contains(&actuator) {
+                found.push(actuator);
+            }
+        }
+        found
+    }
+}
+
+impl Function {
+    fn read(item: &mut TraitItemFn) -> Result<Self> {
+        let signature = &mut item.sig;
+        if let Some(word) = &signature.asyncness {
+            return Err(Error::new_spanned(word, "a function of an interface is not `async`: its clients are"));
+        }
+        if !signature.generics.params.is_empty() {
+            return Err(Error::new_spanned(&signature.generics, "a function of an interface has no generics"));
+        }
+        let ident = signature.ident.clone();
+        let mut returns = None;
+        let (mut name, mut help, mut units) = (None, None, Vec::new());
+        let attributes = Attributes::take(&mut item.attrs)?;
+        for attribute in extract(&mut item.attrs, &["returns", "name", "help", "unit"]) {
+            match attribute.path().get_ident().map(ToString::to_string).unwrap_or_default().as_str() {
+                "returns" => set(
+                    &mut returns,
+                    attribute.parse_args_with(Punctuated::<Named, Token![,]>::parse_terminated)?,
+                    &attribute,
+                )?,
+                "name" => set(&mut name, text(&attribute)?.value(), &attribute)?,
+                "help" => set(&mut help, text(&attribute)?.value(), &attribute)?,
+                _ => units.extend(read_units(&attribute)?),
+            }
+        }
+        let mut takes_state = false;
+        let mut inputs = Vec::new();
+        for input in &mut signature.inputs {
+            match input {
+                FnArg::Receiver(receiver) if receiver.reference.is_none() => {
+                    return Err(Error::new_spanned(
+                        receiver,
+                        "a function of an interface takes `&mut self`, `&self`, or no self at all",
+                    ));
+                }
+                FnArg::Receiver(_) => takes_state = true,
+                FnArg::Typed(argument) => inputs.push(Input::read(&argument.pat, &argument.ty, &mut argument.attrs)?),
+            }
+        }
+        let span = signature.ident.span();
+        let variables = inputs.iter().filter(|input| !matches!(input, Input::Call)).count();
+        if variables > 1 && inputs.iter().any(|input| matches!(input, Input::Struct(..))) {
+            return Err(Error::new(span, "an argument with #[variables] is the only one"));
+        }
+        let (results, can_fail) = read_results(&signature.output, returns)?;
+        let help = help.unwrap_or_else(|| documentation(&item.attrs));
+        let name = name.unwrap_or_else(|| plain(&ident));
+        let function = Self { ident, name, takes_state, inputs, results, can_fail, attributes, help, units };
+        function.check(span)?;
+        Ok(function)
+    }
+
+    /// What holds between its attributes and the rest.
+    fn check(&self, span: Span) -> Result<()> {
+        let Attributes { priority, lease, actuator, stop, reset, .. } = &self.attributes;
+        if let (Some(priority), true) =
+            (priority.as_ref().filter(|priority| *priority == "emergency"), self.takes_state)
+        {
+            let wrong = "an emergency service waits for nothing, and so does not get the state: take no self";
+            return Err(Error::new(priority.span(), wrong));
+        }
+        if let (Some(lease), None) = (lease, actuator) {
+            return Err(Error::new(lease.span(), "a lease is of what moves: name it with #[actuator(drive)]"));
+        }
+        if let (Some(actuator), None, false, false) = (actuator, lease, *stop, *reset) {
+            let wrong = "what moves an actuator has a lease, as #[lease(ms = 400)]; or say #[stop] or #[reset]";
+            return Err(Error::new(actuator.span(), wrong));
+        }
+        if *stop && *reset {
+            return Err(Error::new(span, "a function stops or resets, not both"));
+        }
+        let known: Vec<&str> = self.variables().map(|variable| variable.name.as_str()).collect();
+        let has_struct = self.inputs.iter().any(|input| matches!(input, Input::Struct(..)))
+            || matches!(&self.results, Results::Struct(rust) if !is_unit(rust));
+        match self.units.iter().find(|(name, _)| !has_struct && !known.contains(&name.as_str())) {
+            Some((name, unit)) => {
+                Err(Error::new(unit.span(), format!("the function has no argument and no result `{name}`")))
+            }
+            None => Ok(()),
+        }
+    }
+
+    /// Arguments and results that are told one by one.
+    fn variables(&self) -> impl Iterator<Item = &Variable> {
+        let results: &[Variable] = match &self.results {
+            Results::Named(results) => results,
+            Results::Struct(_) => &[],
+        };
+        let arguments = self.inputs.iter().filter_map(|input| match input {
+            Input::Variable(_, variable) => Some(variable),
+            Input::Call | Input::Struct(..) => None,
+        });
+        arguments.chain(results)
+    }
+
+    /// A constant of this function.
+    pub(crate) fn constant(&self, what: &str) -> Ident {
+        format_ident!("{}_{}", what, plain(&self.ident))
+    }
+
+    /// The Rust type that it gives back, without `Result`.
+    pub(crate) fn returned(&self) -> TokenStream {
+        match &self.results {
+            Results::Struct(rust) => rust.to_token_stream(),
+            Results::Named(results) => match results.as_slice() {
+                [only] => only.rust.to_token_stream(),
+                several => {
+                    let types = several.iter().map(|result| &result.rust);
+                    quote!((#(#types),*))
+                }
+            },
+        }
+    }
+}
+
+impl Input {
+    fn read(pattern: &Pat, rust: &Type, attributes: &mut Vec<Attribute>) -> Result<Self> {
+        let Pat::Ident(pattern) = pattern else {
+            return Err(Error::new_spanned(pattern, "an argument has a name, which is the variable's"));
+        };
+        if let Type::Reference(reference) = rust
+            && let Type::ImplTrait(_) = &*reference.elem
+        {
+            return Ok(Self::Call);
+        }
+        let is_struct = extract(attributes, &["variables"]);
+        let mut said = OfVariable::take(attributes)?;
+        if let Some(attribute) = is_struct.first() {
+            flag(attribute)?;
+            return Ok(Self::Struct(pattern.ident.clone(), rust.clone()));
+        }
+        let name = said.name_or(&pattern.ident);
+        Ok(Self::Variable(pattern.ident.clone(), Variable::new(name, rust.clone(), said.size)?))
+    }
+}
+
+/// The name of a result, as `sum`, `"pos-x"` or `#[size(64)] text`.
+struct Named {
+    name: String,
+    span: Span,
+    size: Option<LitInt>,
+}
+
+impl Parse for Named {
+    fn parse(input: ParseStream<'_>) -> Result<Self> {
+        let mut attributes = input.call(Attribute::parse_outer)?;
+        let size = OfVariable::take(&mut attributes)?.size;
+        let span = input.span();
+        let name = if input.peek(LitStr) { input.parse::<LitStr>()?.value() } else { plain(&input.parse()?) };
+        Ok(Self { name, span, size })
+    }
+}
+
+/// The results, and whether the function can fail.
+fn read_results(output: &ReturnType, returns: Option<Punctuated<Named, Token![,]>>) -> Result<(Results, bool)> {
+    let unit = || syn::parse_quote!(());
+    let (rust, can_fail) = match output {
+        ReturnType::Default => (unit(), false),
+        ReturnType::Type(_, rust) => match of_result(rust) {
+            Some(rust) => (rust, true),
+            None => ((**rust).clone(), false),
+        },
+    };
+    let Some(names) = returns else {
+        return match &rust {
+            Type::Tuple(tuple) if !tuple.elems.is_empty() => {
+                Err(Error::new_spanned(tuple, "name the results above the function: #[returns(x, y)]"))
+            }
+            Type::Reference(reference) => {
+                Err(Error::new_spanned(reference, "a result is owned: it outlives the call that made it"))
+            }
+            _ => Ok((Results::Struct(rust), can_fail)),
+        };
+    };
+    let types: Vec<Type> = match (&rust, names.len()) {
+        (Type::Tuple(tuple), _) => tuple.elems.iter().cloned().collect(),
+        _ => vec![rust.clone()],
+    };
+    if types.len() != names.len() {
+        let wrong = format!("#[returns] names {} results, and the function gives {}", names.len(), types.len());
+        return Err(Error::new_spanned(rust, wrong));
+    }
+    let mut results = Vec::new();
+    for (Named { name, span, size }, rust) in names.into_iter().zip(types) {
+        if let Type::Reference(reference) = &rust {
+            return Err(Error::new_spanned(reference, "a result is owned: it outlives the call that made it"));
+        }
+        let result = Variable::new(name, rust, size).map_err(|error| {
+            let mut error = error;
+            error.combine(Error::new(span, "this result"));
+            error
+        });
+        results.push(result?);
+    }
+    Ok((Results::Named(results), can_fail))
+}
+
+/// The first type of a `Result<…>`.
+fn of_result(rust: &Type) -> Option<Type> {
+    let Type::Path(path) = rust else { return None };
+    let last = path.path.segments.last().filter(|segment| segment.ident == "Result")?;
+    let PathArguments::AngleBracketed(generic) = &last.arguments else { return None };
+    match generic.args.first()? {
+        GenericArgument::Type(rust) => Some(rust.clone()),
+        _ => None,
+    }
+}
+
+fn is_unit(rust: &Type) -> bool {
+    matches!(rust, Type::Tuple(tuple) if tuple.elems.is_empty())
+}
+
+/// The documentation as one text.
+fn documentation(attributes: &[Attribute]) -> String {
+    let line = |attribute: &Attribute| match &attribute.meta {
+        Meta::NameValue(pair) if attribute.path().is_ident("doc") => match &pair.value {
+            Expr::Lit(ExprLit { lit: Lit::Str(text), .. }) => Some(text.value().trim().to_owned()),
+            _ => None,
+        },
+        _ => None,
+    };
+    attributes.iter().filter_map(line).collect::<Vec<_>>().join(" ")
+}
+
+/// Signatures, and the places of results.
+fn constants(interface: &Interface, root: &TokenStream) -> TokenStream {
+    let Interface { item, functions } = interface;
+    let (visibility, holder) = (&item.vis, interface.holder());
+    let (typed, parts) = (quote!(#root::typed), quote!(#root::typed::parts));
+    let each = functions.iter().map(|function| {
+        let name = &function.name;
+        let named = |what: &str| function.constant(what);
+        let (arguments, results, places) = (named("ARGUMENTS"), named("RESULTS"), named("PLACES"));
+        let (encoded, signature, attributes) = (named("ENCODED"), named("SIGNATURE"), named("ATTRIBUTES"));
+        let of_arguments = match function.inputs.iter().find_map(|input| match input {
+            Input::Struct(_, rust) => Some(rust),
+            Input::Call | Input::Variable(..) => None,
+        }) {
+            Some(rust) => quote!(<#rust as #typed::Variables>::SPECS),
+            None => {
+                let specs = function.inputs.iter().filter_map(|input| match input {
+                    Input::Variable(_, variable) => Some(variable.spec(root)),
+                    Input::Call | Input::Struct(..) => None,
+                });
+                quote!(&[#(#specs),*])
+            }
+        };
+        let of_results = match &function.results {
+            Results::Struct(rust) => quote!(<#rust as #typed::Variables>::SPECS),
+            Results::Named(results) => {
+                let specs = results.iter().map(|result| result.spec(root));
+                quote!(&[#(#specs),*])
+            }
+        };
+        let values = function.attributes.expression(root);
+        let span = function.ident.span();
+        let made = quote::quote_spanned! { span =>
+            match #typed::Encoded::new(#name, Self::#arguments, Self::#results) {
+                ::core::result::Result::Ok(encoded) => encoded,
+                ::core::result::Result::Err(rule) => ::core::panic!("{}", rule),
+            }
+        };
+        quote! {
+            const #arguments: &'static [#parts::VariableSpec<'static>] = #of_arguments;
+            const #results: &'static [#parts::VariableSpec<'static>] = #of_results;
+            const #places: [u8; #typed::IN_ORDER.len()] = #typed::places_of_results(Self::#arguments, Self::#results);
+            const #encoded: &'static #typed::Encoded<{ #typed::encoded_bytes(#name, Self::#arguments, Self::#results) }> = &#made;
+            const #signature: #parts::Signature<'static> = Self::#encoded.signature();
+            const #attributes: #parts::Attributes = #values;
+        }
+    });
+    quote! {
+        #[doc(hidden)]
+        #[allow(non_camel_case_types)]
+        #visibility struct #holder;
+
+        #[allow(non_upper_case_globals, dead_code)]
+        impl #holder {
+            #(#each)*
+        }
+    }
+}

@@ -1,0 +1,70 @@
+//! CARA's typed services: a derive for structs of variables and enums, and an attribute that makes of a trait a list of
+//! functions, a server and clients. They are used by their names in `cara_core`, `cara_std` or `cara_embassy`, which export
+//! them with the feature `derive`.
+
+mod attributes;
+mod calling;
+mod client;
+mod interface;
+mod kind;
+mod server;
+mod variables;
+
+use proc_macro::TokenStream;
+use quote::quote;
+
+/// As `cara_core::Variables`: the fields of a struct are variables by their names, an enum without fields is one integer.
+///
+/// | attribute of a field | means |
+/// |---|---|
+/// | `#[size(200)]` | how many bytes a `String` or `Vec<u8>` has at most |
+/// | `#[name = "x-1"]` | the variable's name, where it is not the field's |
+#[proc_macro_derive(Variables, attributes(size, name))]
+pub fn variables(input: TokenStream) -> TokenStream {
+    variables::derive(input.into(), &quote!(::cara_core)).into()
+}
+
+/// The same, as `cara_std::Variables`.
+#[proc_macro_derive(VariablesStd, attributes(size, name))]
+pub fn variables_std(input: TokenStream) -> TokenStream {
+    variables::derive(input.into(), &quote!(::cara_std)).into()
+}
+
+/// The same, as `cara_embassy::Variables`.
+#[proc_macro_derive(VariablesEmbassy, attributes(size, name))]
+pub fn variables_embassy(input: TokenStream) -> TokenStream {
+    variables::derive(input.into(), &quote!(::cara_embassy)).into()
+}
+
+/// As `cara_core::interface`: makes `DriveServer`, `DriveClient` and `DriveAsyncClient` of a trait `Drive`.
+///
+/// | attribute of a function | means |
+/// |---|---|
+/// | `#[returns(sum)]` | the names of the results; not needed for `()` and for structs that derive `Variables` |
+/// | `#[priority(high)]` | the class of calls that name none: `emergency`, `high`, `normal`, `low` |
+/// | `#[actuator(drive)]` | what it moves, stops or resets, which the server is made with |
+/// | `#[lease(ms = 400)]` | how long it moves it after the caller's last sign that it wants it |
+/// | `#[stop]`, `#[reset]` | it stops, or lets move again, its actuator or, without one, all |
+/// | `#[idempotent]` | running it twice is as good as running it once |
+/// | `#[help = "…"]`, `#[unit(position = "m")]` | what it does, and units of its variables; its documentation is the help otherwise |
+/// | `#[name = "go-to"]` | its name, where it is not the method's |
+///
+/// Arguments have `#[size(200)]` and `#[name = "…"]` as fields do, and names of results too: `#[returns(#[size(64)] text)]`. One
+/// argument alone may be `#[variables] order: Order`, whose fields are the arguments then. An argument `call: &impl AnyCall` tells
+/// about the call.
+#[proc_macro_attribute]
+pub fn interface(attribute: TokenStream, input: TokenStream) -> TokenStream {
+    interface::expand(attribute.into(), input.into(), &quote!(::cara_core)).into()
+}
+
+/// The same, as `cara_std::interface`.
+#[proc_macro_attribute]
+pub fn interface_std(attribute: TokenStream, input: TokenStream) -> TokenStream {
+    interface::expand(attribute.into(), input.into(), &quote!(::cara_std)).into()
+}
+
+/// The same, as `cara_embassy::interface`.
+#[proc_macro_attribute]
+pub fn interface_embassy(attribute: TokenStream, input: TokenStream) -> TokenStream {
+    interface::expand(attribute.into(), input.into(), &quote!(::cara_embassy)).into()
+}

@@ -1,0 +1,113 @@
+//! `#[derive(Variables)]`.
+
+use proc_macro2::TokenStream;
+use quote::{format_ident, quote};
+use syn::spanned::Spanned;
+use syn::{Data, DataEnum, DeriveInput, Error, Fields, FieldsNamed, Ident, Result};
+
+use crate::attributes::OfVariable;
+use crate::kind::Variable;
+
+/// The implementation for a struct or an enum, or what is wrong with it.
+pub(crate) fn derive(input: TokenStream, root: &TokenStream) -> TokenStream {
+    syn::parse2(input).and_then(|input| implement(input, root)).unwrap_or_else(Error::into_compile_error)
+}
+
+fn implement(input: DeriveInput, root: &TokenStream) -> Result<TokenStream> {
+    if !input.generics.params.is_empty() {
+        return Err(Error::new_spanned(input.generics, "what derives `Variables` owns its data and has no generics"));
+    }
+    match input.data {
+        Data::Struct(data) => match data.fields {
+            Fields::Named(fields) => of_struct(&input.ident, fields, root),
+            fields => Err(Error::new(
+                if fields.is_empty() { input.ident.span() } else { fields.span() },
+                "variables have names: make it a struct with named fields",
+            )),
+        },
+        Data::Enum(data) => of_enum(&input.ident, &data, root),
+        Data::Union(union) => {
+            Err(Error::new_spanned(union.union_token, "a union cannot be variables: make it a struct"))
+        }
+    }
+}
+
+fn of_struct(ident: &Ident, fields: FieldsNamed, root: &TokenStream) -> Result<TokenStream> {
+    let mut names = Vec::new();
+    let mut variables = Vec::new();
+    for mut field in fields.named {
+        let Some(name) = field.ident.take() else { continue };
+        let mut said = OfVariable::take(&mut field.attrs)?;
+        let variable = Variable::new(said.name_or(&name), field.ty, said.size)?;
+        if variable.is_borrowed() {
+            let wrong =
+                "a struct of variables owns its data: use `String` or `heapless::String<N>`, or a vector of `u8`";
+            return Err(Error::new_spanned(variable.rust, wrong));
+        }
+        names.push(name);
+        variables.push(variable);
+    }
+    let specs = variables.iter().map(|variable| variable.spec(root));
+    let places = (0..variables.len()).map(|index| quote!(#root::typed::place(places, #index))).collect::<Vec<_>>();
+    let reads = variables.iter().zip(&places).map(|(variable, place)| variable.read(root, place));
+    let writes = variables
+        .iter()
+        .zip(&places)
+        .zip(&names)
+        .map(|((variable, place), name)| variable.write(root, &quote!(self.#name), place));
+    let (parameters, error) = (quote!(#root::typed::parts::ParametersView), quote!(#root::typed::parts::Error));
+    Ok(quote! {
+        #[automatically_derived]
+        impl #root::typed::Variables for #ident {
+            const SPECS: &'static [#root::typed::parts::VariableSpec<'static>] = &[#(#specs),*];
+
+            fn read_places(parameters: &#parameters, places: &[u8]) -> ::core::result::Result<Self, #error> {
+                ::core::result::Result::Ok(Self { #(#names: #reads?),* })
+            }
+
+            fn write_places(&self, parameters: &mut #parameters, places: &[u8]) -> ::core::result::Result<(), #error> {
+                #(#writes?;)*
+                ::core::result::Result::Ok(())
+            }
+        }
+    })
+}
+
+fn of_enum(ident: &Ident, data: &DataEnum, root: &TokenStream) -> Result<TokenStream> {
+    if data.variants.is_empty() {
+        return Err(Error::new_spanned(ident, "an enum that is a variable has a variant at least"));
+    }
+    for variant in &data.variants {
+        if !matches!(variant.fields, Fields::Unit) {
+            let wrong = "an enum that is a variable has no fields: it travels as the number of its variant";
+            return Err(Error::new_spanned(variant, wrong));
+        }
+    }
+    let variants = data.variants.iter().map(|variant| &variant.ident).collect::<Vec<_>>();
+    let numbers = variants.iter().map(|variant| format_ident!("NUMBER_OF_{}", variant)).collect::<Vec<_>>();
+    let (field, error) = (quote!(#root::typed::Field), quote!(#root::typed::parts::Error));
+    let result = quote!(::core::result::Result);
+    Ok(quote! {
+        #[automatically_derived]
+        impl #field for #ident {
+            const KIND: #root::typed::parts::Type = #root::typed::parts::Type::Int;
+            const SIZE: u32 = 1;
+
+            #[allow(non_upper_case_globals)]
+            fn from_field(value: #root::typed::parts::Value<'_>) -> #result<Self, #error> {
+                #(const #numbers: i64 = #ident::#variants as i64;)*
+                match <i64 as #field>::from_field(value)? {
+                    #(#numbers => #result::Ok(Self::#variants),)*
+                    _ => #result::Err(#error::OutOfRange),
+                }
+            }
+
+            fn to_field(&self, target: #root::typed::parts::Target<'_>) -> #result<(), #error> {
+                let number = match self {
+                    #(Self::#variants => Self::#variants as i64,)*
+                };
+                <i64 as #field>::to_field(&number, target)
+            }
+        }
+    })
+}

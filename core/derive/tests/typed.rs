@@ -1,0 +1,421 @@
+//! What the macros make, with a list of functions and a peer that stand side by side.
+
+use core::cell::RefCell;
+use core::future::Future;
+use core::pin::pin;
+use core::task::{Context, Poll, Waker};
+
+use cara_core::config::Priority;
+use cara_core::distribution::block::{self, SliceWriter};
+use cara_core::distribution::function::{Attributes, Definition, Signature};
+use cara_core::distribution::identity::Identity;
+use cara_core::services::heart::Renew;
+use cara_core::services::lease::Ended;
+use cara_core::services::requests::CallId;
+use cara_core::services::session::RequestOptions;
+use cara_core::time::{Duration, Instant};
+use cara_core::typed::{
+    AwaitedCaller, BAD_ARGUMENT, BlockingCaller, CallError, Caller, Free, Functions, Interface, Method,
+};
+use cara_core::{AnyCall, Error, Parameters, ParametersView, ServiceError, Variables, interface};
+
+#[derive(Variables, Clone, Copy, Debug, PartialEq)]
+enum Gear {
+    Reverse = -1,
+    Neutral,
+    Drive = 7,
+}
+
+#[derive(Variables, Clone, Debug, PartialEq)]
+struct Pose {
+    at: [f64; 2],
+    #[name = "heading.deg"]
+    heading: i16,
+    gear: Gear,
+    lit: [bool; 3],
+    r#type: u8,
+    ratio: f32,
+    label: heapless::String<8>,
+    #[size(200)]
+    note: String,
+    #[size(16)]
+    photo: Vec<u8>,
+}
+
+impl Pose {
+    fn new(note: &str) -> Self {
+        Self {
+            at: [1.5, -2.0],
+            heading: -90,
+            gear: Gear::Drive,
+            lit: [true, false, true],
+            r#type: 3,
+            ratio: 0.25,
+            label: heapless::String::try_from("agv").unwrap(),
+            note: note.to_owned(),
+            photo: vec![1, 2, 3],
+        }
+    }
+}
+
+/// What each kind of argument and result is there for.
+#[interface]
+trait Agv {
+    /// Adds.
+    #[returns(sum)]
+    #[idempotent]
+    fn add(&self, a: i64, b: i64) -> i64;
+
+    #[name = "go-to"]
+    #[help = "Drives there."]
+    #[unit(position = "m")]
+    #[priority(high)]
+    #[actuator(drive)]
+    #[lease(ms = 400)]
+    fn go_to(&mut self, call: &impl AnyCall, position: [i64; 2]) -> Result<(), ServiceError>;
+
+    #[priority(emergency)]
+    #[actuator(drive)]
+    #[stop]
+    fn stop();
+
+    #[reset]
+    fn reset(&mut self) -> Result<(), ServiceError>;
+
+    fn pose(&mut self) -> Result<Pose, ServiceError>;
+
+    #[returns(#[size(64)] text, "length-1", gear)]
+    fn say(
+        &mut self,
+        #[size(64)] text: &str,
+        #[size(8)] raw: &[u8],
+        #[name = "n.1"] small: u8,
+        gear: Gear,
+    ) -> Result<(String, u16, Gear), ServiceError>;
+
+    fn place(&mut self, #[variables] pose: Pose);
+}
+
+#[derive(Default)]
+struct Vehicle {
+    target: Option<[i64; 2]>,
+    placed: Option<Pose>,
+    resets: u32,
+    stands_by: bool,
+}
+
+impl Agv for Vehicle {
+    fn add(&self, a: i64, b: i64) -> i64 {
+        a.wrapping_add(b)
+    }
+
+    fn go_to(&mut self, call: &impl AnyCall, position: [i64; 2]) -> Result<(), ServiceError> {
+        assert_eq!(call.caller().name(), "manager");
+        call.commit(|| self.target = Some(position))?;
+        Ok(())
+    }
+
+    fn stop() {}
+
+    fn reset(&mut self) -> Result<(), ServiceError> {
+        self.resets += 1;
+        if self.stands_by { Err(ServiceError::Failed(2)) } else { Ok(()) }
+    }
+
+    fn pose(&mut self) -> Result<Pose, ServiceError> {
+        self.placed.clone().ok_or(ServiceError::NotReady)
+    }
+
+    fn say(&mut self, text: &str, raw: &[u8], small: u8, gear: Gear) -> Result<(String, u16, Gear), ServiceError> {
+        assert_eq!(gear, Gear::Reverse);
+        Ok((text.to_uppercase(), raw.len() as u16 + u16::from(small), Gear::Neutral))
+    }
+
+    fn place(&mut self, pose: Pose) {
+        self.placed = Some(pose);
+    }
+}
+
+/// What a call tells here.
+struct Told(Identity, Option<Ended>);
+
+impl AnyCall for Told {
+    fn caller(&self) -> &Identity {
+        &self.0
+    }
+    fn priority(&self) -> Priority {
+        Priority::Normal
+    }
+    fn deadline(&self) -> Instant {
+        Instant::START
+    }
+    fn wants_reply(&self) -> bool {
+        true
+    }
+    fn commit<R>(&self, change: impl FnOnce() -> R) -> Result<R, Ended> {
+        self.1.map_or_else(|| Ok(change()), Err)
+    }
+}
+
+enum Run {
+    Method(&'static Method<Vehicle, Told>),
+    Free(&'static Free<Told>),
+}
+
+struct Listed {
+    signature: Signature<'static>,
+    attributes: Attributes,
+    actuator: Option<&'static str>,
+    run: Run,
+}
+
+/// A unit with its list, which is its own peer.
+#[derive(Default)]
+struct Unit {
+    listed: RefCell<Vec<Listed>>,
+    /// Published in place of the list's own.
+    other: Option<Definition>,
+    vehicle: RefCell<Vehicle>,
+    ended: Option<Ended>,
+    sent: RefCell<Vec<RequestOptions>>,
+}
+
+impl Functions<Vehicle> for Unit {
+    type Call = Told;
+    type Actuator = &'static str;
+
+    fn add_method(
+        &self,
+        signature: Signature<'static>,
+        attributes: Attributes,
+        actuator: Option<&&'static str>,
+        run: &'static Method<Vehicle, Told>,
+    ) -> Result<(), Error> {
+        let (actuator, run) = (actuator.copied(), Run::Method(run));
+        self.listed.borrow_mut().push(Listed { signature, attributes, actuator, run });
+        Ok(())
+    }
+
+    fn add_free(
+        &self,
+        signature: Signature<'static>,
+        attributes: Attributes,
+        actuator: Option<&&'static str>,
+        run: &'static Free<Told>,
+    ) -> Result<(), Error> {
+        let (actuator, run) = (actuator.copied(), Run::Free(run));
+        self.listed.borrow_mut().push(Listed { signature, attributes, actuator, run });
+        Ok(())
+    }
+}
+
+impl Caller for Unit {
+    fn published<R>(&self, function: &str, look: impl Fn(Option<Signature<'_>>) -> R) -> R {
+        if let Some(other) = &self.other {
+            return look(Some(other.signature()));
+        }
+        let listed = self.listed.borrow();
+        look(listed.iter().find(|listed| listed.signature.name() == function).map(|listed| listed.signature))
+    }
+
+    fn send(&self, function: &str, parameters: &ParametersView, options: &RequestOptions) -> Result<CallId, Error> {
+        let mut copy = Parameters::<1024>::sized();
+        copy.copy_from(parameters)?;
+        self.block(function, &mut copy, options).map(|()| CallId(1))
+    }
+}
+
+impl BlockingCaller for Unit {
+    type Hold = &'static str;
+
+    /// Through blocks, as between two units.
+    fn block(&self, function: &str, parameters: &mut ParametersView, options: &RequestOptions) -> Result<(), Error> {
+        self.sent.borrow_mut().push(*options);
+        let listed = self.listed.borrow();
+        let listed = listed.iter().find(|listed| listed.signature.name() == function).ok_or(Error::UnknownFunction)?;
+        let (arguments, results) = (listed.signature.arguments(), listed.signature.results());
+        block::check_results_fit(results, parameters)?;
+        let mut bytes = vec![0; block::measure(arguments, parameters)?];
+        block::write(arguments, parameters, &mut SliceWriter::new(&mut bytes));
+        let mut served = Parameters::<1024>::sized();
+        block::read_arguments(arguments, &bytes, &mut served)?;
+        block::prepare_results(results, &mut served)?;
+        let call = Told(Identity::m_unit("manager", 1)?, self.ended);
+        match listed.run {
+            Run::Method(run) => run(&mut self.vehicle.borrow_mut(), &call, &mut served)?,
+            Run::Free(run) => run(&call, &mut served)?,
+        }
+        let mut bytes = vec![0; block::measure(results, &served)?];
+        block::write(results, &served, &mut SliceWriter::new(&mut bytes));
+        block::read(results, &bytes, parameters)
+    }
+
+    fn block_and_hold(
+        &self,
+        function: &str,
+        parameters: &mut ParametersView,
+        options: &RequestOptions,
+    ) -> Result<&'static str, Error> {
+        self.block(function, parameters, options).map(|()| "held")
+    }
+}
+
+impl AwaitedCaller for Unit {
+    async fn call(
+        &self,
+        function: &str,
+        parameters: &mut ParametersView,
+        options: &RequestOptions,
+    ) -> Result<(), Error> {
+        self.block(function, parameters, options)
+    }
+}
+
+fn unit() -> Unit {
+    let unit = Unit::default();
+    AgvServer { drive: "motor" }.add_to(&unit).unwrap();
+    unit
+}
+
+#[test]
+fn signatures_are_those_of_the_text_form() {
+    let unit = unit();
+    let shown: Vec<String> = unit.listed.borrow().iter().map(|listed| listed.signature.to_string()).collect();
+    let pose = "at: float[2], heading.deg: int, gear: int, lit: bool[3], type: int, ratio: float, label: string[8], \
+                note: string[200], photo: bytes[16]";
+    assert_eq!(
+        shown,
+        [
+            "add(a: int, b: int) -> (sum: int)".to_owned(),
+            "go-to(position: int[2])".to_owned(),
+            "stop()".to_owned(),
+            "reset()".to_owned(),
+            format!("pose() -> ({pose})"),
+            "say(text: string[64], raw: bytes[8], n.1: int, gear: int) -> (text: string[64], length-1: int, gear: int)"
+                .to_owned(),
+            format!("place({pose})"),
+        ]
+    );
+    for (text, listed) in shown.iter().zip(unit.listed.borrow().iter()) {
+        assert_eq!(Definition::parse(text).unwrap().as_bytes(), listed.signature.as_bytes());
+    }
+}
+
+#[test]
+fn attributes_and_actuators_are_passed_on() {
+    let unit = unit();
+    let listed = unit.listed.borrow();
+    let of = |name: &str| listed.iter().find(|listed| listed.signature.name() == name).unwrap();
+    let usual = Attributes::default();
+    assert_eq!((of("add").attributes, of("add").actuator), (Attributes { idempotent: true, ..usual }, None));
+    let moves = Attributes { priority: Priority::High, lease: Some(Duration::from_millis(400)), ..usual };
+    assert_eq!((of("go-to").attributes, of("go-to").actuator), (moves, Some("motor")));
+    let stops = Attributes { priority: Priority::Emergency, stop: true, ..usual };
+    assert_eq!((of("stop").attributes, of("stop").actuator), (stops, Some("motor")));
+    assert!(matches!(of("stop").run, Run::Free(_)));
+    assert_eq!((of("reset").attributes, of("reset").actuator), (Attributes { reset: true, ..usual }, None));
+    let help: Vec<_> = __AgvFunctions::HELP.iter().map(|help| (help.function, help.text, help.units)).collect();
+    assert_eq!(help[0], ("add", "Adds.", &[][..]));
+    assert_eq!(help[1], ("go-to", "Drives there.", &[("position", "m")][..]));
+}
+
+#[test]
+fn a_client_gets_what_the_service_gives() {
+    let unit = unit();
+    let agv = AgvClient::at(&unit);
+    assert_eq!(agv.add(40, 2), Ok(42));
+    assert_eq!(agv.go_to([3, 4]), Ok(()));
+    assert_eq!(unit.vehicle.borrow().target, Some([3, 4]));
+    assert_eq!(agv.stop(), Ok(()));
+    assert_eq!(agv.say("stand by", &[1, 2], 5, Gear::Reverse), Ok(("STAND BY".to_owned(), 7, Gear::Neutral)));
+    assert_eq!(agv.pose(), Err(CallError::Call(Error::Service(ServiceError::NotReady))));
+    assert_eq!(agv.place(Pose::new("hall 7")), Ok(()));
+    assert_eq!(agv.pose(), Ok(Pose::new("hall 7")));
+    unit.vehicle.borrow_mut().stands_by = true;
+    assert_eq!(agv.reset(), Err(CallError::Call(Error::Service(ServiceError::Failed(2)))));
+    assert_eq!(unit.vehicle.borrow().resets, 1);
+}
+
+#[test]
+fn options_holds_and_requests_go_through() {
+    let mut unit = unit();
+    let wanted = RequestOptions { timeout: Some(Duration::from_secs(9)), ..RequestOptions::new() };
+    let agv = AgvClient::at(&unit).with(wanted).renewing(Renew::Process);
+    assert_eq!(agv.hold_go_to([1, 2]), Ok("held"));
+    assert_eq!(agv.request_add(1, 2), Ok(CallId(1)));
+    assert_eq!(*unit.sent.borrow(), [RequestOptions { renew: Renew::Process, ..wanted }; 2]);
+    unit.ended = Some(Ended);
+    assert!(AgvClient::at(&unit).go_to([9, 9]).is_err(), "its order has ended");
+    assert_eq!(unit.vehicle.borrow().target, Some([1, 2]));
+}
+
+#[test]
+fn a_task_awaits_the_same() {
+    let unit = unit();
+    let agv = AgvAsyncClient::at(&unit);
+    let both = async { (agv.add(1, 2).await, agv.request_go_to([5, 6]), agv.pose().await) };
+    let Poll::Ready((sum, sent, pose)) = pin!(both).poll(&mut Context::from_waker(Waker::noop())) else {
+        panic!("it is ready at once");
+    };
+    assert_eq!((sum, sent), (Ok(3), Ok(CallId(1))));
+    assert_eq!(pose, Err(CallError::Call(Error::Service(ServiceError::NotReady))));
+}
+
+#[test]
+fn another_version_at_the_peer_is_told_before_anything_is_sent() {
+    let mut unit = unit();
+    for (theirs, told) in [
+        ("add(a: int, b: float) -> (sum: int)", Some("argument b is float there and int here")),
+        ("add(a: int, c: int) -> (sum: int)", Some("argument c is int there and missing here")),
+        ("add(a: int, b: int) -> (sum: float)", Some("result sum is float there and int here")),
+        ("add(a: int, b: int)", Some("result sum is missing there and int here")),
+        ("add(a: int) -> (sum: int, carry: bool)", None),
+    ] {
+        unit.other = Some(Definition::parse(theirs).unwrap());
+        unit.sent.borrow_mut().clear();
+        match (AgvClient::at(&unit).add(1, 2), told) {
+            (Err(CallError::Mismatch(mismatch)), Some(told)) => {
+                assert!(mismatch.to_string().contains(told), "{mismatch}");
+                assert_eq!(mismatch.function, "add");
+                assert_eq!(unit.sent.borrow().len(), 0);
+            }
+            (Ok(3), None) => {}
+            other => panic!("{theirs}: {other:?}"),
+        }
+    }
+}
+
+#[test]
+fn what_does_not_fit_the_rust_type_is_refused() {
+    let unit = unit();
+    let mut call = Parameters::new();
+    call.add_string("text", 64).unwrap();
+    call.add_bytes("raw", 8).unwrap();
+    call.add_int("n.1", 1).unwrap();
+    call.add_int("gear", 1).unwrap();
+    call.add_int("length-1", 1).unwrap();
+    let usual = RequestOptions::new();
+    for (number, gear) in [(256, -1), (-1, -1), (0, 1), (0, 8)] {
+        call.set_value("n.1", number).unwrap();
+        call.set_value("gear", gear).unwrap();
+        let refused = Err(Error::Service(ServiceError::Failed(BAD_ARGUMENT)));
+        assert_eq!(unit.block("say", &mut call, &usual), refused, "{number} {gear}");
+    }
+    call.set_value("gear", -1).unwrap();
+    assert_eq!(unit.block("say", &mut call, &usual), Ok(()));
+    assert_eq!(call.variable("gear"), Ok(0));
+    // Too long for what is declared: nothing is sent.
+    let long = AgvClient::at(&unit).say(&"x".repeat(65), &[], 0, Gear::Reverse);
+    assert_eq!(long, Err(CallError::Call(Error::WrongSize { index: 0, expected: 64, found: 65 })));
+}
+
+#[test]
+fn a_struct_goes_into_dynamic_parameters_and_back() {
+    let mut parameters = Parameters::<1024>::sized();
+    Pose::new("here").to_parameters(&mut parameters).unwrap();
+    assert_eq!(parameters.variable("heading.deg"), Ok(-90));
+    assert_eq!(parameters.variable("note"), Ok("here"));
+    assert_eq!(Pose::from_parameters(&parameters), Ok(Pose::new("here")));
+    parameters.set_value("heading.deg", 40_000).unwrap();
+    assert_eq!(Pose::from_parameters(&parameters), Err(Error::OutOfRange));
+}

@@ -1,0 +1,8 @@
+use cara_core::interface;
+
+#[interface]
+trait Drive<T> {
+    fn go_to(&mut self, position: T);
+}
+
+fn main() {}

@@ -1,0 +1,10 @@
+use cara_core::interface;
+
+#[interface]
+trait Drive {
+    #[priority(high)]
+    #[priority(low)]
+    fn go_to(&mut self, position: [i64; 2]);
+}
+
+fn main() {}

@@ -1,0 +1,13 @@
+use cara_core::interface;
+use cara_core::typed::BlockingCaller;
+
+#[interface]
+trait Drive {
+    fn go_to(&mut self, position: [i64; 2]);
+}
+
+fn drive(peer: &impl BlockingCaller) {
+    let _ = DriveClient::at(peer).go_to([1.0, 2.0]);
+}
+
+fn main() {}
