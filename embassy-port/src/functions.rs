@@ -5,7 +5,7 @@ use core::future::poll_fn;
 use core::task::Poll;
 
 use cara_core::config::Priority;
-use cara_core::distribution::function::Definition;
+use cara_core::distribution::function::{Definition, Signature};
 use cara_core::distribution::function_list::{FunctionList, Slot};
 use cara_core::error::Error;
 use cara_core::storage::Lent;
@@ -15,9 +15,9 @@ use crate::handler::{Handler, Listed, ServiceOptions};
 use crate::machine::Machine;
 use crate::time::now;
 
-type Put<T> = fn(
+pub(crate) type Put<T> = fn(
     &mut FunctionList<Lent, Listed<T>>,
-    &Definition,
+    Signature<'_>,
     cara_core::distribution::function::Attributes,
     Listed<T>,
 ) -> Result<Slot, Error>;
@@ -74,29 +74,34 @@ impl<T> MyFunctionList<T> {
     /// [`Error::EmergencyWaits`] for a handler of an emergency service that takes the application's state, or is a task.
     #[doc(alias = "add_function")]
     pub fn add_service(&self, signature: &str, options: ServiceOptions<T>, handler: Handler<T>) -> Result<(), Error> {
-        self.put(signature, options, handler, FunctionList::add_function)
+        self.put(parsed(signature)?.signature(), options, handler, FunctionList::add_signature)
     }
 
     /// Changes a service. A caller that knows the old one gets [`Error::StaleFunction`] until it is published again.
     pub fn replace(&self, signature: &str, options: ServiceOptions<T>, handler: Handler<T>) -> Result<(), Error> {
-        self.put(signature, options, handler, FunctionList::replace)
+        self.put(parsed(signature)?.signature(), options, handler, FunctionList::replace_signature)
     }
 
-    fn put(&self, signature: &str, options: ServiceOptions<T>, handler: Handler<T>, put: Put<T>) -> Result<(), Error> {
-        let definition = Definition::parse(signature).map_err(|_| Error::BadName)?;
+    pub(crate) fn put(
+        &self,
+        signature: Signature<'_>,
+        options: ServiceOptions<T>,
+        handler: Handler<T>,
+        put: Put<T>,
+    ) -> Result<(), Error> {
         let ServiceOptions { attributes, lease, safe, then } = options;
         if attributes.priority == Priority::Emergency && handler.waits() {
             return Err(Error::EmergencyWaits);
         }
         let stop = self.unit.act(|machine| {
             let limit = machine.limits.arguments;
-            if definition.signature().parameters_bytes() as usize > limit {
+            if signature.parameters_bytes() as usize > limit {
                 return Err(Error::TooLarge { limit: u32::try_from(limit).unwrap_or(u32::MAX) });
             }
             let listed = Listed { handler, lease, safe, then };
-            let replaced = machine.functions.find(definition.name()).and_then(|slot| machine.functions.function(slot));
+            let replaced = machine.functions.find(signature.name()).and_then(|slot| machine.functions.function(slot));
             let replaced = replaced.map(|function| *function.handler);
-            put(&mut machine.functions, &definition, attributes, listed)?;
+            put(&mut machine.functions, signature, attributes, listed)?;
             // What a call of the service before started would go on to the end of its lease.
             let stop = replaced.and_then(Listed::clear);
             // Another service that had this lease may have left it dead, and no call would begin.
@@ -137,6 +142,10 @@ impl<T> MyFunctionList<T> {
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
+}
+
+fn parsed(signature: &str) -> Result<Definition, Error> {
+    Definition::parse(signature).map_err(|_| Error::BadName)
 }
 
 impl<T> fmt::Display for MyFunctionList<T> {

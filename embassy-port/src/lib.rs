@@ -88,6 +88,7 @@ mod event;
 mod functions;
 mod handle;
 mod handler;
+mod interfaces;
 mod lease;
 mod limits;
 mod line;
@@ -103,11 +104,15 @@ mod taken;
 mod time;
 
 pub use calls::Hold;
+pub use cara_core::typed::{self, AnyCall, CallError, Variables};
+#[cfg(feature = "derive")]
+pub use cara_derive::{VariablesEmbassy as Variables, interface_embassy as interface};
 pub use config::Config;
 pub use event::{Name, UnitEvent};
 pub use functions::MyFunctionList;
 pub use handle::Handle;
 pub use handler::{Call, Free, Handler, Hook, Method, Safe, ServiceOptions};
+pub use interfaces::Actuator;
 pub use lease::LeaseWatch;
 pub use limits::Limits;
 pub use peer::{Peer, TheirFunctionList};

@@ -37,6 +37,7 @@ mod future;
 mod handle;
 mod handler;
 mod heart;
+mod interfaces;
 pub mod keys;
 mod lease;
 mod locks;
@@ -78,6 +79,9 @@ pub use cara_core::services::requests::CallId;
 pub use cara_core::services::session::{Delivery, RequestOptions};
 pub use cara_core::term::Term;
 pub use cara_core::time::Duration;
+pub use cara_core::typed::{self, AnyCall, CallError, Mismatch, Variables};
+#[cfg(feature = "derive")]
+pub use cara_derive::{VariablesStd as Variables, interface_std as interface};
 pub use communication_system::{CommunicationSystem, WeakSystem};
 pub use config::Capacities;
 pub use error::StartError;

@@ -104,7 +104,7 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
         Ok(())
     }
 
-    fn put<Form>(
+    pub(crate) fn put<Form>(
         &self,
         definition: &Definition,
         options: ServiceOptions<T>,

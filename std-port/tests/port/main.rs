@@ -27,3 +27,4 @@ mod stuck;
 mod support;
 mod terms;
 mod threads;
+mod typed;

@@ -1,0 +1,148 @@
+//! Typed services on boards: how a unit's list takes the functions of an interface, and how its clients call a peer.
+
+use core::fmt;
+
+use cara_core::config::Priority;
+use cara_core::distribution::function::{Attributes, Signature};
+use cara_core::distribution::function_list::FunctionList;
+use cara_core::distribution::identity::Identity;
+use cara_core::distribution::parameters::ParametersView;
+use cara_core::error::Error;
+use cara_core::services::lease::{Ended, Lease};
+use cara_core::services::requests::CallId;
+use cara_core::services::session::RequestOptions;
+use cara_core::time::Instant;
+use cara_core::typed::{AnyCall, AwaitedCaller, Caller, Free, Functions, Interface, Method};
+
+use crate::functions::MyFunctionList;
+use crate::handler::{Call, Handler, Hook, Safe, ServiceOptions};
+use crate::peer::Peer;
+
+/// What functions of an interface move, stop or reset: see [`ServiceOptions::lease`].
+pub struct Actuator<T: 'static> {
+    lease: &'static Lease,
+    safe: &'static Safe,
+    then: Option<&'static Hook<T>>,
+}
+
+impl<T> fmt::Debug for Actuator<T> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Actuator").finish_non_exhaustive()
+    }
+}
+
+impl<T> Clone for Actuator<T> {
+    fn clone(&self) -> Self {
+        *self
+    }
+}
+
+impl<T> Copy for Actuator<T> {}
+
+impl<T> Actuator<T> {
+    /// What a lease is of, and what makes it safe.
+    pub const fn new(lease: &'static Lease, safe: &'static Safe) -> Self {
+        Self { lease, safe, then: None }
+    }
+
+    /// Runs each time after `safe`, with the application's state.
+    pub const fn then(self, hook: &'static Hook<T>) -> Self {
+        Self { then: Some(hook), ..self }
+    }
+}
+
+impl<T> AnyCall for Call<T> {
+    fn caller(&self) -> &Identity {
+        &self.caller
+    }
+
+    fn priority(&self) -> Priority {
+        self.priority
+    }
+
+    fn deadline(&self) -> Instant {
+        self.deadline
+    }
+
+    fn wants_reply(&self) -> bool {
+        self.wants_reply
+    }
+
+    fn commit<R>(&self, change: impl FnOnce() -> R) -> Result<R, Ended> {
+        Self::commit(self, change)
+    }
+}
+
+impl<T: 'static> MyFunctionList<T> {
+    /// Adds all functions of an interface, which the unit's state implements. Adding them makes nothing visible. The errors of
+    /// [`add_service`](Self::add_service); functions before the one that was refused stay.
+    pub fn serve(&self, interface: impl Interface<T, Self>) -> Result<(), Error> {
+        interface.add_to(self)
+    }
+
+    fn add(
+        &self,
+        signature: Signature<'_>,
+        attributes: Attributes,
+        actuator: Option<&Actuator<T>>,
+        handler: Handler<T>,
+    ) -> Result<(), Error> {
+        let mut options = ServiceOptions { attributes, ..ServiceOptions::new() };
+        if let Some(actuator) = actuator {
+            options.lease = Some(actuator.lease);
+            // What stops or resets has no hook of its own.
+            if attributes.lease.is_some() {
+                (options.safe, options.then) = (Some(actuator.safe), actuator.then);
+            }
+        }
+        self.put(signature, options, handler, FunctionList::add_signature)
+    }
+}
+
+impl<T: 'static> Functions<T> for MyFunctionList<T> {
+    type Call = Call<T>;
+    type Actuator = Actuator<T>;
+
+    fn add_method(
+        &self,
+        signature: Signature<'static>,
+        attributes: Attributes,
+        actuator: Option<&Actuator<T>>,
+        run: &'static Method<T, Call<T>>,
+    ) -> Result<(), Error> {
+        self.add(signature, attributes, actuator, Handler::method(run))
+    }
+
+    fn add_free(
+        &self,
+        signature: Signature<'static>,
+        attributes: Attributes,
+        actuator: Option<&Actuator<T>>,
+        run: &'static Free<Call<T>>,
+    ) -> Result<(), Error> {
+        self.add(signature, attributes, actuator, Handler::free(run))
+    }
+}
+
+impl<T> Caller for Peer<T> {
+    fn published<R>(&self, function: &str, look: impl Fn(Option<Signature<'_>>) -> R) -> R {
+        let seen = self
+            .session(|session| look(session.their_function_list().named(function).map(|function| function.signature)));
+        seen.unwrap_or_else(|| look(None))
+    }
+
+    fn send(&self, function: &str, parameters: &ParametersView, options: &RequestOptions) -> Result<CallId, Error> {
+        self.request_with(function, parameters, options)
+    }
+}
+
+impl<T> AwaitedCaller for Peer<T> {
+    async fn call(
+        &self,
+        function: &str,
+        parameters: &mut ParametersView,
+        options: &RequestOptions,
+    ) -> Result<(), Error> {
+        self.block_request_with(function, parameters, options).await
+    }
+}
