@@ -7,6 +7,7 @@ use serde_json::json;
 
 use crate::nodes;
 use crate::operator::{Need, Operator};
+use crate::text;
 use cara_tools::exit::Exit;
 use cara_tools::global::Global;
 use cara_tools::output::{self, PLAIN, Rows};
@@ -16,13 +17,22 @@ use cara_tools::output::{self, PLAIN, Rows};
 pub(crate) struct Arguments {
     /// The node: NAME, NAME/ID or #ID.
     node: String,
+    /// Print them as the trait of a typed program.
+    #[arg(long)]
+    rust: bool,
 }
 
-pub(crate) fn run(Arguments { node }: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
+pub(crate) fn run(Arguments { node, rust }: Arguments, global: &Global) -> anyhow::Result<ExitCode> {
     let mut operator = Operator::open(global, &Need::Node(&node))?;
     let node = nodes::connected(&mut operator, &node)?.selector;
     let functions = nodes::functions(&mut operator, &node)?;
-    if global.json {
+    if rust {
+        let source = text::interface(&node, &functions).map_err(|why| anyhow::anyhow!("cannot read {why}"))?;
+        match global.json {
+            true => output::object(&json!({ "node": node, "rust": source }))?,
+            false => output::line(source.trim_end())?,
+        }
+    } else if global.json {
         output::object(&json!({ "node": node, "functions": functions }))?;
     } else if functions.is_empty() {
         output::line(format_args!("{node} has published nothing to this unit"))?;

@@ -11,11 +11,13 @@
 //! - several of the first three in brackets, as `[1, 2]`, where the signature has a size other than 1.
 
 mod bind;
+mod interface;
 mod mistake;
 mod print;
 mod read;
 
 pub(crate) use bind::bind;
+pub(crate) use interface::interface;
 pub(crate) use mistake::Mistake;
 pub(crate) use print::show_call;
 pub(crate) use read::{Written, read};

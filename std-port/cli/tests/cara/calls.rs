@@ -17,6 +17,16 @@ fn functions_are_shown_as_they_are_called() {
 }
 
 #[test]
+fn functions_are_shown_as_the_trait_of_a_typed_program() {
+    let stage = Stage::with(&["agv-1"]);
+    let shown = stage.ends(0, &["functions", "agv-1", "--rust"]);
+    shown.says("#[interface]").says("pub trait Agv1 {");
+    shown.says("    fn go_to(&mut self, position: [i64; 2]) -> Result<");
+    let told = stage.ends(0, &["functions", "agv-1", "--rust", "--json"]).json();
+    assert_eq!(told["rust"], shown.out);
+}
+
+#[test]
 fn results_can_be_pasted_back() {
     let stage = Stage::with(&["agv-1"]);
     let calls = [

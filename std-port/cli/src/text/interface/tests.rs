@@ -1,0 +1,60 @@
+//! What is printed is compiled here, and has the signatures that it was printed from.
+
+use cara_std::Attributes;
+use cara_std::control::protocol::FunctionInfo;
+
+use super::{interface, trait_name};
+
+const SOURCE: &str = include_str!("agv.rs");
+
+/// The printed trait.
+mod printed {
+    #![allow(unreachable_pub, dead_code, missing_docs)]
+    include!("agv.rs");
+
+    /// Signatures and attributes.
+    pub(super) fn functions() -> Vec<(String, cara_std::Attributes)> {
+        type Of = __Agv17Functions;
+        let signatures = [
+            Of::SIGNATURE_pos_info,
+            Of::SIGNATURE_go_to,
+            Of::SIGNATURE_stop,
+            Of::SIGNATURE_reset,
+            Of::SIGNATURE_log_line,
+        ];
+        let attributes = [
+            Of::ATTRIBUTES_pos_info,
+            Of::ATTRIBUTES_go_to,
+            Of::ATTRIBUTES_stop,
+            Of::ATTRIBUTES_reset,
+            Of::ATTRIBUTES_log_line,
+        ];
+        signatures.iter().map(ToString::to_string).zip(attributes).collect()
+    }
+}
+
+#[test]
+fn the_printed_trait_is_the_one_that_was_published() {
+    let of = |(signature, attributes): (String, Attributes)| {
+        let moves = ["go_to", "stop"].iter().any(|name| signature.starts_with(name));
+        let attributes = Attributes { actuator: if moves { 3 } else { 0 }, ..attributes };
+        FunctionInfo { name: signature.clone(), signature, attributes }
+    };
+    let published: Vec<FunctionInfo> = printed::functions().into_iter().map(of).collect();
+    assert_eq!(
+        published[4].signature,
+        "log/line(line: string[64], a-b: float, a.b: bool, type: int, self: int, _raw: bytes[8], 2nd: int) -> \
+         (text: string[9], is-new: bool)"
+    );
+    assert_eq!(interface("agv-17/17", &published).unwrap(), SOURCE);
+    let broken = FunctionInfo { signature: "f(".into(), ..published[0].clone() };
+    assert!(interface("agv", &[broken]).unwrap_err().contains("f("));
+}
+
+#[test]
+fn a_nodes_name_becomes_that_of_a_trait() {
+    for (node, name) in [("agv-17/17", "Agv17"), ("AGV_manager/1", "AGVManager"), ("7up", "Node7up"), ("ä/1", "Node")]
+    {
+        assert_eq!(trait_name(node), name);
+    }
+}
