@@ -215,6 +215,27 @@ fn methods_are_services() {
 }
 
 #[test]
+fn the_typed_listing_runs_and_is_short() {
+    let mut process = Fleet::new().start("typed", env!("CARGO_BIN_EXE_typed"), &[]);
+    ends_well(&mut process);
+    for said in [
+        "pos_info() -> (position: int[2])",
+        "go_to(position: int[2])",
+        "position [0, 0]",
+        "driving to [1, 2]",
+        "call_mechanic: a wheel squeaks",
+        "a mechanic comes in 5 minutes",
+        "ended at [1, 2]",
+    ] {
+        process.seen(said, Duration::ZERO).unwrap();
+    }
+    let source = include_str!("../src/bin/typed.rs");
+    let listing =
+        source.split("// The listing begins.\n").nth(1).and_then(|rest| rest.split("    // The listing ends.").next());
+    assert!((10..=15).contains(&listing.unwrap().lines().count()), "{listing:?}");
+}
+
+#[test]
 fn a_best_effort_stream_arrives() {
     let fleet = Fleet::new();
     let program = env!("CARGO_BIN_EXE_telemetry");
