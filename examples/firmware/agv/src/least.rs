@@ -1,8 +1,7 @@
 //! The least s_unit: one service, and memory for no more than that. It is how small a unit can be, and what CARA itself
 //! takes of a board when nothing else is there.
 
-use cara_core::error::{Error, ServiceError};
-use cara_embassy::{Handler, Limits, Runner, Security, ServiceOptions, resources};
+use cara_embassy::{Limits, Runner, Security, interface, resources};
 use cara_settings::Settings;
 use embassy_net::Stack;
 
@@ -28,6 +27,21 @@ pub const LIMITS: Limits = Limits {
 /// Its memory.
 pub type LeastResources = resources!((), LIMITS);
 
+/// What it serves.
+#[interface]
+pub trait Add {
+    /// Adds two numbers.
+    #[returns(sum)]
+    fn add(&mut self, a: i64, b: i64) -> i64;
+}
+
+/// It has no state.
+impl Add for () {
+    fn add(&mut self, a: i64, b: i64) -> i64 {
+        a.wrapping_add(b)
+    }
+}
+
 /// Makes the unit, whose one service adds two numbers.
 pub fn unit(
     stack: Stack<'static>,
@@ -36,14 +50,7 @@ pub fn unit(
     security: Security,
 ) -> Result<Runner<()>, VehicleError> {
     let (unit, runner) = cara_embassy::new(stack, resources, unit_config(settings, security)?, ())?;
-    let add = Handler::method(&|(), _, numbers| {
-        let mut sum = || {
-            let (a, b): (i64, i64) = (numbers.variable("a")?, numbers.variable("b")?);
-            numbers.set_value("sum", a.wrapping_add(b))
-        };
-        sum().map_err(|_: Error| ServiceError::BadResults)
-    });
-    unit.my_function_list().add_service("add(a: int, b: int) -> (sum: int)", ServiceOptions::new(), add)?;
+    unit.my_function_list().serve(AddServer)?;
     unit.publish_my_function_list()?;
     Ok(runner)
 }
