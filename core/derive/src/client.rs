@@ -7,12 +7,11 @@ use crate::interface::{Function, Input, Interface, Results};
 use crate::kind::Variable;
 
 pub(crate) fn make(interface: &Interface, root: &TokenStream) -> TokenStream {
-    let Interface { functions, item } = interface;
-    let (name, holder) = (&item.ident, interface.holder());
+    let Interface { functions, .. } = interface;
+    let holder = interface.holder();
     let shared = functions.iter().map(|function| shared(function, root));
     let blocking = client(interface, root, "Client", "for threads: a call returns when it has its results", blocking);
     let awaited = client(interface, root, "AsyncClient", "for tasks: a call is awaited", awaited);
-    let _ = name;
     quote! {
         #[allow(dead_code)]
         impl #holder {
@@ -45,14 +44,12 @@ fn shared(function: &Function, root: &TokenStream) -> TokenStream {
     let results = match &function.results {
         Results::Struct(rust) => quote!(<#rust as #typed::Variables>::read_places(parameters, &Self::#places)),
         Results::Named(results) => {
-            let read = |(index, result): (usize, &Variable)| {
-                let read = result.read(root, &quote!(#typed::place(&Self::#places, #index)));
-                quote!(#read?)
-            };
+            let read =
+                |(index, result): (usize, &Variable)| result.read(root, &quote!(#typed::place(&Self::#places, #index)));
             let reads = results.iter().enumerate().map(read).collect::<Vec<_>>();
             match reads.as_slice() {
-                [only] => quote!(::core::result::Result::Ok(#only)),
-                several => quote!(::core::result::Result::Ok((#(#several),*))),
+                [only] => only.clone(),
+                several => quote!(::core::result::Result::Ok((#(#several?),*))),
             }
         }
     };

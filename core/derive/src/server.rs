@@ -130,7 +130,7 @@ fn serve(interface: &Interface, function: &Function, root: &TokenStream) -> Toke
 fn write_results(function: &Function, root: &TokenStream) -> TokenStream {
     let (holder_places, typed) = (function.constant("PLACES"), quote!(#root::typed));
     match &function.results {
-        Results::Struct(rust) if matches!(rust, syn::Type::Tuple(_)) => quote!(),
+        Results::Struct(syn::Type::Tuple(_)) => quote!(),
         Results::Struct(_) => quote!(#typed::Variables::write_places(&results, parameters, &Self::#holder_places)?;),
         Results::Named(results) => {
             let is_tuple = results.len() > 1;

@@ -64,7 +64,8 @@ entry!(parameters_read, {
 entry!(parameters_placed, {
     let parameters = parameters();
     keep(parameters.lay_out(*unknown::<Signature<'static>>()));
-    keep((parameters.value_of(*unknown()), parameters.target_of(*unknown()).is_ok()));
+    keep(parameters.value_of(*unknown()));
+    keep(parameters.target_of(*unknown()).is_ok());
 });
 
 entry!(typed_signatures, {
