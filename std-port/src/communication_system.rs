@@ -18,6 +18,7 @@ use cara_core::time::Duration;
 use core::net::IpAddr;
 
 use crate::builder::{BuildError, Builder};
+use crate::engine::CallsToAll;
 use crate::handle::{Handle, MUnit, WeakHandle};
 #[cfg(feature = "control")]
 use crate::locks::lock;
@@ -140,6 +141,44 @@ impl<T: Send + 'static> CommunicationSystem<T> {
         self.only(|identity| identity.role() == Role::SUnit && identity.name() == name)
     }
 
+    /// The s_unit of a name, once it is connected and has told what it offers; [`Error::TimedOut`] after `timeout`,
+    /// [`Error::Ambiguous`] where several have that name.
+    ///
+    /// ```no_run
+    /// # let depot = cara_std::CommunicationSystem::new("depot", 1)?;
+    /// depot.start()?;
+    /// let agv = depot.wait_for_s_unit("agv-07", std::time::Duration::from_secs(30))?;
+    /// # Ok::<(), cara_std::BuildError>(())
+    /// ```
+    pub fn wait_for_s_unit(&self, name: &str, timeout: impl Into<Duration>) -> Result<Peer<T>, Error> {
+        let engine = self.engine();
+        let deadline = engine.now() + timeout.into();
+        // Counted before the look: what comes after it ends the wait.
+        let mut seen = engine.news.count();
+        loop {
+            if let Some(found) = self.s_unit_here(name) {
+                return found;
+            }
+            let left = deadline.since(engine.now());
+            if engine.is_stopping() {
+                return Err(Error::NotRunning);
+            }
+            if left == Duration::ZERO {
+                return Err(Error::TimedOut);
+            }
+            seen = engine.news.wait(seen, left);
+        }
+    }
+
+    /// The s_unit of a name if it is connected and has told what it offers, or why none can be meant.
+    pub(crate) fn s_unit_here(&self, name: &str) -> Option<Result<Peer<T>, Error>> {
+        match self.s_unit(name) {
+            Ok(peer) => peer.cell.is_introduced().then_some(Ok(peer)),
+            Err(Error::NotConnected) => None,
+            Err(error) => Some(Err(error)),
+        }
+    }
+
     /// The m_unit of a name, likewise.
     pub fn m_unit(&self, name: &str) -> Result<Peer<T>, Error> {
         self.only(|identity| identity.role() == Role::MUnit && identity.name() == name)
@@ -239,16 +278,21 @@ impl<T: Send + 'static> CommunicationSystem<T> {
         options: &RequestOptions,
     ) -> Vec<(Peer<T>, Result<Parameters<BYTES>, Error>)> {
         let peers = self.asked_with_all(function);
-        let links = peers.iter().map(Peer::link).collect();
-        let calls = self.engine().call_each(links, function, parameters, options);
-        let each = peers.into_iter().zip(calls);
-        each.map(|(peer, call)| {
-            let mut results = parameters.clone();
-            let outcome = call.and_then(|mut call| wait(|cx| call.poll(cx, &mut results)));
-            (peer, outcome.map(|()| results))
-        })
-        .collect()
+        let mut results = vec![parameters.clone(); peers.len()];
+        let mut calls = CallsToAll::new(self.engine(), peers.iter().map(Peer::link), function, options);
+        wait(|cx| calls.poll(cx, &mut results));
+        outcomes(peers, calls, results)
     }
+}
+
+/// With each peer its results, or why there are none.
+pub(crate) fn outcomes<T: Send + 'static, P>(
+    peers: Vec<Peer<T>>,
+    calls: CallsToAll<T>,
+    results: Vec<P>,
+) -> Vec<(Peer<T>, Result<P, Error>)> {
+    let outcomes = peers.into_iter().zip(calls.into_outcomes()).zip(results);
+    outcomes.map(|((peer, outcome), results)| (peer, outcome.map(|()| results))).collect()
 }
 
 /// Unparks the thread that makes it.

@@ -349,7 +349,7 @@ impl<T: Send + 'static, R> Handle<T, R> {
     }
 
     /// Events that wait for a subscriber before it loses some: an m_unit has many nodes.
-    fn events_waiting(&self) -> usize {
+    pub(crate) fn events_waiting(&self) -> usize {
         match self.identity().role() {
             Role::MUnit => 4096,
             Role::SUnit => 256,

@@ -1,6 +1,10 @@
 //! What runs a service: functions and methods, in the paper's form (`Parameters` in, `Parameters` out) and in place.
 
 use std::fmt;
+#[cfg(feature = "async")]
+use std::future::Future;
+#[cfg(feature = "async")]
+use std::pin::Pin;
 use std::sync::Arc;
 
 use cara_core::config::Priority;
@@ -28,6 +32,9 @@ pub struct Call {
     pub wants_reply: bool,
     /// The call's hold of the service's lease, if there is one: what the call starts may go on while it is live.
     pub lease: Option<LeaseWatch>,
+    /// For a handler that is a future.
+    #[cfg(feature = "async")]
+    pub(crate) given_up: Option<Arc<crate::engine::GivenUp>>,
 }
 
 impl Call {
@@ -61,6 +68,12 @@ impl Call {
 
 type Free = dyn Fn(&Call, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync;
 type Method<T> = dyn Fn(&mut T, &Call, &mut ParametersView) -> Result<(), ServiceError> + Send + Sync;
+/// The rest of a handler that is a future: its results.
+#[cfg(feature = "async")]
+pub(crate) type Work = Pin<Box<dyn Future<Output = Result<Box<ParametersView>, ServiceError>> + Send>>;
+/// Begins a handler that is a future. The results may lie where its arguments lay.
+#[cfg(feature = "async")]
+pub(crate) type Begin = dyn Fn(Call, Box<ParametersView>) -> Work + Send + Sync;
 /// Makes safe what a service has started.
 pub(crate) type Safe = dyn Fn() + Send + Sync;
 /// Runs after something has ended.
@@ -72,6 +85,9 @@ pub(crate) enum Run<T> {
     Free(Arc<Free>),
     /// With it, one at a time, in the order in which they began.
     Method(Arc<Method<T>>),
+    /// As a task, which holds neither the state nor a thread while it waits.
+    #[cfg(feature = "async")]
+    Task(Arc<Begin>),
 }
 
 impl<T> Clone for Run<T> {
@@ -79,6 +95,8 @@ impl<T> Clone for Run<T> {
         match self {
             Self::Free(run) => Self::Free(run.clone()),
             Self::Method(run) => Self::Method(run.clone()),
+            #[cfg(feature = "async")]
+            Self::Task(begin) => Self::Task(begin.clone()),
         }
     }
 }
@@ -87,6 +105,11 @@ impl<T> Run<T> {
     /// It waits for the application's state.
     pub(crate) const fn takes_state(&self) -> bool {
         matches!(self, Self::Method(_))
+    }
+
+    /// It may have to wait before it begins: for the state, or for an executor.
+    pub(crate) const fn waits(&self) -> bool {
+        !matches!(self, Self::Free(_))
     }
 }
 
@@ -99,6 +122,9 @@ pub(crate) struct Handler<T> {
     pub(crate) moves: bool,
     /// Where its emergencies run, if it is a service for those.
     pub(crate) executor: Option<Arc<Executor>>,
+    /// One that is a future is told that its call is given up, and not dropped.
+    #[cfg(feature = "async")]
+    pub(crate) to_its_end: bool,
 }
 
 impl<T: 'static> Service for Handler<T> {
@@ -160,6 +186,8 @@ pub struct ServiceOptions<T> {
     pub(crate) actuator: Option<Actuator>,
     pub(crate) safe: Option<Arc<Safe>>,
     pub(crate) then: Option<Arc<Hook<T>>>,
+    #[cfg(feature = "async")]
+    pub(crate) to_its_end: bool,
 }
 
 impl<T> fmt::Debug for ServiceOptions<T> {
@@ -170,7 +198,14 @@ impl<T> fmt::Debug for ServiceOptions<T> {
 
 impl<T> Default for ServiceOptions<T> {
     fn default() -> Self {
-        Self { attributes: Attributes::default(), actuator: None, safe: None, then: None }
+        Self {
+            attributes: Attributes::default(),
+            actuator: None,
+            safe: None,
+            then: None,
+            #[cfg(feature = "async")]
+            to_its_end: false,
+        }
     }
 }
 
@@ -181,7 +216,7 @@ impl<T> ServiceOptions<T> {
     }
 
     /// The class of calls that name none. A service of the class [`Priority::Emergency`] has a thread of its own, and
-    /// takes a handler without the application's state: see [`Error::EmergencyWaits`](cara_core::error::Error).
+    /// takes a handler without the application's state that is no future: see [`Error::EmergencyWaits`](cara_core::error::Error).
     pub fn priority(mut self, priority: Priority) -> Self {
         self.attributes.priority = priority;
         self
@@ -279,6 +314,14 @@ impl<T> ServiceOptions<T> {
 /// | the paper's, method | `fn(&mut T, Parameters) -> Parameters` |
 /// | in place, free | `fn(&Call, &mut ParametersView) -> Result<(), ServiceError>` |
 /// | in place, method | `fn(&mut T, &Call, &mut ParametersView) -> Result<(), ServiceError>` |
+/// | the paper's, future | `async fn(Parameters) -> Parameters` |
+/// | future | `async fn(Call, Parameters) -> Result<Parameters, ServiceError>` |
+/// | future of any size | `async fn(Call, Box<ParametersView>) -> Result<Box<ParametersView>, ServiceError>` |
+///
+/// Futures need the feature `async`. One holds no thread of the unit while it waits, and not the state: it asks for that with
+/// `with_state_async`. When its call is given up (the caller's deadline has passed, its link has ended, or the order of
+/// the call has) it is dropped at its next `await`, or told: `ServiceOptions::runs_to_its_end`. What it started stops with
+/// the order in either case.
 pub trait IntoHandler<T, Form> {
     #[doc(hidden)]
     fn into_run(self) -> RunOf<T>;

@@ -83,7 +83,7 @@ impl Drop for Heart {
 /// What a call has started goes on as long as this is kept, if its caller is alive: [`Peer::hold`](crate::Peer::hold).
 #[must_use = "dropped, it is released at once"]
 pub struct Hold<T: Send + 'static = ()> {
-    call: CallFuture<T>,
+    pub(crate) call: CallFuture<T>,
 }
 
 impl<T: Send + 'static> Hold<T> {

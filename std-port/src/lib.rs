@@ -21,6 +21,8 @@
 
 pub mod access;
 mod actuator;
+#[cfg(feature = "async")]
+pub mod asynchronous;
 mod builder;
 mod clock;
 mod communication_system;
@@ -32,8 +34,6 @@ mod error;
 mod event;
 mod executor;
 mod file_name;
-#[cfg(feature = "async")]
-mod future;
 mod handle;
 mod handler;
 mod heart;
@@ -63,6 +63,8 @@ mod timers;
 mod unit;
 
 pub use actuator::Actuator;
+#[cfg(feature = "async")]
+pub use asynchronous::{CallGivenUp, EventStream, EventsLost, PendingReply};
 pub use builder::{BuildError, Builder};
 pub use cara_core::config::{Constraints, Mode, PLAIN_PORT, Priority, SECURED_PORT};
 pub use cara_core::distribution::connection_handler::NodeCounter;
@@ -86,8 +88,6 @@ pub use communication_system::{CommunicationSystem, WeakSystem};
 pub use config::Capacities;
 pub use error::StartError;
 pub use event::{Finding, UnitEvent};
-#[cfg(feature = "async")]
-pub use future::PendingReply;
 pub use handle::{Handle, MUnit, SUnit, WeakHandle};
 pub use handler::{Call, IntoHandler, ServiceOptions};
 pub use heart::{Heart, Hold};

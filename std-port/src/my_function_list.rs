@@ -72,8 +72,8 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
     /// ```
     ///
     /// [`Error::TooLarge`] when arguments and results are declared larger than any call can be served with,
-    /// [`Error::EmergencyWaits`] for a handler of an emergency service that takes the application's state,
-    /// [`Error::Network`] when the system refuses the threads of a safe hook or of an emergency service.
+    /// [`Error::EmergencyWaits`] for a handler of an emergency service that takes the application's state or is a future,
+    /// [`Error::Network`] when the system refuses the threads of a safe hook, of an emergency service, or of futures.
     pub fn add_service<Form>(
         &self,
         definition: &Definition,
@@ -115,8 +115,12 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
         let attributes = options.attributes;
         let run = handler.into_run().0;
         let is_emergency = attributes.priority == Priority::Emergency;
-        if is_emergency && run.takes_state() {
+        if is_emergency && run.waits() {
             return Err(Error::EmergencyWaits);
+        }
+        #[cfg(feature = "async")]
+        if matches!(run, crate::handler::Run::Task(_)) {
+            self.engine.make_runner()?;
         }
         let executor = if is_emergency { Some(Arc::new(Executor::start("cara-emergency")?)) } else { None };
         let actuator = match (options.actuator, options.safe) {
@@ -125,7 +129,14 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
             (actuator, _) => actuator,
         };
         let watch = actuator.as_ref().map_or_else(|| self.never(), Actuator::watch);
-        let handler = Handler { run, actuator, moves: attributes.lease.is_some(), executor };
+        let handler = Handler {
+            run,
+            actuator,
+            moves: attributes.lease.is_some(),
+            executor,
+            #[cfg(feature = "async")]
+            to_its_end: options.to_its_end,
+        };
         put(&mut self.engine.functions_mut(), definition, attributes, handler)?;
         Ok(watch)
     }

@@ -224,7 +224,7 @@ impl<T: Send + 'static> Peer<T> {
         self.link().is_ok_and(|link| link.lock().session.their_function_list().named(function).is_some())
     }
 
-    /// Waits until the node has published `function`; `false` after `timeout`.
+    /// Waits until the node has published `function`; `false` after `timeout`, or when this unit is stopped.
     ///
     /// ```no_run
     /// # let depot = cara_std::CommunicationSystem::new("depot", 1)?;
@@ -238,7 +238,7 @@ impl<T: Send + 'static> Peer<T> {
         let mut seen = self.engine.news.count();
         while !self.offers(function) {
             let left = deadline.since(self.engine.now());
-            if left == Duration::ZERO {
+            if left == Duration::ZERO || self.engine.is_stopping() {
                 return false;
             }
             seen = self.engine.news.wait(seen, left);
@@ -377,18 +377,6 @@ impl<T: Send + 'static> Peer<T> {
         self.engine.request(&self.link()?, function, parameters, options)
     }
 
-    /// Calls a function; the future ends with its results, or with why there are none.
-    #[cfg(feature = "async")]
-    pub fn request_async<'p>(
-        &self,
-        function: &str,
-        parameters: &'p mut ParametersView,
-        options: &RequestOptions,
-    ) -> Result<crate::future::PendingReply<'p, T>, Error> {
-        let call = self.engine.call_future(self.link()?, function, parameters, options)?;
-        Ok(crate::future::PendingReply::new(call, parameters))
-    }
-
     /// The end of a call, to be polled for.
     #[cfg(feature = "control")]
     pub(crate) fn call_future(
@@ -397,7 +385,7 @@ impl<T: Send + 'static> Peer<T> {
         parameters: &ParametersView,
         options: &RequestOptions,
     ) -> Result<CallFuture<T>, Error> {
-        self.engine.call_future(self.link()?, function, parameters, options)
+        self.engine.call_future(&self.link()?, function, parameters, options, None)
     }
 
     /// Gives up the leases that calls of `function` have begun or will begin: what they started stops, and what has not

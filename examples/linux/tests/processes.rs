@@ -18,7 +18,7 @@ struct Fleet {
 impl Fleet {
     fn new() -> Self {
         let number = random_fleet();
-        let nodes = ["AGV_manager/1@m_unit", "zone-1/1@m_unit", "zone-2/2@m_unit", "agv-1/11", "seven/7"];
+        let nodes = ["AGV_manager/1@m_unit", "zone-1/1@m_unit", "zone-2/2@m_unit", "agv-1/11", "agv-2/12", "seven/7"];
         Self { number: number.to_string(), keys: KeyFolder::draw(number, &nodes).unwrap() }
     }
 
@@ -233,6 +233,30 @@ fn the_typed_listing_runs_and_is_short() {
     let listing =
         source.split("// The listing begins.\n").nth(1).and_then(|rest| rest.split("    // The listing ends.").next());
     assert!((10..=15).contains(&listing.unwrap().lines().count()), "{listing:?}");
+}
+
+#[test]
+fn a_manager_on_tokio_drives_its_vehicles_side_by_side() {
+    let fleet = Fleet::new();
+    let mut manager = fleet.start("manager", env!("CARGO_BIN_EXE_async_manager"), &[]);
+    let program = env!("CARGO_BIN_EXE_agv");
+    let mut agvs = [("agv-1", "11"), ("agv-2", "12")]
+        .map(|(name, id)| fleet.start(name, program, &["--attended", "--name", name, "--id", id]));
+    ends_well(&mut manager);
+    for node in ["agv-1/11", "agv-2/12"] {
+        for line in [format!("joined {node}"), format!("{node} drives"), format!("left {node}")] {
+            assert!(manager.has(&line), "{line}: {:?}", manager.lines());
+        }
+        assert!(manager.has(&format!("{node} stands, its order is over")), "{node}: {:?}", manager.lines());
+    }
+    let at = |line: &str| manager.lines().iter().position(|shown| shown.text.contains(line)).unwrap();
+    assert!(["agv-1/11", "agv-2/12"].iter().all(|node| at(&format!("{node} drives")) < at("stands")), "side by side");
+    for agv in &mut agvs {
+        agv.seen("driving to [50.000, 0.000]", STEP).unwrap();
+        agv.seen("the order has ended", STEP).unwrap();
+        agv.end_input();
+        ends_well(agv);
+    }
 }
 
 #[test]

@@ -1,7 +1,6 @@
 //! Requests of this unit: blocking ones, whose caller reads its own reply, and those that do not wait.
 
 use std::sync::Arc;
-use std::task::{Context as TaskContext, Poll};
 use std::thread;
 
 use cara_core::distribution::block;
@@ -14,9 +13,9 @@ use cara_core::services::session::RequestOptions;
 use cara_core::time::{Duration, Instant};
 
 use super::Engine;
+use super::awaiting::CallFuture;
 use super::inbound::OwnCall;
 use super::link::{LinkCell, LinkState, Outcome, Waiter, Wake};
-use super::noting::Noted;
 use super::reader::{Cause, Token};
 use super::settling::RETRY;
 use super::worker::READ_BYTES;
@@ -24,10 +23,7 @@ use crate::locks::Locked;
 use crate::sys::stream::{Received, Wait};
 
 /// How long a caller waits at a time for room or for its turn, before it looks again.
-const PAUSE: Duration = Duration::from_millis(20);
-
-/// The same for calls of many links, of which one or the other soon has room.
-const SHORT_PAUSE: Duration = Duration::from_millis(2);
+pub(super) const PAUSE: Duration = Duration::from_millis(20);
 
 thread_local! {
     /// What a caller reads into. A caller that reads runs no handlers, so one is in use at a time in a thread.
@@ -93,7 +89,7 @@ impl<T: Send + 'static> Engine<T> {
         options: &RequestOptions,
     ) -> Result<CallFuture<T>, Error> {
         let id = self.block_request(&link, function, parameters, options)?;
-        Ok(CallFuture { engine: self.clone(), link, id, has_succeeded: false, noted: None })
+        Ok(CallFuture::held(self.clone(), link, id))
     }
 
     /// Sends the request as soon as the interval and the room allow, within the deadline.
@@ -266,37 +262,6 @@ impl<T: Send + 'static> Engine<T> {
         self.settle_at(now, link, state);
     }
 
-    /// A request as a future: the pool reads its reply.
-    pub(crate) fn call_future(
-        self: &Arc<Self>,
-        link: Arc<LinkCell>,
-        function: &str,
-        parameters: &ParametersView,
-        options: &RequestOptions,
-    ) -> Result<CallFuture<T>, Error> {
-        let noted = self.noted(&link, function, options);
-        note_attempt(self.try_call_future(link, function, parameters, options), noted)
-    }
-
-    fn try_call_future(
-        self: &Arc<Self>,
-        link: Arc<LinkCell>,
-        function: &str,
-        parameters: &ParametersView,
-        options: &RequestOptions,
-    ) -> Result<CallFuture<T>, Error> {
-        let mut state = link.lock();
-        let now = self.now();
-        // A link that is kept is read by no thread until its caller is back.
-        self.read_by(now, &link, &mut state, Cause::NeedsPool);
-        let sent = self.request_on(now, &link, &mut state, function, parameters, options, true);
-        if let Ok(id) = sent {
-            state.waiters.push(Waiter { id, wake: Wake::Task(None), outcome: None });
-        }
-        self.settle(&link, state);
-        sent.map(|id| CallFuture { engine: self.clone(), link, id, has_succeeded: false, noted: None })
-    }
-
     /// Nothing waits for a call any more, and what it started is not wanted.
     pub(crate) fn give_up_call(&self, link: &Arc<LinkCell>, id: CallId) {
         let mut state = link.lock();
@@ -313,13 +278,13 @@ impl<T: Send + 'static> Engine<T> {
         }
     }
 
-    fn cancel(&self, now: Instant, link: &LinkCell, state: &mut LinkState, id: CallId) {
+    pub(super) fn cancel(&self, now: Instant, link: &LinkCell, state: &mut LinkState, id: CallId) {
         self.with_at(now, link, state, |session, cx| session.cancel(cx, id));
         state.forget(id);
     }
 
     /// Decodes what another thread read. What a call started whose results do not fit is not wanted.
-    fn read_outcome(
+    pub(super) fn read_outcome(
         &self,
         link: &Arc<LinkCell>,
         id: CallId,
@@ -332,60 +297,6 @@ impl<T: Send + 'static> Engine<T> {
             self.give_up_call(link, id);
         }
         result
-    }
-}
-
-impl<T: Send + 'static> Engine<T> {
-    /// Begins a call on each of many links. One that has no room, or whose interval has not passed, is tried again
-    /// within the deadline, while the others run.
-    pub(crate) fn call_each(
-        self: &Arc<Self>,
-        links: Vec<Result<Arc<LinkCell>, Error>>,
-        function: &str,
-        parameters: &ParametersView,
-        options: &RequestOptions,
-    ) -> Vec<Result<CallFuture<T>, Error>> {
-        let began = self.now();
-        let mut calls: Vec<_> = links.iter().map(|_| None).collect();
-        let mut noted: Vec<_> = links.iter().map(|link| self.noted(link.as_ref().ok()?, function, options)).collect();
-        loop {
-            let mut pause = Duration::MAX;
-            let open = links.iter().zip(&mut calls).zip(&mut noted).filter(|((_, call), _)| call.is_none());
-            for ((link, call), noted) in open {
-                let Ok(link) = link.as_ref().map_err(|error| *call = Some(Err(*error))) else { continue };
-                let usual = || link.lock().session.constraints().request_timeout;
-                let deadline = began + options.timeout.unwrap_or_else(usual);
-                let options = RequestOptions { timeout: Some(deadline.since(self.now())), ..*options };
-                let attempt = self.try_call_future(link.clone(), function, parameters, &options);
-                match attempt.as_ref().err().and_then(|error| worth_waiting(error, SHORT_PAUSE)) {
-                    Some(wait) if self.now() + wait < deadline => pause = pause.min(wait),
-                    _ => *call = Some(note_attempt(attempt, noted.take())),
-                }
-            }
-            if pause == Duration::MAX {
-                return calls.into_iter().flatten().collect();
-            }
-            thread::sleep(pause.into());
-        }
-    }
-}
-
-/// A call that was sent notes its end itself.
-fn note_attempt<T: Send + 'static>(
-    attempt: Result<CallFuture<T>, Error>,
-    noted: Option<Noted>,
-) -> Result<CallFuture<T>, Error> {
-    match attempt {
-        Ok(mut call) => {
-            call.noted = noted;
-            Ok(call)
-        }
-        Err(error) => {
-            if let Some(noted) = noted {
-                noted.ended(Err(error));
-            }
-            Err(error)
-        }
     }
 }
 
@@ -402,71 +313,4 @@ pub(crate) fn worth_waiting(error: &Error, pause: Duration) -> Option<Duration> 
 fn is_over(state: &LinkState, id: CallId) -> bool {
     let ended = state.session.deadline() == Instant::START || state.session.is_ended();
     ended || state.waiters.iter().any(|waiter| waiter.id == id && waiter.outcome.is_some())
-}
-
-/// A call in flight. Dropped before it has ended well, it is given up: nothing waits for its reply, and the lease that it
-/// began, or would begin, is released. A service without a lease may still run.
-pub(crate) struct CallFuture<T: Send + 'static> {
-    engine: Arc<Engine<T>>,
-    link: Arc<LinkCell>,
-    id: CallId,
-    has_succeeded: bool,
-    noted: Option<Noted>,
-}
-
-impl<T: Send + 'static> CallFuture<T> {
-    /// The call's id.
-    #[cfg(feature = "control")]
-    pub(crate) fn id(&self) -> CallId {
-        self.id
-    }
-
-    /// Whether the lease that it has begun is renewed.
-    pub(crate) fn is_held(&self) -> bool {
-        self.link.lock().session.holds(self.id)
-    }
-
-    /// What a call has started that ended well is not wanted any more.
-    #[cfg(feature = "control")]
-    pub(crate) fn release(&mut self) {
-        self.has_succeeded = false;
-    }
-
-    /// Polls for the reply, which updates `parameters`.
-    pub(crate) fn poll(
-        &mut self,
-        cx: &mut TaskContext<'_>,
-        parameters: &mut ParametersView,
-    ) -> Poll<Result<(), Error>> {
-        let mut state = self.link.lock();
-        if let Some(outcome) = state.take_outcome(self.id) {
-            drop(state);
-            let result = self.engine.read_outcome(&self.link, self.id, outcome, parameters);
-            self.has_succeeded = result.is_ok();
-            if let Some(noted) = self.noted.take() {
-                noted.ended(result);
-            }
-            return Poll::Ready(result);
-        }
-        match state.waiters.iter_mut().find(|waiter| waiter.id == self.id) {
-            Some(waiter) => {
-                waiter.wake = Wake::Task(Some(cx.waker().clone()));
-                Poll::Pending
-            }
-            None => {
-                if let Some(noted) = self.noted.take() {
-                    noted.ended(Err(Error::Interrupted));
-                }
-                Poll::Ready(Err(Error::Interrupted))
-            }
-        }
-    }
-}
-
-impl<T: Send + 'static> Drop for CallFuture<T> {
-    fn drop(&mut self) {
-        if !self.has_succeeded {
-            self.engine.give_up_call(&self.link, self.id);
-        }
-    }
 }

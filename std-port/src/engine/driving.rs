@@ -179,7 +179,7 @@ impl<T: Send + 'static> Driven for Engine<T> {
     fn keep_time(&self) -> Instant {
         let others = self.poll_node().min(self.go_on_listening());
         let look = self.watch_links(others);
-        self.poll_links().min(others).min(look)
+        self.poll_links().min(others).min(look).min(self.sound_alarms())
     }
 
     fn look_around(&self) -> Instant {

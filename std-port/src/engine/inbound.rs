@@ -102,7 +102,7 @@ impl<T: Send + 'static> Engine<T> {
         self.make_list_room(state);
         self.make_call_room(state);
         let functions = self.functions();
-        let LinkState { session, waiters, notices, .. } = state;
+        let LinkState { session, waiters, notices, woken, .. } = state;
         let receipt = self.with_functions(now, &functions, link, session, |session, cx| {
             session.receive(cx, bytes, arguments.as_deref_mut())
         });
@@ -128,8 +128,10 @@ impl<T: Send + 'static> Engine<T> {
                 if let Some(own) = own.filter(|own| own.id == id) {
                     own.result = Some(outcome.and_then(|block| block.read_into(own.parameters)));
                 } else if let Some(waiter) = waiters.iter_mut().find(|waiter| waiter.id == id) {
-                    waiter.finish(outcome.map(|block| (block.signature().as_bytes().into(), block.bytes().into())));
+                    let outcome = outcome.map(|block| (block.signature().as_bytes().into(), block.bytes().into()));
+                    waiter.finish(outcome, woken);
                 }
+                state.wake_tasks();
             }
             Some(event) => {
                 if matches!(event, Event::ListChanged) && !link.is_introduced() {

@@ -10,6 +10,8 @@ use cara_core::distribution::function_list::Slot;
 use cara_core::error::{CloseReason, Error};
 use cara_core::host::mailman::{LinkId, Mailman};
 use cara_core::services::Port;
+#[cfg(feature = "async")]
+use cara_core::services::Ticket;
 use cara_core::services::lease::ActuatorState;
 use cara_core::services::requests::CallId;
 use cara_core::services::session::Session;
@@ -68,8 +70,15 @@ pub(crate) struct LinkState {
     pub(crate) backlog: Backlog,
     /// The timer that is set for the session.
     pub(crate) timer: Instant,
-    /// A thread waits for the answer to a ping.
+    /// A thread or a task waits for the answer to a ping.
     pub(crate) pinging: bool,
+    /// Tasks that wait for a change of the link, as threads wait at [`LinkCell::room`].
+    tasks: Vec<Waker>,
+    /// Of the peer's calls that tasks run, to be woken when the link ends.
+    #[cfg(feature = "async")]
+    serving: Vec<(Ticket, Waker)>,
+    /// Wakers that are due. A waker may run code of an executor, so it waits until the link's lock has been given up.
+    pub(crate) woken: Vec<Waker>,
     /// What it has counted is among the sums of links that have ended.
     pub(crate) retired: bool,
     pub(crate) notices: Notices,
@@ -94,9 +103,9 @@ pub(crate) struct Waiter {
 }
 
 impl Waiter {
-    pub(crate) fn finish(&mut self, outcome: Outcome) {
+    pub(crate) fn finish(&mut self, outcome: Outcome, woken: &mut Vec<Waker>) {
         self.outcome = Some(outcome);
-        self.wake.wake();
+        self.wake.wake(woken);
     }
 }
 
@@ -126,6 +135,10 @@ impl LinkCell {
             backlog: Backlog { bytes: Vec::new(), position: 0, moved_at: Instant::START },
             timer: Instant::FAR_FUTURE,
             pinging: false,
+            tasks: Vec::new(),
+            #[cfg(feature = "async")]
+            serving: Vec::new(),
+            woken: Vec::new(),
             retired: false,
             notices: Notices::default(),
             actuators: BTreeMap::new(),
@@ -169,6 +182,16 @@ impl LinkCell {
         crate::locks::lock(&self.state)
     }
 
+    /// What threads and tasks wait for may have come. The link is not locked by this thread.
+    pub(crate) fn notify(&self) {
+        let mut state = self.lock();
+        state.wake_tasks();
+        let woken = std::mem::take(&mut state.woken);
+        drop(state);
+        self.room.notify_all();
+        woken.into_iter().for_each(Waker::wake);
+    }
+
     /// The state, unless a thread has it now.
     #[track_caller]
     pub(crate) fn try_lock(&self) -> Option<Locked<'_, LinkState>> {
@@ -205,13 +228,15 @@ impl LinkState {
     /// Notes how a call ended and wakes what waits for it.
     pub(crate) fn finish(&mut self, id: CallId, outcome: Outcome) {
         if let Some(waiter) = self.waiters.iter_mut().find(|waiter| waiter.id == id) {
-            waiter.finish(outcome);
+            waiter.finish(outcome, &mut self.woken);
         }
+        self.wake_tasks();
     }
 
     /// Wakes the thread or the task that waits for a call.
     pub(crate) fn wake(&mut self, id: CallId) {
-        self.waiters.iter_mut().filter(|waiter| waiter.id == id).for_each(|waiter| waiter.wake.wake());
+        let woken = &mut self.woken;
+        self.waiters.iter_mut().filter(|waiter| waiter.id == id).for_each(|waiter| waiter.wake.wake(woken));
     }
 
     /// Takes out how a call ended, if it has.
@@ -221,9 +246,54 @@ impl LinkState {
         self.waiters.swap_remove(index).outcome
     }
 
-    /// Nothing waits for a call any more.
+    /// Nothing waits for a call any more, and there may be room for another.
     pub(crate) fn forget(&mut self, id: CallId) {
-        self.waiters.retain(|waiter| waiter.id != id);
+        let Some(index) = self.waiters.iter().position(|waiter| waiter.id == id) else { return };
+        if let Wake::Task(Some(waker)) = self.waiters.swap_remove(index).wake {
+            // Dropped under the lock, the last one of a task would run the end of that task's calls.
+            self.woken.push(waker);
+        }
+        self.wake_tasks();
+    }
+
+    /// The task of `waker` looks again when the link has changed: room, a reply, an answer, its end.
+    pub(crate) fn await_change(&mut self, waker: &Waker) {
+        if !self.tasks.iter().any(|task| task.will_wake(waker)) {
+            self.tasks.push(waker.clone());
+        }
+    }
+
+    /// The task of `waker` runs a call of the peer, and looks again when the link has ended.
+    #[cfg(feature = "async")]
+    pub(crate) fn await_end(&mut self, call: Ticket, waker: &Waker) {
+        match self.serving.iter_mut().find(|(known, _)| *known == call) {
+            Some((_, known)) if known.will_wake(waker) => {}
+            Some((_, known)) => self.woken.push(std::mem::replace(known, waker.clone())),
+            None => self.serving.push((call, waker.clone())),
+        }
+    }
+
+    /// That call has been answered.
+    #[cfg(feature = "async")]
+    pub(crate) fn await_no_end(&mut self, call: Ticket) {
+        if let Some(index) = self.serving.iter().position(|(known, _)| *known == call) {
+            self.woken.push(self.serving.swap_remove(index).1);
+        }
+    }
+
+    /// The link has ended: whatever waits for that, or for anything else of it, looks again.
+    pub(crate) fn wake_all(&mut self) {
+        self.wake_tasks();
+        #[cfg(feature = "async")]
+        self.woken.extend(self.serving.drain(..).map(|(_, waker)| waker));
+    }
+
+    /// The link has changed: tasks that wait for it look again, when the lock has been given up.
+    #[inline]
+    pub(crate) fn wake_tasks(&mut self) {
+        if !self.tasks.is_empty() {
+            self.woken.append(&mut self.tasks);
+        }
     }
 }
 
@@ -254,14 +324,11 @@ impl Backlog {
 }
 
 impl Wake {
-    pub(crate) fn wake(&mut self) {
+    /// Unparks the thread; the task's waker is left to the thread that gives the link's lock up.
+    fn wake(&mut self, woken: &mut Vec<Waker>) {
         match self {
             Self::Thread(thread) => thread.unpark(),
-            Self::Task(waker) => {
-                if let Some(waker) = waker.take() {
-                    waker.wake();
-                }
-            }
+            Self::Task(waker) => woken.extend(waker.take()),
         }
     }
 }

@@ -227,7 +227,7 @@ impl<T: Send + 'static> Engine<T> {
         }
         self.tell_of(link, event);
         if let Event::Answered | Event::Acknowledged { .. } = event {
-            link.room.notify_all();
+            link.notify();
         }
     }
 
@@ -235,9 +235,10 @@ impl<T: Send + 'static> Engine<T> {
     fn actuator_told(&self, link: &LinkCell, slot: Slot, state: ActuatorState) {
         let mut held = link.lock();
         let before = held.actuators.insert(slot, state).unwrap_or_default();
-        let Some(peer) = link.peer.get().filter(|_| before.latch != state.latch) else { return };
         let name = held.session.their_function_list().function(slot).map(|function| function.name().to_owned());
         drop(held);
+        link.notify();
+        let Some(peer) = link.peer.get().filter(|_| before.latch != state.latch) else { return };
         if let Some(function) = name {
             self.tell(UnitEvent::Inhibited { peer: peer.identity.clone(), function, latch: state.latch });
         }

@@ -10,7 +10,7 @@
 //! | `keys`, `access`, `events`, `sockets`, `services`, `driving` | the other parts |
 //! | `Engine` | all of them |
 //! | `reading`, `inbound`, `settling` | what every thread does with a link that it has locked |
-//! | `calling`, `pinging`, `workers`, `staying`, `serving`, `afterwards` | requests of this unit, and those of its peers |
+//! | `calling`, `awaiting`, `alarms`, `looking`, `pinging`, `workers`, `staying`, `serving`, `tasks`, `afterwards` | requests of this unit, and those of its peers |
 //! | `membership`, `tables`, `clock_thread`, `presence`, `interfaces`, `accounts` | the node and its links, the clock, counters |
 //!
 //! Locks are taken in the order of [`Rank`](crate::locks::Rank), which a debug build asserts: the accounts, the table of
@@ -21,6 +21,8 @@
 mod access;
 mod accounts;
 mod afterwards;
+mod alarms;
+mod awaiting;
 mod calling;
 mod clock_thread;
 mod driving;
@@ -30,6 +32,8 @@ mod interfaces;
 mod keys;
 pub(crate) mod link;
 mod links;
+#[cfg(feature = "async")]
+mod looking;
 mod membership;
 pub(crate) mod notices;
 mod noting;
@@ -46,6 +50,8 @@ mod sockets;
 mod state_gate;
 mod staying;
 mod tables;
+#[cfg(feature = "async")]
+mod tasks;
 mod terms;
 #[cfg(test)]
 mod tests;
@@ -56,11 +62,20 @@ mod workers;
 pub(crate) use accounts::pairs;
 #[cfg(feature = "metrics")]
 pub(crate) use accounts::{Group, Reading};
-#[cfg(any(feature = "async", feature = "control"))]
-pub(crate) use calling::{CallFuture, worth_waiting};
+#[cfg(feature = "async")]
+pub(crate) use alarms::Alarm;
+pub(crate) use awaiting::{CallFuture, CallsToAll};
+#[cfg(feature = "async")]
+pub(crate) use awaiting::{PendingCall, Step};
+#[cfg(feature = "control")]
+pub(crate) use calling::worth_waiting;
+#[cfg(feature = "async")]
+pub(crate) use events::Told;
 pub(crate) use keys::Keys;
 pub(crate) use membership::HubCell;
 pub(crate) use tables::node_storage;
+#[cfg(feature = "async")]
+pub(crate) use tasks::{GivenUp, Spawned};
 pub(crate) use worker::arena_bytes;
 
 use std::path::PathBuf;
@@ -123,6 +138,7 @@ pub(crate) struct Engine<T: 'static> {
     #[cfg(feature = "control")]
     audit: Option<Arc<Audit>>,
     events: Events,
+    alarms: alarms::Alarms,
     /// For threads that look for themselves at what has happened.
     pub(crate) news: News,
 }
@@ -168,6 +184,7 @@ impl<T: Send + 'static> Engine<T> {
             #[cfg(feature = "control")]
             audit: parts.audit,
             events: Events::default(),
+            alarms: alarms::Alarms::default(),
             news: News::default(),
         })
     }
@@ -282,6 +299,15 @@ impl<T: Send + 'static> Engine<T> {
         self.events.subscribe(sender)
     }
 
+    /// Puts into `queue` what happens from here on, until the unit is stopped.
+    #[cfg(feature = "async")]
+    pub(crate) fn subscribe_queue(&self, queue: &Arc<crate::asynchronous::EventQueue>) {
+        self.events.subscribe_queue(queue);
+        if self.is_stopping() {
+            self.events.end_queues();
+        }
+    }
+
     /// Changes the constraints of the unit and tells every peer. [`Error::BadConstraint`] for more nodes than the process may
     /// have files open for.
     pub(crate) fn set_constraints(&self, constraints: Constraints) -> Result<(), Error> {
@@ -340,6 +366,8 @@ impl<T: Send + 'static> Engine<T> {
         if self.driver.stop() {
             return;
         }
+        // Those that wait for a node wait in vain.
+        self.news.add();
         for link in self.each_link() {
             let mut state = link.lock();
             self.with(&link, &mut state, |session, cx| session.close(cx, CloseReason::StoppedHere));
@@ -353,7 +381,13 @@ impl<T: Send + 'static> Engine<T> {
         handlers.iter().filter_map(|handler| handler.actuator.as_ref()).for_each(|actuator| actuator.safe.end());
         self.services.afterwards.end();
         handlers.iter().filter_map(|handler| handler.executor.as_ref()).for_each(|executor| executor.end());
+        #[cfg(feature = "async")]
+        self.services.runner.end();
         self.release_threads();
+        // No clock sounds them any more, and the task of one may hold the unit.
+        self.alarms.clear();
+        #[cfg(feature = "async")]
+        self.events.end_queues();
     }
 
     /// Runs `act` with the application's state, when its turn comes.
@@ -361,6 +395,26 @@ impl<T: Send + 'static> Engine<T> {
         let result = self.services.state.enter().map(|mut state| act(&mut state));
         self.go_on_with_parked();
         result
+    }
+
+    /// The same for a task, which no thread waits for.
+    #[cfg(feature = "async")]
+    pub(crate) async fn with_state_awaited<R>(&self, act: impl FnOnce(&mut T) -> R) -> Result<R, Error> {
+        struct Place<'e, T: Send + 'static>(&'e Engine<T>, state_gate::Turn);
+        impl<T: Send + 'static> Drop for Place<'_, T> {
+            fn drop(&mut self) {
+                self.0.services.state.give_up(self.1);
+                self.0.go_on_with_parked();
+            }
+        }
+        let place = Place(self, self.services.state.take_turn(None));
+        let mut act = Some(act);
+        std::future::poll_fn(|cx| {
+            let entered = self.services.state.poll_enter(place.1, cx);
+            entered.map_ok(|mut state| act.take().map(|act| act(&mut state)))
+        })
+        .await?
+        .ok_or(Error::NotRunning)
     }
 
     fn take_handlers(&self) -> Vec<Handler<T>> {

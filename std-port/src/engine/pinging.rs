@@ -21,7 +21,7 @@ impl<T: Send + 'static> Engine<T> {
         state.pinging = true;
         let took = self.round_trip(link, state, deadline);
         link.lock().pinging = false;
-        link.room.notify_all();
+        link.notify();
         took
     }
 

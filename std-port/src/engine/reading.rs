@@ -109,7 +109,7 @@ impl<T: Send + 'static> Engine<T> {
             return;
         }
         let Some(unit_number) = self.unit_number() else { return };
-        let due = || self.links.next_due().min(self.links.watch.others());
+        let due = || self.links.next_due().min(self.links.watch.others()).min(self.alarms.next());
         if let Some(at) = self.thread_pool().put_off(unit_number, look, || due().min(at)) {
             self.links.watch.put_off(look, at);
         }

@@ -18,6 +18,8 @@ pub(super) struct Services<T: 'static> {
     functions: RwLock<Functions<T>>,
     pub(super) state: StateGate<T, Parked>,
     pub(super) afterwards: Afterwards<T>,
+    #[cfg(feature = "async")]
+    pub(super) runner: super::tasks::Runner,
     /// Longest block of parameters that this unit takes.
     longest_message: AtomicUsize,
     /// Bytes that the arguments and results of the largest function need.
@@ -30,6 +32,8 @@ impl<T> Services<T> {
             functions: RwLock::new(functions),
             state: StateGate::new(state),
             afterwards: Afterwards::default(),
+            #[cfg(feature = "async")]
+            runner: super::tasks::Runner::default(),
             longest_message: AtomicUsize::new(longest_message),
             largest_function: AtomicUsize::new(0),
         }

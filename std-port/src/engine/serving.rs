@@ -41,6 +41,9 @@ pub(crate) struct Parked {
 enum Ran {
     Over(Result<(), Error>),
     NotYet(Turn),
+    /// It is to be begun as a task.
+    #[cfg(feature = "async")]
+    Apart(Box<handler::Call>, Arc<handler::Begin>, bool),
 }
 
 impl<T: Send + 'static> Engine<T> {
@@ -78,6 +81,14 @@ impl<T: Send + 'static> Engine<T> {
                 let spare = arena(worker.longest());
                 let arguments = std::mem::replace(&mut worker.arguments, spare);
                 self.park(turn, Parked { link: link.clone(), call: begun.call, arguments });
+                return None;
+            }
+            #[cfg(feature = "async")]
+            Ran::Apart(told, begin, to_its_end) => {
+                link.lock().reading.ran(self.now().since(began));
+                let spare = arena(worker.longest());
+                let arguments = std::mem::replace(&mut worker.arguments, spare);
+                self.begin_task(link, begun.call, *told, (&*begin, to_its_end), arguments);
                 return None;
             }
         };
@@ -149,6 +160,10 @@ impl<T: Send + 'static> Engine<T> {
                 engine.settle(&link, state);
             }
             Ran::NotYet(turn) => engine.park(turn, Parked { link, call: begun.call, arguments }),
+            #[cfg(feature = "async")]
+            Ran::Apart(told, begin, to_its_end) => {
+                engine.begin_task(&link, begun.call, *told, (&*begin, to_its_end), arguments);
+            }
         });
     }
 
@@ -232,6 +247,14 @@ impl<T: Send + 'static> Engine<T> {
                 self.go_on_with_parked();
                 Ran::Over(result)
             }
+            #[cfg(feature = "async")]
+            Run::Task(begin) => {
+                self.give_up(turn);
+                let told = handler::Call { given_up: Some(Arc::default()), ..told };
+                let to_its_end =
+                    self.functions().function(call.slot).is_some_and(|function| function.handler.to_its_end);
+                Ran::Apart(Box::new(told), begin, to_its_end)
+            }
         }
     }
 
@@ -259,6 +282,8 @@ impl<T: Send + 'static> Engine<T> {
             deadline: call.deadline,
             wants_reply: call.wants_reply,
             lease: moved.map(|(actuator, order)| LeaseWatch::of(order, actuator)),
+            #[cfg(feature = "async")]
+            given_up: None,
         };
         Ok((run, told))
     }

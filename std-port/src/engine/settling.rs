@@ -2,6 +2,7 @@
 //! epoll are set, and what happened is acted upon.
 
 use std::sync::Arc;
+use std::task::Waker;
 
 use cara_core::services::session::Event;
 use cara_core::time::{Duration, Instant};
@@ -30,9 +31,13 @@ impl<T: Send + 'static> Engine<T> {
         }
         self.set_timer(now, deadline, link, state);
         self.set_interest(link, state);
+        let woken = std::mem::take(&mut state.woken);
         if state.notices.begin() {
             self.act(link, guard);
+        } else {
+            drop(guard);
         }
+        woken.into_iter().for_each(Waker::wake);
     }
 
     pub(super) fn poll_session(&self, link: &Arc<LinkCell>, state: &mut LinkState) {
@@ -47,6 +52,7 @@ impl<T: Send + 'static> Engine<T> {
                     if let Event::Closed(_) = event {
                         link.stream.shutdown();
                         link.room.notify_all();
+                        state.wake_all();
                     }
                     self.note(state, event);
                 }

@@ -12,6 +12,9 @@ use std::cell::Cell;
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::task::Waker;
+#[cfg(feature = "async")]
+use std::task::{Context, Poll};
 use std::thread::ThreadId;
 use std::time::{Duration, Instant};
 
@@ -46,13 +49,17 @@ pub(crate) struct StateGate<T, W> {
 
 struct Gate<W> {
     holder: Option<Holder>,
-    /// The holder waits for a reply of this peer.
-    waits_for: Option<LinkId>,
+    /// The holder waits for a reply of each of these peers.
+    waits_for: Vec<LinkId>,
+    /// So many have held it until now: tells the waits of one holder from those of a later one.
+    held: u64,
     /// Those that wait, in their order.
     queue: VecDeque<Waiting<W>>,
     /// What was parked and is to go on.
     ready: VecDeque<(W, Result<Turn, Error>)>,
     turns: u64,
+    /// Of the tasks that wait for their turn.
+    tasks: Vec<Waker>,
     /// Peers' calls are no longer let in.
     stopped: bool,
 }
@@ -63,6 +70,14 @@ enum Holder {
     /// It has yet to come.
     Expected(Turn),
     Here(ThreadId),
+}
+
+/// That the holder waits for a peer.
+#[derive(Debug)]
+pub(crate) struct Mark {
+    peer: LinkId,
+    /// Which holder.
+    held: u64,
 }
 
 struct Waiting<W> {
@@ -87,7 +102,16 @@ pub(crate) struct Held<'g, T, W> {
 impl<T, W> StateGate<T, W> {
     pub(crate) fn new(state: T) -> Self {
         let (queue, ready) = (VecDeque::new(), VecDeque::new());
-        let gate = Gate { holder: None, waits_for: None, queue, ready, turns: 0, stopped: false };
+        let gate = Gate {
+            holder: None,
+            waits_for: Vec::new(),
+            held: 0,
+            queue,
+            ready,
+            turns: 0,
+            tasks: Vec::new(),
+            stopped: false,
+        };
         Self { gate: Mutex::new(gate), changed: Condvar::new(), state: Mutex::new(state), ready: AtomicUsize::new(0) }
     }
 
@@ -127,13 +151,10 @@ impl<T, W> StateGate<T, W> {
             if gate.holder == Some(Holder::Expected(turn)) {
                 if gate.stopped && turn.caller.is_some() {
                     gate.pass_on();
-                    self.count_ready(&gate);
+                    self.notify(gate);
                     return Entered::Refused(Error::NotRunning);
                 }
-                gate.holder = Some(Holder::Here(this));
-                drop(gate);
-                HOLDING.with(|holding| holding.set(holding.get() + 1));
-                return Entered::Held(Held { gate: self, state: lock(&self.state) });
+                return Entered::Held(self.hold(gate, this));
             }
             let refusal = match gate.holder == Some(Holder::Here(this)) {
                 true => Some(Error::WouldDeadlock),
@@ -154,6 +175,41 @@ impl<T, W> StateGate<T, W> {
             }
             gate = self.changed.wait_timeout(gate, left).unwrap_or_else(PoisonError::into_inner).0;
         }
+    }
+
+    /// The state for a task that has this turn, of the application itself, once it is its turn. [`Error::WouldDeadlock`] when
+    /// this thread has it.
+    #[cfg(feature = "async")]
+    pub(crate) fn poll_enter(&self, turn: Turn, cx: &Context<'_>) -> Poll<Result<Held<'_, T, W>, Error>> {
+        let this = std::thread::current().id();
+        let mut gate = lock(&self.gate);
+        match gate.holder {
+            Some(Holder::Expected(next)) if next == turn => Poll::Ready(Ok(self.hold(gate, this))),
+            Some(Holder::Here(holder)) if holder == this => Poll::Ready(Err(Error::WouldDeadlock)),
+            _ => {
+                if !gate.tasks.iter().any(|task| task.will_wake(cx.waker())) {
+                    gate.tasks.push(cx.waker().clone());
+                }
+                Poll::Pending
+            }
+        }
+    }
+
+    fn hold(&self, mut gate: MutexGuard<'_, Gate<W>>, thread: ThreadId) -> Held<'_, T, W> {
+        gate.holder = Some(Holder::Here(thread));
+        gate.held += 1;
+        drop(gate);
+        HOLDING.with(|holding| holding.set(holding.get() + 1));
+        Held { gate: self, state: lock(&self.state) }
+    }
+
+    /// Something has changed: threads and tasks that wait look again.
+    fn notify(&self, mut gate: MutexGuard<'_, Gate<W>>) {
+        self.count_ready(&gate);
+        let tasks = std::mem::take(&mut gate.tasks);
+        drop(gate);
+        self.changed.notify_all();
+        tasks.into_iter().for_each(Waker::wake);
     }
 
     /// Leaves a call here until its turn comes; whether that is now, so that it is to be asked for at once.
@@ -196,9 +252,7 @@ impl<T, W> StateGate<T, W> {
             true => gate.pass_on(),
             false => gate.queue.retain(|waiting| waiting.turn != turn),
         }
-        self.count_ready(&gate);
-        drop(gate);
-        self.changed.notify_all();
+        self.notify(gate);
     }
 
     /// Lets no more calls of peers in; those that wait return.
@@ -206,9 +260,7 @@ impl<T, W> StateGate<T, W> {
         let mut gate = lock(&self.gate);
         gate.stopped = true;
         gate.refuse_parked();
-        self.count_ready(&gate);
-        drop(gate);
-        self.changed.notify_all();
+        self.notify(gate);
     }
 
     /// Notes, around a blocking request of a method, whom it waits for.
@@ -217,26 +269,39 @@ impl<T, W> StateGate<T, W> {
             return wait();
         }
         // However the wait ends: a mark that stays would refuse that peer's later calls.
-        struct Mark<'g, T, W>(&'g StateGate<T, W>);
-        impl<T, W> Drop for Mark<'_, T, W> {
+        struct Marked<'g, T, W>(&'g StateGate<T, W>, Option<Mark>);
+        impl<T, W> Drop for Marked<'_, T, W> {
             fn drop(&mut self) {
-                self.0.set_waits_for(None);
+                self.1.take().into_iter().for_each(|mark| self.0.unmark(mark));
             }
         }
-        self.set_waits_for(Some(peer));
-        let _mark = Mark(self);
+        let _marked = Marked(self, self.mark(peer));
         wait()
     }
 
-    fn set_waits_for(&self, peer: Option<LinkId>) {
-        let mut gate = lock(&self.gate);
-        if gate.holder == Some(Holder::Here(std::thread::current().id())) {
-            gate.waits_for = peer;
-            gate.refuse_parked();
-            self.count_ready(&gate);
+    /// Notes that this thread waits for a peer, if it holds the state: for a call that is polled, which may end elsewhere.
+    pub(crate) fn mark(&self, peer: LinkId) -> Option<Mark> {
+        if HOLDING.with(Cell::get) == 0 {
+            return None;
         }
-        drop(gate);
-        self.changed.notify_all();
+        let mut gate = lock(&self.gate);
+        if gate.holder != Some(Holder::Here(std::thread::current().id())) {
+            return None;
+        }
+        gate.waits_for.push(peer);
+        gate.refuse_parked();
+        let held = gate.held;
+        self.notify(gate);
+        Some(Mark { peer, held })
+    }
+
+    /// That wait is over.
+    pub(crate) fn unmark(&self, mark: Mark) {
+        let mut gate = lock(&self.gate);
+        let index = gate.waits_for.iter().position(|peer| *peer == mark.peer);
+        if let Some(index) = index.filter(|_| gate.held == mark.held) {
+            gate.waits_for.swap_remove(index);
+        }
     }
 }
 
@@ -246,13 +311,13 @@ impl<W> Gate<W> {
         match turn.caller {
             None => None,
             Some(_) if self.stopped => Some(Error::NotRunning),
-            caller => (self.waits_for == caller).then_some(Error::WouldDeadlock),
+            Some(caller) => self.waits_for.contains(&caller).then_some(Error::WouldDeadlock),
         }
     }
 
     /// The next one has its turn.
     fn pass_on(&mut self) {
-        self.waits_for = None;
+        self.waits_for.clear();
         let next = self.queue.pop_front();
         self.holder = next.as_ref().map(|waiting| Holder::Expected(waiting.turn));
         if let Some(Waiting { turn, parked: Some(work), .. }) = next {
@@ -292,10 +357,8 @@ impl<T, W> Drop for Held<'_, T, W> {
     fn drop(&mut self) {
         let mut gate = lock(&self.gate.gate);
         gate.pass_on();
-        self.gate.count_ready(&gate);
-        drop(gate);
         HOLDING.with(|holding| holding.set(holding.get().saturating_sub(1)));
-        self.gate.changed.notify_all();
+        self.gate.notify(gate);
     }
 }
 
@@ -413,7 +476,7 @@ mod tests {
         };
         barrier.wait();
         let _held = mine.enter().unwrap();
-        other.waiting_for(LinkId(1), || assert_eq!(lock(&other.gate).waits_for, None));
+        other.waiting_for(LinkId(1), || assert_eq!(lock(&other.gate).waits_for, []));
         barrier.wait();
         holder.join().unwrap();
     }

@@ -57,6 +57,7 @@ impl<T: Send + 'static> Engine<T> {
         if ready.writable && !state.reading.is_opening() {
             self.with(&link, &mut state, |session, cx| session.writable(cx));
             link.room.notify_all();
+            state.wake_tasks();
         }
         let mut call = None;
         if ready.readable && state.reading.is_free() && !state.is_paused() {

@@ -1,0 +1,70 @@
+//! The asynchronous face, for tokio or any other executor: what waits is a future or a stream, and holds no thread.
+//!
+//! The unit's own threads read its links, and its clock ends what takes too long; both wake the task that waits. No method
+//! whose name ends in `_async` blocks the thread that polls it: a poll takes locks that other threads hold for as long as a
+//! frame takes to be encoded, and never while they wait for the network.
+//!
+//! | waits for | method | dropped before it has ended |
+//! |---|---|---|
+//! | a reply | [`Peer::request_async`] | the call is given up, and what it started, or would start, stops if its service has a lease |
+//! | a reply, and keeps what was started | [`Peer::hold_async`] | likewise |
+//! | the end of what was kept | [`Hold::release_async`] | it is released all the same |
+//! | replies of all nodes | [`CommunicationSystem::request_all_async`] | those calls that have not ended are given up |
+//! | a round trip | [`Peer::ping_async`] | the answer is not measured; another caller has its turn |
+//! | a node | [`CommunicationSystem::wait_for_s_unit_async`], [`Unit::wait_for_manager_async`] | nothing |
+//! | a function | [`Peer::wait_for_function_async`] | nothing |
+//! | anything else that events tell of | [`Handle::wait_until_async`] | nothing |
+//! | readers of the published list | [`CommunicationSystem::publish_and_wait_async`], [`Peer::publish_and_wait_async`] | the list is published all the same |
+//! | an event | [`Handle::events_async`], [`EventStream::next`] | no event is lost |
+//! | the application's state | [`Handle::with_state_async`] | the turn is given up |
+//! | the end of a lease | [`LeaseWatch::ended`], [`Call::lease_ended`] | nothing |
+//! | the start and the end of the unit | [`Handle::start_async`], [`Handle::stop_async`] | it starts, or stops, all the same |
+//!
+//! What does not wait has no form of its own: [`Peer::request`], [`Peer::release`], [`Peer::flush`] and everything that
+//! tells how it is now return at once. [`Hold`] and [`Heart`](crate::Heart) release when they are dropped, without waiting.
+//! Dropping the last handle of a unit that runs stops it, and waits for its threads: [`Handle::stop_async`] before does not.
+//!
+//! Services may be `async` as well: [`MyFunctionList::add_service`](crate::MyFunctionList::add_service) takes them, and
+//! [`Handle::run_services_on`] tells which executor runs them.
+//!
+//! A call that has to wait for the minimum interval, or for room, does so within its deadline. A method that holds the
+//! application's state and waits for such a call, as in `block_on`, counts as waiting for its peer: the peer's calls that
+//! need the state are refused with [`Error::WouldDeadlock`] meanwhile, as around a
+//! [`block_request`]. An `async` service holds no state while it waits, so that its peer may call back.
+//!
+//! [`Call::lease_ended`]: crate::Call::lease_ended
+//! [`CommunicationSystem::publish_and_wait_async`]: crate::CommunicationSystem::publish_and_wait_async
+//! [`CommunicationSystem::request_all_async`]: crate::CommunicationSystem::request_all_async
+//! [`CommunicationSystem::wait_for_s_unit_async`]: crate::CommunicationSystem::wait_for_s_unit_async
+//! [`Error::WouldDeadlock`]: crate::Error::WouldDeadlock
+//! [`Handle::events_async`]: crate::Handle::events_async
+//! [`Handle::run_services_on`]: crate::Handle::run_services_on
+//! [`Handle::start_async`]: crate::Handle::start_async
+//! [`Handle::stop_async`]: crate::Handle::stop_async
+//! [`Handle::wait_until_async`]: crate::Handle::wait_until_async
+//! [`Handle::with_state_async`]: crate::Handle::with_state_async
+//! [`Hold`]: crate::Hold
+//! [`Hold::release_async`]: crate::Hold::release_async
+//! [`LeaseWatch::ended`]: crate::LeaseWatch::ended
+//! [`Peer::flush`]: crate::Peer::flush
+//! [`Peer::hold_async`]: crate::Peer::hold_async
+//! [`Peer::ping_async`]: crate::Peer::ping_async
+//! [`Peer::publish_and_wait_async`]: crate::Peer::publish_and_wait_async
+//! [`Peer::release`]: crate::Peer::release
+//! [`Peer::request`]: crate::Peer::request
+//! [`Peer::request_async`]: crate::Peer::request_async
+//! [`Peer::wait_for_function_async`]: crate::Peer::wait_for_function_async
+//! [`Unit::wait_for_manager_async`]: crate::Unit::wait_for_manager_async
+//! [`block_request`]: crate::Peer::block_request
+
+mod calls;
+mod elsewhere;
+mod events;
+mod reply;
+mod services;
+mod waiting;
+
+pub(crate) use events::EventQueue;
+pub use events::{EventStream, EventsLost};
+pub use reply::PendingReply;
+pub use services::CallGivenUp;

@@ -1,0 +1,132 @@
+//! Services whose handlers are futures.
+
+use std::fmt;
+use std::future::Future;
+use std::marker::PhantomData;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+
+use cara_core::distribution::parameters::{Parameters, ParametersView};
+use cara_core::error::{Error, ServiceError};
+
+use crate::engine::{GivenUp, Spawned};
+use crate::handle::Handle;
+use crate::handler::{Call, IntoHandler, Run, RunOf, ServiceOptions};
+
+impl<T: Send + 'static, R> Handle<T, R> {
+    /// Has handlers that are futures run by an executor of the application, from here on. `spawn` is called by threads of the
+    /// unit, outside of that executor, and must not wait. A task that it drops is answered with
+    /// [`ServiceError::NotReady`].
+    ///
+    /// Without it a thread of the unit runs them, one at a time between their `await`s: enough for what only calls other
+    /// nodes and waits for state or leases; timers and sockets of tokio need its own runtime.
+    ///
+    /// ```no_run
+    /// # async fn serve(agv: cara_std::Unit) {
+    /// let runtime = tokio::runtime::Handle::current();
+    /// agv.run_services_on(move |task| drop(runtime.spawn(task)));
+    /// # }
+    /// ```
+    pub fn run_services_on(&self, spawn: impl Fn(Spawned) + Send + Sync + 'static) {
+        self.engine().run_tasks_on(Arc::new(spawn));
+    }
+
+    /// As [`with_state`](Self::with_state): runs `act` with the application's state when its turn comes. `act` itself must not
+    /// wait. [`Error::WouldDeadlock`] when this thread has the state already. Dropped before its turn, it gives the turn up.
+    pub async fn with_state_async<A>(&self, act: impl FnOnce(&mut T) -> A) -> Result<A, Error> {
+        self.engine().with_state_awaited(act).await
+    }
+}
+
+impl<T> ServiceOptions<T> {
+    /// A handler that is a future is not dropped when its call is given up, but told by [`Call::given_up`]: for one that has to
+    /// end in order. What it returns then has no caller.
+    pub const fn runs_to_its_end(mut self) -> Self {
+        self.to_its_end = true;
+        self
+    }
+}
+
+impl Call {
+    /// Ends when nothing wants the call any more: its caller waits no longer, its link has ended, or its order has. For a
+    /// handler that is a future and [runs to its end](ServiceOptions::runs_to_its_end); any other such handler is dropped
+    /// then. Of a call whose handler is no future it never ends. Dropping it loses nothing.
+    pub fn given_up(&self) -> CallGivenUp {
+        CallGivenUp(self.given_up.clone())
+    }
+}
+
+/// The end of what a call is wanted for; see [`Call::given_up`].
+#[derive(Clone, Debug)]
+#[must_use = "it is awaited"]
+pub struct CallGivenUp(Option<Arc<GivenUp>>);
+
+impl Future for CallGivenUp {
+    type Output = ();
+
+    fn poll(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<()> {
+        self.0.as_ref().map_or(Poll::Pending, |given_up| given_up.poll(cx))
+    }
+}
+
+/// The form of a handler that is a future.
+#[doc(hidden)]
+pub struct Awaited<Form>(PhantomData<Form>);
+
+impl<Form> fmt::Debug for Awaited<Form> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Awaited")
+    }
+}
+
+impl<T, F, W, const BYTES: usize> IntoHandler<T, Awaited<fn(Parameters<BYTES>) -> W>> for F
+where
+    F: Fn(Parameters<BYTES>) -> W + Send + Sync + 'static,
+    W: Future<Output = Parameters<BYTES>> + Send + 'static,
+{
+    fn into_run(self) -> RunOf<T> {
+        by_value(move |_, arguments| {
+            let work = self(arguments);
+            async move { Ok(work.await) }
+        })
+    }
+}
+
+impl<T, F, W, const BYTES: usize> IntoHandler<T, Awaited<fn(Call, Parameters<BYTES>) -> W>> for F
+where
+    F: Fn(Call, Parameters<BYTES>) -> W + Send + Sync + 'static,
+    W: Future<Output = Result<Parameters<BYTES>, ServiceError>> + Send + 'static,
+{
+    fn into_run(self) -> RunOf<T> {
+        by_value(self)
+    }
+}
+
+impl<T, F, W> IntoHandler<T, Awaited<fn(Call, Box<ParametersView>) -> W>> for F
+where
+    F: Fn(Call, Box<ParametersView>) -> W + Send + Sync + 'static,
+    W: Future<Output = Result<Box<ParametersView>, ServiceError>> + Send + 'static,
+{
+    fn into_run(self) -> RunOf<T> {
+        RunOf(Run::Task(Arc::new(move |call, arguments| Box::pin(self(call, arguments)))))
+    }
+}
+
+fn by_value<T, W, const BYTES: usize>(
+    service: impl Fn(Call, Parameters<BYTES>) -> W + Send + Sync + 'static,
+) -> RunOf<T>
+where
+    W: Future<Output = Result<Parameters<BYTES>, ServiceError>> + Send + 'static,
+{
+    RunOf(Run::Task(Arc::new(move |call, mut view| {
+        let mut arguments = Parameters::<BYTES>::sized();
+        let copied = arguments.copy_from(&view);
+        let work = copied.map(|()| service(call, arguments));
+        Box::pin(async move {
+            let results = work.map_err(|_| ServiceError::BadResults)?.await?;
+            view.copy_from(&results).map_err(|_| ServiceError::BadResults)?;
+            Ok(view)
+        })
+    })))
+}

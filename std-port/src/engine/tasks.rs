@@ -1,0 +1,289 @@
+//! Calls whose handlers are futures: the executor of the application runs them, or a thread of the unit. A call has its
+//! slot at its link until it is answered, which bounds how many there are.
+
+use std::future::Future;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::pin::Pin;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::task::{Context, Poll, Wake, Waker};
+
+use cara_core::distribution::parameters::ParametersView;
+use cara_core::error::{Error, ServiceError};
+use cara_core::services::session::Call;
+
+use super::Engine;
+use super::alarms::Alarm;
+use super::calling::PAUSE;
+use super::link::LinkCell;
+use crate::executor::Executor;
+use crate::handler::{self, Begin, Work};
+use crate::lease::LeaseEnded;
+use crate::locks::lock;
+
+/// A task as an executor gets it.
+pub(crate) type Spawned = Pin<Box<dyn Future<Output = ()> + Send>>;
+
+/// Gives a task to the executor of the application.
+type Spawn = dyn Fn(Spawned) + Send + Sync;
+
+/// What runs the handlers that are futures.
+#[derive(Default)]
+pub(super) struct Runner {
+    /// Of the application.
+    spawn: Mutex<Option<Arc<Spawn>>>,
+    /// The unit's own thread, once there is a service that needs it.
+    own: Mutex<Option<Arc<Executor>>>,
+}
+
+impl Runner {
+    /// Ends the unit's own thread.
+    pub(super) fn end(&self) {
+        let own = lock(&self.own).take();
+        own.into_iter().for_each(|executor| executor.end());
+    }
+}
+
+impl<T: Send + 'static> Engine<T> {
+    /// Handlers that begin from here on are given to `spawn`.
+    pub(crate) fn run_tasks_on(&self, spawn: Arc<Spawn>) {
+        *lock(&self.services.runner.spawn) = Some(spawn);
+    }
+
+    /// There is something that runs futures. [`Error::Network`] when the system refuses the thread.
+    pub(crate) fn make_runner(&self) -> Result<(), Error> {
+        let runner = &self.services.runner;
+        let mut own = lock(&runner.own);
+        if own.is_none() && lock(&runner.spawn).is_none() {
+            *own = Some(Arc::new(Executor::start("cara-tasks")?));
+        }
+        Ok(())
+    }
+
+    /// Begins the handler of a call; what it leads to is answered by its task.
+    pub(super) fn begin_task(
+        &self,
+        link: &Arc<LinkCell>,
+        call: Call,
+        told: handler::Call,
+        (begin, to_its_end): (&Begin, bool),
+        arguments: Box<ParametersView>,
+    ) {
+        let Some(engine) = self.me.upgrade() else { return };
+        let (lease, given_up) = (told.lease_ended(), told.given_up.clone());
+        let caller = told.caller.clone();
+        let work = catch_unwind(AssertUnwindSafe(|| begin(told, arguments)));
+        if work.is_err() {
+            tracing::error!(%caller, "a handler panicked");
+        }
+        let (work, result) = match work {
+            Ok(work) => (Some(work), Err(Error::Service(ServiceError::NotReady))),
+            Err(_) => (None, Err(Error::Service(ServiceError::Panicked))),
+        };
+        let alarm = Alarm::new(engine.clone());
+        let link = link.clone();
+        let task = Task { engine, link, call, work, result, given_up, to_its_end, lease, alarm, answered: false };
+        self.spawn(Box::pin(task));
+    }
+
+    fn spawn(&self, task: Spawned) {
+        let runner = &self.services.runner;
+        let spawn = lock(&runner.spawn).clone();
+        if let Some(spawn) = spawn {
+            // A task that the executor does not take is dropped, and so its call is answered.
+            if catch_unwind(AssertUnwindSafe(|| spawn(task))).is_err() {
+                tracing::error!("the executor of the services panicked");
+            }
+            return;
+        }
+        let own = lock(&runner.own).clone();
+        if let Some(executor) = own {
+            OwnTask::start(task, executor);
+        }
+    }
+}
+
+/// One call until it is answered. Dropped before, as by an executor that ends, it is answered as not ready.
+struct Task<T: Send + 'static> {
+    engine: Arc<Engine<T>>,
+    link: Arc<LinkCell>,
+    call: Call,
+    /// The handler, while it runs.
+    work: Option<Work>,
+    /// What is answered once it does not.
+    result: Result<Box<ParametersView>, Error>,
+    given_up: Option<Arc<GivenUp>>,
+    /// It is told that its call is given up, and not dropped.
+    to_its_end: bool,
+    lease: LeaseEnded,
+    alarm: Alarm<T>,
+    answered: bool,
+}
+
+impl<T: Send + 'static> Task<T> {
+    /// Whether nothing wants the call any more: its caller's time is over, its link or its order has ended. Otherwise the
+    /// task is woken when that changes.
+    fn is_given_up(&mut self, cx: &mut Context<'_>) -> bool {
+        let mut state = self.link.lock();
+        let is_live = state.session.is_live();
+        if is_live {
+            state.await_end(self.call.ticket, cx.waker());
+        }
+        drop(state);
+        let waits = self.call.wants_reply;
+        if !is_live || (waits && self.engine.now() >= self.call.deadline) {
+            return true;
+        }
+        if waits {
+            self.alarm.set(self.call.deadline, cx.waker());
+        }
+        Pin::new(&mut self.lease).poll(cx).is_ready()
+    }
+
+    /// Goes on with the handler; ready when it does not run any more.
+    fn go_on(&mut self, cx: &mut Context<'_>) -> Poll<()> {
+        let is_given_up = self.work.is_some() && self.is_given_up(cx);
+        let Some(work) = &mut self.work else { return Poll::Ready(()) };
+        if is_given_up {
+            self.given_up.iter().for_each(|given_up| given_up.tell());
+        }
+        let ended = if is_given_up && !self.to_its_end {
+            Ok(Err(Error::Expired))
+        } else {
+            match catch_unwind(AssertUnwindSafe(|| work.as_mut().poll(cx))) {
+                Ok(Poll::Pending) => return Poll::Pending,
+                Ok(Poll::Ready(result)) => Ok(result.map_err(Error::Service)),
+                Err(panic) => Err(panic),
+            }
+        };
+        let dropped = catch_unwind(AssertUnwindSafe(|| self.work = None));
+        self.result = ended.and_then(|ended| dropped.map(|()| ended)).unwrap_or_else(|_| {
+            tracing::error!("a handler panicked");
+            Err(Error::Service(ServiceError::Panicked))
+        });
+        Poll::Ready(())
+    }
+
+    /// Answers, unless there is no room for it now. Without a waker, or after the deadline, the answer is dropped then.
+    fn answer(&mut self, waker: Option<&Waker>) -> Poll<()> {
+        let (engine, link) = (&self.engine, &self.link);
+        let (now, ticket) = (engine.now(), self.call.ticket);
+        let answer = self.result.as_deref().map_err(|error| *error);
+        let mut state = link.lock();
+        let kept = engine.with_at(now, link, &mut state, |session, cx| session.answer(cx, ticket, answer));
+        match waker.filter(|_| kept.is_err() && now < self.call.deadline) {
+            Some(waker) => {
+                state.await_change(waker);
+                engine.settle_at(now, link, state);
+                self.alarm.set(self.call.deadline.min(now + PAUSE), waker);
+                Poll::Pending
+            }
+            None => {
+                if kept.is_err() {
+                    state.session.drop_answer(ticket);
+                }
+                state.await_no_end(ticket);
+                if state.session.has_next_call() {
+                    engine.hand_over(link);
+                }
+                engine.settle_at(now, link, state);
+                self.answered = true;
+                Poll::Ready(())
+            }
+        }
+    }
+}
+
+impl<T: Send + 'static> Future for Task<T> {
+    type Output = ();
+
+    fn poll(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<()> {
+        match self.go_on(cx) {
+            Poll::Ready(()) => self.answer(Some(cx.waker())),
+            Poll::Pending => Poll::Pending,
+        }
+    }
+}
+
+impl<T: Send + 'static> Drop for Task<T> {
+    fn drop(&mut self) {
+        if !self.answered {
+            // What it holds may be what the call's order is to find free.
+            let _ = catch_unwind(AssertUnwindSafe(|| self.work = None));
+            let _ = self.answer(None);
+        }
+    }
+}
+
+/// Whether the call of a handler is given up, for whatever awaits it.
+#[derive(Debug, Default)]
+pub(crate) struct GivenUp(Mutex<(bool, Vec<Waker>)>);
+
+impl GivenUp {
+    fn tell(&self) {
+        let mut state = lock(&self.0);
+        state.0 = true;
+        let tasks = std::mem::take(&mut state.1);
+        drop(state);
+        tasks.into_iter().for_each(Waker::wake);
+    }
+
+    pub(crate) fn poll(&self, cx: &Context<'_>) -> Poll<()> {
+        let mut state = lock(&self.0);
+        if state.0 {
+            return Poll::Ready(());
+        }
+        if !state.1.iter().any(|task| task.will_wake(cx.waker())) {
+            state.1.push(cx.waker().clone());
+        }
+        Poll::Pending
+    }
+}
+
+/// A task that the unit's own thread runs.
+struct OwnTask {
+    work: Mutex<Option<Spawned>>,
+    executor: Arc<Executor>,
+    /// It waits for the thread.
+    is_queued: AtomicBool,
+}
+
+impl OwnTask {
+    fn start(work: Spawned, executor: Arc<Executor>) {
+        Arc::new(Self { work: Mutex::new(Some(work)), executor, is_queued: AtomicBool::new(false) }).wake();
+    }
+
+    fn poll(self: Arc<Self>) {
+        // Before it is polled: what happens from here on queues it again.
+        self.is_queued.store(false, Ordering::SeqCst);
+        let waker = Waker::from(self.clone());
+        let mut work = lock(&self.work);
+        let is_over = work.as_mut().is_none_or(|work| work.as_mut().poll(&mut Context::from_waker(&waker)).is_ready());
+        let ended = if is_over { work.take() } else { None };
+        drop(work);
+        drop(ended);
+    }
+}
+
+impl Wake for OwnTask {
+    fn wake(self: Arc<Self>) {
+        if !self.is_queued.swap(true, Ordering::SeqCst) {
+            let task = self.clone();
+            self.executor.run(move || task.poll());
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_awaits_the_end_of_a_call_is_woken_and_late_comers_see_it_at_once() {
+        let given_up = GivenUp::default();
+        let cx = Context::from_waker(Waker::noop());
+        assert!(given_up.poll(&cx).is_pending());
+        given_up.tell();
+        assert!(given_up.poll(&cx).is_ready());
+    }
+}

@@ -1,0 +1,227 @@
+//! The asynchronous face, on tokio.
+
+mod services;
+mod starving;
+mod waiting;
+
+use std::future::Future;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use cara_std::{Constraints, Error, Parameters, Peer, RequestOptions, ServiceError};
+
+use crate::support::{Gate, ask, counter, fleet, held, meet, number, pair, service, system, unit, until, value};
+
+fn runtime() -> tokio::runtime::Runtime {
+    tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_time().build().unwrap()
+}
+
+fn patient() -> RequestOptions {
+    within_millis(20_000)
+}
+
+fn within_millis(millis: u64) -> RequestOptions {
+    RequestOptions { timeout: Some(cara_std::Duration::from_millis(millis)), ..Default::default() }
+}
+
+/// Polls a future once.
+async fn once<F: Future + Unpin>(future: &mut F) -> Option<F::Output> {
+    std::future::poll_fn(|cx| match std::pin::Pin::new(&mut *future).poll(cx) {
+        std::task::Poll::Ready(output) => std::task::Poll::Ready(Some(output)),
+        std::task::Poll::Pending => std::task::Poll::Ready(None),
+    })
+    .await
+}
+
+async fn echo(peer: &Peer, number_in: i64) -> Result<i64, Error> {
+    let mut parameters = number(number_in);
+    peer.request_async("echo", &mut parameters, &patient())?.await.map(|()| value(&parameters))
+}
+
+#[test]
+fn a_request_can_be_awaited_and_fails_like_any_other() {
+    let (manager, agv) = pair();
+    agv.my_function_list().add_function("echo", &number(0), service(|number| number)).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    runtime().block_on(async {
+        for number in 0..100 {
+            assert_eq!(echo(&peer, number).await, Ok(number));
+        }
+        let refused = peer.request_async("no_such", &mut number(1), &patient()).err();
+        assert_eq!(refused, Some(Error::UnknownFunction));
+    });
+    agv.stop();
+    until("it has left", || !peer.is_connected());
+    assert_eq!(runtime().block_on(echo(&peer, 1)), Err(Error::NotConnected));
+}
+
+#[test]
+fn a_hundred_requests_are_awaited_side_by_side() {
+    let (manager, agv) = pair();
+    agv.my_function_list().add_function("echo", &number(0), service(|number| number)).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    runtime().block_on(async {
+        let tasks: Vec<_> = (0..100)
+            .map(|number| {
+                let peer = peer.clone();
+                tokio::spawn(async move {
+                    loop {
+                        match echo(&peer, number).await {
+                            // There are fewer slots than tasks: here it waits for one, and there it may be refused.
+                            Err(Error::Busy) => tokio::task::yield_now().await,
+                            outcome => return outcome,
+                        }
+                    }
+                })
+            })
+            .collect();
+        for (number, task) in tasks.into_iter().enumerate() {
+            assert_eq!(task.await.unwrap(), Ok(number as i64));
+        }
+    });
+    assert_eq!(counter(&peer.counters(), "CallsTimedOut"), 0);
+}
+
+#[test]
+fn a_future_times_out_and_a_dropped_one_frees_its_slot() {
+    let (manager, agv) = pair();
+    let gate = Arc::new(Gate::default());
+    agv.my_function_list().add_function("hang", &number(0), held(&gate)).unwrap();
+    agv.my_function_list().add_function("echo", &number(0), service(|number| number)).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    runtime().block_on(async {
+        let options = RequestOptions { timeout: Some(cara_std::Duration::from_millis(30)), ..Default::default() };
+        let mut parameters = number(5);
+        let outcome = peer.request_async("hang", &mut parameters, &options).unwrap().await;
+        assert_eq!((outcome, value(&parameters)), (Err(Error::TimedOut), 5));
+        // More than there are slots, each given up before its reply.
+        for _ in 0..300 {
+            let mut parameters = number(5);
+            let pending = peer.request_async("hang", &mut parameters, &options).unwrap();
+            match tokio::time::timeout(Duration::ZERO, pending).await {
+                Err(_) => {}
+                Ok(Err(Error::Busy | Error::TimedOut)) => {} // The peer refuses those beyond its own limit.
+                Ok(outcome) => panic!("{outcome:?}"),
+            }
+        }
+    });
+    gate.open();
+    until("calls work again", || ask(&peer, "echo", 3) == Ok(3));
+}
+
+#[test]
+fn a_future_ends_when_its_link_does() {
+    let (manager, agv) = pair();
+    let gate = Arc::new(Gate::default());
+    agv.my_function_list().add_function("hang", &number(0), held(&gate)).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    let runtime = runtime();
+    let waiting = runtime.spawn({
+        let peer = peer.clone();
+        async move {
+            let mut parameters = number(5);
+            peer.request_async("hang", &mut parameters, &patient())?.await
+        }
+    });
+    until("it runs", || gate.came() == 1);
+    manager.stop();
+    assert_eq!(runtime.block_on(waiting).unwrap(), Err(Error::Interrupted));
+    gate.open();
+}
+
+#[test]
+fn a_future_waits_for_the_interval_within_its_deadline() {
+    let (manager, agv) = pair();
+    agv.my_function_list().add_function("echo", &number(0), service(|number| number)).unwrap();
+    let (peer, _) = meet(&manager, &agv);
+    let interval = cara_std::Duration::from_millis(200);
+    peer.set_constraints(Constraints { minimum_interval: interval, ..peer.constraints() }).unwrap();
+    runtime().block_on(async {
+        assert_eq!(echo(&peer, 1).await, Ok(1));
+        let began = Instant::now();
+        assert_eq!(echo(&peer, 2).await, Ok(2));
+        assert!(began.elapsed() >= Duration::from_millis(150), "{:?}", began.elapsed());
+        let mut parameters = number(3);
+        let refused = peer.request_async("echo", &mut parameters, &within_millis(20)).err();
+        assert!(matches!(refused, Some(Error::TooSoon { .. })), "{refused:?}");
+        // Dropped while it waits, it is never sent.
+        let mut pending = peer.request_async("echo", &mut parameters, &patient()).unwrap();
+        assert_eq!(once(&mut pending).await, None);
+        drop(pending);
+        tokio::time::sleep(Duration::from_millis(400)).await;
+    });
+    assert_eq!(counter(&agv.manager().unwrap().counters(), "RequestsRun"), 2);
+}
+
+#[test]
+fn calls_to_all_have_an_outcome_each_and_are_given_up_when_they_are_dropped() {
+    let fleet = fleet();
+    let manager = system(fleet).build().unwrap();
+    let agvs = [1, 2, 3].map(|id| unit(&format!("agv{id}"), id, fleet).build().unwrap());
+    let gate = Arc::new(Gate::default());
+    for (index, agv) in agvs.iter().enumerate() {
+        agv.my_function_list().add_function("hang", &number(0), held(&gate)).unwrap();
+        let fails = move |parameters: Parameters| match index {
+            2 => panic!("this one fails"),
+            _ => parameters,
+        };
+        agv.my_function_list().add_function("echo", &number(0), fails).unwrap();
+        meet(&manager, agv);
+    }
+    crate::support::retire_absent(&manager);
+    runtime().block_on(async {
+        let outcomes = manager.request_all_async("echo", &number(4), &patient()).await;
+        let mut outcomes: Vec<_> =
+            outcomes.into_iter().map(|(peer, outcome)| (peer.id(), outcome.map(|results| value(&results)))).collect();
+        outcomes.sort_by_key(|(id, _)| *id);
+        assert_eq!(outcomes, [(1, Ok(4)), (2, Ok(4)), (3, Err(Error::Service(ServiceError::Panicked)))]);
+        let (parameters, options) = (number(4), patient());
+        let all = manager.request_all_async("hang", &parameters, &options);
+        assert!(tokio::time::timeout(Duration::from_millis(100), all).await.is_err());
+    });
+    let cancelled = |peer: &Peer| counter(&peer.counters(), "CallsCancelled");
+    assert!(manager.s_units().iter().all(|peer| cancelled(peer) == 1));
+    gate.open();
+}
+
+/// A method holds the manager's state and waits for the vehicle, whose service calls a method of the manager.
+#[test]
+fn a_method_that_waits_for_a_future_is_told_at_once_of_a_call_that_waits_for_it() {
+    let fleet = fleet();
+    let manager = system(fleet).state(0_i64).build().unwrap();
+    let agv = unit("agv", 7, fleet).build().unwrap();
+    let back: Arc<std::sync::OnceLock<Peer>> = Arc::default();
+    let there = back.clone();
+    let forwards = move |mut parameters: Parameters| {
+        let there = there.clone();
+        async move {
+            let asked = there.get().unwrap().request_async("last", &mut parameters, &patient()).unwrap().await;
+            if asked == Err(Error::WouldDeadlock) {
+                parameters.set_value("number", -1).unwrap();
+            }
+            parameters
+        }
+    };
+    manager.my_function_list().add_function("last", &number(0), |_: &mut i64, p: Parameters| p).unwrap();
+    agv.my_function_list().add_function("forwards", &number(0), forwards).unwrap();
+    let (peer, to_manager) = meet(&manager, &agv);
+    assert!(back.set(to_manager.clone()).is_ok());
+    let runtime = runtime();
+    let one = || {
+        let mut parameters = number(4);
+        let asked = peer.request_async("forwards", &mut parameters, &patient()).unwrap();
+        runtime.block_on(asked).map(|()| value(&parameters))
+    };
+    let all = || {
+        let outcomes = manager.block_request_all("forwards", &number(4), &patient());
+        outcomes
+            .iter()
+            .find(|(asked, _)| asked.id() == 7)
+            .map(|(_, outcome)| outcome.as_ref().map(|p| value(p)).unwrap())
+    };
+    assert_eq!((one(), all()), (Ok(4), Some(4)), "the manager's state is free");
+    assert_eq!(manager.with_state(|_| one()), Ok(Ok(-1)));
+    assert_eq!(manager.with_state(|_| all()), Ok(Some(-1)));
+    assert_eq!(one(), Ok(4), "no mark is left");
+    agv.stop();
+}
