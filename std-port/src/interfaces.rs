@@ -95,7 +95,7 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
         actuator: Option<&Actuator>,
         run: impl IntoHandler<T, Form>,
     ) -> Result<(), Error> {
-        let options = ServiceOptions { attributes, actuator: actuator.cloned(), ..ServiceOptions::new() };
+        let options = ServiceOptions { attributes, actuator: actuator.cloned(), ..ServiceOptions::default() };
         self.put(&signature.to_definition(), options, run, FunctionList::add_function).map(|_| ())
     }
 }

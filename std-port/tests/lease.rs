@@ -3,6 +3,8 @@
 //! `Lease` is the core's own. Two links write it, under a lock as in `safe_hook.rs`, and the application reads it without.
 //! Where the links take no lock, the model must fail.
 
+#![allow(unexpected_cfgs, reason = "the features are those of the core")]
+
 // The file's `core` is this crate: all is the standard library's but for `sync::atomic` below.
 extern crate self as core;
 use std::*;
