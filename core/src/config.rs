@@ -131,6 +131,12 @@ pub struct Constraints {
     pub keep_alive: Duration,
     /// Calls that one peer may have waiting or running here; the next one is answered with `Busy`.
     pub calls_per_peer: u16,
+    /// Streams of this unit that one peer may be subscribed to; the next subscription is refused.
+    #[cfg(feature = "streams")]
+    pub subscriptions_per_peer: u16,
+    /// Bytes of values of streams that one peer is sent in a second; what is above comes later, and is newer then.
+    #[cfg(feature = "streams")]
+    pub stream_bytes: u32,
 }
 
 impl Constraints {
@@ -143,6 +149,10 @@ impl Constraints {
         chunk_size: CHUNK_BYTES as u16,
         keep_alive: Duration::from_secs(1),
         calls_per_peer: 64,
+        #[cfg(feature = "streams")]
+        subscriptions_per_peer: 1_024,
+        #[cfg(feature = "streams")]
+        stream_bytes: 1_000_000,
     };
     /// Defaults of an s_unit, sized for a microcontroller.
     pub const S_UNIT: Self = Self {
@@ -153,6 +163,10 @@ impl Constraints {
         chunk_size: 1024,
         keep_alive: Duration::from_secs(1),
         calls_per_peer: 8,
+        #[cfg(feature = "streams")]
+        subscriptions_per_peer: 8,
+        #[cfg(feature = "streams")]
+        stream_bytes: 100_000,
     };
 }
 

@@ -76,10 +76,12 @@ impl<C: Counter, const N: usize> fmt::Debug for Counters<C, N> {
 
 /// Declares an enum of counters: `counters! { /// doc  pub enum Name { /// doc  Variant, … } }`.
 macro_rules! counters {
-    ($(#[$meta:meta])* pub enum $name:ident { $(#[doc = $help:literal] $variant:ident,)+ }) => {
+    ($(#[$meta:meta])* pub enum $name:ident {
+        $(#[doc = $help:literal] $(#[cfg(feature = $feature:literal)])? $variant:ident,)+
+    }) => {
         $(#[$meta])*
         #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-        pub enum $name { $(#[doc = $help] $variant,)+ }
+        pub enum $name { $(#[doc = $help] $(#[cfg(feature = $feature)])? $variant,)+ }
 
         impl $name {
             /// How many counters there are.
@@ -87,15 +89,15 @@ macro_rules! counters {
         }
 
         impl $crate::counters::Counter for $name {
-            const ALL: &'static [Self] = &[$(Self::$variant,)+];
+            const ALL: &'static [Self] = &[$($(#[cfg(feature = $feature)])? Self::$variant,)+];
             fn index(self) -> usize {
                 self as usize
             }
             fn name(self) -> &'static str {
-                match self { $(Self::$variant => stringify!($variant),)+ }
+                match self { $($(#[cfg(feature = $feature)])? Self::$variant => stringify!($variant),)+ }
             }
             fn help(self) -> &'static str {
-                match self { $(Self::$variant => $help.trim_ascii(),)+ }
+                match self { $($(#[cfg(feature = $feature)])? Self::$variant => $help.trim_ascii(),)+ }
             }
         }
     };

@@ -65,6 +65,10 @@ pub enum Limit {
     /// Handlers running at the same time.
     #[error("every thread for handlers is busy: try again later, or let handlers take less time")]
     Handlers = 12,
+    /// The peer's `Constraints::subscriptions_per_peer`.
+    #[cfg(feature = "streams")]
+    #[error("the peer lets this unit subscribe to no more streams: end one, or raise subscriptions_per_peer there")]
+    Subscriptions = 13,
 }
 
 /// A constraint for which a unit may have too little memory.

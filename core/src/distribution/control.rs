@@ -8,22 +8,22 @@ use crate::error::Error;
 
 /// Makes [`Control`] of its table: each row is the item's kind, the variant and its fields in their order.
 macro_rules! controls {
-    ($($(#[$about:meta])* $kind:literal => $name:ident { $($(#[$field_about:meta])* $field:ident: $type:ty,)* })*) => {
+    ($($(#[$about:meta])* $kind:literal $(if $feature:literal)? => $name:ident { $($(#[$field_about:meta])* $field:ident: $type:ty,)* })*) => {
         /// Messages between two units that are no requests: what they tell each other about their functions, limits and
         /// leases.
         #[derive(Clone, Copy, Debug, PartialEq, Eq)]
         pub enum Control<'b> {
-            $($(#[$about])* $name { $($(#[$field_about])* $field: $type,)* },)*
+            $($(#[$about])* $(#[cfg(feature = $feature)])? $name { $($(#[$field_about])* $field: $type,)* },)*
         }
 
         impl<'b> Control<'b> {
             /// How many kinds there are.
             #[cfg(test)]
-            pub(crate) const KINDS: u16 = [$($kind),*].len() as u16;
+            pub(crate) const KINDS: u16 = [$($(#[cfg(feature = $feature)])? $kind),*].len() as u16;
 
             fn put(&self, writer: &mut Writer<'_>) {
                 match *self {
-                    $(Self::$name { $($field),* } => {
+                    $($(#[cfg(feature = $feature)])? Self::$name { $($field),* } => {
                         let item = writer.begin($kind);
                         $($field.put(writer);)*
                         writer.end(item);
@@ -34,7 +34,7 @@ macro_rules! controls {
             /// Reads an item of a control message; `None` for a kind that this version does not know.
             pub fn take(item: &Item<'b>) -> Result<Option<Self>, Malformed> {
                 item.read(|reader| match item.kind {
-                    $($kind => Some(Self::$name { $($field: Field::take(reader)),* }),)*
+                    $($(#[cfg(feature = $feature)])? $kind => Some(Self::$name { $($field: Field::take(reader)),* }),)*
                     _ => None,
                 })
             }
@@ -95,6 +95,63 @@ controls! {
         latch: Option<Latch>,
         /// The order that it has, or had last.
         last: Option<LastOrder>,
+    }
+    /// The sender wants values of a stream of the reader, or no more of them.
+    8 if "streams" => Subscribe {
+        /// Its slot.
+        slot: u16,
+        /// Its life.
+        generation: u16,
+        /// Least time between two values in milliseconds; [`NO_SUBSCRIPTION`] ends it.
+        interval: u32,
+    }
+    /// The answer to `Subscribe`.
+    9 if "streams" => Subscribed {
+        /// Its slot.
+        slot: u16,
+        /// Its life.
+        generation: u16,
+        /// Least time between two values in milliseconds, [`NO_SUBSCRIPTION`] where it was ended or refused.
+        interval: u32,
+        /// Bytes of values of all streams that the sender sends in a second.
+        bytes: u32,
+        /// Why it was refused.
+        refusal: SubscriptionRefusal,
+    }
+}
+
+/// As the interval of a subscription: there is none.
+#[cfg(feature = "streams")]
+pub const NO_SUBSCRIPTION: u32 = u32::MAX;
+
+/// Why a subscription was refused.
+#[cfg(feature = "streams")]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum SubscriptionRefusal {
+    /// It was not.
+    None = 0,
+    /// There is no such stream, or it was replaced. Also any reason that this version does not know.
+    Unknown = 1,
+    /// The access table does not let the subscriber have it.
+    NotAllowed = 2,
+    /// The subscriber has as many subscriptions as it may.
+    Full = 3,
+}
+
+#[cfg(feature = "streams")]
+impl Field<'_> for SubscriptionRefusal {
+    fn put(self, writer: &mut Writer<'_>) {
+        writer.number(self as u64);
+    }
+
+    fn take(reader: &mut Reader<'_>) -> Self {
+        match reader.u32() {
+            0 => Self::None,
+            2 => Self::NotAllowed,
+            3 => Self::Full,
+            _ => Self::Unknown,
+        }
     }
 }
 

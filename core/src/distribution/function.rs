@@ -82,6 +82,17 @@ impl Definition {
         text::parse(text)
     }
 
+    /// A stream from its text form, as in `pose(position: float[2])`: a function without arguments whose results are the values.
+    ///
+    /// ```
+    /// let pose = cara_core::Definition::stream("pose(position: float[2])").unwrap();
+    /// assert_eq!(pose.to_string(), "pose() -> (position: float[2])");
+    /// ```
+    #[cfg(feature = "streams")]
+    pub fn stream(text: &str) -> Result<Self, ParseError> {
+        text::parse_stream(text)
+    }
+
     /// The same function with the variables of `parameters` as its arguments; their values don't matter.
     pub fn arguments(self, parameters: &ParametersView) -> Result<Self, Error> {
         let signature = self.signature();

@@ -7,6 +7,8 @@ use core::fmt;
 
 use super::function::{Definition, Signature};
 use super::table::Table;
+#[cfg(feature = "streams")]
+pub(crate) use super::table::Wish;
 pub use super::table::{Entry, Function, Generation, Slot};
 use crate::error::{Error, Limit};
 use crate::storage::Storage;
@@ -213,6 +215,22 @@ impl<S: Storage> TheirFunctionList<S> {
                 entry.hidden = hidden;
             }
         }
+    }
+
+    /// What this unit wants of a stream.
+    #[cfg(feature = "streams")]
+    pub(crate) fn wish_mut(&mut self, slot: Slot) -> Option<&mut Wish> {
+        let index = self.index_of(slot)?;
+        self.table.entries.get_mut(index).map(|entry| &mut entry.wish)
+    }
+
+    /// A stream of which the peer has not been told what this unit wants: its place, its generation and the interval.
+    #[cfg(feature = "streams")]
+    pub(crate) fn untold_wish(&self) -> Option<(Slot, Generation, u32)> {
+        let untold = |entry: &&Entry| entry.function.is_some() && entry.wish.interval != entry.wish.told;
+        let entry = self.table.entries.iter().find(untold)?;
+        let function = self.table.of(entry)?;
+        Some((function.slot, function.generation, entry.wish.interval))
     }
 
     /// Hides a function.

@@ -4,6 +4,8 @@
 //! that knows the encoding; `docs/wire.md` says it in words.
 
 pub use super::control::{ActuatorState, Control, LastOrder, Latch, LeaseEnd, OrderOutcome};
+#[cfg(feature = "streams")]
+pub use super::control::{NO_SUBSCRIPTION, SubscriptionRefusal};
 
 use super::block::Put;
 use super::function_list::{Generation, Slot};
@@ -16,6 +18,8 @@ const REQUEST: u8 = 1;
 const REPLY: u8 = 2;
 pub(super) const CONTROL: u8 = 3;
 const FAILURE: u8 = 4;
+#[cfg(feature = "streams")]
+const SAMPLE: u8 = 6;
 
 const WANTS_REPLY: u8 = 1;
 /// An operator made it, and not the unit's program.
@@ -61,6 +65,9 @@ pub enum Message<'b> {
     Failure(u32, Error),
     /// Lists, limits, leases: [items](super::items), of which [`Control`] is one each.
     Control(&'b [u8]),
+    /// The newest value of a stream.
+    #[cfg(feature = "streams")]
+    Sample(SampleHeader, &'b [u8]),
 }
 
 impl<'b> Message<'b> {
@@ -82,6 +89,11 @@ impl<'b> Message<'b> {
                 Some(Self::Failure(id, status.err()?))
             }
             CONTROL => Some(Self::Control(bytes.get(CONTROL_HEADER_BYTES..)?)),
+            #[cfg(feature = "streams")]
+            SAMPLE => {
+                let header = SampleHeader::decode(bytes.first_chunk()?);
+                Some(Self::Sample(header, behind_header(bytes, bytes.get(6)?, LEAST_SAMPLE_BYTES)?))
+            }
             _ => None,
         }
     }
@@ -202,6 +214,44 @@ impl RequestHeader {
             remaining: micros([*r0, *r1, *r2, *r3]),
             stamp: u64::from_le_bytes([*t0, *t1, *t2, *t3, *t4, *t5, *t6, *t7]),
             since: micros([*e0, *e1, *e2, *e3]),
+        }
+    }
+}
+
+/// What stands in front of a value of a stream.
+#[cfg(feature = "streams")]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SampleHeader {
+    /// The sender's stream.
+    pub slot: Slot,
+    /// The life of the slot.
+    pub generation: Generation,
+    /// When the value was made, at the earliest, on the subscriber's clock in microseconds: before its start if negative.
+    pub made: i64,
+}
+
+/// The header of a sample that each version has.
+#[cfg(feature = "streams")]
+const LEAST_SAMPLE_BYTES: usize = 16;
+/// Bytes before the block of a sample.
+#[cfg(feature = "streams")]
+pub const SAMPLE_BYTES: usize = LEAST_SAMPLE_BYTES + MORE_BYTES;
+
+#[cfg(feature = "streams")]
+impl SampleHeader {
+    /// The header's bytes.
+    pub fn encode(&self) -> [u8; SAMPLE_BYTES] {
+        let ([s0, s1], [g0, g1]) = (self.slot.0.to_le_bytes(), self.generation.0.to_le_bytes());
+        let [a, b, c, d, e, f, g, h] = self.made.to_le_bytes();
+        with_more([SAMPLE, 0, s0, s1, g0, g1, (SAMPLE_BYTES / WORD) as u8, 0, a, b, c, d, e, f, g, h])
+    }
+
+    fn decode(bytes: &[u8; LEAST_SAMPLE_BYTES]) -> Self {
+        let &[_, _, s0, s1, g0, g1, _, _, a, b, c, d, e, f, g, h] = bytes;
+        Self {
+            slot: Slot(u16::from_le_bytes([s0, s1])),
+            generation: Generation(u16::from_le_bytes([g0, g1])),
+            made: i64::from_le_bytes([a, b, c, d, e, f, g, h]),
         }
     }
 }
@@ -500,7 +550,7 @@ mod tests {
         }
 
         #[test]
-        fn decoding_never_panics(bytes in prop::collection::vec(any::<u8>(), 0..80), kind in 0..5u8) {
+        fn decoding_never_panics(bytes in prop::collection::vec(any::<u8>(), 0..80), kind in 0..8u8) {
             let mut bytes = bytes;
             bytes.insert(0, kind);
             let _ = Message::decode(&bytes);
@@ -514,6 +564,20 @@ mod tests {
             let Some(Message::Reply(7, Err(read))) = Message::decode(&bytes) else { panic!() };
             prop_assert_eq!(read, error);
         }
+    }
+
+    #[cfg(feature = "streams")]
+    #[test]
+    fn a_sample_survives() {
+        let header = SampleHeader { slot: Slot(7), generation: Generation(0x102), made: -3 };
+        let mut bytes = Vec::from(header.encode());
+        assert_eq!(bytes[..8], [6, 0, 7, 0, 2, 1, REPLY_WORDS, 0]);
+        bytes[6] += 1;
+        bytes.extend([0xEE; WORD + 3]);
+        let Some(Message::Sample(read, block)) = Message::decode(&bytes) else { panic!() };
+        assert_eq!((read, block), (header, &[0xEE; 3][..]), "a later version says more");
+        bytes[6] = 3;
+        assert!(Message::decode(&bytes).is_none());
     }
 
     /// Flag 2 is one that a callee which does not know it passes over, and the answer says it in what had been a 0.

@@ -59,7 +59,25 @@ pub struct Entry<H = ()> {
     pub(super) generation: Generation,
     /// It is kept and not shown.
     pub(super) hidden: bool,
+    /// What this unit wants of a stream.
+    #[cfg(feature = "streams")]
+    pub(super) wish: Wish,
     pub(super) function: Option<Stored<H>>,
+}
+
+/// What a unit wants of a stream of its peer: the interval of a subscription in milliseconds, or
+/// [`NO_SUBSCRIPTION`](super::control::NO_SUBSCRIPTION).
+#[cfg(feature = "streams")]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Wish {
+    pub(crate) interval: u32,
+    /// As the peer was told.
+    pub(crate) told: u32,
+}
+
+#[cfg(feature = "streams")]
+impl Wish {
+    const NONE: Self = Self { interval: super::control::NO_SUBSCRIPTION, told: super::control::NO_SUBSCRIPTION };
 }
 
 pub(super) struct Stored<H> {
@@ -73,7 +91,13 @@ pub(super) struct Stored<H> {
 impl<H> Entry<H> {
     /// Room without a function.
     pub const fn empty() -> Self {
-        Self { generation: Generation(0), hidden: false, function: None }
+        Self {
+            generation: Generation(0),
+            hidden: false,
+            #[cfg(feature = "streams")]
+            wish: Wish::NONE,
+            function: None,
+        }
     }
 }
 
@@ -142,6 +166,10 @@ impl<S: Storage, H: 'static> Table<S, H> {
         copy(signature, place);
         let length = signature.len() as u16;
         entry.hidden = false;
+        #[cfg(feature = "streams")]
+        {
+            entry.wish = Wish::NONE;
+        }
         entry.function = Some(Stored { slot, at: saturate(self.used), length, attributes, handler });
         self.used = end;
         self.len = self.len.saturating_add(1);

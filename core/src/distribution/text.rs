@@ -88,6 +88,17 @@ pub(super) fn parse(text: &str) -> Result<Definition, ParseError> {
     if parser.rest().is_empty() { Ok(builder.finish()) } else { Err(parser.error(Expected::End)) }
 }
 
+/// Reads a stream; see [`Definition::stream`].
+#[cfg(feature = "streams")]
+pub(super) fn parse_stream(text: &str) -> Result<Definition, ParseError> {
+    let mut parser = Parser { text: text.as_bytes(), position: 0 };
+    let (at, name) = parser.name()?;
+    let mut builder = Builder::new(name).map_err(|error| explain(at, error))?;
+    parser.list(|spec| builder.result(spec))?;
+    parser.skip_spaces();
+    if parser.rest().is_empty() { Ok(builder.finish()) } else { Err(parser.error(Expected::End)) }
+}
+
 struct Parser<'a> {
     text: &'a [u8],
     position: usize,

@@ -450,6 +450,12 @@ pub trait Service {
         None
     }
 
+    /// The newest value, of a stream.
+    #[cfg(feature = "streams")]
+    fn stream(&self) -> Option<&dyn crate::services::stream::Source> {
+        None
+    }
+
     /// [`Lease::claim`]; `Ok(None)` for a service without a lease.
     fn begin_lease(&self, now: Instant, end: Instant, claim: &Claim) -> Result<Option<Order>, Error> {
         self.lease().map(|lease| lease.claim(now, end, claim)).transpose()

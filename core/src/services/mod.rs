@@ -26,6 +26,7 @@
 //! | [`LeaseExpired`](session::Event::LeaseExpired) | runs the safe hook of the service, before anything else |
 //! | [`Call`](session::Event::Call) | runs the handler, and answers by ticket; an `order` makes the handler's view of the service's [`Lease`](lease::Lease). A newer call of the service ends that view without an event, so wake what awaits it |
 //! | [`Reply`](session::Event::Reply), [`Failed`](session::Event::Failed), and all others | tells the program what [`UnitEvent::of`](event::UnitEvent::of) makes of it, and the results of a reply, which `session.results` shows. It says `session.cancel` for a call that the program gives up, `session.release` for all of a function |
+//! | `Sample`, `Subscribed` (feature `streams`) | keeps the value, which `session.results` shows, or what became of a subscription. It says `session.subscribe` again with each [`ListChanged`](session::Event::ListChanged), and `session.stream_changed`, then `session.poll`, for each value that the unit publishes |
 //! | [`Joined`](session::Event::Joined) | the peer is taken, and is being told what is published to it; from here on it is `session.peer()` |
 //! | [`Closed`](session::Event::Closed) | the last one: forgets the session (`into_storage` gives its slices back), then `node.left`, also for a link that never joined |
 //!
@@ -191,6 +192,8 @@ pub mod lease;
 pub mod publications;
 pub mod requests;
 pub mod session;
+#[cfg(feature = "streams")]
+pub mod stream;
 pub mod typed;
 
 pub use crate::host::port::Port;

@@ -140,6 +140,7 @@ entry!(types, {
 entry!(definitions, {
     keep(Definition::new(unknown_text()));
     keep(Definition::parse(unknown_text()));
+    keep(Definition::stream(unknown_text()));
     let definition = unknown::<Definition>();
     keep(definition.clone().arguments(parameters()));
     keep(definition.clone().results(parameters()));

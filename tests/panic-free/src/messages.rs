@@ -2,7 +2,7 @@
 
 use cara_core::distribution::block::{self, SliceWriter};
 use cara_core::distribution::function::VariableSpecs;
-use cara_core::distribution::message::{self, Control, Message, RequestHeader, SessionBody};
+use cara_core::distribution::message::{self, Control, Message, RequestHeader, SampleHeader, SessionBody};
 use cara_core::distribution::parameters::{Parameters, ParametersView};
 
 use crate::linkage::{keep, unknown, unknown_slice};
@@ -27,6 +27,7 @@ entry!(messages_written, {
     keep((SessionBody::keep_alive(*unknown()), SessionBody::renewal(unknown())));
     keep((SessionBody::release(unknown()), SessionBody::release_all(*unknown(), *unknown())));
     keep(SessionBody::renewed(*unknown()));
+    keep(unknown::<SampleHeader>().encode());
     keep(SessionBody::message_prefix(*unknown()));
 });
 

@@ -19,6 +19,7 @@ use cara_core::services::lease::{Lease, Service};
 use cara_core::services::publications::Publications;
 use cara_core::services::requests::Requests;
 use cara_core::services::session::{self, Event, ReplyBlock, Session, SessionConfig, SessionStorage};
+use cara_core::services::stream::{Newest, Source};
 use cara_core::services::{Context, OwnFunctions, Port, slots_for};
 use cara_core::storage::{Lent, Pool};
 
@@ -30,6 +31,10 @@ struct Handler;
 
 impl Service for Handler {
     fn lease(&self) -> Option<&Lease> {
+        *unknown()
+    }
+
+    fn stream(&self) -> Option<&dyn Source> {
         *unknown()
     }
 }
@@ -74,6 +79,10 @@ entry!(own_functions, {
         service.reset(*unknown(), *unknown());
         keep((service.finish_lease(*unknown(), *unknown()), service.expire_lease(*unknown(), *unknown(), *unknown())));
         service.cut_lease(*unknown());
+        if let Some(stream) = service.stream() {
+            keep(stream.version());
+            stream.newest(&mut |value| keep(value.age_at(*unknown())));
+        }
     }
 });
 
@@ -128,6 +137,19 @@ entry!(session_asked, {
         session.is_acknowledged(*unknown()),
     ));
     keep(session.constraints());
+});
+
+entry!(streams, {
+    let session = session();
+    keep(session.subscribe(context(), unknown_text(), *unknown()));
+    session.unsubscribe(context(), unknown_text());
+    keep((session.stream_changed(*unknown()), session.subscriptions()));
+    let newest = unknown::<Newest<[u8; 64]>>();
+    let values: &Parameters<64> = unknown();
+    keep(newest.publish(*unknown(), *unknown(), *unknown(), values));
+    keep(newest.pass_on(*unknown(), *unknown(), unknown_slice()));
+    keep((newest.version(), newest.value()));
+    unknown::<MaybeUninit<Newest<[u8; 64]>>>().write(Newest::new([0; 64]));
 });
 
 entry!(session_connected, {

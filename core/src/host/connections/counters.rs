@@ -83,5 +83,20 @@ crate::counters::counters! {
         RenewalsStopped,
         /// Leases of calls of this unit that it released because the peer answered no renewal for the length of the lease.
         RenewalsUnanswered,
+        /// Values of streams sent to a subscriber.
+        #[cfg(feature = "streams")]
+        SamplesSent,
+        /// Values of streams received.
+        #[cfg(feature = "streams")]
+        SamplesReceived,
+        /// Values of streams that a newer one replaced before they were due for a subscriber.
+        #[cfg(feature = "streams")]
+        SamplesReplaced,
+        /// Values of streams received that this unit does not want, or cannot read.
+        #[cfg(feature = "streams")]
+        SamplesDropped,
+        /// Subscriptions refused by the access table, or because the peer has as many as it may.
+        #[cfg(feature = "streams")]
+        SubscriptionsRefused,
     }
 }

@@ -45,11 +45,11 @@ pub struct Receipt {
 /// Where the results of a call lie until the session next receives; [`Session::results`] shows them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Results {
-    slot: Slot,
-    generation: Generation,
-    block: Place,
+    pub(super) slot: Slot,
+    pub(super) generation: Generation,
+    pub(super) block: Place,
     /// Refuses those of an earlier [`receive`](Session::receive), whose place may hold other bytes by now.
-    step: u32,
+    pub(super) step: u32,
 }
 
 /// The results of a call, still in the buffer that they came in.
@@ -299,6 +299,11 @@ impl<P: Port> Session<P> {
                 self.release_call(cx, CallId(id), None);
                 Some(Event::Failed(CallId(id), error))
             }
+            #[cfg(feature = "streams")]
+            Some(Message::Sample(header, block)) => {
+                let block = place.last(block.len());
+                self.sample_arrived(cx.now, &header, block, lent)
+            }
             Some(Message::Control(items)) => {
                 let items = place.last(items.len());
                 self.controls_arrived(cx, items, lent)
@@ -403,6 +408,17 @@ impl<P: Port> Session<P> {
             Control::Actuator { slot, latch, last } => {
                 Some(Event::Actuator { slot: Slot(slot), state: ActuatorState { latch, last } })
             }
+            #[cfg(feature = "streams")]
+            Control::Subscribe { slot, generation, interval } => {
+                self.subscription_arrived(cx, Slot(slot), Generation(generation), interval);
+                None
+            }
+            #[cfg(feature = "streams")]
+            Control::Subscribed { slot, generation, interval, bytes, refusal } => {
+                let granted =
+                    super::GrantedStream { interval: crate::time::Duration::from_millis(interval.into()), bytes };
+                self.subscription_answered(Slot(slot), Generation(generation), granted, refusal)
+            }
             Control::LeaseEnded { call, why } => {
                 self.stop_renewing(CallId(call)).map(|held| Event::LeaseEnded { call: held.call, slot: held.slot, why })
             }
@@ -493,6 +509,10 @@ impl<P: Port> Session<P> {
             Told::Earlier => return Err(Error::StaleFunction),
             Told::Now => function?,
         };
+        #[cfg(feature = "streams")]
+        if function.attributes.stream.is_some() {
+            return Err(Error::UnknownFunction);
+        }
         if cx.access.is_some() {
             self.permit_call(cx, &function)?;
         }

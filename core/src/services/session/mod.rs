@@ -27,12 +27,16 @@ mod pinging;
 mod proving;
 mod publishing;
 mod renewing;
+#[cfg(feature = "streams")]
+mod streaming;
 mod timing;
 
 pub use inbound::{Receipt, ReplyBlock, Results};
 pub use lending::ListSlices;
 pub use outbound::{Delivery, RequestOptions};
 pub use publishing::Publication;
+#[cfg(feature = "streams")]
+pub use streaming::{Granted as GrantedStream, Sample};
 
 use crate::config::{Constraints, HELLO_TIMEOUT, LEASES, LINK_BUFFER_BYTES, Mode, Priority};
 use crate::counters::Counters;
@@ -138,6 +142,12 @@ pub enum Event {
         /// Its state.
         state: ActuatorState,
     },
+    /// A value of a stream of the peer.
+    #[cfg(feature = "streams")]
+    Sample(Sample),
+    /// What became of a subscription to a stream of the peer; after an error it has ended.
+    #[cfg(feature = "streams")]
+    Subscribed(Slot, Result<GrantedStream, Error>),
     /// The peer answered a [`Session::ping`].
     Answered,
     /// The link has ended; every call in flight and every lease has been reported before.
@@ -216,6 +226,8 @@ pub struct Session<P: Port> {
     held: heapless::Vec<Held, LEASES>,
     answered: holding::Answered,
     releases: holding::Releases,
+    #[cfg(feature = "streams")]
+    streaming: streaming::Streaming,
     /// The newest call that was to move something.
     last_order: Option<(Slot, CallId)>,
     /// How often something was received, by which [`Results`] are known to be the last ones.
@@ -263,6 +275,8 @@ impl<P: Port> Session<P> {
             held: heapless::Vec::new(),
             answered: holding::Answered::new(),
             releases: holding::Releases::new(),
+            #[cfg(feature = "streams")]
+            streaming: streaming::Streaming::new(),
             last_order: None,
             step: 0,
         }
@@ -463,6 +477,8 @@ impl<P: Port> Session<P> {
         self.pump_renewal(cx);
         self.send_releases(cx);
         self.pump(cx);
+        #[cfg(feature = "streams")]
+        self.send_samples(cx);
     }
 
     /// Changes the limits of this unit; the peer is told.

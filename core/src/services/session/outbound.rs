@@ -147,6 +147,10 @@ impl<P: Port> Session<P> {
             return Err(Error::NotConnected);
         }
         let function = self.theirs.named(function).ok_or(Error::UnknownFunction)?;
+        #[cfg(feature = "streams")]
+        if function.attributes.stream.is_some() {
+            return Err(Error::UnknownFunction);
+        }
         let priority = options.priority.unwrap_or(function.attributes.priority);
         let length = block::measure(function.signature.arguments(), parameters)?;
         self.check_length(priority, options.delivery, length)?;

@@ -25,6 +25,9 @@ pub struct Publication {
     released: u32,
     /// What the peer has left of the rate that it may call at.
     bucket: Bucket,
+    /// Of a stream.
+    #[cfg(feature = "streams")]
+    subscription: super::streaming::Subscription,
 }
 
 /// Whether a peer may call a function.
@@ -142,6 +145,18 @@ impl<S: Storage> Publishing<S> {
         self.table.get_mut(usize::from(slot.0)).map(|publication| &mut publication.bucket)
     }
 
+    /// What the peer wants of a stream.
+    #[cfg(feature = "streams")]
+    pub(super) fn subscription(&mut self, slot: Slot) -> Option<&mut super::streaming::Subscription> {
+        self.table.get_mut(usize::from(slot.0)).map(|publication| &mut publication.subscription)
+    }
+
+    /// How many streams the peer is subscribed to.
+    #[cfg(feature = "streams")]
+    pub(super) fn count_subscriptions(&self) -> u16 {
+        self.table.iter().filter(|publication| publication.subscription.is_active()).count() as u16
+    }
+
     /// Every rate is whole again.
     pub(super) fn fill_buckets(&mut self) {
         self.table.iter_mut().for_each(|publication| publication.bucket = Bucket::default());
@@ -226,6 +241,8 @@ impl<P: Port> Session<P> {
             let serial = self.publishing.serial;
             self.publishing.end_due = !self.send_control(cx, &Control::ListEnd { serial });
         }
+        #[cfg(feature = "streams")]
+        self.pump_streams(cx);
     }
 
     /// Whether the peer may be told what is published: it has proven itself to this end, which dialled, or the link is live.
@@ -246,6 +263,8 @@ impl<P: Port> Session<P> {
     pub(super) fn has_news(&self) -> bool {
         let publishing = &self.publishing;
         let told = publishing.acknowledgement_due.is_none() && self.ends.is_empty();
+        #[cfg(feature = "streams")]
+        let told = told && !self.streaming.has_news();
         publishing.dirty || publishing.end_due || publishing.limits_due || publishing.actuators_due || !told
     }
 

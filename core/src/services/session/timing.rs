@@ -107,6 +107,8 @@ impl<P: Port> Session<P> {
                 let own =
                     timers.keep_alive.min(timers.gathered).min(timers.lease).min(timers.renewal).min(timers.release);
                 let own = own.min(self.renewal.deadline(self.dialed));
+                #[cfg(feature = "streams")]
+                let own = own.min(self.streaming.deadline(self.link.queued()));
                 own.min(self.requests.deadline()).min(self.liveness.deadline())
             }
         }
@@ -161,6 +163,10 @@ impl<P: Port> Session<P> {
         }
         self.poll_renewal(cx);
         self.look_for_peer(cx);
+        #[cfg(feature = "streams")]
+        if cx.now >= self.streaming.deadline(self.link.queued()) {
+            self.send_samples(cx);
+        }
         match self.phase {
             Phase::Ending(reason) => self.poll_ending(cx, reason),
             _ => None,

@@ -19,7 +19,7 @@ const LEASE: Duration = Duration::from_millis(500);
 const MOMENT: Duration = Duration::from_millis(5);
 
 const STOP: Attributes =
-    Attributes { priority: Priority::Emergency, lease: None, idempotent: true, actuator: 0, stop: true, reset: false };
+    Attributes { priority: Priority::Emergency, idempotent: true, stop: true, ..Attributes::NORMAL };
 const RESET: Attributes = Attributes { priority: Priority::Normal, stop: false, reset: true, ..STOP };
 
 /// A vehicle whose `go()` and `dock()` move the drive, and `lift()` the fork; `halt()` stops all, `free()` resets all.

@@ -28,6 +28,8 @@ mod pair;
 mod requests;
 mod setup;
 mod side;
+#[cfg(feature = "streams")]
+mod streams;
 
 use std::boxed::Box;
 use std::string::String;

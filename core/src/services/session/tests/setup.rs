@@ -58,6 +58,9 @@ pub(super) struct Handler {
     pub(super) lease: Option<Rc<Lease>>,
     /// It has a word that motors read. Without one, the unit alone knows of the lease.
     pub(super) has_word: Cell<bool>,
+    /// Of a stream.
+    #[cfg(feature = "streams")]
+    pub(super) values: Option<super::streams::Values>,
 }
 
 /// When a service answers.
@@ -71,13 +74,24 @@ pub(super) enum Run {
 
 impl Handler {
     pub(super) fn new(run: Run, lease: Option<Rc<Lease>>) -> Self {
-        Self { run, lease, has_word: Cell::new(true) }
+        Self {
+            run,
+            lease,
+            has_word: Cell::new(true),
+            #[cfg(feature = "streams")]
+            values: None,
+        }
     }
 }
 
 impl Service for Handler {
     fn lease(&self) -> Option<&Lease> {
         self.lease.as_deref().filter(|_| self.has_word.get())
+    }
+
+    #[cfg(feature = "streams")]
+    fn stream(&self) -> Option<&dyn crate::services::stream::Source> {
+        self.values.as_ref().map(|values| values as &dyn crate::services::stream::Source)
     }
 }
 

@@ -96,6 +96,9 @@ pub(super) struct Side {
     unanswered: Vec<(Call, Result<Arguments, Error>)>,
     pub(super) buffers: usize,
     pub(super) base: Duration,
+    /// Values of streams that have arrived: their `x`, and their age.
+    #[cfg(feature = "streams")]
+    pub(super) samples: Vec<(i64, Duration)>,
 }
 
 /// The context of a side, whose parts are borrowed one by one.
@@ -144,6 +147,8 @@ impl Side {
             unanswered: Vec::new(),
             buffers: setup.buffers,
             base,
+            #[cfg(feature = "streams")]
+            samples: Vec::new(),
         }
     }
 
@@ -243,6 +248,12 @@ impl Side {
                     block.read_into(self.results.get_mut(&id).unwrap()).map(|()| results)
                 });
                 self.happened.push(Event::Reply(id, outcome));
+            }
+            #[cfg(feature = "streams")]
+            Some(Event::Sample(sample)) => {
+                let mut values: Arguments = Box::default();
+                self.session.results(&sample.values, &self.inbox).unwrap().read_into(&mut values).unwrap();
+                self.samples.push((values.variable("x").unwrap(), sample.age));
             }
             Some(event) => self.happened.push(event),
         }

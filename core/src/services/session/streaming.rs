@@ -1,0 +1,454 @@
+//! Streams on one link: samples of this unit's to the peer, and the peer's to this unit.
+//!
+//! State is the queue: a subscription knows which version the peer was sent last and when the next one may follow. A
+//! sample is made of what is newest when it is due and the stream is empty, so at most one waits at a time, and it is of
+//! the lowest class.
+
+use super::permitting::decide;
+use super::publishing::Told;
+use super::{Event, Phase, Results, Session};
+use crate::config::Priority;
+use crate::distribution::block;
+use crate::distribution::function_list::{Function, Generation, Slot};
+use crate::distribution::message::{Control, NO_SUBSCRIPTION, SAMPLE_BYTES, SampleHeader, SubscriptionRefusal};
+use crate::error::{Error, Limit};
+use crate::host::connections::{LinkCounter, Place};
+use crate::services::access::{Decision, Verb};
+use crate::services::stream::{Source, Value};
+use crate::services::{Context, Port};
+use crate::time::{Duration, Instant};
+
+/// How long a sample waits for a buffer.
+const RETRY: Duration = Duration::from_millis(10);
+/// A second in microseconds.
+const SECOND: u64 = 1_000_000;
+
+/// A value of a stream of the peer, in what was lent.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Sample {
+    /// The peer's stream.
+    pub slot: Slot,
+    /// Its age on arrival; never too low.
+    pub age: Duration,
+    /// The values: [`Session::results`] shows them.
+    pub values: Results,
+}
+
+/// A subscription of this unit, as the peer has granted it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Granted {
+    /// Least time between two values.
+    pub interval: Duration,
+    /// Bytes of values of all its streams that the peer sends in a second.
+    pub bytes: u32,
+}
+
+/// What the peer wants of one of this unit's streams.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Subscription {
+    /// In milliseconds, or [`NO_SUBSCRIPTION`].
+    interval: u32,
+    /// Of the value that was sent last; 0 before.
+    version: u32,
+    generation: Generation,
+    /// What the peer is still to be told of it.
+    answer: Option<SubscriptionRefusal>,
+    /// When the next value may follow.
+    due: Instant,
+}
+
+impl Subscription {
+    const NONE: Self =
+        Self { interval: NO_SUBSCRIPTION, version: 0, generation: Generation(0), answer: None, due: Instant::START };
+
+    pub(super) const fn is_active(&self) -> bool {
+        self.interval != NO_SUBSCRIPTION
+    }
+}
+
+impl Default for Subscription {
+    fn default() -> Self {
+        Self::NONE
+    }
+}
+
+/// The streams of one link.
+pub(super) struct Streaming {
+    /// Subscriptions of the peer.
+    active: u16,
+    /// The slot that is looked at first: each stream has its turn where there is room for few.
+    first: usize,
+    /// When the next sample is due.
+    due: Instant,
+    /// Samples wait since then for the stream to be empty.
+    blocked: Option<Instant>,
+    /// Up to here the peer has had the bytes that it may.
+    paid: Instant,
+    answers_due: bool,
+    wishes_due: bool,
+}
+
+impl Streaming {
+    pub(super) const fn new() -> Self {
+        Self {
+            active: 0,
+            first: 0,
+            due: Instant::FAR_FUTURE,
+            blocked: None,
+            paid: Instant::START,
+            answers_due: false,
+            wishes_due: false,
+        }
+    }
+
+    /// When a sample can be made, where so many bytes wait on the link.
+    pub(super) fn deadline(&self, queued: usize) -> Instant {
+        match self.blocked {
+            // What blocked the stream has gone out with something else, so that the port is not told that it takes bytes again.
+            Some(since) if queued == 0 => since,
+            _ => self.due,
+        }
+    }
+
+    pub(super) const fn has_news(&self) -> bool {
+        self.answers_due || self.wishes_due
+    }
+}
+
+/// What becomes of a sample that is due.
+enum Attempt {
+    Sent,
+    /// It may be sent then.
+    Later(Instant),
+    /// The stream is full.
+    Blocked,
+    /// The subscription has ended, for this reason.
+    Ended(SubscriptionRefusal),
+}
+
+impl<P: Port> Session<P> {
+    /// Wants values of a stream of the peer, at least `interval` apart; the peer may grant a longer one, which comes as
+    /// [`Event::Subscribed`]. Of several calls for one stream the last one counts. The subscription ends with the link, and when
+    /// the peer publishes another stream in its place: a port subscribes again with [`Event::ListChanged`], which changes nothing
+    /// where nothing has changed. [`Error::UnknownFunction`] where the peer has no such stream, [`Error::NotConnected`].
+    pub fn subscribe(&mut self, cx: &mut Context<'_, P>, stream: &str, interval: Duration) -> Result<Slot, Error> {
+        let longest = NO_SUBSCRIPTION.saturating_sub(1);
+        self.wish(cx, stream, u32::try_from(interval.as_millis()).map_or(longest, |interval| interval.min(longest)))
+    }
+
+    /// Wants no more values of a stream of the peer.
+    pub fn unsubscribe(&mut self, cx: &mut Context<'_, P>, stream: &str) {
+        // Where there is no such stream, none comes.
+        let _ = self.wish(cx, stream, NO_SUBSCRIPTION);
+    }
+
+    fn wish(&mut self, cx: &mut Context<'_, P>, stream: &str, interval: u32) -> Result<Slot, Error> {
+        if self.phase != Phase::Live {
+            return Err(Error::NotConnected);
+        }
+        let known = self.theirs.named(stream).filter(|function| function.attributes.stream.is_some());
+        let slot = known.ok_or(Error::UnknownFunction)?.slot;
+        if let Some(wish) = self.theirs.wish_mut(slot) {
+            wish.interval = interval;
+            self.streaming.wishes_due = true;
+        }
+        self.pump_streams(cx);
+        Ok(slot)
+    }
+
+    /// A stream of this unit has a new value: [`poll`](Self::poll) then sends it where it is due. Whether the peer has any
+    /// subscription.
+    pub fn stream_changed(&mut self, now: Instant) -> bool {
+        let wanted = self.streaming.active > 0;
+        if wanted {
+            self.streaming.due = self.streaming.due.min(now);
+        }
+        wanted
+    }
+
+    /// Streams of this unit that the peer is subscribed to.
+    pub const fn subscriptions(&self) -> u16 {
+        self.streaming.active
+    }
+
+    /// Tells the peer what this unit wants of its streams, and what became of its own wishes.
+    pub(super) fn pump_streams(&mut self, cx: &mut Context<'_, P>) {
+        while self.streaming.wishes_due {
+            let Some((slot, generation, interval)) = self.theirs.untold_wish() else {
+                self.streaming.wishes_due = false;
+                break;
+            };
+            if !self.send_control(cx, &Control::Subscribe { slot: slot.0, generation: generation.0, interval }) {
+                break;
+            }
+            if let Some(wish) = self.theirs.wish_mut(slot) {
+                wish.told = interval;
+            }
+        }
+        if self.streaming.answers_due {
+            self.streaming.answers_due = !self.send_answers(cx);
+        }
+    }
+
+    /// Answers each subscription that is not; `false` when there was no more room.
+    fn send_answers(&mut self, cx: &mut Context<'_, P>) -> bool {
+        let bytes = self.constraints.stream_bytes;
+        for slot in self.publishing.all_slots() {
+            let Some(&mut Subscription { interval, generation, answer: Some(refusal), .. }) =
+                self.publishing.subscription(slot)
+            else {
+                continue;
+            };
+            let answer = Control::Subscribed { slot: slot.0, generation: generation.0, interval, bytes, refusal };
+            if !self.send_control(cx, &answer) {
+                return false;
+            }
+            if let Some(subscription) = self.publishing.subscription(slot) {
+                subscription.answer = None;
+            }
+        }
+        true
+    }
+
+    /// The peer wants values of a stream of this unit, or no more of them.
+    pub(super) fn subscription_arrived(
+        &mut self,
+        cx: &mut Context<'_, P>,
+        slot: Slot,
+        generation: Generation,
+        interval: u32,
+    ) {
+        let granted = match interval {
+            NO_SUBSCRIPTION => Ok(NO_SUBSCRIPTION),
+            _ => self.check_subscription(cx, slot, generation).map(|least| interval.max(least)),
+        };
+        if granted.is_err() {
+            self.link.counters.add(LinkCounter::SubscriptionsRefused, 1);
+        }
+        let Some(subscription) = self.publishing.subscription(slot) else { return };
+        // One that goes on at another pace has had the newest value.
+        let (version, due) = match subscription.is_active() && subscription.generation == generation {
+            true => (subscription.version, subscription.due.min(cx.now + millis(interval))),
+            false => (0, cx.now),
+        };
+        let answer = Some(granted.err().unwrap_or(SubscriptionRefusal::None));
+        let interval = granted.unwrap_or(NO_SUBSCRIPTION);
+        *subscription = Subscription { interval, version, generation, answer, due };
+        self.streaming.active = self.publishing.count_subscriptions();
+        self.streaming.answers_due = true;
+        self.streaming.due = cx.now;
+        self.pump_streams(cx);
+    }
+
+    /// Whether the peer may have a stream; its least interval in milliseconds.
+    fn check_subscription(
+        &mut self,
+        cx: &Context<'_, P>,
+        slot: Slot,
+        generation: Generation,
+    ) -> Result<u32, SubscriptionRefusal> {
+        let stream = self.stream(cx, slot, generation).ok_or(SubscriptionRefusal::Unknown)?;
+        if !self.decide_stream(cx, &stream).is_allowed() {
+            return Err(SubscriptionRefusal::NotAllowed);
+        }
+        let is_new = self.publishing.subscription(slot).is_some_and(|subscription| !subscription.is_active());
+        if is_new && self.streaming.active >= self.constraints.subscriptions_per_peer {
+            return Err(SubscriptionRefusal::Full);
+        }
+        Ok(u32::from(stream.attributes.stream.unwrap_or(0)))
+    }
+
+    /// A stream of this unit that the peer was told of.
+    fn stream<'f>(
+        &self,
+        cx: &Context<'f, P>,
+        slot: Slot,
+        generation: Generation,
+    ) -> Option<Function<'f, dyn crate::services::lease::Service>> {
+        let function = cx.functions.lookup(slot, generation).ok()?;
+        let is_told = matches!(self.publishing.told(slot, generation), Told::Now);
+        (is_told && function.attributes.stream.is_some()).then_some(function)
+    }
+
+    fn decide_stream(
+        &self,
+        cx: &Context<'_, P>,
+        stream: &Function<'_, dyn crate::services::lease::Service>,
+    ) -> Decision {
+        decide(cx.access, self.remote.as_ref(), stream.name(), Verb::Call)
+    }
+
+    /// Sends each value that is due, as far as the stream is empty: so none is ever before a call that this end sends later, and
+    /// one that waits is the newest when it leaves.
+    pub(super) fn send_samples(&mut self, cx: &mut Context<'_, P>) {
+        self.streaming.due = Instant::FAR_FUTURE;
+        self.streaming.blocked = None;
+        if self.streaming.active == 0 || self.phase != Phase::Live {
+            return;
+        }
+        let slots = self.publishing.slots();
+        let first = self.streaming.first;
+        let mut next = Instant::FAR_FUTURE;
+        for index in (first..slots).chain(0..first.min(slots)) {
+            let slot = Slot(index as u16);
+            let Some(&mut subscription) = self.publishing.subscription(slot) else { continue };
+            if !subscription.is_active() {
+                continue;
+            }
+            match self.attempt(cx, slot, &subscription) {
+                Attempt::Sent => self.streaming.first = index.saturating_add(1),
+                Attempt::Later(due) => next = next.min(due),
+                Attempt::Ended(why) => self.end_subscription(slot, why),
+                Attempt::Blocked => {
+                    self.streaming.blocked = Some(cx.now);
+                    break;
+                }
+            }
+        }
+        self.streaming.due = next;
+        self.pump_streams(cx);
+    }
+
+    fn attempt(&mut self, cx: &mut Context<'_, P>, slot: Slot, subscription: &Subscription) -> Attempt {
+        let Some(stream) = self.stream(cx, slot, subscription.generation) else {
+            return Attempt::Ended(SubscriptionRefusal::Unknown);
+        };
+        let Some(source) = stream.handler.stream() else { return Attempt::Ended(SubscriptionRefusal::Unknown) };
+        if source.version() == subscription.version {
+            return Attempt::Later(Instant::FAR_FUTURE);
+        }
+        let due = subscription.due.max(self.streaming.paid);
+        if due > cx.now {
+            return Attempt::Later(due);
+        }
+        // What gathers goes first.
+        if self.link.queued() > 0 {
+            self.flush(cx);
+        }
+        if self.link.queued() > 0 || self.phase != Phase::Live {
+            return Attempt::Blocked;
+        }
+        match self.decide_stream(cx, &stream) {
+            Decision::Denied => return Attempt::Ended(SubscriptionRefusal::NotAllowed),
+            Decision::Allowed { rate: None, .. } => {}
+            Decision::Allowed { rate: Some(rate), .. } => {
+                let bucket = self.publishing.bucket(slot);
+                if let Some(Err(Error::TooSoon { wait })) = bucket.map(|bucket| bucket.take(cx.now, rate)) {
+                    return Attempt::Later(cx.now + wait);
+                }
+            }
+        }
+        self.send_sample(cx, slot, subscription, source)
+    }
+
+    fn send_sample(
+        &mut self,
+        cx: &mut Context<'_, P>,
+        slot: Slot,
+        subscription: &Subscription,
+        source: &dyn Source,
+    ) -> Attempt {
+        let (stamp, since) = self.clock.tell(cx.now);
+        let most = self.peer_message_size() as usize;
+        let mut sent = None;
+        source.newest(&mut |value: &Value<'_>| {
+            let total = SAMPLE_BYTES.saturating_add(value.block.len());
+            let made = micros(stamp).saturating_add(micros(since.as_micros()));
+            let made = made.saturating_sub(micros(value.age_at(cx.now).as_micros()));
+            let header = SampleHeader { slot, generation: subscription.generation, made };
+            // One that the peer cannot take is passed over, as the next one may be shorter.
+            let result = match value.block.len() > most {
+                true => Err(Error::TooLarge { limit: most as u32 }),
+                false => self.send(cx, Priority::Low, total, &mut |writer| {
+                    writer.put(&header.encode());
+                    writer.put(value.block);
+                }),
+            };
+            sent = Some((result, value.version, total));
+        });
+        let Some((result, version, total)) = sent else { return Attempt::Later(Instant::FAR_FUTURE) };
+        if matches!(result, Err(Error::Full(_))) {
+            return Attempt::Later(cx.now + RETRY);
+        }
+        if result.is_ok() {
+            self.link.counters.add(LinkCounter::SamplesSent, 1);
+            let second = (total as u64).saturating_mul(SECOND);
+            let cost = second.checked_div(u64::from(self.constraints.stream_bytes)).unwrap_or(SECOND);
+            self.streaming.paid = cx.now + Duration::from_micros(cost);
+        }
+        if subscription.version != 0 {
+            let replaced = version.wrapping_sub(subscription.version).saturating_sub(1);
+            self.link.counters.add(LinkCounter::SamplesReplaced, replaced.into());
+        }
+        if let Some(place) = self.publishing.subscription(slot) {
+            place.version = version;
+            // Counted from when it was due, so that the pace holds where polls come late.
+            let interval = millis(subscription.interval);
+            place.due =
+                if subscription.due + interval > cx.now { subscription.due + interval } else { cx.now + interval };
+        }
+        Attempt::Sent
+    }
+
+    /// The peer is told that it has a stream no longer.
+    fn end_subscription(&mut self, slot: Slot, why: SubscriptionRefusal) {
+        if let Some(subscription) = self.publishing.subscription(slot) {
+            *subscription =
+                Subscription { answer: Some(why), generation: subscription.generation, ..Subscription::NONE };
+            self.streaming.answers_due = true;
+        }
+        self.streaming.active = self.publishing.count_subscriptions();
+    }
+
+    /// A value of a stream of the peer.
+    pub(super) fn sample_arrived(
+        &mut self,
+        now: Instant,
+        header: &SampleHeader,
+        block: Place,
+        lent: &[u8],
+    ) -> Option<Event> {
+        let SampleHeader { slot, generation, made } = *header;
+        let stream = self.theirs.function(slot).filter(|function| function.generation == generation);
+        let known =
+            stream.is_some_and(|stream| block::check(stream.signature.results(), self.link.view(block, lent)).is_ok());
+        let wanted = self.theirs.wish_mut(slot).is_some_and(|wish| wish.interval != NO_SUBSCRIPTION);
+        if !known || !wanted {
+            self.link.counters.add(LinkCounter::SamplesDropped, 1);
+            return None;
+        }
+        self.link.counters.add(LinkCounter::SamplesReceived, 1);
+        let age = micros(now.as_micros()).saturating_sub(made);
+        let age = Duration::from_micros(u64::try_from(age).unwrap_or(0));
+        Some(Event::Sample(Sample { slot, age, values: Results { slot, generation, block, step: self.step } }))
+    }
+
+    /// What became of a subscription of this unit.
+    pub(super) fn subscription_answered(
+        &mut self,
+        slot: Slot,
+        generation: Generation,
+        granted: Granted,
+        refusal: SubscriptionRefusal,
+    ) -> Option<Event> {
+        self.theirs.function(slot).filter(|function| function.generation == generation)?;
+        let wish = self.theirs.wish_mut(slot).filter(|wish| wish.interval != NO_SUBSCRIPTION)?;
+        let error = match refusal {
+            SubscriptionRefusal::None if granted.interval >= millis(NO_SUBSCRIPTION) => return None,
+            SubscriptionRefusal::None => return Some(Event::Subscribed(slot, Ok(granted))),
+            SubscriptionRefusal::Unknown => Error::StaleFunction,
+            SubscriptionRefusal::NotAllowed => Error::NotAllowed,
+            SubscriptionRefusal::Full => Error::Full(Limit::Subscriptions),
+        };
+        (wish.interval, wish.told) = (NO_SUBSCRIPTION, NO_SUBSCRIPTION);
+        Some(Event::Subscribed(slot, Err(error)))
+    }
+}
+
+const fn millis(interval: u32) -> Duration {
+    Duration::from_millis(interval as u64)
+}
+
+fn micros(time: u64) -> i64 {
+    i64::try_from(time).unwrap_or(i64::MAX)
+}
