@@ -236,6 +236,31 @@ impl<T: Send + 'static> CommunicationSystem<T> {
         peers.into_iter()
     }
 
+    /// Passes on a stream of a node to this unit's other nodes, as a stream of its own called `node/stream`, until the returned
+    /// guard is dropped: however many read it, the node's link has one subscription, at least `interval` apart. Ages go
+    /// on: a value is as old there as it is here, and more. It is seen once this unit's list is
+    /// [published](Self::publish_my_function_list). The errors are those of [`Peer::stream`] and
+    /// [`MyFunctionList::add_stream`](crate::MyFunctionList::add_stream), and [`Error::BadName`] where the name is too long.
+    ///
+    /// ```no_run
+    /// # let depot = cara_std::CommunicationSystem::new("depot", 1)?;
+    /// use cara_std::Duration;
+    ///
+    /// let relay = depot.relay_stream("agv-07", "pose", Duration::from_millis(200))?;
+    /// depot.publish_my_function_list()?;
+    /// # drop(relay);
+    /// # Ok::<(), cara_std::BuildError>(())
+    /// ```
+    pub fn relay_stream(
+        &self,
+        node: &str,
+        stream: &str,
+        interval: impl Into<Duration>,
+    ) -> Result<crate::stream::Relay<T>, Error> {
+        let peer = self.s_unit(node).or_else(|_| self.m_unit(node))?;
+        crate::stream::Relay::new(&peer, stream, interval.into())
+    }
+
     /// Makes the unit's functions visible to all nodes, also to those that come later (paper, listing line 24).
     pub fn publish_my_function_list(&self) -> Result<(), Error> {
         self.engine().publish(None).map(|_| ())

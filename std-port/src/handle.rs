@@ -305,6 +305,11 @@ impl<T: Send + 'static, R> Handle<T, R> {
         is_finished
     }
 
+    /// A stream of this unit, as [added](MyFunctionList::add_stream) before.
+    pub fn stream(&self, name: &str) -> Option<crate::stream::Stream<T>> {
+        self.my_function_list().stream(name)
+    }
+
     /// The constraints in force.
     pub fn constraints(&self) -> Constraints {
         *self.engine().hub().hub.node.constraints()

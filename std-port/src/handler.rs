@@ -13,9 +13,11 @@ use cara_core::distribution::identity::Identity;
 use cara_core::distribution::parameters::{Parameters, ParametersView};
 use cara_core::error::{Error, ServiceError};
 use cara_core::services::lease::{ActuatorState, Claim, Ended, Latch, Lease, LeaseEnd, Order, Service};
+use cara_core::services::stream::Source;
 use cara_core::time::{Duration, Instant};
 
 use crate::actuator::Actuator;
+use crate::engine::streams::OwnStream;
 use crate::executor::Executor;
 use crate::lease::{LeaseEnded, LeaseWatch};
 
@@ -125,11 +127,17 @@ pub(crate) struct Handler<T> {
     /// One that is a future is told that its call is given up, and not dropped.
     #[cfg(feature = "async")]
     pub(crate) to_its_end: bool,
+    /// Its newest value, of a stream.
+    pub(crate) stream: Option<Arc<OwnStream>>,
 }
 
 impl<T: 'static> Service for Handler<T> {
     fn lease(&self) -> Option<&Lease> {
         self.actuator.as_ref().map(Actuator::word)
+    }
+
+    fn stream(&self) -> Option<&dyn Source> {
+        self.stream.as_deref().map(|stream| stream as &dyn Source)
     }
 
     fn begin_lease(&self, _: Instant, end: Instant, claim: &Claim) -> Result<Option<Order>, Error> {

@@ -52,6 +52,7 @@ mod pool;
 mod safe_hook;
 mod seldom;
 mod storage;
+mod stream;
 pub mod survey;
 #[doc(hidden)]
 pub mod sys;
@@ -95,6 +96,7 @@ pub use lease::{LeaseEnded, LeaseWatch};
 pub use my_function_list::MyFunctionList;
 pub use name_and_id::NameAndId;
 pub use peer::{Peer, TheirFunction, TheirFunctionList};
+pub use stream::{Relay, Sample, Stream, Subscription, TheirStream};
 pub use sys::interfaces::{Interface, Interfaces};
 pub use threads::Threads;
 pub use unit::{Unit, WeakUnit};

@@ -136,6 +136,7 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
             executor,
             #[cfg(feature = "async")]
             to_its_end: options.to_its_end,
+            stream: None,
         };
         put(&mut self.engine.functions_mut(), definition, attributes, handler)?;
         Ok(watch)

@@ -11,7 +11,7 @@ use cara_core::time::Duration;
 
 use super::protocol::{Answer, Failure, Question};
 use super::stop::{self, Which};
-use super::{call, constraint, describe, everybody, hold, select};
+use super::{call, constraint, describe, everybody, hold, select, stream};
 use crate::{CommunicationSystem, Finding, Identity, Peer};
 
 /// Where answers go; `Break` when the client is gone.
@@ -118,6 +118,9 @@ fn attempt<T: Send + 'static>(
             send(sink, Answer::Constraints(describe::constraints(&constraints)))
         }
         Question::Watch => watch(system, sink, wanted),
+        Question::Stream { node, name, interval_ms } => {
+            stream::values(system, node, name.as_deref(), Duration::from_millis(*interval_ms), sink, wanted)
+        }
         Question::Counters { node } => counters(system, node.as_deref(), sink),
         Question::Metrics => metrics(system, sink),
         Question::Ping { node, count, pause_us, timeout_ms } => {

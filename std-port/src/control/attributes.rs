@@ -22,6 +22,8 @@ pub(super) struct Form {
     stop: bool,
     #[serde(default)]
     reset: bool,
+    #[serde(default, rename = "stream_ms", skip_serializing_if = "Option::is_none")]
+    stream: Option<u16>,
 }
 
 mod class {

@@ -207,6 +207,7 @@ impl<'q> Asked<'q> {
             | Question::Watch
             | Question::Counters { .. }
             | Question::Metrics
+            | Question::Stream { .. }
             | Question::Ping { .. } => None,
         }
     }

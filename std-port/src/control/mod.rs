@@ -25,6 +25,7 @@ pub mod protocol;
 mod select;
 mod server;
 mod stop;
+mod stream;
 mod values;
 
 use std::path::PathBuf;

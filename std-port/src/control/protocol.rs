@@ -83,6 +83,16 @@ pub enum Question {
     /// An [`Answer::Event`] for each event, until the connection is closed. The first is `watching`, behind which nothing
     /// is missed; `lost` tells how many came faster than they were read.
     Watch,
+    /// Values of a stream of a node as they come, until the connection is closed: an [`Answer::Value`] for each. Without a name
+    /// the last value of each of its streams, or that there is none.
+    Stream {
+        /// `NAME`, `NAME/ID` or `#ID`.
+        node: String,
+        /// The stream.
+        name: Option<String>,
+        /// Least time between two values; 0 for as often as the node grants.
+        interval_ms: u64,
+    },
     /// Counters of the unit, or of the link to one node. Answered by an [`Answer::Counters`] for each.
     Counters {
         /// The unit and all connected nodes if absent.
@@ -278,6 +288,21 @@ pub enum Answer {
         node: Option<String>,
         /// The rest, in words.
         text: String,
+    },
+    /// A value of a stream.
+    Value {
+        /// The node's `name/id`.
+        node: String,
+        /// The stream's signature.
+        stream: String,
+        /// Milliseconds since 1970, when this was told.
+        unix_ms: u64,
+        /// How old it was then, never too low; absent where there is no value.
+        age_us: Option<u64>,
+        /// The values.
+        values: Vec<Argument>,
+        /// Why there is none.
+        error: Option<Failure>,
     },
     /// Counters by name, zeros included.
     Counters {

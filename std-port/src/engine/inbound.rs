@@ -133,6 +133,12 @@ impl<T: Send + 'static> Engine<T> {
                 }
                 state.wake_tasks();
             }
+            Some(Event::Sample(sample)) => {
+                let block = session.results(&sample.values, bytes);
+                if block.is_ok_and(|block| self.sample_arrived(now, link, sample.age, &block)) {
+                    notices.push(Event::Sample(sample));
+                }
+            }
             Some(event) => {
                 if matches!(event, Event::ListChanged) && !link.is_introduced() {
                     // A node that counts has its place.

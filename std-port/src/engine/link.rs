@@ -55,6 +55,8 @@ pub(crate) struct LinkCell {
     pub(crate) peer: OnceLock<Arc<PeerCell>>,
     /// The peer has told what it offers.
     introduced: AtomicBool,
+    /// The peer is subscribed to streams of this unit.
+    subscribed: AtomicBool,
     state: Mutex<LinkState>,
     /// The stream took bytes, or the link ended.
     pub(crate) room: Condvar,
@@ -150,8 +152,21 @@ impl LinkCell {
             stream,
             peer: OnceLock::new(),
             introduced: AtomicBool::new(false),
+            subscribed: AtomicBool::new(false),
             state: Mutex::new(state),
             room: Condvar::new(),
+        }
+    }
+
+    /// Whether the peer is subscribed to streams of this unit, as it was told when the lock was given up last.
+    pub(crate) fn has_subscriptions(&self) -> bool {
+        self.subscribed.load(Ordering::SeqCst)
+    }
+
+    /// Notes whether it is.
+    pub(super) fn note_subscriptions(&self, any: bool) {
+        if self.subscribed.load(Ordering::Relaxed) != any {
+            self.subscribed.store(any, Ordering::SeqCst);
         }
     }
 

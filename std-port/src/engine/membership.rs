@@ -225,6 +225,12 @@ impl<T: Send + 'static> Engine<T> {
         if let Event::Actuator { slot, state } = event {
             return self.actuator_told(link, slot, state);
         }
+        match event {
+            Event::Sample(_) => return self.pass_on_samples(link),
+            Event::Subscribed(slot, answer) => return self.subscription_answered(link, slot, answer),
+            Event::ListChanged => self.subscribe_again(link),
+            _ => {}
+        }
         self.tell_of(link, event);
         if let Event::Answered | Event::Acknowledged { .. } = event {
             link.notify();

@@ -11,6 +11,7 @@
 //! | `Engine` | all of them |
 //! | `reading`, `inbound`, `settling` | what every thread does with a link that it has locked |
 //! | `calling`, `awaiting`, `alarms`, `looking`, `pinging`, `workers`, `staying`, `serving`, `tasks`, `afterwards` | requests of this unit, and those of its peers |
+//! | `streams` | values that this unit publishes, and those that it reads |
 //! | `membership`, `tables`, `clock_thread`, `presence`, `interfaces`, `accounts` | the node and its links, the clock, counters |
 //!
 //! Locks are taken in the order of [`Rank`](crate::locks::Rank), which a debug build asserts: the accounts, the table of
@@ -49,6 +50,7 @@ mod settling;
 mod sockets;
 mod state_gate;
 mod staying;
+pub(crate) mod streams;
 mod tables;
 #[cfg(feature = "async")]
 mod tasks;
@@ -76,7 +78,7 @@ pub(crate) use membership::HubCell;
 pub(crate) use tables::node_storage;
 #[cfg(feature = "async")]
 pub(crate) use tasks::{GivenUp, Spawned};
-pub(crate) use worker::arena_bytes;
+pub(crate) use worker::{arena, arena_bytes};
 
 use std::path::PathBuf;
 use std::sync::atomic::{self, AtomicU64};

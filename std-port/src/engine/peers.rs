@@ -32,6 +32,8 @@ pub(crate) struct PeerCell {
     own: Mutex<Option<OwnConstraints>>,
     /// The newest call of each function that was to move something, and the link that it was made by.
     orders: Mutex<BTreeMap<String, (u32, CallId)>>,
+    /// Its streams that are read here.
+    pub(super) streams: Mutex<HashMap<String, Arc<super::streams::Watched>>>,
     /// What its earlier links have counted.
     earlier: Mutex<Option<Box<LinkCounters>>>,
     /// It has told what it offers since it has its place, on this link or an earlier one.
@@ -104,6 +106,7 @@ impl PeerCell {
             left: Mutex::new(None),
             own: Mutex::new(None),
             orders: Mutex::default(),
+            streams: Mutex::default(),
             earlier: Mutex::new(None),
             introduced: AtomicBool::new(false),
             retired: AtomicBool::new(false),

@@ -24,6 +24,8 @@ impl<T: Send + 'static> Engine<T> {
     pub(super) fn settle_at<'l>(&self, now: Instant, link: &'l Arc<LinkCell>, mut guard: Locked<'l, LinkState>) {
         let state = &mut *guard;
         self.dispatch_emergencies(link, state);
+        // Before the poll, which looks for values: one that is published meanwhile finds either the note or the poll.
+        link.note_subscriptions(state.session.subscriptions() > 0);
         let mut deadline = state.session.deadline();
         if deadline <= now {
             self.poll_session(link, state);

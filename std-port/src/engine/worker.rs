@@ -41,7 +41,7 @@ pub(crate) const fn arena_bytes(message: usize) -> usize {
     }
 }
 
-pub(super) fn arena(message: usize) -> Box<ParametersView> {
+pub(crate) fn arena(message: usize) -> Box<ParametersView> {
     match message {
         0..=2048 => Box::new(Parameters::<{ arena_bytes(0) }>::sized()),
         2049..=20_000 => Box::new(Parameters::<{ arena_bytes(20_000) }>::sized()),

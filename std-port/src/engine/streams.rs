@@ -1,0 +1,281 @@
+//! Streams: those of this unit, and those of its nodes that it is subscribed to.
+//!
+//! However many handles of this process read a stream of a node, there is one subscription on the link: at the shortest
+//! interval that any of them wants. It is made again whenever the node tells its list, so also after a reconnection.
+
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::{Arc, Condvar, Mutex, PoisonError, Weak};
+
+use cara_core::distribution::function_list::Slot;
+use cara_core::error::Error;
+use cara_core::services::session::{GrantedStream, ReplyBlock};
+use cara_core::services::stream::{Newest, Source, Value};
+use cara_core::time::{Duration, Instant};
+
+use super::Engine;
+use super::link::LinkCell;
+use super::peers::PeerCell;
+use crate::locks::lock;
+
+/// A stream of this unit.
+pub(crate) struct OwnStream {
+    /// Without a rank: the link that sends a value takes buffers of the pool meanwhile, and nothing that holds those comes here.
+    newest: Mutex<Newest<Box<[u8]>>>,
+    /// In one order with the notes of the links that they have subscriptions.
+    version: AtomicU32,
+}
+
+impl OwnStream {
+    pub(crate) fn new(bytes: usize) -> Self {
+        Self { newest: Mutex::new(Newest::new(vec![0; bytes].into())), version: AtomicU32::new(0) }
+    }
+
+    pub(crate) fn put(&self, put: impl FnOnce(&mut Newest<Box<[u8]>>) -> Result<(), Error>) -> Result<(), Error> {
+        let mut newest = lock(&self.newest);
+        put(&mut newest)?;
+        self.version.store(newest.version(), Ordering::SeqCst);
+        Ok(())
+    }
+}
+
+impl Source for OwnStream {
+    fn version(&self) -> u32 {
+        self.version.load(Ordering::SeqCst)
+    }
+
+    fn newest(&self, look: &mut dyn FnMut(&Value<'_>)) {
+        if let Some(value) = lock(&self.newest).value() {
+            look(&value);
+        }
+    }
+}
+
+/// A stream of a node, as the handles of this process share it.
+pub(crate) struct Watched {
+    pub(crate) name: String,
+    state: Mutex<WatchedState>,
+    changed: Condvar,
+}
+
+#[derive(Default)]
+struct WatchedState {
+    /// The handles, and the interval that each wants.
+    wants: Vec<(u64, Duration)>,
+    last_id: u64,
+    newest: Option<Received>,
+    /// Values that have come.
+    count: u64,
+    /// So many had come when the newest one was passed on.
+    passed: u64,
+    refused: Option<Error>,
+    relays: Vec<Weak<OwnStream>>,
+}
+
+/// A value as it came.
+#[derive(Clone)]
+pub(crate) struct Received {
+    pub(crate) signature: Arc<[u8]>,
+    pub(crate) block: Arc<[u8]>,
+    /// On arrival.
+    pub(crate) age: Duration,
+    pub(crate) arrived: Instant,
+}
+
+impl Received {
+    pub(crate) fn age_at(&self, now: Instant) -> Duration {
+        self.age + now.since(self.arrived)
+    }
+}
+
+impl Watched {
+    pub(super) fn new(name: &str) -> Self {
+        Self { name: name.to_owned(), state: Mutex::default(), changed: Condvar::new() }
+    }
+
+    /// The newest value, and how many have come.
+    pub(crate) fn newest(&self) -> (Option<Received>, u64) {
+        let state = lock(&self.state);
+        (state.newest.clone(), state.count)
+    }
+
+    /// Waits until more than `seen` values have come, or for so long; [`Error::TimedOut`], or why there is no subscription.
+    pub(crate) fn wait(&self, seen: u64, at_most: std::time::Duration) -> Result<(Received, u64), Error> {
+        let mut state = lock(&self.state);
+        let waits = |state: &mut WatchedState| state.refused.is_none() && state.count <= seen;
+        if waits(&mut state) {
+            let waited = self.changed.wait_timeout_while(state, at_most, waits);
+            state = waited.unwrap_or_else(PoisonError::into_inner).0;
+        }
+        match (&state.newest, state.refused) {
+            (_, Some(error)) => Err(error),
+            (Some(newest), None) if state.count > seen => Ok((newest.clone(), state.count)),
+            _ => Err(Error::TimedOut),
+        }
+    }
+
+    /// Values go on to this stream of the unit's own.
+    pub(crate) fn relay_to(&self, own: &Arc<OwnStream>) {
+        let mut state = lock(&self.state);
+        state.relays.retain(|relay| relay.strong_count() > 0);
+        state.relays.push(Arc::downgrade(own));
+    }
+
+    /// A value has come; whether it is to go on.
+    fn receive(&self, now: Instant, age: Duration, block: &ReplyBlock<'_>) -> bool {
+        let mut state = lock(&self.state);
+        let signature = block.signature();
+        let known = state.newest.as_ref().map(|newest| &newest.signature);
+        let signature = match known.filter(|known| known[..] == *signature.as_bytes()) {
+            Some(known) => known.clone(),
+            None => signature.as_bytes().into(),
+        };
+        state.newest = Some(Received { signature, block: block.bytes().into(), age, arrived: now });
+        state.count += 1;
+        state.refused = None;
+        self.changed.notify_all();
+        !state.relays.is_empty()
+    }
+
+    fn was_answered(&self, answer: Result<GrantedStream, Error>) {
+        lock(&self.state).refused = answer.err();
+        self.changed.notify_all();
+    }
+
+    fn interval(&self) -> Option<Duration> {
+        lock(&self.state).wants.iter().map(|(_, interval)| *interval).min()
+    }
+
+    fn want(&self, interval: Duration) -> u64 {
+        let mut state = lock(&self.state);
+        state.last_id += 1;
+        let id = state.last_id;
+        state.wants.push((id, interval));
+        id
+    }
+
+    /// Whether no handle is left.
+    fn want_no_more(&self, id: u64) -> bool {
+        let mut state = lock(&self.state);
+        state.wants.retain(|(known, _)| *known != id);
+        state.wants.is_empty()
+    }
+
+    /// Passes the newest value on; whether there was anything to pass on to.
+    fn pass_on(&self, now: Instant) -> bool {
+        let (newest, relays) = {
+            let mut state = lock(&self.state);
+            if state.passed == state.count {
+                return false;
+            }
+            state.passed = state.count;
+            (state.newest.clone(), state.relays.clone())
+        };
+        let Some(newest) = newest else { return false };
+        let passed = relays.iter().filter_map(Weak::upgrade).map(|own| {
+            // A value that has become longer than declared comes under another signature, which the relay does not have.
+            own.put(|own| own.pass_on(now, newest.age_at(now), &newest.block))
+        });
+        passed.filter(Result::is_ok).count() > 0
+    }
+}
+
+impl PeerCell {
+    /// The stream of this name, if it is read here.
+    fn watched(&self, name: &str) -> Option<Arc<Watched>> {
+        lock(&self.streams).get(name).cloned()
+    }
+}
+
+impl<T: Send + 'static> Engine<T> {
+    /// A stream of this unit has a new value: it goes to each node whose turn it is.
+    pub(crate) fn stream_published(&self) {
+        for link in self.each_link() {
+            if !link.has_subscriptions() {
+                continue;
+            }
+            let mut state = link.lock();
+            if state.session.stream_changed(self.now()) {
+                self.settle(&link, state);
+            }
+        }
+    }
+
+    /// One more handle reads a stream of a node.
+    pub(crate) fn subscribe_to(&self, peer: &PeerCell, name: &str, interval: Duration) -> (Arc<Watched>, u64) {
+        let (watched, id) = {
+            let mut streams = lock(&peer.streams);
+            let watched = streams.entry(name.to_owned()).or_insert_with(|| Arc::new(Watched::new(name))).clone();
+            let id = watched.want(interval);
+            (watched, id)
+        };
+        self.tell_subscription(peer, &watched);
+        (watched, id)
+    }
+
+    /// A handle is dropped.
+    pub(crate) fn unsubscribe(&self, peer: &PeerCell, watched: &Watched, id: u64) {
+        {
+            let mut streams = lock(&peer.streams);
+            if watched.want_no_more(id) {
+                streams.remove(&watched.name);
+            }
+        }
+        self.tell_subscription(peer, watched);
+    }
+
+    fn tell_subscription(&self, peer: &PeerCell, watched: &Watched) {
+        let Some(link) = peer.link() else { return };
+        self.tell_on(&link, peer, watched);
+    }
+
+    fn tell_on(&self, link: &Arc<LinkCell>, peer: &PeerCell, watched: &Watched) {
+        let mut state = link.lock();
+        // Read under the lock of the link: of two threads the last one tells what holds.
+        let interval = peer.watched(&watched.name).and_then(|watched| watched.interval());
+        let told = self.with(link, &mut state, |session, cx| match interval {
+            Some(interval) => session.subscribe(cx, &watched.name, interval).map(drop),
+            None => {
+                session.unsubscribe(cx, &watched.name);
+                Ok(())
+            }
+        });
+        if let Err(error @ Error::UnknownFunction) = told {
+            watched.was_answered(Err(error));
+        }
+        self.settle(link, state);
+    }
+
+    /// A node has told its list: what is read of it is subscribed to.
+    pub(super) fn subscribe_again(&self, link: &Arc<LinkCell>) {
+        let Some(peer) = link.peer.get() else { return };
+        let all: Vec<_> = lock(&peer.streams).values().cloned().collect();
+        all.iter().for_each(|watched| self.tell_on(link, peer, watched));
+    }
+
+    /// Whether a value is to go on to a stream of this unit.
+    pub(super) fn sample_arrived(&self, now: Instant, link: &LinkCell, age: Duration, block: &ReplyBlock<'_>) -> bool {
+        let watched = link.peer.get().and_then(|peer| peer.watched(block.signature().name()));
+        watched.is_some_and(|watched| watched.receive(now, age, block))
+    }
+
+    pub(super) fn subscription_answered(&self, link: &LinkCell, slot: Slot, answer: Result<GrantedStream, Error>) {
+        let watched = {
+            let state = link.lock();
+            let stream = state.session.their_function_list().function(slot);
+            link.peer.get().zip(stream).and_then(|(peer, stream)| peer.watched(stream.name()))
+        };
+        if let Some(watched) = watched {
+            watched.was_answered(answer);
+        }
+    }
+
+    /// Values have come that go on to streams of this unit.
+    pub(super) fn pass_on_samples(&self, link: &LinkCell) {
+        let Some(peer) = link.peer.get() else { return };
+        let all: Vec<_> = lock(&peer.streams).values().cloned().collect();
+        let now = self.now();
+        if all.iter().filter(|watched| watched.pass_on(now)).count() > 0 {
+            self.stream_published();
+        }
+    }
+}
