@@ -30,6 +30,7 @@ pub(crate) enum Verb {
     Retire(commands::retire::Arguments),
     Set(commands::set::Arguments),
     Watch(commands::watch::Arguments),
+    Stream(commands::stream::Arguments),
     Counters(commands::counters::Arguments),
     Ping(commands::ping::Arguments),
     Bench(commands::bench::Arguments),

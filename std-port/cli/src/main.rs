@@ -34,6 +34,7 @@ fn run(verb: Verb, global: &Global) -> anyhow::Result<ExitCode> {
         Verb::Retire(arguments) => commands::retire::run(arguments, global),
         Verb::Set(arguments) => commands::set::run(arguments, global),
         Verb::Watch(arguments) => commands::watch::run(arguments, global),
+        Verb::Stream(arguments) => commands::stream::run(arguments, global),
         Verb::Counters(arguments) => commands::counters::run(arguments, global),
         Verb::Ping(arguments) => commands::ping::run(arguments, global),
         Verb::Bench(arguments) => commands::bench::run(arguments, global),

@@ -140,7 +140,7 @@ fn of_its_lease(failure: Failure, function: &str, ended_us: Option<u64>) -> Fail
 }
 
 /// The results, of which those of size 1 are a value and no list of one.
-fn values(results: &[Argument]) -> Vec<Value> {
+pub(super) fn values(results: &[Argument]) -> Vec<Value> {
     let one = |value: Value| match value {
         Value::Array(list) if list.len() == 1 => list.into_iter().next().unwrap_or_default(),
         value => value,

@@ -14,4 +14,5 @@ pub(crate) mod retire;
 pub(crate) mod scan;
 pub(crate) mod set;
 pub(crate) mod stop;
+pub(crate) mod stream;
 pub(crate) mod watch;

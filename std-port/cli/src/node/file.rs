@@ -145,7 +145,7 @@ impl Function {
     pub(super) fn attributes(&self) -> Attributes {
         let priority = self.priority.map(Into::into).unwrap_or_default();
         let Self { idempotent, stop, reset, .. } = *self;
-        Attributes { priority, idempotent, stop, reset, lease: None, actuator: 0 }
+        Attributes { priority, idempotent, stop, reset, lease: None, actuator: 0, stream: None }
     }
 }
 

@@ -16,6 +16,7 @@ const VERBS: &[&[&str]] = &[
     &["publish"],
     &["set", ".", "request_timeout", "2s"],
     &["watch"],
+    &["stream", "agv-1"],
     &["counters"],
     &["ping", "agv-1"],
     &["bench", "agv-1"],

@@ -11,5 +11,6 @@ mod managers;
 mod measuring;
 mod scanning;
 mod stopping;
+mod streaming;
 mod support;
 mod watching;

@@ -1,0 +1,68 @@
+//! `cara stream`.
+
+use cara_std::{Definition, Duration, Parameters};
+
+use crate::support::{PATIENCE, Running, Stage};
+
+/// An AGV with `pose`, which has a value, and `battery`, which has none.
+fn stage() -> (Stage, cara_std::Unit, cara_std::Stream) {
+    let stage = Stage::with(&[]);
+    stage.know("agv-1", 11);
+    let agv = stage.vehicle("agv-1", 11).build().unwrap();
+    let list = agv.my_function_list();
+    let pose = list.add_stream(&Definition::stream("pose(x: int)").unwrap(), Duration::ZERO).unwrap();
+    list.add_stream(&Definition::stream("battery(percent: float)").unwrap(), Duration::ZERO).unwrap();
+    put(&pose, 7);
+    agv.publish_my_function_list().unwrap();
+    agv.start().unwrap();
+    let start = std::time::Instant::now();
+    while !stage.cara(&["functions", "agv-1"]).everything().contains("pose") {
+        assert!(start.elapsed() < PATIENCE);
+        std::thread::sleep(std::time::Duration::from_millis(50));
+    }
+    (stage, agv, pose)
+}
+
+fn put(pose: &cara_std::Stream, x: i64) {
+    let mut values = Parameters::new();
+    values.add_int("x", 1).unwrap();
+    values.set_value("x", x).unwrap();
+    pose.publish(&values).unwrap();
+}
+
+#[test]
+fn values_come_with_age_and_time() {
+    let (stage, agv, pose) = stage();
+    let mut people = Running::start(stage.command(&["stream", "agv-1", "pose"]));
+    let mut programs = Running::start(stage.command(&["stream", "agv-1", "pose", "--json", "--count", "2"]));
+    let line = people.expect("pose(x: 7)");
+    assert!(line.ends_with(" old") && line.contains(':'), "{line}");
+    let last: serde_json::Value = serde_json::from_str(&programs.expect("unix_ms")).unwrap();
+    assert_eq!((&last["node"], &last["values"][0]["value"]), (&"agv-1/11".into(), &7.into()));
+    assert!(last["age_us"].as_u64().unwrap() > 1_000, "{last}");
+    put(&pose, 8);
+    people.expect("pose(x: 8)");
+    programs.expect("8");
+    assert_eq!(programs.end(), 0);
+    agv.stop();
+}
+
+#[test]
+fn without_a_name_each_stream_is_listed_once() {
+    let (stage, agv, _) = stage();
+    stage.ends(0, &["stream", "agv-1"]).says("pose(x: 7)").says("battery() -> (percent: float)  no value yet");
+    let listed = stage.ends(0, &["stream", "agv-1", "--json"]);
+    assert_eq!(listed.lines().len(), 2);
+    assert!(stage.cara(&["functions", "agv-1"]).everything().contains("stream"));
+    agv.stop();
+}
+
+#[test]
+fn what_is_no_stream_is_said() {
+    let (stage, agv, _) = stage();
+    let told = stage.cara(&["stream", "agv-1", "speed", "--json"]).error();
+    assert_eq!(told["name"], "UnknownFunction", "{told}");
+    stage.ends(2, &["stream", "agv-1", "pose", "--rate", "0"]);
+    stage.ends(2, &["stream", "agv-1", "--rate", "1"]);
+    agv.stop();
+}
