@@ -56,7 +56,7 @@ impl<T> Handle<T> {
 /// The functions that a unit offers, looked at now. Adding one makes nothing visible: that is what publishing
 /// is for.
 pub struct MyFunctionList<T: 'static> {
-    unit: Handle<T>,
+    pub(crate) unit: Handle<T>,
 }
 
 impl<T> fmt::Debug for MyFunctionList<T> {
@@ -98,7 +98,14 @@ impl<T> MyFunctionList<T> {
             if signature.parameters_bytes() as usize > limit {
                 return Err(Error::TooLarge { limit: u32::try_from(limit).unwrap_or(u32::MAX) });
             }
-            let listed = Listed { handler, lease, safe, then };
+            let listed = Listed {
+                handler,
+                lease,
+                safe,
+                then,
+                #[cfg(feature = "streams")]
+                stream: None,
+            };
             let replaced = machine.functions.find(signature.name()).and_then(|slot| machine.functions.function(slot));
             let replaced = replaced.map(|function| *function.handler);
             put(&mut machine.functions, signature, attributes, listed)?;

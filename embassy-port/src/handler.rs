@@ -195,15 +195,7 @@ impl<T> Default for ServiceOptions<T> {
 impl<T> ServiceOptions<T> {
     /// Normal priority, no lease.
     pub const fn new() -> Self {
-        let attributes = Attributes {
-            priority: Priority::Normal,
-            lease: None,
-            idempotent: false,
-            actuator: 0,
-            stop: false,
-            reset: false,
-        };
-        Self { attributes, lease: None, safe: None, then: None }
+        Self { attributes: Attributes::NORMAL, lease: None, safe: None, then: None }
     }
 
     /// The class of calls that name none.
@@ -270,6 +262,9 @@ pub(crate) struct Listed<T: 'static> {
     pub(crate) lease: Option<&'static Lease>,
     pub(crate) safe: Option<&'static Safe>,
     pub(crate) then: Option<&'static Hook<T>>,
+    /// Its newest value, of a stream.
+    #[cfg(feature = "streams")]
+    pub(crate) stream: Option<&'static dyn crate::streams::Cell>,
 }
 
 impl<T> Clone for Listed<T> {
@@ -293,5 +288,10 @@ impl<T> Listed<T> {
 impl<T> Service for Listed<T> {
     fn lease(&self) -> Option<&Lease> {
         self.lease
+    }
+
+    #[cfg(feature = "streams")]
+    fn stream(&self) -> Option<&dyn cara_core::services::stream::Source> {
+        self.stream.map(|cell| cell as &dyn cara_core::services::stream::Source)
     }
 }

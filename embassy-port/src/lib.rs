@@ -100,6 +100,8 @@ mod replies;
 mod resources;
 mod runner;
 mod security;
+#[cfg(feature = "streams")]
+mod streams;
 mod taken;
 mod time;
 
@@ -119,5 +121,7 @@ pub use peer::{Peer, TheirFunctionList};
 pub use resources::{Memory, Resources, new};
 pub use runner::Runner;
 pub use security::Security;
+#[cfg(feature = "streams")]
+pub use streams::{Stream, StreamCell};
 pub use taken::TakenCall;
 pub use time::now;

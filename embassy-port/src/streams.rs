@@ -1,0 +1,145 @@
+//! Streams of a board: named values that change, which any task publishes without allocation. A board publishes; it does
+//! not subscribe.
+
+use core::cell::RefCell;
+use core::fmt;
+
+use cara_core::config::Priority;
+use cara_core::distribution::block;
+use cara_core::distribution::function::{Attributes, Definition, Signature};
+use cara_core::distribution::function_list::Slot;
+use cara_core::distribution::parameters::ParametersView;
+use cara_core::error::{Error, ServiceError};
+use cara_core::services::stream::{Newest, Source, Value};
+use cara_core::time::Duration;
+
+use crate::functions::MyFunctionList;
+use crate::handle::Handle;
+use crate::handler::{Handler, Listed};
+use crate::time::now;
+
+/// Room for the newest value of a stream of `BYTES` bytes: 8 for each int and float, and for each 8 truth values; a string or
+/// bytes take 8, and their size rounded up to a multiple of 8.
+pub struct StreamCell<const BYTES: usize>(RefCell<Newest<[u8; BYTES]>>);
+
+impl<const BYTES: usize> fmt::Debug for StreamCell<BYTES> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("StreamCell").field("bytes", &BYTES).finish_non_exhaustive()
+    }
+}
+
+impl<const BYTES: usize> StreamCell<BYTES> {
+    /// Without a value.
+    pub const fn new() -> Self {
+        Self(RefCell::new(Newest::new([0; BYTES])))
+    }
+}
+
+impl<const BYTES: usize> Default for StreamCell<BYTES> {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+/// A stream's cell, whatever its size.
+pub(crate) trait Cell: Source {
+    fn publish(&self, signature: Signature<'_>, values: &ParametersView) -> Result<(), Error>;
+}
+
+impl<const BYTES: usize> Source for StreamCell<BYTES> {
+    fn version(&self) -> u32 {
+        self.0.borrow().version()
+    }
+
+    fn newest(&self, look: &mut dyn FnMut(&Value<'_>)) {
+        if let Some(value) = self.0.borrow().value() {
+            look(&value);
+        }
+    }
+}
+
+impl<const BYTES: usize> Cell for StreamCell<BYTES> {
+    fn publish(&self, signature: Signature<'_>, values: &ParametersView) -> Result<(), Error> {
+        self.0.borrow_mut().publish(now(), Duration::ZERO, signature, values)
+    }
+}
+
+/// A stream of this unit.
+pub struct Stream<T: 'static> {
+    unit: Handle<T>,
+    slot: Slot,
+    cell: &'static dyn Cell,
+}
+
+impl<T> Clone for Stream<T> {
+    fn clone(&self) -> Self {
+        *self
+    }
+}
+
+impl<T> Copy for Stream<T> {}
+
+impl<T> fmt::Debug for Stream<T> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Stream").field("slot", &self.slot).finish_non_exhaustive()
+    }
+}
+
+impl<T> Stream<T> {
+    /// Publishes a new value: the newest one goes to each subscriber as often as that one wants it. It does not wait.
+    ///
+    /// [`Error::MissingArgument`], [`Error::WrongType`] and [`Error::WrongSize`] where `values` are not what the stream
+    /// declares, and [`Error::UnknownFunction`] where it has been removed.
+    pub fn publish(&self, values: &ParametersView) -> Result<(), Error> {
+        self.unit.act(|machine| {
+            let function = machine.functions.function(self.slot).ok_or(Error::UnknownFunction)?;
+            let is_same = function.handler.stream.is_some_and(|cell| core::ptr::addr_eq(cell, self.cell));
+            if !is_same {
+                return Err(Error::UnknownFunction);
+            }
+            self.cell.publish(function.signature, values)?;
+            machine.each_link(|session, cx| {
+                session.stream_changed(cx.now);
+            });
+            Ok(())
+        })
+    }
+}
+
+impl<T> MyFunctionList<T> {
+    /// Adds a stream in its text form, as in `pose(position: float[2])`. A subscriber gets its values at least
+    /// `least_interval` apart, in whole milliseconds, up to 65 s. Like a function it is seen by those to which the list is
+    /// published.
+    ///
+    /// [`Error::BadName`] for a text that cannot be read, [`Error::TooLarge`] for a cell that is too small,
+    /// [`Error::NameTaken`], [`Error::Full`].
+    pub fn add_stream<const BYTES: usize>(
+        &self,
+        stream: &str,
+        least_interval: Duration,
+        cell: &'static StreamCell<BYTES>,
+    ) -> Result<Stream<T>, Error> {
+        let definition = Definition::stream(stream).map_err(|_| Error::BadName)?;
+        if block::longest(definition.signature().results()).is_none_or(|longest| longest > BYTES) {
+            return Err(Error::TooLarge { limit: u32::try_from(BYTES).unwrap_or(u32::MAX) });
+        }
+        let least = u16::try_from(least_interval.as_millis()).unwrap_or(u16::MAX);
+        let attributes = Attributes { priority: Priority::Low, stream: Some(least), ..Attributes::NORMAL };
+        // Never run: a call of a stream is refused before.
+        let handler = Handler::free(&|_, _| Err(ServiceError::NotReady));
+        let listed = Listed { handler, lease: None, safe: None, then: None, stream: Some(cell) };
+        let slot = self.unit.act(|machine| machine.functions.add_function(&definition, attributes, listed))?;
+        Ok(Stream { unit: self.unit, slot, cell })
+    }
+}
+
+impl<T> Handle<T> {
+    /// A stream of this unit, as [added](MyFunctionList::add_stream) before.
+    pub fn stream(&self, name: &str) -> Option<Stream<T>> {
+        let (slot, cell) = self.look(|machine| {
+            let slot = machine.functions.find(name)?;
+            Some((slot, machine.functions.function(slot)?.handler.stream?))
+        })?;
+        Some(Stream { unit: *self, slot, cell })
+    }
+}
