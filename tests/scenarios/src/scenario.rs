@@ -43,11 +43,13 @@ pub enum Need {
     Panics,
     /// An m_unit that is told to which m_units it connects.
     Choice,
+    /// A unit that publishes streams, and reads those of others.
+    Streams,
 }
 
 impl Need {
     /// All of them.
-    pub const ALL: [Self; 19] = [
+    pub const ALL: [Self; 20] = [
         Self::Crash,
         Self::Partition,
         Self::Freeze,
@@ -67,6 +69,7 @@ impl Need {
         Self::SameSeed,
         Self::Panics,
         Self::Choice,
+        Self::Streams,
     ];
 
     /// Why a port lacks it; `None` where it does not.
@@ -104,6 +107,7 @@ impl Need {
             Self::ExactTime => "instants depend on the machine's load",
             Self::Panics
             | Self::Choice
+            | Self::Streams
             | Self::Freeze
             | Self::Reset
             | Self::SlowReader
@@ -123,6 +127,7 @@ impl Need {
             Self::Backlog => "a board refuses connections while its few sockets are busy",
             Self::ManyUnits => "more nodes than a board has links for",
             Self::Panics => "a panic restarts a board",
+            Self::Streams => "its nodes are those of boards without the feature `streams`",
             Self::Choice => "a board that is an m_unit has few links, and meets every m_unit",
             _ => return None,
         })

@@ -23,6 +23,7 @@ pub struct Spec {
     pub(crate) fleet: u32,
     pub(crate) constraints: Constraints,
     pub(crate) services: Vec<Service>,
+    pub(crate) streams: Vec<&'static str>,
     pub(crate) published: bool,
     pub(crate) their_functions: usize,
     pub(crate) message_buffers: usize,
@@ -51,6 +52,7 @@ impl Spec {
             fleet: 0,
             constraints,
             services: Vec::new(),
+            streams: Vec::new(),
             published: true,
             their_functions: 48,
             message_buffers: 32,
@@ -89,6 +91,12 @@ impl Spec {
     /// A service that it has from the start.
     pub fn service(mut self, service: &Service) -> Self {
         self.services.push(service.clone());
+        self
+    }
+
+    /// A stream in its text form that it has from the start.
+    pub fn stream(mut self, stream: &'static str) -> Self {
+        self.streams.push(stream);
         self
     }
 

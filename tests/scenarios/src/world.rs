@@ -19,7 +19,7 @@ use cara_core::services::requests::CallId;
 use cara_core::services::session::RequestOptions;
 use cara_core::term::Term;
 use cara_core::time::{Duration, Instant};
-use cara_sim::{BoxedParameters, Path};
+use cara_sim::{BoxedParameters, Path, Sample};
 
 use crate::{Need, Service, Spec, UnknownClient, boxed, secs};
 
@@ -242,6 +242,26 @@ pub trait Node {
     fn begin(&self, peer: &str, function: &str, parameters: &ParametersView, options: RequestOptions) -> Pending;
     /// The synchronous request to all, likewise, in a task of its own.
     fn begin_all(&self, function: &str, parameters: &ParametersView) -> PendingAll;
+    /// Publishes a new value of a stream.
+    fn put(&self, _stream: &str, _values: &ParametersView) -> Result<(), Error> {
+        Err(Error::Unsupported)
+    }
+    /// Reads a stream of a peer from now on.
+    fn subscribe(&self, _peer: &str, _stream: &str, _interval: Duration) -> Result<(), Error> {
+        Err(Error::Unsupported)
+    }
+    /// Reads it no more.
+    fn unsubscribe(&self, _peer: &str, _stream: &str) -> Result<(), Error> {
+        Err(Error::Unsupported)
+    }
+    /// The values of a stream that have come.
+    fn samples(&self, _peer: &str, _stream: &str) -> Vec<Sample> {
+        Vec::new()
+    }
+    /// Why there is no subscription, if it was refused.
+    fn subscription_refused(&self, _peer: &str, _stream: &str) -> Option<Error> {
+        None
+    }
     /// Gives up the lease on a function of a peer.
     fn release(&self, peer: &str, function: &str) -> Result<(), Error>;
     /// A heart for one loop of the unit.

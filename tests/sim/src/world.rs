@@ -35,6 +35,7 @@ mod replies;
 mod requests;
 mod service;
 mod state;
+mod streams;
 mod tasks;
 
 pub use actuator::{Actuator, Heart};
@@ -45,6 +46,7 @@ pub use handle::{Peer, UnitHandle};
 pub use keys::Ring;
 pub use requests::Hold;
 pub use service::{BoxedParameters, Call, LeaseWatch, Outcome, Service, boxed_parameters};
+pub use streams::Sample;
 
 use audited::Seals;
 use replies::Promise;

@@ -21,6 +21,7 @@ use cara_core::services::access::Rule;
 use cara_core::services::requests::CallId;
 use cara_core::services::session::RequestOptions;
 use cara_core::time::{Duration, Instant};
+use cara_sim::Sample;
 use cara_std::access::AccessTable;
 use cara_std::{
     BuildError, Builder, Call, Capacities, CommunicationSystem, Interfaces, LeaseWatch, MyFunctionList, Peer,
@@ -77,6 +78,15 @@ struct LinuxNode {
     leases: Mutex<BTreeMap<String, LeaseWatch>>,
     /// Of the calls of each service.
     orders: Mutex<BTreeMap<String, Vec<LeaseWatch>>>,
+    readings: Mutex<BTreeMap<(String, String), Arc<Mutex<Reading>>>>,
+}
+
+/// A stream of a peer that a thread reads.
+#[derive(Default)]
+struct Reading {
+    samples: Vec<Sample>,
+    refused: Option<Error>,
+    over: bool,
 }
 
 struct Handle {
@@ -186,6 +196,7 @@ impl World for LinuxWorld {
             losses: Arc::default(),
             leases: Mutex::default(),
             orders: Mutex::default(),
+            readings: Mutex::default(),
         });
         node.start();
         self.units.push(Arc::clone(&node));
@@ -271,6 +282,10 @@ impl LinuxNode {
         *lock(&self.machine) = Some(Arc::clone(&machine));
         for service in &self.spec.services {
             self.add(service, false).expect("a unit has room for its services");
+        }
+        for stream in &self.spec.streams {
+            let stream = Definition::stream(stream).expect("it is a stream");
+            machine.functions().add_stream(&stream, Duration::ZERO).expect("a unit has room for its streams");
         }
         if self.spec.published {
             machine.publish().expect("what was added can be published");
@@ -584,6 +599,58 @@ impl Node for Handle {
             told.end(outcomes.map(|outcomes| outcomes.into_iter().map(short).collect()), node.now());
         });
         pending
+    }
+
+    fn put(&self, stream: &str, values: &ParametersView) -> Result<(), Error> {
+        let own = match &*self.node.machine()? {
+            Machine::Manager(system) => system.stream(stream),
+            Machine::Agv(unit) => unit.stream(stream),
+        };
+        own.ok_or(Error::UnknownFunction)?.publish(values)
+    }
+
+    fn subscribe(&self, peer: &str, stream: &str, interval: Duration) -> Result<(), Error> {
+        let mut subscription = self.node.peer(peer)?.stream(stream)?.subscribe(interval);
+        let (node, reading) = (Arc::clone(&self.node), Arc::<Mutex<Reading>>::default());
+        lock(&self.node.readings).insert((peer.to_owned(), stream.to_owned()), Arc::clone(&reading));
+        thread::spawn(move || {
+            while !lock(&reading).over {
+                let next = subscription.next(Duration::from_millis(20));
+                let mut reading = lock(&reading);
+                match next {
+                    Ok(sample) => {
+                        let (at, age, values) = (node.now(), sample.age(), sample.values().into());
+                        reading.samples.push(Sample { at, age, values });
+                    }
+                    Err(Error::TimedOut) => reading.refused = None,
+                    Err(Error::NotRunning) => return,
+                    Err(error) => {
+                        reading.refused = Some(error);
+                        drop(reading);
+                        thread::sleep(LOOK);
+                    }
+                }
+            }
+        });
+        Ok(())
+    }
+
+    fn unsubscribe(&self, peer: &str, stream: &str) -> Result<(), Error> {
+        if let Some(reading) = lock(&self.node.readings).get(&(peer.to_owned(), stream.to_owned())) {
+            lock(reading).over = true;
+        }
+        Ok(())
+    }
+
+    fn samples(&self, peer: &str, stream: &str) -> Vec<Sample> {
+        let readings = lock(&self.node.readings);
+        let reading = readings.get(&(peer.to_owned(), stream.to_owned()));
+        reading.map(|reading| lock(reading).samples.clone()).unwrap_or_default()
+    }
+
+    fn subscription_refused(&self, peer: &str, stream: &str) -> Option<Error> {
+        let readings = lock(&self.node.readings);
+        readings.get(&(peer.to_owned(), stream.to_owned())).and_then(|reading| lock(reading).refused)
     }
 
     fn release(&self, peer: &str, function: &str) -> Result<(), Error> {

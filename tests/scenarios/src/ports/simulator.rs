@@ -17,7 +17,7 @@ use cara_core::services::access::Rule;
 use cara_core::services::requests::CallId;
 use cara_core::services::session::RequestOptions;
 use cara_core::time::{Duration, Instant};
-use cara_sim::{Action, Chance, Crash, Direction, HostId, LeaseWatch, Path, StreamId, UnitEvent, UnitHandle};
+use cara_sim::{Action, Chance, Crash, Direction, HostId, LeaseWatch, Path, Sample, StreamId, UnitEvent, UnitHandle};
 
 use super::lent;
 use crate::run::Report;
@@ -137,8 +137,8 @@ impl World for SimWorld {
     }
 
     fn add(&mut self, spec: Spec) -> Unit {
-        let Spec { role, name, id, fleet, constraints, services, published, their_functions, message_buffers, .. } =
-            spec;
+        let Spec { role, name, id, fleet, constraints, services, streams, .. } = spec;
+        let Spec { published, their_functions, message_buffers, .. } = spec;
         let new = match role {
             SpecRole::Manager => self.world.m_unit(&name, id),
             SpecRole::Agv(manager, manager_id) => self.world.s_unit(&name, id).joins(&manager, manager_id),
@@ -160,6 +160,9 @@ impl World for SimWorld {
                 unit.my_function_list()
                     .add_service(&service.signature, simulated(service, &begun))
                     .expect("a unit has room for its services");
+            }
+            for stream in &streams {
+                unit.add_stream(stream, Duration::ZERO).expect("a unit has room for its streams");
             }
             if published {
                 unit.publish_my_function_list().expect("what was added can be published");
@@ -488,6 +491,26 @@ impl Node for SimNode {
             told.end(Ok(outcomes), unit.now());
         });
         pending
+    }
+
+    fn put(&self, stream: &str, values: &ParametersView) -> Result<(), Error> {
+        self.handle.put(stream, values)
+    }
+
+    fn subscribe(&self, peer: &str, stream: &str, interval: Duration) -> Result<(), Error> {
+        self.handle.subscribe(peer, stream, interval)
+    }
+
+    fn unsubscribe(&self, peer: &str, stream: &str) -> Result<(), Error> {
+        self.handle.unsubscribe(peer, stream)
+    }
+
+    fn samples(&self, peer: &str, stream: &str) -> Vec<Sample> {
+        self.handle.samples(peer, stream)
+    }
+
+    fn subscription_refused(&self, peer: &str, stream: &str) -> Option<Error> {
+        self.handle.subscription_refused(peer, stream)
     }
 
     fn release(&self, peer: &str, function: &str) -> Result<(), Error> {

@@ -22,6 +22,7 @@ mod orders;
 mod priorities;
 mod publishing;
 mod slow;
+mod streams;
 
 use std::sync::{Arc, Mutex};
 
@@ -53,6 +54,7 @@ pub fn all() -> Vec<Scenario> {
         best_effort::SCENARIOS,
         slow::SCENARIOS,
         everybody::SCENARIOS,
+        streams::SCENARIOS,
         anything::SCENARIOS,
     ]
     .concat()

@@ -16,6 +16,7 @@ use super::handle::UnitHandle;
 use super::links::{Happened, Link, Links};
 use super::service::{BoxedParameters, Call, Handler, LeaseWatch};
 use super::state::NODE_TIMER;
+use super::streams::Sample;
 use super::tasks::Owner;
 use super::{Inner, LogEvent, Shared, UnitEvent};
 use crate::event::{HostId, NetEvent, StreamId};
@@ -223,7 +224,24 @@ impl Inner {
         match happened {
             (Event::Call(call), Some(parameters)) => self.serve(shared, host, index, &call, parameters),
             (Event::Closed(reason), _) => self.closed(shared, host, index, reason),
+            (Event::Sample(sample), Some(values)) => {
+                let (at, age) = (self.network.now(), sample.age);
+                let Some(machine) = &mut self.units[host.index()].machine else { return };
+                if let Some(stream) = machine.links.stream_of(index, sample.slot) {
+                    machine.links.sample_arrived(index, &stream, Sample { at, age, values: values.into() });
+                }
+            }
+            (Event::Subscribed(slot, answer), _) => {
+                let Some(machine) = &mut self.units[host.index()].machine else { return };
+                if let Some(stream) = machine.links.stream_of(index, slot) {
+                    machine.links.subscription_answered(index, &stream, answer.err());
+                }
+            }
             (event, _) => {
+                if let (Event::ListChanged, Some(machine)) = (event, &mut self.units[host.index()].machine) {
+                    machine.links.subscribe(&mut self.network, index);
+                    machine.links.arm(&mut self.network, index);
+                }
                 if let Event::LeaseExpired(slot) = event {
                     self.make_safe(shared, host, slot);
                 }

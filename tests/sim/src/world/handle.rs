@@ -56,7 +56,7 @@ impl From<&Self> for Peer {
 }
 
 impl Peer {
-    fn is(&self, identity: &Identity) -> bool {
+    pub(super) fn is(&self, identity: &Identity) -> bool {
         match self {
             Self::Named(name) => identity.name() == name,
             Self::Is(wanted) => identity == wanted,

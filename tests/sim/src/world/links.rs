@@ -18,6 +18,7 @@ use super::keys::Keys;
 use super::mail::{LazyPool, SimMailman};
 use super::replies::{Promise, Waiting};
 use super::service::{BoxedParameters, Handler};
+use super::streams::Reading;
 use crate::event::{HostId, StreamId};
 use crate::network::Network;
 use crate::storage::Boxed;
@@ -63,6 +64,8 @@ pub(super) struct Links {
     pub(super) access: Option<&'static dyn Access>,
     pub(super) hub: Hub<Simulated>,
     pub(super) keys: Keys,
+    /// Streams of other units that are read.
+    pub(super) readings: Vec<Reading>,
     arguments: BoxedParameters,
 }
 
@@ -90,6 +93,7 @@ impl Links {
             access: None,
             hub,
             keys,
+            readings: Vec::new(),
             arguments,
         }
     }
@@ -434,6 +438,12 @@ fn note(
                 }
                 !reached
             });
+        }
+        Some(event @ Event::Sample(sample)) => {
+            let block = link.session.results(&sample.values, lent).expect("it has just come");
+            let mut values = super::service::boxed_parameters(block.signature().parameters_bytes() as usize);
+            block.read_into(&mut values).expect("it was checked");
+            happened.push((event, Some(values)));
         }
         Some(event @ Event::Call(call)) => happened.push((event, Some(own(functions, call.slot, arguments)))),
         Some(event) => happened.push((event, None)),

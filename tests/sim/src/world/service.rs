@@ -17,6 +17,7 @@ use cara_core::time::{Duration, Instant};
 
 use super::actuator::Actuator;
 use super::handle::UnitHandle;
+use super::streams::Values;
 
 /// Parameters of any size on the heap.
 pub type BoxedParameters = Box<ParametersView>;
@@ -120,6 +121,8 @@ pub struct Service {
     pub(super) attributes: Attributes,
     /// What it moves, or what it alone stops or resets.
     pub(super) actuator: Option<Actuator>,
+    /// The newest value, of a stream.
+    pub(super) values: Option<Values>,
 }
 
 impl Service {
@@ -156,8 +159,14 @@ impl Service {
         }
     }
 
+    /// A stream, which is not called.
+    pub(super) fn stream(values: Values) -> Self {
+        Self { values: Some(values), ..Self::new(|_, _| Err(ServiceError::NotReady)) }
+    }
+
     fn with(body: Body) -> Self {
-        Self { body, takes: Duration::ZERO, survives_panics: false, attributes: Attributes::default(), actuator: None }
+        let attributes = Attributes::default();
+        Self { body, takes: Duration::ZERO, survives_panics: false, attributes, actuator: None, values: None }
     }
 
     /// It answers this much later; the unit goes on with everything else meanwhile.
@@ -238,6 +247,10 @@ impl Service {
 impl cara_core::services::lease::Service for Handler {
     fn lease(&self) -> Option<&Lease> {
         self.0.actuator.as_ref().map(Actuator::word)
+    }
+
+    fn stream(&self) -> Option<&dyn cara_core::services::stream::Source> {
+        self.0.values.as_ref().map(|values| values as &dyn cara_core::services::stream::Source)
     }
 
     fn inhibit(&self, now: Instant, latch: Latch) {
