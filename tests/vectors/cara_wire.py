@@ -22,6 +22,7 @@ LEAST_MESSAGE = 512
 REQUEST_BYTES = 32
 LONGEST_HEADER = 64
 REPLY_BYTES = 16
+SAMPLE_BYTES = 16
 MUST_UNDERSTAND = 0x8000
 
 
@@ -162,6 +163,9 @@ def read_fields(reader, fields):
         elif encoding == "lease_end":
             why = reader.varint(32)
             value[name] = LEASE_ENDS[why] if why < len(LEASE_ENDS) else "expired"
+        elif encoding == "refusal":
+            refusal = reader.varint(32)
+            value[name] = REFUSALS[refusal] if refusal < len(REFUSALS) else "unknown"
         elif encoding == "latch":
             reason, by = reader.varint(32), reader.varint(32)
             value[name] = {"by": by, "reason": min(reason - 1, 0xFFFF)} if reason else None
@@ -185,6 +189,8 @@ def write_fields(value, fields):
             out += bytes([ROLES.index(value[name])])
         elif encoding == "lease_end":
             out += varint(LEASE_ENDS.index(value[name]))
+        elif encoding == "refusal":
+            out += varint(REFUSALS.index(value[name]))
         elif encoding == "latch":
             latch = value[name] or {"by": 0, "reason": -1}
             out += varint(latch["reason"] + 1) + varint(latch["by"])
@@ -386,9 +392,12 @@ CONTROLS = {
     5: ("limits", [("message_size", 32), ("minimum_interval", 32), ("calls", 16)]),
     6: ("lease_ended", [("call", 32), ("why", "lease_end")]),
     7: ("actuator", [("slot", 16), ("latch", "latch"), ("last", "order")]),
+    8: ("subscribe", [("slot", 16), ("generation", 16), ("interval", 32)]),
+    9: ("subscribed", [("slot", 16), ("generation", 16), ("interval", 32), ("bytes", 32), ("refusal", "refusal")]),
 }
 # Behind one of these nothing follows in a message.
-LAST_ITEMS = ("list_end", "list_ack", "lease_ended", "actuator")
+LAST_ITEMS = ("list_end", "list_ack", "lease_ended", "actuator", "subscribed")
+REFUSALS = ["none", "unknown", "not_allowed", "full"]
 LEASE_ENDS = ["finished", "expired", "replaced", "stopped", "released"]
 
 
@@ -402,6 +411,8 @@ def decode_message(data):
     if kind == 3:
         require(len(data) >= 4)
         return {"control": [read_control(*each) for each in items_of(data[4:])]}
+    if kind == 6:
+        return {"sample": read_sample(Reader(data))}
     require(kind == 4)
     failure = read_answer(Reader(data))
     require("error" in failure)
@@ -418,6 +429,9 @@ def encode_message(message):
         return struct.pack("<BBHHBBIIQII", 1, flags, *place, *numbers) + bytes.fromhex(value["block"])
     if name in ("reply", "failure"):
         return write_answer(2 if name == "reply" else 4, value)
+    if name == "sample":
+        head = struct.pack("<BBHHBBq", 6, 0, value["slot"], value["generation"], SAMPLE_BYTES // 4, 0, value["made"])
+        return head + bytes.fromhex(value["block"])
     return bytes([3, 0, 0, 0]) + b"".join(write_control(*told) for each in value for told in each.items())
 
 
@@ -436,6 +450,12 @@ def read_request(reader):
         "takes_over": flags & 0x10 != 0, "operator": flags & 4 != 0, "unknown": flags & 0xE0,
         "remaining": remaining, "stamp": stamp, "since": since, "block": behind_header(reader, words, REQUEST_BYTES),
     }
+
+
+def read_sample(reader):
+    _, _, slot, generation, words, _, made = reader.fixed("BBHHBBq")
+    block = behind_header(reader, words, SAMPLE_BYTES)
+    return {"slot": slot, "generation": generation, "made": made, "block": block}
 
 
 def read_answer(reader):
@@ -534,10 +554,11 @@ def text_form(name, arguments, results):
 
 
 def decode_attributes(data):
-    flags, actuator, _, lease = Reader(data).fixed("BB2sI")
+    flags, actuator, least, lease = Reader(data).fixed("BBHI")
     return {
         "priority": PRIORITIES[flags & 3], "idempotent": flags & 4 != 0, "lease": lease or None,
         "actuator": actuator, "stop": flags & 8 != 0, "reset": flags & 16 != 0,
+        "stream": least if flags & 32 else None,
     }
 
 
@@ -546,7 +567,9 @@ def encode_attributes(attributes):
     flags = PRIORITIES.index(attributes.get("priority", "normal"))
     for name, bit in (("idempotent", 4), ("stop", 8), ("reset", 16)):
         flags |= bit if attributes.get(name) else 0
-    return struct.pack("<BB2sI", flags, attributes.get("actuator", 0), b"\0\0", attributes.get("lease") or 0)
+    stream = attributes.get("stream")
+    flags |= 0 if stream is None else 32
+    return struct.pack("<BBHI", flags, attributes.get("actuator", 0), stream or 0, attributes.get("lease") or 0)
 
 
 def decode_block(data, variables):

@@ -7,7 +7,7 @@ use cara_core::distribution::function::{Attributes, Signature};
 use cara_core::distribution::hello::{Hello, HelloError, Manager};
 use cara_core::distribution::identity::{Fleet, Identity};
 use cara_core::distribution::items::{Item, Items, Malformed};
-use cara_core::distribution::message::{Control, Message, SessionBody};
+use cara_core::distribution::message::{Control, Message, SampleHeader, SessionBody, SubscriptionRefusal};
 use cara_core::distribution::parameters::{Parameters, Type, Value as Variable};
 use cara_core::error::{Error, ServiceError};
 use cara_core::host::secure::Plain;
@@ -91,6 +91,9 @@ pub(crate) fn message(bytes: &[u8]) -> Option<Value> {
         Message::Reply(id, Ok(block)) => json!({ "reply": { "id": id, "block": hex(block) } }),
         Message::Reply(id, Err(error)) => json!({ "reply": { "id": id, "error": self::error(error) } }),
         Message::Failure(id, error) => json!({ "failure": { "id": id, "error": self::error(error) } }),
+        Message::Sample(SampleHeader { slot, generation, made }, block) => json!({ "sample": {
+            "slot": slot.0, "generation": generation.0, "made": made, "block": hex(block),
+        }}),
         Message::Control(items) => json!({ "control": controls(items)? }),
     })
 }
@@ -153,6 +156,20 @@ fn control(control: &Control<'_>) -> Value {
             "message_size": message_size, "minimum_interval": minimum_interval, "calls": calls,
         }}),
         Control::LeaseEnded { call, why } => json!({ "lease_ended": { "call": call, "why": why.word() } }),
+        Control::Subscribe { slot, generation, interval } => json!({ "subscribe": {
+            "slot": slot, "generation": generation, "interval": interval,
+        }}),
+        Control::Subscribed { slot, generation, interval, bytes, refusal } => {
+            let refusal = match refusal {
+                SubscriptionRefusal::None => "none",
+                SubscriptionRefusal::Unknown => "unknown",
+                SubscriptionRefusal::NotAllowed => "not_allowed",
+                SubscriptionRefusal::Full => "full",
+            };
+            json!({ "subscribed": {
+                "slot": slot, "generation": generation, "interval": interval, "bytes": bytes, "refusal": refusal,
+            }})
+        }
         Control::Actuator { slot, latch, last } => {
             let latch = latch.map(|Latch { by, reason }| json!({ "by": by, "reason": reason }));
             let last = last.map(|LastOrder { holder, link, call, end }| {
@@ -183,6 +200,7 @@ fn attributes(attributes: &Attributes) -> Value {
         "stop": attributes.stop,
         "reset": attributes.reset,
         "lease": attributes.lease.map(|lease| lease.as_millis()),
+        "stream": attributes.stream,
     })
 }
 

@@ -4,7 +4,8 @@ use cara_core::config::Priority;
 use cara_core::distribution::function::Attributes;
 use cara_core::distribution::function_list::{Generation, Slot};
 use cara_core::distribution::message::{
-    Control, LastOrder, Latch, LeaseEnd, Release, Renewal, RequestHeader, SessionBody, encode_failure, encode_reply,
+    Control, LastOrder, Latch, LeaseEnd, Release, Renewal, RequestHeader, SampleHeader, SessionBody,
+    SubscriptionRefusal, encode_failure, encode_reply,
 };
 use cara_core::error::{Error, ServiceError};
 use cara_core::time::Duration;
@@ -70,6 +71,15 @@ fn messages() -> Vec<Vector> {
     longer_reply[3] += 1;
     let reply = [&encode_reply(0x0102_0304, Ok(()))[..], &results].concat();
     let replied = json!({ "reply": { "id": 0x0102_0304, "block": "0102030405060708090a0b0c0d0e0f10" } });
+    let header = SampleHeader { slot: Slot(3), generation: Generation(2), made: -1_500 }.encode();
+    let sample = [&header[..], &results].concat();
+    let mut longer_sample = [&header[..], &[0xEE; 4], &results].concat();
+    longer_sample[6] += 1;
+    let mut shorter_sample = sample.clone();
+    shorter_sample[6] -= 1;
+    let sampled = json!({ "sample": {
+        "slot": 3, "generation": 2, "made": -1_500, "block": "0102030405060708090a0b0c0d0e0f10",
+    }});
     vec![
         message(("request", "a blocking request with arguments"), &request(true, &block), &fields(true, &block)),
         message(("request_one_way", "an asynchronous request without any"), &request(false, &[]), &fields(false, &[])),
@@ -87,7 +97,11 @@ fn messages() -> Vec<Vector> {
         message(("reply", "results"), &reply, &replied),
         message(("reply_longer_header", "a later version has more in front of the block"), &longer_reply, &replied)
             .lossy(),
-        message(("message_of_no_kind", "refused: there is no kind 5"), &[5; 16], &Value::Null),
+        message(("sample", "a value of a stream"), &sample, &sampled),
+        message(("sample_longer_header", "a later version has more in front of the block"), &longer_sample, &sampled)
+            .lossy(),
+        message(("sample_shorter_header", "refused: 3 words"), &shorter_sample, &Value::Null),
+        message(("message_of_no_kind", "refused: there is no kind 7"), &[7; 16], &Value::Null),
         message(("request_cut", "refused: a header of 31 bytes"), &request(true, &[])[..31], &Value::Null),
         message(
             ("failure_without_error", "refused: a failure needs an error"),
@@ -171,7 +185,7 @@ fn controls() -> Vec<Vector> {
     let stop = definition("stop()");
     let attributes = Attributes { priority: Priority::Emergency, idempotent: true, ..Attributes::default() }.encode();
     let publish = Control::Publish { slot: 300, generation: 2, attributes: &attributes, signature: stop.as_bytes() };
-    let all: [(&'static str, &'static str, Control<'_>, Value); 11] = [
+    let all: [(&'static str, &'static str, Control<'_>, Value); 15] = [
         (
             "publish",
             "a function may be called",
@@ -210,6 +224,46 @@ fn controls() -> Vec<Vector> {
             "a newer call of the same function goes on",
             Control::LeaseEnded { call: 4, why: LeaseEnd::Replaced },
             json!({ "lease_ended": { "call": 4, "why": "replaced" } }),
+        ),
+        (
+            "subscribe",
+            "values of a stream, at least 100 ms apart",
+            Control::Subscribe { slot: 300, generation: 2, interval: 100 },
+            json!({ "subscribe": { "slot": 300, "generation": 2, "interval": 100 } }),
+        ),
+        (
+            "subscribe_no_more",
+            "no more values of a stream",
+            Control::Subscribe { slot: 3, generation: 2, interval: u32::MAX },
+            json!({ "subscribe": { "slot": 3, "generation": 2, "interval": u32::MAX } }),
+        ),
+        (
+            "subscribed",
+            "a subscription is granted",
+            Control::Subscribed {
+                slot: 3,
+                generation: 2,
+                interval: 200,
+                bytes: 100_000,
+                refusal: SubscriptionRefusal::None,
+            },
+            json!({ "subscribed": {
+                "slot": 3, "generation": 2, "interval": 200, "bytes": 100_000, "refusal": "none",
+            } }),
+        ),
+        (
+            "subscribed_refused",
+            "the reader has as many subscriptions as it may",
+            Control::Subscribed {
+                slot: 3,
+                generation: 2,
+                interval: u32::MAX,
+                bytes: 100_000,
+                refusal: SubscriptionRefusal::Full,
+            },
+            json!({ "subscribed": {
+                "slot": 3, "generation": 2, "interval": u32::MAX, "bytes": 100_000, "refusal": "full",
+            } }),
         ),
         (
             "actuator_free",

@@ -93,7 +93,7 @@ fn attributes() -> Vec<Vector> {
     let json = |priority: &str, idempotent: bool, lease: Option<u32>, actuator: u8, stop: bool, reset: bool| {
         json!({
             "priority": priority, "idempotent": idempotent, "lease": lease,
-            "actuator": actuator, "stop": stop, "reset": reset,
+            "actuator": actuator, "stop": stop, "reset": reset, "stream": null,
         })
     };
     let made = |names, attributes: &Attributes, value: &Value| {
@@ -117,11 +117,19 @@ fn attributes() -> Vec<Vector> {
         made(("attributes_actuator", "it moves actuator 3"), &drive, &json("high", false, Some(500), 3, false, false)),
         made(("attributes_stop", "it stops all"), &stop, &json("emergency", true, None, 0, true, false)),
         made(("attributes_reset", "it resets actuator 3"), &reset, &json("normal", false, None, 3, false, true)),
+        made(
+            ("attributes_stream", "a stream, whose values come at least 20 ms apart"),
+            &Attributes { priority: Priority::Low, stream: Some(20), ..Attributes::default() },
+            &json!({
+                "priority": "low", "idempotent": false, "lease": null, "actuator": 0, "stop": false, "reset": false,
+                "stream": 20,
+            }),
+        ),
         Vector::new(
             ("attributes_of_a_later_version", "other bits, and what follows, are passed over"),
             Kind::Attributes,
             Context::default(),
-            &[0xE0 | 5, 0, 9, 9, 0xF4, 1, 0, 0, 7, 7],
+            &[0xC0 | 5, 0, 9, 9, 0xF4, 1, 0, 0, 7, 7],
             &json("high", true, Some(500), 0, false, false),
         )
         .lossy(),
