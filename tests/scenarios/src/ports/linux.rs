@@ -78,8 +78,11 @@ struct LinuxNode {
     leases: Mutex<BTreeMap<String, LeaseWatch>>,
     /// Of the calls of each service.
     orders: Mutex<BTreeMap<String, Vec<LeaseWatch>>>,
-    readings: Mutex<BTreeMap<(String, String), Arc<Mutex<Reading>>>>,
+    readings: Mutex<Readings>,
 }
+
+/// By peer and stream.
+type Readings = BTreeMap<(String, String), Arc<Mutex<Reading>>>;
 
 /// A stream of a peer that a thread reads.
 #[derive(Default)]

@@ -36,7 +36,7 @@ fn number_of(sample: &cara_sim::Sample) -> i64 {
 }
 
 fn values(reader: &Unit, peer: &str) -> Vec<i64> {
-    reader.samples(peer, "pose").iter().map(|sample| number_of(sample)).collect()
+    reader.samples(peer, "pose").iter().map(number_of).collect()
 }
 
 fn last(reader: &Unit, peer: &str) -> Option<i64> {
