@@ -87,7 +87,15 @@ impl<T: Send + 'static> MyFunctionList<'_, T> {
         let attributes = Attributes { priority: Priority::Low, stream: Some(least), ..Attributes::default() };
         // Never run: a call of a stream is refused before.
         let run = Run::Free(Arc::new(|_, _| Err(ServiceError::NotReady)));
-        let handler = Handler { run, actuator: None, moves: false, executor: None, stream: Some(own.clone()) };
+        let handler = Handler {
+            run,
+            actuator: None,
+            moves: false,
+            executor: None,
+            stream: Some(own.clone()),
+            #[cfg(feature = "async")]
+            to_its_end: false,
+        };
         self.engine.functions_mut().add_function(definition, attributes, handler)?;
         Ok(Stream { engine: self.engine.clone(), definition: definition.clone(), own })
     }

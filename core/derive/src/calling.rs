@@ -62,9 +62,9 @@ impl Attributes {
             priority: #parts::Priority::#class,
             lease: #lease,
             idempotent: #idempotent,
-            actuator: 0,
             stop: #stop,
             reset: #reset,
+            ..#parts::Attributes::NORMAL
         })
     }
 }

@@ -13,7 +13,7 @@ pub(crate) fn make(interface: &Interface, root: &TokenStream) -> TokenStream {
     let blocking = client(interface, root, "Client", "for threads: a call returns when it has its results", blocking);
     let awaited = client(interface, root, "AsyncClient", "for tasks: a call is awaited", awaited);
     quote! {
-        #[allow(dead_code)]
+        #[allow(dead_code, clippy::needless_question_mark)]
         impl #holder {
             #(#shared)*
         }
@@ -54,13 +54,13 @@ fn shared(function: &Function, root: &TokenStream) -> TokenStream {
         }
     };
     quote! {
-        #[allow(unused_variables, clippy::too_many_arguments)]
+        #[allow(unused_variables, clippy::too_many_arguments, clippy::needless_question_mark)]
         fn #fill(parameters: &mut #parts::ParametersView, #(#inputs),*) -> ::core::result::Result<(), #parts::Error> {
             #(#writes)*
             ::core::result::Result::Ok(())
         }
 
-        #[allow(unused_variables)]
+        #[allow(unused_variables, clippy::needless_question_mark)]
         fn #take(parameters: &#parts::ParametersView) -> ::core::result::Result<#returned, #parts::Error> {
             #results
         }

@@ -87,6 +87,11 @@ const HOST_FOR_SERVICES: [Purpose; 17] = [
         items: &["connections::Incoming", "connections::Place", "frame::Frame"],
     },
     Purpose {
+        what: "where a sample lies that came whole",
+        places: &["services/session/streaming.rs"],
+        items: &["connections::Place"],
+    },
+    Purpose {
         what: "why a session datagram is dropped",
         places: &["services/session/inbound.rs"],
         items: &["secure::Unopened"],
