@@ -32,7 +32,7 @@ struct Purpose {
 }
 
 /// A layer talks to its neighbour. These are the exceptions of services; everything else of host goes through distribution.
-const HOST_FOR_SERVICES: [Purpose; 17] = [
+const HOST_FOR_SERVICES: [Purpose; 18] = [
     Purpose {
         what: "the cipher's trait, over which all of a session is generic",
         places: &["services"],
