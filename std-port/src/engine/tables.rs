@@ -123,7 +123,8 @@ impl<T: Send + 'static> Engine<T> {
         outcome
     }
 
-    /// Makes room for as many calls of the peer as it may have here, once it has more than one.
+    /// Makes room for as many calls of the peer as it may have here, once more than one runs: before the next one comes, and when
+    /// one that waited has begun.
     pub(super) fn make_call_room(&self, state: &mut LinkState) {
         let most = slots_for(self.links.capacities.calls_running);
         let (slots, empty) = state.session.running_slots();
