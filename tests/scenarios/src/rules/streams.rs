@@ -137,7 +137,7 @@ fn a_subscription_survives_a_reconnection(world: &mut dyn World) {
 
 fn two_readers_have_each_its_pace(world: &mut dyn World) {
     let manager = world.add(Spec::manager("manager", 1).stream("pose(n: int)"));
-    let agvs = [("slow", 7), ("fast", 8)].map(|(name, id)| world.add(Spec::agv(name, id)));
+    let agvs = [("late", 7), ("quick", 8)].map(|(name, id)| world.add(Spec::agv(name, id)));
     let [slow, fast] = &agvs;
     agvs.iter().for_each(|agv| met(world, agv, "manager", "pose"));
     slow.subscribe("manager", "pose", millis(500)).expect("it is connected");

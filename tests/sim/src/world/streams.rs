@@ -58,7 +58,8 @@ pub struct Sample {
 pub(super) struct Reading {
     peer: Peer,
     stream: String,
-    interval: Duration,
+    /// `None` once it is unsubscribed from.
+    interval: Option<Duration>,
     /// The newest ones.
     samples: Vec<Sample>,
     count: u64,
@@ -71,7 +72,8 @@ impl Links {
     pub(super) fn subscribe(&mut self, network: &mut Network, index: u16) {
         let Some(peer) = self.peer(index) else { return };
         let wanted: Vec<_> = self.readings.iter().filter(|reading| reading.peer.is(&peer)).collect();
-        let wanted: Vec<_> = wanted.iter().map(|reading| (reading.stream.clone(), reading.interval)).collect();
+        let wanted: Vec<_> =
+            wanted.iter().filter_map(|reading| Some((reading.stream.clone(), reading.interval?))).collect();
         for (stream, interval) in wanted {
             self.with(network, index, |session, cx| session.subscribe(cx, &stream, interval));
         }
@@ -154,9 +156,9 @@ impl UnitHandle {
         self.machine(|machine, _| {
             let readings = &mut machine.links.readings;
             match readings.iter_mut().find(|reading| reading.peer == peer && reading.stream == stream) {
-                Some(reading) => reading.interval = interval,
+                Some(reading) => reading.interval = Some(interval),
                 None => {
-                    let (samples, count, refused) = (Vec::new(), 0, None);
+                    let (interval, samples, count, refused) = (Some(interval), Vec::new(), 0, None);
                     readings.push(Reading { peer: peer.clone(), stream, interval, samples, count, refused });
                 }
             }
@@ -172,7 +174,9 @@ impl UnitHandle {
     pub fn unsubscribe(&self, peer: impl Into<Peer>, stream: &str) -> Result<(), Error> {
         let peer = peer.into();
         self.machine(|machine, _| {
-            machine.links.readings.retain(|reading| reading.peer != peer || reading.stream != stream);
+            let readings = machine.links.readings.iter_mut();
+            let ended = readings.filter(|reading| reading.peer == peer && reading.stream == stream);
+            ended.for_each(|reading| reading.interval = None);
         })?;
         if let Ok(index) = self.link_to(&peer) {
             self.machine(|machine, network| {
