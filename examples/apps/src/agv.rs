@@ -12,6 +12,10 @@ pub const POS_INFO: &str = "pos_info(position: int[2]) -> (position: int[2])";
 pub const GO_TO: &str = "go_to(position: int[2])";
 /// Tells how full the battery is, in percent.
 pub const BATTERY: &str = "battery() -> (charge: float)";
+/// The stream of where the vehicle is, in units.
+pub const POSE: &str = "pose(position: float[2])";
+/// The stream of how full the battery is, in percent.
+pub const CHARGE: &str = "charge(percent: float)";
 /// Stops at once, and keeps the vehicle from driving until [`RESET`].
 pub const STOP: &str = "stop()";
 /// Lets the vehicle drive again, unless its bumper is pressed.
@@ -58,6 +62,11 @@ impl Place {
     /// The nearest place of whole units.
     pub const fn rounded(self) -> [i64; 2] {
         [(self.x + PARTS / 2).div_euclid(PARTS), (self.y + PARTS / 2).div_euclid(PARTS)]
+    }
+
+    /// In units.
+    pub const fn exact(self) -> [f64; 2] {
+        [self.x as f64 / PARTS as f64, self.y as f64 / PARTS as f64]
     }
 }
 
@@ -169,8 +178,12 @@ impl<Order> Agv<Order> {
 
     /// Serves [`BATTERY`].
     pub fn battery(&self, parameters: &mut ParametersView) -> Result<(), ServiceError> {
-        let charge = 100.0 - 100.0 * self.driven as f64 / (RANGE * PARTS) as f64;
-        parameters.set_value("charge", charge.max(0.0)).map_err(|_| ServiceError::BadResults)
+        parameters.set_value("charge", self.charge()).map_err(|_| ServiceError::BadResults)
+    }
+
+    /// How full the battery is, in percent.
+    pub fn charge(&self) -> f64 {
+        (100.0 - 100.0 * self.driven as f64 / (RANGE * PARTS) as f64).max(0.0)
     }
 }
 
@@ -208,6 +221,13 @@ mod tests {
         assert_eq!(agv.place(), Place::at([1, -2]));
         assert_eq!(agv.step(TICK, true), None);
         assert_eq!((agv.finished(), agv.finished()), (Some(1), None));
+    }
+
+    #[test]
+    fn a_place_is_exact_in_units() {
+        let mut agv = driving_to([0, -1]);
+        assert_eq!(agv.step(TICK, true), None);
+        assert_eq!((agv.place().exact(), agv.charge()), ([0.0, -0.04], 100.0 - 0.04 / 50.0));
     }
 
     #[test]

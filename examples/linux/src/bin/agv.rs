@@ -4,10 +4,13 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
-use cara_apps::agv::{BATTERY, BUMPER, GO_TO, GO_TO_LEASE, POS_INFO, Progress, RESET, STOP, TICK};
+use cara_apps::agv::{BATTERY, BUMPER, CHARGE, GO_TO, GO_TO_LEASE, POS_INFO, POSE, Progress, RESET, STOP, TICK};
 use cara_apps::mechanic;
 use cara_examples::{NameAndId, Network, Stop, log_to_stderr, say};
-use cara_std::{Actuator, Call, Definition, LeaseWatch, ParametersView, Priority, ServiceOptions, Unit, UnitEvent};
+use cara_std::{
+    Actuator, Call, Definition, Error, LeaseWatch, Parameters, ParametersView, Priority, ServiceOptions, Stream, Unit,
+    UnitEvent,
+};
 use clap::Parser;
 
 /// The vehicle, which keeps the lease of the call that it drives for.
@@ -36,20 +39,21 @@ fn main() -> Result<()> {
     let builder = network.place(Unit::builder(&name, id, &manager.name, manager.id)?);
     let unit = builder.build()?;
     let agv = Arc::new(Mutex::new(Agv::new([0, 0])));
-    let drive = offer(&unit, &agv)?;
+    let (drive, mut streams) = (offer(&unit, &agv)?, Streams::of(&unit)?);
+    unit.publish_my_function_list()?;
     let (bumped, motors) = (agv.clone(), drive.clone());
     let stop = Stop::hearing(network.attended, move |line| bumper(line, &bumped, &motors))?;
     unit.on_manager_lost(|()| say!("manager lost"))?;
     follow(&unit);
     unit.start()?;
     say!("started {name}/{id}, {}, at {}", unit.mode().as_str(), lock(&agv).place());
-    run_motors(&unit, &agv, &drive, &stop)?;
+    run_motors(&unit, &agv, &drive, &mut streams, &stop)?;
     unit.stop();
     say!("ended at {}", lock(&agv).place());
     Ok(())
 }
 
-/// Publishes the AGV's services. Returns what they move.
+/// Adds the AGV's services. Returns what they move.
 fn offer(unit: &Unit, agv: &Arc<Mutex<Agv>>) -> Result<Actuator> {
     let own = || agv.clone();
     let agv = own();
@@ -85,8 +89,33 @@ fn offer(unit: &Unit, agv: &Arc<Mutex<Agv>>) -> Result<Actuator> {
     functions.add_service(&Definition::parse(STOP)?, stops, stop)?;
     functions.add_service(&Definition::parse(RESET)?, plain().idempotent().resets(&drive), reset)?;
     functions.add_service(&Definition::parse(GO_TO)?, plain().moves(&drive, GO_TO_LEASE), go_to)?;
-    unit.publish_my_function_list()?;
     Ok(drive)
+}
+
+/// What the AGV tells of itself, with the newest values.
+struct Streams {
+    pose: (Stream, Parameters),
+    charge: (Stream, Parameters),
+}
+
+impl Streams {
+    fn of(unit: &Unit) -> Result<Self> {
+        let add = |text, least| {
+            unit.my_function_list().add_stream(&Definition::stream(text)?, least).map_err(anyhow::Error::from)
+        };
+        let (mut position, mut percent) = (Parameters::new(), Parameters::new());
+        position.add_float("position", 2)?;
+        percent.add_float("percent", 1)?;
+        Ok(Self { pose: (add(POSE, TICK)?, position), charge: (add(CHARGE, POSITION_EVERY.into())?, percent) })
+    }
+
+    fn publish(&mut self, position: [f64; 2], percent: f64) -> Result<(), Error> {
+        let Self { pose: (pose, at), charge: (charge, left) } = self;
+        at.set_value("position", position)?;
+        left.set_value("percent", percent)?;
+        pose.publish(at)?;
+        charge.publish(left)
+    }
 }
 
 /// The bumper, by hand: while it is pressed no reset lets the vehicle drive.
@@ -106,7 +135,7 @@ fn bumper(line: &str, agv: &Mutex<Agv>, drive: &Actuator) {
 }
 
 /// The motors' loop: drives while an order is live.
-fn run_motors(unit: &Unit, agv: &Mutex<Agv>, drive: &Actuator, stop: &Stop) -> Result<()> {
+fn run_motors(unit: &Unit, agv: &Mutex<Agv>, drive: &Actuator, streams: &mut Streams, stop: &Stop) -> Result<()> {
     let (order, mut last, mut said) = (drive.watch(), Instant::now(), Instant::now());
     loop {
         if let Some(outcome) = stop.wait_for(TICK.into()) {
@@ -114,10 +143,11 @@ fn run_motors(unit: &Unit, agv: &Mutex<Agv>, drive: &Actuator, stop: &Stop) -> R
         }
         let elapsed = last.elapsed();
         last += elapsed;
-        let (progress, place, finished) = {
+        let (progress, place, charge, finished) = {
             let mut agv = lock(agv);
-            (agv.step(elapsed.into(), order.is_live()), agv.place(), agv.finished())
+            (agv.step(elapsed.into(), order.is_live()), agv.place(), agv.charge(), agv.finished())
         };
+        streams.publish(place.exact(), charge)?;
         if let Some(order) = finished {
             unit.end_order(&order);
         }
