@@ -124,7 +124,6 @@ impl<T: Send + 'static> Engine<T> {
     /// Begins the next call of a link.
     pub(super) fn take_call(&self, link: &LinkCell, state: &mut LinkState, worker: &mut Worker) -> Option<Begun> {
         let call = self.with(link, state, |session, cx| session.next_call(cx, &mut worker.arguments))?;
-        self.make_call_room(state);
         Some(self.begun(&self.functions(), link, call))
     }
 
@@ -134,7 +133,6 @@ impl<T: Send + 'static> Engine<T> {
             let mut arguments = arena(self.call_bytes());
             let call = self.with(link, state, |session, cx| session.next_emergency(cx, &mut arguments));
             let Some(call) = call else { return };
-            self.make_call_room(state);
             let begun = self.begun(&self.functions(), link, call);
             self.run_emergency(&self.functions(), link, begun, arguments);
         }

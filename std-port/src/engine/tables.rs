@@ -123,12 +123,11 @@ impl<T: Send + 'static> Engine<T> {
         outcome
     }
 
-    /// Makes room for as many calls of the peer as it may have here, once more than one runs: before the next one comes, and when
-    /// one that waited has begun.
+    /// Makes room for as many calls of the peer as it may have here once more than one runs or waits, before the next one comes.
     pub(super) fn make_call_room(&self, state: &mut LinkState) {
         let most = slots_for(self.links.capacities.calls_running);
-        let (slots, empty) = state.session.running_slots();
-        if slots < most && slots.saturating_sub(empty) > 1 {
+        let (slots, calls) = state.session.running_slots();
+        if slots < most && calls > 1 {
             drop(state.session.lend_running(filled(most, None)));
         }
     }

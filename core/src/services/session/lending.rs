@@ -24,9 +24,9 @@ impl<P: Port> Session<P> {
         self.requests.grow(pending)
     }
 
-    /// Slots for calls of the peer that run here, and those of them that are empty.
-    pub fn running_slots(&self) -> (usize, usize) {
-        self.calls.slots()
+    /// Slots for calls of the peer that run here, and how many calls of it run or wait.
+    pub fn running_slots(&self) -> (usize, u16) {
+        (self.calls.slots(), self.calls.held())
     }
 
     /// Lends more slots for calls of the peer that run here. Returns the slots that are not needed any more: the new ones if
